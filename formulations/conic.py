@@ -1,0 +1,306 @@
+r"""Parametrised conic problems, canonicalised once and re-solved on Clarabel's own data.
+
+A cvxpy problem that obeys the parameter rules (DPP) becomes
+
+.. math:: \min_x \tfrac12 x^\top P x + q^\top x + d \quad\text{subject to}\quad A x + s = b, \; s \in K,
+
+in which `P`, `q`, `d`, `A`, `b` are affine in the parameters. The affine maps are taken out of cvxpy once; a later solve is a few
+sparse products, an update of Clarabel's data and the bare solve. Its dual point `z`, projected on the dual cone, gives
+
+.. math:: \min \ge d - \tfrac12 x^\top P x - b^\top z - \rho \, |P x + q + A^\top z|
+
+for every minimiser with :math:`|x^*| \le \rho`, whatever the solver reports: the "optimal value" is never used as a bound.
+
+Sources: A. Agrawal et al., "Differentiable convex optimization layers", NeurIPS 2019, section 4 (the affine maps); C. Jansson,
+D. Chaykin and C. Keil, "Rigorous error bounds for the optimal value in semidefinite programming", SIAM J. Numer. Anal. 46 (2007),
+theorem 3.2 (the bound, here with one radius for all of x).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What one conic solve gave.
+
+    Parameters
+    ----------
+    values : Mapping[str, Array]
+        Values of the variables by name; NaN where the solver gave none.
+    primal : float
+        Objective at the point found.
+    bound : float
+        Lower bound of the optimum, recomputed from the dual point; minus infinity where none is available.
+    status : str
+        The solver's own word for how it ended.
+    solved : bool
+        True where the solver met its full tolerances.
+    iterations : int
+        Interior-point (or other) iterations.
+    """
+
+    values: Mapping[str, Array]
+    primal: float
+    bound: float
+    status: str
+    solved: bool
+    iterations: int
+
+
+class Relaxation:
+    """One cvxpy problem with named parameters, solved many times.
+
+    Parameters
+    ----------
+    problem : cvxpy.Problem
+        A minimisation that is DPP; parameters and variables carry unique names. Linear, second-order and
+        semidefinite cones.
+    backend : str
+        ``"CLARABEL"`` for the fast way; any other solver cvxpy knows goes through ``problem.solve`` and yields no bound.
+    settings : Mapping[str, Any], optional
+        Settings of the back end.
+    radius : float
+        Factor on ``1 + |x|`` of the solution found that is taken to hold every minimiser, for the bound.
+
+    Notes
+    -----
+    Agrawal et al. (2019), section 4. Holds solver state: build one per worker, do not pickle or share between threads.
+    """
+
+    def __init__(
+        self,
+        problem: Any,
+        *,
+        backend: str = "CLARABEL",
+        settings: Mapping[str, Any] | None = None,
+        radius: float = 2.0,
+    ) -> None:
+        self.problem, self.backend, self.settings, self.radius = problem, backend, dict(settings or {}), radius
+        self.parameters = {parameter.name(): parameter for parameter in problem.parameters()}
+        self._data = _Data(problem) if backend == "CLARABEL" else None
+        self._solver: Any = None
+
+    def solve(self, values: Mapping[str, Array]) -> Answer:
+        """Solve with new parameter values.
+
+        Parameters
+        ----------
+        values : Mapping[str, Array]
+            Values of every parameter, by name.
+
+        Returns
+        -------
+        Answer
+            Point, value, bound and status; failure is reported, not raised.
+        """
+        if values.keys() != self.parameters.keys():
+            raise ValueError(f"parameters {sorted(values)} given, {sorted(self.parameters)} expected")
+        return self._elsewhere(values) if self._data is None else self._directly(self._data, values)
+
+    def _directly(self, data: _Data, values: Mapping[str, Array]) -> Answer:
+        data.feed(values)
+        if self._solver is None:
+            self._solver = _solver(data, self.settings)
+        else:
+            self._solver.update(P=data.P.data, q=data.q, A=data.A.data, b=data.b)
+        solution = self._solver.solve()
+        x, z, status = np.array(solution.x), np.array(solution.z), str(solution.status)
+        if not (np.isfinite(x).all() and np.isfinite(z).all()):
+            x, z = np.full(len(x), np.nan), np.full(len(z), np.nan)
+        quadratic = float(x @ data.square(x))
+        return Answer(
+            data.recover(x),
+            0.5 * quadratic + float(data.q @ x) + data.d,
+            data.bound(x, z, self.radius * (1.0 + float(np.linalg.norm(x)))),
+            status,
+            status == "Solved",
+            int(solution.iterations),
+        )
+
+    def _elsewhere(self, values: Mapping[str, Array]) -> Answer:
+        import cvxpy
+
+        for name, value in values.items():
+            self.parameters[name].value = value
+        try:
+            self.problem.solve(solver=self.backend, **self.settings)
+        except cvxpy.error.SolverError as trouble:
+            status = str(trouble)
+        else:
+            status = str(self.problem.status)
+        found: dict[str, Array] = {}
+        for variable in self.problem.variables():
+            missing = variable.value is None
+            found[variable.name()] = np.full(variable.shape, np.nan) if missing else np.asarray(variable.value)
+        known = status in ("optimal", "optimal_inaccurate")
+        stats = self.problem.solver_stats if known else None
+        count = int(stats.num_iters or 0) if stats is not None else 0
+        primal = float(self.problem.value) if known else np.nan
+        return Answer(found, primal, -np.inf, status, status == "optimal", count)
+
+
+def _solver(data: _Data, settings: Mapping[str, Any]) -> Any:
+    import clarabel
+
+    chosen = clarabel.DefaultSettings()
+    # presolve and chordal decomposition forbid updates of the data
+    chosen.verbose, chosen.presolve_enable, chosen.chordal_decomposition_enable = False, False, False
+    chosen.max_threads = 1
+    for name, value in settings.items():
+        setattr(chosen, name, value)
+    return clarabel.DefaultSolver(data.P, data.q, data.A, data.b, data.cones, chosen)
+
+
+class _Data:
+    """Clarabel's data as affine functions of the parameters, with a fixed sparsity pattern."""
+
+    def __init__(self, problem: Any) -> None:
+        import cvxpy
+        import scipy.sparse as sp
+        from cvxpy.reductions.solvers.conic_solvers.clarabel_conif import dims_to_solver_cones
+
+        for parameter in problem.parameters():
+            if parameter.value is None:
+                parameter.value = np.zeros(parameter.shape)
+        if not (problem.is_dcp(dpp=True) and isinstance(problem.objective, cvxpy.Minimize)):
+            raise ValueError("the problem must be a minimisation that follows cvxpy's rules for parameters (DPP)")
+        stuff, chain, inverse = problem.get_problem_data(cvxpy.CLARABEL)
+        self.program = stuff["param_prob"]
+        self.dims, self.cones = stuff["dims"], dims_to_solver_cones(stuff["dims"])
+        columns = self.program.param_id_to_col
+        self.slots = {p.name(): columns[p.id] for p in problem.parameters() if p.id in columns}
+        if len(self.slots) != len(problem.parameters()):
+            raise ValueError("parameters need unique names and no symmetric, diagonal or semidefinite attribute")
+        self.vector = np.zeros(self.program.total_param_size + 1)
+        self.vector[-1] = 1.0
+        n = self.program.x.size
+        self._linear = self.program.q.tocsr()
+        self._matrix, pattern = _affine(self.program.reduced_A)
+        m = pattern[2][0]
+        self.q, self.d, self.b = np.zeros(n), 0.0, np.zeros(m)
+        last = pattern[1][n]
+        self._left, self._rows = slice(0, last), pattern[0][last:]
+        self._quadratic, self._upper = None, np.zeros(0, dtype=np.int64)
+        self.A = sp.csc_array((np.zeros(last), pattern[0][:last], pattern[1][: n + 1]), shape=(m, n))
+        self.P = sp.csc_array((n, n))
+        if self.program.P is not None:
+            self._quadratic, pattern = _affine(self.program.reduced_P)
+            column = np.repeat(np.arange(n), np.diff(pattern[1]))
+            self._upper = np.flatnonzero(pattern[0] <= column)
+            row, column = pattern[0][self._upper], column[self._upper]
+            start = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=n))])
+            self.P = sp.csc_array((np.zeros(len(row)), row, start), shape=(n, n))
+        # transposed views share the entries that feed overwrites
+        self._across, self._below = self.A.T, self.P.T
+        self._recover = _recovery(problem, chain, inverse, self.program.x.id, n)
+
+    def feed(self, values: Mapping[str, Array]) -> None:
+        for name, start in self.slots.items():
+            value = np.asarray(values[name], dtype=np.float64).ravel(order="F")
+            self.vector[start : start + value.size] = value
+        linear = np.asarray(self._linear @ self.vector).ravel()
+        self.q, self.d = linear[:-1].copy(), float(linear[-1])
+        entries = np.asarray(self._matrix @ self.vector).ravel()
+        self.A.data[:] = -entries[self._left]
+        self.b = np.zeros(self.A.shape[0])
+        self.b[self._rows] = entries[self._left.stop :]
+        if self._quadratic is not None:
+            self.P.data[:] = np.asarray(self._quadratic @ self.vector).ravel()[self._upper]
+
+    def square(self, x: Array) -> Array:
+        """``Px`` from the stored upper triangle."""
+        if self._quadratic is None:
+            return np.zeros_like(x)
+        return np.asarray(self.P @ x + self._below @ x - self.P.diagonal() * x)
+
+    def bound(self, x: Array, z: Array, radius: float) -> float:
+        z = _dual_point(z, self.dims)
+        if not np.isfinite(z).all():
+            return -np.inf
+        product = self.square(x)
+        rest = float(np.linalg.norm(product + self.q + self._across @ z))
+        return self.d - 0.5 * float(x @ product) - float(self.b @ z) - radius * rest
+
+    def recover(self, x: Array) -> dict[str, Array]:
+        return {name: (matrix @ x).reshape(shape, order="F") for name, matrix, shape in self._recover}
+
+
+def _affine(reduced: Any) -> tuple[Any, tuple[NDArray[np.int64], NDArray[np.int64], tuple[int, int]]]:
+    """Map from the parameter vector to the stored entries, and their compressed-column pattern."""
+    reduced.cache()
+    return reduced.reduced_mat, reduced.problem_data_index
+
+
+def _recovery(problem: Any, chain: Any, inverse: Any, name: int, n: int) -> list[tuple[str, Array, tuple[int, ...]]]:
+    """Matrices from the solver's x to each variable, read off by undoing the reductions on unit vectors."""
+    from cvxpy.reductions.solution import Solution
+
+    columns: dict[int, list[Array]] = {variable.id: [] for variable in problem.variables()}
+    for unit in np.eye(n):
+        solution = Solution("optimal", 0.0, {name: unit}, {}, {})
+        for reduction, data in zip(reversed(chain.reductions[:-1]), reversed(inverse[:-1]), strict=True):
+            solution = reduction.invert(solution, data)
+        for variable in problem.variables():
+            value = solution.primal_vars[variable.id]
+            dense = value.toarray() if hasattr(value, "toarray") else np.asarray(value)
+            columns[variable.id].append(dense.ravel(order="F"))
+    return [(v.name(), np.stack(columns[v.id], axis=1), v.shape) for v in problem.variables()]
+
+
+def _dual_point(z: Array, dims: Any) -> Array:
+    """Projection on the dual cone; NaN for cones without one here."""
+    z, at = z.copy(), int(dims.zero)
+    z[at : at + dims.nonneg] = np.maximum(z[at : at + dims.nonneg], 0.0)
+    at += int(dims.nonneg)
+    for size in dims.soc:
+        z[at : at + size] = _second_order(z[at : at + size])
+        at += int(size)
+    for size in dims.psd:
+        count = size * (size + 1) // 2
+        z[at : at + count] = _semidefinite(z[at : at + count], size)
+        at += count
+    if at != len(z):
+        z[at:] = np.nan
+    return z
+
+
+def _second_order(z: Array) -> Array:
+    """Projection on ``z_0 >= |z_1..|``."""
+    size = float(np.linalg.norm(z[1:]))
+    if size <= z[0]:
+        return z
+    if size <= -z[0]:
+        return np.zeros_like(z)
+    half = 0.5 * (1.0 + z[0] / size)
+    return np.concatenate([[half * size], half * z[1:]])
+
+
+def _semidefinite(z: Array, size: int) -> Array:
+    """Projection of a scaled upper triangle, stored column by column, on the semidefinite cone."""
+    if not np.isfinite(z).all():
+        return z
+    column, row, scale = _triangle(size)
+    matrix = np.empty((size, size))
+    matrix[row, column] = matrix[column, row] = z * scale
+    values, vectors = np.linalg.eigh(matrix)
+    if values[0] >= 0.0:
+        return z
+    fixed = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return np.asarray(fixed[row, column] / scale)
+
+
+@lru_cache(maxsize=64)
+def _triangle(size: int) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """Columns and rows of a stored upper triangle, and what undoes the scale of its off-diagonal entries."""
+    column, row = np.tril_indices(size)
+    return column, row, np.where(row == column, 1.0, np.sqrt(0.5))

@@ -1,0 +1,205 @@
+r"""Weighted nonlinear least squares with bounds, equalities and inequalities, as a CasADi program for IPOPT.
+
+.. math:: \min_x \; |W\, e(x, p, z)|^2 + (x - m)^\top M (x - m) \quad\text{subject to}\quad
+   l \le x \le u, \quad c(x, p) = 0, \quad d(x, p) \ge 0,
+
+with :math:`e = z - h(x, p)` unless another residual is given (angles must wrap). The functions h, c, d are injected and
+differentiated exactly by CasADi; data, weights, prior, bounds and start are arguments of the solve, so that a program is compiled once per
+structure.
+
+Sources: A. Waechter and L. T. Biegler, "On the implementation of an interior-point filter line-search algorithm for large-scale
+nonlinear programming", Math. Program. 106 (2006); J. A. E. Andersson et al., "CasADi", Math. Program. Comput. 11 (2019).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Function = Callable[[Any, Any], Any]
+Residual = Callable[[Any, Any, Any], Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Local:
+    """A local solution.
+
+    Parameters
+    ----------
+    x : Array, shape (n,)
+        The point; the last iterate where `success` is False.
+    cost : float
+        ``|We|^2`` plus the prior term.
+    bounds : Array, shape (n,)
+        Multipliers of the bounds: positive at an upper, negative at a lower bound. The gradient of the cost plus all
+        multipliers times the gradients of their constraints is zero.
+    equalities, inequalities : Array
+        Multipliers of ``c = 0`` and ``d >= 0``; the latter are at most zero.
+    status : str
+        IPOPT's own word.
+    success : bool
+        True where IPOPT met its tolerances.
+    iterations : int
+        Interior-point iterations.
+    """
+
+    x: Array
+    cost: float
+    bounds: Array
+    equalities: Array
+    inequalities: Array
+    status: str
+    success: bool
+    iterations: int
+
+
+class Program:
+    """A compiled least-squares program, solved many times with new data.
+
+    Parameters
+    ----------
+    n, m, p : int
+        Numbers of unknowns, measurements and parameters.
+    h : callable, optional
+        ``h(x, p)`` on CasADi symbols (column vectors), giving m expressions as a list or a column.
+    residual : callable, optional
+        ``residual(x, p, z)``, m expressions, in the place of ``z - h(x, p)``.
+    equalities, inequalities : callable, optional
+        ``c(x, p)`` and ``d(x, p)``, lists or columns of expressions.
+    diagonal : bool
+        True: W is a vector of m weights; False: W is an m by m matrix.
+    settings : Mapping[str, Any], optional
+        IPOPT settings, for instance ``{"max_iter": 200}``.
+
+    Notes
+    -----
+    Waechter and Biegler (2006). Holds a compiled program: build one per worker, do not pickle.
+    """
+
+    def __init__(
+        self,
+        n: int,
+        m: int,
+        p: int = 0,
+        h: Function | None = None,
+        *,
+        residual: Residual | None = None,
+        equalities: Function | None = None,
+        inequalities: Function | None = None,
+        diagonal: bool = True,
+        settings: Mapping[str, Any] | None = None,
+    ) -> None:
+        import casadi as ca
+
+        if (h is None) == (residual is None):
+            raise ValueError("give either h or residual")
+        self.n, self.m, self.p, self.diagonal = n, m, p, diagonal
+        x, given, z = ca.SX.sym("x", n), ca.SX.sym("p", p), ca.SX.sym("z", m)
+        weight = ca.SX.sym("W", m, 1 if diagonal else m)
+        mean, information = ca.SX.sym("mean", n), ca.SX.sym("M", n, n)
+        misfit = z - _column(h(x, given), m) if h is not None else _column(residual(x, given, z), m)  # type: ignore[misc]
+        white = weight * misfit if diagonal else weight @ misfit
+        cost = ca.sumsqr(white) + ca.bilin(information, x - mean, x - mean)
+        c = _column(equalities(x, given)) if equalities else ca.SX(0, 1)
+        d = _column(inequalities(x, given)) if inequalities else ca.SX(0, 1)
+        self._equal, self._more = c.shape[0], d.shape[0]
+        data = ca.vertcat(given, z, ca.vec(weight), mean, ca.vec(information))
+        quiet = {"print_level": 0, "sb": "yes", "tol": 1e-10, **(settings or {})}
+        self._solver = ca.nlpsol(
+            "nls",
+            "ipopt",
+            {"x": x, "p": data, "f": cost, "g": ca.vertcat(c, d)},
+            {"ipopt": quiet, "print_time": False, "error_on_fail": False},
+        )
+
+    def solve(
+        self,
+        start: ArrayLike,
+        z: ArrayLike,
+        weight: ArrayLike | None = None,
+        p: ArrayLike = (),
+        *,
+        lower: ArrayLike | None = None,
+        upper: ArrayLike | None = None,
+        prior: tuple[ArrayLike, ArrayLike] | None = None,
+    ) -> Local:
+        """Solve with new data.
+
+        Parameters
+        ----------
+        start : array_like, shape (n,)
+            First iterate.
+        z : array_like, shape (m,)
+            Measurements.
+        weight : array_like, shape (m,) or (m, m), optional
+            W; ones (the identity) if absent. A zero weight drops a row.
+        p : array_like, shape (p,)
+            Parameters of h, c and d.
+        lower, upper : array_like, shape (n,), optional
+            Bounds; infinite if absent.
+        prior : pair of array_like, shapes (n,) and (n, n), optional
+            Mean m and information matrix M.
+
+        Returns
+        -------
+        Local
+            A local minimiser, or the last iterate and why there is none.
+        """
+        identity = np.ones(self.m) if self.diagonal else np.eye(self.m)
+        mean, information = prior if prior is not None else (np.zeros(self.n), np.zeros((self.n, self.n)))
+        data = np.concatenate(
+            [
+                _checked("p", p, (self.p,)),
+                _checked("z", z, (self.m,)),
+                _checked("weight", identity if weight is None else weight, identity.shape).ravel(order="F"),
+                _checked("prior mean", mean, (self.n,)),
+                _checked("prior information", information, (self.n, self.n)).ravel(order="F"),
+            ]
+        )
+        found = self._solver(
+            x0=_checked("start", start, (self.n,)),
+            p=data,
+            lbx=_checked("lower", np.full(self.n, -np.inf) if lower is None else lower, (self.n,)),
+            ubx=_checked("upper", np.full(self.n, np.inf) if upper is None else upper, (self.n,)),
+            lbg=np.zeros(self._equal + self._more),
+            ubg=np.concatenate([np.zeros(self._equal), np.full(self._more, np.inf)]),
+        )
+        stats = self._solver.stats()
+        multipliers = _numbers(found["lam_g"])
+        return Local(
+            x=_numbers(found["x"]),
+            cost=float(found["f"]),
+            bounds=_numbers(found["lam_x"]),
+            equalities=multipliers[: self._equal],
+            inequalities=multipliers[self._equal :],
+            status=str(stats["return_status"]),
+            success=bool(stats["success"]),
+            iterations=int(stats.get("iter_count", 0)),
+        )
+
+
+def _column(expressions: Any, count: int | None = None) -> Any:
+    """Expressions as one CasADi column."""
+    import casadi as ca
+
+    listed = isinstance(expressions, Sequence)
+    column = ca.vertcat(*expressions) if listed else ca.vec(ca.SX(expressions))
+    if count is not None and column.shape[0] != count:
+        raise ValueError(f"{column.shape[0]} expressions given, {count} measurements expected")
+    return column
+
+
+def _checked(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+    array = np.asarray(value, dtype=np.float64)
+    if array.shape != shape:
+        raise ValueError(f"{name} has shape {array.shape}, {shape} expected")
+    return array
+
+
+def _numbers(value: Any) -> Array:
+    return np.asarray(value.full(), dtype=np.float64).ravel()

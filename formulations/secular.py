@@ -1,0 +1,177 @@
+r"""The secular equation of least squares with one quadratic constraint.
+
+.. math:: \sum_j \frac{c_j^2}{(t - p_j)^2} = \kappa + \sigma t, \qquad \sigma \ge 0,
+
+with poles :math:`p_1 \le \dots \le p_d`. Put :math:`T(t)` for the left side. By Cauchy's inequality
+:math:`3 T'^2 \le 2 T T''`, so :math:`T^{-1/2}` is concave between two poles, :math:`(\kappa + \sigma t)^{-1/2}` is
+convex where it exists, and
+
+.. math:: k(t) = T(t)^{-1/2} - (\kappa + \sigma t)^{-1/2}
+
+is concave in every interval. Newton's iteration on `k`, started where `k <= 0` beside a pole, therefore climbs
+monotonically to the first root on that side of the pole or meets `k' <= 0`, which proves there is none. Every interval
+holds at most two roots, one per end, so the two sides of all poles, and for ``sigma > 0`` the zero of the right
+side, list all real roots without a polynomial and without a bracket. Each root is held as its distance from its own pole: roots that
+fall onto a pole (the "hard case", ``c_j`` near 0) keep their full relative accuracy.
+
+Sources: J. J. More and D. C. Sorensen, "Computing a trust region step", SIAM J. Sci. Stat. Comput. 4 (1983), section 3
+(the concave form on the last interval); the use on every interval is the same inequality.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_EPS = float(np.finfo(np.float64).eps)
+_STEPS = 80
+
+
+@dataclass(frozen=True, slots=True)
+class Secular:
+    """A batch of secular equations, the batch on the last axis.
+
+    Parameters
+    ----------
+    gap : Array, shape (d, d, N)
+        Differences of poles ``gap[k, j] = p_j - p_k``, given apart because they may be known better than the poles.
+    pole : Array, shape (d, N)
+        Poles in ascending order.
+    weight : Array, shape (d, N)
+        The :math:`c_j^2`, all positive (the caller floors exact zeros).
+    level, slope : Array, shape (N,)
+        :math:`\\kappa` and :math:`\\sigma`.
+    """
+
+    gap: Array
+    pole: Array
+    weight: Array
+    level: Array
+    slope: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Roots:
+    """Roots on a batch of secular equations, one per slot.
+
+    Parameters
+    ----------
+    t : Array, shape (K, N)
+        The roots.
+    apart : Array, shape (d, K, N)
+        ``t - p_j`` with full relative accuracy.
+    found : Mask, shape (K, N)
+        True where the slot holds a root; the other arrays are meaningless elsewhere.
+    """
+
+    t: Array
+    apart: Array
+    found: Mask
+
+
+def largest(equation: Secular) -> Roots:
+    """Root above the last pole; it is unique, and exists whenever the right side grows or is positive.
+
+    Parameters
+    ----------
+    equation : Secular
+        N equations.
+
+    Returns
+    -------
+    Roots
+        One slot (K = 1).
+
+    Notes
+    -----
+    More and Sorensen (1983), section 3.
+    """
+    gap = equation.gap[:, -1:]
+    start, free = _start(equation, equation.pole[-1:], equation.weight[-1:], 1.0)
+    return _climb(equation, equation.pole[-1:], gap, np.ones((1, 1)), start, free)
+
+
+def everything(equation: Secular) -> Roots:
+    """All real roots.
+
+    Parameters
+    ----------
+    equation : Secular
+        N equations.
+
+    Returns
+    -------
+    Roots
+        Slots: d to the left of each pole, d to the right, and one beside the zero of the right side (K = 2d + 1).
+
+    Notes
+    -----
+    See the module's first lines; each interval between poles holds at most two roots.
+    """
+    d, count = equation.pole.shape
+    left, left_free = _start(equation, equation.pole, equation.weight, -1.0)
+    right, right_free = _start(equation, equation.pole, equation.weight, 1.0)
+    sign = np.concatenate([-np.ones((d, 1)), np.ones((d + 1, 1))])
+    slope = np.where(equation.slope > 0.0, equation.slope, 1.0)
+    zero = -equation.level / slope
+    apart = zero - equation.pole
+    tail = np.sum(equation.weight / apart**2, axis=0) / slope
+    gap = np.concatenate([equation.gap, equation.gap, apart[:, None]], axis=1)
+    pole = np.concatenate([equation.pole, equation.pole, zero[None]])
+    start = np.concatenate([left, right, tail[None]])
+    exists = (equation.slope > 0.0) & (zero < equation.pole[0])
+    free = np.concatenate([left_free, right_free, exists[None]])
+    return _climb(equation, pole, gap, sign, start, free)
+
+
+def _start(equation: Secular, pole: Array, weight: Array, sign: float) -> tuple[Array, Mask]:
+    """Distances from the poles that cannot lie beyond the first root, and whether a root is possible at all."""
+    level, slope = equation.level + equation.slope * pole, equation.slope
+    positive = level > 0.0
+    safe = np.where(positive, level, 1.0)
+    if sign < 0.0:
+        return np.sqrt(weight / safe), positive
+    grows = slope > 0.0
+    if not grows.any():
+        return np.sqrt(weight / safe), positive
+    rate = np.where(grows, slope, 1.0)
+    cube = np.where(grows, np.cbrt(0.25 * weight / rate), np.inf)
+    above = np.minimum(np.sqrt(0.5 * weight / safe), cube)
+    away = np.where(positive, 1.0, -level / rate)
+    below = away + np.minimum(0.25 * weight / (rate * away**2), cube)
+    return np.where(positive, above, np.where(away > 0.0, below, cube)), positive | grows
+
+
+def _climb(equation: Secular, origin: Array, gap: Array, sign: Array, start: Array, free: Mask) -> Roots:
+    """Newton's monotone iteration from every start; ``gap[k, i]`` is the distance of origin i from pole k."""
+    weight = equation.weight[:, None]
+    level = equation.level + equation.slope * origin
+    slope = equation.slope * sign
+    away, todo, found = start.copy(), free.copy(), np.zeros(free.shape, dtype=np.bool_)
+    with np.errstate(all="ignore"):
+        for _ in range(_STEPS):
+            apart = gap + sign * away
+            part = weight / (apart * apart)
+            total = part.sum(axis=0)
+            right = level + slope * away
+            root, side = 1.0 / np.sqrt(total), 1.0 / np.sqrt(right)
+            value = root - side
+            change = sign * (part / apart).sum(axis=0) * root / total + 0.5 * slope * side / right
+            step = -value / change
+            # a level too high for the interval: no root, k' changes sign first
+            todo &= (change > 0.0) & np.isfinite(step)
+            done = todo & (step <= 4.0 * _EPS * away)
+            found |= done
+            todo &= ~done
+            if not todo.any():
+                break
+            away = np.where(todo, away + step, away)
+    apart = gap + sign * away
+    # a Newton step may jump over the next pole when the interval holds no root
+    found &= np.all((apart * gap > 0.0) | (gap == 0.0), axis=0) & np.all((gap != 0.0) | (apart * sign > 0.0), axis=0)
+    return Roots(origin + sign * away, apart, found)

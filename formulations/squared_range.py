@@ -1,0 +1,227 @@
+r"""Squared-range least squares: a linear fit with one quadratic constraint, solved exactly.
+
+.. math:: \min_y \; |B y - g|^2 \quad\text{subject to}\quad y^\top C y + 2 h^\top y = 0
+
+for two quadrics. The *cone*, :math:`y = (x, r)`, `C = diag(1, .., 1, -1)`, `h = 0`: `x` is measured from a reference point and `r`
+is its distance (range differences, arrival times, range sums, bearings). The *paraboloid*, :math:`y = (x, w)`,
+`C = diag(1, .., 1, 0)`, `h = (0, .., 0, -1/2)`: `w` is :math:`|x|^2` (ranges, ratios of ranges, bearings).
+
+A multiplier :math:`\lambda` makes every stationary point but the apex of the cone a solution of
+:math:`(B^\top B + \lambda C) y = B^\top g - \lambda h`. Both cases become :math:`\sum_j c_j^2/(t - p_j)^2 = \kappa +
+\sigma t` (:mod:`formulations.secular`), with d poles:
+
+- cone: :math:`C v_j = \gamma_j (A + \lambda_0 C) v_j`, one negative :math:`\gamma_0`, and
+  :math:`t = 1/(1 + (\lambda - \lambda_0) \gamma_0)`. Adding :math:`\lambda_0 C` changes no value on the cone; it makes the
+  pencil definite when :math:`A = B^\top B` is singular;
+- paraboloid: `w` is eliminated by its own (linear) equation and :math:`t = \lambda`.
+
+The global minimiser is the root above the last pole, where :math:`B^\top B + \lambda C` is positive semidefinite (no gap). A singular `A`
+is the hard case: a root sits on a pole, and both intersections of the solution line with the quadric appear.
+
+Sources: J. J. More, "Generalizations of the trust region problem", Optim. Methods Softw. 2 (1993), section 3; A. Beck,
+P. Stoica and J. Li, "Exact and approximate solutions of source localization problems", IEEE Trans. Signal Process. 56 (2008),
+eqs. 10-16 (paraboloid) and 38-45 (cone).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formulations._diagonal import Finder, apply, solve_cone, solve_paraboloid
+from formulations.secular import everything, largest
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_CHUNK = 1024
+
+
+@dataclass(frozen=True, slots=True)
+class Quadric:
+    """The constraint ``y'Cy + 2h'y = 0`` on ``y`` of length ``size``.
+
+    Parameters
+    ----------
+    shape : {"cone", "paraboloid"}
+        ``|x| = |r|`` with ``y = (x, r)``, or ``|x|^2 = w`` with ``y = (x, w)``.
+    size : int
+        Length of ``y``: the dimension of ``x`` plus one.
+    """
+
+    shape: Literal["cone", "paraboloid"]
+    size: int
+
+    @property
+    def square(self) -> Array:
+        """Diagonal of C, shape (size,)."""
+        out = np.ones(self.size)
+        out[-1] = -1.0 if self.shape == "cone" else 0.0
+        return out
+
+    @property
+    def linear(self) -> Array:
+        """The vector h, shape (size,)."""
+        out = np.zeros(self.size)
+        out[-1] = 0.0 if self.shape == "cone" else -0.5
+        return out
+
+    def value(self, y: Array) -> Array:
+        """``y'Cy + 2h'y``.
+
+        Parameters
+        ----------
+        y : Array, shape (..., size)
+            Points.
+
+        Returns
+        -------
+        Array, shape (...)
+            Zero on the quadric.
+        """
+        return np.asarray(np.sum(self.square * y * y + 2.0 * self.linear * y, axis=-1))
+
+
+def cone(d: int) -> Quadric:
+    """Quadric ``|x|^2 = r^2`` with ``x`` of dimension `d`.
+
+    Parameters
+    ----------
+    d : int
+        Dimension of ``x``.
+
+    Returns
+    -------
+    Quadric
+        The cone (Beck, Stoica and Li, 2008, eq. 38).
+    """
+    return Quadric("cone", d + 1)
+
+
+def paraboloid(d: int) -> Quadric:
+    """Quadric ``|x|^2 = w`` with ``x`` of dimension `d`.
+
+    Parameters
+    ----------
+    d : int
+        Dimension of ``x``.
+
+    Returns
+    -------
+    Quadric
+        The paraboloid (Beck, Stoica and Li, 2008, eq. 10).
+    """
+    return Quadric("paraboloid", d + 1)
+
+
+def minimiser(B: Array, g: Array, quadric: Quadric, *, positive: bool = False) -> tuple[Array, Mask]:
+    """Global minimiser of ``|By - g|^2`` on the quadric.
+
+    Parameters
+    ----------
+    B : Array, shape (..., q, n)
+        Whitened rows, numbers of order one; absent rows are zero.
+    g : Array, shape (..., q)
+        Right sides.
+    quadric : Quadric
+        The constraint, of size n.
+    positive : bool
+        Minimise over the half ``y[-1] >= 0``; matters for the cone only.
+
+    Returns
+    -------
+    y : Array, shape (..., n)
+        The minimiser, NaN where `ok` is False. Where ``B'B`` has rank n - 1 it may be one of two.
+    ok : Mask, shape (...)
+        False where the input is not finite or ``B'B`` lacks two or more ranks.
+
+    Notes
+    -----
+    More (1993), theorem 3.2; Beck, Stoica and Li (2008), eqs. 14-16 and 43-45.
+    """
+    y, cost, valid, shape = _batched(B, g, quadric, largest)
+    y, ok = y[:, 0], valid[:, 0]
+    if positive and quadric.shape == "cone":
+        wrong = np.flatnonzero(ok & (y[:, -1] < 0.0))
+        if wrong.size:
+            rows, right = _flat(B, g, quadric)
+            y[wrong] = stationary(rows[wrong], right[wrong], quadric, positive=True)[0][:, 0]
+    return y.reshape(*shape, quadric.size), ok.reshape(shape)
+
+
+def stationary(
+    B: Array, g: Array, quadric: Quadric, *, positive: bool = False
+) -> tuple[Array, Array, Mask]:
+    """All real stationary points of ``|By - g|^2`` on the quadric, the cheapest first.
+
+    Parameters
+    ----------
+    B : Array, shape (..., q, n)
+        Whitened rows, numbers of order one; absent rows are zero.
+    g : Array, shape (..., q)
+        Right sides.
+    quadric : Quadric
+        The constraint, of size n.
+    positive : bool
+        Drop points with ``y[-1] < 0`` (a negative range).
+
+    Returns
+    -------
+    y : Array, shape (..., K, n)
+        Points, NaN where not valid; K = 2n - 1. The cone has at most 2(n - 1) with a multiplier, and its apex ``y = 0``,
+        where the gradient of the constraint vanishes. The paraboloid has at most 2n - 1.
+    cost : Array, shape (..., K)
+        ``|By - g|^2``, ascending, infinite where not valid.
+    valid : Mask, shape (..., K)
+        Nothing is valid where the input is not finite or ``B'B`` lacks two or more ranks.
+
+    Notes
+    -----
+    Real roots of the numerator of the secular equation, without forming it. Where ``B'B`` has rank n - 1, both
+    intersections of the line of least-squares solutions with the quadric are among them.
+    """
+    y, cost, valid, shape = _batched(B, g, quadric, everything)
+    if positive:
+        valid &= y[..., -1] >= 0.0
+    y[~valid], cost[~valid] = np.nan, np.inf
+    order = np.argsort(cost, axis=-1, kind="stable")
+    y = np.take_along_axis(y, order[..., None], axis=1)
+    cost, valid = np.take_along_axis(cost, order, axis=1), np.take_along_axis(valid, order, axis=1)
+    k, n = 2 * quadric.size - 1, quadric.size
+    return y.reshape(*shape, k, n), cost.reshape(*shape, k), valid.reshape(*shape, k)
+
+
+def _flat(B: Array, g: Array, quadric: Quadric) -> tuple[Array, Array]:
+    B, g = np.asarray(B, dtype=np.float64), np.asarray(g, dtype=np.float64)
+    if B.ndim < 2 or g.ndim < 1 or B.shape[-1] != quadric.size or B.shape[-2] != g.shape[-1]:
+        raise ValueError(f"rows {B.shape} and right sides {g.shape} do not fit a quadric of size {quadric.size}")
+    shape = np.broadcast_shapes(B.shape[:-2], g.shape[:-1])
+    rows = np.broadcast_to(B, (*shape, *B.shape[-2:])).reshape(-1, *B.shape[-2:])
+    return rows, np.broadcast_to(g, (*shape, g.shape[-1])).reshape(-1, g.shape[-1])
+
+
+def _batched(B: Array, g: Array, quadric: Quadric, find: Finder) -> tuple[Array, Array, Mask, tuple[int, ...]]:
+    """Run chunks that fit the cache, with the batch on the last axis inside."""
+    rows, right = _flat(B, g, quadric)
+    shape = np.broadcast_shapes(np.shape(B)[:-2], np.shape(g)[:-1])
+    slots = 1 if find is largest else 2 * quadric.size - 1
+    count, n = len(rows), quadric.size
+    y, cost = np.empty((count, slots, n)), np.empty((count, slots))
+    valid = np.empty((count, slots), dtype=np.bool_)
+    solve = solve_cone if quadric.shape == "cone" else solve_paraboloid
+    with np.errstate(all="ignore"):
+        for i in range(0, count, _CHUNK):
+            part = slice(i, i + _CHUNK)
+            b, h = np.moveaxis(rows[part], 0, -1).copy(), right[part].T.copy()
+            bad = ~(np.isfinite(b).all(axis=(0, 1)) & np.isfinite(h).all(axis=0))
+            b[..., bad], h[..., bad] = 0.0, 0.0
+            points, found = solve(b, h, find)
+            found &= np.isfinite(points).all(axis=0) & ~bad
+            y[part], valid[part] = points.transpose(2, 1, 0), found.T
+            left = apply(b, points) - h[:, None]
+            cost[part] = (left * left).sum(axis=0).T
+    y[~valid], cost[~valid] = np.nan, np.inf
+    return y, cost, valid, shape

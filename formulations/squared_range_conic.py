@@ -1,0 +1,193 @@
+r"""Convex relaxations of squared-range least squares.
+
+The problem is :math:`\min |B y - g|^2` subject to :math:`y^\top C y + 2 h^\top y = 0` (:mod:`formulations.squared_range`). With
+:math:`R^\top R = [B, -g]^\top [B, -g]` (the triangular factor, so the size does not grow with the rows):
+
+*Shor.* :math:`\min \operatorname{tr}(R^\top R\, Y)` over :math:`Y \succeq 0`, :math:`Y_{n+1,n+1} = 1`,
+:math:`\operatorname{tr}(C Y_{11}) + 2 h^\top Y_{12} = 0`. With one quadratic constraint the S-lemma makes it exact: the optimum equals
+the GTRS value and a rank-one optimum exists.
+
+*Second order.* The constraint is relaxed to its convex hull, :math:`|x| \le r` (cone) or :math:`|x|^2 \le w` (paraboloid):
+:math:`\min |R (y, 1)|`. A lower bound, tight when the unconstrained fit violates the hull.
+
+Sources: N. Z. Shor, "Quadratic optimization problems", Sov. J. Comput. Syst. Sci. 25 (1987); J. J. More, "Generalizations of the
+trust region problem", Optim. Methods Softw. 2 (1993); for tightness of the second-order form see the tests.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formulations.conic import Answer, Relaxation
+from formulations.squared_range import Quadric
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Relaxed:
+    """A relaxed squared-range fit.
+
+    Parameters
+    ----------
+    y : Array, shape (n,)
+        Point read off the relaxation; on the quadric only where tight.
+    value : float
+        Optimal ``|By - g|^2`` of the relaxation (the second-order one squared).
+    bound : float
+        Lower bound of the squared-range cost, recomputed from the dual.
+    rank_ratio : float
+        Second over first eigenvalue of the lifted matrix (Shor); relative distance from the quadric (second order). Near
+        zero means tight.
+    answer : Answer
+        The solver's report.
+    """
+
+    y: Array
+    value: float
+    bound: float
+    rank_ratio: float
+    answer: Answer
+
+
+def shor_problem(quadric: Quadric) -> Any:
+    """The semidefinite relaxation as a cvxpy problem with parameter ``gram``.
+
+    Parameters
+    ----------
+    quadric : Quadric
+        The constraint, of size n.
+
+    Returns
+    -------
+    cvxpy.Problem
+        Parameter ``gram`` of shape (n + 1, n + 1) is ``[B, -g]'[B, -g]``; variable ``lift`` is Y.
+
+    Notes
+    -----
+    Shor (1987).
+    """
+    import cvxpy as cp
+
+    n = quadric.size
+    gram = cp.Parameter((n + 1, n + 1), name="gram")
+    lift = cp.Variable((n + 1, n + 1), symmetric=True, name="lift")
+    shape = np.zeros((n + 1, n + 1))
+    shape[np.arange(n), np.arange(n)] = quadric.square
+    shape[:n, n] = shape[n, :n] = quadric.linear
+    constraints = [lift >> 0, lift[n, n] == 1, cp.sum(cp.multiply(shape, lift)) == 0]
+    return cp.Problem(cp.Minimize(cp.sum(cp.multiply(gram, lift))), constraints)
+
+
+def hull_problem(quadric: Quadric) -> Any:
+    """The second-order relaxation as a cvxpy problem with parameter ``factor``.
+
+    Parameters
+    ----------
+    quadric : Quadric
+        The constraint, of size n.
+
+    Returns
+    -------
+    cvxpy.Problem
+        Parameter ``factor`` of shape (n + 1, n + 1) is the triangular factor of ``[B, -g]``; variable ``y``.
+
+    Notes
+    -----
+    The convex hull of the half cone and of the paraboloid.
+    """
+    import cvxpy as cp
+
+    n = quadric.size
+    factor = cp.Parameter((n + 1, n + 1), name="factor")
+    y = cp.Variable(n, name="y")
+    inside = cp.norm(y[:-1]) <= y[-1] if quadric.shape == "cone" else cp.sum_squares(y[:-1]) <= y[-1]
+    return cp.Problem(cp.Minimize(cp.norm(factor[:, :n] @ y + factor[:, n])), [inside])
+
+
+@lru_cache(maxsize=32)
+def _built(kind: str, quadric: Quadric, backend: str) -> Relaxation:
+    tight = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10} if backend == "CLARABEL" else {}
+    problem = shor_problem(quadric) if kind == "shor" else hull_problem(quadric)
+    return Relaxation(problem, backend=backend, settings=tight)
+
+
+def shor(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL") -> Relaxed:
+    """Solve the semidefinite relaxation.
+
+    Parameters
+    ----------
+    B : Array, shape (q, n)
+        Whitened rows, numbers of order one.
+    g : Array, shape (q,)
+        Right sides.
+    quadric : Quadric
+        The constraint.
+    backend : str
+        Conic solver.
+
+    Returns
+    -------
+    Relaxed
+        ``y`` is the last column of the lift. The problem is built once per quadric and back end in each process.
+
+    Notes
+    -----
+    Shor (1987).
+    """
+    n = quadric.size
+    factor, scale = _triangle(B, g)
+    answer = _built("shor", quadric, backend).solve({"gram": factor.T @ factor})
+    lift = answer.values["lift"]
+    ratio = np.nan
+    if np.isfinite(lift).all():
+        values = np.linalg.eigvalsh(lift)
+        ratio = float(abs(values[-2]) / values[-1])
+    return Relaxed(lift[:n, n].copy(), answer.primal * scale**2, answer.bound * scale**2, ratio, answer)
+
+
+def hull(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL") -> Relaxed:
+    """Solve the second-order cone relaxation.
+
+    Parameters
+    ----------
+    B : Array, shape (q, n)
+        Whitened rows, numbers of order one.
+    g : Array, shape (q,)
+        Right sides.
+    quadric : Quadric
+        The constraint.
+    backend : str
+        Conic solver.
+
+    Returns
+    -------
+    Relaxed
+        The relaxed point. The bound is for the half cone ``r >= 0``.
+
+    Notes
+    -----
+    Its objective is the norm; value and bound are squared.
+    """
+    factor, scale = _triangle(B, g)
+    answer = _built("hull", quadric, backend).solve({"factor": factor})
+    y = answer.values["y"]
+    off = float(abs(quadric.value(y)) / (1.0 + np.sum(y * y)))
+    value, bound = answer.primal * scale, max(answer.bound, 0.0) * scale
+    return Relaxed(y, value**2, bound**2, off, answer)
+
+
+def _triangle(B: Array, g: Array) -> tuple[Array, float]:
+    """Square triangular factor of ``[B, -g]`` divided by its size: whitened rows can be large where noise is small."""
+    rows = np.concatenate([B, -g[:, None]], axis=1)
+    n = rows.shape[1]
+    factor = np.zeros((n, n))
+    upper = np.linalg.qr(rows, mode="r")
+    factor[: len(upper)] = upper
+    scale = float(np.abs(factor).max()) or 1.0
+    return factor / scale, scale

@@ -1,0 +1,231 @@
+"""Put a problem together from arrays: stations, a few lines of measurements, noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from optloc import noise as noises
+from optloc.check import checked
+from optloc.errors import InvalidProblem
+from optloc.frames import CARTESIAN, Frame
+from optloc.models import MODELS
+from optloc.problem import Problem
+from optloc.types import Array, Bias, Motion, Prior, Rows, Stations
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """Rows of one kind together with their noise, before they are put into a problem.
+
+    Parameters
+    ----------
+    rows : Rows
+        The rows.
+    variance : array (..., m), optional
+        Independent variance of each row.
+    arrival : array (..., s) or (), optional
+        Variance of each station's arrival; rows that share a station and an epoch are then correlated.
+    covariance : array (..., m, m), optional
+        Full covariance of these rows.
+    """
+
+    rows: Rows
+    variance: Array | None = None
+    arrival: Array | None = None
+    covariance: Array | None = None
+
+
+def measured(
+    kind: str,
+    z: Any = None,
+    *,
+    a: Any = None,
+    b: Any = None,
+    sigma: Any = None,
+    arrival_sigma: Any = None,
+    covariance: Any = None,
+    epoch: Any = 0,
+    target: Any = 0,
+    weight: Any = 1.0,
+    correction: Any = 0.0,
+) -> Measured:
+    """Return measurements of one kind.
+
+    Parameters
+    ----------
+    kind : str
+        A key of `optloc.MODELS`, for instance "tdoa".
+    z : array (..., m), optional
+        Measured values: metres, metres per second, radians or ratios; None to be simulated.
+    a, b : int array (m,) or int
+        Stations of each row, as indices.
+    sigma : float or array (..., m), optional
+        Standard deviation of each row; rows are then independent.
+    arrival_sigma : float or array (..., s), optional
+        Standard deviation of each station's arrival (metres); rows get the covariance D diag(sigma^2) D'.
+    covariance : array (..., m, m), optional
+        Full covariance of these rows. Exactly one of the three forms of noise is needed.
+    epoch, target : int array (m,) or int
+        Epoch and target of each row.
+    weight : float or array (..., m)
+        1 for a row as measured, 0 for an absent one.
+    correction : float or array (..., m)
+        Known amount by which the measurement exceeds the model.
+
+    Returns
+    -------
+    Measured
+        To be given to `problem`.
+
+    Raises
+    ------
+    InvalidProblem
+        For an unknown kind, missing stations or a noise given not exactly once.
+    """
+    model = MODELS.get(kind)
+    if model is None:
+        raise InvalidProblem(f"unknown kind {kind!r}", where="kind", advice=f"use one of {', '.join(sorted(MODELS))}")
+    sizes = [np.shape(v)[-1] for v in (z, sigma, covariance, a, b, epoch, target) if v is not None and np.ndim(v)]
+    count = max(sizes, default=1)
+    if any(size not in (1, count) for size in sizes):
+        raise InvalidProblem(f"arguments of {kind} have {sorted(set(sizes))} rows", where=kind, advice="give one each")
+
+    def index(values: Any, needed: bool, name: str) -> Array:
+        if needed and values is None:
+            raise InvalidProblem(f"{kind} needs station {name}", where=name, advice="give station indices")
+        return np.array(np.broadcast_to(np.asarray(values if needed else -1, dtype=np.int64), (count,)))
+
+    def number(values: Any) -> Array:
+        array = np.asarray(values, dtype=float)
+        return np.array(np.broadcast_to(array, (*array.shape[:-1], count)))
+
+    if sum(v is not None for v in (sigma, arrival_sigma, covariance)) != 1:
+        raise InvalidProblem(
+            f"the noise of {kind} must be given once", where=kind, advice="give sigma, arrival_sigma or covariance"
+        )
+    rows = Rows(
+        kind,
+        number(np.nan if z is None else z),
+        index(a, model.stations > 0, "a"),
+        index(b, model.stations > 1, "b"),
+        index(epoch, True, "epoch"),
+        index(target, True, "target"),
+        number(weight),
+        number(correction),
+    )
+    return Measured(
+        rows,
+        None if sigma is None else number(sigma) ** 2,
+        None if arrival_sigma is None else np.asarray(arrival_sigma, dtype=float) ** 2,
+        None if covariance is None else np.asarray(covariance, dtype=float),
+    )
+
+
+def problem(
+    stations: Any,
+    *measurements: Measured,
+    times: Any = None,
+    motions: Sequence[Motion] = (Motion(),),
+    biases: Sequence[Bias] = (),
+    priors: Sequence[Prior] = (),
+    frame: Frame = CARTESIAN,
+    covariance: Any = None,
+) -> Problem:
+    """Return a problem, or a batch of problems where arrays have leading axes.
+
+    Parameters
+    ----------
+    stations : Stations, or array (s, d), or array (..., k, s, d)
+        Positions in metres.
+    *measurements : Measured
+        One or more of `measured`.
+    times : array (k,), optional
+        Seconds of each epoch; 0, 1, 2 ... by default.
+    motions : sequence of Motion
+        How each target moves; one static target by default.
+    biases : sequence of Bias
+        Unknown systematic errors.
+    priors : sequence of Prior
+        Prior knowledge of named unknowns.
+    frame : Frame
+        What the coordinates mean.
+    covariance : array (..., m, m), optional
+        Covariance of all rows together, across kinds; replaces what the measurements say.
+
+    Raises
+    ------
+    InvalidProblem
+        Naming the argument, row or station that cannot be right.
+    """
+    if not measurements:
+        raise InvalidProblem("there are no measurements", where="measurements", advice="give at least one")
+    blocks = _numbered(measurements)
+    epochs = 1 + max(int(m.rows.epoch.max(initial=0)) for m in measurements)
+    made = Problem(
+        stations if isinstance(stations, Stations) else station_array(stations),
+        tuple(m.rows for m in measurements),
+        noises.Noise(()),
+        np.arange(float(epochs)) if times is None else np.asarray(times, dtype=float),
+        tuple(motions),
+        tuple(biases),
+        tuple(priors),
+        frame,
+    )
+    if covariance is None:
+        noise = noises.group([block for m, start in blocks for block in _noise(m, start, made.stations.count)])
+    else:
+        full = np.asarray(covariance, dtype=float)
+        noise = noises.Noise((noises.Block(np.arange(made.count)[None], full[..., None, :, :]),))
+    return checked(replace(made, noise=noise))
+
+
+def station_array(position: Any, names: Sequence[str] | None = None) -> Stations:
+    """Return stations at positions (s, d), or (..., k, s, d) where they move or differ from problem to problem."""
+    array = np.asarray(position, dtype=float)
+    if array.ndim < 2 or array.shape[-1] not in (2, 3):
+        raise InvalidProblem(
+            f"stations have shape {array.shape}", where="stations", advice="give an array (stations, 2 or 3) in metres"
+        )
+    if array.ndim == 2:
+        array = array[None]
+    labels = tuple(names) if names is not None else tuple(f"S{i}" for i in range(array.shape[-2]))
+    return Stations(array, labels)
+
+
+def _numbered(measurements: Sequence[Measured]) -> list[tuple[Measured, int]]:
+    starts = np.cumsum([0, *(m.rows.count for m in measurements)])
+    return [(m, int(start)) for m, start in zip(measurements, starts, strict=False)]
+
+
+def _noise(m: Measured, start: int, stations: int) -> list[noises.Block]:
+    rows = np.arange(start, start + m.rows.count)
+    if m.variance is not None:
+        return [noises.Block(rows[:, None], m.variance[..., None, None])]
+    if m.covariance is not None:
+        return [noises.Block(rows[None], m.covariance[..., None, :, :])]
+    assert m.arrival is not None
+    variance = m.arrival if m.arrival.ndim else np.full(stations, float(m.arrival))
+    return _arrival_blocks(m.rows, start, variance)
+
+
+def _arrival_blocks(rows: Rows, start: int, variance: Array) -> list[noises.Block]:
+    """Return one block for each epoch and target: its rows combine the same arrivals."""
+    design = np.zeros((rows.count, variance.shape[-1]))
+    coefficients = MODELS[rows.kind].ranges
+    if coefficients is None:
+        raise InvalidProblem(
+            f"{rows.kind} does not combine arrival times", where="arrival_sigma", advice="give sigma or covariance"
+        )
+    for index, sign in ((rows.a, coefficients[0]), (rows.b, coefficients[1])):
+        if sign:
+            design[np.arange(rows.count), index] += sign
+    blocks = []
+    for key in sorted(set(zip(rows.epoch.tolist(), rows.target.tolist(), strict=True))):
+        inside = np.flatnonzero((rows.epoch == key[0]) & (rows.target == key[1]))
+        covariance = noises.of_stations(design[inside], variance)
+        blocks.append(noises.Block(start + inside[None], covariance[..., None, :, :]))
+    return blocks

@@ -1,0 +1,234 @@
+"""The answer: estimate, covariance, verdict and the other positions that the data allow."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from optloc.errors import NoSolution
+from optloc.frames import Frame
+from optloc.layout import Layout
+from optloc.status import Certificate, Status
+from optloc.types import Array
+
+_STATES = ("position", "velocity", "acceleration")
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """One step on the way to a fix.
+
+    Parameters
+    ----------
+    name : str
+        Method, for instance "gtrs" or "lsr".
+    detail : str
+        What it did, in a few words.
+    seconds : float
+        Wall-clock time for the whole batch.
+    """
+
+    name: str
+    detail: str
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Alternatives:
+    """Other minima of the cost that were found, cheapest first.
+
+    Parameters
+    ----------
+    x : array (..., q, size)
+        Parameter vectors; NaN where there is none.
+    gap : array (..., q)
+        Their cost less the cost of the fix; infinite where there is none.
+    """
+
+    x: Array
+    gap: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Fix:
+    """Estimates of a batch of problems; a single problem has no leading axes.
+
+    Parameters
+    ----------
+    x : array (..., size)
+        Parameter vector in the order of `layout`; NaN where there is no answer.
+    cov : array (..., n, n)
+        Covariance of the shared unknowns; NaN where it does not exist.
+    layout : Layout
+        What each entry means.
+    frame : Frame
+        What the coordinates mean.
+    code : int array (...)
+        `Status` numbers.
+    reason : object array (...)
+        Sentence that belongs to the status: the direction, the groups, the count.
+    certificate : object array (...)
+        `Certificate` of each fix.
+    alternatives : Alternatives
+        Other minima.
+    cost : array (...)
+        Weighted sum of squared residuals, chi-square distributed if the model is right.
+    dof : int array (...)
+        Degrees of freedom: rows present less unknowns without a prior.
+    weights : array (..., m)
+        Row weights that were used.
+    stages : tuple of Stage
+        How it was found.
+    """
+
+    x: Array
+    cov: Array
+    layout: Layout
+    frame: Frame
+    code: Array
+    reason: Array
+    certificate: Array
+    alternatives: Alternatives
+    cost: Array
+    dof: Array
+    weights: Array
+    stages: tuple[Stage, ...] = ()
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Return the batch axes; () for a single fix."""
+        return self.x.shape[:-1]
+
+    @property
+    def status(self) -> Any:
+        """Return the `Status` of a single fix, or the int array (...) of a batch (compare with `Status` members)."""
+        return Status(int(self.code)) if self.shape == () else self.code
+
+    @property
+    def position(self) -> Array:
+        """Return the position (..., d) of the only target, or of each epoch (..., k, d), metres."""
+        return self.layout.take(self.x, "position")
+
+    @property
+    def velocity(self) -> Array:
+        """Return the velocity like `position`, metres per second."""
+        return self.layout.take(self.x, "velocity")
+
+    def take(self, name: str) -> Array:
+        """Return a named part of the estimate, for instance "position[1]" or "clock"."""
+        return self.layout.take(self.x, name)
+
+    @property
+    def bias(self) -> Mapping[str, Array]:
+        """Return the estimates of everything that is not the state of a target, by name."""
+        names = (slot.name for slot in (*self.layout.shared, *self.layout.local))
+        return {name: self.take(name) for name in names if name.partition("[")[0] not in _STATES}
+
+    def covariance(self, name: str = "position") -> Array:
+        """Return the covariance (..., q, q) of a named shared part."""
+        slot, shared = self.layout.find(name)
+        if not shared:
+            raise NotImplementedError(f"{name} is local to each epoch; solve problem.by_epoch() for its covariance")
+        part = slice(slot.start, slot.start + slot.size)
+        return self.cov[..., part, part]
+
+    def sigma(self, name: str = "position") -> Array:
+        """Return the standard deviations (..., q) of a named shared part."""
+        return np.asarray(np.sqrt(np.diagonal(self.covariance(name), axis1=-2, axis2=-1)))
+
+    @property
+    def p_value(self) -> Array:
+        """Return the probability (...) of a cost at least this large if model and noise are right; NaN without redundancy."""
+        from scipy.special import gammaincc
+
+        redundant = (self.dof > 0) & np.isfinite(self.cost)
+        return np.where(
+            redundant, gammaincc(np.where(redundant, self.dof, 1) / 2, np.where(redundant, self.cost, 0.0) / 2), np.nan
+        )
+
+    @property
+    def geodetic(self) -> tuple[Array, Array, Array]:
+        """Return latitude, longitude (radians) and ellipsoidal height (metres) of the position."""
+        return self.frame.to_geodetic(self.position)
+
+    def ellipse(self, probability: float = 0.95) -> tuple[Array, Array]:
+        """Return the error ellipse or ellipsoid of the position.
+
+        Parameters
+        ----------
+        probability : float
+            Probability that it contains the target.
+
+        Returns
+        -------
+        semi_axes : array (..., d)
+            Lengths in metres, ascending.
+        directions : array (..., d, d)
+            Unit vectors of the axes in columns.
+        """
+        from scipy.special import gammaincinv
+
+        cov = self.covariance()
+        known = np.isfinite(cov).all((-1, -2))
+        values, vectors = np.linalg.eigh(np.where(known[..., None, None], cov, 0.0))
+        scale = np.sqrt(2.0 * gammaincinv(cov.shape[-1] / 2, probability))
+        axes = scale * np.sqrt(np.maximum(values, 0.0))
+        return np.where(known[..., None], axes, np.nan), np.where(known[..., None, None], vectors, np.nan)
+
+    def gaussian(self) -> tuple[Array, Array]:
+        """Return mean (..., n) and covariance (..., n, n) of the shared unknowns: an initial state for a tracker."""
+        return self.x[..., : self.layout.n_shared], self.cov
+
+    @property
+    def answered(self) -> Array:
+        """Return where there is an answer with a covariance, possibly one of several, (...)."""
+        return np.isin(self.code, (Status.OK, Status.AMBIGUOUS, Status.SEARCHED))
+
+    def require(self) -> Fix:
+        """Return the fix if every status in it is ok; raise NoSolution with the first that is not."""
+        bad = np.flatnonzero(np.ravel(self.code) != Status.OK)
+        if len(bad):
+            flat = self.flat()
+            raise NoSolution(None, flat[int(bad[0])])
+        return self
+
+    def flat(self) -> Fix:
+        """Return the same fixes with exactly one batch axis."""
+        return self._map(lambda array, core: array.reshape(-1, *array.shape[array.ndim - core :]))
+
+    def reshape(self, shape: tuple[int, ...]) -> Fix:
+        """Return the fixes of a flat batch with other batch axes."""
+        return self._map(lambda array, core: array.reshape(*shape, *array.shape[array.ndim - core :]))
+
+    def __getitem__(self, index: Any) -> Fix:
+        """Return some fixes of a batch."""
+        return self._map(lambda array, core: _as_array(array[index]))
+
+    def __len__(self) -> int:
+        """Return the length of the first batch axis."""
+        return int(self.x.shape[0])
+
+    def _map(self, change: Any) -> Fix:
+        return replace(
+            self,
+            x=change(self.x, 1),
+            cov=change(self.cov, 2),
+            code=change(self.code, 0),
+            reason=change(self.reason, 0),
+            certificate=change(self.certificate, 0),
+            alternatives=Alternatives(change(self.alternatives.x, 2), change(self.alternatives.gap, 1)),
+            cost=change(self.cost, 0),
+            dof=change(self.dof, 0),
+            weights=change(self.weights, 1),
+        )
+
+
+def _as_array(value: Any) -> Array:
+    if isinstance(value, np.ndarray):
+        return value
+    out = np.empty((), dtype=object if isinstance(value, str | Certificate) else None)
+    out[()] = value
+    return out

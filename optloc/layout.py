@@ -1,0 +1,151 @@
+"""The parameter vector: which unknown lives where, shared by all epochs or local to one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from optloc.errors import InvalidProblem
+from optloc.types import Array, Bias, Motion, Stations
+
+_STATE = (("position", "m"), ("velocity", "m/s"), ("acceleration", "m/s^2"))
+_BIAS_UNIT = {"scale": "1", "rotation": "rad"}
+
+
+@dataclass(frozen=True, slots=True)
+class Slot:
+    """A named part of the parameter vector.
+
+    Parameters
+    ----------
+    name : str
+        For instance "position", "velocity[2]", "clock" or "emission".
+    start, size : int
+        Place within the shared part, or within the local part of an epoch.
+    unit : str
+        SI unit.
+    """
+
+    name: str
+    start: int
+    size: int
+    unit: str
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """The order of unknowns: the shared slots first, then the local slots of epoch 0, of epoch 1 and so on.
+
+    Parameters
+    ----------
+    shared, local : tuple of Slot
+        Unknowns of the run, and of each epoch.
+    epochs : int
+        Number of epochs k.
+    """
+
+    shared: tuple[Slot, ...]
+    local: tuple[Slot, ...]
+    epochs: int
+
+    @property
+    def n_shared(self) -> int:
+        """Return the number of shared unknowns."""
+        return sum(slot.size for slot in self.shared)
+
+    @property
+    def n_local(self) -> int:
+        """Return the number of unknowns local to each epoch."""
+        return sum(slot.size for slot in self.local)
+
+    @property
+    def size(self) -> int:
+        """Return the length of the parameter vector."""
+        return self.n_shared + self.epochs * self.n_local
+
+    def find(self, name: str) -> tuple[Slot, bool]:
+        """Return the slot of a name and whether it is shared; raise InvalidProblem for an unknown name."""
+        for slots, is_shared in ((self.shared, True), (self.local, False)):
+            for slot in slots:
+                if slot.name == name:
+                    return slot, is_shared
+        known = ", ".join(slot.name for slot in (*self.shared, *self.local))
+        raise InvalidProblem(f"no unknown is called {name!r}", advice=f"this problem has {known}")
+
+    def split(self, x: Array) -> tuple[Array, Array]:
+        """Return the shared part (..., n) and the local part (..., k, l) of vectors (..., size)."""
+        n = self.n_shared
+        return x[..., :n], x[..., n:].reshape(*x.shape[:-1], self.epochs, self.n_local)
+
+    def take(self, x: Array, name: str) -> Array:
+        """Return a named part, (..., q) of the shared unknowns or (..., k, q) of the local ones."""
+        slot, is_shared = self.find(name)
+        shared, local = self.split(x)
+        return (shared if is_shared else local)[..., slot.start : slot.start + slot.size]
+
+    def labels(self) -> tuple[str, ...]:
+        """Return one label for each entry of the shared part, for instance "position x"."""
+        return tuple(f"{slot.name} {_entry(slot, i)}".strip() for slot in self.shared for i in range(slot.size))
+
+
+def _entry(slot: Slot, i: int) -> str:
+    return "xyz"[i] if slot.name.partition("[")[0] in {name for name, _ in _STATE} else str(i)
+
+
+def state_names(target: int, count: int, order: int) -> tuple[str, ...]:
+    """Return the slot names of a target's state, numbered where there are several targets."""
+    suffix = f"[{target}]" if count > 1 else ""
+    return tuple(name + suffix for name, _ in _STATE[: order + 1])
+
+
+def emission_name(target: int, count: int) -> str:
+    """Return the slot name of a target's emission time."""
+    return f"emission[{target}]" if count > 1 else "emission"
+
+
+def layout(
+    stations: Stations, motions: Sequence[Motion], biases: Sequence[Bias], emitting: Sequence[int], epochs: int
+) -> Layout:
+    """Return the layout of a problem.
+
+    Parameters
+    ----------
+    stations : Stations
+        Gives the dimension, and station offsets where positions are uncertain.
+    motions : sequence of Motion
+        One for each target.
+    biases : sequence of Bias
+        Families of systematic errors.
+    emitting : sequence of int
+        Targets whose emission times are unknown.
+    epochs : int
+        Number of epochs.
+    """
+    shared: list[tuple[str, int, str]] = []
+    local: list[tuple[str, int, str]] = []
+    for i, motion in enumerate(motions):
+        if motion.known is None:
+            room = shared if motion.span == "run" else local
+            units = (unit for _, unit in _STATE)
+            names = state_names(i, len(motions), motion.order)
+            room.extend((name, stations.dimension, unit) for name, unit in zip(names, units, strict=False))
+    for bias in biases:
+        turns = 1 if stations.dimension == 2 else 3
+        shared.append((bias.name, len(bias.members) * (turns if bias.form == "rotation" else 1), _bias_unit(bias)))
+    local.extend((emission_name(i, len(motions)), 1, "m") for i in emitting)
+    if stations.covariance is not None:
+        room = shared if stations.span == "run" else local
+        room.append(("stations", stations.count * stations.dimension, "m"))
+    return Layout(_slots(shared), _slots(local), epochs)
+
+
+def _bias_unit(bias: Bias) -> str:
+    return _BIAS_UNIT.get(bias.form, "1/s" if bias.form == "drift" else "")
+
+
+def _slots(parts: list[tuple[str, int, str]]) -> tuple[Slot, ...]:
+    slots, start = [], 0
+    for name, size, unit in parts:
+        slots.append(Slot(name, start, size, unit))
+        start += size
+    return tuple(slots)

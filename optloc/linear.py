@@ -1,0 +1,159 @@
+"""One linearisation for everything: residual and Jacobian of a problem at a point."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from optloc.models.jet import Jet
+from optloc.models.primitives import wrap
+from optloc.noise import Whitener, whiten
+from optloc.problem import Problem
+from optloc.states import Plan, columns, plans, points
+from optloc.types import Array, Bias
+
+
+@dataclass(frozen=True, slots=True)
+class Linear:
+    """A problem linearised at a point.
+
+    Parameters
+    ----------
+    residual : array (..., m)
+        Measured less modelled, z - h(x); angles wrapped.
+    shared : array (..., m, n)
+        Derivative of h with respect to the shared unknowns.
+    local : array (..., m, l)
+        Derivative of h with respect to the local unknowns of the row's epoch.
+    epoch : int array (m,)
+        Epoch of each row.
+    noise : tuple of Whitener
+        Whitening matrices of the noise blocks.
+    """
+
+    residual: Array
+    shared: Array
+    local: Array
+    epoch: Array
+    noise: tuple[Whitener, ...]
+
+
+def linearise(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = None) -> Linear:
+    """Return residual, Jacobian and noise of a problem at a point.
+
+    Parameters
+    ----------
+    problem : Problem
+        Batch of problems (...).
+    x : array (..., size)
+        Parameter vectors, ordered by ``problem.layout``.
+    noise : tuple of Whitener, optional
+        Whitening matrices made before; None: made from the problem.
+
+    Returns
+    -------
+    Linear
+        With leading axes (...).
+    """
+    layout = problem.layout
+    batch = np.broadcast_shapes(problem.batch_shape, x.shape[:-1])
+    jacobian = np.zeros((*batch, problem.count, layout.n_shared + layout.n_local))
+    values = []
+    for plan, start in zip(plans(problem), problem.starts, strict=True):
+        value = _differentiate(problem, plan, start, x, jacobian[..., start : start + plan.block.count, :])
+        values.append(np.broadcast_to(value, (*batch, plan.block.count)))
+    residual = _residual(problem, np.concatenate(values, axis=-1))
+    if noise is None:
+        noise = whiten(problem.noise, problem.weight)
+    n = layout.n_shared
+    return Linear(residual, jacobian[..., :n], jacobian[..., n:], problem.epoch, noise)
+
+
+def predict(problem: Problem, x: Array) -> Array:
+    """Return the modelled measurements h(x), (..., m), of a problem at vectors x (..., size)."""
+    values = []
+    for plan, start in zip(plans(problem), problem.starts, strict=True):
+        t, a, b = points(problem, plan, x, differentiate=False)
+        value = np.asarray(plan.model.h(t, a, b))
+        value = np.broadcast_to(value, np.broadcast_shapes(value.shape, (plan.block.count,)))
+        values.append(_biased(problem, plan, start, x, value, None, None))
+    shape = np.broadcast_shapes(*(value.shape[:-1] for value in values))
+    return np.concatenate([np.broadcast_to(value, (*shape, value.shape[-1])) for value in values], axis=-1)
+
+
+def _residual(problem: Problem, value: Array) -> Array:
+    residual = np.asarray(problem.z - value)
+    for plan, start in zip(plans(problem), problem.starts, strict=True):
+        if plan.model.period is not None:
+            part = slice(start, start + plan.block.count)
+            residual[..., part] = wrap(residual[..., part])
+    weight = problem.weight
+    return residual if np.all(weight > 0.0) else np.where(weight > 0.0, residual, 0.0)
+
+
+def _differentiate(problem: Problem, plan: Plan, start: int, x: Array, jacobian: Array) -> Array:
+    """Write the derivatives of one block into its part of the Jacobian and return its values."""
+    t, a, b = points(problem, plan, x, differentiate=True)
+    jet = plan.model.h(t, a, b)
+    if not isinstance(jet, Jet):
+        jet = Jet(np.asarray(jet), {})
+    rows = np.arange(plan.block.count)
+    fold = _folded(problem)
+    for feed in plan.feeds:
+        partial = jet.partials.get(feed.seed)
+        if partial is not None:
+            picked = partial if isinstance(feed.rows, slice) or partial.shape[-1] == 1 else partial[..., feed.rows]
+            jacobian[..., rows[feed.rows], fold(feed.column)] += picked * feed.gain
+    value = np.broadcast_to(jet.value, (*jacobian.shape[:-2], plan.block.count))
+    return _biased(problem, plan, start, x, value, jacobian, fold)
+
+
+def _folded(problem: Problem) -> Any:
+    """Return the map from columns of the full vector to columns of [shared, local of the row's epoch]."""
+    n, length = problem.layout.n_shared, problem.layout.n_local
+
+    def fold(column: Array) -> Array:
+        return column if length == 0 else np.where(column < n, column, n + (column - n) % length)
+
+    return fold
+
+
+def _biased(problem: Problem, plan: Plan, start: int, x: Array, value: Array, jacobian: Array | None, fold: Any) -> Array:
+    """Return the values with scales, offsets, drifts and emission times; write their derivatives where asked."""
+    if not problem.biases and not plan.emission:
+        return value
+    gain, added = np.ones(1), np.zeros(1)
+    pending: list[tuple[Array, Array, Array]] = []
+    for bias in problem.biases:
+        if bias.form == "rotation":
+            continue
+        rows, column, coefficient = _touched(problem, bias, start, plan.block.count)
+        if bias.form == "drift":
+            coefficient = coefficient * (problem.times - problem.times[0])[plan.block.epoch[rows]]
+        total = np.zeros((*x.shape[:-1], plan.block.count))
+        np.add.at(total, (..., rows), x[..., column] * coefficient)
+        if bias.form == "scale":
+            gain = gain + total
+            pending.append((rows, column, value[..., rows] * coefficient))
+        else:
+            added = added + total
+            pending.append((rows, column, coefficient))
+    for rows, column in plan.emission:
+        total = np.zeros((*x.shape[:-1], plan.block.count))
+        total[..., rows] = x[..., column]
+        added = added + total
+        pending.append((rows, column, np.ones(len(rows))))
+    if jacobian is not None:
+        jacobian *= gain[..., None]
+        for rows, column, derivative in pending:
+            np.add.at(jacobian, (..., rows, fold(column)), derivative)
+    return np.asarray(value * gain + added)
+
+
+def _touched(problem: Problem, bias: Bias, start: int, count: int) -> tuple[Array, Array, Array]:
+    inside = (bias.row >= start) & (bias.row < start + count)
+    rows = bias.row[inside] - start
+    column = columns(problem.layout, bias.name, rows)[np.arange(len(rows)), bias.member[inside]]
+    return rows, column, bias.coefficient[inside]

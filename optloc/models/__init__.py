@@ -1,0 +1,202 @@
+"""Measurement kinds: every h(x) is written here, once, elementwise.
+
+The same entry serves numbers (NumPy), symbols (CasADi) and derivatives (Jet). To add a kind, add one entry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import tau
+from typing import Any
+
+from optloc.models.namespace import namespace
+from optloc.models.primitives import Components, Point, distance, dot, geodetic_height, local, range_rate, wrap
+
+__all__ = ["MODELS", "LiftedRow", "Model", "Point", "lifted_row", "wrap"]
+
+
+@dataclass(frozen=True, slots=True)
+class LiftedRow:
+    """A measurement as a row linear in position and ranges: ``x.position + ra r_a + rb r_b + constant = 0``.
+
+    Parameters
+    ----------
+    x : tuple of d numbers, or None
+        Coefficients of the target's position (1); None where the row has ranges only.
+    ra, rb : number
+        Coefficients of the ranges to the first and second station.
+    constant : number
+        Constant term, metres.
+    factor : callable of (t, a, b)
+        Derivative of the row with respect to the measured value: turns measurement noise into row noise.
+    """
+
+    x: Components | None
+    ra: Any
+    rb: Any
+    constant: Any
+    factor: Callable[[Point, Point, Point], Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Model:
+    """A measurement kind.
+
+    Parameters
+    ----------
+    h : callable of (t, a, b)
+        The measurement of target `t` by stations `a` and `b`, elementwise on `Point` components, SI units and radians.
+    quantity : str
+        What it measures: "length", "angle", "ratio" or "speed"; decides which units a file may use.
+    stations : int
+        How many stations it takes: 0, 1 or 2.
+    summary : str
+        One line for listings.
+    ranges : (ra, rb), optional
+        Set where ``h = ra r_a + rb r_b`` exactly.
+    lifted : callable of (m, a, b), optional
+        The `LiftedRow` of a measured value m, where there is one that is not a sum of ranges.
+    period : float, optional
+        Period of an angle, radians; the residual is wrapped.
+    emission : bool
+        True where an unknown emission time (times c, metres) of the epoch is added.
+    velocity, axes, ecef : bool
+        What the points must carry beyond their position.
+    dimensions : tuple of int
+        Dimensions in which the kind makes sense.
+    """
+
+    h: Callable[[Point, Point, Point], Any]
+    quantity: str
+    stations: int
+    summary: str
+    ranges: tuple[int, int] | None = None
+    lifted: Callable[[Any, Point, Point], LiftedRow] | None = None
+    period: float | None = None
+    emission: bool = False
+    velocity: bool = False
+    axes: bool = False
+    ecef: bool = False
+    dimensions: tuple[int, ...] = (2, 3)
+
+
+def _azimuth(t: Point, a: Point, b: Point) -> Any:
+    line = local(t, a)
+    return namespace(line[1]).atan2(line[1], line[0])
+
+
+def _elevation(t: Point, a: Point, b: Point) -> Any:
+    line = local(t, a)
+    xp = namespace(line[2])
+    return xp.atan2(line[2], xp.hypot(line[0], line[1]))
+
+
+def _height(t: Point, a: Point, b: Point) -> Any:
+    assert t.ecef is not None
+    return geodetic_height(t.ecef)
+
+
+def _basis(a: Point) -> tuple[Components, ...]:
+    if a.axes is not None:
+        return a.axes
+    d = len(a.position)
+    return tuple(tuple(float(i == j) for j in range(d)) for i in range(d))
+
+
+def _lifted_azimuth(m: Any, a: Point, b: Point) -> LiftedRow:
+    xp = namespace(m)
+    basis = _basis(a)
+    across = tuple(xp.cos(m) * v - xp.sin(m) * u for u, v in zip(basis[0], basis[1], strict=True))
+
+    def horizontal(t: Point, a: Point, b: Point) -> Any:
+        line = local(t, a)
+        return -1.0 * namespace(line[0]).hypot(line[0], line[1])
+
+    return LiftedRow(across, 0.0, 0.0, -1.0 * dot(across, a.position), horizontal)
+
+
+def _lifted_elevation(m: Any, a: Point, b: Point) -> LiftedRow:
+    xp = namespace(m)
+    up = _basis(a)[2]
+    return LiftedRow(
+        up, -1.0 * xp.sin(m), 0.0, -1.0 * dot(up, a.position), lambda t, a, b: -1.0 * distance(t, a) * xp.cos(m)
+    )
+
+
+MODELS: dict[str, Model] = {
+    "tdoa": Model(
+        lambda t, a, b: distance(t, a) - distance(t, b),
+        "length",
+        2,
+        "time difference of arrival times c, r_a - r_b",
+        ranges=(1, -1),
+    ),
+    "groa": Model(
+        lambda t, a, b: distance(t, a) / distance(t, b),
+        "ratio",
+        2,
+        "gain ratio of arrival, r_a / r_b",
+        lifted=lambda m, a, b: LiftedRow(None, 1.0, -1.0 * m, 0.0, lambda t, a, b: -1.0 * distance(t, b)),
+    ),
+    "range": Model(lambda t, a, b: distance(t, a), "length", 1, "range r_a", ranges=(1, 0)),
+    "toa": Model(
+        lambda t, a, b: distance(t, a),
+        "length",
+        1,
+        "time of arrival times c, r_a plus the epoch's unknown emission time",
+        ranges=(1, 0),
+        emission=True,
+    ),
+    "range_sum": Model(
+        lambda t, a, b: distance(t, a) + distance(t, b),
+        "length",
+        2,
+        "bistatic range, r_a + r_b",
+        ranges=(1, 1),
+    ),
+    "azimuth": Model(
+        _azimuth,
+        "angle",
+        1,
+        "azimuth from the station's first axis towards its second",
+        lifted=_lifted_azimuth,
+        period=tau,
+        axes=True,
+    ),
+    "elevation": Model(
+        _elevation,
+        "angle",
+        1,
+        "elevation above the plane of the station's first two axes",
+        lifted=_lifted_elevation,
+        period=tau,
+        axes=True,
+        dimensions=(3,),
+    ),
+    "height": Model(_height, "length", 0, "height above the WGS 84 ellipsoid", ecef=True, dimensions=(3,)),
+    "fdoa": Model(
+        lambda t, a, b: range_rate(t, a) - range_rate(t, b),
+        "speed",
+        2,
+        "frequency difference of arrival as range-rate difference, r'_a - r'_b",
+        velocity=True,
+    ),
+}
+
+
+def lifted_row(model: Model, m: Any, a: Point, b: Point) -> LiftedRow | None:
+    """Return the row of a measured value that is linear in position and ranges, or None where there is none.
+
+    Parameters
+    ----------
+    model : Model
+        The measurement kind.
+    m : number or array
+        Measured value, SI units or radians.
+    a, b : Point
+        Its stations.
+    """
+    if model.ranges is not None:
+        return LiftedRow(None, float(model.ranges[0]), float(model.ranges[1]), -1.0 * m, lambda t, a, b: -1.0)
+    return None if model.lifted is None else model.lifted(m, a, b)

@@ -1,0 +1,137 @@
+"""Elementwise building blocks of the measurement functions: they work on components, never on array axes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from optloc.models.namespace import namespace
+
+Components = tuple[Any, ...]
+
+WGS84_A = 6378137.0
+WGS84_F = 1.0 / 298.257223563
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """A target or a station as component tuples; only what a measurement kind asks for is filled in.
+
+    Parameters
+    ----------
+    position : tuple of d numbers
+        Metres, in the problem's frame.
+    velocity : tuple of d numbers, optional
+        Metres per second.
+    axes : tuple of d tuples of d numbers, optional
+        Unit vectors of the local frame, expressed in the problem's frame.
+    ecef : tuple of 3 numbers, optional
+        The same position, Earth-centred Earth-fixed, metres.
+    """
+
+    position: Components
+    velocity: Components | None = None
+    axes: tuple[Components, ...] | None = None
+    ecef: Components | None = None
+
+
+def dot(u: Components, v: Components) -> Any:
+    """Return the inner product of two component tuples."""
+    total = u[0] * v[0]
+    for p, q in zip(u[1:], v[1:], strict=True):
+        total = total + p * q
+    return total
+
+
+def subtract(u: Components, v: Components) -> Components:
+    """Return the componentwise difference ``u - v``."""
+    return tuple(p - q for p, q in zip(u, v, strict=True))
+
+
+def norm(u: Components) -> Any:
+    """Return the Euclidean length of a component tuple."""
+    squared = dot(u, u)
+    return namespace(squared).sqrt(squared)
+
+
+def distance(t: Point, a: Point) -> Any:
+    """Return the range between two points, metres."""
+    return norm(subtract(t.position, a.position))
+
+
+def range_rate(t: Point, a: Point) -> Any:
+    """Return the rate of the range between two points, metres per second."""
+    assert t.velocity is not None and a.velocity is not None
+    line = subtract(t.position, a.position)
+    return dot(line, subtract(t.velocity, a.velocity)) / norm(line)
+
+
+def local(t: Point, a: Point) -> Components:
+    """Return the line of sight from station to target in the station's own axes, metres."""
+    line = subtract(t.position, a.position)
+    return line if a.axes is None else tuple(dot(axis, line) for axis in a.axes)
+
+
+def wrap(angle: Any) -> Any:
+    """Return an angle wrapped to (-pi, pi], radians."""
+    xp = namespace(angle)
+    return xp.atan2(xp.sin(angle), xp.cos(angle))
+
+
+def rotate(axes: tuple[Components, ...], turn: Components) -> tuple[Components, ...]:
+    """Return axes turned by a small rotation vector given in those axes.
+
+    The rotation is the unit quaternion ``(1, turn / 2) / norm``: exact to third order, smooth everywhere. In the plane
+    `turn` has one component.
+
+    Parameters
+    ----------
+    axes : tuple of d tuples of d numbers
+        Unit vectors of the local frame.
+    turn : tuple of 1 (plane) or 3 numbers
+        Rotation vector, radians.
+    """
+    half = tuple(0.5 * w for w in turn)
+    scale = 1.0 / (1.0 + dot(half, half))
+    if len(half) == 1:
+        c, s = (1.0 - half[0] * half[0]) * scale, 2.0 * half[0] * scale
+        matrix: tuple[Components, ...] = ((c, s), (-1.0 * s, c))
+    else:
+        x, y, z = half
+        xx, yy, zz = x * x, y * y, z * z
+        matrix = (
+            ((1.0 + xx - yy - zz) * scale, 2.0 * (x * y + z) * scale, 2.0 * (x * z - y) * scale),
+            (2.0 * (x * y - z) * scale, (1.0 + yy - xx - zz) * scale, 2.0 * (y * z + x) * scale),
+            (2.0 * (x * z + y) * scale, 2.0 * (y * z - x) * scale, (1.0 + zz - xx - yy) * scale),
+        )
+    columns = tuple(zip(*axes, strict=True))
+    return tuple(tuple(dot(row, column) for column in columns) for row in matrix)
+
+
+def geodetic_height(ecef: Components) -> Any:
+    """Return the height above the WGS 84 ellipsoid, metres.
+
+    Bowring's parametric latitude with two fixed steps: below 1e-9 m from the surface to 1 000 km, no test, so that it
+    serves symbols as well as numbers. ``h = p cos(phi) + z sin(phi) - a sqrt(1 - e2 sin(phi)^2)`` is stationary in phi.
+
+    References
+    ----------
+    B. R. Bowring, "Transformation from spatial to geographical coordinates", Survey Review 23 (1976).
+    """
+    x, y, z = ecef
+    xp = namespace(x)
+    e2 = WGS84_F * (2.0 - WGS84_F)
+    b = WGS84_A * (1.0 - WGS84_F)
+    p = xp.hypot(x, y)
+    sin_u, cos_u = _direction(z * WGS84_A, p * b)
+    for _ in range(2):
+        up = z + (e2 / (1.0 - e2)) * b * sin_u * sin_u * sin_u
+        out = p - e2 * WGS84_A * cos_u * cos_u * cos_u
+        sin_phi, cos_phi = _direction(up, out)
+        sin_u, cos_u = _direction((1.0 - WGS84_F) * sin_phi, cos_phi)
+    return p * cos_phi + z * sin_phi - WGS84_A * xp.sqrt(1.0 - e2 * sin_phi * sin_phi)
+
+
+def _direction(rise: Any, run: Any) -> tuple[Any, Any]:
+    length = namespace(rise).hypot(rise, run)
+    return rise / length, run / length

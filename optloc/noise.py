@@ -1,0 +1,185 @@
+"""Measurement noise: a covariance kept as blocks over rows, never as one full matrix."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from optloc import linalg
+from optloc.types import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """Equal-sized groups of rows that are correlated within a group only.
+
+    Parameters
+    ----------
+    row : int array (g, r)
+        Global row numbers of each of the g groups.
+    covariance : array (..., g or 1, r, r)
+        Covariance of each group, in the rows' units squared.
+    """
+
+    row: Array
+    covariance: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """The covariance of all rows as blocks; every row belongs to exactly one group.
+
+    Parameters
+    ----------
+    blocks : tuple of Block
+        Groups of equal size are kept together.
+    """
+
+    blocks: tuple[Block, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Whitener:
+    """Maps residuals to unit covariance; rows of weight zero map to zero.
+
+    Parameters
+    ----------
+    row : int array (g, r)
+        Global row numbers.
+    matrix : array (..., g or 1, r, r)
+        ``matrix @ covariance @ matrix.T`` is the identity on the rows that are present.
+    """
+
+    row: Array
+    matrix: Array
+
+    def apply(self, values: Array) -> Array:
+        """Return whitened values (..., g * r, p) of values (..., m, p) for this block's rows."""
+        g, r = self.row.shape
+        if r == 1:
+            return self.matrix[..., 0] * values[..., self.row[:, 0], :]
+        if g == 1:
+            rows = self.row[0]
+            whole = len(rows) == values.shape[-2] and bool(np.all(np.diff(rows) == 1))
+            return self.matrix[..., 0, :, :] @ (values if whole else values[..., rows, :])
+        picked = values[..., self.row, :]
+        return (self.matrix @ picked).reshape(*picked.shape[:-3], g * r, picked.shape[-1])
+
+
+def independent(variance: Array) -> Noise:
+    """Return noise that is independent from row to row.
+
+    Parameters
+    ----------
+    variance : array (..., m)
+        Variance of each row.
+    """
+    rows = np.arange(variance.shape[-1])
+    return Noise((Block(rows[:, None], variance[..., None, None]),))
+
+
+def of_stations(design: Array, variance: Array) -> Array:
+    """Return the covariance ``D diag(variance) D'`` of rows that combine independent per-station errors.
+
+    Parameters
+    ----------
+    design : array (m, s)
+        How each station's arrival enters each row: +1, -1 or 0.
+    variance : array (..., s)
+        Variance of each station's arrival.
+
+    Returns
+    -------
+    array (..., m, m)
+        Singular where the rows close a loop; the whitener then uses the pseudo-inverse.
+    """
+    return np.asarray((design * variance[..., None, :]) @ design.T)
+
+
+def group(blocks: Sequence[Block]) -> Noise:
+    """Return noise with groups of equal size and batch shape stacked, so that they are handled in one operation.
+
+    Parameters
+    ----------
+    blocks : sequence of Block
+        Any blocks.
+    """
+    stacks: dict[tuple[int, tuple[int, ...]], list[Block]] = {}
+    for block in blocks:
+        stacks.setdefault((block.row.shape[1], block.covariance.shape[:-3]), []).append(block)
+    return Noise(tuple(_stack(same) for same in stacks.values()))
+
+
+def _stack(blocks: list[Block]) -> Block:
+    if len(blocks) == 1:
+        return blocks[0]
+    covariances = []
+    for block in blocks:
+        shape = block.covariance.shape
+        covariances.append(np.broadcast_to(block.covariance, (*shape[:-3], len(block.row), *shape[-2:])))
+    return Block(np.concatenate([block.row for block in blocks]), np.concatenate(covariances, axis=-3))
+
+
+def whiten(noise: Noise, weight: Array) -> tuple[Whitener, ...]:
+    """Return the whitening matrices of noise with row weights.
+
+    A weight w adds ``(1/w - 1)`` times its own variance to a row, so that w -> 0 is exactly the row's absence.
+
+    Parameters
+    ----------
+    noise : Noise
+        Covariance blocks.
+    weight : array (..., m)
+        Row weights in [0, 1].
+    """
+    return tuple(_whitener(block, weight) for block in noise.blocks)
+
+
+def _whitener(block: Block, weight: Array) -> Whitener:
+    picked = weight[..., block.row]
+    if np.all(picked == 1.0):
+        return Whitener(block.row, linalg.whitening(block.covariance))
+    present = picked > 0.0
+    variance = np.diagonal(block.covariance, axis1=-2, axis2=-1)
+    extra = np.where(present, (1.0 / np.where(present, picked, 1.0) - 1.0) * variance, 1.0)
+    both = present[..., :, None] & present[..., None, :]
+    covariance = np.where(both, block.covariance, 0.0) + extra[..., None] * np.eye(block.row.shape[1])
+    return Whitener(block.row, linalg.whitening(covariance) * present[..., None, :])
+
+
+def dense(noise: Noise, rows: Array) -> Array:
+    """Return the covariance of a few rows as one matrix.
+
+    Parameters
+    ----------
+    noise : Noise
+        Covariance blocks.
+    rows : int array (q,)
+        Global row numbers.
+
+    Returns
+    -------
+    array (..., q, q)
+        Their covariance, in the given order.
+    """
+    place = {int(row): i for i, row in enumerate(rows)}
+    shape = np.broadcast_shapes(*(block.covariance.shape[:-3] for block in noise.blocks))
+    matrix = np.zeros((*shape, len(rows), len(rows)))
+    for block in noise.blocks:
+        covariance = np.broadcast_to(block.covariance, (*block.covariance.shape[:-3], *block.row.shape, block.row.shape[1]))
+        for g, members in enumerate(block.row):
+            inside = [i for i, row in enumerate(members) if int(row) in place]
+            at = [place[int(members[i])] for i in inside]
+            matrix[..., np.ix_(at, at)[0], np.ix_(at, at)[1]] = covariance[..., g, :, :][..., inside, :][..., :, inside]
+    return matrix
+
+
+def variances(noise: Noise, count: int) -> Array:
+    """Return the variance of each of `count` rows, (..., m)."""
+    shape = np.broadcast_shapes(*(block.covariance.shape[:-3] for block in noise.blocks))
+    out = np.zeros((*shape, count))
+    for block in noise.blocks:
+        out[..., block.row] = np.diagonal(block.covariance, axis1=-2, axis2=-1)
+    return out

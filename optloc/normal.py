@@ -1,0 +1,235 @@
+"""Normal equations with the shape of an arrow: one shared block, one local block for each epoch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from optloc import linalg
+from optloc.linear import Linear
+from optloc.problem import Problem
+from optloc.types import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Normal:
+    """Information about shared and local unknowns.
+
+    Parameters
+    ----------
+    shared : array (..., n, n)
+        Information of the shared unknowns.
+    local : array (..., k, l, l)
+        Information of the local unknowns of each epoch.
+    cross : array (..., k, n, l)
+        Coupling.
+    shared_vector : array (..., n)
+        Right-hand side of the shared unknowns.
+    local_vector : array (..., k, l)
+        Right-hand side of the local unknowns.
+    cost : array (...)
+        Weighted sum of squared residuals, without a factor 1/2.
+    """
+
+    shared: Array
+    local: Array
+    cross: Array
+    shared_vector: Array
+    local_vector: Array
+    cost: Array
+
+    def __add__(self, other: Normal) -> Normal:
+        """Return the sum of the information of disjoint epochs: shared parts add, local parts are joined."""
+        return Normal(
+            self.shared + other.shared,
+            np.concatenate([self.local, other.local], axis=-3),
+            np.concatenate([self.cross, other.cross], axis=-3),
+            self.shared_vector + other.shared_vector,
+            np.concatenate([self.local_vector, other.local_vector], axis=-2),
+            self.cost + other.cost,
+        )
+
+
+def normal(linear: Linear, epochs: int) -> Normal:
+    """Return the normal equations of a linearised problem.
+
+    Parameters
+    ----------
+    linear : Linear
+        Residual, Jacobian, noise.
+    epochs : int
+        Number of epochs k.
+    """
+    n, length = linear.shared.shape[-1], linear.local.shape[-1]
+    stacked = np.concatenate([linear.shared, linear.local, linear.residual[..., None]], axis=-1)
+    single = epochs == 1 or length == 0
+    total = _Sum(single, epochs)
+    for whitener in linear.noise:
+        total.add(whitener.apply(stacked), linear.epoch[whitener.row].reshape(-1))
+    gram = total.value
+    last = n + length
+    flat = gram[..., 0, :, :] if single else gram.sum(-3)
+    k = epochs if length else 1
+    batch = flat.shape[:-2]
+    return Normal(
+        flat[..., :n, :n],
+        np.broadcast_to(gram[..., n:last, n:last], (*batch, k, length, length)),
+        np.broadcast_to(gram[..., :n, n:last], (*batch, k, n, length)),
+        flat[..., :n, last],
+        np.broadcast_to(gram[..., n:last, last], (*batch, k, length)),
+        flat[..., last, last],
+    )
+
+
+class _Sum:
+    """Adds up outer products of whitened rows, over all epochs or epoch by epoch."""
+
+    def __init__(self, single: bool, epochs: int) -> None:
+        self.single, self.epochs, self.value = single, epochs, np.zeros(())
+
+    def add(self, white: Array, epoch: Array) -> None:
+        if self.single:
+            self.value = self.value + (np.swapaxes(white, -1, -2) @ white)[..., None, :, :]
+            return
+        order = np.argsort(epoch, kind="stable")
+        present, first = np.unique(epoch[order], return_index=True)
+        rows = white[..., order, :]
+        sums = np.add.reduceat(rows[..., :, None] * rows[..., None, :], first, axis=-3)
+        full = np.zeros((*sums.shape[:-3], self.epochs, *sums.shape[-2:]))
+        full[..., present, :, :] = sums
+        self.value = self.value + full
+
+
+def with_priors(problem: Problem, x: Array, equations: Normal) -> Normal:
+    """Return normal equations with the Gaussian priors of a problem added.
+
+    Parameters
+    ----------
+    problem : Problem
+        Priors on named unknowns, biases and station positions.
+    x : array (..., size)
+        Where the problem was linearised.
+    equations : Normal
+        Of the measurements alone.
+    """
+    parts = _prior_parts(problem)
+    if not parts:
+        return equations
+    layout = problem.layout
+    at_shared, at_local = layout.split(x)
+    shared, vector, cost = equations.shared.copy(), equations.shared_vector.copy(), equations.cost
+    local, local_vector = equations.local.copy(), equations.local_vector.copy()
+    for name, mean, precision in parts:
+        slot, is_shared = layout.find(name)
+        part = slice(slot.start, slot.start + slot.size)
+        error = mean - (at_shared[..., part] if is_shared else at_local[..., part])
+        pull = (precision @ error[..., None])[..., 0]
+        penalty = (error * pull).sum(-1)
+        if is_shared:
+            shared[..., part, part] += precision
+            vector[..., part] += pull
+            cost = cost + penalty
+        else:
+            local[..., part, part] += precision
+            local_vector[..., part] += pull
+            cost = cost + penalty.sum(-1)
+    return Normal(shared, local, equations.cross, vector, local_vector, cost)
+
+
+def _prior_parts(problem: Problem) -> list[tuple[str, Array, Array]]:
+    """Return (name, mean, precision) of every prior; local ones have an epoch axis of length one."""
+    parts = []
+    for prior in problem.priors:
+        precision, _ = linalg.inverse(prior.covariance)
+        _, is_shared = problem.layout.find(prior.name)
+        mean = prior.mean if is_shared else prior.mean[..., None, :]
+        parts.append((prior.name, mean, precision if is_shared else precision[..., None, :, :]))
+    for bias in problem.biases:
+        if bias.sigma is not None:
+            sigma = np.ravel(bias.sigma)
+            parts.append((bias.name, np.broadcast_to(np.ravel(bias.mean), sigma.shape), np.diag(sigma**-2.0)))
+    stations = problem.stations
+    if stations.covariance is not None:
+        precision = _block_diagonal(linalg.inverse(stations.covariance)[0])
+        if stations.span == "epoch":
+            precision = precision[..., None, :, :]
+        parts.append(("stations", np.zeros(precision.shape[-1]), precision))
+    return parts
+
+
+def _block_diagonal(blocks: Array) -> Array:
+    s, d = blocks.shape[-3], blocks.shape[-1]
+    out = np.zeros((*blocks.shape[:-3], s, d, s, d))
+    index = np.arange(s)
+    out[..., index, :, index, :] = np.moveaxis(blocks, -3, 0)
+    return out.reshape(*blocks.shape[:-3], s * d, s * d)
+
+
+def marginal(equations: Normal) -> tuple[Array, Array, Array]:
+    """Return information (..., n, n) and vector (..., n) of the shared unknowns with the local ones eliminated, and ok.
+
+    Schur complement epoch by epoch; `ok` (...) is False where an epoch's local block is singular.
+    """
+    if equations.local.shape[-1] == 0:
+        return equations.shared, equations.shared_vector, np.ones(equations.cost.shape, dtype=bool)
+    right = np.concatenate([np.swapaxes(equations.cross, -1, -2), equations.local_vector[..., None]], axis=-1)
+    solved, ok = linalg.solve(equations.local, right)
+    lost = (equations.cross @ solved).sum(-3)
+    return equations.shared - lost[..., :-1], equations.shared_vector - lost[..., -1], ok.all(-1)
+
+
+def step(equations: Normal, damping: Array) -> tuple[Array, Array]:
+    """Return the damped step (..., size) of the full parameter vector, and where it exists (...).
+
+    Parameters
+    ----------
+    equations : Normal
+        Information and right-hand side.
+    damping : array (...)
+        Marquardt's factor: the diagonal of the information is multiplied by ``1 + damping``.
+    """
+    damped = _damped(equations, damping)
+    information, vector, ok = marginal(damped)
+    if information.shape[-1]:
+        shared, good = linalg.solve(information, vector[..., None])
+        shared, ok = shared[..., 0], ok & good
+    else:
+        shared = vector
+    if damped.local.shape[-1] == 0:
+        return shared, ok
+    rest = damped.local_vector - (np.swapaxes(damped.cross, -1, -2) @ shared[..., None, :, None])[..., 0]
+    local, good = linalg.solve(damped.local, rest[..., None])
+    flat = local[..., 0].reshape(*local.shape[:-3], -1)
+    return np.concatenate([shared, flat], axis=-1), ok & good.all(-1)
+
+
+def _damped(equations: Normal, damping: Array) -> Normal:
+    def grow(matrix: Array, factor: Array) -> Array:
+        index = np.arange(matrix.shape[-1])
+        out = np.array(matrix)
+        out[..., index, index] *= 1.0 + factor
+        return out
+
+    return Normal(
+        grow(equations.shared, damping[..., None]),
+        grow(equations.local, damping[..., None, None]),
+        equations.cross,
+        equations.shared_vector,
+        equations.local_vector,
+        equations.cost,
+    )
+
+
+def covariance(equations: Normal) -> tuple[Array, Array]:
+    """Return the covariance (..., n, n) of the shared unknowns, NaN where singular, and where it exists (...)."""
+    information, _, ok = marginal(equations)
+    inverse, good = linalg.inverse(information)
+    return np.where((ok & good)[..., None, None], inverse, np.nan), ok & good
+
+
+def decrement(equations: Normal, move: Array, layout_n: int) -> Array:
+    """Return the squared length of a step in units of its own standard deviations, (...)."""
+    shared = move[..., :layout_n]
+    local = move[..., layout_n:].reshape(*equations.local_vector.shape)
+    return np.asarray((shared * equations.shared_vector).sum(-1) + (local * equations.local_vector).sum((-1, -2)))

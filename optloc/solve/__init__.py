@@ -1,0 +1,54 @@
+"""Solve: from a problem to a fix, without a guess."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from optloc.epochs import by_epoch, separable
+from optloc.errors import InvalidProblem
+from optloc.fix import Fix
+from optloc.problem import Problem
+from optloc.solve.stages import SOLVERS, given
+
+METHODS = {"auto": "candidates+lsr"}
+
+
+def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
+    """Return the fix of every problem of a batch, without a first guess.
+
+    Parameters
+    ----------
+    problem : Problem
+        Batch axes (...). Where its epochs share no unknown they are solved as one more batch axis, (..., k).
+    method : str
+        "auto", or stages joined by "+": for instance "gtrs+lsr"; see ``optloc list solvers``.
+    start : array (..., size), optional
+        Starting vector for a method that begins with a refinement, for instance "lsr".
+
+    Returns
+    -------
+    Fix
+        With the problem's batch axes. Failure is a status, never an exception.
+
+    Raises
+    ------
+    InvalidProblem
+        For an unknown method.
+    """
+    stages = METHODS.get(method, method).split("+")
+    unknown = [name for name in stages if name not in SOLVERS]
+    if unknown:
+        raise InvalidProblem(f"unknown method {unknown[0]!r}", "method", f"use auto or stages of {', '.join(SOLVERS)}")
+    if separable(problem):
+        problem = by_epoch(problem)
+    shape, flat = problem.batch_shape, problem.flat()
+    fix = None
+    if start is not None:
+        vector = np.broadcast_to(np.asarray(start, dtype=float), (*shape, problem.layout.size))
+        fix = given(flat, vector.reshape(-1, problem.layout.size))
+    for name in stages:
+        fix = SOLVERS[name](flat, fix)
+    assert fix is not None
+    return fix.reshape(shape) if shape != (len(fix),) else fix

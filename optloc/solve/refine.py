@@ -1,0 +1,165 @@
+"""Damped Gauss-Newton (Taylor least squares, LSR) for a batch of problems; finished ones leave the batch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optloc.linear import linearise
+from optloc.noise import Whitener, whiten
+from optloc.normal import Normal, decrement, normal, step, with_priors
+from optloc.problem import Problem
+from optloc.status import Status
+from optloc.types import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Refined:
+    """Where the refinement ended.
+
+    Parameters
+    ----------
+    x : array (N, size)
+        Parameter vectors.
+    cost : array (N,)
+        Weighted sum of squared residuals and prior penalties.
+    status : int array (N,)
+        `Status` of each: ok, max iterations, stalled, singular geometry, numerical.
+    iterations : int array (N,)
+        Steps tried.
+    equations : Normal
+        Normal equations at `x`.
+    """
+
+    x: Array
+    cost: Array
+    status: Array
+    iterations: Array
+    equations: Normal
+
+
+def equations_at(problem: Problem, x: Array, noise: tuple[Whitener, ...]) -> Normal:
+    """Return the normal equations, priors included, of a batch of problems at vectors x (..., size)."""
+    return with_priors(problem, x, normal(linearise(problem, x, noise), problem.epochs))
+
+
+def refine(
+    problem: Problem, start: Array, *, tolerance: float = 1e-7, limit: int = 60, damped: bool = True
+) -> Refined:
+    """Return the local maximum-likelihood estimates next to given starts.
+
+    Levenberg's method with Marquardt's scaling: a step is taken where it lowers the cost, and the damping follows
+    the ratio of the achieved to the predicted decrease (Nielsen 1999).
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems.
+    start : array (N, size)
+        Starting vectors.
+    tolerance : float
+        A fix is finished when its next step is shorter than this many of its own standard deviations.
+    limit : int
+        Steps tried at most.
+    damped : bool
+        False: plain Taylor iteration, every step is taken whatever it does to the cost.
+
+    Returns
+    -------
+    Refined
+        One entry for each start.
+    """
+    n = problem.layout.n_shared
+    noise = whiten(problem.noise, problem.weight)
+    with np.errstate(all="ignore"):
+        state = _State.begin(problem, start, noise)
+        active = np.arange(len(start))
+        for iteration in range(limit):
+            active = active[state.status[active] == Status.MAX_ITERATIONS]
+            if not len(active):
+                break
+            part = _Part.of(problem, noise, active, len(start))
+            _advance(part, state, active, n, tolerance, damped, iteration)
+    return Refined(state.x, state.equations.cost, state.status, state.iterations, state.equations)
+
+
+@dataclass(slots=True)
+class _State:
+    """What the iteration remembers of every problem; only the active entries change."""
+
+    x: Array
+    equations: Normal
+    damping: Array
+    growth: Array
+    status: Array
+    iterations: Array
+
+    @classmethod
+    def begin(cls, problem: Problem, start: Array, noise: tuple[Whitener, ...]) -> _State:
+        count = len(start)
+        equations = _owned(equations_at(problem, start, noise))
+        status = np.full(count, int(Status.MAX_ITERATIONS), dtype=np.int8)
+        status[~np.isfinite(equations.cost)] = Status.NUMERICAL
+        return cls(np.array(start), equations, np.full(count, 1e-6), np.full(count, 2.0), status, np.zeros(count, dtype=np.int32))
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """The problems still moving."""
+
+    problem: Problem
+    noise: tuple[Whitener, ...]
+
+    @classmethod
+    def of(cls, problem: Problem, noise: tuple[Whitener, ...], active: Array, count: int) -> _Part:
+        if len(active) == count:
+            return cls(problem, noise)
+        picked = tuple(w if w.matrix.ndim == 3 else replace(w, matrix=w.matrix[active]) for w in noise)
+        return cls(problem.take(active), picked)
+
+
+def _advance(
+    part: _Part, state: _State, active: Array, n: int, tolerance: float, damped: bool, iteration: int
+) -> None:
+    everything = len(active) == len(state.x)
+    now = state.equations if everything else _at(state.equations, active)
+    damping = state.damping[active] if damped else np.zeros(len(active))
+    move, solvable = step(now, damping)
+    gain = decrement(now, move, n)
+    x = state.x[active] + move
+    after = equations_at(part.problem, x, part.noise)
+    achieved, predicted = now.cost - after.cost, gain + damping * 0.0
+    noise_floor = 1e-13 * (1.0 + now.cost)
+    better = solvable & np.isfinite(after.cost) & ((achieved >= -noise_floor) if damped else True)
+    state.iterations[active] = iteration + 1
+    small = solvable & (np.abs(gain) <= tolerance**2)
+    _keep(state, active, better, x, after)
+    ratio = achieved / np.where(predicted > 0.0, predicted, 1.0)
+    factor = np.maximum(1.0 / 3.0, 1.0 - (2.0 * np.clip(ratio, 0.0, 1.0) - 1.0) ** 3)
+    factor = np.where(ratio > 0.9, 0.1, factor)
+    state.damping[active] = np.where(better, np.maximum(damping * factor, 1e-12), damping * state.growth[active] + 1e-12)
+    state.growth[active] = np.where(better, 2.0, 2.0 * state.growth[active])
+    state.status[active[small & (better | (damping < 1e-3))]] = Status.OK
+    state.status[active[~better & (state.damping[active] > 1e12)]] = Status.STALLED
+    if not damped:
+        state.status[active[~better]] = Status.NUMERICAL
+
+
+def _keep(state: _State, active: Array, better: Array, x: Array, after: Normal) -> None:
+    if better.all() and len(active) == len(state.x):
+        state.x, state.equations = x, _owned(after)
+        return
+    to = active[better]
+    state.x[to] = x[better]
+    for name in Normal.__slots__:
+        getattr(state.equations, name)[to] = getattr(after, name)[better]
+
+
+def _owned(equations: Normal) -> Normal:
+    arrays = (getattr(equations, name) for name in Normal.__slots__)
+    return Normal(*(array if array.flags.writeable else np.array(array) for array in arrays))
+
+
+def _at(equations: Normal, index: Array) -> Normal:
+    return Normal(*(getattr(equations, name)[index] for name in Normal.__slots__))

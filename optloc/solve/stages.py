@@ -1,0 +1,112 @@
+"""The stages that a method is made of; each is a solver of its own: (problem, fix or None) -> fix."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from time import perf_counter
+
+import numpy as np
+
+from optloc.errors import InvalidProblem
+from optloc.fix import Fix, Stage
+from optloc.noise import whiten
+from optloc.normal import Normal
+from optloc.problem import Problem
+from optloc.solve.refine import equations_at, refine
+from optloc.solve.start import mirrored, squared_range_starts, static, subarray_starts, vectors
+from optloc.solve.verdict import Candidates, judge
+from optloc.status import Status
+from optloc.types import Array
+
+Solver = Callable[[Problem, Fix | None], Fix]
+
+
+def gtrs(problem: Problem, fix: Fix | None) -> Fix:
+    """Return every stationary point of the weighted squared-range problem, unrefined."""
+    began = perf_counter()
+    position = squared_range_starts(static(problem))
+    half = position.shape[1] // 2
+    return _unrefined(problem, position[:, : max(half, 1)], fix, "gtrs", began)
+
+
+def everything(problem: Problem, fix: Fix | None) -> Fix:
+    """Return all candidates worth refining: stationary points of both weightings, mirrors, sub-arrays."""
+    began = perf_counter()
+    alone = static(problem)
+    position = squared_range_starts(alone)
+    parts = [position, mirrored(alone, position), subarray_starts(alone)]
+    return _unrefined(problem, np.concatenate(parts, axis=1), fix, "candidates", began)
+
+
+def lsr(problem: Problem, fix: Fix | None, *, damped: bool = True, limit: int = 100) -> Fix:
+    """Return the refined maximum-likelihood fix: best of all candidates of the stage before."""
+    if fix is None:
+        raise InvalidProblem("lsr refines a start", "method", "give start= or a method such as 'gtrs+lsr'")
+    began = perf_counter()
+    pool = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
+    item, slot = np.nonzero(np.isfinite(pool).all(-1))
+    cost, code = np.full(pool.shape[:2], np.inf), np.full(pool.shape[:2], int(Status.NUMERICAL), dtype=np.int8)
+    pool = np.array(pool)
+    detail = "nothing to refine"
+    if len(item):
+        whole = len(item) == len(pool) and bool((item == np.arange(len(pool))).all())
+        done = refine(problem if whole else problem.take(item), pool[item, slot], damped=damped, limit=limit)
+        pool[item, slot], cost[item, slot], code[item, slot] = done.x, done.cost, done.status
+        cost[~np.isfinite(cost)] = np.inf
+        detail = f"{len(item)} candidates, {int(done.iterations.max())} steps at most"
+    stage = Stage("lsr", detail, perf_counter() - began)
+    return judge(problem, Candidates(pool, cost, code), _equations, (*fix.stages, stage))
+
+
+def taylor(problem: Problem, fix: Fix | None) -> Fix:
+    """Return the result of plain undamped Taylor iteration: a baseline that diverges silently, kept for comparison."""
+    return lsr(problem, fix, damped=False, limit=50)
+
+
+def given(problem: Problem, start: Array) -> Fix:
+    """Return a given start (N, size) or (N, q, size) as an unrefined fix."""
+    began = perf_counter()
+    x = np.asarray(start, dtype=float)
+    x = x[:, None] if x.ndim == 2 else x
+    return _assembled(problem, x, None, "start", began)
+
+
+def _unrefined(problem: Problem, position: Array, fix: Fix | None, name: str, began: float) -> Fix:
+    finite = np.isfinite(position).all(-1)
+    order = np.argsort(~finite, axis=1, kind="stable")
+    keep = max(1, int(finite.sum(1).max(initial=0)))
+    position = np.take_along_axis(position, order[..., None], axis=1)[:, :keep]
+    x = vectors(problem, position)
+    return _assembled(problem, np.where(np.isfinite(position).all(-1, keepdims=True), x, np.nan), fix, name, began)
+
+
+def _assembled(problem: Problem, x: Array, fix: Fix | None, name: str, began: float) -> Fix:
+    from optloc.fix import Alternatives
+    from optloc.status import Certificate
+    from optloc.solve.verdict import degrees_of_freedom
+
+    size, n = len(x), problem.layout.n_shared
+    reason, certificate = np.empty(size, dtype=object), np.empty(size, dtype=object)
+    reason[:], certificate[:] = "not refined", Certificate("unknown", "a start, not refined", name)
+    stage = Stage(name, f"{x.shape[1]} candidates at most", perf_counter() - began)
+    return Fix(
+        x[:, 0],
+        np.full((size, n, n), np.nan),
+        problem.layout,
+        problem.frame,
+        np.full(size, int(Status.UNAVAILABLE), dtype=np.int8),
+        reason,
+        certificate,
+        Alternatives(x[:, 1:], np.full((size, x.shape[1] - 1), np.nan)),
+        np.full(size, np.nan),
+        degrees_of_freedom(problem),
+        np.broadcast_to(problem.weight, (size, problem.count)),
+        (*(fix.stages if fix else ()), stage),
+    )
+
+
+def _equations(problem: Problem, x: Array) -> Normal:
+    return equations_at(problem, x, whiten(problem.noise, problem.weight))
+
+
+SOLVERS: dict[str, Solver] = {"gtrs": gtrs, "candidates": everything, "lsr": lsr, "taylor": taylor}

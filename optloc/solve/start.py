@@ -1,0 +1,88 @@
+"""Starts without a guess: closed forms give every candidate worth refining."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from optloc.models import MODELS
+from optloc.problem import Problem
+from optloc.solve.reduce import ranges
+from optloc.solve.squared import candidates
+from optloc.types import Array
+
+
+def squared_range_starts(problem: Problem, passes: int = 2) -> Array:
+    """Return all squared-range candidates (N, q, d) of a flat batch with one static target; NaN where there is none."""
+    position, valid = _by_form(problem, passes)
+    return np.where(valid[..., None], position, np.nan)
+
+
+def _by_form(problem: Problem, passes: int) -> tuple[Array, Array]:
+    """Solve problems whose ranges are free apart from those whose ranges are determined."""
+    found = ranges(problem)
+    if found is None or found.free.all() or not found.free.any():
+        return candidates(problem, found, passes)
+    parts = []
+    for mask in (found.free, ~found.free):
+        some = problem.take(np.flatnonzero(mask))
+        parts.append((mask, *candidates(some, ranges(some), passes)))
+    slots = max(position.shape[1] for _, position, _ in parts)
+    position = np.full((len(found.free), slots, problem.dimension), np.nan)
+    valid = np.zeros((len(found.free), slots), dtype=bool)
+    for mask, points, good in parts:
+        position[mask, : points.shape[1]] = points
+        valid[mask, : points.shape[1]] = good
+    return position, valid
+
+
+def mirrored(problem: Problem, position: Array) -> Array:
+    """Return points (N, ..., d) mirrored in the plane (or line) that fits the stations of each problem best."""
+    stations = problem.stations.position
+    flat = stations.reshape(*stations.shape[:-3], -1, stations.shape[-1])
+    centre = flat.mean(-2, keepdims=True)
+    _, vectors = np.linalg.eigh(np.swapaxes(flat - centre, -1, -2) @ (flat - centre))
+    normal = vectors[..., :, 0]
+    shape = (-1, *(1,) * (position.ndim - 2), position.shape[-1])
+    across, middle = normal.reshape(shape), centre.reshape(shape)
+    return position - 2.0 * ((position - middle) * across).sum(-1, keepdims=True) * across
+
+
+def subarray_starts(problem: Problem, passes: int = 2) -> Array:
+    """Return the candidates (N, q, d) of all arrays that lack one station; NaN where there is none."""
+    parts = []
+    for station in range(problem.stations.count):
+        weight = np.broadcast_to(problem.weight, (*problem.batch_shape, problem.count)).copy()
+        for rows, start in zip(problem.rows, problem.starts, strict=True):
+            taken = MODELS[rows.kind].stations
+            touched = ((rows.a == station) & (taken > 0)) | ((rows.b == station) & (taken > 1))
+            weight[:, start + np.flatnonzero(touched)] = 0.0
+        changed = (weight != problem.weight).any()
+        if changed and (weight > 0.0).any():
+            parts.append(squared_range_starts(problem.with_rows(weight=weight), passes))
+    if not parts:
+        return np.full((problem.batch_shape[0], 0, problem.dimension), np.nan)
+    return np.concatenate(parts, axis=1)
+
+
+def vectors(problem: Problem, position: Array) -> Array:
+    """Return full parameter vectors (N, q, size) with given positions and every other unknown at its prior mean."""
+    layout = problem.layout
+    x = np.zeros((*position.shape[:-1], layout.size))
+    for bias in problem.biases:
+        slot, _ = layout.find(bias.name)
+        x[..., slot.start : slot.start + slot.size] = np.ravel(bias.mean) if bias.sigma is not None else 0.0
+    for prior in problem.priors:
+        slot, shared = layout.find(prior.name)
+        if shared:
+            x[..., slot.start : slot.start + slot.size] = prior.mean if prior.mean.ndim == 1 else prior.mean[:, None]
+    slot, _ = layout.find("position")
+    x[..., slot.start : slot.start + slot.size] = position
+    return x
+
+
+def static(problem: Problem) -> Problem:
+    """Return the problem of the position alone: one static target, nothing else unknown but emission times."""
+    motions = tuple(replace(motion, order=0) for motion in problem.motions)
+    return replace(problem, motions=motions, biases=(), priors=())

@@ -1,0 +1,159 @@
+"""The values of an estimation problem: frozen records of arrays, SI units and radians, leading axes are batch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+Array = np.ndarray[Any, np.dtype[Any]]
+
+
+@dataclass(frozen=True, slots=True)
+class Stations:
+    """Where the stations are.
+
+    Parameters
+    ----------
+    position : array (..., k or 1, s, d)
+        Metres, in the problem's frame; one entry along the epoch axis for stations that stay.
+    names : tuple of s str
+        Unique names.
+    velocity : array (..., k or 1, s, d), optional
+        Metres per second.
+    axes : array (..., k or 1, s, d, d), optional
+        Rows are the unit vectors of each station's own axes, in the problem's frame; None: the frame's axes.
+    covariance : array (..., s, d, d), optional
+        Covariance of the position errors, square metres; None: surveyed exactly.
+    span : "epoch" or "run"
+        Whether a position error is drawn anew at each epoch or lasts the whole run.
+    """
+
+    position: Array
+    names: tuple[str, ...]
+    velocity: Array | None = None
+    axes: Array | None = None
+    covariance: Array | None = None
+    span: Literal["epoch", "run"] = "epoch"
+
+    @property
+    def dimension(self) -> int:
+        """Return 2 or 3."""
+        return int(self.position.shape[-1])
+
+    @property
+    def count(self) -> int:
+        """Return the number of stations."""
+        return int(self.position.shape[-2])
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """Measurements of one kind.
+
+    Parameters
+    ----------
+    kind : str
+        A key of `optloc.MODELS`.
+    z : array (..., m)
+        Measured values, SI units or radians.
+    a, b : int array (m,)
+        Stations of each row; -1 where the kind takes none.
+    epoch : int array (m,)
+        Index into the problem's times.
+    target : int array (m,)
+        Index of the target; -1 for an unlabelled row.
+    weight : array (..., m)
+        1 for a row as measured, 0 for an absent one; between, its own variance is divided by the weight.
+    correction : array (..., m)
+        Known amount by which the measurement exceeds the model, for instance refraction.
+    """
+
+    kind: str
+    z: Array
+    a: Array
+    b: Array
+    epoch: Array
+    target: Array
+    weight: Array
+    correction: Array
+
+    @property
+    def count(self) -> int:
+        """Return the number of rows."""
+        return int(self.a.shape[0])
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """How one target moves: a polynomial in time over the whole run, or a free state at each epoch, or known.
+
+    Parameters
+    ----------
+    order : 0, 1 or 2
+        Position only; position and velocity; position, velocity and acceleration.
+    span : "run" or "epoch"
+        One state for the run, or an independent one at every epoch.
+    known : array (..., k or 1, order + 1, d), optional
+        The target's true state at each epoch (calibration); it is then not estimated.
+    reference : float, optional
+        Time at which the state of a run holds, seconds; None: the first epoch.
+    """
+
+    order: int = 0
+    span: Literal["run", "epoch"] = "run"
+    known: Array | None = None
+    reference: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Bias:
+    """A family of unknown systematic errors that share a name and a form, one per member.
+
+    Parameters
+    ----------
+    name : str
+        Name of the family, for instance "clock".
+    members : tuple of q str
+        Names of its members, for instance the stations.
+    row, member : int array (n,)
+        Sparse design: which global rows are touched, and by which member.
+    coefficient : float array (n,)
+        Sign or size of each touch, for instance +1 for station a and -1 for station b.
+    form : "offset", "scale", "drift" or "rotation"
+        Added to the measurement; times the measured quantity; times seconds since the first epoch; or a turn of
+        the station's axes (one angle in the plane, a rotation vector in space, `member` then names the station's mount).
+    mean : float array (q,) or (q, c)
+        Prior mean, in the unit of the form.
+    sigma : float array like `mean`, optional
+        Prior standard deviation; None: unknown.
+    """
+
+    name: str
+    members: tuple[str, ...]
+    row: Array
+    member: Array
+    coefficient: Array
+    form: Literal["offset", "scale", "drift", "rotation"] = "offset"
+    mean: Array = field(default_factory=lambda: np.zeros(1))
+    sigma: Array | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """Gaussian prior knowledge of one named part of the parameter vector.
+
+    Parameters
+    ----------
+    name : str
+        A slot of the problem's layout, for instance "position".
+    mean : array (..., n)
+        Mean in SI units.
+    covariance : array (..., n, n)
+        Covariance.
+    """
+
+    name: str
+    mean: Array
+    covariance: Array
