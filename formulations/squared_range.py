@@ -31,7 +31,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from formulations._diagonal import Finder, apply, solve_cone, solve_paraboloid
+from formulations._batch import apply
+from formulations._cone import Finder, solve_cone
+from formulations._interior import descend
+from formulations._paraboloid import solve_paraboloid
 from formulations.secular import everything, largest
 
 Array = NDArray[np.float64]
@@ -152,9 +155,7 @@ def minimiser(B: Array, g: Array, quadric: Quadric, *, positive: bool = False) -
     return y.reshape(*shape, quadric.size), ok.reshape(shape)
 
 
-def stationary(
-    B: Array, g: Array, quadric: Quadric, *, positive: bool = False
-) -> tuple[Array, Array, Mask]:
+def stationary(B: Array, g: Array, quadric: Quadric, *, positive: bool = False) -> tuple[Array, Array, Mask]:
     """All real stationary points of ``|By - g|^2`` on the quadric, the cheapest first.
 
     Parameters
@@ -218,10 +219,22 @@ def _batched(B: Array, g: Array, quadric: Quadric, find: Finder) -> tuple[Array,
             b, h = np.moveaxis(rows[part], 0, -1).copy(), right[part].T.copy()
             bad = ~(np.isfinite(b).all(axis=(0, 1)) & np.isfinite(h).all(axis=0))
             b[..., bad], h[..., bad] = 0.0, 0.0
-            points, found = solve(b, h, find)
+            points, found = solve(b, h, find) if find is everything else _cheapest(b, h, quadric)
             found &= np.isfinite(points).all(axis=0) & ~bad
             y[part], valid[part] = points.transpose(2, 1, 0), found.T
             left = apply(b, points) - h[:, None]
             cost[part] = (left * left).sum(axis=0).T
     y[~valid], cost[~valid] = np.nan, np.inf
     return y, cost, valid, shape
+
+
+def _cheapest(b: Array, h: Array, quadric: Quadric) -> tuple[Array, Mask]:
+    """Global minimisers: by the multiplier where that settles, else by the secular equation."""
+    y, settled = descend(b, h, quadric.square, quadric.linear)
+    found = np.ones((1, len(settled)), dtype=np.bool_)
+    hard = np.flatnonzero(~settled)
+    if hard.size:
+        solve = solve_cone if quadric.shape == "cone" else solve_paraboloid
+        points, found[:, hard] = solve(np.ascontiguousarray(b[..., hard]), np.ascontiguousarray(h[:, hard]), largest)
+        y[:, hard] = points[:, 0]
+    return y[:, None], found

@@ -1,0 +1,72 @@
+"""optloc: fixes and registrations from passive measurements, without a guess, with a covariance and a verdict."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from optloc.bounds import crlb
+from optloc.build import assemble, measured, station_array
+from optloc.epochs import by_epoch
+from optloc.errors import InvalidProblem, NoSolution, OptlocError
+from optloc.fix import Alternatives, Fix, Stage
+from optloc.frames import CARTESIAN, ECEF, Frame
+from optloc.layout import Layout
+from optloc.linear import Linear, linearise, predict
+from optloc.models import MODELS, Model
+from optloc.noise import Noise
+from optloc.normal import Normal, normal
+from optloc.problem import Problem
+from optloc.simulate import simulate
+from optloc.solve import METHODS, solve
+from optloc.solve.reduce import reduce
+from optloc.status import Certificate, Status
+from optloc.types import Bias, Motion, Prior, Rows, Stations
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "CARTESIAN",
+    "ECEF",
+    "METHODS",
+    "MODELS",
+    "Alternatives",
+    "Bias",
+    "Certificate",
+    "Fix",
+    "Frame",
+    "InvalidProblem",
+    "Layout",
+    "Linear",
+    "Model",
+    "Motion",
+    "NoSolution",
+    "Noise",
+    "Normal",
+    "OptlocError",
+    "Prior",
+    "Problem",
+    "Rows",
+    "Stage",
+    "Stations",
+    "Status",
+    "assemble",
+    "by_epoch",
+    "crlb",
+    "linearise",
+    "load",
+    "measured",
+    "normal",
+    "predict",
+    "reduce",
+    "simulate",
+    "solve",
+    "station_array",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name == "load":
+        from optloc.scenario import load
+
+        return load
+    raise AttributeError(f"module 'optloc' has no attribute {name!r}")

@@ -79,7 +79,7 @@ def measured(
     Returns
     -------
     Measured
-        To be given to `problem`.
+        To be given to `assemble`.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def measured(
     )
 
 
-def problem(
+def assemble(
     stations: Any,
     *measurements: Measured,
     times: Any = None,
@@ -229,3 +229,6 @@ def _arrival_blocks(rows: Rows, start: int, variance: Array) -> list[noises.Bloc
         covariance = noises.of_stations(design[inside], variance)
         blocks.append(noises.Block(start + inside[None], covariance[..., None, :, :]))
     return blocks
+
+
+problem = assemble

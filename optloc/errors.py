@@ -6,13 +6,15 @@ A well-posed call that finds no trustworthy answer returns a fix whose status sa
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from difflib import get_close_matches
 from typing import Any
 
 import numpy as np
 
 from optloc.status import Status
 
-__all__ = ["InvalidProblem", "NoSolution", "OptlocError"]
+__all__ = ["InvalidProblem", "NoSolution", "OptlocError", "nearest"]
 
 
 class OptlocError(Exception):
@@ -78,3 +80,25 @@ class NoSolution(OptlocError):  # noqa: N818  (a verdict about the problem)
         verdicts = {Status(int(code)): None for code in np.ravel(status)}
         refused = [verdict.sentence for verdict in verdicts if verdict is not Status.OK]
         return " ".join(refused or [verdict.sentence for verdict in verdicts])
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """Return advice for an unknown word: the nearest known ones, then all of them.
+
+    Parameters
+    ----------
+    word : str
+        What the user wrote.
+    known : iterable of str
+        What would have been understood.
+
+    Returns
+    -------
+    str
+        ``"did you mean 'km'? known are m, km"``.
+    """
+    names = list(known)
+    folded = {name.lower(): name for name in names}
+    close = [repr(folded[name]) for name in get_close_matches(str(word).lower(), folded, n=2, cutoff=0.5)]
+    hint = f"did you mean {' or '.join(close)}? " if close else ""
+    return f"{hint}known are {', '.join(names)}"

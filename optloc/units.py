@@ -20,14 +20,13 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from types import MappingProxyType
 from typing import Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from optloc.errors import InvalidProblem
+from optloc.errors import InvalidProblem, nearest
 
 __all__ = [
     "SI_UNIT",
@@ -251,20 +250,15 @@ def sigma_to_si(
 
 def _check_options(unit: str, quantity: str, propagation_speed: float, convention: str, where: str | None) -> None:
     if quantity not in UNITS:
-        raise InvalidProblem(f"unknown quantity {quantity!r}", where, _nearest(quantity, list(UNITS)))
+        raise InvalidProblem(f"unknown quantity {quantity!r}", where, nearest(quantity, list(UNITS)))
     if unit not in UNITS[quantity]:  # type: ignore[index]  # just checked
         table = list(UNITS[quantity])  # type: ignore[index]
-        raise InvalidProblem(f"unknown unit {unit!r} for the quantity {quantity!r}", where, _nearest(unit, table))
+        raise InvalidProblem(f"unknown unit {unit!r} for the quantity {quantity!r}", where, nearest(unit, table))
     if convention not in get_args(AzimuthConvention):
-        advice = _nearest(convention, list(get_args(AzimuthConvention)))
+        advice = nearest(convention, list(get_args(AzimuthConvention)))
         raise InvalidProblem(f"unknown azimuth convention {convention!r}", where, advice)
     if not (math.isfinite(propagation_speed) and propagation_speed > 0):
         raise InvalidProblem(f"the propagation speed must be positive, not {propagation_speed:g} m/s", where)
 
 
-def _nearest(word: str, known: list[str]) -> str:
-    """Advise the nearest known words, then all of them."""
-    folded = {name.lower(): name for name in known}
-    close = [repr(folded[name]) for name in get_close_matches(str(word).lower(), folded, n=2, cutoff=0.5)]
-    hint = f"did you mean {' or '.join(close)}? " if close else ""
-    return f"{hint}known are {', '.join(known)}"
+_nearest = nearest

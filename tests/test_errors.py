@@ -4,7 +4,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optloc.errors import InvalidProblem, NoSolution, OptlocError
+from optloc.errors import InvalidProblem, NoSolution, OptlocError, nearest
 from optloc.status import Status
 
 
@@ -40,3 +40,8 @@ def test_no_solution_of_a_batch_names_each_status_once():
 
 def test_no_solution_without_a_fix():
     assert str(NoSolution(None, None)) == "There is no fix."
+
+
+def test_nearest_ignores_case_and_lists_all():
+    assert nearest("KM", ["m", "km", "nmi"]).startswith("did you mean 'km'")
+    assert nearest("bogus", ["m", "km"]) == "known are m, km"

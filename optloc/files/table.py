@@ -80,10 +80,11 @@ class Table:
             column = np.array([None if np.isnan(v) else f"{v:.15g}" for v in column], dtype=object)
         elif column.dtype.kind == "M":
             column = np.datetime_as_string(column).astype(object)
-        empty = np.array([_empty(cell) for cell in column], dtype=bool)
-        if empty.any():
-            raise InvalidProblem("the cell is empty", self.where(key, int(np.flatnonzero(empty)[0])), "give a name")
-        return np.array([str(cell).strip() for cell in column], dtype=object)
+        spelled = {cell: "" if _empty(cell) else str(cell).strip() for cell in set(column.tolist())}
+        out = np.array(list(map(spelled.__getitem__, column.tolist())), dtype=object)
+        if "" in spelled.values():
+            raise InvalidProblem("the cell is empty", self.where(key, int(np.flatnonzero(out == "")[0])), "give a name")
+        return out
 
     def times(self, key: str, factor: float) -> Array:
         """Return a column of numbers (times `factor` seconds) or ISO 8601 dates as seconds (m,)."""

@@ -12,7 +12,7 @@ from optloc.fix import Fix
 from optloc.problem import Problem
 from optloc.solve.stages import SOLVERS, given
 
-METHODS = {"auto": "candidates+lsr"}
+METHODS = {"auto": "gtrs+lsr+widen+lsr"}
 
 
 def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:

@@ -20,22 +20,31 @@ from optloc.types import Array
 
 Solver = Callable[[Problem, Fix | None], Fix]
 
+_DOUBT = 1e-3
+
 
 def gtrs(problem: Problem, fix: Fix | None) -> Fix:
     """Return every stationary point of the weighted squared-range problem, unrefined."""
     began = perf_counter()
     position = squared_range_starts(static(problem))
-    half = position.shape[1] // 2
-    return _unrefined(problem, position[:, : max(half, 1)], fix, "gtrs", began)
+    return _unrefined(problem, position, fix, "gtrs", began)
 
 
-def everything(problem: Problem, fix: Fix | None) -> Fix:
-    """Return all candidates worth refining: stationary points of both weightings, mirrors, sub-arrays."""
+def widen(problem: Problem, fix: Fix | None) -> Fix:
+    """Return a refined fix with more candidates beside it: its mirror image, and where the verdict is not clean, sub-arrays."""
+    if fix is None:
+        raise InvalidProblem("widen adds candidates to a fix", "method", "put it behind a refinement")
     began = perf_counter()
     alone = static(problem)
-    position = squared_range_starts(alone)
-    parts = [position, mirrored(alone, position), subarray_starts(alone)]
-    return _unrefined(problem, np.concatenate(parts, axis=1), fix, "candidates", began)
+    seen = _positions(problem, fix)
+    parts = [seen, mirrored(alone, seen[:, :1])]
+    doubtful = np.flatnonzero((fix.code != Status.OK) | (fix.p_value < _DOUBT))
+    if len(doubtful):
+        extra = subarray_starts(alone.take(doubtful))
+        more = np.full((len(fix.x), 2 * extra.shape[1], problem.dimension), np.nan)
+        more[doubtful] = np.concatenate([extra, mirrored(alone.take(doubtful), extra)], axis=1)
+        parts.append(more)
+    return _unrefined(problem, np.concatenate(parts, axis=1), fix, "widen", began)
 
 
 def lsr(problem: Problem, fix: Fix | None, *, damped: bool = True, limit: int = 100) -> Fix:
@@ -69,6 +78,13 @@ def given(problem: Problem, start: Array) -> Fix:
     x = np.asarray(start, dtype=float)
     x = x[:, None] if x.ndim == 2 else x
     return _assembled(problem, x, None, "start", began)
+
+
+def _positions(problem: Problem, fix: Fix) -> Array:
+    """Return the positions (N, q, d) of a fix and its alternatives."""
+    slot, _ = problem.layout.find("position")
+    pool = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
+    return pool[..., slot.start : slot.start + slot.size]
 
 
 def _unrefined(problem: Problem, position: Array, fix: Fix | None, name: str, began: float) -> Fix:
@@ -109,4 +125,4 @@ def _equations(problem: Problem, x: Array) -> Normal:
     return equations_at(problem, x, whiten(problem.noise, problem.weight))
 
 
-SOLVERS: dict[str, Solver] = {"gtrs": gtrs, "candidates": everything, "lsr": lsr, "taylor": taylor}
+SOLVERS: dict[str, Solver] = {"gtrs": gtrs, "widen": widen, "lsr": lsr, "taylor": taylor}

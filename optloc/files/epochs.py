@@ -1,0 +1,145 @@
+"""Put rows together to epochs: by a column of labels, by exact time, or by windows of time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from optloc.errors import InvalidProblem
+from optloc.types import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Keys:
+    """What the rows of all measurements say about their epochs.
+
+    Parameters
+    ----------
+    label : object array (m,), optional
+        Epoch column.
+    time : array (m,), optional
+        Time column, seconds.
+    written : object array (m,), optional
+        The time column as it was written.
+    target : object array (m,), optional
+        Target column.
+    """
+
+    label: Array | None
+    time: Array | None
+    written: Array | None
+    target: Array | None
+
+
+@dataclass(frozen=True, slots=True)
+class Epochs:
+    """The epochs of a problem.
+
+    Parameters
+    ----------
+    index : int array (m,)
+        Epoch of each row.
+    target : int array (m,)
+        Target of each row.
+    labels : tuple of k str
+        What the file calls them.
+    times : array (k,)
+        Seconds as the file gives them; NaN where it gives none.
+    targets : tuple of str
+        Names of the targets, or of the target of each epoch where `own`.
+    own : bool
+        Whether every epoch belongs to one target: free targets share nothing.
+    """
+
+    index: Array
+    target: Array
+    labels: tuple[str, ...]
+    times: Array
+    targets: tuple[str, ...]
+    own: bool = False
+
+    @property
+    def count(self) -> int:
+        """Return the number of epochs k."""
+        return len(self.labels)
+
+    @property
+    def clock(self) -> Array:
+        """Return strictly increasing seconds (k,): the times, or the numbers of the epochs where those are no such thing."""
+        dated = bool(np.isfinite(self.times).all() and (np.diff(self.times) > 0.0).all())
+        return self.times if dated else np.arange(float(self.count))
+
+
+def epochs_of(keys: Keys, count: int, window: float | None, free: bool | None) -> Epochs:
+    """Return the epochs of rows.
+
+    Parameters
+    ----------
+    keys : Keys
+        Columns of all rows.
+    count : int
+        Number of rows m.
+    window : float, optional
+        Seconds that make one epoch; None: rows of exactly equal time.
+    free : bool, optional
+        Whether targets are free at each epoch; None: where there are several epochs.
+    """
+    index, labels, times = _grouped(keys, count, window)
+    if keys.target is None:
+        return Epochs(index, np.zeros(count, dtype=np.int64), labels, times, ("target",))
+    names, target = np.unique(keys.target.astype(str), return_inverse=True)
+    if len(names) == 1 or not (len(labels) > 1 if free is None else free):
+        return Epochs(index, target, labels, times, tuple(names.tolist()))
+    pairs, index = np.unique(index * len(names) + target, return_inverse=True)
+    epoch, owner = pairs // len(names), pairs % len(names)
+    owners = tuple(names[owner].tolist())
+    chosen = tuple(np.array(labels, dtype=object)[epoch].tolist())
+    return Epochs(index, np.zeros(count, dtype=np.int64), chosen, times[epoch], owners, own=True)
+
+
+def _grouped(keys: Keys, count: int, window: float | None) -> tuple[Array, tuple[str, ...], Array]:
+    """Return index (m,), labels and times (k,), in the order of time, else of number, else of appearance."""
+    if keys.label is None and keys.time is None:
+        return np.zeros(count, dtype=np.int64), ("0",), np.full(1, np.nan)
+    if keys.label is not None:
+        values, first, index = np.unique(keys.label.astype(str), return_index=True, return_inverse=True)
+        rank = _numbers(values)
+        order = np.argsort(first if rank is None else rank, kind="stable")
+        labels = values.astype(object)
+    else:
+        assert keys.time is not None and keys.written is not None
+        bins = keys.time if window is None else np.floor((keys.time - keys.time.min()) / window + 1e-9)
+        _, first, index = np.unique(bins, return_index=True, return_inverse=True)
+        order, labels = np.arange(len(first)), keys.written[first].astype(str).astype(object)
+    times = np.full(len(first), np.nan)
+    if keys.time is not None:
+        # Differences from the first row: equal times stay exactly themselves.
+        base = keys.time[first]
+        times = base + np.bincount(index, keys.time - base[index]) / np.bincount(index)
+        order = order[np.argsort(times[order], kind="stable")]
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    return place[index], tuple(labels[order].tolist()), times[order]
+
+
+def _numbers(values: Array) -> Array | None:
+    try:
+        return values.astype(np.float64)
+    except ValueError:
+        return None
+
+
+def need_clock(epochs: Epochs, why: str, source: str) -> Array:
+    """Return strictly increasing times; raise InvalidProblem where the file gives none."""
+    if epochs.count > 1 and not np.isfinite(epochs.times).all():
+        raise InvalidProblem(f"{why} needs the time of each epoch", source, "give the measurements a column 'time'")
+    twice = np.flatnonzero(np.diff(epochs.times) <= 0.0)
+    if len(twice):
+        one, two = epochs.labels[twice[0]], epochs.labels[twice[0] + 1]
+        raise InvalidProblem(
+            f"the epochs {one!r} and {two!r} have the same time, but {why} tells epochs apart by their times",
+            source,
+            "correct the times, or give both one label",
+        )
+    return epochs.clock

@@ -1,0 +1,197 @@
+"""Stations and frame from a table: lengths in any unit, latitudes and longitudes, moving stations."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from optloc.errors import InvalidProblem
+from optloc.files.epochs import Epochs
+from optloc.files.schema import FrameTable, StationsTable
+from optloc.files.table import Table
+from optloc.files.words import Units, join
+from optloc.frames import CARTESIAN, ECEF, Frame, ecef_to_geodetic
+from optloc.types import Array, Stations
+
+_XYZ, _GEODETIC, _RATES = ("x", "y", "z"), ("lat_deg", "lon_deg", "height"), ("vx", "vy", "vz")
+_QUATERNION = ("qw", "qx", "qy", "qz")
+
+
+@dataclass(frozen=True, slots=True)
+class Survey:
+    """Stations as the rows of their table say, before they are spread over epochs.
+
+    Parameters
+    ----------
+    names : tuple of s str
+        Stations in the order of appearance.
+    index : int array (n,)
+        Station of each row.
+    position : array (n, d)
+        Metres, in the frame.
+    velocity : array (n, d), optional
+        Metres per second.
+    axes : array (n, d, d), optional
+        Unit vectors in rows.
+    sigma : array (n,), optional
+        Standard deviation of each coordinate, metres.
+    table : Table
+        The rows.
+    """
+
+    names: tuple[str, ...]
+    index: Array
+    position: Array
+    velocity: Array | None
+    axes: Array | None
+    sigma: Array | None
+    table: Table
+
+    @property
+    def moving(self) -> bool:
+        """Return whether the table dates its rows."""
+        return self.table.has("time") or self.table.has("epoch")
+
+
+def survey(section: StationsTable, table: Table, frame_table: FrameTable, where: str) -> tuple[Survey, Frame]:
+    """Return the stations of a table and the frame of the problem."""
+    labels = table.labels("name")
+    found, first, index = np.unique(labels.astype(str), return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    names = tuple(found[order].tolist())
+    index = np.argsort(order)[index]
+    if len(names) < table.count and not (table.has("time") or table.has("epoch")):
+        row = int(np.setdiff1d(np.arange(table.count), first)[0])
+        advice = "rename one, or give moving stations a column 'time' or 'epoch'"
+        raise InvalidProblem(f"station name {labels[row]!r} is used twice", table.where("name", row), advice)
+    position, frame = _positions(table, frame_table, Units("length").conversion(section.unit, where).factor, where)
+    d = position.shape[-1]
+    rates = [key for key in _RATES[:d] if table.has(key)]
+    velocity = None
+    if rates:
+        factor = Units("speed").conversion(section.speed_unit, where).factor
+        velocity = factor * np.stack([table.numbers(key) for key in _RATES[:d]], axis=-1)
+        if frame.geodetic and frame_table.kind == "geodetic":
+            velocity = np.einsum("nij,ni->nj", frame.enu_axes(position), velocity)
+    axes = _axes(section, table, frame, position)
+    return Survey(names, index, position, velocity, axes, _sigma(section, table, where), table), frame
+
+
+def _positions(table: Table, wanted: FrameTable, factor: float, where: str) -> tuple[Array, Frame]:
+    plane, globe = table.has("x") or table.has("y"), table.has("lat_deg") or table.has("lon_deg")
+    if plane and globe:
+        advice = "give every station x, y, z, or every one lat_deg, lon_deg, height"
+        raise InvalidProblem("the stations mix x, y with latitude and longitude", table.source, advice)
+    if globe and wanted.kind == "cartesian":
+        advice = "write kind = \"geodetic\", \"ecef\" or \"enu\" in [frame]"
+        raise InvalidProblem("latitudes and longitudes have no place in a cartesian frame", table.source, advice)
+    if not globe:
+        if wanted.kind == "geodetic":
+            raise InvalidProblem("the frame is geodetic, but the stations have no lat_deg and lon_deg", table.source, "add them")
+        d = wanted.dimension or (3 if table.has("z") else 2)
+        return factor * np.stack([table.numbers(key) for key in _XYZ[:d]], axis=-1), _frame(wanted, where)
+    lat, lon = (np.radians(table.numbers(key)) for key in _GEODETIC[:2])
+    height = factor * table.numbers("height") if table.has("height") else np.zeros(table.count)
+    ecef = ECEF.from_geodetic(lat, lon, height, where=table.source, first_row=1)
+    if wanted.kind == "enu" and wanted.origin is None:
+        frame = Frame("enu", tuple(float(v) for v in ecef_to_geodetic(ecef.mean(0))))  # type: ignore[arg-type]
+    else:
+        frame = _frame(wanted, where)
+    return frame.from_ecef(ecef)[:, : _dimension(wanted, frame, where)], frame
+
+
+def _dimension(wanted: FrameTable, frame: Frame, where: str) -> int:
+    if wanted.dimension == 2 and frame.kind != "enu":
+        raise InvalidProblem("only a cartesian or enu frame has two dimensions", join(where, "[frame]"), 'use kind = "enu"')
+    return wanted.dimension or 3
+
+
+def _frame(wanted: FrameTable, where: str) -> Frame:
+    place = wanted.origin
+    if wanted.kind == "enu" and place is not None:
+        return Frame.enu(lat_deg=place.lat_deg, lon_deg=place.lon_deg, height=place.height)
+    if wanted.kind == "enu":
+        advice = "write origin = { lat_deg = ..., lon_deg = ..., height = ... }"
+        raise InvalidProblem("an enu frame of stations in x, y, z needs its origin", join(where, "[frame]"), advice)
+    if place is not None:
+        raise InvalidProblem(f"the frame {wanted.kind!r} has no origin", join(where, "[frame]"), 'only kind = "enu" has one')
+    return CARTESIAN if wanted.kind == "cartesian" else ECEF
+
+
+def _axes(section: StationsTable, table: Table, frame: Frame, position: Array) -> Array | None:
+    """Return the axes (n, d, d) of each row, None where they are the frame's."""
+    n, d = position.shape
+    local = section.axes == "enu" or (section.axes is None and frame.geodetic)
+    base = frame.enu_axes(position) if local else np.broadcast_to(np.eye(d), (n, d, d))
+    turn = _turn(table, d)
+    if turn is None:
+        return base if local and not np.allclose(base, np.eye(d), rtol=0.0, atol=1e-15) else None
+    return np.asarray(np.swapaxes(turn, -1, -2) @ base)
+
+
+def _turn(table: Table, d: int) -> Array | None:
+    """Return the rotations (n, d, d) that columns of the table give, from the station's axes to the base axes."""
+    from scipy.spatial.transform import Rotation
+
+    if table.has("yaw_deg") or table.has("heading_deg"):
+        yaw = table.numbers("yaw_deg") if table.has("yaw_deg") else -table.numbers("heading_deg")
+        return np.asarray(Rotation.from_euler("z", yaw, degrees=True).as_matrix()[:, :d, :d])
+    if not any(table.has(key) for key in _QUATERNION):
+        return None
+    if d == 2:
+        raise InvalidProblem("a quaternion turns axes in space, but the stations have x and y only", table.source, "use yaw_deg")
+    parts = np.stack([table.numbers(key) for key in _QUATERNION], axis=-1)
+    length = np.linalg.norm(parts, axis=-1)
+    bad = np.flatnonzero(np.abs(length - 1.0) > 1e-2)
+    if len(bad):
+        what = f"the quaternion has length {length[bad[0]]:.4g}, not 1"
+        raise InvalidProblem(what, table.where("qw", int(bad[0])), "check the order w, x, y, z")
+    return np.asarray(Rotation.from_quat(parts[:, [1, 2, 3, 0]]).as_matrix())
+
+
+def _sigma(section: StationsTable, table: Table, where: str) -> Array | None:
+    units = Units("length")
+    if table.has("sigma"):
+        sigma = units.conversion(section.unit, where).sigma_to_si(table.numbers("sigma"))
+    elif section.sigma is not None:
+        number, unit = units.amount(section.sigma, units.conversion(section.unit, where), join(where, "[stations]", "key 'sigma'"))
+        sigma = np.full(table.count, float(unit.sigma_to_si(number)))
+    else:
+        return None
+    bad = np.flatnonzero(sigma <= 0.0)
+    if len(bad):
+        place = table.where("sigma", int(bad[0])) if table.has("sigma") else join(where, "[stations]", "key 'sigma'")
+        raise InvalidProblem("a standard deviation is not positive", place, "leave sigma out for surveyed stations")
+    return sigma
+
+
+def over_epochs(found: Survey, section: StationsTable, epochs: Epochs, used: Sequence[Array]) -> Stations:
+    """Return the stations at the epochs.
+
+    Parameters
+    ----------
+    found : Survey
+        Rows of the station table.
+    section : StationsTable
+        Its settings.
+    epochs : Epochs
+        Epochs of the measurements.
+    used : sequence of int array (u, 2)
+        Pairs (epoch, station) whose position is needed.
+    """
+    from optloc.files.moving import spread
+
+    s = len(found.names)
+    if found.moving:
+        position, velocity, axes = spread(found, section, epochs, np.concatenate(used))
+    else:
+        order = np.argsort(found.index)
+        position, velocity, axes = (None if v is None else v[order][None] for v in (found.position, found.velocity, found.axes))
+    covariance = None
+    if found.sigma is not None:
+        first = np.array([np.flatnonzero(found.index == i)[0] for i in range(s)])
+        covariance = found.sigma[first, None, None] ** 2 * np.eye(found.position.shape[-1])
+    assert position is not None
+    return Stations(position, found.names, velocity, axes, covariance, section.span)
