@@ -19,7 +19,7 @@ from formulations._batch import across, normal
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_STEPS = 8
+_STEPS = 5
 _WEAK = 1e-7  # a pivot below this share of the largest entry: the secular equation is the better tool
 _SETTLED = 1e-7  # relative change of y below which the last, polishing step squares the error away
 

@@ -25,6 +25,7 @@ eqs. 10-16 (paraboloid) and 38-45 (cone).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
@@ -40,7 +41,7 @@ from formulations.secular import everything, largest
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-_CHUNK = 1024
+_CHUNK = 2048
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,12 +146,20 @@ def minimiser(B: Array, g: Array, quadric: Quadric, *, positive: bool = False) -
     -----
     More (1993), theorem 3.2; Beck, Stoica and Li (2008), eqs. 14-16 and 43-45.
     """
-    y, cost, valid, shape = _batched(B, g, quadric, largest)
-    y, ok = y[:, 0], valid[:, 0]
+    rows, right, shape = _flat(B, g, quadric)
+    y, ok = np.empty((len(rows), quadric.size)), np.empty(len(rows), dtype=np.bool_)
+    with np.errstate(all="ignore"):
+        for part, b, h, _ in _chunks(rows, right):
+            points, ok[part] = descend(b, h, quadric.square, quadric.linear)
+            y[part] = points.T
+    # what does not settle is gathered over all chunks: small batches are dear
+    hard = np.flatnonzero(~ok)
+    if hard.size:
+        points, _, valid = _solved(rows[hard], right[hard], quadric, largest)
+        y[hard], ok[hard] = points[:, 0], valid[:, 0]
     if positive and quadric.shape == "cone":
         wrong = np.flatnonzero(ok & (y[:, -1] < 0.0))
         if wrong.size:
-            rows, right = _flat(B, g, quadric)
             y[wrong] = stationary(rows[wrong], right[wrong], quadric, positive=True)[0][:, 0]
     return y.reshape(*shape, quadric.size), ok.reshape(shape)
 
@@ -184,7 +193,8 @@ def stationary(B: Array, g: Array, quadric: Quadric, *, positive: bool = False) 
     Real roots of the numerator of the secular equation, without forming it. Where ``B'B`` has rank n - 1, both
     intersections of the line of least-squares solutions with the quadric are among them.
     """
-    y, cost, valid, shape = _batched(B, g, quadric, everything)
+    rows, right, shape = _flat(B, g, quadric)
+    y, cost, valid = _solved(rows, right, quadric, everything)
     if positive:
         valid &= y[..., -1] >= 0.0
     y[~valid], cost[~valid] = np.nan, np.inf
@@ -195,46 +205,39 @@ def stationary(B: Array, g: Array, quadric: Quadric, *, positive: bool = False) 
     return y.reshape(*shape, k, n), cost.reshape(*shape, k), valid.reshape(*shape, k)
 
 
-def _flat(B: Array, g: Array, quadric: Quadric) -> tuple[Array, Array]:
+def _flat(B: Array, g: Array, quadric: Quadric) -> tuple[Array, Array, tuple[int, ...]]:
+    """Inputs with one batch axis, and the leading axes they had."""
     B, g = np.asarray(B, dtype=np.float64), np.asarray(g, dtype=np.float64)
     if B.ndim < 2 or g.ndim < 1 or B.shape[-1] != quadric.size or B.shape[-2] != g.shape[-1]:
         raise ValueError(f"rows {B.shape} and right sides {g.shape} do not fit a quadric of size {quadric.size}")
     shape = np.broadcast_shapes(B.shape[:-2], g.shape[:-1])
-    rows = np.broadcast_to(B, (*shape, *B.shape[-2:])).reshape(-1, *B.shape[-2:])
-    return rows, np.broadcast_to(g, (*shape, g.shape[-1])).reshape(-1, g.shape[-1])
+    count = int(np.prod(shape))
+    rows = np.broadcast_to(B, (*shape, *B.shape[-2:])).reshape(count, *B.shape[-2:])
+    return rows, np.broadcast_to(g, (*shape, g.shape[-1])).reshape(count, g.shape[-1]), shape
 
 
-def _batched(B: Array, g: Array, quadric: Quadric, find: Finder) -> tuple[Array, Array, Mask, tuple[int, ...]]:
-    """Run chunks that fit the cache, with the batch on the last axis inside."""
-    rows, right = _flat(B, g, quadric)
-    shape = np.broadcast_shapes(np.shape(B)[:-2], np.shape(g)[:-1])
+def _chunks(rows: Array, right: Array) -> Iterator[tuple[slice, Array, Array, Mask]]:
+    """Yield parts that fit the cache, the batch on the last axis; items that are not finite are zeroed and named."""
+    for i in range(0, len(rows), _CHUNK):
+        part = slice(i, i + _CHUNK)
+        b, h = np.moveaxis(rows[part], 0, -1).copy(), right[part].T.copy()
+        bad = ~(np.isfinite(b).all(axis=(0, 1)) & np.isfinite(h).all(axis=0))
+        b[..., bad], h[..., bad] = 0.0, 0.0
+        yield part, b, h, bad
+
+
+def _solved(rows: Array, right: Array, quadric: Quadric, find: Finder) -> tuple[Array, Array, Mask]:
+    """Points, costs and validity of every slot by the secular equation."""
     slots = 1 if find is largest else 2 * quadric.size - 1
     count, n = len(rows), quadric.size
     y, cost = np.empty((count, slots, n)), np.empty((count, slots))
     valid = np.empty((count, slots), dtype=np.bool_)
     solve = solve_cone if quadric.shape == "cone" else solve_paraboloid
     with np.errstate(all="ignore"):
-        for i in range(0, count, _CHUNK):
-            part = slice(i, i + _CHUNK)
-            b, h = np.moveaxis(rows[part], 0, -1).copy(), right[part].T.copy()
-            bad = ~(np.isfinite(b).all(axis=(0, 1)) & np.isfinite(h).all(axis=0))
-            b[..., bad], h[..., bad] = 0.0, 0.0
-            points, found = solve(b, h, find) if find is everything else _cheapest(b, h, quadric)
+        for part, b, h, bad in _chunks(rows, right):
+            points, found = solve(b, h, find)
             found &= np.isfinite(points).all(axis=0) & ~bad
-            y[part], valid[part] = points.transpose(2, 1, 0), found.T
             left = apply(b, points) - h[:, None]
-            cost[part] = (left * left).sum(axis=0).T
+            y[part], valid[part], cost[part] = points.transpose(2, 1, 0), found.T, (left * left).sum(axis=0).T
     y[~valid], cost[~valid] = np.nan, np.inf
-    return y, cost, valid, shape
-
-
-def _cheapest(b: Array, h: Array, quadric: Quadric) -> tuple[Array, Mask]:
-    """Global minimisers: by the multiplier where that settles, else by the secular equation."""
-    y, settled = descend(b, h, quadric.square, quadric.linear)
-    found = np.ones((1, len(settled)), dtype=np.bool_)
-    hard = np.flatnonzero(~settled)
-    if hard.size:
-        solve = solve_cone if quadric.shape == "cone" else solve_paraboloid
-        points, found[:, hard] = solve(np.ascontiguousarray(b[..., hard]), np.ascontiguousarray(h[:, hard]), largest)
-        y[:, hard] = points[:, 0]
-    return y[:, None], found
+    return y, cost, valid

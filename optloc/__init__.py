@@ -66,7 +66,7 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     if name == "load":
-        from optloc.scenario import load
+        from optloc.files import load
 
         return load
     raise AttributeError(f"module 'optloc' has no attribute {name!r}")

@@ -215,15 +215,17 @@ def _graph(design: Array, stations: int) -> Graph:
                     break
                 reach = wider
             group[reach] = node
-    sign = np.zeros(count, dtype=int)
-    sizes = {}
+    sign, determined = np.zeros(count, dtype=int), np.zeros(count, dtype=bool)
     for name in np.unique(group[group >= 0]):
         nodes = np.flatnonzero(group == name)
         inner = design[:, nodes]
         values, vectors = np.linalg.eigh(inner.T @ inner)
         if values[0] < 1e-9 * max(values[-1], 1.0):
             sign[nodes] = np.sign(vectors[:, 0] * vectors[np.argmax(np.abs(vectors[:, 0])), 0]).astype(int)
-        sizes[int(name)] = int((nodes < stations).sum())
+        else:
+            determined[nodes] = True
+    group[determined] = count  # ranges that are all known belong together, linked or not
+    sizes = {int(name): int((group[:stations] == name).sum()) for name in np.unique(group[group >= 0])}
     main = max(sizes, key=lambda name: (sizes[name], -name)) if sizes else -1
     return Graph(group, sign, main)
 

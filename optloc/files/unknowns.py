@@ -1,0 +1,180 @@
+"""Motions, biases and priors of a problem file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from optloc.errors import InvalidProblem
+from optloc.files.epochs import Epochs
+from optloc.files.schema import BiasTable, PriorTable, ProblemFile, TargetTable
+from optloc.files.words import Units, join, nearest
+from optloc.models import MODELS
+from optloc.types import Array, Bias, Motion, Prior, Rows
+from optloc.units import Quantity
+
+_ORDERS = {"static": 0, "free": 0, "constant_velocity": 1, "constant_acceleration": 2}
+_STATES: dict[str, tuple[Quantity, str]] = {
+    "position": ("length", "m"),
+    "velocity": ("speed", "m/s"),
+    "acceleration": ("plain", "1"),
+    "emission": ("length", "m"),
+}
+
+
+def motions_of(file: ProblemFile, epochs: Epochs, source: str) -> tuple[Motion, ...]:
+    """Return the motion of each target."""
+    names = ("target",) if epochs.own else epochs.targets
+    unknown = [name for name in file.targets if name not in epochs.targets]
+    if unknown:
+        raise InvalidProblem(
+            f"no row has the target {unknown[0]!r}", join(source, "[targets]"), nearest(unknown[0], sorted(set(epochs.targets)))
+        )
+    return tuple(_motion(file.targets.get(name, file.target), epochs.count) for name in names)
+
+
+def _motion(table: TargetTable, count: int) -> Motion:
+    motion = table.motion or ("static" if count == 1 else "free")
+    return Motion(_ORDERS[motion], "epoch" if motion == "free" and count > 1 else "run", reference=table.reference)
+
+
+def needs_clock(motions: Sequence[Motion], biases: Sequence[BiasTable]) -> str | None:
+    """Return why the times of the epochs matter, or None."""
+    if any(motion.order > 0 for motion in motions):
+        return "a moving target"
+    return "a drift" if any(bias.form == "drift" for bias in biases) else None
+
+
+def bias_of(
+    table: BiasTable, rows: Sequence[Rows], stations: Sequence[str], dimension: int, speed: float, source: str
+) -> Bias:
+    """Return a family of biases over the rows of a problem."""
+    where = join(source, f"[[biases]] {table.name!r}")
+    touches = _touched(table, rows, where)
+    members, row, member, coefficient = _members(table, touches, stations, where)
+    block = touches[0][0]
+    quantity: Quantity = MODELS[block.kind].quantity  # type: ignore[assignment]  # the table holds known quantities only
+    if table.form == "rotation" and not MODELS[block.kind].axes:
+        raise InvalidProblem(f"{block.kind} has no axes that could be turned", where, 'use form = "offset"')
+    turns = (3,) if table.form == "rotation" and dimension == 3 else ()
+    mean, sigma = _prior(table, quantity, speed, (len(members), *turns), where)
+    return Bias(table.name, members, row, member, coefficient, table.form, mean, sigma)
+
+
+def _touched(table: BiasTable, rows: Sequence[Rows], where: str) -> list[tuple[Rows, int]]:
+    starts = np.cumsum([0, *(block.count for block in rows)]).tolist()
+    kinds = [block.kind for block in rows]
+    if table.kind is not None and table.kind not in kinds:
+        raise InvalidProblem(f"there are no rows of kind {table.kind!r}", join(where, "key 'kind'"), nearest(table.kind, kinds))
+    chosen = [
+        (block, start)
+        for block, start in zip(rows, starts, strict=False)
+        if table.kind in {None, block.kind} and (table.form != "rotation" or MODELS[block.kind].axes or table.kind)
+    ]
+    if not chosen:
+        raise InvalidProblem("no rows depend on the axes of stations", where, "leave the bias out")
+    if len({MODELS[block.kind].quantity for block, _ in chosen}) > 1:
+        raise InvalidProblem("the rows measure different quantities", where, "name the kind that it touches")
+    return chosen
+
+
+@dataclass(slots=True)
+class _Touches:
+    row: list[Array]
+    member: list[Array]
+    coefficient: list[Array]
+
+    def add(self, row: Array, member: Array, coefficient: Array) -> None:
+        inside = member >= 0
+        self.row.append(row[inside])
+        self.member.append(member[inside])
+        self.coefficient.append(coefficient[inside])
+
+
+def _members(
+    table: BiasTable, touches: list[tuple[Rows, int]], stations: Sequence[str], where: str
+) -> tuple[tuple[str, ...], Array, Array, Array]:
+    """Return the names of the members and the sparse design row, member, coefficient."""
+    design = _Touches([], [], [])
+    if table.per == "kind":
+        members: tuple[str, ...] = tuple(block.kind for block, _ in touches)
+        for i, (block, start) in enumerate(touches):
+            design.add(start + np.arange(block.count), np.full(block.count, i), np.ones(block.count))
+    elif table.per == "pair":
+        s = len(stations)
+        codes = [block.a * s + block.b for block, _ in touches]
+        known = np.unique(np.concatenate(codes))
+        members = tuple(f"{stations[code // s]}-{stations[code % s]}" for code in known.tolist())
+        for (block, start), code in zip(touches, codes, strict=True):
+            design.add(start + np.arange(block.count), np.searchsorted(known, code), np.ones(block.count))
+    else:
+        members = _station_members(table, touches, stations, where)
+        place = np.array([members.index(name) if name in members else -1 for name in stations] + [-1])
+        for block, start in touches:
+            for index, sign in zip((block.a, block.b), _signs(block.kind, table.form), strict=True):
+                if sign:
+                    design.add(start + np.arange(block.count), place[index], np.full(block.count, float(sign)))
+    return members, np.concatenate(design.row), np.concatenate(design.member), np.concatenate(design.coefficient)
+
+
+def _signs(kind: str, form: str) -> tuple[int, int]:
+    """Return how a station's error enters as first and as second station of a row."""
+    model = MODELS[kind]
+    if form == "rotation" or model.stations == 1:
+        return (1, 0)
+    return model.ranges or (1, -1)
+
+
+def _station_members(
+    table: BiasTable, touches: list[tuple[Rows, int]], stations: Sequence[str], where: str
+) -> tuple[str, ...]:
+    if table.members is not None:
+        unknown = [name for name in table.members if name not in stations]
+        if unknown:
+            raise InvalidProblem(f"there is no station {unknown[0]!r}", join(where, "key 'members'"), nearest(unknown[0], list(stations)))
+        return tuple(table.members)
+    used = np.unique(np.concatenate([np.concatenate([block.a, block.b]) for block, _ in touches]))
+    return tuple(stations[i] for i in used.tolist() if i >= 0)
+
+
+def _prior(
+    table: BiasTable, quantity: Quantity, speed: float, shape: tuple[int, ...], where: str
+) -> tuple[Array, Array | None]:
+    if table.form == "scale":
+        quantity = "plain"
+    elif table.form == "rotation":
+        quantity = "angle"
+    units = Units(quantity, speed)
+
+    def si(value: float | str, key: str) -> float:
+        text = value.removesuffix("/s") if isinstance(value, str) and table.form == "drift" else value
+        return units.plain(text, "1" if quantity in {"plain", "ratio"} else None, join(where, f"key {key!r}"))
+
+    mean = np.full(shape, 0.0 if table.mean is None else si(table.mean, "mean"))
+    if table.sigma is None:
+        return mean, None
+    sigma = si(table.sigma, "sigma")
+    if sigma <= 0.0:
+        raise InvalidProblem("the standard deviation is not positive", join(where, "key 'sigma'"), "leave it out if unknown")
+    return mean, np.full(shape, sigma)
+
+
+def prior_of(table: PriorTable, dimension: int, source: str) -> Prior:
+    """Return prior knowledge of a state."""
+    where = join(source, f"[[priors]] {table.name!r}")
+    base = table.name.partition("[")[0]
+    if base not in _STATES:
+        raise InvalidProblem("there is no such unknown", where, f"{nearest(base, list(_STATES))}; those of biases stand with the bias")
+    quantity, default = _STATES[base]
+    units, unit = Units(quantity), table.unit or default
+    size = 1 if base == "emission" else dimension
+    if len(table.mean) != size:
+        raise InvalidProblem(f"the mean has {len(table.mean)} coordinates, not {size}", where, "give one each")
+    spread = table.sigma if isinstance(table.sigma, list) else [units.plain(table.sigma, unit, where)] * size
+    sigma = np.array(spread) * (units.conversion(unit, where).factor if isinstance(table.sigma, list) else 1.0)
+    if len(sigma) != size or (sigma <= 0.0).any():
+        raise InvalidProblem(f"sigma is not {size} positive numbers", where, "give one each")
+    return Prior(table.name, units.conversion(unit, where).factor * np.array(table.mean), np.diag(sigma**2))
+
