@@ -1,15 +1,15 @@
 """Small linear algebra on batches whose batch is the last axis.
 
 Every product is a fixed chain of elementwise operations: an item that is singular or not finite changes no bit of its
-neighbours, and problems of three or four unknowns cost no call per matrix. Textbook formulas; the bordered system is the one
-of a Newton step on the optimality conditions (J. Nocedal and S. J. Wright, "Numerical Optimization", 2006, section 16.1).
+neighbours, and problems of three or four unknowns cost no call per matrix. Textbook formulas; the bordered system is
+the one of a Newton step on the optimality conditions (J. Nocedal and S. J. Wright, "Numerical Optimization", 2006,
+section 16.1).
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

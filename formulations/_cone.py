@@ -1,10 +1,10 @@
 r"""Squared-range least squares on the cone: every stationary point from one secular equation.
 
 :math:`\min |B y - g|^2` over :math:`y = (x, r)`, :math:`y^\top C y = |x|^2 - r^2 = 0`. With :math:`A = B^\top B`,
-:math:`b = B^\top g` the stationary points solve :math:`(A + \lambda C) y = b`. Let :math:`L L^\top = A + \lambda_0 C`, let
-:math:`\gamma_0 < 0 < \gamma_1 \le \dots` and `W` be the eigenpairs of :math:`L^{-1} C L^{-\top}`, and
-:math:`V = L^{-\top} W`, :math:`f = V^\top b`, :math:`a_j = -\gamma_j / \gamma_0`. Then, with
-:math:`t = 1/(1 + (\lambda - \lambda_0) \gamma_0)`,
+:math:`b = B^\top g` the stationary points solve :math:`(A + \lambda C) y = b`. Let :math:`L L^\top = A + \lambda_0
+C`, let :math:`\gamma_0 < 0 < \gamma_1 \le \dots` and `W` be the eigenpairs of :math:`L^{-1} C L^{-\top}`, and
+:math:`V = L^{-\top} W`, :math:`f = V^\top b`, :math:`a_j = -\gamma_j / \gamma_0`. Then, with :math:`t = 1/(1 +
+(\lambda - \lambda_0) \gamma_0)`,
 
 .. math:: y(t) = t \Big( f_0 v_0 + \sum_j \frac{f_j v_j}{(1 + a_j)(t - p_j)} \Big), \qquad p_j = \frac{a_j}{1 + a_j},
    \qquad \sum_j \frac{a_j f_j^2 / (1 + a_j)^2}{(t - p_j)^2} = f_0^2 .
@@ -12,8 +12,8 @@ r"""Squared-range least squares on the cone: every stationary point from one sec
 Adding :math:`\lambda_0 C` changes no value on the cone; it makes the pencil definite where `A` is singular, the middle
 of the definite interval being the safest choice. The apex ``y = 0`` has no multiplier and is added.
 
-Sources: J. J. More, "Generalizations of the trust region problem", Optim. Methods Softw. 2 (1993), theorem 3.2; the map
-to a trust-region equation is a direct computation.
+Sources: J. J. More, "Generalizations of the trust region problem", Optim. Methods Softw. 2 (1993), theorem 3.2; the
+map to a trust-region equation is a direct computation.
 """
 
 from __future__ import annotations

@@ -1,10 +1,10 @@
 r"""Newton's iteration on the multiplier of squared-range least squares, where its Lagrangian is positive definite.
 
-On the interval where :math:`A + \lambda C \succ 0` the function :math:`\varphi(\lambda) = y^\top C y + 2 h^\top y` with
-:math:`y = (A + \lambda C)^{-1} (b - \lambda h)` decreases with slope
-:math:`-2 q^\top (A + \lambda C)^{-1} q`, :math:`q = C y + h`, and its only zero is the global minimiser (More, 1993, theorem 3.2).
-Started at :math:`\lambda = 0`, the unconstrained fit, a few factorisations suffice for data of ordinary noise, at a fraction
-of the price of an eigenvalue problem. Items that leave the interval or do not settle are reported and go to the secular equation.
+On the interval where :math:`A + \lambda C \succ 0` the function :math:`\varphi(\lambda) = y^\top C y + 2 h^\top y`
+with :math:`y = (A + \lambda C)^{-1} (b - \lambda h)` decreases with slope :math:`-2 q^\top (A + \lambda C)^{-1} q`,
+:math:`q = C y + h`, and its only zero is the global minimiser (More, 1993, theorem 3.2). Started at :math:`\lambda =
+0`, the unconstrained fit, a few factorisations suffice for data of ordinary noise, at a fraction of the price of an
+eigenvalue problem. Items that leave the interval or do not settle are reported and go to the secular equation.
 
 Source: J. J. More, "Generalizations of the trust region problem", Optim. Methods Softw. 2 (1993), theorem 3.2.
 """
@@ -75,7 +75,7 @@ def descend(B: Array, g: Array, square: Array, linear: Array) -> tuple[Array, Ma
 
 
 def _factor(A: Array, multiplier: Array, square: Array) -> tuple[list[list[Array]], list[Array]]:
-    """Unit lower factor and pivots of ``A + multiplier diag(square)``."""
+    """Find the unit lower factor and pivots of ``A + multiplier diag(square)``."""
     lower: list[list[Array]] = []
     pivots: list[Array] = []
     for i in range(len(A)):

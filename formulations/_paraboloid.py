@@ -1,9 +1,9 @@
 r"""Squared-range least squares on the paraboloid: every stationary point from one secular equation.
 
-:math:`\min |B y - g|^2` over :math:`y = (x, w)`, :math:`|x|^2 = w`. With :math:`A = B^\top B`, :math:`b = B^\top g` the
-stationary points solve :math:`(A + \lambda C) y = b + \tfrac12 \lambda e_w`. Let `(a, A_ww)` be the column of `w`,
-:math:`S = A_{xx} - a a^\top / A_{ww} = V s V^\top`, :math:`\alpha = V^\top a / (2 A_{ww})`,
-:math:`\beta = V^\top (b_x - a b_w / A_{ww})`. Eliminating `w` leaves :math:`x = V (u - \alpha)` with
+:math:`\min |B y - g|^2` over :math:`y = (x, w)`, :math:`|x|^2 = w`. With :math:`A = B^\top B`, :math:`b = B^\top g`
+the stationary points solve :math:`(A + \lambda C) y = b + \tfrac12 \lambda e_w`. Let `(a, A_ww)` be the column of
+`w`, :math:`S = A_{xx} - a a^\top / A_{ww} = V s V^\top`, :math:`\alpha = V^\top a / (2 A_{ww})`, :math:`\beta =
+V^\top (b_x - a b_w / A_{ww})`. Eliminating `w` leaves :math:`x = V (u - \alpha)` with
 
 .. math:: u_j = \frac{\beta_j + s_j \alpha_j}{\lambda + s_j}, \qquad
    |u|^2 = |\alpha|^2 + \frac{b_w}{A_{ww}} + \frac{\lambda}{2 A_{ww}} .

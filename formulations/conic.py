@@ -4,27 +4,30 @@ A cvxpy problem that obeys the parameter rules (DPP) becomes
 
 .. math:: \min_x \tfrac12 x^\top P x + q^\top x + d \quad\text{subject to}\quad A x + s = b, \; s \in K,
 
-in which `P`, `q`, `d`, `A`, `b` are affine in the parameters. The affine maps are taken out of cvxpy once; a later solve is a few
-sparse products, an update of Clarabel's data and the bare solve. Its dual point `z`, projected on the dual cone, gives
+in which `P`, `q`, `d`, `A`, `b` are affine in the parameters. The affine maps are taken out of cvxpy once; a later
+solve is a few sparse products, an update of Clarabel's data and the bare solve. Its dual point `z`, projected on the
+dual cone, gives
 
 .. math:: \min \ge d - \tfrac12 x^\top P x - b^\top z - \rho \, |P x + q + A^\top z|
 
-for every minimiser with :math:`|x^*| \le \rho`, whatever the solver reports: the "optimal value" is never used as a bound.
+for every minimiser with :math:`|x^*| \le \rho`, whatever the solver reports: the "optimal value" is never used as a
+bound.
 
-Sources: A. Agrawal et al., "Differentiable convex optimization layers", NeurIPS 2019, section 4 (the affine maps); C. Jansson,
-D. Chaykin and C. Keil, "Rigorous error bounds for the optimal value in semidefinite programming", SIAM J. Numer. Anal. 46 (2007),
-theorem 3.2 (the bound, here with one radius for all of x).
+Sources: A. Agrawal et al., "Differentiable convex optimization layers", NeurIPS 2019 (the affine maps); C. Jansson,
+D. Chaykin and C. Keil, "Rigorous error bounds for the optimal value in semidefinite programming", SIAM J. Numer.
+Anal. 46 (2007) (the bound, here with one radius for all of x).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from formulations._dual import dual_point
 
 Array = NDArray[np.float64]
 
@@ -66,7 +69,7 @@ class Relaxation:
         A minimisation that is DPP; parameters and variables carry unique names. Linear, second-order and
         semidefinite cones.
     backend : str
-        ``"CLARABEL"`` for the fast way; any other solver cvxpy knows goes through ``problem.solve`` and yields no bound.
+        ``"CLARABEL"`` for the fast way; any other solver of cvxpy goes through ``problem.solve`` and yields no bound.
     settings : Mapping[str, Any], optional
         Settings of the back end.
     radius : float
@@ -74,7 +77,7 @@ class Relaxation:
 
     Notes
     -----
-    Agrawal et al. (2019), section 4. Holds solver state: build one per worker, do not pickle or share between threads.
+    Agrawal et al. (2019). Holds solver state: build one per worker, do not pickle or share between threads.
     """
 
     def __init__(
@@ -121,7 +124,7 @@ class Relaxation:
         return Answer(
             data.recover(x),
             0.5 * quadratic + float(data.q @ x) + data.d,
-            data.bound(x, z, self.radius * (1.0 + float(np.linalg.norm(x)))),
+            data.bound(x, z, self.radius * (1.0 + float(np.sqrt(x @ x)))),
             status,
             status == "Solved",
             int(solution.iterations),
@@ -178,19 +181,20 @@ class _Data:
         self.program = stuff["param_prob"]
         self.dims, self.cones = stuff["dims"], dims_to_solver_cones(stuff["dims"])
         columns = self.program.param_id_to_col
-        self.slots = {p.name(): columns[p.id] for p in problem.parameters() if p.id in columns}
+        self.slots = {p.name(): (columns[p.id], p.shape) for p in problem.parameters() if p.id in columns}
         if len(self.slots) != len(problem.parameters()):
             raise ValueError("parameters need unique names and no symmetric, diagonal or semidefinite attribute")
         self.vector = np.zeros(self.program.total_param_size + 1)
         self.vector[-1] = 1.0
         n = self.program.x.size
-        self._linear = self.program.q.tocsr()
+        self._linear = _Product.of(self.program.q)
         self._matrix, pattern = _affine(self.program.reduced_A)
         m = pattern[2][0]
         self.q, self.d, self.b = np.zeros(n), 0.0, np.zeros(m)
         last = pattern[1][n]
         self._left, self._rows = slice(0, last), pattern[0][last:]
-        self._quadratic, self._upper = None, np.zeros(0, dtype=np.int64)
+        self._quadratic: _Product | None = None
+        self._upper = np.zeros(0, dtype=np.int64)
         self.A = sp.csc_array((np.zeros(last), pattern[0][:last], pattern[1][: n + 1]), shape=(m, n))
         self.P = sp.csc_array((n, n))
         if self.program.P is not None:
@@ -200,45 +204,76 @@ class _Data:
             row, column = pattern[0][self._upper], column[self._upper]
             start = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=n))])
             self.P = sp.csc_array((np.zeros(len(row)), row, start), shape=(n, n))
-        # transposed views share the entries that feed overwrites
-        self._across, self._below = self.A.T, self.P.T
+        self._across, self._below = _Product.transposed(self.A), _Product.transposed(self.P)
+        self._above = _Product(n, self._below.source, self._below.row, self.P.data)
+        self._ridge = np.where(self._below.row == self._below.source, 0.0, 1.0)
         self._recover = _recovery(problem, chain, inverse, self.program.x.id, n)
 
     def feed(self, values: Mapping[str, Array]) -> None:
-        for name, start in self.slots.items():
-            value = np.asarray(values[name], dtype=np.float64).ravel(order="F")
-            self.vector[start : start + value.size] = value
-        linear = np.asarray(self._linear @ self.vector).ravel()
+        for name, (start, shape) in self.slots.items():
+            value = np.asarray(values[name], dtype=np.float64)
+            if value.shape != shape:
+                raise ValueError(f"parameter {name} has shape {value.shape}, {shape} expected")
+            self.vector[start : start + value.size] = value.ravel(order="F")
+        linear = self._linear(self.vector)
         self.q, self.d = linear[:-1].copy(), float(linear[-1])
-        entries = np.asarray(self._matrix @ self.vector).ravel()
+        entries = self._matrix(self.vector)
         self.A.data[:] = -entries[self._left]
         self.b = np.zeros(self.A.shape[0])
         self.b[self._rows] = entries[self._left.stop :]
         if self._quadratic is not None:
-            self.P.data[:] = np.asarray(self._quadratic @ self.vector).ravel()[self._upper]
+            self.P.data[:] = self._quadratic(self.vector)[self._upper]
 
     def square(self, x: Array) -> Array:
         """``Px`` from the stored upper triangle."""
         if self._quadratic is None:
             return np.zeros_like(x)
-        return np.asarray(self.P @ x + self._below @ x - self.P.diagonal() * x)
+        return self._below(x) + self._above(x, self._ridge)
 
     def bound(self, x: Array, z: Array, radius: float) -> float:
-        z = _dual_point(z, self.dims)
+        z = dual_point(z, self.dims)
         if not np.isfinite(z).all():
             return -np.inf
         product = self.square(x)
-        rest = float(np.linalg.norm(product + self.q + self._across @ z))
-        return self.d - 0.5 * float(x @ product) - float(self.b @ z) - radius * rest
+        rest = product + self.q + self._across(z)
+        return self.d - 0.5 * float(x @ product) - float(self.b @ z) - radius * float(np.sqrt(rest @ rest))
 
     def recover(self, x: Array) -> dict[str, Array]:
         return {name: (matrix @ x).reshape(shape, order="F") for name, matrix, shape in self._recover}
 
 
-def _affine(reduced: Any) -> tuple[Any, tuple[NDArray[np.int64], NDArray[np.int64], tuple[int, int]]]:
+@dataclass(frozen=True, slots=True)
+class _Product:
+    """A sparse matrix as a product only: on problems of tens of entries scipy's own costs more than the solver."""
+
+    size: int
+    row: NDArray[np.int64]
+    source: NDArray[np.int64]
+    data: Array
+
+    @classmethod
+    def of(cls, matrix: Any) -> _Product:
+        entries = matrix.tocoo()
+        return cls(matrix.shape[0], entries.row.astype(np.int64), entries.col.astype(np.int64), entries.data)
+
+    @classmethod
+    def transposed(cls, matrix: Any) -> _Product:
+        """Transpose of a compressed-column matrix, sharing its entries."""
+        size = matrix.shape[1]
+        column = np.repeat(np.arange(size), np.diff(matrix.indptr))
+        return cls(size, column, matrix.indices.astype(np.int64), matrix.data)
+
+    def __call__(self, x: Array, share: Array | float = 1.0) -> Array:
+        total = np.bincount(self.row, weights=self.data * x[self.source] * share, minlength=self.size)
+        return np.asarray(total, dtype=np.float64)
+
+
+def _affine(reduced: Any) -> tuple[_Product, tuple[NDArray[np.int64], NDArray[np.int64], tuple[int, int]]]:
     """Map from the parameter vector to the stored entries, and their compressed-column pattern."""
     reduced.cache()
-    return reduced.reduced_mat, reduced.problem_data_index
+    if reduced.problem_data_index is None:
+        raise ValueError("the problem has no constraint")
+    return _Product.of(reduced.reduced_mat), reduced.problem_data_index
 
 
 def _recovery(problem: Any, chain: Any, inverse: Any, name: int, n: int) -> list[tuple[str, Array, tuple[int, ...]]]:
@@ -255,52 +290,3 @@ def _recovery(problem: Any, chain: Any, inverse: Any, name: int, n: int) -> list
             dense = value.toarray() if hasattr(value, "toarray") else np.asarray(value)
             columns[variable.id].append(dense.ravel(order="F"))
     return [(v.name(), np.stack(columns[v.id], axis=1), v.shape) for v in problem.variables()]
-
-
-def _dual_point(z: Array, dims: Any) -> Array:
-    """Projection on the dual cone; NaN for cones without one here."""
-    z, at = z.copy(), int(dims.zero)
-    z[at : at + dims.nonneg] = np.maximum(z[at : at + dims.nonneg], 0.0)
-    at += int(dims.nonneg)
-    for size in dims.soc:
-        z[at : at + size] = _second_order(z[at : at + size])
-        at += int(size)
-    for size in dims.psd:
-        count = size * (size + 1) // 2
-        z[at : at + count] = _semidefinite(z[at : at + count], size)
-        at += count
-    if at != len(z):
-        z[at:] = np.nan
-    return z
-
-
-def _second_order(z: Array) -> Array:
-    """Projection on ``z_0 >= |z_1..|``."""
-    size = float(np.linalg.norm(z[1:]))
-    if size <= z[0]:
-        return z
-    if size <= -z[0]:
-        return np.zeros_like(z)
-    half = 0.5 * (1.0 + z[0] / size)
-    return np.concatenate([[half * size], half * z[1:]])
-
-
-def _semidefinite(z: Array, size: int) -> Array:
-    """Projection of a scaled upper triangle, stored column by column, on the semidefinite cone."""
-    if not np.isfinite(z).all():
-        return z
-    column, row, scale = _triangle(size)
-    matrix = np.empty((size, size))
-    matrix[row, column] = matrix[column, row] = z * scale
-    values, vectors = np.linalg.eigh(matrix)
-    if values[0] >= 0.0:
-        return z
-    fixed = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    return np.asarray(fixed[row, column] / scale)
-
-
-@lru_cache(maxsize=64)
-def _triangle(size: int) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Columns and rows of a stored upper triangle, and what undoes the scale of its off-diagonal entries."""
-    column, row = np.tril_indices(size)
-    return column, row, np.where(row == column, 1.0, np.sqrt(0.5))

@@ -3,12 +3,13 @@ r"""Weighted nonlinear least squares with bounds, equalities and inequalities, a
 .. math:: \min_x \; |W\, e(x, p, z)|^2 + (x - m)^\top M (x - m) \quad\text{subject to}\quad
    l \le x \le u, \quad c(x, p) = 0, \quad d(x, p) \ge 0,
 
-with :math:`e = z - h(x, p)` unless another residual is given (angles must wrap). The functions h, c, d are injected and
-differentiated exactly by CasADi; data, weights, prior, bounds and start are arguments of the solve, so that a program is compiled once per
-structure.
+with :math:`e = z - h(x, p)` unless another residual is given (angles must wrap). The functions h, c, d are injected
+and differentiated exactly by CasADi; data, weights, prior, bounds and start are arguments of the solve, so that a
+program is compiled once per structure.
 
-Sources: A. Waechter and L. T. Biegler, "On the implementation of an interior-point filter line-search algorithm for large-scale
-nonlinear programming", Math. Program. 106 (2006); J. A. E. Andersson et al., "CasADi", Math. Program. Comput. 11 (2019).
+Sources: A. Waechter and L. T. Biegler, "On the implementation of an interior-point filter line-search algorithm for
+large-scale nonlinear programming", Math. Program. 106 (2006); J. A. E. Andersson et al., "CasADi", Math. Program.
+Comput. 11 (2019).
 """
 
 from __future__ import annotations
@@ -114,7 +115,13 @@ class Program:
             "nls",
             "ipopt",
             {"x": x, "p": data, "f": cost, "g": ca.vertcat(c, d)},
-            {"ipopt": quiet, "print_time": False, "error_on_fail": False},
+            {
+                "ipopt": quiet,
+                "print_time": False,
+                "error_on_fail": False,
+                "show_eval_warnings": False,
+                "calc_lam_p": False,
+            },
         )
 
     def solve(

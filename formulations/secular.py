@@ -9,10 +9,10 @@ convex where it exists, and
 .. math:: k(t) = T(t)^{-1/2} - (\kappa + \sigma t)^{-1/2}
 
 is concave in every interval. Newton's iteration on `k`, started where `k <= 0` beside a pole, therefore climbs
-monotonically to the first root on that side of the pole or meets `k' <= 0`, which proves there is none. Every interval
-holds at most two roots, one per end, so the two sides of all poles, and for ``sigma > 0`` the zero of the right
-side, list all real roots without a polynomial and without a bracket. Each root is held as its distance from its own pole: roots that
-fall onto a pole (the "hard case", ``c_j`` near 0) keep their full relative accuracy.
+monotonically to the first root on that side of the pole or meets `k' <= 0`, which proves there is none. Every
+interval holds at most two roots, one per end, so the two sides of all poles, and for ``sigma > 0`` the zero of the
+right side, list all real roots without a polynomial and without a bracket. Each root is held as its distance from its
+own pole: roots that fall onto a pole (the "hard case", ``c_j`` near 0) keep their full relative accuracy.
 
 Sources: J. J. More and D. C. Sorensen, "Computing a trust region step", SIAM J. Sci. Stat. Comput. 4 (1983), section 3
 (the concave form on the last interval); the use on every interval is the same inequality.
@@ -34,7 +34,7 @@ _STEPS = 80
 
 @dataclass(frozen=True, slots=True)
 class Secular:
-    """A batch of secular equations, the batch on the last axis.
+    r"""A batch of secular equations, the batch on the last axis.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class Secular:
     weight : Array, shape (d, N)
         The :math:`c_j^2`, all positive (the caller floors exact zeros).
     level, slope : Array, shape (N,)
-        :math:`\\kappa` and :math:`\\sigma`.
+        :math:`\kappa` and :math:`\sigma`.
     """
 
     gap: Array
@@ -113,7 +113,7 @@ def everything(equation: Secular) -> Roots:
     -----
     See the module's first lines; each interval between poles holds at most two roots.
     """
-    d, count = equation.pole.shape
+    d = len(equation.pole)
     left, left_free = _start(equation, equation.pole, equation.weight, -1.0)
     right, right_free = _start(equation, equation.pole, equation.weight, 1.0)
     sign = np.concatenate([-np.ones((d, 1)), np.ones((d + 1, 1))])

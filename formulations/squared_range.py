@@ -2,25 +2,26 @@ r"""Squared-range least squares: a linear fit with one quadratic constraint, sol
 
 .. math:: \min_y \; |B y - g|^2 \quad\text{subject to}\quad y^\top C y + 2 h^\top y = 0
 
-for two quadrics. The *cone*, :math:`y = (x, r)`, `C = diag(1, .., 1, -1)`, `h = 0`: `x` is measured from a reference point and `r`
-is its distance (range differences, arrival times, range sums, bearings). The *paraboloid*, :math:`y = (x, w)`,
-`C = diag(1, .., 1, 0)`, `h = (0, .., 0, -1/2)`: `w` is :math:`|x|^2` (ranges, ratios of ranges, bearings).
+for two quadrics. The *cone*, :math:`y = (x, r)`, `C = diag(1, .., 1, -1)`, `h = 0`: `x` is measured from a reference
+point and `r` is its distance (range differences, arrival times, range sums, bearings). The *paraboloid*, :math:`y =
+(x, w)`, `C = diag(1, .., 1, 0)`, `h = (0, .., 0, -1/2)`: `w` is :math:`|x|^2` (ranges, ratios of ranges, bearings).
 
 A multiplier :math:`\lambda` makes every stationary point but the apex of the cone a solution of
 :math:`(B^\top B + \lambda C) y = B^\top g - \lambda h`. Both cases become :math:`\sum_j c_j^2/(t - p_j)^2 = \kappa +
 \sigma t` (:mod:`formulations.secular`), with d poles:
 
-- cone: :math:`C v_j = \gamma_j (A + \lambda_0 C) v_j`, one negative :math:`\gamma_0`, and
-  :math:`t = 1/(1 + (\lambda - \lambda_0) \gamma_0)`. Adding :math:`\lambda_0 C` changes no value on the cone; it makes the
-  pencil definite when :math:`A = B^\top B` is singular;
+- cone: :math:`C v_j = \gamma_j (A + \lambda_0 C) v_j`, one negative :math:`\gamma_0`, and :math:`t = 1/(1 + (\lambda
+  - \lambda_0) \gamma_0)`. Adding :math:`\lambda_0 C` changes no value on the cone; it makes the pencil definite when
+  :math:`A = B^\top B` is singular;
 - paraboloid: `w` is eliminated by its own (linear) equation and :math:`t = \lambda`.
 
-The global minimiser is the root above the last pole, where :math:`B^\top B + \lambda C` is positive semidefinite (no gap). A singular `A`
-is the hard case: a root sits on a pole, and both intersections of the solution line with the quadric appear.
+The global minimiser is the root above the last pole, where :math:`B^\top B + \lambda C` is positive semidefinite (no
+gap). A singular `A` is the hard case: a root sits on a pole, and both intersections of the solution line with the
+quadric appear.
 
-Sources: J. J. More, "Generalizations of the trust region problem", Optim. Methods Softw. 2 (1993), section 3; A. Beck,
-P. Stoica and J. Li, "Exact and approximate solutions of source localization problems", IEEE Trans. Signal Process. 56 (2008),
-eqs. 10-16 (paraboloid) and 38-45 (cone).
+Sources: J. J. More, "Generalizations of the trust region problem", Optim. Methods Softw. 2 (1993), section 3; A.
+Beck, P. Stoica and J. Li, "Exact and approximate solutions of source localization problems", IEEE Trans. Signal
+Process. 56 (2008), section II (ranges: the paraboloid) and section III (range differences: the cone).
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ from numpy.typing import NDArray
 from formulations._batch import apply
 from formulations._cone import Finder, solve_cone
 from formulations._interior import descend
+from formulations._line import intersections
 from formulations._paraboloid import solve_paraboloid
 from formulations.secular import everything, largest
 
@@ -100,7 +102,7 @@ def cone(d: int) -> Quadric:
     Returns
     -------
     Quadric
-        The cone (Beck, Stoica and Li, 2008, eq. 38).
+        The cone (Beck, Stoica and Li, 2008, section III).
     """
     return Quadric("cone", d + 1)
 
@@ -116,7 +118,7 @@ def paraboloid(d: int) -> Quadric:
     Returns
     -------
     Quadric
-        The paraboloid (Beck, Stoica and Li, 2008, eq. 10).
+        The paraboloid (Beck, Stoica and Li, 2008, section II).
     """
     return Quadric("paraboloid", d + 1)
 
@@ -144,7 +146,7 @@ def minimiser(B: Array, g: Array, quadric: Quadric, *, positive: bool = False) -
 
     Notes
     -----
-    More (1993), theorem 3.2; Beck, Stoica and Li (2008), eqs. 14-16 and 43-45.
+    More (1993), theorem 3.2; Beck, Stoica and Li (2008), sections II and III.
     """
     rows, right, shape = _flat(B, g, quadric)
     y, ok = np.empty((len(rows), quadric.size)), np.empty(len(rows), dtype=np.bool_)
@@ -181,8 +183,8 @@ def stationary(B: Array, g: Array, quadric: Quadric, *, positive: bool = False) 
     Returns
     -------
     y : Array, shape (..., K, n)
-        Points, NaN where not valid; K = 2n - 1. The cone has at most 2(n - 1) with a multiplier, and its apex ``y = 0``,
-        where the gradient of the constraint vanishes. The paraboloid has at most 2n - 1.
+        Points, NaN where not valid; K = 2n - 1. The cone has at most 2(n - 1) with a multiplier, and its apex
+        ``y = 0``, where the gradient of the constraint vanishes. The paraboloid has at most 2n - 1.
     cost : Array, shape (..., K)
         ``|By - g|^2``, ascending, infinite where not valid.
     valid : Mask, shape (..., K)
@@ -206,7 +208,7 @@ def stationary(B: Array, g: Array, quadric: Quadric, *, positive: bool = False) 
 
 
 def _flat(B: Array, g: Array, quadric: Quadric) -> tuple[Array, Array, tuple[int, ...]]:
-    """Inputs with one batch axis, and the leading axes they had."""
+    """Give inputs one batch axis, and the leading axes they had."""
     B, g = np.asarray(B, dtype=np.float64), np.asarray(g, dtype=np.float64)
     if B.ndim < 2 or g.ndim < 1 or B.shape[-1] != quadric.size or B.shape[-2] != g.shape[-1]:
         raise ValueError(f"rows {B.shape} and right sides {g.shape} do not fit a quadric of size {quadric.size}")
@@ -223,7 +225,7 @@ def _chunks(rows: Array, right: Array) -> Iterator[tuple[slice, Array, Array, Ma
         b, h = np.moveaxis(rows[part], 0, -1).copy(), right[part].T.copy()
         bad = ~(np.isfinite(b).all(axis=(0, 1)) & np.isfinite(h).all(axis=0))
         b[..., bad], h[..., bad] = 0.0, 0.0
-        yield part, b, h, bad
+        yield part, b, h, np.asarray(bad)
 
 
 def _solved(rows: Array, right: Array, quadric: Quadric, find: Finder) -> tuple[Array, Array, Mask]:
@@ -231,7 +233,7 @@ def _solved(rows: Array, right: Array, quadric: Quadric, find: Finder) -> tuple[
     slots = 1 if find is largest else 2 * quadric.size - 1
     count, n = len(rows), quadric.size
     y, cost = np.empty((count, slots, n)), np.empty((count, slots))
-    valid = np.empty((count, slots), dtype=np.bool_)
+    valid, usable = np.empty((count, slots), dtype=np.bool_), np.empty(count, dtype=np.bool_)
     solve = solve_cone if quadric.shape == "cone" else solve_paraboloid
     with np.errstate(all="ignore"):
         for part, b, h, bad in _chunks(rows, right):
@@ -239,5 +241,14 @@ def _solved(rows: Array, right: Array, quadric: Quadric, find: Finder) -> tuple[
             found &= np.isfinite(points).all(axis=0) & ~bad
             left = apply(b, points) - h[:, None]
             y[part], valid[part], cost[part] = points.transpose(2, 1, 0), found.T, (left * left).sum(axis=0).T
+            usable[part] = ~bad
+    roots = slots - 1 if quadric.shape == "cone" and slots > 1 else slots
+    lost = np.flatnonzero(usable & ~valid[:, :roots].any(axis=1))
+    if lost.size:
+        points, met = intersections(rows[lost], right[lost], quadric.square, quadric.linear)
+        few = min(roots, 2)
+        y[lost, :few], valid[lost, :few] = points[:, :few], met[:, :few]
+        left = np.einsum("Nqn,Nkn->Nkq", rows[lost], points[:, :few]) - right[lost, None]
+        cost[lost, :few] = (left * left).sum(axis=-1)
     y[~valid], cost[~valid] = np.nan, np.inf
     return y, cost, valid

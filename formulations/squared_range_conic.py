@@ -1,17 +1,19 @@
 r"""Convex relaxations of squared-range least squares.
 
-The problem is :math:`\min |B y - g|^2` subject to :math:`y^\top C y + 2 h^\top y = 0` (:mod:`formulations.squared_range`). With
-:math:`R^\top R = [B, -g]^\top [B, -g]` (the triangular factor, so the size does not grow with the rows):
+The problem is :math:`\min |B y - g|^2` subject to :math:`y^\top C y + 2 h^\top y = 0`
+(:mod:`formulations.squared_range`). With :math:`R^\top R = [B, -g]^\top [B, -g]` (the triangular factor, so the size
+does not grow with the rows):
 
 *Shor.* :math:`\min \operatorname{tr}(R^\top R\, Y)` over :math:`Y \succeq 0`, :math:`Y_{n+1,n+1} = 1`,
-:math:`\operatorname{tr}(C Y_{11}) + 2 h^\top Y_{12} = 0`. With one quadratic constraint the S-lemma makes it exact: the optimum equals
-the GTRS value and a rank-one optimum exists.
+:math:`\operatorname{tr}(C Y_{11}) + 2 h^\top Y_{12} = 0`. With one quadratic constraint the S-lemma makes it exact:
+the optimum equals the GTRS value and a rank-one optimum exists.
 
-*Second order.* The constraint is relaxed to its convex hull, :math:`|x| \le r` (cone) or :math:`|x|^2 \le w` (paraboloid):
-:math:`\min |R (y, 1)|`. A lower bound, tight when the unconstrained fit violates the hull.
+*Second order.* The constraint is relaxed to its convex hull, :math:`|x| \le r` (cone) or :math:`|x|^2 \le w`
+(paraboloid): :math:`\min |R (y, 1)|`. A lower bound, tight when the unconstrained fit violates the hull.
 
-Sources: N. Z. Shor, "Quadratic optimization problems", Sov. J. Comput. Syst. Sci. 25 (1987); J. J. More, "Generalizations of the
-trust region problem", Optim. Methods Softw. 2 (1993); for tightness of the second-order form see the tests.
+Sources: N. Z. Shor, "Quadratic optimization problems", Sov. J. Comput. Syst. Sci. 25 (1987); J. J. More,
+"Generalizations of the trust region problem", Optim. Methods Softw. 2 (1993); for tightness of the second-order form
+see the tests.
 """
 
 from __future__ import annotations
@@ -42,8 +44,8 @@ class Relaxed:
     bound : float
         Lower bound of the squared-range cost, recomputed from the dual.
     rank_ratio : float
-        Second over first eigenvalue of the lifted matrix (Shor); relative distance from the quadric (second order). Near
-        zero means tight.
+        Second over first eigenvalue of the lifted matrix (Shor); relative distance from the quadric (second order).
+        Near zero means tight.
     answer : Answer
         The solver's report.
     """
@@ -56,7 +58,7 @@ class Relaxed:
 
 
 def shor_problem(quadric: Quadric) -> Any:
-    """The semidefinite relaxation as a cvxpy problem with parameter ``gram``.
+    """Build the semidefinite relaxation as a cvxpy problem with parameter ``gram``.
 
     Parameters
     ----------
@@ -85,7 +87,7 @@ def shor_problem(quadric: Quadric) -> Any:
 
 
 def hull_problem(quadric: Quadric) -> Any:
-    """The second-order relaxation as a cvxpy problem with parameter ``factor``.
+    """Build the second-order relaxation as a cvxpy problem with parameter ``factor``.
 
     Parameters
     ----------

@@ -197,11 +197,11 @@ class Fix:
 
     def flat(self) -> Fix:
         """Return the same fixes with exactly one batch axis."""
-        return self._map(lambda array, core: array.reshape(-1, *array.shape[array.ndim - core :]))
+        return self.reshape((self.code.size,))
 
     def reshape(self, shape: tuple[int, ...]) -> Fix:
         """Return the fixes of a flat batch with other batch axes."""
-        return self._map(lambda array, core: array.reshape(*shape, *array.shape[array.ndim - core :]))
+        return self._map(lambda array, core: array.reshape((*shape, *array.shape[array.ndim - core :])))
 
     def __getitem__(self, index: Any) -> Fix:
         """Return some fixes of a batch."""

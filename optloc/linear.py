@@ -11,8 +11,8 @@ from optloc.models.jet import Jet
 from optloc.models.primitives import wrap
 from optloc.noise import Whitener, whiten
 from optloc.problem import Problem
-from optloc.states import Plan, columns, plans, points
-from optloc.types import Array, Bias
+from optloc.states import Plan, plans, points
+from optloc.types import Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,7 +62,7 @@ def linearise(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = N
     jacobian = np.zeros((*batch, problem.count, layout.n_shared + layout.n_local))
     values = []
     for plan, start in zip(plans(problem), problem.starts, strict=True):
-        value = _differentiate(problem, plan, start, x, jacobian[..., start : start + plan.block.count, :])
+        value = _differentiate(problem, plan, x, jacobian[..., start : start + plan.block.count, :])
         values.append(np.broadcast_to(value, (*batch, plan.block.count)))
     residual = _residual(problem, np.concatenate(values, axis=-1))
     if noise is None:
@@ -74,11 +74,11 @@ def linearise(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = N
 def predict(problem: Problem, x: Array) -> Array:
     """Return the modelled measurements h(x), (..., m), of a problem at vectors x (..., size)."""
     values = []
-    for plan, start in zip(plans(problem), problem.starts, strict=True):
+    for plan in plans(problem):
         t, a, b = points(problem, plan, x, differentiate=False)
         value = np.asarray(plan.model.h(t, a, b))
         value = np.broadcast_to(value, np.broadcast_shapes(value.shape, (plan.block.count,)))
-        values.append(_biased(problem, plan, start, x, value, None, None))
+        values.append(_biased(plan, x, value, None, None))
     shape = np.broadcast_shapes(*(value.shape[:-1] for value in values))
     return np.concatenate([np.broadcast_to(value, (*shape, value.shape[-1])) for value in values], axis=-1)
 
@@ -93,7 +93,7 @@ def _residual(problem: Problem, value: Array) -> Array:
     return residual if np.all(weight > 0.0) else np.where(weight > 0.0, residual, 0.0)
 
 
-def _differentiate(problem: Problem, plan: Plan, start: int, x: Array, jacobian: Array) -> Array:
+def _differentiate(problem: Problem, plan: Plan, x: Array, jacobian: Array) -> Array:
     """Write the derivatives of one block into its part of the Jacobian and return its values."""
     t, a, b = points(problem, plan, x, differentiate=True)
     jet = plan.model.h(t, a, b)
@@ -107,7 +107,7 @@ def _differentiate(problem: Problem, plan: Plan, start: int, x: Array, jacobian:
             picked = partial if isinstance(feed.rows, slice) or partial.shape[-1] == 1 else partial[..., feed.rows]
             jacobian[..., rows[feed.rows], fold(feed.column)] += picked * feed.gain
     value = np.broadcast_to(jet.value, (*jacobian.shape[:-2], plan.block.count))
-    return _biased(problem, plan, start, x, value, jacobian, fold)
+    return _biased(plan, x, value, jacobian, fold)
 
 
 def _folded(problem: Problem) -> Any:
@@ -120,40 +120,14 @@ def _folded(problem: Problem) -> Any:
     return fold
 
 
-def _biased(problem: Problem, plan: Plan, start: int, x: Array, value: Array, jacobian: Array | None, fold: Any) -> Array:
+def _biased(plan: Plan, x: Array, value: Array, jacobian: Array | None, fold: Any) -> Array:
     """Return the values with scales, offsets, drifts and emission times; write their derivatives where asked."""
-    if not problem.biases and not plan.emission:
+    if not plan.gains.row.size and not plan.adds.row.size:
         return value
-    gain, added = np.ones(1), np.zeros(1)
-    pending: list[tuple[Array, Array, Array]] = []
-    for bias in problem.biases:
-        if bias.form == "rotation":
-            continue
-        rows, column, coefficient = _touched(problem, bias, start, plan.block.count)
-        if bias.form == "drift":
-            coefficient = coefficient * (problem.times - problem.times[0])[plan.block.epoch[rows]]
-        total = np.zeros((*x.shape[:-1], plan.block.count))
-        np.add.at(total, (..., rows), x[..., column] * coefficient)
-        if bias.form == "scale":
-            gain = gain + total
-            pending.append((rows, column, value[..., rows] * coefficient))
-        else:
-            added = added + total
-            pending.append((rows, column, coefficient))
-    for rows, column in plan.emission:
-        total = np.zeros((*x.shape[:-1], plan.block.count))
-        total[..., rows] = x[..., column]
-        added = added + total
-        pending.append((rows, column, np.ones(len(rows))))
+    gain, added = 1.0 + plan.gains.total(x, plan.block.count), plan.adds.total(x, plan.block.count)
     if jacobian is not None:
         jacobian *= gain[..., None]
-        for rows, column, derivative in pending:
-            np.add.at(jacobian, (..., rows, fold(column)), derivative)
+        for terms, factor in ((plan.gains, value), (plan.adds, np.ones(value.shape[-1:]))):
+            derivative = factor[..., terms.row] * terms.coefficient
+            np.add.at(jacobian, (..., terms.row, fold(terms.column)), derivative)  # type: ignore[arg-type]
     return np.asarray(value * gain + added)
-
-
-def _touched(problem: Problem, bias: Bias, start: int, count: int) -> tuple[Array, Array, Array]:
-    inside = (bias.row >= start) & (bias.row < start + count)
-    rows = bias.row[inside] - start
-    column = columns(problem.layout, bias.name, rows)[np.arange(len(rows)), bias.member[inside]]
-    return rows, column, bias.coefficient[inside]

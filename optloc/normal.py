@@ -113,7 +113,7 @@ def with_priors(problem: Problem, x: Array, equations: Normal) -> Normal:
     equations : Normal
         Of the measurements alone.
     """
-    parts = _prior_parts(problem)
+    parts = prior_parts(problem)
     if not parts:
         return equations
     layout = problem.layout
@@ -137,7 +137,7 @@ def with_priors(problem: Problem, x: Array, equations: Normal) -> Normal:
     return Normal(shared, local, equations.cross, vector, local_vector, cost)
 
 
-def _prior_parts(problem: Problem) -> list[tuple[str, Array, Array]]:
+def prior_parts(problem: Problem) -> list[tuple[str, Array, Array]]:
     """Return (name, mean, precision) of every prior; local ones have an epoch axis of length one."""
     parts = []
     for prior in problem.priors:

@@ -105,7 +105,9 @@ class Problem:
         rows = tuple((r.kind, r.a.tobytes(), r.b.tobytes(), r.epoch.tobytes(), r.target.tobytes()) for r in self.rows)
         blocks = tuple((b.row.shape, b.row.tobytes()) for b in self.noise.blocks)
         motions = tuple((m.order, m.span, m.known is None, m.reference) for m in self.motions)
-        biases = tuple((b.name, b.members, b.form, b.row.tobytes(), b.member.tobytes()) for b in self.biases)
+        biases = tuple(
+            (b.name, b.members, b.form, b.row.tobytes(), b.member.tobytes(), b.coefficient.tobytes()) for b in self.biases
+        )
         stations = (self.stations.count, self.dimension, self.stations.covariance is None, self.stations.span)
         return (rows, blocks, motions, biases, stations, self.times.tobytes(), self.frame)
 

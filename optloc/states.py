@@ -15,7 +15,7 @@ from optloc.models.primitives import rotate
 from optloc.problem import Problem
 from optloc.types import Array, Rows
 
-_TARGET, _TARGET_RATE, _A, _B, _TURN = (16 * i for i in range(5))
+_TARGET, _TARGET_RATE, _A, _B, _RATE_A, _RATE_B, _AXES_A, _AXES_B, _TURN = (16 * i for i in range(9))
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,13 +41,51 @@ class Feed:
 
 
 @dataclass(frozen=True, slots=True)
+class Terms:
+    """Linear terms of rows in the unknowns: each entry adds ``coefficient * x[column]`` to its row.
+
+    Parameters
+    ----------
+    row : int array (n,)
+        Row within the block; may repeat.
+    column : int array (n,)
+        Column of the full parameter vector.
+    coefficient : array (n,)
+        Factor.
+    """
+
+    row: Array
+    column: Array
+    coefficient: Array
+
+    def total(self, x: Array, count: int) -> Array:
+        """Return the sums (..., count) of every row at vectors x (..., size)."""
+        out = np.zeros((*x.shape[:-1], count))
+        np.add.at(out, (..., self.row), x[..., self.column] * self.coefficient)  # type: ignore[arg-type]
+        return out
+
+
+@dataclass(frozen=True, slots=True)
 class Plan:
-    """The indices of one block of rows: which unknowns feed which inputs of its measurement function."""
+    """The indices of one block of rows: measurement = h(fed inputs) * (1 + gains) + adds.
+
+    Parameters
+    ----------
+    block : Rows
+        The rows.
+    model : Model
+        Their kind.
+    feeds : tuple of Feed
+        Which unknowns move which inputs of h.
+    gains, adds : Terms
+        Scale factors, and offsets, drifts and emission times.
+    """
 
     block: Rows
     model: Model
     feeds: tuple[Feed, ...]
-    emission: tuple[tuple[Array, Array], ...]
+    gains: Terms
+    adds: Terms
 
 
 def columns(layout: Layout, name: str, epoch: Array) -> Array:
@@ -74,12 +112,34 @@ def _plan(problem: Problem, block: Rows, start: int) -> Plan:
     layout, model = problem.layout, MODELS[block.kind]
     feeds = [*_motion_feeds(problem, block, model), *_station_feeds(problem, block, model)]
     feeds += _turn_feeds(problem, block, start)
-    emission = []
-    for target in problem.emitting if model.emission else ():
+    return Plan(block, model, tuple(feeds), _terms(problem, block, start, ("scale",)), _adds(problem, block, start))
+
+
+def _adds(problem: Problem, block: Rows, start: int) -> Terms:
+    parts = [_terms(problem, block, start, ("offset", "drift"))]
+    for target in problem.emitting if MODELS[block.kind].emission else ():
         rows = np.flatnonzero(block.target == target)
-        name = emission_name(target, len(problem.motions))
-        emission.append((rows, columns(layout, name, block.epoch[rows])[:, 0]))
-    return Plan(block, model, tuple(feeds), tuple(emission))
+        column = columns(problem.layout, emission_name(target, len(problem.motions)), block.epoch[rows])
+        parts.append(Terms(rows, column[:, 0], np.ones(len(rows))))
+    return _appended(parts)
+
+
+def _terms(problem: Problem, block: Rows, start: int, forms: tuple[str, ...]) -> Terms:
+    parts = [Terms(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))]
+    for bias in problem.biases:
+        if bias.form not in forms:
+            continue
+        inside = (bias.row >= start) & (bias.row < start + block.count)
+        rows, member, coefficient = bias.row[inside] - start, bias.member[inside], bias.coefficient[inside]
+        if bias.form == "drift":
+            coefficient = coefficient * (problem.times - problem.times[0])[block.epoch[rows]]
+        column = columns(problem.layout, bias.name, rows)[np.arange(len(rows)), member]
+        parts.append(Terms(rows, column, coefficient))
+    return _appended(parts)
+
+
+def _appended(parts: list[Terms]) -> Terms:
+    return Terms(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("row", "column", "coefficient")))
 
 
 def _motion_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
@@ -149,49 +209,78 @@ def points(problem: Problem, plan: Plan, x: Array, differentiate: bool) -> tuple
     differentiate : bool
         Whether fed inputs become `Jet` values seeded with one.
     """
-    model, block, stations = plan.model, plan.block, problem.stations
-    inputs = {feed.seed: 0.0 for feed in plan.feeds} | _known(problem, plan)
+    inputs = given(problem, plan)
     for feed in plan.feeds:
-        inputs[feed.seed] = _fed(inputs[feed.seed], feed, x, block.count)
+        inputs[feed.seed] = _fed(inputs.get(feed.seed, 0.0), feed, x, plan.block.count)
     if differentiate:
         for seed in {feed.seed for feed in plan.feeds}:
             inputs[seed] = Jet(inputs[seed], {seed: np.ones(1)})
+    return joined(problem, plan.model, inputs)
+
+
+def joined(problem: Problem, model: Model, inputs: dict[int, Any]) -> tuple[Point, Point, Point]:
+    """Return target, first and second station made of inputs of any type: arrays, jets or symbols.
+
+    Parameters
+    ----------
+    problem : Problem
+        Gives dimension and frame.
+    model : Model
+        Says what the points must carry.
+    inputs : dict of seed to number
+        Components; an absent one is zero.
+    """
     d = problem.dimension
 
-    def place(seed: int) -> tuple[Any, ...]:
+    def vector(seed: int) -> tuple[Any, ...]:
         return tuple(inputs.get(seed + c, 0.0) for c in range(d))
 
-    def station(index: Array, seed: int) -> Point:
-        axes = _gather(stations.axes, block, index, 2) if model.axes and stations.axes is not None else None
+    def station(place: int, rate: int, axes: int) -> Point:
+        own = tuple(vector(axes + 3 * i) for i in range(d)) if axes in inputs else None
         if _TURN in inputs:
-            axes = _gather(np.broadcast_to(np.eye(d), (1, stations.count, d, d)), block, index, 2) if axes is None else axes
-            axes = rotate(axes, tuple(inputs[_TURN + c] for c in range(1 if d == 2 else 3)))
-        rate = _gather(stations.velocity, block, index, 1) if model.velocity and stations.velocity is not None else None
-        return Point(place(seed), rate or ((0.0,) * d if model.velocity else None), axes)
+            identity = tuple(tuple(float(i == j) for j in range(d)) for i in range(d))
+            own = rotate(own or identity, tuple(inputs[_TURN + c] for c in range(1 if d == 2 else 3)))
+        return Point(vector(place), vector(rate) if model.velocity else None, own)
 
-    ecef = _ecef(problem, place(_TARGET)) if model.ecef else None
-    target = Point(place(_TARGET), place(_TARGET_RATE) if model.velocity else None, None, ecef)
-    a = station(block.a, _A) if model.stations else target
-    return target, a, station(block.b, _B) if model.stations > 1 else a
+    place = vector(_TARGET)
+    ecef = _ecef(problem, place) if model.ecef else None
+    target = Point(place, vector(_TARGET_RATE) if model.velocity else None, None, ecef)
+    a = station(_A, _RATE_A, _AXES_A) if model.stations else target
+    return target, a, station(_B, _RATE_B, _AXES_B) if model.stations > 1 else a
 
 
-def _known(problem: Problem, plan: Plan) -> dict[int, Any]:
-    """Return the parts of the inputs that are data: surveyed stations and known targets."""
-    block, d, inputs = plan.block, problem.dimension, {}
-    for seed, index in ((_A, block.a), (_B, block.b))[: plan.model.stations]:
-        for c, values in enumerate(_gather(problem.stations.position, block, index, 1)):
-            inputs[seed + c] = values
+def given(problem: Problem, plan: Plan) -> dict[int, Any]:
+    """Return the inputs that are data, each (..., m): surveyed stations, their rates and axes, known targets."""
+    block, model, stations = plan.block, plan.model, problem.stations
+    inputs: dict[int, Any] = {}
+    for place, rate, axes, index in ((_A, _RATE_A, _AXES_A, block.a), (_B, _RATE_B, _AXES_B, block.b))[: model.stations]:
+        inputs |= _at_rows(stations.position, 1, block, index, place)
+        if model.velocity and stations.velocity is not None:
+            inputs |= _at_rows(stations.velocity, 1, block, index, rate)
+        if model.axes and stations.axes is not None:
+            inputs |= _at_rows(stations.axes, 2, block, index, axes)
     for i, motion in enumerate(problem.motions):
         rows = np.flatnonzero(block.target == i)
         if motion.known is None or not len(rows):
             continue
         epoch = block.epoch[rows] if motion.known.shape[-3] > 1 else np.zeros(len(rows), dtype=int)
         for seed, order in ((_TARGET, 0), (_TARGET_RATE, 1)):
-            for c in range(d if order < motion.known.shape[-2] else 0):
+            for c in range(problem.dimension if order < motion.known.shape[-2] else 0):
                 values = np.zeros((*motion.known.shape[:-3], block.count))
                 values[..., rows] = motion.known[..., epoch, order, c]
                 inputs[seed + c] = inputs.get(seed + c, 0.0) + values
     return inputs
+
+
+def _at_rows(array: Array, rank: int, block: Rows, index: Array, seed: int) -> dict[int, Any]:
+    """Return the components of a per-station vector (rank 1) or set of axes (rank 2) at each row."""
+    epoch = block.epoch if array.shape[-2 - rank] > 1 else np.zeros_like(block.epoch)
+    if rank == 1:
+        picked = array[..., epoch, index, :]
+        return {seed + c: picked[..., c] for c in range(array.shape[-1])}
+    picked = array[..., epoch, index, :, :]
+    d = range(array.shape[-1])
+    return {seed + 3 * i + c: picked[..., i, c] for i in d for c in d}
 
 
 def _fed(value: Any, feed: Feed, x: Array, count: int) -> Any:
@@ -201,18 +290,6 @@ def _fed(value: Any, feed: Feed, x: Array, count: int) -> Any:
     full = np.zeros((*x.shape[:-1], count))
     full[..., feed.rows] = part
     return value + full
-
-
-def _gather(array: Array | None, block: Rows, index: Array, rank: int) -> tuple[Any, ...]:
-    """Return components (or components of rows) of a per-station quantity at each row."""
-    assert array is not None
-    epochs = array.shape[-2 - rank]
-    epoch = block.epoch if epochs > 1 else np.zeros_like(block.epoch)
-    if rank == 1:
-        picked = array[..., epoch, index, :]
-        return tuple(picked[..., c] for c in range(array.shape[-1]))
-    picked = array[..., epoch, index, :, :]
-    return tuple(tuple(picked[..., i, c] for c in range(array.shape[-1])) for i in range(array.shape[-2]))
 
 
 def _ecef(problem: Problem, position: tuple[Any, ...]) -> tuple[Any, ...]:

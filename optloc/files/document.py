@@ -45,12 +45,16 @@ def existing(path: Path) -> Path:
         raise InvalidProblem("this is a folder, not a file", str(path), "name a file in it")
     if not path.exists():
         near = nearest(path.name, sorted(p.name for p in path.parent.iterdir())) if path.parent.is_dir() else ""
-        hint = near.partition("?")[0] + "?" if "?" in near else "check the name; it is taken relative to the problem file"
+        hint = (
+            near.partition("?")[0] + "?" if "?" in near else "check the name; it is taken relative to the problem file"
+        )
         raise InvalidProblem("there is no such file", str(path), hint)
     try:
         path.open("rb").close()
     except OSError as error:
-        raise InvalidProblem(f"the file cannot be opened ({error.strerror})", str(path), "check its permissions") from None
+        raise InvalidProblem(
+            f"the file cannot be opened ({error.strerror})", str(path), "check its permissions"
+        ) from None
     return path
 
 
@@ -62,7 +66,9 @@ def _toml(text: str, source: str) -> dict[str, Any]:
     except tomllib.TOMLDecodeError as error:
         what, _, place = str(error).partition(" (at ")
         line = place.rstrip(")").partition(",")[0] if place else None
-        raise InvalidProblem(f"this is not TOML: {what[0].lower()}{what[1:]}", join(source, line), "see toml.io") from None
+        raise InvalidProblem(
+            f"this is not TOML: {what[0].lower()}{what[1:]}", join(source, line), "see toml.io"
+        ) from None
 
 
 _WHAT = {

@@ -28,8 +28,12 @@ class Chunk:
         Row of each in its table, from 0.
     z, a, b, weight, correction : array (m,)
         As in `optloc.types.Rows`; NaN where a value is to be simulated.
+    unit : Conversion
+        Of z.
     slope : array (m,)
         SI units in one unit of the file, with sign.
+    baseline : array (m,)
+        Distance of the two stations that was added to z, metres.
     sigma : array (m,), optional
         Standard deviation of each row.
     arrival : array (s,), optional
@@ -51,7 +55,9 @@ class Chunk:
     b: Array
     weight: Array
     correction: Array
+    unit: Conversion
     slope: Array
+    baseline: Array
     sigma: Array | None
     arrival: Array | None
     covariance: Array | None
@@ -127,7 +133,8 @@ def _chunk(c: _Context, kind: str, pick: Array) -> Chunk:
     sigma, arrival, covariance = _noise(c, model, units, unit, z, pick)
     seconds = Units("time").conversion(section.time_unit, join(c.where, "key 'time_unit'")).factor
     return Chunk(
-        kind, pick, z, a, b, weight, _correction(c, units, unit, pick), np.broadcast_to(unit.slope(z), z.shape),
+        kind, pick, z, a, b, weight, _correction(c, units, unit, pick), unit,
+        np.broadcast_to(unit.slope(z), z.shape), np.zeros(len(pick)),
         sigma, arrival, covariance,
         table.labels("epoch")[pick] if table.has("epoch") else None,
         table.times("time", seconds)[pick] if table.has("time") else None,
@@ -140,7 +147,9 @@ def _chunk(c: _Context, kind: str, pick: Array) -> Chunk:
 def _check_options(c: _Context, kind: str, model: Model) -> None:
     section = c.section
     if section.excess and kind != "range_sum":
-        raise InvalidProblem(f"{kind} has no excess path", join(c.where, "key 'excess'"), "leave it out; it is for range_sum")
+        raise InvalidProblem(
+            f"{kind} has no excess path", join(c.where, "key 'excess'"), "leave it out; it is for range_sum"
+        )
     if section.positive == "b-farther" and (model.stations < 2 or kind == "range_sum"):
         raise InvalidProblem(f"{kind} has no sign to turn", join(c.where, "key 'positive'"), "leave it out")
     if section.azimuth == "north-clockwise" and section.kind not in {None, "azimuth"}:
@@ -152,7 +161,9 @@ def _unit(section: MeasurementsTable, kind: str, where: str) -> str | None:
         return section.unit
     if section.kind is None or kind in section.unit:
         return section.unit.get(kind)
-    raise InvalidProblem(f"the units do not name {kind}", join(where, "key 'unit'"), nearest(kind, sorted(section.unit)))
+    raise InvalidProblem(
+        f"the units do not name {kind}", join(where, "key 'unit'"), nearest(kind, sorted(section.unit))
+    )
 
 
 def _numbers(c: _Context, key: str, pick: Array, default: float) -> Array:
@@ -163,7 +174,9 @@ def _check_weight(c: _Context, weight: Array, pick: Array) -> None:
     bad = np.flatnonzero(~((weight >= 0.0) & (weight <= 1.0)))
     if len(bad):
         place = c.table.where("weight", int(pick[bad[0]]))
-        raise InvalidProblem(f"the weight {weight[bad[0]]:g} is outside 0 to 1", place, "use 0 for absent, 1 for present")
+        raise InvalidProblem(
+            f"the weight {weight[bad[0]]:g} is outside 0 to 1", place, "use 0 for absent, 1 for present"
+        )
 
 
 def _values(c: _Context, unit: Conversion, weight: Array, pick: Array) -> Array:
@@ -254,7 +267,11 @@ def square(rows: list[list[float]], where: str) -> Array:
     r = len(rows)
     ragged = next((i for i, row in enumerate(rows) if len(row) != r), None)
     if r == 0 or ragged is not None:
-        what = "the covariance is empty" if r == 0 else f"row {ragged + 1} of the covariance has {len(rows[ragged])} numbers, not {r}"  # type: ignore[operator,index]
+        what = (
+            "the covariance is empty"
+            if r == 0
+            else f"row {ragged + 1} of the covariance has {len(rows[ragged])} numbers, not {r}"
+        )  # type: ignore[operator,index]
         raise InvalidProblem(what, where, "give a square matrix")
     matrix = np.array(rows, dtype=float)
     i, j = np.unravel_index(int(np.argmax(np.abs(matrix - matrix.T))), matrix.shape)
@@ -264,7 +281,9 @@ def square(rows: list[list[float]], where: str) -> Array:
     diagonal = np.diagonal(matrix)
     if (diagonal <= 0.0).any():
         place = int(np.flatnonzero(diagonal <= 0.0)[0]) + 1
-        raise InvalidProblem(f"the variance ({place}, {place}) is {diagonal[place - 1]:g}, not positive", where, "give a covariance")
+        raise InvalidProblem(
+            f"the variance ({place}, {place}) is {diagonal[place - 1]:g}, not positive", where, "give a covariance"
+        )
     lowest = np.linalg.eigvalsh(matrix)[0]
     if lowest < -1e-9 * diagonal.max():
         raise InvalidProblem(f"the covariance has the negative eigenvalue {lowest:g}", where, "give a covariance")
@@ -288,4 +307,4 @@ def _size(unit: Conversion, c: _Context) -> float:
 
 def with_baseline(chunk: Chunk, baseline: Array) -> Chunk:
     """Return a chunk of excess paths with the distance (m,) of its stations added."""
-    return replace(chunk, z=chunk.z + baseline * (chunk.weight > 0.0))
+    return replace(chunk, z=chunk.z + baseline * (chunk.weight > 0.0), baseline=baseline)

@@ -38,7 +38,9 @@ def spread(
 
     if found.axes is not None and np.any((share > 0.0) & (low != high)) and _turning(found):
         raise InvalidProblem(
-            "the axes of stations turn between the times of their rows", found.table.source, "give rows at the epochs' times"
+            "the axes of stations turn between the times of their rows",
+            found.table.source,
+            "give rows at the epochs' times",
         )
     velocity = None if found.velocity is None else between(found.velocity)
     return between(found.position), velocity, None if found.axes is None else found.axes[low]
@@ -69,7 +71,9 @@ def _by_time(found: Survey, section: StationsTable, epochs: Epochs) -> tuple[Arr
     times, k = found.table.times("time", unit.factor), epochs.count
     if not np.isfinite(epochs.times).all():
         advice = "give the measurements a column 'time', or the stations a column 'epoch'"
-        raise InvalidProblem("the stations move in time, but the measurements are not dated", found.table.source, advice)
+        raise InvalidProblem(
+            "the stations move in time, but the measurements are not dated", found.table.source, advice
+        )
     low = np.full((k, len(found.names)), -1)
     high, share = low.copy(), np.zeros(low.shape)
     for station in range(len(found.names)):

@@ -14,7 +14,9 @@ from optloc.noise import Block, Noise, group
 from optloc.types import Array
 
 
-def noise_of(chunks: Sequence[Chunk], numbers: Sequence[Array], epochs: Sequence[Array], targets: Sequence[Array]) -> Noise:
+def noise_of(
+    chunks: Sequence[Chunk], numbers: Sequence[Array], epochs: Sequence[Array], targets: Sequence[Array]
+) -> Noise:
     """Return the noise of chunks.
 
     Parameters

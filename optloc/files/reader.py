@@ -20,6 +20,7 @@ from optloc.files.stations import over_epochs, survey
 from optloc.files.table import Table
 from optloc.files.unknowns import bias_of, motions_of, needs_clock, prior_of
 from optloc.files.words import Units, join
+from optloc.frames import Frame
 from optloc.noise import Noise
 from optloc.problem import Problem
 from optloc.types import Array, Rows, Stations
@@ -88,7 +89,39 @@ def read(path: str | Path, *, values: bool = True) -> Loaded:
     InvalidProblem
         As `load`.
     """
-    path = Path(path)
+    return draft(Path(path), values=values).loaded
+
+
+@dataclass(frozen=True, slots=True)
+class Draft:
+    """A problem with everything that is needed to write its file again.
+
+    Parameters
+    ----------
+    loaded : Loaded
+        The problem.
+    file : ProblemFile
+        Settings.
+    tables : tuple of Table
+        Rows of each ``[[measurements]]``.
+    chunks : tuple of Chunk
+        The same in SI units, one for each kind of each table.
+    numbers : tuple of int array (m,)
+        Global row number of each row of each chunk.
+    moving : bool
+        Whether stations move.
+    """
+
+    loaded: Loaded
+    file: ProblemFile
+    tables: tuple[Table, ...]
+    chunks: tuple[Chunk, ...]
+    numbers: tuple[Array, ...]
+    moving: bool
+
+
+def draft(path: Path, *, values: bool) -> Draft:
+    """Return the problem of a file together with its tables; arguments as `read`."""
     file = read_document(path)
     stations = table_of(file.stations, path.parent, join(path.name, "[stations]"))
     places = [join(path.name, f"[[measurements]] {i + 1}") for i in range(len(file.measurements))]
@@ -96,7 +129,7 @@ def read(path: str | Path, *, values: bool = True) -> Loaded:
     return assemble(file, stations, tables, path.name, values=values)
 
 
-def assemble(file: ProblemFile, station_table: Table, tables: Sequence[Table], source: str, *, values: bool) -> Loaded:
+def assemble(file: ProblemFile, station_table: Table, tables: Sequence[Table], source: str, *, values: bool) -> Draft:
     """Return the problem of settings and tables.
 
     Parameters
@@ -116,30 +149,36 @@ def assemble(file: ProblemFile, station_table: Table, tables: Sequence[Table], s
     found, frame = survey(file.stations, station_table, file.frame, source)
     chunks = []
     for i, (section, table) in enumerate(zip(file.measurements, tables, strict=True)):
-        chunks += chunks_of(
-            section, table, found.names, join(source, f"[[measurements]] {i + 1}"), speed, values=values
-        )
+        place = join(source, f"[[measurements]] {i + 1}")
+        chunks += chunks_of(section, table, found.names, place, speed, values=values)
     epochs = _epochs(file, chunks, source)
     cuts = np.cumsum([len(chunk.z) for chunk in chunks])[:-1]
     index, target = np.split(epochs.index, cuts), np.split(epochs.target, cuts)
     stations = over_epochs(found, file.stations, epochs, [_used(c, i) for c, i in zip(chunks, index, strict=True)])
     chunks = [_completed(chunk, i, stations) for chunk, i in zip(chunks, index, strict=True)]
     rows, numbers = _rows(chunks, index, target)
+    noise = _noise(file, chunks, numbers, index, target, source)
+    problem = _problem(file, epochs, stations, rows, noise, frame, source)
+    names = (source, file.title or source, epochs.labels, epochs.times, epochs.targets, epochs.own)
+    return Draft(Loaded(problem, *names), file, tuple(tables), tuple(chunks), tuple(numbers), found.moving)
+
+
+def _problem(
+    file: ProblemFile,
+    epochs: Epochs,
+    stations: Stations,
+    rows: tuple[Rows, ...],
+    noise: Noise,
+    frame: Frame,
+    source: str,
+) -> Problem:
+    speed = file.propagation_speed or SPEED_OF_LIGHT
     motions = motions_of(file, epochs, source)
     why = needs_clock(motions, file.biases)
-    problem = Problem(
-        stations,
-        rows,
-        _noise(file, chunks, numbers, index, target, source),
-        epochs.clock if why is None else need_clock(epochs, why, source),
-        motions,
-        tuple(bias_of(b, rows, found.names, stations.dimension, speed, source) for b in file.biases),
-        tuple(prior_of(p, stations.dimension, source) for p in file.priors),
-        frame,
-    )
-    return Loaded(
-        _checked(problem, source), source, file.title or source, epochs.labels, epochs.times, epochs.targets, epochs.own
-    )
+    times = epochs.clock if why is None else need_clock(epochs, why, source)
+    biases = tuple(bias_of(b, rows, stations.names, stations.dimension, speed, source) for b in file.biases)
+    priors = tuple(prior_of(p, stations.dimension, source) for p in file.priors)
+    return _checked(Problem(stations, rows, noise, times, motions, biases, priors, frame), source)
 
 
 def _checked(problem: Problem, source: str) -> Problem:
@@ -184,7 +223,9 @@ def _completed(chunk: Chunk, epoch: Array, stations: Stations) -> Chunk:
     return with_baseline(chunk, np.linalg.norm(place[rows, chunk.a] - place[rows, chunk.b], axis=-1))
 
 
-def _rows(chunks: Sequence[Chunk], index: Sequence[Array], target: Sequence[Array]) -> tuple[tuple[Rows, ...], list[Array]]:
+def _rows(
+    chunks: Sequence[Chunk], index: Sequence[Array], target: Sequence[Array]
+) -> tuple[tuple[Rows, ...], list[Array]]:
     """Return the rows of each kind, and the global number of each row of each chunk."""
     kinds = dict.fromkeys(chunk.kind for chunk in chunks)
     rows, numbers, start = [], [np.zeros(0, dtype=np.int64)] * len(chunks), 0
@@ -194,7 +235,10 @@ def _rows(chunks: Sequence[Chunk], index: Sequence[Array], target: Sequence[Arra
             name: np.concatenate([getattr(chunks[i], name) for i in same])
             for name in ("z", "a", "b", "weight", "correction")
         }
-        joined = {"epoch": np.concatenate([index[i] for i in same]), "target": np.concatenate([target[i] for i in same])}
+        joined = {
+            "epoch": np.concatenate([index[i] for i in same]),
+            "target": np.concatenate([target[i] for i in same]),
+        }
         rows.append(Rows(kind, **columns, **joined))
         for i in same:
             numbers[i] = start + np.arange(len(chunks[i].z))

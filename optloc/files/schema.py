@@ -20,7 +20,9 @@ Row = dict[str, Cell]
 class _Table(BaseModel):
     """A table of the file; keys that it does not know are refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True)
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
 
 
 class Origin(_Table):

@@ -22,15 +22,21 @@ _FILES = (".csv", ".txt", ".tsv", *_PARQUET)
 def table_of(section: DataTable, folder: Path, where: str) -> Table:
     """Return the rows that a table of a problem file names or holds."""
     if (section.file is None) == (section.rows is None):
-        raise InvalidProblem("the rows must be given once", where, "write file = \"...\" or rows = [ ... ]")
+        raise InvalidProblem("the rows must be given once", where, 'write file = "..." or rows = [ ... ]')
     if section.rows is not None:
         return of_rows(section.rows, where, section.columns)
     assert section.file is not None
     path = folder / section.file
     suffix = path.suffix.lower()
     if suffix not in _FILES and not path.is_dir():
-        raise InvalidProblem(f"{section.file!r} is of no known type", join(where, "key 'file'"), f"use {', '.join(_FILES)}")
-    found = parquet(existing(path), section.columns) if suffix in _PARQUET else csv(path, section.separator, section.columns)
+        raise InvalidProblem(
+            f"{section.file!r} is of no known type", join(where, "key 'file'"), f"use {', '.join(_FILES)}"
+        )
+    found = (
+        parquet(existing(path), section.columns)
+        if suffix in _PARQUET
+        else csv(path, section.separator, section.columns)
+    )
     if not found.count:
         raise InvalidProblem("the table has no rows", found.source, "give at least one")
     return found
@@ -77,7 +83,9 @@ def csv(path: Path, separator: str, names: Mapping[str, str]) -> Table:
     except pa.ArrowInvalid as error:
         what = str(error).partition("CSV parse error: ")[2] or str(error)
         what = what.replace("Row #", "line ").splitlines()[0]
-        raise InvalidProblem(f"the file is no CSV table ({what})", path.name, "check its separators and quotes") from None
+        raise InvalidProblem(
+            f"the file is no CSV table ({what})", path.name, "check its separators and quotes"
+        ) from None
     columns = {name: read.column(name).to_numpy(zero_copy_only=False).astype(object) for name in header}
     return Table(path.name, columns, read.num_rows, names)
 

@@ -85,11 +85,13 @@ def _positions(table: Table, wanted: FrameTable, factor: float, where: str) -> t
         advice = "give every station x, y, z, or every one lat_deg, lon_deg, height"
         raise InvalidProblem("the stations mix x, y with latitude and longitude", table.source, advice)
     if globe and wanted.kind == "cartesian":
-        advice = "write kind = \"geodetic\", \"ecef\" or \"enu\" in [frame]"
+        advice = 'write kind = "geodetic", "ecef" or "enu" in [frame]'
         raise InvalidProblem("latitudes and longitudes have no place in a cartesian frame", table.source, advice)
     if not globe:
         if wanted.kind == "geodetic":
-            raise InvalidProblem("the frame is geodetic, but the stations have no lat_deg and lon_deg", table.source, "add them")
+            raise InvalidProblem(
+                "the frame is geodetic, but the stations have no lat_deg and lon_deg", table.source, "add them"
+            )
         d = wanted.dimension or (3 if table.has("z") else 2)
         return factor * np.stack([table.numbers(key) for key in _XYZ[:d]], axis=-1), _frame(wanted, where)
     lat, lon = (np.radians(table.numbers(key)) for key in _GEODETIC[:2])
@@ -104,7 +106,9 @@ def _positions(table: Table, wanted: FrameTable, factor: float, where: str) -> t
 
 def _dimension(wanted: FrameTable, frame: Frame, where: str) -> int:
     if wanted.dimension == 2 and frame.kind != "enu":
-        raise InvalidProblem("only a cartesian or enu frame has two dimensions", join(where, "[frame]"), 'use kind = "enu"')
+        raise InvalidProblem(
+            "only a cartesian or enu frame has two dimensions", join(where, "[frame]"), 'use kind = "enu"'
+        )
     return wanted.dimension or 3
 
 
@@ -116,7 +120,9 @@ def _frame(wanted: FrameTable, where: str) -> Frame:
         advice = "write origin = { lat_deg = ..., lon_deg = ..., height = ... }"
         raise InvalidProblem("an enu frame of stations in x, y, z needs its origin", join(where, "[frame]"), advice)
     if place is not None:
-        raise InvalidProblem(f"the frame {wanted.kind!r} has no origin", join(where, "[frame]"), 'only kind = "enu" has one')
+        raise InvalidProblem(
+            f"the frame {wanted.kind!r} has no origin", join(where, "[frame]"), 'only kind = "enu" has one'
+        )
     return CARTESIAN if wanted.kind == "cartesian" else ECEF
 
 
@@ -141,7 +147,9 @@ def _turn(table: Table, d: int) -> Array | None:
     if not any(table.has(key) for key in _QUATERNION):
         return None
     if d == 2:
-        raise InvalidProblem("a quaternion turns axes in space, but the stations have x and y only", table.source, "use yaw_deg")
+        raise InvalidProblem(
+            "a quaternion turns axes in space, but the stations have x and y only", table.source, "use yaw_deg"
+        )
     parts = np.stack([table.numbers(key) for key in _QUATERNION], axis=-1)
     length = np.linalg.norm(parts, axis=-1)
     bad = np.flatnonzero(np.abs(length - 1.0) > 1e-2)
@@ -156,7 +164,9 @@ def _sigma(section: StationsTable, table: Table, where: str) -> Array | None:
     if table.has("sigma"):
         sigma = units.conversion(section.unit, where).sigma_to_si(table.numbers("sigma"))
     elif section.sigma is not None:
-        number, unit = units.amount(section.sigma, units.conversion(section.unit, where), join(where, "[stations]", "key 'sigma'"))
+        number, unit = units.amount(
+            section.sigma, units.conversion(section.unit, where), join(where, "[stations]", "key 'sigma'")
+        )
         sigma = np.full(table.count, float(unit.sigma_to_si(number)))
     else:
         return None
@@ -188,7 +198,9 @@ def over_epochs(found: Survey, section: StationsTable, epochs: Epochs, used: Seq
         position, velocity, axes = spread(found, section, epochs, np.concatenate(used))
     else:
         order = np.argsort(found.index)
-        position, velocity, axes = (None if v is None else v[order][None] for v in (found.position, found.velocity, found.axes))
+        position, velocity, axes = (
+            None if v is None else v[order][None] for v in (found.position, found.velocity, found.axes)
+        )
     covariance = None
     if found.sigma is not None:
         first = np.array([np.flatnonzero(found.index == i)[0] for i in range(s)])

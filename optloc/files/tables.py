@@ -88,7 +88,7 @@ def from_table(
         "target": {"motion": motion},
     }
     file = validated(settings, "arguments")
-    return assemble(file, station_table, [of_frame(table, "table", names)], "arguments", values=values).problem
+    return assemble(file, station_table, [of_frame(table, "table", names)], "arguments", values=values).loaded.problem
 
 
 def _station_table(stations: Any, names: Mapping[str, str]) -> Table:
@@ -102,6 +102,8 @@ def _station_table(stations: Any, names: Mapping[str, str]) -> Table:
         except ValueError:
             position = np.zeros(0)
         if position.ndim != 2 or position.shape[1] not in {2, 3}:
-            raise InvalidProblem("the stations are no positions of 2 or 3 coordinates", "stations", "give name: (x, y, z)")
+            raise InvalidProblem(
+                "the stations are no positions of 2 or 3 coordinates", "stations", "give name: (x, y, z)"
+            )
         stations = {"name": np.array(list(stations), dtype=object)} | dict(zip("xyz", position.T, strict=False))
     return of_frame(stations, "stations", names)

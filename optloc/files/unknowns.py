@@ -30,7 +30,9 @@ def motions_of(file: ProblemFile, epochs: Epochs, source: str) -> tuple[Motion, 
     unknown = [name for name in file.targets if name not in epochs.targets]
     if unknown:
         raise InvalidProblem(
-            f"no row has the target {unknown[0]!r}", join(source, "[targets]"), nearest(unknown[0], sorted(set(epochs.targets)))
+            f"no row has the target {unknown[0]!r}",
+            join(source, "[targets]"),
+            nearest(unknown[0], sorted(set(epochs.targets))),
         )
     return tuple(_motion(file.targets.get(name, file.target), epochs.count) for name in names)
 
@@ -67,7 +69,9 @@ def _touched(table: BiasTable, rows: Sequence[Rows], where: str) -> list[tuple[R
     starts = np.cumsum([0, *(block.count for block in rows)]).tolist()
     kinds = [block.kind for block in rows]
     if table.kind is not None and table.kind not in kinds:
-        raise InvalidProblem(f"there are no rows of kind {table.kind!r}", join(where, "key 'kind'"), nearest(table.kind, kinds))
+        raise InvalidProblem(
+            f"there are no rows of kind {table.kind!r}", join(where, "key 'kind'"), nearest(table.kind, kinds)
+        )
     chosen = [
         (block, start)
         for block, start in zip(rows, starts, strict=False)
@@ -133,7 +137,9 @@ def _station_members(
     if table.members is not None:
         unknown = [name for name in table.members if name not in stations]
         if unknown:
-            raise InvalidProblem(f"there is no station {unknown[0]!r}", join(where, "key 'members'"), nearest(unknown[0], list(stations)))
+            raise InvalidProblem(
+                f"there is no station {unknown[0]!r}", join(where, "key 'members'"), nearest(unknown[0], list(stations))
+            )
         return tuple(table.members)
     used = np.unique(np.concatenate([np.concatenate([block.a, block.b]) for block, _ in touches]))
     return tuple(stations[i] for i in used.tolist() if i >= 0)
@@ -157,7 +163,9 @@ def _prior(
         return mean, None
     sigma = si(table.sigma, "sigma")
     if sigma <= 0.0:
-        raise InvalidProblem("the standard deviation is not positive", join(where, "key 'sigma'"), "leave it out if unknown")
+        raise InvalidProblem(
+            "the standard deviation is not positive", join(where, "key 'sigma'"), "leave it out if unknown"
+        )
     return mean, np.full(shape, sigma)
 
 
@@ -166,7 +174,9 @@ def prior_of(table: PriorTable, dimension: int, source: str) -> Prior:
     where = join(source, f"[[priors]] {table.name!r}")
     base = table.name.partition("[")[0]
     if base not in _STATES:
-        raise InvalidProblem("there is no such unknown", where, f"{nearest(base, list(_STATES))}; those of biases stand with the bias")
+        raise InvalidProblem(
+            "there is no such unknown", where, f"{nearest(base, list(_STATES))}; those of biases stand with the bias"
+        )
     quantity, default = _STATES[base]
     units, unit = Units(quantity), table.unit or default
     size = 1 if base == "emission" else dimension
@@ -177,4 +187,3 @@ def prior_of(table: PriorTable, dimension: int, source: str) -> Prior:
     if len(sigma) != size or (sigma <= 0.0).any():
         raise InvalidProblem(f"sigma is not {size} positive numbers", where, "give one each")
     return Prior(table.name, units.conversion(unit, where).factor * np.array(table.mean), np.diag(sigma**2))
-

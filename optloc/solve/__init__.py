@@ -7,12 +7,12 @@ from typing import Any
 import numpy as np
 
 from optloc.epochs import by_epoch, separable
-from optloc.errors import InvalidProblem
 from optloc.fix import Fix
 from optloc.problem import Problem
-from optloc.solve.stages import SOLVERS, given
+from optloc.solve.catalogue import FORMULATIONS, METHODS, SOLVERS, stages_of
+from optloc.solve.stages import given
 
-METHODS = {"auto": "gtrs+lsr+widen+lsr"}
+__all__ = ["FORMULATIONS", "METHODS", "SOLVERS", "solve"]
 
 
 def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
@@ -37,10 +37,7 @@ def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
     InvalidProblem
         For an unknown method.
     """
-    stages = METHODS.get(method, method).split("+")
-    unknown = [name for name in stages if name not in SOLVERS]
-    if unknown:
-        raise InvalidProblem(f"unknown method {unknown[0]!r}", "method", f"use auto or stages of {', '.join(SOLVERS)}")
+    stages = stages_of(method)
     if separable(problem):
         problem = by_epoch(problem)
     shape, flat = problem.batch_shape, problem.flat()
@@ -48,7 +45,7 @@ def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
     if start is not None:
         vector = np.broadcast_to(np.asarray(start, dtype=float), (*shape, problem.layout.size))
         fix = given(flat, vector.reshape(-1, problem.layout.size))
-    for name in stages:
-        fix = SOLVERS[name](flat, fix)
+    for stage in stages:
+        fix = stage.solver(flat, fix)
     assert fix is not None
     return fix.reshape(shape) if shape != (len(fix),) else fix

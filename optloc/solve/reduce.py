@@ -95,7 +95,7 @@ def ranges(problem: Problem) -> Ranges | None:
     weight = np.broadcast_to(problem.weight, (*problem.batch_shape, problem.count))
     used = np.any(design != 0.0, axis=1)
     present = weight[:, used] > 0.0
-    patterns, pattern = np.unique(present, axis=0, return_inverse=True)
+    patterns, pattern = _patterns(present)
     graphs = [_graph(design[used][rows], len(station)) for rows in patterns]
     chosen = [_main(graph, len(station)) for graph in graphs]
     inside, sign, reference = (np.array([c[i] for c in chosen])[pattern] for i in range(3))
@@ -176,6 +176,14 @@ def _unbatched(rows: tuple[Rows, ...]) -> tuple[Rows, ...]:
     )
 
 
+def _patterns(present: Array) -> tuple[Array, Array]:
+    """Return the distinct rows of a mask (N, m), and which of them each problem has."""
+    if present.all() or (present == present[:1]).all():
+        return present[:1], np.zeros(len(present), dtype=int)
+    patterns, pattern = np.unique(present, axis=0, return_inverse=True)
+    return patterns, pattern.reshape(-1)
+
+
 def _design(problem: Problem) -> tuple[Array, Array, Array]:
     """Return D (m, q) over nodes, and station and epoch of the station nodes."""
     moving = problem.stations.position.shape[-3] > 1
@@ -253,20 +261,20 @@ def _pinned(graphs: list[Graph], chosen: list[tuple[Array, Array, int]], station
 
 
 def _least_squares(problem: Problem, design: Array, pinned: Array) -> tuple[Array, Array, Array]:
+    """Return the values of all nodes (N, q), their covariance (N or 1, q, q) and the misfit (N,)."""
     q = design.shape[1]
-    stacked = np.concatenate([np.broadcast_to(design, (*problem.z.shape[:-1], *design.shape)), problem.z[..., None]], axis=-1)
     used = np.any(design != 0.0, axis=1)
-    stacked = np.where(used[:, None] & (problem.weight > 0.0)[..., None], stacked, 0.0)
-    gram = np.zeros((q + 1, q + 1))
+    z = np.where(used & (problem.weight > 0.0), problem.z, 0.0)[..., None]
+    information, vector, total = np.zeros((1, q, q)), np.zeros((1, q, 1)), np.zeros((1, 1, 1))
     for whitener in whiten(problem.noise, problem.weight):
-        white = whitener.apply(stacked)
-        gram = gram + np.swapaxes(white, -1, -2) @ white
-    one = (pinned == pinned[:1]).all()
-    held = pinned[:1] if one else pinned
-    information = np.where(held[:, :, None] | held[:, None, :], 0.0, gram[..., :q, :q])
-    information = information + held[:, :, None] * np.eye(q)
-    information = information[:1] if one and np.ptp(information, axis=0).max() == 0.0 else information
+        white, seen = whitener.apply(design), whitener.apply(z)
+        transposed = np.swapaxes(white, -1, -2)
+        information = information + transposed @ white
+        vector = vector + transposed @ seen
+        total = total + np.swapaxes(seen, -1, -2) @ seen
+    held = pinned[:1] if (pinned == pinned[:1]).all() else pinned
+    information = np.where(held[:, :, None] | held[:, None, :], 0.0, information) + held[:, :, None] * np.eye(q)
     covariance, _ = linalg.inverse(information)
-    offset = (covariance @ np.where(held, 0.0, gram[..., :q, q])[..., None])[..., 0]
-    cost = gram[..., q, q] - (offset * gram[..., :q, q]).sum(-1)
+    offset = (covariance @ np.where(held[..., None], 0.0, vector))[..., 0]
+    cost = total[..., 0, 0] - (offset * vector[..., 0]).sum(-1)
     return np.broadcast_to(offset, (len(pinned), q)), covariance, np.broadcast_to(cost, (len(pinned),))

@@ -8,14 +8,15 @@ from time import perf_counter
 import numpy as np
 
 from optloc.errors import InvalidProblem
-from optloc.fix import Fix, Stage
+from optloc.fix import Alternatives, Fix, Stage
 from optloc.noise import whiten
 from optloc.normal import Normal
 from optloc.problem import Problem
 from optloc.solve.refine import equations_at, refine
 from optloc.solve.start import mirrored, squared_range_starts, static, subarray_starts, vectors
-from optloc.solve.verdict import Candidates, judge
-from optloc.status import Status
+from optloc.solve.squared import Pick, every, hull, minimum, shor
+from optloc.solve.verdict import Candidates, degrees_of_freedom, judge
+from optloc.status import Certificate, Status
 from optloc.types import Array
 
 Solver = Callable[[Problem, Fix | None], Fix]
@@ -24,10 +25,28 @@ _DOUBT = 1e-3
 
 
 def gtrs(problem: Problem, fix: Fix | None) -> Fix:
-    """Return every stationary point of the weighted squared-range problem, unrefined."""
+    """Return the minimiser of the weighted squared-range problem, unrefined: one candidate, the cheapest start."""
+    return _squared(problem, fix, "gtrs", minimum)
+
+
+def roots(problem: Problem, fix: Fix | None) -> Fix:
+    """Return every stationary point of the squared-range problem in two weightings, unrefined."""
+    return _squared(problem, fix, "roots", every)
+
+
+def sdp(problem: Problem, fix: Fix | None) -> Fix:
+    """Return the answer of Shor's semidefinite relaxation of the squared-range problem, unrefined."""
+    return _squared(problem, fix, "sdp", shor)
+
+
+def socp(problem: Problem, fix: Fix | None) -> Fix:
+    """Return the answer of the second-order cone relaxation of the squared-range problem, unrefined."""
+    return _squared(problem, fix, "socp", hull)
+
+
+def _squared(problem: Problem, fix: Fix | None, name: str, pick: Pick) -> Fix:
     began = perf_counter()
-    position = squared_range_starts(static(problem))
-    return _unrefined(problem, position, fix, "gtrs", began)
+    return _unrefined(problem, squared_range_starts(static(problem), pick), fix, name, began)
 
 
 def widen(problem: Problem, fix: Fix | None) -> Fix:
@@ -52,19 +71,28 @@ def lsr(problem: Problem, fix: Fix | None, *, damped: bool = True, limit: int = 
     if fix is None:
         raise InvalidProblem("lsr refines a start", "method", "give start= or a method such as 'gtrs+lsr'")
     began = perf_counter()
-    pool = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
-    item, slot = np.nonzero(np.isfinite(pool).all(-1))
+    pool, item, slot = pooled(fix)
     cost, code = np.full(pool.shape[:2], np.inf), np.full(pool.shape[:2], int(Status.NUMERICAL), dtype=np.int8)
-    pool = np.array(pool)
     detail = "nothing to refine"
     if len(item):
         whole = len(item) == len(pool) and bool((item == np.arange(len(pool))).all())
         done = refine(problem if whole else problem.take(item), pool[item, slot], damped=damped, limit=limit)
         pool[item, slot], cost[item, slot], code[item, slot] = done.x, done.cost, done.status
-        cost[~np.isfinite(cost)] = np.inf
         detail = f"{len(item)} candidates, {int(done.iterations.max())} steps at most"
-    stage = Stage("lsr", detail, perf_counter() - began)
-    return judge(problem, Candidates(pool, cost, code), _equations, (*fix.stages, stage))
+    return finished(problem, fix, Candidates(pool, cost, code), Stage("lsr", detail, perf_counter() - began))
+
+
+def pooled(fix: Fix) -> tuple[Array, Array, Array]:
+    """Return a fix and its alternatives as one pool (N, q, size), and item and slot of every point in it."""
+    pool = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
+    item, slot = np.nonzero(np.isfinite(pool).all(-1))
+    return pool, item, slot
+
+
+def finished(problem: Problem, fix: Fix, pool: Candidates, stage: Stage) -> Fix:
+    """Return the judged fix of refined candidates."""
+    pool = Candidates(pool.x, np.where(np.isfinite(pool.cost), pool.cost, np.inf), pool.code)
+    return judge(problem, pool, _equations, (*fix.stages, stage))
 
 
 def taylor(problem: Problem, fix: Fix | None) -> Fix:
@@ -83,24 +111,19 @@ def given(problem: Problem, start: Array) -> Fix:
 def _positions(problem: Problem, fix: Fix) -> Array:
     """Return the positions (N, q, d) of a fix and its alternatives."""
     slot, _ = problem.layout.find("position")
-    pool = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
-    return pool[..., slot.start : slot.start + slot.size]
+    return pooled(fix)[0][..., slot.start : slot.start + slot.size]
 
 
 def _unrefined(problem: Problem, position: Array, fix: Fix | None, name: str, began: float) -> Fix:
-    finite = np.isfinite(position).all(-1)
-    order = np.argsort(~finite, axis=1, kind="stable")
-    keep = max(1, int(finite.sum(1).max(initial=0)))
-    position = np.take_along_axis(position, order[..., None], axis=1)[:, :keep]
-    x = vectors(problem, position)
-    return _assembled(problem, np.where(np.isfinite(position).all(-1, keepdims=True), x, np.nan), fix, name, began)
+    if position.shape[1] > 1:
+        finite = np.isfinite(position).all(-1)
+        order = np.argsort(~finite, axis=1, kind="stable")
+        keep = max(1, int(finite.sum(1).max(initial=0)))
+        position = np.take_along_axis(position, order[..., None], axis=1)[:, :keep]
+    return _assembled(problem, vectors(problem, position), fix, name, began)
 
 
 def _assembled(problem: Problem, x: Array, fix: Fix | None, name: str, began: float) -> Fix:
-    from optloc.fix import Alternatives
-    from optloc.status import Certificate
-    from optloc.solve.verdict import degrees_of_freedom
-
     size, n = len(x), problem.layout.n_shared
     reason, certificate = np.empty(size, dtype=object), np.empty(size, dtype=object)
     reason[:], certificate[:] = "not refined", Certificate("unknown", "a start, not refined", name)
@@ -123,6 +146,3 @@ def _assembled(problem: Problem, x: Array, fix: Fix | None, name: str, began: fl
 
 def _equations(problem: Problem, x: Array) -> Normal:
     return equations_at(problem, x, whiten(problem.noise, problem.weight))
-
-
-SOLVERS: dict[str, Solver] = {"gtrs": gtrs, "widen": widen, "lsr": lsr, "taylor": taylor}

@@ -9,32 +9,31 @@ import numpy as np
 from optloc.models import MODELS
 from optloc.problem import Problem
 from optloc.solve.reduce import ranges
-from optloc.solve.squared import candidates
+from optloc.solve.squared import Pick, candidates, every
 from optloc.types import Array
 
 
-def squared_range_starts(problem: Problem, passes: int = 2) -> Array:
-    """Return all squared-range candidates (N, q, d) of a flat batch with one static target; NaN where there is none."""
-    position, valid = _by_form(problem, passes)
-    return np.where(valid[..., None], position, np.nan)
+def squared_range_starts(problem: Problem, pick: Pick) -> Array:
+    """Return squared-range candidates (N, q, d) of a flat batch with one static target; NaN where there is none.
 
-
-def _by_form(problem: Problem, passes: int) -> tuple[Array, Array]:
-    """Solve problems whose ranges are free apart from those whose ranges are determined."""
+    Parameters
+    ----------
+    problem : Problem
+        N problems; those whose ranges are determined are solved apart from those whose ranges share an unknown.
+    pick : callable
+        Which points to take, see `optloc.solve.squared`.
+    """
     found = ranges(problem)
     if found is None or found.free.all() or not found.free.any():
-        return candidates(problem, found, passes)
+        return candidates(problem, found, pick)
     parts = []
     for mask in (found.free, ~found.free):
         some = problem.take(np.flatnonzero(mask))
-        parts.append((mask, *candidates(some, ranges(some), passes)))
-    slots = max(position.shape[1] for _, position, _ in parts)
-    position = np.full((len(found.free), slots, problem.dimension), np.nan)
-    valid = np.zeros((len(found.free), slots), dtype=bool)
-    for mask, points, good in parts:
+        parts.append((mask, candidates(some, ranges(some), pick)))
+    position = np.full((len(found.free), max(points.shape[1] for _, points in parts), problem.dimension), np.nan)
+    for mask, points in parts:
         position[mask, : points.shape[1]] = points
-        valid[mask, : points.shape[1]] = good
-    return position, valid
+    return position
 
 
 def mirrored(problem: Problem, position: Array) -> Array:
@@ -46,10 +45,10 @@ def mirrored(problem: Problem, position: Array) -> Array:
     normal = vectors[..., :, 0]
     shape = (-1, *(1,) * (position.ndim - 2), position.shape[-1])
     across, middle = normal.reshape(shape), centre.reshape(shape)
-    return position - 2.0 * ((position - middle) * across).sum(-1, keepdims=True) * across
+    return np.asarray(position - 2.0 * ((position - middle) * across).sum(-1, keepdims=True) * across)
 
 
-def subarray_starts(problem: Problem, passes: int = 2) -> Array:
+def subarray_starts(problem: Problem) -> Array:
     """Return the candidates (N, q, d) of all arrays that lack one station; NaN where there is none."""
     parts = []
     for station in range(problem.stations.count):
@@ -60,7 +59,7 @@ def subarray_starts(problem: Problem, passes: int = 2) -> Array:
             weight[:, start + np.flatnonzero(touched)] = 0.0
         changed = (weight != problem.weight).any()
         if changed and (weight > 0.0).any():
-            parts.append(squared_range_starts(problem.with_rows(weight=weight), passes))
+            parts.append(squared_range_starts(problem.with_rows(weight=weight), every))
     if not parts:
         return np.full((problem.batch_shape[0], 0, problem.dimension), np.nan)
     return np.concatenate(parts, axis=1)

@@ -63,10 +63,7 @@ def judge(problem: Problem, pool: Candidates, equations: Any, stages: tuple[Stag
         What was done so far.
     """
     size = len(pool.x)
-    order = np.argsort(np.where(np.isfinite(pool.cost), pool.cost, np.inf), axis=1, kind="stable")
-    x = np.take_along_axis(pool.x, order[..., None], axis=1)
-    cost = np.take_along_axis(pool.cost, order, axis=1)
-    code = np.take_along_axis(pool.code, order, axis=1)
+    x, cost, code = _sorted(pool)
     best, code = _preferred(cost, code)
     rows = np.arange(size)
     chosen, value, status = x[rows, best], cost[rows, best], code[rows, best].astype(np.int8)
@@ -95,6 +92,15 @@ def judge(problem: Problem, pool: Candidates, equations: Any, stages: tuple[Stag
     )
     _explain(problem, fix, information, found & ok & regular)
     return fix
+
+
+def _sorted(pool: Candidates) -> tuple[Array, Array, Array]:
+    """Return points, costs and codes of every problem, the cheapest first."""
+    if pool.cost.shape[1] == 1:
+        return pool.x, pool.cost, pool.code
+    order = np.argsort(pool.cost, axis=1, kind="stable")
+    x = np.take_along_axis(pool.x, order[..., None], axis=1)
+    return x, np.take_along_axis(pool.cost, order, axis=1), np.take_along_axis(pool.code, order, axis=1)
 
 
 def _preferred(cost: Array, code: Array) -> tuple[Array, Array]:
@@ -208,13 +214,13 @@ def _explain_missing(problem: Problem, fix: Fix, items: Array) -> None:
 
 
 def _weakest(information: Array) -> Array:
-    """Return the smallest eigenvalue of the information scaled to a unit diagonal, (N,)."""
+    """Return the smallest squared pivot of the information scaled to a unit diagonal, (N,)."""
     diagonal = np.diagonal(information, axis1=-2, axis2=-1)
     with np.errstate(invalid="ignore", divide="ignore"):
         scale = 1.0 / np.sqrt(diagonal)
-        unit = information * scale[..., :, None] * scale[..., None, :]
-    usable = np.isfinite(unit).all((-1, -2))
-    return np.where(usable, np.linalg.eigvalsh(np.where(usable[..., None, None], unit, 0.0))[..., 0], 0.0)
+        lower, ok = linalg.factor(information * scale[..., :, None] * scale[..., None, :])
+        pivots = np.diagonal(lower, axis1=-2, axis2=-1).min(-1) ** 2
+    return np.where(ok & np.isfinite(pivots), pivots, 0.0)
 
 
 def _distance(problem: Problem, fix: Fix) -> Array:

@@ -1,0 +1,168 @@
+"""Entry point; bad input ends in one sentence and exit code 2."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from optloc.errors import InvalidProblem
+
+# Heavy libraries are imported inside the commands, so that --help answers at once.
+
+
+class _Group(TyperGroup):
+    """Commands whose bad input is a sentence, not a traceback."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except InvalidProblem as error:
+            typer.echo(" ".join(str(error).split()), err=True)
+            raise typer.Exit(2) from None
+
+
+app = typer.Typer(
+    cls=_Group,
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+    help="Position fixes from time, gain, angle and Doppler measurements, with covariance and verdict.",
+    epilog="Exit codes: 0 all fixes are ok, 1 some are not, 2 bad input.",
+)
+
+ProblemPath = Annotated[Path, typer.Argument(metavar="FILE", help="Problem file (TOML, format = 1).")]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON on standard output and nothing else.")]
+Plot = Annotated[Path | None, typer.Option("--plot", metavar="OUT.png", help="Draw stations, fix and 95 % ellipse.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
+Method = Annotated[str, typer.Option("--method", "-m", help="How to solve; see [bold]optloc list solvers[/bold].")]
+Geodetic = Annotated[
+    bool, typer.Option("--geodetic", help="The coordinates are latitude, longitude (deg) and height (m).")
+]
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"optloc {version('optloc')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+def example(*lines: str) -> str:
+    """Return an epilogue of examples for a help text."""
+    return "[bold]Examples[/bold]\n\n" + "\n\n".join(f"[cyan]{line}[/cyan]" for line in lines)
+
+
+@app.command(
+    epilog=example(
+        "optloc fix site.toml", "optloc fix flight.toml --out fixes.csv", "optloc fix site.toml --json | jq .fixes"
+    )
+)
+def fix(
+    file: ProblemPath,
+    method: Method = "auto",
+    as_json: Json = False,
+    geojson: Annotated[Path | None, typer.Option(metavar="OUT", help="Write GeoJSON; - is standard output.")] = None,
+    plot: Plot = None,
+    out: Annotated[Path | None, typer.Option(metavar="OUT", help="Write all fixes as .csv or .parquet.")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Fix the target of a problem file, at every epoch if there are several."""
+    from optloc.cli.commands import run_fix
+
+    raise typer.Exit(run_fix(file, method, as_json=as_json, geojson_path=geojson, plot=plot, out=out, quiet=quiet))
+
+
+@app.command(epilog=example("optloc demo", "optloc demo ambiguous --plot two.png"))
+def demo(
+    name: Annotated[str, typer.Argument(help="Name of a shipped problem: demo, ambiguous, run.")] = "demo",
+    plot: Annotated[Path, typer.Option(metavar="OUT.png", help="Where to draw the fix.")] = Path("optloc-demo.png"),
+    quiet: Quiet = False,
+) -> None:
+    """Fix a problem file that is shipped with optloc, as a table and a picture."""
+    from optloc.cli.commands import run_demo
+
+    raise typer.Exit(run_demo(name, plot, quiet))
+
+
+@app.command(epilog=example("optloc simulate site.toml --truth 1200,800,50 --seed 7 --trials 100 --out trials.toml"))
+def simulate(
+    file: ProblemPath,
+    truth: Annotated[str, typer.Option(metavar="X,Y[,Z]", help="True position, metres in the frame of the file.")],
+    out: Annotated[
+        Path, typer.Option(metavar="OUT.toml", help="Problem file to write; rows go to CSV files beside it.")
+    ],
+    velocity: Annotated[
+        str | None, typer.Option(metavar="X,Y[,Z]", help="True velocity of a moving target, m/s.")
+    ] = None,
+    geodetic: Geodetic = False,
+    seed: Annotated[int, typer.Option(help="Decides the draw.")] = 0,
+    trials: Annotated[int, typer.Option(min=1, help="Independent draws; each becomes an epoch.")] = 1,
+    quiet: Quiet = False,
+) -> None:
+    """Draw measurements of a known target and write them as a problem file."""
+    from optloc.cli.bounds import run_simulate
+
+    raise typer.Exit(run_simulate(file, truth, velocity, out, geodetic=geodetic, seed=seed, trials=trials, quiet=quiet))
+
+
+@app.command(epilog=example("optloc crlb site.toml --at 1200,800,50", "optloc crlb site.toml"))
+def crlb(
+    file: ProblemPath,
+    at: Annotated[
+        str | None, typer.Option(metavar="X,Y[,Z]", help="Position of the target, metres; the fix by default.")
+    ] = None,
+    velocity: Annotated[str | None, typer.Option(metavar="X,Y[,Z]", help="Velocity of a moving target, m/s.")] = None,
+    geodetic: Geodetic = False,
+    as_json: Json = False,
+) -> None:
+    """Print the Cramer-Rao bound: the accuracy that no unbiased estimate beats."""
+    from optloc.cli.bounds import run_crlb
+
+    raise typer.Exit(run_crlb(file, at, velocity, geodetic=geodetic, as_json=as_json))
+
+
+@app.command(epilog=example("optloc check site.toml"))
+def check(file: ProblemPath, as_json: Json = False) -> None:
+    """Read a problem file and say what is in it: stations, rows, redundancy, connections, geometry."""
+    from optloc.cli.checking import run_check
+
+    raise typer.Exit(run_check(file, as_json))
+
+
+@app.command("list", epilog=example("optloc list kinds", "optloc list solvers"))
+def list_(
+    what: Annotated[str, typer.Argument(metavar="kinds|formulations|solvers", help="Which table.")],
+    as_json: Json = False,
+) -> None:
+    """List measurement kinds, formulations or solvers."""
+    from optloc.cli.listing import run_list
+
+    raise typer.Exit(run_list(what, as_json))
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON schema of problem files."""
+    from optloc.cli.output import dumps
+    from optloc.files import schema as of_files
+
+    typer.echo(dumps(of_files()))
+
+
+def main() -> None:
+    """Run the command line."""
+    app()

@@ -1,0 +1,110 @@
+"""What ``optloc check`` does: say what a file holds, before anything is solved."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from optloc.cli.output import dumps, write_text
+from optloc.epochs import separable
+from optloc.files import Loaded, read
+from optloc.models import MODELS
+from optloc.problem import Problem
+from optloc.types import Array
+
+
+def run_check(file: Path, as_json: bool) -> int:
+    """Print a summary of a file; the exit code is 1 where some epoch cannot be fixed."""
+    loaded = read(file, values=False)
+    found = summary(loaded)
+    if as_json:
+        write_text(Path("-"), dumps(found))
+    else:
+        table = Table(title=loaded.title, show_header=False, title_justify="left")
+        for name, value in found.items():
+            table.add_row(name.replace("_", " "), _spelled(value))
+        Console().print(table)
+    return 1 if found["epochs_with_too_few_rows"] or found["epochs_with_disconnected_pairs"] else 0
+
+
+def _spelled(value: Any) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{key}: {inner}" for key, inner in value.items())
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def summary(loaded: Loaded) -> dict[str, Any]:
+    """Return what a file holds, as numbers and words."""
+    problem = loaded.problem
+    alone = separable(problem)
+    redundancy = _redundancy(problem, alone)
+    parts = components(problem)
+    flattest, widest = spread(problem.stations.position)
+    worst = int(np.argmin(flattest / widest))
+    return {
+        "file": loaded.source,
+        "frame": problem.frame.kind,
+        "dimension": problem.dimension,
+        "stations": problem.stations.count,
+        "stations_move": len(problem.stations.position) > 1,
+        "epochs": problem.epochs,
+        "targets": len(set(loaded.targets)),
+        "rows": {block.kind: block.count for block in problem.rows},
+        "absent_rows": int((problem.weight == 0.0).sum()),
+        "unknowns": problem.layout.size // problem.epochs if alone else problem.layout.size,
+        "redundancy": {"least": int(redundancy.min()), "median": float(np.median(redundancy))},
+        "epochs_with_too_few_rows": int((redundancy < 0).sum()),
+        "groups_of_connected_stations": {"most": int(parts.max(initial=0))},
+        "epochs_with_disconnected_pairs": int((parts > 1).sum()),
+        "geometry": f"stations spread {flattest[worst]:.4g} m across and {widest[worst]:.4g} m along (root mean square)",
+    }
+
+
+def _redundancy(problem: Problem, alone: bool) -> Array:
+    """Return rows and priors less unknowns, of each epoch (k,) or of the run (1,)."""
+    present = np.bincount(problem.epoch, problem.weight > 0.0, problem.epochs)
+    layout = problem.layout
+    known = sum(bias.sigma is not None and len(np.ravel(bias.sigma)) for bias in problem.biases)
+    known += sum(prior.mean.shape[-1] for prior in problem.priors)
+    if problem.stations.covariance is not None:
+        known += (
+            problem.stations.count
+            * problem.dimension
+            * (1 if alone or problem.stations.span == "run" else problem.epochs)
+        )
+    if alone:
+        return np.asarray(present + known - layout.size // problem.epochs)
+    return np.array([present.sum() + known - layout.size])
+
+
+def components(problem: Problem) -> Array:
+    """Return how many groups of stations the differences of each epoch (k,) fall into; 0 where there are none."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    s, k = problem.stations.count, problem.epochs
+    ends = []
+    for block in problem.rows:
+        ranges = MODELS[block.kind].ranges
+        if MODELS[block.kind].stations == 2 and (ranges is None or sum(ranges) == 0):
+            present = block.weight > 0.0
+            ends.append(np.stack([block.epoch * s + block.a, block.epoch * s + block.b])[:, present])
+    edges = np.concatenate(ends, axis=-1) if ends else np.zeros((2, 0), dtype=int)
+    graph = coo_array((np.ones(edges.shape[1]), (edges[0], edges[1])), shape=(k * s, k * s))
+    _, label = connected_components(graph, directed=False)
+    touched = np.unique(edges)
+    pairs = np.unique(np.stack([touched // s, label[touched]]), axis=1)
+    return np.bincount(pairs[0], minlength=k)
+
+
+def spread(position: Array) -> tuple[Array, Array]:
+    """Return the least and the greatest root mean square extent (k,) of stations (k, s, d) about their centre."""
+    centred = position - position.mean(-2, keepdims=True)
+    values = np.linalg.svd(centred, compute_uv=False) / np.sqrt(position.shape[-2])
+    if position.shape[-2] <= position.shape[-1]:
+        values = np.concatenate([values, np.zeros((*values.shape[:-1], 1))], axis=-1)
+    return values[..., -1], np.maximum(values[..., 0], 1e-300)

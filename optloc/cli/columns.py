@@ -1,0 +1,130 @@
+"""The long table of fixes: one row for each target and epoch, one column for each number."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from optloc.ellipse import error_ellipse
+from optloc.files import Loaded
+from optloc.fix import Fix
+from optloc.frames import Frame
+from optloc.layout import state_names
+from optloc.status import Status
+from optloc.types import Array
+
+Columns = dict[str, Array]
+_RATES = {"velocity": "v", "acceleration": "a"}
+
+
+def fix_columns(loaded: Loaded, fix: Fix, first: int | None) -> Columns:
+    """Return the table of fixes.
+
+    Parameters
+    ----------
+    loaded : Loaded
+        Names of epochs and targets.
+    fix : Fix
+        A batch (n,) of single epochs, or the fix of a whole run, without batch axes.
+    first : int or None
+        Epoch of the first fix of a batch; None: the fix belongs to the whole run.
+
+    Returns
+    -------
+    dict of str to array (rows,)
+        Metres, seconds and degrees; NaN where there is no number.
+    """
+    motions = loaded.problem.motions
+    flat = fix if first is not None else fix.flat()
+    return joined(
+        [_of_target(loaded, flat, first, i, state_names(i, len(motions), m.order)) for i, m in enumerate(motions)]
+    )
+
+
+def joined(parts: Sequence[Columns]) -> Columns:
+    """Return tables below each other; a column that one lacks is NaN there."""
+    names = dict.fromkeys(name for part in parts for name in part)
+    sizes = [len(next(iter(part.values()))) for part in parts]
+    return {
+        name: np.concatenate([part.get(name, np.full(size, np.nan)) for part, size in zip(parts, sizes, strict=True)])
+        for name in names
+    }
+
+
+def _of_target(loaded: Loaded, fix: Fix, first: int | None, target: int, names: Sequence[str]) -> Columns:
+    position = (
+        fix.take(names[0]) if _estimated(fix, names[0]) else np.full((len(fix), loaded.problem.dimension), np.nan)
+    )
+    n, d = len(fix), position.shape[-1]
+    spread = position.ndim == 3
+    count = position.shape[1] if spread else 1
+    columns = _labels(loaded, n, first, target, spread)
+    position = position.reshape(n * count, d)
+    covariance = np.full((n * count, d, d), np.nan)
+    if not spread and _estimated(fix, names[0]):
+        covariance = fix.covariance(names[0])
+
+    def repeated(values: Array) -> Array:
+        return np.repeat(values, count)
+
+    columns["status"] = repeated(np.array([Status(int(code)).label for code in fix.code], dtype=object))
+    columns["reason"] = repeated(fix.reason.astype(object))
+    columns |= _state(position, covariance)
+    for name in names[1:] if _estimated(fix, names[0]) else ():
+        letter = _RATES[name.partition("[")[0]]
+        columns |= {
+            f"{letter}{axis}": v for axis, v in zip("xyz", fix.take(name).reshape(n * count, d).T, strict=False)
+        }
+    columns |= geodetic_columns(loaded.problem.frame, position, covariance)
+    semi_axes, _ = error_ellipse(covariance)
+    columns |= {f"ellipse95_{i + 1}": semi_axes[:, d - 1 - i] for i in range(d)}
+    columns |= {"cost": repeated(fix.cost), "dof": repeated(fix.dof), "p_value": repeated(np.asarray(fix.p_value))}
+    columns["alternatives"] = repeated(np.isfinite(fix.alternatives.gap).sum(-1))
+    columns["proof"] = repeated(np.array([getattr(c, "proof", "unknown") for c in fix.certificate], dtype=object))
+    return columns
+
+
+def _estimated(fix: Fix, name: str) -> bool:
+    return name in {slot.name for slot in (*fix.layout.shared, *fix.layout.local)}
+
+
+def _labels(loaded: Loaded, n: int, first: int | None, target: int, spread: bool) -> Columns:
+    """Return epoch, time and target of every row."""
+    k = loaded.problem.epochs
+    if first is None and not spread:
+        motion = loaded.problem.motions[target]
+        label = loaded.epochs[0] if k == 1 else "run"
+        time = loaded.times[0] if motion.reference is None else motion.reference
+        epochs, times = [label], np.array([time])
+    else:
+        part = slice(0, k) if first is None else slice(first, first + n)
+        epochs, times = list(loaded.epochs[part]), loaded.times[part]
+    names = [loaded.targets[target]] * len(epochs)
+    if loaded.own_epochs:
+        names = list(loaded.targets[slice(0, k) if first is None else slice(first, first + n)])
+    return {"epoch": np.array(epochs, dtype=object), "time": times, "target": np.array(names, dtype=object)}
+
+
+def _state(position: Array, covariance: Array) -> Columns:
+    d = position.shape[-1]
+    sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    columns = {axis: position[:, i] for i, axis in enumerate("xyz"[:d])}
+    columns |= {f"sigma_{axis}": sigma[:, i] for i, axis in enumerate("xyz"[:d])}
+    return columns | _triangle(covariance, "xyz")
+
+
+def _triangle(covariance: Array, axes: str) -> Columns:
+    d = covariance.shape[-1]
+    return {f"cov_{axes[i]}{axes[j]}": covariance[:, i, j] for i in range(d) for j in range(i, d)}
+
+
+def geodetic_columns(frame: Frame, position: Array, covariance: Array) -> Columns:
+    """Return latitude and longitude (degrees), height (metres) and the covariance along east, north, up; none if nowhere."""
+    if not frame.geodetic:
+        return {}
+    with np.errstate(invalid="ignore"):
+        lat, lon, height = frame.to_geodetic(position)
+        axes = frame.enu_axes(position)
+    local = axes @ covariance @ np.swapaxes(axes, -1, -2)
+    return {"lat_deg": np.degrees(lat), "lon_deg": np.degrees(lon), "height": height} | _triangle(local, "enu")

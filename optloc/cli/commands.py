@@ -1,0 +1,68 @@
+"""What ``optloc fix`` and ``optloc demo`` do."""
+
+from __future__ import annotations
+
+from importlib.resources import as_file, files
+from pathlib import Path
+
+from rich.console import Console
+
+from optloc.cli.fixing import Fixed, fix_file
+from optloc.cli.output import dumps, fixed_json, geojson, write_table, write_text
+from optloc.cli.show import show
+from optloc.errors import InvalidProblem
+from optloc.files import read
+
+
+def run_fix(
+    file: Path,
+    method: str,
+    *,
+    as_json: bool = False,
+    geojson_path: Path | None = None,
+    plot: Path | None = None,
+    out: Path | None = None,
+    quiet: bool = False,
+) -> int:
+    """Fix a file, write what was asked for, and return the exit code."""
+    if as_json and geojson_path is not None and str(geojson_path) == "-":
+        raise InvalidProblem("JSON and GeoJSON cannot both go to standard output", "--geojson", "name a file")
+    fixed = fix_file(read(file), method, quiet or as_json)
+    if out is not None:
+        write_table(out, fixed.columns)
+    if geojson_path is not None:
+        write_text(geojson_path, dumps(geojson(fixed)))
+    if plot is not None:
+        draw(fixed, plot)
+    if as_json:
+        write_text(Path("-"), dumps(fixed_json(fixed)))
+    elif not quiet:
+        show(fixed, Console(stderr=geojson_path is not None and str(geojson_path) == "-"))
+    return 0 if fixed.clean else 1
+
+
+def run_demo(name: str, plot: Path, quiet: bool) -> int:
+    """Fix a shipped problem file, and return the exit code."""
+    folder = files("optloc") / "scenarios"
+    names = sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
+    if name not in names:
+        raise InvalidProblem(f"there is no demo {name!r}", "demo", f"known are {', '.join(names)}")
+    with as_file(folder) as place:
+        fixed = fix_file(read(place / f"{name}.toml"), "auto", quiet)
+    if not quiet:
+        show(fixed, Console())
+    draw(fixed, plot)
+    if not quiet:
+        Console().print(f"The picture is in {plot}.", highlight=False)
+    return 0 if fixed.clean else 1
+
+
+def draw(fixed: Fixed, path: Path) -> None:
+    """Draw fixes to a picture file; raise InvalidProblem where that fails."""
+    from optloc.plot import plot_fixes, save
+
+    figure = plot_fixes(fixed.loaded.problem, fixed.fixes, title=fixed.loaded.title)
+    try:
+        save(figure, path)
+    except (OSError, ValueError) as error:
+        raise InvalidProblem(f"the picture cannot be written ({error})", str(path), "use .png, .svg or .pdf") from None

@@ -1,0 +1,84 @@
+"""What ``optloc list`` prints: any table of entries that have a summary."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from optloc.cli.output import dumps
+from optloc.errors import InvalidProblem
+from optloc.models import MODELS
+from optloc.units import UNITS
+
+
+def _kinds() -> list[dict[str, str]]:
+    return [
+        {
+            "kind": name,
+            "stations": str(model.stations),
+            "dimensions": " ".join(str(d) for d in model.dimensions),
+            "units": " ".join(UNITS[model.quantity]),  # type: ignore[index]  # models hold known quantities only
+            "summary": model.summary,
+        }
+        for name, model in MODELS.items()
+    ]
+
+
+def _formulations() -> list[dict[str, str]]:
+    from optloc.solve.catalogue import FORMULATIONS
+
+    return _entries("formulation", FORMULATIONS)
+
+
+def _solvers() -> list[dict[str, str]]:
+    from optloc.solve.catalogue import SOLVERS
+
+    return _entries("solver", SOLVERS)
+
+
+def _entries(title: str, table: Mapping[str, Any]) -> list[dict[str, str]]:
+    """Return name and the text fields of every entry, its summary last."""
+    rows = []
+    for name, entry in table.items():
+        names = getattr(type(entry), "__dataclass_fields__", {}) or {"summary": None}
+        texts = {field: getattr(entry, field) for field in names if field != "summary"}
+        shown = {field: _text(value) for field, value in texts.items() if _text(value) is not None}
+        rows.append({title: name} | shown | {"summary": str(entry.summary)})
+    return rows
+
+
+def _text(value: Any) -> Any:
+    if isinstance(value, bool | int | float | str):
+        return str(value)
+    if isinstance(value, tuple | list | frozenset | set) and all(isinstance(v, str | int) for v in value):
+        return " ".join(str(v) for v in value)
+    return None
+
+
+_LISTS: dict[str, Callable[[], list[dict[str, str]]]] = {
+    "kinds": _kinds,
+    "formulations": _formulations,
+    "solvers": _solvers,
+}
+
+
+def run_list(what: str, as_json: bool) -> int:
+    """Print one of the tables."""
+    if what not in _LISTS:
+        raise InvalidProblem(f"there is no list of {what!r}", "list", f"use {', '.join(_LISTS)}")
+    rows = _LISTS[what]()
+    if as_json:
+        typer.echo(dumps(rows))
+        return 0
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    table = Table()
+    for name in names:
+        table.add_column(name, overflow="fold")
+    for row in rows:
+        table.add_row(*(row.get(name, "") for name in names))
+    Console().print(table)
+    return 0

@@ -1,0 +1,162 @@
+"""Fixes as tables for people."""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from optloc.cli.columns import Columns
+from optloc.cli.fixing import Fixed
+from optloc.cli.output import alternative_position
+from optloc.fix import Fix
+from optloc.status import Status
+from optloc.types import Array
+
+_GOOD, _CARE, _BAD = "green", "yellow", "red"
+
+
+def show(fixed: Fixed, console: Console) -> None:
+    """Print fixes: one in full, a few of a run below each other, many as a count by status."""
+    rows = len(next(iter(fixed.columns.values())))
+    first = fixed.fixes[0]
+    if rows == 1:
+        _one(fixed, first if first.shape == () else first[0], console)
+    elif not first.shape:
+        _one(fixed, first, console)
+    else:
+        _many(fixed, console)
+
+
+def _one(fixed: Fixed, fix: Fix, console: Console) -> None:
+    verdict = Status(int(fix.code))
+    table = Table(title=fixed.loaded.title, show_header=False, title_justify="left", min_width=60)
+    table.add_row("status", Text(verdict.label, style=f"bold {_colour(verdict)}"))
+    reason = str(fix.reason[()] or "")
+    table.add_row("", verdict.sentence if verdict is not Status.OK or not reason else reason)
+    if verdict is not Status.OK and reason:
+        table.add_row("reason", reason)
+    rows = len(fixed.columns["x"])
+    for i in range(min(rows, 12)):
+        _state_rows(table, fixed.columns, i, f" of {fixed.columns['target'][i]}" if rows > 1 else "")
+    if rows > 12:
+        table.add_row("...", f"{rows - 12} more; --out writes all of them")
+    for name, values in fix.bias.items():
+        _bias_row(table, fix, name, values)
+    table.add_row("chi-square", _chi_square(fix))
+    certificate = fix.certificate[()]
+    if certificate is not None and hasattr(certificate, "proof"):
+        table.add_row("certificate", f"{certificate.proof}: {certificate.reason}")
+    table.add_row("stages", " → ".join(stage.name for stage in fix.stages) or "none")
+    console.print(table)
+    _alternatives(fix, console)
+
+
+def _colour(verdict: Status) -> str:
+    return {Status.OK: _GOOD, Status.AMBIGUOUS: _CARE, Status.SEARCHED: _CARE}.get(verdict, _BAD)
+
+
+def _state_rows(table: Table, columns: Columns, i: int, whose: str) -> None:
+    if not np.isfinite(columns["x"][i]):
+        return
+    axes = [axis for axis in "xyz" if axis in columns]
+    for axis in axes:
+        table.add_row(f"{axis}{whose}", with_sigma(columns[axis][i], columns[f"sigma_{axis}"][i], "m"))
+    if "lat_deg" in columns:
+        table.add_row(f"latitude{whose}", f"{columns['lat_deg'][i]:.7f} deg")
+        table.add_row(f"longitude{whose}", f"{columns['lon_deg'][i]:.7f} deg")
+        table.add_row(f"height{whose}", f"{columns['height'][i]:.2f} m")
+        local = [columns[f"cov_{axis}{axis}"][i] for axis in "enu" if f"cov_{axis}{axis}" in columns]
+        table.add_row("sigma east, north, up", ", ".join(f"{v:.3g}" for v in np.sqrt(local)) + " m")
+    for letter, unit in (("v", "m/s"), ("a", "m/s²")):
+        found = [columns[f"{letter}{axis}"][i] for axis in axes if f"{letter}{axis}" in columns]
+        if found:
+            table.add_row(
+                {"v": "velocity", "a": "acceleration"}[letter] + whose,
+                ", ".join(f"{v:.4g}" for v in found) + f" {unit}",
+            )
+    semi = [columns[f"ellipse95_{j + 1}"][i] for j in range(len(axes))]
+    if np.isfinite(semi).all():
+        table.add_row(
+            "95 % ellipse" if len(axes) == 2 else "95 % ellipsoid",
+            " x ".join(f"{v:.3g}" for v in semi) + " m (semi-axes)",
+        )
+
+
+def with_sigma(value: float, sigma: float, unit: str) -> str:
+    """Return a number with its standard deviation, rounded to it."""
+    if not np.isfinite(sigma) or sigma <= 0.0:
+        return f"{value:.6g} {unit}"
+    digits = int(max(0, 1 - np.floor(np.log10(sigma))))
+    return f"{value:.{digits}f} ± {sigma:.{digits}f} {unit}"
+
+
+def _bias_row(table: Table, fix: Fix, name: str, values: Array) -> None:
+    slot, shared = fix.layout.find(name)
+    if not shared or values.ndim != 1:
+        table.add_row(
+            name, f"{values.size} values, root mean square {np.sqrt(np.mean(values**2)):.4g} {slot.unit}".strip()
+        )
+        return
+    sigma = fix.sigma(name)
+    shown = [with_sigma(v, s, slot.unit) for v, s in zip(values, sigma, strict=True)]
+    table.add_row(name, "\n".join(f"{i}: {text}" for i, text in enumerate(shown[:16])))
+
+
+def _chi_square(fix: Fix) -> str:
+    if int(fix.dof) <= 0 or not np.isfinite(fix.cost):
+        return "no redundancy: nothing to test"
+    return f"{float(fix.cost):.4g} with {int(fix.dof)} degrees of freedom, p = {float(fix.p_value):.3g}"
+
+
+def _alternatives(fix: Fix, console: Console) -> None:
+    found = np.isfinite(fix.alternatives.gap)
+    if not found.any():
+        return
+    table = Table(title="Alternatives", title_justify="left")
+    for name in ("#", "position, m", "cost gap"):
+        table.add_column(name, justify="right")
+    for i, (x, gap) in enumerate(zip(fix.alternatives.x[found], fix.alternatives.gap[found], strict=True)):
+        point = np.ravel(alternative_position(fix, x))
+        table.add_row(str(i + 1), ", ".join(f"{v:.1f}" for v in point[:6]), f"{gap:.4g}")
+    console.print(table)
+
+
+def _many(fixed: Fixed, console: Console) -> None:
+    columns = fixed.columns
+    table = Table(title=f"{fixed.loaded.title}: {len(columns['x'])} fixes", title_justify="left")
+    table.add_column("status")
+    for name in ("fixes", "median sigma, m", "95 % of sigmas, m", "median p"):
+        table.add_column(name, justify="right")
+    sigma = np.sqrt(sum(columns[name] ** 2 for name in columns if name.startswith("sigma_")))
+    for label, count in Counter(columns["status"].tolist()).most_common():
+        inside = columns["status"] == label
+        cells = [
+            _quantile(sigma[inside], 0.5),
+            _quantile(sigma[inside], 0.95),
+            _quantile(columns["p_value"][inside], 0.5),
+        ]
+        table.add_row(Text(label, style=_colour(Status[label.upper().replace(" ", "_")])), str(count), *cells)
+    console.print(table)
+    _failures(columns, console)
+
+
+def _quantile(values: Any, share: float) -> str:
+    finite = values[np.isfinite(values)]
+    return f"{np.quantile(finite, share):.3g}" if len(finite) else "-"
+
+
+def _failures(columns: Columns, console: Console, limit: int = 10) -> None:
+    bad = np.flatnonzero(columns["status"] != Status.OK.label)
+    for i in bad[:limit]:
+        console.print(
+            f"epoch {columns['epoch'][i]}: {columns['status'][i]}: {columns['reason'][i]}",
+            highlight=False,
+            markup=False,
+        )
+    if len(bad) > limit:
+        console.print(f"... and {len(bad) - limit} more; --out writes all of them", highlight=False)

@@ -1,0 +1,114 @@
+"""Write a problem file again, with other measured values in the units and signs of its author."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from optloc.errors import InvalidProblem
+from optloc.files.reader import Draft, draft
+from optloc.files.table import Table
+from optloc.types import Array
+
+
+def write_measured(source: Path, out: Path, z: Array, note: str = "") -> list[Path]:
+    """Write a problem file with other measured values.
+
+    Parameters
+    ----------
+    source : Path
+        Problem file to begin with.
+    out : Path
+        Problem file to write; the rows go to CSV files beside it.
+    z : array (trials, m)
+        Measured values of all rows in SI units, in the order of the problem. Several trials become epochs.
+    note : str
+        Remark behind the title.
+
+    Returns
+    -------
+    list of Path
+        The files that were written.
+
+    Raises
+    ------
+    InvalidProblem
+        Where trials cannot become epochs, or a file cannot be written.
+    """
+    made = draft(source, values=False)
+    if len(z) > 1 and (made.loaded.problem.epochs > 1 or made.moving):
+        advice = "draw once for each file, with another seed"
+        raise InvalidProblem("several trials of a run of epochs do not fit one file", str(out), advice)
+    if out.suffix.lower() != ".toml":
+        raise InvalidProblem("a simulation is written as a problem file", str(out), "let its name end in .toml")
+    settings = made.file.model_dump(exclude_defaults=True)
+    settings["title"] = " ".join(part for part in (made.loaded.title, f"({note})" if note else "") if part)
+    if made.file.stations.file is not None:
+        settings["stations"]["file"] = os.path.relpath(source.parent / made.file.stations.file, out.parent)
+    written = [out]
+    try:
+        for i, (section, table) in enumerate(zip(settings["measurements"], made.tables, strict=True)):
+            path = out.with_name(f"{out.stem}-{i + 1}.csv")
+            _write_rows(path, made, table, z)
+            for key in ("rows", "columns", "separator"):
+                section.pop(key, None)
+            section["file"] = path.name
+            written.append(path)
+        out.write_text("format = 1\n" + _toml({k: v for k, v in settings.items() if k != "format"}), encoding="utf-8")
+    except OSError as error:
+        raise InvalidProblem(
+            f"the file cannot be written ({error.strerror})", str(out), "choose another place"
+        ) from None
+    return written
+
+
+def _write_rows(path: Path, made: Draft, table: Table, z: Array) -> None:
+    """Write one table: its known columns under their own names, the values of each trial below each other."""
+    import pyarrow as pa
+    from pyarrow import csv
+
+    trials = len(z)
+    values = np.full((trials, table.count), np.nan)
+    for chunk, number in zip(made.chunks, made.numbers, strict=True):
+        if chunk.table is table:
+            values[:, chunk.row] = chunk.unit.from_si(z[:, number] - chunk.baseline)
+    known = {key: table.raw(key) for key in COLUMNS if key != "z" and table.has(key)}
+    columns: dict[str, Any] = {key: np.tile(column, trials) for key, column in known.items()}
+    if trials > 1:
+        columns["epoch"] = np.repeat(np.arange(trials), table.count)
+        columns.pop("time", None)
+    columns["z"] = values.ravel()
+    csv.write_csv(pa.table({key: pa.array(column, from_pandas=True) for key, column in columns.items()}), path)
+
+
+COLUMNS = ("kind", "epoch", "time", "target", "a", "b", "z", "sigma", "weight", "correction")
+
+
+def _toml(settings: dict[str, Any], path: tuple[str, ...] = ()) -> str:
+    """Return TOML: numbers and lists first, then tables."""
+    plain, tables = [], []
+    for key, value in settings.items():
+        name = (*path, key)
+        if isinstance(value, dict) and len(path) < 1:
+            tables.append(f"\n[{'.'.join(map(_key, name))}]\n" + _toml(value, name))
+        elif isinstance(value, list) and value and isinstance(value[0], dict) and not path:
+            tables += [f"\n[[{_key(key)}]]\n" + _toml(item, name) for item in value]
+        elif value is not None:
+            plain.append(f"{_key(key)} = {_value(value)}\n")
+    return "".join([*plain, *tables])
+
+
+def _key(name: str) -> str:
+    return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else json.dumps(name)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items() if v is not None) + " }"
+    if isinstance(value, list):
+        return "[" + ", ".join(_value(item) for item in value) + "]"
+    return repr(value) if isinstance(value, float) else json.dumps(value, ensure_ascii=False)

@@ -1,0 +1,256 @@
+"""Pictures of fixes: stations, estimate, 95 % ellipse and the other positions that the data allow.
+
+matplotlib is imported where it is used. Colours are those of Okabe and Ito, and every kind of point has its own mark.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optloc.ellipse import error_ellipse
+from optloc.errors import InvalidProblem
+from optloc.fix import Fix
+from optloc.frames import Frame
+from optloc.problem import Problem
+from optloc.status import Status
+from optloc.types import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_BLACK, _BLUE, _ORANGE, _GREY = "#000000", "#0072B2", "#D55E00", "#999999"
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """What is drawn, metres along the picture's axes (east, north, up on Earth).
+
+    Parameters
+    ----------
+    stations : array (s, d)
+        Positions.
+    names : tuple of s str
+        Their names.
+    fixes : array (n, d)
+        Estimates; NaN where there is none.
+    covariances : array (n, d, d)
+        Theirs; NaN where there is none.
+    clean : bool array (n,)
+        Where the status is ok.
+    alternatives : array (q, d)
+        Other positions.
+    gaps : array (q,)
+        Their cost gaps.
+    axes : tuple of d str
+        Names of the axes.
+    """
+
+    stations: Array
+    names: tuple[str, ...]
+    fixes: Array
+    covariances: Array
+    clean: Array
+    alternatives: Array
+    gaps: Array
+    axes: tuple[str, ...]
+
+
+def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") -> Figure:
+    """Return a picture of fixes.
+
+    A plan of everything and a plan of the surroundings of the fix; in three dimensions a view of the height between
+    them. One scale on both axes of each.
+
+    Parameters
+    ----------
+    problem : Problem
+        Gives the stations and the frame; ECEF is drawn along east, north and up at the stations' centre.
+    fixes : Fix or sequence of Fix
+        Single fixes or batches.
+    title : str
+        Title of the picture.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        To be written with `save`.
+    """
+    figure_class = _figure_class()
+    scene = scene_of(problem, [fixes] if isinstance(fixes, Fix) else fixes)
+    spatial = scene.stations.shape[-1] == 3
+    figure = figure_class(figsize=(15.0 if spatial else 10.5, 5.2), layout="constrained")
+    panels = figure.subplots(1, 3 if spatial else 2)
+    _overview(panels[0], scene, (0, 1))
+    if spatial:
+        _overview(panels[1], scene, (0, 2))
+    _close(panels[-1], scene)
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)
+    if title:
+        figure.suptitle(title)
+    return figure
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a picture; the ending of the name decides the type."""
+    figure.savefig(path, dpi=120)
+
+
+def _figure_class() -> type[Figure]:
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise InvalidProblem(
+            "pictures need matplotlib", "plot", "install it with: pip install 'optloc[plot]'"
+        ) from None
+    return Figure
+
+
+def scene_of(problem: Problem, fixes: Sequence[Fix]) -> Scene:
+    """Return what is to be drawn of a problem and its fixes."""
+    stations = problem.stations.position.reshape(-1, problem.stations.count, problem.dimension)[0]
+    parts = [part for fix in fixes for part in _states(fix)]
+    d = problem.dimension
+    position = np.concatenate([p for p, _, _ in parts] or [np.zeros((0, d))])
+    covariance = np.concatenate([c for _, c, _ in parts] or [np.zeros((0, d, d))])
+    clean = np.concatenate([ok for _, _, ok in parts] or [np.zeros(0, dtype=bool)])
+    others, gaps = _alternatives(fixes) if len(position) <= 12 else (np.zeros((0, d)), np.zeros(0))
+    if problem.frame.kind == "ecef":
+        local = Frame("enu", tuple(float(v) for v in problem.frame.to_geodetic(stations.mean(0))))  # type: ignore[arg-type]
+        turn = local.rotation_to_ecef().T
+        stations, position, others = (local.from_ecef(p) for p in (stations, position, others.reshape(-1, 3)))
+        covariance = turn @ covariance @ turn.T
+    axes = ("east", "north", "up") if problem.frame.geodetic else ("x", "y", "z")
+    return Scene(stations, problem.stations.names, position, covariance, clean, others, gaps, axes[:d])
+
+
+def _states(fix: Fix) -> list[tuple[Array, Array, Array]]:
+    """Return positions (n, d), covariances (n, d, d) and whether they are clean (n,) of every target."""
+    flat = fix if len(fix.shape) == 1 else fix.flat()
+    found = []
+    for slots, shared in ((flat.layout.shared, True), (flat.layout.local, False)):
+        for slot in slots:
+            if slot.name.partition("[")[0] != "position":
+                continue
+            values = flat.take(slot.name)
+            d = values.shape[-1]
+            position = values.reshape(-1, d)
+            covariance = flat.covariance(slot.name) if shared else np.full((len(position), d, d), np.nan)
+            found.append((position, covariance, np.repeat(flat.code == Status.OK, len(position) // len(flat))))
+    return found
+
+
+def _alternatives(fixes: Sequence[Fix]) -> tuple[Array, Array]:
+    points, gaps = [], []
+    for fix in fixes:
+        flat = fix if len(fix.shape) == 1 else fix.flat()
+        shown = np.isfinite(flat.alternatives.gap)
+        for slot in flat.layout.shared:
+            if slot.name.partition("[")[0] == "position":
+                points.append(flat.layout.take(flat.alternatives.x, slot.name)[shown])
+                gaps.append(flat.alternatives.gap[shown])
+    d = points[0].shape[-1] if points else 2
+    return np.concatenate(points or [np.zeros((0, d))]), np.concatenate(gaps or [np.zeros(0)])
+
+
+def _overview(panel: Axes, scene: Scene, view: tuple[int, int]) -> None:
+    everything = np.concatenate([scene.stations, scene.fixes, scene.alternatives])
+    unit, size = _unit(everything[:, view])
+    _ellipses(panel, scene, view, size)
+    panel.scatter(*_xy(scene.stations, view, size), marker="^", s=60, color=_BLACK, label="station", zorder=3)
+    if scene.stations.shape[0] <= 20:
+        for name, x, y in zip(scene.names, *_xy(scene.stations, view, size), strict=True):
+            panel.annotate(name, (x, y), xytext=(5, 5), textcoords="offset points", fontsize=8, zorder=6)
+    _points(panel, scene, view, size)
+    _frame(panel, scene, view, unit)
+    panel.set_title("plan" if view == (0, 1) else "height")
+
+
+def _points(panel: Axes, scene: Scene, view: tuple[int, int], size: float) -> None:
+    many = len(scene.fixes) > 12
+    for clean, colour, mark, label in ((True, _BLUE, "o", "fix"), (False, _ORANGE, "X", "fix, status not ok")):
+        chosen = scene.fixes[scene.clean == clean]
+        if len(chosen):
+            panel.scatter(
+                *_xy(chosen, view, size), marker=mark, s=12 if many else 70, color=colour, label=label, zorder=4
+            )
+    if len(scene.alternatives):
+        style: dict[str, Any] = {"marker": "D", "s": 70, "facecolors": "none", "edgecolors": _ORANGE, "linewidths": 1.8}
+        panel.scatter(*_xy(scene.alternatives, view, size), label="alternative, with its cost gap", zorder=4, **style)
+    for gap, x, y in zip(scene.gaps, *_xy(scene.alternatives, view, size), strict=True):
+        panel.annotate(f"+{gap:.3g}", (x, y), xytext=(7, -12), textcoords="offset points", fontsize=8, color=_ORANGE)
+
+
+def _ellipses(panel: Axes, scene: Scene, view: tuple[int, int], size: float) -> None:
+    if len(scene.fixes) > 200:
+        return
+    angle = np.linspace(0.0, 2.0 * np.pi, 181)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    label: str | None = "95 % ellipse"
+    for centre, covariance in zip(scene.fixes, scene.covariances, strict=True):
+        semi_axes, directions = error_ellipse(covariance[np.ix_(view, view)])
+        if np.isfinite(semi_axes).all() and np.isfinite(centre).all():
+            line = centre[list(view)] + circle * semi_axes @ directions.T
+            panel.plot(*(line.T / size), color=_BLUE, linewidth=1.5, label=label, zorder=2)
+            label = None
+
+
+def _close(panel: Axes, scene: Scene) -> None:
+    """Draw the surroundings of the fixes: three times their ellipse, or their own spread."""
+    known: Array = np.asarray(np.isfinite(scene.fixes).all(-1))
+    view = (0, 1)
+    if not known.any():
+        panel.set_axis_off()
+        panel.text(0.5, 0.5, "no fix", ha="center", va="center", transform=panel.transAxes)
+        return
+    centre = np.median(scene.fixes[known][:, view], axis=0)
+    extent = _reach(scene, known, centre)
+    unit, size = _unit(np.array([centre - extent, centre + extent]) - centre)
+    shifted = _moved(scene, centre)
+    _ellipses(panel, shifted, view, size)
+    _points(panel, shifted, view, size)
+    panel.scatter(*_xy(shifted.stations, view, size), marker="^", s=60, color=_BLACK, zorder=3)
+    _frame(panel, shifted, view, unit)
+    panel.set_aspect("equal", adjustable="box")
+    panel.set_xlim(-extent / size, extent / size)
+    panel.set_ylim(-extent / size, extent / size)
+    panel.set_title(f"around {scene.axes[0]} {centre[0]:.6g} m, {scene.axes[1]} {centre[1]:.6g} m")
+
+
+def _moved(scene: Scene, centre: Array) -> Scene:
+    shift = np.zeros(scene.stations.shape[-1])
+    shift[:2] = centre
+    moved = (array - shift for array in (scene.stations, scene.fixes, scene.alternatives))
+    stations, fixes, alternatives = moved
+    return Scene(stations, scene.names, fixes, scene.covariances, scene.clean, alternatives, scene.gaps, scene.axes)
+
+
+def _reach(scene: Scene, known: Array, centre: Array) -> float:
+    semi_axes, _ = error_ellipse(scene.covariances[known][:, :2, :2])
+    largest = np.max(semi_axes[np.isfinite(semi_axes)], initial=0.0)
+    away = np.abs(scene.fixes[known][:, :2] - centre).max(-1)
+    reach = 1.6 * float(largest) + 1.1 * float(np.quantile(away, 0.95))
+    return reach if reach > 0.0 else 0.1 * float(np.ptp(scene.stations[:, :2]) or 1.0)
+
+
+def _frame(panel: Axes, scene: Scene, view: tuple[int, int], unit: str) -> None:
+    panel.set_aspect("equal", adjustable="datalim")
+    panel.grid(color=_GREY, alpha=0.35, linewidth=0.6)
+    panel.set_xlabel(f"{scene.axes[view[0]]} ({unit})")
+    panel.set_ylabel(f"{scene.axes[view[1]]} ({unit})")
+
+
+def _xy(points: Array, view: tuple[int, int], size: float) -> tuple[Array, Array]:
+    return points[:, view[0]] / size, points[:, view[1]] / size
+
+
+def _unit(points: Array) -> tuple[str, float]:
+    """Return the unit in which points (n, 2) of metres read best, and its size."""
+    reach = np.nanmax(np.abs(points), initial=1e-3)
+    return ("km", 1e3) if reach >= 1e4 else ("m", 1.0) if reach >= 1.0 else ("mm", 1e-3)

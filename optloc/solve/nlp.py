@@ -1,0 +1,148 @@
+"""The maximum-likelihood problem as a nonlinear program for IPOPT: a second opinion on the refinement, one by one."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from formulations.nls import Program
+from optloc.errors import InvalidProblem
+from optloc.fix import Fix, Stage
+from optloc.noise import whiten
+from optloc.normal import decrement, prior_parts, step
+from optloc.problem import Problem
+from optloc.solve.refine import equations_at
+from optloc.solve.scale import length_scale
+from optloc.solve.stages import finished, pooled
+from optloc.solve.verdict import Candidates
+from optloc.status import Status
+from optloc.symbolic import parameters, residual
+from optloc.types import Array
+
+
+def nlp(problem: Problem, fix: Fix | None) -> Fix:
+    """Return the fix found by IPOPT from every candidate of the stage before.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems.
+    fix : Fix
+        Where to start.
+
+    Returns
+    -------
+    Fix
+        Judged like a refined one.
+    """
+    if fix is None:
+        raise InvalidProblem("nlp improves a start", "method", "give start= or a method such as 'gtrs+nlp'")
+    began = perf_counter()
+    pool, item, slot = pooled(fix)
+    x, cost, code = pool.copy(), np.full(pool.shape[:2], np.inf), np.full(pool.shape[:2], int(Status.NUMERICAL), np.int8)
+    for i in np.unique(item):
+        one = problem.take(np.array([i]))
+        solver = _Scaled(one)
+        for j in slot[item == i]:
+            x[i, j], cost[i, j], code[i, j] = solver.from_start(pool[i, j])
+    if len(item):
+        code[item, slot] = _stationary(problem.take(item), x[item, slot], code[item, slot])
+    stage = Stage("nlp", f"{len(item)} programs", perf_counter() - began)
+    return finished(problem, fix, Candidates(x, cost, code), stage)
+
+
+def _stationary(problem: Problem, x: Array, code: Array) -> Array:
+    """Return `ok` where the next Gauss-Newton step is shorter than 1e-5 sigma, whatever IPOPT calls its own ending."""
+    with np.errstate(all="ignore"):
+        equations = equations_at(problem, x, whiten(problem.noise, problem.weight))
+        move, solvable = step(equations, np.zeros(len(x)))
+        small = solvable & (np.abs(decrement(equations, move, problem.layout.n_shared)) < 1e-10)
+    return np.where(small, np.int8(Status.OK), code)
+
+
+class _Scaled:
+    """One problem in units of its own size, with the compiled program of its structure."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        shift, size = length_scale(problem)
+        layout = problem.layout
+        unit = np.concatenate([_slot_units(layout.shared, size), np.tile(_slot_units(layout.local, size), layout.epochs)])
+        centre = np.zeros(layout.size)
+        for found in (layout.shared, layout.local):
+            for place in found:
+                if place.name.partition("[")[0] == "position":
+                    base = place.start + (0 if found is layout.shared else layout.n_shared)
+                    step = layout.n_local or 1
+                    for k in range(1 if found is layout.shared else layout.epochs):
+                        centre[base + k * step : base + k * step + place.size] = shift
+        self.unit, self.centre = unit, centre
+        self.data = np.concatenate([unit, centre, parameters(problem)])
+        self.program = _program(_Key(problem, len(self.data)))
+        self.weight = _whitening(problem)
+        self.z = np.where(problem.weight[0] > 0.0, problem.z[0], 0.0)
+        self.prior = _prior(problem, unit, centre)
+
+    def from_start(self, start: Array) -> tuple[Array, float, int]:
+        found = self.program.solve(
+            (start - self.centre) / self.unit, self.z, self.weight, self.data, prior=self.prior
+        )
+        code = Status.OK if found.success else Status.MAX_ITERATIONS if "Iteration" in found.status else Status.NUMERICAL
+        return found.x * self.unit + self.centre, found.cost, int(code)
+
+
+class _Key:
+    """A problem that is equal to another of the same structure: the key of a compiled program."""
+
+    def __init__(self, problem: Problem, data: int) -> None:
+        self.problem, self.data = problem, data
+        s = problem.stations
+        shapes = tuple(None if a is None else a.shape[-3:] for a in (s.position, s.velocity, s.axes))
+        self.key = (problem.structure, data, shapes)
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Key) and self.key == other.key
+
+
+@lru_cache(maxsize=64)
+def _program(key: _Key) -> Program:
+    problem, n = key.problem, key.problem.layout.size
+
+    def scaled(y: Any, p: Any, z: Any) -> list[Any]:
+        return residual(problem, y * p[:n] + p[n : 2 * n], p[2 * n :], z)
+
+    return Program(n, problem.count, key.data, residual=scaled, diagonal=False)
+
+
+def _slot_units(slots: Any, size: float) -> Array:
+    units = [np.full(slot.size, size if slot.unit.startswith("m") else 1.0) for slot in slots]
+    return np.concatenate([*units, np.zeros(0)])
+
+
+def _whitening(problem: Problem) -> Array:
+    rows = problem.count
+    matrix = np.zeros((rows, rows))
+    for whitener in whiten(problem.noise, problem.weight):
+        full = np.broadcast_to(whitener.matrix, (1, *whitener.row.shape, whitener.row.shape[1]))[0]
+        for members, block in zip(whitener.row, full, strict=True):
+            matrix[np.ix_(members, members)] = block
+    return matrix
+
+
+def _prior(problem: Problem, unit: Array, centre: Array) -> tuple[Array, Array]:
+    layout = problem.layout
+    mean, information = np.zeros(layout.size), np.zeros((layout.size, layout.size))
+    for name, value, precision in prior_parts(problem):
+        slot, shared = layout.find(name)
+        for k in range(1 if shared else layout.epochs):
+            start = slot.start + (0 if shared else layout.n_shared + k * layout.n_local)
+            part = slice(start, start + slot.size)
+            mean[part] = value.reshape(-1, value.shape[-1])[0]
+            information[part, part] = precision.reshape(-1, slot.size, slot.size)[0]
+    return (mean - centre) / unit, information * unit[:, None] * unit[None, :]
