@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from typing import Any
 
 import numpy as np
 
@@ -66,7 +67,9 @@ def _check_stations(problem: Problem) -> None:
 def _check_rows(problem: Problem, rows: Rows) -> None:
     model = MODELS[rows.kind]
     if problem.dimension not in model.dimensions:
-        raise InvalidProblem(f"{rows.kind} has no meaning in {problem.dimension} dimensions", rows.kind, "use 3-D stations")
+        raise InvalidProblem(
+            f"{rows.kind} has no meaning in {problem.dimension} dimensions", rows.kind, "use 3-D stations"
+        )
     if model.ecef and not problem.frame.geodetic:
         raise InvalidProblem(f"{rows.kind} needs a geodetic frame", "frame", "use frame ecef or enu with an origin")
     if model.ecef and problem.dimension != 3:
@@ -103,8 +106,8 @@ def _check_noise(noise: Noise, count: int) -> None:
 
 
 def _check_covariance(covariance: Array, what: str, names: tuple[str, ...] | None) -> None:
-    def fail(bad: Array, why: str) -> None:
-        if bad.any():
+    def fail(bad: Any, why: str) -> None:
+        if np.any(bad):
             place = int(np.argwhere(bad)[0][-1])
             label = f" {names[place]}" if names and place < len(names) else ""
             raise InvalidProblem(f"the covariance in {what}{label} is {why}", "covariance", "give a true covariance")

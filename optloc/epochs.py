@@ -50,7 +50,9 @@ def by_epoch(problem: Problem) -> Problem:
         rows.append(
             Rows(old.kind, spread(old.z), a, b, np.zeros_like(a), target, spread(old.weight), spread(old.correction))
         )
-    motions = tuple(replace(m, span="run", known=None if m.known is None else _split(m.known, 3)) for m in problem.motions)
+    motions = tuple(
+        replace(m, span="run", known=None if m.known is None else _split(m.known, 3)) for m in problem.motions
+    )
     s = problem.stations
     stations = replace(
         s,
@@ -68,7 +70,9 @@ def _places(rows: Rows) -> tuple[list[tuple[int, int, int, int]], Array]:
     seen: dict[tuple[int, int, int, int], int] = {}
     keys: dict[tuple[int, int, int, int], int] = {}
     place = np.empty(rows.count, dtype=np.int64)
-    for i, key in enumerate(zip(rows.a.tolist(), rows.b.tolist(), rows.target.tolist(), rows.epoch.tolist(), strict=True)):
+    for i, key in enumerate(
+        zip(rows.a.tolist(), rows.b.tolist(), rows.target.tolist(), rows.epoch.tolist(), strict=True)
+    ):
         occurrence = seen.get(key, 0)
         seen[key] = occurrence + 1
         place[i] = keys.setdefault((*key[:3], occurrence), len(keys))

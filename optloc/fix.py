@@ -100,7 +100,7 @@ class Fix:
     @property
     def shape(self) -> tuple[int, ...]:
         """Return the batch axes; () for a single fix."""
-        return self.x.shape[:-1]
+        return tuple(self.x.shape[:-1])
 
     @property
     def status(self) -> Any:
@@ -141,7 +141,7 @@ class Fix:
 
     @property
     def p_value(self) -> Array:
-        """Return the probability (...) of a cost at least this large if model and noise are right; NaN without redundancy."""
+        """Return the probability (...) of a cost at least this large if the model is right; NaN without redundancy."""
         from scipy.special import gammaincc
 
         redundant = (self.dof > 0) & np.isfinite(self.cost)
@@ -172,7 +172,7 @@ class Fix:
         from scipy.special import gammaincinv
 
         cov = self.covariance()
-        known = np.isfinite(cov).all((-1, -2))
+        known = np.asarray(np.isfinite(cov).all((-1, -2)))
         values, vectors = np.linalg.eigh(np.where(known[..., None, None], cov, 0.0))
         scale = np.sqrt(2.0 * gammaincinv(cov.shape[-1] / 2, probability))
         axes = scale * np.sqrt(np.maximum(values, 0.0))

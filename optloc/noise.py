@@ -168,7 +168,9 @@ def dense(noise: Noise, rows: Array) -> Array:
     shape = np.broadcast_shapes(*(block.covariance.shape[:-3] for block in noise.blocks))
     matrix = np.zeros((*shape, len(rows), len(rows)))
     for block in noise.blocks:
-        covariance = np.broadcast_to(block.covariance, (*block.covariance.shape[:-3], *block.row.shape, block.row.shape[1]))
+        covariance = np.broadcast_to(
+            block.covariance, (*block.covariance.shape[:-3], *block.row.shape, block.row.shape[1])
+        )
         for g, members in enumerate(block.row):
             inside = [i for i, row in enumerate(members) if int(row) in place]
             at = [place[int(members[i])] for i in inside]

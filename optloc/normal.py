@@ -176,7 +176,7 @@ def marginal(equations: Normal) -> tuple[Array, Array, Array]:
     right = np.concatenate([np.swapaxes(equations.cross, -1, -2), equations.local_vector[..., None]], axis=-1)
     solved, ok = linalg.solve(equations.local, right)
     lost = (equations.cross @ solved).sum(-3)
-    return equations.shared - lost[..., :-1], equations.shared_vector - lost[..., -1], ok.all(-1)
+    return equations.shared - lost[..., :-1], equations.shared_vector - lost[..., -1], np.asarray(ok.all(-1))
 
 
 def step(equations: Normal, damping: Array) -> tuple[Array, Array]:

@@ -84,12 +84,14 @@ def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") ->
     figure_class = _figure_class()
     scene = scene_of(problem, [fixes] if isinstance(fixes, Fix) else fixes)
     spatial = scene.stations.shape[-1] == 3
-    figure = figure_class(figsize=(15.0 if spatial else 10.5, 5.2), layout="constrained")
-    panels = figure.subplots(1, 3 if spatial else 2)
+    count = 1 + spatial + (near := _nearby(scene))
+    figure = figure_class(figsize=(0.4 + 5.0 * count, 5.2), layout="constrained")
+    panels = figure.subplots(1, count, squeeze=False)[0]
     _overview(panels[0], scene, (0, 1))
     if spatial:
         _overview(panels[1], scene, (0, 2))
-    _close(panels[-1], scene)
+    if near:
+        _close(panels[-1], scene)
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)
     if title:
@@ -184,7 +186,14 @@ def _points(panel: Axes, scene: Scene, view: tuple[int, int], size: float) -> No
         style: dict[str, Any] = {"marker": "D", "s": 70, "facecolors": "none", "edgecolors": _ORANGE, "linewidths": 1.8}
         panel.scatter(*_xy(scene.alternatives, view, size), label="alternative, with its cost gap", zorder=4, **style)
     for gap, x, y in zip(scene.gaps, *_xy(scene.alternatives, view, size), strict=True):
-        panel.annotate(f"+{gap:.3g}", (x, y), xytext=(7, -12), textcoords="offset points", fontsize=8, color=_ORANGE)
+        panel.annotate(
+            f"+{gap:.3g}" if gap >= 1e-3 else "+0",
+            (x, y),
+            xytext=(7, -12),
+            textcoords="offset points",
+            fontsize=8,
+            color=_ORANGE,
+        )
 
 
 def _ellipses(panel: Axes, scene: Scene, view: tuple[int, int], size: float) -> None:
@@ -199,6 +208,16 @@ def _ellipses(panel: Axes, scene: Scene, view: tuple[int, int], size: float) -> 
             line = centre[list(view)] + circle * semi_axes @ directions.T
             panel.plot(*(line.T / size), color=_BLUE, linewidth=1.5, label=label, zorder=2)
             label = None
+
+
+def _nearby(scene: Scene) -> bool:
+    """Return whether the fixes are so close together that they deserve a panel of their own."""
+    known = np.asarray(np.isfinite(scene.fixes).all(-1))
+    if not known.any():
+        return True
+    return _reach(scene, known, np.median(scene.fixes[known][:, :2], axis=0)) < 0.3 * float(
+        np.ptp(scene.stations[:, :2])
+    )
 
 
 def _close(panel: Axes, scene: Scene) -> None:
@@ -220,7 +239,7 @@ def _close(panel: Axes, scene: Scene) -> None:
     panel.set_aspect("equal", adjustable="box")
     panel.set_xlim(-extent / size, extent / size)
     panel.set_ylim(-extent / size, extent / size)
-    panel.set_title(f"around {scene.axes[0]} {centre[0]:.6g} m, {scene.axes[1]} {centre[1]:.6g} m")
+    panel.set_title(f"around {scene.axes[0]} {centre[0]:.1f} m, {scene.axes[1]} {centre[1]:.1f} m")
 
 
 def _moved(scene: Scene, centre: Array) -> Scene:
@@ -240,6 +259,7 @@ def _reach(scene: Scene, known: Array, centre: Array) -> float:
 
 
 def _frame(panel: Axes, scene: Scene, view: tuple[int, int], unit: str) -> None:
+    panel.margins(0.12)
     panel.set_aspect("equal", adjustable="datalim")
     panel.grid(color=_GREY, alpha=0.35, linewidth=0.6)
     panel.set_xlabel(f"{scene.axes[view[0]]} ({unit})")
@@ -253,4 +273,4 @@ def _xy(points: Array, view: tuple[int, int], size: float) -> tuple[Array, Array
 def _unit(points: Array) -> tuple[str, float]:
     """Return the unit in which points (n, 2) of metres read best, and its size."""
     reach = np.nanmax(np.abs(points), initial=1e-3)
-    return ("km", 1e3) if reach >= 1e4 else ("m", 1.0) if reach >= 1.0 else ("mm", 1e-3)
+    return ("km", 1e3) if reach >= 5e3 else ("m", 1.0) if reach >= 1.0 else ("mm", 1e-3)

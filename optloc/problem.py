@@ -106,7 +106,8 @@ class Problem:
         blocks = tuple((b.row.shape, b.row.tobytes()) for b in self.noise.blocks)
         motions = tuple((m.order, m.span, m.known is None, m.reference) for m in self.motions)
         biases = tuple(
-            (b.name, b.members, b.form, b.row.tobytes(), b.member.tobytes(), b.coefficient.tobytes()) for b in self.biases
+            (b.name, b.members, b.form, b.row.tobytes(), b.member.tobytes(), b.coefficient.tobytes())
+            for b in self.biases
         )
         stations = (self.stations.count, self.dimension, self.stations.covariance is None, self.stations.span)
         return (rows, blocks, motions, biases, stations, self.times.tobytes(), self.frame)
@@ -180,7 +181,8 @@ def _map(problem: Problem, change: Any) -> Problem:
         covariance=maybe(s.covariance, 3),
     )
     rows = tuple(
-        replace(r, z=change(r.z, 1), weight=change(r.weight, 1), correction=change(r.correction, 1)) for r in problem.rows
+        replace(r, z=change(r.z, 1), weight=change(r.weight, 1), correction=change(r.correction, 1))
+        for r in problem.rows
     )
     noise = Noise(tuple(Block(b.row, change(b.covariance, 3)) for b in problem.noise.blocks))
     motions = tuple(replace(m, known=maybe(m.known, 3)) for m in problem.motions)

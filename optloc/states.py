@@ -104,12 +104,14 @@ def plans(problem: Problem) -> tuple[Plan, ...]:
     if key not in _PLANS:
         if len(_PLANS) > 64:
             _PLANS.clear()
-        _PLANS[key] = tuple(_plan(problem, block, start) for block, start in zip(problem.rows, problem.starts, strict=True))
+        _PLANS[key] = tuple(
+            _plan(problem, block, start) for block, start in zip(problem.rows, problem.starts, strict=True)
+        )
     return _PLANS[key]
 
 
 def _plan(problem: Problem, block: Rows, start: int) -> Plan:
-    layout, model = problem.layout, MODELS[block.kind]
+    model = MODELS[block.kind]
     feeds = [*_motion_feeds(problem, block, model), *_station_feeds(problem, block, model)]
     feeds += _turn_feeds(problem, block, start)
     return Plan(block, model, tuple(feeds), _terms(problem, block, start, ("scale",)), _adds(problem, block, start))
@@ -139,7 +141,9 @@ def _terms(problem: Problem, block: Rows, start: int, forms: tuple[str, ...]) ->
 
 
 def _appended(parts: list[Terms]) -> Terms:
-    return Terms(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("row", "column", "coefficient")))
+    return Terms(
+        *(np.concatenate([getattr(part, name) for part in parts]) for name in ("row", "column", "coefficient"))
+    )
 
 
 def _motion_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
@@ -253,7 +257,9 @@ def given(problem: Problem, plan: Plan) -> dict[int, Any]:
     """Return the inputs that are data, each (..., m): surveyed stations, their rates and axes, known targets."""
     block, model, stations = plan.block, plan.model, problem.stations
     inputs: dict[int, Any] = {}
-    for place, rate, axes, index in ((_A, _RATE_A, _AXES_A, block.a), (_B, _RATE_B, _AXES_B, block.b))[: model.stations]:
+    for place, rate, axes, index in ((_A, _RATE_A, _AXES_A, block.a), (_B, _RATE_B, _AXES_B, block.b))[
+        : model.stations
+    ]:
         inputs |= _at_rows(stations.position, 1, block, index, place)
         if model.velocity and stations.velocity is not None:
             inputs |= _at_rows(stations.velocity, 1, block, index, rate)

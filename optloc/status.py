@@ -36,8 +36,8 @@ class Status(IntEnum):
 
 _SENTENCES: dict[Status, str] = {
     Status.OK: "A refined maximum-likelihood fix.",
-    Status.AMBIGUOUS: "Several positions explain the data about equally well; see the alternatives, or add a row, a station or a "
-    "known height that tells them apart.",
+    Status.AMBIGUOUS: "Several positions explain the data about equally well; see the alternatives, or add a row, a "
+    "station or a known height that tells them apart.",
     Status.SEARCHED: "No safe start is known for this mixture of rows: this is the best of a seeded search.",
     Status.MAX_ITERATIONS: "The refinement used all its iterations; raise the limit or look at the geometry.",
     Status.STALLED: "The refinement could not lower the cost any more although its gradient is not zero.",

@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 
 FLOORS = {
-    0: "types errors units frames status noise linalg",
+    0: "types errors units frames status noise linalg ellipse",
     1: "models",
     2: "layout problem linear normal fix tables kernels states build check epochs",
     3: "solve bounds simulate",

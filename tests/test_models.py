@@ -165,10 +165,8 @@ def test_geodetic_height_is_exact_from_the_sea_bed_to_orbit():
 def test_gradient_of_height_is_the_normal_of_the_ellipsoid():
     lat, lon, height = grid()
     ecef = ECEF.from_geodetic(lat, lon, height)
-    keep = np.hypot(ecef[:, 0], ecef[:, 1]) > 1e-3  # on the axis itself hypot has no derivative
-    assert keep.mean() > 0.98
-    jet = geodetic_height(tuple(Jet(ecef[keep, i], {i: np.ones(1)}) for i in range(3)))
-    normal = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])[:, keep]
+    jet = geodetic_height(tuple(Jet(ecef[:, i], {i: np.ones(1)}) for i in range(3)))
+    normal = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
     assert np.abs(np.stack([jet.partials[i] for i in range(3)]) - normal).max() < 1e-8
 
 

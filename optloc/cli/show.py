@@ -25,7 +25,7 @@ def show(fixed: Fixed, console: Console) -> None:
     rows = len(next(iter(fixed.columns.values())))
     first = fixed.fixes[0]
     if rows == 1:
-        _one(fixed, first if first.shape == () else first[0], console)
+        _one(fixed, first[0] if first.shape else first, console)
     elif not first.shape:
         _one(fixed, first, console)
     else:
@@ -49,7 +49,7 @@ def _one(fixed: Fixed, fix: Fix, console: Console) -> None:
         _bias_row(table, fix, name, values)
     table.add_row("chi-square", _chi_square(fix))
     certificate = fix.certificate[()]
-    if certificate is not None and hasattr(certificate, "proof"):
+    if hasattr(certificate, "proof"):
         table.add_row("certificate", f"{certificate.proof}: {certificate.reason}")
     table.add_row("stages", " → ".join(stage.name for stage in fix.stages) or "none")
     console.print(table)
@@ -110,7 +110,9 @@ def _bias_row(table: Table, fix: Fix, name: str, values: Array) -> None:
 def _chi_square(fix: Fix) -> str:
     if int(fix.dof) <= 0 or not np.isfinite(fix.cost):
         return "no redundancy: nothing to test"
-    return f"{float(fix.cost):.4g} with {int(fix.dof)} degrees of freedom, p = {float(fix.p_value):.3g}"
+    p = float(fix.p_value)
+    warning = "; the residuals are larger than the stated noise" if p < 1e-3 else ""
+    return f"{float(fix.cost):.4g} with {int(fix.dof)} degrees of freedom, p = {p:.3g}{warning}"
 
 
 def _alternatives(fix: Fix, console: Console) -> None:
@@ -122,7 +124,7 @@ def _alternatives(fix: Fix, console: Console) -> None:
         table.add_column(name, justify="right")
     for i, (x, gap) in enumerate(zip(fix.alternatives.x[found], fix.alternatives.gap[found], strict=True)):
         point = np.ravel(alternative_position(fix, x))
-        table.add_row(str(i + 1), ", ".join(f"{v:.1f}" for v in point[:6]), f"{gap:.4g}")
+        table.add_row(str(i + 1), ", ".join(f"{v:.1f}" for v in point[:6]), f"{gap:.4g}" if gap >= 1e-3 else "0")
     console.print(table)
 
 

@@ -108,7 +108,8 @@ def _grouped(keys: Keys, count: int, window: float | None) -> tuple[Array, tuple
         order = np.argsort(first if rank is None else rank, kind="stable")
         labels = values.astype(object)
     else:
-        assert keys.time is not None and keys.written is not None
+        assert keys.time is not None
+        assert keys.written is not None
         bins = keys.time if window is None else np.floor((keys.time - keys.time.min()) / window + 1e-9)
         _, first, index = np.unique(bins, return_index=True, return_inverse=True)
         order, labels = np.arange(len(first)), keys.written[first].astype(str).astype(object)

@@ -101,9 +101,13 @@ def chunks_of(
     values : bool
         Whether measured values are needed; without them a missing column z is NaN.
     """
-    context = _Context(section, table, stations, where, speed, values)
+
+    def chunk(kind: str) -> Chunk:
+        part = _Context(section, table.take(pick), stations, where, speed, values)
+        return replace(_chunk(part, kind), row=pick, table=table)
+
     if section.kind is not None:
-        return [_chunk(context, section.kind, np.arange(table.count))]
+        return [chunk(section.kind, np.arange(table.count))]
     if not table.has("kind"):
         raise InvalidProblem("the key 'kind' is missing", where, 'write kind = "tdoa", or give the rows a column kind')
     labels = table.labels("kind")
@@ -111,11 +115,11 @@ def chunks_of(
     made = []
     for kind, row in zip(kinds[np.argsort(first)].tolist(), np.sort(first).tolist(), strict=True):
         kind_model(kind, table.where("kind", row))
-        made.append(_chunk(context, kind, np.flatnonzero(labels == kind)))
+        made.append(chunk(kind, np.flatnonzero(labels == kind)))
     return made
 
 
-def _chunk(c: _Context, kind: str, pick: Array) -> Chunk:
+def _chunk(c: _Context, kind: str) -> Chunk:
     section, table = c.section, c.table
     model = kind_model(kind, join(c.where, "key 'kind'"))
     convention = section.azimuth if kind == "azimuth" else "east-counterclockwise"
@@ -123,23 +127,23 @@ def _chunk(c: _Context, kind: str, pick: Array) -> Chunk:
     _check_options(c, kind, model)
     unit = units.conversion(_unit(section, kind, c.where), join(c.where, "key 'unit'"))
     weight = _numbers(c, "weight", pick, 1.0 if section.weight is None else section.weight)
-    _check_weight(c, weight, pick)
-    z = _values(c, unit, weight, pick)
-    a, b = (_stations(c, key, pick, needed) for key, needed in (("a", model.stations > 0), ("b", model.stations > 1)))
+    _check_weight(c, weight)
+    z = _values(c, unit, weight)
+    a, b = (_stations(c, key, needed) for key, needed in (("a", model.stations > 0), ("b", model.stations > 1)))
     if model.stations > 1:
-        _check_pairs(c, kind, a, b, pick)
+        _check_pairs(c, kind, a, b)
     if section.positive == "b-farther":
         a, b = b, a
-    sigma, arrival, covariance = _noise(c, model, units, unit, z, pick)
+    sigma, arrival, covariance = _noise(c, model, units, unit, z)
     seconds = Units("time").conversion(section.time_unit, join(c.where, "key 'time_unit'")).factor
     return Chunk(
-        kind, pick, z, a, b, weight, _correction(c, units, unit, pick), unit,
-        np.broadcast_to(unit.slope(z), z.shape), np.zeros(len(pick)),
+        kind, z, a, b, weight, _correction(c, units, unit), unit,
+        np.broadcast_to(unit.slope(z), z.shape), np.zeros(c.table.count),
         sigma, arrival, covariance,
-        table.labels("epoch")[pick] if table.has("epoch") else None,
-        table.times("time", seconds)[pick] if table.has("time") else None,
-        table.labels("time")[pick] if table.has("time") else None,
-        table.labels("target")[pick] if table.has("target") else None,
+        table.labels("epoch") if table.has("epoch") else None,
+        table.times("time", seconds) if table.has("time") else None,
+        table.labels("time") if table.has("time") else None,
+        table.labels("target") if table.has("target") else None,
         section.excess, table,
     )  # fmt: skip
 
@@ -166,24 +170,24 @@ def _unit(section: MeasurementsTable, kind: str, where: str) -> str | None:
     )
 
 
-def _numbers(c: _Context, key: str, pick: Array, default: float) -> Array:
-    return c.table.numbers(key)[pick] if c.table.has(key) else np.full(len(pick), default)
+def _numbers(c: _Context, key: str, default: float) -> Array:
+    return c.table.numbers(key) if c.table.has(key) else np.full(c.table.count, default)
 
 
-def _check_weight(c: _Context, weight: Array, pick: Array) -> None:
+def _check_weight(c: _Context, weight: Array) -> None:
     bad = np.flatnonzero(~((weight >= 0.0) & (weight <= 1.0)))
     if len(bad):
-        place = c.table.where("weight", int(pick[bad[0]]))
+        place = c.table.where("weight", int(bad[0]))
         raise InvalidProblem(
             f"the weight {weight[bad[0]]:g} is outside 0 to 1", place, "use 0 for absent, 1 for present"
         )
 
 
-def _values(c: _Context, unit: Conversion, weight: Array, pick: Array) -> Array:
+def _values(c: _Context, unit: Conversion, weight: Array) -> Array:
     """Return z in SI: zero where a row is absent, NaN where values are not needed and not there."""
     if not c.values and not c.table.has("z"):
-        return np.full(len(pick), np.nan)
-    raw = c.table.numbers("z", optional=bool((weight == 0.0).any()) or not c.values)[pick]
+        return np.full(c.table.count, np.nan)
+    raw = c.table.numbers("z", optional=bool((weight == 0.0).any()) or not c.values)
     empty = np.flatnonzero(np.isnan(raw) & (weight > 0.0))
     if len(empty) and c.values:
         c.table.numbers("z")
@@ -191,24 +195,24 @@ def _values(c: _Context, unit: Conversion, weight: Array, pick: Array) -> Array:
     return np.where(weight > 0.0, unit.to_si(raw), 0.0)
 
 
-def _stations(c: _Context, key: str, pick: Array, needed: bool) -> Array:
+def _stations(c: _Context, key: str, needed: bool) -> Array:
     if not needed:
-        return np.full(len(pick), -1)
+        return np.full(c.table.count, -1)
     single = getattr(c.section, key)
     if c.table.has(key) or single is None:
-        labels = c.table.labels(key)[pick]
+        labels = c.table.labels(key)
     else:
-        labels = np.full(len(pick), single, dtype=object)
+        labels = np.full(c.table.count, single, dtype=object)
     numbers = {name: i for i, name in enumerate(c.stations)}
     unknown = set(labels.tolist()) - numbers.keys()
     if unknown:
         row = int(np.flatnonzero(np.isin(labels.astype(str), list(unknown)))[0])
-        place = c.table.where(key, int(pick[row])) if c.table.has(key) else join(c.where, f"key {key!r}")
+        place = c.table.where(key, row) if c.table.has(key) else join(c.where, f"key {key!r}")
         raise InvalidProblem(f"there is no station {labels[row]!r}", place, nearest(labels[row], list(c.stations)))
     return np.array(list(map(numbers.__getitem__, labels.tolist())), dtype=np.int64)
 
 
-def _check_pairs(c: _Context, kind: str, a: Array, b: Array, pick: Array) -> None:
+def _check_pairs(c: _Context, kind: str, a: Array, b: Array) -> None:
     same = np.flatnonzero(a == b)
     if len(same):
         what = f"{kind} names station {c.stations[a[same[0]]]!r} twice"
@@ -224,7 +228,7 @@ def _noise(
     if sum(given) > 1:
         raise InvalidProblem("the noise is given more than once", c.where, "give sigma, arrival_sigma or covariance")
     if column:
-        return _positive(c, unit.sigma_to_si(c.table.numbers("sigma")[pick], z), pick), None, None
+        return _positive(c, unit.sigma_to_si(c.table.numbers("sigma"), z), pick), None, None
     if section.sigma is not None:
         number, own = units.amount(section.sigma, unit, join(c.where, "key 'sigma'"))
         return _positive(c, np.broadcast_to(own.sigma_to_si(number, z), z.shape), None), None, None
@@ -234,10 +238,10 @@ def _noise(
     return None, None, covariance
 
 
-def _positive(c: _Context, sigma: Array, pick: Array | None) -> Array:
+def _positive(c: _Context, sigma: Array, place: str) -> Array:
     bad = np.flatnonzero(sigma <= 0.0)
     if len(bad):
-        place = join(c.where, "key 'sigma'") if pick is None else c.table.where("sigma", int(pick[bad[0]]))
+        place = join(c.where, "key 'sigma'") if pick is None else c.table.where("sigma", int(bad[0]))
         raise InvalidProblem("the standard deviation is not positive", place, "give a positive number")
     return sigma
 
@@ -290,13 +294,13 @@ def square(rows: list[list[float]], where: str) -> Array:
     return matrix
 
 
-def _correction(c: _Context, units: Units, unit: Conversion, pick: Array) -> Array:
+def _correction(c: _Context, units: Units, unit: Conversion) -> Array:
     if c.table.has("correction"):
-        return c.table.numbers("correction")[pick] * _size(unit, c)
+        return c.table.numbers("correction") * _size(unit, c)
     if c.section.correction is None:
-        return np.zeros(len(pick))
+        return np.zeros(c.table.count)
     number, own = units.amount(c.section.correction, unit, join(c.where, "key 'correction'"))
-    return np.full(len(pick), number * _size(own, c))
+    return np.full(c.table.count, number * _size(own, c))
 
 
 def _size(unit: Conversion, c: _Context) -> float:

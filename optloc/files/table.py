@@ -26,12 +26,20 @@ class Table:
         Number of rows m.
     names : mapping of str to str
         What the columns that are asked for are called here.
+    first : int array (m,), optional
+        Row of the source that each row was, where it is a part of a table.
     """
 
     source: str
     columns: Mapping[str, Array]
     count: int
     names: Mapping[str, str] = field(default_factory=dict)
+    first: Array | None = None
+
+    def take(self, pick: Array) -> Table:
+        """Return some of the rows."""
+        columns = {name: column[pick] for name, column in self.columns.items()}
+        return Table(self.source, columns, len(pick), self.names, pick)
 
     def name(self, key: str) -> str:
         """Return what a column is called in this table."""
@@ -43,7 +51,8 @@ class Table:
 
     def where(self, key: str, row: int | None = None) -> str:
         """Return the place of a cell (0-based row) or of a column."""
-        return join(self.source, None if row is None else f"row {row + 1}", f"column {self.name(key)!r}")
+        place = row if row is None or self.first is None else int(self.first[row])
+        return join(self.source, None if place is None else f"row {place + 1}", f"column {self.name(key)!r}")
 
     def raw(self, key: str) -> Array:
         """Return a column as it was read; raise InvalidProblem where there is none."""
@@ -59,10 +68,7 @@ class Table:
     def numbers(self, key: str, optional: bool = False) -> Array:
         """Return a column as finite numbers (m,); an empty cell is NaN where `optional`, else refused."""
         column = self.raw(key)
-        if column.dtype.kind in "iuf":
-            values = column.astype(np.float64)
-        else:
-            values = self._parsed(key, column)
+        values = column.astype(np.float64) if column.dtype.kind in "iuf" else self._parsed(key, column)
         bad = np.isinf(values) if optional else ~np.isfinite(values)
         if bad.any():
             row = int(np.flatnonzero(bad)[0])

@@ -27,6 +27,6 @@ def namespace(value: Any) -> Any:
     array_api = getattr(value, "__array_namespace__", None)
     if array_api is not None:
         return array_api()
-    import numpy
+    import numpy as np
 
-    return numpy
+    return np

@@ -112,7 +112,7 @@ def _point(problem: Problem, rows: Rows, index: Array, to: Coordinates) -> Point
 
 
 def _azimuth_beside(problem: Problem, rows: Rows) -> Array | None:
-    """Return the azimuth that the same station took of the same target at the same epoch, (..., m); None if any lacks one."""
+    """Return the azimuth beside each elevation (same station, target and epoch), (..., m); None if any lacks one."""
     for other in problem.rows:
         if other.kind != "azimuth":
             continue
@@ -125,7 +125,7 @@ def _azimuth_beside(problem: Problem, rows: Rows) -> Array | None:
 
 
 def _paired_elevation(m: Array, azimuth: Array, a: Point) -> Row:
-    """Return the row [sin E cos A, sin E sin A, -cos E] . (x - s) = 0 in the station's axes; its error is range times n_E."""
+    """Return [sin E cos A, sin E sin A, -cos E] . (x - s) = 0 in the station's axes; its error is range times n_E."""
     local = (np.sin(m) * np.cos(azimuth), np.sin(m) * np.sin(azimuth), -np.cos(m))
     basis = a.axes or tuple(tuple(float(i == j) for j in range(3)) for i in range(3))
     normal = [sum(local[i] * basis[i][c] for i in range(3)) for c in range(3)]
@@ -138,7 +138,9 @@ def _paired_elevation(m: Array, azimuth: Array, a: Point) -> Row:
     return np.concatenate([row, np.zeros((*row.shape[:-1], 1))], axis=-1), (row * place).sum(-1), factor
 
 
-def _substituted(lifted: LiftedRow, rows: Rows, a: Point, b: Point, found: Ranges | None, to: Coordinates) -> Row | None:
+def _substituted(
+    lifted: LiftedRow, rows: Rows, a: Point, b: Point, found: Ranges | None, to: Coordinates
+) -> Row | None:
     """Return a lifted row with its ranges replaced by c + sign t, or None where a range stays unknown."""
     d = len(a.position)
 

@@ -42,7 +42,11 @@ def nlp(problem: Problem, fix: Fix | None) -> Fix:
         raise InvalidProblem("nlp improves a start", "method", "give start= or a method such as 'gtrs+nlp'")
     began = perf_counter()
     pool, item, slot = pooled(fix)
-    x, cost, code = pool.copy(), np.full(pool.shape[:2], np.inf), np.full(pool.shape[:2], int(Status.NUMERICAL), np.int8)
+    x, cost, code = (
+        pool.copy(),
+        np.full(pool.shape[:2], np.inf),
+        np.full(pool.shape[:2], int(Status.NUMERICAL), np.int8),
+    )
     for i in np.unique(item):
         one = problem.take(np.array([i]))
         solver = _Scaled(one)
@@ -70,7 +74,9 @@ class _Scaled:
         self.problem = problem
         shift, size = length_scale(problem)
         layout = problem.layout
-        unit = np.concatenate([_slot_units(layout.shared, size), np.tile(_slot_units(layout.local, size), layout.epochs)])
+        unit = np.concatenate(
+            [_slot_units(layout.shared, size), np.tile(_slot_units(layout.local, size), layout.epochs)]
+        )
         centre = np.zeros(layout.size)
         for found in (layout.shared, layout.local):
             for place in found:
@@ -87,10 +93,10 @@ class _Scaled:
         self.prior = _prior(problem, unit, centre)
 
     def from_start(self, start: Array) -> tuple[Array, float, int]:
-        found = self.program.solve(
-            (start - self.centre) / self.unit, self.z, self.weight, self.data, prior=self.prior
+        found = self.program.solve((start - self.centre) / self.unit, self.z, self.weight, self.data, prior=self.prior)
+        code = (
+            Status.OK if found.success else Status.MAX_ITERATIONS if "Iteration" in found.status else Status.NUMERICAL
         )
-        code = Status.OK if found.success else Status.MAX_ITERATIONS if "Iteration" in found.status else Status.NUMERICAL
         return found.x * self.unit + self.centre, found.cost, int(code)
 
 

@@ -133,9 +133,13 @@ def reduce(problem: Problem) -> Problem:
     if found is None:
         return problem
     if len(found.groups) > 1 or len(found.groups[0]) > 1:
-        raise InvalidProblem("the range rows do not form one connected set", "reduce", "reduce connected problems one by one")
+        raise InvalidProblem(
+            "the range rows do not form one connected set", "reduce", "reduce connected problems one by one"
+        )
     kept = [i for i, rows in enumerate(flat.rows) if MODELS[rows.kind].ranges is None]
-    others = np.concatenate([np.arange(flat.starts[i], flat.starts[i] + flat.rows[i].count) for i in kept] or [np.zeros(0, int)])
+    others = np.concatenate(
+        [np.arange(flat.starts[i], flat.starts[i] + flat.rows[i].count) for i in kept] or [np.zeros(0, int)]
+    )
     blocks = [block for block in flat.noise.blocks if np.isin(block.row, others).all()]
     if any(np.isin(block.row, others).any() for block in flat.noise.blocks if block not in blocks):
         raise InvalidProblem("range rows are correlated with other kinds", "reduce", "solve the problem unreduced")
@@ -148,7 +152,13 @@ def reduce(problem: Problem) -> Problem:
     )
     reduced = replace(flat, rows=(*rows, *(flat.rows[i] for i in kept)), noise=noise)
     shape = problem.batch_shape
-    return reduced if len(shape) == 1 else replace(reduced.take(np.arange(1)), rows=_unbatched(reduced.rows)) if not shape else reduced
+    return (
+        reduced
+        if len(shape) == 1
+        else replace(reduced.take(np.arange(1)), rows=_unbatched(reduced.rows))
+        if not shape
+        else reduced
+    )
 
 
 def _reduced_rows(found: Ranges) -> tuple[list[Rows], Array]:
@@ -171,7 +181,12 @@ def _reduced_rows(found: Ranges) -> tuple[list[Rows], Array]:
 
 def _unbatched(rows: tuple[Rows, ...]) -> tuple[Rows, ...]:
     return tuple(
-        replace(r, z=r.z.reshape(r.count), weight=r.weight.reshape(-1)[-r.count :], correction=r.correction.reshape(-1)[-r.count :])
+        replace(
+            r,
+            z=r.z.reshape(r.count),
+            weight=r.weight.reshape(-1)[-r.count :],
+            correction=r.correction.reshape(-1)[-r.count :],
+        )
         for r in rows
     )
 
@@ -188,6 +203,7 @@ def _design(problem: Problem) -> tuple[Array, Array, Array]:
     """Return D (m, q) over nodes, and station and epoch of the station nodes."""
     moving = problem.stations.position.shape[-3] > 1
     entries: list[tuple[int, tuple[int, int, int], float]] = []
+    coefficient: float
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         model = MODELS[rows.kind]
         if model.ranges is None:
@@ -218,7 +234,7 @@ def _graph(design: Array, stations: int) -> Graph:
             reach = np.zeros(count, dtype=bool)
             reach[node] = True
             while True:
-                wider = linked[reach].any(0)
+                wider = np.asarray(linked[reach].any(0))
                 if (wider == reach).all():
                     break
                 reach = wider

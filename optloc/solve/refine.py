@@ -44,9 +44,7 @@ def equations_at(problem: Problem, x: Array, noise: tuple[Whitener, ...]) -> Nor
     return with_priors(problem, x, normal(linearise(problem, x, noise), problem.epochs))
 
 
-def refine(
-    problem: Problem, start: Array, *, tolerance: float = 1e-7, limit: int = 60, damped: bool = True
-) -> Refined:
+def refine(problem: Problem, start: Array, *, tolerance: float = 1e-7, limit: int = 60, damped: bool = True) -> Refined:
     """Return the local maximum-likelihood estimates next to given starts.
 
     Levenberg's method with Marquardt's scaling: a step is taken where it lowers the cost, and the damping follows
@@ -101,7 +99,14 @@ class _State:
         equations = _owned(equations_at(problem, start, noise))
         status = np.full(count, int(Status.MAX_ITERATIONS), dtype=np.int8)
         status[~np.isfinite(equations.cost)] = Status.NUMERICAL
-        return cls(np.array(start), equations, np.full(count, 1e-6), np.full(count, 2.0), status, np.zeros(count, dtype=np.int32))
+        return cls(
+            np.array(start),
+            equations,
+            np.full(count, 1e-6),
+            np.full(count, 2.0),
+            status,
+            np.zeros(count, dtype=np.int32),
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,9 +124,7 @@ class _Part:
         return cls(problem.take(active), picked)
 
 
-def _advance(
-    part: _Part, state: _State, active: Array, n: int, tolerance: float, damped: bool, iteration: int
-) -> None:
+def _advance(part: _Part, state: _State, active: Array, n: int, tolerance: float, damped: bool, iteration: int) -> None:
     everything = len(active) == len(state.x)
     now = state.equations if everything else _at(state.equations, active)
     damping = state.damping[active] if damped else np.zeros(len(active))
@@ -138,7 +141,9 @@ def _advance(
     ratio = achieved / np.where(predicted > 0.0, predicted, 1.0)
     factor = np.maximum(1.0 / 3.0, 1.0 - (2.0 * np.clip(ratio, 0.0, 1.0) - 1.0) ** 3)
     factor = np.where(ratio > 0.9, 0.1, factor)
-    state.damping[active] = np.where(better, np.maximum(damping * factor, 1e-12), damping * state.growth[active] + 1e-12)
+    state.damping[active] = np.where(
+        better, np.maximum(damping * factor, 1e-12), damping * state.growth[active] + 1e-12
+    )
     state.growth[active] = np.where(better, 2.0, 2.0 * state.growth[active])
     state.status[active[small & (better | (damping < 1e-3))]] = Status.OK
     state.status[active[~better & (state.damping[active] > 1e12)]] = Status.STALLED

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
+
 import numpy as np
 
 from formulations.squared_range import Quadric, cone, minimiser, paraboloid, stationary

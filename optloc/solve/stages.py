@@ -12,9 +12,10 @@ from optloc.fix import Alternatives, Fix, Stage
 from optloc.noise import whiten
 from optloc.normal import Normal
 from optloc.problem import Problem
+from optloc.solve.pieces import from_pieces, one_position
 from optloc.solve.refine import equations_at, refine
-from optloc.solve.start import mirrored, squared_range_starts, static, subarray_starts, vectors
 from optloc.solve.squared import Pick, every, hull, minimum, shor
+from optloc.solve.start import mirrored, squared_range_starts, static, subarray_starts, vectors
 from optloc.solve.verdict import Candidates, degrees_of_freedom, judge
 from optloc.status import Certificate, Status
 from optloc.types import Array
@@ -46,13 +47,18 @@ def socp(problem: Problem, fix: Fix | None) -> Fix:
 
 def _squared(problem: Problem, fix: Fix | None, name: str, pick: Pick) -> Fix:
     began = perf_counter()
-    return _unrefined(problem, squared_range_starts(static(problem), pick), fix, name, began)
+    if one_position(problem):
+        return _unrefined(problem, squared_range_starts(static(problem), pick), fix, name, began)
+    x = from_pieces(problem, lambda piece: lsr(piece, _squared(piece, None, name, pick)))
+    return _assembled(problem, x, fix, name, began)
 
 
 def widen(problem: Problem, fix: Fix | None) -> Fix:
     """Return a refined fix with more candidates beside it: its mirror image, and where the verdict is not clean, sub-arrays."""
     if fix is None:
         raise InvalidProblem("widen adds candidates to a fix", "method", "put it behind a refinement")
+    if not one_position(problem):
+        return fix
     began = perf_counter()
     alone = static(problem)
     seen = _positions(problem, fix)

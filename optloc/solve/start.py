@@ -65,19 +65,28 @@ def subarray_starts(problem: Problem) -> Array:
     return np.concatenate(parts, axis=1)
 
 
-def vectors(problem: Problem, position: Array) -> Array:
-    """Return full parameter vectors (N, q, size) with given positions and every other unknown at its prior mean."""
+def vectors(problem: Problem, position: Array | None) -> Array:
+    """Return full parameter vectors (N, q, size) with given positions and every other unknown at its prior mean.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems.
+    position : array (N, q, d), optional
+        Of the only target; None: vectors (N, size) without any state.
+    """
     layout = problem.layout
-    x = np.zeros((*position.shape[:-1], layout.size))
-    for bias in problem.biases:
-        slot, _ = layout.find(bias.name)
-        x[..., slot.start : slot.start + slot.size] = np.ravel(bias.mean) if bias.sigma is not None else 0.0
-    for prior in problem.priors:
-        slot, shared = layout.find(prior.name)
+    x = np.zeros(((problem.batch_shape[0],) if position is None else position.shape[:-1]) + (layout.size,))
+    means = [(prior.name, prior.mean) for prior in problem.priors]
+    means += [(bias.name, np.ravel(bias.mean)) for bias in problem.biases if bias.sigma is not None]
+    for name, mean in means:
+        slot, shared = layout.find(name)
         if shared:
-            x[..., slot.start : slot.start + slot.size] = prior.mean if prior.mean.ndim == 1 else prior.mean[:, None]
-    slot, _ = layout.find("position")
-    x[..., slot.start : slot.start + slot.size] = position
+            each = mean if mean.ndim == 1 or position is None else mean[:, None]
+            x[..., slot.start : slot.start + slot.size] = each
+    if position is not None:
+        slot, _ = layout.find("position")
+        x[..., slot.start : slot.start + slot.size] = position
     return x
 
 

@@ -24,7 +24,9 @@ _WEAK = 1e-12
 _FAR = 1e4
 
 _LOCAL = Certificate(
-    "local", "a stationary point with a positive definite normal matrix; the best of all candidates refined", "refinement"
+    "local",
+    "a stationary point with a positive definite normal matrix; the best of all candidates refined",
+    "refinement",
 )
 _UNKNOWN = Certificate("unknown", "there is no refined answer to prove anything about", "none")
 
@@ -133,7 +135,8 @@ def _alternatives(
     order = np.argsort(gaps, axis=1, kind="stable")
     keep = int(np.isfinite(gaps).sum(1).max())
     return Alternatives(
-        np.take_along_axis(points, order[..., None], axis=1)[:, :keep], np.take_along_axis(gaps, order, axis=1)[:, :keep]
+        np.take_along_axis(points, order[..., None], axis=1)[:, :keep],
+        np.take_along_axis(gaps, order, axis=1)[:, :keep],
     )
 
 
@@ -153,7 +156,11 @@ def degrees_of_freedom(problem: Problem) -> Array:
         rank = rank + (whitener.matrix != 0.0).any(-1).sum((-1, -2)) * (
             len(whitener.row) if whitener.matrix.shape[-3] == 1 and len(whitener.row) > 1 else 1
         )
-    known = {prior.name for prior in problem.priors} | {b.name for b in problem.biases if b.sigma is not None} | {"stations"}
+    known = (
+        {prior.name for prior in problem.priors}
+        | {b.name for b in problem.biases if b.sigma is not None}
+        | {"stations"}
+    )
     layout = problem.layout
     unknowns = sum(slot.size for slot in layout.shared if slot.name not in known)
     heard = [bool((problem.epoch == k).any()) for k in range(problem.epochs)]

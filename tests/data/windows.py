@@ -1,0 +1,121 @@
+"""What the tests of real data share: a data set as windows, and least squares started at the truth to judge a fix by."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from scipy.optimize import least_squares
+from scipy.stats import chi2
+
+from optloc import Fix, Problem, Status
+
+
+@dataclass(frozen=True)
+class Window:
+    """Rows of one short window: stations, measured values less known corrections, covariance, true position."""
+
+    a: np.ndarray
+    b: np.ndarray | None
+    z: np.ndarray
+    covariance: np.ndarray
+    truth: np.ndarray
+
+
+@dataclass(frozen=True)
+class Windows:
+    """A data set: the stations, its windows, and the problem whose epochs they are."""
+
+    name: str
+    stations: np.ndarray
+    windows: tuple[Window, ...]
+    problem: Problem
+
+    @property
+    def truth(self) -> np.ndarray:
+        return np.array([window.truth for window in self.windows])
+
+
+def windowed(rows: pd.DataFrame, truth: pd.DataFrame, times: np.ndarray, width: float) -> tuple[pd.DataFrame, np.ndarray]:
+    """Return the rows that fall into windows centred at `times`, with their `window`, and the truth (k, d) there."""
+    columns = [c for c in ("x_m", "y_m", "z_m") if c in truth]
+    at = np.stack([np.interp(times, truth["t_s"], truth[c]) for c in columns], axis=-1)
+    window = np.searchsorted(times - width / 2, rows["t_s"], side="right") - 1
+    inside = (window >= 0) & (rows["t_s"].to_numpy() < times[np.maximum(window, 0)] + width / 2)
+    return rows.assign(window=window)[inside], at
+
+
+def from_truth(data: Windows) -> np.ndarray:
+    """Return the least-squares positions (k, d) of all windows, each started at the truth; nothing of optloc is used."""
+    found = np.empty_like(data.truth)
+    for k, w in enumerate(data.windows):
+        whiten = np.linalg.inv(np.linalg.cholesky(w.covariance))
+
+        def residual(x: np.ndarray, w: Window = w, whiten: np.ndarray = whiten) -> np.ndarray:
+            model = np.linalg.norm(x - data.stations[w.a], axis=1)
+            if w.b is not None:
+                model = model - np.linalg.norm(x - data.stations[w.b], axis=1)
+            return whiten @ (w.z - model)
+
+        found[k] = least_squares(residual, w.truth, x_scale="jac", xtol=1e-10, ftol=1e-12).x
+    return found
+
+
+def quantiles(error: np.ndarray) -> tuple[float, float]:
+    """Return median and 95 % of errors."""
+    return float(np.median(error)), float(np.quantile(error, 0.95))
+
+
+def statuses(fix: Fix) -> str:
+    """Return how often each status occurs, in words."""
+    numbers, counts = np.unique(fix.code, return_counts=True)
+    return ", ".join(f"{n} {Status(int(s)).label}" for s, n in zip(numbers, counts, strict=True))
+
+
+def judge(data: Windows, fix: Fix) -> tuple[float, float]:
+    """Assert what must hold for the fixes of a data set made without a guess; print and return median and 95 % error."""
+    answered = fix.answered
+    error = np.linalg.norm(fix.position - data.truth, axis=-1)
+    reference = np.linalg.norm(from_truth(data) - data.truth, axis=-1)
+    ours, theirs = quantiles(error[answered]), quantiles(reference[answered])
+    seconds = sum(stage.seconds for stage in fix.stages)
+    print(
+        f"{data.name}: {len(error)} windows ({statuses(fix)}), error median {ours[0]:.3f} m, 95 % {ours[1]:.3f} m; "
+        f"started at the truth {theirs[0]:.3f} / {theirs[1]:.3f} m; {1e3 * seconds / len(error):.2f} ms a fix"
+    )
+    assert answered.mean() >= 0.99, f"{data.name}: {statuses(fix)}"
+    assert ours[0] <= 1.05 * theirs[0], data.name
+    assert ours[1] <= 1.05 * theirs[1], data.name
+    wrong = (fix.code == Status.OK) & ~(error <= 5.0)
+    assert not wrong.any() or theirs[1] > 5.0, f"{data.name}: silently wrong in windows {np.flatnonzero(wrong)}"
+    dof = np.array([len(w.z) - data.stations.shape[1] for w in data.windows])
+    assert np.array_equal(fix.dof[answered], dof[answered])
+    np.testing.assert_allclose(fix.p_value[answered], chi2.sf(fix.cost, dof)[answered], rtol=1e-9, atol=1e-300)
+    return ours
+
+
+def own_sigmas(data: Windows, fix: Fix) -> np.ndarray:
+    """Return how many of its own standard deviations each fix is off: the whole error ellipsoid, not axis by axis."""
+    error = fix.position - data.truth
+    cov = fix.covariance()
+    return np.sqrt(np.einsum("ki,kij,kj->k", error, np.linalg.inv(cov), error))
+
+
+def judge_consistency(data: Windows, fix: Fix, share: float = 0.01) -> None:
+    """Assert that of the fixes whose chi-square is plausible at most a share is more than 5 own sigma off."""
+    off = np.full(len(data.windows), np.nan)
+    good = fix.answered & (fix.p_value > 1e-3)
+    off[good] = own_sigmas(data, fix)[good]
+    far = np.flatnonzero(off > 5.0)
+    rms = np.sqrt(np.mean(off[good] ** 2 / data.stations.shape[1]))
+    print(f"{data.name}: {good.sum()} of {len(off)} plausible (p > 0.001), {len(far)} beyond 5 sigma, rms {rms:.2f} sigma")
+    listed = _listed(data, fix, off, far)
+    assert len(far) <= share * good.sum(), f"{data.name}: {len(far)} of {good.sum()} beyond 5 own sigma\n{listed}"
+    assert good.mean() > 0.5, "a chi-square that rejects most windows says that the noise is not the data's"
+
+
+def _listed(data: Windows, fix: Fix, off: np.ndarray, which: Sequence[int]) -> str:
+    error = np.linalg.norm(fix.position - data.truth, axis=-1)
+    return "\n".join(f"  window {k}: {off[k]:.1f} sigma, {error[k]:.2f} m, p = {fix.p_value[k]:.3g}" for k in which)
