@@ -17,7 +17,7 @@ from optloc.noise import Noise
 from optloc.normal import Normal, normal
 from optloc.problem import Problem
 from optloc.simulate import simulate
-from optloc.solve import METHODS, solve
+from optloc.solve import FORMULATIONS, METHODS, SOLVERS, solve
 from optloc.solve.reduce import reduce
 from optloc.status import Certificate, Status
 from optloc.types import Bias, Motion, Prior, Rows, Stations
@@ -27,8 +27,10 @@ __version__ = "0.1.0"
 __all__ = [
     "CARTESIAN",
     "ECEF",
+    "FORMULATIONS",
     "METHODS",
     "MODELS",
+    "SOLVERS",
     "Alternatives",
     "Bias",
     "Certificate",
@@ -52,6 +54,7 @@ __all__ = [
     "assemble",
     "by_epoch",
     "crlb",
+    "from_table",
     "linearise",
     "load",
     "measured",
@@ -65,8 +68,18 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name == "load":
-        from optloc.files import load
+    if name in ("load", "from_table"):
+        from optloc import files  # pandas is loaded when a file or a table is read
 
-        return load
+        return getattr(files, name)
     raise AttributeError(f"module 'optloc' has no attribute {name!r}")
+
+
+def _from_table(*args: Any, **options: Any) -> Problem:
+    from optloc.files import from_table
+
+    return from_table(*args, **options)
+
+
+_from_table.__doc__ = "Return the problem of a long table with one row for each measurement; see `optloc.from_table`."
+Problem.from_table = staticmethod(_from_table)  # type: ignore[attr-defined]  # files are a higher floor than Problem

@@ -80,7 +80,7 @@ def _places(rows: Rows) -> tuple[list[tuple[int, int, int, int]], Array]:
 
 
 def _split(array: Array, core: int) -> Array:
-    """Return a per-epoch quantity (..., k or 1, s, ...) as (..., k, 1, s, ...), or unchanged where it is one for all."""
+    """Return a per-epoch quantity (..., k or 1, s, ...) as (..., k, 1, s, ...); unchanged where it is one for all."""
     if array.ndim == core and array.shape[0] == 1:
         return array
     return np.expand_dims(array, array.ndim - core + 1)

@@ -189,13 +189,15 @@ def _turn_feeds(problem: Problem, block: Rows, start: int) -> list[Feed]:
     for bias in problem.biases:
         if bias.form != "rotation":
             continue
-        inside = (bias.row >= start) & (bias.row < start + block.count)
-        rows, member = bias.row[inside] - start, bias.member[inside]
+        left = np.flatnonzero((bias.row >= start) & (bias.row < start + block.count))
         turns = 1 if problem.dimension == 2 else 3
-        column = columns(problem.layout, bias.name, rows)
-        for c in range(turns):
-            picked = column[np.arange(len(rows)), member * turns + c]
-            feeds.append(Feed(_TURN + c, picked, bias.coefficient[inside], rows))
+        while left.size:  # a row turned by several members takes one pass for each: a feed holds a row once
+            rows, first = np.unique(bias.row[left] - start, return_index=True)
+            touch, left = left[first], np.delete(left, first)
+            column = columns(problem.layout, bias.name, rows)
+            for c in range(turns):
+                picked = column[np.arange(len(rows)), bias.member[touch] * turns + c]
+                feeds.append(Feed(_TURN + c, picked, bias.coefficient[touch], rows))
     return feeds
 
 

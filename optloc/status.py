@@ -41,7 +41,7 @@ _SENTENCES: dict[Status, str] = {
     Status.SEARCHED: "No safe start is known for this mixture of rows: this is the best of a seeded search.",
     Status.MAX_ITERATIONS: "The refinement used all its iterations; raise the limit or look at the geometry.",
     Status.STALLED: "The refinement could not lower the cost any more although its gradient is not zero.",
-    Status.SINGULAR_GEOMETRY: "The rows leave a direction of the answer undetermined; add a station off that direction.",
+    Status.SINGULAR_GEOMETRY: "The rows leave a direction of the answer undetermined; add a station off it.",
     Status.TOO_FEW_ROWS: "There are fewer measurements than unknowns; add rows or fix an unknown.",
     Status.INFEASIBLE: "No position meets the constraints.",
     Status.UNBOUNDED: "The likelihood keeps rising towards infinity: the data say a direction, not a range.",

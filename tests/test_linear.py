@@ -9,14 +9,15 @@ from cases import CASES, STATIONS, TARGET, kitchen_sink, plain_predict, random_v
 from optloc import Bias, Motion, Prior, Stations, assemble, linearise, measured, predict, simulate
 
 
-def sinks():
-    """Yield problems with every form of unknown."""
-    for d in (2, 3):
-        for span in ("epoch", "run"):
-            yield pytest.param(kitchen_sink(d, span), id=f"{d}d-{span}")
-        free = kitchen_sink(d)
-        motions = (Motion(1, span="epoch"), Motion(0, span="epoch"), free.motions[2])
-        yield pytest.param(replace(free, motions=motions), id=f"{d}d-free")
+def _free(d):
+    sink = kitchen_sink(d)
+    return replace(sink, motions=(Motion(1, span="epoch"), Motion(0, span="epoch"), sink.motions[2]))
+
+
+# Problems with every form of unknown: station errors of an epoch or the run, targets that move or are new at each epoch.
+SINKS = {f"{d}d-{span}": kitchen_sink(d, span) for d in (2, 3) for span in ("epoch", "run")}
+SINKS |= {f"{d}d-free": _free(d) for d in (2, 3)}
+every_sink = pytest.mark.parametrize("problem", SINKS.values(), ids=SINKS.keys())
 
 
 def dense_jacobian(problem, x):
@@ -31,41 +32,44 @@ def dense_jacobian(problem, x):
 
 
 def numeric_jacobian(problem, x):
-    out = np.zeros((problem.count, len(x)))
+    """Central differences, and what rounding of the values can do to them."""
+    out, doubt = np.zeros((problem.count, len(x))), np.zeros((problem.count, len(x)))
+    size = np.abs(predict(problem, x)) + 1e-9
+    if any(rows.kind == "height" for rows in problem.rows):
+        size = size + 6.4e6
     for j in range(len(x)):
         step = 1e-5 * max(abs(x[j]), 1.0)
         high, low = np.array(x), np.array(x)
         high[j] += step
         low[j] -= step
         out[:, j] = wrapped(problem, predict(problem, high) - predict(problem, low)) / (high[j] - low[j])
-    return out
+        doubt[:, j] = 4.0 * np.finfo(float).eps * size / (high[j] - low[j])
+    return out, doubt
 
 
-@pytest.mark.parametrize("problem", sinks())
+@every_sink
 def test_prediction_is_that_of_the_words(problem):
     x = random_vector(problem)
     assert np.abs(wrapped(problem, predict(problem, x) - plain_predict(problem, x))).max() < 1e-9
 
 
-@pytest.mark.parametrize("problem", sinks())
+@every_sink
 def test_jacobian_of_every_unknown(problem):
     x = random_vector(problem)
-    exact, numeric = dense_jacobian(problem, x), numeric_jacobian(problem, x)
+    exact, (numeric, doubt) = dense_jacobian(problem, x), numeric_jacobian(problem, x)
     assert (np.abs(exact).max(axis=0) > 0.0).mean() > 0.9  # the problem touches its unknowns
-    scale = np.maximum(np.abs(exact).max(axis=0), 1e-9)
-    assert (np.abs(exact - numeric) <= 2e-6 * scale).all()
+    assert (np.abs(exact - numeric) <= 1e-6 * np.abs(exact).max(axis=0) + doubt).all()
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_cases_predict_and_linearise(name):
     case = CASES[name]
     assert np.abs(wrapped(case.problem, predict(case.problem, case.truth) - plain_predict(case.problem, case.truth))).max() < 1e-8
-    exact, numeric = dense_jacobian(case.problem, case.truth), numeric_jacobian(case.problem, case.truth)
-    # A geodetic height is a difference of numbers of the Earth's size: 4e-9 m over a step of some centimetres.
-    assert (np.abs(exact - numeric) <= 2e-6 * np.maximum(np.abs(exact).max(axis=0), 1e-9)).all()
+    exact, (numeric, doubt) = dense_jacobian(case.problem, case.truth), numeric_jacobian(case.problem, case.truth)
+    assert (np.abs(exact - numeric) <= 1e-6 * np.abs(exact).max(axis=0) + doubt).all()
 
 
-@pytest.mark.parametrize("problem", sinks())
+@every_sink
 def test_residual_is_the_measurement_less_the_prediction_wrapped(problem):
     x = random_vector(problem)
     drawn = simulate(problem, x, 4)
@@ -155,8 +159,8 @@ def test_a_turn_of_one_row_by_two_mounts_is_not_lost():
     problem = assemble(STATIONS[2], measured("azimuth", a=[0, 1], sigma=0.01), biases=(bias,))
     x = np.r_[TARGET[2], 0.03, 0.02]
     level = predict(problem, np.r_[TARGET[2], 0.0, 0.0])
-    assert np.allclose(predict(problem, x), level - 0.05, atol=1e-5)
-    assert np.allclose(dense_jacobian(problem, x), numeric_jacobian(problem, x), rtol=1e-6, atol=1e-9)
+    assert np.allclose(predict(problem, x), level - 0.05, atol=2e-5)
+    assert np.allclose(dense_jacobian(problem, x), numeric_jacobian(problem, x)[0], rtol=1e-6, atol=1e-9)
 
 
 def test_absent_rows_may_hold_anything():

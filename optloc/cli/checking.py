@@ -68,7 +68,7 @@ def _redundancy(problem: Problem, alone: bool) -> Array:
     """Return rows and priors less unknowns, of each epoch (k,) or of the run (1,)."""
     present = np.bincount(problem.epoch, problem.weight > 0.0, problem.epochs)
     layout = problem.layout
-    known = sum(bias.sigma is not None and len(np.ravel(bias.sigma)) for bias in problem.biases)
+    known = sum(len(np.ravel(bias.sigma)) for bias in problem.biases if bias.sigma is not None)
     known += sum(prior.mean.shape[-1] for prior in problem.priors)
     if problem.stations.covariance is not None:
         known += (

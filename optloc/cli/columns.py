@@ -120,7 +120,7 @@ def _triangle(covariance: Array, axes: str) -> Columns:
 
 
 def geodetic_columns(frame: Frame, position: Array, covariance: Array) -> Columns:
-    """Return latitude and longitude (degrees), height (metres) and the covariance along east, north, up; none if nowhere."""
+    """Return latitude and longitude (degrees), height (metres) and covariance along east, north, up."""
     if not frame.geodetic:
         return {}
     with np.errstate(invalid="ignore"):

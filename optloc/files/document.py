@@ -80,7 +80,7 @@ _WHAT = {
 
 def _sentence(error: ValidationError, source: str, data: dict[str, Any]) -> InvalidProblem:
     # Alternatives of a union each complain; the deepest complaint is the one about what was written.
-    first = max(error.errors(), key=lambda e: (e["type"] == "extra_forbidden", len(_path(e["loc"], data)[0])))
+    first = max(error.errors(), key=lambda e: (e["type"] in {"extra_forbidden", "finite_number"}, len(_path(e["loc"], data)[0])))
     path, key = _path(first["loc"], data)
     template = _WHAT.get(first["type"])
     if template is not None:
@@ -100,11 +100,9 @@ def _sentence(error: ValidationError, source: str, data: dict[str, Any]) -> Inva
 def _path(loc: tuple[int | str, ...], data: Any) -> tuple[list[int | str], str]:
     """Return the path of the table and the key of a complaint, without the names of union members."""
     path: list[int | str] = []
-    at = data
+    at: Any = data
     for part in loc:
-        if isinstance(at, dict) and part in at:
-            at = at[part]
-        elif isinstance(at, list) and isinstance(part, int) and part < len(at):
+        if (isinstance(at, dict) and part in at) or (isinstance(at, list) and isinstance(part, int) and part < len(at)):
             at = at[part]
         elif part != loc[-1] or not isinstance(at, dict):
             continue

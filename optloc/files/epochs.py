@@ -66,7 +66,7 @@ class Epochs:
 
     @property
     def clock(self) -> Array:
-        """Return strictly increasing seconds (k,): the times, or the numbers of the epochs where those are no such thing."""
+        """Return strictly increasing seconds (k,): the times, or the numbers of the epochs where they are not."""
         dated = bool(np.isfinite(self.times).all() and (np.diff(self.times) > 0.0).all())
         return self.times if dated else np.arange(float(self.count))
 

@@ -2,83 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from optloc.errors import InvalidProblem
+from optloc.files.chunk import Chunk, Context
 from optloc.files.schema import MeasurementsTable
+from optloc.files.sigmas import spread_of
 from optloc.files.table import Table
 from optloc.files.words import Units, join, kind_model, nearest
 from optloc.models import Model
 from optloc.types import Array
 from optloc.units import Conversion
-
-
-@dataclass(frozen=True, slots=True)
-class Chunk:
-    """Rows of one kind.
-
-    Parameters
-    ----------
-    kind : str
-        Their kind.
-    row : int array (m,)
-        Row of each in its table, from 0.
-    z, a, b, weight, correction : array (m,)
-        As in `optloc.types.Rows`; NaN where a value is to be simulated.
-    unit : Conversion
-        Of z.
-    slope : array (m,)
-        SI units in one unit of the file, with sign.
-    baseline : array (m,)
-        Distance of the two stations that was added to z, metres.
-    sigma : array (m,), optional
-        Standard deviation of each row.
-    arrival : array (s,), optional
-        Standard deviation of each station's arrival.
-    covariance : array (r, r), optional
-        Covariance of the rows of one epoch, in the file's unit squared.
-    label, time, written, target : array (m,), optional
-        Columns epoch, time (seconds; as written) and target.
-    excess : bool
-        Whether the distance of the two stations is still to be added to z.
-    table : Table
-        Where the rows come from.
-    """
-
-    kind: str
-    row: Array
-    z: Array
-    a: Array
-    b: Array
-    weight: Array
-    correction: Array
-    unit: Conversion
-    slope: Array
-    baseline: Array
-    sigma: Array | None
-    arrival: Array | None
-    covariance: Array | None
-    label: Array | None
-    time: Array | None
-    written: Array | None
-    target: Array | None
-    excess: bool
-    table: Table
-
-
-@dataclass(frozen=True, slots=True)
-class _Context:
-    """What all rows of a section share."""
-
-    section: MeasurementsTable
-    table: Table
-    stations: tuple[str, ...]
-    where: str
-    speed: float
-    values: bool
 
 
 def chunks_of(
@@ -102,8 +38,8 @@ def chunks_of(
         Whether measured values are needed; without them a missing column z is NaN.
     """
 
-    def chunk(kind: str) -> Chunk:
-        part = _Context(section, table.take(pick), stations, where, speed, values)
+    def chunk(kind: str, pick: Array) -> Chunk:
+        part = Context(section, table.take(pick), stations, where, speed, values)
         return replace(_chunk(part, kind), row=pick, table=table)
 
     if section.kind is not None:
@@ -119,44 +55,46 @@ def chunks_of(
     return made
 
 
-def _chunk(c: _Context, kind: str) -> Chunk:
+def _chunk(c: Context, kind: str) -> Chunk:
     section, table = c.section, c.table
     model = kind_model(kind, join(c.where, "key 'kind'"))
     convention = section.azimuth if kind == "azimuth" else "east-counterclockwise"
     units = Units(model.quantity, c.speed, section.carrier_hz, convention)  # type: ignore[arg-type]
     _check_options(c, kind, model)
     unit = units.conversion(_unit(section, kind, c.where), join(c.where, "key 'unit'"))
-    weight = _numbers(c, "weight", pick, 1.0 if section.weight is None else section.weight)
+    weight = _numbers(c, "weight", 1.0 if section.weight is None else section.weight)
     _check_weight(c, weight)
     z = _values(c, unit, weight)
     a, b = (_stations(c, key, needed) for key, needed in (("a", model.stations > 0), ("b", model.stations > 1)))
     if model.stations > 1:
         _check_pairs(c, kind, a, b)
-    if section.positive == "b-farther":
+    if section.positive == "b-farther" and model.stations > 1 and kind != "range_sum":
         a, b = b, a
-    sigma, arrival, covariance = _noise(c, model, units, unit, z)
+    sigma, arrival, covariance = spread_of(c, model, units, unit, z)
     seconds = Units("time").conversion(section.time_unit, join(c.where, "key 'time_unit'")).factor
     return Chunk(
-        kind, z, a, b, weight, _correction(c, units, unit), unit,
+        kind, np.arange(table.count), z, a, b, weight, _correction(c, units, unit), unit,
         np.broadcast_to(unit.slope(z), z.shape), np.zeros(c.table.count),
         sigma, arrival, covariance,
         table.labels("epoch") if table.has("epoch") else None,
         table.times("time", seconds) if table.has("time") else None,
         table.labels("time") if table.has("time") else None,
         table.labels("target") if table.has("target") else None,
-        section.excess, table,
+        section.excess and kind == "range_sum", table,
     )  # fmt: skip
 
 
-def _check_options(c: _Context, kind: str, model: Model) -> None:
+def _check_options(c: Context, kind: str, model: Model) -> None:
     section = c.section
+    if section.kind is None:
+        return  # settings of a mixed table apply to the kinds that know them
     if section.excess and kind != "range_sum":
         raise InvalidProblem(
             f"{kind} has no excess path", join(c.where, "key 'excess'"), "leave it out; it is for range_sum"
         )
     if section.positive == "b-farther" and (model.stations < 2 or kind == "range_sum"):
         raise InvalidProblem(f"{kind} has no sign to turn", join(c.where, "key 'positive'"), "leave it out")
-    if section.azimuth == "north-clockwise" and section.kind not in {None, "azimuth"}:
+    if section.azimuth == "north-clockwise" and kind != "azimuth":
         raise InvalidProblem(f"{kind} is no azimuth", join(c.where, "key 'azimuth'"), "leave it out")
 
 
@@ -170,11 +108,11 @@ def _unit(section: MeasurementsTable, kind: str, where: str) -> str | None:
     )
 
 
-def _numbers(c: _Context, key: str, default: float) -> Array:
+def _numbers(c: Context, key: str, default: float) -> Array:
     return c.table.numbers(key) if c.table.has(key) else np.full(c.table.count, default)
 
 
-def _check_weight(c: _Context, weight: Array) -> None:
+def _check_weight(c: Context, weight: Array) -> None:
     bad = np.flatnonzero(~((weight >= 0.0) & (weight <= 1.0)))
     if len(bad):
         place = c.table.where("weight", int(bad[0]))
@@ -183,7 +121,7 @@ def _check_weight(c: _Context, weight: Array) -> None:
         )
 
 
-def _values(c: _Context, unit: Conversion, weight: Array) -> Array:
+def _values(c: Context, unit: Conversion, weight: Array) -> Array:
     """Return z in SI: zero where a row is absent, NaN where values are not needed and not there."""
     if not c.values and not c.table.has("z"):
         return np.full(c.table.count, np.nan)
@@ -195,14 +133,12 @@ def _values(c: _Context, unit: Conversion, weight: Array) -> Array:
     return np.where(weight > 0.0, unit.to_si(raw), 0.0)
 
 
-def _stations(c: _Context, key: str, needed: bool) -> Array:
+def _stations(c: Context, key: str, needed: bool) -> Array:
     if not needed:
         return np.full(c.table.count, -1)
     single = getattr(c.section, key)
-    if c.table.has(key) or single is None:
-        labels = c.table.labels(key)
-    else:
-        labels = np.full(c.table.count, single, dtype=object)
+    column = c.table.has(key) or single is None
+    labels = c.table.labels(key) if column else np.full(c.table.count, single, dtype=object)
     numbers = {name: i for i, name in enumerate(c.stations)}
     unknown = set(labels.tolist()) - numbers.keys()
     if unknown:
@@ -212,89 +148,14 @@ def _stations(c: _Context, key: str, needed: bool) -> Array:
     return np.array(list(map(numbers.__getitem__, labels.tolist())), dtype=np.int64)
 
 
-def _check_pairs(c: _Context, kind: str, a: Array, b: Array) -> None:
+def _check_pairs(c: Context, kind: str, a: Array, b: Array) -> None:
     same = np.flatnonzero(a == b)
     if len(same):
         what = f"{kind} names station {c.stations[a[same[0]]]!r} twice"
-        raise InvalidProblem(what, join(c.table.source, f"row {pick[same[0]] + 1}"), "name two stations")
+        raise InvalidProblem(what, c.table.at(int(same[0])), "name two stations")
 
 
-def _noise(
-    c: _Context, model: Model, units: Units, unit: Conversion, z: Array, pick: Array
-) -> tuple[Array | None, Array | None, Array | None]:
-    section = c.section
-    column = c.table.has("sigma")
-    given = [column or section.sigma is not None, section.arrival_sigma is not None, section.covariance is not None]
-    if sum(given) > 1:
-        raise InvalidProblem("the noise is given more than once", c.where, "give sigma, arrival_sigma or covariance")
-    if column:
-        return _positive(c, unit.sigma_to_si(c.table.numbers("sigma"), z), pick), None, None
-    if section.sigma is not None:
-        number, own = units.amount(section.sigma, unit, join(c.where, "key 'sigma'"))
-        return _positive(c, np.broadcast_to(own.sigma_to_si(number, z), z.shape), None), None, None
-    if section.arrival_sigma is not None:
-        return None, _arrival(c, model, units, unit, section.arrival_sigma), None
-    covariance = None if section.covariance is None else square(section.covariance, join(c.where, "key 'covariance'"))
-    return None, None, covariance
-
-
-def _positive(c: _Context, sigma: Array, place: str) -> Array:
-    bad = np.flatnonzero(sigma <= 0.0)
-    if len(bad):
-        place = join(c.where, "key 'sigma'") if pick is None else c.table.where("sigma", int(bad[0]))
-        raise InvalidProblem("the standard deviation is not positive", place, "give a positive number")
-    return sigma
-
-
-def _arrival(
-    c: _Context, model: Model, units: Units, unit: Conversion, given: float | str | Mapping[str, float | str]
-) -> Array:
-    place = join(c.where, "key 'arrival_sigma'")
-    if model.ranges is None:
-        raise InvalidProblem("these rows do not combine arrival times", place, "give sigma or covariance")
-    if not isinstance(given, Mapping):
-        given = dict.fromkeys(c.stations, given)
-    unknown = [name for name in given if name not in c.stations]
-    if unknown:
-        raise InvalidProblem(f"there is no station {unknown[0]!r}", place, nearest(unknown[0], list(c.stations)))
-    sigma = np.zeros(len(c.stations))
-    for name, value in given.items():
-        number, own = units.amount(value, unit, place)
-        sigma[c.stations.index(name)] = own.sigma_to_si(number)
-        if number <= 0.0:
-            raise InvalidProblem("the standard deviation is not positive", place, "give a positive number")
-    return sigma
-
-
-def square(rows: list[list[float]], where: str) -> Array:
-    """Return a covariance (r, r) as an array; raise InvalidProblem where it is none."""
-    r = len(rows)
-    ragged = next((i for i, row in enumerate(rows) if len(row) != r), None)
-    if r == 0 or ragged is not None:
-        what = (
-            "the covariance is empty"
-            if r == 0
-            else f"row {ragged + 1} of the covariance has {len(rows[ragged])} numbers, not {r}"
-        )  # type: ignore[operator,index]
-        raise InvalidProblem(what, where, "give a square matrix")
-    matrix = np.array(rows, dtype=float)
-    i, j = np.unravel_index(int(np.argmax(np.abs(matrix - matrix.T))), matrix.shape)
-    if abs(matrix[i, j] - matrix[j, i]) > 1e-9 * np.abs(matrix).max():
-        what = f"the covariance is not symmetric: entry ({i + 1}, {j + 1}) is {matrix[i, j]:g}, ({j + 1}, {i + 1}) is {matrix[j, i]:g}"
-        raise InvalidProblem(what, where, "make both equal")
-    diagonal = np.diagonal(matrix)
-    if (diagonal <= 0.0).any():
-        place = int(np.flatnonzero(diagonal <= 0.0)[0]) + 1
-        raise InvalidProblem(
-            f"the variance ({place}, {place}) is {diagonal[place - 1]:g}, not positive", where, "give a covariance"
-        )
-    lowest = np.linalg.eigvalsh(matrix)[0]
-    if lowest < -1e-9 * diagonal.max():
-        raise InvalidProblem(f"the covariance has the negative eigenvalue {lowest:g}", where, "give a covariance")
-    return matrix
-
-
-def _correction(c: _Context, units: Units, unit: Conversion) -> Array:
+def _correction(c: Context, units: Units, unit: Conversion) -> Array:
     if c.table.has("correction"):
         return c.table.numbers("correction") * _size(unit, c)
     if c.section.correction is None:
@@ -303,7 +164,7 @@ def _correction(c: _Context, units: Units, unit: Conversion) -> Array:
     return np.full(c.table.count, number * _size(own, c))
 
 
-def _size(unit: Conversion, c: _Context) -> float:
+def _size(unit: Conversion, c: Context) -> float:
     if unit.logarithmic:
         raise InvalidProblem("a correction in dB is no sum", join(c.where, "key 'correction'"), "correct z itself")
     return unit.factor

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from optloc.errors import InvalidProblem
-from optloc.files.measurements import Chunk
+from optloc.files.chunk import Chunk
 from optloc.files.words import join
 from optloc.models import MODELS
 from optloc.noise import Block, Noise, group
@@ -90,7 +90,7 @@ def per_epoch(number: Array, epoch: Array, slope: Array, matrix: Array, where: s
     wrong = [g for g in groups if g.shape[1] != len(matrix)]
     if wrong:
         row = int(wrong[0][0, 0])
-        what = f"the epoch of row {row + first + 1} has {wrong[0].shape[1]} rows, but the covariance is {len(matrix)} x {len(matrix)}"
+        what = f"the epoch of row {row + first + 1} has {wrong[0].shape[1]} rows, but the covariance {len(matrix)}"
         raise InvalidProblem(what, where, "give every epoch all rows, absent ones with weight 0")
     members = groups[0]
     sizes = slope[members]

@@ -10,11 +10,13 @@ import numpy as np
 
 from optloc.check import checked
 from optloc.errors import InvalidProblem
+from optloc.files.chunk import Chunk
 from optloc.files.document import read_document
 from optloc.files.epochs import Epochs, Keys, epochs_of, need_clock
-from optloc.files.measurements import Chunk, chunks_of, square, with_baseline
+from optloc.files.measurements import chunks_of, with_baseline
 from optloc.files.noise import noise_of, per_epoch
 from optloc.files.schema import ProblemFile
+from optloc.files.sigmas import square
 from optloc.files.sources import table_of
 from optloc.files.stations import over_epochs, survey
 from optloc.files.table import Table

@@ -143,7 +143,7 @@ def _turn(table: Table, d: int) -> Array | None:
 
     if table.has("yaw_deg") or table.has("heading_deg"):
         yaw = table.numbers("yaw_deg") if table.has("yaw_deg") else -table.numbers("heading_deg")
-        return np.asarray(Rotation.from_euler("z", yaw, degrees=True).as_matrix()[:, :d, :d])
+        return np.asarray(Rotation.from_euler("z", yaw[:, None], degrees=True).as_matrix()[:, :d, :d])
     if not any(table.has(key) for key in _QUATERNION):
         return None
     if d == 2:
@@ -198,12 +198,10 @@ def over_epochs(found: Survey, section: StationsTable, epochs: Epochs, used: Seq
         position, velocity, axes = spread(found, section, epochs, np.concatenate(used))
     else:
         order = np.argsort(found.index)
-        position, velocity, axes = (
-            None if v is None else v[order][None] for v in (found.position, found.velocity, found.axes)
-        )
+        position = found.position[order][None]
+        velocity, axes = (None if v is None else v[order][None] for v in (found.velocity, found.axes))
     covariance = None
     if found.sigma is not None:
         first = np.array([np.flatnonzero(found.index == i)[0] for i in range(s)])
         covariance = found.sigma[first, None, None] ** 2 * np.eye(found.position.shape[-1])
-    assert position is not None
     return Stations(position, found.names, velocity, axes, covariance, section.span)

@@ -51,8 +51,11 @@ class Table:
 
     def where(self, key: str, row: int | None = None) -> str:
         """Return the place of a cell (0-based row) or of a column."""
-        place = row if row is None or self.first is None else int(self.first[row])
-        return join(self.source, None if place is None else f"row {place + 1}", f"column {self.name(key)!r}")
+        return join(self.source if row is None else self.at(row), f"column {self.name(key)!r}")
+
+    def at(self, row: int) -> str:
+        """Return the place of a row (0-based)."""
+        return f"{self.source}, row {(row if self.first is None else int(self.first[row])) + 1}"
 
     def raw(self, key: str) -> Array:
         """Return a column as it was read; raise InvalidProblem where there is none."""

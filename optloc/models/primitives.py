@@ -113,7 +113,8 @@ def geodetic_height(ecef: Components) -> Any:
     """Return the height above the WGS 84 ellipsoid, metres.
 
     Bowring's parametric latitude with two fixed steps: exact to 1e-11 m from -5 km to 1 000 km, to which doubles add
-    4e-9 m; no test, so that it serves symbols as well as numbers. ``h = p cos(phi) + z sin(phi) - a sqrt(1 - e2 sin(phi)^2)`` is stationary in phi.
+    4e-9 m; no test, so that it serves symbols as well as numbers. The height
+    ``h = p cos(phi) + z sin(phi) - a sqrt(1 - e2 sin(phi)^2)`` is stationary in phi.
 
     References
     ----------

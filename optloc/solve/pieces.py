@@ -1,4 +1,4 @@
-"""Starts for problems larger than one position: target by target, epoch by epoch, then a polynomial through the fixes."""
+"""Starts for more than one position: target by target, epoch by epoch, then a polynomial through the fixes."""
 
 from __future__ import annotations
 

@@ -53,8 +53,8 @@ class Squared:
 def candidates(problem: Problem, found: Ranges | None, pick: Pick) -> Array:
     """Return starting positions (N, q, d) of a flat batch of problems with one static target; NaN where there is none.
 
-    Two weightings: the first takes all ranges as equal, the second divides by twice the ranges to the first answer, which
-    turns the error of a squared range into that of a range.
+    Two weightings: the first takes all ranges as equal, the second divides by twice the ranges to the first
+    answer, which turns the error of a squared range into that of a range.
 
     Parameters
     ----------
@@ -67,8 +67,8 @@ def candidates(problem: Problem, found: Ranges | None, pick: Pick) -> Array:
 
     References
     ----------
-    A. Beck, P. Stoica, J. Li, "Exact and approximate solutions of source localization problems", IEEE Trans. Signal Process. 56
-    (2008), section IV for range differences.
+    A. Beck, P. Stoica, J. Li, "Exact and approximate solutions of source localization problems", IEEE Trans.
+    Signal Process. 56 (2008), section IV for range differences.
     """
     squared = squared_rows(problem, found)
     first = _picked(squared, np.ones(squared.ranged_right.shape), None, pick)

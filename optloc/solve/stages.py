@@ -54,7 +54,7 @@ def _squared(problem: Problem, fix: Fix | None, name: str, pick: Pick) -> Fix:
 
 
 def widen(problem: Problem, fix: Fix | None) -> Fix:
-    """Return a refined fix with more candidates beside it: its mirror image, and where the verdict is not clean, sub-arrays."""
+    """Return a refined fix with its mirror image beside it, and where the verdict is not clean those of sub-arrays."""
     if fix is None:
         raise InvalidProblem("widen adds candidates to a fix", "method", "put it behind a refinement")
     if not one_position(problem):

@@ -17,5 +17,7 @@ def test_fixes_reach_the_published_accuracy_and_know_it(data_dir, form):
     data = plaza.load(data_dir / "plaza_range", form)
     assert len(data.windows) == 155
     fix = solve(data.problem)
-    assert judge(data, fix) == pytest.approx(README[form], rel=0.06)
+    # Raw ranges are 7 % too long, up to 5 m: the loss itself is wrong by more than 5 m in one window of ten.
+    limit = 8.0 if form == "raw" else 5.0
+    assert judge(data, fix, limit) == pytest.approx(README[form], rel=0.06)
     judge_consistency(data, fix)
