@@ -93,26 +93,28 @@ def whitening(covariance: Array) -> Array:
     Parameters
     ----------
     covariance : array (..., r, r)
-        Symmetric positive semidefinite.
+        Symmetric positive semidefinite; a row and column of zeros is absent.
 
     Returns
     -------
     array (..., r, r)
-        Lower triangular where the covariance is regular.
+        Lower triangular where the covariance of the rows present is regular; its rank is that of the covariance, and
+        rows beyond it, like the columns of absent rows, are exactly zero.
     """
-    if covariance.shape[-1] == 1:
-        return np.asarray(1.0 / np.sqrt(covariance))
     diagonal = np.diagonal(covariance, axis1=-2, axis2=-1)
+    absent = diagonal == 0.0
+    if covariance.shape[-1] == 1:
+        return np.asarray(np.where(absent[..., None], 0.0, 1.0 / np.sqrt(np.where(absent[..., None], 1.0, covariance))))
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     unit = covariance * scale[..., :, None] * scale[..., None, :]
-    lower, ok = factor(unit)
+    eye = np.broadcast_to(np.eye(covariance.shape[-1]), covariance.shape)
+    lower, ok = factor(unit + absent[..., None] * eye)
     pivot = np.diagonal(lower, axis1=-2, axis2=-1).min(-1)
     ok = ok & (pivot > 1e-6)
-    eye = np.broadcast_to(np.eye(covariance.shape[-1]), covariance.shape)
     matrix = _forward(np.where(ok[..., None, None], lower, eye), eye)
     if not ok.all():
         values, vectors = np.linalg.eigh(np.where(np.isfinite(unit), unit, 0.0))
         kept = values > 1e-10 * values[..., -1:]
         roots = np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)
         matrix = np.where(ok[..., None, None], matrix, roots[..., :, None] * np.swapaxes(vectors, -1, -2))
-    return np.asarray(matrix * scale[..., None, :])
+    return np.asarray(matrix * (scale * ~absent)[..., None, :])

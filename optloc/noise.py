@@ -143,10 +143,10 @@ def _whitener(block: Block, weight: Array) -> Whitener:
         return Whitener(block.row, linalg.whitening(block.covariance))
     present = picked > 0.0
     variance = np.diagonal(block.covariance, axis1=-2, axis2=-1)
-    extra = np.where(present, (1.0 / np.where(present, picked, 1.0) - 1.0) * variance, 1.0)
+    extra = np.where(present, (1.0 / np.where(present, picked, 1.0) - 1.0) * variance, 0.0)
     both = present[..., :, None] & present[..., None, :]
     covariance = np.where(both, block.covariance, 0.0) + extra[..., None] * np.eye(block.row.shape[1])
-    return Whitener(block.row, linalg.whitening(covariance) * present[..., None, :])
+    return Whitener(block.row, linalg.whitening(covariance))
 
 
 def dense(noise: Noise, rows: Array) -> Array:

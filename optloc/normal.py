@@ -174,9 +174,15 @@ def marginal(equations: Normal) -> tuple[Array, Array, Array]:
     if equations.local.shape[-1] == 0:
         return equations.shared, equations.shared_vector, np.ones(equations.cost.shape, dtype=bool)
     right = np.concatenate([np.swapaxes(equations.cross, -1, -2), equations.local_vector[..., None]], axis=-1)
-    solved, ok = linalg.solve(equations.local, right)
+    solved, ok = linalg.solve(_measured(equations.local), right)
     lost = (equations.cross @ solved).sum(-3)
     return equations.shared - lost[..., :-1], equations.shared_vector - lost[..., -1], np.asarray(ok.all(-1))
+
+
+def _measured(local: Array) -> Array:
+    """Return local blocks with a one for every unknown that no row touches: it stays where it is and hides no other."""
+    dead = np.diagonal(local, axis1=-2, axis2=-1) == 0.0
+    return local + dead[..., None] * np.eye(local.shape[-1]) if dead.any() else local
 
 
 def step(equations: Normal, damping: Array) -> tuple[Array, Array]:
@@ -199,7 +205,7 @@ def step(equations: Normal, damping: Array) -> tuple[Array, Array]:
     if damped.local.shape[-1] == 0:
         return shared, ok
     rest = damped.local_vector - (np.swapaxes(damped.cross, -1, -2) @ shared[..., None, :, None])[..., 0]
-    local, good = linalg.solve(damped.local, rest[..., None])
+    local, good = linalg.solve(_measured(damped.local), rest[..., None])
     flat = local[..., 0].reshape(*local.shape[:-3], -1)
     return np.concatenate([shared, flat], axis=-1), ok & good.all(-1)
 

@@ -46,9 +46,12 @@ Geodetic = Annotated[
 
 def _version(wanted: bool) -> None:
     if wanted:
-        from importlib.metadata import version
+        from importlib.metadata import PackageNotFoundError, version
 
-        typer.echo(f"optloc {version('optloc')}")
+        try:
+            typer.echo(f"optloc {version('optloc')}")
+        except PackageNotFoundError:
+            typer.echo("optloc 0 (not installed)")
         raise typer.Exit
 
 

@@ -48,7 +48,7 @@ def _one(fixed: Fixed, fix: Fix, console: Console) -> None:
     for name, values in fix.bias.items():
         _bias_row(table, fix, name, values)
     table.add_row("chi-square", _chi_square(fix))
-    certificate = fix.certificate[()]
+    certificate: Any = fix.certificate[()]
     if hasattr(certificate, "proof"):
         table.add_row("certificate", f"{certificate.proof}: {certificate.reason}")
     table.add_row("stages", " → ".join(stage.name for stage in fix.stages) or "none")

@@ -102,8 +102,8 @@ def _path(loc: tuple[int | str, ...], data: Any) -> tuple[list[int | str], str]:
     path: list[int | str] = []
     at: Any = data
     for part in loc:
-        if (isinstance(at, dict) and part in at) or (isinstance(at, list) and isinstance(part, int) and part < len(at)):
-            at = at[part]
+        if (isinstance(at, dict) and part in at) or (isinstance(at, list) and part in range(len(at))):
+            at = at[part]  # type: ignore[index]  # just checked
         elif part != loc[-1] or not isinstance(at, dict):
             continue
         path.append(part)

@@ -123,7 +123,7 @@ def _check_weight(c: Context, weight: Array) -> None:
 
 def _values(c: Context, unit: Conversion, weight: Array) -> Array:
     """Return z in SI: zero where a row is absent, NaN where values are not needed and not there."""
-    if not c.values and not c.table.has("z"):
+    if not (c.values or c.table.has("z") or "z" in c.table.names):
         return np.full(c.table.count, np.nan)
     raw = c.table.numbers("z", optional=bool((weight == 0.0).any()) or not c.values)
     empty = np.flatnonzero(np.isnan(raw) & (weight > 0.0))

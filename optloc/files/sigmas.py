@@ -86,7 +86,7 @@ def square(rows: list[list[float]], where: str) -> Array:
             what = f"row {i + 1} of the covariance has {len(row)} numbers, not {r}"
             raise InvalidProblem(what, where, "give a square matrix")
     matrix = np.array(rows, dtype=float)
-    i, j = np.unravel_index(int(np.argmax(np.abs(matrix - matrix.T))), matrix.shape)
+    i, j = divmod(int(np.argmax(np.abs(matrix - matrix.T))), r)
     if abs(matrix[i, j] - matrix[j, i]) > 1e-9 * np.abs(matrix).max():
         entries = f"({i + 1}, {j + 1}) is {matrix[i, j]:g}, ({j + 1}, {i + 1}) is {matrix[j, i]:g}"
         raise InvalidProblem(f"the covariance is not symmetric: entry {entries}", where, "make both equal")

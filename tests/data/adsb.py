@@ -1,4 +1,4 @@
-"""Reader of `locards_adsb`: airliners' messages, each heard by five of 27 receivers, as arrival times with a known height.
+"""Reader of `locards_adsb`: airliners' messages, each heard by five of 27 receivers, as arrivals and a height.
 
 Each message is an epoch with a free position and an unknown emission time; arrival times are counted from the first
 arrival of their message, so that metres keep their digits. Frame: ECEF. The height is the aircraft's own h_geo.

@@ -1,12 +1,12 @@
 """Reader of `plaza_range`: windows of outdoor radio ranges of a mower, in the plane, each one epoch of a free target.
 
-Windows are 1.5 s long, centred at every 3 s from 2 s after the first range; the 155 that hear at least 3 beacons are kept.
-The motion within a window is taken out with the truth: what the true range at a row's time exceeds the true range at the
-window's centre is the row's known `correction`.
+Windows are 1.5 s long, centred at every 3 s from 2 s after the first range; the 155 that hear at least 3 beacons are
+kept. The motion within a window is taken out with the truth: what the true range at a row's time exceeds the true range
+at the window's centre is the row's known `correction`.
 
-Three forms, as in the set's README: the ranges as they are ("raw"), less the mean residual of each beacon ("offset"), or
-with the affine fit of each beacon's residual undone ("affine"). Rows are independent; sigma is the rms of all residuals:
-3.0 m raw (2.8 m of it a mean, for the ranges are 7 % too long), 1.15 m less the means, 0.53 m after the affine fit.
+Three forms, as in the set's README: the ranges as they are ("raw"), less the mean residual of each beacon ("offset"),
+or with the affine fit of each beacon's residual undone ("affine"). Rows are independent; sigma is the rms of all
+residuals: 3.0 m raw (2.8 m of it a mean, as ranges are 7 % too long), 1.15 m less the means, 0.53 m after the fit.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from data import adsb
-from data.windows import quantiles, statuses
+from data.windows import quantiles, report, statuses
 
 from optloc import solve
 
@@ -22,7 +22,7 @@ def test_messages_are_fixed_as_one_batch(data_dir, method):
     horizontal = np.linalg.norm(local[:, :2], axis=1)
     ours = quantiles(horizontal[fix.answered])
     seconds = sum(stage.seconds for stage in fix.stages)
-    print(
+    report(
         f"ADS-B by {method}: 763 messages ({statuses(fix)}), horizontal median {ours[0]:.0f} m, 95 % {ours[1]:.0f} m, "
         f"{1e3 * seconds / 763:.2f} ms a fix"
     )

@@ -4,16 +4,21 @@ Windows are 0.1 s long and centred at every half second of a flight in which the
 `rdiff_m` is |tag - anchor_b| - |tag - anchor_a|, so a row is optloc's tdoa, r_a - r_b, with a and b exchanged.
 
 Noise. A row is off by 0.22 m (F01) or 0.19 m (F03; robust spread in the set's README), but not independently of the
-other rows of its window: the rows of one pair repeat within 0.05 m (median absolute deviation; 0.11 m rms, as the tails are
-heavy and the tag moves by up to 0.1 m), whereas their means scatter by 0.20 m (F01) and 0.18 m (F03) from window to window.
-The means of neighbouring pairs are correlated by -0.4 to -0.9: what lasts for a window is an error of each anchor's arrival
-(antenna pattern, multipath), which enters its two pairs with opposite signs. Hence
+other rows of its window: the rows of one pair repeat within 0.05 m (robust; 0.11 m rms in F01, as the tails are heavy
+and the tag moves by up to 0.1 m), whereas their means scatter by 0.20 m (F01) and 0.18 m (F03) from window to window.
+The means of neighbouring pairs are correlated, by -0.9 to 0: what lasts for a window is mostly an error of each
+anchor's arrival (antenna pattern, multipath), which enters its two pairs with opposite signs. Hence
 
     R = 0.10^2 I + 0.14^2 D D',       D = +1 at a, -1 at b,
 
-whose diagonal, (0.22 m)^2, is the spread of the README. With `shared=False` rows are independent with 0.2 m: this is the
-loss of the README's table, but its covariance averages over some 40 rows an error that does not average: it says 0.07 m
-where 0.18 m is the truth, and one plausible fix in five is then more than 5 of its own sigma off.
+with 0.14 = 0.20 / sqrt(2); its diagonal, (0.22 m)^2 for two arrivals and a row, is the spread of the README. That no
+plausible fix is 5 sigma off does not hang on the numbers: it holds for 0.06 to 0.15 m a row and 0.14 to 0.17 m an
+arrival. At 0.10 m a row the chi-square rejects 26 % (F01) and 39 % (F03) of the windows, which is what heavy tails do.
+The only two fixes that are 5 sigma off, of F03, rest on one value wrong by 26 or 27 m, and p says so.
+
+With `shared=False` rows are independent with 0.2 m: this is the loss of the README's table, but its covariance averages
+over some 40 rows an error that does not average. It says 0.07 m where 0.18 m is the truth, and one plausible fix in
+five is then more than 5 of its own sigma off.
 """
 
 from __future__ import annotations
@@ -35,7 +40,8 @@ STEP, WIDTH, AIRBORNE = 0.5, 0.1, 0.5
 def load(folder: Path, flight: str, *, shared: bool = True) -> Windows:
     """Return the windows of one flight; `shared`: with the errors that a window's rows share through their anchors."""
     flights = pd.read_csv(folder / "flights.csv").set_index("flight")
-    anchors = pd.read_csv(folder / "stations.csv").query("session == @flights.session[@flight]").sort_values("anchor")
+    anchors = pd.read_csv(folder / "stations.csv").sort_values("anchor")
+    anchors = anchors[anchors["session"] == flights.loc[flight, "session"]]
     truth = pd.read_csv(folder / "truth.csv").query("flight == @flight")
     rows = pd.read_csv(folder / "tdoa.csv").query("flight == @flight").sort_values("t_s", kind="stable")
     stations = anchors[["x_m", "y_m", "z_m"]].to_numpy()

@@ -1,4 +1,4 @@
-"""What the tests of real data share: a data set as windows, and least squares started at the truth to judge a fix by."""
+"""What the tests of real data share: a set as windows, and least squares started at the truth to judge a fix by."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def windowed(
 
 
 def from_truth(data: Windows) -> tuple[np.ndarray, np.ndarray]:
-    """Return least-squares positions (k, d) and costs (k,), each window started at the truth; nothing of optloc is used."""
+    """Return least-squares positions (k, d) and costs (k,), started at the truth; nothing of optloc is used."""
     found, cost = np.empty_like(data.truth), np.empty(len(data.windows))
     for k, w in enumerate(data.windows):
         whiten = np.linalg.inv(np.linalg.cholesky(w.covariance))
@@ -71,6 +71,11 @@ def quantiles(error: np.ndarray) -> tuple[float, float]:
     return float(np.median(error)), float(np.quantile(error, 0.95))
 
 
+def report(text: str) -> None:
+    """Print a line that ``pytest -s`` shows."""
+    print(text)  # noqa: T201
+
+
 def statuses(fix: Fix) -> str:
     """Return how often each status occurs, in words."""
     numbers, counts = np.unique(fix.code, return_counts=True)
@@ -88,7 +93,7 @@ def judge(data: Windows, fix: Fix, limit: float = 5.0) -> tuple[float, float]:
     ours = quantiles(error[answered])
     theirs = quantiles(np.linalg.norm(position - data.truth, axis=-1)[answered])
     seconds = sum(stage.seconds for stage in fix.stages)
-    print(
+    report(
         f"{data.name}: {len(error)} windows ({statuses(fix)}), error median {ours[0]:.3f} m, 95 % {ours[1]:.3f} m; "
         f"started at the truth {theirs[0]:.3f} / {theirs[1]:.3f} m; {1e3 * seconds / len(error):.2f} ms a fix"
     )
@@ -119,7 +124,7 @@ def judge_consistency(data: Windows, fix: Fix, share: float = 0.01) -> None:
     off[good] = own_sigmas(data, fix)[good]
     far = np.flatnonzero(off > 5.0)
     rms = np.sqrt(np.mean(off[good] ** 2 / data.stations.shape[1]))
-    print(
+    report(
         f"{data.name}: {good.sum()} of {len(off)} plausible (p > 0.001), {len(far)} beyond 5 sigma, rms {rms:.2f} sigma"
     )
     listed = _listed(data, fix, off, far)

@@ -1,0 +1,59 @@
+"""Pictures: every kind of problem is drawn, with units, one scale and the alternatives."""
+
+from importlib.resources import files as package_files
+
+import numpy as np
+import pytest
+
+from optloc.cli.fixing import fix_file
+from optloc.ellipse import error_ellipse
+from optloc.files import from_table, read
+from optloc.plot import plot_fixes, save, scene_of
+from optloc.solve import solve
+
+DEMOS = package_files("optloc") / "scenarios"
+
+
+@pytest.mark.parametrize(("name", "panels"), [("demo", 3), ("ambiguous", 2), ("run", 1)])
+def test_demos_are_drawn(name, panels, tmp_path):
+    fixed = fix_file(read(DEMOS / f"{name}.toml"), "auto", quiet=True)
+    figure = plot_fixes(fixed.loaded.problem, fixed.fixes, title=name)
+    assert len(figure.axes) == panels
+    for axes in figure.axes:
+        assert axes.get_aspect() == 1.0
+        assert axes.get_xlabel().endswith((" (m)", " (km)"))
+        assert axes.get_ylabel().endswith((" (m)", " (km)"))
+    save(figure, tmp_path / "p.png")
+    assert len((tmp_path / "p.png").read_bytes()) > 5_000
+
+
+def test_alternatives_are_labelled_with_their_cost():
+    fixed = fix_file(read(DEMOS / "ambiguous.toml"), "auto", quiet=True)
+    figure = plot_fixes(fixed.loaded.problem, fixed.fixes)
+    assert any(text.get_text().startswith("+") for text in figure.axes[0].texts)
+
+
+def test_nothing_fixed_is_drawn_too(tmp_path):
+    problem = from_table({"a": ["B"], "b": ["A"], "z": [1.0]}, {"A": (0, 0), "B": (9, 0)}, kind="tdoa", sigma=1.0)
+    figure = plot_fixes(problem, solve(problem))
+    save(figure, tmp_path / "p.svg")
+    assert (tmp_path / "p.svg").stat().st_size > 1_000
+
+
+def test_positions_in_ecef_are_drawn_along_east_and_north():
+    stations = {"name": ["A", "B", "C", "D", "E"], "lat_deg": [47.0, 47.1, 47.2, 47.1, 47.0]}
+    stations |= {"lon_deg": [11.0, 11.1, 11.0, 10.9, 11.2], "height": [500.0, 900.0, 700.0, 600.0, 2000.0]}
+    rows = {"a": list("ABCDE"), "z": [9e3, 8e3, 15e3, 9e3, 16e3]}
+    problem = from_table(rows, stations, kind="range", sigma=5.0, frame="geodetic")
+    scene = scene_of(problem, [solve(problem)])
+    assert scene.axes == ("east", "north", "up")
+    assert np.abs(scene.stations).max() < 3e4
+
+
+def test_ellipse_holds_its_share():
+    covariance = np.array([[4.0, 1.0], [1.0, 9.0]])
+    semi_axes, directions = error_ellipse(covariance, 0.95)
+    draws = np.random.default_rng(2).multivariate_normal(np.zeros(2), covariance, 20_000)
+    inside = (((draws @ directions) / semi_axes) ** 2).sum(-1) < 1.0
+    assert abs(inside.mean() - 0.95) < 0.006
+    assert np.isnan(error_ellipse(np.full((2, 2), np.nan))[0]).all()
