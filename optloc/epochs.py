@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from optloc.noise import Block, Noise
+from optloc.errors import InvalidProblem
+from optloc.noise import Block, Noise, group
 from optloc.problem import Problem
 from optloc.types import Array, Rows
 
@@ -15,7 +16,18 @@ def separable(problem: Problem) -> bool:
     """Return whether no unknown is shared between the epochs of a problem."""
     run_long_errors = problem.stations.covariance is not None and problem.stations.span == "run"
     free = all(motion.span == "epoch" for motion in problem.motions)
-    return problem.epochs > 1 and free and not problem.biases and not run_long_errors
+    return problem.epochs > 1 and free and not problem.biases and not run_long_errors and not _tied(problem)
+
+
+def _tied(problem: Problem) -> bool:
+    """Return whether the noise of rows of different epochs is correlated."""
+    epoch = problem.epoch
+    for block in problem.noise.blocks:
+        when = epoch[block.row]
+        apart = when[:, :, None] != when[:, None, :]
+        if apart.any() and np.any(np.where(apart, block.covariance, 0.0)):
+            return True
+    return False
 
 
 def by_epoch(problem: Problem) -> Problem:
@@ -32,7 +44,15 @@ def by_epoch(problem: Problem) -> Problem:
     -------
     Problem
         Leading axes (..., k), one epoch.
+
+    Raises
+    ------
+    InvalidProblem
+        Where biases or the noise tie the epochs together.
     """
+    if problem.biases or _tied(problem):
+        tie = f"the bias {problem.biases[0].name!r} is" if problem.biases else "correlated noise is"
+        raise InvalidProblem(f"{tie} shared by several epochs", "by_epoch", "solve them as one problem")
     places = [_places(rows) for rows in problem.rows]
     sizes = [len(keys) for keys, _ in places]
     starts = np.cumsum([0, *sizes])
@@ -59,10 +79,14 @@ def by_epoch(problem: Problem) -> Problem:
         position=_split(s.position, 3),
         velocity=None if s.velocity is None else _split(s.velocity, 3),
         axes=None if s.axes is None else _split(s.axes, 4),
-        covariance=None if s.covariance is None else s.covariance[..., None, :, :, :],
+        covariance=None if s.covariance is None else _same(s.covariance, 3),
     )
+    priors = tuple(replace(p, mean=_same(p.mean, 1), covariance=_same(p.covariance, 2)) for p in problem.priors)
     noise = _noise(problem, where, int(starts[-1]))
-    return replace(problem, stations=stations, rows=tuple(rows), noise=noise, times=np.zeros(1), motions=motions)
+    once = np.zeros(1)
+    return replace(
+        problem, stations=stations, rows=tuple(rows), noise=noise, times=once, motions=motions, priors=priors
+    )
 
 
 def _places(rows: Rows) -> tuple[list[tuple[int, int, int, int]], Array]:
@@ -86,27 +110,47 @@ def _split(array: Array, core: int) -> Array:
     return np.expand_dims(array, array.ndim - core + 1)
 
 
+def _same(array: Array, core: int) -> Array:
+    """Return a quantity of the run (..., ...) as (..., 1, ...), or unchanged where it is one for the whole batch."""
+    return array if array.ndim == core else np.expand_dims(array, array.ndim - core)
+
+
+def _cut(block: Block, epoch: Array) -> list[Block]:
+    """Return a block as blocks whose groups hold rows of one epoch each."""
+    when = epoch[block.row]
+    if (when == when[:, :1]).all():
+        return [block]
+    blocks = []
+    for g, (rows, times) in enumerate(zip(block.row, when, strict=True)):
+        own = block.covariance[..., g if block.covariance.shape[-3] > 1 else 0, :, :]
+        for k in np.unique(times):
+            inside = np.flatnonzero(times == k)
+            blocks.append(Block(rows[None, inside], own[..., None, inside[:, None], inside]))
+    return blocks
+
+
 def _noise(problem: Problem, where: Array, size: int) -> Noise:
     """Return the noise of the batch: groups of rows that are correlated in some epoch stay together."""
     epoch, k = problem.epoch, problem.epochs
     label = np.arange(size)
-    for block in problem.noise.blocks:
+    cut = group([part for block in problem.noise.blocks for part in _cut(block, epoch)]).blocks
+    for block in cut:
         for members in where[block.row]:
             joined = np.isin(label, label[members])
             label[joined] = label[members[0]]
     blocks = []
     for name in np.unique(label):
         members = np.flatnonzero(label == name)
-        blocks.append(_gathered(problem, where, epoch, members, k))
+        blocks.append(_gathered(cut, where, epoch, members, k))
     return _merge(blocks)
 
 
-def _gathered(problem: Problem, where: Array, epoch: Array, members: Array, k: int) -> Block:
+def _gathered(cut: tuple[Block, ...], where: Array, epoch: Array, members: Array, k: int) -> Block:
     slot = {int(row): i for i, row in enumerate(members)}
-    shape = np.broadcast_shapes(*(block.covariance.shape[:-3] for block in problem.noise.blocks))
+    shape = np.broadcast_shapes(*(block.covariance.shape[:-3] for block in cut))
     out = np.zeros((*shape, k, 1, len(members), len(members)))
     out[..., np.arange(len(members)), np.arange(len(members))] = 1.0
-    for block in problem.noise.blocks:
+    for block in cut:
         inside = np.flatnonzero(np.isin(where[block.row[:, 0]], members))
         if not len(inside):
             continue

@@ -64,8 +64,8 @@ class Whitener:
             rows = self.row[0]
             whole = len(rows) == values.shape[-2] and bool(np.all(np.diff(rows) == 1))
             return self.matrix[..., 0, :, :] @ (values if whole else values[..., rows, :])
-        picked = values[..., self.row, :]
-        return (self.matrix @ picked).reshape(*picked.shape[:-3], g * r, picked.shape[-1])
+        white = self.matrix @ values[..., self.row, :]
+        return np.asarray(white.reshape(*white.shape[:-3], g * r, white.shape[-1]))
 
 
 def independent(variance: Array) -> Noise:

@@ -122,7 +122,7 @@ def scene_of(problem: Problem, fixes: Sequence[Fix]) -> Scene:
     position = np.concatenate([p for p, _, _ in parts] or [np.zeros((0, d))])
     covariance = np.concatenate([c for _, c, _ in parts] or [np.zeros((0, d, d))])
     clean = np.concatenate([ok for _, _, ok in parts] or [np.zeros(0, dtype=bool)])
-    others, gaps = _alternatives(fixes) if len(position) <= 12 else (np.zeros((0, d)), np.zeros(0))
+    others, gaps = _alternatives(fixes, d) if len(position) <= 12 else (np.zeros((0, d)), np.zeros(0))
     if problem.frame.kind == "ecef":
         local = Frame("enu", tuple(float(v) for v in problem.frame.to_geodetic(stations.mean(0))))  # type: ignore[arg-type]
         turn = local.rotation_to_ecef().T
@@ -148,7 +148,7 @@ def _states(fix: Fix) -> list[tuple[Array, Array, Array]]:
     return found
 
 
-def _alternatives(fixes: Sequence[Fix]) -> tuple[Array, Array]:
+def _alternatives(fixes: Sequence[Fix], d: int) -> tuple[Array, Array]:
     points, gaps = [], []
     for fix in fixes:
         flat = fix if len(fix.shape) == 1 else fix.flat()
@@ -157,7 +157,6 @@ def _alternatives(fixes: Sequence[Fix]) -> tuple[Array, Array]:
             if slot.name.partition("[")[0] == "position":
                 points.append(flat.layout.take(flat.alternatives.x, slot.name)[shown])
                 gaps.append(flat.alternatives.gap[shown])
-    d = points[0].shape[-1] if points else 2
     return np.concatenate(points or [np.zeros((0, d))]), np.concatenate(gaps or [np.zeros(0)])
 
 

@@ -199,7 +199,10 @@ def test_simulate_keeps_units_kinds_and_geodesy(tmp_path):
     np.testing.assert_allclose(one.stations.position, two.stations.position)
     bearing = np.degrees(np.pi / 2 - two.z)
     assert 5.0 < bearing[0] < 25.0
-    assert "several trials" in run("simulate", DEMOS / "run.toml", "--truth", "1,2", "--trials", 2, "--out", out, code=2).stderr
+    assert (
+        "several trials"
+        in run("simulate", DEMOS / "run.toml", "--truth", "1,2", "--trials", 2, "--out", out, code=2).stderr
+    )
     assert "no list" in run("simulate", path, "--truth", "1;2", "--out", out, code=2).stderr
     assert "dimensions" in run("simulate", path, "--truth", "1,2", "--out", out, code=2).stderr
 
@@ -254,3 +257,45 @@ def test_a_copy_of_the_demo_files_is_all_they_need(tmp_path):
 def test_inline_rows_of_this_table_are_read(tmp_path):
     assert read(write(tmp_path, tdoa())).problem.count == len(TDOA)
     assert inline(TDOA)
+
+
+def ranges(targets, times=(0.0, 1.0, 2.0, 3.0)):
+    """Return noise-free ranges of targets that move uniformly: name to (place, velocity)."""
+    table = []
+    for name, (place, velocity) in targets.items():
+        for t in times:
+            at = np.array(place) + t * np.array(velocity)
+            for a in "ABCDEF":
+                table.append({"time": t, "target": name, "a": a, "z": float(np.linalg.norm(at - PLACES[a]))})
+    return f'{HEAD.replace(chr(10) + "]", chr(10) + EXTRA + "]")}[[measurements]]\nkind = "range"\nsigma = 1.0\n{rows(table)}'
+
+
+MOVING = {"u": (TRUTH, (50.0, -20.0, 5.0)), "v": (TRUTH + 300.0, (-10.0, 40.0, 0.0))}
+
+
+def test_several_moving_targets_of_one_run(tmp_path):
+    path = write(tmp_path, ranges(MOVING) + '[target]\nmotion = "constant_velocity"\n')
+    found = json.loads(run("fix", path, "--json").stdout)
+    assert [row["target"] for row in found["fixes"]] == ["u", "v"]
+    for row, (place, velocity) in zip(found["fixes"], MOVING.values(), strict=True):
+        np.testing.assert_allclose([row["x"], row["y"], row["z"]], place, atol=1e-3)
+        np.testing.assert_allclose([row["vx"], row["vy"], row["vz"]], velocity, atol=1e-3)
+    assert "velocity of v" in run("fix", path).stdout
+
+
+def test_free_targets_are_fixed_apart(tmp_path):
+    path = write(tmp_path, ranges(MOVING))
+    found = json.loads(run("fix", path, "--json").stdout)["fixes"]
+    assert [(row["time"], row["target"]) for row in found] == [(t, n) for t in (0.0, 1.0, 2.0, 3.0) for n in "uv"]
+    place, velocity = MOVING["v"]
+    last = found[-1]
+    np.testing.assert_allclose([last["x"], last["y"], last["z"]], place + 3.0 * np.array(velocity), atol=1e-3)
+
+
+def test_free_positions_that_share_a_bias(tmp_path):
+    text = ranges({"u": MOVING["u"]}) + '[[biases]]\nname = "common"\nper = "kind"\nsigma = "10 m"\n'
+    out = tmp_path / "o.csv"
+    run("fix", write(tmp_path, text), "--out", out, "--plot", tmp_path / "o.png")
+    table = pd.read_csv(out)
+    assert len(table) == 4
+    np.testing.assert_allclose(table["x"], TRUTH[0] + 50.0 * np.arange(4), atol=1e-2)

@@ -71,7 +71,9 @@ def test_nanoseconds_and_metres_are_the_same_problem(tmp_path):
 
 
 def test_kilometres_and_sound(tmp_path):
-    text = tdoa(extra='unit = "ms"\nsigma = "2 ms"\n').replace("format = 1\n", "format = 1\npropagation_speed = 343.0\n")
+    text = tdoa(extra='unit = "ms"\nsigma = "2 ms"\n').replace(
+        "format = 1\n", "format = 1\npropagation_speed = 343.0\n"
+    )
     problem = load(write(tmp_path, text.replace("[stations]\n", '[stations]\nunit = "km"\n')))
     np.testing.assert_allclose(problem.z, [z * 0.343 for _, _, z in TDOA])
     np.testing.assert_allclose(problem.stations.position[0], 1e3 * np.array(list(STATIONS.values())))
@@ -112,7 +114,11 @@ def test_csv_parquet_inline_and_frame_are_the_same_problem(tmp_path):
     for other in problems[1:]:
         same(problems[0], other, rtol=1e-15)
     assert [m.span for m in problems[0].motions] == ["epoch"]
-    assert read(write(tmp_path, f'{HEAD}[[measurements]]\nkind = "tdoa"\nfile = "rows.csv"\n')).epochs == ("1", "2", "3")
+    assert read(write(tmp_path, f'{HEAD}[[measurements]]\nkind = "tdoa"\nfile = "rows.csv"\n')).epochs == (
+        "1",
+        "2",
+        "3",
+    )
 
 
 def test_a_column_of_kinds_with_a_unit_each():
@@ -129,7 +135,9 @@ def test_a_column_of_kinds_with_a_unit_each():
 @given(st.lists(st.floats(-180.0, 360.0), min_size=1, max_size=5))
 def test_compass_bearings_and_counterclockwise_azimuths_agree(bearings):
     a = ["A"] * len(bearings)
-    north = from_table({"a": a, "z": bearings}, STATIONS, kind="azimuth", unit="deg", sigma=1.0, azimuth="north-clockwise")
+    north = from_table(
+        {"a": a, "z": bearings}, STATIONS, kind="azimuth", unit="deg", sigma=1.0, azimuth="north-clockwise"
+    )
     east = from_table({"a": a, "z": [90.0 - v for v in bearings]}, STATIONS, kind="azimuth", unit="deg", sigma=1.0)
     same(north, east)
 
@@ -229,7 +237,13 @@ def test_epochs_by_window_and_by_time(tmp_path):
 
 
 def test_free_targets_have_epochs_of_their_own():
-    rows = {"time": [0.0, 0.0, 1.0, 1.0], "target": ["u", "v", "u", "u"], "a": list("BBCD"), "b": ["A"] * 4, "z": [1.0] * 4}
+    rows = {
+        "time": [0.0, 0.0, 1.0, 1.0],
+        "target": ["u", "v", "u", "u"],
+        "a": list("BBCD"),
+        "b": ["A"] * 4,
+        "z": [1.0] * 4,
+    }
     free = from_table(rows, STATIONS, kind="tdoa", sigma=1.0)
     assert (free.epochs, len(free.motions)) == (3, 1)
     static = from_table(rows, STATIONS, kind="tdoa", sigma=1.0, motion="static")
@@ -252,9 +266,12 @@ def test_stations_move():
 
 
 def test_biases_and_priors(tmp_path):
-    text = tdoa() + """[[biases]]\nname = "clock"\nmembers = ["B", "C", "D"]\nsigma = "200 m"\n
+    text = (
+        tdoa()
+        + """[[biases]]\nname = "clock"\nmembers = ["B", "C", "D"]\nsigma = "200 m"\n
 [[biases]]\nname = "scale"\nform = "scale"\nper = "kind"\n[[biases]]\nname = "pairs"\nper = "pair"\nsigma = "10 ns"
 [[priors]]\nname = "position"\nmean = [1.0, 2.0, 3.0]\nunit = "km"\nsigma = "50 m"\n"""
+    )
     problem = load(write(tmp_path, text))
     clock, scale, pairs = problem.biases
     assert (clock.members, scale.members, pairs.members) == (("B", "C", "D"), ("tdoa",), ("B-A", "C-A", "D-A"))
@@ -278,7 +295,9 @@ def test_ten_thousand_epochs_load_in_a_second(tmp_path):
     frame = pd.DataFrame({"t": np.repeat(np.arange(k) * 0.1, 5), "a": names * k, "b": "A", "z": np.arange(5.0 * k)})
     frame.loc[frame.index % 5 > 2, "b"] = "D"
     frame.to_csv(tmp_path / "rows.csv", index=False)
-    text = f'{HEAD}[[measurements]]\nkind = "tdoa"\narrival_sigma = 3.0\nfile = "rows.csv"\ncolumns = {{ time = "t" }}\n'
+    text = (
+        f'{HEAD}[[measurements]]\nkind = "tdoa"\narrival_sigma = 3.0\nfile = "rows.csv"\ncolumns = {{ time = "t" }}\n'
+    )
     path = write(tmp_path, text)
     load(path)
     start = time.perf_counter()

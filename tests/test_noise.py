@@ -125,6 +125,19 @@ def test_dense_and_variances_read_the_blocks():
     assert np.allclose(noises.dense(mixed.noise, rows), dense_covariance(mixed)[np.ix_(rows, rows)])
 
 
+def test_a_batch_of_grouped_noise_whitens_values_that_all_share():
+    rng = np.random.default_rng(4)
+    covariance = np.stack([np.stack([random_noise(rng, 2) for _ in range(3)]) for _ in range(5)])
+    noise = Noise((Block(np.arange(6).reshape(3, 2), covariance),))
+    (white,) = noises.whiten(noise, np.ones(6))
+    values = rng.standard_normal((6, 4))
+    together = white.apply(values)
+    assert together.shape == (5, 6, 4)
+    for i in range(5):
+        (own,) = noises.whiten(Noise((Block(noise.blocks[0].row, covariance[i]),)), np.ones(6))
+        assert np.array_equal(together[i], own.apply(values))
+
+
 def test_grouping_blocks_changes_nothing():
     rng = np.random.default_rng(3)
     blocks = [Block(np.array([[2 * i, 2 * i + 1]]), random_noise(rng, 2)[None]) for i in range(4)]

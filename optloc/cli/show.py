@@ -42,7 +42,7 @@ def _one(fixed: Fixed, fix: Fix, console: Console) -> None:
         table.add_row("reason", reason)
     rows = len(fixed.columns["x"])
     for i in range(min(rows, 12)):
-        _state_rows(table, fixed.columns, i, f" of {fixed.columns['target'][i]}" if rows > 1 else "")
+        _state_rows(table, fixed.columns, i, _whose(fixed.columns, i) if rows > 1 else "")
     if rows > 12:
         table.add_row("...", f"{rows - 12} more; --out writes all of them")
     for name, values in fix.bias.items():
@@ -58,6 +58,13 @@ def _one(fixed: Fixed, fix: Fix, console: Console) -> None:
 
 def _colour(verdict: Status) -> str:
     return {Status.OK: _GOOD, Status.AMBIGUOUS: _CARE, Status.SEARCHED: _CARE}.get(verdict, _BAD)
+
+
+def _whose(columns: Columns, i: int) -> str:
+    """Return whose state a row is where there are several."""
+    several = len(set(columns["target"].tolist())) > 1
+    epoch = f" at {columns['epoch'][i]}" if columns["epoch"][i] != "run" else ""
+    return (f" of {columns['target'][i]}" if several else "") + epoch
 
 
 def _state_rows(table: Table, columns: Columns, i: int, whose: str) -> None:
@@ -159,6 +166,7 @@ def _failures(columns: Columns, console: Console, limit: int = 10) -> None:
             f"epoch {columns['epoch'][i]}: {columns['status'][i]}: {columns['reason'][i]}",
             highlight=False,
             markup=False,
+            soft_wrap=True,
         )
     if len(bad) > limit:
         console.print(f"... and {len(bad) - limit} more; --out writes all of them", highlight=False)

@@ -80,7 +80,9 @@ _WHAT = {
 
 def _sentence(error: ValidationError, source: str, data: dict[str, Any]) -> InvalidProblem:
     # Alternatives of a union each complain; the deepest complaint is the one about what was written.
-    first = max(error.errors(), key=lambda e: (e["type"] in {"extra_forbidden", "finite_number"}, len(_path(e["loc"], data)[0])))
+    first = max(
+        error.errors(), key=lambda e: (e["type"] in {"extra_forbidden", "finite_number"}, len(_path(e["loc"], data)[0]))
+    )
     path, key = _path(first["loc"], data)
     template = _WHAT.get(first["type"])
     if template is not None:
