@@ -28,7 +28,8 @@ class Measured:
     variance : array (..., m), optional
         Independent variance of each row.
     arrival : array (..., s) or (), optional
-        Variance of each station's arrival; rows that share a station and an epoch are then correlated.
+        Variance of each station's arrival; rows that share a station and an epoch are then correlated. It adds to
+        `variance`.
     covariance : array (..., m, m), optional
         Full covariance of these rows.
     """
@@ -66,9 +67,10 @@ def measured(
     sigma : float or array (..., m), optional
         Standard deviation of each row; rows are then independent.
     arrival_sigma : float or array (..., s), optional
-        Standard deviation of each station's arrival (metres); rows get the covariance D diag(sigma^2) D'.
+        Standard deviation of each station's arrival (metres); rows get the covariance D diag(sigma^2) D'. With
+        `sigma` as well, the two add.
     covariance : array (..., m, m), optional
-        Full covariance of these rows. Exactly one of the three forms of noise is needed.
+        Full covariance of these rows, in the place of both.
     epoch, target : int array (m,) or int
         Epoch and target of each row.
     weight : float or array (..., m)
@@ -103,10 +105,9 @@ def measured(
         array = np.asarray(values, dtype=float)
         return np.array(np.broadcast_to(array, (*array.shape[:-1], count)))
 
-    if sum(v is not None for v in (sigma, arrival_sigma, covariance)) != 1:
-        raise InvalidProblem(
-            f"the noise of {kind} must be given once", where=kind, advice="give sigma, arrival_sigma or covariance"
-        )
+    if (covariance is None) == (sigma is None and arrival_sigma is None):
+        advice = "give covariance, or sigma, or arrival_sigma, or the last two together"
+        raise InvalidProblem(f"the noise of {kind} must be given once", where=kind, advice=advice)
     rows = Rows(
         kind,
         number(np.nan if z is None else z),
@@ -203,17 +204,18 @@ def _numbered(measurements: Sequence[Measured]) -> list[tuple[Measured, int]]:
 
 def _noise(m: Measured, start: int, stations: int) -> list[noises.Block]:
     rows = np.arange(start, start + m.rows.count)
-    if m.variance is not None:
+    if m.variance is not None and m.arrival is None:
         return [noises.Block(rows[:, None], m.variance[..., None, None])]
     if m.covariance is not None:
         return [noises.Block(rows[None], m.covariance[..., None, :, :])]
     assert m.arrival is not None
     variance = m.arrival if m.arrival.ndim else np.full(stations, float(m.arrival))
-    return _arrival_blocks(m.rows, start, variance)
+    return _arrival_blocks(m, start, variance)
 
 
-def _arrival_blocks(rows: Rows, start: int, variance: Array) -> list[noises.Block]:
-    """Return one block for each epoch and target: its rows combine the same arrivals."""
+def _arrival_blocks(m: Measured, start: int, variance: Array) -> list[noises.Block]:
+    """Return one block for each epoch and target: its rows combine the same arrivals, and have noise of their own."""
+    rows = m.rows
     design = np.zeros((rows.count, variance.shape[-1]))
     coefficients = MODELS[rows.kind].ranges
     if coefficients is None:
@@ -227,6 +229,8 @@ def _arrival_blocks(rows: Rows, start: int, variance: Array) -> list[noises.Bloc
     for key in sorted(set(zip(rows.epoch.tolist(), rows.target.tolist(), strict=True))):
         inside = np.flatnonzero((rows.epoch == key[0]) & (rows.target == key[1]))
         covariance = noises.of_stations(design[inside], variance)
+        if m.variance is not None:
+            covariance = covariance + m.variance[..., inside, None] * np.eye(len(inside))
         blocks.append(noises.Block(start + inside[None], covariance[..., None, :, :]))
     return blocks
 

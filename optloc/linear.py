@@ -84,7 +84,7 @@ def predict(problem: Problem, x: Array) -> Array:
 
 
 def _residual(problem: Problem, value: Array) -> Array:
-    residual = np.asarray(problem.z - value)
+    residual = np.asarray(problem.observed - value)
     for plan, start in zip(plans(problem), problem.starts, strict=True):
         if plan.model.period is not None:
             part = slice(start, start + plan.block.count)

@@ -55,6 +55,11 @@ class Whitener:
     row: Array
     matrix: Array
 
+    def take(self, index: Array) -> Whitener:
+        """Return the whitener of some problems of a flat batch."""
+        shared = self.matrix.ndim == 3 or self.matrix.shape[0] == 1
+        return self if shared else Whitener(self.row, self.matrix[index])
+
     def apply(self, values: Array) -> Array:
         """Return whitened values (..., g * r, p) of values (..., m, p) for this block's rows."""
         g, r = self.row.shape

@@ -86,7 +86,12 @@ class Problem:
 
     @property
     def z(self) -> Array:
-        """Return the measurements of all rows less their known corrections, (..., m)."""
+        """Return the measurements of all rows as measured, (..., m)."""
+        return _join([block.z for block in self.rows])
+
+    @property
+    def observed(self) -> Array:
+        """Return the measurements of all rows less their known corrections, (..., m): what h(x) is compared with."""
         return _join([block.z - block.correction for block in self.rows])
 
     @property

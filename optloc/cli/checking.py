@@ -60,7 +60,7 @@ def summary(loaded: Loaded) -> dict[str, Any]:
         "epochs_with_too_few_rows": int((redundancy < 0).sum()),
         "groups_of_connected_stations": {"most": int(parts.max(initial=0))},
         "epochs_with_disconnected_pairs": int((parts > 1).sum()),
-        "geometry": f"stations spread {flattest[worst]:.4g} m across and {widest[worst]:.4g} m along (root mean square)",
+        "geometry": f"stations spread {flattest[worst]:.4g} m (root mean square) across, {widest[worst]:.4g} m along",
     }
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import typer
 from rich.console import Console
+from rich.padding import Padding
 from rich.table import Table
 
 from optloc.cli.output import dumps
@@ -74,11 +75,23 @@ def run_list(what: str, as_json: bool) -> int:
     if as_json:
         typer.echo(dumps(rows))
         return 0
-    names = list(dict.fromkeys(name for row in rows for name in row))
-    table = Table()
-    for name in names:
-        table.add_column(name, overflow="fold")
-    for row in rows:
-        table.add_row(*(row.get(name, "") for name in names))
-    Console().print(table)
+    _print(rows, Console())
     return 0
+
+
+def _print(rows: list[dict[str, str]], console: Console) -> None:
+    """Print entries as a table, or one below the other where they are too long for one."""
+    title, *names = dict.fromkeys(name for row in rows for name in row)
+    if sum(max(len(row.get(name, "")) for row in rows) for name in names) > 4 * console.width:
+        for row in rows:
+            console.print(f"[bold]{row[title]}[/bold]: {row['summary']}", highlight=False)
+            for name in names[:-1]:
+                console.print(Padding(f"{name}: {row.get(name, '')}", (0, 0, 0, 4)), highlight=False)
+        return
+    table = Table()
+    table.add_column(title, no_wrap=True)
+    for name in names:
+        table.add_column(name)
+    for row in rows:
+        table.add_row(row[title], *(row.get(name, "") for name in names))
+    console.print(table)

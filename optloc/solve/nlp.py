@@ -89,7 +89,7 @@ class _Scaled:
         self.data = np.concatenate([unit, centre, parameters(problem)])
         self.program = _program(_Key(problem, len(self.data)))
         self.weight = _whitening(problem)
-        self.z = np.where(problem.weight[0] > 0.0, problem.z[0], 0.0)
+        self.z = np.where(problem.weight[0] > 0.0, problem.observed[0], 0.0)
         self.prior = _prior(problem, unit, centre)
 
     def from_start(self, start: Array) -> tuple[Array, float, int]:

@@ -115,7 +115,7 @@ def reduce(problem: Problem) -> Problem:
     Parameters
     ----------
     problem : Problem
-        One target, one epoch or stations that stay.
+        One target, without biases; one epoch, or target and stations that stay.
 
     Returns
     -------
@@ -125,44 +125,54 @@ def reduce(problem: Problem) -> Problem:
     Raises
     ------
     InvalidProblem
-        Where the rows fall into groups without a common station, differ in which rows are present, or where their
-        noise is correlated with that of other kinds.
+        Where the rows fall into groups without a common station, differ in which rows are present, belong to several
+        targets or to a bias, or where their noise is correlated with that of other kinds.
     """
-    flat = problem.flat()
-    found = ranges(flat)
+    _check(problem)
+    found = ranges(problem.flat())
     if found is None:
         return problem
     if len(found.groups) > 1 or len(found.groups[0]) > 1:
         raise InvalidProblem(
             "the range rows do not form one connected set", "reduce", "reduce connected problems one by one"
         )
-    kept = [i for i, rows in enumerate(flat.rows) if MODELS[rows.kind].ranges is None]
-    others = np.concatenate(
-        [np.arange(flat.starts[i], flat.starts[i] + flat.rows[i].count) for i in kept] or [np.zeros(0, int)]
-    )
-    blocks = [block for block in flat.noise.blocks if np.isin(block.row, others).all()]
-    if any(np.isin(block.row, others).any() for block in flat.noise.blocks if block not in blocks):
-        raise InvalidProblem("range rows are correlated with other kinds", "reduce", "solve the problem unreduced")
-    rows, covariance = _reduced_rows(found)
+    kept = [i for i, rows in enumerate(problem.rows) if MODELS[rows.kind].ranges is None]
+    parts = [np.arange(start, start + rows.count) for rows, start in zip(problem.rows, problem.starts, strict=True)]
+    others = np.concatenate([parts[i] for i in kept] or [np.zeros(0, dtype=np.int64)])
+    blocks = _others(problem.noise, others)
+    rows, covariance = _reduced_rows(found, problem.batch_shape)
     count = sum(r.count for r in rows)
-    shift = np.full(flat.count, -1)
+    shift = np.full(problem.count, -1)
     shift[others] = count + np.arange(len(others))
-    noise = Noise(
-        (Block(np.arange(count)[None], covariance[:, None]), *(Block(shift[b.row], b.covariance) for b in blocks))
-    )
-    reduced = replace(flat, rows=(*rows, *(flat.rows[i] for i in kept)), noise=noise)
-    shape = problem.batch_shape
-    return (
-        reduced
-        if len(shape) == 1
-        else replace(reduced.take(np.arange(1)), rows=_unbatched(reduced.rows))
-        if not shape
-        else reduced
-    )
+    noise = Noise((Block(np.arange(count)[None], covariance), *(Block(shift[b.row], b.covariance) for b in blocks)))
+    return replace(problem, rows=(*rows, *(problem.rows[i] for i in kept)), noise=noise)
 
 
-def _reduced_rows(found: Ranges) -> tuple[list[Rows], Array]:
-    """Return range, tdoa and range_sum rows of the statistic and their joint covariance."""
+def _check(problem: Problem) -> None:
+    """Refuse what has no common ranges: they are those of one target, and free of unknown errors."""
+    if len(problem.motions) > 1:
+        raise InvalidProblem("there are several targets", "reduce", "reduce the rows of one target")
+    if problem.biases:
+        name = problem.biases[0].name
+        raise InvalidProblem(f"the bias {name!r} belongs to rows that would go", "reduce", "solve the problem unreduced")
+
+
+def _others(noise: Noise, others: Array) -> list[Block]:
+    """Return the noise of the rows that stay."""
+    blocks = []
+    for block in noise.blocks:
+        stays = np.isin(block.row, others)
+        whole = stays.all(1)
+        if (stays.any(1) != whole).any():
+            raise InvalidProblem("range rows are correlated with other kinds", "reduce", "solve the problem unreduced")
+        if whole.any():
+            covariance = block.covariance[..., whole, :, :] if block.covariance.shape[-3] > 1 else block.covariance
+            blocks.append(Block(block.row[whole], covariance))
+    return blocks
+
+
+def _reduced_rows(found: Ranges, shape: tuple[int, ...]) -> tuple[list[Rows], Array]:
+    """Return range, tdoa and range_sum rows of the statistic with batch axes `shape`, and their joint covariance."""
     free, reference = bool(found.free[0]), int(found.reference[0])
     nodes = [n for n in np.flatnonzero(found.inside[0]) if not (free and n == reference)]
     kinds = ["range" if not free else "tdoa" if found.sign[0, n] > 0 else "range_sum" for n in nodes]
@@ -171,24 +181,11 @@ def _reduced_rows(found: Ranges) -> tuple[list[Rows], Array]:
         own = np.array([n for n, k in zip(nodes, kinds, strict=True) if k == kind])
         order.extend(own.tolist())
         other = np.full(len(own), found.station[reference]) if free else np.full(len(own), -1)
-        epoch = found.epoch[own]
-        z = found.offset[:, own]
-        rows.append(
-            Rows(kind, z, found.station[own], other, epoch, np.zeros_like(own), np.ones_like(z), np.zeros_like(z))
-        )
-    return rows, found.covariance[:, order][:, :, order]
-
-
-def _unbatched(rows: tuple[Rows, ...]) -> tuple[Rows, ...]:
-    return tuple(
-        replace(
-            r,
-            z=r.z.reshape(r.count),
-            weight=r.weight.reshape(-1)[-r.count :],
-            correction=r.correction.reshape(-1)[-r.count :],
-        )
-        for r in rows
-    )
+        z = found.offset[:, own].reshape(*shape, len(own))
+        one = np.ones(len(own))
+        rows.append(Rows(kind, z, found.station[own], other, found.epoch[own], np.zeros_like(own), one, 0.0 * one))
+    covariance = found.covariance[:, None, order][..., order]
+    return rows, covariance[0] if len(covariance) == 1 else covariance.reshape(*shape, *covariance.shape[1:])
 
 
 def _patterns(present: Array) -> tuple[Array, Array]:
@@ -199,9 +196,13 @@ def _patterns(present: Array) -> tuple[Array, Array]:
     return patterns, pattern.reshape(-1)
 
 
+def _stays(problem: Problem) -> bool:
+    return all(motion.order == 0 and motion.span == "run" for motion in problem.motions)
+
+
 def _design(problem: Problem) -> tuple[Array, Array, Array]:
     """Return D (m, q) over nodes, and station and epoch of the station nodes."""
-    moving = problem.stations.position.shape[-3] > 1
+    moving = problem.stations.position.shape[-3] > 1 or (problem.epochs > 1 and not _stays(problem))
     entries: list[tuple[int, tuple[int, int, int], float]] = []
     coefficient: float
     for rows, start in zip(problem.rows, problem.starts, strict=True):
@@ -280,7 +281,7 @@ def _least_squares(problem: Problem, design: Array, pinned: Array) -> tuple[Arra
     """Return the values of all nodes (N, q), their covariance (N or 1, q, q) and the misfit (N,)."""
     q = design.shape[1]
     used = np.any(design != 0.0, axis=1)
-    z = np.where(used & (problem.weight > 0.0), problem.z, 0.0)[..., None]
+    z = np.where(used & (problem.weight > 0.0), problem.observed, 0.0)[..., None]
     information, vector, total = np.zeros((1, q, q)), np.zeros((1, q, 1)), np.zeros((1, 1, 1))
     for whitener in whiten(problem.noise, problem.weight):
         white, seen = whitener.apply(design), whitener.apply(z)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -44,7 +44,15 @@ def equations_at(problem: Problem, x: Array, noise: tuple[Whitener, ...]) -> Nor
     return with_priors(problem, x, normal(linearise(problem, x, noise), problem.epochs))
 
 
-def refine(problem: Problem, start: Array, *, tolerance: float = 1e-7, limit: int = 60, damped: bool = True) -> Refined:
+def refine(
+    problem: Problem,
+    start: Array,
+    *,
+    item: Array | None = None,
+    tolerance: float = 1e-7,
+    limit: int = 60,
+    damped: bool = True,
+) -> Refined:
     """Return the local maximum-likelihood estimates next to given starts.
 
     Levenberg's method with Marquardt's scaling: a step is taken where it lowers the cost, and the damping follows
@@ -54,8 +62,10 @@ def refine(problem: Problem, start: Array, *, tolerance: float = 1e-7, limit: in
     ----------
     problem : Problem
         Flat batch of N problems.
-    start : array (N, size)
+    start : array (M, size)
         Starting vectors.
+    item : int array (M,), optional
+        Problem of each start; None: one start for each problem, M = N.
     tolerance : float
         A fix is finished when its next step is shorter than this many of its own standard deviations.
     limit : int
@@ -70,6 +80,8 @@ def refine(problem: Problem, start: Array, *, tolerance: float = 1e-7, limit: in
     """
     n = problem.layout.n_shared
     noise = whiten(problem.noise, problem.weight)
+    if item is not None:
+        problem, noise = problem.take(item), tuple(w.take(item) for w in noise)
     with np.errstate(all="ignore"):
         state = _State.begin(problem, start, noise)
         active = np.arange(len(start))
@@ -120,8 +132,7 @@ class _Part:
     def of(cls, problem: Problem, noise: tuple[Whitener, ...], active: Array, count: int) -> _Part:
         if len(active) == count:
             return cls(problem, noise)
-        picked = tuple(w if w.matrix.ndim == 3 else replace(w, matrix=w.matrix[active]) for w in noise)
-        return cls(problem.take(active), picked)
+        return cls(problem.take(active), tuple(w.take(active) for w in noise))
 
 
 def _advance(part: _Part, state: _State, active: Array, n: int, tolerance: float, damped: bool, iteration: int) -> None:

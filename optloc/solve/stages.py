@@ -7,6 +7,7 @@ from time import perf_counter
 
 import numpy as np
 
+from optloc import linalg
 from optloc.errors import InvalidProblem
 from optloc.fix import Alternatives, Fix, Stage
 from optloc.noise import whiten
@@ -16,13 +17,11 @@ from optloc.solve.pieces import from_pieces, one_position
 from optloc.solve.refine import equations_at, refine
 from optloc.solve.squared import Pick, every, hull, minimum, shor
 from optloc.solve.start import mirrored, squared_range_starts, static, subarray_starts, vectors
-from optloc.solve.verdict import Candidates, degrees_of_freedom, judge
+from optloc.solve.verdict import DOUBT, Candidates, degrees_of_freedom, judge
 from optloc.status import Certificate, Status
 from optloc.types import Array
 
 Solver = Callable[[Problem, Fix | None], Fix]
-
-_DOUBT = 1e-3
 
 
 def gtrs(problem: Problem, fix: Fix | None) -> Fix:
@@ -63,13 +62,27 @@ def widen(problem: Problem, fix: Fix | None) -> Fix:
     alone = static(problem)
     seen = _positions(problem, fix)
     parts = [seen, mirrored(alone, seen[:, :1])]
-    doubtful = np.flatnonzero((fix.code != Status.OK) | (fix.p_value < _DOUBT))
+    doubtful = np.flatnonzero((fix.code != Status.OK) | (fix.p_value < DOUBT))
     if len(doubtful):
         extra = subarray_starts(alone.take(doubtful))
         more = np.full((len(fix.x), 2 * extra.shape[1], problem.dimension), np.nan)
         more[doubtful] = np.concatenate([extra, mirrored(alone.take(doubtful), extra)], axis=1)
         parts.append(more)
-    return _unrefined(problem, np.concatenate(parts, axis=1), fix, "widen", began)
+    return _unrefined(problem, _fresh(problem, fix, parts[0], np.concatenate(parts[1:], axis=1)), fix, "widen", began)
+
+
+def _fresh(problem: Problem, fix: Fix, seen: Array, more: Array) -> Array:
+    """Return the positions seen and those of the others that are not within one standard deviation of them."""
+    covariance = fix.covariance()
+    usable = np.isfinite(covariance).all((-1, -2))
+    information, ok = linalg.inverse(np.where(usable[:, None, None], covariance, np.eye(problem.dimension)))
+    near = np.zeros(more.shape[:2], dtype=bool)
+    for point in np.moveaxis(seen, 1, 0):
+        apart = more - point[:, None]
+        with np.errstate(invalid="ignore"):
+            near |= ((apart @ information) * apart).sum(-1) < 1.0
+    more = np.where((near & (usable & ok)[:, None])[..., None], np.nan, more)
+    return np.concatenate([seen, more], axis=1)
 
 
 def lsr(problem: Problem, fix: Fix | None, *, damped: bool = True, limit: int = 100) -> Fix:
@@ -82,7 +95,7 @@ def lsr(problem: Problem, fix: Fix | None, *, damped: bool = True, limit: int = 
     detail = "nothing to refine"
     if len(item):
         whole = len(item) == len(pool) and bool((item == np.arange(len(pool))).all())
-        done = refine(problem if whole else problem.take(item), pool[item, slot], damped=damped, limit=limit)
+        done = refine(problem, pool[item, slot], item=None if whole else item, damped=damped, limit=limit)
         pool[item, slot], cost[item, slot], code[item, slot] = done.x, done.cost, done.status
         detail = f"{len(item)} candidates, {int(done.iterations.max())} steps at most"
     return finished(problem, fix, Candidates(pool, cost, code), Stage("lsr", detail, perf_counter() - began))

@@ -19,6 +19,7 @@ from optloc.types import Array
 
 AMBIGUOUS_GAP = 9.0
 LISTED_GAP = 25.0
+DOUBT = 1e-3
 _SAME = 1e-2
 _WEAK = 1e-12
 _FAR = 1e4
@@ -187,6 +188,10 @@ def _explain(problem: Problem, fix: Fix, information: Array, regular: Array) -> 
     fix.code[weak] = Status.SINGULAR_GEOMETRY
     gap = np.min(fix.alternatives.gap, axis=1, initial=np.inf)
     fix.code[(fix.code == Status.OK) & (gap < AMBIGUOUS_GAP)] = Status.AMBIGUOUS
+    doubtful = (fix.code == Status.OK) & (fix.p_value < DOUBT)
+    p_value = fix.p_value
+    for i in np.flatnonzero(doubtful):
+        fix.reason[i] = f"the residuals are larger than the noise allows (p = {p_value[i]:.1g})"
     for i in np.flatnonzero(few):
         fix.reason[i] = f"there are {-int(fix.dof[i])} measurements fewer than unknowns"
     for i in np.flatnonzero(weak):
