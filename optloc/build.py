@@ -135,6 +135,7 @@ def assemble(
     priors: Sequence[Prior] = (),
     frame: Frame = CARTESIAN,
     covariance: Any = None,
+    constraints: Sequence[Any] = (),
 ) -> Problem:
     """Return a problem, or a batch of problems where arrays have leading axes.
 
@@ -156,6 +157,8 @@ def assemble(
         What the coordinates mean.
     covariance : array (..., m, m), optional
         Covariance of all rows together, across kinds; replaces what the measurements say.
+    constraints : sequence of Band, Polygon or tuples of them
+        What the answer must meet, see `optloc.constraints`.
 
     Raises
     ------
@@ -175,6 +178,7 @@ def assemble(
         tuple(biases),
         tuple(priors),
         frame,
+        tuple(c for given in constraints for c in (given if isinstance(given, tuple | list) else (given,))),
     )
     if covariance is None:
         noise = noises.group([block for m, start in blocks for block in _noise(m, start, made.stations.count)])

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from optloc import linalg
+from optloc import tangent as tangents
 from optloc.linear import Linear
 from optloc.problem import Problem
+from optloc.tangent import Tangent
 from optloc.types import Array
 
 
@@ -185,7 +187,7 @@ def _measured(local: Array) -> Array:
     return local + dead[..., None] * np.eye(local.shape[-1]) if dead.any() else local
 
 
-def step(equations: Normal, damping: Array) -> tuple[Array, Array]:
+def step(equations: Normal, damping: Array, space: Tangent | None = None) -> tuple[Array, Array]:
     """Return the damped step (..., size) of the full parameter vector, and where it exists (...).
 
     Parameters
@@ -194,10 +196,15 @@ def step(equations: Normal, damping: Array) -> tuple[Array, Array]:
         Information and right-hand side.
     damping : array (...)
         Marquardt's factor: the diagonal of the information is multiplied by ``1 + damping``.
+    space : Tangent, optional
+        Tangent space of equalities that the step keeps to first order.
     """
     damped = _damped(equations, damping)
     information, vector, ok = marginal(damped)
-    if information.shape[-1]:
+    if space is not None:
+        shared, good = tangents.solve(information, vector, space)
+        ok = ok & good
+    elif information.shape[-1]:
         shared, good = linalg.solve(information, vector[..., None])
         shared, ok = shared[..., 0], ok & good
     else:
@@ -227,10 +234,13 @@ def _damped(equations: Normal, damping: Array) -> Normal:
     )
 
 
-def covariance(equations: Normal) -> tuple[Array, Array]:
-    """Return the covariance (..., n, n) of the shared unknowns, NaN where singular, and where it exists (...)."""
+def covariance(equations: Normal, space: Tangent | None = None) -> tuple[Array, Array]:
+    """Return the covariance (..., n, n) of the shared unknowns, NaN where singular, and where it exists (...).
+
+    With equalities it is the covariance on their tangent space.
+    """
     information, _, ok = marginal(equations)
-    inverse, good = linalg.inverse(information)
+    inverse, good = linalg.inverse(information) if space is None else tangents.inverse(information, space)
     return np.where((ok & good)[..., None, None], inverse, np.nan), ok & good
 
 

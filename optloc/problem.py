@@ -11,7 +11,7 @@ from optloc.frames import CARTESIAN, Frame
 from optloc.layout import Layout, layout
 from optloc.models import MODELS
 from optloc.noise import Block, Noise
-from optloc.types import Array, Bias, Motion, Prior, Rows, Stations
+from optloc.types import Array, Band, Bias, Motion, Polygon, Prior, Rows, Stations
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +36,8 @@ class Problem:
         Gaussian prior knowledge of named unknowns.
     frame : Frame
         What the coordinates mean.
+    constraints : tuple of Band or Polygon
+        What the answer must meet.
     """
 
     stations: Stations
@@ -46,6 +48,7 @@ class Problem:
     biases: tuple[Bias, ...] = ()
     priors: tuple[Prior, ...] = ()
     frame: Frame = CARTESIAN
+    constraints: tuple[Band | Polygon, ...] = ()
 
     @property
     def dimension(self) -> int:
@@ -115,7 +118,8 @@ class Problem:
             for b in self.biases
         )
         stations = (self.stations.count, self.dimension, self.stations.covariance is None, self.stations.span)
-        return (rows, blocks, motions, biases, stations, self.times.tobytes(), self.frame)
+        constraints = tuple((c.kind, c.target) for c in self.constraints if isinstance(c, Band))
+        return (rows, blocks, motions, biases, stations, self.times.tobytes(), self.frame, constraints)
 
     def flat(self) -> Problem:
         """Return the same problems with exactly one batch axis."""
@@ -192,7 +196,21 @@ def _map(problem: Problem, change: Any) -> Problem:
     noise = Noise(tuple(Block(b.row, change(b.covariance, 3)) for b in problem.noise.blocks))
     motions = tuple(replace(m, known=maybe(m.known, 3)) for m in problem.motions)
     priors = tuple(replace(p, mean=change(p.mean, 1), covariance=change(p.covariance, 2)) for p in problem.priors)
-    return replace(problem, stations=stations, rows=rows, noise=noise, motions=motions, priors=priors)
+    constraints = tuple(
+        c
+        if isinstance(c, Polygon)
+        else replace(c, lower=change(c.lower, 0), upper=change(c.upper, 0), coefficients=change(c.coefficients, 1))
+        for c in problem.constraints
+    )
+    return replace(
+        problem,
+        stations=stations,
+        rows=rows,
+        noise=noise,
+        motions=motions,
+        priors=priors,
+        constraints=constraints,
+    )
 
 
 def _map_z(problem: Problem, change: Any) -> Problem:

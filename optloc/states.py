@@ -249,7 +249,7 @@ def joined(problem: Problem, model: Model, inputs: dict[int, Any]) -> tuple[Poin
         return Point(vector(place), vector(rate) if model.velocity else None, own)
 
     place = vector(_TARGET)
-    ecef = _ecef(problem, place) if model.ecef else None
+    ecef = to_ecef(problem, place) if model.ecef else None
     target = Point(place, vector(_TARGET_RATE) if model.velocity else None, None, ecef)
     a = station(_A, _RATE_A, _AXES_A) if model.stations else target
     return target, a, station(_B, _RATE_B, _AXES_B) if model.stations > 1 else a
@@ -300,7 +300,8 @@ def _fed(value: Any, feed: Feed, x: Array, count: int) -> Any:
     return value + full
 
 
-def _ecef(problem: Problem, position: tuple[Any, ...]) -> tuple[Any, ...]:
+def to_ecef(problem: Problem, position: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return a position of the problem's frame as ECEF components of the same type."""
     turn, origin = problem.frame.rotation_to_ecef(), problem.frame.origin_ecef()
     if problem.frame.kind == "ecef":
         return position

@@ -141,6 +141,51 @@ class Bias:
 
 
 @dataclass(frozen=True, slots=True)
+class Band:
+    """A quantity of a target that must lie between two values, or equal one.
+
+    Parameters
+    ----------
+    kind : str
+        A key of `optloc.SURFACES`, for instance "height".
+    lower, upper : array (...)
+        Bounds in SI units; equal for an equality, infinite for none.
+    coefficients : array (..., c)
+        What the quantity is made of, for instance the normal of a plane.
+    name : str
+        How reports call it.
+    target : int
+        Which target; the constraint holds for its state at the reference time.
+    """
+
+    kind: str
+    lower: Array
+    upper: Array
+    coefficients: Array
+    name: str
+    target: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Polygon:
+    """A region of the plan (first two coordinates) that must contain a target.
+
+    Parameters
+    ----------
+    vertices : array (v, 2)
+        Corners in order, metres; the polygon is simple, convex or not.
+    name : str
+        How reports call it.
+    target : int
+        Which target.
+    """
+
+    vertices: Array
+    name: str = "polygon"
+    target: int = 0
+
+
+@dataclass(frozen=True, slots=True)
 class Prior:
     """Gaussian prior knowledge of one named part of the parameter vector.
 

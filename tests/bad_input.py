@@ -62,7 +62,7 @@ BAD = {
     "infinite": (tdoa([*TDOA, ("C", "B", float("inf"))]), ["[[rows]] 4", "z is inf", "finite"]),
     "empty cell": (ROWS + 'file = "hole.csv"\n', ["hole.csv", "row 1", "'z'"]),
     "text": (ROWS + 'file = "text.csv"\n', ["text.csv", "row 2", "'1,5x'"]),
-    "ragged": (ROWS + 'file = "ragged.csv"\n', ["ragged.csv", "CSV"]),
+    "ragged": (ROWS + 'file = "ragged.csv"\n', ["ragged.csv", "row 2", "CSV", "expected 3 columns"]),
     "negative sigma": (tdoa(extra="sigma = -1.0\n"), ["sigma", "positive"]),
     "negative covariance": (
         tdoa(extra="covariance = [[1.0, 0, 0], [0, -2.0, 0], [0, 0, 1.0]]\n"),

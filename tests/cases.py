@@ -357,7 +357,7 @@ def wrapped(problem: Problem, residual: np.ndarray) -> np.ndarray:
 
 def plain_cost(problem: Problem, x: np.ndarray) -> float:
     """Return the weighted sum of squared residuals of one unbatched problem with all rows present."""
-    residual = wrapped(problem, problem.z - plain_predict(problem, x))
+    residual = wrapped(problem, problem.observed - plain_predict(problem, x))
     return float(residual @ np.linalg.pinv(dense_covariance(problem), rcond=1e-12, hermitian=True) @ residual)
 
 

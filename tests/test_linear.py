@@ -74,11 +74,11 @@ def test_residual_is_the_measurement_less_the_prediction_wrapped(problem):
     x = random_vector(problem)
     drawn = simulate(problem, x, 4)
     turns = np.where(wrapped(problem, np.full(problem.count, 4.0)) != 4.0, 2.0 * np.pi, 0.0)
-    shifted = drawn.with_rows(z=np.concatenate([rows.z for rows in drawn.rows]) + 3.0 * turns)
+    shifted = drawn.with_rows(z=drawn.z + 3.0 * turns)
     assert turns.any()
     other = random_vector(problem, seed=12)
     residual = linearise(shifted, other).residual
-    assert np.allclose(residual, wrapped(problem, drawn.z - plain_predict(problem, other)), atol=1e-8)
+    assert np.allclose(residual, wrapped(problem, drawn.observed - plain_predict(problem, other)), atol=1e-8)
 
 
 def test_a_batch_is_its_members_one_by_one():
@@ -88,7 +88,7 @@ def test_a_batch_is_its_members_one_by_one():
     together = linearise(drawn, xs)
     values = predict(drawn, xs)
     for i in range(4):
-        alone = linearise(problem.with_rows(z=drawn.with_rows().z[i]), xs[i])
+        alone = linearise(problem.with_rows(z=drawn.z[i]), xs[i])
         assert np.array_equal(values[i], predict(problem, xs[i]))
         for name in ("residual", "shared", "local"):
             assert np.array_equal(getattr(together, name)[i], getattr(alone, name))
@@ -101,7 +101,7 @@ def test_one_measurement_many_points_and_many_measurements_one_point():
     many = simulate(case.problem, case.truth, 1, trials=5)
     linear = linearise(many, case.truth)
     assert linear.residual.shape == (5, case.problem.count)
-    assert np.allclose(linear.residual, wrapped(case.problem, many.z - predict(case.problem, case.truth)))
+    assert np.allclose(linear.residual, wrapped(case.problem, many.observed - predict(case.problem, case.truth)))
 
 
 def test_every_problem_of_a_batch_has_its_own_stations_axes_and_known_target():
@@ -179,8 +179,8 @@ def test_known_corrections_come_off_the_measurement():
     corrected = assemble(STATIONS[2], measured("range", [103.0, 205.0], a=[0, 1], sigma=1.0, correction=[3.0, 5.0]))
     assert np.array_equal(linearise(plain, TARGET[2]).residual, linearise(corrected, TARGET[2]).residual)
     again = simulate(corrected, TARGET[2], 3)
-    assert np.allclose(again.z, simulate(plain, TARGET[2], 3).z)
-    assert np.allclose(again.rows[0].z - again.z, [3.0, 5.0])
+    assert np.allclose(again.observed, simulate(plain, TARGET[2], 3).observed)
+    assert np.allclose(again.z - again.observed, [3.0, 5.0])
 
 
 def test_a_prior_does_not_change_the_prediction():

@@ -62,7 +62,7 @@ def test_weight_zero_gives_the_fix_of_the_problem_without_the_row(name):
     gone = [1, problem.count - 1]
     weight = np.ones(problem.count)
     weight[gone] = 0.0
-    z = problem.with_rows().z.copy()
+    z = problem.z.copy()
     z[gone] = [np.nan, 1e9]
     faded = solve(problem.with_rows(z=z, weight=weight))
     keep = np.setdiff1d(np.arange(problem.count), gone)

@@ -82,7 +82,7 @@ def dense(problem, x):
             precision[at, at], mean[at] = 1.0 / prior.covariance[0, 0], prior.mean[0]
     J = numeric_jacobian(problem, x)
     weight = np.linalg.inv(dense_covariance(problem))
-    residual = wrapped(problem, problem.z - plain_predict(problem, x))
+    residual = wrapped(problem, problem.observed - plain_predict(problem, x))
     information = J.T @ weight @ J + precision
     vector = J.T @ weight @ residual + precision @ (mean - x)
     cost = residual @ weight @ residual + (mean - x) @ precision @ (mean - x)
@@ -164,7 +164,7 @@ def test_normal_equations_of_a_batch_are_those_of_its_members():
     drawn = simulate(problem, xs, 8)
     together = equations(drawn, xs)
     for i in range(3):
-        alone = equations(problem.with_rows(z=drawn.with_rows().z[i]), xs[i])
+        alone = equations(problem.with_rows(z=drawn.z[i]), xs[i])
         for name in type(alone).__slots__:
             assert np.allclose(getattr(together, name)[i], getattr(alone, name), rtol=1e-12, atol=1e-12)
 

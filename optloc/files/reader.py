@@ -180,7 +180,8 @@ def _problem(
     times = epochs.clock if why is None else need_clock(epochs, why, source)
     biases = tuple(bias_of(b, rows, stations.names, stations.dimension, speed, source) for b in file.biases)
     priors = tuple(prior_of(p, stations.dimension, source) for p in file.priors)
-    return _checked(Problem(stations, rows, noise, times, motions, biases, priors, frame), source)
+    made = Problem(stations, rows, noise, times, motions, biases=biases, priors=priors, frame=frame)
+    return _checked(made, source)
 
 
 def _checked(problem: Problem, source: str) -> Problem:

@@ -74,7 +74,7 @@ def csv(path: Path, separator: str, names: Mapping[str, str]) -> Table:
     try:
         read = reader.read_csv(
             pa.BufferReader(text.encode()),
-            read_options=reader.ReadOptions(column_names=header, skip_rows=1),
+            read_options=reader.ReadOptions(column_names=header, skip_rows=1, use_threads=False),
             parse_options=reader.ParseOptions(delimiter=separator),
             convert_options=reader.ConvertOptions(
                 column_types=dict.fromkeys(header, pa.string()), strings_can_be_null=True, null_values=[""]
@@ -82,10 +82,11 @@ def csv(path: Path, separator: str, names: Mapping[str, str]) -> Table:
         )
     except pa.ArrowInvalid as error:
         what = str(error).partition("CSV parse error: ")[2] or str(error)
-        what = what.replace("Row #", "line ").splitlines()[0]
-        raise InvalidProblem(
-            f"the file is no CSV table ({what})", path.name, "check its separators and quotes"
-        ) from None
+        line, _, rest = what.splitlines()[0].rpartition(": Expected")
+        number = line.removeprefix("Row #")
+        place = join(path.name, f"row {int(number) - 1}" if number.isdigit() else None)
+        what = f"expected{rest}" if rest else what
+        raise InvalidProblem(f"this is no CSV table: {what}", place, "check its separators and quotes") from None
     columns = {name: read.column(name).to_numpy(zero_copy_only=False).astype(object) for name in header}
     return Table(path.name, columns, read.num_rows, names)
 

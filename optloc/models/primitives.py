@@ -120,6 +120,19 @@ def geodetic_height(ecef: Components) -> Any:
     ----------
     B. R. Bowring, "Transformation from spatial to geographical coordinates", Survey Review 23 (1976).
     """
+    e2 = WGS84_F * (2.0 - WGS84_F)
+    p, sin_phi, cos_phi = _latitude(ecef)
+    return p * cos_phi + ecef[2] * sin_phi - WGS84_A * namespace(p).sqrt(1.0 - e2 * sin_phi * sin_phi)
+
+
+def geodetic_normal(ecef: Components) -> Components:
+    """Return the unit normal of the WGS 84 ellipsoid at a point, which is the gradient of its height."""
+    p, sin_phi, cos_phi = _latitude(ecef)
+    return ecef[0] / p * cos_phi, ecef[1] / p * cos_phi, sin_phi
+
+
+def _latitude(ecef: Components) -> tuple[Any, Any, Any]:
+    """Return distance from the axis, and sine and cosine of the geodetic latitude."""
     x, y, z = ecef
     xp = namespace(x)
     e2 = WGS84_F * (2.0 - WGS84_F)
@@ -131,7 +144,7 @@ def geodetic_height(ecef: Components) -> Any:
         out = p - e2 * WGS84_A * cos_u * cos_u * cos_u
         sin_phi, cos_phi = _direction(up, out)
         sin_u, cos_u = _direction((1.0 - WGS84_F) * sin_phi, cos_phi)
-    return p * cos_phi + z * sin_phi - WGS84_A * xp.sqrt(1.0 - e2 * sin_phi * sin_phi)
+    return p, sin_phi, cos_phi
 
 
 def _direction(rise: Any, run: Any) -> tuple[Any, Any]:

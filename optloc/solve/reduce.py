@@ -154,7 +154,9 @@ def _check(problem: Problem) -> None:
         raise InvalidProblem("there are several targets", "reduce", "reduce the rows of one target")
     if problem.biases:
         name = problem.biases[0].name
-        raise InvalidProblem(f"the bias {name!r} belongs to rows that would go", "reduce", "solve the problem unreduced")
+        raise InvalidProblem(
+            f"the bias {name!r} belongs to rows that would go", "reduce", "solve the problem unreduced"
+        )
 
 
 def _others(noise: Noise, others: Array) -> list[Block]:

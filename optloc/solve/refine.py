@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from optloc.constraints import Face, restored, tangent_at
 from optloc.linear import linearise
 from optloc.noise import Whitener, whiten
 from optloc.normal import Normal, decrement, normal, step, with_priors
@@ -52,6 +53,7 @@ def refine(
     tolerance: float = 1e-7,
     limit: int = 60,
     damped: bool = True,
+    face: Face = (),
 ) -> Refined:
     """Return the local maximum-likelihood estimates next to given starts.
 
@@ -72,6 +74,8 @@ def refine(
         Steps tried at most.
     damped : bool
         False: plain Taylor iteration, every step is taken whatever it does to the cost.
+    face : Face
+        Constraints that hold with equality: steps follow their tangent space and are put back onto them.
 
     Returns
     -------
@@ -83,6 +87,7 @@ def refine(
     if item is not None:
         problem, noise = problem.take(item), tuple(w.take(item) for w in noise)
     with np.errstate(all="ignore"):
+        start = restored(problem, face, start) if face else start
         state = _State.begin(problem, start, noise)
         active = np.arange(len(start))
         for iteration in range(limit):
@@ -90,7 +95,7 @@ def refine(
             if not len(active):
                 break
             part = _Part.of(problem, noise, active, len(start))
-            _advance(part, state, active, n, tolerance, damped, iteration)
+            _advance(part, state, active, _Rules(n, tolerance, damped, face), iteration)
     return Refined(state.x, state.equations.cost, state.status, state.iterations, state.equations)
 
 
@@ -122,6 +127,16 @@ class _State:
 
 
 @dataclass(frozen=True, slots=True)
+class _Rules:
+    """What does not change during an iteration."""
+
+    n: int
+    tolerance: float
+    damped: bool
+    face: Face
+
+
+@dataclass(frozen=True, slots=True)
 class _Part:
     """The problems still moving."""
 
@@ -135,30 +150,32 @@ class _Part:
         return cls(problem.take(active), tuple(w.take(active) for w in noise))
 
 
-def _advance(part: _Part, state: _State, active: Array, n: int, tolerance: float, damped: bool, iteration: int) -> None:
+def _advance(part: _Part, state: _State, active: Array, rules: _Rules, iteration: int) -> None:
+    """Try one step of every problem still moving."""
     everything = len(active) == len(state.x)
     now = state.equations if everything else _at(state.equations, active)
-    damping = state.damping[active] if damped else np.zeros(len(active))
-    move, solvable = step(now, damping)
-    gain = decrement(now, move, n)
-    x = state.x[active] + move
+    here = state.x[active]
+    damping = state.damping[active] if rules.damped else np.zeros(len(active))
+    move, solvable = step(now, damping, tangent_at(part.problem, rules.face, here) if rules.face else None)
+    gain = decrement(now, move, rules.n)
+    x = restored(part.problem, rules.face, here + move) if rules.face else here + move
     after = equations_at(part.problem, x, part.noise)
-    achieved, predicted = now.cost - after.cost, gain + damping * 0.0
-    noise_floor = 1e-13 * (1.0 + now.cost)
-    better = solvable & np.isfinite(after.cost) & ((achieved >= -noise_floor) if damped else True)
+    achieved = now.cost - after.cost
+    rounding = 1e-13 * (1.0 + now.cost)
+    better = solvable & np.isfinite(after.cost) & ((achieved >= -rounding) if rules.damped else True)
     state.iterations[active] = iteration + 1
-    small = solvable & (np.abs(gain) <= tolerance**2)
+    small = solvable & (np.abs(gain) * (1.0 + damping) <= rules.tolerance**2)
     _keep(state, active, better, x, after)
-    ratio = achieved / np.where(predicted > 0.0, predicted, 1.0)
+    ratio = achieved / np.where(gain > 0.0, gain, 1.0)
     factor = np.maximum(1.0 / 3.0, 1.0 - (2.0 * np.clip(ratio, 0.0, 1.0) - 1.0) ** 3)
     factor = np.where(ratio > 0.9, 0.1, factor)
     state.damping[active] = np.where(
         better, np.maximum(damping * factor, 1e-12), damping * state.growth[active] + 1e-12
     )
     state.growth[active] = np.where(better, 2.0, 2.0 * state.growth[active])
-    state.status[active[small & (better | (damping < 1e-3))]] = Status.OK
+    state.status[active[small]] = Status.OK
     state.status[active[~better & (state.damping[active] > 1e12)]] = Status.STALLED
-    if not damped:
+    if not rules.damped:
         state.status[active[~better]] = Status.NUMERICAL
 
 

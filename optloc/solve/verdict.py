@@ -44,11 +44,14 @@ class Candidates:
         Infinite in empty slots.
     code : int array (N, q)
         `Status` of their refinement.
+    face : int array (N, q)
+        Number of the face of `optloc.constraints.faces` on which each was refined; 0 without inequalities.
     """
 
     x: Array
     cost: Array
     code: Array
+    face: Array
 
 
 def judge(problem: Problem, pool: Candidates, equations: Any, stages: tuple[Stage, ...]) -> Fix:

@@ -1,0 +1,225 @@
+r"""Pseudo-linear fixes from bearings: weighted least squares, then one instrumental-variable pass.
+
+A station S with azimuth A and elevation E (in its own axes) sees p in two planes,
+
+.. math:: g_A = (\sin A, -\cos A, 0), \quad g_E = (\sin E \cos A, \sin E \sin A, -\cos E), \qquad g^\top (p - S) = 0,
+
+with errors :math:`\rho \sin n_A` and, to first order, :math:`D n_E` (horizontal and slant range); in the plane only
+the first row. With rows `G`, right sides :math:`b = g^\top S` and weights `W`:
+
+- *plain*: :math:`\min |W_0 (G p - b)|^2`, :math:`W_0 = 1/\sigma`;
+- *weighted*: the same with :math:`1/(\rho \sigma_A)`, :math:`1/(D \sigma_E)` at the fix before;
+- *instrumental*: :math:`Z^\top W^2 (G p - b) = 0`, `Z` being `G` at the angles predicted by the weighted fix. The
+  noise in `G` is what biases the first two (with many rays towards the stations, by about :math:`-(G^\top G)^{-1}
+  \sum \sigma^2 (\rho u_h + D u)`); `Z` does not share it.
+
+Source: K. Dogancay, "Bias compensation for the bearings-only pseudolinear target track estimator", IEEE Trans. Signal
+Process. 54 (2006), and "3D pseudolinear target motion analysis from angle measurements", IEEE Trans. Signal Process.
+63 (2015).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_FLAT = 1e-13  # determinant of a normal matrix, over the product of its row lengths, that counts as zero
+_NEAR = 1e-6  # shortest range, over the size of the array, that a weight is computed from
+
+
+@dataclass(frozen=True, slots=True)
+class Rays:
+    """Directions of sight and the two tangents along which the angles grow, in the frame of the stations.
+
+    Parameters
+    ----------
+    ahead : Array, shape (..., N, d)
+        Unit directions; level (no elevation) in the station's axes where `N` bearings have an azimuth only.
+    across : Array, shape (..., N, d)
+        Unit tangents of growing azimuth.
+    upward : Array, shape (..., N, 3) or None
+        Unit tangents of growing elevation; None in the plane.
+    """
+
+    ahead: Array
+    across: Array
+    upward: Array | None
+
+
+@dataclass(frozen=True, slots=True)
+class Sighted:
+    """Pseudo-linear fixes of a batch.
+
+    Parameters
+    ----------
+    plain, weighted, instrumental : Array, shape (..., d)
+        The three fixes; NaN where the rows do not determine one.
+    ok : Mask, shape (...)
+        Where the instrumental fix exists.
+    ahead : Mask, shape (...)
+        Where it also lies in front of every station that has a bearing.
+    """
+
+    plain: Array
+    weighted: Array
+    instrumental: Array
+    ok: Mask
+    ahead: Mask
+
+
+def rays(azimuth: ArrayLike, elevation: ArrayLike | None = None, axes: ArrayLike | None = None) -> Rays:
+    """Turn angles into directions.
+
+    Parameters
+    ----------
+    azimuth : array_like, shape (..., N)
+        From the first axis towards the second, radians.
+    elevation : array_like, shape (..., N), optional
+        Above the plane of the first two axes; None for the plane problem.
+    axes : array_like, shape (..., N, d, d), optional
+        Rows are the unit vectors of each station's axes; None: those of the frame.
+
+    Returns
+    -------
+    Rays
+        Unit vectors.
+
+    Notes
+    -----
+    The directions of the module's text: ``across = -g_A``, ``upward = -g_E``.
+    """
+    A = np.asarray(azimuth, dtype=np.float64)
+    if elevation is None:
+        local = [np.stack([np.cos(A), np.sin(A)], axis=-1), np.stack([-np.sin(A), np.cos(A)], axis=-1)]
+    else:
+        A, E = np.broadcast_arrays(A, np.asarray(elevation, dtype=np.float64))
+        ca, sa, ce, se = np.cos(A), np.sin(A), np.cos(E), np.sin(E)
+        local = [
+            np.stack([ce * ca, ce * sa, se], axis=-1),
+            np.stack([-sa, ca, np.zeros_like(A)], axis=-1),
+            np.stack([-se * ca, -se * sa, ce], axis=-1),
+        ]
+    if axes is not None:
+        turn = np.asarray(axes, dtype=np.float64)
+        local = [np.einsum("...ij,...i->...j", turn, vector) for vector in local]
+    return Rays(local[0], local[1], local[2] if elevation is not None else None)
+
+
+def sight(
+    azimuth: ArrayLike,
+    station: ArrayLike,
+    weight: ArrayLike,
+    *,
+    elevation: ArrayLike | None = None,
+    elevation_weight: ArrayLike | None = None,
+    axes: ArrayLike | None = None,
+    passes: int = 2,
+) -> Sighted:
+    """Locate from bearings without a guess.
+
+    Parameters
+    ----------
+    azimuth, elevation : array_like, shape (..., N)
+        Radians, in the axes given. Without `elevation` the problem is plane if the stations are, else azimuths alone
+        (which leave the height open unless the axes differ).
+    station : array_like, shape (..., N, d)
+        Positions, numbers of order one.
+    weight, elevation_weight : array_like, shape (..., N)
+        One over the standard deviation; zero where the angle is absent (its value is then not read). An elevation
+        needs the azimuth of the same station.
+    axes : array_like, shape (..., N, d, d), optional
+        Rows are the unit vectors of each station's axes; None: those of the frame.
+    passes : int
+        Weighted passes before the instrumental one.
+
+    Returns
+    -------
+    Sighted
+        Three fixes per item and whether they exist.
+
+    Notes
+    -----
+    Dogancay (2006, 2015). Elementwise: an item that is singular or not finite changes nothing in the others.
+    """
+    S = np.asarray(station, dtype=np.float64)
+    wA = np.asarray(weight, dtype=np.float64)
+    use = wA > 0.0
+    A = np.where(use, azimuth, 0.0)
+    E, wE = None, np.zeros_like(wA)
+    if S.shape[-1] == 3:
+        wE = wE if elevation is None or elevation_weight is None else np.where(use, elevation_weight, 0.0)
+        E = np.where(wE > 0.0, 0.0 if elevation is None else elevation, 0.0)
+    turn = None if axes is None else np.asarray(axes, dtype=np.float64)
+    with np.errstate(all="ignore"):
+        seen = rays(A, E, turn)
+        share = np.where(use, 1.0, 0.0)[..., None]
+        middle = (share * S).sum(axis=-2, keepdims=True) / share.sum(axis=-2, keepdims=True)
+        S = S - middle
+        least = _NEAR * np.sqrt((share * S * S).sum(axis=(-2, -1)))[..., None]
+        G, W = _rows(seen), np.concatenate([wA, wE], axis=-1) if E is not None else wA
+        own = np.concatenate([S, S], axis=-2) if E is not None else S
+        b = (G * own).sum(axis=-1)
+        point = plain = _balance(G, G, b, W)
+        for _ in range(passes):
+            point = _balance(G, G, b, W / _lengths(point, S, turn, least, E is not None))
+        scale = W / _lengths(point, S, turn, least, E is not None)
+        final = _balance(_rows(_predicted(point, S, turn, E is not None)), G, b, scale)
+        front = ((final[..., None, :] - S) * seen.ahead).sum(axis=-1) > 0.0
+    ok = np.isfinite(final).all(axis=-1)
+    shift = middle[..., 0, :]
+    return Sighted(plain + shift, point + shift, final + shift, ok, ok & (front | ~use).all(axis=-1))
+
+
+def _rows(seen: Rays) -> Array:
+    """Rows ``g`` (up to sign): the azimuths' first, then the elevations'."""
+    return seen.across if seen.upward is None else np.concatenate([seen.across, seen.upward], axis=-2)
+
+
+def _local(point: Array, S: Array, turn: Array | None) -> Array:
+    line = point[..., None, :] - S
+    return line if turn is None else np.einsum("...ij,...j->...i", turn, line)
+
+
+def _lengths(point: Array, S: Array, turn: Array | None, least: Array, both: bool) -> Array:
+    """Horizontal ranges, then slant ranges: what turns an angle's error into a row's."""
+    line = _local(point, S, turn)
+    flat = np.maximum(np.hypot(line[..., 0], line[..., 1]), least)
+    return np.concatenate([flat, np.hypot(flat, line[..., 2])], axis=-1) if both else flat
+
+
+def _predicted(point: Array, S: Array, turn: Array | None, both: bool) -> Rays:
+    line = _local(point, S, turn)
+    A = np.arctan2(line[..., 1], line[..., 0])
+    return rays(A, np.arctan2(line[..., 2], np.hypot(line[..., 0], line[..., 1])) if both else None, turn)
+
+
+def _balance(Z: Array, G: Array, b: Array, W: Array) -> Array:
+    """Solve ``Z' W^2 (G p - b) = 0``, with one step of refinement; NaN where it has no single solution."""
+    left = Z * np.where(W > 0.0, W / W.max(axis=-1, keepdims=True), 0.0)[..., None] ** 2
+    inverse = _inverse(np.einsum("...ki,...kj->...ij", left, G))
+    point = np.zeros(inverse.shape[:-1])
+    for _ in range(2):
+        rest = b - np.einsum("...kj,...j->...k", G, point)
+        point = point + np.einsum("...ij,...j->...i", inverse, np.einsum("...ki,...k->...i", left, rest))
+    return point
+
+
+def _inverse(M: Array) -> Array:
+    """Inverse of 2 x 2 or 3 x 3 matrices by cofactors; NaN where singular."""
+    if M.shape[-1] == 2:
+        first, second = M[..., 0, :], M[..., 1, :]
+        columns = np.stack(
+            [np.stack([second[..., 1], -second[..., 0]], -1), np.stack([-first[..., 1], first[..., 0]], -1)], -1
+        )
+    else:
+        a, b, c = M[..., 0, :], M[..., 1, :], M[..., 2, :]
+        columns = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-1)
+    determinant = (M[..., 0, :] * columns[..., :, 0]).sum(axis=-1)
+    size = np.sqrt((M * M).sum(axis=-1)).prod(axis=-1)
+    determinant = np.where(np.abs(determinant) > _FLAT * size, determinant, np.nan)
+    return np.asarray(columns / determinant[..., None, None])

@@ -1,0 +1,302 @@
+r"""Bearings as unknown unit directions: a semidefinite relaxation, and a lower bound of the angular ML cost.
+
+Station i at :math:`S_i` measured azimuth and elevation, that is a unit vector :math:`u_i` with tangents
+:math:`a_i`, :math:`e_i`. The unknowns are the unit directions :math:`v_i` themselves,
+
+.. math:: \min \sum_i q_i(v_i) \quad\text{subject to}\quad |v_i| = 1, \quad v_i^\top [S_j - S_i]_\times v_j = 0,
+
+the last for every pair: two lines of sight lie in one plane. All is quadratic in `v`; with :math:`v_i = F_i^\top (e_1 +
+\sigma w_i)`, the rows of :math:`F_i` being a reference direction and its tangents, the lift :math:`Y = (1, w)(1,
+w)^\top` of size 3N + 1 is relaxed to :math:`Y \succeq 0`.
+
+*Chordal* (a start without a guess): :math:`q_i = (u_i - v_i)^\top W_i (u_i - v_i)`, :math:`W_i = a_i a_i^\top /
+(\sigma_A \cos E)^2 + e_i e_i^\top / \sigma_E^2 + w_r u_i u_i^\top`. Its bound bounds the chordal cost only: on the
+sphere :math:`a^\top v = \cos E_v \sin\delta`, so the two costs differ to first order in :math:`\sigma \tan E`.
+
+*Touching* (a proof): :math:`q_i` is a quadratic that nowhere exceeds the squared angle errors and equals them at a
+given fix (:mod:`formulations._minorant`). Its bound is rigorous for the ML cost itself, and equal to it where the
+relaxation is tight and the fix is the best point. Epipolar equalities hold for every point, also one behind a
+station, so that adding them loses none.
+
+Sources: N. Z. Shor, "Quadratic optimization problems", Sov. J. Comput. Syst. Sci. 25 (1987) (the lift); R. Hartley
+and A. Zisserman, "Multiple view geometry in computer vision", 2004, section 9 (the equalities).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from formulations._minorant import minorant
+from formulations.bearing_ls import rays
+from formulations.conic import Answer, Relaxation
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Directed:
+    """What the relaxation says.
+
+    Parameters
+    ----------
+    point : Array, shape (3,)
+        Where the directions read off meet, in least squares.
+    direction : Array, shape (N, 3)
+        Unit directions of sight: the last column of the lift, normalised.
+    value, bound : float
+        Optimum of the relaxation, and its lower bound recomputed from the dual: of the chordal cost
+        (`directions`) or of the angular ML cost (`angle_bound`).
+    rank_ratio : float
+        Second over first eigenvalue of the lift in terms of v; near zero where tight.
+    answer : Answer
+        The solver's report.
+    """
+
+    point: Array
+    direction: Array
+    value: float
+    bound: float
+    rank_ratio: float
+    answer: Answer
+
+
+def direction_problem(count: int) -> Any:
+    """Build the relaxation for `count` directions as a cvxpy problem.
+
+    Parameters
+    ----------
+    count : int
+        N, at least two.
+
+    Returns
+    -------
+    cvxpy.Problem
+        Variable ``lift`` of shape (3N + 1, 3N + 1), the one first. Parameters ``linear`` (3N,) and ``square`` (3N,)
+        of the cost ``2 linear'w + sum square w^2``; ``unit`` (N,), the scales of the directions; for the P pairs
+        ``level`` (P,), ``slope`` (P, 6) and ``turn`` (P, 9) of ``level + slope'(w_i, w_j) + w_i' turn w_j = 0``.
+
+    Notes
+    -----
+    Shor (1987).
+    """
+    import cvxpy as cp
+
+    size, pairs = 3 * count, list(combinations(range(count), 2))
+    lift = cp.Variable((size + 1, size + 1), symmetric=True, name="lift")
+    linear, square = cp.Parameter(size, name="linear"), cp.Parameter(size, name="square")
+    unit, level = cp.Parameter(count, name="unit"), cp.Parameter(len(pairs), name="level")
+    slope, turn = cp.Parameter((len(pairs), 6), name="slope"), cp.Parameter((len(pairs), 9), name="turn")
+    w, diagonal = lift[0, 1:], cp.diag(lift)[1:]
+    rules = [lift >> 0, lift[0, 0] == 1]
+    rules += [2 * w[3 * i] + unit[i] * cp.sum(diagonal[3 * i : 3 * i + 3]) == 0 for i in range(count)]
+    for k, (i, j) in enumerate(pairs):
+        block = cp.vec(lift[1 + 3 * i : 4 + 3 * i, 1 + 3 * j : 4 + 3 * j], order="C")
+        both = cp.hstack([w[3 * i : 3 * i + 3], w[3 * j : 3 * j + 3]])
+        rules.append(level[k] + slope[k] @ both + turn[k] @ block == 0)
+    return cp.Problem(cp.Minimize(2 * linear @ w + square @ diagonal), rules)
+
+
+@lru_cache(maxsize=16)
+def _built(count: int, backend: str) -> Relaxation:
+    tight = {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9, "tol_feas": 1e-9} if backend == "CLARABEL" else {}
+    return Relaxation(direction_problem(count), backend=backend, settings=tight)
+
+
+def directions(
+    angle: ArrayLike,
+    sigma: ArrayLike,
+    station: ArrayLike,
+    *,
+    axes: ArrayLike | None = None,
+    radial: float = 1.0,
+    backend: str = "CLARABEL",
+) -> Directed:
+    """Solve the chordal relaxation.
+
+    Parameters
+    ----------
+    angle : array_like, shape (N, 2)
+        Azimuth and elevation, radians.
+    sigma : array_like, shape (N, 2)
+        Standard deviations, positive.
+    station : array_like, shape (N, 3)
+        Positions, numbers of order one.
+    axes : array_like, shape (N, 3, 3), optional
+        Rows are the unit vectors of each station's axes.
+    radial : float
+        Radial weight over the smaller tangent weight; it removes the solution v = -u.
+    backend : str
+        Conic solver.
+
+    Returns
+    -------
+    Directed
+        A start; its bound is not one of the ML cost.
+
+    Notes
+    -----
+    The module's text. Built once per N and back end in each process.
+    """
+    z, s = np.asarray(angle, dtype=np.float64), np.asarray(sigma, dtype=np.float64)
+    flat = 1.0 / (s[:, 0] * np.maximum(np.cos(z[:, 1]), 1e-3)) ** 2
+    steep = 1.0 / s[:, 1] ** 2
+    square = np.stack([radial * np.minimum(flat, steep), flat, steep], axis=-1)
+    cost = _Cost(0.0, np.zeros_like(square), square, 4.0 * len(z))
+    return _solve(_frames(z, axes), np.asarray(station, dtype=np.float64), cost, backend)
+
+
+def angle_bound(
+    angle: ArrayLike,
+    sigma: ArrayLike,
+    station: ArrayLike,
+    point: ArrayLike,
+    *,
+    axes: ArrayLike | None = None,
+    backend: str = "CLARABEL",
+) -> Directed:
+    """Bound the ML cost ``sum (angle error / sigma)^2`` from below over all points, using a fix.
+
+    Parameters
+    ----------
+    angle, sigma, station, axes, backend
+        As in `directions`.
+    point : array_like, shape (3,)
+        A fix, best a refined one: the bound is valid for any, and can reach its cost only if it is stationary.
+
+    Returns
+    -------
+    Directed
+        ``bound`` is at most the ML cost of every point, up to rounding.
+
+    Notes
+    -----
+    The module's text. The proof: points costlier than the fix need no bound; for the others, the minorant, the
+    equalities and weak duality.
+    """
+    z, s = np.asarray(angle, dtype=np.float64), np.asarray(sigma, dtype=np.float64)
+    S = np.asarray(station, dtype=np.float64)
+    seen = predicted(np.asarray(point, dtype=np.float64), S, axes)
+    error = seen - z
+    error[:, 0] = np.arctan2(np.sin(error[:, 0]), np.cos(error[:, 0]))
+    found = minorant(error, s, seen[:, 1], float(((error / s) ** 2).sum()))
+    cost = _Cost(float(found.constant.sum()), found.linear, found.square, float((found.reach**2).sum()))
+    return _solve(_frames(seen, axes), S, cost, backend)
+
+
+def predicted(point: Array, station: Array, axes: ArrayLike | None = None) -> Array:
+    """Return azimuth and elevation of a point.
+
+    Parameters
+    ----------
+    point : Array, shape (3,)
+        Target.
+    station : Array, shape (N, 3)
+        Positions.
+    axes : array_like, shape (N, 3, 3), optional
+        Rows are the unit vectors of each station's axes.
+
+    Returns
+    -------
+    Array, shape (N, 2)
+        Radians.
+
+    Notes
+    -----
+    Plain geometry.
+    """
+    line = point - station
+    if axes is not None:
+        line = np.einsum("nij,nj->ni", np.asarray(axes, dtype=np.float64), line)
+    flat = np.hypot(line[:, 0], line[:, 1])
+    return np.stack([np.arctan2(line[:, 1], line[:, 0]), np.arctan2(line[:, 2], flat)], axis=-1)
+
+
+@dataclass(frozen=True, slots=True)
+class _Cost:
+    """Coefficients in ``v - v^``, and the largest sum of ``|v - v^|^2`` of any point that matters."""
+
+    constant: float
+    linear: Array
+    square: Array
+    reach: float
+
+
+def _frames(angle: Array, axes: ArrayLike | None) -> Array:
+    seen = rays(angle[:, 0], angle[:, 1], axes)
+    assert seen.upward is not None
+    return np.stack([seen.ahead, seen.across, seen.upward], axis=1)
+
+
+def _solve(frame: Array, S: Array, cost: _Cost, backend: str) -> Directed:
+    count = len(S)
+    size = float(cost.square[:, 1:].max()) or 1.0
+    unit = 1.0 / np.sqrt(size)
+    pairs = np.array(list(combinations(range(count), 2)))
+    base = S[pairs[:, 1]] - S[pairs[:, 0]]
+    base = base / np.linalg.norm(base, axis=1, keepdims=True)
+    across = np.cross(base[:, None], frame[pairs[:, 1]])
+    turn = np.einsum("pai,pbi->pab", frame[pairs[:, 0]], across)
+    relaxation = _built(count, backend)
+    # |Y| of every point that matters: the radius that makes the dual bound rigorous
+    relaxation.radius = 1.0 + cost.reach / unit**2
+    answer = relaxation.solve(
+        {
+            "linear": (cost.linear * unit).ravel(),
+            "square": (cost.square * unit**2).ravel(),
+            "unit": np.full(count, unit),
+            "level": turn[:, 0, 0] / unit,
+            "slope": np.concatenate([turn[:, :, 0], turn[:, 0, :]], axis=1),
+            "turn": unit * turn.reshape(-1, 9),
+        }
+    )
+    lift = answer.values["lift"]
+    v, ratio = np.full((count, 3), np.nan), np.nan
+    if np.isfinite(lift).all():
+        change = np.zeros_like(lift)
+        change[0, 0] = 1.0
+        for i in range(count):
+            own = slice(1 + 3 * i, 4 + 3 * i)
+            change[own, 0], change[own, own] = frame[i, 0], unit * frame[i].T
+        plain = change @ lift @ change.T
+        values = np.linalg.eigvalsh(plain)
+        ratio = float(abs(values[-2]) / values[-1])
+        v = plain[1:, 0].reshape(count, 3)
+        v = v / np.linalg.norm(v, axis=1, keepdims=True)
+    bound = cost.constant + answer.bound
+    return Directed(meeting(v, S), v, cost.constant + answer.primal, max(bound, 0.0), ratio, answer)
+
+
+def meeting(direction: Array, station: Array) -> Array:
+    """Return the point nearest to lines, in least squares weighted by one over the distance along them.
+
+    Parameters
+    ----------
+    direction : Array, shape (N, 3)
+        Unit vectors.
+    station : Array, shape (N, 3)
+        A point of each line.
+
+    Returns
+    -------
+    Array, shape (3,)
+        The point; NaN for parallel lines.
+
+    Notes
+    -----
+    Two passes, the first without weights.
+    """
+    off = np.eye(3) - direction[:, :, None] * direction[:, None, :]
+    weight, point = np.ones(len(station)), np.full(3, np.nan)
+    for _ in range(2):
+        left = np.einsum("n,nij->ij", weight, off)
+        if not np.isfinite(left).all() or np.linalg.cond(left) > 1e13:
+            return np.full(3, np.nan)
+        point = np.linalg.solve(left, np.einsum("n,nij,nj->i", weight, off, station))
+        weight = 1.0 / np.maximum(np.sum((point - station) ** 2, axis=1), 1e-12)
+    return point
