@@ -1,10 +1,11 @@
 r"""Curves on which a point has measured ranges, as conics in their own plane.
 
-.. math:: x(t, \mu) = b + p\,t + n\,\mu, \qquad \mu^2 = q_0 + q_1 t + q_2 t^2, \qquad r_i = \sigma_i t + e_i
+.. math:: x(t, \mu) = b + p\,t + n\,\mu, \qquad \mu^2 = q_0 + q_1 t + q_2 t^2, \qquad r_i = \rho_i t + e_i
 
 Three stations whose ranges are known up to one unknown: squared and subtracted, :math:`r_i = \sigma_i r_1 + e_i`
 gives :math:`2 a_i^\top (x - s_1) = |a_i|^2 - e_i^2 - 2 \sigma_i e_i r_1` with :math:`a_i = s_i - s_1`; `n` is the unit
-normal of the plane of the stations and :math:`t = r_1`. Two stations of known range: a circle about their line, `t`
+normal of the plane of the stations and `t` is :math:`r_1`, shifted and scaled so that `p` is at most a unit long and
+`b` near the stations (nearly collinear stations make both huge otherwise). Two stations of known range: a circle about their line, `t`
 and :math:`\mu` being cosine and sine.
 
 Source: K. C. Ho and Y. T. Chan, "Geolocation of a known altitude object from TDOA and FDOA measurements", IEEE Trans.
@@ -35,8 +36,8 @@ class Curve:
         The vectors b, p and n.
     square : Array, shape (N, 3)
         The coefficients q, constant first.
-    sign, offset : Array, shape (N, s)
-        Ranges ``sign t + offset`` of the s stations.
+    rate, offset : Array, shape (N, s)
+        Ranges ``rate t + offset`` of the s stations.
     ok : Mask, shape (N,)
         False where the stations fix no such curve; the other arrays are finite all the same.
     """
@@ -45,7 +46,7 @@ class Curve:
     along: Array
     across: Array
     square: Array
-    sign: Array
+    rate: Array
     offset: Array
     ok: Mask
 
@@ -105,7 +106,7 @@ def three_stations(stations: Array, sign: Array, offset: Array) -> Curve:
     Returns
     -------
     Curve
-        Its parameter t is the range of the first station.
+        Not ok where the stations lie on a line.
 
     Notes
     -----
@@ -117,19 +118,30 @@ def three_stations(stations: Array, sign: Array, offset: Array) -> Curve:
     length = np.sum(a * a, axis=-1)
     normal = np.cross(a[:, 0], a[:, 1])
     size = np.sum(normal * normal, axis=-1)
-    ok = np.isfinite(gap).all(axis=-1) & (size > _THIN**2 * length[:, 0] * length[:, 1])
+    ok = np.isfinite(gap).all(axis=-1)
+    ok &= size > _THIN**2 * length[:, 0] * length[:, 1]
     size, gap = np.where(ok, size, 1.0), np.where(ok[:, None], gap, 0.0)
     a = np.where(ok[:, None, None], a, np.eye(3)[1:])
     normal = np.where(ok[:, None], normal, np.eye(3)[0])
     length = np.where(ok[:, None], length, 1.0)
     # the reciprocal basis of the plane
     first, second = np.cross(a[:, 1], normal) / size[:, None], np.cross(normal, a[:, 0]) / size[:, None]
-    fixed, rate = 0.5 * (length - gap[:, 1:] ** 2), -turn[:, 1:] * gap[:, 1:]
+    fixed, slope = 0.5 * (length - gap[:, 1:] ** 2), -turn[:, 1:] * gap[:, 1:]
+    p = slope[:, :1] * first + slope[:, 1:] * second
     start = fixed[:, :1] * first + fixed[:, 1:] * second
-    along = rate[:, :1] * first + rate[:, 1:] * second
-    square = np.stack([-_dot(start, start), -2.0 * _dot(start, along), 1.0 - _dot(along, along)], axis=-1)
-    base = np.where(ok[:, None], stations[:, 0], 0.0) + start
-    return Curve(base, along, normal / np.sqrt(size)[:, None], square, turn, gap, ok)
+    long = np.maximum(_dot(p, p), 1.0)
+    shift = -_dot(start, p) / long
+    start, scale = start + p * shift[:, None], 1.0 / np.sqrt(long)
+    square = [shift**2 - _dot(start, start), 2.0 * scale * (shift - _dot(start, p)), (1.0 - _dot(p, p)) / long]
+    return Curve(
+        np.where(ok[:, None], stations[:, 0], 0.0) + start,
+        p * scale[:, None],
+        normal / np.sqrt(size)[:, None],
+        np.stack(square, axis=-1),
+        turn * scale[:, None],
+        gap + turn * shift[:, None],
+        ok,
+    )
 
 
 def two_stations(stations: Array, ranges: Array, towards: Array) -> Curve:

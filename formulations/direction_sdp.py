@@ -92,6 +92,7 @@ def direction_problem(count: int) -> Any:
     linear, square = cp.Parameter(size, name="linear"), cp.Parameter(size, name="square")
     unit, level = cp.Parameter(count, name="unit"), cp.Parameter(len(pairs), name="level")
     slope, turn = cp.Parameter((len(pairs), 6), name="slope"), cp.Parameter((len(pairs), 9), name="turn")
+    start, order = cp.Parameter(len(pairs), name="start"), cp.Parameter((len(pairs), 6), name="order")
     w, diagonal = lift[0, 1:], cp.diag(lift)[1:]
     rules = [lift >> 0, lift[0, 0] == 1]
     rules += [2 * w[3 * i] + unit[i] * cp.sum(diagonal[3 * i : 3 * i + 3]) == 0 for i in range(count)]
@@ -99,13 +100,16 @@ def direction_problem(count: int) -> Any:
         block = cp.vec(lift[1 + 3 * i : 4 + 3 * i, 1 + 3 * j : 4 + 3 * j], order="C")
         both = cp.hstack([w[3 * i : 3 * i + 3], w[3 * j : 3 * j + 3]])
         rules.append(level[k] + slope[k] @ both + turn[k] @ block == 0)
+        rules.append(start[k] + order[k] @ both >= 0)
     return cp.Problem(cp.Minimize(2 * linear @ w + square @ diagonal), rules)
 
 
 @lru_cache(maxsize=16)
 def _built(count: int, backend: str) -> Relaxation:
-    tight = {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9, "tol_feas": 1e-9} if backend == "CLARABEL" else {}
-    return Relaxation(direction_problem(count), backend=backend, settings=tight)
+    tight = {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9, "tol_feas": 1e-9}
+    # the equalities depend on each other at a solution: with Clarabel's own 1e-8 one solve in five stops early
+    settings = {**tight, "static_regularization_constant": 1e-7} if backend == "CLARABEL" else {}
+    return Relaxation(direction_problem(count), backend=backend, settings=settings)
 
 
 def directions(
@@ -242,6 +246,8 @@ def _solve(frame: Array, S: Array, cost: _Cost, backend: str) -> Directed:
     base = base / np.linalg.norm(base, axis=1, keepdims=True)
     across = np.cross(base[:, None], frame[pairs[:, 1]])
     turn = np.einsum("pai,pbi->pab", frame[pairs[:, 0]], across)
+    near = np.einsum("pai,pi->pa", frame[pairs[:, 0]], base)
+    far = np.einsum("pai,pi->pa", frame[pairs[:, 1]], base)
     relaxation = _built(count, backend)
     # |Y| of every point that matters: the radius that makes the dual bound rigorous
     relaxation.radius = 1.0 + cost.reach / unit**2
@@ -253,6 +259,8 @@ def _solve(frame: Array, S: Array, cost: _Cost, backend: str) -> Directed:
             "level": turn[:, 0, 0] / unit,
             "slope": np.concatenate([turn[:, :, 0], turn[:, 0, :]], axis=1),
             "turn": unit * turn.reshape(-1, 9),
+            "start": (near[:, 0] - far[:, 0]) / unit,
+            "order": np.concatenate([near, -far], axis=1),
         }
     )
     lift = answer.values["lift"]

@@ -149,7 +149,7 @@ def _meet(curve: Curve, stations: Array, A: Array, centre: Array, *, positive: b
         t, mu = _starts(curve.square, E, L, alpha)
         t, mu = _newton(t, mu, curve.square, E, L, alpha)
         x = curve.points(t, mu)
-        ranges = curve.sign[:, None] * t[..., None] + curve.offset[:, None]
+        ranges = curve.rate[:, None] * t[..., None] + curve.offset[:, None]
         away = x[:, :, None] - stations[:, None]
         size = 1.0 + np.max(np.abs(ranges), axis=-1)
         miss = np.max(np.abs(np.sqrt(_dot(away, away)) - np.abs(ranges)), axis=-1)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from optloc import noise as noises
+from optloc.arguments import numbers, positive, whole
 from optloc.check import checked
 from optloc.errors import InvalidProblem
 from optloc.frames import CARTESIAN, Frame
@@ -91,18 +92,32 @@ def measured(
     model = MODELS.get(kind)
     if model is None:
         raise InvalidProblem(f"unknown kind {kind!r}", where="kind", advice=f"use one of {', '.join(sorted(MODELS))}")
-    sizes = [np.shape(v)[-1] for v in (z, sigma, covariance, a, b, epoch, target) if v is not None and np.ndim(v)]
+    z, sigma, arrival_sigma = (
+        numbers(z, "z"),
+        positive(sigma, "sigma", kind),
+        positive(arrival_sigma, "arrival_sigma", kind),
+    )
+    covariance, weight, correction = (
+        numbers(v, name) for v, name in ((covariance, "covariance"), (weight, "weight"), (correction, "correction"))
+    )
+    a, b, epoch, target = (whole(v, name) for v, name in ((a, "a"), (b, "b"), (epoch, "epoch"), (target, "target")))
+    given = (z, sigma, covariance, a, b, epoch, target, weight, correction)
+    sizes = [v.shape[-1] for v in given if v is not None and v.ndim]
     count = max(sizes, default=1)
+    if covariance is not None and covariance.shape[-2:] != (count, count):
+        raise InvalidProblem(
+            f"the covariance of {kind} has shape {covariance.shape}", "covariance", f"give one of {count} x {count}"
+        )
     if any(size not in (1, count) for size in sizes):
         raise InvalidProblem(f"arguments of {kind} have {sorted(set(sizes))} rows", where=kind, advice="give one each")
 
-    def index(values: Any, needed: bool, name: str) -> Array:
+    def index(values: Array | None, needed: bool, name: str) -> Array:
         if needed and values is None:
             raise InvalidProblem(f"{kind} needs station {name}", where=name, advice="give station indices")
-        return np.array(np.broadcast_to(np.asarray(values if needed else -1, dtype=np.int64), (count,)))
+        return np.array(np.broadcast_to(values if needed and values is not None else np.int64(-1), (count,)))
 
-    def number(values: Any) -> Array:
-        array = np.asarray(values, dtype=float)
+    def row(values: Array | None) -> Array:
+        array = np.asarray(np.nan) if values is None else values
         return np.array(np.broadcast_to(array, (*array.shape[:-1], count)))
 
     if (covariance is None) == (sigma is None and arrival_sigma is None):
@@ -110,19 +125,19 @@ def measured(
         raise InvalidProblem(f"the noise of {kind} must be given once", where=kind, advice=advice)
     rows = Rows(
         kind,
-        number(np.nan if z is None else z),
+        row(z),
         index(a, model.stations > 0, "a"),
         index(b, model.stations > 1, "b"),
         index(epoch, True, "epoch"),
         index(target, True, "target"),
-        number(weight),
-        number(correction),
+        row(weight),
+        row(correction),
     )
     return Measured(
         rows,
-        None if sigma is None else number(sigma) ** 2,
-        None if arrival_sigma is None else np.asarray(arrival_sigma, dtype=float) ** 2,
-        None if covariance is None else np.asarray(covariance, dtype=float),
+        None if sigma is None else row(sigma) ** 2,
+        None if arrival_sigma is None else arrival_sigma**2,
+        covariance,
     )
 
 
@@ -173,7 +188,7 @@ def assemble(
         stations if isinstance(stations, Stations) else station_array(stations),
         tuple(m.rows for m in measurements),
         noises.Noise(()),
-        np.arange(float(epochs)) if times is None else np.asarray(times, dtype=float),
+        np.arange(float(epochs)) if times is None else np.asarray(numbers(times, "times")),
         tuple(motions),
         tuple(biases),
         tuple(priors),
@@ -183,14 +198,18 @@ def assemble(
     if covariance is None:
         noise = noises.group([block for m, start in blocks for block in _noise(m, start, made.stations.count)])
     else:
-        full = np.asarray(covariance, dtype=float)
+        full = np.asarray(numbers(covariance, "covariance"))
+        if full.shape[-2:] != (made.count, made.count):
+            raise InvalidProblem(
+                f"the joint covariance has shape {full.shape}", "covariance", f"give one of {made.count} x {made.count}"
+            )
         noise = noises.Noise((noises.Block(np.arange(made.count)[None], full[..., None, :, :]),))
     return checked(replace(made, noise=noise))
 
 
 def station_array(position: Any, names: Sequence[str] | None = None) -> Stations:
     """Return stations at positions (s, d), or (..., k, s, d) where they move or differ from problem to problem."""
-    array = np.asarray(position, dtype=float)
+    array = np.asarray(numbers(position, "stations"))
     if array.ndim < 2 or array.shape[-1] not in (2, 3):
         raise InvalidProblem(
             f"stations have shape {array.shape}", where="stations", advice="give an array (stations, 2 or 3) in metres"
@@ -214,6 +233,12 @@ def _noise(m: Measured, start: int, stations: int) -> list[noises.Block]:
         return [noises.Block(rows[None], m.covariance[..., None, :, :])]
     assert m.arrival is not None
     variance = m.arrival if m.arrival.ndim else np.full(stations, float(m.arrival))
+    if variance.shape[-1] != stations:
+        raise InvalidProblem(
+            f"there are {variance.shape[-1]} values for {stations} stations",
+            "arrival_sigma",
+            "give one for each station",
+        )
     return _arrival_blocks(m, start, variance)
 
 

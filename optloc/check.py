@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from optloc.check_unknowns import check_unknowns
 from optloc.errors import InvalidProblem
+from optloc.frames import Frame
 from optloc.models import MODELS
 from optloc.noise import Noise
 from optloc.problem import Problem
@@ -27,19 +29,22 @@ def checked(problem: Problem) -> Problem:
     InvalidProblem
         Naming the station, row or argument and what to do.
     """
+    if not isinstance(problem.frame, Frame):
+        raise InvalidProblem(f"{problem.frame!r} is not a frame", "frame", "give an optloc.Frame, such as optloc.ECEF")
+    if problem.count == 0:
+        raise InvalidProblem("there are no measurements", "measurements", "give at least one row")
     _check_stations(problem)
     for rows in problem.rows:
         _check_rows(problem, rows)
     _check_noise(problem.noise, problem.count)
     _check_times(problem)
+    _check_moving(problem)
+    check_unknowns(problem)
     try:
         problem.batch_shape  # noqa: B018  (raises where leading axes disagree)
     except ValueError:
         raise InvalidProblem("leading axes disagree", "problem", "give every array the same batch axes") from None
-    if problem.stations.covariance is not None:
-        _check_covariance(problem.stations.covariance, "position error of station", problem.stations.names)
     for prior in problem.priors:
-        problem.layout.find(prior.name)
         _check_covariance(prior.covariance[..., None, :, :], f"prior on {prior.name}", None)
     return problem
 
@@ -57,11 +62,48 @@ def _check_stations(problem: Problem) -> None:
     twice = [name for name, n in Counter(stations.names).items() if n > 1]
     if twice:
         raise InvalidProblem(f"station name {twice[0]!r} is used twice", "stations", "rename one of them")
-    for name, array, core in (("velocity", stations.velocity, 1), ("axes", stations.axes, 2)):
-        if array is not None and (array.shape[-core - 1] != stations.count or array.shape[-1] != stations.dimension):
-            raise InvalidProblem(f"station {name} has shape {array.shape}", "stations", "match the positions")
     if problem.frame.kind == "ecef" and stations.dimension != 3:
         raise InvalidProblem("stations in ECEF need three coordinates", "stations", "give x, y and z")
+    if stations.covariance is not None:
+        shape = (stations.count, stations.dimension, stations.dimension)
+        if stations.covariance.shape[-3:] != shape:
+            raise InvalidProblem(
+                f"the covariance of their errors has shape {stations.covariance.shape}", "stations", f"give {shape}"
+            )
+        _check_covariance(stations.covariance, "position error of station", stations.names)
+    if stations.span not in ("epoch", "run"):
+        raise InvalidProblem(f"unknown span {stations.span!r} of position errors", "stations", "use 'epoch' or 'run'")
+
+
+def _check_moving(problem: Problem) -> None:
+    """Refuse velocities, axes and moving positions that do not fit the stations and epochs."""
+    s, d, count = problem.stations, problem.dimension, problem.stations.count
+    for name, array, tail in (
+        ("position", s.position, (count, d)),
+        ("velocity", s.velocity, (count, d)),
+        ("axes", s.axes, (count, d, d)),
+    ):
+        if array is None:
+            continue
+        core = len(tail) + 1
+        if array.ndim < core or array.shape[-core + 1 :] != tail:
+            raise InvalidProblem(f"station {name} has shape {array.shape}", "stations", "match the positions")
+        if array.shape[-core] not in (1, problem.epochs):
+            counts = f"{array.shape[-core]} epochs of station {name} for {problem.epochs} epochs of measurements"
+            raise InvalidProblem(counts, "stations", "give one, or one for each epoch")
+        bad = ~np.isfinite(array).all(tuple(range(-core + 2, 0)))
+        if bad.any():
+            label = s.names[int(np.argwhere(bad)[0][-1])]
+            raise InvalidProblem(f"the {name} of station {label!r} is not finite", "stations", "give SI units")
+    if s.axes is not None:
+        skew = np.abs(s.axes @ np.swapaxes(s.axes, -1, -2) - np.eye(d)).max((-1, -2)) > 1e-6
+        if skew.any():
+            label = s.names[int(np.argwhere(skew)[0][-1])]
+            raise InvalidProblem(
+                f"the axes of station {label!r} are not unit vectors at right angles",
+                "stations",
+                "give a rotation matrix",
+            )
 
 
 def _check_rows(problem: Problem, rows: Rows) -> None:
@@ -91,8 +133,14 @@ def _check_rows(problem: Problem, rows: Rows) -> None:
     if model.stations > 1 and np.any(rows.a == rows.b):
         row = int(np.flatnonzero(rows.a == rows.b)[0])
         raise InvalidProblem(f"{rows.kind} row {row} names one station twice", "a, b", "name two stations")
-    if np.isinf(rows.z).any():
-        raise InvalidProblem(f"{rows.kind} has an infinite value", "z", "remove the row or give it weight zero")
+    infinite = np.argwhere(np.isinf(rows.z))
+    if len(infinite):
+        row = infinite[0][-1]
+        raise InvalidProblem(f"{rows.kind} row {row} is infinite", "z", "remove the row or give it weight zero")
+    if not np.isfinite(rows.correction).all():
+        raise InvalidProblem(
+            f"{rows.kind} has a correction that is not finite", "correction", "give 0 where none is known"
+        )
     if not ((rows.weight >= 0.0) & (rows.weight <= 1.0)).all():
         raise InvalidProblem(f"{rows.kind} has a weight outside 0 to 1", "weight", "use 0 for absent, 1 for present")
 

@@ -202,13 +202,19 @@ def violation(problem: Problem, x: Array) -> Array:
         if isinstance(c, Polygon):
             worst = np.maximum(worst, _outside(c, _plan(problem, c.target, x)))
             continue
-        value = _quantity(problem, c, x)[0].value
+        with np.errstate(all="ignore"):  # the speed of a target at rest has no derivative, and none is needed here
+            value = _quantity(problem, c, x)[0].value
         for bound, sign in ((c.lower, 1.0), (c.upper, -1.0)):
             with np.errstate(invalid="ignore"):
                 short = np.where(np.isfinite(bound), sign * (bound - value), -np.inf)
             size = 1.0 + np.where(np.isfinite(bound), np.abs(bound), 0.0)
             worst = np.maximum(worst, short / size)
     return worst
+
+
+def violation_names(problem: Problem) -> str:
+    """Return the names of all constraints, for messages."""
+    return ", ".join(dict.fromkeys(c.name for c in problem.constraints))
 
 
 def _quantity(problem: Problem, band: Band, x: Array) -> tuple[Jet, dict[int, int]]:

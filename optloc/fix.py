@@ -37,6 +37,23 @@ class Stage:
 
 
 @dataclass(frozen=True, slots=True)
+class Active:
+    """A constraint that holds a fix with equality.
+
+    Parameters
+    ----------
+    name : str
+        Constraint and side, for instance "height upper".
+    multiplier : float
+        The gradient of the cost plus all multipliers times the gradients of their quantities is zero: positive at
+        an upper bound, negative at a lower one, in cost per SI unit of the quantity.
+    """
+
+    name: str
+    multiplier: float
+
+
+@dataclass(frozen=True, slots=True)
 class Alternatives:
     """Other minima of the cost that were found, cheapest first.
 
@@ -82,6 +99,8 @@ class Fix:
         Row weights that were used.
     stages : tuple of Stage
         How it was found.
+    active : object array (...), optional
+        Constraints that hold each fix with equality, a tuple of `Active`.
     """
 
     x: Array
@@ -96,6 +115,7 @@ class Fix:
     dof: Array
     weights: Array
     stages: tuple[Stage, ...] = ()
+    active: Array | None = None
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -223,12 +243,13 @@ class Fix:
             cost=change(self.cost, 0),
             dof=change(self.dof, 0),
             weights=change(self.weights, 1),
+            active=None if self.active is None else change(self.active, 0),
         )
 
 
 def _as_array(value: Any) -> Array:
     if isinstance(value, np.ndarray):
         return value
-    out = np.empty((), dtype=object if isinstance(value, str | Certificate) else None)
-    out[()] = value
-    return out
+    out = np.empty(1, dtype=object if isinstance(value, str | tuple | Certificate) else None)
+    out[0] = value
+    return out.reshape(())

@@ -11,7 +11,7 @@ from optloc.models.jet import Jet
 from optloc.models.primitives import wrap
 from optloc.noise import Whitener, whiten
 from optloc.problem import Problem
-from optloc.states import Plan, plans, points
+from optloc.states import Plan, fitting, plans, points
 from optloc.types import Array
 
 
@@ -57,7 +57,7 @@ def linearise(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = N
     Linear
         With leading axes (...).
     """
-    layout = problem.layout
+    layout, x = problem.layout, fitting(problem, x)
     batch = np.broadcast_shapes(problem.batch_shape, x.shape[:-1])
     jacobian = np.zeros((*batch, problem.count, layout.n_shared + layout.n_local))
     values = []
@@ -73,7 +73,7 @@ def linearise(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = N
 
 def predict(problem: Problem, x: Array) -> Array:
     """Return the modelled measurements h(x), (..., m), of a problem at vectors x (..., size)."""
-    values = []
+    values, x = [], fitting(problem, x)
     for plan in plans(problem):
         t, a, b = points(problem, plan, x, differentiate=False)
         value = np.asarray(plan.model.h(t, a, b))

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from optloc.errors import InvalidProblem
 from optloc.layout import Layout, emission_name, state_names
 from optloc.models import MODELS, Model, Point
 from optloc.models.jet import Jet
@@ -112,6 +113,9 @@ def plans(problem: Problem) -> tuple[Plan, ...]:
 
 def _plan(problem: Problem, block: Rows, start: int) -> Plan:
     model = MODELS[block.kind]
+    if (block.target < 0).any():
+        where = f"{block.kind} row {int(np.argmax(block.target < 0))}"
+        raise InvalidProblem("the row names no target", where, "give the index of its target")
     feeds = [*_motion_feeds(problem, block, model), *_station_feeds(problem, block, model)]
     feeds += _turn_feeds(problem, block, start)
     return Plan(block, model, tuple(feeds), _terms(problem, block, start, ("scale",)), _adds(problem, block, start))
@@ -199,6 +203,14 @@ def _turn_feeds(problem: Problem, block: Rows, start: int) -> list[Feed]:
                 picked = column[np.arange(len(rows)), bias.member[touch] * turns + c]
                 feeds.append(Feed(_TURN + c, picked, bias.coefficient[touch], rows))
     return feeds
+
+
+def fitting(problem: Problem, x: Array) -> Array:
+    """Return parameter vectors (..., size) of a problem; refuse those of another length."""
+    size = problem.layout.size
+    if x.shape[-1:] != (size,):
+        raise InvalidProblem(f"a vector of shape {x.shape} for {size} unknowns", "vector", "order it by problem.layout")
+    return x
 
 
 def points(problem: Problem, plan: Plan, x: Array, differentiate: bool) -> tuple[Point, Point, Point]:

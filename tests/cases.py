@@ -369,7 +369,9 @@ def kitchen_sink(d: int, span: str = "epoch", seed: int = 5) -> Problem:
     moving = STATIONS[d] + rng.normal(0.0, 300.0, (k, count, d))
     spread = np.array([np.diag(rng.uniform(1.0, 9.0, d)) for _ in range(count)])
     axes = np.concatenate([turned(seed + i, d, count) for i in range(k)])
-    own = Stations(moving, tuple(f"N{i}" for i in range(count)), rng.normal(0, 100.0, (k, count, d)), axes, spread, span)
+    own = Stations(
+        moving, tuple(f"N{i}" for i in range(count)), rng.normal(0, 100.0, (k, count, d)), axes, spread, span
+    )
     known = np.stack([np.stack([TARGET[d] + 500.0 * i, RATE[d]]) for i in range(k)])
     motions = (Motion(1), Motion(2, reference=11.0), Motion(1, known=known))
     kinds = ["tdoa", "groa", "range", "toa", "range_sum", "azimuth", "fdoa"] + (["elevation"] if d == 3 else [])
@@ -379,9 +381,7 @@ def kitchen_sink(d: int, span: str = "epoch", seed: int = 5) -> Problem:
         b = (a + rng.integers(1, count, 11)) % count
         sizes[kind] = (sum(size for _, size in sizes.values()), 11)
         sigma = rng.uniform(1.0, 3.0, 11) * (1e-3 if kind in ("groa", "azimuth", "elevation") else 1.0)
-        parts.append(
-            measured(kind, a=a, b=b, sigma=sigma, epoch=rng.integers(0, k, 11), target=rng.integers(0, 3, 11))
-        )
+        parts.append(measured(kind, a=a, b=b, sigma=sigma, epoch=rng.integers(0, k, 11), target=rng.integers(0, 3, 11)))
 
     def rows(kind: str) -> np.ndarray:
         start, size = sizes[kind]

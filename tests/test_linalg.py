@@ -50,7 +50,13 @@ def test_leading_axes_broadcast():
 
 @pytest.mark.parametrize(
     "broken",
-    [np.zeros((3, 3)), np.full((3, 3), np.nan), np.diag([1.0, -1.0, 1.0]), np.ones((3, 3)), np.diag([1.0, np.inf, 1.0])],
+    [
+        np.zeros((3, 3)),
+        np.full((3, 3), np.nan),
+        np.diag([1.0, -1.0, 1.0]),
+        np.ones((3, 3)),
+        np.diag([1.0, np.inf, 1.0]),
+    ],
     ids=["zero", "nan", "indefinite", "singular", "infinite"],
 )
 def test_a_bad_item_is_named_and_leaves_the_others_untouched(broken):

@@ -64,7 +64,10 @@ def test_jacobian_of_every_unknown(problem):
 @pytest.mark.parametrize("name", CASES)
 def test_cases_predict_and_linearise(name):
     case = CASES[name]
-    assert np.abs(wrapped(case.problem, predict(case.problem, case.truth) - plain_predict(case.problem, case.truth))).max() < 1e-8
+    assert (
+        np.abs(wrapped(case.problem, predict(case.problem, case.truth) - plain_predict(case.problem, case.truth))).max()
+        < 1e-8
+    )
     exact, (numeric, doubt) = dense_jacobian(case.problem, case.truth), numeric_jacobian(case.problem, case.truth)
     assert (np.abs(exact - numeric) <= 1e-6 * np.abs(exact).max(axis=0) + doubt).all()
 
@@ -153,9 +156,7 @@ def test_problems_that_differ_in_coefficients_alone_do_not_share_a_plan():
 
 def test_a_turn_of_one_row_by_two_mounts_is_not_lost():
     """Station mounts ride on a common platform: two members turn the same row."""
-    bias = Bias(
-        "turn", ("platform", "mount"), np.array([0, 1, 0, 1]), np.array([0, 0, 1, 1]), np.ones(4), "rotation"
-    )
+    bias = Bias("turn", ("platform", "mount"), np.array([0, 1, 0, 1]), np.array([0, 0, 1, 1]), np.ones(4), "rotation")
     problem = assemble(STATIONS[2], measured("azimuth", a=[0, 1], sigma=0.01), biases=(bias,))
     x = np.r_[TARGET[2], 0.03, 0.02]
     level = predict(problem, np.r_[TARGET[2], 0.0, 0.0])

@@ -36,7 +36,9 @@ def points(kind, d, inputs, axes):
     own = tuple(tuple(row) for row in axes) if model.axes else None
 
     def point(i, axes=None):
-        return Point(parts[2 * i], parts[2 * i + 1] if model.velocity else None, axes, parts[2 * i] if model.ecef else None)
+        return Point(
+            parts[2 * i], parts[2 * i + 1] if model.velocity else None, axes, parts[2 * i] if model.ecef else None
+        )
 
     return point(0), point(1, own), point(2)
 
@@ -215,8 +217,12 @@ def test_jet_arithmetic_and_functions_follow_the_rules_of_calculus():
     jet = all_of(Jet(x0, {0: np.ones(1)}), Jet(y0, {1: np.ones(1)}), J)
     assert np.allclose(jet.value, all_of(x0, y0, np), rtol=1e-14)
     step = 1e-6
-    assert np.allclose(jet.partials[0], (all_of(x0 + step, y0, np) - all_of(x0 - step, y0, np)) / 2e-6, rtol=1e-7, atol=1e-7)
-    assert np.allclose(jet.partials[1], (all_of(x0, y0 + step, np) - all_of(x0, y0 - step, np)) / 2e-6, rtol=1e-7, atol=1e-7)
+    assert np.allclose(
+        jet.partials[0], (all_of(x0 + step, y0, np) - all_of(x0 - step, y0, np)) / 2e-6, rtol=1e-7, atol=1e-7
+    )
+    assert np.allclose(
+        jet.partials[1], (all_of(x0, y0 + step, np) - all_of(x0, y0 - step, np)) / 2e-6, rtol=1e-7, atol=1e-7
+    )
 
 
 def test_an_array_on_the_left_of_a_jet_is_elementwise():

@@ -20,7 +20,11 @@ def prior_information(problem):
     precision, mean = np.zeros((layout.size, layout.size)), np.zeros(layout.size)
     if problem.stations.covariance is not None:
         slot, shared = layout.find("stations")
-        starts = [slot.start] if shared else [layout.n_shared + k * layout.n_local + slot.start for k in range(problem.epochs)]
+        starts = (
+            [slot.start]
+            if shared
+            else [layout.n_shared + k * layout.n_local + slot.start for k in range(problem.epochs)]
+        )
         for start in starts:
             for i, block in enumerate(problem.stations.covariance):
                 part = slice(start + i * d, start + (i + 1) * d)
@@ -45,7 +49,9 @@ def numeric_jacobian(problem, x):
     for j in range(len(x)):
         shift = np.zeros(len(x))
         shift[j] = 1e-4 * max(abs(x[j]), 0.1)
-        out[:, j] = wrapped(problem, plain_predict(problem, x + shift) - plain_predict(problem, x - shift)) / (2 * shift[j])
+        out[:, j] = wrapped(problem, plain_predict(problem, x + shift) - plain_predict(problem, x - shift)) / (
+            2 * shift[j]
+        )
     return out
 
 
@@ -221,7 +227,9 @@ def test_crlb_of_a_batch_of_truths_and_of_a_singular_geometry():
     bounds = crlb(case.problem, truths)
     for i in range(4):
         assert np.allclose(bounds[i], crlb(case.problem, truths[i]), rtol=1e-12)
-    line = assemble(np.array([[0.0, 0.0, 0.0], [1e3, 0, 0], [2e3, 0, 0], [5e3, 0, 0]]), measured("range", a=[0, 1, 2, 3], sigma=1.0))
+    line = assemble(
+        np.array([[0.0, 0.0, 0.0], [1e3, 0, 0], [2e3, 0, 0], [5e3, 0, 0]]), measured("range", a=[0, 1, 2, 3], sigma=1.0)
+    )
     assert np.isnan(crlb(line, TARGET[3])).all()
 
 

@@ -50,7 +50,9 @@ def one(problem, i):
     s = problem.stations
     stations = replace(s, position=s.position[i], axes=s.axes[i], covariance=s.covariance[i])
     rows = tuple(replace(r, z=r.z[i], weight=pick(r.weight, i), correction=pick(r.correction, i)) for r in problem.rows)
-    noise = Noise(tuple(Block(b.row, b.covariance[i] if b.covariance.ndim > 3 else b.covariance) for b in problem.noise.blocks))
+    noise = Noise(
+        tuple(Block(b.row, b.covariance[i] if b.covariance.ndim > 3 else b.covariance) for b in problem.noise.blocks)
+    )
     priors = tuple(replace(p, mean=p.mean[i], covariance=p.covariance[i]) for p in problem.priors)
     return replace(problem, stations=stations, rows=rows, noise=noise, priors=priors)
 
@@ -134,7 +136,10 @@ def test_structure_knows_everything_but_the_numbers():
         replace(problem, biases=problem.biases[:3]),
         replace(problem, stations=replace(problem.stations, span="run")),
         replace(problem, rows=(replace(problem.rows[0], a=problem.rows[0].b, b=problem.rows[0].a), *problem.rows[1:])),
-        replace(problem, biases=(replace(problem.biases[0], coefficient=-problem.biases[0].coefficient), *problem.biases[1:])),
+        replace(
+            problem,
+            biases=(replace(problem.biases[0], coefficient=-problem.biases[0].coefficient), *problem.biases[1:]),
+        ),
     ]
     assert len({problem.structure, *(p.structure for p in changed)}) == len(changed) + 1
     for other in changed:
@@ -220,7 +225,9 @@ def alone(problem, k):
     """The problem of one epoch, posed by hand."""
     s = problem.stations
     moving = len(s.position) > 1
-    stations = replace(s, position=s.position[k : k + 1] if moving else s.position, axes=s.axes[k : k + 1] if moving else None)
+    stations = replace(
+        s, position=s.position[k : k + 1] if moving else s.position, axes=s.axes[k : k + 1] if moving else None
+    )
     parts, kept = [], []
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         inner = np.flatnonzero((rows.epoch == k) & (rows.weight > 0))
@@ -262,7 +269,9 @@ def test_batches_of_many_epochs_and_priors_split_too():
     fix = solve(several)
     assert fix.shape == (2, K)
     assert np.array_equal(fix.x[0], fix.x[1], equal_nan=True)
-    held = replace(several, priors=(Prior("position", np.stack([path.mean(0), path.mean(0) + 40.0]), np.stack([spread] * 2)),))
+    held = replace(
+        several, priors=(Prior("position", np.stack([path.mean(0), path.mean(0) + 40.0]), np.stack([spread] * 2)),)
+    )
     fixed = solve(held)
     assert fixed.shape == (2, K)
     for i in range(2):
@@ -306,7 +315,9 @@ def test_known_targets_and_velocities_follow_their_epoch():
     stations = Stations(place, tuple("abcdef"), rates)
     problem = assemble(
         stations,
-        measured("fdoa", np.zeros(8), a=[1, 2, 3, 4] * 2, b=0, epoch=[0] * 4 + [1] * 4, target=[0, 0, 1, 1] * 2, sigma=1.0),
+        measured(
+            "fdoa", np.zeros(8), a=[1, 2, 3, 4] * 2, b=0, epoch=[0] * 4 + [1] * 4, target=[0, 0, 1, 1] * 2, sigma=1.0
+        ),
         motions=(Motion(1, span="epoch"), Motion(1, known=known)),
     )
     split = by_epoch(problem)

@@ -105,7 +105,17 @@ def angles_first(d):
 
 SHAPES = [ring, all_pairs, arrivals, tree, toa, odd_sums, even_sums, sums_and_differences, ranged, everything]
 SHAPES += [with_angles, angles_first]
-FREE = {"ring", "all_pairs", "arrivals", "tree", "toa", "even_sums", "sums_and_differences", "with_angles", "angles_first"}
+FREE = {
+    "ring",
+    "all_pairs",
+    "arrivals",
+    "tree",
+    "toa",
+    "even_sums",
+    "sums_and_differences",
+    "with_angles",
+    "angles_first",
+}
 
 
 def start(problem):
@@ -252,9 +262,7 @@ def test_priors_on_the_position_stay():
 # ----------------------------------------------------------------------------- what must be refused, not reduced
 def test_a_moving_target_has_other_ranges_at_each_epoch():
     a, epoch = np.tile(np.arange(6), 4), np.repeat(np.arange(4), 6)
-    problem = assemble(
-        STATIONS[2], measured("tdoa", a=a, b=(a + 1) % 6, epoch=epoch, sigma=3.0), motions=(Motion(1),)
-    )
+    problem = assemble(STATIONS[2], measured("tdoa", a=a, b=(a + 1) % 6, epoch=epoch, sigma=3.0), motions=(Motion(1),))
     drawn = simulate(problem, np.r_[TARGET[2], RATE[2]], 3)
     x, cov, _ = polish(drawn, np.r_[TARGET[2], RATE[2]])
     try:

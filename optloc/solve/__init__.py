@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 
 from optloc.epochs import by_epoch, separable
+from optloc.errors import InvalidProblem
 from optloc.fix import Fix
 from optloc.problem import Problem
 from optloc.solve.catalogue import FORMULATIONS, METHODS, SOLVERS, stages_of
 from optloc.solve.stages import given
+from optloc.types import Array
 
 __all__ = ["FORMULATIONS", "METHODS", "SOLVERS", "solve"]
 
@@ -43,9 +45,19 @@ def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
     shape, flat = problem.batch_shape, problem.flat()
     fix = None
     if start is not None:
-        vector = np.broadcast_to(np.asarray(start, dtype=float), (*shape, problem.layout.size))
-        fix = given(flat, vector.reshape(-1, problem.layout.size))
+        fix = given(flat, _started(problem, start).reshape(-1, problem.layout.size))
     for stage in stages:
         fix = stage.solver(flat, fix)
     assert fix is not None
     return fix.reshape(shape) if shape != (len(fix),) else fix
+
+
+def _started(problem: Problem, start: Any) -> Array:
+    """Return a starting vector for every problem, (..., size)."""
+    vector, wanted = np.asarray(start, dtype=float), (*problem.batch_shape, problem.layout.size)
+    try:
+        return np.broadcast_to(vector, wanted)
+    except ValueError:
+        raise InvalidProblem(
+            f"start has shape {vector.shape}, not {wanted}", "start", "order it by the layout"
+        ) from None

@@ -55,7 +55,7 @@ def nlp(problem: Problem, fix: Fix | None) -> Fix:
     if len(item):
         code[item, slot] = _stationary(problem.take(item), x[item, slot], code[item, slot])
     stage = Stage("nlp", f"{len(item)} programs", perf_counter() - began)
-    return finished(problem, fix, Candidates(x, cost, code), stage)
+    return finished(problem, fix, Candidates(x, cost, code, np.zeros(cost.shape, dtype=int)), stage)
 
 
 def _stationary(problem: Problem, x: Array, code: Array) -> Array:

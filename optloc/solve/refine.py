@@ -164,7 +164,7 @@ def _advance(part: _Part, state: _State, active: Array, rules: _Rules, iteration
     rounding = 1e-13 * (1.0 + now.cost)
     better = solvable & np.isfinite(after.cost) & ((achieved >= -rounding) if rules.damped else True)
     state.iterations[active] = iteration + 1
-    small = solvable & (np.abs(gain) * (1.0 + damping) <= rules.tolerance**2)
+    small = solvable & (np.abs(gain) * (1.0 + damping) <= np.maximum(rules.tolerance**2, rounding))
     _keep(state, active, better, x, after)
     ratio = achieved / np.where(gain > 0.0, gain, 1.0)
     factor = np.maximum(1.0 / 3.0, 1.0 - (2.0 * np.clip(ratio, 0.0, 1.0) - 1.0) ** 3)

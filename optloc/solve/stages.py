@@ -8,11 +8,13 @@ from time import perf_counter
 import numpy as np
 
 from optloc import linalg
+from optloc.constraints import exact
 from optloc.errors import InvalidProblem
 from optloc.fix import Alternatives, Fix, Stage
 from optloc.noise import whiten
 from optloc.normal import Normal
 from optloc.problem import Problem
+from optloc.solve.bounded import bounded
 from optloc.solve.pieces import from_pieces, one_position
 from optloc.solve.refine import equations_at, refine
 from optloc.solve.squared import Pick, every, hull, minimum, shor
@@ -95,10 +97,15 @@ def lsr(problem: Problem, fix: Fix | None, *, damped: bool = True, limit: int = 
     detail = "nothing to refine"
     if len(item):
         whole = len(item) == len(pool) and bool((item == np.arange(len(pool))).all())
-        done = refine(problem, pool[item, slot], item=None if whole else item, damped=damped, limit=limit)
+        face = exact(problem) if damped else ()
+        own = None if whole else item
+        done = refine(problem, pool[item, slot], item=own, damped=damped, limit=limit, face=face)
         pool[item, slot], cost[item, slot], code[item, slot] = done.x, done.cost, done.status
         detail = f"{len(item)} candidates, {int(done.iterations.max())} steps at most"
-    return finished(problem, fix, Candidates(pool, cost, code), Stage("lsr", detail, perf_counter() - began))
+    candidates = Candidates(pool, cost, code, np.zeros(cost.shape, dtype=int))
+    if problem.constraints and damped:
+        candidates = bounded(problem, candidates)
+    return finished(problem, fix, candidates, Stage("lsr", detail, perf_counter() - began))
 
 
 def pooled(fix: Fix) -> tuple[Array, Array, Array]:
@@ -110,7 +117,7 @@ def pooled(fix: Fix) -> tuple[Array, Array, Array]:
 
 def finished(problem: Problem, fix: Fix, pool: Candidates, stage: Stage) -> Fix:
     """Return the judged fix of refined candidates."""
-    pool = Candidates(pool.x, np.where(np.isfinite(pool.cost), pool.cost, np.inf), pool.code)
+    pool = Candidates(pool.x, np.where(np.isfinite(pool.cost), pool.cost, np.inf), pool.code, pool.face)
     return judge(problem, pool, _equations, (*fix.stages, stage))
 
 

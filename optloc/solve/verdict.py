@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from optloc import linalg
 from optloc.fix import Alternatives, Fix, Stage
 from optloc.models import MODELS
 from optloc.noise import whiten
-from optloc.normal import Normal, marginal
+from optloc.constraints import exact, violation_names
+from optloc.normal import marginal
 from optloc.problem import Problem
+from optloc.solve.curvature import Curvature, curved, station_direction, weak_direction
 from optloc.solve.reduce import ranges
 from optloc.status import Certificate, Status
 from optloc.types import Array
@@ -69,25 +70,23 @@ def judge(problem: Problem, pool: Candidates, equations: Any, stages: tuple[Stag
         What was done so far.
     """
     size = len(pool.x)
-    x, cost, code = _sorted(pool)
-    best, code = _preferred(cost, code)
+    pool = _sorted(pool)
+    best = _preferred(pool)
     rows = np.arange(size)
-    chosen, value, status = x[rows, best], cost[rows, best], code[rows, best].astype(np.int8)
+    chosen, value, face = pool.x[rows, best], pool.cost[rows, best], pool.face[rows, best]
     found = np.isfinite(value)
     with np.errstate(all="ignore"):
         at = equations(problem, np.where(found[:, None], chosen, 0.0))
-        information, _, ok = marginal(at)
-        cov, regular = linalg.inverse(information)
-    cov = np.where((found & ok & regular)[:, None, None], cov, np.nan)
-    others = _alternatives(problem, x, cost, code, chosen, value, information)
+        curvature = curved(problem, at, chosen, np.where(found, face, 0))
+    others = _alternatives(problem, pool, chosen, value, marginal(at)[0])
     reason = np.empty(size, dtype=object)
     reason[:] = ""
     fix = Fix(
         np.where(found[:, None], chosen, np.nan),
-        cov,
+        np.where((found & curvature.regular)[:, None, None], curvature.covariance, np.nan),
         problem.layout,
         problem.frame,
-        status,
+        pool.code[rows, best].astype(np.int8),
         reason,
         _fill(size, _LOCAL),
         others,
@@ -95,35 +94,36 @@ def judge(problem: Problem, pool: Candidates, equations: Any, stages: tuple[Stag
         degrees_of_freedom(problem),
         np.broadcast_to(problem.weight, (size, problem.count)),
         stages,
+        curvature.active,
     )
-    _explain(problem, fix, information, found & ok & regular)
+    _explain(problem, fix, curvature)
     return fix
 
 
-def _sorted(pool: Candidates) -> tuple[Array, Array, Array]:
-    """Return points, costs and codes of every problem, the cheapest first."""
+def _sorted(pool: Candidates) -> Candidates:
+    """Return the candidates of every problem, the cheapest first."""
     if pool.cost.shape[1] == 1:
-        return pool.x, pool.cost, pool.code
+        return pool
     order = np.argsort(pool.cost, axis=1, kind="stable")
-    x = np.take_along_axis(pool.x, order[..., None], axis=1)
-    return x, np.take_along_axis(pool.cost, order, axis=1), np.take_along_axis(pool.code, order, axis=1)
+    cost, code, face = (np.take_along_axis(a, order, axis=1) for a in (pool.cost, pool.code, pool.face))
+    return Candidates(np.take_along_axis(pool.x, order[..., None], axis=1), cost, code, face)
 
 
-def _preferred(cost: Array, code: Array) -> tuple[Array, Array]:
+def _preferred(pool: Candidates) -> Array:
     """Return the slot to answer with: the cheapest, or a finished one that costs the same."""
-    finished = code == Status.OK
-    lowest = cost[:, :1]
-    near = finished & (cost <= lowest + 1e-6 * (1.0 + np.abs(lowest)))
-    return np.where(near.any(1), near.argmax(1), 0), code
+    finished, lowest = pool.code == Status.OK, pool.cost[:, :1]
+    with np.errstate(invalid="ignore"):
+        near = finished & (pool.cost <= lowest + 1e-6 * (1.0 + np.abs(lowest)))
+    return np.where(near.any(1), near.argmax(1), 0)
 
 
 def _alternatives(
-    problem: Problem, x: Array, cost: Array, code: Array, chosen: Array, value: Array, information: Array
+    problem: Problem, pool: Candidates, chosen: Array, value: Array, information: Array
 ) -> Alternatives:
     """Return the other finished minima within the listed gap, each once."""
-    n = problem.layout.n_shared
+    n, x = problem.layout.n_shared, pool.x
     with np.errstate(invalid="ignore"):
-        gap = np.where(code == Status.OK, cost - value[:, None], np.inf)
+        gap = np.where(pool.code == Status.OK, pool.cost - value[:, None], np.inf)
     gap = np.where(np.isfinite(gap) & (gap < LISTED_GAP), gap, np.inf)
     kept: list[tuple[Array, Array]] = [(chosen, np.full(len(x), -1.0))]
     used = np.isfinite(gap).any(0)
@@ -169,7 +169,7 @@ def degrees_of_freedom(problem: Problem) -> Array:
     unknowns = sum(slot.size for slot in layout.shared if slot.name not in known)
     heard = [bool((problem.epoch == k).any()) for k in range(problem.epochs)]
     unknowns += sum(heard) * sum(slot.size for slot in layout.local if slot.name not in known)
-    return np.broadcast_to(rank - unknowns, problem.batch_shape).astype(np.int32)
+    return np.broadcast_to(rank - unknowns + len(exact(problem)), problem.batch_shape).astype(np.int32)
 
 
 def _fill(size: int, value: Any) -> Array:
@@ -178,14 +178,14 @@ def _fill(size: int, value: Any) -> Array:
     return out
 
 
-def _explain(problem: Problem, fix: Fix, information: Array, regular: Array) -> None:
+def _explain(problem: Problem, fix: Fix, curvature: Curvature) -> None:
     """Settle the status of every fix and say why; writes into the fresh arrays of `fix`."""
     finite = np.isfinite(problem.z) | (problem.weight == 0.0)
     broken = ~np.broadcast_to(finite.all(-1), fix.code.shape)
     few = (fix.dof < 0) & ~broken
     missing = ~np.isfinite(fix.cost) & ~broken & ~few
     answered = ~(broken | few | missing)
-    weak = answered & (_weakest(information) < _WEAK) | (answered & ~regular)
+    weak = answered & ~(curvature.regular & (curvature.weakest >= _WEAK))
     far = answered & ~weak & (fix.code != Status.OK) & (_distance(problem, fix) > _FAR)
     fix.code[broken], fix.code[few], fix.code[far] = Status.REJECTED, Status.TOO_FEW_ROWS, Status.UNBOUNDED
     fix.code[weak] = Status.SINGULAR_GEOMETRY
@@ -198,14 +198,18 @@ def _explain(problem: Problem, fix: Fix, information: Array, regular: Array) -> 
     for i in np.flatnonzero(few):
         fix.reason[i] = f"there are {-int(fix.dof[i])} measurements fewer than unknowns"
     for i in np.flatnonzero(weak):
-        fix.reason[i] = weak_direction(problem, information[i])
+        fix.reason[i] = weak_direction(problem, curvature.information[i])
     for i in np.flatnonzero(fix.code == Status.AMBIGUOUS):
         fix.reason[i] = f"another position costs only {gap[i]:.2g} more"
+    barred = missing & (fix.code == Status.INFEASIBLE)
+    for i in np.flatnonzero(barred):
+        fix.reason[i] = f"no minimum of the cost meets all of: {violation_names(problem)}"
+    missing = missing & ~barred
     if missing.any():
         _explain_missing(problem, fix, np.flatnonzero(missing))
     unsure = ~np.isin(fix.code, (Status.OK, Status.AMBIGUOUS))
     fix.certificate[unsure] = _UNKNOWN
-    gone = broken | few | missing | weak
+    gone = broken | few | missing | barred | weak
     fix.x[gone & ~weak] = np.nan
     fix.cov[gone] = np.nan
 
@@ -228,16 +232,6 @@ def _explain_missing(problem: Problem, fix: Fix, items: Array) -> None:
             fix.reason[i] = station_direction(problem.take(np.array([i])))
 
 
-def _weakest(information: Array) -> Array:
-    """Return the smallest squared pivot of the information scaled to a unit diagonal, (N,)."""
-    diagonal = np.diagonal(information, axis1=-2, axis2=-1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        scale = 1.0 / np.sqrt(diagonal)
-        lower, ok = linalg.factor(information * scale[..., :, None] * scale[..., None, :])
-        pivots = np.diagonal(lower, axis1=-2, axis2=-1).min(-1) ** 2
-    return np.where(ok & np.isfinite(pivots), pivots, 0.0)
-
-
 def _distance(problem: Problem, fix: Fix) -> Array:
     """Return how far a fix is from the stations, in units of their spread."""
     if not any(slot.name == "position" for slot in problem.layout.shared):
@@ -246,40 +240,3 @@ def _distance(problem: Problem, fix: Fix) -> Array:
     centre = stations.mean(-2)
     spread = np.linalg.norm(stations - centre[..., None, :], axis=-1).max(-1)
     return np.asarray(np.linalg.norm(fix.position - centre, axis=-1) / np.where(spread > 0.0, spread, 1.0))
-
-
-def weak_direction(problem: Problem, information: Array) -> str:
-    """Return a sentence that names the combination of unknowns that the data leave open."""
-    diagonal = np.diagonal(information)
-    if not np.isfinite(information).all():
-        return "the information is not finite"
-    labels = problem.layout.labels()
-    dead = np.flatnonzero(diagonal <= 1e-300)
-    if len(dead):
-        return "nothing measures " + ", ".join(labels[i] for i in dead)
-    scale = 1.0 / np.sqrt(diagonal)
-    _, vectors = np.linalg.eigh(information * scale[:, None] * scale[None])
-    direction = vectors[:, 0] * scale
-    direction = direction / np.abs(direction).max()
-    terms = [f"{value:+.2g} {labels[i]}" for i, value in enumerate(direction) if abs(value) > 0.05]
-    return "undetermined along " + " ".join(terms)
-
-
-def station_direction(problem: Problem) -> str:
-    """Return a sentence that names why the stations of one problem cannot fix a position."""
-    position = problem.stations.position.reshape(-1, problem.dimension)
-    used = sorted({int(s) for rows in problem.rows for s in (*rows.a, *rows.b) if s >= 0})
-    places = position[used]
-    values, vectors = np.linalg.eigh(np.cov(places.T, bias=True)) if len(used) > 1 else (np.zeros(1), np.eye(1))
-    spread = np.sqrt(np.maximum(values, 0.0))
-    if spread[-1] <= 1e-9 * (1.0 + np.abs(places).max()):
-        return "the stations stand at one point"
-    flat = int((spread < 1e-6 * spread[-1]).sum())
-    axis = ", ".join(f"{v:.2f}" for v in vectors[:, -1])
-    if flat >= problem.dimension - 1 and problem.dimension > 1:
-        return f"the stations stand on one line along ({axis}); turning about it changes nothing"
-    axis = ", ".join(f"{v:.2f}" for v in vectors[:, 0])
-    return f"the rows leave more than one direction open; the stations spread least along ({axis})"
-
-
-__all__ = ["Candidates", "Normal", "degrees_of_freedom", "judge", "weak_direction"]

@@ -1,0 +1,139 @@
+r"""Semidefinite relaxation of the fix on an ellipsoid from ranges known up to one unknown.
+
+.. math:: \min_{t, \mu} \; |x(t, \mu) - \bar x|^2 + (r_1(t) - |\bar x - s_1|)^2 \quad\text{subject to}\quad
+   \mu^2 = q(t), \quad E(t) + L(t)\,\mu + \alpha\,\mu^2 = 0
+
+with :math:`x = b + p\,t + n\,\mu` (:mod:`formulations._curve`): the range equations are eliminated *before* lifting
+:math:`(1, t, \mu)` to a 3 by 3 matrix. The system is square, its points are isolated and the least-squares cost is zero
+at all of them, so the objective is a choice: :math:`\bar x` is a point near the target (the one below the satellites).
+Its second term puts the mirror point of negative range at a distance; without it the relaxation mixes the two. The
+full lift of (x, r) is never tight here. A range guess that is wrong by a factor of two loses exactness.
+
+Source: N. Z. Shor, "Quadratic optimization problems", Sov. J. Comput. Syst. Sci. 25 (1987); elimination before
+lifting is facial reduction: D. Drusvyatskiy and H. Wolkowicz, "The many faces of degeneracy in conic optimization",
+Found. Trends Optim. 3 (2017).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formulations._curve import Curve, three_stations
+from formulations.conic import Answer, Relaxation
+from formulations.ellipsoid import Ellipsoid
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Lifted:
+    """A lifted fix.
+
+    Parameters
+    ----------
+    x : Array, shape (3,)
+        Point read off the lift; on the ellipsoid only where tight. NaN where the solver gave none.
+    ranges : Array, shape (3,)
+        Ranges read off the lift.
+    bound : float
+        Lower bound of the objective over all points that fit, recomputed from the dual. It bounds no likelihood.
+    rank_ratio : float
+        Second over first eigenvalue of the lift; near zero means exact.
+    answer : Answer
+        The solver's report.
+    """
+
+    x: Array
+    ranges: Array
+    bound: float
+    rank_ratio: float
+    answer: Answer
+
+
+def lifted_problem() -> Any:
+    """Build the relaxation as a cvxpy problem.
+
+    Returns
+    -------
+    cvxpy.Problem
+        Parameters ``objective``, ``curve``, ``surface``, symmetric matrices of shape (3, 3); variable ``lift``.
+
+    Notes
+    -----
+    Shor (1987).
+    """
+    import cvxpy as cp
+
+    objective, curve, surface = (cp.Parameter((3, 3), name=name) for name in ("objective", "curve", "surface"))
+    lift = cp.Variable((3, 3), symmetric=True, name="lift")
+    zero = [cp.sum(cp.multiply(form, lift)) == 0 for form in (curve, surface)]
+    return cp.Problem(cp.Minimize(cp.sum(cp.multiply(objective, lift))), [lift >> 0, lift[0, 0] == 1, *zero])
+
+
+@lru_cache(maxsize=8)
+def _built(backend: str) -> Relaxation:
+    tight = {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11} if backend == "CLARABEL" else {}
+    return Relaxation(lifted_problem(), backend=backend, settings=tight)
+
+
+def lifted(
+    stations: Array, sign: Array, offset: Array, surface: Ellipsoid, near: Array, *, backend: str = "CLARABEL"
+) -> Lifted:
+    """Solve the relaxation.
+
+    Parameters
+    ----------
+    stations : Array, shape (3, 3)
+        Positions, one a row, numbers of order one (Earth radii).
+    sign, offset : Array, shape (3,)
+        Ranges ``sign tau + offset``, signs 1 or -1.
+    surface : Ellipsoid
+        Shape (3, 3) and centre (3,).
+    near : Array, shape (3,)
+        The point that the fix is to be near to.
+    backend : str
+        Conic solver.
+
+    Returns
+    -------
+    Lifted
+        The fix where `rank_ratio` is small. The problem is built once per back end in each process.
+
+    Notes
+    -----
+    Shor (1987) after the elimination of the ranges.
+    """
+    curve = three_stations(stations[None], np.asarray(sign, dtype=np.float64)[None], offset[None])
+    guess = float(np.linalg.norm(near - stations[0]))
+    forms, change = _forms(curve, surface, near, guess)
+    if not (curve.ok[0] and all(np.isfinite(form).all() for form in forms.values())):
+        nothing = Answer({}, np.nan, -np.inf, "not posed", solved=False, iterations=0)
+        return Lifted(np.full(3, np.nan), np.full(3, np.nan), -np.inf, np.nan, nothing)
+    scale = float(np.abs(forms["objective"]).max())
+    answer = _built(backend).solve({name: form / np.abs(form).max() for name, form in forms.items()})
+    lift, ratio = answer.values["lift"], np.nan
+    if np.isfinite(lift).all():
+        values = np.linalg.eigvalsh(lift)
+        ratio = float(abs(values[-2]) / values[-1])
+    _, t, mu = change @ lift[:, 0]
+    x = curve.points(np.array([[t]]), np.array([[mu]]))[0, 0]
+    return Lifted(x, curve.rate[0] * t + curve.offset[0], answer.bound * scale, ratio, answer)
+
+
+def _forms(curve: Curve, surface: Ellipsoid, near: Array, guess: float) -> tuple[dict[str, Array], Array]:
+    """Quadratic forms in (1, t, mu), referred to the guess and in units of it, and what undoes that."""
+    E, L, alpha = (v[0] for v in curve.on_ellipsoid(surface.shape[None], surface.centre[None]))
+    q, rate, offset = curve.square[0], curve.rate[0, 0], curve.offset[0, 0]
+    on_surface = 0.5 * np.array([[2.0 * E[0], E[1], L[0]], [E[1], 2.0 * E[2], L[1]], [L[0], L[1], 2.0 * alpha]])
+    on_curve = -0.5 * np.array([[2.0 * q[0], q[1], 0.0], [q[1], 2.0 * q[2], 0.0], [0.0, 0.0, -2.0]])
+    away = np.stack([curve.base[0] - near, curve.along[0], curve.across[0]], axis=1)
+    late = np.array([offset - guess, rate, 0.0])
+    change = np.diag([1.0, guess / rate, guess])
+    change[1, 0] = (guess - offset) / rate
+    forms = {"objective": away.T @ away + np.outer(late, late), "curve": on_curve, "surface": on_surface}
+    return {name: change.T @ form @ change for name, form in forms.items()}, change
