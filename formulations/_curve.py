@@ -5,8 +5,8 @@ r"""Curves on which a point has measured ranges, as conics in their own plane.
 Three stations whose ranges are known up to one unknown: squared and subtracted, :math:`r_i = \sigma_i r_1 + e_i`
 gives :math:`2 a_i^\top (x - s_1) = |a_i|^2 - e_i^2 - 2 \sigma_i e_i r_1` with :math:`a_i = s_i - s_1`; `n` is the unit
 normal of the plane of the stations and `t` is :math:`r_1`, shifted and scaled so that `p` is at most a unit long and
-`b` near the stations (nearly collinear stations make both huge otherwise). Two stations of known range: a circle about their line, `t`
-and :math:`\mu` being cosine and sine.
+`b` near the stations (nearly collinear stations make both huge otherwise). Two stations of known range: a circle
+about their line, `t` and :math:`\mu` being cosine and sine.
 
 Source: K. C. Ho and Y. T. Chan, "Geolocation of a known altitude object from TDOA and FDOA measurements", IEEE Trans.
 Aerosp. Electron. Syst. 33 (1997), section III (the elimination).
@@ -178,7 +178,7 @@ def two_stations(stations: Array, ranges: Array, towards: Array) -> Curve:
 
 
 def _perpendicular(axis: Array, hint: Array) -> Array:
-    """Unit vector normal to the axis, towards the hint where that is off the axis."""
+    """Find the unit vector normal to the axis, towards the hint where that is off the axis."""
     least = np.eye(3)[np.argmin(np.abs(axis), axis=-1)]
     off = hint - axis * _dot(axis, hint)[:, None]
     weak = _dot(off, off) <= 1e-12 * _dot(hint, hint)

@@ -139,7 +139,8 @@ def _flat(value: ArrayLike, last: tuple[int, ...], lead: tuple[int, ...]) -> Arr
 
 def _shaped(found: Candidates, lead: tuple[int, ...]) -> Candidates:
     """Give the batch axis its shape back."""
-    return Candidates(*(v.reshape(*lead, *v.shape[1:]) for v in (found.x, found.ranges, found.valid)))
+    x, ranges = (v.reshape(*lead, *v.shape[1:]) for v in (found.x, found.ranges))
+    return Candidates(x, ranges, found.valid.reshape(*lead, _SLOTS))
 
 
 def _meet(curve: Curve, stations: Array, A: Array, centre: Array, *, positive: bool) -> Candidates:
@@ -201,7 +202,7 @@ def _times(a: Array, b: Array) -> Array:
 
 
 def _roots(c: Array) -> Array:
-    """The four complex roots."""
+    """Find the four complex roots."""
     c = np.where(np.isfinite(c).all(axis=-1, keepdims=True), c, [1.0, 0.0, 0.0, 0.0, 1.0])
     size = np.max(np.abs(c), axis=-1)
     c = c / np.where(size > 0.0, size, 1.0)[:, None]
@@ -214,7 +215,7 @@ def _roots(c: Array) -> Array:
 
 
 def _starts(square: Array, E: Array, L: Array, alpha: Array) -> tuple[Array, Array]:
-    """Starts near every real intersection, two slots a root; NaN where there is nothing to start from."""
+    """Find starts near every real intersection, two slots a root; NaN where there is nothing to start from."""
     roots = _roots(quartic(square, E, L, alpha))
     t = np.tile(roots.real, 2)
     # a pair that has just left the real axis may be a double root

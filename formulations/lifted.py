@@ -1,0 +1,191 @@
+r"""Lifted ranges, the textbook forms: **baselines of studies, never a default**.
+
+Ranges :math:`r_i = |x - s_i|` become unknowns of their own, so that rows linear in ranges are linear:
+
+.. math:: \min_{x, r \ge 0} \; |K r - z|^2 \quad\text{subject to}\quad r_i^2 = |x - s_i|^2, \quad i = 1..M,
+
+with whitened rows `K` (ranges: a scaled identity; range differences: rows :math:`e_a - e_b`; sums: :math:`e_a +
+e_b`).
+
+*Order one.* :math:`Y = (1, x, r)(1, x, r)^\top` relaxed to :math:`Y \succeq 0`; the equalities are linear in `Y`. For
+range differences it is **never tight** where the residual is not zero: adding :math:`t \, 1 1^\top` to the block of
+:math:`r r^\top` costs nothing, which leaves the squared system with its reference range free. The value is then near
+zero, and the point read off is no fix. It is kept to show exactly that.
+
+*Nonlinear.* The same problem for IPOPT, with `r` as unknowns: no better than the problem in `x` alone, and a local
+method like it.
+
+Sources: K. Yang, G. Wang and Z.-Q. Luo, "Efficient convex relaxation methods for robust target localization by a
+sensor network using time differences of arrivals", IEEE Trans. Signal Process. 57 (2009) (the lift, which they
+penalise); K. W. Cheung, W.-K. Ma and H. C. So, "Accurate approximation algorithm for TOA-based maximum likelihood
+mobile location using semidefinite programming", ICASSP 2004.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from formulations.conic import Answer, Relaxation
+from formulations.nls import Local, Program
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Lifted:
+    """What the order-one relaxation says.
+
+    Parameters
+    ----------
+    point : Array, shape (d,)
+        Position read off the first column.
+    ranges : Array, shape (M,)
+        Ranges read off the first column; not the distances of `point` where the relaxation is loose.
+    value, bound : float
+        Optimum, and a lower bound of the ML cost ``|K r(x) - z|^2`` recomputed from the dual.
+    rank_ratio : float
+        Second over first eigenvalue of the lift.
+    answer : Answer
+        The solver's report.
+    """
+
+    point: Array
+    ranges: Array
+    value: float
+    bound: float
+    rank_ratio: float
+    answer: Answer
+
+
+def lifted_problem(count: int, dim: int) -> Any:
+    """Build the order-one relaxation as a cvxpy problem: a baseline, never a default.
+
+    Parameters
+    ----------
+    count, dim : int
+        M stations in d dimensions.
+
+    Returns
+    -------
+    cvxpy.Problem
+        Variable ``lift`` of shape (1 + d + M, 1 + d + M), ordered (1, x, r); parameters ``gram`` (1 + M, 1 + M), the
+        products of ``[-z, K]``, ``station`` (M, d) and ``square`` (M,), the stations' squared lengths.
+
+    Notes
+    -----
+    Yang, Wang and Luo (2009), without their penalty.
+    """
+    import cvxpy as cp
+
+    size, first = 1 + dim + count, 1 + dim
+    lift = cp.Variable((size, size), symmetric=True, name="lift")
+    gram = cp.Parameter((1 + count, 1 + count), name="gram")
+    station, square = cp.Parameter((count, dim), name="station"), cp.Parameter(count, name="square")
+    x, r, diagonal = lift[0, 1:first], lift[0, first:], cp.diag(lift)
+    value = gram[0, 0] + 2 * gram[0, 1:] @ r + cp.sum(cp.multiply(gram[1:, 1:], lift[first:, first:]))
+    rules = [
+        lift >> 0,
+        lift[0, 0] == 1,
+        diagonal[first:] == cp.sum(diagonal[1:first]) - 2 * station @ x + square,
+        r >= 0,
+    ]
+    return cp.Problem(cp.Minimize(value), rules)
+
+
+@lru_cache(maxsize=16)
+def _built(count: int, dim: int, backend: str) -> Relaxation:
+    tight = {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9, "tol_feas": 1e-9} if backend == "CLARABEL" else {}
+    return Relaxation(lifted_problem(count, dim), backend=backend, settings=tight)
+
+
+def lifted_ranges(
+    rows: ArrayLike, right: ArrayLike, station: ArrayLike, *, reach: float = 10.0, backend: str = "CLARABEL"
+) -> Lifted:
+    """Solve the order-one relaxation: a baseline, never a default.
+
+    Parameters
+    ----------
+    rows : array_like, shape (q, M)
+        Whitened K.
+    right : array_like, shape (q,)
+        Whitened z.
+    station : array_like, shape (M, d)
+        Positions, numbers of order one.
+    reach : float
+        Largest ``|(x, r)|`` of the points that the bound is for.
+    backend : str
+        Conic solver.
+
+    Returns
+    -------
+    Lifted
+        Point and bound; see the module's text for what they are worth.
+
+    Notes
+    -----
+    Yang, Wang and Luo (2009). Built once per size and back end in each process.
+    """
+    K, z, S = (np.asarray(part, dtype=np.float64) for part in (rows, right, station))
+    count, dim = S.shape
+    table = np.concatenate([-z[:, None], K], axis=1)
+    size = float(np.abs(K).max()) or 1.0
+    relaxation = _built(count, dim, backend)
+    relaxation.radius = 1.0 + reach**2
+    values = {"gram": table.T @ table / size**2, "station": S, "square": (S * S).sum(axis=1)}
+    answer = relaxation.solve(values)
+    lift, ratio = answer.values["lift"], np.nan
+    if np.isfinite(lift).all():
+        found = np.linalg.eigvalsh(lift)
+        ratio = float(abs(found[-2]) / found[-1])
+    point, ranges = lift[0, 1 : 1 + dim].copy(), lift[0, 1 + dim :].copy()
+    return Lifted(point, ranges, answer.primal * size**2, max(answer.bound, 0.0) * size**2, ratio, answer)
+
+
+@lru_cache(maxsize=16)
+def _program(count: int, dim: int, measured: int) -> Program:
+    """Program with unknowns (x, r) and parameters: the stations, then the rows K, both row by row."""
+
+    def residual(y: Any, p: Any, z: Any) -> list[Any]:
+        at = count * dim
+        return [z[k] - sum(p[at + count * k + i] * y[dim + i] for i in range(count)) for k in range(measured)]
+
+    def equalities(y: Any, p: Any) -> list[Any]:
+        return [y[dim + i] ** 2 - sum((y[j] - p[dim * i + j]) ** 2 for j in range(dim)) for i in range(count)]
+
+    return Program(dim + count, measured, count * (dim + measured), residual=residual, equalities=equalities)
+
+
+def lifted_program(rows: ArrayLike, right: ArrayLike, station: ArrayLike, start: ArrayLike) -> Local:
+    """Solve the lifted problem locally with IPOPT: a baseline, never a default.
+
+    Parameters
+    ----------
+    rows : array_like, shape (q, M)
+        Whitened K.
+    right : array_like, shape (q,)
+        Whitened z.
+    station : array_like, shape (M, d)
+        Positions, numbers of order one.
+    start : array_like, shape (d,)
+        First position; the ranges start at its distances.
+
+    Returns
+    -------
+    Local
+        ``x`` is (x, r), of length d + M.
+
+    Notes
+    -----
+    Cheung, Ma and So (2004) state the problem. Built once per size in each process.
+    """
+    K, z, S, x = (np.asarray(part, dtype=np.float64) for part in (rows, right, station, start))
+    count, dim = S.shape
+    first = np.concatenate([x, np.sqrt(((x - S) ** 2).sum(axis=1))])
+    lower = np.concatenate([np.full(dim, -np.inf), np.zeros(count)])
+    given = np.concatenate([S.ravel(), K.ravel()])
+    return _program(count, dim, len(z)).solve(first, z, p=given, lower=lower)

@@ -1,0 +1,326 @@
+r"""Bearings with bounded errors: cones, their common points, and the fix whose worst angle is least.
+
+The angle between p - S_i and the measured unit direction :math:`u_i` is at most :math:`\theta_i < \pi/2` exactly if
+
+.. math:: |T_i (p - S_i)| \le \tan(\theta_i) \, u_i^\top (p - S_i), \qquad T_i^\top T_i = I - u_i u_i^\top,
+
+a second-order cone that no point behind the station satisfies. A ball of radius r about p lies in it exactly if
+:math:`|T_i (p - S_i)| + r / \cos\theta_i \le \tan(\theta_i) u_i^\top (p - S_i)`, so one problem,
+
+.. math:: \max_{p,\, r \le 1} \; r \quad\text{subject to these N cones},
+
+tells whether the cones meet (:math:`r \ge 0`), gives the centre of the largest inscribed ball, and otherwise, from
+its dual, multipliers that prove that they do not. With :math:`\theta_i = t \sigma_i` the set grows with t (the worst
+scaled angle is quasi-convex): bisection on t, helped by the angles really attained, finds the global minimax fix.
+
+Sources: M. S. Lobo, L. Vandenberghe, S. Boyd and H. Lebret, "Applications of second-order cone programming", Linear
+Algebra Appl. 284 (1998); F. Kahl and R. Hartley, "Multiple-view geometry under the L-infinity norm", IEEE Trans.
+Pattern Anal. Mach. Intell. 30 (2008).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from formulations.conic import Answer, Relaxation
+
+Array = NDArray[np.float64]
+
+_WIDEST = 0.5 * np.pi - 0.01  # largest half-angle that is handled as a cone, radians
+_RADIUS = 1e3  # distance, in the caller's scaled units, within which a proof of emptiness is asked for
+_EXACT = 1e-6  # level, in the caller's sigma, that counts as zero
+_SOLVED = ("solved", "almostsolved", "optimal", "optimal_inaccurate")
+_UNBOUNDED = ("dualinfeasible", "almostdualinfeasible", "unbounded", "unbounded_inaccurate")
+
+
+@dataclass(frozen=True, slots=True)
+class Common:
+    """The common points of cones.
+
+    Parameters
+    ----------
+    point : Array, shape (d,)
+        Centre of the largest ball (of radius at most one) inside all cones; where they do not meet, the point that
+        violates them least.
+    margin : float
+        Radius of that ball; negative where the cones do not meet, then the largest (distance-like) violation.
+    most : float
+        Upper bound of the margin, recomputed from the dual, over points within `_RADIUS` of the origin.
+    meet : bool or None
+        True where `point` was checked to lie in every cone; False where `most` is negative, a proof that no point
+        does; None where neither could be shown.
+    answer : Answer
+        The solver's report.
+    """
+
+    point: Array
+    margin: float
+    most: float
+    meet: bool | None
+    answer: Answer
+
+
+@dataclass(frozen=True, slots=True)
+class Minimax:
+    """The fix whose worst scaled angle is least.
+
+    Parameters
+    ----------
+    point : Array, shape (d,)
+        The fix; NaN where no point is in front of all stations.
+    level : float
+        Its worst ``angle_i / sigma_i``.
+    least : float
+        No point has a smaller one: the largest level proven empty.
+    meet : bool or None
+        As in `Common`, at the widest level.
+    solves : int
+        Cone programs solved.
+    """
+
+    point: Array
+    level: float
+    least: float
+    meet: bool | None
+    solves: int
+
+
+def ball_problem(count: int, dim: int) -> Any:
+    """Build the largest common ball of cones as a cvxpy problem.
+
+    Parameters
+    ----------
+    count, dim : int
+        N cones in d dimensions.
+
+    Returns
+    -------
+    cvxpy.Problem
+        Variables ``point`` (d,) and ``radius``; parameters ``side`` (N (d - 1), d) and ``side_at`` (N (d - 1),): rows
+        of T and their products with S; ``slope`` (N, d) and ``slope_at`` (N,): u and its product with S; each cone times
+        its own factor; ``widen`` (N,): that factor over cos(theta). Rows of zeros with ``slope_at`` negative drop one.
+
+    Notes
+    -----
+    Lobo et al. (1998).
+    """
+    import cvxpy as cp
+
+    point, radius = cp.Variable(dim, name="point"), cp.Variable(name="radius")
+    return cp.Problem(cp.Minimize(-radius), [*_cones(point, radius, count, dim), radius <= 1.0])
+
+
+def edge_problem(count: int, dim: int) -> Any:
+    """Build the farthest common point of cones in a direction as a cvxpy problem.
+
+    Parameters
+    ----------
+    count, dim : int
+        N cones in d dimensions.
+
+    Returns
+    -------
+    cvxpy.Problem
+        Variable ``point`` minimising ``towards'point``; parameters as in `ball_problem`, without ``widen``.
+
+    Notes
+    -----
+    Lobo et al. (1998).
+    """
+    import cvxpy as cp
+
+    point, towards = cp.Variable(dim, name="point"), cp.Parameter(dim, name="towards")
+    return cp.Problem(cp.Minimize(towards @ point), _cones(point, None, count, dim))
+
+
+def _cones(point: Any, radius: Any, count: int, dim: int) -> list[Any]:
+    import cvxpy as cp
+
+    rows = dim - 1
+    side, at = cp.Parameter((count * rows, dim), name="side"), cp.Parameter(count * rows, name="side_at")
+    slope, from_ = cp.Parameter((count, dim), name="slope"), cp.Parameter(count, name="slope_at")
+    off, reach = side @ point - at, slope @ point - from_
+    if radius is not None:
+        reach = reach - cp.Parameter(count, name="widen") * radius
+    return [cp.SOC(reach[i], off[i * rows : (i + 1) * rows]) for i in range(count)]
+
+
+@lru_cache(maxsize=32)
+def _built(kind: str, count: int, dim: int, backend: str) -> Relaxation:
+    tight = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10} if backend == "CLARABEL" else {}
+    if kind == "edge":
+        return Relaxation(edge_problem(count, dim), backend=backend, settings=tight)
+    # (p, 0) is feasible for every common point p: emptiness is proven for all p with |p| <= radius (1 + ..)
+    return Relaxation(ball_problem(count, dim), backend=backend, settings=tight, radius=_RADIUS)
+
+
+def common(direction: ArrayLike, station: ArrayLike, bound: ArrayLike, *, backend: str = "CLARABEL") -> Common:
+    """Do the cones meet, and where is their middle?
+
+    Parameters
+    ----------
+    direction : array_like, shape (N, d)
+        Measured unit directions.
+    station : array_like, shape (N, d)
+        Positions, numbers of order one.
+    bound : array_like, shape (N,)
+        Largest possible angle to the true direction, radians, positive and below pi/2; infinite drops a cone.
+    backend : str
+        Conic solver; other ones than Clarabel prove nothing.
+
+    Returns
+    -------
+    Common
+        Verdict, centre and margin.
+
+    Notes
+    -----
+    The module's text.
+    """
+    u, S, theta = (np.asarray(part, dtype=np.float64) for part in (direction, station, bound))
+    relaxation = _built("ball", *u.shape, backend)
+    answer = relaxation.solve(_data(u, S, theta, ball=True))
+    point, margin = answer.values["point"], -answer.primal
+    inside = bool((angles(point, u, S) <= theta).all())
+    meet = True if inside else (False if -answer.bound < 0.0 else None)
+    return Common(point, margin, -answer.bound, meet, answer)
+
+
+def extent(
+    direction: ArrayLike, station: ArrayLike, bound: ArrayLike, towards: ArrayLike, *, backend: str = "CLARABEL"
+) -> Array:
+    """How far do the common points of the cones reach?
+
+    Parameters
+    ----------
+    direction, station, bound, backend
+        As in `common`.
+    towards : array_like, shape (K, d)
+        Directions asked for.
+
+    Returns
+    -------
+    Array, shape (K,)
+        Upper bounds of ``towards'p`` over the set, recomputed from the dual and attained up to the solver's accuracy;
+        infinite where the set is not bounded, NaN where it is empty or the solver failed.
+
+    Notes
+    -----
+    Lobo et al. (1998).
+    """
+    u, S, theta = (np.asarray(part, dtype=np.float64) for part in (direction, station, bound))
+    relaxation, data = _built("edge", *u.shape, backend), _data(u, S, theta, ball=False)
+    out = []
+    for line in np.asarray(towards, dtype=np.float64):
+        answer = relaxation.solve({**data, "towards": -line})
+        if answer.status.lower() in _UNBOUNDED:
+            out.append(np.inf)
+        else:
+            known = answer.status.lower() in _SOLVED
+            out.append((-answer.bound if np.isfinite(answer.bound) else -answer.primal) if known else np.nan)
+    return np.array(out)
+
+
+def minimax(
+    direction: ArrayLike,
+    station: ArrayLike,
+    sigma: ArrayLike,
+    *,
+    tolerance: float = 1e-4,
+    most: int = 60,
+    backend: str = "CLARABEL",
+) -> Minimax:
+    """Find the point whose largest scaled angle to the bearings is least, over all points.
+
+    Parameters
+    ----------
+    direction, station, backend
+        As in `common`.
+    sigma : array_like, shape (N,)
+        Scale of each angle, radians; infinite drops a bearing.
+    tolerance : float
+        Relative width of the bracket at which to stop.
+    most : int
+        Largest number of cone programs.
+
+    Returns
+    -------
+    Minimax
+        Fix, level, and the level proven empty.
+
+    Notes
+    -----
+    Kahl and Hartley (2008), bisection; a level is raised from below only by a proof.
+    """
+    u, S, scale = (np.asarray(part, dtype=np.float64) for part in (direction, station, sigma))
+    level, low = _WIDEST / float(scale[np.isfinite(scale)].min()), 0.0
+    found = _at(u, S, scale, level, backend)
+    if not found.meet:
+        nowhere = level if found.meet is False else 0.0
+        return Minimax(np.full(u.shape[1], np.nan), np.inf, nowhere, found.meet, 1)
+    point, solves = found.point, 1
+    level = float((angles(point, u, S) / scale).max())
+    while level - low > tolerance * level and level > _EXACT and solves < most:
+        middle = 0.5 * (low + level)
+        found, solves = _at(u, S, scale, middle, backend), solves + 1
+        if found.meet:
+            point, level = found.point, float((angles(found.point, u, S) / scale).max())
+        elif found.meet is False:
+            low = middle
+        else:
+            break
+    return Minimax(point, level, low, True, solves)
+
+
+def angles(point: Array, direction: Array, station: Array) -> Array:
+    """Return the angles between measured directions and a point.
+
+    Parameters
+    ----------
+    point : Array, shape (d,)
+        Target.
+    direction, station : Array, shape (N, d)
+        Unit vectors and positions.
+
+    Returns
+    -------
+    Array, shape (N,)
+        Radians, from 0 to pi.
+
+    Notes
+    -----
+    W. Kahan's form: accurate for small and for nearly opposite directions.
+    """
+    line = point - station
+    line = line / np.linalg.norm(line, axis=1, keepdims=True)
+    away, along = np.linalg.norm(line - direction, axis=1), np.linalg.norm(line + direction, axis=1)
+    return np.asarray(2.0 * np.arctan2(away, along))
+
+
+def _at(u: Array, S: Array, scale: Array, level: float, backend: str) -> Common:
+    theta = np.where(np.isfinite(scale), np.minimum(level * scale, _WIDEST), np.inf)
+    return common(u, S, theta, backend=backend)
+
+
+def _data(u: Array, S: Array, theta: Array, *, ball: bool) -> dict[str, Array]:
+    """Parameters of the two problems; a cone is divided by 1 / cos where it is wide, so that numbers stay small."""
+    count, dim = u.shape
+    kept = np.isfinite(theta)
+    half = np.where(kept, theta, 0.0)
+    # the complement of u: the last left singular vectors of a column
+    side = np.linalg.svd(u[:, :, None])[0][:, :, 1:].transpose(0, 2, 1)
+    side = np.where(kept[:, None, None], np.cos(half)[:, None, None] * side, 0.0)
+    slope = np.where(kept, np.sin(half), 0.0)[:, None] * u
+    at = (slope * S).sum(axis=1)
+    data = {
+        "side": side.reshape(-1, dim),
+        "side_at": np.einsum("nrd,nd->nr", side, S).ravel(),
+        "slope": slope,
+        "slope_at": np.where(kept, at, -1.0),
+    }
+    return {**data, "widen": np.where(kept, 1.0, 0.0)} if ball else data
