@@ -13,8 +13,8 @@ A target :math:`p(t) = \sum_k c_k t^k` meets, exactly and linearly in c,
 
 with :math:`e_1, e_2` normal to u; for angle errors :math:`\sigma_1, \sigma_2` and path error :math:`\sigma_l` the rows
 have the deviations :math:`r \sigma_1`, :math:`r \sigma_2` and, to first order, :math:`\sigma_l |p - A| / L`. The second
-order, :math:`r \delta^2 / 2` for an angle error :math:`\delta`, must be added to the last: a path weighted too well turns
-the errors of u in its row into information about the direction.
+order, :math:`r \delta^2 / 2` for an angle error :math:`\delta`, must be added to the last: a path weighted too
+well turns the errors of u in its row into information about the direction.
 
 Source: M. I. Skolnik, "An analysis of bistatic radar", IRE Trans. Aerosp. Navig. Electron. ANE-8 (1961) (the ellipse);
 the linear rows are its polar equation.
@@ -232,7 +232,7 @@ def _fit(normals: Array, right: Array, powers: Array, weight: Array) -> tuple[Ar
     good = np.isfinite(rows).all(axis=(-2, -1))
     rows = np.where(good[:, None, None], rows, 0.0)
     rows = np.pad(rows, ((0, 0), (0, max(0, n + 1 - rows.shape[1])), (0, 0)))
-    triangle = np.linalg.qr(rows, mode="r")[:, :n]
+    triangle = np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)[:, :n]
     U, size, V = np.linalg.svd(triangle[..., :n])
     good &= size[:, -1] > _RANK * size[:, 0]
     inverse = np.where(good[:, None], 1.0 / np.where(good[:, None], size, 1.0), 0.0)

@@ -74,7 +74,8 @@ def lifted_problem(count: int, dim: int) -> Any:
     -------
     cvxpy.Problem
         Variable ``lift`` of shape (1 + d + M, 1 + d + M), ordered (1, x, r); parameters ``gram`` (1 + M, 1 + M), the
-        products of ``[-z, K]``, ``station`` (M, d) and ``square`` (M,), the stations' squared lengths.
+        products of ``[-z, K]``; ``station`` (M, d) and ``square`` (M,), the stations' squared lengths; ``reach``, the
+        largest ``|x|^2``, without which range differences leave the lift unbounded.
 
     Notes
     -----
@@ -86,6 +87,7 @@ def lifted_problem(count: int, dim: int) -> Any:
     lift = cp.Variable((size, size), symmetric=True, name="lift")
     gram = cp.Parameter((1 + count, 1 + count), name="gram")
     station, square = cp.Parameter((count, dim), name="station"), cp.Parameter(count, name="square")
+    reach = cp.Parameter(name="reach")
     x, r, diagonal = lift[0, 1:first], lift[0, first:], cp.diag(lift)
     value = gram[0, 0] + 2 * gram[0, 1:] @ r + cp.sum(cp.multiply(gram[1:, 1:], lift[first:, first:]))
     rules = [
@@ -93,6 +95,7 @@ def lifted_problem(count: int, dim: int) -> Any:
         lift[0, 0] == 1,
         diagonal[first:] == cp.sum(diagonal[1:first]) - 2 * station @ x + square,
         r >= 0,
+        cp.sum(diagonal[1:first]) <= reach,
     ]
     return cp.Problem(cp.Minimize(value), rules)
 
@@ -117,7 +120,7 @@ def lifted_ranges(
     station : array_like, shape (M, d)
         Positions, numbers of order one.
     reach : float
-        Largest ``|(x, r)|`` of the points that the bound is for.
+        Largest ``|x|`` allowed.
     backend : str
         Conic solver.
 
@@ -135,8 +138,9 @@ def lifted_ranges(
     table = np.concatenate([-z[:, None], K], axis=1)
     size = float(np.abs(K).max()) or 1.0
     relaxation = _built(count, dim, backend)
-    relaxation.radius = 1.0 + reach**2
-    values = {"gram": table.T @ table / size**2, "station": S, "square": (S * S).sum(axis=1)}
+    square = (S * S).sum(axis=1)
+    relaxation.radius = 1.0 + reach**2 + float(((reach + np.sqrt(square)) ** 2).sum())
+    values = {"gram": table.T @ table / size**2, "station": S, "square": square, "reach": np.array(reach**2)}
     answer = relaxation.solve(values)
     lift, ratio = answer.values["lift"], np.nan
     if np.isfinite(lift).all():

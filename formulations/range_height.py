@@ -228,6 +228,7 @@ def _starts(square: Array, E: Array, L: Array, alpha: Array) -> tuple[Array, Arr
 
 def _newton(t: Array, mu: Array, square: Array, E: Array, L: Array, alpha: Array) -> tuple[Array, Array]:
     """Newton's iteration on the two conics; slots that lead nowhere are caught by their residuals."""
+    go = np.isfinite(t)
     for _ in range(_NEWTON):
         one = mu * mu - _value(square, t)
         cross = L[:, :1] + L[:, 1:] * t
@@ -237,9 +238,11 @@ def _newton(t: Array, mu: Array, square: Array, E: Array, L: Array, alpha: Array
         determinant = one_t * two_mu - one_mu * two_t
         move_t = (two * one_mu - one * two_mu) / determinant
         move_mu = (one * two_t - two * one_t) / determinant
-        go = np.isfinite(move_t) & np.isfinite(move_mu)
+        go &= np.isfinite(move_t) & np.isfinite(move_mu)
         t, mu = np.where(go, t + move_t, t), np.where(go, mu + move_mu, mu)
-        if not np.any(go & (np.abs(move_t) + np.abs(move_mu) > 1e-14 * (np.abs(t) + np.abs(mu)))):
+        # a slot that has settled rests: the length of the iteration depends on its neighbours
+        go &= np.abs(move_t) + np.abs(move_mu) > 1e-14 * (np.abs(t) + np.abs(mu))
+        if not go.any():
             break
     return t, mu
 

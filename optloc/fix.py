@@ -247,6 +247,42 @@ class Fix:
         )
 
 
+def merged(fix: Fix, items: Array, other: Fix, stage: Stage) -> Fix:
+    """Return a flat batch of fixes with some of them replaced by others, and one more stage.
+
+    Parameters
+    ----------
+    fix : Fix
+        N fixes.
+    items : int array (q,)
+        Which are replaced.
+    other : Fix
+        The q fixes that take their place.
+    stage : Stage
+        What was done.
+    """
+    width = max(fix.alternatives.gap.shape[1], other.alternatives.gap.shape[1])
+    out = replace(fix, alternatives=_padded(fix.alternatives, width), stages=(*fix.stages, stage))
+    new = replace(other, alternatives=_padded(other.alternatives, width))
+
+    def pieces(f: Fix) -> list[Array]:
+        found: list[Array] = []
+        f._map(lambda array, core: found.append(array) or array)
+        return found
+
+    copies = iter([np.array(array) for array in pieces(out)])
+    out = out._map(lambda array, core: next(copies))
+    for old, fresh in zip(pieces(out), pieces(new), strict=True):
+        old[items] = fresh
+    return out
+
+
+def _padded(alternatives: Alternatives, width: int) -> Alternatives:
+    more = width - alternatives.gap.shape[1]
+    x = np.pad(alternatives.x, ((0, 0), (0, more), (0, 0)), constant_values=np.nan)
+    return Alternatives(x, np.pad(alternatives.gap, ((0, 0), (0, more)), constant_values=np.inf))
+
+
 def _as_array(value: Any) -> Array:
     if isinstance(value, np.ndarray):
         return value

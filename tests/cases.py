@@ -419,3 +419,36 @@ def random_vector(problem: Problem, seed: int = 9) -> np.ndarray:
                 else:
                     parts.append(rng.normal(0.0, size[name], slot.size))
     return np.concatenate(parts)
+
+
+def quick(problem: Problem) -> Callable[[np.ndarray], np.ndarray]:
+    """Return whitened residuals as a function of the vector: one target, one epoch, no unknown but emission."""
+    s, d, full = problem.stations, problem.dimension, dense_covariance(problem)
+    place = s.position[0]
+    rate = np.zeros_like(place) if s.velocity is None else s.velocity[0]
+    values, vectors = np.linalg.eigh(full)
+    kept = values > 1e-10 * values[-1]
+    W = (vectors[:, kept] / np.sqrt(values[kept])).T
+    z, order = problem.observed, problem.motions[0].order
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        line = x[:d] - place
+        r = np.sqrt((line * line).sum(1))
+        out = []
+        for rows in problem.rows:
+            a, b = rows.a, rows.b
+            if rows.kind == "height":
+                out.append([plain_h("height", x[:d], None, None, None, None, None, None, problem.frame)])
+            elif rows.kind == "fdoa":
+                v = x[d : 2 * d] if order else np.zeros(d)
+                slope = (line * (v - rate)).sum(1) / r
+                out.append(slope[a] - slope[b])
+            elif rows.kind in ("azimuth", "elevation"):
+                own = line[a] if s.axes is None else np.einsum("mij,mj->mi", s.axes[0][a], line[a])
+                out.append(np.arctan2(own[:, 1], own[:, 0]) if rows.kind == "azimuth" else np.arcsin(own[:, 2] / r[a]))
+            else:
+                made = {"tdoa": lambda: r[a] - r[b], "groa": lambda: r[a] / r[b], "range_sum": lambda: r[a] + r[b]}
+                out.append(made.get(rows.kind, lambda: r[a])() + (x[-1] if rows.kind == "toa" else 0.0))
+        return W @ wrapped(problem, z - np.concatenate(out))
+
+    return residual

@@ -14,12 +14,12 @@ from optloc.noise import Block, Noise
 STARTED = sorted(name for name, case in CASES.items() if case.start)
 FLAT = [name for name in STARTED if "height" not in name]  # a height is measured from the Earth, which does not turn
 seeds = st.integers(0, 10**6)
-few = settings(max_examples=3)
+few = settings(max_examples=2)
 
 
 def redrawn(name, seed):
     case = CASES[name]
-    return simulate(case.problem, case.truth, seed)
+    return simulate(case.problem, case.truth, seed, trials=5)
 
 
 def rotation(rng, d):
@@ -47,17 +47,18 @@ def in_frame(fix, R, shift):
     """Position and velocity of a fix, and their covariance, turned."""
     d, n = len(R), fix.layout.n_shared
     whole = np.kron(np.eye(n // d), R)
-    x = whole @ fix.x[:n]
-    x[:d] += shift
+    x = fix.x[..., :n] @ whole.T
+    x[..., :d] += shift
     return x, whole @ fix.cov @ whole.T
 
 
 def agree(fix, x, cov, cost, size=1e4, rtol=1e-6):
-    n = len(x)
-    sigma = np.sqrt(np.diag(cov))
-    assert np.all(np.abs(fix.x[:n] - x) <= 1e-9 * size + 1e-5 * sigma)
-    assert np.abs((fix.cov - cov) / sigma[:, None] / sigma).max() < 1e-5
-    assert float(fix.cost) == pytest.approx(float(cost), rel=rtol, abs=1e-6)
+    n = x.shape[-1]
+    sigma = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
+    assert np.isfinite(sigma).all()
+    assert np.all(np.abs(fix.x[..., :n] - x) <= 1e-9 * size + 1e-5 * sigma)
+    assert np.abs((fix.cov - cov) / sigma[..., :, None] / sigma[..., None, :]).max() < 1e-5
+    assert np.allclose(fix.cost, cost, rtol=rtol, atol=1e-6)
 
 
 @pytest.mark.parametrize("name", FLAT)
@@ -68,7 +69,7 @@ def test_the_fix_turns_and_shifts_with_the_scene(name, seed):
     problem = redrawn(name, seed)
     R, shift = rotation(rng, problem.dimension), rng.uniform(-2e4, 2e4, problem.dimension)
     fix, turned = solve(problem), solve(moved(problem, R, shift))
-    assert fix.status == turned.status
+    assert np.array_equal(fix.code, turned.code)
     agree(turned, *in_frame(fix, R, shift), fix.cost)
 
 
@@ -109,14 +110,14 @@ def test_names_and_order_change_nothing(name, seed):
     problem = redrawn(name, seed)
     fix = solve(problem)
     other = solve(shuffled(relabelled(problem, rng.permutation(problem.stations.count)), rng))
-    assert fix.status == other.status
-    assert fix.dof == other.dof
-    agree(other, fix.x[: fix.layout.n_shared], fix.cov, fix.cost)
+    assert np.array_equal(fix.code, other.code)
+    assert np.array_equal(fix.dof, other.dof)
+    agree(other, fix.x[..., : fix.layout.n_shared], fix.cov, fix.cost)
 
 
 @pytest.mark.parametrize("d", [2, 3])
 @given(seed=seeds, reference=st.integers(0, 5))
-@settings(max_examples=8)
+@settings(max_examples=6)
 def test_the_reference_of_differences_does_not_matter(d, seed, reference):
     problem = redrawn(f"tdoa-{d}d", seed)
     count = len(STATIONS[d])
@@ -128,9 +129,9 @@ def test_the_reference_of_differences_does_not_matter(d, seed, reference):
         if reference:
             T[row, reference - 1] -= 1.0
     full = T @ dense_covariance(problem) @ T.T
-    changed = assemble(STATIONS[d], measured("tdoa", T @ problem.z, a=others, b=reference, covariance=full))
+    changed = assemble(STATIONS[d], measured("tdoa", problem.z @ T.T, a=others, b=reference, covariance=full))
     fix, other = solve(problem), solve(changed)
-    assert fix.status == other.status
+    assert np.array_equal(fix.code, other.code)
     agree(other, fix.x, fix.cov, fix.cost)
     assert np.allclose(crlb(problem, TARGET[d]), crlb(changed, TARGET[d]), rtol=1e-9)
 
@@ -153,9 +154,9 @@ def test_the_unit_of_length_does_not_matter(name, seed, unit):
         noise=Noise((Block(np.arange(problem.count)[None], full[None]),)),
     )
     fix, other = solve(problem), solve(scaled)
-    assert fix.status == other.status
+    assert np.array_equal(fix.code, other.code)
     n = fix.layout.n_shared
-    agree(other, fix.x[:n] * unit, fix.cov * unit**2, fix.cost, size=1e4 * unit)
+    agree(other, fix.x[..., :n] * unit, fix.cov * unit**2, fix.cost, size=1e4 * unit)
 
 
 @pytest.mark.parametrize("name", STARTED)
@@ -163,7 +164,7 @@ def test_a_batch_is_its_problems_one_by_one(name):
     case = CASES[name]
     many = simulate(case.problem, case.truth, 77, trials=12)
     fix = solve(many)
-    for i in range(12):
+    for i in (0, 5, 11):
         alone = solve(case.problem.with_rows(z=many.z[i]))
         assert alone.status == fix.code[i]
         assert fix[i].status == alone.status

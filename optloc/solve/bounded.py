@@ -7,6 +7,7 @@ import numpy as np
 from optloc.constraints import TOLERANCE, Face, exact, faces, violation
 from optloc.problem import Problem
 from optloc.solve.refine import refine
+from optloc.solve.sight import hidden
 from optloc.solve.verdict import Candidates
 from optloc.status import Status
 from optloc.types import Array
@@ -16,6 +17,8 @@ _STARTS = 3
 
 def bounded(problem: Problem, pool: Candidates) -> Candidates:
     """Return the feasible candidates of a flat batch, with those on faces added where the cheapest breaks a constraint.
+
+    A target that the Earth hides from a satellite which hears it is not feasible either.
 
     Every set of inequalities that can hold with equality together is a face. The cost is minimised on each from the
     cheapest candidates, and what is feasible competes: the cheapest satisfies the conditions of Karush, Kuhn and Tucker.
@@ -32,11 +35,10 @@ def bounded(problem: Problem, pool: Candidates) -> Candidates:
     Candidates
         Infeasible ones have infinite cost and status `infeasible`.
     """
+    broken = _broken(problem, pool)
+    if not broken.any():
+        return pool
     sides = faces(problem)
-    item, slot = np.nonzero(np.isfinite(pool.x).all(-1))
-    broken = np.zeros(pool.cost.shape, dtype=bool)
-    if len(item):
-        broken[item, slot] = violation(problem.take(item), pool.x[item, slot]) > TOLERANCE
     first = np.argmin(np.where(np.isfinite(pool.cost), pool.cost, np.inf), axis=1)
     needy = np.flatnonzero(broken[np.arange(len(first)), first])
     kept = _without(pool, broken)
@@ -56,6 +58,16 @@ def bounded(problem: Problem, pool: Candidates) -> Candidates:
         np.concatenate([kept.code, code], axis=1),
         np.concatenate([kept.face, face], axis=1),
     )
+
+
+def _broken(problem: Problem, pool: Candidates) -> Array:
+    """Return which candidates break a constraint, or stand where the Earth hides them from a satellite."""
+    broken = np.zeros(pool.cost.shape, dtype=bool)
+    item, slot = np.nonzero(np.isfinite(pool.x).all(-1))
+    if len(item) and (problem.constraints or problem.frame.geodetic):
+        part, x = problem.take(item), pool.x[item, slot]
+        broken[item, slot] = (violation(part, x) > TOLERANCE) | hidden(part, x)
+    return broken
 
 
 def _without(pool: Candidates, broken: Array) -> Candidates:
@@ -78,7 +90,8 @@ def _on_face(problem: Problem, sides: list[Face], number: int, items: Array, sta
     x = np.array(starts)
     row, slot = np.nonzero(np.isfinite(starts).all(-1))
     done = refine(problem, starts[row, slot], item=items[row], face=sides[number], limit=100)
-    inside = (violation(problem.take(items[row]), done.x) <= TOLERANCE) & np.isfinite(done.cost)
+    part = problem.take(items[row])
+    inside = (violation(part, done.x) <= TOLERANCE) & ~hidden(part, done.x) & np.isfinite(done.cost)
     x[row, slot] = done.x
     cost[row, slot] = np.where(inside, done.cost, np.inf)
     code[row, slot] = np.where(inside, done.status, np.int8(Status.INFEASIBLE))

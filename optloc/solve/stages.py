@@ -10,13 +10,16 @@ import numpy as np
 from optloc import linalg
 from optloc.constraints import exact
 from optloc.errors import InvalidProblem
-from optloc.fix import Alternatives, Fix, Stage
+from optloc.fix import Alternatives, Fix, Stage, merged
 from optloc.noise import whiten
 from optloc.normal import Normal
 from optloc.problem import Problem
 from optloc.solve.bounded import bounded
+from optloc.solve.heights import height_starts
 from optloc.solve.pieces import from_pieces, one_position
 from optloc.solve.refine import equations_at, refine
+from optloc.solve.reduce import ranges
+from optloc.solve.search import PLACES, searched_starts
 from optloc.solve.squared import Pick, every, hull, minimum, shor
 from optloc.solve.start import mirrored, squared_range_starts, static, subarray_starts, vectors
 from optloc.solve.verdict import DOUBT, Candidates, degrees_of_freedom, judge
@@ -49,7 +52,9 @@ def socp(problem: Problem, fix: Fix | None) -> Fix:
 def _squared(problem: Problem, fix: Fix | None, name: str, pick: Pick) -> Fix:
     began = perf_counter()
     if one_position(problem):
-        return _unrefined(problem, squared_range_starts(static(problem), pick), fix, name, began)
+        alone = static(problem)
+        position = np.concatenate([squared_range_starts(alone, pick), height_starts(alone, ranges(alone))], axis=1)
+        return _unrefined(problem, position, fix, name, began)
     x = from_pieces(problem, lambda piece: lsr(piece, _squared(piece, None, name, pick)))
     return _assembled(problem, x, fix, name, began)
 
@@ -87,6 +92,27 @@ def _fresh(problem: Problem, fix: Fix, seen: Array, more: Array) -> Array:
     return np.concatenate([seen, more], axis=1)
 
 
+def search(problem: Problem, fix: Fix | None) -> Fix:
+    """Return a fix whose unanswered problems were searched from many places; such answers say so in their status."""
+    if fix is None:
+        raise InvalidProblem("search fills the gaps of a fix", "method", "put it behind a refinement")
+    lost = ~fix.answered & ~np.isin(fix.code, (Status.REJECTED, Status.TOO_FEW_ROWS, Status.INFEASIBLE))
+    lost &= fix.dof >= np.where(fix.code == Status.DISCONNECTED, 1, 0)
+    items = np.flatnonzero(lost)
+    if not len(items) or not one_position(problem):
+        return fix
+    began = perf_counter()
+    part = problem.take(items)
+    found = lsr(part, _unrefined(part, searched_starts(part), fix[items], "search", began))
+    good = np.flatnonzero(found.answered)
+    found.code[found.code == Status.OK] = Status.SEARCHED
+    for i in good:
+        why = fix.reason[items[i]]
+        found.reason[i] = f"{why}; best of a search from {PLACES} places" if why else f"best of {PLACES} places"
+    stage = Stage("search", f"{len(good)} of {len(items)} found", perf_counter() - began)
+    return merged(fix, items[good], found[good], stage)
+
+
 def lsr(problem: Problem, fix: Fix | None, *, damped: bool = True, limit: int = 100) -> Fix:
     """Return the refined maximum-likelihood fix: best of all candidates of the stage before."""
     if fix is None:
@@ -103,7 +129,7 @@ def lsr(problem: Problem, fix: Fix | None, *, damped: bool = True, limit: int = 
         pool[item, slot], cost[item, slot], code[item, slot] = done.x, done.cost, done.status
         detail = f"{len(item)} candidates, {int(done.iterations.max())} steps at most"
     candidates = Candidates(pool, cost, code, np.zeros(cost.shape, dtype=int))
-    if problem.constraints and damped:
+    if damped:
         candidates = bounded(problem, candidates)
     return finished(problem, fix, candidates, Stage("lsr", detail, perf_counter() - began))
 

@@ -203,7 +203,8 @@ def _explain(problem: Problem, fix: Fix, curvature: Curvature) -> None:
         fix.reason[i] = f"another position costs only {gap[i]:.2g} more"
     barred = missing & (fix.code == Status.INFEASIBLE)
     for i in np.flatnonzero(barred):
-        fix.reason[i] = f"no minimum of the cost meets all of: {violation_names(problem)}"
+        names = violation_names(problem)
+        fix.reason[i] = f"no minimum meets all of: {names}" if names else "the Earth hides every position from a satellite"
     missing = missing & ~barred
     if missing.any():
         _explain_missing(problem, fix, np.flatnonzero(missing))

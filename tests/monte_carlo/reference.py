@@ -11,6 +11,8 @@ import numpy as np
 
 Array = np.ndarray
 TIE = 1e-6
+# Sizes of the array: by then a wave front is flat to far below any noise here, and ranges still hold their digits.
+FAR = 1e6
 
 
 @dataclass(frozen=True)
@@ -94,10 +96,10 @@ class Minimum:
     @property
     def at_infinity(self) -> Array:
         """Return where no finite point is the best one, (N,)."""
-        return self.infimum < self.cost - TIE * (1.0 + self.cost)
+        return self.infimum * (1.0 + TIE) + TIE < self.cost
 
 
-def global_minimum(model: Model, z: Array, truth: Array, seed: np.random.SeedSequence, spread: int = 27) -> Minimum:
+def global_minimum(model: Model, z: Array, truth: Array, seed: np.random.SeedSequence, spread: int = 20) -> Minimum:
     """Return the lowest of the minima next to the truth and next to `spread` points at all distances and bearings."""
     rng = np.random.default_rng(seed)
     count, d = truth.shape
@@ -108,9 +110,8 @@ def global_minimum(model: Model, z: Array, truth: Array, seed: np.random.SeedSeq
     far = 10.0 ** rng.uniform(-1.0, 1.7, (count, spread, 1))
     starts = np.concatenate([truth[:, None], centre[:, None] + way * far * size[:, None, None]], axis=1)
     item = np.repeat(np.arange(count), spread + 1)
-    x, cost, done = descend(model, z, starts.reshape(-1, d), item)
+    x, cost, done = descend(model, z, starts.reshape(-1, d), item, centre, FAR * size)
     x, cost, done = (array.reshape(count, spread + 1, *array.shape[1:]) for array in (x, cost, done))
-    done &= np.linalg.norm(x - centre[:, None], axis=-1) < 1e4 * size[:, None]
     settled = np.where(done, cost, np.inf)
     best = settled.argmin(1)[:, None]
     return Minimum(
@@ -118,41 +119,47 @@ def global_minimum(model: Model, z: Array, truth: Array, seed: np.random.SeedSeq
     )
 
 
-def descend(model: Model, z: Array, start: Array, item: Array, limit: int = 300) -> tuple[Array, Array, Array]:
-    """Return where Levenberg-Marquardt iterations end: points (K, d), costs, and which of them came to rest."""
-    x = np.array(start)
+def descend(
+    model: Model, z: Array, start: Array, item: Array, centre: Array, radius: Array, limit: int = 300
+) -> tuple[Array, Array, Array]:
+    """Return where Levenberg-Marquardt iterations end: points (K, d), costs, and which of them came to rest.
+
+    Iterations that leave the radius (N,) about the centre (N, d) are stopped there.
+    """
+    x, now = np.array(start), np.arange(len(start))
     with np.errstate(all="ignore"):
-        cost = (model.residual(x, z, item)[0] ** 2).sum(-1)
-        damping, done = np.full(len(x), 1e-3), np.zeros(len(x), dtype=bool)
-        active = np.arange(len(x))
+        w, J = model.residual(x, z, item)
+        cost = (w**2).sum(-1)
+        value, damping, done = np.array(cost), np.full(len(x), 1e-3), np.zeros(len(x), dtype=bool)
         for _ in range(limit):
-            if not len(active):
+            if not len(now):
                 break
-            move, gain = _step(model, z, x[active], item[active], damping[active])
-            after = (model.residual(x[active] + move, z, item[active])[0] ** 2).sum(-1)
-            better = after <= cost[active]
-            to = active[better]
-            x[to], cost[to] = x[to] + move[better], after[better]
-            # At the rounding floor no step is better, and the decrement says how little is left.
-            rest = gain < 1e-11 * (1.0 + 1e-2 * cost[active])
-            done[active[rest]] = True
-            damping[active] = np.where(better, np.maximum(damping[active] / 8.0, 1e-14), damping[active] * 5.0)
-            active = active[~rest & (damping[active] < 1e14)]
+            move, gain = _step(w, J, damping)
+            point = x[now] + move
+            after, slope = model.residual(point, z, item[now])
+            value = (after**2).sum(-1)
+            better = value <= cost[now]
+            to = now[better]
+            x[to], cost[to], w[better], J[better] = point[better], value[better], after[better], slope[better]
+            damping = np.where(better, np.maximum(damping / 8.0, 1e-14), damping * 5.0)
+            # At the rounding floor no step is better; the undamped step says how little is left.
+            done[now] = gain < 1e-11 * (1.0 + 1e-2 * cost[now])
+            away = np.linalg.norm(x[now] - centre[item[now]], axis=-1) > radius[item[now]]
+            going = ~done[now] & (damping < 1e12) & ~away
+            done[now[away]] = False
+            now, w, J, damping = now[going], w[going], J[going], damping[going]
     return x, np.where(np.isfinite(cost), cost, np.inf), done
 
 
-def _step(model: Model, z: Array, x: Array, item: Array, damping: Array) -> tuple[Array, Array]:
-    """Return the damped step and the squared length of the undamped one, a bound of what it can gain."""
-    w, J = model.residual(x, z, item)
+def _step(w: Array, J: Array, damping: Array) -> tuple[Array, Array]:
+    """Return the damped steps and the decrease that undamped ones promise."""
     turned = np.swapaxes(J, 1, 2)
-    normal, g = turned @ J, turned @ w[..., None]
-    scale = np.diagonal(normal, axis1=1, axis2=2) + 1e-300
-    g = g[..., 0] / np.sqrt(scale)
-    normal = normal / np.sqrt(scale[:, :, None] * scale[:, None, :])
+    normal, g = turned @ J, (turned @ w[..., None])[..., 0]
+    scale = np.sqrt(np.diagonal(normal, axis1=1, axis2=2)) + 1e-150
+    g, normal = g / scale, normal / (scale[:, :, None] * scale[:, None, :])
     usable = np.isfinite(normal).all((1, 2)) & np.isfinite(g).all(1)
-    normal, g = np.where(usable[:, None, None], normal, np.eye(x.shape[-1])), np.where(usable[:, None], g, 0.0)
-    values, vectors = np.linalg.eigh(normal)
-    values = np.maximum(values, 1e-15)
-    along = (np.swapaxes(vectors, 1, 2) @ g[..., None])[..., 0]
-    move = (vectors @ (along / (values + damping[:, None]))[..., None])[..., 0] / np.sqrt(scale)
-    return move, np.where(usable, (along**2 / values).sum(-1), np.inf)
+    normal, g = np.where(usable[:, None, None], normal, np.eye(J.shape[-1])), np.where(usable[:, None], g, 0.0)
+    # The floor keeps every matrix of the batch regular.
+    added = np.stack([damping, np.zeros(len(w))]) + 1e-13
+    move = np.linalg.solve(normal + added[..., None, None] * np.eye(J.shape[-1]), np.stack([g, g])[..., None])[..., 0]
+    return move[0] / scale, np.where(usable, (move[1] * g).sum(-1), np.inf)

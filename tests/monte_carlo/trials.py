@@ -96,8 +96,11 @@ class Outcome:
         Neither, and its status claims an answer.
     lower : array (N,)
         The fix is below the reference: the reference missed.
-    infinite : array (N,)
-        The likelihood keeps rising towards infinity: there is no minimum to find.
+    endless : array (N,)
+        There is no minimum to find, because the likelihood keeps rising towards infinity or into a station, and the
+        status says that there is no answer.
+    claimed : array (N,)
+        The same, and the status claims an answer.
     """
 
     trials: int
@@ -106,7 +109,8 @@ class Outcome:
     declined: Array
     silent: Array
     lower: Array
-    infinite: Array
+    endless: Array
+    claimed: Array
 
 
 def outcome(run: Trials, fix: Fix) -> Outcome:
@@ -114,19 +118,20 @@ def outcome(run: Trials, fix: Fix) -> Outcome:
     d = run.truth.shape[1]
     cost = run.model.cost(position(fix), run.z)
     others = run.model.cost(fix.alternatives.x[..., :d], run.z).min(1, initial=np.inf)
-    slack = TIE * (1.0 + run.best.cost)
+    slack = TIE * (1.0 + run.best.infimum)
     answered = np.isin(fix.code, (Status.OK, Status.AMBIGUOUS, Status.SEARCHED))
     reached = answered & (cost <= run.best.cost + slack)
     listed = ~reached & (fix.code == Status.AMBIGUOUS) & (others <= run.best.cost + slack)
-    # The value at infinity is approached, never attained: a finite fix below it is the better point.
-    infinite = run.best.at_infinity & ~(cost <= run.best.infimum + slack)
-    missed = ~(reached | listed)
+    # An infimum at infinity is approached, never attained: a finite fix below it is the better point.
+    endless = run.best.at_infinity & ~(answered & (cost <= run.best.infimum + slack))
+    missed = ~(reached | listed | endless)
     return Outcome(
         len(cost),
         reached,
         listed,
         missed & ~answered,
         missed & answered,
-        cost < run.best.cost - slack,
-        infinite,
+        answered & ~endless & (cost + slack < run.best.cost),
+        endless & ~answered,
+        endless & answered,
     )
