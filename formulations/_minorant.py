@@ -90,8 +90,9 @@ def minorant(error: Array, sigma: Array, elevation: Array, cost: float) -> Minor
     turn = np.minimum(rho * sA, np.pi) + np.abs(dA)
     tilt = np.maximum(high - elevation, elevation - low)
     with np.errstate(all="ignore"):
+        # |eta epsilon| is split so that both weights lose the same share
         mixed = np.abs(dA) * steep / (own * sA * sE)
-        left_A = 1.0 / sA**2 - mixed - np.abs(dA) * widest * turn / (3.0 * own * sA**2)
+        left_A = 1.0 / sA**2 - mixed * (sE / sA) ** 2 - np.abs(dA) * widest * turn / (3.0 * own * sA**2)
         left_A -= np.maximum(dE * np.sin(elevation), 0.0) * widest / sE**2
         left_E = 1.0 / sE**2 - mixed - np.abs(dE) * tilt / (3.0 * sE**2)
         # (e^'v)^2 <= epsilon^2 + spill eta^2

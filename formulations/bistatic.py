@@ -44,7 +44,7 @@ class Ranges:
     range : Array, shape (...)
         Ranges, NaN where not valid.
     slope : Array, shape (...)
-        Change of the excess path with the range, from 0 (towards the illuminator) to 2 (away from it).
+        Change of the excess path with the range, from 0 (towards the illuminator) to 2 (away from it); NaN at 0/0.
     turn : Array, shape (..., 3)
         Change of the excess path with the direction, a vector normal to it.
     valid : Mask, shape (...)

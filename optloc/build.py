@@ -244,23 +244,17 @@ def _noise(m: Measured, start: int, stations: int) -> list[noises.Block]:
 
 def _arrival_blocks(m: Measured, start: int, variance: Array) -> list[noises.Block]:
     """Return one block for each epoch and target: its rows combine the same arrivals, and have noise of their own."""
-    rows = m.rows
-    design = np.zeros((rows.count, variance.shape[-1]))
-    coefficients = MODELS[rows.kind].ranges
-    if coefficients is None:
+    rows, signs = m.rows, MODELS[m.rows.kind].ranges
+    if signs is None:
         raise InvalidProblem(
             f"{rows.kind} does not combine arrival times", where="arrival_sigma", advice="give sigma or covariance"
         )
-    for index, sign in ((rows.a, coefficients[0]), (rows.b, coefficients[1])):
-        if sign:
-            design[np.arange(rows.count), index] += sign
     blocks = []
-    for key in sorted(set(zip(rows.epoch.tolist(), rows.target.tolist(), strict=True))):
-        inside = np.flatnonzero((rows.epoch == key[0]) & (rows.target == key[1]))
-        covariance = noises.of_stations(design[inside], variance)
+    for members in noises.together(rows.epoch * (rows.target.max(initial=0) + 2) + rows.target):
+        covariance = noises.arrivals([(rows.a[members], signs[0]), (rows.b[members], signs[1])], variance)
         if m.variance is not None:
-            covariance = covariance + m.variance[..., inside, None] * np.eye(len(inside))
-        blocks.append(noises.Block(start + inside[None], covariance[..., None, :, :]))
+            covariance = covariance + m.variance[..., members, None] * np.eye(members.shape[1])
+        blocks.append(noises.Block(start + members, covariance))
     return blocks
 
 

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from optloc.check_constraints import check_constraints
 from optloc.check_unknowns import check_unknowns
+from optloc.epochs import tied, untied
 from optloc.errors import InvalidProblem
 from optloc.frames import Frame
 from optloc.models import MODELS
@@ -23,6 +25,11 @@ def checked(problem: Problem) -> Problem:
     ----------
     problem : Problem
         Any problem. NaN measurements pass: they are simulated later, or become a status of their own fix.
+
+    Returns
+    -------
+    Problem
+        The same; a noise block that holds several uncorrelated epochs is cut.
 
     Raises
     ------
@@ -46,6 +53,18 @@ def checked(problem: Problem) -> Problem:
         raise InvalidProblem("leading axes disagree", "problem", "give every array the same batch axes") from None
     for prior in problem.priors:
         _check_covariance(prior.covariance[..., None, :, :], f"prior on {prior.name}", None)
+    check_constraints(problem)
+    return _arrowed(problem)
+
+
+def _arrowed(problem: Problem) -> Problem:
+    """Return the problem with noise in blocks of one epoch each, as the elimination of local unknowns needs it."""
+    if not tied(problem):
+        return untied(problem)
+    if problem.layout.n_local:
+        name = problem.layout.local[0].name
+        what = f"rows of different epochs are correlated, but every epoch has its own {name!r}"
+        raise InvalidProblem(what, "covariance", "correlate rows of one epoch only, or share the unknown")
     return problem
 
 
@@ -112,6 +131,9 @@ def _check_rows(problem: Problem, rows: Rows) -> None:
         raise InvalidProblem(
             f"{rows.kind} has no meaning in {problem.dimension} dimensions", rows.kind, "use 3-D stations"
         )
+    if model.axes and problem.frame.kind == "ecef" and problem.stations.axes is None:
+        advice = "give the stations axes, for instance frame.enu_axes(positions)"
+        raise InvalidProblem(f"{rows.kind} rows in ECEF need the stations' own axes", rows.kind, advice)
     if model.ecef and not problem.frame.geodetic:
         raise InvalidProblem(f"{rows.kind} needs a geodetic frame", "frame", "use frame ecef or enu with an origin")
     if model.ecef and problem.dimension != 3:

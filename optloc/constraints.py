@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
@@ -39,9 +39,7 @@ def box(lower: Sequence[float], upper: Sequence[float], *, target: int = 0) -> t
     )
 
 
-def height(
-    lower: float = -np.inf, upper: float = np.inf, *, exactly: Any = None, target: int = 0
-) -> tuple[Band, ...]:
+def height(lower: float = -np.inf, upper: float = np.inf, *, exactly: Any = None, target: int = 0) -> tuple[Band, ...]:
     """Return the constraint on a target's height above the WGS 84 ellipsoid, metres: a band, or one exact value.
 
     Parameters
@@ -195,8 +193,40 @@ def _band(constraint: Band | Polygon, side: str | int) -> Band:
     return Band("plane", value, value, normal, constraint.name, constraint.target)
 
 
+def conjunction(problem: Problem) -> list[Band]:
+    """Return the constraints as bands that must all hold: edges of a convex polygon too, a concave one is left out."""
+    bands: list[Band] = []
+    for c in problem.constraints:
+        if isinstance(c, Band):
+            bands.append(c)
+            continue
+        corners = c.vertices
+        edge = np.roll(corners, -1, axis=0) - corners
+        turn = edge[:, 0] * np.roll(edge, -1, axis=0)[:, 1] - edge[:, 1] * np.roll(edge, -1, axis=0)[:, 0]
+        if (turn >= 0.0).all() or (turn <= 0.0).all():
+            sign = 1.0 if turn.sum() > 0.0 else -1.0
+            for i in range(len(corners)):
+                plane = _band(c, i)
+                bands.append(
+                    replace(
+                        plane, coefficients=sign * plane.coefficients, upper=sign * plane.upper, lower=_number(-np.inf)
+                    )
+                )
+    return bands
+
+
+def face_of(problem: Problem, x: Array) -> Array:
+    """Return the number of the face (N,) in `faces` on which vectors x (N, size) lie, the one with most levels."""
+    found = np.zeros(len(x), dtype=int)
+    for number, face in enumerate(faces(problem)):
+        if face:
+            values, _ = levels(problem, face, x)
+            found[(np.abs(values) <= 10.0 * TOLERANCE * (1.0 + np.abs(x).max(1, keepdims=True))).all(1)] = number
+    return found
+
+
 def violation(problem: Problem, x: Array) -> Array:
-    """Return by how much vectors x (N, size) break their worst constraint, relative to its size (N,); 0 where none is."""
+    """Return by how much vectors x (N, size) break their worst constraint, relative to its size (N,), or 0."""
     worst = np.zeros(len(x))
     for c in problem.constraints:
         if isinstance(c, Polygon):
@@ -223,7 +253,9 @@ def _quantity(problem: Problem, band: Band, x: Array) -> tuple[Jet, dict[int, in
     names = state_names(band.target, len(problem.motions), 2)
     slot, shared = problem.layout.find(names[0])
     if not shared:
-        raise InvalidProblem("a constraint needs a target whose state lasts the run", "constraints", "solve epoch by epoch")
+        raise InvalidProblem(
+            "a constraint needs a target whose state lasts the run", "constraints", "solve epoch by epoch"
+        )
     columns = {i: slot.start + i for i in range(d)}
     position: tuple[Any, ...] = tuple(Jet(x[:, slot.start + i], {i: np.ones(1)}) for i in range(d))
     velocity: tuple[Any, ...] | None = None

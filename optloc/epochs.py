@@ -16,7 +16,7 @@ def separable(problem: Problem) -> bool:
     """Return whether no unknown is shared between the epochs of a problem."""
     run_long_errors = problem.stations.covariance is not None and problem.stations.span == "run"
     free = all(motion.span == "epoch" for motion in problem.motions)
-    return problem.epochs > 1 and free and not problem.biases and not run_long_errors and not _tied(problem)
+    return problem.epochs > 1 and free and not problem.biases and not run_long_errors and not tied(problem)
 
 
 def _tied(problem: Problem) -> bool:
@@ -50,7 +50,7 @@ def by_epoch(problem: Problem) -> Problem:
     InvalidProblem
         Where biases or the noise tie the epochs together.
     """
-    if problem.biases or _tied(problem):
+    if problem.biases or tied(problem):
         tie = f"the bias {problem.biases[0].name!r} is" if problem.biases else "correlated noise is"
         raise InvalidProblem(f"{tie} shared by several epochs", "by_epoch", "solve them as one problem")
     places = [_places(rows) for rows in problem.rows]
@@ -87,6 +87,15 @@ def by_epoch(problem: Problem) -> Problem:
     return replace(
         problem, stations=stations, rows=tuple(rows), noise=noise, times=once, motions=motions, priors=priors
     )
+
+
+def untied(problem: Problem) -> Problem:
+    """Return the problem with noise blocks of one epoch each; correlation between epochs is dropped."""
+    epoch = problem.epoch
+    if all((epoch[block.row] == epoch[block.row[:, :1]]).all() for block in problem.noise.blocks):
+        return problem
+    parts = [part for block in problem.noise.blocks for part in _cut(block, epoch)]
+    return replace(problem, noise=group(parts))
 
 
 def _places(rows: Rows) -> tuple[list[tuple[int, int, int, int]], Array]:

@@ -262,19 +262,14 @@ def merged(fix: Fix, items: Array, other: Fix, stage: Stage) -> Fix:
         What was done.
     """
     width = max(fix.alternatives.gap.shape[1], other.alternatives.gap.shape[1])
-    out = replace(fix, alternatives=_padded(fix.alternatives, width), stages=(*fix.stages, stage))
-    new = replace(other, alternatives=_padded(other.alternatives, width))
-
-    def pieces(f: Fix) -> list[Array]:
-        found: list[Array] = []
-        f._map(lambda array, core: found.append(array) or array)
-        return found
-
-    copies = iter([np.array(array) for array in pieces(out)])
-    out = out._map(lambda array, core: next(copies))
-    for old, fresh in zip(pieces(out), pieces(new), strict=True):
-        old[items] = fresh
-    return out
+    mine, theirs = _padded(fix.alternatives, width), _padded(other.alternatives, width)
+    mine.x[items], mine.gap[items] = theirs.x, theirs.gap
+    changed: dict[str, Array] = {}
+    for name in ("x", "cov", "code", "reason", "certificate", "cost", "dof", "weights", "active"):
+        if (old := getattr(fix, name)) is not None:
+            changed[name] = np.array(old)
+            changed[name][items] = getattr(other, name)
+    return replace(fix, alternatives=mine, stages=(*fix.stages, stage), **changed)  # type: ignore[arg-type]
 
 
 def _padded(alternatives: Alternatives, width: int) -> Alternatives:

@@ -9,7 +9,8 @@ from optloc.errors import InvalidProblem
 from optloc.types import Array, Bias, Motion, Stations
 
 _STATE = (("position", "m"), ("velocity", "m/s"), ("acceleration", "m/s^2"))
-_BIAS_UNIT = {"scale": "1", "rotation": "rad"}
+_OWN_UNIT = {"scale": "1", "rotation": "rad"}
+_RATE = {"m/s": "m/s^2"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +105,12 @@ def emission_name(target: int, count: int) -> str:
 
 
 def layout(
-    stations: Stations, motions: Sequence[Motion], biases: Sequence[Bias], emitting: Sequence[int], epochs: int
+    stations: Stations,
+    motions: Sequence[Motion],
+    biases: Sequence[Bias],
+    emitting: Sequence[int],
+    epochs: int,
+    bias_units: Sequence[str] = (),
 ) -> Layout:
     """Return the layout of a problem.
 
@@ -120,6 +126,8 @@ def layout(
         Targets whose emission times are unknown.
     epochs : int
         Number of epochs.
+    bias_units : sequence of str
+        SI unit of the rows that each bias touches; empty where they have several, or where it does not matter.
     """
     shared: list[tuple[str, int, str]] = []
     local: list[tuple[str, int, str]] = []
@@ -129,9 +137,10 @@ def layout(
             units = (unit for _, unit in _STATE)
             names = state_names(i, len(motions), motion.order)
             room.extend((name, stations.dimension, unit) for name, unit in zip(names, units, strict=False))
-    for bias in biases:
-        turns = 1 if stations.dimension == 2 else 3
-        shared.append((bias.name, len(bias.members) * (turns if bias.form == "rotation" else 1), _bias_unit(bias)))
+    turns = 1 if stations.dimension == 2 else 3
+    for bias, unit in zip(biases, bias_units or [""] * len(biases), strict=True):
+        size = len(bias.members) * (turns if bias.form == "rotation" else 1)
+        shared.append((bias.name, size, _bias_unit(bias.form, unit)))
     local.extend((emission_name(i, len(motions)), 1, "m") for i in emitting)
     if stations.covariance is not None:
         room = shared if stations.span == "run" else local
@@ -139,8 +148,11 @@ def layout(
     return Layout(_slots(shared), _slots(local), epochs)
 
 
-def _bias_unit(bias: Bias) -> str:
-    return _BIAS_UNIT.get(bias.form, "1/s" if bias.form == "drift" else "")
+def _bias_unit(form: str, unit: str) -> str:
+    """Return the unit of a bias on rows of a unit: "1" is that of ratios."""
+    if form in _OWN_UNIT:
+        return _OWN_UNIT[form]
+    return unit if form == "offset" else _RATE.get(unit, f"{unit}/s" if unit else "")
 
 
 def _slots(parts: list[tuple[str, int, str]]) -> tuple[Slot, ...]:

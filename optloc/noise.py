@@ -85,22 +85,36 @@ def independent(variance: Array) -> Noise:
     return Noise((Block(rows[:, None], variance[..., None, None]),))
 
 
-def of_stations(design: Array, variance: Array) -> Array:
-    """Return the covariance ``D diag(variance) D'`` of rows that combine independent per-station errors.
+def together(key: Array) -> list[Array]:
+    """Return the members (g, r) of equal keys (m,), one array for each size of group r."""
+    order = np.argsort(key, kind="stable")
+    _, first, sizes = np.unique(key[order], return_index=True, return_counts=True)
+    return [order[first[sizes == r][:, None] + np.arange(r)] for r in np.unique(sizes)]
+
+
+def arrivals(ends: Sequence[tuple[Array, int]], variance: Array) -> Array:
+    """Return the covariance of groups of rows that combine independent arrivals at stations.
 
     Parameters
     ----------
-    design : array (m, s)
-        How each station's arrival enters each row: +1, -1 or 0.
+    ends : sequence of (int array (g, r), int)
+        Station of each row at one end, and the sign of its arrival: 0 for none.
     variance : array (..., s)
         Variance of each station's arrival.
 
     Returns
     -------
-    array (..., m, m)
-        Singular where the rows close a loop; the whitener then uses the pseudo-inverse.
+    array (..., g, r, r)
+        Singular where the rows of a group close a loop; the whitener then uses the pseudo-inverse.
     """
-    return np.asarray((design * variance[..., None, :]) @ design.T)
+    used = [(index, sign) for index, sign in ends if sign]
+    shape = used[0][0].shape
+    covariance = np.zeros((*variance.shape[:-1], *shape, shape[-1]))
+    for one, sign in used:
+        for two, other in used:
+            shared = one[:, :, None] == two[:, None, :]
+            covariance += sign * other * np.where(shared, variance[..., one][..., None], 0.0)
+    return covariance
 
 
 def group(blocks: Sequence[Block]) -> Noise:

@@ -12,6 +12,7 @@ from optloc.layout import Layout, layout
 from optloc.models import MODELS
 from optloc.noise import Block, Noise
 from optloc.types import Array, Band, Bias, Motion, Polygon, Prior, Rows, Stations
+from optloc.units import SI_UNIT
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +81,17 @@ class Problem:
     @property
     def layout(self) -> Layout:
         """Return the order of the unknowns."""
-        return layout(self.stations, self.motions, self.biases, self.emitting, self.epochs)
+        units = [self._unit(bias.row) for bias in self.biases]
+        return layout(self.stations, self.motions, self.biases, self.emitting, self.epochs, units)
+
+    def _unit(self, touched: Array) -> str:
+        """Return the SI unit of the rows of given global numbers, empty where they have several."""
+        found = {
+            SI_UNIT[MODELS[block.kind].quantity]  # type: ignore[index]  # the table holds known quantities only
+            for block, start in zip(self.rows, self.starts, strict=True)
+            if np.any((touched >= start) & (touched < start + block.count))
+        }
+        return found.pop() if len(found) == 1 else ""
 
     @property
     def weight(self) -> Array:

@@ -6,10 +6,13 @@ from typing import Any
 
 import numpy as np
 
-from optloc.models.primitives import wrap
+from optloc.constraints import conjunction
+from optloc.layout import state_names
+from optloc.models.primitives import Point, wrap
+from optloc.models.surfaces import SURFACES
 from optloc.problem import Problem
-from optloc.states import Terms, given, joined, plans
-from optloc.types import Array
+from optloc.states import Terms, given, joined, plans, to_ecef
+from optloc.types import Array, Band
 
 
 def parameters(problem: Problem) -> Array:
@@ -55,3 +58,58 @@ def residual(problem: Problem, x: Any, p: Any, z: Any) -> list[Any]:
 
 def _total(terms: Terms, row: int, x: Any) -> Any:
     return sum(float(terms.coefficient[i]) * x[int(terms.column[i])] for i in np.flatnonzero(terms.row == row))
+
+
+def bounds(problem: Problem) -> Array:
+    """Return the numbers (q,) that the symbolic constraints of a single problem need: coefficients, lower, upper."""
+    values = [np.zeros(0)]
+    for band in conjunction(problem):
+        values += [np.ravel(band.coefficients), np.ravel(band.lower), np.ravel(band.upper)]
+    return np.concatenate(values)
+
+
+def constrained(problem: Problem, x: Any, p: Any, length: Any) -> tuple[list[Any], list[Any]]:
+    """Return the equalities c(x) = 0 and inequalities d(x) >= 0 of a problem as CasADi expressions.
+
+    Parameters
+    ----------
+    problem : Problem
+        A single problem; only its structure enters the expressions.
+    x : casadi.SX (size, 1)
+        Parameter vector.
+    p : casadi.SX (q, 1)
+        Numbers in the order of `bounds`.
+    length : casadi.SX
+        By which quantities in metres are divided.
+    """
+    equal: list[Any] = []
+    more: list[Any] = []
+    used = 0
+    for band in conjunction(problem):
+        surface, count = SURFACES[band.kind], band.coefficients.shape[-1]
+        c = tuple(p[used + i] for i in range(count))
+        lower, upper = p[used + count], p[used + count + 1]
+        used += count + 2
+        unit = length if surface.unit == "m" else 1.0
+        value = surface.g(_target(problem, band, x), c)
+        if np.all(band.lower == band.upper):
+            equal.append((value - lower) / unit)
+            continue
+        if np.isfinite(band.lower).all():
+            more.append((value - lower) / unit)
+        if np.isfinite(band.upper).all():
+            more.append((upper - value) / unit)
+    return equal, more
+
+
+def _target(problem: Problem, band: Band, x: Any) -> Point:
+    names, d = state_names(band.target, len(problem.motions), 2), problem.dimension
+    surface = SURFACES[band.kind]
+    start = problem.layout.find(names[0])[0].start
+    position = tuple(x[start + i] for i in range(d))
+    velocity = None
+    if surface.velocity:
+        start = problem.layout.find(names[1])[0].start
+        velocity = tuple(x[start + i] for i in range(d))
+    ecef = to_ecef(problem, position) if surface.ecef else None
+    return Point(position[: band.coefficients.shape[-1]] if band.kind == "plane" else position, velocity, None, ecef)

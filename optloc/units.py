@@ -259,6 +259,3 @@ def _check_options(unit: str, quantity: str, propagation_speed: float, conventio
         raise InvalidProblem(f"unknown azimuth convention {convention!r}", where, advice)
     if not (math.isfinite(propagation_speed) and propagation_speed > 0):
         raise InvalidProblem(f"the propagation speed must be positive, not {propagation_speed:g} m/s", where)
-
-
-_nearest = nearest

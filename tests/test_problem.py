@@ -290,7 +290,10 @@ def test_epochs_tied_by_anything_are_not_torn_apart():
     tied = np.eye(6)
     assert separable(assemble(STATIONS[2], *rows, motions=free.motions, covariance=tied))
     tied[0, 3] = tied[3, 0] = 0.5
-    assert not separable(assemble(STATIONS[2], *rows, motions=free.motions, covariance=tied))
+    static = assemble(STATIONS[2], *rows, covariance=tied)
+    assert not separable(replace(static, motions=free.motions))
+    with pytest.raises(InvalidProblem, match="correlated noise"):
+        by_epoch(static)
 
 
 def test_a_row_measured_twice_in_an_epoch_counts_twice():

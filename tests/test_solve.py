@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import CASES, ENU, STATIONS, TARGET, kitchen_sink, plain_cost, quick, random_vector, stations
+from cases import CASES, ENU, STATIONS, TARGET, dense_covariance, kitchen_sink, plain_cost, quick, random_vector, stations
 from scipy.optimize import least_squares
 
 from optloc import InvalidProblem, Motion, NoSolution, Status, assemble, crlb, measured, simulate, solve, station_array
@@ -374,16 +374,43 @@ def test_everything_at_once_refines_from_near():
     assert fix.x.shape == truth.shape
 
 
-def test_epochs_tied_by_noise_are_one_problem():
-    a, epoch = np.tile(np.arange(6), 2), np.repeat([0, 1], 6)
-    full = np.eye(12) * 9.0
-    full[:6, 6:] = full[6:, :6] = np.eye(6) * 6.0
-    problem = assemble(
-        STATIONS[2], measured("range", a=a, epoch=epoch, covariance=full), motions=(Motion(0, span="epoch"),)
-    )
-    truth = np.r_[TARGET[2], TARGET[2] + 300.0]
-    fix = solve(simulate(problem, truth, 2), "lsr", start=truth)
-    assert np.abs(fix.x - truth).max() < 50.0
+def tied(**more):
+    a, epoch = np.tile(np.arange(6), 3), np.repeat([0, 1, 2], 6)
+    full = np.kron(np.array([[9.0, 6.0, 0.0], [6.0, 9.0, 3.0], [0.0, 3.0, 9.0]]), np.eye(6))
+    return assemble(STATIONS[2], measured(more.pop("kind", "range"), a=a, epoch=epoch, covariance=full), **more)
+
+
+@pytest.mark.parametrize("order", [0, 1])
+def test_noise_may_tie_epochs_that_share_all_unknowns(order):
+    problem = tied(motions=(Motion(order),))
+    truth = np.r_[TARGET[2], 30.0, -50.0][: 2 + 2 * order]
+    drawn = simulate(problem, truth, 2)
+    fix = solve(drawn)
+    assert fix.status == Status.OK
+    assert fix.cost == pytest.approx(plain_cost(drawn, fix.x))
+    for shift in np.random.default_rng(1).normal(0.0, 1.0, (20, len(truth))) * np.sqrt(np.diag(fix.cov)):
+        assert plain_cost(drawn, fix.x + 0.1 * shift) > fix.cost
+
+
+@pytest.mark.parametrize("more", [{"kind": "toa"}, {"motions": (Motion(0, span="epoch"),)}], ids=["emission", "position"])
+def test_noise_may_not_tie_unknowns_of_an_epoch(more):
+    """The elimination epoch by epoch would be silently wrong."""
+    with pytest.raises(InvalidProblem, match="different epochs are correlated.*(emission|position)"):
+        tied(**more)
+
+
+def test_one_covariance_over_uncorrelated_epochs_is_cut():
+    """All pairs at three epochs: singular, so that its eigenvectors would mix the epochs."""
+    a, b = np.triu_indices(6, 1)
+    single = assemble(STATIONS[2], measured("tdoa", a=a, b=b, arrival_sigma=3.0))
+    full = np.kron(np.eye(3), dense_covariance(single))
+    epoch = np.repeat([0, 1, 2], len(a))
+    at = {"a": np.tile(a, 3), "b": np.tile(b, 3), "epoch": epoch}
+    spread = np.tile(4.0 * np.eye(2), (6, 1, 1))
+    whole = assemble(stations(2, covariance=spread), measured("tdoa", covariance=full, **at))
+    apart = assemble(stations(2, covariance=spread), measured("tdoa", arrival_sigma=3.0, **at))
+    truth = np.r_[TARGET[2], np.zeros(36)]
+    assert np.allclose(crlb(whole, truth), crlb(apart, truth), rtol=1e-9)
 
 
 def test_uncertain_stations_widen_the_covariance():

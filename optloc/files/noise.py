@@ -10,7 +10,7 @@ from optloc.errors import InvalidProblem
 from optloc.files.chunk import Chunk
 from optloc.files.words import join
 from optloc.models import MODELS
-from optloc.noise import Block, Noise, group
+from optloc.noise import Block, Noise, arrivals, group, together
 from optloc.types import Array
 
 
@@ -32,7 +32,7 @@ def noise_of(
             blocks.append(Block(number[:, None], chunk.sigma[:, None, None] ** 2))
         elif chunk.arrival is not None:
             members = together(epoch * (target.max(initial=0) + 1) + target)
-            blocks += [Block(number[m], arrivals(chunk, m)) for m in members]
+            blocks += [Block(number[m], _arrivals(chunk, m)) for m in members]
         elif chunk.covariance is not None:
             blocks.append(_repeated(chunk, number, epoch, chunk.covariance))
         else:
@@ -41,24 +41,13 @@ def noise_of(
     return group([Block(b.row, b.covariance) for b in blocks])
 
 
-def together(key: Array) -> list[Array]:
-    """Return the members (g, r) of equal keys (m,), one array for each size of group r."""
-    order = np.argsort(key, kind="stable")
-    _, first, sizes = np.unique(key[order], return_index=True, return_counts=True)
-    return [order[first[sizes == r][:, None] + np.arange(r)] for r in np.unique(sizes)]
-
-
-def arrivals(chunk: Chunk, members: Array) -> Array:
+def _arrivals(chunk: Chunk, members: Array) -> Array:
     """Return the covariance (g, r, r) of groups of rows (g, r) that combine independent arrivals."""
-    coefficients = MODELS[chunk.kind].ranges
-    assert coefficients is not None
+    signs = MODELS[chunk.kind].ranges
+    assert signs is not None
     assert chunk.arrival is not None
-    ends = [(index[members], sign) for index, sign in zip((chunk.a, chunk.b), coefficients, strict=True) if sign]
-    covariance = np.zeros((*members.shape, members.shape[1]))
-    for one, sign in ends:
-        for two, other in ends:
-            shared = one[:, :, None] == two[:, None, :]
-            covariance += sign * other * np.where(shared, chunk.arrival[one][:, :, None] ** 2, 0.0)
+    ends = [(index[members], sign) for index, sign in zip((chunk.a, chunk.b), signs, strict=True)]
+    covariance = arrivals(ends, chunk.arrival**2)
     row, column = np.nonzero(np.diagonal(covariance, axis1=-2, axis2=-1) <= 0.0)
     if len(row):
         place = join(chunk.table.source, f"row {chunk.row[members[row[0], column[0]]] + 1}")

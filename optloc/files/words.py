@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from optloc.errors import InvalidProblem
+from optloc.errors import InvalidProblem, nearest
 from optloc.models import MODELS, Model
 from optloc.units import SI_UNIT, SPEED_OF_LIGHT, AzimuthConvention, Conversion, Quantity, conversion
-from optloc.units import _nearest as nearest
 
 __all__ = ["Units", "join", "kind_model", "nearest"]
 

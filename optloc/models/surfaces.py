@@ -54,6 +54,8 @@ def _speed(t: Point, c: Components) -> Any:
 SURFACES: dict[str, Surface] = {
     "plane": Surface(lambda t, c: dot(c, t.position), "linear form c . x of the position", "m", -1),
     "height": Surface(_height, "height above the WGS 84 ellipsoid", "m", ecef=True),
-    "visible": Surface(_visible, "sine of the elevation of a point c (ECEF) above the target's horizon", "1", 3, ecef=True),
+    "visible": Surface(
+        _visible, "sine of the elevation of a point c (ECEF) above the target's horizon", "1", 3, ecef=True
+    ),
     "speed": Surface(_speed, "speed of the target", "m/s", velocity=True),
 }

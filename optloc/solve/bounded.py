@@ -21,7 +21,7 @@ def bounded(problem: Problem, pool: Candidates) -> Candidates:
     A target that the Earth hides from a satellite which hears it is not feasible either.
 
     Every set of inequalities that can hold with equality together is a face. The cost is minimised on each from the
-    cheapest candidates, and what is feasible competes: the cheapest satisfies the conditions of Karush, Kuhn and Tucker.
+    cheapest candidates, and what is feasible competes: the cheapest meets the conditions of Karush, Kuhn and Tucker.
 
     Parameters
     ----------
@@ -58,6 +58,11 @@ def bounded(problem: Problem, pool: Candidates) -> Candidates:
         np.concatenate([kept.code, code], axis=1),
         np.concatenate([kept.face, face], axis=1),
     )
+
+
+def without_broken(problem: Problem, pool: Candidates) -> Candidates:
+    """Return candidates of which those that break a constraint, or are hidden, have infinite cost."""
+    return _without(pool, _broken(problem, pool))
 
 
 def _broken(problem: Problem, pool: Candidates) -> Array:

@@ -67,7 +67,9 @@ SOLVERS: dict[str, Entry] = {
     "sdp": Entry(stages.sdp, "Shor's semidefinite relaxation of the squared-range problem (Clarabel)", "start"),
     "socp": Entry(stages.socp, "second-order cone relaxation of the squared-range problem (Clarabel)", "start"),
     "widen": Entry(stages.widen, "more candidates beside a fix: mirror image, sub-arrays", "refinement"),
-    "search": Entry(stages.search, "a seeded search from many places for problems still without an answer", "refinement"),
+    "search": Entry(
+        stages.search, "a seeded search from many places for problems still without an answer", "refinement"
+    ),
     "lsr": Entry(stages.lsr, "damped Taylor least squares (Gauss-Newton) from every candidate", "refinement"),
     "nlp": Entry(_nlp, "the maximum-likelihood cost by IPOPT from every candidate", "refinement"),
     "taylor": Entry(stages.taylor, "plain undamped Taylor iteration; a baseline, it diverges", "refinement"),

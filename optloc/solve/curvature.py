@@ -77,7 +77,7 @@ def _weakest(information: Array) -> Array:
     with np.errstate(invalid="ignore", divide="ignore"):
         scale = 1.0 / np.sqrt(diagonal)
         lower, ok = linalg.factor(information * scale[..., :, None] * scale[..., None, :])
-        pivots = np.diagonal(lower, axis1=-2, axis2=-1).min(-1) ** 2
+        pivots = np.diagonal(lower, axis1=-2, axis2=-1).min(-1, initial=1.0) ** 2
     return np.where(ok & np.isfinite(pivots), pivots, 0.0)
 
 

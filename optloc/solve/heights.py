@@ -1,4 +1,4 @@
-"""Starts from a known height: three ranges with one common unknown, or two known ranges, meet the ellipsoid in points."""
+"""Starts from a known height: three ranges with one common unknown, or two known ranges, meet the ellipsoid."""
 
 from __future__ import annotations
 
@@ -21,9 +21,10 @@ def known_height(problem: Problem) -> Array | None:
     """Return the height (N,) that rows or an exact constraint give, metres, or None where nothing does."""
     size = problem.batch_shape[0]
     for constraint in problem.constraints:
-        if isinstance(constraint, Band) and constraint.kind == "height":
-            if np.all(constraint.lower == constraint.upper):
-                return np.broadcast_to(constraint.lower, (size,))
+        if not isinstance(constraint, Band) or constraint.kind != "height":
+            continue
+        if np.all(constraint.lower == constraint.upper):
+            return np.broadcast_to(constraint.lower, (size,))
     for rows in problem.rows:
         if rows.kind == "height":
             value = np.broadcast_to(rows.z - rows.correction, (size, rows.count))
@@ -57,8 +58,8 @@ def height_starts(problem: Problem, found: Ranges | None) -> Array:
     surface = ellipsoid(_AXES, height / WGS84_A)
     parts = []
     for count, mask in ((3, found.free), (2, ~found.free)):
-        for nodes in _subsets(place, found, mask, count):
-            parts.append(_met(place, found, nodes, surface, mask & (nodes[:, 0] >= 0)))
+        subsets = _subsets(place, found, mask, count)
+        parts += [_met(place, found, nodes, surface, mask & (nodes[:, 0] >= 0)) for nodes in subsets]
     if not parts:
         return np.full((size, 0, 3), np.nan)
     return problem.frame.from_ecef(np.concatenate(parts, axis=1) * WGS84_A)
@@ -79,7 +80,11 @@ def _subsets(place: Array, found: Ranges, mask: Array, count: int) -> list[Array
     width = np.where(usable, width, -1.0)
     order = np.argsort(-width, axis=1)[:, :_SUBSETS]
     best = np.take_along_axis(width, order, axis=1)
-    return [np.where(best[:, i : i + 1] > 0.0, choices[order[:, i]], -1) for i in range(order.shape[1]) if (best[:, i] > 0).any()]
+    return [
+        np.where(best[:, i : i + 1] > 0.0, choices[order[:, i]], -1)
+        for i in range(order.shape[1])
+        if (best[:, i] > 0).any()
+    ]
 
 
 def _met(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask: Array) -> Array:
@@ -88,7 +93,10 @@ def _met(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask: Ar
     out = np.full((len(place), 4, 3), np.nan)
     pick = items[:, None]
     stations, offset = place[pick, nodes[items]], found.offset[pick, nodes[items]] / WGS84_A
-    own = Ellipsoid(np.broadcast_to(surface.shape, (len(place), 3, 3))[items], np.broadcast_to(surface.centre, (len(place), 3))[items])
+    own = Ellipsoid(
+        np.broadcast_to(surface.shape, (len(place), 3, 3))[items],
+        np.broadcast_to(surface.centre, (len(place), 3))[items],
+    )
     if nodes.shape[1] == 3:
         out[items] = locate(stations, found.sign[pick, nodes[items]], offset, own).x
     else:

@@ -9,17 +9,19 @@ from typing import Any
 import numpy as np
 
 from formulations.nls import Program
+from optloc.constraints import conjunction, face_of
 from optloc.errors import InvalidProblem
 from optloc.fix import Fix, Stage
 from optloc.noise import whiten
 from optloc.normal import decrement, prior_parts, step
 from optloc.problem import Problem
+from optloc.solve.bounded import without_broken
 from optloc.solve.refine import equations_at
 from optloc.solve.scale import length_scale
 from optloc.solve.stages import finished, pooled
 from optloc.solve.verdict import Candidates
 from optloc.status import Status
-from optloc.symbolic import parameters, residual
+from optloc.symbolic import bounds, constrained, parameters, residual
 from optloc.types import Array
 
 
@@ -54,8 +56,12 @@ def nlp(problem: Problem, fix: Fix | None) -> Fix:
             x[i, j], cost[i, j], code[i, j] = solver.from_start(pool[i, j])
     if len(item):
         code[item, slot] = _stationary(problem.take(item), x[item, slot], code[item, slot])
+    cost[code == Status.NUMERICAL] = np.inf  # a start on a station has no gradient, and IPOPT's last word is no point
+    face = np.zeros(cost.shape, dtype=int)
+    if problem.constraints and len(item):
+        face[item, slot] = face_of(problem.take(item), x[item, slot])
     stage = Stage("nlp", f"{len(item)} programs", perf_counter() - began)
-    return finished(problem, fix, Candidates(x, cost, code, np.zeros(cost.shape, dtype=int)), stage)
+    return finished(problem, fix, without_broken(problem, Candidates(x, cost, code, face)), stage)
 
 
 def _stationary(problem: Problem, x: Array, code: Array) -> Array:
@@ -86,8 +92,9 @@ class _Scaled:
                     for k in range(1 if found is layout.shared else layout.epochs):
                         centre[base + k * step : base + k * step + place.size] = shift
         self.unit, self.centre = unit, centre
-        self.data = np.concatenate([unit, centre, parameters(problem)])
-        self.program = _program(_Key(problem, len(self.data)))
+        rows = parameters(problem)
+        self.data = np.concatenate([unit, centre, rows, [size], bounds(problem)])
+        self.program = _program(_Key(problem, len(self.data), len(rows)))
         self.weight = _whitening(problem)
         self.z = np.where(problem.weight[0] > 0.0, problem.observed[0], 0.0)
         self.prior = _prior(problem, unit, centre)
@@ -103,11 +110,15 @@ class _Scaled:
 class _Key:
     """A problem that is equal to another of the same structure: the key of a compiled program."""
 
-    def __init__(self, problem: Problem, data: int) -> None:
-        self.problem, self.data = problem, data
+    def __init__(self, problem: Problem, data: int, rows: int) -> None:
+        self.problem, self.data, self.rows = problem, data, rows
         s = problem.stations
         shapes = tuple(None if a is None else a.shape[-3:] for a in (s.position, s.velocity, s.axes))
-        self.key = (problem.structure, data, shapes)
+        limits = tuple(
+            (bool(np.all(b.lower == b.upper)), bool(np.isfinite(b.lower).all()), bool(np.isfinite(b.upper).all()))
+            for b in conjunction(problem)
+        )
+        self.key = (problem.structure, data, shapes, limits)
 
     def __hash__(self) -> int:
         return hash(self.key)
@@ -123,7 +134,12 @@ def _program(key: _Key) -> Program:
     def scaled(y: Any, p: Any, z: Any) -> list[Any]:
         return residual(problem, y * p[:n] + p[n : 2 * n], p[2 * n :], z)
 
-    return Program(n, problem.count, key.data, residual=scaled, diagonal=False)
+    def limited(y: Any, p: Any) -> tuple[list[Any], list[Any]]:
+        last = 2 * n + key.rows
+        return constrained(problem, y * p[:n] + p[n : 2 * n], p[last + 1 :], p[last])
+
+    equal, more = ((lambda y, p, i=i: limited(y, p)[i]) if problem.constraints else None for i in (0, 1))
+    return Program(n, problem.count, key.data, residual=scaled, equalities=equal, inequalities=more, diagonal=False)
 
 
 def _slot_units(slots: Any, size: float) -> Array:

@@ -9,7 +9,7 @@ from math import factorial
 import numpy as np
 
 from optloc import linalg
-from optloc.epochs import by_epoch
+from optloc.epochs import by_epoch, untied
 from optloc.fix import Fix
 from optloc.layout import state_names
 from optloc.problem import Problem
@@ -71,7 +71,7 @@ def _state(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
         state = np.zeros((size, 1, motion.order + 1, problem.dimension))
         state[:, 0, 0] = position
         return state
-    free = by_epoch(replace(problem, motions=(Motion(span="epoch"),)))
+    free = by_epoch(untied(replace(problem, motions=(Motion(span="epoch"),))))
     fix = fixed(free.flat()).reshape((size, problem.epochs))
     if motion.span == "epoch":
         state = np.zeros((size, problem.epochs, motion.order + 1, problem.dimension))

@@ -61,4 +61,4 @@ def _blocked(point: Array, station: Array, heard: Array) -> Array:
     with np.errstate(invalid="ignore", divide="ignore"):
         share = np.clip(-(point * line).sum(-1) / (line**2).sum(-1), 0.0, 1.0)
         nearest = ((point + share[:, None] * line) ** 2).sum(-1)
-    return high & (share > 0.0) & (nearest < _GRAZE**2)
+    return np.asarray(high & (share > 0.0) & (nearest < _GRAZE**2))

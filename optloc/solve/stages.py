@@ -17,8 +17,8 @@ from optloc.problem import Problem
 from optloc.solve.bounded import bounded
 from optloc.solve.heights import height_starts
 from optloc.solve.pieces import from_pieces, one_position
-from optloc.solve.refine import equations_at, refine
 from optloc.solve.reduce import ranges
+from optloc.solve.refine import equations_at, refine
 from optloc.solve.search import PLACES, searched_starts
 from optloc.solve.squared import Pick, every, hull, minimum, shor
 from optloc.solve.start import mirrored, squared_range_starts, static, subarray_starts, vectors
@@ -81,7 +81,7 @@ def widen(problem: Problem, fix: Fix | None) -> Fix:
 def _fresh(problem: Problem, fix: Fix, seen: Array, more: Array) -> Array:
     """Return the positions seen and those of the others that are not within one standard deviation of them."""
     covariance = fix.covariance()
-    usable = np.isfinite(covariance).all((-1, -2))
+    usable = np.asarray(np.isfinite(covariance).all((-1, -2)))
     information, ok = linalg.inverse(np.where(usable[:, None, None], covariance, np.eye(problem.dimension)))
     near = np.zeros(more.shape[:2], dtype=bool)
     for point in np.moveaxis(seen, 1, 0):

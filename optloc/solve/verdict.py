@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from optloc.constraints import exact, violation_names
 from optloc.fix import Alternatives, Fix, Stage
 from optloc.models import MODELS
 from optloc.noise import whiten
-from optloc.constraints import exact, violation_names
-from optloc.normal import marginal
 from optloc.problem import Problem
 from optloc.solve.curvature import Curvature, curved, station_direction, weak_direction
 from optloc.solve.reduce import ranges
@@ -22,6 +21,7 @@ AMBIGUOUS_GAP = 9.0
 LISTED_GAP = 25.0
 DOUBT = 1e-3
 _SAME = 1e-2
+_EQUAL = 1e-3
 _WEAK = 1e-12
 _FAR = 1e4
 
@@ -78,7 +78,7 @@ def judge(problem: Problem, pool: Candidates, equations: Any, stages: tuple[Stag
     with np.errstate(all="ignore"):
         at = equations(problem, np.where(found[:, None], chosen, 0.0))
         curvature = curved(problem, at, chosen, np.where(found, face, 0))
-    others = _alternatives(problem, pool, chosen, value, marginal(at)[0])
+    others = _alternatives(problem, pool, chosen, value, curvature)
     reason = np.empty(size, dtype=object)
     reason[:] = ""
     fix = Fix(
@@ -118,7 +118,7 @@ def _preferred(pool: Candidates) -> Array:
 
 
 def _alternatives(
-    problem: Problem, pool: Candidates, chosen: Array, value: Array, information: Array
+    problem: Problem, pool: Candidates, chosen: Array, value: Array, curvature: Curvature
 ) -> Alternatives:
     """Return the other finished minima within the listed gap, each once."""
     n, x = problem.layout.n_shared, pool.x
@@ -130,7 +130,7 @@ def _alternatives(
     for slot in np.flatnonzero(used):
         new = np.isfinite(gap[:, slot])
         for other, other_gap in kept:
-            new &= ~_same(x[:, slot, :n], other[:, :n], information) | ~np.isfinite(other_gap)
+            new &= ~_same(x[:, slot, :n], other[:, :n], curvature) | ~np.isfinite(other_gap)
         if new.any():
             kept.append((np.where(new[:, None], x[:, slot], np.nan), np.where(new, gap[:, slot], np.inf)))
     if len(kept) == 1:
@@ -144,11 +144,13 @@ def _alternatives(
     )
 
 
-def _same(x: Array, y: Array, information: Array) -> Array:
-    """Return where two points are nearer than a tenth of a standard deviation, or equal to rounding."""
+def _same(x: Array, y: Array, curvature: Curvature) -> Array:
+    """Return where two points are nearer than a tenth of a standard deviation in every direction, or equal."""
     difference = x - y
     with np.errstate(invalid="ignore", over="ignore"):
-        squared = (difference[:, None, :] @ information @ difference[..., None])[:, 0, 0]
+        squared = (difference[:, None, :] @ curvature.information @ difference[..., None])[:, 0, 0]
+        spread = np.trace(curvature.covariance, axis1=-2, axis2=-1)  # constraints leave directions without information
+        squared = np.maximum(squared, (difference**2).sum(-1) / spread)
         equal = (np.abs(difference) <= 1e-9 * (1.0 + np.abs(x))).all(-1)
     return np.asarray(equal | (squared < _SAME))
 
@@ -196,15 +198,20 @@ def _explain(problem: Problem, fix: Fix, curvature: Curvature) -> None:
     for i in np.flatnonzero(doubtful):
         fix.reason[i] = f"the residuals are larger than the noise allows (p = {p_value[i]:.1g})"
     for i in np.flatnonzero(few):
-        fix.reason[i] = f"there are {-int(fix.dof[i])} measurements fewer than unknowns"
+        lacking = -int(fix.dof[i])
+        some = "is 1 measurement" if lacking == 1 else f"are {lacking} measurements"
+        fix.reason[i] = f"there {some} fewer than unknowns"
     for i in np.flatnonzero(weak):
         fix.reason[i] = weak_direction(problem, curvature.information[i])
     for i in np.flatnonzero(fix.code == Status.AMBIGUOUS):
-        fix.reason[i] = f"another position costs only {gap[i]:.2g} more"
+        alike = gap[i] < _EQUAL
+        fix.reason[i] = "another position " + ("fits as well" if alike else f"costs only {gap[i]:.2g} more")
     barred = missing & (fix.code == Status.INFEASIBLE)
     for i in np.flatnonzero(barred):
         names = violation_names(problem)
-        fix.reason[i] = f"no minimum meets all of: {names}" if names else "the Earth hides every position from a satellite"
+        fix.reason[i] = (
+            f"no minimum meets all of: {names}" if names else "the Earth hides every position from a satellite"
+        )
     missing = missing & ~barred
     if missing.any():
         _explain_missing(problem, fix, np.flatnonzero(missing))

@@ -45,7 +45,7 @@ def problems(count, sigma, seed):
 
 @pytest.mark.parametrize("sigma", [0.0, SIGMA, 10 * SIGMA], ids=["0 ns", "50 ns", "500 ns"])
 def test_reduced_lift_is_exact(sigma):
-    z, offset, x = problems(200, sigma, 5)
+    _, offset, x = problems(200, sigma, 5)
     answers = [lifted(SATELLITES, ALL, c, WGS84, BELOW) for c in offset]
     off = np.array([np.linalg.norm(a.x - y) for a, y in zip(answers, x, strict=True)]) * EARTH
     ratio = np.array([a.rank_ratio for a in answers])
@@ -134,7 +134,7 @@ def test_multipliers_say_what_is_active(program):
 def test_more_stations_ranges_and_a_station_below_the_surface():
     rng = np.random.default_rng(9)
     high = ellipsoid(AXES, 9e3 / EARTH)
-    ground = on_surface(BELOW + [[0.01, 0, 0], [0, 0.01, 0], [-0.01, 0, 0.01]])
+    ground = on_surface(BELOW + np.array([[0.01, 0, 0], [0, 0.01, 0], [-0.01, 0, 0.01]]))
     x = (BELOW + 0.004) / np.sqrt(high.polar(BELOW + 0.004, BELOW + 0.004))
     s = np.concatenate([ground, SATELLITES[:1]])
     r = np.linalg.norm(x - s, axis=-1)

@@ -9,9 +9,9 @@ from zlib import crc32
 
 import numpy as np
 from monte_carlo.reference import Model
+from scipy.constants import speed_of_light as LIGHT
 
 from optloc import Problem, assemble, measured
-from scipy.constants import c as LIGHT
 
 Array = np.ndarray
 Rng = np.random.Generator

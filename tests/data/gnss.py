@@ -1,0 +1,127 @@
+"""Reader of `gnss_static`: pseudoranges of two fixed receivers, as epochs of many satellites or draws of three. ECEF.
+
+Satellites move, so every problem of a batch has stations of its own. Noise: 1 m a pseudorange, about the robust spread
+in the README (0.4 to 2 m, mostly slow errors of each satellite).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from data.reference import Reference, centred, descend, ecef, horizontal
+
+from optloc import ECEF, Bias, Motion, Problem, assemble, measured, station_array
+from optloc.constraints import height
+
+SIGMA = 1.0
+MASK = np.deg2rad(10.0)
+
+
+@dataclass(frozen=True)
+class Receptions:
+    """Problems of one session: satellites (n, s, 3), pseudoranges and weights (n, s), system of each satellite (s,).
+
+    `truth` is the receiver (3,), `geodetic` its latitude, longitude (radians) and height.
+    """
+
+    satellites: np.ndarray
+    z: np.ndarray
+    weight: np.ndarray
+    systems: tuple[str, ...]
+    truth: np.ndarray
+    geodetic: tuple[float, float, float]
+
+    def by_arrival(self, offset: tuple[str, ...]) -> Problem:
+        """Return the epochs as arrivals with an unknown clock, and an unknown offset of some systems against it."""
+        touched = [i for i, system in enumerate(self.systems) if system in offset]
+        member = np.array([offset.index(self.systems[i]) for i in touched])
+        bias = Bias("system", offset, np.array(touched), member, np.ones(len(touched)))
+        count = self.satellites.shape[-2]
+        return assemble(
+            station_array(self.satellites[:, None]),
+            measured("toa", self.z, a=np.arange(count), sigma=SIGMA, weight=self.weight),
+            motions=(Motion(),),
+            biases=(bias,),
+            frame=ECEF,
+        )
+
+    def by_difference(self) -> Problem:
+        """Return the draws as differences to their first satellite, with the true height known exactly."""
+        others = np.arange(1, self.satellites.shape[-2])
+        return assemble(
+            station_array(self.satellites[:, None]),
+            measured("tdoa", self.z[:, 1:] - self.z[:, :1], a=others, b=np.zeros_like(others), arrival_sigma=SIGMA),
+            frame=ECEF,
+            constraints=[height(exactly=self.geodetic[2])],
+        )
+
+    def epochs_from_truth(self, offset: tuple[str, ...]) -> Reference:
+        """Return least squares of `by_arrival` started at the truth."""
+        groups = [np.array([s == name for s in self.systems], dtype=float) for name in offset]
+        groups.append(1.0 - sum(groups))
+        start = np.tile(self.truth, (len(self.z), 1))
+        return Reference(
+            *descend(
+                lambda x: sum(centred(self._off(x), g * self.weight) for g in groups) / SIGMA, start, 10.0, limit=60
+            )
+        )
+
+    def draws_from_truth(self) -> Reference:
+        """Return least squares of `by_difference` started at the truth: arrivals with a common clock."""
+        lat, lon, h = self.geodetic
+        start = np.tile([lat, lon], (len(self.z), 1))
+        coordinates, cost = descend(lambda u: centred(self._off(ecef(u, h)), self.weight) / SIGMA, start, 1e-6)
+        return Reference(ecef(coordinates, h), cost)
+
+    def horizontal(self, position: np.ndarray) -> np.ndarray:
+        """Return horizontal errors (...), metres."""
+        return horizontal(position, self.truth, *(np.asarray(v) for v in self.geodetic[:2]))
+
+    def _off(self, x: np.ndarray) -> np.ndarray:
+        return self.z - np.linalg.norm(x[:, None] - self.satellites, axis=-1)
+
+
+@dataclass(frozen=True)
+class Session:
+    """All rows of one session above the mask, and its receiver."""
+
+    rows: pd.DataFrame
+    column: str
+    truth: np.ndarray
+    geodetic: tuple[float, float, float]
+
+    def epochs(self) -> Receptions:
+        """Return every epoch with all its satellites."""
+        names = sorted(self.rows["sat"].unique())
+        times = np.unique(self.rows["t_gps_s"])
+        k, s = np.searchsorted(times, self.rows["t_gps_s"]), np.searchsorted(names, self.rows["sat"])
+        z, weight = np.zeros((len(times), len(names))), np.zeros((len(times), len(names)))
+        place = np.empty((len(times), len(names), 3))
+        place[:] = self.rows.groupby("sat")[list(_XYZ)].first().loc[names].to_numpy()
+        z[k, s], weight[k, s], place[k, s] = self.rows[self.column], 1.0, self.rows[list(_XYZ)].to_numpy()
+        return Receptions(place, z, weight, tuple(n[0] for n in names), self.truth, self.geodetic)
+
+    def draws(self, count: int, seed: int) -> Receptions:
+        """Return three random satellites of a random epoch, `count` times."""
+        rng = np.random.default_rng(seed)
+        members = list(self.rows.groupby("t_gps_s").indices.values())
+        chosen = np.array([rng.choice(members[rng.integers(len(members))], 3, replace=False) for _ in range(count)])
+        place = self.rows[list(_XYZ)].to_numpy()[chosen]
+        z = self.rows[self.column].to_numpy()[chosen]
+        return Receptions(place, z, np.ones_like(z), ("", "", ""), self.truth, self.geodetic)
+
+
+_XYZ = ("sat_x_m", "sat_y_m", "sat_z_m")
+
+
+def load(folder: Path, session: str, column: str) -> Session:
+    """Return one session by `column`, "prc_l1_m" or "prc_if_m"."""
+    tables = [pd.read_csv(folder / f"{name}.csv") for name in ("truth", "measurements")]
+    truth, rows = (table[table["session"] == session] for table in tables)
+    site = truth.iloc[0]
+    rows = rows[(rows["el_rad"] > MASK) & rows[column].notna()]
+    place = (np.deg2rad(site["lat_deg"]), np.deg2rad(site["lon_deg"]), float(site["h_m"]))
+    return Session(rows, column, site[["x_m", "y_m", "z_m"]].to_numpy(dtype=float), place)

@@ -1,0 +1,56 @@
+"""Satellites heard by a fixed receiver: all of them, or three and the height; no guess where on Earth it is."""
+
+import numpy as np
+import pytest
+from data import gnss
+from data.reference import Reference, law, listed, never_a_worse_minimum
+from data.windows import quantiles, report, statuses
+
+from optloc import Status, solve
+
+pytestmark = pytest.mark.data
+
+CASES = [("K078", "prc_l1_m"), ("K078", "prc_if_m"), ("N176", "prc_l1_m"), ("N176", "prc_if_m")]
+
+# Horizontal median and 95 % error, and mean height error, in the set's README, metres.
+ALL = dict(zip(CASES, ((0.6, 0.8, -1.2), (0.8, 1.4, -0.3), (1.6, 1.9, -0.8), (1.4, 1.9, -0.4)), strict=True))
+THREE = dict(zip(CASES, ((2.0, 13.0), (2.7, 25.0), (2.5, 12.0), (2.9, 13.0)), strict=True))
+
+
+@pytest.fixture
+def session(data_dir, case):
+    return gnss.load(data_dir / "gnss_static", *case)
+
+
+@pytest.mark.parametrize("offset", [("E",), ("E", "J")], ids="+".join)
+@pytest.mark.parametrize("case", CASES, ids="-".join)
+def test_all_satellites_by_arrival_with_system_offsets(session, case, offset):
+    data = session.epochs()
+    fix, reference = solve(data.by_arrival(offset)), data.epochs_from_truth(offset)
+    ours, theirs = data.horizontal(fix.position), data.horizontal(reference.position)
+    found = law(f"GNSS {case} offset of {offset}", fix, ours, theirs, reference)
+    up = (fix.position - data.truth) @ data.truth / np.linalg.norm(data.truth)
+    report(f"   height error {up.mean():.2f} m, offset {np.median(fix.bias['system'], axis=0).ravel()} m")
+    assert fix.answered.all()
+    if offset == ("E",):
+        assert (*found, up.mean()) == pytest.approx(ALL[case], abs=0.15)
+
+
+@pytest.mark.parametrize("case", CASES, ids="-".join)
+def test_three_satellites_and_the_height(session, case):
+    data = session.draws(1500, seed=3)
+    fix, reference = solve(data.by_difference()), data.draws_from_truth()
+    name = f"GNSS {case}, three satellites"
+    right = np.linalg.norm(fix.position - reference.position, axis=-1) < 1.0
+    near = listed(fix, lambda x: np.linalg.norm(x - reference.position, axis=-1)) < 1.0
+    best = listed(fix, data.horizontal)
+    report(f"{name}: the fix is the truth's minimum in {right.sum()}, it is listed in {near.sum()} of {len(right)}")
+    law(name, fix, best, data.horizontal(reference.position), reference, answered=0.98)
+    found = quantiles(data.horizontal(reference.position))
+    assert found[0] == pytest.approx(THREE[case][0], rel=0.15)
+    assert found[1] == pytest.approx(THREE[case][1], rel=0.6)
+    hemisphere = fix.position @ data.truth > 0.0
+    assert hemisphere[fix.answered].all()
+    silent = np.flatnonzero((fix.code == Status.OK) & ~right)
+    assert not len(silent), f"{name}: says ok and is not the minimum that the truth leads to: {silent}"
+    assert near[fix.code == Status.AMBIGUOUS].all(), name

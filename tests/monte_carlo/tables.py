@@ -1,0 +1,46 @@
+"""Generated tables: rows are collected while cases run and written when a full run has all of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+
+from optloc import __version__
+
+FOLDER = Path(__file__).resolve().parents[2] / "docs" / "measured"
+# The page includes what follows this line; the lines above keep Sphinx from missing the file in a table of contents.
+START = "<!-- table -->"
+
+
+@dataclass
+class Ledger:
+    """Rows of one table by the name of their case."""
+
+    header: Sequence[str]
+    rows: dict[str, Sequence[str]] = field(default_factory=dict)
+
+    def add(self, name: str, *cells: object) -> None:
+        self.rows[name] = [str(cell) for cell in cells]
+
+
+@contextmanager
+def ledger(file: str, header: Sequence[str], names: Sequence[str], facts: str) -> Iterator[Ledger]:
+    """Yield a ledger; write it to docs/measured/`file`.md if every name has a row in the end."""
+    book = Ledger(header)
+    yield book
+    if all(name in book.rows for name in names):
+        write(file, header, [[name, *book.rows[name]] for name in names], facts)
+
+
+def write(file: str, header: Sequence[str], rows: Sequence[Sequence[str]], facts: str) -> Path:
+    """Write a markdown table with what is needed to make it again."""
+    lines = [header, ["---", *["---:"] * (len(header) - 1)], *rows]
+    table = "\n".join("| " + " | ".join(line) + " |" for line in lines)
+    made = f"optloc {__version__}, {datetime.now(UTC):%Y-%m-%d}, {facts}."
+    FOLDER.mkdir(exist_ok=True)
+    path = FOLDER / f"{file}.md"
+    path.write_text(f"---\norphan: true\n---\n\n{START}\n\n{made}\n\n{table}\n", encoding="utf-8")
+    return path

@@ -1,0 +1,138 @@
+"""The covariance of a fix is the covariance of its error, and no larger than the Cramer-Rao bound allows."""
+
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import pytest
+from monte_carlo.layouts import CASES, KINDS, SEED, Y_ARRAY, Y_TARGETS, Case, fixed, model
+from monte_carlo.tables import ledger
+from monte_carlo.trials import automatic, position, trials
+from scipy.constants import speed_of_light as LIGHT
+from scipy.stats import chi2
+
+from optloc import Status, crlb, solve
+
+DEFAULT, FULL, MANY = 200, 2000, 20_000
+CLEAR_GAP, SMALL = 25.0, 0.05
+NAMES = [case.name for case in CASES]
+
+
+@dataclass(frozen=True)
+class Regular:
+    """A fixed layout with one emitter."""
+
+    name: str
+    kind: str
+    stations: np.ndarray
+    emitter: np.ndarray
+    sigma: float
+
+
+_SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+REGULAR = {
+    layout.name: layout
+    for layout in (
+        Regular(
+            "octahedron, emitter inside, 10 m",
+            "tdoa",
+            np.concatenate([np.eye(3), -np.eye(3)]) * [5e3, 5e3, 3e3],
+            np.array([1e3, 2e3, 1e3]),
+            10.0,
+        ),
+        Regular(
+            "corners of the box, emitter at 17 km, 10 m",
+            "tdoa",
+            _SIGNS * [5e3, 5e3, 3e3],
+            np.array([15e3, 8e3, 4e3]),
+            10.0,
+        ),
+        Regular("planar Y, first target, 10 ns", "tdoa, white", Y_ARRAY, Y_TARGETS[0], 10e-9 * LIGHT),
+    )
+}
+
+
+@pytest.fixture(scope="module")
+def nees_book():
+    header = ["case", "fixes used", "share", "NEES / d", "99 % band"]
+    with ledger("nees", header, NAMES, f"seed {SEED}, {FULL} trials a case") as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def bound_book():
+    header = ["layout", "RMSE, m", "bound, m", "RMSE / bound"]
+    with ledger("bound", header, list(REGULAR), f"seed {SEED}, {MANY} trials a layout") as made:
+        yield made
+
+
+def nees(name: str, count: int) -> np.ndarray:
+    """Return the normalised squared errors of the fixes that are clear: no rival, and a small ellipse."""
+    run, fix = trials(name, count), automatic(name, count)
+    x, cov = position(fix), fix.covariance()
+    nearest = np.linalg.norm(x[:, None] - run.model.stations, axis=-1).min(1)
+    usable = (fix.code == Status.OK) & np.isfinite(cov).all((1, 2))
+    usable &= fix.alternatives.gap.min(1, initial=np.inf) > CLEAR_GAP
+    axis = np.sqrt(np.linalg.eigvalsh(np.where(usable[:, None, None], cov, 0.0))[:, -1])
+    usable &= axis < SMALL * nearest
+    error = (x - run.truth)[usable, :, None]
+    return (np.swapaxes(error, 1, 2) @ np.linalg.solve(cov[usable], error))[:, 0, 0]
+
+
+def band(degrees: int, probability: float = 0.99) -> tuple[float, float]:
+    """Return the band of a mean of squared unit normals."""
+    tail = (1.0 - probability) / 2.0
+    return chi2.ppf(tail, degrees) / degrees, chi2.ppf(1.0 - tail, degrees) / degrees
+
+
+def judge_nees(name: str, count: int):
+    squared, d = nees(name, count), trials(name, count).truth.shape[1]
+    low, high = band(max(len(squared) * d, 1))
+    return len(squared), squared.mean() / d if len(squared) else np.nan, low, high
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_errors_are_as_large_as_the_covariance_says(name):
+    used, mean, low, high = judge_nees(name, DEFAULT)
+    assert used < 20 or low <= mean <= high, f"NEES/d {mean:.3f} of {used} fixes, band {low:.3f} to {high:.3f}"
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", NAMES)
+def test_errors_are_as_large_as_the_covariance_says_in_full(name, nees_book):
+    used, mean, low, high = judge_nees(name, FULL)
+    nees_book.add(name, used, f"{100.0 * used / FULL:.1f} %", f"{mean:.3f}", f"{low:.3f} to {high:.3f}")
+    assert used < 20 or low <= mean <= high, f"NEES/d {mean:.3f} of {used} fixes, band {low:.3f} to {high:.3f}"
+
+
+def rmse(layout: Regular, count: int) -> tuple[float, float]:
+    """Return the root mean square error of a layout and its bound."""
+    kind = KINDS[layout.kind]
+    places, truth = fixed(layout.stations, None, count), fixed(layout.emitter, None, count)
+    own = model(kind, places, layout.sigma)
+    exact = own.exact(truth)
+    case = Case(layout.name, layout.kind, partial(fixed, layout.stations), partial(fixed, layout.emitter), 1.0, 1.0)
+    rng = np.random.default_rng(case.seed)
+    root = np.linalg.cholesky(kind.covariance(exact.shape[1], layout.sigma))
+    problem = kind.problem(places, exact + rng.standard_normal(exact.shape) @ root.T, layout.sigma)
+    fix = solve(problem)
+    assert (fix.code == Status.OK).all()
+    _, J = own.residual(truth[:1], exact[:1], np.array([0]))
+    bound = np.linalg.inv(J[0].T @ J[0])
+    np.testing.assert_allclose(crlb(problem, truth)[0], bound, rtol=1e-6)
+    return float(np.sqrt(((position(fix) - truth) ** 2).sum(1).mean())), float(np.sqrt(np.trace(bound)))
+
+
+@pytest.mark.parametrize("name", REGULAR)
+def test_errors_meet_the_bound_within_their_scatter(name):
+    found, bound = rmse(REGULAR[name], DEFAULT)
+    low, high = np.sqrt(band(DEFAULT))  # of one axis: the widest
+    assert low <= found / bound <= high
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", REGULAR)
+def test_errors_meet_the_bound_in_full(name, bound_book):
+    found, bound = rmse(REGULAR[name], MANY)
+    bound_book.add(name, f"{found:.2f}", f"{bound:.2f}", f"{found / bound:.4f}")
+    assert found == pytest.approx(bound, rel=0.05)
