@@ -20,7 +20,8 @@ every remainder of
 is at most a multiple of :math:`\eta^2` or :math:`\epsilon^2` (from :math:`|x - \sin x| \le |x|^3/6`, :math:`1 - \cos x
 \le x^2/2` and the mean value theorem for cos), and the three weights are what is left of :math:`1/\sigma^2`. Hence
 :math:`q \le f` on the cap and :math:`q(\hat v) = f(\hat v)`. A point with total cost at most :math:`\rho^2` has all its
-directions in their caps, so the least sum of `q` over any set that holds the best point is at most the least sum of `f`.
+directions in their caps, so the least sum of `q` over any set that holds the best point is at most the least sum of
+`f`.
 
 Source: derived here.
 """

@@ -170,9 +170,65 @@ def sight(
         scale = W / _lengths(point, S, turn, least, E is not None)
         final = _balance(_rows(_predicted(point, S, turn, E is not None)), G, b, scale)
         front = ((final[..., None, :] - S) * seen.ahead).sum(axis=-1) > 0.0
-    ok = np.isfinite(final).all(axis=-1)
+    ok = np.asarray(np.isfinite(final).all(axis=-1))
     shift = middle[..., 0, :]
     return Sighted(plain + shift, point + shift, final + shift, ok, ok & (front | ~use).all(axis=-1))
+
+
+def predicted(point: Array, station: Array, axes: ArrayLike | None = None) -> Array:
+    """Return azimuth and elevation of a point.
+
+    Parameters
+    ----------
+    point : Array, shape (..., 3)
+        Target.
+    station : Array, shape (..., N, 3)
+        Positions.
+    axes : array_like, shape (..., N, 3, 3), optional
+        Rows are the unit vectors of each station's axes.
+
+    Returns
+    -------
+    Array, shape (..., N, 2)
+        Radians.
+
+    Notes
+    -----
+    Plain geometry.
+    """
+    line = _local(point, station, None if axes is None else np.asarray(axes, dtype=np.float64))
+    flat = np.hypot(line[..., 0], line[..., 1])
+    return np.stack([np.arctan2(line[..., 1], line[..., 0]), np.arctan2(line[..., 2], flat)], axis=-1)
+
+
+def meeting(direction: Array, station: Array) -> Array:
+    """Return the point nearest to lines, in least squares weighted by one over the distance along them.
+
+    Parameters
+    ----------
+    direction : Array, shape (N, 3)
+        Unit vectors.
+    station : Array, shape (N, 3)
+        A point of each line.
+
+    Returns
+    -------
+    Array, shape (3,)
+        The point; NaN for parallel lines.
+
+    Notes
+    -----
+    Two passes, the first without weights.
+    """
+    off = np.eye(3) - direction[:, :, None] * direction[:, None, :]
+    weight, point = np.ones(len(station)), np.full(3, np.nan)
+    for _ in range(2):
+        left = np.einsum("n,nij->ij", weight, off)
+        if not np.isfinite(left).all() or np.linalg.cond(left) > 1e13:
+            return np.full(3, np.nan)
+        point = np.linalg.solve(left, np.einsum("n,nij,nj->i", weight, off, station))
+        weight = 1.0 / np.maximum(np.sum((point - station) ** 2, axis=1), 1e-12)
+    return point
 
 
 def _rows(seen: Rays) -> Array:
@@ -194,8 +250,8 @@ def _lengths(point: Array, S: Array, turn: Array | None, least: Array, both: boo
 
 def _predicted(point: Array, S: Array, turn: Array | None, both: bool) -> Rays:
     line = _local(point, S, turn)
-    A = np.arctan2(line[..., 1], line[..., 0])
-    return rays(A, np.arctan2(line[..., 2], np.hypot(line[..., 0], line[..., 1])) if both else None, turn)
+    flat = np.hypot(line[..., 0], line[..., 1])
+    return rays(np.arctan2(line[..., 1], line[..., 0]), np.arctan2(line[..., 2], flat) if both else None, turn)
 
 
 def _balance(Z: Array, G: Array, b: Array, W: Array) -> Array:

@@ -4,8 +4,10 @@ Station i at :math:`S_i` measured azimuth and elevation, that is a unit vector :
 :math:`a_i`, :math:`e_i`. The unknowns are the unit directions :math:`v_i` themselves,
 
 .. math:: \min \sum_i q_i(v_i) \quad\text{subject to}\quad |v_i| = 1, \quad v_i^\top [S_j - S_i]_\times v_j = 0,
+   \quad (S_j - S_i)^\top (v_i - v_j) \ge 0,
 
-the last for every pair: two lines of sight lie in one plane. All is quadratic in `v`; with :math:`v_i = F_i^\top (e_1 +
+the last two for every pair: two lines of sight lie in one plane, and they do not diverge (without this linear
+inequality a pair of rays that meet behind the stations is taken at its word). All is quadratic in `v`; with :math:`v_i = F_i^\top (e_1 +
 \sigma w_i)`, the rows of :math:`F_i` being a reference direction and its tangents, the lift :math:`Y = (1, w)(1,
 w)^\top` of size 3N + 1 is relaxed to :math:`Y \succeq 0`.
 
@@ -15,8 +17,7 @@ sphere :math:`a^\top v = \cos E_v \sin\delta`, so the two costs differ to first 
 
 *Touching* (a proof): :math:`q_i` is a quadratic that nowhere exceeds the squared angle errors and equals them at a
 given fix (:mod:`formulations._minorant`). Its bound is rigorous for the ML cost itself, and equal to it where the
-relaxation is tight and the fix is the best point. Epipolar equalities hold for every point, also one behind a
-station, so that adding them loses none.
+relaxation is tight and the fix is the best point.
 
 Sources: N. Z. Shor, "Quadratic optimization problems", Sov. J. Comput. Syst. Sci. 25 (1987) (the lift); R. Hartley
 and A. Zisserman, "Multiple view geometry in computer vision", 2004, section 9 (the equalities).
@@ -33,7 +34,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from formulations._minorant import minorant
-from formulations.bearing_ls import rays
+from formulations.bearing_ls import meeting, predicted, rays
 from formulations.conic import Answer, Relaxation
 
 Array = NDArray[np.float64]
@@ -79,7 +80,8 @@ def direction_problem(count: int) -> Any:
     cvxpy.Problem
         Variable ``lift`` of shape (3N + 1, 3N + 1), the one first. Parameters ``linear`` (3N,) and ``square`` (3N,)
         of the cost ``2 linear'w + sum square w^2``; ``unit`` (N,), the scales of the directions; for the P pairs
-        ``level`` (P,), ``slope`` (P, 6) and ``turn`` (P, 9) of ``level + slope'(w_i, w_j) + w_i' turn w_j = 0``.
+        ``level`` (P,), ``slope`` (P, 6) and ``turn`` (P, 9) of ``level + slope'(w_i, w_j) + w_i' turn w_j = 0``, and
+        ``start`` (P,) and ``order`` (P, 6) of ``start + order'(w_i, w_j) >= 0``.
 
     Notes
     -----
@@ -193,34 +195,6 @@ def angle_bound(
     return _solve(_frames(seen, axes), S, cost, backend)
 
 
-def predicted(point: Array, station: Array, axes: ArrayLike | None = None) -> Array:
-    """Return azimuth and elevation of a point.
-
-    Parameters
-    ----------
-    point : Array, shape (3,)
-        Target.
-    station : Array, shape (N, 3)
-        Positions.
-    axes : array_like, shape (N, 3, 3), optional
-        Rows are the unit vectors of each station's axes.
-
-    Returns
-    -------
-    Array, shape (N, 2)
-        Radians.
-
-    Notes
-    -----
-    Plain geometry.
-    """
-    line = point - station
-    if axes is not None:
-        line = np.einsum("nij,nj->ni", np.asarray(axes, dtype=np.float64), line)
-    flat = np.hypot(line[:, 0], line[:, 1])
-    return np.stack([np.arctan2(line[:, 1], line[:, 0]), np.arctan2(line[:, 2], flat)], axis=-1)
-
-
 @dataclass(frozen=True, slots=True)
 class _Cost:
     """Coefficients in ``v - v^``, and the largest sum of ``|v - v^|^2`` of any point that matters."""
@@ -278,33 +252,3 @@ def _solve(frame: Array, S: Array, cost: _Cost, backend: str) -> Directed:
         v = v / np.linalg.norm(v, axis=1, keepdims=True)
     bound = cost.constant + answer.bound
     return Directed(meeting(v, S), v, cost.constant + answer.primal, max(bound, 0.0), ratio, answer)
-
-
-def meeting(direction: Array, station: Array) -> Array:
-    """Return the point nearest to lines, in least squares weighted by one over the distance along them.
-
-    Parameters
-    ----------
-    direction : Array, shape (N, 3)
-        Unit vectors.
-    station : Array, shape (N, 3)
-        A point of each line.
-
-    Returns
-    -------
-    Array, shape (3,)
-        The point; NaN for parallel lines.
-
-    Notes
-    -----
-    Two passes, the first without weights.
-    """
-    off = np.eye(3) - direction[:, :, None] * direction[:, None, :]
-    weight, point = np.ones(len(station)), np.full(3, np.nan)
-    for _ in range(2):
-        left = np.einsum("n,nij->ij", weight, off)
-        if not np.isfinite(left).all() or np.linalg.cond(left) > 1e13:
-            return np.full(3, np.nan)
-        point = np.linalg.solve(left, np.einsum("n,nij,nj->i", weight, off, station))
-        weight = 1.0 / np.maximum(np.sum((point - station) ** 2, axis=1), 1e-12)
-    return point

@@ -22,11 +22,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from formulations._sight_cones import ball_problem, cone_data, edge_problem
 from formulations.conic import Answer, Relaxation
 
 Array = NDArray[np.float64]
@@ -76,7 +76,7 @@ class Minimax:
     level : float
         Its worst ``angle_i / sigma_i``.
     least : float
-        No point has a smaller one: the largest level proven empty.
+        No point within `_WIDEST` of every bearing has a smaller one: the largest level proven empty.
     meet : bool or None
         As in `Common`, at the widest level.
     solves : int
@@ -88,66 +88,6 @@ class Minimax:
     least: float
     meet: bool | None
     solves: int
-
-
-def ball_problem(count: int, dim: int) -> Any:
-    """Build the largest common ball of cones as a cvxpy problem.
-
-    Parameters
-    ----------
-    count, dim : int
-        N cones in d dimensions.
-
-    Returns
-    -------
-    cvxpy.Problem
-        Variables ``point`` (d,) and ``radius``; parameters ``side`` (N (d - 1), d) and ``side_at`` (N (d - 1),): rows
-        of T and their products with S; ``slope`` (N, d) and ``slope_at`` (N,): u and its product with S; each cone times
-        its own factor; ``widen`` (N,): that factor over cos(theta). Rows of zeros with ``slope_at`` negative drop one.
-
-    Notes
-    -----
-    Lobo et al. (1998).
-    """
-    import cvxpy as cp
-
-    point, radius = cp.Variable(dim, name="point"), cp.Variable(name="radius")
-    return cp.Problem(cp.Minimize(-radius), [*_cones(point, radius, count, dim), radius <= 1.0])
-
-
-def edge_problem(count: int, dim: int) -> Any:
-    """Build the farthest common point of cones in a direction as a cvxpy problem.
-
-    Parameters
-    ----------
-    count, dim : int
-        N cones in d dimensions.
-
-    Returns
-    -------
-    cvxpy.Problem
-        Variable ``point`` minimising ``towards'point``; parameters as in `ball_problem`, without ``widen``.
-
-    Notes
-    -----
-    Lobo et al. (1998).
-    """
-    import cvxpy as cp
-
-    point, towards = cp.Variable(dim, name="point"), cp.Parameter(dim, name="towards")
-    return cp.Problem(cp.Minimize(towards @ point), _cones(point, None, count, dim))
-
-
-def _cones(point: Any, radius: Any, count: int, dim: int) -> list[Any]:
-    import cvxpy as cp
-
-    rows = dim - 1
-    side, at = cp.Parameter((count * rows, dim), name="side"), cp.Parameter(count * rows, name="side_at")
-    slope, from_ = cp.Parameter((count, dim), name="slope"), cp.Parameter(count, name="slope_at")
-    off, reach = side @ point - at, slope @ point - from_
-    if radius is not None:
-        reach = reach - cp.Parameter(count, name="widen") * radius
-    return [cp.SOC(reach[i], off[i * rows : (i + 1) * rows]) for i in range(count)]
 
 
 @lru_cache(maxsize=32)
@@ -184,7 +124,7 @@ def common(direction: ArrayLike, station: ArrayLike, bound: ArrayLike, *, backen
     """
     u, S, theta = (np.asarray(part, dtype=np.float64) for part in (direction, station, bound))
     relaxation = _built("ball", *u.shape, backend)
-    answer = relaxation.solve(_data(u, S, theta, ball=True))
+    answer = relaxation.solve(cone_data(u, S, theta, ball=True))
     point, margin = answer.values["point"], -answer.primal
     inside = bool((angles(point, u, S) <= theta).all())
     meet = True if inside else (False if -answer.bound < 0.0 else None)
@@ -214,7 +154,7 @@ def extent(
     Lobo et al. (1998).
     """
     u, S, theta = (np.asarray(part, dtype=np.float64) for part in (direction, station, bound))
-    relaxation, data = _built("edge", *u.shape, backend), _data(u, S, theta, ball=False)
+    relaxation, data = _built("edge", *u.shape, backend), cone_data(u, S, theta, ball=False)
     out = []
     for line in np.asarray(towards, dtype=np.float64):
         answer = relaxation.solve({**data, "towards": -line})
@@ -305,22 +245,3 @@ def angles(point: Array, direction: Array, station: Array) -> Array:
 def _at(u: Array, S: Array, scale: Array, level: float, backend: str) -> Common:
     theta = np.where(np.isfinite(scale), np.minimum(level * scale, _WIDEST), np.inf)
     return common(u, S, theta, backend=backend)
-
-
-def _data(u: Array, S: Array, theta: Array, *, ball: bool) -> dict[str, Array]:
-    """Parameters of the two problems; a cone is divided by 1 / cos where it is wide, so that numbers stay small."""
-    count, dim = u.shape
-    kept = np.isfinite(theta)
-    half = np.where(kept, theta, 0.0)
-    # the complement of u: the last left singular vectors of a column
-    side = np.linalg.svd(u[:, :, None])[0][:, :, 1:].transpose(0, 2, 1)
-    side = np.where(kept[:, None, None], np.cos(half)[:, None, None] * side, 0.0)
-    slope = np.where(kept, np.sin(half), 0.0)[:, None] * u
-    at = (slope * S).sum(axis=1)
-    data = {
-        "side": side.reshape(-1, dim),
-        "side_at": np.einsum("nrd,nd->nr", side, S).ravel(),
-        "slope": slope,
-        "slope_at": np.where(kept, at, -1.0),
-    }
-    return {**data, "widen": np.where(kept, 1.0, 0.0)} if ball else data

@@ -28,10 +28,12 @@ def check_unknowns(problem: Problem) -> None:
         Naming the motion, bias or prior.
     """
     for number, motion in enumerate(problem.motions):
-        _check_motion(problem, motion, f"motions[{number}]")
+        _check_motion(problem, motion, number)
     for bias in problem.biases:
         _check_bias(problem, bias, f"bias {bias.name!r}")
     layout = problem.layout
+    if layout.size == 0:
+        raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
     names = Counter(slot.name for slot in (*layout.shared, *layout.local))
     twice = [name for name, count in names.items() if count > 1]
     if twice:
@@ -40,7 +42,8 @@ def check_unknowns(problem: Problem) -> None:
         _check_prior(problem, prior)
 
 
-def _check_motion(problem: Problem, motion: Motion, where: str) -> None:
+def _check_motion(problem: Problem, motion: Motion, number: int) -> None:
+    where = f"motions[{number}]"
     if motion.order not in (0, 1, 2):
         raise InvalidProblem(f"a motion of order {motion.order}", where, "use order 0, 1 or 2")
     if motion.span not in ("run", "epoch"):
@@ -59,6 +62,10 @@ def _check_motion(problem: Problem, motion: Motion, where: str) -> None:
         raise InvalidProblem(f"known states for {shape[-3]} epochs, not {counts}", where, "give one, or one an epoch")
     if not np.isfinite(motion.known).all():
         raise InvalidProblem("a known state is not finite", where, "give metres and metres per second")
+    if shape[-3] > 1 and shape[-2] == 1:
+        for rows in problem.rows:
+            if MODELS[rows.kind].velocity and (rows.target == number).any():
+                raise InvalidProblem(f"{rows.kind} needs the velocity of this known target", where, "give it as well")
 
 
 def _check_bias(problem: Problem, bias: Bias, where: str) -> None:

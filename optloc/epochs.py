@@ -19,7 +19,7 @@ def separable(problem: Problem) -> bool:
     return problem.epochs > 1 and free and not problem.biases and not run_long_errors and not tied(problem)
 
 
-def _tied(problem: Problem) -> bool:
+def tied(problem: Problem) -> bool:
     """Return whether the noise of rows of different epochs is correlated."""
     epoch = problem.epoch
     for block in problem.noise.blocks:

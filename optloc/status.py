@@ -64,8 +64,14 @@ class Certificate:
         Why it is this and not more.
     method : str
         What was done to find out.
+    bound : float
+        Lower bound of the maximum-likelihood cost over all positions; NaN where none was computed.
+    gap : float
+        Cost less bound.
     """
 
     proof: str
     reason: str
     method: str
+    bound: float = float("nan")
+    gap: float = float("nan")

@@ -363,7 +363,7 @@ def plain_cost(problem: Problem, x: np.ndarray) -> float:
 
 # ------------------------------------------------------------------------------------ everything in one problem
 def kitchen_sink(d: int, span: str = "epoch", seed: int = 5) -> Problem:
-    """Return three targets over three epochs (steady, accelerating, known) that share all forms of bias and stations' errors."""
+    """Return three targets over three epochs (steady, accelerating, known) with all forms of shared bias."""
     rng = np.random.default_rng(seed)
     count, k, times = len(STATIONS[d]), 3, np.array([10.0, 12.5, 14.0])
     moving = STATIONS[d] + rng.normal(0.0, 300.0, (k, count, d))
@@ -437,7 +437,11 @@ def quick(problem: Problem) -> Callable[[np.ndarray], np.ndarray]:
         out = []
         for rows in problem.rows:
             a, b = rows.a, rows.b
-            if rows.kind == "height":
+            if rows.kind in ("tdoa", "groa", "range", "toa", "range_sum"):
+                two = {"tdoa": np.subtract, "groa": np.divide, "range_sum": np.add}.get(rows.kind)
+                one = r[a] + (x[-1] if rows.kind == "toa" else 0.0)
+                out.append(one if two is None else two(r[a], r[b]))
+            elif rows.kind == "height":
                 out.append([plain_h("height", x[:d], None, None, None, None, None, None, problem.frame)])
             elif rows.kind == "fdoa":
                 v = x[d : 2 * d] if order else np.zeros(d)
@@ -447,8 +451,7 @@ def quick(problem: Problem) -> Callable[[np.ndarray], np.ndarray]:
                 own = line[a] if s.axes is None else np.einsum("mij,mj->mi", s.axes[0][a], line[a])
                 out.append(np.arctan2(own[:, 1], own[:, 0]) if rows.kind == "azimuth" else np.arcsin(own[:, 2] / r[a]))
             else:
-                made = {"tdoa": lambda: r[a] - r[b], "groa": lambda: r[a] / r[b], "range_sum": lambda: r[a] + r[b]}
-                out.append(made.get(rows.kind, lambda: r[a])() + (x[-1] if rows.kind == "toa" else 0.0))
+                raise LookupError(rows.kind)
         return W @ wrapped(problem, z - np.concatenate(out))
 
     return residual

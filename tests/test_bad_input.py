@@ -6,7 +6,20 @@ import numpy as np
 import pytest
 from cases import CASES, STATIONS, stations
 
-from optloc import ECEF, Bias, Frame, InvalidProblem, Motion, Prior, Stations, assemble, crlb, measured, solve, station_array
+from optloc import (
+    ECEF,
+    Bias,
+    Frame,
+    InvalidProblem,
+    Motion,
+    Prior,
+    Stations,
+    assemble,
+    crlb,
+    measured,
+    solve,
+    station_array,
+)
 from optloc.layout import Layout
 
 SIX = np.arange(6)
@@ -23,7 +36,13 @@ def posed(*, rows=None, place=STATIONS[2], **more):
 
 
 def biased(**changes):
-    given = {"name": "clock", "members": ("A", "B"), "row": [0, 1], "member": [0, 1], "coefficient": [1.0, 1.0]} | changes
+    given = {
+        "name": "clock",
+        "members": ("A", "B"),
+        "row": [0, 1],
+        "member": [0, 1],
+        "coefficient": [1.0, 1.0],
+    } | changes
     for key in ("row", "member", "coefficient"):
         given[key] = np.array(given[key])
     return posed(biases=(Bias(**given),))
@@ -63,11 +82,17 @@ TABLE = {
     "station beyond": (lambda: posed(rows=ranges(a=SIX + 1)), "range row 5 has a = 6.*0 to 5"),
     "station below": (lambda: posed(rows=ranges(a=SIX - 1)), "range row 0 has a = -1"),
     "second station beyond": (lambda: posed(rows=measured("tdoa", [1.0], a=0, b=9, sigma=1.0)), "tdoa row 0 has b = 9"),
-    "one station twice": (lambda: posed(rows=measured("tdoa", [1.0], a=2, b=2, sigma=1.0)), "tdoa row 0.*one station twice"),
+    "one station twice": (
+        lambda: posed(rows=measured("tdoa", [1.0], a=2, b=2, sigma=1.0)),
+        "tdoa row 0.*one station twice",
+    ),
     "epoch below": (lambda: posed(rows=ranges(epoch=-1)), "epoch = -1"),
     "epoch beyond": (lambda: posed(rows=ranges(epoch=4), times=[0.0, 1.0]), "epoch = 4.*0 to 1"),
     "target beyond": (lambda: posed(rows=ranges(target=1)), "target = 1"),
-    "no rows": (lambda: posed(rows=measured("range", np.zeros(0), a=np.zeros(0, int), sigma=1.0)), "no measurements|no rows"),
+    "no rows": (
+        lambda: posed(rows=measured("range", np.zeros(0), a=np.zeros(0, int), sigma=1.0)),
+        "no measurements|no rows",
+    ),
     "nothing measured": (lambda: assemble(STATIONS[2]), "no measurements"),
     "infinite value": (lambda: posed(rows=ranges(z=np.r_[np.full(5, 1.0), np.inf])), "range row 5.*infinite.*remove"),
     "infinite correction": (lambda: posed(rows=ranges(correction=np.inf)), "range.*correction"),
@@ -80,20 +105,29 @@ TABLE = {
     "nan sigma": (lambda: posed(rows=ranges(sigma=np.nan)), "sigma.*range row 0.*positive"),
     "infinite sigma": (lambda: posed(rows=ranges(sigma=np.inf)), "sigma.*range row 0.*positive"),
     "negative arrival sigma": (
-        lambda: posed(rows=measured("tdoa", [1.0], a=1, b=0, arrival_sigma=-1.0)), "arrival_sigma.*-1.*positive",
+        lambda: posed(rows=measured("tdoa", [1.0], a=1, b=0, arrival_sigma=-1.0)),
+        "arrival_sigma.*-1.*positive",
     ),
     "arrival sigmas of too few": (
-        lambda: posed(rows=measured("tdoa", [1.0], a=1, b=0, arrival_sigma=[1.0, 2.0])), "arrival_sigma.*2.*6 stations",
+        lambda: posed(rows=measured("tdoa", [1.0], a=1, b=0, arrival_sigma=[1.0, 2.0])),
+        "arrival_sigma.*2.*6 stations",
     ),
     "arrival sigma of angles": (
-        lambda: posed(rows=measured("azimuth", [1.0], a=1, arrival_sigma=1.0)), "azimuth does not combine arrival",
+        lambda: posed(rows=measured("azimuth", [1.0], a=1, arrival_sigma=1.0)),
+        "azimuth does not combine arrival",
     ),
     "negative variance": (lambda: covariance(put((3, 3), -1.0)), "row.*3|noise.*not positive"),
     "non-symmetric covariance": (lambda: covariance(put((0, 1), 0.5)), "noise.*not symmetric"),
     "indefinite covariance": (lambda: covariance(put(([0, 1], [1, 0]), 2.0)), "noise.*not positive semidefinite"),
     "nan covariance": (lambda: covariance(put((2, 2), np.nan)), "noise.*not finite"),
-    "covariance of another size": (lambda: posed(rows=ranges(sigma=None, covariance=np.ones((6, 5)))), r"range.*covariance.*\(6, 5\)|covariance.*range.*\(6, 5\)"),
-    "variances for a covariance": (lambda: posed(rows=ranges(sigma=None, covariance=np.ones(6))), r"covariance.*\(6,\)"),
+    "covariance of another size": (
+        lambda: posed(rows=ranges(sigma=None, covariance=np.ones((6, 5)))),
+        r"range.*covariance.*\(6, 5\)|covariance.*range.*\(6, 5\)",
+    ),
+    "variances for a covariance": (
+        lambda: posed(rows=ranges(sigma=None, covariance=np.ones(6))),
+        r"covariance.*\(6,\)",
+    ),
     "joint covariance of another size": (lambda: posed(covariance=np.eye(5)), r"covariance.*\(5, 5\).*6"),
     "flat stations": (lambda: posed(place=np.zeros(6)), r"stations.*\(6,\)"),
     "stations in four dimensions": (lambda: posed(place=np.zeros((6, 4))), r"stations.*\(6, 4\)"),
@@ -101,23 +135,62 @@ TABLE = {
     "stations in words": (lambda: posed(place=[["here", "there"]]), "stations"),
     "nan station": (lambda: posed(place=np.r_[STATIONS[2][:5], [[np.nan, 0.0]]]), "'S5' is not finite"),
     "infinite station": (lambda: posed(place=np.r_[[[np.inf, 0.0]], STATIONS[2][1:]]), "'S0' is not finite"),
-    "name twice": (lambda: posed(place=station_array(STATIONS[2], ["a", "b", "c", "a", "e", "f"])), "'a' is used twice"),
+    "name twice": (
+        lambda: posed(place=station_array(STATIONS[2], ["a", "b", "c", "a", "e", "f"])),
+        "'a' is used twice",
+    ),
     "names missing": (lambda: posed(place=station_array(STATIONS[2], ["a", "b"])), "6 stations have 2 names"),
-    "velocities of another shape": (lambda: posed(place=stations(2, velocity=np.zeros((1, 5, 2)))), r"velocity.*\(1, 5, 2\)"),
-    "nan velocity": (lambda: posed(place=stations(2, velocity=np.full((1, 6, 2), np.nan))), "velocity.*'S0'.*not finite"),
-    "axes of another shape": (lambda: posed(rows=angles(), place=stations(2, axes=np.zeros((1, 6, 3, 3)))), r"axes.*\(1, 6, 3, 3\)"),
-    "skewed axes": (lambda: posed(rows=angles(), place=stations(2, axes=np.tile(skew, (1, 6, 1, 1)))), "axes of station 'S0'.*orthogonal|'S0'.*right angles"),
-    "station errors of another shape": (lambda: posed(place=stations(2, covariance=np.eye(2))), r"covariance.*\(2, 2\)"),
-    "negative station errors": (lambda: posed(place=stations(2, covariance=-np.tile(np.eye(2), (6, 1, 1)))), "position error of station S0.*not positive"),
-    "station errors of an unknown span": (lambda: posed(place=stations(2, covariance=np.tile(np.eye(2), (6, 1, 1)), span="day")), "span.*'day'.*epoch.*run"),
-    "stations of too few epochs": (lambda: posed(place=np.stack([STATIONS[2]] * 2), rows=ranges(epoch=[0, 0, 1, 1, 2, 2])), "stations.*2.*3 epochs"),
-    "elevation in the plane": (lambda: posed(rows=measured("elevation", [0.1], a=0, sigma=0.1)), "elevation has no meaning in 2 dim"),
-    "height without a globe": (lambda: posed(place=STATIONS[3], rows=measured("height", [0.1], sigma=0.1)), "height needs a geodetic frame"),
-    "height in the plane": (lambda: posed(rows=measured("height", [0.1], sigma=0.1), frame=ENU), "height has no meaning in 2"),
+    "velocities of another shape": (
+        lambda: posed(place=stations(2, velocity=np.zeros((1, 5, 2)))),
+        r"velocity.*\(1, 5, 2\)",
+    ),
+    "nan velocity": (
+        lambda: posed(place=stations(2, velocity=np.full((1, 6, 2), np.nan))),
+        "velocity.*'S0'.*not finite",
+    ),
+    "axes of another shape": (
+        lambda: posed(rows=angles(), place=stations(2, axes=np.zeros((1, 6, 3, 3)))),
+        r"axes.*\(1, 6, 3, 3\)",
+    ),
+    "skewed axes": (
+        lambda: posed(rows=angles(), place=stations(2, axes=np.tile(skew, (1, 6, 1, 1)))),
+        "axes of station 'S0'.*orthogonal|'S0'.*right angles",
+    ),
+    "station errors of another shape": (
+        lambda: posed(place=stations(2, covariance=np.eye(2))),
+        r"covariance.*\(2, 2\)",
+    ),
+    "negative station errors": (
+        lambda: posed(place=stations(2, covariance=-np.tile(np.eye(2), (6, 1, 1)))),
+        "position error of station S0.*not positive",
+    ),
+    "station errors of an unknown span": (
+        lambda: posed(place=stations(2, covariance=np.tile(np.eye(2), (6, 1, 1)), span="day")),
+        "span.*'day'.*epoch.*run",
+    ),
+    "stations of too few epochs": (
+        lambda: posed(place=np.stack([STATIONS[2]] * 2), rows=ranges(epoch=[0, 0, 1, 1, 2, 2])),
+        "stations.*2.*3 epochs",
+    ),
+    "elevation in the plane": (
+        lambda: posed(rows=measured("elevation", [0.1], a=0, sigma=0.1)),
+        "elevation has no meaning in 2 dim",
+    ),
+    "height without a globe": (
+        lambda: posed(place=STATIONS[3], rows=measured("height", [0.1], sigma=0.1)),
+        "height needs a geodetic frame",
+    ),
+    "height in the plane": (
+        lambda: posed(rows=measured("height", [0.1], sigma=0.1), frame=ENU),
+        "height has no meaning in 2",
+    ),
     "flat ECEF": (lambda: posed(frame=ECEF), "ECEF need three"),
     "a word for a frame": (lambda: posed(frame="ecef"), "frame.*'ecef'"),
     "latitude": (lambda: Frame.enu(lat_deg=95.0, lon_deg=0.0), "latitude 95"),
-    "times of another length": (lambda: posed(times=[0.0, 1.0], rows=ranges(epoch=[0, 0, 0, 1, 1, 2])), "epoch = 2|2 times"),
+    "times of another length": (
+        lambda: posed(times=[0.0, 1.0], rows=ranges(epoch=[0, 0, 0, 1, 1, 2])),
+        "epoch = 2|2 times",
+    ),
     "times backwards": (lambda: posed(times=[0.0, 2.0, 1.0]), "epoch 2 is not later"),
     "nan time": (lambda: posed(times=[0.0, np.nan]), "times.*finite"),
     "times in words": (lambda: posed(times=["noon"]), "times"),
@@ -125,8 +198,14 @@ TABLE = {
     "no motion": (lambda: posed(motions=()), "target = 0|motions"),
     "third derivative": (lambda: posed(motions=(Motion(3),)), "motions?.*order 3.*0, 1 or 2"),
     "motion of an unknown span": (lambda: posed(motions=(Motion(0, span="hour"),)), "'hour'.*run.*epoch"),
-    "known path of another dimension": (lambda: posed(motions=(Motion(0, known=np.zeros((1, 1, 3))),)), r"known.*\(1, 1, 3\)"),
-    "known path of other epochs": (lambda: posed(motions=(Motion(0, known=np.zeros((4, 1, 2))),)), r"known.*4.*1 epoch"),
+    "known path of another dimension": (
+        lambda: posed(motions=(Motion(0, known=np.zeros((1, 1, 3))),)),
+        r"known.*\(1, 1, 3\)",
+    ),
+    "known path of other epochs": (
+        lambda: posed(motions=(Motion(0, known=np.zeros((4, 1, 2))),)),
+        r"known.*4.*1 epoch",
+    ),
     "unknown known path": (lambda: posed(motions=(Motion(0, known=np.full((1, 1, 2), np.nan)),)), "known.*finite"),
     "bias of an unknown form": (lambda: biased(form="wobble"), "clock.*'wobble'.*offset"),
     "bias on a row beyond": (lambda: biased(row=[0, 6]), "clock.*row.*6"),
@@ -139,9 +218,18 @@ TABLE = {
     "bias prior of no width": (lambda: biased(mean=np.zeros(2), sigma=np.zeros(2)), "clock.*sigma.*positive"),
     "turned ranges": (lambda: biased(form="rotation"), "clock.*rotation.*range"),
     "prior on nothing": (lambda: posed(priors=(Prior("speed", np.zeros(2), np.eye(2)),)), "'speed'.*position"),
-    "prior of the wrong size": (lambda: posed(priors=(Prior("position", np.zeros(3), np.eye(3)),)), "prior.*position.*3.*2"),
-    "prior without covariance": (lambda: posed(priors=(Prior("position", np.zeros(2), np.zeros((2, 2))),)), "prior on position.*not positive"),
-    "prior at nan": (lambda: posed(priors=(Prior("position", np.array([0.0, np.nan]), np.eye(2)),)), "prior on position.*not finite"),
+    "prior of the wrong size": (
+        lambda: posed(priors=(Prior("position", np.zeros(3), np.eye(3)),)),
+        "prior.*position.*3.*2",
+    ),
+    "prior without covariance": (
+        lambda: posed(priors=(Prior("position", np.zeros(2), np.zeros((2, 2))),)),
+        "prior on position.*not positive",
+    ),
+    "prior at nan": (
+        lambda: posed(priors=(Prior("position", np.array([0.0, np.nan]), np.eye(2)),)),
+        "prior on position.*not finite",
+    ),
     "unlabelled rows": (lambda: solve(posed(rows=ranges(target=-1))), "range row 0.*target"),
     "unknown method": (lambda: solve(posed(), "sdpp+lsr"), "method.*'sdpp'.*sdp"),
     "empty method": (lambda: solve(posed(), ""), "method"),
@@ -149,7 +237,7 @@ TABLE = {
     "start of another length": (lambda: solve(posed(), "lsr", start=np.zeros(3)), r"start.*\(3,\).*2"),
     "unknown unknown": (lambda: solve(posed()).take("speed"), "'speed'.*position"),
     "truth of another length": (lambda: crlb(posed(), np.zeros(3)), r"vector.*\(3,\).*2 unknowns"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", TABLE)

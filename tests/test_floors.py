@@ -12,7 +12,8 @@ ROOT = Path(__file__).resolve().parents[1]
 FLOORS = {
     0: "types errors units frames status noise linalg ellipse",
     1: "models",
-    2: "layout problem linear normal fix tables kernels states build check check_constraints check_unknowns arguments epochs constraints tangent symbolic",
+    2: "layout problem linear normal fix tables kernels states build check check_constraints check_unknowns arguments "
+    "epochs constraints tangent symbolic",
     3: "solve bounds simulate",
     4: "track",
     5: "study papers scenario files",

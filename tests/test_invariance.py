@@ -1,4 +1,4 @@
-"""What must not matter does not: where the axes point, names and order, reference station, unit of length, the batch."""
+"""What must not matter does not: where the axes point, names, order, reference station, unit of length, the batch."""
 
 from dataclasses import replace
 

@@ -96,7 +96,7 @@ def of_stations(design, variance):
 
 @pytest.mark.parametrize("count", [3, 4, 6])
 def test_whitening_of_a_singular_covariance_is_its_pseudo_inverse(count):
-    """All pairs of arrival times: R = D diag(variance) D' has rank s - 1, and weighs consistent rows as s - 1 rows do."""
+    """All pairs of arrival times: R = D diag(variance) D' has rank s - 1 and weighs as s - 1 rows do."""
     rng = np.random.default_rng(count)
     variance = rng.uniform(0.5, 4.0, count)
     design = all_pairs(count)

@@ -14,7 +14,7 @@ def _free(d):
     return replace(sink, motions=(Motion(1, span="epoch"), Motion(0, span="epoch"), sink.motions[2]))
 
 
-# Problems with every form of unknown: station errors of an epoch or the run, targets that move or are new at each epoch.
+# Every form of unknown: station errors of an epoch or the run, targets that move or are new at each epoch.
 SINKS = {f"{d}d-{span}": kitchen_sink(d, span) for d in (2, 3) for span in ("epoch", "run")}
 SINKS |= {f"{d}d-free": _free(d) for d in (2, 3)}
 every_sink = pytest.mark.parametrize("problem", SINKS.values(), ids=SINKS.keys())

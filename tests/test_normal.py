@@ -1,4 +1,4 @@
-"""Arrow-shaped normal equations against dense ones, sums over epochs, priors, the bound against a numerical Fisher matrix."""
+"""Arrow-shaped normal equations against dense ones; sums, priors; the bound against a numerical Fisher matrix."""
 
 from dataclasses import replace
 

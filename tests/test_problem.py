@@ -34,12 +34,13 @@ def batch_of(count=6):
     axes = np.stack([turned(i, 3, n) for i in range(count)])
     stations = Stations(place, tuple("ABCDEFG"), None, axes, np.tile(np.eye(3), (count, n, 1, 1)))
     spread = np.stack([np.eye(3) * (100.0 + 50.0 * i) ** 2 for i in range(count)])
+    sigma, correction = rng.uniform(1, 3, (count, 5)), rng.normal(0, 1, (count, 5))
     problem = assemble(
         stations,
-        measured("range", np.zeros((count, 5)), a=np.arange(5), sigma=rng.uniform(1, 3, (count, 5)), correction=rng.normal(0, 1, (count, 5))),
+        measured("range", np.zeros((count, 5)), a=np.arange(5), sigma=sigma, correction=correction),
         measured("azimuth", np.zeros((count, 3)), a=[0, 1, 6], sigma=0.01, weight=rng.uniform(0.2, 1.0, (count, 3))),
         priors=(Prior("position", TARGET[3] + rng.normal(0, 50, (count, 3)), spread),),
-    )  # fmt: skip
+    )
     x = np.zeros(problem.layout.size)
     x[:3] = TARGET[3]
     return simulate(problem, x, 4), x
@@ -170,7 +171,7 @@ def test_layout_of_everything():
     assert layout.take(x, "stations").shape == (3, 21)
     assert len(layout.labels()) == layout.n_shared
     assert isinstance(layout, Layout)
-    with pytest.raises(InvalidProblem, match="'speed'.*position"):
+    with pytest.raises(InvalidProblem, match=r"'speed'.*position"):
         layout.find("speed")
 
 
@@ -179,7 +180,7 @@ K = 9
 
 
 def many_epochs(seed=2, moving=False, d=3, uncertain=False):
-    """A free target heard by other stations at each epoch: correlated differences, arrival times, angles, absent rows."""
+    """A free target heard by other stations at each epoch: correlated differences, arrivals, angles, absent rows."""
     rng = np.random.default_rng(seed)
     count = len(STATIONS[d])
     path = TARGET[d] + np.arange(K)[:, None] * RATE[d]

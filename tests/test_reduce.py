@@ -1,4 +1,4 @@
-"""Rows linear in ranges against their sufficient statistic: the same fix, the same covariance, the cost less the loops'."""
+"""Rows linear in ranges against their sufficient statistic: the same fix and covariance, the cost less the loops'."""
 
 from dataclasses import replace
 

@@ -4,7 +4,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from cases import CASES, ENU, STATIONS, TARGET, dense_covariance, kitchen_sink, plain_cost, quick, random_vector, stations
+from cases import (
+    CASES,
+    ENU,
+    STATIONS,
+    TARGET,
+    dense_covariance,
+    kitchen_sink,
+    plain_cost,
+    quick,
+    random_vector,
+    stations,
+)
 from scipy.optimize import least_squares
 
 from optloc import InvalidProblem, Motion, NoSolution, Status, assemble, crlb, measured, simulate, solve, station_array
@@ -119,7 +130,9 @@ def differences(place, truth, *, seed=1, sigma=1.0, pairs=None):
 
 def ranged(place, truth, *, seed=1, sigma=1.0):
     place = np.asarray(place, dtype=float)
-    return simulate(assemble(place, measured("range", a=np.arange(len(place)), sigma=sigma)), np.asarray(truth, float), seed)
+    return simulate(
+        assemble(place, measured("range", a=np.arange(len(place)), sigma=sigma)), np.asarray(truth, float), seed
+    )
 
 
 def test_too_few_rows_are_counted():
@@ -392,10 +405,12 @@ def test_noise_may_tie_epochs_that_share_all_unknowns(order):
         assert plain_cost(drawn, fix.x + 0.1 * shift) > fix.cost
 
 
-@pytest.mark.parametrize("more", [{"kind": "toa"}, {"motions": (Motion(0, span="epoch"),)}], ids=["emission", "position"])
+@pytest.mark.parametrize(
+    "more", [{"kind": "toa"}, {"motions": (Motion(0, span="epoch"),)}], ids=["emission", "position"]
+)
 def test_noise_may_not_tie_unknowns_of_an_epoch(more):
     """The elimination epoch by epoch would be silently wrong."""
-    with pytest.raises(InvalidProblem, match="different epochs are correlated.*(emission|position)"):
+    with pytest.raises(InvalidProblem, match=r"different epochs are correlated.*(emission|position)"):
         tied(**more)
 
 

@@ -42,6 +42,14 @@ Method = Annotated[str, typer.Option("--method", "-m", help="How to solve; see [
 Geodetic = Annotated[
     bool, typer.Option("--geodetic", help="The coordinates are latitude, longitude (deg) and height (m).")
 ]
+Height = Annotated[
+    str | None, typer.Option("--height", metavar="H", help="Known height above the ellipsoid: 500, or '1640 ft'.")
+]
+AboveGround = Annotated[bool, typer.Option("--above-ground", help="The target is above the ellipsoid.")]
+Box = Annotated[
+    str | None,
+    typer.Option("--box", metavar="LOW:HIGH", help="Region, metres in the frame: X,Y[,Z]:X,Y[,Z]; inf is no bound."),
+]
 
 
 def _version(wanted: bool) -> None:
@@ -71,7 +79,10 @@ def example(*lines: str) -> str:
 
 @app.command(
     epilog=example(
-        "optloc fix site.toml", "optloc fix flight.toml --out fixes.csv", "optloc fix site.toml --json | jq .fixes"
+        "optloc fix site.toml",
+        "optloc fix flight.toml --out fixes.csv",
+        "optloc fix site.toml --json | jq .fixes",
+        "optloc fix site.toml --height '1640 ft'",
     )
 )
 def fix(
@@ -81,12 +92,21 @@ def fix(
     geojson: Annotated[Path | None, typer.Option(metavar="OUT", help="Write GeoJSON; - is standard output.")] = None,
     plot: Plot = None,
     out: Annotated[Path | None, typer.Option(metavar="OUT", help="Write all fixes as .csv or .parquet.")] = None,
+    height: Height = None,
+    above_ground: AboveGround = False,
+    box: Box = None,
     quiet: Quiet = False,
 ) -> None:
-    """Fix the target of a problem file, at every epoch if there are several."""
-    from optloc.cli.commands import run_fix
+    """Fix the target of a problem file, at every epoch if there are several.
 
-    raise typer.Exit(run_fix(file, method, as_json=as_json, geojson_path=geojson, plot=plot, out=out, quiet=quiet))
+    Options such as --height add to the constraints of the file.
+    """
+    from optloc.cli.commands import run_fix
+    from optloc.cli.constraints import demanded
+
+    more = demanded(height, above_ground, box)
+    code = run_fix(file, method, more, as_json=as_json, geojson_path=geojson, plot=plot, out=out, quiet=quiet)
+    raise typer.Exit(code)
 
 
 @app.command(epilog=example("optloc demo", "optloc demo ambiguous --plot two.png"))

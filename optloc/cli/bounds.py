@@ -78,6 +78,8 @@ def vector(problem: Problem, position: str, velocity: str | None, geodetic: bool
     layout = problem.layout
     shared, local = np.zeros(layout.n_shared), np.zeros((problem.epochs, layout.n_local))
     for i, motion in enumerate(problem.motions):
+        if motion.known is not None:
+            continue
         for name in state_names(i, len(problem.motions), motion.order):
             value = values.get(name.partition("[")[0])
             if value is None:

@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from optloc.cli.output import dumps, write_text
+from optloc.constraints import exact
 from optloc.epochs import separable
 from optloc.files import Loaded, read
 from optloc.models import MODELS
@@ -34,6 +35,8 @@ def run_check(file: Path, as_json: bool) -> int:
 def _spelled(value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{key}: {inner}" for key, inner in value.items())
+    if isinstance(value, list):
+        return ", ".join(value) or "none"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
@@ -55,6 +58,7 @@ def summary(loaded: Loaded) -> dict[str, Any]:
         "targets": len(set(loaded.targets)),
         "rows": {block.kind: block.count for block in problem.rows},
         "absent_rows": int((problem.weight == 0.0).sum()),
+        "constraints": [constraint.name for constraint in problem.constraints],
         "unknowns": problem.layout.size // problem.epochs if alone else problem.layout.size,
         "redundancy": {"least": int(redundancy.min()), "median": float(np.median(redundancy))},
         "epochs_with_too_few_rows": int((redundancy < 0).sum()),
@@ -68,7 +72,7 @@ def _redundancy(problem: Problem, alone: bool) -> Array:
     """Return rows and priors less unknowns, of each epoch (k,) or of the run (1,)."""
     present = np.bincount(problem.epoch, problem.weight > 0.0, problem.epochs)
     layout = problem.layout
-    known = sum(len(np.ravel(bias.sigma)) for bias in problem.biases if bias.sigma is not None)
+    known = len(exact(problem)) + sum(len(np.ravel(bias.sigma)) for bias in problem.biases if bias.sigma is not None)
     known += sum(prior.mean.shape[-1] for prior in problem.priors)
     if problem.stations.covariance is not None:
         known += (

@@ -37,8 +37,9 @@ def fix_columns(loaded: Loaded, fix: Fix, first: int | None) -> Columns:
     """
     motions = loaded.problem.motions
     flat = fix if first is not None else fix.flat()
+    shown = [i for i, m in enumerate(motions) if m.known is None] or range(len(motions))
     return joined(
-        [_of_target(loaded, flat, first, i, state_names(i, len(motions), m.order)) for i, m in enumerate(motions)]
+        [_of_target(loaded, flat, first, i, state_names(i, len(motions), motions[i].order)) for i in shown]
     )
 
 
@@ -82,7 +83,18 @@ def _of_target(loaded: Loaded, fix: Fix, first: int | None, target: int, names: 
     columns |= {"cost": repeated(fix.cost), "dof": repeated(fix.dof), "p_value": repeated(np.asarray(fix.p_value))}
     columns["alternatives"] = repeated(np.isfinite(fix.alternatives.gap).sum(-1))
     columns["proof"] = repeated(np.array([getattr(c, "proof", "unknown") for c in fix.certificate], dtype=object))
+    if loaded.problem.constraints:
+        columns |= {name: repeated(values) for name, values in _held(fix).items()}
     return columns
+
+
+def _held(fix: Fix) -> Columns:
+    """Return the names and the multipliers of the constraints that hold each fix, as text."""
+    held = [()] * len(fix) if fix.active is None else fix.active
+    names, multipliers = np.empty(len(fix), dtype=object), np.empty(len(fix), dtype=object)
+    names[:] = ["; ".join(active.name for active in each) for each in held]
+    multipliers[:] = ["; ".join(f"{active.multiplier:.6g}" for active in each) for each in held]
+    return {"active": names, "multipliers": multipliers}
 
 
 def _estimated(fix: Fix, name: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib.resources import as_file, files
 from pathlib import Path
 
@@ -12,11 +13,13 @@ from optloc.cli.output import dumps, fixed_json, geojson, write_table, write_tex
 from optloc.cli.show import show
 from optloc.errors import InvalidProblem
 from optloc.files import read
+from optloc.files.schema import ConstraintTable
 
 
 def run_fix(
     file: Path,
     method: str,
+    more: Mapping[str, ConstraintTable],
     *,
     as_json: bool = False,
     geojson_path: Path | None = None,
@@ -24,10 +27,10 @@ def run_fix(
     out: Path | None = None,
     quiet: bool = False,
 ) -> int:
-    """Fix a file, write what was asked for, and return the exit code."""
+    """Fix a file under constraints of its own and more, write what was asked for, and return the exit code."""
     if as_json and geojson_path is not None and str(geojson_path) == "-":
         raise InvalidProblem("JSON and GeoJSON cannot both go to standard output", "--geojson", "name a file")
-    fixed = fix_file(read(file), method, quiet or as_json)
+    fixed = fix_file(read(file, more=more), method, quiet or as_json)
     if out is not None:
         write_table(out, fixed.columns)
     if geojson_path is not None:

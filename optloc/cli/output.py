@@ -12,7 +12,7 @@ import numpy as np
 from optloc.cli.columns import Columns
 from optloc.cli.fixing import Fixed
 from optloc.errors import InvalidProblem
-from optloc.fix import Fix
+from optloc.fix import Active, Fix
 from optloc.status import Status
 from optloc.types import Array
 
@@ -113,10 +113,16 @@ def _detail(fix: Fix) -> dict[str, Any]:
             {"gap": gap, "position": alternative_position(fix, x)}
             for x, gap in zip(fix.alternatives.x[shown], fix.alternatives.gap[shown], strict=True)
         ],
+        "active": [{"name": a.name, "multiplier": a.multiplier} for a in active_of(fix)],
         "certificate": {name: getattr(certificate, name, None) for name in ("proof", "reason", "method")},
         "biases": fix.bias,
         "bias_sigmas": {slot.name: fix.sigma(slot.name) for slot in fix.layout.shared if slot.name in fix.bias},
     }
+
+
+def active_of(fix: Fix) -> tuple[Active, ...]:
+    """Return the constraints that hold a single fix with equality."""
+    return () if fix.active is None else fix.active[()]
 
 
 def alternative_position(fix: Fix, x: Array) -> Array:

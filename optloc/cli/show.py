@@ -12,7 +12,7 @@ from rich.text import Text
 
 from optloc.cli.columns import Columns
 from optloc.cli.fixing import Fixed
-from optloc.cli.output import alternative_position
+from optloc.cli.output import active_of, alternative_position
 from optloc.fix import Fix
 from optloc.status import Status
 from optloc.types import Array
@@ -47,6 +47,8 @@ def _one(fixed: Fixed, fix: Fix, console: Console) -> None:
         table.add_row("...", f"{rows - 12} more; --out writes all of them")
     for name, values in fix.bias.items():
         _bias_row(table, fix, name, values)
+    for active in active_of(fix):
+        table.add_row(f"held by {active.name}", f"multiplier {active.multiplier:.4g} (cost per SI unit)")
     table.add_row("chi-square", _chi_square(fix))
     certificate: Any = fix.certificate[()]
     if hasattr(certificate, "proof"):

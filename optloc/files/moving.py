@@ -27,7 +27,7 @@ def spread(
     missing = low[used[:, 0], used[:, 1]] < 0
     if missing.any():
         epoch, station = used[int(np.flatnonzero(missing)[0])]
-        what = f"station {found.names[station]!r} has no position at epoch {epochs.labels[epoch]!r}"
+        what = f"{found.noun} {found.names[station]!r} has no position at epoch {epochs.labels[epoch]!r}"
         raise InvalidProblem(what, found.table.source, "add it, or leave out what it measured then")
     first = np.array([np.flatnonzero(found.index == i)[0] for i in range(len(found.names))])
     low, high = np.where(low < 0, first, low), np.where(high < 0, first, high)
@@ -60,7 +60,7 @@ def _by_label(found: Survey, epochs: Epochs) -> tuple[Array, Array, Array]:
     again = np.flatnonzero(grid[place, found.index] != np.arange(len(labels)))
     if len(again):
         row = int(again[0])
-        what = f"station {found.names[found.index[row]]!r} occurs twice at epoch {labels[row]!r}"
+        what = f"{found.noun} {found.names[found.index[row]]!r} occurs twice at epoch {labels[row]!r}"
         raise InvalidProblem(what, found.table.where("name", row), "leave one of them out")
     low = grid[at]
     return low, low, np.zeros(low.shape)
@@ -83,7 +83,7 @@ def _by_time(found: Survey, section: StationsTable, epochs: Epochs) -> tuple[Arr
         again = np.flatnonzero(np.diff(own) == 0.0)
         if len(again):
             row = int(rows[again[0] + 1])
-            what = f"station {found.names[station]!r} occurs twice at time {own[again[0]]:.10g} s"
+            what = f"{found.noun} {found.names[station]!r} occurs twice at time {own[again[0]]:.10g} s"
             raise InvalidProblem(what, found.table.where("name", row), "leave one of them out")
         inside = (epochs.times >= own[0]) & (epochs.times <= own[-1])
         before = np.searchsorted(own, epochs.times, side="right").clip(1, len(own)) - 1

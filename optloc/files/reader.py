@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,11 +11,13 @@ import numpy as np
 from optloc.check import checked
 from optloc.errors import InvalidProblem
 from optloc.files.chunk import Chunk
+from optloc.files.constraints import constraints_of
 from optloc.files.document import read_document
 from optloc.files.epochs import Epochs, Keys, epochs_of, need_clock
+from optloc.files.known import known_of, places_of
 from optloc.files.measurements import chunks_of, with_baseline
 from optloc.files.noise import noise_of, per_epoch
-from optloc.files.schema import ProblemFile
+from optloc.files.schema import ConstraintTable, ProblemFile
 from optloc.files.sigmas import square
 from optloc.files.sources import table_of
 from optloc.files.stations import over_epochs, survey
@@ -76,7 +78,7 @@ def load(path: str | Path) -> Problem:
     return read(path).problem
 
 
-def read(path: str | Path, *, values: bool = True) -> Loaded:
+def read(path: str | Path, *, values: bool = True, more: Mapping[str, ConstraintTable] | None = None) -> Loaded:
     """Return the problem of a file with the names that results need.
 
     Parameters
@@ -85,13 +87,15 @@ def read(path: str | Path, *, values: bool = True) -> Loaded:
         A TOML file with ``format = 1``.
     values : bool
         Whether measured values are needed; False for simulations and bounds.
+    more : mapping of str to ConstraintTable, optional
+        Constraints in addition to those of the file, each behind the place to name.
 
     Raises
     ------
     InvalidProblem
         As `load`.
     """
-    return draft(Path(path), values=values).loaded
+    return draft(Path(path), values=values, more=more or {}).loaded
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,7 +115,7 @@ class Draft:
     numbers : tuple of int array (m,)
         Global row number of each row of each chunk.
     moving : bool
-        Whether stations move.
+        Whether stations or known targets move.
     """
 
     loaded: Loaded
@@ -122,16 +126,26 @@ class Draft:
     moving: bool
 
 
-def draft(path: Path, *, values: bool) -> Draft:
+def draft(path: Path, *, values: bool, more: Mapping[str, ConstraintTable] | None = None) -> Draft:
     """Return the problem of a file together with its tables; arguments as `read`."""
     file = read_document(path)
+    known = places_of(file, path.parent, path.name)
     stations = table_of(file.stations, path.parent, join(path.name, "[stations]"))
     places = [join(path.name, f"[[measurements]] {i + 1}") for i in range(len(file.measurements))]
     tables = [table_of(m, path.parent, place) for m, place in zip(file.measurements, places, strict=True)]
-    return assemble(file, stations, tables, path.name, values=values)
+    return assemble(file, stations, tables, path.name, values=values, known=known, more=more)
 
 
-def assemble(file: ProblemFile, station_table: Table, tables: Sequence[Table], source: str, *, values: bool) -> Draft:
+def assemble(
+    file: ProblemFile,
+    station_table: Table,
+    tables: Sequence[Table],
+    source: str,
+    *,
+    values: bool,
+    known: Mapping[str | None, Table] | None = None,
+    more: Mapping[str, ConstraintTable] | None = None,
+) -> Draft:
     """Return the problem of settings and tables.
 
     Parameters
@@ -146,6 +160,10 @@ def assemble(file: ProblemFile, station_table: Table, tables: Sequence[Table], s
         Name to call the settings.
     values : bool
         Whether measured values are needed.
+    known : mapping of str to Table, optional
+        Places of known targets by name; None names the target.
+    more : mapping of str to ConstraintTable, optional
+        As `read`.
     """
     speed = file.propagation_speed or SPEED_OF_LIGHT
     found, frame = survey(file.stations, station_table, file.frame, source)
@@ -160,9 +178,9 @@ def assemble(file: ProblemFile, station_table: Table, tables: Sequence[Table], s
     chunks = [_completed(chunk, i, stations) for chunk, i in zip(chunks, index, strict=True)]
     rows, numbers = _rows(chunks, index, target)
     noise = _noise(file, chunks, numbers, index, target, source)
-    problem = _problem(file, epochs, stations, rows, noise, frame, source)
+    problem = _problem(file, epochs, stations, rows, noise, frame, source, known or {}, more or {})
     names = (source, file.title or source, epochs.labels, epochs.times, epochs.targets, epochs.own)
-    return Draft(Loaded(problem, *names), file, tuple(tables), tuple(chunks), tuple(numbers), found.moving)
+    return Draft(Loaded(problem, *names), file, tuple(tables), tuple(chunks), tuple(numbers), found.moving or _led(problem))
 
 
 def _problem(
@@ -173,15 +191,23 @@ def _problem(
     noise: Noise,
     frame: Frame,
     source: str,
+    known: Mapping[str | None, Table],
+    more: Mapping[str, ConstraintTable],
 ) -> Problem:
     speed = file.propagation_speed or SPEED_OF_LIGHT
-    motions = motions_of(file, epochs, source)
+    motions = motions_of(file, epochs, known_of(file, known, epochs, frame, stations.dimension), source)
     why = needs_clock(motions, file.biases)
     times = epochs.clock if why is None else need_clock(epochs, why, source)
     biases = tuple(bias_of(b, rows, stations.names, stations.dimension, speed, source) for b in file.biases)
     priors = tuple(prior_of(p, stations.dimension, source) for p in file.priors)
-    made = Problem(stations, rows, noise, times, motions, biases=biases, priors=priors, frame=frame)
+    demands = {join(source, f"[[constraints]] {i + 1}"): table for i, table in enumerate(file.constraints)}
+    constraints = constraints_of({**demands, **more}, stations, frame, motions, epochs.targets, speed)
+    made = Problem(stations, rows, noise, times, motions, biases, priors, frame, constraints)
     return _checked(made, source)
+
+
+def _led(problem: Problem) -> bool:
+    return any(motion.known is not None and len(motion.known) > 1 for motion in problem.motions)
 
 
 def _checked(problem: Problem, source: str) -> Problem:
@@ -207,7 +233,7 @@ def _epochs(file: ProblemFile, chunks: Sequence[Chunk], source: str) -> Epochs:
     if window is not None and (window <= 0.0 or columns["time"] is None or columns["label"] is not None):
         what = "the window is not positive" if window <= 0.0 else "a window needs a column 'time' and no column 'epoch'"
         raise InvalidProblem(what, place, "leave the key out, or correct the columns")
-    motion = {table.motion for table in (file.target, *file.targets.values())} - {None}
+    motion = {table.moves for table in (file.target, *file.targets.values())} - {None}
     free = None if not motion else motion == {"free"}
     keys = Keys(columns["label"], columns["time"], columns["written"], columns["target"])
     return epochs_of(keys, sum(len(chunk.z) for chunk in chunks), window, free)

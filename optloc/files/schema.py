@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -11,6 +11,9 @@ from optloc.units import AzimuthConvention
 
 Amount = float | str
 """A number in the unit of its table, or text such as "30 ns"."""
+
+Bound = Annotated[float, Field(allow_inf_nan=True)]
+"""One coordinate of a box; infinite where there is no bound."""
 
 Cell = str | int | float
 
@@ -110,13 +113,50 @@ class MeasurementsTable(DataTable):
     """Unit of the column time."""
 
 
-class TargetTable(_Table):
-    """How targets move."""
+class TargetTable(DataTable):
+    """How targets move; the rows of a known one. Columns: x, y, z or lat_deg, lon_deg, height; time or epoch."""
 
-    motion: Literal["static", "free", "constant_velocity", "constant_acceleration"] | None = None
-    """Default: static with one epoch, a free position at every epoch with several."""
+    motion: Literal["static", "free", "constant_velocity", "constant_acceleration", "known"] | None = None
+    """Default: known with rows or a file, else static with one epoch, else a free position at every epoch."""
     reference: float | None = None
     """Time at which the state of a moving target is answered, seconds; the first epoch by default."""
+    unit: str = "m"
+    """Unit of x, y, z and height of a known target."""
+    speed_unit: str = "m/s"
+    """Unit of vx, vy, vz."""
+    time_unit: str = "s"
+    """Unit of the time column."""
+
+    @property
+    def moves(self) -> str | None:
+        """Return the motion that is stated, if only by giving the places."""
+        given = self.file is not None or self.rows is not None
+        return self.motion or ("known" if given else None)
+
+
+class ConstraintTable(_Table):
+    """What the answer must meet."""
+
+    kind: Literal["box", "height", "above-ground", "polygon", "visible", "speed"]
+    """What is bounded; each kind has its own keys."""
+    target: str | None = None
+    """Name of the target; all by default."""
+    exactly: Amount | None = None
+    """Known height above the WGS 84 ellipsoid."""
+    min: Amount | list[Bound] | None = None
+    """Least height or speed; least coordinates of a box in the frame, -inf for none."""
+    max: Amount | list[Bound] | None = None
+    """Greatest height or speed; greatest coordinates of a box, inf for none."""
+    unit: str | None = None
+    """Unit of bare numbers; metres or metres per second by default."""
+    corners: list[list[float]] | None = None
+    """Corners [x, y] of a polygon in the plan, in order around it."""
+    corners_deg: list[list[float]] | None = None
+    """The same as [latitude, longitude] in degrees, at the height of the origin of an ENU frame."""
+    stations: str | list[str] | None = None
+    """Stations, for instance satellites, that stand above the target's horizon: "all" (default), or names."""
+    elevation: Amount | None = None
+    """Least elevation of these stations, degrees; 0 by default."""
 
 
 class BiasTable(_Table):
@@ -176,6 +216,7 @@ class ProblemFile(_Table):
     """Motions of single targets by name."""
     biases: list[BiasTable] = Field(default_factory=list)
     priors: list[PriorTable] = Field(default_factory=list)
+    constraints: list[ConstraintTable] = Field(default_factory=list)
     covariance: list[list[float]] | None = None
     """Covariance of the rows of one epoch across all kinds, in the order of the file, in their units."""
 

@@ -39,6 +39,8 @@ class Survey:
         Standard deviation of each coordinate, metres.
     table : Table
         The rows.
+    noun : str
+        What they are, for messages.
     """
 
     names: tuple[str, ...]
@@ -48,6 +50,7 @@ class Survey:
     axes: Array | None
     sigma: Array | None
     table: Table
+    noun: str = "station"
 
     @property
     def moving(self) -> bool:
@@ -82,15 +85,15 @@ def survey(section: StationsTable, table: Table, frame_table: FrameTable, where:
 def _positions(table: Table, wanted: FrameTable, factor: float, where: str) -> tuple[Array, Frame]:
     plane, globe = table.has("x") or table.has("y"), table.has("lat_deg") or table.has("lon_deg")
     if plane and globe:
-        advice = "give every station x, y, z, or every one lat_deg, lon_deg, height"
-        raise InvalidProblem("the stations mix x, y with latitude and longitude", table.source, advice)
+        advice = "give x, y, z everywhere, or lat_deg, lon_deg, height"
+        raise InvalidProblem("the rows mix x, y with latitude and longitude", table.source, advice)
     if globe and wanted.kind == "cartesian":
         advice = 'write kind = "geodetic", "ecef" or "enu" in [frame]'
         raise InvalidProblem("latitudes and longitudes have no place in a cartesian frame", table.source, advice)
     if not globe:
         if wanted.kind == "geodetic":
             raise InvalidProblem(
-                "the frame is geodetic, but the stations have no lat_deg and lon_deg", table.source, "add them"
+                "the frame is geodetic, but there are no columns lat_deg and lon_deg", table.source, "add them"
             )
         d = wanted.dimension or (3 if table.has("z") else 2)
         return factor * np.stack([table.numbers(key) for key in _XYZ[:d]], axis=-1), _frame(wanted, where)
@@ -133,7 +136,8 @@ def _axes(section: StationsTable, table: Table, frame: Frame, position: Array) -
     base = frame.enu_axes(position) if local else np.broadcast_to(np.eye(d), (n, d, d))
     turn = _turn(table, d)
     if turn is None:
-        return base if local and not np.allclose(base, np.eye(d), rtol=0.0, atol=1e-15) else None
+        stated = frame.kind == "ecef" and section.axes is not None
+        return base if stated or not np.allclose(base, np.eye(d), rtol=0.0, atol=1e-15) else None
     return np.asarray(np.swapaxes(turn, -1, -2) @ base)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,7 @@ def from_table(
     window: str | None = None,
     propagation_speed: float | None = None,
     station_options: Mapping[str, Any] | None = None,
+    constraints: Sequence[Mapping[str, Any]] = (),
     values: bool = True,
     **options: Any,
 ) -> Problem:
@@ -59,6 +60,8 @@ def from_table(
         Metres per second; light in vacuum by default.
     station_options : mapping, optional
         Further keys of the table ``[stations]`` of a problem file, for instance ``{"unit": "km"}``.
+    constraints : sequence of mapping
+        Tables ``[[constraints]]`` of a problem file, for instance ``{"kind": "height", "exactly": "500 m"}``.
     values : bool
         Whether measured values are needed; False to simulate them.
     **options
@@ -86,6 +89,7 @@ def from_table(
         "measurements": [{key: value for key, value in measured.items() if value is not None}],
         "epochs": {"window": window},
         "target": {"motion": motion},
+        "constraints": [dict(constraint) for constraint in constraints],
     }
     file = validated(settings, "arguments")
     return assemble(file, station_table, [of_frame(table, "table", names)], "arguments", values=values).loaded.problem

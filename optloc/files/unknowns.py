@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,8 +24,8 @@ _STATES: dict[str, tuple[Quantity, str]] = {
 }
 
 
-def motions_of(file: ProblemFile, epochs: Epochs, source: str) -> tuple[Motion, ...]:
-    """Return the motion of each target."""
+def motions_of(file: ProblemFile, epochs: Epochs, known: Mapping[str, Array], source: str) -> tuple[Motion, ...]:
+    """Return the motion of each target; `known` holds the states of those that are given."""
     names = ("target",) if epochs.own else epochs.targets
     unknown = [name for name in file.targets if name not in epochs.targets]
     if unknown:
@@ -34,17 +34,19 @@ def motions_of(file: ProblemFile, epochs: Epochs, source: str) -> tuple[Motion, 
             join(source, "[targets]"),
             nearest(unknown[0], sorted(set(epochs.targets))),
         )
-    return tuple(_motion(file.targets.get(name, file.target), epochs.count) for name in names)
+    return tuple(_motion(file.targets.get(name, file.target), epochs.count, known.get(name)) for name in names)
 
 
-def _motion(table: TargetTable, count: int) -> Motion:
+def _motion(table: TargetTable, count: int, known: Array | None) -> Motion:
+    if known is not None:
+        return Motion(known.shape[-2] - 1, "epoch" if count > 1 else "run", known)
     motion = table.motion or ("static" if count == 1 else "free")
     return Motion(_ORDERS[motion], "epoch" if motion == "free" and count > 1 else "run", reference=table.reference)
 
 
 def needs_clock(motions: Sequence[Motion], biases: Sequence[BiasTable]) -> str | None:
     """Return why the times of the epochs matter, or None."""
-    if any(motion.order > 0 for motion in motions):
+    if any(motion.order > 0 and motion.known is None for motion in motions):
         return "a moving target"
     return "a drift" if any(bias.form == "drift" for bias in biases) else None
 

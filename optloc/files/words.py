@@ -45,10 +45,14 @@ class Units:
     carrier: float | None = None
     convention: AzimuthConvention = "east-counterclockwise"
 
+    def name(self, unit: str | None) -> str:
+        """Return a unit; None is the SI unit."""
+        return unit or SI_UNIT[self.quantity]
+
     def conversion(self, unit: str | None, where: str) -> Conversion:
         """Return how a unit becomes SI; None is the SI unit."""
         return conversion(
-            unit or SI_UNIT[self.quantity],
+            self.name(unit),
             self.quantity,
             propagation_speed=self.speed,
             carrier=self.carrier,

@@ -47,8 +47,9 @@ def write_measured(source: Path, out: Path, z: Array, note: str = "") -> list[Pa
         raise InvalidProblem("a simulation is written as a problem file", str(out), "let its name end in .toml")
     settings = made.file.model_dump(exclude_defaults=True)
     settings["title"] = " ".join(part for part in (made.loaded.title, f"({note})" if note else "") if part)
-    if made.file.stations.file is not None:
-        settings["stations"]["file"] = os.path.relpath(source.parent / made.file.stations.file, out.parent)
+    for section in (settings["stations"], settings.get("target", {}), *settings.get("targets", {}).values()):
+        if "file" in section:
+            section["file"] = os.path.relpath(source.parent / section["file"], out.parent)
     written = [out]
     try:
         for i, (section, table) in enumerate(zip(settings["measurements"], made.tables, strict=True)):

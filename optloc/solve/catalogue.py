@@ -66,16 +66,20 @@ SOLVERS: dict[str, Entry] = {
     "roots": Entry(stages.roots, "every stationary point of the squared-range problem", "start"),
     "sdp": Entry(stages.sdp, "Shor's semidefinite relaxation of the squared-range problem (Clarabel)", "start"),
     "socp": Entry(stages.socp, "second-order cone relaxation of the squared-range problem (Clarabel)", "start"),
+    "wiv": Entry(stages.wiv, "pseudo-linear angles with an instrumental-variable pass", "start"),
+    "directions": Entry(stages.directions, "semidefinite relaxation over unit directions (Clarabel); angles", "start"),
+    "minimax": Entry(stages.minimax, "least worst angle by second-order cones (Clarabel); bounded errors", "start"),
     "widen": Entry(stages.widen, "more candidates beside a fix: mirror image, sub-arrays", "refinement"),
     "search": Entry(
         stages.search, "a seeded search from many places for problems still without an answer", "refinement"
     ),
     "lsr": Entry(stages.lsr, "damped Taylor least squares (Gauss-Newton) from every candidate", "refinement"),
     "nlp": Entry(_nlp, "the maximum-likelihood cost by IPOPT from every candidate", "refinement"),
+    "certify": Entry(stages.certify, "compares the cost of an angle fix with a bound over all positions", "refinement"),
     "taylor": Entry(stages.taylor, "plain undamped Taylor iteration; a baseline, it diverges", "refinement"),
 }
 
-METHODS = {"auto": "roots+lsr+widen+lsr+search"}
+METHODS = {"auto": "roots+lsr+widen+lsr+search", "proven": "roots+lsr+widen+lsr+search+certify"}
 
 _RANGES = "range, toa, tdoa, range_sum; azimuth, elevation and groa rows linear in (x, r)"
 

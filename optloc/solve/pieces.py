@@ -13,6 +13,7 @@ from optloc.epochs import by_epoch, untied
 from optloc.fix import Fix
 from optloc.layout import state_names
 from optloc.problem import Problem
+from optloc.solve.bistatic import course_starts
 from optloc.solve.start import static, vectors
 from optloc.states import elapsed
 from optloc.types import Array, Motion
@@ -71,6 +72,9 @@ def _state(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
         state = np.zeros((size, 1, motion.order + 1, problem.dimension))
         state[:, 0, 0] = position
         return state
+    ahead = course_starts(problem) if motion.span == "run" else None
+    if ahead is not None and np.isfinite(ahead).all():
+        return ahead[:, None]
     free = by_epoch(untied(replace(problem, motions=(Motion(span="epoch"),))))
     fix = fixed(free.flat()).reshape((size, problem.epochs))
     if motion.span == "epoch":

@@ -56,7 +56,8 @@ def load(folder: Path, run: str, attitude: str, groups: int, seed: int) -> Group
     stations, truth = stations.set_index("frame"), truth.set_index("tag")
     rng = np.random.default_rng(seed)
     counts = rows["tag"].value_counts().sort_index()
-    tags = rng.choice(counts.index[counts >= SIZE].to_numpy(), groups)
+    counts = counts[counts >= SIZE]
+    tags = rng.choice(counts.index.to_numpy(), groups, p=counts.to_numpy() / counts.sum())
     members = np.stack([rng.choice(np.flatnonzero(rows["tag"] == tag), SIZE, replace=False) for tag in tags])
     frames = rows["frame"].to_numpy()[members].ravel()
     columns = [f"{attitude}_{c}" for c in ("x_m", "y_m", "z_m", "qx", "qy", "qz", "qw")]

@@ -125,7 +125,7 @@ def test_points_behind_a_station_are_told():
 def test_many_rays_bias_is_predicted_and_the_instruments_remove_it(count, sigma, room):
     """Specification A5: the pull towards the stations is -(G'G)^-1 sum k (rho u_h + D u)."""
     runs = 200
-    S, A, E, found = trials(count, sigma, runs)
+    S, _A, _E, found = trials(count, sigma, runs)
     line = TARGET - S
     A0, E0 = angles(TARGET, S)
     seen = rays(A0, E0)

@@ -5,8 +5,8 @@ import pytest
 from scipy.optimize import least_squares
 
 from formulations._minorant import minorant
-from formulations.bearing_ls import rays
-from formulations.direction_sdp import angle_bound, directions, meeting, predicted
+from formulations.bearing_ls import meeting, predicted, rays
+from formulations.direction_sdp import angle_bound, directions
 
 
 def errors(point, station, angle, axes=None):
@@ -96,7 +96,7 @@ def test_a_poor_fix_is_not_certified():
     rng = np.random.default_rng(2)
     for _ in range(10):
         S, P, s, z = case(rng, 4, 0.02)
-        x, cost = best(S, z, s, [P])
+        x, _cost = best(S, z, s, [P])
         poor = x + 0.2 * rng.normal(size=3)
         assert ((errors(poor, S, z) / s) ** 2).sum() - angle_bound(z, s, S, poor).bound > 1e-2
 
@@ -143,7 +143,7 @@ def test_meeting_of_lines():
 
 def test_another_back_end_gives_the_point_but_no_bound():
     rng = np.random.default_rng(5)
-    S, P, s, z = case(rng, 2, 0.02)
+    S, _P, s, z = case(rng, 2, 0.02)
     other = directions(z, s, S, backend="SCS")
     assert other.bound == 0.0
     np.testing.assert_allclose(other.direction, directions(z, s, S).direction, atol=1e-3)

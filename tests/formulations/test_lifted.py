@@ -29,7 +29,7 @@ def test_range_differences_are_never_tight(count):
     rng, share = np.random.default_rng(count), []
     for _ in range(8):
         S, P, K, z = case(rng, "tdoa", count)
-        x, cost = best(S, K, z, [P, *rng.normal(0, 2, (2, 3))])
+        _x, cost = best(S, K, z, [P, *rng.normal(0, 2, (2, 3))])
         found = lifted_ranges(K, z, S)
         assert 0.0 <= found.bound <= cost
         assert found.bound <= max(found.value, 0.0) + 1e-6
@@ -70,5 +70,5 @@ def test_nonlinear_form_agrees_with_scipy_from_near(kind):
 
 def test_the_lift_drops_no_range_sign():
     rng = np.random.default_rng(2)
-    S, P, K, z = case(rng, "tdoa", 6)
+    S, _P, K, z = case(rng, "tdoa", 6)
     assert (lifted_ranges(K, z, S).ranges >= -1e-6).all()

@@ -27,7 +27,10 @@ def test_minimax_equals_brute_force(dim, count, sigma):
         found = minimax(u, S, scale)
         assert found.meet
         assert found.least <= found.level <= found.least * (1 + 2e-3)
-        worst = lambda p, u=u, scale=scale: (angles(p, u, S) / scale).max()
+
+        def worst(p, u=u, scale=scale):
+            return (angles(p, u, S) / scale).max()
+
         assert worst(found.point) == pytest.approx(found.level)
         starts = (P, found.point, found.point + 0.3 * rng.normal(size=dim))
         brute = min(

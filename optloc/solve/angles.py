@@ -1,0 +1,153 @@
+"""Starts and proofs from angles alone: instrumental variables, unit directions, the least worst angle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from formulations.bearing_ls import rays, sight
+from optloc.noise import variances
+from optloc.problem import Problem
+from optloc.types import Array, Rows
+
+
+@dataclass(frozen=True, slots=True)
+class Bearings:
+    """The angles of a flat batch of N problems, one bearing for each station and epoch that has an azimuth.
+
+    Parameters
+    ----------
+    station : array (N, m, d)
+        Positions in units of `scale` from `centre`.
+    angle : array (N, m, 2)
+        Azimuth and elevation, radians; the elevation is zero where there is none.
+    weight : array (N, m, 2)
+        One over the standard deviations, 1/radians; zero where absent.
+    axes : array (N, m, d, d), optional
+        Axes of the stations.
+    centre : array (N, d)
+        Metres.
+    scale : array (N,)
+        Metres.
+    """
+
+    station: Array
+    angle: Array
+    weight: Array
+    axes: Array | None
+    centre: Array
+    scale: Array
+
+    def metres(self, point: Array) -> Array:
+        """Return scaled points (N, ..., d) in the problem's frame."""
+        extra = (1,) * (point.ndim - 2)
+        return point * self.scale.reshape(-1, *extra, 1) + self.centre.reshape(-1, *extra, point.shape[-1])
+
+
+def bearings(problem: Problem) -> Bearings | None:
+    """Return the angles of a flat batch with one static target, or None where no azimuth was measured."""
+    rows = {block.kind: (block, start) for block, start in zip(problem.rows, problem.starts, strict=True)}
+    if "azimuth" not in rows:
+        return None
+    block, start = rows["azimuth"]
+    size = problem.batch_shape[0]
+    angle, weight = np.zeros((size, block.count, 2)), np.zeros((size, block.count, 2))
+    angle[..., 0], weight[..., 0] = _measured(problem, block, start)
+    if "elevation" in rows:
+        other, begin = rows["elevation"]
+        value, importance = _measured(problem, other, begin)
+        keys = {key: i for i, key in enumerate(_keys(other))}
+        for i, key in enumerate(_keys(block)):
+            if key in keys:
+                angle[:, i, 1], weight[:, i, 1] = value[:, keys[key]], importance[:, keys[key]]
+    place = _at(problem.stations.position, 3, block, size)
+    axes = None if problem.stations.axes is None else _at(problem.stations.axes, 4, block, size)
+    centre = place.mean(1)
+    spread = np.linalg.norm(place - centre[:, None], axis=-1).max(1)
+    scale = np.where(spread > 0.0, spread, 1.0)
+    return Bearings((place - centre[:, None]) / scale[:, None, None], angle, weight, axes, centre, scale[:size])
+
+
+def _keys(rows: Rows) -> list[tuple[int, int]]:
+    return list(zip(rows.a.tolist(), rows.epoch.tolist(), strict=True))
+
+
+def _measured(problem: Problem, rows: Rows, start: int) -> tuple[Array, Array]:
+    sigma = np.sqrt(variances(problem.noise, problem.count)[..., start : start + rows.count])
+    shape = (problem.batch_shape[0], rows.count)
+    importance = np.where(rows.weight > 0.0, np.sqrt(rows.weight) / sigma, 0.0)
+    return np.broadcast_to(rows.z - rows.correction, shape), np.broadcast_to(importance, shape)
+
+
+def _at(array: Array, core: int, rows: Rows, size: int) -> Array:
+    """Return a per-station quantity (N, m, ...) at the stations and epochs of rows."""
+    full = np.broadcast_to(array, (size, *array.shape[array.ndim - core :]))
+    epoch = rows.epoch if full.shape[1] > 1 else np.zeros_like(rows.epoch)
+    return full[:, epoch, rows.a]
+
+
+def instrumental(seen: Bearings) -> Array:
+    """Return the instrumental-variable fixes (N, 1, d), NaN where there is none."""
+    d = seen.station.shape[-1]
+    steep = {} if d == 2 else {"elevation": seen.angle[..., 1], "elevation_weight": seen.weight[..., 1]}
+    found = sight(seen.angle[..., 0], seen.station, seen.weight[..., 0], axes=seen.axes, **steep)
+    return seen.metres(np.where(found.ok[:, None], found.instrumental, np.nan))[:, None]
+
+
+def by_directions(seen: Bearings) -> Array:
+    """Return the fixes (N, 1, 3) of the unit-direction relaxation, one by one; NaN where an elevation is missing."""
+    from formulations.direction_sdp import directions
+
+    out = np.full((len(seen.station), 1, 3), np.nan)
+    for i, use in _complete(seen):
+        axes = None if seen.axes is None else seen.axes[i, use]
+        out[i, 0] = directions(seen.angle[i, use], 1.0 / seen.weight[i, use], seen.station[i, use], axes=axes).point
+    return seen.metres(out)
+
+
+def least_worst(seen: Bearings) -> Array:
+    """Return the fixes (N, 1, d) whose worst angle in sigma is least, one by one."""
+    from formulations.minimax_cone import minimax
+
+    d = seen.station.shape[-1]
+    out = np.full((len(seen.station), 1, d), np.nan)
+    ahead = rays(seen.angle[..., 0], seen.angle[..., 1] if d == 3 else None, seen.axes).ahead
+    for i in range(len(out)):
+        use = (seen.weight[i, :, : d - 1] > 0.0).all(-1)
+        if use.sum() > 1:
+            sigma = 1.0 / seen.weight[i, use, : d - 1].min(-1)
+            out[i, 0] = minimax(ahead[i, use], seen.station[i, use], sigma).point
+    return seen.metres(out)
+
+
+def angle_bounds(seen: Bearings, point: Array) -> Array:
+    """Return lower bounds (N,) of the maximum-likelihood cost over all positions; minus infinity where there is none.
+
+    Parameters
+    ----------
+    seen : Bearings
+        All the rows of the problems.
+    point : array (N, 3)
+        Refined fixes, metres.
+    """
+    from formulations.direction_sdp import angle_bound
+
+    out = np.full(len(point), -np.inf)
+    scaled = (point - seen.centre) / seen.scale[:, None]
+    for i, use in _complete(seen):
+        if np.isfinite(scaled[i]).all() and not (seen.weight[i, ~use] > 0.0).any():
+            axes = None if seen.axes is None else seen.axes[i, use]
+            found = angle_bound(
+                seen.angle[i, use], 1.0 / seen.weight[i, use], seen.station[i, use], scaled[i], axes=axes
+            )
+            out[i] = found.bound
+    return out
+
+
+def _complete(seen: Bearings) -> list[tuple[int, Array]]:
+    """Return the problems with at least two complete bearings, and which bearings those are."""
+    if seen.station.shape[-1] != 3:
+        return []
+    use = (seen.weight > 0.0).all(-1) & np.isfinite(seen.angle).all(-1)
+    return [(int(i), use[i]) for i in np.flatnonzero(use.sum(1) > 1)]
