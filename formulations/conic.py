@@ -93,13 +93,15 @@ class Relaxation:
         self._data = _Data(problem) if backend == "CLARABEL" else None
         self._solver: Any = None
 
-    def solve(self, values: Mapping[str, Array]) -> Answer:
+    def solve(self, values: Mapping[str, Array], *, bound: bool = True) -> Answer:
         """Solve with new parameter values.
 
         Parameters
         ----------
         values : Mapping[str, Array]
             Values of every parameter, by name.
+        bound : bool
+            Whether to recompute the lower bound from the dual; without it the bound is minus infinity.
 
         Returns
         -------
@@ -108,9 +110,9 @@ class Relaxation:
         """
         if values.keys() != self.parameters.keys():
             raise ValueError(f"parameters {sorted(values)} given, {sorted(self.parameters)} expected")
-        return self._elsewhere(values) if self._data is None else self._directly(self._data, values)
+        return self._elsewhere(values) if self._data is None else self._directly(self._data, values, bound=bound)
 
-    def _directly(self, data: _Data, values: Mapping[str, Array]) -> Answer:
+    def _directly(self, data: _Data, values: Mapping[str, Array], *, bound: bool) -> Answer:
         data.feed(values)
         if self._solver is None:
             self._solver = _solver(data, self.settings)
@@ -124,7 +126,7 @@ class Relaxation:
         return Answer(
             data.recover(x),
             0.5 * quadratic + float(data.q @ x) + data.d,
-            data.bound(x, z, self.radius * (1.0 + float(np.sqrt(x @ x)))),
+            data.bound(x, z, self.radius * (1.0 + float(np.sqrt(x @ x)))) if bound else -np.inf,
             status,
             status == "Solved",
             int(solution.iterations),

@@ -7,9 +7,9 @@ Station i at :math:`S_i` measured azimuth and elevation, that is a unit vector :
    \quad (S_j - S_i)^\top (v_i - v_j) \ge 0,
 
 the last two for every pair: two lines of sight lie in one plane, and they do not diverge (without this linear
-inequality a pair of rays that meet behind the stations is taken at its word). All is quadratic in `v`; with :math:`v_i = F_i^\top (e_1 +
-\sigma w_i)`, the rows of :math:`F_i` being a reference direction and its tangents, the lift :math:`Y = (1, w)(1,
-w)^\top` of size 3N + 1 is relaxed to :math:`Y \succeq 0`.
+inequality, rays that meet behind the stations are taken at their word). All is quadratic in `v`; with :math:`v_i =
+F_i^\top (e_1 + \sigma w_i)`, the rows of :math:`F_i` being a reference direction and its tangents, the lift :math:`Y
+= (1, w)(1, w)^\top` of size 3N + 1 is relaxed to :math:`Y \succeq 0`.
 
 *Chordal* (a start without a guess): :math:`q_i = (u_i - v_i)^\top W_i (u_i - v_i)`, :math:`W_i = a_i a_i^\top /
 (\sigma_A \cos E)^2 + e_i e_i^\top / \sigma_E^2 + w_r u_i u_i^\top`. Its bound bounds the chordal cost only: on the

@@ -110,7 +110,7 @@ class HeightProgram:
         surface : Ellipsoid
             Shape (3, 3) and centre (3,).
         weight : array_like, shape (m,) or (m, m), optional
-            W; a zero drops a row.
+            W; a zero drops a row. Inverse deviations: with weights of order one the barrier outweighs metres.
         horizon : array_like of bool, shape (s,) or ()
             False takes away the polar plane of a station that did not hear the target.
 
@@ -126,7 +126,12 @@ class HeightProgram:
         planes = np.broadcast_to(np.asarray(horizon, dtype=np.bool_), s.shape[:1]) & (surface.polar(s, s) > 1.0)
         limit = np.where(planes, 1.0, _FREE)
         p = np.concatenate([surface.shape.ravel(), surface.centre, np.column_stack([s, limit]).ravel()])
-        return self._program.solve(start, z, weight, p)
+        found = self._program.solve(start, z, weight, p)
+        if found.success or not np.isfinite(found.x).all():
+            return found
+        # at the solution rounding may stop the last step: seen in 1 of 4 000 starts
+        again = self._program.solve(found.x, z, weight, p)
+        return again if again.success else found
 
 
 def _polar(p: Any, x: Any, y: Any) -> Any:

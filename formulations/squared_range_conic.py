@@ -119,7 +119,9 @@ def _built(kind: str, quadric: Quadric, backend: str) -> Relaxation:
     return Relaxation(problem, backend=backend, settings=tight)
 
 
-def shor(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL") -> Relaxed:
+def shor(
+    B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL", bound: bool = True
+) -> Relaxed:
     """Solve the semidefinite relaxation.
 
     Parameters
@@ -132,6 +134,8 @@ def shor(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL") -> 
         The constraint.
     backend : str
         Conic solver.
+    bound : bool
+        Whether to recompute the lower bound from the dual.
 
     Returns
     -------
@@ -144,7 +148,7 @@ def shor(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL") -> 
     """
     n = quadric.size
     factor, scale = _triangle(B, g)
-    answer = _built("shor", quadric, backend).solve({"gram": factor.T @ factor})
+    answer = _built("shor", quadric, backend).solve({"gram": factor.T @ factor}, bound=bound)
     lift = answer.values["lift"]
     ratio = np.nan
     if np.isfinite(lift).all():
@@ -153,7 +157,9 @@ def shor(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL") -> 
     return Relaxed(lift[:n, n].copy(), answer.primal * scale**2, answer.bound * scale**2, ratio, answer)
 
 
-def hull(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL") -> Relaxed:
+def hull(
+    B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL", bound: bool = True
+) -> Relaxed:
     """Solve the second-order cone relaxation.
 
     Parameters
@@ -166,6 +172,8 @@ def hull(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL") -> 
         The constraint.
     backend : str
         Conic solver.
+    bound : bool
+        Whether to recompute the lower bound from the dual.
 
     Returns
     -------
@@ -177,11 +185,11 @@ def hull(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL") -> 
     Its objective is the norm; value and bound are squared.
     """
     factor, scale = _triangle(B, g)
-    answer = _built("hull", quadric, backend).solve({"factor": factor})
+    answer = _built("hull", quadric, backend).solve({"factor": factor}, bound=bound)
     y = answer.values["y"]
     off = float(abs(quadric.value(y)) / (1.0 + np.sum(y * y)))
-    value, bound = answer.primal * scale, max(answer.bound, 0.0) * scale
-    return Relaxed(y, value**2, bound**2, off, answer)
+    value, low = answer.primal * scale, max(answer.bound, 0.0) * scale
+    return Relaxed(y, value**2, low**2, off, answer)
 
 
 def _triangle(B: Array, g: Array) -> tuple[Array, float]:

@@ -6,7 +6,7 @@ matplotlib is imported where it is used. Colours are those of Okabe and Ito, and
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,9 +15,8 @@ import numpy as np
 from optloc.ellipse import error_ellipse
 from optloc.errors import InvalidProblem
 from optloc.fix import Fix
-from optloc.frames import Frame
 from optloc.problem import Problem
-from optloc.status import Status
+from optloc.scene import Scene, scene_of
 from optloc.types import Array
 
 if TYPE_CHECKING:
@@ -25,40 +24,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _BLACK, _BLUE, _ORANGE, _GREY = "#000000", "#0072B2", "#D55E00", "#999999"
-
-
-@dataclass(frozen=True, slots=True)
-class Scene:
-    """What is drawn, metres along the picture's axes (east, north, up on Earth).
-
-    Parameters
-    ----------
-    stations : array (s, d)
-        Positions.
-    names : tuple of s str
-        Their names.
-    fixes : array (n, d)
-        Estimates; NaN where there is none.
-    covariances : array (n, d, d)
-        Theirs; NaN where there is none.
-    clean : bool array (n,)
-        Where the status is ok.
-    alternatives : array (q, d)
-        Other positions.
-    gaps : array (q,)
-        Their cost gaps.
-    axes : tuple of d str
-        Names of the axes.
-    """
-
-    stations: Array
-    names: tuple[str, ...]
-    fixes: Array
-    covariances: Array
-    clean: Array
-    alternatives: Array
-    gaps: Array
-    axes: tuple[str, ...]
 
 
 def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") -> Figure:
@@ -114,55 +79,11 @@ def _figure_class() -> type[Figure]:
     return Figure
 
 
-def scene_of(problem: Problem, fixes: Sequence[Fix]) -> Scene:
-    """Return what is to be drawn of a problem and its fixes."""
-    stations = problem.stations.position.reshape(-1, problem.stations.count, problem.dimension)[0]
-    parts = [part for fix in fixes for part in _states(fix)]
-    d = problem.dimension
-    position = np.concatenate([p for p, _, _ in parts] or [np.zeros((0, d))])
-    covariance = np.concatenate([c for _, c, _ in parts] or [np.zeros((0, d, d))])
-    clean = np.concatenate([ok for _, _, ok in parts] or [np.zeros(0, dtype=bool)])
-    others, gaps = _alternatives(fixes, d) if len(position) <= 12 else (np.zeros((0, d)), np.zeros(0))
-    if problem.frame.kind == "ecef":
-        local = Frame("enu", tuple(float(v) for v in problem.frame.to_geodetic(stations.mean(0))))  # type: ignore[arg-type]
-        turn = local.rotation_to_ecef().T
-        stations, position, others = (local.from_ecef(p) for p in (stations, position, others.reshape(-1, 3)))
-        covariance = turn @ covariance @ turn.T
-    axes = ("east", "north", "up") if problem.frame.geodetic else ("x", "y", "z")
-    return Scene(stations, problem.stations.names, position, covariance, clean, others, gaps, axes[:d])
-
-
-def _states(fix: Fix) -> list[tuple[Array, Array, Array]]:
-    """Return positions (n, d), covariances (n, d, d) and whether they are clean (n,) of every target."""
-    flat = fix if len(fix.shape) == 1 else fix.flat()
-    found = []
-    for slots, shared in ((flat.layout.shared, True), (flat.layout.local, False)):
-        for slot in slots:
-            if slot.name.partition("[")[0] != "position":
-                continue
-            values = flat.take(slot.name)
-            d = values.shape[-1]
-            position = values.reshape(-1, d)
-            covariance = flat.covariance(slot.name) if shared else np.full((len(position), d, d), np.nan)
-            found.append((position, covariance, np.repeat(flat.code == Status.OK, len(position) // len(flat))))
-    return found
-
-
-def _alternatives(fixes: Sequence[Fix], d: int) -> tuple[Array, Array]:
-    points, gaps = [], []
-    for fix in fixes:
-        flat = fix if len(fix.shape) == 1 else fix.flat()
-        shown = np.isfinite(flat.alternatives.gap)
-        for slot in flat.layout.shared:
-            if slot.name.partition("[")[0] == "position":
-                points.append(flat.layout.take(flat.alternatives.x, slot.name)[shown])
-                gaps.append(flat.alternatives.gap[shown])
-    return np.concatenate(points or [np.zeros((0, d))]), np.concatenate(gaps or [np.zeros(0)])
-
-
 def _overview(panel: Axes, scene: Scene, view: tuple[int, int]) -> None:
     everything = np.concatenate([scene.stations, scene.fixes, scene.alternatives])
     unit, size = _unit(everything[:, view])
+    if view == (0, 1):
+        _edges(panel, scene, size)
     _ellipses(panel, scene, view, size)
     panel.scatter(*_xy(scene.stations, view, size), marker="^", s=60, color=_BLACK, label="station", zorder=3)
     if scene.stations.shape[0] <= 20:
@@ -171,6 +92,15 @@ def _overview(panel: Axes, scene: Scene, view: tuple[int, int]) -> None:
     _points(panel, scene, view, size)
     _frame(panel, scene, view, unit)
     panel.set_title("plan" if view == (0, 1) else "height")
+
+
+def _edges(panel: Axes, scene: Scene, size: float) -> None:
+    """Draw the outlines of the regions that must hold the target."""
+    label: str | None = "region"
+    for corners in scene.regions:
+        ring = np.concatenate([corners, corners[:1]]) / size
+        panel.plot(*ring.T, color=_GREY, linewidth=1.2, linestyle="--", label=label, zorder=1)
+        label = None
 
 
 def _points(panel: Axes, scene: Scene, view: tuple[int, int], size: float) -> None:
@@ -231,6 +161,7 @@ def _close(panel: Axes, scene: Scene) -> None:
     extent = _reach(scene, known, centre)
     unit, size = _unit(np.array([centre - extent, centre + extent]) - centre)
     shifted = _moved(scene, centre)
+    _edges(panel, shifted, size)
     _ellipses(panel, shifted, view, size)
     _points(panel, shifted, view, size)
     panel.scatter(*_xy(shifted.stations, view, size), marker="^", s=60, color=_BLACK, zorder=3)
@@ -244,9 +175,13 @@ def _close(panel: Axes, scene: Scene) -> None:
 def _moved(scene: Scene, centre: Array) -> Scene:
     shift = np.zeros(scene.stations.shape[-1])
     shift[:2] = centre
-    moved = (array - shift for array in (scene.stations, scene.fixes, scene.alternatives))
-    stations, fixes, alternatives = moved
-    return Scene(stations, scene.names, fixes, scene.covariances, scene.clean, alternatives, scene.gaps, scene.axes)
+    return replace(
+        scene,
+        stations=scene.stations - shift,
+        fixes=scene.fixes - shift,
+        alternatives=scene.alternatives - shift,
+        regions=tuple(corners - centre for corners in scene.regions),
+    )
 
 
 def _reach(scene: Scene, known: Array, centre: Array) -> float:

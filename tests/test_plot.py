@@ -8,7 +8,8 @@ import pytest
 from optloc.cli.fixing import fix_file
 from optloc.ellipse import error_ellipse
 from optloc.files import from_table, read
-from optloc.plot import plot_fixes, save, scene_of
+from optloc.plot import plot_fixes, save
+from optloc.scene import scene_of
 from optloc.solve import solve
 
 DEMOS = package_files("optloc") / "scenarios"

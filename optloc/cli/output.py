@@ -122,7 +122,7 @@ def _detail(fix: Fix) -> dict[str, Any]:
 
 def active_of(fix: Fix) -> tuple[Active, ...]:
     """Return the constraints that hold a single fix with equality."""
-    return () if fix.active is None else fix.active[()]
+    return () if fix.active is None else tuple(fix.active[()])
 
 
 def alternative_position(fix: Fix, x: Array) -> Array:

@@ -80,7 +80,7 @@ def _state_rows(table: Table, columns: Columns, i: int, whose: str) -> None:
         table.add_row(f"longitude{whose}", f"{columns['lon_deg'][i]:.7f} deg")
         table.add_row(f"height{whose}", f"{columns['height'][i]:.2f} m")
         local = [columns[f"cov_{axis}{axis}"][i] for axis in "enu" if f"cov_{axis}{axis}" in columns]
-        table.add_row("sigma east, north, up", ", ".join(f"{v:.3g}" for v in np.sqrt(local)) + " m")
+        table.add_row("sigma east, north, up", ", ".join(f"{v:.3g}" for v in np.sqrt(np.maximum(local, 0.0))) + " m")
     for letter, unit in (("v", "m/s"), ("a", "m/s²")):
         found = [columns[f"{letter}{axis}"][i] for axis in axes if f"{letter}{axis}" in columns]
         if found:
@@ -97,8 +97,10 @@ def _state_rows(table: Table, columns: Columns, i: int, whose: str) -> None:
 
 
 def with_sigma(value: float, sigma: float, unit: str) -> str:
-    """Return a number with its standard deviation, rounded to it."""
-    if not np.isfinite(sigma) or sigma <= 0.0:
+    """Return a number with its standard deviation, rounded to it; a constraint may leave it none."""
+    if sigma <= 1e-12 * (1.0 + abs(value)):
+        return f"{value:.10g} {unit} (held)"
+    if not np.isfinite(sigma):
         return f"{value:.6g} {unit}"
     digits = int(max(0, 1 - np.floor(np.log10(sigma))))
     return f"{value:.{digits}f} ± {sigma:.{digits}f} {unit}"

@@ -184,6 +184,6 @@ def _merged(constraints: Sequence[Constraint]) -> Iterator[Constraint]:
     """Yield the intersection of the bands on each quantity, and every polygon once."""
     for bands in like(constraints):
         lower, upper = np.max([band.lower for band in bands], axis=0), np.min([band.upper for band in bands], axis=0)
-        if np.isfinite(lower) or np.isfinite(upper) or lower > upper or np.isnan(lower + upper):
+        if np.isfinite(lower) or np.isfinite(upper) or lower > upper or np.isnan([lower, upper]).any():
             yield replace(bands[0], lower=lower, upper=upper)
     yield from {(c.target, c.vertices.tobytes()): c for c in constraints if isinstance(c, Polygon)}.values()

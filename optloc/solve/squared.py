@@ -116,7 +116,7 @@ def _one_by_one(relax: Callable[..., Any], rows: Array, right: Array, quadric: Q
     usable = np.isfinite(rows).all((-1, -2)) & np.isfinite(right).all(-1)
     y = np.full((len(rows), 1, quadric.size), np.nan)
     for i in np.flatnonzero(usable):
-        y[i, 0] = relax(rows[i], right[i], quadric).y
+        y[i, 0] = relax(rows[i], right[i], quadric, bound=False).y
     return y, np.isfinite(y).all(-1)
 
 

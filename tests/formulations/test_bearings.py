@@ -163,6 +163,19 @@ def test_few_rays_start_reaches_the_best_of_a_multi_start(count, sigma):
             assert np.linalg.norm(found.instrumental[i] - ours.x) < 0.1 * np.linalg.norm(ours.x - TARGET) + 2e-2
 
 
+def test_two_stations_of_the_angles_paper():
+    """Specification A5, first row, in km: CRB 5.265; RMSE PLS 5.30, WPLS 5.28, WIV 5.30; bias below its scatter."""
+    S, P, runs = np.array([[-40.0, 0.0, 0.0], [40.0, 0.0, 0.0]]), np.array([-10.0, 50.0, 10.0]), 200
+    H = jacobian(P, S) / 0.05
+    assert np.sqrt(np.trace(np.linalg.inv(H.T @ H))) == pytest.approx(5.265, abs=1e-3)
+    rng, (A, E) = np.random.default_rng(8), angles(P, S)
+    A, E, w = A + 0.05 * rng.normal(size=(runs, 2)), E + 0.05 * rng.normal(size=(runs, 2)), np.full((runs, 2), 20.0)
+    found = sight(A, np.broadcast_to(S, (runs, 2, 3)), w, elevation=E, elevation_weight=w)
+    for point in (found.plain, found.weighted, found.instrumental):
+        assert np.sqrt(((point - P) ** 2).sum(axis=1).mean()) == pytest.approx(5.30, rel=0.1)
+        assert np.linalg.norm((point - P).mean(axis=0)) < 3 * 5.3 / np.sqrt(runs)
+
+
 def test_weighting_matters_where_ranges_differ():
     rng = np.random.default_rng(7)
     S = np.array([[0.0, 0, 0], [4.0, 0, 0], [0, 40.0, 1.0], [-30.0, 0, 2.0]])
