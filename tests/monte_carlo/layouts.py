@@ -9,7 +9,7 @@ from zlib import crc32
 
 import numpy as np
 from monte_carlo.reference import Model
-from scipy.constants import speed_of_light as LIGHT
+from scipy.constants import speed_of_light
 
 from optloc import Problem, assemble, measured
 
@@ -157,7 +157,9 @@ def _in_space(label: str, kind: str, s: int, sigmas: tuple[float, ...], unit: tu
 def _in_plane(label: str, emitters: Callable[[Rng, int], Array]) -> list[Case]:
     stations = partial(fixed, Y_ARRAY)
     return [
-        Case(f"planar TDOA, {label}, {time * 1e9:g} ns", "tdoa, white", stations, emitters, time * LIGHT, 1000e3)
+        Case(
+            f"planar TDOA, {label}, {time * 1e9:g} ns", "tdoa, white", stations, emitters, time * speed_of_light, 1000e3
+        )
         for time in (1e-9, 10e-9, 100e-9, 1e-6)
     ]
 

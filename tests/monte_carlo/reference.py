@@ -71,7 +71,7 @@ class Model:
         """Return g' (J'J)^-1 g, (N,): the squared length of the next Gauss-Newton step in standard deviations."""
         w, J = self.residual(x, z, np.arange(len(x)))
         g = np.swapaxes(J, 1, 2) @ w[..., None]
-        return (g[..., 0] * (np.linalg.pinv(np.swapaxes(J, 1, 2) @ J) @ g)[..., 0]).sum(-1)
+        return (g[..., 0] * (np.linalg.pinv(np.swapaxes(J, 1, 2) @ J, rcond=1e-12) @ g)[..., 0]).sum(-1)
 
 
 @dataclass(frozen=True)
