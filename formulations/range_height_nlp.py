@@ -14,6 +14,7 @@ is that of :mod:`formulations.nls`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,7 @@ Mask = NDArray[np.bool_]
 
 # the left side of a polar plane is at least -1 for a point and a station of the closed ellipsoid
 _FREE = -10.0
+_LOOSER = 1e-8
 
 
 class HeightProgram:
@@ -76,16 +78,12 @@ class HeightProgram:
         def horizon(x: Any, p: Any) -> list[Any]:
             return [_polar(p, x, station(p, i)) - p[15 + 4 * i] for i in range(count)]
 
-        self._program = Program(
-            3,
-            len(rows),
-            12 + 4 * count,
-            h,
-            equalities=surface,
-            inequalities=horizon,
-            diagonal=diagonal,
-            settings=settings,
-        )
+        def build(chosen: Mapping[str, Any]) -> Program:
+            size = (3, len(rows), 12 + 4 * count)
+            return Program(*size, h, equalities=surface, inequalities=horizon, diagonal=diagonal, settings=chosen)
+
+        self._program = build(settings or {})
+        self._looser = cache(lambda: build({**(settings or {}), "tol": _LOOSER}))
 
     def solve(
         self,
@@ -129,8 +127,8 @@ class HeightProgram:
         found = self._program.solve(start, z, weight, p)
         if found.success or not np.isfinite(found.x).all():
             return found
-        # at the solution rounding may stop the last step: seen in 1 of 4 000 starts
-        again = self._program.solve(found.x, z, weight, p)
+        # rounding may stop the last step at the very solution: seen in 1 of 4 000 starts
+        again = self._looser().solve(found.x, z, weight, p)
         return again if again.success else found
 
 

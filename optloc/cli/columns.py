@@ -38,9 +38,7 @@ def fix_columns(loaded: Loaded, fix: Fix, first: int | None) -> Columns:
     motions = loaded.problem.motions
     flat = fix if first is not None else fix.flat()
     shown = [i for i, m in enumerate(motions) if m.known is None] or range(len(motions))
-    return joined(
-        [_of_target(loaded, flat, first, i, state_names(i, len(motions), motions[i].order)) for i in shown]
-    )
+    return joined([_of_target(loaded, flat, first, i, state_names(i, len(motions), motions[i].order)) for i in shown])
 
 
 def joined(parts: Sequence[Columns]) -> Columns:

@@ -180,7 +180,9 @@ def assemble(
     noise = _noise(file, chunks, numbers, index, target, source)
     problem = _problem(file, epochs, stations, rows, noise, frame, source, known or {}, more or {})
     names = (source, file.title or source, epochs.labels, epochs.times, epochs.targets, epochs.own)
-    return Draft(Loaded(problem, *names), file, tuple(tables), tuple(chunks), tuple(numbers), found.moving or _led(problem))
+    return Draft(
+        Loaded(problem, *names), file, tuple(tables), tuple(chunks), tuple(numbers), found.moving or _led(problem)
+    )
 
 
 def _problem(

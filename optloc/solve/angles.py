@@ -90,8 +90,9 @@ def _at(array: Array, core: int, rows: Rows, size: int) -> Array:
 def instrumental(seen: Bearings) -> Array:
     """Return the instrumental-variable fixes (N, 1, d), NaN where there is none."""
     d = seen.station.shape[-1]
-    steep = {} if d == 2 else {"elevation": seen.angle[..., 1], "elevation_weight": seen.weight[..., 1]}
-    found = sight(seen.angle[..., 0], seen.station, seen.weight[..., 0], axes=seen.axes, **steep)
+    steep = (None, None) if d == 2 else (seen.angle[..., 1], seen.weight[..., 1])
+    azimuth, importance = seen.angle[..., 0], seen.weight[..., 0]
+    found = sight(azimuth, seen.station, importance, elevation=steep[0], elevation_weight=steep[1], axes=seen.axes)
     return seen.metres(np.where(found.ok[:, None], found.instrumental, np.nan))[:, None]
 
 
@@ -149,5 +150,5 @@ def _complete(seen: Bearings) -> list[tuple[int, Array]]:
     """Return the problems with at least two complete bearings, and which bearings those are."""
     if seen.station.shape[-1] != 3:
         return []
-    use = (seen.weight > 0.0).all(-1) & np.isfinite(seen.angle).all(-1)
+    use = np.asarray((seen.weight > 0.0).all(-1) & np.isfinite(seen.angle).all(-1))
     return [(int(i), use[i]) for i in np.flatnonzero(use.sum(1) > 1)]

@@ -50,7 +50,7 @@ def course_starts(problem: Problem) -> Array | None:
     found = course(excess / length, axes, away / length, np.broadcast_to(since, (size, k)), spread, order=order)
     state = found.coefficients * length * np.array([1.0, 1.0, 2.0])[: order + 1, None]
     state[:, 0] += home
-    return state
+    return np.asarray(state)
 
 
 def _pair(problem: Problem) -> tuple[int, int] | None:

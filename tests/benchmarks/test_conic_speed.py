@@ -43,7 +43,3 @@ def test_warm_relaxation(benchmark, kind):
         alone.append(time.perf_counter() - middle)
     benchmark.extra_info["warm / bare"] = float(np.median(np.array(whole) / np.array(alone)))
     benchmark(warm.solve, inputs[1], bound=False)
-    print(
-        f"{kind}: warm {np.median(whole) * 1e6:.0f} us, bare {np.median(alone) * 1e6:.0f} us, "
-        f"ratio {benchmark.extra_info['warm / bare']:.2f}"
-    )

@@ -54,8 +54,12 @@ def test_three_satellites_and_the_height(session, case):
     assert quantiles(theirs)[0] == pytest.approx(THREE[case][0], rel=0.3)
     assert quantiles(theirs[good]) == pytest.approx(CONDITIONED[case], rel=0.2)
     assert quantiles(best[good]) == pytest.approx(CONDITIONED[case], rel=0.2)
-    hemisphere = fix.position @ data.truth > 0.0
-    assert hemisphere[fix.answered].all()
+    # Beyond 90 deg from the receiver three satellites may still be in sight: two exact answers, and nothing tells which.
+    beyond = fix.answered & (fix.position @ data.truth < 0.0)
+    report(f"   {beyond.sum()} fixes in the other hemisphere, all with the right one beside them")
+    assert np.all(fix.code[beyond] == Status.AMBIGUOUS)
+    assert np.all(near[beyond])
+    assert beyond.mean() < 0.005
     silent = np.flatnonzero((fix.code == Status.OK) & ~right)
     assert not len(silent), f"{name}: says ok and is not the minimum that the truth leads to: {silent}"
     assert near[fix.code == Status.AMBIGUOUS].all(), name
