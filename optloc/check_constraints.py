@@ -142,14 +142,14 @@ def _check_band(problem: Problem, band: Band, where: str) -> None:
 
 def _check_agreement(bands: Sequence[Band]) -> None:
     """Refuse bands on one quantity that cannot hold together, and equalities that are given twice."""
-    where, unit = f"constraint {bands[0].name!r}", SURFACES[bands[0].kind].unit
+    where, unit = f"constraint {bands[0].name!r}", SURFACES[bands[0].kind].unit.replace("1", "")
     exact = [band.lower for band in bands if np.all(band.lower == band.upper)]
     low = np.max(np.broadcast_arrays(*(band.lower for band in bands)), axis=0)
     high = np.min(np.broadcast_arrays(*(band.upper for band in bands)), axis=0)
     clash = np.broadcast_arrays(low, high, low > high)
     if clash[2].any():
-        least, most = (float(np.ravel(bound[clash[2]])[0]) for bound in clash[:2])
-        what = f"it must be at least {least:.10g} {unit} and at most {most:.10g} {unit}".replace(" 1 ", " ")
+        least, most = (f"{np.ravel(bound[clash[2]])[0]:.10g} {unit}".strip() for bound in clash[:2])
+        what = f"it must be at least {least} and at most {most}"
         raise InvalidProblem(what, where, "correct the bounds, they contradict each other")
     if len(exact) > 1:
         raise InvalidProblem("the same equality is given twice", where, "leave one of them out")

@@ -195,7 +195,7 @@ def test_satellites_behind_the_horizon_are_a_status():
 
 def test_where_nothing_binds_the_fix_is_the_unconstrained_one():
     problem, _ = drawn(SPACE, np.array([2e3, 2e3, 900.0]), np.random.default_rng(1), frame=ENU)
-    wide = (*box((-1e4,) * 3, (1e4,) * 3), *height(0.0, 1e4), *polygon(10.0 * (ELL - 2e3)))
+    wide = (*box((-1e4,) * 3, (1e4,) * 3), *height(0.0, 1e4), *polygon([[-1e5, -1e5], [1e5, -1e5], [0.0, 1e5]]))
     fix, free = solve(replace(problem, constraints=wide)), solve(problem)
     np.testing.assert_array_equal(fix.x, free.x)
     np.testing.assert_array_equal(fix.cov, free.cov)
@@ -232,7 +232,7 @@ REFUSED = {
     "closed ring": (lambda: posed(polygon([*ELL, ELL[0]])), "corner 7 repeats corner 1"),
     "no area": (lambda: posed(polygon([[0, 0], [1, 1], [2, 2]])), "no area"),
     "bow tie": (lambda: posed(polygon(np.array(BOW) * [[1.0, 1.1]] * 1e3 + [[0, 0], [0, 90], [0, 0], [0, 0]])), "1-2 and 3-4 meet"),
-    "spike": (lambda: posed(polygon(SPIKE)), "2-3 and 3-4 meet"),
+    "spike": (lambda: posed(polygon(SPIKE)), "not simple"),
     "corner on an edge": (lambda: posed(polygon(TOUCH)), "not simple"),
     "polygon in ECEF": (lambda: posed(polygon(ELL), frame=Frame("ecef")), "needs a plan"),
     "known target": (lambda: assemble(PLANE, measured("range", np.ones(5), a=np.arange(5), sigma=1.0),

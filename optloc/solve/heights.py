@@ -34,7 +34,7 @@ def known_height(problem: Problem) -> Array | None:
     return None
 
 
-def height_starts(problem: Problem, found: Ranges | None) -> Array:
+def height_starts(problem: Problem, found: Ranges | None, *, relax: bool = False) -> Array:
     """Return candidate positions (N, q, 3) of a flat batch from a known height and its best-placed stations.
 
     Parameters
@@ -43,6 +43,8 @@ def height_starts(problem: Problem, found: Ranges | None) -> Array:
         N problems with one static target.
     found : Ranges, optional
         Their least-squares ranges.
+    relax : bool
+        True: the answer of the reduced semidefinite relaxation in the place of the quartic's roots, one by one.
 
     Returns
     -------
@@ -59,7 +61,8 @@ def height_starts(problem: Problem, found: Ranges | None) -> Array:
     parts = []
     for count, mask in ((3, found.free), (2, ~found.free)):
         subsets = _subsets(place, found, mask, count)
-        parts += [_met(place, found, nodes, surface, mask & (nodes[:, 0] >= 0)) for nodes in subsets]
+        met = _relaxed if relax and count == 3 else _met
+        parts += [met(place, found, nodes, surface, mask & (nodes[:, 0] >= 0)) for nodes in subsets]
     if not parts:
         return np.full((size, 0, 3), np.nan)
     return problem.frame.from_ecef(np.concatenate(parts, axis=1) * WGS84_A)
@@ -85,6 +88,23 @@ def _subsets(place: Array, found: Ranges, mask: Array, count: int) -> list[Array
         for i in range(order.shape[1])
         if (best[:, i] > 0).any()
     ]
+
+
+def _relaxed(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask: Array) -> Array:
+    """Return the answers (N, 1, 3) of the reduced relaxation, nearest to the point below the stations."""
+    from formulations.range_height_conic import lifted
+
+    out = np.full((len(place), 1, 3), np.nan)
+    whole = Ellipsoid(
+        np.broadcast_to(surface.shape, (len(place), 3, 3)), np.broadcast_to(surface.centre, (len(place), 3))
+    )
+    for i in np.flatnonzero(mask & np.isfinite(whole.shape).all((-1, -2))):
+        own = Ellipsoid(whole.shape[i], whole.centre[i])
+        stations, offset = place[i, nodes[i]], found.offset[i, nodes[i]] / WGS84_A
+        above = stations.mean(0)
+        below = own.centre + (above - own.centre) / np.sqrt(own.polar(above, above))
+        out[i, 0] = lifted(stations, found.sign[i, nodes[i]].astype(float), offset, own, below).x
+    return out
 
 
 def _met(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask: Array) -> Array:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from formulations.nls import Program
-from optloc.constraints import conjunction, face_of
+from optloc.constraints import conjunction, face_of, faces, tangent_at
 from optloc.errors import InvalidProblem
 from optloc.fix import Fix, Stage
 from optloc.noise import whiten
@@ -54,23 +54,29 @@ def nlp(problem: Problem, fix: Fix | None) -> Fix:
         solver = _Scaled(one)
         for j in slot[item == i]:
             x[i, j], cost[i, j], code[i, j] = solver.from_start(pool[i, j])
-    if len(item):
-        code[item, slot] = _stationary(problem.take(item), x[item, slot], code[item, slot])
-    cost[code == Status.NUMERICAL] = np.inf  # a start on a station has no gradient, and IPOPT's last word is no point
     face = np.zeros(cost.shape, dtype=int)
-    if problem.constraints and len(item):
-        face[item, slot] = face_of(problem.take(item), x[item, slot])
+    if len(item):
+        part, points = problem.take(item), x[item, slot]
+        face[item, slot] = face_of(part, points) if problem.constraints else 0
+        code[item, slot] = _stationary(part, points, code[item, slot], face[item, slot])
+    cost[code == Status.NUMERICAL] = np.inf  # a start on a station has no gradient, and IPOPT's last word is no point
     stage = Stage("nlp", f"{len(item)} programs", perf_counter() - began)
     return finished(problem, fix, without_broken(problem, Candidates(x, cost, code, face)), stage)
 
 
-def _stationary(problem: Problem, x: Array, code: Array) -> Array:
+def _stationary(problem: Problem, x: Array, code: Array, face: Array) -> Array:
     """Return `ok` where the next Gauss-Newton step is shorter than 1e-5 sigma, whatever IPOPT calls its own ending."""
-    with np.errstate(all="ignore"):
-        equations = equations_at(problem, x, whiten(problem.noise, problem.weight))
-        move, solvable = step(equations, np.zeros(len(x)))
-        small = solvable & (np.abs(decrement(equations, move, problem.layout.n_shared)) < 1e-10)
-    return np.where(small, np.int8(Status.OK), code)
+    sides, out = faces(problem) if problem.constraints else [()], np.array(code)
+    for number in np.unique(face):
+        items = np.flatnonzero(face == number)
+        part, here = problem.take(items), x[items]
+        with np.errstate(all="ignore"):
+            space = tangent_at(part, sides[number], here) if sides[number] else None
+            equations = equations_at(part, here, whiten(part.noise, part.weight))
+            move, solvable = step(equations, np.zeros(len(here)), space)
+            small = solvable & (np.abs(decrement(equations, move, problem.layout.n_shared)) < 1e-10)
+        out[items[small]] = Status.OK
+    return out
 
 
 class _Scaled:

@@ -113,7 +113,8 @@ def _squared(problem: Problem, fix: Fix | None, name: str, pick: Pick) -> Fix:
     began = perf_counter()
     if one_position(problem):
         alone = static(problem)
-        position = np.concatenate([squared_range_starts(alone, pick), height_starts(alone, ranges(alone))], axis=1)
+        heights = height_starts(alone, ranges(alone), relax=pick is shor)
+        position = np.concatenate([squared_range_starts(alone, pick), heights], axis=1)
         return _unrefined(problem, position, fix, name, began)
     x = from_pieces(problem, lambda piece: lsr(piece, _squared(piece, None, name, pick)))
     return _assembled(problem, x, fix, name, began)
