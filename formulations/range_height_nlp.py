@@ -128,7 +128,7 @@ class HeightProgram:
         if found.success or not np.isfinite(found.x).all():
             return found
         # rounding may stop the last step at the very solution: seen in 1 of 4 000 starts
-        again = self._looser().solve(found.x, z, weight, p)
+        again = self._looser().solve(start, z, weight, p)
         return again if again.success else found
 
 

@@ -320,9 +320,8 @@ def plain_predict(problem: Problem, x: np.ndarray) -> np.ndarray:
             axes = None if s.axes is None or not model.stations else _at(s.axes, epoch)[rows.a[i]]
             gain, added = 1.0, 0.0
             for bias in problem.biases:
-                for row, member, coefficient in zip(bias.row, bias.member, bias.coefficient, strict=True):
-                    if row != number:
-                        continue
+                for touch in np.flatnonzero(bias.row == number):
+                    member, coefficient = bias.member[touch], bias.coefficient[touch]
                     value = take[bias.name].reshape(len(bias.members), -1)[member] * coefficient
                     if bias.form == "rotation":
                         axes = turn_matrix(value) @ (np.eye(d) if axes is None else axes)

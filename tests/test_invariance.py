@@ -117,7 +117,7 @@ def test_names_and_order_change_nothing(name, seed):
 
 @pytest.mark.parametrize("d", [2, 3])
 @given(seed=seeds, reference=st.integers(0, 5))
-@settings(max_examples=6)
+@settings(max_examples=4)
 def test_the_reference_of_differences_does_not_matter(d, seed, reference):
     problem = redrawn(f"tdoa-{d}d", seed)
     count = len(STATIONS[d])
@@ -164,7 +164,7 @@ def test_a_batch_is_its_problems_one_by_one(name):
     case = CASES[name]
     many = simulate(case.problem, case.truth, 77, trials=12)
     fix = solve(many)
-    for i in (0, 5, 11):
+    for i in (5, 11):
         alone = solve(case.problem.with_rows(z=many.z[i]))
         assert alone.status == fix.code[i]
         assert fix[i].status == alone.status

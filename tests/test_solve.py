@@ -1,6 +1,7 @@
 """Solve without a guess against an independent multi-start, and the statuses of what has no answer."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -38,6 +39,20 @@ def truths(case, rng):
     return out
 
 
+@cache
+def fixed(name):
+    """The fix of a case."""
+    return solve(CASES[name].problem)
+
+
+@cache
+def scattered(name):
+    """A case with targets inside and outside of the array, and their fixes."""
+    case = CASES[name]
+    many = simulate(case.problem, truths(case, np.random.default_rng([3, *name.encode()])), 31)
+    return many, solve(many)
+
+
 def best_of_many(problem, rng):
     """The least cost that MINPACK reaches from random starts, and where."""
     residual, d = quick(problem), problem.dimension
@@ -54,10 +69,8 @@ def best_of_many(problem, rng):
 
 @pytest.mark.parametrize("name", STARTED)
 def test_no_silent_miss_of_the_global_minimum(name):
-    case = CASES[name]
-    rng = np.random.default_rng([3, *name.encode()])
-    many = simulate(case.problem, truths(case, rng), 31)
-    fix = solve(many)
+    case, rng = CASES[name], np.random.default_rng([5, *name.encode()])
+    many, fix = scattered(name)
     answered = np.isin(fix.code, (Status.OK, Status.AMBIGUOUS))
     assert answered.sum() >= TRIALS - 1, [fix.reason[i] for i in np.flatnonzero(~answered)]
     for i in np.flatnonzero(answered):
@@ -74,9 +87,7 @@ def test_no_silent_miss_of_the_global_minimum(name):
 @pytest.mark.parametrize("name", STARTED)
 def test_alternatives_are_other_minima_cheapest_first(name):
     case = CASES[name]
-    rng = np.random.default_rng([4, *name.encode()])
-    many = simulate(case.problem, truths(case, rng), 32)
-    fix = solve(many)
+    many, fix = scattered(name)
     gap = np.where(np.isnan(fix.alternatives.gap), np.inf, fix.alternatives.gap)
     assert (np.diff(gap, axis=1) >= 0.0)[np.isfinite(gap[:, 1:])].all()
     assert ((gap >= -1e-6) | ~np.isfinite(gap)).all()
@@ -93,8 +104,7 @@ def test_alternatives_are_other_minima_cheapest_first(name):
 
 @pytest.mark.parametrize("name", STARTED)
 def test_the_covariance_is_the_inverse_information_at_the_estimate(name):
-    case = CASES[name]
-    fix = solve(case.problem)
+    case, fix = CASES[name], fixed(name)
     assert fix.status == Status.OK
     assert np.allclose(fix.cov, crlb(case.problem, fix.x), rtol=1e-9)
     assert fix.p_value > 1e-6
@@ -269,7 +279,7 @@ def test_wild_measurements_are_finite_statuses():
     """Nothing finite fits 1e12 m differences between stations 10 km apart; whatever comes, it is no clean fix."""
     case = CASES["tdoa-2d"]
     for scale in (1e6, 1e12):
-        z = np.random.default_rng(1).normal(0.0, scale, (6, case.problem.count))
+        z = np.random.default_rng(1).normal(0.0, scale, (3, case.problem.count))
         fix = solve(case.problem.with_rows(z=z))
         clean = fix.code == Status.OK
         assert (fix.p_value[clean] < 1e-6).all()
@@ -290,8 +300,7 @@ def test_a_far_emitter_seen_by_two_parallel_bearings():
 # --------------------------------------------------------------------------------------------------- from a start
 def test_refinement_from_a_near_start_is_the_fix():
     for name in STARTED:
-        case = CASES[name]
-        fix = solve(case.problem)
+        case, fix = CASES[name], fixed(name)
         refined = solve(case.problem, "lsr", start=case.truth)
         assert refined.status == Status.OK
         assert np.allclose(refined.x, fix.x, atol=1e-4)
@@ -316,7 +325,7 @@ def test_starts_of_a_batch():
 def test_wild_starts_never_raise_and_an_unfinished_run_is_never_ok(name, method):
     case = CASES[name]
     rng = np.random.default_rng(7)
-    d, count = case.problem.dimension, 60
+    d, count = case.problem.dimension, 40
     starts = np.zeros((count, case.problem.layout.size))
     starts[:, :d] = STATIONS[d].mean(0) + rng.standard_normal((count, d)) * 10.0 ** rng.uniform(3, 8, (count, 1))
     starts[0, :d] = STATIONS[d][0]  # on a station: a range of zero

@@ -145,7 +145,16 @@ def _program(key: _Key) -> Program:
         return constrained(problem, y * p[:n] + p[n : 2 * n], p[last + 1 :], p[last])
 
     equal, more = ((lambda y, p, i=i: limited(y, p)[i]) if problem.constraints else None for i in (0, 1))
-    return Program(n, problem.count, key.data, residual=scaled, equalities=equal, inequalities=more, diagonal=False)
+    return Program(
+        n,
+        problem.count,
+        key.data,
+        residual=scaled,
+        equalities=equal,
+        inequalities=more,
+        diagonal=False,
+        settings={"bound_relax_factor": 0.0},  # by default constraints give way by 1e-8 of the problem's size
+    )
 
 
 def _slot_units(slots: Any, size: float) -> Array:

@@ -107,6 +107,21 @@ class Heard:
         geodetic = np.repeat(self.geodetic, len(chosen), axis=0)
         return Heard(stations.reshape(-1, 3, 3), arrival.reshape(-1, 3), excess.reshape(-1, 3), geodetic)
 
+    @property
+    def width(self) -> np.ndarray:
+        """Return the least distance between two stations of each message, metres, (n,)."""
+        apart = np.linalg.norm(self.stations[:, :, None] - self.stations[:, None], axis=-1)
+        return (apart + np.where(np.eye(apart.shape[-1]), np.inf, 0.0)).min((1, 2))
+
+    def unbiased(self) -> Heard:
+        """Return the messages less the median residual of each station at the truth."""
+        off = self.arrival - self.excess - np.linalg.norm(self.truth[:, None] - self.stations, axis=-1)
+        off = off - np.median(off, axis=1, keepdims=True)
+        _, station = np.unique(self.stations.reshape(-1, 3), axis=0, return_inverse=True)
+        station = station.reshape(off.shape)
+        bias = np.array([np.median(off[station == s]) for s in range(station.max() + 1)])
+        return replace(self, excess=self.excess + bias[station])
+
     def take(self, index: np.ndarray) -> Heard:
         """Return some messages."""
         return Heard(self.stations[index], self.arrival[index], self.excess[index], self.geodetic[index])

@@ -20,8 +20,10 @@ def folder(data_dir):
     return data_dir / "locards_adsb"
 
 
-@pytest.mark.parametrize("refraction", README, ids=["vacuum", "air"])
-@pytest.mark.parametrize("given", ["exactly", "row"])
+# The height as a row, in vacuum, is in test_adsb_smoke.py.
+@pytest.mark.parametrize(
+    ("given", "refraction"), [("exactly", False), ("exactly", True), ("row", True)], ids=["exact", "exact-air", "row-air"]
+)
 def test_five_stations_and_the_height(folder, given, refraction):
     data = adsb.heard(folder, refraction=refraction)
     assert len(data.truth) == 763
@@ -33,26 +35,36 @@ def test_five_stations_and_the_height(folder, given, refraction):
 
 
 def test_three_stations_and_the_height(folder):
-    # Refraction corrected, as in the README's table: each line of it adds to the one above.
-    data = adsb.heard(folder, refraction=True).triplets()
+    whole = adsb.heard(folder, refraction=True)
+    chosen = np.sort(np.random.default_rng(10).choice(len(whole.truth), 30, replace=False))
+    data = whole.take(chosen).triplets()
+    # Stations 147 and 632 are 22 m apart: three with both of them are two, and say nothing that can be judged.
+    data = data.take(np.flatnonzero(data.width > 50.0))
     fix, reference = solve(data.problem("exactly")), data.from_truth("exactly")
-    theirs, best = data.horizontal(reference.position), listed(fix, data.horizontal)
     name = "ADS-B, three stations and height"
-    law(name, fix, best, theirs, reference)
-    ten = theirs.reshape(-1, 10)
-    for text, error, wanted in (
-        ("best", ten.min(1), BEST_TRIPLET),
-        ("median", np.median(ten, axis=1), MEDIAN_TRIPLET),
-    ):
-        report(f"   {text} triplet of the ten: {quantiles(error)}, README {wanted}")
+    theirs, best = data.horizontal(reference.position), listed(fix, data.horizontal)
+    law(name, fix, best, theirs, reference, answered=0.97)
+    near = listed(fix, lambda x: np.linalg.norm(x - reference.position, axis=-1)) < 1.0
     silent = np.flatnonzero(_silent(fix, reference))
     assert not len(silent), f"{name}: says ok and does not list the minimum that the truth leads to: {silent}"
-    near = listed(fix, lambda x: np.linalg.norm(x - reference.position, axis=-1)) < 1.0
     lost = np.flatnonzero((fix.code == Status.AMBIGUOUS) & ~near & (reference.cost < fix.cost + 9.0))
     assert not len(lost), f"{name}: does not list the minimum that the truth leads to: {lost}"
 
 
+def test_the_reference_of_three_stations_is_the_published_one(folder):
+    data = adsb.heard(folder, refraction=True).unbiased().triplets()
+    ten = data.horizontal(data.from_truth("exactly").position).reshape(-1, 10)
+    best, middle = quantiles(ten.min(1)), quantiles(np.median(ten, axis=1))
+    report(f"ADS-B, of ten triplets started at the truth: best {best}, median {middle} m")
+    assert best == pytest.approx(BEST_TRIPLET, rel=0.1)
+    assert middle == pytest.approx(MEDIAN_TRIPLET, rel=0.1)
+
+
 def _silent(fix, reference):
-    """Return where a fix says ok although the truth leads to another minimum that is about as good."""
-    other = np.linalg.norm(fix.position - reference.position, axis=-1) > 10.0
-    return (fix.code == Status.OK) & other & (reference.cost < fix.cost + 9.0)
+    """Return where a fix says ok although the truth leads to a minimum about as good, beyond three of its own sigma."""
+    apart = fix.position - reference.position
+    off = np.zeros(len(fix))
+    good = (fix.code == Status.OK) & (reference.cost < fix.cost + 9.0)
+    information = np.linalg.pinv(fix.covariance()[good], rcond=1e-12, hermitian=True)
+    off[good] = np.sqrt(np.einsum("ki,kij,kj->k", apart[good], information, apart[good]))
+    return off > 3.0
