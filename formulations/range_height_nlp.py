@@ -14,7 +14,7 @@ is that of :mod:`formulations.nls`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import cache
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,10 @@ Mask = NDArray[np.bool_]
 
 # the left side of a polar plane is at least -1 for a point and a station of the closed ellipsoid
 _FREE = -10.0
-_LOOSER = 1e-8
+# of the largest weight, tried in turn. Too small, and IPOPT's barrier outweighs metres where satellites fix a point
+# weakly; too large, and rounding stops it short of its tolerance where they fix it well. IPOPT's own scaling looks at
+# the gradient of the start, which vanishes where the start is the fix
+_SIZES = (1e3, 1e2, 1e1)
 
 
 class HeightProgram:
@@ -78,12 +81,17 @@ class HeightProgram:
         def horizon(x: Any, p: Any) -> list[Any]:
             return [_polar(p, x, station(p, i)) - p[15 + 4 * i] for i in range(count)]
 
-        def build(chosen: Mapping[str, Any]) -> Program:
-            size = (3, len(rows), 12 + 4 * count)
-            return Program(*size, h, equalities=surface, inequalities=horizon, diagonal=diagonal, settings=chosen)
-
-        self._program = build(settings or {})
-        self._looser = cache(lambda: build({**(settings or {}), "tol": _LOOSER}))
+        self._weight = np.ones(len(rows)) if diagonal else np.eye(len(rows))
+        self._program = Program(
+            3,
+            len(rows),
+            12 + 4 * count,
+            h,
+            equalities=surface,
+            inequalities=horizon,
+            diagonal=diagonal,
+            settings={"nlp_scaling_method": "none", **(settings or {})},
+        )
 
     def solve(
         self,
@@ -108,7 +116,7 @@ class HeightProgram:
         surface : Ellipsoid
             Shape (3, 3) and centre (3,).
         weight : array_like, shape (m,) or (m, m), optional
-            W; a zero drops a row. Inverse deviations: with weights of order one the barrier outweighs metres.
+            W, of any size; a zero drops a row.
         horizon : array_like of bool, shape (s,) or ()
             False takes away the polar plane of a station that did not hear the target.
 
@@ -124,12 +132,20 @@ class HeightProgram:
         planes = np.broadcast_to(np.asarray(horizon, dtype=np.bool_), s.shape[:1]) & (surface.polar(s, s) > 1.0)
         limit = np.where(planes, 1.0, _FREE)
         p = np.concatenate([surface.shape.ravel(), surface.centre, np.column_stack([s, limit]).ravel()])
-        found = self._program.solve(start, z, weight, p)
-        if found.success or not np.isfinite(found.x).all():
-            return found
-        # rounding may stop the last step at the very solution: seen in 1 of 4 000 starts
-        again = self._looser().solve(start, z, weight, p)
-        return again if again.success else found
+        W = self._weight if weight is None else np.asarray(weight, dtype=np.float64)
+        size = float(np.abs(W).max(initial=0.0))
+        for aim in _SIZES:
+            unit = aim / size if np.isfinite(size) and size > 0.0 else 1.0
+            found = self._program.solve(start, z, unit * W, p)
+            if found.success or "Infeasible" in found.status:
+                break
+        return replace(
+            found,
+            cost=found.cost / unit**2,
+            bounds=found.bounds / unit**2,
+            equalities=found.equalities / unit**2,
+            inequalities=found.inequalities / unit**2,
+        )
 
 
 def _polar(p: Any, x: Any, y: Any) -> Any:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -109,17 +108,16 @@ Face = tuple[Level, ...]
 
 def exact(problem: Problem) -> Face:
     """Return the equalities of a problem."""
-    return tuple(Level(i, "equal") for i, c in enumerate(problem.constraints) if _is_exact(c))
+    return tuple(Level(i, "equal") for i, c in enumerate(problem.constraints) if is_exact(c))
 
 
 def faces(problem: Problem) -> list[Face]:
     """Return every set of constraints that can hold with equality together; the equalities alone come first."""
-    choices = [[(), *_sides(i, c)] for i, c in enumerate(problem.constraints) if not _is_exact(c)]
-    found = []
-    for combination in product(*choices):
-        face = (*exact(problem), *(level for side in combination for level in side))
-        if sum(_kind(problem, level) != "speed" for level in face) <= problem.dimension:
-            found.append(face)
+    found = [exact(problem)]
+    for i, constraint in enumerate(problem.constraints):
+        sides = [] if is_exact(constraint) else list(_sides(i, constraint))
+        wider = [(*face, *side) for face in found for side in sides]
+        found += [face for face in wider if sum(_kind(problem, v) != "speed" for v in face) <= problem.dimension]
     return sorted(found, key=len)
 
 
@@ -136,8 +134,14 @@ def _kind(problem: Problem, level: Level) -> str:
     return constraint.kind if isinstance(constraint, Band) else "plane"
 
 
-def _is_exact(constraint: Band | Polygon) -> bool:
+def is_exact(constraint: Band | Polygon) -> bool:
+    """Return whether a constraint is an equality."""
     return isinstance(constraint, Band) and bool(np.all(constraint.lower == constraint.upper))
+
+
+def needs_velocity(constraint: Band | Polygon) -> bool:
+    """Return whether a constraint bounds the velocity of its target."""
+    return isinstance(constraint, Band) and SURFACES[constraint.kind].velocity
 
 
 def _sides(i: int, constraint: Band | Polygon) -> Iterator[Face]:

@@ -9,7 +9,7 @@ import numpy as np
 from optloc.errors import InvalidProblem
 from optloc.noise import Block, Noise, group
 from optloc.problem import Problem
-from optloc.types import Array, Rows
+from optloc.types import Array, Band, Polygon, Rows
 
 
 def separable(problem: Problem) -> bool:
@@ -82,11 +82,24 @@ def by_epoch(problem: Problem) -> Problem:
         covariance=None if s.covariance is None else _same(s.covariance, 3),
     )
     priors = tuple(replace(p, mean=_same(p.mean, 1), covariance=_same(p.covariance, 2)) for p in problem.priors)
+    constraints = tuple(_spread(c) for c in problem.constraints)
     noise = _noise(problem, where, int(starts[-1]))
-    once = np.zeros(1)
     return replace(
-        problem, stations=stations, rows=tuple(rows), noise=noise, times=once, motions=motions, priors=priors
+        problem,
+        stations=stations,
+        rows=tuple(rows),
+        noise=noise,
+        times=np.zeros(1),
+        motions=motions,
+        priors=priors,
+        constraints=constraints,
     )
+
+
+def _spread(c: Band | Polygon) -> Band | Polygon:
+    if isinstance(c, Polygon):
+        return c
+    return replace(c, lower=_same(c.lower, 0), upper=_same(c.upper, 0), coefficients=_same(c.coefficients, 1))
 
 
 def untied(problem: Problem) -> Problem:

@@ -58,7 +58,8 @@ def test_boxes(seed):
     assert (fix.position >= low - 1e-2).all()
     assert (fix.position <= high + 1e-2).all()
     held = {active.name for active in fix.active[()]}
-    touching = {f"{'xy'[i]} {side}" for i in range(2) for side, b in (("lower", low), ("upper", high)) if abs(fix.position[i] - b[i]) < 1e-6}
+    sides = [(i, side, bound[i]) for i in range(2) for side, bound in (("lower", low), ("upper", high))]
+    touching = {f"{'xy'[i]} {side}" for i, side, bound in sides if abs(fix.position[i] - bound) < 1e-6}
     assert held == touching
 
 
@@ -77,7 +78,7 @@ def test_heights(seed, exact):
         demands = [{"type": "eq", "fun": lambda u: (above(u * 1e3) - low) / 1e3}]
     else:
         demands = [{"type": "ineq", "fun": lambda u: np.array([above(u * 1e3) - low, high - above(u * 1e3)]) / 1e3}]
-    starts = np.c_[rng.uniform(0.0, 5e3, (8, 2)), np.full(8, 600.0)]
+    starts = np.c_[rng.uniform(0.0, 5e3, (4, 2)), np.full(4, 600.0)]
     fix = solve(problem)
     agree(fix, reference(cost, starts, 1e3, constraints=demands))
     assert low - 1e-2 <= float(above(fix.position)) <= high + 1e-2
@@ -206,7 +207,7 @@ def posed(*constraints, place=SPACE, frame=ENU, **more):
     return drawn(place, place[0] + 1e3, np.random.default_rng(0), *constraints, frame=frame, **more)
 
 
-BOW = [[0.0, 0.0], [1.0, 1.0], [1.0, 0.0], [0.0, 1.0]]
+BOW = [[0.0, 0.0], [9.0, 10.0], [9.0, 0.0], [0.0, 8.0]]
 SPIKE = [[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [4.0, -2.0]]
 TOUCH = [[0.0, 0.0], [4.0, 0.0], [4.0, 4.0], [2.0, 0.0], [0.0, 4.0]]
 PLAIN = Frame("cartesian")
@@ -231,7 +232,7 @@ REFUSED = {
     "nan corner": (lambda: posed(polygon([[0, 0], [1, np.nan], [1, 0]])), "corner 2 is not finite"),
     "closed ring": (lambda: posed(polygon([*ELL, ELL[0]])), "corner 7 repeats corner 1"),
     "no area": (lambda: posed(polygon([[0, 0], [1, 1], [2, 2]])), "no area"),
-    "bow tie": (lambda: posed(polygon(np.array(BOW) * [[1.0, 1.1]] * 1e3 + [[0, 0], [0, 90], [0, 0], [0, 0]])), "1-2 and 3-4 meet"),
+    "bow tie": (lambda: posed(polygon(BOW)), "1-2 and 3-4 meet"),
     "spike": (lambda: posed(polygon(SPIKE)), "not simple"),
     "corner on an edge": (lambda: posed(polygon(TOUCH)), "not simple"),
     "polygon in ECEF": (lambda: posed(polygon(ELL), frame=Frame("ecef")), "needs a plan"),
@@ -257,5 +258,5 @@ def test_simple_polygons_pass_either_way_round(turn):
     rng = np.random.default_rng(6)
     angle = np.sort(rng.uniform(0.0, 2.0 * np.pi, 40))
     star = rng.uniform(1.0, 3.0, (40, 1)) * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    for corners in (ELL, star + [5e6, 5e6], 1e6 * star):
+    for corners in (ELL, star + 5e6, 1e6 * star):
         assert isinstance(posed(polygon(corners[::turn]))[0].constraints[0], Polygon)

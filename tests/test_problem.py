@@ -24,6 +24,7 @@ from optloc import (
 )
 from optloc.epochs import separable
 from optloc.noise import Block, Noise
+from optloc.types import Band
 
 
 def batch_of(count=6):
@@ -278,6 +279,20 @@ def test_batches_of_many_epochs_and_priors_split_too():
     for i in range(2):
         single = solve(replace(problem, priors=(Prior("position", held.priors[0].mean[i], spread),)))
         assert np.allclose(fixed.position[i], single.position, atol=1e-4, equal_nan=True)
+
+
+def test_constraints_of_a_batch_split_too():
+    problem, path = many_epochs(d=2)
+    several = problem.with_rows(z=np.stack([problem.z] * 2))
+    low = path[:, 1].mean() + np.array([-9e3, 500.0])
+    band = Band("plane", low, np.full(2, np.inf), np.tile([0.0, 1.0], (2, 1)), "north of a line")
+    fix = solve(replace(several, constraints=(band,)))
+    assert fix.shape == (2, K)
+    free = solve(problem)
+    assert np.allclose(fix.position[0], free.position, atol=1e-4, equal_nan=True)
+    held = np.isfinite(fix.position[1, :, 1]) & np.isfinite(free.position[:, 1])
+    assert (fix.position[1, held, 1] >= low[1] - 1e-3).all()
+    assert (free.position[held, 1] < low[1]).any()
 
 
 def test_epochs_tied_by_anything_are_not_torn_apart():

@@ -9,6 +9,7 @@ from math import factorial
 import numpy as np
 
 from optloc import linalg
+from optloc.constraints import is_exact, needs_velocity
 from optloc.epochs import by_epoch, untied
 from optloc.fix import Fix
 from optloc.layout import state_names
@@ -61,7 +62,14 @@ def _alone(problem: Problem, target: int) -> Problem:
         replace(r, weight=np.where(r.target == target, r.weight, 0.0), target=np.zeros_like(r.target))
         for r in problem.rows
     )
-    return replace(problem, rows=rows, motions=(problem.motions[target],), biases=(), priors=())
+    motion = problem.motions[target]
+    # What bounds a moving target holds at its reference time only, but a known height is as good a start elsewhere.
+    constraints = tuple(
+        replace(c, target=0)
+        for c in problem.constraints
+        if c.target == target and (motion.order == 0 or (is_exact(c) and not needs_velocity(c)))
+    )
+    return replace(problem, rows=rows, motions=(motion,), biases=(), priors=(), constraints=constraints)
 
 
 def _state(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:

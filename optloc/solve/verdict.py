@@ -147,7 +147,7 @@ def _alternatives(
 def _same(x: Array, y: Array, curvature: Curvature) -> Array:
     """Return where two points are nearer than a tenth of a standard deviation in every direction, or equal."""
     difference = x - y
-    with np.errstate(invalid="ignore", over="ignore"):
+    with np.errstate(all="ignore"):  # a point that constraints hold has no spread
         squared = (difference[:, None, :] @ curvature.information @ difference[..., None])[:, 0, 0]
         spread = np.trace(curvature.covariance, axis1=-2, axis2=-1)  # constraints leave directions without information
         squared = np.maximum(squared, (difference**2).sum(-1) / spread)
@@ -218,7 +218,7 @@ def _explain(problem: Problem, fix: Fix, curvature: Curvature) -> None:
     unsure = ~np.isin(fix.code, (Status.OK, Status.AMBIGUOUS))
     fix.certificate[unsure] = _UNKNOWN
     gone = broken | few | missing | barred | weak
-    fix.x[gone & ~weak] = np.nan
+    fix.x[gone] = np.nan
     fix.cov[gone] = np.nan
 
 

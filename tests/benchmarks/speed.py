@@ -6,7 +6,7 @@ from functools import cache
 from time import perf_counter
 
 import numpy as np
-from monte_carlo.layouts import KINDS, SEED, anywhere, inside, model, outside
+from monte_carlo.layouts import BOX, KINDS, SEED, anywhere, fixed, inside, model, outside
 from scipy.optimize import least_squares
 
 from optloc import Fix, Problem, solve
@@ -15,12 +15,20 @@ COUNT, STATIONS, SIGMA, GENERAL = 10_000, 6, 10.0, 300
 Array = np.ndarray
 
 
+# An array of good shape: the faces of the box.
+FACES = np.concatenate([np.eye(3), -np.eye(3)]) * BOX / 2.0
+SCENES = ("one array, inside", "random arrays, half outside")
+
+
 @cache
-def batch() -> tuple[Problem, Array, Array, Array]:
-    """Return problem, stations, measurements and truth; emitters half inside the box, half outside."""
+def batch(scene: str) -> tuple[Problem, Array, Array, Array]:
+    """Return problem, stations, measurements and truth."""
     rng = np.random.default_rng(SEED)
-    stations = anywhere(STATIONS, rng, COUNT)
-    truth = np.concatenate([inside(rng, COUNT // 2), outside(rng, COUNT - COUNT // 2)])
+    if scene == SCENES[0]:
+        stations, truth = np.array(fixed(FACES, rng, COUNT)), inside(rng, COUNT)
+    else:
+        stations = anywhere(STATIONS, rng, COUNT)
+        truth = np.concatenate([inside(rng, COUNT // 2), outside(rng, COUNT - COUNT // 2)])
     kind = KINDS["tdoa"]
     exact = model(kind, stations, SIGMA).exact(truth)
     root = np.linalg.cholesky(kind.covariance(STATIONS - 1, SIGMA))
@@ -29,31 +37,31 @@ def batch() -> tuple[Problem, Array, Array, Array]:
 
 
 @cache
-def cut(chunk: int) -> tuple[Problem, ...]:
+def cut(scene: str, chunk: int) -> tuple[Problem, ...]:
     """Return the same problems in chunks."""
-    problem = batch()[0]
+    problem = batch(scene)[0]
     return tuple(problem.take(np.arange(i, min(i + chunk, COUNT))) for i in range(0, COUNT, chunk))
 
 
-def fixes(method: str, chunk: int) -> list[Fix]:
+def fixes(scene: str, method: str, chunk: int) -> list[Fix]:
     """Fix all problems, chunk by chunk; the covariance is part of every fix."""
-    return [solve(problem, method=method) for problem in cut(chunk)]
+    return [solve(problem, method=method) for problem in cut(scene, chunk)]
 
 
-def microseconds(method: str, chunk: int, rounds: int = 5) -> float:
+def microseconds(scene: str, method: str, chunk: int, rounds: int = 5) -> float:
     """Return the time of one fix in the quietest round."""
-    fixes(method, chunk)
+    fixes(scene, method, chunk)
     times = []
     for _ in range(rounds):
         began = perf_counter()
-        fixes(method, chunk)
+        fixes(scene, method, chunk)
         times.append(perf_counter() - began)
     return 1e6 * min(times) / COUNT
 
 
-def general() -> list[Array]:
+def general(scene: str) -> list[Array]:
     """Fix every 33rd problem by scipy from the truth, with exact derivatives, and add the covariance."""
-    _, stations, z, truth = batch()
+    _, stations, z, truth = batch(scene)
     white = np.linalg.inv(np.linalg.cholesky(KINDS["tdoa"].covariance(STATIONS - 1, SIGMA)))
     out = []
     for i in range(0, COUNT, COUNT // GENERAL):
@@ -73,25 +81,29 @@ def general() -> list[Array]:
     return out
 
 
-def general_microseconds(rounds: int = 3) -> float:
+def general_microseconds(scene: str, rounds: int = 3) -> float:
     """Return scipy's time of one fix in the quietest round."""
     times = []
     for _ in range(rounds):
         began = perf_counter()
-        count = len(general())
+        count = len(general(scene))
         times.append((perf_counter() - began) / count)
     return 1e6 * min(times)
 
 
-def relaxation_ratio(kind: str, solves: int = 300) -> tuple[float, float]:
-    """Return microseconds of a warm relaxation and its ratio to the bare Clarabel solve of the same data."""
-    from formulations.conic import Relaxation, _solver
+def relaxation_ratio(kind: str, solves: int = 300) -> tuple[float, float, float]:
+    """Return microseconds of a warm relaxation, and its ratios to bare Clarabel with and without its set-up."""
+    import clarabel
+
+    from formulations.conic import Relaxation
     from formulations.squared_range import cone
     from formulations.squared_range_conic import hull_problem, shor_problem
 
     relaxation = Relaxation(shor_problem(cone(3)) if kind == "shor" else hull_problem(cone(3)))
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
     rng = np.random.default_rng(SEED)
-    whole, bare = [], []
+    times = []
     for _ in range(solves):
         x = rng.uniform(-2.0, 2.0, 3)
         rows = rng.standard_normal((5, 4))
@@ -99,12 +111,14 @@ def relaxation_ratio(kind: str, solves: int = 300) -> tuple[float, float]:
         factor = np.linalg.qr(np.concatenate([rows, -right[:, None]], axis=1), mode="r")
         factor /= np.abs(factor).max()
         values = {"gram": factor.T @ factor} if kind == "shor" else {"factor": factor}
-        began = perf_counter()
-        relaxation.solve(values)
-        whole.append(perf_counter() - began)
-        # The same data, already in Clarabel's form and in a solver of its own.
-        alone = _solver(relaxation._data, {})
-        began = perf_counter()
+        begin = perf_counter()
+        relaxation.solve(values, bound=False)
+        whole = perf_counter()
+        data = relaxation._data
+        alone = clarabel.DefaultSolver(data.P, data.q, data.A, data.b, data.cones, settings)
+        ready = perf_counter()
         alone.solve()
-        bare.append(perf_counter() - began)
-    return 1e6 * float(np.median(whole)), float(np.median(np.array(whole) / np.array(bare)))
+        end = perf_counter()
+        times.append((whole - begin, end - whole, end - ready))
+    warm, bare, only = np.array(times).T
+    return 1e6 * float(np.median(warm)), float(np.median(warm / bare)), float(np.median(warm / only))

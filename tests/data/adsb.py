@@ -72,7 +72,9 @@ class Heard:
 
     def problem(self, given: str) -> Problem:
         """Return the messages as a batch; `given` is how the height enters: "exactly", "row", or "nothing"."""
-        rows = [measured("toa", self.arrival, a=np.arange(self.arrival.shape[1]), sigma=ARRIVAL, correction=self.excess)]
+        rows = [
+            measured("toa", self.arrival, a=np.arange(self.arrival.shape[1]), sigma=ARRIVAL, correction=self.excess)
+        ]
         if given == "row":
             rows.append(measured("height", self.geodetic[:, 2:], sigma=HEIGHT))
         known = [height(exactly=self.geodetic[:, 2])] if given == "exactly" else []

@@ -15,7 +15,7 @@ import pandas as pd
 from data.reference import Reference, centred, descend, ecef, horizontal
 
 from optloc import ECEF, Bias, Motion, Problem, assemble, measured, station_array
-from optloc.constraints import height
+from optloc.constraints import height, visible
 
 SIGMA = 1.0
 MASK = np.deg2rad(10.0)
@@ -23,7 +23,7 @@ MASK = np.deg2rad(10.0)
 
 @dataclass(frozen=True)
 class Receptions:
-    """Problems of one session: satellites (n, s, 3), pseudoranges, sigmas and weights (n, s), systems of satellites (s,).
+    """Problems of one session: satellites (n, s, 3), pseudoranges, sigmas and weights (n, s), their systems (s,).
 
     `truth` is the receiver (3,), `geodetic` its latitude, longitude (radians) and height.
     """
@@ -50,14 +50,20 @@ class Receptions:
             frame=ECEF,
         )
 
-    def by_difference(self) -> Problem:
-        """Return the draws as differences to their first satellite, with the true height known exactly."""
+    def by_difference(self, *, masked: bool = False) -> Problem:
+        """Return the draws as differences to their first satellite, with the true height known exactly.
+
+        `masked`: the receiver's elevation mask is known too.
+        """
+        known = height(exactly=self.geodetic[2])
+        if masked:
+            known += visible(np.moveaxis(self.satellites, 1, 0), elevation=MASK)
         others = np.arange(1, self.satellites.shape[-2])
         return assemble(
             station_array(self.satellites[:, None]),
             measured("tdoa", self.z[:, 1:] - self.z[:, :1], a=others, b=np.zeros_like(others), arrival_sigma=SIGMA),
             frame=ECEF,
-            constraints=[height(exactly=self.geodetic[2])],
+            constraints=[known],
         )
 
     def epochs_from_truth(self, offset: tuple[str, ...]) -> Reference:

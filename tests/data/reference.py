@@ -1,4 +1,4 @@
-"""Independent answers for many small problems at once: damped Gauss-Newton in plain numpy, and how a fix is judged by it.
+"""Independent answers to many small problems at once: damped Gauss-Newton in plain numpy, and how it judges a fix.
 
 Nothing of optloc computes here. Residuals are functions of free coordinates (N, n), where nuisances are already taken
 out: an emission time or a system offset by centring, an exact height by turning latitude and longitude into ECEF.
@@ -33,7 +33,7 @@ def descend(residual: Residual, start: np.ndarray, step: float, limit: int = 200
     x, damping = np.array(start), np.full(len(start), 1e-6)
     r = residual(x)
     cost = (r**2).sum(-1)
-    size = x.shape[-1]
+    size, done = x.shape[-1], np.zeros(len(x), dtype=bool)
     for _ in range(limit):
         columns = [(residual(x + h) - residual(x - h)) / (2.0 * step) for h in step * np.eye(size)]
         J = np.stack(columns, axis=-1)
@@ -45,11 +45,10 @@ def descend(residual: Residual, start: np.ndarray, step: float, limit: int = 200
         reached = (further**2).sum(-1)
         better = reached < cost
         x[better], r[better] = (x + move)[better], further[better]
-        settled = np.where(better, cost - reached, 0.0) <= 1e-12 * (1.0 + cost)
-        settled &= (damping < 1e-3) | (damping > 1e10)
+        done |= (better & (cost - reached <= 1e-12 * (1.0 + cost)) & (damping < 1e-3)) | (damping > 1e10)
         cost = np.where(better, reached, cost)
         damping = np.where(better, np.maximum(0.1 * damping, 1e-12), np.minimum(10.0 * damping, 1e15))
-        if settled.all():
+        if done.all():
             break
     return x, cost
 

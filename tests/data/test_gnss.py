@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from data import gnss
 from data.reference import law, listed
-from data.windows import quantiles, report
+from data.windows import quantiles, report, statuses
 
 from optloc import Status, solve
 
@@ -54,7 +54,7 @@ def test_three_satellites_and_the_height(session, case):
     assert quantiles(theirs)[0] == pytest.approx(THREE[case][0], rel=0.3)
     assert quantiles(theirs[good]) == pytest.approx(CONDITIONED[case], rel=0.2)
     assert quantiles(best[good]) == pytest.approx(CONDITIONED[case], rel=0.2)
-    # Beyond 90 deg from the receiver three satellites may still be in sight: two exact answers, and nothing tells which.
+    # Beyond 90 deg from the receiver three satellites may still be in sight: two exact answers, nothing tells which.
     beyond = fix.answered & (fix.position @ data.truth < 0.0)
     report(f"   {beyond.sum()} fixes in the other hemisphere, all with the right one beside them")
     assert np.all(fix.code[beyond] == Status.AMBIGUOUS)
@@ -63,3 +63,20 @@ def test_three_satellites_and_the_height(session, case):
     silent = np.flatnonzero((fix.code == Status.OK) & ~right)
     assert not len(silent), f"{name}: says ok and is not the minimum that the truth leads to: {silent}"
     assert near[fix.code == Status.AMBIGUOUS].all(), name
+
+
+def test_the_elevation_mask_leaves_fewer_answers(data_dir):
+    data = gnss.load(data_dir / "gnss_static", "K078", "prc_l1_m").draws(100, seed=3)
+    reference, free, masked = (
+        data.draws_from_truth(),
+        solve(data.by_difference()),
+        solve(data.by_difference(masked=True)),
+    )
+    report(f"GNSS, 100 draws: {statuses(free)}; with the mask of 10 deg known: {statuses(masked)}")
+    assert masked.answered.all()
+    assert (masked.code == Status.AMBIGUOUS).sum() < (free.code == Status.AMBIGUOUS).sum()
+    near = listed(masked, lambda x: np.linalg.norm(x - reference.position, axis=-1)) < 1.0
+    assert near.all()
+    # Draw 4 has a second answer 103 deg away, which one of its satellites would not have reached.
+    assert free.code[4] == Status.AMBIGUOUS
+    assert masked.code[4] == Status.OK

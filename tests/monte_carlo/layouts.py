@@ -175,3 +175,16 @@ CASES = [
     *_in_space("TOA, 6 stations", "toa", 6, (1.0, 10.0, 30.0), METRES),
     *_in_space("range sum, 6 stations", "range sum", 6, (1.0, 10.0, 30.0), METRES),
 ]
+NAMES = [case.name for case in CASES]
+
+
+def _extremes(names: list[str]) -> list[str]:
+    """Return the least and the greatest noise of every family of cases."""
+    families: dict[str, list[str]] = {}
+    for name in names:
+        families.setdefault(name.rpartition(", ")[0], []).append(name)
+    return [name for family in families.values() for name in (family[0], family[-1])]
+
+
+# What runs every day; all of them run in full.
+DAILY = _extremes(NAMES)

@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from monte_carlo.layouts import CASES, KINDS, SEED, Y_ARRAY, Y_TARGETS, Case, fixed, model
+from monte_carlo.layouts import DAILY, KINDS, NAMES, SEED, Y_ARRAY, Y_TARGETS, Case, fixed, model
 from monte_carlo.tables import ledger
 from monte_carlo.trials import automatic, position, trials
 from scipy.constants import speed_of_light
@@ -16,8 +16,7 @@ from optloc import Status, crlb, solve
 DEFAULT, FULL, MANY = 200, 2000, 20_000
 CLEAR_GAP, SMALL = 25.0, 0.05
 # The band that all cases together meet with 99 %: few trials leave single cases to chance.
-EVERY_CASE = 1.0 - 0.01 / len(CASES)
-NAMES = [case.name for case in CASES]
+EVERY_CASE = 1.0 - 0.01 / len(DAILY)
 
 
 @dataclass(frozen=True)
@@ -93,7 +92,7 @@ def summary(name: str, count: int, probability: float):
     return len(squared), squared.mean() / d if len(squared) else np.nan, *band(max(len(squared) * d, 1), probability)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", DAILY)
 def test_errors_are_as_large_as_the_covariance_says(name):
     used, mean, low, high = summary(name, DEFAULT, EVERY_CASE)
     assert not used or low <= mean <= high, f"NEES/d {mean:.3f} of {used} fixes, band {low:.3f} to {high:.3f}"
