@@ -186,6 +186,14 @@ def test_a_region_that_cannot_be_reached_is_infeasible_and_leaves_the_others_alo
     np.testing.assert_array_equal(fix.position[[0, 2]], free.position[[0, 2]])
 
 
+def test_a_height_outside_the_box_is_infeasible():
+    floor, ceiling = (-np.inf, -np.inf, -500.0), (np.inf, np.inf, 0.0)
+    problem, _ = drawn(SPACE, np.array([2e3, 2e3, 900.0]), np.random.default_rng(1), frame=ENU)
+    fix = solve(replace(problem, constraints=(*box(floor, ceiling), *height(exactly=2e3))))
+    assert (fix.status, fix.active[()]) == (Status.INFEASIBLE, ())
+    assert np.isnan(fix.position).all()
+
+
 def test_satellites_behind_the_horizon_are_a_status():
     earth = Frame("ecef")
     truth = earth.from_geodetic(0.8, 0.1, 100.0)

@@ -8,7 +8,7 @@ import numpy as np
 
 from optloc.constraints import Face, restored, tangent_at
 from optloc.linear import linearise
-from optloc.noise import Whitener, whiten
+from optloc.noise import Whitener, variances, whiten
 from optloc.normal import Normal, decrement, normal, step, with_priors
 from optloc.problem import Problem
 from optloc.status import Status
@@ -89,12 +89,12 @@ def refine(
     with np.errstate(all="ignore"):
         start = restored(problem, face, start) if face else start
         state = _State.begin(problem, start, noise)
-        active = np.arange(len(start))
+        active, blur = np.arange(len(start)), _blur(problem, len(start))
         for iteration in range(limit):
             active = active[state.status[active] == Status.MAX_ITERATIONS]
             if not len(active):
                 break
-            part = _Part.of(problem, noise, active, len(start))
+            part = _Part.of(problem, noise, blur, active)
             _advance(part, state, active, _Rules(n, tolerance, damped, face), iteration)
     return Refined(state.x, state.equations.cost, state.status, state.iterations, state.equations)
 
@@ -142,12 +142,21 @@ class _Part:
 
     problem: Problem
     noise: tuple[Whitener, ...]
+    blur: Array
 
     @classmethod
-    def of(cls, problem: Problem, noise: tuple[Whitener, ...], active: Array, count: int) -> _Part:
-        if len(active) == count:
-            return cls(problem, noise)
-        return cls(problem.take(active), tuple(w.take(active) for w in noise))
+    def of(cls, problem: Problem, noise: tuple[Whitener, ...], blur: Array, active: Array) -> _Part:
+        if len(active) == len(blur):
+            return cls(problem, noise, blur)
+        return cls(problem.take(active), tuple(w.take(active) for w in noise), blur[active])
+
+
+def _blur(problem: Problem, count: int) -> Array:
+    """Return the rounding error (N,) of the whitened residuals: arrival times that count from long ago are coarse."""
+    sigma = np.sqrt(variances(problem.noise, problem.count))
+    ratio = np.where(problem.weight > 0.0, problem.observed / sigma, 0.0)
+    coarse = 4.0 * np.finfo(float).eps * np.sqrt((ratio**2).sum(-1))
+    return np.broadcast_to(np.where(np.isfinite(coarse), coarse, 0.0), (count,))
 
 
 def _advance(part: _Part, state: _State, active: Array, rules: _Rules, iteration: int) -> None:
@@ -161,10 +170,11 @@ def _advance(part: _Part, state: _State, active: Array, rules: _Rules, iteration
     x = restored(part.problem, rules.face, here + move) if rules.face else here + move
     after = equations_at(part.problem, x, part.noise)
     achieved = now.cost - after.cost
-    rounding = 1e-13 * (1.0 + now.cost)
+    floor = 1e-13 * (1.0 + now.cost)
+    rounding = floor + 2.0 * part.blur * np.sqrt(1.0 + now.cost)
     better = solvable & np.isfinite(after.cost) & ((achieved >= -rounding) if rules.damped else True)
     state.iterations[active] = iteration + 1
-    small = solvable & (np.abs(gain) * (1.0 + damping) <= np.maximum(rules.tolerance**2, rounding))
+    small = solvable & (np.abs(gain) * (1.0 + damping) <= np.maximum(rules.tolerance**2, floor + part.blur**2))
     _keep(state, active, better, x, after)
     ratio = achieved / np.where(gain > 0.0, gain, 1.0)
     factor = np.maximum(1.0 / 3.0, 1.0 - (2.0 * np.clip(ratio, 0.0, 1.0) - 1.0) ** 3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from optloc.constraints import exact
 from optloc.problem import Problem
 from optloc.solve.refine import refine
 from optloc.solve.start import vectors
@@ -33,7 +34,7 @@ def searched_starts(problem: Problem) -> Array:
     places = centre[:, None] + spread[:, None, None] * _directions(d)
     x = vectors(problem, places)
     item = np.repeat(np.arange(size), PLACES)
-    done = refine(problem, x.reshape(-1, x.shape[-1]), item=item, limit=8)
+    done = refine(problem, x.reshape(-1, x.shape[-1]), item=item, limit=8, face=exact(problem))
     cost = np.where(np.isfinite(done.cost), done.cost, np.inf).reshape(size, PLACES)
     order = np.argsort(cost, axis=1, kind="stable")[:, :_KEPT]
     slot, _ = problem.layout.find("position")

@@ -57,9 +57,13 @@ def subarray_starts(problem: Problem) -> Array:
             taken = MODELS[rows.kind].stations
             touched = ((rows.a == station) & (taken > 0)) | ((rows.b == station) & (taken > 1))
             weight[:, start + np.flatnonzero(touched)] = 0.0
-        changed = (weight != problem.weight).any()
-        if changed and (weight > 0.0).any():
-            parts.append(squared_range_starts(problem.with_rows(weight=weight), every))
+        touching = np.flatnonzero((weight != problem.weight).any(1) & (weight > 0.0).any(1))
+        if len(touching):
+            rest = problem.with_rows(weight=weight).take(touching)
+            found = squared_range_starts(rest, every)
+            spread = np.full((problem.batch_shape[0], *found.shape[1:]), np.nan)
+            spread[touching] = found
+            parts.append(spread)
     if not parts:
         return np.full((problem.batch_shape[0], 0, problem.dimension), np.nan)
     return np.concatenate(parts, axis=1)

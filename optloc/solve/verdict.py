@@ -14,6 +14,7 @@ from optloc.noise import whiten
 from optloc.problem import Problem
 from optloc.solve.curvature import Curvature, curved, station_direction, weak_direction
 from optloc.solve.reduce import ranges
+from optloc.solve.sight import lowest
 from optloc.status import Certificate, Status
 from optloc.types import Array
 
@@ -71,7 +72,7 @@ def judge(problem: Problem, pool: Candidates, equations: Any, stages: tuple[Stag
     """
     size = len(pool.x)
     pool = _sorted(pool)
-    best = _preferred(pool)
+    best = _preferred(problem, pool)
     rows = np.arange(size)
     chosen, value, face = pool.x[rows, best], pool.cost[rows, best], pool.face[rows, best]
     found = np.isfinite(value)
@@ -109,12 +110,18 @@ def _sorted(pool: Candidates) -> Candidates:
     return Candidates(np.take_along_axis(pool.x, order[..., None], axis=1), cost, code, face)
 
 
-def _preferred(pool: Candidates) -> Array:
-    """Return the slot to answer with: the cheapest, or a finished one that costs the same."""
-    finished, lowest = pool.code == Status.OK, pool.cost[:, :1]
+def _preferred(problem: Problem, pool: Candidates) -> Array:
+    """Return the slot to answer with: the cheapest, or of finished ones that cost the same the one with the best sight."""
+    finished, lowest_cost = pool.code == Status.OK, pool.cost[:, :1]
     with np.errstate(invalid="ignore"):
-        near = finished & (pool.cost <= lowest + 1e-6 * (1.0 + np.abs(lowest)))
-    return np.where(near.any(1), near.argmax(1), 0)
+        near = finished & (pool.cost <= lowest_cost + 1e-6 * (1.0 + np.abs(lowest_cost)))
+    best = np.where(near.any(1), near.argmax(1), 0)
+    tied, slot = np.nonzero(near & (near.sum(1) > 1)[:, None])
+    if len(tied) and problem.frame.geodetic:
+        sight = np.full(pool.cost.shape, -np.inf)
+        sight[tied, slot] = np.round(lowest(problem.take(tied), pool.x[tied, slot]), 6)
+        best[tied] = sight[tied].argmax(1)
+    return best
 
 
 def _alternatives(
