@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from optloc.errors import NoSolution
+from optloc.errors import InvalidProblem, NoSolution
 from optloc.frames import Frame
 from optloc.layout import Layout
 from optloc.status import Certificate, Status
@@ -151,7 +151,7 @@ class Fix:
         """Return the covariance (..., q, q) of a named shared part."""
         slot, shared = self.layout.find(name)
         if not shared:
-            raise NotImplementedError(f"{name} is local to each epoch; solve problem.by_epoch() for its covariance")
+            raise InvalidProblem(f"{name} is local to each epoch", name, "solve by_epoch(problem) for its covariance")
         part = slice(slot.start, slot.start + slot.size)
         return self.cov[..., part, part]
 

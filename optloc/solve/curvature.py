@@ -65,13 +65,11 @@ def _multipliers(problem: Problem, face: Face, x: Array, vector: Array) -> Array
     _, gradients = levels(problem, face, x)
     names = face_names(problem, face)
     out = np.empty(len(x), dtype=object)
-    answered = np.isfinite(gradients).all((-1, -2)) & np.isfinite(vector).all(-1)
     for i in range(len(x)):
-        if not (np.isfinite(gradients[i]).all() and np.isfinite(vector[i]).all()):
-            out[i] = ()
-            continue
-        values = np.linalg.lstsq(gradients[i].T, 2.0 * vector[i], rcond=None)[0] if answered[i] else ()
-        out[i] = tuple(Active(name, float(value)) for name, value in zip(names, values, strict=bool(answered[i])))
+        out[i] = ()
+        if np.isfinite(gradients[i]).all() and np.isfinite(vector[i]).all():
+            values = np.linalg.lstsq(gradients[i].T, 2.0 * vector[i], rcond=None)[0]
+            out[i] = tuple(Active(name, float(value)) for name, value in zip(names, values, strict=True))
     return out
 
 

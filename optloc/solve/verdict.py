@@ -111,7 +111,7 @@ def _sorted(pool: Candidates) -> Candidates:
 
 
 def _preferred(problem: Problem, pool: Candidates) -> Array:
-    """Return the slot to answer with: the cheapest, or of finished ones that cost the same the one with the best sight."""
+    """Return the slot to answer with: the cheapest, or of finished ones that cost the same that with the best sight."""
     finished, lowest_cost = pool.code == Status.OK, pool.cost[:, :1]
     with np.errstate(invalid="ignore"):
         near = finished & (pool.cost <= lowest_cost + 1e-6 * (1.0 + np.abs(lowest_cost)))
@@ -176,8 +176,10 @@ def degrees_of_freedom(problem: Problem) -> Array:
     )
     layout = problem.layout
     unknowns = sum(slot.size for slot in layout.shared if slot.name not in known)
-    heard = [bool((problem.epoch == k).any()) for k in range(problem.epochs)]
-    unknowns += sum(heard) * sum(slot.size for slot in layout.local if slot.name not in known)
+    heard = np.zeros((*problem.batch_shape, problem.epochs), dtype=bool)
+    for k in range(problem.epochs):
+        heard[..., k] = (problem.weight[..., problem.epoch == k] > 0.0).any(-1)
+    unknowns = unknowns + heard.sum(-1) * sum(slot.size for slot in layout.local if slot.name not in known)
     return np.broadcast_to(rank - unknowns + len(exact(problem)), problem.batch_shape).astype(np.int32)
 
 
@@ -195,7 +197,10 @@ def _explain(problem: Problem, fix: Fix, curvature: Curvature) -> None:
     missing = ~np.isfinite(fix.cost) & ~broken & ~few
     answered = ~(broken | few | missing)
     weak = answered & ~(curvature.regular & (curvature.weakest >= _WEAK))
-    far = answered & ~weak & (fix.code != Status.OK) & (_distance(problem, fix) > _FAR)
+    distance = _distance(problem, fix)
+    with np.errstate(invalid="ignore"):
+        far = answered & (weak | (fix.code != Status.OK)) & (distance > _FAR)
+    weak &= ~far
     fix.code[broken], fix.code[few], fix.code[far] = Status.REJECTED, Status.TOO_FEW_ROWS, Status.UNBOUNDED
     fix.code[weak] = Status.SINGULAR_GEOMETRY
     gap = np.min(fix.alternatives.gap, axis=1, initial=np.inf)
@@ -208,6 +213,8 @@ def _explain(problem: Problem, fix: Fix, curvature: Curvature) -> None:
         lacking = -int(fix.dof[i])
         some = "is 1 measurement" if lacking == 1 else f"are {lacking} measurements"
         fix.reason[i] = f"there {some} fewer than unknowns"
+    for i in np.flatnonzero(answered & np.isin(fix.code, (Status.UNBOUNDED, Status.MAX_ITERATIONS, Status.STALLED))):
+        fix.reason[i] = f"the refinement stopped {distance[i]:.3g} spreads of the stations away"
     for i in np.flatnonzero(weak):
         fix.reason[i] = weak_direction(problem, curvature.information[i])
     for i in np.flatnonzero(fix.code == Status.AMBIGUOUS):
@@ -224,7 +231,7 @@ def _explain(problem: Problem, fix: Fix, curvature: Curvature) -> None:
         _explain_missing(problem, fix, np.flatnonzero(missing))
     unsure = ~np.isin(fix.code, (Status.OK, Status.AMBIGUOUS))
     fix.certificate[unsure] = _UNKNOWN
-    gone = broken | few | missing | barred | weak
+    gone = broken | few | missing | barred | weak | far
     fix.x[gone] = np.nan
     fix.cov[gone] = np.nan
 

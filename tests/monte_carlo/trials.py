@@ -124,6 +124,7 @@ def outcome(run: Trials, fix: Fix) -> Outcome:
     listed = ~reached & (fix.code == Status.AMBIGUOUS) & (others <= run.best.cost + slack)
     # An infimum at infinity is approached, never attained: a finite fix below it is the better point.
     endless = run.best.at_infinity & ~(answered & (cost <= run.best.infimum + slack))
+    reached, listed = reached & ~endless, listed & ~endless
     missed = ~(reached | listed | endless)
     return Outcome(
         len(cost),
