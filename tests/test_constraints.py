@@ -187,7 +187,7 @@ def test_a_region_that_cannot_be_reached_is_infeasible_and_leaves_the_others_alo
 
 
 def test_a_height_outside_the_box_is_infeasible():
-    floor, ceiling = (-np.inf, -np.inf, -500.0), (np.inf, np.inf, 0.0)
+    floor, ceiling = (-50e3, -50e3, -500.0), (50e3, 50e3, 0.0)  # farther out the Earth curves away below the box
     problem, _ = drawn(SPACE, np.array([2e3, 2e3, 900.0]), np.random.default_rng(1), frame=ENU)
     fix = solve(replace(problem, constraints=(*box(floor, ceiling), *height(exactly=2e3))))
     assert (fix.status, fix.active[()]) == (Status.INFEASIBLE, ())
