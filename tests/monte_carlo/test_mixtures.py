@@ -9,7 +9,17 @@ from monte_carlo.tables import ledger
 from optloc import Status, solve
 
 DEFAULT, FULL = 60, 1000
-HEADER = ["mixture", "global minimum", "listed", "said so", "missed silently", "at infinity", "ambiguous"]
+HEADER = [
+    "mixture",
+    "global minimum",
+    "listed",
+    "said so",
+    "missed silently",
+    "at infinity",
+    "behind the Earth",
+    "ambiguous",
+]
+HORIZON = 1.5e6  # the chord to such a distance passes 45 km below ground
 NAMES = list(MIXTURES)
 
 
@@ -20,7 +30,10 @@ def book():
 
 
 def counted(name: str, count: int) -> list[int]:
-    """Return how many reached the minimum, list it, say they lack it, miss it silently, have none, are ambiguous."""
+    """Return how many reached the minimum, list it, say they lack it, miss it silently, and so on as in the header.
+
+    Where the best minimum of the formulas lies so far that the Earth is in between, the package drops it on purpose.
+    """
     model, truth, z, problem, search = drawn(name, count)
     best = global_minimum(model, z, truth, search)
     fix = solve(problem)
@@ -31,17 +44,18 @@ def counted(name: str, count: int) -> list[int]:
     others = model.cost(fix.alternatives.x, z).min(1, initial=np.inf)
     listed = ~reached & (fix.code == Status.AMBIGUOUS) & (others <= best.cost + slack)
     endless &= ~reached & ~listed & ~answered
-    rest = ~(reached | listed | endless)
-    parts = (reached, listed, rest & ~answered, rest & answered, endless, fix.code == Status.AMBIGUOUS)
+    hidden = ~reached & ~listed & ~endless & (np.linalg.norm(best.x, axis=1) > HORIZON)
+    rest = ~(reached | listed | endless | hidden)
+    parts = (reached, listed, rest & ~answered, rest & answered, endless, hidden, fix.code == Status.AMBIGUOUS)
     return [int(part.sum()) for part in parts]
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_mixture_reaches_its_global_minimum(name, record_property):
-    reached, listed, declined, silent, endless, _ = counted(name, DEFAULT)
+    reached, listed, declined, silent, endless, hidden, _ = counted(name, DEFAULT)
     record_property("reached", f"{reached} of {DEFAULT}")
     assert silent == 0
-    assert reached + listed + endless >= 0.98 * DEFAULT, (reached, listed, declined, endless)
+    assert reached + listed + endless + hidden >= 0.98 * DEFAULT, (reached, listed, declined, endless)
 
 
 @pytest.mark.full
@@ -49,6 +63,6 @@ def test_a_mixture_reaches_its_global_minimum(name, record_property):
 def test_a_mixture_reaches_its_global_minimum_in_full(name, book):
     counts = counted(name, FULL)
     book.add(name, *(f"{n} of {FULL}" if i == 0 else n for i, n in enumerate(counts)))
-    reached, _, _, silent, endless, _ = counts
+    reached, _, _, silent, endless, hidden, _ = counts
     assert silent <= 0.001 * FULL
-    assert reached >= 0.995 * (FULL - endless)
+    assert reached >= 0.995 * (FULL - endless - hidden)
