@@ -119,9 +119,7 @@ def _built(kind: str, quadric: Quadric, backend: str) -> Relaxation:
     return Relaxation(problem, backend=backend, settings=tight)
 
 
-def shor(
-    B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL", bound: bool = True
-) -> Relaxed:
+def shor(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL", bound: bool = True) -> Relaxed:
     """Solve the semidefinite relaxation.
 
     Parameters
@@ -157,9 +155,7 @@ def shor(
     return Relaxed(lift[:n, n].copy(), answer.primal * scale**2, answer.bound * scale**2, ratio, answer)
 
 
-def hull(
-    B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL", bound: bool = True
-) -> Relaxed:
+def hull(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL", bound: bool = True) -> Relaxed:
     """Solve the second-order cone relaxation.
 
     Parameters

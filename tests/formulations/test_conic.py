@@ -1,6 +1,5 @@
 """Canonicalised-once conic problems: equal to cvxpy, honest bounds, and the relaxations of squared ranges."""
 
-
 import cvxpy as cp
 import numpy as np
 import pytest
