@@ -23,7 +23,7 @@ from optloc.solve.reduce import ranges
 from optloc.solve.refine import equations_at, refine
 from optloc.solve.search import PLACES, searched_starts
 from optloc.solve.squared import Pick, every, hull, minimum, shor
-from optloc.solve.start import mirrored, squared_range_starts, static, subarray_starts, vectors
+from optloc.solve.start import along_the_valley, mirrored, squared_range_starts, static, subarray_starts, vectors
 from optloc.solve.verdict import DOUBT, Candidates, degrees_of_freedom, judge
 from optloc.status import Certificate, Status
 from optloc.types import Array
@@ -31,6 +31,7 @@ from optloc.types import Array
 Solver = Callable[[Problem, Fix | None], Fix]
 
 _TIGHT = 1e-3
+_WEAK = 1e-2
 
 
 def gtrs(problem: Problem, fix: Fix | None) -> Fix:
@@ -129,18 +130,38 @@ def widen(problem: Problem, fix: Fix | None) -> Fix:
     began = perf_counter()
     alone = static(problem)
     seen = _positions(problem, fix)
-    parts = [seen, mirrored(alone, seen[:, :1])]
-    doubtful = np.flatnonzero((fix.code != Status.OK) | (fix.p_value < DOUBT))
-    if len(doubtful):
-        extra = subarray_starts(alone.take(doubtful))
-        more = np.full((len(fix.x), 2 * extra.shape[1], problem.dimension), np.nan)
-        more[doubtful] = np.concatenate([extra, mirrored(alone.take(doubtful), extra)], axis=1)
-        parts.append(more)
-    return _unrefined(problem, _fresh(problem, fix, parts[0], np.concatenate(parts[1:], axis=1)), fix, "widen", began)
+    parts = [mirrored(alone, seen[:, :1])]
+    unsettled = (fix.code != Status.OK) | (fix.p_value < DOUBT)
+    valley = np.flatnonzero(unsettled | _weak(problem, fix))
+    for items, more in (
+        (np.flatnonzero(unsettled), _subarrays),
+        (valley, lambda part, at: along_the_valley(part, at.position, at.covariance())),
+    ):
+        if len(items):
+            found = more(alone.take(items), fix[items])
+            spread = np.full((len(fix.x), *found.shape[1:]), np.nan)
+            spread[items] = found
+            parts.append(spread)
+    fresh = vectors(problem, _fresh(problem, fix, seen, np.concatenate(parts, axis=1)))
+    return _assembled(problem, _packed(np.concatenate([pooled(fix)[0], fresh], axis=1)), fix, "widen", began)
+
+
+def _subarrays(problem: Problem, fix: Fix) -> Array:
+    found = subarray_starts(problem)
+    return np.concatenate([found, mirrored(problem, found)], axis=1)
+
+
+def _weak(problem: Problem, fix: Fix) -> Array:
+    """Return which fixes have an error of more than a hundredth of their distance from the stations, (N,)."""
+    stations = problem.stations.position
+    centre = stations.reshape(*stations.shape[:-3], -1, stations.shape[-1]).mean(-2)
+    with np.errstate(invalid="ignore"):
+        spread = np.sqrt(np.trace(fix.covariance(), axis1=-2, axis2=-1))
+        return np.asarray(~(spread < _WEAK * np.sqrt(((fix.position - centre) ** 2).sum(-1))))
 
 
 def _fresh(problem: Problem, fix: Fix, seen: Array, more: Array) -> Array:
-    """Return the positions seen and those of the others that are not within one standard deviation of them."""
+    """Return those of more positions that are not within one standard deviation of those seen; the others are NaN."""
     covariance = fix.covariance()
     usable = np.asarray(np.isfinite(covariance).all((-1, -2)))
     information, ok = linalg.inverse(np.where(usable[:, None, None], covariance, np.eye(problem.dimension)))
@@ -149,8 +170,7 @@ def _fresh(problem: Problem, fix: Fix, seen: Array, more: Array) -> Array:
         apart = more - point[:, None]
         with np.errstate(invalid="ignore"):
             near |= ((apart @ information) * apart).sum(-1) < 1.0
-    more = np.where((near & (usable & ok)[:, None])[..., None], np.nan, more)
-    return np.concatenate([seen, more], axis=1)
+    return np.where((near & (usable & ok)[:, None])[..., None], np.nan, more)
 
 
 def search(problem: Problem, fix: Fix | None) -> Fix:
@@ -228,12 +248,17 @@ def _positions(problem: Problem, fix: Fix) -> Array:
 
 
 def _unrefined(problem: Problem, position: Array, fix: Fix | None, name: str, began: float) -> Fix:
-    if position.shape[1] > 1:
-        finite = np.isfinite(position).all(-1)
-        order = np.argsort(~finite, axis=1, kind="stable")
-        keep = max(1, int(finite.sum(1).max(initial=0)))
-        position = np.take_along_axis(position, order[..., None], axis=1)[:, :keep]
-    return _assembled(problem, vectors(problem, position), fix, name, began)
+    return _assembled(problem, vectors(problem, _packed(position)), fix, name, began)
+
+
+def _packed(points: Array) -> Array:
+    """Return points (N, q, n) with the finite ones of each problem first, and no more slots than needed."""
+    if points.shape[1] <= 1:
+        return points
+    finite = np.isfinite(points).all(-1)
+    order = np.argsort(~finite, axis=1, kind="stable")
+    keep = max(1, int(finite.sum(1).max(initial=0)))
+    return np.take_along_axis(points, order[..., None], axis=1)[:, :keep]
 
 
 def _assembled(problem: Problem, x: Array, fix: Fix | None, name: str, began: float) -> Fix:

@@ -6,11 +6,18 @@ from dataclasses import replace
 
 import numpy as np
 
+from optloc.layout import emission_name
+from optloc.linear import predict
 from optloc.models import MODELS
 from optloc.problem import Problem
 from optloc.solve.reduce import ranges
 from optloc.solve.squared import Pick, candidates, every
+from optloc.states import columns, plans
 from optloc.types import Array
+
+_RADIAL = np.array([0.25, 0.45, 0.7, 1.5, 2.5, 4.0, 8.0])
+_FAR = np.array([3.0, 30.0])
+_STEPS = np.array([-12.0, -6.0, -3.0, -1.5, 1.5, 3.0, 6.0, 12.0])
 
 
 def squared_range_starts(problem: Problem, pick: Pick) -> Array:
@@ -46,6 +53,37 @@ def mirrored(problem: Problem, position: Array) -> Array:
     shape = (-1, *(1,) * (position.ndim - 2), position.shape[-1])
     across, middle = normal.reshape(shape), centre.reshape(shape)
     return np.asarray(position - 2.0 * ((position - middle) * across).sum(-1, keepdims=True) * across)
+
+
+def along_the_valley(problem: Problem, position: Array, covariance: Array) -> Array:
+    """Return points (N, q, d) where other minima hide beside a badly determined fix.
+
+    Far emitters have a long valley towards the stations, flat networks one across their plane: other minima lie along
+    the line to the stations' centre, or along the longest axis of the error ellipsoid.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    position : array (N, d)
+        Fixes, metres.
+    covariance : array (N, d, d)
+        Of the fixes; where it is not finite there are no steps along its axis.
+    """
+    stations = problem.stations.position
+    places = stations.reshape(*stations.shape[:-3], -1, stations.shape[-1])
+    centre = places.mean(-2)
+    size = np.sqrt(((places - centre[..., None, :]) ** 2).sum(-1)).max(-1)
+    away = position - centre
+    length = np.sqrt((away**2).sum(-1, keepdims=True))
+    ahead = away / np.where(length > 0.0, length, 1.0)
+    scaled = centre[..., None, :] + _RADIAL[:, None] * away[:, None]
+    far = centre[..., None, :] + _FAR[:, None] * (np.broadcast_to(size, (len(away),))[:, None] * ahead)[:, None]
+    known = np.asarray(np.isfinite(covariance).all((-1, -2)))
+    values, vectors = np.linalg.eigh(np.where(known[:, None, None], covariance, 0.0))
+    longest = np.sqrt(np.maximum(values[:, -1:], 0.0)) * vectors[..., -1]
+    stepped = position[:, None] + _STEPS[:, None] * np.where(known[:, None], longest, np.nan)[:, None]
+    return np.concatenate([scaled, far, stepped], axis=1)
 
 
 def subarray_starts(problem: Problem) -> Array:
@@ -91,7 +129,31 @@ def vectors(problem: Problem, position: Array | None) -> Array:
     if position is not None:
         slot, _ = layout.find("position")
         x[..., slot.start : slot.start + slot.size] = position
+        x = _emitted(problem, x) if problem.emitting else x
     return x
+
+
+def _emitted(problem: Problem, x: Array) -> Array:
+    """Return vectors (N, q, size) with the emission times that fit their positions: the mean of what is left over."""
+    size, q = x.shape[:2]
+    part, out = problem.take(np.repeat(np.arange(size), q)), x.reshape(size * q, -1).copy()
+    usable = np.asarray(np.isfinite(out).all(-1))
+    left = part.observed - predict(part, np.where(usable[:, None], out, 0.0))
+    present, emissions = np.broadcast_to(part.weight > 0.0, left.shape), emission_columns(problem)
+    for plan, start in zip(plans(problem), problem.starts, strict=True):
+        own = emissions[np.isin(emissions, plan.adds.column)] if plan.model.emission else ()
+        for column in own:
+            rows = start + plan.adds.row[plan.adds.column == column]
+            heard = present[:, rows]
+            mean = np.where(heard, left[:, rows], 0.0).sum(1) / np.maximum(heard.sum(1), 1)
+            out[:, column] += np.where(usable, mean, 0.0)
+    return out.reshape(size, q, -1)
+
+
+def emission_columns(problem: Problem) -> Array:
+    """Return the columns of all emission times in the full parameter vector."""
+    names = [emission_name(target, len(problem.motions)) for target in problem.emitting]
+    return np.concatenate([columns(problem.layout, name, np.arange(problem.epochs)).ravel() for name in names])
 
 
 def static(problem: Problem) -> Problem:

@@ -199,7 +199,8 @@ def _explain(problem: Problem, fix: Fix, curvature: Curvature) -> None:
     weak = answered & ~(curvature.regular & (curvature.weakest >= _WEAK))
     distance = _distance(problem, fix)
     with np.errstate(invalid="ignore"):
-        far = answered & (weak | (fix.code != Status.OK)) & (distance > _FAR)
+        loose = np.trace(fix.cov, axis1=-2, axis2=-1) > (distance * _spread(problem)) ** 2
+        far = answered & (weak | loose | (fix.code != Status.OK)) & (distance > _FAR)
     weak &= ~far
     fix.code[broken], fix.code[few], fix.code[far] = Status.REJECTED, Status.TOO_FEW_ROWS, Status.UNBOUNDED
     fix.code[weak] = Status.SINGULAR_GEOMETRY
@@ -254,11 +255,16 @@ def _explain_missing(problem: Problem, fix: Fix, items: Array) -> None:
             fix.reason[i] = station_direction(problem.take(np.array([i])))
 
 
+def _spread(problem: Problem) -> Array:
+    """Return the greatest distance of a station from their centre, metres, (N,) or ()."""
+    stations = problem.stations.position.reshape(*problem.stations.position.shape[:-3], -1, problem.dimension)
+    spread = np.linalg.norm(stations - stations.mean(-2, keepdims=True), axis=-1).max(-1)
+    return np.where(spread > 0.0, spread, 1.0)
+
+
 def _distance(problem: Problem, fix: Fix) -> Array:
     """Return how far a fix is from the stations, in units of their spread."""
     if not any(slot.name == "position" for slot in problem.layout.shared):
         return np.zeros(len(fix.x))
     stations = problem.stations.position.reshape(*problem.stations.position.shape[:-3], -1, problem.dimension)
-    centre = stations.mean(-2)
-    spread = np.linalg.norm(stations - centre[..., None, :], axis=-1).max(-1)
-    return np.asarray(np.linalg.norm(fix.position - centre, axis=-1) / np.where(spread > 0.0, spread, 1.0))
+    return np.asarray(np.linalg.norm(fix.position - stations.mean(-2), axis=-1) / _spread(problem))
