@@ -24,7 +24,8 @@ DOUBT = 1e-3
 _SAME = 1e-2
 _EQUAL = 1e-3
 _WEAK = 1e-12
-_FAR = 1e4
+# Spreads of the stations: from here on a fix must be a good one, and from there on every wave front is flat.
+_FAR, _FLAT = 1e4, 1e6
 
 _LOCAL = Certificate(
     "local",
@@ -200,7 +201,8 @@ def _explain(problem: Problem, fix: Fix, curvature: Curvature) -> None:
     distance = _distance(problem, fix)
     with np.errstate(invalid="ignore"):
         loose = np.trace(fix.cov, axis1=-2, axis2=-1) > (distance * _spread(problem)) ** 2
-        far = answered & (weak | loose | (fix.code != Status.OK)) & (distance > _FAR)
+        lost = weak | loose | (fix.code != Status.OK) | (fix.p_value < DOUBT)
+        far = answered & ((lost & (distance > _FAR)) | (distance > _FLAT))
     weak &= ~far
     fix.code[broken], fix.code[few], fix.code[far] = Status.REJECTED, Status.TOO_FEW_ROWS, Status.UNBOUNDED
     fix.code[weak] = Status.SINGULAR_GEOMETRY
@@ -267,4 +269,5 @@ def _distance(problem: Problem, fix: Fix) -> Array:
     if not any(slot.name == "position" for slot in problem.layout.shared):
         return np.zeros(len(fix.x))
     stations = problem.stations.position.reshape(*problem.stations.position.shape[:-3], -1, problem.dimension)
-    return np.asarray(np.linalg.norm(fix.position - stations.mean(-2), axis=-1) / _spread(problem))
+    with np.errstate(over="ignore"):
+        return np.asarray(np.linalg.norm(fix.position - stations.mean(-2), axis=-1) / _spread(problem))
