@@ -7,7 +7,7 @@ import numpy as np
 from formulations.bistatic import course, triad
 from optloc.noise import variances
 from optloc.problem import Problem
-from optloc.solve.scale import length_scale
+from optloc.solve.scale import spread_of
 from optloc.states import elapsed
 from optloc.types import Array, Rows
 
@@ -39,7 +39,7 @@ def course_starts(problem: Problem) -> Array | None:
         sigma[kind][:, rows.epoch] = np.where(rows.weight > 0.0, own, np.inf)
     place = np.broadcast_to(problem.stations.position, (size, *problem.stations.position.shape[-3:]))[:, 0]
     home, away = place[:, receiver], place[:, illuminator] - place[:, receiver]
-    length = length_scale(problem.take(np.arange(1)))[1]
+    length = float(spread_of(problem)[1][0])
     axes = triad(value[0], value[1])
     if problem.stations.axes is not None:
         own = np.broadcast_to(problem.stations.axes, (size, *problem.stations.axes.shape[-4:]))[:, 0, receiver]

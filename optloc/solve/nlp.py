@@ -17,7 +17,7 @@ from optloc.normal import decrement, prior_parts, step
 from optloc.problem import Problem
 from optloc.solve.bounded import without_broken
 from optloc.solve.refine import equations_at
-from optloc.solve.scale import length_scale
+from optloc.solve.scale import spread_of
 from optloc.solve.stages import finished, pooled
 from optloc.solve.verdict import Candidates
 from optloc.status import Status
@@ -84,7 +84,7 @@ class _Scaled:
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
-        shift, size = length_scale(problem)
+        shift, size = (value[0] for value in spread_of(problem))
         layout = problem.layout
         unit = np.concatenate(
             [_slot_units(layout.shared, size), np.tile(_slot_units(layout.local, size), layout.epochs)]

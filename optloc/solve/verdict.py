@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from optloc.noise import whiten
 from optloc.problem import Problem
 from optloc.solve.curvature import Curvature, curved, station_direction, weak_direction
 from optloc.solve.reduce import ranges
+from optloc.solve.scale import distance_of, spread_of
 from optloc.solve.sight import lowest
 from optloc.status import Certificate, Status
 from optloc.types import Array
@@ -72,6 +73,7 @@ def judge(problem: Problem, pool: Candidates, equations: Any, stages: tuple[Stag
         What was done so far.
     """
     size = len(pool.x)
+    pool, endless = _finite(problem, pool)
     pool = _sorted(pool)
     best = _preferred(problem, pool)
     rows = np.arange(size)
@@ -99,7 +101,27 @@ def judge(problem: Problem, pool: Candidates, equations: Any, stages: tuple[Stag
         curvature.active,
     )
     _explain(problem, fix, curvature)
+    rivalled = endless & (fix.code == Status.OK)
+    fix.code[rivalled], fix.reason[rivalled] = Status.AMBIGUOUS, "positions ever farther away explain the data as well"
     return fix
+
+
+def _finite(problem: Problem, pool: Candidates) -> tuple[Candidates, Array]:
+    """Return the pool without runs to infinity where a finite minimum rivals them, and where that was so, (N,)."""
+    none = np.zeros(len(pool.x), dtype=bool)
+    if not any(slot.name == "position" for slot in problem.layout.shared):
+        return pool, none
+    distance = distance_of(problem, problem.layout.take(pool.x, "position"))
+    with np.errstate(invalid="ignore"):
+        remote = (distance > _FLAT) | ((distance > _FAR) & (pool.code != Status.OK))
+    if not remote.any():
+        return pool, none
+    near = np.where(~remote & (pool.code == Status.OK), pool.cost, np.inf).min(1)
+    far = np.where(remote, pool.cost, np.inf).min(1)
+    with np.errstate(invalid="ignore"):
+        rivals = np.isfinite(near) & (near - far <= AMBIGUOUS_GAP)
+        alike = rivals & (far - near < AMBIGUOUS_GAP)
+    return replace(pool, cost=np.where(remote & rivals[:, None], np.inf, pool.cost)), alike
 
 
 def _sorted(pool: Candidates) -> Candidates:
@@ -198,9 +220,9 @@ def _explain(problem: Problem, fix: Fix, curvature: Curvature) -> None:
     missing = ~np.isfinite(fix.cost) & ~broken & ~few
     answered = ~(broken | few | missing)
     weak = answered & ~(curvature.regular & (curvature.weakest >= _WEAK))
-    distance = _distance(problem, fix)
+    distance = distance_of(problem, _position(problem, fix))
     with np.errstate(invalid="ignore"):
-        loose = np.trace(fix.cov, axis1=-2, axis2=-1) > (distance * _spread(problem)) ** 2
+        loose = np.trace(fix.cov, axis1=-2, axis2=-1) > (distance * spread_of(problem)[1]) ** 2
         lost = weak | loose | (fix.code != Status.OK) | (fix.p_value < DOUBT)
         far = answered & ((lost & (distance > _FAR)) | (distance > _FLAT))
     weak &= ~far
@@ -257,17 +279,8 @@ def _explain_missing(problem: Problem, fix: Fix, items: Array) -> None:
             fix.reason[i] = station_direction(problem.take(np.array([i])))
 
 
-def _spread(problem: Problem) -> Array:
-    """Return the greatest distance of a station from their centre, metres, (N,) or ()."""
-    stations = problem.stations.position.reshape(*problem.stations.position.shape[:-3], -1, problem.dimension)
-    spread = np.linalg.norm(stations - stations.mean(-2, keepdims=True), axis=-1).max(-1)
-    return np.where(spread > 0.0, spread, 1.0)
-
-
-def _distance(problem: Problem, fix: Fix) -> Array:
-    """Return how far a fix is from the stations, in units of their spread."""
-    if not any(slot.name == "position" for slot in problem.layout.shared):
-        return np.zeros(len(fix.x))
-    stations = problem.stations.position.reshape(*problem.stations.position.shape[:-3], -1, problem.dimension)
-    with np.errstate(over="ignore"):
-        return np.asarray(np.linalg.norm(fix.position - stations.mean(-2), axis=-1) / _spread(problem))
+def _position(problem: Problem, fix: Fix) -> Array:
+    """Return the position (N, d) of the only target, or the centre of the stations where there is no such thing."""
+    if any(slot.name == "position" for slot in problem.layout.shared):
+        return fix.position
+    return np.broadcast_to(spread_of(problem)[0], (len(fix.x), problem.dimension))
