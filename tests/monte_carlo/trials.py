@@ -126,6 +126,8 @@ def outcome(run: Trials, fix: Fix) -> Outcome:
     endless = run.best.at_infinity & ~(answered & (cost <= run.best.infimum + slack))
     reached, listed = reached & ~endless, listed & ~endless
     missed = ~(reached | listed | endless)
+    # An ambiguous fix says that infinity rivals it.
+    claimed = endless & np.isin(fix.code, (Status.OK, Status.SEARCHED))
     return Outcome(
         len(cost),
         reached,
@@ -133,6 +135,6 @@ def outcome(run: Trials, fix: Fix) -> Outcome:
         missed & ~answered,
         missed & answered,
         answered & ~endless & (cost + slack < run.best.cost),
-        endless & ~answered,
-        endless & answered,
+        endless & ~claimed,
+        claimed,
     )
