@@ -10,7 +10,7 @@ from formulations.ellipsoid import Ellipsoid, ellipsoid
 from formulations.range_height import locate, locate_by_ranges
 from optloc.models.primitives import WGS84_A, WGS84_F
 from optloc.problem import Problem
-from optloc.solve.reduce import Ranges
+from optloc.solve.reduce import Ranges, ranges
 from optloc.types import Array, Band
 
 _SUBSETS = 6
@@ -34,15 +34,13 @@ def known_height(problem: Problem) -> Array | None:
     return None
 
 
-def height_starts(problem: Problem, found: Ranges | None, *, relax: bool = False) -> Array:
+def height_starts(problem: Problem, *, relax: bool = False) -> Array:
     """Return candidate positions (N, q, 3) of a flat batch from a known height and its best-placed stations.
 
     Parameters
     ----------
     problem : Problem
         N problems with one static target.
-    found : Ranges, optional
-        Their least-squares ranges.
     relax : bool
         True: the answer of the reduced semidefinite relaxation in the place of the quartic's roots, one by one.
 
@@ -52,7 +50,8 @@ def height_starts(problem: Problem, found: Ranges | None, *, relax: bool = False
         Metres; NaN where there is none, q = 0 where no height is known.
     """
     size = problem.batch_shape[0]
-    height = known_height(problem) if found is not None and problem.frame.geodetic and problem.dimension == 3 else None
+    height = known_height(problem) if problem.frame.geodetic and problem.dimension == 3 else None
+    found = None if height is None else ranges(problem)
     if height is None or found is None:
         return np.full((size, 0, problem.dimension), np.nan)
     position = np.broadcast_to(problem.stations.position, (size, *problem.stations.position.shape[-3:]))

@@ -19,7 +19,6 @@ from optloc.solve.angles import Bearings, angle_bounds, bearings, by_directions,
 from optloc.solve.bounded import bounded
 from optloc.solve.heights import height_starts
 from optloc.solve.pieces import from_pieces, one_position
-from optloc.solve.reduce import ranges
 from optloc.solve.refine import equations_at, refine
 from optloc.solve.search import PLACES, searched_starts
 from optloc.solve.squared import Pick, every, hull, minimum, shor
@@ -114,7 +113,7 @@ def _squared(problem: Problem, fix: Fix | None, name: str, pick: Pick) -> Fix:
     began = perf_counter()
     if one_position(problem):
         alone = static(problem)
-        heights = height_starts(alone, ranges(alone), relax=pick is shor)
+        heights = height_starts(alone, relax=pick is shor)
         position = np.concatenate([squared_range_starts(alone, pick), heights], axis=1)
         return _unrefined(problem, position, fix, name, began)
     x = from_pieces(problem, lambda piece: lsr(piece, _squared(piece, None, name, pick)))

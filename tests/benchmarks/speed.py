@@ -33,7 +33,8 @@ def batch(scene: str) -> tuple[Problem, Array, Array, Array]:
     exact = model(kind, stations, SIGMA).exact(truth)
     root = np.linalg.cholesky(kind.covariance(STATIONS - 1, SIGMA))
     z = exact + rng.standard_normal(exact.shape) @ root.T
-    return kind.problem(stations, z, SIGMA), stations, z, truth
+    shared = stations[:1] if scene == SCENES[0] else stations
+    return kind.problem(shared, z, SIGMA), stations, z, truth
 
 
 @cache
