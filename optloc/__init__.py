@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from optloc.bias import with_bias
 from optloc.bounds import crlb
 from optloc.build import assemble, measured, station_array
 from optloc.epochs import by_epoch
@@ -11,7 +12,8 @@ from optloc.errors import InvalidProblem, NoSolution, OptlocError
 from optloc.fix import Alternatives, Fix, Stage
 from optloc.frames import CARTESIAN, ECEF, Frame
 from optloc.layout import Layout
-from optloc.linear import Linear, linearise, predict
+from optloc.evaluate import predict
+from optloc.linear import Linear, linearise
 from optloc.models import MODELS, Model
 from optloc.noise import Noise
 from optloc.normal import Normal, normal
@@ -64,6 +66,7 @@ __all__ = [
     "simulate",
     "solve",
     "station_array",
+    "with_bias",
 ]
 
 

@@ -90,8 +90,8 @@ def _check_stations(problem: Problem) -> None:
                 f"the covariance of their errors has shape {stations.covariance.shape}", "stations", f"give {shape}"
             )
         _check_covariance(stations.covariance, "position error of station", stations.names)
-    if stations.span not in ("epoch", "run"):
-        raise InvalidProblem(f"unknown span {stations.span!r} of position errors", "stations", "use 'epoch' or 'run'")
+    if stations.span not in ("epoch", "run", "noise"):
+        raise InvalidProblem(f"unknown span {stations.span!r} of position errors", "stations", "use epoch, run or noise")
 
 
 def _check_moving(problem: Problem) -> None:

@@ -68,6 +68,14 @@ class Alternatives:
     x: Array
     gap: Array
 
+    @property
+    def doubt(self) -> Array:
+        """Return the probability (..., q) that an alternative is the right one, if it is this one or the fix.
+
+        Each is as likely before the measurement, and the data then weigh them by exp(-cost / 2).
+        """
+        return np.asarray(1.0 / (1.0 + np.exp(np.minimum(0.5 * self.gap, 700.0)))) * np.isfinite(self.gap)
+
 
 @dataclass(frozen=True, slots=True)
 class Fix:
@@ -146,6 +154,10 @@ class Fix:
         """Return the estimates of everything that is not the state of a target, by name."""
         names = (slot.name for slot in (*self.layout.shared, *self.layout.local))
         return {name: self.take(name) for name in names if name.partition("[")[0] not in _STATES}
+
+    def members(self, name: str) -> tuple[str, ...]:
+        """Return what the entries of a named part are called, for instance the stations of "clock"."""
+        return self.layout.find(name)[0].entries
 
     def covariance(self, name: str = "position") -> Array:
         """Return the covariance (..., q, q) of a named shared part."""

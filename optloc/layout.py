@@ -11,6 +11,7 @@ from optloc.types import Array, Bias, Motion, Stations
 _STATE = (("position", "m"), ("velocity", "m/s"), ("acceleration", "m/s^2"))
 _OWN_UNIT = {"scale": "1", "rotation": "rad"}
 _RATE = {"m/s": "m/s^2"}
+_Part = tuple[str, int, str, tuple[str, ...]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,12 +26,22 @@ class Slot:
         Place within the shared part, or within the local part of an epoch.
     unit : str
         SI unit.
+    members : tuple of str
+        Who has an equal share of it: the members of a bias, or the stations; empty for the state of a target.
     """
 
     name: str
     start: int
     size: int
     unit: str
+    members: tuple[str, ...] = ()
+
+    @property
+    def entries(self) -> tuple[str, ...]:
+        """Return what tells the entries apart: a coordinate, a member, or a member and its coordinate."""
+        per = self.size // max(len(self.members), 1)
+        axes = tuple("xyz"[:per]) if per > 1 else ("",)
+        return tuple(f"{member} {axis}".strip() for member in self.members or ("",) for axis in axes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,12 +96,8 @@ class Layout:
         return (shared if is_shared else local)[..., slot.start : slot.start + slot.size]
 
     def labels(self) -> tuple[str, ...]:
-        """Return one label for each entry of the shared part, for instance "position x"."""
-        return tuple(f"{slot.name} {_entry(slot, i)}".strip() for slot in self.shared for i in range(slot.size))
-
-
-def _entry(slot: Slot, i: int) -> str:
-    return "xyz"[i] if slot.name.partition("[")[0] in {name for name, _ in _STATE} else str(i)
+        """Return one label for each entry of the shared part, for instance "position x" or "clock B"."""
+        return tuple(f"{slot.name} {entry}".strip() for slot in self.shared for entry in slot.entries)
 
 
 def state_names(target: int, count: int, order: int) -> tuple[str, ...]:
@@ -129,22 +136,22 @@ def layout(
     bias_units : sequence of str
         SI unit of the rows that each bias touches; empty where they have several, or where it does not matter.
     """
-    shared: list[tuple[str, int, str]] = []
-    local: list[tuple[str, int, str]] = []
+    shared: list[_Part] = []
+    local: list[_Part] = []
     for i, motion in enumerate(motions):
         if motion.known is None:
             room = shared if motion.span == "run" else local
             units = (unit for _, unit in _STATE)
             names = state_names(i, len(motions), motion.order)
-            room.extend((name, stations.dimension, unit) for name, unit in zip(names, units, strict=False))
+            room.extend((name, stations.dimension, unit, ()) for name, unit in zip(names, units, strict=False))
     turns = 1 if stations.dimension == 2 else 3
     for bias, unit in zip(biases, bias_units or [""] * len(biases), strict=True):
         size = len(bias.members) * (turns if bias.form == "rotation" else 1)
-        shared.append((bias.name, size, _bias_unit(bias.form, unit)))
-    local.extend((emission_name(i, len(motions)), 1, "m") for i in emitting)
-    if stations.covariance is not None:
+        shared.append((bias.name, size, _bias_unit(bias.form, unit), bias.members))
+    local.extend((emission_name(i, len(motions)), 1, "m", ()) for i in emitting)
+    if stations.covariance is not None and stations.span != "noise":
         room = shared if stations.span == "run" else local
-        room.append(("stations", stations.count * stations.dimension, "m"))
+        room.append(("stations", stations.count * stations.dimension, "m", stations.names))
     return Layout(_slots(shared), _slots(local), epochs)
 
 
@@ -155,9 +162,9 @@ def _bias_unit(form: str, unit: str) -> str:
     return unit if form == "offset" else _RATE.get(unit, f"{unit}/s" if unit else "")
 
 
-def _slots(parts: list[tuple[str, int, str]]) -> tuple[Slot, ...]:
+def _slots(parts: list[_Part]) -> tuple[Slot, ...]:
     slots, start = [], 0
-    for name, size, unit in parts:
-        slots.append(Slot(name, start, size, unit))
+    for name, size, unit, members in parts:
+        slots.append(Slot(name, start, size, unit, members))
         start += size
     return tuple(slots)

@@ -92,12 +92,12 @@ def together(key: Array) -> list[Array]:
     return [order[first[sizes == r][:, None] + np.arange(r)] for r in np.unique(sizes)]
 
 
-def arrivals(ends: Sequence[tuple[Array, int]], variance: Array) -> Array:
+def arrivals(ends: Sequence[tuple[Array, int | Array]], variance: Array) -> Array:
     """Return the covariance of groups of rows that combine independent arrivals at stations.
 
     Parameters
     ----------
-    ends : sequence of (int array (g, r), int)
+    ends : sequence of (int array (g, r), int or int array (g, r))
         Station of each row at one end, and the sign of its arrival: 0 for none.
     variance : array (..., s)
         Variance of each station's arrival.
@@ -107,13 +107,13 @@ def arrivals(ends: Sequence[tuple[Array, int]], variance: Array) -> Array:
     array (..., g, r, r)
         Singular where the rows of a group close a loop; the whitener then uses the pseudo-inverse.
     """
-    used = [(index, sign) for index, sign in ends if sign]
-    shape = used[0][0].shape
+    used = [(index, np.broadcast_to(sign, index.shape)) for index, sign in ends if np.any(sign)]
+    shape = ends[0][0].shape
     covariance = np.zeros((*variance.shape[:-1], *shape, shape[-1]))
     for one, sign in used:
         for two, other in used:
-            shared = one[:, :, None] == two[:, None, :]
-            covariance += sign * other * np.where(shared, variance[..., one][..., None], 0.0)
+            shared = (one[:, :, None] == two[:, None, :]) * (sign[:, :, None] * other[:, None, :])
+            covariance += shared * variance[..., one][..., None]
     return covariance
 
 
@@ -168,33 +168,38 @@ def _whitener(block: Block, weight: Array) -> Whitener:
     return Whitener(block.row, linalg.whitening(covariance))
 
 
-def dense(noise: Noise, rows: Array) -> Array:
-    """Return the covariance of a few rows as one matrix.
+def gathered(noise: Noise, members: Array) -> Array:
+    """Return the covariance of groups of rows.
 
     Parameters
     ----------
     noise : Noise
         Covariance blocks.
-    rows : int array (q,)
-        Global row numbers.
+    members : int array (g, r)
+        Global row numbers; correlation with rows of other groups is left out.
 
     Returns
     -------
-    array (..., q, q)
-        Their covariance, in the given order.
+    array (..., g, r, r)
+        In the given order.
     """
-    place = {int(row): i for i, row in enumerate(rows)}
+    count = 1 + max(int(members.max()), *(int(block.row.max()) for block in noise.blocks))
+    group_of, slot = np.full(count, -1), np.zeros(count, dtype=np.int64)
+    group_of[members], slot[members] = np.arange(len(members))[:, None], np.arange(members.shape[1])
     shape = np.broadcast_shapes(*(block.covariance.shape[:-3] for block in noise.blocks))
-    matrix = np.zeros((*shape, len(rows), len(rows)))
+    out = np.zeros((*shape, *members.shape, members.shape[1]))
     for block in noise.blocks:
-        covariance = np.broadcast_to(
-            block.covariance, (*block.covariance.shape[:-3], *block.row.shape, block.row.shape[1])
-        )
-        for g, members in enumerate(block.row):
-            inside = [i for i, row in enumerate(members) if int(row) in place]
-            at = [place[int(members[i])] for i in inside]
-            matrix[..., np.ix_(at, at)[0], np.ix_(at, at)[1]] = covariance[..., g, :, :][..., inside, :][..., :, inside]
-    return matrix
+        inner = (*block.covariance.shape[:-3], *block.row.shape, block.row.shape[1])
+        one, two = np.broadcast_arrays(block.row[:, :, None], block.row[:, None, :])
+        kept = (group_of[one] >= 0) & (group_of[one] == group_of[two])
+        where = (group_of[one[kept]], slot[one[kept]], slot[two[kept]])
+        out[..., where[0], where[1], where[2]] = np.broadcast_to(block.covariance, inner)[..., kept]
+    return out
+
+
+def dense(noise: Noise, rows: Array) -> Array:
+    """Return the covariance (..., q, q) of a few rows (q,) as one matrix, in the given order."""
+    return np.asarray(gathered(noise, rows[None])[..., 0, :, :])
 
 
 def variances(noise: Noise, count: int) -> Array:

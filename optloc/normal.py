@@ -152,7 +152,7 @@ def prior_parts(problem: Problem) -> list[tuple[str, Array, Array]]:
             sigma = np.ravel(bias.sigma)
             parts.append((bias.name, np.broadcast_to(np.ravel(bias.mean), sigma.shape), np.diag(sigma**-2.0)))
     stations = problem.stations
-    if stations.covariance is not None:
+    if stations.covariance is not None and stations.span != "noise":
         precision = _block_diagonal(linalg.inverse(stations.covariance)[0])
         if stations.span == "epoch":
             precision = precision[..., None, :, :]

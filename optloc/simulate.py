@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from optloc.linear import predict
+from optloc.evaluate import predict
 from optloc.models import MODELS
 from optloc.models.primitives import wrap
 from optloc.noise import Noise
 from optloc.problem import Problem
 from optloc.types import Array
+from optloc.weigh import with_offsets
 
 
 def simulate(problem: Problem, truth: Array, seed: int | np.random.SeedSequence, trials: int | None = None) -> Problem:
@@ -18,7 +19,7 @@ def simulate(problem: Problem, truth: Array, seed: int | np.random.SeedSequence,
     Parameters
     ----------
     problem : Problem
-        Stations, rows and noise; its measurements are ignored.
+        Stations, rows and noise; its measurements are ignored. Position errors of span "noise" are drawn as well.
     truth : array (..., size)
         True parameter vectors in the order of ``problem.layout``; leading axes must fit the problem's.
     seed : int or SeedSequence
@@ -32,11 +33,12 @@ def simulate(problem: Problem, truth: Array, seed: int | np.random.SeedSequence,
         With leading axes (trials, ...), or (...).
     """
     rng = np.random.default_rng(seed)
-    exact = predict(problem, np.asarray(truth, dtype=float))
-    shape = np.broadcast_shapes(exact.shape[:-1], problem.batch_shape)
+    truth = np.asarray(truth, dtype=float)
+    shape = np.broadcast_shapes(truth.shape[:-1], problem.batch_shape)
     if trials is not None:
         shape = (trials, *shape)
-    z = exact + draw(problem.noise, problem.count, shape, rng)
+    noise = draw(problem.noise, problem.count, shape, rng)
+    z = noise + predict(*_displaced(problem, truth, shape, rng))
     values = []
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         part = z[..., start : start + rows.count]
@@ -44,12 +46,27 @@ def simulate(problem: Problem, truth: Array, seed: int | np.random.SeedSequence,
     return problem.with_rows(z=np.concatenate(values, axis=-1))
 
 
+def _displaced(
+    problem: Problem, truth: Array, shape: tuple[int, ...], rng: np.random.Generator
+) -> tuple[Problem, Array]:
+    """Return the problem with the stations where they really are, as far as their errors are noise, and its truth."""
+    stations = problem.stations
+    if stations.covariance is None or stations.span != "noise":
+        return problem, truth
+    errors = samples(stations.covariance[..., None, :, :, :], (*shape, problem.epochs, stations.count), rng)
+    return with_offsets(problem, truth, errors.reshape(*shape, problem.epochs, -1))
+
+
+def samples(covariance: Array, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
+    """Return normal samples (*shape, r) of covariances (..., r, r) whose leading axes fit the shape."""
+    values, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
+    return np.asarray((root @ rng.standard_normal((*shape, covariance.shape[-1], 1)))[..., 0])
+
+
 def draw(noise: Noise, count: int, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
     """Return noise samples (*shape, count) with the covariance of a problem's rows."""
     out = np.zeros((*shape, count))
     for block in noise.blocks:
-        values, vectors = np.linalg.eigh(block.covariance)
-        root = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
-        normal = rng.standard_normal((*shape, *block.row.shape, 1))
-        out[..., block.row] = (root @ normal)[..., 0]
+        out[..., block.row] = samples(block.covariance, (*shape, len(block.row)), rng)
     return out

@@ -2,207 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from math import factorial
 from typing import Any
 
 import numpy as np
 
 from optloc.errors import InvalidProblem
-from optloc.layout import Layout, emission_name, state_names
-from optloc.models import MODELS, Model, Point
+from optloc.models import Model, Point
 from optloc.models.jet import Jet
 from optloc.models.primitives import rotate
+from optloc.plan import AXES_A, AXES_B, RATE_A, RATE_B, TARGET, TARGET_RATE, TURN, A, B, Feed, Plan
 from optloc.problem import Problem
 from optloc.types import Array, Rows
-
-_TARGET, _TARGET_RATE, _A, _B, _RATE_A, _RATE_B, _AXES_A, _AXES_B, _TURN = (16 * i for i in range(9))
-
-
-@dataclass(frozen=True, slots=True)
-class Feed:
-    """How one unknown of each row moves a seed: ``seed += gain * x[column]``.
-
-    Parameters
-    ----------
-    seed : int
-        Which input of the measurement function.
-    column : int array (m,)
-        Column of the full parameter vector.
-    gain : float or array (m,)
-        Factor.
-    rows : slice or int array
-        Rows of the block it applies to.
-    """
-
-    seed: int
-    column: Array
-    gain: Any
-    rows: Any
-
-
-@dataclass(frozen=True, slots=True)
-class Terms:
-    """Linear terms of rows in the unknowns: each entry adds ``coefficient * x[column]`` to its row.
-
-    Parameters
-    ----------
-    row : int array (n,)
-        Row within the block; may repeat.
-    column : int array (n,)
-        Column of the full parameter vector.
-    coefficient : array (n,)
-        Factor.
-    """
-
-    row: Array
-    column: Array
-    coefficient: Array
-
-    def total(self, x: Array, count: int) -> Array:
-        """Return the sums (..., count) of every row at vectors x (..., size)."""
-        out = np.zeros((*x.shape[:-1], count))
-        np.add.at(out, (..., self.row), x[..., self.column] * self.coefficient)  # type: ignore[arg-type]
-        return out
-
-
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """The indices of one block of rows: measurement = h(fed inputs) * (1 + gains) + adds.
-
-    Parameters
-    ----------
-    block : Rows
-        The rows.
-    model : Model
-        Their kind.
-    feeds : tuple of Feed
-        Which unknowns move which inputs of h.
-    gains, adds : Terms
-        Scale factors, and offsets, drifts and emission times.
-    """
-
-    block: Rows
-    model: Model
-    feeds: tuple[Feed, ...]
-    gains: Terms
-    adds: Terms
-
-
-def columns(layout: Layout, name: str, epoch: Array) -> Array:
-    """Return the columns (m, size) of a slot in the full parameter vector for rows of given epochs."""
-    slot, shared = layout.find(name)
-    base = slot.start + (0 if shared else layout.n_shared + epoch * layout.n_local)
-    return np.broadcast_to(np.asarray(base)[..., None] + np.arange(slot.size), (len(epoch), slot.size))
-
-
-_PLANS: dict[tuple[Any, ...], tuple[Plan, ...]] = {}
-
-
-def plans(problem: Problem) -> tuple[Plan, ...]:
-    """Return the plan of each block of rows; kept for problems of equal structure."""
-    key = problem.structure
-    if key not in _PLANS:
-        if len(_PLANS) > 64:
-            _PLANS.clear()
-        _PLANS[key] = tuple(
-            _plan(problem, block, start) for block, start in zip(problem.rows, problem.starts, strict=True)
-        )
-    return _PLANS[key]
-
-
-def _plan(problem: Problem, block: Rows, start: int) -> Plan:
-    model = MODELS[block.kind]
-    if (block.target < 0).any():
-        where = f"{block.kind} row {int(np.argmax(block.target < 0))}"
-        raise InvalidProblem("the row names no target", where, "give the index of its target")
-    feeds = [*_motion_feeds(problem, block, model), *_station_feeds(problem, block, model)]
-    feeds += _turn_feeds(problem, block, start)
-    return Plan(block, model, tuple(feeds), _terms(problem, block, start, ("scale",)), _adds(problem, block, start))
-
-
-def _adds(problem: Problem, block: Rows, start: int) -> Terms:
-    parts = [_terms(problem, block, start, ("offset", "drift"))]
-    for target in problem.emitting if MODELS[block.kind].emission else ():
-        rows = np.flatnonzero(block.target == target)
-        column = columns(problem.layout, emission_name(target, len(problem.motions)), block.epoch[rows])
-        parts.append(Terms(rows, column[:, 0], np.ones(len(rows))))
-    return _appended(parts)
-
-
-def _terms(problem: Problem, block: Rows, start: int, forms: tuple[str, ...]) -> Terms:
-    parts = [Terms(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))]
-    for bias in problem.biases:
-        if bias.form not in forms:
-            continue
-        inside = (bias.row >= start) & (bias.row < start + block.count)
-        rows, member, coefficient = bias.row[inside] - start, bias.member[inside], bias.coefficient[inside]
-        if bias.form == "drift":
-            coefficient = coefficient * (problem.times - problem.times[0])[block.epoch[rows]]
-        column = columns(problem.layout, bias.name, rows)[np.arange(len(rows)), member]
-        parts.append(Terms(rows, column, coefficient))
-    return _appended(parts)
-
-
-def _appended(parts: list[Terms]) -> Terms:
-    return Terms(
-        *(np.concatenate([getattr(part, name) for part in parts]) for name in ("row", "column", "coefficient"))
-    )
-
-
-def _motion_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
-    feeds, count = [], len(problem.motions)
-    for i, motion in enumerate(problem.motions):
-        if motion.known is not None or not np.any(block.target == i):
-            continue
-        rows = slice(None) if np.all(block.target == i) else np.flatnonzero(block.target == i)
-        epoch = block.epoch[rows]
-        since = elapsed(problem, i)[epoch]
-        for j, name in enumerate(state_names(i, count, motion.order)):
-            column = columns(problem.layout, name, epoch)
-            for c in range(problem.dimension):
-                feeds.append(Feed(_TARGET + c, column[:, c], since**j / factorial(j), rows))
-                if model.velocity and j:
-                    feeds.append(Feed(_TARGET_RATE + c, column[:, c], since ** (j - 1) / factorial(j - 1), rows))
-    return feeds
-
-
-def elapsed(problem: Problem, target: int) -> Array:
-    """Return the seconds (k,) since a target's state holds; zero where each epoch has its own state."""
-    motion = problem.motions[target]
-    if motion.span == "epoch":
-        return np.zeros(problem.epochs)
-    reference = problem.times[0] if motion.reference is None else motion.reference
-    return np.asarray(problem.times - reference)
-
-
-def _station_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
-    if problem.stations.covariance is None:
-        return []
-    d, feeds = problem.dimension, []
-    column = columns(problem.layout, "stations", block.epoch)
-    for seed, station in ((_A, block.a), (_B, block.b))[: model.stations]:
-        for c in range(d):
-            picked = column[np.arange(block.count), station * d + c]
-            feeds.append(Feed(seed + c, picked, 1.0, slice(None)))
-    return feeds
-
-
-def _turn_feeds(problem: Problem, block: Rows, start: int) -> list[Feed]:
-    feeds = []
-    for bias in problem.biases:
-        if bias.form != "rotation":
-            continue
-        left = np.flatnonzero((bias.row >= start) & (bias.row < start + block.count))
-        turns = 1 if problem.dimension == 2 else 3
-        while left.size:  # a row turned by several members takes one pass for each: a feed holds a row once
-            rows, first = np.unique(bias.row[left] - start, return_index=True)
-            touch, left = left[first], np.delete(left, first)
-            column = columns(problem.layout, bias.name, rows)
-            for c in range(turns):
-                picked = column[np.arange(len(rows)), bias.member[touch] * turns + c]
-                feeds.append(Feed(_TURN + c, picked, bias.coefficient[touch], rows))
-    return feeds
 
 
 def fitting(problem: Problem, x: Array) -> Array:
@@ -255,23 +65,23 @@ def joined(problem: Problem, model: Model, inputs: dict[int, Any]) -> tuple[Poin
 
     def station(place: int, rate: int, axes: int) -> Point:
         own = tuple(vector(axes + 3 * i) for i in range(d)) if axes in inputs else None
-        if _TURN in inputs:
+        if TURN in inputs:
             identity = tuple(tuple(float(i == j) for j in range(d)) for i in range(d))
-            own = rotate(own or identity, tuple(inputs[_TURN + c] for c in range(1 if d == 2 else 3)))
+            own = rotate(own or identity, tuple(inputs[TURN + c] for c in range(1 if d == 2 else 3)))
         return Point(vector(place), vector(rate) if model.velocity else None, own)
 
-    place = vector(_TARGET)
+    place = vector(TARGET)
     ecef = to_ecef(problem, place) if model.ecef else None
-    target = Point(place, vector(_TARGET_RATE) if model.velocity else None, None, ecef)
-    a = station(_A, _RATE_A, _AXES_A) if model.stations else target
-    return target, a, station(_B, _RATE_B, _AXES_B) if model.stations > 1 else a
+    target = Point(place, vector(TARGET_RATE) if model.velocity else None, None, ecef)
+    a = station(A, RATE_A, AXES_A) if model.stations else target
+    return target, a, station(B, RATE_B, AXES_B) if model.stations > 1 else a
 
 
 def given(problem: Problem, plan: Plan) -> dict[int, Any]:
     """Return the inputs that are data, each (..., m): surveyed stations, their rates and axes, known targets."""
     block, model, stations = plan.block, plan.model, problem.stations
     inputs: dict[int, Any] = {}
-    for place, rate, axes, index in ((_A, _RATE_A, _AXES_A, block.a), (_B, _RATE_B, _AXES_B, block.b))[
+    for place, rate, axes, index in ((A, RATE_A, AXES_A, block.a), (B, RATE_B, AXES_B, block.b))[
         : model.stations
     ]:
         inputs |= _at_rows(stations.position, 1, block, index, place)
@@ -284,7 +94,7 @@ def given(problem: Problem, plan: Plan) -> dict[int, Any]:
         if motion.known is None or not len(rows):
             continue
         epoch = block.epoch[rows] if motion.known.shape[-3] > 1 else np.zeros(len(rows), dtype=int)
-        for seed, order in ((_TARGET, 0), (_TARGET_RATE, 1)):
+        for seed, order in ((TARGET, 0), (TARGET_RATE, 1)):
             for c in range(problem.dimension if order < motion.known.shape[-2] else 0):
                 values = np.zeros((*motion.known.shape[:-3], block.count))
                 values[..., rows] = motion.known[..., epoch, order, c]

@@ -11,7 +11,8 @@ from optloc.layout import state_names
 from optloc.models.primitives import Point, wrap
 from optloc.models.surfaces import SURFACES
 from optloc.problem import Problem
-from optloc.states import Terms, given, joined, plans, to_ecef
+from optloc.plan import Terms, plans
+from optloc.states import given, joined, to_ecef
 from optloc.types import Array, Band
 
 

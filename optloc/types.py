@@ -26,8 +26,9 @@ class Stations:
         Rows are the unit vectors of each station's own axes, in the problem's frame; None: the frame's axes.
     covariance : array (..., s, d, d), optional
         Covariance of the position errors, square metres; None: surveyed exactly.
-    span : "epoch" or "run"
-        Whether a position error is drawn anew at each epoch or lasts the whole run.
+    span : "epoch", "run" or "noise"
+        A position error is an unknown of each epoch, or one that lasts the whole run; or it is drawn anew at each
+        epoch and not estimated: it enlarges the noise of the rows that the station takes part in.
     """
 
     position: Array
@@ -35,7 +36,7 @@ class Stations:
     velocity: Array | None = None
     axes: Array | None = None
     covariance: Array | None = None
-    span: Literal["epoch", "run"] = "epoch"
+    span: Literal["epoch", "run", "noise"] = "epoch"
 
     @property
     def dimension(self) -> int:

@@ -170,8 +170,9 @@ class BiasTable(_Table):
     """Who has one of his own: each station (with the sign of its arrival), each pair of stations, or the kind."""
     kind: str | None = None
     """Kind of the rows that are touched; needed where the file has several."""
-    members: list[str] | None = None
-    """Stations that have one; all stations that measure by default. Leave out the reference of a difference."""
+    members: list[str] | dict[str, list[str]] | None = None
+    """Stations that have one; all that measure by default. Leave out the reference of a difference. Or groups of
+    stations that share one: `{ GPS = ["G01", "G07"] }`. Of pairs: names such as "A-B"."""
     mean: Amount | None = None
     """Prior mean."""
     sigma: Amount | None = None

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
+from optloc.bias import family
 from optloc.errors import InvalidProblem
 from optloc.files.epochs import Epochs
 from optloc.files.schema import BiasTable, PriorTable, ProblemFile, TargetTable
@@ -56,95 +57,22 @@ def bias_of(
 ) -> Bias:
     """Return a family of biases over the rows of a problem."""
     where = join(source, f"[[biases]] {table.name!r}")
-    touches = _touched(table, rows, where)
-    members, row, member, coefficient = _members(table, touches, stations, where)
-    block = touches[0][0]
+    bias = family(
+        rows,
+        stations,
+        table.name,
+        per=table.per,
+        form=table.form,
+        kind=table.kind,
+        members=table.members,
+        where=where,
+    )
+    ends = np.cumsum([block.count for block in rows])
+    block = rows[int(np.searchsorted(ends, bias.row[0], side="right"))]
     quantity: Quantity = MODELS[block.kind].quantity  # type: ignore[assignment]  # the table holds known quantities only
-    if table.form == "rotation" and not MODELS[block.kind].axes:
-        raise InvalidProblem(f"{block.kind} has no axes that could be turned", where, 'use form = "offset"')
     turns = (3,) if table.form == "rotation" and dimension == 3 else ()
-    mean, sigma = _prior(table, quantity, speed, (len(members), *turns), where)
-    return Bias(table.name, members, row, member, coefficient, table.form, mean, sigma)
-
-
-def _touched(table: BiasTable, rows: Sequence[Rows], where: str) -> list[tuple[Rows, int]]:
-    starts = np.cumsum([0, *(block.count for block in rows)]).tolist()
-    kinds = [block.kind for block in rows]
-    if table.kind is not None and table.kind not in kinds:
-        raise InvalidProblem(
-            f"there are no rows of kind {table.kind!r}", join(where, "key 'kind'"), nearest(table.kind, kinds)
-        )
-    chosen = [
-        (block, start)
-        for block, start in zip(rows, starts, strict=False)
-        if table.kind in {None, block.kind} and (table.form != "rotation" or MODELS[block.kind].axes or table.kind)
-    ]
-    if not chosen:
-        raise InvalidProblem("no rows depend on the axes of stations", where, "leave the bias out")
-    if len({MODELS[block.kind].quantity for block, _ in chosen}) > 1:
-        raise InvalidProblem("the rows measure different quantities", where, "name the kind that it touches")
-    return chosen
-
-
-@dataclass(slots=True)
-class _Touches:
-    row: list[Array]
-    member: list[Array]
-    coefficient: list[Array]
-
-    def add(self, row: Array, member: Array, coefficient: Array) -> None:
-        inside = member >= 0
-        self.row.append(row[inside])
-        self.member.append(member[inside])
-        self.coefficient.append(coefficient[inside])
-
-
-def _members(
-    table: BiasTable, touches: list[tuple[Rows, int]], stations: Sequence[str], where: str
-) -> tuple[tuple[str, ...], Array, Array, Array]:
-    """Return the names of the members and the sparse design row, member, coefficient."""
-    design = _Touches([], [], [])
-    if table.per == "kind":
-        members: tuple[str, ...] = tuple(block.kind for block, _ in touches)
-        for i, (block, start) in enumerate(touches):
-            design.add(start + np.arange(block.count), np.full(block.count, i), np.ones(block.count))
-    elif table.per == "pair":
-        s = len(stations)
-        codes = [block.a * s + block.b for block, _ in touches]
-        known = np.unique(np.concatenate(codes))
-        members = tuple(f"{stations[code // s]}-{stations[code % s]}" for code in known.tolist())
-        for (block, start), code in zip(touches, codes, strict=True):
-            design.add(start + np.arange(block.count), np.searchsorted(known, code), np.ones(block.count))
-    else:
-        members = _station_members(table, touches, stations, where)
-        place = np.array([members.index(name) if name in members else -1 for name in stations] + [-1])
-        for block, start in touches:
-            for index, sign in zip((block.a, block.b), _signs(block.kind, table.form), strict=True):
-                if sign:
-                    design.add(start + np.arange(block.count), place[index], np.full(block.count, float(sign)))
-    return members, np.concatenate(design.row), np.concatenate(design.member), np.concatenate(design.coefficient)
-
-
-def _signs(kind: str, form: str) -> tuple[int, int]:
-    """Return how a station's error enters as first and as second station of a row."""
-    model = MODELS[kind]
-    if form == "rotation" or model.stations == 1:
-        return (1, 0)
-    return model.ranges or (1, -1)
-
-
-def _station_members(
-    table: BiasTable, touches: list[tuple[Rows, int]], stations: Sequence[str], where: str
-) -> tuple[str, ...]:
-    if table.members is not None:
-        unknown = [name for name in table.members if name not in stations]
-        if unknown:
-            raise InvalidProblem(
-                f"there is no station {unknown[0]!r}", join(where, "key 'members'"), nearest(unknown[0], list(stations))
-            )
-        return tuple(table.members)
-    used = np.unique(np.concatenate([np.concatenate([block.a, block.b]) for block, _ in touches]))
-    return tuple(stations[i] for i in used.tolist() if i >= 0)
+    mean, sigma = _prior(table, quantity, speed, (len(bias.members), *turns), where)
+    return replace(bias, mean=mean, sigma=sigma)
 
 
 def _prior(

@@ -8,7 +8,7 @@ from formulations.bistatic import course, triad
 from optloc.noise import variances
 from optloc.problem import Problem
 from optloc.solve.scale import spread_of
-from optloc.states import elapsed
+from optloc.plan import elapsed
 from optloc.types import Array, Rows
 
 

@@ -16,7 +16,7 @@ from optloc.layout import state_names
 from optloc.problem import Problem
 from optloc.solve.bistatic import course_starts
 from optloc.solve.start import static, vectors
-from optloc.states import elapsed
+from optloc.plan import elapsed
 from optloc.types import Array, Motion
 
 
