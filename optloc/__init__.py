@@ -9,10 +9,10 @@ from optloc.bounds import crlb
 from optloc.build import assemble, measured, station_array
 from optloc.epochs import by_epoch
 from optloc.errors import InvalidProblem, NoSolution, OptlocError
+from optloc.evaluate import predict
 from optloc.fix import Alternatives, Fix, Stage
 from optloc.frames import CARTESIAN, ECEF, Frame
 from optloc.layout import Layout
-from optloc.evaluate import predict
 from optloc.linear import Linear, linearise
 from optloc.models import MODELS, Model
 from optloc.noise import Noise

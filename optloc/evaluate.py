@@ -8,7 +8,7 @@ import numpy as np
 
 from optloc.models.jet import Jet
 from optloc.models.primitives import wrap
-from optloc.plan import Plan, Terms, plans
+from optloc.plan import Plan, plans
 from optloc.problem import Problem
 from optloc.states import fitting, points
 from optloc.types import Array

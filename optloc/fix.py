@@ -74,7 +74,9 @@ class Alternatives:
 
         Each is as likely before the measurement, and the data then weigh them by exp(-cost / 2).
         """
-        return np.asarray(1.0 / (1.0 + np.exp(np.minimum(0.5 * self.gap, 700.0)))) * np.isfinite(self.gap)
+        from scipy.special import expit
+
+        return np.asarray(expit(-0.5 * self.gap))
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,6 +43,15 @@ class Normal:
 
     def __add__(self, other: Normal) -> Normal:
         """Return the sum of the information of disjoint epochs: shared parts add, local parts are joined."""
+        if self.local.shape[-1] == 0 == other.local.shape[-1]:
+            return Normal(
+                self.shared + other.shared,
+                self.local,
+                self.cross,
+                self.shared_vector + other.shared_vector,
+                self.local_vector,
+                self.cost + other.cost,
+            )
         return Normal(
             self.shared + other.shared,
             np.concatenate([self.local, other.local], axis=-3),

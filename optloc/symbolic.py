@@ -10,8 +10,8 @@ from optloc.constraints import conjunction
 from optloc.layout import state_names
 from optloc.models.primitives import Point, wrap
 from optloc.models.surfaces import SURFACES
-from optloc.problem import Problem
 from optloc.plan import Terms, plans
+from optloc.problem import Problem
 from optloc.states import given, joined, to_ecef
 from optloc.types import Array, Band
 

@@ -13,8 +13,8 @@ FLOORS = {
     0: "types errors units frames status noise linalg ellipse",
     1: "models",
     2: "layout problem linear normal fix tables kernels states build check check_constraints check_unknowns arguments "
-    "epochs constraints tangent symbolic plan evaluate weigh windows bias",
-    3: "solve bounds simulate",
+    "epochs constraints tangent symbolic plan evaluate weigh windows equations bias",
+    3: "solve bounds simulate observe",
     4: "track",
     5: "study papers scenario files",
     6: "cli plot scene report plugins demo __main__",

@@ -6,9 +6,9 @@ import numpy as np
 
 from formulations.bistatic import course, triad
 from optloc.noise import variances
+from optloc.plan import elapsed
 from optloc.problem import Problem
 from optloc.solve.scale import spread_of
-from optloc.plan import elapsed
 from optloc.types import Array, Rows
 
 

@@ -10,13 +10,13 @@ import numpy as np
 
 from formulations.nls import Program
 from optloc.constraints import conjunction, face_of, faces, tangent_at
+from optloc.equations import equations_at
 from optloc.errors import InvalidProblem
 from optloc.fix import Fix, Stage
 from optloc.noise import whiten
 from optloc.normal import decrement, prior_parts, step
 from optloc.problem import Problem
 from optloc.solve.bounded import without_broken
-from optloc.solve.refine import equations_at
 from optloc.solve.scale import spread_of
 from optloc.solve.stages import finished, pooled
 from optloc.solve.verdict import Candidates

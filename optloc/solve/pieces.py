@@ -13,10 +13,10 @@ from optloc.constraints import is_exact, needs_velocity
 from optloc.epochs import by_epoch, untied
 from optloc.fix import Fix
 from optloc.layout import state_names
+from optloc.plan import elapsed
 from optloc.problem import Problem
 from optloc.solve.bistatic import course_starts
 from optloc.solve.start import static, vectors
-from optloc.plan import elapsed
 from optloc.types import Array, Motion
 
 

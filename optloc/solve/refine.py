@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from optloc.constraints import Face, restored, tangent_at
-from optloc.linear import linearise
+from optloc.equations import equations_at
 from optloc.noise import Whitener, variances, whiten
-from optloc.normal import Normal, decrement, normal, step, with_priors
+from optloc.normal import Normal, decrement, step
 from optloc.problem import Problem
 from optloc.status import Status
 from optloc.types import Array
+from optloc.weigh import depends_on_place, weighed
+from optloc.windows import whole, windows
+
+# Station errors are weighed where the target is thought to be; the weights hardly change with it.
+_WEIGHINGS = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,11 +44,6 @@ class Refined:
     status: Array
     iterations: Array
     equations: Normal
-
-
-def equations_at(problem: Problem, x: Array, noise: tuple[Whitener, ...]) -> Normal:
-    """Return the normal equations, priors included, of a batch of problems at vectors x (..., size)."""
-    return with_priors(problem, x, normal(linearise(problem, x, noise), problem.epochs))
 
 
 def refine(
@@ -82,20 +83,35 @@ def refine(
     Refined
         One entry for each start.
     """
-    n = problem.layout.n_shared
-    noise = whiten(problem.noise, problem.weight)
+    rules = _Rules(problem.layout.n_shared, tolerance, limit, damped, face)
+    if not depends_on_place(problem):
+        problem = weighed(problem)
+        noise = whiten(problem.noise, problem.weight) if whole(problem, len(start)) else None
+        if item is not None:
+            problem = problem.take(item)
+            noise = None if noise is None else tuple(w.take(item) for w in noise)
+        return _iterated(problem, start, noise, rules)
     if item is not None:
-        problem, noise = problem.take(item), tuple(w.take(item) for w in noise)
+        problem = problem.take(item)
+    for _ in range(_WEIGHINGS):
+        part = weighed(problem, start)
+        done = _iterated(part, start, whiten(part.noise, part.weight) if whole(part, len(start)) else None, rules)
+        start = done.x
+    return done
+
+
+def _iterated(problem: Problem, start: Array, noise: tuple[Whitener, ...] | None, rules: _Rules) -> Refined:
+    """Return where the iteration ends whose noise stays as it is."""
     with np.errstate(all="ignore"):
-        start = restored(problem, face, start) if face else start
+        start = restored(problem, rules.face, start) if rules.face else start
         state = _State.begin(problem, start, noise)
         active, blur = np.arange(len(start)), _blur(problem, len(start))
-        for iteration in range(limit):
+        for iteration in range(rules.limit):
             active = active[state.status[active] == Status.MAX_ITERATIONS]
             if not len(active):
                 break
             part = _Part.of(problem, noise, blur, active)
-            _advance(part, state, active, _Rules(n, tolerance, damped, face), iteration)
+            _advance(part, state, active, rules, iteration)
     return Refined(state.x, state.equations.cost, state.status, state.iterations, state.equations)
 
 
@@ -111,7 +127,7 @@ class _State:
     iterations: Array
 
     @classmethod
-    def begin(cls, problem: Problem, start: Array, noise: tuple[Whitener, ...]) -> _State:
+    def begin(cls, problem: Problem, start: Array, noise: tuple[Whitener, ...] | None) -> _State:
         count = len(start)
         equations = _owned(equations_at(problem, start, noise))
         status = np.full(count, int(Status.MAX_ITERATIONS), dtype=np.int8)
@@ -132,6 +148,7 @@ class _Rules:
 
     n: int
     tolerance: float
+    limit: int
     damped: bool
     face: Face
 
@@ -141,21 +158,24 @@ class _Part:
     """The problems still moving."""
 
     problem: Problem
-    noise: tuple[Whitener, ...]
+    noise: tuple[Whitener, ...] | None
     blur: Array
 
     @classmethod
-    def of(cls, problem: Problem, noise: tuple[Whitener, ...], blur: Array, active: Array) -> _Part:
+    def of(cls, problem: Problem, noise: tuple[Whitener, ...] | None, blur: Array, active: Array) -> _Part:
         if len(active) == len(blur):
             return cls(problem, noise, blur)
-        return cls(problem.take(active), tuple(w.take(active) for w in noise), blur[active])
+        noise = None if noise is None else tuple(w.take(active) for w in noise)
+        return cls(problem.take(active), noise, blur[active])
 
 
 def _blur(problem: Problem, count: int) -> Array:
     """Return the rounding error (N,) of the whitened residuals: arrival times that count from long ago are coarse."""
-    sigma = np.sqrt(variances(problem.noise, problem.count))
-    ratio = np.where(problem.weight > 0.0, problem.observed / sigma, 0.0)
-    coarse = 4.0 * np.finfo(float).eps * np.sqrt((ratio**2).sum(-1))
+    squares: Any = 0.0
+    for _, _, part in windows(problem, count):
+        sigma = np.sqrt(variances(part.noise, part.count))
+        squares = squares + (np.where(part.weight > 0.0, part.observed / sigma, 0.0) ** 2).sum(-1)
+    coarse = 4.0 * np.finfo(float).eps * np.sqrt(squares)
     return np.broadcast_to(np.where(np.isfinite(coarse), coarse, 0.0), (count,))
 
 

@@ -10,16 +10,16 @@ import numpy as np
 
 from optloc import linalg
 from optloc.constraints import exact
+from optloc.equations import equations_at
 from optloc.errors import InvalidProblem
 from optloc.fix import Alternatives, Fix, Stage, merged
-from optloc.noise import whiten
 from optloc.normal import Normal
 from optloc.problem import Problem
 from optloc.solve.angles import Bearings, angle_bounds, bearings, by_directions, instrumental, least_worst
 from optloc.solve.bounded import bounded
 from optloc.solve.heights import height_starts
 from optloc.solve.pieces import from_pieces, one_position
-from optloc.solve.refine import equations_at, refine
+from optloc.solve.refine import refine
 from optloc.solve.search import PLACES, searched_starts
 from optloc.solve.squared import Pick, every, hull, minimum, shor
 from optloc.solve.start import along_the_valley, mirrored, squared_range_starts, static, subarray_starts, vectors
@@ -282,4 +282,4 @@ def _assembled(problem: Problem, x: Array, fix: Fix | None, name: str, began: fl
 
 
 def _equations(problem: Problem, x: Array) -> Normal:
-    return equations_at(problem, x, whiten(problem.noise, problem.weight))
+    return equations_at(problem, x)

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from optloc.layout import emission_name
 from optloc.evaluate import predict
+from optloc.layout import emission_name
 from optloc.models import MODELS
+from optloc.plan import columns, plans
 from optloc.problem import Problem
 from optloc.solve.reduce import ranges
 from optloc.solve.squared import Pick, candidates, every
-from optloc.plan import columns, plans
 from optloc.types import Array
 
 _RADIAL = np.array([0.25, 0.45, 0.7, 1.5, 2.5, 4.0, 8.0])

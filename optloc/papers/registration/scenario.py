@@ -7,7 +7,6 @@ from typing import Literal
 
 import numpy as np
 
-from optloc import noise
 from optloc.bias import with_bias
 from optloc.build import assemble, measured
 from optloc.problem import Problem

@@ -1,0 +1,245 @@
+"""What the data say about each unknown, what the priors say, and which combinations stay open."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optloc import linalg
+from optloc.constraints import exact, tangent_at
+from optloc.layout import Layout
+from optloc.linear import linearise
+from optloc.normal import Normal, normal, prior_parts
+from optloc.problem import Problem
+from optloc.types import Array
+
+OPEN = 1e-12
+"""Share of its information, scaled to one, below which a combination of unknowns counts as open."""
+
+TIED = 0.99
+"""Correlation from which a bias counts as hard to tell from another unknown."""
+
+_SHOWN = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Observability:
+    """What is known of each shared unknown of a problem, from what.
+
+    Parameters
+    ----------
+    labels : tuple of n str
+        Names of the unknowns, for instance "position x" or "clock B".
+    units : tuple of n str
+        Their SI units.
+    data : array (n,)
+        Standard deviation from the measurements alone; infinite where they leave the unknown open.
+    prior : array (n,)
+        Standard deviation of the prior; infinite where there is none.
+    posterior : array (n,)
+        Standard deviation from both.
+    rank : int
+        Number of combinations of the unknowns that the measurements determine.
+    open : tuple of str
+        One sentence for each combination that the measurements leave open.
+    tied : tuple of str
+        One sentence for each group of unknowns, biases among them, that are hard to tell apart even so.
+    """
+
+    labels: tuple[str, ...]
+    units: tuple[str, ...]
+    data: Array
+    prior: Array
+    posterior: Array
+    rank: int
+    open: tuple[str, ...]
+    tied: tuple[str, ...]
+
+    @property
+    def from_data(self) -> Array:
+        """Return the share (n,) of what is known that the measurements contribute.
+
+        One less the posterior variance over the prior one: 0 where the prior says it all, 1 without a prior, NaN where
+        nothing is known.
+        """
+        with np.errstate(invalid="ignore", divide="ignore"):
+            left = np.where(np.isinf(self.prior), 0.0, (self.posterior / self.prior) ** 2)
+        return np.where(np.isinf(self.posterior), np.nan, np.clip(1.0 - left, 0.0, 1.0))
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """Return what is not separable, one sentence each; empty where everything is."""
+        return (*self.open, *self.tied)
+
+
+def observability(problem: Problem, x: Array) -> Observability:
+    """Return what the data and the priors say about each shared unknown of a problem.
+
+    The normal matrix of the measurements at x, unknowns of single epochs eliminated and columns scaled, is taken apart
+    into its eigenvectors: those of eigenvalue zero are combinations of unknowns that no measurement sees, all others
+    have a finite variance. Errors of station positions that last one epoch, and equality constraints, count with the
+    measurements; priors of shared unknowns do not.
+
+    Parameters
+    ----------
+    problem : Problem
+        A single problem.
+    x : array (size,)
+        Where it is linearised: a fix, or a truth.
+
+    Returns
+    -------
+    Observability
+        In SI units.
+
+    References
+    ----------
+    S. M. Kay, "Fundamentals of Statistical Signal Processing: Estimation Theory" (1993), sections 3.7 and 10.4.
+    G. H. Golub and C. F. Van Loan, "Matrix Computations" (2013), section 5.5.
+    """
+    x = np.asarray(x, dtype=float)
+    layout = problem.layout
+    equations = _with_local_priors(problem, normal(linearise(problem, x), problem.epochs))
+    information, size = _eliminated(equations), equations.shared
+    held = exact(problem)
+    basis = tangent_at(problem.flat(), held, x[None]).along[0] if held else np.eye(layout.n_shared)
+    precision, prior = _shared_priors(problem, layout)
+    data = _taken_apart(information, size, basis)
+    both = _taken_apart(information + precision, size + precision, basis)
+    return Observability(
+        layout.labels(),
+        tuple(slot.unit for slot in layout.shared for _ in range(slot.size)),
+        data.sigma,
+        prior,
+        both.sigma,
+        basis.shape[1] - len(data.open),
+        tuple(_open_sentence(layout, direction) for direction in data.open),
+        tuple(_tied_sentences(layout, both.correlation)),
+    )
+
+
+def _with_local_priors(problem: Problem, equations: Normal) -> Normal:
+    """Return the equations of the data with what is known of the unknowns of single epochs."""
+    local = equations.local.copy()
+    for name, _, precision in prior_parts(problem):
+        slot, shared = problem.layout.find(name)
+        if not shared:
+            part = slice(slot.start, slot.start + slot.size)
+            local[..., part, part] += precision
+    return replace(equations, local=local)
+
+
+def _eliminated(equations: Normal) -> Array:
+    """Return the information (n, n) of the shared unknowns; an epoch that leaves its own unknowns open counts too."""
+    if equations.local.shape[-1] == 0:
+        return equations.shared
+    diagonal = np.diagonal(equations.local, axis1=-2, axis2=-1)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    values, vectors = np.linalg.eigh(equations.local * scale[..., :, None] * scale[..., None, :])
+    kept = values > OPEN
+    roots = np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)
+    seen = equations.cross @ (scale[..., :, None] * vectors * roots[..., None, :])
+    return np.asarray(equations.shared - (seen @ np.swapaxes(seen, -1, -2)).sum(-3))
+
+
+def _shared_priors(problem: Problem, layout: Layout) -> tuple[Array, Array]:
+    """Return the precision (n, n) and the standard deviations (n,) of the priors of shared unknowns."""
+    precision = np.zeros((layout.n_shared, layout.n_shared))
+    for name, _, part in prior_parts(problem):
+        slot, shared = layout.find(name)
+        if shared:
+            where = slice(slot.start, slot.start + slot.size)
+            precision[where, where] += part
+    known = np.diagonal(precision) > 0.0
+    covariance, _ = linalg.inverse(precision[np.ix_(known, known)])
+    sigma = np.full(layout.n_shared, np.inf)
+    sigma[known] = np.sqrt(np.diagonal(covariance))
+    return precision, sigma
+
+
+@dataclass(frozen=True, slots=True)
+class _Parts:
+    """Standard deviations (n,), correlations (n, n), and open directions (q, n) in SI units."""
+
+    sigma: Array
+    correlation: Array
+    open: Array
+
+
+def _taken_apart(information: Array, size: Array, basis: Array) -> _Parts:
+    """Return what information (n, n) on a basis (n, p) determines.
+
+    `size` is the information before anything was eliminated: its rounding errors decide what counts as zero.
+    """
+    weight = np.sqrt(np.einsum("ip,ij,jp->p", basis, size, basis).clip(0.0))
+    basis = basis / np.where(weight > 0.0, weight, 1.0)
+    values, vectors = np.linalg.eigh(basis.T @ information @ basis)
+    directions = basis @ vectors
+    reach = np.linalg.norm(directions, axis=-1, keepdims=True)
+    reach = np.where(reach > 0.0, reach, 1.0)
+    shut = values > OPEN
+    known, null = directions[:, shut] / np.sqrt(values[shut]), directions[:, ~shut] / reach
+    sigma = np.linalg.norm(known, axis=-1)
+    loose = (np.abs(null) > 1e-6).any(-1)
+    unit = known / np.where(sigma > 0.0, sigma, 1.0)[:, None]
+    correlation = np.where(loose[:, None] | loose, 0.0, unit @ unit.T)
+    return _Parts(np.where(loose, np.inf, sigma), correlation, _sparse(null.T) * reach[:, 0])
+
+
+def _sparse(rows: Array) -> Array:
+    """Return a basis (q, n) of the same space in which each row has an entry of one that no other row has."""
+    rows = rows.copy()
+    for i in range(len(rows)):
+        at, pivot = np.unravel_index(np.argmax(np.abs(rows[i:])), rows[i:].shape)
+        rows[[i, i + at]] = rows[[i + at, i]]
+        rows[i] /= rows[i, pivot]
+        others = np.arange(len(rows)) != i
+        rows[others] -= rows[others, pivot, None] * rows[i]
+    return np.where(np.abs(rows) > 1e-5, rows, 0.0)
+
+
+def _open_sentence(layout: Layout, direction: Array) -> str:
+    """Return the sentence of a combination (n,) of unknowns that no measurement sees."""
+    labels, names, amounts = layout.labels(), [], []
+    for slot in layout.shared:
+        part = direction[slot.start : slot.start + slot.size]
+        if slot.size > 2 and part[0] and np.allclose(part, part[0], rtol=1e-4):
+            names.append(f"every {slot.name}")
+            amounts.append((float(part[0]), slot.unit))
+        else:
+            names += [labels[slot.start + i] for i in np.flatnonzero(part)]
+            amounts += [(float(value), slot.unit) for value in part[part != 0.0]]
+    values = np.array([value for value, _ in amounts])
+    if len(names) == 1 and not names[0].startswith("every "):
+        return f"the data do not show {names[0]}"
+    if len({unit for _, unit in amounts}) == 1 and np.allclose(values, values[0], rtol=1e-4):
+        return f"the data do not show a common change of {_listed(names)}"
+    values = values / values[0]
+    shown = [f"{name} by {v:+.3g} {u}".rstrip() for name, v, (_, u) in zip(names, values, amounts, strict=True)]
+    return f"the data do not show a change of {_listed(shown)}"
+
+
+def _tied_sentences(layout: Layout, correlation: Array) -> list[str]:
+    """Return a sentence for each group of unknowns with biases in it that are strongly correlated."""
+    labels, found, seen = layout.labels(), [], set[int]()
+    bias = np.array([bool(slot.members) for slot in layout.shared for _ in range(slot.size)])
+    close = np.abs(correlation) > TIED
+    np.fill_diagonal(close, val=False)
+    for first in np.flatnonzero(close.any(-1)).tolist():
+        group, fresh = set[int](), {first} - seen
+        while fresh:
+            group |= fresh
+            fresh = set(np.flatnonzero(close[sorted(fresh)].any(0)).tolist()) - group
+        seen |= group
+        members = sorted(group)
+        if bias[members].any():
+            most = np.abs(correlation[np.ix_(members, members)] - np.eye(len(members))).max()
+            found.append(f"hard to tell apart: {_listed([labels[i] for i in members])} (correlated up to {most:.5f})")
+    return found
+
+
+def _listed(names: list[str]) -> str:
+    if len(names) > _SHOWN:
+        names = [*names[: _SHOWN - 1], f"{len(names) - _SHOWN + 1} more"]
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))

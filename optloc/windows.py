@@ -1,0 +1,213 @@
+"""Stretches of epochs: what is summed over a run is worked on window by window, in constant memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from optloc.epochs import tied
+from optloc.errors import InvalidProblem
+from optloc.noise import Block, Noise
+from optloc.problem import Problem
+from optloc.types import Array, Bias, Motion, Rows, Stations
+
+_NUMBERS = 2**17
+
+
+def windows(problem: Problem, batch: int = 1) -> Iterator[tuple[int, int, Problem]]:
+    """Yield the stretches (first, last, problem) of a run whose Jacobians fit into the cache, in order.
+
+    Parameters
+    ----------
+    problem : Problem
+        A run of k epochs; where noise ties its epochs, it is one stretch.
+    batch : int
+        Number of problems that are worked on together.
+    """
+    length = _length(problem, batch)
+    if length >= problem.epochs:
+        yield 0, problem.epochs, problem
+        return
+    for first in range(0, problem.epochs, length):
+        last = min(first + length, problem.epochs)
+        yield first, last, window(problem, first, last)
+
+
+def whole(problem: Problem, batch: int = 1) -> bool:
+    """Return whether a run is one window."""
+    return _length(problem, batch) >= problem.epochs
+
+
+def _length(problem: Problem, batch: int) -> int:
+    """Return the number of epochs of a window."""
+    if problem.epochs == 1 or tied(problem):
+        return problem.epochs
+    columns = problem.layout.n_shared + problem.layout.n_local + 1
+    return max(1, int(_NUMBERS * problem.epochs / (batch * problem.count * columns)))
+
+
+def window(problem: Problem, first: int, last: int) -> Problem:
+    """Return the problem with the rows of epochs first <= k < last only; times, stations and unknowns stay.
+
+    Parameters
+    ----------
+    problem : Problem
+        Noise must not tie its epochs.
+    first, last : int
+        Stretch of epochs.
+    """
+    rows = [_rows(block, _inside(block.epoch, first, last)) for block in problem.rows]
+    blocks = []
+    epoch = problem.epoch
+    number = np.cumsum((epoch >= first) & (epoch < last)) - 1
+    for block in problem.noise.blocks:
+        groups = _inside(epoch[block.row[:, 0]], first, last)
+        covariance = block.covariance if block.covariance.shape[-3] == 1 else block.covariance[..., groups, :, :]
+        if len(block.row[groups]):
+            blocks.append(Block(number[block.row[groups]], covariance))
+    biases = tuple(_touches(bias, _inside(epoch[bias.row], first, last), number) for bias in problem.biases)
+    return replace(problem, rows=tuple(rows), noise=Noise(tuple(blocks)), biases=biases)
+
+
+def _inside(epoch: Array, first: int, last: int) -> slice | Array:
+    """Return the entries whose epoch lies in a stretch: a slice, and so a view, where they are sorted."""
+    if np.all(epoch[1:] >= epoch[:-1]):
+        return slice(*np.searchsorted(epoch, (first, last)).tolist())
+    return np.flatnonzero((epoch >= first) & (epoch < last))
+
+
+def _rows(block: Rows, kept: slice | Array) -> Rows:
+    return replace(
+        block,
+        **{
+            name: getattr(block, name)[..., kept] for name in ("z", "a", "b", "epoch", "target", "weight", "correction")
+        },
+    )
+
+
+def _touches(bias: Bias, kept: slice | Array, number: Array) -> Bias:
+    return replace(bias, row=number[bias.row[kept]], member=bias.member[kept], coefficient=bias.coefficient[kept])
+
+
+def joined(problem: Problem, more: Problem) -> Problem:
+    """Return one run of two: the epochs of the second follow those of the first.
+
+    Parameters
+    ----------
+    problem, more : Problem
+        The same stations, targets, biases, priors and kinds in the same order; all times of `more` are later.
+
+    Returns
+    -------
+    Problem
+        States hold at the reference time of the first run.
+
+    Raises
+    ------
+    InvalidProblem
+        Naming what differs.
+    """
+    _check_alike(problem, more)
+    k = problem.epochs
+    rows = tuple(
+        _appended(one, replace(two, epoch=two.epoch + k)) for one, two in zip(problem.rows, more.rows, strict=True)
+    )
+    # Where the rows of either run come to stand: kinds stay together, the second run behind the first.
+    counts = [(one.count, two.count) for one, two in zip(problem.rows, more.rows, strict=True)]
+    starts = np.cumsum([0, *(a + b for a, b in counts)])[:-1]
+    mine = np.concatenate([start + np.arange(a) for start, (a, _) in zip(starts, counts, strict=True)])
+    theirs = np.concatenate([start + a + np.arange(b) for start, (a, b) in zip(starts, counts, strict=True)])
+    blocks = [Block(mine[block.row], block.covariance) for block in problem.noise.blocks]
+    blocks += [Block(theirs[block.row], block.covariance) for block in more.noise.blocks]
+    biases = tuple(
+        replace(
+            one,
+            row=np.concatenate([mine[one.row], theirs[two.row]]),
+            member=np.concatenate([one.member, two.member]),
+            coefficient=np.concatenate([one.coefficient, two.coefficient]),
+        )
+        for one, two in zip(problem.biases, more.biases, strict=True)
+    )
+    return replace(
+        problem,
+        stations=_stations(problem, more),
+        rows=rows,
+        noise=Noise(tuple(blocks)),
+        times=np.concatenate([problem.times, more.times]),
+        motions=_motions(problem, more),
+        biases=biases,
+    )
+
+
+def _appended(one: Rows, two: Rows) -> Rows:
+    batch = np.broadcast_shapes(one.z.shape[:-1], two.z.shape[:-1])
+
+    def both(a: Array, b: Array) -> Array:
+        shape = batch if a.ndim > 1 or b.ndim > 1 else ()
+        return np.concatenate([np.broadcast_to(v, (*shape, v.shape[-1])) for v in (a, b)], axis=-1)
+
+    names = ("z", "a", "b", "epoch", "target", "weight", "correction")
+    return replace(one, **{name: both(getattr(one, name), getattr(two, name)) for name in names})
+
+
+def _stations(problem: Problem, more: Problem) -> Stations:
+    one, two = problem.stations, more.stations
+
+    def both(a: Array | None, b: Array | None, core: int) -> Array | None:
+        if a is None or b is None:
+            return None
+        return _course(a, problem.epochs, b, more.epochs, core)
+
+    position = _course(one.position, problem.epochs, two.position, more.epochs, 3)
+    return replace(
+        one, position=position, velocity=both(one.velocity, two.velocity, 3), axes=both(one.axes, two.axes, 4)
+    )
+
+
+def _motions(problem: Problem, more: Problem) -> tuple[Motion, ...]:
+    joint = []
+    for one, two in zip(problem.motions, more.motions, strict=True):
+        known = one.known
+        if known is not None and two.known is not None:
+            known = _course(known, problem.epochs, two.known, more.epochs, 3)
+        reference = problem.times[0] if one.reference is None and one.span == "run" else one.reference
+        joint.append(replace(one, known=known, reference=reference))
+    return tuple(joint)
+
+
+def _course(one: Array, first: int, two: Array, second: int, core: int) -> Array:
+    """Return what holds at each epoch (..., k, ...) of both runs; unchanged where it never changes."""
+    if one.shape[-core] == 1 and two.shape[-core] == 1 and np.array_equal(one, two):
+        return one
+    axis = -core
+    parts = [np.repeat(a, n, axis) if a.shape[axis] == 1 else a for a, n in ((one, first), (two, second))]
+    batch = np.broadcast_shapes(*(part.shape[:axis] for part in parts))
+    return np.concatenate([np.broadcast_to(part, (*batch, *part.shape[axis:])) for part in parts], axis)
+
+
+def _check_alike(problem: Problem, more: Problem) -> None:
+    one, two = problem, more
+    for what, same in (
+        ("stations", one.stations.names == two.stations.names and one.stations.span == two.stations.span),
+        ("kinds", [rows.kind for rows in one.rows] == [rows.kind for rows in two.rows]),
+        (
+            "targets",
+            [(m.order, m.span, m.known is None) for m in one.motions]
+            == [(m.order, m.span, m.known is None) for m in two.motions],
+        ),
+        (
+            "biases",
+            [(b.name, b.members, b.form) for b in one.biases] == [(b.name, b.members, b.form) for b in two.biases],
+        ),
+        ("frames", one.frame == two.frame),
+    ):
+        if not same:
+            raise InvalidProblem(f"the {what} of the two runs differ", "update", "give the same ones in the same order")
+    if two.times[0] <= one.times[-1]:
+        raise InvalidProblem(
+            f"its first epoch, at {two.times[0]} s, is not later than the last one, at {one.times[-1]} s",
+            "update",
+            "give epochs in the order of time",
+        )
