@@ -2,12 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
 import numpy as np
 
-from optloc.linear import linearise
-from optloc.normal import covariance, normal, with_priors
+from optloc import linalg
+from optloc.epochs import tied
+from optloc.equations import equations_at
+from optloc.errors import InvalidProblem
+from optloc.layout import Layout
+from optloc.linear import Linear, linearise
+from optloc.normal import Normal, covariance, normal, prior_parts
 from optloc.problem import Problem
 from optloc.types import Array
+from optloc.windows import windows
+
+OPEN = 1e-12
+"""Share of its information, scaled to one, below which a combination of unknowns counts as open."""
 
 
 def crlb(problem: Problem, truth: Array) -> Array:
@@ -32,6 +44,148 @@ def crlb(problem: Problem, truth: Array) -> Array:
     ----------
     S. M. Kay, "Fundamentals of Statistical Signal Processing: Estimation Theory" (1993), eq. 3.31.
     """
-    x = np.asarray(truth, dtype=float)
-    equations = with_priors(problem, x, normal(linearise(problem, x), problem.epochs))
-    return covariance(equations)[0]
+    return covariance(equations_at(problem, np.asarray(truth, dtype=float)))[0]
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """The bound after the first epochs of a run.
+
+    Parameters
+    ----------
+    counts : int array (q,)
+        How many epochs count.
+    times : array (q,)
+        Seconds of the last of them.
+    covariance : array (q, n, n)
+        Bound of the shared unknowns in SI units; NaN where they are not yet determined.
+    layout : Layout
+        What each entry means.
+    """
+
+    counts: Array
+    times: Array
+    covariance: Array
+    layout: Layout
+
+    def sigma(self, name: str) -> Array:
+        """Return the bound (q, size) of the standard deviations of a named unknown."""
+        slot, _ = self.layout.find(name)
+        variance = np.diagonal(self.covariance, axis1=-2, axis2=-1)[:, slot.start : slot.start + slot.size]
+        return np.asarray(np.sqrt(variance))
+
+    def total(self, name: str) -> Array:
+        """Return the root of the sum of variances (q,) of a named unknown: of a position, its error in space."""
+        return np.asarray(np.linalg.norm(self.sigma(name), axis=-1))
+
+
+def crlb_course(
+    problem: Problem, truth: Array, counts: Sequence[int] | Array | None = None, *, known: Sequence[str] = ()
+) -> Course:
+    """Return the Cramer-Rao bound after the first 1, 2, ... epochs of a run.
+
+    What every epoch says of the shared unknowns, its own unknowns eliminated, adds up; the prior counts once. Time and
+    memory grow with the number of epochs times the square of the number of shared unknowns.
+
+    Parameters
+    ----------
+    problem : Problem
+        A single problem whose epochs share unknowns; its measurements do not matter.
+    truth : array (size,)
+        True parameter vector.
+    counts : sequence of int, optional
+        Numbers of epochs, 1 to k; all by default.
+    known : sequence of str
+        Names of shared unknowns that are taken as known; their bound is zero.
+
+    Raises
+    ------
+    InvalidProblem
+        Where noise ties the epochs together, a count is out of range, or a name is unknown.
+
+    References
+    ----------
+    S. M. Kay, "Fundamentals of Statistical Signal Processing: Estimation Theory" (1993), sections 3.7 and 8.4.
+    """
+    x, layout, k = np.asarray(truth, dtype=float), problem.layout, problem.epochs
+    if tied(problem):
+        advice = "ask for the bound of the whole run"
+        raise InvalidProblem("noise correlates the epochs, so that what they say does not add up", "noise", advice)
+    chosen = np.arange(1, k + 1) if counts is None else np.asarray(counts, dtype=np.int64)
+    if chosen.ndim != 1 or not len(chosen) or chosen.min() < 1 or chosen.max() > k:
+        raise InvalidProblem(f"the counts are not among 1 to {k}", "counts", "give numbers of epochs")
+    each, size = _each_epoch(problem, x)
+    prior = shared_priors(problem)
+    total, scale = (np.cumsum(part, axis=0)[chosen - 1] + prior for part in (each, size))
+    free = np.ones(layout.n_shared, dtype=bool)
+    for slot in (layout.find(name)[0] for name in known):
+        free[slot.start : slot.start + slot.size] = False
+    bound = np.zeros((len(chosen), layout.n_shared, layout.n_shared))
+    bound[np.ix_(np.arange(len(chosen)), free, free)] = _inverse(total[:, free][..., free], scale[:, free][..., free])
+    return Course(chosen, problem.times[chosen - 1], bound, layout)
+
+
+def _each_epoch(problem: Problem, x: Array) -> tuple[Array, Array]:
+    """Return what each epoch says of the shared unknowns (k, n, n), with its own unknowns eliminated and known."""
+    n, found, known = problem.layout.n_shared, [], []
+    for first, last, part in windows(problem):
+        linear = linearise(part, x)
+        # As if every epoch had all unknowns to itself: the local blocks are then what each epoch says.
+        both = np.concatenate([linear.shared, linear.local], axis=-1)
+        own = Linear(linear.residual, linear.shared[..., :0], both, linear.epoch - first, linear.noise)
+        gram = normal(own, last - first).local
+        none, here = np.zeros(len(gram)), gram[:, None]
+        equations = Normal(
+            gram[:, :n, :n], here[..., n:, n:], here[..., :n, n:], none[:, None], none[:, None, None], none
+        )
+        found.append(eliminated(with_local_priors(problem, equations)))
+        known.append(gram[:, :n, :n])
+    return np.concatenate(found), np.concatenate(known)
+
+
+def _inverse(information: Array, size: Array) -> Array:
+    """Return inverses (q, n, n), NaN where a combination is open; `size` is the information before elimination."""
+    inverse, _ = linalg.inverse(information)
+    diagonal = np.diagonal(size, axis1=-2, axis2=-1)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    weakest = np.linalg.eigvalsh(information * scale[..., :, None] * scale[..., None, :]).min(-1, initial=1.0)
+    return np.where((weakest > OPEN)[..., None, None], inverse, np.nan)
+
+
+def with_local_priors(problem: Problem, equations: Normal) -> Normal:
+    """Return equations of the data with what is known of the unknowns of single epochs, such as station errors."""
+    local = equations.local.copy()
+    for name, _, precision in prior_parts(problem):
+        slot, shared = problem.layout.find(name)
+        if not shared:
+            part = slice(slot.start, slot.start + slot.size)
+            local[..., part, part] += precision
+    return replace(equations, local=local)
+
+
+def shared_priors(problem: Problem) -> Array:
+    """Return the precision (n, n) of the priors of shared unknowns."""
+    layout = problem.layout
+    precision = np.zeros((layout.n_shared, layout.n_shared))
+    for name, _, part in prior_parts(problem):
+        slot, shared = layout.find(name)
+        if shared:
+            where = slice(slot.start, slot.start + slot.size)
+            precision[where, where] += part
+    return precision
+
+
+def eliminated(equations: Normal) -> Array:
+    """Return the information (..., n, n) of the shared unknowns; an epoch that leaves some of its own open counts too.
+
+    Where all local blocks are regular it is that of `optloc.normal.marginal`.
+    """
+    if equations.local.shape[-1] == 0:
+        return equations.shared
+    diagonal = np.diagonal(equations.local, axis1=-2, axis2=-1)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    values, vectors = np.linalg.eigh(equations.local * scale[..., :, None] * scale[..., None, :])
+    kept = values > OPEN
+    roots = np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)
+    seen = equations.cross @ (scale[..., :, None] * vectors * roots[..., None, :])
+    return np.asarray(equations.shared - (seen @ np.swapaxes(seen, -1, -2)).sum(-3))

@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
-from optloc import linalg
+from optloc.bounds import OPEN, eliminated, shared_priors, with_local_priors
 from optloc.constraints import exact, tangent_at
-from optloc.layout import Layout
-from optloc.linear import linearise
-from optloc.normal import Normal, normal, prior_parts
+from optloc.equations import summed
+from optloc.layout import Layout, Slot
 from optloc.problem import Problem
 from optloc.types import Array
-
-OPEN = 1e-12
-"""Share of its information, scaled to one, below which a combination of unknowns counts as open."""
 
 TIED = 0.99
 """Correlation from which a bias counts as hard to tell from another unknown."""
 
-_SHOWN = 8
+_SHOWN, _FEW = 8, 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +39,7 @@ class Observability:
     rank : int
         Number of combinations of the unknowns that the measurements determine.
     open : tuple of str
-        One sentence for each combination that the measurements leave open.
+        Sentences that name the combinations that the measurements leave open.
     tied : tuple of str
         One sentence for each group of unknowns, biases among them, that are hard to tell apart even so.
     """
@@ -100,71 +97,33 @@ def observability(problem: Problem, x: Array) -> Observability:
     """
     x = np.asarray(x, dtype=float)
     layout = problem.layout
-    equations = _with_local_priors(problem, normal(linearise(problem, x), problem.epochs))
-    information, size = _eliminated(equations), equations.shared
+    equations = with_local_priors(problem, summed(problem, x))
+    information, size = eliminated(equations), equations.shared
     held = exact(problem)
     basis = tangent_at(problem.flat(), held, x[None]).along[0] if held else np.eye(layout.n_shared)
-    precision, prior = _shared_priors(problem, layout)
+    precision = shared_priors(problem)
     data = _taken_apart(information, size, basis)
     both = _taken_apart(information + precision, size + precision, basis)
     return Observability(
         layout.labels(),
         tuple(slot.unit for slot in layout.shared for _ in range(slot.size)),
         data.sigma,
-        prior,
+        _taken_apart(precision, precision, np.eye(layout.n_shared)).sigma,
         both.sigma,
         basis.shape[1] - len(data.open),
-        tuple(_open_sentence(layout, direction) for direction in data.open),
+        tuple(_open_sentences(layout, data)),
         tuple(_tied_sentences(layout, both.correlation)),
     )
 
 
-def _with_local_priors(problem: Problem, equations: Normal) -> Normal:
-    """Return the equations of the data with what is known of the unknowns of single epochs."""
-    local = equations.local.copy()
-    for name, _, precision in prior_parts(problem):
-        slot, shared = problem.layout.find(name)
-        if not shared:
-            part = slice(slot.start, slot.start + slot.size)
-            local[..., part, part] += precision
-    return replace(equations, local=local)
-
-
-def _eliminated(equations: Normal) -> Array:
-    """Return the information (n, n) of the shared unknowns; an epoch that leaves its own unknowns open counts too."""
-    if equations.local.shape[-1] == 0:
-        return equations.shared
-    diagonal = np.diagonal(equations.local, axis1=-2, axis2=-1)
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    values, vectors = np.linalg.eigh(equations.local * scale[..., :, None] * scale[..., None, :])
-    kept = values > OPEN
-    roots = np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)
-    seen = equations.cross @ (scale[..., :, None] * vectors * roots[..., None, :])
-    return np.asarray(equations.shared - (seen @ np.swapaxes(seen, -1, -2)).sum(-3))
-
-
-def _shared_priors(problem: Problem, layout: Layout) -> tuple[Array, Array]:
-    """Return the precision (n, n) and the standard deviations (n,) of the priors of shared unknowns."""
-    precision = np.zeros((layout.n_shared, layout.n_shared))
-    for name, _, part in prior_parts(problem):
-        slot, shared = layout.find(name)
-        if shared:
-            where = slice(slot.start, slot.start + slot.size)
-            precision[where, where] += part
-    known = np.diagonal(precision) > 0.0
-    covariance, _ = linalg.inverse(precision[np.ix_(known, known)])
-    sigma = np.full(layout.n_shared, np.inf)
-    sigma[known] = np.sqrt(np.diagonal(covariance))
-    return precision, sigma
-
-
 @dataclass(frozen=True, slots=True)
 class _Parts:
-    """Standard deviations (n,), correlations (n, n), and open directions (q, n) in SI units."""
+    """Standard deviations (n,), correlations (n, n), and a basis (q, n) of what is open, in units of `reach` (n,)."""
 
     sigma: Array
     correlation: Array
     open: Array
+    reach: Array
 
 
 def _taken_apart(information: Array, size: Array, basis: Array) -> _Parts:
@@ -184,14 +143,49 @@ def _taken_apart(information: Array, size: Array, basis: Array) -> _Parts:
     loose = (np.abs(null) > 1e-6).any(-1)
     unit = known / np.where(sigma > 0.0, sigma, 1.0)[:, None]
     correlation = np.where(loose[:, None] | loose, 0.0, unit @ unit.T)
-    return _Parts(np.where(loose, np.inf, sigma), correlation, _sparse(null.T) * reach[:, 0])
+    return _Parts(np.where(loose, np.inf, sigma), correlation, null.T, reach[:, 0])
+
+
+def _open_sentences(layout: Layout, parts: _Parts) -> Iterator[str]:
+    """Yield sentences that name what is open: a common change of a family first, then what is left."""
+    common = np.array([_entries(layout, slot) for slot in layout.shared if slot.members]).reshape(-1, layout.n_shared)
+    found = [row for row in common / parts.reach if _inside(row, parts.open)]
+    for row in found:
+        yield _open_sentence(layout, row * parts.reach)
+    rest = _sparse(_without(parts.open, found))
+    if len(rest) <= _FEW:
+        yield from (_open_sentence(layout, row * parts.reach) for row in rest)
+    else:
+        names = [label for label, used in zip(layout.labels(), np.asarray(rest.any(0)), strict=True) if used]
+        yield f"the data leave {len(rest)} combinations of {_listed(names)} open"
+
+
+def _entries(layout: Layout, slot: Slot) -> Array:
+    """Return the change (n,) of all entries of a slot by one."""
+    place = np.arange(layout.n_shared) - slot.start
+    return ((place >= 0) & (place < slot.size)).astype(float)
+
+
+def _inside(row: Array, basis: Array) -> bool:
+    """Return whether a vector (n,) lies in the span of a basis (q, n)."""
+    away = row - np.linalg.lstsq(basis.T, row, rcond=None)[0] @ basis
+    return float(np.linalg.norm(away)) < 1e-6 * float(np.linalg.norm(row))
+
+
+def _without(basis: Array, found: list[Array]) -> Array:
+    """Return a basis (q - f, n) of what a basis (q, n) spans beside f vectors within it."""
+    if not found:
+        return basis
+    taken, _ = np.linalg.qr(np.array(found).T)
+    _, _, right = np.linalg.svd(basis - basis @ taken @ taken.T)
+    return np.asarray(right[: len(basis) - len(found)])
 
 
 def _sparse(rows: Array) -> Array:
     """Return a basis (q, n) of the same space in which each row has an entry of one that no other row has."""
     rows = rows.copy()
     for i in range(len(rows)):
-        at, pivot = np.unravel_index(np.argmax(np.abs(rows[i:])), rows[i:].shape)
+        at, pivot = divmod(int(np.argmax(np.abs(rows[i:]))), rows.shape[1])
         rows[[i, i + at]] = rows[[i + at, i]]
         rows[i] /= rows[i, pivot]
         others = np.arange(len(rows)) != i
@@ -222,19 +216,16 @@ def _open_sentence(layout: Layout, direction: Array) -> str:
 
 def _tied_sentences(layout: Layout, correlation: Array) -> list[str]:
     """Return a sentence for each group of unknowns with biases in it that are strongly correlated."""
-    labels, found, seen = layout.labels(), [], set[int]()
+    from scipy.sparse.csgraph import connected_components
+
+    labels, found = layout.labels(), []
     bias = np.array([bool(slot.members) for slot in layout.shared for _ in range(slot.size)])
-    close = np.abs(correlation) > TIED
-    np.fill_diagonal(close, val=False)
-    for first in np.flatnonzero(close.any(-1)).tolist():
-        group, fresh = set[int](), {first} - seen
-        while fresh:
-            group |= fresh
-            fresh = set(np.flatnonzero(close[sorted(fresh)].any(0)).tolist()) - group
-        seen |= group
-        members = sorted(group)
-        if bias[members].any():
-            most = np.abs(correlation[np.ix_(members, members)] - np.eye(len(members))).max()
+    close = np.abs(np.triu(correlation, 1)) > TIED
+    _, group = connected_components(close, directed=False)
+    for number in np.unique(group[bias]):
+        members = np.flatnonzero(group == number)
+        if len(members) > 1:
+            most = np.abs(np.triu(correlation[np.ix_(members, members)], 1)).max()
             found.append(f"hard to tell apart: {_listed([labels[i] for i in members])} (correlated up to {most:.5f})")
     return found
 

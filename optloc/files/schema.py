@@ -76,8 +76,8 @@ class StationsTable(DataTable):
     """Axes that angles refer to: the frame's, or east, north, up at each station (default on Earth)."""
     sigma: Amount | None = None
     """Standard deviation of each coordinate of the positions; None: surveyed exactly."""
-    span: Literal["epoch", "run"] = "epoch"
-    """Whether a position error is drawn anew at each epoch or lasts the whole run."""
+    span: Literal["epoch", "run", "noise"] = "epoch"
+    """Whether a position error is an unknown of each epoch or of the whole run; or drawn anew at each epoch and noise."""
 
 
 class MeasurementsTable(DataTable):

@@ -40,8 +40,9 @@ def recursion(scenario: Scenario, z: Array, start: Array, *, first: int = FIRST,
     """
     trials, epochs = z.shape[:2]
     out = np.empty((trials, epochs - first + 1, start.shape[-1] + z.shape[-1]))
-    arrivals = np.concatenate([np.zeros((trials, epochs, 1)), z], axis=-1).swapaxes(1, 2)
-    track, times = scenario.track(epochs).T, scenario.times(epochs)
+    arrivals = np.zeros((trials, z.shape[-1] + 1, epochs))
+    arrivals[:, 1:] = z.swapaxes(1, 2)
+    track, times = np.ascontiguousarray(scenario.track(epochs).T), scenario.times(epochs)
     with np.errstate(all="ignore"):
         for low in range(0, trials, _BLOCK):
             part = slice(low, low + _BLOCK)

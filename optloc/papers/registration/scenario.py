@@ -9,6 +9,7 @@ import numpy as np
 
 from optloc.bias import with_bias
 from optloc.build import assemble, measured
+from optloc.noise import Block, Noise
 from optloc.problem import Problem
 from optloc.types import Array, Motion, Stations
 
@@ -18,6 +19,9 @@ SPEED = 3e8
 NANOSECOND = 1e-9 * SPEED
 
 Shape = Literal["full", "half", "diag"]
+
+# Variance of a row's own noise, and of what all rows of an epoch share, over sigma squared.
+_SHAPES: dict[Shape, tuple[float, float]] = {"full": (1.0, 1.0), "half": (0.5, 0.5), "diag": (1.0, 0.0)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,8 +138,8 @@ def problem(
     prior : float, optional
         Prior standard deviation of the biases of the range differences, metres; None: unknown.
     shape : "full", "half" or "diag"
-        Covariance of the differences of an epoch, sigma^2 times I + 11', its half, or I: the paper's text allows all
-        three, its numbers only the first.
+        Covariance of the rows of one kind and epoch: sigma^2 times I + 11', its half, or I. The paper's text allows
+        all three, its numbers only the first.
 
     Returns
     -------
@@ -144,10 +148,8 @@ def problem(
     """
     count, spread = len(scenario.position), scenario.sigma if sigma is None else sigma
     a, epoch = np.tile(np.arange(1, count), epochs), np.repeat(np.arange(epochs), count - 1)
-    sigmas = {"sigma": spread} if shape == "diag" else {"arrival_sigma": spread * (np.sqrt(0.5) if shape == "half" else 1.0)}
-    rows = [measured("tdoa", a=a, b=0, epoch=epoch, **sigmas)]
-    if gain_sigma is not None:
-        rows.append(measured("groa", a=a, b=0, epoch=epoch, sigma=gain_sigma))
+    kinds = {"tdoa": spread} if gain_sigma is None else {"tdoa": spread, "groa": gain_sigma}
+    rows = [measured(kind, a=a, b=0, epoch=epoch, sigma=size) for kind, size in kinds.items()]
     covariance = np.broadcast_to(station_sigma**2 * np.eye(3), (count, 3, 3)) if station_sigma else None
     made = assemble(
         Stations(scenario.track(epochs), scenario.names, covariance=covariance, span="noise"),
@@ -155,7 +157,14 @@ def problem(
         times=scenario.times(epochs),
         motions=[Motion(order=0 if scenario.course is None else 1)],
     )
-    made = with_bias(made, "delay", per="pair", kind="tdoa", sigma=prior)
+    own, common = _SHAPES[shape]
+    unit = own * np.eye(count - 1) + common
+    members = np.arange(made.count).reshape(-1, count - 1)
+    blocks = [
+        Block(part, size**2 * unit[None])
+        for part, size in zip(np.split(members, len(kinds)), kinds.values(), strict=True)
+    ]
+    made = with_bias(replace(made, noise=Noise(tuple(blocks))), "delay", per="pair", kind="tdoa", sigma=prior)
     return made if gain_sigma is None else with_bias(made, "gain", per="pair", kind="groa")
 
 

@@ -1,0 +1,271 @@
+r"""Registration without a guess: place, course and biases from range differences of moving stations, in closed form.
+
+At times :math:`t_k` stations :math:`s_i(k)` measure range offsets to a reference station 0,
+
+.. math:: r_i(k) = c_i(k) - E_i(k) \delta + \sigma_i r_0(k), \qquad r_i(k) = |x(t_k) - s_i(k)|,
+          \qquad x(t) = \sum_j \theta_j t^j / j!,
+
+with unknown biases :math:`\delta`. Squaring and subtracting :math:`r_0^2` leaves, with
+:math:`m_i = c_i - E_i \hat\delta` and :math:`\delta = \hat\delta + \varepsilon`, rows that are linear in
+:math:`(\theta, \varepsilon, r_0(k))` to first order in the small :math:`\varepsilon`:
+
+.. math:: (s_i - s_0)' x + \sigma_i m_i r_0 - r_i E_i \varepsilon = \tfrac12 (|s_i|^2 - |s_0|^2 - m_i^2).
+
+*Stage 0* takes every :math:`r_0(k)` as free and projects it out. *Stage 1* ties them to the course,
+:math:`r_0 \approx (\hat r_0^2 + r_0^2) / 2 \hat r_0` with :math:`r_0^2 = \sum_j \lambda_j t^j - 2 s_0' x + |s_0|^2`, linear in
+:math:`\theta` and the lifts :math:`\lambda` of :math:`|x(t)|^2`. For a fixed target the one lift is :math:`|x|^2`, and all
+stationary points of that problem with its quadratic constraint are found exactly. Stations in one plane leave the
+distance from it open; it follows from :math:`r_0` up to its sign, which gives two branches.
+
+Rows are divided by :math:`r_i`, so that their errors are those of the ranges. All lengths are in one unit in which
+stations and target are of order one to a hundred.
+
+Sources: Y. T. Chan and K. C. Ho, "A simple and efficient estimator for hyperbolic location", IEEE Trans. Signal
+Process. 42 (1994), for the lifted rows; A. Beck, P. Stoica, J. Li, IEEE Trans. Signal Process. 56 (2008), for the exact
+constraint. Biases, free reference ranges over time and branches are this package's own.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import factorial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formulations.squared_range import paraboloid, stationary
+
+Array = NDArray[np.float64]
+
+_PASSES = 4
+_LIFTED_PASSES = 3
+_CUT = 1e-10
+_LIFTED_CUT = 1e-14
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """Range offsets of a batch of N problems at B times.
+
+    Parameters
+    ----------
+    time : Array, shape (B,)
+        Times, of order one.
+    station : Array, shape (N or 1, B, S + 1, d)
+        Stations, the reference first.
+    offset : Array, shape (N, B, S)
+        c, range of each other station less ``sign`` times the range of the reference.
+    sign : Array, shape (S,)
+        +1, or -1 where ranges add up.
+    bias : Array, shape (N or 1, B, S, q)
+        E, what the biases add to the offsets.
+    whiten : Array, shape (N or 1, B or 1, S, S)
+        Whitening matrices of the offsets; zero rows where a station is silent.
+    mean, sigma : Array, shape (q,)
+        Prior of the biases; infinite `sigma` for none.
+    """
+
+    time: Array
+    station: Array
+    offset: Array
+    sign: Array
+    bias: Array
+    whiten: Array
+    mean: Array
+    sigma: Array
+
+
+@dataclass(slots=True)
+class _Guess:
+    """What the passes hand on: biases (N, q) and ranges of the reference (N, B)."""
+
+    bias: Array
+    reference: Array
+
+
+def candidates(course: Course, order: int = 0) -> tuple[Array, Array]:
+    """Return starting points of a registration.
+
+    Parameters
+    ----------
+    course : Course
+        N problems.
+    order : 0, 1 or 2
+        Fixed target, constant velocity, constant acceleration.
+
+    Returns
+    -------
+    state : Array, shape (N, C, order + 1, d)
+        Candidates; NaN where there is none.
+    bias : Array, shape (N, q)
+        Biases that belong to them.
+    """
+    with np.errstate(all="ignore"):
+        guess = _free_ranges(course, order)
+        state = np.full((len(course.offset), 1, order + 1, course.station.shape[-1]), np.nan)
+        for _ in range(_LIFTED_PASSES):
+            state, guess = _lifted_ranges(course, guess, order)
+        branches = _branches(course, state[:, 0], guess.reference)
+    return np.concatenate([state, branches], axis=1), guess.bias
+
+
+def _powers(course: Course, count: int) -> Array:
+    """Return the powers t^j / j! (B, count)."""
+    return np.stack([course.time**j / factorial(j) for j in range(count)], axis=-1)
+
+
+def _rows(course: Course, guess: _Guess, order: int) -> tuple[Array, ...]:
+    """Return offsets m, ranges r, position columns, sigma m / r and right side of the rows, each (N, B, S, ...)."""
+    m = course.offset - (course.bias @ guess.bias[:, None, :, None])[..., 0]
+    r = np.maximum(m + course.sign * guess.reference[..., None], 1e-3)
+    first, others = course.station[..., :1, :], course.station[..., 1:, :]
+    right = ((others**2).sum(-1) - (first**2).sum(-1) - m**2) / (2.0 * r)
+    return m, r, (others - first) / r[..., None], course.sign * m / r, right
+
+
+def _moved(course: Course, columns: Array, order: int) -> Array:
+    """Return columns (N, B, S, d) of a place as columns (N, B, S, (order + 1) d) of a course."""
+    powers = _powers(course, order + 1)
+    spread = powers[:, None, :, None] * columns[..., None, :]
+    return spread.reshape(*spread.shape[:-2], -1)
+
+
+def _free_ranges(course: Course, order: int) -> _Guess:
+    """Return biases and smoothed reference ranges of stage 0."""
+    size, q = len(course.offset), course.bias.shape[-1]
+    guess = _Guess(np.zeros((size, q)) + course.mean, np.ones(course.offset.shape[:2]))
+    # The first pass knows no ranges: all rows weigh alike, and biases stay at their prior means.
+    _, _, place, _, right = _rows(course, _Guess(guess.bias, guess.reference), order)
+    for turn in range(_PASSES):
+        m, r, place, gain, right = _rows(course, guess, order)
+        if turn == 0:
+            place, gain, right = place * r[..., None], gain * r, right * r
+        columns = [_moved(course, place, order)]
+        if turn:
+            columns.append(np.broadcast_to(-course.bias, (*right.shape, q)))
+        seen = course.whiten @ np.concatenate([*columns, gain[..., None], right[..., None]], axis=-1)
+        free = seen[..., -2]
+        norm = (free**2).sum(-1, keepdims=True)
+        unit = free / np.sqrt(np.where(norm > 0.0, norm, 1.0))
+        bare = np.delete(seen, -2, axis=-1)
+        bare = bare - unit[..., None] * (unit[..., None, :] @ bare)
+        y = _least_squares(bare, course, guess.bias if turn else None, _CUT)
+        rest = seen[..., -1] - (seen[..., :-2] @ y[:, None, :, None])[..., 0]
+        reference = (free * rest).sum(-1) / np.where(norm > 0.0, norm, 1.0)[..., 0]
+        bias = guess.bias + y[:, -q:] if turn and q else guess.bias
+        guess = _Guess(bias, _smoothed(course, reference, order))
+    return guess
+
+
+def _least_squares(rows: Array, course: Course, bias: Array | None, cut: float) -> Array:
+    """Return the least-squares solution (N, n) of rows [A | b] (N, B, S, n + 1); undetermined directions stay zero."""
+    flat = rows.reshape(len(rows), -1, rows.shape[-1])
+    gram = np.swapaxes(flat, -1, -2) @ flat
+    matrix, vector = gram[..., :-1, :-1].copy(), gram[..., :-1, -1].copy()
+    if bias is not None and bias.shape[1]:
+        index = np.arange(matrix.shape[-1])[-bias.shape[1] :]
+        matrix[:, index, index] += course.sigma**-2.0
+        vector[:, index] += (course.mean - bias) * course.sigma**-2.0
+    return _solved(matrix, vector, cut)
+
+
+def _solved(matrix: Array, vector: Array, cut: float) -> Array:
+    """Return the solution of scaled normal equations without their directions of (almost) no information."""
+    diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    scaled = matrix * scale[..., :, None] * scale[..., None, :]
+    good = np.isfinite(scaled).all((-1, -2))
+    values, vectors = np.linalg.eigh(np.where(good[:, None, None], scaled, np.eye(matrix.shape[-1])))
+    inverse = np.where(values > cut * values[..., -1:], 1.0 / np.where(values > 0.0, values, 1.0), 0.0)
+    inner = (np.swapaxes(vectors, -1, -2) @ (scale * vector)[..., None])[..., 0] * inverse
+    y = scale * (vectors @ inner[..., None])[..., 0]
+    return np.where(good[:, None], y, np.nan)
+
+
+def _smoothed(course: Course, reference: Array, order: int) -> Array:
+    """Return reference ranges whose squares are those of some course: r^2 - |s|^2 = lifts(t) - 2 s' x(t)."""
+    first = course.station[..., 0, :]
+    lifts = _powers(course, 2 * order + 1)
+    along = _moved(course, first[..., None, :], order)[..., 0, :]
+    basis = np.concatenate([np.broadcast_to(lifts, (*along.shape[:-1], lifts.shape[-1])), along], axis=-1)
+    known = (first**2).sum(-1)
+    square = (reference**2 - known)[..., None]
+    fitted = basis @ (np.linalg.pinv(basis, rcond=1e-9) @ square)
+    return np.sqrt(np.maximum(fitted[..., 0] + known, 1e-6))
+
+
+def _lifted_ranges(course: Course, guess: _Guess, order: int) -> tuple[Array, _Guess]:
+    """Return the candidates of stage 1 (N, C, order + 1, d), and biases and reference ranges of the best."""
+    q, d, n = course.bias.shape[-1], course.station.shape[-1], (order + 1) * course.station.shape[-1]
+    _, _, place, gain, right = _rows(course, guess, order)
+    first, r = course.station[..., :1, :], guess.reference[..., None]
+    square = (first**2).sum(-1)
+    lifts = (gain / (2.0 * r))[..., None] * _powers(course, 2 * order + 1)[:, None, :]
+    columns = [
+        np.broadcast_to(-course.bias, (*right.shape, q)),
+        _moved(course, place - (gain / r)[..., None] * first, order),
+        lifts,
+        (right - gain * (r**2 + square) / (2.0 * r))[..., None],
+    ]
+    seen = course.whiten @ np.concatenate(columns, axis=-1)
+    rows = _with_prior(seen.reshape(len(seen), -1, seen.shape[-1]), course, guess.bias)
+    if order == 0:
+        y, more = _constrained(rows, q, d)
+    else:
+        y = _solved(np.swapaxes(rows[..., :-1], -1, -2) @ rows[..., :-1], (rows[..., :-1] * rows[..., -1:]).sum(-2), _LIFTED_CUT)
+        more = y[:, None, q : q + n]
+    state = more.reshape(len(more), -1, order + 1, d)
+    distance = np.maximum(_reference(course, y[:, q : q + n], y[:, q + n :], order), 1e-6)
+    return state, _Guess(guess.bias + y[:, :q], np.sqrt(distance))
+
+
+def _with_prior(rows: Array, course: Course, bias: Array) -> Array:
+    """Return rows (N, R, q + n + 1) with those of the prior of the biases, whose columns are the first."""
+    q = bias.shape[1]
+    prior = np.zeros((len(rows), q, rows.shape[-1]))
+    index = np.arange(q)
+    prior[:, index, index] = 1.0 / course.sigma
+    prior[:, index, -1] = (course.mean - bias) / course.sigma
+    return np.concatenate([rows, prior], axis=1)
+
+
+def _constrained(rows: Array, q: int, d: int) -> tuple[Array, Array]:
+    """Return the best (N, q + d + 1) and all places (N, C, d) of the rows [E | x | |x|^2 | right] with its constraint."""
+    usable = np.isfinite(rows).all((-1, -2))
+    scale = np.sqrt((rows**2).sum(1))[:, None, :]
+    scale = np.where(scale > 0.0, scale, 1.0)
+    scale[..., q : q + d] = 1.0  # the constraint knows no scales of its own
+    scale[..., -2:] = 1.0
+    upper = np.linalg.qr(np.where(usable[:, None, None], rows / scale, 0.0), mode="r")
+    points, _, valid = stationary(upper[:, q:, q:-1], upper[:, q:, -1], paraboloid(d))
+    points = np.where((valid & usable[:, None])[..., None], points, np.nan)
+    left = upper[:, :q, -1] - (upper[:, :q, q:-1] @ points[:, 0, :, None])[..., 0]
+    bias = _solved(np.swapaxes(upper[:, :q, :q], -1, -2) @ upper[:, :q, :q], (upper[:, :q, :q] * left[..., None]).sum(-2), 0.0) / scale[:, 0, :q] if q else left
+    return np.concatenate([bias, points[:, 0]], axis=-1), points[..., :d]
+
+
+def _reference(course: Course, theta: Array, lifts: Array, order: int) -> Array:
+    """Return the squared ranges (N, B) of the reference station."""
+    first = course.station[..., 0, :]
+    along = _moved(course, first[..., None, :], order)[..., 0, :]
+    inner = (along @ theta[..., None])[..., 0]
+    return lifts @ _powers(course, 2 * order + 1).T - 2.0 * inner + (first**2).sum(-1)
+
+
+def _branches(course: Course, state: Array, reference: Array) -> Array:
+    """Return two courses (N, 2, order + 1, d) on either side of the plane that the stations spread in most."""
+    first = course.station[..., 0, :]
+    apart = course.station[..., 1:, :] - first[..., None, :]
+    apart = apart.reshape(len(apart), -1, apart.shape[-1])
+    _, vectors = np.linalg.eigh(np.swapaxes(apart, -1, -2) @ apart)
+    normal = vectors[..., 0][:, None]
+    powers = _powers(course, state.shape[1])
+    away = powers @ state - first
+    height = (away * normal).sum(-1)
+    inside = (away**2).sum(-1) - height**2
+    beside = np.sqrt(np.maximum(reference**2 - inside, 0.0))
+    level = (first * normal).sum(-1)
+    fit = np.linalg.pinv(powers)
+    flat = state - ((state * normal).sum(-1, keepdims=True)) * normal
+    sides = [flat + ((level + side * beside) @ fit.T)[..., None] * normal for side in (1.0, -1.0)]
+    return np.stack(sides, axis=1)

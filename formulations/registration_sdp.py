@@ -1,0 +1,314 @@
+r"""Biased range differences of moving stations: a semidefinite start for the target and the biases.
+
+Windows k of a run, station i at :math:`s_i(k)` (the first is the reference), target :math:`p_k = p + v t_k` (`v = 0`
+for a fixed one), biases :math:`\delta` common to all windows,
+
+.. math:: z_i(k) = r_i(k) - r_1(k) + (E \delta)_i + n_i(k), \quad r_i = |p_k - s_i(k)|, \quad W_k n(k) \sim N(0, I),
+   \quad \delta \sim N(\mu, \operatorname{diag} \sigma^2).
+
+With :math:`f_i = z_i - (E\mu)_i - (r_i - r_1)`, what the geometry leaves over, everything is quadratic in :math:`y =
+(1, p, v, r_1(k), f_i(k))`: the cost once the biases are eliminated, :math:`f^\top M f`, and the definitions of the
+ranges,
+
+.. math:: r_1^2 = |p_k - s_1|^2, \qquad (z_i - f_i)^2 + 2 r_1 (z_i - f_i) = |p_k - s_i|^2 - |p_k - s_1|^2 .
+
+The lift :math:`Y = y y^\top` is relaxed to :math:`Y \succeq 0` and solved with the price :math:`\eta \,
+\operatorname{mean}_k |p_k|^2`, read off the lift. Small unknowns are lifted in small units: the leftovers, not the
+ranges :math:`r_i`, whose squares would hide them from an interior-point method.
+
+Both the price and the prior are needed. A misfit `m` of the second equality can be absorbed in the moments alone,
+:math:`2 \operatorname{cov}(r_1, f) = m`, for which :math:`\operatorname{var}(r_1) \operatorname{var}(f) \ge m^2 / 4`
+suffices. Without the price, :math:`\operatorname{var}(r_1)`, that is the trace, grows without end and every target has
+cost zero in the limit; with it a misfit costs :math:`\sqrt{\eta M_{ff}} \, |m|`. Without the prior, `M` is blind to
+leftovers common to all windows, so that such misfits cost nothing again and the price draws the target into the
+array. The relaxation is never tight (second over first eigenvalue 0.03 to 0.2): it gives starts, not bounds.
+
+The best price depends on the unknown distance: too high, and it draws the target in; too low, and the slack throws it
+out. So a ladder of prices is solved, and the answers are ranked by the cost of the data at their targets.
+
+Sources: N. Z. Shor, "Quadratic optimization problems", Sov. J. Comput. Syst. Sci. 25 (1987) (the lift); K. W. T. Lui,
+W.-K. Ma, H. C. So and F. K. W. Chan, "Semi-definite programming algorithms for sensor network node localization with
+uncertainties in anchor positions and/or propagation speed", IEEE Trans. Signal Process. 57 (2009) (nuisance parameters
+in the lift); the leftovers, the price and its reason are this project's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from formulations.conic import Answer, Relaxation
+
+Array = NDArray[np.float64]
+
+PRICES = (10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01)
+"""Prices eta of the squared distance from the array's centre, in units of its mean squared extent."""
+
+
+@dataclass(frozen=True, slots=True)
+class Started:
+    """One answer of the relaxation.
+
+    Parameters
+    ----------
+    target : Array, shape (1, d) or (2, d)
+        Position; for a moving target position at time zero and velocity.
+    bias : Array, shape (b,)
+        The biases that fit best at this target.
+    cost : float
+        Cost of the windows at target and bias, ``sum |W (z - h - E bias)|^2 + sum ((bias - mean) / sigma)^2``.
+    price : float
+        The price that led here.
+    misfit : float
+        The same cost as the relaxation sees it; far below what noise leaves.
+    slack : float
+        Mean over the windows of the lifted ``|p_k|^2`` less its value at the target, length squared.
+    rank_ratio : float
+        Second over first eigenvalue of the lift in its own units; near zero would mean tight.
+    answer : Answer
+        The solver's report.
+    """
+
+    target: Array
+    bias: Array
+    cost: float
+    price: float
+    misfit: float
+    slack: float
+    rank_ratio: float
+    answer: Answer
+
+
+def registration_problem(windows: int, stations: int, dimension: int, order: int) -> Any:
+    """Build the relaxation as a cvxpy problem.
+
+    Parameters
+    ----------
+    windows, stations, dimension : int
+        K, S and d.
+    order : int
+        Zero for a fixed target, one for a uniformly moving one.
+
+    Returns
+    -------
+    cvxpy.Problem
+        Variable ``lift`` of size 1 + n + K + K (S - 1), n = d (order + 1), in the order of `y`. Parameters ``form``,
+        the matrix M, ``price`` (n, n), ``moment`` (K, order + 1, order + 1) flattened to (K, ...), whose entries
+        weigh the inner products of p and v in ``|p_k|^2``; of ``r_1^2 = |p_k|^2 + near'(1, p, v)`` the rows ``near``
+        (K, n + 1); of ``unit f^2 - 2 r_1 f + level'(1, p, v) + ahead r_1 - turn f = 0`` the rows ``level``
+        (K (S - 1), n + 1), ``ahead`` and ``turn`` (K (S - 1),), and the scalar ``unit``.
+
+    Notes
+    -----
+    Shor (1987).
+    """
+    import cvxpy as cp
+
+    n, count = dimension * (order + 1), windows * (stations - 1)
+    first, last = 1 + n, 1 + n + windows
+    lift = cp.Variable((last + count, last + count), symmetric=True, name="lift")
+    form, price = cp.Parameter((count, count), name="form"), cp.Parameter((n, n), name="price")
+    moment = cp.Parameter((windows, (order + 1) ** 2), name="moment")
+    near, level = cp.Parameter((windows, n + 1), name="near"), cp.Parameter((count, n + 1), name="level")
+    ahead, turn = cp.Parameter(count, name="ahead"), cp.Parameter(count, name="turn")
+    unit = cp.Parameter(name="unit")
+    head, square = lift[0, :first], cp.diag(lift)
+    parts = [slice(1 + i * dimension, 1 + (i + 1) * dimension) for i in range(order + 1)]
+    inner = cp.hstack([cp.trace(lift[a, b]) for a in parts for b in parts])
+    owner = np.repeat(np.arange(first, last), stations - 1)
+    cross = lift[owner, np.arange(last, last + count)]
+    rules = [
+        lift >> 0,
+        lift[0, 0] == 1,
+        square[first:last] == moment @ inner + near @ head,
+        unit * square[last:] - 2 * cross + level @ head + cp.multiply(ahead, lift[0, owner])
+        == cp.multiply(turn, lift[0, last:]),
+    ]
+    cost = cp.sum(cp.multiply(form, lift[last:, last:])) + cp.sum(cp.multiply(price, lift[1:first, 1:first]))
+    return cp.Problem(cp.Minimize(cost), rules)
+
+
+@lru_cache(maxsize=16)
+def _built(windows: int, stations: int, dimension: int, order: int, backend: str) -> Relaxation:
+    return Relaxation(registration_problem(windows, stations, dimension, order), backend=backend)
+
+
+def registration(
+    station: ArrayLike,
+    z: ArrayLike,
+    whiten: ArrayLike,
+    sigma: ArrayLike,
+    *,
+    design: ArrayLike | None = None,
+    mean: ArrayLike = 0.0,
+    time: ArrayLike | None = None,
+    prices: tuple[float, ...] = PRICES,
+    backend: str = "CLARABEL",
+) -> tuple[Started, ...]:
+    """Solve the relaxation for a ladder of prices.
+
+    Parameters
+    ----------
+    station : array_like, shape (K, S, d)
+        Positions in each window, the reference first; d is 2 or 3, any unit of length.
+    z : array_like, shape (K, S - 1)
+        Averaged range differences ``r_i - r_1`` plus bias, same unit.
+    whiten : array_like, shape (K, S - 1, S - 1) or (S - 1, S - 1)
+        Whitening matrices W of the averaged rows, ``W'W`` their inverse covariance.
+    sigma : array_like, shape (b,)
+        Prior standard deviations of the biases, positive and finite.
+    design : array_like, shape (S - 1, b), optional
+        E; one bias for each row if not given.
+    mean : array_like, shape (b,) or ()
+        Prior means.
+    time : array_like, shape (K,), optional
+        Times of the windows, for a uniformly moving target; without them it is fixed.
+    prices : tuple of float
+        Prices eta, in units of the inverse mean squared distance of the stations from their mean over all windows.
+    backend : str
+        Conic solver.
+
+    Returns
+    -------
+    tuple of Started
+        One for each price that was solved, lowest cost first: starts to be refined. Empty where the solver gave none.
+
+    Raises
+    ------
+    ValueError
+        A prior standard deviation is not positive and finite: without one there is no start.
+
+    Notes
+    -----
+    The module's text. Shifted and scaled inside, so the answer does not depend on origin or unit. Built once per
+    shape and back end in each process.
+    """
+    run = _Run.of(station, z, whiten, sigma, design, mean, time)
+    K, S, d = run.station.shape
+    order = run.power.shape[1] - 1
+    relaxation, data = _built(K, S, d, order, backend), _parameters(run)
+    weight = np.kron(run.power.T @ run.power / K, np.eye(d))
+    found = []
+    for price in prices:
+        answer = relaxation.solve({**data, "price": price * weight}, bound=False)
+        lift = answer.values["lift"]
+        if np.isfinite(lift).all():
+            found.append(_started(run, lift, weight, price, answer))
+    return tuple(sorted(found, key=lambda one: one.cost))
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """The data about the stations' mean in units of their extent; biases and leftovers in `unit` of these.
+
+    `gram` is the information of the rows, `gain` times it the biases of leftovers, `prior` the biases' information.
+    """
+
+    station: Array
+    z: Array
+    gram: Array
+    design: Array
+    prior: Array
+    mean: Array
+    power: Array
+    unit: float
+    origin: Array
+    scale: float
+    clock: tuple[float, float]
+
+    @classmethod
+    def of(
+        cls,
+        station: ArrayLike,
+        z: ArrayLike,
+        whiten: ArrayLike,
+        sigma: ArrayLike,
+        design: ArrayLike | None,
+        mean: ArrayLike,
+        time: ArrayLike | None,
+    ) -> _Run:
+        s, rows, W, spread = (np.asarray(a, dtype=np.float64) for a in (station, z, whiten, sigma))
+        if not (np.isfinite(spread) & (spread > 0)).all():
+            raise ValueError("every bias needs a prior standard deviation that is positive and finite")
+        K, C = rows.shape
+        E = np.eye(C) if design is None else np.asarray(design, dtype=np.float64)
+        mu = np.broadcast_to(np.asarray(mean, dtype=np.float64), spread.shape)
+        gram = np.broadcast_to(np.swapaxes(W, -1, -2) @ W, (K, C, C))
+        origin = s.mean(axis=(0, 1))
+        scale = float(np.sqrt(((s - origin) ** 2).sum(axis=-1).mean()))
+        # the size of a leftover: what the prior says of the biases in the rows
+        fine = float(np.sqrt(((E * spread) ** 2).sum(axis=1).mean()))
+        middle, half, power = 0.0, 1.0, np.ones((K, 1))
+        if time is not None:
+            t = np.asarray(time, dtype=np.float64)
+            middle, half = float(t.mean()), float(np.ptp(t)) / 2 or 1.0
+            power = np.stack([np.ones(K), (t - middle) / half], axis=1)
+        place, seen = (s - origin) / scale, (rows - E @ mu) / scale
+        prior, unit = (fine / spread) ** 2, fine / scale
+        return cls(place, seen, gram * fine**2, E, prior, mu, power, unit, origin, scale, (middle, half))
+
+    def biases(self, left: Array) -> Array:
+        """Shifts from the prior mean that fit leftovers (K, C) best, both in the fine unit."""
+        total = self.design.T @ self.gram.sum(axis=0) @ self.design + np.diag(self.prior)
+        right = self.design.T @ np.einsum("kij,kj->i", self.gram, left)
+        return np.asarray(np.linalg.solve(total, right), dtype=np.float64)
+
+    def form(self) -> Array:
+        """M: the blocks of the rows less what the biases explain."""
+        K, C, _ = self.gram.shape
+        total = self.design.T @ self.gram.sum(axis=0) @ self.design + np.diag(self.prior)
+        along = (self.gram @ self.design).reshape(K * C, -1)
+        blocks = np.zeros((K, C, K, C))
+        blocks[np.arange(K), :, np.arange(K)] = self.gram
+        return np.asarray(blocks.reshape(K * C, K * C) - along @ np.linalg.solve(total, along.T), dtype=np.float64)
+
+
+def _parameters(run: _Run) -> dict[str, Array]:
+    """Coefficients of the lifted equalities."""
+    K, S, _ = run.station.shape
+    power, first, other = run.power, run.station[:, 0], run.station[:, 1:]
+    size = (run.station**2).sum(axis=-1)
+    lever = np.einsum("ko,kid->kiod", power, other - first[:, None]).reshape(K, S - 1, -1)
+    level = np.concatenate([(run.z**2 - size[:, 1:] + size[:, :1])[..., None], 2 * lever], axis=-1)
+    slope = np.einsum("ko,kd->kod", power, first).reshape(K, -1)
+    return {
+        "form": run.form(),
+        "moment": np.einsum("ka,kb->kab", power, power).reshape(K, -1),
+        "near": np.concatenate([size[:, :1], -2 * slope], axis=1),
+        "level": level.reshape(K * (S - 1), -1) / run.unit,
+        "ahead": 2 * run.z.ravel() / run.unit,
+        "turn": 2 * run.z.ravel(),
+        "unit": np.array(run.unit),
+    }
+
+
+def _started(run: _Run, lift: Array, weight: Array, price: float, answer: Answer) -> Started:
+    n, d = len(weight), run.station.shape[-1]
+    y, values = lift[0, 1 : n + 1], np.linalg.eigvalsh(lift)
+    target = y.reshape(-1, d)
+    away = np.linalg.norm((run.power @ target)[:, None] - run.station, axis=-1)
+    left = (run.z - away[:, 1:] + away[:, :1]) / run.unit
+    shift = run.biases(left)
+    rest = left - run.design @ shift
+    cost = float(np.einsum("ki,kij,kj", rest, run.gram, rest) + run.prior @ shift**2)
+    square = float((weight * lift[1 : n + 1, 1 : n + 1]).sum())
+    middle, half = run.clock
+    plain = run.scale * target
+    if len(plain) == 2:
+        plain[1] /= half
+        plain[0] -= middle * plain[1]
+    plain[0] += run.origin
+    return Started(
+        plain,
+        run.mean + run.unit * run.scale * shift,
+        cost,
+        price,
+        answer.primal - price * square,
+        run.scale**2 * (square - float(y @ weight @ y)),
+        float(abs(values[-2]) / values[-1]),
+        answer,
+    )

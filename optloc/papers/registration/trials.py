@@ -1,0 +1,217 @@
+"""Monte Carlo trials of a scene: the paper's recursion and the route without a guess on the same data."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from optloc.bounds import crlb
+from optloc.fix import Fix
+from optloc.papers.registration.recursion import FIRST, recursion
+from optloc.papers.registration.scenario import PRINTED, Scenario, problem, truth
+from optloc.papers.report import Tick
+from optloc.problem import Problem
+from optloc.simulate import simulate
+from optloc.solve import solve
+from optloc.types import Array
+
+FAR = 10.0
+"""An estimate further from the truth than this many bounds is lost."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What is drawn.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Stations and target.
+    trials : int
+        Independent draws.
+    seed : int
+        Seed of the whole reproduction.
+    key : int
+        Number of this draw within it.
+    sigma, station_sigma, gain_sigma : float, optional
+        As `problem` takes them.
+    """
+
+    scenario: Scenario
+    trials: int
+    seed: int
+    key: int
+    sigma: float | None = None
+    station_sigma: float = 1.0
+    gain_sigma: float | None = None
+
+    def problem(self, epochs: int) -> Problem:
+        """Return the problem of the first epochs, without measurements."""
+        return problem(
+            self.scenario,
+            epochs,
+            sigma=self.sigma,
+            station_sigma=self.station_sigma,
+            gain_sigma=self.gain_sigma,
+        )
+
+    def draw(self, epochs: int) -> Problem:
+        """Return all trials, measured."""
+        made = self.problem(epochs)
+        return simulate(made, truth(self.scenario, made), self._sequence(0), self.trials)
+
+    def first(self, drawn: Problem, epochs: int) -> Problem:
+        """Return the first epochs of what was drawn."""
+        return self.problem(epochs).with_rows(z=drawn.z[..., drawn.epoch < epochs])
+
+    def bound(self, epochs: int) -> Array:
+        """Return the Cramer-Rao bound of the shared unknowns (n, n) after some epochs."""
+        made = self.problem(epochs)
+        return crlb(made, truth(self.scenario, made))
+
+    def starts(self, factor: float) -> Array:
+        """Return Gaussian starts (trials, n) around the truth, `factor` one-shot standard deviations wide.
+
+        A moving target's velocity is wrong by `factor` times 10 m/s in each coordinate.
+        """
+        scene = self.scenario
+        rng = np.random.default_rng(self._sequence(1))
+        spread, centre = one_shot(scene), scene.target
+        if scene.course is not None:
+            spread, centre = np.concatenate([spread, np.full(3, 10.0)]), np.concatenate([centre, scene.course])
+        return np.asarray(centre + factor * spread * rng.standard_normal((self.trials, len(centre))))
+
+    def _sequence(self, purpose: int) -> np.random.SeedSequence:
+        return np.random.SeedSequence(self.seed, spawn_key=(self.key, purpose))
+
+
+def one_shot(scenario: Scenario = PRINTED) -> Array:
+    """Return the bound of each coordinate (3,) at t = 0 from one epoch with known biases, metres: the paper's sigma0."""
+    still = Scenario(scenario.position, scenario.velocity, scenario.target, sigma=scenario.sigma)
+    made = problem(still, 1, prior=1e-6)
+    return np.asarray(np.sqrt(np.diagonal(crlb(made, truth(still, made)))[:3]))
+
+
+def rms(bound: Array) -> float:
+    """Return the root mean square of the length of a position error with a covariance (n, n)."""
+    return float(np.sqrt(np.trace(bound[:3, :3])))
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """Estimates of one kind of all trials, against the truth.
+
+    Parameters
+    ----------
+    error : array (trials, n)
+        Estimate less truth, SI units; not finite where there is none.
+    lost : bool array (trials,)
+        Estimates without sense: not finite, or further away than `FAR` bounds.
+    """
+
+    error: Array
+    lost: Array
+
+    @property
+    def rmse(self) -> float:
+        """Return the root mean square position error of the trials that are not lost, metres."""
+        kept = self.error[~self.lost, :3]
+        return float(np.sqrt((kept**2).sum(-1).mean())) if len(kept) else float("nan")
+
+    @property
+    def share(self) -> float:
+        """Return the share of lost trials."""
+        return float(self.lost.mean())
+
+
+def score(estimate: Array, exact: Array, bound: Array) -> Score:
+    """Return the score of estimates (trials, n) of a truth (n,) with a bound (n, n)."""
+    error = estimate - exact
+    with np.errstate(invalid="ignore", over="ignore"):
+        far = ~((error[:, :3] ** 2).sum(-1) < (FAR * rms(bound)) ** 2)
+    return Score(error, far | ~np.isfinite(error).all(-1))
+
+
+def branch(fix: Fix, exact: Array) -> Array:
+    """Return of every fix and its alternatives the vector (trials, n) nearest to a truth in position.
+
+    For a target that moves straight two mirror images explain the data exactly; both are listed.
+    """
+    pool = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
+    with np.errstate(invalid="ignore"):
+        apart = ((pool[..., :3] - exact[:3]) ** 2).sum(-1)
+    best = np.argmin(np.where(np.isfinite(apart), apart, np.inf), axis=1)
+    return np.asarray(pool[np.arange(len(pool)), best])
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """Scores after growing numbers of epochs.
+
+    Parameters
+    ----------
+    setting : Setting
+        What was drawn.
+    epochs : tuple of int
+        Numbers of epochs.
+    bounds : tuple of array (n, n)
+        Cramer-Rao bound at each.
+    plain : tuple of Score, or None
+        The paper's recursion on the range differences.
+    found : tuple of Score
+        The fix without a guess.
+    listed : tuple of float
+        Share of fixes that list more than one place.
+    """
+
+    setting: Setting
+    epochs: tuple[int, ...]
+    bounds: tuple[Array, ...]
+    plain: tuple[Score, ...] | None
+    found: tuple[Score, ...]
+    listed: tuple[float, ...]
+
+
+def course(setting: Setting, epochs: Sequence[int], tick: Tick, *, factor: float | None = 1.0) -> Course:
+    """Return the scores of both routes on the same data.
+
+    Parameters
+    ----------
+    setting : Setting
+        What is drawn.
+    epochs : sequence of int
+        Numbers of epochs to look at.
+    tick : callable
+        Called after each of them, and after the recursion.
+    factor : float, optional
+        Width of the recursion's starts; None leaves the recursion out.
+    """
+    drawn = setting.draw(max(epochs))
+    bounds = tuple(setting.bound(k) for k in epochs)
+    exact = truth(setting.scenario, drawn)
+    plain = None
+    if factor is not None:
+        plain = tuple(wander(setting, drawn, factor, epochs, bounds))
+        tick()
+    found, listed = [], []
+    for k, bound in zip(epochs, bounds, strict=True):
+        fix = solve(setting.first(drawn, k))
+        moving = setting.scenario.course is not None
+        found.append(score(branch(fix, exact) if moving else fix.x, exact, bound))
+        listed.append(float(np.isfinite(fix.alternatives.gap).any(-1).mean()))
+        tick()
+    return Course(setting, tuple(epochs), bounds, plain, tuple(found), tuple(listed))
+
+
+def wander(
+    setting: Setting, drawn: Problem, factor: float, epochs: Sequence[int], bounds: Sequence[Array]
+) -> list[Score]:
+    """Return the scores of the paper's recursion after some numbers of epochs."""
+    scene = setting.scenario
+    differences = drawn.z[..., : drawn.rows[0].count]
+    z = differences.reshape(setting.trials, drawn.epochs, -1)
+    estimates = recursion(scene, z, setting.starts(factor))
+    exact = truth(scene, drawn)[: estimates.shape[-1]]
+    return [score(estimates[:, k - FIRST], exact, bound) for k, bound in zip(epochs, bounds, strict=True)]
