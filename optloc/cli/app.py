@@ -142,7 +142,13 @@ def simulate(
     raise typer.Exit(run_simulate(file, truth, velocity, out, geodetic=geodetic, seed=seed, trials=trials, quiet=quiet))
 
 
-@app.command(epilog=example("optloc crlb site.toml --at 1200,800,50", "optloc crlb site.toml"))
+@app.command(
+    epilog=example(
+        "optloc crlb site.toml --at 1200,800,50",
+        "optloc crlb site.toml",
+        "optloc crlb flight.toml --at 200e3,300e3,0 --plot bound.png",
+    )
+)
 def crlb(
     file: ProblemPath,
     at: Annotated[
@@ -150,12 +156,18 @@ def crlb(
     ] = None,
     velocity: Annotated[str | None, typer.Option(metavar="X,Y[,Z]", help="Velocity of a moving target, m/s.")] = None,
     geodetic: Geodetic = False,
+    plot: Annotated[
+        Path | None, typer.Option("--plot", metavar="OUT.png", help="Draw the bound of a run against time.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
-    """Print the Cramer-Rao bound: the accuracy that no unbiased estimate beats."""
+    """Print the Cramer-Rao bound: the accuracy that no unbiased estimate beats.
+
+    Of a run whose epochs share unknowns (a motion, biases) it is also given after its first 1, 2, ... epochs.
+    """
     from optloc.cli.bounds import run_crlb
 
-    raise typer.Exit(run_crlb(file, at, velocity, geodetic=geodetic, as_json=as_json))
+    raise typer.Exit(run_crlb(file, at, velocity, geodetic=geodetic, as_json=as_json, plot=plot))
 
 
 @app.command(epilog=example("optloc check site.toml"))

@@ -9,66 +9,106 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from optloc.cli.output import dumps, write_text
+from optloc.bounds import Course
+from optloc.cli.course import course_records, course_table, courses
+from optloc.cli.output import dumps, saved, write_text
 from optloc.ellipse import error_ellipse
 from optloc.epochs import by_epoch, separable
 from optloc.errors import InvalidProblem
 from optloc.files import Loaded, read
-from optloc.layout import state_names
+from optloc.layout import Slot, state_names
 from optloc.problem import Problem
 from optloc.types import Array
 
 
-def run_crlb(file: Path, at: str | None, velocity: str | None, *, geodetic: bool, as_json: bool) -> int:
-    """Print the Cramer-Rao bound at a truth or at the fix, and return the exit code."""
+def run_crlb(
+    file: Path, at: str | None, velocity: str | None, *, geodetic: bool, as_json: bool, plot: Path | None = None
+) -> int:
+    """Print the Cramer-Rao bound at a truth or at the fix, draw it against time, and return the exit code."""
     from optloc.bounds import crlb
 
-    loaded = read(file, values=at is None)
+    loaded = read(file, values=False)
     problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
-    if at is None:
-        from optloc.solve import solve
-
-        truth = solve(loaded.problem).x
-    else:
-        truth = vector(problem, at, velocity, geodetic)
+    truth = _fixed(file) if at is None and _sought(problem) else vector(problem, at, velocity, geodetic)
     bound = np.asarray(crlb(problem, truth))
-    bound = np.broadcast_to(bound, (*problem.batch_shape, *bound.shape[-2:]))
+    bound = np.broadcast_to(bound, (*problem.batch_shape, *bound.shape[-2:])).reshape(-1, *bound.shape[-2:])
     labels = loaded.epochs if problem.batch_shape else ("run" if loaded.problem.epochs > 1 else loaded.epochs[0],)
-    slots = [slot for slot in problem.layout.shared if slot.name.partition("[")[0] == "position"]
     rows = [
-        _bound(label, slot.name, cov[slot.start : slot.start + slot.size, slot.start : slot.start + slot.size])
-        for label, cov in zip(labels, bound.reshape(-1, *bound.shape[-2:]), strict=True)
-        for slot in slots
+        _bound(label, slot, cov[slot.start : slot.start + slot.size, slot.start : slot.start + slot.size])
+        for label, cov in zip(labels, bound, strict=True)
+        for slot in problem.layout.shared
     ]
+    over_time = courses(problem, truth)
+    if plot is not None:
+        _draw(plot, loaded, over_time)
     if as_json:
-        write_text(Path("-"), dumps({"file": loaded.source, "bounds": rows}))
+        course = [] if over_time is None else course_records(*over_time)
+        write_text(Path("-"), dumps({"file": loaded.source, "bounds": rows, "course": course}))
     else:
-        Console().print(_bound_table(loaded, rows))
+        console = Console()
+        console.print(_bound_table(loaded, rows))
+        if over_time is not None:
+            console.print(course_table(*over_time))
     return 0 if all(np.isfinite(row["sigma"]).all() for row in rows) and rows else 1
 
 
-def _bound(label: str, name: str, covariance: Array) -> dict[str, Any]:
-    semi_axes, _ = error_ellipse(covariance)
-    sigma = np.sqrt(np.diagonal(covariance))
-    return {"epoch": label, "unknown": name, "sigma": sigma, "ellipse95": semi_axes[::-1], "covariance": covariance}
+def _sought(problem: Problem) -> bool:
+    """Return whether the position of some target is unknown, so that it matters where it is."""
+    return any(motion.known is None for motion in problem.motions)
+
+
+def _fixed(file: Path) -> Array:
+    """Return the fix of a file that has measured values."""
+    from optloc.solve import solve
+
+    problem = read(file).problem
+    return solve(problem).x
+
+
+def _draw(path: Path, loaded: Loaded, over_time: tuple[Course, Course | None] | None) -> None:
+    from optloc.plot import plot_course
+
+    if over_time is None:
+        advice = "give the epochs something in common: a motion, or biases"
+        raise InvalidProblem("the epochs share no unknowns, so that no bound falls with time", "--plot", advice)
+    saved(plot_course(*over_time, title=f"{loaded.title}: Cramer-Rao bound"), path)
+
+
+def _bound(label: str, slot: Slot, covariance: Array) -> dict[str, Any]:
+    record = {"epoch": label, "unknown": slot.name, "entries": slot.entries, "unit": slot.unit}
+    record |= {"sigma": np.sqrt(np.diagonal(covariance))}
+    if not slot.name.startswith("position"):
+        return record
+    return record | {"ellipse95": error_ellipse(covariance)[0][::-1], "covariance": covariance}
 
 
 def _bound_table(loaded: Loaded, rows: list[dict[str, Any]], limit: int = 30) -> Table:
     table = Table(title=f"{loaded.title}: Cramer-Rao bound", title_justify="left")
-    for name in ("epoch", "unknown", "sigma, m", "95 % ellipse, m (semi-axes)"):
+    for name in ("epoch", "unknown", "sigma", "95 % ellipse, m (semi-axes)"):
         table.add_column(name)
     for row in rows[:limit]:
-        numbers = [", ".join(f"{v:.4g}" for v in row[key]) for key in ("sigma", "ellipse95")]
-        table.add_row(row["epoch"], row["unknown"], *numbers)
+        ellipse = ", ".join(f"{v:.4g}" for v in row.get("ellipse95", ()))
+        table.add_row(row["epoch"], row["unknown"], _sigmas(row), ellipse)
     if len(rows) > limit:
         table.add_row("...", "", f"{len(rows) - limit} more", "--json prints all")
     return table
 
 
-def vector(problem: Problem, position: str, velocity: str | None, geodetic: bool) -> Array:
-    """Return the true parameter vector of targets at a position; every other unknown is zero."""
-    place = _coordinates(position, "position")
-    if geodetic:
+def _sigmas(row: dict[str, Any], limit: int = 16) -> str:
+    """Return standard deviations in a line, those of members one below the other."""
+    if set(row["entries"]) <= set("xyz"):
+        return f"{', '.join(f'{v:.4g}' for v in row['sigma'])} {row['unit']}"
+    named = zip(row["entries"][:limit], row["sigma"], strict=False)
+    lines = [f"{entry}: {v:.4g} {row['unit']}".strip(": ") for entry, v in named]
+    return "\n".join(
+        [*lines, *([f"... and {len(row['entries']) - limit} more"] if len(row["entries"]) > limit else [])]
+    )
+
+
+def vector(problem: Problem, position: str | None, velocity: str | None, geodetic: bool) -> Array:
+    """Return the true parameter vector of targets at a position; biases have their prior means, the rest is zero."""
+    place = None if position is None else _coordinates(position, "position")
+    if geodetic and place is not None:
         if not problem.frame.geodetic or len(place) != 3:
             raise InvalidProblem(
                 "latitude, longitude and height need a geodetic frame and three numbers", "--geodetic", "leave it out"
@@ -90,6 +130,10 @@ def vector(problem: Problem, position: str, velocity: str | None, geodetic: bool
                 )
             slot, is_shared = layout.find(name)
             (shared if is_shared else local)[..., slot.start : slot.start + slot.size] = value
+    for bias in problem.biases:
+        if bias.sigma is not None:
+            slot, _ = layout.find(bias.name)
+            shared[slot.start : slot.start + slot.size] = np.ravel(bias.mean)
     if velocity is not None and all(motion.order == 0 for motion in problem.motions):
         raise InvalidProblem(
             "the target of this file does not move", "--velocity", 'write motion = "constant_velocity"'

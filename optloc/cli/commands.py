@@ -9,7 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from optloc.cli.fixing import Fixed, fix_file
-from optloc.cli.output import dumps, fixed_json, geojson, write_table, write_text
+from optloc.cli.output import dumps, fixed_json, geojson, saved, write_table, write_text
 from optloc.cli.show import show
 from optloc.errors import InvalidProblem
 from optloc.files import read
@@ -62,10 +62,6 @@ def run_demo(name: str, plot: Path, quiet: bool) -> int:
 
 def draw(fixed: Fixed, path: Path) -> None:
     """Draw fixes to a picture file; raise InvalidProblem where that fails."""
-    from optloc.plot import plot_fixes, save
+    from optloc.plot import plot_fixes
 
-    figure = plot_fixes(fixed.loaded.problem, fixed.fixes, title=fixed.loaded.title)
-    try:
-        save(figure, path)
-    except (OSError, ValueError) as error:
-        raise InvalidProblem(f"the picture cannot be written ({error})", str(path), "use .png, .svg or .pdf") from None
+    saved(plot_fixes(fixed.loaded.problem, fixed.fixes, title=fixed.loaded.title), path)

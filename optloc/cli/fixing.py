@@ -13,6 +13,7 @@ from optloc.cli.columns import Columns, fix_columns, joined
 from optloc.epochs import by_epoch, separable
 from optloc.files import Loaded
 from optloc.fix import Fix
+from optloc.observe import Observability, observability
 from optloc.problem import Problem
 
 CHUNK = 1024
@@ -30,16 +31,26 @@ class Fixed:
         Batches of epochs in order; one fix without batch axes where the epochs share unknowns.
     columns : dict of str to array
         The long table.
+    seen : Observability, optional
+        What the data of a run show of its biases.
     """
 
     loaded: Loaded
     fixes: tuple[Fix, ...]
     columns: Columns
+    seen: Observability | None = None
 
     @property
     def clean(self) -> bool:
         """Return whether every status is ok."""
         return all(bool((fix.code == 0).all()) for fix in self.fixes)
+
+    @property
+    def singles(self) -> Iterator[Fix]:
+        """Yield the fixes one by one."""
+        for fix in self.fixes:
+            flat = fix if fix.shape else fix.flat()
+            yield from (flat[i] for i in range(len(flat)))
 
 
 def fix_file(loaded: Loaded, method: str, quiet: bool) -> Fixed:
@@ -50,7 +61,7 @@ def fix_file(loaded: Loaded, method: str, quiet: bool) -> Fixed:
         with _bar(loaded.title, 1, quiet) as advance:
             fix = solve(loaded.problem, method=method)
             advance(1)
-        return Fixed(loaded, (fix,), fix_columns(loaded, fix, None))
+        return Fixed(loaded, (fix,), fix_columns(loaded, fix, None), _seen(loaded.problem, fix))
     fixes, tables = [], []
     batch = by_epoch(loaded.problem)
     with _bar(loaded.title, loaded.problem.epochs, quiet) as advance:
@@ -60,6 +71,12 @@ def fix_file(loaded: Loaded, method: str, quiet: bool) -> Fixed:
             tables.append(fix_columns(loaded, fix, first))
             advance(len(fix))
     return Fixed(loaded, tuple(fixes), joined(tables))
+
+
+def _seen(problem: Problem, fix: Fix) -> Observability | None:
+    """Return what the data show of biases; None where there is no fix, or no bias."""
+    biased = any(slot.members for slot in fix.layout.shared)
+    return observability(problem, fix.x) if biased and np.isfinite(fix.x).all() else None
 
 
 def _parts(batch: Problem, count: int) -> Iterator[tuple[int, Problem]]:

@@ -5,16 +5,21 @@ from __future__ import annotations
 import json
 import sys
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from optloc.cli.biases import bias_records
 from optloc.cli.columns import Columns
 from optloc.cli.fixing import Fixed
 from optloc.errors import InvalidProblem
 from optloc.fix import Active, Fix
+from optloc.observe import Observability
 from optloc.status import Status
 from optloc.types import Array
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def write_text(path: Path, text: str) -> None:
@@ -54,6 +59,16 @@ def write_table(path: Path, columns: Columns) -> None:
         raise _unwritable(path, error) from None
 
 
+def saved(figure: Figure, path: Path) -> None:
+    """Write a picture; raise InvalidProblem where that fails."""
+    from optloc.plot import save
+
+    try:
+        save(figure, path)
+    except (OSError, ValueError) as error:
+        raise InvalidProblem(f"the picture cannot be written ({error})", str(path), "use .png, .svg or .pdf") from None
+
+
 def plain(value: Any) -> Any:
     """Return a value as JSON knows it: arrays as lists, what is not finite as null."""
     if isinstance(value, dict):
@@ -76,7 +91,7 @@ def fixed_json(fixed: Fixed) -> dict[str, Any]:
     """Return all fixes of a file as one JSON value; lengths in metres, angles in degrees."""
     frame = fixed.loaded.problem.frame
     rows = _records(fixed.columns)
-    per_fix = [detail for fix in fixed.fixes for detail in _details(fix)]
+    per_fix = [_detail(fix, fixed.seen) for fix in fixed.singles]
     # One row a fix wherever it has one target and one epoch; else what belongs to the fix stands with the run.
     single = len(rows) == len(per_fix)
     stages = {stage.name: stage for fix in fixed.fixes for stage in fix.stages}
@@ -99,24 +114,21 @@ def _records(columns: Columns) -> list[dict[str, Any]]:
     return [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)]
 
 
-def _details(fix: Fix) -> list[dict[str, Any]]:
-    flat = fix if fix.shape else fix.flat()
-    return [_detail(flat[i]) for i in range(len(flat))]
-
-
-def _detail(fix: Fix) -> dict[str, Any]:
+def _detail(fix: Fix, seen: Observability | None) -> dict[str, Any]:
     certificate = fix.certificate[()]
-    shown = np.isfinite(fix.alternatives.gap)
+    others = fix.alternatives
+    shown = np.isfinite(others.gap)
     return {
         "sentence": Status(int(fix.code)).sentence,
         "alternatives": [
-            {"gap": gap, "position": alternative_position(fix, x)}
-            for x, gap in zip(fix.alternatives.x[shown], fix.alternatives.gap[shown], strict=True)
+            {"gap": gap, "probability": doubt, "position": alternative_position(fix, x)}
+            for x, gap, doubt in zip(others.x[shown], others.gap[shown], others.doubt[shown], strict=True)
         ],
         "active": [{"name": a.name, "multiplier": a.multiplier} for a in active_of(fix)],
         "certificate": {name: getattr(certificate, name, None) for name in ("proof", "reason", "method")},
-        "biases": fix.bias,
-        "bias_sigmas": {slot.name: fix.sigma(slot.name) for slot in fix.layout.shared if slot.name in fix.bias},
+        "biases": bias_records(fix, seen),
+        "not_separable": [] if seen is None else list(seen.sentences),
+        "of_each_epoch": {name: values for name, values in fix.bias.items() if not fix.layout.find(name)[1]},
     }
 
 

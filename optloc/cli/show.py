@@ -10,12 +10,13 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from optloc.cli.biases import show_biases
 from optloc.cli.columns import Columns
 from optloc.cli.fixing import Fixed
+from optloc.cli.numbers import with_sigma
 from optloc.cli.output import active_of, alternative_position
 from optloc.fix import Fix
 from optloc.status import Status
-from optloc.types import Array
 
 _GOOD, _CARE, _BAD = "green", "yellow", "red"
 
@@ -46,7 +47,10 @@ def _one(fixed: Fixed, fix: Fix, console: Console) -> None:
     if rows > 12:
         table.add_row("...", f"{rows - 12} more; --out writes all of them")
     for name, values in fix.bias.items():
-        _bias_row(table, fix, name, values)
+        slot, shared = fix.layout.find(name)
+        if not shared:
+            spread = np.sqrt(np.mean(values**2))
+            table.add_row(name, f"{values.size} values, root mean square {spread:.4g} {slot.unit}".strip())
     for active in active_of(fix):
         table.add_row(f"held by {active.name}", f"multiplier {active.multiplier:.4g} (cost per SI unit)")
     table.add_row("chi-square", _chi_square(fix))
@@ -55,6 +59,7 @@ def _one(fixed: Fixed, fix: Fix, console: Console) -> None:
         table.add_row("certificate", f"{certificate.proof}: {certificate.reason}")
     table.add_row("stages", " → ".join(stage.name for stage in fix.stages) or "none")
     console.print(table)
+    show_biases(fix, fixed.seen, console)
     _alternatives(fix, console)
 
 
@@ -96,28 +101,6 @@ def _state_rows(table: Table, columns: Columns, i: int, whose: str) -> None:
         )
 
 
-def with_sigma(value: float, sigma: float, unit: str) -> str:
-    """Return a number with its standard deviation, rounded to it; a constraint may leave it none."""
-    if sigma <= 1e-12 * (1.0 + abs(value)):
-        return f"{value:.10g} {unit} (held)"
-    if not np.isfinite(sigma):
-        return f"{value:.6g} {unit}"
-    digits = int(max(0, 1 - np.floor(np.log10(sigma))))
-    return f"{value:.{digits}f} ± {sigma:.{digits}f} {unit}"
-
-
-def _bias_row(table: Table, fix: Fix, name: str, values: Array) -> None:
-    slot, shared = fix.layout.find(name)
-    if not shared or values.ndim != 1:
-        table.add_row(
-            name, f"{values.size} values, root mean square {np.sqrt(np.mean(values**2)):.4g} {slot.unit}".strip()
-        )
-        return
-    sigma = fix.sigma(name)
-    shown = [with_sigma(v, s, slot.unit) for v, s in zip(values, sigma, strict=True)]
-    table.add_row(name, "\n".join(f"{i}: {text}" for i, text in enumerate(shown[:16])))
-
-
 def _chi_square(fix: Fix) -> str:
     if int(fix.dof) <= 0 or not np.isfinite(fix.cost):
         return "no redundancy: nothing to test"
@@ -131,11 +114,12 @@ def _alternatives(fix: Fix, console: Console) -> None:
     if not found.any():
         return
     table = Table(title="Alternatives", title_justify="left")
-    for name in ("#", "position, m", "cost gap"):
+    for name in ("#", "position, m", "cost gap", "probability"):
         table.add_column(name, justify="right")
-    for i, (x, gap) in enumerate(zip(fix.alternatives.x[found], fix.alternatives.gap[found], strict=True)):
-        point = np.ravel(alternative_position(fix, x))
-        table.add_row(str(i + 1), ", ".join(f"{v:.1f}" for v in point[:6]), f"{gap:.4g}" if gap >= 1e-3 else "0")
+    others = (fix.alternatives.x[found], fix.alternatives.gap[found], fix.alternatives.doubt[found])
+    for i, (x, gap, doubt) in enumerate(zip(*others, strict=True)):
+        point = ", ".join(f"{v:.1f}" for v in np.ravel(alternative_position(fix, x))[:6])
+        table.add_row(str(i + 1), point, f"{gap:.4g}" if gap >= 1e-3 else "0", f"{doubt:.2g}")
     console.print(table)
 
 

@@ -7,10 +7,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from optloc import __version__
 from optloc.errors import InvalidProblem
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Tick = Callable[[], None]
 """Called after each piece of work."""
@@ -63,7 +66,7 @@ class Picture:
 
     name: str
     title: str
-    figure: Any
+    figure: Figure
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +104,17 @@ class Report:
     def made(self) -> str:
         """Return the sentence that says when and how the numbers were made."""
         return f"optloc {__version__}, {datetime.now(UTC):%Y-%m-%d}, {self.facts}."
+
+
+def canvas(width: float, height: float) -> Figure:
+    """Return an empty figure of a size in inches; raise InvalidProblem where matplotlib is not installed."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise InvalidProblem(
+            "pictures need matplotlib", "reproduce", "install it with: pip install 'optloc[plot]'"
+        ) from None
+    return Figure(figsize=(width, height), layout="constrained")
 
 
 def write(report: Report, folder: Path) -> list[Path]:

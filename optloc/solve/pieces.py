@@ -1,4 +1,4 @@
-"""Starts for more than one position: target by target, epoch by epoch, then a polynomial through the fixes."""
+"""Starts for more than one position: target by target, then all epochs at once, or one by one and a polynomial."""
 
 from __future__ import annotations
 
@@ -13,11 +13,13 @@ from optloc.constraints import is_exact, needs_velocity
 from optloc.epochs import by_epoch, untied
 from optloc.fix import Fix
 from optloc.layout import state_names
+from optloc.models import MODELS
+from optloc.noise import Block, Noise, group
 from optloc.plan import elapsed
 from optloc.problem import Problem
 from optloc.solve.bistatic import course_starts
 from optloc.solve.start import static, vectors
-from optloc.types import Array, Motion
+from optloc.types import Array, Motion, Rows, Stations
 
 
 def one_position(problem: Problem) -> bool:
@@ -57,11 +59,8 @@ def from_pieces(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
 
 
 def _alone(problem: Problem, target: int) -> Problem:
-    """Return the problem of one target: the rows of the others are absent."""
-    rows = tuple(
-        replace(r, weight=np.where(r.target == target, r.weight, 0.0), target=np.zeros_like(r.target))
-        for r in problem.rows
-    )
+    """Return the problem of one target: its rows and nothing else unknown."""
+    problem = _with_rows_of(problem, target) if len(problem.motions) > 1 else problem
     motion = problem.motions[target]
     # What bounds a moving target holds at its reference time only, but a known height is as good a start elsewhere.
     constraints = tuple(
@@ -69,7 +68,36 @@ def _alone(problem: Problem, target: int) -> Problem:
         for c in problem.constraints
         if c.target == target and (motion.order == 0 or (is_exact(c) and not needs_velocity(c)))
     )
-    return replace(problem, rows=rows, motions=(motion,), biases=(), priors=(), constraints=constraints)
+    return replace(problem, motions=(motion,), biases=(), priors=(), constraints=constraints)
+
+
+def _with_rows_of(problem: Problem, target: int) -> Problem:
+    """Return the problem with the rows of one target, which becomes the first."""
+    own = [np.flatnonzero(rows.target == target) for rows in problem.rows]
+    rows = [
+        Rows(r.kind, r.z[..., i], r.a[i], r.b[i], r.epoch[i], 0 * i, r.weight[..., i], r.correction[..., i])
+        for r, i in zip(problem.rows, own, strict=True)
+        if len(i)
+    ]
+    kept = np.concatenate([start + i for start, i in zip(problem.starts, own, strict=True)])
+    return replace(problem, rows=tuple(rows), noise=_noise_of(problem.noise, kept, problem.count))
+
+
+def _noise_of(noise: Noise, kept: Array, count: int) -> Noise:
+    """Return the noise of some of the rows, which are numbered anew in their order."""
+    number = np.full(count, -1)
+    number[kept] = np.arange(len(kept))
+    blocks = []
+    for block in noise.blocks:
+        present = number[block.row] >= 0
+        for pattern in np.unique(present, axis=0):
+            inside = np.flatnonzero(pattern)
+            if not len(inside):
+                continue
+            groups = np.flatnonzero((present == pattern).all(1))
+            own = block.covariance if block.covariance.shape[-3] == 1 else block.covariance[..., groups, :, :]
+            blocks.append(Block(number[block.row[groups][:, inside]], own[..., inside[:, None], inside]))
+    return group(blocks)
 
 
 def _state(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
@@ -80,6 +108,8 @@ def _state(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
         state = np.zeros((size, 1, motion.order + 1, problem.dimension))
         state[:, 0, 0] = position
         return state
+    if _meets(problem):
+        return fixed(_at_once(problem)).position[:, None, None]
     ahead = course_starts(problem) if motion.span == "run" else None
     if ahead is not None and np.isfinite(ahead).all():
         return ahead[:, None]
@@ -90,6 +120,38 @@ def _state(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
         state[:, :, 0] = fix.position
         return state
     return _polynomial(fix, elapsed(problem, 0), motion.order)[:, None]
+
+
+def _meets(problem: Problem) -> bool:
+    """Return whether the rows of one target that stays meet in one epoch: it takes no two of them to make a range."""
+    motion = problem.motions[0]
+    alone = all(MODELS[rows.kind].stations < 2 for rows in problem.rows)
+    return motion.order == 0 and motion.span == "run" and alone and not problem.emitting
+
+
+def _at_once(problem: Problem) -> Problem:
+    """Return the problem of a target that stays as one epoch: every place it was measured from is a station."""
+    s = problem.stations
+    nodes = [np.where(rows.a < 0, -1, rows.epoch * s.count + rows.a) for rows in problem.rows]
+    used = np.unique(np.concatenate(nodes))
+    used = used[used >= 0]
+    epoch, station = np.divmod(used, s.count)
+
+    def there(array: Array | None, rank: int) -> Array | None:
+        if array is None:
+            return None
+        when = epoch if array.shape[-2 - rank] > 1 else 0 * epoch
+        return np.expand_dims(array[(..., when, station, *(slice(None),) * rank)], -2 - rank)
+
+    names = tuple(f"{s.names[i]} at {k}" for k, i in zip(epoch.tolist(), station.tolist(), strict=True))
+    position, velocity, axes = there(s.position, 1), there(s.velocity, 1), there(s.axes, 2)
+    assert position is not None
+    rows = tuple(
+        replace(r, a=np.where(node < 0, -1, np.searchsorted(used, node)), epoch=0 * r.epoch)
+        for r, node in zip(problem.rows, nodes, strict=True)
+    )
+    stations = Stations(position, names, velocity, axes)
+    return replace(problem, stations=stations, rows=rows, times=np.zeros(1))
 
 
 def _polynomial(fix: Fix, since: Array, order: int) -> Array:

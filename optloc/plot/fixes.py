@@ -1,20 +1,16 @@
-"""Pictures of fixes: stations, estimate, 95 % ellipse and the other positions that the data allow.
-
-matplotlib is imported where it is used. Colours are those of Okabe and Ito, and every kind of point has its own mark.
-"""
+"""Pictures of fixes: stations, estimate, 95 % ellipse and the other positions that the data allow."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from optloc.ellipse import error_ellipse
-from optloc.errors import InvalidProblem
 from optloc.fix import Fix
+from optloc.plot.style import BLACK, BLUE, GREY, ORANGE, figure_class
 from optloc.problem import Problem
 from optloc.scene import Scene, scene_of
 from optloc.types import Array
@@ -22,8 +18,6 @@ from optloc.types import Array
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-_BLACK, _BLUE, _ORANGE, _GREY = "#000000", "#0072B2", "#D55E00", "#999999"
 
 
 def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") -> Figure:
@@ -44,13 +38,12 @@ def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") ->
     Returns
     -------
     matplotlib.figure.Figure
-        To be written with `save`.
+        To be written with `optloc.plot.save`.
     """
-    figure_class = _figure_class()
     scene = scene_of(problem, [fixes] if isinstance(fixes, Fix) else fixes)
     spatial = scene.stations.shape[-1] == 3
     count = 1 + spatial + (near := _nearby(scene))
-    figure = figure_class(figsize=(0.4 + 5.0 * count, 5.2), layout="constrained")
+    figure = figure_class()(figsize=(0.4 + 5.0 * count, 5.2), layout="constrained")
     panels = figure.subplots(1, count, squeeze=False)[0]
     _overview(panels[0], scene, (0, 1))
     if spatial:
@@ -64,28 +57,13 @@ def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") ->
     return figure
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a picture; the ending of the name decides the type."""
-    figure.savefig(path, dpi=120)
-
-
-def _figure_class() -> type[Figure]:
-    try:
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise InvalidProblem(
-            "pictures need matplotlib", "plot", "install it with: pip install 'optloc[plot]'"
-        ) from None
-    return Figure
-
-
 def _overview(panel: Axes, scene: Scene, view: tuple[int, int]) -> None:
     everything = np.concatenate([scene.stations, scene.fixes, scene.alternatives])
     unit, size = _unit(everything[:, view])
     if view == (0, 1):
         _edges(panel, scene, size)
     _ellipses(panel, scene, view, size)
-    panel.scatter(*_xy(scene.stations, view, size), marker="^", s=60, color=_BLACK, label="station", zorder=3)
+    panel.scatter(*_xy(scene.stations, view, size), marker="^", s=60, color=BLACK, label="station", zorder=3)
     if scene.stations.shape[0] <= 20:
         for name, x, y in zip(scene.names, *_xy(scene.stations, view, size), strict=True):
             panel.annotate(name, (x, y), xytext=(5, 5), textcoords="offset points", fontsize=8, zorder=6)
@@ -99,20 +77,20 @@ def _edges(panel: Axes, scene: Scene, size: float) -> None:
     label: str | None = "region"
     for corners in scene.regions:
         ring = np.concatenate([corners, corners[:1]]) / size
-        panel.plot(*ring.T, color=_GREY, linewidth=1.2, linestyle="--", label=label, zorder=1)
+        panel.plot(*ring.T, color=GREY, linewidth=1.2, linestyle="--", label=label, zorder=1)
         label = None
 
 
 def _points(panel: Axes, scene: Scene, view: tuple[int, int], size: float) -> None:
     many = len(scene.fixes) > 12
-    for clean, colour, mark, label in ((True, _BLUE, "o", "fix"), (False, _ORANGE, "X", "fix, status not ok")):
+    for clean, colour, mark, label in ((True, BLUE, "o", "fix"), (False, ORANGE, "X", "fix, status not ok")):
         chosen = scene.fixes[scene.clean == clean]
         if len(chosen):
             panel.scatter(
                 *_xy(chosen, view, size), marker=mark, s=12 if many else 70, color=colour, label=label, zorder=4
             )
     if len(scene.alternatives):
-        style: dict[str, Any] = {"marker": "D", "s": 70, "facecolors": "none", "edgecolors": _ORANGE, "linewidths": 1.8}
+        style: dict[str, Any] = {"marker": "D", "s": 70, "facecolors": "none", "edgecolors": ORANGE, "linewidths": 1.8}
         panel.scatter(*_xy(scene.alternatives, view, size), label="alternative, with its cost gap", zorder=4, **style)
     for gap, x, y in zip(scene.gaps, *_xy(scene.alternatives, view, size), strict=True):
         panel.annotate(
@@ -121,7 +99,7 @@ def _points(panel: Axes, scene: Scene, view: tuple[int, int], size: float) -> No
             xytext=(7, -12),
             textcoords="offset points",
             fontsize=8,
-            color=_ORANGE,
+            color=ORANGE,
         )
 
 
@@ -135,7 +113,7 @@ def _ellipses(panel: Axes, scene: Scene, view: tuple[int, int], size: float) -> 
         semi_axes, directions = error_ellipse(covariance[np.ix_(view, view)])
         if np.isfinite(semi_axes).all() and np.isfinite(centre).all():
             line = centre[list(view)] + circle * semi_axes @ directions.T
-            panel.plot(*(line.T / size), color=_BLUE, linewidth=1.5, label=label, zorder=2)
+            panel.plot(*(line.T / size), color=BLUE, linewidth=1.5, label=label, zorder=2)
             label = None
 
 
@@ -164,7 +142,7 @@ def _close(panel: Axes, scene: Scene) -> None:
     _edges(panel, shifted, size)
     _ellipses(panel, shifted, view, size)
     _points(panel, shifted, view, size)
-    panel.scatter(*_xy(shifted.stations, view, size), marker="^", s=60, color=_BLACK, zorder=3)
+    panel.scatter(*_xy(shifted.stations, view, size), marker="^", s=60, color=BLACK, zorder=3)
     _frame(panel, shifted, view, unit)
     panel.set_aspect("equal", adjustable="box")
     panel.set_xlim(-extent / size, extent / size)
@@ -195,7 +173,7 @@ def _reach(scene: Scene, known: Array, centre: Array) -> float:
 def _frame(panel: Axes, scene: Scene, view: tuple[int, int], unit: str) -> None:
     panel.margins(0.12)
     panel.set_aspect("equal", adjustable="datalim")
-    panel.grid(color=_GREY, alpha=0.35, linewidth=0.6)
+    panel.grid(color=GREY, alpha=0.35, linewidth=0.6)
     panel.set_xlabel(f"{scene.axes[view[0]]} ({unit})")
     panel.set_ylabel(f"{scene.axes[view[1]]} ({unit})")
 

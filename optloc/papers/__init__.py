@@ -1,0 +1,71 @@
+"""Published studies, made again from their text: one line for each paper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from optloc.errors import InvalidProblem, nearest
+from optloc.papers.report import Report, Table, Tick, write
+
+__all__ = ["PAPERS", "Paper", "Plan", "Report", "Size", "Table", "paper", "write"]
+
+Size = Literal["quick", "full"]
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A reproduction that is ready to run.
+
+    Parameters
+    ----------
+    work : int
+        Number of pieces of about equal work.
+    run : callable
+        ``(tick) -> Report``; calls ``tick()`` after each piece.
+    """
+
+    work: int
+    run: Callable[[Tick], Report]
+
+
+@dataclass(frozen=True, slots=True)
+class Paper:
+    """A paper that can be reproduced.
+
+    Parameters
+    ----------
+    summary : str
+        One line for listings.
+    source : str
+        Publication.
+    plan : callable
+        ``(size, seed) -> Plan``.
+    """
+
+    summary: str
+    source: str
+    plan: Callable[[Size, int], Plan]
+
+
+def _registration(size: Size, seed: int) -> Plan:
+    from optloc.papers.registration.study import SIZES, plan
+
+    return plan(SIZES[size], seed)
+
+
+PAPERS: Mapping[str, Paper] = {
+    "registration": Paper(
+        "biases of moving stations from time differences and gain ratios, many epochs",
+        "Journal of Electronics and Information Technology 39 (2017), TDOA and GROA error registration",
+        _registration,
+    ),
+}
+
+
+def paper(name: str) -> Paper:
+    """Return a paper by its name; raise InvalidProblem for an unknown one."""
+    if name not in PAPERS:
+        raise InvalidProblem(f"there is no paper {name!r}", "reproduce", nearest(name, list(PAPERS)))
+    return PAPERS[name]
