@@ -14,10 +14,11 @@ from optloc.problem import Problem
 from optloc.types import Array
 
 _LINES, _POINTS = 10, 400
+_RMS = {True: " (rms)", False: ""}
 
 
 def courses(problem: Problem, truth: Array) -> tuple[Course, Course | None] | None:
-    """Return the bound against time with biases unknown and, if there are some, known; None where there is no course."""
+    """Return the bound against time with biases unknown and, if there are some, known; None where it has none."""
     if problem.epochs == 1 or not problem.layout.n_shared or tied(problem) or problem.batch_shape:
         return None
     k = problem.epochs
@@ -49,7 +50,7 @@ def _sigmas(course: Course, i: int) -> Array:
 def _few(course: Course) -> list[int]:
     """Return the places of a few times, closer together at the start."""
     wanted = np.geomspace(1, course.counts[-1], _LINES)
-    return np.unique(np.searchsorted(course.counts, np.floor(wanted))).tolist()
+    return [int(i) for i in np.unique(np.searchsorted(course.counts, np.floor(wanted)))]
 
 
 def course_table(course: Course, known: Course | None, limit: int = 4) -> Table:
@@ -59,7 +60,7 @@ def course_table(course: Course, known: Course | None, limit: int = 4) -> Table:
         table.add_column(name, justify="right")
     shown: list[tuple[Course, Slot]] = []
     for slot in course.layout.shared[:limit]:
-        table.add_column(f"{slot.name}, {slot.unit}".rstrip(", "), justify="right")
+        table.add_column(f"{slot.name}{_RMS[bool(slot.members)]}, {slot.unit}".rstrip(", "), justify="right")
         shown.append((course, slot))
         if known is not None and not slot.members:
             table.add_column("biases known", justify="right")

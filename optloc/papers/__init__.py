@@ -4,30 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Literal
 
 from optloc.errors import InvalidProblem, nearest
-from optloc.papers.report import Report, Table, Tick, write
+from optloc.papers.report import Plan, Report, Size, Table, write
 
 __all__ = ["PAPERS", "Paper", "Plan", "Report", "Size", "Table", "paper", "write"]
-
-Size = Literal["quick", "full"]
-
-
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """A reproduction that is ready to run.
-
-    Parameters
-    ----------
-    work : int
-        Number of pieces of about equal work.
-    run : callable
-        ``(tick) -> Report``; calls ``tick()`` after each piece.
-    """
-
-    work: int
-    run: Callable[[Tick], Report]
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from optloc import __version__
 from optloc.errors import InvalidProblem
@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
 Tick = Callable[[], None]
 """Called after each piece of work."""
+
+Size = Literal["quick", "full"]
+"""How much is drawn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +107,22 @@ class Report:
     def made(self) -> str:
         """Return the sentence that says when and how the numbers were made."""
         return f"optloc {__version__}, {datetime.now(UTC):%Y-%m-%d}, {self.facts}."
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """A reproduction that is ready to run.
+
+    Parameters
+    ----------
+    work : int
+        Number of pieces of about equal work.
+    run : callable
+        ``(tick) -> Report``; calls ``tick()`` after each piece.
+    """
+
+    work: int
+    run: Callable[[Tick], Report]
 
 
 def canvas(width: float, height: float) -> Figure:

@@ -20,7 +20,7 @@ _WORDS = {"position": ("position", "m"), "velocity": ("velocity", "m/s"), "accel
 
 
 def plot_course(course: Course, known: Course | None = None, title: str = "") -> Figure:
-    """Return a picture of the bound against time: one panel for each unknown of a target, one for each family of biases.
+    """Return a picture of the bound against time, one panel for each state of a target and each family of biases.
 
     Parameters
     ----------
@@ -57,9 +57,9 @@ def _panel(panel: Axes, course: Course, known: Course | None, slot: Slot) -> Non
         entries, sigma = ("root mean square",), course.total(slot.name)[:, None] / np.sqrt(slot.size)
     for entry, values, colour in zip(entries, sigma.T, _CYCLE * 2, strict=False):
         label = f"{word} {entry}".strip() if slot.members else f"along {entry}"
-        panel.plot(course.times, values, color=colour, linewidth=1.8 if slot.members else 1.0, label=label)
+        panel.plot(course.times, values, color=colour, linewidth=1.8 if slot.members else 1.0, label=label, zorder=3)
     if not slot.members:
-        panel.plot(course.times, course.total(slot.name), color=BLUE, linewidth=2.4, label=f"in {_SPACE[slot.size]}")
+        panel.plot(course.times, course.total(slot.name), color=BLUE, linewidth=3.5, label=f"in {_SPACE[slot.size]}")
         if known is not None:
             total = known.total(slot.name)
             panel.plot(known.times, total, color=BLUE, linewidth=1.6, linestyle="--", label="the same, biases known")

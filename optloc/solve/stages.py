@@ -20,6 +20,8 @@ from optloc.solve.bounded import bounded
 from optloc.solve.heights import height_starts
 from optloc.solve.pieces import from_pieces, one_position
 from optloc.solve.refine import refine
+from optloc.solve.register import closed_form, registrable
+from optloc.solve.runs import run_starts
 from optloc.solve.search import PLACES, searched_starts
 from optloc.solve.squared import Pick, every, hull, minimum, shor
 from optloc.solve.start import along_the_valley, mirrored, squared_range_starts, static, subarray_starts, vectors
@@ -116,6 +118,8 @@ def _squared(problem: Problem, fix: Fix | None, name: str, pick: Pick) -> Fix:
         heights = height_starts(alone, relax=pick is shor)
         position = np.concatenate([squared_range_starts(alone, pick), heights], axis=1)
         return _unrefined(problem, position, fix, name, began)
+    if registrable(problem):
+        return _assembled(problem, run_starts(problem, closed_form), fix, name, began)
     x = from_pieces(problem, lambda piece: lsr(piece, _squared(piece, None, name, pick)))
     return _assembled(problem, x, fix, name, began)
 

@@ -133,6 +133,14 @@ def vectors(problem: Problem, position: Array | None) -> Array:
     return x
 
 
+def completed(problem: Problem, shared: Array) -> Array:
+    """Return full parameter vectors (N, q, size) of shared unknowns (N, q, n): local ones as fit them, or zero."""
+    x = np.zeros((*shared.shape[:-1], problem.layout.size))
+    x[..., : shared.shape[-1]] = shared
+    x[np.isnan(shared).any(-1)] = np.nan
+    return _emitted(problem, x) if problem.emitting else x
+
+
 def _emitted(problem: Problem, x: Array) -> Array:
     """Return vectors (N, q, size) with the emission times that fit their positions: the mean of what is left over."""
     size, q = x.shape[:2]

@@ -56,7 +56,9 @@ def minima() -> Table:
             continue
         offset = np.abs(found.x[5:7] - PRINTED.delays[2:]).mean()
         place = " ".join(f"{v:.1f}" for v in 1e-3 * found.x[:3])
-        lines.append((str(epochs), place, f"{offset:.0f}", f"{found.gap:.4g}", f"{found.doubt:.2g}", f"{noisy.doubt:.2g}"))
+        lines.append(
+            (str(epochs), place, f"{offset:.0f}", f"{found.gap:.4g}", f"{found.doubt:.2g}", f"{noisy.doubt:.2g}")
+        )
     note = (
         "Noise-free data, 1 m station error, 10 ns. The gap is the cost of the image, a weighted sum of squares; half its "
         "root is how many standard deviations of noise turn the choice. The image needs biases of hundreds of metres: a "

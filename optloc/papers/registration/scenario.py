@@ -170,5 +170,10 @@ def problem(
 
 def truth(scenario: Scenario, problem: Problem) -> Array:
     """Return the true parameter vector (size,) of a problem of a scene."""
-    values = {"position": scenario.target, "velocity": scenario.course, "delay": scenario.delays, "gain": scenario.gains}
+    values = {
+        "position": scenario.target,
+        "velocity": scenario.course,
+        "delay": scenario.delays,
+        "gain": scenario.gains,
+    }
     return np.concatenate([np.asarray(values[slot.name], dtype=float) for slot in problem.layout.shared])

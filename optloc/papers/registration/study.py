@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
-import numpy as np
-
-from optloc.papers import Plan
 from optloc.papers.registration import printed, tables, text
 from optloc.papers.registration.extras import minima, readings, scenes
 from optloc.papers.registration.figures import against_time
 from optloc.papers.registration.scenario import MOVING, NANOSECOND, PRINTED, SPATIAL, truth
 from optloc.papers.registration.tables import Case
-from optloc.papers.registration.trials import Course, Setting, course, one_shot, rms, score, wander
-from optloc.papers.report import Picture, Report, Table, Tick, canvas
+from optloc.papers.registration.trials import Course, Setting, course, rms, score, wander
+from optloc.papers.report import Picture, Plan, Report, Size, Table, Tick, canvas
 from optloc.solve import solve
 
-_EPOCHS = 600
+_LAST = 600
 _GAIN = 0.03
 _MOVING_FIRST = 200
+_WIDEST = 20.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +32,7 @@ class Sample:
     many : int
         Trials of tables 3 and 4, which count failures.
     fixed, moving : tuple of int
-        Epochs at which the fixed and the moving target are looked at.
+        Epochs at which the fixed and the moving target are looked at; those of the printed tables among them.
     """
 
     trials: int
@@ -43,7 +41,7 @@ class Sample:
     moving: tuple[int, ...]
 
 
-SIZES = {
+SIZES: dict[Size, Sample] = {
     "quick": Sample(20, 40, (150, 200, 300, 400, 600), (300, 400, 550, 600, 700)),
     "full": Sample(200, 500, tuple(range(150, 701, 50)), tuple(range(250, 801, 50))),
 }
@@ -66,34 +64,94 @@ def plan(sample: Sample, seed: int) -> Plan:
     """
     canvas(1.0, 1.0)
     courses = 4 * len(sample.fixed) + len(sample.moving) + 3
-    counts = len(printed.INITIAL) + 1 + 2 * len(printed.NOISE) + 2
+    counts = len(printed.INITIAL) + len(printed.NOISE) + 1
     return Plan(courses + counts, partial(_run, sample, seed))
 
 
 def _run(sample: Sample, seed: int, tick: Tick) -> Report:
-    far = Setting(PRINTED, sample.trials, seed, 1, station_sigma=5.0)
-    near, moving = Setting(PRINTED, sample.trials, seed, 2), Setting(MOVING, sample.trials, seed, 3)
-    fixed = {"5 m": course(far, sample.fixed, tick), "1 m": course(near, sample.fixed, tick)}
-    flying = course(moving, sample.moving, tick, first=_MOVING_FIRST)
-    joint = {
-        name: course(Setting(PRINTED, sample.trials, seed, key, station_sigma=size, gain_sigma=_GAIN), sample.fixed, tick, plain=False)
-        for key, (name, size) in enumerate((("5 m", 5.0), ("1 m", 1.0)), start=4)
+    fixed = {
+        name: course(Setting(PRINTED, sample.trials, seed, key, station_sigma=size), sample.fixed, tick)
+        for key, (name, size) in enumerate((("5 m", 5.0), ("1 m", 1.0)))
     }
-    starts = _starts(sample, seed, tick)
-    noises = _noises(sample, seed, tick)
-    spatial = _case(Setting(SPATIAL, sample.many, seed, 20), 20.0, 20.0, tick)
+    moving = course(Setting(MOVING, sample.trials, seed, 2), sample.moving, tick, first=_MOVING_FIRST)
+    joint = {
+        name: course(Setting(PRINTED, sample.trials, seed, key, None, size, _GAIN), sample.fixed, tick, plain=False)
+        for key, (name, size) in enumerate((("5 m", 5.0), ("1 m", 1.0)), 3)
+    }
+    starts = _starts(Setting(PRINTED, sample.many, seed, 5), tick)
+    noises = _noises(sample.many, seed, tick)
+    spatial = _case(Setting(SPATIAL, sample.many, seed, 10), _WIDEST, tick)
+    pictures, tabled = _figures(fixed, moving, joint)
     return Report(
         text.TITLE,
-        f"seed {seed}, {sample.trials} trials, {sample.many} in tables 3 and 4 and of the spatial stations",
+        f"seed {seed}, {sample.trials} trials, {sample.many} in tables 3 and 4 and for the spatial stations",
         text.OPENING,
         text.CLOSING,
         (
-            *_tables(fixed, flying, joint),
+            *_accuracies(fixed["1 m"], moving, joint["1 m"]),
             tables.starts(starts),
-            tables.noises(noises, [rms(Setting(PRINTED, 1, seed, 0, sigma=c.sigma).bound(700)) for c in noises]),
+            tables.noises(noises, [rms(Setting(PRINTED, 1, seed, 0, case.sigma).bound(700)) for case in noises]),
+            *tabled,
             scenes({"printed": starts[-1], "spatial": spatial}),
             minima(),
             readings(),
         ),
-        _pictures(fixed, flying, joint),
+        pictures,
     )
+
+
+def _case(setting: Setting, width: float, tick: Tick, label: float = 0.0) -> Case:
+    """Return both routes on the same draw."""
+    drawn, bound = setting.draw(_LAST), setting.bound(_LAST)
+    (plain,) = wander(setting, drawn, (_LAST,), (bound,), width=width)
+    found = score(solve(drawn).x, truth(setting.scenario, drawn), bound)
+    tick()
+    return Case(label or width, setting.sigma or setting.scenario.sigma, rms(bound), plain, found)
+
+
+def _starts(setting: Setting, tick: Tick) -> list[Case]:
+    """Return table 3: one draw, and the recursion from starts of growing width."""
+    drawn, bound = setting.draw(_LAST), setting.bound(_LAST)
+    found = score(solve(drawn).x, truth(setting.scenario, drawn), bound)
+    cases = []
+    for width in printed.INITIAL:
+        (plain,) = wander(setting, drawn, (_LAST,), (bound,), width=float(width))
+        cases.append(Case(float(width), setting.scenario.sigma, rms(bound), plain, found))
+        tick()
+    return cases
+
+
+def _noises(many: int, seed: int, tick: Tick) -> list[Case]:
+    """Return table 4; its labels are 10 ns too large."""
+    return [
+        _case(Setting(PRINTED, many, seed, key, (label - 10) * NANOSECOND), 1.0, tick, label)
+        for key, label in enumerate(printed.NOISE, 6)
+    ]
+
+
+def _accuracies(fixed: Course, moving: Course, joint: Course) -> tuple[Table, ...]:
+    """Return tables 2, 5 and 6."""
+    exact = [truth(c.setting.scenario, c.setting.problem(1)) for c in (fixed, moving, joint)]
+    return (
+        tables.biases("table-2", "Table 2: biases, fixed target", fixed, exact[0], printed.ACCURACY_FIXED),
+        tables.biases("table-5", "Table 5: biases, moving target", moving, exact[1], printed.ACCURACY_MOVING),
+        tables.biases("table-6", "Table 6: biases with gain ratios", joint, exact[2], printed.ACCURACY_JOINT),
+    )
+
+
+def _figures(
+    fixed: Mapping[str, Course], moving: Course, joint: Mapping[str, Course]
+) -> tuple[tuple[Picture, ...], tuple[Table, ...]]:
+    """Return figures 1 to 3 and the numbers behind them."""
+    parts = (
+        ("figure-1", "Figure 1: fixed target", dict(fixed), printed.FIXED, None),
+        ("figure-2", "Figure 2: moving target", {"1 m": moving}, printed.MOVING, 450),
+        ("figure-3", "Figure 3: fixed target, with gain ratios", dict(joint), printed.JOINT, None),
+    )
+    pictures, tabled = [], []
+    for name, title, courses, values, zoom in parts:
+        labels = [f"station error {label}" for label in courses]
+        figure = against_time(list(courses.values()), labels, [values[label] for label in courses], zoom)
+        pictures.append(Picture(name, title, figure))
+        tabled.append(tables.errors(name, f"{title}, in numbers", courses, values))
+    return tuple(pictures), tuple(tabled)

@@ -70,13 +70,24 @@ def biases(
     rows : mapping of int to sequence of float
         Printed accuracies of the channels, by second.
     """
-    header = ("second", "bias", "printed", "recursion, mean of all", "optloc, mean of all", "optloc, one run", "bound, one run")
+    header = (
+        "second",
+        "bias",
+        "printed",
+        "recursion, mean of all",
+        "optloc, mean of all",
+        "optloc, one run",
+        "bound, one run",
+    )
     lines = []
     for second, values in rows.items():
         at = course.epochs.index(second)
         n = len(exact) - len(values)
         spread = np.sqrt(np.diagonal(course.bounds[at]))[n:]
-        columns = [_mean(None if course.plain is None else course.plain[at], n, exact), _mean(course.found[at], n, exact)]
+        columns = [
+            _mean(None if course.plain is None else course.plain[at], n, exact),
+            _mean(course.found[at], n, exact),
+        ]
         columns += [_single(course.found[at], n, exact), accuracy(spread, exact[n:])]
         for i, value in enumerate(values):
             shown = ["–" if i >= len(column) else f"{column[i]:.2f}" for column in columns]
@@ -110,7 +121,17 @@ def errors(name: str, title: str, courses: Mapping[str, Course], figures: Mappin
     figures : mapping of str to float
         Error at 600 s that the paper's text names, by environment.
     """
-    header = ("environment", "second", "printed", "recursion", "optloc", "bound", "recursion lost", "optloc lost", "several places")
+    header = (
+        "environment",
+        "second",
+        "printed",
+        "recursion",
+        "optloc",
+        "bound",
+        "recursion lost",
+        "optloc lost",
+        "several places",
+    )
     lines = []
     for label, course in courses.items():
         for at, second in enumerate(course.epochs):
@@ -134,11 +155,23 @@ def errors(name: str, title: str, courses: Mapping[str, Course], figures: Mappin
 
 def starts(cases: Sequence[Case]) -> Table:
     """Return table 3: the width of the initial error."""
-    header = ("n", "printed error", "printed bound", "printed divergence", "recursion", "optloc", "bound", "recursion lost", "optloc lost")
+    header = (
+        "n",
+        "printed error",
+        "printed bound",
+        "printed divergence",
+        "recursion",
+        "optloc",
+        "bound",
+        "recursion lost",
+        "optloc lost",
+    )
     lines = []
     for case in cases:
         error, divergence = printed.INITIAL[int(case.label)]
-        lines.append((f"{case.label:.0f}", f"{error:.1f}", f"{printed.BOUND:.1f}", f"{divergence:.1f} %", *_compared(case)))
+        lines.append(
+            (f"{case.label:.0f}", f"{error:.1f}", f"{printed.BOUND:.1f}", f"{divergence:.1f} %", *_compared(case))
+        )
     note = (
         "Metres after 600 epochs; the start is Gaussian, n times sigma0 wide. optloc takes no start, so its column is one "
         "and the same. The printed bound of 36.7 m is not reproduced by any reading; errors of the trials that are not lost."

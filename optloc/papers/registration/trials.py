@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from optloc.bounds import crlb
 from optloc.fix import Fix
 from optloc.papers.registration.recursion import FIRST, recursion
-from optloc.papers.registration.scenario import PRINTED, Scenario, problem, truth
+from optloc.papers.registration.scenario import PRINTED, Scenario, Shape, problem, truth
 from optloc.papers.report import Tick
 from optloc.problem import Problem
 from optloc.simulate import simulate
@@ -71,26 +71,26 @@ class Setting:
         made = self.problem(epochs)
         return crlb(made, truth(self.scenario, made))
 
-    def starts(self, factor: float) -> Array:
-        """Return Gaussian starts (trials, n) around the truth, `factor` one-shot standard deviations wide.
+    def starts(self, width: float) -> Array:
+        """Return Gaussian starts (trials, n) around the truth, `width` one-shot standard deviations wide.
 
-        A moving target's velocity is wrong by `factor` times 10 m/s in each coordinate.
+        The velocity of a moving target is wrong by `width` times 10 m/s in each coordinate.
         """
         scene = self.scenario
         rng = np.random.default_rng(self._sequence(1))
-        spread, centre = one_shot(scene), scene.target
+        spread, centre = one_shot(scene, sigma=self.sigma), scene.target
         if scene.course is not None:
             spread, centre = np.concatenate([spread, np.full(3, 10.0)]), np.concatenate([centre, scene.course])
-        return np.asarray(centre + factor * spread * rng.standard_normal((self.trials, len(centre))))
+        return np.asarray(centre + width * spread * rng.standard_normal((self.trials, len(centre))))
 
     def _sequence(self, purpose: int) -> np.random.SeedSequence:
         return np.random.SeedSequence(self.seed, spawn_key=(self.key, purpose))
 
 
-def one_shot(scenario: Scenario = PRINTED) -> Array:
-    """Return the bound of each coordinate (3,) at t = 0 from one epoch with known biases, metres: the paper's sigma0."""
-    still = Scenario(scenario.position, scenario.velocity, scenario.target, sigma=scenario.sigma)
-    made = problem(still, 1, prior=1e-6)
+def one_shot(scenario: Scenario = PRINTED, *, sigma: float | None = None, shape: Shape = "full") -> Array:
+    """Return the paper's sigma0, metres: the bound of each coordinate (3,) from the first epoch with known biases."""
+    still = replace(scenario, course=None)
+    made = problem(still, 1, sigma=sigma, prior=1e-6, shape=shape)
     return np.asarray(np.sqrt(np.diagonal(crlb(made, truth(still, made)))[:3]))
 
 
@@ -174,7 +174,7 @@ class Course:
     listed: tuple[float, ...]
 
 
-def course(setting: Setting, epochs: Sequence[int], tick: Tick, *, factor: float | None = 1.0) -> Course:
+def course(setting: Setting, epochs: Sequence[int], tick: Tick, *, plain: bool = True, first: int = FIRST) -> Course:
     """Return the scores of both routes on the same data.
 
     Parameters
@@ -185,33 +185,45 @@ def course(setting: Setting, epochs: Sequence[int], tick: Tick, *, factor: float
         Numbers of epochs to look at.
     tick : callable
         Called after each of them, and after the recursion.
-    factor : float, optional
-        Width of the recursion's starts; None leaves the recursion out.
+    plain : bool
+        Whether the recursion runs as well.
+    first : int
+        Epochs of its first estimate.
     """
     drawn = setting.draw(max(epochs))
     bounds = tuple(setting.bound(k) for k in epochs)
     exact = truth(setting.scenario, drawn)
-    plain = None
-    if factor is not None:
-        plain = tuple(wander(setting, drawn, factor, epochs, bounds))
+    wandered = None
+    if plain:
+        wandered = wander(setting, drawn, epochs, bounds, first=first)
         tick()
     found, listed = [], []
     for k, bound in zip(epochs, bounds, strict=True):
         fix = solve(setting.first(drawn, k))
-        moving = setting.scenario.course is not None
-        found.append(score(branch(fix, exact) if moving else fix.x, exact, bound))
+        found.append(score(fix.x if setting.scenario.course is None else branch(fix, exact), exact, bound))
         listed.append(float(np.isfinite(fix.alternatives.gap).any(-1).mean()))
         tick()
-    return Course(setting, tuple(epochs), bounds, plain, tuple(found), tuple(listed))
+    return Course(setting, tuple(epochs), bounds, wandered, tuple(found), tuple(listed))
 
 
 def wander(
-    setting: Setting, drawn: Problem, factor: float, epochs: Sequence[int], bounds: Sequence[Array]
-) -> list[Score]:
-    """Return the scores of the paper's recursion after some numbers of epochs."""
+    setting: Setting,
+    drawn: Problem,
+    epochs: Sequence[int],
+    bounds: Sequence[Array],
+    *,
+    width: float = 1.0,
+    first: int = FIRST,
+) -> tuple[Score, ...]:
+    """Return the scores of the paper's recursion after some numbers of epochs; arguments as `course`.
+
+    Parameters
+    ----------
+    width : float
+        Width of the starts in one-shot standard deviations.
+    """
     scene = setting.scenario
-    differences = drawn.z[..., : drawn.rows[0].count]
-    z = differences.reshape(setting.trials, drawn.epochs, -1)
-    estimates = recursion(scene, z, setting.starts(factor))
+    z = drawn.rows[0].z.reshape(setting.trials, drawn.epochs, -1)
+    estimates = recursion(scene, z[:, : max(epochs)], setting.starts(width), first=first)
     exact = truth(scene, drawn)[: estimates.shape[-1]]
-    return [score(estimates[:, k - FIRST], exact, bound) for k, bound in zip(epochs, bounds, strict=True)]
+    return tuple(score(estimates[:, k - first], exact, bound) for k, bound in zip(epochs, bounds, strict=True))
