@@ -26,7 +26,7 @@ array. The relaxation is never tight (second over first eigenvalue 0.03 to 0.2):
 The best price depends on the unknown distance: too high, and it draws the target in; too low, and the slack throws it
 out. So a ladder of prices is solved, and the answers are ranked by the cost of the data at their targets.
 
-Sources: N. Z. Shor, "Quadratic optimization problems", Sov. J. Comput. Syst. Sci. 25 (1987) (the lift); K. W. T. Lui,
+Sources: N. Z. Shor, "Quadratic optimization problems", Sov. J. Comput. Syst. Sci. 25 (1987) (the lift); K. W. K. Lui,
 W.-K. Ma, H. C. So and F. K. W. Chan, "Semi-definite programming algorithms for sensor network node localization with
 uncertainties in anchor positions and/or propagation speed", IEEE Trans. Signal Process. 57 (2009) (nuisance parameters
 in the lift); the leftovers, the price and its reason are this project's.
@@ -41,6 +41,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from formulations._windows import Windows
 from formulations.conic import Answer, Relaxation
 
 Array = NDArray[np.float64]
@@ -175,7 +176,8 @@ def registration(
     Returns
     -------
     tuple of Started
-        One for each price that was solved, lowest cost first: starts to be refined. Empty where the solver gave none.
+        One for each price that was solved, lowest cost first: starts to be refined. Empty where the data are not finite
+        or the solver gave none.
 
     Raises
     ------
@@ -187,88 +189,22 @@ def registration(
     The module's text. Shifted and scaled inside, so the answer does not depend on origin or unit. Built once per
     shape and back end in each process.
     """
-    run = _Run.of(station, z, whiten, sigma, design, mean, time)
+    run = Windows.of(station, z, whiten, sigma, design, mean, time)
+    if not run.finite:
+        return ()
     K, S, d = run.station.shape
-    order = run.power.shape[1] - 1
-    relaxation, data = _built(K, S, d, order, backend), _parameters(run)
+    relaxation, data = _built(K, S, d, run.power.shape[1] - 1, backend), _parameters(run)
     weight = np.kron(run.power.T @ run.power / K, np.eye(d))
     found = []
     for price in prices:
         answer = relaxation.solve({**data, "price": price * weight}, bound=False)
-        lift = answer.values["lift"]
-        if np.isfinite(lift).all():
-            found.append(_started(run, lift, weight, price, answer))
+        if np.isfinite(answer.values["lift"]).all():
+            found.append(_started(run, weight, price, answer))
     return tuple(sorted(found, key=lambda one: one.cost))
 
 
-@dataclass(frozen=True, slots=True)
-class _Run:
-    """The data about the stations' mean in units of their extent; biases and leftovers in `unit` of these.
-
-    `gram` is the information of the rows, `gain` times it the biases of leftovers, `prior` the biases' information.
-    """
-
-    station: Array
-    z: Array
-    gram: Array
-    design: Array
-    prior: Array
-    mean: Array
-    power: Array
-    unit: float
-    origin: Array
-    scale: float
-    clock: tuple[float, float]
-
-    @classmethod
-    def of(
-        cls,
-        station: ArrayLike,
-        z: ArrayLike,
-        whiten: ArrayLike,
-        sigma: ArrayLike,
-        design: ArrayLike | None,
-        mean: ArrayLike,
-        time: ArrayLike | None,
-    ) -> _Run:
-        s, rows, W, spread = (np.asarray(a, dtype=np.float64) for a in (station, z, whiten, sigma))
-        if not (np.isfinite(spread) & (spread > 0)).all():
-            raise ValueError("every bias needs a prior standard deviation that is positive and finite")
-        K, C = rows.shape
-        E = np.eye(C) if design is None else np.asarray(design, dtype=np.float64)
-        mu = np.broadcast_to(np.asarray(mean, dtype=np.float64), spread.shape)
-        gram = np.broadcast_to(np.swapaxes(W, -1, -2) @ W, (K, C, C))
-        origin = s.mean(axis=(0, 1))
-        scale = float(np.sqrt(((s - origin) ** 2).sum(axis=-1).mean()))
-        # the size of a leftover: what the prior says of the biases in the rows
-        fine = float(np.sqrt(((E * spread) ** 2).sum(axis=1).mean()))
-        middle, half, power = 0.0, 1.0, np.ones((K, 1))
-        if time is not None:
-            t = np.asarray(time, dtype=np.float64)
-            middle, half = float(t.mean()), float(np.ptp(t)) / 2 or 1.0
-            power = np.stack([np.ones(K), (t - middle) / half], axis=1)
-        place, seen = (s - origin) / scale, (rows - E @ mu) / scale
-        prior, unit = (fine / spread) ** 2, fine / scale
-        return cls(place, seen, gram * fine**2, E, prior, mu, power, unit, origin, scale, (middle, half))
-
-    def biases(self, left: Array) -> Array:
-        """Shifts from the prior mean that fit leftovers (K, C) best, both in the fine unit."""
-        total = self.design.T @ self.gram.sum(axis=0) @ self.design + np.diag(self.prior)
-        right = self.design.T @ np.einsum("kij,kj->i", self.gram, left)
-        return np.asarray(np.linalg.solve(total, right), dtype=np.float64)
-
-    def form(self) -> Array:
-        """M: the blocks of the rows less what the biases explain."""
-        K, C, _ = self.gram.shape
-        total = self.design.T @ self.gram.sum(axis=0) @ self.design + np.diag(self.prior)
-        along = (self.gram @ self.design).reshape(K * C, -1)
-        blocks = np.zeros((K, C, K, C))
-        blocks[np.arange(K), :, np.arange(K)] = self.gram
-        return np.asarray(blocks.reshape(K * C, K * C) - along @ np.linalg.solve(total, along.T), dtype=np.float64)
-
-
-def _parameters(run: _Run) -> dict[str, Array]:
-    """Coefficients of the lifted equalities."""
+def _parameters(run: Windows) -> dict[str, Array]:
+    """Coefficients of the lifted equalities, those of the second kind divided by the unit of the leftovers."""
     K, S, _ = run.station.shape
     power, first, other = run.power, run.station[:, 0], run.station[:, 1:]
     size = (run.station**2).sum(axis=-1)
@@ -286,29 +222,19 @@ def _parameters(run: _Run) -> dict[str, Array]:
     }
 
 
-def _started(run: _Run, lift: Array, weight: Array, price: float, answer: Answer) -> Started:
-    n, d = len(weight), run.station.shape[-1]
-    y, values = lift[0, 1 : n + 1], np.linalg.eigvalsh(lift)
-    target = y.reshape(-1, d)
-    away = np.linalg.norm((run.power @ target)[:, None] - run.station, axis=-1)
-    left = (run.z - away[:, 1:] + away[:, :1]) / run.unit
-    shift = run.biases(left)
-    rest = left - run.design @ shift
-    cost = float(np.einsum("ki,kij,kj", rest, run.gram, rest) + run.prior @ shift**2)
-    square = float((weight * lift[1 : n + 1, 1 : n + 1]).sum())
-    middle, half = run.clock
-    plain = run.scale * target
-    if len(plain) == 2:
-        plain[1] /= half
-        plain[0] -= middle * plain[1]
-    plain[0] += run.origin
+def _started(run: Windows, weight: Array, price: float, answer: Answer) -> Started:
+    lift = answer.values["lift"]
+    inside = slice(1, 1 + len(weight))
+    target, values = lift[0, inside], np.linalg.eigvalsh(lift)
+    cost, shift = run.cost(target)
+    square = float((weight * lift[inside, inside]).sum())
     return Started(
-        plain,
+        run.place(target),
         run.mean + run.unit * run.scale * shift,
         cost,
         price,
         answer.primal - price * square,
-        run.scale**2 * (square - float(y @ weight @ y)),
+        run.scale**2 * (square - float(target @ weight @ target)),
         float(abs(values[-2]) / values[-1]),
         answer,
     )

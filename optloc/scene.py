@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from math import factorial
 
 import numpy as np
 
 from optloc.fix import Fix
 from optloc.frames import Frame
+from optloc.layout import state_names
 from optloc.problem import Problem
 from optloc.status import Status
 from optloc.types import Array, Band, Polygon
@@ -38,6 +40,14 @@ class Scene:
         Names of the axes.
     regions : tuple of array (v, 2)
         Corners of the polygons and boxes of the plan.
+    tracks : tuple of array (k, d)
+        Where moving stations are in the course of the run.
+    paths : tuple of array (k, d)
+        The same of moving targets, as they were fixed.
+    other_paths : tuple of array (k, d)
+        The same as the alternatives have it.
+    known : tuple of array (k, d)
+        Places of known targets.
     """
 
     stations: Array
@@ -49,6 +59,23 @@ class Scene:
     gaps: Array
     axes: tuple[str, ...]
     regions: tuple[Array, ...] = ()
+    tracks: tuple[Array, ...] = ()
+    paths: tuple[Array, ...] = ()
+    other_paths: tuple[Array, ...] = ()
+    known: tuple[Array, ...] = ()
+
+    def moved(self, change: Callable[[Array], Array]) -> Scene:
+        """Return the scene with all positions changed; regions and covariances stay."""
+        return replace(
+            self,
+            stations=change(self.stations),
+            fixes=change(self.fixes),
+            alternatives=change(self.alternatives),
+            tracks=tuple(change(part) for part in self.tracks),
+            paths=tuple(change(part) for part in self.paths),
+            other_paths=tuple(change(part) for part in self.other_paths),
+            known=tuple(change(part) for part in self.known),
+        )
 
 
 def scene_of(problem: Problem, fixes: Sequence[Fix]) -> Scene:
@@ -60,15 +87,67 @@ def scene_of(problem: Problem, fixes: Sequence[Fix]) -> Scene:
     covariance = np.concatenate([c for _, c, _ in parts] or [np.zeros((0, d, d))])
     clean = np.concatenate([ok for _, _, ok in parts] or [np.zeros(0, dtype=bool)])
     others, gaps = _alternatives(fixes, d) if len(position) <= 12 else (np.zeros((0, d)), np.zeros(0))
-    if problem.frame.kind == "ecef":
-        local = Frame("enu", tuple(float(v) for v in problem.frame.to_geodetic(stations.mean(0))))  # type: ignore[arg-type]
-        turn = local.rotation_to_ecef().T
-        stations, position, others = (local.from_ecef(p) for p in (stations, position, others.reshape(-1, 3)))
-        covariance = turn @ covariance @ turn.T
     axes = ("east", "north", "up") if problem.frame.geodetic else ("x", "y", "z")
     reach = np.concatenate([stations, position[np.isfinite(position).all(-1)]])[:, :2]
     regions = () if problem.frame.kind == "ecef" else _regions(problem, reach)
-    return Scene(stations, problem.stations.names, position, covariance, clean, others, gaps, axes[:d], regions)
+    paths, other = _paths(problem, fixes)
+    known = tuple(m.known.reshape(-1, *m.known.shape[-2:])[:, 0] for m in problem.motions if m.known is not None)
+    scene = Scene(
+        *(stations, problem.stations.names, position, covariance, clean, others, gaps, axes[:d], regions),
+        tracks=_tracks(problem),
+        paths=paths,
+        other_paths=other,
+        known=tuple(_thinned(place) for place in known),
+    )
+    return _local(problem, scene) if problem.frame.kind == "ecef" else scene
+
+
+def _local(problem: Problem, scene: Scene) -> Scene:
+    """Return a scene in ECEF along east, north and up at the stations' centre."""
+    lat, lon, height = problem.frame.to_geodetic(scene.stations.mean(0))
+    local = Frame("enu", (float(lat), float(lon), float(height)))
+    turn = local.rotation_to_ecef().T
+    moved = scene.moved(lambda place: local.from_ecef(place.reshape(-1, 3)))
+    return replace(moved, covariances=turn @ scene.covariances @ turn.T)
+
+
+def _tracks(problem: Problem) -> tuple[Array, ...]:
+    """Return the tracks (k, d) of the stations of a single run that move."""
+    position = problem.stations.position
+    if position.ndim > 3:
+        return ()
+    tracks = (_thinned(track) for track in np.swapaxes(position, 0, 1))
+    return tuple(track for track in tracks if np.ptp(track, axis=0).max() > 0.0)
+
+
+def _thinned(track: Array, most: int = 200) -> Array:
+    """Return a track (k, d) with no more points than a picture needs, the first and the last among them."""
+    return np.asarray(track[np.unique(np.linspace(0, len(track) - 1, most).astype(int))])
+
+
+def _paths(problem: Problem, fixes: Sequence[Fix]) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """Return the paths (k, d) of the moving targets of a run, as fixed and as its alternatives have them."""
+    if len(fixes) != 1 or fixes[0].shape or problem.epochs == 1:
+        return (), ()
+    others = fixes[0].alternatives
+    vectors = [fixes[0].x, *others.x[np.isfinite(others.gap)]]
+    paths: list[list[Array]] = [[], []]
+    for number, x in enumerate(vectors):
+        if not np.isfinite(x).all():
+            continue
+        for i, motion in enumerate(problem.motions):
+            if motion.known is None and (motion.order or motion.span == "epoch"):
+                paths[number > 0].append(_thinned(_path(problem, fixes[0], i, x)))
+    return tuple(paths[0]), tuple(paths[1])
+
+
+def _path(problem: Problem, fix: Fix, target: int, x: Array) -> Array:
+    motion = problem.motions[target]
+    states = [fix.layout.take(x, name) for name in state_names(target, len(problem.motions), motion.order)]
+    if motion.span == "epoch":
+        return states[0]
+    since = problem.times - (problem.times[0] if motion.reference is None else motion.reference)
+    return np.asarray(sum(since[:, None] ** i / factorial(i) * state for i, state in enumerate(states)))
 
 
 def _regions(problem: Problem, reach: Array) -> tuple[Array, ...]:

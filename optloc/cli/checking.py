@@ -15,7 +15,7 @@ from optloc.epochs import separable
 from optloc.files import Loaded, read
 from optloc.models import MODELS
 from optloc.problem import Problem
-from optloc.types import Array
+from optloc.types import Array, Bias
 
 
 def run_check(file: Path, as_json: bool) -> int:
@@ -34,10 +34,12 @@ def run_check(file: Path, as_json: bool) -> int:
 
 def _spelled(value: Any) -> str:
     if isinstance(value, dict):
-        return ", ".join(f"{key}: {inner}" for key, inner in value.items())
+        return ", ".join(f"{key}: {inner}" for key, inner in value.items()) or "none"
     if isinstance(value, list):
         return ", ".join(value) or "none"
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return f"{value:.4g}" if np.isfinite(value) else "unknown"
+    return str(value)
 
 
 def summary(loaded: Loaded) -> dict[str, Any]:
@@ -53,12 +55,15 @@ def summary(loaded: Loaded) -> dict[str, Any]:
         "frame": problem.frame.kind,
         "dimension": problem.dimension,
         "stations": problem.stations.count,
-        "stations_move": len(problem.stations.position) > 1,
+        "moving_stations": _moving(problem.stations.position),
+        "station_errors": _errors(problem),
         "epochs": problem.epochs,
+        "duration_s": float(np.ptp(loaded.times)),
         "targets": len(set(loaded.targets)),
         "rows": {block.kind: block.count for block in problem.rows},
         "absent_rows": int((problem.weight == 0.0).sum()),
         "constraints": [constraint.name for constraint in problem.constraints],
+        "biases": {bias.name: _bias(problem, bias) for bias in problem.biases},
         "unknowns": problem.layout.size // problem.epochs if alone else problem.layout.size,
         "redundancy": {"least": int(redundancy.min()), "median": float(np.median(redundancy))},
         "epochs_with_too_few_rows": int((redundancy < 0).sum()),
@@ -68,13 +73,39 @@ def summary(loaded: Loaded) -> dict[str, Any]:
     }
 
 
+def _moving(position: Array) -> int:
+    """Return how many stations (k, s, d) are not at one place in all epochs."""
+    return int((np.ptp(position, axis=0).max(-1) > 0.0).sum())
+
+
+def _errors(problem: Problem) -> str:
+    """Return the size of the errors of station positions, and how long they last."""
+    covariance, span = problem.stations.covariance, problem.stations.span
+    if covariance is None:
+        return "none"
+    sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    sizes = f"{sigma.min():.4g}" if np.ptp(sigma) == 0.0 else f"{sigma.min():.4g} to {sigma.max():.4g}"
+    return f"{sizes} m, {'noise of each epoch' if span == 'noise' else f'unknown for each {span}'}"
+
+
+def _bias(problem: Problem, bias: Bias) -> str:
+    """Return form, members and prior of a bias in words."""
+    slot, _ = problem.layout.find(bias.name)
+    names = ", ".join(bias.members[:8]) + (f" and {len(bias.members) - 8} more" if len(bias.members) > 8 else "")
+    if bias.sigma is None:
+        return f"{bias.form} of {names}, unknown"
+    low, high = np.min(bias.sigma), np.max(bias.sigma)
+    prior = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
+    return f"{bias.form} of {names}, prior {prior} {slot.unit}"
+
+
 def _redundancy(problem: Problem, alone: bool) -> Array:
     """Return rows and priors less unknowns, of each epoch (k,) or of the run (1,)."""
     present = np.bincount(problem.epoch, problem.weight > 0.0, problem.epochs)
     layout = problem.layout
     known = len(exact(problem)) + sum(len(np.ravel(bias.sigma)) for bias in problem.biases if bias.sigma is not None)
     known += sum(prior.mean.shape[-1] for prior in problem.priors)
-    if problem.stations.covariance is not None:
+    if problem.stations.covariance is not None and problem.stations.span != "noise":
         known += (
             problem.stations.count
             * problem.dimension

@@ -10,7 +10,7 @@ import numpy as np
 
 from optloc.ellipse import error_ellipse
 from optloc.fix import Fix
-from optloc.plot.style import BLACK, BLUE, GREY, ORANGE, figure_class
+from optloc.plot.style import BLACK, BLUE, GREEN, GREY, ORANGE, figure_class
 from optloc.problem import Problem
 from optloc.scene import Scene, scene_of
 from optloc.types import Array
@@ -58,12 +58,15 @@ def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") ->
 
 
 def _overview(panel: Axes, scene: Scene, view: tuple[int, int]) -> None:
-    everything = np.concatenate([scene.stations, scene.fixes, scene.alternatives])
+    lines = (*scene.tracks, *scene.paths, *scene.other_paths, *scene.known)
+    everything = np.concatenate([scene.stations, scene.fixes, scene.alternatives, *lines])
     unit, size = _unit(everything[:, view])
     if view == (0, 1):
         _edges(panel, scene, size)
     _ellipses(panel, scene, view, size)
-    panel.scatter(*_xy(scene.stations, view, size), marker="^", s=60, color=BLACK, label="station", zorder=3)
+    _lines(panel, scene, view, size)
+    label = "station, first epoch" if scene.tracks else "station"
+    panel.scatter(*_xy(scene.stations, view, size), marker="^", s=60, color=BLACK, label=label, zorder=3)
     if scene.stations.shape[0] <= 20:
         for name, x, y in zip(scene.names, *_xy(scene.stations, view, size), strict=True):
             panel.annotate(name, (x, y), xytext=(5, 5), textcoords="offset points", fontsize=8, zorder=6)
@@ -79,6 +82,20 @@ def _edges(panel: Axes, scene: Scene, size: float) -> None:
         ring = np.concatenate([corners, corners[:1]]) / size
         panel.plot(*ring.T, color=GREY, linewidth=1.2, linestyle="--", label=label, zorder=1)
         label = None
+
+
+def _lines(panel: Axes, scene: Scene, view: tuple[int, int], size: float) -> None:
+    """Draw what moves as lines, and known targets."""
+    spots: dict[str, Any] = {"marker": "s", "markersize": 4, "markevery": [0]}
+    styles: tuple[tuple[tuple[Array, ...], dict[str, Any]], ...] = (
+        (scene.tracks, {"label": "track of a station", "color": BLACK, "linewidth": 1.0}),
+        (scene.paths, {"label": "path of the target", "color": BLUE, "linewidth": 1.6}),
+        (scene.other_paths, {"label": "path of an alternative", "color": ORANGE, "linewidth": 1.2, "linestyle": "--"}),
+        (scene.known, {"label": "known target", "color": GREEN, "linewidth": 1.2, **spots}),
+    )
+    for parts, style in styles:
+        for i, part in enumerate(parts):
+            panel.plot(*_xy(part, view, size), zorder=2, **(style if i == 0 else style | {"label": None}))
 
 
 def _points(panel: Axes, scene: Scene, view: tuple[int, int], size: float) -> None:
@@ -141,6 +158,7 @@ def _close(panel: Axes, scene: Scene) -> None:
     shifted = _moved(scene, centre)
     _edges(panel, shifted, size)
     _ellipses(panel, shifted, view, size)
+    _lines(panel, shifted, view, size)
     _points(panel, shifted, view, size)
     panel.scatter(*_xy(shifted.stations, view, size), marker="^", s=60, color=BLACK, zorder=3)
     _frame(panel, shifted, view, unit)
@@ -153,13 +171,7 @@ def _close(panel: Axes, scene: Scene) -> None:
 def _moved(scene: Scene, centre: Array) -> Scene:
     shift = np.zeros(scene.stations.shape[-1])
     shift[:2] = centre
-    return replace(
-        scene,
-        stations=scene.stations - shift,
-        fixes=scene.fixes - shift,
-        alternatives=scene.alternatives - shift,
-        regions=tuple(corners - centre for corners in scene.regions),
-    )
+    return replace(scene.moved(lambda place: place - shift), regions=tuple(ring - centre for ring in scene.regions))
 
 
 def _reach(scene: Scene, known: Array, centre: Array) -> float:

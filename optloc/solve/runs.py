@@ -8,11 +8,14 @@ from math import factorial
 import numpy as np
 
 from optloc.blocks import averaged
+from optloc.equations import equations_at
+from optloc.normal import covariance
 from optloc.plan import elapsed
 from optloc.problem import Problem
 from optloc.solve.refine import refine
-from optloc.solve.scale import spread_of
-from optloc.solve.start import completed
+from optloc.solve.scale import distance_of, spread_of
+from optloc.solve.start import completed, vectors
+from optloc.solve.verdict import DOUBT, degrees_of_freedom
 from optloc.status import Status
 from optloc.types import Array
 
@@ -21,6 +24,11 @@ _BLOCKS = 30
 _RIVAL = 1e3
 _KEPT = 4
 _SAME = 1e-4
+# Where the verdict is not clean: minima beyond the stations' plane and along the valley of a weak fix.
+_WEAK = 1e-2
+_AZIMUTHS = 6
+_RADII = (1.5, 5.0)
+_STEPS = (-8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0)
 
 
 def run_starts(problem: Problem, begin: Callable[[Problem], Array | None]) -> Array:
@@ -37,11 +45,14 @@ def run_starts(problem: Problem, begin: Callable[[Problem], Array | None]) -> Ar
     x = begin(blocks)
     if x is None:
         return np.full((problem.batch_shape[0], 1, problem.layout.size), np.nan)
-    found, cost = _minima(blocks, x)
-    beside, more = _minima(blocks, mirrored_courses(blocks, found[:, :1]))
-    found, cost = _best(blocks, np.concatenate([found, beside], axis=1), np.concatenate([cost, more], axis=1))
-    n = problem.layout.n_shared
-    return completed(problem, found[..., :n])
+    pool = _minima(blocks, x)
+    pool = _pooled(pool, _minima(blocks, mirrored_courses(blocks, pool[0][:, :1])))
+    doubtful = np.flatnonzero(~_settled(blocks, pool))
+    if len(doubtful):
+        part = blocks.take(doubtful)
+        wider = _minima(part, np.concatenate([_around(part), _valley(part, pool[0][doubtful, 0])], axis=1))
+        pool = _pooled(pool, _spread(wider, doubtful, len(x)))
+    return completed(problem, _best(blocks, *pool)[..., : problem.layout.n_shared])
 
 
 def _minima(blocks: Problem, x: Array) -> tuple[Array, Array]:
@@ -56,8 +67,70 @@ def _minima(blocks: Problem, x: Array) -> tuple[Array, Array]:
     return np.take_along_axis(out, order[..., None], axis=1), np.take_along_axis(cost, order, axis=1)
 
 
-def _best(blocks: Problem, x: Array, cost: Array) -> tuple[Array, Array]:
-    """Return the different minima (N, C, size) worth refining on all epochs, NaN in empty slots, and their costs."""
+def _pooled(one: tuple[Array, Array], two: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Return two sets of minima as one, the cheapest first."""
+    x, cost = (np.concatenate(parts, axis=1) for parts in zip(one, two, strict=True))
+    order = np.argsort(cost, axis=1, kind="stable")
+    return np.take_along_axis(x, order[..., None], axis=1), np.take_along_axis(cost, order, axis=1)
+
+
+def _spread(found: tuple[Array, Array], items: Array, count: int) -> tuple[Array, Array]:
+    x = np.full((count, *found[0].shape[1:]), np.nan)
+    cost = np.full((count, found[1].shape[1]), np.inf)
+    x[items], cost[items] = found
+    return x, cost
+
+
+def _settled(blocks: Problem, pool: tuple[Array, Array]) -> Array:
+    """Return where the best minimum (N,) fits the data and has a small error: where else to look is no question."""
+    from scipy.special import gammaincc
+
+    x, cost = pool[0][:, 0], pool[1][:, 0]
+    found, dof = np.isfinite(cost), np.maximum(degrees_of_freedom(blocks), 1)
+    fits = found & (gammaincc(dof / 2.0, np.where(found, cost, np.inf) / 2.0) > DOUBT)
+    deviation = np.sqrt(np.trace(_covariance(blocks, x), axis1=-2, axis2=-1))
+    with np.errstate(invalid="ignore"):
+        return np.asarray(fits & (deviation < _WEAK * distance_of(blocks, blocks.layout.take(x, "position"))))
+
+
+def _covariance(blocks: Problem, x: Array) -> Array:
+    """Return the covariance of the position (N, d, d) in units of the spread of the stations."""
+    usable = np.isfinite(x).all(-1)
+    slot, _ = blocks.layout.find("position")
+    part = slice(slot.start, slot.start + slot.size)
+    with np.errstate(all="ignore"):
+        full, ok = covariance(equations_at(blocks, np.where(usable[:, None], x, 0.0)))
+    return np.where((usable & ok)[:, None, None], full[:, part, part], np.nan) / spread_of(blocks)[1][:, None, None] ** 2
+
+
+def _around(blocks: Problem) -> Array:
+    """Return vectors (N, C, size) of targets at rest on circles around the stations, and above and below."""
+    d, (centre, spread) = blocks.dimension, spread_of(blocks)
+    angle = 2.0 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
+    level = np.stack([np.cos(angle), np.sin(angle), *([0.0 * angle] * (d - 2))], axis=-1)
+    poles = np.eye(d)[2:]
+    direction = np.concatenate([level, poles, -poles])
+    away = (np.array(_RADII)[:, None, None] * direction).reshape(-1, d)
+    x = np.repeat(vectors(blocks, None)[:, None], len(away), axis=1)
+    slot, _ = blocks.layout.find("position")
+    x[..., slot.start : slot.start + slot.size] = centre[:, None] + spread[:, None, None] * away
+    return x
+
+
+def _valley(blocks: Problem, x: Array) -> Array:
+    """Return vectors (N, C, size) along the longest axis of the error ellipsoid of the best minimum."""
+    cov = _covariance(blocks, x)
+    usable = np.isfinite(cov).all((-1, -2))
+    values, axes = np.linalg.eigh(np.where(usable[:, None, None], cov, 0.0))
+    longest = (np.sqrt(np.maximum(values[:, -1], 0.0)) * spread_of(blocks)[1])[:, None] * axes[..., -1]
+    out = np.repeat(np.where(usable[:, None], x, np.nan)[:, None], len(_STEPS), axis=1)
+    slot, _ = blocks.layout.find("position")
+    out[..., slot.start : slot.start + slot.size] += np.array(_STEPS)[:, None] * longest[:, None]
+    return out
+
+
+def _best(blocks: Problem, x: Array, cost: Array) -> Array:
+    """Return the different minima (N, C, size) worth refining on all epochs; NaN in empty slots."""
     order = np.argsort(cost, axis=1, kind="stable")[:, : 4 * _KEPT]
     x, cost = np.take_along_axis(x, order[..., None], axis=1), np.take_along_axis(cost, order, axis=1)
     for i in range(1, x.shape[1]):
@@ -68,7 +141,7 @@ def _best(blocks: Problem, x: Array, cost: Array) -> tuple[Array, Array]:
     with np.errstate(invalid="ignore"):
         cost[:, 2:] = np.where(cost[:, 2:] - cost[:, :1] > _RIVAL, np.inf, cost[:, 2:])
     used = np.isfinite(cost)
-    return np.where(used[..., None], x, np.nan)[:, : max(1, int(used.sum(1).max()))], cost
+    return np.where(used[..., None], x, np.nan)[:, : max(1, int(used.sum(1).max()))]
 
 
 def _alike(blocks: Problem, x: Array, y: Array) -> Array:

@@ -23,7 +23,9 @@ def readings() -> Table:
     """Return the bounds of the fixed target under each reading of the noise, metres."""
     shapes: dict[Shape, str] = {"full": "I + 11'", "half": "(I + 11') / 2", "diag": "I"}
     header = ("covariance", "σ", "600 s, no station error", "600 s, 1 m", "600 s, 5 m", "700 s, 1 m", "sigma0, 1 m")
-    lines = [("printed", "", "", "39", "75", "36.7", ", ".join(f"{v:.0f}" for v in printed.SIGMA0))]
+    lines: list[tuple[str, ...]] = [
+        ("printed", "", "", "39", "75", "36.7", ", ".join(f"{v:.0f}" for v in printed.SIGMA0))
+    ]
     for (shape, name), delay in product(shapes.items(), (10, 20)):
         sigma = delay * NANOSECOND
         bounds = [
@@ -60,9 +62,9 @@ def minima() -> Table:
             (str(epochs), place, f"{offset:.0f}", f"{found.gap:.4g}", f"{found.doubt:.2g}", f"{noisy.doubt:.2g}")
         )
     note = (
-        "Noise-free data, 1 m station error, 10 ns. The gap is the cost of the image, a weighted sum of squares; half its "
-        "root is how many standard deviations of noise turn the choice. The image needs biases of hundreds of metres: a "
-        "prior of 200 m removes it."
+        "Noise-free data, 1 m station error, 10 ns. The gap is the cost of the image, a weighted sum of squares; half "
+        "its root is how many standard deviations of noise turn the choice. The image needs biases of hundreds of "
+        "metres: a prior of 200 m removes it."
     )
     return Table("minima", "The image in the plane of the stations", header, tuple(lines), note)
 

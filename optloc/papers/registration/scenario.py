@@ -68,7 +68,7 @@ class Scenario:
 
     def track(self, epochs: int) -> Array:
         """Return the positions (k, s, 3) of the stations, metres."""
-        return self.position + self.times(epochs)[:, None, None] * self.velocity
+        return np.asarray(self.position + self.times(epochs)[:, None, None] * self.velocity)
 
 
 def _fleet(*rows: tuple[float, ...]) -> tuple[Array, Array]:
@@ -92,21 +92,15 @@ PRINTED = Scenario(
 MOVING = replace(PRINTED, target=np.array([200e3, 300e3, 5e3]), course=np.array([-100.0, 0.0, 0.0]))
 """The same stations and the target of section 4.4, which flies straight."""
 
-SPATIAL = replace(
-    PRINTED,
-    **dict(
-        zip(
-            ("position", "velocity"),
-            _fleet(
-                (0, 0, 10, 0, 300, 0),
-                (-15, 0, 6, -20, 290, 0),
-                (15, 0, 9, 20, 290, 0),
-                (-8, 30, 3, -60, 300, 0),
-                (8, 30, 11, 60, 280, 0),
-            ),
-            strict=True,
-        )
+SPATIAL = Scenario(
+    *_fleet(
+        (0, 0, 10, 0, 300, 0),
+        (-15, 0, 6, -20, 290, 0),
+        (15, 0, 9, 20, 290, 0),
+        (-8, 30, 3, -60, 300, 0),
+        (8, 30, 11, 60, 280, 0),
     ),
+    target=np.array([200e3, 300e3, 0.0]),
 )
 """Stations of like size and speed that span space at every epoch and keep their distance."""
 

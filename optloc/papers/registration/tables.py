@@ -173,8 +173,8 @@ def starts(cases: Sequence[Case]) -> Table:
             (f"{case.label:.0f}", f"{error:.1f}", f"{printed.BOUND:.1f}", f"{divergence:.1f} %", *_compared(case))
         )
     note = (
-        "Metres after 600 epochs; the start is Gaussian, n times sigma0 wide. optloc takes no start, so its column is one "
-        "and the same. The printed bound of 36.7 m is not reproduced by any reading; errors of the trials that are not lost."
+        "Metres after 600 epochs; the start is Gaussian, n times sigma0 wide. optloc takes no start: its column repeats "
+        "one number. The printed bound of 36.7 m is not reproduced by any reading of the noise."
     )
     return Table("table-3", "Table 3: initial error", header, tuple(lines), note)
 
@@ -192,9 +192,9 @@ def noises(cases: Sequence[Case], later: Sequence[float]) -> Table:
         line = (f"{case.label:.0f} ns", read, f"{error:.1f}", f"{crlb:.1f}", f"{divergence:.1f} %")
         lines.append((*line, *_compared(case), metres(bound)))
     note = (
-        "Metres after 600 epochs, starts one sigma0 of the case wide. The printed errors are those of 600 s, not of 700 s as the text "
-        "says, and of 10 to 40 ns, not 20 to 50. The printed bounds are exactly 1 : 2 : 3 : 4, so they leave the "
-        "station errors out; they are reproduced at neither time."
+        "Metres after 600 epochs, starts one sigma0 of the case wide. The printed errors are those of 600 s, not of "
+        "700 s as the text says, and of 10 to 40 ns, not 20 to 50. The printed bounds are exactly 1 : 2 : 3 : 4, so they "
+        "leave the station errors out; they are reproduced at neither time."
     )
     return Table("table-4", "Table 4: measurement noise", header, tuple(lines), note)
 

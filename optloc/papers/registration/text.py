@@ -6,9 +6,9 @@ TITLE = "Registration of moving stations by TDOA and GROA"
 
 OPENING = """\
 Five moving stations measure the range differences of one emitter once a second; every channel has an unknown constant
-bias, and the reported station positions are wrong by a metre or five, anew at each epoch. The paper (*Error registration
-of multiple moving observers by TDOA and GROA*, Journal of Electronics & Information Technology 39, 2017) estimates
-target and biases by least squares. Its section 4 is made again here in two ways, on the same data:
+bias, and the reported station positions are wrong by a metre or five, anew at each epoch. The paper (*Error
+registration of multiple moving observers by TDOA and GROA*, Journal of Electronics & Information Technology 39, 2017)
+estimates target and biases by least squares. Its section 4 is made again here in two ways, on the same data:
 
 - **recursion** is the algorithm as printed: from a Gaussian start near the truth, two undamped steps over all past data
   at each epoch from the fortieth on. The start is one sigma0 wide where nothing else is said.
@@ -34,7 +34,7 @@ CLOSING = """\
 ## What is wrong in the paper
 
 1. Equation 23, the bound for unknown biases, is printed as X − Y Q Y'. With the stacked Q that allows a new bias at
-   every epoch, and nothing is left of the information. It has to be X − Y (Σ R⁻¹)⁻¹ Y'. Equation 24 has lost a sign too.
+   every epoch, and nothing is left of the information. It has to be X − Y (Σ R⁻¹)⁻¹ Y'. Equation 24 has lost a sign.
 2. Equation 15 stacks the target once for each epoch; it is one unknown. The corner of size 3 + 3M is that of one epoch.
 3. sigma0 is said to follow from equation 23. It is equation 25, with known biases, for the single epoch t = 0.
 4. Stations 4 and 5 of table 1 meet at t = 50 s: their distance is exactly zero.
@@ -57,5 +57,5 @@ CLOSING = """\
     against 75 and 39 m) is the scatter of 200 trials. Gain ratios help from about 3·10⁻⁴ on (38.9 m), and
     take 40 % off at 3·10⁻⁵ (24.9 m). The recursion is not run with them.
 
-The error of 200 trials scatters by about five per cent. Divergence of 2.5 % is 5 trials of 200: the 95 % interval is 0.8
-to 5.7 %."""
+The error of 200 trials scatters by about five per cent. Divergence of 2.5 % is 5 trials of 200: the 95 % interval is
+0.8 to 5.7 %."""
