@@ -46,7 +46,7 @@ from formulations.conic import Answer, Relaxation
 
 Array = NDArray[np.float64]
 
-PRICES = (10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01)
+PRICES = (30.0, 10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01)
 """Prices eta of the squared distance from the array's centre, in units of its mean squared extent."""
 
 

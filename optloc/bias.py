@@ -19,6 +19,7 @@ Form = Literal["offset", "scale", "drift", "rotation"]
 Per = Literal["station", "pair", "kind"]
 Members = Sequence[str] | Mapping[str, Sequence[str]] | None
 _Touch = tuple[Array, Array, Array]
+_TAKEN = ("position", "velocity", "acceleration", "emission", "stations")
 
 
 def with_bias(
@@ -96,6 +97,9 @@ def family(
         Place that complaints name; the bias by default.
     """
     where = where or f"bias {name!r}"
+    if not name or name.partition("[")[0] in _TAKEN:
+        advice = f"other unknowns are called {', '.join(_TAKEN)}"
+        raise InvalidProblem(f"the name {name!r} is taken" if name else "the name is empty", where, advice)
     for value, known, what in (
         (per, ("station", "pair", "kind"), "per"),
         (form, ("offset", "scale", "drift", "rotation"), "form"),

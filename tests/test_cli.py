@@ -244,7 +244,9 @@ def test_biases_are_reported(tmp_path):
     bias = '[[biases]]\nname = "common"\nper = "kind"\n'
     path = write(tmp_path, f'{MORE}[[measurements]]\nkind = "range"\nsigma = 1.0\n{rows(ranges)}{bias}')
     (fix,) = json.loads(run("fix", path, "--json").stdout)["fixes"]
-    assert fix["biases"]["common"] == pytest.approx([25.0], abs=1e-3)
+    (bias,) = fix["biases"]
+    assert bias["value"] == pytest.approx(25.0, abs=1e-3)
+    assert (bias["name"], bias["member"], bias["unit"], bias["from_data"]) == ("common", "range", "m", 1.0)
     assert "common" in run("fix", path).stdout
 
 

@@ -261,7 +261,7 @@ def test_a_known_target_calibrates(kind, tmp_path):
     assert problem.layout.find("delay")[0].unit == "m"
     (fix,) = json.loads(run("fix", source, "--json").stdout)["fixes"]
     assert fix["status"] == "ok"
-    assert fix["biases"]["delay"] == pytest.approx([25.0], abs=1e-4)
+    assert fix["biases"][0]["value"] == pytest.approx(25.0, abs=1e-4)
     run("simulate", source, "--truth", "0,0,0", "--out", tmp_path / "s.toml", "-q")
 
 

@@ -111,7 +111,9 @@ def fix(
 
 @app.command(epilog=example("optloc demo", "optloc demo ambiguous --plot two.png"))
 def demo(
-    name: Annotated[str, typer.Argument(help="Name of a shipped problem: demo, ambiguous, run.")] = "demo",
+    name: Annotated[
+        str, typer.Argument(help="Name of a shipped problem: demo, ambiguous, run, registration.")
+    ] = "demo",
     plot: Annotated[Path, typer.Option(metavar="OUT.png", help="Where to draw the fix.")] = Path("optloc-demo.png"),
     quiet: Quiet = False,
 ) -> None:
@@ -176,6 +178,24 @@ def check(file: ProblemPath, as_json: Json = False) -> None:
     from optloc.cli.checking import run_check
 
     raise typer.Exit(run_check(file, as_json))
+
+
+@app.command(epilog=example("optloc reproduce registration", "optloc reproduce registration --size full --out tables"))
+def reproduce(
+    name: Annotated[str, typer.Argument(metavar="PAPER", help="Name of a paper: registration.")],
+    size: Annotated[str, typer.Option(metavar="quick|full", help="Two minutes, or the sample sizes of the paper.")] = (
+        "quick"
+    ),
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Where tables and pictures go; optloc-PAPER by default.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Decides all draws.")] = 1,
+    quiet: Quiet = False,
+) -> None:
+    """Make the simulations of a paper again: tables and pictures with printed value, reproduced value and bound."""
+    from optloc.cli.reproduce import run_reproduce
+
+    raise typer.Exit(run_reproduce(name, size, out, seed, quiet))
 
 
 @app.command("list", epilog=example("optloc list kinds", "optloc list solvers"))

@@ -39,9 +39,14 @@ def bias_records(fix: Fix, seen: Observability | None) -> list[dict[str, Any]]:
 
 def show_biases(fix: Fix, seen: Observability | None, console: Console) -> None:
     """Print the biases of a single fix, and what cannot be told apart; nothing where there is none."""
-    records = bias_records(fix, seen)
-    if not records:
-        return
+    records = bias_records(fix, seen) if np.isfinite(fix.x).all() else []
+    if records:
+        console.print(_table(records))
+    for sentence in () if seen is None else seen.sentences:
+        console.print(f"{sentence[0].upper()}{sentence[1:]}.", highlight=False, markup=False, soft_wrap=True)
+
+
+def _table(records: list[dict[str, Any]]) -> Table:
     table = Table(title="Biases", title_justify="left")
     for name in ("name", "member", "estimate", "from data"):
         table.add_column(name, justify="right" if name == "from data" else "left")
@@ -51,6 +56,4 @@ def show_biases(fix: Fix, seen: Observability | None, console: Console) -> None:
         table.add_row(record["name"], record["member"], estimate, share)
     if len(records) > _LONG:
         table.add_row("...", f"{len(records) - _LONG} more", "--json prints all", "")
-    console.print(table)
-    for sentence in () if seen is None else seen.sentences:
-        console.print(f"{sentence[0].upper()}{sentence[1:]}.", highlight=False, markup=False, soft_wrap=True)
+    return table

@@ -74,9 +74,10 @@ def fix_file(loaded: Loaded, method: str, quiet: bool) -> Fixed:
 
 
 def _seen(problem: Problem, fix: Fix) -> Observability | None:
-    """Return what the data show of biases; None where there is no fix, or no bias."""
+    """Return what the data show of biases, at the fix or else at an alternative; None without either, or a bias."""
+    points = [x for x in (fix.x, *fix.alternatives.x) if np.isfinite(x).all()]
     biased = any(slot.members for slot in fix.layout.shared)
-    return observability(problem, fix.x) if biased and np.isfinite(fix.x).all() else None
+    return observability(problem, points[0]) if biased and points else None
 
 
 def _parts(batch: Problem, count: int) -> Iterator[tuple[int, Problem]]:

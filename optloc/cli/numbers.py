@@ -7,6 +7,7 @@ import numpy as np
 
 def with_sigma(value: float, sigma: float, unit: str) -> str:
     """Return a number with its standard deviation, rounded to it; a constraint may leave it none."""
+    unit = unit if unit != "1" else ""
     if sigma <= 1e-12 * (1.0 + abs(value)):
         return f"{value:.10g} {unit} (held)"
     if not np.isfinite(sigma):

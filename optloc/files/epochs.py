@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,7 +72,7 @@ class Epochs:
         return self.times if dated else np.arange(float(self.count))
 
 
-def epochs_of(keys: Keys, count: int, window: float | None, free: bool | None) -> Epochs:
+def epochs_of(keys: Keys, count: int, window: float | None, free: bool | None, source: str = "") -> Epochs:
     """Return the epochs of rows.
 
     Parameters
@@ -84,8 +85,16 @@ def epochs_of(keys: Keys, count: int, window: float | None, free: bool | None) -
         Seconds that make one epoch; None: rows of exactly equal time.
     free : bool, optional
         Whether targets are free at each epoch; None: where there are several epochs.
+    source : str
+        Place to name.
+
+    Raises
+    ------
+    InvalidProblem
+        Where the times of an epoch have a whole other epoch between them.
     """
     index, labels, times = _grouped(keys, count, window)
+    _check_instants(keys, labels, index, source)
     if keys.target is None:
         return Epochs(index, np.zeros(count, dtype=np.int64), labels, times, ("target",))
     names, target = np.unique(keys.target.astype(str), return_inverse=True)
@@ -122,6 +131,23 @@ def _grouped(keys: Keys, count: int, window: float | None) -> tuple[Array, tuple
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
     return place[index], tuple(labels[order].tolist()), times[order]
+
+
+def _check_instants(keys: Keys, labels: Sequence[str], index: Array, source: str) -> None:
+    """Refuse a label whose rows have times with a whole other epoch between them."""
+    if keys.label is None or keys.time is None or len(labels) < 2:
+        return
+    first, last = np.full(len(labels), np.inf), np.full(len(labels), -np.inf)
+    np.minimum.at(first, index, keys.time)
+    np.maximum.at(last, index, keys.time)
+    order = np.argsort(first, kind="stable")
+    outer, inner = order[:-1], order[1:]
+    held = np.flatnonzero((first[outer] < first[inner]) & (last[inner] < last[outer]))
+    if len(held):
+        one, two = outer[held[0]], inner[held[0]]
+        what = f"epoch {labels[one]!r} has the times {first[one]:.10g} s and {last[one]:.10g} s"
+        advice = "give every instant a label of its own"
+        raise InvalidProblem(f"{what}, and epoch {labels[two]!r} lies between them", source, advice)
 
 
 def _numbers(values: Array) -> Array | None:

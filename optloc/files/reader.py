@@ -17,6 +17,7 @@ from optloc.files.epochs import Epochs, Keys, epochs_of, need_clock
 from optloc.files.known import known_of, places_of
 from optloc.files.measurements import chunks_of, with_baseline
 from optloc.files.noise import noise_of, per_epoch
+from optloc.files.repeats import check_repeats
 from optloc.files.schema import ConstraintTable, ProblemFile
 from optloc.files.sigmas import square
 from optloc.files.sources import table_of
@@ -174,6 +175,7 @@ def assemble(
     epochs = _epochs(file, chunks, source)
     cuts = np.cumsum([len(chunk.z) for chunk in chunks])[:-1]
     index, target = np.split(epochs.index, cuts), np.split(epochs.target, cuts)
+    check_repeats(chunks, index, target, found.names, epochs)
     stations = over_epochs(found, file.stations, epochs, [_used(c, i) for c, i in zip(chunks, index, strict=True)])
     chunks = [_completed(chunk, i, stations) for chunk, i in zip(chunks, index, strict=True)]
     rows, numbers = _rows(chunks, index, target)
@@ -238,7 +240,7 @@ def _epochs(file: ProblemFile, chunks: Sequence[Chunk], source: str) -> Epochs:
     motion = {table.moves for table in (file.target, *file.targets.values())} - {None}
     free = None if not motion else motion == {"free"}
     keys = Keys(columns["label"], columns["time"], columns["written"], columns["target"])
-    return epochs_of(keys, sum(len(chunk.z) for chunk in chunks), window, free)
+    return epochs_of(keys, sum(len(chunk.z) for chunk in chunks), window, free, source)
 
 
 def _used(chunk: Chunk, epoch: Array) -> Array:

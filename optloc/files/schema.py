@@ -77,7 +77,7 @@ class StationsTable(DataTable):
     sigma: Amount | None = None
     """Standard deviation of each coordinate of the positions; None: surveyed exactly."""
     span: Literal["epoch", "run", "noise"] = "epoch"
-    """Whether a position error is an unknown of each epoch or of the whole run; or drawn anew at each epoch and noise."""
+    """Whether a position error is an unknown of each epoch, or of the run; or noise that is drawn anew at each epoch."""
 
 
 class MeasurementsTable(DataTable):
@@ -162,7 +162,7 @@ class ConstraintTable(_Table):
 class BiasTable(_Table):
     """A family of unknown systematic errors."""
 
-    name: str
+    name: str = Field(min_length=1)
     """Its name."""
     form: Literal["offset", "scale", "drift", "rotation"] = "offset"
     """Added; times the measured quantity; times the seconds of the run; or a turn of the station's axes."""

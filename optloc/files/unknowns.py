@@ -78,15 +78,20 @@ def bias_of(
 def _prior(
     table: BiasTable, quantity: Quantity, speed: float, shape: tuple[int, ...], where: str
 ) -> tuple[Array, Array | None]:
-    if table.form == "scale":
-        quantity = "plain"
-    elif table.form == "rotation":
-        quantity = "angle"
-    units = Units(quantity, speed)
+    own: dict[str, Quantity] = {"scale": "plain", "rotation": "angle"}
+    units = Units(own.get(table.form, quantity), speed)
 
     def si(value: float | str, key: str) -> float:
-        text = value.removesuffix("/s") if isinstance(value, str) and table.form == "drift" else value
-        return units.plain(text, "1" if quantity in {"plain", "ratio"} else None, join(where, f"key {key!r}"))
+        place, text = join(where, f"key {key!r}"), value
+        bare = "1" if units.quantity in {"plain", "ratio"} and table.form != "drift" else None
+        if table.form == "drift":
+            number, _, unit = str(value).strip().partition(" ")
+            amount, slash, _ = unit.replace("^2", "/s").rpartition("/s")
+            if not slash:
+                example = f'"{number} {units.name(None)}/s"'
+                raise InvalidProblem(f"{value!r} is no drift", place, f"write its unit, such as {example}")
+            text = f"{number} {amount}"
+        return units.plain(text, bare, place)
 
     mean = np.full(shape, 0.0 if table.mean is None else si(table.mean, "mean"))
     if table.sigma is None:

@@ -39,12 +39,12 @@ def run_starts(problem: Problem, begin: Callable[[Problem], Array | None]) -> Ar
     problem : Problem
         N runs of one target that lasts them.
     begin : callable
-        Maps the block averages to starting vectors (N, C, size of theirs), or None where it cannot.
+        Maps the block averages to starting vectors (N, C, size of theirs), or None where it cannot: the starts are
+        then places around the stations.
     """
     blocks = averaged(problem, _BLOCKS)
     x = begin(blocks)
-    if x is None:
-        return np.full((problem.batch_shape[0], 1, problem.layout.size), np.nan)
+    x = _around(blocks) if x is None else x
     pool = _minima(blocks, x)
     pool = _pooled(pool, _minima(blocks, mirrored_courses(blocks, pool[0][:, :1])))
     doubtful = np.flatnonzero(~_settled(blocks, pool))

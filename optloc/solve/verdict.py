@@ -150,11 +150,15 @@ def _preferred(problem: Problem, pool: Candidates) -> Array:
 def _alternatives(
     problem: Problem, pool: Candidates, chosen: Array, value: Array, curvature: Curvature
 ) -> Alternatives:
-    """Return the other finished minima within the listed gap, each once."""
+    """Return the other finished minima within the listed gap, each once; those of a run whatever they cost.
+
+    The rivals of a run are few, and by how much the data exclude them is what its user asks.
+    """
     n, x = problem.layout.n_shared, pool.x
+    limit = np.inf if problem.epochs > 1 else LISTED_GAP
     with np.errstate(invalid="ignore"):
         gap = np.where(pool.code == Status.OK, pool.cost - value[:, None], np.inf)
-    gap = np.where(np.isfinite(gap) & (gap < LISTED_GAP), gap, np.inf)
+    gap = np.where(np.isfinite(gap) & (gap < limit), gap, np.inf)
     kept: list[tuple[Array, Array]] = [(chosen, np.full(len(x), -1.0))]
     used = np.isfinite(gap).any(0)
     for slot in np.flatnonzero(used):
@@ -245,6 +249,8 @@ def _explain(problem: Problem, fix: Fix, curvature: Curvature) -> None:
     for i in np.flatnonzero(fix.code == Status.AMBIGUOUS):
         alike = gap[i] < _EQUAL
         fix.reason[i] = "another position " + ("fits as well" if alike else f"costs only {gap[i]:.2g} more")
+        if problem.epochs > 1 and any(motion.order > 0 for motion in problem.motions):
+            fix.reason[i] += ": a bound on height, speed or place would decide"
     barred = missing & (fix.code == Status.INFEASIBLE)
     for i in np.flatnonzero(barred):
         names = violation_names(problem)
@@ -262,7 +268,8 @@ def _explain(problem: Problem, fix: Fix, curvature: Curvature) -> None:
 
 
 def _explain_missing(problem: Problem, fix: Fix, items: Array) -> None:
-    found = ranges(problem.take(items))
+    single = problem.epochs == 1 or problem.stations.position.shape[-3] == 1
+    found = ranges(problem.take(items)) if single else None
     for place, i in enumerate(items):
         groups = () if found is None else found.groups[int(found.pattern[place])]
         if len(groups) > 1:

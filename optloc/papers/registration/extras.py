@@ -59,7 +59,7 @@ def minima() -> Table:
         offset = np.abs(found.x[5:7] - PRINTED.delays[2:]).mean()
         place = " ".join(f"{v:.1f}" for v in 1e-3 * found.x[:3])
         lines.append(
-            (str(epochs), place, f"{offset:.0f}", f"{found.gap:.4g}", f"{found.doubt:.2g}", f"{noisy.doubt:.2g}")
+            (str(epochs), place, f"{offset:.0f}", metres(found.gap), _chance(found.doubt), _chance(noisy.doubt))
         )
     note = (
         "Noise-free data, 1 m station error, 10 ns. The gap is the cost of the image, a weighted sum of squares; half "
@@ -67,6 +67,23 @@ def minima() -> Table:
         "metres: a prior of 200 m removes it."
     )
     return Table("minima", "The image in the plane of the stations", header, tuple(lines), note)
+
+
+def _chance(share: float) -> str:
+    return f"{share:.2g}" if share >= 1e-9 else "< 1e-9"
+
+
+def gains() -> Table:
+    """Return what gain ratios of growing accuracy add to the bound of the fixed target."""
+    lines = []
+    for sigma in (None, 0.03, 3e-3, 3e-4, 3e-5):
+        made = problem(PRINTED, 600, gain_sigma=sigma)
+        bound = rms(crlb(made, truth(PRINTED, made)))
+        lines.append(("none" if sigma is None else f"{sigma:g}", f"{bound:.4f}"))
+    note = (
+        "Bound of the position after 600 epochs with 1 m station error. The paper has 0.03 and reports a gain of 3 m."
+    )
+    return Table("gains", "What gain ratios add", ("standard deviation of a ratio", "bound, m"), tuple(lines), note)
 
 
 def scenes(cases: Mapping[str, Case]) -> Table:
@@ -81,7 +98,7 @@ def scenes(cases: Mapping[str, Case]) -> Table:
         image = ghost(scenario, 600)
         lengths = (metres(v) for v in (flat, close, case.bound, case.plain.rmse, case.found.rmse))
         lost = (percent(case.plain.share), percent(case.found.share))
-        lines.append((name, *lengths, *lost, "no image" if image is None else f"{image.gap:.4g}"))
+        lines.append((name, *lengths, *lost, "no image" if image is None else metres(image.gap)))
     return Table("scenes", "Stations that span space", header, tuple(lines), _NOTE)
 
 

@@ -47,6 +47,11 @@ def against_time(
     return figure
 
 
+def _two_or_five(value: float, place: int) -> str:
+    """Return the label of a minor tick of a logarithmic axis: 20, 50, 200, 500 and no other."""
+    return f"{value:.0f}" if f"{value:.0e}"[0] in "25" else ""
+
+
 def _panel(ax: Axes, course: Course, printed: float | None, since: int | None) -> None:
     step = course.setting.scenario.interval
     keep = [i for i, k in enumerate(course.epochs) if since is None or k * step >= since]
@@ -62,6 +67,8 @@ def _panel(ax: Axes, course: Course, printed: float | None, since: int | None) -
         ax.plot([600.0], [printed], "D", color=_GREEN, ms=6, label="printed at 600 s")
     if since is None:
         ax.set_yscale("log")
+        ax.yaxis.set_major_formatter("{x:.0f}")
+        ax.yaxis.set_minor_formatter(_two_or_five)
     ax.set_xlabel("time, s")
     ax.set_ylabel("position error, m (root mean square)")
     ax.grid(visible=True, which="both", alpha=0.25)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from optloc.papers.registration import printed, tables, text
-from optloc.papers.registration.extras import minima, readings, scenes
+from optloc.papers.registration.extras import gains, minima, readings, scenes
 from optloc.papers.registration.figures import against_time
 from optloc.papers.registration.scenario import MOVING, NANOSECOND, PRINTED, SPATIAL, truth
 from optloc.papers.registration.tables import Case
@@ -42,7 +42,7 @@ class Sample:
 
 
 SIZES: dict[Size, Sample] = {
-    "quick": Sample(20, 40, (150, 200, 300, 400, 600), (300, 400, 550, 600, 700)),
+    "quick": Sample(30, 60, (150, 200, 300, 400, 600), (300, 400, 550, 600, 700)),
     "full": Sample(200, 500, tuple(range(150, 701, 50)), tuple(range(250, 801, 50))),
 }
 
@@ -94,6 +94,7 @@ def _run(sample: Sample, seed: int, tick: Tick) -> Report:
             *tabled,
             scenes({"printed": starts[-1], "spatial": spatial}),
             minima(),
+            gains(),
             readings(),
         ),
         pictures,

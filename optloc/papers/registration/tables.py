@@ -40,8 +40,8 @@ class Case:
 
 
 def metres(value: float) -> str:
-    """Return a length with four significant digits, a dash where it is not a number."""
-    return f"{value:.4g}" if np.isfinite(value) else "–"
+    """Return a number with four significant digits and no exponent, a dash where it is not finite."""
+    return f"{value:.{max(0, 3 - int(np.floor(np.log10(max(abs(value), 0.1)))))}f}" if np.isfinite(value) else "–"
 
 
 def percent(share: float) -> str:
@@ -173,8 +173,8 @@ def starts(cases: Sequence[Case]) -> Table:
             (f"{case.label:.0f}", f"{error:.1f}", f"{printed.BOUND:.1f}", f"{divergence:.1f} %", *_compared(case))
         )
     note = (
-        "Metres after 600 epochs; the start is Gaussian, n times sigma0 wide. optloc takes no start: its column repeats "
-        "one number. The printed bound of 36.7 m is not reproduced by any reading of the noise."
+        "Metres after 600 epochs; the start is Gaussian, n times sigma0 wide. optloc takes no start: its column "
+        "repeats one number. The printed bound of 36.7 m is not reproduced by any reading of the noise."
     )
     return Table("table-3", "Table 3: initial error", header, tuple(lines), note)
 
@@ -193,8 +193,8 @@ def noises(cases: Sequence[Case], later: Sequence[float]) -> Table:
         lines.append((*line, *_compared(case), metres(bound)))
     note = (
         "Metres after 600 epochs, starts one sigma0 of the case wide. The printed errors are those of 600 s, not of "
-        "700 s as the text says, and of 10 to 40 ns, not 20 to 50. The printed bounds are exactly 1 : 2 : 3 : 4, so they "
-        "leave the station errors out; they are reproduced at neither time."
+        "700 s as the text says, and of 10 to 40 ns, not 20 to 50. The printed bounds are exactly 1 : 2 : 3 : 4, so "
+        "they leave the station errors out; they are reproduced at neither time."
     )
     return Table("table-4", "Table 4: measurement noise", header, tuple(lines), note)
 

@@ -1,0 +1,276 @@
+"""The semidefinite start of registration: exact equalities, starts in the right basin, the need of price and prior."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from formulations._windows import Windows
+from formulations.registration_sdp import PRICES, _parameters, registration, registration_problem
+
+# Four stations that fly side by side and two pairs that cross: coplanar at every moment.
+STATION = 1e3 * np.array([[0, 0, 10], [-15, 0, 10], [15, 0, 10], [-5, 30, 0], [5, 30, 0]])
+SPEED = np.array([[0, 300, 0], [0, 300, 0], [0, 300, 0], [100, 300, 0], [-100, 300, 0.0]])
+TARGET = 1e3 * np.array([200, 300, 0.0])
+BIAS = np.array([30, -40, 50, -30.0])
+PRIOR = 200.0
+
+
+@dataclass
+class Run:
+    """Epochs of a run: what is measured, and what is true."""
+
+    time: np.ndarray
+    station: np.ndarray
+    z: np.ndarray
+    gram: np.ndarray
+    sigma: np.ndarray
+    design: np.ndarray
+    truth: np.ndarray
+
+    def windows(self, count, width=10):
+        first = np.linspace(0, len(self.time) - width, count).round().astype(int)
+        pick = first[:, None] + np.arange(width)
+        whiten = np.linalg.cholesky(self.gram * width).T
+        return self.station[pick].mean(1), self.z[pick].mean(1), whiten, self.time[pick].mean(1)
+
+    def start(self, count=5, **options):
+        station, z, whiten, time = self.windows(count)
+        moving = {"time": time} if len(self.truth) == 2 else {}
+        return registration(station, z, whiten, self.sigma, design=self.design, **moving, **options)
+
+
+def run(rng, noise, *, epochs=600, station=STATION, speed=SPEED, target=TARGET, bias=BIAS, design=None, shake=1.0):
+    """Range differences R = noise^2 (I + 11'), and stations known to `shake` metres an epoch."""
+    target = np.atleast_2d(target)
+    time = np.arange(epochs) * 1.0
+    place = station + speed * time[:, None, None]
+    design = np.eye(len(station) - 1) if design is None else design
+    point = target[0] + (target[1] * time[:, None] if len(target) == 2 else 0.0)
+    arrival = np.linalg.norm(np.broadcast_to(point, place[:, 0].shape)[:, None] - place, axis=-1)
+    arrival = arrival + noise * rng.normal(size=arrival.shape)
+    z = arrival[:, 1:] - arrival[:, :1] + design @ bias
+    seen = place + shake * rng.normal(size=place.shape)
+    count = len(station) - 1
+    gram = np.linalg.inv((noise**2 + shake**2) * (np.eye(count) + 1.0))
+    return Run(time, seen, z, gram, np.full(len(bias), PRIOR), design, target)
+
+
+def refined(one, target, bias):
+    """Levenberg-Marquardt on all epochs, target and biases side by side; cost and estimate."""
+    W = np.linalg.cholesky(one.gram).T
+    size, d = target.size, target.shape[-1]
+
+    def rows(x):
+        p = x[:d] + (x[d:size] * one.time[:, None] if size > d else np.zeros((len(one.time), d)))
+        u = p[:, None] - one.station
+        r = np.linalg.norm(u, axis=-1)
+        slope = u[:, 1:] / r[:, 1:, None] - u[:, :1] / r[:, :1, None]
+        parts = [slope, slope * one.time[:, None, None]] if size > d else [slope]
+        parts.append(np.broadcast_to(one.design, (len(slope), *one.design.shape)))
+        b = (one.z - r[:, 1:] + r[:, :1] - one.design @ x[size:]) @ W.T
+        A = W @ np.concatenate(parts, axis=-1)
+        prior = np.concatenate([np.zeros((len(one.sigma), size)), np.diag(1 / one.sigma)], axis=1)
+        return np.append(b.ravel(), -x[size:] / one.sigma), np.concatenate([A.reshape(-1, len(x)), prior])
+
+    x, damp = np.append(target.ravel(), bias), 1e-6
+    b, A = rows(x)
+    for _ in range(100):
+        scale = np.linalg.norm(A, axis=0)
+        wide = np.concatenate([A / scale, np.sqrt(damp) * np.eye(len(x))])
+        step = np.linalg.lstsq(wide, np.append(b, np.zeros(len(x))), rcond=None)[0] / scale
+        trial = rows(x + step)
+        if trial[0] @ trial[0] > b @ b:
+            damp *= 10
+            continue
+        gain = b @ b - trial[0] @ trial[0]
+        x, (b, A), damp = x + step, trial, max(damp / 10, 1e-12)
+        if gain < 1e-9 * (b @ b):
+            break
+    return b @ b, x[:size].reshape(target.shape)
+
+
+def other_geometry(rng, dimension=3):
+    """Five stations spread over 60 km with courses of their own, a target up to 400 km off."""
+    station = rng.uniform(-30e3, 30e3, (5, 3)) * [1, 1, 0.3]
+    speed = rng.uniform(-200, 200, (5, 3)) * [1, 1, 0.1]
+    away, round_ = rng.uniform(80e3, 400e3), rng.uniform(0, 2 * np.pi)
+    target = np.array([away * np.cos(round_), away * np.sin(round_), rng.uniform(0, 10e3)])
+    cut = slice(0, dimension)
+    return {"station": station[:, cut], "speed": speed[:, cut], "target": target[cut]}
+
+
+def lifted(data, target, bias):
+    """The vector y of the module's text at a target, in the units of the data."""
+    scaled = np.concatenate([target[:1] - data.origin, target[1:]])
+    if len(scaled) == 2:
+        scaled = np.stack([scaled[0] + data.clock[0] * scaled[1], scaled[1] * data.clock[1]])
+    scaled = scaled / data.scale
+    r = np.linalg.norm((data.power @ scaled)[:, None] - data.station, axis=-1)
+    f = (data.z - r[:, 1:] + r[:, :1]) / data.unit
+    return np.concatenate([[1.0], scaled.ravel(), r[:, 0], f.ravel()])
+
+
+@pytest.mark.parametrize(("dimension", "moving", "clocks"), [(3, False, False), (3, True, True), (2, False, True)])
+def test_any_target_is_a_rank_one_point_at_its_own_cost(dimension, moving, clocks):
+    rng = np.random.default_rng(0)
+    design = np.concatenate([-np.ones((4, 1)), np.eye(4)], axis=1) if clocks else np.eye(4)
+    bias = 50 * rng.normal(size=design.shape[1])
+    scene = other_geometry(rng, dimension)
+    if moving:
+        scene["target"] = np.stack([scene["target"], 100 * rng.normal(size=dimension)])
+    one = run(rng, 3.0, bias=bias, design=design, **scene)
+    station, z, whiten, time = one.windows(4)
+    data = Windows.of(station, z, whiten, one.sigma, design, 10.0, time if moving else None)
+    problem = registration_problem(4, 5, dimension, int(moving))
+    target = one.truth + 0.1 * one.truth * rng.normal(size=one.truth.shape)
+    y = lifted(data, target, bias)
+    weight = np.kron(data.power.T @ data.power / 4, np.eye(dimension))
+    for parameter in problem.parameters():
+        parameter.value = {**_parameters(data), "price": 0.7 * weight}[parameter.name()]
+    problem.variables()[0].value = np.outer(y, y)
+    for rule in problem.constraints:
+        assert np.max(rule.violation()) < 1e-7
+    # the cost of target and bias, the biases eliminated by brute force
+    point = target[0] + (target[1] * time[:, None] if moving else np.zeros((4, dimension)))
+    r = np.linalg.norm(point[:, None] - station, axis=-1)
+    left = z - r[:, 1:] + r[:, :1]
+    A = np.concatenate([np.tile(whiten @ design, (4, 1)), np.diag(1 / one.sigma)])
+    b = np.concatenate([(left @ whiten.T).ravel(), 10.0 / one.sigma])
+    found = np.linalg.lstsq(A, b, rcond=None)[0]
+    cost, shift = data.cost(y[1 : 1 + target.size])
+    assert cost == pytest.approx(np.sum((b - A @ found) ** 2), rel=1e-8)
+    np.testing.assert_allclose(10.0 + shift * data.unit * data.scale, found, rtol=1e-7)
+    far = np.mean(np.sum((point - data.origin) ** 2, axis=-1)) / data.scale**2
+    assert problem.objective.value == pytest.approx(cost + 0.7 * far, rel=1e-8)
+    np.testing.assert_allclose(data.place(y[1 : 1 + target.size]), target, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("noise", "prices", "trials", "half", "most"),
+    [
+        (3.0, PRICES, 5, 2000, 5000),
+        (6.0, (10.0, 3.0, 1.0), 5, 3000, 8000),
+        (12.0, (10.0, 3.0, 1.0), 5, 4500, 12000),
+        *(
+            pytest.param(noise, (10.0, 3.0, 1.0, 0.3), 200, half, most, marks=pytest.mark.full)
+            for noise, half, most in ((3.0, 2000, 5000), (6.0, 3000, 8000), (12.0, 4500, 12000))
+        ),
+    ],
+)
+def test_paper_geometry_starts_near_and_ends_in_the_truths_minimum(noise, prices, trials, half, most):
+    error = []
+    for seed in range(trials):
+        one = run(np.random.default_rng(seed), noise)
+        found = one.start(prices=prices)
+        assert all(start.answer.solved for start in found)
+        assert [start.cost for start in found] == sorted(start.cost for start in found)
+        error.append(np.linalg.norm(found[0].target - one.truth))
+        cost, point = refined(one, found[0].target, found[0].bias)
+        best, ideal = refined(one, one.truth, BIAS)
+        assert cost == pytest.approx(best, rel=1e-7)
+        assert np.linalg.norm(point - ideal) < 10.0
+    assert np.median(error) < half
+    assert np.max(error) < most
+
+
+def test_it_is_a_relaxation_and_far_from_tight():
+    one = run(np.random.default_rng(1), 3.0)
+    station, z, whiten, _time = one.windows(5)
+    data = Windows.of(station, z, whiten, one.sigma, None, 0.0, None)
+    best = min(data.cost((refined(one, one.truth, BIAS)[1] - data.origin).ravel() / data.scale)[0], 100.0)
+    for start in one.start():
+        truth = (one.truth - data.origin) / data.scale
+        assert start.answer.primal <= data.cost(truth.ravel())[0] + start.price * np.sum(truth**2)
+        assert start.misfit < 0.1 * best
+        assert start.rank_ratio > 1e-4
+        assert start.slack > -1.0
+
+
+def test_other_geometry_and_clock_biases():
+    rng = np.random.default_rng(2)
+    design = np.concatenate([-np.ones((4, 1)), np.eye(4)], axis=1)
+    for _ in range(3):
+        bias = 50 * rng.normal(size=5)
+        one = run(rng, 3.0, bias=bias, design=design, **other_geometry(rng))
+        found = one.start()
+        assert refined(one, found[0].target, found[0].bias)[0] <= refined(one, one.truth, bias)[0] * (1 + 1e-7)
+
+
+def test_plane():
+    rng = np.random.default_rng(3)
+    for _ in range(3):
+        one = run(rng, 3.0, **other_geometry(rng, 2))
+        found = one.start()
+        assert found[0].target.shape == (1, 2)
+        assert np.linalg.norm(found[0].target - one.truth) < 0.03 * np.linalg.norm(one.truth)
+        assert refined(one, found[0].target, found[0].bias)[0] <= refined(one, one.truth, BIAS)[0] * (1 + 1e-7)
+
+
+def test_moving_target_ends_in_the_truth_or_its_mirror():
+    target = np.array([[200e3, 300e3, 5e3], [-100.0, 0.0, 0.0]])
+    normal = np.array([0.0, 1.0, 3.0]) / np.sqrt(10)
+    flip = np.eye(3) - 2 * np.outer(normal, normal)
+    centre = STATION.mean(axis=0)
+    mirror = np.stack([centre + flip @ (target[0] - centre), SPEED[0] + flip @ (target[1] - SPEED[0])])
+    for seed in range(2):
+        one = run(np.random.default_rng(seed), 3.0, target=target)
+        goals = [refined(one, goal, BIAS) for goal in (target, mirror)]
+        assert goals[0][0] == pytest.approx(goals[1][0], rel=0.2)
+        cost, point = min((refined(one, s.target, s.bias) for s in one.start(6)), key=lambda pair: pair[0])
+        assert cost <= max(goal[0] for goal in goals) * (1 + 1e-7)
+        assert min(np.linalg.norm(point[0] - goal[1][0]) for goal in goals) < 50.0
+
+
+def test_neither_unit_nor_origin_nor_axes_matter():
+    rng = np.random.default_rng(4)
+    one = run(rng, 3.0)
+    station, z, whiten, _time = one.windows(5)
+    (plain,) = registration(station, z, whiten, one.sigma, prices=(3.0,))
+    move = np.array([3e6, -2e6, 5e6])
+    (moved,) = registration((station + move) / 1e3, z / 1e3, whiten * 1e3, one.sigma / 1e3, prices=(3.0,))
+    np.testing.assert_allclose(moved.target * 1e3 - move, plain.target, atol=10.0)
+    np.testing.assert_allclose(moved.bias * 1e3, plain.bias, atol=1.0)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    (turned,) = registration(station @ turn.T, z, whiten, one.sigma, prices=(3.0,))
+    np.testing.assert_allclose(turned.target @ turn, plain.target, atol=10.0)
+
+
+@pytest.mark.parametrize("prior", [50.0, 1000.0, 3000.0])
+def test_the_ladder_serves_other_priors(prior):
+    one = run(np.random.default_rng(5), 3.0)
+    one.sigma[:] = prior
+    found = one.start()
+    assert np.linalg.norm(found[0].target - one.truth) < 5000
+    assert refined(one, found[0].target, found[0].bias)[0] == pytest.approx(refined(one, one.truth, BIAS)[0], rel=1e-7)
+
+
+def test_a_prior_mean_moves_the_biases():
+    one = run(np.random.default_rng(6), 3.0, bias=BIAS + 1000.0)
+    found = one.start(mean=np.full(4, 1000.0), prices=(10.0, 3.0, 1.0))
+    np.testing.assert_allclose(found[0].bias, BIAS + 1000.0, atol=100.0)
+    assert np.linalg.norm(found[0].target - one.truth) < 5000
+
+
+def test_price_and_prior_are_both_needed():
+    one = run(np.random.default_rng(7), 3.0)
+    good = one.start(prices=(3.0,))[0]
+    free = one.start(prices=(1e-4,))[0]
+    assert np.linalg.norm(free.target - one.truth) > 100e3
+    assert free.slack + np.sum(free.target**2) > 1.5 * np.sum(one.truth**2)
+    assert free.answer.primal < 0.1
+    assert good.answer.primal > 10.0
+    one.sigma[:] = 2e4
+    drawn = one.start(prices=(3.0,))[0]
+    assert np.linalg.norm(drawn.target - one.truth) > 150e3
+    assert np.linalg.norm(drawn.target - one.station.mean((0, 1))) < 50e3
+
+
+def test_what_cannot_be_started():
+    one = run(np.random.default_rng(8), 3.0, epochs=60)
+    station, z, whiten, _time = one.windows(3)
+    z[0, 0] = np.nan
+    assert registration(station, z, whiten, one.sigma) == ()
+    for sigma in (np.inf, 0.0, np.nan):
+        with pytest.raises(ValueError, match="prior standard deviation"):
+            registration(station, z, whiten, np.full(4, sigma))
