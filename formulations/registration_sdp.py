@@ -19,9 +19,10 @@ ranges :math:`r_i`, whose squares would hide them from an interior-point method.
 Both the price and the prior are needed. A misfit `m` of the second equality can be absorbed in the moments alone,
 :math:`2 \operatorname{cov}(r_1, f) = m`, for which :math:`\operatorname{var}(r_1) \operatorname{var}(f) \ge m^2 / 4`
 suffices. Without the price, :math:`\operatorname{var}(r_1)`, that is the trace, grows without end and every target has
-cost zero in the limit; with it a misfit costs :math:`\sqrt{\eta M_{ff}} \, |m|`. Without the prior, `M` is blind to
-leftovers common to all windows, so that such misfits cost nothing again and the price draws the target into the
-array. The relaxation is never tight (second over first eigenvalue 0.03 to 0.2): it gives starts, not bounds.
+cost zero in the limit; with it misfits cost about :math:`\sqrt{\eta \sum M_{ff} m^2}`. Without the prior, `M` is
+blind to leftovers common to all windows, so that such misfits cost nothing again and the price draws the target into
+the array. The relaxation is not tight (at the best price its misfit is about a twentieth of what noise leaves): it
+gives starts, not bounds.
 
 The best price depends on the unknown distance: too high, and it draws the target in; too low, and the slack throws it
 out. So a ladder of prices is solved, and the answers are ranked by the cost of the data at their targets.
@@ -176,8 +177,9 @@ def registration(
     Returns
     -------
     tuple of Started
-        One for each price that was solved, lowest cost first: starts to be refined. Empty where the data are not finite
-        or the solver gave none.
+        One for each price that was solved, lowest cost first: starts to be refined. Of a moving target refine all:
+        it has several minima, and the order says little about which of them a start leads to. Empty where the data
+        are not finite or the solver gave none.
 
     Raises
     ------

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from optloc.bias import with_bias
-from optloc.bounds import crlb
+from optloc.bounds import Course, crlb, crlb_course
 from optloc.build import assemble, measured, station_array
 from optloc.epochs import by_epoch
 from optloc.errors import InvalidProblem, NoSolution, OptlocError
@@ -17,6 +17,7 @@ from optloc.linear import Linear, linearise
 from optloc.models import MODELS, Model
 from optloc.noise import Noise
 from optloc.normal import Normal, normal
+from optloc.observe import Observability, observability
 from optloc.problem import Problem
 from optloc.simulate import simulate
 from optloc.solve import FORMULATIONS, METHODS, SOLVERS, solve
@@ -36,6 +37,7 @@ __all__ = [
     "Alternatives",
     "Bias",
     "Certificate",
+    "Course",
     "Fix",
     "Frame",
     "InvalidProblem",
@@ -46,6 +48,7 @@ __all__ = [
     "NoSolution",
     "Noise",
     "Normal",
+    "Observability",
     "OptlocError",
     "Prior",
     "Problem",
@@ -56,11 +59,13 @@ __all__ = [
     "assemble",
     "by_epoch",
     "crlb",
+    "crlb_course",
     "from_table",
     "linearise",
     "load",
     "measured",
     "normal",
+    "observability",
     "predict",
     "reduce",
     "simulate",

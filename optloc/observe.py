@@ -104,6 +104,7 @@ def observability(problem: Problem, x: Array) -> Observability:
     precision = shared_priors(problem)
     data = _taken_apart(information, size, basis)
     both = _taken_apart(information + precision, size + precision, basis)
+    shown = np.isfinite(data.sigma)  # what is open is named as such
     return Observability(
         layout.labels(),
         tuple(slot.unit for slot in layout.shared for _ in range(slot.size)),
@@ -112,7 +113,7 @@ def observability(problem: Problem, x: Array) -> Observability:
         both.sigma,
         basis.shape[1] - len(data.open),
         tuple(_open_sentences(layout, data)),
-        tuple(_tied_sentences(layout, both.correlation)),
+        tuple(_tied_sentences(layout, both.correlation * np.outer(shown, shown))),
     )
 
 
@@ -197,13 +198,14 @@ def _open_sentence(layout: Layout, direction: Array) -> str:
     """Return the sentence of a combination (n,) of unknowns that no measurement sees."""
     labels, names, amounts = layout.labels(), [], []
     for slot in layout.shared:
+        unit = "" if slot.unit == "1" else slot.unit
         part = direction[slot.start : slot.start + slot.size]
         if slot.size > 2 and part[0] and np.allclose(part, part[0], rtol=1e-4):
             names.append(f"every {slot.name}")
-            amounts.append((float(part[0]), slot.unit))
+            amounts.append((float(part[0]), unit))
         else:
             names += [labels[slot.start + i] for i in np.flatnonzero(part)]
-            amounts += [(float(value), slot.unit) for value in part[part != 0.0]]
+            amounts += [(float(value), unit) for value in part[part != 0.0]]
     values = np.array([value for value, _ in amounts])
     if len(names) == 1 and not names[0].startswith("every "):
         return f"the data do not show {names[0]}"

@@ -18,7 +18,8 @@ def check_repeats(
     """Refuse a row that another one repeats.
 
     Two measurements of the same stations at the same epoch are welcome where each has noise of its own; the same value
-    at the same time is a copy. Where the noise is that of arrivals, both have the same noise and only one can be right.
+    at the same stated time or epoch is a copy. Where the noise is that of arrivals, both have the same noise and only
+    one can be right.
 
     Parameters
     ----------
@@ -59,7 +60,8 @@ def _table(chunk: Chunk, index: Array, target: Array, number: int) -> Array:
     value = chunk.z if own else np.zeros(len(index))
     same = (chunk.a, chunk.b, index, target, np.full(len(index), own), value, time)
     table = np.array([np.full(len(index), number), *same, np.arange(len(index))], dtype=float)
-    return table[:, (chunk.weight > 0.0) & ~np.isnan(value)]
+    dated = not own or chunk.label is not None or chunk.time is not None
+    return table[:, (chunk.weight > 0.0) & ~np.isnan(value) & dated]
 
 
 def _repeated(

@@ -77,7 +77,7 @@ class StationsTable(DataTable):
     sigma: Amount | None = None
     """Standard deviation of each coordinate of the positions; None: surveyed exactly."""
     span: Literal["epoch", "run", "noise"] = "epoch"
-    """Whether a position error is an unknown of each epoch, or of the run; or noise that is drawn anew at each epoch."""
+    """Whether a position error is an unknown of each epoch, one of the whole run, or noise drawn anew at each epoch."""
 
 
 class MeasurementsTable(DataTable):

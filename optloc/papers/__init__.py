@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from optloc.errors import InvalidProblem, nearest
@@ -36,7 +36,7 @@ def _registration(size: Size, seed: int) -> Plan:
     return plan(SIZES[size], seed)
 
 
-PAPERS: Mapping[str, Paper] = {
+PAPERS: dict[str, Paper] = {
     "registration": Paper(
         "biases of moving stations from time differences and gain ratios, many epochs",
         "Journal of Electronics and Information Technology 39 (2017), TDOA and GROA error registration",

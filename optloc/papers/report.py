@@ -6,10 +6,10 @@ import csv
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from optloc import __version__
 from optloc.errors import InvalidProblem
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ class Report:
 
     def made(self) -> str:
         """Return the sentence that says when and how the numbers were made."""
-        return f"optloc {__version__}, {datetime.now(UTC):%Y-%m-%d}, {self.facts}."
+        return f"optloc {version('optloc')}, {datetime.now(UTC):%Y-%m-%d}, {self.facts}."
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from formulations.nls import Program
+from optloc.blocks import averaged
 from optloc.constraints import conjunction, face_of, faces, tangent_at
 from optloc.equations import equations_at
 from optloc.errors import InvalidProblem
@@ -17,12 +18,16 @@ from optloc.noise import whiten
 from optloc.normal import decrement, prior_parts, step
 from optloc.problem import Problem
 from optloc.solve.bounded import without_broken
+from optloc.solve.register import registrable
+from optloc.solve.runs import BLOCKS
 from optloc.solve.scale import spread_of
-from optloc.solve.stages import finished, pooled
+from optloc.solve.stages import finished, given, pooled, unrefined
+from optloc.solve.start import completed
 from optloc.solve.verdict import Candidates
 from optloc.status import Status
 from optloc.symbolic import bounds, constrained, parameters, residual
 from optloc.types import Array
+from optloc.weigh import weighed
 
 
 def nlp(problem: Problem, fix: Fix | None) -> Fix:
@@ -38,11 +43,16 @@ def nlp(problem: Problem, fix: Fix | None) -> Fix:
     Returns
     -------
     Fix
-        Judged like a refined one.
+        Judged like a refined one; of a long run, the answers for its block averages, to be refined by `lsr`.
     """
     if fix is None:
         raise InvalidProblem("nlp improves a start", "method", "give start= or a method such as 'gtrs+nlp'")
     began = perf_counter()
+    if registrable(problem) and problem.epochs >= 2 * BLOCKS:
+        blocks, n = averaged(problem, BLOCKS), problem.layout.n_shared
+        found, _, _ = pooled(nlp(blocks, given(blocks, completed(blocks, pooled(fix)[0][..., :n]))))
+        return unrefined(problem, completed(problem, found[..., :n]), fix, "nlp", began)
+    problem = weighed(problem)
     pool, item, slot = pooled(fix)
     x, cost, code = (
         pool.copy(),

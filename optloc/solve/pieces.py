@@ -46,7 +46,9 @@ def from_pieces(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
         if motion.known is not None:
             continue
         names = state_names(i, len(problem.motions), motion.order)
-        state = _state(_alone(problem, i), fixed)
+        state = np.full((len(x), problem.epochs, len(names), problem.dimension), np.nan)
+        if any((rows.target == i).any() for rows in problem.rows):
+            state = _state(_alone(problem, i), fixed)
         for j, name in enumerate(names):
             slot, shared = problem.layout.find(name)
             if shared:
@@ -117,7 +119,7 @@ def _state(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
     fix = fixed(free.flat()).reshape((size, problem.epochs))
     if motion.span == "epoch":
         state = np.zeros((size, problem.epochs, motion.order + 1, problem.dimension))
-        state[:, :, 0] = fix.position
+        state[:, :, 0] = _filled(fix.position)
         return state
     return _polynomial(fix, elapsed(problem, 0), motion.order)[:, None]
 
@@ -141,7 +143,8 @@ def _at_once(problem: Problem) -> Problem:
         if array is None:
             return None
         when = epoch if array.shape[-2 - rank] > 1 else 0 * epoch
-        return np.expand_dims(array[(..., when, station, *(slice(None),) * rank)], -2 - rank)
+        picked = array[..., when, station, :] if rank == 1 else array[..., when, station, :, :]
+        return np.expand_dims(picked, -2 - rank)
 
     names = tuple(f"{s.names[i]} at {k}" for k, i in zip(epoch.tolist(), station.tolist(), strict=True))
     position, velocity, axes = there(s.position, 1), there(s.velocity, 1), there(s.axes, 2)
@@ -152,6 +155,14 @@ def _at_once(problem: Problem) -> Problem:
     )
     stations = Stations(position, names, velocity, axes)
     return replace(problem, stations=stations, rows=rows, times=np.zeros(1))
+
+
+def _filled(position: Array) -> Array:
+    """Return positions (N, k, d) in which an epoch without a fix takes that of the last one before, or of the first."""
+    found = np.asarray(np.isfinite(position).all(-1))
+    last = np.maximum.accumulate(np.where(found, np.arange(position.shape[1]), -1), axis=1)
+    taken = np.where(last < 0, found.argmax(1)[:, None], last)
+    return np.take_along_axis(position, taken[..., None], axis=1)
 
 
 def _polynomial(fix: Fix, since: Array, order: int) -> Array:

@@ -19,7 +19,7 @@ from optloc.solve.verdict import DOUBT, degrees_of_freedom
 from optloc.status import Status
 from optloc.types import Array
 
-_BLOCKS = 30
+BLOCKS = 30
 # Rivals that cost more than this on block averages are not refined on all epochs, but for the best of them.
 _RIVAL = 1e3
 _KEPT = 4
@@ -42,7 +42,7 @@ def run_starts(problem: Problem, begin: Callable[[Problem], Array | None]) -> Ar
         Maps the block averages to starting vectors (N, C, size of theirs), or None where it cannot: the starts are
         then places around the stations.
     """
-    blocks = averaged(problem, _BLOCKS)
+    blocks = averaged(problem, BLOCKS)
     x = begin(blocks)
     x = _around(blocks) if x is None else x
     pool = _minima(blocks, x)

@@ -74,10 +74,10 @@ def _angular(problem: Problem, fix: Fix | None, name: str, locate: Callable[[Bea
     began = perf_counter()
     if not one_position(problem):
         x = from_pieces(problem, lambda piece: lsr(piece, _angular(piece, None, name, locate)))
-        return _assembled(problem, x, fix, name, began)
+        return unrefined(problem, x, fix, name, began)
     seen = bearings(static(problem))
     nowhere = np.full((problem.batch_shape[0], 1, problem.dimension), np.nan)
-    return _unrefined(problem, nowhere if seen is None else locate(seen), fix, name, began)
+    return _placed(problem, nowhere if seen is None else locate(seen), fix, name, began)
 
 
 def certify(problem: Problem, fix: Fix | None) -> Fix:
@@ -117,11 +117,11 @@ def _squared(problem: Problem, fix: Fix | None, name: str, pick: Pick) -> Fix:
         alone = static(problem)
         heights = height_starts(alone, relax=pick is shor)
         position = np.concatenate([squared_range_starts(alone, pick), heights], axis=1)
-        return _unrefined(problem, position, fix, name, began)
+        return _placed(problem, position, fix, name, began)
     if registrable(problem):
-        return _assembled(problem, run_starts(problem, closed_form), fix, name, began)
+        return unrefined(problem, run_starts(problem, closed_form), fix, name, began)
     x = from_pieces(problem, lambda piece: lsr(piece, _squared(piece, None, name, pick)))
-    return _assembled(problem, x, fix, name, began)
+    return unrefined(problem, x, fix, name, began)
 
 
 def widen(problem: Problem, fix: Fix | None) -> Fix:
@@ -146,7 +146,7 @@ def widen(problem: Problem, fix: Fix | None) -> Fix:
             spread[items] = found
             parts.append(spread)
     fresh = vectors(problem, _fresh(problem, fix, seen, np.concatenate(parts, axis=1)))
-    return _assembled(problem, _packed(np.concatenate([pooled(fix)[0], fresh], axis=1)), fix, "widen", began)
+    return unrefined(problem, _packed(np.concatenate([pooled(fix)[0], fresh], axis=1)), fix, "widen", began)
 
 
 def _subarrays(problem: Problem, fix: Fix) -> Array:
@@ -187,7 +187,7 @@ def search(problem: Problem, fix: Fix | None) -> Fix:
         return fix
     began = perf_counter()
     part = problem.take(items)
-    found = lsr(part, _unrefined(part, searched_starts(part), fix[items], "search", began))
+    found = lsr(part, _placed(part, searched_starts(part), fix[items], "search", began))
     good = np.flatnonzero(found.answered)
     found.code[found.code == Status.OK] = Status.SEARCHED
     for i in good:
@@ -241,7 +241,7 @@ def given(problem: Problem, start: Array) -> Fix:
     began = perf_counter()
     x = np.asarray(start, dtype=float)
     x = x[:, None] if x.ndim == 2 else x
-    return _assembled(problem, x, None, "start", began)
+    return unrefined(problem, x, None, "start", began)
 
 
 def _positions(problem: Problem, fix: Fix) -> Array:
@@ -250,8 +250,8 @@ def _positions(problem: Problem, fix: Fix) -> Array:
     return pooled(fix)[0][..., slot.start : slot.start + slot.size]
 
 
-def _unrefined(problem: Problem, position: Array, fix: Fix | None, name: str, began: float) -> Fix:
-    return _assembled(problem, vectors(problem, _packed(position)), fix, name, began)
+def _placed(problem: Problem, position: Array, fix: Fix | None, name: str, began: float) -> Fix:
+    return unrefined(problem, vectors(problem, _packed(position)), fix, name, began)
 
 
 def _packed(points: Array) -> Array:
@@ -264,7 +264,8 @@ def _packed(points: Array) -> Array:
     return np.take_along_axis(points, order[..., None], axis=1)[:, :keep]
 
 
-def _assembled(problem: Problem, x: Array, fix: Fix | None, name: str, began: float) -> Fix:
+def unrefined(problem: Problem, x: Array, fix: Fix | None, name: str, began: float) -> Fix:
+    """Return starts (N, q, size) as a fix whose status says that they are not refined."""
     size, n = len(x), problem.layout.n_shared
     reason, certificate = np.empty(size, dtype=object), np.empty(size, dtype=object)
     reason[:], certificate[:] = "not refined", Certificate("unknown", "a start, not refined", name)

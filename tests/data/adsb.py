@@ -34,8 +34,14 @@ class Messages:
     problem: Problem
     truth: np.ndarray
 
+    def horizontal(self, position: np.ndarray, messages: np.ndarray) -> np.ndarray:
+        """Return horizontal errors (n,) of the positions (n, 3) of some messages, metres."""
+        there = self.truth[messages]
+        local = np.einsum("kij,kj->ki", ECEF.enu_axes(there), position - there)
+        return np.linalg.norm(local[:, :2], axis=1)
 
-def load(folder: Path) -> Messages:
+
+def load(folder: Path, *, refraction: bool = False) -> Messages:
     """Return all messages as one problem."""
     stations = pd.read_csv(folder / "stations.csv")
     rows = pd.read_csv(folder / "measurements.csv")
@@ -44,14 +50,19 @@ def load(folder: Path) -> Messages:
     epoch = messages.get_indexer(pd.MultiIndex.from_frame(rows[["set", "msg"]]))
     first = rows.groupby(["set", "msg"])["toa_s"].transform("min")
     z = speed_of_light * (rows["toa_s"] - first).to_numpy()
+    place, there = (table[["x_m", "y_m", "z_m"]].to_numpy() for table in (stations, truth))
+    a, excess = pd.Index(stations["station"]).get_indexer(rows["station"]), 0.0
+    if refraction:
+        distance = np.linalg.norm(there[epoch] - place[a], axis=-1)
+        excess = _refracted(stations["h_m"].to_numpy()[a], truth["h_geo_m"].to_numpy()[epoch], distance)
     problem = assemble(
-        station_array(stations[["x_m", "y_m", "z_m"]].to_numpy(), stations["station"].astype(str)),
-        measured("toa", z, a=pd.Index(stations["station"]).get_indexer(rows["station"]), sigma=ARRIVAL, epoch=epoch),
+        station_array(place, stations["station"].astype(str)),
+        measured("toa", z, a=a, sigma=ARRIVAL, epoch=epoch, correction=excess),
         measured("height", truth["h_geo_m"].to_numpy(), sigma=HEIGHT, epoch=np.arange(len(truth))),
         motions=(Motion(span="epoch"),),
         frame=ECEF,
     )
-    return Messages(problem, truth[["x_m", "y_m", "z_m"]].to_numpy())
+    return Messages(problem, there)
 
 
 @dataclass(frozen=True)
@@ -144,7 +155,11 @@ def heard(folder: Path, *, refraction: bool = False) -> Heard:
     made = Heard(place, arrival, np.zeros_like(arrival), geodetic)
     if not refraction:
         return made
-    low, high = own["h_m"].to_numpy().reshape(toa.shape), geodetic[:, 2:]
+    distance = np.linalg.norm(made.truth[:, None] - place, axis=-1)
+    return replace(made, excess=_refracted(own["h_m"].to_numpy().reshape(toa.shape), geodetic[:, 2:], distance))
+
+
+def _refracted(low: np.ndarray, high: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Return by how much air lengthens paths between two heights, metres."""
     drop = np.exp(-low / SCALE_HEIGHT) - np.exp(-high / SCALE_HEIGHT)
-    mean = REFRACTIVITY * SCALE_HEIGHT * drop / (high - low)
-    return replace(made, excess=mean * np.linalg.norm(made.truth[:, None] - place, axis=-1))
+    return REFRACTIVITY * SCALE_HEIGHT * drop / (high - low) * distance

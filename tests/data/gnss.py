@@ -127,6 +127,19 @@ class Session:
         sigma[k, s] = SIGMA / np.sin(rows["el_rad"])
         return Receptions(place, z, sigma, weight, tuple(n[0] for n in names), self.truth, self.geodetic)
 
+    def run(self, column: str | None = None) -> Problem:
+        """Return all epochs as one problem of a receiver that stays: arrivals at a clock of each epoch."""
+        rows, column = self.rows, column or self.column
+        (times, k), (names, s) = (np.unique(rows[c], return_inverse=True) for c in ("t_gps_s", "sat"))
+        place = np.zeros((len(times), len(names), 3))
+        place[k, s] = rows[list(_XYZ)]
+        return assemble(
+            station_array(place, names.tolist()),
+            measured("toa", rows[column].to_numpy(), a=s, epoch=k, sigma=SIGMA / np.sin(rows["el_rad"].to_numpy())),
+            times=times - times[0],
+            frame=ECEF,
+        )
+
     def draws(self, count: int, seed: int) -> Receptions:
         """Return three random satellites of a random epoch, `count` times."""
         rng = np.random.default_rng(seed)

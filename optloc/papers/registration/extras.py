@@ -16,8 +16,6 @@ from optloc.papers.registration.trials import one_shot, rms
 from optloc.papers.report import Table
 from optloc.types import Array
 
-_NOTE = "The spatial stations are those of `optloc demo registration`; starts 20 sigma0 wide, after 600 epochs."
-
 
 def readings() -> Table:
     """Return the bounds of the fixed target under each reading of the noise, metres."""
@@ -99,7 +97,9 @@ def scenes(cases: Mapping[str, Case]) -> Table:
         lengths = (metres(v) for v in (flat, close, case.bound, case.plain.rmse, case.found.rmse))
         lost = (percent(case.plain.share), percent(case.found.share))
         lines.append((name, *lengths, *lost, "no image" if image is None else metres(image.gap)))
-    return Table("scenes", "Stations that span space", header, tuple(lines), _NOTE)
+    epochs = next(iter(cases.values())).epochs
+    note = f"The spatial stations are those of `optloc demo registration`. {epochs} epochs; starts 20 sigma0 wide."
+    return Table("scenes", "Stations that span space", header, tuple(lines), note)
 
 
 def flatness(scenario: Scenario, epochs: int) -> float:

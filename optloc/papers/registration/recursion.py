@@ -81,6 +81,7 @@ def step(state: Array, arrivals: Array, track: Array, times: Array) -> tuple[Arr
     distance = np.sqrt(np.einsum("tcsk,tcsk->tsk", slope, slope))
     slope /= distance[:, None]
     misfit = arrivals - distance
+    misfit -= misfit.mean(1, keepdims=True)
     slope -= slope.mean(2, keepdims=True)
     if n > 3:
         slope = np.concatenate([slope, slope * times], axis=1)

@@ -1,4 +1,4 @@
-"""The problem file ``registration.toml`` that is shipped with optloc: stations that span space, eight minutes."""
+"""The problem file ``registration.toml`` that is shipped with optloc: stations that span space, ten minutes."""
 
 from __future__ import annotations
 
@@ -9,39 +9,37 @@ import numpy as np
 from optloc.papers.registration.scenario import SPATIAL
 from optloc.units import SPEED_OF_LIGHT
 
-NAMES = ("A", "B", "C", "D", "E")
+NAMES = ("R1", "R2", "R3", "R4", "R5")
 DELAYS = (100.0, -133.0, 167.0, -100.0)
-"""Nanoseconds by which the receivers B to E are late."""
+"""Nanoseconds by which the clocks of R2 to R5 are late."""
 
-_EPOCHS, _INTERVAL, _SEED = 240, 2.0, 20170502
+_EPOCHS, _INTERVAL, _SEED = 200, 3.0, 20170502
 _ARRIVAL, _STATION = 10.0, 1.0  # ns, m
 
 _PROBLEM = """\
-# Five aircraft time the pulses of one emitter on the ground, 360 km away, every two seconds for eight minutes. The clock
-# of each runs late by an unknown amount, and the positions that they report are wrong by a metre. True place: 200 km,
-# 300 km, 0; true delays of B to E against A: 100, -133, 167, -100 ns.
+# Five aircraft time an emitter 360 km away for ten minutes, each by a clock of its own. The emitter stands at 200 km,
+# 300 km, 0; the clocks of R2 to R5 are 100, -133, 167 and -100 ns late against that of R1.
 format = 1
-title = "Five moving receivers with unknown delays"
+title = "Five aircraft, one emitter, four clock errors"
 
 [stations]
-file = "registration-stations.csv"
-sigma = "1 m"
-span = "noise"
+file = "registration-stations.csv"   # where each aircraft is at the first and at the last second
+sigma = "1 m"                        # of each coordinate of its position
+span = "noise"                       # drawn anew at every epoch
+
+[[measurements]]
+kind = "tdoa"
+file = "registration-rows.csv"
+unit = "ns"
+b = "R1"
+arrival_sigma = 10.0
 
 [target]
 motion = "static"
 
-[[measurements]]
-kind = "tdoa"
-file = "registration-tdoa.csv"
-columns = { a = "receiver", time = "t", z = "tdoa" }
-b = "A"
-unit = "ns"
-arrival_sigma = 10.0
-
 [[biases]]
-name = "delay"
-members = ["B", "C", "D", "E"]
+name = "clock"
+members = ["R2", "R3", "R4", "R5"]   # against that of R1
 """
 
 
@@ -57,7 +55,7 @@ def files() -> Mapping[str, str]:
     arrival = 1e9 / SPEED_OF_LIGHT * np.sqrt(((SPATIAL.target - true) ** 2).sum(-1))
     arrival += _ARRIVAL * rng.standard_normal(arrival.shape) + np.array([0.0, *DELAYS])
     rows = [
-        f"{t:.0f},{name},{value:.2f}"
+        f"{t:.0f},{name},{value:.1f}"
         for t, late in zip(times, arrival - arrival[:, :1], strict=True)
         for name, value in zip(NAMES[1:], late[1:], strict=True)
     ]
@@ -69,5 +67,5 @@ def files() -> Mapping[str, str]:
     return {
         "registration.toml": _PROBLEM,
         "registration-stations.csv": "\n".join(["name,time,x,y,z", *ends]) + "\n",
-        "registration-tdoa.csv": "\n".join(["t,receiver,tdoa", *rows]) + "\n",
+        "registration-rows.csv": "\n".join(["time,a,z", *rows]) + "\n",
     }

@@ -6,19 +6,22 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 
+import numpy as np
+
 from optloc.papers.registration import printed, tables, text
 from optloc.papers.registration.extras import gains, minima, readings, scenes
 from optloc.papers.registration.figures import against_time
+from optloc.papers.registration.minima import ghost
 from optloc.papers.registration.scenario import MOVING, NANOSECOND, PRINTED, SPATIAL, truth
 from optloc.papers.registration.tables import Case
-from optloc.papers.registration.trials import Course, Setting, course, rms, score, wander
+from optloc.papers.registration.trials import History, Score, Setting, history, rms, score, wander
 from optloc.papers.report import Picture, Plan, Report, Size, Table, Tick, canvas
 from optloc.solve import solve
 
-_LAST = 600
 _GAIN = 0.03
 _MOVING_FIRST = 200
 _WIDEST = 20.0
+_NEAR = 5e3
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,12 +36,15 @@ class Sample:
         Trials of tables 3 and 4, which count failures.
     fixed, moving : tuple of int
         Epochs at which the fixed and the moving target are looked at; those of the printed tables among them.
+    last : int
+        Epochs of tables 3 and 4.
     """
 
     trials: int
     many: int
     fixed: tuple[int, ...]
     moving: tuple[int, ...]
+    last: int = 600
 
 
 SIZES: dict[Size, Sample] = {
@@ -63,24 +69,24 @@ def plan(sample: Sample, seed: int) -> Plan:
         Where matplotlib is missing: before the work, not after it.
     """
     canvas(1.0, 1.0)
-    courses = 4 * len(sample.fixed) + len(sample.moving) + 3
+    histories = 4 * len(sample.fixed) + len(sample.moving) + 3
     counts = len(printed.INITIAL) + len(printed.NOISE) + 1
-    return Plan(courses + counts, partial(_run, sample, seed))
+    return Plan(histories + counts, partial(_run, sample, seed))
 
 
 def _run(sample: Sample, seed: int, tick: Tick) -> Report:
     fixed = {
-        name: course(Setting(PRINTED, sample.trials, seed, key, station_sigma=size), sample.fixed, tick)
+        name: history(Setting(PRINTED, sample.trials, seed, key, station_sigma=size), sample.fixed, tick)
         for key, (name, size) in enumerate((("5 m", 5.0), ("1 m", 1.0)))
     }
-    moving = course(Setting(MOVING, sample.trials, seed, 2), sample.moving, tick, first=_MOVING_FIRST)
+    moving = history(Setting(MOVING, sample.trials, seed, 2), sample.moving, tick, first=_MOVING_FIRST)
     joint = {
-        name: course(Setting(PRINTED, sample.trials, seed, key, None, size, _GAIN), sample.fixed, tick, plain=False)
+        name: history(Setting(PRINTED, sample.trials, seed, key, None, size, _GAIN), sample.fixed, tick, plain=False)
         for key, (name, size) in enumerate((("5 m", 5.0), ("1 m", 1.0)), 3)
     }
-    starts = _starts(Setting(PRINTED, sample.many, seed, 5), tick)
-    noises = _noises(sample.many, seed, tick)
-    spatial = _case(Setting(SPATIAL, sample.many, seed, 10), _WIDEST, tick)
+    starts = _starts(Setting(PRINTED, sample.many, seed, 5), sample.last, tick)
+    noises = _noises(sample, seed, tick)
+    spatial = _case(Setting(SPATIAL, sample.many, seed, 10), sample.last, _WIDEST, tick)
     pictures, tabled = _figures(fixed, moving, joint)
     return Report(
         text.TITLE,
@@ -101,36 +107,48 @@ def _run(sample: Sample, seed: int, tick: Tick) -> Report:
     )
 
 
-def _case(setting: Setting, width: float, tick: Tick, label: float = 0.0) -> Case:
+def _case(setting: Setting, epochs: int, width: float, tick: Tick, label: float = 0.0) -> Case:
     """Return both routes on the same draw."""
-    drawn, bound = setting.draw(_LAST), setting.bound(_LAST)
-    (plain,) = wander(setting, drawn, (_LAST,), (bound,), width=width)
+    drawn, bound = setting.draw(epochs), setting.bound(epochs)
+    (plain,) = wander(setting, drawn, (epochs,), (bound,), width=width)
     found = score(solve(drawn).x, truth(setting.scenario, drawn), bound)
     tick()
-    return Case(label or width, setting.sigma or setting.scenario.sigma, rms(bound), plain, found)
+    sigma, image = setting.sigma or setting.scenario.sigma, _at_image(setting, epochs, plain)
+    return Case(label or width, epochs, sigma, rms(bound), plain, found, image)
 
 
-def _starts(setting: Setting, tick: Tick) -> list[Case]:
+def _at_image(setting: Setting, epochs: int, plain: Score) -> float:
+    """Return the share of trials that ended at the second minimum of the scene."""
+    image = ghost(setting.scenario, epochs, sigma=setting.sigma)
+    if image is None:
+        return 0.0
+    with np.errstate(invalid="ignore", over="ignore"):
+        apart = np.linalg.norm(plain.error[:, :3] - (image.x[:3] - setting.scenario.target), axis=-1)
+    return float((plain.lost & (apart < _NEAR)).mean())
+
+
+def _starts(setting: Setting, epochs: int, tick: Tick) -> list[Case]:
     """Return table 3: one draw, and the recursion from starts of growing width."""
-    drawn, bound = setting.draw(_LAST), setting.bound(_LAST)
+    drawn, bound = setting.draw(epochs), setting.bound(epochs)
     found = score(solve(drawn).x, truth(setting.scenario, drawn), bound)
     cases = []
     for width in printed.INITIAL:
-        (plain,) = wander(setting, drawn, (_LAST,), (bound,), width=float(width))
-        cases.append(Case(float(width), setting.scenario.sigma, rms(bound), plain, found))
+        (plain,) = wander(setting, drawn, (epochs,), (bound,), width=float(width))
+        image = _at_image(setting, epochs, plain)
+        cases.append(Case(float(width), epochs, setting.scenario.sigma, rms(bound), plain, found, image))
         tick()
     return cases
 
 
-def _noises(many: int, seed: int, tick: Tick) -> list[Case]:
+def _noises(sample: Sample, seed: int, tick: Tick) -> list[Case]:
     """Return table 4; its labels are 10 ns too large."""
     return [
-        _case(Setting(PRINTED, many, seed, key, (label - 10) * NANOSECOND), 1.0, tick, label)
+        _case(Setting(PRINTED, sample.many, seed, key, (label - 10) * NANOSECOND), sample.last, 1.0, tick, label)
         for key, label in enumerate(printed.NOISE, 6)
     ]
 
 
-def _accuracies(fixed: Course, moving: Course, joint: Course) -> tuple[Table, ...]:
+def _accuracies(fixed: History, moving: History, joint: History) -> tuple[Table, ...]:
     """Return tables 2, 5 and 6."""
     exact = [truth(c.setting.scenario, c.setting.problem(1)) for c in (fixed, moving, joint)]
     return (
@@ -141,7 +159,7 @@ def _accuracies(fixed: Course, moving: Course, joint: Course) -> tuple[Table, ..
 
 
 def _figures(
-    fixed: Mapping[str, Course], moving: Course, joint: Mapping[str, Course]
+    fixed: Mapping[str, History], moving: History, joint: Mapping[str, History]
 ) -> tuple[tuple[Picture, ...], tuple[Table, ...]]:
     """Return figures 1 to 3 and the numbers behind them."""
     parts = (
@@ -150,9 +168,9 @@ def _figures(
         ("figure-3", "Figure 3: fixed target, with gain ratios", dict(joint), printed.JOINT, None),
     )
     pictures, tabled = [], []
-    for name, title, courses, values, zoom in parts:
-        labels = [f"station error {label}" for label in courses]
-        figure = against_time(list(courses.values()), labels, [values[label] for label in courses], zoom)
+    for name, title, histories, values, zoom in parts:
+        labels = [f"station error {label}" for label in histories]
+        figure = against_time(list(histories.values()), labels, [values[label] for label in histories], zoom)
         pictures.append(Picture(name, title, figure))
-        tabled.append(tables.errors(name, f"{title}, in numbers", courses, values))
+        tabled.append(tables.errors(name, f"{title}, in numbers", histories, values))
     return tuple(pictures), tuple(tabled)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optloc.bounds import crlb
+from optloc.bounds import crlb, crlb_course
 from optloc.fix import Fix
 from optloc.papers.registration.recursion import FIRST, recursion
 from optloc.papers.registration.scenario import PRINTED, Scenario, Shape, problem, truth
@@ -68,8 +68,12 @@ class Setting:
 
     def bound(self, epochs: int) -> Array:
         """Return the Cramer-Rao bound of the shared unknowns (n, n) after some epochs."""
-        made = self.problem(epochs)
-        return crlb(made, truth(self.scenario, made))
+        return np.asarray(self.bounds((epochs,))[0])
+
+    def bounds(self, epochs: Sequence[int] | Array) -> Array:
+        """Return the bounds (t, n, n) after several numbers of epochs."""
+        made = self.problem(max(epochs))
+        return crlb_course(made, truth(self.scenario, made), epochs).covariance
 
     def starts(self, width: float) -> Array:
         """Return Gaussian starts (trials, n) around the truth, `width` one-shot standard deviations wide.
@@ -147,7 +151,7 @@ def branch(fix: Fix, exact: Array) -> Array:
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class History:
     """Scores after growing numbers of epochs.
 
     Parameters
@@ -156,7 +160,7 @@ class Course:
         What was drawn.
     epochs : tuple of int
         Numbers of epochs.
-    bounds : tuple of array (n, n)
+    bounds : array (t, n, n)
         Cramer-Rao bound at each.
     plain : tuple of Score, or None
         The paper's recursion on the range differences.
@@ -168,13 +172,13 @@ class Course:
 
     setting: Setting
     epochs: tuple[int, ...]
-    bounds: tuple[Array, ...]
+    bounds: Array
     plain: tuple[Score, ...] | None
     found: tuple[Score, ...]
     listed: tuple[float, ...]
 
 
-def course(setting: Setting, epochs: Sequence[int], tick: Tick, *, plain: bool = True, first: int = FIRST) -> Course:
+def history(setting: Setting, epochs: Sequence[int], tick: Tick, *, plain: bool = True, first: int = FIRST) -> History:
     """Return the scores of both routes on the same data.
 
     Parameters
@@ -191,7 +195,7 @@ def course(setting: Setting, epochs: Sequence[int], tick: Tick, *, plain: bool =
         Epochs of its first estimate.
     """
     drawn = setting.draw(max(epochs))
-    bounds = tuple(setting.bound(k) for k in epochs)
+    bounds = setting.bounds(epochs)
     exact = truth(setting.scenario, drawn)
     wandered = None
     if plain:
@@ -203,14 +207,14 @@ def course(setting: Setting, epochs: Sequence[int], tick: Tick, *, plain: bool =
         found.append(score(fix.x if setting.scenario.course is None else branch(fix, exact), exact, bound))
         listed.append(float(np.isfinite(fix.alternatives.gap).any(-1).mean()))
         tick()
-    return Course(setting, tuple(epochs), bounds, wandered, tuple(found), tuple(listed))
+    return History(setting, tuple(epochs), bounds, wandered, tuple(found), tuple(listed))
 
 
 def wander(
     setting: Setting,
     drawn: Problem,
     epochs: Sequence[int],
-    bounds: Sequence[Array],
+    bounds: Sequence[Array] | Array,
     *,
     width: float = 1.0,
     first: int = FIRST,
