@@ -74,14 +74,14 @@ class Windows:
         clock, power = (0.0, 1.0), np.ones((K, 1))
         if time is not None:
             t = np.asarray(time, dtype=np.float64)
-            clock = float(t.mean()), float(np.ptp(t)) / 2
+            clock = float(t.mean()), float(np.ptp(t)) / 2 or np.nan
             power = np.stack([np.ones(K), (t - clock[0]) / clock[1]], axis=1)
         place, seen, prior = (s - origin) / scale, (rows - E @ mu) / scale, (fine / spread) ** 2
         return cls(place, seen, gram * fine**2, E, prior, mu, power, fine / scale, origin, scale, clock)
 
     @property
     def finite(self) -> bool:
-        """Whether all numbers are finite."""
+        """Whether all numbers are finite and the times, where they count, differ."""
         return all(np.isfinite(part).all() for part in (self.station, self.z, self.gram, self.power))
 
     def form(self) -> Array:

@@ -212,7 +212,9 @@ def _lifted_ranges(course: Course, guess: _Guess, order: int) -> tuple[Array, _G
     if order == 0:
         y, more = _constrained(rows, q, d)
     else:
-        y = _solved(np.swapaxes(rows[..., :-1], -1, -2) @ rows[..., :-1], (rows[..., :-1] * rows[..., -1:]).sum(-2), _LIFTED_CUT)
+        y = _solved(
+            np.swapaxes(rows[..., :-1], -1, -2) @ rows[..., :-1], (rows[..., :-1] * rows[..., -1:]).sum(-2), _LIFTED_CUT
+        )
         more = y[:, None, q : q + n]
     state = more.reshape(len(more), -1, order + 1, d)
     distance = np.maximum(_reference(course, y[:, q : q + n], y[:, q + n :], order), 1e-6)
@@ -240,7 +242,14 @@ def _constrained(rows: Array, q: int, d: int) -> tuple[Array, Array]:
     points, _, valid = stationary(upper[:, q:, q:-1], upper[:, q:, -1], paraboloid(d))
     points = np.where((valid & usable[:, None])[..., None], points, np.nan)
     left = upper[:, :q, -1] - (upper[:, :q, q:-1] @ points[:, 0, :, None])[..., 0]
-    bias = _solved(np.swapaxes(upper[:, :q, :q], -1, -2) @ upper[:, :q, :q], (upper[:, :q, :q] * left[..., None]).sum(-2), 0.0) / scale[:, 0, :q] if q else left
+    bias = (
+        _solved(
+            np.swapaxes(upper[:, :q, :q], -1, -2) @ upper[:, :q, :q], (upper[:, :q, :q] * left[..., None]).sum(-2), 0.0
+        )
+        / scale[:, 0, :q]
+        if q
+        else left
+    )
     return np.concatenate([bias, points[:, 0]], axis=-1), points[..., :d]
 
 

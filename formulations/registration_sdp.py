@@ -179,7 +179,7 @@ def registration(
     tuple of Started
         One for each price that was solved, lowest cost first: starts to be refined. Of a moving target refine all:
         it has several minima, and the order says little about which of them a start leads to. Empty where the data
-        are not finite or the solver gave none.
+        are not finite, a moving target is seen at one time only, or the solver gave none.
 
     Raises
     ------

@@ -22,6 +22,7 @@ from optloc.problem import Problem
 from optloc.simulate import simulate
 from optloc.solve import FORMULATIONS, METHODS, SOLVERS, solve
 from optloc.solve.reduce import reduce
+from optloc.solve.running import Running
 from optloc.status import Certificate, Status
 from optloc.types import Bias, Motion, Prior, Rows, Stations
 
@@ -53,6 +54,7 @@ __all__ = [
     "Prior",
     "Problem",
     "Rows",
+    "Running",
     "Stage",
     "Stations",
     "Status",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -84,8 +84,8 @@ def crlb_course(
 ) -> Course:
     """Return the Cramer-Rao bound after the first 1, 2, ... epochs of a run.
 
-    What every epoch says of the shared unknowns, its own unknowns eliminated, adds up; the prior counts once. Time and
-    memory grow with the number of epochs times the square of the number of shared unknowns.
+    What every epoch says of the shared unknowns, its own unknowns eliminated, adds up; the prior counts once. Time is
+    proportional to the number of epochs, and memory beyond the answer does not depend on it.
 
     Parameters
     ----------
@@ -114,20 +114,36 @@ def crlb_course(
     chosen = np.arange(1, k + 1) if counts is None else np.asarray(counts, dtype=np.int64)
     if chosen.ndim != 1 or not len(chosen) or chosen.min() < 1 or chosen.max() > k:
         raise InvalidProblem(f"the counts are not among 1 to {k}", "counts", "give numbers of epochs")
-    each, size = _each_epoch(problem, x)
+    total, size = _totals(problem, x, chosen)
     prior = shared_priors(problem)
-    total, scale = (np.cumsum(part, axis=0)[chosen - 1] + prior for part in (each, size))
+    total, size = total + prior, size + np.diagonal(prior)
     free = np.ones(layout.n_shared, dtype=bool)
     for slot in (layout.find(name)[0] for name in known):
         free[slot.start : slot.start + slot.size] = False
     bound = np.zeros((len(chosen), layout.n_shared, layout.n_shared))
-    bound[np.ix_(np.arange(len(chosen)), free, free)] = _inverse(total[:, free][..., free], scale[:, free][..., free])
+    bound[np.ix_(np.arange(len(chosen)), free, free)] = _inverse(total[:, free][..., free], size[:, free])
     return Course(chosen, problem.times[chosen - 1], bound, layout)
 
 
-def _each_epoch(problem: Problem, x: Array) -> tuple[Array, Array]:
-    """Return what each epoch says of the shared unknowns (k, n, n), with its own unknowns eliminated and known."""
-    n, found, known = problem.layout.n_shared, [], []
+def _totals(problem: Problem, x: Array, counts: Array) -> tuple[Array, Array]:
+    """Return what the first epochs say together (q, n, n), and its diagonal (q, n) before anything was eliminated."""
+    n = problem.layout.n_shared
+    total, size = np.zeros((len(counts), n, n)), np.zeros((len(counts), n))
+    so_far, size_so_far = np.zeros((n, n)), np.zeros(n)
+    for first, each, known in _each_epoch(problem, x):
+        sums, sizes = so_far + np.cumsum(each, axis=0), size_so_far + np.cumsum(known, axis=0)
+        inside = np.flatnonzero((counts > first) & (counts <= first + len(each)))
+        total[inside], size[inside] = sums[counts[inside] - first - 1], sizes[counts[inside] - first - 1]
+        so_far, size_so_far = sums[-1], sizes[-1]
+    return total, size
+
+
+def _each_epoch(problem: Problem, x: Array) -> Iterator[tuple[int, Array, Array]]:
+    """Yield the first epoch of stretches, what each epoch says of the shared unknowns (k, n, n), and its size.
+
+    The size is the diagonal (k, n) before elimination.
+    """
+    n = problem.layout.n_shared
     for first, last, part in windows(problem):
         linear = linearise(part, x)
         # As if every epoch had all unknowns to itself: the local blocks are then what each epoch says.
@@ -138,16 +154,13 @@ def _each_epoch(problem: Problem, x: Array) -> tuple[Array, Array]:
         equations = Normal(
             gram[:, :n, :n], here[..., n:, n:], here[..., :n, n:], none[:, None], none[:, None, None], none
         )
-        found.append(eliminated(with_local_priors(problem, equations)))
-        known.append(gram[:, :n, :n])
-    return np.concatenate(found), np.concatenate(known)
+        yield first, eliminated(with_local_priors(problem, equations)), np.diagonal(gram[:, :n, :n], 0, -2, -1)
 
 
 def _inverse(information: Array, size: Array) -> Array:
-    """Return inverses (q, n, n), NaN where a combination is open; `size` is the information before elimination."""
+    """Return inverses (q, n, n), NaN where a combination is open; `size` (q, n) tells what rounding leaves of zero."""
     inverse, _ = linalg.inverse(information)
-    diagonal = np.diagonal(size, axis1=-2, axis2=-1)
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    scale = 1.0 / np.sqrt(np.where(size > 0.0, size, 1.0))
     weakest = np.linalg.eigvalsh(information * scale[..., :, None] * scale[..., None, :]).min(-1, initial=1.0)
     return np.where((weakest > OPEN)[..., None, None], inverse, np.nan)
 

@@ -112,7 +112,7 @@ class _Sum:
         self.value = self.value + full
 
 
-def with_priors(problem: Problem, x: Array, equations: Normal) -> Normal:
+def with_priors(problem: Problem, x: Array, equations: Normal, *, shared: bool = True, local: bool = True) -> Normal:
     """Return normal equations with the Gaussian priors of a problem added.
 
     Parameters
@@ -123,14 +123,16 @@ def with_priors(problem: Problem, x: Array, equations: Normal) -> Normal:
         Where the problem was linearised.
     equations : Normal
         Of the measurements alone.
+    shared, local : bool
+        Which priors are added: those of shared unknowns, those of unknowns local to each epoch.
     """
-    parts = prior_parts(problem)
+    layout = problem.layout
+    parts = [part for part in prior_parts(problem) if (shared if layout.find(part[0])[1] else local)]
     if not parts:
         return equations
-    layout = problem.layout
     at_shared, at_local = layout.split(x)
-    shared, vector, cost = equations.shared.copy(), equations.shared_vector.copy(), equations.cost
-    local, local_vector = equations.local.copy(), equations.local_vector.copy()
+    matrix, vector, cost = equations.shared.copy(), equations.shared_vector.copy(), equations.cost
+    blocks, local_vector = equations.local.copy(), equations.local_vector.copy()
     for name, mean, precision in parts:
         slot, is_shared = layout.find(name)
         part = slice(slot.start, slot.start + slot.size)
@@ -138,14 +140,14 @@ def with_priors(problem: Problem, x: Array, equations: Normal) -> Normal:
         pull = (precision @ error[..., None])[..., 0]
         penalty = (error * pull).sum(-1)
         if is_shared:
-            shared[..., part, part] += precision
+            matrix[..., part, part] += precision
             vector[..., part] += pull
             cost = cost + penalty
         else:
-            local[..., part, part] += precision
+            blocks[..., part, part] += precision
             local_vector[..., part] += pull
             cost = cost + penalty.sum(-1)
-    return Normal(shared, local, equations.cross, vector, local_vector, cost)
+    return Normal(matrix, blocks, equations.cross, vector, local_vector, cost)
 
 
 def prior_parts(problem: Problem) -> list[tuple[str, Array, Array]]:
@@ -188,6 +190,17 @@ def marginal(equations: Normal) -> tuple[Array, Array, Array]:
     solved, ok = linalg.solve(_measured(equations.local), right)
     lost = (equations.cross @ solved).sum(-3)
     return equations.shared - lost[..., :-1], equations.shared_vector - lost[..., -1], np.asarray(ok.all(-1))
+
+
+def eliminated(equations: Normal) -> Normal:
+    """Return the information about the shared unknowns alone: local ones take the values that fit best."""
+    information, vector, _ = marginal(equations)
+    cost = equations.cost
+    if equations.local.shape[-1]:
+        rest, _ = linalg.solve(_measured(equations.local), equations.local_vector[..., None])
+        cost = cost - (rest[..., 0] * equations.local_vector).sum((-1, -2))
+    none = np.zeros((*cost.shape, 1, 0))
+    return Normal(information, none[..., None], np.zeros((*cost.shape, 1, vector.shape[-1], 0)), vector, none, cost)
 
 
 def _measured(local: Array) -> Array:

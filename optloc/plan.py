@@ -137,7 +137,7 @@ def _terms(problem: Problem, block: Rows, start: int, forms: tuple[str, ...]) ->
         inside = (bias.row >= start) & (bias.row < start + block.count)
         rows, member, coefficient = bias.row[inside] - start, bias.member[inside], bias.coefficient[inside]
         if bias.form == "drift":
-            coefficient = coefficient * (problem.times - problem.times[0])[block.epoch[rows]]
+            coefficient = coefficient * (problem.times - problem.origin)[block.epoch[rows]]
         column = columns(problem.layout, bias.name, rows)[np.arange(len(rows)), member]
         parts.append(Terms(rows, column, coefficient))
     return _appended(parts)

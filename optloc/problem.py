@@ -62,6 +62,12 @@ class Problem:
         return len(self.times)
 
     @property
+    def origin(self) -> float:
+        """Return the time from which drifts count: the first target's reference, the first epoch by default."""
+        reference = self.motions[0].reference
+        return float(self.times[0] if reference is None else reference)
+
+    @property
     def count(self) -> int:
         """Return the number of rows of all kinds."""
         return sum(block.count for block in self.rows)

@@ -71,6 +71,47 @@ def window(problem: Problem, first: int, last: int) -> Problem:
     return replace(problem, rows=tuple(rows), noise=Noise(tuple(blocks)), biases=biases)
 
 
+def cut(problem: Problem, first: int, last: int) -> Problem:
+    """Return the epochs first <= k < last of a run as a run of its own; states hold at the same time as before.
+
+    Parameters
+    ----------
+    problem : Problem
+        Noise must not tie its epochs.
+    first, last : int
+        Stretch of epochs, not empty.
+
+    Raises
+    ------
+    InvalidProblem
+        Where no rows belong to these epochs.
+    """
+    part = window(problem, first, last)
+    if part.count == 0:
+        raise InvalidProblem(f"epochs {first} to {last} hold no rows", "cut", "take a longer stretch")
+
+    def own(values: Array | None, core: int) -> Array | None:
+        if values is None or values.shape[-core] == 1:
+            return values
+        return np.moveaxis(np.moveaxis(values, -core, 0)[first:last], 0, -core)
+
+    s = problem.stations
+    position = own(s.position, 3)
+    assert position is not None
+    motions = tuple(replace(m, known=own(m.known, 3), reference=_reference(problem, m)) for m in problem.motions)
+    return replace(
+        part,
+        stations=replace(s, position=position, velocity=own(s.velocity, 3), axes=own(s.axes, 4)),
+        rows=tuple(replace(rows, epoch=rows.epoch - first) for rows in part.rows),
+        times=problem.times[first:last],
+        motions=motions,
+    )
+
+
+def _reference(problem: Problem, motion: Motion) -> float | None:
+    return float(problem.times[0]) if motion.reference is None else motion.reference
+
+
 def _inside(epoch: Array, first: int, last: int) -> slice | Array:
     """Return the entries whose epoch lies in a stretch: a slice, and so a view, where they are sorted."""
     if np.all(epoch[1:] >= epoch[:-1]):
@@ -172,8 +213,7 @@ def _motions(problem: Problem, more: Problem) -> tuple[Motion, ...]:
         known = one.known
         if known is not None and two.known is not None:
             known = _course(known, problem.epochs, two.known, more.epochs, 3)
-        reference = problem.times[0] if one.reference is None and one.span == "run" else one.reference
-        joint.append(replace(one, known=known, reference=reference))
+        joint.append(replace(one, known=known, reference=_reference(problem, one)))
     return tuple(joint)
 
 

@@ -299,7 +299,7 @@ def test_the_file_of_the_manual_is_that_which_is_shipped(tmp_path):
 
 
 def test_the_programs_of_the_manual_run(capsys):
-    exec("\n".join(blocks("python")), {})  # noqa: S102  (this file's own manual)
+    exec("\n".join(blocks("python")), {})
     printed = capsys.readouterr().out
     assert "R2: 30.0 ± 1.1 m" in printed
     assert "of 12 combinations are determined" in printed

@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from optloc.bounds import Course
-from optloc.cli.course import course_records, course_table, courses
+from optloc.cli.course import course_records, course_table, courses, shown
 from optloc.cli.output import dumps, saved, write_text
 from optloc.ellipse import error_ellipse
 from optloc.epochs import by_epoch, separable
@@ -69,9 +69,10 @@ def _draw(path: Path, loaded: Loaded, over_time: tuple[Course, Course | None] | 
     from optloc.plot import plot_course
 
     if over_time is None:
-        advice = "give the epochs something in common: a motion, or biases"
-        raise InvalidProblem("the epochs share no unknowns, so that no bound falls with time", "--plot", advice)
-    saved(plot_course(*over_time, title=f"{loaded.title}: Cramer-Rao bound"), path)
+        advice = "give the epochs something in common, a motion or biases, but not hundreds of targets"
+        raise InvalidProblem("the epochs share no unknowns, or too many to be drawn", "--plot", advice)
+    names = shown(over_time[0].layout)
+    saved(plot_course(*over_time, title=f"{loaded.title}: Cramer-Rao bound", names=names), path)
 
 
 def _bound(label: str, slot: Slot, covariance: Array) -> dict[str, Any]:

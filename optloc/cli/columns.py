@@ -72,9 +72,9 @@ def _of_target(loaded: Loaded, fix: Fix, first: int | None, target: int, names: 
     columns |= _state(position, covariance)
     for name in names[1:] if _estimated(fix, names[0]) else ():
         letter = _RATES[name.partition("[")[0]]
-        columns |= {
-            f"{letter}{axis}": v for axis, v in zip("xyz", fix.take(name).reshape(n * count, d).T, strict=False)
-        }
+        sigma = np.full((n * count, d), np.nan) if spread else fix.sigma(name)
+        for values, prefix in ((fix.take(name).reshape(n * count, d), letter), (sigma, f"sigma_{letter}")):
+            columns |= {f"{prefix}{axis}": v for axis, v in zip("xyz", values.T, strict=False)}
     columns |= geodetic_columns(loaded.problem.frame, position, covariance)
     semi_axes, _ = error_ellipse(covariance)
     columns |= {f"ellipse95_{i + 1}": semi_axes[:, d - 1 - i] for i in range(d)}

@@ -9,19 +9,19 @@ from rich.table import Table
 
 from optloc.bounds import Course, crlb_course
 from optloc.epochs import tied
-from optloc.layout import Slot
+from optloc.layout import Layout, Slot
 from optloc.problem import Problem
 from optloc.types import Array
 
-_LINES, _POINTS = 10, 400
+_LINES, _POINTS, _UNKNOWNS = 10, 400, 100
 _RMS = {True: " (rms)", False: ""}
 
 
 def courses(problem: Problem, truth: Array) -> tuple[Course, Course | None] | None:
     """Return the bound against time with biases unknown and, if there are some, known; None where it has none."""
-    if problem.epochs == 1 or not problem.layout.n_shared or tied(problem) or problem.batch_shape:
+    n, k = problem.layout.n_shared, problem.epochs
+    if k == 1 or not 0 < n <= _UNKNOWNS or tied(problem) or problem.batch_shape:
         return None
-    k = problem.epochs
     counts = np.arange(1, k + 1) if k <= _POINTS else np.unique(np.geomspace(1, k, _POINTS).round().astype(int))
     names = [slot.name for slot in problem.layout.shared if slot.members]
     course = crlb_course(problem, truth, counts)
@@ -53,19 +53,26 @@ def _few(course: Course) -> list[int]:
     return [int(i) for i in np.unique(np.searchsorted(course.counts, np.floor(wanted)))]
 
 
-def course_table(course: Course, known: Course | None, limit: int = 4) -> Table:
+def shown(layout: Layout) -> tuple[str, ...]:
+    """Return the names of the unknowns that a table or a picture has room for: of two targets, and four biases."""
+    states = [slot.name for slot in layout.shared if not slot.members]
+    biases = [slot.name for slot in layout.shared if slot.members]
+    return (*states[:4], *biases[:4])
+
+
+def course_table(course: Course, known: Course | None) -> Table:
     """Return the bound at a few times, as root sum of squares over coordinates and root mean square over members."""
     table = Table(title="Bound after the first epochs", title_justify="left")
     for name in ("epochs", "time, s"):
         table.add_column(name, justify="right")
-    shown: list[tuple[Course, Slot]] = []
-    for slot in course.layout.shared[:limit]:
+    columns: list[tuple[Course, Slot]] = []
+    for slot in (course.layout.find(name)[0] for name in shown(course.layout)):
         table.add_column(f"{slot.name}{_RMS[bool(slot.members)]}, {slot.unit}".rstrip(", "), justify="right")
-        shown.append((course, slot))
+        columns.append((course, slot))
         if known is not None and not slot.members:
             table.add_column("biases known", justify="right")
-            shown.append((known, slot))
-    values = [which.total(slot.name) / np.sqrt(slot.size if slot.members else 1) for which, slot in shown]
+            columns.append((known, slot))
+    values = [which.total(slot.name) / np.sqrt(slot.size if slot.members else 1) for which, slot in columns]
     for i in _few(course):
         numbers = [f"{value[i]:.4g}" if np.isfinite(value[i]) else "-" for value in values]
         table.add_row(str(course.counts[i]), f"{course.times[i]:g}", *numbers)

@@ -47,7 +47,7 @@ def _usable(folder: Path) -> None:
 def _shown(table: Table) -> Shown:
     shown = Shown(title=table.title, title_justify="left", caption=table.note, caption_justify="left")
     for i, name in enumerate(table.header):
-        shown.add_column(name, justify="right" if i else "left")
+        shown.add_column(name, justify="right" if i else "left", overflow="fold")
     for row in table.rows:
         shown.add_row(*row)
     return shown

@@ -86,13 +86,11 @@ def _state_rows(table: Table, columns: Columns, i: int, whose: str) -> None:
         table.add_row(f"height{whose}", f"{columns['height'][i]:.2f} m")
         local = [columns[f"cov_{axis}{axis}"][i] for axis in "enu" if f"cov_{axis}{axis}" in columns]
         table.add_row("sigma east, north, up", ", ".join(f"{v:.3g}" for v in np.sqrt(np.maximum(local, 0.0))) + " m")
-    for letter, unit in (("v", "m/s"), ("a", "m/s²")):
-        found = [columns[f"{letter}{axis}"][i] for axis in axes if f"{letter}{axis}" in columns]
-        if found:
-            table.add_row(
-                {"v": "velocity", "a": "acceleration"}[letter] + whose,
-                ", ".join(f"{v:.4g}" for v in found) + f" {unit}",
-            )
+    for letter, word, unit in (("v", "velocity", "m/s"), ("a", "acceleration", "m/s²")):
+        found = [axis for axis in axes if f"{letter}{axis}" in columns]
+        for axis in found:
+            value, sigma = (columns[f"{prefix}{letter}{axis}"][i] for prefix in ("", "sigma_"))
+            table.add_row(f"{word} {axis}{whose}", with_sigma(value, sigma, unit))
     semi = [columns[f"ellipse95_{j + 1}"][i] for j in range(len(axes))]
     if np.isfinite(semi).all():
         table.add_row(
@@ -129,7 +127,7 @@ def _many(fixed: Fixed, console: Console) -> None:
     table.add_column("status")
     for name in ("fixes", "median sigma, m", "95 % of sigmas, m", "median p"):
         table.add_column(name, justify="right")
-    sigma = np.sqrt(sum(columns[name] ** 2 for name in columns if name.startswith("sigma_")))
+    sigma = np.sqrt(sum(columns[f"sigma_{axis}"] ** 2 for axis in "xyz" if axis in columns))
     for label, count in Counter(columns["status"].tolist()).most_common():
         inside = columns["status"] == label
         cells = [

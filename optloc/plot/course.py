@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,7 +20,9 @@ _MANY = 10
 _WORDS = {"position": ("position", "m"), "velocity": ("velocity", "m/s"), "acceleration": ("acceleration", "m/s²")}
 
 
-def plot_course(course: Course, known: Course | None = None, title: str = "") -> Figure:
+def plot_course(
+    course: Course, known: Course | None = None, title: str = "", names: Sequence[str] | None = None
+) -> Figure:
     """Return a picture of the bound against time, one panel for each state of a target and each family of biases.
 
     Parameters
@@ -30,13 +33,15 @@ def plot_course(course: Course, known: Course | None = None, title: str = "") ->
         The same with biases known, drawn dashed.
     title : str
         Title of the picture.
+    names : sequence of str, optional
+        Names of the unknowns that are drawn; all by default.
 
     Returns
     -------
     matplotlib.figure.Figure
         To be written with `optloc.plot.save`.
     """
-    slots = course.layout.shared
+    slots = [slot for slot in course.layout.shared if names is None or slot.name in names]
     columns = min(len(slots), 3)
     rows = -(-len(slots) // columns)
     figure = figure_class()(figsize=(0.6 + 4.8 * columns, 0.4 + 4.2 * rows), layout="constrained")

@@ -163,7 +163,7 @@ def _program(key: _Key) -> Program:
         equalities=equal,
         inequalities=more,
         diagonal=False,
-        settings={"bound_relax_factor": 0.0},  # by default constraints give way by 1e-8 of the problem's size
+        settings={"bound_relax_factor": 0.0, "max_iter": 200},  # by default constraints give way by 1e-8
     )
 
 

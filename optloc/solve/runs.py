@@ -100,12 +100,16 @@ def _covariance(blocks: Problem, x: Array) -> Array:
     part = slice(slot.start, slot.start + slot.size)
     with np.errstate(all="ignore"):
         full, ok = covariance(equations_at(blocks, np.where(usable[:, None], x, 0.0)))
-    return np.where((usable & ok)[:, None, None], full[:, part, part], np.nan) / spread_of(blocks)[1][:, None, None] ** 2
+    return np.where((usable & ok)[:, None, None], full[:, part, part], np.nan) / _length(blocks)[:, None, None] ** 2
+
+
+def _length(blocks: Problem) -> Array:
+    return np.asarray(spread_of(blocks)[1])
 
 
 def _around(blocks: Problem) -> Array:
     """Return vectors (N, C, size) of targets at rest on circles around the stations, and above and below."""
-    d, (centre, spread) = blocks.dimension, spread_of(blocks)
+    d, centre = blocks.dimension, spread_of(blocks)[0]
     angle = 2.0 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
     level = np.stack([np.cos(angle), np.sin(angle), *([0.0 * angle] * (d - 2))], axis=-1)
     poles = np.eye(d)[2:]
@@ -113,7 +117,7 @@ def _around(blocks: Problem) -> Array:
     away = (np.array(_RADII)[:, None, None] * direction).reshape(-1, d)
     x = np.repeat(vectors(blocks, None)[:, None], len(away), axis=1)
     slot, _ = blocks.layout.find("position")
-    x[..., slot.start : slot.start + slot.size] = centre[:, None] + spread[:, None, None] * away
+    x[..., slot.start : slot.start + slot.size] = centre[:, None] + _length(blocks)[:, None, None] * away
     return x
 
 
@@ -122,7 +126,7 @@ def _valley(blocks: Problem, x: Array) -> Array:
     cov = _covariance(blocks, x)
     usable = np.isfinite(cov).all((-1, -2))
     values, axes = np.linalg.eigh(np.where(usable[:, None, None], cov, 0.0))
-    longest = (np.sqrt(np.maximum(values[:, -1], 0.0)) * spread_of(blocks)[1])[:, None] * axes[..., -1]
+    longest = (np.sqrt(np.maximum(values[:, -1], 0.0)) * _length(blocks))[:, None] * axes[..., -1]
     out = np.repeat(np.where(usable[:, None], x, np.nan)[:, None], len(_STEPS), axis=1)
     slot, _ = blocks.layout.find("position")
     out[..., slot.start : slot.start + slot.size] += np.array(_STEPS)[:, None] * longest[:, None]
@@ -147,7 +151,7 @@ def _best(blocks: Problem, x: Array, cost: Array) -> Array:
 def _alike(blocks: Problem, x: Array, y: Array) -> Array:
     """Return where the positions of two vectors (N, size) are one, as measured by the spread of the stations."""
     apart = blocks.layout.take(x, "position") - blocks.layout.take(y, "position")
-    return np.asarray(np.sqrt((apart**2).sum(-1)) < _SAME * spread_of(blocks)[1])
+    return np.asarray(np.sqrt((apart**2).sum(-1)) < _SAME * _length(blocks))
 
 
 def mirrored_courses(blocks: Problem, x: Array) -> Array:

@@ -6,8 +6,8 @@ at the window's centre is the row's known `correction`.
 
 Three forms, as in the set's README: the ranges as they are ("raw"), less the mean residual of each beacon ("offset"),
 or with the affine fit of each beacon's residual undone ("affine"). Rows are independent; sigma is the rms of all
-residuals: 3.0 m raw (2.8 m of it a mean, as ranges are 7 % too long), 1.15 m less the means, 0.53 m after the fit. Where
-the scale is to be learnt, "scaled", the ranges are as they are with the sigma that is left with it, 0.53 m.
+residuals: 3.0 m raw (2.8 m of it a mean, as ranges are 7 % too long), 1.15 m less the means, 0.53 m after the fit.
+Where the scale is to be learnt, "scaled", the ranges are as they are, with the sigma that the scale leaves: 0.53 m.
 """
 
 from __future__ import annotations

@@ -154,7 +154,7 @@ def test_any_target_is_a_rank_one_point_at_its_own_cost(dimension, moving, clock
         (12.0, (10.0, 3.0, 1.0), 5, 4500, 12000),
         *(
             pytest.param(noise, (10.0, 3.0, 1.0, 0.3), 200, half, most, marks=pytest.mark.full)
-            for noise, half, most in ((3.0, 2000, 5000), (6.0, 3000, 8000), (12.0, 4500, 12000))
+            for noise, half, most in ((3.0, 2000, 6000), (6.0, 3000, 10000), (12.0, 4500, 15000))
         ),
     ],
 )
@@ -272,6 +272,7 @@ def test_price_and_prior_are_both_needed():
 def test_what_cannot_be_started():
     one = run(np.random.default_rng(8), 3.0, epochs=60)
     station, z, whiten, _time = one.windows(3)
+    assert registration(station, z, whiten, one.sigma, time=np.ones(3)) == ()
     z[0, 0] = np.nan
     assert registration(station, z, whiten, one.sigma) == ()
     for sigma in (np.inf, 0.0, np.nan):

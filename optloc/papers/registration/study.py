@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -70,7 +70,7 @@ def plan(sample: Sample, seed: int) -> Plan:
     """
     canvas(1.0, 1.0)
     histories = 4 * len(sample.fixed) + len(sample.moving) + 3
-    counts = len(printed.INITIAL) + len(printed.NOISE) + 1
+    counts = len(printed.INITIAL) + 2 * len(printed.NOISE) + 1
     return Plan(histories + counts, partial(_run, sample, seed))
 
 
@@ -85,7 +85,7 @@ def _run(sample: Sample, seed: int, tick: Tick) -> Report:
         for key, (name, size) in enumerate((("5 m", 5.0), ("1 m", 1.0)), 3)
     }
     starts = _starts(Setting(PRINTED, sample.many, seed, 5), sample.last, tick)
-    noises = _noises(sample, seed, tick)
+    noisy = [Setting(PRINTED, sample.many, seed, 6 + i, (ns - 10) * NANOSECOND) for i, ns in enumerate(printed.NOISE)]
     spatial = _case(Setting(SPATIAL, sample.many, seed, 10), sample.last, _WIDEST, tick)
     pictures, tabled = _figures(fixed, moving, joint)
     return Report(
@@ -96,7 +96,7 @@ def _run(sample: Sample, seed: int, tick: Tick) -> Report:
         (
             *_accuracies(fixed["1 m"], moving, joint["1 m"]),
             tables.starts(starts),
-            tables.noises(noises, [rms(Setting(PRINTED, 1, seed, 0, case.sigma).bound(700)) for case in noises]),
+            _noises(noisy, sample.last, tick),
             *tabled,
             scenes({"printed": starts[-1], "spatial": spatial}),
             minima(),
@@ -140,12 +140,15 @@ def _starts(setting: Setting, epochs: int, tick: Tick) -> list[Case]:
     return cases
 
 
-def _noises(sample: Sample, seed: int, tick: Tick) -> list[Case]:
-    """Return table 4; its labels are 10 ns too large."""
-    return [
-        _case(Setting(PRINTED, sample.many, seed, key, (label - 10) * NANOSECOND), sample.last, 1.0, tick, label)
-        for key, label in enumerate(printed.NOISE, 6)
-    ]
+def _noises(settings: Sequence[Setting], epochs: int, tick: Tick) -> Table:
+    """Return table 4, whose labels are 10 ns too large; the recursion is started at the truth itself as well."""
+    cases: list[Case] = []
+    sure: list[Score] = []
+    for setting, label in zip(settings, printed.NOISE, strict=True):
+        cases.append(_case(setting, epochs, 1.0, tick, label))
+        sure += wander(setting, setting.draw(epochs), (epochs,), (setting.bound(epochs),), width=0.0)
+        tick()
+    return tables.noises(cases, sure, [rms(setting.bound(700)) for setting in settings])
 
 
 def _accuracies(fixed: History, moving: History, joint: History) -> tuple[Table, ...]:

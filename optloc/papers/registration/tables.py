@@ -125,16 +125,9 @@ def errors(
         Error at 600 s that the paper's text names, by environment.
     """
     header = (
-        "environment",
-        "second",
-        "printed",
-        "recursion",
-        "optloc",
-        "bound",
-        "recursion lost",
-        "optloc lost",
-        "several places",
-    )
+        "environment", "second", "printed", "recursion", "optloc", "bound",
+        "recursion lost", "optloc lost", "several places",
+    )  # fmt: skip
     lines = []
     for label, history in histories.items():
         for at, second in enumerate(history.epochs):
@@ -175,18 +168,29 @@ def starts(cases: Sequence[Case]) -> Table:
     return Table("table-3", "Table 3: initial error", header, tuple(lines), note)
 
 
-def noises(cases: Sequence[Case], later: Sequence[float]) -> Table:
-    """Return table 4: the noise. `later` are the bounds after 700 epochs, metres."""
+def noises(cases: Sequence[Case], sure: Sequence[Score], later: Sequence[float]) -> Table:
+    """Return table 4: the noise.
+
+    Parameters
+    ----------
+    cases : sequence of Case
+        One for each noise.
+    sure : sequence of Score
+        The recursion on the same data, started at the truth itself.
+    later : sequence of float
+        Bounds after 700 epochs, metres.
+    """
     header = (
         "printed noise", "read as", "printed error", "printed bound", "printed divergence",
-        "recursion", "optloc", "bound", "recursion lost", "ended at the image", "optloc lost", "bound at 700 s",
+        "recursion", "optloc", "bound", "recursion lost", "ended at the image", "optloc lost",
+        "recursion from the truth lost", "bound at 700 s",
     )  # fmt: skip
     lines = []
-    for case, bound in zip(cases, later, strict=True):
+    for case, certain, bound in zip(cases, sure, later, strict=True):
         error, crlb, divergence = printed.NOISE[int(case.label)]
         read = f"{case.sigma / NANOSECOND:.0f} ns"
         line = (f"{case.label:.0f} ns", read, f"{error:.1f}", f"{crlb:.1f}", f"{divergence:.1f} %")
-        lines.append((*line, *_compared(case), metres(bound)))
+        lines.append((*line, *_compared(case), percent(certain.share), metres(bound)))
     note = (
         f"Metres after {cases[0].epochs} epochs, starts one sigma0 of the case wide. The printed errors are those of "
         "600 s, not of 700 s as the text says, and of 10 to 40 ns, not 20 to 50. The printed bounds are exactly "

@@ -42,10 +42,10 @@ CLOSING = """\
    on: one epoch says nothing about the side of the plane on which the target is.
 6. For that reason the fixed target has a second minimum, the image in the plane (table *minima*). It costs little
    in short records, and it is what catches the recursion when the noise is large: not the worse initial guess that
-   the paper blames, for the count hardly changes with the start.
+   the paper blames, for as many trials are lost when the recursion is started at the truth itself (table 4).
 7. The image of a uniformly moving target moves uniformly as well, and explains all data exactly. The paper does not say
    so; its recursion stays on the side on which it was started. optloc lists both places and calls the fix ambiguous; a
-   height or a speed has to decide. The scores below are those of the listed place nearer to the truth.
+   height or a speed has to decide. The scores are those of the listed place nearer to the truth.
 8. The recursion cannot start the moving target at 40 s: the bound of the position is 618 km by then, and every trial
    runs away. It is started at 200 s here.
 9. Table 4 is said to hold at 700 s. Its errors are those of 600 s, where the bound is 40.3 m; at 700 s it is 29.8 m.
