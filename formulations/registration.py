@@ -12,10 +12,12 @@ with unknown biases :math:`\delta`. Squaring and subtracting :math:`r_0^2` leave
 .. math:: (s_i - s_0)' x + \sigma_i m_i r_0 - r_i E_i \varepsilon = \tfrac12 (|s_i|^2 - |s_0|^2 - m_i^2).
 
 *Stage 0* takes every :math:`r_0(k)` as free and projects it out. *Stage 1* ties them to the course,
-:math:`r_0 \approx (\hat r_0^2 + r_0^2) / 2 \hat r_0` with :math:`r_0^2 = \sum_j \lambda_j t^j - 2 s_0' x + |s_0|^2`, linear in
-:math:`\theta` and the lifts :math:`\lambda` of :math:`|x(t)|^2`. For a fixed target the one lift is :math:`|x|^2`, and all
-stationary points of that problem with its quadratic constraint are found exactly. Stations in one plane leave the
-distance from it open; it follows from :math:`r_0` up to its sign, which gives two branches.
+
+.. math:: r_0 \approx (\hat r_0^2 + r_0^2) / 2 \hat r_0, \qquad r_0^2 = \sum_j \lambda_j t^j - 2 s_0' x + |s_0|^2,
+
+linear in :math:`\theta` and the lifts :math:`\lambda` of :math:`|x(t)|^2`. For a fixed target the one lift is
+:math:`|x|^2`, and all stationary points of that problem with its quadratic constraint are found exactly. Stations in
+one plane leave the distance from it open; it follows from :math:`r_0` up to its sign, which gives two branches.
 
 Rows are divided by :math:`r_i`, so that their errors are those of the ranges. All lengths are in one unit in which
 stations and target are of order one to a hundred.
@@ -114,13 +116,13 @@ def _powers(course: Course, count: int) -> Array:
     return np.stack([course.time**j / factorial(j) for j in range(count)], axis=-1)
 
 
-def _rows(course: Course, guess: _Guess, order: int) -> tuple[Array, ...]:
-    """Return offsets m, ranges r, position columns, sigma m / r and right side of the rows, each (N, B, S, ...)."""
+def _rows(course: Course, guess: _Guess) -> tuple[Array, Array, Array, Array]:
+    """Return ranges r, and of the rows over r the columns of x and of r_0 and the right side, each (N, B, S, ...)."""
     m = course.offset - (course.bias @ guess.bias[:, None, :, None])[..., 0]
     r = np.maximum(m + course.sign * guess.reference[..., None], 1e-3)
     first, others = course.station[..., :1, :], course.station[..., 1:, :]
     right = ((others**2).sum(-1) - (first**2).sum(-1) - m**2) / (2.0 * r)
-    return m, r, (others - first) / r[..., None], course.sign * m / r, right
+    return r, (others - first) / r[..., None], course.sign * m / r, right
 
 
 def _moved(course: Course, columns: Array, order: int) -> Array:
@@ -134,11 +136,9 @@ def _free_ranges(course: Course, order: int) -> _Guess:
     """Return biases and smoothed reference ranges of stage 0."""
     size, q = len(course.offset), course.bias.shape[-1]
     guess = _Guess(np.zeros((size, q)) + course.mean, np.ones(course.offset.shape[:2]))
-    # The first pass knows no ranges: all rows weigh alike, and biases stay at their prior means.
-    _, _, place, _, right = _rows(course, _Guess(guess.bias, guess.reference), order)
     for turn in range(_PASSES):
-        m, r, place, gain, right = _rows(course, guess, order)
-        if turn == 0:
+        r, place, gain, right = _rows(course, guess)
+        if turn == 0:  # no ranges are known yet: all rows weigh alike, and biases stay at their prior means
             place, gain, right = place * r[..., None], gain * r, right * r
         columns = [_moved(course, place, order)]
         if turn:
@@ -197,7 +197,7 @@ def _smoothed(course: Course, reference: Array, order: int) -> Array:
 def _lifted_ranges(course: Course, guess: _Guess, order: int) -> tuple[Array, _Guess]:
     """Return the candidates of stage 1 (N, C, order + 1, d), and biases and reference ranges of the best."""
     q, d, n = course.bias.shape[-1], course.station.shape[-1], (order + 1) * course.station.shape[-1]
-    _, _, place, gain, right = _rows(course, guess, order)
+    _, place, gain, right = _rows(course, guess)
     first, r = course.station[..., :1, :], guess.reference[..., None]
     square = (first**2).sum(-1)
     lifts = (gain / (2.0 * r))[..., None] * _powers(course, 2 * order + 1)[:, None, :]
@@ -212,9 +212,8 @@ def _lifted_ranges(course: Course, guess: _Guess, order: int) -> tuple[Array, _G
     if order == 0:
         y, more = _constrained(rows, q, d)
     else:
-        y = _solved(
-            np.swapaxes(rows[..., :-1], -1, -2) @ rows[..., :-1], (rows[..., :-1] * rows[..., -1:]).sum(-2), _LIFTED_CUT
-        )
+        matrix, vector = np.swapaxes(rows[..., :-1], -1, -2) @ rows[..., :-1], (rows[..., :-1] * rows[..., -1:]).sum(-2)
+        y = _solved(matrix, vector, _LIFTED_CUT)
         more = y[:, None, q : q + n]
     state = more.reshape(len(more), -1, order + 1, d)
     distance = np.maximum(_reference(course, y[:, q : q + n], y[:, q + n :], order), 1e-6)
@@ -232,24 +231,20 @@ def _with_prior(rows: Array, course: Course, bias: Array) -> Array:
 
 
 def _constrained(rows: Array, q: int, d: int) -> tuple[Array, Array]:
-    """Return the best (N, q + d + 1) and all places (N, C, d) of the rows [E | x | |x|^2 | right] with its constraint."""
-    usable = np.isfinite(rows).all((-1, -2))
-    scale = np.sqrt((rows**2).sum(1))[:, None, :]
-    scale = np.where(scale > 0.0, scale, 1.0)
-    scale[..., q : q + d] = 1.0  # the constraint knows no scales of its own
-    scale[..., -2:] = 1.0
-    upper = np.linalg.qr(np.where(usable[:, None, None], rows / scale, 0.0), mode="r")
+    """Return biases, place and its square (N, q + d + 1), and all places (N, C, d), of rows [E | x | |x|^2 | right].
+
+    The biases are free and leave the problem by a triangular factor; what is left is a squared-range problem.
+    """
+    usable = np.asarray(np.isfinite(rows).all((-1, -2)))
+    scale = np.ones((len(rows), rows.shape[-1]))
+    norm = np.sqrt((rows[..., :q] ** 2).sum(1))
+    scale[:, :q] = np.where(usable[:, None] & (norm > 0.0), norm, 1.0)
+    upper = np.linalg.qr(np.where(usable[:, None, None], rows / scale[:, None], 0.0), mode="r")
     points, _, valid = stationary(upper[:, q:, q:-1], upper[:, q:, -1], paraboloid(d))
     points = np.where((valid & usable[:, None])[..., None], points, np.nan)
     left = upper[:, :q, -1] - (upper[:, :q, q:-1] @ points[:, 0, :, None])[..., 0]
-    bias = (
-        _solved(
-            np.swapaxes(upper[:, :q, :q], -1, -2) @ upper[:, :q, :q], (upper[:, :q, :q] * left[..., None]).sum(-2), 0.0
-        )
-        / scale[:, 0, :q]
-        if q
-        else left
-    )
+    inner = upper[:, :q, :q]
+    bias = _solved(np.swapaxes(inner, -1, -2) @ inner, (inner * left[..., None]).sum(-2), 0.0) / scale[:, :q]
     return np.concatenate([bias, points[:, 0]], axis=-1), points[..., :d]
 
 
@@ -258,7 +253,7 @@ def _reference(course: Course, theta: Array, lifts: Array, order: int) -> Array:
     first = course.station[..., 0, :]
     along = _moved(course, first[..., None, :], order)[..., 0, :]
     inner = (along @ theta[..., None])[..., 0]
-    return lifts @ _powers(course, 2 * order + 1).T - 2.0 * inner + (first**2).sum(-1)
+    return np.asarray(lifts @ _powers(course, 2 * order + 1).T - 2.0 * inner + (first**2).sum(-1))
 
 
 def _branches(course: Course, state: Array, reference: Array) -> Array:

@@ -51,12 +51,12 @@ def averaged(problem: Problem, count: int) -> Problem:
     since = np.zeros(problem.epochs)
     since[place >= 0] = (times[kept] - middle[:, None]).ravel()
     when = _Blocks(place, since, middle)
-    present = (problem.weight > 0.0).reshape(-1, problem.count).all(0)
-    means, first, taken = [], [], 0
-    for rows, start in zip(problem.rows, problem.starts, strict=True):
-        means.append(_means(rows, when, present[start : start + rows.count], start, taken))
+    present = np.asarray((problem.weight > 0.0).reshape(-1, problem.count).all(0))
+    means: list[_Mean] = []
+    taken = 0
+    for kind, start in zip(problem.rows, problem.starts, strict=True):
+        means.append(_means(kind, when, present[start : start + kind.count], start, taken))
         taken += len(means[-1].first)
-        first.append(means[-1].first)
     rows = tuple(_averaged(block, mean) for block, mean in zip(problem.rows, means, strict=True))
     return replace(
         problem,
@@ -65,7 +65,7 @@ def averaged(problem: Problem, count: int) -> Problem:
         noise=_noise(problem, means, np.concatenate([block.epoch for block in rows])),
         times=middle,
         motions=tuple(replace(m, reference=_reference(problem, m.reference)) for m in problem.motions),
-        biases=tuple(_bias(bias, np.concatenate(first)) for bias in problem.biases),
+        biases=tuple(_bias(bias, np.concatenate([mean.first for mean in means])) for bias in problem.biases),
     )
 
 

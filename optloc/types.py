@@ -123,8 +123,8 @@ class Bias:
     coefficient : float array (n,)
         Sign or size of each touch, for instance +1 for station a and -1 for station b.
     form : "offset", "scale", "drift" or "rotation"
-        Added to the measurement; times the measured quantity; times seconds since the first target's reference time (the
-        first epoch by default); or a turn of
+        Added to the measurement; times the measured quantity; times seconds since the first target's reference time
+        (by default the first epoch); or a turn of
         the station's axes (one angle in the plane, a rotation vector in space; a member is then a station's mount).
     mean : float array (q,) or (q, c)
         Prior mean, in the unit of the form.

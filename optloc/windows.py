@@ -14,6 +14,7 @@ from optloc.problem import Problem
 from optloc.types import Array, Bias, Motion, Rows, Stations
 
 _NUMBERS = 2**17
+_ROW_ARRAYS = ("z", "a", "b", "epoch", "target", "weight", "correction")
 
 
 def windows(problem: Problem, batch: int = 1) -> Iterator[tuple[int, int, Problem]]:
@@ -120,12 +121,7 @@ def _inside(epoch: Array, first: int, last: int) -> slice | Array:
 
 
 def _rows(block: Rows, kept: slice | Array) -> Rows:
-    return replace(
-        block,
-        **{
-            name: getattr(block, name)[..., kept] for name in ("z", "a", "b", "epoch", "target", "weight", "correction")
-        },
-    )
+    return Rows(block.kind, *(getattr(block, name)[..., kept] for name in _ROW_ARRAYS))
 
 
 def _touches(bias: Bias, kept: slice | Array, number: Array) -> Bias:
@@ -189,8 +185,7 @@ def _appended(one: Rows, two: Rows) -> Rows:
         shape = batch if a.ndim > 1 or b.ndim > 1 else ()
         return np.concatenate([np.broadcast_to(v, (*shape, v.shape[-1])) for v in (a, b)], axis=-1)
 
-    names = ("z", "a", "b", "epoch", "target", "weight", "correction")
-    return replace(one, **{name: both(getattr(one, name), getattr(two, name)) for name in names})
+    return Rows(one.kind, *(both(getattr(one, name), getattr(two, name)) for name in _ROW_ARRAYS))
 
 
 def _stations(problem: Problem, more: Problem) -> Stations:

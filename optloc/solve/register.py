@@ -18,6 +18,10 @@ from optloc.solve.scale import spread_of
 from optloc.solve.start import vectors
 from optloc.types import Array
 
+_WINDOWS = 6
+# The relaxation needs a prior: biases without one are taken for about this share of the largest range difference.
+_LOOSE = 1e-2
+
 
 def registrable(problem: Problem) -> bool:
     """Return whether a problem is a run of range differences whose only target lasts it, and is not one fix."""
@@ -63,18 +67,18 @@ def closed_form(problem: Problem) -> Array | None:
     if run is None:
         return None
     state, bias = candidates(run.course, problem.motions[0].order)
-    return started(problem, run, state, bias)
+    return started(problem, run, state, np.repeat(bias[:, None], state.shape[1], axis=1))
 
 
 def started(problem: Problem, run: Run, state: Array, bias: Array) -> Array:
-    """Return vectors (N, C, size) of states (N, C, order + 1, d) and biases (N, q) in the units of a run."""
+    """Return vectors (N, C, size) of states (N, C, order + 1, d) and biases (N, C, q) in the units of a run."""
     state = state * (run.length / run.duration ** np.arange(state.shape[2])[:, None])
     state[:, :, 0] += run.origin
     x = np.repeat(vectors(problem, None)[:, None], state.shape[1], axis=1)
     for j, name in enumerate(("position", "velocity", "acceleration")[: state.shape[2]]):
         slot, _ = problem.layout.find(name)
         x[..., slot.start : slot.start + slot.size] = state[:, :, j]
-    x[..., run.column] = bias[:, None] * run.length
+    x[..., run.column] = bias * run.length
     return x
 
 
@@ -169,3 +173,51 @@ def _prior(problem: Problem, column: Array) -> tuple[Array, Array]:
             information[part] = np.diagonal(precision.reshape(-1, slot.size, slot.size)[0])
     with np.errstate(divide="ignore"):
         return mean[column], 1.0 / np.sqrt(information[column])
+
+
+def relaxed(problem: Problem) -> Array | None:
+    """Return starting vectors (N, C, size) of runs from the semidefinite relaxation, or None where it does not apply.
+
+    A few blocks over the whole run are used, of those in which every station is heard.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N runs of a few dozen epochs, fixed targets or constant velocity.
+    """
+    from formulations.registration_sdp import registration
+
+    run, order = run_of(problem), problem.motions[0].order
+    if run is None or order > 1 or (run.course.sign < 0).any():
+        return None
+    course = run.course
+    size, d = len(course.offset), problem.dimension
+    station, bias = (np.broadcast_to(a, (size, *a.shape[1:])) for a in (course.station, course.bias))
+    whiten = np.broadcast_to(course.whiten, (size, *course.offset.shape[1:], course.offset.shape[2]))
+    loose = _LOOSE * np.abs(course.offset).max() if course.offset.size else 1.0
+    sigma = np.where(np.isfinite(course.sigma), course.sigma, loose)
+    found: list[list[tuple[Array, Array]]] = []
+    for i in range(size):
+        whole = np.flatnonzero((whiten[i] != 0.0).any(-1).all(-1))
+        k = whole[np.unique(np.linspace(0, len(whole) - 1, _WINDOWS).round().astype(int))] if len(whole) else whole
+        time = course.time[k] if order else None
+        answers = (
+            registration(
+                station[i, k],
+                course.offset[i, k],
+                whiten[i, k],
+                sigma,
+                design=bias[i, k[0]],
+                mean=course.mean,
+                time=time,
+            )
+            if len(k) > 1
+            else ()
+        )
+        found.append([(one.target, one.bias) for one in answers])
+    width = max(1, *(len(pairs) for pairs in found))
+    state, delta = np.full((size, width, order + 1, d), np.nan), np.zeros((size, width, len(run.column)))
+    for i, pairs in enumerate(found):
+        for j, (target, own) in enumerate(pairs):
+            state[i, j], delta[i, j] = target, own
+    return started(problem, run, state, delta)

@@ -95,12 +95,14 @@ def _settled(blocks: Problem, pool: tuple[Array, Array]) -> Array:
 
 def _covariance(blocks: Problem, x: Array) -> Array:
     """Return the covariance of the position (N, d, d) in units of the spread of the stations."""
-    usable = np.isfinite(x).all(-1)
+    usable = np.asarray(np.isfinite(x).all(-1))
     slot, _ = blocks.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)
     with np.errstate(all="ignore"):
         full, ok = covariance(equations_at(blocks, np.where(usable[:, None], x, 0.0)))
-    return np.where((usable & ok)[:, None, None], full[:, part, part], np.nan) / _length(blocks)[:, None, None] ** 2
+    return np.asarray(
+        np.where((usable & ok)[:, None, None], full[:, part, part], np.nan) / _length(blocks)[:, None, None] ** 2
+    )
 
 
 def _length(blocks: Problem) -> Array:
@@ -124,7 +126,7 @@ def _around(blocks: Problem) -> Array:
 def _valley(blocks: Problem, x: Array) -> Array:
     """Return vectors (N, C, size) along the longest axis of the error ellipsoid of the best minimum."""
     cov = _covariance(blocks, x)
-    usable = np.isfinite(cov).all((-1, -2))
+    usable = np.asarray(np.isfinite(cov).all((-1, -2)))
     values, axes = np.linalg.eigh(np.where(usable[:, None, None], cov, 0.0))
     longest = (np.sqrt(np.maximum(values[:, -1], 0.0)) * _length(blocks))[:, None] * axes[..., -1]
     out = np.repeat(np.where(usable[:, None], x, np.nan)[:, None], len(_STEPS), axis=1)

@@ -20,7 +20,7 @@ from optloc.solve.bounded import bounded
 from optloc.solve.heights import height_starts
 from optloc.solve.pieces import from_pieces, one_position
 from optloc.solve.refine import refine
-from optloc.solve.register import closed_form, registrable
+from optloc.solve.register import closed_form, registrable, relaxed
 from optloc.solve.runs import run_starts
 from optloc.solve.search import PLACES, searched_starts
 from optloc.solve.squared import Pick, every, hull, minimum, shor
@@ -119,7 +119,7 @@ def _squared(problem: Problem, fix: Fix | None, name: str, pick: Pick) -> Fix:
         position = np.concatenate([squared_range_starts(alone, pick), heights], axis=1)
         return _placed(problem, position, fix, name, began)
     if registrable(problem):
-        return unrefined(problem, run_starts(problem, closed_form), fix, name, began)
+        return unrefined(problem, run_starts(problem, relaxed if pick is shor else closed_form), fix, name, began)
     x = from_pieces(problem, lambda piece: lsr(piece, _squared(piece, None, name, pick)))
     return unrefined(problem, x, fix, name, began)
 

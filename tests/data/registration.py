@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from data.windows import quantiles, report
 
-from optloc import Fix, Motion, Noise, Problem, Status, predict, solve, with_bias
+from optloc import Fix, Noise, Problem, Status, predict, solve, with_bias
 from optloc.noise import Block
 
 ROUNDS = 6
@@ -65,13 +65,13 @@ def plausible(problem: Problem, least: float = 0.01) -> np.ndarray:
 
 
 def robust(problem: Problem, scale: float) -> Fix:
-    """Return the fix by Cauchy's loss: rows are weighed anew by what they are off at each of a few fixes."""
-    weight = problem.weight
+    """Return the fix by Cauchy's loss: from plain least squares on, rows are weighed anew by what they are off."""
+    fix = solve(problem)
     for _ in range(ROUNDS):
-        fix = solve(problem.with_rows(weight=weight))
         off = problem.observed - predict(problem, fix.x)
         weight = np.where(np.isfinite(off), problem.weight / (1.0 + (off / scale) ** 2), problem.weight)
-    return solve(problem.with_rows(weight=weight))
+        fix = solve(problem.with_rows(weight=weight), "lsr", start=fix.x)
+    return fix
 
 
 def not_beaten(problem: Problem, fix: Fix, truth: np.ndarray) -> None:
@@ -92,8 +92,3 @@ def fixed(fix: Fix) -> Fix:
     """Return a fix, asserting that it has an answer."""
     assert fix.answered.all(), f"{Status(int(np.ravel(fix.code)[0])).label}: {fix.reason}"
     return fix
-
-
-def free(count: int) -> tuple[Motion, ...]:
-    """Return the motions of targets that stay where they are."""
-    return tuple(Motion() for _ in range(count))

@@ -85,7 +85,7 @@ def test_satellite_offsets_do_not_show_at_an_unknown_receiver(session):
     share, sigma = zip(*(posterior(problem) for problem in (few, many)), strict=True)
     report(f"GNSS {name}, prior 2 m: position sigma {sigma[0]} m of {few.epochs} epochs, {sigma[1]} m of {many.epochs}")
     assert min(s[-4:].min() for s in share) > 0.85
-    assert share[1][:-4].max() < 0.1
+    assert share[1][:-4].max() < 0.2
     np.testing.assert_allclose(sigma[1], sigma[0], rtol=0.2)
 
 

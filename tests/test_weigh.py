@@ -1,0 +1,103 @@
+"""Station errors of each epoch: weighed through the noise or eliminated, it is the same information."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from runs import drawn, estimated, run, truth
+
+import optloc
+from optloc.equations import equations_at
+from optloc.linear import linearise
+from optloc.noise import dense
+from optloc.normal import marginal
+from optloc.solve.refine import refine
+from optloc.weigh import weighed
+
+
+def oblong(problem):
+    """Return the run with errors that differ from station to station and along the axes."""
+    rng = np.random.default_rng(4)
+    root = rng.normal(size=(problem.stations.count, 3, 3))
+    return replace(problem, stations=replace(problem.stations, covariance=4.0 * root @ np.swapaxes(root, -1, -2)))
+
+
+CASES = {
+    "isotropic": run(6),
+    "oblong": oblong(run(6)),
+    "gains": run(6, gain=3e-4),
+    "oblong gains, moving": oblong(run(6, gain=3e-4, order=1)),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_weighed_and_eliminated_information_is_equal(name):
+    problem = drawn(CASES[name], 1, 2)
+    x = truth(problem) + np.zeros((2, 1))
+    whole = equations_at(problem, x)
+    named = estimated(problem)
+    inner = np.concatenate([x, np.zeros((2, named.layout.size - x.shape[1]))], axis=1)
+    information, vector, ok = marginal(equations_at(named, inner))
+    assert ok.all()
+    scale = np.sqrt(np.diagonal(whole.shared, axis1=-2, axis2=-1))
+    both = scale[:, :, None] * scale[:, None, :]
+    np.testing.assert_allclose(information / both, whole.shared / both, atol=1e-10)
+    np.testing.assert_allclose(vector / scale, whole.shared_vector / scale, rtol=1e-9, atol=1e-8)
+
+
+def test_estimates_agree_within_a_hundredth_of_sigma():
+    problem = drawn(run(60, station=5.0, prior=200.0), 2, 5)
+    x = np.broadcast_to(truth(problem), (5, problem.layout.size))
+    weighed_ = refine(problem, x)
+    named = estimated(problem)
+    start = np.concatenate([x, np.zeros((5, named.layout.size - x.shape[1]))], axis=1)
+    eliminated = refine(named, start)
+    sigma = np.sqrt(np.diagonal(optloc.crlb(problem, truth(problem)), axis1=-2, axis2=-1))
+    assert (np.abs(weighed_.x - eliminated.x[:, : x.shape[1]]) < 0.01 * sigma).all()
+
+
+def test_the_bound_is_that_of_the_full_fisher_matrix():
+    """All station positions of all epochs are kept as unknowns of one dense matrix, written from the definitions."""
+    problem = oblong(run(12, gain=0.03))
+    named, x = estimated(problem), truth(problem)
+    inner = np.concatenate([x, np.zeros(named.layout.size - len(x))])
+    linear = linearise(named, inner)
+    n, each = named.layout.n_shared, named.layout.n_local
+    full = np.zeros((named.count, named.layout.size))
+    full[:, :n] = linear.shared
+    for row, epoch in enumerate(named.epoch):
+        full[row, n + epoch * each : n + (epoch + 1) * each] = linear.local[row]
+    noise = dense(named.noise, np.arange(named.count))
+    fisher = full.T @ np.linalg.solve(noise, full)
+    for epoch in range(named.epochs):
+        for s, covariance in enumerate(named.stations.covariance):
+            at = n + epoch * each + 3 * s
+            fisher[at : at + 3, at : at + 3] += np.linalg.inv(covariance)
+    scale = 1.0 / np.sqrt(np.diag(fisher))
+    bound = (np.linalg.inv(fisher * scale * scale[:, None]) * scale * scale[:, None])[:n, :n]
+    ours = optloc.crlb(problem, x)
+    size = np.sqrt(np.diag(bound))
+    np.testing.assert_allclose(ours / size / size[:, None], bound / size / size[:, None], atol=1e-8)
+    assert len(fisher) == 191
+
+
+def test_isotropic_errors_are_arrival_errors():
+    problem = run(3, sigma=3.0, station=4.0)
+    covariance = dense(weighed(problem).noise, np.arange(4))
+    np.testing.assert_allclose(covariance, 25.0 * (np.eye(4) + 1.0), rtol=1e-12)
+    assert weighed(problem).stations.covariance is None
+
+
+def test_what_has_no_such_errors_stays():
+    problem = run(3, station=0)
+    assert weighed(problem) is problem
+
+
+def test_simulated_station_errors_have_the_weighed_covariance():
+    problem = oblong(run(1, gain=3e-4, biased=False))
+    x = truth(problem)
+    drawn_ = optloc.simulate(problem, x, 5, trials=20_000)
+    sample = np.cov(drawn_.z.T)
+    expected = dense(weighed(problem, x).noise, np.arange(problem.count))
+    scale = np.sqrt(np.diag(expected))
+    np.testing.assert_allclose(sample / scale / scale[:, None], expected / scale / scale[:, None], atol=0.04)
