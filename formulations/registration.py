@@ -239,7 +239,7 @@ def _constrained(rows: Array, q: int, d: int) -> tuple[Array, Array]:
     scale = np.ones((len(rows), rows.shape[-1]))
     norm = np.sqrt((rows[..., :q] ** 2).sum(1))
     scale[:, :q] = np.where(usable[:, None] & (norm > 0.0), norm, 1.0)
-    upper = np.linalg.qr(np.where(usable[:, None, None], rows / scale[:, None], 0.0), mode="r")
+    upper: Array = np.asarray(np.linalg.qr(np.where(usable[:, None, None], rows / scale[:, None], 0.0), mode="r"))
     points, _, valid = stationary(upper[:, q:, q:-1], upper[:, q:, -1], paraboloid(d))
     points = np.where((valid & usable[:, None])[..., None], points, np.nan)
     left = upper[:, :q, -1] - (upper[:, :q, q:-1] @ points[:, 0, :, None])[..., 0]

@@ -8,12 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optloc import linalg
+from optloc import tangent as tangents
+from optloc.constraints import exact, levels, tangent_at
 from optloc.epochs import tied
 from optloc.equations import equations_at
 from optloc.errors import InvalidProblem
 from optloc.layout import Layout
 from optloc.linear import Linear, linearise
-from optloc.normal import Normal, covariance, normal, prior_parts
+from optloc.normal import Normal, covariance, marginal, normal, prior_parts
 from optloc.problem import Problem
 from optloc.types import Array
 from optloc.windows import windows
@@ -26,7 +28,7 @@ def crlb(problem: Problem, truth: Array) -> Array:
     """Return the Cramer-Rao lower bound of the shared unknowns.
 
     The inverse of the same normal matrix that refines a fix, taken at the truth; unknowns local to an epoch are
-    eliminated, priors count as information.
+    eliminated, priors count as information, and equalities such as an exact height leave their tangent space.
 
     Parameters
     ----------
@@ -43,8 +45,17 @@ def crlb(problem: Problem, truth: Array) -> Array:
     References
     ----------
     S. M. Kay, "Fundamentals of Statistical Signal Processing: Estimation Theory" (1993), eq. 3.31.
+    J. D. Gorman and A. O. Hero, "Lower bounds for parametric estimation with constraints" (1990), theorem 1.
     """
-    return covariance(equations_at(problem, np.asarray(truth, dtype=float)))[0]
+    x, held = np.asarray(truth, dtype=float), exact(problem)
+    equations = equations_at(problem, x)
+    if not held:
+        return covariance(equations)[0]
+    information, _, ok = marginal(equations)
+    vectors = np.broadcast_to(x, (*ok.shape, x.shape[-1])).reshape(-1, x.shape[-1])
+    space = tangent_at(problem.flat(), held, vectors)
+    bound, good = tangents.inverse(information.reshape(-1, *information.shape[-2:]), space)
+    return np.where((ok.ravel() & good)[:, None, None], bound, np.nan).reshape(information.shape)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,13 +127,22 @@ def crlb_course(
         raise InvalidProblem(f"the counts are not among 1 to {k}", "counts", "give numbers of epochs")
     total, size = _totals(problem, x, chosen)
     prior = shared_priors(problem)
-    total, size = total + prior, size + np.diagonal(prior)
-    free = np.ones(layout.n_shared, dtype=bool)
-    for slot in (layout.find(name)[0] for name in known):
-        free[slot.start : slot.start + slot.size] = False
-    bound = np.zeros((len(chosen), layout.n_shared, layout.n_shared))
-    bound[np.ix_(np.arange(len(chosen)), free, free)] = _inverse(total[:, free][..., free], size[:, free])
+    bound = _inverse(total + prior, size + np.diagonal(prior), free_directions(problem, x, known))
     return Course(chosen, problem.times[chosen - 1], bound, layout)
+
+
+def free_directions(problem: Problem, x: Array, known: Sequence[str] = ()) -> Array:
+    """Return a basis (n, p) of what equalities, at a vector (size,), and names that are known leave free."""
+    layout, held = problem.layout, exact(problem)
+    fixed = np.zeros(layout.n_shared, dtype=bool)
+    for slot in (layout.find(name)[0] for name in known):
+        fixed[slot.start : slot.start + slot.size] = True
+    eye = np.eye(layout.n_shared)
+    if not held:
+        return eye[:, ~fixed]
+    gradients = levels(problem.flat(), held, x[None])[1]
+    across = np.concatenate([gradients, eye[None, fixed]], axis=1)
+    return np.asarray(tangents.tangent(across, np.ones((1, len(eye)))).along[0])
 
 
 def _totals(problem: Problem, x: Array, counts: Array) -> tuple[Array, Array]:
@@ -157,12 +177,16 @@ def _each_epoch(problem: Problem, x: Array) -> Iterator[tuple[int, Array, Array]
         yield first, eliminated(with_local_priors(problem, equations)), np.diagonal(gram[:, :n, :n], 0, -2, -1)
 
 
-def _inverse(information: Array, size: Array) -> Array:
-    """Return inverses (q, n, n), NaN where a combination is open; `size` (q, n) tells what rounding leaves of zero."""
-    inverse, _ = linalg.inverse(information)
+def _inverse(information: Array, size: Array, basis: Array) -> Array:
+    """Return inverses (q, n, n) on a basis (n, p), NaN where a combination is open.
+
+    `size` (q, n), the diagonal before elimination, tells what rounding leaves of zero.
+    """
+    inner, size = basis.T @ information @ basis, size @ basis**2
+    inverse, _ = linalg.inverse(inner)
     scale = 1.0 / np.sqrt(np.where(size > 0.0, size, 1.0))
-    weakest = np.linalg.eigvalsh(information * scale[..., :, None] * scale[..., None, :]).min(-1, initial=1.0)
-    return np.where((weakest > OPEN)[..., None, None], inverse, np.nan)
+    weakest = np.linalg.eigvalsh(inner * scale[..., :, None] * scale[..., None, :]).min(-1, initial=1.0)
+    return np.where((weakest > OPEN)[..., None, None], basis @ inverse @ basis.T, np.nan)
 
 
 def with_local_priors(problem: Problem, equations: Normal) -> Normal:

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optloc.bounds import OPEN, eliminated, shared_priors, with_local_priors
-from optloc.constraints import exact, tangent_at
+from optloc.bounds import OPEN, eliminated, free_directions, shared_priors, with_local_priors
 from optloc.equations import summed
 from optloc.layout import Layout, Slot
 from optloc.problem import Problem
@@ -99,8 +98,7 @@ def observability(problem: Problem, x: Array) -> Observability:
     layout = problem.layout
     equations = with_local_priors(problem, summed(problem, x))
     information, size = eliminated(equations), equations.shared
-    held = exact(problem)
-    basis = tangent_at(problem.flat(), held, x[None]).along[0] if held else np.eye(layout.n_shared)
+    basis = free_directions(problem, x)
     precision = shared_priors(problem)
     data = _taken_apart(information, size, basis)
     both = _taken_apart(information + precision, size + precision, basis)

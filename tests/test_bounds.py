@@ -1,12 +1,17 @@
 """The Cramer-Rao bound: against its textbook form, against all unknowns kept, and in the course of a run."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from optloc import InvalidProblem, Motion, Prior, Stations, assemble, crlb, measured, with_bias
 from optloc.bounds import crlb_course
+from optloc.constraints import height
+from optloc.frames import Frame
 from optloc.linear import linearise
 from optloc.normal import prior_parts
+from optloc.observe import observability
 from optloc.papers.registration import scenario as scenes
 
 
@@ -157,6 +162,26 @@ def test_a_position_prior_counts_once():
     each = np.linalg.inv(crlb(problem, x)) - np.diag([1 / 100.0, 1 / 400.0])
     for k, bound in enumerate(crlb_course(problem, x).covariance, start=1):
         np.testing.assert_allclose(np.linalg.inv(bound), each * k / 5 + np.diag([1 / 100.0, 1 / 400.0]), rtol=1e-9)
+
+
+def test_equalities_leave_the_bound_of_their_surface():
+    """A known height is worth as much as measuring it almost exactly, alone, in a batch and in the course of a run."""
+    frame, rng = Frame.enu(lat_deg=47.0, lon_deg=8.0, height=400.0), np.random.default_rng(4)
+    places = rng.uniform(-5e3, 5e3, (5, 3))
+    rows = measured("range", a=np.tile(np.arange(5), 3), epoch=np.repeat(np.arange(3), 5), sigma=3.0)
+    x = np.array([9e3, 3e3, 800.0, 0.0])
+    h = float(frame.to_geodetic(x[:3])[2])
+    posed = with_bias(assemble(places, rows, frame=frame, constraints=[height(exactly=h)]), "delay", per="kind")
+    measuring = measured("height", z=[h], sigma=1e-4)
+    free = with_bias(assemble(places, rows, measuring, frame=frame), "delay", per="kind", kind="range")
+    bound = crlb(posed, x)
+    np.testing.assert_allclose(bound, crlb(free, x), rtol=1e-5, atol=1e-5)
+    assert np.linalg.matrix_rank(bound, tol=1e-9) == 3
+    np.testing.assert_allclose(crlb(posed, np.stack([x, x]))[1], bound)
+    np.testing.assert_allclose(crlb_course(posed, x, [3]).covariance[0], bound, rtol=1e-9, atol=1e-9)
+    known = crlb_course(posed, x, [3], known=["delay"]).covariance[0]
+    np.testing.assert_allclose(known[:3, :3], crlb(replace(posed, biases=()), x[:3]), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(np.sqrt(np.diagonal(bound)), observability(posed, x).posterior, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -102,7 +102,10 @@ def test_ambiguity_is_exit_code_1_with_the_alternatives():
     assert fix["status"] == "ambiguous"
     places = [[fix["x"], fix["y"]], *(other["position"] for other in fix["alternatives"])]
     assert min(np.hypot(x + 3000.0, y + 1000.0) for x, y in places) < 500.0
+    for other in fix["alternatives"]:
+        assert other["probability"] == pytest.approx(1.0 / (1.0 + np.exp(other["gap"] / 2.0)))
     text = run("fix", DEMOS / "ambiguous.toml", code=1).stdout
+    assert "probability" in text
     assert "ambiguous" in text
     assert "Alternatives" in text
     assert run("fix", DEMOS / "ambiguous.toml", "-q", code=1).output == ""

@@ -108,3 +108,27 @@ def test_the_noise_of_some_rows_is_the_matching_part():
     kept = np.array([1, 2, 4, 6])
     part = dense(_noise_of(noise, kept, 7), np.arange(4))
     np.testing.assert_array_equal(part, dense(noise, np.arange(7))[np.ix_(kept, kept)])
+
+
+@pytest.mark.parametrize("epochs", [1, 4])
+@pytest.mark.parametrize("kind", ["tdoa", "range"])
+def test_biases_that_are_large_but_roughly_known_do_not_mislead_the_start(kind, epochs):
+    # Delays of the size of the array, known to 20 m: taken for zero they start one run in five at a wrong place.
+    stations = 1e3 * np.array([[0.0, 0.0], [20.0, 1.0], [3.0, 18.0], [17.0, 21.0], [9.0, -12.0]])
+    rng, delay = np.random.default_rng(7), np.array([20e3, -10e3])
+    others, each = np.tile(np.arange(1, 5), epochs), np.repeat(np.arange(epochs), 4)
+    rows = (
+        measured("tdoa", a=others, b=0 * others, sigma=10.0, epoch=each)
+        if kind == "tdoa"
+        else measured("range", a=others, sigma=10.0, epoch=each)
+    )
+    problem = assemble(stations, rows, motions=(Motion(span="epoch" if epochs > 1 else "run"),))
+    problem = with_bias(problem, "delay", members=["S1", "S2"], mean=delay, sigma=20.0)
+    places = rng.uniform(-40e3, 40e3, (60, 2 * epochs))
+    delays = delay + rng.normal(0.0, 20.0, (60, 2))
+    parts = [places, delays] if epochs == 1 else [delays, places]
+    truth = np.concatenate(parts, axis=1)
+    drawn = simulate(problem, truth, 1)
+    fix, started = solve(drawn), solve(drawn, "lsr", start=truth)
+    assert fix.answered.all()
+    assert np.all(fix.cost <= started.cost * (1.0 + 1e-6) + 1e-6)

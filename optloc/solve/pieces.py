@@ -18,7 +18,7 @@ from optloc.noise import Block, Noise, group
 from optloc.plan import elapsed
 from optloc.problem import Problem
 from optloc.solve.bistatic import course_starts
-from optloc.solve.start import static, vectors
+from optloc.solve.start import static, unbiased, vectors
 from optloc.types import Array, Motion, Rows, Stations
 
 
@@ -62,6 +62,7 @@ def from_pieces(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
 
 def _alone(problem: Problem, target: int) -> Problem:
     """Return the problem of one target: its rows and nothing else unknown."""
+    problem = unbiased(problem)
     problem = _with_rows_of(problem, target) if len(problem.motions) > 1 else problem
     motion = problem.motions[target]
     # What bounds a moving target holds at its reference time only, but a known height is as good a start elsewhere.
@@ -70,7 +71,7 @@ def _alone(problem: Problem, target: int) -> Problem:
         for c in problem.constraints
         if c.target == target and (motion.order == 0 or (is_exact(c) and not needs_velocity(c)))
     )
-    return replace(problem, motions=(motion,), biases=(), priors=(), constraints=constraints)
+    return replace(problem, motions=(motion,), constraints=constraints)
 
 
 def _with_rows_of(problem: Problem, target: int) -> Problem:

@@ -149,12 +149,12 @@ def _emitted(problem: Problem, x: Array) -> Array:
     left = part.observed - predict(part, np.where(usable[:, None], out, 0.0))
     present, emissions = np.broadcast_to(part.weight > 0.0, left.shape), emission_columns(problem)
     for plan, start in zip(plans(problem), problem.starts, strict=True):
-        own = emissions[np.isin(emissions, plan.adds.column)] if plan.model.emission else ()
-        for column in own:
-            rows = start + plan.adds.row[plan.adds.column == column]
-            heard = present[:, rows]
-            mean = np.where(heard, left[:, rows], 0.0).sum(1) / np.maximum(heard.sum(1), 1)
-            out[:, column] += np.where(usable, mean, 0.0)
+        own = np.isin(plan.adds.column, emissions) & plan.model.emission
+        column, rows = plan.adds.column[own], start + plan.adds.row[own]
+        heard, total = np.zeros(out.shape), np.zeros(out.shape)
+        np.add.at(heard, (..., column), present[:, rows])  # type: ignore[arg-type]
+        np.add.at(total, (..., column), np.where(present[:, rows], left[:, rows], 0.0))  # type: ignore[arg-type]
+        out += np.where(usable[:, None], total / np.maximum(heard, 1.0), 0.0)
     return out.reshape(size, q, -1)
 
 
@@ -167,4 +167,18 @@ def emission_columns(problem: Problem) -> Array:
 def static(problem: Problem) -> Problem:
     """Return the problem of the position alone: one static target, nothing else unknown but emission times."""
     motions = tuple(replace(motion, order=0) for motion in problem.motions)
-    return replace(problem, motions=motions, biases=(), priors=())
+    return replace(unbiased(problem), motions=motions)
+
+
+def unbiased(problem: Problem) -> Problem:
+    """Return a flat batch of problems without biases and priors: what is unknown of them is known as its prior mean.
+
+    Offsets, drifts and scales without a prior are taken for zero, rotations always are.
+    """
+    x, rows = vectors(problem, None), []
+    for plan, block in zip(plans(problem), problem.rows, strict=True):
+        gain, added = plan.gains.total(x, block.count), plan.adds.total(x, block.count)
+        z = (block.z - block.correction - added) / (1.0 + gain)
+        known = replace(block, z=z, correction=np.zeros(block.count))
+        rows.append(known if gain.any() or added.any() else block)
+    return replace(problem, rows=tuple(rows), biases=(), priors=())
