@@ -174,7 +174,7 @@ def _solved(matrix: Array, vector: Array, cut: float) -> Array:
     diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
     scaled = matrix * scale[..., :, None] * scale[..., None, :]
-    good = np.isfinite(scaled).all((-1, -2))
+    good = np.asarray(np.isfinite(scaled).all((-1, -2)))
     values, vectors = np.linalg.eigh(np.where(good[:, None, None], scaled, np.eye(matrix.shape[-1])))
     inverse = np.where(values > cut * values[..., -1:], 1.0 / np.where(values > 0.0, values, 1.0), 0.0)
     inner = (np.swapaxes(vectors, -1, -2) @ (scale * vector)[..., None])[..., 0] * inverse
@@ -191,7 +191,7 @@ def _smoothed(course: Course, reference: Array, order: int) -> Array:
     known = (first**2).sum(-1)
     square = (reference**2 - known)[..., None]
     fitted = basis @ (np.linalg.pinv(basis, rcond=1e-9) @ square)
-    return np.sqrt(np.maximum(fitted[..., 0] + known, 1e-6))
+    return np.asarray(np.sqrt(np.maximum(fitted[..., 0] + known, 1e-6)))
 
 
 def _lifted_ranges(course: Course, guess: _Guess, order: int) -> tuple[Array, _Guess]:

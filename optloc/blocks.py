@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 from scipy import sparse
@@ -13,6 +14,7 @@ from optloc.noise import Block, Noise, together
 from optloc.problem import Problem
 from optloc.types import Array, Bias, Rows, Stations
 from optloc.weigh import weighed
+from optloc.windows import cut, epochs_of, joined
 
 # A block that lasts this many times longer than usual has a gap in it, and the line through it means nothing.
 _GAP = 2.0
@@ -37,14 +39,24 @@ def averaged(problem: Problem, count: int) -> Problem:
         Batch (...) with one epoch a block. A row is the line through its values in the block, taken in the middle; it
         exists where it is present in all problems of the batch. The same biases; states hold at the same time.
     """
-    problem = _clear(problem)
     length = max(1, problem.epochs // count)
     if length == 1:
-        return problem
+        return _clear(problem)
+    last = length * (problem.epochs // length)
+    lasting = problem.times[length - 1 : last : length] - problem.times[:last:length]
+    longest = _GAP * float(np.median(lasting))
+    stretch = length * max(1, epochs_of(problem, int(np.prod(problem.batch_shape))) // length)
+    if stretch >= last:
+        return _blocks(_clear(problem), length, longest)
+    parts = (cut(problem, first, min(first + stretch, last)) for first in range(0, last, stretch))
+    return reduce(joined, (_blocks(_clear(part), length, longest) for part in parts))
+
+
+def _blocks(problem: Problem, length: int, longest: float) -> Problem:
+    """Return the blocks of a given length of a run, but for those that last longer than they may."""
     blocks = problem.epochs // length
     times = problem.times[: blocks * length].reshape(blocks, length)
-    lasting = times[:, -1] - times[:, 0]
-    kept = np.flatnonzero(lasting <= _GAP * np.median(lasting))
+    kept = np.flatnonzero(times[:, -1] - times[:, 0] <= longest)
     middle = 0.5 * (times[kept, 0] + times[kept, -1])
     place = np.full(problem.epochs, -1)
     place[(kept[:, None] * length + np.arange(length)).ravel()] = np.repeat(np.arange(len(kept)), length)

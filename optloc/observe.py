@@ -115,6 +115,11 @@ def observability(problem: Problem, x: Array) -> Observability:
     )
 
 
+def open_sentences(layout: Layout, information: Array) -> tuple[str, ...]:
+    """Return sentences that name the combinations of shared unknowns on which an information matrix is silent."""
+    return tuple(_open_sentences(layout, _taken_apart(information, information, np.eye(layout.n_shared))))
+
+
 @dataclass(frozen=True, slots=True)
 class _Parts:
     """Standard deviations (n,), correlations (n, n), and a basis (q, n) of what is open, in units of `reach` (n,)."""

@@ -96,18 +96,24 @@ def columns(layout: Layout, name: str, epoch: Array) -> Array:
 
 
 _PLANS: dict[tuple[Any, ...], tuple[Plan, ...]] = {}
+# Plans of longer problems are made anew: that takes less time than their rows do, and no memory that lasts.
+_KEPT_PLANS, _KEPT_ROWS = 64, 4096
 
 
 def plans(problem: Problem) -> tuple[Plan, ...]:
-    """Return the plan of each block of rows; kept for problems of equal structure."""
+    """Return the plan of each block of rows; kept for problems of equal structure that are not long."""
+    if problem.count > _KEPT_ROWS:
+        return _plans(problem)
     key = problem.structure
     if key not in _PLANS:
-        if len(_PLANS) > 64:
+        if len(_PLANS) >= _KEPT_PLANS:
             _PLANS.clear()
-        _PLANS[key] = tuple(
-            _plan(problem, block, start) for block, start in zip(problem.rows, problem.starts, strict=True)
-        )
+        _PLANS[key] = _plans(problem)
     return _PLANS[key]
+
+
+def _plans(problem: Problem) -> tuple[Plan, ...]:
+    return tuple(_plan(problem, block, start) for block, start in zip(problem.rows, problem.starts, strict=True))
 
 
 def _plan(problem: Problem, block: Rows, start: int) -> Plan:

@@ -27,7 +27,7 @@ def windows(problem: Problem, batch: int = 1) -> Iterator[tuple[int, int, Proble
     batch : int
         Number of problems that are worked on together.
     """
-    length = _length(problem, batch)
+    length = epochs_of(problem, batch)
     if length >= problem.epochs:
         yield 0, problem.epochs, problem
         return
@@ -38,11 +38,11 @@ def windows(problem: Problem, batch: int = 1) -> Iterator[tuple[int, int, Proble
 
 def whole(problem: Problem, batch: int = 1) -> bool:
     """Return whether a run is one window."""
-    return _length(problem, batch) >= problem.epochs
+    return epochs_of(problem, batch) >= problem.epochs
 
 
-def _length(problem: Problem, batch: int) -> int:
-    """Return the number of epochs of a window."""
+def epochs_of(problem: Problem, batch: int = 1) -> int:
+    """Return the number of epochs whose Jacobians fit into the cache."""
     if problem.epochs == 1 or tied(problem):
         return problem.epochs
     columns = problem.layout.n_shared + problem.layout.n_local + 1

@@ -84,33 +84,52 @@ def refine(
         One entry for each start.
     """
     rules = _Rules(problem.layout.n_shared, tolerance, limit, damped, face)
+    weights = None
     if not depends_on_place(problem):
-        problem = weighed(problem)
-        noise = whiten(problem.noise, problem.weight) if whole(problem, len(start)) else None
-        if item is not None:
-            problem = problem.take(item)
-            noise = None if noise is None else tuple(w.take(item) for w in noise)
-        return _iterated(problem, start, noise, rules)
+        weights = _Weights.of(problem, start)
+        weights = weights if item is None else weights.take(item)
     if item is not None:
         problem = problem.take(item)
+    if weights is not None:
+        return _iterated(problem, start, weights, rules)
     for _ in range(_WEIGHINGS):
-        part = weighed(problem, start)
-        done = _iterated(part, start, whiten(part.noise, part.weight) if whole(part, len(start)) else None, rules)
+        done = _iterated(problem, start, _Weights.of(problem, start), rules)
         start = done.x
     return done
 
 
-def _iterated(problem: Problem, start: Array, noise: tuple[Whitener, ...] | None, rules: _Rules) -> Refined:
-    """Return where the iteration ends whose noise stays as it is."""
+@dataclass(frozen=True, slots=True)
+class _Weights:
+    """What whitens the rows during an iteration: matrices of a run that is one window, else where they are taken."""
+
+    matrices: tuple[Whitener, ...] | None
+    at: Array | None
+
+    @classmethod
+    def of(cls, problem: Problem, start: Array) -> _Weights:
+        at = start if depends_on_place(problem) else None
+        one = whole(problem, len(start))
+        return cls(whiten(weighed(problem, at).noise, problem.weight) if one else None, at)
+
+    def take(self, items: Array) -> _Weights:
+        matrices = None if self.matrices is None else tuple(w.take(items) for w in self.matrices)
+        return _Weights(matrices, None if self.at is None else self.at[items])
+
+    def equations(self, problem: Problem, x: Array) -> Normal:
+        return equations_at(problem, x, self.matrices, at=self.at)
+
+
+def _iterated(problem: Problem, start: Array, weights: _Weights, rules: _Rules) -> Refined:
+    """Return where the iteration ends whose weights stay as they are."""
     with np.errstate(all="ignore"):
         start = restored(problem, rules.face, start) if rules.face else start
-        state = _State.begin(problem, start, noise)
+        state = _State.begin(problem, start, weights)
         active, blur = np.arange(len(start)), _blur(problem, len(start))
         for iteration in range(rules.limit):
             active = active[state.status[active] == Status.MAX_ITERATIONS]
             if not len(active):
                 break
-            part = _Part.of(problem, noise, blur, active)
+            part = _Part.of(problem, weights, blur, active)
             _advance(part, state, active, rules, iteration)
     return Refined(state.x, state.equations.cost, state.status, state.iterations, state.equations)
 
@@ -127,9 +146,9 @@ class _State:
     iterations: Array
 
     @classmethod
-    def begin(cls, problem: Problem, start: Array, noise: tuple[Whitener, ...] | None) -> _State:
+    def begin(cls, problem: Problem, start: Array, weights: _Weights) -> _State:
         count = len(start)
-        equations = _owned(equations_at(problem, start, noise))
+        equations = _owned(weights.equations(problem, start))
         status = np.full(count, int(Status.MAX_ITERATIONS), dtype=np.int8)
         status[~np.isfinite(equations.cost)] = Status.NUMERICAL
         return cls(
@@ -158,15 +177,14 @@ class _Part:
     """The problems still moving."""
 
     problem: Problem
-    noise: tuple[Whitener, ...] | None
+    weights: _Weights
     blur: Array
 
     @classmethod
-    def of(cls, problem: Problem, noise: tuple[Whitener, ...] | None, blur: Array, active: Array) -> _Part:
+    def of(cls, problem: Problem, weights: _Weights, blur: Array, active: Array) -> _Part:
         if len(active) == len(blur):
-            return cls(problem, noise, blur)
-        noise = None if noise is None else tuple(w.take(active) for w in noise)
-        return cls(problem.take(active), noise, blur[active])
+            return cls(problem, weights, blur)
+        return cls(problem.take(active), weights.take(active), blur[active])
 
 
 def _blur(problem: Problem, count: int) -> Array:
@@ -188,7 +206,7 @@ def _advance(part: _Part, state: _State, active: Array, rules: _Rules, iteration
     move, solvable = step(now, damping, tangent_at(part.problem, rules.face, here) if rules.face else None)
     gain = decrement(now, move, rules.n)
     x = restored(part.problem, rules.face, here + move) if rules.face else here + move
-    after = equations_at(part.problem, x, part.noise)
+    after = part.weights.equations(part.problem, x)
     achieved = now.cost - after.cost
     floor = 1e-13 * (1.0 + now.cost)
     rounding = floor + 2.0 * part.blur * np.sqrt(1.0 + now.cost)

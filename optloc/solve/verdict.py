@@ -11,6 +11,7 @@ from optloc.constraints import exact, violation_names
 from optloc.fix import Alternatives, Fix, Stage
 from optloc.models import MODELS
 from optloc.noise import whiten
+from optloc.observe import open_sentences
 from optloc.problem import Problem
 from optloc.solve.curvature import Curvature, curved, station_direction, weak_direction
 from optloc.solve.reduce import ranges
@@ -18,6 +19,7 @@ from optloc.solve.scale import distance_of, spread_of
 from optloc.solve.sight import lowest
 from optloc.status import Certificate, Status
 from optloc.types import Array
+from optloc.windows import windows
 
 AMBIGUOUS_GAP = 9.0
 LISTED_GAP = 25.0
@@ -191,23 +193,29 @@ def _same(x: Array, y: Array, curvature: Curvature) -> Array:
 
 def degrees_of_freedom(problem: Problem) -> Array:
     """Return rows present (the rank of their noise) less unknowns without a prior, (N,)."""
-    rank = np.zeros(problem.batch_shape, dtype=int)
-    for whitener in whiten(problem.noise, problem.weight):
-        rank = rank + (whitener.matrix != 0.0).any(-1).sum((-1, -2)) * (
-            len(whitener.row) if whitener.matrix.shape[-3] == 1 and len(whitener.row) > 1 else 1
-        )
+    rank: Any = np.zeros(problem.batch_shape, dtype=int)
+    heard: Any = 0
+    for _, _, part in windows(problem, len(problem.weight) if problem.weight.ndim > 1 else 1):
+        for whitener in whiten(part.noise, part.weight):
+            same = len(whitener.row) if whitener.matrix.shape[-3] == 1 else 1
+            rank = rank + same * (whitener.matrix != 0.0).any(-1).sum((-1, -2))
+        heard = heard + _heard(part)
     known = (
         {prior.name for prior in problem.priors}
         | {b.name for b in problem.biases if b.sigma is not None}
         | {"stations"}
     )
     layout = problem.layout
-    unknowns = sum(slot.size for slot in layout.shared if slot.name not in known)
-    heard = np.zeros((*problem.batch_shape, problem.epochs), dtype=bool)
-    for k in range(problem.epochs):
-        heard[..., k] = (problem.weight[..., problem.epoch == k] > 0.0).any(-1)
-    unknowns = unknowns + heard.sum(-1) * sum(slot.size for slot in layout.local if slot.name not in known)
+    unknowns: Any = sum(slot.size for slot in layout.shared if slot.name not in known)
+    unknowns = unknowns + heard * sum(slot.size for slot in layout.local if slot.name not in known)
     return np.broadcast_to(rank - unknowns + len(exact(problem)), problem.batch_shape).astype(np.int32)
+
+
+def _heard(problem: Problem) -> Array:
+    """Return the number of epochs with a row that is present, (...)."""
+    order = np.argsort(problem.epoch, kind="stable")
+    _, first = np.unique(problem.epoch[order], return_index=True)
+    return np.asarray(np.maximum.reduceat(problem.weight[..., order] > 0.0, first, axis=-1).sum(-1))
 
 
 def _fill(size: int, value: Any) -> Array:
@@ -245,7 +253,7 @@ def _explain(problem: Problem, fix: Fix, curvature: Curvature) -> None:
     for i in np.flatnonzero(answered & np.isin(fix.code, (Status.UNBOUNDED, Status.MAX_ITERATIONS, Status.STALLED))):
         fix.reason[i] = f"the refinement stopped {distance[i]:.3g} spreads of the stations away"
     for i in np.flatnonzero(weak):
-        fix.reason[i] = weak_direction(problem, curvature.information[i])
+        fix.reason[i] = _open(problem, curvature.information[i])
     for i in np.flatnonzero(fix.code == Status.AMBIGUOUS):
         alike = gap[i] < _EQUAL
         fix.reason[i] = "another position " + ("fits as well" if alike else f"costs only {gap[i]:.2g} more")
@@ -265,6 +273,12 @@ def _explain(problem: Problem, fix: Fix, curvature: Curvature) -> None:
     gone = broken | few | missing | barred | weak | far
     fix.x[gone] = np.nan
     fix.cov[gone] = np.nan
+
+
+def _open(problem: Problem, information: Array) -> str:
+    """Return what the data leave open: combinations of biases by name, else the direction of the position."""
+    named = open_sentences(problem.layout, information) if problem.biases and np.isfinite(information).all() else ()
+    return "; ".join(named) or weak_direction(problem, information)
 
 
 def _explain_missing(problem: Problem, fix: Fix, items: Array) -> None:
