@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from optloc.noise import Block, Noise
 from optloc.problem import Problem
 from optloc.types import Array, Bias, Motion, Rows, Stations
 
-_NUMBERS = 2**17
+_NUMBERS = 2**16
 _ROW_ARRAYS = ("z", "a", "b", "epoch", "target", "weight", "correction")
 
 
@@ -59,17 +59,51 @@ def window(problem: Problem, first: int, last: int) -> Problem:
     first, last : int
         Stretch of epochs.
     """
-    rows = [_rows(block, _inside(block.epoch, first, last)) for block in problem.rows]
+    kept = [_inside(block.epoch, first, last) for block in problem.rows]
+    rows = tuple(_rows(block, inside) for block, inside in zip(problem.rows, kept, strict=True))
+    number = _Numbers.of(problem, kept, [block.count for block in rows])
     blocks = []
-    epoch = problem.epoch
-    number = np.cumsum((epoch >= first) & (epoch < last)) - 1
     for block in problem.noise.blocks:
-        groups = _inside(epoch[block.row[:, 0]], first, last)
+        groups = _inside(number.epoch(problem, block.row[:, 0]), first, last)
         covariance = block.covariance if block.covariance.shape[-3] == 1 else block.covariance[..., groups, :, :]
         if len(block.row[groups]):
-            blocks.append(Block(number[block.row[groups]], covariance))
-    biases = tuple(_touches(bias, _inside(epoch[bias.row], first, last), number) for bias in problem.biases)
-    return replace(problem, rows=tuple(rows), noise=Noise(tuple(blocks)), biases=biases)
+            blocks.append(Block(number.new(block.row[groups]), covariance))
+    biases = tuple(_touches(problem, bias, number, first, last) for bias in problem.biases)
+    return replace(problem, rows=rows, noise=Noise(tuple(blocks)), biases=biases)
+
+
+@dataclass(frozen=True, slots=True)
+class _Numbers:
+    """Row numbers of a run and its window: first row of each kind, what is kept of it, its first row in the window."""
+
+    start: Array
+    kept: list[slice | Array]
+    taken: Array
+
+    @classmethod
+    def of(cls, problem: Problem, kept: list[slice | Array], counts: list[int]) -> _Numbers:
+        return cls(np.array(problem.starts), kept, np.cumsum([0, *counts[:-1]]))
+
+    def epoch(self, problem: Problem, rows: Array) -> Array:
+        """Return the epochs of rows of the run."""
+        if len(self.kept) == 1:
+            return problem.rows[0].epoch[rows]
+        kind = np.searchsorted(self.start, rows, side="right") - 1
+        out = np.empty(rows.shape, dtype=np.int64)
+        for i, block in enumerate(problem.rows):
+            out[kind == i] = block.epoch[rows[kind == i] - self.start[i]]
+        return out
+
+    def new(self, rows: Array) -> Array:
+        """Return the numbers in the window of rows of the run that are in it."""
+        kind = np.searchsorted(self.start, rows, side="right") - 1
+        out = np.empty(rows.shape, dtype=np.int64)
+        for i, kept in enumerate(self.kept):
+            own = rows[kind == i] - self.start[i]
+            out[kind == i] = self.taken[i] + (
+                own - kept.start if isinstance(kept, slice) else np.searchsorted(kept, own)
+            )
+        return out
 
 
 def cut(problem: Problem, first: int, last: int) -> Problem:
@@ -124,8 +158,9 @@ def _rows(block: Rows, kept: slice | Array) -> Rows:
     return Rows(block.kind, *(getattr(block, name)[..., kept] for name in _ROW_ARRAYS))
 
 
-def _touches(bias: Bias, kept: slice | Array, number: Array) -> Bias:
-    return replace(bias, row=number[bias.row[kept]], member=bias.member[kept], coefficient=bias.coefficient[kept])
+def _touches(problem: Problem, bias: Bias, number: _Numbers, first: int, last: int) -> Bias:
+    kept = _inside(number.epoch(problem, bias.row), first, last)
+    return replace(bias, row=number.new(bias.row[kept]), member=bias.member[kept], coefficient=bias.coefficient[kept])
 
 
 def joined(problem: Problem, more: Problem) -> Problem:

@@ -191,7 +191,7 @@ def test_divergence_of_500_wild_starts():
 
 def test_accuracies_and_cells():
     assert accuracy(np.array([0.5, -20.0]), np.array([-10.0, 10.0])) == pytest.approx([95.0, 0.0])
-    assert [metres(v) for v in (0.1462, 40.2826, 25262.08, np.nan)] == ["0.1462", "40.28", "25262", "–"]
+    assert [metres(v) for v in (0.1462, 40.2826, 25262.08, 0.0, np.nan)] == ["0.1462", "40.28", "25262", "0", "–"]
 
 
 def test_the_nearest_branch_is_scored():
@@ -232,7 +232,8 @@ def test_a_reproduction_has_every_table_and_figure(report):
     assert [row[2] for row in rows["table-2"][:4]] == ["99.60", "89.38", "92.10", "86.65"]
     assert [row[:4] for row in rows["table-3"]][-1] == ("20", "38.0", "36.7", "2.5 %")
     assert [row[1] for row in rows["table-4"]] == ["10 ns", "20 ns", "30 ns", "40 ns"]
-    assert all(row[-1] == "100.0 %" for row in rows["figure-2"])  # both places of the moving target are listed
+    assert all(row[-1] == "100.0 %" for row in rows["figure-2"])  # a moving target has two places
+    assert all(row[-2] == "0.0 %" for i in (1, 2, 3) for row in rows[f"figure-{i}"])  # none is lost silently
     assert all(len(row) == len(table.header) for table in report.tables for row in table.rows)
 
 

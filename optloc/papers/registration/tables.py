@@ -47,7 +47,9 @@ class Case:
 
 def metres(value: float) -> str:
     """Return a number with four significant digits and no exponent, a dash where it is not finite."""
-    return f"{value:.{max(0, 3 - int(np.floor(np.log10(max(abs(value), 0.1)))))}f}" if np.isfinite(value) else "–"
+    if value == 0.0 or not np.isfinite(value):
+        return "0" if value == 0.0 else "–"
+    return f"{value:.{max(0, 3 - int(np.floor(np.log10(max(abs(value), 0.1)))))}f}"
 
 
 def percent(share: float) -> str:
@@ -126,7 +128,7 @@ def errors(
     """
     header = (
         "environment", "second", "printed", "recursion", "optloc", "bound",
-        "recursion lost", "optloc lost", "several places",
+        "recursion lost", "optloc lost", "lost and ok", "ambiguous",
     )  # fmt: skip
     lines = []
     for label, history in histories.items():
@@ -143,7 +145,8 @@ def errors(
                     metres(rms(history.bounds[at])),
                     "–" if plain is None else percent(plain.share),
                     percent(found.share),
-                    percent(history.listed[at]),
+                    percent(history.silent[at]),
+                    percent(history.ambiguous[at]),
                 )
             )
     return Table(name, title, header, tuple(lines), note)

@@ -15,7 +15,8 @@ estimates target and biases by least squares. Its section 4 is made again here i
 - **optloc** is `optloc.solve` on the epochs so far. It takes no start and knows nothing of the truth.
 
 *Lost* is an estimate that is not finite, or further from the truth than ten bounds; errors are those of the trials that
-are not lost. The *bound* is that of Cramér and Rao with the biases unknown.
+are not lost. *Ambiguous* is a fix of optloc that says so and lists the other place; *lost and ok* is one that is lost
+and does not say so. The *bound* is that of Cramér and Rao with the biases unknown.
 
 ## How the paper was read
 

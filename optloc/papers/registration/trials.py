@@ -15,6 +15,7 @@ from optloc.papers.report import Tick
 from optloc.problem import Problem
 from optloc.simulate import simulate
 from optloc.solve import solve
+from optloc.status import Status
 from optloc.types import Array
 
 FAR = 10.0
@@ -166,8 +167,10 @@ class History:
         The paper's recursion on the range differences.
     found : tuple of Score
         The fix without a guess.
-    listed : tuple of float
-        Share of fixes that list more than one place.
+    ambiguous : tuple of float
+        Share of fixes that say that the data allow another place.
+    silent : tuple of float
+        Share of fixes that are lost and say ok.
     """
 
     setting: Setting
@@ -175,7 +178,8 @@ class History:
     bounds: Array
     plain: tuple[Score, ...] | None
     found: tuple[Score, ...]
-    listed: tuple[float, ...]
+    ambiguous: tuple[float, ...]
+    silent: tuple[float, ...]
 
 
 def history(setting: Setting, epochs: Sequence[int], tick: Tick, *, plain: bool = True, first: int = FIRST) -> History:
@@ -201,13 +205,14 @@ def history(setting: Setting, epochs: Sequence[int], tick: Tick, *, plain: bool 
     if plain:
         wandered = wander(setting, drawn, epochs, bounds, first=first)
         tick()
-    found, listed = [], []
+    found, ambiguous, silent = [], [], []
     for k, bound in zip(epochs, bounds, strict=True):
         fix = solve(setting.first(drawn, k))
         found.append(score(fix.x if setting.scenario.course is None else branch(fix, exact), exact, bound))
-        listed.append(float(np.isfinite(fix.alternatives.gap).any(-1).mean()))
+        ambiguous.append(float((fix.code == Status.AMBIGUOUS).mean()))
+        silent.append(float((found[-1].lost & (fix.code == Status.OK)).mean()))
         tick()
-    return History(setting, tuple(epochs), bounds, wandered, tuple(found), tuple(listed))
+    return History(setting, tuple(epochs), bounds, wandered, tuple(found), tuple(ambiguous), tuple(silent))
 
 
 def wander(
