@@ -15,7 +15,8 @@ from optloc.equations import equations_at
 from optloc.errors import InvalidProblem
 from optloc.layout import Layout
 from optloc.linear import Linear, linearise
-from optloc.normal import Normal, covariance, marginal, normal, prior_parts
+from optloc.normal import Normal, covariance, marginal, normal
+from optloc.priors import prior_parts
 from optloc.problem import Problem
 from optloc.types import Array
 from optloc.windows import windows
@@ -217,12 +218,6 @@ def eliminated(equations: Normal) -> Array:
 
     Where all local blocks are regular it is that of `optloc.normal.marginal`.
     """
-    if equations.local.shape[-1] == 0:
-        return equations.shared
-    diagonal = np.diagonal(equations.local, axis1=-2, axis2=-1)
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-    values, vectors = np.linalg.eigh(equations.local * scale[..., :, None] * scale[..., None, :])
-    kept = values > OPEN
-    roots = np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)
-    seen = equations.cross @ (scale[..., :, None] * vectors * roots[..., None, :])
+    root, _ = linalg.root(equations.local)
+    seen = equations.cross @ root
     return np.asarray(equations.shared - (seen @ np.swapaxes(seen, -1, -2)).sum(-3))

@@ -91,7 +91,8 @@ def _check_stations(problem: Problem) -> None:
             )
         _check_covariance(stations.covariance, "position error of station", stations.names)
     if stations.span not in ("epoch", "run", "noise"):
-        raise InvalidProblem(f"unknown span {stations.span!r} of position errors", "stations", "use epoch, run or noise")
+        what = f"unknown span {stations.span!r} of position errors"
+        raise InvalidProblem(what, "stations", "use 'epoch', 'run' or 'noise'")
 
 
 def _check_moving(problem: Problem) -> None:

@@ -32,8 +32,6 @@ def check_unknowns(problem: Problem) -> None:
     for bias in problem.biases:
         _check_bias(problem, bias, f"bias {bias.name!r}")
     layout = problem.layout
-    if layout.size == 0:
-        raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
     names = Counter(slot.name for slot in (*layout.shared, *layout.local))
     twice = [name for name, count in names.items() if count > 1]
     if twice:

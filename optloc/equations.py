@@ -6,7 +6,8 @@ from dataclasses import replace
 
 from optloc.linear import linearise
 from optloc.noise import Whitener
-from optloc.normal import Normal, normal, with_priors
+from optloc.normal import Normal, normal
+from optloc.priors import with_priors
 from optloc.problem import Problem
 from optloc.types import Array
 from optloc.weigh import whitener_at

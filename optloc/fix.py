@@ -111,6 +111,9 @@ class Fix:
         How it was found.
     active : object array (...), optional
         Constraints that hold each fix with equality, a tuple of `Active`.
+    local : array (..., k, p, p), optional
+        Covariance of the states that targets have at each epoch of a run, in the order of the layout; NaN where an
+        epoch leaves them open.
     """
 
     x: Array
@@ -126,6 +129,7 @@ class Fix:
     weights: Array
     stages: tuple[Stage, ...] = ()
     active: Array | None = None
+    local: Array | None = None
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -162,15 +166,19 @@ class Fix:
         return self.layout.find(name)[0].entries
 
     def covariance(self, name: str = "position") -> Array:
-        """Return the covariance (..., q, q) of a named shared part."""
+        """Return the covariance of a named part: (..., q, q), or (..., k, q, q) of a state at each epoch."""
         slot, shared = self.layout.find(name)
-        if not shared:
-            raise InvalidProblem(f"{name} is local to each epoch", name, "solve by_epoch(problem) for its covariance")
         part = slice(slot.start, slot.start + slot.size)
-        return self.cov[..., part, part]
+        if shared:
+            return self.cov[..., part, part]
+        if self.local is None or slot.start + slot.size > self.local.shape[-1]:
+            raise InvalidProblem(
+                f"{name} is an unknown of each epoch whose covariance is not kept", name, "ask for others"
+            )
+        return self.local[..., part, part]
 
     def sigma(self, name: str = "position") -> Array:
-        """Return the standard deviations (..., q) of a named shared part."""
+        """Return the standard deviations of a named part: (..., q), or (..., k, q) of a state at each epoch."""
         return np.asarray(np.sqrt(np.diagonal(self.covariance(name), axis1=-2, axis2=-1)))
 
     @property
@@ -258,38 +266,8 @@ class Fix:
             dof=change(self.dof, 0),
             weights=change(self.weights, 1),
             active=None if self.active is None else change(self.active, 0),
+            local=None if self.local is None else change(self.local, 3),
         )
-
-
-def merged(fix: Fix, items: Array, other: Fix, stage: Stage) -> Fix:
-    """Return a flat batch of fixes with some of them replaced by others, and one more stage.
-
-    Parameters
-    ----------
-    fix : Fix
-        N fixes.
-    items : int array (q,)
-        Which are replaced.
-    other : Fix
-        The q fixes that take their place.
-    stage : Stage
-        What was done.
-    """
-    width = max(fix.alternatives.gap.shape[1], other.alternatives.gap.shape[1])
-    mine, theirs = _padded(fix.alternatives, width), _padded(other.alternatives, width)
-    mine.x[items], mine.gap[items] = theirs.x, theirs.gap
-    changed: dict[str, Array] = {}
-    for name in ("x", "cov", "code", "reason", "certificate", "cost", "dof", "weights", "active"):
-        if (old := getattr(fix, name)) is not None:
-            changed[name] = np.array(old)
-            changed[name][items] = getattr(other, name)
-    return replace(fix, alternatives=mine, stages=(*fix.stages, stage), **changed)  # type: ignore[arg-type]
-
-
-def _padded(alternatives: Alternatives, width: int) -> Alternatives:
-    more = width - alternatives.gap.shape[1]
-    x = np.pad(alternatives.x, ((0, 0), (0, more), (0, 0)), constant_values=np.nan)
-    return Alternatives(x, np.pad(alternatives.gap, ((0, 0), (0, more)), constant_values=np.inf))
 
 
 def _as_array(value: Any) -> Array:

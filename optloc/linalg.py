@@ -7,20 +7,22 @@ import numpy as np
 from optloc.types import Array
 
 
-def factor(matrix: Array) -> tuple[Array, Array]:
+def factor(matrix: Array, least: float = 1e-15) -> tuple[Array, Array]:
     """Return Cholesky factors of a batch of symmetric matrices.
 
     Parameters
     ----------
     matrix : array (..., n, n)
         Symmetric matrices.
+    least : float
+        Share of its diagonal that a pivot must exceed.
 
     Returns
     -------
     lower : array (..., n, n)
         Lower factors; meaningless where not ok.
     ok : bool array (...)
-        Whether the matrix is numerically positive definite (pivots above 1e-15 of their diagonal).
+        Whether the matrix is numerically positive definite.
     """
     n = matrix.shape[-1]
     lower = np.zeros(matrix.shape)
@@ -29,7 +31,7 @@ def factor(matrix: Array) -> tuple[Array, Array]:
         known = lower[..., j:, :j]
         column = matrix[..., j:, j] - (known * lower[..., j, None, :j]).sum(-1)
         pivot = column[..., 0]
-        positive = pivot > 1e-15 * np.abs(matrix[..., j, j])
+        positive = pivot > least * np.abs(matrix[..., j, j])
         ok &= positive
         lower[..., j:, j] = column / np.sqrt(np.where(positive, pivot, 1.0))[..., None]
     return lower, ok
@@ -51,7 +53,7 @@ def _backward(lower: Array, right: Array) -> Array:
     return out
 
 
-def solve(matrix: Array, right: Array) -> tuple[Array, Array]:
+def solve(matrix: Array, right: Array, least: float = 1e-15) -> tuple[Array, Array]:
     """Return the solution of ``matrix @ x = right`` for symmetric positive definite matrices.
 
     The matrix is first scaled to a unit diagonal (Jacobi).
@@ -62,6 +64,8 @@ def solve(matrix: Array, right: Array) -> tuple[Array, Array]:
         Symmetric matrices.
     right : array (..., n, q)
         Right-hand sides.
+    least : float
+        Share of its diagonal that a pivot must exceed.
 
     Returns
     -------
@@ -73,18 +77,45 @@ def solve(matrix: Array, right: Array) -> tuple[Array, Array]:
     diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
     good = diagonal > 0.0
     scale = 1.0 / np.sqrt(np.where(good, diagonal, 1.0))
-    lower, ok = factor(matrix * scale[..., :, None] * scale[..., None, :])
+    lower, ok = factor(matrix * scale[..., :, None] * scale[..., None, :], least)
     ok = ok & good.all(-1)
     lower = np.where(ok[..., None, None], lower, np.eye(matrix.shape[-1]))
     x = scale[..., None] * _backward(lower, _forward(lower, scale[..., None] * right))
     return np.where(ok[..., None, None], x, 0.0), ok
 
 
-def inverse(matrix: Array) -> tuple[Array, Array]:
+def inverse(matrix: Array, least: float = 1e-15) -> tuple[Array, Array]:
     """Return inverses (..., n, n) of symmetric positive definite matrices, NaN where not ok, and ok (...)."""
     n = matrix.shape[-1]
-    out, ok = solve(matrix, np.broadcast_to(np.eye(n), matrix.shape))
+    out, ok = solve(matrix, np.broadcast_to(np.eye(n), matrix.shape), least)
     return np.where(ok[..., None, None], 0.5 * (out + np.swapaxes(out, -1, -2)), np.nan), ok
+
+
+def root(matrix: Array, cut: float = 1e-12) -> tuple[Array, Array]:
+    """Return A with ``A A'`` the pseudo-inverse of symmetric positive semidefinite matrices.
+
+    Parameters
+    ----------
+    matrix : array (..., n, n)
+        Symmetric matrices.
+    cut : float
+        Directions with less than this share of the largest eigenvalue, columns scaled, count as nothing.
+
+    Returns
+    -------
+    root : array (..., n, n)
+        Zero columns for directions of nothing.
+    regular : bool array (...)
+        Whether there are none.
+    """
+    diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
+    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    scaled = matrix * scale[..., :, None] * scale[..., None, :]
+    finite = np.asarray(np.isfinite(scaled).all((-1, -2)))
+    values, vectors = np.linalg.eigh(np.where(finite[..., None, None], scaled, 0.0))
+    kept = values > cut * np.maximum(values[..., -1:], cut)
+    inverse = np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)
+    return scale[..., :, None] * vectors * inverse[..., None, :], np.asarray(kept.all(-1))
 
 
 def whitening(covariance: Array) -> Array:

@@ -9,9 +9,11 @@ import numpy as np
 from optloc import linalg
 from optloc import tangent as tangents
 from optloc.linear import Linear
-from optloc.problem import Problem
 from optloc.tangent import Tangent
 from optloc.types import Array
+
+# Share of its information below which an epoch of a run leaves a combination of its own unknowns open.
+_OPEN = 1e-12
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,84 +114,18 @@ class _Sum:
         self.value = self.value + full
 
 
-def with_priors(problem: Problem, x: Array, equations: Normal, *, shared: bool = True, local: bool = True) -> Normal:
-    """Return normal equations with the Gaussian priors of a problem added.
-
-    Parameters
-    ----------
-    problem : Problem
-        Priors on named unknowns, biases and station positions.
-    x : array (..., size)
-        Where the problem was linearised.
-    equations : Normal
-        Of the measurements alone.
-    shared, local : bool
-        Which priors are added: those of shared unknowns, those of unknowns local to each epoch.
-    """
-    layout = problem.layout
-    parts = [part for part in prior_parts(problem) if (shared if layout.find(part[0])[1] else local)]
-    if not parts:
-        return equations
-    at_shared, at_local = layout.split(x)
-    matrix, vector, cost = equations.shared.copy(), equations.shared_vector.copy(), equations.cost
-    blocks, local_vector = equations.local.copy(), equations.local_vector.copy()
-    for name, mean, precision in parts:
-        slot, is_shared = layout.find(name)
-        part = slice(slot.start, slot.start + slot.size)
-        error = mean - (at_shared[..., part] if is_shared else at_local[..., part])
-        pull = (precision @ error[..., None])[..., 0]
-        penalty = (error * pull).sum(-1)
-        if is_shared:
-            matrix[..., part, part] += precision
-            vector[..., part] += pull
-            cost = cost + penalty
-        else:
-            blocks[..., part, part] += precision
-            local_vector[..., part] += pull
-            cost = cost + penalty.sum(-1)
-    return Normal(matrix, blocks, equations.cross, vector, local_vector, cost)
-
-
-def prior_parts(problem: Problem) -> list[tuple[str, Array, Array]]:
-    """Return (name, mean, precision) of every prior; local ones have an epoch axis of length one."""
-    parts = []
-    for prior in problem.priors:
-        precision, _ = linalg.inverse(prior.covariance)
-        _, is_shared = problem.layout.find(prior.name)
-        mean = prior.mean if is_shared else prior.mean[..., None, :]
-        parts.append((prior.name, mean, precision if is_shared else precision[..., None, :, :]))
-    for bias in problem.biases:
-        if bias.sigma is not None:
-            sigma = np.ravel(bias.sigma)
-            parts.append((bias.name, np.broadcast_to(np.ravel(bias.mean), sigma.shape), np.diag(sigma**-2.0)))
-    stations = problem.stations
-    if stations.covariance is not None and stations.span != "noise":
-        precision = _block_diagonal(linalg.inverse(stations.covariance)[0])
-        if stations.span == "epoch":
-            precision = precision[..., None, :, :]
-        parts.append(("stations", np.zeros(precision.shape[-1]), precision))
-    return parts
-
-
-def _block_diagonal(blocks: Array) -> Array:
-    s, d = blocks.shape[-3], blocks.shape[-1]
-    out = np.zeros((*blocks.shape[:-3], s, d, s, d))
-    index = np.arange(s)
-    out[..., index, :, index, :] = np.moveaxis(blocks, -3, 0)
-    return out.reshape(*blocks.shape[:-3], s * d, s * d)
-
-
 def marginal(equations: Normal) -> tuple[Array, Array, Array]:
     """Return information (..., n, n) and vector (..., n) of the shared unknowns with the local ones eliminated, and ok.
 
-    Schur complement epoch by epoch; `ok` (...) is False where an epoch's local block is singular.
+    Schur complement epoch by epoch. Of several epochs one may leave some of its own unknowns open: what it says about
+    the shared ones counts all the same. `ok` (...) is False where the only epoch does so.
     """
     if equations.local.shape[-1] == 0:
         return equations.shared, equations.shared_vector, np.ones(equations.cost.shape, dtype=bool)
     right = np.concatenate([np.swapaxes(equations.cross, -1, -2), equations.local_vector[..., None]], axis=-1)
-    solved, ok = linalg.solve(_measured(equations.local), right)
+    solved, ok = _solved(equations.local, right)
     lost = (equations.cross @ solved).sum(-3)
-    return equations.shared - lost[..., :-1], equations.shared_vector - lost[..., -1], np.asarray(ok.all(-1))
+    return equations.shared - lost[..., :-1], equations.shared_vector - lost[..., -1], ok
 
 
 def eliminated(equations: Normal) -> Normal:
@@ -197,16 +133,46 @@ def eliminated(equations: Normal) -> Normal:
     information, vector, _ = marginal(equations)
     cost = equations.cost
     if equations.local.shape[-1]:
-        rest, _ = linalg.solve(_measured(equations.local), equations.local_vector[..., None])
+        rest, _ = _solved(equations.local, equations.local_vector[..., None])
         cost = cost - (rest[..., 0] * equations.local_vector).sum((-1, -2))
     none = np.zeros((*cost.shape, 1, 0))
     return Normal(information, none[..., None], np.zeros((*cost.shape, 1, vector.shape[-1], 0)), vector, none, cost)
+
+
+def _solved(local: Array, right: Array) -> tuple[Array, Array]:
+    """Return solutions (..., k, l, p) of the local systems, of least norm where they are singular, and ok (...)."""
+    if local.shape[-3] == 1:
+        solved, good = linalg.solve(_measured(local), right)
+        return solved, np.asarray(good.all(-1))
+    solved, good = linalg.solve(local, right, _OPEN)
+    if not good.all():
+        root, _ = linalg.root(local[~good])
+        solved[~good] = root @ (np.swapaxes(root, -1, -2) @ np.broadcast_to(right, solved.shape)[~good])
+    return solved, np.ones(good.shape[:-1], dtype=bool)
 
 
 def _measured(local: Array) -> Array:
     """Return local blocks with a one for every unknown that no row touches: it stays where it is and hides no other."""
     dead = np.diagonal(local, axis1=-2, axis2=-1) == 0.0
     return local + dead[..., None] * np.eye(local.shape[-1]) if dead.any() else local
+
+
+def local_covariance(equations: Normal, shared: Array, size: int) -> Array:
+    """Return the covariance (..., k, size, size) of the first local unknowns of each epoch; NaN where they are open.
+
+    Parameters
+    ----------
+    equations : Normal
+        Normal equations at an answer.
+    shared : array (..., n, n)
+        Covariance of the shared unknowns there.
+    size : int
+        How many of the local unknowns are wanted.
+    """
+    inverse, good = linalg.inverse(equations.local, _OPEN)
+    gain = inverse @ np.swapaxes(equations.cross, -1, -2)
+    full = inverse + gain @ shared[..., None, :, :] @ np.swapaxes(gain, -1, -2)
+    return np.where(good[..., None, None], full, np.nan)[..., :size, :size]
 
 
 def step(equations: Normal, damping: Array, space: Tangent | None = None) -> tuple[Array, Array]:
@@ -234,9 +200,9 @@ def step(equations: Normal, damping: Array, space: Tangent | None = None) -> tup
     if damped.local.shape[-1] == 0:
         return shared, ok
     rest = damped.local_vector - (np.swapaxes(damped.cross, -1, -2) @ shared[..., None, :, None])[..., 0]
-    local, good = linalg.solve(_measured(damped.local), rest[..., None])
+    local, good = _solved(damped.local, rest[..., None])
     flat = local[..., 0].reshape(*local.shape[:-3], -1)
-    return np.concatenate([shared, flat], axis=-1), ok & good.all(-1)
+    return np.concatenate([shared, flat], axis=-1), ok & good
 
 
 def _damped(equations: Normal, damping: Array) -> Normal:

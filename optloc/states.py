@@ -81,9 +81,7 @@ def given(problem: Problem, plan: Plan) -> dict[int, Any]:
     """Return the inputs that are data, each (..., m): surveyed stations, their rates and axes, known targets."""
     block, model, stations = plan.block, plan.model, problem.stations
     inputs: dict[int, Any] = {}
-    for place, rate, axes, index in ((A, RATE_A, AXES_A, block.a), (B, RATE_B, AXES_B, block.b))[
-        : model.stations
-    ]:
+    for place, rate, axes, index in ((A, RATE_A, AXES_A, block.a), (B, RATE_B, AXES_B, block.b))[: model.stations]:
         inputs |= _at_rows(stations.position, 1, block, index, place)
         if model.velocity and stations.velocity is not None:
             inputs |= _at_rows(stations.velocity, 1, block, index, rate)

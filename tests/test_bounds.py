@@ -10,7 +10,7 @@ from optloc.bounds import crlb_course
 from optloc.constraints import height
 from optloc.frames import Frame
 from optloc.linear import linearise
-from optloc.normal import prior_parts
+from optloc.priors import prior_parts
 from optloc.observe import observability
 from optloc.papers.registration import scenario as scenes
 

@@ -227,6 +227,6 @@ def test_station_errors_at_one_point_weigh_like_noise():
 
 
 def normal_of(problem, x):
-    from optloc.normal import with_priors
+    from optloc.priors import with_priors
 
     return with_priors(problem, x, normal(linearise(problem, x), problem.epochs))

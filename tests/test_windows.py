@@ -11,7 +11,8 @@ from optloc import windows as stretches
 from optloc.equations import equations_at
 from optloc.errors import InvalidProblem
 from optloc.linear import linearise
-from optloc.normal import normal, with_priors
+from optloc.normal import normal
+from optloc.priors import with_priors
 from optloc.types import Motion
 from optloc.windows import cut, joined, windows
 

@@ -61,8 +61,8 @@ def _of_target(loaded: Loaded, fix: Fix, first: int | None, target: int, names: 
     columns = _labels(loaded, n, first, target, spread)
     position = position.reshape(n * count, d)
     covariance = np.full((n * count, d, d), np.nan)
-    if not spread and _estimated(fix, names[0]):
-        covariance = fix.covariance(names[0])
+    if _estimated(fix, names[0]) and (not spread or fix.local is not None):
+        covariance = fix.covariance(names[0]).reshape(n * count, d, d)
 
     def repeated(values: Array) -> Array:
         return np.repeat(values, count)
@@ -72,7 +72,8 @@ def _of_target(loaded: Loaded, fix: Fix, first: int | None, target: int, names: 
     columns |= _state(position, covariance)
     for name in names[1:] if _estimated(fix, names[0]) else ():
         letter = _RATES[name.partition("[")[0]]
-        sigma = np.full((n * count, d), np.nan) if spread else fix.sigma(name)
+        kept = not spread or fix.local is not None
+        sigma = fix.sigma(name).reshape(n * count, d) if kept else np.full((n * count, d), np.nan)
         for values, prefix in ((fix.take(name).reshape(n * count, d), letter), (sigma, f"sigma_{letter}")):
             columns |= {f"{prefix}{axis}": v for axis, v in zip("xyz", values.T, strict=False)}
     columns |= geodetic_columns(loaded.problem.frame, position, covariance)

@@ -11,6 +11,7 @@ from optloc.errors import InvalidProblem
 from optloc.fix import Fix
 from optloc.problem import Problem
 from optloc.solve.catalogue import FORMULATIONS, METHODS, SOLVERS, stages_of
+from optloc.solve.reasons import without_open_epochs
 from optloc.solve.stages import given
 from optloc.types import Array
 
@@ -37,9 +38,11 @@ def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
     Raises
     ------
     InvalidProblem
-        For an unknown method.
+        For an unknown method, or where nothing is unknown.
     """
     stages = stages_of(method)
+    if problem.layout.size == 0:
+        raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
     if separable(problem):
         problem = by_epoch(problem)
     shape, flat = problem.batch_shape, problem.flat()
@@ -49,6 +52,7 @@ def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
     for stage in stages:
         fix = stage.solver(flat, fix)
     assert fix is not None
+    fix = without_open_epochs(fix)
     return fix.reshape(shape) if shape != (len(fix),) else fix
 
 

@@ -15,7 +15,8 @@ from optloc.equations import equations_at
 from optloc.errors import InvalidProblem
 from optloc.fix import Fix, Stage
 from optloc.noise import whiten
-from optloc.normal import decrement, prior_parts, step
+from optloc.normal import decrement, step
+from optloc.priors import prior_parts
 from optloc.problem import Problem
 from optloc.solve.bounded import without_broken
 from optloc.solve.register import registrable

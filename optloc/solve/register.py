@@ -10,8 +10,8 @@ from formulations.registration import Course, candidates
 from optloc import linalg
 from optloc.epochs import by_epoch, untied
 from optloc.models import MODELS
-from optloc.normal import prior_parts
 from optloc.plan import elapsed, plans
+from optloc.priors import prior_parts
 from optloc.problem import Problem
 from optloc.solve.reduce import Ranges, ranges
 from optloc.solve.scale import spread_of

@@ -10,7 +10,8 @@ from optloc import linalg
 from optloc.equations import summed
 from optloc.errors import InvalidProblem
 from optloc.fix import Fix
-from optloc.normal import Normal, eliminated, with_priors
+from optloc.normal import Normal, eliminated
+from optloc.priors import with_priors
 from optloc.problem import Problem
 from optloc.solve.refine import refine
 from optloc.solve.stages import given, lsr

@@ -12,10 +12,11 @@ from optloc.equations import equations_at
 from optloc.normal import covariance
 from optloc.plan import elapsed
 from optloc.problem import Problem
+from optloc.solve.freedom import degrees_of_freedom
+from optloc.solve.reasons import DOUBT
 from optloc.solve.refine import refine
 from optloc.solve.scale import distance_of, spread_of
 from optloc.solve.start import completed, vectors
-from optloc.solve.verdict import DOUBT, degrees_of_freedom
 from optloc.status import Status
 from optloc.types import Array
 

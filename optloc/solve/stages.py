@@ -12,20 +12,23 @@ from optloc import linalg
 from optloc.constraints import exact
 from optloc.equations import equations_at
 from optloc.errors import InvalidProblem
-from optloc.fix import Alternatives, Fix, Stage, merged
+from optloc.fix import Alternatives, Fix, Stage
 from optloc.normal import Normal
 from optloc.problem import Problem
 from optloc.solve.angles import Bearings, angle_bounds, bearings, by_directions, instrumental, least_worst
 from optloc.solve.bounded import bounded
+from optloc.solve.freedom import degrees_of_freedom
 from optloc.solve.heights import height_starts
+from optloc.solve.merge import merged
 from optloc.solve.pieces import from_pieces, one_position
+from optloc.solve.reasons import DOUBT
 from optloc.solve.refine import refine
 from optloc.solve.register import closed_form, registrable, relaxed
 from optloc.solve.runs import run_starts
 from optloc.solve.search import PLACES, searched_starts
 from optloc.solve.squared import Pick, every, hull, minimum, shor
 from optloc.solve.start import along_the_valley, mirrored, squared_range_starts, static, subarray_starts, vectors
-from optloc.solve.verdict import DOUBT, Candidates, degrees_of_freedom, judge
+from optloc.solve.verdict import Candidates, judge
 from optloc.status import Certificate, Status
 from optloc.types import Array
 

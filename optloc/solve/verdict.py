@@ -7,35 +7,26 @@ from typing import Any
 
 import numpy as np
 
-from optloc.constraints import exact, violation_names
 from optloc.fix import Alternatives, Fix, Stage
-from optloc.models import MODELS
-from optloc.noise import whiten
-from optloc.observe import open_sentences
+from optloc.layout import state_names
+from optloc.normal import Normal, local_covariance
 from optloc.problem import Problem
-from optloc.solve.curvature import Curvature, curved, station_direction, weak_direction
-from optloc.solve.reduce import ranges
-from optloc.solve.scale import distance_of, spread_of
+from optloc.solve.curvature import Curvature, curved
+from optloc.solve.freedom import degrees_of_freedom
+from optloc.solve.reasons import AMBIGUOUS_GAP, FAR, FLAT, explain
+from optloc.solve.scale import distance_of
 from optloc.solve.sight import lowest
 from optloc.status import Certificate, Status
 from optloc.types import Array
-from optloc.windows import windows
 
-AMBIGUOUS_GAP = 9.0
 LISTED_GAP = 25.0
-DOUBT = 1e-3
 _SAME = 1e-2
-_EQUAL = 1e-3
-_WEAK = 1e-12
-# Spreads of the stations: from here on a fix must be a good one, and from there on every wave front is flat.
-_FAR, _FLAT = 1e4, 1e6
 
 _LOCAL = Certificate(
     "local",
     "a stationary point with a positive definite normal matrix; the best of all candidates refined",
     "refinement",
 )
-_UNKNOWN = Certificate("unknown", "there is no refined answer to prove anything about", "none")
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,8 +92,9 @@ def judge(problem: Problem, pool: Candidates, equations: Any, stages: tuple[Stag
         np.broadcast_to(problem.weight, (size, problem.count)),
         stages,
         curvature.active,
+        _local(problem, at, curvature.covariance),
     )
-    _explain(problem, fix, curvature)
+    explain(problem, fix, curvature)
     rivalled = endless & (fix.code == Status.OK)
     fix.code[rivalled], fix.reason[rivalled] = Status.AMBIGUOUS, "positions ever farther away explain the data as well"
     return fix
@@ -115,7 +107,7 @@ def _finite(problem: Problem, pool: Candidates) -> tuple[Candidates, Array]:
         return pool, none
     distance = distance_of(problem, problem.layout.take(pool.x, "position"))
     with np.errstate(invalid="ignore"):
-        remote = (distance > _FLAT) | ((distance > _FAR) & (pool.code != Status.OK))
+        remote = (distance > FLAT) | ((distance > FAR) & (pool.code != Status.OK))
     if not remote.any():
         return pool, none
     near = np.where(~remote & (pool.code == Status.OK), pool.cost, np.inf).min(1)
@@ -191,117 +183,15 @@ def _same(x: Array, y: Array, curvature: Curvature) -> Array:
     return np.asarray(equal | (squared < _SAME))
 
 
-def degrees_of_freedom(problem: Problem) -> Array:
-    """Return rows present (the rank of their noise) less unknowns without a prior, (N,)."""
-    rank: Any = np.zeros(problem.batch_shape, dtype=int)
-    heard: Any = 0
-    for _, _, part in windows(problem, len(problem.weight) if problem.weight.ndim > 1 else 1):
-        for whitener in whiten(part.noise, part.weight):
-            same = len(whitener.row) if whitener.matrix.shape[-3] == 1 else 1
-            rank = rank + same * (whitener.matrix != 0.0).any(-1).sum((-1, -2))
-        heard = heard + _heard(part)
-    known = (
-        {prior.name for prior in problem.priors}
-        | {b.name for b in problem.biases if b.sigma is not None}
-        | {"stations"}
-    )
-    layout = problem.layout
-    unknowns: Any = sum(slot.size for slot in layout.shared if slot.name not in known)
-    unknowns = unknowns + heard * sum(slot.size for slot in layout.local if slot.name not in known)
-    return np.broadcast_to(rank - unknowns + len(exact(problem)), problem.batch_shape).astype(np.int32)
-
-
-def _heard(problem: Problem) -> Array:
-    """Return the number of epochs with a row that is present, (...)."""
-    order = np.argsort(problem.epoch, kind="stable")
-    _, first = np.unique(problem.epoch[order], return_index=True)
-    return np.asarray(np.maximum.reduceat(problem.weight[..., order] > 0.0, first, axis=-1).sum(-1))
-
-
 def _fill(size: int, value: Any) -> Array:
     out = np.empty(size, dtype=object)
     out[:] = value
     return out
 
 
-def _explain(problem: Problem, fix: Fix, curvature: Curvature) -> None:
-    """Settle the status of every fix and say why; writes into the fresh arrays of `fix`."""
-    finite = np.isfinite(problem.z) | (problem.weight == 0.0)
-    broken = ~np.broadcast_to(finite.all(-1), fix.code.shape)
-    few = (fix.dof < 0) & ~broken
-    missing = ~np.isfinite(fix.cost) & ~broken & ~few
-    answered = ~(broken | few | missing)
-    weak = answered & ~(curvature.regular & (curvature.weakest >= _WEAK))
-    distance = distance_of(problem, _position(problem, fix))
-    with np.errstate(invalid="ignore"):
-        loose = np.trace(fix.cov, axis1=-2, axis2=-1) > (distance * spread_of(problem)[1]) ** 2
-        lost = weak | loose | (fix.code != Status.OK) | (fix.p_value < DOUBT)
-        far = answered & ((lost & (distance > _FAR)) | (distance > _FLAT))
-    weak &= ~far
-    fix.code[broken], fix.code[few], fix.code[far] = Status.REJECTED, Status.TOO_FEW_ROWS, Status.UNBOUNDED
-    fix.code[weak] = Status.SINGULAR_GEOMETRY
-    gap = np.min(fix.alternatives.gap, axis=1, initial=np.inf)
-    fix.code[(fix.code == Status.OK) & (gap < AMBIGUOUS_GAP)] = Status.AMBIGUOUS
-    doubtful = (fix.code == Status.OK) & (fix.p_value < DOUBT)
-    p_value = fix.p_value
-    for i in np.flatnonzero(doubtful):
-        fix.reason[i] = f"the residuals are larger than the noise allows (p = {p_value[i]:.1g})"
-    for i in np.flatnonzero(few):
-        lacking = -int(fix.dof[i])
-        some = "is 1 measurement" if lacking == 1 else f"are {lacking} measurements"
-        fix.reason[i] = f"there {some} fewer than unknowns"
-    for i in np.flatnonzero(answered & np.isin(fix.code, (Status.UNBOUNDED, Status.MAX_ITERATIONS, Status.STALLED))):
-        fix.reason[i] = f"the refinement stopped {distance[i]:.3g} spreads of the stations away"
-    for i in np.flatnonzero(weak):
-        fix.reason[i] = _open(problem, curvature.information[i])
-    for i in np.flatnonzero(fix.code == Status.AMBIGUOUS):
-        alike = gap[i] < _EQUAL
-        fix.reason[i] = "another position " + ("fits as well" if alike else f"costs only {gap[i]:.2g} more")
-        if problem.epochs > 1 and any(motion.order > 0 for motion in problem.motions):
-            fix.reason[i] += ": a bound on height, speed or place would decide"
-    barred = missing & (fix.code == Status.INFEASIBLE)
-    for i in np.flatnonzero(barred):
-        names = violation_names(problem)
-        fix.reason[i] = (
-            f"no minimum meets all of: {names}" if names else "the Earth hides every position from a satellite"
-        )
-    missing = missing & ~barred
-    if missing.any():
-        _explain_missing(problem, fix, np.flatnonzero(missing))
-    unsure = ~np.isin(fix.code, (Status.OK, Status.AMBIGUOUS))
-    fix.certificate[unsure] = _UNKNOWN
-    gone = broken | few | missing | barred | weak | far
-    fix.x[gone] = np.nan
-    fix.cov[gone] = np.nan
-
-
-def _open(problem: Problem, information: Array) -> str:
-    """Return what the data leave open: combinations of biases by name, else the direction of the position."""
-    named = open_sentences(problem.layout, information) if problem.biases and np.isfinite(information).all() else ()
-    return "; ".join(named) or weak_direction(problem, information)
-
-
-def _explain_missing(problem: Problem, fix: Fix, items: Array) -> None:
-    single = problem.epochs == 1 or problem.stations.position.shape[-3] == 1
-    found = ranges(problem.take(items)) if single else None
-    for place, i in enumerate(items):
-        groups = () if found is None else found.groups[int(found.pattern[place])]
-        if len(groups) > 1:
-            names = problem.stations.names
-            fix.code[i] = Status.DISCONNECTED
-            fix.reason[i] = "no row links " + " with ".join(
-                "{" + ", ".join(names[s] for s in sorted(set(group))) + "}" for group in groups
-            )
-        elif not any(MODELS[rows.kind].ranges or MODELS[rows.kind].lifted for rows in problem.rows):
-            fix.code[i] = Status.UNAVAILABLE
-            fix.reason[i] = "no closed form starts from " + " and ".join(rows.kind for rows in problem.rows)
-        else:
-            fix.code[i] = Status.SINGULAR_GEOMETRY
-            fix.reason[i] = station_direction(problem.take(np.array([i])))
-
-
-def _position(problem: Problem, fix: Fix) -> Array:
-    """Return the position (N, d) of the only target, or the centre of the stations where there is no such thing."""
-    if any(slot.name == "position" for slot in problem.layout.shared):
-        return fix.position
-    return np.broadcast_to(spread_of(problem)[0], (len(fix.x), problem.dimension))
+def _local(problem: Problem, equations: Normal, shared: Array) -> Array | None:
+    """Return the covariance of the states that targets have at each epoch of a run, or None where there are none."""
+    names = {name for i, m in enumerate(problem.motions) for name in state_names(i, len(problem.motions), m.order)}
+    size = sum(slot.size for slot in problem.layout.local if slot.name in names)
+    with np.errstate(all="ignore"):
+        return local_covariance(equations, shared, size) if size else None

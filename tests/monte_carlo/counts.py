@@ -1,0 +1,194 @@
+"""Counts of registration: many draws of one run, solved without a guess and, beside it, from the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from time import perf_counter
+from zlib import crc32
+
+import numpy as np
+from monte_carlo.layouts import SEED
+from runs import truth
+
+import optloc
+from optloc import Problem, Status
+from optloc.solve.refine import refine
+
+Array = np.ndarray
+SLACK = 1e-3
+"""A cost that exceeds that of the optimum next to the truth by more than this is a failure."""
+
+_CHUNK = 200
+_SAME = 1e-2
+
+
+@dataclass(frozen=True)
+class Case:
+    """A run and where its trials lie.
+
+    Parameters
+    ----------
+    name : str
+        Also decides the seed.
+    problem : Problem
+        Without measurements.
+    truths : callable, optional
+        ``(rng, trials) -> (trials, size)``; None: the truth of `runs`, in every trial.
+    spoil : callable, optional
+        ``(problem, rng) -> problem``: what happens to the rows after they were drawn.
+    answer : callable, optional
+        ``problem -> fix``; `optloc.solve` by default.
+    """
+
+    name: str
+    problem: Problem
+    truths: Callable[[np.random.Generator, int], Array] | None = None
+    spoil: Callable[[Problem, np.random.Generator], Problem] | None = None
+    answer: Callable[[Problem], optloc.Fix] = optloc.solve
+
+
+@dataclass(frozen=True)
+class Counts:
+    """What became of N trials.
+
+    Parameters
+    ----------
+    code : int array (N,)
+        Statuses.
+    failed : bool array (N,)
+        The answer costs more than the optimum that is reached from the truth, or is none.
+    away : bool array (N,)
+        The answer is not that optimum.
+    listed : bool array (N,)
+        The optimum is one of the alternatives.
+    gap : array (N,)
+        Cost of the best alternative less that of the answer.
+    error : array (N, n)
+        The answer or the alternative that is nearest to the truth, less the truth; shared unknowns.
+    nees : array (N, p)
+        Squared errors of the answer in units of its own covariance: of the target and of each family of biases.
+    start : array (N,)
+        Distance of the nearest start from the truth before the refinement on all epochs, metres; NaN if not asked for.
+    seconds : array (N,)
+        Time of one trial.
+    """
+
+    code: Array
+    failed: Array
+    away: Array
+    listed: Array
+    gap: Array
+    error: Array
+    nees: Array
+    start: Array
+    seconds: Array
+
+    def __len__(self) -> int:
+        return len(self.code)
+
+    @property
+    def rmse(self) -> float:
+        """Return the root mean square of the length of the position error, metres."""
+        return float(np.sqrt((self.error[:, :3] ** 2).sum(1).mean()))
+
+
+def counted(case: Case, trials: int, *, starts: bool = False) -> Counts:
+    """Return the counts of some trials of a case; the first ones are the same whatever their number."""
+    parts = []
+    for first in range(0, trials, _CHUNK):
+        seed = np.random.SeedSequence([SEED, crc32(case.name.encode()), first])
+        parts.append(_chunk(case, seed, min(_CHUNK, trials - first), starts))
+    return Counts(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Counts)))
+
+
+def drawn(case: Case, seed: np.random.SeedSequence, trials: int) -> tuple[Problem, Array]:
+    """Return trials of a case and their true vectors (trials, size)."""
+    draw, place, spoil = seed.spawn(3)
+    if case.truths is None:
+        x = np.tile(truth(case.problem), (trials, 1))
+    else:
+        x = case.truths(np.random.default_rng(place), trials)
+    problem = optloc.simulate(case.problem, x, draw)
+    return problem if case.spoil is None else case.spoil(problem, np.random.default_rng(spoil)), x
+
+
+def _chunk(case: Case, seed: np.random.SeedSequence, trials: int, starts: bool) -> Counts:
+    problem, x = drawn(case, seed, trials)
+    began = perf_counter()
+    fix = case.answer(problem)
+    seconds = perf_counter() - began
+    best = refine(problem, x)
+    n = problem.layout.n_shared
+    gap = np.min(fix.alternatives.gap, axis=1, initial=np.inf)
+    pool = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)[..., :n]
+    same = _alike(pool, best.x[:, None, :n], best.equations.shared)
+    return Counts(
+        fix.code,
+        ~(fix.answered & (fix.cost <= best.cost + SLACK)),
+        ~same[:, 0],
+        same[:, 1:].any(1),
+        gap,
+        _nearest(pool, x[:, :n]),
+        np.stack(_nees(fix, x), axis=1),
+        _start_error(problem, x) if starts else np.full(trials, np.nan),
+        np.full(trials, seconds / trials),
+    )
+
+
+def _alike(pool: Array, best: Array, information: Array) -> Array:
+    """Return which points (N, q) are the optimum, to a hundredth of a standard deviation in every direction."""
+    apart = pool - best
+    with np.errstate(invalid="ignore"):
+        return ((apart @ information) * apart).sum(-1) < _SAME**2
+
+
+def _nearest(pool: Array, x: Array) -> Array:
+    apart = pool - x[:, None]
+    distance = np.linalg.norm(apart[..., :3], axis=-1)
+    return apart[np.arange(len(x)), np.where(np.isfinite(distance), distance, np.inf).argmin(1)]
+
+
+def _nees(fix: optloc.Fix, x: Array) -> list[Array]:
+    """Return the squared errors (N,) of the target's state and of each family of biases."""
+    layout = fix.layout
+    states = [slot for slot in layout.shared if slot.name in ("position", "velocity")]
+    parts = [slice(0, states[-1].start + states[-1].size)]
+    parts += [slice(slot.start, slot.start + slot.size) for slot in layout.shared if slot not in states]
+    out = []
+    for part in parts:
+        error, cov = (fix.x - x)[:, part, None], fix.cov[:, part, part]
+        known = np.isfinite(cov).all((1, 2))
+        cov = np.where(known[:, None, None], cov, np.eye(cov.shape[-1]))
+        squared = (np.swapaxes(error, 1, 2) @ np.linalg.solve(cov, error))[:, 0, 0]
+        out.append(np.where(known, squared, np.nan))
+    return out
+
+
+def _start_error(problem: Problem, x: Array) -> Array:
+    fix = optloc.solve(problem, "roots")
+    pool = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)[..., : problem.layout.n_shared]
+    return np.linalg.norm(_nearest(pool, x[:, : pool.shape[-1]])[:, :3], axis=1)
+
+
+def expected(problem: Problem, x: Array) -> Array:
+    """Return the covariance of the error at a truth (n, n), to first order.
+
+    Without priors the Cramer-Rao bound. A prior takes the biases of the truth x for an unlikely draw and pulls towards
+    its own mean; the bound of a random draw is then not that of one truth.
+    """
+    cov = optloc.crlb(problem, x)
+    prior, pull = np.zeros_like(cov), np.zeros(len(cov))
+    for bias in problem.biases:
+        if bias.sigma is not None:
+            slot, _ = problem.layout.find(bias.name)
+            part = np.arange(slot.start, slot.start + slot.size)
+            prior[part, part] = 1.0 / bias.sigma.ravel() ** 2
+            pull[part] = prior[part, part] * (x[part] - bias.mean.ravel())
+    shift = cov @ pull
+    return cov - cov @ prior @ cov + np.outer(shift, shift)
+
+
+def ok(counts: Counts) -> bool:
+    """Return whether every trial is on the optimum next to the truth, and says ok."""
+    return not counts.failed.any() and not counts.away.any() and bool((counts.code == Status.OK).all())
