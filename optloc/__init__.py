@@ -13,6 +13,7 @@ from optloc.evaluate import predict
 from optloc.fix import Alternatives, Fix, Stage
 from optloc.frames import CARTESIAN, ECEF, Frame
 from optloc.layout import Layout
+from optloc.learnt import with_known_bias
 from optloc.linear import Linear, linearise
 from optloc.models import MODELS, Model
 from optloc.noise import Noise
@@ -74,6 +75,7 @@ __all__ = [
     "solve",
     "station_array",
     "with_bias",
+    "with_known_bias",
 ]
 
 

@@ -17,8 +17,18 @@ FIXED = np.array([200e3, 300e3, 0.0])
 MOVING = np.array([200e3, 300e3, 5e3, -100.0, 0.0, 0.0])
 
 
-def run(  # noqa: PLR0913
-    epochs, *, sigma=3.0, station=1.0, span="noise", order=0, prior=None, gain=None, places=PLACES, biased=True, step=1.0
+def run(
+    epochs,
+    *,
+    sigma=3.0,
+    station=1.0,
+    span="noise",
+    order=0,
+    prior=None,
+    gain=None,
+    places=PLACES,
+    biased=True,
+    step=1.0,
 ):
     """Return a run of range differences to the first station (and gain ratios), with a bias for each channel."""
     times = step * np.arange(epochs)

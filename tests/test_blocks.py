@@ -23,9 +23,7 @@ def test_blocks_are_equally_long_and_their_noise_is_averaged(epochs, blocks, len
     problem = averaged(run(epochs), 30)
     assert problem.epochs == blocks
     np.testing.assert_allclose(np.diff(problem.times), length)
-    np.testing.assert_allclose(
-        dense(problem.noise, np.arange(4)), 10.0 / length * (np.eye(4) + 1.0), rtol=1e-9
-    )
+    np.testing.assert_allclose(dense(problem.noise, np.arange(4)), 10.0 / length * (np.eye(4) + 1.0), rtol=1e-9)
 
 
 def test_averages_are_means_where_nothing_is_missing():

@@ -10,9 +10,9 @@ from optloc.bounds import crlb_course
 from optloc.constraints import height
 from optloc.frames import Frame
 from optloc.linear import linearise
-from optloc.priors import prior_parts
 from optloc.observe import observability
 from optloc.papers.registration import scenario as scenes
+from optloc.priors import prior_parts
 
 
 def posed(epochs, *, moving=True, prior=None, span="noise", station_sigma=1.0, scene=scenes.SPATIAL, gain=None):

@@ -13,7 +13,7 @@ FLOORS = {
     0: "types errors units frames status noise linalg ellipse",
     1: "models",
     2: "layout problem linear normal fix tables kernels states build check check_constraints check_unknowns arguments "
-    "epochs constraints tangent symbolic plan evaluate weigh windows equations blocks priors bias",
+    "epochs constraints tangent symbolic plan evaluate weigh windows equations blocks priors learnt bias",
     3: "solve bounds simulate observe",
     4: "track",
     5: "study papers scenario files",

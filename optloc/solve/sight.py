@@ -61,7 +61,7 @@ def _blocked(point: Array, station: Array, heard: Array) -> Array:
     """Return whether the line from point to station dips too deep; unit sphere coordinates."""
     limit = np.where((station**2).sum(-1) > _SATELLITE**2, _GRAZE, _GROUND)
     line = station - point
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
         share = np.clip(-(point * line).sum(-1) / (line**2).sum(-1), 0.0, 1.0)
         nearest = ((point + share[:, None] * line) ** 2).sum(-1)
     return np.asarray(heard & (share > 0.0) & (nearest < limit**2))

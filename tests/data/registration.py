@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from data.windows import quantiles, report
 
-from optloc import Fix, Noise, Problem, Status, predict, solve, with_bias
+from optloc import Fix, Noise, Problem, Status, predict, solve, with_bias, with_known_bias
 from optloc.noise import Block
 
 ROUNDS = 6
@@ -48,15 +48,11 @@ def learnt(problem: Problem, fix: Fix, name: str) -> dict[str, float]:
     return dict(zip(bias.members, fix.take(name).tolist(), strict=True))
 
 
-def corrected(problem: Problem, values: Mapping[str, float], *, form: str = "offset", **family: Any) -> Problem:
+def corrected(problem: Problem, values: Mapping[str, float], **family: Any) -> Problem:
     """Return the problem less biases of known value, by member; others are none. The family is as in `with_bias`."""
-    bias = with_bias(problem, "known", form=form, **family).biases[0]
-    of_member = np.array([values.get(member, 0.0) for member in bias.members])
-    amount = np.zeros(problem.count)
-    np.add.at(amount, bias.row, bias.coefficient * of_member[bias.member])
-    if form == "scale":
-        return problem.with_rows(z=problem.z - problem.observed * amount / (1.0 + amount))
-    return problem.with_rows(z=problem.z - amount)
+    biased = with_bias(problem, "known", **family)
+    own = set(biased.biases[-1].members)
+    return with_known_bias(biased, "known", {name: value for name, value in values.items() if name in own})
 
 
 def plausible(problem: Problem, least: float = 0.01) -> np.ndarray:

@@ -1,5 +1,7 @@
 """Registration in closed form: exact without noise, near the bound with it, both branches where there are two."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from runs import DELAYS, FIXED, MOVING, PLACES, SPATIAL, SPEEDS
@@ -45,7 +47,7 @@ def nearest(found, span, state):
 def test_exact_without_noise(epochs, places):
     problem, span = course(epochs, places=places)
     state, bias = candidates(problem)
-    point, error = nearest(state, span, FIXED)
+    _, error = nearest(state, span, FIXED)
     assert error < 1.0
     assert np.abs(bias[0] * UNIT - DELAYS).max() < 0.1
 
@@ -80,13 +82,17 @@ def test_a_plane_of_stations_gives_both_branches_of_a_moving_target():
 
 def test_the_plane_case_works_in_two_dimensions():
     places = 1e3 * np.array([[0.0, 0.0], [-12.0, 5.0], [15.0, -3.0], [4.0, 20.0]])
-    speeds, span, target = np.array([[120.0, 30.0], [100.0, -20.0], [90.0, 60.0], [110.0, 0.0]]), 300.0, np.array([80e3, 60e3])
+    speeds = np.array([[120.0, 30.0], [100.0, -20.0], [90.0, 60.0], [110.0, 0.0]])
+    span, target = 300.0, np.array([80e3, 60e3])
     time = np.linspace(0.0, span, 25)
     station = places + speeds * time[:, None, None]
     ranges = np.linalg.norm(target - station, axis=-1)
     offset = (ranges[:, 1:] - ranges[:, :1] + np.array([20.0, -10.0, 5.0]))[None]
     eye = np.broadcast_to(np.eye(3), (1, 25, 3, 3))
-    problem = Course(time / span, station[None] / UNIT, offset / UNIT, np.ones(3), eye, eye[:, :1] * UNIT, np.zeros(3), np.full(3, np.inf))
+    free = np.full(3, np.inf)
+    problem = Course(
+        time / span, station[None] / UNIT, offset / UNIT, np.ones(3), eye, eye[:, :1] * UNIT, np.zeros(3), free
+    )
     state, bias = candidates(problem)
     assert np.nanmin(np.linalg.norm(state[0, :, 0] * UNIT - target, axis=-1)) < 5.0
     np.testing.assert_allclose(bias[0] * UNIT, [20.0, -10.0, 5.0], atol=0.05)
@@ -96,7 +102,7 @@ def test_a_prior_of_the_biases_steadies_short_records():
     loose, tight = [], []
     for seed in range(20):
         for prior, errors in ((np.inf, loose), (100.0, tight)):
-            problem, span = course(30, sigma=1.5, noise=1.5, seed=seed, span=60.0, prior=prior)
+            problem, _ = course(30, sigma=1.5, noise=1.5, seed=seed, span=60.0, prior=prior)
             best = candidates(problem)[0][0, 0, 0] * UNIT
             errors.append(np.linalg.norm(best - FIXED))
     assert np.median(tight) < 0.5 * np.median(loose)
@@ -114,7 +120,7 @@ def test_silent_stations_do_not_matter():
         whiten[0, k] = 0.0
         whiten[0, k][np.ix_(heard, heard)] = np.linalg.inv(np.linalg.cholesky(covariance))
         offset[0, k, i] = 7.0
-    patchy = Course(problem.time, problem.station, offset, problem.sign, problem.bias, whiten, problem.mean, problem.sigma)
+    patchy = replace(problem, offset=offset, whiten=whiten)
     assert nearest(candidates(patchy)[0], span, FIXED)[1] < 1.0
 
 
@@ -122,7 +128,7 @@ def test_numbers_that_are_not_finite_spoil_only_their_own_item():
     one, span = course(30)
     offset = np.concatenate([one.offset, one.offset])
     offset[1, 3, 2] = np.nan
-    both = Course(one.time, one.station, offset, one.sign, one.bias, one.whiten, one.mean, one.sigma)
+    both = replace(one, offset=offset)
     state, _ = candidates(both)
     assert nearest(state[:1], span, FIXED)[1] < 1.0
     assert np.isnan(state[1]).all(-1).all(-1).any()
@@ -130,5 +136,5 @@ def test_numbers_that_are_not_finite_spoil_only_their_own_item():
 
 def test_without_biases():
     one, span = course(30, bias=0.0 * DELAYS)
-    none = Course(one.time, one.station, one.offset, one.sign, np.zeros((1, 30, 4, 0)), one.whiten, np.zeros(0), np.zeros(0))
+    none = replace(one, bias=np.zeros((1, 30, 4, 0)), mean=np.zeros(0), sigma=np.zeros(0))
     assert nearest(candidates(none)[0], span, FIXED)[1] < 1.0

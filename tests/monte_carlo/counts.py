@@ -21,6 +21,7 @@ SLACK = 1e-3
 
 _CHUNK = 200
 _SAME = 1e-2
+_PATIENCE = 300  # valleys of weak runs are long and curved
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ def _chunk(case: Case, seed: np.random.SeedSequence, trials: int, starts: bool) 
     began = perf_counter()
     fix = case.answer(problem)
     seconds = perf_counter() - began
-    best = refine(problem, x)
+    best = refine(problem, x, limit=_PATIENCE)
     n = problem.layout.n_shared
     gap = np.min(fix.alternatives.gap, axis=1, initial=np.inf)
     pool = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)[..., :n]
