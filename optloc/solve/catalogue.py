@@ -150,6 +150,20 @@ FORMULATIONS: dict[str, Formulation] = {
         "50 us",
         "Skolnik 1961",
     ),
+    "registration": Formulation(
+        "place, course and biases of a run: reference ranges projected out, then tied to the lifted course",
+        "tdoa, toa, range_sum of moving stations or a moving target",
+        "exact without noise; with noise a start near the bound",
+        "0.3 ms",
+        "Chan, Ho 1994; Beck, Stoica, Li 2008",
+    ),
+    "registration_sdp": Formulation(
+        "the same lifted with its reference ranges; price on the trace, prior on the biases",
+        "tdoa, toa of moving stations",
+        "never tight: a start",
+        "1 s",
+        "Shor 1987",
+    ),
     "lifted": Formulation(
         "order-1 lift [1, x, r]: a baseline for studies, never a default",
         "tdoa, range",

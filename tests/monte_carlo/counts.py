@@ -12,7 +12,7 @@ from monte_carlo.layouts import SEED
 from runs import truth
 
 import optloc
-from optloc import Problem, Status
+from optloc import Problem
 from optloc.solve.refine import refine
 
 Array = np.ndarray
@@ -38,15 +38,12 @@ class Case:
         ``(rng, trials) -> (trials, size)``; None: the truth of `runs`, in every trial.
     spoil : callable, optional
         ``(problem, rng) -> problem``: what happens to the rows after they were drawn.
-    answer : callable, optional
-        ``problem -> fix``; `optloc.solve` by default.
     """
 
     name: str
     problem: Problem
     truths: Callable[[np.random.Generator, int], Array] | None = None
     spoil: Callable[[Problem, np.random.Generator], Problem] | None = None
-    answer: Callable[[Problem], optloc.Fix] = optloc.solve
 
 
 @dataclass(frozen=True)
@@ -99,7 +96,7 @@ def counted(case: Case, trials: int, *, starts: bool = False) -> Counts:
     parts = []
     for first in range(0, trials, _CHUNK):
         seed = np.random.SeedSequence([SEED, crc32(case.name.encode()), first])
-        parts.append(_chunk(case, seed, min(_CHUNK, trials - first), starts))
+        parts.append(judged(*drawn(case, seed, min(_CHUNK, trials - first)), starts=starts))
     return Counts(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(Counts)))
 
 
@@ -114,27 +111,32 @@ def drawn(case: Case, seed: np.random.SeedSequence, trials: int) -> tuple[Proble
     return problem if case.spoil is None else case.spoil(problem, np.random.default_rng(spoil)), x
 
 
-def _chunk(case: Case, seed: np.random.SeedSequence, trials: int, starts: bool) -> Counts:
-    problem, x = drawn(case, seed, trials)
+def judged(problem: Problem, x: Array, *, starts: bool = False) -> Counts:
+    """Return the counts of drawn trials with true vectors (N, size)."""
     began = perf_counter()
-    fix = case.answer(problem)
+    fix = optloc.solve(problem)
     seconds = perf_counter() - began
     best = refine(problem, x, limit=_PATIENCE)
     n = problem.layout.n_shared
-    gap = np.min(fix.alternatives.gap, axis=1, initial=np.inf)
-    pool = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)[..., :n]
+    pool = _pool(fix, n)
     same = _alike(pool, best.x[:, None, :n], best.equations.shared)
     return Counts(
         fix.code,
         ~(fix.answered & (fix.cost <= best.cost + SLACK)),
         ~same[:, 0],
         same[:, 1:].any(1),
-        gap,
+        np.min(fix.alternatives.gap, axis=1, initial=np.inf),
         _nearest(pool, x[:, :n]),
         np.stack(_nees(fix, x), axis=1),
-        _start_error(problem, x) if starts else np.full(trials, np.nan),
-        np.full(trials, seconds / trials),
+        np.linalg.norm(_nearest(_pool(optloc.solve(problem, "roots"), n), x[:, :n])[:, :3], axis=1)
+        if starts
+        else np.full(len(x), np.nan),
+        np.full(len(x), seconds / len(x)),
     )
+
+
+def _pool(fix: optloc.Fix, n: int) -> Array:
+    return np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)[..., :n]
 
 
 def _alike(pool: Array, best: Array, information: Array) -> Array:
@@ -166,12 +168,6 @@ def _nees(fix: optloc.Fix, x: Array) -> list[Array]:
     return out
 
 
-def _start_error(problem: Problem, x: Array) -> Array:
-    fix = optloc.solve(problem, "roots")
-    pool = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)[..., : problem.layout.n_shared]
-    return np.linalg.norm(_nearest(pool, x[:, : pool.shape[-1]])[:, :3], axis=1)
-
-
 def expected(problem: Problem, x: Array) -> Array:
     """Return the covariance of the error at a truth (n, n), to first order.
 
@@ -190,6 +186,8 @@ def expected(problem: Problem, x: Array) -> Array:
     return cov - cov @ prior @ cov + np.outer(shift, shift)
 
 
-def ok(counts: Counts) -> bool:
-    """Return whether every trial is on the optimum next to the truth, and says ok."""
-    return not counts.failed.any() and not counts.away.any() and bool((counts.code == Status.OK).all())
+def around(rng: np.random.Generator, trials: int) -> Array:
+    """Return targets 50 to 600 km away in all directions, with biases within 60 m, (trials, 7)."""
+    angle, radius = rng.uniform(0.0, 2.0 * np.pi, trials), rng.uniform(50e3, 600e3, trials)
+    biases = rng.uniform(-60.0, 60.0, (trials, 4))
+    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), 0.0 * angle, biases])
