@@ -11,7 +11,7 @@ import optloc
 from optloc.blocks import averaged
 from optloc.solve.register import closed_form, relaxed
 
-SEED, TRIALS = 41, 40
+SEED, TRIALS = 41, 12
 CASES = {
     "600 epochs, 3 m": run(600),
     "600 epochs, 12 m": run(600, sigma=12.0),

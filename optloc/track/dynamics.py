@@ -1,0 +1,158 @@
+"""How a target moves from one scan to the next: transition, process noise and drive of a state [p, v, a]."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from math import factorial
+
+import numpy as np
+
+from optloc.errors import InvalidProblem
+from optloc.types import Array
+
+Step = Callable[[float, Array, int], tuple[Array, Array, Array]]
+"""Maps seconds, means (..., n) and dimension d to F (n, n), Q (..., n, n) and the drive (..., n) that is added."""
+
+# Accelerations nearer to the limit of the current statistical model than this share of it, or beyond, count as here.
+_CLAMP = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Dynamics:
+    """A model of motion.
+
+    Parameters
+    ----------
+    name : str
+        For reports.
+    order : 0, 1 or 2
+        Whether the state holds position; position and velocity; or position, velocity and acceleration.
+    step : callable
+        See `Step`.
+    """
+
+    name: str
+    order: int
+    step: Step
+
+
+def polynomial(order: int, noise: float = 0.0) -> Dynamics:
+    """Return a static target (order 0), constant velocity (1) or constant acceleration (2), driven by white noise.
+
+    Parameters
+    ----------
+    order : 0, 1 or 2
+        Order of the polynomial.
+    noise : float
+        Standard deviation of the next derivative, constant between scans: of the velocity of a static target, the
+        acceleration of constant velocity, the jerk of constant acceleration (SI units).
+
+    References
+    ----------
+    Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), 6.3.2.
+    """
+    if order not in (0, 1, 2):
+        raise InvalidProblem(f"a motion of order {order}", "order", "use 0, 1 or 2")
+    if not (np.isfinite(noise) and noise >= 0.0):
+        raise InvalidProblem(f"process noise of {noise}", "noise", "give a standard deviation of at least 0")
+
+    def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
+        powers = np.array([dt**j / factorial(j) for j in range(order + 2)])
+        F = sum(powers[j] * np.eye(order + 1, k=j) for j in range(order + 1))
+        drive = noise * powers[order + 1 : 0 : -1]
+        return *_blocked(np.asarray(F), np.outer(drive, drive), d), np.zeros(mean.shape)
+
+    return Dynamics(("static", "constant velocity", "constant acceleration")[order], order, step)
+
+
+def singer(time_constant: float, deviation: float) -> Dynamics:
+    """Return Singer's model: an acceleration that is exponentially correlated in time.
+
+    Parameters
+    ----------
+    time_constant : float
+        Seconds after which the correlation has fallen to 1/e.
+    deviation : float
+        Standard deviation of the acceleration, m/s^2.
+
+    References
+    ----------
+    R. A. Singer, "Estimating optimal tracking filter performance for manned maneuvering targets", IEEE Trans. Aerosp.
+    Electron. Syst. 6 (1970), eq. 8 and 10.
+    """
+    alpha = 1.0 / _positive(time_constant, "time_constant")
+
+    def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
+        F, Q, _ = correlated(alpha, dt)
+        return *_blocked(F, deviation**2 * Q, d), np.zeros(mean.shape)
+
+    return Dynamics("Singer", 2, step)
+
+
+def current_statistical(time_constant: float, limit: float, floor: float = 0.0) -> Dynamics:
+    """Return the current statistical model: Singer's about the present acceleration, with a variance that adapts.
+
+    The prediction of the mean is that of constant acceleration; time constant and limit act through the covariance.
+
+    Parameters
+    ----------
+    time_constant : float
+        Seconds.
+    limit : float
+        Largest acceleration of an axis, m/s^2; three or four times what is expected. Estimates near or beyond it count
+        as 5 % away from it, where the rule as published lets the variance vanish or grow without bound.
+    floor : float
+        Least standard deviation of the acceleration, m/s^2.
+
+    References
+    ----------
+    H. Zhou, K. S. P. Kumar, "A current statistical model and adaptive algorithm for estimating maneuvering targets",
+    J. Guidance 7 (1984), eq. 8 and 15.
+    """
+    alpha = 1.0 / _positive(time_constant, "time_constant")
+    _positive(limit, "limit")
+
+    def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
+        F, Q, u = correlated(alpha, dt)
+        present = mean[..., 2 * d :]
+        gap = np.maximum(limit - np.abs(present), _CLAMP * limit)
+        variance = np.maximum((4.0 - np.pi) / np.pi * gap**2, floor**2)
+        noise = np.einsum("ij,...c,cb->...icjb", Q, variance, np.eye(d))
+        drive = (u[:, None] * present[..., None, :]).reshape(mean.shape)
+        return np.kron(F, np.eye(d)), noise.reshape(*mean.shape, mean.shape[-1]), drive
+
+    return Dynamics("current statistical", 2, step)
+
+
+@lru_cache(maxsize=256)
+def correlated(alpha: float, dt: float) -> tuple[Array, Array, Array]:
+    """Return F (3, 3), Q (3, 3) for unit variance and U (3,) of an exponentially correlated acceleration of one axis.
+
+    Q is taken from the exponential of a block matrix: its closed form loses all digits where ``alpha * dt`` is small.
+
+    References
+    ----------
+    C. F. Van Loan, "Computing integrals involving the matrix exponential", IEEE Trans. Autom. Control 23 (1978).
+    """
+    from scipy.linalg import expm
+
+    A = np.diag([1.0, 1.0], k=1)
+    A[2, 2] = -alpha
+    noise = np.diag([0.0, 0.0, 2.0 * alpha])
+    exponential = expm(np.block([[-A, noise], [np.zeros((3, 3)), A.T]]) * dt)
+    F = exponential[3:, 3:].T
+    Q = F @ exponential[:3, 3:]
+    return F, 0.5 * (Q + Q.T), np.array([0.5 * dt**2, dt, 1.0]) - F[:, 2]
+
+
+def _blocked(F: Array, Q: Array, d: int) -> tuple[Array, Array]:
+    """Return F and Q of one axis for a state [p, v, a] of d axes."""
+    return np.kron(F, np.eye(d)), np.kron(Q, np.eye(d))
+
+
+def _positive(value: float, name: str) -> float:
+    if not (np.isfinite(value) and value > 0.0):
+        raise InvalidProblem(f"{name} is {value}", name, "give a positive number")
+    return float(value)

@@ -1,0 +1,116 @@
+"""Initial states: a fix of one epoch, or of as many as it takes to see a velocity."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from optloc.errors import InvalidProblem, NoSolution
+from optloc.fix import Fix
+from optloc.problem import Problem
+from optloc.solve import solve
+from optloc.status import Status
+from optloc.track.dynamics import Dynamics
+from optloc.track.track import State, check_trackable
+from optloc.types import Motion, Prior
+from optloc.windows import cut
+
+
+def begun(
+    problem: Problem,
+    dynamics: Dynamics,
+    *,
+    epochs: int | None = None,
+    speed: float | None = None,
+    rate: float | None = None,
+) -> State:
+    """Return the initial state of a run's target, without a guess.
+
+    The first epochs are solved as one problem of the order of the dynamics: as many as it takes until position,
+    velocity and acceleration are determined. With prior standard deviations the first epoch alone may do.
+
+    Parameters
+    ----------
+    problem : Problem
+        A single run.
+    dynamics : Dynamics
+        Gives the order of the state.
+    epochs : int, optional
+        Number of epochs to start from; None: the fewest that determine the state.
+    speed, rate : float, optional
+        Prior standard deviation of each coordinate of velocity (m/s) and acceleration (m/s^2), about zero.
+
+    Returns
+    -------
+    State
+        At the time of the last epoch used.
+
+    Raises
+    ------
+    InvalidProblem
+        Where the run is not one target's.
+    NoSolution
+        Where no number of epochs determines the state; it carries the last fix.
+    """
+    check_trackable(problem)
+    order = dynamics.order
+    fix, used = None, 0
+    for used in [epochs] if epochs is not None else _counts(problem.epochs, order, speed, rate):
+        fix = solve(_first(problem, used, order, speed, rate))
+        if fix.status in (Status.OK, Status.AMBIGUOUS):
+            return _state(problem, fix, used)
+    if fix is None:
+        raise InvalidProblem("there are no epochs", "start", "give a run of at least one scan")
+    raise NoSolution(problem, fix)
+
+
+def two_point(first: Fix, second: Fix, times: tuple[float, float]) -> State:
+    """Return the state at the second of two fixes, with velocity and the covariance between both.
+
+    Parameters
+    ----------
+    first, second : Fix
+        Fixes (...) of static positions with independent errors.
+    times : tuple of two float
+        Seconds.
+
+    References
+    ----------
+    Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), eq.
+    5.5.3-4, with the covariance of each fix.
+    """
+    T = times[1] - times[0]
+    one, two = first.covariance(), second.covariance()
+    mean = np.concatenate([second.position, (second.position - first.position) / T], axis=-1)
+    upper = np.concatenate([two, two / T], axis=-1)
+    lower = np.concatenate([two / T, (one + two) / T**2], axis=-1)
+    return State(times[1], mean, np.concatenate([upper, lower], axis=-2))
+
+
+def _counts(epochs: int, order: int, speed: float | None, rate: float | None) -> list[int]:
+    """Return the numbers of epochs to try: each next by half more."""
+    known = speed is not None and (order < 2 or rate is not None)
+    count = 1 if order == 0 or known else order + 1
+    out = []
+    while count < epochs:
+        out.append(count)
+        count = max(count + 1, count * 3 // 2)
+    return [*out, epochs]
+
+
+def _first(problem: Problem, count: int, order: int, speed: float | None, rate: float | None) -> Problem:
+    part = cut(problem, 0, count)
+    d = problem.dimension
+    priors = [
+        Prior(name, np.zeros(d), sigma**2 * np.eye(d))
+        for name, sigma in (("velocity", speed), ("acceleration", rate))[:order]
+        if sigma is not None
+    ]
+    motion = Motion(order, reference=float(problem.times[count - 1]))
+    return replace(part, motions=(motion,), priors=tuple(priors))
+
+
+def _state(problem: Problem, fix: Fix, used: int) -> State:
+    mean, cov = fix.gaussian()
+    return State(float(problem.times[used - 1]), np.array(mean), np.array(cov))

@@ -1,0 +1,251 @@
+"""Fixes in time: predict, update, scan by scan."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optloc.errors import InvalidProblem, nearest
+from optloc.problem import Problem
+from optloc.status import Status
+from optloc.track.dynamics import Dynamics
+from optloc.track.updates import UPDATES, Update, Updated
+from optloc.types import Array, Motion
+from optloc.windows import cut
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """Where a target is believed to be.
+
+    Parameters
+    ----------
+    time : float
+        Seconds.
+    mean : array (..., n)
+        State [p, v, a].
+    cov : array (..., n, n)
+        Covariance.
+    """
+
+    time: float
+    mean: Array
+    cov: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Track:
+    """A target over time; a batch of targets has leading axes.
+
+    Parameters
+    ----------
+    times : array (k,)
+        Seconds of the scans.
+    mean : array (..., k, n)
+        State after each scan.
+    cov : array (..., k, n, n)
+        Covariance.
+    nis : array (..., k)
+        Normalised innovation squared; NaN where no row was used.
+    count : int array (..., k)
+        Rows used.
+    loglikelihood : array (..., k)
+        Of each scan given the prediction.
+    code : int array (..., k)
+        `Status` of each scan: ok; too few rows where none was valid and the state was only predicted; rejected where
+        rows did not pass the gate or are not finite; numerical where the state is lost.
+    dimension : int
+        2 or 3.
+    """
+
+    times: Array
+    mean: Array
+    cov: Array
+    nis: Array
+    count: Array
+    loglikelihood: Array
+    code: Array
+    dimension: int
+
+    @property
+    def position(self) -> Array:
+        """Return the positions (..., k, d), metres."""
+        return self.mean[..., : self.dimension]
+
+    @property
+    def velocity(self) -> Array:
+        """Return the velocities (..., k, d), metres per second; raise InvalidProblem for a static target."""
+        if self.mean.shape[-1] < 2 * self.dimension:
+            raise InvalidProblem("the state has no velocity", "velocity", "track with a moving model")
+        return self.mean[..., self.dimension : 2 * self.dimension]
+
+    @property
+    def last(self) -> State:
+        """Return the state after the last scan."""
+        return State(float(self.times[-1]), self.mean[..., -1, :], self.cov[..., -1, :, :])
+
+
+def predicted(state: State, dynamics: Dynamics, time: float, dimension: int) -> State:
+    """Return a state at a later time.
+
+    Parameters
+    ----------
+    state : State
+        Its order is that of the dynamics.
+    dynamics : Dynamics
+        Model of motion.
+    time : float
+        Seconds, not before the state's.
+    dimension : int
+        2 or 3.
+    """
+    dt = time - state.time
+    if dt < 0.0:
+        raise InvalidProblem(f"the scan at {time} s is before the state at {state.time} s", "times", "sort the scans")
+    if dt == 0.0:
+        return state
+    F, Q, drive = dynamics.step(dt, state.mean, dimension)
+    cov = F @ state.cov @ F.T + Q
+    return State(time, (F @ state.mean[..., None])[..., 0] + drive, 0.5 * (cov + np.swapaxes(cov, -1, -2)))
+
+
+def scans(problem: Problem, order: int) -> Iterator[tuple[float, Problem]]:
+    """Yield the times and the scans of a run: problems of one epoch whose only unknown is a state at that time.
+
+    Parameters
+    ----------
+    problem : Problem
+        A run of one target without biases; what it says of the motion does not matter. Rows of arrival times are
+        taken as differences.
+    order : int
+        Order of the state.
+    """
+    check_trackable(problem)
+    for k in range(problem.epochs):
+        part = np.flatnonzero(problem.epoch == k)
+        if not len(part):
+            yield float(problem.times[k]), replace(problem, rows=())
+            continue
+        scan = cut(replace(problem, motions=(Motion(order),)), k, k + 1)
+        yield float(problem.times[k]), replace(scan, motions=(Motion(order, reference=float(problem.times[k])),))
+
+
+def check_trackable(problem: Problem) -> None:
+    """Refuse runs that a tracker of one target cannot take; raise InvalidProblem that says what to do."""
+    if len(problem.motions) > 1:
+        raise InvalidProblem("there are several targets", "track", "track them one by one")
+    if problem.biases:
+        advice = "learn it first, then `with_known_bias`"
+        raise InvalidProblem(f"the bias {problem.biases[0].name!r} is unknown", "track", advice)
+    if problem.emitting:
+        raise InvalidProblem("emission times are unknown", "track", "use differences: `optloc.reduce` makes them")
+    if problem.stations.covariance is not None and problem.stations.span != "noise":
+        raise InvalidProblem("station offsets are unknown", "stations", 'give their errors span = "noise"')
+
+
+def followed(problem: Problem, start: State, dynamics: Dynamics, update: Update | str = "iekf") -> Track:
+    """Return the track of a target from a state on.
+
+    Parameters
+    ----------
+    problem : Problem
+        Batch (...) of runs, see `scans`; scans not later than the start are left out.
+    start : State
+        At or before the first scan used.
+    dynamics : Dynamics
+        Model of motion.
+    update : callable or str
+        A filter, or its name in `UPDATES`.
+
+    Raises
+    ------
+    InvalidProblem
+        For an unknown filter, a state that does not fit the dynamics, or a run that is not one target's.
+    """
+    rule = filter_of(update)
+    d, n = problem.dimension, (dynamics.order + 1) * problem.dimension
+    check_state(start, n)
+    state, steps, times = start, [], []
+    for time, scan in scans(problem, dynamics.order):
+        if time <= start.time:
+            continue
+        ahead = predicted(state, dynamics, time, d)
+        done, code = taken(scan, ahead, rule)
+        state = State(time, done.mean, done.cov)
+        steps.append((done, code))
+        times.append(time)
+    return gathered(np.array(times), steps, d)
+
+
+def taken(scan: Problem, ahead: State, rule: Update) -> tuple[Updated, Array]:
+    """Return the update of a predicted state by a scan, and its status (...): bad scans leave the prediction."""
+    shape = ahead.mean.shape[:-1]
+    if not scan.rows or not scan.count:
+        return unchanged(ahead), np.full(shape, int(Status.TOO_FEW_ROWS), dtype=np.int8)
+    weight = np.broadcast_to(scan.weight, np.broadcast_shapes((*shape, scan.count), scan.z.shape))
+    broken = ~np.isfinite(scan.z) & (weight > 0.0)
+    usable = scan if not broken.any() else scan.with_rows(z=np.where(broken, 0.0, scan.z), weight=weight * ~broken)
+    with np.errstate(all="ignore"):
+        done = rule(usable, ahead.mean, ahead.cov)
+    lost = ~(np.isfinite(done.mean).all(-1) & np.isfinite(done.cov).all((-1, -2)))
+    silent = done.count == 0
+    code = np.where(lost, Status.NUMERICAL, np.where(silent, Status.TOO_FEW_ROWS, Status.OK))
+    code = np.where(broken.any(-1) & ~lost, Status.REJECTED, code).astype(np.int8)
+    kept = lost | silent
+    mean = np.where(kept[..., None], ahead.mean, done.mean)
+    cov = np.where(kept[..., None, None], ahead.cov, done.cov)
+    return Updated(
+        mean, cov, np.where(kept, np.nan, done.nis), np.where(kept, 0.0, done.loglikelihood), done.count
+    ), code
+
+
+def unchanged(ahead: State) -> Updated:
+    """Return the prediction as an update by nothing."""
+    shape = ahead.mean.shape[:-1]
+    none = np.zeros(shape)
+    return Updated(ahead.mean, ahead.cov, np.full(shape, np.nan), none, none)
+
+
+def gathered(times: Array, steps: list[tuple[Updated, Array]], dimension: int) -> Track:
+    """Return updates and their status, scan by scan, as a track."""
+    if not steps:
+        raise InvalidProblem("no scan is later than the start", "start", "start before the last scan")
+
+    def stacked(name: str, core: int) -> Array:
+        return np.stack([getattr(done, name) for done, _ in steps], axis=-1 - core)
+
+    return Track(
+        times,
+        stacked("mean", 1),
+        stacked("cov", 2),
+        stacked("nis", 0),
+        stacked("count", 0).astype(int),
+        stacked("loglikelihood", 0),
+        np.stack([code for _, code in steps], axis=-1),
+        dimension,
+    )
+
+
+def filter_of(update: Update | str) -> Update:
+    """Return a filter by name; raise InvalidProblem for an unknown one."""
+    if not isinstance(update, str):
+        return update
+    if update not in UPDATES:
+        raise InvalidProblem(f"unknown filter {update!r}", "filter", nearest(update, list(UPDATES)))
+    return UPDATES[update]
+
+
+def check_state(state: State, n: int) -> None:
+    """Refuse states of the wrong size, or whose covariance is none; raise InvalidProblem."""
+    if state.mean.shape[-1:] != (n,) or state.cov.shape[-2:] != (n, n):
+        raise InvalidProblem(
+            f"a state of {state.mean.shape[-1]} numbers and a covariance of {state.cov.shape[-2:]} for {n} unknowns",
+            "start",
+            "give position, velocity and acceleration as the dynamics have them",
+        )
+    if not (np.isfinite(state.mean).all() and np.isfinite(state.cov).all()):
+        raise InvalidProblem("the state is not finite", "start", "start from a fix that has an answer")
+    if (np.linalg.eigvalsh(state.cov)[..., 0] < -1e-9 * np.abs(state.cov).max((-1, -2))).any():
+        raise InvalidProblem("the covariance is not positive semidefinite", "start", "give a true covariance")
