@@ -58,13 +58,13 @@ def fix_file(loaded: Loaded, method: str, quiet: bool) -> Fixed:
     from optloc.solve import solve
 
     if not separable(loaded.problem):
-        with _bar(loaded.title, 1, quiet) as advance:
+        with bar(loaded.title, 1, quiet) as advance:
             fix = solve(loaded.problem, method=method)
             advance(1)
         return Fixed(loaded, (fix,), fix_columns(loaded, fix, None), _seen(loaded.problem, fix))
     fixes, tables = [], []
     batch = by_epoch(loaded.problem)
-    with _bar(loaded.title, loaded.problem.epochs, quiet) as advance:
+    with bar(loaded.title, loaded.problem.epochs, quiet) as advance:
         for first, part in _parts(batch, loaded.problem.epochs):
             fix = solve(part, method=method)
             fixes.append(fix)
@@ -86,7 +86,7 @@ def _parts(batch: Problem, count: int) -> Iterator[tuple[int, Problem]]:
 
 
 @contextmanager
-def _bar(title: str, total: int, quiet: bool) -> Iterator[Any]:
+def bar(title: str, total: int, quiet: bool) -> Iterator[Any]:
     """Yield a function that moves a progress bar on standard error; it is drawn on terminals only."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn

@@ -7,7 +7,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table as Shown
 
-from optloc.cli.fixing import _bar
+from optloc.cli.fixing import bar
 from optloc.errors import InvalidProblem, nearest
 from optloc.papers import Size, Table, paper, write
 
@@ -23,7 +23,7 @@ def run_reproduce(name: str, size: str, out: Path | None, seed: int, quiet: bool
     folder = Path(f"optloc-{name}") if out is None else out
     _usable(folder)
     plan = wanted.plan(chosen, seed)
-    with _bar(name, plan.work, quiet) as advance:
+    with bar(name, plan.work, quiet) as advance:
         report = plan.run(lambda: advance(1))
     written = write(report, folder)
     if not quiet:
