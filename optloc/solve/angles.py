@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from formulations.bearing_course import Courses, sighted_courses
 from formulations.bearing_ls import rays, sight
 from optloc.noise import variances
+from optloc.plan import elapsed
 from optloc.problem import Problem
 from optloc.types import Array, Rows
 
@@ -94,6 +96,56 @@ def instrumental(seen: Bearings) -> Array:
     azimuth, importance = seen.angle[..., 0], seen.weight[..., 0]
     found = sight(azimuth, seen.station, importance, elevation=steep[0], elevation_weight=steep[1], axes=seen.axes)
     return seen.metres(np.where(found.ok[:, None], found.instrumental, np.nan))[:, None]
+
+
+def courses(problem: Problem) -> Courses | None:
+    """Return the pseudo-linear courses of a flat batch of runs, or None where its rows are not all angles.
+
+    Parameters
+    ----------
+    problem : Problem
+        N runs of one target that moves as a polynomial all the while; nothing else is unknown.
+
+    Returns
+    -------
+    Courses
+        In metres and seconds since the time at which the target's state holds.
+    """
+    if any(rows.kind not in ("azimuth", "elevation") for rows in problem.rows):
+        return None
+    seen = bearings(problem)
+    if seen is None:
+        return None
+    block = next(rows for rows in problem.rows if rows.kind == "azimuth")
+    found = sighted_courses(
+        seen.angle[..., 0],
+        seen.station,
+        elapsed(problem, 0)[block.epoch],
+        seen.weight[..., 0],
+        elevation=seen.angle[..., 1],
+        elevation_weight=seen.weight[..., 1],
+        axes=seen.axes,
+        order=problem.motions[0].order,
+    )
+
+    def metres(c: Array) -> Array:
+        out = c * seen.scale[:, None, None]
+        out[:, 0] += seen.centre
+        return out
+
+    return Courses(metres(found.plain), metres(found.weighted), metres(found.instrumental), found.ok, found.ahead)
+
+
+def course_states(problem: Problem) -> Array | None:
+    """Return the states (N, order + 1, d) of the instrumental courses, or None where rows are not all angles.
+
+    NaN where the run does not determine a course, or where it is not in front of the stations.
+    """
+    found = courses(problem)
+    if found is None:
+        return None
+    unit = np.array([1.0, 1.0, 2.0])[: found.plain.shape[1], None]
+    return np.where(found.ahead[:, None, None], unit * found.instrumental, np.nan)
 
 
 def by_directions(seen: Bearings) -> Array:

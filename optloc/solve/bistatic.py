@@ -25,10 +25,10 @@ def course_starts(problem: Problem) -> Array | None:
     array (N, order + 1, 3)
         Position, velocity and acceleration; NaN where the epochs do not determine them.
     """
-    pair = _pair(problem)
-    if pair is None:
+    found = pair(problem)
+    if found is None:
         return None
-    receiver, illuminator = pair
+    receiver, illuminator = found
     size, k = problem.batch_shape[0], problem.epochs
     value, sigma = np.zeros((3, size, k)), np.full((3, size, k), np.inf)
     deviation = np.sqrt(variances(problem.noise, problem.count))
@@ -47,14 +47,14 @@ def course_starts(problem: Problem) -> Array | None:
     excess = value[2] - np.sqrt((away**2).sum(-1))[:, None]
     spread = np.stack([np.cos(value[1]) * sigma[0], sigma[1], sigma[2] / length], axis=-1)
     since, order = elapsed(problem, 0), problem.motions[0].order
-    found = course(excess / length, axes, away / length, np.broadcast_to(since, (size, k)), spread, order=order)
-    state = found.coefficients * length * np.array([1.0, 1.0, 2.0])[: order + 1, None]
+    fitted = course(excess / length, axes, away / length, np.broadcast_to(since, (size, k)), spread, order=order)
+    state = fitted.coefficients * length * np.array([1.0, 1.0, 2.0])[: order + 1, None]
     state[:, 0] += home
     return np.asarray(state)
 
 
-def _pair(problem: Problem) -> tuple[int, int] | None:
-    """Return receiver and illuminator of all rows, or None."""
+def pair(problem: Problem) -> tuple[int, int] | None:
+    """Return receiver and illuminator of all rows, or None where they are not of one bistatic pair that stays."""
     kinds = {rows.kind: rows for rows in problem.rows}
     if problem.dimension != 3 or set(kinds) != {"range_sum", "azimuth", "elevation"} or len(kinds) != len(problem.rows):
         return None

@@ -17,6 +17,7 @@ from optloc.models import MODELS
 from optloc.noise import Block, Noise, group
 from optloc.plan import elapsed
 from optloc.problem import Problem
+from optloc.solve.angles import course_states
 from optloc.solve.bistatic import course_starts
 from optloc.solve.start import static, unbiased, vectors
 from optloc.types import Array, Motion, Rows, Stations
@@ -116,13 +117,19 @@ def _state(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
     ahead = course_starts(problem) if motion.span == "run" else None
     if ahead is not None and np.isfinite(ahead).all():
         return ahead[:, None]
+    seen = course_states(problem) if motion.span == "run" else None
+    if seen is not None and np.isfinite(seen).all():
+        return seen[:, None]
     free = by_epoch(untied(replace(problem, motions=(Motion(span="epoch"),))))
     fix = fixed(free.flat()).reshape((size, problem.epochs))
     if motion.span == "epoch":
         state = np.zeros((size, problem.epochs, motion.order + 1, problem.dimension))
         state[:, :, 0] = _filled(fix.position)
         return state
-    return _polynomial(fix, elapsed(problem, 0), motion.order)[:, None]
+    state = _polynomial(fix, elapsed(problem, 0), motion.order)
+    if seen is not None:
+        state = np.where(np.isfinite(seen).all((-2, -1), keepdims=True), seen, state)
+    return state[:, None]
 
 
 def _meets(problem: Problem) -> bool:

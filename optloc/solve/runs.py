@@ -30,6 +30,9 @@ _WEAK = 1e-2
 _AZIMUTHS = 6
 _RADII = (1.5, 5.0)
 _STEPS = (-8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0)
+# Fixes with an error beyond this share of their distance may have another minimum that block averages do not show.
+_BLURRED = 2e-3
+_BESIDE = (-6.0, -2.0, 2.0, 6.0)
 
 
 def run_starts(problem: Problem, begin: Callable[[Problem], Array | None]) -> Array:
@@ -126,13 +129,37 @@ def _around(blocks: Problem) -> Array:
 
 def _valley(blocks: Problem, x: Array) -> Array:
     """Return vectors (N, C, size) along the longest axis of the error ellipsoid of the best minimum."""
-    cov = _covariance(blocks, x)
-    usable = np.asarray(np.isfinite(cov).all((-1, -2)))
-    values, axes = np.linalg.eigh(np.where(usable[:, None, None], cov, 0.0))
-    longest = (np.sqrt(np.maximum(values[:, -1], 0.0)) * _length(blocks))[:, None] * axes[..., -1]
-    out = np.repeat(np.where(usable[:, None], x, np.nan)[:, None], len(_STEPS), axis=1)
-    slot, _ = blocks.layout.find("position")
-    out[..., slot.start : slot.start + slot.size] += np.array(_STEPS)[:, None] * longest[:, None]
+    return _along(blocks, x, _covariance(blocks, x) * _length(blocks)[:, None, None] ** 2, _STEPS)
+
+
+def beside(problem: Problem, x: Array, covariance: Array) -> Array:
+    """Return vectors (N, C, size) along the longest axis of badly determined fixes of runs; NaN for the others.
+
+    Block averages blur minima that lie within a few standard deviations of each other.
+
+    Parameters
+    ----------
+    problem : Problem
+        N runs.
+    x : array (N, size)
+        Their fixes.
+    covariance : array (N, d, d)
+        Of the positions, square metres.
+    """
+    far = distance_of(problem, problem.layout.take(x, "position")) * _length(problem)
+    with np.errstate(invalid="ignore"):
+        weak = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1)) > _BLURRED * far
+    return np.where(weak[:, None, None], _along(problem, x, covariance, _BESIDE), np.nan)
+
+
+def _along(problem: Problem, x: Array, covariance: Array, steps: tuple[float, ...]) -> Array:
+    """Return vectors (N, C, size) moved by steps in standard deviations along the longest axis of their covariances."""
+    usable = np.asarray(np.isfinite(covariance).all((-1, -2)) & np.isfinite(x).all(-1))
+    values, axes = np.linalg.eigh(np.where(usable[:, None, None], covariance, 0.0))
+    longest = np.sqrt(np.maximum(values[:, -1:], 0.0)) * axes[..., -1]
+    out = np.repeat(np.where(usable[:, None], x, np.nan)[:, None], len(steps), axis=1)
+    slot, _ = problem.layout.find("position")
+    out[..., slot.start : slot.start + slot.size] += np.array(steps)[:, None] * longest[:, None]
     return out
 
 

@@ -24,7 +24,7 @@ from optloc.solve.pieces import from_pieces, one_position
 from optloc.solve.reasons import DOUBT
 from optloc.solve.refine import refine
 from optloc.solve.register import closed_form, registrable, relaxed
-from optloc.solve.runs import run_starts
+from optloc.solve.runs import beside, run_starts
 from optloc.solve.search import PLACES, searched_starts
 from optloc.solve.squared import Pick, every, hull, minimum, shor
 from optloc.solve.start import along_the_valley, mirrored, squared_range_starts, static, subarray_starts, vectors
@@ -131,9 +131,14 @@ def widen(problem: Problem, fix: Fix | None) -> Fix:
     """Return a refined fix with its mirror image beside it, and where the verdict is not clean those of sub-arrays."""
     if fix is None:
         raise InvalidProblem("widen adds candidates to a fix", "method", "put it behind a refinement")
+    began = perf_counter()
+    if registrable(problem):
+        around = beside(problem, fix.x, fix.covariance())
+        if not np.isfinite(around).any():
+            return fix
+        return unrefined(problem, _packed(np.concatenate([pooled(fix)[0], around], axis=1)), fix, "widen", began)
     if not one_position(problem):
         return fix
-    began = perf_counter()
     alone = static(problem)
     seen = _positions(problem, fix)
     parts = [mirrored(alone, seen[:, :1])]
