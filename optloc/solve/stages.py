@@ -209,6 +209,9 @@ def lsr(problem: Problem, fix: Fix | None, *, damped: bool = True, limit: int = 
     """Return the refined maximum-likelihood fix: best of all candidates of the stage before."""
     if fix is None:
         raise InvalidProblem("lsr refines a start", "method", "give start= or a method such as 'gtrs+lsr'")
+    unfinished = np.isin(fix.code, (Status.MAX_ITERATIONS, Status.STALLED)).any()
+    if damped and fix.stages and fix.stages[-1].name == "lsr" and not unfinished:
+        return fix  # nothing was added since
     began = perf_counter()
     pool, item, slot = pooled(fix)
     cost, code = np.full(pool.shape[:2], np.inf), np.full(pool.shape[:2], int(Status.NUMERICAL), dtype=np.int8)
@@ -223,7 +226,7 @@ def lsr(problem: Problem, fix: Fix | None, *, damped: bool = True, limit: int = 
     candidates = Candidates(pool, cost, code, np.zeros(cost.shape, dtype=int))
     if damped:
         candidates = bounded(problem, candidates)
-    return finished(problem, fix, candidates, Stage("lsr", detail, perf_counter() - began))
+    return finished(problem, fix, candidates, Stage("lsr" if damped else "taylor", detail, perf_counter() - began))
 
 
 def pooled(fix: Fix) -> tuple[Array, Array, Array]:
