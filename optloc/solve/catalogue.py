@@ -8,6 +8,7 @@ from optloc.errors import InvalidProblem, nearest
 from optloc.fix import Fix
 from optloc.problem import Problem
 from optloc.solve import stages
+from optloc.solve.certify import certify
 from optloc.solve.stages import Solver
 
 
@@ -75,7 +76,7 @@ SOLVERS: dict[str, Entry] = {
     ),
     "lsr": Entry(stages.lsr, "damped Taylor least squares (Gauss-Newton) from every candidate", "refinement"),
     "nlp": Entry(_nlp, "the maximum-likelihood cost by IPOPT from every candidate", "refinement"),
-    "certify": Entry(stages.certify, "compares the cost of an angle fix with a bound over all positions", "refinement"),
+    "certify": Entry(certify, "compares the cost of an angle fix with a bound over all positions", "refinement"),
     "taylor": Entry(stages.taylor, "plain undamped Taylor iteration; a baseline, it diverges", "refinement"),
 }
 

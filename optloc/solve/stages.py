@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
@@ -15,7 +14,7 @@ from optloc.errors import InvalidProblem
 from optloc.fix import Alternatives, Fix, Stage
 from optloc.normal import Normal
 from optloc.problem import Problem
-from optloc.solve.angles import Bearings, angle_bounds, bearings, by_directions, instrumental, least_worst
+from optloc.solve.angles import Bearings, bearings, by_directions, instrumental, least_worst
 from optloc.solve.bounded import bounded
 from optloc.solve.freedom import degrees_of_freedom
 from optloc.solve.heights import height_starts
@@ -34,7 +33,6 @@ from optloc.types import Array
 
 Solver = Callable[[Problem, Fix | None], Fix]
 
-_TIGHT = 1e-3
 _WEAK = 1e-2
 
 
@@ -81,37 +79,6 @@ def _angular(problem: Problem, fix: Fix | None, name: str, locate: Callable[[Bea
     seen = bearings(static(problem))
     nowhere = np.full((problem.batch_shape[0], 1, problem.dimension), np.nan)
     return _placed(problem, nowhere if seen is None else locate(seen), fix, name, began)
-
-
-def certify(problem: Problem, fix: Fix | None) -> Fix:
-    """Return a fix of angles whose certificate compares its cost with a lower bound over all positions."""
-    if fix is None:
-        raise InvalidProblem("certify examines a fix", "method", "put it behind a refinement")
-    angles_only = all(rows.kind in ("azimuth", "elevation") for rows in problem.rows)
-    if not angles_only or not one_position(problem) or problem.layout.size != 3 or problem.priors:
-        return fix
-    began = perf_counter()
-    seen = bearings(problem)
-    independent = all(block.row.shape[1] == 1 for block in problem.noise.blocks)
-    if seen is None or not independent:
-        return fix
-    bound = angle_bounds(seen, np.where(fix.answered[:, None], fix.position, np.nan))
-    certificate = np.array(fix.certificate)
-    for i in np.flatnonzero(np.isfinite(bound)):
-        certificate[i] = _proof(float(fix.cost[i]), float(bound[i]))
-    proven = sum(c.proof == "global" for c in certificate)
-    stage = Stage("certify", f"{proven} of {len(certificate)} proven", perf_counter() - began)
-    return replace(fix, certificate=certificate, stages=(*fix.stages, stage))
-
-
-def _proof(cost: float, bound: float) -> Certificate:
-    gap = cost - bound
-    tight = gap <= _TIGHT * (1.0 + cost)
-    reason = "no position costs less" if tight else f"a lower bound leaves a gap of {gap:.2g}"
-    proof = "global" if tight else "local"
-    return Certificate(
-        proof, f"{reason}; other minima were searched for, not excluded", "direction relaxation", bound, gap
-    )
 
 
 def _squared(problem: Problem, fix: Fix | None, name: str, pick: Pick) -> Fix:
