@@ -23,10 +23,11 @@ the linear rows are its polar equation.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import comb
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from formulations._polynomial import span, uncentred
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -189,7 +190,7 @@ def course(excess: Array, axes: Array, illuminator: Array, time: Array, sigma: A
         heard = np.isfinite(L + when + e.sum(axis=(-2, -1))) & (L > 0.0)
         present = heard[..., None] & (deviation > 0.0) & np.isfinite(deviation)
         heard &= present.any(axis=-1)
-        middle, spread = _span(when, heard)
+        middle, spread = span(when, heard)
         powers = np.where(heard, (when - middle) / spread, 0.0)[..., None] ** np.arange(order + 1.0)
         normals = np.concatenate([e[:, :, :2], (e[:, :, 2] - A[:, None] / L[..., None])[:, :, None, :]], axis=2)
         normals = np.where(present[..., None], normals, 0.0)
@@ -205,22 +206,13 @@ def course(excess: Array, axes: Array, illuminator: Array, time: Array, sigma: A
             p = np.einsum("nkj,nji->nki", powers, c)
             far, across = np.sqrt(_dot(p, p)), np.sqrt(_dot(p - A[:, None], p - A[:, None]))
         ok &= ((_dot(p, e[:, :, 2]) > 0.0) | ~heard).all(axis=-1)
-        c = np.where(ok[:, None, None], _uncentred(c, middle, spread), np.nan)
+        c = np.where(ok[:, None, None], uncentred(c, middle, spread), np.nan)
     return Course(c.reshape(*lead, order + 1, 3), ok.reshape(lead))
 
 
 def _flat(value: ArrayLike, last: tuple[int, ...], lead: tuple[int, ...]) -> Array:
     """Give a value one batch axis."""
     return np.broadcast_to(np.asarray(value, dtype=np.float64), (*lead, *last)).reshape(-1, *last)
-
-
-def _span(when: Array, heard: Mask) -> tuple[Array, Array]:
-    """Middle and half length of the times heard, shape (N, 1): powers of what is left are of order one."""
-    first = np.min(np.where(heard, when, np.inf), axis=-1, keepdims=True)
-    last = np.max(np.where(heard, when, -np.inf), axis=-1, keepdims=True)
-    some = last >= first
-    half = np.where(some, 0.5 * (last - first), 0.0)
-    return np.where(some, 0.5 * (first + last), 0.0), np.where(half > 0.0, half, 1.0)
 
 
 def _fit(normals: Array, right: Array, powers: Array, weight: Array) -> tuple[Array, Mask]:
@@ -238,15 +230,6 @@ def _fit(normals: Array, right: Array, powers: Array, weight: Array) -> tuple[Ar
     inverse = np.where(good[:, None], 1.0 / np.where(good[:, None], size, 1.0), 0.0)
     c = np.einsum("nji,nj->ni", V, inverse * np.einsum("nkj,nk->nj", U, triangle[..., n]))
     return c.reshape(count, order, 3), good
-
-
-def _uncentred(c: Array, middle: Array, spread: Array) -> Array:
-    """Coefficients in time from those in ``(time - middle) / spread``."""
-    out = np.zeros_like(c)
-    for j in range(c.shape[1]):
-        for i in range(j + 1):
-            out[:, i] += c[:, j] * comb(j, i) * (-middle) ** (j - i) / spread**j
-    return out
 
 
 def _dot(a: Array, b: Array) -> Array:

@@ -97,7 +97,7 @@ def columns(layout: Layout, name: str, epoch: Array) -> Array:
 
 _PLANS: dict[tuple[Any, ...], tuple[Plan, ...]] = {}
 # Plans of longer problems are made anew: that takes less time than their rows do, and no memory that lasts.
-_KEPT_PLANS, _KEPT_ROWS = 64, 4096
+_KEPT_ROWS = 4096
 
 
 def plans(problem: Problem) -> tuple[Plan, ...]:
@@ -106,7 +106,7 @@ def plans(problem: Problem) -> tuple[Plan, ...]:
         return _plans(problem)
     key = problem.structure
     if key not in _PLANS:
-        if len(_PLANS) >= _KEPT_PLANS:
+        if sum(plan.block.count for kept in _PLANS.values() for plan in kept) > 2 * _KEPT_ROWS:
             _PLANS.clear()
         _PLANS[key] = _plans(problem)
     return _PLANS[key]

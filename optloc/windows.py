@@ -43,7 +43,7 @@ def whole(problem: Problem, batch: int = 1) -> bool:
 
 def epochs_of(problem: Problem, batch: int = 1) -> int:
     """Return the number of epochs whose Jacobians fit into the cache."""
-    if problem.epochs == 1 or tied(problem):
+    if problem.epochs == 1 or problem.count == 0 or tied(problem):
         return problem.epochs
     columns = problem.layout.n_shared + problem.layout.n_local + 1
     return max(1, int(_NUMBERS * problem.epochs / (batch * problem.count * columns)))

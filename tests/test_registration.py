@@ -52,9 +52,9 @@ FIXED_TARGET = {
     "600 s, 12 m": (run(600, sigma=12.0), 60),
     "600 s, 3 m, stations 5 m": (run(600, station=5.0), 60),
     "60 s, 3 m, prior": (run(60, prior=200.0), 100),
-    "60 s, 12 m, prior": (run(60, sigma=12.0, prior=200.0), 60),
+    "60 s, 12 m, prior": (run(60, sigma=12.0, prior=200.0), 40),
     "100 s, 3 m, prior": (run(100, prior=200.0), 100),
-    "100 s, 12 m, prior": (run(100, sigma=12.0, prior=200.0), 60),
+    "100 s, 12 m, prior": (run(100, sigma=12.0, prior=200.0), 40),
     "stations in space": (run(600, places=SPATIAL), 60),
 }
 
@@ -97,12 +97,12 @@ def test_another_program_finds_the_same_optimum(problem):
 @pytest.mark.parametrize("sigma", [3.0, 12.0])
 def test_a_moving_target_has_two_branches_and_both_are_listed(sigma):
     problem = run(600, sigma=sigma, order=1)
-    found = counted(Case(f"moving, {sigma:g} m", problem), 40)
+    found = counted(Case(f"moving, {sigma:g} m", problem), 30)
     assert not found.failed.any()
     assert (found.code == Status.AMBIGUOUS).all()
     assert (~found.away | found.listed).all()
     assert (np.abs(found.gap) < TIE).all()
-    assert 5 < found.away.sum() < 35  # the data choose neither
+    assert 3 < found.away.sum() < 27  # the data choose neither
     on_the_bound(found, problem)
 
 
@@ -140,7 +140,7 @@ def thinned(epochs, gain):
 @pytest.mark.parametrize("gain", [0.03, 3e-4])
 def test_gain_ratios_join_the_differences(gain):
     problem = thinned(100, gain)
-    found = counted(Case(f"gains {gain:g}", problem), 30)
+    found = counted(Case(f"gains {gain:g}", problem), 20)
     settled(found)
     on_the_bound(found, problem)
     in_band(found, problem)
@@ -149,7 +149,7 @@ def test_gain_ratios_join_the_differences(gain):
 def test_exact_gain_ratios_lower_bound_and_error():
     """Over the same draw: 3e-5 removes 40 % of the bound, 0.03 nothing."""
     fine, coarse, none = (thinned(100, gain) for gain in (3e-5, 0.03, None))
-    x, trials = truth(fine), 50
+    x, trials = truth(fine), 40
     many = simulate(fine, x, 4, trials=trials)
     alone = none.with_rows(z=many.z[:, : none.count])
     bound, without = rms(crlb(fine, x)), rms(crlb(none, truth(none)))
@@ -236,7 +236,7 @@ GAPS = {
 @pytest.mark.parametrize("name", GAPS)
 def test_gaps(name):
     problem, spoil = GAPS[name]
-    settled(counted(Case(name, problem, spoil=spoil), 50))
+    settled(counted(Case(name, problem, spoil=spoil), 40))
 
 
 def test_stations_and_target_at_rest_leave_target_and_biases_open():
@@ -262,25 +262,31 @@ def test_offsets_that_last_the_run():
     in_band(found, problem)  # drawn from the priors: the errors have the covariance of the fix
 
 
+def sharing(targets):
+    """Return 40 epochs of emitters that are heard one by one with the same clocks."""
+    times = 15.0 * np.arange(40)
+    k, target, a = (v.ravel() for v in np.meshgrid(np.arange(40), np.arange(targets), np.arange(1, 5), indexing="ij"))
+    rows = optloc.measured("tdoa", a=a, b=0, epoch=k, target=target, arrival_sigma=3.0)
+    names = tuple(f"S{i + 1}" for i in range(5))
+    stations = Stations(SPATIAL + SPEEDS * times[:, None, None], names)
+    problem = optloc.assemble(stations, rows, times=times, motions=(Motion(0),) * targets)
+    return optloc.with_bias(problem, "clock", members=names[1:])
+
+
 def test_targets_that_share_biases():
     """Two emitters with shared clock errors are found together, and pin the clocks better than either alone."""
-    epochs, times = 40, 15.0 * np.arange(40)
-    places = np.array([FIXED, [-150e3, 250e3, 0.0]])
-    k, target, a = (v.ravel() for v in np.meshgrid(np.arange(epochs), [0, 1], np.arange(1, 5), indexing="ij"))
-    rows = optloc.measured("tdoa", a=a, b=0, epoch=k, target=target, arrival_sigma=3.0)
-    place = SPATIAL + SPEEDS * times[:, None, None]
-    names = tuple(f"S{i + 1}" for i in range(5))
-    problem = optloc.assemble(Stations(place, names), rows, times=times, motions=(Motion(0), Motion(0)))
-    problem = optloc.with_bias(problem, "clock", members=names[1:])
+    places, problem = np.array([FIXED, [-150e3, 250e3, 0.0]]), sharing(2)
     x = np.concatenate([places.ravel(), DELAYS])
-    many = simulate(problem, x, 11, trials=20)
-    fix = solve(many)
+    fix = solve(many := simulate(problem, x, 11, trials=20))
     best = refine(many, np.tile(x, (20, 1)))
     assert (fix.code == Status.OK).all()
     assert (fix.cost <= best.cost + TIE).all()
     nees = np.einsum("ni,nij,nj->n", fix.x - x, np.linalg.inv(fix.cov), fix.x - x)
     low, high = band(20 * 10, EVERY_CASE)
     assert low < nees.mean() / 10 < high
+    for place in places:
+        alone = np.sqrt(np.diagonal(crlb(sharing(1), np.concatenate([place, DELAYS])))[3:])
+        assert (fix.sigma("clock") < 0.95 * alone).all()
 
 
 @cache

@@ -109,6 +109,60 @@ def fix(
     raise typer.Exit(code)
 
 
+@app.command(
+    epilog=example(
+        "optloc track flight.toml --out track.csv --plot track.png",
+        "optloc track flight.toml --model csm --noise 30 --filter ekf",
+        "optloc track flight.toml --json | jq '.scans[-1]'",
+    )
+)
+def track(
+    file: ProblemPath,
+    model: Annotated[
+        str,
+        typer.Option(metavar="cv|ca|static|singer|csm", help="How the target moves; csm: current statistical model."),
+    ] = "cv",
+    filter_: Annotated[
+        str, typer.Option("--filter", metavar="iekf|ekf|mgekf|mvekf", help="How a scan updates the state.")
+    ] = "iekf",
+    noise: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SD",
+            help="Standard deviation, SI units, of what drives the target: velocity (static, 0 by default), "
+            "acceleration (cv, singer: 1), jerk (ca: 1); csm: the largest acceleration (10).",
+        ),
+    ] = None,
+    memory: Annotated[
+        float, typer.Option(metavar="SECONDS", help="Time over which accelerations last (singer, csm).")
+    ] = 10.0,
+    out: Annotated[Path | None, typer.Option(metavar="OUT", help="Write the track as .csv or .parquet.")] = None,
+    as_json: Json = False,
+    plot: Annotated[Path | None, typer.Option("--plot", metavar="OUT.png", help="Draw track, sigma and NIS.")] = None,
+    gap: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            help="A longer silence ends the track, and a new fix begins another; by default when the prediction is "
+            "more uncertain than the stations are spread.",
+        ),
+    ] = None,
+    gate: Annotated[float, typer.Option(metavar="SIGMAS", help="Rows further from the prediction are left out.")] = 5.0,
+    start: Annotated[
+        str | None, typer.Option(metavar="X,Y[,Z],VX...", help="Known state at the first scan; needs none.")
+    ] = None,
+    start_sigma: Annotated[
+        str | None, typer.Option(metavar="P[,V[,A]]", help="Its standard deviations: position, velocity, acceleration.")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Track the targets of a problem file through its scans, from fixes of its first ones, without a guess."""
+    from optloc.cli.tracking import Wanted, rules, run_track
+
+    wanted = Wanted(model, filter_, noise, memory, rules(gate, gap), start, start_sigma)
+    raise typer.Exit(run_track(file, wanted, out=out, as_json=as_json, plot=plot, quiet=quiet))
+
+
 @app.command(epilog=example("optloc demo", "optloc demo ambiguous --plot two.png"))
 def demo(
     name: Annotated[

@@ -130,6 +130,13 @@ FORMULATIONS: dict[str, Formulation] = {
         "30 us",
         "Dogancay 2006, 2015",
     ),
+    "bearing_course": Formulation(
+        "the same for a target on a polynomial course, over all epochs at once; one station that turns may do",
+        "azimuth, elevation of a moving target",
+        "asymptotically unbiased; as good as maximum likelihood to 0.1 %",
+        "0.5 ms for 100 angles",
+        "Dogancay 2006, 2015",
+    ),
     "direction_sdp": Formulation(
         "unknown unit directions that meet in a point, lifted; with a minorant a bound of the angular cost",
         "azimuth and elevation",

@@ -20,7 +20,7 @@ from optloc.priors import prior_parts
 from optloc.problem import Problem
 from optloc.solve.bounded import without_broken
 from optloc.solve.register import registrable
-from optloc.solve.runs import BLOCKS
+from optloc.solve.runs import BLOCKS, alike
 from optloc.solve.scale import spread_of
 from optloc.solve.stages import finished, given, pooled, unrefined
 from optloc.solve.start import completed
@@ -50,9 +50,7 @@ def nlp(problem: Problem, fix: Fix | None) -> Fix:
         raise InvalidProblem("nlp improves a start", "method", "give start= or a method such as 'gtrs+nlp'")
     began = perf_counter()
     if registrable(problem) and problem.epochs >= 2 * BLOCKS:
-        blocks, n = averaged(problem, BLOCKS), problem.layout.n_shared
-        found, _, _ = pooled(nlp(blocks, given(blocks, completed(blocks, pooled(fix)[0][..., :n]))))
-        return unrefined(problem, completed(problem, found[..., :n]), fix, "nlp", began)
+        return unrefined(problem, _of_blocks(problem, pooled(fix)[0]), fix, "nlp", began)
     problem = weighed(problem)
     pool, item, slot = pooled(fix)
     x, cost, code = (
@@ -73,6 +71,17 @@ def nlp(problem: Problem, fix: Fix | None) -> Fix:
     cost[code == Status.NUMERICAL] = np.inf  # a start on a station has no gradient, and IPOPT's last word is no point
     stage = Stage("nlp", f"{len(item)} programs", perf_counter() - began)
     return finished(problem, fix, without_broken(problem, Candidates(x, cost, code, face)), stage)
+
+
+def _of_blocks(problem: Problem, x: Array) -> Array:
+    """Return the answers (N, C, size) for the block averages of runs from their candidates."""
+    n, out = problem.layout.n_shared, np.full(x.shape, np.nan)
+    for items in alike(problem):
+        blocks = averaged(problem.take(items), BLOCKS)
+        found, _, _ = pooled(nlp(blocks, given(blocks, completed(blocks, x[items, :, :n]))))
+        width = min(found.shape[1], x.shape[1])
+        out[items, :width] = completed(problem.take(items), found[:, :width, :n])
+    return out
 
 
 def _stationary(problem: Problem, x: Array, code: Array, face: Array) -> Array:

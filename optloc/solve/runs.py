@@ -46,6 +46,26 @@ def run_starts(problem: Problem, begin: Callable[[Problem], Array | None]) -> Ar
         Maps the block averages to starting vectors (N, C, size of theirs), or None where it cannot: the starts are
         then places around the stations.
     """
+    groups = alike(problem)
+    if len(groups) == 1:
+        return _starts(problem, begin)
+    parts = [(items, _starts(problem.take(items), begin)) for items in groups]
+    out = np.full((problem.batch_shape[0], max(part.shape[1] for _, part in parts), problem.layout.size), np.nan)
+    for items, part in parts:
+        out[items, : part.shape[1]] = part
+    return out
+
+
+def alike(problem: Problem) -> list[Array]:
+    """Return the problems of a flat batch in groups that have the same rows: these have block averages in common."""
+    present = np.broadcast_to(problem.weight > 0.0, (problem.batch_shape[0], problem.count))
+    if problem.weight.ndim == 1 or (present == present[:1]).all():
+        return [np.arange(len(present))]
+    _, group = np.unique(present, axis=0, return_inverse=True)
+    return [np.flatnonzero(group.reshape(-1) == i) for i in range(int(group.max()) + 1)]
+
+
+def _starts(problem: Problem, begin: Callable[[Problem], Array | None]) -> Array:
     blocks = averaged(problem, BLOCKS)
     x = begin(blocks)
     x = _around(blocks) if x is None else x
@@ -165,11 +185,11 @@ def _along(problem: Problem, x: Array, covariance: Array, steps: tuple[float, ..
 
 def _best(blocks: Problem, x: Array, cost: Array) -> Array:
     """Return the different minima (N, C, size) worth refining on all epochs; NaN in empty slots."""
-    order = np.argsort(cost, axis=1, kind="stable")[:, : 4 * _KEPT]
+    order = np.argsort(cost, axis=1, kind="stable")
     x, cost = np.take_along_axis(x, order[..., None], axis=1), np.take_along_axis(cost, order, axis=1)
-    for i in range(1, x.shape[1]):
+    for i in np.flatnonzero(np.isfinite(cost).any(0))[1:]:
         for j in range(i):
-            cost[:, i] = np.where(_alike(blocks, x[:, i], x[:, j]) & np.isfinite(cost[:, j]), np.inf, cost[:, i])
+            cost[:, i] = np.where(_at_one_place(blocks, x[:, i], x[:, j]) & np.isfinite(cost[:, j]), np.inf, cost[:, i])
     order = np.argsort(cost, axis=1, kind="stable")[:, :_KEPT]
     x, cost = np.take_along_axis(x, order[..., None], axis=1), np.take_along_axis(cost, order, axis=1)
     with np.errstate(invalid="ignore"):
@@ -178,7 +198,7 @@ def _best(blocks: Problem, x: Array, cost: Array) -> Array:
     return np.where(used[..., None], x, np.nan)[:, : max(1, int(used.sum(1).max()))]
 
 
-def _alike(blocks: Problem, x: Array, y: Array) -> Array:
+def _at_one_place(blocks: Problem, x: Array, y: Array) -> Array:
     """Return where the positions of two vectors (N, size) are one, as measured by the spread of the stations."""
     apart = blocks.layout.take(x, "position") - blocks.layout.take(y, "position")
     return np.asarray(np.sqrt((apart**2).sum(-1)) < _SAME * _length(blocks))

@@ -17,6 +17,10 @@ Step = Callable[[float, Array, int], tuple[Array, Array, Array]]
 
 # Accelerations nearer to the limit of the current statistical model than this share of it, or beyond, count as here.
 _CLAMP = 0.05
+_POWERS = np.array([2.0, 1.0, 0.0])
+# Below this share of the time constant, steps are summed as power series, of so many terms.
+_SERIES = 1.0
+_TERMS = 18
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +87,7 @@ def singer(time_constant: float, deviation: float) -> Dynamics:
     Electron. Syst. 6 (1970), eq. 8 and 10.
     """
     alpha = 1.0 / _positive(time_constant, "time_constant")
+    _positive(deviation, "deviation")
 
     def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
         F, Q, _ = correlated(alpha, dt)
@@ -113,6 +118,8 @@ def current_statistical(time_constant: float, limit: float, floor: float = 0.0) 
     """
     alpha = 1.0 / _positive(time_constant, "time_constant")
     _positive(limit, "limit")
+    if not (np.isfinite(floor) and floor >= 0.0):
+        raise InvalidProblem(f"a floor of {floor}", "floor", "give a standard deviation of at least 0")
 
     def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
         F, Q, u = correlated(alpha, dt)
@@ -130,21 +137,41 @@ def current_statistical(time_constant: float, limit: float, floor: float = 0.0) 
 def correlated(alpha: float, dt: float) -> tuple[Array, Array, Array]:
     """Return F (3, 3), Q (3, 3) for unit variance and U (3,) of an exponentially correlated acceleration of one axis.
 
-    Q is taken from the exponential of a block matrix: its closed form loses all digits where ``alpha * dt`` is small.
+    With x = alpha dt and f(s) the answer of [p, v, a] to an impulse of acceleration after the share s of the step,
+    Q = 2 x int_0^1 f f' ds in units of the step. Its closed form loses all digits where x is small: there, f is
+    summed as a power series.
 
     References
     ----------
-    C. F. Van Loan, "Computing integrals involving the matrix exponential", IEEE Trans. Autom. Control 23 (1978).
+    R. A. Singer, IEEE Trans. Aerosp. Electron. Syst. 6 (1970), eq. 8 and 11.
     """
-    from scipy.linalg import expm
+    x = alpha * dt
+    f, Q, U = _series(x) if x < _SERIES else _closed(x)
+    units = dt**_POWERS
+    F = np.eye(3) + dt * np.eye(3, k=1)
+    F[:, 2] = units * f
+    return F, units[:, None] * units * Q, units * U
 
-    A = np.diag([1.0, 1.0], k=1)
-    A[2, 2] = -alpha
-    noise = np.diag([0.0, 0.0, 2.0 * alpha])
-    exponential = expm(np.block([[-A, noise], [np.zeros((3, 3)), A.T]]) * dt)
-    F = exponential[3:, 3:].T
-    Q = F @ exponential[:3, 3:]
-    return F, 0.5 * (Q + Q.T), np.array([0.5 * dt**2, dt, 1.0]) - F[:, 2]
+
+def _series(x: float) -> tuple[Array, Array, Array]:
+    """Return f at the end of the step, Q and U from power series in x."""
+    n = np.arange(_TERMS)
+    terms = (-x) ** n / np.array([[float(factorial(k + p)) for k in range(_TERMS)] for p in (2, 1, 0)])
+    order = n + _POWERS[:, None]
+    lengths = order[:, None, :, None] + order[None, :, None, :] + 1.0
+    Q = 2.0 * x * (terms[:, None, :, None] * terms[None, :, None, :] / lengths).sum((-2, -1))
+    return terms.sum(-1), Q, -terms[:, 1:].sum(-1)
+
+
+def _closed(x: float) -> tuple[Array, Array, Array]:
+    """Return f at the end of the step, Q and U in closed form."""
+    e, e2 = np.exp(-x), np.exp(-2.0 * x)
+    f = np.array([(x - 1.0 + e) / x**2, (1.0 - e) / x, e])
+    q11 = (1.0 - e2 + 2.0 * x + 2.0 * x**3 / 3.0 - 2.0 * x**2 - 4.0 * x * e) / x**4
+    q12 = (e2 + 1.0 - 2.0 * e + 2.0 * x * e - 2.0 * x + x**2) / x**3
+    q13, q22 = (1.0 - e2 - 2.0 * x * e) / x**2, (4.0 * e - 3.0 - e2 + 2.0 * x) / x**2
+    q23, q33 = (e2 + 1.0 - 2.0 * e) / x, 1.0 - e2
+    return f, np.array([[q11, q12, q13], [q12, q22, q23], [q13, q23, q33]]), np.array([0.5, 1.0, 1.0]) - f
 
 
 def _blocked(F: Array, Q: Array, d: int) -> tuple[Array, Array]:
@@ -153,6 +180,7 @@ def _blocked(F: Array, Q: Array, d: int) -> tuple[Array, Array]:
 
 
 def _positive(value: float, name: str) -> float:
+    """Return a finite positive number; raise InvalidProblem for any other."""
     if not (np.isfinite(value) and value > 0.0):
         raise InvalidProblem(f"{name} is {value}", name, "give a positive number")
     return float(value)

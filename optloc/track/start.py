@@ -56,10 +56,10 @@ def begun(
     check_trackable(problem)
     order = dynamics.order
     fix, used = None, 0
-    for used in [epochs] if epochs is not None else _counts(problem.epochs, order, speed, rate):
-        fix = solve(_first(problem, used, order, speed, rate))
+    for used in [epochs] if epochs is not None else counts(problem.epochs, order, speed, rate):
+        fix = first_fix(problem, dynamics, used, speed=speed, rate=rate)
         if fix.status in (Status.OK, Status.AMBIGUOUS):
-            return _state(problem, fix, used)
+            return state_of(problem, fix, used)
     if fix is None:
         raise InvalidProblem("there are no epochs", "start", "give a run of at least one scan")
     raise NoSolution(problem, fix)
@@ -75,12 +75,19 @@ def two_point(first: Fix, second: Fix, times: tuple[float, float]) -> State:
     times : tuple of two float
         Seconds.
 
+    Raises
+    ------
+    InvalidProblem
+        Where the second fix is not later than the first.
+
     References
     ----------
     Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), eq.
     5.5.3-4, with the covariance of each fix.
     """
     T = times[1] - times[0]
+    if not T > 0.0:
+        raise InvalidProblem(f"fixes at {times[0]} and {times[1]} s", "times", "give the earlier fix first")
     one, two = first.covariance(), second.covariance()
     mean = np.concatenate([second.position, (second.position - first.position) / T], axis=-1)
     upper = np.concatenate([two, two / T], axis=-1)
@@ -88,8 +95,8 @@ def two_point(first: Fix, second: Fix, times: tuple[float, float]) -> State:
     return State(times[1], mean, np.concatenate([upper, lower], axis=-2))
 
 
-def _counts(epochs: int, order: int, speed: float | None, rate: float | None) -> list[int]:
-    """Return the numbers of epochs to try: each next by half more."""
+def counts(epochs: int, order: int, speed: float | None = None, rate: float | None = None) -> list[int]:
+    """Return the numbers of first epochs, of so many, that a start tries: each next by half more; as `begun`."""
     known = speed is not None and (order < 2 or rate is not None)
     count = 1 if order == 0 or known else order + 1
     out = []
@@ -97,6 +104,19 @@ def _counts(epochs: int, order: int, speed: float | None, rate: float | None) ->
         out.append(count)
         count = max(count + 1, count * 3 // 2)
     return [*out, epochs]
+
+
+def first_fix(
+    problem: Problem, dynamics: Dynamics, count: int, *, speed: float | None = None, rate: float | None = None
+) -> Fix:
+    """Return the fix of the first epochs of a run, a target that moves by the order of the dynamics; as `begun`."""
+    return solve(_first(problem, count, dynamics.order, speed, rate))
+
+
+def state_of(problem: Problem, fix: Fix, used: int) -> State:
+    """Return the `first_fix` of so many epochs as a state at the last of them."""
+    mean, cov = fix.gaussian()
+    return State(float(problem.times[used - 1]), np.array(mean), np.array(cov))
 
 
 def _first(problem: Problem, count: int, order: int, speed: float | None, rate: float | None) -> Problem:
@@ -109,8 +129,3 @@ def _first(problem: Problem, count: int, order: int, speed: float | None, rate: 
     ]
     motion = Motion(order, reference=float(problem.times[count - 1]))
     return replace(part, motions=(motion,), priors=tuple(priors))
-
-
-def _state(problem: Problem, fix: Fix, used: int) -> State:
-    mean, cov = fix.gaussian()
-    return State(float(problem.times[used - 1]), np.array(mean), np.array(cov))

@@ -124,12 +124,15 @@ def scans(problem: Problem, order: int) -> Iterator[tuple[float, Problem]]:
     """
     check_trackable(problem)
     for k in range(problem.epochs):
-        part = np.flatnonzero(problem.epoch == k)
-        if not len(part):
-            yield float(problem.times[k]), replace(problem, rows=())
-            continue
-        scan = cut(replace(problem, motions=(Motion(order),)), k, k + 1)
-        yield float(problem.times[k]), replace(scan, motions=(Motion(order, reference=float(problem.times[k])),))
+        yield float(problem.times[k]), scan_at(problem, k, order)
+
+
+def scan_at(problem: Problem, k: int, order: int) -> Problem:
+    """Return one scan of a run, see `scans`; it has no rows where the epoch has none."""
+    if not (problem.epoch == k).any():
+        return replace(problem, rows=())
+    scan = cut(replace(problem, motions=(Motion(order),)), k, k + 1)
+    return replace(scan, motions=(Motion(order, reference=float(problem.times[k])),))
 
 
 def check_trackable(problem: Problem) -> None:

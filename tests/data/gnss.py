@@ -8,6 +8,7 @@ where an epoch has all its satellites, which is the loss that reproduces the REA
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -138,6 +139,39 @@ class Session:
             measured("toa", rows[column].to_numpy(), a=s, epoch=k, sigma=SIGMA / np.sin(rows["el_rad"].to_numpy())),
             times=times - times[0],
             frame=ECEF,
+        )
+
+    def three(self) -> Problem:
+        """Return the differences of three satellites that are heard all the time, with the true height known exactly.
+
+        Of all such GPS satellites these are the three with the best horizontal geometry at the first epoch.
+        """
+        times = np.unique(self.rows["t_gps_s"])
+        rows = self.rows[self.rows["sat"].str.startswith("G")]
+        always = [name for name, heard in rows.groupby("sat").size().items() if heard == len(times)]
+        table = rows[rows["sat"].isin(always)].pivot_table([*_XYZ, self.column], "t_gps_s", "sat")
+        place = np.stack([table[column][always].to_numpy() for column in _XYZ], axis=-1)
+        triples = np.array(list(combinations(range(len(always)), 3)))
+        first = np.stack([place[0, chosen] for chosen in triples])
+        one = np.ones(first.shape[:2])
+        conditioned = Receptions(first, one, one, one, ("", "", ""), self.truth, self.geodetic).conditioned
+        best = triples[np.argmax(conditioned)]
+        z = table[self.column][always].to_numpy()[:, best]
+        k = len(times)
+        rows_of = measured(
+            "tdoa",
+            (z[:, 1:] - z[:, :1]).ravel(),
+            a=np.tile([1, 2], k),
+            b=np.zeros(2 * k, dtype=int),
+            epoch=np.repeat(np.arange(k), 2),
+            arrival_sigma=SIGMA,
+        )
+        return assemble(
+            station_array(place[:, best]),
+            rows_of,
+            times=times - times[0],
+            frame=ECEF,
+            constraints=[height(exactly=self.geodetic[2])],
         )
 
     def draws(self, count: int, seed: int) -> Receptions:

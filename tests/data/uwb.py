@@ -30,7 +30,7 @@ import numpy as np
 import pandas as pd
 from data.windows import Window, Windows, windowed
 
-from optloc import Motion, Noise, assemble, measured
+from optloc import Motion, Noise, Problem, assemble, measured
 from optloc.noise import Block, group
 
 ROW, ARRIVAL, INDEPENDENT = 0.10, 0.14, 0.2
@@ -61,6 +61,38 @@ def load(folder: Path, flight: str, *, shared: bool = True) -> Windows:
     if shared:
         problem = replace(problem, noise=_noise(places, covariances))
     return Windows(f"{flight}{'' if shared else ', independent rows'}", stations, windows, problem)
+
+
+def course(
+    folder: Path, flight: str, width: float, *, airborne: bool = True, until: float = np.inf
+) -> tuple[Problem, np.ndarray]:
+    """Return a flight as one run of windows next to each other, at the mean time of their rows, and the truth there.
+
+    `airborne`: from the first to the last time that the tag is higher than 0.5 m.
+    """
+    flights = pd.read_csv(folder / "flights.csv").set_index("flight")
+    anchors = pd.read_csv(folder / "stations.csv").sort_values("anchor")
+    stations = anchors[anchors["session"] == flights.loc[flight, "session"]][["x_m", "y_m", "z_m"]].to_numpy()
+    truth = pd.read_csv(folder / "truth.csv").query("flight == @flight")
+    rows = (
+        pd.read_csv(folder / "tdoa.csv").query("flight == @flight and t_s < @until").sort_values("t_s", kind="stable")
+    )
+    if airborne:
+        high = truth.loc[truth["z_m"] > AIRBORNE, "t_s"]
+        rows = rows[rows["t_s"].between(high.min(), high.max())]
+    _, epoch = np.unique(np.floor(rows["t_s"] / width), return_inverse=True)
+    times = np.bincount(epoch, rows["t_s"]) / np.bincount(epoch)
+    a, b = rows["anchor_b"].to_numpy(), rows["anchor_a"].to_numpy()
+    problem = assemble(
+        stations,
+        measured("tdoa", rows["rdiff_m"].to_numpy(), a=a, b=b, sigma=INDEPENDENT, epoch=epoch),
+        times=times,
+        motions=(Motion(span="epoch"),),
+    )
+    places = [np.flatnonzero(epoch == k) for k in range(len(times))]
+    noise = _noise(places, [_covariance(a[i], b[i], len(stations), shared=True) for i in places])
+    at = np.stack([np.interp(times, truth["t_s"], truth[c]) for c in ("x_m", "y_m", "z_m")], axis=-1)
+    return replace(problem, noise=noise), at
 
 
 def _covariance(a: np.ndarray, b: np.ndarray, stations: int, *, shared: bool) -> np.ndarray:

@@ -11,12 +11,12 @@ from optloc.problem import Problem
 from optloc.types import Array, Motion
 
 TIME_CONSTANT = 10.0
-"""The "manoeuvre constant 10": seconds after which the acceleration has forgotten 63 % of itself."""
+"""The "manoeuvre constant 10": seconds after which a deviation of the acceleration has fallen to 1/e."""
 
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """Two stations that stay, and a target whose state is written down.
+    """Two stations that stay, and a target whose states are written down.
 
     Parameters
     ----------
@@ -29,7 +29,7 @@ class Scenario:
     sigma : float
         Standard deviation of an angle, radians.
     phases : tuple of int
-        Epoch behind the last of each phase.
+        Last second of each phase.
     """
 
     name: str
@@ -53,92 +53,79 @@ class Scenario:
         """Return the true states (k + 1, 3 d), ordered [p, v, a]."""
         return self.states.reshape(len(self.states), -1)
 
-    def problem(self, order: int | None = None) -> Problem:
-        """Return the run without measurements.
-
-        Parameters
-        ----------
-        order : int, optional
-            Of the polynomial that the target follows, its state held at the last epoch; None: any course.
-        """
+    def problem(self) -> Problem:
+        """Return the run without measurements; every epoch has a position of its own."""
         count, k = len(self.stations), self.epochs
         a, epoch = np.tile(np.arange(count), k), np.repeat(np.arange(k), count)
-        times = np.arange(1.0, k + 1.0)
         kinds = ("azimuth", "elevation")[: self.dimension - 1]
-        motion = Motion(span="epoch") if order is None else Motion(order, reference=float(k))
         rows = [measured(kind, a=a, epoch=epoch, sigma=self.sigma) for kind in kinds]
-        return assemble(self.stations, *rows, times=times, motions=(motion,))
+        return assemble(self.stations, *rows, times=np.arange(1.0, k + 1.0), motions=(Motion(span="epoch"),))
+
+
+def _states(*parts: tuple[Array, Array, Array]) -> Array:
+    """Return positions, velocities and accelerations (k + 1, d) as states; each part begins where the last ended."""
+    return np.concatenate([np.stack(part, axis=1)[i > 0 :] for i, part in enumerate(parts)])
 
 
 def _straight() -> Scenario:
-    t, zero = np.arange(51.0), np.zeros(51)
-    states = np.stack(
-        [
-            np.stack([2.0 * t + 0.1 * t**2, zero], -1),
-            np.stack([2.0 + 0.2 * t, zero], -1),
-            np.stack([zero + 0.2, zero], -1),
-        ],
-        axis=1,
-    )
+    t, still = np.arange(51.0)[:, None], np.zeros((51, 2))
+    ahead = np.array([1.0, 0.0])
+    states = _states(((2.0 * t + 0.1 * t**2) * ahead, (2.0 + 0.2 * t) * ahead, still + 0.2 * ahead))
     return Scenario("simulation 1", _BASE, states, _FINE, (50,))
 
 
 def _winding() -> Scenario:
     t, rate = np.arange(51.0), np.pi / 36.0
-    sine, cosine = 10.0 * np.sin(rate * t), 10.0 * np.cos(rate * t)
-    states = np.stack(
-        [
-            np.stack([2.0 * t, sine], -1),
-            np.stack([np.full(51, 2.0), rate * cosine], -1),
-            np.stack([np.zeros(51), -(rate**2) * sine], -1),
-        ],
-        axis=1,
-    )
-    return Scenario("simulation 2", _BASE, states, _FINE, (50,))
+    wave, zero = np.exp(1j * rate * t), np.zeros(51)
+    parts = [
+        np.stack(pair, axis=-1)
+        for pair in (
+            (2.0 * t, 10.0 * wave.imag),
+            (zero + 2.0, 10.0 * rate * wave.real),
+            (zero, -10.0 * rate**2 * wave.imag),
+        )
+    ]
+    return Scenario("simulation 2", _BASE, _states((parts[0], parts[1], parts[2])), _FINE, (50,))
 
 
-def phased(name: str, speeds: tuple[float, float], seconds: tuple[int, int, int], rate: float) -> Scenario:
-    """Return simulation 3: straight, in a circle of 3 km, straight.
+def circling(name: str, slow: float, fast: float, rate: float, seconds: tuple[int, int, int]) -> Scenario:
+    """Return simulation 3: straight, in a circle, straight.
 
     Parameters
     ----------
     name : str
         For tables.
-    speeds : tuple of two float
-        On the straight parts, towards (2, 1, 0), and in the circle, m/s.
-    seconds : tuple of three int
-        How long each part lasts.
+    slow, fast : float
+        Speed on the straight parts, which begin towards (2, 1, 0), and in the circle, m/s.
     rate : float
         Turn to the left, radians per second.
+    seconds : tuple of three int
+        How long each part lasts.
+
+    Notes
+    -----
+    The last part has the velocity of the first, as printed, whatever the heading at the end of the circle.
     """
-    along, across = np.array([2.0, 1.0, 0.0]) / np.sqrt(5.0), np.array([-1.0, 2.0, 0.0]) / np.sqrt(5.0)
-    slow, fast = speeds
-    radius, turn = fast / rate, rate * seconds[1]
+    ahead, left = np.array([2.0, 1.0, 0.0]) / np.sqrt(5.0), np.array([-1.0, 2.0, 0.0]) / np.sqrt(5.0)
     one, two, three = (np.arange(n + 1.0)[:, None] for n in seconds)
-    leave = np.array([-10e3, 50e3, 10e3]) + slow * seconds[0] * along
+    begin, radius = np.array([-10e3, 50e3, 10e3]), fast / rate
+    leave = begin + slow * seconds[0] * ahead
     sine, cosine = np.sin(rate * two), np.cos(rate * two)
-    circle = [
-        leave + radius * (sine * along + (1.0 - cosine) * across),
-        fast * (cosine * along + sine * across),
-        fast * rate * (cosine * across - sine * along),
-    ]
-    heading = np.cos(turn) * along + np.sin(turn) * across
-    # Where the heading has turned back, the paper's velocity is that of its first part again.
-    heading = heading if slow == fast else along
-    parts = [
-        [np.array([-10e3, 50e3, 10e3]) + slow * one * along, slow * along + 0.0 * one, 0.0 * one * along],
-        circle,
-        [circle[0][-1] + slow * three * heading, slow * heading + 0.0 * three, 0.0 * three * heading],
-    ]
-    states = np.concatenate([np.stack(part, axis=1)[i > 0 :] for i, part in enumerate(parts)])
+    circle = leave + radius * (sine * ahead + (1.0 - cosine) * left)
+    states = _states(
+        (begin + slow * one * ahead, slow * ahead + 0.0 * one, 0.0 * one * ahead),
+        (circle, fast * (cosine * ahead + sine * left), fast * rate * (cosine * left - sine * ahead)),
+        (circle[-1] + slow * three * ahead, slow * ahead + 0.0 * three, 0.0 * three * ahead),
+    )
     ends = np.cumsum(seconds)
-    return Scenario(name, _WIDE, states, 5e-3, tuple(int(end) for end in ends))
+    return Scenario(name, _WIDE, states, 5e-3, (int(ends[0]), int(ends[1]), int(ends[2])))
 
 
 _BASE = np.array([[0.0, 50.0], [0.0, 100.0]])
 _WIDE = np.array([[-40e3, 0.0, 0.0], [40e3, 0.0, 0.0]])
 _FINE = float(np.deg2rad(1e-3))
-_RATE = 0.157
+_RATE, _RADIUS = 0.157, 3e3
+_PRINTED = (1500, 500, 1000)
 
 STRAIGHT = _straight()
 """Simulation 1: constant acceleration. The stations and the place at t = 0 lie on one line."""
@@ -146,8 +133,11 @@ STRAIGHT = _straight()
 WINDING = _winding()
 """Simulation 2: a sine."""
 
-REPAIRED = phased("repaired", (150.0 * np.pi, 150.0 * np.pi), (100, 40, 100), np.pi / 20.0)
-"""Simulation 3 with one speed, one full turn and straight parts of 100 s."""
+REPAIRED = circling("repaired", _RADIUS * np.pi / 20.0, _RADIUS * np.pi / 20.0, np.pi / 20.0, (100, 40, 100))
+"""Simulation 3 with one speed, 471 m/s, one full turn in 40 s, and straight parts of 100 s."""
 
-SLOW = phased("m/s", (np.hypot(0.2, 0.1) * 1e3, 3e3 * _RATE), (1500, 500, 1000), _RATE)
-"""Simulation 3 as printed."""
+READINGS = (
+    circling("as printed, in m/s", float(np.hypot(0.2, 0.1)), _RADIUS * _RATE, _RATE, _PRINTED),
+    circling("as printed, in km/s", 1e3 * float(np.hypot(0.2, 0.1)), _RADIUS * _RATE, _RATE, _PRINTED),
+)
+"""Simulation 3 as printed: the speed of the straight parts has no unit."""

@@ -1,0 +1,196 @@
+r"""A polynomial course from bearings of many epochs: pseudo-linear least squares, then one instrumental-variable pass.
+
+A target at :math:`p(t) = \sum_j c_j t^j`, seen at time t from S with azimuth A and elevation E, meets, linearly in c,
+
+.. math:: g^\top \Bigl(\sum_j c_j t^j - S\Bigr) = 0, \quad g_A = (\sin A, -\cos A, 0), \quad
+   g_E = (\sin E \cos A, \sin E \sin A, -\cos E),
+
+with errors :math:`\rho \sin n_A` and, to first order, :math:`D n_E` (horizontal and slant range). With rows
+:math:`G_{kj} = t_k^j g_k`, right sides :math:`b = g^\top S` and weights W:
+
+- *plain*: :math:`\min |W_0 (G c - b)|^2`, :math:`W_0 = 1/\sigma`;
+- *weighted*: the same with :math:`1/(\rho \sigma_A)`, :math:`1/(D \sigma_E)` on the course before;
+- *instrumental*: :math:`Z^\top W^2 (G c - b) = 0`, `Z` being `G` at the angles predicted by the weighted course. A run
+  has many rays, and the noise in `G` is what biases the first two, more than it scatters them; `Z` does not share it.
+
+No epoch needs a fix of its own: one station that manoeuvres may do.
+
+Source: K. Dogancay, "Bias compensation for the bearings-only pseudolinear target track estimator", IEEE Trans. Signal
+Process. 54 (2006), and "3D pseudolinear target motion analysis from angle measurements", IEEE Trans. Signal Process.
+63 (2015).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from formulations._polynomial import span, uncentred
+from formulations.bearing_ls import Rays, rays
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+_RANK = 1e-10  # singular value, over the largest one, of scaled rows that counts as zero
+_NEAR = 1e-6  # shortest range, over the size of the array, that a weight is computed from
+
+
+@dataclass(frozen=True, slots=True)
+class Courses:
+    """Pseudo-linear courses of a batch.
+
+    Parameters
+    ----------
+    plain, weighted, instrumental : Array, shape (N, order + 1, d)
+        Position, velocity, half the acceleration at time zero; NaN where the rows do not determine them.
+    ok : Mask, shape (N,)
+        Where the instrumental course exists.
+    ahead : Mask, shape (N,)
+        Where it also lies in front of the stations at every bearing.
+    """
+
+    plain: Array
+    weighted: Array
+    instrumental: Array
+    ok: Mask
+    ahead: Mask
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    """What was seen: stations (N, m, d), axes, times as powers (N, m, order + 1), rows and right sides."""
+
+    station: Array
+    axes: Array | None
+    powers: Array
+    normal: Array
+    right: Array
+    both: bool
+    least: Array
+
+    def design(self, normal: Array) -> Array:
+        """Return the rows G, shape (N, rows, n), made of normals (N, rows, d)."""
+        powers = np.concatenate([self.powers, self.powers], axis=1) if self.both else self.powers
+        return (powers[..., :, None] * normal[..., None, :]).reshape(*normal.shape[:2], -1)
+
+    def line(self, c: Array) -> Array:
+        """Return the lines of sight (N, m, d) to a course, in the frame of the stations."""
+        return np.asarray(self.powers @ c - self.station)
+
+    def own(self, line: Array) -> Array:
+        """Return lines of sight in the axes of each station."""
+        return line if self.axes is None else np.einsum("nmij,nmj->nmi", self.axes, line)
+
+    def lengths(self, c: Array) -> Array:
+        """Return horizontal, then slant ranges: what turns an angle's error into a row's."""
+        line = self.own(self.line(c))
+        flat = np.maximum(np.hypot(line[..., 0], line[..., 1]), self.least)
+        return np.concatenate([flat, np.hypot(flat, line[..., 2])], axis=-1) if self.both else flat
+
+    def predicted(self, c: Array) -> Rays:
+        """Return the directions in which a course would have been seen."""
+        line = self.own(self.line(c))
+        flat = np.hypot(line[..., 0], line[..., 1])
+        azimuth = np.arctan2(line[..., 1], line[..., 0])
+        return rays(azimuth, np.arctan2(line[..., 2], flat) if self.both else None, self.axes)
+
+
+def sighted_courses(
+    azimuth: ArrayLike,
+    station: ArrayLike,
+    time: ArrayLike,
+    weight: ArrayLike,
+    *,
+    elevation: ArrayLike | None = None,
+    elevation_weight: ArrayLike | None = None,
+    axes: Array | None = None,
+    order: int = 1,
+    passes: int = 2,
+) -> Courses:
+    """Fit a polynomial course to bearings without a guess.
+
+    Parameters
+    ----------
+    azimuth, elevation : array_like, shape (N, m)
+        Radians, in the axes given; elevations are needed where the stations are in space.
+    station : array_like, shape (N, m, d)
+        Where each bearing was taken from, numbers of order one.
+    time : array_like, shape (m,)
+        When.
+    weight, elevation_weight : array_like, shape (N, m)
+        One over the standard deviation; zero where the angle is absent (its value is then not read).
+    axes : array_like, shape (N, m, d, d), optional
+        Rows are the unit vectors of each station's axes; None: those of the frame.
+    order : int
+        0: static, 1: constant velocity, 2: constant acceleration.
+    passes : int
+        Weighted passes before the instrumental one.
+
+    Returns
+    -------
+    Courses
+        Three courses per item and whether they exist.
+
+    Notes
+    -----
+    Dogancay (2006, 2015); rows are triangularised, not squared. An item that is singular or not finite changes nothing
+    in the others.
+    """
+    S, wA = np.asarray(station, dtype=np.float64), np.asarray(weight, dtype=np.float64)
+    use = wA > 0.0
+    A, both = np.where(use, azimuth, 0.0), S.shape[-1] == 3
+    E = wE = np.zeros_like(wA)
+    if both and elevation is not None and elevation_weight is not None:
+        wE = np.where(use, elevation_weight, 0.0)
+        E = np.where(wE > 0.0, elevation, 0.0)
+    W = np.concatenate([wA, wE], axis=-1) if both else wA
+    when = np.broadcast_to(np.asarray(time, dtype=np.float64), wA.shape)
+    with np.errstate(all="ignore"):
+        middle, half = span(when, use)
+        powers = ((when - middle) / half)[..., None] ** np.arange(order + 1.0)
+        seen = rays(A, E if both else None, axes)
+        run = _run(S, axes, powers, seen, both)
+        G = run.design(run.normal)
+        c = plain = _balance(G, G, run.right, W, order)
+        for _ in range(passes):
+            c = _balance(G, G, run.right, W / run.lengths(c), order)
+        final = _balance(run.design(_normals(run.predicted(c))), G, run.right, W / run.lengths(c), order)
+        front = (run.line(final) * seen.ahead).sum(axis=-1) > 0.0
+        ok = np.asarray(np.isfinite(final).all(axis=(-2, -1)))
+        three = [uncentred(each, middle, half) for each in (plain, c, final)]
+    return Courses(three[0], three[1], three[2], ok, ok & (front | ~use).all(axis=-1))
+
+
+def _run(S: Array, axes: Array | None, powers: Array, seen: Rays, both: bool) -> _Run:
+    normal = _normals(seen)
+    right = (normal * (np.concatenate([S, S], axis=1) if both else S)).sum(axis=-1)
+    size = np.sqrt((S * S).sum(axis=-1)).max(axis=-1, keepdims=True)
+    return _Run(S, axes, powers, normal, right, both, np.maximum(_NEAR * size, 1e-300))
+
+
+def _normals(seen: Rays) -> Array:
+    """Rows ``g`` (up to sign): the azimuths' first, then the elevations'."""
+    return seen.across if seen.upward is None else np.concatenate([seen.across, seen.upward], axis=-2)
+
+
+def _balance(Z: Array, G: Array, b: Array, W: Array, order: int) -> Array:
+    """Solve ``Z' W^2 (G c - b) = 0``, shape (N, order + 1, d); NaN where it has no single solution."""
+    n = G.shape[-1]
+    share = np.where(W > 0.0, W / W.max(axis=-1, keepdims=True), 0.0)[..., None]
+    left, right = share * Z, np.concatenate([share * G, share * b[..., None]], axis=-1)
+    good = np.isfinite(left).all(axis=(-2, -1)) & np.isfinite(right).all(axis=(-2, -1))
+    left, right = (np.where(good[:, None, None], part, 0.0) for part in (left, right))
+    short = max(0, n - left.shape[1])
+    left, right = (np.pad(part, ((0, 0), (0, short), (0, 0))) for part in (left, right))
+    sizes = np.sqrt((right[..., :n] ** 2).sum(axis=-2))
+    good &= (sizes > 0.0).all(axis=-1)
+    sizes = np.where(sizes > 0.0, sizes, 1.0)
+    base = np.linalg.qr(left)[0]
+    small = np.swapaxes(base, -1, -2) @ right
+    U, size, V = np.linalg.svd(small[..., :n] / sizes[:, None])
+    good &= size[:, -1] > _RANK * size[:, 0]
+    inverse = np.where(good[:, None], 1.0 / np.where(good[:, None], size, 1.0), np.nan)
+    c = np.einsum("nji,nj->ni", V, inverse * np.einsum("nkj,nk->nj", U, small[..., n])) / sizes
+    return np.asarray(c.reshape(len(c), order + 1, -1), dtype=np.float64)

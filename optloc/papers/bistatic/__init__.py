@@ -1,0 +1,1 @@
+"""Location of slow targets by one receiver with one illuminator: excess path, azimuth and elevation."""

@@ -1,0 +1,1 @@
+"""Tracking of ships by the time differences of three satellites and a known height: four Kalman filters."""

@@ -1,0 +1,219 @@
+"""Tracks: where targets went, how sure that is, and whether the innovations agree."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optloc.ellipse import error_ellipse
+from optloc.frames import Frame
+from optloc.plot.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, YELLOW, figure_class
+from optloc.problem import Problem
+from optloc.track.run import Entry
+from optloc.types import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_CYCLE = (BLUE, GREEN, PURPLE, SKY, YELLOW)
+_ELLIPSES = 25
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """One target's track.
+
+    Parameters
+    ----------
+    name : str
+        Of the target.
+    problem : Problem
+        Its run: gives the stations and the frame.
+    entries : tuple of Entry
+        What became of its scans.
+    """
+
+    name: str
+    problem: Problem
+    entries: tuple[Entry, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Line:
+    name: str
+    times: Array
+    position: Array
+    cov: Array
+    sigma: Array
+    nis: Array
+    count: Array
+    starts: Array
+    bad: Array
+
+
+def plot_tracks(drawn: Sequence[Drawn], title: str = "") -> Figure:
+    """Return a picture of tracks: plan, in three dimensions the height, sigma of the position, and NIS against time.
+
+    Parameters
+    ----------
+    drawn : sequence of Drawn
+        At least one target; ECEF is drawn along east, north and up at the stations' centre, or at the first position
+        where the stations are further than that from the ground.
+    title : str
+        Title of the picture.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        To be written with `optloc.plot.save`.
+    """
+    lines, stations, axes = _along(drawn)
+    names = ["height", "sigma", "nis"][3 - stations.shape[-1] :]
+    figure = figure_class()(figsize=(12.5, 2.4 + 2.2 * len(names)), layout="constrained")
+    panels = figure.subplot_mosaic([["plan", name] for name in names])
+    _plan(panels["plan"], lines, stations, axes)
+    if "height" in panels:
+        _heights(panels["height"], lines, axes[2])
+    _sigmas(panels["sigma"], lines)
+    _innovations(panels["nis"], lines)
+    for name in names:
+        panels[name].grid(color=GREY, alpha=0.35, linewidth=0.6)
+        panels[name].sharex(panels[names[-1]]) if name != names[-1] else panels[name].set_xlabel("time (s)")
+    handles, labels = panels["plan"].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False)
+    if title:
+        figure.suptitle(title)
+    return figure
+
+
+def _along(drawn: Sequence[Drawn]) -> tuple[list[_Line], Array, tuple[str, ...]]:
+    """Return tracks and stations (s, d) of the first scan along the picture's axes, and the axes' names."""
+    first = drawn[0].problem
+    d = first.dimension
+    stations = first.stations.position.reshape(-1, first.stations.count, d)[0]
+    lines = [_line(each, d) for each in drawn]
+    axes = ("east", "north", "up") if first.frame.geodetic else ("x", "y", "z")
+    if first.frame.kind != "ecef":
+        return lines, stations, axes[:d]
+    known = [line.position[np.isfinite(line.position).all(-1)] for line in lines]
+    lat, lon, height = first.frame.to_geodetic(next((p[0] for p in known if len(p)), stations.mean(0)))
+    local = Frame("enu", (float(lat), float(lon), float(height)))
+    turn = local.rotation_to_ecef().T
+    moved = [_Line(n.name, n.times, local.from_ecef(n.position), turn @ n.cov @ turn.T, *_rest(n)) for n in lines]
+    return moved, local.from_ecef(stations), axes
+
+
+def _rest(line: _Line) -> tuple[Array, Array, Array, Array, Array]:
+    return line.sigma, line.nis, line.count, line.starts, line.bad
+
+
+def _line(drawn: Drawn, d: int) -> _Line:
+    entries = drawn.entries
+    cov = np.stack([e.updated.cov[:d, :d] for e in entries])
+    return _Line(
+        drawn.name,
+        np.array([e.time for e in entries]),
+        np.stack([e.updated.mean[:d] for e in entries]),
+        cov,
+        np.sqrt(np.trace(cov, axis1=-2, axis2=-1)),
+        np.array([float(e.updated.nis) for e in entries]),
+        np.array([int(e.updated.count) for e in entries]),
+        np.array([e.event in ("started", "restarted") for e in entries]),
+        np.array([bool(e.code) for e in entries]),
+    )
+
+
+def _coloured(lines: Sequence[_Line]) -> list[tuple[_Line, str]]:
+    return [(line, _CYCLE[i % len(_CYCLE)]) for i, line in enumerate(lines)]
+
+
+def _plan(panel: Axes, lines: Sequence[_Line], stations: Array, axes: Sequence[str]) -> None:
+    position = np.concatenate([line.position for line in lines])[:, :2]
+    known = position[np.isfinite(position).all(-1)]
+    spots = stations[_near(stations[:, :2], known), :2]
+    unit, size = ("km", 1e3) if np.abs(np.concatenate([spots, known])).max(initial=0.0) >= 5e3 else ("m", 1.0)
+    if len(spots):
+        panel.scatter(
+            spots[:, 0] / size, spots[:, 1] / size, marker="^", s=50, color=BLACK, label="station, first scan", zorder=3
+        )
+    for i, (line, colour) in enumerate(_coloured(lines)):
+        path = line.position[:, :2] / size
+        panel.plot(*path.T, color=colour, linewidth=1.5, zorder=4, label=line.name if len(lines) > 1 else "track")
+        marks: dict[str, Any] = {"marker": "o", "s": 45, "color": colour, "edgecolors": BLACK, "zorder": 6}
+        panel.scatter(path[line.starts, 0], path[line.starts, 1], label=None if i else "start, from a fix", **marks)
+        if line.bad.any():
+            panel.scatter(
+                path[line.bad, 0], path[line.bad, 1], marker="x", s=22, color=ORANGE, zorder=5, label="status not ok"
+            )
+        _ellipses(panel, line, size, None if i else "95 % ellipse")
+    panel.set_aspect("equal", adjustable="datalim")
+    panel.set_xlabel(f"{axes[0]} ({unit})")
+    panel.set_ylabel(f"{axes[1]} ({unit})")
+    panel.set_title("plan")
+    panel.grid(color=GREY, alpha=0.35, linewidth=0.6)
+
+
+def _near(stations: Array, known: Array) -> Array:
+    """Return the stations (s,) that a picture of positions (n, 2) can hold: satellites are out of it."""
+    if not len(known):
+        return np.ones(len(stations), dtype=bool)
+    centre, extent = known.mean(0), max(float(np.ptp(known, axis=0).max()), 1.0)
+    return np.asarray(np.linalg.norm(stations - centre, axis=-1) < 100.0 * extent)
+
+
+def _ellipses(panel: Axes, line: _Line, size: float, label: str | None) -> None:
+    known = np.flatnonzero(np.isfinite(line.cov).all((-1, -2)))
+    angle = np.linspace(0.0, 2.0 * np.pi, 91)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    for i in known[:: max(1, len(known) // _ELLIPSES)]:
+        semi_axes, directions = error_ellipse(line.cov[i, :2, :2])
+        ring = (line.position[i, :2] + circle * semi_axes @ directions.T) / size
+        panel.plot(*ring.T, color=GREY, linewidth=0.8, zorder=2, label=label)
+        label = None
+
+
+def _heights(panel: Axes, lines: Sequence[_Line], name: str) -> None:
+    for line, colour in _coloured(lines):
+        sigma = np.sqrt(line.cov[:, 2, 2])
+        panel.plot(line.times, line.position[:, 2], color=colour, linewidth=1.2)
+        band = (line.position[:, 2] - 1.96 * sigma, line.position[:, 2] + 1.96 * sigma)
+        panel.fill_between(line.times, *band, color=colour, alpha=0.2, linewidth=0.0)
+    panel.set_ylabel(f"{name} (m)")
+    panel.set_title("height, and 95 % of it")
+
+
+def _sigmas(panel: Axes, lines: Sequence[_Line]) -> None:
+    for line, colour in _coloured(lines):
+        panel.plot(line.times, line.sigma, color=colour, linewidth=1.2)
+    _decades(panel)
+    panel.set_ylabel("sigma (m)")
+    panel.set_title("standard deviation of the position, all axes together")
+
+
+def _innovations(panel: Axes, lines: Sequence[_Line]) -> None:
+    """Draw the NIS, and the 99.9 % that the chi-square of as many rows allows."""
+    from scipy.special import gammaincinv
+
+    for i, (line, colour) in enumerate(_coloured(lines)):
+        tested = np.isfinite(line.nis) & (line.count > 0)
+        panel.plot(line.times[tested], line.nis[tested], color=colour, linestyle="", marker=".", markersize=4)
+        limit = 2.0 * gammaincinv(0.5 * np.maximum(line.count, 1), 0.999)
+        label = None if i else "99.9 % of the chi-square"
+        panel.plot(line.times, np.where(tested, limit, np.nan), color=ORANGE, linewidth=1.0, label=label)
+    _decades(panel)
+    panel.set_ylabel("NIS")
+    panel.set_title("normalised innovation squared of each scan")
+    panel.legend(frameon=False, fontsize=8, loc="lower right")
+
+
+def _decades(panel: Axes) -> None:
+    """Make the vertical axis logarithmic with plain numbers."""
+    from matplotlib.ticker import LogFormatter
+
+    panel.set_yscale("log")
+    panel.yaxis.set_major_formatter(LogFormatter(labelOnlyBase=False))
+    panel.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False, minor_thresholds=(2, 0.5)))

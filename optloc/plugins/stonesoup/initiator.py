@@ -1,0 +1,163 @@
+"""An initiator of Stone Soup that needs no guess: it gathers scans until they determine the state."""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from stonesoup.base import Property
+from stonesoup.initiator.base import GaussianInitiator
+from stonesoup.types.array import CovarianceMatrix, StateVector
+from stonesoup.types.hypothesis import SingleHypothesis
+from stonesoup.types.track import Track
+from stonesoup.types.update import GaussianStateUpdate
+
+from optloc.errors import InvalidProblem
+from optloc.fix import Fix
+from optloc.plugins.stonesoup.models import StationMeasurement, problem_of, rows_by_kind, values_of
+from optloc.problem import Problem
+from optloc.solve import solve
+from optloc.status import Status
+from optloc.types import Motion, Prior
+
+# A fix is trusted as a Gaussian where no other minimum costs less than this more, and where its largest standard
+# deviation is below this share of the nearest range.
+_GAP, _FLAT = 25.0, 0.05
+_REMEMBERED = 40
+
+
+@dataclass(frozen=True, slots=True)
+class _Chain:
+    """Detections that may be of one target, and their fix."""
+
+    detections: tuple[Any, ...]
+    fix: Fix
+    p: float
+
+    @property
+    def last(self) -> dt.datetime:
+        return self.detections[-1].timestamp  # type: ignore[no-any-return]
+
+
+class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
+    """Begins tracks with optloc's fix of as many scans as it takes, with its covariance.
+
+    Every detection is a scan of one target, its measurement model one of this plug-in, and its stations, which may
+    move, the same throughout. Detections of several targets are told apart by the chi-square of the fix that they would
+    have together. A chain of them becomes a track once position and velocity are determined, unique and nearly
+    Gaussian: no other minimum within a cost gap of 25, standard deviation below 5 % of the nearest range.
+    """
+
+    velocity_mapping: Sequence[int] | None = Property(
+        default=None, doc="Places of the velocity in the state; by default those after the position's."
+    )
+    order: int = Property(default=1, doc="1 for a state with velocity, 0 for one without.")
+    speed: float | None = Property(
+        default=None,
+        doc="Prior standard deviation of each coordinate of the velocity about zero, m/s; a single scan may then do.",
+    )
+    limit: int = Property(default=10, doc="Scans after which a chain that is not clear is given up.")
+    least_p: float = Property(default=1e-3, doc="Chains whose chi-square is less likely are not of one target.")
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        if self.order not in (0, 1):
+            raise InvalidProblem(f"a motion of order {self.order}", "order", "use 0 or 1")
+        self._chains: list[_Chain] = []
+
+    def initiate(self, detections: Any, timestamp: dt.datetime, **kwargs: Any) -> set[Track]:
+        """Return the tracks that begin with some of the detections that belong to no track yet.
+
+        Raises
+        ------
+        InvalidProblem
+            For a detection whose measurement model is not one of this plug-in.
+        """
+        tracks, grown = set(), []
+        for detection in sorted(detections, key=lambda d: (d.timestamp, tuple(values_of(d)))):
+            chain = self._extended(detection)
+            if self._clear(chain):
+                tracks.add(self._track(chain))
+            elif len(chain.detections) < self.limit:
+                grown.append(chain)
+        # What no detection has continued for long is forgotten: false alarms must not pile up.
+        self._chains = [*self._chains, *grown][-_REMEMBERED:]
+        return tracks
+
+    def _extended(self, detection: Any) -> _Chain:
+        """Return the most likely chain that a detection continues, which is then taken, or a new one."""
+        if not isinstance(detection.measurement_model, StationMeasurement):
+            what = f"a detection has the measurement model {type(detection.measurement_model).__name__}"
+            raise InvalidProblem(what, "initiator", "use TDOA, GROA or AOATDOA of this plug-in")
+        tried = [
+            (self._chain((*chain.detections, detection)), chain)
+            for chain in self._chains
+            if chain.last < detection.timestamp and _alike(chain.detections[-1], detection)
+        ]
+        fitting = [(new, old) for new, old in tried if new.p >= self.least_p]
+        if not fitting:
+            return self._chain((detection,))
+        new, old = max(fitting, key=lambda pair: (len(pair[0].detections), pair[0].p))
+        self._chains.remove(old)
+        return new
+
+    def _chain(self, detections: tuple[Any, ...]) -> _Chain:
+        fix = solve(self._problem(detections))
+        p = float(fix.p_value)
+        return _Chain(detections, fix, 1.0 if np.isnan(p) else p)
+
+    def _problem(self, detections: tuple[Any, ...]) -> Problem:
+        models = [detection.measurement_model for detection in detections]
+        last = detections[-1].timestamp
+        times = np.array([(detection.timestamp - last).total_seconds() for detection in detections])
+        d = len(models[0].mapping)
+        priors = [Prior("velocity", np.zeros(d), self.speed**2 * np.eye(d))] if self.order and self.speed else []
+        problem = problem_of(
+            np.stack([model.stations for model in models]),
+            [model.rows for model in models],
+            [model.covar() for model in models],
+            times=times,
+            motions=(Motion(self.order, reference=0.0),),
+            priors=priors,
+        )
+        z = np.concatenate([values_of(detection) for detection in detections])
+        return problem.with_rows(z=z[rows_by_kind([model.rows for model in models])[1]])
+
+    def _clear(self, chain: _Chain) -> bool:
+        """Return whether a fix is the only one, and nearly Gaussian."""
+        fix = chain.fix
+        if fix.status != Status.OK or chain.p < self.least_p or (fix.alternatives.gap < _GAP).any():
+            return False
+        stations = chain.detections[-1].measurement_model.stations
+        nearest = np.linalg.norm(stations - fix.position, axis=-1).min()
+        return bool(np.sqrt(np.linalg.eigvalsh(fix.covariance())[-1]) < _FLAT * nearest)
+
+    def _track(self, chain: _Chain) -> Track:
+        detection = chain.detections[-1]
+        model = detection.measurement_model
+        place = [*model.mapping, *self._rates(model)]
+        mean, cov = chain.fix.gaussian()
+        vector, covariance = np.zeros((model.ndim_state, 1)), np.zeros((model.ndim_state,) * 2)
+        vector[place, 0] = mean
+        covariance[np.ix_(place, place)] = cov
+        update = GaussianStateUpdate(
+            StateVector(vector),
+            CovarianceMatrix(covariance),
+            hypothesis=SingleHypothesis(None, detection),
+            timestamp=detection.timestamp,
+        )
+        return Track([update])
+
+    def _rates(self, model: StationMeasurement) -> Sequence[int]:
+        if not self.order:
+            return []
+        return [i + 1 for i in model.mapping] if self.velocity_mapping is None else list(self.velocity_mapping)
+
+
+def _alike(one: Any, two: Any) -> bool:
+    """Return whether two detections can be scans of one run."""
+    a, b = one.measurement_model, two.measurement_model
+    return a.stations.shape == b.stations.shape and list(a.mapping) == list(b.mapping)

@@ -1,0 +1,234 @@
+"""Measurement models of Stone Soup whose functions, derivatives and inverses are those of optloc."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from stonesoup.base import Property, clearable_cached_property
+from stonesoup.models.base import ReversibleModel
+from stonesoup.models.measurement.nonlinear import NonLinearGaussianMeasurement
+from stonesoup.types.angle import Bearing, Elevation
+from stonesoup.types.array import StateVector, StateVectors
+
+from optloc.build import assemble, measured
+from optloc.errors import InvalidProblem
+from optloc.evaluate import predict
+from optloc.linear import linearise
+from optloc.noise import Block, arrivals, group
+from optloc.problem import Problem
+from optloc.solve import solve
+from optloc.status import Status
+from optloc.types import Array
+
+_TYPES = {"azimuth": Bearing, "elevation": Elevation}
+
+Row = tuple[str, int, int]
+"""Kind, first and second station; -1 where the kind takes none."""
+
+
+def arrival_covariance(pairs: Any, sigma: Any, stations: int) -> Array:
+    """Return the covariance (m, m) of differences of arrivals, in square metres: rows that share a station correlate.
+
+    Parameters
+    ----------
+    pairs : int array (m, 2)
+        Stations a and b of each row.
+    sigma : float or array (s,)
+        Standard deviation of each station's arrival, metres.
+    stations : int
+        Number of stations s.
+    """
+    index = np.atleast_2d(np.asarray(pairs, dtype=int))
+    variance = np.broadcast_to(np.asarray(sigma, dtype=float) ** 2, (stations,))
+    return np.asarray(arrivals([(index[None, :, 0], 1), (index[None, :, 1], -1)], variance)[0])
+
+
+class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  # type: ignore[misc]  # untyped bases
+    """What stations at given positions measure of a target; base of the models below.
+
+    Moving stations: give each detection a model of its own. Azimuths go from +x towards +y, elevations up from the
+    plane, ranges and their differences are in metres.
+
+    Raises
+    ------
+    InvalidProblem
+        Where stations, mapping or rows do not fit together, or for a rotation offset: turn the frame instead.
+    """
+
+    stations: np.ndarray = Property(doc="Positions (s, d) of the stations, metres.")
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.stations = np.asarray(self.stations, dtype=float)
+        if np.any(np.asarray(self.rotation_offset, dtype=float)):
+            raise InvalidProblem("there is a rotation offset", "rotation_offset", "give positions in a turned frame")
+        if self.stations.ndim != 2 or self.stations.shape[1] != len(self.mapping):
+            what = f"stations have shape {self.stations.shape} and {len(self.mapping)} coordinates are mapped"
+            raise InvalidProblem(what, "stations", "give an array (stations, 2 or 3)")
+        if np.shape(self.noise_covar) != (self.ndim_meas, self.ndim_meas):
+            what = f"the covariance has shape {np.shape(self.noise_covar)} for {self.ndim_meas} rows"
+            raise InvalidProblem(what, "noise_covar", "give one row and column for each row of the measurement")
+
+    @property
+    @abstractmethod
+    def rows(self) -> Sequence[Row]:
+        """Return kind and stations of each row of the measurement."""
+
+    @property
+    def ndim_meas(self) -> int:
+        """Return the number of rows."""
+        return len(self.rows)
+
+    @clearable_cached_property("stations", "noise_covar")  # type: ignore[untyped-decorator]
+    def problem(self) -> Problem:
+        """Return the optloc problem of one measurement: an unknown position, values of zero."""
+        return problem_of(self.stations[None], [self.rows], [np.asarray(self.noise_covar, dtype=float)])
+
+    def function(self, state: Any, noise: Any = False, **kwargs: Any) -> Any:
+        """Return the measurement (m, 1) of a state, or (m, N) of N of them, with noise if wanted."""
+        position = np.asarray(state.state_vector, dtype=float)[list(self.mapping)].T
+        values = self._ordered(predict(self.problem, position).T)
+        if isinstance(noise, bool) or noise is None:
+            noise = self.rvs(num_samples=values.shape[1], **kwargs) if noise else 0
+        return self._typed(values) + noise
+
+    def jacobian(self, state: Any, **kwargs: Any) -> Array:
+        """Return the derivative (m, n) of the measurement with respect to the state."""
+        position = np.asarray(state.state_vector, dtype=float)[list(self.mapping), 0]
+        out = np.zeros((self.ndim_meas, self.ndim_state))
+        out[:, list(self.mapping)] = self._ordered(linearise(self.problem, position).shared)
+        return out
+
+    def inverse_function(self, detection: Any, **kwargs: Any) -> Any:
+        """Return the state (n, 1) with the position that fits a detection best, found without a guess; else zeros.
+
+        Raises
+        ------
+        NotImplementedError
+            Where the detection has no clean fix of its own; initiators of Stone Soup can skip such ones.
+        """
+        fix = solve(self.problem.with_rows(z=values_of(detection)[self.order]))
+        if fix.status != Status.OK:
+            raise NotImplementedError(Status(int(fix.code)).sentence)
+        out = np.zeros((self.ndim_state, 1))
+        out[list(self.mapping), 0] = fix.position
+        return out.view(StateVector)
+
+    def rvs(self, num_samples: int = 1, **kwargs: Any) -> Any:
+        """Return samples (m, N) of the noise."""
+        drawn = np.asarray(super().rvs(num_samples, **kwargs), dtype=float)
+        return self._typed(drawn.reshape(self.ndim_meas, num_samples))
+
+    def logpdf(self, state1: Any, state2: Any, **kwargs: Any) -> Any:
+        """Return the logarithm of the density of a measurement given a state, angles wrapped."""
+        from scipy.stats import multivariate_normal
+
+        off = np.asarray(state1.state_vector - self.function(state2), dtype=float)
+        return multivariate_normal.logpdf(off.T, cov=np.asarray(self.covar(**kwargs), dtype=float))
+
+    @property
+    def order(self) -> Array:
+        """Return the place in the measurement of each row of `problem`, which keeps kinds together."""
+        return rows_by_kind([self.rows])[1]
+
+    def _ordered(self, values: Array) -> Array:
+        """Return values (m, N) of the rows of `problem` in the order of the measurement."""
+        out = np.empty_like(values)
+        out[self.order] = values
+        return out
+
+    def _typed(self, values: Array) -> Any:
+        """Return values (m, N) with the angles among them as angles."""
+        kind: Any = StateVector if values.shape[1] == 1 else StateVectors
+        if not any(row[0] in _TYPES for row in self.rows):
+            return kind(values)
+        typed = values.astype(object)
+        for i, (name, _, _) in enumerate(self.rows):
+            if name in _TYPES:
+                typed[i] = [_TYPES[name](value) for value in values[i]]
+        return kind(typed)
+
+
+class TDOA(StationMeasurement):
+    """Range differences r_a - r_b of pairs of stations, metres."""
+
+    pairs: np.ndarray = Property(doc="Stations a and b (m, 2) of each row.")
+
+    @property
+    def rows(self) -> Sequence[Row]:
+        """Return kind and stations of each row."""
+        return [("tdoa", int(a), int(b)) for a, b in np.atleast_2d(self.pairs)]
+
+
+class GROA(StationMeasurement):
+    """Gain ratios r_a / r_b of pairs of stations."""
+
+    pairs: np.ndarray = Property(doc="Stations a and b (m, 2) of each row.")
+
+    @property
+    def rows(self) -> Sequence[Row]:
+        """Return kind and stations of each row."""
+        return [("groa", int(a), int(b)) for a, b in np.atleast_2d(self.pairs)]
+
+
+class AOATDOA(StationMeasurement):
+    """Azimuths, in space then elevations, of some stations; then range differences r_a - r_b of pairs, metres."""
+
+    angles: np.ndarray = Property(doc="Stations (q,) that measure angles.")
+    pairs: np.ndarray = Property(doc="Stations a and b (m, 2) of each range difference.")
+
+    @property
+    def rows(self) -> Sequence[Row]:
+        """Return kind and stations of each row."""
+        kinds = ("azimuth", "elevation")[: len(self.mapping) - 1]
+        seen = [(kind, int(a), -1) for kind in kinds for a in np.atleast_1d(self.angles)]
+        return [*seen, *(("tdoa", int(a), int(b)) for a, b in np.atleast_2d(self.pairs))]
+
+
+def values_of(detection: Any) -> Array:
+    """Return the values (m,) of a detection."""
+    return np.asarray(detection.state_vector, dtype=float)[:, 0]
+
+
+def rows_by_kind(scans: Sequence[Sequence[Row]]) -> tuple[dict[str, list[tuple[int, int, int]]], Array]:
+    """Return (a, b, scan) of the rows of each kind, and the place of each in the scans one after the other."""
+    found: dict[str, list[tuple[int, int, int]]] = {}
+    places: dict[str, list[int]] = {}
+    every = [(k, row) for k, rows in enumerate(scans) for row in rows]
+    for i, (k, (kind, a, b)) in enumerate(every):
+        found.setdefault(kind, []).append((a, b, k))
+        places.setdefault(kind, []).append(i)
+    return found, np.concatenate([np.array(part) for part in places.values()])
+
+
+def problem_of(stations: Array, scans: Sequence[Sequence[Row]], covariances: Sequence[Array], **more: Any) -> Problem:
+    """Return the problem of some scans, with values of zero.
+
+    Parameters
+    ----------
+    stations : array (k, s, d)
+        Positions at each scan.
+    scans : sequence of k sequences of (kind, a, b)
+        Rows.
+    covariances : sequence of k arrays (m, m)
+        Of the rows of each scan.
+    **more
+        Further arguments of `optloc.assemble`.
+    """
+    kinds, order = rows_by_kind(scans)
+    parts = []
+    for kind, rows in kinds.items():
+        a, b, k = np.array(rows).T
+        parts.append(measured(kind, np.zeros(len(rows)), a=a, b=b, epoch=k, sigma=1.0))
+    place = np.argsort(order)
+    ends = np.cumsum([0, *(len(rows) for rows in scans)])
+    blocks = [
+        Block(place[None, first:last], np.asarray(covariance, dtype=float)[None])
+        for first, last, covariance in zip(ends[:-1], ends[1:], covariances, strict=True)
+    ]
+    still = stations[:1] if np.array_equal(stations, np.broadcast_to(stations[:1], stations.shape)) else stations
+    return replace(assemble(still, *parts, **more), noise=group(blocks))

@@ -1,0 +1,116 @@
+"""Whole-run fits: one polynomial course through all scans at once, without a guess."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from optloc.errors import InvalidProblem
+from optloc.fix import Fix
+from optloc.problem import Problem
+from optloc.solve import solve
+from optloc.status import Status
+from optloc.track.dynamics import polynomial
+from optloc.track.track import State, Track, check_trackable, gathered, scans
+from optloc.track.updates import Updated, whitened
+from optloc.types import Array, Motion
+
+
+def fitted(problem: Problem, order: int, *, reference: float | None = None, method: str = "auto") -> Fix:
+    """Return the maximum-likelihood polynomial course through all scans of a run.
+
+    Where the target really moves so, no filter with process noise comes near it.
+
+    Parameters
+    ----------
+    problem : Problem
+        Batch (...) of runs of one target without biases; what it says of the motion does not matter.
+    order : 0, 1 or 2
+        Static, constant velocity, constant acceleration.
+    reference : float, optional
+        Time at which the state holds, seconds; None: the last scan.
+    method : str
+        Of `optloc.solve`.
+
+    Returns
+    -------
+    Fix
+        Of the batch; failure is a status.
+
+    Raises
+    ------
+    InvalidProblem
+        For an unknown order, or a run that is not one target's.
+    """
+    if order not in (0, 1, 2):
+        raise InvalidProblem(f"a motion of order {order}", "order", "use 0, 1 or 2")
+    check_trackable(problem)
+    time = float(problem.times[-1]) if reference is None else reference
+    return solve(replace(problem, motions=(Motion(order, reference=time),)), method)
+
+
+def along(state: State, times: Array, dimension: int) -> tuple[Array, Array]:
+    """Return states and covariances along a polynomial course, before or after the state.
+
+    Parameters
+    ----------
+    state : State
+        Mean (..., n) and covariance; position, and velocity and acceleration if it has them.
+    times : array (k,)
+        Seconds.
+    dimension : int
+        2 or 3.
+
+    Returns
+    -------
+    tuple of array
+        Means (..., k, n) and covariances (..., k, n, n).
+    """
+    model = polynomial(state.mean.shape[-1] // dimension - 1)
+    F = np.stack([model.step(float(t) - state.time, state.mean, dimension)[0] for t in np.asarray(times)])
+    mean = (F @ state.mean[..., None, :, None])[..., 0]
+    return mean, F @ state.cov[..., None, :, :] @ np.swapaxes(F, -1, -2)
+
+
+def smoothed(problem: Problem, order: int, *, method: str = "auto") -> Track:
+    """Return the maximum-likelihood polynomial course through all scans as a track.
+
+    Parameters
+    ----------
+    problem : Problem
+        See `fitted`.
+    order : 0, 1 or 2
+        Of the course.
+    method : str
+        Of `optloc.solve`.
+
+    Returns
+    -------
+    Track
+        States at the scans given all of them. `nis` is what the rows of a scan add to the chi-square of the fit, and
+        the status of all scans is that of the fit, but for those without a row.
+
+    Raises
+    ------
+    InvalidProblem
+        For an unknown order, or a run that is not one target's.
+    """
+    fix = fitted(problem, order, method=method)
+    state = State(float(problem.times[-1]), *(np.asarray(part) for part in (fix.x, fix.cov)))
+    mean, cov = along(state, problem.times, problem.dimension)
+    steps = []
+    for k, (_, scan) in enumerate(scans(problem, order)):
+        at, spread = mean[..., k, :], cov[..., k, :, :]
+        none = np.zeros(at.shape[:-1])
+        if not scan.count:
+            empty = Updated(at, spread, np.full(at.shape[:-1], np.nan), none, none)
+            steps.append((empty, np.full(at.shape[:-1], int(Status.TOO_FEW_ROWS), dtype=np.int8)))
+            continue
+        with np.errstate(invalid="ignore"):
+            white = whitened(scan, at)
+            square = (white.residual**2).sum(-1)
+        found = Updated(at, spread, square, -0.5 * (square + white.logdet), np.broadcast_to(white.count, none.shape))
+        code = np.where(white.count > 0, fix.code, int(Status.TOO_FEW_ROWS)).astype(np.int8)
+        steps.append((found, np.broadcast_to(code, none.shape)))
+    return gathered(np.asarray(problem.times), steps, problem.dimension)

@@ -1,0 +1,120 @@
+"""Constant unknowns as states: an assumed height or a late clock, learnt while a target is tracked."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from optloc.errors import InvalidProblem
+from optloc.problem import Problem
+from optloc.solve import solve
+from optloc.track.dynamics import Dynamics
+from optloc.track.track import (
+    State,
+    Track,
+    check_state,
+    check_trackable,
+    filter_of,
+    gathered,
+    predicted,
+    scan_at,
+    taken,
+)
+from optloc.track.updates import Update
+from optloc.types import Array, Motion
+from optloc.windows import cut
+
+
+def begun_with_constants(problem: Problem, dynamics: Dynamics, epochs: int) -> State:
+    """Return the joint state of a target and of the biases of its run, from the first epochs, without a guess.
+
+    Parameters
+    ----------
+    problem : Problem
+        Batch (...) of runs of one target. Biases are offsets, scales or rotations; what the first epochs leave open
+        needs a prior.
+    dynamics : Dynamics
+        Gives the order of the state.
+    epochs : int
+        Number of epochs to start from.
+
+    Returns
+    -------
+    State
+        At the last epoch used: [p, v, a] and the biases as the layout has them; NaN where there is no fix.
+    """
+    _check(problem)
+    time = float(problem.times[epochs - 1])
+    fix = solve(replace(cut(problem, 0, epochs), motions=(Motion(dynamics.order, reference=time),)))
+    mean, cov = fix.gaussian()
+    return State(time, np.where(fix.answered[..., None], mean, np.nan), np.array(cov))
+
+
+def followed_with_constants(problem: Problem, start: State, dynamics: Dynamics, update: Update | str = "iekf") -> Track:
+    """Return the track of a target from a state on, biases of the run among its states.
+
+    A constant has no process noise: what all scans share of an error stays in the covariance, where white noise of the
+    same size would average out.
+
+    Parameters
+    ----------
+    problem : Problem
+        Batch (...) of runs, see `begun_with_constants`; scans not later than the start are left out.
+    start : State
+        [p, v, a] and the biases, at or before the first scan used.
+    dynamics : Dynamics
+        Model of motion.
+    update : callable or str
+        A filter, or its name in `UPDATES`.
+
+    Returns
+    -------
+    Track
+        Its means hold the biases behind [p, v, a].
+
+    Raises
+    ------
+    InvalidProblem
+        For an unknown filter, a bias that drifts, or a state that does not fit.
+
+    References
+    ----------
+    B. Friedland, "Treatment of bias in recursive filtering", IEEE Trans. Autom. Control 14 (1969): the augmented state.
+    """
+    _check(problem)
+    rule, d = filter_of(update), problem.dimension
+    constants = problem.layout.n_shared - sum((motion.order + 1) * d for motion in problem.motions)
+    check_state(start, (dynamics.order + 1) * d + constants)
+    joint, state, steps, times = _joint(dynamics, constants), start, [], []
+    for k, time in enumerate(problem.times.tolist()):
+        if time <= start.time:
+            continue
+        ahead = predicted(state, joint, time, d)
+        done, code = taken(scan_at(problem, k, dynamics.order), ahead, rule)
+        state = State(time, done.mean, done.cov)
+        steps.append((done, code))
+        times.append(time)
+    return gathered(np.array(times), steps, d)
+
+
+def _check(problem: Problem) -> None:
+    check_trackable(replace(problem, biases=()))
+    drifting = next((bias.name for bias in problem.biases if bias.form == "drift"), None)
+    if drifting is not None:
+        raise InvalidProblem(f"the bias {drifting!r} drifts", "track", "learn it first, then `with_known_bias`")
+
+
+def _joint(dynamics: Dynamics, constants: int) -> Dynamics:
+    """Return dynamics of a state that is followed by constants."""
+
+    def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
+        n = mean.shape[-1] - constants
+        F, Q, drive = dynamics.step(dt, mean[..., :n], d)
+        none = [(0, 0)] * (Q.ndim - 2)
+        pad = (0, constants)
+        whole = np.pad(F, [(0, 0)] * (F.ndim - 2) + [pad, pad])
+        whole[..., range(n, n + constants), range(n, n + constants)] = 1.0
+        return whole, np.pad(Q, [*none, pad, pad]), np.pad(drive, [(0, 0)] * (drive.ndim - 1) + [pad])
+
+    return Dynamics(f"{dynamics.name} with constants", dynamics.order, step)

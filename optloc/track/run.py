@@ -1,0 +1,273 @@
+"""A whole run as a track: started without a guess, gated, and begun anew where the model cannot follow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from optloc.errors import InvalidProblem
+from optloc.problem import Problem
+from optloc.status import Status
+from optloc.track.begin import Begun, beginning, reach
+from optloc.track.dynamics import Dynamics
+from optloc.track.gate import innovation
+from optloc.track.heights import with_height_rows
+from optloc.track.track import (
+    State,
+    Track,
+    check_state,
+    check_trackable,
+    filter_of,
+    gathered,
+    predicted,
+    scan_at,
+    taken,
+)
+from optloc.track.updates import Update, Updated
+from optloc.types import Array
+
+Event = Literal["starting", "started", "restarted", ""]
+
+# A given state whose first scan is less likely than this contradicts it.
+_ABSURD = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """When a row is left out and when a track begins anew.
+
+    Parameters
+    ----------
+    gate : float
+        Rows further than this many standard deviations from the prediction are left out; infinite for none.
+    patience : int
+        So many scans in succession of whose rows most were left out end a track.
+    gap : float, optional
+        Seconds without a valid row that end a track. Without it a gap ends a track where the predicted position has a
+        standard deviation beyond the spread of the stations, and beyond the range of the target.
+    speed, rate : float, optional
+        Prior standard deviation of each coordinate of velocity (m/s) and acceleration (m/s^2), about zero, for starts.
+    """
+
+    gate: float = 5.0
+    patience: int = 5
+    gap: float | None = None
+    speed: float | None = None
+    rate: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Entry:
+    """What became of one scan.
+
+    Parameters
+    ----------
+    time : float
+        Seconds.
+    updated : Updated
+        State after the scan, its NIS and the rows used; NaN before the first start.
+    code : Status
+        Ok; too few rows where none was valid and the state was only predicted; rejected where most rows did not pass
+        the gate or are not finite; ambiguous where a start has alternatives; numerical where the update failed.
+    rejected : int
+        Rows left out.
+    event : "starting", "started", "restarted" or ""
+        The scan is one that a start needed; the state is a new fix; or nothing special.
+    reason : str
+        A sentence where the status or the event needs one.
+    """
+
+    time: float
+    updated: Updated
+    code: Status
+    rejected: int = 0
+    event: Event = ""
+    reason: str = ""
+
+    @property
+    def label(self) -> str:
+        """Return the event, else the status, in words; a start that is not clean is called by its status."""
+        return self.event if self.event and self.code == Status.OK else self.code.label
+
+
+def tracked(
+    problem: Problem,
+    dynamics: Dynamics,
+    update: Update | str = "iekf",
+    *,
+    start: State | None = None,
+    rules: Rules | None = None,
+) -> Iterator[Entry]:
+    """Yield what becomes of each scan of a run, one by one: what was yielded stays, whatever goes wrong later.
+
+    The track starts from the first stretch of scans that determine the state, without a guess. Scans without a valid
+    row keep the prediction.
+
+    Parameters
+    ----------
+    problem : Problem
+        A single run of one target, see `followed`; an exact height is held by every update.
+    dynamics : Dynamics
+        Model of motion.
+    update : callable or str
+        A filter, or its name in `UPDATES`.
+    start : State, optional
+        Known state at or before the first scan, in the place of a fix.
+    rules : Rules, optional
+        When rows are left out and tracks begin anew.
+
+    Raises
+    ------
+    InvalidProblem
+        For an unknown filter, times that do not increase, a run that is not one target's, and a given state that does
+        not fit the dynamics or contradicts the first scan.
+    """
+    rule = filter_of(update)
+    check_trackable(problem)
+    _check_run(problem)
+    if start is not None:
+        _check_start(start, problem, dynamics)
+    cleaned, broken = _cleaned(problem)
+    # The checks above are made at the call, not at the first scan.
+    return _Run(with_height_rows(cleaned), broken, dynamics, rule, rules or Rules()).entries(start)
+
+
+def collected(entries: Sequence[Entry], dimension: int) -> Track:
+    """Return entries as one track.
+
+    Parameters
+    ----------
+    entries : sequence of Entry
+        In the order of time.
+    dimension : int
+        2 or 3.
+    """
+    times = np.array([entry.time for entry in entries])
+    return gathered(times, [(entry.updated, np.asarray(int(entry.code))) for entry in entries], dimension)
+
+
+@dataclass(frozen=True, slots=True)
+class _Run:
+    problem: Problem
+    broken: Array
+    dynamics: Dynamics
+    rule: Update
+    rules: Rules
+
+    def entries(self, start: State | None) -> Iterator[Entry]:
+        """Yield all entries."""
+        times, k, state, why = self.problem.times, 0, start, ""
+        heard = float(times[0]) if start is None else start.time
+        missed, fresh = 0, start is not None
+        while k < len(times):
+            if state is None:
+                begun = beginning(self.problem, k, self.dynamics, self.rules.speed, self.rules.rate)
+                yield from self._begun(begun, k, why)
+                k, state, missed = begun.last + 1, begun.state, 0
+                heard = float(times[begun.last])
+                continue
+            ahead = predicted(state, self.dynamics, float(times[k]), self.problem.dimension)
+            why = self._unbridged(ahead, times[k] - heard)
+            if why:
+                state = None
+                continue
+            entry = self._updated(k, ahead)
+            if fresh and entry.updated.count + entry.rejected > 0:
+                _check_agrees(entry)
+                fresh = False
+            gated, used = entry.rejected - self._bad(k), int(entry.updated.count)
+            missed = missed + 1 if gated > used else missed * int(used == 0)
+            heard = float(times[k]) if entry.updated.count > 0 else heard
+            yield entry
+            state, k = State(entry.time, entry.updated.mean, entry.updated.cov), k + 1
+            if missed >= self.rules.patience:
+                state, why = None, f"most rows of {missed} scans did not fit the prediction"
+
+    def _begun(self, begun: Begun, k: int, why: str) -> Iterator[Entry]:
+        """Yield the scans of a start, of which the last one has the state."""
+        n = (self.dynamics.order + 1) * self.problem.dimension
+        none = Updated(np.full(n, np.nan), np.full((n, n), np.nan), np.array(np.nan), np.array(0.0), np.array(0))
+        for i in range(k, begun.last + 1):
+            time = float(self.problem.times[i])
+            if i < begun.last or begun.state is None:
+                yield Entry(time, none, begun.waiting, self._bad(i), "starting", begun.reason)
+                continue
+            count = np.array(int((self.problem.weight[self.problem.epoch == i] > 0.0).sum()))
+            done = replace(none, mean=begun.state.mean, cov=begun.state.cov, count=count)
+            reason = "; ".join(filter(None, (why, begun.reason)))
+            yield Entry(time, done, begun.code, self._bad(i), "restarted" if why else "started", reason)
+
+    def _bad(self, k: int) -> int:
+        """Return how many rows of a scan are not finite."""
+        return int(self.broken[self.problem.epoch[: len(self.broken)] == k].sum())
+
+    def _unbridged(self, ahead: State, silence: float) -> str:
+        """Return why a prediction is not worth following; empty where it is."""
+        if self.rules.gap is not None:
+            return f"no valid row for {silence:.6g} s" if silence > self.rules.gap else ""
+        d = self.problem.dimension
+        sigma = float(np.sqrt(max(np.linalg.eigvalsh(ahead.cov[:d, :d])[-1], 0.0)))
+        limit = reach(self.problem, ahead.mean[:d])
+        return f"the prediction was uncertain by {sigma:.3g} m after {silence:.6g} s" if sigma > limit else ""
+
+    def _updated(self, k: int, ahead: State) -> Entry:
+        """Return the update of a prediction by the rows of a scan that pass the gate."""
+        scan = scan_at(self.problem, k, self.dynamics.order)
+        kept = self._gated(scan, ahead) if scan.rows else np.zeros(0)
+        lost = int(((scan.weight > 0.0) & (kept == 0.0)).sum()) if scan.rows else 0
+        used = scan.with_rows(weight=kept) if lost else scan
+        done, code = taken(used, ahead, self.rule)
+        status, rejected, reason = Status(int(code)), lost + self._bad(k), ""
+        if status == Status.TOO_FEW_ROWS and not rejected:
+            reason = "no valid row: the state was only predicted"
+        elif rejected > int(done.count):
+            status, reason = Status.REJECTED, f"{rejected} of {rejected + int(done.count)} rows were left out"
+        elif status == Status.NUMERICAL:
+            reason = "the update failed: the state was only predicted"
+        return Entry(ahead.time, done, status, rejected, "", reason)
+
+    def _gated(self, scan: Problem, ahead: State) -> Array:
+        """Return the weights (m,) of a scan, zero where a row lies beyond the gate."""
+        with np.errstate(invalid="ignore"):
+            near = np.abs(innovation(scan, ahead.mean, ahead.cov).normalised) <= self.rules.gate
+        return np.where(near, scan.weight, 0.0)
+
+
+def _cleaned(problem: Problem) -> tuple[Problem, Array]:
+    """Return the run with weight zero for rows that are not finite, and which of the present ones these are (m,)."""
+    broken = ~np.isfinite(problem.z) & (problem.weight > 0.0)
+    if not broken.any():
+        return problem, broken
+    z, weight = np.where(broken, 0.0, problem.z), np.where(broken, 0.0, problem.weight)
+    return problem.with_rows(z=z, weight=weight), broken
+
+
+def _check_run(problem: Problem) -> None:
+    if problem.batch_shape:
+        raise InvalidProblem("there are several runs", "track", "take them one by one, or use `followed`")
+    steps = np.flatnonzero(~(np.diff(problem.times) > 0.0))
+    if len(steps):
+        one, two = problem.times[steps[0]], problem.times[steps[0] + 1]
+        what = f"the scan at {two:.10g} s follows one at {one:.10g} s"
+        raise InvalidProblem(what, "times", "sort the scans by time, and give one scan for each time")
+
+
+def _check_start(start: State, problem: Problem, dynamics: Dynamics) -> None:
+    check_state(start, (dynamics.order + 1) * problem.dimension)
+    if start.time > problem.times[0]:
+        what = f"the state holds at {start.time:.10g} s, after the first scan at {problem.times[0]:.10g} s"
+        raise InvalidProblem(what, "start", "give the state at or before the first scan")
+
+
+def _check_agrees(entry: Entry) -> None:
+    """Refuse a given state that its first scan contradicts: by its chi-square, or as no row passed the gate."""
+    from scipy.special import gammaincc
+
+    count, nis = float(entry.updated.count), float(entry.updated.nis)
+    if entry.code == Status.REJECTED or (count > 0 and gammaincc(count / 2.0, nis / 2.0) < _ABSURD):
+        what = f"the initial state contradicts the first scan, at {entry.time:.10g} s"
+        advice = "correct it, make its standard deviation larger, or leave it out: a start needs no guess"
+        raise InvalidProblem(what, "start", advice)

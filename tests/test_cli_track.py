@@ -1,0 +1,206 @@
+"""`optloc track`: tables, JSON and pictures; what goes wrong is a sentence or a status, and nothing is lost."""
+
+import json
+from importlib.resources import files as package_files
+
+import numpy as np
+import pandas as pd
+import pytest
+from typer.testing import CliRunner
+
+from optloc.cli import app
+from optloc.files import read
+from optloc.track import collected, polynomial, tracked
+
+RUN = CliRunner()
+SHIPPED = package_files("optloc") / "scenarios" / "run.toml"
+BEACONS = {"A": (0, 0), "B": (1000, 0), "C": (0, 1000), "D": (1000, 900)}
+HEAD = 'format = 1\n[stations]\nfile = "stations.csv"\n'
+ROWS = '[[measurements]]\nkind = "range"\nfile = "rows.csv"\nsigma = 1.0\n'
+
+
+def run(*arguments, code=0):
+    result = RUN.invoke(app, ["track", *(str(argument) for argument in arguments)])
+    assert result.exit_code == code, result.output + repr(result.exception)
+    return result
+
+
+def sentence(*arguments):
+    result = run(*arguments, code=2)
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert "Traceback" not in result.output
+    return result.stderr
+
+
+def drive(folder, times=range(12), target=None, more="", table=None):
+    """Write ranges to something that drives by; return the problem file."""
+    rng = np.random.default_rng(1)
+    rows = []
+    for t in times:
+        place = np.array([100.0 + 20 * t, 300 + 10 * t])
+        for name, at in BEACONS.items():
+            rows.append({"time": t, "a": name, "z": np.linalg.norm(place - at) + rng.standard_normal()})
+            if target:
+                rows[-1]["target"] = target
+    stations = pd.DataFrame([{"name": n, "x": x, "y": y} for n, (x, y) in BEACONS.items()])
+    stations.to_csv(folder / "stations.csv", index=False)
+    (pd.DataFrame(rows) if table is None else table(pd.DataFrame(rows))).to_csv(folder / "rows.csv", index=False)
+    path = folder / "drive.toml"
+    path.write_text(HEAD + ROWS + more)
+    return path
+
+
+def test_the_shipped_run_as_a_table(tmp_path):
+    out = tmp_path / "track.csv"
+    shown = run(SHIPPED, "--out", out).stdout
+    assert "60 scans" in shown
+    table = pd.read_csv(out)
+    names = "epoch time target status reason x y vx vy sigma_x sigma_y sigma_vx sigma_vy cov_xx cov_xy cov_yy"
+    assert list(table) == [*names.split(), "nis", "rows", "rejected"]
+    assert table["status"].tolist() == ["starting", "started"] + ["ok"] * 58
+    assert table["x"].isna().tolist() == [True] + [False] * 59
+    np.testing.assert_allclose(table["sigma_x"] ** 2, table["cov_xx"])
+    assert table["nis"].sum() / table["rows"][2:].sum() == pytest.approx(1.0, abs=0.25)
+    loaded = read(SHIPPED)
+    ours = collected(list(tracked(loaded.problem, polynomial(1, 1.0))), 2)
+    np.testing.assert_allclose(table[["x", "y", "vx", "vy"]], ours.mean, rtol=1e-9)
+
+
+def test_tables_agree_and_quiet_is_quiet(tmp_path):
+    for name in ("a.csv", "a.parquet"):
+        assert run(SHIPPED, "--out", tmp_path / name, "--quiet").output == ""
+    one, two = pd.read_csv(tmp_path / "a.csv"), pd.read_parquet(tmp_path / "a.parquet")
+    np.testing.assert_allclose(one[["x", "nis"]], two[["x", "nis"]].to_numpy(float))
+
+
+def test_json_is_the_table_and_nothing_else():
+    found = json.loads(run(SHIPPED, "--json").stdout)
+    assert found["title"] == "A drive past five beacons"
+    assert len(found["scans"]) == 60
+    assert found["scans"][0]["x"] is None
+    assert found["scans"][-1]["status"] == "ok"
+
+
+@pytest.mark.parametrize("model", ["cv", "ca", "static", "singer", "csm"])
+@pytest.mark.parametrize("name", ["iekf", "mvekf"])
+def test_models_and_filters(tmp_path, model, name):
+    noise = {"static": 25.0}.get(model, 2.0 if model != "csm" else 10.0)
+    path = drive(tmp_path)
+    run(path, "--model", model, "--filter", name, "--noise", noise, "--out", tmp_path / "t.csv")
+    last = pd.read_csv(tmp_path / "t.csv").iloc[-1]
+    assert np.hypot(last["x"] - 320, last["y"] - 410) < 5.0
+    assert ("vx" in last) == (model != "static")
+    assert ("ax" in last) == (model in {"ca", "singer", "csm"})
+
+
+def test_pictures(tmp_path):
+    pytest.importorskip("matplotlib")
+    run(SHIPPED, "--plot", tmp_path / "t.png", "--quiet")
+    assert (tmp_path / "t.png").stat().st_size > 20_000
+    assert "written" in sentence(SHIPPED, "--plot", "/no/such/place.png")
+
+
+def test_a_gap_begins_another_track(tmp_path):
+    path = drive(tmp_path, [*range(8), *range(20, 28)])
+    shown = run(path, "--gap", 5, "--out", tmp_path / "t.csv", code=1)
+    status = pd.read_csv(tmp_path / "t.csv")["status"].tolist()
+    assert status == ["starting", "started", *["ok"] * 6, "starting", "restarted", *["ok"] * 6]
+    assert "no valid row for 13 s" in shown.stdout
+    run(path, "--noise", 0.1, "--out", tmp_path / "t.csv")
+    assert "restarted" not in pd.read_csv(tmp_path / "t.csv")["status"].tolist()
+
+
+def test_a_scan_without_valid_rows_keeps_the_prediction(tmp_path):
+    path = drive(tmp_path, table=lambda t: t.assign(weight=np.where(t["time"] == 6, 0.0, 1.0)))
+    run(path, "--out", tmp_path / "t.csv", code=1)
+    table = pd.read_csv(tmp_path / "t.csv")
+    assert table["status"].tolist()[5:8] == ["ok", "too few rows", "ok"]
+    assert "only predicted" in table["reason"][6]
+    np.testing.assert_allclose(table["x"][6], table["x"][5] + table["vx"][5])
+
+
+def test_several_targets_have_a_track_each(tmp_path):
+    one = drive(tmp_path, target="kite")
+    kite = pd.read_csv(tmp_path / "rows.csv")
+    run(one, "--out", tmp_path / "alone.csv")
+    for more, jumble in (("", 0), ('[target]\nmotion = "constant_velocity"\n', 1)):
+        two = drive(
+            tmp_path,
+            target="kite",
+            more=more,
+            table=lambda t: pd.concat([kite, kite.assign(target="crow", z=t["z"] + 0.1)]).sample(
+                frac=1, random_state=1
+            ),
+        )
+        run(two, "--out", tmp_path / f"both{jumble}.csv")
+        table = pd.read_csv(tmp_path / f"both{jumble}.csv")
+        assert table.groupby("target").size().to_dict() == {"crow": 12, "kite": 12}
+        own = table[table["target"] == "kite"].reset_index(drop=True)
+        np.testing.assert_allclose(own[["x", "vx"]], pd.read_csv(tmp_path / "alone.csv")[["x", "vx"]], rtol=1e-6)
+
+
+def test_a_given_state_needs_no_start(tmp_path):
+    path = drive(tmp_path)
+    run(path, "--start", "100,300,20,10", "--start-sigma", "5,2", "--out", tmp_path / "t.csv")
+    assert pd.read_csv(tmp_path / "t.csv")["status"].tolist() == ["ok"] * 12
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--filter", "ikf"], "did you mean 'iekf'"),
+        (["--model", "cvv"], "did you mean 'cv'"),
+        (["--noise", "-1"], "process noise of -1"),
+        (["--gap", "0"], "--gap"),
+        (["--gate", "-3"], "--gate"),
+        (["--model", "csm", "--memory", "0"], "time_constant"),
+        (["--start", "1,2,3,4"], "--start-sigma"),
+        (["--start", "1,2", "--start-sigma", "1,1"], "2 numbers for a state of 4"),
+        (["--start", "1,2,x,4", "--start-sigma", "1,1"], "no numbers"),
+        (["--start", "1,2,3,4", "--start-sigma", "1"], "give 2 positive numbers"),
+        (["--start", "1,2,3,4", "--start-sigma", "1,-1"], "give 2 positive numbers"),
+        (["--start", "900,900,0,0", "--start-sigma", "1,1"], "contradicts the first scan"),
+        (["--out", "t.docx"], "t.docx"),
+        (["--out", "/no/such/place.csv"], "written"),
+        (["--plot", "/no/such/place.png"], "written"),
+    ],
+)
+def test_bad_options_are_one_sentence(tmp_path, options, words):
+    assert words in sentence(drive(tmp_path), *options)
+
+
+@pytest.mark.parametrize(
+    ("table", "more", "words"),
+    [
+        (lambda t: t.drop(columns="time").assign(epoch=t["time"]), "", "needs the time"),
+        (lambda t: t.assign(epoch=t["time"], time=np.where(t["time"] == 5, 4, t["time"])), "", "have the same time"),
+        (None, '[[priors]]\nname = "position"\nmean = [0, 0]\nsigma = 1.0\n', "--start"),
+        (None, '[[biases]]\nname = "clock"\n', "clock"),
+    ],
+)
+def test_bad_files_are_one_sentence(tmp_path, table, more, words):
+    assert words in sentence(drive(tmp_path, table=table, more=more))
+
+
+def test_rows_in_any_order_are_sorted(tmp_path):
+    run(drive(tmp_path), "--out", tmp_path / "a.csv")
+    run(drive(tmp_path, table=lambda t: t.sample(frac=1.0, random_state=3)), "--out", tmp_path / "b.csv")
+    one, two = pd.read_csv(tmp_path / "a.csv"), pd.read_csv(tmp_path / "b.csv")
+    np.testing.assert_allclose(one["x"], two["x"], rtol=1e-9)
+
+
+def test_the_track_so_far_is_kept(tmp_path, monkeypatch):
+    from optloc.track import UPDATES
+
+    calls = []
+
+    def failing(scan, mean, cov):
+        calls.append(scan)
+        if len(calls) > 4:
+            raise KeyboardInterrupt
+        return UPDATES["ekf"](scan, mean, cov)
+
+    monkeypatch.setitem(UPDATES, "failing", failing)
+    result = RUN.invoke(app, ["track", str(drive(tmp_path)), "--filter", "failing", "--out", str(tmp_path / "t.csv")])
+    assert result.exit_code not in (0, 1) or result.exception
+    assert pd.read_csv(tmp_path / "t.csv")["status"].tolist() == ["starting", "started"] + ["ok"] * 4
