@@ -318,3 +318,22 @@ def test_other_equalities_are_refused():
     problem = replace(run(np.arange(4.0)), constraints=box([-1e4, -1e4, 150.0], [1e4, 1e4, 150.0]))
     with pytest.raises(InvalidProblem, match="equality"):
         tracked(problem, polynomial(1))
+
+
+def test_pictures_of_tracks_in_space_and_on_earth(tmp_path):
+    pytest.importorskip("matplotlib")
+    from optloc.plot import plot_tracks, save
+    from optloc.plot.track import Drawn
+
+    for name, problem in (("space", run(np.arange(15.0), wild=(6,))), ("earth", earth(12)[0])):
+        figure = plot_tracks([Drawn(name, problem, tuple(tracked(problem, polynomial(1, 0.1))))], title=name)
+        panels = [axes for axes in figure.axes if axes.get_visible()]
+        assert [axes.get_ylabel() for axes in panels][1:] == [
+            f"{'up' if name == 'earth' else 'z'} (m)",
+            "sigma (m)",
+            "NIS",
+        ]
+        # Satellites are out of the picture, stations on the ground are in it.
+        assert (panels[0].get_legend_handles_labels()[1].count("station, first scan") == 1) == (name == "space")
+        save(figure, tmp_path / f"{name}.png")
+        assert (tmp_path / f"{name}.png").stat().st_size > 20_000

@@ -189,7 +189,7 @@ def _heights(panel: Axes, lines: Sequence[_Line], name: str) -> None:
 def _sigmas(panel: Axes, lines: Sequence[_Line]) -> None:
     for line, colour in _coloured(lines):
         panel.plot(line.times, line.sigma, color=colour, linewidth=1.2)
-    _decades(panel)
+    _decades(panel, np.concatenate([line.sigma for line in lines]))
     panel.set_ylabel("sigma (m)")
     panel.set_title("standard deviation of the position, all axes together")
 
@@ -204,16 +204,21 @@ def _innovations(panel: Axes, lines: Sequence[_Line]) -> None:
         limit = 2.0 * gammaincinv(0.5 * np.maximum(line.count, 1), 0.999)
         label = None if i else "99.9 % of the chi-square"
         panel.plot(line.times, np.where(tested, limit, np.nan), color=ORANGE, linewidth=1.0, label=label)
-    _decades(panel)
+    _decades(panel, np.concatenate([line.nis for line in lines]))
     panel.set_ylabel("NIS")
     panel.set_title("normalised innovation squared of each scan")
     panel.legend(frameon=False, fontsize=8, loc="lower right")
 
 
-def _decades(panel: Axes) -> None:
-    """Make the vertical axis logarithmic with plain numbers."""
-    from matplotlib.ticker import LogFormatter
+def _decades(panel: Axes, values: Array) -> None:
+    """Make the vertical axis logarithmic, with plain numbers, where values span more than a decade."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
+    known = values[np.isfinite(values) & (values > 0.0)]
+    if not len(known) or known.max() < 10.0 * known.min():
+        return
     panel.set_yscale("log")
-    panel.yaxis.set_major_formatter(LogFormatter(labelOnlyBase=False))
-    panel.yaxis.set_minor_formatter(LogFormatter(labelOnlyBase=False, minor_thresholds=(2, 0.5)))
+    wide = known.max() > 1e3 * known.min()
+    panel.yaxis.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0)))
+    panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    panel.yaxis.set_minor_formatter(NullFormatter())

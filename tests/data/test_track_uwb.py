@@ -66,7 +66,9 @@ def test_the_table_of_the_documentation(data_dir):
         cells = [f"{waited:.1f} s", f"{found.rms:.2f}", f"{high:.2f}", f"{far:.2f}", f"{100 * found.left_out:.1f} %"]
         rows.append([flight, f"{flights.loc[flight, 'mode']} {flights.loc[flight, 'condition']}", *cells])
     header = ["flight", "mode, line of sight", "start after", "3-D rms, m", "95 %, m", "largest, m", "rows left out"]
-    write("flights", header, rows, f"windows of {WINDOW} s, {ACCELERATION:g} m/s², gate {GATE:g}")
+    write(
+        "flights", header, rows, f"windows of {WINDOW} s, extended Kalman filter, {ACCELERATION:g} m/s², gate {GATE:g}"
+    )
 
 
 def test_a_flight_from_the_floor_finds_itself_in_the_air(data_dir):

@@ -1,6 +1,5 @@
 """Trackers of azimuth and elevation against plain filters written from the equations, bounds and counts."""
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -9,8 +8,7 @@ from scipy.linalg import block_diag, expm
 from scipy.optimize import least_squares
 
 import optloc
-from optloc import InvalidProblem, Status
-from optloc.papers.angles.scenario import READINGS, REPAIRED, STRAIGHT, WINDING
+from optloc.papers.angles.scenario import READINGS, REPAIRED, STRAIGHT
 from optloc.papers.angles.trials import (
     bound,
     draw,
@@ -25,11 +23,9 @@ from optloc.papers.angles.trials import (
     snapshot_bound,
     tracked,
 )
-from optloc.solve.angles import courses
 from optloc.track import State, begun, current_statistical, followed, polynomial, singer
-from optloc.track.batch import along, fitted, smoothed
 from optloc.track.bound import posterior_bound
-from optloc.types import Motion, Stations
+from optloc.types import Motion
 from optloc.windows import cut
 
 # --- a second implementation, in the order [x vx ax | y vy ay | z vz az] -------------------------------------------
@@ -264,110 +260,3 @@ def test_a_matched_filter_meets_the_posterior_bound_and_knows_its_error():
     assert nis == pytest.approx(4.0, abs=4.0 * np.sqrt(8.0 / track.nis.size))
     found, wanted = np.sqrt((error[..., :3] ** 2).sum(-1).mean()), np.sqrt(np.trace(least[:, :3, :3], 0, 1, 2).mean())
     assert found == pytest.approx(wanted, rel=0.05)
-
-
-def test_the_posterior_bound_without_noise_is_the_bound_of_the_whole_run():
-    sigmas = (0.1, 0.1, 0.2)
-    start = placed(draw(STRAIGHT, 1, 1, 0), sigmas)
-    cov = posterior_bound(
-        STRAIGHT.problem(), STRAIGHT.truth[1:], State(0.0, start.mean[0], start.cov[0]), polynomial(2)
-    )
-    run = course_of(STRAIGHT, 2)
-    J = np.linalg.inv(optloc.crlb(run, STRAIGHT.truth[-1]).reshape(6, 6))
-    back = polynomial(2).step(-50.0, np.zeros(6), 2)[0]
-    J = J + back.T @ np.linalg.inv(start.cov[0]) @ back
-    assert np.linalg.inv(J) == pytest.approx(cov[-1], rel=1e-5, abs=1e-12)
-
-
-# --- whole-run fits ------------------------------------------------------------------------------------------------
-
-
-def course_of(scenario, order, trials=None, seed=1):
-    drawn = draw(scenario, 1 if trials is None else trials, seed, 7).problem
-    return replace(drawn, motions=(Motion(order, reference=float(scenario.epochs)),))
-
-
-def parts(error):
-    return np.sqrt((error.reshape(len(error), 3, 2) ** 2).sum(-1).mean(0))
-
-
-def test_the_whole_track_fit_of_simulation_1():
-    run = course_of(STRAIGHT, 2, 200)
-    cov = optloc.crlb(course_of(STRAIGHT, 2), STRAIGHT.truth[-1]).reshape(6, 6)
-    least = np.sqrt(np.diagonal(cov).reshape(3, 2).sum(-1))
-    assert least == pytest.approx([0.01129, 6.00e-4, 1.63e-5], rel=1e-3)
-    fix = fitted(run, 2)
-    assert (fix.code == Status.OK).all()
-    error = fix.x - STRAIGHT.truth[-1]
-    assert parts(error) == pytest.approx(least, rel=0.10)
-    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(fix.cov), error)
-    assert nees.mean() == pytest.approx(6.0, abs=4.0 * np.sqrt(12.0 / 200))
-    found = courses(run)
-    unit = np.array([1.0, 1.0, 2.0])[:, None]
-    plain, iv = ((unit * c).reshape(200, 6) - STRAIGHT.truth[-1] for c in (found.plain, found.instrumental))
-    assert parts(iv) == pytest.approx(parts(error), rel=0.01)
-    assert (parts(plain) > 1.15 * parts(error)).all()
-    assert found.ahead.all()
-
-
-def test_the_fit_beats_the_filter_where_its_model_is_true():
-    drawn = draw(STRAIGHT, 100, 1, 7)
-    fit = fitted(drawn.problem, 2).x - STRAIGHT.truth[-1]
-    track = tracked(drawn, placed(drawn, (0.1, 0.1, 0.2), known=2), current_statistical(10.0, 30.0))
-    end = errors(drawn, track)[:, -1]
-    gain = np.sqrt((end**2).sum(-1).mean(0)) / parts(fit)
-    assert gain[0] > 3.0
-    assert gain[1] > 50.0
-
-
-def test_smoothed_states_follow_the_polynomial():
-    drawn = draw(STRAIGHT, 20, 1, 8)
-    track = smoothed(drawn.problem, 2)
-    error = track.mean - STRAIGHT.truth[1:]
-    nees = np.einsum("nki,nkij,nkj->nk", error, np.linalg.inv(track.cov), error)
-    assert nees.mean() == pytest.approx(6.0, abs=4.0 * np.sqrt(12.0 / 20))
-    fix = fitted(drawn.problem, 2)
-    assert track.nis.sum(-1) == pytest.approx(fix.cost)
-    assert (track.code == Status.OK).all()
-    mean, cov = along(State(50.0, fix.x, fix.cov), np.array([50.0]), 2)
-    assert mean[:, 0] == pytest.approx(fix.x)
-    assert cov[:, 0] == pytest.approx(fix.cov)
-
-
-def turning(turns, sigma, trials, seed):
-    """Return runs of one ship that measures the azimuth of another, and the truth; it turns half-way or does not."""
-    t = np.arange(0.0, 600.0, 10.0)
-    speed = np.where((t < 300.0)[:, None] | (not turns), [5.0, 0.0], [0.0, 5.0])
-    place = np.vstack([np.zeros((1, 2)), np.cumsum(10.0 * speed[:-1], axis=0)])
-    k = len(t)
-    problem = optloc.assemble(
-        Stations(place[:, None], ("ship",)),
-        optloc.measured("azimuth", a=np.zeros(k, int), epoch=np.arange(k), sigma=sigma),
-        times=t,
-        motions=(Motion(1),),
-    )
-    truth = np.array([3e3, 5e3, -3.0, -4.0])
-    return optloc.simulate(problem, truth, seed, trials=trials), truth
-
-
-@pytest.mark.parametrize("sigma", [1e-3, 1e-2])
-def test_one_observer_that_turns_sees_the_course(sigma):
-    runs, truth = turning(True, sigma, 200, 1)
-    fix = optloc.solve(runs)
-    assert (fix.code == Status.OK).all()
-    error = fix.x - truth
-    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(fix.cov), error)
-    assert nees.mean() == pytest.approx(4.0, abs=4.0 * np.sqrt(8.0 / 200))
-    found = courses(runs)
-    bias = [np.linalg.norm(c[:, 0].mean(0) - truth[:2]) for c in (found.plain, found.instrumental)]
-    assert bias[1] < 0.35 * bias[0]
-
-
-def test_one_observer_that_goes_straight_on_is_told_so():
-    runs, _ = turning(False, 1e-3, 20, 1)
-    assert not (optloc.solve(runs).code == Status.OK).any()
-
-
-def test_wrong_orders_are_refused():
-    with pytest.raises(InvalidProblem, match="order 3"):
-        fitted(WINDING.problem(), 3)

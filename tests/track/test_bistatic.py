@@ -18,9 +18,9 @@ SPEED = np.array([4.0, 10.0, 6.0])
 U0 = np.array([np.cos(EL0) * np.cos(AZ0), np.cos(EL0) * np.sin(AZ0), np.sin(EL0)])
 
 
-def run(epochs, order=0, turn=None, home=np.zeros(3), path=PATH):
+def run(epochs, order=0, turn=None, home=(0.0, 0.0, 0.0), path=PATH):
     k = np.arange(epochs)
-    place = np.stack([home, home + (np.eye(3) if turn is None else turn).T @ [D, 0.0, 0.0]])[None]
+    place = np.stack([home, np.array(home) + (np.eye(3) if turn is None else turn).T @ [D, 0.0, 0.0]])[None]
     axes = None if turn is None else np.broadcast_to(turn, (1, 2, 3, 3))
     return assemble(
         Stations(place, ("receiver", "illuminator"), axes=axes),

@@ -69,7 +69,7 @@ def plain_h(x):
     return np.array([r[0] - r[1], r[0] - r[2], geodetic(x[:3])[0]])
 
 
-def plain_H(x):
+def plain_rows(x):
     u = (x[:3] - SAT) / np.linalg.norm(x[:3] - SAT, axis=1)[:, None]
     return np.hstack([np.array([u[0] - u[1], u[0] - u[2], geodetic(x[:3])[1]]), np.zeros((3, 3))])
 
@@ -94,18 +94,18 @@ def plain_filter(name, x, P, zs):
     out = []
     for z in zs:
         x, P = F @ x, F @ P @ F.T + W
-        H = plain_H(x)
+        H = plain_rows(x)
         K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
         new, A, gain = x + K @ (z - plain_h(x)), H, K
         if name == "iekf":
             for _ in range(30):
-                A = plain_H(new)
+                A = plain_rows(new)
                 gain = P @ A.T @ np.linalg.inv(A @ P @ A.T + R)
                 new = x + gain @ (z - plain_h(new) - A @ (x - new))
         if name == "mgekf":
             A = plain_g(new, x)
         if name == "mvekf":
-            A = plain_H(new)
+            A = plain_rows(new)
             gain = P @ A.T @ np.linalg.inv(A @ P @ A.T + R)
         left = np.eye(6) - gain @ A
         x, P = new, left @ P @ left.T + gain @ R @ gain.T
@@ -144,9 +144,9 @@ def test_one_run_is_that_of_a_plain_implementation(name, width):
 
 
 def test_the_mean_derivative_is_a_g():
-    x, y = P0 + [3e4, -2e4, 1e4], P0
+    x, y = P0 + np.array([3e4, -2e4, 1e4]), P0
     nodes, weights = np.polynomial.legendre.leggauss(5)
-    g = sum(0.5 * w * plain_H(y + 0.5 * (1 + n) * (x - y)) for n, w in zip(nodes, weights, strict=True))
+    g = sum(0.5 * w * plain_rows(y + 0.5 * (1 + n) * (x - y)) for n, w in zip(nodes, weights, strict=True))
     for each in (g, plain_g(x, y)):
         assert each[:, :3] @ (x - y) == pytest.approx(plain_h(x) - plain_h(y), abs=1e-5)
 
@@ -180,14 +180,14 @@ def plain_bound(P, epochs):
     out = []
     for x in truth(epochs + 2)[2:]:
         P = F @ P @ F.T + W
-        H = plain_H(x)
+        H = plain_rows(x)
         P = P - P @ H.T @ np.linalg.inv(H @ P @ H.T + R) @ H @ P
         out.append(P)
     return np.array(out)
 
 
 def test_the_posterior_bound_in_covariance_form():
-    phi = np.linalg.inv(plain_H(truth(2)[1])[:, :3].T @ np.linalg.inv(R) @ plain_H(truth(2)[1])[:, :3])
+    phi = np.linalg.inv(plain_rows(truth(2)[1])[:, :3].T @ np.linalg.inv(R) @ plain_rows(truth(2)[1])[:, :3])
     start = State(1.0, truth(2)[1], np.block([[phi, phi], [phi, 2 * phi]]))
     found = posterior_bound(run(202), truth(202), start, DYNAMICS)
     assert found == pytest.approx(plain_bound(start.cov, 200), rel=1e-6, abs=1e-6)
@@ -228,7 +228,7 @@ def ideal(problem, start, epochs):
     exact = truth(epochs)
     for k in range(epochs):
         x, P = x @ F.T, F @ P @ F.T + W
-        H = plain_H(exact[k])
+        H = plain_rows(exact[k])
         K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
         P = P - K @ H @ P
         x = x + (z[:, k] - plain_h(exact[k]) - (x - exact[k]) @ H.T) @ K.T

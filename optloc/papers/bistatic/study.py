@@ -40,11 +40,14 @@ class Sample:
         Trials of the target that stays, and of the slow one.
     ground : int
         Trials of each case with a ground.
+    epochs : int
+        Length of the records, more than 50.
     """
 
     still: int
     slow: int
     ground: int
+    epochs: int = EPOCHS
 
 
 SIZES: dict[Size, Sample] = {"quick": Sample(1000, 150, 200), "full": Sample(2000, 1000, 2000)}
@@ -73,22 +76,22 @@ def _run(sample: Sample, seed: int, tick: Tick) -> Report:
     def sequence(key: int) -> np.random.SeedSequence:
         return np.random.SeedSequence(seed, spawn_key=(key,))
 
-    stays = still(EPOCHS, sample.still, sequence(0))
+    stays = still(sample.epochs, sample.still, sequence(0))
     tick()
-    tracks = moving(EPOCHS, sample.slow, sequence(1), tick)
+    tracks = moving(sample.epochs, sample.slow, sequence(1), tick)
     fits = {}
-    for count in (_EARLY, EPOCHS):
-        fits[count] = batches(count, sample.slow, sequence(1), whole=EPOCHS)
+    for count in (_EARLY, sample.epochs):
+        fits[count] = batches(count, sample.slow, sequence(1), whole=sample.epochs)
         tick()
-    bounds = {count: bound_moving(np.array([count]))[0] for count in (_EARLY, EPOCHS)}
+    bounds = {count: bound_moving(np.array([count]))[0] for count in (_EARLY, sample.epochs)}
     made = (
-        tables.still(stays, {count: bound_still(np.array([count]))[0] for count in _COUNTS}),
+        tables.still(stays, {count: bound_still(np.array([count]))[0] for count in _COUNTS if count <= sample.epochs}),
         tables.claims(stays),
         tables.slow(tracks, fits, bounds),
         _short(sample.slow, sequence, tick),
         tables.directions({azimuth: bound_single(azimuth) for azimuth in _AZIMUTHS}),
         ground.table(sample.ground, sequence(4), tick),
-        tables.printed(printed_angles(EPOCHS, sample.still, sequence(5)), ANGLE),
+        tables.printed(printed_angles(sample.epochs, sample.still, sequence(5)), ANGLE),
     )
     facts = f"seed {seed}, {sample.still} trials of the target that stays, {sample.slow} of the slow one"
     return Report(text.TITLE, facts, text.OPENING, text.CLOSING, made, _pictures(stays, tracks, fits))
@@ -107,7 +110,7 @@ def _short(trials: int, sequence: Callable[[int], np.random.SeedSequence], tick:
 def _pictures(
     stays: Mapping[str, Errors], tracks: Mapping[str, Errors], fits: Mapping[int, Mapping[str, Errors]]
 ) -> tuple[Picture, ...]:
-    counts = np.unique(np.geomspace(1, EPOCHS, 40).astype(int))
+    counts = np.unique(np.geomspace(1, max(fits), 40).astype(int))
     # Two epochs determine a course, but so badly that its bound is off the scale.
     later = counts[counts >= 5]
     shown = {name: tracks[name] for name in _SHOWN}

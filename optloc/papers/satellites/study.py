@@ -13,7 +13,6 @@ from optloc.papers.satellites import figures, tables, text
 from optloc.papers.satellites.scenario import HEIGHT, START, orbits, problem
 from optloc.papers.satellites.trials import climbing, far, fixed, heights, moving, root_trace, wild
 
-_STEPS, _WILD = 200, 100
 _FAR = (0.0, 5.0, 10.0, 20.0, 25.0)
 _HEADINGS = {"north": 0.0, "north-east": 0.25 * np.pi, "east": 0.5 * np.pi, "south-east": 0.75 * np.pi}
 _PANEL = 100e3
@@ -31,11 +30,15 @@ class Sample:
         Trials of each kind of height, and of each heading of moving satellites.
     widths : tuple of float
         Start errors, metres; 100 km, which a figure shows, among them.
+    steps, far : int
+        Steps of the filters, and of those from far starts; more than ten.
     """
 
     trials: int
     others: int
     widths: tuple[float, ...] = (1e3, 10e3, 30e3, 100e3, 200e3, 400e3)
+    steps: int = 200
+    far: int = 100
 
 
 SIZES: dict[Size, Sample] = {"quick": Sample(200, 100), "full": Sample(2000, 1000)}
@@ -64,20 +67,20 @@ def _run(sample: Sample, seed: int, tick: Tick) -> Report:
     def sequence(key: int) -> np.random.SeedSequence:
         return np.random.SeedSequence(seed, spawn_key=(key,))
 
-    begun = fixed(_STEPS, sample.trials, sequence(0))
+    begun = fixed(sample.steps, sample.trials, sequence(0))
     tick()
     starts = {}
     for width in sample.widths:
         # The same data for every width: only the start differs.
-        starts[width] = wild(width, _WILD, sample.trials, sequence(1))
+        starts[width] = wild(width, sample.far, sample.trials, sequence(1))
         tick()
-    known = heights(_STEPS, sample.others, sequence(2))
+    known = heights(sample.steps, sample.others, sequence(2))
     tick()
-    known["climbing target, height said to be 0"] = climbing(_STEPS, sample.others, sequence(3))
+    known["climbing target, height said to be 0"] = climbing(sample.steps, sample.others, sequence(3))
     tick()
     flying = {}
     for name, heading in _HEADINGS.items():
-        flying[name] = moving(orbits(_STEPS + 2, heading), sample.others, sequence(4))
+        flying[name] = moving(orbits(sample.steps + 2, heading), sample.others, sequence(4))
         tick()
     panels = {"from the first two fixes": begun, "start wrong by 100 km": starts[_PANEL]}
     return Report(
