@@ -1,10 +1,13 @@
 """Trackers: fixes in time, started by the fixes of `optloc.solve`."""
 
 from optloc.track.batch import fitted, smoothed
+from optloc.track.bistatic import simplified
 from optloc.track.bound import posterior_bound
+from optloc.track.constants import begun_with_constants, followed_with_constants
 from optloc.track.dynamics import Dynamics, current_statistical, polynomial, singer
+from optloc.track.measurement_space import lines
 from optloc.track.run import Entry, Rules, collected, tracked
-from optloc.track.start import begun
+from optloc.track.start import begun, two_point
 from optloc.track.track import State, Track, followed, predicted
 from optloc.track.updates import UPDATES
 
@@ -16,14 +19,19 @@ __all__ = [
     "State",
     "Track",
     "begun",
+    "begun_with_constants",
     "collected",
     "current_statistical",
     "fitted",
     "followed",
+    "followed_with_constants",
+    "lines",
     "polynomial",
     "posterior_bound",
     "predicted",
+    "simplified",
     "singer",
     "smoothed",
     "tracked",
+    "two_point",
 ]

@@ -13,7 +13,7 @@ from optloc.linear import linearise
 from optloc.problem import Problem
 from optloc.solve.bistatic import pair
 from optloc.status import Status
-from optloc.track.lines import lines
+from optloc.track.measurement_space import lines
 from optloc.track.track import Track, check_trackable
 from optloc.types import Array, Motion
 from optloc.windows import cut
@@ -60,7 +60,7 @@ def simplified(problem: Problem, *, restart: int | None = None, mean: int = 1, f
     _check(restart, mean, floor)
     flat = problem.flat()
     home = _receiver(flat)
-    apart = by_epoch(replace(flat, motions=(Motion(0, "epoch"),), priors=(), constraints=())).flat()
+    apart = by_epoch(replace(flat, motions=(Motion(0, "epoch"),))).flat()
     size, epochs = flat.batch_shape[0], problem.epochs
     state = _State(np.full((size, 3), np.nan), np.full((size, 3, 3), np.nan), np.zeros(size), np.zeros(size))
     steps = []

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from optloc import InvalidProblem, Motion, assemble, crlb, linearise, measured, simulate, solve
+from optloc.constraints import box
 from optloc.solve.bistatic import course_starts
 from optloc.status import Status
 from optloc.track.bistatic import simplified
-from optloc.track.lines import lines
+from optloc.track.measurement_space import lines
 from optloc.types import Stations
 
 D, R0, AZ0, EL0 = 150e3, 81.2e3, 1.446, 0.123
@@ -286,6 +287,8 @@ MOVING = assemble(
         (lambda: simplified(draw(5, 1, 1), mean=0), "mean is 0"),
         (lambda: simplified(draw(5, 1, 1), floor=1.5), "gain floor"),
         (lambda: lines(MOVING), "stations move"),
+        (lambda: lines(replace(draw(5, 1, 1), constraints=box([0, 0, 0], [9e9] * 3))), "constraints or priors"),
+        (lambda: simplified(replace(draw(5, 1, 1), constraints=box([0, 0, 0], [9e9] * 3))), "constraints or priors"),
         (lambda: lines(draw(5, 1, 1), 3), "order 3"),
         (lambda: lines(draw(5, 1, 1), 1, window=1), "too few epochs"),
         (lambda: lines(draw(1, 1, 1), 1), "too few epochs"),

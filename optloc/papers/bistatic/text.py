@@ -36,8 +36,8 @@ CLOSING = """\
    the mean of ten epochs, or never to let the gain fall below a floor, is better than any period of plain restarts.
 4. In the measurements themselves the slow target moves on straight lines and nothing has to be linearised: the line
    fit is ten times better than the recursion after 200 epochs, and near the bound.
-5. The Cartesian filters miss the bound by far: 6 m along against 1.4 km across are a curved ridge, which one
-   linearisation per scan does not follow.
+5. The Cartesian filters miss the bound by far: 6 m along against 1.4 km across are a curved ridge. One linearisation
+   a scan does not follow it, and iteration helps little, for no Gaussian state has that shape.
 
 ## What is wrong in the paper
 

@@ -15,7 +15,7 @@ from optloc.solve import solve
 from optloc.solve.bistatic import course_starts
 from optloc.track.bistatic import simplified
 from optloc.track.dynamics import polynomial
-from optloc.track.lines import lines
+from optloc.track.measurement_space import lines
 from optloc.track.start import first_fix, state_of
 from optloc.track.track import Track, followed
 from optloc.types import Array, Motion

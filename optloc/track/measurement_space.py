@@ -48,7 +48,7 @@ def lines(problem: Problem, order: int = 1, window: int | None = None) -> Track:
     Raises
     ------
     InvalidProblem
-        For stations that move, and runs that are not one target's.
+        For stations that move, priors or constraints, and runs that are not one target's.
 
     References
     ----------
@@ -56,7 +56,7 @@ def lines(problem: Problem, order: int = 1, window: int | None = None) -> Track:
     """
     check_trackable(problem)
     _check(problem, order, window)
-    apart = by_epoch(replace(problem, motions=(Motion(0, "epoch"),), priors=(), constraints=()))
+    apart = by_epoch(replace(problem, motions=(Motion(0, "epoch"),)))
     z, weight = _unwrapped(apart), _weights(apart)
     values, covs, known = [], [], []
     for k in range(order, problem.epochs):
@@ -76,6 +76,8 @@ def _check(problem: Problem, order: int, window: int | None) -> None:
         raise InvalidProblem(
             "the stations move", "lines", "their measurements bend even of a still target: use a filter"
         )
+    if problem.constraints or problem.priors:
+        raise InvalidProblem("there are constraints or priors", "lines", "leave them out, or use a filter")
     if problem.stations.covariance is not None:
         raise InvalidProblem("station positions have errors", "lines", "use a filter")
     if problem.epochs <= order or (window is not None and window <= order):
