@@ -18,8 +18,8 @@ extended Kalman filters on this task and finds its own, with a covariance that i
   height give a quartic, of whose roots one is in sight of all satellites; one more step takes in the noise. Two
   fixes give place and velocity, with the covariance between both.
 
-The *posterior bound* is that of Cramér and Rao for the model of motion, in covariance form. All filters see the same
-data, so they differ by less than the scatter of a root mean square of 200 trials, which is five per cent.
+The *posterior bound* is that of Cramér and Rao for the model of motion, in covariance form. Where it is met, a root
+mean square of 200 trials still scatters about it by five per cent, alike for all filters: they see the same data.
 
 ## How the paper was read
 
