@@ -18,7 +18,11 @@ CASES = {
     "100 epochs, 3 m, biases known to 200 m": run(100, prior=200.0),
     "600 epochs, 3 m, moving target": run(600, order=1),
 }
-METHODS = {"closed form": (closed_form, "roots+lsr"), "relaxation": (relaxed, "sdp+lsr"), "IPOPT": (None, "roots+nlp+lsr")}
+METHODS = {
+    "closed form": (closed_form, "roots+lsr"),
+    "relaxation": (relaxed, "sdp+lsr"),
+    "IPOPT": (None, "roots+nlp+lsr"),
+}
 
 
 def start_error(problem, begin, x):
