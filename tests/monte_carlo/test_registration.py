@@ -15,7 +15,7 @@ from optloc.papers.registration.scenario import PRINTED
 from optloc.papers.registration.scenario import truth as printed_truth
 from optloc.papers.registration.trials import Setting, rms, wander
 
-FULL, JOINT, GAUSSIAN = 2000, 500, 500
+FULL, JOINT, GAUSSIAN = 2000, 2000, 500
 PRIOR, WIDTH = 200.0, 20.0
 TIE, RARE = 1e-3, 2e-3
 
