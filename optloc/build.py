@@ -101,15 +101,7 @@ def measured(
         numbers(v, name) for v, name in ((covariance, "covariance"), (weight, "weight"), (correction, "correction"))
     )
     a, b, epoch, target = (whole(v, name) for v, name in ((a, "a"), (b, "b"), (epoch, "epoch"), (target, "target")))
-    given = (z, sigma, covariance, a, b, epoch, target, weight, correction)
-    sizes = [v.shape[-1] for v in given if v is not None and v.ndim]
-    count = max(sizes, default=1)
-    if covariance is not None and covariance.shape[-2:] != (count, count):
-        raise InvalidProblem(
-            f"the covariance of {kind} has shape {covariance.shape}", "covariance", f"give one of {count} x {count}"
-        )
-    if any(size not in (1, count) for size in sizes):
-        raise InvalidProblem(f"arguments of {kind} have {sorted(set(sizes))} rows", where=kind, advice="give one each")
+    count = _count(kind, (z, sigma, covariance, a, b, epoch, target, weight, correction), covariance)
 
     def index(values: Array | None, needed: bool, name: str) -> Array:
         if needed and values is None:
@@ -139,6 +131,19 @@ def measured(
         None if arrival_sigma is None else arrival_sigma**2,
         covariance,
     )
+
+
+def _count(kind: str, given: Sequence[Array | None], covariance: Array | None) -> int:
+    """Return the number of rows of measurements; refuse arguments that disagree about it."""
+    sizes = [v.shape[-1] for v in given if v is not None and v.ndim]
+    count = max(sizes, default=1)
+    if covariance is not None and covariance.shape[-2:] != (count, count):
+        raise InvalidProblem(
+            f"the covariance of {kind} has shape {covariance.shape}", "covariance", f"give one of {count} x {count}"
+        )
+    if any(size not in (1, count) for size in sizes):
+        raise InvalidProblem(f"arguments of {kind} have {sorted(set(sizes))} rows", where=kind, advice="give one each")
+    return count
 
 
 def assemble(
