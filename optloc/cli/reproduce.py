@@ -9,20 +9,20 @@ from rich.table import Table as Shown
 
 from optloc.cli.fixing import bar
 from optloc.errors import InvalidProblem, nearest
-from optloc.papers import Size, Table, paper, write
+from optloc.papers import Size, Table, paper, planned, write
 
 SIZES: tuple[Size, ...] = ("quick", "full")
 
 
 def run_reproduce(name: str, size: str, out: Path | None, seed: int, quiet: bool) -> int:
     """Make the tables and pictures of a paper again, print the tables, and return the exit code."""
-    wanted = paper(name)
+    paper(name)
     chosen = next((known for known in SIZES if known == size), None)
     if chosen is None:
         raise InvalidProblem(f"there is no size {size!r}", "--size", nearest(size, SIZES))
     folder = Path(f"optloc-{name}") if out is None else out
     _usable(folder)
-    plan = wanted.plan(chosen, seed)
+    plan = planned(name, chosen, seed)
     with bar(name, plan.work, quiet) as advance:
         report = plan.run(lambda: advance(1))
     written = write(report, folder)

@@ -6,14 +6,17 @@ import csv
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
 from optloc.errors import InvalidProblem
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+S = TypeVar("S")
 
 Tick = Callable[[], None]
 """Called after each piece of work."""
@@ -123,6 +126,36 @@ class Plan:
 
     work: int
     run: Callable[[Tick], Report]
+
+
+@dataclass(frozen=True, slots=True)
+class Study(Generic[S]):
+    """How a paper is made again, in any sample size.
+
+    Parameters
+    ----------
+    sizes : dict of "quick", "full" to sample
+        What is drawn in either size.
+    work : callable
+        ``(sample) -> int``, the number of pieces of about equal work.
+    run : callable
+        ``(sample, seed, tick) -> Report``.
+    """
+
+    sizes: dict[Size, S]
+    work: Callable[[S], int]
+    run: Callable[[S, int, Tick], Report]
+
+    def plan(self, sample: S, seed: int) -> Plan:
+        """Return the reproduction with a sample of any size; the seed decides all draws.
+
+        Raises
+        ------
+        InvalidProblem
+            Where matplotlib is missing: before the work, not after it.
+        """
+        canvas(1.0, 1.0)
+        return Plan(self.work(sample), partial(self.run, sample, seed))
 
 
 def canvas(width: float, height: float) -> Figure:

@@ -7,10 +7,10 @@ import pytest
 from typer.testing import CliRunner
 
 from optloc.cli import app
-from optloc.papers import PAPERS, Plan
 from optloc.papers.angles import filters, fits, printed, study, tables
 from optloc.papers.angles.scenario import READINGS, REPAIRED, STRAIGHT, WINDING
 from optloc.papers.angles.trials import draw
+from optloc.papers.report import Study
 
 RUN = CliRunner()
 
@@ -151,7 +151,7 @@ TINY = study.Sample(8, 12, 3, 1)
 def report():
     # Simulation 3 as printed lasts 3000 s; here it has two minutes.
     short = tuple(replace(s, states=s.states[:121], phases=(40, 80, 120)) for s in READINGS)
-    ticks, plan = [], study.plan(TINY, 3)
+    ticks, plan = [], study.STUDY.plan(TINY, 3)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(filters, "READINGS", short)
         made = plan.run(lambda: ticks.append(1))
@@ -174,8 +174,8 @@ def test_a_reproduction_has_every_table_and_figure(report):
 
 
 def test_reproduce_writes_the_page(report, tmp_path, monkeypatch):
-    cheap = replace(PAPERS["angles"], plan=lambda size, seed: Plan(1, lambda tick: report))
-    monkeypatch.setitem(PAPERS, "angles", cheap)
+    cheap = Study(study.STUDY.sizes, lambda _: 1, lambda *_: report)
+    monkeypatch.setattr(study, "STUDY", cheap)
     result = RUN.invoke(app, ["reproduce", "angles", "--out", str(tmp_path / "new"), "--quiet"])
     assert result.exit_code == 0, result.output
     page = (tmp_path / "new" / "README.md").read_text(encoding="utf-8")

@@ -1,13 +1,10 @@
 """The paper `bistatic`: its numbers, the bounds beside them, and the page."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from optloc.cli import app
-from optloc.papers import PAPERS, Plan
 from optloc.papers.bistatic import ground, study
 from optloc.papers.bistatic.scenario import BASELINE, COURSE, ELEVATION, place, polar, problem, truth
 from optloc.papers.bistatic.trials import (
@@ -19,6 +16,7 @@ from optloc.papers.bistatic.trials import (
     printed_angles,
     still,
 )
+from optloc.papers.report import Study
 
 RUN = CliRunner()
 
@@ -93,7 +91,7 @@ TINY = study.Sample(20, 4, 4, epochs=60)
 
 @pytest.fixture(scope="module")
 def report():
-    ticks, plan = [], study.plan(TINY, 3)
+    ticks, plan = [], study.STUDY.plan(TINY, 3)
     made = plan.run(lambda: ticks.append(1))
     assert len(ticks) == plan.work
     return made
@@ -112,8 +110,8 @@ def test_a_reproduction_has_every_table_and_figure(report):
 
 
 def test_reproduce_writes_the_page(report, tmp_path, monkeypatch):
-    cheap = replace(PAPERS["bistatic"], plan=lambda size, seed: Plan(1, lambda tick: report))
-    monkeypatch.setitem(PAPERS, "bistatic", cheap)
+    cheap = Study(study.STUDY.sizes, lambda _: 1, lambda *_: report)
+    monkeypatch.setattr(study, "STUDY", cheap)
     result = RUN.invoke(app, ["reproduce", "bistatic", "--out", str(tmp_path / "new"), "--seed", "3"])
     assert result.exit_code == 0, result.output
     page = (tmp_path / "new" / "README.md").read_text(encoding="utf-8")

@@ -8,7 +8,6 @@ from typer.testing import CliRunner
 
 from optloc import solve
 from optloc.cli import app
-from optloc.papers import PAPERS, Plan
 from optloc.papers.kinematic import printed, study
 from optloc.papers.kinematic.scenario import ORDERS, Scenario, baseline, draw, unlabelled
 from optloc.papers.kinematic.tables import km
@@ -26,6 +25,7 @@ from optloc.papers.kinematic.trials import (
     tracked,
 )
 from optloc.papers.kinematic.wrong import taylor, twice_predicted, weighting
+from optloc.papers.report import Study
 from optloc.types import Motion
 from optloc.windows import cut
 
@@ -240,7 +240,7 @@ TINY = study.Sample(6, 3)
 
 @pytest.fixture(scope="module")
 def report():
-    ticks, plan = [], study.plan(TINY, 3)
+    ticks, plan = [], study.STUDY.plan(TINY, 3)
     made = plan.run(lambda: ticks.append(1))
     assert len(ticks) == plan.work
     return made
@@ -265,8 +265,8 @@ def test_a_reproduction_has_every_table_and_figure(report):
 
 def test_reproduce_writes_tables_and_pictures(report, tmp_path, monkeypatch):
     seeds = []
-    cheap = replace(PAPERS["kinematic"], plan=lambda size, seed: Plan(1, lambda tick: seeds.append(seed) or report))
-    monkeypatch.setitem(PAPERS, "kinematic", cheap)
+    cheap = Study(study.STUDY.sizes, lambda _: 1, lambda _, seed, tick: seeds.append(seed) or report)
+    monkeypatch.setattr(study, "STUDY", cheap)
     result = RUN.invoke(app, ["reproduce", "kinematic", "--out", str(tmp_path), "--seed", "3"])
     assert result.exit_code == 0, result.output
     assert seeds == [3]

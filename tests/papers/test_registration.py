@@ -13,7 +13,6 @@ from optloc.evaluate import predict
 from optloc.files import read
 from optloc.normal import normal
 from optloc.normal import step as house_step
-from optloc.papers import PAPERS, Plan
 from optloc.papers.registration import printed, shipped, study
 from optloc.papers.registration.extras import flatness, separation
 from optloc.papers.registration.minima import ghost, mirror
@@ -21,6 +20,7 @@ from optloc.papers.registration.recursion import FIRST, recursion, step
 from optloc.papers.registration.scenario import MOVING, NANOSECOND, PRINTED, SPATIAL, problem, truth
 from optloc.papers.registration.tables import accuracy, metres
 from optloc.papers.registration.trials import Setting, branch, one_shot, rms, score, wander
+from optloc.papers.report import Study
 
 RUN = CliRunner()
 
@@ -217,7 +217,7 @@ TINY = study.Sample(4, 6, (150, 200, 300, 400), (300, 400, 550, 700), last=150)
 
 @pytest.fixture(scope="module")
 def report():
-    ticks, plan = [], study.plan(TINY, 3)
+    ticks, plan = [], study.STUDY.plan(TINY, 3)
     made = plan.run(lambda: ticks.append(1))
     assert len(ticks) == plan.work
     return made
@@ -239,8 +239,8 @@ def test_a_reproduction_has_every_table_and_figure(report):
 
 def test_reproduce_writes_tables_and_pictures(report, tmp_path, monkeypatch):
     seeds = []
-    cheap = replace(PAPERS["registration"], plan=lambda size, seed: Plan(1, lambda tick: seeds.append(seed) or report))
-    monkeypatch.setitem(PAPERS, "registration", cheap)
+    cheap = Study(study.STUDY.sizes, lambda _: 1, lambda _, seed, tick: seeds.append(seed) or report)
+    monkeypatch.setattr(study, "STUDY", cheap)
     folder = tmp_path / "new"
     result = RUN.invoke(app, ["reproduce", "registration", "--out", str(folder), "--seed", "3"])
     assert result.exit_code == 0, result.output

@@ -1,14 +1,12 @@
 """The paper `satellites`: its numbers, the bounds beside them, and the page."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from optloc import ECEF, crlb, predict
 from optloc.cli import app
-from optloc.papers import PAPERS, Plan
+from optloc.papers.report import Study
 from optloc.papers.satellites import study
 from optloc.papers.satellites.scenario import COURSE, SATELLITES, START, orbits, problem, surface_course, truth
 from optloc.papers.satellites.trials import FILTERS, climbing, far, fixed, heights, root_trace, wild
@@ -104,7 +102,7 @@ TINY = study.Sample(4, 4, (100e3,), steps=20, far=12)
 
 @pytest.fixture(scope="module")
 def report():
-    ticks, plan = [], study.plan(TINY, 3)
+    ticks, plan = [], study.STUDY.plan(TINY, 3)
     made = plan.run(lambda: ticks.append(1))
     assert len(ticks) == plan.work
     return made
@@ -122,8 +120,8 @@ def test_a_reproduction_has_every_table_and_figure(report):
 
 
 def test_reproduce_writes_the_page(report, tmp_path, monkeypatch):
-    cheap = replace(PAPERS["satellites"], plan=lambda size, seed: Plan(1, lambda tick: report))
-    monkeypatch.setitem(PAPERS, "satellites", cheap)
+    cheap = Study(study.STUDY.sizes, lambda _: 1, lambda *_: report)
+    monkeypatch.setattr(study, "STUDY", cheap)
     result = RUN.invoke(app, ["reproduce", "satellites", "--out", str(tmp_path / "new"), "--seed", "3"])
     assert result.exit_code == 0, result.output
     page = (tmp_path / "new" / "README.md").read_text(encoding="utf-8")

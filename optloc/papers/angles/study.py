@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 from optloc.papers.angles import figures, filters, fits, tables, text
 from optloc.papers.angles.scenario import REPAIRED, STRAIGHT, WINDING
 from optloc.papers.angles.trials import draw
-from optloc.papers.report import Picture, Plan, Report, Size, Tick, canvas
+from optloc.papers.report import Picture, Report, Size, Study, Tick
 
 _TICKS = 31
 
@@ -35,26 +34,7 @@ class Sample:
     readings: int
 
 
-SIZES: dict[Size, Sample] = {"quick": Sample(200, 200, 60, 10), "full": Sample(1000, 1000, 400, 100)}
-
-
-def plan(sample: Sample, seed: int) -> Plan:
-    """Return the reproduction of section 3 of the paper.
-
-    Parameters
-    ----------
-    sample : Sample
-        How much is drawn; one of `SIZES`, or any other.
-    seed : int
-        Decides all draws.
-
-    Raises
-    ------
-    InvalidProblem
-        Where matplotlib is missing: before the work, not after it.
-    """
-    canvas(1.0, 1.0)
-    return Plan(_TICKS, partial(_run, sample, seed))
+_SIZES: dict[Size, Sample] = {"quick": Sample(200, 200, 60, 10), "full": Sample(1000, 1000, 400, 100)}
 
 
 def _run(sample: Sample, seed: int, tick: Tick) -> Report:
@@ -90,3 +70,7 @@ def _run(sample: Sample, seed: int, tick: Tick) -> Report:
             Picture("figure-7", "Figure 7: simulation 3, repaired", figures.circles(circles, snapshot)),
         ),
     )
+
+
+STUDY = Study(_SIZES, lambda _: _TICKS, _run)
+"""The reproduction of the paper."""

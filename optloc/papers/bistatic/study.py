@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -21,7 +20,7 @@ from optloc.papers.bistatic.trials import (
     printed_angles,
     still,
 )
-from optloc.papers.report import Picture, Plan, Report, Size, Table, Tick, canvas
+from optloc.papers.report import Picture, Report, Size, Study, Table, Tick
 
 _COUNTS = (1, 10, 50, 200)
 _EARLY = 50
@@ -50,26 +49,7 @@ class Sample:
     epochs: int = EPOCHS
 
 
-SIZES: dict[Size, Sample] = {"quick": Sample(1000, 150, 200), "full": Sample(2000, 1000, 2000)}
-
-
-def plan(sample: Sample, seed: int) -> Plan:
-    """Return the reproduction of the paper.
-
-    Parameters
-    ----------
-    sample : Sample
-        How much is drawn; one of `SIZES`, or any other.
-    seed : int
-        Decides all draws.
-
-    Raises
-    ------
-    InvalidProblem
-        Where matplotlib is missing: before the work, not after it.
-    """
-    canvas(1.0, 1.0)
-    return Plan(len(TRACKERS) + len(ground.CASES) + 5, partial(_run, sample, seed))
+_SIZES: dict[Size, Sample] = {"quick": Sample(1000, 150, 200), "full": Sample(2000, 1000, 2000)}
 
 
 def _run(sample: Sample, seed: int, tick: Tick) -> Report:
@@ -123,3 +103,7 @@ def _pictures(
         Picture("slow", "Slow target", figures.against_time(shown, (later, bound_moving(later)), points)),
         Picture("run", "One run of the slow target", figures.one_run({name: tracks[name] for name in _RUN})),
     )
+
+
+STUDY = Study(_SIZES, lambda _: len(TRACKERS) + len(ground.CASES) + 5, _run)
+"""The reproduction of the paper."""

@@ -27,7 +27,7 @@ from optloc.papers.kinematic.trials import (
     tracked,
 )
 from optloc.papers.kinematic.wrong import taylor, twice_predicted, weighting
-from optloc.papers.report import Picture, Plan, Report, Size, Table, Tick, canvas
+from optloc.papers.report import Picture, Report, Size, Study, Table, Tick
 from optloc.solve import solve
 from optloc.track import polynomial
 from optloc.track.parallel import parallel
@@ -58,26 +58,7 @@ class Sample:
     mixed: int
 
 
-SIZES: dict[Size, Sample] = {"quick": Sample(500, 300), "full": Sample(2000, 1000)}
-
-
-def plan(sample: Sample, seed: int) -> Plan:
-    """Return the reproduction of section 3 of the paper.
-
-    Parameters
-    ----------
-    sample : Sample
-        How much is drawn; one of `SIZES`, or any other.
-    seed : int
-        Decides all draws.
-
-    Raises
-    ------
-    InvalidProblem
-        Where matplotlib is missing: before the work, not after it.
-    """
-    canvas(1.0, 1.0)
-    return Plan(_WORK, partial(_run, sample, seed))
+_SIZES: dict[Size, Sample] = {"quick": Sample(500, 300), "full": Sample(2000, 1000)}
 
 
 def _run(sample: Sample, seed: int, tick: Tick) -> Report:
@@ -198,3 +179,7 @@ def _wrong(seed: int, drawn: dict[str, Draw], matched: dict[str, Score], tests: 
     levels = [f"{each.nees[..., -1].mean():.2f}" for each in (paper, dropped)]
     rows.append(("12: missed row := prediction", "NEES of the static filter at the last step", levels[0], levels[1]))
     return tables.wrong(rows)
+
+
+STUDY = Study(_SIZES, lambda _: _WORK, _run)
+"""The reproduction of the paper."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -15,7 +14,7 @@ from optloc.papers.registration.minima import ghost
 from optloc.papers.registration.scenario import MOVING, NANOSECOND, PRINTED, SPATIAL, truth
 from optloc.papers.registration.tables import Case
 from optloc.papers.registration.trials import History, Score, Setting, history, rms, score, wander
-from optloc.papers.report import Picture, Plan, Report, Size, Table, Tick, canvas
+from optloc.papers.report import Picture, Report, Size, Study, Table, Tick
 from optloc.solve import solve
 
 _GAIN = 0.03
@@ -47,31 +46,15 @@ class Sample:
     last: int = 600
 
 
-SIZES: dict[Size, Sample] = {
+_SIZES: dict[Size, Sample] = {
     "quick": Sample(30, 60, (150, 200, 300, 400, 600), (300, 400, 550, 600, 700)),
     "full": Sample(200, 500, tuple(range(150, 701, 50)), tuple(range(250, 801, 50))),
 }
 
 
-def plan(sample: Sample, seed: int) -> Plan:
-    """Return the reproduction of section 4 of the paper.
-
-    Parameters
-    ----------
-    sample : Sample
-        How much is drawn; one of `SIZES`, or any other.
-    seed : int
-        Decides all draws.
-
-    Raises
-    ------
-    InvalidProblem
-        Where matplotlib is missing: before the work, not after it.
-    """
-    canvas(1.0, 1.0)
+def _work(sample: Sample) -> int:
     histories = 4 * len(sample.fixed) + len(sample.moving) + 3
-    counts = len(printed.INITIAL) + 2 * len(printed.NOISE) + 1
-    return Plan(histories + counts, partial(_run, sample, seed))
+    return histories + len(printed.INITIAL) + 2 * len(printed.NOISE) + 1
 
 
 def _run(sample: Sample, seed: int, tick: Tick) -> Report:
@@ -177,3 +160,7 @@ def _figures(
         pictures.append(Picture(name, title, figure))
         tabled.append(tables.errors(name, f"{title}, in numbers", histories, values))
     return tuple(pictures), tuple(tabled)
+
+
+STUDY = Study(_SIZES, _work, _run)
+"""The reproduction of the paper."""

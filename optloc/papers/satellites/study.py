@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
 from optloc.bounds import crlb
-from optloc.papers.report import Picture, Plan, Report, Size, Table, Tick, canvas
+from optloc.papers.report import Picture, Report, Size, Study, Table, Tick
 from optloc.papers.satellites import figures, tables, text
 from optloc.papers.satellites.scenario import HEIGHT, START, orbits, problem
 from optloc.papers.satellites.trials import climbing, far, fixed, heights, moving, root_trace, wild
@@ -41,26 +40,7 @@ class Sample:
     far: int = 100
 
 
-SIZES: dict[Size, Sample] = {"quick": Sample(200, 100), "full": Sample(2000, 1000)}
-
-
-def plan(sample: Sample, seed: int) -> Plan:
-    """Return the reproduction of the paper.
-
-    Parameters
-    ----------
-    sample : Sample
-        How much is drawn; one of `SIZES`, or any other.
-    seed : int
-        Decides all draws.
-
-    Raises
-    ------
-    InvalidProblem
-        Where matplotlib is missing: before the work, not after it.
-    """
-    canvas(1.0, 1.0)
-    return Plan(len(sample.widths) + len(_HEADINGS) + 3, partial(_run, sample, seed))
+_SIZES: dict[Size, Sample] = {"quick": Sample(200, 100), "full": Sample(2000, 1000)}
 
 
 def _run(sample: Sample, seed: int, tick: Tick) -> Report:
@@ -118,3 +98,7 @@ def _one_shot() -> Table:
     }
     bounds = {name: float(root_trace(crlb(case, START))) for name, case in cases.items()}
     return tables.one_shot(bounds, dict(zip(_FAR, far([np.radians(angle) for angle in _FAR]).tolist(), strict=True)))
+
+
+STUDY = Study(_SIZES, lambda sample: len(sample.widths) + len(_HEADINGS) + 3, _run)
+"""The reproduction of the paper."""
