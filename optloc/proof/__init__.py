@@ -1,0 +1,1 @@
+"""Proofs that no position costs less: enclosure, convex box, branch and bound."""
