@@ -20,16 +20,20 @@ Anal. 46 (2007) (the bound, here with one radius for all of x).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import threading
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from functools import lru_cache, wraps
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from formulations._dual import dual_point
+from formulations._canonical import Data
 
 Array = NDArray[np.float64]
+_Arguments = ParamSpec("_Arguments")
+_Built = TypeVar("_Built")
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +81,8 @@ class Relaxation:
 
     Notes
     -----
-    Agrawal et al. (2019). Holds solver state: build one per worker, do not pickle or share between threads.
+    Agrawal et al. (2019). Threads may share one: each works on numbers of its own, every solve starts afresh, and
+    Clarabel releases the interpreter lock. An answer therefore depends on its own data alone. Do not pickle.
     """
 
     def __init__(
@@ -90,10 +95,20 @@ class Relaxation:
     ) -> None:
         self.problem, self.backend, self.settings, self.radius = problem, backend, dict(settings or {}), radius
         self.parameters = {parameter.name(): parameter for parameter in problem.parameters()}
-        self._data = _Data(problem) if backend == "CLARABEL" else None
-        self._solver: Any = None
+        self._shared = Data(problem) if backend == "CLARABEL" else None
+        self._own, self._lock = threading.local(), threading.Lock()
 
-    def solve(self, values: Mapping[str, Array], *, bound: bool = True) -> Answer:
+    @property
+    def _data(self) -> Data | None:
+        """The data of this thread."""
+        if self._shared is None:
+            return None
+        if not hasattr(self._own, "data"):
+            self._own.data = self._shared.twin()
+        own: Data = self._own.data
+        return own
+
+    def solve(self, values: Mapping[str, Array], *, bound: bool = True, reach: float | None = None) -> Answer:
         """Solve with new parameter values.
 
         Parameters
@@ -102,6 +117,9 @@ class Relaxation:
             Values of every parameter, by name.
         bound : bool
             Whether to recompute the lower bound from the dual; without it the bound is minus infinity.
+        reach : float, optional
+            Length of the variables that no minimiser exceeds, where that is known: it makes the bound rigorous. In
+            the place of ``radius (1 + |x|)``.
 
         Returns
         -------
@@ -110,23 +128,24 @@ class Relaxation:
         """
         if values.keys() != self.parameters.keys():
             raise ValueError(f"parameters {sorted(values)} given, {sorted(self.parameters)} expected")
-        return self._elsewhere(values) if self._data is None else self._directly(self._data, values, bound=bound)
+        data = self._data
+        if data is None:
+            with self._lock:  # the values are those of the one problem
+                return self._elsewhere(values)
+        return self._directly(data, values, bound=bound, reach=reach)
 
-    def _directly(self, data: _Data, values: Mapping[str, Array], *, bound: bool) -> Answer:
+    def _directly(self, data: Data, values: Mapping[str, Array], *, bound: bool, reach: float | None) -> Answer:
         data.feed(values)
-        if self._solver is None:
-            self._solver = _solver(data, self.settings)
-        else:
-            self._solver.update(P=data.P.data, q=data.q, A=data.A.data, b=data.b)
-        solution = self._solver.solve()
+        solution = _solver(data, self.settings).solve()
         x, z, status = np.array(solution.x), np.array(solution.z), str(solution.status)
         if not (np.isfinite(x).all() and np.isfinite(z).all()):
             x, z = np.full(len(x), np.nan), np.full(len(z), np.nan)
         quadratic = float(x @ data.square(x))
+        far = self.radius * (1.0 + float(np.sqrt(x @ x))) if reach is None else reach
         return Answer(
             data.recover(x),
             0.5 * quadratic + float(data.q @ x) + data.d,
-            data.bound(x, z, self.radius * (1.0 + float(np.sqrt(x @ x)))) if bound else -np.inf,
+            data.bound(x, z, far) if bound else -np.inf,
             status,
             status == "Solved",
             int(solution.iterations),
@@ -154,11 +173,11 @@ class Relaxation:
         return Answer(found, primal, -np.inf, status, status == "optimal", count)
 
 
-def _solver(data: _Data, settings: Mapping[str, Any]) -> Any:
+def _solver(data: Data, settings: Mapping[str, Any]) -> Any:
     import clarabel
 
     chosen = clarabel.DefaultSettings()
-    # presolve and chordal decomposition forbid updates of the data
+    # a presolve or a decomposition would return multipliers of another problem than the one that bounds are read from
     chosen.verbose, chosen.presolve_enable, chosen.chordal_decomposition_enable = False, False, False
     chosen.max_threads = 1
     for name, value in settings.items():
@@ -166,129 +185,28 @@ def _solver(data: _Data, settings: Mapping[str, Any]) -> Any:
     return clarabel.DefaultSolver(data.P, data.q, data.A, data.b, data.cones, chosen)
 
 
-class _Data:
-    """Clarabel's data as affine functions of the parameters, with a fixed sparsity pattern."""
+def kept(maxsize: int) -> Callable[[Callable[_Arguments, _Built]], Callable[_Arguments, _Built]]:
+    """Build once for each set of arguments in each process, whichever thread asks first.
 
-    def __init__(self, problem: Any) -> None:
-        import cvxpy
-        import scipy.sparse as sp
-        from cvxpy.reductions.solvers.conic_solvers.clarabel_conif import dims_to_solver_cones
+    Parameters
+    ----------
+    maxsize : int
+        How many are kept, the latest used.
 
-        for parameter in problem.parameters():
-            if parameter.value is None:
-                parameter.value = np.zeros(parameter.shape)
-        if not (problem.is_dcp(dpp=True) and isinstance(problem.objective, cvxpy.Minimize)):
-            raise ValueError("the problem must be a minimisation that follows cvxpy's rules for parameters (DPP)")
-        stuff, chain, inverse = problem.get_problem_data(cvxpy.CLARABEL)
-        self.program = stuff["param_prob"]
-        self.dims, self.cones = stuff["dims"], dims_to_solver_cones(stuff["dims"])
-        columns = self.program.param_id_to_col
-        self.slots = {p.name(): (columns[p.id], p.shape) for p in problem.parameters() if p.id in columns}
-        if len(self.slots) != len(problem.parameters()):
-            raise ValueError("parameters need unique names and no symmetric, diagonal or semidefinite attribute")
-        self.vector = np.zeros(self.program.total_param_size + 1)
-        self.vector[-1] = 1.0
-        n = self.program.x.size
-        self._linear = _Product.of(self.program.q)
-        self._matrix, pattern = _affine(self.program.reduced_A)
-        m = pattern[2][0]
-        self.q, self.d, self.b = np.zeros(n), 0.0, np.zeros(m)
-        last = pattern[1][n]
-        self._left, self._rows = slice(0, last), pattern[0][last:]
-        self._quadratic: _Product | None = None
-        self._upper = np.zeros(0, dtype=np.int64)
-        self.A = sp.csc_array((np.zeros(last), pattern[0][:last], pattern[1][: n + 1]), shape=(m, n))
-        self.P = sp.csc_array((n, n))
-        if self.program.P is not None:
-            self._quadratic, pattern = _affine(self.program.reduced_P)
-            column = np.repeat(np.arange(n), np.diff(pattern[1]))
-            self._upper = np.flatnonzero(pattern[0] <= column)
-            row, column = pattern[0][self._upper], column[self._upper]
-            start = np.concatenate([[0], np.cumsum(np.bincount(column, minlength=n))])
-            self.P = sp.csc_array((np.zeros(len(row)), row, start), shape=(n, n))
-        self._across, self._below = _Product.transposed(self.A), _Product.transposed(self.P)
-        self._above = _Product(n, self._below.source, self._below.row, self.P.data)
-        self._ridge = np.where(self._below.row == self._below.source, 0.0, 1.0)
-        self._recover = _recovery(problem, chain, inverse, self.program.x.id, n)
+    Returns
+    -------
+    callable
+        A decorator of functions with hashable arguments.
+    """
 
-    def feed(self, values: Mapping[str, Array]) -> None:
-        for name, (start, shape) in self.slots.items():
-            value = np.asarray(values[name], dtype=np.float64)
-            if value.shape != shape:
-                raise ValueError(f"parameter {name} has shape {value.shape}, {shape} expected")
-            self.vector[start : start + value.size] = value.ravel(order="F")
-        linear = self._linear(self.vector)
-        self.q, self.d = linear[:-1].copy(), float(linear[-1])
-        entries = self._matrix(self.vector)
-        self.A.data[:] = -entries[self._left]
-        self.b = np.zeros(self.A.shape[0])
-        self.b[self._rows] = entries[self._left.stop :]
-        if self._quadratic is not None:
-            self.P.data[:] = self._quadratic(self.vector)[self._upper]
+    def decorate(build: Callable[_Arguments, _Built]) -> Callable[_Arguments, _Built]:
+        cached, lock = lru_cache(maxsize)(build), threading.Lock()
 
-    def square(self, x: Array) -> Array:
-        """``Px`` from the stored upper triangle."""
-        if self._quadratic is None:
-            return np.zeros_like(x)
-        return self._below(x) + self._above(x, self._ridge)
+        @wraps(build)
+        def once(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Built:
+            with lock:
+                return cached(*args, **kwargs)  # type: ignore[arg-type]  # arguments are hashable
 
-    def bound(self, x: Array, z: Array, radius: float) -> float:
-        z = dual_point(z, self.dims)
-        if not np.isfinite(z).all():
-            return -np.inf
-        product = self.square(x)
-        rest = product + self.q + self._across(z)
-        return self.d - 0.5 * float(x @ product) - float(self.b @ z) - radius * float(np.sqrt(rest @ rest))
+        return once
 
-    def recover(self, x: Array) -> dict[str, Array]:
-        return {name: (matrix @ x).reshape(shape, order="F") for name, matrix, shape in self._recover}
-
-
-@dataclass(frozen=True, slots=True)
-class _Product:
-    """A sparse matrix as a product only: on problems of tens of entries scipy's own costs more than the solver."""
-
-    size: int
-    row: NDArray[np.int64]
-    source: NDArray[np.int64]
-    data: Array
-
-    @classmethod
-    def of(cls, matrix: Any) -> _Product:
-        entries = matrix.tocoo()
-        return cls(matrix.shape[0], entries.row.astype(np.int64), entries.col.astype(np.int64), entries.data)
-
-    @classmethod
-    def transposed(cls, matrix: Any) -> _Product:
-        """Transpose of a compressed-column matrix, sharing its entries."""
-        size = matrix.shape[1]
-        column = np.repeat(np.arange(size), np.diff(matrix.indptr))
-        return cls(size, column, matrix.indices.astype(np.int64), matrix.data)
-
-    def __call__(self, x: Array, share: Array | float = 1.0) -> Array:
-        total = np.bincount(self.row, weights=self.data * x[self.source] * share, minlength=self.size)
-        return np.asarray(total, dtype=np.float64)
-
-
-def _affine(reduced: Any) -> tuple[_Product, tuple[NDArray[np.int64], NDArray[np.int64], tuple[int, int]]]:
-    """Map from the parameter vector to the stored entries, and their compressed-column pattern."""
-    reduced.cache()
-    if reduced.problem_data_index is None:
-        raise ValueError("the problem has no constraint")
-    return _Product.of(reduced.reduced_mat), reduced.problem_data_index
-
-
-def _recovery(problem: Any, chain: Any, inverse: Any, name: int, n: int) -> list[tuple[str, Array, tuple[int, ...]]]:
-    """Matrices from the solver's x to each variable, read off by undoing the reductions on unit vectors."""
-    from cvxpy.reductions.solution import Solution
-
-    columns: dict[int, list[Array]] = {variable.id: [] for variable in problem.variables()}
-    for unit in np.eye(n):
-        solution = Solution("optimal", 0.0, {name: unit}, {}, {})
-        for reduction, data in zip(reversed(chain.reductions[:-1]), reversed(inverse[:-1]), strict=True):
-            solution = reduction.invert(solution, data)
-        for variable in problem.variables():
-            value = solution.primal_vars[variable.id]
-            dense = value.toarray() if hasattr(value, "toarray") else np.asarray(value)
-            columns[variable.id].append(dense.ravel(order="F"))
-    return [(v.name(), np.stack(columns[v.id], axis=1), v.shape) for v in problem.variables()]
+    return decorate

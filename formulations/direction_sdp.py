@@ -26,7 +26,6 @@ and A. Zisserman, "Multiple view geometry in computer vision", 2004, section 9 (
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from itertools import combinations
 from typing import Any
 
@@ -35,7 +34,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from formulations._minorant import minorant
 from formulations.bearing_ls import meeting, predicted, rays
-from formulations.conic import Answer, Relaxation
+from formulations.conic import Answer, Relaxation, kept
 
 Array = NDArray[np.float64]
 
@@ -106,7 +105,7 @@ def direction_problem(count: int) -> Any:
     return cp.Problem(cp.Minimize(2 * linear @ w + square @ diagonal), rules)
 
 
-@lru_cache(maxsize=16)
+@kept(16)
 def _built(count: int, backend: str) -> Relaxation:
     tight = {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9, "tol_feas": 1e-9}
     # the equalities depend on each other at a solution: with Clarabel's own 1e-8 one solve in five stops early
@@ -223,8 +222,6 @@ def _solve(frame: Array, S: Array, cost: _Cost, backend: str) -> Directed:
     near = np.einsum("pai,pi->pa", frame[pairs[:, 0]], base)
     far = np.einsum("pai,pi->pa", frame[pairs[:, 1]], base)
     relaxation = _built(count, backend)
-    # |Y| of every point that matters: the radius that makes the dual bound rigorous
-    relaxation.radius = 1.0 + cost.reach / unit**2
     answer = relaxation.solve(
         {
             "linear": (cost.linear * unit).ravel(),
@@ -235,7 +232,9 @@ def _solve(frame: Array, S: Array, cost: _Cost, backend: str) -> Directed:
             "turn": unit * turn.reshape(-1, 9),
             "start": (near[:, 0] - far[:, 0]) / unit,
             "order": np.concatenate([near, -far], axis=1),
-        }
+        },
+        # |Y| of every point that matters
+        reach=1.0 + cost.reach / unit**2,
     )
     lift = answer.values["lift"]
     v, ratio = np.full((count, 3), np.nan), np.nan

@@ -24,13 +24,12 @@ mobile location using semidefinite programming", ICASSP 2004.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from formulations.conic import Answer, Relaxation
+from formulations.conic import Answer, Relaxation, kept
 from formulations.nls import Local, Program
 
 Array = NDArray[np.float64]
@@ -100,7 +99,7 @@ def lifted_problem(count: int, dim: int) -> Any:
     return cp.Problem(cp.Minimize(value), rules)
 
 
-@lru_cache(maxsize=16)
+@kept(16)
 def _built(count: int, dim: int, backend: str) -> Relaxation:
     tight = {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9, "tol_feas": 1e-9} if backend == "CLARABEL" else {}
     return Relaxation(lifted_problem(count, dim), backend=backend, settings=tight)
@@ -139,9 +138,9 @@ def lifted_ranges(
     size = float(np.abs(K).max()) or 1.0
     relaxation = _built(count, dim, backend)
     square = (S * S).sum(axis=1)
-    relaxation.radius = 1.0 + reach**2 + float(((reach + np.sqrt(square)) ** 2).sum())
+    longest = 1.0 + reach**2 + float(((reach + np.sqrt(square)) ** 2).sum())
     values = {"gram": table.T @ table / size**2, "station": S, "square": square, "reach": np.array(reach**2)}
-    answer = relaxation.solve(values)
+    answer = relaxation.solve(values, reach=longest)
     lift, ratio = answer.values["lift"], np.nan
     if np.isfinite(lift).all():
         found = np.linalg.eigvalsh(lift)
@@ -150,7 +149,7 @@ def lifted_ranges(
     return Lifted(point, ranges, answer.primal * size**2, max(answer.bound, 0.0) * size**2, ratio, answer)
 
 
-@lru_cache(maxsize=16)
+@kept(16)
 def _program(count: int, dim: int, measured: int) -> Program:
     """Program with unknowns (x, r) and parameters: the stations, then the rows K, both row by row."""
 

@@ -21,13 +21,12 @@ Pattern Anal. Mach. Intell. 30 (2008).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from formulations._sight_cones import ball_problem, cone_data, edge_problem
-from formulations.conic import Answer, Relaxation
+from formulations.conic import Answer, Relaxation, kept
 
 Array = NDArray[np.float64]
 
@@ -90,7 +89,7 @@ class Minimax:
     solves: int
 
 
-@lru_cache(maxsize=32)
+@kept(32)
 def _built(kind: str, count: int, dim: int, backend: str) -> Relaxation:
     tight = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10} if backend == "CLARABEL" else {}
     if kind == "edge":
@@ -123,7 +122,7 @@ def common(direction: ArrayLike, station: ArrayLike, bound: ArrayLike, *, backen
     The module's text.
     """
     u, S, theta = (np.asarray(part, dtype=np.float64) for part in (direction, station, bound))
-    relaxation = _built("ball", *u.shape, backend)
+    relaxation = _built("ball", u.shape[0], u.shape[1], backend)
     answer = relaxation.solve(cone_data(u, S, theta, ball=True))
     point, margin = answer.values["point"], -answer.primal
     inside = bool((angles(point, u, S) <= theta).all())
@@ -154,7 +153,7 @@ def extent(
     Lobo et al. (1998).
     """
     u, S, theta = (np.asarray(part, dtype=np.float64) for part in (direction, station, bound))
-    relaxation, data = _built("edge", *u.shape, backend), cone_data(u, S, theta, ball=False)
+    relaxation, data = _built("edge", u.shape[0], u.shape[1], backend), cone_data(u, S, theta, ball=False)
     out = []
     for line in np.asarray(towards, dtype=np.float64):
         answer = relaxation.solve({**data, "towards": -line})

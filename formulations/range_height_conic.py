@@ -17,14 +17,13 @@ Found. Trends Optim. 3 (2017).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from formulations._curve import Curve, three_stations
-from formulations.conic import Answer, Relaxation
+from formulations.conic import Answer, Relaxation, kept
 from formulations.ellipsoid import Ellipsoid
 
 Array = NDArray[np.float64]
@@ -75,7 +74,7 @@ def lifted_problem() -> Any:
     return cp.Problem(cp.Minimize(cp.sum(cp.multiply(objective, lift))), [lift >> 0, lift[0, 0] == 1, *zero])
 
 
-@lru_cache(maxsize=8)
+@kept(8)
 def _built(backend: str) -> Relaxation:
     tight = {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11} if backend == "CLARABEL" else {}
     return Relaxation(lifted_problem(), backend=backend, settings=tight)

@@ -36,14 +36,13 @@ in the lift); the leftovers, the price and its reason are this project's.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from formulations._windows import Windows
-from formulations.conic import Answer, Relaxation
+from formulations.conic import Answer, Relaxation, kept
 
 Array = NDArray[np.float64]
 
@@ -134,7 +133,7 @@ def registration_problem(windows: int, stations: int, dimension: int, order: int
     return cp.Problem(cp.Minimize(cost), rules)
 
 
-@lru_cache(maxsize=16)
+@kept(16)
 def _built(windows: int, stations: int, dimension: int, order: int, backend: str) -> Relaxation:
     return Relaxation(registration_problem(windows, stations, dimension, order), backend=backend)
 

@@ -19,13 +19,12 @@ see the tests.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from formulations.conic import Answer, Relaxation
+from formulations.conic import Answer, Relaxation, kept
 from formulations.squared_range import Quadric
 
 Array = NDArray[np.float64]
@@ -112,7 +111,7 @@ def hull_problem(quadric: Quadric) -> Any:
     return cp.Problem(cp.Minimize(cp.norm(factor[:, :n] @ y + factor[:, n])), [inside])
 
 
-@lru_cache(maxsize=32)
+@kept(32)
 def _built(kind: str, quadric: Quadric, backend: str) -> Relaxation:
     tight = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10} if backend == "CLARABEL" else {}
     problem = shor_problem(quadric) if kind == "shor" else hull_problem(quadric)

@@ -12,6 +12,7 @@ from optloc.errors import InvalidProblem, NoSolution, OptlocError
 from optloc.evaluate import predict
 from optloc.fix import Alternatives, Fix, Stage
 from optloc.frames import CARTESIAN, ECEF, Frame
+from optloc.gauss_newton import gauss_newton
 from optloc.layout import Layout
 from optloc.learnt import with_known_bias
 from optloc.linear import Linear, linearise
@@ -22,6 +23,7 @@ from optloc.observe import Observability, observability
 from optloc.problem import Problem
 from optloc.simulate import simulate
 from optloc.solve import FORMULATIONS, METHODS, SOLVERS, solve
+from optloc.solve.certify import certify
 from optloc.solve.reduce import reduce
 from optloc.solve.running import Running
 from optloc.status import Certificate, Status
@@ -61,9 +63,11 @@ __all__ = [
     "Status",
     "assemble",
     "by_epoch",
+    "certify",
     "crlb",
     "crlb_course",
     "from_table",
+    "gauss_newton",
     "linearise",
     "load",
     "measured",

@@ -6,24 +6,23 @@ from typing import Any
 
 import numpy as np
 
+from optloc.arrays import foreign, library, placed
 from optloc.models.jet import Jet
 from optloc.models.primitives import wrap
 from optloc.plan import Plan, plans
 from optloc.problem import Problem
 from optloc.states import fitting, points
-from optloc.types import Array
+from optloc.types import Array, Rows
 
 
 def predict(problem: Problem, x: Array) -> Array:
     """Return the modelled measurements h(x), (..., m), of a problem at vectors x (..., size)."""
-    values, x = [], fitting(problem, x)
+    values, x, xp = [], fitting(problem, x), library(x)
     for plan in plans(problem):
-        t, a, b = points(problem, plan, x, differentiate=False)
-        value = np.asarray(plan.model.h(t, a, b))
-        value = np.broadcast_to(value, np.broadcast_shapes(value.shape, (plan.block.count,)))
-        values.append(_biased(plan, x, value, None, None))
-    shape = np.broadcast_shapes(*(value.shape[:-1] for value in values))
-    return np.concatenate([np.broadcast_to(value, (*shape, value.shape[-1])) for value in values], axis=-1)
+        value = placed(plan.model.h(*points(problem, plan, x, differentiate=False)), x)
+        value = xp.broadcast_to(value, np.broadcast_shapes(value.shape, (plan.block.count,)))
+        values.append(_biased(plan, x, value)[0])
+    return _joined(values)
 
 
 def differentiate(problem: Problem, x: Array) -> tuple[Array, Array]:
@@ -34,7 +33,7 @@ def differentiate(problem: Problem, x: Array) -> tuple[Array, Array]:
     problem : Problem
         Batch of problems (...).
     x : array (..., size)
-        Parameter vectors, ordered by ``problem.layout``.
+        Parameter vectors, ordered by ``problem.layout``, of any array library; so are the answers.
 
     Returns
     -------
@@ -43,41 +42,43 @@ def differentiate(problem: Problem, x: Array) -> tuple[Array, Array]:
     jacobian : array (..., m, n + l)
         Derivatives of h with respect to the shared unknowns and to the local ones of each row's epoch.
     """
-    layout, x = problem.layout, fitting(problem, x)
+    layout, x, xp = problem.layout, fitting(problem, x), library(x)
+    width = layout.n_shared + layout.n_local
     batch = np.broadcast_shapes(problem.batch_shape, x.shape[:-1])
-    jacobian = np.zeros((*batch, problem.count, layout.n_shared + layout.n_local))
-    values = []
-    for plan, start in zip(plans(problem), problem.starts, strict=True):
-        value = _differentiate(problem, plan, x, jacobian[..., start : start + plan.block.count, :])
-        values.append(np.broadcast_to(value, (*batch, plan.block.count)))
-    return _residual(problem, np.concatenate(values, axis=-1)), jacobian
+    place = None if foreign(x) else np.zeros((*batch, problem.count, width))
+    residuals, jacobians = [], []
+    for plan, block, start in zip(plans(problem), problem.rows, problem.starts, strict=True):
+        m = block.count
+        value, terms = _derived(problem, plan, x)
+        residual = _residual(block, value, plan.model.period is not None)
+        residuals.append(xp.broadcast_to(residual, (*batch, m)))
+        if place is None:
+            jacobians.append(_stacked(terms, (*batch, m), width, x))
+        else:
+            _added(terms, place[..., start : start + m, :])
+    return _joined(residuals), xp.concat(jacobians, axis=-2) if place is None else place
 
 
-def _residual(problem: Problem, value: Array) -> Array:
-    residual = np.asarray(problem.observed - value)
-    for plan, start in zip(plans(problem), problem.starts, strict=True):
-        if plan.model.period is not None:
-            part = slice(start, start + plan.block.count)
-            residual[..., part] = wrap(residual[..., part])
-    weight = problem.weight
-    return residual if np.all(weight > 0.0) else np.where(weight > 0.0, residual, 0.0)
+# Derivatives of a block of m rows: folded column (m,) and coefficient (m,) of each row, times a factor (..., m or 1).
+_Terms = list[tuple[Array, Array, Any]]
 
 
-def _differentiate(problem: Problem, plan: Plan, x: Array, jacobian: Array) -> Array:
-    """Write the derivatives of one block into its part of the Jacobian and return its values."""
-    t, a, b = points(problem, plan, x, differentiate=True)
-    jet = plan.model.h(t, a, b)
+def _derived(problem: Problem, plan: Plan, x: Array) -> tuple[Any, _Terms]:
+    """Return the values (..., m) of one block, biases included, and their derivatives."""
+    jet, m, fold = plan.model.h(*points(problem, plan, x, differentiate=True)), plan.block.count, _folded(problem)
     if not isinstance(jet, Jet):
-        jet = Jet(np.asarray(jet), {})
-    rows = np.arange(plan.block.count)
-    fold = _folded(problem)
+        jet = Jet(placed(np.asarray(jet), x), {})
+    value, gain = _biased(plan, x, jet.value)
+    terms: _Terms = []
     for feed in plan.feeds:
         partial = jet.partials.get(feed.seed)
         if partial is not None:
-            picked = partial if isinstance(feed.rows, slice) or partial.shape[-1] == 1 else partial[..., feed.rows]
-            jacobian[..., rows[feed.rows], fold(feed.column)] += picked * feed.gain
-    value = np.broadcast_to(jet.value, (*jacobian.shape[:-2], plan.block.count))
-    return _biased(plan, x, value, jacobian, fold)
+            column, coefficient = feed.table(m)
+            terms.append((fold(column), coefficient, partial if gain is None else partial * gain))
+    unit = placed(np.ones(1), x)
+    for found, factor in ((plan.gains, jet.value), (plan.adds, unit)):
+        terms += [(fold(column), coefficient, factor) for column, coefficient in found.tables(m)]
+    return value, terms
 
 
 def _folded(problem: Problem) -> Any:
@@ -90,14 +91,48 @@ def _folded(problem: Problem) -> Any:
     return fold
 
 
-def _biased(plan: Plan, x: Array, value: Array, jacobian: Array | None, fold: Any) -> Array:
-    """Return the values with scales, offsets, drifts and emission times; write their derivatives where asked."""
-    if not plan.gains.row.size and not plan.adds.row.size:
-        return value
-    gain, added = 1.0 + plan.gains.total(x, plan.block.count), plan.adds.total(x, plan.block.count)
-    if jacobian is not None:
-        jacobian *= gain[..., None]
-        for terms, factor in ((plan.gains, value), (plan.adds, np.ones(value.shape[-1:]))):
-            derivative = factor[..., terms.row] * terms.coefficient
-            np.add.at(jacobian, (..., terms.row, fold(terms.column)), derivative)  # type: ignore[arg-type]
-    return np.asarray(value * gain + added)
+def _biased(plan: Plan, x: Array, value: Any) -> tuple[Any, Any]:
+    """Return values with scales, offsets, drifts and emission times, and the factor that scales them or None."""
+    m, gain = plan.block.count, None
+    if plan.gains.row.size:
+        gain = 1.0 + plan.gains.total(x, m)
+        value = value * gain
+    return value + plan.adds.total(x, m) if plan.adds.row.size else value, gain
+
+
+def _residual(block: Rows, value: Any, periodic: bool) -> Any:
+    """Return what is measured less the values of one block; absent rows count as met."""
+    residual = placed(block.z - block.correction, value) - value
+    residual = wrap(residual) if periodic else residual
+    if not foreign(block.weight) and np.all(block.weight > 0.0):
+        return residual
+    return library(residual).where(placed(block.weight, residual) > 0.0, residual, 0.0)
+
+
+def _added(terms: _Terms, jacobian: Array) -> None:
+    """Add derivatives to a block's part of the Jacobian."""
+    for column, coefficient, factor in terms:
+        if np.all(column == column[:1]):
+            jacobian[..., column[0]] += factor if np.all(coefficient == 1.0) else factor * coefficient
+            continue
+        rows = np.flatnonzero(coefficient)
+        picked = factor if factor.shape[-1:] in ((), (1,)) else factor[..., rows]
+        jacobian[..., rows, column[rows]] += picked * coefficient[rows]
+
+
+def _stacked(terms: _Terms, shape: tuple[int, ...], width: int, x: Array) -> Any:
+    """Return the Jacobian (*shape, width) of a block, column by column: in some libraries nothing can be written."""
+    columns: dict[int, Any] = {}
+    for column, coefficient, factor in terms:
+        for j in np.unique(column[coefficient != 0.0]):
+            part = factor * placed(np.where(column == j, coefficient, 0.0), x)
+            columns[int(j)] = columns[int(j)] + part if int(j) in columns else part
+    zero, xp = placed(np.zeros(1), x), library(x)
+    return xp.stack([xp.broadcast_to(columns.get(j, zero), shape) for j in range(width)], axis=-1)
+
+
+def _joined(parts: list[Any]) -> Array:
+    xp = library(parts[0])
+    shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
+    joined: Array = xp.concat([xp.broadcast_to(part, (*shape, part.shape[-1])) for part in parts], axis=-1)
+    return joined

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from optloc.arrays import library
 from optloc.errors import InvalidProblem
 from optloc.types import Array, Bias, Motion, Stations
 
@@ -87,7 +88,7 @@ class Layout:
     def split(self, x: Array) -> tuple[Array, Array]:
         """Return the shared part (..., n) and the local part (..., k, l) of vectors (..., size)."""
         n = self.n_shared
-        return x[..., :n], x[..., n:].reshape(*x.shape[:-1], self.epochs, self.n_local)
+        return x[..., :n], library(x).reshape(x[..., n:], (*x.shape[:-1], self.epochs, self.n_local))
 
     def take(self, x: Array, name: str) -> Array:
         """Return a named part, (..., q) of the shared unknowns or (..., k, q) of the local ones."""

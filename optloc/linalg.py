@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
+from optloc import arrays
 from optloc.types import Array
 
 
@@ -25,6 +28,8 @@ def factor(matrix: Array, least: float = 1e-15) -> tuple[Array, Array]:
         Whether the matrix is numerically positive definite.
     """
     n = matrix.shape[-1]
+    if arrays.foreign(matrix):
+        return _factor(matrix, least)
     lower = np.zeros(matrix.shape)
     ok = np.ones(matrix.shape[:-2], dtype=bool)
     for j in range(n):
@@ -37,7 +42,36 @@ def factor(matrix: Array, least: float = 1e-15) -> tuple[Array, Array]:
     return lower, ok
 
 
+def _factor(matrix: Any, least: float) -> tuple[Any, Any]:
+    """Return what `factor` does without writing into an array: column by column, the rest less what each explains."""
+    xp, n = arrays.library(matrix), matrix.shape[-1]
+    below = arrays.placed(np.tril(np.ones((n, n))), matrix)
+    rest, columns, ok = matrix, [], matrix[..., 0, 0] == matrix[..., 0, 0]
+    for j in range(n):
+        pivot = rest[..., j, j]
+        positive = pivot > least * xp.abs(matrix[..., j, j])
+        ok = ok & positive
+        column = below[:, j] * rest[..., :, j] / xp.sqrt(xp.where(positive, pivot, 1.0))[..., None]
+        rest = rest - column[..., :, None] * column[..., None, :]
+        columns.append(column)
+    return xp.stack(columns, axis=-1), ok
+
+
+def _substituted(lower: Any, right: Any, order: range) -> Array:
+    """Return the solution of a triangular system whose rows are solved in a given order; it writes into no array."""
+    xp, rows = arrays.library(lower), dict[int, Any]()
+    for j in order:
+        left = right[..., j, :]
+        for i, row in rows.items():
+            left = left - lower[..., j, i, None] * row
+        rows[j] = left / lower[..., j, j, None]
+    solved: Array = xp.stack([rows[j] for j in range(len(order))], axis=-2)
+    return solved
+
+
 def _forward(lower: Array, right: Array) -> Array:
+    if arrays.foreign(lower):
+        return _substituted(lower, right, range(lower.shape[-1]))
     out = np.empty(np.broadcast_shapes(lower.shape[:-2], right.shape[:-2]) + right.shape[-2:])
     for j in range(lower.shape[-1]):
         known = (lower[..., j, :j, None] * out[..., :j, :]).sum(-2)
@@ -46,6 +80,8 @@ def _forward(lower: Array, right: Array) -> Array:
 
 
 def _backward(lower: Array, right: Array) -> Array:
+    if arrays.foreign(lower):
+        return _substituted(lower.mT, right, range(lower.shape[-1])[::-1])
     out = np.empty(right.shape)
     for j in reversed(range(lower.shape[-1])):
         known = (lower[..., j + 1 :, j, None] * out[..., j + 1 :, :]).sum(-2)
@@ -74,21 +110,22 @@ def solve(matrix: Array, right: Array, least: float = 1e-15) -> tuple[Array, Arr
     ok : bool array (...)
         Whether the matrix is numerically positive definite.
     """
-    diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
+    xp = arrays.library(matrix)
+    diagonal = xp.linalg.diagonal(matrix)
     good = diagonal > 0.0
-    scale = 1.0 / np.sqrt(np.where(good, diagonal, 1.0))
+    scale = 1.0 / xp.sqrt(xp.where(good, diagonal, 1.0))
     lower, ok = factor(matrix * scale[..., :, None] * scale[..., None, :], least)
-    ok = ok & good.all(-1)
-    lower = np.where(ok[..., None, None], lower, np.eye(matrix.shape[-1]))
+    ok = ok & xp.all(good, axis=-1)
+    lower = xp.where(ok[..., None, None], lower, arrays.eye(matrix.shape[-1], matrix))
     x = scale[..., None] * _backward(lower, _forward(lower, scale[..., None] * right))
-    return np.where(ok[..., None, None], x, 0.0), ok
+    return xp.where(ok[..., None, None], x, 0.0), ok
 
 
 def inverse(matrix: Array, least: float = 1e-15) -> tuple[Array, Array]:
     """Return inverses (..., n, n) of symmetric positive definite matrices, NaN where not ok, and ok (...)."""
-    n = matrix.shape[-1]
-    out, ok = solve(matrix, np.broadcast_to(np.eye(n), matrix.shape), least)
-    return np.where(ok[..., None, None], 0.5 * (out + np.swapaxes(out, -1, -2)), np.nan), ok
+    xp = arrays.library(matrix)
+    out, ok = solve(matrix, xp.broadcast_to(arrays.eye(matrix.shape[-1], matrix), matrix.shape), least)
+    return xp.where(ok[..., None, None], 0.5 * (out + out.mT), xp.nan), ok
 
 
 def root(matrix: Array, cut: float = 1e-12) -> tuple[Array, Array]:
@@ -108,14 +145,16 @@ def root(matrix: Array, cut: float = 1e-12) -> tuple[Array, Array]:
     regular : bool array (...)
         Whether there are none.
     """
-    diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+    xp = arrays.library(matrix)
+    diagonal = xp.linalg.diagonal(matrix)
+    scale = 1.0 / xp.sqrt(xp.where(diagonal > 0.0, diagonal, 1.0))
     scaled = matrix * scale[..., :, None] * scale[..., None, :]
-    finite = np.asarray(np.isfinite(scaled).all((-1, -2)))
-    values, vectors = np.linalg.eigh(np.where(finite[..., None, None], scaled, 0.0))
-    kept = values > cut * np.maximum(values[..., -1:], cut)
-    inverse = np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)
-    return scale[..., :, None] * vectors * inverse[..., None, :], np.asarray(kept.all(-1))
+    finite = xp.all(xp.isfinite(scaled), axis=(-1, -2))
+    values, vectors = xp.linalg.eigh(xp.where(finite[..., None, None], scaled, 0.0))
+    largest = values[..., -1:]
+    kept = values > cut * xp.where(largest > cut, largest, cut)
+    inverse = xp.where(kept, 1.0 / xp.sqrt(xp.where(kept, values, 1.0)), 0.0)
+    return scale[..., :, None] * vectors * inverse[..., None, :], xp.all(kept, axis=-1)
 
 
 def whitening(covariance: Array) -> Array:
@@ -132,20 +171,22 @@ def whitening(covariance: Array) -> Array:
         Lower triangular where the covariance of the rows present is regular; its rank is that of the covariance, and
         rows beyond it, like the columns of absent rows, are exactly zero.
     """
-    diagonal = np.diagonal(covariance, axis1=-2, axis2=-1)
+    xp = arrays.library(covariance)
+    diagonal = xp.linalg.diagonal(covariance)
     absent = diagonal == 0.0
     if covariance.shape[-1] == 1:
-        return np.asarray(np.where(absent[..., None], 0.0, 1.0 / np.sqrt(np.where(absent[..., None], 1.0, covariance))))
-    scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
+        matrix: Array = xp.where(absent[..., None], 0.0, 1.0 / xp.sqrt(xp.where(absent[..., None], 1.0, covariance)))
+        return matrix
+    scale = 1.0 / xp.sqrt(xp.where(diagonal > 0.0, diagonal, 1.0))
     unit = covariance * scale[..., :, None] * scale[..., None, :]
-    eye = np.broadcast_to(np.eye(covariance.shape[-1]), covariance.shape)
-    lower, ok = factor(unit + absent[..., None] * eye)
-    pivot = np.diagonal(lower, axis1=-2, axis2=-1).min(-1)
-    ok = ok & (pivot > 1e-6)
-    matrix = _forward(np.where(ok[..., None, None], lower, eye), eye)
-    if not ok.all():
-        values, vectors = np.linalg.eigh(np.where(np.isfinite(unit), unit, 0.0))
+    eye = xp.broadcast_to(arrays.eye(covariance.shape[-1], covariance), covariance.shape)
+    lower, ok = factor(xp.where(absent[..., None], eye, unit))
+    ok = ok & xp.all(xp.linalg.diagonal(lower) > 1e-6, axis=-1)
+    matrix = _forward(xp.where(ok[..., None, None], lower, eye), eye)
+    if not bool(xp.all(ok)):
+        values, vectors = xp.linalg.eigh(xp.where(xp.isfinite(unit), unit, 0.0))
         kept = values > 1e-10 * values[..., -1:]
-        roots = np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)
-        matrix = np.where(ok[..., None, None], matrix, roots[..., :, None] * np.swapaxes(vectors, -1, -2))
-    return np.asarray(matrix * (scale * ~absent)[..., None, :])
+        roots = xp.where(kept, 1.0 / xp.sqrt(xp.where(kept, values, 1.0)), 0.0)
+        matrix = xp.where(ok[..., None, None], matrix, roots[..., :, None] * vectors.mT)
+    matrix = matrix * xp.where(absent, 0.0, scale)[..., None, :]
+    return matrix

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optloc import linalg
+from optloc import arrays, linalg
 from optloc.types import Array
 
 
@@ -63,14 +63,17 @@ class Whitener:
     def apply(self, values: Array) -> Array:
         """Return whitened values (..., g * r, p) of values (..., m, p) for this block's rows."""
         g, r = self.row.shape
+        matrix, count = arrays.placed(self.matrix, values), values.shape[-2]
+        whole = self.row.size == count and np.array_equal(self.row.ravel(), np.arange(count))
+        white: Array
         if r == 1:
-            return self.matrix[..., 0] * values[..., self.row[:, 0], :]
-        if g == 1:
-            rows = self.row[0]
-            whole = len(rows) == values.shape[-2] and bool(np.all(np.diff(rows) == 1))
-            return self.matrix[..., 0, :, :] @ (values if whole else values[..., rows, :])
-        white = self.matrix @ values[..., self.row, :]
-        return np.asarray(white.reshape(*white.shape[:-3], g * r, white.shape[-1]))
+            white = matrix[..., 0] * (values if whole else arrays.gather(values, self.row[:, 0], -2))
+        elif g == 1:
+            white = matrix[..., 0, :, :] @ (values if whole else arrays.gather(values, self.row[0], -2))
+        else:
+            white = matrix @ arrays.gather(values, self.row, -2)
+            white = arrays.library(white).reshape(white, (*white.shape[:-3], g * r, white.shape[-1]))
+        return white
 
 
 def independent(variance: Array) -> Noise:
@@ -157,14 +160,14 @@ def whiten(noise: Noise, weight: Array) -> tuple[Whitener, ...]:
 
 
 def _whitener(block: Block, weight: Array) -> Whitener:
-    picked = weight[..., block.row]
-    if np.all(picked == 1.0):
+    picked, xp = arrays.gather(weight, block.row), arrays.library(weight)
+    if bool(xp.all(picked == 1.0)):
         return Whitener(block.row, linalg.whitening(block.covariance))
     present = picked > 0.0
-    variance = np.diagonal(block.covariance, axis1=-2, axis2=-1)
-    extra = np.where(present, (1.0 / np.where(present, picked, 1.0) - 1.0) * variance, 0.0)
+    variance = xp.linalg.diagonal(block.covariance)
+    extra = xp.where(present, (1.0 / xp.where(present, picked, 1.0) - 1.0) * variance, 0.0)
     both = present[..., :, None] & present[..., None, :]
-    covariance = np.where(both, block.covariance, 0.0) + extra[..., None] * np.eye(block.row.shape[1])
+    covariance = xp.where(both, block.covariance, 0.0) + extra[..., None] * arrays.eye(block.row.shape[1], weight)
     return Whitener(block.row, linalg.whitening(covariance))
 
 

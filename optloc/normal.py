@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from optloc import linalg
 from optloc import tangent as tangents
+from optloc.arrays import as_number, eye, gather, library, placed
 from optloc.linear import Linear
 from optloc.tangent import Tangent
 from optloc.types import Array
@@ -74,44 +76,39 @@ def normal(linear: Linear, epochs: int) -> Normal:
     epochs : int
         Number of epochs k.
     """
-    n, length = linear.shared.shape[-1], linear.local.shape[-1]
-    stacked = np.concatenate([linear.shared, linear.local, linear.residual[..., None]], axis=-1)
+    n, length, xp = linear.shared.shape[-1], linear.local.shape[-1], library(linear.residual)
+    stacked = xp.concat([linear.shared, linear.local, linear.residual[..., None]], axis=-1)
     single = epochs == 1 or length == 0
-    total = _Sum(single, epochs)
+    gram: Any = placed(np.zeros(()), linear.residual)
     for whitener in linear.noise:
-        total.add(whitener.apply(stacked), linear.epoch[whitener.row].reshape(-1))
-    gram = total.value
+        white = whitener.apply(stacked)
+        if not single:
+            white = _by_epoch(white, linear.epoch[whitener.row].reshape(-1), epochs)
+        gram = gram + (white.mT @ white if not single else (white.mT @ white)[..., None, :, :])
     last = n + length
-    flat = gram[..., 0, :, :] if single else gram.sum(-3)
+    flat = gram[..., 0, :, :] if single else xp.sum(gram, axis=-3)
     k = epochs if length else 1
     batch = flat.shape[:-2]
     return Normal(
         flat[..., :n, :n],
-        np.broadcast_to(gram[..., n:last, n:last], (*batch, k, length, length)),
-        np.broadcast_to(gram[..., :n, n:last], (*batch, k, n, length)),
+        xp.broadcast_to(gram[..., n:last, n:last], (*batch, k, length, length)),
+        xp.broadcast_to(gram[..., :n, n:last], (*batch, k, n, length)),
         flat[..., :n, last],
-        np.broadcast_to(gram[..., n:last, last], (*batch, k, length)),
+        xp.broadcast_to(gram[..., n:last, last], (*batch, k, length)),
         flat[..., last, last],
     )
 
 
-class _Sum:
-    """Adds up outer products of whitened rows, over all epochs or epoch by epoch."""
-
-    def __init__(self, single: bool, epochs: int) -> None:
-        self.single, self.epochs, self.value = single, epochs, np.zeros(())
-
-    def add(self, white: Array, epoch: Array) -> None:
-        if self.single:
-            self.value = self.value + (np.swapaxes(white, -1, -2) @ white)[..., None, :, :]
-            return
-        order = np.argsort(epoch, kind="stable")
-        present, first = np.unique(epoch[order], return_index=True)
-        rows = white[..., order, :]
-        sums = np.add.reduceat(rows[..., :, None] * rows[..., None, :], first, axis=-3)
-        full = np.zeros((*sums.shape[:-3], self.epochs, *sums.shape[-2:]))
-        full[..., present, :, :] = sums
-        self.value = self.value + full
+def _by_epoch(white: Any, epoch: Array, epochs: int) -> Any:
+    """Return the rows (..., m, p) of each epoch (..., k, r, p), zero beyond its own number of rows."""
+    order = np.argsort(epoch, kind="stable")
+    sizes = np.bincount(epoch, minlength=epochs)
+    most = max(1, int(sizes.max(initial=0)))
+    slot = np.arange(most)
+    used = slot < sizes[:, None]
+    table = order[np.where(used, (np.cumsum(sizes) - sizes)[:, None] + slot, 0)]
+    rows = gather(white, table, -2)
+    return rows if used.all() else rows * placed(1.0 * used, white)[..., None]
 
 
 def marginal(equations: Normal) -> tuple[Array, Array, Array]:
@@ -120,11 +117,12 @@ def marginal(equations: Normal) -> tuple[Array, Array, Array]:
     Schur complement epoch by epoch. Of several epochs one may leave some of its own unknowns open: what it says about
     the shared ones counts all the same. `ok` (...) is False where the only epoch does so.
     """
+    xp = library(equations.cost)
     if equations.local.shape[-1] == 0:
-        return equations.shared, equations.shared_vector, np.ones(equations.cost.shape, dtype=bool)
-    right = np.concatenate([np.swapaxes(equations.cross, -1, -2), equations.local_vector[..., None]], axis=-1)
+        return equations.shared, equations.shared_vector, xp.ones_like(equations.cost, dtype=xp.bool)
+    right = xp.concat([equations.cross.mT, equations.local_vector[..., None]], axis=-1)
     solved, ok = _solved(equations.local, right)
-    lost = (equations.cross @ solved).sum(-3)
+    lost = xp.sum(equations.cross @ solved, axis=-3)
     return equations.shared - lost[..., :-1], equations.shared_vector - lost[..., -1], ok
 
 
@@ -141,20 +139,25 @@ def eliminated(equations: Normal) -> Normal:
 
 def _solved(local: Array, right: Array) -> tuple[Array, Array]:
     """Return solutions (..., k, l, p) of the local systems, of least norm where they are singular, and ok (...)."""
+    xp = library(local)
     if local.shape[-3] == 1:
         solved, good = linalg.solve(_measured(local), right)
-        return solved, np.asarray(good.all(-1))
+        return solved, xp.all(good, axis=-1)
     solved, good = linalg.solve(local, right, _OPEN)
-    if not good.all():
+    if xp is np and not good.all():
         root, _ = linalg.root(local[~good])
-        solved[~good] = root @ (np.swapaxes(root, -1, -2) @ np.broadcast_to(right, solved.shape)[~good])
-    return solved, np.ones(good.shape[:-1], dtype=bool)
+        solved[~good] = root @ (root.mT @ np.broadcast_to(right, solved.shape)[~good])
+    elif xp is not np:
+        root, _ = linalg.root(local)
+        solved = xp.where(good[..., None, None], solved, root @ (root.mT @ right))
+    return solved, xp.ones_like(solved[..., 0, 0, 0], dtype=xp.bool)
 
 
 def _measured(local: Array) -> Array:
     """Return local blocks with a one for every unknown that no row touches: it stays where it is and hides no other."""
-    dead = np.diagonal(local, axis1=-2, axis2=-1) == 0.0
-    return local + dead[..., None] * np.eye(local.shape[-1]) if dead.any() else local
+    dead = library(local).linalg.diagonal(local) == 0.0
+    grown: Array = local + as_number(dead, local)[..., None] * eye(local.shape[-1], local)
+    return grown
 
 
 def local_covariance(equations: Normal, shared: Array, size: int) -> Array:
@@ -199,22 +202,21 @@ def step(equations: Normal, damping: Array, space: Tangent | None = None) -> tup
         shared = vector
     if damped.local.shape[-1] == 0:
         return shared, ok
-    rest = damped.local_vector - (np.swapaxes(damped.cross, -1, -2) @ shared[..., None, :, None])[..., 0]
+    rest = damped.local_vector - (damped.cross.mT @ shared[..., None, :, None])[..., 0]
     local, good = _solved(damped.local, rest[..., None])
-    flat = local[..., 0].reshape(*local.shape[:-3], -1)
-    return np.concatenate([shared, flat], axis=-1), ok & good
+    xp = library(local)
+    flat = xp.reshape(local[..., 0], (*local.shape[:-3], -1))
+    return xp.concat([shared, flat], axis=-1), ok & good
 
 
 def _damped(equations: Normal, damping: Array) -> Normal:
     def grow(matrix: Array, factor: Array) -> Array:
-        index = np.arange(matrix.shape[-1])
-        out = np.array(matrix)
-        out[..., index, index] *= 1.0 + factor
-        return out
+        grown: Array = matrix * (1.0 + factor[..., None, None] * eye(matrix.shape[-1], matrix))
+        return grown
 
     return Normal(
-        grow(equations.shared, damping[..., None]),
-        grow(equations.local, damping[..., None, None]),
+        grow(equations.shared, damping),
+        grow(equations.local, damping[..., None]),
         equations.cross,
         equations.shared_vector,
         equations.local_vector,
@@ -229,7 +231,8 @@ def covariance(equations: Normal, space: Tangent | None = None) -> tuple[Array, 
     """
     information, _, ok = marginal(equations)
     inverse, good = linalg.inverse(information) if space is None else tangents.inverse(information, space)
-    return np.where((ok & good)[..., None, None], inverse, np.nan), ok & good
+    xp = library(inverse)
+    return xp.where((ok & good)[..., None, None], inverse, xp.nan), ok & good
 
 
 def decrement(equations: Normal, move: Array, layout_n: int) -> Array:

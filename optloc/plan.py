@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from optloc.arrays import gather, placed
 from optloc.errors import InvalidProblem
 from optloc.layout import Layout, emission_name, state_names
 from optloc.models import MODELS, Model
@@ -39,6 +40,12 @@ class Feed:
     gain: Any
     rows: Any
 
+    def table(self, count: int) -> tuple[Array, Array]:
+        """Return column and factor, each (count,), for all rows of the block: factor zero where it does not apply."""
+        column, gain = np.zeros(count, dtype=np.int64), np.zeros(count)
+        column[self.rows], gain[self.rows] = self.column, self.gain
+        return column, gain
+
 
 @dataclass(frozen=True, slots=True)
 class Terms:
@@ -58,11 +65,23 @@ class Terms:
     column: Array
     coefficient: Array
 
-    def total(self, x: Array, count: int) -> Array:
+    def total(self, x: Array, count: int) -> Any:
         """Return the sums (..., count) of every row at vectors x (..., size)."""
-        out = np.zeros((*x.shape[:-1], count))
-        np.add.at(out, (..., self.row), x[..., self.column] * self.coefficient)  # type: ignore[arg-type]
+        out: Any = placed(np.zeros(count), x)
+        for column, coefficient in self.tables(count):
+            out = out + gather(x, column) * placed(coefficient, x)
         return out
+
+    def tables(self, count: int) -> list[tuple[Array, Array]]:
+        """Return pairs of column and coefficient, each (count,), that add up to the terms of all rows of the block."""
+        found, left = [], np.arange(len(self.row))
+        while left.size:  # a row with several terms takes part in several tables
+            rows, first = np.unique(self.row[left], return_index=True)
+            column, coefficient = np.zeros(count, dtype=np.int64), np.zeros(count)
+            column[rows], coefficient[rows] = self.column[left[first]], self.coefficient[left[first]]
+            found.append((column, coefficient))
+            left = np.delete(left, first)
+        return found
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from optloc import linalg
+from optloc.arrays import library, placed
 from optloc.normal import Normal
 from optloc.problem import Problem
 from optloc.types import Array
@@ -28,23 +29,26 @@ def with_priors(problem: Problem, x: Array, equations: Normal, *, shared: bool =
     parts = [part for part in prior_parts(problem) if (shared if layout.find(part[0])[1] else local)]
     if not parts:
         return equations
-    at_shared, at_local = layout.split(x)
-    matrix, vector, cost = equations.shared.copy(), equations.shared_vector.copy(), equations.cost
-    blocks, local_vector = equations.local.copy(), equations.local_vector.copy()
+    (at_shared, at_local), xp = layout.split(x), library(x)
+    matrix, vector, cost = equations.shared, equations.shared_vector, equations.cost
+    blocks, local_vector = equations.local, equations.local_vector
     for name, mean, precision in parts:
         slot, is_shared = layout.find(name)
-        part = slice(slot.start, slot.start + slot.size)
-        error = mean - (at_shared[..., part] if is_shared else at_local[..., part])
+        width = layout.n_shared if is_shared else layout.n_local
+        pick = placed(np.eye(width)[:, slot.start : slot.start + slot.size], x)
+        precision = placed(precision, x)  # noqa: PLW2901  # the same numbers, elsewhere
+        error = placed(mean, x) - (at_shared if is_shared else at_local)[..., slot.start : slot.start + slot.size]
         pull = (precision @ error[..., None])[..., 0]
-        penalty = (error * pull).sum(-1)
+        penalty = xp.sum(error * pull, axis=-1)
         if is_shared:
-            matrix[..., part, part] += precision
-            vector[..., part] += pull
+            matrix, vector = matrix + pick @ precision @ pick.mT, vector + (pick @ pull[..., None])[..., 0]
             cost = cost + penalty
         else:
-            blocks[..., part, part] += precision
-            local_vector[..., part] += pull
-            cost = cost + penalty.sum(-1)
+            blocks, local_vector = (
+                blocks + pick @ precision @ pick.mT,
+                local_vector + (pick @ pull[..., None])[..., 0],
+            )
+            cost = cost + xp.sum(penalty, axis=-1)
     return Normal(matrix, blocks, equations.cross, vector, local_vector, cost)
 
 
@@ -71,7 +75,6 @@ def prior_parts(problem: Problem) -> list[tuple[str, Array, Array]]:
 
 def _block_diagonal(blocks: Array) -> Array:
     s, d = blocks.shape[-3], blocks.shape[-1]
-    out = np.zeros((*blocks.shape[:-3], s, d, s, d))
-    index = np.arange(s)
-    out[..., index, :, index, :] = np.moveaxis(blocks, -3, 0)
-    return out.reshape(*blocks.shape[:-3], s * d, s * d)
+    apart = placed(np.eye(s)[:, None, :, None], blocks) * blocks[..., :, :, None, :]
+    whole: Array = library(blocks).reshape(apart, (*blocks.shape[:-3], s * d, s * d))
+    return whole

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from optloc.arrays import library, placed
 from optloc.frames import CARTESIAN, Frame
 from optloc.layout import Layout, layout
 from optloc.models import MODELS
@@ -154,6 +155,10 @@ class Problem:
         flat = _map(self, reshape)
         return flat if shape else _map_z(flat, lambda z: z[None])
 
+    def placed(self, like: Any) -> Problem:
+        """Return the problem with its numbers as arrays of another array's library, device and float type."""
+        return _map(self, lambda array, core: placed(array, like))
+
     def take(self, index: Array) -> Problem:
         """Return the problems of a flat batch at an index or mask; structure stays."""
 
@@ -177,8 +182,10 @@ class Problem:
 
 
 def _join(parts: list[Array]) -> Array:
+    xp = library(parts[0])
     shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
-    return np.concatenate([np.broadcast_to(part, (*shape, part.shape[-1])) for part in parts], axis=-1)
+    joined: Array = xp.concat([xp.broadcast_to(part, (*shape, part.shape[-1])) for part in parts], axis=-1)
+    return joined
 
 
 def _arrays(problem: Problem) -> list[tuple[Array, int]]:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from optloc.arrays import foreign, gather, library, placed
 from optloc.errors import InvalidProblem
 from optloc.models import Model, Point
 from optloc.models.jet import Jet
@@ -37,12 +38,14 @@ def points(problem: Problem, plan: Plan, x: Array, differentiate: bool) -> tuple
     differentiate : bool
         Whether fed inputs become `Jet` values seeded with one.
     """
-    inputs = given(problem, plan)
+    inputs = {seed: placed(value, x) for seed, value in given(problem, plan).items()}
     for feed in plan.feeds:
         inputs[feed.seed] = _fed(inputs.get(feed.seed, 0.0), feed, x, plan.block.count)
     if differentiate:
-        for seed in {feed.seed for feed in plan.feeds}:
-            inputs[seed] = Jet(inputs[seed], {seed: np.ones(1)})
+        fed = {feed.seed for feed in plan.feeds}
+        # Arrays of other libraries need not hand arithmetic with a Jet on the right to the Jet: there all are jets.
+        for seed in inputs if foreign(x) else fed:
+            inputs[seed] = Jet(inputs[seed], {seed: placed(np.ones(1), x)} if seed in fed else {})
     return joined(problem, plan.model, inputs)
 
 
@@ -91,33 +94,30 @@ def given(problem: Problem, plan: Plan) -> dict[int, Any]:
         rows = np.flatnonzero(block.target == i)
         if motion.known is None or not len(rows):
             continue
-        epoch = block.epoch[rows] if motion.known.shape[-3] > 1 else np.zeros(len(rows), dtype=int)
+        epoch = block.epoch if motion.known.shape[-3] > 1 else np.zeros_like(block.epoch)
+        mine = placed(1.0 * (block.target == i), motion.known)
         for seed, order in ((TARGET, 0), (TARGET_RATE, 1)):
             for c in range(problem.dimension if order < motion.known.shape[-2] else 0):
-                values = np.zeros((*motion.known.shape[:-3], block.count))
-                values[..., rows] = motion.known[..., epoch, order, c]
+                values = mine * gather(motion.known[..., order, c], epoch)
                 inputs[seed + c] = inputs.get(seed + c, 0.0) + values
     return inputs
 
 
 def _at_rows(array: Array, rank: int, block: Rows, index: Array, seed: int) -> dict[int, Any]:
     """Return the components of a per-station vector (rank 1) or set of axes (rank 2) at each row."""
-    epoch = block.epoch if array.shape[-2 - rank] > 1 else np.zeros_like(block.epoch)
+    epochs, count = array.shape[-2 - rank : -rank]
+    joint = library(array).reshape(array, (*array.shape[: -2 - rank], epochs * count, *array.shape[-rank:]))
+    picked = gather(joint, index + (count * block.epoch if epochs > 1 else 0), -1 - rank)
     if rank == 1:
-        picked = array[..., epoch, index, :]
         return {seed + c: picked[..., c] for c in range(array.shape[-1])}
-    picked = array[..., epoch, index, :, :]
     d = range(array.shape[-1])
     return {seed + 3 * i + c: picked[..., i, c] for i in d for c in d}
 
 
 def _fed(value: Any, feed: Feed, x: Array, count: int) -> Any:
-    part = x[..., feed.column] * feed.gain
-    if isinstance(feed.rows, slice):
-        return value + part
-    full = np.zeros((*x.shape[:-1], count))
-    full[..., feed.rows] = part
-    return value + full
+    column, gain = feed.table(count)
+    part = gather(x, column)
+    return value + (part if np.all(gain == 1.0) else part * placed(gain, x))
 
 
 def to_ecef(problem: Problem, position: tuple[Any, ...]) -> tuple[Any, ...]:

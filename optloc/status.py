@@ -59,15 +59,25 @@ class Certificate:
     Parameters
     ----------
     proof : "global", "region", "local" or "unknown"
-        What has been proven about the maximum-likelihood cost.
+        What has been proven about the maximum-likelihood cost: no position costs less, none of a region does, none
+        nearby does, or nothing.
     reason : str
-        Why it is this and not more.
+        What is claimed in a sentence, and why it is this and not more.
     method : str
         What was done to find out.
     bound : float
-        Lower bound of the maximum-likelihood cost over all positions; NaN where none was computed.
+        Lower bound of the maximum-likelihood cost over all positions, or over the region; NaN where none was computed.
     gap : float
         Cost less bound.
+    unique : bool
+        Whether it is proven too that no other minimum costs less than `margin` more, but for listed alternatives;
+        otherwise other minima were searched for, not excluded.
+    margin : float
+        Cost beyond that of the fix below which no other minimum is left; 0 where uniqueness is not proven.
+    boxes : int
+        How many boxes a proof by branch and bound looked at.
+    region : tuple of (lower, upper), optional
+        Corners of the region of the claim, each d coordinates in the problem's frame, metres.
     """
 
     proof: str
@@ -75,3 +85,7 @@ class Certificate:
     method: str
     bound: float = float("nan")
     gap: float = float("nan")
+    unique: bool = False
+    margin: float = 0.0
+    boxes: int = 0
+    region: tuple[tuple[float, ...], tuple[float, ...]] | None = None

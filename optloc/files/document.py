@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -12,22 +12,44 @@ from optloc.errors import InvalidProblem
 from optloc.files.schema import ProblemFile
 from optloc.files.words import join, nearest
 
+_Model = TypeVar("_Model", bound=BaseModel)
+
 
 def read_document(path: Path) -> ProblemFile:
     """Return the contents of a problem file; raise InvalidProblem where it is none."""
-    data = _toml(read_text(path), path.name)
+    return validated(parsed(read_text(path), path.name), path.name)
+
+
+def parsed(text: str, source: str) -> dict[str, Any]:
+    """Return TOML of format 1 as data; `source` is the place to name."""
+    data = _toml(text, source)
     if data.get("format") != 1 or isinstance(data.get("format"), bool):
         given = f"format {data['format']!r} is unknown" if "format" in data else "the key 'format' is missing"
-        raise InvalidProblem(given, path.name, "begin the file with the line format = 1")
-    return validated(data, path.name)
+        raise InvalidProblem(given, source, "begin the file with the line format = 1")
+    return data
 
 
 def validated(data: dict[str, Any], source: str) -> ProblemFile:
     """Return data as a problem file; `source` is the place to name."""
+    return fitted(ProblemFile, data, source)
+
+
+def fitted(model: type[_Model], data: dict[str, Any], source: str) -> _Model:
+    """Return data as a table of a schema; raise InvalidProblem with the first complaint.
+
+    Parameters
+    ----------
+    model : type of pydantic model
+        The schema.
+    data : dict
+        What was written.
+    source : str
+        Place to name.
+    """
     try:
-        return ProblemFile.model_validate(data)
+        return model.model_validate(data)
     except ValidationError as error:
-        raise _sentence(error, source, data) from None
+        raise _sentence(error, source, data, model) from None
 
 
 def read_text(path: Path) -> str:
@@ -78,7 +100,7 @@ _WHAT = {
 }
 
 
-def _sentence(error: ValidationError, source: str, data: dict[str, Any]) -> InvalidProblem:
+def _sentence(error: ValidationError, source: str, data: dict[str, Any], model: type[BaseModel]) -> InvalidProblem:
     # Alternatives of a union each complain; the deepest complaint is the one about what was written.
     first = max(
         error.errors(), key=lambda e: (e["type"] in {"extra_forbidden", "finite_number"}, len(_path(e["loc"], data)[0]))
@@ -91,7 +113,7 @@ def _sentence(error: ValidationError, source: str, data: dict[str, Any]) -> Inva
         what = f"{key} = {first['input']!r} does not fit: {first['msg'][0].lower()}{first['msg'][1:]}"
     advice = None
     if first["type"] in {"extra_forbidden", "missing"}:
-        known = _keys(path)
+        known = _keys(path, model)
         advice = nearest(key, known) if first["type"] == "extra_forbidden" else "add it"
     if first["type"] == "literal_error":
         known = [part.strip().strip("'") for part in str(first["ctx"]["expected"]).replace(" or ", ", ").split(",")]
@@ -126,9 +148,8 @@ def _spelled(path: list[int | str]) -> list[str]:
     return names
 
 
-def _keys(path: list[int | str]) -> list[str]:
-    """Return the keys that the table at a path may have."""
-    model: Any = ProblemFile
+def _keys(path: list[int | str], model: Any) -> list[str]:
+    """Return the keys that the table at a path of a schema may have."""
     for part in path:
         if isinstance(part, str) and part in getattr(model, "model_fields", {}):
             model = _model_in(model.model_fields[part].annotation)

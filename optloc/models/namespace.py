@@ -5,6 +5,8 @@ from __future__ import annotations
 import sys
 from typing import Any
 
+from optloc.arrays import library
+
 
 def namespace(value: Any) -> Any:
     """Return the module that offers ``sqrt sin cos atan2 hypot`` for a value.
@@ -24,9 +26,4 @@ def namespace(value: Any) -> Any:
         return own()
     if type(value).__module__.startswith("casadi"):
         return sys.modules["casadi"]
-    array_api = getattr(value, "__array_namespace__", None)
-    if array_api is not None:
-        return array_api()
-    import numpy as np
-
-    return np
+    return library(value)

@@ -11,6 +11,7 @@ from formulations.bearing_ls import rays, sight
 from optloc.noise import variances
 from optloc.plan import elapsed
 from optloc.problem import Problem
+from optloc.threads import mapped
 from optloc.types import Array, Rows
 
 
@@ -149,28 +150,35 @@ def course_states(problem: Problem) -> Array | None:
 
 
 def by_directions(seen: Bearings) -> Array:
-    """Return the fixes (N, 1, 3) of the unit-direction relaxation, one by one; NaN where an elevation is missing."""
+    """Return the fixes (N, 1, 3) of the unit-direction relaxation, over threads; NaN where an elevation is missing."""
     from formulations.direction_sdp import directions
 
     out = np.full((len(seen.station), 1, 3), np.nan)
-    for i, use in _complete(seen):
+
+    def relaxed(item: tuple[int, Array]) -> None:
+        i, use = item
         axes = None if seen.axes is None else seen.axes[i, use]
         out[i, 0] = directions(seen.angle[i, use], 1.0 / seen.weight[i, use], seen.station[i, use], axes=axes).point
+
+    mapped(relaxed, _complete(seen))
     return seen.metres(out)
 
 
 def least_worst(seen: Bearings) -> Array:
-    """Return the fixes (N, 1, d) whose worst angle in sigma is least, one by one."""
+    """Return the fixes (N, 1, d) whose worst angle in sigma is least, over threads."""
     from formulations.minimax_cone import minimax
 
     d = seen.station.shape[-1]
     out = np.full((len(seen.station), 1, d), np.nan)
     ahead = rays(seen.angle[..., 0], seen.angle[..., 1] if d == 3 else None, seen.axes).ahead
-    for i in range(len(out)):
+
+    def bisected(i: int) -> None:
         use = (seen.weight[i, :, : d - 1] > 0.0).all(-1)
         if use.sum() > 1:
             sigma = 1.0 / seen.weight[i, use, : d - 1].min(-1)
             out[i, 0] = minimax(ahead[i, use], seen.station[i, use], sigma).point
+
+    mapped(bisected, range(len(out)))
     return seen.metres(out)
 
 
@@ -188,13 +196,15 @@ def angle_bounds(seen: Bearings, point: Array) -> Array:
 
     out = np.full(len(point), -np.inf)
     scaled = (point - seen.centre) / seen.scale[:, None]
-    for i, use in _complete(seen):
+
+    def bounded(item: tuple[int, Array]) -> None:
+        i, use = item
         if np.isfinite(scaled[i]).all() and not (seen.weight[i, ~use] > 0.0).any():
             axes = None if seen.axes is None else seen.axes[i, use]
-            found = angle_bound(
-                seen.angle[i, use], 1.0 / seen.weight[i, use], seen.station[i, use], scaled[i], axes=axes
-            )
-            out[i] = found.bound
+            sigma = 1.0 / seen.weight[i, use]
+            out[i] = angle_bound(seen.angle[i, use], sigma, seen.station[i, use], scaled[i], axes=axes).bound
+
+    mapped(bounded, _complete(seen))
     return out
 
 

@@ -8,7 +8,9 @@ from optloc.errors import InvalidProblem, nearest
 from optloc.fix import Fix
 from optloc.problem import Problem
 from optloc.solve import stages
-from optloc.solve.certify import certify
+from optloc.solve.bearing_bound import bearing_bound
+from optloc.solve.branches import first_that_proves
+from optloc.solve.certify import certified
 from optloc.solve.stages import Solver
 
 
@@ -76,11 +78,21 @@ SOLVERS: dict[str, Entry] = {
     ),
     "lsr": Entry(stages.lsr, "damped Taylor least squares (Gauss-Newton) from every candidate", "refinement"),
     "nlp": Entry(_nlp, "the maximum-likelihood cost by IPOPT from every candidate", "refinement"),
-    "certify": Entry(certify, "compares the cost of an angle fix with a bound over all positions", "refinement"),
+    "certify": Entry(
+        certified, "branch and bound: no position costs less, and no other minimum comes near", "refinement"
+    ),
+    "bound": Entry(
+        bearing_bound, "compares the cost of an angle fix with the bound of a relaxation (Clarabel)", "refinement"
+    ),
     "taylor": Entry(stages.taylor, "plain undamped Taylor iteration; a baseline, it diverges", "refinement"),
 }
 
-METHODS = {"auto": "roots+lsr+widen+lsr+search", "proven": "roots+lsr+widen+lsr+search+certify"}
+# What stands behind "|" is for the problems of which not everything is proven by then.
+METHODS = {
+    "auto": "gtrs+lsr+certify|roots+lsr+widen+lsr+search+certify",
+    "searched": "roots+lsr+widen+lsr+search",
+    "proven": "roots+lsr+widen+lsr+search+bound",
+}
 
 _RANGES = "range, toa, tdoa, range_sum; azimuth, elevation and groa rows linear in (x, r)"
 
@@ -190,10 +202,23 @@ FORMULATIONS: dict[str, Formulation] = {
 
 
 def stages_of(method: str) -> list[Entry]:
-    """Return the stages of a method such as "auto" or "gtrs+lsr"; raise InvalidProblem naming an unknown one."""
-    names = METHODS.get(method, method).split("+")
-    for name in names:
-        if name not in SOLVERS:
-            advice = nearest(name, [*METHODS, *SOLVERS])
-            raise InvalidProblem(f"unknown method {name!r}", "method", advice)
-    return [SOLVERS[name] for name in names]
+    """Return the stages of a method such as "auto" or "gtrs+lsr"; raise InvalidProblem naming an unknown one.
+
+    Branches joined by "|" become one stage, which takes the second where the first leaves something to prove.
+    """
+    branches = branches_of(method)
+    if len(branches) == 1:
+        return branches[0]
+    solver = first_that_proves([[entry.solver for entry in branch] for branch in branches])
+    return [Entry(solver, METHODS.get(method, method), branches[0][0].role)]
+
+
+def branches_of(method: str) -> list[list[Entry]]:
+    """Return the stages of each branch of a method; raise InvalidProblem naming an unknown one."""
+    return [[_named(name) for name in branch.split("+")] for branch in METHODS.get(method, method).split("|")]
+
+
+def _named(name: str) -> Entry:
+    if name not in SOLVERS:
+        raise InvalidProblem(f"unknown method {name!r}", "method", nearest(name, [*METHODS, *SOLVERS]))
+    return SOLVERS[name]

@@ -1,4 +1,4 @@
-"""How sure a fix is the best: its cost against a lower bound over all positions."""
+"""Whether a fix is the best one: branch and bound over all positions, and what it finds on the way."""
 
 from __future__ import annotations
 
@@ -7,42 +7,81 @@ from time import perf_counter
 
 import numpy as np
 
+from optloc.epochs import by_epoch, separable
 from optloc.errors import InvalidProblem
 from optloc.fix import Fix, Stage
 from optloc.problem import Problem
-from optloc.solve.angles import angle_bounds, bearings
-from optloc.solve.pieces import one_position
-from optloc.status import Certificate
-
-_TIGHT = 1e-3
+from optloc.proof.scope import unsupported
+from optloc.solve.claims import unknown
+from optloc.types import Array
 
 
-def certify(problem: Problem, fix: Fix | None) -> Fix:
-    """Return a fix of angles whose certificate compares its cost with a lower bound over all positions."""
+def certify(problem: Problem, fix: Fix, region: tuple[Array, Array] | None = None) -> Fix:
+    """Return a fix with a certificate of what is proven about it, and with every better or other minimum met.
+
+    The proof encloses all positions that could cost less, shows that the cost is convex around the fix, and splits
+    the rest into boxes until a lower bound excludes each. A better position replaces the fix, which is then proven
+    again; other minima with a cost within 25 are listed as alternatives.
+
+    Parameters
+    ----------
+    problem : Problem
+        Batch (...) of problems.
+    fix : Fix
+        Their fixes, refined.
+    region : (lower, upper), optional
+        Corners (d,) of the box to which the claim may be limited, in the problem's frame, metres; None: all positions,
+        or where that cannot be bounded a box around the stations that the certificate names.
+
+    Returns
+    -------
+    Fix
+        Like `fix`. Fixes without an answer stay as they are; what cannot be proven has the certificate "unknown" with
+        the reason.
+
+    Raises
+    ------
+    InvalidProblem
+        For a fix of another shape, or corners that do not bound a box.
+    """
+    if separable(problem):
+        problem = by_epoch(problem)
+    shape, flat = problem.batch_shape, problem.flat()
+    if fix.shape != shape:
+        raise InvalidProblem(
+            f"a fix of shape {fix.shape} for problems of shape {shape}", "fix", "give the fix of this problem"
+        )
+    corners = None if region is None else _corners(problem, region)
+    out = certified(flat, fix.reshape((flat.batch_shape[0],)), corners)
+    return out.reshape(shape)
+
+
+def certified(problem: Problem, fix: Fix | None, region: Array | None = None) -> Fix:
+    """Return the certified fixes of a flat batch of problems: the stage "certify"; region (2, d) as of `certify`."""
     if fix is None:
         raise InvalidProblem("certify examines a fix", "method", "put it behind a refinement")
-    angles_only = all(rows.kind in ("azimuth", "elevation") for rows in problem.rows)
-    if not angles_only or not one_position(problem) or problem.layout.size != 3 or problem.priors:
-        return fix
     began = perf_counter()
-    seen = bearings(problem)
-    independent = all(block.row.shape[1] == 1 for block in problem.noise.blocks)
-    if seen is None or not independent:
-        return fix
-    bound = angle_bounds(seen, np.where(fix.answered[:, None], fix.position, np.nan))
-    certificate = np.array(fix.certificate)
-    for i in np.flatnonzero(np.isfinite(bound)):
-        certificate[i] = _proof(float(fix.cost[i]), float(bound[i]))
-    proven = sum(c.proof == "global" for c in certificate)
-    stage = Stage("certify", f"{proven} of {len(certificate)} proven", perf_counter() - began)
-    return replace(fix, certificate=certificate, stages=(*fix.stages, stage))
+    answered = fix.answered & np.isfinite(fix.cost)
+    why = unsupported(problem)
+    if why or not answered.any():
+        certificate = np.array(fix.certificate)
+        certificate[answered] = unknown(why)
+        return replace(fix, certificate=certificate, stages=(*fix.stages, _stage(why or "nothing to prove", began)))
+    from optloc.solve.certifying import Work, settled_by_rounds  # machine code is loaded when it is used
+
+    work = settled_by_rounds(Work.begin(problem, fix, answered, region))
+    return replace(work.fix, stages=(*fix.stages, _stage(work.summary(), began)))
 
 
-def _proof(cost: float, bound: float) -> Certificate:
-    gap = cost - bound
-    tight = gap <= _TIGHT * (1.0 + cost)
-    reason = "no position costs less" if tight else f"a lower bound leaves a gap of {gap:.2g}"
-    proof = "global" if tight else "local"
-    return Certificate(
-        proof, f"{reason}; other minima were searched for, not excluded", "direction relaxation", bound, gap
-    )
+def _stage(detail: str, began: float) -> Stage:
+    return Stage("certify", detail, perf_counter() - began)
+
+
+def _corners(problem: Problem, region: tuple[Array, Array]) -> Array:
+    """Return the corners (2, d) of a region that is a box."""
+    corners = np.array([np.asarray(corner, dtype=float) for corner in region])
+    if corners.shape != (2, problem.dimension) or not np.isfinite(corners).all() or (corners[0] >= corners[1]).any():
+        raise InvalidProblem(
+            "the region is no box", "region", f"give (lower, upper) with {problem.dimension} finite coordinates each"
+        )
+    return corners

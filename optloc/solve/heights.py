@@ -11,6 +11,7 @@ from formulations.range_height import locate, locate_by_ranges
 from optloc.models.primitives import WGS84_A, WGS84_F
 from optloc.problem import Problem
 from optloc.solve.reduce import Ranges, ranges
+from optloc.threads import mapped
 from optloc.types import Array, Band
 
 _SUBSETS = 6
@@ -97,12 +98,15 @@ def _relaxed(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask
     whole = Ellipsoid(
         np.broadcast_to(surface.shape, (len(place), 3, 3)), np.broadcast_to(surface.centre, (len(place), 3))
     )
-    for i in np.flatnonzero(mask & np.isfinite(whole.shape).all((-1, -2))):
+
+    def relaxed(i: int) -> None:
         own = Ellipsoid(whole.shape[i], whole.centre[i])
         stations, offset = place[i, nodes[i]], found.offset[i, nodes[i]] / WGS84_A
         above = stations.mean(0)
         below = own.centre + (above - own.centre) / np.sqrt(own.polar(above, above))
         out[i, 0] = lifted(stations, found.sign[i, nodes[i]].astype(float), offset, own, below).x
+
+    mapped(relaxed, np.flatnonzero(mask & np.isfinite(whole.shape).all((-1, -2))).tolist())
     return out
 
 

@@ -13,6 +13,7 @@ from optloc import linalg
 from optloc.problem import Problem
 from optloc.solve.lifted import Coordinates, Lifted, lifted_rows
 from optloc.solve.reduce import Ranges
+from optloc.threads import mapped
 from optloc.types import Array
 
 Pick = Callable[[Array, Array, Quadric], tuple[Array, Array]]
@@ -99,14 +100,14 @@ def every(rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
 
 
 def shor(rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
-    """Return the answers (N, 1, n) of Shor's semidefinite relaxation, one by one."""
+    """Return the answers (N, 1, n) of Shor's semidefinite relaxation, over threads."""
     from formulations.squared_range_conic import shor as relax
 
     return _one_by_one(relax, rows, right, quadric)
 
 
 def hull(rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
-    """Return the answers (N, 1, n) of the second-order cone relaxation, one by one."""
+    """Return the answers (N, 1, n) of the second-order cone relaxation, over threads."""
     from formulations.squared_range_conic import hull as relax
 
     return _one_by_one(relax, rows, right, quadric)
@@ -115,8 +116,11 @@ def hull(rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
 def _one_by_one(relax: Callable[..., Any], rows: Array, right: Array, quadric: Quadric) -> tuple[Array, Array]:
     usable = np.isfinite(rows).all((-1, -2)) & np.isfinite(right).all(-1)
     y = np.full((len(rows), 1, quadric.size), np.nan)
-    for i in np.flatnonzero(usable):
+
+    def relaxed(i: int) -> None:
         y[i, 0] = relax(rows[i], right[i], quadric, bound=False).y
+
+    mapped(relaxed, np.flatnonzero(usable).tolist())
     return y, np.isfinite(y).all(-1)
 
 

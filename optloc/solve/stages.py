@@ -103,7 +103,7 @@ def widen(problem: Problem, fix: Fix | None) -> Fix:
         around = beside(problem, fix.x, fix.covariance())
         if not np.isfinite(around).any():
             return fix
-        return unrefined(problem, _packed(np.concatenate([pooled(fix)[0], around], axis=1)), fix, "widen", began)
+        return unrefined(problem, packed(np.concatenate([pooled(fix)[0], around], axis=1)), fix, "widen", began)
     if not one_position(problem):
         return fix
     alone = static(problem)
@@ -121,7 +121,7 @@ def widen(problem: Problem, fix: Fix | None) -> Fix:
             spread[items] = found
             parts.append(spread)
     fresh = vectors(problem, _fresh(problem, fix, seen, np.concatenate(parts, axis=1)))
-    return unrefined(problem, _packed(np.concatenate([pooled(fix)[0], fresh], axis=1)), fix, "widen", began)
+    return unrefined(problem, packed(np.concatenate([pooled(fix)[0], fresh], axis=1)), fix, "widen", began)
 
 
 def _subarrays(problem: Problem, fix: Fix) -> Array:
@@ -229,10 +229,10 @@ def _positions(problem: Problem, fix: Fix) -> Array:
 
 
 def _placed(problem: Problem, position: Array, fix: Fix | None, name: str, began: float) -> Fix:
-    return unrefined(problem, vectors(problem, _packed(position)), fix, name, began)
+    return unrefined(problem, vectors(problem, packed(position)), fix, name, began)
 
 
-def _packed(points: Array) -> Array:
+def packed(points: Array) -> Array:
     """Return points (N, q, n) with the finite ones of each problem first, and no more slots than needed."""
     if points.shape[1] <= 1:
         return points

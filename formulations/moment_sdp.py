@@ -1,0 +1,184 @@
+r"""Ranges up to a common unknown: the order-2 moment relaxation of the maximum-likelihood fix, and its lower bound.
+
+In a box (:mod:`formulations.range_enclosure`), :math:`x = c + A s`, :math:`r_1 = \bar r + h t`, and with the errors
+:math:`w_i = u_i \omega_i` of the other ranges :math:`r_i = \sigma_i r_1 + d_i + w_i`,
+
+.. math:: \min_{s, t, \omega} \; \zeta^\top Q\, \zeta, \; \zeta = (1, t, \omega) \quad\text{subject to}\quad
+   |x - s_1|^2 = r_1^2, \qquad |x - s_i|^2 = (\sigma_i r_1 + d_i + w_i)^2, \qquad s_k^2, t^2 \le 1
+
+is exact and polynomial. Its relaxation has the moments of :math:`(1, s, t) \otimes (1, \omega)` as unknowns: their
+matrix, of size (d + 2) M, is positive semidefinite, so are :math:`E[(1 - t^2)\,(1, \omega)(1, \omega)^\top]` and those
+of :math:`1 - s_k^2`; the first equality times every product of two errors and the others times 1, s and t vanish.
+Rows for :math:`\omega_i^2` would be combinations of these, by the second equalities.
+
+The cost sees differences of ranges only, so that the lift of (1, x, r) is never tight; products of errors and
+positions make the difference. The box matters too: without it the moments have no bound, and the relative tolerances
+of a solver hide what they violate. Every monomial is at most one here, which makes the bound from the dual rigorous.
+
+Source: J. B. Lasserre, "Global optimization with polynomials and the problem of moments", SIAM J. Optim. 11 (2001).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from formulations._moments import moments, upper
+from formulations.conic import Answer, Relaxation, kept
+from formulations.range_enclosure import Box, Ranged
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Bounded:
+    """What the relaxation says about the points of a box.
+
+    Parameters
+    ----------
+    point : Array, shape (d,)
+        First moments: the minimiser where `rank_ratio` is small.
+    value : float
+        Optimum of the relaxation as the solver reports it.
+    bound : float
+        No point of the box costs less: recomputed from the dual, and at most the `cost` that was given.
+    rank_ratio : float
+        Second over first eigenvalue of the moments of (1, s, t); near zero where tight.
+    answer : Answer
+        The solver's report.
+    """
+
+    point: Array
+    value: float
+    bound: float
+    rank_ratio: float
+    answer: Answer
+
+
+def moment_problem(stations: int, dimension: int) -> Any:
+    """Build the relaxation as a cvxpy problem.
+
+    Parameters
+    ----------
+    stations, dimension : int
+        M and d.
+
+    Returns
+    -------
+    cvxpy.Problem
+        Variable ``y`` of moments, numbered by `formulations._moments.moments`. Parameters: ``cost`` of the pairs of
+        ``(1, t, w)``; ``cone`` of the pairs of ``(1, s, t)``; ``rule`` (M - 1, d + 5) of ``1, s, t, w_i, t w_i,
+        w_i^2``.
+
+    Notes
+    -----
+    Lasserre (2001).
+    """
+    import cvxpy as cp
+
+    own = moments(stations, dimension)
+    y = cp.Variable(own.count, name="y")
+    cost = cp.Parameter(len(own.cost), name="cost")
+    cone = cp.Parameter(own.cone.shape[1], name="cone")
+    rule = cp.Parameter((stations - 1, dimension + 5), name="rule")
+
+    def arranged(index: NDArray[np.int64]) -> Any:
+        return cp.reshape(y[index.ravel()], index.shape, order="C")
+
+    errors = arranged(own.table[0, 0])
+    demands = [arranged(own.matrix) >> 0, y[0] == 1, arranged(own.cone) @ cone == 0]
+    demands += [errors - arranged(own.table[k, k]) >> 0 for k in range(1, dimension + 2)]
+    demands += [arranged(index) @ rule[i] == 0 for i, index in enumerate(own.rules)]
+    return cp.Problem(cp.Minimize(cost @ y[own.cost]), demands)
+
+
+@kept(16)
+def _built(stations: int, dimension: int, backend: str) -> Relaxation:
+    tight = {"tol_gap_abs": 1e-8, "tol_gap_rel": 1e-8, "tol_feas": 1e-8}
+    # the equalities depend on each other at a solution: with Clarabel's own 1e-8 one solve in four stops early
+    settings = {**tight, "static_regularization_constant": 1e-7} if backend == "CLARABEL" else {}
+    return Relaxation(moment_problem(stations, dimension), backend=backend, settings=settings)
+
+
+def moment_bound(ranged: Ranged, box: Box, cost: float, *, backend: str = "CLARABEL") -> Bounded:
+    """Bound the maximum-likelihood cost from below over a box.
+
+    Parameters
+    ----------
+    ranged : Ranged
+        The measurements, numbers of order one.
+    box : Box
+        Where to look; best `formulations.range_enclosure.enclosure` with the same cost.
+    cost : float
+        Costs above this need no bound: that of a fix, and a little more.
+    backend : str
+        Conic solver; other ones than Clarabel bound nothing.
+
+    Returns
+    -------
+    Bounded
+        Bound, value and point. Built once per size and back end in each process.
+
+    Notes
+    -----
+    Lasserre (2001).
+    """
+    M, d = ranged.station.shape
+    own = moments(M, d)
+    unit = np.sqrt(cost * np.diag(ranged.spread))
+    cone, rule, form = _forms(ranged, box, unit)
+    size = float(np.abs(form).max())
+    values = {
+        "cost": upper(form / size),
+        "cone": upper(cone / np.abs(cone).max()),
+        "rule": rule / np.abs(rule).max(1, keepdims=True),
+    }
+    # no monomial of a point that matters exceeds one
+    answer = _built(M, d, backend).solve(values, reach=float(np.sqrt(own.count)))
+    place = answer.values["y"][own.table[:, :, 0, 0]]
+    ratio = np.nan
+    if np.isfinite(place).all():
+        found = np.linalg.eigvalsh(place)
+        ratio = float(abs(found[-2]) / found[-1])
+    point = box.centre + box.axes @ place[0, 1:-1]
+    return Bounded(point, answer.primal * size, min(answer.bound * size, cost), ratio, answer)
+
+
+def _forms(ranged: Ranged, box: Box, unit: Array) -> tuple[Array, Array, Array]:
+    """Quadratic form of the first equality, coefficients of the others, and the cost in terms of (1, t, w)."""
+    from_first, other = box.centre - ranged.station[0], ranged.station[1:] - ranged.station[0]
+    middle, half = 0.5 * (box.low + box.high), 0.5 * (box.high - box.low)
+    side, d, D = ranged.side, ranged.excess, len(from_first)
+    place = np.column_stack([from_first, box.axes, np.zeros(D)])
+    reach = np.zeros(D + 2)
+    reach[0], reach[-1] = middle, half
+    cone = place.T @ place - np.outer(reach, reach)
+    # |x - s_1|^2 - |x - s_i|^2 + (sign r_1 + d + w)^2 - r_1^2
+    rule = np.column_stack(
+        [
+            2.0 * side * d * middle + d * d - (other * other).sum(1) + 2.0 * other @ from_first,
+            2.0 * other @ box.axes,
+            2.0 * side * d * half,
+            2.0 * (side * middle + d) * unit,
+            2.0 * side * half * unit,
+            unit * unit,
+        ]
+    )
+    change = np.diag(np.concatenate([[1.0, half], unit]))
+    change[1, 0] = middle
+    return cone, rule, change.T @ _cost(ranged) @ change
+
+
+def _cost(ranged: Ranged) -> Array:
+    """Matrix of the cost in (1, r_1, w)."""
+    M = len(ranged.station)
+    out = np.zeros((M + 1, M + 1))
+    if ranged.free:
+        out[2:, 2:] = np.linalg.inv(ranged.spread)
+        return out
+    error = np.zeros((M, M + 1))
+    error[:, 0], error[:, 1], error[1:, 2:] = -ranged.offset[0], 1.0, np.eye(M - 1)
+    return np.asarray(error.T @ np.linalg.solve(ranged.covariance, error))

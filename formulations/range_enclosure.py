@@ -1,0 +1,239 @@
+r"""A box that holds every point whose range residuals are small: what makes a bound over a box a bound over all space.
+
+Ranges :math:`r_i = |x - s_i|` are measured up to one unknown, :math:`r_i = \sigma_i r_1 + d_i + w_i`, with errors `w`
+of covariance `R`. Squared, and with :math:`a_i = s_i - s_1`, :math:`x' = x - s_1`, :math:`r_1^2 = |x'|^2`,
+
+.. math:: 2 a_i^\top x' + 2 \sigma_i d_i r_1 = |a_i|^2 - d_i^2 - \varphi_i, \qquad
+   \varphi_i = w_i (2 \sigma_i r_1 + 2 d_i + w_i)
+
+holds exactly. Where the cost is at most :math:`\rho^2`, :math:`|m^\top w| \le \rho \sqrt{m^\top R\, m}` for every
+vector `m`; a left inverse of the system therefore bounds :math:`r_1` (which enters its own bound through
+:math:`\varphi`), and then the position. Measured ranges bound :math:`r_1` directly.
+
+Source: the linear system is that of H. C. Schau and A. Z. Robinson, "Passive source localization employing
+intersecting spherical surfaces from time-of-arrival differences", IEEE Trans. Acoust. Speech Signal Process. 35
+(1987); its interval form follows from the Cauchy-Schwarz inequality.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+_FLAT = 1e-12  # relative singular value below which a system of squared ranges determines nothing
+_ROUND = 1.0 + 1e-6  # boxes are this much larger, for rounding
+
+
+@dataclass(frozen=True, slots=True)
+class Ranged:
+    """Measured ranges of one point, up to a common unknown or without one.
+
+    Parameters
+    ----------
+    station : Array, shape (M, d)
+        Positions, the reference first.
+    sign : Array, shape (M,)
+        Free: 1 or -1, ``r_i = sign_i r_1 + offset_i + error_i``, the reference's own being 1. Not used otherwise.
+    offset : Array, shape (M,)
+        As above, the reference's being zero; where nothing is free the measured ranges ``r_i - error_i``.
+    covariance : Array, shape (M, M)
+        Of the errors; the row and the column of the reference are not used where it is free.
+    free : bool
+        Whether the range of the reference is unknown altogether.
+    """
+
+    station: Array
+    sign: Array
+    offset: Array
+    covariance: Array
+    free: bool
+
+    @property
+    def side(self) -> Array:
+        """The signs of all but the reference, shape (M - 1,)."""
+        return self.sign[1:] if self.free else np.ones(len(self.station) - 1)
+
+    @property
+    def excess(self) -> Array:
+        """The vector d, shape (M - 1,)."""
+        return self.offset[1:] if self.free else self.offset[1:] - self.offset[0]
+
+    @property
+    def spread(self) -> Array:
+        """The covariance R of w, shape (M - 1, M - 1)."""
+        inner = self.covariance[1:, 1:]
+        if self.free:
+            return inner
+        cross = self.covariance[0, 1:]
+        return np.asarray(inner - cross[:, None] - cross + self.covariance[0, 0])
+
+    def cost(self, point: Array) -> Array:
+        """Weighted squared misfit.
+
+        Parameters
+        ----------
+        point : Array, shape (..., d)
+            Points.
+
+        Returns
+        -------
+        Array, shape (...)
+            The maximum-likelihood cost of these ranges.
+        """
+        ranges = np.linalg.norm(point[..., None, :] - self.station, axis=-1)
+        if self.free:
+            error, matrix = ranges[..., 1:] - self.side * ranges[..., :1] - self.excess, self.spread
+        else:
+            error, matrix = ranges - self.offset, self.covariance
+        return np.asarray((error * np.linalg.solve(matrix, error[..., None])[..., 0]).sum(-1))
+
+
+@dataclass(frozen=True, slots=True)
+class Box:
+    """A parallelepiped of positions and an interval of the reference range.
+
+    Parameters
+    ----------
+    centre : Array, shape (d,)
+        Its middle.
+    axes : Array, shape (d, d)
+        Half-edges, one a column: ``x = centre + axes s`` with ``|s_k| <= 1``.
+    low, high : float
+        Least and greatest range of the reference.
+    """
+
+    centre: Array
+    axes: Array
+    low: float
+    high: float
+
+
+def enclosure(ranged: Ranged, point: Array, cost: float) -> Box | None:
+    """Find a box that holds every position with at most a given cost.
+
+    Parameters
+    ----------
+    ranged : Ranged
+        The measurements, numbers of order one.
+    point : Array, shape (d,)
+        A position near the minimum, for the weights and the axes; any point gives a valid box.
+    cost : float
+        Highest cost that matters.
+
+    Returns
+    -------
+    Box or None
+        None where the rows do not enclose: too few of them, or the errors too large for the geometry.
+
+    Notes
+    -----
+    The module's text.
+    """
+    a, side, d, rho = ranged.station[1:] - ranged.station[0], ranged.side, ranged.excess, float(np.sqrt(cost))
+    right = (a * a).sum(1) - d * d
+    system = 2.0 * (np.column_stack([a, side * d]) if ranged.free else a)
+    away = np.maximum(np.linalg.norm(point - ranged.station[1:], axis=1), 1e-6)
+    root: Array = np.asarray(np.linalg.cholesky(ranged.spread), dtype=np.float64)
+    left = _left_inverse(system, away, root)
+    error = _Error(rho, root, side, d, np.array(np.diag(ranged.spread)))
+    if not ranged.free:
+        slack = rho * float(np.sqrt(ranged.covariance[0, 0]))
+        reach = max(0.0, ranged.offset[0] - slack), ranged.offset[0] + slack
+        if left is None:
+            return Box(ranged.station[0], reach[1] * np.eye(a.shape[1]), *reach)
+        return _box(ranged, point, left, right - side * d * sum(reach), error, reach)
+    found = None if left is None else error.reference(left[-1], float(left[-1] @ right))
+    return None if left is None or found is None else _box(ranged, point, left[:-1], right, error, found)
+
+
+def ball(ranged: Ranged, centre: Array, radius: float) -> Box:
+    """Return the box around a ball of positions.
+
+    Parameters
+    ----------
+    ranged : Ranged
+        The measurements.
+    centre : Array, shape (d,)
+        Its centre.
+    radius : float
+        Its radius.
+
+    Returns
+    -------
+    Box
+        A cube, and the ranges that points of the ball have.
+    """
+    away = float(np.linalg.norm(centre - ranged.station[0]))
+    return Box(centre, radius * np.eye(len(centre)), max(0.0, away - radius), away + radius)
+
+
+def _left_inverse(system: Array, away: Array, root: Array) -> Array | None:
+    """Left inverse weighted for squared ranges, or None where the columns are not independent."""
+    rows, columns = system.shape
+    if rows < columns:
+        return None
+    weight = np.linalg.inv(root) / (2.0 * away)
+    heavy = weight @ system
+    size = np.linalg.norm(heavy, axis=0)
+    values = np.linalg.svd(heavy / np.where(size > 0.0, size, 1.0), compute_uv=False)
+    if not values[-1] > _FLAT * values[0]:
+        return None
+    return np.asarray(np.linalg.pinv(heavy, rcond=1e-15) @ weight)
+
+
+@dataclass(frozen=True, slots=True)
+class _Error:
+    """How far the errors of the ranges move a linear function of the squared equations."""
+
+    rho: float
+    root: Array
+    side: Array
+    excess: Array
+    variance: Array
+
+    def reference(self, row: Array, middle: float) -> tuple[float, float] | None:
+        """Bound r_1 by the row of the left inverse that belongs to it."""
+        slope = self._along(row * self.side)
+        rest = self._along(row * self.excess) + self._square(row)
+        if slope >= 1.0 or middle + rest < 0.0:
+            return None
+        return max(0.0, (middle - rest) / (1.0 + slope)), (middle + rest) / (1.0 - slope)
+
+    def position(self, row: Array, low: float, high: float) -> float:
+        """Bound what the errors do to a coordinate."""
+        middle, half = 0.5 * (low + high), 0.5 * (high - low)
+        both = self._along(row * (self.excess + self.side * middle)) + half * self._along(row * self.side)
+        return both + self._square(row)
+
+    def _along(self, row: Array) -> float:
+        return 2.0 * self.rho * float(np.linalg.norm(self.root.T @ row))
+
+    def _square(self, row: Array) -> float:
+        return self.rho**2 * float(np.abs(row) @ self.variance)
+
+
+def _box(ranged: Ranged, point: Array, left: Array, right: Array, error: _Error, reach: tuple[float, float]) -> Box:
+    """Box of ``x' = left (right - phi)``, in principal axes; a measured reference range is an unknown of its own."""
+    low, high = reach
+    axes = _principal(ranged, point)
+    rows = np.linalg.inv(axes) @ left
+    half = np.array([error.position(row, low, high) for row in rows])
+    if not ranged.free:
+        half += np.abs(rows @ (error.side * error.excess)) * (high - low)
+    return Box(ranged.station[0] + left @ right, axes * (half * _ROUND), low / _ROUND, high * _ROUND)
+
+
+def _principal(ranged: Ranged, point: Array) -> Array:
+    """Principal axes of the errors of a fix, one standard deviation long, in columns."""
+    apart = point - ranged.station
+    unit = apart / np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), 1e-9)
+    if ranged.free:
+        slope, matrix = unit[1:] - ranged.side[:, None] * unit[0], ranged.spread
+    else:
+        slope, matrix = unit, ranged.covariance
+    values, vectors = np.linalg.eigh(slope.T @ np.linalg.solve(matrix, slope))
+    return np.asarray(vectors / np.sqrt(np.maximum(values, 1e-9 * values[-1])))

@@ -1,0 +1,138 @@
+"""Proofs of many fixes: a compiled loop over a stretch of a batch, called from plain threads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from math import isnan
+from typing import Any
+
+import numpy as np
+
+from optloc.kernels.jit import compiled, enabled
+from optloc.proof.pose import Posed
+from optloc.proof.search import OPEN, prove
+from optloc.threads import mapped
+from optloc.types import Array
+
+_STRETCH = 256
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What is to be proven of each of n fixes.
+
+    Parameters
+    ----------
+    x : array (n, d)
+        Positions of the fixes.
+    others : array (n, P, d)
+        Other known minima, the finite ones first.
+    known : int array (n,)
+        How many of them count.
+    kappa, eps : array (n,)
+        Gap to prove, and how far below the cost of the fix still counts as equal.
+    region : array (n, 2, d)
+        Corners of the regions; NaN for all positions.
+    fallback : array (n, 2, d)
+        Corners of the regions to take where all positions cannot be bounded.
+    budget : int
+        How many boxes each may take.
+    """
+
+    x: Array
+    others: Array
+    known: Array
+    kappa: Array
+    eps: Array
+    region: Array
+    fallback: Array
+    budget: int
+
+    def take(self, index: Array) -> Asked:
+        """Return what is asked of some of the fixes."""
+        own = {name: getattr(self, name)[index] for name in Asked.__slots__ if name != "budget"}
+        return replace(self, **own)
+
+
+@dataclass(frozen=True, slots=True)
+class Answered:
+    """What became of each of n proofs.
+
+    Parameters
+    ----------
+    verdict : int array (n,)
+        As `optloc.proof.search.prove` returns it.
+    boxes : int array (n,)
+        Boxes looked at.
+    bound : array (n,)
+        Certified lower bounds of the posed cost.
+    everywhere : bool array (n,)
+        Whether the claim is for all positions, not for the region asked for or the fallback.
+    found : array (n, d)
+        Better or other points; NaN where there is none.
+    """
+
+    verdict: Array
+    boxes: Array
+    bound: Array
+    everywhere: Array
+    found: Array
+
+    def take(self, index: Array) -> Answered:
+        """Return what became of some of the proofs."""
+        return Answered(*(getattr(self, name)[index] for name in Answered.__slots__))
+
+
+def prove_all(pose: Posed, asked: Asked) -> Answered:
+    """Return the outcome of the proofs of n fixes of n posed problems."""
+    n, d = asked.x.shape
+    whole = np.zeros(n, dtype=np.int64)
+    out = Answered(whole, whole.copy(), np.zeros(n), np.zeros(n, dtype=np.bool_), np.full((n, d), np.nan))
+    names = ("x", "others", "known", "kappa", "eps", "region", "fallback")
+    own = [np.ascontiguousarray(array) for array in (pose.w, *(getattr(asked, name) for name in names))]
+
+    def stretch(first: int) -> None:
+        part = slice(first, min(first + _STRETCH, n))
+        given: list[Any] = [array if len(array) == 1 else array[part] for array in (pose.data, pose.K)]
+        given += [array[part] for array in own]
+        given += [asked.budget, *(getattr(out, name)[part] for name in Answered.__slots__)]
+        _loop(pose.kinds, *given)
+
+    mapped(stretch, range(0, n, _STRETCH), None if enabled() else 1)
+    return out
+
+
+@compiled
+def _loop(
+    kinds: Array,
+    data: Array,
+    K: Array,
+    w: Array,
+    x: Array,
+    others: Array,
+    known: Array,
+    kappa: Array,
+    eps: Array,
+    region: Array,
+    fallback: Array,
+    budget: int,
+    verdict: Array,
+    boxes: Array,
+    bound: Array,
+    everywhere: Array,
+    found: Array,
+) -> None:
+    for i in range(len(x)):
+        numbers, rows = data[i if len(data) > 1 else 0], K[i if len(K) > 1 else 0]
+        minima, low, high = others[i, : known[i]], region[i, 0], region[i, 1]
+        everywhere[i] = isnan(low[0])
+        verdict[i], boxes[i], bound[i] = prove(
+            kinds, numbers, rows, w[i], x[i], minima, kappa[i], eps[i], budget, low, high, False, found[i]
+        )
+        if verdict[i] == OPEN:
+            everywhere[i] = False
+            low, high = fallback[i, 0], fallback[i, 1]
+            verdict[i], more, bound[i] = prove(
+                kinds, numbers, rows, w[i], x[i], minima, kappa[i], eps[i], budget, low, high, False, found[i]
+            )
+            boxes[i] += more

@@ -1,0 +1,207 @@
+"""A box: all nodes bounded over it, and the least length that the residual can have there."""
+
+from __future__ import annotations
+
+from math import sqrt
+
+from optloc.kernels.jit import compiled
+from optloc.proof.nodes import LINEAR, RANGE
+from optloc.types import Array
+
+_ULP = 2.0**-52
+# Columns of a table of nodes over a box (J, 6): value at the centre, gradient, enclosure of the remainder.
+NODE_WIDTH = 6
+# Columns of a table of rows over a box (q, 5): residual in the middle of the remainders, Jacobian, direction v.
+ROW_WIDTH = 5
+
+
+@compiled
+def quadratic(a: float, b: float, c: float, d: float, e: float, f: float, h0: float, h1: float, h2: float) -> float:
+    """Return the maximum of s'[[a, b, c], [b, d, e], [c, e, f]]s, positive semidefinite, over |s_k| <= h_k.
+
+    The maximum is at a corner. The signs of a corner make all three mixed terms positive where their product is;
+    otherwise one of them must be negative: the smallest.
+    """
+    u, v, t = b * h0 * h1, c * h0 * h2, e * h1 * h2
+    mixed = abs(u) + abs(v) + abs(t)
+    if u * v * t < 0.0:
+        mixed -= 2.0 * min(abs(u), abs(v), abs(t))
+    return max(a * h0 * h0 + d * h1 * h1 + f * h2 * h2 + 2.0 * mixed, 0.0)
+
+
+@compiled
+def bound_range(line: Array, sense: Array, gram: Array, half: Array, node: Array) -> None:
+    """Bound a range over a box: its row of the table of nodes.
+
+    With u the direction of the line v, a = r + u.d and b = |d - u u.d| the remainder is ``sqrt(a^2 + b^2) - a``, which
+    falls with a (of either sign) and grows with b: it is at most its value at the least a and the greatest b.
+
+    Parameters
+    ----------
+    line, sense, half : array (3,), (3, 3), (3,)
+        Of the node (`optloc.proof.nodes`).
+    gram : array (3, 3)
+        ``sense' sense``.
+    node : array (6,)
+        Written.
+    """
+    x, y, z = line[0], line[1], line[2]
+    r = sqrt(x * x + y * y + z * z)
+    per = 1.0 / r if r > 0.0 else 0.0
+    g0 = (x * sense[0, 0] + y * sense[1, 0] + z * sense[2, 0]) * per
+    g1 = (x * sense[0, 1] + y * sense[1, 1] + z * sense[2, 1]) * per
+    g2 = (x * sense[0, 2] + y * sense[1, 2] + z * sense[2, 2]) * per
+    h0, h1, h2 = half[0], half[1], half[2]
+    least = r - abs(g0) * h0 - abs(g1) * h1 - abs(g2) * h2
+    across = quadratic(
+        gram[0, 0] - g0 * g0,
+        gram[0, 1] - g0 * g1,
+        gram[0, 2] - g0 * g2,
+        gram[1, 1] - g1 * g1,
+        gram[1, 2] - g1 * g2,
+        gram[2, 2] - g2 * g2,
+        h0,
+        h1,
+        h2,
+    )
+    root = sqrt(least * least + across)
+    node[0], node[1], node[2], node[3], node[4] = r, g0, g1, g2, 0.0
+    # The same number without cancellation.
+    node[5] = across / (root + least) if least > 0.0 else root - least
+
+
+@compiled
+def bound_linear(line: Array, sense: Array, data: Array, node: Array) -> None:
+    """Write the row of a linear form n.(x - o), which has no remainder, into the table of nodes."""
+    n0, n1, n2 = data[3], data[4], data[5]
+    node[0] = n0 * line[0] + n1 * line[1] + n2 * line[2]
+    for k in range(3):
+        node[1 + k] = n0 * sense[0, k] + n1 * sense[1, k] + n2 * sense[2, k]
+    node[4] = node[5] = 0.0
+
+
+@compiled
+def bound_nodes(
+    kinds: Array, data: Array, centre: Array, sense: Array, gram: Array, half: Array, line: Array, nodes: Array
+) -> None:
+    """Bound all nodes over a box in the near chart.
+
+    Parameters
+    ----------
+    kinds, data : array (J,), (J, WIDTH)
+        The nodes.
+    centre : array (3,)
+        Centre of the box, metres.
+    sense, gram : array (3, 3)
+        T with x = c + T s, and ``T'T``.
+    half : array (3,)
+        Half-widths in search coordinates.
+    line : array (6,)
+        Working memory.
+    nodes : array (J, NODE_WIDTH)
+        Written.
+    """
+    for j in range(kinds.shape[0]):
+        kind = kinds[j]
+        for k in range(3):
+            line[k] = centre[k] - data[j, k]
+        if kind == RANGE:
+            bound_range(line, sense, gram, half, nodes[j])
+        elif kind == LINEAR:
+            bound_linear(line, sense, data[j], nodes[j])
+
+
+@compiled
+def linearise_rows(K: Array, w: Array, nodes: Array, rows: Array) -> None:
+    """Fill residuals (in the middle of the remainders) and Jacobian of the table of rows (q, ROW_WIDTH)."""
+    for i in range(K.shape[0]):
+        middle, j0, j1, j2 = -w[i], 0.0, 0.0, 0.0
+        for j in range(K.shape[1]):
+            factor = K[i, j]
+            middle += factor * (nodes[j, 0] + 0.5 * (nodes[j, 4] + nodes[j, 5]))
+            j0 += factor * nodes[j, 1]
+            j1 += factor * nodes[j, 2]
+            j2 += factor * nodes[j, 3]
+        rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3] = middle, j0, j1, j2
+
+
+@compiled
+def cost_at(K: Array, w: Array, nodes: Array) -> float:
+    """Return f at the centre of a box whose table of nodes is filled."""
+    total = 0.0
+    for i in range(K.shape[0]):
+        residual = -w[i]
+        for j in range(K.shape[1]):
+            residual += K[i, j] * nodes[j, 0]
+        total += residual * residual
+    return total
+
+
+@compiled
+def least_residual(K: Array, weight: Array, floor: float, half: Array, nodes: Array, rows: Array) -> float:
+    """Return a lower bound of ``|K phi - w|`` over a box, negative where it says nothing.
+
+    For any v, ``v.(K phi - w)`` over the box is at least its value in the middle less what the box and the remainders
+    can change; v is the residual nearest to zero of the linear part (box-constrained least squares).
+
+    Parameters
+    ----------
+    K : array (q, J)
+        Whitened rows.
+    weight : array (J,)
+        Lengths of the columns of K.
+    floor : float
+        What else limits the accuracy of residuals: lengths of w and of the coordinates times their weights.
+    half : array (3,)
+        Half-widths in search coordinates.
+    nodes, rows : array (J, NODE_WIDTH), (q, ROW_WIDTH)
+        Filled tables; the direction v is written.
+    """
+    _nearest(half, rows)
+    length, reach, t0, t1, t2, size = 0.0, 0.0, 0.0, 0.0, 0.0, floor
+    for i in range(K.shape[0]):
+        v = rows[i, 4]
+        length += v * v
+        reach += v * rows[i, 0]
+        t0 += v * rows[i, 1]
+        t1 += v * rows[i, 2]
+        t2 += v * rows[i, 3]
+    if not length > 0.0:
+        return -1.0
+    reach -= abs(t0) * half[0] + abs(t1) * half[1] + abs(t2) * half[2]
+    for j in range(K.shape[1]):
+        radius = 0.5 * (nodes[j, 5] - nodes[j, 4])
+        if radius > 0.0:
+            total = 0.0
+            for i in range(K.shape[0]):
+                total += K[i, j] * rows[i, 4]
+            reach -= abs(total) * radius
+        size += weight[j] * (abs(nodes[j, 0]) + abs(nodes[j, 4]) + abs(nodes[j, 5]))
+    return reach / sqrt(length) - (32 + K.shape[0] + K.shape[1]) * _ULP * size
+
+
+@compiled
+def _nearest(half: Array, rows: Array) -> None:
+    """Write the direction v = middle + J s with s nearly the least-squares solution inside the box."""
+    a00, a01, a02, a11, a12, a22, b0, b1, b2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(rows.shape[0]):
+        middle, j0, j1, j2 = rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3]
+        a00 += j0 * j0
+        a01 += j0 * j1
+        a02 += j0 * j2
+        a11 += j1 * j1
+        a12 += j1 * j2
+        a22 += j2 * j2
+        b0 += j0 * middle
+        b1 += j1 * middle
+        b2 += j2 * middle
+    s0, s1, s2 = 0.0, 0.0, 0.0
+    for _ in range(4):
+        if a00 > 0.0:
+            s0 = min(max(-(b0 + a01 * s1 + a02 * s2) / a00, -half[0]), half[0])
+        if a11 > 0.0:
+            s1 = min(max(-(b1 + a01 * s0 + a12 * s2) / a11, -half[1]), half[1])
+        if a22 > 0.0:
+            s2 = min(max(-(b2 + a02 * s0 + a12 * s1) / a22, -half[2]), half[2])
+    for i in range(rows.shape[0]):
+        rows[i, 4] = rows[i, 0] + rows[i, 1] * s0 + rows[i, 2] * s1 + rows[i, 3] * s2

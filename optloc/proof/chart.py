@@ -1,0 +1,206 @@
+"""What a proof works on: the cost, search coordinates around a fix, and tables for one box."""
+
+from __future__ import annotations
+
+from math import sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from optloc.kernels.jit import compiled
+from optloc.proof.boxes import NODE_WIDTH, ROW_WIDTH, bound_nodes, cost_at, least_residual, linearise_rows
+from optloc.proof.convex import CURVE_WIDTH, SUMS, convex, curve_nodes, sum_up
+from optloc.proof.linear3 import principal
+from optloc.proof.nodes import LINEAR, RANGE
+from optloc.types import Array
+
+
+class Cost(NamedTuple):
+    """The cost ``f(x) = |K phi(x) - w|^2``.
+
+    Parameters
+    ----------
+    kinds, data : array (J,), (J, WIDTH)
+        The nodes.
+    K, w : array (q, J), (q,)
+        Whitened rows.
+    A : array (J, J)
+        ``K'K``.
+    weight : array (J,)
+        Lengths of the columns of K.
+    """
+
+    kinds: Array
+    data: Array
+    K: Array
+    w: Array
+    A: Array
+    weight: Array
+
+
+class Chart(NamedTuple):
+    """Search coordinates s with ``x = origin + sense s``: principal axes of the fix, one unit a standard deviation.
+
+    Parameters
+    ----------
+    origin : array (3,)
+        The fix.
+    sense, back, gram : array (3, 3)
+        T, its inverse, and T'T; rows and columns of zeros for the third coordinate in the plane.
+    """
+
+    origin: Array
+    sense: Array
+    back: Array
+    gram: Array
+
+
+class Box(NamedTuple):
+    """A box and its tables.
+
+    Parameters
+    ----------
+    at, half : array (3,)
+        Centre and half-widths, search coordinates.
+    centre : array (3,)
+        Centre, metres.
+    line : array (6,)
+        Working memory.
+    nodes, rows, curves, sums : array (J, NODE_WIDTH), (q, ROW_WIDTH), (J, CURVE_WIDTH), (SUMS,)
+        Tables, see `optloc.proof.boxes` and `optloc.proof.convex`.
+    solve : array (3, 3)
+        Working memory.
+    """
+
+    at: Array
+    half: Array
+    centre: Array
+    line: Array
+    nodes: Array
+    rows: Array
+    curves: Array
+    sums: Array
+    solve: Array
+
+
+@compiled
+def cost_of(kinds: Array, data: Array, K: Array, w: Array) -> Cost:
+    """Return the cost of nodes and whitened rows."""
+    q, J = K.shape
+    A, weight = np.empty((J, J)), np.empty(J)
+    for j in range(J):
+        for m in range(j, J):
+            total = 0.0
+            for i in range(q):
+                total += K[i, j] * K[i, m]
+            A[j, m] = A[m, j] = total
+        weight[j] = sqrt(A[j, j])
+    return Cost(kinds, data, K, w, A, weight)
+
+
+@compiled
+def empty_box(q: int, J: int) -> Box:
+    """Return tables for boxes of J nodes and q rows."""
+    return Box(
+        np.zeros(3),
+        np.zeros(3),
+        np.zeros(3),
+        np.empty(6),
+        np.empty((J, NODE_WIDTH)),
+        np.empty((q, ROW_WIDTH)),
+        np.empty((J, CURVE_WIDTH)),
+        np.empty(SUMS),
+        np.empty((3, 3)),
+    )
+
+
+@compiled
+def chart_at(cost: Cost, x: Array, box: Box) -> tuple[Chart, bool]:
+    """Return the search coordinates around a fix x (D,), and whether the rows determine them."""
+    D = x.shape[0]
+    origin, sense, back, gram = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    for k in range(D):
+        origin[k] = x[k]
+        sense[k, k] = gram[k, k] = 1.0
+    box.half[:] = 0.0
+    bound_nodes(cost.kinds, cost.data, origin, sense, gram, box.half, box.line, box.nodes)
+    linearise_rows(cost.K, cost.w, box.nodes, box.rows)
+    rows, information = box.rows, box.solve
+    for k in range(3):
+        for m in range(k, 3):
+            total = 0.0
+            for i in range(rows.shape[0]):
+                total += rows[i, 1 + k] * rows[i, 1 + m]
+            information[k, m] = information[m, k] = total
+    principal(information, gram)
+    most = max(information[0, 0], information[1, 1], information[2, 2])
+    good = True
+    for k in range(D):
+        length = information[k, k]
+        good = good and length > 1e-13 * most
+        root = sqrt(length) if length > 0.0 else 1.0
+        for m in range(3):
+            sense[m, k], back[k, m] = gram[m, k] / root, gram[m, k] * root
+    for k in range(3):
+        for m in range(3):
+            gram[k, m] = sense[0, k] * sense[0, m] + sense[1, k] * sense[1, m] + sense[2, k] * sense[2, m]
+    return Chart(origin, sense, back, gram), good
+
+
+@compiled
+def accuracy_floor(cost: Cost, chart: Chart) -> float:
+    """Return the sizes of what residuals are differences of, beside the nodes: measurements and coordinates."""
+    total = 0.0
+    for i in range(cost.w.shape[0]):
+        total += cost.w[i] * cost.w[i]
+    total = sqrt(total)
+    for j in range(cost.kinds.shape[0]):
+        size = 1.0
+        if cost.kinds[j] in (RANGE, LINEAR):
+            size = abs(chart.origin[0]) + abs(chart.origin[1]) + abs(chart.origin[2])
+            size += abs(cost.data[j, 0]) + abs(cost.data[j, 1]) + abs(cost.data[j, 2])
+            if cost.kinds[j] == LINEAR:
+                size *= abs(cost.data[j, 3]) + abs(cost.data[j, 4]) + abs(cost.data[j, 5])
+        total += cost.weight[j] * size
+    return total
+
+
+@compiled
+def place(chart: Chart, box: Box) -> None:
+    """Write the centre of a box in metres."""
+    s0, s1, s2 = box.at[0], box.at[1], box.at[2]
+    for k in range(3):
+        box.centre[k] = chart.origin[k] + (chart.sense[k, 0] * s0 + chart.sense[k, 1] * s1 + chart.sense[k, 2] * s2)
+
+
+@compiled
+def bound_box(cost: Cost, chart: Chart, box: Box, floor: float) -> float:
+    """Fill the first tables of a box; return a lower bound of the length of the residual there, or a negative number."""
+    place(chart, box)
+    bound_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, box.half, box.line, box.nodes)
+    linearise_rows(cost.K, cost.w, box.nodes, box.rows)
+    return least_residual(cost.K, cost.weight, floor, box.half, box.nodes, box.rows)
+
+
+@compiled
+def value_at(cost: Cost, chart: Chart, box: Box) -> float:
+    """Return f at the centre of a box; its first table is filled."""
+    place(chart, box)
+    bound_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, box.half, box.line, box.nodes)
+    return cost_at(cost.K, cost.w, box.nodes)
+
+
+@compiled
+def curve_box(cost: Cost, chart: Chart, box: Box) -> None:
+    """Fill the tables of second derivatives of a box whose nodes are bounded."""
+    curve_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, box.half, box.line, box.nodes, box.curves)
+    sum_up(cost.K, cost.w, box.nodes, box.curves, box.sums)
+
+
+@compiled
+def is_convex(cost: Cost, chart: Chart, box: Box, margin: float) -> bool:
+    """Return whether the Hessian of f/2 exceeds `margin` all over a box, whose tables are filled."""
+    place(chart, box)
+    bound_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, box.half, box.line, box.nodes)
+    curve_box(cost, chart, box)
+    return convex(cost.kinds, cost.A, box.half, box.nodes, box.curves, box.sums, margin)

@@ -1,0 +1,253 @@
+"""Second derivatives of the cost over a box: where it is convex, and where its gradient cannot vanish."""
+
+from __future__ import annotations
+
+from math import inf, sqrt
+
+from optloc.kernels.jit import compiled
+from optloc.proof.linear3 import inverse, positive
+from optloc.proof.nodes import HEIGHT, LINEAR, RANGE
+from optloc.types import Array
+
+# Columns of a table of second derivatives (J, 14): Hessian (00, 01, 02, 11, 12, 22), bounds of the change of the
+# gradient (6:9) and of the Hessian (9), K'(K phi - w) (10), and K'J (11:14).
+CURVE_WIDTH = 14
+# A vector of sums: Hessian of f/2 at the centre (0:6), its gradient (6:9), and bounds of its change (9:15).
+SUMS = 15
+
+
+@compiled
+def curve_range(sense: Array, gram: Array, half: Array, node: Array, curve: Array) -> None:
+    """Write Hessian and bounds of its change of a range into its row of the table of second derivatives.
+
+    With P the projection across the direction u of the line and r' >= A the range elsewhere in the box, the gradient
+    T'u changes by ``(T'P d - q T'u) / r'`` and the Hessian ``T'P T / r`` by a difference of quotients.
+
+    Parameters
+    ----------
+    sense, gram, half : array (3, 3), (3, 3), (3,)
+        As of `bound_range`.
+    node : array (NODE_WIDTH,)
+        Row filled by `bound_range`.
+    curve : array (CURVE_WIDTH,)
+        Written.
+    """
+    r, most = node[0], node[5]
+    least, move, slope, norm = r, most, 0.0, 0.0
+    for k in range(3):
+        least -= abs(node[1 + k]) * half[k]
+        move += abs(node[1 + k]) * half[k]
+        slope += node[1 + k] * node[1 + k]
+    column = 0
+    for k in range(3):
+        for m in range(k, 3):
+            entry = gram[k, m] - node[1 + k] * node[1 + m]
+            norm += entry * entry * (1.0 if k == m else 2.0)
+            curve[column] = entry / r if r > 0.0 else 0.0
+            column += 1
+    if not least > 0.0:
+        for k in range(3):
+            curve[6 + k] = sqrt(gram[k, k]) + abs(node[1 + k])
+        curve[9] = inf
+        return
+    eta = 0.0
+    for k in range(3):
+        total = most * abs(node[1 + k])
+        for m in range(3):
+            total += abs(gram[k, m] - node[1 + k] * node[1 + m]) * half[m]
+        curve[6 + k] = total / least
+        eta += curve[6 + k] * curve[6 + k]
+    eta = sqrt(eta)
+    curve[9] = (eta * (2.0 * sqrt(slope) + eta) + sqrt(norm) * move / r) / least
+
+
+@compiled
+def curve_nodes(
+    kinds: Array,
+    data: Array,
+    centre: Array,
+    sense: Array,
+    gram: Array,
+    half: Array,
+    line: Array,
+    nodes: Array,
+    curves: Array,
+) -> None:
+    """Fill the table of second derivatives (J, CURVE_WIDTH) over a box; arguments as of `bound_nodes`, which ran."""
+    for j in range(kinds.shape[0]):
+        kind = kinds[j]
+        if kind == RANGE:
+            curve_range(sense, gram, half, nodes[j], curves[j])
+        elif kind == LINEAR:
+            curves[j, :10] = 0.0
+
+
+@compiled
+def sum_up(K: Array, w: Array, nodes: Array, curves: Array, sums: Array) -> None:
+    """Fill forces and pulls of the table, and Hessian and gradient of f/2 at the centre of the box.
+
+    Parameters
+    ----------
+    K, w : array (q, J), (q,)
+        Whitened rows.
+    nodes, curves : array (J, NODE_WIDTH), (J, CURVE_WIDTH)
+        Tables of the box.
+    sums : array (SUMS,)
+        Written.
+    """
+    sums[:] = 0.0
+    curves[:, 10:] = 0.0
+    for i in range(K.shape[0]):
+        residual, j0, j1, j2 = -w[i], 0.0, 0.0, 0.0
+        for j in range(K.shape[1]):
+            factor = K[i, j]
+            residual += factor * nodes[j, 0]
+            j0 += factor * nodes[j, 1]
+            j1 += factor * nodes[j, 2]
+            j2 += factor * nodes[j, 3]
+        sums[0] += j0 * j0
+        sums[1] += j0 * j1
+        sums[2] += j0 * j2
+        sums[3] += j1 * j1
+        sums[4] += j1 * j2
+        sums[5] += j2 * j2
+        sums[6] += j0 * residual
+        sums[7] += j1 * residual
+        sums[8] += j2 * residual
+        for j in range(K.shape[1]):
+            factor = K[i, j]
+            curves[j, 10] += factor * residual
+            curves[j, 11] += factor * j0
+            curves[j, 12] += factor * j1
+            curves[j, 13] += factor * j2
+    for j in range(K.shape[1]):
+        for k in range(6):
+            sums[k] += curves[j, 10] * curves[j, k]
+
+
+@compiled
+def force_change(A: Array, half: Array, nodes: Array, curves: Array, j: int) -> tuple[float, float]:
+    """Return how far component j of K'(K phi - w) can fall and rise over the box; A = K'K (J, J)."""
+    spread = abs(curves[j, 11]) * half[0] + abs(curves[j, 12]) * half[1] + abs(curves[j, 13]) * half[2]
+    fall, rise = -spread, spread
+    for m in range(A.shape[0]):
+        first, second = A[j, m] * nodes[m, 4], A[j, m] * nodes[m, 5]
+        fall += min(first, second)
+        rise += max(first, second)
+    return fall, rise
+
+
+@compiled
+def convex(kinds: Array, A: Array, half: Array, nodes: Array, curves: Array, sums: Array, margin: float) -> bool:
+    """Return whether the Hessian of f/2 exceeds `margin` times the identity all over the box.
+
+    H = Phi'A Phi + sum_j g_j N_j. The first part changes by at least ``-(B'E + E'B)`` with B = A Phi and E the changes
+    of the gradients (a term ``dPhi'A dPhi`` is positive). A node whose Hessian is positive semidefinite counts with its
+    least force. What is bounded by entries only is taken off the diagonal, row by row (Gershgorin).
+
+    Parameters
+    ----------
+    kinds : array (J,)
+        Codes of the nodes.
+    A : array (J, J)
+        ``K'K``.
+    half, nodes, curves, sums : arrays
+        Of the box, filled by `bound_nodes`, `curve_nodes` and `sum_up`.
+    margin : float
+        In units of f/2 per squared search coordinate.
+    """
+    h0, h1, h2, h3, h4, h5 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
+    away, d0, d1, d2 = margin, 0.0, 0.0, 0.0
+    for j in range(kinds.shape[0]):
+        kind = kinds[j]
+        b0, b1, b2 = abs(curves[j, 11]), abs(curves[j, 12]), abs(curves[j, 13])
+        e0, e1, e2 = curves[j, 6], curves[j, 7], curves[j, 8]
+        d0 += 2.0 * b0 * e0 + b0 * e1 + b1 * e0 + b0 * e2 + b2 * e0
+        d1 += 2.0 * b1 * e1 + b0 * e1 + b1 * e0 + b1 * e2 + b2 * e1
+        d2 += 2.0 * b2 * e2 + b0 * e2 + b2 * e0 + b1 * e2 + b2 * e1
+        if kind == LINEAR:
+            continue
+        fall, rise = force_change(A, half, nodes, curves, j)
+        if kind in (RANGE, HEIGHT):
+            h0 += fall * curves[j, 0]
+            h1 += fall * curves[j, 1]
+            h2 += fall * curves[j, 2]
+            h3 += fall * curves[j, 3]
+            h4 += fall * curves[j, 4]
+            h5 += fall * curves[j, 5]
+            away += abs(curves[j, 10] + fall) * curves[j, 9]
+        else:
+            most = max(-fall, rise)
+            n1, n2, n4 = abs(curves[j, 1]), abs(curves[j, 2]), abs(curves[j, 4])
+            d0 += most * (abs(curves[j, 0]) + n1 + n2)
+            d1 += most * (abs(curves[j, 3]) + n1 + n4)
+            d2 += most * (abs(curves[j, 5]) + n2 + n4)
+            away += (abs(curves[j, 10]) + most) * curves[j, 9]
+    h0, h3 = h0 - d0 - away, h3 - d1 - away
+    # In the plane nothing depends on the third coordinate.
+    h5 = 1.0 if half[2] == 0.0 and sums[5] == 0.0 else h5 - d2 - away
+    return positive(h0, h1, h2, h3, h4, h5)
+
+
+@compiled
+def spread_of(A: Array, half: Array, nodes: Array, curves: Array, sums: Array) -> float:
+    """Write bounds of the change of each entry of the Hessian into sums[9:15]; return one of the rest's norm."""
+    sums[9:15] = 0.0
+    ball = 0.0
+    for j in range(A.shape[0]):
+        fall, rise = force_change(A, half, nodes, curves, j)
+        most = max(-fall, rise)
+        ball += (abs(curves[j, 10]) + most) * curves[j, 9]
+        b0, b1, b2 = abs(curves[j, 11]), abs(curves[j, 12]), abs(curves[j, 13])
+        e0, e1, e2 = curves[j, 6], curves[j, 7], curves[j, 8]
+        f0, f1, f2 = 0.0, 0.0, 0.0
+        for m in range(A.shape[0]):
+            factor = abs(A[j, m])
+            f0 += factor * curves[m, 6]
+            f1 += factor * curves[m, 7]
+            f2 += factor * curves[m, 8]
+        sums[9] += 2.0 * b0 * e0 + e0 * f0 + most * abs(curves[j, 0])
+        sums[10] += b0 * e1 + b1 * e0 + e0 * f1 + most * abs(curves[j, 1])
+        sums[11] += b0 * e2 + b2 * e0 + e0 * f2 + most * abs(curves[j, 2])
+        sums[12] += 2.0 * b1 * e1 + e1 * f1 + most * abs(curves[j, 3])
+        sums[13] += b1 * e2 + b2 * e1 + e1 * f2 + most * abs(curves[j, 4])
+        sums[14] += 2.0 * b2 * e2 + e2 * f2 + most * abs(curves[j, 5])
+    return ball
+
+
+@compiled
+def slopes_everywhere(A: Array, half: Array, nodes: Array, curves: Array, sums: Array, solve: Array) -> bool:
+    """Return whether the gradient of f cannot vanish in the box (interval Newton test).
+
+    The gradient at c + s is ``g + H(.) s`` with H between centre and s. With any matrix Y, here the inverse of the
+    Hessian at the centre, a component of ``Y g`` larger than all that ``Y H(.) s`` can be excludes a zero.
+
+    Parameters
+    ----------
+    A, half, nodes, curves, sums : arrays
+        As of `convex`.
+    solve : array (3, 3)
+        Working memory.
+    """
+    ball = spread_of(A, half, nodes, curves, sums)
+    if not ball < inf:
+        return False
+    a, b, c, d, e, f = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
+    if half[2] == 0.0 and f == 0.0:
+        f = 1.0
+    if not inverse(a, b, c, d, e, f, solve):
+        return False
+    h0, h1, h2 = half[0], half[1], half[2]
+    ball *= sqrt(h0 * h0 + h1 * h1 + h2 * h2)
+    w0 = sums[9] * h0 + sums[10] * h1 + sums[11] * h2
+    w1 = sums[10] * h0 + sums[12] * h1 + sums[13] * h2
+    w2 = sums[11] * h0 + sums[13] * h1 + sums[14] * h2
+    for k in range(3):
+        y0, y1, y2 = solve[k, 0], solve[k, 1], solve[k, 2]
+        step = abs(y0 * sums[6] + y1 * sums[7] + y2 * sums[8])
+        reach = abs(y0 * a + y1 * b + y2 * c) * h0 + abs(y0 * b + y1 * d + y2 * e) * h1
+        reach += abs(y0 * c + y1 * e + y2 * f) * h2 + abs(y0) * w0 + abs(y1) * w1 + abs(y2) * w2
+        reach += sqrt(y0 * y0 + y1 * y1 + y2 * y2) * ball
+        if step > reach * (1.0 + 1e-6) + 1e-9:
+            return True
+    return False

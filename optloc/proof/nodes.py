@@ -1,0 +1,39 @@
+"""The scalar functions ("nodes") that residuals are sums of: codes, data, and ranges and linear forms over a box.
+
+Residuals are ``K phi(x) - w``, whitened, with one node phi_j a column. A node is a row of `WIDTH` numbers and a code:
+
+======== ============ =====================================================================================
+code     node         numbers
+======== ============ =====================================================================================
+RANGE    ``|x - a|``  0:3 station a
+LINEAR   ``n.(x-o)``  0:3 origin o, 3:6 coefficients n
+AZIMUTH  angle        0:3 station, 6:15 its axes (rows), 15 measured angle m: the node is the azimuth minus m, wrapped
+ELEVATION angle       0:3 station, 6:15 its axes (rows)
+RATIO    ``r_a/r_b``  0:3 station a, 3:6 station b
+HEIGHT   height       0:3 point o of the frame, 3:6 its ECEF position, 6:15 rows of the rotation from frame to ECEF
+======== ============ =====================================================================================
+
+All vectors here have three numbers. In the plane the third of a point, of a line and of every axis is 0, `sense` has a
+column and a row of zeros, and the third half-width is 0: nothing depends on the third search coordinate then.
+
+Over a box (centre c, half-widths h in search coordinates s, x = c + T s) a node is bounded by two functions of
+
+    line (3,)      c minus the point 0:3 (in the inverse-range chart the scaled line p - varpi a)
+    sense (3, 3)   derivative of the line with respect to s (T near; [e_j, e_k, -a] far)
+    half (3,)      half-widths h
+
+(RATIO has ``line_b, sense_b`` of its second station after ``line, sense``):
+
+``bound_<node>(data, line, sense, half, slope) -> (value, low, high)``
+    value at the centre; writes its gradient with respect to s into slope (3,); low and high enclose the remainder
+    ``phi(s) - value - slope.s`` for all |s_k| <= half_k. What cannot be bounded sharply has slope 0 and a wide interval.
+``curve_<node>(data, line, sense, half, curvature, turn) -> chi``
+    writes the Hessian with respect to s at the centre into curvature (3, 3), a bound of the change of each component of
+    the gradient over the box into turn (3,), and returns a bound of the spectral norm of the change of the Hessian;
+    infinite turn or chi where there is none.
+"""
+
+from __future__ import annotations
+
+WIDTH = 24
+RANGE, LINEAR, AZIMUTH, ELEVATION, RATIO, HEIGHT = range(6)

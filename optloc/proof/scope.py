@@ -1,0 +1,89 @@
+"""What the proof covers: one static position, rows made of ranges, angles, ratios and heights."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from optloc.constraints import is_exact
+from optloc.models import MODELS
+from optloc.priors import prior_parts
+from optloc.problem import Problem
+from optloc.types import Band
+
+ANGLES = ("azimuth", "elevation")
+# Kinds that are nodes of their own; every other kind must be a sum of ranges.
+OWN = (*ANGLES, "groa", "height")
+# Rows, and unknowns beside the position, of a problem whose proof is still worth the time.
+MOST_ROWS, MOST_UNKNOWNS = 512, 512
+
+
+def unsupported(problem: Problem) -> str:
+    """Return why a problem is beyond the proof, in a sentence that names what, or nothing where it is within.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of problems.
+    """
+    return next(_reasons(problem), "")
+
+
+def _reasons(problem: Problem) -> Iterator[str]:
+    if len(problem.motions) != 1:
+        yield f"there are {len(problem.motions)} targets, and the proof is for one"
+        return
+    motion = problem.motions[0]
+    if motion.known is not None or not any(slot.name == "position" for slot in problem.layout.shared):
+        yield "no position is common to all rows"
+    if motion.order > 0:
+        yield "the target moves, and the proof is for one that stays"
+    yield from _of_rows(problem)
+    yield from _of_biases(problem)
+    yield from _of_stations(problem)
+    yield from _of_constraints(problem)
+    known = {"position", "stations", *(bias.name for bias in problem.biases)}
+    for name, _, _ in prior_parts(problem):
+        if name not in known:
+            yield f"the prior on {name} is not covered"
+
+
+def _of_rows(problem: Problem) -> Iterator[str]:
+    for rows in problem.rows:
+        model = MODELS[rows.kind]
+        if model.velocity:
+            yield f"{rows.kind} rows depend on velocities, which the proof does not bound"
+        elif rows.kind not in OWN and model.ranges is None:
+            yield f"{rows.kind} rows are neither sums of ranges nor a kind whose bounds are known"
+    if problem.count > MOST_ROWS:
+        yield f"there are {problem.count} rows, and the proof takes {MOST_ROWS}"
+    if problem.layout.size - problem.dimension > MOST_UNKNOWNS:
+        yield f"there are {problem.layout.size} unknowns, and the proof takes {MOST_UNKNOWNS}"
+
+
+def _of_biases(problem: Problem) -> Iterator[str]:
+    angular = np.concatenate([np.full(rows.count, rows.kind in ANGLES) for rows in problem.rows])
+    for bias in problem.biases:
+        if bias.form not in ("offset", "drift"):
+            yield f"the {bias.form} {bias.name!r} multiplies what it touches, and the proof takes what is added"
+        elif bias.sigma is None and angular[bias.row].any():
+            yield f"the bias {bias.name!r} of angles has no prior, and may be whole turns"
+
+
+def _of_stations(problem: Problem) -> Iterator[str]:
+    covariance = problem.stations.covariance
+    if covariance is None:
+        return
+    same = np.eye(problem.dimension) * covariance[..., :1, :1]
+    if not np.allclose(covariance, same, rtol=1e-9, atol=0.0):
+        yield "the station errors differ from axis to axis"
+    bent = [rows.kind for rows in problem.rows if MODELS[rows.kind].ranges is None and MODELS[rows.kind].stations]
+    if bent:
+        yield f"station errors enter {bent[0]} rows in a way that depends on the place"
+
+
+def _of_constraints(problem: Problem) -> Iterator[str]:
+    for constraint in problem.constraints:
+        if is_exact(constraint) and isinstance(constraint, Band) and constraint.kind not in ("height", "plane"):
+            yield f"the equality {constraint.name!r} is neither a height nor a plane"

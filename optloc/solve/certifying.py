@@ -1,0 +1,246 @@
+"""Rounds of proofs: what one finds, a better or another minimum, is refined and listed before the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from time import perf_counter
+
+import numpy as np
+
+from optloc.constraints import exact
+from optloc.fix import Fix, Stage
+from optloc.kernels.jit import enabled
+from optloc.problem import Problem
+from optloc.proof.batch import Answered, Asked, prove_all
+from optloc.proof.pose import Posed, posed, taken
+from optloc.proof.search import BETTER, BUDGET, OTHER, UNIQUE, VALUE
+from optloc.solve import claims
+from optloc.solve.held import held
+from optloc.solve.merge import merged
+from optloc.solve.reasons import AMBIGUOUS_GAP
+from optloc.solve.refine import refine
+from optloc.solve.scale import spread_of
+from optloc.solve.sight import hidden
+from optloc.solve.stages import lsr, packed, pooled, unrefined
+from optloc.solve.start import vectors
+from optloc.solve.verdict import LISTED_GAP
+from optloc.status import Certificate, Status
+from optloc.types import Array
+
+# Gaps to other minima that are tried to prove, one after the other; the last is the value alone.
+_MARGINS = np.array([LISTED_GAP, AMBIGUOUS_GAP, 0.0])
+_ROUNDS = 12
+# Boxes for one proof; plain Python takes a thousand times longer for each.
+_BUDGET, _SLOW_BUDGET = 4000, 200
+# Cost that counts as equal, relative: covers the rounding of two ways to compute it.
+_EQUAL = 1e-6
+# Minima behind the Earth that are set aside at most.
+_HIDDEN = 4
+# Half-width of the region where all positions cannot be bounded: spreads of the stations, distances of the fix.
+_SPREADS, _DISTANCES = 10.0, 2.0
+
+
+@dataclass(slots=True)
+class Work:
+    """A flat batch of N fixes while they are proven; entries of `fix` are replaced as better ones are found.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems within the scope of the proof.
+    fix : Fix
+        Their fixes.
+    pose : Posed
+        Their costs over the position, equalities apart.
+    ignored : array (N, h, d)
+        Minima that the Earth hides; NaN in empty slots.
+    region : array (N, 2, d)
+        Corners of the regions of the claims; NaN for all positions.
+    fallback : array (N, 2, d)
+        Corners of the regions that take their place where all positions cannot be bounded.
+    level : int array (N,)
+        Which of the margins is tried.
+    pending : bool array (N,)
+        What is not settled.
+    before : Fix
+        The fixes at first.
+    replaced, listed : int
+        How many fixes were replaced, and how often another minimum was added to the alternatives.
+    """
+
+    problem: Problem
+    fix: Fix
+    pose: Posed
+    ignored: Array
+    region: Array
+    fallback: Array
+    level: Array
+    pending: Array
+    before: Fix
+    replaced: int = 0
+    listed: int = 0
+
+    @classmethod
+    def begin(cls, problem: Problem, fix: Fix, answered: Array, region: Array | None) -> Work:
+        """Return the work before the first round."""
+        size, d = len(fix.x), problem.dimension
+        corners = np.full((2, d), np.nan) if region is None else region
+        return cls(
+            problem,
+            replace(fix, certificate=np.array(fix.certificate), code=np.array(fix.code), reason=np.array(fix.reason)),
+            posed(problem),
+            np.full((size, 0, d), np.nan),
+            np.broadcast_to(corners, (size, 2, d)),
+            _around(problem, fix.position),
+            np.zeros(size, dtype=np.int64),
+            np.array(answered),
+            fix,
+        )
+
+    def summary(self) -> str:
+        """Return what was proven, in a few words."""
+        proofs = [c.proof for c in self.fix.certificate]
+        counts = [f"{proofs.count(name)} {name}" for name in ("global", "region", "unknown") if name in proofs]
+        more = [f"{self.replaced} fixes replaced by better ones"] if self.replaced else []
+        more += [f"{self.listed} other minima found"] if self.listed else []
+        return ", ".join(counts + more)
+
+
+def settled_by_rounds(work: Work) -> Work:
+    """Return the work with a certificate for every fix that was to be proven."""
+    for _ in range(_ROUNDS):
+        items = np.flatnonzero(work.pending)
+        if not len(items):
+            break
+        _round(work, items)
+    _give_up(work, np.flatnonzero(work.pending), claims.RESTLESS)
+    _judge_again(work)
+    return work
+
+
+def _round(work: Work, items: Array) -> None:
+    """Try to prove some fixes once, and settle or change what can be."""
+    part = held(work.problem.take(items), work.fix[items], taken(work.pose, items))
+    _give_up(work, items[~part.able], claims.HELD)
+    asked = _asked(work, items, part.extra)
+    turning = part.able & (part.pose.level < work.fix.cost[items] + asked.kappa)
+    _lower(work, items[turning], claims.TURNS)
+    good = np.flatnonzero(part.able & ~turning)
+    items, asked, extra = items[good], asked.take(good), part.extra[good]
+    if not len(items):
+        return
+    answer = prove_all(taken(part.pose, good), asked)
+    done = np.isin(answer.verdict, (UNIQUE, VALUE))
+    _claim(work, items[done], asked.take(done), answer.take(done), extra[done])
+    short = answer.verdict == BUDGET
+    _lower(work, items[short], claims.BUDGET)
+    found = np.isin(answer.verdict, (BETTER, OTHER))
+    if found.any():
+        _add(work, items[found], answer.found[found], answer.verdict[found] == BETTER)
+    _give_up(work, items[~(done | short | found)], claims.UNSETTLED)
+
+
+def _asked(work: Work, items: Array, extra: Array) -> Asked:
+    kappa = _MARGINS[work.level[items]]
+    fix, ignored = work.fix, work.ignored[items]
+    gap = fix.alternatives.gap[items]
+    with np.errstate(invalid="ignore"):
+        listed = np.isfinite(gap) & (gap < np.maximum(kappa, AMBIGUOUS_GAP)[:, None])
+    place = fix.layout.take(fix.alternatives.x[items], "position")
+    others = packed(np.concatenate([np.where(listed[..., None], place, np.nan), ignored], axis=1))
+    return Asked(
+        fix.position[items],
+        np.where(np.isfinite(others), others, 0.0),
+        np.isfinite(others).all(-1).sum(1),
+        kappa,
+        _EQUAL * (1.0 + fix.cost[items] + extra),
+        work.region[items],
+        work.fallback[items],
+        _BUDGET if enabled() else _SLOW_BUDGET,
+    )
+
+
+def _lower(work: Work, items: Array, why: str) -> None:
+    """Let proofs that failed try for a smaller margin, or give up where that was zero."""
+    work.level[items] += 1
+    spent = work.level[items] >= len(_MARGINS)
+    _give_up(work, items[spent], why)
+
+
+def _give_up(work: Work, items: Array, why: str) -> None:
+    work.fix.certificate[items] = claims.unknown(why)
+    work.pending[items] = False
+
+
+def _claim(work: Work, items: Array, asked: Asked, answer: Answered, extra: Array) -> None:
+    """Write the certificates of proven fixes."""
+    cost, kappa, boxes = work.fix.cost[items].tolist(), asked.kappa.tolist(), answer.boxes.tolist()
+    bound, everywhere = (answer.bound - extra).tolist(), answer.everywhere.tolist()
+    listed = (work.fix.alternatives.gap[items] < asked.kappa[:, None]).sum(1).tolist()
+    for k, i in enumerate(items.tolist()):
+        own = asked.fallback[k] if np.isnan(asked.region[k, 0, 0]) else asked.region[k]
+        corners = None if everywhere[k] else (own[0], own[1])
+        work.fix.certificate[i] = claims.claimed(cost[k], bound[k], kappa[k], boxes[k], listed[k], corners)
+    work.pending[items] = False
+
+
+def _add(work: Work, items: Array, points: Array, better: Array) -> None:
+    """Refine points that were found beside some fixes, and let them compete."""
+    began = perf_counter()
+    part, own = work.problem.take(items), work.fix[items]
+    pool = np.concatenate([pooled(own)[0], vectors(part, points[:, None])], axis=1)
+    new = lsr(part, unrefined(part, packed(pool), own, "certify", began))
+    with np.errstate(invalid="ignore"):
+        lower = new.cost < own.cost - _EQUAL * (1.0 + own.cost)
+        more = np.isfinite(new.alternatives.gap).sum(1) > np.isfinite(own.alternatives.gap).sum(1)
+    changed = lower | more | ~new.answered
+    work.replaced += int(lower.sum())
+    work.listed += int(more.sum())
+    keep = np.flatnonzero(changed)
+    if len(keep):
+        work.fix = merged(work.fix, items[keep], new[keep], Stage("certify", "", 0.0))
+        work.pending[items[keep]] = new.answered[keep]
+    stuck = np.flatnonzero(~changed)
+    stuck = stuck[~_ignore(work, items[stuck], points[stuck])]
+    _give_up(work, items[stuck[better[stuck]]], claims.BARRED)
+    _lower(work, items[stuck[~better[stuck]]], claims.BUDGET)
+
+
+def _ignore(work: Work, items: Array, points: Array) -> Array:
+    """Note the minima next to points (n, d) that the Earth hides, and return which are new (n,)."""
+    problem = work.problem
+    if not problem.frame.geodetic or not len(items) or work.ignored.shape[1] >= _HIDDEN:
+        return np.zeros(len(items), dtype=bool)
+    part = problem.take(items)
+    done = refine(part, vectors(part, points[:, None])[:, 0], face=exact(problem))
+    place = problem.layout.take(done.x, "position")
+    known = (np.abs(work.ignored[items] - place[:, None]) <= 1e-6 * np.abs(place[:, None])).all(-1).any(1)
+    fresh = hidden(part, done.x) & np.isfinite(place).all(-1) & ~known
+    more = np.full((len(work.ignored), 1, place.shape[-1]), np.nan)
+    more[items[fresh], 0] = place[fresh]
+    work.ignored = np.concatenate([work.ignored, more], axis=1)
+    return np.asarray(fresh)
+
+
+def _judge_again(work: Work) -> None:
+    """Restore what a status said before the proof, but for searched fixes that are proven now."""
+    fix, before = work.fix, work.before
+    for i in np.flatnonzero(before.code == Status.SEARCHED):
+        certificate: Certificate = fix.certificate[i]
+        if fix.code[i] not in (Status.OK, Status.SEARCHED):
+            continue
+        sure = certificate.proof == "global" and certificate.unique
+        fix.code[i] = Status.OK if sure else Status.SEARCHED
+        fix.reason[i] = before.reason[i] if not sure else ""
+    lone = (before.code == Status.AMBIGUOUS) & ~(before.alternatives.gap < AMBIGUOUS_GAP).any(1)
+    for i in np.flatnonzero(lone & (fix.code == Status.OK)):
+        fix.code[i], fix.reason[i] = Status.AMBIGUOUS, before.reason[i]
+
+
+def _around(problem: Problem, position: Array) -> Array:
+    """Return the corners (N, 2, d) of cubes around the stations that hold the fixes (N, d) well inside."""
+    centre, spread = spread_of(problem)
+    with np.errstate(invalid="ignore"):
+        away = np.abs(position - centre).max(-1)
+    half = np.maximum(_SPREADS * spread, _DISTANCES * np.where(np.isfinite(away), away, 0.0))
+    return np.stack([centre - half[:, None], centre + half[:, None]], axis=1)

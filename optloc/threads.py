@@ -1,0 +1,70 @@
+"""Work spread over plain threads: for code that releases the interpreter lock (compiled kernels, Clarabel)."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+from optloc.errors import InvalidProblem
+
+_VARIABLE = "OPTLOC_THREADS"
+
+_Item = TypeVar("_Item")
+_Result = TypeVar("_Result")
+
+
+def thread_count() -> int:
+    """Return how many threads a batch may use: the variable OPTLOC_THREADS, else the processors of this process.
+
+    Returns
+    -------
+    int
+        At least one.
+
+    Raises
+    ------
+    InvalidProblem
+        If OPTLOC_THREADS is not a whole number of at least one.
+    """
+    given = os.environ.get(_VARIABLE, "").strip()
+    if not given:
+        return _processors()
+    if not given.isdecimal() or int(given) < 1:
+        raise InvalidProblem(f"{given!r} is no number of threads", _VARIABLE, "give a whole number of at least 1")
+    return int(given)
+
+
+def mapped(function: Callable[[_Item], _Result], items: Iterable[_Item], threads: int | None = None) -> list[_Result]:
+    """Return the function of every item, in the order of the items whatever the number of threads.
+
+    Parameters
+    ----------
+    function : callable
+        Called once for each item, from several threads at a time; state that it changes must be its thread's own.
+    items : iterable
+        The work; each item should take far longer than a thread takes to pick it up (20 us).
+    threads : int, optional
+        At most so many at a time; `thread_count` if absent. One runs in the calling thread.
+
+    Returns
+    -------
+    list
+        The results. If a call raises, the error of the earliest such item is raised.
+    """
+    work = list(items)
+    count = min(thread_count() if threads is None else max(threads, 1), len(work))
+    if count <= 1:
+        return [function(item) for item in work]
+    with ThreadPoolExecutor(count, thread_name_prefix="optloc") as pool:
+        return list(pool.map(function, work))
+
+
+def _processors() -> int:
+    """Return the processors this process may use; os.process_cpu_count where Python has it (3.13)."""
+    own = getattr(os, "process_cpu_count", None)
+    if own is not None:
+        return own() or 1
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity is not None else os.cpu_count() or 1
