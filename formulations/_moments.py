@@ -47,7 +47,7 @@ class Moments:
 
 @lru_cache(maxsize=32)
 def moments(stations: int, dimension: int) -> Moments:
-    """Number the monomials; pairs are upper triangles, row by row.
+    """Return numbers of the monomials; pairs are upper triangles, row by row.
 
     Parameters
     ----------

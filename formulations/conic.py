@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from formulations._canonical import Data
+from formulations.backend import chosen, count
 
 Array = NDArray[np.float64]
 _Arguments = ParamSpec("_Arguments")
@@ -128,15 +129,27 @@ class Relaxation:
         """
         if values.keys() != self.parameters.keys():
             raise ValueError(f"parameters {sorted(values)} given, {sorted(self.parameters)} expected")
-        data = self._data
-        if data is None:
+        choice, data = chosen("conic"), self._data
+        backend, settings = (self.backend, self.settings) if choice is None else (choice.name, dict(choice.settings))
+        if data is None or backend != "CLARABEL":
             with self._lock:  # the values are those of the one problem
-                return self._elsewhere(values)
-        return self._directly(data, values, bound=bound, reach=reach)
+                answer = self._elsewhere(values, backend, settings)
+        else:
+            answer = self._directly(data, values, {**self.settings, **settings}, bound=bound, reach=reach)
+        count(backend, answer.iterations)
+        return answer
 
-    def _directly(self, data: Data, values: Mapping[str, Array], *, bound: bool, reach: float | None) -> Answer:
+    def _directly(
+        self,
+        data: Data,
+        values: Mapping[str, Array],
+        settings: Mapping[str, Any],
+        *,
+        bound: bool,
+        reach: float | None,
+    ) -> Answer:
         data.feed(values)
-        solution = _solver(data, self.settings).solve()
+        solution = _solver(data, settings).solve()
         x, z, status = np.array(solution.x), np.array(solution.z), str(solution.status)
         if not (np.isfinite(x).all() and np.isfinite(z).all()):
             x, z = np.full(len(x), np.nan), np.full(len(z), np.nan)
@@ -151,13 +164,13 @@ class Relaxation:
             int(solution.iterations),
         )
 
-    def _elsewhere(self, values: Mapping[str, Array]) -> Answer:
+    def _elsewhere(self, values: Mapping[str, Array], backend: str, settings: Mapping[str, Any]) -> Answer:
         import cvxpy
 
         for name, value in values.items():
             self.parameters[name].value = value
         try:
-            self.problem.solve(solver=self.backend, **self.settings)
+            self.problem.solve(solver=backend, **settings)
         except cvxpy.error.SolverError as trouble:
             status = str(trouble)
         else:

@@ -42,7 +42,7 @@ def placed(numbers: Any, like: Any) -> Any:
     xp = library(like)
     if xp is np or foreign(numbers):
         return numbers
-    values = np.asarray(numbers, dtype=np.float64)
+    values = np.array(numbers, dtype=np.float64)  # a copy: some libraries refuse arrays that cannot be written
     if type(like).__module__.startswith("jax"):  # what JAX traces has no device; it places arrays itself
         return xp.asarray(values, dtype=like.dtype)
     return xp.asarray(values, dtype=like.dtype, device=like.device)

@@ -175,8 +175,8 @@ def whitening(covariance: Array) -> Array:
     diagonal = xp.linalg.diagonal(covariance)
     absent = diagonal == 0.0
     if covariance.shape[-1] == 1:
-        matrix: Array = xp.where(absent[..., None], 0.0, 1.0 / xp.sqrt(xp.where(absent[..., None], 1.0, covariance)))
-        return matrix
+        single: Array = xp.where(absent[..., None], 0.0, 1.0 / xp.sqrt(xp.where(absent[..., None], 1.0, covariance)))
+        return single
     scale = 1.0 / xp.sqrt(xp.where(diagonal > 0.0, diagonal, 1.0))
     unit = covariance * scale[..., :, None] * scale[..., None, :]
     eye = xp.broadcast_to(arrays.eye(covariance.shape[-1], covariance), covariance.shape)
@@ -188,5 +188,5 @@ def whitening(covariance: Array) -> Array:
         kept = values > 1e-10 * values[..., -1:]
         roots = xp.where(kept, 1.0 / xp.sqrt(xp.where(kept, values, 1.0)), 0.0)
         matrix = xp.where(ok[..., None, None], matrix, roots[..., :, None] * vectors.mT)
-    matrix = matrix * xp.where(absent, 0.0, scale)[..., None, :]
-    return matrix
+    whitened: Array = matrix * xp.where(absent, 0.0, scale)[..., None, :]
+    return whitened

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
+from contextvars import copy_context
 from typing import TypeVar
 
 from optloc.errors import InvalidProblem
@@ -57,8 +59,9 @@ def mapped(function: Callable[[_Item], _Result], items: Iterable[_Item], threads
     count = min(thread_count() if threads is None else max(threads, 1), len(work))
     if count <= 1:
         return [function(item) for item in work]
+    contexts = [copy_context() for _ in work]  # what holds for the caller, such as a chosen back end, holds for them
     with ThreadPoolExecutor(count, thread_name_prefix="optloc") as pool:
-        return list(pool.map(function, work))
+        return list(pool.map(lambda context, item: context.run(function, item), contexts, work))
 
 
 def _processors() -> int:

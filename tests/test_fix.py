@@ -134,11 +134,12 @@ def test_where_there_is_no_answer_there_are_no_numbers():
     assert bad.certificate.item().proof == "unknown"
 
 
-def test_certificates_claim_no_more_than_a_local_minimum():
+def test_certificates_say_what_is_proven_and_what_is_searched():
     for name in ("tdoa-3d", "azimuth-2d", "range-2d"):
         fix = many(name)
-        assert {c.proof for c in fix.certificate} <= {"local", "unknown"}
+        assert {c.proof for c in fix.certificate} <= {"global", "region", "unknown"}
         assert all(c.reason for c in fix.certificate)
+        assert all(("searched" in c.reason) != c.unique for c in fix.certificate if c.proof == "global")
 
 
 def test_geodetic_in_enu():

@@ -1,196 +1,174 @@
-"""Small symmetric positive definite systems in lanes: one singular lane never disturbs the others."""
+"""Small symmetric positive definite systems in lanes: one singular lane never disturbs the others.
+
+Matrices and vectors stand in cells of a memory (cells, B), row by row.
+"""
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 
 from optloc.kernels.jit import compiled
+from optloc.kernels.room import Room
 from optloc.types import Array
 
-LEAST = 1e-15
-"""Share of its diagonal that a pivot must exceed, as in `optloc.linalg`."""
-
-
-class Systems(NamedTuple):
-    """Working memory for normal equations of n shared and l local unknowns in B lanes."""
-
-    shared: Array  # (n, n, B): lower triangle, then its factor
-    shared_scale: Array  # (n, B)
-    local: Array  # (l, l, B)
-    local_scale: Array  # (l, B)
-    half: Array  # (l, n + 1, B): the factor's inverse times coupling and vector
-    step: Array  # (n + l, B)
-    ok: Array  # (B,): 1.0 where the systems can be solved
+_LEAST = 1e-15  # share of its diagonal that a pivot must exceed, as in `optloc.linalg`
 
 
 @compiled
-def systems(n: int, local: int, lanes: int) -> Systems:
-    """Return working memory for a number of lanes."""
-    return Systems(
-        np.zeros((n, n, lanes)),
-        np.zeros((n, lanes)),
-        np.zeros((local, local, lanes)),
-        np.zeros((local, lanes)),
-        np.zeros((local, n + 1, lanes)),
-        np.zeros((n + local, lanes)),
-        np.zeros(lanes),
-    )
+def factor(m: Array, matrix: int, n: int, scale: int, ok: int, lanes: int) -> None:
+    """Replace the lower triangle (n, n) by the factor of the matrix scaled to a unit diagonal.
 
-
-@compiled
-def factor(matrix: Array, scale: Array, ok: Array, lanes: int) -> None:
-    """Replace lower triangles (n, n, B) by the factors of the matrices scaled to a unit diagonal.
+    Its diagonal holds inverse pivots.
 
     Parameters
     ----------
-    matrix : array (n, n, B)
-        Symmetric matrices.
-    scale : array (n, B)
-        Receives the scales.
-    ok : array (B,)
-        Becomes 0.0 where a matrix is not numerically positive definite.
+    m : array (cells, B)
+        Memory.
+    matrix : int
+        Cell of the matrix.
+    n : int
+        Its size.
+    scale : int
+        Cell that receives the scales (n,).
+    ok : int
+        Cell that becomes 0.0 where a matrix is not numerically positive definite.
     lanes : int
         How many lanes count.
     """
-    n = matrix.shape[0]
     for i in range(n):
-        diagonal, own = matrix[i, i], scale[i]
         for b in range(lanes):
-            positive = diagonal[b] > 0.0
-            own[b] = 1.0 / np.sqrt(diagonal[b] if positive else 1.0)
-            ok[b] = ok[b] if positive else 0.0
+            positive = m[matrix + i * n + i, b] > 0.0
+            m[scale + i, b] = 1.0 / np.sqrt(m[matrix + i * n + i, b] if positive else 1.0)
+            m[ok, b] = m[ok, b] if positive else 0.0
         for j in range(i + 1):
-            entry, other = matrix[i, j], scale[j]
             for b in range(lanes):
-                entry[b] = entry[b] * own[b] * other[b]
+                m[matrix + i * n + j, b] *= m[scale + i, b] * m[scale + j, b]
     for j in range(n):
-        pivot = matrix[j, j]
+        pivot = matrix + j * n + j
         for k in range(j):
-            u = matrix[j, k]
             for b in range(lanes):
-                pivot[b] -= u[b] * u[b]
+                m[pivot, b] -= m[matrix + j * n + k, b] * m[matrix + j * n + k, b]
         for b in range(lanes):
-            positive = pivot[b] > LEAST  # of a diagonal that is one
-            ok[b] = ok[b] if positive else 0.0
-            pivot[b] = np.sqrt(pivot[b]) if positive else 1.0
+            positive = m[pivot, b] > _LEAST
+            m[ok, b] = m[ok, b] if positive else 0.0
+            m[pivot, b] = 1.0 / np.sqrt(m[pivot, b] if positive else 1.0)
         for i in range(j + 1, n):
-            entry = matrix[i, j]
+            entry = matrix + i * n + j
             for k in range(j):
-                u, v = matrix[i, k], matrix[j, k]
                 for b in range(lanes):
-                    entry[b] -= u[b] * v[b]
+                    m[entry, b] -= m[matrix + i * n + k, b] * m[matrix + j * n + k, b]
             for b in range(lanes):
-                entry[b] /= pivot[b]
+                m[entry, b] *= m[pivot, b]
 
 
 @compiled
-def forward(lower: Array, scale: Array, right: Array, lanes: int) -> None:
-    """Replace vectors (n, B) by the factor's inverse times the scaled vectors."""
-    for i in range(lower.shape[0]):
-        own, by, pivot = right[i], scale[i], lower[i, i]
-        for b in range(lanes):
-            own[b] *= by[b]
-        for k in range(i):
-            u, v = lower[i, k], right[k]
-            for b in range(lanes):
-                own[b] -= u[b] * v[b]
-        for b in range(lanes):
-            own[b] /= pivot[b]
-
-
-@compiled
-def backward(lower: Array, scale: Array, right: Array, lanes: int) -> None:
-    """Replace vectors (n, B) that `forward` returned by the solutions."""
-    n = lower.shape[0]
-    for i in range(n - 1, -1, -1):
-        own, pivot = right[i], lower[i, i]
-        for k in range(i + 1, n):
-            u, v = lower[k, i], right[k]
-            for b in range(lanes):
-                own[b] -= u[b] * v[b]
-        for b in range(lanes):
-            own[b] /= pivot[b]
+def forward(m: Array, lower: int, n: int, scale: int, right: int, lanes: int) -> None:
+    """Replace a vector by the factor's inverse times it, scaled."""
     for i in range(n):
-        own, by = right[i], scale[i]
         for b in range(lanes):
-            own[b] *= by[b]
+            m[right + i, b] *= m[scale + i, b]
+        for k in range(i):
+            for b in range(lanes):
+                m[right + i, b] -= m[lower + i * n + k, b] * m[right + k, b]
+        for b in range(lanes):
+            m[right + i, b] *= m[lower + i * n + i, b]
 
 
 @compiled
-def step(now: Array, damping: Array, room: Systems, lanes: int) -> None:
-    """Write the damped step of every lane into `room.step`, zero where `room.ok` becomes 0.0.
+def backward(m: Array, lower: int, n: int, scale: int, right: int, lanes: int) -> None:
+    """Replace a vector that `forward` returned by the solution."""
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            for b in range(lanes):
+                m[right + i, b] -= m[lower + k * n + i, b] * m[right + k, b]
+        for b in range(lanes):
+            m[right + i, b] *= m[lower + i * n + i, b]
+    for i in range(n):
+        for b in range(lanes):
+            m[right + i, b] *= m[scale + i, b]
+
+
+@compiled
+def step(m: Array, room: Room, n: int, local: int, damping: int, ok: int, lanes: int) -> None:
+    """Write the damped step from `room.now` into `room.step`, zero where cell `ok` becomes 0.0.
 
     Parameters
     ----------
-    now : array (n + l + 1, n + l + 1, B)
-        Normal equations as `optloc.kernels.gather.gather` writes them.
-    damping : array (B,)
-        Marquardt's factor: the diagonal of the information is multiplied by one more than it.
-    room : Systems
-        Working memory.
+    m : array (cells, B)
+        Memory.
+    room : Room
+        Where things stand.
+    n, local : int
+        Numbers of shared and of local unknowns.
+    damping : int
+        Cell of Marquardt's factor: the diagonal of the information is multiplied by one more than it.
+    ok : int
+        Cell that says where the systems can be solved.
     lanes : int
         How many lanes count.
     """
-    n, local = room.shared.shape[0], room.local.shape[0]
-    size, move = n + local, room.step
-    room.ok[:lanes] = 1.0
+    size = n + local
+    line = size + 1
+    for b in range(lanes):
+        m[ok, b] = 1.0
     for i in range(n):
         for j in range(i + 1):
-            room.shared[i, j, :lanes] = now[i, j, :lanes]
+            for b in range(lanes):
+                m[room.shared + i * n + j, b] = m[room.now + i * line + j, b]
         for b in range(lanes):
-            room.shared[i, i, b] *= 1.0 + damping[b]
-        move[i, :lanes] = now[size, i, :lanes]
+            m[room.shared + i * n + i, b] *= 1.0 + m[damping, b]
+            m[room.step + i, b] = m[room.now + size * line + i, b]
     if local > 0:
-        _eliminate(now, damping, room, lanes)
-    factor(room.shared, room.shared_scale, room.ok, lanes)
-    forward(room.shared, room.shared_scale, move[:n], lanes)
-    backward(room.shared, room.shared_scale, move[:n], lanes)
+        _eliminate(m, room, n, local, damping, ok, lanes)
+    factor(m, room.shared, n, room.shared_scale, ok, lanes)
+    forward(m, room.shared, n, room.shared_scale, room.step, lanes)
+    backward(m, room.shared, n, room.shared_scale, room.step, lanes)
     if local > 0:
-        _complete(now, room, lanes)
+        _complete(m, room, n, local, lanes)
     for i in range(size):
         for b in range(lanes):
-            if room.ok[b] == 0.0:
-                move[i, b] = 0.0
+            m[room.step + i, b] = m[room.step + i, b] if m[ok, b] != 0.0 else 0.0
 
 
 @compiled
-def _eliminate(now: Array, damping: Array, room: Systems, lanes: int) -> None:
-    """Take from the shared system what the local unknowns cost it."""
-    n, local = room.shared.shape[0], room.local.shape[0]
-    size = n + local
+def _eliminate(m: Array, room: Room, n: int, local: int, damping: int, ok: int, lanes: int) -> None:
+    """Take from the shared system (in `room.shared` and `room.step`) what the local unknowns cost it."""
+    line, half = n + local + 1, room.half
     for i in range(local):
+        row, own = room.now + (n + i) * line, room.local + i * local
         for j in range(i + 1):
-            room.local[i, j, :lanes] = now[n + i, n + j, :lanes]
+            for b in range(lanes):
+                m[own + j, b] = m[row + n + j, b]
         for b in range(lanes):
-            grown = room.local[i, i, b] * (1.0 + damping[b])
-            room.local[i, i, b] = grown if grown != 0.0 else 1.0  # what no row touches stays where it is
+            grown = m[own + i, b] * (1.0 + m[damping, b])
+            m[own + i, b] = grown if grown != 0.0 else 1.0  # what no row touches stays where it is
         for j in range(n):
-            room.half[i, j, :lanes] = now[n + i, j, :lanes]
-        room.half[i, n, :lanes] = now[size, n + i, :lanes]
-    factor(room.local, room.local_scale, room.ok, lanes)
+            for b in range(lanes):
+                m[half + j * local + i, b] = m[row + j, b]
+        for b in range(lanes):
+            m[half + n * local + i, b] = m[room.now + (n + local) * line + n + i, b]
+    factor(m, room.local, local, room.local_scale, ok, lanes)
     for j in range(n + 1):
-        forward(room.local, room.local_scale, room.half[:, j], lanes)
+        forward(m, room.local, local, room.local_scale, half + j * local, lanes)
     for a in range(local):
         for i in range(n):
-            u = room.half[a, i]
+            u, v = half + i * local + a, half + n * local + a
             for b in range(lanes):
-                room.step[i, b] -= u[b] * room.half[a, n, b]
+                m[room.step + i, b] -= m[u, b] * m[v, b]
             for j in range(i + 1):
                 for b in range(lanes):
-                    room.shared[i, j, b] -= u[b] * room.half[a, j, b]
+                    m[room.shared + i * n + j, b] -= m[u, b] * m[half + j * local + a, b]
 
 
 @compiled
-def _complete(now: Array, room: Systems, lanes: int) -> None:
+def _complete(m: Array, room: Room, n: int, local: int, lanes: int) -> None:
     """Write the step of the local unknowns behind that of the shared ones."""
-    n, local = room.shared.shape[0], room.local.shape[0]
+    line, size, own = n + local + 1, n + local, room.step + n
     for a in range(local):
-        own = room.step[n + a]
-        own[:lanes] = now[n + local, n + a, :lanes]
+        for b in range(lanes):
+            m[own + a, b] = m[room.now + size * line + n + a, b]
         for i in range(n):
             for b in range(lanes):
-                own[b] -= now[n + a, i, b] * room.step[i, b]
-    forward(room.local, room.local_scale, room.step[n:], lanes)
-    backward(room.local, room.local_scale, room.step[n:], lanes)
+                m[own + a, b] -= m[room.now + (n + a) * line + i, b] * m[room.step + i, b]
+    forward(m, room.local, local, room.local_scale, own, lanes)
+    backward(m, room.local, local, room.local_scale, own, lanes)

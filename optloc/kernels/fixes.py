@@ -2,12 +2,35 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from optloc.kernels.fixes_lanes import Lanes, Model, apply, lanes_for
-from optloc.kernels.fixes_refine import ranges, refine
-from optloc.kernels.fixes_start import begin, read, stand
-from optloc.kernels.gtrs import LANES, factor, solve
+from optloc.kernels.fixes_refine import (
+    ALIVE,
+    BLUR,
+    CENTRE,
+    COST,
+    DIAGONAL,
+    GOOD,
+    H_TRIAL,
+    INVERSE,
+    LOOP,
+    LOWER,
+    MOVE,
+    ORIGIN,
+    SCALE,
+    SOLVABLE,
+    SPARE,
+    SPREAD,
+    STEPS,
+    H,
+    X,
+    ranges,
+    refine,
+)
+from optloc.kernels.fixes_start import read, square, stand, weigh
+from optloc.kernels.gtrs import LANES, factor, minimise, scratch, solve
 from optloc.kernels.jit import compiled
 from optloc.types import Array
 
@@ -16,13 +39,53 @@ _WEAK = 1e-11  # a tenfold margin to the pivot below which a direction counts as
 _FAR = 2.5e3  # a fourfold margin to the spreads of the stations from which on a fix is doubted
 
 
+class Model(NamedTuple):
+    """Linear maps from measurements z to all that a fix needs; every row is a sum of ranges to s stations.
+
+    Parameters
+    ----------
+    row : array (2, m)
+        Known amount by which each measurement exceeds the model, metres; one over its variance, 0 where absent.
+    anchor : int64 array (m,)
+        Row whose measurement is subtracted first, -1 for none: emission times count from it.
+    linear : array (s + q + e + l, m)
+        Maps to the least-squares ranges c, known up to sign * t; to whitened rows u, of which the cost is
+        ``|u - K r|^2 + |loops|^2``; to emission times for zero ranges; and to the loops, which depend on no range.
+    sign : array (s,)
+        How the unknown range t enters each; zeros where the ranges are determined.
+    reference : int
+        Station whose range is t; -1 where the ranges are determined.
+    white : array (s, s)
+        Lower triangular whitening matrix of c.
+    K : array (q, s)
+        Whitened rows over the ranges.
+    travel : array (e, s)
+        How the ranges reduce the emission times.
+    start : int64 array (e,)
+        Anchor of each emission time, -1 where there is no row.
+    limit : float
+        Cost above which the residuals are larger than the noise allows.
+    """
+
+    row: Array
+    anchor: Array
+    linear: Array
+    sign: Array
+    reference: int
+    white: Array
+    K: Array
+    travel: Array
+    start: Array
+    limit: float
+
+
 @compiled
 def fixes(
     model: Model,
     z: Array,
     station: Array,
     tolerance: float,
-    limit: int,
+    most: int,
     x: Array,
     covariance: Array,
     cost: Array,
@@ -38,8 +101,8 @@ def fixes(
         Measurements, metres.
     station : array (N or 1, s, d)
         Stations, metres.
-    tolerance, limit : float, int
-        Of `optloc.kernels.fixes_refine.refine`.
+    tolerance, most : float, int
+        Tolerance and limit of `optloc.kernels.fixes_refine.refine`.
     x : array (N, d + e)
         Written: positions, then emission times (times c, metres).
     covariance : array (N, d, d)
@@ -50,124 +113,107 @@ def fixes(
         Written: whether the fix is plainly good: a finite input, an exact start, a finished refinement, a regular
         covariance, a place that is not far away, a cost that the noise allows. The others need a closer look.
     """
-    count, d = len(z), station.shape[2]
-    lanes = lanes_for(model, d)
+    row, anchor, linear, sign, reference, white, K, travel, start, limit = model
+    count, (s, d), q, e = len(z), station.shape[1:], len(K), len(start)
     item, late = np.empty(LANES, np.int64), np.empty(count, np.int64)
-    waiting, most = 0, 0
-    if len(station) == 1:
-        stand(model, station, np.zeros(LANES, np.int64), lanes)
-    for first in range(0, count, LANES):
-        size = min(LANES, count - first)
+    seen, value = np.zeros((z.shape[1], LANES)), np.zeros((len(linear), LANES))
+    place, unit, r = np.zeros((s, d, LANES)), np.zeros((s, d, LANES)), np.zeros((s, LANES))
+    squared, rows = np.zeros((s, d + 2, LANES)), np.zeros((s, d + 2, LANES))
+    y, work = np.zeros((d + 1, LANES)), np.zeros((scratch(d + 1), LANES))
+    vector, matrix, scalar = np.zeros((10, d, LANES)), np.zeros((3, d, d, LANES)), np.zeros((14, LANES))
+    c, u, emission, loops = value[:s], value[s : s + q], value[s + q : s + q + e], value[s + q + e :]
+    spare, good = scalar[SPARE], scalar[GOOD]
+    waiting, first, steps, again = 0, 0, 0, False
+    while first < (waiting if again else count):
+        size = min(LANES, (waiting if again else count) - first)
         for lane in range(LANES):
-            item[lane] = first + min(lane, size - 1)
-        _load(model, z, station, item, lanes)
-        begin(model, lanes)
-        refine(model, lanes, tolerance, min(_FEW, limit))
-        most = max(most, _store(model, lanes, z, item, size, x, covariance, cost, plain))
-        if limit > _FEW:
-            for lane in range(size):
-                late[waiting] = item[lane]
-                waiting += 1 if lanes.alive[lane] != 0.0 else 0
-    for first in range(0, waiting, LANES):
-        size = min(LANES, waiting - first)
-        for lane in range(LANES):
-            item[lane] = late[first + min(lane, size - 1)]
-        _load(model, z, station, item, lanes)
-        for j in range(d):
-            for lane in range(LANES):
-                lanes.x[j, lane] = x[item[lane], j] - lanes.origin[j, lane]
-        refine(model, lanes, tolerance, limit - _FEW)
-        most = max(most, _FEW + _store(model, lanes, z, item, size, x, covariance, cost, plain))
-    return most
+            at = first + min(lane, size - 1)
+            item[lane] = late[at] if again else at
+        read(z, item, row, anchor, linear, seen, value, scalar[BLUR], good)
+        _loops(loops, scalar[LOOP])
+        if len(station) > 1 or (first == 0 and not again):
+            stand(station, item, reference, place, vector[ORIGIN], vector[CENTRE], scalar[SPREAD], spare)
+        if again:
+            for j in range(d):
+                for lane in range(LANES):
+                    vector[X, j, lane] = x[item[lane], j] - vector[ORIGIN, j, lane]
+        else:
+            square(c, sign, reference, place, scalar[SPREAD], scalar[SCALE], squared, spare)
+            for turn in range(2):
+                weigh(squared, place, y, scalar[SCALE], white, turn == 0, rows, spare)
+                minimise(rows, reference >= 0, y, scalar[SOLVABLE], work)
+                _accept(y, scalar[SOLVABLE], good, scalar[SCALE], vector[X])
+        refine(K, u, place, r, unit, vector, matrix, scalar, tolerance, most - _FEW if again else min(_FEW, most))
+        _invert(vector, matrix, scalar)
+        if e:
+            ranges(place, vector[X], r, unit, spare)
+        for lane in range(size):
+            i = item[lane]
+            plain[i] = scalar[SOLVABLE, lane] * good[lane] > scalar[ALIVE, lane] and scalar[COST, lane] <= limit
+            cost[i] = scalar[COST, lane]
+            for j in range(d):
+                x[i, j] = vector[X, j, lane] + vector[ORIGIN, j, lane]
+                for k in range(d):
+                    covariance[i, j, k] = matrix[H_TRIAL, max(j, k), min(j, k), lane]
+            for j in range(e):
+                x[i, d + j] = emission[j, lane] + (z[i, start[j]] - row[0, start[j]] if start[j] >= 0 else 0.0)
+                for k in range(s):
+                    x[i, d + j] -= travel[j, k] * r[k, lane]
+            steps = max(steps, int(scalar[STEPS, lane]) + (_FEW if again else 0))
+            if not again and scalar[ALIVE, lane] != 0.0 and most > _FEW:
+                late[waiting] = i
+                waiting += 1
+        first += LANES
+        if not again and first >= count:
+            first, again = 0, True
+    return steps
 
 
 @compiled
-def _load(model: Model, z: Array, station: Array, item: Array, lanes: Lanes) -> None:
-    read(model, z, item, lanes)
-    if len(station) > 1:
-        stand(model, station, item, lanes)
+def _loops(loops: Array, cost: Array) -> None:
+    """Write the cost of the loops."""
+    count, width = loops.shape
+    for lane in range(width):
+        cost[lane] = 0.0
+    for i in range(count):
+        for lane in range(width):
+            cost[lane] += loops[i, lane] * loops[i, lane]
 
 
 @compiled
-def _store(
-    model: Model,
-    lanes: Lanes,
-    z: Array,
-    item: Array,
-    size: int,
-    x: Array,
-    covariance: Array,
-    cost: Array,
-    plain: Array,
-) -> int:
-    """Write the first lanes to the fixes of their problems, and return the most steps that one took."""
-    d = len(lanes.x)
-    _invert(lanes)
-    _remote(lanes)
-    _emit(model, lanes)
-    most = 0.0
-    for lane in range(size):
-        i = item[lane]
-        fine = lanes.settled[lane] * lanes.good[lane] * (1.0 - lanes.alive[lane])
-        plain[i] = fine != 0.0 and lanes.spare[lane] <= _FAR and lanes.cost[lane] <= model.limit
-        cost[i] = lanes.cost[lane]
-        most = max(most, lanes.steps[lane])
-        for j in range(d):
-            x[i, j] = lanes.x[j, lane] + lanes.origin[j, lane]
-            for k in range(d):
-                covariance[i, j, k] = lanes.H2[max(j, k), min(j, k), lane]
-        for j in range(len(model.start)):
-            at = model.start[j]
-            known = z[i, at] - model.correction[at] if at >= 0 else 0.0
-            x[i, d + j] = lanes.emission[j, lane] + known
-    return int(most)
+def _accept(y: Array, settled: Array, good: Array, scale: Array, x: Array) -> None:
+    """Take positions from squared-range answers; those that are not settled, or behind the stations, are not good."""
+    d, width = x.shape
+    for lane in range(width):
+        good[lane] = good[lane] * settled[lane] if y[d, lane] >= 0.0 else 0.0
+    for j in range(d):
+        for lane in range(width):
+            y[j, lane] = y[j, lane] if good[lane] != 0.0 else 0.0
+            x[j, lane] = y[j, lane] * scale[lane]
 
 
 @compiled
-def _invert(lanes: Lanes) -> None:
-    """Write the lower half of the inverse information into `H2`, and into `settled` whether it is regular."""
-    d, width = lanes.x.shape
+def _invert(vector: Array, matrix: Array, scalar: Array) -> None:
+    """Write the lower half of the covariance over H_TRIAL, and whether it is regular and the fix near to SOLVABLE."""
+    _, d, width = vector.shape
+    diagonal, inverse, move, fine, away = vector[DIAGONAL], vector[INVERSE], vector[MOVE], scalar[SOLVABLE], scalar[SPARE]
+    for lane in range(width):
+        away[lane] = 0.0
     for i in range(d):
         for lane in range(width):
-            lanes.diagonal[i, lane] = lanes.H[i, i, lane]
-    factor(lanes.H, lanes.diagonal, lanes.lower, lanes.inverse)
+            diagonal[i, lane] = matrix[H, i, i, lane]
+            apart = (vector[X, i, lane] - vector[CENTRE, i, lane]) / scalar[SPREAD, lane]
+            away[lane] += apart * apart
     for lane in range(width):
-        lanes.settled[lane] = 1.0
+        fine[lane] = 1.0 if away[lane] <= _FAR * _FAR else 0.0
+    factor(matrix[H], diagonal, matrix[LOWER], inverse)
     for j in range(d):
-        for lane in range(width):
-            share = lanes.inverse[j, lane] * lanes.diagonal[j, lane]
-            lanes.settled[lane] = lanes.settled[lane] if 0.0 < share < 1.0 / _WEAK else 0.0
         for i in range(d):
             for lane in range(width):
-                lanes.move[i, lane] = 1.0 if i == j else 0.0
-        solve(lanes.lower, lanes.inverse, lanes.move)
+                move[i, lane] = 1.0 if i == j else 0.0
+        solve(matrix[LOWER], inverse, move)
+        for lane in range(width):
+            fine[lane] = fine[lane] if 0.0 < inverse[j, lane] * diagonal[j, lane] < 1.0 / _WEAK else 0.0
         for i in range(j, d):
             for lane in range(width):
-                lanes.H2[i, j, lane] = lanes.move[i, lane]
-
-
-@compiled
-def _remote(lanes: Lanes) -> None:
-    """Write how far the fixes are from the stations into `spare`, in units of their spread."""
-    d, width = lanes.x.shape
-    for lane in range(width):
-        lanes.spare[lane] = 0.0
-    for j in range(d):
-        for lane in range(width):
-            lanes.spare[lane] += (lanes.x[j, lane] - lanes.centre[j, lane]) ** 2
-    for lane in range(width):
-        lanes.spare[lane] = np.sqrt(lanes.spare[lane]) / lanes.spread[lane]
-
-
-@compiled
-def _emit(model: Model, lanes: Lanes) -> None:
-    """Find the emission times that fit the positions best, less those of their anchors."""
-    count, width = lanes.emission.shape
-    if count == 0:
-        return
-    ranges(lanes, lanes.x)
-    apply(model.travel, lanes.r, lanes.emission)
-    for k in range(count):
-        apply(model.emission[k : k + 1], lanes.z, lanes.extra.reshape(1, width))
-        for lane in range(width):
-            lanes.emission[k, lane] = lanes.extra[lane] - lanes.emission[k, lane]
+                matrix[H_TRIAL, i, j, lane] = move[i, lane]

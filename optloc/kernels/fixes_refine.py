@@ -4,25 +4,45 @@ from __future__ import annotations
 
 import numpy as np
 
-from optloc.kernels.fixes_lanes import Lanes, Model
 from optloc.kernels.gtrs import factor, solve
 from optloc.kernels.jit import compiled
 from optloc.types import Array
 
 _FLOOR = 1e-13  # rounding error of a cost, relative to one more than it
 _PIVOT = 1e-15  # share of its diagonal that a pivot must exceed
+# Rows of the arrays `vector` and `matrix` at the position and at the one tried, and scratch.
+X, TRIAL, MOVE, G, G_TRIAL, DIAGONAL, INVERSE, ROW, ORIGIN, CENTRE = range(10)
+H, H_TRIAL, LOWER = range(3)
+# Rows of the array `scalar`.
+COST, COST_TRIAL, LOOP, BLUR, DAMPING, GROWTH, GAIN, SOLVABLE, SPARE, ALIVE, GOOD, STEPS, SCALE, SPREAD = range(14)
 
 
 @compiled
-def refine(model: Model, lanes: Lanes, tolerance: float, limit: int) -> None:
-    """Refine the positions `x` of the lanes that are `good`; those that do not finish in time stay `alive`.
+def refine(
+    K: Array,
+    u: Array,
+    place: Array,
+    r: Array,
+    unit: Array,
+    vector: Array,
+    matrix: Array,
+    scalar: Array,
+    tolerance: float,
+    limit: int,
+) -> None:
+    """Refine the positions of the lanes that are good; those that do not finish in time stay alive.
 
     Parameters
     ----------
-    model : Model
-        What all problems share.
-    lanes : Lanes
-        Positions in; positions, costs, information and numbers of steps out. A lane that fails is no longer `good`.
+    K, u : array (q, s), (q, W)
+        The cost is ``|u - K r|^2`` and that of the loops.
+    place : array (s, d, W)
+        Stations, metres.
+    r, unit : array (s, W), (s, d, W)
+        Scratch: ranges and unit vectors.
+    vector, matrix, scalar : array (10, d, W), (3, d, d, W), (14, W)
+        Positions in row X, cost of the loops, rounding error and which lanes are good in; positions, right-hand
+        sides, information (lower half), costs, steps, which are alive and which good out.
     tolerance : float
         A fix is finished when its next step is shorter than this many of its own standard deviations.
     limit : int
@@ -33,130 +53,159 @@ def refine(model: Model, lanes: Lanes, tolerance: float, limit: int) -> None:
     Levenberg's method with Marquardt's scaling; the damping follows H. B. Nielsen, "Damping parameter in Marquardt's
     method", IMM-REP-1999-05, Technical University of Denmark.
     """
-    width = len(lanes.cost)
-    equations(model, lanes, lanes.x, lanes.H, lanes.g, lanes.cost)
+    width = scalar.shape[1]
+    equations(K, u, place, r, unit, vector[X], vector[ROW], scalar[SPARE], scalar[LOOP], matrix[H], vector[G], scalar[COST])
     for lane in range(width):
-        lanes.good[lane] = lanes.good[lane] if lanes.cost[lane] < np.inf else 0.0
-        lanes.alive[lane] = lanes.good[lane]
-        lanes.damping[lane], lanes.growth[lane], lanes.steps[lane] = 1e-6, 2.0, 0.0
+        scalar[GOOD, lane] = scalar[GOOD, lane] if scalar[COST, lane] < np.inf else 0.0
+        scalar[ALIVE, lane] = scalar[GOOD, lane]
+        scalar[DAMPING, lane], scalar[GROWTH, lane], scalar[STEPS, lane] = 1e-6, 2.0, 0.0
     for _ in range(limit):
-        _propose(lanes)
-        equations(model, lanes, lanes.trial, lanes.H2, lanes.g2, lanes.cost2)
-        _decide(lanes, tolerance)
-        alive = 0.0
-        for lane in range(width):
-            alive += lanes.alive[lane]
-        if alive == 0.0:
+        _propose(vector, matrix, scalar)
+        equations(
+            K,
+            u,
+            place,
+            r,
+            unit,
+            vector[TRIAL],
+            vector[ROW],
+            scalar[SPARE],
+            scalar[LOOP],
+            matrix[H_TRIAL],
+            vector[G_TRIAL],
+            scalar[COST_TRIAL],
+        )
+        if not _decide(vector, matrix, scalar, tolerance):
             break
 
 
 @compiled
-def equations(model: Model, lanes: Lanes, x: Array, H: Array, g: Array, cost: Array) -> None:
-    """Find information (lower half), right-hand side and cost at positions x (d, W) from the origin."""
-    s, d, width = lanes.place.shape
-    ranges(lanes, x)
+def equations(
+    K: Array,
+    u: Array,
+    place: Array,
+    r: Array,
+    unit: Array,
+    x: Array,
+    row: Array,
+    left: Array,
+    loop: Array,
+    information: Array,
+    right: Array,
+    cost: Array,
+) -> None:
+    """Find information (lower half), right-hand side and cost at positions x (d, W); `row` and `left` are scratch."""
+    s, d, width = place.shape
+    ranges(place, x, r, unit, left)
     for lane in range(width):
-        cost[lane] = lanes.loop[lane]
+        cost[lane] = loop[lane]
     for i in range(d):
         for lane in range(width):
-            g[i, lane] = 0.0
+            right[i, lane] = 0.0
         for j in range(i + 1):
             for lane in range(width):
-                H[i, j, lane] = 0.0
-    for k in range(len(model.K)):
+                information[i, j, lane] = 0.0
+    for k in range(len(K)):
         for lane in range(width):
-            lanes.spare[lane] = lanes.u[k, lane]
+            left[lane] = u[k, lane]
         for j in range(d):
             for lane in range(width):
-                lanes.row[j, lane] = 0.0
+                row[j, lane] = 0.0
         for i in range(s):
-            share = model.K[k, i]
+            share = K[k, i]
             if share != 0.0:
                 for lane in range(width):
-                    lanes.spare[lane] -= share * lanes.r[i, lane]
+                    left[lane] -= share * r[i, lane]
                 for j in range(d):
                     for lane in range(width):
-                        lanes.row[j, lane] += share * lanes.unit[i, j, lane]
+                        row[j, lane] += share * unit[i, j, lane]
         for lane in range(width):
-            cost[lane] += lanes.spare[lane] * lanes.spare[lane]
+            cost[lane] += left[lane] * left[lane]
         for i in range(d):
             for lane in range(width):
-                g[i, lane] += lanes.row[i, lane] * lanes.spare[lane]
+                right[i, lane] += row[i, lane] * left[lane]
             for j in range(i + 1):
                 for lane in range(width):
-                    H[i, j, lane] += lanes.row[i, lane] * lanes.row[j, lane]
+                    information[i, j, lane] += row[i, lane] * row[j, lane]
 
 
 @compiled
-def ranges(lanes: Lanes, x: Array) -> None:
-    """Find ranges and unit vectors from the stations at positions x (d, W)."""
-    s, d, width = lanes.place.shape
+def ranges(place: Array, x: Array, r: Array, unit: Array, spare: Array) -> None:
+    """Find ranges (s, W) and unit vectors (s, d, W) from the stations at positions x (d, W)."""
+    s, d, width = place.shape
     for i in range(s):
         for lane in range(width):
-            lanes.r[i, lane] = 0.0
+            spare[lane] = 0.0
         for j in range(d):
             for lane in range(width):
-                apart = x[j, lane] - lanes.place[i, j, lane]
-                lanes.unit[i, j, lane] = apart
-                lanes.r[i, lane] += apart * apart
+                apart = x[j, lane] - place[i, j, lane]
+                unit[i, j, lane] = apart
+                spare[lane] += apart * apart
         for lane in range(width):
-            lanes.r[i, lane] = np.sqrt(lanes.r[i, lane])
-        for lane in range(width):
-            lanes.spare[lane] = 1.0 / lanes.r[i, lane]
+            r[i, lane] = np.sqrt(spare[lane])
+            spare[lane] = 1.0 / r[i, lane]
         for j in range(d):
             for lane in range(width):
-                lanes.unit[i, j, lane] *= lanes.spare[lane]
+                unit[i, j, lane] *= spare[lane]
 
 
 @compiled
-def _propose(lanes: Lanes) -> None:
-    """Find the damped step; `extra` is the squared length in its own standard deviations, `spare` the least pivot."""
-    d, width = lanes.x.shape
-    for i in range(d):
-        for lane in range(width):
-            lanes.diagonal[i, lane] = lanes.H[i, i, lane] * (1.0 + lanes.damping[lane])
-            lanes.move[i, lane] = lanes.g[i, lane]
-    factor(lanes.H, lanes.diagonal, lanes.lower, lanes.inverse)
-    solve(lanes.lower, lanes.inverse, lanes.move)
+def _propose(vector: Array, matrix: Array, scalar: Array) -> None:
+    """Find the damped step, its squared length in its own standard deviations, and whether it exists."""
+    _, d, width = vector.shape
+    diagonal, inverse, move, right, damping = vector[DIAGONAL], vector[INVERSE], vector[MOVE], vector[G], scalar[DAMPING]
+    gain, solvable, information = scalar[GAIN], scalar[SOLVABLE], matrix[H]
     for lane in range(width):
-        lanes.extra[lane], lanes.settled[lane] = 0.0, 1.0
+        gain[lane], solvable[lane] = 0.0, 1.0
     for i in range(d):
         for lane in range(width):
-            lanes.extra[lane] += lanes.move[i, lane] * lanes.g[i, lane]
-            lanes.trial[i, lane] = lanes.x[i, lane] + lanes.move[i, lane]
-            share = lanes.inverse[i, lane] * lanes.diagonal[i, lane]
-            lanes.settled[lane] = lanes.settled[lane] if 0.0 < share < 1.0 / _PIVOT else 0.0
+            diagonal[i, lane] = information[i, i, lane] * (1.0 + damping[lane])
+            move[i, lane] = right[i, lane]
+    factor(information, diagonal, matrix[LOWER], inverse)
+    solve(matrix[LOWER], inverse, move)
+    x, trial = vector[X], vector[TRIAL]
+    for i in range(d):
+        for lane in range(width):
+            gain[lane] += move[i, lane] * right[i, lane]
+            trial[i, lane] = x[i, lane] + move[i, lane]
+            share = inverse[i, lane] * diagonal[i, lane]
+            solvable[lane] = solvable[lane] if 0.0 < share < 1.0 / _PIVOT else 0.0
 
 
 @compiled
-def _decide(lanes: Lanes, tolerance: float) -> None:
-    """Keep the steps that lower the cost, move the damping, and end the lanes whose step was small."""
-    d, width = lanes.x.shape
+def _decide(vector: Array, matrix: Array, scalar: Array, tolerance: float) -> bool:
+    """Keep the steps that lower the cost, move the damping, end lanes whose step was small; return if any is alive."""
+    _, d, width = vector.shape
+    kept, alive = scalar[SPARE], scalar[ALIVE]
     for lane in range(width):
-        cost, gain, damping = lanes.cost[lane], lanes.extra[lane], lanes.damping[lane]
-        achieved, floor = cost - lanes.cost2[lane], _FLOOR * (1.0 + cost)
-        rounding = floor + 2.0 * lanes.blur[lane] * np.sqrt(1.0 + cost)
-        solvable = lanes.alive[lane] * lanes.settled[lane]
-        better = solvable if achieved >= -rounding else 0.0
-        better = better if lanes.cost2[lane] < np.inf else 0.0
-        small = solvable if abs(gain) * (1.0 + damping) <= max(tolerance**2, floor + lanes.blur[lane] ** 2) else 0.0
+        cost, gain, damping, blur = scalar[COST, lane], scalar[GAIN, lane], scalar[DAMPING, lane], scalar[BLUR, lane]
+        after, floor = scalar[COST_TRIAL, lane], _FLOOR * (1.0 + cost)
+        achieved = cost - after
+        rounding = floor + 2.0 * blur * np.sqrt(1.0 + cost)
+        solvable = alive[lane] * scalar[SOLVABLE, lane]
+        better = solvable if achieved >= -rounding and after < np.inf else 0.0
+        small = solvable if abs(gain) * (1.0 + damping) <= max(tolerance * tolerance, floor + blur * blur) else 0.0
         ratio = min(max(achieved / (gain if gain > 0.0 else 1.0), 0.0), 1.0)
         shape = 2.0 * ratio - 1.0
         change = 0.1 if ratio > 0.9 else max(1.0 / 3.0, 1.0 - shape * shape * shape)
-        down, up = max(damping * change, 1e-12), damping * lanes.growth[lane] + 1e-12
-        lanes.damping[lane] = down if better != 0.0 else up
-        lanes.growth[lane] = 2.0 if better != 0.0 else 2.0 * lanes.growth[lane]
-        lanes.cost[lane] = lanes.cost2[lane] if better != 0.0 else cost
-        lanes.steps[lane] += lanes.alive[lane]
-        lanes.spare[lane] = better
-        lost = lanes.alive[lane] if better == 0.0 and lanes.damping[lane] > 1e12 and small == 0.0 else 0.0
-        lanes.good[lane] = lanes.good[lane] if lost == 0.0 else 0.0
-        lanes.alive[lane] = lanes.alive[lane] if small + lost == 0.0 else 0.0
+        growth = scalar[GROWTH, lane]
+        damping = max(damping * change, 1e-12) if better != 0.0 else damping * growth + 1e-12
+        lost = alive[lane] if better == 0.0 and damping > 1e12 and small == 0.0 else 0.0
+        scalar[DAMPING, lane] = damping
+        scalar[GROWTH, lane] = 2.0 if better != 0.0 else 2.0 * growth
+        scalar[COST, lane] = after if better != 0.0 else cost
+        scalar[STEPS, lane] += alive[lane]
+        scalar[GOOD, lane] = scalar[GOOD, lane] if lost == 0.0 else 0.0
+        alive[lane] = alive[lane] if small + lost == 0.0 else 0.0
+        kept[lane] = better
     for i in range(d):
         for lane in range(width):
-            keep = lanes.spare[lane] != 0.0
-            lanes.x[i, lane] = lanes.trial[i, lane] if keep else lanes.x[i, lane]
-            lanes.g[i, lane] = lanes.g2[i, lane] if keep else lanes.g[i, lane]
+            vector[X, i, lane] = vector[TRIAL, i, lane] if kept[lane] != 0.0 else vector[X, i, lane]
+            vector[G, i, lane] = vector[G_TRIAL, i, lane] if kept[lane] != 0.0 else vector[G, i, lane]
         for j in range(i + 1):
             for lane in range(width):
-                lanes.H[i, j, lane] = lanes.H2[i, j, lane] if lanes.spare[lane] != 0.0 else lanes.H[i, j, lane]
+                matrix[H, i, j, lane] = matrix[H_TRIAL, i, j, lane] if kept[lane] != 0.0 else matrix[H, i, j, lane]
+    left = 0.0
+    for lane in range(width):
+        left += alive[lane]
+    return left > 0.0

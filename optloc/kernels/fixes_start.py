@@ -4,191 +4,210 @@ from __future__ import annotations
 
 import numpy as np
 
-from optloc.kernels.fixes_lanes import Lanes, Model, apply
-from optloc.kernels.gtrs import minimise
 from optloc.kernels.jit import compiled
 from optloc.types import Array
 
 _NEAR = 1e-3  # least distance from a station that weighs a row, in units of the stations' spread
+_ROUNDING = 4.0 * 2.220446049250313e-16
 
 
 @compiled
-def read(model: Model, z: Array, item: Array, lanes: Lanes) -> None:
-    """Take the measurements of a block of problems: least-squares ranges, whitened rows, loops, rounding errors.
+def read(
+    z: Array, item: Array, row: Array, anchor: Array, linear: Array, out: Array, value: Array, blur: Array, good: Array
+) -> None:
+    """Take the measurements of a block of problems, and everything that is linear in them.
 
     Parameters
     ----------
-    model : Model
-        What all problems share.
     z : array (N, m)
-        Measurements.
+        Measurements, metres.
     item : int64 array (W,)
         Problem of each lane.
-    lanes : Lanes
-        Written.
+    row : array (2, m)
+        Of each row: known amount by which the measurement exceeds the model; one over its variance, 0 where absent.
+    anchor : int64 array (m,)
+        Row that is subtracted from each before anything is added up, -1 for none.
+    linear : array (p, m)
+        Linear maps of the measurements.
+    out : array (m, W)
+        Written: measurements less corrections and anchors; zero where absent.
+    value : array (p, W)
+        Written: their images.
+    blur : array (W,)
+        Written: rounding error of the whitened residuals.
+    good : array (W,)
+        Written: 1.0 where all rows that are present are finite, else 0.0.
     """
-    m, width = lanes.z.shape
+    m, width = out.shape
     for lane in range(width):
-        lanes.blur[lane], lanes.loop[lane], lanes.good[lane] = 0.0, 0.0, 1.0
+        blur[lane], good[lane] = 0.0, 1.0
     for j in range(m):
-        if model.present[j] == 0.0:
+        if row[1, j] == 0.0:
             for lane in range(width):
-                lanes.z[j, lane] = 0.0
+                out[j, lane] = 0.0
             continue
         for lane in range(width):
-            lanes.z[j, lane] = z[item[lane], j] - model.correction[j]
+            out[j, lane] = z[item[lane], j] - row[0, j]
         for lane in range(width):
-            lanes.blur[lane] += model.precision[j] * lanes.z[j, lane] ** 2
-            lanes.good[lane] = lanes.good[lane] if abs(lanes.z[j, lane]) < np.inf else 0.0
+            blur[lane] += row[1, j] * out[j, lane] * out[j, lane]
+            good[lane] = good[lane] if abs(out[j, lane]) < np.inf else 0.0
     for lane in range(width):
-        lanes.blur[lane] = 4.0 * 2.220446049250313e-16 * np.sqrt(lanes.blur[lane])
-    for j in range(m - 1, -1, -1):
-        at = model.anchor[j]
-        if at >= 0 and at != j:
+        blur[lane] = _ROUNDING * np.sqrt(blur[lane])
+    for j in range(m - 1, -1, -1):  # an anchor is the first of its rows: it goes last
+        if anchor[j] >= 0:
             for lane in range(width):
-                lanes.z[j, lane] -= lanes.z[at, lane]
-    for j in range(m):
-        if model.anchor[j] == j:
-            for lane in range(width):
-                lanes.z[j, lane] = 0.0
-    apply(model.offset, lanes.z, lanes.c)
-    apply(model.right, lanes.z, lanes.u)
-    for k in range(len(model.loops)):
-        apply(model.loops[k : k + 1], lanes.z, lanes.spare.reshape(1, width))
+                out[j, lane] -= out[anchor[j], lane]
+    for i in range(len(linear)):
         for lane in range(width):
-            lanes.loop[lane] += lanes.spare[lane] ** 2
-
-
-@compiled
-def stand(model: Model, station: Array, item: Array, lanes: Lanes) -> None:
-    """Take the stations (N or 1, s, d) of a block of problems: their origin, and the unit of their coordinates."""
-    s, d, width = lanes.place.shape
-    free = model.sign[model.reference] != 0.0
-    shared = len(station) == 1
-    for i in range(s):
-        for j in range(d):
-            for lane in range(width):
-                lanes.place[i, j, lane] = station[0 if shared else item[lane], i, j]
-    for j in range(d):
-        for lane in range(width):
-            lanes.centre[j, lane] = 0.0
-        for i in range(s):
-            for lane in range(width):
-                lanes.centre[j, lane] += lanes.place[i, j, lane] / s
-        for lane in range(width):
-            lanes.origin[j, lane] = lanes.place[model.reference, j, lane] if free else lanes.centre[j, lane]
-            lanes.centre[j, lane] -= lanes.origin[j, lane]
-    for lane in range(width):
-        lanes.spread[lane] = 0.0
-    for i in range(s):
-        for lane in range(width):
-            lanes.spare[lane] = 0.0
-        for j in range(d):
-            for lane in range(width):
-                lanes.place[i, j, lane] -= lanes.origin[j, lane]
-                lanes.spare[lane] += (lanes.place[i, j, lane] - lanes.centre[j, lane]) ** 2
-        for lane in range(width):
-            lanes.spread[lane] = max(lanes.spread[lane], lanes.spare[lane])
-    for lane in range(width):
-        lanes.spread[lane] = np.sqrt(lanes.spread[lane])
-
-
-@compiled
-def begin(model: Model, lanes: Lanes) -> None:
-    """Find where to start: the squared-range fix, with equal weights first and then weighted by its own ranges.
-
-    Lanes whose fix is not settled, or lies behind the stations, are marked in `good`.
-    """
-    s, d, width = lanes.place.shape
-    free = model.sign[model.reference] != 0.0
-    _unit(lanes, free)
-    _square(model, lanes, free)
-    for turn in range(2):
-        for i in range(s):
-            _weigh(lanes, i, turn == 0)
-            for j in range(d + 2):
-                row = lanes.rows[i, j] if j <= d else lanes.right[i]
+            value[i, lane] = 0.0
+        for j in range(m):
+            share = linear[i, j]
+            if share != 0.0:
                 for lane in range(width):
-                    row[lane] = lanes.spare[lane] * lanes.squared[i, j, lane]
-        _whiten(model, lanes)
-        minimise(lanes.rows, lanes.right, free, lanes.y, lanes.settled, lanes.work)
-        for lane in range(width):
-            lanes.good[lane] *= lanes.settled[lane]
-            lanes.good[lane] = lanes.good[lane] if lanes.y[d, lane] >= 0.0 else 0.0
-    for j in range(d):
-        for lane in range(width):
-            lanes.x[j, lane] = lanes.y[j, lane] * lanes.scale[lane] if lanes.good[lane] != 0.0 else 0.0
+                    value[i, lane] += share * out[j, lane]
 
 
 @compiled
-def _unit(lanes: Lanes, free: bool) -> None:
-    """Find the unit of length: the spread of the stations, and of determined ranges."""
-    s, width = lanes.c.shape
+def stand(
+    station: Array, item: Array, reference: int, place: Array, origin: Array, centre: Array, spread: Array, spare: Array
+) -> None:
+    """Take the stations of a block of problems.
+
+    Parameters
+    ----------
+    station : array (N or 1, s, d)
+        Positions, metres.
+    item : int64 array (W,)
+        Problem of each lane.
+    reference : int
+        Station that becomes the origin; -1: their mean does.
+    place : array (s, d, W)
+        Written: positions from the origin.
+    origin, centre : array (d, W)
+        Written: the origin, and the mean of the stations from there.
+    spread : array (W,)
+        Written: greatest distance of a station from the mean.
+    spare : array (W,)
+        Scratch.
+    """
+    s, d, width = place.shape
+    shared = len(station) == 1
+    for j in range(d):
+        for lane in range(width):
+            centre[j, lane] = 0.0
+        for i in range(s):
+            for lane in range(width):
+                place[i, j, lane] = station[0 if shared else item[lane], i, j]
+                centre[j, lane] += place[i, j, lane] / s
+        for lane in range(width):
+            origin[j, lane] = place[reference, j, lane] if reference >= 0 else centre[j, lane]
+            centre[j, lane] -= origin[j, lane]
     for lane in range(width):
-        lanes.scale[lane] = lanes.spread[lane]
+        spread[lane] = 0.0
+    for i in range(s):
+        for lane in range(width):
+            spare[lane] = 0.0
+        for j in range(d):
+            for lane in range(width):
+                place[i, j, lane] -= origin[j, lane]
+                apart = place[i, j, lane] - centre[j, lane]
+                spare[lane] += apart * apart
+        for lane in range(width):
+            spread[lane] = max(spread[lane], np.sqrt(spare[lane]))
+
+
+@compiled
+def square(
+    c: Array, sign: Array, reference: int, place: Array, spread: Array, scale: Array, rows: Array, spare: Array
+) -> None:
+    """Square the ranges ``r = c + sign t``: linear in (x, t) with t from the cone, or in (x, |x|^2).
+
+    Parameters
+    ----------
+    c : array (s, W)
+        Least-squares ranges, metres.
+    sign : array (s,)
+        How the unknown range t enters.
+    reference : int
+        Station whose range is t; -1 where ranges are determined.
+    place, spread : array (s, d, W), (W,)
+        Of `stand`.
+    scale : array (W,)
+        Written: unit of length.
+    rows : array (s, d + 2, W)
+        Written: coefficients of x and of the last entry, and the right side; scaled.
+    spare : array (W,)
+        Scratch.
+    """
+    s, d, width = place.shape
+    free = reference >= 0
+    turn = 2.0 if free else -2.0
+    for lane in range(width):
+        scale[lane] = spread[lane]
     if not free:
         for i in range(s):
             for lane in range(width):
-                lanes.scale[lane] = max(lanes.scale[lane], abs(lanes.c[i, lane]))
+                scale[lane] = max(scale[lane], abs(c[i, lane]))
     for lane in range(width):
-        lanes.scale[lane] = lanes.scale[lane] if lanes.scale[lane] > 0.0 else 1.0
-
-
-@compiled
-def _square(model: Model, lanes: Lanes, free: bool) -> None:
-    """Square ``r = c + sign t``: linear in (x, t) with t from the cone, or in (x, |x|^2)."""
-    s, d, width = lanes.place.shape
+        scale[lane] = scale[lane] if scale[lane] > 0.0 else 1.0
+        spare[lane] = 1.0 / scale[lane]
     for i in range(s):
-        if free and (i == model.reference or model.sign[i] == 0.0):
-            for j in range(d + 2):
-                for lane in range(width):
-                    lanes.squared[i, j, lane] = 0.0
-            continue
-        turn = 2.0 if free else -2.0
-        right = lanes.squared[i, d + 1]
+        used = 0.0 if free and (i == reference or sign[i] == 0.0) else 1.0
         for lane in range(width):
-            c = lanes.c[i, lane] / lanes.scale[lane]
-            right[lane] = c * c
-            lanes.squared[i, d, lane] = turn * model.sign[i] * c if free else 1.0
+            known = used * c[i, lane] * spare[lane]
+            rows[i, d + 1, lane] = known * known
+            rows[i, d, lane] = 2.0 * sign[i] * known if free else 1.0
         for j in range(d):
             for lane in range(width):
-                place = lanes.place[i, j, lane] / lanes.scale[lane]
-                lanes.squared[i, j, lane] = turn * place
-                right[lane] -= place * place
+                at = used * place[i, j, lane] * spare[lane]
+                rows[i, j, lane] = turn * at
+                rows[i, d + 1, lane] -= at * at
         if free:
             for lane in range(width):
-                right[lane] = -right[lane]
+                rows[i, d + 1, lane] = -rows[i, d + 1, lane]
 
 
 @compiled
-def _weigh(lanes: Lanes, i: int, equal: bool) -> None:
-    """Find what turns the error of a squared range into that of the range: one over twice the range, scaled."""
-    d, width = lanes.x.shape
-    if equal:
-        for lane in range(width):
-            lanes.spare[lane] = 0.5 * lanes.scale[lane]
-        return
-    for lane in range(width):
-        lanes.spare[lane] = 0.0
-    for j in range(d):
-        for lane in range(width):
-            lanes.spare[lane] += (lanes.y[j, lane] - lanes.place[i, j, lane] / lanes.scale[lane]) ** 2
-    for lane in range(width):
-        lanes.spare[lane] = 0.5 * lanes.scale[lane] / max(np.sqrt(lanes.spare[lane]), _NEAR)
+def weigh(
+    rows: Array, place: Array, y: Array, scale: Array, white: Array, equal: bool, out: Array, spare: Array
+) -> None:
+    """Divide squared-range rows by twice the ranges, which turns their errors into those of ranges, and whiten them.
 
-
-@compiled
-def _whiten(model: Model, lanes: Lanes) -> None:
-    """Multiply the rows and right sides by the lower triangular whitening matrix, in place from the last one up."""
-    s, n, width = lanes.rows.shape
-    for i in range(s - 1, -1, -1):
-        for j in range(n + 1):
-            out = lanes.rows[i, j] if j < n else lanes.right[i]
+    Parameters
+    ----------
+    rows, place, scale : array (s, d + 2, W), (s, d, W), (W,)
+        Of `square` and `stand`.
+    y : array (d + 1, W)
+        Where the ranges are taken, scaled.
+    white : array (s, s)
+        Lower triangular whitening matrix of the ranges, 1/metres.
+    equal : bool
+        Take all ranges as equal instead.
+    out : array (s, d + 2, W)
+        Written.
+    spare : array (W,)
+        Scratch.
+    """
+    s, d, width = place.shape
+    for i in range(s):
+        for lane in range(width):
+            spare[lane] = 0.0
+        for j in range(d):
             for lane in range(width):
-                out[lane] *= model.white[i, i]
-            for k in range(i):
-                factor = model.white[i, k]
-                if factor != 0.0:
-                    other = lanes.rows[k, j] if j < n else lanes.right[k]
+                apart = y[j, lane] - place[i, j, lane] / scale[lane]
+                spare[lane] += apart * apart
+        for lane in range(width):
+            spare[lane] = 0.5 * scale[lane] / (1.0 if equal else max(np.sqrt(spare[lane]), _NEAR))
+        for j in range(d + 2):
+            for lane in range(width):
+                out[i, j, lane] = spare[lane] * rows[i, j, lane]
+    for i in range(s - 1, -1, -1):
+        for j in range(d + 2):
+            for lane in range(width):
+                out[i, j, lane] *= white[i, i]
+        for k in range(i):
+            share = white[i, k]
+            if share != 0.0:
+                for j in range(d + 2):
                     for lane in range(width):
-                        out[lane] += factor * other[lane]
+                        out[i, j, lane] += share * out[k, j, lane]

@@ -3,99 +3,144 @@
 from __future__ import annotations
 
 from optloc.kernels.jit import compiled
-from optloc.kernels.lanes import Scratch, measure
-from optloc.kernels.pack import Numbers, Packed
+from optloc.kernels.lanes import measure
+from optloc.kernels.pack import Numbers
+from optloc.kernels.room import Room
 from optloc.kernels.tables import Tables
 from optloc.types import Array
 
 
 @compiled
-def gather(packed: Packed, work: Scratch, x: Array, lanes: int, out: Array) -> None:
-    """Write the normal equations of the first lanes, priors included.
+def gather(t: Tables, c: Numbers, m: Array, r: Array, room: Room, lanes: int) -> None:
+    """Write the normal equations at `room.trial` into `room.after`, priors included.
 
     Parameters
     ----------
-    packed : Packed
-        Problems of one epoch, or without unknowns local to the epochs.
-    work : Scratch
-        Their numbers.
-    x : array (p, B)
-        Parameter vectors: shared unknowns, then local ones.
+    t : Tables
+        Indices of problems of one epoch, or without unknowns local to the epochs.
+    c : Numbers
+        What the problems share.
+    m : array (cells, B)
+        Memory.
+    r : array (registers, LENGTH)
+        Registers.
+    room : Room
+        Where things stand.
     lanes : int
         How many lanes hold a problem.
-    out : array (p + 1, p + 1, B)
-        Lower triangle of the information; the last row is the vector and the cost.
     """
-    t, c = packed
-    out[:, :, :lanes] = 0.0
-    for packet in range(t.packet_row.shape[0]):
-        measure(packed, work, x, packet, lanes)
-        for group in range(t.packet_group[packet], t.packet_group[packet + 1]):
-            whiten(t, c, work, group, lanes)
-            add_group(t, work, group, lanes, out)
-    for i in range(c.prior_start.shape[0]):
-        start = c.prior_start[i] + (t.shared if c.prior_local[i] else 0)
-        add_prior(c, work, i, x[start : start + c.prior_size[i]], start, lanes, out)
+    last = t.shared + t.local
+    clear(m, room.after, (last + 1) ** 2, lanes)
+    for packet in range(t.packets):
+        measure(t, c.common, m, r, room, packet, room.trial, lanes)
+        for group in range(t.index[t.packet + packet, 0], t.index[t.packet + packet + 1, 0]):
+            add_group(t, c.common, c.place, m, room, group, lanes)
+    for i in range(t.groups, c.place.shape[0]):
+        start = c.place[i, 1] + (t.shared if c.place[i, 3] else 0)
+        add_prior(c.common, c.place[i, 0], c.place[i, 2], m, room, room.trial + start, start, last, lanes)
 
 
 @compiled
-def whiten(t: Tables, c: Numbers, work: Scratch, group: int, lanes: int) -> None:
-    """Write the whitened rows of a group into `work.whitened`."""
-    size, columns = t.group_size[group], t.column_at[group + 1] - t.column_at[group] + 1
-    first, place = t.group_row[group], c.group_white[group]
+def clear(m: Array, first: int, count: int, lanes: int) -> None:
+    """Write zeros."""
+    for cell in range(first, first + count):
+        for b in range(lanes):
+            m[cell, b] = 0.0
+
+
+@compiled
+def add_group(t: Tables, common: Array, place: Array, m: Array, room: Room, group: int, lanes: int) -> None:
+    """Add the whitened rows of a group to the equations in `room.after`."""
+    line = t.group + group
+    first, size = room.rows + t.index[line, 0] * t.width, t.index[line, 1]
+    columns, column = t.index[line + 1, 3] - t.index[line, 3] + 1, t.column + t.index[line, 3]
+    _whiten(common, place[group, 0], place[group, 1], m, room.own, first, t.width, size, columns, room.whitened, lanes)
+    _square(t.index, column, m, room.whitened, t.width, size, columns, room.after, t.shared + t.local, lanes)
+
+
+@compiled
+def _whiten(
+    common: Array,
+    place: int,
+    full: int,
+    m: Array,
+    own: int,
+    first: int,
+    width: int,
+    size: int,
+    columns: int,
+    to: int,
+    lanes: int,
+) -> None:
+    """Write `size` rows from cell `first` on, whitened, to cell `to`."""
     for i in range(size):
-        end = size if c.group_full[group] else i + 1
         for s in range(columns):
-            target = work.whitened[i, s]
-            target[:lanes] = 0.0
-            for j in range(end):
-                row = work.rows[first + j, s]
-                if place >= 0:
-                    factor = c.white_common[place + i * size + j]
-                    for b in range(lanes):
-                        target[b] += factor * row[b]
-                else:
-                    factors = work.white[-1 - place + i * size + j]
-                    for b in range(lanes):
-                        target[b] += factors[b] * row[b]
-
-
-@compiled
-def add_group(t: Tables, work: Scratch, group: int, lanes: int, out: Array) -> None:
-    """Add the products of the whitened rows of a group."""
-    begin, end = t.column_at[group], t.column_at[group + 1]
-    size, count, last = t.group_size[group], end - begin, out.shape[0] - 1
-    for i in range(count + 1):
-        row = out[t.column[begin + i] if i < count else last]
-        for j in range(i + 1):
-            total = row[t.column[begin + j] if j < count else last]
-            for r in range(size):
-                u, v = work.whitened[r, i], work.whitened[r, j]
-                for b in range(lanes):
-                    total[b] += u[b] * v[b]
-
-
-@compiled
-def add_prior(c: Numbers, work: Scratch, prior: int, x: Array, start: int, lanes: int, out: Array) -> None:
-    """Add a Gaussian prior of the unknowns x (q, B) whose first column is `start`."""
-    size, place, last = c.prior_size[prior], c.prior_at[prior], out.shape[0] - 1
-    for i in range(size):
-        error, pull = work.error[i], work.error[size + i]
-        for b in range(lanes):
-            error[b] = (c.prior_common[place + i] if place >= 0 else work.prior[-1 - place + i, b]) - x[i, b]
-            pull[b] = 0.0
-    for i in range(size):
-        pull = work.error[size + i]
-        for j in range(size):
-            error, at = work.error[j], size + i * size + j
-            information = out[start + max(i, j), start + min(i, j)]
+            cell = to + i * width + s
             for b in range(lanes):
-                precision = c.prior_common[place + at] if place >= 0 else work.prior[-1 - place + at, b]
-                pull[b] += precision * error[b]
-                if j <= i:
-                    information[b] += precision
+                m[cell, b] = 0.0
+            for j in range(size if full else i + 1):
+                row = first + j * width + s
+                if place >= 0:
+                    factor = common[place + i * size + j]
+                    for b in range(lanes):
+                        m[cell, b] += factor * m[row, b]
+                else:
+                    matrix = own - 1 - place + i * size + j
+                    for b in range(lanes):
+                        m[cell, b] += m[matrix, b] * m[row, b]
+
+
+@compiled
+def _square(
+    index: Array,
+    column: int,
+    m: Array,
+    first: int,
+    width: int,
+    size: int,
+    columns: int,
+    to: int,
+    last: int,
+    lanes: int,
+) -> None:
+    """Add the products of the columns of whitened rows; the last column is the residual."""
+    for i in range(columns):
+        line = to + (index[column + i, 0] if i < columns - 1 else last) * (last + 1)
+        for j in range(i + 1):
+            cell = line + (index[column + j, 0] if j < columns - 1 else last)
+            r, u, v = 0, first + i, first + j
+            while r + 3 < size:
+                for b in range(lanes):
+                    m[cell, b] += (m[u, b] * m[v, b] + m[u + width, b] * m[v + width, b]) + (
+                        m[u + 2 * width, b] * m[v + 2 * width, b] + m[u + 3 * width, b] * m[v + 3 * width, b]
+                    )
+                r, u, v = r + 4, u + 4 * width, v + 4 * width
+            while r < size:
+                for b in range(lanes):
+                    m[cell, b] += m[u, b] * m[v, b]
+                r, u, v = r + 1, u + width, v + width
+
+
+@compiled
+def add_prior(
+    common: Array, place: int, size: int, m: Array, room: Room, x: int, start: int, last: int, lanes: int
+) -> None:
+    """Add a Gaussian prior of the `size` unknowns at cell x on, whose first column is `start`."""
+    error, pull, to = room.error, room.error + size, room.after
+    vector = to + last * (last + 1)
     for i in range(size):
-        error, pull = work.error[i], work.error[size + i]
         for b in range(lanes):
-            out[last, start + i, b] += pull[b]
-            out[last, last, b] += error[b] * pull[b]
+            m[error + i, b] = (common[place + i] if place >= 0 else m[room.own - 1 - place + i, b]) - m[x + i, b]
+            m[pull + i, b] = 0.0
+    for i in range(size):
+        for j in range(size):
+            at, cell = size + i * size + j, to + (start + i) * (last + 1) + start + j
+            for b in range(lanes):
+                precision = common[place + at] if place >= 0 else m[room.own - 1 - place + at, b]
+                m[pull + i, b] += precision * m[error + j, b]
+                if j <= i:
+                    m[cell, b] += precision
+    for i in range(size):
+        for b in range(lanes):
+            m[vector + start + i, b] += m[pull + i, b]
+            m[vector + last, b] += m[error + i, b] * m[pull + i, b]

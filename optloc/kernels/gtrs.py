@@ -28,15 +28,13 @@ def scratch(n: int) -> int:
 
 
 @compiled
-def minimise(rows: Array, right: Array, on_cone: bool, y: Array, settled: Array, work: Array) -> None:
+def minimise(rows: Array, on_cone: bool, y: Array, settled: Array, work: Array) -> None:
     """Find the global minimisers of squared-range problems, one in each lane.
 
     Parameters
     ----------
-    rows : array (q, n, W)
-        B: whitened rows, numbers of order one; absent rows are zero.
-    right : array (q, W)
-        g.
+    rows : array (q, n + 1, W)
+        B and behind it g: whitened rows, numbers of order one; absent rows are zero.
     on_cone : bool
         Whether the last entry of y is a range r; else it is ``|x|^2``.
     y : array (n, W)
@@ -57,7 +55,7 @@ def minimise(rows: Array, right: Array, on_cone: bool, y: Array, settled: Array,
     b, inverse, across, p = rest[:n], rest[n : 2 * n], rest[2 * n : 3 * n], rest[3 * n : 4 * n]
     slope, spare = rest[4 * n : 5 * n], rest[5 * n : 5 * n + 5]
     multiplier, bend, todo, least, value = spare[0], spare[1], spare[2], spare[3], spare[4]
-    _normal(rows, right, A, b, least)
+    _normal(rows, A, b, least)
     for lane in range(width):
         multiplier[lane], todo[lane], settled[lane] = 0.0, 1.0, 1.0
     for _ in range(_STEPS):
@@ -72,7 +70,7 @@ def minimise(rows: Array, right: Array, on_cone: bool, y: Array, settled: Array,
         solve(lower, inverse, p)
         if not _advance(y, across, p, on_cone, spare, slope, settled):
             break
-    _residual_slope(rows, right, y, across, multiplier, slope, value)
+    _residual_slope(rows, y, across, multiplier, slope, value)
     solve(lower, inverse, slope)
     _step(y, across, p, on_cone, slope, bend, value)
     for lane in range(width):
@@ -83,17 +81,17 @@ def minimise(rows: Array, right: Array, on_cone: bool, y: Array, settled: Array,
 
 
 @compiled
-def _normal(rows: Array, right: Array, A: Array, b: Array, least: Array) -> None:
+def _normal(rows: Array, A: Array, b: Array, least: Array) -> None:
     """Find the lower half of ``B'B``, ``B'g``, and the smallest pivot that counts."""
-    q, n, width = rows.shape
+    q, (n, width) = len(rows), b.shape
     for lane in range(width):
         least[lane] = 0.0
     for i in range(n):
         for lane in range(width):
-            b[i, lane] = rows[0, i, lane] * right[0, lane]
+            b[i, lane] = rows[0, i, lane] * rows[0, n, lane]
         for k in range(1, q):
             for lane in range(width):
-                b[i, lane] += rows[k, i, lane] * right[k, lane]
+                b[i, lane] += rows[k, i, lane] * rows[k, n, lane]
         for j in range(i + 1):
             for lane in range(width):
                 A[i, j, lane] = rows[0, i, lane] * rows[0, j, lane]
@@ -219,17 +217,15 @@ def _advance(y: Array, across: Array, p: Array, on_cone: bool, spare: Array, fre
 
 
 @compiled
-def _residual_slope(
-    rows: Array, right: Array, y: Array, across: Array, multiplier: Array, slope: Array, left: Array
-) -> None:
+def _residual_slope(rows: Array, y: Array, across: Array, multiplier: Array, slope: Array, left: Array) -> None:
     """Write ``B'(B y - g) + multiplier (C y + h)``: near the answer its digits are those of B, not of B'B."""
-    q, n, width = rows.shape
+    q, (n, width) = len(rows), y.shape
     for i in range(n):
         for lane in range(width):
             slope[i, lane] = multiplier[lane] * across[i, lane]
     for k in range(q):
         for lane in range(width):
-            left[lane] = -right[k, lane]
+            left[lane] = -rows[k, n, lane]
         for j in range(n):
             for lane in range(width):
                 left[lane] += rows[k, j, lane] * y[j, lane]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from optloc.kernels.tables import Sources, Tables, tables
+from optloc.models import MODELS
+from optloc.models.primitives import WGS84_A
 from optloc.noise import Whitener, variances
 from optloc.priors import prior_parts
 from optloc.problem import Problem
@@ -16,25 +19,21 @@ from optloc.types import Array
 class Numbers(NamedTuple):
     """The numbers of N problems; what all of them share is kept once.
 
-    An array (N or 1, ...) has one row where the problems share it. Places in it are those of `Tables.source`: one that
-    is >= 0 counts through the shared numbers, -1 - i through those of each problem.
+    An array (N or 1, ...) has one row where the problems share it. A place >= 0 counts through the shared numbers, one
+    of -1 - i through those of each problem: sources, whitening matrices, priors.
     """
 
-    common: Array  # stations, rates, axes, known targets; the first is zero
-    own: Array  # (N, ...)
+    common: Array  # zero; stations, rates, axes, known targets; whitening matrices; priors
+    place: Array  # int64 (groups + priors, 4), see below
+    source: Array  # (N or 1, ...)
+    white: Array  # (N or 1, ...)
+    prior: Array  # (N or 1, ...)
     observed: Array  # (N or 1, m): measurements less corrections
     present: Array  # (N or 1, m): 1 for a row that counts; (1, 0) where all do
     sigma: Array  # (N or 1, m): standard deviations of the rows
-    white_common: Array  # whitening matrices
-    white_own: Array
-    group_white: Array  # place of the matrix of each group
-    group_full: Array  # 0 where it is lower triangular
-    prior_start: Array  # first unknown of each prior, among shared ones or those of an epoch
-    prior_size: Array
-    prior_local: Array  # 1 for unknowns of an epoch
-    prior_at: Array  # place of its mean, and behind it of its precision
-    prior_common: Array
-    prior_own: Array
+    size: Array  # (m,): numbers of this size, beside the measurement, are rounded to get to the row's value
+    # A line of `place` is, for a group: place of its whitening matrix; 0 where that is lower triangular. For a prior:
+    # place of its mean, with its precision behind; first unknown, how many, 1 for those of an epoch.
 
 
 class Packed(NamedTuple):
@@ -62,28 +61,35 @@ def packed(problem: Problem, noise: tuple[Whitener, ...]) -> Packed | None:
     noise : tuple of Whitener
         Whitening matrices of their rows.
     """
-    index = tables(problem, tuple(w.row for w in noise))
-    if index is None:
+    kept = tables(problem, tuple(w.row for w in noise))
+    if kept is None:
         return None
-    common, own = _sources(problem)
+    source, white, prior = _sources(problem), _whiteners(noise), _priors(problem)
+    # Places count on from one kind of numbers to the next.
+    for one, before in ((white, (source,)), (prior, (source, white))):
+        shared, own = (sum(part.size(mine) for part in before) for mine in (False, True))
+        one.place[:, 0] += np.where(one.place[:, 0] >= 0, shared, -own)
     weight = problem.weight
     present = np.zeros((1, 0)) if np.all(weight > 0.0) else _plain(weight > 0.0, 1)
-    white, full = _whiteners(noise)
     return Packed(
-        index,
+        kept.tables,
         Numbers(
-            common,
-            own,
+            np.concatenate([source.common, white.common, prior.common]),
+            np.concatenate([white.place[kept.number], prior.place]),
+            source.own,
+            white.own,
+            prior.own,
             observed(problem),
             present,
             _plain(np.sqrt(variances(problem.noise, problem.count)), 1),
-            white[0],
-            white[1],
-            white[2][index.group_number],
-            full[index.group_number],
-            *_priors(problem),
+            coarseness(problem),
         ),
     )
+
+
+def coarseness(problem: Problem) -> Array:
+    """Return the size (m,) of the numbers beside the measurement that are rounded to get to a row's value."""
+    return np.concatenate([np.full(rows.count, WGS84_A if MODELS[rows.kind].ecef else 0.0) for rows in problem.rows])
 
 
 def observed(problem: Problem) -> Array:
@@ -100,40 +106,51 @@ def _plain(values: Array, core: int) -> Array:
     return np.require(flat, np.float64, ["C", "W"])
 
 
-def _divided(parts: list[Array]) -> tuple[Array, Array, Array]:
-    """Return the parts (N or 1, numbers) that are shared, those that are not, and the place of each part."""
-    place, lengths = np.zeros(len(parts), dtype=np.int64), [0, 0]
-    for i, part in enumerate(parts):
-        mine = int(len(part) > 1)
-        place[i] = -1 - lengths[1] if mine else lengths[0]
-        lengths[mine] += part.shape[1]
-    shared, own = ([part for part in parts if (len(part) > 1) == mine] for mine in (False, True))
-    flat = np.concatenate([part[0] for part in shared]) if shared else np.zeros(0)
-    if len(own) > 1:
-        own = [np.concatenate(own, axis=1)]
-    return flat, own[0] if own else np.zeros((1, 0)), place
+@dataclass(frozen=True, slots=True)
+class _Divided:
+    """Numbers that are shared (numbers,), those that are not (N or 1, numbers), and where to find them."""
+
+    common: Array
+    own: Array
+    place: Array
+
+    def size(self, own: bool) -> int:
+        return self.own.shape[1] if own else len(self.common)
+
+    @classmethod
+    def of(cls, parts: list[Array]) -> _Divided:
+        """Return parts (N or 1, numbers) divided; `place` (parts, 4) begins with the place of each."""
+        place, lengths = np.zeros((len(parts), 4), dtype=np.int64), [0, 0]
+        for i, part in enumerate(parts):
+            mine = int(len(part) > 1)
+            place[i, 0] = -1 - lengths[1] if mine else lengths[0]
+            lengths[mine] += part.shape[1]
+        shared, own = ([part for part in parts if (len(part) > 1) == mine] for mine in (False, True))
+        flat = np.concatenate([part[0] for part in shared]) if shared else np.zeros(0)
+        if len(own) > 1:
+            own = [np.concatenate(own, axis=1)]
+        return cls(flat, own[0] if own else np.zeros((1, 0)), place)
 
 
-def _sources(problem: Problem) -> tuple[Array, Array]:
+def _sources(problem: Problem) -> _Divided:
     parts = [_plain(array, core) for array, core in Sources.of(problem).arrays]
-    common, own, _ = _divided([np.zeros((1, 1)), *parts])
-    return common, own
+    return _Divided.of([np.zeros((1, 1)), *parts])
 
 
-def _whiteners(noise: tuple[Whitener, ...]) -> tuple[tuple[Array, Array, Array], Array]:
-    """Return whitening matrices, shared and own, the place of that of each group, and which are not triangular."""
-    common, own, place = _divided([_plain(w.matrix, 3) for w in noise])
-    at, full = [], []
-    for start, w in zip(place, noise, strict=True):
+def _whiteners(noise: tuple[Whitener, ...]) -> _Divided:
+    """Return whitening matrices; a line of `place` for each group."""
+    divided, lines = _Divided.of([_plain(w.matrix, 3) for w in noise]), []
+    for start, w in zip(divided.place[:, 0], noise, strict=True):
         count, size = w.row.shape
         step = size * size if w.matrix.shape[-3] > 1 else 0
-        at.append(start + (step if start >= 0 else -step) * np.arange(count))
-        upper = np.triu(w.matrix, 1).reshape(-1, w.matrix.shape[-3], size * size).any((0, 2))
-        full.append(np.broadcast_to(upper, (count,)))
-    return (common, own, np.concatenate(at)), np.concatenate(full).astype(np.int64)
+        line = np.zeros((count, 4), dtype=np.int64)
+        line[:, 0] = start + (step if start >= 0 else -step) * np.arange(count)
+        line[:, 1] = np.triu(w.matrix, 1).reshape(-1, w.matrix.shape[-3], size * size).any((0, 2))
+        lines.append(line)
+    return _Divided(divided.common, divided.own, np.concatenate(lines))
 
 
-def _priors(problem: Problem) -> tuple[Array, ...]:
+def _priors(problem: Problem) -> _Divided:
     layout, parts, heads = problem.layout, [], []
     for name, mean, precision in prior_parts(problem):
         slot, shared = layout.find(name)
@@ -142,10 +159,9 @@ def _priors(problem: Problem) -> tuple[Array, ...]:
         count = max(len(part) for part in both)
         parts.append(np.concatenate([np.broadcast_to(part, (count, part.shape[1])) for part in both], axis=1))
         heads.append((slot.start, slot.size, int(not shared)))
-    common, own, place = _divided(parts)
-    table = np.array(heads, dtype=np.int64).reshape(-1, 3)
-    start, size, local = (np.ascontiguousarray(table[:, i]) for i in range(3))
-    return start, size, local, place, common, own
+    divided = _Divided.of(parts)
+    divided.place[:, 1:] = np.array(heads, dtype=np.int64).reshape(-1, 3)
+    return divided
 
 
 def _single(values: Array, core: int) -> Array:

@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optloc.kernels.dense import Systems, step, systems
+from optloc.kernels.dense import step
 from optloc.kernels.gather import gather
 from optloc.kernels.jit import compiled
-from optloc.kernels.lanes import Scratch, load, move, scratch
 from optloc.kernels.pack import Numbers, Packed
+from optloc.kernels.room import Room, blocks, furnished, load, memory
 from optloc.status import Status
 from optloc.types import Array
 
@@ -21,7 +21,6 @@ _OK, _LIMIT, _STALLED, _NUMERICAL = (
     int(status) for status in (Status.OK, Status.MAX_ITERATIONS, Status.STALLED, Status.NUMERICAL)
 )
 _EPSILON = float(np.finfo(float).eps)
-_LANES, _MEMORY = 64, 2**17
 
 
 class Rules(NamedTuple):
@@ -43,22 +42,10 @@ class Answers(NamedTuple):
     vector: Array  # (M, p)
 
 
-class _State(NamedTuple):
-    """What is remembered of the problem of each of B lanes."""
-
-    start: Array  # int64 (B,): which start it is
-    fresh: Array  # int64 (B,): 1 while nothing but its start is known
-    steps: Array  # int64 (B,)
-    x: Array  # (p, B): best place so far
-    trial: Array  # (p, B): place to try
-    now: Array  # (p + 1, p + 1, B): equations at the best place
-    after: Array  # (p + 1, p + 1, B): equations at the place tried
-    damping: Array  # (B,)
-    growth: Array  # (B,)
-    blur: Array  # (B,)
-    gain: Array  # (B,): squared length of the step tried
-    solvable: Array  # (B,)
-    better: Array  # (B,): 1.0 where the place tried is taken
+# Cells that a refinement keeps of every problem, from `room.state` on; `room.STATE` of them.
+_DAMPING, _GROWTH, _BLUR, _GAIN, _SOLVABLE, _BETTER = range(6)
+# What it keeps beside them: which start it is, 1 while nothing but the start is known, steps tried, status.
+_START, _FRESH, _STEPS, _STATUS = range(4)
 
 
 def answers(start: Array) -> Answers:
@@ -91,167 +78,142 @@ def refine_block(packed: Packed, item: Array, first: int, last: int, rules: Rule
     out : Answers
         Starts; they become the answers. Status: ok, max iterations, stalled, numerical.
     """
-    t, size = packed.tables, out.x.shape[1]
-    fitting = _MEMORY // max(1, t.rows * t.width + 2 * (size + 1) * (size + 1))
-    lanes = min(last - first, min(_LANES, max(8, 8 * (fitting // 8))))
-    work, room, state = scratch(packed, lanes), systems(t.shared, size - t.shared, lanes), _state(size, lanes)
+    t, c = packed
+    size = out.x.shape[1]
+    lanes, room = blocks(packed, size, last - first), furnished(t, c, size)
+    m, r = memory(t, room, lanes)
+    tag = np.zeros((4, lanes), np.int64)
     used, following = 0, first
     while used < lanes:
-        _begin(packed, work, state, used, following, item, out)
+        _begin(c, m, room, tag, used, following, item[following], out.x)
         used, following = used + 1, following + 1
     while used > 0:
-        gather(packed, work, state.trial, used, state.after)
-        _judge(state, rules, out, used)
+        gather(t, c, m, r, room, used)
+        _judge(m, room, size, tag, rules, used)
         b = 0
         while b < used:
-            if out.status[state.start[b]] == _LIMIT and state.steps[b] < rules.limit:
+            if tag[_STATUS, b] == _LIMIT and tag[_STEPS, b] < rules.limit:
                 b += 1
                 continue
-            _finish(state, b, out)
+            _finish(m, room, tag, b, out)
             if following < last:
-                _begin(packed, work, state, b, following, item, out)
+                _begin(c, m, room, tag, b, following, item[following], out.x)
                 following, b = following + 1, b + 1
             else:
                 used -= 1
-                _move(work, state, b, used)
-        _advance(state, room, rules, used)
+                _move(m, room.cells, tag, b, used)
+        _advance(m, room, t.shared, t.local, tag, rules.damped, used)
 
 
 @compiled
-def _state(size: int, lanes: int) -> _State:
-    return _State(
-        np.zeros(lanes, np.int64),
-        np.zeros(lanes, np.int64),
-        np.zeros(lanes, np.int64),
-        np.zeros((size, lanes)),
-        np.zeros((size, lanes)),
-        np.zeros((size + 1, size + 1, lanes)),
-        np.zeros((size + 1, size + 1, lanes)),
-        np.zeros(lanes),
-        np.zeros(lanes),
-        np.zeros(lanes),
-        np.zeros(lanes),
-        np.zeros(lanes),
-        np.zeros(lanes),
-    )
-
-
-@compiled
-def _begin(packed: Packed, work: Scratch, state: _State, lane: int, start: int, item: Array, out: Answers) -> None:
+def _begin(c: Numbers, m: Array, room: Room, tag: Array, lane: int, start: int, item: int, x: Array) -> None:
     """Bring a start into a lane."""
-    load(packed, work, lane, item[start])
-    state.start[lane], state.fresh[lane], state.steps[lane] = start, 1, 0
-    for i in range(state.x.shape[0]):
-        state.trial[i, lane] = out.x[start, i]
-    state.damping[lane], state.growth[lane] = 1e-6, 2.0
-    state.blur[lane] = _blur(packed.numbers, work, lane, item[start])
-    out.status[start] = _LIMIT
+    load(c, m, lane, item)
+    tag[_START, lane], tag[_FRESH, lane], tag[_STEPS, lane], tag[_STATUS, lane] = start, 1, 0, _LIMIT
+    for i in range(x.shape[1]):
+        m[room.trial + i, lane] = x[start, i]
+    m[room.state + _DAMPING, lane], m[room.state + _GROWTH, lane] = 1e-6, 2.0
+    m[room.state + _BLUR, lane] = _blur(c.sigma, c.size, m, room, lane, item)
 
 
 @compiled
-def _blur(c: Numbers, work: Scratch, lane: int, item: int) -> float:
+def _blur(sigma: Array, size: Array, m: Array, room: Room, lane: int, item: int) -> float:
     """Return the rounding error of the whitened residuals: arrival times that count from long ago are coarse."""
-    sigma, squares = c.sigma[item if c.sigma.shape[0] > 1 else 0], 0.0
-    for i in range(sigma.shape[0]):
-        if work.present.shape[0] == 0 or work.present[i, lane] != 0.0:
-            ratio = work.observed[i, lane] / sigma[i]
+    row, squares = item if sigma.shape[0] > 1 else 0, 0.0
+    for i in range(sigma.shape[1]):
+        if not room.absent or m[room.present + i, lane] != 0.0:
+            ratio = (abs(m[room.observed + i, lane]) + size[i]) / sigma[row, i]
             squares += ratio * ratio
     coarse = 4.0 * _EPSILON * np.sqrt(squares)
     return coarse if np.isfinite(coarse) else 0.0
 
 
 @compiled
-def _move(work: Scratch, state: _State, to: int, lane: int) -> None:
-    """Bring the problem of one lane into another, with its equations before and after."""
-    if to == lane:
-        return
-    move(work, to, lane)
-    for ints in (state.start, state.fresh, state.steps):
-        ints[to] = ints[lane]
-    for one in (state.damping, state.growth, state.blur):
-        one[to] = one[lane]
-    for i in range(state.x.shape[0]):
-        state.x[i, to], state.trial[i, to] = state.x[i, lane], state.trial[i, lane]
-    for i in range(state.now.shape[0]):
-        for j in range(i + 1):
-            state.now[i, j, to] = state.now[i, j, lane]
+def _move(m: Array, cells: int, tag: Array, to: int, lane: int) -> None:
+    """Bring the problem of one lane into another."""
+    if to != lane:
+        for i in range(tag.shape[0]):
+            tag[i, to] = tag[i, lane]
+        for i in range(cells):
+            m[i, to] = m[i, lane]
 
 
 @compiled
-def _judge(state: _State, rules: Rules, out: Answers, used: int) -> None:
+def _judge(m: Array, room: Room, size: int, tag: Array, rules: Rules, used: int) -> None:
     """Take the places tried that are better, and set damping and status."""
-    size = state.x.shape[0]
+    line = size + 1
+    better, cost = room.state + _BETTER, line * line - 1
     for b in range(used):
-        after = state.after[size, size, b]
-        if state.fresh[b]:
-            state.better[b], state.fresh[b] = 1.0, 0
-            if not np.isfinite(after):
-                out.status[state.start[b]] = _NUMERICAL
+        if tag[_FRESH, b]:
+            m[better, b], tag[_FRESH, b] = 1.0, 0
+            if not np.isfinite(m[room.after + cost, b]):
+                tag[_STATUS, b] = _NUMERICAL
         else:
-            out.status[state.start[b]] = _judged(state, rules, b, after)
-    for i in range(size + 1):
-        if i < size:
-            best, trial = state.x[i], state.trial[i]
+            tag[_STATUS, b] = _judged(m, room, room.now + cost, room.after + cost, rules, b)
+    for i in range(size):
+        for b in range(used):
+            m[room.best + i, b] = m[room.trial + i, b] if m[better, b] != 0.0 else m[room.best + i, b]
+    for i in range(line):
+        for cell in range(i * line, i * line + i + 1):
             for b in range(used):
-                best[b] = trial[b] if state.better[b] else best[b]
-        for j in range(i + 1):
-            now, fresh = state.now[i, j], state.after[i, j]
-            for b in range(used):
-                now[b] = fresh[b] if state.better[b] else now[b]
+                m[room.now + cell, b] = m[room.after + cell, b] if m[better, b] != 0.0 else m[room.now + cell, b]
 
 
 @compiled
-def _judged(state: _State, rules: Rules, b: int, after: float) -> int:
-    """Return the status of the problem of a lane after a step; say whether it is better and set the damping."""
-    cost, damping, gain = state.now[-1, -1, b], state.damping[b] if rules.damped else 0.0, state.gain[b]
-    solvable, blur, status = state.solvable[b] != 0.0, state.blur[b], _LIMIT
-    achieved, floor = cost - after, 1e-13 * (1.0 + cost)
+def _judged(m: Array, room: Room, now: int, after: int, rules: Rules, b: int) -> int:
+    """Return the status of a lane after a step; say whether it is better and set the damping."""
+    state, status = room.state, _LIMIT
+    cost, new, gain, blur = m[now, b], m[after, b], m[state + _GAIN, b], m[state + _BLUR, b]
+    damping, solvable = m[state + _DAMPING, b], m[state + _SOLVABLE, b] != 0.0
+    achieved, floor = cost - new, 1e-13 * (1.0 + cost)
     rounding = floor + 2.0 * blur * np.sqrt(1.0 + cost)
-    better = solvable and np.isfinite(after) and (achieved >= -rounding or not rules.damped)
-    small = solvable and abs(gain) * (1.0 + damping) <= max(rules.tolerance * rules.tolerance, floor + blur * blur)
+    better = solvable and np.isfinite(new) and (achieved >= -rounding or not rules.damped)
+    if solvable and abs(gain) * (1.0 + damping) <= max(rules.tolerance * rules.tolerance, floor + blur * blur):
+        status = _OK
     if better:
         ratio = achieved / (gain if gain > 0.0 else 1.0)
         middle = 2.0 * min(max(ratio, 0.0), 1.0) - 1.0
         change = 0.1 if ratio > 0.9 else max(1.0 / 3.0, 1.0 - middle * middle * middle)
-        state.damping[b], state.growth[b] = max(damping * change, 1e-12), 2.0
+        m[state + _DAMPING, b], m[state + _GROWTH, b] = max(damping * change, 1e-12), 2.0
     else:
-        state.damping[b] = damping * state.growth[b] + 1e-12
-        state.growth[b] *= 2.0
-    if small:
-        status = _OK
-    if not better and state.damping[b] > 1e12:
-        status = _STALLED
-    if not rules.damped and not better:
-        status = _NUMERICAL
-    state.better[b] = 1.0 if better else 0.0
+        m[state + _DAMPING, b] = damping * m[state + _GROWTH, b] + 1e-12
+        m[state + _GROWTH, b] *= 2.0
+        if m[state + _DAMPING, b] > 1e12:
+            status = _STALLED
+        if not rules.damped:
+            status = _NUMERICAL
+    m[state + _BETTER, b] = 1.0 if better else 0.0
     return status
 
 
 @compiled
-def _finish(state: _State, lane: int, out: Answers) -> None:
+def _finish(m: Array, room: Room, tag: Array, lane: int, out: Answers) -> None:
     """Write the answer of a lane."""
-    start, size = state.start[lane], state.x.shape[0]
-    out.cost[start], out.iterations[start] = state.now[size, size, lane], state.steps[lane]
+    start, size = tag[_START, lane], out.x.shape[1]
+    last = room.now + size * (size + 1)
+    out.cost[start], out.iterations[start] = m[last + size, lane], tag[_STEPS, lane]
+    out.status[start] = tag[_STATUS, lane]
     for i in range(size):
-        out.x[start, i], out.vector[start, i] = state.x[i, lane], state.now[size, i, lane]
+        out.x[start, i], out.vector[start, i] = m[room.best + i, lane], m[last + i, lane]
         for j in range(i + 1):
-            out.matrix[start, i, j] = out.matrix[start, j, i] = state.now[i, j, lane]
+            entry = m[room.now + i * (size + 1) + j, lane]
+            out.matrix[start, i, j], out.matrix[start, j, i] = entry, entry
 
 
 @compiled
-def _advance(state: _State, room: Systems, rules: Rules, used: int) -> None:
-    """Write the next place to try of every lane that is not fresh, and the length of the step."""
-    size = state.x.shape[0]
+def _advance(m: Array, room: Room, n: int, local: int, tag: Array, damped: bool, used: int) -> None:
+    """Write the next place to try of every lane that is not fresh, and the squared length of the step."""
+    size, damping, gain = n + local, room.state + _DAMPING, room.state + _GAIN
+    vector = room.now + size * (size + 1)
     for b in range(used):
-        if not rules.damped:
-            state.damping[b] = 0.0
-    step(state.now, state.damping, room, used)
-    state.gain[:used] = 0.0
+        m[damping, b] = m[damping, b] if damped else 0.0
+        m[gain, b] = 0.0
+    step(m, room, n, local, damping, room.state + _SOLVABLE, used)
     for i in range(size):
-        trial, best, change, vector = state.trial[i], state.x[i], room.step[i], state.now[size, i]
         for b in range(used):
-            state.gain[b] += change[b] * vector[b]
-            trial[b] = trial[b] if state.fresh[b] else best[b] + change[b]
+            m[gain, b] += m[room.step + i, b] * m[vector + i, b]
+            m[room.trial + i, b] = (
+                m[room.trial + i, b] if tag[_FRESH, b] else m[room.best + i, b] + m[room.step + i, b]
+            )
     for b in range(used):
-        state.solvable[b] = room.ok[b]
-        state.steps[b] += 1 - state.fresh[b]
+        tag[_STEPS, b] += 1 - tag[_FRESH, b]

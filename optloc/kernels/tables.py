@@ -18,44 +18,28 @@ class Tables(NamedTuple):
     """The indices of a structure; rows are numbered in the order in which they are evaluated.
 
     Rows whose noise is correlated form a group, groups follow each other in time, and a stretch of groups whose rows
-    are evaluated together is a packet. An integer array `..._at` holds the first entry of each item, and the end.
+    are evaluated together is a packet. All tables stand below each other in `index`, for every array that is handed to
+    a kernel takes time. Where a table says "first", its next line says where that ends.
     """
 
-    code: Array  # operations of all kinds, see `Tape`
-    code_at: Array
-    constant_register: Array
-    constant: Array
-    constant_at: Array
-    input_register: Array  # inputs of all kinds
-    partial_register: Array  # where the derivative by each input is found; -1 for none
-    input_at: Array
-    value_register: Array  # of each kind
-    periodic: Array
-    row: Array  # number of each row in the problem
-    place: Array  # of each row in the packet
-    last: Array  # number of columns of its group
-    source: Array  # of each input of each row: >= 0 a number that all problems share, else -1 - one of its own
-    source_at: Array
-    feed_column: Array  # unknowns that move each input of each row
-    feed_slot: Array
-    feed_factor: Array
-    feed_at: Array
-    scale_column: Array  # unknowns that scale each row
-    scale_slot: Array
-    scale_factor: Array
-    scale_at: Array
-    add_column: Array  # unknowns that add to each row
-    add_slot: Array
-    add_factor: Array
-    add_at: Array
-    packet_group: Array
-    packet_row: Array  # (packets, kinds + 1): rows of each kind
-    group_row: Array  # first place of each group in its packet
-    group_size: Array
-    group_epoch: Array
-    group_number: Array  # which of the groups of the whiteners it is
-    column: Array  # unknowns that each group touches, ascending: shared ones, then local ones of its epoch
-    column_at: Array
+    index: Array  # int64 (n, 6)
+    real: Array  # constants and factors
+    # Where each table begins in `index`.
+    code: int  # operation, target, operands, see `Tape`; the tapes of all kinds
+    kind: int  # first operation, constant, input; register of the value; 1 for an angle
+    constant: int  # register; its values are the first of `real`
+    input: int  # register, and the register of the derivative by it; -1 for none
+    row: int  # number in the problem, place in the packet, columns of the group; first source, scale, addend
+    source: int  # input of a row: >= 0 a number that all problems share, else -1 - one of its own; first feed
+    term: int  # column of the vector, place among the columns of the group: of feeds, scales, addends
+    packet: int  # first group
+    part: int  # first row, for each packet and kind
+    group: int  # first row in the packet, rows, epoch; first column
+    column: int  # unknowns of a group, ascending: shared ones, then local ones of its epoch
+    factor: int  # where the factors of the terms begin in `real`
+    kinds: int
+    packets: int
+    groups: int
     shared: int
     local: int
     epochs: int
@@ -63,6 +47,14 @@ class Tables(NamedTuple):
     width: int  # most columns of a group, and one for the residual
     rows: int  # most rows of a packet
     size: int  # most rows of a group
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """Tables, and which of the groups of the whiteners each group is: int array (groups,)."""
+
+    tables: Tables
+    number: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,12 +111,12 @@ class Sources:
         return np.concatenate(out)
 
 
-_KEPT: dict[tuple[Any, ...], Tables | None] = {}
+_KEPT: dict[tuple[Any, ...], Kept | None] = {}
 # Tables of longer problems are made anew each time: that takes less time than a fix, and no memory that lasts.
-_KEPT_ROWS = 4096
+_KEPT_ROWS, _KEPT_LINES = 4096, 2**19
 
 
-def tables(problem: Problem, groups: tuple[Array, ...]) -> Tables | None:
+def tables(problem: Problem, groups: tuple[Array, ...]) -> Kept | None:
     """Return the tables of a flat batch of problems, or None where the compiled core does not serve it.
 
     Parameters
@@ -140,13 +132,13 @@ def tables(problem: Problem, groups: tuple[Array, ...]) -> Tables | None:
     shapes = tuple(array.shape[array.ndim - core :] for array, core in sources.arrays)
     key = (problem.structure, shapes, sources.own, *((g.shape, g.tobytes()) for g in groups))
     if key not in _KEPT:
-        if sum(len(kept.row) for kept in _KEPT.values() if kept is not None) > 2 * _KEPT_ROWS:
+        if sum(len(kept.tables.index) for kept in _KEPT.values() if kept is not None) > _KEPT_LINES:
             _KEPT.clear()
         _KEPT[key] = _tables(problem, groups, sources)
     return _KEPT[key]
 
 
-def _tables(problem: Problem, groups: tuple[Array, ...], sources: Sources) -> Tables | None:
+def _tables(problem: Problem, groups: tuple[Array, ...], sources: Sources) -> Kept | None:
     layout = problem.layout
     if layout.n_shared + layout.n_local == 0 or _spanning(problem, groups):
         return None
@@ -177,45 +169,64 @@ class _Kind:
     inputs: dict[int, Array]
 
 
-def _filled(problem: Problem, groups: Groups, found: list[_Kind], lookup: Array) -> Tables:
+def _filled(problem: Problem, groups: Groups, found: list[_Kind], lookup: Array) -> Kept:
     pairs = list(zip(found, problem.starts, strict=True))
     feeds = Entries.joined([Entries.feeds(kind.plan, kind.trace, start) for kind, start in pairs])
     scales = Entries.joined([Entries.terms(kind.plan.gains, start) for kind, start in pairs])
     adds = Entries.joined([Entries.terms(kind.plan.adds, start) for kind, start in pairs])
     columns, slots = Columns.of(problem, groups, [feeds, scales, adds])
-    count = np.diff(columns.at)
+    count, tapes = np.diff(columns.at), [kind.trace.tape for kind in found]
     order = Order.of(problem, groups, int(count.max()) + 1)
-    inputs = np.concatenate([np.full(kind.plan.block.count, len(kind.trace.tape.inputs)) for kind in found])
+    inputs = np.concatenate([np.full(k.plan.block.count, len(t.inputs)) for k, t in zip(found, tapes, strict=True)])
     source_at = starts(inputs[order.row])
     place = source_at[order.at[feeds.row]] + feeds.place
-    first = starts(groups.size)
-    return Tables(
-        **_tapes([kind.trace for kind in found]),
-        periodic=np.array([kind.plan.model.period is not None for kind in found], dtype=np.int64),
-        row=order.row,
-        place=order.place,
-        last=count[groups.of[order.row]],
-        source=_sources(found, source_at, order, lookup),
-        source_at=source_at,
-        **_listed("feed", feeds, slots[0], place, int(source_at[-1])),
-        **_listed("scale", scales, slots[1], order.at[scales.row], problem.count),
-        **_listed("add", adds, slots[2], order.at[adds.row], problem.count),
-        packet_group=order.packet_group,
-        packet_row=order.packet_row,
-        group_row=first[:-1] - first[np.repeat(order.packet_group[:-1], np.diff(order.packet_group))],
-        group_size=groups.size,
-        group_epoch=groups.epoch,
-        group_number=groups.number,
-        column=columns.column,
-        column_at=columns.at,
+    term, factor, at = _listed(
+        [feeds, scales, adds],
+        slots,
+        [place, order.at[scales.row], order.at[adds.row]],
+        [int(source_at[-1]), problem.count, problem.count],
+    )
+    first = starts(groups.size)[:-1]
+    head = first[np.repeat(order.packet_group[:-1], np.diff(order.packet_group))]
+    constant, parts = _tapes(found)
+    parts |= {
+        "row": _table(order.row, order.place, count[groups.of[order.row]], source_at, at[1], at[2]),
+        "source": _table(_sources(found, source_at, order, lookup), at[0]),
+        "term": term,
+        "packet": _table(order.packet_group),
+        "part": _table(order.packet_row.ravel()),
+        "group": _table(first - head, groups.size, groups.epoch, columns.at),
+        "column": _table(columns.column),
+    }
+    begin = starts([len(part) for part in parts.values()])
+    index = np.zeros((int(begin[-1]), 6), dtype=np.int64)
+    for start, part in zip(begin, parts.values(), strict=False):
+        index[start : start + len(part), : part.shape[1]] = part
+    tables = Tables(
+        index,
+        np.concatenate([constant, factor]),
+        **dict(zip(parts, begin.tolist(), strict=False)),
+        factor=len(constant),
+        kinds=len(found),
+        packets=len(order.packet_row),
+        groups=len(groups.size),
         shared=problem.layout.n_shared,
         local=problem.layout.n_local,
         epochs=problem.epochs,
-        registers=max(kind.trace.tape.registers for kind in found),
+        registers=max(tape.registers for tape in tapes),
         width=int(count.max()) + 1,
         rows=int(order.place.max()) + 1,
         size=int(groups.size.max()),
     )
+    return Kept(tables, groups.number)
+
+
+def _table(*columns: Array) -> Array:
+    """Return columns side by side; shorter ones end with a zero."""
+    out = np.zeros((max(len(column) for column in columns), len(columns)), dtype=np.int64)
+    for i, column in enumerate(columns):
+        out[: len(column), i] = column
+    return out
 
 
 def _sources(found: list[_Kind], source_at: Array, order: Order, lookup: Array) -> Array:
@@ -228,36 +239,40 @@ def _sources(found: list[_Kind], source_at: Array, order: Order, lookup: Array) 
             if seed in kind.inputs:
                 out[first + i] = kind.inputs[seed]
         start += count
-    return lookup[out]
+    return np.asarray(lookup[out])
 
 
-def _listed(name: str, entries: Entries, slot: Array, owner: Array, owners: int) -> dict[str, Array]:
-    """Return entries one after the other, owner by owner."""
-    order = np.argsort(owner, kind="stable")
-    return {
-        f"{name}_column": entries.column[order].astype(np.int64),
-        f"{name}_slot": slot[order].astype(np.int64),
-        f"{name}_factor": entries.factor[order].astype(float),
-        f"{name}_at": starts(np.bincount(owner, minlength=owners)),
-    }
+def _listed(
+    parts: list[Entries], slots: list[Array], owners: list[Array], counts: list[int]
+) -> tuple[Array, Array, list[Array]]:
+    """Return entries one after the other, owner by owner: indices, factors, and where each owner begins."""
+    terms, factors, at, start = [], [], [], 0
+    for part, slot, owner, count in zip(parts, slots, owners, counts, strict=True):
+        order = np.argsort(owner, kind="stable")
+        terms.append(_table(part.column, slot)[order])
+        factors.append(part.factor[order].astype(float))
+        at.append(start + starts(np.bincount(owner, minlength=count)))
+        start += len(order)
+    return np.concatenate(terms), np.concatenate(factors), at
 
 
-def _tapes(found: list[Traced]) -> dict[str, Any]:
-    """Return the tapes of all kinds, one after the other."""
-    constants = [pair for trace in found for pair in trace.tape.constants]
-    inputs = [register for trace in found for _, register in trace.tape.inputs]
-    partials: list[int] = []
-    for trace in found:
-        where = dict(zip(trace.seeds, trace.tape.outputs[1:], strict=True))
-        partials.extend(where.get(seed, -1) for seed, _ in trace.tape.inputs)
-    return {
-        "code": np.concatenate([trace.tape.code for trace in found]),
-        "code_at": starts([len(trace.tape.code) for trace in found]),
-        "constant_register": np.array([register for register, _ in constants], dtype=np.int64),
-        "constant": np.array([value for _, value in constants], dtype=float),
-        "constant_at": starts([len(trace.tape.constants) for trace in found]),
-        "input_register": np.array(inputs, dtype=np.int64),
-        "partial_register": np.array(partials, dtype=np.int64),
-        "input_at": starts([len(trace.tape.inputs) for trace in found]),
-        "value_register": np.array([trace.tape.outputs[0] for trace in found], dtype=np.int64),
+def _tapes(found: list[_Kind]) -> tuple[Array, dict[str, Array]]:
+    """Return the constants of the tapes of all kinds, and the tapes one after the other."""
+    tapes = [kind.trace.tape for kind in found]
+    constants = [pair for tape in tapes for pair in tape.constants]
+    inputs: list[tuple[int, int]] = []
+    for kind in found:
+        where = dict(zip(kind.trace.seeds, kind.trace.tape.outputs[1:], strict=True))
+        inputs.extend((register, where.get(seed, -1)) for seed, register in kind.trace.tape.inputs)
+    parts = [[len(t.code) for t in tapes], [len(t.constants) for t in tapes], [len(t.inputs) for t in tapes]]
+    kinds = _table(
+        *(starts(part) for part in parts),
+        np.array([tape.outputs[0] for tape in tapes]),
+        np.array([kind.plan.model.period is not None for kind in found]),
+    )
+    return np.array([value for _, value in constants], dtype=float), {
+        "code": np.concatenate([tape.code for tape in tapes]),
+        "kind": kinds,
+        "constant": np.array([register for register, _ in constants], dtype=np.int64).reshape(-1, 1),
+        "input": np.array(inputs, dtype=np.int64).reshape(-1, 2),
     }

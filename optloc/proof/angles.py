@@ -9,7 +9,20 @@ from __future__ import annotations
 from math import atan, atan2, cos, inf, pi, sin, sqrt
 
 from optloc.kernels.jit import compiled
-from optloc.proof.forms import Triple, blend, excess, inner, length, product, pull, reach, triple, unbounded, write
+from optloc.proof.forms import (
+    Triple,
+    blend,
+    excess,
+    inner,
+    length,
+    product,
+    pull,
+    reach,
+    still,
+    triple,
+    unbounded,
+    write,
+)
 from optloc.proof.turning import arguments, remainder
 from optloc.types import Array
 
@@ -152,6 +165,9 @@ def curve_elevation(data: Array, line: Array, sense: Array, half: Array, curvatu
     In the unit vectors along the line (a), upwards across it (b) and sideways (c), all pulled and divided by the range,
     the gradient is b and the Hessian ``-(a b' + b a') - tan(elevation) c c'``; the frame turns over the box.
     """
+    bound_elevation(data, line, sense, half, turn)
+    if still(turn):
+        return unbounded(curvature, turn)
     rho, rise, outward, sideways, upward = _upright(data, line, sense)
     h = triple(half, 0)
     least, swing = rho - reach(outward, h), reach(sideways, h)

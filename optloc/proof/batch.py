@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import isnan
 from typing import Any
 
 import numpy as np
 
 from optloc.kernels.jit import compiled, enabled
+from optloc.proof.everywhere import prove_everywhere
 from optloc.proof.pose import Posed
 from optloc.proof.search import OPEN, prove
 from optloc.threads import mapped
@@ -35,7 +36,7 @@ class Asked:
         Corners of the regions; NaN for all positions.
     fallback : array (n, 2, d)
         Corners of the regions to take where all positions cannot be bounded.
-    budget : int
+    budget : int array (n,)
         How many boxes each may take.
     """
 
@@ -46,12 +47,11 @@ class Asked:
     eps: Array
     region: Array
     fallback: Array
-    budget: int
+    budget: Array
 
     def take(self, index: Array) -> Asked:
         """Return what is asked of some of the fixes."""
-        own = {name: getattr(self, name)[index] for name in Asked.__slots__ if name != "budget"}
-        return replace(self, **own)
+        return Asked(*(getattr(self, name)[index] for name in Asked.__slots__))
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +61,7 @@ class Answered:
     Parameters
     ----------
     verdict : int array (n,)
-        As `optloc.proof.search.prove` returns it.
+        As `optloc.proof.search.prove` or `optloc.proof.everywhere.prove_everywhere` returns it.
     boxes : int array (n,)
         Boxes looked at.
     bound : array (n,)
@@ -88,14 +88,13 @@ def prove_all(pose: Posed, asked: Asked) -> Answered:
     n, d = asked.x.shape
     whole = np.zeros(n, dtype=np.int64)
     out = Answered(whole, whole.copy(), np.zeros(n), np.zeros(n, dtype=np.bool_), np.full((n, d), np.nan))
-    names = ("x", "others", "known", "kappa", "eps", "region", "fallback")
-    own = [np.ascontiguousarray(array) for array in (pose.w, *(getattr(asked, name) for name in names))]
+    own = [np.ascontiguousarray(a) for a in (pose.w, *(getattr(asked, name) for name in Asked.__slots__))]
 
     def stretch(first: int) -> None:
         part = slice(first, min(first + _STRETCH, n))
         given: list[Any] = [array if len(array) == 1 else array[part] for array in (pose.data, pose.K)]
         given += [array[part] for array in own]
-        given += [asked.budget, *(getattr(out, name)[part] for name in Answered.__slots__)]
+        given += [getattr(out, name)[part] for name in Answered.__slots__]
         _loop(pose.kinds, *given)
 
     mapped(stretch, range(0, n, _STRETCH), None if enabled() else 1)
@@ -115,7 +114,7 @@ def _loop(
     eps: Array,
     region: Array,
     fallback: Array,
-    budget: int,
+    budget: Array,
     verdict: Array,
     boxes: Array,
     bound: Array,
@@ -126,13 +125,15 @@ def _loop(
         numbers, rows = data[i if len(data) > 1 else 0], K[i if len(K) > 1 else 0]
         minima, low, high = others[i, : known[i]], region[i, 0], region[i, 1]
         everywhere[i] = isnan(low[0])
-        verdict[i], boxes[i], bound[i] = prove(
-            kinds, numbers, rows, w[i], x[i], minima, kappa[i], eps[i], budget, low, high, False, found[i]
-        )
-        if verdict[i] == OPEN:
+        if everywhere[i]:
+            verdict[i], boxes[i], bound[i] = prove_everywhere(
+                kinds, numbers, rows, w[i], x[i], minima, kappa[i], eps[i], budget[i], found[i]
+            )
+            if verdict[i] != OPEN:
+                continue
             everywhere[i] = False
             low, high = fallback[i, 0], fallback[i, 1]
-            verdict[i], more, bound[i] = prove(
-                kinds, numbers, rows, w[i], x[i], minima, kappa[i], eps[i], budget, low, high, False, found[i]
-            )
-            boxes[i] += more
+        verdict[i], more, bound[i] = prove(
+            kinds, numbers, rows, w[i], x[i], minima, kappa[i], eps[i], budget[i], low, high, False, found[i]
+        )
+        boxes[i] += more

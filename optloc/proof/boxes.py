@@ -5,7 +5,11 @@ from __future__ import annotations
 from math import sqrt
 
 from optloc.kernels.jit import compiled
-from optloc.proof.nodes import LINEAR, RANGE
+from optloc.proof.angles import bound_azimuth, bound_elevation
+from optloc.proof.height import bound_height
+from optloc.proof.linear3 import inverse
+from optloc.proof.nodes import AZIMUTH, ELEVATION, LINEAR, RANGE, RATIO
+from optloc.proof.ratio import bound_ratio
 from optloc.types import Array
 
 _ULP = 2.0**-52
@@ -109,6 +113,19 @@ def bound_nodes(
             bound_range(line, sense, gram, half, nodes[j])
         elif kind == LINEAR:
             bound_linear(line, sense, data[j], nodes[j])
+        else:
+            for k in range(3):
+                line[3 + k] = centre[k] - data[j, 3 + k]
+            own, slope = data[j], nodes[j, 1:4]
+            if kind == AZIMUTH:
+                value, low, high = bound_azimuth(own, line[:3], sense, half, slope)
+            elif kind == ELEVATION:
+                value, low, high = bound_elevation(own, line[:3], sense, half, slope)
+            elif kind == RATIO:
+                value, low, high = bound_ratio(own, line[:3], sense, line[3:], sense, half, slope)
+            else:
+                value, low, high = bound_height(own, line[:3], sense, half, slope)
+            nodes[j, 0], nodes[j, 4], nodes[j, 5] = value, low, high
 
 
 @compiled
@@ -158,7 +175,7 @@ def least_residual(K: Array, weight: Array, floor: float, half: Array, nodes: Ar
         Filled tables; the direction v is written.
     """
     _nearest(half, rows)
-    length, reach, t0, t1, t2, size = 0.0, 0.0, 0.0, 0.0, 0.0, floor
+    length, reach, t0, t1, t2 = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(K.shape[0]):
         v = rows[i, 4]
         length += v * v
@@ -176,13 +193,79 @@ def least_residual(K: Array, weight: Array, floor: float, half: Array, nodes: Ar
             for i in range(K.shape[0]):
                 total += K[i, j] * rows[i, 4]
             reach -= abs(total) * radius
-        size += weight[j] * (abs(nodes[j, 0]) + abs(nodes[j, 4]) + abs(nodes[j, 5]))
-    return reach / sqrt(length) - (32 + K.shape[0] + K.shape[1]) * _ULP * size
+    return float(reach / sqrt(length)) - rounding(K, weight, floor, nodes)
 
 
 @compiled
-def _nearest(half: Array, rows: Array) -> None:
-    """Write the direction v = middle + J s with s nearly the least-squares solution inside the box."""
+def rounding(K: Array, weight: Array, floor: float, nodes: Array) -> float:
+    """Return a bound of the rounding errors of a residual (its length); arguments as of `least_residual`."""
+    size = floor
+    for j in range(K.shape[1]):
+        size += weight[j] * (abs(nodes[j, 0]) + abs(nodes[j, 4]) + abs(nodes[j, 5]))
+    return (32 + K.shape[0] + K.shape[1]) * _ULP * size
+
+
+@compiled
+def shrink(K: Array, rho: float, at: Array, half: Array, nodes: Array, rows: Array, solve: Array) -> float:
+    """Clip a box to where the residual may be shorter than rho; return the share of the volume left, 0 if none.
+
+    With Y = (J'J)^-1 J' every point of the box obeys ``s = Y (residual) - Y (middle) - Y K dq``, dq the remainders
+    from their middle: each coordinate is within ``rho |Y_k| + sum_j |Y_k K_j| (high_j - low_j)/2`` of that of Y middle.
+
+    Parameters
+    ----------
+    K : array (q, J)
+        Whitened rows.
+    rho : float
+        Longest residual of interest, rounding included.
+    at, half : array (3,)
+        Centre and half-widths; changed.
+    nodes, rows : arrays
+        Filled tables of the box.
+    solve : array (3, 3)
+        Working memory.
+    """
+    a00, a01, a02, a11, a12, a22, b0, b1, b2 = _normal(rows)
+    if half[2] == 0.0:
+        a22 = a22 + 1.0
+    if not inverse(a00, a01, a02, a11, a12, a22, solve):
+        return 1.0
+    c0 = solve[0, 0] * b0 + solve[0, 1] * b1 + solve[0, 2] * b2
+    c1 = solve[1, 0] * b0 + solve[1, 1] * b1 + solve[1, 2] * b2
+    c2 = solve[2, 0] * b0 + solve[2, 1] * b1 + solve[2, 2] * b2
+    r0, r1 = rho * sqrt(max(solve[0, 0], 0.0)), rho * sqrt(max(solve[1, 1], 0.0))
+    r2 = rho * sqrt(max(solve[2, 2], 0.0))
+    for j in range(K.shape[1]):
+        radius = 0.5 * (nodes[j, 5] - nodes[j, 4])
+        if radius > 0.0:
+            p0, p1, p2 = 0.0, 0.0, 0.0
+            for i in range(K.shape[0]):
+                p0 += K[i, j] * rows[i, 1]
+                p1 += K[i, j] * rows[i, 2]
+                p2 += K[i, j] * rows[i, 3]
+            r0 += abs(solve[0, 0] * p0 + solve[0, 1] * p1 + solve[0, 2] * p2) * radius
+            r1 += abs(solve[1, 0] * p0 + solve[1, 1] * p1 + solve[1, 2] * p2) * radius
+            r2 += abs(solve[2, 0] * p0 + solve[2, 1] * p1 + solve[2, 2] * p2) * radius
+    share = _clip(at, half, 0, -c0, r0) * _clip(at, half, 1, -c1, r1)
+    return share * _clip(at, half, 2, -c2, r2) if half[2] > 0.0 else share
+
+
+@compiled
+def _clip(at: Array, half: Array, k: int, centre: float, reach: float) -> float:
+    """Clip one side of a box to |s - centre| <= reach (relative to its middle); return the share that is left."""
+    slack = 1e-9 * (abs(centre) + reach)
+    old = half[k]
+    low, high = max(-old, centre - reach - slack), min(old, centre + reach + slack)
+    if low > high:
+        return 0.0
+    if low > -old or high < old:
+        at[k], half[k] = at[k] + 0.5 * (low + high), 0.5 * (high - low) * (1.0 + 1e-12) + 1e-15 * (abs(at[k]) + old)
+    return min(half[k] / old, 1.0)
+
+
+@compiled
+def _normal(rows: Array) -> tuple[float, float, float, float, float, float, float, float, float]:
+    """Return J'J (00, 01, 02, 11, 12, 22) and J' middle."""
     a00, a01, a02, a11, a12, a22, b0, b1, b2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(rows.shape[0]):
         middle, j0, j1, j2 = rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3]
@@ -195,6 +278,13 @@ def _nearest(half: Array, rows: Array) -> None:
         b0 += j0 * middle
         b1 += j1 * middle
         b2 += j2 * middle
+    return a00, a01, a02, a11, a12, a22, b0, b1, b2
+
+
+@compiled
+def _nearest(half: Array, rows: Array) -> None:
+    """Write the direction v = middle + J s with s nearly the least-squares solution inside the box."""
+    a00, a01, a02, a11, a12, a22, b0, b1, b2 = _normal(rows)
     s0, s1, s2 = 0.0, 0.0, 0.0
     for _ in range(4):
         if a00 > 0.0:

@@ -175,7 +175,7 @@ def place(chart: Chart, box: Box) -> None:
 
 @compiled
 def bound_box(cost: Cost, chart: Chart, box: Box, floor: float) -> float:
-    """Fill the first tables of a box; return a lower bound of the length of the residual there, or a negative number."""
+    """Fill the first tables of a box; return a lower bound of the length of the residual there, or less than 0."""
     place(chart, box)
     bound_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, box.half, box.line, box.nodes)
     linearise_rows(cost.K, cost.w, box.nodes, box.rows)
@@ -193,7 +193,18 @@ def value_at(cost: Cost, chart: Chart, box: Box) -> float:
 @compiled
 def curve_box(cost: Cost, chart: Chart, box: Box) -> None:
     """Fill the tables of second derivatives of a box whose nodes are bounded."""
-    curve_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, box.half, box.line, box.nodes, box.curves)
+    curve_nodes(
+        cost.kinds,
+        cost.data,
+        box.centre,
+        chart.sense,
+        chart.gram,
+        box.half,
+        box.line,
+        box.solve,
+        box.nodes,
+        box.curves,
+    )
     sum_up(cost.K, cost.w, box.nodes, box.curves, box.sums)
 
 

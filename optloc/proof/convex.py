@@ -5,8 +5,11 @@ from __future__ import annotations
 from math import inf, sqrt
 
 from optloc.kernels.jit import compiled
+from optloc.proof.angles import curve_azimuth, curve_elevation
+from optloc.proof.height import curve_height
 from optloc.proof.linear3 import inverse, positive
-from optloc.proof.nodes import HEIGHT, LINEAR, RANGE
+from optloc.proof.nodes import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO
+from optloc.proof.ratio import curve_ratio
 from optloc.types import Array
 
 # Columns of a table of second derivatives (J, 14): Hessian (00, 01, 02, 11, 12, 22), bounds of the change of the
@@ -70,16 +73,41 @@ def curve_nodes(
     gram: Array,
     half: Array,
     line: Array,
+    second: Array,
     nodes: Array,
     curves: Array,
 ) -> None:
-    """Fill the table of second derivatives (J, CURVE_WIDTH) over a box; arguments as of `bound_nodes`, which ran."""
+    """Fill the table of second derivatives (J, CURVE_WIDTH) over a box.
+
+    Arguments are those of `bound_nodes`, which ran before, and working memory `second` (3, 3).
+    """
     for j in range(kinds.shape[0]):
         kind = kinds[j]
         if kind == RANGE:
             curve_range(sense, gram, half, nodes[j], curves[j])
         elif kind == LINEAR:
             curves[j, :10] = 0.0
+        else:
+            for k in range(3):
+                line[k] = centre[k] - data[j, k]
+                line[3 + k] = centre[k] - data[j, 3 + k]
+            own, turn = data[j], curves[j, 6:9]
+            if kind == AZIMUTH:
+                chi = curve_azimuth(own, line[:3], sense, half, second, turn)
+            elif kind == ELEVATION:
+                chi = curve_elevation(own, line[:3], sense, half, second, turn)
+            elif kind == RATIO:
+                chi = curve_ratio(own, line[:3], sense, line[3:], sense, half, second, turn)
+            else:
+                chi = curve_height(own, line[:3], sense, half, second, turn)
+            # A slope of zero may stand for one that was not used: then the gradient is not that of the node.
+            flat = nodes[j, 1] == 0.0 and nodes[j, 2] == 0.0 and nodes[j, 3] == 0.0
+            curves[j, 9] = inf if flat else chi
+            column = 0
+            for k in range(3):
+                for m in range(k, 3):
+                    curves[j, column] = second[k, m]
+                    column += 1
 
 
 @compiled
@@ -219,8 +247,10 @@ def spread_of(A: Array, half: Array, nodes: Array, curves: Array, sums: Array) -
 def slopes_everywhere(A: Array, half: Array, nodes: Array, curves: Array, sums: Array, solve: Array) -> bool:
     """Return whether the gradient of f cannot vanish in the box (interval Newton test).
 
-    The gradient at c + s is ``g + H(.) s`` with H between centre and s. With any matrix Y, here the inverse of the
-    Hessian at the centre, a component of ``Y g`` larger than all that ``Y H(.) s`` can be excludes a zero.
+    The gradient at c + s is ``g + H(.) s``, H the mean of the Hessian between centre and s. Bounds of its change over
+    t times the box are at most t times those over the box (`optloc.proof.nodes`), so the mean changes by half of them.
+    With any matrix Y, here the inverse of the Hessian at the centre, a component of ``Y g`` larger than all that
+    ``Y H(.) s`` can be excludes a zero.
 
     Parameters
     ----------
@@ -238,10 +268,10 @@ def slopes_everywhere(A: Array, half: Array, nodes: Array, curves: Array, sums: 
     if not inverse(a, b, c, d, e, f, solve):
         return False
     h0, h1, h2 = half[0], half[1], half[2]
-    ball *= sqrt(h0 * h0 + h1 * h1 + h2 * h2)
-    w0 = sums[9] * h0 + sums[10] * h1 + sums[11] * h2
-    w1 = sums[10] * h0 + sums[12] * h1 + sums[13] * h2
-    w2 = sums[11] * h0 + sums[13] * h1 + sums[14] * h2
+    ball *= 0.5 * sqrt(h0 * h0 + h1 * h1 + h2 * h2)
+    w0 = 0.5 * (sums[9] * h0 + sums[10] * h1 + sums[11] * h2)
+    w1 = 0.5 * (sums[10] * h0 + sums[12] * h1 + sums[13] * h2)
+    w2 = 0.5 * (sums[11] * h0 + sums[13] * h1 + sums[14] * h2)
     for k in range(3):
         y0, y1, y2 = solve[k, 0], solve[k, 1], solve[k, 2]
         step = abs(y0 * sums[6] + y1 * sums[7] + y2 * sums[8])

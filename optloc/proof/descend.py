@@ -5,7 +5,6 @@ from __future__ import annotations
 from optloc.kernels.jit import compiled
 from optloc.proof.chart import Box, Chart, Cost, curve_box, value_at
 from optloc.proof.linear3 import inverse, positive
-from optloc.types import Array
 
 _STEPS = 40
 _CLOSE = 1e-3
@@ -47,7 +46,7 @@ def descend(cost: Cost, chart: Chart, box: Box) -> float:
 @compiled
 def _step(cost: Cost, box: Box, damping: float) -> float:
     """Write the damped step into the first row of box.solve; return its squared length, NaN where there is none."""
-    sums, rows, solve = box.sums, box.rows, box.solve
+    sums, solve = box.sums, box.solve
     h0, h1, h2, h3, h4, h5 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
     if h5 == 0.0:
         h5 = 1.0
@@ -68,4 +67,4 @@ def _step(cost: Cost, box: Box, damping: float) -> float:
     s1 = solve[1, 0] * g0 + solve[1, 1] * g1 + solve[1, 2] * g2
     s2 = solve[2, 0] * g0 + solve[2, 1] * g1 + solve[2, 2] * g2
     solve[0, 0], solve[0, 1], solve[0, 2] = s0, s1, s2
-    return s0 * s0 + s1 * s1 + s2 * s2
+    return float(s0 * s0 + s1 * s1 + s2 * s2)

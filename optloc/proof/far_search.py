@@ -1,4 +1,4 @@
-"""Branch and bound outside a cube, to infinity, and with a search inside it: proofs where nothing encloses."""
+"""Branch and bound over all positions, for costs that nothing encloses."""
 
 from __future__ import annotations
 
@@ -7,52 +7,44 @@ from math import inf, sqrt
 import numpy as np
 
 from optloc.kernels.jit import compiled
+from optloc.proof.atlas import Atlas, position, set_centre, within
 from optloc.proof.boxes import cost_at, least_residual, linearise_rows
-from optloc.proof.chart import Box, Chart, Cost, empty_box
+from optloc.proof.chart import Box, Cost, empty_box
 from optloc.proof.convex import slopes_everywhere, spread_of, sum_up
 from optloc.proof.descend import descend
-from optloc.proof.far import Far, bound_far, curve_far, position, set_face
+from optloc.proof.far import bound_pieces, curve_pieces
+from optloc.proof.nodes import RANGE
+from optloc.proof.stack import push_around
 from optloc.types import Array
 
-# What a search of the outside finds: nothing, a cheaper point, a point below the level that may belong to another
-# minimum, no end within the budget, or a cost at infinity below the level.
-CLEAR, CHEAPER, LOW, SPENT, INFINITE = range(5)
+# What a search finds: nothing, a cheaper point, another minimum below the level, no end within the budget, or a cost at
+# infinity below the level.
+CLEAR, CHEAPER, ANOTHER, SPENT, INFINITE = range(5)
 _CAPACITY, _DEPTH = 1024, 8
 # A box at infinity of this size whose cost is below the level is not split further.
 _TINY = 1e-5
-# Minima closer than this are the same, standard deviations of the fix.
-_SAME = 0.1
+# How much wider than the convex box around the fix the box is that is searched in the fix's own axes.
+_WIDER = 3.0
 
 
 @compiled
-def search_far(
-    cost: Cost,
-    far: Far,
-    box: Box,
-    chart: Chart,
-    minima: Array,
-    level: float,
-    value: float,
-    budget: int,
-    found: Array,
+def search_everywhere(
+    cost: Cost, atlas: Atlas, minima: Array, sides: Array, level: float, value: float, budget: int, found: Array
 ) -> tuple[int, int, float]:
-    """Search the outside of a cube for positions that cost less than a level.
+    """Search all positions but some boxes for minima that cost less than a level.
 
-    A box is done where the cost is at least `level`. Where `level` exceeds `value` it is also done where the gradient
-    cannot vanish: the least cost over all positions, if it is attained, is attained elsewhere.
+    A box is done where the cost is at least `level`, or where the gradient cannot vanish: the least cost over all
+    positions, if it is attained, is attained elsewhere. Around the fix boxes lie along its principal axes.
 
     Parameters
     ----------
     cost : Cost
         The cost; `optloc.proof.far.reaches_infinity` holds.
-    far : Far
-        The outside.
-    box : Box
-        Tables.
-    chart : Chart
-        Search coordinates around the fix, in which low points descend.
-    minima : array (P, 3)
-        Known minima in those coordinates.
+    atlas : Atlas
+        The pieces.
+    minima, sides : array (P, 3)
+        Known minima, the fix first, and half-widths of boxes around them where the cost is convex, in the search
+        coordinates of the fix.
     level : float
         Cost to exceed.
     value : float
@@ -60,84 +52,106 @@ def search_far(
     budget : int
         How many boxes may be looked at.
     found : array (D,)
-        Written: the point of the outcomes CHEAPER and LOW.
+        Written: the point of the outcomes CHEAPER and ANOTHER.
 
     Returns
     -------
     outcome : int
-        CLEAR: no minimum costs less than `level`. CHEAPER: `found` costs less than `value`. LOW: `found` is another
+        CLEAR: no minimum costs less than `level`. CHEAPER: `found` costs less than `value`. ANOTHER: `found` is a
         minimum that costs less than `level`. SPENT: boxes are left. INFINITE: the cost at infinity is below `level`.
     boxes : int
         How many boxes were looked at.
     bound : float
-        A lower bound of f there: `value`, unless boxes are left.
+        A lower bound of f: `value`, unless boxes are left.
     """
-    stack, near, lows = np.empty((_CAPACITY, _DEPTH)), empty_box(cost.K.shape[0], cost.K.shape[1]), 0
-    size, boxes, floor = _faces(stack, far.dimension), 0, _floor(cost, far)
+    box, near = empty_box(cost.K.shape[0], cost.K.shape[1]), empty_box(cost.K.shape[0], cost.K.shape[1])
+    stack, core, last = np.zeros((_CAPACITY, _DEPTH)), _WIDER * sides[0], atlas.dimension - 1
+    size, boxes, lows, floor = _pieces(stack, atlas.dimension, core, sides[0]), 0, 0, _floor(cost, atlas)
     while size > 0:
-        if boxes >= budget or size + 2 > stack.shape[0]:
+        if boxes >= budget or size + 2 > _CAPACITY:
             return SPENT, boxes, _least(stack, size)
         size -= 1
         boxes += 1
         box.at[:], box.half[:] = stack[size, :3], stack[size, 3:6]
-        face = int(stack[size, 7])
-        set_face(far, face, box.at)
-        bound_far(far, cost.kinds, cost.data, box.at, box.half, box.nodes)
+        piece = int(stack[size, 7])
+        set_centre(atlas, piece, box.at)
+        if _known(atlas, box, piece, core, minima, sides):
+            continue
+        bound_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes)
         linearise_rows(cost.K, cost.w, box.nodes, box.rows)
         low = least_residual(cost.K, cost.weight, floor, box.half, box.nodes, box.rows)
         if low > 0.0 and low * low >= level:
             continue
         here = cost_at(cost.K, cost.w, box.nodes)
-        if here < level:
-            position(far, box.at, found)
-            if here < value:
-                return CHEAPER, boxes, 0.0
-        if level > value and _leaves(cost, far, box):
+        if here < value:
+            position(atlas, found)
+            return CHEAPER, boxes, 0.0
+        touching = piece < 2 * atlas.dimension and box.at[last] <= box.half[last]
+        if _leaves(cost, atlas, box, touching):
             continue
         if here < level:
             lows += 1
-            if lows & (lows - 1) == 0 and _another(cost, chart, near, minima, level, found):
-                return LOW, boxes, 0.0
-        touching = box.at[far.dimension - 1] <= box.half[far.dimension - 1]
-        if touching and max(box.half[0], box.half[1], box.half[2]) < _TINY and _at_infinity(cost, far, box) < level:
+            if lows & (lows - 1) == 0 and _another(cost, atlas, near, minima, sides, level, found):
+                return ANOTHER, boxes, 0.0
+        if touching and max(box.half[0], box.half[1], box.half[2]) < _TINY and _at_infinity(cost, atlas, box) < level:
             return INFINITE, boxes, 0.0
-        size = _split(stack, size, far.dimension, box, low, face)
+        size = _split(stack, size, atlas.dimension, box, low, piece)
     return CLEAR, boxes, value
 
 
 @compiled
-def _another(cost: Cost, chart: Chart, near: Box, minima: Array, level: float, found: Array) -> bool:
-    """Return whether a point descends to a minimum below the level that is not known; `found` is moved there."""
-    dimension = found.shape[0]
+def _known(atlas: Atlas, box: Box, piece: int, core: Array, minima: Array, sides: Array) -> bool:
+    """Return whether a box lies in the convex box of a known minimum, or in that searched in the fix's own axes."""
+    if piece <= 2 * atlas.dimension and within(atlas, box.half, minima[0], core):
+        return True
+    known = False
+    for p in range(minima.shape[0]):
+        known = known or within(atlas, box.half, minima[p], sides[p])
+    return known
+
+
+@compiled
+def _another(cost: Cost, atlas: Atlas, near: Box, minima: Array, sides: Array, level: float, found: Array) -> bool:
+    """Return whether the centre of a box descends to a minimum below the level that is not known, and write it."""
+    chart = atlas.chart
+    position(atlas, found)
     for k in range(3):
         near.at[k] = 0.0
-        for m in range(dimension):
+        for m in range(atlas.dimension):
             near.at[k] += chart.back[k, m] * (found[m] - chart.origin[m])
     if not descend(cost, chart, near) < level:
         return False
     for p in range(minima.shape[0]):
-        if max(abs(near.at[0] - minima[p, 0]), abs(near.at[1] - minima[p, 1]), abs(near.at[2] - minima[p, 2])) < _SAME:
+        inside = True
+        for k in range(3):
+            inside = inside and abs(near.at[k] - minima[p, k]) <= sides[p, k]
+        if inside:
             return False
-    for m in range(dimension):
+    for m in range(atlas.dimension):
         found[m] = near.centre[m]
     return True
 
 
 @compiled
-def _faces(stack: Array, dimension: int) -> int:
-    """Push all faces of the cube, from infinity to its surface."""
-    stack[:] = 0.0
+def _pieces(stack: Array, dimension: int, core: Array, hole: Array) -> int:
+    """Push all faces of the cube, its inside, and on top of them the core around the fix less its convex box."""
     size = 2 * dimension
-    for face in range(size):
-        for k in range(dimension - 1):
-            stack[face, 3 + k] = 1.0
-        stack[face, dimension - 1] = stack[face, dimension + 2] = 0.5
-        stack[face, 7] = face
-    return size
+    for piece in range(size + 1):
+        for k in range(dimension):
+            stack[piece, 3 + k] = 1.0
+        if piece < size:
+            stack[piece, dimension - 1] = stack[piece, dimension + 2] = 0.5
+        stack[piece, 7] = piece
+    slabs = np.zeros((6, 7))
+    count = push_around(slabs, -core, core, hole)
+    for i in range(count):
+        stack[size + 1 + i, :7] = slabs[i]
+        stack[size + 1 + i, 7] = size + 1
+    return size + 1 + count
 
 
 @compiled
-def _split(stack: Array, size: int, dimension: int, box: Box, low: float, face: int) -> int:
+def _split(stack: Array, size: int, dimension: int, box: Box, low: float, piece: int) -> int:
     """Push the halves of a box, cut across the side along which the residual changes most; return the stack's size."""
     most, k = -1.0, 0
     for m in range(dimension):
@@ -150,38 +164,37 @@ def _split(stack: Array, size: int, dimension: int, box: Box, low: float, face: 
     for side in range(2):
         stack[size, :3], stack[size, 3:6] = box.at, box.half
         quarter = 0.5 * box.half[k]
-        # Centres and half-widths are exact: sums of powers of two.
         stack[size, k] += quarter if side else -quarter
-        stack[size, 3 + k] = quarter
-        stack[size, 6], stack[size, 7] = low, face
+        # Exact but around the fix, where centres and half-widths are no sums of powers of two.
+        stack[size, 3 + k] = quarter + (1e-15 * (abs(box.at[k]) + quarter) if piece > 2 * dimension else 0.0)
+        stack[size, 6], stack[size, 7] = low, piece
         size += 1
     return size
 
 
 @compiled
-def _leaves(cost: Cost, far: Far, box: Box) -> bool:
+def _leaves(cost: Cost, atlas: Atlas, box: Box, touching: bool) -> bool:
     """Return whether no infimum of the cost can lie in a box whose nodes are bounded.
 
     The gradient does not vanish; and at infinity, an end of the box that is none of space, the cost also falls inwards
     or changes along infinity.
     """
-    curve_far(far, cost.kinds, cost.data, box.at, box.half, box.curves)
+    curve_pieces(atlas, cost.kinds, cost.data, box.half, box.curves)
     sum_up(cost.K, cost.w, box.nodes, box.curves, box.sums)
-    last = far.dimension - 1
-    if box.at[last] > box.half[last]:
+    if not touching:
         return slopes_everywhere(cost.A, box.half, box.nodes, box.curves, box.sums, box.solve)
     ball = spread_of(cost.A, box.half, box.nodes, box.curves, box.sums)
     if not ball < inf:
         return False
     sums, h = box.sums, box.half
     ball *= sqrt(h[0] * h[0] + h[1] * h[1] + h[2] * h[2])
-    for k in range(far.dimension):
-        change = ball * (1.0 + 1e-6)
+    for k in range(atlas.dimension):
+        change = ball
         for m in range(3):
             entry = _entry(k, m)
-            change += (abs(sums[entry]) + sums[9 + entry]) * h[m] * (1.0 + 1e-6)
-        slope = sums[6 + k]
-        if -slope > change or (k < last and slope > change):
+            change += (abs(sums[entry]) + sums[9 + entry]) * h[m]
+        slope, change = sums[6 + k], change * (1.0 + 1e-6) + 1e-9
+        if -slope > change or (k < atlas.dimension - 1 and slope > change):
             return True
     return False
 
@@ -194,25 +207,25 @@ def _entry(k: int, m: int) -> int:
 
 
 @compiled
-def _at_infinity(cost: Cost, far: Far, box: Box) -> float:
-    """Return the cost at infinity in the direction of a box's centre; its tables are those of that point then."""
-    last = far.dimension - 1
-    middle, box.at[last] = box.at[last], 0.0
-    bound_far(far, cost.kinds, cost.data, box.at, box.half, box.nodes)
-    box.at[last] = middle
+def _at_infinity(cost: Cost, atlas: Atlas, box: Box) -> float:
+    """Return the cost at infinity in the direction of the centre of a box on a face; its table of nodes is lost."""
+    atlas.scale[0] = 0.0
+    bound_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes)
     return cost_at(cost.K, cost.w, box.nodes)
 
 
 @compiled
-def _floor(cost: Cost, far: Far) -> float:
+def _floor(cost: Cost, atlas: Atlas) -> float:
     """Return the sizes of what residuals are differences of, beside the nodes: measurements and the cube."""
     total = 0.0
     for i in range(cost.w.shape[0]):
         total += cost.w[i] * cost.w[i]
     total = sqrt(total)
-    size = 4.0 * far.radius + abs(far.middle[0]) + abs(far.middle[1]) + abs(far.middle[2])
+    size = 4.0 * atlas.radius + abs(atlas.middle[0]) + abs(atlas.middle[1]) + abs(atlas.middle[2])
+    for k in range(atlas.dimension):
+        size += abs(atlas.chart.origin[k])
     for j in range(cost.kinds.shape[0]):
-        total += cost.weight[j] * (size if cost.kinds[j] == 0 else 4.0)
+        total += cost.weight[j] * (size if cost.kinds[j] == RANGE else 4.0)
     return total
 
 

@@ -54,6 +54,12 @@ def write(u: Triple, out: Array) -> None:
 
 
 @compiled
+def still(slope: Array) -> bool:
+    """Return whether a slope (3,) is zero: what `optloc.proof.nodes` prescribes for a node that is only enclosed."""
+    return bool(slope[0] == 0.0 and slope[1] == 0.0 and slope[2] == 0.0)
+
+
+@compiled
 def unbounded(curvature: Array, turn: Array) -> float:
     """Say that a node's curvature has no bound over a box: no Hessian, infinite change of the gradient; return inf."""
     for k in range(3):

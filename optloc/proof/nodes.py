@@ -26,11 +26,13 @@ Over a box (centre c, half-widths h in search coordinates s, x = c + T s) a node
 
 ``bound_<node>(data, line, sense, half, slope) -> (value, low, high)``
     value at the centre; writes its gradient with respect to s into slope (3,); low and high enclose the remainder
-    ``phi(s) - value - slope.s`` for all |s_k| <= half_k. What cannot be bounded sharply has slope 0 and a wide interval.
+    ``phi(s) - value - slope.s`` for all |s_k| <= half_k. What cannot be bounded sharply has slope 0 and a wide
+    interval.
 ``curve_<node>(data, line, sense, half, curvature, turn) -> chi``
     writes the Hessian with respect to s at the centre into curvature (3, 3), a bound of the change of each component of
     the gradient over the box into turn (3,), and returns a bound of the spectral norm of the change of the Hessian;
-    infinite turn or chi where there is none.
+    infinite turn or chi where there is none. Over t times the box, 0 < t < 1, these bounds and those of the remainder
+    are at most t times as large wherever chi is finite.
 """
 
 from __future__ import annotations

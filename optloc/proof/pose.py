@@ -68,7 +68,9 @@ def posed(problem: Problem) -> Posed:
     K, w = _projected(problem, made, others, value)
     K, w = _with_position_prior(problem, made, K, w)
     K, w = compressed(K, w)
-    return Posed(np.array(made.kinds), made.numbers, K, w, _turned(problem, others, angles, known))
+    size, level = problem.batch_shape[0], _turned(problem, others, angles, known)
+    w, level = np.broadcast_to(w, (size, w.shape[-1])), np.broadcast_to(level, (size,))
+    return Posed(np.array(made.kinds), made.numbers, K, w, level)
 
 
 @dataclass(frozen=True, slots=True)

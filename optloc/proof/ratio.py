@@ -12,15 +12,20 @@ from optloc.proof.forms import (
     blend,
     length,
     product,
+    pull,
     range_bend,
     range_form,
     reach,
     scaled,
+    still,
     triple,
     unbounded,
     write,
 )
 from optloc.types import Array
+
+# Numbers of a ratio's row: its measured value, and what is not 0 where no other node shares its rows.
+MEASURED, ALONE = 15, 16
 
 
 @compiled
@@ -29,26 +34,82 @@ def bound_ratio(
 ) -> tuple[float, float, float]:
     """Bound a ratio of ranges over a box (see `optloc.proof.nodes`).
 
-    With ``r_a' = r_a + u_a.s + q_a`` and likewise b, slope ``g = (u_a - phi u_b)/r_b``, the remainder is exactly
-    ``(q_a - (g.s)(u_b.s) - (phi + g.s) q_b) / r_b'``. The upper end is infinite where the box may touch station b.
+    In two steps, exact but for the enclosures of what is in them: with ``N = r_a^2 - r_b^2`` (affine in the
+    position), S = r_a + r_b, delta = N/S = r_a - r_b and phi = 1 + delta/r_b, the remainder of a quotient phi = N/S is
+    ``(q_N - (g.s)(u.s) - (phi + g.s) q_S) / S'`` with g its slope, and S' = S + u.s + q_S elsewhere in the box.
+
+    Where the box may touch station b the ratio has no upper end. A row of its own (number `ALONE`) only grows beyond
+    its measured value, so there the lower end may stand for the ratio.
     """
     h = triple(half, 0)
-    ra, ua, least_a, most_qa = range_form(line, sense, h)
-    rb, ub, least_b, most_qb = range_form(line_b, sense_b, h)
+    ra, ua, least_a, most_a = range_form(line, sense, h)
+    rb, ub, least_b, most_b = range_form(line_b, sense_b, h)
     phi = ra / rb if rb > 0.0 else inf
-    top, bottom = ra + reach(ua, h) + most_qa, rb + reach(ub, h) + most_qb
-    low, high = max(least_a, 0.0) / bottom - phi, top / least_b - phi if least_b > 0.0 else inf
+    bottom = rb + reach(ub, h) + most_b
+    low = max(least_a, 0.0) / bottom
     if least_b > 0.0:
-        g = blend(1.0 / rb, ua, -phi / rb, ub)
-        down, up = product(g, ub, h)
-        swing = reach(g, h)
-        under, over = min((phi - swing) * most_qb, 0.0), max((phi + swing) * most_qb, 0.0)
-        less, more = scaled(-up - over, most_qa - down - under, least_b, bottom)
+        high = (ra + reach(ua, h) + most_a) / least_b
+        n, q = _squares(line, sense, line_b, sense_b, h)
+        size, u, most = ra + rb, blend(1.0, ua, 1.0, ub), most_a + most_b
+        delta = ra - rb
+        g = blend(1.0 / size, n, -delta / size, u)
+        least = least_b + max(least_a, 0.0)
+        q = quotient(delta, g, u, most, q, (least, size + reach(u, h) + most), h)
+        g = blend(1.0 / rb, g, -(phi - 1.0) / rb, ub)
+        less, more = quotient(phi - 1.0, g, ub, most_b, q, (least_b, bottom), h)
         if more - less <= high - low:
             write(g, slope)
             return phi, less, more
+    else:
+        high = max(low, data[MEASURED]) if data[ALONE] != 0.0 else inf
     slope[0] = slope[1] = slope[2] = 0.0
-    return phi, low, high
+    return phi, low - phi, high - phi
+
+
+@compiled
+def quotient(
+    phi: float,
+    g: Triple,
+    u: Triple,
+    most: float,
+    above: tuple[float, float],
+    below: tuple[float, float],
+    h: Triple,
+) -> tuple[float, float]:
+    """Return an enclosure of the remainder of a quotient phi = N/S over a box.
+
+    Parameters
+    ----------
+    phi, g : float, triple
+        Its value and slope.
+    u, most : triple, float
+        Slope of S, and the greatest remainder of S, which is not negative.
+    above : pair of float
+        Enclosure of the remainder of N.
+    below : pair of float
+        Least, positive, and greatest S over the box.
+    h : triple
+        Half-widths.
+    """
+    low, high = product(g, u, h)
+    swing = reach(g, h)
+    low, high = low + min((phi - swing) * most, 0.0), high + max((phi + swing) * most, 0.0)
+    return scaled(above[0] - high, above[1] - low, below[0], below[1])
+
+
+@compiled
+def _squares(line: Array, sense: Array, line_b: Array, sense_b: Array, h: Triple) -> tuple[Triple, tuple[float, float]]:
+    """Return slope and remainder of ``|line|^2 - |line_b|^2`` over a box: the product of difference and sum."""
+    apart = (line[0] - line_b[0], line[1] - line_b[1], line[2] - line_b[2])
+    n, low, high = pull(apart, sense), 0.0, 0.0
+    n = blend(1.0, n, 1.0, pull(apart, sense_b))
+    for i in range(3):
+        own, other = triple(sense[i], 0), triple(sense_b[i], 0)
+        differ, both = blend(1.0, own, -1.0, other), blend(1.0, own, 1.0, other)
+        n = blend(1.0, n, line[i] + line_b[i], differ)
+        less, more = product(differ, both, h)
+        low, high = low + less, high + more
+    return n, (low, high)
 
 
 @compiled
@@ -62,22 +123,45 @@ def curve_ratio(
     curvature: Array,
     turn: Array,
 ) -> float:
-    """Bound how a ratio of ranges curves over a box (see `optloc.proof.nodes`).
-
-    ``phi r_b = r_a`` differentiated twice: the Hessian is ``(H_a - g u_b' - u_b g' - phi H_b) / r_b``.
-    """
+    """Bound how a ratio of ranges curves over a box (see `optloc.proof.nodes`), in the two steps of `bound_ratio`."""
     h = triple(half, 0)
+    bound_ratio(data, line, sense, line_b, sense_b, half, turn)
     ra, ua, least_a, qa = range_form(line, sense, h)
     rb, ub, least_b, qb = range_form(line_b, sense_b, h)
-    if not (least_a > 0.0 and least_b > 0.0):
+    if still(turn) or not (least_a > 0.0 and least_b > 0.0):
         return unbounded(curvature, turn)
-    phi = ra / rb
-    bend = np.empty((3, 3))
-    ea, chi_a, _ = range_bend(sense, h, ra, ua, least_a, qa, curvature)
-    eb, chi_b, norm_b = range_bend(sense_b, h, rb, ub, least_b, qb, bend)
-    g = blend(1.0 / rb, ua, -phi / rb, ub)
-    changes = (ea, eb, chi_a, chi_b, norm_b, reach(ub, h) + qb)
-    return quotient_bend(g, ub, (phi, rb, least_b), changes, h, curvature, bend, turn)
+    bend, whole = np.empty((3, 3)), np.empty((3, 3))
+    da, chi_a, norm_a = range_bend(sense, h, ra, ua, least_a, qa, whole)
+    db, chi_b, norm_b = range_bend(sense_b, h, rb, ub, least_b, qb, bend)
+    n, _ = _squares(line, sense, line_b, sense_b, h)
+    dn = _square_bend(sense, sense_b, h, curvature)
+    for k in range(3):
+        for m in range(3):
+            whole[k, m] += bend[k, m]
+    size, u, delta = ra + rb, blend(1.0, ua, 1.0, ub), ra - rb
+    g = blend(1.0 / size, n, -delta / size, u)
+    changes = (dn, blend(1.0, da, 1.0, db), 0.0, chi_a + chi_b, norm_a + norm_b, reach(u, h) + qa + qb)
+    chi = quotient_bend(g, u, (delta, size, least_a + least_b), changes, h, curvature, whole, turn)
+    wander = triple(turn, 0)
+    g = blend(1.0 / rb, g, -delta / (rb * rb), ub)
+    changes = (wander, db, chi, chi_b, norm_b, reach(ub, h) + qb)
+    return quotient_bend(g, ub, (delta / rb, rb, least_b), changes, h, curvature, bend, turn)
+
+
+@compiled
+def _square_bend(sense: Array, sense_b: Array, h: Triple, curvature: Array) -> Triple:
+    """Write the Hessian of ``|line|^2 - |line_b|^2``, a constant; return how much the gradient changes over a box."""
+    for k in range(3):
+        for m in range(3):
+            entry = 0.0
+            for i in range(3):
+                entry += sense[i, k] * sense[i, m] - sense_b[i, k] * sense_b[i, m]
+            curvature[k, m] = 2.0 * entry
+    return (
+        reach((curvature[0, 0], curvature[0, 1], curvature[0, 2]), h),
+        reach((curvature[1, 0], curvature[1, 1], curvature[1, 2]), h),
+        reach((curvature[2, 0], curvature[2, 1], curvature[2, 2]), h),
+    )
 
 
 @compiled

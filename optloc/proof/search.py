@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from math import inf, sqrt
+from math import inf, isnan, sqrt
 
 import numpy as np
 
 from optloc.kernels.jit import compiled
+from optloc.proof.boxes import cost_at, rounding, shrink
 from optloc.proof.chart import (
     Box,
     Chart,
@@ -20,12 +21,11 @@ from optloc.proof.chart import (
     is_convex,
     value_at,
 )
-from optloc.proof.boxes import cost_at
 from optloc.proof.convex import convex, slopes_everywhere
 from optloc.proof.descend import descend
 from optloc.proof.enclosure import enclose
 from optloc.proof.grow import grow
-from optloc.proof.stack import CAPACITY, DEPTH, push_around, push_halves
+from optloc.proof.stack import CAPACITY, DEPTH, push, push_around, push_halves
 from optloc.types import Array
 
 # Verdicts of a proof.
@@ -109,7 +109,7 @@ def prove(
     low, high = np.empty(3), np.empty(3)
     if not _start(cost, chart, box, sqrt(least + kappa), lower, upper, low, high):
         return OPEN, 0, -inf
-    whole = closed or not lower[0] == lower[0]
+    whole = closed or isnan(lower[0])
     minima, sides, known = _minima(cost, chart, box, others, low, high, margin)
     if known == 0:
         return STATIONARY, 0, -inf
@@ -131,9 +131,7 @@ def prove(
 @compiled
 def _start(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper: Array, low: Array, high: Array) -> bool:
     """Write the corners of the box to search: the region, or an enclosure of all that costs less than rho^2."""
-    if not lower[0] == lower[0]:
-        for j in range(cost.A.shape[0]):
-            box.line[0] = 0.0
+    if isnan(lower[0]):
         if not enclose(
             cost.kinds,
             cost.data,
@@ -214,6 +212,7 @@ def _search(
     `level` is the cost from which on a box is done; below it, where it exceeds `value`, also a box whose cost is at
     least `value` (or which is part of the whole search) and where the gradient cannot vanish.
     """
+    rho = sqrt(max(level, 0.0))
     floor, boxes, low_points = accuracy_floor(cost, chart), 0, 0
     while size > 0:
         if boxes >= budget or size + 2 > stack.shape[0]:
@@ -244,8 +243,57 @@ def _search(
                 if least < level and not _known(box, minima, sides):
                     return OTHER, boxes, 0.0
                 box.at[:], box.half[:] = keep[:3], keep[3:6]
-        size = push_halves(stack, size, box.at, box.half, low)
+        share = shrink(
+            cost.K,
+            rho + rounding(cost.K, cost.weight, floor, box.nodes),
+            box.at,
+            box.half,
+            box.nodes,
+            box.rows,
+            box.solve,
+        )
+        if share == 0.0:
+            continue
+        if share < 0.5:
+            size = push(stack, size, box.at, box.half, low)
+        else:
+            size = push_halves(stack, size, _side(cost, chart, box), box.at, box.half, low)
     return _GOING, boxes, inf
+
+
+@compiled
+def _side(cost: Cost, chart: Chart, box: Box) -> int:
+    """Return the coordinate across which to cut a box: where the remainders that matter shrink most.
+
+    The remainder of a range is nearly ``s'N s / 2``, so coordinate k has the share ``h_k sum_m |N_km| h_m`` in it; it
+    matters with its pull ``|K_j.v|`` on the bound. Boxes whose ranges have no part in it are cut across the widest side.
+    """
+    t0, t1, t2 = 0.0, 0.0, 0.0
+    nodes, half, gram = box.nodes, box.half, chart.gram
+    h0, h1, h2 = half[0], half[1], half[2]
+    for j in range(cost.kinds.shape[0]):
+        if nodes[j, 5] > nodes[j, 4]:
+            pull = 0.0
+            for i in range(cost.K.shape[0]):
+                pull += cost.K[i, j] * box.rows[i, 4]
+            g0, g1, g2 = nodes[j, 1], nodes[j, 2], nodes[j, 3]
+            a, b, c = (
+                abs(gram[0, 1] - g0 * g1) * h0 * h1,
+                abs(gram[0, 2] - g0 * g2) * h0 * h2,
+                abs(gram[1, 2] - g1 * g2) * h1 * h2,
+            )
+            x, y, z = (
+                (gram[0, 0] - g0 * g0) * h0 * h0 + a + b,
+                (gram[1, 1] - g1 * g1) * h1 * h1 + a + c,
+                (gram[2, 2] - g2 * g2) * h2 * h2 + b + c,
+            )
+            pull = abs(pull) * (nodes[j, 5] - nodes[j, 4]) / (x + y + z + 1e-300)
+            t0 += pull * x
+            t1 += pull * y
+            t2 += pull * z
+    if t0 >= t1 and t0 >= t2 and h0 > 0.0:
+        return 0
+    return 1 if t1 >= t2 else 2
 
 
 @compiled

@@ -33,13 +33,17 @@ def push_around(stack: Array, low: Array, high: Array, hole: Array) -> int:
 
 
 @compiled
-def push_halves(stack: Array, size: int, at: Array, half: Array, low: float) -> int:
-    """Push the halves of a box, cut across its widest side; return the size of the stack."""
-    k = 0
-    if half[1] > half[k]:
-        k = 1
-    if half[2] > half[k]:
-        k = 2
+def push(stack: Array, size: int, at: Array, half: Array, low: float) -> int:
+    """Push a box; return the size of the stack."""
+    for k in range(3):
+        stack[size, k], stack[size, 3 + k] = at[k], half[k]
+    stack[size, 6] = low
+    return size + 1
+
+
+@compiled
+def push_halves(stack: Array, size: int, k: int, at: Array, half: Array, low: float) -> int:
+    """Push the halves of a box, cut across side k; return the size of the stack."""
     for side in range(2):
         for m in range(3):
             stack[size, m], stack[size, 3 + m] = at[m], half[m]

@@ -10,7 +10,7 @@ from optloc.problem import Problem
 from optloc.solve import stages
 from optloc.solve.bearing_bound import bearing_bound
 from optloc.solve.branches import first_that_proves
-from optloc.solve.certify import certified
+from optloc.solve.certify import certified, value_certified
 from optloc.solve.stages import Solver
 
 
@@ -81,6 +81,7 @@ SOLVERS: dict[str, Entry] = {
     "certify": Entry(
         certified, "branch and bound: no position costs less, and no other minimum comes near", "refinement"
     ),
+    "value": Entry(value_certified, "the same for the cost alone, without other minima: quicker", "refinement"),
     "bound": Entry(
         bearing_bound, "compares the cost of an angle fix with the bound of a relaxation (Clarabel)", "refinement"
     ),

@@ -13,10 +13,13 @@ from optloc.fix import Fix, Stage
 from optloc.problem import Problem
 from optloc.proof.scope import unsupported
 from optloc.solve.claims import unknown
+from optloc.solve.verdict import LISTED_GAP
 from optloc.types import Array
 
 
-def certify(problem: Problem, fix: Fix, region: tuple[Array, Array] | None = None) -> Fix:
+def certify(
+    problem: Problem, fix: Fix, region: tuple[Array, Array] | None = None, *, margin: float = LISTED_GAP
+) -> Fix:
     """Return a fix with a certificate of what is proven about it, and with every better or other minimum met.
 
     The proof encloses all positions that could cost less, shows that the cost is convex around the fix, and splits
@@ -32,6 +35,9 @@ def certify(problem: Problem, fix: Fix, region: tuple[Array, Array] | None = Non
     region : (lower, upper), optional
         Corners (d,) of the box to which the claim may be limited, in the problem's frame, metres; None: all positions,
         or where that cannot be bounded a box around the stations that the certificate names.
+    margin : float
+        Gap between the cost of the fix and that of any other minimum that is tried to prove first; where the proof is
+        not finished, 9, the gap of `ambiguous`, and the value alone follow. 0 asks for the value alone: quicker.
 
     Returns
     -------
@@ -42,7 +48,7 @@ def certify(problem: Problem, fix: Fix, region: tuple[Array, Array] | None = Non
     Raises
     ------
     InvalidProblem
-        For a fix of another shape, or corners that do not bound a box.
+        For a fix of another shape, corners that do not bound a box, or a negative margin.
     """
     if separable(problem):
         problem = by_epoch(problem)
@@ -51,12 +57,19 @@ def certify(problem: Problem, fix: Fix, region: tuple[Array, Array] | None = Non
         raise InvalidProblem(
             f"a fix of shape {fix.shape} for problems of shape {shape}", "fix", "give the fix of this problem"
         )
+    if not 0.0 <= margin < np.inf:
+        raise InvalidProblem(f"the margin is {margin}", "margin", "give 0 or a positive number")
     corners = None if region is None else _corners(problem, region)
-    out = certified(flat, fix.reshape((flat.batch_shape[0],)), corners)
+    out = certified(flat, fix.reshape((flat.batch_shape[0],)), corners, margin)
     return out.reshape(shape)
 
 
-def certified(problem: Problem, fix: Fix | None, region: Array | None = None) -> Fix:
+def value_certified(problem: Problem, fix: Fix | None) -> Fix:
+    """Return the fixes of a flat batch of problems with a proof that nothing costs less: the stage "value"."""
+    return certified(problem, fix, margin=0.0)
+
+
+def certified(problem: Problem, fix: Fix | None, region: Array | None = None, margin: float = LISTED_GAP) -> Fix:
     """Return the certified fixes of a flat batch of problems: the stage "certify"; region (2, d) as of `certify`."""
     if fix is None:
         raise InvalidProblem("certify examines a fix", "method", "put it behind a refinement")
@@ -69,7 +82,7 @@ def certified(problem: Problem, fix: Fix | None, region: Array | None = None) ->
         return replace(fix, certificate=certificate, stages=(*fix.stages, _stage(why or "nothing to prove", began)))
     from optloc.solve.certifying import Work, settled_by_rounds  # machine code is loaded when it is used
 
-    work = settled_by_rounds(Work.begin(problem, fix, answered, region))
+    work = settled_by_rounds(Work.begin(problem, fix, answered, region, margin))
     return replace(work.fix, stages=(*fix.stages, _stage(work.summary(), began)))
 
 

@@ -12,6 +12,7 @@ from optloc.fix import Fix, Stage
 from optloc.kernels.jit import enabled
 from optloc.problem import Problem
 from optloc.proof.batch import Answered, Asked, prove_all
+from optloc.proof.everywhere import UNBOUNDED
 from optloc.proof.pose import Posed, posed, taken
 from optloc.proof.search import BETTER, BUDGET, OTHER, UNIQUE, VALUE
 from optloc.solve import claims
@@ -28,10 +29,10 @@ from optloc.status import Certificate, Status
 from optloc.types import Array
 
 # Gaps to other minima that are tried to prove, one after the other; the last is the value alone.
-_MARGINS = np.array([LISTED_GAP, AMBIGUOUS_GAP, 0.0])
-_ROUNDS = 12
-# Boxes for one proof; plain Python takes a thousand times longer for each.
-_BUDGET, _SLOW_BUDGET = 4000, 200
+_MARGINS = (LISTED_GAP, AMBIGUOUS_GAP, 0.0)
+_ROUNDS = 16
+# Boxes for the proof of a gap and of the value; plain Python takes a thousand times longer for each.
+_BUDGETS, _SLOW_BUDGETS = (4000, 16000), (150, 300)
 # Cost that counts as equal, relative: covers the rounding of two ways to compute it.
 _EQUAL = 1e-6
 # Minima behind the Earth that are set aside at most.
@@ -58,6 +59,8 @@ class Work:
         Corners of the regions of the claims; NaN for all positions.
     fallback : array (N, 2, d)
         Corners of the regions that take their place where all positions cannot be bounded.
+    margins : array (q,)
+        Gaps to prove, one after the other where proofs are not finished.
     level : int array (N,)
         Which of the margins is tried.
     pending : bool array (N,)
@@ -74,6 +77,7 @@ class Work:
     ignored: Array
     region: Array
     fallback: Array
+    margins: Array
     level: Array
     pending: Array
     before: Fix
@@ -81,7 +85,7 @@ class Work:
     listed: int = 0
 
     @classmethod
-    def begin(cls, problem: Problem, fix: Fix, answered: Array, region: Array | None) -> Work:
+    def begin(cls, problem: Problem, fix: Fix, answered: Array, region: Array | None, margin: float) -> Work:
         """Return the work before the first round."""
         size, d = len(fix.x), problem.dimension
         corners = np.full((2, d), np.nan) if region is None else region
@@ -92,6 +96,7 @@ class Work:
             np.full((size, 0, d), np.nan),
             np.broadcast_to(corners, (size, 2, d)),
             _around(problem, fix.position),
+            np.array([margin, *(m for m in _MARGINS if m < margin)]),
             np.zeros(size, dtype=np.int64),
             np.array(answered),
             fix,
@@ -134,14 +139,16 @@ def _round(work: Work, items: Array) -> None:
     _claim(work, items[done], asked.take(done), answer.take(done), extra[done])
     short = answer.verdict == BUDGET
     _lower(work, items[short], claims.BUDGET)
+    remote = answer.verdict == UNBOUNDED
+    _lower(work, items[remote], claims.REMOTE)
     found = np.isin(answer.verdict, (BETTER, OTHER))
     if found.any():
         _add(work, items[found], answer.found[found], answer.verdict[found] == BETTER)
-    _give_up(work, items[~(done | short | found)], claims.UNSETTLED)
+    _give_up(work, items[~(done | short | remote | found)], claims.UNSETTLED)
 
 
 def _asked(work: Work, items: Array, extra: Array) -> Asked:
-    kappa = _MARGINS[work.level[items]]
+    kappa = work.margins[work.level[items]]
     fix, ignored = work.fix, work.ignored[items]
     gap = fix.alternatives.gap[items]
     with np.errstate(invalid="ignore"):
@@ -156,14 +163,14 @@ def _asked(work: Work, items: Array, extra: Array) -> Asked:
         _EQUAL * (1.0 + fix.cost[items] + extra),
         work.region[items],
         work.fallback[items],
-        _BUDGET if enabled() else _SLOW_BUDGET,
+        np.where(kappa > 0.0, *(_BUDGETS if enabled() else _SLOW_BUDGETS)),
     )
 
 
 def _lower(work: Work, items: Array, why: str) -> None:
     """Let proofs that failed try for a smaller margin, or give up where that was zero."""
     work.level[items] += 1
-    spent = work.level[items] >= len(_MARGINS)
+    spent = work.level[items] >= len(work.margins)
     _give_up(work, items[spent], why)
 
 

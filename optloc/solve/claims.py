@@ -15,6 +15,7 @@ BUDGET = "the proof was not finished within its budget of boxes"
 UNSETTLED = "the rows do not make the fix a strict minimum that stands out from its neighbourhood"
 BARRED = "a position that costs less is not admitted: a constraint or the Earth forbids it"
 HELD = "an inequality holds the fix, and the proof covers equalities only"
+REMOTE = "positions ever farther away explain the data about as well"
 TURNS = "angles may be a whole turn off with their biases at costs that matter"
 RESTLESS = "minima kept turning up"
 

@@ -48,7 +48,7 @@ class Direct:
     station : int array (s,)
         Stations that take part.
     maps : tuple
-        Fields of `optloc.kernels.fixes_lanes.Model`.
+        Fields of `optloc.kernels.fixes.Model`.
     """
 
     layout: Layout
@@ -80,7 +80,8 @@ def direct(problem: Problem) -> Direct | None:
     dof = int(degrees_of_freedom(one)[0])
     if dof < 0 or np.triu(white, 1).any():
         return None
-    maps = _maps(one, found, white, dof)
+    correction = np.concatenate([rows.correction for rows in problem.rows])
+    maps = _maps(one, correction, found, white, dof)
     return Direct(problem.layout, problem.frame, one.weight, dof, found.station, maps)
 
 
@@ -114,7 +115,7 @@ def _probe(problem: Problem) -> Problem:
     return replace(problem, rows=rows, stations=replace(stations, position=place, velocity=None, axes=None))
 
 
-def _maps(one: Problem, found: Ranges, white: Array, dof: int) -> tuple[Array | int | float, ...]:
+def _maps(one: Problem, correction: Array, found: Ranges, white: Array, dof: int) -> tuple[Array | int | float, ...]:
     """Return the fields of the compiled model, in its order."""
     from scipy.special import gammainccinv
 
@@ -144,27 +145,22 @@ def _maps(one: Problem, found: Ranges, white: Array, dof: int) -> tuple[Array | 
     emission = np.linalg.pinv(times) @ alone
     present = one.weight > 0.0
     precision = np.where(present, 1.0 / np.where(present, variances(one.noise, count), 1.0), 0.0)
-    limit = 2.0 * float(gammainccinv(dof / 2, DOUBT)) * (1.0 - 1e-9) if dof else np.inf
     return (
-        present.astype(float),
-        precision,
+        np.stack([correction, precision]),
         anchor,
-        found.offset.T.copy(),
+        np.concatenate([found.offset.T, turned[:inside], emission, loops]),
         found.sign[0].astype(float),
-        int(found.reference[0]),
+        int(found.reference[0]) if found.free.all() else -1,
         white,
         upper[:inside].copy(),
-        turned[:inside].copy(),
-        loops.copy(),
-        emission,
         emission @ design,
         start,
-        limit,
+        2.0 * float(gammainccinv(dof / 2, DOUBT)) * (1.0 - 1e-9) if dof else np.inf,
     )
 
 
 def fixed(
-    direct: Direct, z: Array, correction: Array, position: Array, rest: Callable[[Array], Fix], threads: int | None = None
+    direct: Direct, z: Array, position: Array, rest: Callable[[Array], Fix], threads: int | None = None
 ) -> Fix:
     """Return the fixes of measurements: directly where the answer is plain, else by other means.
 
@@ -174,8 +170,6 @@ def fixed(
         From `direct` for problems of the same structure.
     z : array (N, m)
         Measurements.
-    correction : array (m,)
-        Known amounts by which they exceed the model.
     position : array (N or 1, stations, d)
         Of all stations.
     rest : callable
@@ -183,12 +177,10 @@ def fixed(
     threads : int, optional
         At most so many; as many as `optloc.threads.thread_count` says if absent.
     """
-    from optloc.kernels.fixes import fixes
-    from optloc.kernels.fixes_lanes import Model
-
+    from optloc.kernels.fixes import Model, fixes
+    
     began = perf_counter()
-    present, *others = direct.maps
-    model = Model(present, correction, *others)  # type: ignore[arg-type]
+    model = Model(*direct.maps)  # type: ignore[arg-type]
     count, d = len(z), position.shape[-1]
     x, covariance = np.empty((count, direct.layout.size)), np.empty((count, d, d))
     cost, plain = np.empty(count), np.empty(count, dtype=np.bool_)

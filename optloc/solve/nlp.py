@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from formulations.backend import chosen
 from formulations.nls import Program
 from optloc.blocks import averaged
 from optloc.constraints import conjunction, face_of, faces, tangent_at
@@ -144,7 +145,8 @@ class _Key:
             (bool(np.all(b.lower == b.upper)), bool(np.isfinite(b.lower).all()), bool(np.isfinite(b.upper).all()))
             for b in conjunction(problem)
         )
-        self.key = (problem.structure, data, shapes, limits)
+        self.choice = chosen("nonlinear")
+        self.key = (problem.structure, data, shapes, limits, None if self.choice is None else self.choice.key)
 
     def __hash__(self) -> int:
         return hash(self.key)
@@ -174,6 +176,7 @@ def _program(key: _Key) -> Program:
         inequalities=more,
         diagonal=False,
         settings={"bound_relax_factor": 0.0, "max_iter": 200},  # by default constraints give way by 1e-8
+        choice=key.choice,
     )
 
 

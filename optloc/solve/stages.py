@@ -7,6 +7,7 @@ from time import perf_counter
 
 import numpy as np
 
+from formulations.backend import count
 from optloc import linalg
 from optloc.constraints import exact
 from optloc.equations import equations_at
@@ -190,6 +191,7 @@ def lsr(problem: Problem, fix: Fix | None, *, damped: bool = True, limit: int = 
         done = refine(problem, pool[item, slot], item=own, damped=damped, limit=limit, face=face)
         pool[item, slot], cost[item, slot], code[item, slot] = done.x, done.cost, done.status
         detail = f"{len(item)} candidates, {int(done.iterations.max())} steps at most"
+        count("lsr", int(done.iterations.sum()))
     candidates = Candidates(pool, cost, code, np.zeros(cost.shape, dtype=int))
     if damped:
         candidates = bounded(problem, candidates)

@@ -1,0 +1,77 @@
+"""Which back end solves the programs of this package, and a count of what solving took.
+
+Both are context variables: threads and tasks may each have a choice of their own, and no formulation passes them on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+Kind = Literal["conic", "nonlinear"]
+"""What a back end solves."""
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """A back end in the place of a formulation's own.
+
+    Parameters
+    ----------
+    kind : "conic" or "nonlinear"
+        Which programs it takes: those of cvxpy, or those of CasADi.
+    name : str
+        Solver of cvxpy, for instance ``"SCS"``, or plugin of CasADi, for instance ``"sqpmethod"``.
+    settings : Mapping[str, Any]
+        Its settings, by its own names.
+    """
+
+    kind: Kind
+    name: str
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def key(self) -> str:
+        """Return text that is equal for equal choices."""
+        return f"{self.kind}:{self.name}:{sorted(self.settings.items())!r}"
+
+
+_CHOICE: ContextVar[Choice | None] = ContextVar("choice", default=None)
+_TALLY: ContextVar[list[tuple[str, int]] | None] = ContextVar("tally", default=None)
+
+
+def chosen(kind: Kind) -> Choice | None:
+    """Return the choice that holds for a kind of program, None for the formulation's own."""
+    choice = _CHOICE.get()
+    return choice if choice is not None and choice.kind == kind else None
+
+
+@contextmanager
+def using(choice: Choice | None) -> Iterator[None]:
+    """Let a choice hold for everything inside."""
+    token = _CHOICE.set(choice)
+    try:
+        yield
+    finally:
+        _CHOICE.reset(token)
+
+
+@contextmanager
+def counting() -> Iterator[list[tuple[str, int]]]:
+    """Yield a list to which everything inside adds the name of the solver and its iterations, one pair a solve."""
+    tally: list[tuple[str, int]] = []
+    token = _TALLY.set(tally)
+    try:
+        yield tally
+    finally:
+        _TALLY.reset(token)
+
+
+def count(name: str, iterations: int) -> None:
+    """Add a solve to the tally, where one is kept."""
+    tally = _TALLY.get()
+    if tally is not None:
+        tally.append((name, iterations))

@@ -1,0 +1,186 @@
+"""From methods of a study file to functions: a batch of trials in, its fixes and what they took out."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from itertools import product
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from optloc.errors import InvalidProblem, nearest
+from optloc.files.words import Units, join
+from optloc.fix import Fix
+from optloc.study.backends import kind_of
+from optloc.study.baselines import BASELINES, start_of
+from optloc.study.document import MethodTable
+from optloc.study.draws import Drawn
+
+
+@dataclass(frozen=True, slots=True)
+class Method:
+    """One way to solve.
+
+    Parameters
+    ----------
+    name : str
+        As tables show it.
+    method, baseline : str, optional
+        What solves: one of both.
+    solver : str
+        Back end of its programs; empty: its own.
+    settings : dict
+        Of the back end.
+    start : str
+        Where a baseline that needs a guess begins.
+    width : float
+        Width of the box of random starts, metres.
+    batch, chunk : int, optional
+        Fixes in a call, and in a task.
+    """
+
+    name: str
+    method: str | None
+    baseline: str | None
+    solver: str = ""
+    settings: dict[str, Any] = field(default_factory=dict)
+    start: str = "centre"
+    width: float = 1e5
+    batch: int | None = None
+    chunk: int | None = None
+
+    @property
+    def identity(self) -> str:
+        """Return what decides the answers, as text."""
+        settings = json.dumps(self.settings, sort_keys=True)
+        parts = (self.name, self.method, self.baseline, self.solver, settings, self.start, self.width, self.batch)
+        return json.dumps(parts)
+
+    @property
+    def slow(self) -> bool:
+        """Return whether fixes are solved one by one."""
+        if self.baseline is not None:
+            return BASELINES[self.baseline].slow
+        from optloc.solve.catalogue import METHODS
+
+        assert self.method is not None
+        stages = METHODS.get(self.method, self.method).split("+")
+        return not set(stages) <= _BATCHED
+
+
+_BATCHED = {"gtrs", "roots", "wiv", "widen", "search", "lsr", "taylor"}
+
+
+def methods_of(table: MethodTable, number: int) -> Iterator[Method]:
+    """Yield the methods of a table: one for each combination of its lists.
+
+    Parameters
+    ----------
+    table : MethodTable
+        The table.
+    number : int
+        Its place in the file, from 1.
+
+    Raises
+    ------
+    InvalidProblem
+        For an unknown method, baseline or solver, naming the nearest, or a solver that is not installed.
+    """
+    where = f"[[method]] {number}" if table.name is None else f"method {table.name!r}"
+    if (table.method is None) == (table.baseline is None):
+        raise InvalidProblem("a method is one thing", where, "give either method or baseline")
+    solvers: list[str | None] = [*_listed(table.solver)] or [None]
+    names = _listed(table.method) or _listed(table.baseline)
+    for name, solver in product(names, solvers):
+        if table.method is not None:
+            from optloc.solve.catalogue import stages_of
+
+            try:
+                stages_of(name)
+            except InvalidProblem as error:
+                raise InvalidProblem(error.what, where, error.advice) from None
+        elif name not in BASELINES:
+            raise InvalidProblem(f"unknown baseline {name!r}", where, nearest(name, list(BASELINES)))
+        if solver is not None:
+            kind_of(solver, join(where, "solver"))
+        elif table.settings:
+            raise InvalidProblem("settings belong to a solver", join(where, "settings"), "name it in 'solver'")
+        yield Method(
+            _called(table, name, solver, len(names) * len(solvers)),
+            None if table.method is None else name,
+            None if table.baseline is None else name,
+            solver or "",
+            dict(table.settings),
+            table.start,
+            Units("length").plain(table.width, "m", join(where, "width")),
+            table.batch,
+            table.chunk,
+        )
+
+
+def _listed(value: str | list[str] | None) -> list[str]:
+    return [] if value is None else [value] if isinstance(value, str) else value
+
+
+def _called(table: MethodTable, name: str, solver: str | None, count: int) -> str:
+    guess = table.baseline is not None and BASELINES[name].guess
+    words = [name, *([f"from the {table.start}"] if guess else []), *([f"({solver})"] if solver else [])]
+    made = " ".join(words)
+    if table.name is None:
+        return made
+    return table.name if count == 1 else f"{table.name}: {made}"
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """What a call gave.
+
+    Parameters
+    ----------
+    fix : Fix
+        Fixes (n,).
+    seconds : float
+        Time of the call.
+    iterations : float
+        Iterations of all its solvers and refinements; NaN where nothing was counted.
+    """
+
+    fix: Fix
+    seconds: float
+    iterations: float
+
+
+def run(method: Method, drawn: Drawn) -> Run:
+    """Return the fixes of trials by a method, with the back end and the settings that it asks for.
+
+    Raises
+    ------
+    InvalidProblem
+        Where the method solved nothing with the back end that was asked for.
+    """
+    from optloc.solve.choice import Choice, counting, using
+
+    choice = None
+    if method.solver:
+        choice = Choice(kind_of(method.solver, "solver"), method.solver, method.settings)
+    with using(choice), counting() as tally:
+        began = perf_counter()
+        fix = _solved(method, drawn)
+        seconds = perf_counter() - began
+    if choice is not None and tally and choice.name not in {name for name, _ in tally}:
+        what = f"{method.method or method.baseline} has no program that {choice.name} solves"
+        raise InvalidProblem(what, f"method {method.name!r}", "leave the solver out, or use a stage such as sdp or nlp")
+    return Run(fix, seconds, float(sum(n for _, n in tally)) if tally else np.nan)
+
+
+def _solved(method: Method, drawn: Drawn) -> Fix:
+    if method.baseline is not None:
+        return BASELINES[method.baseline].run(drawn, start_of(method.start, method.width, drawn))
+    from optloc.solve import solve
+
+    assert method.method is not None
+    fix = solve(drawn.problem, method.method)
+    return fix if fix.shape else fix.flat()
