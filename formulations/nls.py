@@ -14,9 +14,6 @@ Comput. 11 (2019).
 
 from __future__ import annotations
 
-import os
-import shutil
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -24,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from formulations._machine_code import library_solver
 from formulations.backend import Choice, count
 
 Array = NDArray[np.float64]
@@ -83,7 +81,6 @@ class Program:
         IPOPT settings, for instance ``{"max_iter": 200}``.
     choice : Choice, optional
         Another nonlinear solver of CasADi with its settings, in the place of IPOPT and `settings`.
-
     compiled : bool
         Turn the functions into machine code with the C compiler of the system: a solve of 200 rows then takes half
         the time, but the compiler some 10 s. The attribute of this name tells whether that was possible; where not,
@@ -127,9 +124,10 @@ class Program:
         program = {"x": x, "p": data, "f": cost, "g": ca.vertcat(c, d)}
         self._name = "ipopt" if choice is None else choice.name
         options = _options(choice, settings or {})
-        found = _machine_code(self._name, program, options) if compiled else None
-        self.compiled = found is not None
-        self._solver = ca.nlpsol("nls", self._name, program, options) if found is None else found
+        self._solver = ca.nlpsol("nls", self._name, program, options)
+        faster = library_solver(self._name, self._solver, options) if compiled else None
+        self.compiled = faster is not None
+        self._solver = self._solver if faster is None else faster
 
     def solve(
         self,
@@ -223,23 +221,6 @@ def _options(choice: Choice | None, settings: Mapping[str, Any]) -> dict[str, An
     if name == "ipopt":
         return {**_QUIET, "ipopt": {**silent["ipopt"], **own}}
     return {**_QUIET, **silent, **own}
-
-
-def _machine_code(name: str, program: dict[str, Any], options: dict[str, Any]) -> Any:
-    """Build the solver with compiled functions, or None where the system has no C compiler."""
-    import casadi as ca
-
-    if shutil.which("gcc") is None:  # CasADi's shell calls it by this name
-        return None
-    folder = tempfile.mkdtemp(prefix="nls")
-    jit = {"flags": ["-O1"], "directory": f"{folder}{os.sep}", "cleanup": True}
-    try:
-        return ca.nlpsol("nls", name, program, {**options, "jit": True, "compiler": "shell", "jit_options": jit})
-    except RuntimeError:
-        return None
-    finally:
-        # what is loaded stays
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _column(expressions: Any, count: int | None = None) -> Any:

@@ -24,6 +24,7 @@ from optloc.problem import Problem
 from optloc.simulate import simulate
 from optloc.solve import FORMULATIONS, METHODS, SOLVERS, solve
 from optloc.solve.certify import certify
+from optloc.solve.prepared import Prepared, prepare
 from optloc.solve.reduce import reduce
 from optloc.solve.running import Running
 from optloc.status import Certificate, Status
@@ -54,6 +55,7 @@ __all__ = [
     "Normal",
     "Observability",
     "OptlocError",
+    "Prepared",
     "Prior",
     "Problem",
     "Rows",
@@ -74,6 +76,7 @@ __all__ = [
     "normal",
     "observability",
     "predict",
+    "prepare",
     "reduce",
     "simulate",
     "solve",

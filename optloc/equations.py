@@ -4,14 +4,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
+from optloc.kernels.jit import enabled
+from optloc.kernels.pack import packed
 from optloc.linear import linearise
 from optloc.noise import Whitener
 from optloc.normal import Normal, normal
 from optloc.priors import with_priors
 from optloc.problem import Problem
 from optloc.types import Array
-from optloc.weigh import whitener_at
+from optloc.weigh import depends_on_place, whitener_at
 from optloc.windows import windows
+
+# Numbers of rows, over all problems, from which machine code saves more than it takes to get it going; tables of longer
+# runs would not be constant in memory.
+_WORTH, _LONGEST = 2000, 4096
 
 
 def equations_at(
@@ -38,6 +46,9 @@ def equations_at(
 
 def summed(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = None, *, at: Array | None = None) -> Normal:
     """Return the normal equations of the measurements alone; arguments as of `equations_at`."""
+    quick = _compiled(problem, x, noise) if at is None else None
+    if quick is not None:
+        return quick
     total = None
     for first, last, part in windows(problem, x.size // x.shape[-1]):
         own = noise if last - first == problem.epochs else None
@@ -48,3 +59,22 @@ def summed(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = None
         total = sums if total is None else total + sums
     assert total is not None
     return total
+
+
+def _compiled(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None) -> Normal | None:
+    """Return the sums by machine code, or None where it does not serve the problem or does not pay."""
+    count = x.size // x.shape[-1]
+    alike = problem.batch_shape in {(), (1,), (count,)} and x.ndim == 2
+    if not alike or not serves(problem, count) or (noise is None and depends_on_place(problem)):
+        return None
+    found = packed(problem, whitener_at(problem, x) if noise is None else noise)
+    if found is None:
+        return None
+    from optloc.kernels.equations import normal_at
+
+    return normal_at(found, x, np.arange(count) % max(1, *problem.batch_shape, 1))
+
+
+def serves(problem: Problem, starts: int) -> bool:
+    """Return whether machine code is at hand and pays for a number of vectors of a problem."""
+    return problem.count <= _LONGEST and starts * problem.count >= _WORTH and enabled()

@@ -21,7 +21,7 @@ def parameters(problem: Problem) -> Array:
     values = [np.zeros(0)]
     for plan in plans(problem):
         inputs = given(problem, plan)
-        values.extend(np.ravel(np.broadcast_to(inputs[seed], (plan.block.count,))) for seed in sorted(inputs))
+        values.extend(np.ravel(inputs[seed] + np.zeros(plan.block.count)) for seed in sorted(inputs))
     return np.concatenate(values)
 
 

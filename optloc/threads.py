@@ -6,7 +6,6 @@ import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
-from contextvars import copy_context
 from typing import TypeVar
 
 from optloc.errors import InvalidProblem

@@ -13,10 +13,11 @@ from optloc.errors import InvalidProblem
 # Heavy libraries are imported inside the commands, so that --help answers at once.
 
 
-class _Group(TyperGroup):
+class Group(TyperGroup):
     """Commands whose bad input is a sentence, not a traceback."""
 
     def invoke(self, ctx: Any) -> Any:
+        """Run a command; malformed input ends in exit code 2."""
         try:
             return super().invoke(ctx)
         except InvalidProblem as error:
@@ -25,7 +26,7 @@ class _Group(TyperGroup):
 
 
 app = typer.Typer(
-    cls=_Group,
+    cls=Group,
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode="rich",
@@ -252,12 +253,15 @@ def reproduce(
     raise typer.Exit(run_reproduce(name, size, out, seed, quiet))
 
 
-@app.command("list", epilog=example("optloc list kinds", "optloc list solvers"))
+@app.command("list", epilog=example("optloc list kinds", "optloc list solvers", "optloc list studies"))
 def list_(
-    what: Annotated[str, typer.Argument(metavar="kinds|formulations|solvers", help="Which table.")],
+    what: Annotated[
+        str,
+        typer.Argument(metavar="kinds|formulations|solvers|methods|baselines|executors|studies", help="Which table."),
+    ],
     as_json: Json = False,
 ) -> None:
-    """List measurement kinds, formulations or solvers."""
+    """List measurement kinds, formulations, solvers with the back ends found here, or what studies are made of."""
     from optloc.cli.listing import run_list
 
     raise typer.Exit(run_list(what, as_json))

@@ -37,8 +37,40 @@ def _formulations() -> list[dict[str, str]]:
 
 def _solvers() -> list[dict[str, str]]:
     from optloc.solve.catalogue import SOLVERS
+    from optloc.study.backends import backends
 
-    return _entries("solver", SOLVERS)
+    found = {
+        name: {"solver": name, "role": f"back end, {entry.kind}", "version": entry.version, "summary": entry.summary}
+        for name, entry in backends().items()
+    }
+    return [*_entries("solver", SOLVERS), *found.values()]
+
+
+def _methods() -> list[dict[str, str]]:
+    from optloc.solve.catalogue import METHODS
+
+    return [{"method": name, "summary": stages} for name, stages in METHODS.items()]
+
+
+def _baselines() -> list[dict[str, str]]:
+    from optloc.study.baselines import BASELINES
+
+    return _entries("baseline", BASELINES)
+
+
+def _executors() -> list[dict[str, str]]:
+    from optloc.study.execute import EXECUTORS
+
+    return _entries("executor", EXECUTORS)
+
+
+def _studies() -> list[dict[str, str]]:
+    import tomllib
+
+    from optloc.study.plan import shipped
+
+    texts = {name: tomllib.loads(entry.read_text(encoding="utf-8")) for name, entry in shipped().items()}
+    return [{"study": name, "summary": data.get("title", data["name"])} for name, data in texts.items()]
 
 
 def _entries(title: str, table: Mapping[str, Any]) -> list[dict[str, str]]:
@@ -64,6 +96,10 @@ _LISTS: dict[str, Callable[[], list[dict[str, str]]]] = {
     "kinds": _kinds,
     "formulations": _formulations,
     "solvers": _solvers,
+    "methods": _methods,
+    "baselines": _baselines,
+    "executors": _executors,
+    "studies": _studies,
 }
 
 

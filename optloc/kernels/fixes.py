@@ -196,7 +196,13 @@ def _accept(y: Array, settled: Array, good: Array, scale: Array, x: Array) -> No
 def _invert(vector: Array, matrix: Array, scalar: Array) -> None:
     """Write the lower half of the covariance over H_TRIAL, and whether it is regular and the fix near to SOLVABLE."""
     _, d, width = vector.shape
-    diagonal, inverse, move, fine, away = vector[DIAGONAL], vector[INVERSE], vector[MOVE], scalar[SOLVABLE], scalar[SPARE]
+    diagonal, inverse, move, fine, away = (
+        vector[DIAGONAL],
+        vector[INVERSE],
+        vector[MOVE],
+        scalar[SOLVABLE],
+        scalar[SPARE],
+    )
     for lane in range(width):
         away[lane] = 0.0
     for i in range(d):

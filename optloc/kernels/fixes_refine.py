@@ -54,7 +54,9 @@ def refine(
     method", IMM-REP-1999-05, Technical University of Denmark.
     """
     width = scalar.shape[1]
-    equations(K, u, place, r, unit, vector[X], vector[ROW], scalar[SPARE], scalar[LOOP], matrix[H], vector[G], scalar[COST])
+    equations(
+        K, u, place, r, unit, vector[X], vector[ROW], scalar[SPARE], scalar[LOOP], matrix[H], vector[G], scalar[COST]
+    )
     for lane in range(width):
         scalar[GOOD, lane] = scalar[GOOD, lane] if scalar[COST, lane] < np.inf else 0.0
         scalar[ALIVE, lane] = scalar[GOOD, lane]
@@ -153,7 +155,13 @@ def ranges(place: Array, x: Array, r: Array, unit: Array, spare: Array) -> None:
 def _propose(vector: Array, matrix: Array, scalar: Array) -> None:
     """Find the damped step, its squared length in its own standard deviations, and whether it exists."""
     _, d, width = vector.shape
-    diagonal, inverse, move, right, damping = vector[DIAGONAL], vector[INVERSE], vector[MOVE], vector[G], scalar[DAMPING]
+    diagonal, inverse, move, right, damping = (
+        vector[DIAGONAL],
+        vector[INVERSE],
+        vector[MOVE],
+        vector[G],
+        scalar[DAMPING],
+    )
     gain, solvable, information = scalar[GAIN], scalar[SOLVABLE], matrix[H]
     for lane in range(width):
         gain[lane], solvable[lane] = 0.0, 1.0

@@ -11,8 +11,8 @@ from optloc.types import Array
 
 
 @compiled
-def gather(t: Tables, c: Numbers, m: Array, r: Array, room: Room, lanes: int) -> None:
-    """Write the normal equations at `room.trial` into `room.after`, priors included.
+def gather(t: Tables, c: Numbers, m: Array, r: Array, room: Room, priors: bool, lanes: int) -> None:
+    """Write the normal equations at `room.trial` into `room.after`.
 
     Parameters
     ----------
@@ -26,6 +26,8 @@ def gather(t: Tables, c: Numbers, m: Array, r: Array, room: Room, lanes: int) ->
         Registers.
     room : Room
         Where things stand.
+    priors : bool
+        Whether Gaussian priors are added.
     lanes : int
         How many lanes hold a problem.
     """
@@ -33,9 +35,9 @@ def gather(t: Tables, c: Numbers, m: Array, r: Array, room: Room, lanes: int) ->
     clear(m, room.after, (last + 1) ** 2, lanes)
     for packet in range(t.packets):
         measure(t, c.common, m, r, room, packet, room.trial, lanes)
-        for group in range(t.index[t.packet + packet, 0], t.index[t.packet + packet + 1, 0]):
+        for group in range(t.table[t.packet + packet, 0], t.table[t.packet + packet + 1, 0]):
             add_group(t, c.common, c.place, m, room, group, lanes)
-    for i in range(t.groups, c.place.shape[0]):
+    for i in range(t.groups, c.place.shape[0] if priors else t.groups):
         start = c.place[i, 1] + (t.shared if c.place[i, 3] else 0)
         add_prior(c.common, c.place[i, 0], c.place[i, 2], m, room, room.trial + start, start, last, lanes)
 
@@ -52,10 +54,10 @@ def clear(m: Array, first: int, count: int, lanes: int) -> None:
 def add_group(t: Tables, common: Array, place: Array, m: Array, room: Room, group: int, lanes: int) -> None:
     """Add the whitened rows of a group to the equations in `room.after`."""
     line = t.group + group
-    first, size = room.rows + t.index[line, 0] * t.width, t.index[line, 1]
-    columns, column = t.index[line + 1, 3] - t.index[line, 3] + 1, t.column + t.index[line, 3]
+    first, size = room.rows + t.table[line, 0] * t.width, t.table[line, 1]
+    columns, column = t.table[line + 1, 3] - t.table[line, 3] + 1, t.column + t.table[line, 3]
     _whiten(common, place[group, 0], place[group, 1], m, room.own, first, t.width, size, columns, room.whitened, lanes)
-    _square(t.index, column, m, room.whitened, t.width, size, columns, room.after, t.shared + t.local, lanes)
+    _square(t.table, column, m, room.whitened, t.width, size, columns, room.after, t.shared + t.local, lanes)
 
 
 @compiled

@@ -37,27 +37,33 @@ def run(code: Array, first: int, last: int, r: Array, count: int) -> None:
         elif operation == SQRT:
             for i in range(count):
                 r[to, i] = np.sqrt(r[u, i])
-        elif operation == NEG:
-            for i in range(count):
-                r[to, i] = -r[u, i]
-        elif operation == HYPOT:
-            for i in range(count):
-                r[to, i] = np.sqrt(r[u, i] * r[u, i] + r[v, i] * r[v, i])
-        elif operation == ATAN2:
-            for i in range(count):
-                r[to, i] = atan2(r[u, i], r[v, i])
         else:
-            for i in range(count):
-                r[to, i] = _rare(operation, r[u, i])
+            _rare(operation, r, to, u, v, count)
 
 
 @compiled
-def _rare(operation: int, u: float) -> float:
-    if operation == SIN:
-        return sin(u)
-    if operation == COS:
-        return cos(u)
-    return float(np.log(u) if operation == LOG else np.exp(u))
+def _rare(operation: int, r: Array, to: int, u: int, v: int, count: int) -> None:
+    if operation == NEG:
+        for i in range(count):
+            r[to, i] = -r[u, i]
+    elif operation == HYPOT:
+        for i in range(count):
+            r[to, i] = np.sqrt(r[u, i] * r[u, i] + r[v, i] * r[v, i])
+    elif operation == ATAN2:
+        for i in range(count):
+            r[to, i] = atan2(r[u, i], r[v, i])
+    elif operation == SIN:
+        for i in range(count):
+            r[to, i] = sin(r[u, i])
+    elif operation == COS:
+        for i in range(count):
+            r[to, i] = cos(r[u, i])
+    elif operation == LOG:
+        for i in range(count):
+            r[to, i] = np.log(r[u, i])
+    else:
+        for i in range(count):
+            r[to, i] = np.exp(r[u, i])
 
 
 @compiled
@@ -83,7 +89,7 @@ def measure(t: Tables, common: Array, m: Array, r: Array, room: Room, packet: in
     lanes : int
         How many lanes hold a problem.
     """
-    index, together = t.index, max(1, LENGTH // lanes)
+    index, together = t.table, max(1, LENGTH // lanes)
     for number in range(t.kinds):
         kind, part = t.kind + number, t.part + packet * (t.kinds + 1) + number
         for row in range(index[part, 0], index[part + 1, 0], together):
@@ -109,7 +115,7 @@ def _inputs(
     t: Tables, common: Array, m: Array, own: int, r: Array, begin: int, row: int, end: int, x: int, lanes: int
 ) -> None:
     """Write the inputs of rows of one kind, which `begin` in the table of inputs, into their registers."""
-    index = t.index
+    index = t.table
     for one in range(row, end):
         low, source = (one - row) * lanes, index[t.row + one, 3]
         for i in range(index[t.row + one + 1, 3] - source):
@@ -130,7 +136,7 @@ def _inputs(
 @compiled
 def _derivatives(t: Tables, m: Array, r: Array, begin: int, line: int, low: int, to: int, lanes: int) -> None:
     """Write the derivatives of h of one row by the unknowns that move its inputs."""
-    index = t.index
+    index = t.table
     source = index[line, 3]
     for j in range(index[line, 2]):
         for b in range(lanes):
@@ -149,7 +155,7 @@ def _measurement(
     t: Tables, m: Array, r: Array, place: int, line: int, low: int, to: int, x: int, scale: int, lanes: int
 ) -> None:
     """Write the value of one row behind its derivatives, and what scales and offsets do to both."""
-    index = t.index
+    index = t.table
     value, first, last, end = to + index[line, 2], index[line, 4], index[line + 1, 4], index[line + 1, 5]
     for b in range(lanes):
         m[value, b] = r[place, low + b]

@@ -10,11 +10,13 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.kernels.dense import step
+from optloc.kernels.equations import chunks
 from optloc.kernels.gather import gather
 from optloc.kernels.jit import compiled
 from optloc.kernels.pack import Numbers, Packed
 from optloc.kernels.room import Room, blocks, furnished, load, memory
 from optloc.status import Status
+from optloc.threads import mapped
 from optloc.types import Array
 
 _OK, _LIMIT, _STALLED, _NUMERICAL = (
@@ -44,8 +46,10 @@ class Answers(NamedTuple):
 
 # Cells that a refinement keeps of every problem, from `room.state` on; `room.STATE` of them.
 _DAMPING, _GROWTH, _BLUR, _GAIN, _SOLVABLE, _BETTER = range(6)
-# What it keeps beside them: which start it is, 1 while nothing but the start is known, steps tried, status.
+# What it keeps beside them: which start it is, 1 while nothing but the start is
+# known and 2 before it is there, steps tried, status.
 _START, _FRESH, _STEPS, _STATUS = range(4)
+_EMPTY = 2
 
 
 def answers(start: Array) -> Answers:
@@ -59,6 +63,13 @@ def answers(start: Array) -> Answers:
         np.empty((count, size, size)),
         np.empty((count, size)),
     )
+
+
+def refined(packed: Packed, item: Array, start: Array, rules: Rules) -> Answers:
+    """Return where the refinements of starts (M, p) of given problems end; see `refine_block`."""
+    out = answers(start)
+    mapped(lambda part: refine_block(packed, item, part[0], part[1], rules, out), chunks(len(start)))
+    return out
 
 
 @compiled
@@ -85,10 +96,11 @@ def refine_block(packed: Packed, item: Array, first: int, last: int, rules: Rule
     tag = np.zeros((4, lanes), np.int64)
     used, following = 0, first
     while used < lanes:
-        _begin(c, m, room, tag, used, following, item[following], out.x)
+        tag[_START, used], tag[_FRESH, used] = following, _EMPTY
         used, following = used + 1, following + 1
     while used > 0:
-        gather(t, c, m, r, room, used)
+        _begin(c, m, room, tag, used, item, out.x)
+        gather(t, c, m, r, room, True, used)
         _judge(m, room, size, tag, rules, used)
         b = 0
         while b < used:
@@ -97,7 +109,7 @@ def refine_block(packed: Packed, item: Array, first: int, last: int, rules: Rule
                 continue
             _finish(m, room, tag, b, out)
             if following < last:
-                _begin(c, m, room, tag, b, following, item[following], out.x)
+                tag[_START, b], tag[_FRESH, b] = following, _EMPTY
                 following, b = following + 1, b + 1
             else:
                 used -= 1
@@ -106,14 +118,17 @@ def refine_block(packed: Packed, item: Array, first: int, last: int, rules: Rule
 
 
 @compiled
-def _begin(c: Numbers, m: Array, room: Room, tag: Array, lane: int, start: int, item: int, x: Array) -> None:
-    """Bring a start into a lane."""
-    load(c, m, lane, item)
-    tag[_START, lane], tag[_FRESH, lane], tag[_STEPS, lane], tag[_STATUS, lane] = start, 1, 0, _LIMIT
-    for i in range(x.shape[1]):
-        m[room.trial + i, lane] = x[start, i]
-    m[room.state + _DAMPING, lane], m[room.state + _GROWTH, lane] = 1e-6, 2.0
-    m[room.state + _BLUR, lane] = _blur(c.sigma, c.size, m, room, lane, item)
+def _begin(c: Numbers, m: Array, room: Room, tag: Array, used: int, item: Array, x: Array) -> None:
+    """Bring the starts of empty lanes into them."""
+    for b in range(used):
+        if tag[_FRESH, b] == _EMPTY:
+            start = tag[_START, b]
+            tag[_FRESH, b], tag[_STEPS, b], tag[_STATUS, b] = 1, 0, _LIMIT
+            load(m, b, item[start], c.source, c.white, c.prior, c.observed, c.present)
+            for i in range(x.shape[1]):
+                m[room.trial + i, b] = x[start, i]
+            m[room.state + _DAMPING, b], m[room.state + _GROWTH, b] = 1e-6, 2.0
+            m[room.state + _BLUR, b] = _blur(c.sigma, c.size, m, room, b, item[start])
 
 
 @compiled
@@ -212,8 +227,6 @@ def _advance(m: Array, room: Room, n: int, local: int, tag: Array, damped: bool,
     for i in range(size):
         for b in range(used):
             m[gain, b] += m[room.step + i, b] * m[vector + i, b]
-            m[room.trial + i, b] = (
-                m[room.trial + i, b] if tag[_FRESH, b] else m[room.best + i, b] + m[room.step + i, b]
-            )
+            m[room.trial + i, b] = m[room.trial + i, b] if tag[_FRESH, b] else m[room.best + i, b] + m[room.step + i, b]
     for b in range(used):
         tag[_STEPS, b] += 1 - tag[_FRESH, b]

@@ -47,6 +47,9 @@ class Room(NamedTuple):
 STATE = 8
 """Cells that a refinement keeps of every problem."""
 
+# Lanes of a block: as many as keep its cells in the cache.
+_LANES, _FEWEST, _CELLS = 64, 8, 2**18
+
 
 @compiled
 def furnished(t: Tables, c: Numbers, size: int) -> Room:
@@ -97,13 +100,15 @@ def furnished(t: Tables, c: Numbers, size: int) -> Room:
 
 
 @compiled
-def load(c: Numbers, m: Array, lane: int, item: int) -> None:
-    """Bring the numbers of a problem into a lane of the memory (cells, B)."""
-    cell = _filled(m, 0, lane, c.source, item)
-    cell = _filled(m, cell, lane, c.white, item)
-    cell = _filled(m, cell, lane, c.prior, item)
-    cell = _filled(m, cell, lane, c.observed, item)
-    _filled(m, cell, lane, c.present, item)
+def load(
+    m: Array, lane: int, item: int, source: Array, white: Array, prior: Array, observed: Array, present: Array
+) -> None:
+    """Bring the numbers of a problem into a lane of the memory (cells, B); the arrays are those of `Numbers`."""
+    cell = _filled(m, 0, lane, source, item)
+    cell = _filled(m, cell, lane, white, item)
+    cell = _filled(m, cell, lane, prior, item)
+    cell = _filled(m, cell, lane, observed, item)
+    _filled(m, cell, lane, present, item)
 
 
 @compiled
@@ -119,10 +124,7 @@ def blocks(packed: Packed, size: int, count: int) -> int:
     """Return how many of a number of problems of p = `size` unknowns are worked on together: they fit the cache."""
     t = packed.tables
     each = t.rows * t.width + 2 * (t.shared + t.local + 1) ** 2 + 2 * size + packed.numbers.observed.shape[1]
-    return max(1, min(count, _LANES, max(_FEWEST, _FEWEST * (_CELLS // each // _FEWEST))))
-
-
-_LANES, _FEWEST, _CELLS = 64, 8, 2**16
+    return int(max(1, min(count, _LANES, max(_FEWEST, _FEWEST * (_CELLS // each // _FEWEST)))))
 
 
 @compiled

@@ -14,17 +14,18 @@ from optloc.problem import Problem
 from optloc.states import given
 from optloc.types import Array
 
+
 class Tables(NamedTuple):
     """The indices of a structure; rows are numbered in the order in which they are evaluated.
 
     Rows whose noise is correlated form a group, groups follow each other in time, and a stretch of groups whose rows
-    are evaluated together is a packet. All tables stand below each other in `index`, for every array that is handed to
+    are evaluated together is a packet. All tables stand below each other, for every array that is handed to
     a kernel takes time. Where a table says "first", its next line says where that ends.
     """
 
-    index: Array  # int64 (n, 6)
+    table: Array  # int64 (n, 6): all tables below each other
     real: Array  # constants and factors
-    # Where each table begins in `index`.
+    # Where each table begins in `table`.
     code: int  # operation, target, operands, see `Tape`; the tapes of all kinds
     kind: int  # first operation, constant, input; register of the value; 1 for an angle
     constant: int  # register; its values are the first of `real`
@@ -132,7 +133,7 @@ def tables(problem: Problem, groups: tuple[Array, ...]) -> Kept | None:
     shapes = tuple(array.shape[array.ndim - core :] for array, core in sources.arrays)
     key = (problem.structure, shapes, sources.own, *((g.shape, g.tobytes()) for g in groups))
     if key not in _KEPT:
-        if sum(len(kept.tables.index) for kept in _KEPT.values() if kept is not None) > _KEPT_LINES:
+        if sum(len(kept.tables.table) for kept in _KEPT.values() if kept is not None) > _KEPT_LINES:
             _KEPT.clear()
         _KEPT[key] = _tables(problem, groups, sources)
     return _KEPT[key]

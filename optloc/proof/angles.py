@@ -190,7 +190,7 @@ def curve_elevation(data: Array, line: Array, sense: Array, half: Array, curvatu
         turn[0] = turn[1] = turn[2] = inf
         return inf
     near = 1.0 / (1.0 - back)
-    stretch = max(back * near, 1.0 - 1.0 / (1.0 + back + aside + bulge))
+    stretch = max(back * near, back + aside + bulge)
     steeper = pitch * (1.0 + tan * tan) / (1.0 - abs(tan) * pitch)
     sweep = blend(1.0 / r, outward, 0.0, outward)
     swung = _swung(sweep, c, yaw, (0.0, 0.0, 0.0), near, 0.0)

@@ -202,12 +202,12 @@ def rounding(K: Array, weight: Array, floor: float, nodes: Array) -> float:
     size = floor
     for j in range(K.shape[1]):
         size += weight[j] * (abs(nodes[j, 0]) + abs(nodes[j, 4]) + abs(nodes[j, 5]))
-    return (32 + K.shape[0] + K.shape[1]) * _ULP * size
+    return float((32 + K.shape[0] + K.shape[1]) * _ULP * size)
 
 
 @compiled
-def shrink(K: Array, rho: float, at: Array, half: Array, nodes: Array, rows: Array, solve: Array) -> float:
-    """Clip a box to where the residual may be shorter than rho; return the share of the volume left, 0 if none.
+def shrink(K: Array, rho: float, plane: bool, nodes: Array, rows: Array, cut: Array, solve: Array) -> None:
+    """Clip a box to where the residual may be shorter than rho.
 
     With Y = (J'J)^-1 J' every point of the box obeys ``s = Y (residual) - Y (middle) - Y K dq``, dq the remainders
     from their middle: each coordinate is within ``rho |Y_k| + sum_j |Y_k K_j| (high_j - low_j)/2`` of that of Y middle.
@@ -218,18 +218,20 @@ def shrink(K: Array, rho: float, at: Array, half: Array, nodes: Array, rows: Arr
         Whitened rows.
     rho : float
         Longest residual of interest, rounding included.
-    at, half : array (3,)
-        Centre and half-widths; changed.
+    plane : bool
+        Whether nothing depends on the third coordinate.
     nodes, rows : arrays
         Filled tables of the box.
+    cut : array (6,)
+        Lower and upper ends of the box about its centre; clipped.
     solve : array (3, 3)
         Working memory.
     """
     a00, a01, a02, a11, a12, a22, b0, b1, b2 = _normal(rows)
-    if half[2] == 0.0:
+    if plane:
         a22 = a22 + 1.0
     if not inverse(a00, a01, a02, a11, a12, a22, solve):
-        return 1.0
+        return
     c0 = solve[0, 0] * b0 + solve[0, 1] * b1 + solve[0, 2] * b2
     c1 = solve[1, 0] * b0 + solve[1, 1] * b1 + solve[1, 2] * b2
     c2 = solve[2, 0] * b0 + solve[2, 1] * b1 + solve[2, 2] * b2
@@ -246,21 +248,33 @@ def shrink(K: Array, rho: float, at: Array, half: Array, nodes: Array, rows: Arr
             r0 += abs(solve[0, 0] * p0 + solve[0, 1] * p1 + solve[0, 2] * p2) * radius
             r1 += abs(solve[1, 0] * p0 + solve[1, 1] * p1 + solve[1, 2] * p2) * radius
             r2 += abs(solve[2, 0] * p0 + solve[2, 1] * p1 + solve[2, 2] * p2) * radius
-    share = _clip(at, half, 0, -c0, r0) * _clip(at, half, 1, -c1, r1)
-    return share * _clip(at, half, 2, -c2, r2) if half[2] > 0.0 else share
+    clip(cut, 0, -c0, r0)
+    clip(cut, 1, -c1, r1)
+    if not plane:
+        clip(cut, 2, -c2, r2)
 
 
 @compiled
-def _clip(at: Array, half: Array, k: int, centre: float, reach: float) -> float:
-    """Clip one side of a box to |s - centre| <= reach (relative to its middle); return the share that is left."""
-    slack = 1e-9 * (abs(centre) + reach)
-    old = half[k]
-    low, high = max(-old, centre - reach - slack), min(old, centre + reach + slack)
-    if low > high:
-        return 0.0
-    if low > -old or high < old:
-        at[k], half[k] = at[k] + 0.5 * (low + high), 0.5 * (high - low) * (1.0 + 1e-12) + 1e-15 * (abs(at[k]) + old)
-    return min(half[k] / old, 1.0)
+def clip(cut: Array, k: int, centre: float, reach: float) -> None:
+    """Clip coordinate k of a box to ``|s - centre| <= reach``, with some slack for rounding."""
+    reach += 1e-9 * (abs(centre) + reach)
+    cut[k], cut[3 + k] = max(cut[k], centre - reach), min(cut[3 + k], centre + reach)
+
+
+@compiled
+def cut_out(cut: Array, at: Array, half: Array) -> float:
+    """Replace a box by its part between the ends of a cut; return the share of its volume that this is."""
+    share = 1.0
+    for k in range(3):
+        low, high, old = cut[k], cut[3 + k], half[k]
+        if low > high:
+            return 0.0
+        if low > -old or high < old:
+            middle = at[k] + 0.5 * (low + high)
+            half[k] = min(0.5 * (high - low) * (1.0 + 1e-12) + 1e-15 * (abs(at[k]) + old), old)
+            at[k] = middle
+            share *= half[k] / old
+    return share
 
 
 @compiled

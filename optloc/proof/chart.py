@@ -70,6 +70,8 @@ class Box(NamedTuple):
         Tables, see `optloc.proof.boxes` and `optloc.proof.convex`.
     solve : array (3, 3)
         Working memory.
+    cut : array (6,)
+        Ends of the part of the box that is left, about its centre.
     """
 
     at: Array
@@ -81,6 +83,7 @@ class Box(NamedTuple):
     curves: Array
     sums: Array
     solve: Array
+    cut: Array
 
 
 @compiled
@@ -111,6 +114,7 @@ def empty_box(q: int, J: int) -> Box:
         np.empty((J, CURVE_WIDTH)),
         np.empty(SUMS),
         np.empty((3, 3)),
+        np.empty(6),
     )
 
 

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from math import inf, sqrt
 
+import numpy as np
+
 from optloc.kernels.jit import compiled
 from optloc.proof.angles import curve_azimuth, curve_elevation
+from optloc.proof.boxes import clip
 from optloc.proof.height import curve_height
 from optloc.proof.linear3 import inverse, positive
 from optloc.proof.nodes import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO
@@ -244,40 +247,52 @@ def spread_of(A: Array, half: Array, nodes: Array, curves: Array, sums: Array) -
 
 
 @compiled
-def slopes_everywhere(A: Array, half: Array, nodes: Array, curves: Array, sums: Array, solve: Array) -> bool:
-    """Return whether the gradient of f cannot vanish in the box (interval Newton test).
+def clip_to_stationary(
+    A: Array, half: Array, nodes: Array, curves: Array, sums: Array, cut: Array, solve: Array
+) -> None:
+    """Clip a box to where the gradient of f may vanish.
 
-    The gradient at c + s is ``g + H(.) s``, H the mean of the Hessian between centre and s. Bounds of its change over
-    t times the box are at most t times those over the box (`optloc.proof.nodes`), so the mean changes by half of them.
-    With any matrix Y, here the inverse of the Hessian at the centre, a component of ``Y g`` larger than all that
-    ``Y H(.) s`` can be excludes a zero.
+    Interval Newton: the gradient at c + s is ``g + H s``, H the mean of the Hessian between centre and s. Bounds of its
+    change over t times the box are at most t times those over the box (`optloc.proof.nodes`), so the mean changes by
+    half of them. With Y the inverse of the Hessian at the centre a zero obeys ``s = -Y g - (Y H - 1) s``.
 
     Parameters
     ----------
     A, half, nodes, curves, sums : arrays
         As of `convex`.
+    cut : array (6,)
+        Lower and upper ends of the box about its centre; clipped.
     solve : array (3, 3)
         Working memory.
     """
     ball = spread_of(A, half, nodes, curves, sums)
     if not ball < inf:
-        return False
-    a, b, c, d, e, f = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
-    if half[2] == 0.0 and f == 0.0:
-        f = 1.0
+        return
+    plane = half[2] == 0.0 and sums[5] == 0.0
+    a, b, c, d, e, f = sums[0], sums[1], sums[2], sums[3], sums[4], 1.0 if plane else sums[5]
     if not inverse(a, b, c, d, e, f, solve):
-        return False
+        return
     h0, h1, h2 = half[0], half[1], half[2]
     ball *= 0.5 * sqrt(h0 * h0 + h1 * h1 + h2 * h2)
     w0 = 0.5 * (sums[9] * h0 + sums[10] * h1 + sums[11] * h2)
     w1 = 0.5 * (sums[10] * h0 + sums[12] * h1 + sums[13] * h2)
     w2 = 0.5 * (sums[11] * h0 + sums[13] * h1 + sums[14] * h2)
-    for k in range(3):
+    for k in range(2 if plane else 3):
         y0, y1, y2 = solve[k, 0], solve[k, 1], solve[k, 2]
-        step = abs(y0 * sums[6] + y1 * sums[7] + y2 * sums[8])
-        reach = abs(y0 * a + y1 * b + y2 * c) * h0 + abs(y0 * b + y1 * d + y2 * e) * h1
-        reach += abs(y0 * c + y1 * e + y2 * f) * h2 + abs(y0) * w0 + abs(y1) * w1 + abs(y2) * w2
+        step = y0 * sums[6] + y1 * sums[7] + y2 * sums[8]
+        # What rounding leaves of Y H - 1 counts as change.
+        e0, e1, e2 = y0 * a + y1 * b + y2 * c, y0 * b + y1 * d + y2 * e, y0 * c + y1 * e + y2 * f
+        e0, e1, e2 = e0 - (k == 0), e1 - (k == 1), e2 - (k == 2)
+        reach = abs(e0) * h0 + abs(e1) * h1 + abs(e2) * h2 + abs(y0) * w0 + abs(y1) * w1 + abs(y2) * w2
         reach += sqrt(y0 * y0 + y1 * y1 + y2 * y2) * ball
-        if step > reach * (1.0 + 1e-6) + 1e-9:
-            return True
-    return False
+        clip(cut, k, -step, reach + 1e-9)
+
+
+@compiled
+def slopes_everywhere(A: Array, half: Array, nodes: Array, curves: Array, sums: Array, solve: Array) -> bool:
+    """Return whether the gradient of f cannot vanish in the box; arguments as of `clip_to_stationary`."""
+    cut = np.empty(6)
+    for k in range(3):
+        cut[k], cut[3 + k] = -half[k], half[k]
+    clip_to_stationary(A, half, nodes, curves, sums, cut, solve)
+    return bool(cut[0] > cut[3] or cut[1] > cut[4] or cut[2] > cut[5])

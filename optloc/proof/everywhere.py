@@ -1,4 +1,4 @@
-"""The proof for all positions where nothing encloses the cheap ones: the atlas of all space is searched."""
+"""The proof for all positions: an enclosure where there is one, else the atlas of all space."""
 
 from __future__ import annotations
 
@@ -10,15 +10,18 @@ from optloc.kernels.jit import compiled
 from optloc.proof.atlas import atlas_of, cube
 from optloc.proof.chart import Box, Chart, Cost, chart_at, cost_of, curve_box, empty_box, value_at
 from optloc.proof.convex import convex
+from optloc.proof.far import reaches_infinity
 from optloc.proof.far_search import ANOTHER, CHEAPER, CLEAR, INFINITE, search_everywhere
 from optloc.proof.grow import grow
-from optloc.proof.search import BETTER, BUDGET, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE
+from optloc.proof.search import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove
 from optloc.types import Array
 
 # A verdict beside those of `optloc.proof.search`: the cost at infinity is within the gap.
 UNBOUNDED = 8
 # No convex box is looked for beyond this many standard deviations of the fix.
 _WIDEST = 1e4
+# Boxes after which the search of an enclosure is given up for the atlas, which takes some hundred.
+_SOON = 500
 
 
 @compiled
@@ -36,24 +39,46 @@ def prove_everywhere(
 ) -> tuple[int, int, float]:
     """Prove that no position costs less than a fix, and that no other minimum has a gap below kappa.
 
-    The claim is for all positions, to infinity, and needs no enclosure; where there is one,
-    `optloc.proof.search.prove` is faster.
+    The claim is for all positions, to infinity. Where something encloses the cheap ones, that is searched first; where
+    nothing does, or the search does not end soon, and the cost stays finite at infinity, the atlas of all space.
 
     Parameters
     ----------
     kinds, data, K, w, x, others, kappa, eps, budget, found
-        As of `optloc.proof.search.prove`; `optloc.proof.far.reaches_infinity` must hold.
+        As of `optloc.proof.search.prove`.
 
     Returns
     -------
     verdict : int
-        UNIQUE, VALUE, BETTER, OTHER, BUDGET, STATIONARY or SINGULAR as there. UNBOUNDED: the cost at infinity is below
-        that of the fix plus kappa.
+        As of `optloc.proof.search.prove`. UNBOUNDED: the cost at infinity is below that of the fix plus kappa.
     boxes : int
         How many boxes were looked at.
     bound : float
         A certified lower bound of f over all positions; -inf where there is none.
     """
+    nowhere, open_end = np.full(x.shape[0], np.nan), reaches_infinity(kinds, K)
+    first = min(budget, _SOON) if open_end else budget
+    verdict, boxes, bound = prove(kinds, data, K, w, x, others, kappa, eps, first, nowhere, nowhere, False, found)
+    if not open_end or verdict not in (OPEN, BUDGET) or boxes >= budget:
+        return verdict, boxes, bound
+    verdict, more, bound = prove_atlas(kinds, data, K, w, x, others, kappa, eps, budget - boxes, found)
+    return verdict, boxes + more, bound
+
+
+@compiled
+def prove_atlas(
+    kinds: Array,
+    data: Array,
+    K: Array,
+    w: Array,
+    x: Array,
+    others: Array,
+    kappa: float,
+    eps: float,
+    budget: int,
+    found: Array,
+) -> tuple[int, int, float]:
+    """Prove the same as `prove_everywhere`, with the atlas alone; `optloc.proof.far.reaches_infinity` must hold."""
     cost, box = cost_of(kinds, data, K, w), empty_box(K.shape[0], K.shape[1])
     chart, good = chart_at(cost, x, box)
     if not good:

@@ -13,7 +13,7 @@ from __future__ import annotations
 from optloc.kernels.jit import compiled
 from optloc.proof.angles import bound_azimuth, bound_elevation, curve_azimuth, curve_elevation
 from optloc.proof.atlas import Atlas, scaled_station, set_line
-from optloc.proof.forms import blend, range_bend, range_form, reach, still, triple, unbounded, write
+from optloc.proof.forms import RangeForm, blend, range_bend, range_form, reach, still, triple, unbounded, write
 from optloc.proof.nodes import AZIMUTH, ELEVATION, RANGE, RATIO
 from optloc.proof.ratio import bound_ratio, curve_ratio, quotient, quotient_bend
 from optloc.types import Array
@@ -50,16 +50,19 @@ def reaches_infinity(kinds: Array, K: Array) -> bool:
 
 
 @compiled
-def bound_difference(atlas: Atlas, data: Array, half: Array, slope: Array) -> tuple[float, float, float]:
+def bound_difference(
+    atlas: Atlas, data: Array, centre: RangeForm, half: Array, slope: Array
+) -> tuple[float, float, float]:
     """Bound a range less the distance to the centre over a box, metres; as the functions of `optloc.proof.nodes`.
 
     A quotient N/S with N linear, as ratios are (`optloc.proof.ratio.bound_ratio`), and at most ``R |a|`` in size.
+    `centre` is what `optloc.proof.forms.range_form` says of p.
     """
     h, radius = triple(half, 0), atlas.radius
     set_line(atlas, data, 0, atlas.away, atlas.sense)
     a, rise, n = scaled_station(atlas, data)
     r, u, least, q = range_form(atlas.away, atlas.sense, h)
-    r0, u0, least0, q0 = range_form(atlas.point, atlas.flat, h)
+    r0, u0, least0, q0 = centre
     size, u, most = r + r0, blend(1.0, u, 1.0, u0), q + q0
     phi, least = rise / size if size > 0.0 else 0.0, max(least, 0.0) + max(least0, 0.0)
     if least > 0.0:
@@ -73,16 +76,16 @@ def bound_difference(atlas: Atlas, data: Array, half: Array, slope: Array) -> tu
 
 
 @compiled
-def curve_difference(atlas: Atlas, data: Array, half: Array, turn: Array) -> float:
+def curve_difference(atlas: Atlas, data: Array, centre: RangeForm, half: Array, turn: Array) -> float:
     """Bound how a range less the distance to the centre curves over a box; the Hessian goes into ``atlas.bend``."""
     h, bend, second = triple(half, 0), atlas.bend, atlas.second
-    bound_difference(atlas, data, half, turn)
+    bound_difference(atlas, data, centre, half, turn)
     a, rise, n = scaled_station(atlas, data)
     if a == 0.0:
         bend[:] = 0.0
         return 0.0
     r, u, least, q = range_form(atlas.away, atlas.sense, h)
-    r0, u0, least0, q0 = range_form(atlas.point, atlas.flat, h)
+    r0, u0, least0, q0 = centre
     if still(turn) or not (least > 0.0 and least0 > 0.0):
         return unbounded(bend, turn)
     ds, chi, norm = range_bend(atlas.sense, h, r, u, least, q, second)
@@ -119,10 +122,11 @@ def bound_pieces(atlas: Atlas, kinds: Array, data: Array, half: Array, nodes: Ar
         Written, see `optloc.proof.boxes`.
     """
     away, sense = atlas.away, atlas.sense
+    centre = range_form(atlas.point, atlas.flat, triple(half, 0))
     for j in range(kinds.shape[0]):
         kind, own, slope = kinds[j], data[j], nodes[j, 1:4]
         if kind == RANGE:
-            value, low, high = bound_difference(atlas, own, half, slope)
+            value, low, high = bound_difference(atlas, own, centre, half, slope)
         else:
             set_line(atlas, own, 0, away, sense)
             if kind == AZIMUTH:
@@ -139,10 +143,11 @@ def bound_pieces(atlas: Atlas, kinds: Array, data: Array, half: Array, nodes: Ar
 def curve_pieces(atlas: Atlas, kinds: Array, data: Array, half: Array, curves: Array) -> None:
     """Fill second derivatives and bounds of their change in the table of all nodes (J, CURVE_WIDTH)."""
     away, sense, bend = atlas.away, atlas.sense, atlas.bend
+    centre = range_form(atlas.point, atlas.flat, triple(half, 0))
     for j in range(kinds.shape[0]):
         kind, own, turn = kinds[j], data[j], curves[j, 6:9]
         if kind == RANGE:
-            chi = curve_difference(atlas, own, half, turn)
+            chi = curve_difference(atlas, own, centre, half, turn)
         else:
             set_line(atlas, own, 0, away, sense)
             if kind == AZIMUTH:

@@ -25,6 +25,8 @@ _CAPACITY, _DEPTH = 1024, 8
 _TINY = 1e-5
 # How much wider than the convex box around the fix the box is that is searched in the fix's own axes.
 _WIDER = 3.0
+_ALIKE = 0.1
+_NEAR = 100.0
 
 
 @compiled
@@ -87,7 +89,8 @@ def search_everywhere(
             position(atlas, found)
             return CHEAPER, boxes, 0.0
         touching = piece < 2 * atlas.dimension and box.at[last] <= box.half[last]
-        if _leaves(cost, atlas, box, touching):
+        # The test is dear, and fails in large boxes: only where the cost is low it can spare splits.
+        if here < _NEAR * (level + 1.0) and _leaves(cost, atlas, box, touching):
             continue
         if here < level:
             lows += 1
@@ -153,14 +156,7 @@ def _pieces(stack: Array, dimension: int, core: Array, hole: Array) -> int:
 @compiled
 def _split(stack: Array, size: int, dimension: int, box: Box, low: float, piece: int) -> int:
     """Push the halves of a box, cut across the side along which the residual changes most; return the stack's size."""
-    most, k = -1.0, 0
-    for m in range(dimension):
-        steep = 0.0
-        for i in range(box.rows.shape[0]):
-            steep += box.rows[i, 1 + m] * box.rows[i, 1 + m]
-        steep = sqrt(steep) * box.half[m]
-        if steep > most:
-            most, k = steep, m
+    k = _side(box, dimension)
     for side in range(2):
         stack[size, :3], stack[size, 3:6] = box.at, box.half
         quarter = 0.5 * box.half[k]
@@ -170,6 +166,30 @@ def _split(stack: Array, size: int, dimension: int, box: Box, low: float, piece:
         stack[size, 6], stack[size, 7] = low, piece
         size += 1
     return size
+
+
+@compiled
+def _side(box: Box, dimension: int) -> int:
+    """Return the side along which the residual changes most; a part of that change counts for all sides alike.
+
+    Nodes that are only enclosed have no slope, and bend where they do.
+    """
+    steepest, best, k = 0.0, -1.0, 0
+    for m in range(dimension):
+        steepest = max(steepest, _steepness(box, m))
+    for m in range(dimension):
+        change = (_steepness(box, m) + _ALIKE * steepest + 1e-300) * box.half[m]
+        if change > best:
+            best, k = change, m
+    return k
+
+
+@compiled
+def _steepness(box: Box, m: int) -> float:
+    total = 0.0
+    for i in range(box.rows.shape[0]):
+        total += box.rows[i, 1 + m] * box.rows[i, 1 + m]
+    return sqrt(total)
 
 
 @compiled

@@ -11,6 +11,8 @@ from optloc.kernels.jit import compiled
 from optloc.types import Array
 
 Triple = tuple[float, float, float]
+# A range over a box, see `range_form`.
+RangeForm = tuple[float, Triple, float, float]
 
 
 @compiled
@@ -126,7 +128,7 @@ def across(sense: Array, u: Triple, h: Triple) -> float:
 
 
 @compiled
-def range_form(line: Array, sense: Array, h: Triple) -> tuple[float, Triple, float, float]:
+def range_form(line: Array, sense: Array, h: Triple) -> RangeForm:
     """Return a range over a box: its value r, the linear form u, the least r + u.s, and a bound of the remainder.
 
     The range is ``r + u.s + q`` with ``0 <= q <= remainder``.

@@ -97,7 +97,7 @@ def curve_height(data: Array, line: Array, sense: Array, half: Array, curvature:
     meridian = prime * (1.0 - _E2) / flat
     u, v = pull(east, sense), pull(north, sense)
     bend = 1.0 / (LEAST_RADIUS + height - way)
-    change = bend * min(1.2 * bend * way, 1.0)
+    change = 1.2 * bend * bend * way
     chi = 0.0
     for k in range(3):
         for m in range(3):

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from math import inf, isnan, sqrt
+from typing import NamedTuple
 
 import numpy as np
 
 from optloc.kernels.jit import compiled
-from optloc.proof.boxes import cost_at, rounding, shrink
+from optloc.proof.boxes import cost_at, cut_out, rounding, shrink
 from optloc.proof.chart import (
     Box,
     Chart,
@@ -21,7 +22,7 @@ from optloc.proof.chart import (
     is_convex,
     value_at,
 )
-from optloc.proof.convex import convex, slopes_everywhere
+from optloc.proof.convex import clip_to_stationary, convex
 from optloc.proof.descend import descend
 from optloc.proof.enclosure import enclose
 from optloc.proof.grow import grow
@@ -31,7 +32,8 @@ from optloc.types import Array
 # Verdicts of a proof.
 UNIQUE, VALUE, BETTER, OTHER, BUDGET, OPEN, STATIONARY, SINGULAR = range(8)
 _GOING = -1
-_LARGEST = 1e7
+# Share of a box below which what is left is looked at again before it is cut.
+_SHRUNK = 0.5
 
 
 @compiled
@@ -109,17 +111,15 @@ def prove(
     low, high = np.empty(3), np.empty(3)
     if not _start(cost, chart, box, sqrt(least + kappa), lower, upper, low, high):
         return OPEN, 0, -inf
-    whole = closed or isnan(lower[0])
     minima, sides, known = _minima(cost, chart, box, others, low, high, margin)
     if known == 0:
         return STATIONARY, 0, -inf
     if kappa <= 0.0:
         known = 1
+    aim = Aim(level, least - eps, closed or isnan(lower[0]), accuracy_floor(cost, chart))
     stack = np.empty((CAPACITY, DEPTH))
     size = push_around(stack, low, high, sides[0])
-    verdict, boxes, bound = _search(
-        cost, chart, box, minima[:known], sides[:known], level, least - eps, whole, budget, stack, size
-    )
+    verdict, boxes, bound = _search(cost, chart, box, minima[:known], sides[:known], aim, budget, stack, size)
     if verdict in (BETTER, OTHER):
         for k in range(x.shape[0]):
             found[k] = box.centre[k]
@@ -193,81 +193,116 @@ def _minima(
     return minima, sides, count
 
 
+class Aim(NamedTuple):
+    """What is to be shown of every box.
+
+    Parameters
+    ----------
+    level : float
+        Cost from which on a box is done.
+    value : float
+        Cost below which a point refutes the fix.
+    whole : bool
+        Whether a box is done as well where the gradient cannot vanish, because the search as a whole leaves no way out;
+        otherwise only if its cost is at least `value`.
+    floor : float
+        See `optloc.proof.boxes.least_residual`.
+    """
+
+    level: float
+    value: float
+    whole: bool
+    floor: float
+
+
 @compiled
 def _search(
-    cost: Cost,
-    chart: Chart,
-    box: Box,
-    minima: Array,
-    sides: Array,
-    level: float,
-    value: float,
-    whole: bool,
-    budget: int,
-    stack: Array,
-    size: int,
+    cost: Cost, chart: Chart, box: Box, minima: Array, sides: Array, aim: Aim, budget: int, stack: Array, size: int
 ) -> tuple[int, int, float]:
-    """Empty the stack; return the verdict (-1: all boxes are dealt with), the boxes looked at, and a lower bound.
-
-    `level` is the cost from which on a box is done; below it, where it exceeds `value`, also a box whose cost is at
-    least `value` (or which is part of the whole search) and where the gradient cannot vanish.
-    """
-    rho = sqrt(max(level, 0.0))
-    floor, boxes, low_points = accuracy_floor(cost, chart), 0, 0
+    """Empty the stack; return the verdict (-1: all boxes are dealt with), the boxes looked at, and a lower bound."""
+    boxes, low_points = 0, 0
     while size > 0:
         if boxes >= budget or size + 2 > stack.shape[0]:
             return BUDGET, boxes, _lowest(stack, size)
         size -= 1
         box.at[:], box.half[:] = stack[size, :3], stack[size, 3:6]
         boxes += 1
-        low = bound_box(cost, chart, box, floor)
-        if low > 0.0 and low * low >= level:
+        low = bound_box(cost, chart, box, aim.floor)
+        if low > 0.0 and low * low >= aim.level:
             continue
         here = cost_at(cost.K, cost.w, box.nodes)
-        if here < value:
+        if here < aim.value:
             return BETTER, boxes, 0.0
-        if level > value:
-            sound = whole or (low > 0.0 and low * low >= value)
-            if sound and _known(box, minima, sides):
-                continue
-            curve_box(cost, chart, box)
-            if sound and slopes_everywhere(cost.A, box.half, box.nodes, box.curves, box.sums, box.solve):
-                continue
-            low_points += here < level
-            once = here < level and low_points & (low_points - 1) == 0
-            if once or convex(cost.kinds, cost.A, box.half, box.nodes, box.curves, box.sums, 0.0):
-                keep = stack[size]
-                least = descend(cost, chart, box)
-                if least < value:
-                    return BETTER, boxes, 0.0
-                if least < level and not _known(box, minima, sides):
-                    return OTHER, boxes, 0.0
-                box.at[:], box.half[:] = keep[:3], keep[3:6]
-        share = shrink(
-            cost.K,
-            rho + rounding(cost.K, cost.weight, floor, box.nodes),
-            box.at,
-            box.half,
-            box.nodes,
-            box.rows,
-            box.solve,
-        )
-        if share == 0.0:
-            continue
-        if share < 0.5:
+        for k in range(3):
+            box.cut[k], box.cut[3 + k] = -box.half[k], box.half[k]
+        _shrink(cost, box, aim)
+        if aim.level > aim.value:
+            if aim.whole or (low > 0.0 and low * low >= aim.value):
+                if _known(box, minima, sides):
+                    continue
+                curve_box(cost, chart, box)
+                clip_to_stationary(cost.A, box.half, box.nodes, box.curves, box.sums, box.cut, box.solve)
+            else:
+                curve_box(cost, chart, box)
+            low_points += here < aim.level
+            early = here < aim.level and low_points & (low_points - 1) == 0
+            if not _empty(box.cut) and (early or _is_bowl(cost, box)):
+                verdict = _follow(cost, chart, box, minima, sides, aim)
+                if verdict != _GOING:
+                    return verdict, boxes, 0.0
+        side = _side(cost, chart, box, here < aim.level)
+        share = cut_out(box.cut, box.at, box.half)
+        if 0.0 < share < _SHRUNK:
             size = push(stack, size, box.at, box.half, low)
-        else:
-            size = push_halves(stack, size, _side(cost, chart, box), box.at, box.half, low)
+        elif share > 0.0:
+            size = push_halves(stack, size, side, box.at, box.half, low)
     return _GOING, boxes, inf
 
 
 @compiled
-def _side(cost: Cost, chart: Chart, box: Box) -> int:
+def _shrink(cost: Cost, box: Box, aim: Aim) -> None:
+    rho = sqrt(max(aim.level, 0.0)) + rounding(cost.K, cost.weight, aim.floor, box.nodes)
+    shrink(cost.K, rho, box.half[2] == 0.0, box.nodes, box.rows, box.cut, box.solve)
+
+
+@compiled
+def _empty(cut: Array) -> bool:
+    return bool(cut[0] > cut[3] or cut[1] > cut[4] or cut[2] > cut[5])
+
+
+@compiled
+def _is_bowl(cost: Cost, box: Box) -> bool:
+    return convex(cost.kinds, cost.A, box.half, box.nodes, box.curves, box.sums, 0.0)
+
+
+@compiled
+def _follow(cost: Cost, chart: Chart, box: Box, minima: Array, sides: Array, aim: Aim) -> int:
+    """Descend from the centre of a box to a minimum; return a verdict if it is better or not known, else -1.
+
+    The box is as it was afterwards (but for its tables), or the minimum where there is a verdict.
+    """
+    at0, at1, at2 = box.at[0], box.at[1], box.at[2]
+    h0, h1, h2 = box.half[0], box.half[1], box.half[2]
+    least = descend(cost, chart, box)
+    if least < aim.value:
+        return BETTER
+    if least < aim.level and not _known(box, minima, sides):
+        return OTHER
+    box.at[0], box.at[1], box.at[2] = at0, at1, at2
+    box.half[0], box.half[1], box.half[2] = h0, h1, h2
+    return _GOING
+
+
+@compiled
+def _side(cost: Cost, chart: Chart, box: Box, inside: bool) -> int:
     """Return the coordinate across which to cut a box: where the remainders that matter shrink most.
 
     The remainder of a range is nearly ``s'N s / 2``, so coordinate k has the share ``h_k sum_m |N_km| h_m`` in it; it
-    matters with its pull ``|K_j.v|`` on the bound. Boxes whose ranges have no part in it are cut across the widest side.
+    matters with its pull ``|K_j.v|`` on the bound. Where the centre lies below the level,
+    and where ranges have no part in it, the widest side is cut.
     """
+    if inside:
+        return _widest(box.half)
     t0, t1, t2 = 0.0, 0.0, 0.0
     nodes, half, gram = box.nodes, box.half, chart.gram
     h0, h1, h2 = half[0], half[1], half[2]
@@ -291,9 +326,17 @@ def _side(cost: Cost, chart: Chart, box: Box) -> int:
             t0 += pull * x
             t1 += pull * y
             t2 += pull * z
-    if t0 >= t1 and t0 >= t2 and h0 > 0.0:
+    most = max(t0, t1, t2)
+    if most > 0.0:
+        return 0 if t0 == most else (1 if t1 == most else 2)
+    return _widest(half)
+
+
+@compiled
+def _widest(half: Array) -> int:
+    if half[0] >= half[1] and half[0] >= half[2]:
         return 0
-    return 1 if t1 >= t2 else 2
+    return 1 if half[1] >= half[2] else 2
 
 
 @compiled

@@ -11,11 +11,16 @@ from optloc.errors import InvalidProblem
 from optloc.fix import Fix
 from optloc.problem import Problem
 from optloc.solve.catalogue import FORMULATIONS, METHODS, SOLVERS, stages_of
+from optloc.solve.direct import Quick, shortened
+from optloc.solve.parts import in_parts
 from optloc.solve.reasons import without_open_epochs
 from optloc.solve.stages import given
 from optloc.types import Array
 
 __all__ = ["FORMULATIONS", "METHODS", "SOLVERS", "solve"]
+
+# Machine code takes time to load, more than the stages take for fewer problems.
+_WORTH = 16
 
 
 def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
@@ -40,19 +45,23 @@ def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
     InvalidProblem
         For an unknown method, or where nothing is unknown.
     """
-    stages = stages_of(method)
+    solvers = shortened([stage.solver for stage in stages_of(method)], _WORTH)
     if problem.layout.size == 0:
         raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
     if separable(problem):
         problem = by_epoch(problem)
     shape, flat = problem.batch_shape, problem.flat()
-    fix = None
-    if start is not None:
-        fix = given(flat, _started(problem, start).reshape(-1, problem.layout.size))
-    for stage in stages:
-        fix = stage.solver(flat, fix)
-    assert fix is not None
-    fix = without_open_epochs(fix)
+    vector = None if start is None else _started(problem, start).reshape(-1, problem.layout.size)
+
+    def work(some: Problem, part: slice) -> Fix:
+        fix = None if vector is None else given(some, vector[part])
+        for solver in solvers:
+            fix = solver(some, fix)
+        assert fix is not None
+        return without_open_epochs(fix)
+
+    whole = len(solvers) == 1 and isinstance(solvers[0], Quick)
+    fix = work(flat, slice(None)) if whole else in_parts(flat, work)
     return fix.reshape(shape) if shape != (len(fix),) else fix
 
 

@@ -66,7 +66,9 @@ def least_squares(problem: Problem, start: Array, limit: int = 200) -> Fix:
         code[i, 0] = Status.OK if found.status > 0 else Status.MAX_ITERATIONS
         count("scipy", int(found.nfev))
     stage = Stage("scipy", f"{len(pool)} problems", perf_counter() - began)
-    return finished(problem, given(problem, start), Candidates(pool, cost, code, np.zeros(cost.shape, dtype=int)), stage)
+    return finished(
+        problem, given(problem, start), Candidates(pool, cost, code, np.zeros(cost.shape, dtype=int)), stage
+    )
 
 
 def lifted_sdp(problem: Problem) -> Fix:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from functools import lru_cache
 from time import perf_counter
 from typing import Any
@@ -30,6 +31,9 @@ from optloc.status import Status
 from optloc.symbolic import bounds, constrained, parameters, residual
 from optloc.types import Array
 from optloc.weigh import weighed
+
+# "1" has programs compiled by the system's C compiler: worth its seconds for many fixes of one large structure
+_COMPILE = "OPTLOC_COMPILE_NLP"
 
 
 def nlp(problem: Problem, fix: Fix | None) -> Fix:
@@ -146,7 +150,15 @@ class _Key:
             for b in conjunction(problem)
         )
         self.choice = chosen("nonlinear")
-        self.key = (problem.structure, data, shapes, limits, None if self.choice is None else self.choice.key)
+        self.compiled = os.environ.get(_COMPILE, "") == "1"
+        self.key = (
+            problem.structure,
+            data,
+            shapes,
+            limits,
+            None if self.choice is None else self.choice.key,
+            self.compiled,
+        )
 
     def __hash__(self) -> int:
         return hash(self.key)
@@ -174,9 +186,10 @@ def _program(key: _Key) -> Program:
         residual=scaled,
         equalities=equal,
         inequalities=more,
-        diagonal=False,
+        diagonal=_independent(problem),
         settings={"bound_relax_factor": 0.0, "max_iter": 200},  # by default constraints give way by 1e-8
         choice=key.choice,
+        compiled=key.compiled,
     )
 
 
@@ -185,11 +198,19 @@ def _slot_units(slots: Any, size: float) -> Array:
     return np.concatenate([*units, np.zeros(0)])
 
 
+def _independent(problem: Problem) -> bool:
+    return all(block.row.shape[1] == 1 for block in problem.noise.blocks)
+
+
 def _whitening(problem: Problem) -> Array:
+    """Return the whitening matrix, or the weights alone where errors are independent."""
     rows = problem.count
-    matrix = np.zeros((rows, rows))
+    matrix = np.zeros(rows if _independent(problem) else (rows, rows))
     for whitener in whiten(problem.noise, problem.weight):
         full = np.broadcast_to(whitener.matrix, (1, *whitener.row.shape, whitener.row.shape[1]))[0]
+        if matrix.ndim == 1:
+            matrix[whitener.row[:, 0]] = full[:, 0, 0]
+            continue
         for members, block in zip(whitener.row, full, strict=True):
             matrix[np.ix_(members, members)] = block
     return matrix

@@ -6,18 +6,20 @@ belongs to another cost than the likelihood answers NaN and says so.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from time import perf_counter
 
 import numpy as np
 
 from formulations.range_enclosure import Box, Ranged, ball, enclosure
 from optloc.errors import InvalidProblem, nearest
-from optloc.fix import Fix
+from optloc.fix import Fix, Stage
 from optloc.problem import Problem
 from optloc.solve.angles import angle_bounds, bearings
 from optloc.solve.pieces import one_position
 from optloc.solve.reduce import Ranges, ranges
 from optloc.solve.start import static
+from optloc.status import Certificate
 from optloc.threads import mapped
 from optloc.types import Array
 
@@ -33,6 +35,7 @@ _OTHER_COSTS = {
     "minimax": "the cones bound the worst angle, not the likelihood",
     "heights": "the satellite relaxation bounds the distance from the point below, not the likelihood",
 }
+_NAMES = {"moment": "moment relaxation", "directions": "direction relaxation"}
 METHODS = ("moment", "directions", *_OTHER_COSTS)
 
 
@@ -66,17 +69,15 @@ class Reference:
             return np.asarray(cost - self.bound <= TIGHT * (1.0 + cost))
 
 
-def reference_bound(
-    problem: Problem, fix: Fix, method: str, *, region: float | None = None, threads: int | None = None
-) -> Reference:
+def reference_bound(problem: Problem, fix: Fix, method: str, *, region: float | None = None) -> Reference:
     """Bound the maximum-likelihood cost from below by a convex relaxation, one program for each fix, over threads.
 
     Parameters
     ----------
     problem : Problem
-        Flat batch of N problems.
+        N problems, flattened.
     fix : Fix
-        Refined fixes. A bound is valid whatever the fix, but tight at its best only for the global minimum.
+        Their refined fixes. A bound is valid whatever the fix, but tight at its best only for the global minimum.
     method : {"moment", "directions"}
         Order-2 moments: one static position from range, toa, tdoa and range_sum rows, up to 10 stations.
         Unit directions: one static position from azimuths and elevations. The names of other relaxations are known
@@ -84,8 +85,6 @@ def reference_bound(
     region : float, optional
         Radius of a ball about the middle of the stations, metres: the scope where the rows alone do not enclose the
         positions with a cost as low as that of the fix.
-    threads : int, optional
-        At most so many at a time; `optloc.threads.thread_count` if absent.
 
     Returns
     -------
@@ -104,12 +103,43 @@ def reference_bound(
     """
     if method not in METHODS:
         raise InvalidProblem(f"unknown reference {method!r}", "method", nearest(method, METHODS))
+    problem, fix = problem.flat(), fix.flat()
     why = _OTHER_COSTS.get(method) or _beyond(problem)
     if not why:
         why = _beyond_moments(problem) if method == "moment" else _beyond_directions(problem)
     if why:
         return _nothing(problem, method, why)
-    return _by_moments(problem, fix, region, threads) if method == "moment" else _by_directions(problem, fix)
+    return _by_moments(problem, fix, region) if method == "moment" else _by_directions(problem, fix)
+
+
+def by_reference(problem: Problem, fix: Fix | None) -> Fix:
+    """Return a fix whose certificates compare its cost with the lower bound of the relaxation for its kinds of rows.
+
+    A stage: unit directions for angles, order-2 moments for ranges; fixes of other kinds, and those already proven,
+    stay as they are.
+    """
+    if fix is None:
+        raise InvalidProblem("bound examines a fix", "method", "put it behind a refinement")
+    began = perf_counter()
+    angular = all(rows.kind in ("azimuth", "elevation") for rows in problem.rows)
+    found = reference_bound(problem, fix, "directions" if angular else "moment")
+    certificate, tight = np.array(fix.certificate), found.tight(fix.cost)
+    known = np.flatnonzero(np.isfinite(found.bound))
+    if not len(known):
+        return fix
+    for i in known:
+        if certificate[i].proof != "global":
+            gap = float(fix.cost[i] - found.bound[i])
+            reason = "no position costs less" if tight[i] else f"a lower bound leaves a gap of {gap:.2g}"
+            certificate[i] = Certificate(
+                "global" if tight[i] else "local",
+                f"{reason}; other minima were searched for, not excluded",
+                _NAMES[found.method],
+                float(found.bound[i]),
+                gap,
+            )
+    detail = f"{int(tight[known].sum())} of {len(tight)} proven"
+    return replace(fix, certificate=certificate, stages=(*fix.stages, Stage("bound", detail, perf_counter() - began)))
 
 
 def _beyond(problem: Problem) -> str:
@@ -158,7 +188,7 @@ def _by_directions(problem: Problem, fix: Fix) -> Reference:
     return out
 
 
-def _by_moments(problem: Problem, fix: Fix, region: float | None, threads: int | None) -> Reference:
+def _by_moments(problem: Problem, fix: Fix, region: float | None) -> Reference:
     from formulations.moment_sdp import moment_bound
 
     out, found = _nothing(problem, "moment", ""), ranges(static(problem))
@@ -192,7 +222,7 @@ def _by_moments(problem: Problem, fix: Fix, region: float | None, threads: int |
         if answer.rank_ratio < _RANK_ONE:
             out.point[i] = centre + size * answer.point
 
-    mapped(bounded, range(len(place)), threads)
+    mapped(bounded, range(len(place)))
     return out
 
 

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from optloc.constraints import Face, restored, tangent_at
-from optloc.equations import equations_at
+from optloc.equations import equations_at, serves
+from optloc.kernels.pack import coarseness, packed
 from optloc.noise import Whitener, variances, whiten
 from optloc.normal import Normal, decrement, step
 from optloc.problem import Problem
@@ -19,6 +20,8 @@ from optloc.windows import whole, windows
 
 # Station errors are weighed where the target is thought to be; the weights hardly change with it.
 _WEIGHINGS = 2
+# Systems of more unknowns are better solved one after the other than side by side.
+_UNKNOWNS = 40
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +87,9 @@ def refine(
         One entry for each start.
     """
     rules = _Rules(problem.layout.n_shared, tolerance, limit, damped, face)
+    quick = _compiled(problem, start, item, rules)
+    if quick is not None:
+        return quick
     weights = None
     if not depends_on_place(problem):
         weights = _Weights.of(problem, start)
@@ -96,6 +102,31 @@ def refine(
         done = _iterated(problem, start, _Weights.of(problem, start), rules)
         start = done.x
     return done
+
+
+def _compiled(problem: Problem, start: Array, item: Array | None, rules: _Rules) -> Refined | None:
+    """Return where machine code ends by the same rules, or None where it does not serve or does not pay."""
+    layout = problem.layout
+    few = layout.n_shared + layout.n_local <= _UNKNOWNS and (problem.epochs == 1 or layout.n_local == 0)
+    if rules.face or not few or not serves(problem, len(start)) or depends_on_place(problem):
+        return None
+    found = packed(problem, whiten(weighed(problem).noise, problem.weight))
+    if found is None:
+        return None
+    from optloc.kernels import refine as kernel
+
+    own = np.arange(len(start)) if item is None else np.asarray(item, dtype=np.int64)
+    done = kernel.refined(found, own, start, kernel.Rules(rules.tolerance, rules.limit, rules.damped))
+    n = rules.n
+    equations = Normal(
+        done.matrix[:, :n, :n],
+        done.matrix[:, None, n:, n:],
+        done.matrix[:, None, :n, n:],
+        done.vector[:, :n],
+        done.vector[:, None, n:],
+        done.cost,
+    )
+    return Refined(done.x, done.cost, done.status, done.iterations, equations)
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,7 +223,8 @@ def _blur(problem: Problem, count: int) -> Array:
     squares: Any = 0.0
     for _, _, part in windows(problem, count):
         sigma = np.sqrt(variances(part.noise, part.count))
-        squares = squares + (np.where(part.weight > 0.0, part.observed / sigma, 0.0) ** 2).sum(-1)
+        ratio = (np.abs(part.observed) + coarseness(part)) / sigma
+        squares = squares + (np.where(part.weight > 0.0, ratio, 0.0) ** 2).sum(-1)
     coarse = 4.0 * np.finfo(float).eps * np.sqrt(squares)
     return np.broadcast_to(np.where(np.isfinite(coarse), coarse, 0.0), (count,))
 

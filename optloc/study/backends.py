@@ -24,14 +24,13 @@ class Backend:
         One line for listings.
     """
 
-    kind: Literal["conic", "nonlinear", "least squares", "closed form"]
+    kind: Literal["conic", "nonlinear", "least squares"]
     version: str
     summary: str
 
 
-_PACKAGES = {"CLARABEL": "clarabel", "SCS": "scs", "MOSEK": "Mosek", "COPT": "coptpy", "CVXOPT": "cvxopt"} | {
-    "SDPA": "sdpa-python", "ECOS": "ecos", "QOCO": "qoco", "CUCLARABEL": "juliacall", "GUROBI": "gurobipy"
-} | {"XPRESS": "xpress", "MOREAU": "moreau", "CUOPT": "cuopt"}
+# Where cvxpy's name of a solver is not that of its package.
+_PACKAGES = {"COPT": "coptpy", "CUCLARABEL": "juliacall", "GUROBI": "gurobipy", "MOSEK": "Mosek", "SDPA": "sdpa-python"}
 _NONLINEAR = {
     "ipopt": "interior point with line search (Waechter, Biegler 2006)",
     "sqpmethod": "sequential quadratic programming with CasADi's qrqp",
@@ -71,12 +70,8 @@ def backends() -> dict[str, Backend]:
     for name, summary in _NONLINEAR.items():
         if casadi.has_nlpsol(name):
             found[name] = Backend("nonlinear", f"CasADi {_version('casadi')}", summary)
-    own = _version("optloc")
-    found["lsr"] = Backend("least squares", own, "damped Gauss-Newton from every candidate, batched")
-    found["taylor"] = Backend("least squares", own, "plain undamped iteration: a baseline")
-    found["scipy"] = Backend("least squares", _version("scipy"), "scipy.optimize.least_squares: a baseline")
-    found["gtrs"] = Backend("closed form", own, "minimiser of squared ranges, batched")
-    found["roots"] = Backend("closed form", own, "every stationary point of squared ranges, batched")
+    about = "scipy.optimize.least_squares; a baseline of studies"
+    found["scipy"] = Backend("least squares", _version("scipy"), about)
     return found
 
 
@@ -86,7 +81,7 @@ def kind_of(name: str, where: str) -> Literal["conic", "nonlinear"]:
     if name not in found:
         import cvxpy
 
-        known = {*_PACKAGES, *_NONLINEAR, *cvxpy.settings.SOLVERS} - set(found)
+        known = {*_NONLINEAR, *cvxpy.settings.SOLVERS} - set(found)
         if name in known:
             advice = f"install it; here are {', '.join(found)}"
             raise InvalidProblem(f"the solver {name!r} is not installed, or cannot solve these cones", where, advice)

@@ -1,4 +1,4 @@
-"""What studies compare with: iterations from a guess, the papers' originals, general least squares, weak relaxations."""
+"""What studies compare with: iterations from a guess, the papers' originals, general tools, weak relaxations."""
 
 from __future__ import annotations
 
@@ -98,7 +98,9 @@ def _lifted(drawn: Drawn, start: Array) -> Fix:
 BASELINES: dict[str, Baseline] = {
     "truth": Baseline(_truth, "damped least squares from the truth: the best that any start can lead to", guess=False),
     "gauss-newton": Baseline(_iterated("lsr"), "damped least squares from a guess"),
-    "taylor": Baseline(_iterated("taylor"), "plain undamped Taylor iteration from a guess (Foy 1976), as in the papers"),
+    "taylor": Baseline(
+        _iterated("taylor"), "plain undamped Taylor iteration from a guess (Foy 1976), as in the papers"
+    ),
     "taylor-printed": Baseline(_printed, "the same with the sign of equations 8 and 15 of the paper `kinematic`"),
     "ipopt": Baseline(_iterated("nlp"), "IPOPT from a guess, or another nonlinear solver", slow=True),
     "scipy": Baseline(_general, "scipy.optimize.least_squares with exact derivatives from a guess", slow=True),

@@ -126,8 +126,8 @@ def _swept(table: ScenarioTable) -> Iterator[tuple[dict[str, Any], ScenarioTable
         if not values or name in ("name", "sweep", "noise", "trials"):
             what = "has no values" if not values else "cannot be swept"
             raise InvalidProblem(f"{name!r} {what}", join(where, "sweep"), "give a list; noise has levels of its own")
-    for values in product(*table.sweep.values()):
-        swept = dict(zip(table.sweep, values, strict=True))
+    for chosen in product(*table.sweep.values()):
+        swept = dict(zip(table.sweep, chosen, strict=True))
         data = table.model_dump(exclude_unset=True, exclude={"sweep"})
         for name, value in swept.items():
             *path, last = name.split(".")
@@ -245,7 +245,7 @@ def _noise(problem: Problem, level: Level, from_file: bool, where: str) -> tuple
     if isinstance(level, str):
         level = dict.fromkeys(kinds, level)
     if set(level) != set(kinds):
-        odd = sorted(set(level) ^ set(kinds))[0]
+        odd = min(set(level) ^ set(kinds))
         raise InvalidProblem(f"the levels do not fit the kinds: {odd!r}", where, f"name {', '.join(kinds)}")
     wanted = {kind: sigma_of(kind, amount, where) for kind, amount in level.items()}
     own = np.sqrt(variances(problem.noise, problem.count))

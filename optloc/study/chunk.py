@@ -140,12 +140,27 @@ def part_of(chunk: Chunk, values: Values, seed: tuple[str, ...], build: float) -
     case, method, n = chunk.cell.case, chunk.cell.method, chunk.count
     problem = case.template
     kinds = "+".join(rows.kind for rows in problem.rows)
-    values = values | {
-        **{"key": chunk.cell.key, "data": case.key, "scenario": case.table.name, "method": method.name},
-        **{"solver": method.solver, "noise": case.level, "noise_unit": case.unit, "noise_label": case.label},
-        **{"sweep": case.sweep, "kinds": kinds, "dimension": problem.dimension, "stations": problem.stations.count},
-        **{"rows": problem.count, "epochs": problem.epochs, "trial": chunk.first + np.arange(n), "seed": list(seed)},
-        **{"build": build, "chunk": chunk.key, "machine": machine(), "versions": versions()},
+    values |= {
+        "key": chunk.cell.key,
+        "data": case.key,
+        "scenario": case.table.name,
+        "method": method.name,
+        "solver": method.solver,
+        "noise": case.level,
+        "noise_unit": case.unit,
+        "noise_label": case.label,
+        "sweep": case.sweep,
+        "kinds": kinds,
+        "dimension": problem.dimension,
+        "stations": problem.stations.count,
+        "rows": problem.count,
+        "epochs": problem.epochs,
+        "trial": chunk.first + np.arange(n),
+        "seed": list(seed),
+        "build": build,
+        "chunk": chunk.key,
+        "machine": machine(),
+        "versions": versions(),
     }
     schema = arrow_schema()
     arrays = [_MAKERS[column.kind](values[column.name], n) for column in COLUMNS]

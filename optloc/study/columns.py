@@ -1,4 +1,4 @@
-"""The long table of a study: one row for each trial of each method; the columns with units and meaning, in one place."""
+"""The long table of a study, one row for each trial of each method: columns, units and meaning in one place."""
 
 from __future__ import annotations
 
@@ -39,7 +39,9 @@ COLUMNS: tuple[Column, ...] = (
     Column("scenario", "category", "", "Name of the scenario."),
     Column("method", "category", "", "Name of the method as tables show it; different settings have different names."),
     Column("solver", "category", "", "Back end that was asked for, for instance SCS; empty: the method's own."),
-    Column("noise", "float", "", "Noise level in the unit `noise_unit`: deviation of a row of the first kind, or factor."),
+    Column(
+        "noise", "float", "", "Noise level in the unit `noise_unit`: deviation of a row of the first kind, or factor."
+    ),
     Column("noise_unit", "category", "", "m, m/s, rad or 1; x where levels are factors on the noise of a file."),
     Column("noise_label", "category", "", "The level as the study file writes it."),
     Column("sweep", "category", "", "Swept values as a JSON object of name and value; {} without a sweep."),
@@ -67,7 +69,9 @@ COLUMNS: tuple[Column, ...] = (
     Column("crlb", "float", "m", "Root of the trace of the position's Cramer-Rao bound at the truth."),
     Column("crlb_velocity", "float", "m/s", "The same of the velocity."),
     Column("crlb_bias", "float", "m", "Root mean square bound of the biases in metres."),
-    Column("deviation", "float", "1", "Error in units of the bound: sqrt(e' B^-1 e), B the position's bound at the truth."),
+    Column(
+        "deviation", "float", "1", "Error in units of the bound: sqrt(e' B^-1 e), B the position's bound at the truth."
+    ),
     Column("sigma", "float", "m", "Root of the trace of the position covariance that the method claims."),
     Column("nees", "float", "1", "e' C^-1 e with the claimed covariance C; its expectation is `dimension`."),
     Column("cost", "float", "1", "Maximum-likelihood cost at the estimate, also of estimates that were not refined."),
@@ -77,10 +81,20 @@ COLUMNS: tuple[Column, ...] = (
     Column("proof", "category", "", "Proof of the certificate: global, region, local or unknown."),
     Column("certificate", "category", "", "Method of the certificate."),
     Column("bound", "float", "1", "Certified lower bound of the cost; NaN without one."),
-    Column("iterations", "float", "1", "Iterations of solver and refinement, mean over the fixes of one call; NaN unknown."),
-    Column("seconds", "float", "s", "Time of the solution: that of the call over the number of its fixes.", value=False),
-    Column("build", "float", "s", "Time of the first fix of its kind in its process, before the others: compilation "
-           "and canonicalisation; 0 where that had been done.", value=False),
+    Column(
+        "iterations", "float", "1", "Iterations of solver and refinement, mean over the fixes of one call; NaN unknown."
+    ),
+    Column(
+        "seconds", "float", "s", "Time of the solution: that of the call over the number of its fixes.", value=False
+    ),
+    Column(
+        "build",
+        "float",
+        "s",
+        "Time of the first fix of its kind in its process, before the others: compilation "
+        "and canonicalisation; 0 where that had been done.",
+        value=False,
+    ),
     Column("batch", "int", "", "Number of fixes in the call."),
     Column("chunk", "category", "", "Chunk of the plan that holds the row."),
     Column("machine", "category", "", "Processor, number of cores and system of the worker.", value=False),

@@ -119,7 +119,7 @@ class MethodTable(_Table):
     baseline: str | list[str] | None = None
     """Something to compare with, in the place of a method; see `optloc list baselines`."""
     solver: str | list[str] | None = None
-    """Back end of the conic or nonlinear programs; see `optloc list backends`."""
+    """Back end of the conic or nonlinear programs; see `optloc list solvers`."""
     settings: dict[str, Any] = Field(default_factory=dict)
     """Settings of that back end, such as a time limit or a tolerance."""
     start: Literal["centre", "truth", "box"] = "centre"

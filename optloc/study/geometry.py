@@ -119,17 +119,19 @@ def places(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rn
     if truth.kind == "fixed":
         return np.broadcast_to(_fixed(truth, frame, d, where), (count, d))
     if truth.kind == "area":
-        lat, lon = (np.radians(rng.uniform(*span, count)) for span in (truth.lat_deg, truth.lon_deg) if span)
+        spans = [np.array(span) for span in (truth.lat_deg, truth.lon_deg) if span]
+        lat, lon = (np.radians(rng.uniform(span[0], span[1], count)) for span in spans)
         height = metres([truth.height], join(where, "height"))[0]
         return np.asarray(frame.from_geodetic(lat, lon, np.full(count, height)))
     if truth.kind == "box":
         assert truth.box is not None
         box = metres(truth.box, join(where, "box"), d)
         middle = centre if truth.centre is None else metres(truth.centre, join(where, "centre"), d)
-        return middle + _turned(frame, centre, rng.uniform(-0.5, 0.5, (count, d)) * box)
+        return np.asarray(middle + _turned(frame, centre, rng.uniform(-0.5, 0.5, (count, d)) * box))
     assert truth.distance is not None
     low, high = metres(truth.distance, join(where, "distance"))
-    return centre + _turned(frame, centre, _directions(truth, d, count, rng) * rng.uniform(low, high, (count, 1)))
+    away = _directions(truth, d, count, rng) * rng.uniform(low, high, (count, 1))
+    return np.asarray(centre + _turned(frame, centre, away))
 
 
 def _fixed(truth: TruthTable, frame: Frame, dimension: int, where: str) -> Array:

@@ -71,13 +71,13 @@ def fix_values(case: Case, known: Exact, fix: Fix) -> Values:
     """Return the columns of fixes (n,) of trials."""
     problem, truth, names = known.drawn.problem, known.drawn.truth, case.state
     size = len(truth)
-    x = np.where(np.isfinite(fix.x).all(-1)[:, None], fix.x, np.nan)
+    x = np.where(np.isfinite(fix.x).all(-1, keepdims=True), fix.x, np.nan)
     error = _take(problem, x - truth, names[0])
     claimed = _block(problem, fix.cov, names[0])
     values: Values = {f"error_{axis}": _component(error, i) for i, axis in enumerate("xyz")}
     values |= {
         "answered": fix.answered,
-        "located": np.isfinite(error).all(-1),
+        "located": np.asarray(np.isfinite(error).all(-1)),
         "error": np.linalg.norm(error, axis=-1),
         "error_nearest": _nearest(problem, fix, truth, names[0], error),
         "deviation": np.sqrt(_squared(error, _block(problem, known.bound, names[0]))),
@@ -125,10 +125,10 @@ def _root_trace(matrix: Array) -> Array:
 
 def _squared(error: Array, matrix: Array) -> Array:
     """Return e' M^-1 e (n,); NaN where there is no error or no regular matrix."""
-    usable = np.isfinite(matrix).all((-1, -2)) & np.isfinite(error).all(-1)
+    usable = np.asarray(np.isfinite(matrix).all((-1, -2)) & np.isfinite(error).all(-1))
     kept = np.where(usable[:, None, None], matrix, np.eye(matrix.shape[-1]))
     solved, ok = linalg.solve(kept, np.where(usable[:, None], error, 0.0)[..., None])
-    return np.where(usable & ok, (error * solved[..., 0]).sum(-1), np.nan)
+    return np.asarray(np.where(usable & ok, (error * solved[..., 0]).sum(-1), np.nan))
 
 
 def _nearest(problem: Problem, fix: Fix, truth: Array, name: str, error: Array) -> Array:
@@ -136,7 +136,7 @@ def _nearest(problem: Problem, fix: Fix, truth: Array, name: str, error: Array) 
     for i in range(fix.alternatives.x.shape[1]):
         with np.errstate(invalid="ignore"):
             best = np.fmin(best, np.linalg.norm(_take(problem, fix.alternatives.x[:, i] - truth, name), axis=-1))
-    return best
+    return np.asarray(best)
 
 
 def _cost(problem: Problem, fix: Fix, x: Array) -> Array:

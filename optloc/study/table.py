@@ -81,4 +81,6 @@ def swept(frame: pd.DataFrame) -> pd.DataFrame:
     """Return a frame with one column for each swept parameter, named as in the study file, from the column `sweep`."""
     found: dict[str, dict[str, Any]] = {text: json.loads(text) for text in frame["sweep"].unique()}
     names = dict.fromkeys(name for values in found.values() for name in values)
-    return frame.assign(**{name: frame["sweep"].astype(object).map(lambda t, n=name: found[t].get(n)) for name in names})
+    return frame.assign(
+        **{name: frame["sweep"].astype(object).map(lambda t, n=name: found[t].get(n)) for name in names}
+    )

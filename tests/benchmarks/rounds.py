@@ -19,6 +19,7 @@ ROOT = HERE.parents[1]
 PEERS = "OPTLOC_PEERS"
 ORDER = 200
 ONE_THREAD = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPTLOC_THREADS"), "1")
+ONE_THREAD["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
 
 class Worker:

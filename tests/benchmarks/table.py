@@ -24,7 +24,7 @@ NEAR = 25.0
 
 
 def draw(name: str) -> Scene:
-    """Return a scene: an array of its own for each emitter, in a box of 10 x 10 x 6 km or 10 to 30 km from its middle."""
+    """Return a scene: an array for each emitter, in a box of 10 x 10 x 6 km, the emitter in it or 10 to 30 km away."""
     rng, kind = np.random.default_rng([layouts.SEED, SCENES.index(name)]), layouts.KINDS["tdoa"]
     stations = layouts.anywhere(STATIONS, rng, COUNT)
     truth = {"inside": layouts.inside, "outside": layouts.outside}[name](rng, COUNT)
@@ -222,7 +222,9 @@ def save_csv(found: list[Line], path: Path) -> None:
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         names = ["global", "near", "error", "proven"]
-        writer.writerow(["scene", "method", "group", "fixes_a_round", "rounds", "us_median", "us_min", "products", *names])
+        writer.writerow(
+            ["scene", "method", "group", "fixes_a_round", "rounds", "us_median", "us_min", "products", *names]
+        )
         for line in found:
             times = line.times
             quickest = 1e6 * min(times.seconds) / times.count

@@ -3,51 +3,17 @@
 from dataclasses import replace
 
 import numpy as np
-import pymap3d
 import pytest
 from cases import CASES, STATIONS, TARGET, pairs, stations
+from proof.plain import cost_of
 
 from optloc import Motion, Prior, Stations, assemble, measured, simulate, with_bias
 from optloc.equations import equations_at
-from optloc.proof.nodes import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO
 from optloc.proof.pose import posed
 from optloc.proof.scope import unsupported
 from optloc.types import Bias
 
 PLACES = 12
-
-
-def node_values(problem, kinds, data, x):
-    """Return the values (M, J) of the nodes at positions x (M, d), from the words of the table of nodes."""
-    d, out = x.shape[-1], []
-    for j, kind in enumerate(kinds):
-        p = data[:, j]
-        line = x - p[:, :d]
-        if kind == RANGE:
-            out.append(np.linalg.norm(line, axis=-1))
-        elif kind == RATIO:
-            out.append(np.linalg.norm(line, axis=-1) / np.linalg.norm(x - p[:, 3 : 3 + d], axis=-1))
-        elif kind == LINEAR:
-            out.append((line * p[:, 3 : 3 + d]).sum(-1))
-        elif kind in (AZIMUTH, ELEVATION):
-            own = (p[:, 6:15].reshape(-1, 3, 3)[:, :d, :d] @ line[..., None])[..., 0]
-            if kind == AZIMUTH:
-                angle = np.arctan2(own[:, 1], own[:, 0]) - p[:, 15]
-                out.append((angle + np.pi) % (2.0 * np.pi) - np.pi)
-            else:
-                out.append(np.arcsin(own[:, 2] / np.linalg.norm(own, axis=-1)))
-        else:
-            assert kind == HEIGHT
-            ecef = line @ np.swapaxes(p[0, 6:15].reshape(3, 3), 0, 1) + p[0, 3:6]
-            out.append(pymap3d.ecef2geodetic(*ecef.T)[2])
-    return np.stack(out, axis=-1)
-
-
-def cost_of(problem, x):
-    """Return the posed cost (M,) of one problem at positions x (M, d)."""
-    one = posed(problem.flat())
-    phi = node_values(problem, one.kinds, np.broadcast_to(one.data[:1], (len(x), *one.data.shape[1:])), x)
-    return ((phi @ one.K[0].T - one.w[:1]) ** 2).sum(-1)
 
 
 def profiled(problem, x):

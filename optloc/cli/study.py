@@ -1,0 +1,195 @@
+"""What ``optloc study`` does: run, status, compare; the report has a file of its own."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from optloc.cli.app import Group, Json, Quiet, example
+
+# Heavy libraries are imported inside the commands, so that --help answers at once.
+
+study = typer.Typer(
+    cls=Group,
+    no_args_is_help=True,
+    rich_markup_mode="rich",
+    help="Compare methods and solvers over scenarios, noise levels and many trials.",
+)
+
+Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Output folder of a study.")]
+STOPPED = 130
+"""Exit code after Ctrl-C."""
+
+
+@study.command(
+    epilog=example(
+        "optloc study run divergence --out divergence",
+        "optloc study run my.toml --out runs/my --trials 10000",
+        "optloc study run my.toml --out runs/my --executor dask --scheduler tcp://10.0.0.1:8786",
+    )
+)
+def run(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="Study file, or the name of a shipped study.")],
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Output folder; NAME-study by default. Goes on where it stopped.")
+    ] = None,
+    executor: Annotated[
+        str, typer.Option("--executor", "-x", metavar="NAME", help="in-process, processes, dask or ray.")
+    ] = "processes",
+    scheduler: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Cluster that exists, such as tcp://host:8786; implies dask.")
+    ] = None,
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", "-j", min=1, help="Processes; all processors by default.")
+    ] = None,
+    trials: Annotated[int | None, typer.Option(min=1, help="Trials, in the place of those of the file.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Seed, in the place of that of the file.")] = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Run a study, or go on with one that was stopped: finished parts are kept."""
+    from optloc.study.execute import executor as chosen
+    from optloc.study.plan import plan_of
+    from optloc.study.run import run_plan
+
+    by = chosen("dask" if scheduler is not None and executor == "processes" else executor, jobs, scheduler)
+    plan = plan_of(file, trials=trials, seed=seed)
+    folder = Path(f"{plan.study.name}-study".replace(" ", "-").replace("/", "-")) if out is None else out
+    try:
+        with _bar(plan.study.name, plan.rows, quiet or as_json) as tell:
+            found = run_plan(plan, folder, by, tell)
+    except KeyboardInterrupt:
+        typer.echo(f"Stopped. What is finished is in {folder}; the same command goes on from there.", err=True)
+        raise typer.Exit(STOPPED) from None
+    if as_json:
+        _print_json(_record(found))
+    elif not quiet:
+        _show(found, Console())
+        Console().print(f"The table is in {folder}; optloc study report {folder} makes the report.", highlight=False)
+
+
+@study.command(epilog=example("optloc study status runs/my"))
+def status(folder: Folder, as_json: Json = False) -> None:
+    """Say how far a study is, and what its methods answered. Exit code 1 while something is left to do."""
+    from optloc.study.run import progress
+
+    found = progress(folder)
+    if as_json:
+        _print_json(_record(found))
+    else:
+        _show(found, Console())
+    raise typer.Exit(0 if found.complete else 1)
+
+
+@study.command(epilog=example("optloc study compare runs/before runs/after"))
+def compare(
+    one: Annotated[Path, typer.Argument(metavar="A", help="Output folder of a study.")],
+    two: Annotated[Path, typer.Argument(metavar="B", help="Another one.")],
+    as_json: Json = False,
+) -> None:
+    """Set two studies side by side, cell by cell. Exit code 1 where a share of answers differs by 3 sigma."""
+    from dataclasses import asdict
+
+    from optloc.study.compare import compared
+
+    found = compared(one, two)
+    if as_json:
+        _print_json([asdict(difference) for difference in found])
+    else:
+        _show_comparison(found, one, two, Console())
+    raise typer.Exit(int(any(abs(difference.z) > 3.0 for difference in found)))
+
+
+@study.command()
+def schema() -> None:
+    """Print the JSON schema of study files."""
+    from optloc.study.document import study_schema
+
+    _print_json(study_schema())
+
+
+def _print_json(value: Any) -> None:
+    from optloc.cli.output import dumps
+
+    typer.echo(dumps(value))
+
+
+def _record(found: Any) -> dict[str, Any]:
+    m = found.manifest
+    return {
+        "name": m.name,
+        "title": m.title,
+        "seed": m.seed,
+        "version": m.version,
+        "created": m.created,
+        "machine": m.machine,
+        "versions": m.versions,
+        "complete": found.complete,
+        "chunks": found.done,
+        "chunks_planned": found.chunks,
+        "rows": found.rows,
+        "rows_planned": m.rows,
+        "statuses": found.counts,
+        "methods": [{"method": k, "status": s, "rows": n} for (k, s), n in found.methods.items()],
+    }
+
+
+@contextmanager
+def _bar(title: str, total: int, quiet: bool) -> Iterator[Any]:
+    """Yield a function that moves a bar with the counts of statuses; it is drawn on terminals only."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    counts: Counter[str] = Counter()
+    parts = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    shown = console.is_terminal and not quiet
+    with Progress(*parts, TextColumn("{task.fields[counts]}"), console=console, disable=not shown) as progress:
+        task = progress.add_task(title, total=total, counts="")
+
+        def tell(rows: int, more: dict[str, int]) -> None:
+            counts.update(more)
+            progress.update(task, advance=rows, counts=_in_words(counts))
+
+        yield tell
+
+
+def _in_words(counts: Counter[str], most: int = 3) -> str:
+    first = [f"{status} {count}" for status, count in counts.most_common(most)]
+    rest = counts.total() - sum(count for _, count in counts.most_common(most))
+    return ", ".join([*first, *([f"other {rest}"] if rest else [])])
+
+
+def _show(found: Any, console: Console) -> None:
+    m = found.manifest
+    state = "complete" if found.complete else f"{found.done} of {found.chunks} chunks"
+    table = Table(title=f"{m.title or m.name}: {state}, {found.rows} of {m.rows} rows", title_justify="left")
+    statuses = [status for status, _ in Counter(found.counts).most_common()]
+    table.add_column("method")
+    for name in statuses:
+        table.add_column(name, justify="right")
+    for method in dict.fromkeys(method for method, _ in found.methods):
+        table.add_row(method, *(str(found.methods.get((method, name), 0)) for name in statuses))
+    console.print(table)
+
+
+def _show_comparison(found: list[Any], one: Path, two: Path, console: Console) -> None:
+    table = Table(title=f"A = {one}, B = {two}", title_justify="left")
+    for name in ("scenario", "noise", "method"):
+        table.add_column(name)
+    for name in ("answers A, %", "B, %", "z", "RMSE A, m", "B, m", "time B/A", "values"):
+        table.add_column(name, justify="right")
+    for d in found:
+        scenario, sweep, noise, method = d.cell
+        label = scenario if sweep == "{}" else f"{scenario} {sweep}"
+        values = "identical" if d.identical else "same data" if d.same_data else "other data"
+        times = d.two.seconds / d.one.seconds if d.one.seconds else float("nan")
+        numbers = (100 * d.one.answered, 100 * d.two.answered, d.z, d.one.rmse, d.two.rmse, times)
+        table.add_row(label, noise, method, *("-" if n != n else f"{n:.4g}" for n in numbers), values)  # noqa: PLR0124
+    console.print(table)

@@ -1,0 +1,175 @@
+"""A proof is never wrong: no wrong point is certified, and no search by other means beats a certified fix."""
+
+import numpy as np
+import pytest
+from proof.independent import Trial
+from proof.layouts import BY_NAME, CELLS
+
+from optloc import solve
+from optloc.kernels.jit import enabled
+from optloc.proof.batch import Asked, prove_all
+from optloc.proof.pose import posed, taken
+from optloc.proof.search import UNIQUE, VALUE
+
+EQUAL = 1e-6
+# Formulas of their own exist for all cells but that of satellites, which is in geodetic coordinates.
+NAMES = [cell.name for cell in CELLS if "satellites" not in cell.name]
+HARD = [
+    "TDOA, 6 stations, outside, 30 m",
+    "TDOA, 5 stations, inside, 30 m",
+    "TDOA, 5 stations, outside, 30 m",
+    "TDOA, 5 stations, near-coplanar, outside, 30 m",
+    "TDOA, 6 stations, near-coplanar, inside, 30 m",
+    "range, 5 stations, outside, 30 m",
+    "TOA, 6 stations, outside, 30 m",
+    "range sum, 6 stations, outside, 30 m",
+    "AOA, 4 stations, outside, 20 mrad",
+    "GROA + TDOA, 5 stations, outside, 10 m",
+    "AOA + TDOA, 4 stations, outside, 10 m",
+    "GROA, 6 stations, inside, 2000 permille",
+    "TDOA in the plane, 4 stations, 10 m",
+    "AOA in the plane, 3 stations, 10 mrad",
+    "bistatic, two illuminators, 10 m, 5 mrad",
+]
+# Plain Python takes a thousand times longer for a box.
+SHARE = 1.0 if enabled() else 0.05
+
+
+def counted(count: int) -> int:
+    return max(2, round(count * SHARE))
+
+
+def verdicts(problem, item, x, kappa: float, budget: int = 300):
+    """Return the verdicts (n,) on positions x (n, d) of trials `item`, without any repair."""
+    n, d = x.shape
+    pose = posed(problem.flat())
+    cost = np.array([Trial(problem, i).cost(at) for i, at in zip(item, x, strict=True)])
+    nowhere = np.full((n, 2, d), np.nan)
+    reach = 1e5 * np.stack([-np.ones((n, d)), np.ones((n, d))], axis=1)
+    asked = Asked(
+        x,
+        np.zeros((n, 0, d)),
+        np.zeros(n, dtype=np.int64),
+        np.full(n, kappa),
+        EQUAL * (1.0 + cost),
+        nowhere,
+        reach,
+        np.full(n, budget),
+    )
+    return prove_all(taken(pose, item), asked).verdict
+
+
+def stationary_points(trial: Trial, truth, rng, count: int):
+    """Return points (n, d) where the gradient vanishes, by SciPy: minima, and saddles and maxima between them."""
+    from scipy.optimize import root
+
+    found = [x for x, cost, rest in trial.minima(truth, rng, count) if np.isfinite(cost) and rest < 1e-4]
+    size = np.abs(trial.place).max()
+
+    def gradient(y):
+        return trial.slope(size * y).T @ trial.residual(size * y) * size
+
+    for start in (*found, *(truth + rng.standard_normal((count, len(truth))) * size)):
+        mixed = start + 0.3 * (truth - start) * rng.uniform()
+        with np.errstate(all="ignore"):
+            done = root(gradient, mixed / size, method="hybr", tol=1e-13)
+            if done.success:
+                step = np.linalg.lstsq(trial.slope(size * done.x), trial.residual(size * done.x), rcond=None)[0]
+                if np.linalg.norm(trial.slope(size * done.x) @ step) < 1e-4:
+                    found.append(size * done.x)
+    return np.array(found)
+
+
+def wrong_points(name: str, trials: int, count: int):
+    """Return problem, trials and wrong stationary points of a cell: those that cost more than the best one known."""
+    problem, truth = BY_NAME[name].drawn(trials, more=1)
+    rng = np.random.default_rng(5)
+    item, points = [], []
+    for i in range(trials):
+        trial = Trial(problem, i)
+        x = stationary_points(trial, truth[i], rng, count)
+        cost = np.array([trial.cost(at) for at in x])
+        if len(cost):
+            wrong = cost > cost.min() + 1e-4 * (1.0 + cost.min())
+            item += [i] * int(wrong.sum())
+            points += list(x[wrong])
+    return problem, np.array(item, dtype=np.int64), np.array(points).reshape(-1, truth.shape[1])
+
+
+def check_wrong_points(name: str, trials: int, count: int) -> int:
+    problem, item, points = wrong_points(name, trials, count)
+    for kappa in (0.0, 25.0) if len(points) else ():
+        assert not np.isin(verdicts(problem, item, points, kappa), (UNIQUE, VALUE)).any()
+    return len(points)
+
+
+def test_no_wrong_stationary_point_is_certified():
+    found = sum(check_wrong_points(name, counted(6), 6) for name in HARD)
+    assert found >= 100 * SHARE
+
+
+@pytest.mark.full
+def test_no_wrong_stationary_point_is_certified_in_full():
+    found = sum(check_wrong_points(name, 40, 12) for name in HARD)
+    assert found >= 500
+
+
+def check_candidates(name: str, trials: int, each: int) -> int:
+    """Check random places near and far, most of them no minima; return how many."""
+    problem, truth = BY_NAME[name].drawn(trials, more=2)
+    rng = np.random.default_rng(6)
+    fix = solve(problem, "gtrs+lsr")
+    item = np.repeat(np.arange(trials), each)
+    size = 10.0 ** rng.uniform(-4.0, 4.5, (len(item), 1))
+    x = np.where(np.isfinite(fix.position), fix.position, truth)[item] + size * rng.standard_normal(
+        (len(item), truth.shape[1])
+    )
+    for kappa in (0.0, 25.0):
+        good = np.isin(verdicts(problem, item, x, kappa, 60), (UNIQUE, VALUE))
+        for k in np.flatnonzero(good):  # only what is the best minimum itself may pass
+            trial = Trial(problem, item[k])
+            best = min(cost for _, cost, _ in trial.minima(truth[item[k]], rng, 10))
+            assert trial.cost(x[k]) <= best + EQUAL * (1.0 + best)
+    return len(item)
+
+
+def test_no_random_candidate_is_certified():
+    total = sum(check_candidates(name, counted(10), 6) for name in HARD)
+    assert total >= 900 * SHARE
+
+
+@pytest.mark.full
+def test_no_random_candidate_is_certified_in_full():
+    assert sum(check_candidates(name, 70, 10) for name in HARD) >= 10_000
+
+
+def check_starts(name: str, trials: int, starts: int, more: int = 3) -> tuple[int, int]:
+    """Compare certified fixes with minima by other means; return how many are global, and how many are unique too."""
+    problem, truth = BY_NAME[name].drawn(trials, more=more)
+    fix = solve(problem)
+    rng = np.random.default_rng(7)
+    proofs = fix.certificate
+    for i in np.flatnonzero([c.proof == "global" for c in proofs]):
+        trial, proof, cost = Trial(problem, i), proofs[i], float(fix.cost[i])
+        slack = 2.0 * EQUAL * (1.0 + cost)
+        assert trial.cost(fix.position[i]) == pytest.approx(cost, rel=1e-6, abs=1e-6)
+        known = np.concatenate([fix.position[i : i + 1], problem.layout.take(fix.alternatives.x[i], "position")])
+        for x, least, rest in trial.minima(truth[i], rng, starts):
+            assert least >= cost - slack, f"{name}, trial {i}: {least} at {x} beats {cost}"
+            if proof.unique and least < cost + proof.margin - 0.1 and rest < 1e-3:
+                spread = np.sqrt(np.trace(fix.covariance()[i]))
+                apart = np.sqrt(((known - x) ** 2).sum(-1))
+                assert np.nanmin(apart) < 1e-2 * spread, f"{name}, trial {i}: {x} costs {least - cost} more"
+    return sum(c.proof == "global" for c in proofs), sum(c.unique for c in proofs)
+
+
+@pytest.mark.parametrize("name", HARD)
+def test_twenty_starts_do_not_beat_a_proof(name, record_property):
+    proven, unique = check_starts(name, counted(67), 20)
+    record_property("global, unique", f"{proven}, {unique}")
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", NAMES)
+def test_twenty_starts_do_not_beat_a_proof_in_full(name):
+    check_starts(name, 20_000 // len(NAMES) + 1, 20, more=4)

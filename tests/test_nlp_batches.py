@@ -1,0 +1,20 @@
+"""Nonlinear programs over a batch whose problems have stations of their own."""
+
+import numpy as np
+import pytest
+from cases import STATIONS, TARGET
+
+from optloc import assemble, measured, simulate, solve
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_each_problem_has_its_own_stations(count):
+    rng = np.random.default_rng(1)
+    places = STATIONS[3] + rng.normal(0.0, 500.0, (count, 1, *STATIONS[3].shape))
+    a = np.arange(1, len(STATIONS[3]))
+    exact = assemble(places, measured("tdoa", a=a, b=np.zeros_like(a), arrival_sigma=5.0))
+    problem = simulate(exact, np.broadcast_to(TARGET[3], (count, 3)), np.random.SeedSequence(2))
+    found, expected = solve(problem, "gtrs+nlp"), solve(problem, "gtrs+lsr")
+    sigma = np.sqrt(np.diagonal(expected.cov, axis1=-2, axis2=-1))
+    assert found.answered.all()
+    assert (np.abs(found.position - expected.position) <= 1e-4 * sigma).all()

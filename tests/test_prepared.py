@@ -1,0 +1,263 @@
+"""The direct way from measurements to fixes: the same answers as the stages give, and no item disturbs another."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from cases import CASES, ENU, STATIONS, TARGET, pairs
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from optloc import InvalidProblem, Motion, Status, assemble, crlb, measured, prepare, simulate, solve, station_array
+from optloc.kernels.jit import enabled
+from optloc.solve.maps import direct
+from optloc.solve.parts import in_parts
+from optloc.solve.stages import gtrs, lsr
+
+compiled = pytest.mark.skipif(not enabled(), reason="there is no direct way without machine code")
+TRIALS = 100
+
+
+def by_stages(problem):
+    """Return the fixes of a flat batch by the stages, never directly."""
+    return lsr(problem, gtrs(problem, None))
+
+
+def assert_same(fix, other):
+    """The same verdicts, and the same numbers to a millionth of a standard deviation."""
+    assert np.array_equal(fix.code, other.code)
+    assert np.array_equal(fix.reason, other.reason)
+    assert list(fix.certificate) == list(other.certificate)
+    assert list(fix.active) == list(other.active)
+    assert np.array_equal(fix.dof, other.dof)
+    assert np.array_equal(fix.weights, other.weights)
+    assert fix.layout == other.layout
+    assert [stage.name for stage in fix.stages] == [stage.name for stage in other.stages]
+    assert fix.alternatives.x.shape == other.alternatives.x.shape
+    assert np.array_equal(np.isnan(fix.x), np.isnan(other.x))
+    sigma = np.sqrt(np.diagonal(other.cov, axis1=-2, axis2=-1))
+    n = sigma.shape[-1]
+    assert np.nanmax(np.abs(fix.x[..., :n] - other.x[..., :n]) / sigma, initial=0.0) < 1e-6
+    assert np.allclose(fix.x[..., n:], other.x[..., n:], rtol=1e-9, atol=1e-5, equal_nan=True)
+    spread = sigma[..., :, None] * sigma[..., None, :]
+    assert np.nanmax(np.abs(fix.cov - other.cov) / spread, initial=0.0) < 1e-5
+    assert np.allclose(fix.cost, other.cost, rtol=1e-8, atol=1e-8, equal_nan=True)
+    assert fix.local is None
+    assert other.local is None
+
+
+def ring(d):
+    """Every neighbour against the next, twice: loops among the rows, and no common reference."""
+    s = len(STATIONS[d])
+    a, b = np.arange(s), np.roll(np.arange(s), 1)
+    return assemble(STATIONS[d], measured("tdoa", a=np.r_[a, a], b=np.r_[b, b], sigma=4.0))
+
+
+def absent(d):
+    """A row with weight zero, one with half its weight, and known corrections."""
+    a, b = pairs(d)
+    problem = assemble(STATIONS[d], measured("tdoa", a=a, b=b, arrival_sigma=5.0))
+    weight = np.ones(len(a))
+    weight[1], weight[2] = 0.0, 0.5
+    rows = replace(problem.rows[0], weight=weight, correction=np.linspace(-40.0, 60.0, len(a)))
+    return replace(problem, rows=(rows,))
+
+
+def epochs(d):
+    """A target that stays, heard at three epochs with an emission time each, the last by half of the stations."""
+    s = len(STATIONS[d])
+    a, epoch = np.r_[np.arange(s), np.arange(s), np.arange(s // 2)], np.repeat([0, 1, 2], [s, s, s // 2])
+    rows = measured("toa", a=a, epoch=epoch, sigma=5.0)
+    return assemble(STATIONS[d], rows, times=np.array([0.0, 10.0, 25.0]), motions=(Motion(0),))
+
+
+def loose(d):
+    """Stations whose positions are known to three metres only: as much noise of their arrivals."""
+    a, b = pairs(d)
+    base = station_array(STATIONS[d])
+    stations = replace(base, covariance=np.tile(9.0 * np.eye(d), (base.count, 1, 1)), span="noise")
+    return assemble(stations, measured("tdoa", a=a, b=b, arrival_sigma=5.0))
+
+
+def unheard(d):
+    """A station that no row mentions, far from the others."""
+    a, b = pairs(d)
+    place = np.concatenate([STATIONS[d], 3.0 * STATIONS[d][1:2]])
+    return assemble(place, measured("tdoa", a=a, b=b, arrival_sigma=5.0))
+
+
+def somewhere(d):
+    """In a geodetic frame."""
+    return assemble(STATIONS[d], measured("range", a=np.arange(len(STATIONS[d])), sigma=5.0), frame=ENU)
+
+
+DIRECT = ["tdoa", "range", "toa", "range_sum", "range+range_sum", "toa+tdoa"]
+BUILT = {"ring": ring, "absent": absent, "epochs": epochs, "loose": loose, "unheard": unheard}
+
+
+def problems():
+    """Return every problem that has a direct way, with simulated measurements (TRIALS, m)."""
+    made = {f"{name}-{d}d": CASES[f"{name}-{d}d"].problem for name in DIRECT for d in (2, 3)}
+    made |= {f"{name}-{d}d": build(d) for name, build in BUILT.items() for d in (2, 3)}
+    made["geodetic"] = somewhere(3)
+    return made
+
+
+PROBLEMS = problems()
+
+
+def trials(problem, seed=1, count=TRIALS):
+    early = {"emission": -1234.0 - 77.0 * np.arange(problem.epochs)}
+    local = early["emission"] if problem.layout.n_local else np.zeros(0)
+    return simulate(problem, np.concatenate([TARGET[problem.dimension], local]), seed, trials=count)
+
+
+@compiled
+@pytest.mark.parametrize("name", sorted(PROBLEMS))
+def test_equals_the_stages(name):
+    batch = trials(PROBLEMS[name])
+    assert direct(batch) is not None
+    assert_same(solve(batch, "gtrs+lsr"), by_stages(batch))
+
+
+@compiled
+@pytest.mark.parametrize("kind", ["tdoa", "range", "range_sum"])
+@pytest.mark.parametrize("d", [2, 3])
+def test_random_networks(d, kind):
+    """Stations anew in each problem, emitters near and far, noise from fair to hopeless: every status occurs."""
+    rng = np.random.default_rng([d, len(kind)])
+    count, s = 400, d + 3
+    place = rng.uniform(-5e3, 5e3, (count, 1, s, d))
+    target = rng.standard_normal((count, d)) * 10.0 ** rng.uniform(3.0, 6.0, (count, 1))
+    r = np.sqrt(((place[:, 0] - target[:, None]) ** 2).sum(-1))
+    a, b = np.arange(1, s), np.zeros(s - 1, dtype=int)
+    exact = {"tdoa": r[:, 1:] - r[:, :1], "range": r[:, 1:], "range_sum": r[:, 1:] + r[:, :1]}[kind]
+    z = exact + rng.standard_normal(exact.shape) * 10.0 ** rng.uniform(0.0, 2.0, (count, 1))
+    batch = assemble(place, measured(kind, z, a=a, **({} if kind == "range" else {"b": b}), sigma=10.0))
+    fix = solve(batch, "gtrs+lsr")
+    assert_same(fix, by_stages(batch))
+    assert len(set(fix.code.tolist())) >= (2 if kind == "range" else 3)
+
+
+@compiled
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_any_network(seed):
+    rng = np.random.default_rng(seed)
+    d = int(rng.integers(2, 4))
+    s = int(rng.integers(d + 2, 9))
+    place = rng.uniform(-1.0, 1.0, (s, d)) * 10.0 ** rng.uniform(1.0, 5.0)
+    pair = np.array([(i, j) for i in range(s) for j in range(i)])
+    pair = pair[rng.permutation(len(pair))[: int(rng.integers(d, len(pair) + 1))]]
+    problem = assemble(place, measured("tdoa", a=pair[:, 0], b=pair[:, 1], sigma=10.0 ** rng.uniform(-2.0, 2.0)))
+    batch = simulate(problem, rng.uniform(-1.0, 1.0, d) * np.abs(place).max() * 3.0, seed, trials=20)
+    assert_same(solve(batch, "gtrs+lsr"), by_stages(batch))
+
+
+def test_bad_items_leave_the_others_as_they_are():
+    """Measurements that are not finite, and stations that stand on one line, at one point or nowhere."""
+    rng = np.random.default_rng(7)
+    place = np.broadcast_to(STATIONS[3], (TRIALS, 1, *STATIONS[3].shape)).copy()
+    a, b = pairs(3)
+    good = trials(assemble(place[0], measured("tdoa", a=a, b=b, arrival_sigma=5.0)), seed=3)
+    z = good.z.copy()
+    z[3, 1], z[50, 0], z[99, 4] = np.nan, np.inf, -np.inf
+    place[10, 0] = STATIONS[3][0]
+    place[20, 0] = np.arange(7)[:, None] * np.array([2e3, 1e3, 500.0])
+    place[40, 0, 2] = np.nan
+    z[60] = rng.uniform(-1e5, 1e5, z.shape[1])
+    bad = [3, 10, 20, 40, 50, 60, 99]
+    batch = assemble(place, measured("tdoa", z, a=a, b=b, arrival_sigma=5.0))
+    fix, alone = solve(batch, "gtrs+lsr"), solve(good, "gtrs+lsr")
+    rest = np.setdiff1d(np.arange(TRIALS), bad)
+    assert np.array_equal(fix.x[rest], alone.x[rest])
+    assert np.array_equal(fix.cov[rest], alone.cov[rest])
+    assert_same(fix, by_stages(batch))
+    assert (fix.code[[3, 50, 99]] == Status.REJECTED).all()
+    assert (fix.code[[10, 20]] == Status.SINGULAR_GEOMETRY).all()
+    assert np.isnan(fix.x[[3, 10, 20, 40, 50, 99]]).all()
+
+
+@pytest.mark.parametrize("name", sorted(PROBLEMS))
+def test_prepared_equals_solve(name):
+    batch = trials(PROBLEMS[name], count=40)
+    ready = prepare(PROBLEMS[name])
+    fix = ready(batch.z)
+    assert_same(fix, solve(batch, "gtrs+lsr"))
+    one = ready.solve(batch.z[7])
+    assert one.shape == solve(batch.with_rows(z=batch.z[7]), "gtrs+lsr").shape == ()
+    assert np.allclose(one.x, fix.x[7], rtol=0.0, atol=1e-6)
+    many = ready(batch.z.reshape(4, 10, -1))
+    assert np.array_equal(many.x, fix.x.reshape(4, 10, -1))
+    assert many.reason.shape == (4, 10)
+
+
+@pytest.mark.parametrize("method", ["gtrs+lsr", "roots+lsr", "auto"])
+@pytest.mark.parametrize("name", ["tdoa+azimuth-2d", "groa-3d", "angles-3d", "tdoa+height-3d", "tdoa-3d"])
+def test_every_problem_and_method_can_be_prepared(name, method):
+    problem = CASES[name].problem
+    fix, other = prepare(problem, method)(problem.z), solve(problem, method)
+    assert fix.status == other.status
+    assert np.allclose(fix.x, other.x, rtol=0.0, atol=1e-4, equal_nan=True)
+    assert [s.name for s in fix.stages] == [s.name for s in other.stages]
+
+
+def test_prepared_networks_share_measurement_axes():
+    """Two networks and five measurements of each: batch axes broadcast."""
+    a, b = pairs(3)
+    place = np.stack([STATIONS[3], 1.5 * STATIONS[3]])[:, None]
+    pair = assemble(place, measured("tdoa", a=a, b=b, arrival_sigma=5.0))
+    z = np.stack([trials(pair.take(np.array([i])), seed=i, count=5).z for i in (0, 1)], axis=1)
+    fix = prepare(pair)(z)
+    assert fix.shape == z.shape[:2] == (5, 2)
+    for i in (0, 1):
+        alone = prepare(assemble(place[i, 0], measured("tdoa", a=a, b=b, arrival_sigma=5.0)))(z[:, i])
+        assert np.array_equal(fix.x[:, i], alone.x)
+
+
+def test_prepared_refuses_what_does_not_fit():
+    ready = prepare(CASES["tdoa-3d"].problem)
+    with pytest.raises(InvalidProblem, match="6 rows"):
+        ready(np.zeros(5))
+    with pytest.raises(InvalidProblem, match="6 rows"):
+        ready(3.0)
+    with pytest.raises(InvalidProblem, match="unknown method"):
+        prepare(CASES["tdoa-3d"].problem, "gtrss+lsr")
+    a, b = pairs(3)
+    two = assemble(np.stack([STATIONS[3]] * 2)[:, None], measured("tdoa", a=a, b=b, sigma=1.0))
+    with pytest.raises(InvalidProblem, match="batch axes"):
+        prepare(two)(np.zeros((3, 6)))
+
+
+def test_errors_are_those_that_the_covariance_says():
+    """By the truth alone: mean squared errors on the bound, and normalised ones that average to the dimension."""
+    case, count = CASES["tdoa-3d"], 4000
+    fix = prepare(case.problem)(simulate(case.problem, case.truth, 11, trials=count).z)
+    error = fix.position - case.truth
+    bound = crlb(case.problem, case.truth)
+    scatter = error.T @ error / count
+    assert np.allclose(np.diag(scatter), np.diag(bound), rtol=6.0 * np.sqrt(2.0 / count))
+    nees = np.einsum("Ni,Nij,Nj->N", error, np.linalg.inv(fix.cov), error)
+    assert abs(nees.mean() - 3.0) < 5.0 * np.sqrt(6.0 / count)
+    assert abs(fix.cost.mean() - fix.dof[0]) < 5.0 * np.sqrt(2.0 * fix.dof[0] / count)
+
+
+@pytest.mark.parametrize("method", ["gtrs+lsr", "roots+lsr", "roots+lsr+widen+lsr+search"])
+def test_parts_make_the_whole(method):
+    """A large batch is worked on in parts: the same fixes, whatever slots of alternatives each part needs."""
+    near_plane = STATIONS[3] * np.array([1.0, 1.0, 0.01])
+    a, b = pairs(3)
+    batch = simulate(
+        assemble(near_plane, measured("tdoa", a=a, b=b, sigma=5.0)), np.array([3e3, 4e3, 500.0]), 2, trials=50
+    )
+    parts = in_parts(batch, lambda some, part: solve(some, method), most=7)
+    fix = solve(batch, method)
+    for name in ("x", "cov", "code", "reason", "cost", "dof", "weights"):
+        mine, theirs = getattr(parts, name), getattr(fix, name)
+        assert mine.shape == theirs.shape
+        assert all(mine[np.isfinite(fix.cost)].ravel() == theirs[np.isfinite(fix.cost)].ravel()) or np.allclose(
+            mine, theirs, rtol=1e-9, atol=1e-6, equal_nan=True
+        )
+    assert np.allclose(parts.alternatives.gap, fix.alternatives.gap, atol=1e-6)
+    assert [s.name for s in parts.stages] == [s.name for s in fix.stages]
+    assert "parts" in parts.stages[0].detail
