@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -115,7 +116,7 @@ def _records(columns: Columns) -> list[dict[str, Any]]:
 
 
 def _detail(fix: Fix, seen: Observability | None) -> dict[str, Any]:
-    certificate = fix.certificate[()]
+    certificate: Any = fix.certificate[()]
     others = fix.alternatives
     shown = np.isfinite(others.gap)
     return {
@@ -125,7 +126,7 @@ def _detail(fix: Fix, seen: Observability | None) -> dict[str, Any]:
             for x, gap, doubt in zip(others.x[shown], others.gap[shown], others.doubt[shown], strict=True)
         ],
         "active": [{"name": a.name, "multiplier": a.multiplier} for a in active_of(fix)],
-        "certificate": {name: getattr(certificate, name, None) for name in ("proof", "reason", "method")},
+        "certificate": {part.name: getattr(certificate, part.name) for part in fields(certificate)},
         "biases": bias_records(fix, seen),
         "not_separable": [] if seen is None else list(seen.sentences),
         "of_each_epoch": {name: values for name, values in fix.bias.items() if not fix.layout.find(name)[1]},

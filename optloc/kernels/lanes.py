@@ -6,7 +6,7 @@ is done with it.
 
 from __future__ import annotations
 
-from math import atan2, cos, pi, sin
+from math import pi
 
 import numpy as np
 
@@ -51,13 +51,13 @@ def _rare(operation: int, r: Array, to: int, u: int, v: int, count: int) -> None
             r[to, i] = np.sqrt(r[u, i] * r[u, i] + r[v, i] * r[v, i])
     elif operation == ATAN2:
         for i in range(count):
-            r[to, i] = atan2(r[u, i], r[v, i])
+            r[to, i] = np.arctan2(r[u, i], r[v, i])
     elif operation == SIN:
         for i in range(count):
-            r[to, i] = sin(r[u, i])
+            r[to, i] = np.sin(r[u, i])
     elif operation == COS:
         for i in range(count):
-            r[to, i] = cos(r[u, i])
+            r[to, i] = np.cos(r[u, i])
     elif operation == LOG:
         for i in range(count):
             r[to, i] = np.log(r[u, i])
@@ -189,7 +189,7 @@ def _residual(m: Array, value: int, observed: int, periodic: int, lanes: int) ->
     if periodic:
         for b in range(lanes):
             if not -pi < m[value, b] <= pi:
-                m[value, b] = atan2(sin(m[value, b]), cos(m[value, b]))
+                m[value, b] = np.arctan2(np.sin(m[value, b]), np.cos(m[value, b]))
 
 
 @compiled

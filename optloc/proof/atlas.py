@@ -1,11 +1,12 @@
-"""An atlas of all positions: around a fix, inside a cube, and outside it to infinity, as boxes of finite size.
+"""An atlas of all positions: around known minima, inside a cube, and outside it to infinity, as boxes of finite size.
 
 A position is ``x = m + R p / v``, with m the centre and R half the side of a cube that holds all stations:
 
 - piece k < 2 D, a face of the cube: p on the surface of the unit cube, v in (0, 1]; v = 0 is infinity. The coordinates
   are those of p on the face, then v: the inverse-range chart;
 - piece 2 D, inside the cube: v = 1, the coordinates are those of p;
-- piece 2 D + 1, around the fix: v = 1, the coordinates are the principal axes s of the fix (`optloc.proof.chart`).
+- piece 2 D + 1 + p, around the known minimum p, the fix first: v = 1, the coordinates are the principal axes s of that
+  minimum (`optloc.proof.chart`).
 
 The line to a station at ``m + R a`` is, but for the factor R/v, ``p - v a``.
 """
@@ -18,7 +19,6 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.kernels.jit import compiled
-from optloc.proof.chart import Chart
 from optloc.proof.forms import Triple, inner, pull, triple
 from optloc.proof.nodes import RATIO
 from optloc.types import Array
@@ -38,8 +38,10 @@ class Atlas(NamedTuple):
         Half its side; all stations lie inside.
     dimension : int
         2 or 3.
-    chart : Chart
-        Search coordinates around the fix.
+    origin, axes, back : array (P, 3), (P, 3, 3), (P, 3, 3)
+        Search coordinates s around the known minima, ``x = origin + axes s``.
+    sides : array (P, 3)
+        Half-widths of boxes around them on which the cost is convex.
     point, away, away_b : array (3,)
         p at the centre of a box, and the scaled lines to a node's stations.
     flat, sense, sense_b : array (3, 3)
@@ -53,7 +55,10 @@ class Atlas(NamedTuple):
     middle: Array
     radius: float
     dimension: int
-    chart: Chart
+    origin: Array
+    axes: Array
+    back: Array
+    sides: Array
     point: Array
     away: Array
     away_b: Array
@@ -66,14 +71,17 @@ class Atlas(NamedTuple):
 
 
 @compiled
-def atlas_of(middle: Array, radius: float, dimension: int, chart: Chart) -> Atlas:
-    """Return the pieces around a cube with centre `middle` (3,) and half-width `radius`, metres, and around a fix."""
+def atlas_of(middle: Array, radius: float, dimension: int, count: int) -> Atlas:
+    """Return the pieces around a cube, centre `middle` (3,) and half-width `radius`, with room for `count` minima."""
     lines, matrices = np.zeros((4, 3)), np.zeros((5, 3, 3))
     return Atlas(
         middle,
         radius,
         dimension,
-        chart,
+        np.zeros((count, 3)),
+        np.zeros((count, 3, 3)),
+        np.zeros((count, 3, 3)),
+        np.zeros((count, 3)),
         lines[0],
         lines[1],
         lines[2],
@@ -83,6 +91,29 @@ def atlas_of(middle: Array, radius: float, dimension: int, chart: Chart) -> Atla
         lines[3],
         matrices[3],
         matrices[4],
+    )
+
+
+@compiled
+def first_minima(atlas: Atlas, count: int) -> Atlas:
+    """Return the atlas with the first `count` of its minima."""
+    return Atlas(
+        atlas.middle,
+        atlas.radius,
+        atlas.dimension,
+        atlas.origin[:count],
+        atlas.axes[:count],
+        atlas.back[:count],
+        atlas.sides[:count],
+        atlas.point,
+        atlas.away,
+        atlas.away_b,
+        atlas.flat,
+        atlas.sense,
+        atlas.sense_b,
+        atlas.scale,
+        atlas.bend,
+        atlas.second,
     )
 
 
@@ -106,10 +137,10 @@ def set_centre(atlas: Atlas, piece: int, at: Array) -> None:
         for k in range(d):
             point[k], flat[k, k] = at[k], 1.0
     elif piece > 2 * d:
-        sense = atlas.chart.sense
+        origin, sense = atlas.origin[piece - 2 * d - 1], atlas.axes[piece - 2 * d - 1]
         for k in range(d):
             move = sense[k, 0] * at[0] + sense[k, 1] * at[1] + sense[k, 2] * at[2]
-            point[k] = (atlas.chart.origin[k] + move - atlas.middle[k]) / atlas.radius
+            point[k] = (origin[k] + move - atlas.middle[k]) / atlas.radius
             for m in range(d):
                 flat[k, m] = sense[k, m] / atlas.radius
     else:
@@ -131,8 +162,8 @@ def position(atlas: Atlas, x: Array) -> None:
 
 
 @compiled
-def within(atlas: Atlas, half: Array, at: Array, sides: Array) -> bool:
-    """Return whether a box lies inside the box ``|s - at| <= sides`` in the search coordinates around the fix.
+def within(atlas: Atlas, half: Array, p: int, wider: float, least: float) -> bool:
+    """Return whether a box lies inside the box around minimum p with half-widths ``max(wider sides, least)``.
 
     Times v, each of these inequalities is between linear forms in the coordinates of every piece.
 
@@ -142,13 +173,15 @@ def within(atlas: Atlas, half: Array, at: Array, sides: Array) -> bool:
         Set by `set_centre`.
     half : array (3,)
         Half-widths of the box.
-    at, sides : array (3,)
-        Centre and half-widths, standard deviations of the fix.
+    p : int
+        Which minimum.
+    wider, least : float
+        Factor of the sides of the convex box, and standard deviations.
     """
     d, v, last = atlas.dimension, atlas.scale[0], atlas.dimension - 1
-    back, origin = atlas.chart.back, atlas.chart.origin
+    back, origin = atlas.back[p], atlas.origin[p]
     for k in range(d):
-        middle, still = 0.0, -at[k]
+        middle, still, side = 0.0, 0.0, max(wider * atlas.sides[p, k], least)
         for m in range(d):
             middle += atlas.radius * back[k, m] * atlas.point[m]
             still += back[k, m] * (atlas.middle[m] - origin[m])
@@ -160,9 +193,9 @@ def within(atlas: Atlas, half: Array, at: Array, sides: Array) -> bool:
                 slope += atlas.radius * back[k, m] * atlas.flat[m, c]
             varies = atlas.scale[1] if c == last else 0.0
             slope += still * varies
-            low += abs(-slope - sides[k] * varies) * half[c]
-            high += abs(slope - sides[k] * varies) * half[c]
-        room = sides[k] * v * (1.0 - 1e-9)
+            low += abs(-slope - side * varies) * half[c]
+            high += abs(slope - side * varies) * half[c]
+        room = side * v * (1.0 - 1e-9)
         if middle + high > room or low - middle > room:
             return False
     return True

@@ -15,7 +15,7 @@ from optloc.proof.search import OPEN, prove
 from optloc.threads import mapped
 from optloc.types import Array
 
-_STRETCH = 256
+_STRETCH = 64
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,17 +88,24 @@ def prove_all(pose: Posed, asked: Asked) -> Answered:
     n, d = asked.x.shape
     whole = np.zeros(n, dtype=np.int64)
     out = Answered(whole, whole.copy(), np.zeros(n), np.zeros(n, dtype=np.bool_), np.full((n, d), np.nan))
-    own = [np.ascontiguousarray(a) for a in (pose.w, *(getattr(asked, name) for name in Asked.__slots__))]
+    own = [_plain(a) for a in (pose.w, *(getattr(asked, name) for name in Asked.__slots__))]
+    geometry = [_plain(pose.data), _plain(pose.K)]
 
     def stretch(first: int) -> None:
         part = slice(first, min(first + _STRETCH, n))
-        given: list[Any] = [array if len(array) == 1 else array[part] for array in (pose.data, pose.K)]
+        given: list[Any] = [array if len(array) == 1 else array[part] for array in geometry]
         given += [array[part] for array in own]
         given += [getattr(out, name)[part] for name in Answered.__slots__]
-        _loop(pose.kinds, *given)
+        with np.errstate(all="ignore"):  # plain Python would warn of what has no bound
+            _loop(pose.kinds, *given)
 
     mapped(stretch, range(0, n, _STRETCH), None if enabled() else 1)
     return out
+
+
+def _plain(array: Array) -> Array:
+    """Return an array in one form for all calls: machine code is made anew for read-only or strided arrays."""
+    return np.require(array, requirements=["C", "W"])
 
 
 @compiled

@@ -7,7 +7,7 @@ from math import inf
 import numpy as np
 
 from optloc.kernels.jit import compiled
-from optloc.proof.atlas import atlas_of, cube
+from optloc.proof.atlas import Atlas, atlas_of, cube, first_minima
 from optloc.proof.chart import Box, Chart, Cost, chart_at, cost_of, curve_box, empty_box, value_at
 from optloc.proof.convex import convex
 from optloc.proof.far import reaches_infinity
@@ -86,15 +86,18 @@ def prove_atlas(
     box.half[:] = 0.0
     box.at[:] = 0.0
     least = value_at(cost, chart, box)
-    minima, sides, known = _minima(cost, chart, box, others if kappa > 0.0 else others[:0], eps)
+    middle, radius = cube(kinds, data)
+    atlas = atlas_of(middle, radius, x.shape[0], 1 + (others.shape[0] if kappa > 0.0 else 0))
+    known = _set_minimum(cost, chart, box, atlas, 0, eps)
     if known == 0:
         return STATIONARY, 0, -inf
-    middle, radius = cube(kinds, data)
-    atlas = atlas_of(middle, radius, x.shape[0], chart)
+    for p in range(atlas.origin.shape[0] - 1):
+        own, good = chart_at(cost, others[p], box)
+        if good:
+            known += _set_minimum(cost, own, box, atlas, known, eps)
+    atlas = first_minima(atlas, known)
     level = least + kappa if kappa > 0.0 else least - eps
-    outcome, boxes, bound = search_everywhere(
-        cost, atlas, minima[:known], sides[:known], level, least - eps, budget, found
-    )
+    outcome, boxes, bound = search_everywhere(cost, atlas, chart, level, least - eps, budget, found)
     if outcome == CLEAR:
         return UNIQUE if kappa > 0.0 else VALUE, boxes, bound
     if outcome == CHEAPER:
@@ -105,33 +108,19 @@ def prove_atlas(
 
 
 @compiled
-def _minima(cost: Cost, chart: Chart, box: Box, others: Array, eps: float) -> tuple[Array, Array, int]:
-    """Return minima in search coordinates, half-widths of convex boxes around them, and their number.
-
-    The fix comes first; the number is 0 where the cost is not convex around it. Others that are no minima are left out.
-    """
-    count, hull = 0, np.zeros(3)
-    minima, sides = np.zeros((1 + others.shape[0], 3)), np.zeros((1 + others.shape[0], 3))
-    hull[: others.shape[1]] = _WIDEST
-    for p in range(1 + others.shape[0]):
-        box.at[:] = 0.0
-        box.half[:] = 0.0
-        for k in range(3 if p > 0 else 0):
-            for m in range(others.shape[1]):
-                box.at[k] += chart.back[k, m] * (others[p - 1, m] - chart.origin[m])
-        value_at(cost, chart, box)
-        curve_box(cost, chart, box)
-        sums = box.sums
-        slope = sums[6] * sums[6] + sums[7] * sums[7] + sums[8] * sums[8]
-        # On a convex box whose Hessian exceeds a margin the cost falls below that of its centre by slope / margin.
-        margin = slope / eps
-        if not convex(cost.kinds, cost.A, box.half, box.nodes, box.curves, sums, margin):
-            if p == 0:
-                return minima, sides, 0
-            continue
-        if grow(cost, chart, box, hull, margin, sides[count]):
-            minima[count] = box.at
-            count += 1
-        elif p == 0:
-            return minima, sides, 0
-    return minima, sides, count
+def _set_minimum(cost: Cost, chart: Chart, box: Box, atlas: Atlas, p: int, eps: float) -> int:
+    """Write a minimum, its search coordinates and a convex box around it into an atlas; return 1, or 0 for none."""
+    box.at[:] = 0.0
+    box.half[:] = 0.0
+    value_at(cost, chart, box)
+    curve_box(cost, chart, box)
+    sums, hull = box.sums, np.zeros(3)
+    # On a convex box whose Hessian exceeds a margin the cost falls below that of its centre by slope^2 / margin.
+    margin = (sums[6] * sums[6] + sums[7] * sums[7] + sums[8] * sums[8]) / eps
+    if not convex(cost.kinds, cost.A, box.half, box.nodes, box.curves, sums, margin):
+        return 0
+    hull[: atlas.dimension] = _WIDEST
+    if not grow(cost, chart, box, hull, margin, atlas.sides[p]):
+        return 0
+    atlas.origin[p], atlas.axes[p], atlas.back[p] = chart.origin, chart.sense, chart.back
+    return 1

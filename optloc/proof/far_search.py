@@ -9,7 +9,7 @@ import numpy as np
 from optloc.kernels.jit import compiled
 from optloc.proof.atlas import Atlas, position, set_centre, within
 from optloc.proof.boxes import cost_at, least_residual, linearise_rows
-from optloc.proof.chart import Box, Cost, empty_box
+from optloc.proof.chart import Box, Chart, Cost, empty_box
 from optloc.proof.convex import slopes_everywhere, spread_of, sum_up
 from optloc.proof.descend import descend
 from optloc.proof.far import bound_pieces, curve_pieces
@@ -20,33 +20,34 @@ from optloc.types import Array
 # What a search finds: nothing, a cheaper point, another minimum below the level, no end within the budget, or a cost at
 # infinity below the level.
 CLEAR, CHEAPER, ANOTHER, SPENT, INFINITE = range(5)
-_CAPACITY, _DEPTH = 1024, 8
+_CAPACITY, _DEPTH = 2048, 8
 # A box at infinity of this size whose cost is below the level is not split further.
 _TINY = 1e-5
-# How much wider than the convex box around the fix the box is that is searched in the fix's own axes.
-_WIDER = 3.0
+# The box around a minimum that is searched in its own axes: how many convex boxes wide, and standard deviations at least.
+_WIDER, _WIDE = 3.0, 3.0
+# Points closer to a minimum than this are that minimum, standard deviations.
+_SAME = 1e-3
 _ALIKE = 0.1
 _NEAR = 100.0
 
 
 @compiled
 def search_everywhere(
-    cost: Cost, atlas: Atlas, minima: Array, sides: Array, level: float, value: float, budget: int, found: Array
+    cost: Cost, atlas: Atlas, chart: Chart, level: float, value: float, budget: int, found: Array
 ) -> tuple[int, int, float]:
     """Search all positions but some boxes for minima that cost less than a level.
 
     A box is done where the cost is at least `level`, or where the gradient cannot vanish: the least cost over all
-    positions, if it is attained, is attained elsewhere. Around the fix boxes lie along its principal axes.
+    positions, if it is attained, is attained elsewhere. Around known minima boxes lie along their principal axes.
 
     Parameters
     ----------
     cost : Cost
         The cost; `optloc.proof.far.reaches_infinity` holds.
     atlas : Atlas
-        The pieces.
-    minima, sides : array (P, 3)
-        Known minima, the fix first, and half-widths of boxes around them where the cost is convex, in the search
-        coordinates of the fix.
+        The pieces, known minima among them.
+    chart : Chart
+        Search coordinates around the fix, in which low points descend.
     level : float
         Cost to exceed.
     value : float
@@ -67,8 +68,8 @@ def search_everywhere(
         A lower bound of f: `value`, unless boxes are left.
     """
     box, near = empty_box(cost.K.shape[0], cost.K.shape[1]), empty_box(cost.K.shape[0], cost.K.shape[1])
-    stack, core, last = np.zeros((_CAPACITY, _DEPTH)), _WIDER * sides[0], atlas.dimension - 1
-    size, boxes, lows, floor = _pieces(stack, atlas.dimension, core, sides[0]), 0, 0, _floor(cost, atlas)
+    stack, last = np.zeros((_CAPACITY, _DEPTH)), atlas.dimension - 1
+    size, boxes, lows, floor = _pieces(stack, atlas), 0, 0, _floor(cost, atlas)
     while size > 0:
         if boxes >= budget or size + 2 > _CAPACITY:
             return SPENT, boxes, _least(stack, size)
@@ -77,7 +78,7 @@ def search_everywhere(
         box.at[:], box.half[:] = stack[size, :3], stack[size, 3:6]
         piece = int(stack[size, 7])
         set_centre(atlas, piece, box.at)
-        if _known(atlas, box, piece, core, minima, sides):
+        if _known(atlas, box, piece):
             continue
         bound_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes)
         linearise_rows(cost.K, cost.w, box.nodes, box.rows)
@@ -94,7 +95,7 @@ def search_everywhere(
             continue
         if here < level:
             lows += 1
-            if lows & (lows - 1) == 0 and _another(cost, atlas, near, minima, sides, level, found):
+            if lows & (lows - 1) == 0 and _another(cost, atlas, chart, near, level, found):
                 return ANOTHER, boxes, 0.0
         if touching and max(box.half[0], box.half[1], box.half[2]) < _TINY and _at_infinity(cost, atlas, box) < level:
             return INFINITE, boxes, 0.0
@@ -103,54 +104,62 @@ def search_everywhere(
 
 
 @compiled
-def _known(atlas: Atlas, box: Box, piece: int, core: Array, minima: Array, sides: Array) -> bool:
-    """Return whether a box lies in the convex box of a known minimum, or in that searched in the fix's own axes."""
-    if piece <= 2 * atlas.dimension and within(atlas, box.half, minima[0], core):
-        return True
+def _known(atlas: Atlas, box: Box, piece: int) -> bool:
+    """Return whether a box lies in the convex box of a known minimum, or in one that is searched in its own axes."""
     known = False
-    for p in range(minima.shape[0]):
-        known = known or within(atlas, box.half, minima[p], sides[p])
+    for p in range(atlas.origin.shape[0]):
+        known = known or within(atlas, box.half, p, 1.0, 0.0)
+        # Searched already, or next: each such box is left to the minimum that comes first.
+        if piece > 2 * atlas.dimension + 1 + p or piece <= 2 * atlas.dimension:
+            known = known or within(atlas, box.half, p, _WIDER, _WIDE)
     return known
 
 
 @compiled
-def _another(cost: Cost, atlas: Atlas, near: Box, minima: Array, sides: Array, level: float, found: Array) -> bool:
+def _another(cost: Cost, atlas: Atlas, chart: Chart, near: Box, level: float, found: Array) -> bool:
     """Return whether the centre of a box descends to a minimum below the level that is not known, and write it."""
-    chart = atlas.chart
+    d = atlas.dimension
     position(atlas, found)
     for k in range(3):
         near.at[k] = 0.0
-        for m in range(atlas.dimension):
+        for m in range(d):
             near.at[k] += chart.back[k, m] * (found[m] - chart.origin[m])
     if not descend(cost, chart, near) < level:
         return False
-    for p in range(minima.shape[0]):
+    for p in range(atlas.origin.shape[0]):
         inside = True
-        for k in range(3):
-            inside = inside and abs(near.at[k] - minima[p, k]) <= sides[p, k]
+        for k in range(d):
+            away = 0.0
+            for m in range(d):
+                away += atlas.back[p, k, m] * (near.centre[m] - atlas.origin[p, m])
+            inside = inside and abs(away) <= max(atlas.sides[p, k], _SAME)
         if inside:
             return False
-    for m in range(atlas.dimension):
+    for m in range(d):
         found[m] = near.centre[m]
     return True
 
 
 @compiled
-def _pieces(stack: Array, dimension: int, core: Array, hole: Array) -> int:
-    """Push all faces of the cube, its inside, and on top of them the core around the fix less its convex box."""
-    size = 2 * dimension
-    for piece in range(size + 1):
-        for k in range(dimension):
+def _pieces(stack: Array, atlas: Atlas) -> int:
+    """Push all faces of the cube, its inside, and on top of them the surroundings of known minima, the fix last."""
+    d = atlas.dimension
+    size = 2 * d + 1
+    for piece in range(size):
+        for k in range(d):
             stack[piece, 3 + k] = 1.0
-        if piece < size:
-            stack[piece, dimension - 1] = stack[piece, dimension + 2] = 0.5
+        if piece < 2 * d:
+            stack[piece, d - 1] = stack[piece, d + 2] = 0.5
         stack[piece, 7] = piece
-    slabs = np.zeros((6, 7))
-    count = push_around(slabs, -core, core, hole)
-    for i in range(count):
-        stack[size + 1 + i, :7] = slabs[i]
-        stack[size + 1 + i, 7] = size + 1
-    return size + 1 + count
+    slabs, core = np.zeros((6, 7)), np.zeros(3)
+    for p in range(atlas.origin.shape[0] - 1, -1, -1):
+        for k in range(d):
+            core[k] = max(_WIDER * atlas.sides[p, k], _WIDE)
+        for i in range(push_around(slabs, -core, core, atlas.sides[p])):
+            stack[size, :7] = slabs[i]
+            stack[size, 7] = 2 * d + 1 + p
+            size += 1
+    return size
 
 
 @compiled
@@ -243,7 +252,7 @@ def _floor(cost: Cost, atlas: Atlas) -> float:
     total = sqrt(total)
     size = 4.0 * atlas.radius + abs(atlas.middle[0]) + abs(atlas.middle[1]) + abs(atlas.middle[2])
     for k in range(atlas.dimension):
-        size += abs(atlas.chart.origin[k])
+        size += abs(atlas.origin[0, k])
     for j in range(cost.kinds.shape[0]):
         total += cost.weight[j] * (size if cost.kinds[j] == RANGE else 4.0)
     return total

@@ -181,4 +181,4 @@ def range_bend(
 def _gram(sense: Array, u: Triple, k: int, m: int) -> float:
     entry = sense[0, k] * sense[0, m] + sense[1, k] * sense[1, m] + sense[2, k] * sense[2, m] - u[k] * u[m]
     # A squared length: rounding may not make it negative.
-    return max(entry, 0.0) if k == m else entry
+    return float(max(entry, 0.0)) if k == m else float(entry)

@@ -116,7 +116,7 @@ def prove(
         return STATIONARY, 0, -inf
     if kappa <= 0.0:
         known = 1
-    aim = Aim(level, least - eps, closed or isnan(lower[0]), accuracy_floor(cost, chart))
+    aim = Aim(level, least - eps, least - 0.5 * eps, closed or isnan(lower[0]), accuracy_floor(cost, chart))
     stack = np.empty((CAPACITY, DEPTH))
     size = push_around(stack, low, high, sides[0])
     verdict, boxes, bound = _search(cost, chart, box, minima[:known], sides[:known], aim, budget, stack, size)
@@ -201,7 +201,9 @@ class Aim(NamedTuple):
     level : float
         Cost from which on a box is done.
     value : float
-        Cost below which a point refutes the fix.
+        Cost that every point must be shown to have.
+    better : float
+        Cost below which a point refutes the fix; above `value`, so that no sliver is left between the two.
     whole : bool
         Whether a box is done as well where the gradient cannot vanish, because the search as a whole leaves no way out;
         otherwise only if its cost is at least `value`.
@@ -211,6 +213,7 @@ class Aim(NamedTuple):
 
     level: float
     value: float
+    better: float
     whole: bool
     floor: float
 
@@ -231,7 +234,7 @@ def _search(
         if low > 0.0 and low * low >= aim.level:
             continue
         here = cost_at(cost.K, cost.w, box.nodes)
-        if here < aim.value:
+        if here < aim.better:
             return BETTER, boxes, 0.0
         for k in range(3):
             box.cut[k], box.cut[3 + k] = -box.half[k], box.half[k]
@@ -250,7 +253,7 @@ def _search(
                 verdict = _follow(cost, chart, box, minima, sides, aim)
                 if verdict != _GOING:
                     return verdict, boxes, 0.0
-        side = _side(cost, chart, box, here < aim.level)
+        side = _side(cost, chart, box, sqrt(max(aim.level, 0.0)) - low)
         share = cut_out(box.cut, box.at, box.half)
         if 0.0 < share < _SHRUNK:
             size = push(stack, size, box.at, box.half, low)
@@ -284,7 +287,7 @@ def _follow(cost: Cost, chart: Chart, box: Box, minima: Array, sides: Array, aim
     at0, at1, at2 = box.at[0], box.at[1], box.at[2]
     h0, h1, h2 = box.half[0], box.half[1], box.half[2]
     least = descend(cost, chart, box)
-    if least < aim.value:
+    if least < aim.better:
         return BETTER
     if least < aim.level and not _known(box, minima, sides):
         return OTHER
@@ -294,42 +297,38 @@ def _follow(cost: Cost, chart: Chart, box: Box, minima: Array, sides: Array, aim
 
 
 @compiled
-def _side(cost: Cost, chart: Chart, box: Box, inside: bool) -> int:
+def _side(cost: Cost, chart: Chart, box: Box, missing: float) -> int:
     """Return the coordinate across which to cut a box: where the remainders that matter shrink most.
 
     The remainder of a range is nearly ``s'N s / 2``, so coordinate k has the share ``h_k sum_m |N_km| h_m`` in it; it
-    matters with its pull ``|K_j.v|`` on the bound. Where the centre lies below the level,
-    and where ranges have no part in it, the widest side is cut.
+    matters with its pull ``|K_j.v|`` on the bound. Where ranges have no part in the bound, or where it would miss the
+    level even without remainders, the widest side is cut.
     """
-    if inside:
-        return _widest(box.half)
-    t0, t1, t2 = 0.0, 0.0, 0.0
+    t0, t1, t2, length = 0.0, 0.0, 0.0, 0.0
     nodes, half, gram = box.nodes, box.half, chart.gram
     h0, h1, h2 = half[0], half[1], half[2]
+    for i in range(box.rows.shape[0]):
+        length += box.rows[i, 4] * box.rows[i, 4]
     for j in range(cost.kinds.shape[0]):
-        if nodes[j, 5] > nodes[j, 4]:
+        wide = nodes[j, 5] - nodes[j, 4]
+        if wide > 0.0:
             pull = 0.0
             for i in range(cost.K.shape[0]):
                 pull += cost.K[i, j] * box.rows[i, 4]
             g0, g1, g2 = nodes[j, 1], nodes[j, 2], nodes[j, 3]
-            a, b, c = (
-                abs(gram[0, 1] - g0 * g1) * h0 * h1,
-                abs(gram[0, 2] - g0 * g2) * h0 * h2,
-                abs(gram[1, 2] - g1 * g2) * h1 * h2,
-            )
-            x, y, z = (
-                (gram[0, 0] - g0 * g0) * h0 * h0 + a + b,
-                (gram[1, 1] - g1 * g1) * h1 * h1 + a + c,
-                (gram[2, 2] - g2 * g2) * h2 * h2 + b + c,
-            )
-            pull = abs(pull) * (nodes[j, 5] - nodes[j, 4]) / (x + y + z + 1e-300)
+            a = abs(gram[0, 1] - g0 * g1) * h0 * h1
+            b = abs(gram[0, 2] - g0 * g2) * h0 * h2
+            c = abs(gram[1, 2] - g1 * g2) * h1 * h2
+            x, y = (gram[0, 0] - g0 * g0) * h0 * h0 + a + b, (gram[1, 1] - g1 * g1) * h1 * h1 + a + c
+            z = (gram[2, 2] - g2 * g2) * h2 * h2 + b + c
+            pull = abs(pull) * wide / (x + y + z + 1e-300)
             t0 += pull * x
             t1 += pull * y
             t2 += pull * z
     most = max(t0, t1, t2)
-    if most > 0.0:
-        return 0 if t0 == most else (1 if t1 == most else 2)
-    return _widest(half)
+    if not most > 0.0 or 0.5 * (t0 + t1 + t2) < missing * sqrt(length):
+        return _widest(half)
+    return 0 if t0 == most else (1 if t1 == most else 2)
 
 
 @compiled

@@ -11,6 +11,7 @@ from optloc.solve import stages
 from optloc.solve.bearing_bound import bearing_bound
 from optloc.solve.branches import first_that_proves
 from optloc.solve.certify import certified, value_certified
+from optloc.solve.direct import shortened
 from optloc.solve.stages import Solver
 
 
@@ -88,6 +89,8 @@ SOLVERS: dict[str, Entry] = {
     "taylor": Entry(stages.taylor, "plain undamped Taylor iteration; a baseline, it diverges", "refinement"),
 }
 
+# Machine code takes time to load, more than the stages take for fewer problems.
+WORTH = 16
 # What stands behind "|" is for the problems of which not everything is proven by then.
 METHODS = {
     "auto": "gtrs+lsr+certify|roots+lsr+widen+lsr+search+certify",
@@ -210,7 +213,7 @@ def stages_of(method: str) -> list[Entry]:
     branches = branches_of(method)
     if len(branches) == 1:
         return branches[0]
-    solver = first_that_proves([[entry.solver for entry in branch] for branch in branches])
+    solver = first_that_proves([shortened([entry.solver for entry in branch], WORTH) for branch in branches])
     return [Entry(solver, METHODS.get(method, method), branches[0][0].role)]
 
 

@@ -31,8 +31,8 @@ from optloc.types import Array
 # Gaps to other minima that are tried to prove, one after the other; the last is the value alone.
 _MARGINS = (LISTED_GAP, AMBIGUOUS_GAP, 0.0)
 _ROUNDS = 16
-# Boxes for the proof of a gap and of the value; plain Python takes a thousand times longer for each.
-_BUDGETS, _SLOW_BUDGETS = (4000, 16000), (150, 300)
+# Boxes for the proof of a gap and of the value. Plain Python takes a thousand times longer for each: a budget of all.
+_BUDGETS, _SLOW_BUDGET = (4000, 16000), 2000
 # Cost that counts as equal, relative: covers the rounding of two ways to compute it.
 _EQUAL = 1e-6
 # Minima behind the Earth that are set aside at most.
@@ -163,7 +163,7 @@ def _asked(work: Work, items: Array, extra: Array) -> Asked:
         _EQUAL * (1.0 + fix.cost[items] + extra),
         work.region[items],
         work.fallback[items],
-        np.where(kappa > 0.0, *(_BUDGETS if enabled() else _SLOW_BUDGETS)),
+        np.where(kappa > 0.0, *_BUDGETS) if enabled() else np.full(len(items), max(5, _SLOW_BUDGET // len(items))),
     )
 
 

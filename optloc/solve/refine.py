@@ -116,7 +116,7 @@ def _compiled(problem: Problem, start: Array, item: Array | None, rules: _Rules)
     from optloc.kernels import refine as kernel
 
     own = np.arange(len(start)) if item is None else np.asarray(item, dtype=np.int64)
-    done = kernel.refined(found, own, start, kernel.Rules(rules.tolerance, rules.limit, rules.damped))
+    done = kernel.refined(found, own, start, kernel.Rules(float(rules.tolerance), int(rules.limit), bool(rules.damped)))
     n = rules.n
     equations = Normal(
         done.matrix[:, :n, :n],

@@ -37,6 +37,9 @@ class Baseline:
 def start_of(kind: str, width: float, drawn: Drawn) -> Array:
     """Return the starting vectors (n, size) of a guess: "truth", "centre" of the stations, or "box" around it.
 
+    The centre is taken a tenth of the stations' spread off at random, lest it fall on a station, where ranges have no
+    derivative.
+
     Parameters
     ----------
     kind : str
@@ -49,8 +52,9 @@ def start_of(kind: str, width: float, drawn: Drawn) -> Array:
     if kind == "truth":
         return drawn.truth
     stations = drawn.problem.stations.position
-    centre = np.broadcast_to(stations.mean((-3, -2)), drawn.wild.shape)
-    place = centre + (width * drawn.wild if kind == "box" else 0.0)
+    centre = stations.mean((-3, -2))
+    spread = np.linalg.norm(stations - centre[..., None, None, :], axis=-1).max((-2, -1))
+    place = centre + (width if kind == "box" else 0.2 * spread[..., None]) * drawn.wild
     start = np.zeros_like(drawn.truth)
     slot, _ = drawn.problem.layout.find(drawn.position)
     start[:, slot.start : slot.start + slot.size] = place

@@ -170,7 +170,7 @@ def run(method: Method, drawn: Drawn) -> Run:
         began = perf_counter()
         fix = _solved(method, drawn)
         seconds = perf_counter() - began
-    if choice is not None and tally and choice.name not in {name for name, _ in tally}:
+    if choice is not None and choice.name not in {name for name, _ in tally}:
         what = f"{method.method or method.baseline} has no program that {choice.name} solves"
         raise InvalidProblem(what, f"method {method.name!r}", "leave the solver out, or use a stage such as sdp or nlp")
     return Run(fix, seconds, float(sum(n for _, n in tally)) if tally else np.nan)

@@ -8,6 +8,7 @@ from time import perf_counter
 
 import numpy as np
 import pytest
+from monte_carlo.tables import write
 from monte_carlo.trials import automatic, trials
 
 from formulations.direction_sdp import directions
@@ -127,6 +128,15 @@ def test_two_threads_beside_one(benchmark, name):
     benchmark.group = "batches of relaxations"
     benchmark.extra_info.update(two_threads=gain, two_threads_of_matrix_products=spare)
     benchmark.pedantic(work, (2,), rounds=1)
-    print(f"{name}: {gain:.2f} x with two threads; matrix products {spare:.2f} x")
     if spare > 1.8 and name != "cone relaxation":  # 0.2 ms a solve: half of it is Python's own
         assert gain > 1.6
+
+
+@pytest.mark.full
+def test_write_the_table():
+    rows = []
+    for name, make in WORK.items():
+        gain, spare, alone = gains(make())
+        rows.append([name, f"{alone:.2f}", f"{gain:.2f}", f"{spare:.2f}"])
+    header = ["batch", "one thread, s", "two threads, gain", "gain of matrix products meanwhile"]
+    write("relaxations", header, rows, f"{os.cpu_count()} processors, least of {ROUNDS} interleaved rounds")

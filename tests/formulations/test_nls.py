@@ -1,5 +1,7 @@
 """The least-squares program: agreement with SciPy, constraints and the signs of their multipliers, re-use."""
 
+import shutil
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -36,6 +38,35 @@ def test_agrees_with_scipy_and_is_built_once(program):
         assert found.iterations > 0
         np.testing.assert_allclose(found.x, other.x, atol=1e-7)
         assert found.cost == pytest.approx(2 * other.cost, rel=1e-8)
+
+
+@pytest.mark.skipif(shutil.which("cc") is None, reason="no C compiler")
+def test_machine_code_gives_the_same_answers(program, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    fast = Program(2, 5, 10, distances, compiled=True)
+    assert fast.compiled
+    assert not program.compiled
+    assert not list(tmp_path.iterdir())  # nothing is left where the program was built
+    rng = np.random.default_rng(1)
+    for _ in range(5):
+        x, weight = rng.uniform(-1, 2, 2), rng.uniform(0.5, 3, 5)
+        data = (x + 0.1, measured(x, rng), weight, STATIONS.ravel())
+        one, other = program.solve(*data), fast.solve(*data)
+        assert other.success
+        np.testing.assert_allclose(other.x, one.x, atol=1e-10)
+        assert other.cost == pytest.approx(one.cost, rel=1e-10)
+
+
+@pytest.mark.parametrize("broken", [False, True])
+def test_without_a_working_compiler_the_program_is_interpreted(broken, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    if broken:
+        (tmp_path / "cc").write_text("#!/bin/sh\nexit 1\n")
+        (tmp_path / "cc").chmod(0o755)
+    slow = Program(2, 5, 10, distances, compiled=True)
+    assert not slow.compiled
+    found = slow.solve([0.2, 0.2], measured(np.array([0.5, 0.4])), p=STATIONS.ravel())
+    np.testing.assert_allclose(found.x, [0.5, 0.4], atol=1e-7)
 
 
 def test_stations_are_data(program):

@@ -118,14 +118,14 @@ def test_residuals_are_no_shorter_than_the_bound(d, kind):
     for i in range(BOXES // 2):
         case, truth = random_case(rng, d, kind=kind, outside=i % 2 == 0)
         cost, chart, box = charted(case, truth)
-        place_box(box, d, rng)
+        place_box(box, d, rng, most=2.0)
         low = bound_box(cost, chart, box, accuracy_floor(cost, chart))
         s = box.at + ways(rng, box.half, POINTS)
         x = chart.origin + s @ chart.sense.T
         least = np.sqrt(case.cost(x[:, :d])).min()
         assert low <= least
         told += low > 0.5 * least
-    assert told > 0.2 * (BOXES // 2)
+    assert told > 0.3 * (BOXES // 2)
 
 
 @pytest.mark.parametrize("d", [2, 3])

@@ -9,6 +9,7 @@ from optloc.proof.search import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONAR
 
 CASES, BUDGET_HERE = (24, 20_000) if enabled() else (3, 300)
 KAPPAS = (0.0, 9.0, 25.0)
+AROUND = 1e5
 
 
 def proof(case, x, kappa=0.0, others=(), region=None, budget=BUDGET_HERE, closed=False):
@@ -59,7 +60,7 @@ def test_what_is_proven_holds_against_many_starts(d, kind):
 def test_minima_that_are_not_the_least_are_refuted_or_left_open(d):
     rng = np.random.default_rng(10 + d)
     tried = refuted = 0
-    for i in range(4 * CASES):
+    for i in range(2 * CASES):
         case, _ = random_case(rng, d, m=d + 2, outside=i % 2 == 1, sigma=30.0)
         minima = case.minima(rng)
         for wrong in minima[1:]:
@@ -68,13 +69,16 @@ def test_minima_that_are_not_the_least_are_refuted_or_left_open(d):
             tried += 1
             for kappa in KAPPAS:
                 verdict, _, bound, found = proof(case, wrong, kappa)
+                if verdict == OPEN:
+                    region = (np.full(d, -AROUND), np.full(d, AROUND))
+                    verdict, _, bound, found = proof(case, wrong, kappa, region=region)
                 assert verdict not in (VALUE, UNIQUE)
                 assert bound <= case.cost(minima[0])
                 if verdict == BETTER:
                     refuted += kappa == 0.0
                     assert case.cost(found) < case.cost(wrong)
     assert tried >= CASES // 4
-    assert refuted > 0.3 * tried
+    assert refuted > 0.9 * tried
 
 
 def test_points_that_are_no_minima_are_not_certified():

@@ -1,0 +1,150 @@
+"""The refinement by machine code against the one by numpy: answers, statuses, and what bad items do to others."""
+
+from dataclasses import replace
+from importlib import import_module
+
+import numpy as np
+import pytest
+from cases import CASES, STATIONS, TARGET
+from runs import drawn, run, truth
+from test_normal import regular_sink
+
+from optloc import Motion, Prior, assemble, measured, simulate, station_array
+from optloc.kernels.jit import enabled
+from optloc.linalg import inverse
+from optloc.normal import marginal
+from optloc.status import Status
+
+hooks = import_module("optloc.solve.refine")
+COUNT = 100 if enabled() else 3
+
+
+@pytest.fixture
+def both(monkeypatch):
+    """Return a function that refines by machine code and by numpy."""
+
+    def refined(problem, start, **more):
+        out = []
+        for chosen in (True, False):
+            monkeypatch.setattr(hooks, "serves", lambda problem, starts, chosen=chosen: chosen)
+            out.append(hooks.refine(problem, start, **more))
+        assert out[0].equations.local.shape == out[1].equations.local.shape
+        return out
+
+    return refined
+
+
+def apart(one, two):
+    """The largest difference of answers with status ok, in standard deviations of the shared unknowns."""
+    settled = np.flatnonzero((one.status == Status.OK) & (two.status == Status.OK))
+    cov, ok = inverse(marginal(two.equations)[0][settled])
+    sigma = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
+    n = sigma.shape[-1]
+    return (np.abs(one.x[settled, :n] - two.x[settled, :n]) / sigma)[ok].max(initial=0.0)
+
+
+def started(case, spread=300.0, seed=0):
+    problem = simulate(case.problem, case.truth, 5, trials=COUNT).flat()
+    return problem, case.truth + np.random.default_rng(seed).normal(0.0, spread, (COUNT, len(case.truth)))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_answers_and_statuses_are_those_of_numpy(name, both):
+    problem, start = started(CASES[name])
+    ours, theirs = both(problem, start)
+    assert (ours.status == theirs.status).all()
+    assert apart(ours, theirs) < 1e-6
+    assert np.allclose(ours.cost, theirs.cost, rtol=1e-6, atol=1e-6)
+    assert (ours.iterations == theirs.iterations).mean() > 0.9
+    assert (theirs.status == Status.OK).mean() > 0.9
+
+
+def test_from_far_away(both):
+    """Many steps are refused, damping grows and falls; what takes dozens of steps ends where rounding says."""
+    problem, start = started(CASES["tdoa-3d"], spread=1.5e4)
+    ours, theirs = both(problem, start, limit=100)
+    alike = ours.iterations == theirs.iterations
+    assert alike.mean() > 0.75 or not enabled()
+    assert (ours.status == theirs.status)[alike].all()
+    assert np.allclose(ours.cost[alike], theirs.cost[alike], rtol=1e-6)
+    assert theirs.iterations[alike].max() > 12
+
+
+@pytest.mark.parametrize("damped", [True, False])
+def test_limit_tolerance_and_plain_taylor_steps(both, damped):
+    problem, start = started(CASES["range-2d"], spread=3e3)
+    ours, theirs = both(problem, start, limit=3, tolerance=1e-3, damped=damped)
+    assert (ours.status == theirs.status).all()
+    assert len(np.unique(theirs.status)) > 1
+    assert np.array_equal(ours.iterations, theirs.iterations)
+    assert np.allclose(ours.x, theirs.x, rtol=1e-9, atol=1e-6)
+
+
+def test_several_starts_of_a_problem(both):
+    case = CASES["range_sum-3d"]
+    problem, start = started(case)
+    item = np.random.default_rng(2).integers(0, COUNT, COUNT)
+    ours, theirs = both(problem, start, item=item)
+    assert (ours.status == theirs.status).all()
+    assert apart(ours, theirs) < 1e-6
+
+
+def test_biases_moving_targets_and_priors(both):
+    """A run whose only unknowns of single epochs are none: all else is there."""
+    sink = regular_sink(3, "run")
+    rows = tuple(block for block in sink.rows if block.kind != "toa")
+    assert len(rows) < len(sink.rows)
+    problem = drawn(run(30, prior=40.0, order=1), 2, COUNT).flat()
+    prior = (Prior("velocity", np.array([-90.0, 5.0, 0.0]), 100.0 * np.eye(3)),)
+    problem = replace(problem, priors=prior)
+    start = np.tile(truth(problem), (COUNT, 1)) + np.random.default_rng(1).normal(0.0, 10.0, (COUNT, 10))
+    ours, theirs = both(problem, start)
+    assert (ours.status == theirs.status).all()
+    assert apart(ours, theirs) < 1e-6
+
+
+def test_singular_and_broken_items_leave_the_others_as_they_are(both):
+    """Stations on one line, a measurement that is not a number, an infinite start: the rest is bit for bit the same."""
+    place = np.tile(STATIONS[2][None, None], (COUNT, 1, 1, 1))
+    problem = assemble(station_array(place), measured("range", a=np.arange(6), sigma=5.0))
+    problem = simulate(problem, np.tile(TARGET[2], (COUNT, 1)), 3).flat()
+    start = TARGET[2] + np.random.default_rng(4).normal(0.0, 500.0, (COUNT, 2))
+    clean, _ = both(problem, start)
+    bent, z = place.copy(), problem.z.copy()
+    bent[0, 0] = STATIONS[2][0]
+    z[1, 3], start[2] = np.nan, np.inf
+    broken = replace(problem, stations=replace(problem.stations, position=bent)).with_rows(z=z)
+    ours, theirs = both(broken, start)
+    assert (ours.status == theirs.status).all()
+    assert (ours.status[1:3] == Status.NUMERICAL).all()
+    rest = np.arange(3, COUNT)
+    for name in ("x", "cost", "status", "iterations"):
+        assert np.array_equal(getattr(ours, name)[rest], getattr(clean, name)[rest])
+
+
+def test_an_open_direction_stalls_or_ends_as_with_numpy(both):
+    problem = assemble(STATIONS[3], measured("range", a=[0, 1], sigma=5.0))
+    problem = simulate(problem, TARGET[3], 3, trials=COUNT).flat()
+    start = TARGET[3] + np.random.default_rng(4).normal(0.0, 500.0, (COUNT, 3))
+    ours, theirs = both(problem, start)
+    assert (ours.status == theirs.status).mean() > 0.95
+    assert np.abs(ours.cost - theirs.cost).max() < 1e-6
+
+
+def test_threads_change_nothing(monkeypatch, both):
+    problem, start = started(CASES["tdoa-3d"])
+    one, _ = both(problem, start)
+    monkeypatch.setattr("optloc.kernels.equations._SHARE", 7)
+    monkeypatch.setenv("OPTLOC_THREADS", "4")
+    several, _ = both(problem, start)
+    for name in ("x", "cost", "status", "iterations"):
+        assert np.array_equal(getattr(one, name), getattr(several, name))
+
+
+def test_a_moving_target_by_range_rates(both):
+    case = CASES["tdoa+fdoa-3d"]
+    assert case.problem.motions == (Motion(1),)
+    problem, start = started(case, spread=30.0)
+    ours, theirs = both(problem, start)
+    assert (ours.status == theirs.status).all()
+    assert apart(ours, theirs) < 1e-6
