@@ -72,7 +72,8 @@ def run(
         _print_json(_record(found))
     elif not quiet:
         _show(found, Console())
-        Console().print(f"The table is in {folder}; optloc study report {folder} makes the report.", highlight=False)
+        line = f"The table is in {folder}; optloc study report {folder} makes the report."
+        Console().print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 @study.command(epilog=example("optloc study status runs/my"))
@@ -169,7 +170,9 @@ def _in_words(counts: Counter[str], most: int = 3) -> str:
 def _show(found: Any, console: Console) -> None:
     m = found.manifest
     state = "complete" if found.complete else f"{found.done} of {found.chunks} chunks"
-    table = Table(title=f"{m.title or m.name}: {state}, {found.rows} of {m.rows} rows", title_justify="left")
+    line = f"{m.title or m.name}: {state}, {found.rows} of {m.rows} rows"
+    console.print(line, style="bold", highlight=False, markup=False, soft_wrap=True)
+    table = Table()
     statuses = [status for status, _ in Counter(found.counts).most_common()]
     table.add_column("method")
     for name in statuses:
@@ -180,7 +183,8 @@ def _show(found: Any, console: Console) -> None:
 
 
 def _show_comparison(found: list[Any], one: Path, two: Path, console: Console) -> None:
-    table = Table(title=f"A = {one}, B = {two}", title_justify="left")
+    console.print(f"A = {one}, B = {two}", highlight=False, markup=False, soft_wrap=True)
+    table = Table()
     for name in ("scenario", "noise", "method"):
         table.add_column(name)
     for name in ("answers A, %", "B, %", "z", "RMSE A, m", "B, m", "time B/A", "values"):

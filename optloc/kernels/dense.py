@@ -12,10 +12,12 @@ from optloc.kernels.room import Room
 from optloc.types import Array
 
 _LEAST = 1e-15  # share of its diagonal that a pivot must exceed, as in `optloc.linalg`
+OPEN = 1e-12
+"""The same for unknowns of one epoch of a run, as in `optloc.normal`."""
 
 
 @compiled
-def factor(m: Array, matrix: int, n: int, scale: int, ok: int, lanes: int) -> None:
+def factor(m: Array, matrix: int, n: int, scale: int, ok: int, least: float, lanes: int) -> None:
     """Replace the lower triangle (n, n) by the factor of the matrix scaled to a unit diagonal.
 
     Its diagonal holds inverse pivots.
@@ -32,6 +34,8 @@ def factor(m: Array, matrix: int, n: int, scale: int, ok: int, lanes: int) -> No
         Cell that receives the scales (n,).
     ok : int
         Cell that becomes 0.0 where a matrix is not numerically positive definite.
+    least : float
+        Share of its diagonal that a pivot must exceed.
     lanes : int
         How many lanes count.
     """
@@ -49,7 +53,7 @@ def factor(m: Array, matrix: int, n: int, scale: int, ok: int, lanes: int) -> No
             for b in range(lanes):
                 m[pivot, b] -= m[matrix + j * n + k, b] * m[matrix + j * n + k, b]
         for b in range(lanes):
-            positive = m[pivot, b] > _LEAST
+            positive = m[pivot, b] > least
             m[ok, b] = m[ok, b] if positive else 0.0
             m[pivot, b] = 1.0 / np.sqrt(m[pivot, b] if positive else 1.0)
         for i in range(j + 1, n):
@@ -119,23 +123,26 @@ def step(m: Array, room: Room, n: int, local: int, damping: int, ok: int, lanes:
             m[room.shared + i * n + i, b] *= 1.0 + m[damping, b]
             m[room.step + i, b] = m[room.now + size * line + i, b]
     if local > 0:
-        _eliminate(m, room, n, local, damping, ok, lanes)
-    factor(m, room.shared, n, room.shared_scale, ok, lanes)
+        factor_local(m, room, room.now, n, local, damping, ok, _LEAST, lanes)
+        eliminate(m, room, n, local, lanes)
+    factor(m, room.shared, n, room.shared_scale, ok, _LEAST, lanes)
     forward(m, room.shared, n, room.shared_scale, room.step, lanes)
     backward(m, room.shared, n, room.shared_scale, room.step, lanes)
     if local > 0:
-        _complete(m, room, n, local, lanes)
+        complete(m, room, n, local, lanes)
     for i in range(size):
         for b in range(lanes):
             m[room.step + i, b] = m[room.step + i, b] if m[ok, b] != 0.0 else 0.0
 
 
 @compiled
-def _eliminate(m: Array, room: Room, n: int, local: int, damping: int, ok: int, lanes: int) -> None:
-    """Take from the shared system (in `room.shared` and `room.step`) what the local unknowns cost it."""
+def factor_local(
+    m: Array, room: Room, source: int, n: int, local: int, damping: int, ok: int, least: float, lanes: int
+) -> None:
+    """Factor the damped system of the local unknowns of equations at cell `source`; prepare what couples it."""
     line, half = n + local + 1, room.half
     for i in range(local):
-        row, own = room.now + (n + i) * line, room.local + i * local
+        row, own = source + (n + i) * line, room.local + i * local
         for j in range(i + 1):
             for b in range(lanes):
                 m[own + j, b] = m[row + n + j, b]
@@ -146,10 +153,16 @@ def _eliminate(m: Array, room: Room, n: int, local: int, damping: int, ok: int, 
             for b in range(lanes):
                 m[half + j * local + i, b] = m[row + j, b]
         for b in range(lanes):
-            m[half + n * local + i, b] = m[room.now + (n + local) * line + n + i, b]
-    factor(m, room.local, local, room.local_scale, ok, lanes)
+            m[half + n * local + i, b] = m[source + (n + local) * line + n + i, b]
+    factor(m, room.local, local, room.local_scale, ok, least, lanes)
     for j in range(n + 1):
         forward(m, room.local, local, room.local_scale, half + j * local, lanes)
+
+
+@compiled
+def eliminate(m: Array, room: Room, n: int, local: int, lanes: int) -> None:
+    """Take from the shared system (in `room.shared` and `room.step`) what the local unknowns cost it."""
+    half = room.half
     for a in range(local):
         for i in range(n):
             u, v = half + i * local + a, half + n * local + a
@@ -161,14 +174,13 @@ def _eliminate(m: Array, room: Room, n: int, local: int, damping: int, ok: int, 
 
 
 @compiled
-def _complete(m: Array, room: Room, n: int, local: int, lanes: int) -> None:
-    """Write the step of the local unknowns behind that of the shared ones."""
-    line, size, own = n + local + 1, n + local, room.step + n
+def complete(m: Array, room: Room, n: int, local: int, lanes: int) -> None:
+    """Write the step of the local unknowns behind that of the shared ones; their system is factored."""
+    own = room.step + n
     for a in range(local):
         for b in range(lanes):
-            m[own + a, b] = m[room.now + size * line + n + a, b]
+            m[own + a, b] = m[room.half + n * local + a, b]
         for i in range(n):
             for b in range(lanes):
-                m[own + a, b] -= m[room.now + (n + a) * line + i, b] * m[room.step + i, b]
-    forward(m, room.local, local, room.local_scale, own, lanes)
+                m[own + a, b] -= m[room.half + i * local + a, b] * m[room.step + i, b]
     backward(m, room.local, local, room.local_scale, own, lanes)

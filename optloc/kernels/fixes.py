@@ -172,22 +172,22 @@ def fixes(
 @compiled
 def _loops(loops: Array, cost: Array) -> None:
     """Write the cost of the loops."""
-    count, width = loops.shape
-    for lane in range(width):
+    count = len(loops)
+    for lane in range(LANES):
         cost[lane] = 0.0
     for i in range(count):
-        for lane in range(width):
+        for lane in range(LANES):
             cost[lane] += loops[i, lane] * loops[i, lane]
 
 
 @compiled
 def _accept(y: Array, settled: Array, good: Array, scale: Array, x: Array) -> None:
     """Take positions from squared-range answers; those that are not settled, or behind the stations, are not good."""
-    d, width = x.shape
-    for lane in range(width):
+    d = len(x)
+    for lane in range(LANES):
         good[lane] = good[lane] * settled[lane] if y[d, lane] >= 0.0 else 0.0
     for j in range(d):
-        for lane in range(width):
+        for lane in range(LANES):
             y[j, lane] = y[j, lane] if good[lane] != 0.0 else 0.0
             x[j, lane] = y[j, lane] * scale[lane]
 
@@ -195,7 +195,7 @@ def _accept(y: Array, settled: Array, good: Array, scale: Array, x: Array) -> No
 @compiled
 def _invert(vector: Array, matrix: Array, scalar: Array) -> None:
     """Write the lower half of the covariance over H_TRIAL, and whether it is regular and the fix near to SOLVABLE."""
-    _, d, width = vector.shape
+    d = vector.shape[1]
     diagonal, inverse, move, fine, away = (
         vector[DIAGONAL],
         vector[INVERSE],
@@ -203,23 +203,23 @@ def _invert(vector: Array, matrix: Array, scalar: Array) -> None:
         scalar[SOLVABLE],
         scalar[SPARE],
     )
-    for lane in range(width):
+    for lane in range(LANES):
         away[lane] = 0.0
     for i in range(d):
-        for lane in range(width):
+        for lane in range(LANES):
             diagonal[i, lane] = matrix[H, i, i, lane]
             apart = (vector[X, i, lane] - vector[CENTRE, i, lane]) / scalar[SPREAD, lane]
             away[lane] += apart * apart
-    for lane in range(width):
+    for lane in range(LANES):
         fine[lane] = 1.0 if away[lane] <= _FAR * _FAR else 0.0
     factor(matrix[H], diagonal, matrix[LOWER], inverse)
     for j in range(d):
         for i in range(d):
-            for lane in range(width):
+            for lane in range(LANES):
                 move[i, lane] = 1.0 if i == j else 0.0
         solve(matrix[LOWER], inverse, move)
-        for lane in range(width):
+        for lane in range(LANES):
             fine[lane] = fine[lane] if 0.0 < inverse[j, lane] * diagonal[j, lane] < 1.0 / _WEAK else 0.0
         for i in range(j, d):
-            for lane in range(width):
+            for lane in range(LANES):
                 matrix[H_TRIAL, i, j, lane] = move[i, lane]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from optloc.kernels.gtrs import factor, solve
+from optloc.kernels.gtrs import LANES, factor, solve
 from optloc.kernels.jit import compiled
 from optloc.types import Array
 
@@ -53,11 +53,10 @@ def refine(
     Levenberg's method with Marquardt's scaling; the damping follows H. B. Nielsen, "Damping parameter in Marquardt's
     method", IMM-REP-1999-05, Technical University of Denmark.
     """
-    width = scalar.shape[1]
     equations(
         K, u, place, r, unit, vector[X], vector[ROW], scalar[SPARE], scalar[LOOP], matrix[H], vector[G], scalar[COST]
     )
-    for lane in range(width):
+    for lane in range(LANES):
         scalar[GOOD, lane] = scalar[GOOD, lane] if scalar[COST, lane] < np.inf else 0.0
         scalar[ALIVE, lane] = scalar[GOOD, lane]
         scalar[DAMPING, lane], scalar[GROWTH, lane], scalar[STEPS, lane] = 1e-6, 2.0, 0.0
@@ -97,64 +96,71 @@ def equations(
     cost: Array,
 ) -> None:
     """Find information (lower half), right-hand side and cost at positions x (d, W); `row` and `left` are scratch."""
-    s, d, width = place.shape
+    s, d = place.shape[:2]
     ranges(place, x, r, unit, left)
-    for lane in range(width):
+    for lane in range(LANES):
         cost[lane] = loop[lane]
     for i in range(d):
-        for lane in range(width):
+        for lane in range(LANES):
             right[i, lane] = 0.0
         for j in range(i + 1):
-            for lane in range(width):
+            for lane in range(LANES):
                 information[i, j, lane] = 0.0
     for k in range(len(K)):
-        for lane in range(width):
-            left[lane] = u[k, lane]
-        for j in range(d):
-            for lane in range(width):
-                row[j, lane] = 0.0
-        for i in range(s):
-            share = K[k, i]
-            if share != 0.0:
-                for lane in range(width):
-                    left[lane] -= share * r[i, lane]
-                for j in range(d):
-                    for lane in range(width):
-                        row[j, lane] += share * unit[i, j, lane]
-        for lane in range(width):
+        _row(K[k], u[k], r, unit, row, left)
+        for lane in range(LANES):
             cost[lane] += left[lane] * left[lane]
         for i in range(d):
-            for lane in range(width):
+            for lane in range(LANES):
                 right[i, lane] += row[i, lane] * left[lane]
             for j in range(i + 1):
-                for lane in range(width):
+                for lane in range(LANES):
                     information[i, j, lane] += row[i, lane] * row[j, lane]
+
+
+@compiled
+def _row(share: Array, seen: Array, r: Array, unit: Array, row: Array, left: Array) -> None:
+    """Find one whitened row (d, W) of the Jacobian and its residual (W,): what is seen less shares of the ranges."""
+    s, d = unit.shape[:2]
+    for lane in range(LANES):
+        left[lane] = seen[lane]
+    for j in range(d):
+        for lane in range(LANES):
+            row[j, lane] = 0.0
+    for i in range(s):
+        part = share[i]
+        if part != 0.0:
+            for lane in range(LANES):
+                left[lane] -= part * r[i, lane]
+            for j in range(d):
+                for lane in range(LANES):
+                    row[j, lane] += part * unit[i, j, lane]
 
 
 @compiled
 def ranges(place: Array, x: Array, r: Array, unit: Array, spare: Array) -> None:
     """Find ranges (s, W) and unit vectors (s, d, W) from the stations at positions x (d, W)."""
-    s, d, width = place.shape
+    s, d = place.shape[:2]
     for i in range(s):
-        for lane in range(width):
+        for lane in range(LANES):
             spare[lane] = 0.0
         for j in range(d):
-            for lane in range(width):
+            for lane in range(LANES):
                 apart = x[j, lane] - place[i, j, lane]
                 unit[i, j, lane] = apart
                 spare[lane] += apart * apart
-        for lane in range(width):
+        for lane in range(LANES):
             r[i, lane] = np.sqrt(spare[lane])
             spare[lane] = 1.0 / r[i, lane]
         for j in range(d):
-            for lane in range(width):
+            for lane in range(LANES):
                 unit[i, j, lane] *= spare[lane]
 
 
 @compiled
 def _propose(vector: Array, matrix: Array, scalar: Array) -> None:
     """Find the damped step, its squared length in its own standard deviations, and whether it exists."""
-    _, d, width = vector.shape
+    d = vector.shape[1]
     diagonal, inverse, move, right, damping = (
         vector[DIAGONAL],
         vector[INVERSE],
@@ -163,17 +169,17 @@ def _propose(vector: Array, matrix: Array, scalar: Array) -> None:
         scalar[DAMPING],
     )
     gain, solvable, information = scalar[GAIN], scalar[SOLVABLE], matrix[H]
-    for lane in range(width):
+    for lane in range(LANES):
         gain[lane], solvable[lane] = 0.0, 1.0
     for i in range(d):
-        for lane in range(width):
+        for lane in range(LANES):
             diagonal[i, lane] = information[i, i, lane] * (1.0 + damping[lane])
             move[i, lane] = right[i, lane]
     factor(information, diagonal, matrix[LOWER], inverse)
     solve(matrix[LOWER], inverse, move)
     x, trial = vector[X], vector[TRIAL]
     for i in range(d):
-        for lane in range(width):
+        for lane in range(LANES):
             gain[lane] += move[i, lane] * right[i, lane]
             trial[i, lane] = x[i, lane] + move[i, lane]
             share = inverse[i, lane] * diagonal[i, lane]
@@ -183,9 +189,9 @@ def _propose(vector: Array, matrix: Array, scalar: Array) -> None:
 @compiled
 def _decide(vector: Array, matrix: Array, scalar: Array, tolerance: float) -> bool:
     """Keep the steps that lower the cost, move the damping, end lanes whose step was small; return if any is alive."""
-    _, d, width = vector.shape
+    d = vector.shape[1]
     kept, alive = scalar[SPARE], scalar[ALIVE]
-    for lane in range(width):
+    for lane in range(LANES):
         cost, gain, damping, blur = scalar[COST, lane], scalar[GAIN, lane], scalar[DAMPING, lane], scalar[BLUR, lane]
         after, floor = scalar[COST_TRIAL, lane], _FLOOR * (1.0 + cost)
         achieved = cost - after
@@ -207,13 +213,13 @@ def _decide(vector: Array, matrix: Array, scalar: Array, tolerance: float) -> bo
         alive[lane] = alive[lane] if small + lost == 0.0 else 0.0
         kept[lane] = better
     for i in range(d):
-        for lane in range(width):
+        for lane in range(LANES):
             vector[X, i, lane] = vector[TRIAL, i, lane] if kept[lane] != 0.0 else vector[X, i, lane]
             vector[G, i, lane] = vector[G_TRIAL, i, lane] if kept[lane] != 0.0 else vector[G, i, lane]
         for j in range(i + 1):
-            for lane in range(width):
+            for lane in range(LANES):
                 matrix[H, i, j, lane] = matrix[H_TRIAL, i, j, lane] if kept[lane] != 0.0 else matrix[H, i, j, lane]
     left = 0.0
-    for lane in range(width):
+    for lane in range(LANES):
         left += alive[lane]
     return left > 0.0

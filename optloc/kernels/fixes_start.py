@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from optloc.kernels.gtrs import LANES
 from optloc.kernels.jit import compiled
 from optloc.types import Array
 
@@ -38,32 +39,32 @@ def read(
     good : array (W,)
         Written: 1.0 where all rows that are present are finite, else 0.0.
     """
-    m, width = out.shape
-    for lane in range(width):
+    m = len(out)
+    for lane in range(LANES):
         blur[lane], good[lane] = 0.0, 1.0
     for j in range(m):
         if row[1, j] == 0.0:
-            for lane in range(width):
+            for lane in range(LANES):
                 out[j, lane] = 0.0
             continue
-        for lane in range(width):
+        for lane in range(LANES):
             out[j, lane] = z[item[lane], j] - row[0, j]
-        for lane in range(width):
+        for lane in range(LANES):
             blur[lane] += row[1, j] * out[j, lane] * out[j, lane]
             good[lane] = good[lane] if abs(out[j, lane]) < np.inf else 0.0
-    for lane in range(width):
+    for lane in range(LANES):
         blur[lane] = _ROUNDING * np.sqrt(blur[lane])
     for j in range(m - 1, -1, -1):  # an anchor is the first of its rows: it goes last
         if anchor[j] >= 0:
-            for lane in range(width):
+            for lane in range(LANES):
                 out[j, lane] -= out[anchor[j], lane]
     for i in range(len(linear)):
-        for lane in range(width):
+        for lane in range(LANES):
             value[i, lane] = 0.0
         for j in range(m):
             share = linear[i, j]
             if share != 0.0:
-                for lane in range(width):
+                for lane in range(LANES):
                     value[i, lane] += share * out[j, lane]
 
 
@@ -90,29 +91,29 @@ def stand(
     spare : array (W,)
         Scratch.
     """
-    s, d, width = place.shape
+    s, d = place.shape[:2]
     shared = len(station) == 1
     for j in range(d):
-        for lane in range(width):
+        for lane in range(LANES):
             centre[j, lane] = 0.0
         for i in range(s):
-            for lane in range(width):
+            for lane in range(LANES):
                 place[i, j, lane] = station[0 if shared else item[lane], i, j]
                 centre[j, lane] += place[i, j, lane] / s
-        for lane in range(width):
+        for lane in range(LANES):
             origin[j, lane] = place[reference, j, lane] if reference >= 0 else centre[j, lane]
             centre[j, lane] -= origin[j, lane]
-    for lane in range(width):
+    for lane in range(LANES):
         spread[lane] = 0.0
     for i in range(s):
-        for lane in range(width):
+        for lane in range(LANES):
             spare[lane] = 0.0
         for j in range(d):
-            for lane in range(width):
+            for lane in range(LANES):
                 place[i, j, lane] -= origin[j, lane]
                 apart = place[i, j, lane] - centre[j, lane]
                 spare[lane] += apart * apart
-        for lane in range(width):
+        for lane in range(LANES):
             spread[lane] = max(spread[lane], np.sqrt(spare[lane]))
 
 
@@ -139,31 +140,31 @@ def square(
     spare : array (W,)
         Scratch.
     """
-    s, d, width = place.shape
+    s, d = place.shape[:2]
     free = reference >= 0
     turn = 2.0 if free else -2.0
-    for lane in range(width):
+    for lane in range(LANES):
         scale[lane] = spread[lane]
     if not free:
         for i in range(s):
-            for lane in range(width):
+            for lane in range(LANES):
                 scale[lane] = max(scale[lane], abs(c[i, lane]))
-    for lane in range(width):
+    for lane in range(LANES):
         scale[lane] = scale[lane] if scale[lane] > 0.0 else 1.0
         spare[lane] = 1.0 / scale[lane]
     for i in range(s):
         used = 0.0 if free and (i == reference or sign[i] == 0.0) else 1.0
-        for lane in range(width):
+        for lane in range(LANES):
             known = used * c[i, lane] * spare[lane]
             rows[i, d + 1, lane] = known * known
             rows[i, d, lane] = 2.0 * sign[i] * known if free else 1.0
         for j in range(d):
-            for lane in range(width):
+            for lane in range(LANES):
                 at = used * place[i, j, lane] * spare[lane]
                 rows[i, j, lane] = turn * at
                 rows[i, d + 1, lane] -= at * at
         if free:
-            for lane in range(width):
+            for lane in range(LANES):
                 rows[i, d + 1, lane] = -rows[i, d + 1, lane]
 
 
@@ -188,26 +189,26 @@ def weigh(
     spare : array (W,)
         Scratch.
     """
-    s, d, width = place.shape
+    s, d = place.shape[:2]
     for i in range(s):
-        for lane in range(width):
+        for lane in range(LANES):
             spare[lane] = 0.0
         for j in range(d):
-            for lane in range(width):
+            for lane in range(LANES):
                 apart = y[j, lane] - place[i, j, lane] / scale[lane]
                 spare[lane] += apart * apart
-        for lane in range(width):
+        for lane in range(LANES):
             spare[lane] = 0.5 * scale[lane] / (1.0 if equal else max(np.sqrt(spare[lane]), _NEAR))
         for j in range(d + 2):
-            for lane in range(width):
+            for lane in range(LANES):
                 out[i, j, lane] = spare[lane] * rows[i, j, lane]
     for i in range(s - 1, -1, -1):
         for j in range(d + 2):
-            for lane in range(width):
+            for lane in range(LANES):
                 out[i, j, lane] *= white[i, i]
         for k in range(i):
             share = white[i, k]
             if share != 0.0:
                 for j in range(d + 2):
-                    for lane in range(width):
+                    for lane in range(LANES):
                         out[i, j, lane] += share * out[k, j, lane]

@@ -54,10 +54,22 @@ def clear(m: Array, first: int, count: int, lanes: int) -> None:
 def add_group(t: Tables, common: Array, place: Array, m: Array, room: Room, group: int, lanes: int) -> None:
     """Add the whitened rows of a group to the equations in `room.after`."""
     line = t.group + group
-    first, size = room.rows + t.table[line, 0] * t.width, t.table[line, 1]
     columns, column = t.table[line + 1, 3] - t.table[line, 3] + 1, t.column + t.table[line, 3]
-    _whiten(common, place[group, 0], place[group, 1], m, room.own, first, t.width, size, columns, room.whitened, lanes)
-    _square(t.table, column, m, room.whitened, t.width, size, columns, room.after, t.shared + t.local, lanes)
+    first = whiten_group(t, common, place, m, room, group, False, lanes)
+    _square(t.table, column, m, first, t.width, t.table[line, 1], columns, room.after, t.shared + t.local, lanes)
+
+
+@compiled
+def whiten_group(
+    t: Tables, common: Array, place: Array, m: Array, room: Room, group: int, residual: bool, lanes: int
+) -> int:
+    """Whiten the rows of a group, or their residuals alone, and return the cell of the first."""
+    line = t.group + group
+    columns = t.table[line + 1, 3] - t.table[line, 3]
+    begin = room.rows + t.table[line, 0] * t.width + (columns if residual else 0)
+    count, size = (1 if residual else columns + 1), t.table[line, 1]
+    _whiten(common, place[group, 0], place[group, 1], m, room.own, begin, t.width, size, count, room.whitened, lanes)
+    return room.whitened
 
 
 @compiled

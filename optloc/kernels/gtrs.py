@@ -1,7 +1,7 @@
 """Squared-range least squares on lanes: Newton on the multiplier, many problems side by side.
 
-Minimise ``|B y - g|^2`` on the cone ``y = (x, r)``, ``|x|^2 = r^2``, or on the paraboloid ``y = (x, w)``, ``|x|^2 = w``.
-The last axis of every array here counts problems (lanes), so that one instruction serves several of them. Problems
+Minimise ``|B y - g|^2`` over the cone ``y = (x, r)``, ``|x|^2 = r^2``, or the paraboloid ``y = (x, w)``, ``|x|^2 = w``.
+The last axis of every array here counts W = LANES problems, so that one instruction serves several of them. Problems
 whose iteration leaves the interval where the Lagrangian is positive definite, or does not settle, are flagged: they
 need the eigenvalues of their pencil, which batches of few hard problems compute elsewhere.
 
@@ -49,20 +49,20 @@ def minimise(rows: Array, on_cone: bool, y: Array, settled: Array, work: Array) 
     More (1993), theorem 3.2: the function ``y'Cy + 2h'y`` of the multiplier falls on that interval, and its only zero
     is the global minimiser.
     """
-    n, width = y.shape
-    A, lower = work[: n * n].reshape(n, n, width), work[n * n : 2 * n * n].reshape(n, n, width)
+    n = len(y)
+    A, lower = work[: n * n].reshape(n, n, LANES), work[n * n : 2 * n * n].reshape(n, n, LANES)
     rest = work[2 * n * n :]
     b, inverse, across, p = rest[:n], rest[n : 2 * n], rest[2 * n : 3 * n], rest[3 * n : 4 * n]
     slope, spare = rest[4 * n : 5 * n], rest[5 * n : 5 * n + 5]
     multiplier, bend, todo, least, value = spare[0], spare[1], spare[2], spare[3], spare[4]
     _normal(rows, A, b, least)
-    for lane in range(width):
+    for lane in range(LANES):
         multiplier[lane], todo[lane], settled[lane] = 0.0, 1.0, 1.0
     for _ in range(_STEPS):
         _shifted(A, b, multiplier, on_cone, slope, y)
         factor(A, slope, lower, inverse)
         for i in range(n):
-            for lane in range(width):
+            for lane in range(LANES):
                 definite = 0.0 < inverse[i, lane] and inverse[i, lane] * least[lane] < 1.0
                 settled[lane] = settled[lane] if definite else 0.0
         solve(lower, inverse, y)
@@ -73,43 +73,43 @@ def minimise(rows: Array, on_cone: bool, y: Array, settled: Array, work: Array) 
     _residual_slope(rows, y, across, multiplier, slope, value)
     solve(lower, inverse, slope)
     _step(y, across, p, on_cone, slope, bend, value)
-    for lane in range(width):
+    for lane in range(LANES):
         settled[lane] = settled[lane] if todo[lane] == 0.0 else 0.0
     for i in range(n):
-        for lane in range(width):
+        for lane in range(LANES):
             settled[lane] = settled[lane] if abs(y[i, lane]) < np.inf else 0.0
 
 
 @compiled
 def _normal(rows: Array, A: Array, b: Array, least: Array) -> None:
     """Find the lower half of ``B'B``, ``B'g``, and the smallest pivot that counts."""
-    q, (n, width) = len(rows), b.shape
-    for lane in range(width):
+    q, n = len(rows), len(b)
+    for lane in range(LANES):
         least[lane] = 0.0
     for i in range(n):
-        for lane in range(width):
+        for lane in range(LANES):
             b[i, lane] = rows[0, i, lane] * rows[0, n, lane]
         for k in range(1, q):
-            for lane in range(width):
+            for lane in range(LANES):
                 b[i, lane] += rows[k, i, lane] * rows[k, n, lane]
         for j in range(i + 1):
-            for lane in range(width):
+            for lane in range(LANES):
                 A[i, j, lane] = rows[0, i, lane] * rows[0, j, lane]
             for k in range(1, q):
-                for lane in range(width):
+                for lane in range(LANES):
                     A[i, j, lane] += rows[k, i, lane] * rows[k, j, lane]
-        for lane in range(width):
+        for lane in range(LANES):
             least[lane] = max(least[lane], _WEAK * A[i, i, lane])
 
 
 @compiled
 def _shifted(A: Array, b: Array, multiplier: Array, on_cone: bool, diagonal: Array, right: Array) -> None:
     """Write the diagonal of ``A + multiplier C`` and the right side ``b - multiplier h``."""
-    n, width = b.shape
+    n = len(b)
     sign, shift = (-1.0, 0.0) if on_cone else (0.0, 0.5)
     for i in range(n):
         turn, more = (1.0, 0.0) if i < n - 1 else (sign, shift)
-        for lane in range(width):
+        for lane in range(LANES):
             diagonal[i, lane] = A[i, i, lane] + turn * multiplier[lane]
             right[i, lane] = b[i, lane] + more * multiplier[lane]
 
@@ -129,22 +129,22 @@ def factor(A: Array, diagonal: Array, lower: Array, inverse: Array) -> None:
     inverse : array (n, W)
         Written: one over each pivot.
     """
-    n, width = diagonal.shape
+    n = len(diagonal)
     for i in range(n):
         pivot = inverse[i]
-        for lane in range(width):
+        for lane in range(LANES):
             pivot[lane] = diagonal[i, lane]
         for j in range(i):
             # above the diagonal stay the entries before they are divided by their pivot
-            for lane in range(width):
+            for lane in range(LANES):
                 lower[j, i, lane] = A[i, j, lane]
             for k in range(j):
-                for lane in range(width):
+                for lane in range(LANES):
                     lower[j, i, lane] -= lower[k, i, lane] * lower[j, k, lane]
-            for lane in range(width):
+            for lane in range(LANES):
                 lower[i, j, lane] = lower[j, i, lane] * inverse[j, lane]
                 pivot[lane] -= lower[j, i, lane] * lower[i, j, lane]
-        for lane in range(width):
+        for lane in range(LANES):
             pivot[lane] = 1.0 / pivot[lane]
 
 
@@ -159,59 +159,59 @@ def solve(lower: Array, inverse: Array, right: Array) -> None:
     right : array (n, W)
         Overwritten with the solutions.
     """
-    n, width = inverse.shape
+    n = len(inverse)
     for i in range(n):
         for j in range(i):
-            for lane in range(width):
+            for lane in range(LANES):
                 right[i, lane] -= lower[i, j, lane] * right[j, lane]
     for i in range(n - 1, -1, -1):
-        for lane in range(width):
+        for lane in range(LANES):
             right[i, lane] *= inverse[i, lane]
         for j in range(i + 1, n):
-            for lane in range(width):
+            for lane in range(LANES):
                 right[i, lane] -= lower[j, i, lane] * right[j, lane]
 
 
 @compiled
 def _gradient(y: Array, on_cone: bool, across: Array, p: Array) -> None:
     """Write ``C y + h`` twice."""
-    n, width = y.shape
+    n = len(y)
     for i in range(n - 1):
-        for lane in range(width):
+        for lane in range(LANES):
             across[i, lane] = p[i, lane] = y[i, lane]
-    for lane in range(width):
+    for lane in range(LANES):
         across[n - 1, lane] = p[n - 1, lane] = -y[n - 1, lane] if on_cone else -0.5
 
 
 @compiled
 def _value(y: Array, across: Array, on_cone: bool, out: Array) -> None:
     """Write half of ``y'Cy + 2h'y``."""
-    n, width = y.shape
-    for lane in range(width):
+    n = len(y)
+    for lane in range(LANES):
         out[lane] = 0.0 if on_cone else -0.25 * y[n - 1, lane]
     for i in range(n):
-        for lane in range(width):
+        for lane in range(LANES):
             out[lane] += 0.5 * y[i, lane] * across[i, lane]
 
 
 @compiled
 def _advance(y: Array, across: Array, p: Array, on_cone: bool, spare: Array, free: Array, settled: Array) -> bool:
     """Move the multipliers of the lanes that still change, and return whether there are any."""
-    n, width = y.shape
+    n = len(y)
     multiplier, bend, todo, value, big, far = spare[0], spare[1], spare[2], spare[4], free[0], free[1]
     _value(y, across, on_cone, value)
-    for lane in range(width):
+    for lane in range(LANES):
         bend[lane], big[lane], far[lane] = 0.0, 0.0, 0.0
     for i in range(n):
-        for lane in range(width):
+        for lane in range(LANES):
             bend[lane] += across[i, lane] * p[i, lane]
             big[lane], far[lane] = max(big[lane], abs(y[i, lane])), max(far[lane], abs(p[i, lane]))
     moving = 0.0
-    for lane in range(width):
+    for lane in range(LANES):
         step = value[lane] / bend[lane]
         todo[lane] = todo[lane] * settled[lane] if abs(step) * far[lane] > _SETTLED * big[lane] else 0.0
         multiplier[lane] += step if todo[lane] != 0.0 else 0.0
-    for lane in range(width):
+    for lane in range(LANES):
         moving += todo[lane]
     return moving > 0.0
 
@@ -219,29 +219,29 @@ def _advance(y: Array, across: Array, p: Array, on_cone: bool, spare: Array, fre
 @compiled
 def _residual_slope(rows: Array, y: Array, across: Array, multiplier: Array, slope: Array, left: Array) -> None:
     """Write ``B'(B y - g) + multiplier (C y + h)``: near the answer its digits are those of B, not of B'B."""
-    q, (n, width) = len(rows), y.shape
+    q, n = len(rows), len(y)
     for i in range(n):
-        for lane in range(width):
+        for lane in range(LANES):
             slope[i, lane] = multiplier[lane] * across[i, lane]
     for k in range(q):
-        for lane in range(width):
+        for lane in range(LANES):
             left[lane] = -rows[k, n, lane]
         for j in range(n):
-            for lane in range(width):
+            for lane in range(LANES):
                 left[lane] += rows[k, j, lane] * y[j, lane]
         for i in range(n):
-            for lane in range(width):
+            for lane in range(LANES):
                 slope[i, lane] += rows[k, i, lane] * left[lane]
 
 
 @compiled
 def _step(y: Array, across: Array, p: Array, on_cone: bool, slope: Array, bend: Array, value: Array) -> None:
     """Take the Newton step on the optimality conditions: slope and constraint to zero."""
-    n, width = y.shape
+    n = len(y)
     _value(y, across, on_cone, value)
     for i in range(n):
-        for lane in range(width):
+        for lane in range(LANES):
             value[lane] -= across[i, lane] * slope[i, lane]
     for i in range(n):
-        for lane in range(width):
+        for lane in range(LANES):
             y[i, lane] -= slope[i, lane] + p[i, lane] * (value[lane] / bend[lane])

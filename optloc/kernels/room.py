@@ -44,11 +44,11 @@ class Room(NamedTuple):
     absent: int  # 1 where some rows do not count
 
 
-STATE = 8
+STATE = 10
 """Cells that a refinement keeps of every problem."""
 
-# Lanes of a block: as many as keep its cells in the cache.
-_LANES, _FEWEST, _CELLS = 64, 8, 2**18
+# Lanes of a block: as many as keep the cells that are used again and again in the cache, and all of them in bounds.
+_LANES, _FEWEST, _CELLS, _MOST = 64, 8, 2**18, 2**23
 
 
 @compiled
@@ -123,8 +123,9 @@ def _filled(m: Array, cell: int, lane: int, source: Array, item: int) -> int:
 def blocks(packed: Packed, size: int, count: int) -> int:
     """Return how many of a number of problems of p = `size` unknowns are worked on together: they fit the cache."""
     t = packed.tables
-    each = t.rows * t.width + 2 * (t.shared + t.local + 1) ** 2 + 2 * size + packed.numbers.observed.shape[1]
-    return int(max(1, min(count, _LANES, max(_FEWEST, _FEWEST * (_CELLS // each // _FEWEST)))))
+    each = t.rows * t.width + 2 * (t.shared + t.local + 1) ** 2
+    fitting = min(_CELLS // each, _MOST // (each + 2 * size + packed.numbers.observed.shape[1]))
+    return int(max(1, min(count, _LANES, max(_FEWEST, _FEWEST * (fitting // _FEWEST)))))
 
 
 @compiled

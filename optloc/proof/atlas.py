@@ -5,8 +5,8 @@ A position is ``x = m + R p / v``, with m the centre and R half the side of a cu
 - piece k < 2 D, a face of the cube: p on the surface of the unit cube, v in (0, 1]; v = 0 is infinity. The coordinates
   are those of p on the face, then v: the inverse-range chart;
 - piece 2 D, inside the cube: v = 1, the coordinates are those of p;
-- piece 2 D + 1 + p, around the known minimum p, the fix first: v = 1, the coordinates are the principal axes s of that
-  minimum (`optloc.proof.chart`).
+- piece 2 D + 1 + i, around the known minimum i, the fix first: the coordinates are the principal axes s of the minimum
+  in those u of the piece above where it lies, its home: ``u = start + axes s``.
 
 The line to a station at ``m + R a`` is, but for the factor R/v, ``p - v a``.
 """
@@ -19,12 +19,33 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.kernels.jit import compiled
-from optloc.proof.forms import Triple, inner, pull, triple
+from optloc.proof.forms import Triple, blend, inner, pull, triple
 from optloc.proof.nodes import RATIO
 from optloc.types import Array
 
 # Half-width of the cube, reaches of the stations.
 _REACHES = 1.25
+
+
+class Minima(NamedTuple):
+    """Known minima and the boxes around them.
+
+    Parameters
+    ----------
+    home : int array (P,)
+        The face or inside on which each lies.
+    start, axes, back : array (P, 3), (P, 3, 3), (P, 3, 3)
+        Coordinates ``u = start + axes s`` there, and the inverse of the axes.
+    sides, core : array (P, 3)
+        Half-widths of boxes in s: where the cost is convex, and, wider, what is searched along the axes.
+    """
+
+    home: Array
+    start: Array
+    axes: Array
+    back: Array
+    sides: Array
+    core: Array
 
 
 class Atlas(NamedTuple):
@@ -38,16 +59,16 @@ class Atlas(NamedTuple):
         Half its side; all stations lie inside.
     dimension : int
         2 or 3.
-    origin, axes, back : array (P, 3), (P, 3, 3), (P, 3, 3)
-        Search coordinates s around the known minima, ``x = origin + axes s``.
-    sides : array (P, 3)
-        Half-widths of boxes around them on which the cost is convex.
-    point, away, away_b : array (3,)
-        p at the centre of a box, and the scaled lines to a node's stations.
-    flat, sense, sense_b : array (3, 3)
-        Their derivatives with respect to the coordinates of the piece.
-    scale : array (3,)
-        v at the centre of a box; and 1 on a face, where it varies.
+    minima : Minima
+        Known minima.
+    point, slant : array (3,), (3, 3)
+        p at the centre of a box, and its derivative with respect to the coordinates of the piece.
+    scale : array (4,)
+        v at the centre of a box, then its derivative.
+    place, linear : array (4,), (3, 3)
+        The home of the piece (itself but around minima), then coordinates there of the centre, and their derivative.
+    away, away_b, sense, sense_b : arrays
+        Scaled lines to a node's stations, and their derivatives.
     bend, second : array (3, 3)
         Second derivatives.
     """
@@ -55,17 +76,16 @@ class Atlas(NamedTuple):
     middle: Array
     radius: float
     dimension: int
-    origin: Array
-    axes: Array
-    back: Array
-    sides: Array
+    minima: Minima
     point: Array
+    slant: Array
+    scale: Array
+    place: Array
+    linear: Array
     away: Array
     away_b: Array
-    flat: Array
     sense: Array
     sense_b: Array
-    scale: Array
     bend: Array
     second: Array
 
@@ -73,47 +93,50 @@ class Atlas(NamedTuple):
 @compiled
 def atlas_of(middle: Array, radius: float, dimension: int, count: int) -> Atlas:
     """Return the pieces around a cube, centre `middle` (3,) and half-width `radius`, with room for `count` minima."""
-    lines, matrices = np.zeros((4, 3)), np.zeros((5, 3, 3))
+    minima = Minima(
+        np.zeros(count, dtype=np.int64),
+        np.zeros((count, 3)),
+        np.zeros((count, 3, 3)),
+        np.zeros((count, 3, 3)),
+        np.zeros((count, 3)),
+        np.zeros((count, 3)),
+    )
+    return with_minima(middle, radius, dimension, minima)
+
+
+@compiled
+def with_minima(middle: Array, radius: float, dimension: int, minima: Minima) -> Atlas:
+    """Return the pieces around a cube and around known minima."""
+    vectors, matrices = np.zeros((3, 3)), np.zeros((6, 3, 3))
     return Atlas(
         middle,
         radius,
         dimension,
-        np.zeros((count, 3)),
-        np.zeros((count, 3, 3)),
-        np.zeros((count, 3, 3)),
-        np.zeros((count, 3)),
-        lines[0],
-        lines[1],
-        lines[2],
+        minima,
+        vectors[0],
         matrices[0],
+        np.zeros(4),
+        np.zeros(4),
         matrices[1],
+        vectors[1],
+        vectors[2],
         matrices[2],
-        lines[3],
         matrices[3],
         matrices[4],
+        matrices[5],
     )
 
 
 @compiled
-def first_minima(atlas: Atlas, count: int) -> Atlas:
-    """Return the atlas with the first `count` of its minima."""
-    return Atlas(
-        atlas.middle,
-        atlas.radius,
-        atlas.dimension,
-        atlas.origin[:count],
-        atlas.axes[:count],
-        atlas.back[:count],
-        atlas.sides[:count],
-        atlas.point,
-        atlas.away,
-        atlas.away_b,
-        atlas.flat,
-        atlas.sense,
-        atlas.sense_b,
-        atlas.scale,
-        atlas.bend,
-        atlas.second,
+def first_minima(minima: Minima, count: int) -> Minima:
+    """Return the first minima."""
+    return Minima(
+        minima.home[:count],
+        minima.start[:count],
+        minima.axes[:count],
+        minima.back[:count],
+        minima.sides[:count],
+        minima.core[:count],
     )
 
 
@@ -130,28 +153,66 @@ def set_centre(atlas: Atlas, piece: int, at: Array) -> None:
     at : array (3,)
         Centre in the coordinates of the piece.
     """
-    d, flat, point = atlas.dimension, atlas.flat, atlas.point
-    flat[:] = 0.0
-    atlas.scale[0], atlas.scale[1] = 1.0, 0.0
-    if piece == 2 * d:
-        for k in range(d):
-            point[k], flat[k, k] = at[k], 1.0
-    elif piece > 2 * d:
-        origin, sense = atlas.origin[piece - 2 * d - 1], atlas.axes[piece - 2 * d - 1]
-        for k in range(d):
-            move = sense[k, 0] * at[0] + sense[k, 1] * at[1] + sense[k, 2] * at[2]
-            point[k] = (origin[k] + move - atlas.middle[k]) / atlas.radius
-            for m in range(d):
-                flat[k, m] = sense[k, m] / atlas.radius
-    else:
-        column = 0
-        for k in range(d):
-            if k == piece // 2:
-                point[k] = 1.0 if piece % 2 else -1.0
-            else:
-                point[k], flat[k, column] = at[column], 1.0
-                column += 1
-        atlas.scale[0], atlas.scale[1] = at[d - 1], 1.0
+    d, place, linear = atlas.dimension, atlas.place, atlas.linear
+    linear[:] = 0.0
+    around = piece - 2 * d - 1
+    place[0] = piece if around < 0 else atlas.minima.home[around]
+    for k in range(d):
+        if around < 0:
+            place[1 + k], linear[k, k] = at[k], 1.0
+            continue
+        place[1 + k] = atlas.minima.start[around, k]
+        for m in range(d):
+            linear[k, m] = atlas.minima.axes[around, k, m]
+            place[1 + k] += linear[k, m] * at[m]
+    _set_home(atlas, int(place[0]))
+
+
+@compiled
+def _set_home(atlas: Atlas, home: int) -> None:
+    d, place, linear, scale = atlas.dimension, atlas.place, atlas.linear, atlas.scale
+    scale[:] = 0.0
+    scale[0] = 1.0
+    column = 0
+    for k in range(d):
+        atlas.slant[k] = 0.0
+        if k == home // 2:
+            atlas.point[k] = 1.0 if home % 2 else -1.0
+        else:
+            atlas.point[k], atlas.slant[k] = place[1 + column], linear[column]
+            column += 1
+    if home < 2 * d:
+        scale[0], scale[1:4] = place[d], linear[d - 1]
+
+
+@compiled
+def home_of(atlas: Atlas, x: Array, u: Array) -> int:
+    """Return the face or inside on which a position x (D,) lies, and write its coordinates there into u (3,)."""
+    d, most, home = atlas.dimension, 1.0, 2 * atlas.dimension
+    for k in range(d):
+        p = (x[k] - atlas.middle[k]) / atlas.radius
+        if abs(p) > most:
+            most, home = abs(p), 2 * k + (1 if p > 0.0 else 0)
+    coordinates_on(atlas, home, x, u)
+    return home
+
+
+@compiled
+def coordinates_on(atlas: Atlas, home: int, x: Array, u: Array) -> bool:
+    """Write the coordinates u (3,) of a position x (D,) on a face or inside; return False where it has none there."""
+    d, v, column = atlas.dimension, 1.0, 0
+    u[:] = 0.0
+    if home < 2 * d:
+        out = (x[home // 2] - atlas.middle[home // 2]) / atlas.radius * (1.0 if home % 2 else -1.0)
+        if not out > 0.0:
+            return False
+        v = 1.0 / out
+        u[d - 1] = v
+    for k in range(d):
+        if k != home // 2:
+            u[column] = (x[k] - atlas.middle[k]) / atlas.radius * v
+            column += 1
+    return True
 
 
 @compiled
@@ -162,41 +223,20 @@ def position(atlas: Atlas, x: Array) -> None:
 
 
 @compiled
-def within(atlas: Atlas, half: Array, p: int, wider: float, least: float) -> bool:
-    """Return whether a box lies inside the box around minimum p with half-widths ``max(wider sides, least)``.
-
-    Times v, each of these inequalities is between linear forms in the coordinates of every piece.
-
-    Parameters
-    ----------
-    atlas : Atlas
-        Set by `set_centre`.
-    half : array (3,)
-        Half-widths of the box.
-    p : int
-        Which minimum.
-    wider, least : float
-        Factor of the sides of the convex box, and standard deviations.
-    """
-    d, v, last = atlas.dimension, atlas.scale[0], atlas.dimension - 1
-    back, origin = atlas.back[p], atlas.origin[p]
+def within(atlas: Atlas, half: Array, i: int, sides: Array) -> bool:
+    """Return whether a box around the centre set lies inside the box ``|s_k| <= sides_k`` (3,) around minimum i."""
+    minima, d = atlas.minima, atlas.dimension
+    if minima.home[i] != atlas.place[0]:
+        return False
     for k in range(d):
-        middle, still, side = 0.0, 0.0, max(wider * atlas.sides[p, k], least)
+        away = reach = 0.0
         for m in range(d):
-            middle += atlas.radius * back[k, m] * atlas.point[m]
-            still += back[k, m] * (atlas.middle[m] - origin[m])
-        middle += still * v
-        low = high = 0.0
-        for c in range(d):
+            away += minima.back[i, k, m] * (atlas.place[1 + m] - minima.start[i, m])
             slope = 0.0
-            for m in range(d):
-                slope += atlas.radius * back[k, m] * atlas.flat[m, c]
-            varies = atlas.scale[1] if c == last else 0.0
-            slope += still * varies
-            low += abs(-slope - side * varies) * half[c]
-            high += abs(slope - side * varies) * half[c]
-        room = side * v * (1.0 - 1e-9)
-        if middle + high > room or low - middle > room:
+            for c in range(d):
+                slope += minima.back[i, k, c] * atlas.linear[c, m]
+            reach += abs(slope) * half[m]
+        if abs(away) + reach > sides[k] * (1.0 - 1e-9):
             return False
     return True
 
@@ -204,13 +244,11 @@ def within(atlas: Atlas, half: Array, p: int, wider: float, least: float) -> boo
 @compiled
 def set_line(atlas: Atlas, data: Array, first: int, away: Array, sense: Array) -> None:
     """Write the scaled line p - v a to the station at data[first:first + 3], and its derivative."""
-    last = atlas.dimension - 1
     for k in range(atlas.dimension):
         a = (data[first + k] - atlas.middle[k]) / atlas.radius
         away[k] = atlas.point[k] - atlas.scale[0] * a
-        for m in range(atlas.dimension):
-            sense[k, m] = atlas.flat[k, m]
-        sense[k, last] -= a * atlas.scale[1]
+        for m in range(3):
+            sense[k, m] = atlas.slant[k, m] - a * atlas.scale[1 + m]
 
 
 @compiled
@@ -221,9 +259,8 @@ def scaled_station(atlas: Atlas, data: Array) -> tuple[float, float, Triple]:
         (data[1] - atlas.middle[1]) / atlas.radius,
         (data[2] - atlas.middle[2]) / atlas.radius if atlas.dimension == 3 else 0.0,
     )
-    squared, n = inner(a, a), pull((-2.0 * a[0], -2.0 * a[1], -2.0 * a[2]), atlas.flat)
-    steep = squared * atlas.scale[1]
-    n = (n[0], n[1] + steep, 0.0) if atlas.dimension == 2 else (n[0], n[1], n[2] + steep)
+    squared = inner(a, a)
+    n = blend(-2.0, pull(a, atlas.slant), squared, triple(atlas.scale, 1))
     return sqrt(squared), atlas.scale[0] * squared - 2.0 * inner(a, triple(atlas.point, 0)), n
 
 

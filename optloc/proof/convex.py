@@ -8,7 +8,7 @@ import numpy as np
 
 from optloc.kernels.jit import compiled
 from optloc.proof.angles import curve_azimuth, curve_elevation
-from optloc.proof.boxes import clip
+from optloc.proof.clip import clip, is_empty
 from optloc.proof.height import curve_height
 from optloc.proof.linear3 import inverse, positive
 from optloc.proof.nodes import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO
@@ -295,4 +295,4 @@ def slopes_everywhere(A: Array, half: Array, nodes: Array, curves: Array, sums: 
     for k in range(3):
         cut[k], cut[3 + k] = -half[k], half[k]
     clip_to_stationary(A, half, nodes, curves, sums, cut, solve)
-    return bool(cut[0] > cut[3] or cut[1] > cut[4] or cut[2] > cut[5])
+    return is_empty(cut)

@@ -7,19 +7,16 @@ from math import inf
 import numpy as np
 
 from optloc.kernels.jit import compiled
-from optloc.proof.atlas import Atlas, atlas_of, cube, first_minima
-from optloc.proof.chart import Box, Chart, Cost, chart_at, cost_of, curve_box, empty_box, value_at
-from optloc.proof.convex import convex
+from optloc.proof.atlas import atlas_of, cube, first_minima, with_minima
+from optloc.proof.chart import chart_at, cost_of, empty_box, value_at
 from optloc.proof.far import reaches_infinity
 from optloc.proof.far_search import ANOTHER, CHEAPER, CLEAR, INFINITE, search_everywhere
-from optloc.proof.grow import grow
 from optloc.proof.search import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove
+from optloc.proof.surroundings import set_minimum
 from optloc.types import Array
 
 # A verdict beside those of `optloc.proof.search`: the cost at infinity is within the gap.
 UNBOUNDED = 8
-# No convex box is looked for beyond this many standard deviations of the fix.
-_WIDEST = 1e4
 # Boxes after which the search of an enclosure is given up for the atlas, which takes some hundred.
 _SOON = 500
 
@@ -88,14 +85,12 @@ def prove_atlas(
     least = value_at(cost, chart, box)
     middle, radius = cube(kinds, data)
     atlas = atlas_of(middle, radius, x.shape[0], 1 + (others.shape[0] if kappa > 0.0 else 0))
-    known = _set_minimum(cost, chart, box, atlas, 0, eps)
-    if known == 0:
+    if not set_minimum(cost, box, atlas, 0, x, eps):
         return STATIONARY, 0, -inf
-    for p in range(atlas.origin.shape[0] - 1):
-        own, good = chart_at(cost, others[p], box)
-        if good:
-            known += _set_minimum(cost, own, box, atlas, known, eps)
-    atlas = first_minima(atlas, known)
+    known = 1
+    for p in range(atlas.minima.home.shape[0] - 1):
+        known += set_minimum(cost, box, atlas, known, others[p], eps)
+    atlas = with_minima(middle, radius, x.shape[0], first_minima(atlas.minima, known))
     level = least + kappa if kappa > 0.0 else least - eps
     outcome, boxes, bound = search_everywhere(cost, atlas, chart, level, least - eps, budget, found)
     if outcome == CLEAR:
@@ -105,22 +100,3 @@ def prove_atlas(
     if outcome == ANOTHER:
         return OTHER, boxes, bound
     return UNBOUNDED if outcome == INFINITE else BUDGET, boxes, min(bound, least - eps)
-
-
-@compiled
-def _set_minimum(cost: Cost, chart: Chart, box: Box, atlas: Atlas, p: int, eps: float) -> int:
-    """Write a minimum, its search coordinates and a convex box around it into an atlas; return 1, or 0 for none."""
-    box.at[:] = 0.0
-    box.half[:] = 0.0
-    value_at(cost, chart, box)
-    curve_box(cost, chart, box)
-    sums, hull = box.sums, np.zeros(3)
-    # On a convex box whose Hessian exceeds a margin the cost falls below that of its centre by slope^2 / margin.
-    margin = (sums[6] * sums[6] + sums[7] * sums[7] + sums[8] * sums[8]) / eps
-    if not convex(cost.kinds, cost.A, box.half, box.nodes, box.curves, sums, margin):
-        return 0
-    hull[: atlas.dimension] = _WIDEST
-    if not grow(cost, chart, box, hull, margin, atlas.sides[p]):
-        return 0
-    atlas.origin[p], atlas.axes[p], atlas.back[p] = chart.origin, chart.sense, chart.back
-    return 1

@@ -89,7 +89,7 @@ def curve_difference(atlas: Atlas, data: Array, centre: RangeForm, half: Array, 
     if still(turn) or not (least > 0.0 and least0 > 0.0):
         return unbounded(bend, turn)
     ds, chi, norm = range_bend(atlas.sense, h, r, u, least, q, second)
-    ds0, chi0, norm0 = range_bend(atlas.flat, h, r0, u0, least0, q0, bend)
+    ds0, chi0, norm0 = range_bend(atlas.slant, h, r0, u0, least0, q0, bend)
     for k in range(3):
         for m in range(3):
             second[k, m] += bend[k, m]
@@ -122,7 +122,7 @@ def bound_pieces(atlas: Atlas, kinds: Array, data: Array, half: Array, nodes: Ar
         Written, see `optloc.proof.boxes`.
     """
     away, sense = atlas.away, atlas.sense
-    centre = range_form(atlas.point, atlas.flat, triple(half, 0))
+    centre = range_form(atlas.point, atlas.slant, triple(half, 0))
     for j in range(kinds.shape[0]):
         kind, own, slope = kinds[j], data[j], nodes[j, 1:4]
         if kind == RANGE:
@@ -143,7 +143,7 @@ def bound_pieces(atlas: Atlas, kinds: Array, data: Array, half: Array, nodes: Ar
 def curve_pieces(atlas: Atlas, kinds: Array, data: Array, half: Array, curves: Array) -> None:
     """Fill second derivatives and bounds of their change in the table of all nodes (J, CURVE_WIDTH)."""
     away, sense, bend = atlas.away, atlas.sense, atlas.bend
-    centre = range_form(atlas.point, atlas.flat, triple(half, 0))
+    centre = range_form(atlas.point, atlas.slant, triple(half, 0))
     for j in range(kinds.shape[0]):
         kind, own, turn = kinds[j], data[j], curves[j, 6:9]
         if kind == RANGE:

@@ -7,12 +7,13 @@ from math import inf, sqrt
 import numpy as np
 
 from optloc.kernels.jit import compiled
-from optloc.proof.atlas import Atlas, position, set_centre, within
+from optloc.proof.atlas import Atlas, coordinates_on, position, set_centre, within
 from optloc.proof.boxes import cost_at, least_residual, linearise_rows
 from optloc.proof.chart import Box, Chart, Cost, empty_box
 from optloc.proof.convex import slopes_everywhere, spread_of, sum_up
 from optloc.proof.descend import descend
 from optloc.proof.far import bound_pieces, curve_pieces
+from optloc.proof.linear3 import principal
 from optloc.proof.nodes import RANGE
 from optloc.proof.stack import push_around
 from optloc.types import Array
@@ -23,8 +24,6 @@ CLEAR, CHEAPER, ANOTHER, SPENT, INFINITE = range(5)
 _CAPACITY, _DEPTH = 2048, 8
 # A box at infinity of this size whose cost is below the level is not split further.
 _TINY = 1e-5
-# The box around a minimum that is searched in its own axes: how many convex boxes wide, and standard deviations at least.
-_WIDER, _WIDE = 3.0, 3.0
 # Points closer to a minimum than this are that minimum, standard deviations.
 _SAME = 1e-3
 _ALIKE = 0.1
@@ -37,8 +36,9 @@ def search_everywhere(
 ) -> tuple[int, int, float]:
     """Search all positions but some boxes for minima that cost less than a level.
 
-    A box is done where the cost is at least `level`, or where the gradient cannot vanish: the least cost over all
-    positions, if it is attained, is attained elsewhere. Around known minima boxes lie along their principal axes.
+    A box is done where the cost is at least `level`, or where it has no minimum, its gradient or its curvature being of
+    one sign: the least cost over all positions, if it is attained, is attained elsewhere. Around known minima boxes
+    lie along their principal axes.
 
     Parameters
     ----------
@@ -105,20 +105,20 @@ def search_everywhere(
 
 @compiled
 def _known(atlas: Atlas, box: Box, piece: int) -> bool:
-    """Return whether a box lies in the convex box of a known minimum, or in one that is searched in its own axes."""
-    known = False
-    for p in range(atlas.origin.shape[0]):
-        known = known or within(atlas, box.half, p, 1.0, 0.0)
-        # Searched already, or next: each such box is left to the minimum that comes first.
-        if piece > 2 * atlas.dimension + 1 + p or piece <= 2 * atlas.dimension:
-            known = known or within(atlas, box.half, p, _WIDER, _WIDE)
+    """Return whether a box lies in the convex box of a known minimum, or in one that is searched along its axes."""
+    known, d = False, atlas.dimension
+    for i in range(atlas.minima.home.shape[0]):
+        known = known or within(atlas, box.half, i, atlas.minima.sides[i])
+        # A box around one minimum is left to those that come before it, never to itself.
+        if piece <= 2 * d or piece > 2 * d + 1 + i:
+            known = known or within(atlas, box.half, i, atlas.minima.core[i])
     return known
 
 
 @compiled
 def _another(cost: Cost, atlas: Atlas, chart: Chart, near: Box, level: float, found: Array) -> bool:
     """Return whether the centre of a box descends to a minimum below the level that is not known, and write it."""
-    d = atlas.dimension
+    d, minima, u = atlas.dimension, atlas.minima, np.zeros(3)
     position(atlas, found)
     for k in range(3):
         near.at[k] = 0.0
@@ -126,13 +126,13 @@ def _another(cost: Cost, atlas: Atlas, chart: Chart, near: Box, level: float, fo
             near.at[k] += chart.back[k, m] * (found[m] - chart.origin[m])
     if not descend(cost, chart, near) < level:
         return False
-    for p in range(atlas.origin.shape[0]):
-        inside = True
+    for i in range(minima.home.shape[0]):
+        inside = coordinates_on(atlas, minima.home[i], near.centre, u)
         for k in range(d):
             away = 0.0
             for m in range(d):
-                away += atlas.back[p, k, m] * (near.centre[m] - atlas.origin[p, m])
-            inside = inside and abs(away) <= max(atlas.sides[p, k], _SAME)
+                away += minima.back[i, k, m] * (u[m] - minima.start[i, m])
+            inside = inside and abs(away) <= max(minima.sides[i, k], _SAME)
         if inside:
             return False
     for m in range(d):
@@ -151,13 +151,12 @@ def _pieces(stack: Array, atlas: Atlas) -> int:
         if piece < 2 * d:
             stack[piece, d - 1] = stack[piece, d + 2] = 0.5
         stack[piece, 7] = piece
-    slabs, core = np.zeros((6, 7)), np.zeros(3)
-    for p in range(atlas.origin.shape[0] - 1, -1, -1):
-        for k in range(d):
-            core[k] = max(_WIDER * atlas.sides[p, k], _WIDE)
-        for i in range(push_around(slabs, -core, core, atlas.sides[p])):
-            stack[size, :7] = slabs[i]
-            stack[size, 7] = 2 * d + 1 + p
+    slabs = np.zeros((6, 7))
+    for i in range(atlas.minima.home.shape[0] - 1, -1, -1):
+        core = atlas.minima.core[i]
+        for slab in range(push_around(slabs, -core, core, atlas.minima.sides[i])):
+            stack[size, :7] = slabs[slab]
+            stack[size, 7] = 2 * d + 1 + i
             size += 1
     return size
 
@@ -205,16 +204,18 @@ def _steepness(box: Box, m: int) -> float:
 def _leaves(cost: Cost, atlas: Atlas, box: Box, touching: bool) -> bool:
     """Return whether no infimum of the cost can lie in a box whose nodes are bounded.
 
-    The gradient does not vanish; and at infinity, an end of the box that is none of space, the cost also falls inwards
-    or changes along infinity.
+    The gradient does not vanish, or the Hessian has a negative eigenvalue; and at infinity, an end of the box that is
+    none of space, the cost falls inwards or changes along infinity.
     """
     curve_pieces(atlas, cost.kinds, cost.data, box.half, box.curves)
     sum_up(cost.K, cost.w, box.nodes, box.curves, box.sums)
-    if not touching:
-        return slopes_everywhere(cost.A, box.half, box.nodes, box.curves, box.sums, box.solve)
+    if not touching and slopes_everywhere(cost.A, box.half, box.nodes, box.curves, box.sums, box.solve):
+        return True
     ball = spread_of(cost.A, box.half, box.nodes, box.curves, box.sums)
     if not ball < inf:
         return False
+    if not touching:
+        return _bends_down(box, ball)
     sums, h = box.sums, box.half
     ball *= sqrt(h[0] * h[0] + h[1] * h[1] + h[2] * h[2])
     for k in range(atlas.dimension):
@@ -226,6 +227,31 @@ def _leaves(cost: Cost, atlas: Atlas, box: Box, touching: bool) -> bool:
         if -slope > change or (k < atlas.dimension - 1 and slope > change):
             return True
     return False
+
+
+@compiled
+def _bends_down(box: Box, ball: float) -> bool:
+    """Return whether the cost curves downwards along one direction all over a box, as around a saddle.
+
+    `optloc.proof.convex.spread_of` has filled ``box.sums[9:15]`` and returned `ball`, bounds of the Hessian's change.
+    """
+    sums, hessian, vectors = box.sums, box.solve, np.empty((3, 3))
+    for k in range(3):
+        for m in range(3):
+            hessian[k, m] = sums[_entry(k, m)]
+    principal(hessian, vectors)
+    column = 0
+    for k in range(1, 3):
+        if hessian[k, k] < hessian[column, column]:
+            column = k
+    most = ball
+    for k in range(3):
+        for m in range(3):
+            entry = _entry(k, m)
+            z = vectors[k, column] * vectors[m, column]
+            most += sums[entry] * z + sums[9 + entry] * abs(z)
+    size = abs(sums[0]) + abs(sums[3]) + abs(sums[5])
+    return bool(most < -1e-9 * size)
 
 
 @compiled
@@ -251,8 +277,6 @@ def _floor(cost: Cost, atlas: Atlas) -> float:
         total += cost.w[i] * cost.w[i]
     total = sqrt(total)
     size = 4.0 * atlas.radius + abs(atlas.middle[0]) + abs(atlas.middle[1]) + abs(atlas.middle[2])
-    for k in range(atlas.dimension):
-        size += abs(atlas.origin[0, k])
     for j in range(cost.kinds.shape[0]):
         total += cost.weight[j] * (size if cost.kinds[j] == RANGE else 4.0)
     return total

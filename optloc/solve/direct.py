@@ -42,7 +42,8 @@ class Quick:
             return in_parts(problem, lambda some, part: lsr(some, gtrs(some, None if fix is None else fix[part])))
         z = problem.z if len(problem.rows) > 1 else problem.rows[0].z
         place = problem.stations.position.reshape(-1, *problem.stations.position.shape[-2:])
-        return fixed(plan, np.broadcast_to(z, (count, problem.count)), place, lambda items: by_stages(problem, items))
+        z = z if len(z) == count else np.broadcast_to(z, (count, problem.count))
+        return fixed(plan, z, place, lambda items: by_stages(problem, items))
 
 
 def shortened(solvers: Sequence[Solver], least: int = 1) -> list[Solver]:
@@ -83,8 +84,8 @@ def fixed(direct: Direct, z: Array, position: Array, rest: Callable[[Array], Fix
     def work(first: int) -> int:
         part = slice(first, min(first + _CHUNK, count))
         stations = position[part] if len(position) > 1 else position
-        stations = np.ascontiguousarray(stations if everyone else stations[:, direct.station])
-        rows = np.ascontiguousarray(z[part])
+        stations = _owned(stations if everyone else stations[:, direct.station])
+        rows = _owned(z[part])
         return int(fixes(model, rows, stations, _TOLERANCE, _LIMIT, x[part], covariance[part], cost[part], plain[part]))
 
     steps = mapped(work, range(0, count, _CHUNK), threads)
@@ -114,6 +115,11 @@ def _judged(direct: Direct, x: Array, covariance: Array, cost: Array, stages: tu
         _filled(count, ()),
         None,
     )
+
+
+def _owned(values: Array) -> Array:
+    """Return values as the one type of array for which there is machine code: float, C order, writable."""
+    return np.require(values, dtype=float, requirements=["C", "W"])
 
 
 def _filled(count: int, value: object) -> Array:

@@ -28,6 +28,8 @@ TIGHT = 1e-3
 
 _MARGIN = 0.1  # costs up to this above that of the fix are looked at
 _RANK_ONE = 1e-4  # largest ratio of eigenvalues at which first moments are a point
+_SAME = 1e-3  # relative difference at which two ways to a cost agree
+_OPEN = "the rows do not enclose the positions that cost as little; give a region"
 _MOST_STATIONS = 10  # the time of a relaxation grows with the sixth power
 _OTHER_COSTS = {
     "sdp": "Shor's relaxation bounds the squared-range cost, not the likelihood",
@@ -197,28 +199,31 @@ def _by_moments(problem: Problem, fix: Fix, region: float | None) -> Reference:
         problem.stations.position, (problem.batch_shape[0], *problem.stations.position.shape[-3:])
     )
     place = position[:, found.epoch, found.station]
-    cost = np.asarray(fix.cost - found.cost)
 
     def bounded(i: int) -> None:
-        out.reason[i] = _declined(found, i, bool(fix.answered[i]) and bool(np.isfinite(cost[i])))
+        out.reason[i] = _declined(found, i, bool(fix.answered[i]))
         if out.reason[i]:
             return
         nodes = _nodes(found, i)
         centre = place[i, nodes].mean(0)
         size = float(np.linalg.norm(place[i, nodes] - centre, axis=1).max()) or 1.0
         own = _scaled(found, i, nodes, (place[i, nodes] - centre) / size, size)
-        most = max(float(cost[i]), 0.0) + _MARGIN
-        box = enclosure(own, (fix.position[i] - centre) / size, most)
-        scope = "global" if box is not None else "region"
+        point = (fix.position[i] - centre) / size
+        cost = float(own.cost(point))
+        # the misfit of the rows among themselves, without the digits that its own sum of squares has lost
+        loops = float(fix.cost[i]) - cost
+        if not abs(loops - found.cost[i]) <= _SAME * (1.0 + fix.cost[i]):
+            out.reason[i] = "the ranges do not carry the cost of the fix"
+            return
+        box = enclosure(own, point, cost + _MARGIN)
+        out.scope[i] = "global" if box is not None else "region"
         box = box or _region(own, region, size)
-        if box is None:
-            out.reason[i] = "the rows do not enclose the positions that cost as little; give a region"
+        answer = None if box is None else moment_bound(own, box, cost + _MARGIN)
+        if answer is None or not np.isfinite(answer.bound):
+            out.scope[i] = ""
+            out.reason[i] = _OPEN if answer is None else f"no dual point was found ({answer.answer.status})"
             return
-        answer = moment_bound(own, box, most)
-        if not np.isfinite(answer.bound):
-            out.reason[i] = f"the solver stopped without a dual point ({answer.answer.status})"
-            return
-        out.bound[i], out.scope[i] = max(answer.bound, 0.0) + found.cost[i], scope
+        out.bound[i] = max(answer.bound, 0.0) + loops
         if answer.rank_ratio < _RANK_ONE:
             out.point[i] = centre + size * answer.point
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,15 +39,20 @@ class Refined:
         `Status` of each: ok, max iterations, stalled, singular geometry, numerical.
     iterations : int array (N,)
         Steps tried.
-    equations : Normal
-        Normal equations at `x`.
+    make : callable
+        Returns the normal equations at `x`.
     """
 
     x: Array
     cost: Array
     status: Array
     iterations: Array
-    equations: Normal
+    make: Callable[[], Normal]
+
+    @property
+    def equations(self) -> Normal:
+        """Return the normal equations at `x`."""
+        return self.make()
 
 
 def refine(
@@ -106,27 +112,24 @@ def refine(
 
 def _compiled(problem: Problem, start: Array, item: Array | None, rules: _Rules) -> Refined | None:
     """Return where machine code ends by the same rules, or None where it does not serve or does not pay."""
-    layout = problem.layout
-    few = layout.n_shared + layout.n_local <= _UNKNOWNS and (problem.epochs == 1 or layout.n_local == 0)
+    few = problem.layout.n_shared + problem.layout.n_local <= _UNKNOWNS
     if rules.face or not few or not serves(problem, len(start)) or depends_on_place(problem):
         return None
     found = packed(problem, whiten(weighed(problem).noise, problem.weight))
     if found is None:
         return None
-    from optloc.kernels import refine as kernel
+    from optloc.kernels import spread
+    from optloc.kernels.refine import Rules
 
     own = np.arange(len(start)) if item is None else np.asarray(item, dtype=np.int64)
-    done = kernel.refined(found, own, start, kernel.Rules(float(rules.tolerance), int(rules.limit), bool(rules.damped)))
-    n = rules.n
-    equations = Normal(
-        done.matrix[:, :n, :n],
-        done.matrix[:, None, n:, n:],
-        done.matrix[:, None, :n, n:],
-        done.vector[:, :n],
-        done.vector[:, None, n:],
-        done.cost,
-    )
-    return Refined(done.x, done.cost, done.status, done.iterations, equations)
+    kernel = Rules(float(rules.tolerance), int(rules.limit), bool(rules.damped))
+    done, lost = spread.refined(found, own, start, kernel)
+    if lost.any():
+        part, begin = problem.take(own[lost]), start[lost]
+        more = _iterated(part, begin, _Weights.of(part, begin), rules)
+        for name in ("x", "cost", "status", "iterations"):
+            getattr(done, name)[lost] = getattr(more, name)
+    return Refined(done.x, done.cost, done.status, done.iterations, lambda: spread.equations(found, own, done))
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +165,7 @@ def _iterated(problem: Problem, start: Array, weights: _Weights, rules: _Rules) 
                 break
             part = _Part.of(problem, weights, blur, active)
             _advance(part, state, active, rules, iteration)
-    return Refined(state.x, state.equations.cost, state.status, state.iterations, state.equations)
+    return Refined(state.x, state.equations.cost, state.status, state.iterations, lambda: state.equations)
 
 
 @dataclass(slots=True)

@@ -11,9 +11,11 @@ from proof.plain import cost_of
 import optloc
 from optloc import Fix, InvalidProblem, Status, assemble, certify, measured, simulate, solve, with_bias
 from optloc.constraints import box, height
+from optloc.kernels.jit import enabled
 from optloc.solve import certifying
 from optloc.solve.stages import given, lsr
 
+machine_code = pytest.mark.skipif(not enabled(), reason="plain Python takes a thousand times longer for a box")
 SQUARE = 1e3 * np.array([[-5.0, -5, 0], [5, -5, 0], [5, 5, 0], [-5, 5, 0], [0, 2, 0], [1, -3, 0]])
 
 
@@ -49,6 +51,7 @@ def test_a_plain_method_is_not_proven_and_certify_proves_it():
     assert proven.stages[-1].name == "certify"
 
 
+@machine_code
 def test_the_value_alone_is_a_smaller_claim():
     problem = drawn("TDOA, 6 stations, outside, 10 m", 8)
     fix = solve(problem, "gtrs+lsr")
@@ -73,6 +76,7 @@ def twofold():
     return problem.take(items), fix[items]
 
 
+@machine_code
 def test_a_better_position_takes_the_place_of_a_wrong_one(twofold):
     problem, best = twofold
     wrong = lsr(problem, given(problem, best.alternatives.x[:, 0]))
@@ -84,6 +88,7 @@ def test_a_better_position_takes_the_place_of_a_wrong_one(twofold):
     assert f"{len(best)} fixes replaced by better ones" in fix.stages[-1].detail
 
 
+@machine_code
 def test_other_minima_are_found_and_the_list_is_complete(twofold):
     problem, best = twofold
     alone = lsr(problem, given(problem, best.x))
@@ -95,6 +100,7 @@ def test_other_minima_are_found_and_the_list_is_complete(twofold):
     np.testing.assert_array_equal(fix.code == Status.AMBIGUOUS, fix.alternatives.gap[:, 0] < 9.0)
 
 
+@machine_code
 def test_a_mirror_image_is_a_second_minimum_not_a_worse_one():
     a, b = np.arange(1, 6), np.zeros(5, dtype=int)
     problem = simulate(assemble(SQUARE, measured("tdoa", a=a, b=b, arrival_sigma=5.0)), [1e3, 2e3, 3e3], 3)
@@ -106,6 +112,7 @@ def test_a_mirror_image_is_a_second_minimum_not_a_worse_one():
     assert "no other minimum but that listed" in proof.reason
 
 
+@machine_code
 def test_a_region_limits_the_claim_and_is_named():
     a, b = np.arange(1, 6), np.zeros(5, dtype=int)
     problem = simulate(assemble(SQUARE, measured("tdoa", a=a, b=b, arrival_sigma=5.0)), [1e3, 2e3, 3e3], 3)
@@ -145,8 +152,9 @@ def test_a_spent_budget_says_so_and_changes_nothing(monkeypatch):
     monkeypatch.setattr(certifying, "enabled", lambda: True)
     monkeypatch.setattr(certifying, "_BUDGETS", (0, 0))
     poor = certify(problem, fix)
-    assert {c.proof for c in poor.certificate} == {"unknown"}
-    assert all("budget" in c.reason for c in poor.certificate)
+    open_ones = [c for c in poor.certificate if c.boxes or c.proof != "global"]
+    assert open_ones
+    assert all(c.proof == "unknown" and "budget" in c.reason for c in open_ones)
     np.testing.assert_array_equal(poor.x, fix.x)
     np.testing.assert_array_equal(poor.code, fix.code)
 
@@ -175,7 +183,9 @@ def test_one_bad_item_leaves_the_others_alone():
     assert mixed.certificate[2].proof == "unknown"
     for i in (0, 1, 3):
         np.testing.assert_array_equal(mixed.x[i], clean.x[i])
-        assert mixed.certificate[i] == clean.certificate[i]
+        one, other = mixed.certificate[i], clean.certificate[i]
+        assert (one.proof, one.margin) == (other.proof, other.margin)
+        assert one.bound == pytest.approx(other.bound, rel=1e-9)
 
 
 def test_stations_on_a_line_in_a_batch_leave_the_others_alone():
@@ -187,6 +197,7 @@ def test_stations_on_a_line_in_a_batch_leave_the_others_alone():
     assert [c.proof for c in fix.certificate[[0, 2]]] == ["global", "global"]
 
 
+@machine_code
 def test_a_known_height_is_proven_on_its_surface():
     a, b = pairs(3)
     rows = measured("tdoa", a=a[:3], b=b[:3], arrival_sigma=5.0)
@@ -232,6 +243,7 @@ def test_epochs_that_share_nothing_are_certified_one_by_one():
     assert {c.proof for c in fix.certificate} == {"global"}
 
 
+@machine_code
 def test_auto_takes_the_long_way_only_where_the_short_one_leaves_something_open():
     clear = solve(CASES["tdoa-3d"].problem)
     assert [stage.name for stage in clear.stages] == ["gtrs", "lsr", "certify"]

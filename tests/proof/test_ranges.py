@@ -5,8 +5,9 @@ import pytest
 from proof.costs import random_case
 
 from optloc.kernels.jit import enabled
-from optloc.proof.boxes import NODE_WIDTH, bound_range, cut_out, quadratic, shrink
+from optloc.proof.boxes import NODE_WIDTH, bound_range, quadratic
 from optloc.proof.chart import accuracy_floor, bound_box, chart_at, cost_of, empty_box
+from optloc.proof.clip import cut_out, shrink
 
 BOXES, POINTS = (600, 250) if enabled() else (60, 250)
 

@@ -11,7 +11,7 @@ from contextlib import ExitStack, contextmanager
 import cloudpickle
 import numpy as np
 import pytest
-from study.texts import SMALL, assert_identical, plan
+from study.texts import QUICK, SMALL, assert_identical, plan
 
 from optloc.errors import InvalidProblem
 from optloc.study import execute
@@ -20,7 +20,7 @@ from optloc.study.execute import EXECUTORS, executor
 from optloc.study.run import progress, run_plan
 from optloc.study.table import read_frame
 
-LONG = SMALL.replace("trials = 60", "trials = 400")
+LONG = QUICK.replace("trials = 60", "trials = 600")
 
 
 @pytest.fixture(scope="module")
@@ -144,8 +144,9 @@ def test_ctrl_c_stops_with_a_sentence_and_keeps_what_is_finished(tmp_path):
     assert progress(out).done > 0
 
 
-def test_a_trial_that_kills_its_process_costs_one_row(undisturbed, tmp_path, monkeypatch):
-    made = plan()
+def test_a_trial_that_kills_its_process_costs_one_row(tmp_path, monkeypatch):
+    made, undisturbed = plan(QUICK), tmp_path / "plain"
+    run_plan(made, undisturbed, executor("in-process"))
     key = made.cells[0].key
 
     def lethal(chunk):
@@ -181,6 +182,6 @@ def test_an_unreachable_scheduler_is_one_sentence_and_nothing_is_lost(tmp_path, 
     pytest.importorskip("distributed")
     monkeypatch.setattr(execute, "CONNECT", 1.0)
     out = tmp_path / "out"
-    with pytest.raises(InvalidProblem, match="tcp://127.0.0.1:1: the scheduler cannot be reached"):
+    with pytest.raises(InvalidProblem, match=r"tcp://127\.0\.0\.1:1: the scheduler cannot be reached"):
         run_plan(plan(), out, executor("dask", None, "tcp://127.0.0.1:1"))
     assert progress(out).done == 0

@@ -1,0 +1,74 @@
+"""What studies cost beside their solvers: run as `pytest tests/benchmarks/test_study.py`, in a quiet moment."""
+
+import resource
+from pathlib import Path
+from time import perf_counter
+
+import numpy as np
+import pytest
+from study.texts import plan
+
+from optloc.study import chunk as chunks
+from optloc.study.execute import executor
+from optloc.study.plan import workers
+from optloc.study.run import run_plan
+
+MILLION = """
+format = 1
+name = "million"
+trials = 1_000_000
+[[scenario]]
+name = "six stations"
+layout = { stations = 6 }
+truth = { kind = "box", box = ["10 km", "10 km", "6 km"] }
+noise = ["10 m"]
+[[method]]
+method = "gtrs+lsr"
+"""
+SLOW = MILLION.replace("1_000_000", "2000").replace('"gtrs+lsr"', '"socp"\nchunk = 500')
+
+
+@pytest.mark.full
+def test_a_million_fixes_in_two_minutes_and_two_gigabytes(tmp_path):
+    began = perf_counter()
+    found = run_plan(plan(MILLION), tmp_path / "out", executor("processes", 2))
+    seconds = perf_counter() - began
+    own, theirs = (resource.getrusage(who).ru_maxrss / 1e6 for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    print(f"{found.rows} fixes in {seconds:.1f} s; memory {own:.2f} GB here, {theirs:.2f} GB at most in a worker")
+    assert found.complete
+    assert seconds < 120.0
+    assert own + 2.0 * theirs < 2.0
+
+
+@pytest.mark.full
+@pytest.mark.skipif(workers() < 2, reason="needs two processors")
+def test_two_workers_do_the_work_of_nearly_two(tmp_path):
+    """Begun processes are not counted: a first study warms them up."""
+    text, times = SLOW.replace("2000", "8000").replace("chunk = 500", "chunk = 200"), []
+    for jobs in (1, 2):
+        began = perf_counter()
+        run_plan(plan(text), tmp_path / str(jobs), executor("processes", jobs))
+        times.append(perf_counter() - began)
+    print(f"two workers are {times[0] / times[1]:.2f} times as fast as one")
+    assert times[0] > 1.7 * times[1]
+
+
+def test_overhead_of_the_machinery_at_tasks_of_a_millisecond(tmp_path, monkeypatch):
+    """Everything but the solver, storing included, costs less than a tenth of the solver's time."""
+    inside, solved = [], chunks.run
+
+    def timed(method, drawn):
+        began = perf_counter()
+        found = solved(method, drawn)
+        inside.append(perf_counter() - began)
+        return found
+
+    run_plan(plan(SLOW.replace("2000", "500")), tmp_path / "warm", executor("in-process"))
+    monkeypatch.setattr(chunks, "run", timed)
+    began = perf_counter()
+    found = run_plan(plan(SLOW), tmp_path / "out", executor("in-process"))
+    whole, solver = perf_counter() - began, float(np.sum(inside))
+    each = 1e3 * solver / found.rows
+    print(f"{each:.2f} ms a fix, {1e6 * (whole - solver) / found.rows:.0f} us beside it: {whole / solver - 1.0:.1%}")
+    assert Path(tmp_path / "out").is_dir()
+    assert (whole - solver) / found.rows < 0.1 * max(solver / found.rows, 1e-3)

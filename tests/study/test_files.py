@@ -1,0 +1,120 @@
+"""Study files: what is wrong is said in one sentence with the nearest name; shipped studies run."""
+
+from pathlib import Path
+
+import pytest
+from study.texts import QUICK, plan
+from typer.testing import CliRunner
+
+from optloc.cli import app
+from optloc.errors import InvalidProblem
+from optloc.study.chunk import compute
+from optloc.study.plan import plan_of, shipped
+
+RUN = CliRunner()
+STUDIES = sorted(shipped())
+BAD = {
+    "method": ('"gtrs+lsr"', '"gtsr+lsr"', "unknown method 'gtsr'; did you mean 'gtrs'"),
+    "baseline": ('method = "gtrs+lsr"', 'baseline = "tailor"', "unknown baseline 'tailor'; did you mean 'taylor'"),
+    "two methods": ('"gtrs+lsr"', '"gtrs+lsr"\nbaseline = "taylor"', "give either method or baseline"),
+    "solver": ('"gtrs+lsr"', '"sdp"\nsolver = "SCZ"', "unknown solver 'SCZ'; did you mean 'SCS'"),
+    "licence": ('"gtrs+lsr"', '"gtrs+nlp"\nsolver = "snopt"', "the solver 'snopt' is not installed"),
+    "settings": ('"gtrs+lsr"', '"gtrs+lsr"\nsettings = { eps = 1 }', "settings belong to a solver"),
+    "kind": ('["toa"]', '["taoa"]', "unknown kind 'taoa'; did you mean 'toa'"),
+    "geometry": ("layout = { stations = 6 }", "", "a scenario has one geometry"),
+    "problem": ("layout = { stations = 6 }", 'problem = "dema"', "unknown problem 'dema'; did you mean 'demo'"),
+    "file": ("layout = { stations = 6 }", 'problem = "nowhere.toml"', "no such file"),
+    "unit": ('"3 m"', '"3 mm/s"', "unknown unit 'mm/s'"),
+    "no unit": ('["3 m"]', "[3.0]", "has no unit"),
+    "negative": ('"3 m"', '"-3 m"', "not positive"),
+    "truth": ('"hull"', '"hole"', "did you mean 'hull'"),
+    "truth keys": ('{ kind = "hull" }', '{ kind = "hull", at = [1.0] }', "has no key 'at'"),
+    "distance": (', distance = ["5 km", "20 km"]', "", "needs the key 'distance'"),
+    "velocity": ('{ kind = "hull" }', '{ kind = "hull", speed = "3 m/s" }', "does not move"),
+    "key": ("seed = 5", "sede = 5", "unknown key 'sede'; did you mean 'seed'"),
+    "sweep": ('noise = ["3 m"]', 'noise = ["3 m"]\nsweep = { "layout.station" = [5] }', "did you mean 'stations'"),
+    "twice": ('"arrivals"', '"differences"', "two scenarios 'differences'"),
+    "kinds of levels": ('["3 m"]', '[{ tdoa = "3 m" }]', "levels do not fit"),
+    "bias": ('noise = ["3 m"]', 'noise = ["3 m"]\nbias = { clock = 3.0 }', "unknown bias 'clock'"),
+    "format": ("format = 1", "format = 2", "format 2 is unknown"),
+    "empty sweep": ('noise = ["3 m"]', 'noise = ["3 m"]\nsweep = { "layout.stations" = [] }', "has no values"),
+}
+
+
+def sentence(result):
+    assert result.exit_code == 2, result.output + repr(result.exception)
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert "Traceback" not in result.output
+    return result.stderr
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_studies_are_one_sentence(name, tmp_path):
+    old, new, words = BAD[name]
+    assert old in QUICK
+    (tmp_path / "s.toml").write_text(QUICK.replace(old, new))
+    result = RUN.invoke(app, ["study", "run", str(tmp_path / "s.toml"), "--out", str(tmp_path / "out")])
+    assert words in sentence(result)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["run", "divergense"], "did you mean 'divergence'"),
+        (["run", "nowhere.toml"], "no such file"),
+        (["run", "groa", "--executor", "procesess"], "did you mean 'processes'"),
+        (["run", "groa", "--executor", "in-process", "--scheduler", "tcp://h:1"], "has no scheduler"),
+        (["status", "."], "holds no study"),
+        (["compare", ".", "."], "holds no study"),
+    ],
+)
+def test_bad_commands_are_one_sentence(arguments, words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert words in sentence(RUN.invoke(app, ["study", *arguments]))
+
+
+def test_run_status_and_compare(tmp_path):
+    (tmp_path / "s.toml").write_text(QUICK)
+    out = str(tmp_path / "out")
+    made = RUN.invoke(app, ["study", "run", str(tmp_path / "s.toml"), "--out", out, "-x", "in-process"])
+    assert made.exit_code == 0, made.output
+    assert "complete, 180 of 180 rows" in made.stdout
+    state = RUN.invoke(app, ["study", "status", out, "--json"])
+    assert state.exit_code == 0
+    assert '"rows": 180' in state.stdout
+    both = RUN.invoke(app, ["study", "compare", out, out])
+    assert both.exit_code == 0
+    assert "identical" in both.stdout
+    next((tmp_path / "out" / "parts").glob("*.parquet")).unlink()
+    assert RUN.invoke(app, ["study", "status", out]).exit_code == 1
+
+
+def test_lists_show_what_studies_are_made_of():
+    for what, words in {
+        "solvers": ("CLARABEL", "ipopt", "sqpmethod", "scipy", "lsr", "version"),
+        "baselines": ("taylor", "lifted-sdp"),
+        "executors": ("dask", "in-process"),
+        "studies": tuple(STUDIES),
+        "methods": ("auto",),
+    }.items():
+        shown = RUN.invoke(app, ["list", what, "--json"]).stdout
+        assert all(word in shown for word in words), what
+
+
+@pytest.mark.parametrize("name", STUDIES)
+def test_shipped_studies_run(name):
+    made = plan_of(Path(name), trials=2)
+    methods = {}
+    for one in made.chunks:  # each method once, on the scenarios in turn
+        if len(methods.setdefault(one.cell.method.name, [])) < 1:
+            methods[one.cell.method.name].append(compute(one))
+    assert len(methods) == len({cell.method.name for cell in made.cells})
+    assert all(part.counts.get("died", 0) == 0 for parts in methods.values() for part in parts)
+
+
+def test_options_take_the_place_of_what_the_file_says():
+    assert plan(QUICK, trials=7).rows == 21
+    assert plan(QUICK, seed=9).fingerprint != plan(QUICK).fingerprint
+    with pytest.raises(InvalidProblem):
+        plan(QUICK.replace("trials = 60", "trials = 0"))
