@@ -19,7 +19,7 @@ from optloc.windows import windows
 
 # Numbers of rows, over all problems, from which machine code saves more than it takes to get it going; tables of longer
 # runs would not be constant in memory.
-_WORTH, _LONGEST = 2000, 4096
+_WORTH, _LONGEST = 2000, 2**13
 
 
 def equations_at(

@@ -134,9 +134,7 @@ def fixes(
         if len(station) > 1 or (first == 0 and not again):
             stand(station, item, reference, place, vector[ORIGIN], vector[CENTRE], scalar[SPREAD], spare)
         if again:
-            for j in range(d):
-                for lane in range(LANES):
-                    vector[X, j, lane] = x[item[lane], j] - vector[ORIGIN, j, lane]
+            _resume(x, item, vector)
         else:
             square(c, sign, reference, place, scalar[SPREAD], scalar[SCALE], squared, spare)
             for turn in range(2):
@@ -147,21 +145,12 @@ def fixes(
         _invert(vector, matrix, scalar)
         if e:
             ranges(place, vector[X], r, unit, spare)
+            _emit(travel, r, start, row, z, item, emission)
+        _write(vector, matrix, scalar, emission, item[:size], limit, x, covariance, cost, plain)
         for lane in range(size):
-            i = item[lane]
-            plain[i] = scalar[SOLVABLE, lane] * good[lane] > scalar[ALIVE, lane] and scalar[COST, lane] <= limit
-            cost[i] = scalar[COST, lane]
-            for j in range(d):
-                x[i, j] = vector[X, j, lane] + vector[ORIGIN, j, lane]
-                for k in range(d):
-                    covariance[i, j, k] = matrix[H_TRIAL, max(j, k), min(j, k), lane]
-            for j in range(e):
-                x[i, d + j] = emission[j, lane] + (z[i, start[j]] - row[0, start[j]] if start[j] >= 0 else 0.0)
-                for k in range(s):
-                    x[i, d + j] -= travel[j, k] * r[k, lane]
             steps = max(steps, int(scalar[STEPS, lane]) + (_FEW if again else 0))
             if not again and scalar[ALIVE, lane] != 0.0 and most > _FEW:
-                late[waiting] = i
+                late[waiting] = item[lane]
                 waiting += 1
         first += LANES
         if not again and first >= count:
@@ -190,6 +179,53 @@ def _accept(y: Array, settled: Array, good: Array, scale: Array, x: Array) -> No
         for lane in range(LANES):
             y[j, lane] = y[j, lane] if good[lane] != 0.0 else 0.0
             x[j, lane] = y[j, lane] * scale[lane]
+
+
+@compiled
+def _resume(x: Array, item: Array, vector: Array) -> None:
+    """Go on from the positions reached so far."""
+    for j in range(vector.shape[1]):
+        for lane in range(LANES):
+            vector[X, j, lane] = x[item[lane], j] - vector[ORIGIN, j, lane]
+
+
+@compiled
+def _emit(travel: Array, r: Array, start: Array, row: Array, z: Array, item: Array, emission: Array) -> None:
+    """Complete the emission times: less the ranges' share, plus the measurement that they count from."""
+    for j in range(len(start)):
+        at = start[j]
+        for lane in range(LANES):
+            total = emission[j, lane] + (z[item[lane], at] - row[0, at] if at >= 0 else 0.0)
+            for k in range(len(r)):
+                total -= travel[j, k] * r[k, lane]
+            emission[j, lane] = total
+
+
+@compiled
+def _write(
+    vector: Array,
+    matrix: Array,
+    scalar: Array,
+    emission: Array,
+    item: Array,
+    limit: float,
+    x: Array,
+    covariance: Array,
+    cost: Array,
+    plain: Array,
+) -> None:
+    """Write the first lanes to the fixes of their problems."""
+    d = vector.shape[1]
+    for lane, i in enumerate(item):
+        fine = scalar[SOLVABLE, lane] * scalar[GOOD, lane] > scalar[ALIVE, lane]
+        plain[i] = fine and scalar[COST, lane] <= limit
+        cost[i] = scalar[COST, lane]
+        for j in range(d):
+            x[i, j] = vector[X, j, lane] + vector[ORIGIN, j, lane]
+            for k in range(d):
+                covariance[i, j, k] = matrix[H_TRIAL, max(j, k), min(j, k), lane]
+        for j in range(len(emission)):
+            x[i, d + j] = emission[j, lane]
 
 
 @compiled

@@ -96,7 +96,7 @@ def equations(
     cost: Array,
 ) -> None:
     """Find information (lower half), right-hand side and cost at positions x (d, W); `row` and `left` are scratch."""
-    s, d = place.shape[:2]
+    d = len(x)
     ranges(place, x, r, unit, left)
     for lane in range(LANES):
         cost[lane] = loop[lane]

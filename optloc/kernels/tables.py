@@ -114,7 +114,7 @@ class Sources:
 
 _KEPT: dict[tuple[Any, ...], Kept | None] = {}
 # Tables of longer problems are made anew each time: that takes less time than a fix, and no memory that lasts.
-_KEPT_ROWS, _KEPT_LINES = 4096, 2**19
+_KEPT_ROWS, _KEPT_LINES = 2**13, 2**19
 
 
 def tables(problem: Problem, groups: tuple[Array, ...]) -> Kept | None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from math import atan, atan2, cos, inf, pi, sin, sqrt
 
 from optloc.kernels.jit import compiled
+from optloc.proof.alone import ALONE
 from optloc.proof.forms import (
     Triple,
     blend,
@@ -25,9 +26,6 @@ from optloc.proof.forms import (
 )
 from optloc.proof.turning import arguments, remainder
 from optloc.types import Array
-
-# Number of an azimuth's row that is not 0 where the sign of its residual is free: no other node shares its rows.
-ALONE = 16
 
 
 @compiled

@@ -9,7 +9,8 @@ import numpy as np
 from optloc.kernels.jit import compiled
 from optloc.proof.balls import around_node
 from optloc.proof.linear3 import invert
-from optloc.proof.nodes import LINEAR, RANGE
+from optloc.proof.nodes import AZIMUTH, ELEVATION, LINEAR, RANGE
+from optloc.proof.rays import around_rays
 from optloc.types import Array
 
 # Nodes whose rows are tied to each other by less than this share count as independent.
@@ -65,7 +66,7 @@ def enclose(
     J = kinds.shape[0]
     rho = rho * (1.0 + _SLACK) + _SLACK
     label, member, tie, error = np.zeros(J, np.int64), np.empty(J, np.int64), np.empty(J), np.empty(J)
-    R = np.empty((J, J))
+    R, swing, angles = np.empty((J, J)), np.full(J, inf), 0
     for k in range(3):
         plane = sense[0, k] == 0.0 and sense[1, k] == 0.0 and sense[2, k] == 0.0
         lower[k], upper[k] = (0.0, 0.0) if plane else (-inf, inf)
@@ -80,12 +81,13 @@ def enclose(
             if tie[i] == 0.0 and reference != member[i]:
                 j = member[i]
                 middle, reach = phi[j] - error[i], rho * sqrt(R[i, i])
+                swing[j] = abs(error[i]) + reach
+                angles += kinds[j] in (AZIMUTH, ELEVATION)
                 around_node(kinds[j], data[j], middle - reach, middle + reach, x, back, lower, upper)
         _squared(kinds, data, A, phi, x, back, rho, member, count, reference, R, tie, error, lower, upper)
-    bounded = True
-    for k in range(3):
-        bounded = bounded and -inf < lower[k] <= upper[k] < inf
-    return bounded
+    if angles:
+        around_rays(kinds, data, x, back, swing, lower, upper)
+    return bool((lower > -inf).all() and (lower <= upper).all() and (upper < inf).all())
 
 
 @compiled

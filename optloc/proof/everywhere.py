@@ -37,7 +37,8 @@ def prove_everywhere(
     """Prove that no position costs less than a fix, and that no other minimum has a gap below kappa.
 
     The claim is for all positions, to infinity. Where something encloses the cheap ones, that is searched first; where
-    nothing does, or the search does not end soon, and the cost stays finite at infinity, the atlas of all space.
+    nothing does, or the search does not end soon, and the cost stays finite at infinity, the atlas of all space: along
+    inverse ranges a long valley is straight, and the cost convex on wider boxes.
 
     Parameters
     ----------
@@ -56,7 +57,7 @@ def prove_everywhere(
     nowhere, open_end = np.full(x.shape[0], np.nan), reaches_infinity(kinds, K)
     first = min(budget, _SOON) if open_end else budget
     verdict, boxes, bound = prove(kinds, data, K, w, x, others, kappa, eps, first, nowhere, nowhere, False, found)
-    if not open_end or verdict not in (OPEN, BUDGET) or boxes >= budget:
+    if not open_end or verdict not in (OPEN, BUDGET, STATIONARY) or boxes >= budget:
         return verdict, boxes, bound
     verdict, more, bound = prove_atlas(kinds, data, K, w, x, others, kappa, eps, budget - boxes, found)
     return verdict, boxes + more, bound

@@ -7,6 +7,7 @@ from math import inf, sqrt
 import numpy as np
 
 from optloc.kernels.jit import compiled
+from optloc.proof.alone import ALONE, MEASURED
 from optloc.proof.forms import (
     Triple,
     blend,
@@ -23,9 +24,6 @@ from optloc.proof.forms import (
     write,
 )
 from optloc.types import Array
-
-# Numbers of a ratio's row: its measured value, and what is not 0 where no other node shares its rows.
-MEASURED, ALONE = 15, 16
 
 
 @compiled

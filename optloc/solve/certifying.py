@@ -37,6 +37,8 @@ _BUDGETS, _SLOW_BUDGET = (4000, 16000), 2000
 _EQUAL = 1e-6
 # Minima behind the Earth that are set aside at most.
 _HIDDEN = 4
+# How far around such a minimum everything must be hidden too, metres: its convex box is smaller.
+_DEEP = 5e4
 # Half-width of the region where all positions cannot be bounded: spreads of the stations, distances of the fix.
 _SPREADS, _DISTANCES = 10.0, 2.0
 
@@ -94,7 +96,7 @@ class Work:
             replace(fix, certificate=np.array(fix.certificate), code=np.array(fix.code), reason=np.array(fix.reason)),
             posed(problem),
             np.full((size, 0, d), np.nan),
-            np.broadcast_to(corners, (size, 2, d)),
+            np.array(np.broadcast_to(corners, (size, 2, d))),
             _around(problem, fix.position),
             np.array([margin, *(m for m in _MARGINS if m < margin)]),
             np.zeros(size, dtype=np.int64),
@@ -168,10 +170,14 @@ def _asked(work: Work, items: Array, extra: Array) -> Asked:
 
 
 def _lower(work: Work, items: Array, why: str) -> None:
-    """Let proofs that failed try for a smaller margin, or give up where that was zero."""
+    """Let proofs that failed try for a smaller margin, then for a region; give up where that was all."""
     work.level[items] += 1
-    spent = work.level[items] >= len(work.margins)
-    _give_up(work, items[spent], why)
+    spent = items[work.level[items] >= len(work.margins)]
+    everywhere = np.isnan(work.region[spent, 0, 0])
+    regional = spent[everywhere]
+    work.region[regional] = work.fallback[regional]
+    work.level[regional] = min(1, len(work.margins) - 1)
+    _give_up(work, spent[~everywhere], why)
 
 
 def _give_up(work: Work, items: Array, why: str) -> None:
@@ -222,11 +228,23 @@ def _ignore(work: Work, items: Array, points: Array) -> Array:
     done = refine(part, vectors(part, points[:, None])[:, 0], face=exact(problem))
     place = problem.layout.take(done.x, "position")
     known = (np.abs(work.ignored[items] - place[:, None]) <= 1e-6 * np.abs(place[:, None])).all(-1).any(1)
-    fresh = hidden(part, done.x) & np.isfinite(place).all(-1) & ~known
+    fresh = _deep(part, done.x) & ~known
     more = np.full((len(work.ignored), 1, place.shape[-1]), np.nan)
     more[items[fresh], 0] = place[fresh]
     work.ignored = np.concatenate([work.ignored, more], axis=1)
     return np.asarray(fresh)
+
+
+def _deep(problem: Problem, x: Array) -> Array:
+    """Return which vectors (N, size) the Earth hides together with all that is near them, (N,)."""
+    slot, _ = problem.layout.find("position")
+    out = np.asarray(np.isfinite(x).all(-1))
+    for axis in range(slot.start, slot.start + slot.size):
+        for side in (-_DEEP, _DEEP):
+            beside = np.where(np.isfinite(x), x, 0.0)
+            beside[:, axis] += side
+            out &= hidden(problem, beside)
+    return out
 
 
 def _judge_again(work: Work) -> None:

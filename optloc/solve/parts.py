@@ -36,7 +36,7 @@ def in_parts(problem: Problem, work: Callable[[Problem, slice], Fix], most: int 
     fix = None
     for first in range(0, count, most):
         part = slice(first, min(first + most, count))
-        fix = work(problem.take(part), part)
+        fix = work(problem.take(np.arange(part.start, part.stop)), part)
         for name in _NAMES:
             value = getattr(fix, name)
             if value is not None:
@@ -47,7 +47,8 @@ def in_parts(problem: Problem, work: Callable[[Problem, slice], Fix], most: int 
         stages.append(fix.stages)
     assert fix is not None
     weights = np.broadcast_to(problem.weight, (count, problem.count))
-    return replace(fix, **arrays, alternatives=_joined(others), weights=weights, stages=_summed(stages))
+    whole = replace(fix, alternatives=_joined(others), weights=weights, stages=_summed(stages))
+    return replace(whole, **arrays)  # type: ignore[arg-type]
 
 
 def _joined(parts: list[Alternatives]) -> Alternatives:

@@ -2,57 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from optloc.constraints import Face, restored, tangent_at
-from optloc.equations import equations_at, serves
-from optloc.kernels.pack import coarseness, packed
+from optloc.equations import equations_at
+from optloc.kernels.pack import coarseness
 from optloc.noise import Whitener, variances, whiten
 from optloc.normal import Normal, decrement, step
 from optloc.problem import Problem
+from optloc.solve.machine_code import WEIGHINGS, Refined, Rules, by_machine_code
 from optloc.status import Status
 from optloc.types import Array
 from optloc.weigh import depends_on_place, weighed
 from optloc.windows import whole, windows
-
-# Station errors are weighed where the target is thought to be; the weights hardly change with it.
-_WEIGHINGS = 2
-# Systems of more unknowns are better solved one after the other than side by side.
-_UNKNOWNS = 40
-
-
-@dataclass(frozen=True, slots=True)
-class Refined:
-    """Where the refinement ended.
-
-    Parameters
-    ----------
-    x : array (N, size)
-        Parameter vectors.
-    cost : array (N,)
-        Weighted sum of squared residuals and prior penalties.
-    status : int array (N,)
-        `Status` of each: ok, max iterations, stalled, singular geometry, numerical.
-    iterations : int array (N,)
-        Steps tried.
-    make : callable
-        Returns the normal equations at `x`.
-    """
-
-    x: Array
-    cost: Array
-    status: Array
-    iterations: Array
-    make: Callable[[], Normal]
-
-    @property
-    def equations(self) -> Normal:
-        """Return the normal equations at `x`."""
-        return self.make()
 
 
 def refine(
@@ -92,8 +57,8 @@ def refine(
     Refined
         One entry for each start.
     """
-    rules = _Rules(problem.layout.n_shared, tolerance, limit, damped, face)
-    quick = _compiled(problem, start, item, rules)
+    rules = Rules(problem.layout.n_shared, tolerance, limit, damped, face)
+    quick = by_machine_code(problem, start, item, rules, _remade)
     if quick is not None:
         return quick
     weights = None
@@ -104,32 +69,14 @@ def refine(
         problem = problem.take(item)
     if weights is not None:
         return _iterated(problem, start, weights, rules)
-    for _ in range(_WEIGHINGS):
-        done = _iterated(problem, start, _Weights.of(problem, start), rules)
+    for _ in range(WEIGHINGS):
+        done = _remade(problem, start, rules)
         start = done.x
     return done
 
 
-def _compiled(problem: Problem, start: Array, item: Array | None, rules: _Rules) -> Refined | None:
-    """Return where machine code ends by the same rules, or None where it does not serve or does not pay."""
-    few = problem.layout.n_shared + problem.layout.n_local <= _UNKNOWNS
-    if rules.face or not few or not serves(problem, len(start)) or depends_on_place(problem):
-        return None
-    found = packed(problem, whiten(weighed(problem).noise, problem.weight))
-    if found is None:
-        return None
-    from optloc.kernels import spread
-    from optloc.kernels.refine import Rules
-
-    own = np.arange(len(start)) if item is None else np.asarray(item, dtype=np.int64)
-    kernel = Rules(float(rules.tolerance), int(rules.limit), bool(rules.damped))
-    done, lost = spread.refined(found, own, start, kernel)
-    if lost.any():
-        part, begin = problem.take(own[lost]), start[lost]
-        more = _iterated(part, begin, _Weights.of(part, begin), rules)
-        for name in ("x", "cost", "status", "iterations"):
-            getattr(done, name)[lost] = getattr(more, name)
-    return Refined(done.x, done.cost, done.status, done.iterations, lambda: spread.equations(found, own, done))
+def _remade(problem: Problem, start: Array, rules: Rules) -> Refined:
+    return _iterated(problem, start, _Weights.of(problem, start), rules)
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +100,7 @@ class _Weights:
         return equations_at(problem, x, self.matrices, at=self.at)
 
 
-def _iterated(problem: Problem, start: Array, weights: _Weights, rules: _Rules) -> Refined:
+def _iterated(problem: Problem, start: Array, weights: _Weights, rules: Rules) -> Refined:
     """Return where the iteration ends whose weights stay as they are."""
     with np.errstate(all="ignore"):
         start = restored(problem, rules.face, start) if rules.face else start
@@ -196,17 +143,6 @@ class _State:
 
 
 @dataclass(frozen=True, slots=True)
-class _Rules:
-    """What does not change during an iteration."""
-
-    n: int
-    tolerance: float
-    limit: int
-    damped: bool
-    face: Face
-
-
-@dataclass(frozen=True, slots=True)
 class _Part:
     """The problems still moving."""
 
@@ -232,7 +168,7 @@ def _blur(problem: Problem, count: int) -> Array:
     return np.broadcast_to(np.where(np.isfinite(coarse), coarse, 0.0), (count,))
 
 
-def _advance(part: _Part, state: _State, active: Array, rules: _Rules, iteration: int) -> None:
+def _advance(part: _Part, state: _State, active: Array, rules: Rules, iteration: int) -> None:
     """Try one step of every problem still moving."""
     everything = len(active) == len(state.x)
     now = state.equations if everything else _at(state.equations, active)

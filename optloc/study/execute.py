@@ -183,7 +183,7 @@ def _processes(by: Executor) -> Iterator[Begun]:
     try:
         yield {"backend": "loky", "n_jobs": by.jobs or workers(), "inner_max_num_threads": 1}, (BrokenProcessPool,)
     finally:
-        get_reusable_executor().shutdown(wait=False, kill_workers=True)
+        get_reusable_executor().shutdown(wait=True, kill_workers=True)
 
 
 @contextmanager

@@ -17,6 +17,7 @@ from monte_carlo.tables import FOLDER, write
 
 ROUNDS = 7
 MILLION = 1_000_000
+FASTER = 100.0
 
 
 def machine() -> str:
@@ -51,6 +52,8 @@ def test_write_the_table(tmp_path):
     save_csv(found, FOLDER / "benchmarks.csv")
     picture.methods(found, FOLDER / "benchmarks.png")
     ours = {line.scene: line for line in found if line.one.name == "optloc, gtrs+lsr"}
+    theirs = {line.scene: line.times.ratio for line in found if line.one.name == SCIPY}
+    assert all(theirs[scene] > FASTER * line.times.ratio for scene, line in ours.items())
     for line in found:
         if line.one.group == "peer":
             assert ours[line.scene].times.ratio < line.times.ratio, line.one.name

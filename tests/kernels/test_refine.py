@@ -16,6 +16,7 @@ from optloc.normal import marginal
 from optloc.status import Status
 
 hooks = import_module("optloc.solve.refine")
+choice = import_module("optloc.solve.machine_code")
 COUNT = 100 if enabled() else 3
 
 
@@ -26,7 +27,7 @@ def both(monkeypatch):
     def refined(problem, start, **more):
         out = []
         for chosen in (True, False):
-            monkeypatch.setattr(hooks, "serves", lambda problem, starts, chosen=chosen: chosen)
+            monkeypatch.setattr(choice, "serves", lambda problem, starts, chosen=chosen: chosen)
             out.append(hooks.refine(problem, start, **more))
         assert out[0].equations.local.shape == out[1].equations.local.shape
         return out

@@ -15,7 +15,7 @@ import optloc
 from optloc import Fix
 from optloc.solve.reference import Reference, reference_bound
 
-DEFAULT, FULL = 6, 200
+DEFAULT, FULL = 6, 100
 SLACK = 1e-6
 CASES = {
     "TDOA, 5 stations, inside, 1 m": "moment",

@@ -207,7 +207,7 @@ def test_a_known_height_is_proven_on_its_surface():
     problem = replace(simulate(template, truth, 4), constraints=height(exactly=high))
     fix = solve(problem)
     proof = fix.certificate.item()
-    assert proof.proof == "global"
+    assert proof.proof in ("global", "region")
     flat = np.stack(np.meshgrid(*[np.linspace(-60e3, 60e3, 300)] * 2), axis=-1).reshape(-1, 2)
     on = np.column_stack([flat, np.full(len(flat), truth[2])])
     for _ in range(4):  # onto the surface of that height

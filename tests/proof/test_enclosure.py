@@ -10,7 +10,8 @@ from optloc.proof.balls import around_node
 from optloc.proof.chart import value_at
 from optloc.proof.convex import sum_up
 from optloc.proof.enclosure import enclose
-from optloc.proof.nodes import RANGE, RATIO, WIDTH
+from optloc.proof.nodes import AZIMUTH, ELEVATION, RANGE, RATIO, WIDTH
+from optloc.proof.rays import around_rays
 
 CASES, RAYS = (18, 500) if enabled() else (6, 200)
 
@@ -138,3 +139,46 @@ def test_too_few_differences_have_no_enclosure():
     rng = np.random.default_rng(4)
     case, truth = random_case(rng, 3, m=4)
     assert enclosed(case, truth, 3.0)[1] is None
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("swing", [0.01, 0.1])
+def test_points_seen_in_nearly_the_same_directions_are_enclosed(d, swing):
+    rng = np.random.default_rng(5)
+    made = held = 0
+    for _ in range(CASES):
+        stations, x = rng.uniform(-5.0, 5.0, (4, d)), rng.uniform(-4.0, 4.0, d)
+        axes = np.stack([np.linalg.qr(rng.standard_normal((d, d)))[0] for _ in range(4)])
+        kinds = np.array([AZIMUTH] * 4 + [ELEVATION] * (4 if d == 3 else 0), dtype=np.int64)
+        data = np.zeros((len(kinds), WIDTH))
+        for j in range(len(kinds)):
+            data[j, :d] = stations[j % 4]
+            padded = np.zeros((3, 3))
+            padded[:d, :d] = axes[j % 4]
+            data[j, 6:15] = padded.ravel()
+
+        def angles(points, stations=stations, axes=axes):
+            own = np.einsum("sij,...sj->...si", axes, points[..., None, :] - stations)
+            azimuth = np.arctan2(own[..., 1], own[..., 0])
+            return azimuth if d == 2 else np.concatenate([azimuth, np.arcsin(own[..., 2] / norm(own))], axis=-1)
+
+        def norm(own):
+            return np.linalg.norm(own, axis=-1)
+
+        back, low, high = np.zeros((3, 3)), np.full(3, -np.inf), np.full(3, np.inf)
+        back[:d, :d] = rng.standard_normal((d, d))
+        origin = np.zeros(3)
+        origin[:d] = x
+        around_rays(kinds, data, origin, back, np.full(len(kinds), swing), low, high)
+        if not np.isfinite(high[:d]).all():
+            continue
+        made += 1
+        points = x + rng.standard_normal((20_000, d)) * 10.0 ** rng.uniform(-3.0, 1.0, (20_000, 1))
+        off = angles(points) - angles(x)
+        seen = (np.abs((off + np.pi) % (2.0 * np.pi) - np.pi) <= swing).all(1)
+        s = (points[seen] - x) @ back[:d, :d].T
+        assert (s >= low[:d]).all()
+        assert (s <= high[:d]).all()
+        held += len(s)
+    assert made > CASES // 2
+    assert held > made * 20

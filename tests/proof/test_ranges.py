@@ -158,7 +158,7 @@ def test_a_clipped_box_loses_no_short_residual(d):
 
 
 def test_comparing_a_length_with_a_cost_would_drop_the_minimum():
-    """Below a cost of 1 the length of a residual exceeds its square: low >= f^ drops the box with the minimum inside."""
+    """Below a cost of 1 a residual is longer than its square: low >= f^ drops the box with the minimum inside."""
     rng = np.random.default_rng(6)
     dropped = 0
     for _ in range(60):

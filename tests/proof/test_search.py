@@ -35,7 +35,7 @@ def test_what_is_proven_holds_against_many_starts(d, kind):
     rng = np.random.default_rng(d)
     proven = 0
     for i in range(CASES):
-        case, truth = random_case(rng, d, kind=kind, outside=i % 2 == 1, sigma=(1.0, 10.0, 30.0)[i % 3])
+        case, _ = random_case(rng, d, kind=kind, outside=i % 2 == 1, sigma=(1.0, 10.0, 30.0)[i % 3])
         minima = case.minima(rng)
         if not len(minima):
             continue
@@ -117,7 +117,7 @@ def test_a_mirror_twin_has_the_proven_value_and_is_found(kappa):
 def test_other_minima_that_are_known_are_set_aside_and_the_list_is_proven():
     rng = np.random.default_rng(40)
     listed = 0
-    for i in range(2 * CASES):
+    for _ in range(2 * CASES):
         stations = np.array([[-4e3, 0.0], [0.0, 150.0], [4e3, -200.0]]) + 300.0 * rng.standard_normal((3, 2))
         truth = np.array([2e3, 3e3]) + 1e3 * rng.standard_normal(2)
         case = combined(stations, np.eye(3), 100.0**2 * np.eye(3), truth, rng)
@@ -147,7 +147,7 @@ def test_a_region_is_searched_where_nothing_encloses_the_cost():
         if len(inside) != 1:
             continue
         assert proof(case, inside[0])[0] == OPEN
-        verdict, _, bound, found = proof(case, inside[0], region=region)
+        verdict, _, bound, _ = proof(case, inside[0], region=region)
         points = rng.uniform(-4e3, 4e3, (20_000, 3))
         assert bound <= case.cost(points).min()
         if verdict == VALUE:
@@ -183,7 +183,7 @@ def test_a_region_whose_least_cost_is_on_its_border_is_not_proven():
 def test_a_budget_that_ends_leaves_a_valid_bound():
     rng = np.random.default_rng(70)
     for _ in range(CASES):
-        case, truth = random_case(rng, 3, m=6, outside=True, sigma=30.0)
+        case, _ = random_case(rng, 3, m=6, outside=True, sigma=30.0)
         minima = case.minima(rng)
         if not len(minima):
             continue
@@ -197,7 +197,7 @@ def test_a_budget_that_ends_leaves_a_valid_bound():
 
 def test_rows_that_do_not_determine_a_position_are_singular():
     rng = np.random.default_rng(80)
-    case = combined(np.zeros((3, 3)) + [[1.0], [2.0], [3.0]], np.eye(3), np.eye(3), np.array([9.0, 9.0, 9.0]), rng)
+    case = combined(np.outer([1.0, 2.0, 3.0], np.ones(3)), np.eye(3), np.eye(3), np.array([9.0, 9.0, 9.0]), rng)
     assert proof(case, np.array([9.0, 9.0, 9.0]))[0] == SINGULAR
 
 

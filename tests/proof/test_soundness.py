@@ -26,7 +26,7 @@ HARD = [
     "AOA, 4 stations, outside, 20 mrad",
     "GROA + TDOA, 5 stations, outside, 10 m",
     "AOA + TDOA, 4 stations, outside, 10 m",
-    "GROA, 6 stations, inside, 2000 permille",
+    "GROA, 6 stations, inside, 2 permille",
     "TDOA in the plane, 4 stations, 10 m",
     "AOA in the plane, 3 stations, 10 mrad",
     "bistatic, two illuminators, 10 m, 5 mrad",
