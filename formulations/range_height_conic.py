@@ -114,7 +114,8 @@ def lifted(
         nothing = Answer({}, np.nan, -np.inf, "not posed", solved=False, iterations=0)
         return Lifted(np.full(3, np.nan), np.full(3, np.nan), -np.inf, np.nan, nothing)
     scale = float(np.abs(forms["objective"]).max())
-    answer = _built(backend).solve({name: form / np.abs(form).max() for name, form in forms.items()})
+    data = {name: form / np.abs(form).max() for name, form in forms.items()}
+    answer = _built(backend).solve(data, reach=_reach(curve, stations[0], surface, guess))
     lift, ratio = answer.values["lift"], np.nan
     if np.isfinite(lift).all():
         values = np.linalg.eigvalsh(lift)
@@ -136,3 +137,11 @@ def _forms(curve: Curve, surface: Ellipsoid, near: Array, guess: float) -> tuple
     change[1, 0] = (guess - offset) / rate
     forms = {"objective": away.T @ away + np.outer(late, late), "curve": on_curve, "surface": on_surface}
     return {name: change.T @ form @ change for name, form in forms.items()}, change
+
+
+def _reach(curve: Curve, station: Array, surface: Ellipsoid, guess: float) -> float:
+    """Length that the lift of no point of the ellipsoid exceeds: what makes the bound rigorous."""
+    size = 1.0 / float(np.sqrt(np.linalg.eigvalsh(surface.shape)[0]))
+    t = (float(np.linalg.norm(station - surface.centre)) + size) / guess + 1.0
+    mu = (abs(float(curve.across[0] @ (surface.centre - curve.base[0]))) + size) / guess
+    return 1.0 + t * t + mu * mu

@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 
 FLOORS = {
-    0: "types errors units frames status noise linalg ellipse arrays",
+    0: "types errors units frames status noise linalg ellipse arrays threads",
     1: "models",
     2: "layout problem linear normal fix tables kernels states build check check_constraints check_unknowns arguments "
     "epochs constraints tangent symbolic plan evaluate weigh windows equations blocks priors learnt bias gauss_newton",

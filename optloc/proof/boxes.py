@@ -7,70 +7,19 @@ from math import sqrt
 from optloc.kernels.jit import compiled
 from optloc.proof.angles import bound_azimuth, bound_elevation
 from optloc.proof.height import bound_height
+from optloc.proof.inline import inlined
 from optloc.proof.nodes import AZIMUTH, ELEVATION, LINEAR, RANGE, RATIO
+from optloc.proof.ranges import bound_ranges
 from optloc.proof.ratio import bound_ratio
 from optloc.types import Array
 
 _ULP = 2.0**-52
+# Coordinate descents towards the least-squares point of a box; any point gives a valid bound.
+_SWEEPS = 3
 # Columns of a table of nodes over a box (J, 6): value at the centre, gradient, enclosure of the remainder.
 NODE_WIDTH = 6
 # Columns of a table of rows over a box (q, 5): residual in the middle of the remainders, Jacobian, direction v.
 ROW_WIDTH = 5
-
-
-@compiled
-def quadratic(a: float, b: float, c: float, d: float, e: float, f: float, h0: float, h1: float, h2: float) -> float:
-    """Return the maximum of s'[[a, b, c], [b, d, e], [c, e, f]]s, positive semidefinite, over |s_k| <= h_k.
-
-    The maximum is at a corner. The signs of a corner make all three mixed terms positive where their product is;
-    otherwise one of them must be negative: the smallest.
-    """
-    u, v, t = b * h0 * h1, c * h0 * h2, e * h1 * h2
-    mixed = abs(u) + abs(v) + abs(t)
-    if u * v * t < 0.0:
-        mixed -= 2.0 * min(abs(u), abs(v), abs(t))
-    return max(a * h0 * h0 + d * h1 * h1 + f * h2 * h2 + 2.0 * mixed, 0.0)
-
-
-@compiled
-def bound_range(line: Array, sense: Array, gram: Array, half: Array, node: Array) -> None:
-    """Bound a range over a box: its row of the table of nodes.
-
-    With u the direction of the line v, a = r + u.d and b = |d - u u.d| the remainder is ``sqrt(a^2 + b^2) - a``, which
-    falls with a (of either sign) and grows with b: it is at most its value at the least a and the greatest b.
-
-    Parameters
-    ----------
-    line, sense, half : array (3,), (3, 3), (3,)
-        Of the node (`optloc.proof.nodes`).
-    gram : array (3, 3)
-        ``sense' sense``.
-    node : array (6,)
-        Written.
-    """
-    x, y, z = line[0], line[1], line[2]
-    r = sqrt(x * x + y * y + z * z)
-    per = 1.0 / r if r > 0.0 else 0.0
-    g0 = (x * sense[0, 0] + y * sense[1, 0] + z * sense[2, 0]) * per
-    g1 = (x * sense[0, 1] + y * sense[1, 1] + z * sense[2, 1]) * per
-    g2 = (x * sense[0, 2] + y * sense[1, 2] + z * sense[2, 2]) * per
-    h0, h1, h2 = half[0], half[1], half[2]
-    least = r - abs(g0) * h0 - abs(g1) * h1 - abs(g2) * h2
-    across = quadratic(
-        gram[0, 0] - g0 * g0,
-        gram[0, 1] - g0 * g1,
-        gram[0, 2] - g0 * g2,
-        gram[1, 1] - g1 * g1,
-        gram[1, 2] - g1 * g2,
-        gram[2, 2] - g2 * g2,
-        h0,
-        h1,
-        h2,
-    )
-    root = sqrt(least * least + across)
-    node[0], node[1], node[2], node[3], node[4] = r, g0, g1, g2, 0.0
-    # The same number without cancellation.
-    node[5] = across / (root + least) if least > 0.0 else root - least
 
 
 @compiled
@@ -83,7 +32,7 @@ def bound_linear(line: Array, sense: Array, data: Array, node: Array) -> None:
     node[4] = node[5] = 0.0
 
 
-@compiled
+@inlined
 def bound_nodes(
     kinds: Array, data: Array, centre: Array, sense: Array, gram: Array, half: Array, line: Array, nodes: Array
 ) -> None:
@@ -104,13 +53,14 @@ def bound_nodes(
     nodes : array (J, NODE_WIDTH)
         Written.
     """
-    for j in range(kinds.shape[0]):
+    others = bound_ranges(kinds, data, centre, sense, gram, half, nodes)
+    for j in range(kinds.shape[0] if others else 0):
         kind = kinds[j]
+        if kind == RANGE:
+            continue
         for k in range(3):
             line[k] = centre[k] - data[j, k]
-        if kind == RANGE:
-            bound_range(line, sense, gram, half, nodes[j])
-        elif kind == LINEAR:
+        if kind == LINEAR:
             bound_linear(line, sense, data[j], nodes[j])
         else:
             for k in range(3):
@@ -223,16 +173,23 @@ def normal_of(rows: Array) -> tuple[float, float, float, float, float, float, fl
 
 
 @compiled
+def within(s: float, half: float) -> float:
+    """Return the number nearest to s between -half and half."""
+    if s > half:
+        return half
+    return max(s, -half)
+
+
+@compiled
 def _nearest(half: Array, rows: Array) -> None:
     """Write the direction v = middle + J s with s nearly the least-squares solution inside the box."""
     a00, a01, a02, a11, a12, a22, b0, b1, b2 = normal_of(rows)
+    d0, d1 = 1.0 / a00 if a00 > 0.0 else 0.0, 1.0 / a11 if a11 > 0.0 else 0.0
+    d2 = 1.0 / a22 if a22 > 0.0 else 0.0
     s0, s1, s2 = 0.0, 0.0, 0.0
-    for _ in range(4):
-        if a00 > 0.0:
-            s0 = min(max(-(b0 + a01 * s1 + a02 * s2) / a00, -half[0]), half[0])
-        if a11 > 0.0:
-            s1 = min(max(-(b1 + a01 * s0 + a12 * s2) / a11, -half[1]), half[1])
-        if a22 > 0.0:
-            s2 = min(max(-(b2 + a02 * s0 + a12 * s1) / a22, -half[2]), half[2])
+    for _ in range(_SWEEPS):
+        s0 = within(-(b0 + a01 * s1 + a02 * s2) * d0, half[0])
+        s1 = within(-(b1 + a01 * s0 + a12 * s2) * d1, half[1])
+        s2 = within(-(b2 + a02 * s0 + a12 * s1) * d2, half[2])
     for i in range(rows.shape[0]):
         rows[i, 4] = rows[i, 0] + rows[i, 1] * s0 + rows[i, 2] * s1 + rows[i, 3] * s2

@@ -11,6 +11,7 @@ from optloc.proof.chart import Box, Chart, Cost, bound_box, curve_box
 from optloc.proof.clip import cut_out, is_empty, shrink
 from optloc.proof.convex import clip_to_stationary, convex
 from optloc.proof.descend import descend
+from optloc.proof.inline import inlined
 from optloc.proof.stack import push, push_halves
 from optloc.types import Array
 
@@ -100,12 +101,13 @@ def branch(
                 clip_to_stationary(cost.A, box.half, box.nodes, box.curves, box.sums, box.cut, box.solve)
             else:
                 curve_box(cost, chart, box)
-            low_points += here < aim.level
-            early = here < aim.level and low_points & (low_points - 1) == 0
-            if not is_empty(box.cut) and (early or _is_bowl(cost, box)):
-                verdict = _follow(cost, chart, box, minima, sides, aim)
-                if verdict != CLEAR:
-                    return verdict, boxes, 0.0
+            if here < aim.level and not is_empty(box.cut):
+                low_points += 1
+                # Early, then more and more seldom, and wherever a box holds one minimum at most.
+                if low_points & (low_points - 1) == 0 or _is_bowl(cost, box):
+                    outcome = _follow(cost, chart, box, minima, sides, aim)
+                    if outcome != CLEAR:
+                        return outcome, boxes, 0.0
         side = _side(cost, chart, box, here < aim.level)
         share = cut_out(box.cut, box.at, box.half)
         if 0.0 < share < _SHRUNK:
@@ -115,22 +117,22 @@ def branch(
     return CLEAR, boxes, inf
 
 
-@compiled
+@inlined
 def _shrink(cost: Cost, box: Box, aim: Aim) -> None:
     rho = sqrt(max(aim.level, 0.0)) + rounding(cost.K, cost.weight, aim.floor, box.nodes)
     shrink(cost.K, rho, box.half[2] == 0.0, box.nodes, box.rows, box.cut, box.solve)
 
 
-@compiled
+@inlined
 def _is_bowl(cost: Cost, box: Box) -> bool:
     return convex(cost.kinds, cost.A, box.half, box.nodes, box.curves, box.sums, 0.0)
 
 
 @compiled
 def _follow(cost: Cost, chart: Chart, box: Box, minima: Array, sides: Array, aim: Aim) -> int:
-    """Descend from the centre of a box to a minimum; return a verdict if it is better or not known, else -1.
+    """Descend from the centre of a box to a minimum; return CHEAPER, or ANOTHER if it is not known, or CLEAR.
 
-    The box is as it was afterwards (but for its tables), or the minimum where there is a verdict.
+    The box is the minimum afterwards, or where all is clear what it was, but for its tables.
     """
     at0, at1, at2 = box.at[0], box.at[1], box.at[2]
     h0, h1, h2 = box.half[0], box.half[1], box.half[2]

@@ -10,6 +10,7 @@ import numpy as np
 from optloc.kernels.jit import compiled
 from optloc.proof.boxes import NODE_WIDTH, ROW_WIDTH, bound_nodes, cost_at, least_residual, linearise_rows
 from optloc.proof.convex import CURVE_WIDTH, SUMS, convex, curve_nodes, sum_up
+from optloc.proof.inline import inlined
 from optloc.proof.linear3 import principal
 from optloc.proof.nodes import LINEAR, RANGE
 from optloc.types import Array
@@ -169,7 +170,7 @@ def accuracy_floor(cost: Cost, chart: Chart) -> float:
     return total
 
 
-@compiled
+@inlined
 def place(chart: Chart, box: Box) -> None:
     """Write the centre of a box in metres."""
     s0, s1, s2 = box.at[0], box.at[1], box.at[2]
@@ -177,7 +178,7 @@ def place(chart: Chart, box: Box) -> None:
         box.centre[k] = chart.origin[k] + (chart.sense[k, 0] * s0 + chart.sense[k, 1] * s1 + chart.sense[k, 2] * s2)
 
 
-@compiled
+@inlined
 def bound_box(cost: Cost, chart: Chart, box: Box, floor: float) -> float:
     """Fill the first tables of a box; return a lower bound of the length of the residual there, or less than 0."""
     place(chart, box)
@@ -194,7 +195,7 @@ def value_at(cost: Cost, chart: Chart, box: Box) -> float:
     return cost_at(cost.K, cost.w, box.nodes)
 
 
-@compiled
+@inlined
 def curve_box(cost: Cost, chart: Chart, box: Box) -> None:
     """Fill the tables of second derivatives of a box whose nodes are bounded."""
     curve_nodes(

@@ -10,8 +10,10 @@ from optloc.kernels.jit import compiled
 from optloc.proof.angles import curve_azimuth, curve_elevation
 from optloc.proof.clip import clip, is_empty
 from optloc.proof.height import curve_height
+from optloc.proof.inline import inlined
 from optloc.proof.linear3 import inverse, positive
 from optloc.proof.nodes import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO
+from optloc.proof.ranges import curve_range
 from optloc.proof.ratio import curve_ratio
 from optloc.types import Array
 
@@ -22,52 +24,7 @@ CURVE_WIDTH = 14
 SUMS = 15
 
 
-@compiled
-def curve_range(sense: Array, gram: Array, half: Array, node: Array, curve: Array) -> None:
-    """Write Hessian and bounds of its change of a range into its row of the table of second derivatives.
-
-    With P the projection across the direction u of the line and r' >= A the range elsewhere in the box, the gradient
-    T'u changes by ``(T'P d - q T'u) / r'`` and the Hessian ``T'P T / r`` by a difference of quotients.
-
-    Parameters
-    ----------
-    sense, gram, half : array (3, 3), (3, 3), (3,)
-        As of `bound_range`.
-    node : array (NODE_WIDTH,)
-        Row filled by `bound_range`.
-    curve : array (CURVE_WIDTH,)
-        Written.
-    """
-    r, most = node[0], node[5]
-    least, move, slope, norm = r, most, 0.0, 0.0
-    for k in range(3):
-        least -= abs(node[1 + k]) * half[k]
-        move += abs(node[1 + k]) * half[k]
-        slope += node[1 + k] * node[1 + k]
-    column = 0
-    for k in range(3):
-        for m in range(k, 3):
-            entry = gram[k, m] - node[1 + k] * node[1 + m]
-            norm += entry * entry * (1.0 if k == m else 2.0)
-            curve[column] = entry / r if r > 0.0 else 0.0
-            column += 1
-    if not least > 0.0:
-        for k in range(3):
-            curve[6 + k] = sqrt(gram[k, k]) + abs(node[1 + k])
-        curve[9] = inf
-        return
-    eta = 0.0
-    for k in range(3):
-        total = most * abs(node[1 + k])
-        for m in range(3):
-            total += abs(gram[k, m] - node[1 + k] * node[1 + m]) * half[m]
-        curve[6 + k] = total / least
-        eta += curve[6 + k] * curve[6 + k]
-    eta = sqrt(eta)
-    curve[9] = (eta * (2.0 * sqrt(slope) + eta) + sqrt(norm) * move / r) / least
-
-
-@compiled
+@inlined
 def curve_nodes(
     kinds: Array,
     data: Array,

@@ -61,13 +61,13 @@ def bound_difference(
     h, radius = triple(half, 0), atlas.radius
     set_line(atlas, data, 0, atlas.away, atlas.sense)
     a, rise, n = scaled_station(atlas, data)
-    r, u, least, q = range_form(atlas.away, atlas.sense, h)
-    r0, u0, least0, q0 = centre
+    r, u, least, q, far = range_form(atlas.away, atlas.sense, h)
+    r0, u0, least0, q0, far0 = centre
     size, u, most = r + r0, blend(1.0, u, 1.0, u0), q + q0
     phi, least = rise / size if size > 0.0 else 0.0, max(least, 0.0) + max(least0, 0.0)
     if least > 0.0:
         g = blend(1.0 / size, n, -phi / size, u)
-        low, high = quotient(phi, g, u, most, (0.0, 0.0), (least, size + reach(u, h) + most), h)
+        low, high = quotient(phi, g, u, most, (0.0, 0.0), (least, far + far0), h)
         if high - low <= 2.0 * a:
             write(blend(radius, g, 0.0, g), slope)
             return radius * phi, radius * low, radius * high
@@ -84,8 +84,8 @@ def curve_difference(atlas: Atlas, data: Array, centre: RangeForm, half: Array, 
     if a == 0.0:
         bend[:] = 0.0
         return 0.0
-    r, u, least, q = range_form(atlas.away, atlas.sense, h)
-    r0, u0, least0, q0 = centre
+    r, u, least, q, _ = range_form(atlas.away, atlas.sense, h)
+    r0, u0, least0, q0, _ = centre
     if still(turn) or not (least > 0.0 and least0 > 0.0):
         return unbounded(bend, turn)
     ds, chi, norm = range_bend(atlas.sense, h, r, u, least, q, second)

@@ -12,7 +12,7 @@ from optloc.types import Array
 
 Triple = tuple[float, float, float]
 # A range over a box, see `range_form`.
-RangeForm = tuple[float, Triple, float, float]
+RangeForm = tuple[float, Triple, float, float, float]
 
 
 @compiled
@@ -129,15 +129,16 @@ def across(sense: Array, u: Triple, h: Triple) -> float:
 
 @compiled
 def range_form(line: Array, sense: Array, h: Triple) -> RangeForm:
-    """Return a range over a box: its value r, the linear form u, the least r + u.s, and a bound of the remainder.
+    """Return a range over a box: its value r, slope u, the least r + u.s, a bound of the remainder, and the greatest.
 
     The range is ``r + u.s + q`` with ``0 <= q <= remainder``.
     """
     n = triple(line, 0)
     r = length(n)
     u = pull((n[0] / r, n[1] / r, n[2] / r) if r > 0.0 else (1.0, 0.0, 0.0), sense)
-    least = r - reach(u, h)
-    return r, u, least, excess(least, across(sense, u, h))
+    swing, aside = reach(u, h), across(sense, u, h)
+    far = sqrt((r + swing) * (r + swing) + aside * aside) * (1.0 + 1e-15)
+    return r, u, r - swing, excess(r - swing, aside), far
 
 
 @compiled

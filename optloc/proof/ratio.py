@@ -40,21 +40,20 @@ def bound_ratio(
     its measured value, so there the lower end may stand for the ratio.
     """
     h = triple(half, 0)
-    ra, ua, least_a, most_a = range_form(line, sense, h)
-    rb, ub, least_b, most_b = range_form(line_b, sense_b, h)
+    ra, ua, least_a, most_a, far_a = range_form(line, sense, h)
+    rb, ub, least_b, most_b, far_b = range_form(line_b, sense_b, h)
     phi = ra / rb if rb > 0.0 else inf
-    bottom = rb + reach(ub, h) + most_b
-    low = max(least_a, 0.0) / bottom
+    low = max(least_a, 0.0) / far_b if far_b > 0.0 else 0.0
     if least_b > 0.0:
-        high = (ra + reach(ua, h) + most_a) / least_b
+        high = far_a / least_b
         n, q = _squares(line, sense, line_b, sense_b, h)
         size, u, most = ra + rb, blend(1.0, ua, 1.0, ub), most_a + most_b
         delta = ra - rb
         g = blend(1.0 / size, n, -delta / size, u)
         least = least_b + max(least_a, 0.0)
-        q = quotient(delta, g, u, most, q, (least, size + reach(u, h) + most), h)
+        q = quotient(delta, g, u, most, q, (least, far_a + far_b), h)
         g = blend(1.0 / rb, g, -(phi - 1.0) / rb, ub)
-        less, more = quotient(phi - 1.0, g, ub, most_b, q, (least_b, bottom), h)
+        less, more = quotient(phi - 1.0, g, ub, most_b, q, (least_b, far_b), h)
         if more - less <= high - low:
             write(g, slope)
             return phi, less, more
@@ -124,8 +123,8 @@ def curve_ratio(
     """Bound how a ratio of ranges curves over a box (see `optloc.proof.nodes`), in the two steps of `bound_ratio`."""
     h = triple(half, 0)
     bound_ratio(data, line, sense, line_b, sense_b, half, turn)
-    ra, ua, least_a, qa = range_form(line, sense, h)
-    rb, ub, least_b, qb = range_form(line_b, sense_b, h)
+    ra, ua, least_a, qa, _ = range_form(line, sense, h)
+    rb, ub, least_b, qb, _ = range_form(line_b, sense_b, h)
     if still(turn) or not (least_a > 0.0 and least_b > 0.0):
         return unbounded(curvature, turn)
     bend, whole = np.empty((3, 3)), np.empty((3, 3))

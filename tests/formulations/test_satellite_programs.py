@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
+from formulations._curve import three_stations
 from formulations.ellipsoid import ellipsoid, visible
 from formulations.range_height import locate
-from formulations.range_height_conic import lifted
+from formulations.range_height_conic import _reach, lifted
 from formulations.range_height_nlp import HeightProgram
 
 EARTH = 6378137.0
@@ -152,3 +153,15 @@ def test_malformed_input_names_the_culprit(program):
         HeightProgram([(0, 3)], 3)
     with pytest.raises(ValueError, match="stations have shape"):
         program.solve(BELOW, np.zeros(2), SATELLITES[:2], WGS84)
+
+
+def test_the_reach_holds_every_point_of_the_ellipsoid():
+    """The bound counts on it: coordinates (t, mu) of points that fit, visible or not, in units of the guess."""
+    _, offset, _ = problems(100, SIGMA, 6)
+    guess = float(np.linalg.norm(BELOW - SATELLITES[0]))
+    for c in offset:
+        curve = three_stations(SATELLITES[None], ALL[None], c[None])
+        found = locate(SATELLITES, ALL, c, WGS84)
+        for x, r in zip(found.x[found.valid], found.ranges[found.valid], strict=True):
+            lift = np.array([1.0, (r[0] - guess) / guess, curve.across[0] @ (x - curve.base[0]) / guess])
+            assert lift @ lift <= _reach(curve, SATELLITES[0], WGS84, guess)

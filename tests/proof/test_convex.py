@@ -3,22 +3,20 @@
 import numpy as np
 import pytest
 from proof.costs import random_case
-from proof.test_ranges import charted, drawn_box, ways
+from proof.test_ranges import bounded, charted, drawn_box, ways
 
 from optloc.kernels.jit import enabled
-from optloc.proof.boxes import NODE_WIDTH, bound_range
 from optloc.proof.chart import bound_box, curve_box, is_convex
-from optloc.proof.convex import CURVE_WIDTH, convex, curve_range, slopes_everywhere, spread_of
+from optloc.proof.convex import CURVE_WIDTH, convex, slopes_everywhere, spread_of
 from optloc.proof.grow import grow
+from optloc.proof.ranges import curve_range
 
 BOXES, POINTS = (500, 200) if enabled() else (40, 200)
 
 
 def curved(line, sense, half):
-    node, curve = np.empty(NODE_WIDTH), np.empty(CURVE_WIDTH)
-    gram = sense.T @ sense
-    bound_range(line, sense, gram, half, node)
-    curve_range(sense, gram, half, node, curve)
+    node, curve = bounded(line, sense, half), np.empty(CURVE_WIDTH)
+    curve_range(sense, sense.T @ sense, half, node, curve)
     return node, curve
 
 
@@ -29,7 +27,7 @@ def square(six):
 @pytest.mark.parametrize("d", [2, 3])
 def test_gradient_and_hessian_of_a_range_change_less_than_bounded(d):
     rng = np.random.default_rng(d)
-    bounded, used = 0, []
+    limited, used = 0, []
     for _ in range(BOXES):
         line, sense, half = drawn_box(rng, d)
         node, curve = curved(line, sense, half)
@@ -42,9 +40,9 @@ def test_gradient_and_hessian_of_a_range_change_less_than_bounded(d):
             N = (sense.T @ sense - slope[:, :, None] * slope[:, None, :]) / r[..., None]
             change = np.linalg.norm(N - square(curve[:6]), ord=2, axis=(1, 2)).max()
             assert change <= curve[9] * (1.0 + 1e-9) + 1e-12
-            bounded += 1
+            limited += 1
             used.append(np.max(turn[:d] / curve[6 : 6 + d]))
-    assert bounded > BOXES // 3
+    assert limited > BOXES // 3
     assert np.median(used) > 0.5
 
 

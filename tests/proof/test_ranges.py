@@ -5,9 +5,11 @@ import pytest
 from proof.costs import random_case
 
 from optloc.kernels.jit import enabled
-from optloc.proof.boxes import NODE_WIDTH, bound_range, quadratic
+from optloc.proof.boxes import NODE_WIDTH
 from optloc.proof.chart import accuracy_floor, bound_box, chart_at, cost_of, empty_box
 from optloc.proof.clip import cut_out, shrink
+from optloc.proof.nodes import RANGE, WIDTH
+from optloc.proof.ranges import bound_ranges, greatest
 
 BOXES, POINTS = (600, 250) if enabled() else (60, 250)
 
@@ -22,9 +24,10 @@ def drawn_box(rng, d):
 
 
 def bounded(line, sense, half):
-    node = np.empty(NODE_WIDTH)
-    bound_range(line, sense, sense.T @ sense, half, node)
-    return node
+    """Return the row of the range to the origin at the point `line`."""
+    nodes, data = np.empty((1, NODE_WIDTH)), np.zeros((1, WIDTH))
+    bound_ranges(np.array([RANGE]), data, line, sense, sense.T @ sense, half, nodes)
+    return nodes[0]
 
 
 def ways(rng, half, points):
@@ -58,7 +61,8 @@ def test_quadratic_form_is_greatest_at_a_corner():
         M = root.T @ root
         s = corners * h
         exact = ((s @ M) * s).sum(1).max()
-        own = quadratic(M[0, 0], M[0, 1], M[0, 2], M[1, 1], M[1, 2], M[2, 2], h[0], h[1], h[2])
+        M *= h[:, None] * h
+        own = greatest(M[0, 0], M[0, 1], M[0, 2], M[1, 1], M[1, 2], M[2, 2])
         assert own == pytest.approx(exact, rel=1e-12)
 
 

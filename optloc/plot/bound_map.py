@@ -1,0 +1,161 @@
+"""Maps of the Cramer-Rao bound as pictures and as isolines."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optloc.errors import InvalidProblem
+from optloc.maps import BoundMap
+from optloc.plot.style import BLACK, GREY, figure_class
+from optloc.types import Array
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+COLOURS = "cividis_r"
+"""Dark where the bound is large; legible in grey and without colour vision."""
+
+_STEPS = (1.0, 2.0, 5.0)
+
+
+def plot_bound_map(found: BoundMap, title: str = "", *, dilution: bool = False) -> Figure:
+    """Return a map of the bound, with isolines and stations.
+
+    Parameters
+    ----------
+    found : BoundMap
+        The bound over a grid.
+    title : str
+        Title of the picture.
+    dilution : bool
+        Draw the dilution of precision in the place of the bound.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        To be written with `optloc.plot.save`.
+
+    Raises
+    ------
+    InvalidProblem
+        Where the geometry is singular everywhere, or the dilution has no meaning.
+    """
+    from matplotlib.colors import LogNorm
+
+    values, name = _drawn(found, dilution=dilution)
+    steps = levels(values)
+    scale = 1.0 if found.geodetic or max(np.ptp(found.x), np.ptp(found.y)) < 5e3 else 1e-3
+    x, y, stations = found.x * scale, found.y * scale, found.stations * scale
+    squeeze = np.cos(np.radians(found.y.mean())) if found.geodetic else 1.0
+    tall = float(np.clip(np.ptp(y) / (np.ptp(x) * squeeze), 0.4, 1.6))
+    figure = figure_class()(figsize=(6.4, 0.9 + 5.2 * tall), layout="constrained")
+    axes = figure.subplots()
+    norm = LogNorm(steps[0], max(steps[-1], steps[0] * 2.0))
+    drawn = axes.pcolormesh(x, y, values, norm=norm, cmap=COLOURS, shading="nearest", rasterized=True)
+    lines = axes.contour(x, y, values, levels=steps, colors=BLACK, linewidths=0.8)
+    axes.clabel(lines, fmt=lambda value: f"{value:g}", fontsize=8)
+    axes.plot(*stations.T, "^", color="white", mec=BLACK, ms=7, mew=1.2, zorder=4, clip_on=True)
+    inside = (np.abs(stations - [x.mean(), y.mean()]) <= [np.ptp(x) / 2, np.ptp(y) / 2]).all(-1)
+    for place, text in zip(stations[inside], np.array(found.names)[inside], strict=True):
+        if len(found.names) <= 12:
+            note = axes.annotate(str(text), place, (4, 5), textcoords="offset points", fontsize=8, zorder=5)
+            note.set_bbox({"facecolor": "white", "edgecolor": GREY, "alpha": 0.75, "pad": 1, "linewidth": 0.4})
+    axes.set_xlim(x[0], x[-1])
+    axes.set_ylim(y[0], y[-1])
+    axes.set_aspect(1.0 / squeeze)
+    unit = "deg" if found.geodetic else "m" if scale == 1.0 else "km"
+    axes.set_xlabel(f"{'longitude' if found.geodetic else 'x'} ({unit})")
+    axes.set_ylabel(f"{'latitude' if found.geodetic else 'y'} ({unit})")
+    bar = figure.colorbar(drawn, ax=axes, label=name, ticks=steps, format=lambda value, _: f"{value:g}", pad=0.02)
+    bar.ax.minorticks_off()
+    if title:
+        axes.set_title(title, fontsize=11)
+    return figure
+
+
+def _drawn(found: BoundMap, *, dilution: bool) -> tuple[Array, str]:
+    values = found.dilution if dilution else found.sigma
+    if dilution and not np.isfinite(found.row):
+        advice = "ask for the bound in metres"
+        raise InvalidProblem("rows that are not all lengths have no common dilution", "map", advice)
+    if not np.isfinite(values).any():
+        advice = "add rows, or choose another height or place"
+        raise InvalidProblem("the geometry is singular everywhere on the map", "map", advice)
+    return values, "dilution of precision" if dilution else "bound of the position error (m)"
+
+
+def levels(values: Array, most: int = 9) -> list[float]:
+    """Return the levels of isolines: 1, 2, 5 times powers of ten that hold the middle 98 % of values."""
+    good = values[np.isfinite(values) & (values > 0.0)]
+    low, high = (float(np.quantile(good, share)) for share in (0.01, 0.99))
+    decades = range(int(np.floor(np.log10(low))) - 1, int(np.ceil(np.log10(high))) + 1)
+    steps = [step * 10.0**power for power in decades for step in _STEPS]
+    first = max(i for i, step in enumerate(steps) if step <= low)
+    last = min((i for i, step in enumerate(steps) if step >= high), default=len(steps) - 1)
+    chosen = steps[first : max(last, first + 1) + 1]
+    if len(chosen) <= most // 2:
+        return [round(step, 12) for step in _finer(chosen)]
+    if len(chosen) > most:
+        whole = [step for step in chosen if np.isclose(np.log10(step) % 1.0, [0.0, 1.0]).any()]
+        chosen = whole if len(whole) > 2 else chosen[::2]
+    return [round(step, 12) for step in chosen]
+
+
+def _finer(steps: list[float]) -> list[float]:
+    """Return steps with one or two round numbers between each."""
+    between = {1.0: (1.2, 1.5), 2.0: (3.0,), 5.0: (7.0,)}
+    full = []
+    for step in steps[:-1]:
+        power = 10.0 ** np.floor(np.log10(step * 1.0001))
+        full += [step, *(more * power for more in between[float(round(step / power))])]
+    return [*full, steps[-1]]
+
+
+def isolines(found: BoundMap) -> list[tuple[float, list[Array]]]:
+    """Return the isolines of the bound: each level in metres with its lines (n, 2) of x and y."""
+    figure_class()  # one sentence where matplotlib, which brings contourpy, is missing
+    from contourpy import contour_generator
+
+    values, _ = _drawn(found, dilution=False)
+    made = contour_generator(found.x, found.y, np.ma.masked_invalid(values))
+    return [(level, [np.asarray(line) for line in made.lines(level)]) for level in levels(values)]
+
+
+def map_geojson(found: BoundMap) -> dict[str, Any]:
+    """Return stations and isolines of a map as a GeoJSON feature collection (RFC 7946).
+
+    Raises
+    ------
+    InvalidProblem
+        Where the frame is not on Earth, or matplotlib is missing.
+    """
+    if not found.geodetic:
+        advice = 'give a [frame] of kind "geodetic", "ecef" or "enu"'
+        raise InvalidProblem("GeoJSON needs positions on Earth, but the frame is cartesian", "map", advice)
+    features = [
+        _feature("Point", _wrapped(place[None])[0], {"role": "station", "name": name})
+        for name, place in zip(found.names, found.stations, strict=True)
+    ]
+    for level, lines in isolines(found):
+        if lines:
+            about = {"role": "bound", "sigma_m": level, "height": found.height}
+            features.append(_feature("MultiLineString", [piece for line in lines for piece in _pieces(line)], about))
+    return {"type": "FeatureCollection", "features": features}
+
+
+def _pieces(line: Array) -> list[list[list[float]]]:
+    """Return a line cut where it crosses the date line, as the standard asks."""
+    turn = np.floor((line[:, 0] + 180.0) / 360.0)
+    cuts = np.flatnonzero(np.diff(turn)) + 1
+    return [_wrapped(part) for part in np.split(line, cuts) if len(part) > 1]
+
+
+def _wrapped(line: Array) -> list[list[float]]:
+    lon = (line[:, 0] + 180.0) % 360.0 - 180.0
+    return np.round(np.stack([lon, line[:, 1]], axis=-1), 6).tolist()  # type: ignore[no-any-return]
+
+
+def _feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": properties}

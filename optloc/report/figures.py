@@ -1,0 +1,222 @@
+"""The figures of a study's report, one panel each, so that a phone shows them one below the other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optloc.papers.report import Picture
+from optloc.plot.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, figure_class
+from optloc.report.marks import Mark
+from optloc.study.stats import distribution, performance_profile, wilson
+from optloc.study.summary import counted, instances, noise_text
+from optloc.types import Array
+
+if TYPE_CHECKING:
+    import pandas as pd
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+Looks = dict[str, Mark]
+
+_LEVELS = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "D"), (PURPLE, "^"), (BLACK, "v"), (GREY, "P"))
+_MOST = 12
+_LEAST = 1e-6
+_SIZE = (5.2, 3.5)
+
+
+def panel(title: str, size: tuple[float, float] = _SIZE) -> tuple[Figure, Axes]:
+    """Return an empty figure of one panel with a grid."""
+    figure = figure_class()(figsize=size, layout="constrained")
+    axes = figure.subplots()
+    axes.grid(color=GREY, alpha=0.3, linewidth=0.6)
+    axes.set_axisbelow(True)
+    if title:
+        axes.set_title(title, fontsize=10)
+    return figure, axes
+
+
+def success(table: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
+    """Yield the shares of right answers of all methods, a picture for each case; one colour a noise level."""
+    for number, (case, part) in enumerate(table.groupby("case", sort=False)):
+        levels = list(dict.fromkeys(part["noise_label"]))
+        names = [name for name in looks if name in set(part["method"])]
+        step = min(0.24, 0.8 / len(levels))
+        height = 1.35 + len(names) * max(0.26, 0.12 * len(levels))
+        figure, axes = panel(str(case), (_SIZE[0], height))
+        for i, level in enumerate(levels):
+            some = part[part["noise_label"] == level].set_index("method").reindex(names)
+            right, trials = some["right"].to_numpy(dtype=float), some["trials"].to_numpy(dtype=float)
+            share, (low, high) = right / trials, wilson(right, trials)
+            colour, mark = _LEVELS[i % len(_LEVELS)]
+            y = np.arange(len(names)) + step * (i - (len(levels) - 1) / 2)
+            bars = 100 * np.maximum([share - low, high - share], 0.0)
+            axes.errorbar(
+                100 * share, y, xerr=bars, fmt=mark, color=colour, ms=4, lw=1.1, capsize=2, label=noise_text(level)
+            )
+        axes.set_yticks(np.arange(len(names)), names, fontsize=8)
+        axes.set_ylim(len(names) - 0.45, -0.55)
+        axes.set_xlim(-3, 103)
+        axes.set_xlabel("right answers (%)")
+        short = max(len(noise_text(level)) for level in levels) < 12
+        figure.legend(loc="outside lower center", ncols=len(levels) if short and len(levels) < 5 else 2, **_PLAIN)
+        yield Picture(f"success-{number + 1}", f"Right answers: {case}", figure)
+
+
+_PLAIN: dict[str, Any] = {"frameon": False, "fontsize": 8}
+
+
+def accuracy(table: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
+    """Yield the root mean square errors over the bound against noise, a picture for each case."""
+    for number, (case, part) in enumerate(table.groupby("case", sort=False)):
+        figure, axes = panel(str(case))
+        place, labels, name = _noise_axis(part)
+        for mark in looks.values():
+            some = part[part["method"] == mark.name]
+            x = np.array([place[label] for label in some["noise_label"]])
+            ratio, half = some["ratio"].to_numpy(dtype=float), some["ratio_half"].to_numpy(dtype=float)
+            if not np.isfinite(ratio).any():
+                continue
+            low = np.minimum(np.nan_to_num(half), 0.9 * ratio)
+            _line(axes, mark, x, ratio, marker=True)
+            axes.errorbar(x, ratio, yerr=[low, np.nan_to_num(half)], fmt="none", ecolor=mark.colour, lw=0.8, capsize=2)
+        axes.axhline(1.0, color=BLACK, linewidth=1.0, zorder=1)
+        _log(axes.yaxis, axes.set_yscale, *axes.get_ylim())
+        _ticks(axes, place, labels)
+        axes.set_xlabel(name)
+        axes.set_ylabel("RMSE / CRLB")
+        yield Picture(f"accuracy-{number + 1}", f"Error over the bound: {case}", figure)
+
+
+def _noise_axis(part: pd.DataFrame) -> tuple[dict[str, float], list[str], str]:
+    """Return where noise levels are drawn: by their number if that tells them apart, else side by side."""
+    seen = part[["noise_label", "noise"]].drop_duplicates("noise_label")
+    labels = [str(label) for label in seen["noise_label"]]
+    unit = str(part["noise_unit"].iloc[0])
+    name = "factor on the noise of the file" if unit == "x" else "standard deviation of a row"
+    values = seen["noise"].to_numpy(dtype=float)
+    if len(set(values)) == len(values) and (values > 0).all():
+        place = dict(zip(labels, np.log10(values), strict=True))
+    else:
+        place = {label: float(i) for i, label in enumerate(labels)}
+    return place, [noise_text(label).replace(", ", "\n") for label in labels], name
+
+
+def _ticks(axes: Axes, place: dict[str, float], labels: list[str]) -> None:
+    x = np.array(list(place.values()))
+    axes.set_xticks(x, labels, fontsize=8)
+    margin = 0.12 * max(float(np.ptp(x)), 0.5)
+    axes.set_xlim(x.min() - margin, x.max() + margin)
+
+
+def _log(axis: Any, scale: Any, low: float, high: float) -> None:
+    """Make an axis logarithmic, with labels that are plain numbers where it covers less than a decade and a half."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+
+    scale("log")
+    if high / max(low, 1e-300) < 30.0 and low > 0.0:
+        axis.set_major_locator(LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0)))
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        axis.set_minor_locator(NullLocator())
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _line(axes: Axes, mark: Mark, x: Array, y: Array, *, marker: bool, steps: bool = False) -> None:
+    (line,) = axes.plot(
+        x,
+        y,
+        color=mark.colour,
+        linestyle=mark.dash,
+        marker=mark.mark if marker else None,
+        markersize=4.5,
+        linewidth=1.5,
+        drawstyle="steps-post" if steps else "default",
+        label=mark.name,
+    )
+    line.set_gid(mark.line)
+
+
+def distributions(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
+    """Yield the distributions of errors in units of the bound; noise levels apart unless there are many panels."""
+    apart = len(frame[["case", "noise_label"]].drop_duplicates()) <= _MOST
+    names = ["case", "noise_label"] if apart else ["case"]
+    from scipy.special import gammainc
+
+    for number, (key, part) in enumerate(frame.groupby(names, sort=False, observed=True)):
+        text = f"{key[0]}, {noise_text(key[1])}" if apart else f"{key[0]}, all noise levels"
+        figure, axes = panel(text)
+        for mark in looks.values():
+            some = part[part["method"] == mark.name]
+            if len(some):
+                values = some["deviation"].to_numpy(dtype=float)[counted(some)]
+                _line(axes, mark, *distribution(np.maximum(values, 1e-2), len(some)), marker=False, steps=True)
+        x = np.geomspace(0.1, 10.0, 120)
+        theory = gammainc(part["dimension"].iloc[0] / 2.0, x**2 / 2.0)
+        axes.plot(x, theory, color=BLACK, linewidth=3.5, alpha=0.18, zorder=1)
+        axes.set_xscale("log")
+        axes.set_xlim(0.1, float(np.clip(np.nanmax([10.0, *axes.get_xlim()]), 10.0, 1e4)))
+        axes.set_ylim(-0.02, 1.02)
+        axes.set_xlabel("error in units of the bound")
+        axes.set_ylabel("share of trials")
+        yield Picture(f"errors-{number + 1}", f"Distribution of errors: {text}", figure)
+
+
+def gaps(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
+    """Yield the distributions of the cost above the lowest that is known, a picture for each case."""
+    for number, (case, part) in enumerate(frame.groupby("case", sort=False)):
+        figure, axes = panel(str(case))
+        for mark in looks.values():
+            some = part[part["method"] == mark.name]
+            values = some["above"].to_numpy(dtype=float)[some["located"].to_numpy(dtype=bool)]
+            if len(values):
+                _line(axes, mark, *distribution(np.maximum(values, _LEAST), len(some)), marker=False, steps=True)
+        axes.set_xscale("log")
+        axes.set_xlim(_LEAST * 0.7, float(np.clip(axes.get_xlim()[1], 10.0, 1e8)))
+        axes.set_ylim(-0.02, 1.02)
+        axes.set_xlabel("cost above the best known")
+        axes.set_ylabel("share of trials")
+        yield Picture(f"gaps-{number + 1}", f"Cost above the best known: {case}", figure)
+
+
+def profile(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
+    """Yield the performance profile over all instances that every method has seen."""
+    times, solved, _ = instances(frame, list(looks))
+    if not times.size or not solved.any():
+        return
+    spent = np.where(solved, times, np.inf)
+    with np.errstate(invalid="ignore"):
+        slower = np.where(solved, spent / spent.min(0), 1.0)
+    ratios = np.geomspace(1.0, max(10.0, 1.5 * float(slower.max())), 240)
+    figure, axes = panel("", (7.0, 4.0))
+    for mark, shares in zip(looks.values(), performance_profile(times, solved, ratios), strict=True):
+        _line(axes, mark, ratios, shares, marker=False, steps=True)
+    axes.set_xscale("log")
+    axes.set_xlim(ratios[0], ratios[-1])
+    axes.set_ylim(-0.02, 1.02)
+    axes.set_xlabel("time / time of the fastest method of the instance")
+    axes.set_ylabel("share of instances with a right answer")
+    yield Picture("profile", f"Performance profile over {times.shape[1]} instances", figure)
+
+
+def timing(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
+    """Yield the time of a fix against the number of measurements: median, and from the 10th to the 90th percentile."""
+    figure, axes = panel("", (7.0, 4.0))
+    sizes = sorted(frame["rows"].unique())
+    for mark in looks.values():
+        grouped = frame[frame["method"] == mark.name].groupby("rows")["seconds"]
+        low, middle, high = (grouped.quantile(share) for share in (0.1, 0.5, 0.9))
+        # A little apart, so that bars do not hide one another.
+        x = middle.index.to_numpy(dtype=float) * 1.012 ** (mark.number - len(looks) / 2)
+        _line(axes, mark, x, middle.to_numpy(), marker=True)
+        axes.vlines(x, low.to_numpy(), high.to_numpy(), color=mark.colour, linewidth=0.8)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.minorticks_off()
+    axes.set_xticks(sizes, [str(size) for size in sizes])
+    if len(sizes) == 1:
+        axes.set_xlim(sizes[0] / 1.4, sizes[0] * 1.4)
+    axes.set_xlabel("measurements of a trial")
+    axes.set_ylabel("time of a fix (s)")
+    yield Picture("time", "Time of a fix against its size", figure)

@@ -1,0 +1,116 @@
+"""A million fixes: time, memory, one-fix latency; run as `pytest tests/benchmarks`, in a quiet moment."""
+
+import os
+import subprocess
+import sys
+from time import perf_counter
+
+import numpy as np
+import pytest
+from benchmarks.speed import COUNT, SCENES, SIGMA, STATIONS, batch, general_microseconds, microseconds
+from monte_carlo.tables import write
+
+from optloc import prepare, solve
+from optloc.kernels.jit import enabled
+
+MILLION, THREADS = 1_000_000, (1, 2)
+pytestmark = pytest.mark.skipif(not enabled(), reason="times of machine code")
+
+
+def dgemm(n=400, rounds=20):
+    """Return what this machine multiplies, 10^9 operations a second."""
+    a, times = np.random.default_rng(0).random((n, n)), []
+    for _ in range(rounds):
+        began = perf_counter()
+        a @ a
+        times.append(perf_counter() - began)
+    return 2e-9 * n**3 / min(times)
+
+
+def million(scene):
+    """Return a million problems: those of a scene, again and again."""
+    problem = batch(scene)[0]
+    again = np.resize(np.arange(COUNT), MILLION)
+    return problem.take(again)
+
+
+def seconds(problem, method, rounds=3):
+    """Return the time of a batch in the quietest round."""
+    times = []
+    for _ in range(rounds):
+        began = perf_counter()
+        fix = solve(problem, method)
+        times.append(perf_counter() - began)
+        assert fix.answered.mean() > 0.99
+    return min(times)
+
+
+def latency(method, count=300):
+    """Return the median time of one fix of a prepared problem, microseconds."""
+    problem, _, z, _ = batch(SCENES[0])
+    ready = prepare(problem.with_rows(z=z[0]), method)
+    times = []
+    for i in range(count):
+        began = perf_counter()
+        ready(z[i])
+        times.append(perf_counter() - began)
+    return 1e6 * float(np.median(times[count // 10 :]))
+
+
+_MEMORY = """
+import resource
+from benchmarks.test_million import SCENES, million
+from optloc import solve
+problem = million(SCENES[{scene}])
+solve(problem.take(slice(0, 20000)), {method!r})
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+fix = solve(problem, {method!r})
+after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+assert len(fix) == 1_000_000
+print((after - before) / 1024)
+"""
+
+
+def megabytes(scene, method):
+    """Return the growth of the memory of a process of its own while it solves a million problems."""
+    code = _MEMORY.format(scene=SCENES.index(scene), method=method)
+    paths = {"PYTHONPATH": ":".join(path for path in sys.path if path)}
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env={**os.environ, **paths}
+    )
+    return float(done.stdout.split()[-1])
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_million_fixes(scene):
+    assert megabytes(scene, "gtrs+lsr") < 500.0
+    assert seconds(million(scene), "gtrs+lsr") < 3.0
+
+
+def test_one_fix():
+    assert latency("gtrs+lsr") < 100.0
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_hundred_times_faster_than_a_general_routine(scene):
+    theirs, ours = general_microseconds(scene), microseconds(scene, "gtrs+lsr", COUNT)
+    assert theirs / ours > 100.0
+
+
+@pytest.mark.full
+def test_write_the_table(monkeypatch):
+    rows = []
+    for scene in SCENES:
+        problem = million(scene)
+        for threads in THREADS:
+            monkeypatch.setenv("OPTLOC_THREADS", str(threads))
+            took = seconds(problem, "gtrs+lsr")
+            rows.append(
+                [f"{scene}: a million fixes, {threads} threads", f"{took:.2f} s", f"{took / MILLION * 1e6:.2f}"]
+            )
+        rows.append([f"{scene}: memory of a million fixes", f"{megabytes(scene, 'gtrs+lsr'):.0f} MB", ""])
+        rows.append([f"{scene}: scipy least_squares from the truth", "", f"{general_microseconds(scene):.0f}"])
+    for method in ("gtrs+lsr", "auto"):
+        rows.append([f"one fix of a prepared problem, {method}", "", f"{latency(method):.0f}"])
+    facts = f"TDOA, {STATIONS} stations, {SIGMA:g} m; fix, covariance and verdict; dgemm {dgemm():.0f} Gflop/s one core"
+    assert write("million", ["what", "whole", "us a fix"], rows, facts).is_file()
