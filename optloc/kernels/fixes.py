@@ -63,8 +63,6 @@ class Model(NamedTuple):
         How the ranges reduce the emission times.
     start : int64 array (e,)
         Anchor of each emission time, -1 where there is no row.
-    limit : float
-        Cost above which the residuals are larger than the noise allows.
     """
 
     row: Array
@@ -76,7 +74,6 @@ class Model(NamedTuple):
     K: Array
     travel: Array
     start: Array
-    limit: float
 
 
 @compiled
@@ -111,9 +108,9 @@ def fixes(
         Written: weighted sums of squared residuals.
     plain : bool array (N,)
         Written: whether the fix is plainly good: a finite input, an exact start, a finished refinement, a regular
-        covariance, a place that is not far away, a cost that the noise allows. The others need a closer look.
+        covariance, a place that is not far away. The others need a closer look.
     """
-    row, anchor, linear, sign, reference, white, K, travel, start, limit = model
+    row, anchor, linear, sign, reference, white, K, travel, start = model
     count, (s, d), q, e = len(z), station.shape[1:], len(K), len(start)
     item, late = np.empty(LANES, np.int64), np.empty(count, np.int64)
     seen, value = np.zeros((z.shape[1], LANES)), np.zeros((len(linear), LANES))
@@ -146,7 +143,7 @@ def fixes(
         if e:
             ranges(place, vector[X], r, unit, spare)
             _emit(travel, r, start, row, z, item, emission)
-        _write(vector, matrix, scalar, emission, item[:size], limit, x, covariance, cost, plain)
+        _write(vector, matrix, scalar, emission, item[:size], x, covariance, cost, plain)
         for lane in range(size):
             steps = max(steps, int(scalar[STEPS, lane]) + (_FEW if again else 0))
             if not again and scalar[ALIVE, lane] != 0.0 and most > _FEW:
@@ -208,7 +205,6 @@ def _write(
     scalar: Array,
     emission: Array,
     item: Array,
-    limit: float,
     x: Array,
     covariance: Array,
     cost: Array,
@@ -217,8 +213,7 @@ def _write(
     """Write the first lanes to the fixes of their problems."""
     d = vector.shape[1]
     for lane, i in enumerate(item):
-        fine = scalar[SOLVABLE, lane] * scalar[GOOD, lane] > scalar[ALIVE, lane]
-        plain[i] = fine and scalar[COST, lane] <= limit
+        plain[i] = scalar[SOLVABLE, lane] * scalar[GOOD, lane] > scalar[ALIVE, lane]
         cost[i] = scalar[COST, lane]
         for j in range(d):
             x[i, j] = vector[X, j, lane] + vector[ORIGIN, j, lane]

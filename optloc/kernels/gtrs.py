@@ -16,7 +16,7 @@ from optloc.kernels.jit import compiled
 from optloc.types import Array
 
 LANES = 64
-_STEPS = 8
+_STEPS = 12
 _WEAK = 1e-7  # a pivot below this share of the largest entry: the eigenvalues are the better tool
 _SETTLED = 1e-7  # relative change of y below which the last, polishing step squares the error away
 
@@ -24,7 +24,7 @@ _SETTLED = 1e-7  # relative change of y below which the last, polishing step squ
 @compiled
 def scratch(n: int) -> int:
     """Return how many rows of lanes `minimise` needs as scratch for y of length n."""
-    return 2 * n * n + 5 * n + 5
+    return 2 * n * n + 5 * n + 7
 
 
 @compiled
@@ -53,28 +53,38 @@ def minimise(rows: Array, on_cone: bool, y: Array, settled: Array, work: Array) 
     A, lower = work[: n * n].reshape(n, n, LANES), work[n * n : 2 * n * n].reshape(n, n, LANES)
     rest = work[2 * n * n :]
     b, inverse, across, p = rest[:n], rest[n : 2 * n], rest[2 * n : 3 * n], rest[3 * n : 4 * n]
-    slope, spare = rest[4 * n : 5 * n], rest[5 * n : 5 * n + 5]
-    multiplier, bend, todo, least, value = spare[0], spare[1], spare[2], spare[3], spare[4]
+    slope, spare = rest[4 * n : 5 * n], rest[5 * n : 5 * n + 7]
+    multiplier, bend, todo, least, value, last, definite = (
+        spare[0],
+        spare[1],
+        spare[2],
+        spare[3],
+        spare[4],
+        spare[5],
+        spare[6],
+    )
     _normal(rows, A, b, least)
     for lane in range(LANES):
-        multiplier[lane], todo[lane], settled[lane] = 0.0, 1.0, 1.0
+        multiplier[lane], last[lane], todo[lane] = 0.0, 0.0, 1.0
     for _ in range(_STEPS):
         _shifted(A, b, multiplier, on_cone, slope, y)
         factor(A, slope, lower, inverse)
+        for lane in range(LANES):
+            definite[lane] = 1.0
         for i in range(n):
             for lane in range(LANES):
-                definite = 0.0 < inverse[i, lane] and inverse[i, lane] * least[lane] < 1.0
-                settled[lane] = settled[lane] if definite else 0.0
+                positive = 0.0 < inverse[i, lane] and inverse[i, lane] * least[lane] < 1.0
+                definite[lane] = definite[lane] if positive else 0.0
         solve(lower, inverse, y)
         _gradient(y, on_cone, across, p)
         solve(lower, inverse, p)
-        if not _advance(y, across, p, on_cone, spare, slope, settled):
+        if not _advance(y, across, p, on_cone, spare, slope):
             break
     _residual_slope(rows, y, across, multiplier, slope, value)
     solve(lower, inverse, slope)
     _step(y, across, p, on_cone, slope, bend, value)
     for lane in range(LANES):
-        settled[lane] = settled[lane] if todo[lane] == 0.0 else 0.0
+        settled[lane] = 1.0 if todo[lane] == 0.0 else 0.0
     for i in range(n):
         for lane in range(LANES):
             settled[lane] = settled[lane] if abs(y[i, lane]) < np.inf else 0.0
@@ -195,10 +205,14 @@ def _value(y: Array, across: Array, on_cone: bool, out: Array) -> None:
 
 
 @compiled
-def _advance(y: Array, across: Array, p: Array, on_cone: bool, spare: Array, free: Array, settled: Array) -> bool:
-    """Move the multipliers of the lanes that still change, and return whether there are any."""
+def _advance(y: Array, across: Array, p: Array, on_cone: bool, spare: Array, free: Array) -> bool:
+    """Move the multipliers of the lanes that still change, and return whether there are any.
+
+    Newton's step; a step that left the definite interval is halved.
+    """
     n = len(y)
-    multiplier, bend, todo, value, big, far = spare[0], spare[1], spare[2], spare[4], free[0], free[1]
+    multiplier, bend, todo, last, definite = spare[0], spare[1], spare[2], spare[5], spare[6]
+    value, big, far = spare[4], free[0], free[1]
     _value(y, across, on_cone, value)
     for lane in range(LANES):
         bend[lane], big[lane], far[lane] = 0.0, 0.0, 0.0
@@ -206,11 +220,15 @@ def _advance(y: Array, across: Array, p: Array, on_cone: bool, spare: Array, fre
         for lane in range(LANES):
             bend[lane] += across[i, lane] * p[i, lane]
             big[lane], far[lane] = max(big[lane], abs(y[i, lane])), max(far[lane], abs(p[i, lane]))
-    moving = 0.0
     for lane in range(LANES):
+        inside, now = definite[lane] != 0.0, multiplier[lane]
         step = value[lane] / bend[lane]
-        todo[lane] = todo[lane] * settled[lane] if abs(step) * far[lane] > _SETTLED * big[lane] else 0.0
-        multiplier[lane] += step if todo[lane] != 0.0 else 0.0
+        moves = abs(step) * far[lane] > _SETTLED * big[lane]
+        todo[lane] = todo[lane] if moves or not inside else 0.0
+        target = now + step if inside else 0.5 * (now + last[lane])
+        last[lane] = now if inside else last[lane]
+        multiplier[lane] = target if todo[lane] != 0.0 else now
+    moving = 0.0
     for lane in range(LANES):
         moving += todo[lane]
     return moving > 0.0

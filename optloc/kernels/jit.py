@@ -1,13 +1,19 @@
-"""Compilation of scalar kernels: numba where it is there, plain Python where it is not."""
+"""Compilation of scalar kernels: machine code by numba, or the same functions as plain Python."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from functools import cache, cached_property, update_wrapper
+from typing import Any, TypeVar, cast
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
+_PLAIN = ContextVar("plain", default=False)
 
+
+@cache
 def _numba() -> Any:
     try:
         import numba
@@ -19,7 +25,46 @@ def _numba() -> Any:
 
 def enabled() -> bool:
     """Return whether kernels run as machine code: numba is installed and NUMBA_DISABLE_JIT is not set."""
-    return _numba() is not None
+    return not _PLAIN.get() and _numba() is not None
+
+
+@contextmanager
+def plain() -> Iterator[None]:
+    """Run kernels as plain Python: a thousand times slower, but nothing has to be compiled or loaded first."""
+    token = _PLAIN.set(True)
+    try:
+        yield
+    finally:
+        _PLAIN.reset(token)
+
+
+class _Kernel:
+    """A function of scalars and arrays in two forms; numba takes it for the compiled one where kernels call it."""
+
+    def __init__(self, function: Callable[..., Any], inline: str) -> None:
+        self.function, self.inline, self.ready = function, inline, False
+        update_wrapper(self, function)
+
+    @cached_property
+    def machine(self) -> Any:
+        return _numba().njit(cache=True, nogil=True, error_model="numpy", inline=self.inline)(self.function)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return what numba wants to know of a function that a kernel calls."""
+        if name not in ("_numba_type_", "targetoptions", "py_func"):
+            raise AttributeError(name)
+        return getattr(self.machine, name)
+
+    def __call__(self, *args: Any) -> Any:
+        if not enabled():
+            return self.function(*args)
+        self.ready = True
+        return self.machine(*args)
+
+
+def ready(kernel: Callable[..., Any]) -> bool:
+    """Return whether machine code of a kernel has been used in this process: the next call need not load it."""
+    return bool(getattr(kernel, "ready", False))
 
 
 def compiled(function: _Function) -> _Function:
@@ -27,8 +72,9 @@ def compiled(function: _Function) -> _Function:
 
     Division by zero gives infinity or NaN, as in numpy; the order of operations is that of the source.
     """
-    numba = _numba()
-    if numba is None:
-        return function
-    kernel: _Function = numba.njit(cache=True, nogil=True, error_model="numpy")(function)
-    return kernel
+    return cast(_Function, _Kernel(function, "never"))
+
+
+def inlined(function: _Function) -> _Function:
+    """Return a function like `compiled`, of which compiled callers take in the source: every array handed on costs."""
+    return cast(_Function, _Kernel(function, "always"))

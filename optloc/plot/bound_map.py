@@ -14,8 +14,8 @@ from optloc.types import Array
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-COLOURS = "cividis_r"
-"""Dark where the bound is large; legible in grey and without colour vision."""
+COLOURS = "GnBu"
+"""Light to dark in one hue: legible in grey and without colour vision, and black lines stay visible."""
 
 _STEPS = (1.0, 2.0, 5.0)
 
@@ -50,7 +50,7 @@ def plot_bound_map(found: BoundMap, title: str = "", *, dilution: bool = False) 
     x, y, stations = found.x * scale, found.y * scale, found.stations * scale
     squeeze = np.cos(np.radians(found.y.mean())) if found.geodetic else 1.0
     tall = float(np.clip(np.ptp(y) / (np.ptp(x) * squeeze), 0.4, 1.6))
-    figure = figure_class()(figsize=(6.4, 0.9 + 5.2 * tall), layout="constrained")
+    figure = figure_class()(figsize=(6.4, 0.9 + 5.2 * tall), layout="compressed")
     axes = figure.subplots()
     norm = LogNorm(steps[0], max(steps[-1], steps[0] * 2.0))
     drawn = axes.pcolormesh(x, y, values, norm=norm, cmap=COLOURS, shading="nearest", rasterized=True)

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isnan
 from typing import Any
 
 import numpy as np
 
-from optloc.kernels.jit import compiled, enabled
+from optloc.kernels.jit import compiled, enabled, plain, ready
 from optloc.proof.everywhere import prove_everywhere
-from optloc.proof.pose import Posed
-from optloc.proof.search import OPEN, prove
+from optloc.proof.pose import Posed, taken
+from optloc.proof.search import BUDGET, OPEN, prove
 from optloc.threads import mapped
 from optloc.types import Array
 
 _STRETCH = 64
+# So few proofs are begun in plain Python, with so many boxes in all: about half a second.
+_FEW, _FIRST_BOXES = 16, 400
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +86,24 @@ class Answered:
 
 
 def prove_all(pose: Posed, asked: Asked) -> Answered:
-    """Return the outcome of the proofs of n fixes of n posed problems."""
+    """Return the outcome of the proofs of n fixes of n posed problems.
+
+    A few proofs are begun in plain Python: most need few boxes, and machine code takes longer to load.
+    """
+    n = len(asked.x)
+    if n > _FEW or ready(_loop):
+        return _proven(pose, asked)
+    with plain():
+        out = _proven(pose, replace(asked, budget=np.minimum(asked.budget, max(5, _FIRST_BOXES // max(n, 1)))))
+    short = np.flatnonzero((out.verdict == BUDGET) & (out.boxes < asked.budget))
+    if len(short) and enabled():
+        more = _proven(taken(pose, short), asked.take(short))
+        for name in Answered.__slots__:
+            getattr(out, name)[short] = getattr(more, name)
+    return out
+
+
+def _proven(pose: Posed, asked: Asked) -> Answered:
     n, d = asked.x.shape
     whole = np.zeros(n, dtype=np.int64)
     out = Answered(whole, whole.copy(), np.zeros(n), np.zeros(n, dtype=np.bool_), np.full((n, d), np.nan))

@@ -6,13 +6,13 @@ from math import inf, sqrt
 from typing import NamedTuple
 
 from optloc.kernels.jit import compiled
-from optloc.proof.boxes import cost_at, rounding
-from optloc.proof.chart import Box, Chart, Cost, bound_box, curve_box
-from optloc.proof.clip import cut_out, is_empty, shrink
-from optloc.proof.convex import clip_to_stationary, convex
+from optloc.proof.boxes import bound_nodes, cost_at, least_residual, linearise_rows, rounding
+from optloc.proof.chart import Box, Chart, Cost, place
+from optloc.proof.clip import cut_out, is_empty, shrink, uncut
+from optloc.proof.convex import clip_to_stationary, convex, curve_nodes, sum_up
 from optloc.proof.descend import descend
-from optloc.proof.inline import inlined
-from optloc.proof.stack import push, push_halves
+from optloc.proof.nodes import RANGE
+from optloc.proof.stack import pop, push, push_halves
 from optloc.types import Array
 
 # What a search finds: nothing, a cheaper point, another minimum below the level, or no end within the budget.
@@ -77,55 +77,52 @@ def branch(
     bound : float
         A lower bound of f in the boxes left; infinite if there are none.
     """
+    # Arrays by names of their own: to hand a record on counts references to all it holds, at every box.
+    kinds, data, K, w, A = cost.kinds, cost.data, cost.K, cost.w, cost.A
+    sense, gram, at, half, centre, line = chart.sense, chart.gram, box.at, box.half, box.centre, box.line
+    nodes, rows, curves, sums, solve, cut = box.nodes, box.rows, box.curves, box.sums, box.solve, box.cut
+    weight, origin, unique = cost.weight, chart.origin, aim.level > aim.value
+    rho = sqrt(max(aim.level, 0.0))
     boxes, low_points = 0, 0
     while size > 0:
         if boxes >= budget or size + 2 > stack.shape[0]:
             return SPENT, boxes, _lowest(stack, size)
         size -= 1
-        box.at[:], box.half[:] = stack[size, :3], stack[size, 3:6]
+        pop(stack, size, at, half)
         boxes += 1
-        low = bound_box(cost, chart, box, aim.floor)
+        place(origin, sense, at, centre)
+        bound_nodes(kinds, data, centre, sense, gram, half, line, nodes)
+        linearise_rows(K, w, nodes, rows)
+        low = least_residual(K, weight, aim.floor, half, nodes, rows)
         if low > 0.0 and low * low >= aim.level:
             continue
-        here = cost_at(cost.K, cost.w, box.nodes)
+        here = cost_at(K, w, nodes)
         if here < aim.better:
             return CHEAPER, boxes, 0.0
-        for k in range(3):
-            box.cut[k], box.cut[3 + k] = -box.half[k], box.half[k]
-        _shrink(cost, box, aim)
-        if aim.level > aim.value:
-            if aim.whole or (low > 0.0 and low * low >= aim.value):
-                if _known(box, minima, sides):
-                    continue
-                curve_box(cost, chart, box)
-                clip_to_stationary(cost.A, box.half, box.nodes, box.curves, box.sums, box.cut, box.solve)
-            else:
-                curve_box(cost, chart, box)
-            if here < aim.level and not is_empty(box.cut):
+        uncut(half, cut)
+        shrink(K, rho + rounding(K, weight, aim.floor, nodes), half[2] == 0.0, nodes, rows, cut, solve)
+        if unique:
+            sound = aim.whole or (low > 0.0 and low * low >= aim.value)
+            if sound and is_known(at, half, minima, sides):
+                continue
+            curve_nodes(kinds, data, centre, sense, gram, half, line, solve, nodes, curves)
+            sum_up(K, w, nodes, curves, sums)
+            if sound:
+                clip_to_stationary(A, half, nodes, curves, sums, cut, solve)
+            if here < aim.level and not is_empty(cut):
                 low_points += 1
                 # Early, then more and more seldom, and wherever a box holds one minimum at most.
-                if low_points & (low_points - 1) == 0 or _is_bowl(cost, box):
+                if low_points & (low_points - 1) == 0 or convex(kinds, A, half, nodes, curves, sums, 0.0):
                     outcome = _follow(cost, chart, box, minima, sides, aim)
                     if outcome != CLEAR:
                         return outcome, boxes, 0.0
-        side = _side(cost, chart, box, here < aim.level)
-        share = cut_out(box.cut, box.at, box.half)
+        side = cut_side(kinds, K, gram, half, nodes, rows, here < aim.level)
+        share = cut_out(cut, at, half)
         if 0.0 < share < _SHRUNK:
-            size = push(stack, size, box.at, box.half, low)
+            size = push(stack, size, at, half, low)
         elif share > 0.0:
-            size = push_halves(stack, size, side, box.at, box.half, low)
+            size = push_halves(stack, size, side, at, half, low)
     return CLEAR, boxes, inf
-
-
-@inlined
-def _shrink(cost: Cost, box: Box, aim: Aim) -> None:
-    rho = sqrt(max(aim.level, 0.0)) + rounding(cost.K, cost.weight, aim.floor, box.nodes)
-    shrink(cost.K, rho, box.half[2] == 0.0, box.nodes, box.rows, box.cut, box.solve)
-
-
-@inlined
-def _is_bowl(cost: Cost, box: Box) -> bool:
-    return convex(cost.kinds, cost.A, box.half, box.nodes, box.curves, box.sums, 0.0)
 
 
 @compiled
@@ -134,20 +131,30 @@ def _follow(cost: Cost, chart: Chart, box: Box, minima: Array, sides: Array, aim
 
     The box is the minimum afterwards, or where all is clear what it was, but for its tables.
     """
-    at0, at1, at2 = box.at[0], box.at[1], box.at[2]
-    h0, h1, h2 = box.half[0], box.half[1], box.half[2]
+    at, half = box.at.copy(), box.half.copy()
     least = descend(cost, chart, box)
     if least < aim.better:
         return CHEAPER
-    if least < aim.level and not _known(box, minima, sides):
+    if least < aim.level and not is_known(box.at, box.half, minima, sides):
         return ANOTHER
-    box.at[0], box.at[1], box.at[2] = at0, at1, at2
-    box.half[0], box.half[1], box.half[2] = h0, h1, h2
+    box.at[:], box.half[:] = at, half
     return CLEAR
 
 
 @compiled
-def _side(cost: Cost, chart: Chart, box: Box, inside: bool) -> int:
+def is_known(at: Array, half: Array, minima: Array, sides: Array) -> bool:
+    """Return whether a box lies inside the convex box (half-widths `sides`) of a known minimum."""
+    for p in range(minima.shape[0]):
+        inside = True
+        for k in range(3):
+            inside = inside and abs(at[k] - minima[p, k]) + half[k] <= sides[p, k]
+        if inside:
+            return True
+    return False
+
+
+@compiled
+def cut_side(kinds: Array, K: Array, gram: Array, half: Array, nodes: Array, rows: Array, inside: bool) -> int:
     """Return the coordinate across which to cut a box: where the remainders that matter shrink most.
 
     The remainder of a range is nearly ``s'N s / 2``, so coordinate k has the share ``h_k sum_m |N_km| h_m`` in it; it
@@ -155,22 +162,19 @@ def _side(cost: Cost, chart: Chart, box: Box, inside: bool) -> int:
     because the centre lies below the level (`inside`), the widest side is cut.
     """
     if inside:
-        return _widest(box.half)
-    t0, t1, t2 = 0.0, 0.0, 0.0
-    nodes, half, gram = box.nodes, box.half, chart.gram
-    h0, h1, h2 = half[0], half[1], half[2]
-    for j in range(cost.kinds.shape[0]):
+        return _widest(half)
+    t0, t1, t2, h0, h1, h2 = 0.0, 0.0, 0.0, half[0], half[1], half[2]
+    for j in range(kinds.shape[0]):
         wide = nodes[j, 5] - nodes[j, 4]
-        if wide > 0.0:
+        if kinds[j] == RANGE and wide > 0.0:
             pull = 0.0
-            for i in range(cost.K.shape[0]):
-                pull += cost.K[i, j] * box.rows[i, 4]
-            g0, g1, g2 = nodes[j, 1], nodes[j, 2], nodes[j, 3]
-            a = abs(gram[0, 1] - g0 * g1) * h0 * h1
-            b = abs(gram[0, 2] - g0 * g2) * h0 * h2
-            c = abs(gram[1, 2] - g1 * g2) * h1 * h2
-            x, y = (gram[0, 0] - g0 * g0) * h0 * h0 + a + b, (gram[1, 1] - g1 * g1) * h1 * h1 + a + c
-            z = (gram[2, 2] - g2 * g2) * h2 * h2 + b + c
+            for i in range(K.shape[0]):
+                pull += K[i, j] * rows[i, 4]
+            e0, e1, e2 = nodes[j, 1] * h0, nodes[j, 2] * h1, nodes[j, 3] * h2
+            a, b = abs(gram[0, 1] * h0 * h1 - e0 * e1), abs(gram[0, 2] * h0 * h2 - e0 * e2)
+            c = abs(gram[1, 2] * h1 * h2 - e1 * e2)
+            x, y = gram[0, 0] * h0 * h0 - e0 * e0 + a + b, gram[1, 1] * h1 * h1 - e1 * e1 + a + c
+            z = gram[2, 2] * h2 * h2 - e2 * e2 + b + c
             pull = abs(pull) * wide / (x + y + z + 1e-300)
             t0 += pull * x
             t1 += pull * y
@@ -186,18 +190,6 @@ def _widest(half: Array) -> int:
     if half[0] >= half[1] and half[0] >= half[2]:
         return 0
     return 1 if half[1] >= half[2] else 2
-
-
-@compiled
-def _known(box: Box, minima: Array, sides: Array) -> bool:
-    """Return whether a box lies inside the convex box of a known minimum."""
-    for p in range(minima.shape[0]):
-        inside = True
-        for k in range(3):
-            inside = inside and abs(box.at[k] - minima[p, k]) + box.half[k] <= sides[p, k]
-        if inside:
-            return True
-    return False
 
 
 @compiled

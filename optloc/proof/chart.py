@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.kernels.jit import compiled
-from optloc.proof.boxes import NODE_WIDTH, ROW_WIDTH, bound_nodes, cost_at, least_residual, linearise_rows
+from optloc.proof.boxes import NODE_WIDTH, ROW_WIDTH, bound_nodes, cost_at, linearise_rows
 from optloc.proof.convex import CURVE_WIDTH, SUMS, convex, curve_nodes, sum_up
 from optloc.proof.inline import inlined
 from optloc.proof.linear3 import principal
@@ -171,31 +171,22 @@ def accuracy_floor(cost: Cost, chart: Chart) -> float:
 
 
 @inlined
-def place(chart: Chart, box: Box) -> None:
-    """Write the centre of a box in metres."""
-    s0, s1, s2 = box.at[0], box.at[1], box.at[2]
+def place(origin: Array, sense: Array, at: Array, centre: Array) -> None:
+    """Write the centre of a box at search coordinates `at` in metres."""
+    s0, s1, s2 = at[0], at[1], at[2]
     for k in range(3):
-        box.centre[k] = chart.origin[k] + (chart.sense[k, 0] * s0 + chart.sense[k, 1] * s1 + chart.sense[k, 2] * s2)
-
-
-@inlined
-def bound_box(cost: Cost, chart: Chart, box: Box, floor: float) -> float:
-    """Fill the first tables of a box; return a lower bound of the length of the residual there, or less than 0."""
-    place(chart, box)
-    bound_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, box.half, box.line, box.nodes)
-    linearise_rows(cost.K, cost.w, box.nodes, box.rows)
-    return least_residual(cost.K, cost.weight, floor, box.half, box.nodes, box.rows)
+        centre[k] = origin[k] + (sense[k, 0] * s0 + sense[k, 1] * s1 + sense[k, 2] * s2)
 
 
 @compiled
 def value_at(cost: Cost, chart: Chart, box: Box) -> float:
     """Return f at the centre of a box; its first table is filled."""
-    place(chart, box)
+    place(chart.origin, chart.sense, box.at, box.centre)
     bound_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, box.half, box.line, box.nodes)
     return cost_at(cost.K, cost.w, box.nodes)
 
 
-@inlined
+@compiled
 def curve_box(cost: Cost, chart: Chart, box: Box) -> None:
     """Fill the tables of second derivatives of a box whose nodes are bounded."""
     curve_nodes(
@@ -216,7 +207,7 @@ def curve_box(cost: Cost, chart: Chart, box: Box) -> None:
 @compiled
 def is_convex(cost: Cost, chart: Chart, box: Box, margin: float) -> bool:
     """Return whether the Hessian of f/2 exceeds `margin` all over a box, whose tables are filled."""
-    place(chart, box)
+    place(chart.origin, chart.sense, box.at, box.centre)
     bound_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, box.half, box.line, box.nodes)
     curve_box(cost, chart, box)
     return convex(cost.kinds, cost.A, box.half, box.nodes, box.curves, box.sums, margin)

@@ -60,6 +60,13 @@ def shrink(K: Array, rho: float, plane: bool, nodes: Array, rows: Array, cut: Ar
 
 
 @compiled
+def uncut(half: Array, cut: Array) -> None:
+    """Write the ends of a whole box."""
+    for k in range(3):
+        cut[k], cut[3 + k] = -half[k], half[k]
+
+
+@compiled
 def clip(cut: Array, k: int, centre: float, reach: float) -> None:
     """Clip coordinate k of a box to ``|s - centre| <= reach``, with some slack for rounding."""
     reach += 1e-9 * (abs(centre) + reach)

@@ -121,10 +121,13 @@ def across(sense: Array, u: Triple, h: Triple) -> float:
     """
     total = 0.0
     for k in range(3):
-        for m in range(k + 1):
-            gram = _gram(sense, u, k, m)
-            total += gram * h[k] * h[k] if m == k else 2.0 * abs(gram) * h[k] * h[m]
-    return sqrt(total)
+        total += _gram(sense, u, k, k) * h[k] * h[k]
+    first, second = _gram(sense, u, 0, 1) * h[0] * h[1], _gram(sense, u, 0, 2) * h[0] * h[2]
+    third = _gram(sense, u, 1, 2) * h[1] * h[2]
+    mixed = abs(first) + abs(second) + abs(third)
+    if first * second * third < 0.0:  # at no corner are all three positive
+        mixed -= 2.0 * min(abs(first), abs(second), abs(third))
+    return sqrt(max(total + 2.0 * mixed, 0.0))
 
 
 @compiled

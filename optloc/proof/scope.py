@@ -16,7 +16,7 @@ ANGLES = ("azimuth", "elevation")
 # Kinds that are nodes of their own; every other kind must be a sum of ranges.
 OWN = (*ANGLES, "groa", "height")
 # Rows, and unknowns beside the position, of a problem whose proof is still worth the time.
-MOST_ROWS, MOST_UNKNOWNS = 512, 512
+MOST_ROWS, MOST_UNKNOWNS = 128, 128
 
 
 def unsupported(problem: Problem) -> str:

@@ -33,6 +33,13 @@ def push_around(stack: Array, low: Array, high: Array, hole: Array) -> int:
 
 
 @compiled
+def pop(stack: Array, row: int, at: Array, half: Array) -> None:
+    """Write centre and half-widths of a box on the stack into `at` and `half`."""
+    for k in range(3):
+        at[k], half[k] = stack[row, k], stack[row, 3 + k]
+
+
+@compiled
 def push(stack: Array, size: int, at: Array, half: Array, low: float) -> int:
     """Push a box; return the size of the stack."""
     for k in range(3):

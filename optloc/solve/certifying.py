@@ -31,8 +31,8 @@ from optloc.types import Array
 # Gaps to other minima that are tried to prove, one after the other; the last is the value alone.
 _MARGINS = (LISTED_GAP, AMBIGUOUS_GAP, 0.0)
 _ROUNDS = 16
-# Boxes for the proof of a gap and of the value. Plain Python takes a thousand times longer for each: a budget of all.
-_BUDGETS, _SLOW_BUDGET = (4000, 16000), 2000
+# Boxes for the proof of a gap and of the value, with up to so many nodes. Plain Python takes a thousand times longer for each: a budget of all.
+_BUDGETS, _NODES, _SLOW_BUDGET = (4000, 16000), 12, 2000
 # Cost that counts as equal, relative: covers the rounding of two ways to compute it.
 _EQUAL = 1e-6
 # Minima behind the Earth that are set aside at most.
@@ -165,8 +165,16 @@ def _asked(work: Work, items: Array, extra: Array) -> Asked:
         _EQUAL * (1.0 + fix.cost[items] + extra),
         work.region[items],
         work.fallback[items],
-        np.where(kappa > 0.0, *_BUDGETS) if enabled() else np.full(len(items), max(5, _SLOW_BUDGET // len(items))),
+        _budgets(kappa, len(work.pose.kinds)),
     )
+
+
+def _budgets(kappa: Array, nodes: int) -> Array:
+    """Return the boxes (n,) that proofs may take: a box takes time with the square of the nodes."""
+    if not enabled():
+        return np.full(len(kappa), max(5, _SLOW_BUDGET // len(kappa)))
+    share = max(1.0, (nodes / _NODES) ** 2)
+    return np.asarray(np.where(kappa > 0.0, *_BUDGETS) / share).astype(np.int64)
 
 
 def _lower(work: Work, items: Array, why: str) -> None:

@@ -12,6 +12,7 @@ from optloc.fix import Alternatives, Fix, Stage
 from optloc.problem import Problem
 from optloc.solve.maps import Direct, direct
 from optloc.solve.parts import in_parts
+from optloc.solve.reasons import doubt
 from optloc.solve.stages import Solver, gtrs, lsr
 from optloc.solve.verdict import _LOCAL
 from optloc.status import Status
@@ -92,6 +93,7 @@ def fixed(direct: Direct, z: Array, position: Array, rest: Callable[[Array], Fix
     detail = f"{count} candidates, {max(steps, default=0)} steps at most"
     stages = (Stage("gtrs", "1 candidates at most", 0.0), Stage("lsr", detail, perf_counter() - began))
     fix = _judged(direct, x, covariance, cost, stages)
+    doubt(fix, np.flatnonzero(plain & (cost > direct.limit)))
     left = np.flatnonzero(~plain)
     return _replaced(fix, left, rest(left)) if len(left) else fix
 

@@ -39,6 +39,8 @@ class Direct:
         Row weights.
     dof : int
         Degrees of freedom.
+    limit : float
+        Cost above which the noise may not allow the residuals.
     station : int array (s,)
         Stations that take part.
     maps : tuple
@@ -49,8 +51,9 @@ class Direct:
     frame: Frame
     weight: Array
     dof: int
+    limit: float
     station: Array
-    maps: tuple[Array | int | float, ...]
+    maps: tuple[Array | int, ...]
 
 
 _KEPT: dict[tuple[Any, ...], Direct | None] = {}
@@ -83,6 +86,8 @@ def direct(problem: Problem) -> Direct | None:
 
 
 def _direct(problem: Problem) -> Direct | None:
+    from scipy.special import gammainccinv
+
     one = weighed(_probe(problem))
     found = ranges(one)
     if found is None or len(found.groups) != 1 or len(found.groups[0]) != 1:
@@ -93,8 +98,9 @@ def _direct(problem: Problem) -> Direct | None:
     if dof < 0 or np.triu(white, 1).any():
         return None
     correction = np.concatenate([rows.correction for rows in problem.rows])
-    maps = _maps(one, correction, found, heard, white, dof)
-    return Direct(problem.layout, problem.frame, one.weight, dof, found.station[heard], maps)
+    maps = _maps(one, correction, found, heard, white)
+    limit = 2.0 * float(gammainccinv(dof / 2, DOUBT)) * (1.0 - 1e-9) if dof else np.inf
+    return Direct(problem.layout, problem.frame, one.weight, dof, limit, found.station[heard], maps)
 
 
 def _simple(problem: Problem) -> bool:
@@ -125,12 +131,8 @@ def _probe(problem: Problem) -> Problem:
     return replace(problem, rows=rows, stations=replace(stations, position=place, velocity=None, axes=None))
 
 
-def _maps(
-    one: Problem, correction: Array, found: Ranges, heard: Array, white: Array, dof: int
-) -> tuple[Array | int | float, ...]:
+def _maps(one: Problem, correction: Array, found: Ranges, heard: Array, white: Array) -> tuple[Array | int, ...]:
     """Return the fields of the compiled model, in its order."""
-    from scipy.special import gammainccinv
-
     count = one.count
     design, emitted, anchor, start = _design(one, found.station[heard])
     alone = whitened(whiten(one.noise, one.weight), np.eye(count))
@@ -154,7 +156,6 @@ def _maps(
         np.array(upper[:inside], order="C"),
         np.array(emission @ design, order="C"),
         start,
-        2.0 * float(gammainccinv(dof / 2, DOUBT)) * (1.0 - 1e-9) if dof else np.inf,
     )
 
 

@@ -46,10 +46,7 @@ def explain(problem: Problem, fix: Fix, curvature: Curvature) -> None:
     fix.code[weak] = Status.SINGULAR_GEOMETRY
     gap = np.min(fix.alternatives.gap, axis=1, initial=np.inf)
     fix.code[(fix.code == Status.OK) & (gap < AMBIGUOUS_GAP)] = Status.AMBIGUOUS
-    doubtful = (fix.code == Status.OK) & (fix.p_value < DOUBT)
-    p_value = fix.p_value
-    for i in np.flatnonzero(doubtful):
-        fix.reason[i] = f"the residuals are larger than the noise allows (p = {p_value[i]:.1g})"
+    doubt(fix, np.flatnonzero((fix.code == Status.OK) & (fix.p_value < DOUBT)))
     for i in np.flatnonzero(few):
         lacking = -int(fix.dof[i])
         some = "is 1 measurement" if lacking == 1 else f"are {lacking} measurements"
@@ -77,6 +74,13 @@ def explain(problem: Problem, fix: Fix, curvature: Curvature) -> None:
     gone = broken | few | missing | barred | weak | far
     fix.x[gone] = np.nan
     fix.cov[gone] = np.nan
+
+
+def doubt(fix: Fix, items: Array) -> None:
+    """Say of those items of which it is so that the noise does not allow their residuals; writes into `fix.reason`."""
+    for i, p_value in zip(items, fix[items].p_value, strict=True):
+        if p_value < DOUBT:
+            fix.reason[i] = f"the residuals are larger than the noise allows (p = {p_value:.1g})"
 
 
 def without_open_epochs(fix: Fix) -> Fix:

@@ -110,7 +110,7 @@ def test_write_the_table(monkeypatch):
             )
         rows.append([f"{scene}: memory of a million fixes", f"{megabytes(scene, 'gtrs+lsr'):.0f} MB", ""])
         rows.append([f"{scene}: scipy least_squares from the truth", "", f"{general_microseconds(scene):.0f}"])
-    for method in ("gtrs+lsr", "auto"):
-        rows.append([f"one fix of a prepared problem, {method}", "", f"{latency(method):.0f}"])
+    methods = ("gtrs+lsr", "auto")
+    rows += [[f"one fix of a prepared problem, {method}", "", f"{latency(method):.0f}"] for method in methods]
     facts = f"TDOA, {STATIONS} stations, {SIGMA:g} m; fix, covariance and verdict; dgemm {dgemm():.0f} Gflop/s one core"
     assert write("million", ["what", "whole", "us a fix"], rows, facts).is_file()

@@ -5,11 +5,11 @@ from importlib import import_module
 
 import numpy as np
 import pytest
-from cases import CASES, STATIONS, TARGET
-from runs import drawn, run, truth
+from cases import CASES, STATIONS, TARGET, random_vector
+from runs import drawn, estimated, run, truth
 from test_normal import regular_sink
 
-from optloc import Motion, Prior, assemble, measured, simulate, station_array
+from optloc import Bias, Motion, Prior, assemble, measured, simulate, station_array
 from optloc.kernels.jit import enabled
 from optloc.linalg import inverse
 from optloc.normal import marginal
@@ -149,3 +149,55 @@ def test_a_moving_target_by_range_rates(both):
     ours, theirs = both(problem, start)
     assert (ours.status == theirs.status).all()
     assert apart(ours, theirs) < 1e-6
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_runs_whose_epochs_have_unknowns_of_their_own(d, both):
+    """Station errors and emission times of each epoch, eliminated on the way and completed at the end."""
+    problem = regular_sink(d, "epoch").flat()
+    x = np.stack([random_vector(problem, seed) for seed in range(min(COUNT, 20))])
+    problem = simulate(problem, x, 3).flat()
+    ours, theirs = both(problem, x + 0.1, limit=100)
+    assert (ours.status == theirs.status).all()
+    assert (ours.status == Status.OK).all()
+    assert apart(ours, theirs) < 1e-6
+    assert np.allclose(ours.x, theirs.x, rtol=0.0, atol=1e-6)
+    assert np.allclose(ours.cost, theirs.cost, rtol=1e-9)
+
+
+def test_station_errors_eliminated_or_weighed(both):
+    """Of range differences both are the same estimate; with gains the weights depend on where the target is."""
+    made = run(30, prior=100.0)
+    problem = drawn(made, 3, min(COUNT, 8)).flat()
+    start = np.tile(truth(problem), (len(problem.z), 1)) + 20.0
+    weighed, _ = both(problem, start)
+    eliminated, theirs = both(estimated(problem), np.pad(start, ((0, 0), (0, 30 * 15))))
+    assert (eliminated.status == theirs.status).all()
+    assert np.array_equal(eliminated.iterations, theirs.iterations)
+    assert apart(eliminated, theirs) < 1e-6
+    assert np.allclose(eliminated.x[:, :7], weighed.x, rtol=0.0, atol=0.05)
+    gains = drawn(run(30, gain=2e-3, prior=100.0), 3, min(COUNT, 8)).flat()
+    ours, theirs = both(gains, np.pad(start, ((0, 0), (0, 4))))
+    assert (ours.status == theirs.status).all()
+    assert apart(ours, theirs) < 1e-6
+
+
+def test_an_epoch_that_leaves_its_own_unknowns_open(both):
+    """One row cannot place the target of its epoch; it still says something about the bias that all epochs share."""
+    a, epoch = np.tile(np.arange(6), 4), np.repeat(np.arange(4), 6)
+    clock = Bias("clock", ("all",), np.arange(24), np.zeros(24, int), np.ones(24))
+    problem = assemble(
+        STATIONS[2],
+        measured("range", a=a, epoch=epoch, sigma=5.0),
+        times=np.arange(4.0),
+        motions=(Motion(span="epoch"),),
+        biases=(clock,),
+    )
+    x = np.concatenate([[30.0], np.tile(TARGET[2], 4)])
+    problem = simulate(problem, x, 3, trials=min(COUNT, 8)).flat()
+    weight = np.ones(problem.z.shape)
+    weight[1:, 7:12] = 0.0
+    problem = problem.with_rows(weight=weight)
+    ours, theirs = both(problem, np.tile(x + 5.0, (len(weight), 1)))
+    assert (ours.status == theirs.status).all()
+    assert np.allclose(ours.x[:, 0], theirs.x[:, 0], rtol=0.0, atol=1e-5)

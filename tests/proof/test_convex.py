@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from proof.costs import random_case
-from proof.test_ranges import bounded, charted, drawn_box, ways
+from proof.test_ranges import bound_box, bounded, charted, drawn_box, ways
 
 from optloc.kernels.jit import enabled
-from optloc.proof.chart import bound_box, curve_box, is_convex
+from optloc.proof.chart import curve_box, is_convex
 from optloc.proof.convex import CURVE_WIDTH, convex, slopes_everywhere, spread_of
 from optloc.proof.grow import grow
 from optloc.proof.ranges import curve_range
@@ -131,7 +131,7 @@ def test_no_box_around_a_stationary_point_is_excluded(d):
             for inside in (True, False):
                 box.half[:d] = wide * rng.uniform(0.2, 1.0, d)
                 box.at[:d] = at + box.half[:d] * (rng.uniform(-1.0, 1.0, d) if inside else 5.0)
-                bound_box(cost, chart, box, 0.0)
+                bound_box(cost, chart, box)
                 curve_box(cost, chart, box)
                 none = slopes_everywhere(cost.A, box.half, box.nodes, box.curves, box.sums, box.solve)
                 assert not (inside and none)

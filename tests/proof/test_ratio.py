@@ -73,5 +73,5 @@ def test_rows_that_nodes_share_are_told_from_rows_of_their_own():
         out = with_alone(kinds, np.zeros((1, 4, WIDTH)), rows[None], right)
         assert out[:, :, ALONE].tolist() == [[1.0, 1.0, 0.0, 0.0]] * 2
         assert out[:, 1, MEASURED] == pytest.approx([1.3, 1.2])
-    shifted = w + [[1.0, 0, 0, 0]]
+    shifted = w + np.eye(4)[0]
     assert with_alone(kinds, np.zeros((1, 4, WIDTH)), K[None], shifted)[0, 0, ALONE] == 0.0

@@ -1,0 +1,234 @@
+"""The tables of a study's report: numbers for machines, and the same as short text for people."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optloc.papers.report import Table
+from optloc.study.stats import clopper_pearson, wilson
+from optloc.study.summary import PROVEN, noise_text, ranking
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+SHIFT = 1e-5
+"""Shift of geometric means of times, seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sheet:
+    """A table twice.
+
+    Parameters
+    ----------
+    frame : DataFrame
+        Plain numbers in SI units, as CSV.
+    shown : Table
+        The same as text, as HTML and LaTeX.
+    words : int
+        How many columns at the left are words.
+    """
+
+    frame: pd.DataFrame
+    shown: Table
+    words: int = 1
+
+
+def number(value: float, digits: int = 3) -> str:
+    """Return a number with some significant digits, a dash where there is none."""
+    if not np.isfinite(value):
+        return "–"
+    if value and not 1e-3 <= abs(value) < 1e5:
+        mantissa, _, power = f"{value:.{digits - 1}e}".partition("e")
+        return f"{mantissa}·10{str(int(power)).translate(_RAISED)}"
+    places = max(0, digits - 1 - int(np.floor(np.log10(abs(value))))) if value else 0
+    return f"{value:.{places}f}"
+
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def duration(seconds: float) -> str:
+    """Return a time with the unit that suits it."""
+    for unit, scale in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
+        if seconds >= scale * 0.9995:
+            return f"{number(seconds / scale)} {unit}"
+    return f"{number(seconds * 1e9)} ns" if np.isfinite(seconds) else "–"
+
+
+def percent(share: float) -> str:
+    """Return a share in per cent; 100 and 0 stand for all and none only."""
+    if not np.isfinite(share):
+        return "–"
+    near = 0.0005
+    text = f"{100 * share:.1f}"
+    if share not in {0.0, 1.0} and not near <= share < 1.0 - near:
+        text = "> 99.9" if share > 0.5 else "< 0.1"
+    return text if text not in {"0.0", "100.0"} else text[:-2]
+
+
+def _interval(hits: float, count: float) -> str:
+    low, high = wilson(hits, count)
+    return f"{percent(float(hits / count))} ({100 * float(low):.1f} to {100 * float(high):.1f})"
+
+
+def _at_most(hits: int, count: int) -> str:
+    """Return a count with the greatest share that it allows."""
+    return f"{hits} (≤ {number(100 * float(clopper_pearson(hits, count)[1]), 2)} %)"
+
+
+Column = tuple[str, Callable[[Any], str]]
+
+
+def _sheet(name: str, title: str, note: str, frame: pd.DataFrame, columns: list[Column], words: int) -> Sheet:
+    rows = tuple(tuple(show(row) for _, show in columns) for row in frame.itertuples(index=False))
+    return Sheet(frame, Table(name, title, tuple(head for head, _ in columns), rows, note), words)
+
+
+def _case(words: tuple[str, ...] = ("case", "noise", "method")) -> list[Column]:
+    columns: dict[str, Column] = {
+        "case": ("case", lambda r: str(r.case)),
+        "noise": ("noise", lambda r: noise_text(r.noise_label)),
+        "method": ("method", lambda r: str(r.method)),
+    }
+    return [columns[word] for word in words]
+
+
+def ranked(frame: pd.DataFrame, order: list[str]) -> Sheet:
+    """Return the methods, best first."""
+    table = ranking(frame, order, SHIFT)
+    sums = frame.groupby("method", observed=True)[["answered", "right", "wrong", "false"]].sum()
+    counts = frame.groupby("method", observed=True).size()
+    table = table.join(sums, on="method").assign(trials=[int(counts[name]) for name in table["method"]])
+    limits = wilson(table["right"].to_numpy(), table["trials"].to_numpy())
+    table = table.assign(right_low=limits[0], right_high=limits[1])
+    columns: list[Column] = [
+        ("method", lambda r: str(r.method)),
+        ("trials", lambda r: str(r.trials)),
+        ("right, % (95 %)", lambda r: _interval(r.right, r.trials)),
+        ("answered, %", lambda r: percent(r.answered / r.trials)),
+        ("wrong though ok", lambda r: _at_most(r.wrong, r.trials)),
+        ("false proofs", lambda r: str(r.false)),
+        ("shifted mean time", lambda r: duration(r.mean)),
+        ("relative", lambda r: number(r.relative)),
+        ("fastest, %", lambda r: percent(r.fastest)),
+    ]
+    note = (
+        "Right: an answer, and neither another method nor the truth has a lower cost. Wrong though ok: the status is "
+        "ok, but a lower cost is known; in brackets the greatest share that this count allows (95 %). Mean time: "
+        f"geometric, shifted by {duration(SHIFT)}, over the {int(table['instances'].max())} trials that every method "
+        "has seen; where a method is not right it counts ten times the slowest time of the study."
+    )
+    return _sheet("ranking", "Ranking", note, table, columns, 1)
+
+
+def success(cells: pd.DataFrame) -> Sheet:
+    """Return how often methods were right, cell by cell."""
+    names = "case noise noise_unit noise_label method trials answered right wrong died".split()
+    table = cells[names].copy()
+    table["right_low"], table["right_high"] = wilson(table["right"].to_numpy(), table["trials"].to_numpy())
+    columns = [
+        *_case(),
+        ("trials", lambda r: str(r.trials)),
+        ("right, % (95 %)", lambda r: _interval(r.right, r.trials)),
+        ("answered, %", lambda r: percent(r.answered / r.trials)),
+        ("wrong though ok", lambda r: _at_most(r.wrong, r.trials)),
+        ("died", lambda r: str(r.died)),
+    ]
+    return _sheet("success", "Right answers", "Intervals are Wilson's.", table, columns, 3)
+
+
+def accuracy(cells: pd.DataFrame) -> Sheet:
+    """Return how near to the bound answers were, cell by cell."""
+    names = "case noise noise_unit noise_label method rmse bound ratio ratio_half deviation_median deviation_p95 nees"
+    columns = [
+        *_case(),
+        ("RMSE, m", lambda r: number(r.rmse)),
+        ("CRLB, m", lambda r: number(r.bound)),
+        ("RMSE / CRLB", lambda r: f"{number(r.ratio)} ± {number(r.ratio_half, 2)}"),
+        ("error / bound, median", lambda r: number(r.deviation_median)),
+        ("95 %", lambda r: number(r.deviation_p95)),
+        ("NEES / dimension", lambda r: number(r.nees)),
+    ]
+    note = (
+        "Over the answers of a method, or over all its positions where it claims none. The bound is averaged over the "
+        "same trials; a single gross error rules the root mean square, so read it beside the median. NEES over the "
+        "dimension is 1 where claimed covariances are true."
+    )
+    return _sheet("accuracy", "Errors and bounds", note, cells[names.split()], columns, 3)
+
+
+def timing(cells: pd.DataFrame) -> Sheet:
+    """Return the times of a fix, cell by cell."""
+    names = "case noise noise_unit noise_label method rows seconds_median seconds_p10 seconds_p90 build iterations"
+    columns = [
+        *_case(),
+        ("measurements", lambda r: str(r.rows)),
+        ("median", lambda r: duration(r.seconds_median)),
+        ("10 %", lambda r: duration(r.seconds_p10)),
+        ("90 %", lambda r: duration(r.seconds_p90)),
+        ("first of its kind", lambda r: duration(r.build) if r.build else "–"),
+        ("iterations", lambda r: number(r.iterations)),
+    ]
+    note = (
+        "Time of a call over the number of its fixes. First of its kind: longest time of the first fix in a process, "
+        "which compiles or canonicalises and is not in the other columns."
+    )
+    return _sheet("timing", "Times", note, cells[names.split()], columns, 3)
+
+
+def certificates(frame: pd.DataFrame, order: list[str]) -> Sheet:
+    """Return what methods prove of their answers, and how often that was false."""
+    import pandas as pd
+
+    found = []
+    for name in order:
+        part = frame[frame["method"] == name]
+        proofs = part["proof"].astype(str).value_counts()
+        share = {kind: int(proofs.get(kind, 0)) for kind in (PROVEN, "region", "local", "unknown")}
+        below = (part["cost"] - part["bound"]).to_numpy(dtype=float)
+        below = below[np.isfinite(below)]
+        by = ", ".join(sorted(set(part["certificate"].astype(str)) - {"none", "nan", ""}))
+        gap = float(np.median(below)) if len(below) else np.nan
+        found.append({"method": name, "by": by, "trials": len(part), **share, "false": int(part["false"].sum())})
+        found[-1] |= {"cost_less_bound_median": gap}
+    table = pd.DataFrame(found)
+    columns: list[Column] = [
+        ("method", lambda r: str(r.method)),
+        ("by", lambda r: r.by or "–"),
+        *((kind, lambda r, k=kind: percent(getattr(r, k) / r.trials)) for kind in (PROVEN, "region", "local")),
+        ("false proofs", lambda r: _at_most(r.false, getattr(r, PROVEN)) if getattr(r, PROVEN) else "–"),
+        ("cost less bound, median", lambda r: number(r.cost_less_bound_median)),
+    ]
+    note = (
+        "Share of trials, in per cent, whose answer was proven best everywhere, in a region, or locally. A global proof "
+        "is false where another method, or the truth, has a lower cost; in brackets the greatest share of false ones "
+        "that the count allows (95 %)."
+    )
+    return _sheet("certificates", "Certificates", note, table, columns, 2)
+
+
+def made_with(frame: pd.DataFrame) -> Sheet:
+    """Return where the rows were computed and with what."""
+    names = ["machine", "versions"]
+    table = frame.groupby(names, observed=True).size().rename("rows").reset_index()
+    columns: list[Column] = [
+        ("machine", lambda r: str(r.machine)),
+        ("versions", lambda r: str(r.versions)),
+        ("rows", lambda r: str(r.rows)),
+    ]
+    return _sheet("machine", "Machine and versions", "", table, columns, 2)
+
+
+def sheets(frame: pd.DataFrame, cells: pd.DataFrame, order: list[str]) -> Iterator[Sheet]:
+    """Yield all tables of judged rows and their cells, in reading order."""
+    yield ranked(frame, order)
+    yield success(cells)
+    yield accuracy(cells)
+    yield certificates(frame, order)
+    yield timing(cells)
+    yield made_with(frame)
