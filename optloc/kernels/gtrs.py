@@ -2,8 +2,8 @@
 
 Minimise ``|B y - g|^2`` over the cone ``y = (x, r)``, ``|x|^2 = r^2``, or the paraboloid ``y = (x, w)``, ``|x|^2 = w``.
 The last axis of every array here counts W = LANES problems, so that one instruction serves several of them. Problems
-whose iteration leaves the interval where the Lagrangian is positive definite, or does not settle, are flagged: they
-need the eigenvalues of their pencil, which batches of few hard problems compute elsewhere.
+whose normal matrix is not definite, or whose iteration does not settle, are flagged: they need the eigenvalues of
+their pencil, which a batch of few hard problems computes elsewhere.
 
 Source: J. J. More, "Generalizations of the trust region problem", Optim. Methods Softw. 2 (1993), theorem 3.2.
 """
@@ -40,7 +40,8 @@ def minimise(rows: Array, on_cone: bool, y: Array, settled: Array, work: Array) 
     y : array (n, W)
         Written: the minimisers; meaningless where not settled.
     settled : float array (W,)
-        Written: 1.0 where the iteration converged inside the definite interval, else 0.0.
+        Written: 1.0 where the iteration converged inside the interval where ``B'B + multiplier C`` is positive
+        definite, else 0.0.
     work : array (at least ``scratch(n)``, W)
         Scratch.
 

@@ -13,7 +13,7 @@ from optloc.proof.height import curve_height
 from optloc.proof.inline import inlined
 from optloc.proof.linear3 import inverse, positive
 from optloc.proof.nodes import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO
-from optloc.proof.ranges import curve_range
+from optloc.proof.ranges import curve_ranges
 from optloc.proof.ratio import curve_ratio
 from optloc.types import Array
 
@@ -41,13 +41,12 @@ def curve_nodes(
 
     Arguments are those of `bound_nodes`, which ran before, and working memory `second` (3, 3).
     """
+    curve_ranges(kinds, gram, half, nodes, curves)
     for j in range(kinds.shape[0]):
         kind = kinds[j]
-        if kind == RANGE:
-            curve_range(sense, gram, half, nodes[j], curves[j])
-        elif kind == LINEAR:
+        if kind == LINEAR:
             curves[j, :10] = 0.0
-        else:
+        elif kind != RANGE:
             for k in range(3):
                 line[k] = centre[k] - data[j, k]
                 line[3 + k] = centre[k] - data[j, 3 + k]

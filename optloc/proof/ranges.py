@@ -71,45 +71,44 @@ def bound_ranges(kinds: Array, data: Array, centre: Array, sense: Array, gram: A
 
 
 @compiled
-def curve_range(sense: Array, gram: Array, half: Array, node: Array, curve: Array) -> None:
-    """Write Hessian and bounds of its change of a range into its row of the table of second derivatives.
+def curve_ranges(kinds: Array, gram: Array, half: Array, nodes: Array, curves: Array) -> None:
+    """Write Hessians of all ranges, and bounds of their change, into the table of second derivatives.
 
     With P the projection across the direction u of the line and r' >= A the range elsewhere in the box, the gradient
     T'u changes by ``(T'P d - q T'u) / r'`` and the Hessian ``T'P T / r`` by a difference of quotients.
 
     Parameters
     ----------
-    sense, gram, half : array (3, 3), (3, 3), (3,)
-        Of the box (`bound_ranges`).
-    node : array (NODE_WIDTH,)
-        Row filled by `bound_ranges`.
-    curve : array (CURVE_WIDTH,)
-        Written.
+    kinds : array (J,)
+        Codes of the nodes.
+    gram, half : array (3, 3), (3,)
+        ``T'T``, and half-widths of the box.
+    nodes : array (J, NODE_WIDTH)
+        Filled by `bound_ranges`.
+    curves : array (J, CURVE_WIDTH)
+        Rows of ranges are written, see `optloc.proof.convex`.
     """
-    r, most = node[0], node[5]
-    least, move, slope, norm = r, most, 0.0, 0.0
-    for k in range(3):
-        least -= abs(node[1 + k]) * half[k]
-        move += abs(node[1 + k]) * half[k]
-        slope += node[1 + k] * node[1 + k]
-    column = 0
-    for k in range(3):
-        for m in range(k, 3):
-            entry = gram[k, m] - node[1 + k] * node[1 + m]
-            norm += entry * entry * (1.0 if k == m else 2.0)
-            curve[column] = entry / r if r > 0.0 else 0.0
-            column += 1
-    if not least > 0.0:
-        for k in range(3):
-            curve[6 + k] = sqrt(gram[k, k]) + abs(node[1 + k])
-        curve[9] = inf
-        return
-    eta = 0.0
-    for k in range(3):
-        total = most * abs(node[1 + k])
-        for m in range(3):
-            total += abs(gram[k, m] - node[1 + k] * node[1 + m]) * half[m]
-        curve[6 + k] = total / least
-        eta += curve[6 + k] * curve[6 + k]
-    eta = sqrt(eta)
-    curve[9] = (eta * (2.0 * sqrt(slope) + eta) + sqrt(norm) * move / r) / least
+    h0, h1, h2 = half[0], half[1], half[2]
+    m00, m01, m02, m11, m12, m22 = gram[0, 0], gram[0, 1], gram[0, 2], gram[1, 1], gram[1, 2], gram[2, 2]
+    for j in range(kinds.shape[0]):
+        if kinds[j] != RANGE:
+            continue
+        r, g0, g1, g2, most = nodes[j, 0], nodes[j, 1], nodes[j, 2], nodes[j, 3], nodes[j, 5]
+        swing = abs(g0) * h0 + abs(g1) * h1 + abs(g2) * h2
+        least = r - swing
+        n00, n01, n02 = m00 - g0 * g0, m01 - g0 * g1, m02 - g0 * g2
+        n11, n12, n22 = m11 - g1 * g1, m12 - g1 * g2, m22 - g2 * g2
+        if least > 0.0:
+            per, near = 1.0 / r, 1.0 / least
+            e0 = (most * abs(g0) + abs(n00) * h0 + abs(n01) * h1 + abs(n02) * h2) * near
+            e1 = (most * abs(g1) + abs(n01) * h0 + abs(n11) * h1 + abs(n12) * h2) * near
+            e2 = (most * abs(g2) + abs(n02) * h0 + abs(n12) * h1 + abs(n22) * h2) * near
+            eta, slope = sqrt(e0 * e0 + e1 * e1 + e2 * e2), sqrt(g0 * g0 + g1 * g1 + g2 * g2)
+            norm = sqrt(n00 * n00 + n11 * n11 + n22 * n22 + 2.0 * (n01 * n01 + n02 * n02 + n12 * n12))
+            chi = (eta * (2.0 * slope + eta) + norm * (swing + most) * per) * near
+        else:
+            per, chi = 1.0 / r if r > 0.0 else 0.0, inf
+            e0, e1, e2 = sqrt(m00) + abs(g0), sqrt(m11) + abs(g1), sqrt(m22) + abs(g2)
+        curves[j, 0], curves[j, 1], curves[j, 2] = n00 * per, n01 * per, n02 * per
+        curves[j, 3], curves[j, 4], curves[j, 5] = n11 * per, n12 * per, n22 * per
+        curves[j, 6], curves[j, 7], curves[j, 8], curves[j, 9] = e0, e1, e2, chi

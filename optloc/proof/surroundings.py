@@ -13,6 +13,7 @@ from optloc.proof.chart import Box, Cost
 from optloc.proof.convex import convex, sum_up
 from optloc.proof.far import bound_pieces, curve_pieces
 from optloc.proof.linear3 import principal
+from optloc.proof.nodes import RATIO
 from optloc.types import Array
 
 # No convex box is looked for beyond this many standard deviations, nor nearer to infinity than a tenth of the way.
@@ -95,7 +96,8 @@ def _tables(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array) -> None:
 @compiled
 def _convex(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array, margin: float) -> bool:
     _tables(cost, box, atlas, i, half)
-    return convex(cost.kinds, cost.A, box.half, box.nodes, box.curves, box.sums, margin)
+    # Ranges are differences here, whose Hessians have no sign: the test must take them for ratios.
+    return convex(np.full_like(cost.kinds, RATIO), cost.A, box.half, box.nodes, box.curves, box.sums, margin)
 
 
 @compiled

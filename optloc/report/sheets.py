@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -181,6 +182,13 @@ def timing(cells: pd.DataFrame) -> Sheet:
     return _sheet("timing", "Times", note, cells[names.split()], columns, 3)
 
 
+_PROOFS = (PROVEN, "region", "local")
+
+
+def _proven(kind: str, row: Any) -> str:
+    return percent(getattr(row, f"proven_{kind}") / row.trials)
+
+
 def certificates(frame: pd.DataFrame, order: list[str]) -> Sheet:
     """Return what methods prove of their answers, and how often that was false."""
     import pandas as pd
@@ -189,7 +197,7 @@ def certificates(frame: pd.DataFrame, order: list[str]) -> Sheet:
     for name in order:
         part = frame[frame["method"] == name]
         proofs = part["proof"].astype(str).value_counts()
-        share = {kind: int(proofs.get(kind, 0)) for kind in (PROVEN, "region", "local", "unknown")}
+        share = {f"proven_{kind}": int(proofs.get(kind, 0)) for kind in _PROOFS}
         below = (part["cost"] - part["bound"]).to_numpy(dtype=float)
         below = below[np.isfinite(below)]
         by = ", ".join(sorted(set(part["certificate"].astype(str)) - {"none", "nan", ""}))
@@ -200,8 +208,8 @@ def certificates(frame: pd.DataFrame, order: list[str]) -> Sheet:
     columns: list[Column] = [
         ("method", lambda r: str(r.method)),
         ("by", lambda r: r.by or "–"),
-        *((kind, lambda r, k=kind: percent(getattr(r, k) / r.trials)) for kind in (PROVEN, "region", "local")),
-        ("false proofs", lambda r: _at_most(r.false, getattr(r, PROVEN)) if getattr(r, PROVEN) else "–"),
+        *((kind, partial(_proven, kind)) for kind in _PROOFS),
+        ("false proofs", lambda r: _at_most(r.false, r.proven_global) if r.proven_global else "–"),
         ("cost less bound, median", lambda r: number(r.cost_less_bound_median)),
     ]
     note = (

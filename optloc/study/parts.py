@@ -45,6 +45,8 @@ class Manifest:
         When it was begun, UTC.
     machine, versions : str
         Where it was begun and with what.
+    folder : str
+        Where its problem files are; empty where that is not known.
     """
 
     name: str
@@ -59,6 +61,7 @@ class Manifest:
     created: str
     machine: str
     versions: str
+    folder: str = ""
 
     @property
     def rows(self) -> int:
@@ -88,6 +91,7 @@ def manifest_of(plan: Plan) -> Manifest:
         f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
         machine(),
         versions(),
+        plan.folder,
     )
 
 

@@ -89,11 +89,14 @@ class Plan:
         The text of the file.
     cells : tuple of Cell
         In the order of the file.
+    folder : str
+        Where its problem files are.
     """
 
     study: StudyFile
     text: str
     cells: tuple[Cell, ...]
+    folder: str = ""
 
     @property
     def chunks(self) -> Iterator[Chunk]:
@@ -167,7 +170,7 @@ def planned(text: str, source: str, folder: Path, *, trials: int | None = None, 
         raise InvalidProblem(error.what, where, error.advice) from None
     _distinct([method.name for method in methods], source, "method")
     _distinct([table.name for table in study.scenario], source, "scenario")
-    return Plan(study, text, tuple(Cell(case, method) for case in cases for method in methods))
+    return Plan(study, text, tuple(Cell(case, method) for case in cases for method in methods), str(folder.resolve()))
 
 
 def _distinct(names: list[str], source: str, what: str) -> None:

@@ -1,0 +1,254 @@
+"""From the folder of a study to its report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from optloc.errors import InvalidProblem
+from optloc.papers.report import Picture
+from optloc.plot.bound_map import plot_bound_map
+from optloc.plot.style import figure_class
+from optloc.report import figures as drawn
+from optloc.report import page as html
+from optloc.report.geo import map_element
+from optloc.report.latex import latex
+from optloc.report.marks import Mark, marks
+from optloc.report.places import Place, scenario_maps
+from optloc.report.sheets import Sheet, sheets
+from optloc.report.svg import svg_text
+from optloc.study import summary
+from optloc.study.parts import Manifest, read_manifest, unwritable
+from optloc.study.table import read_frame
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Tell = Callable[[str], None]
+"""Hears what is being made."""
+
+_DPI = 200
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """What a report is made of."""
+
+    manifest: Manifest
+    frame: pd.DataFrame
+    cells: pd.DataFrame
+    looks: dict[str, Mark]
+    sheets: dict[str, Sheet]
+    places: list[Place]
+
+
+@dataclass(frozen=True, slots=True)
+class _Section:
+    """Figures that belong together, with the text above them."""
+
+    name: str
+    title: str
+    text: str
+    make: Callable[[_Found], list[Picture]]
+    lines: bool = True
+    wide: bool = False
+    tables: tuple[str, ...] = ()
+
+
+def write_report(folder: Path, out: Path | None = None, tell: Tell | None = None) -> list[Path]:
+    """Write the report of a study, as far as it is finished.
+
+    Parameters
+    ----------
+    folder : Path
+        Output folder of a study.
+    out : Path, optional
+        Where ``report.html``, ``tables`` and ``figures`` go; ``report`` in the folder of the study by default.
+    tell : callable, optional
+        Hears what is being made.
+
+    Returns
+    -------
+    list of Path
+        The files, the page first.
+
+    Raises
+    ------
+    InvalidProblem
+        Where the folder holds no study or nothing of it is finished, matplotlib is missing, or a file cannot be
+        written.
+    """
+    figure_class()
+    place = folder / "report" if out is None else out
+    say = tell or (lambda _: None)
+    say("reading")
+    found = _found(folder)
+    try:
+        files = [_table_file(place, sheet, ending) for sheet in found.sheets.values() for ending in ("csv", "tex")]
+        parts, maps = [], False
+        parts.append(("ranking", "Ranking", html.table(found.sheets["ranking"])))
+        for section in _SECTIONS:
+            say(section.title.lower())
+            pictures = section.make(found)
+            if pictures:
+                parts.append((section.name, section.title, _section(section, found, pictures)))
+                files += [path for picture in pictures for path in _figure_files(place, picture, found, section)]
+        if found.places:
+            say("maps")
+            inner, more, maps = _maps(place, found)
+            parts.append(("maps", "Where the bound is small", inner))
+            files += more
+        parts.append(("made", "How it was made", _made(found)))
+        title = found.manifest.title or found.manifest.name
+        page = html.page(title, parts, _opening(found), html.legend(found.looks), maps=maps)
+        target = place / "report.html"
+        target.write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise unwritable(place, error) from None
+    return [target, *files]
+
+
+def _found(folder: Path) -> _Found:
+    manifest = read_manifest(folder)
+    rows = read_frame(folder, [*summary.COLUMNS])
+    if not len(rows):
+        advice = "wait for the first part, or run the study"
+        raise InvalidProblem("nothing of the study is finished yet", str(folder), advice)
+    frame = summary.judged(rows)
+    order, cells = summary.methods(frame), summary.cells(frame)
+    tables = {sheet.shown.name: sheet for sheet in sheets(frame, cells, order)}
+    return _Found(manifest, frame, cells, marks(order), tables, list(scenario_maps(manifest, frame)))
+
+
+def _opening(found: _Found) -> str:
+    m, rows = found.manifest, len(found.frame)
+    part = "complete" if rows == m.rows else f"{rows} of {m.rows} rows: not finished, and what follows may change"
+    trials = found.frame[["data", "trial"]].drop_duplicates()
+    facts = (
+        f"{rows} fixes of {len(trials)} trials by {len(found.looks)} methods ({part}). optloc {m.version}, begun "
+        f"{m.created[:10]}, seed {m.seed}, {m.machine}."
+    )
+    return (html.paragraph(m.note) if m.note else "") + html.paragraph(facts, "soft")
+
+
+def _section(section: _Section, found: _Found, pictures: list[Picture]) -> str:
+    tables = "".join(
+        html.folded(f"Table: {found.sheets[name].shown.title.lower()}", html.table(found.sheets[name]))
+        for name in section.tables
+    )
+    return html.paragraph(section.text) + html.figures(pictures, wide=section.wide) + tables
+
+
+def _figure_files(place: Path, picture: Picture, found: _Found, section: _Section) -> list[Path]:
+    """Write a picture as PNG and SVG, with a legend of the methods in it where the page has one."""
+    figure = picture.figure
+    if section.lines:
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        columns = 2 if max(map(len, labels), default=0) > 22 else 3
+        legend = figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=7)
+        rows = -(-len(labels) // columns)
+        width, height = figure.get_size_inches()
+        figure.set_size_inches(width, height + 0.16 * rows)
+        legend.set_in_layout(True)
+    paths = [place / "figures" / f"{picture.name}.{ending}" for ending in ("png", "svg")]
+    paths[0].parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(paths[0], dpi=_DPI)
+    paths[1].write_text(svg_text(figure), encoding="utf-8")
+    return paths
+
+
+def _table_file(place: Path, sheet: Sheet, ending: str) -> Path:
+    path = place / "tables" / f"{sheet.shown.name}.{ending}"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if ending == "csv":
+        sheet.frame.to_csv(path, index=False, lineterminator="\n")
+    else:
+        path.write_text(latex(sheet.shown, sheet.words), encoding="utf-8")
+    return path
+
+
+def _maps(place: Path, found: _Found) -> tuple[str, list[Path], bool]:
+    """Return the maps of a page, their files, and whether the page needs the script of maps."""
+    text = (
+        "Bound of the position error (root of its trace) at the height of the middle trial, over the place of the "
+        "target. On maps that move, blue dots are true positions, orange ones those where some method was wrong though "
+        "ok."
+    )
+    parts, files, moving, section = [html.paragraph(text)], [], False, _Section("maps", "", "", lambda _: [], lines=False)
+    for i, one in enumerate(found.places):
+        picture = Picture(f"map-{i + 1}", f"Bound: {one.title}", plot_bound_map(one.found, one.title))
+        if one.found.geodetic:
+            moving = True
+            parts.append(f"<h3>{escape(one.title)}</h3>")
+            parts.append(map_element(one.found, f"map-{i + 1}", one.title, (one.truths, one.off)))
+        else:
+            parts.append(html.figures([picture], wide=True))
+        files += _figure_files(place, picture, found, section)
+    return "".join(parts), files, moving
+
+
+def _made(found: _Found) -> str:
+    file = f"<pre>{escape(found.manifest.text)}</pre>"
+    return html.table(found.sheets["machine"]) + html.folded("Study file", file)
+
+
+def _of_cells(make: Callable[..., object], found: _Found) -> list[Picture]:
+    return list(make(found.cells, found.looks))  # type: ignore[call-overload,no-any-return]
+
+
+def _of_rows(make: Callable[..., object], found: _Found) -> list[Picture]:
+    return list(make(found.frame, found.looks))  # type: ignore[call-overload,no-any-return]
+
+
+_SECTIONS = (
+    _Section(
+        "success",
+        "How often it is right",
+        "Right: the method claims an answer, and no lower cost is known for the same data. Bars are 95 % intervals.",
+        partial(_of_cells, drawn.success),
+        lines=False,
+        tables=("success",),
+    ),
+    _Section(
+        "accuracy",
+        "Error over the bound, against noise",
+        "Root mean square error of the answers over that of the Cramer-Rao bound at the truth; bars are 95 % intervals. "
+        "One gross error is enough to lift a point far, so look at the distributions too.",
+        partial(_of_cells, drawn.accuracy),
+        tables=("accuracy",),
+    ),
+    _Section(
+        "errors",
+        "Distribution of errors",
+        "Share of trials whose error, in units of the bound, is at most so large. A curve ends at the share of trials "
+        "with an answer. The broad grey curve is that of an efficient estimate.",
+        partial(_of_rows, drawn.distributions),
+    ),
+    _Section(
+        "gaps",
+        "How near to the best cost",
+        "Share of trials whose cost exceeds the lowest that is known, of any method or of the truth, by at most so much. "
+        "Answers that are not refined count too: this is how tight a relaxation is. Less than a millionth is drawn there.",
+        partial(_of_rows, drawn.gaps),
+        tables=("certificates",),
+    ),
+    _Section(
+        "profile",
+        "Performance profile",
+        "Share of instances that a method answers right within a multiple of the time of the fastest right one.",
+        partial(_of_rows, drawn.profile),
+        wide=True,
+    ),
+    _Section(
+        "time",
+        "Time against size",
+        "Median time of a fix; bars reach from the 10th to the 90th percentile. Points of one size stand side by side.",
+        partial(_of_rows, drawn.timing),
+        wide=True,
+        tables=("timing",),
+    ),
+)

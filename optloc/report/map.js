@@ -1,0 +1,72 @@
+"use strict";
+// Maps: drag, wheel, pinch and buttons move them; a pointer or a tap tells the bound.
+for (const map of document.querySelectorAll(".map")) {
+  const svg = map.querySelector("svg"), out = map.querySelector("output"), help = out.textContent;
+  const data = JSON.parse(map.querySelector("script").textContent);
+  const whole = svg.getAttribute("viewBox").split(" ").map(Number);
+  let view = [...whole];
+  const unit = () => {
+    const { width, height } = svg.getBoundingClientRect();
+    return Math.max(view[2] / Math.max(width, 1), view[3] / Math.max(height, 1));
+  };
+  const show = () => {
+    svg.setAttribute("viewBox", view.join(" "));
+    svg.style.setProperty("--unit", unit());
+  };
+  const place = event => {
+    const box = svg.getBoundingClientRect(), u = unit();
+    return [view[0] + view[2] / 2 + (event.clientX - box.left - box.width / 2) * u,
+      view[1] + view[3] / 2 + (event.clientY - box.top - box.height / 2) * u];
+  };
+  const zoom = (by, [x, y] = [view[0] + view[2] / 2, view[1] + view[3] / 2]) => {
+    const size = Math.min(Math.max(view[2] / by, whole[2] / 200), whole[2] * 4), f = size / view[2];
+    view = [x + (view[0] - x) * f, y + (view[1] - y) * f, size, view[3] * f];
+    show();
+  };
+  const tell = ([px, py]) => {
+    const lon = data.middle[0] + px / data.scale[0], lat = data.middle[1] + py / data.scale[1];
+    const [x0, x1, nx] = data.x, [y0, y1, ny] = data.y;
+    const i = Math.round((lon - x0) / (x1 - x0) * (nx - 1)), j = Math.round((lat - y0) / (y1 - y0) * (ny - 1));
+    const value = i >= 0 && i < nx && j >= 0 && j < ny ? data.values[j * nx + i] : null;
+    const turned = ((lon + 540) % 360) - 180;
+    const at = `${Math.abs(lat).toFixed(4)}° ${lat < 0 ? "S" : "N"}, ${Math.abs(turned).toFixed(4)}° ${turned < 0 ? "W" : "E"}`;
+    out.textContent = value === null ? `${at}: no bound here` : `${at}: bound ${value} m`;
+  };
+  const fingers = new Map();
+  const spread = () => {
+    const [a, b] = [...fingers.values()];
+    return Math.hypot(a.clientX - b.clientX, a.clientY - b.clientY);
+  };
+  svg.addEventListener("pointerdown", event => { svg.setPointerCapture(event.pointerId); fingers.set(event.pointerId, event); });
+  svg.addEventListener("pointermove", event => {
+    const old = fingers.get(event.pointerId);
+    if (!old) { tell(place(event)); return; }
+    if (fingers.size === 1) {
+      const u = unit();
+      view[0] -= (event.clientX - old.clientX) * u;
+      view[1] -= (event.clientY - old.clientY) * u;
+      fingers.set(event.pointerId, event);
+      show();
+    } else if (fingers.size === 2) {
+      const before = spread();
+      fingers.set(event.pointerId, event);
+      if (before > 0) zoom(spread() / before, place(event));
+    }
+    tell(place(event));
+  });
+  for (const end of ["pointerup", "pointercancel"])
+    svg.addEventListener(end, event => { fingers.delete(event.pointerId); if (end === "pointerup") tell(place(event)); });
+  svg.addEventListener("pointerleave", () => { if (!fingers.size) out.textContent = help; });
+  svg.addEventListener("wheel", event => { event.preventDefault(); zoom(event.deltaY < 0 ? 1.2 : 1 / 1.2, place(event)); }, { passive: false });
+  map.querySelector(".tools").addEventListener("click", event => {
+    const what = event.target.dataset.do;
+    if (what === "in") zoom(1.5);
+    else if (what === "out") zoom(1 / 1.5);
+    else if (what === "all") { view = [...whole]; show(); }
+  });
+  map.querySelector(".layers").addEventListener("change", event => {
+    svg.querySelector(`[data-layer="${event.target.value}"]`).style.display = event.target.checked ? "" : "none";
+  });
+  addEventListener("resize", show);
+  show();
+}

@@ -1,0 +1,125 @@
+"""A headless Chromium that tells what it sees; spoken to through a pipe, so that nothing else is needed."""
+
+import base64
+import json
+import os
+import shutil
+import subprocess
+import tempfile
+import time
+from pathlib import Path
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+PATIENCE = 60.0
+
+
+def executable():
+    """Return the path of a browser, or None."""
+    return next((found for name in NAMES if (found := shutil.which(name))), None)
+
+
+class Browser:
+    """One browser with one tab; `messages` are its complaints: console errors, exceptions, requests to a network."""
+
+    def __init__(self):
+        self.messages, self.requests, self.events, self._number = [], [], [], 0
+        self._profile = tempfile.mkdtemp(prefix="optloc-browser-")
+        there, self._to = os.pipe()
+        self._from, back = os.pipe()
+        flags = "--headless --no-sandbox --disable-gpu --disable-dev-shm-usage --remote-debugging-pipe --mute-audio "
+        flags += "--disable-background-networking --disable-component-update --no-first-run --hide-scrollbars"
+        # The browser reads at descriptor 3 and writes at 4.
+        line = f'exec "$0" "$@" 3<&{there} 4>&{back}'
+        command = ["bash", "-c", line, executable(), *flags.split(), f"--user-data-dir={self._profile}", "about:blank"]
+        quiet = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        self._process = subprocess.Popen(command, pass_fds=(there, back), **quiet)
+        os.close(there)
+        os.close(back)
+        os.set_blocking(self._from, False)
+        self._rest, self._session = b"", None
+        targets = self.ask("Target.getTargets")["targetInfos"]
+        target = next(t["targetId"] for t in targets if t["type"] == "page")
+        self._session = self.ask("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            self.ask(f"{domain}.enable")
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        os.close(self._to)
+        os.close(self._from)
+        self._process.terminate()
+        try:
+            self._process.wait(10)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait(10)
+        shutil.rmtree(self._profile, ignore_errors=True)
+
+    def ask(self, method, **arguments):
+        """Return the answer to a command of the DevTools protocol."""
+        self._number += 1
+        message = {"id": self._number, "method": method, "params": arguments}
+        if self._session is not None:
+            message["sessionId"] = self._session
+        os.write(self._to, json.dumps(message).encode() + b"\0")
+        number, end = self._number, time.monotonic() + PATIENCE
+        while time.monotonic() < end:
+            for answer in self._received():
+                if answer.get("id") == number:
+                    assert "error" not in answer, f"{method}: {answer['error']}"
+                    return answer["result"]
+        raise TimeoutError(method)
+
+    def _received(self):
+        try:
+            more = os.read(self._from, 1 << 20)
+        except BlockingIOError:
+            time.sleep(0.005)
+            return
+        assert more, "the browser ended"
+        *whole, self._rest = (self._rest + more).split(b"\0")
+        for text in whole:
+            message = json.loads(text)
+            self._note(message.get("method"), message.get("params", {}))
+            yield message
+
+    def _note(self, method, what):
+        if method is not None:
+            self.events.append(method)
+        if method == "Runtime.exceptionThrown":
+            self.messages.append(what["exceptionDetails"].get("exception", {}).get("description", "exception"))
+        elif method == "Runtime.consoleAPICalled" and what["type"] in {"error", "warning", "assert"}:
+            self.messages.append(str([a.get("value") for a in what["args"]]))
+        elif method == "Log.entryAdded" and what["entry"]["level"] in {"error", "warning"}:
+            self.messages.append(what["entry"]["text"])
+        elif method == "Network.requestWillBeSent" and not what["request"]["url"].startswith("data:"):
+            self.requests.append(what["request"]["url"])
+
+    def open(self, path, width=1280, height=900, *, phone=False):
+        """Open a file and wait until it is loaded."""
+        self.ask(
+            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone
+        )
+        self.events.clear()
+        self.ask("Page.navigate", url=Path(path).resolve().as_uri())
+        end = time.monotonic() + PATIENCE
+        while "Page.loadEventFired" not in self.events:
+            assert time.monotonic() < end, "the page does not load"
+            self.run("0")
+
+    def run(self, script):
+        """Return the value of a JavaScript expression."""
+        found = self.ask("Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in found, found["exceptionDetails"]
+        return found["result"].get("value")
+
+    def picture(self, path, *, whole=False):
+        """Write a picture of the window, or of the whole page."""
+        data = self.ask("Page.captureScreenshot", format="png", captureBeyondViewport=whole)["data"]
+        Path(path).write_bytes(base64.b64decode(data))
+
+    def pdf(self):
+        """Return the page as it is printed."""
+        return base64.b64decode(self.ask("Page.printToPDF", printBackground=True)["data"])
