@@ -17,7 +17,7 @@ FLOORS = {
     3: "solve proof bounds simulate observe",
     4: "track",
     5: "study papers scenario files",
-    6: "cli plot scene report plugins demo __main__",
+    6: "cli plot scene report maps plugins demo __main__",
 }
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names.split()}
 TOP = max(FLOORS)

@@ -204,6 +204,8 @@ def simulate(
         "optloc crlb site.toml --at 1200,800,50",
         "optloc crlb site.toml",
         "optloc crlb flight.toml --at 200e3,300e3,0 --plot bound.png",
+        "optloc crlb site.toml --map bound.html --height '1200 m'",
+        "optloc crlb site.toml --map bound.geojson --extent 11,11.5,47.6,48",
     )
 )
 def crlb(
@@ -216,12 +218,32 @@ def crlb(
     plot: Annotated[
         Path | None, typer.Option("--plot", metavar="OUT.png", help="Draw the bound of a run against time.")
     ] = None,
+    map_: Annotated[
+        Path | None,
+        typer.Option(
+            "--map", metavar="OUT", help="Map the bound over places: .png, .svg, .pdf, .geojson, or .html that moves."
+        ),
+    ] = None,
+    height: Annotated[
+        str | None,
+        typer.Option(metavar="H", help="Height of the map, such as 500 or '1640 ft'; that of --at or of the fix."),
+    ] = None,
+    extent: Annotated[
+        str | None,
+        typer.Option(metavar="X0,X1,Y0,Y1", help="Limits of the map: metres, or longitudes and latitudes on Earth."),
+    ] = None,
+    dilution: Annotated[bool, typer.Option("--dilution", help="Map the geometric dilution of precision.")] = False,
     as_json: Json = False,
 ) -> None:
     """Print the Cramer-Rao bound: the accuracy that no unbiased estimate beats.
 
-    Of a run whose epochs share unknowns (a motion, biases) it is also given after its first 1, 2, ... epochs.
+    Of a run whose epochs share unknowns (a motion, biases) it is also given after its first 1, 2, ... epochs. With
+    --map it is drawn over the place of the target instead.
     """
+    if map_ is not None:
+        from optloc.cli.bound_map import run_map
+
+        raise typer.Exit(run_map(file, map_, at, height, extent, velocity, geodetic=geodetic, dilution=dilution))
     from optloc.cli.bounds import run_crlb
 
     raise typer.Exit(run_crlb(file, at, velocity, geodetic=geodetic, as_json=as_json, plot=plot))

@@ -1,10 +1,10 @@
-"""What ``optloc study`` does: run, status, compare; the report has a file of its own."""
+"""What ``optloc study`` does: run, status, report, compare."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -87,6 +87,29 @@ def status(folder: Folder, as_json: Json = False) -> None:
     else:
         _show(found, Console())
     raise typer.Exit(0 if found.complete else 1)
+
+
+@study.command(epilog=example("optloc study report runs/my", "optloc study report runs/my --out paper"))
+def report(
+    folder: Folder,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Where the report goes; report in the study's folder by default.")
+    ] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Make one HTML page of a study, and its tables (CSV, LaTeX) and figures (PNG, SVG) as files.
+
+    A study that is not finished has a report too: of what is there.
+    """
+    from optloc.report import write_report
+
+    console = Console(stderr=True)
+    shown = console.is_terminal and not quiet
+    with console.status("report") if shown else nullcontext() as status:
+        files = write_report(folder, out, (lambda text: status.update(f"report: {text}")) if status else None)
+    if not quiet:
+        line = f"{files[0]} is the report; {len(files) - 1} tables and figures are beside it."
+        Console().print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 @study.command(epilog=example("optloc study compare runs/before runs/after"))

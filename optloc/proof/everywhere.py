@@ -19,6 +19,8 @@ from optloc.types import Array
 UNBOUNDED = 8
 # Boxes after which the search of an enclosure is given up for the atlas, which takes some hundred.
 _SOON = 500
+# Distance, relative to that of the fix, within which two minima are the same.
+_CLOSE = 1e-3
 
 
 @compiled
@@ -57,7 +59,8 @@ def prove_everywhere(
     nowhere, open_end = np.full(x.shape[0], np.nan), reaches_infinity(kinds, K)
     first = min(budget, _SOON) if open_end else budget
     verdict, boxes, bound = prove(kinds, data, K, w, x, others, kappa, eps, first, nowhere, nowhere, False, found)
-    if not open_end or verdict not in (OPEN, BUDGET, STATIONARY) or boxes >= budget:
+    again = verdict in (OPEN, BUDGET, STATIONARY, SINGULAR) or (verdict == OTHER and _listed(x, others, found))
+    if not open_end or not again or boxes >= budget:
         return verdict, boxes, bound
     verdict, more, bound = prove_atlas(kinds, data, K, w, x, others, kappa, eps, budget - boxes, found)
     return verdict, boxes + more, bound
@@ -78,9 +81,7 @@ def prove_atlas(
 ) -> tuple[int, int, float]:
     """Prove the same as `prove_everywhere`, with the atlas alone; `optloc.proof.far.reaches_infinity` must hold."""
     cost, box = cost_of(kinds, data, K, w), empty_box(K.shape[0], K.shape[1])
-    chart, good = chart_at(cost, x, box)
-    if not good:
-        return SINGULAR, 0, -inf
+    chart, _ = chart_at(cost, x, box)
     box.half[:] = 0.0
     box.at[:] = 0.0
     least = value_at(cost, chart, box)
@@ -101,3 +102,16 @@ def prove_atlas(
     if outcome == ANOTHER:
         return OTHER, boxes, bound
     return UNBOUNDED if outcome == INFINITE else BUDGET, boxes, min(bound, least - eps)
+
+
+@compiled
+def _listed(x: Array, others: Array, found: Array) -> bool:
+    """Return whether a minimum that was found is one of the others: around it no box along the axes of x is convex."""
+    for p in range(others.shape[0]):
+        apart = away = 0.0
+        for k in range(x.shape[0]):
+            apart += (found[k] - others[p, k]) ** 2
+            away += (x[k] - others[p, k]) ** 2
+        if apart <= _CLOSE * _CLOSE * away:
+            return True
+    return False

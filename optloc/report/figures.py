@@ -189,7 +189,7 @@ def profile(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
     with np.errstate(invalid="ignore"):
         slower = np.where(solved, spent / spent.min(0), 1.0)
     ratios = np.geomspace(1.0, max(10.0, 1.5 * float(slower.max())), 240)
-    figure, axes = panel("", (7.0, 4.0))
+    figure, axes = panel("", (6.0, 3.8))
     for mark, shares in zip(looks.values(), performance_profile(times, solved, ratios), strict=True):
         _line(axes, mark, ratios, shares, marker=False, steps=True)
     axes.set_xscale("log")
@@ -202,7 +202,7 @@ def profile(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
 
 def timing(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
     """Yield the time of a fix against the number of measurements: median, and from the 10th to the 90th percentile."""
-    figure, axes = panel("", (7.0, 4.0))
+    figure, axes = panel("", (6.0, 3.8))
     sizes = sorted(frame["rows"].unique())
     for mark in looks.values():
         grouped = frame[frame["method"] == mark.name].groupby("rows")["seconds"]

@@ -10,7 +10,7 @@ from optloc.epochs import by_epoch, separable
 from optloc.errors import InvalidProblem
 from optloc.fix import Fix
 from optloc.problem import Problem
-from optloc.solve.catalogue import FORMULATIONS, METHODS, SOLVERS, stages_of
+from optloc.solve.catalogue import FORMULATIONS, METHODS, SOLVERS, WORTH, stages_of
 from optloc.solve.direct import Quick, shortened
 from optloc.solve.parts import in_parts
 from optloc.solve.reasons import without_open_epochs
@@ -18,9 +18,6 @@ from optloc.solve.stages import given
 from optloc.types import Array
 
 __all__ = ["FORMULATIONS", "METHODS", "SOLVERS", "solve"]
-
-# Machine code takes time to load, more than the stages take for fewer problems.
-_WORTH = 16
 
 
 def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
@@ -45,7 +42,7 @@ def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
     InvalidProblem
         For an unknown method, or where nothing is unknown.
     """
-    solvers = shortened([stage.solver for stage in stages_of(method)], _WORTH)
+    solvers = shortened([stage.solver for stage in stages_of(method)], WORTH)
     if problem.layout.size == 0:
         raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
     if separable(problem):

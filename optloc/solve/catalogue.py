@@ -8,10 +8,10 @@ from optloc.errors import InvalidProblem, nearest
 from optloc.fix import Fix
 from optloc.problem import Problem
 from optloc.solve import stages
-from optloc.solve.bearing_bound import bearing_bound
 from optloc.solve.branches import first_that_proves
 from optloc.solve.certify import certified, value_certified
 from optloc.solve.direct import shortened
+from optloc.solve.reference import by_reference
 from optloc.solve.stages import Solver
 
 
@@ -84,7 +84,7 @@ SOLVERS: dict[str, Entry] = {
     ),
     "value": Entry(value_certified, "the same for the cost alone, without other minima: quicker", "refinement"),
     "bound": Entry(
-        bearing_bound, "compares the cost of an angle fix with the bound of a relaxation (Clarabel)", "refinement"
+        by_reference, "compares the cost with the bound of a relaxation (Clarabel): angles, ranges", "refinement"
     ),
     "taylor": Entry(stages.taylor, "plain undamped Taylor iteration; a baseline, it diverges", "refinement"),
 }
@@ -159,6 +159,13 @@ FORMULATIONS: dict[str, Formulation] = {
         "100 % to 20 mrad, 98 % at 50 mrad",
         "2 ms two stations, 10 ms four",
         "epipolar equalities; Shor 1987",
+    ),
+    "moment_sdp": Formulation(
+        "order-2 moments of position and range errors in a box: a lower bound of the likelihood's cost",
+        "range, toa, tdoa, range_sum",
+        "89-100 % to 30 m",
+        "50 ms five stations, 100 ms six",
+        "Lasserre 2001",
     ),
     "minimax_cone": Formulation(
         "least worst angle by bisection over second-order cones; proves that bounds contradict each other",

@@ -130,7 +130,7 @@ def by_reference(problem: Problem, fix: Fix | None) -> Fix:
     if not len(known):
         return fix
     for i in known:
-        if certificate[i].proof != "global":
+        if certificate[i].proof != "global" and (tight[i] or certificate[i].proof != "region"):
             gap = float(fix.cost[i] - found.bound[i])
             reason = "no position costs less" if tight[i] else f"a lower bound leaves a gap of {gap:.2g}"
             certificate[i] = Certificate(

@@ -1,0 +1,221 @@
+"""Proofs for all positions: right about every minimum that is met, and there where enclosures fail."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from optloc.kernels.jit import enabled
+from optloc.proof.atlas import atlas_of, cube
+from optloc.proof.chart import cost_of, empty_box
+from optloc.proof.everywhere import UNBOUNDED, prove_atlas, prove_everywhere
+from optloc.proof.far import reaches_infinity
+from optloc.proof.nodes import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO, WIDTH
+from optloc.proof.search import BETTER, OTHER, UNIQUE, VALUE, prove
+from optloc.proof.surroundings import set_minimum
+
+
+def differences(S, sigma, x, rng):
+    """Return nodes and whitened rows of range differences to the first station with independent arrival errors."""
+    m, d = len(S) - 1, S.shape[1]
+    C = np.concatenate([-np.ones((m, 1)), np.eye(m)], axis=1)
+    root = np.linalg.cholesky(0.5 * sigma**2 * (np.eye(m) + 1.0))
+    z = C @ np.linalg.norm(x - S, axis=1) + root @ rng.normal(size=m)
+    data = np.zeros((m + 1, WIDTH))
+    data[:, :d] = S
+    return np.full(m + 1, RANGE), data, np.linalg.solve(root, C), np.linalg.solve(root, z)
+
+
+def minima_of(S, K, w, starts):
+    """Return the minima that an independent solver reaches, the least first: costs and positions."""
+
+    def residual(p):
+        return K @ np.linalg.norm(p - S, axis=1) - w
+
+    def jacobian(p):
+        line = p - S
+        return K @ (line / np.linalg.norm(line, axis=1)[:, None])
+
+    found = []
+    for start in starts:
+        fit = least_squares(residual, start, jacobian, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15, max_nfev=300)
+        p = fit.x
+        for _ in range(8):  # Newton, to vanishing slope
+            line = p - S
+            r = np.linalg.norm(line, axis=1)
+            u = line / r[:, None]
+            J, e = K @ u, K @ r - w
+            force = (K.T @ e) / r
+            H = J.T @ J + force.sum() * np.eye(len(p)) - np.einsum("i,ij,ik->jk", force, u, u)
+            step = np.linalg.solve(H, J.T @ e)
+            if not np.linalg.norm(step) < 1e3 or np.linalg.eigvalsh(H)[0] <= 0.0:
+                break
+            p = p - step
+        else:
+            e = residual(p)
+            if all(np.linalg.norm(p - q) > 0.1 for _, q in found):
+                found.append((e @ e, p))
+    return sorted(found, key=lambda pair: pair[0])
+
+
+def outside(d, rng):
+    way = rng.normal(size=d)
+    return way / np.linalg.norm(way) * rng.uniform(10e3, 30e3)
+
+
+def proven(prover, kinds, data, K, w, x, others, kappa, budget=4000):
+    """Return the verdict, with other minima added as they are found, and how many boxes it took."""
+    others, boxes = list(others), 0
+    for _ in range(6):
+        found = np.full(len(x), np.nan)
+        rest = np.array(others).reshape(-1, len(x))
+        f = K @ np.linalg.norm(x - data[:, : len(x)], axis=1) - w if (kinds == RANGE).all() else np.zeros(1)
+        verdict, more, _ = prover(kinds, data, K, w, x, rest, kappa, 1e-6 * (1.0 + f @ f), budget, found)
+        boxes += more
+        if verdict != OTHER:
+            break
+        others.append(minima_of(data[:, : len(x)], K, w, [found])[0][1])
+    return verdict, boxes
+
+
+def by_enclosure(kinds, data, K, w, x, others, kappa, eps, budget, found):
+    nowhere = np.full(len(x), np.nan)
+    return prove(kinds, data, K, w, x, others, kappa, eps, budget, nowhere, nowhere, False, found)
+
+
+def test_in_the_plane_verdicts_are_those_of_brute_force():
+    """Four stations nearly in line, so that a mirror image competes: the global minimum is proven, no other is."""
+    rng = np.random.default_rng(5)
+    wrong = right = 0
+    for _ in range(25 if enabled() else 4):
+        S = rng.uniform(-5e3, 5e3, (4, 2)) * [1.0, 0.1]
+        x = outside(2, rng)
+        kinds, data, K, w = differences(S, 30.0, x, rng)
+        grid = 10 ** rng.uniform(3.0, 5.5, (150, 1)) * np.array([[1.0, 0.0]])
+        turn = rng.uniform(-np.pi, np.pi, 150)
+        starts = grid[:, :1] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        minima = minima_of(S, K, w, [x, x * [1.0, -1.0], *starts])
+        if not minima:
+            continue
+        for cost, x in minima:
+            found = np.full(2, np.nan)
+            args = (kinds, data, K, w, x, np.zeros((0, 2)), 0.0, 1e-6 * (1.0 + cost), 4000)
+            verdict = prove_atlas(*args, found)[0]
+            if verdict == BETTER:
+                assert ((K @ np.linalg.norm(found - S, axis=1) - w) ** 2).sum() < cost
+                wrong += 1
+            elif verdict == VALUE:
+                assert cost < minima[0][0] + 1e-5
+                right += 1
+            else:
+                assert verdict == UNBOUNDED
+    assert not enabled() or (wrong > 10 and right > 15)
+
+
+def flat_cell(count, seed):
+    """Return problems with five stations in a flat box, emitters 10-30 km out, 30 m noise, and their minima."""
+    rng, out = np.random.default_rng(seed), []
+    for _ in range(count):
+        S = rng.uniform(-0.5, 0.5, (5, 3)) * [10e3, 10e3, 300.0]
+        x = outside(3, rng)
+        problem = differences(S, 30.0, x, rng)
+        starts = [x, x * [1.0, 1.0, -1.0], *rng.normal(size=(6, 3)) * 20e3]
+        minima = minima_of(S, *problem[2:], starts)
+        if minima:
+            out.append((problem, minima))
+    return out
+
+
+def shares(cell, kappa):
+    """Return the shares of fixes that are proven with an enclosure, and everywhere."""
+    counts = np.zeros(2)
+    for problem, minima in cell:
+        best, x = minima[0]
+        others = [p for cost, p in minima[1:] if cost < best + kappa] if kappa else []
+        for k, prover in enumerate((by_enclosure, prove_everywhere)):
+            verdict, _ = proven(prover, *problem, x, others, kappa)
+            # A better point is the failure of the solver here, not of the proof.
+            counts[k] += verdict in (UNIQUE, VALUE, BETTER)
+    return counts / len(cell)
+
+
+@pytest.mark.parametrize(("kappa", "least"), [(0.0, 0.95), (9.0, 0.75)])
+def test_flat_networks_are_proven_where_enclosures_fail(kappa, least):
+    enclosure, everywhere = shares(flat_cell(25 if enabled() else 3, 6), kappa)
+    assert everywhere >= enclosure
+    if enabled():
+        assert everywhere >= least
+        assert kappa == 0.0 or everywhere > enclosure + 0.2
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(("kappa", "least"), [(0.0, 0.97), (9.0, 0.8)])
+def test_flat_networks_in_full(kappa, least):
+    enclosure, everywhere = shares(flat_cell(300, 7), kappa)
+    assert everywhere >= max(enclosure, least)
+
+
+def test_a_cost_that_falls_to_infinity_is_no_proof():
+    """Wave fronts that bend away from their source: the cost falls towards infinity, whatever point is offered."""
+    S = np.array([[-1e3, 0.0], [0.0, 200.0], [1e3, 0.0], [0.0, -200.0]])
+    rng = np.random.default_rng(8)
+    kinds, data, K, w = differences(S, 1.0, np.array([0.0, 1e9]), rng)
+    w = w + 0.5 * K @ np.array([-200.0, 0.0, -200.0, 0.0]) / 100.0
+    x = least_squares(lambda p: K @ np.linalg.norm(p - S, axis=1) - w, [0.0, 1e5]).x
+    verdict = prove_atlas(kinds, data, K, w, x, np.zeros((0, 2)), 9.0, 1e-6, 4000, np.zeros(2))[0]
+    assert verdict not in (UNIQUE, VALUE)
+
+
+def test_costs_that_grow_without_end_are_not_for_the_atlas():
+    kinds, data, K, _ = differences(np.eye(3), 1.0, np.ones(3), np.random.default_rng(9))
+    assert reaches_infinity(kinds, K)
+    assert not reaches_infinity(kinds, np.eye(3))
+    for kind in (LINEAR, HEIGHT):
+        assert not reaches_infinity(np.array([RANGE, RANGE, kind]), K)
+    assert reaches_infinity(np.array([AZIMUTH, ELEVATION, RATIO]), np.eye(3))
+    verdict = prove_everywhere(
+        np.append(kinds, LINEAR),
+        np.concatenate([data, np.zeros((1, WIDTH))]),
+        np.pad(K, ((0, 0), (0, 1))),
+        np.zeros(2),
+        np.array([3.0, 4.0, 5.0]),
+        np.zeros((0, 3)),
+        0.0,
+        1e-6,
+        10,
+        np.zeros(3),
+    )[0]
+    assert verdict not in (UNIQUE, VALUE)
+
+
+def test_the_box_around_a_minimum_is_convex_in_every_sample():
+    """Hessians in the coordinates of the atlas, by central differences of the cost itself."""
+    rng = np.random.default_rng(10)
+    for problem, minima in flat_cell(8 if enabled() else 2, 11):
+        _, data, K, w = problem
+        middle, radius = cube(*problem[:2])
+        atlas, cost, box = atlas_of(middle, radius, 3, 1), cost_of(*problem), empty_box(*K.shape)
+        assert set_minimum(cost, box, atlas, 0, minima[0][1], 1e-6)
+        for s in rng.uniform(-1.0, 1.0, (50, 3)) * atlas.minima.sides[0]:
+            assert np.linalg.eigvalsh(hessian_at(atlas, data, K, w, s))[0] > -1e-3
+
+
+def positions(atlas, u):
+    """Return the positions of coordinates u (n, 3) of the home of the minimum, by the definition."""
+    home = int(atlas.minima.home[0])
+    if home == 6:
+        return atlas.middle + atlas.radius * u
+    p = np.insert(u[:, :2], home // 2, 1.0 if home % 2 else -1.0, axis=1)
+    return atlas.middle + atlas.radius * p / u[:, 2:]
+
+
+def hessian_at(atlas, data, K, w, s):
+    step, signs = 1e-3 * np.eye(3), np.array([1.0, -1.0, -1.0, 1.0])
+    out = np.zeros((3, 3))
+    for k in range(3):
+        for m in range(3):
+            corners = s + np.array([step[k] + step[m], step[k] - step[m], step[m] - step[k], -step[k] - step[m]])
+            u = atlas.minima.start[0] + corners @ atlas.minima.axes[0].T
+            x = positions(atlas, u)
+            f = ((np.linalg.norm(x[:, None] - data[:, :3], axis=-1) @ K.T - w) ** 2).sum(-1)
+            out[k, m] = f @ signs / 4e-6
+    return out
