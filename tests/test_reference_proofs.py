@@ -8,7 +8,7 @@ import pytest
 from cases import STATIONS, TARGET, stations
 
 import optloc
-from optloc import Bias, Motion, Prior, Status, assemble, measured, simulate
+from optloc import Bias, Motion, Prior, assemble, measured, simulate
 from optloc.solve.reference import METHODS, by_reference, reference_bound
 
 S = STATIONS[3][:5]

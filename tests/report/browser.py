@@ -66,24 +66,25 @@ class Browser:
         os.write(self._to, json.dumps(message).encode() + b"\0")
         number, end = self._number, time.monotonic() + PATIENCE
         while time.monotonic() < end:
-            for answer in self._received():
-                if answer.get("id") == number:
-                    assert "error" not in answer, f"{method}: {answer['error']}"
-                    return answer["result"]
+            answer = next((a for a in self._received() if a.get("id") == number), None)
+            if answer is not None:
+                assert "error" not in answer, f"{method}: {answer['error']}"
+                return answer["result"]
         raise TimeoutError(method)
 
     def _received(self):
+        """Return the messages that have come; all of them are noted, whichever is waited for."""
         try:
             more = os.read(self._from, 1 << 20)
         except BlockingIOError:
             time.sleep(0.005)
-            return
+            return []
         assert more, "the browser ended"
         *whole, self._rest = (self._rest + more).split(b"\0")
-        for text in whole:
-            message = json.loads(text)
+        messages = [json.loads(text) for text in whole]
+        for message in messages:
             self._note(message.get("method"), message.get("params", {}))
-            yield message
+        return messages
 
     def _note(self, method, what):
         if method is not None:
