@@ -219,26 +219,21 @@ def crlb(
         Path | None, typer.Option("--plot", metavar="OUT.png", help="Draw the bound of a run against time.")
     ] = None,
     map_: Annotated[
-        Path | None,
-        typer.Option(
-            "--map", metavar="OUT", help="Map the bound over places: .png, .svg, .pdf, .geojson, or .html that moves."
-        ),
+        Path | None, typer.Option("--map", metavar="OUT", help="Map it: .png, .svg, .pdf, .geojson, or .html.")
     ] = None,
     height: Annotated[
-        str | None,
-        typer.Option(metavar="H", help="Height of the map, such as 500 or '1640 ft'; that of --at or of the fix."),
+        str | None, typer.Option(metavar="H", help="Height of the map, such as '1640 ft'; that of --at or of the fix.")
     ] = None,
     extent: Annotated[
-        str | None,
-        typer.Option(metavar="X0,X1,Y0,Y1", help="Limits of the map: metres, or longitudes and latitudes on Earth."),
+        str | None, typer.Option(metavar="X0,X1,Y0,Y1", help="Limits of the map: metres, or degrees on Earth.")
     ] = None,
     dilution: Annotated[bool, typer.Option("--dilution", help="Map the geometric dilution of precision.")] = False,
     as_json: Json = False,
 ) -> None:
     """Print the Cramer-Rao bound: the accuracy that no unbiased estimate beats.
 
-    Of a run whose epochs share unknowns (a motion, biases) it is also given after its first 1, 2, ... epochs. With
-    --map it is drawn over the place of the target instead.
+    Of a run whose epochs share unknowns (a motion, biases) it is also given after its first 1, 2, ... epochs.
+    With --map it is drawn over the place of the target instead.
     """
     if map_ is not None:
         from optloc.cli.bound_map import run_map

@@ -1,7 +1,8 @@
 """Coastlines for maps without a network.
 
-The land polygons of Natural Earth at 1:50 million (https://www.naturalearthdata.com, public domain, version 4.1, by way of
-the package world-atlas 2.0.2), to a hundredth of a degree: differences of the corners of all rings, and the rings' lengths.
+The land polygons of Natural Earth at 1:50 million (https://www.naturalearthdata.com, version 4.1, public domain), by way
+of the package world-atlas 2.0.2, to a hundredth of a degree: differences of the corners of all rings, and the rings'
+lengths.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def land(window: Window) -> list[Array]:
             continue
         for turn in (-360.0, 0.0, 360.0):
             if low[0] + turn < east and high[0] + turn > west:
-                cut = _clipped(ring + [turn, 0.0], window)
+                cut = _clipped(ring + np.array([turn, 0.0]), window)
                 if len(cut) > 2:
                     found.append(cut)
     return found

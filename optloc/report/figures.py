@@ -40,7 +40,7 @@ def panel(title: str, size: tuple[float, float] = _SIZE) -> tuple[Figure, Axes]:
 
 def success(table: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
     """Yield the shares of right answers of all methods, a picture for each case; one colour a noise level."""
-    for number, (case, part) in enumerate(table.groupby("case", sort=False)):
+    for number, (case, part) in enumerate(table.groupby("case", observed=True)):
         levels = list(dict.fromkeys(part["noise_label"]))
         names = [name for name in looks if name in set(part["method"])]
         step = min(0.24, 0.8 / len(levels))
@@ -70,7 +70,7 @@ _PLAIN: dict[str, Any] = {"frameon": False, "fontsize": 8}
 
 def accuracy(table: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
     """Yield the root mean square errors over the bound against noise, a picture for each case."""
-    for number, (case, part) in enumerate(table.groupby("case", sort=False)):
+    for number, (case, part) in enumerate(table.groupby("case", observed=True)):
         figure, axes = panel(str(case))
         place, labels, name = _noise_axis(part)
         for mark in looks.values():
@@ -141,11 +141,11 @@ def _line(axes: Axes, mark: Mark, x: Array, y: Array, *, marker: bool, steps: bo
 def distributions(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
     """Yield the distributions of errors in units of the bound; noise levels apart unless there are many panels."""
     apart = len(frame[["case", "noise_label"]].drop_duplicates()) <= _MOST
-    names = ["case", "noise_label"] if apart else ["case"]
+    names = ["case", "noise", "noise_label"] if apart else ["case"]
     from scipy.special import gammainc
 
-    for number, (key, part) in enumerate(frame.groupby(names, sort=False, observed=True)):
-        text = f"{key[0]}, {noise_text(key[1])}" if apart else f"{key[0]}, all noise levels"
+    for number, (key, part) in enumerate(frame.groupby(names, observed=True)):
+        text = f"{key[0]}, {noise_text(str(key[-1]))}" if apart else f"{key[0]}, all noise levels"
         figure, axes = panel(text)
         for mark in looks.values():
             some = part[part["method"] == mark.name]
@@ -165,7 +165,7 @@ def distributions(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
 
 def gaps(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
     """Yield the distributions of the cost above the lowest that is known, a picture for each case."""
-    for number, (case, part) in enumerate(frame.groupby("case", sort=False)):
+    for number, (case, part) in enumerate(frame.groupby("case", observed=True)):
         figure, axes = panel(str(case))
         for mark in looks.values():
             some = part[part["method"] == mark.name]
@@ -182,7 +182,8 @@ def gaps(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
 
 def profile(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
     """Yield the performance profile over all instances that every method has seen."""
-    times, solved, _ = instances(frame, list(looks))
+    names = [name for name in looks if name in set(frame["method"])]
+    times, solved, _ = instances(frame, names)
     if not times.size or not solved.any():
         return
     spent = np.where(solved, times, np.inf)
@@ -190,8 +191,8 @@ def profile(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
         slower = np.where(solved, spent / spent.min(0), 1.0)
     ratios = np.geomspace(1.0, max(10.0, 1.5 * float(slower.max())), 240)
     figure, axes = panel("", (6.0, 3.8))
-    for mark, shares in zip(looks.values(), performance_profile(times, solved, ratios), strict=True):
-        _line(axes, mark, ratios, shares, marker=False, steps=True)
+    for name, shares in zip(names, performance_profile(times, solved, ratios), strict=True):
+        _line(axes, looks[name], ratios, shares, marker=False, steps=True)
     axes.set_xscale("log")
     axes.set_xlim(ratios[0], ratios[-1])
     axes.set_ylim(-0.02, 1.02)
@@ -201,22 +202,27 @@ def profile(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
 
 
 def timing(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
-    """Yield the time of a fix against the number of measurements: median, and from the 10th to the 90th percentile."""
-    figure, axes = panel("", (6.0, 3.8))
-    sizes = sorted(frame["rows"].unique())
-    for mark in looks.values():
-        grouped = frame[frame["method"] == mark.name].groupby("rows")["seconds"]
-        low, middle, high = (grouped.quantile(share) for share in (0.1, 0.5, 0.9))
-        # A little apart, so that bars do not hide one another.
-        x = middle.index.to_numpy(dtype=float) * 1.012 ** (mark.number - len(looks) / 2)
-        _line(axes, mark, x, middle.to_numpy(), marker=True)
-        axes.vlines(x, low.to_numpy(), high.to_numpy(), color=mark.colour, linewidth=0.8)
-    axes.set_xscale("log")
-    axes.set_yscale("log")
-    axes.minorticks_off()
-    axes.set_xticks(sizes, [str(size) for size in sizes])
-    if len(sizes) == 1:
-        axes.set_xlim(sizes[0] / 1.4, sizes[0] * 1.4)
-    axes.set_xlabel("measurements of a trial")
-    axes.set_ylabel("time of a fix (s)")
-    yield Picture("time", "Time of a fix against its size", figure)
+    """Yield the times of a fix against the number of measurements, a picture for each mixture of kinds.
+
+    Drawn are the median, and bars from the 10th to the 90th percentile.
+    """
+    for number, (kinds, part) in enumerate(frame.groupby("kinds", observed=True)):
+        figure, axes = panel(str(kinds).replace("+", " + "))
+        sizes = sorted(part["rows"].unique())
+        step = 1.006 if len(sizes) == 1 else 1.012
+        for mark in looks.values():
+            grouped = part[part["method"] == mark.name].groupby("rows")["seconds"]
+            low, middle, high = (grouped.quantile(share) for share in (0.1, 0.5, 0.9))
+            # A little apart, so that bars do not hide one another.
+            x = middle.index.to_numpy(dtype=float) * step ** (mark.number - (len(looks) - 1) / 2)
+            _line(axes, mark, x, middle.to_numpy(), marker=True)
+            axes.vlines(x, low.to_numpy(), high.to_numpy(), color=mark.colour, linewidth=0.8)
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.minorticks_off()
+        axes.set_xticks(sizes, [str(size) for size in sizes])
+        if len(sizes) == 1:
+            axes.set_xlim(sizes[0] / 1.1, sizes[0] * 1.1)
+        axes.set_xlabel("measurements of a trial")
+        axes.set_ylabel("time of a fix (s)")
+        yield Picture(f"time-{number + 1}", f"Time of a fix against its size: {kinds}", figure)

@@ -16,7 +16,7 @@ from optloc.report.coast import Window, land
 from optloc.types import Array
 
 _SIZE = 1000.0
-_AROUND = 3.0
+_AROUND = np.array([6.0, 4.0])
 _DOTS = 400
 
 
@@ -36,7 +36,7 @@ class _Plane:
 
     def window(self) -> Window:
         """Return what is drawn of the coast: the map and its surroundings."""
-        half = np.maximum(self.half, self.half.max() * 0.8) * (1.0 + _AROUND) / [self.squeeze * self.unit, self.unit]
+        half = np.maximum(self.half, self.half.max() * 0.8) * _AROUND / [self.squeeze * self.unit, self.unit]
         (west, south), (east, north) = self.middle - half, self.middle + half
         return max(west, self.middle[0] - 180.0), min(east, self.middle[0] + 180.0), max(south, -90.0), min(north, 90.0)
 
@@ -80,7 +80,12 @@ def map_element(found: BoundMap, name: str, title: str, trials: tuple[Array, Arr
 
 def _help(found: BoundMap) -> str:
     steps = levels(found.sigma)
-    return f"Bound from {steps[0]:g} m (light) to {steps[-1]:g} m (dark) at {found.height:g} m of height. Point at a place."
+    low, high = _metres(steps[0]), _metres(steps[-1])
+    return f"Bound from {low} (light) to {high} (dark), {found.height:.0f} m above the ellipsoid. Point at a place."
+
+
+def _metres(level: float) -> str:
+    return f"{level:g} m" if level < 1e3 else f"{level / 1e3:g} km"
 
 
 def _path(lines: list[Array], *, close: bool) -> str:
@@ -119,7 +124,7 @@ def _lines(found: BoundMap, plane: _Plane) -> str:
         parts.append(f'<path class="line" d="{_path(drawn, close=False)}"/>')
         longest = max(drawn, key=len)
         x, y = longest[len(longest) // 2]
-        parts.append(f'<text class="level" x="{x:.1f}" y="{y:.1f}">{level:g} m</text>')
+        parts.append(f'<text class="level" x="{x:.1f}" y="{y:.1f}">{_metres(level)}</text>')
     return "".join(parts)
 
 

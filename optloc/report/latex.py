@@ -37,7 +37,7 @@ def escaped(text: str) -> str:
 
 
 def latex(table: Table, words: int = 1) -> str:
-    """Return a table for ``\\usepackage{booktabs, longtable}``; it breaks across pages.
+    """Return a table that breaks across pages; it needs the packages booktabs and longtable.
 
     Parameters
     ----------

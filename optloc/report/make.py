@@ -18,7 +18,7 @@ from optloc.report import page as html
 from optloc.report.geo import map_element
 from optloc.report.latex import latex
 from optloc.report.marks import Mark, marks
-from optloc.report.places import Place, scenario_maps
+from optloc.report.places import Place, plan_again, references, scenario_maps
 from optloc.report.sheets import Sheet, sheets
 from optloc.report.svg import svg_text
 from optloc.study import summary
@@ -36,7 +36,7 @@ _DPI = 200
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """What a report is made of."""
+    """What a report is made of; rivals are the rows of methods that do not begin at the truth."""
 
     manifest: Manifest
     frame: pd.DataFrame
@@ -44,6 +44,7 @@ class _Found:
     looks: dict[str, Mark]
     sheets: dict[str, Sheet]
     places: list[Place]
+    rivals: pd.DataFrame
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,8 +121,13 @@ def _found(folder: Path) -> _Found:
         raise InvalidProblem("nothing of the study is finished yet", str(folder), advice)
     frame = summary.judged(rows)
     order, cells = summary.methods(frame), summary.cells(frame)
-    tables = {sheet.shown.name: sheet for sheet in sheets(frame, cells, order)}
-    return _Found(manifest, frame, cells, marks(order), tables, list(scenario_maps(manifest, frame)))
+    plan = plan_again(manifest)
+    known = references(plan)
+    rivals = frame[~frame["method"].isin(known)]
+    rivals = rivals if len(rivals) else frame
+    tables = {sheet.shown.name: sheet for sheet in sheets(frame, rivals, cells, order)}
+    places = [] if plan is None else list(scenario_maps(plan, frame))
+    return _Found(manifest, frame, cells, marks(order), tables, places, rivals)
 
 
 def _opening(found: _Found) -> str:
@@ -178,7 +184,12 @@ def _maps(place: Path, found: _Found) -> tuple[str, list[Path], bool]:
         "target. On maps that move, blue dots are true positions, orange ones those where some method was wrong though "
         "ok."
     )
-    parts, files, moving, section = [html.paragraph(text)], [], False, _Section("maps", "", "", lambda _: [], lines=False)
+    parts, files, moving, section = (
+        [html.paragraph(text)],
+        [],
+        False,
+        _Section("maps", "", "", lambda _: [], lines=False),
+    )
     for i, one in enumerate(found.places):
         picture = Picture(f"map-{i + 1}", f"Bound: {one.title}", plot_bound_map(one.found, one.title))
         if one.found.geodetic:
@@ -204,6 +215,10 @@ def _of_rows(make: Callable[..., object], found: _Found) -> list[Picture]:
     return list(make(found.frame, found.looks))  # type: ignore[call-overload,no-any-return]
 
 
+def _profile(found: _Found) -> list[Picture]:
+    return list(drawn.profile(found.rivals, found.looks))
+
+
 _SECTIONS = (
     _Section(
         "success",
@@ -216,8 +231,8 @@ _SECTIONS = (
     _Section(
         "accuracy",
         "Error over the bound, against noise",
-        "Root mean square error of the answers over that of the Cramer-Rao bound at the truth; bars are 95 % intervals. "
-        "One gross error is enough to lift a point far, so look at the distributions too.",
+        "Root mean square error of the answers over that of the Cramer-Rao bound at the truth; bars are 95 % "
+        "intervals. One gross error is enough to lift a point far, so look at the distributions too.",
         partial(_of_cells, drawn.accuracy),
         tables=("accuracy",),
     ),
@@ -231,16 +246,18 @@ _SECTIONS = (
     _Section(
         "gaps",
         "How near to the best cost",
-        "Share of trials whose cost exceeds the lowest that is known, of any method or of the truth, by at most so much. "
-        "Answers that are not refined count too: this is how tight a relaxation is. Less than a millionth is drawn there.",
+        "Share of trials whose cost exceeds the lowest that is known, of any method or of the truth, by at most so "
+        "much. Positions that are not refined count too: this is how tight a relaxation is. Less than a millionth is "
+        "drawn at a millionth.",
         partial(_of_rows, drawn.gaps),
         tables=("certificates",),
     ),
     _Section(
         "profile",
         "Performance profile",
-        "Share of instances that a method answers right within a multiple of the time of the fastest right one.",
-        partial(_of_rows, drawn.profile),
+        "Share of instances that a method answers right within a multiple of the time of the fastest right one. "
+        "Methods that begin at the truth do not take part.",
+        _profile,
         wide=True,
     ),
     _Section(
@@ -248,7 +265,6 @@ _SECTIONS = (
         "Time against size",
         "Median time of a fix; bars reach from the 10th to the 90th percentile. Points of one size stand side by side.",
         partial(_of_rows, drawn.timing),
-        wide=True,
         tables=("timing",),
     ),
 )

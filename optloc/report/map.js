@@ -12,6 +12,7 @@ for (const map of document.querySelectorAll(".map")) {
   const show = () => {
     svg.setAttribute("viewBox", view.join(" "));
     svg.style.setProperty("--unit", unit());
+    svg.classList.toggle("far", view[2] > 1.7 * whole[2]);
   };
   const place = event => {
     const box = svg.getBoundingClientRect(), u = unit();
@@ -19,7 +20,7 @@ for (const map of document.querySelectorAll(".map")) {
       view[1] + view[3] / 2 + (event.clientY - box.top - box.height / 2) * u];
   };
   const zoom = (by, [x, y] = [view[0] + view[2] / 2, view[1] + view[3] / 2]) => {
-    const size = Math.min(Math.max(view[2] / by, whole[2] / 200), whole[2] * 4), f = size / view[2];
+    const size = Math.min(Math.max(view[2] / by, whole[2] / 200), whole[2] * 2.5), f = size / view[2];
     view = [x + (view[0] - x) * f, y + (view[1] - y) * f, size, view[3] * f];
     show();
   };
@@ -30,7 +31,7 @@ for (const map of document.querySelectorAll(".map")) {
     const value = i >= 0 && i < nx && j >= 0 && j < ny ? data.values[j * nx + i] : null;
     const turned = ((lon + 540) % 360) - 180;
     const at = `${Math.abs(lat).toFixed(4)}° ${lat < 0 ? "S" : "N"}, ${Math.abs(turned).toFixed(4)}° ${turned < 0 ? "W" : "E"}`;
-    out.textContent = value === null ? `${at}: no bound here` : `${at}: bound ${value} m`;
+    out.textContent = value === null ? `${at}: no bound here` : `${at}: bound ${value < 1000 ? value + " m" : value / 1000 + " km"}`;
   };
   const fingers = new Map();
   const spread = () => {

@@ -82,17 +82,15 @@ def folded(text: str, inner: str) -> str:
 
 def figures(pictures: Iterable[Picture], *, wide: bool = False) -> str:
     """Return figures side by side as the width allows."""
-    parts = [
-        f'<figure id="figure-{p.name}">{inline(p.figure, p.name, p.title)}</figure>'
-        for p in pictures
-    ]
+    parts = [f'<figure id="figure-{p.name}">{inline(p.figure, p.name, p.title)}</figure>' for p in pictures]
     return f'<div class="figures{" wide" if wide else ""}">{"".join(parts)}</div>'
 
 
 def legend(looks: dict[str, Mark]) -> str:
     """Return the looks of all methods as buttons that make their lines stand out."""
     parts = [
-        f'<button type="button" data-method="{mark.line}" aria-pressed="false">{_swatch(mark)}{escape(mark.name)}</button>'
+        f'<button type="button" data-method="{mark.line}" aria-pressed="false">'
+        f"{_swatch(mark)}{escape(mark.name)}</button>"
         for mark in looks.values()
     ]
     return f'<div class="legend" role="toolbar" aria-label="Methods">{"".join(parts)}</div>'
@@ -102,7 +100,8 @@ def _swatch(mark: Mark) -> str:
     dash = "" if isinstance(mark.dash, str) else f' stroke-dasharray="{" ".join(f"{2 * v:g}" for v in mark.dash[1])}"'
     return (
         '<svg width="34" height="12" viewBox="0 0 34 12" aria-hidden="true">'
-        f'<path d="M0 6H34" stroke="{mark.colour}" stroke-width="2.5"{dash}/>{_SHAPES[mark.mark].format(c=mark.colour)}</svg>'
+        f'<path d="M0 6H34" stroke="{mark.colour}" stroke-width="2.5"{dash}/>'
+        f"{_SHAPES[mark.mark].format(c=mark.colour)}</svg>"
     )
 
 

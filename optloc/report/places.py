@@ -14,7 +14,7 @@ from optloc.maps import BoundMap, bound_map, extent, plan_of
 from optloc.study.cases import Case
 from optloc.study.draws import draw
 from optloc.study.parts import Manifest
-from optloc.study.plan import planned
+from optloc.study.plan import Plan, planned
 from optloc.study.summary import case_label, noise_text
 from optloc.types import Array
 
@@ -48,15 +48,27 @@ class Place:
     off: Array
 
 
-def scenario_maps(manifest: Manifest, frame: pd.DataFrame) -> Iterator[Place]:
+def plan_again(manifest: Manifest) -> Plan | None:
+    """Return the plan of a study from its manifest, None where a problem file cannot be read any more."""
+    try:
+        return planned(manifest.text, manifest.name, Path(manifest.folder or "."), seed=manifest.seed)
+    except InvalidProblem:
+        return None
+
+
+def references(plan: Plan | None) -> set[str]:
+    """Return the names of the methods that begin at the truth, with which nobody competes."""
+    if plan is None:
+        return {"truth"}
+    found = {cell.method.name: cell.method for cell in plan.cells}
+    return {name for name, method in found.items() if method.baseline == "truth" or method.start == "truth"}
+
+
+def scenario_maps(plan: Plan, frame: pd.DataFrame) -> Iterator[Place]:
     """Yield the map of every case whose stations are the same in all trials, at its first noise level.
 
-    Cases whose problem file cannot be read any more, or that have no map, are left out.
+    Cases that have no map are left out.
     """
-    try:
-        plan = planned(manifest.text, manifest.name, Path(manifest.folder or "."), seed=manifest.seed)
-    except InvalidProblem:
-        return
     first: dict[str, Case] = {}
     for cell in plan.cells:
         first.setdefault(case_label(cell.case.table.name, cell.case.sweep), cell.case)

@@ -122,7 +122,8 @@ def ranked(frame: pd.DataFrame, order: list[str]) -> Sheet:
         "Right: an answer, and neither another method nor the truth has a lower cost. Wrong though ok: the status is "
         "ok, but a lower cost is known; in brackets the greatest share that this count allows (95 %). Mean time: "
         f"geometric, shifted by {duration(SHIFT)}, over the {int(table['instances'].max())} trials that every method "
-        "has seen; where a method is not right it counts ten times the slowest time of the study."
+        "has seen; where a method is not right it counts ten times the slowest time of the study. "
+        "Methods that begin at the truth are not ranked."
     )
     return _sheet("ranking", "Ranking", note, table, columns, 1)
 
@@ -213,8 +214,8 @@ def certificates(frame: pd.DataFrame, order: list[str]) -> Sheet:
         ("cost less bound, median", lambda r: number(r.cost_less_bound_median)),
     ]
     note = (
-        "Share of trials, in per cent, whose answer was proven best everywhere, in a region, or locally. A global proof "
-        "is false where another method, or the truth, has a lower cost; in brackets the greatest share of false ones "
+        "Share of trials, in per cent, whose answer was proven best everywhere, in a region, or locally. A "
+        "global proof is false where another method, or the truth, has a lower cost; in brackets the greatest share of false ones "
         "that the count allows (95 %)."
     )
     return _sheet("certificates", "Certificates", note, table, columns, 2)
@@ -232,9 +233,9 @@ def made_with(frame: pd.DataFrame) -> Sheet:
     return _sheet("machine", "Machine and versions", "", table, columns, 2)
 
 
-def sheets(frame: pd.DataFrame, cells: pd.DataFrame, order: list[str]) -> Iterator[Sheet]:
-    """Yield all tables of judged rows and their cells, in reading order."""
-    yield ranked(frame, order)
+def sheets(frame: pd.DataFrame, rivals: pd.DataFrame, cells: pd.DataFrame, order: list[str]) -> Iterator[Sheet]:
+    """Yield all tables of judged rows, of those that are ranked, and of their cells, in reading order."""
+    yield ranked(rivals, [name for name in order if name in set(rivals["method"])])
     yield success(cells)
     yield accuracy(cells)
     yield certificates(frame, order)

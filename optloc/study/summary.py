@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -44,6 +45,8 @@ def judged(frame: pd.DataFrame) -> pd.DataFrame:
         point is known), `wrong` (status ok, though a better point is known), `false` (a proof of globality that a
         better point refutes), and `case` (scenario and swept values as text).
     """
+    import pandas as pd
+
     cost, gap, truth = (frame[name].to_numpy(dtype=float) for name in ("cost", "gap", "cost_truth"))
     best = np.fmin(cost - gap, truth)
     above = cost - best
@@ -51,15 +54,22 @@ def judged(frame: pd.DataFrame) -> pd.DataFrame:
     answered = frame["answered"].to_numpy(dtype=bool)
     with np.errstate(invalid="ignore"):
         better = ~(above <= slack)
-    names = {pair: case_label(*pair) for pair in frame.loc[:, list(CASE)].drop_duplicates().itertuples(index=False)}
-    labels = [names[pair] for pair in zip(frame["scenario"], frame["sweep"], strict=True)]
+    pairs = frame[list(CASE)].astype(str)
+    names = {(a, b): case_label(a, b) for a, b in pairs.drop_duplicates().itertuples(index=False, name=None)}
+    labels = [names[pair] for pair in zip(pairs["scenario"], pairs["sweep"], strict=True)]
     return frame.assign(
         above=above,
         right=answered & ~better,
         wrong=better & (frame["status"] == "ok").to_numpy(),
         false=better & (frame["proof"] == PROVEN).to_numpy(),
-        case=labels,
+        case=pd.Categorical(labels, sorted(set(names.values()), key=_natural), ordered=True),
     )
+
+
+def _natural(text: str) -> list[tuple[bool, float, str]]:
+    """Return a key by which texts are sorted as people do: 8 before 25."""
+    parts = re.split(r"(\d+\.?\d*)", text)
+    return [(i % 2 == 0, 0.0 if i % 2 == 0 else float(part), part) for i, part in enumerate(parts)]
 
 
 def case_label(scenario: str, sweep: str) -> str:
@@ -104,6 +114,7 @@ def cells(frame: pd.DataFrame) -> pd.DataFrame:
         for key, part in frame.groupby(names, observed=True, sort=False)
     ]
     table = pd.DataFrame(found)
+    table["case"] = pd.Categorical(table["case"], frame["case"].cat.categories, ordered=True)
     order = {name: i for i, name in enumerate(methods(frame))}
     return table.sort_values(
         ["case", "noise", "noise_label", "method"],

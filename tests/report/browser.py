@@ -100,9 +100,7 @@ class Browser:
 
     def open(self, path, width=1280, height=900, *, phone=False):
         """Open a file and wait until it is loaded."""
-        self.ask(
-            "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone
-        )
+        self.ask("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=phone)
         self.events.clear()
         self.ask("Page.navigate", url=Path(path).resolve().as_uri())
         end = time.monotonic() + PATIENCE
