@@ -16,8 +16,8 @@ from optloc.threads import mapped
 from optloc.types import Array
 
 _STRETCH = 64
-# So few proofs are begun in plain Python, with so many boxes in all: about half a second.
-_FEW, _FIRST_BOXES = 16, 400
+# So few proofs over so few nodes are begun in plain Python, with so many boxes in all: about half a second.
+_FEW, _SMALL, _FIRST_BOXES = 16, 24, 400
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ def prove_all(pose: Posed, asked: Asked) -> Answered:
     A few proofs are begun in plain Python: most need few boxes, and machine code takes longer to load.
     """
     n = len(asked.x)
-    if n > _FEW or ready(_loop):
+    if n > _FEW or len(pose.kinds) > _SMALL or ready(_loop):
         return _proven(pose, asked)
     with plain():
         out = _proven(pose, replace(asked, budget=np.minimum(asked.budget, max(5, _FIRST_BOXES // max(n, 1)))))

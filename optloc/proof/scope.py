@@ -15,8 +15,8 @@ from optloc.types import Band
 ANGLES = ("azimuth", "elevation")
 # Kinds that are nodes of their own; every other kind must be a sum of ranges.
 OWN = (*ANGLES, "groa", "height")
-# Rows, and unknowns beside the position, of a problem whose proof is still worth the time.
-MOST_ROWS, MOST_UNKNOWNS = 128, 128
+# Different ranges, angles and ratios, and unknowns beside the position, of a problem whose proof is worth the time.
+MOST_NODES, MOST_UNKNOWNS = 128, 128
 
 
 def unsupported(problem: Problem) -> str:
@@ -56,10 +56,24 @@ def _of_rows(problem: Problem) -> Iterator[str]:
             yield f"{rows.kind} rows depend on velocities, which the proof does not bound"
         elif rows.kind not in OWN and model.ranges is None:
             yield f"{rows.kind} rows are neither sums of ranges nor a kind whose bounds are known"
-    if problem.count > MOST_ROWS:
-        yield f"there are {problem.count} rows, and the proof takes {MOST_ROWS}"
+    if problem.count > MOST_NODES and _nodes(problem) > MOST_NODES:
+        yield f"there are {_nodes(problem)} different ranges and angles, and the proof takes {MOST_NODES}"
     if problem.layout.size - problem.dimension > MOST_UNKNOWNS:
         yield f"there are {problem.layout.size} unknowns, and the proof takes {MOST_UNKNOWNS}"
+
+
+def _nodes(problem: Problem) -> int:
+    """Return how many different ranges, angles, ratios and heights the rows are made of."""
+    moving, found, own = problem.stations.position.shape[-3] > 1, set(), 0
+    for rows in problem.rows:
+        model = MODELS[rows.kind]
+        if model.ranges is None:
+            own += rows.count
+            continue
+        when = rows.epoch if moving else np.zeros_like(rows.epoch)
+        for index in (rows.a, rows.b)[: model.stations]:
+            found.update(zip(index.tolist(), when.tolist(), strict=True))
+    return own + len(found)
 
 
 def _of_biases(problem: Problem) -> Iterator[str]:

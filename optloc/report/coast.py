@@ -1,8 +1,8 @@
 """Coastlines for maps without a network.
 
-The land polygons of Natural Earth at 1:50 million (https://www.naturalearthdata.com, version 4.1, public domain), by way
-of the package world-atlas 2.0.2, to a hundredth of a degree: differences of the corners of all rings, and the rings'
-lengths.
+The land polygons of Natural Earth at 1:50 million (https://www.naturalearthdata.com, version 4.1, public domain), by
+way of the package world-atlas 2.0.2, to a hundredth of a degree: differences of the corners of all rings, and the
+lengths of the rings.
 """
 
 from __future__ import annotations
@@ -20,7 +20,10 @@ Window = tuple[float, float, float, float]
 
 @cache
 def rings() -> tuple[Array, ...]:
-    """Return the shores of all land, and of seas in it, as closed rings (n, 2) of longitude and latitude in degrees."""
+    """Return the shores of all land, and of seas in it, as closed rings (n, 2) of longitude and latitude in degrees.
+
+    Each is in one piece, so that some go beyond 180 degrees; that of Antarctica goes along the pole.
+    """
     with (files("optloc.report") / "natural-earth-50m.npz").open("rb") as file, np.load(file) as data:
         delta, length = data["delta"].astype(np.int64), data["length"]
     starts = np.cumsum(length)[:-1]

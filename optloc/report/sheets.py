@@ -215,8 +215,8 @@ def certificates(frame: pd.DataFrame, order: list[str]) -> Sheet:
     ]
     note = (
         "Share of trials, in per cent, whose answer was proven best everywhere, in a region, or locally. A "
-        "global proof is false where another method, or the truth, has a lower cost; in brackets the greatest share of false ones "
-        "that the count allows (95 %)."
+        "global proof is false where another method, or the truth, has a lower cost; in brackets the greatest share of "
+        "false ones that the count allows (95 %)."
     )
     return _sheet("certificates", "Certificates", note, table, columns, 2)
 

@@ -1,0 +1,88 @@
+"""What is right, wrong and falsely proven, on a table made by hand; names, order, ranking."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from optloc.study.summary import case_label, cells, instances, judged, methods, noise_text, ranking
+
+COMMON = {
+    "noise": 10.0, "noise_unit": "m", "noise_label": "10 m", "rows": 5, "dimension": 3, "crlb": 2.0, "deviation": 1.0,
+    "nees": 3.0, "dof": 2, "bound": np.nan, "iterations": 4.0, "build": 0.1, "certificate": "none",
+}  # fmt: skip
+
+
+def row(method, trial, cost, **more):
+    made = {"method": method, "trial": trial, "cost": cost, "status": "ok", "proof": "local", "seconds": 1e-3}
+    made |= {"scenario": "s", "sweep": '{"layout.stations": 8}', "data": "d", "cost_truth": 9.0, "error": 2.0}
+    made |= COMMON | more
+    made["answered"] = made["status"] in {"ok", "ambiguous", "searched"}
+    made["located"] = np.isfinite(made["cost"])
+    return made
+
+
+@pytest.fixture
+def frame():
+    rows = [
+        row("a", 0, 3.0, proof="global"),  # best
+        row("b", 0, 3.0, seconds=2e-3),  # as good
+        row("a", 1, 5.0),  # best
+        row("b", 1, 7.0, proof="global", seconds=2e-3),  # wrong, falsely proven
+        row("a", 2, 9.5, proof="global"),  # the truth costs less
+        row("b", 2, 9.5, status="ambiguous", seconds=2e-3),  # not best, but it says so
+        row("a", 3, np.nan, status="singular geometry"),
+        row("b", 3, 4.0, seconds=2e-3),
+    ]
+    made = pd.DataFrame(rows)
+    best = made.groupby(["data", "trial"])["cost"].transform("min")
+    return judged(made.assign(gap=made["cost"] - best))
+
+
+def test_rows_are_judged_by_what_is_known(frame):
+    table = frame.set_index(["method", "trial"])
+    assert table["right"].loc["a"].tolist() == [True, True, False, False]
+    assert table["right"].loc["b"].tolist() == [True, False, False, True]
+    assert table["wrong"].loc["a"].tolist() == [False, False, True, False]
+    assert table["wrong"].loc["b"].tolist() == [False, True, False, False]
+    assert table["false"].loc["a"].tolist() == [False, False, True, False]
+    assert table["false"].loc["b"].tolist() == [False, True, False, False]
+
+
+def test_cells_count_and_average(frame):
+    table = cells(frame).set_index("method")
+    assert table.loc["a", ["trials", "answered", "right", "wrong", "proven", "false"]].tolist() == [4, 3, 2, 1, 2, 1]
+    assert table.loc["b", ["trials", "answered", "right", "wrong", "proven", "false"]].tolist() == [4, 4, 2, 1, 1, 1]
+    assert table.loc["a", ["rmse", "bound", "ratio", "nees"]].tolist() == [2.0, 2.0, 1.0, 1.0]
+
+
+def test_a_method_that_claims_nothing_is_judged_by_its_positions():
+    rows = pd.DataFrame([row("bare", i, 5.0 + i, status="unavailable", error=4.0) for i in range(3)])
+    found = cells(judged(rows.assign(gap=0.0)))
+    assert found["answered"].tolist() == [0]
+    assert found["right"].tolist() == [0]
+    assert found["ratio"].tolist() == [2.0]
+
+
+def test_ranking_punishes_failures_and_takes_common_instances_only(frame):
+    order = methods(frame)
+    assert order == ["a", "b"]  # equally often right, but quicker
+    times, solved, total = instances(frame[~((frame["method"] == "b") & (frame["trial"] == 0))], order)
+    assert times.shape == solved.shape == (2, 3)
+    assert total == 4
+    table = ranking(frame, order, 0.0).set_index("method")
+    limit = 10 * 2e-3
+    assert table.loc["a", "mean"] == pytest.approx((1e-3 * 1e-3 * limit * limit) ** 0.25)
+    assert table.loc["b", "mean"] == pytest.approx((2e-3 * 2e-3 * limit * limit) ** 0.25)
+    assert table.loc[["a", "b"], "fastest"].tolist() == [0.5, 0.25]
+
+
+def test_names_are_for_people_and_sorted_so():
+    assert case_label("in", "{}") == "in"
+    assert case_label("in", '{"truth.distance": ["8 km", "12 km"], "layout.stations": 6}') == (
+        "in, distance 8 km to 12 km, stations 6"
+    )
+    assert noise_text('{"tdoa": "10 m", "groa": "1 dB"}') == "tdoa 10 m, groa 1 dB"
+    assert (noise_text("30 ns"), noise_text("0.5")) == ("30 ns", "noise × 0.5")
+    rows = [row("a", 0, 1.0, sweep=f'{{"layout.stations": {n}}}', data=str(n)) for n in (12, 5, 8)]
+    found = judged(pd.DataFrame(rows).assign(gap=0.0))
+    assert list(found["case"].cat.categories) == ["s, stations 5", "s, stations 8", "s, stations 12"]
