@@ -87,11 +87,13 @@ def prove_atlas(
     least = value_at(cost, chart, box)
     middle, radius = cube(kinds, data)
     atlas = atlas_of(middle, radius, x.shape[0], 1 + (others.shape[0] if kappa > 0.0 else 0))
-    if not set_minimum(cost, box, atlas, 0, x, eps):
-        return STATIONARY, 0, -inf
-    known = 1
-    for p in range(atlas.minima.home.shape[0] - 1):
-        known += set_minimum(cost, box, atlas, known, others[p], eps)
+    known, place = 0, np.empty(x.shape[0])
+    for p in range(atlas.minima.home.shape[0]):
+        place[:] = x if p == 0 else others[p - 1]
+        if set_minimum(cost, box, atlas, known, place, eps):
+            known += 1
+        elif p == 0:
+            return STATIONARY, 0, -inf
     atlas = with_minima(middle, radius, x.shape[0], first_minima(atlas.minima, known))
     level = least + kappa if kappa > 0.0 else least - eps
     outcome, boxes, bound = search_everywhere(cost, atlas, chart, level, least - eps, budget, found)

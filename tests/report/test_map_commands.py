@@ -56,7 +56,7 @@ def test_the_page_opens_without_complaint(tmp_path):
 @pytest.mark.parametrize(
     ("name", "more", "file", "sentence"),
     [
-        ("m.xyz", (), DEMO, "maps of type .xyz are unknown"),
+        ("m.xyz", (), DEMO, "are unknown; use .png, .svg"),
         ("m.png", ("--extent", "1,2"), DEMO, "no extent of a map; write west,east,south,north"),
         ("m.png", ("--extent", "12,11,47,48"), DEMO, "no extent of a map"),
         ("m.png", ("--extent", "11,12,47,95"), DEMO, "no extent of a map"),
