@@ -43,7 +43,8 @@ def run_map(
     x0, x1, y0, y1 = extent(problem, place) if limits is None else _limits(limits, problem)
     grid = np.linspace(x0, x1, _POINTS), np.linspace(y0, y1, _POINTS)
     found = bound_map(problem, truth, *grid, _height(problem, place, height))
-    _write(found, out, f"{loaded.title}: bound of the position error", dilution=dilution)
+    what = "dilution of precision" if dilution else "bound of the position error"
+    _write(found, out, f"{loaded.title}: {what}", dilution=dilution)
     return 0
 
 

@@ -207,6 +207,9 @@ def test_it_prints_with_its_tables_open(browser, made):
     paper = browser.pdf()
     assert paper.startswith(b"%PDF")
     assert len(paper) > 100_000
+    browser.ask("Emulation.setEmulatedMedia", media="print")
+    assert browser.run("document.documentElement.scrollWidth <= innerWidth")
+    browser.ask("Emulation.setEmulatedMedia", media="")
     browser.run("dispatchEvent(new Event('beforeprint'))")
     assert browser.run("[...document.querySelectorAll('details')].every(d => d.open)")
 
