@@ -10,6 +10,7 @@ from optloc.noise import variances, whiten
 from optloc.plan import columns, plans
 from optloc.priors import prior_parts
 from optloc.problem import Problem
+from optloc.proof.alone import with_alone
 from optloc.proof.columns import Columns, columns_of, linear_nodes
 from optloc.proof.eliminate import compressed, roots, whitened, without
 from optloc.proof.scope import ANGLES
@@ -70,7 +71,8 @@ def posed(problem: Problem) -> Posed:
     K, w = compressed(K, w)
     size, level = problem.batch_shape[0], _turned(problem, others, angles, known)
     w, level = np.broadcast_to(w, (size, w.shape[-1])), np.broadcast_to(level, (size,))
-    return Posed(np.array(made.kinds), made.numbers, K, w, level)
+    kinds = np.array(made.kinds)
+    return Posed(kinds, with_alone(kinds, made.numbers, K, w), K, w, level)
 
 
 @dataclass(frozen=True, slots=True)
