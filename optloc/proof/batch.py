@@ -148,18 +148,39 @@ def _loop(
     found: Array,
 ) -> None:
     for i in range(len(x)):
-        numbers, rows = data[i if len(data) > 1 else 0], K[i if len(K) > 1 else 0]
+        codes, numbers, rows, values = _present(kinds, data[i if len(data) > 1 else 0], K[i if len(K) > 1 else 0], w[i])
         minima, low, high = others[i, : known[i]], region[i, 0], region[i, 1]
         everywhere[i] = isnan(low[0])
         if everywhere[i]:
             verdict[i], boxes[i], bound[i] = prove_everywhere(
-                kinds, numbers, rows, w[i], x[i], minima, kappa[i], eps[i], budget[i], found[i]
+                codes, numbers, rows, values, x[i], minima, kappa[i], eps[i], budget[i], found[i]
             )
             if verdict[i] != OPEN:
                 continue
             everywhere[i] = False
             low, high = fallback[i, 0], fallback[i, 1]
         verdict[i], more, bound[i] = prove(
-            kinds, numbers, rows, w[i], x[i], minima, kappa[i], eps[i], budget[i], low, high, False, found[i]
+            codes, numbers, rows, values, x[i], minima, kappa[i], eps[i], budget[i], low, high, False, found[i]
         )
         boxes[i] += more
+
+
+@compiled
+def _present(kinds: Array, data: Array, K: Array, w: Array) -> tuple[Array, Array, Array, Array]:
+    """Return a problem without nodes that no row has: time goes with the square of the nodes."""
+    nodes, rows = np.empty(K.shape[1], dtype=np.int64), np.empty(K.shape[0], dtype=np.int64)
+    J = q = 0
+    for j in range(K.shape[1]):
+        if np.any(K[:, j] != 0.0):
+            nodes[J] = j
+            J += 1
+    for i in range(K.shape[0]):
+        if w[i] != 0.0 or np.any(K[i] != 0.0):
+            rows[q] = i
+            q += 1
+    own, values = np.empty((q, J)), np.empty(q)
+    for i in range(q):
+        values[i] = w[rows[i]]
+        for j in range(J):
+            own[i, j] = K[rows[i], nodes[j]]
+    return kinds[nodes[:J]], data[nodes[:J]], own, values
