@@ -47,23 +47,15 @@ class _Kernel:
 
     @cached_property
     def machine(self) -> Any:
-        """What Python calls."""
-        return self._compiled(cache=True)
-
-    @cached_property
-    def inner(self) -> Any:
-        """What other kernels call: without an entry for Python it takes a third less time to make."""
-        return self._compiled(no_cpython_wrapper=True)
-
-    def _compiled(self, **options: bool) -> Any:
-        shared = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-        return _numba().njit(**shared, **options, inline=self.inline)(self.function)
+        """The compiled form; without an entry for C, which nobody calls, it is made a fifth faster."""
+        options = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+        return _numba().njit(**options, inline=self.inline)(self.function)
 
     def __getattr__(self, name: str) -> Any:
         """Return what numba wants to know of a function that a kernel calls."""
         if name not in ("_numba_type_", "targetoptions", "py_func"):
             raise AttributeError(name)
-        return getattr(self.inner, name)
+        return getattr(self.machine, name)
 
     def __call__(self, *args: Any) -> Any:
         if not enabled():
