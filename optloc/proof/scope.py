@@ -64,7 +64,8 @@ def _of_rows(problem: Problem) -> Iterator[str]:
 
 def _nodes(problem: Problem) -> int:
     """Return how many different ranges, angles, ratios and heights the rows are made of."""
-    moving, found, own = problem.stations.position.shape[-3] > 1, set(), 0
+    moving, own = problem.stations.position.shape[-3] > 1, 0
+    found: set[tuple[int, int]] = set()
     for rows in problem.rows:
         model = MODELS[rows.kind]
         if model.ranges is None:

@@ -16,6 +16,9 @@ from optloc.solve.claims import unknown
 from optloc.solve.verdict import LISTED_GAP
 from optloc.types import Array
 
+# Who asks for a proof gives it more time than a method that goes on without one.
+_EFFORT = 4
+
 
 def certify(
     problem: Problem, fix: Fix, region: tuple[Array, Array] | None = None, *, margin: float = LISTED_GAP
@@ -60,7 +63,7 @@ def certify(
     if not 0.0 <= margin < np.inf:
         raise InvalidProblem(f"the margin is {margin}", "margin", "give 0 or a positive number")
     corners = None if region is None else _corners(problem, region)
-    out = certified(flat, fix.reshape((flat.batch_shape[0],)), corners, margin)
+    out = certified(flat, fix.reshape((flat.batch_shape[0],)), corners, margin, _EFFORT)
     return out.reshape(shape)
 
 
@@ -69,8 +72,13 @@ def value_certified(problem: Problem, fix: Fix | None) -> Fix:
     return certified(problem, fix, margin=0.0)
 
 
-def certified(problem: Problem, fix: Fix | None, region: Array | None = None, margin: float = LISTED_GAP) -> Fix:
-    """Return the certified fixes of a flat batch of problems: the stage "certify"; region (2, d) as of `certify`."""
+def certified(
+    problem: Problem, fix: Fix | None, region: Array | None = None, margin: float = LISTED_GAP, effort: int = 1
+) -> Fix:
+    """Return the certified fixes of a flat batch of problems: the stage "certify"; region (2, d) as of `certify`.
+
+    `effort` multiplies the boxes that a proof may take.
+    """
     if fix is None:
         raise InvalidProblem("certify examines a fix", "method", "put it behind a refinement")
     began = perf_counter()
@@ -82,7 +90,7 @@ def certified(problem: Problem, fix: Fix | None, region: Array | None = None, ma
         return replace(fix, certificate=certificate, stages=(*fix.stages, _stage(why or "nothing to prove", began)))
     from optloc.solve.certifying import Work, settled_by_rounds  # machine code is loaded when it is used
 
-    work = settled_by_rounds(Work.begin(problem, fix, answered, region, margin))
+    work = settled_by_rounds(Work.begin(problem, fix, answered, region, margin, effort))
     return replace(work.fix, stages=(*fix.stages, _stage(work.summary(), began)))
 
 

@@ -30,7 +30,7 @@ from optloc.types import Array
 
 # Gaps to other minima that are tried to prove, one after the other; the last is the value alone.
 _MARGINS = (LISTED_GAP, AMBIGUOUS_GAP, 0.0)
-_ROUNDS = 8
+_ROUNDS = 6
 # Boxes for the proof of a gap and of the value, with up to so many nodes. Plain Python takes a thousand times longer
 # for each: a budget of all.
 _BUDGETS, _NODES, _SLOW_BUDGET = (1000, 4000), 12, 2000
@@ -70,6 +70,8 @@ class Work:
         What is not settled.
     before : Fix
         The fixes at first.
+    effort : int
+        By how much budgets and rounds are multiplied.
     replaced, listed : int
         How many fixes were replaced, and how often another minimum was added to the alternatives.
     """
@@ -84,11 +86,14 @@ class Work:
     level: Array
     pending: Array
     before: Fix
+    effort: int
     replaced: int = 0
     listed: int = 0
 
     @classmethod
-    def begin(cls, problem: Problem, fix: Fix, answered: Array, region: Array | None, margin: float) -> Work:
+    def begin(
+        cls, problem: Problem, fix: Fix, answered: Array, region: Array | None, margin: float, effort: int
+    ) -> Work:
         """Return the work before the first round."""
         size, d = len(fix.x), problem.dimension
         corners = np.full((2, d), np.nan) if region is None else region
@@ -103,6 +108,7 @@ class Work:
             np.zeros(size, dtype=np.int64),
             np.array(answered),
             fix,
+            effort,
         )
 
     def summary(self) -> str:
@@ -116,7 +122,7 @@ class Work:
 
 def settled_by_rounds(work: Work) -> Work:
     """Return the work with a certificate for every fix that was to be proven."""
-    for _ in range(_ROUNDS):
+    for _ in range(_ROUNDS * work.effort):
         items = np.flatnonzero(work.pending)
         if not len(items):
             break
@@ -166,15 +172,15 @@ def _asked(work: Work, items: Array, extra: Array) -> Asked:
         _EQUAL * (1.0 + fix.cost[items] + extra),
         work.region[items],
         work.fallback[items],
-        _budgets(kappa, len(work.pose.kinds)),
+        _budgets(kappa, len(work.pose.kinds), work.effort),
     )
 
 
-def _budgets(kappa: Array, nodes: int) -> Array:
+def _budgets(kappa: Array, nodes: int, effort: int) -> Array:
     """Return the boxes (n,) that proofs may take: a box takes time with the square of the nodes."""
     if not enabled():
         return np.full(len(kappa), max(5, _SLOW_BUDGET // len(kappa)))
-    share = max(1.0, (nodes / _NODES) ** 2)
+    share = max(1.0, (nodes / _NODES) ** 2) / effort
     return np.asarray(np.where(kappa > 0.0, *_BUDGETS) / share).astype(np.int64)
 
 

@@ -69,7 +69,7 @@ def test_the_value_alone_is_a_smaller_claim():
 def twofold():
     """Return problems with a second minimum at a cost that matters, and their fixes."""
     problem = drawn("TDOA, 5 stations, inside, 30 m", 150)
-    fix = solve(problem)
+    fix = certify(problem, solve(problem))
     gap = fix.alternatives.gap[:, 0]
     items = np.flatnonzero((gap > 1e-2) & (gap < 20.0) & [c.margin == 25.0 for c in fix.certificate])
     assert len(items) >= 5

@@ -83,7 +83,7 @@ def test_run_status_and_compare(tmp_path):
     state = RUN.invoke(app, ["study", "status", out, "--json"])
     assert state.exit_code == 0
     assert '"rows": 180' in state.stdout
-    both = RUN.invoke(app, ["study", "compare", out, out])
+    both = RUN.invoke(app, ["study", "compare", out, out], env={"COLUMNS": "200"})
     assert both.exit_code == 0
     assert "identical" in both.stdout
     next((tmp_path / "out" / "parts").glob("*.parquet")).unlink()
