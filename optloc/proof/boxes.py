@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from math import sqrt
 
-from optloc.kernels.jit import compiled
+from optloc.kernels.jit import compiled, inlined
 from optloc.proof.angles import bound_azimuth, bound_elevation
 from optloc.proof.height import bound_height
-from optloc.proof.inline import inlined
 from optloc.proof.nodes import AZIMUTH, ELEVATION, LINEAR, RANGE, RATIO
 from optloc.proof.ranges import bound_ranges
 from optloc.proof.ratio import bound_ratio

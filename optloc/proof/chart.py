@@ -7,10 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optloc.kernels.jit import compiled
+from optloc.kernels.jit import compiled, inlined
 from optloc.proof.boxes import NODE_WIDTH, ROW_WIDTH, bound_nodes, cost_at, linearise_rows
 from optloc.proof.convex import CURVE_WIDTH, SUMS, convex, curve_nodes, sum_up
-from optloc.proof.inline import inlined
 from optloc.proof.linear3 import principal
 from optloc.proof.nodes import LINEAR, RANGE
 from optloc.types import Array

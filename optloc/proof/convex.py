@@ -6,11 +6,10 @@ from math import inf, sqrt
 
 import numpy as np
 
-from optloc.kernels.jit import compiled
+from optloc.kernels.jit import compiled, inlined
 from optloc.proof.angles import curve_azimuth, curve_elevation
 from optloc.proof.clip import clip, is_empty
 from optloc.proof.height import curve_height
-from optloc.proof.inline import inlined
 from optloc.proof.linear3 import inverse, positive
 from optloc.proof.nodes import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO
 from optloc.proof.ranges import curve_ranges
