@@ -84,28 +84,40 @@ def refine_block(packed: Packed, item: Array, first: int, last: int, rules: Rule
     size = out.x.shape[1]
     lanes, room = blocks(packed, size, last - first), furnished(t, c, size)
     m, r = memory(t, room, lanes)
-    tag = np.zeros((4, lanes), np.int64)
-    used, following = 0, first
-    while used < lanes:
-        tag[START, used], tag[FRESH, used] = following, EMPTY
-        used, following = used + 1, following + 1
+    tag, used, following = np.zeros((4, lanes), np.int64), lanes, first + lanes
+    for b in range(lanes):
+        tag[START, b], tag[FRESH, b] = first + b, EMPTY
     while used > 0:
         begin(c, m, room, tag, used, item, out.x)
         gather(t, c, m, r, room, True, used)
         _judge(m, room, size, tag, rules, used)
-        b = 0
-        while b < used:
-            if tag[STATUS, b] == LIMIT and tag[STEPS, b] < rules.limit:
-                b += 1
-                continue
-            _finish(m, room, tag, b, out)
-            if following < last:
-                tag[START, b], tag[FRESH, b] = following, EMPTY
-                following, b = following + 1, b + 1
-            else:
-                used -= 1
-                move(m, room.cells, tag, b, used)
+        for b in range(used):
+            if ended(tag, b, rules.limit):
+                _finish(m, room, tag, b, out)
+        used, following = refilled(m, room.cells, tag, used, following, last, rules.limit)
         _advance(m, room, t.shared, t.local, tag, rules.damped, used)
+
+
+@compiled
+def ended(tag: Array, lane: int, limit: int) -> bool:
+    """Return whether the start in a lane needs no further step."""
+    return bool(tag[STATUS, lane] != LIMIT or tag[STEPS, lane] >= limit)
+
+
+@compiled
+def refilled(m: Array, cells: int, tag: Array, used: int, following: int, last: int, limit: int) -> tuple[int, int]:
+    """Give the lanes of ended starts to the following ones, or close them; return lanes in use and the next start."""
+    b = 0
+    while b < used:
+        if not ended(tag, b, limit):
+            b += 1
+        elif following < last:
+            tag[START, b], tag[FRESH, b], tag[STATUS, b], tag[STEPS, b] = following, EMPTY, LIMIT, 0
+            following, b = following + 1, b + 1
+        else:
+            used -= 1
+            move(m, cells, tag, b, used)
+    return used, following
 
 
 @compiled

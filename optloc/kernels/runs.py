@@ -21,7 +21,6 @@ from optloc.kernels.refine import (
     EMPTY,
     FRESH,
     GAIN,
-    LIMIT,
     NUMERICAL,
     SOLVABLE,
     START,
@@ -31,8 +30,9 @@ from optloc.kernels.refine import (
     Answers,
     Rules,
     begin,
+    ended,
     judged,
-    move,
+    refilled,
 )
 from optloc.kernels.room import Room, blocks, furnished, memory
 from optloc.kernels.tables import Tables
@@ -53,27 +53,17 @@ def refine_runs(packed: Packed, item: Array, first: int, last: int, rules: Rules
     size = out.x.shape[1]
     lanes, room = blocks(packed, size, last - first), furnished(t, c, size)
     m, r = memory(t, room, lanes)
-    tag = np.zeros((4, lanes), np.int64)
-    used, following = 0, first
-    while used < lanes:
-        tag[START, used], tag[FRESH, used] = following, EMPTY
-        used, following = used + 1, following + 1
+    tag, used, following = np.zeros((4, lanes), np.int64), lanes, first + lanes
+    for b in range(lanes):
+        tag[START, b], tag[FRESH, b] = first + b, EMPTY
     while used > 0:
         begin(c, m, room, tag, used, item, out.x)
         _price(t, c, m, r, room, used)
         _judge(m, room, size, tag, rules, used)
-        b = 0
-        while b < used:
-            if tag[STATUS, b] == LIMIT and tag[STEPS, b] < rules.limit:
-                b += 1
-                continue
-            _finish(m, room, tag, b, out)
-            if following < last:
-                tag[START, b], tag[FRESH, b] = following, EMPTY
-                following, b = following + 1, b + 1
-            else:
-                used -= 1
-                move(m, room.cells, tag, b, used)
+        for b in range(used):
+            if ended(tag, b, rules.limit):
+                _finish(m, room, tag, b, out)
+        used, following = refilled(m, room.cells, tag, used, following, last, rules.limit)
         _advance(t, c, m, r, room, tag, rules.damped, used)
 
 
