@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
+from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -207,16 +208,16 @@ def _show(found: Any, console: Console) -> None:
 
 def _show_comparison(found: list[Any], one: Path, two: Path, console: Console) -> None:
     console.print(f"A = {one}, B = {two}", highlight=False, markup=False, soft_wrap=True)
-    table = Table()
-    for name in ("scenario", "noise", "method"):
-        table.add_column(name)
-    for name in ("answers A, %", "B, %", "z", "RMSE A, m", "B, m", "time B/A", "values"):
-        table.add_column(name, justify="right")
-    for d in found:
-        scenario, sweep, noise, method = d.cell
-        label = scenario if sweep == "{}" else f"{scenario} {sweep}"
-        values = "identical" if d.identical else "same data" if d.same_data else "other data"
-        times = d.two.seconds / d.one.seconds if d.one.seconds else float("nan")
-        numbers = (100 * d.one.answered, 100 * d.two.answered, d.z, d.one.rmse, d.two.rmse, times)
-        table.add_row(label, noise, method, *("-" if n != n else f"{n:.4g}" for n in numbers), values)  # noqa: PLR0124
-    console.print(table)
+    for case, same in groupby(found, lambda difference: difference.cell[:3]):
+        scenario, sweep, noise = case
+        title = " ".join([scenario, *([] if sweep == "{}" else [sweep]), noise])
+        console.print(title, style="bold", highlight=False, markup=False, soft_wrap=True)
+        table = Table("method")
+        for name in ("answers A", "B, %", "z", "RMSE A", "B, m", "time B/A", "values"):
+            table.add_column(name, justify="right", no_wrap=True)
+        for d in same:
+            values = "identical" if d.identical else "same data" if d.same_data else "other data"
+            times = d.two.seconds / d.one.seconds if d.one.seconds else float("nan")
+            numbers = (100 * d.one.answered, 100 * d.two.answered, d.z, d.one.rmse, d.two.rmse, times)
+            table.add_row(d.cell[3], *("-" if n != n else f"{n:.4g}" for n in numbers), values)  # noqa: PLR0124
+        console.print(table)

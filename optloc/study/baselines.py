@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from optloc.fix import Fix
+from optloc.problem import Problem
 from optloc.study.draws import Drawn
+from optloc.study.originals import recursion, single_step
 from optloc.types import Array
 
 
@@ -87,6 +89,17 @@ def _printed(drawn: Drawn, start: Array) -> Fix:
     return given(drawn.problem, x)
 
 
+def _original(steps: Callable[[Problem, Array], Array]) -> Callable[[Drawn, Array], Fix]:
+    """Return the method of a paper; it claims whatever it arrives at."""
+
+    def run(drawn: Drawn, start: Array) -> Fix:
+        from optloc.solve.general import claimed
+
+        return claimed(drawn.problem, start, steps(drawn.problem, start))
+
+    return run
+
+
 def _general(drawn: Drawn, start: Array) -> Fix:
     from optloc.solve.general import least_squares
 
@@ -106,6 +119,12 @@ BASELINES: dict[str, Baseline] = {
         _iterated("taylor"), "plain undamped Taylor iteration from a guess (Foy 1976), as in the papers"
     ),
     "taylor-printed": Baseline(_printed, "the same with the sign of equations 8 and 15 of the paper `kinematic`"),
+    "single-step": Baseline(
+        _original(single_step), "one linearised step from a guess, as in the update of the paper `angles`"
+    ),
+    "recursion": Baseline(
+        _original(recursion), "two undamped steps over all data at every new epoch, as in the paper `registration`"
+    ),
     "ipopt": Baseline(_iterated("nlp"), "IPOPT from a guess, or another nonlinear solver", slow=True),
     "scipy": Baseline(_general, "scipy.optimize.least_squares with exact derivatives from a guess", slow=True),
     "lifted-sdp": Baseline(_lifted, "order-1 lifted ranges, unrefined: never tight for tdoa", guess=False, slow=True),

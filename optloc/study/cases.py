@@ -14,18 +14,19 @@ from typing import Any
 
 import numpy as np
 
-from optloc.bias import with_bias
 from optloc.build import assemble, measured
 from optloc.epochs import separable
 from optloc.errors import InvalidProblem
 from optloc.files import read
 from optloc.files.document import fitted
-from optloc.files.words import Units, join, kind_model, nearest
+from optloc.files.words import join, kind_model, nearest
 from optloc.layout import state_names
 from optloc.models import MODELS
 from optloc.noise import Block, Noise, variances
 from optloc.problem import Problem
-from optloc.study.document import Amount, Level, ScenarioTable
+from optloc.study.amounts import sigma_of
+from optloc.study.document import Level, ScenarioTable
+from optloc.study.flaws import flawed
 from optloc.study.geometry import check_truth, metres, placed
 from optloc.types import Array, Stations
 from optloc.units import SI_UNIT
@@ -201,35 +202,6 @@ def _check(problem: Problem, table: ScenarioTable, where: str) -> None:
             advice = nearest(name, known) if known else "the problem has none"
             raise InvalidProblem(f"unknown bias {name!r}", join(where, "bias"), advice)
     flawed(problem, table, where)
-
-
-def flawed(problem: Problem, table: ScenarioTable, where: str) -> tuple[Problem, dict[str, float]]:
-    """Return the problem as it really is, with the errors that no method is told, and their standard deviations."""
-    offset = table.error.offset
-    if offset is None:
-        return problem, {}
-    kinds = [rows.kind for rows in problem.rows]
-    given = offset if isinstance(offset, dict) else dict.fromkeys(kinds, offset)
-    spreads: dict[str, float] = {}
-    for kind, amount in given.items():
-        place = join(where, "error", "offset")
-        if kind not in kinds:
-            raise InvalidProblem(f"no rows are of kind {kind!r}", place, nearest(kind, kinds))
-        name = f"unmodelled {kind}"
-        problem = with_bias(problem, name, kind=kind)
-        spreads[name] = sigma_of(kind, amount, place)
-    return problem, spreads
-
-
-def sigma_of(kind: str, amount: Amount, where: str) -> float:
-    """Return a standard deviation of rows of a kind in SI units; of ratios in decibels, at a ratio of one."""
-    quantity = MODELS[kind].quantity
-    units = Units(quantity)  # type: ignore[arg-type]  # models hold known quantities only
-    number, unit = units.amount(amount, None if isinstance(amount, str) else units.conversion(None, where), where)
-    value = float(unit.sigma_to_si(number, np.ones(()))) if unit.logarithmic else abs(unit.factor) * number
-    if not value > 0.0:
-        raise InvalidProblem(f"{amount!r} is not positive", where, "give a positive standard deviation")
-    return value
 
 
 def _noise(problem: Problem, level: Level, from_file: bool, where: str) -> tuple[Noise, float, str]:

@@ -109,7 +109,15 @@ def _values(cell: Cell, known: Exact, drawn: Drawn, first: int, count: int) -> V
 def failure(reason: str) -> Values:
     """Return the values of a trial that failed."""
     values: Values = {column.name: np.nan for column in COLUMNS if column.kind == "float"}
-    values |= {"status": DIED, "reason": reason, "answered": False, "located": False, "dof": 0, "alternatives": 0}
+    values |= {
+        "status": DIED,
+        "reason": reason,
+        "answered": False,
+        "located": False,
+        "dof": 0,
+        "alternatives": 0,
+        "rejected": 0,
+    }
     return values | {"proof": "unknown", "certificate": "", "batch": 1}
 
 

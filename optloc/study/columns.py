@@ -56,6 +56,8 @@ COLUMNS: tuple[Column, ...] = (
     Column("answered", "bool", "", "Whether the status claims an answer: ok, ambiguous or searched."),
     Column("reason", "category", "", "Sentence that belongs to the status."),
     Column("located", "bool", "", "Whether there is a finite position at all, refined or not."),
+    Column("outliers", "int", "", "Number of stations with a gross error."),
+    Column("rejected", "int", "", "Number of rows to which the method gives less than half their weight."),
     Column("truth_x", "float", "m", "True position of the target, metres in the frame."),
     Column("truth_y", "float", "m", "As truth_x."),
     Column("truth_z", "float", "m", "As truth_x; NaN in the plane."),

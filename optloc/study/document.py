@@ -77,11 +77,24 @@ class TruthTable(_Table):
     """Velocity of a moving target, in the place of `speed`."""
 
 
+class OutlierTable(_Table):
+    """Gross errors of single stations."""
+
+    share: float = Field(gt=0.0, le=1.0)
+    """Probability that a station is off in a trial."""
+    size: Amount | dict[str, Amount]
+    """How far off: of all kinds, or of each. A difference takes the error of its second station with the other sign."""
+    late: bool = False
+    """Whether stations are off in one direction only, as blocked paths make arrivals late; by default in either."""
+
+
 class ErrorTable(_Table):
     """What the measurements suffer and no method is told."""
 
     offset: Amount | dict[str, Amount] | None = None
     """Standard deviation of a constant error of each station, drawn in every trial: of all kinds, or of each."""
+    outliers: OutlierTable | None = None
+    """Gross errors of a share of the stations."""
 
 
 class ScenarioTable(_Table):

@@ -10,7 +10,9 @@ from optloc.errors import InvalidProblem
 from optloc.files.words import Units, join
 from optloc.problem import Problem
 from optloc.simulate import simulate
-from optloc.study.cases import Case, flawed, sigma_of
+from optloc.study.amounts import sigma_of
+from optloc.study.cases import Case
+from optloc.study.flaws import errors_of, flawed
 from optloc.study.geometry import placed, places, velocities
 from optloc.types import Array, Bias
 
@@ -32,6 +34,8 @@ class Drawn:
         A place in the unit cube around zero for each: where methods begin that need a guess.
     seed : tuple of n str
         Names of the seeds of the trials.
+    bad : int array (n,)
+        How many stations have a gross error.
     position : str
         Name of the position that is sought.
     """
@@ -40,13 +44,14 @@ class Drawn:
     truth: Array
     wild: Array
     seed: tuple[str, ...]
+    bad: Array
     position: str = "position"
 
     def part(self, first: int, count: int) -> Drawn:
         """Return some of the trials."""
         kept = slice(first, first + count)
         problem = self.problem.take(np.arange(first, first + count))
-        return Drawn(problem, self.truth[kept], self.wild[kept], self.seed[kept], self.position)
+        return Drawn(problem, self.truth[kept], self.wild[kept], self.seed[kept], self.bad[kept], self.position)
 
 
 def block_size(case: Case) -> int:
@@ -68,17 +73,17 @@ def draw(case: Case, first: int, count: int) -> Drawn:
     blocks = range(first // size, -(-(first + count) // size))
     parts = [_block(case, number, size) for number in blocks]
     kept = slice(first - blocks[0] * size, first - blocks[0] * size + count)
-    stations, truth, wild, z = (np.concatenate(arrays)[kept] for arrays in zip(*parts, strict=True))
+    stations, truth, wild, z, bad = (np.concatenate(arrays)[kept] for arrays in zip(*parts, strict=True))
     problem = case.template
     if case.table.layout is not None:
         problem = replace(problem, stations=replace(problem.stations, position=stations[:, None]))
     names = [f"{case.seed}:{case.key}:{number}" for number in blocks]
     seed = tuple(names[trial // size - blocks[0]] for trial in range(first, first + count))
-    return Drawn(problem.with_rows(z=z), truth, wild, seed, case.state[0])
+    return Drawn(problem.with_rows(z=z), truth, wild, seed, bad, case.state[0])
 
 
-def _block(case: Case, number: int, size: int) -> tuple[Array, Array, Array, Array]:
-    """Return stations (size, s, d), truth (size, n), wild places (size, d) and measurements (size, m) of one block."""
+def _block(case: Case, number: int, size: int) -> tuple[Array, Array, Array, Array, Array]:
+    """Return stations, truth, wild places, measurements and numbers of stations that are off, of one block."""
     key = [int(case.key[:8], 16), int(case.key[8:], 16)]
     geometry, noise, guess = np.random.SeedSequence([case.seed, *key], spawn_key=(number,)).spawn(3)
     rng, problem, table = np.random.default_rng(geometry), case.template, case.table
@@ -87,18 +92,21 @@ def _block(case: Case, number: int, size: int) -> tuple[Array, Array, Array, Arr
         if table.layout.placement != "frozen":
             stations = placed(table.layout, case.where, rng, size)
         problem = replace(problem, stations=replace(problem.stations, position=stations[:, None]))
-    real, spreads = flawed(problem, table, case.where)
+    real, flaws = flawed(problem, table, case.where)
     names = case.state
     where = join(case.where, "truth")
     values = {names[0]: places(table.truth, problem.frame, stations, where, rng)}
     if len(names) > 1:
         values[names[1]] = velocities(table.truth, problem.dimension, where, rng, size)
     values |= {bias.name: _biases(case, bias, rng, size) for bias in problem.biases}
-    values |= {name: rng.standard_normal((size, _length(real, name))) * sigma for name, sigma in spreads.items()}
+    errors = errors_of(flaws, {flaw.name: _length(real, flaw.name) for flaw in flaws}, rng, size)
+    values |= errors
+    off = [errors[flaw.name] != 0.0 for flaw in flaws if flaw.share is not None]
+    bad = np.any(off, axis=0).sum(-1) if off else np.zeros(size, dtype=int)
     drawn = simulate(real, _vector(real, values, size), noise)
     z = np.broadcast_to(drawn.z, (size, problem.count))
     wild = np.random.default_rng(guess).uniform(-0.5, 0.5, (size, problem.dimension))
-    return stations, _vector(problem, values, size), wild, z
+    return stations, _vector(problem, values, size), wild, z, bad
 
 
 def _vector(problem: Problem, values: dict[str, Array], size: int) -> Array:

@@ -64,14 +64,14 @@ class Method:
         """Return whether fixes are solved one by one."""
         if self.baseline is not None:
             return BASELINES[self.baseline].slow
-        from optloc.solve.catalogue import METHODS
+        from optloc.solve.catalogue import SOLVERS, branches_of
 
         assert self.method is not None
-        stages = METHODS.get(self.method, self.method).split("+")
-        return not set(stages) <= _BATCHED
+        stages = {entry.solver for branch in branches_of(self.method) for entry in branch}
+        return not stages <= {SOLVERS[name].solver for name in _BATCHED}
 
 
-_BATCHED = {"gtrs", "roots", "wiv", "widen", "search", "lsr", "taylor"}
+_BATCHED = {"gtrs", "roots", "wiv", "widen", "search", "lsr", "taylor", "certify", "value"}
 
 
 def methods_of(table: MethodTable, number: int) -> Iterator[Method]:

@@ -58,6 +58,7 @@ def truth_values(case: Case, known: Exact) -> Values:
     names = case.state
     place = _take(problem, truth, names[0])
     values: Values = {f"truth_{axis}": _component(place, i) for i, axis in enumerate("xyz")}
+    values["outliers"] = known.drawn.bad
     values |= {"crlb": _root_trace(_block(problem, known.bound, names[0])), "cost_truth": known.cost}
     moving = len(names) > 1
     values["crlb_velocity"] = _root_trace(_block(problem, known.bound, names[1])) if moving else np.nan
@@ -85,6 +86,7 @@ def fix_values(case: Case, known: Exact, fix: Fix) -> Values:
         "nees": _squared(error, claimed),
         "cost": _cost(problem, fix, x),
         "dof": np.broadcast_to(fix.dof, (size,)),
+        "rejected": np.broadcast_to((fix.weights < 0.5 * problem.weight).sum(-1), (size,)),
         "alternatives": np.isfinite(fix.alternatives.gap).sum(-1),
     }
     moving = len(names) > 1

@@ -56,6 +56,7 @@ def single(method: str) -> Any:
 
 METHODS = {
     "gtrs+lsr": batch("gtrs+lsr"),
+    "gtrs+lsr+value": batch("gtrs+lsr+value"),
     "gtrs+lsr+certify": batch("gtrs+lsr+certify"),
     "auto": batch("auto"),
     "auto, one by one": single("auto"),

@@ -20,6 +20,9 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.scenes import Scene, load
 
+# Repetitions of what is quick, and seconds from which on nothing is.
+REPEATS, ENOUGH = 6, 0.5
+
 
 def serve(module: str, paths: list[str], channel: TextIO) -> None:
     """Answer requests on standard input until it ends."""
@@ -40,10 +43,16 @@ def serve(module: str, paths: list[str], channel: TextIO) -> None:
 
 
 def answer(work: Any, out: str | None) -> dict[str, Any]:
-    """Do the work once; return its seconds and facts, and write the positions where that is wanted."""
-    began = perf_counter()
-    found = work()
-    seconds = perf_counter() - began
+    """Do the work; return its seconds and facts, and write the positions where that is wanted.
+
+    What is quick is done several times: the other methods have cooled the caches and the pages of this process since.
+    """
+    times: list[float] = []
+    while not times or (len(times) < REPEATS and sum(times) < ENOUGH):
+        began = perf_counter()
+        found = work()
+        times.append(perf_counter() - began)
+    seconds = float(np.median(times[1:] or times))
     positions, facts = found() if callable(found) else (found, {})
     if out:
         np.save(out, np.asarray(positions, dtype=float))

@@ -94,3 +94,44 @@ def test_every_kind_of_stations_at_rest_can_be_laid_out():
             drawn = draw(case(text), 0, 50)
             error = drawn.problem.z - predict(drawn.problem, drawn.truth)
             assert np.isfinite(error).all(), kind
+
+
+GROSS = 'error = { outliers = { share = 0.2, size = "500 m" } }\n'
+
+
+def errors(text, trials=2000):
+    drawn = draw(case(text), 0, trials)
+    return drawn, drawn.problem.z - predict(drawn.problem, drawn.truth)
+
+
+def test_a_station_with_a_gross_error_is_off_in_all_its_differences():
+    exact = SHELL.replace("10 m", "1 mm").replace("stations = 6", 'stations = 6, pairs = "all"')
+    drawn, error = errors(exact + GROSS)
+    a, b = drawn.problem.rows[0].a, drawn.problem.rows[0].b
+    # What every station must be off by for its differences, the mean left open.
+    design = np.eye(6)[a] - np.eye(6)[b]
+    off = error @ np.linalg.pinv(design).T
+    assert np.abs(error - off @ design.T).max() < 0.1
+    off -= np.median(off, axis=1, keepdims=True)
+    few = drawn.bad <= 2  # the median is then that of good stations
+    wrong = np.abs(off) > 1.0
+    assert np.array_equal(wrong.sum(1)[few], drawn.bad[few])
+    assert np.allclose(np.abs(off[few][wrong[few]]), 500.0, atol=0.1)
+    assert abs(drawn.bad.mean() - 1.2) < 4.0 * np.sqrt(6 * 0.2 * 0.8 / 2000)
+    assert abs(np.mean(off[few][wrong[few]] > 0.0) - 0.5) < 0.1
+
+
+def test_late_arrivals_are_never_early():
+    text = SHELL.replace("10 m", "1 mm").replace("stations = 6", 'stations = 6, kinds = ["toa"]')
+    drawn, error = errors(text + GROSS.replace('"500 m"', '"500 m", late = true'))
+    assert np.allclose(error[error > 1.0], 500.0, atol=0.1)
+    assert error.min() > -0.1
+    assert np.array_equal((error > 1.0).sum(1), drawn.bad)
+
+
+def test_the_share_of_gross_errors_can_be_swept():
+    text = 'format = 1\nname = "x"\ntrials = 50\n[[scenario]]\nname = "s"\nnoise = ["1 m"]\ntruth = { kind = "hull" }\n'
+    text += 'layout = { stations = 8, kinds = ["toa"] }\nsweep = { "error.outliers.share" = [0.01, 0.5] }\n'
+    text += 'error = { outliers = { share = 0.1, size = "100 m" } }\n[[method]]\nmethod = "gtrs+lsr"\n'
+    few, many = (draw(cell.case, 0, 50) for cell in plan(text).cells)
+    assert few.bad.mean() < 0.5 < many.bad.mean()

@@ -1,0 +1,46 @@
+"""What the papers do between a guess and an answer, against other programs for the same."""
+
+import numpy as np
+import pytest
+from study.texts import plan
+
+from optloc.papers.registration.recursion import recursion as printed
+from optloc.papers.registration.scenario import PRINTED
+from optloc.papers.registration.trials import Setting
+from optloc.solve.stages import given, lsr
+from optloc.status import Status
+from optloc.study.baselines import BASELINES
+from optloc.study.chunk import compute
+from optloc.study.draws import draw
+from optloc.study.originals import recursion, single_step
+
+
+def test_the_recursion_is_that_of_the_paper():
+    setting = Setting(PRINTED, 3, 1, 1)
+    run, start = setting.draw(120), setting.starts(1.0)
+    wanted = printed(PRINTED, run.z.reshape(3, 120, 4), start)[:, -1]
+    found = recursion(run, np.concatenate([start, np.zeros((3, 4))], axis=1))
+    assert np.abs(found - wanted).max() < 1e-6
+
+
+def test_a_single_step_is_the_first_of_an_iteration():
+    drawn = draw(next(plan().chunks).cell.case, 0, 5)
+    start = drawn.truth + 500.0
+    once = lsr(drawn.problem, given(drawn.problem, start), damped=False, limit=1)
+    np.testing.assert_allclose(single_step(drawn.problem, start), once.x, rtol=1e-9)
+
+
+def test_a_recursion_over_runs_with_unknowns_of_their_epochs_has_no_answer():
+    text = 'format = 1\nname = "x"\ntrials = 4\n[[scenario]]\nname = "s"\nlayout = { kinds = ["toa"] }\n'
+    text += 'truth = { kind = "hull" }\nnoise = ["3 m"]\n[[method]]\nbaseline = "recursion"\n'
+    frame = compute(next(plan(text).chunks)).table.to_pandas()
+    assert not frame["answered"].any()
+
+
+@pytest.mark.parametrize("name", ["single-step", "recursion"])
+def test_originals_claim_what_they_arrive_at(name):
+    drawn = draw(next(plan().chunks).cell.case, 0, 5)
+    fix = BASELINES[name].run(drawn, drawn.truth)
+    assert (fix.code == Status.OK).all()
+    best = BASELINES["truth"].run(drawn, drawn.truth)
+    assert (fix.cost >= best.cost - 1e-9).all()
