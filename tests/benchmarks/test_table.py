@@ -46,7 +46,8 @@ def test_write_the_table(tmp_path):
     absent = f"; not installed, also not in {PEERS}: {', '.join(missing)}" if missing else ""
     facts = (
         f"TDOA with {STATIONS} stations, {SIGMA:g} m; batches of {COUNT} where a method takes batches, "
-        f"of {MANY} where it takes microseconds; medians of {ROUNDS} interleaved rounds on one core; accuracy over the first {JUDGED} fixes; {machine()}{absent}"
+        f"of {MANY} where it takes microseconds; medians of {ROUNDS} interleaved rounds on one core; accuracy over the "
+        f"first {JUDGED} fixes; {machine()}{absent}"
     )
     write("benchmarks", HEADER, [row for scene in SCENES for row in cells(found, scene)], facts)
     save_csv(found, FOLDER / "benchmarks.csv")
