@@ -16,18 +16,24 @@ from optloc.gauss_newton import gauss_newton
 from optloc.layout import Layout
 from optloc.learnt import with_known_bias
 from optloc.linear import Linear, linearise
+from optloc.loss import LOSSES, Loss
 from optloc.models import MODELS, Model
 from optloc.noise import Noise
 from optloc.normal import Normal, normal
 from optloc.observe import Observability, observability
 from optloc.problem import Problem
+from optloc.quality.health import Health, health
+from optloc.quality.levels import NoiseLevels, noise_levels, with_estimated_noise, with_noise_levels
 from optloc.simulate import simulate
 from optloc.solve import FORMULATIONS, METHODS, SOLVERS, solve
 from optloc.solve.certify import certify
 from optloc.solve.prepared import Prepared, prepare
 from optloc.solve.reduce import reduce
+from optloc.solve.robust import rejected
 from optloc.solve.running import Running
+from optloc.solve.suspects import suspects
 from optloc.status import Certificate, Status
+from optloc.suspects import Explanation, Suspect
 from optloc.types import Bias, Motion, Prior, Rows, Stations
 
 __version__ = "0.1.0"
@@ -36,6 +42,7 @@ __all__ = [
     "CARTESIAN",
     "ECEF",
     "FORMULATIONS",
+    "LOSSES",
     "METHODS",
     "MODELS",
     "SOLVERS",
@@ -43,15 +50,20 @@ __all__ = [
     "Bias",
     "Certificate",
     "Course",
+    "Emitters",
+    "Explanation",
     "Fix",
     "Frame",
+    "Health",
     "InvalidProblem",
     "Layout",
     "Linear",
+    "Loss",
     "Model",
     "Motion",
     "NoSolution",
     "Noise",
+    "NoiseLevels",
     "Normal",
     "Observability",
     "OptlocError",
@@ -63,6 +75,7 @@ __all__ = [
     "Stage",
     "Stations",
     "Status",
+    "Suspect",
     "assemble",
     "by_epoch",
     "certify",
@@ -70,19 +83,26 @@ __all__ = [
     "crlb_course",
     "from_table",
     "gauss_newton",
+    "health",
     "linearise",
     "load",
     "measured",
+    "noise_levels",
     "normal",
     "observability",
     "predict",
     "prepare",
     "reduce",
+    "rejected",
+    "separate",
     "simulate",
     "solve",
     "station_array",
+    "suspects",
     "with_bias",
+    "with_estimated_noise",
     "with_known_bias",
+    "with_noise_levels",
 ]
 
 
@@ -91,6 +111,10 @@ def __getattr__(name: str) -> Any:
         from optloc import files  # pandas is loaded when a file or a table is read
 
         return getattr(files, name)
+    if name in ("Emitters", "separate"):
+        from optloc import several  # scipy.optimize is loaded when emitters are told apart
+
+        return getattr(several, name)
     raise AttributeError(f"module 'optloc' has no attribute {name!r}")
 
 

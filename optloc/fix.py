@@ -114,6 +114,9 @@ class Fix:
     local : array (..., k, p, p), optional
         Covariance of the states that targets have at each epoch of a run, in the order of the layout; NaN where an
         epoch leaves them open.
+    explanations : object array (...), optional
+        Where the data contradict each other, a tuple of `Explanation`: all the ways of leaving out least, the most
+        plausible first, which is the one that was taken; an empty tuple elsewhere. None where nobody asked.
     """
 
     x: Array
@@ -130,6 +133,7 @@ class Fix:
     stages: tuple[Stage, ...] = ()
     active: Array | None = None
     local: Array | None = None
+    explanations: Array | None = None
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -225,6 +229,18 @@ class Fix:
         return self.x[..., : self.layout.n_shared], self.cov
 
     @property
+    def suspects(self) -> Any:
+        """Return what was left out of a single fix, a tuple of `Suspect`, or an object array (...) of them of a batch.
+
+        They are those of the first of `explanations`: where there are several, others are suspected as much.
+        """
+        out = np.empty(self.shape, dtype=object)
+        for i in np.ndindex(self.shape):
+            found = () if self.explanations is None else self.explanations[i]
+            out[i] = found[0].suspects if found else ()
+        return out[()]
+
+    @property
     def answered(self) -> Array:
         """Return where there is an answer with a covariance, possibly one of several, (...)."""
         return np.isin(self.code, (Status.OK, Status.AMBIGUOUS, Status.SEARCHED))
@@ -267,6 +283,7 @@ class Fix:
             weights=change(self.weights, 1),
             active=None if self.active is None else change(self.active, 0),
             local=None if self.local is None else change(self.local, 3),
+            explanations=None if self.explanations is None else change(self.explanations, 0),
         )
 
 

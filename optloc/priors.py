@@ -54,10 +54,10 @@ def with_priors(problem: Problem, x: Array, equations: Normal, *, shared: bool =
 
 def prior_parts(problem: Problem) -> list[tuple[str, Array, Array]]:
     """Return (name, mean, precision) of every prior; local ones have an epoch axis of length one."""
-    parts = []
+    parts, layout = [], problem.layout
     for prior in problem.priors:
         precision, _ = linalg.inverse(prior.covariance)
-        _, is_shared = problem.layout.find(prior.name)
+        _, is_shared = layout.find(prior.name)
         mean = prior.mean if is_shared else prior.mean[..., None, :]
         parts.append((prior.name, mean, precision if is_shared else precision[..., None, :, :]))
     for bias in problem.biases:

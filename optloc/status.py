@@ -22,6 +22,7 @@ class Status(IntEnum):
     REJECTED = 10
     UNAVAILABLE = 11
     DISCONNECTED = 12
+    CONTRADICTORY = 13
 
     @property
     def sentence(self) -> str:
@@ -49,6 +50,8 @@ _SENTENCES: dict[Status, str] = {
     Status.REJECTED: "A measurement is not a finite number; remove the row or give it weight zero.",
     Status.UNAVAILABLE: "The method does not apply to these kinds of rows; choose another or 'auto'.",
     Status.DISCONNECTED: "The station pairs fall into groups without a common station; add a pair that links them.",
+    Status.CONTRADICTORY: "The measurements contradict each other, and leaving few of them out does not help, or they "
+    "contradict the constraints; check the stations' places and clocks, the noise levels and the bounds.",
 }
 
 

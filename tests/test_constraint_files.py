@@ -180,7 +180,7 @@ def test_options_add_to_the_file(tmp_path):
     text = run("fix", path, "--height", "4000 ft").stdout
     assert "held by height equal" in text
     assert "nan" not in text
-    assert "1000 m (held)" in run("fix", path, "--box", "0,0,0:1000,3000,inf").stdout
+    assert "1490 m (held)" in run("fix", path, "--box", "0,0,0:1490,3000,inf").stdout
 
 
 def test_what_lies_below_the_ground_is_no_alternative(tmp_path):
@@ -218,11 +218,14 @@ def test_an_infeasible_epoch_is_exit_code_1_and_leaves_the_others_alone(tmp_path
     run("fix", path, "--out", out, code=1)
     assert pd.read_csv(out)["status"].tolist() == ["infeasible"] * 2
     assert pd.read_csv(out)["x"].isna().all()
-    inside = ranging(table, PLANE) + '[[constraints]]\nkind = "box"\nmax = [1550, 9000]\n'
-    run("fix", write(tmp_path, inside), "--out", out)
-    found = pd.read_csv(out, keep_default_na=False)
-    assert found["active"].tolist() == ["", "x upper"]
-    np.testing.assert_allclose(found["x"].astype(float), [1500.0, 1550.0], atol=1e-3)
+    for most, status, code in ((1595, "ok", 0), (1550, "contradictory", 1)):  # 1 and 12 sigma before the second place
+        inside = ranging(table, PLANE) + f'[[constraints]]\nkind = "box"\nmax = [{most}, 9000]\n'
+        run("fix", write(tmp_path, inside), "--out", out, code=code)
+        found = pd.read_csv(out, keep_default_na=False)
+        assert found["active"].tolist() == ["", "x upper"]
+        assert found["status"].tolist() == ["ok", status]
+        assert ("data contradict x upper" in found["reason"][1]) == (code == 1)
+        np.testing.assert_allclose(found["x"].astype(float), [1500.0, most], atol=1e-3)
 
 
 def test_constraints_of_one_target_of_several(tmp_path):

@@ -13,9 +13,10 @@ FLOORS = {
     0: "types errors units frames status noise linalg ellipse arrays threads",
     1: "models",
     2: "layout problem linear normal fix tables kernels states build check check_constraints check_unknowns arguments "
-    "epochs constraints tangent symbolic plan evaluate weigh windows equations blocks priors learnt bias gauss_newton",
-    3: "solve proof bounds maps simulate observe",
-    4: "track",
+    "epochs constraints tangent symbolic plan evaluate weigh windows equations blocks priors learnt bias gauss_newton "
+    "loss suspects",
+    3: "solve proof bounds maps simulate observe quality",
+    4: "track several",
     5: "study papers scenario files",
     6: "cli plot scene report maps plugins demo __main__",
 }

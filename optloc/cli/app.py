@@ -8,6 +8,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from optloc.cli.options import AboveGround, Box, Geodetic, Height, Json, Method, NoiseFromData, Plot, ProblemPath, Quiet
 from optloc.errors import InvalidProblem
 
 # Heavy libraries are imported inside the commands, so that --help answers at once.
@@ -34,23 +35,6 @@ app = typer.Typer(
     help="Position fixes from time, gain, angle and Doppler measurements, with covariance and verdict.",
     epilog="Exit codes: 0 all fixes are ok, 1 some are not, 2 bad input.",
 )
-
-ProblemPath = Annotated[Path, typer.Argument(metavar="FILE", help="Problem file (TOML, format = 1).")]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON on standard output and nothing else.")]
-Plot = Annotated[Path | None, typer.Option("--plot", metavar="OUT.png", help="Draw stations, fix and 95 % ellipse.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
-Method = Annotated[str, typer.Option("--method", "-m", help="How to solve; see [bold]optloc list solvers[/bold].")]
-Geodetic = Annotated[
-    bool, typer.Option("--geodetic", help="The coordinates are latitude, longitude (deg) and height (m).")
-]
-Height = Annotated[
-    str | None, typer.Option("--height", metavar="H", help="Known height above the ellipsoid: 500, or '1640 ft'.")
-]
-AboveGround = Annotated[bool, typer.Option("--above-ground", help="The target is above the ellipsoid.")]
-Box = Annotated[
-    str | None,
-    typer.Option("--box", metavar="LOW:HIGH", help="Region, metres in the frame: X,Y[,Z]:X,Y[,Z]; inf is no bound."),
-]
 
 
 def _version(wanted: bool) -> None:
@@ -96,6 +80,7 @@ def fix(
     height: Height = None,
     above_ground: AboveGround = False,
     box: Box = None,
+    noise: NoiseFromData = None,
     quiet: Quiet = False,
 ) -> None:
     """Fix the target of a problem file, at every epoch if there are several.
@@ -106,7 +91,8 @@ def fix(
     from optloc.cli.constraints import demanded
 
     more = demanded(height, above_ground, box)
-    code = run_fix(file, method, more, as_json=as_json, geojson_path=geojson, plot=plot, out=out, quiet=quiet)
+    files = {"geojson_path": geojson, "plot": plot, "out": out}
+    code = run_fix(file, method, more, as_json=as_json, **files, quiet=quiet, noise=noise)
     raise typer.Exit(code)
 
 
@@ -162,6 +148,36 @@ def track(
 
     wanted = Wanted(model, filter_, noise, memory, rules(gate, gap), start, start_sigma)
     raise typer.Exit(run_track(file, wanted, out=out, as_json=as_json, plot=plot, quiet=quiet))
+
+
+@app.command(
+    epilog=example(
+        "optloc separate site.toml --detection 0.9 --false 1",
+        "optloc separate site.toml --emitters 2 --region 0,0:20e3,30e3",
+    )
+)
+def separate(
+    file: ProblemPath,
+    detection: Annotated[
+        float, typer.Option(metavar="P", help="Probability that an emitter is seen in a channel.")
+    ] = 0.9,
+    false: Annotated[
+        float, typer.Option("--false", metavar="N", help="Mean number of false rows in a channel and epoch.")
+    ] = 1.0,
+    emitters: Annotated[
+        str, typer.Option(metavar="N|auto", help="How many emitters; the most likely number.")
+    ] = "auto",
+    region: Annotated[
+        str | None,
+        typer.Option("--region", metavar="LOW:HIGH", help="Where they are sought, metres: X,Y[,Z]:X,Y[,Z]."),
+    ] = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+) -> None:
+    """Tell several emitters apart whose rows do not say whose they are; a channel is a kind at its stations."""
+    from optloc.cli.several import run_separate
+
+    raise typer.Exit(run_separate(file, detection, false, emitters, region, as_json=as_json, quiet=quiet))
 
 
 @app.command(epilog=example("optloc demo", "optloc demo ambiguous --plot two.png"))
@@ -244,12 +260,26 @@ def crlb(
     raise typer.Exit(run_crlb(file, at, velocity, geodetic=geodetic, as_json=as_json, plot=plot))
 
 
-@app.command(epilog=example("optloc check site.toml"))
-def check(file: ProblemPath, as_json: Json = False) -> None:
-    """Read a problem file and say what is in it: stations, rows, redundancy, connections, geometry."""
-    from optloc.cli.checking import run_check
+@app.command(epilog=example("optloc check site.toml", "optloc check flight.toml --plot health.svg --out health.csv"))
+def check(
+    file: ProblemPath,
+    as_json: Json = False,
+    by: Annotated[str, typer.Option(metavar="station|pair|kind", help="Whose health is told.")] = "station",
+    method: Annotated[
+        str | None, typer.Option("--method", "-m", help="How epochs are fixed; a method that resists outliers.")
+    ] = None,
+    no_solve: Annotated[bool, typer.Option("--no-solve", help="Only read the file.")] = False,
+    out: Annotated[Path | None, typer.Option(metavar="OUT", help="Write station health as .csv or .parquet.")] = None,
+    plot: Annotated[Path | None, typer.Option("--plot", metavar="OUT.svg", help="Draw the residuals.")] = None,
+    quiet: Quiet = False,
+) -> None:
+    """Say what a file holds (rows, redundancy, geometry) and, of many epochs, how healthy its stations are.
 
-    raise typer.Exit(run_check(file, as_json))
+    Each epoch is fixed, and each station compared with what the others say: bias, scale, noise, outliers.
+    """
+    from optloc.cli.checking import Asked, run_check
+
+    raise typer.Exit(run_check(file, as_json, Asked(not no_solve, method, by, out, plot), quiet=quiet))
 
 
 @app.command(epilog=example("optloc reproduce registration", "optloc reproduce registration --size full --out tables"))

@@ -1,35 +1,74 @@
-"""What ``optloc check`` does: say what a file holds, before anything is solved."""
+"""What ``optloc check`` does: say what a file holds, and how healthy its stations are."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from optloc.cli.output import dumps, write_text
+from optloc.cli.health import Checked, checked_health, draw_health, health_columns, health_json, show_health
+from optloc.cli.output import dumps, write_table, write_text
 from optloc.constraints import exact
 from optloc.epochs import separable
+from optloc.errors import InvalidProblem, nearest
 from optloc.files import Loaded, read
 from optloc.models import MODELS
 from optloc.problem import Problem
+from optloc.quality.groups import GROUPINGS, By
+from optloc.solve.catalogue import SOLVERS
 from optloc.types import Array, Bias
 
 
-def run_check(file: Path, as_json: bool) -> int:
-    """Print a summary of a file; the exit code is 1 where some epoch cannot be fixed."""
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What is wanted of station health: whether at all, how epochs are fixed, what makes a group, where it goes."""
+
+    solve: bool = True
+    method: str | None = None
+    by: str = "station"
+    out: Path | None = None
+    plot: Path | None = None
+
+
+def run_check(file: Path, as_json: bool, asked: Asked | None = None, *, quiet: bool = False) -> int:
+    """Print a summary of a file and its health; the exit code is 1 where some epoch cannot be fixed."""
+    asked = asked or Asked()
     loaded = read(file, values=False)
     found = summary(loaded)
+    checked = _health(loaded, asked, quiet or as_json)
     if as_json:
-        write_text(Path("-"), dumps(found))
-    else:
+        write_text(Path("-"), dumps(found if checked is None else found | {"health": health_json(checked)}))
+    elif not quiet:
         table = Table(title=loaded.title, show_header=False, title_justify="left")
         for name, value in found.items():
             table.add_row(name.replace("_", " "), _spelled(value))
         Console().print(table)
+        if checked is not None:
+            show_health(checked, Console())
     return 1 if found["epochs_with_too_few_rows"] or found["epochs_with_disconnected_pairs"] else 0
+
+
+def _health(loaded: Loaded, asked: Asked, quiet: bool) -> Checked | None:
+    """Return the health of a file's stations and write what was asked for; None where it was not to be solved."""
+    if not asked.solve:
+        if asked.out is not None or asked.plot is not None:
+            raise InvalidProblem("table and picture need the fixes", "--no-solve", "leave it or --out and --plot out")
+        return None
+    if asked.by not in GROUPINGS:
+        raise InvalidProblem(f"unknown grouping {asked.by!r}", "--by", nearest(asked.by, GROUPINGS))
+    method = asked.method or ("cauchy" if "cauchy" in SOLVERS else "auto")
+    checked = checked_health(loaded, method, cast("By", asked.by), quiet)
+    if asked.out is not None:
+        if checked.health is None:
+            raise InvalidProblem(checked.why, "--out", "leave it out")
+        write_table(asked.out, health_columns(checked.health))
+    if asked.plot is not None:
+        draw_health(checked, loaded.title, asked.plot)
+    return checked
 
 
 def _spelled(value: Any) -> str:

@@ -12,6 +12,7 @@ from optloc.fix import Fix
 from optloc.frames import Frame
 from optloc.layout import state_names
 from optloc.status import Status
+from optloc.suspects import Explanation
 from optloc.types import Array
 
 Columns = dict[str, Array]
@@ -84,6 +85,8 @@ def _of_target(loaded: Loaded, fix: Fix, first: int | None, target: int, names: 
     columns["proof"] = repeated(np.array([getattr(c, "proof", "unknown") for c in fix.certificate], dtype=object))
     if loaded.problem.constraints:
         columns |= {name: repeated(values) for name, values in _held(fix).items()}
+    if fix.explanations is not None:
+        columns["suspects"] = repeated(np.array([suspects_of(each) for each in fix.explanations], dtype=object))
     return columns
 
 
@@ -94,6 +97,11 @@ def _held(fix: Fix) -> Columns:
     names[:] = ["; ".join(active.name for active in each) for each in held]
     multipliers[:] = ["; ".join(f"{active.multiplier:.6g}" for active in each) for each in held]
     return {"active": names, "multipliers": multipliers}
+
+
+def suspects_of(explanations: Sequence[Explanation]) -> str:
+    """Return the suspects of each explanation as text: "A; B" are suspected together, "A | B" instead of each other."""
+    return " | ".join("; ".join(explanation.names) for explanation in explanations)
 
 
 def _estimated(fix: Fix, name: str) -> bool:

@@ -9,6 +9,7 @@ from pathlib import Path
 from rich.console import Console
 
 from optloc.cli.fixing import Fixed, fix_file
+from optloc.cli.levels import levels_json, noised, show_levels
 from optloc.cli.output import dumps, fixed_json, geojson, saved, write_table, write_text
 from optloc.cli.show import show
 from optloc.errors import InvalidProblem
@@ -26,11 +27,12 @@ def run_fix(
     plot: Path | None = None,
     out: Path | None = None,
     quiet: bool = False,
+    noise: str | None = None,
 ) -> int:
     """Fix a file under constraints of its own and more, write what was asked for, and return the exit code."""
     if as_json and geojson_path is not None and str(geojson_path) == "-":
         raise InvalidProblem("JSON and GeoJSON cannot both go to standard output", "--geojson", "name a file")
-    fixed = fix_file(read(file, more=more), method, quiet or as_json)
+    fixed = fix_file(noised(read(file, more=more), noise), method, quiet or as_json)
     if out is not None:
         write_table(out, fixed.columns)
     if geojson_path is not None:
@@ -38,9 +40,14 @@ def run_fix(
     if plot is not None:
         draw(fixed, plot)
     if as_json:
-        write_text(Path("-"), dumps(fixed_json(fixed)))
+        levels = fixed.loaded.levels
+        noted = {} if levels is None else {"noise": levels_json(levels)}
+        write_text(Path("-"), dumps(fixed_json(fixed) | noted))
     elif not quiet:
-        show(fixed, Console(stderr=geojson_path is not None and str(geojson_path) == "-"))
+        console = Console(stderr=geojson_path is not None and str(geojson_path) == "-")
+        show(fixed, console)
+        if fixed.loaded.levels is not None:
+            show_levels(fixed.loaded.levels, console)
     return 0 if fixed.clean else 1
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
-from dataclasses import fields
+from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,8 +15,10 @@ from optloc.cli.columns import Columns
 from optloc.cli.fixing import Fixed
 from optloc.errors import InvalidProblem
 from optloc.fix import Active, Fix
+from optloc.loss import LOSSES
 from optloc.observe import Observability
 from optloc.status import Status
+from optloc.suspects import Explanation
 from optloc.types import Array
 
 if TYPE_CHECKING:
@@ -125,12 +127,19 @@ def _detail(fix: Fix, seen: Observability | None) -> dict[str, Any]:
             {"gap": gap, "probability": doubt, "position": alternative_position(fix, x)}
             for x, gap, doubt in zip(others.x[shown], others.gap[shown], others.doubt[shown], strict=True)
         ],
+        "explanations": [asdict(explanation) for explanation in explanations_of(fix)],
+        "weights": fix.weights if any(stage.name in LOSSES for stage in fix.stages) else None,
         "active": [{"name": a.name, "multiplier": a.multiplier} for a in active_of(fix)],
         "certificate": {part.name: getattr(certificate, part.name) for part in fields(certificate)},
         "biases": bias_records(fix, seen),
         "not_separable": [] if seen is None else list(seen.sentences),
         "of_each_epoch": {name: values for name, values in fix.bias.items() if not fix.layout.find(name)[1]},
     }
+
+
+def explanations_of(fix: Fix) -> tuple[Explanation, ...]:
+    """Return what explains the data of a single fix."""
+    return () if fix.explanations is None else tuple(fix.explanations[()])
 
 
 def active_of(fix: Fix) -> tuple[Active, ...]:

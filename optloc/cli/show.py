@@ -15,6 +15,7 @@ from optloc.cli.columns import Columns
 from optloc.cli.fixing import Fixed
 from optloc.cli.numbers import with_sigma
 from optloc.cli.output import active_of, alternative_position
+from optloc.cli.suspects import show_suspects
 from optloc.fix import Fix
 from optloc.status import Status
 
@@ -60,6 +61,7 @@ def _one(fixed: Fixed, fix: Fix, console: Console) -> None:
     table.add_row("stages", " → ".join(stage.name for stage in fix.stages) or "none")
     console.print(table)
     show_biases(fix, fixed.seen, console)
+    show_suspects(fix, console)
     _alternatives(fix, console)
 
 

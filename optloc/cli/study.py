@@ -13,7 +13,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from optloc.cli.app import Group, Json, Quiet, example
+from optloc.cli.app import Group, example
+from optloc.cli.options import Json, Quiet
 
 # Heavy libraries are imported inside the commands, so that --help answers at once.
 

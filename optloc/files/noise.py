@@ -8,9 +8,13 @@ import numpy as np
 
 from optloc.errors import InvalidProblem
 from optloc.files.chunk import Chunk
+from optloc.files.schema import ProblemFile
+from optloc.files.sigmas import ESTIMATE
 from optloc.files.words import join
 from optloc.models import MODELS
 from optloc.noise import Block, Noise, arrivals, group, together
+from optloc.problem import Problem
+from optloc.quality.levels import NoiseLevels, with_estimated_noise
 from optloc.types import Array
 
 
@@ -86,3 +90,19 @@ def per_epoch(number: Array, epoch: Array, slope: Array, matrix: Array, where: s
     if not np.isfinite(sizes).all():
         raise InvalidProblem("a covariance in dB needs the measured values", where, "state it in unit '1'")
     return Block(number[members], matrix * sizes[:, :, None] * sizes[:, None, :])
+
+
+def with_noise(file: ProblemFile, problem: Problem, source: str) -> tuple[Problem, NoiseLevels | None]:
+    """Return the problem with its noise found from the data, where the file leaves it to them."""
+    if all(section.sigma != ESTIMATE for section in file.measurements):
+        return problem, None
+    place = join(source, "key 'sigma'")
+    if any(section.sigma != ESTIMATE for section in file.measurements):
+        what = "the noise of some measurements is stated and that of others is to be estimated"
+        raise InvalidProblem(what, place, f'state all, or give sigma = "{ESTIMATE}" to all')
+    if not np.isfinite(problem.z[problem.weight > 0.0]).all():
+        raise InvalidProblem("without measured values there is no noise to estimate", place, "state a sigma")
+    try:
+        return with_estimated_noise(problem)
+    except InvalidProblem as error:
+        raise InvalidProblem(error.what, place, error.advice) from None

@@ -16,7 +16,7 @@ from optloc.files.document import read_document
 from optloc.files.epochs import Epochs, Keys, epochs_of, need_clock
 from optloc.files.known import known_of, places_of
 from optloc.files.measurements import chunks_of, with_baseline
-from optloc.files.noise import noise_of, per_epoch
+from optloc.files.noise import noise_of, per_epoch, with_noise
 from optloc.files.repeats import check_repeats
 from optloc.files.schema import ConstraintTable, ProblemFile
 from optloc.files.sigmas import square
@@ -28,6 +28,7 @@ from optloc.files.words import Units, join
 from optloc.frames import Frame
 from optloc.noise import Noise
 from optloc.problem import Problem
+from optloc.quality.levels import NoiseLevels
 from optloc.types import Array, Rows, Stations
 from optloc.units import SPEED_OF_LIGHT
 
@@ -52,6 +53,8 @@ class Loaded:
         Name of each target; of the target of each epoch where `own_epochs`.
     own_epochs : bool
         Whether every epoch belongs to one target.
+    levels : NoiseLevels, optional
+        What the data say of the noise, where it is left to them.
     """
 
     problem: Problem
@@ -61,6 +64,7 @@ class Loaded:
     times: Array
     targets: tuple[str, ...]
     own_epochs: bool = False
+    levels: NoiseLevels | None = None
 
 
 def load(path: str | Path) -> Problem:
@@ -181,10 +185,10 @@ def assemble(
     rows, numbers = _rows(chunks, index, target)
     noise = _noise(file, chunks, numbers, index, target, source)
     problem = _problem(file, epochs, stations, rows, noise, frame, source, known or {}, more or {})
-    names = (source, file.title or source, epochs.labels, epochs.times, epochs.targets, epochs.own)
-    return Draft(
-        Loaded(problem, *names), file, tuple(tables), tuple(chunks), tuple(numbers), found.moving or _led(problem)
-    )
+    problem, levels = with_noise(file, problem, source)
+    title = file.title or source
+    loaded = Loaded(problem, source, title, epochs.labels, epochs.times, epochs.targets, epochs.own, levels)
+    return Draft(loaded, file, tuple(tables), tuple(chunks), tuple(numbers), found.moving or _led(problem))
 
 
 def _problem(

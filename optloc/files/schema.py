@@ -100,7 +100,7 @@ class MeasurementsTable(DataTable):
     carrier_hz: float | None = Field(default=None, gt=0.0)
     """Carrier frequency; needed by the unit Hz."""
     sigma: Amount | None = None
-    """Standard deviation of each row."""
+    """Standard deviation of each row; "estimate": one for each kind, found from the data."""
     arrival_sigma: Amount | dict[str, Amount] | None = None
     """Standard deviation of the arrival at each station; rows of an epoch that share a station are then correlated."""
     covariance: list[list[float]] | None = None

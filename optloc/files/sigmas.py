@@ -13,6 +13,12 @@ from optloc.models import Model
 from optloc.types import Array
 from optloc.units import Conversion
 
+ESTIMATE = "estimate"
+"""Word in the place of a standard deviation that is to be found from the data."""
+
+# Where the search for a level begins, in SI units: it decides nothing but how kinds are weighed in the first fixes.
+_BEGIN = {"length": 1.0, "angle": 1e-2, "ratio": 1e-2, "speed": 0.1}
+
 
 def spread_of(
     c: Context, model: Model, units: Units, unit: Conversion, z: Array
@@ -39,6 +45,8 @@ def spread_of(
         raise InvalidProblem("the noise is given more than once", c.where, "give sigma, arrival_sigma or covariance")
     if column:
         return _positive(c, unit.sigma_to_si(c.table.numbers("sigma"), z), column=True), None, None
+    if section.sigma == ESTIMATE:
+        return np.full(z.shape, _BEGIN[model.quantity]), None, None
     if section.sigma is not None:
         number, own = units.amount(section.sigma, unit, join(c.where, "key 'sigma'"))
         return _positive(c, np.broadcast_to(own.sigma_to_si(number, z), z.shape), column=False), None, None

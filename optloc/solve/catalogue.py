@@ -12,7 +12,10 @@ from optloc.solve.branches import first_that_proves
 from optloc.solve.certify import certified, value_certified
 from optloc.solve.direct import shortened
 from optloc.solve.reference import by_reference
+from optloc.solve.robust import STAGES as ROBUST
+from optloc.solve.sparse import sparse
 from optloc.solve.stages import Solver
+from optloc.solve.suspects import suspected
 
 
 def _nlp(problem: Problem, fix: Fix | None) -> Fix:
@@ -70,6 +73,9 @@ SOLVERS: dict[str, Entry] = {
     "roots": Entry(stages.roots, "every stationary point of the squared-range problem", "start"),
     "sdp": Entry(stages.sdp, "Shor's semidefinite relaxation of the squared-range problem (Clarabel)", "start"),
     "socp": Entry(stages.socp, "second-order cone relaxation of the squared-range problem (Clarabel)", "start"),
+    "sparse": Entry(
+        sparse, "convex start in which a few rows are grossly wrong, and the fix without them (Clarabel)", "start"
+    ),
     "wiv": Entry(stages.wiv, "pseudo-linear angles with an instrumental-variable pass", "start"),
     "directions": Entry(stages.directions, "semidefinite relaxation over unit directions (Clarabel); angles", "start"),
     "minimax": Entry(stages.minimax, "least worst angle by second-order cones (Clarabel); bounded errors", "start"),
@@ -86,7 +92,14 @@ SOLVERS: dict[str, Entry] = {
     "bound": Entry(
         by_reference, "compares the cost with the bound of a relaxation (Clarabel): angles, ranges", "refinement"
     ),
+    "suspects": Entry(
+        suspected, "leaves out the stations, rows and priors that contradict the rest, and names them", "refinement"
+    ),
     "taylor": Entry(stages.taylor, "plain undamped Taylor iteration; a baseline, it diverges", "refinement"),
+    "huber": Entry(ROBUST["huber"], "Huber's convex loss: gross errors pull no harder than 1.3 sigma", "start"),
+    "cauchy": Entry(ROBUST["cauchy"], "Cauchy's loss: the larger an error the less it pulls", "start"),
+    "truncated": Entry(ROBUST["truncated"], "least squares without the rows that are 2.8 sigma off", "start"),
+    "late": Entry(ROBUST["late"], "doubts ranges and arrivals that are too long: blocked paths", "start"),
 }
 
 # Machine code takes time to load, more than the stages take for fewer problems.
@@ -96,6 +109,7 @@ METHODS = {
     "auto": "gtrs+lsr+certify|roots+lsr+widen+lsr+search+certify",
     "searched": "roots+lsr+widen+lsr+search",
     "proven": "roots+lsr+widen+lsr+search+bound",
+    "robust": "roots+lsr+widen+lsr+search+suspects",
 }
 
 _RANGES = "range, toa, tdoa, range_sum; azimuth, elevation and groa rows linear in (x, r)"
@@ -117,6 +131,13 @@ FORMULATIONS: dict[str, Formulation] = {
         "a lower bound; tight where the linear fit violates |x| <= r, about half of all TDOA cases",
         "0.2 ms",
         "convex hull of the cone",
+    ),
+    "sparse_errors": Formulation(
+        "linear rows with gross errors of a few, priced by the sum of their sizes, on the cones of the ranges",
+        _RANGES,
+        "convex, not exact: a start and a guess of the wrong rows; from about 20 stations both are good",
+        "1 ms",
+        "Donoho, Johnstone 1994; Yuan, Lin 2006; She, Owen 2011",
     ),
     "range_height": Formulation(
         "ranges known up to one unknown meet an ellipsoid: a quartic, with horizon",

@@ -79,20 +79,20 @@ def lifted_rows(problem: Problem, rows: Rows, start: int, found: Ranges | None, 
         return None
     a, b = (_point(problem, rows, index, to) for index in (rows.a, rows.b))
     m = rows.z - rows.correction
-    azimuth = _azimuth_beside(problem, rows) if rows.kind == "elevation" else None
-    if azimuth is not None:
+    azimuth, paired = _azimuth_beside(problem, rows) if rows.kind == "elevation" else (None, None)
+    if azimuth is not None and (found is None or bool(np.all(paired))):
         made: Row | None = _paired_elevation(m, azimuth, a)
     else:
         lifted = lifted_row(model, m, a, b)
         assert lifted is not None
-        made = _substituted(lifted, rows, a, b, found, to)
+        made, paired = _substituted(lifted, rows, a, b, found, to), None
     if made is None:
         return None
     row, right, factor = made
     size = problem.batch_shape[0]
     row, right = np.broadcast_to(row, (size, *row.shape[-2:])), np.broadcast_to(right, (size, right.shape[-1]))
     weight = np.broadcast_to(rows.weight, right.shape)
-    present = weight > 0.0
+    present = (weight > 0.0) & (True if paired is None else paired)
     sigma = np.sqrt(variances(problem.noise, problem.count)[..., start : start + rows.count])
     sigma = sigma / np.sqrt(np.where(present, weight, 1.0))
     return Lifted(np.where(present[..., None], row, 0.0), np.where(present, right, 0.0), sigma, factor)
@@ -111,17 +111,21 @@ def _point(problem: Problem, rows: Rows, index: Array, to: Coordinates) -> Point
     return Point(components, None, tuple(tuple(axes[..., i, c] for c in d) for i in d))
 
 
-def _azimuth_beside(problem: Problem, rows: Rows) -> Array | None:
-    """Return the azimuth beside each elevation (same station, target and epoch), (..., m); None if any lacks one."""
+def _azimuth_beside(problem: Problem, rows: Rows) -> tuple[Array | None, Array | None]:
+    """Return the azimuth beside each elevation (same station, target and epoch), (..., m), and where it is present.
+
+    None if any has no such row. An absent elevation is taken for present: it needs no azimuth.
+    """
     for other in problem.rows:
         if other.kind != "azimuth":
             continue
         keys = list(zip(other.a.tolist(), other.epoch.tolist(), other.target.tolist(), strict=True))
         wanted = list(zip(rows.a.tolist(), rows.epoch.tolist(), rows.target.tolist(), strict=True))
         pick = [keys.index(key) for key in wanted if key in keys]
-        if len(pick) == len(wanted) and bool((other.weight[..., pick] >= (rows.weight > 0.0)).all()):
-            return np.asarray(other.z[..., pick] - other.correction[..., pick])
-    return None
+        if len(pick) == len(wanted):
+            there = (other.weight[..., pick] > 0.0) | (rows.weight == 0.0)
+            return np.asarray(other.z[..., pick] - other.correction[..., pick]), np.asarray(there)
+    return None, None
 
 
 def _paired_elevation(m: Array, azimuth: Array, a: Point) -> Row:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from optloc.fix import Alternatives, Fix, Stage
 from optloc.types import Array
+
+_NAMES = "x cov code reason certificate cost dof weights active local explanations".split()
 
 
 def merged(fix: Fix, items: Array, other: Fix, stage: Stage) -> Fix:
@@ -28,11 +31,24 @@ def merged(fix: Fix, items: Array, other: Fix, stage: Stage) -> Fix:
     mine, theirs = _padded(fix.alternatives, width), _padded(other.alternatives, width)
     mine.x[items], mine.gap[items] = theirs.x, theirs.gap
     changed: dict[str, Array] = {}
-    for name in ("x", "cov", "code", "reason", "certificate", "cost", "dof", "weights", "active", "local"):
+    for name in _NAMES:
         if (old := getattr(fix, name)) is not None:
             changed[name] = np.array(old)
             changed[name][items] = getattr(other, name)
     return replace(fix, alternatives=mine, stages=(*fix.stages, stage), **changed)  # type: ignore[arg-type]
+
+
+def stacked(fixes: Sequence[Fix]) -> Fix:
+    """Return single fixes of one layout as a batch."""
+    width = max(len(fix.alternatives.gap) for fix in fixes)
+    every = [_padded(fix.flat().alternatives, width) for fix in fixes]
+    others = Alternatives(np.concatenate([a.x for a in every]), np.concatenate([a.gap for a in every]))
+    arrays = {name: np.stack([getattr(fix, name) for fix in fixes]) for name in _NAMES if _has(fixes, name)}
+    return replace(fixes[0], alternatives=others, **arrays)  # type: ignore[arg-type]
+
+
+def _has(fixes: Sequence[Fix], name: str) -> bool:
+    return all(getattr(fix, name) is not None for fix in fixes)
 
 
 def _padded(alternatives: Alternatives, width: int) -> Alternatives:

@@ -12,7 +12,7 @@ from optloc.problem import Problem
 from optloc.types import Array
 
 PART = 2**15
-_NAMES = ("x", "cov", "code", "reason", "certificate", "cost", "dof", "active", "local")
+_NAMES = ("x", "cov", "code", "reason", "certificate", "cost", "dof", "active", "local", "explanations")
 
 
 def in_parts(problem: Problem, work: Callable[[Problem, slice], Fix], most: int = PART) -> Fix:
@@ -33,6 +33,7 @@ def in_parts(problem: Problem, work: Callable[[Problem, slice], Fix], most: int 
     arrays: dict[str, Array] = {}
     others: list[Alternatives] = []
     stages: list[tuple[Stage, ...]] = []
+    weights: list[Array] = []
     fix = None
     for first in range(0, count, most):
         part = slice(first, min(first + most, count))
@@ -45,9 +46,12 @@ def in_parts(problem: Problem, work: Callable[[Problem, slice], Fix], most: int 
                 arrays[name][part] = value
         others.append(fix.alternatives)
         stages.append(fix.stages)
+        weights.append(fix.weights)
     assert fix is not None
-    weights = np.broadcast_to(problem.weight, (count, problem.count))
-    whole = replace(fix, alternatives=_joined(others), weights=weights, stages=_summed(stages))
+    given = np.broadcast_to(problem.weight, (count, problem.count))
+    kept = all(np.array_equal(part, given[: len(part)]) for part in weights) and not given.strides[0]
+    used = given if kept else np.concatenate(weights)
+    whole = replace(fix, alternatives=_joined(others), weights=used, stages=_summed(stages))
     return replace(whole, **arrays)  # type: ignore[arg-type]
 
 

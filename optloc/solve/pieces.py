@@ -34,6 +34,8 @@ def one_position(problem: Problem) -> bool:
 def from_pieces(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
     """Return one starting vector (N, 1, size) for a flat batch of problems with several targets or epochs.
 
+    A state that its rows do not tell starts from its prior, where it has one.
+
     Parameters
     ----------
     problem : Problem
@@ -43,6 +45,7 @@ def from_pieces(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
     """
     x = vectors(problem, None)[:, None]
     n, length = problem.layout.n_shared, problem.layout.n_local
+    known = {prior.name for prior in problem.priors}
     for i, motion in enumerate(problem.motions):
         if motion.known is not None:
             continue
@@ -53,7 +56,9 @@ def from_pieces(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
         for j, name in enumerate(names):
             slot, shared = problem.layout.find(name)
             if shared:
-                x[:, 0, slot.start : slot.start + slot.size] = state[:, 0, j]
+                own, found = slice(slot.start, slot.start + slot.size), state[:, 0, j]
+                usable = np.isfinite(found) | (name not in known)  # else its prior mean, which stands there
+                x[:, 0, own] = np.where(usable, found, x[:, 0, own])
                 continue
             for k in range(problem.epochs):
                 start = n + k * length + slot.start

@@ -16,7 +16,7 @@ from optloc.fix import Alternatives, Fix, Stage
 from optloc.normal import Normal
 from optloc.problem import Problem
 from optloc.solve.angles import Bearings, bearings, by_directions, instrumental, least_worst
-from optloc.solve.bounded import bounded
+from optloc.solve.bounded import bounded, contradicted
 from optloc.solve.freedom import degrees_of_freedom
 from optloc.solve.heights import height_starts
 from optloc.solve.merge import merged
@@ -156,7 +156,8 @@ def search(problem: Problem, fix: Fix | None) -> Fix:
     """Return a fix whose unanswered problems were searched from many places; such answers say so in their status."""
     if fix is None:
         raise InvalidProblem("search fills the gaps of a fix", "method", "put it behind a refinement")
-    lost = ~fix.answered & ~np.isin(fix.code, (Status.REJECTED, Status.TOO_FEW_ROWS, Status.INFEASIBLE))
+    settled = (Status.REJECTED, Status.TOO_FEW_ROWS, Status.INFEASIBLE, Status.CONTRADICTORY)
+    lost = ~fix.answered & ~np.isin(fix.code, settled)
     lost &= fix.dof >= np.where(fix.code == Status.DISCONNECTED, 1, 0)
     items = np.flatnonzero(lost)
     if not len(items) or not one_position(problem):
@@ -193,9 +194,11 @@ def lsr(problem: Problem, fix: Fix | None, *, damped: bool = True, limit: int = 
         detail = f"{len(item)} candidates, {int(done.iterations.max())} steps at most"
         count("lsr", int(done.iterations.sum()))
     candidates = Candidates(pool, cost, code, np.zeros(cost.shape, dtype=int))
+    free = candidates
     if damped:
         candidates = bounded(problem, candidates)
-    return finished(problem, fix, candidates, Stage("lsr" if damped else "taylor", detail, perf_counter() - began))
+    refined = finished(problem, fix, candidates, Stage("lsr" if damped else "taylor", detail, perf_counter() - began))
+    return contradicted(refined, free) if problem.constraints else refined
 
 
 def pooled(fix: Fix) -> tuple[Array, Array, Array]:

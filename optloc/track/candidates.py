@@ -52,7 +52,7 @@ def candidates(problem: Problem) -> Candidates:
     InvalidProblem
         Where stations or noise differ between the runs of a batch.
     """
-    first, members = _channels(problem)
+    first, members = channels_of(problem)
     rows, values = [], []
     width = max((len(found) for found in members), default=0)
     z = np.where(problem.weight > 0.0, problem.observed, np.nan)
@@ -84,7 +84,7 @@ def checked(given: Candidates) -> Candidates:
     return Candidates(replace(given.channels, rows=rows), given.z - correction[:, None])
 
 
-def _channels(problem: Problem) -> tuple[Array, list[Array]]:
+def channels_of(problem: Problem) -> tuple[Array, list[Array]]:
     """Return the first row of each channel, ascending, and all rows of each."""
     keys = [
         (kind, int(epoch), int(a), int(b))

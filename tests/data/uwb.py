@@ -1,7 +1,8 @@
 """Reader of `util_uwb_tdoa`: windows of indoor UWB range differences, each one epoch of a free target.
 
-Windows are 0.1 s long and centred at every half second of a flight in which the tag is higher than 0.5 m. The file's
-`rdiff_m` is |tag - anchor_b| - |tag - anchor_a|, so a row is optloc's tdoa, r_a - r_b, with a and b exchanged.
+Windows are 0.1 s long (TDOA3, where pairs are rarer: 0.3 s) and centred at every half second of a flight in which the tag
+is higher than 0.5 m. The file's `rdiff_m` is |tag - anchor_b| - |tag - anchor_a|, so a row is optloc's tdoa, r_a - r_b,
+with a and b exchanged.
 
 Noise. A row is off by 0.22 m (F01) or 0.19 m (F03; robust spread in the set's README), but not independently of the
 other rows of its window: the rows of one pair repeat within 0.05 m (robust; 0.11 m rms in F01, as the tails are heavy
@@ -34,7 +35,8 @@ from optloc import Motion, Noise, Problem, assemble, measured
 from optloc.noise import Block, group
 
 ROW, ARRIVAL, INDEPENDENT = 0.10, 0.14, 0.2
-STEP, WIDTH, AIRBORNE = 0.5, 0.1, 0.5
+STEP, AIRBORNE = 0.5, 0.5
+WIDTH = {"TDOA2": 0.1, "TDOA3": 0.3}
 
 
 def load(folder: Path, flight: str, *, shared: bool = True) -> Windows:
@@ -45,7 +47,8 @@ def load(folder: Path, flight: str, *, shared: bool = True) -> Windows:
     truth = pd.read_csv(folder / "truth.csv").query("flight == @flight")
     rows = pd.read_csv(folder / "tdoa.csv").query("flight == @flight").sort_values("t_s", kind="stable")
     stations = anchors[["x_m", "y_m", "z_m"]].to_numpy()
-    rows, at = windowed(rows, truth, np.arange(0.0, truth["t_s"].max() + 0.01, STEP), WIDTH)
+    width = WIDTH[str(flights.loc[flight, "mode"])]
+    rows, at = windowed(rows, truth, np.arange(0.0, truth["t_s"].max() + 0.01, STEP), width)
     rows = rows[at[rows["window"], 2] > AIRBORNE]
     kept, epoch = np.unique(rows["window"], return_inverse=True)
     a, b, z = rows["anchor_b"].to_numpy(), rows["anchor_a"].to_numpy(), rows["rdiff_m"].to_numpy()

@@ -1,0 +1,300 @@
+r"""Linear rows of which a few are grossly wrong, with the position in second-order cones.
+
+.. math::
+    \min_{y, e} \; \tfrac12 |B y - g - e|^2 + \sum_g \lambda_g |e_g| \quad\text{subject to}\quad
+    |M_k (y, 1)| \le m_k^\top (y, 1), \; k = 1, \dots, K
+
+The rows are whitened; `e` are gross errors in sigmas, zero in all rows but a few; :math:`e_g` are those of one group of
+rows (one row by default, or all rows of one station). The penalty is the convex hull of counting the groups in error,
+so the programme is convex: without cones it is the regression with Huber's loss of threshold :math:`\lambda`, and
+
+.. math:: e_g = (1 - \lambda_g / |r_g|)_+ \, r_g, \quad r = B y - g
+
+at every optimum. Groups with :math:`e_g \ne 0` are the *support*. What is relaxed: the count of wrong groups becomes
+the sum of their sizes, which pulls every one of them towards zero by :math:`\lambda_g`; and the quadrics on which
+squared ranges lie become the cones that they bound. The answer is therefore a start and a guess of the support, to be
+refined and tested without the rows of the support; it is no estimate.
+
+The threshold is the universal one, :math:`\lambda = \sqrt{2 \ln m}` of m rows, which the largest of m normal errors
+exceeds with a probability that goes to zero; a group of p rows has the threshold that :math:`\chi_p` exceeds as seldom.
+
+Sources: D. L. Donoho and I. M. Johnstone, "Ideal spatial adaptation by wavelet shrinkage", Biometrika 81 (1994) (the
+universal threshold); M. Yuan and Y. Lin, "Model selection and estimation in regression with grouped variables", J. R.
+Stat. Soc. B 68 (2006), section 2 (groups); Y. She and A. B. Owen, "Outlier detection using nonconvex penalized
+regression", J. Am. Stat. Assoc. 106 (2011) (the penalty on errors is Huber's loss).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri, erfc
+
+from formulations.conic import Answer, Relaxation, kept
+
+Array = NDArray[np.float64]
+Index = NDArray[np.intp]
+
+_RANK = 1e-10
+_TIGHT = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10}
+
+
+@dataclass(frozen=True, slots=True)
+class SparseFit:
+    """Answer of a fit with gross errors.
+
+    Parameters
+    ----------
+    y : Array, shape (n,)
+        Unknowns; NaN where the programme has no answer or the rows leave a direction of y open.
+    errors : Array, shape (m,)
+        Gross error of each row in sigmas, exactly zero outside the support.
+    value : float
+        Cost at `y` and `errors`.
+    bound : float
+        Lower bound of the cost, recomputed from the dual; minus infinity where none was asked for.
+    answer : Answer, optional
+        The solver's report; None where the rows leave a direction open.
+    """
+
+    y: Array
+    errors: Array
+    value: float
+    bound: float
+    answer: Answer | None
+
+
+def thresholds(sizes: NDArray[np.intp]) -> Array:
+    """Universal threshold of each group of rows.
+
+    Parameters
+    ----------
+    sizes : int array, shape (G,)
+        Rows of each group; an empty group has the threshold of one row.
+
+    Returns
+    -------
+    Array, shape (G,)
+        In sigmas: ``sqrt(2 ln G)`` for single rows, for more the value that ``chi`` exceeds with the same probability.
+
+    Notes
+    -----
+    Donoho and Johnstone (1994). At least one, so that a single group has a threshold too.
+    """
+    count = max(int((np.asarray(sizes) > 0).sum()), 2)
+    level = max(np.sqrt(2.0 * np.log(count)), 1.0)
+    return np.asarray(np.sqrt(chdtri(np.maximum(sizes, 1), erfc(level / np.sqrt(2.0)))), dtype=np.float64)
+
+
+def sparse_problem(n: int, groups: tuple[int, ...], cones: tuple[int, ...]) -> Any:
+    """Build the programme as a cvxpy problem with parameters.
+
+    Parameters
+    ----------
+    n : int
+        Length of y.
+    groups : tuple of m int
+        Group of each row, counted from zero.
+    cones : tuple of K int
+        Length of the vector in each cone.
+
+    Returns
+    -------
+    cvxpy.Problem
+        Parameters ``rows`` (m, n), ``right`` (m,), ``price`` (G,) and one ``cone k`` (length + 1, n + 1) for each cone:
+        the vector's rows, then that of its bound; variables ``y``, ``error``.
+
+    Notes
+    -----
+    Yuan and Lin (2006), section 2, with one more unknown for each row.
+    """
+    import cvxpy as cp
+
+    m, member = len(groups), np.asarray(groups)
+    rows, right = cp.Parameter((m, n), name="rows"), cp.Parameter(m, name="right")
+    price = cp.Parameter(int(member.max(initial=-1)) + 1, nonneg=True, name="price")
+    y, error = cp.Variable(n, name="y"), cp.Variable(m, name="error")
+    if len(set(groups)) == m:
+        size = price[member] @ cp.abs(error)
+    else:
+        size = sum(price[i] * cp.norm(error[np.flatnonzero(member == i)]) for i in sorted(set(groups)))
+    inside = []
+    for k, length in enumerate(cones):
+        matrix = cp.Parameter((length + 1, n + 1), name=f"cone {k}")
+        both = matrix[:, :n] @ y + matrix[:, n]
+        inside.append(cp.SOC(both[length], both[:length]))
+    return cp.Problem(cp.Minimize(0.5 * cp.sum_squares(rows @ y - right - error) + size), inside)
+
+
+@kept(64)
+def _built(n: int, groups: tuple[int, ...], cones: tuple[int, ...], backend: str) -> Relaxation:
+    return Relaxation(
+        sparse_problem(n, groups, cones), backend=backend, settings=_TIGHT if backend == "CLARABEL" else {}
+    )
+
+
+def sparse_fit(
+    B: Array,
+    g: Array,
+    groups: Index | None = None,
+    *,
+    price: Array | None = None,
+    cones: Sequence[Array] = (),
+    backend: str = "CLARABEL",
+    bound: bool = False,
+) -> SparseFit:
+    """Fit linear rows of which a few are grossly wrong.
+
+    Parameters
+    ----------
+    B : Array, shape (m, n)
+        Whitened rows; absent rows are zero.
+    g : Array, shape (m,)
+        Right sides.
+    groups : int array, shape (m,), optional
+        Group of each row, counted from zero; each row its own by default.
+    price : Array, shape (G,), optional
+        Threshold of each group in sigmas; `thresholds` of the rows that are present by default.
+    cones : sequence of Array, shape (p + 1, n + 1)
+        The first p rows times ``(y, 1)`` are a vector that is no longer than the last row times ``(y, 1)``.
+    backend : str
+        Conic solver.
+    bound : bool
+        Whether to recompute the lower bound from the dual.
+
+    Returns
+    -------
+    SparseFit
+        The programme is built once for each structure and back end in each process.
+
+    Raises
+    ------
+    ValueError
+        Where the shapes do not fit each other.
+
+    Notes
+    -----
+    Solved in the coordinates ``z = S V' y`` of the singular value decomposition ``B = U S V'`` less the least-squares
+    fit: numbers are sigmas, however small the noise is against the distances.
+    """
+    B, g = np.asarray(B, dtype=np.float64), np.asarray(g, dtype=np.float64)
+    m, n = B.shape
+    member = np.arange(m) if groups is None else np.asarray(groups)
+    if g.shape != (m,) or member.shape != (m,) or any(c.shape[1] != n + 1 for c in cones):
+        raise ValueError(f"rows {B.shape}, right sides {g.shape}, groups {member.shape} and cones do not fit")
+    present = np.asarray((B != 0.0).any(axis=1))
+    price = thresholds(np.bincount(member, weights=present).astype(np.intp)) if price is None else price
+    nothing = SparseFit(np.full(n, np.nan), np.zeros(m), np.nan, -np.inf, None)
+    if m < n or not (np.isfinite(B).all() and np.isfinite(g).all()):
+        return nothing
+    left, size, across = np.linalg.svd(B, full_matrices=False)
+    if size[-1] <= _RANK * size[0]:
+        return nothing
+    back, centre = across.T / size, (across.T / size) @ (left.T @ g)
+    off = g - B @ centre
+    scale = max(float(np.abs(off).max()), 1.0)
+    values = {"rows": left, "right": off / scale, "price": price / scale}
+    for k, given in enumerate(cones):
+        moved = np.concatenate([given[:, :n] @ back, (given[:, :n] @ centre + given[:, n])[:, None] / scale], axis=1)
+        values[f"cone {k}"] = moved / np.abs(moved).max()
+    structure = (n, tuple(member.tolist()), tuple(len(c) - 1 for c in cones))
+    answer = _built(*structure, backend).solve(values, bound=bound)
+    y = centre + back @ (scale * answer.values["y"])
+    errors = shrunk(B @ y - g, member, price)
+    rest = B @ y - g - errors
+    value = 0.5 * float(rest @ rest) + float(price @ group_sizes(errors, member, len(price)))
+    return SparseFit(y, errors, value, answer.bound * scale**2, answer)
+
+
+def group_sizes(values: Array, groups: Index, count: int) -> Array:
+    """Euclidean length of the values of each group.
+
+    Parameters
+    ----------
+    values, groups : Array and int array, shape (m,)
+        A value and the group of each row.
+    count : int
+        Number of groups G.
+
+    Returns
+    -------
+    Array, shape (G,)
+        Zero of an empty group.
+    """
+    return np.sqrt(np.bincount(groups, weights=values * values, minlength=count))
+
+
+def shrunk(residual: Array, groups: Index, price: Array) -> Array:
+    """Gross errors that cost least at given residuals.
+
+    Parameters
+    ----------
+    residual : Array, shape (m,)
+        ``By - g`` in sigmas.
+    groups : int array, shape (m,)
+        Group of each row.
+    price : Array, shape (G,)
+        Thresholds.
+
+    Returns
+    -------
+    Array, shape (m,)
+        Residuals drawn towards zero by the threshold of their group; exactly zero where the group is within it.
+
+    Notes
+    -----
+    Yuan and Lin (2006), section 2: the group form of soft thresholding.
+    """
+    size = group_sizes(residual, groups, len(price))
+    share = np.maximum(1.0 - price / np.where(size > 0.0, size, np.inf), 0.0)
+    return np.asarray(share[groups] * residual)
+
+
+def range_cone(apex: Array, n: int, column: int) -> Array:
+    """Cone ``|x - apex| <= y[column]``: a range is not shorter than the way.
+
+    Parameters
+    ----------
+    apex : Array, shape (d,)
+        Station.
+    n : int
+        Length of y, whose first d entries are x.
+    column : int
+        Entry of y that holds the range.
+
+    Returns
+    -------
+    Array, shape (d + 1, n + 1)
+        One of `cones`; the convex hull of ``|x - apex| = y[column]``.
+    """
+    d = len(apex)
+    cone = np.zeros((d + 1, n + 1))
+    cone[np.arange(d), np.arange(d)], cone[:d, n], cone[d, column] = 1.0, -apex, 1.0
+    return cone
+
+
+def square_cone(d: int, n: int, column: int) -> Array:
+    """Cone ``|x|^2 <= y[column]``, as ``|(2 x, y[column] - 1)| <= y[column] + 1``.
+
+    Parameters
+    ----------
+    d : int
+        Dimension of x.
+    n : int
+        Length of y, whose first d entries are x.
+    column : int
+        Entry of y that holds the square.
+
+    Returns
+    -------
+    Array, shape (d + 2, n + 1)
+        One of `cones`; the convex hull of ``|x|^2 = y[column]``.
+    """
+    cone = np.zeros((d + 2, n + 1))
+    cone[np.arange(d), np.arange(d)] = 2.0
+    cone[d, column], cone[d, n], cone[d + 1, column], cone[d + 1, n] = 1.0, -1.0, 1.0, 1.0
+    return cone

@@ -1,0 +1,239 @@
+"""Health of stations over many fixes: what the others say of each, its offset, noise and gross errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optloc.fix import Fix
+from optloc.models import MODELS
+from optloc.problem import Problem
+from optloc.quality.components import snooped
+from optloc.quality.elements import Elements, batch_of, elements
+from optloc.quality.groups import By, ends_of
+from optloc.quality.levels import NoiseLevels, levels_of, usable
+from optloc.quality.offsets import Offsets, offsets_of
+from optloc.quality.redundancy import tested
+from optloc.types import Array
+from optloc.units import SI_UNIT
+
+OUTLIER = 3.0
+"""Size of a test, in standard deviations, from which a measurement is called an outlier."""
+
+_ROUNDS = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """What many fixes say of G stations (pairs, kinds), in SI units and radians; NaN where they say nothing.
+
+    Residuals are left-out ones: the measurement less what the rest of its fix, without this station, predicts, with the
+    offsets of the others taken out. A station's error is not absorbed by the fix that it is compared with.
+
+    Parameters
+    ----------
+    by : "station", "pair" or "kind"
+        What makes a group.
+    names, units : tuple of G str
+        Groups and the unit of their measurements.
+    count : int array (G,)
+        Fixes that it takes part in and that the others can check.
+    bias, bias_error : array (G,)
+        Offset, from all stations together, and its standard error.
+    scale, scale_error : array (G,)
+        Growth of the offset with the path, metres a metre.
+    noise, noise_error : array (G,)
+        Standard deviation of its errors, which a fix takes no part of, and its standard error.
+    outliers : array (G,)
+        Share of its measurements that are outliers: beyond three standard deviations, one at a time.
+    suspect : array (G,)
+        Share of its fixes that name it as a suspect; NaN where the method names none.
+    levels : NoiseLevels
+        More about the noise.
+    epoch, group : int array (n,)
+        Problem of the batch and group of each residual.
+    residual, sigma : array (n,)
+        Left-out residuals, biases included, and their standard deviations.
+    outlying : bool array (n,)
+        Which are outliers.
+    sentences : tuple of str
+        What the data do not tell.
+    """
+
+    by: By
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    count: Array
+    bias: Array
+    bias_error: Array
+    scale: Array
+    scale_error: Array
+    noise: Array
+    noise_error: Array
+    outliers: Array
+    suspect: Array
+    levels: NoiseLevels
+    epoch: Array
+    group: Array
+    residual: Array
+    sigma: Array
+    outlying: Array
+    sentences: tuple[str, ...]
+
+
+def health(problem: Problem, by: By = "station", *, method: str = "auto", fix: Fix | None = None) -> Health:
+    """Return the health of the stations of a problem with many epochs.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its epochs, or its batch, are the fixes.
+    by : "station", "pair" or "kind"
+        What a bias and a noise belong to.
+    method : str
+        How to fix, see `solve`; one that resists outliers is best.
+    fix : Fix, optional
+        Fixes of `batch_of(problem)` made before.
+
+    Returns
+    -------
+    Health
+        Biases that the data show only relative to each other are relative to their mean over all rows, and a sentence
+        says so.
+
+    Raises
+    ------
+    InvalidProblem
+        Where no epoch has a fix, or none has redundancy.
+    """
+    from optloc.solve import solve
+
+    batch = batch_of(problem)
+    if fix is None and batch.layout.size:
+        fix = solve(batch, method)
+    return health_of(batch, usable(batch, fix), by, None if fix is None else getattr(fix, "explanations", None))
+
+
+def health_of(batch: Problem, fixed: tuple[Array, Array], by: By, explained: Array | None = None) -> Health:
+    """Return the health of stations from fixes that were made already.
+
+    Parameters
+    ----------
+    batch : Problem
+        Of `batch_of`.
+    fixed : int array (n,), array (n, size)
+        Which of its problems have a fix, and their parameter vectors; of `usable`.
+    by : "station", "pair" or "kind"
+        As in `health`.
+    explained : object array (N,), optional
+        Explanations of all fixes, where suspects were looked for.
+    """
+    kept, x = fixed
+    made = elements(batch.take(kept), x, by)
+    levels, offsets = _settled(made, by)
+    found = snooped(
+        tested(_unbiased(made, offsets), _variance(made, levels)), slice(made.effect.shape[-1], None), OUTLIER
+    )
+    item, own = np.nonzero(np.isfinite(found.sigma) & (made.of_offset >= 0))
+    group = made.of_offset[item, own]
+    outlying = found.gross[item, own]
+    count = np.bincount(group, minlength=len(made.names))
+    used = np.flatnonzero(count)
+    number = np.full(len(made.names), -1)
+    number[used] = np.arange(len(used))
+    names = tuple(made.names[g] for g in used)
+    own_level = [levels.names.index(name) if name in levels.names else -1 for name in names]
+    noise, noise_error = (np.append(v, np.nan)[own_level] for v in (levels.sigma, levels.sigma_error))
+    return Health(
+        by=by,
+        names=names,
+        units=_units(batch, by, names),
+        count=count[used],
+        bias=offsets.value[used],
+        bias_error=offsets.error[used],
+        scale=offsets.slope[used],
+        scale_error=offsets.slope_error[used],
+        noise=noise,
+        noise_error=noise_error,
+        outliers=np.bincount(group, outlying, len(made.names))[used] / count[used],
+        suspect=_suspected(batch, explained, by, names),
+        levels=levels,
+        epoch=kept[item],
+        group=number[group],
+        residual=found.shift[item, own] + offsets.value[group],
+        sigma=found.sigma[item, own],
+        outlying=outlying,
+        sentences=(*levels.sentences, *_sentences(offsets, made.names, used)),
+    )
+
+
+def _settled(made: Elements, by: By) -> tuple[NoiseLevels, Offsets]:
+    """Return noise levels and offsets that belong together: each is found with the other known."""
+    offsets = offsets_of(made, tested(made, np.ones(())))
+    for _ in range(_ROUNDS):
+        levels = levels_of(_unbiased(made, offsets), by)
+        offsets = offsets_of(made, tested(made, _variance(made, levels)))
+    return levels, offsets
+
+
+def _unbiased(made: Elements, offsets: Offsets) -> Elements:
+    """Return the elements with the offsets taken out of the residuals."""
+    value = np.append(np.nan_to_num(offsets.value), 0.0)[made.of_offset]
+    return replace(made, residual=made.residual - (made.offset @ value[..., None])[..., 0])
+
+
+def _variance(made: Elements, levels: NoiseLevels) -> Array:
+    """Return the variance (N, q) of each error."""
+    factor = dict(zip(levels.names, levels.factor.tolist(), strict=True))
+    return np.array([*(factor.get(name, 1.0) for name in made.names), 1.0])[made.of_effect] ** 2
+
+
+def _units(batch: Problem, by: By, names: tuple[str, ...]) -> tuple[str, ...]:
+    ends = ends_of(batch, by).name
+    found: dict[str, str] = {}
+    for rows, start in zip(batch.rows, batch.starts, strict=True):
+        unit = SI_UNIT[MODELS[rows.kind].quantity]  # type: ignore[index]  # the table holds known quantities only
+        found |= dict.fromkeys(ends[start : start + rows.count].ravel().tolist(), unit)
+    return tuple(found[name] for name in names)
+
+
+def _suspected(batch: Problem, explained: Array | None, by: By, names: tuple[str, ...]) -> Array:
+    """Return the share (G,) of the fixes with a group that name it, or one of its rows, as a suspect."""
+    if explained is None:
+        return np.full(len(names), np.nan)
+    ends = ends_of(batch, by).name
+    heard, hits = dict.fromkeys(names, 0), dict.fromkeys(names, 0)
+    weight = np.broadcast_to(batch.weight, (len(np.ravel(explained)), batch.count))
+    for own, present in zip(np.ravel(explained), weight > 0.0, strict=True):
+        for name in {*ends[present].ravel().tolist()} & heard.keys():
+            heard[name] += 1
+        suspects = own[0].suspects if own else ()
+        for name in {n for s in suspects for n in _named(s.name, s.group, ends[list(s.rows)], by)} & hits.keys():
+            hits[name] += 1
+    return np.array([hits[name] / max(heard[name], 1) for name in names])
+
+
+def _named(name: str, group: str, ends: Array, by: By) -> set[str]:
+    """Return the groups that a suspect means: those of its rows, or of a station those that bear its name."""
+    touched = {*ends.ravel().tolist()} - {""}
+    if group != "station" or by != "station":
+        return touched
+    own = name.removeprefix("station ")
+    return {n for n in touched if n == own or n.startswith(f"{own} ")}
+
+
+def _sentences(offsets: Offsets, names: tuple[str, ...], used: Array) -> tuple[str, ...]:
+    """Return one sentence for each combination of offsets that the data do not show."""
+    said = []
+    for direction in offsets.open:
+        share = np.abs(direction[used]) > 1e-3 * np.abs(direction).max()
+        who = [names[g] for g in used[share]]
+        listed = ", ".join(who[:6]) + (f" and {len(who) - 6} more" if len(who) > 6 else "")
+        if len(who) == 1:
+            said.append(f"the data do not show a bias of {listed}")
+        elif np.ptp(direction[used][share]) < 1e-3 * np.abs(direction).max():
+            said.append(f"biases of {listed} are relative to their mean over all rows: a common one is not seen")
+        else:
+            said.append(f"the data do not show every combination of the biases of {listed}: others are taken as zero")
+    return tuple(dict.fromkeys(said))

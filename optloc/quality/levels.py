@@ -1,0 +1,236 @@
+"""Noise from data: how large the errors of each station, pair or kind are, estimated over many fixes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optloc.errors import InvalidProblem
+from optloc.fix import Fix
+from optloc.noise import Block, Noise
+from optloc.problem import Problem
+from optloc.quality.components import KEPT, Fitted, fit, total, without
+from optloc.quality.elements import Elements, batch_of, elements
+from optloc.quality.groups import By, split
+from optloc.quality.redundancy import Tested, tested
+from optloc.types import Array
+
+_ROUNDS, _CLOSE = 4, 0.02
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseLevels:
+    """Noise of groups of errors as the residuals of fixes show it.
+
+    Parameters
+    ----------
+    by : "station", "pair" or "kind"
+        What makes a group.
+    names : tuple of G str
+        Groups.
+    stated : array (G,)
+        Standard deviation that the problem states, root mean square, SI units.
+    factor : array (G,)
+        What the stated standard deviations are to be multiplied by; 1 where the data do not tell.
+    error : array (G,)
+        Standard error of the factor; NaN where the data do not tell it for this group alone.
+    redundancy : array (G,)
+        Share of each group's errors that shows in the residuals, from 0 to 1.
+    count : int array (G,)
+        Errors of each group.
+    gross : int array (G,)
+        Those that were left out as gross.
+    before, after : float
+        Chi-square per degree of freedom with the noise as stated and as found, gross errors left out.
+    fixes : int
+        Number of fixes that were used.
+    sentences : tuple of str
+        What the data do not tell.
+    """
+
+    by: By
+    names: tuple[str, ...]
+    stated: Array
+    factor: Array
+    error: Array
+    redundancy: Array
+    count: Array
+    gross: Array
+    before: float
+    after: float
+    fixes: int
+    sentences: tuple[str, ...]
+
+    @property
+    def sigma(self) -> Array:
+        """Return the standard deviations (G,) that were found, SI units; NaN where the data do not tell."""
+        return np.where(np.isnan(self.error), np.nan, self.factor * self.stated)
+
+    @property
+    def sigma_error(self) -> Array:
+        """Return the standard errors (G,) of `sigma`, SI units."""
+        return np.asarray(self.error * self.stated)
+
+
+def noise_levels(problem: Problem, by: By = "station", *, method: str = "auto", fix: Fix | None = None) -> NoiseLevels:
+    """Return how large the errors of groups of rows are, from the residuals of many fixes.
+
+    Restricted maximum likelihood of variance components: the covariance of the rows is a sum of the stated one's parts,
+    each times an unknown factor, and the factors maximise the likelihood of what the residuals say that does not depend
+    on the fixes. Scoring steps on the logarithms are taken until they vanish; each is Rao's minimum norm quadratic
+    estimate at the factors before. Errors that the rest of their fix shows to be gross are left out one by one, and
+    the scale is that of the others.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its epochs, where they share no unknown, or its batch are the fixes; otherwise it is one fix of many rows.
+        Its noise may be wrong; its ratios within a group are kept.
+    by : "station", "pair" or "kind"
+        Whether each station has a level (the error of an arrival where rows combine arrivals), each pair or each kind.
+    method : str
+        How to fix; see `solve`.
+    fix : Fix, optional
+        Fixes of `batch_of(problem)` made before.
+
+    Returns
+    -------
+    NoiseLevels
+        Groups that the data cannot tell apart share one factor or stay as stated, and a sentence says so.
+
+    Raises
+    ------
+    InvalidProblem
+        Where no fix has redundancy.
+
+    References
+    ----------
+    H. D. Patterson and R. Thompson, "Recovery of inter-block information when block sizes are unequal" (1971).
+    C. R. Rao, "Estimation of variance and covariance components - MINQUE theory" (1971), section 4.
+    D. A. Harville, "Maximum likelihood approaches to variance component estimation" (1977), section 5.
+    K. R. Koch, "Maximum likelihood estimate of variance components" (1986), equation 4.
+    """
+    from optloc.solve import solve
+
+    batch = batch_of(problem)
+    if fix is None and batch.layout.size:
+        fix = solve(batch, method)
+    kept, x = usable(batch, fix)
+    made = elements(batch.take(kept), x, by)
+    return levels_of(made, by)
+
+
+def usable(batch: Problem, fix: Fix | None) -> tuple[Array, Array]:
+    """Return which problems of a flat batch have a fix (n,), and their parameter vectors (n, size).
+
+    Raises
+    ------
+    InvalidProblem
+        Where there is none.
+    """
+    if fix is None:
+        size = batch.batch_shape[0]
+        return np.arange(size), np.zeros((size, 0))
+    flat = fix.flat()
+    kept = np.flatnonzero(np.isfinite(flat.x).all(-1) & flat.answered)
+    if not len(kept):
+        raise InvalidProblem("no epoch has a fix", "noise", "see `optloc fix` for the reasons")
+    return kept, flat.x[kept]
+
+
+def levels_of(made: Elements, by: By) -> NoiseLevels:
+    """Return the noise levels of linearised fixes; see `noise_levels`."""
+    used, inverse = np.unique(made.of_effect, return_inverse=True)
+    none = int(used[0] == -1)
+    group, used = inverse.reshape(made.of_effect.shape) - none, used[none:]
+    fitted = fit(made, group, len(used))
+    names = tuple(made.names[i] for i in used)
+    count, gross = total(group, len(used)), total(group, len(used), fitted.gross)
+    redundancy = fitted.tests.size[:, : group.shape[1]] * fitted.variance[group]
+    factor = np.sqrt(fitted.variance)
+    stated = without(tested(made, np.ones(())), fitted.gross)
+    return NoiseLevels(
+        by,
+        names,
+        np.sqrt(total(group, len(used), made.sigma**2) / count),
+        factor,
+        factor * fitted.error,
+        total(group, len(used), redundancy) / np.maximum(count - gross, 1),
+        count.astype(np.int64),
+        gross.astype(np.int64),
+        _ratio(stated),
+        _ratio(fitted.tests),
+        int((stated.dof > 0).sum()),
+        _sentences(fitted, names),
+    )
+
+
+def _ratio(tests: Tested) -> float:
+    return float(tests.cost.sum() / KEPT / max(int(tests.dof.sum()), 1))
+
+
+def _sentences(fitted: Fitted, names: tuple[str, ...]) -> tuple[str, ...]:
+    """Return what the data do not tell."""
+    open_ = [names[i] for i in np.flatnonzero(fitted.shared)]
+    if not open_:
+        return ()
+    who = ", ".join(open_[:8]) + (f" and {len(open_) - 8} more" if len(open_) > 8 else "")
+    if fitted.stay:
+        return (f"the data do not tell the noise of {who}: it stays as stated",)
+    return (f"the data do not tell the noise of {who} apart: one factor for all of them",)
+
+
+def with_noise_levels(problem: Problem, levels: NoiseLevels) -> Problem:
+    """Return the problem with its noise scaled as the levels say.
+
+    Parameters
+    ----------
+    problem : Problem
+        The problem that the levels were estimated from, or another one of the same stations and kinds.
+    levels : NoiseLevels
+        Of `noise_levels`; groups that it does not have stay as they are.
+    """
+    factor = dict(zip(levels.names, levels.factor.tolist(), strict=True))
+    present = problem.weight > 0.0
+    blocks = [_scaled(problem, block, levels.by, factor, present) for block in problem.noise.blocks]
+    return replace(problem, noise=Noise(tuple(blocks)))
+
+
+def with_estimated_noise(problem: Problem, by: By = "kind", *, method: str = "auto") -> tuple[Problem, NoiseLevels]:
+    """Return the problem with its noise from the data, and the levels: fixes and levels are made until they agree.
+
+    Parameters
+    ----------
+    problem : Problem
+        What its noise states is only where to begin; ratios within a group are kept.
+    by, method
+        As in `noise_levels`.
+
+    Raises
+    ------
+    InvalidProblem
+        As `noise_levels`, and where the data do not tell any level.
+    """
+    first = levels = noise_levels(problem, by, method=method)
+    factor = levels.factor
+    for _ in range(_ROUNDS):
+        problem = with_noise_levels(problem, levels)
+        levels = noise_levels(problem, by, method=method)
+        factor = factor * levels.factor
+        if np.abs(levels.factor - 1.0).max() < _CLOSE:
+            break
+    if levels.names != first.names or np.isnan(levels.error).all():
+        advice = "state a sigma, or add rows, stations or epochs"
+        raise InvalidProblem("the data do not tell the noise", "noise", advice)
+    whole = replace(levels, stated=first.stated, factor=factor, error=levels.error * factor, before=first.before)
+    return with_noise_levels(problem, levels), whole
+
+
+def _scaled(problem: Problem, block: Block, by: By, factor: dict[str, float], present: Array) -> Block:
+    effect, names, _ = split(problem, block, by, present)
+    own = np.array([[factor.get(name, 1.0) for name in row] for row in names.tolist()])
+    scaled = effect * own[:, None, :]
+    here = present[..., block.row]
+    both = here[..., :, None] & here[..., None, :]
+    return Block(block.row, np.where(both, scaled @ np.swapaxes(scaled, -1, -2), block.covariance))

@@ -1,0 +1,197 @@
+"""Starts for a robust cost, without a guess: what fits when some stations or rows are left out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from optloc.constraints import exact
+from optloc.loss import LOSSES, Loss
+from optloc.models import MODELS
+from optloc.noise import independent, variances
+from optloc.problem import Problem
+from optloc.solve.pieces import one_position
+from optloc.solve.refine import refine
+from optloc.solve.robust_descent import weighed_by
+from optloc.solve.robust_weights import Doubt, doubted
+from optloc.solve.stages import lsr, packed, pooled, roots, search, widen
+from optloc.solve.verdict import Candidates
+from optloc.status import Status
+from optloc.types import Array
+from optloc.weigh import depends_on_place, weighed
+
+# Subsets of a problem, starts of it that are screened and kept at most; rows up to which single ones are left out.
+_SUBSETS, _SCREENED, _KEPT, _ROWS = 80, 30, 12, 12
+# Problems times subsets, and starts times rows, that are worked on at a time.
+_PAIRS, _NUMBERS = 2048, 2**20
+# Starts whose residuals differ by less than this many sigma are one.
+_SAME = 0.5
+_FLIPPED = 10
+_HALVINGS, _GROWTH, _GRADES = 6, 1.4, 40
+
+
+def robust_starts(problem: Problem, loss: Loss) -> Array:
+    """Return starting vectors (N, q, size) of a flat batch; NaN in empty slots.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    loss : Loss
+        Whose cost decides which starts are kept.
+    """
+    plain = search(problem, lsr(problem, widen(problem, lsr(problem, roots(problem, None)))))
+    pool = pooled(plain)[0][:, :_KEPT]
+    parts = [pool, _graduated(problem, pool[:, :1])]
+    if one_position(problem):
+        parts.append(_left_out(problem, loss))
+    else:
+        item, slot = np.nonzero(np.isfinite(pool).all(-1))
+        parts.append(_cheapest(problem, pool[item, slot], item, loss, _KEPT, anneal=True))
+    return packed(np.concatenate(parts, axis=1))
+
+
+def subsets(problem: Problem) -> Array:
+    """Return which rows are left (S, m) when one or two stations, or single rows of a short problem, are left out."""
+    touched = _touched(problem)
+    used = np.flatnonzero(touched.any(1))
+    stations = [touched[s] for s in used]
+    left = [~one for one in stations]
+    if problem.count <= _ROWS:
+        left += [~row for row in np.eye(problem.count, dtype=bool)]
+    left += [~(one | two) for one, two in combinations(stations, 2)]
+    if len(used) <= _ROWS // 2 + 2:
+        left += [~(one | two | three) for one, two, three in combinations(stations, 3)]
+    some = [keep for keep in left if keep.sum() >= problem.dimension]
+    return np.unique(np.array(some[:_SUBSETS]).reshape(-1, problem.count), axis=0)
+
+
+def _touched(problem: Problem) -> Array:
+    """Return which rows (s, m) each station takes part in."""
+    ends = []
+    for rows in problem.rows:
+        taken = MODELS[rows.kind].stations
+        every = np.arange(problem.stations.count)[:, None]
+        ends.append(((rows.a == every) & (taken > 0)) | ((rows.b == every) & (taken > 1)))
+    return np.concatenate(ends, axis=1)
+
+
+def _left_out(problem: Problem, loss: Loss) -> Array:
+    """Return the best starts (N, q, size) from closed forms of all subsets."""
+    kept, size = subsets(problem), problem.batch_shape[0]
+    if not len(kept):
+        return np.full((size, 0, problem.layout.size), np.nan)
+    # Correlation matters for the answer, hardly for where to look for it, and it costs time.
+    noise = weighed(problem).noise if not depends_on_place(problem) else problem.noise
+    problem = replace(problem, noise=independent(variances(noise, problem.count)))
+    each = max(1, _PAIRS // len(kept))
+    parts = [_of_subsets(problem.take(np.arange(i, min(i + each, size))), kept, loss) for i in range(0, size, each)]
+    out = np.full((size, max(part.shape[1] for part in parts), problem.layout.size), np.nan)
+    for i, part in enumerate(parts):
+        out[i * each : i * each + len(part), : part.shape[1]] = part
+    return out
+
+
+def _of_subsets(problem: Problem, kept: Array, loss: Loss) -> Array:
+    size, count = problem.batch_shape[0], len(kept)
+    item = np.repeat(np.arange(size), count)
+    part = problem.take(item)
+    part = part.with_rows(weight=np.where(np.tile(kept, (size, 1)), part.weight, 0.0))
+    points, pair, slot = pooled(roots(part, None))
+    x = refine(part, points[pair, slot], item=pair, limit=5, face=exact(problem)).x
+    pool = _cheapest(problem, x, item[pair], loss, _SCREENED, anneal=False)
+    first, slot = np.nonzero(np.isfinite(pool).all(-1))
+    return _cheapest(problem, pool[first, slot], first, loss, _KEPT, anneal=True)
+
+
+def _cheapest(problem: Problem, x: Array, item: Array, loss: Loss, most: int, *, anneal: bool) -> Array:
+    """Return the cheapest of starts (M, size) of given problems (M,), each once, as (N, most, size)."""
+    size, count = problem.batch_shape[0], len(x)
+    cost, u, x = np.full(count, np.inf), np.zeros((count, problem.count)), np.array(x)
+    usable = np.flatnonzero(np.isfinite(x).all(-1))
+    step = max(1, _NUMBERS // problem.count)
+    for first in range(0, len(usable), step):
+        some = usable[first : first + step]
+        x[some], cost[some], u[some] = _annealed(problem.take(item[some]), x[some], loss, _HALVINGS if anneal else 0)
+    chosen = np.full((size, most, x.shape[1]), np.nan)
+    for slot in range(most if count else 0):
+        order = np.lexsort((cost, item))
+        first = order[np.searchsorted(item[order], np.arange(size), side="left").clip(max=count - 1)]
+        found = (item[first] == np.arange(size)) & np.isfinite(cost[first])
+        if not found.any():
+            return chosen[:, :slot]
+        chosen[found, slot] = x[first[found]]
+        left = np.flatnonzero(np.isfinite(cost) & found[item])
+        same = np.abs(u[left] - u[first[item[left]]]).max(-1) < _SAME
+        cost[left[same]] = np.inf
+    return chosen
+
+
+def _annealed(problem: Problem, x: Array, loss: Loss, halvings: int) -> tuple[Array, Array, Array]:
+    """Return vectors after a few weighings by the Cauchy loss whose scale is halved, their costs and residuals."""
+    doubt, cauchy, face = Doubt.of(problem, x), LOSSES["cauchy"], exact(problem)
+    weight = np.ones(doubt.base.shape)
+    with np.errstate(all="ignore"):
+        u = doubt.residual(problem, x, weight)
+        size = np.where(doubt.base > 0.0, np.abs(u), np.nan)
+        scale = np.maximum(1.0, 1.4826 * np.nanmedian(size, axis=1, keepdims=True)) if halvings else 1.0
+        for halving in range(halvings):
+            weight = weighed_by(cauchy, problem, doubt, x, weight, np.maximum(1.0, scale * 0.5**halving))
+            x = refine(problem.with_rows(weight=doubt.row_weight(weight)), x, limit=2, face=face).x
+        u = doubt.residual(problem, x, weight) if halvings else u
+        cost = np.where(doubt.base > 0.0, loss.rho(doubted(loss, u, doubt.sided)), 0.0).sum(-1)
+    return x, np.where(np.isfinite(cost) & np.isfinite(u).all(-1), cost, np.inf), np.nan_to_num(u)
+
+
+def flipped(problem: Problem, loss: Loss, pool: Candidates) -> Array:
+    """Return starts (N, q, size) beside the cheapest minimum: those with one more row in or out, of rows at the brink.
+
+    A loss that cuts rows off has minima of its own for almost every set of rows; the best ones differ in few rows.
+    """
+    best = np.where(pool.code == Status.OK, pool.cost, np.inf).argmin(1)
+    x = pool.x[np.arange(len(best)), best]
+    item = np.flatnonzero(np.isfinite(x).all(-1))
+    if not len(item):
+        return x[:, None]
+    part = problem.take(item)
+    doubt, q = Doubt.of(part, x[item]), min(_FLIPPED, problem.count)
+    weight = weighed_by(loss, part, doubt, x[item], np.ones(doubt.base.shape))
+    u = np.where(doubt.base > 0.0, np.abs(doubt.residual(part, x[item], weight)), np.inf)
+    brink = np.argsort(np.abs(u - loss.constant), axis=1)[:, :q]
+    each = np.repeat(np.arange(len(item)), q)
+    changed, row = weight[each], (np.arange(len(each)), brink.ravel())
+    changed[row] = 1.0 - changed[row]
+    beside = part.take(each).with_rows(weight=doubt.take(each).row_weight(changed))
+    out = np.full((len(x), q, x.shape[-1]), np.nan)
+    out[item] = refine(beside, x[item][each], limit=5, face=exact(problem)).x.reshape(len(item), q, -1)
+    return out
+
+
+def _graduated(problem: Problem, start: Array) -> Array:
+    """Return where truncated least squares leads (N, q, size) when it begins convex and is bent step by step.
+
+    H. Yang, P. Antonante, V. Tzoumas, L. Carlone, "Graduated non-convexity for robust spatial perception", IEEE Robot.
+    Autom. Lett. 5 (2020), eq. 14 for the weights and section III-C for the schedule.
+    """
+    item, slot = np.nonzero(np.isfinite(start).all(-1))
+    out = np.full(start.shape, np.nan)
+    if not len(item):
+        return out
+    problem, x = problem.take(item), start[item, slot]
+    doubt, face, c = Doubt.of(problem, x), exact(problem), LOSSES["truncated"].constant
+    weight, mu = np.ones(doubt.base.shape), np.full((len(x), 1), np.inf)
+    with np.errstate(all="ignore"):
+        for grade in range(_GRADES):
+            u = np.abs(doubt.residual(problem, x, weight))
+            worst = np.where(doubt.base > 0.0, u, 0.0).max(1, keepdims=True)
+            convex = c**2 / np.maximum(2.0 * worst**2 - c**2, 1e-300)
+            mu = np.minimum(convex, 1e3) if grade == 0 else mu * _GROWTH
+            if (mu > 1e3).all():
+                break
+            bent = c / u * np.sqrt(mu * (mu + 1.0)) - mu
+            weight = np.where(np.isfinite(u), np.clip(bent, 0.0, 1.0), 0.0)
+            x = refine(problem.with_rows(weight=doubt.row_weight(weight)), x, limit=2, face=face).x
+    out[item, slot] = x
+    return out

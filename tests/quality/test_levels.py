@@ -1,0 +1,162 @@
+"""Noise from data: against an independent maximisation of the restricted likelihood, and on simulated noise."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.linalg import multi_dot
+from quality.rings import FREE, RING, SIGMA, ranged
+from scipy.optimize import minimize
+from scipy.stats import chi2
+
+from optloc import InvalidProblem, assemble, linearise, measured, noise_levels, solve, with_noise_levels
+from optloc.epochs import by_epoch
+from optloc.noise import Block, Noise, variances
+from optloc.quality import components as rules
+from optloc.quality.elements import batch_of
+from optloc.quality.levels import with_estimated_noise
+
+
+def differences(rng, epochs, sigma):
+    """Return range differences against the first station, made from arrivals with their own noise."""
+    s = len(sigma)
+    target = rng.uniform(-1500.0, 1500.0, (epochs, 2))
+    arrival = np.linalg.norm(target[:, None] - RING[:s], axis=-1) + sigma * rng.standard_normal((epochs, s))
+    z = arrival[:, 1:] - arrival[:, :1]
+    a, epoch = np.tile(np.arange(1, s), epochs), np.repeat(np.arange(epochs), s - 1)
+    rows = measured("tdoa", z.ravel(), a=a, b=0, arrival_sigma=10.0, epoch=epoch)
+    return assemble(RING[:s], rows, motions=FREE)
+
+
+def restricted(residuals, jacobians, parts):
+    """Return minus twice the restricted log-likelihood as a function of log-variances; parts are (m, m) matrices."""
+
+    def value(level):
+        total = 0.0
+        for residual, jacobian, own in zip(residuals, jacobians, parts, strict=True):
+            V = sum(np.exp(v) * part for v, part in zip(level, own, strict=True))
+            inverse = np.linalg.inv(V)
+            N = multi_dot([jacobian.T, inverse, jacobian])
+            P = inverse - multi_dot([inverse, jacobian, np.linalg.inv(N), jacobian.T, inverse])
+            total += np.linalg.slogdet(V)[1] + np.linalg.slogdet(N)[1] + residual @ P @ residual
+        return total
+
+    return value
+
+
+def test_is_the_maximum_of_the_restricted_likelihood(monkeypatch):
+    # Nothing is called gross here: the estimate is then plain REML, which scipy maximises from its definition.
+    monkeypatch.setattr(rules, "CUT", np.inf)
+    monkeypatch.setattr(rules, "KEPT", 1.0)
+    problem = ranged(np.random.default_rng(3), 40, np.array([5.0, 10.0, 20.0, 10.0, 30.0, 10.0]))
+    batch = by_epoch(problem)
+    fix = solve(batch)
+    found = noise_levels(problem, fix=fix)
+    line = linearise(batch, fix.x)
+    jacobian = np.concatenate([line.shared, line.local], axis=-1)
+    parts = [[np.diag(100.0 * (np.arange(6) == s)) for s in range(6)]] * 40
+    value = restricted(line.residual, jacobian, parts)
+    best = minimize(value, np.zeros(6), method="L-BFGS-B")
+    assert value(2.0 * np.log(found.factor)) <= best.fun + 1e-3
+    np.testing.assert_allclose(found.factor, np.exp(0.5 * best.x), rtol=0.02)
+
+
+@pytest.mark.parametrize("make", [ranged, differences], ids=["arrivals", "differences"])
+def test_levels_are_within_their_errors(make):
+    off, told = [], []
+    for seed in range(25):
+        levels = noise_levels(make(np.random.default_rng(seed), 150, SIGMA))
+        assert levels.names == tuple(f"S{i}" for i in range(8))
+        off.append((levels.sigma - SIGMA) / levels.sigma_error)
+        told.append(levels.after)
+    off = np.array(off)
+    assert np.isfinite(off).all()
+    # 200 correlated z-scores: their mean square within what 25 x 5 independent ones allow, their means not biased.
+    assert 0.5 < (off**2).mean() < chi2.ppf(0.999, 125) / 125
+    assert np.abs(off.mean(0)).max() < 4.0 / np.sqrt(25)
+    assert np.mean(told) == pytest.approx(1.0, abs=0.03)
+
+
+def test_gross_errors_do_not_enlarge_the_noise():
+    off = []
+    for seed in range(4):
+        problem = ranged(np.random.default_rng(50 + seed), 100, gross=0.05)
+        levels = noise_levels(problem, method="cauchy")
+        off.append(levels.sigma / SIGMA)
+        assert levels.gross.sum() / levels.count.sum() == pytest.approx(0.05, abs=0.03)
+    assert np.abs(np.median(off, axis=0) - 1.0).max() < 0.3
+
+
+def test_a_refit_with_the_levels_has_chi_square_one():
+    problem = ranged(np.random.default_rng(8), 400)
+    levels = noise_levels(problem)
+    assert solve(problem).cost.sum() > 3.0 * solve(problem).dof.sum()
+    refit = solve(with_noise_levels(problem, levels))
+    ratio = refit.cost.sum() / refit.dof.sum()
+    assert ratio == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / refit.dof.sum()) + 0.03)
+    assert 0.02 < (refit.p_value < 0.05).mean() < 0.1
+
+
+def test_scaled_noise_keeps_its_structure():
+    problem = differences(np.random.default_rng(0), 20, SIGMA)
+    levels = noise_levels(problem)
+    scaled = with_noise_levels(problem, levels)
+    factor = dict(zip(levels.names, levels.factor**2, strict=True))
+    covariance = scaled.noise.blocks[0].covariance[0]
+    np.testing.assert_allclose(covariance[0, 1], 100.0 * factor["S0"], rtol=1e-9)
+    np.testing.assert_allclose(covariance[2, 2], 100.0 * (factor["S0"] + factor["S3"]), rtol=1e-9)
+
+
+def test_arrivals_and_rows_are_told_apart():
+    # Every pair twice: what repeats is the stations' arrivals, what does not is the rows' own noise.
+    rng, s, epochs = np.random.default_rng(4), 6, 120
+    pairs = np.array([(i, (i + 1) % s) for i in range(s)] * 4)
+    design = np.eye(s)[pairs[:, 0]] - np.eye(s)[pairs[:, 1]]
+    target = rng.uniform(-1500.0, 1500.0, (epochs, 2))
+    true = np.linalg.norm(target[:, None] - RING[:s], axis=-1) @ design.T
+    z = true + 14.0 * rng.standard_normal((epochs, s)) @ design.T + 5.0 * rng.standard_normal(true.shape)
+    epoch = np.repeat(np.arange(epochs), len(pairs))
+    a, b = np.tile(pairs[:, 0], epochs), np.tile(pairs[:, 1], epochs)
+    rows = measured("tdoa", z.ravel(), a=a, b=b, sigma=10.0, arrival_sigma=10.0, epoch=epoch)
+    levels = noise_levels(assemble(RING[:s], rows, motions=FREE), "kind")
+    assert levels.names == ("tdoa", "tdoa rows")
+    np.testing.assert_allclose(levels.sigma[levels.names.index("tdoa rows")], 5.0, rtol=0.05)
+    assert levels.factor[0] == pytest.approx(1.4, rel=0.1)
+
+
+def test_what_the_data_cannot_tell_apart_is_said():
+    # Three ranges in the plane have one degree of freedom, and a target that hardly moves always shows the same sum.
+    rng = np.random.default_rng(5)
+    target = np.array([100.0, 200.0]) + rng.standard_normal((80, 2))
+    z = np.linalg.norm(target[:, None] - RING[:3], axis=-1) + 20.0 * rng.standard_normal((80, 3))
+    a, epoch = np.tile(np.arange(3), 80), np.repeat(np.arange(80), 3)
+    problem = assemble(RING[:3], measured("range", z.ravel(), a=a, sigma=10.0, epoch=epoch), motions=FREE)
+    levels = noise_levels(problem)
+    assert np.isnan(levels.sigma).all()
+    np.testing.assert_allclose(levels.factor, 2.0, rtol=0.25)
+    assert "do not tell the noise of S0, S1, S2 apart" in levels.sentences[0]
+
+
+def test_no_redundancy_is_an_error_with_advice():
+    rng = np.random.default_rng(6)
+    problem = ranged(rng, 20, SIGMA[:3])
+    with pytest.raises(InvalidProblem, match="more rows than unknowns"):
+        noise_levels(problem)
+
+
+def test_estimated_noise_does_not_depend_on_what_was_stated():
+    problem = ranged(np.random.default_rng(7), 150, stated=1.0)
+    other = ranged(np.random.default_rng(7), 150, stated=100.0)
+    one, two = (with_estimated_noise(p, "station") for p in (problem, other))
+    np.testing.assert_allclose(one[1].sigma, two[1].sigma, rtol=0.02)
+    np.testing.assert_allclose(*(variances(p.noise, p.count) for p, _ in (one, two)), rtol=0.04)
+
+
+def test_correlated_rows_that_are_no_arrivals_are_one_group():
+    problem = ranged(np.random.default_rng(9), 60, np.full(6, 10.0), kind="range")
+    members = np.arange(problem.count).reshape(-1, 6)
+    covariance = 25.0 * (np.eye(6) + 0.5 * np.ones((6, 6)) + np.diag(np.arange(6.0)))
+    tied = replace(problem, noise=Noise((Block(members, covariance[None]),)))
+    levels = noise_levels(tied)
+    assert levels.names == ("range",)
+    assert batch_of(tied).batch_shape == (60,)

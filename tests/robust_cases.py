@@ -1,0 +1,69 @@
+"""Problems with gross errors: stations and emitters at random in a box, some rows wrong by so many sigma."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from optloc import Fix, Problem, assemble, measured, solve
+from optloc.solve.refine import refine
+
+BOX, SIGMA = np.array([10e3, 10e3, 6e3]), 10.0
+
+
+@dataclass(frozen=True)
+class Spoilt:
+    """A batch of problems, the true vectors (N, size), and which arrivals are wrong (N, s)."""
+
+    problem: Problem
+    truth: np.ndarray
+    wrong: np.ndarray
+
+
+def spoilt(
+    kind: str, trials: int, stations: int, *, bad: int = 0, share: float = 0.0, size: float = 100.0, late=False, seed=1
+) -> Spoilt:
+    """Return trials in which `bad` rows, or each with a probability, are off by `size` sigma, either way or late."""
+    rng = np.random.default_rng([seed, stations, bad])
+    place = rng.uniform(-0.5, 0.5, (trials, 1, stations, 3)) * BOX
+    truth = rng.uniform(-0.5, 0.5, (trials, 3)) * BOX
+    distance = np.linalg.norm(truth[:, None] - place[:, 0], axis=-1)
+    wrong = np.argsort(rng.random((trials, stations)), axis=1) < bad
+    wrong |= rng.random(wrong.shape) < share
+    sign = 1.0 if late else rng.choice([-1.0, 1.0], wrong.shape)
+    z = distance + SIGMA * (rng.standard_normal(wrong.shape) + size * sign * wrong)
+    every = np.arange(stations)
+    if kind == "tdoa":
+        rows = measured("tdoa", z[:, 1:] - z[:, :1], a=every[1:], b=0, arrival_sigma=SIGMA)
+    elif kind == "toa":
+        rows = measured("toa", z + 5e3, a=every, sigma=SIGMA)
+        truth = np.column_stack([truth, np.full(trials, 5e3)])
+    else:
+        rows = measured("range", z, a=every, sigma=SIGMA)
+    return Spoilt(assemble(place, rows), truth, wrong)
+
+
+def worse_than_from_truth(case: Spoilt, method: str, fix: Fix) -> np.ndarray:
+    """Return the trials in which the minimum that the truth leads to costs less than the answer."""
+    best = solve(case.problem, method, start=case.truth)
+    return np.flatnonzero(~(fix.cost <= best.cost + 1e-3) & np.isfinite(best.cost))
+
+
+def least_squares(case: Spoilt) -> np.ndarray:
+    """Return the least-squares positions (N, 3) next to the truth of clean data."""
+    return refine(case.problem, case.truth).x[:, :3]
+
+
+def rmse(position: np.ndarray, truth: np.ndarray) -> float:
+    """Return the root mean square of the length of position errors (N, 3)."""
+    return float(np.sqrt(((position - truth[:, :3]) ** 2).sum(-1).mean()))
+
+
+def nees(fix: Fix, truth: np.ndarray) -> np.ndarray:
+    """Return squared errors (N,) of positions in their own sigma, over their number; NaN where nothing is claimed."""
+    claimed = fix.code == 0
+    out, error = np.full(len(fix), np.nan), (fix.position - truth[:, :3])[claimed, :, None]
+    solved = np.linalg.solve(fix.covariance()[claimed], error)
+    out[claimed] = (np.swapaxes(error, 1, 2) @ solved)[:, 0, 0] / 3.0
+    return out

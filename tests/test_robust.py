@@ -1,0 +1,207 @@
+"""Robust fixes: nothing that the truth leads to is better, gross errors are named, and sigma means what it says."""
+
+import json
+from dataclasses import replace
+from importlib.resources import files
+
+import numpy as np
+import pytest
+import runs
+from robust_cases import SIGMA, least_squares, nees, rmse, spoilt, worse_than_from_truth
+from typer.testing import CliRunner
+
+from optloc import Status, assemble, measured, rejected, simulate, solve
+from optloc.cli import app
+from optloc.loss import LOSSES
+from optloc.noise import Block, Noise
+from optloc.solve.robust_descent import reweighted
+from optloc.solve.robust_weights import Doubt
+
+REDESCENDING = ("cauchy", "truncated")
+
+
+def _cost(loss, problem, x):
+    """Return the robust cost of independent range rows, written down anew."""
+    place = problem.stations.position[:, 0]
+    distance = np.linalg.norm(x[:, None, :3] - place, axis=-1)
+    u = (problem.z - distance - x[:, 3:]) / SIGMA
+    return loss.rho(u if loss.one_sided else np.abs(u)).sum(-1)
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_no_weighing_raises_the_cost(name):
+    case = spoilt("toa", 30, 8, bad=2)
+    start = case.truth + np.random.default_rng(2).normal(0.0, 60.0, case.truth.shape)
+    doubt, costs = Doubt.of(case.problem, start), [_cost(LOSSES[name], case.problem, start)]
+    for limit in range(1, 16):
+        done = reweighted(case.problem, start, LOSSES[name], doubt, limit=limit)
+        np.testing.assert_allclose(done.cost, _cost(LOSSES[name], case.problem, done.x), rtol=1e-9)
+        costs.append(done.cost)
+    assert np.all(np.diff(costs, axis=0) <= 1e-7 * (1.0 + np.abs(costs[0])))
+    assert (costs[-1] < costs[0]).mean() > (0.5 if name == "truncated" else 0.99)
+
+
+@pytest.mark.parametrize("name", ["huber", "cauchy", "late"])
+def test_the_answer_is_a_minimum_of_the_loss(name):
+    case = spoilt("toa", 20, 8, bad=1)
+    fix = solve(case.problem, name)
+    good = np.flatnonzero(np.isin(fix.code, (Status.OK, Status.AMBIGUOUS)))
+    assert len(good) >= 19
+    problem, x = case.problem.take(good), fix.x[good]
+    sigma = np.sqrt(np.trace(fix.covariance()[good], axis1=1, axis2=2))[:, None]
+    rng = np.random.default_rng(4)
+    for _ in range(20):
+        way = rng.standard_normal(x.shape)
+        step = 1e-2 * sigma * way / np.linalg.norm(way, axis=1, keepdims=True)
+        assert np.all(_cost(LOSSES[name], problem, x + step) >= _cost(LOSSES[name], problem, x) - 1e-9)
+
+
+@pytest.mark.parametrize("kind", ["toa", "tdoa", "range"])
+@pytest.mark.parametrize("name", REDESCENDING)
+def test_the_truth_leads_to_nothing_better(kind, name):
+    case = spoilt(kind, 60, 8, bad=2, size=30.0)
+    if kind == "tdoa":
+        case = replace(case, truth=case.truth[:, :3])
+    worse = worse_than_from_truth(case, name, solve(case.problem, name))
+    assert len(worse) <= 1, f"{kind}, {name}: {worse}"
+
+
+@pytest.mark.parametrize("name", REDESCENDING)
+def test_gross_errors_are_named_and_do_no_harm(name):
+    case = spoilt("toa", 100, 10, bad=1, size=1000.0)
+    fix = solve(case.problem, name)
+    claimed = fix.code == Status.OK
+    assert claimed.mean() >= 0.95
+    assert np.array_equal(rejected(case.problem, fix)[claimed] & case.wrong[claimed], case.wrong[claimed])
+    assert np.nanmax(np.linalg.norm(fix.position - case.truth[:, :3], axis=1)[claimed]) < 50 * SIGMA
+    # Least squares is dragged by the hundreds of sigma.
+    assert np.median(np.linalg.norm(least_squares(case) - case.truth[:, :3], axis=1)) > 100 * SIGMA
+
+
+@pytest.mark.parametrize("name", LOSSES)
+def test_clean_data_lose_next_to_nothing(name):
+    case = spoilt("toa", 150, 9)
+    fix = solve(case.problem, name)
+    assert (fix.code == Status.OK).mean() >= 0.97
+    assert rmse(fix.position, case.truth) <= 1.07 * rmse(least_squares(case), case.truth)
+    assert 0.75 < np.nanmean(nees(fix, case.truth)) < 1.25
+
+
+@pytest.mark.parametrize("name", REDESCENDING)
+def test_sigma_means_what_it_says_with_one_row_in_ten_wrong(name):
+    case = spoilt("range", 200, 10, share=0.1)
+    fix = solve(case.problem, name)
+    claimed = fix.code == Status.OK
+    assert claimed.mean() > 0.9
+    assert 0.7 < np.nanmean(nees(fix, case.truth)) < 1.4
+
+
+def test_range_differences_are_doubted_as_arrivals():
+    # Of the first station's arrival all differences are made: all seven are wrong, and one arrival is.
+    arrivals, differences = (spoilt(kind, 20, 8, bad=1, seed=6) for kind in ("toa", "tdoa"))
+    for name in ("cauchy", "late"):
+        one, two = solve(arrivals.problem, name), solve(differences.problem, name)
+        np.testing.assert_allclose(one.position, two.position, atol=1e-2)
+        np.testing.assert_allclose(one.cost, two.cost, rtol=1e-4)
+    assert two.weights.shape == (20, 7)
+    assert two.x.shape == (20, 3)
+
+
+def test_late_arrivals_are_doubted_and_early_ones_believed():
+    case = spoilt("range", 100, 8, bad=2, size=50.0, late=True)
+    fix = solve(case.problem, "late")
+    claimed = fix.code == Status.OK
+    assert claimed.mean() > 0.9
+    lost = rejected(case.problem, fix)[claimed]
+    assert (lost == case.wrong[claimed]).all(1).mean() > 0.95
+    error = np.linalg.norm(fix.position - case.truth[:, :3], axis=1)[claimed]
+    assert np.median(error) < 4 * SIGMA
+
+
+def test_angles_of_a_wrong_detection_are_rejected():
+    rng = np.random.default_rng(8)
+    stations, truth = rng.uniform(-50.0, 50.0, (7, 3)), np.array([20.0, 40.0, 10.0])
+    rows = [measured(kind, a=np.arange(7), sigma=5e-3) for kind in ("azimuth", "elevation")]
+    problem = simulate(assemble(stations, *rows), np.tile(truth, (50, 1)), 9)
+    z = problem.z.copy()
+    z[:, [2, 9]] += 0.7
+    fix = solve(problem.with_rows(z=z), "cauchy")
+    claimed = fix.code == Status.OK
+    assert claimed.mean() > 0.9
+    assert rejected(problem, fix)[claimed][:, [2, 9]].all()
+    assert np.linalg.norm(fix.position - truth, axis=1)[claimed].max() < 5.0
+
+
+def test_partners_tell_which_of_correlated_rows_is_wrong():
+    # Pairs of rows share most of their error: one of a pair is known from the other far better than by itself.
+    rng = np.random.default_rng(10)
+    stations, truth = rng.uniform(-50.0, 50.0, (6, 3)), np.array([5.0, -10.0, 20.0])
+    a = np.repeat(np.arange(6), 2)
+    pair = np.array([[1.0, 0.99], [0.99, 1.0]])
+    problem = assemble(stations, measured("range", a=a, sigma=1.0))
+    problem = replace(problem, noise=Noise((Block(np.arange(12).reshape(6, 2), pair[None]),)))
+    problem = simulate(problem, np.tile(truth, (100, 1)), 11)
+    z = problem.z.copy()
+    z[:, 4] += 2.0
+    fix = solve(problem.with_rows(z=z), "truncated")
+    lost = rejected(problem, fix)
+    assert lost[:, 4:6].any(1).mean() > 0.95
+    assert lost[:, [0, 1, 2, 3, 6, 7, 8, 9, 10, 11]].mean() < 0.03
+
+
+def test_a_run_with_biases_bears_wild_rows():
+    template = runs.run(40, station=0.0, prior=60.0, places=runs.SPATIAL)
+    x = np.tile(runs.truth(template), (3, 1))
+    problem = simulate(template, x, 12)
+    wild = np.random.default_rng(13).random(problem.z.shape) < 0.05
+    spoilt_run = problem.with_rows(z=problem.z + 600.0 * wild)
+    fix = solve(spoilt_run, "cauchy")
+    best = solve(spoilt_run, "cauchy", start=x)
+    assert fix.answered.all()
+    assert np.all(fix.cost <= best.cost + 1e-3)
+    assert rejected(spoilt_run, fix)[wild].mean() > 0.95
+    assert rejected(spoilt_run, fix)[~wild].mean() < 0.02
+    n = problem.layout.n_shared
+    error = (fix.x - x)[:, :n, None]
+    squared = (np.swapaxes(error, 1, 2) @ np.linalg.solve(fix.cov, error))[:, 0, 0]
+    assert squared.max() < 3.0 * n
+
+
+def test_the_command_line_takes_a_loss_as_a_method(tmp_path):
+    out = tmp_path / "fixes.csv"
+    path = files("optloc") / "scenarios" / "demo.toml"
+    result = CliRunner().invoke(app, ["fix", str(path), "--method", "cauchy", "--out", str(out), "--json"])
+    assert result.exit_code == 0, result.output
+    assert all(len(fix["weights"]) for fix in json.loads(result.output)["fixes"])
+    assert len(out.read_text(encoding="utf-8").splitlines()) >= 2
+
+
+def test_absent_rows_stay_absent_and_broken_ones_are_said():
+    case = spoilt("toa", 4, 8, bad=1, seed=3)
+    weight, z = np.ones((4, 8)), case.problem.z.copy()
+    weight[0, 0], weight[1, :5], z[0, 0], z[2, 3] = 0.0, 0.0, np.nan, np.nan
+    problem = case.problem.with_rows(z=z, weight=weight)
+    fix = solve(problem, "cauchy")
+    assert fix.answered[0]
+    assert fix.weights[0, 0] == 0.0
+    assert not rejected(problem, fix)[0, 0]
+    assert fix.code[1] == Status.TOO_FEW_ROWS
+    assert fix.code[2] == Status.REJECTED
+    assert np.isnan(fix.x[1:3]).all()
+
+
+def test_rows_that_are_all_wrong_get_no_clean_answer():
+    case = spoilt("toa", 30, 7)
+    z = case.problem.z + 1e4 * np.random.default_rng(13).standard_normal((30, 7))
+    fix = solve(case.problem.with_rows(z=z), "cauchy")
+    warned = (fix.code != Status.OK) | (fix.p_value < 1e-3)
+    assert warned.all()
+    assert all(fix.reason[i] for i in np.flatnonzero(fix.code == Status.OK))
+
+
+def test_one_problem_gives_the_same_as_many():
+    case = spoilt("toa", 20, 8, bad=1)
+    many = solve(case.problem, "cauchy")
+    one = solve(case.problem.take(np.array([7])), "cauchy")
+    np.testing.assert_allclose(one.x[0], many.x[7], atol=1e-3)
+    np.testing.assert_allclose(one.weights[0], many.weights[7], atol=1e-5)

@@ -1,0 +1,366 @@
+"""Who is lying: arrivals for differences, groups, evidence, and what is said where nobody can be named."""
+
+import json
+from dataclasses import replace
+from importlib.resources import files
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+from typer.testing import CliRunner
+
+import optloc
+from optloc import InvalidProblem, Motion, Prior, Status, assemble, measured, simulate, solve, with_bias
+from optloc.cli import app
+from optloc.solve.arrivals import as_arrivals, original
+from optloc.solve.refine import refine
+from optloc.solve.suspect_evidence import errors, influence, log_tail, significance
+from optloc.solve.suspect_groups import groups_of
+
+RNG = np.random.default_rng(20251121)
+STATIONS = RNG.uniform(-0.5, 0.5, (8, 3)) * [10e3, 10e3, 6e3]
+TARGET = np.array([1e3, -2e3, 500.0])
+EACH = np.arange(8)
+PAIRS = np.triu_indices(8, 1)
+
+
+def problem(*rows, **given):
+    return assemble(STATIONS, *rows, **given)
+
+
+def arrivals(sigma=10.0, stations=8):
+    """Return differences to the first station."""
+    a = EACH[1:stations]
+    return assemble(STATIONS[:stations], measured("tdoa", a=a, b=0 * a, arrival_sigma=sigma))
+
+
+def angles(**given):
+    both = (measured(kind, a=EACH, sigma=1e-3) for kind in ("azimuth", "elevation"))
+    return problem(*both, **given)
+
+
+def spoiled(clean, truth=TARGET, seed=1, **errors_of):
+    """Return a problem with noise, and errors added to stations ("s3") or rows ("r3")."""
+    made = simulate(clean, truth, seed)
+    z = made.z.copy()
+    for name, size in errors_of.items():
+        i = int(name[1:])
+        if name[0] == "r":
+            z[..., i] += size
+            continue
+        a, b = (np.concatenate([getattr(r, end) for r in made.rows]) for end in "ab")
+        z += size * ((a == i) * 1.0 - (b == i))
+    return made.with_rows(z=z)
+
+
+def names(fix):
+    return [one.names for one in fix.explanations[()]]
+
+
+@pytest.mark.parametrize("rows", ["first", "chain", "all pairs", "two kinds"])
+def test_arrivals_cost_what_their_differences_cost(rows):
+    a, b = {"first": (EACH[1:], 0 * EACH[1:]), "chain": (EACH[1:], EACH[:-1])}.get(rows, PAIRS)
+    sigma = np.linspace(5.0, 20.0, 8)
+    more = (measured("azimuth", a=EACH[:2], sigma=1e-2),) if rows == "two kinds" else ()
+    clean = problem(measured("tdoa", a=a, b=b, arrival_sigma=sigma), *more)
+    flat = simulate(clean, TARGET, 5, trials=3).flat()
+    made = as_arrivals(flat)
+    assert made.problem.count == 8 + 2 * len(more)
+    for x in (TARGET, TARGET + np.array([300.0, -500.0, 200.0])):
+        vector = np.tile(x, (3, 1))
+        differences = refine(flat, vector, limit=0).cost
+        with_times = np.concatenate([vector, np.zeros((3, 1))], axis=1)
+        held = replace(made.problem, priors=(Prior("position", x, np.eye(3) * 1e-12),))
+        np.testing.assert_allclose(refine(held, with_times).cost, differences, rtol=1e-6)
+
+
+def test_arrivals_give_the_same_fix():
+    flat = simulate(arrivals(), TARGET, 5, trials=4).flat()
+    made = as_arrivals(flat)
+    fix, other = solve(flat, "searched"), solve(made.problem, "searched")
+    np.testing.assert_allclose(original(flat, made.problem, other.x), fix.x, atol=1e-3)
+    np.testing.assert_allclose(other.cov, fix.cov, rtol=1e-5)
+    np.testing.assert_allclose(other.cost, fix.cost, rtol=1e-6)
+    assert (other.dof == fix.dof).all()
+
+
+def test_differences_with_noise_of_their_own_are_no_arrivals():
+    clean = simulate(problem(measured("tdoa", a=PAIRS[0], b=PAIRS[1], sigma=10.0)), TARGET, 1)
+    assert as_arrivals(clean.flat()) is None
+    biased = with_bias(simulate(arrivals(), TARGET, 1), "clock", members=["S1"])
+    assert as_arrivals(biased.flat()) is None
+    a = np.array([1, 2, 4, 5])
+    apart = simulate(problem(measured("tdoa", a=a, b=[0, 0, 3, 3], arrival_sigma=10.0)), TARGET, 1)
+    assert as_arrivals(apart.flat()) is None
+
+
+def test_an_exact_reference_is_an_exact_arrival():
+    """Independent differences to one station are arrivals of which the reference has no noise."""
+    flat = simulate(problem(measured("tdoa", a=EACH[1:], b=0, sigma=10.0)), TARGET, 4).flat()
+    fix, other = solve(flat, "searched"), solve(as_arrivals(flat).problem, "searched")
+    np.testing.assert_allclose(other.cost, fix.cost, rtol=1e-5)
+    np.testing.assert_allclose(other.x[:, :3], fix.x, atol=1e-2)
+
+
+@pytest.mark.parametrize(
+    ("clean", "bad", "expected"),
+    [
+        (arrivals(), {"s3": 400.0}, ("station S3",)),
+        (arrivals(), {"s0": 400.0}, ("station S0",)),
+        (arrivals(), {"s2": 400.0, "s6": -700.0}, ("station S2", "station S6")),
+        (problem(measured("tdoa", a=PAIRS[0], b=PAIRS[1], arrival_sigma=10.0)), {"s5": 400.0}, ("station S5",)),
+        (problem(measured("tdoa", a=PAIRS[0], b=PAIRS[1], sigma=10.0)), {"s5": 400.0}, ("station S5",)),
+        (problem(measured("tdoa", a=PAIRS[0], b=PAIRS[1], sigma=10.0)), {"r9": 400.0}, ("tdoa of S1 and S4",)),
+        (problem(measured("range", a=EACH, sigma=10.0)), {"r3": 400.0}, ("station S3",)),
+        (angles(), {"r3": 0.05}, ("azimuth of S3",)),
+        (angles(), {"r11": 0.05}, ("elevation of S3",)),
+        (angles(), {"r3": 0.05, "r11": 0.05}, ("station S3",)),
+        (angles(), {"r3": 0.05, "r12": 0.05}, ("azimuth of S3", "elevation of S4")),
+    ],
+)
+def test_the_culprit_is_named(clean, bad, expected):
+    fix = solve(spoiled(clean, **bad), "robust")
+    assert names(fix) == [expected]
+    assert fix.status is Status.OK
+    assert np.linalg.norm(fix.position - TARGET) < 5.0 * np.sqrt(np.trace(fix.covariance()))
+    assert all(name in str(fix.reason) for name in expected)
+    for suspect in fix.suspects:
+        assert suspect.p_with < 1e-6
+        assert suspect.p_without == pytest.approx(float(fix.p_value))
+        assert suspect.p_without >= 0.01
+        assert not fix.weights[list(suspect.rows)].any()
+
+
+def test_toa_and_its_emission_time_lose_a_station():
+    fix = solve(spoiled(problem(measured("toa", a=EACH, sigma=10.0)), [*TARGET, 1e5], r3=400.0), "robust")
+    assert names(fix) == [("station S3",)]
+    assert fix.bias["emission"] == pytest.approx(1e5, abs=60.0)
+
+
+def test_the_size_of_an_error_is_what_the_others_tell_of_it():
+    """Over trials: unbiased, and as far off as its sigma says."""
+    clean = simulate(arrivals(), TARGET, 3, trials=60)
+    z = clean.z.copy()
+    z[:, 2] += 500.0
+    fix = solve(clean.with_rows(z=z), "robust")
+    one = [found[0].suspects[0] for found in fix.explanations if len(found) == 1 and len(found[0].suspects) == 1]
+    assert len(one) >= 50
+    assert {suspect.name for suspect in one} == {"station S3"}
+    scores = np.array([(suspect.error[0] - 500.0) / suspect.sigma[0] for suspect in one])
+    assert (scores**2).sum() < chi2.isf(1e-4, len(one))
+    assert (scores**2).sum() > chi2.ppf(1e-4, len(one))
+
+
+def test_the_covariance_is_that_of_the_rest():
+    fix = solve(spoiled(arrivals(), s3=400.0), "robust")
+    a = np.array([1, 2, 4, 5, 6, 7])
+    z = spoiled(arrivals(), s3=400.0).z[a - 1]
+    rest = solve(problem(measured("tdoa", z, a=a, b=0 * a, arrival_sigma=10.0)), "searched")
+    np.testing.assert_allclose(fix.cov, rest.cov, rtol=1e-6)
+    np.testing.assert_allclose(fix.x, rest.x, atol=1e-3)
+    assert (int(fix.dof), float(fix.cost)) == (int(rest.dof), pytest.approx(float(rest.cost), rel=1e-6))
+
+
+def test_first_order_evidence_is_exact_for_linear_problems():
+    """With a tiny cost surface (far stations, small errors) the drop of the cost equals the tested one."""
+    flat = spoiled(problem(measured("range", a=EACH, sigma=0.01)), r3=0.1, r5=0.05).flat()
+    fix = solve(flat, "searched")
+    groups = groups_of(flat, np.ones(8, dtype=bool))
+    at = influence(flat, fix.x[0])
+    weight = 1.0 - np.eye(8)
+    without = solve(flat.take(np.zeros(8, dtype=int)).with_rows(weight=weight), "searched")
+    drop = fix.cost - without.cost
+    np.testing.assert_allclose(significance(at, groups), chi2.logsf(drop, 1), rtol=1e-3)
+    z = without.x[3]
+    error = errors(influence(flat, z), [groups[3]])[0]
+    assert error.value[0] == pytest.approx(float(flat.z[0, 3] - np.linalg.norm(z - STATIONS[3])), abs=1e-6)
+    assert error.statistic == pytest.approx(drop[3], rel=1e-3)
+
+
+def test_tails_are_exact_where_floats_hold_them_and_smooth_beyond():
+    x = np.array([1.0, 50.0, 600.0])
+    np.testing.assert_allclose(log_tail(x, np.array([1, 3, 7])), chi2.logsf(x, [1, 3, 7]), rtol=1e-9)
+    assert log_tail(np.array(5000.0), np.array(2)) == pytest.approx(-2500.0)
+    assert log_tail(np.array(5000.0), np.array(0)) == 0.0
+
+
+def test_a_wrong_prior_is_named_and_a_right_one_is_not():
+    off = np.array([300.0, 0.0, 0.0])
+    wrong = solve(spoiled(angles(priors=(Prior("position", TARGET + off, np.eye(3) * 100.0),))), "robust")
+    assert names(wrong) == [("prior of position",)]
+    np.testing.assert_allclose(wrong.suspects[0].error, off, atol=50.0)
+    assert wrong.suspects[0].rows == ()
+    right = angles(priors=(Prior("position", TARGET + np.array([5.0, 0.0, 0.0]), np.eye(3) * 100.0),))
+    assert names(solve(spoiled(right, r3=0.05), "robust")) == [("azimuth of S3",)]
+
+
+def test_two_explanations_are_both_listed():
+    """Two ranges leave two places; a third station stands for the one, and a fourth for the other."""
+    stations = np.array([[-1e3, 0.0], [1e3, 0.0], [300.0, 2e3], [-500.0, -1.5e3]])
+    place, other = np.array([200.0, 1e3]), np.array([200.0, -1e3])
+    z = np.linalg.norm(stations - place, axis=1)
+    z[3] = np.linalg.norm(stations[3] - other)
+    fix = solve(assemble(stations, measured("range", z, a=np.arange(4), sigma=10.0)), "robust")
+    assert set(names(fix)) == {("station S2",), ("station S3",)}
+    assert fix.status is Status.AMBIGUOUS
+    assert "station S2 or station S3" in str(fix.reason) or "station S3 or station S2" in str(fix.reason)
+    listed = np.vstack([fix.position, fix.alternatives.x])
+    assert min(np.linalg.norm(listed - place, axis=1)) < 1.0
+    assert min(np.linalg.norm(listed - other, axis=1)) < 1.0
+
+
+def test_too_little_redundancy_is_said():
+    unnoticed = solve(spoiled(arrivals(stations=4), s2=50.0), "robust")
+    assert int(unnoticed.dof) == 0
+    if unnoticed.answered:
+        assert "would not be noticed" in str(unnoticed.reason)
+    unnamed = solve(spoiled(arrivals(stations=5), s2=900.0), "robust")
+    assert unnamed.status is Status.AMBIGUOUS
+    assert len(unnamed.explanations[()]) > 1
+    assert ("station S2",) in names(unnamed)
+    assert "redundancy 1 does not tell" in str(unnamed.reason)
+
+
+@pytest.mark.parametrize("stations", [6, 7, 8])
+def test_all_rows_outliers_are_contradictory(stations):
+    rng = np.random.default_rng(8)
+    clean = simulate(arrivals(stations=stations), TARGET, 1, trials=10)
+    fix = solve(clean.with_rows(z=clean.z + rng.normal(0.0, 3e3, clean.z.shape)), "robust")
+    said = fix.code == Status.CONTRADICTORY
+    assert said.sum() >= 8  # by chance some rest agrees: about one in a hundred for each
+    assert np.isnan(fix.cov[said]).all()
+    assert not fix.answered[said].any()
+    assert all(reason for reason in fix.reason)
+
+
+def test_rows_that_are_absent_or_not_numbers():
+    made = spoiled(arrivals(), s3=400.0)
+    weight = np.ones(7)
+    weight[5] = 0.0
+    z = made.z.copy()
+    z[5] = np.nan
+    assert names(solve(made.with_rows(z=z, weight=weight), "robust")) == [("station S3",)]
+    assert solve(made.with_rows(z=z), "robust").status is Status.REJECTED
+
+
+def test_epochs_and_batches_each_have_their_own_culprit():
+    k = 4
+    a, epoch = np.tile(EACH[1:], k), np.repeat(np.arange(k), 7)
+    weight = np.ones(7 * k)
+    weight[[3, 10]] = 0.0
+    rows = measured("tdoa", a=a, b=0 * a, epoch=epoch, arrival_sigma=10.0, weight=weight)
+    made = simulate(problem(rows, motions=(Motion(span="epoch"),)), np.tile(TARGET, k), 2, trials=2)
+    z = made.z.copy()
+    z[0, 0] += 400.0
+    z[0, 7 + 4] -= 400.0
+    z[1, 21 + 6] += 400.0
+    fix = optloc.suspects(made.with_rows(z=z))
+    assert fix.shape == (2, k)
+    assert fix.explanations.shape == (2, k)
+    found = [[tuple(s.name for s in fix.suspects[i, j]) for j in range(k)] for i in range(2)]
+    expected = [[("station S1",), ("station S5",), (), ()], [(), (), (), ("station S7",)]]
+    assert found == expected
+
+
+def test_what_may_be_wrong_can_be_chosen():
+    made = spoiled(angles(), r3=0.05)
+    assert names(optloc.suspects(made, by="station")) == [("station S3",)]
+    assert names(optloc.suspects(made, by=("row",))) == [("azimuth of S3",)]
+    with pytest.raises(InvalidProblem, match="station"):
+        optloc.suspects(made, by="statoin")
+    with pytest.raises(InvalidProblem, match="batch axes"):
+        optloc.suspects(made, solve(simulate(angles(), TARGET, 1, trials=2)))
+    with pytest.raises(InvalidProblem, match="questions a fix"):
+        solve(made, "suspects")
+
+
+def test_clean_fixes_are_left_alone():
+    made = simulate(arrivals(), TARGET, 4, trials=50)
+    plain, asked = solve(made, "searched"), solve(made, "robust")
+    clean = np.array([not found for found in asked.explanations])
+    assert clean.sum() >= 45
+    np.testing.assert_array_equal(asked.x[clean], plain.x[clean])
+    np.testing.assert_array_equal(asked.cov[clean], plain.cov[clean])
+    assert (asked.code[clean] == plain.code[clean]).all()
+    assert plain.explanations is None
+    assert asked[0].suspects == ()
+
+
+def run(epochs=40, bad=(), prior_off=0.0):
+    """Return bearings of three markers from a camera that moves, some of them wrong, with a map of the markers."""
+    rng = np.random.default_rng(6)
+    markers = np.array([[5.0, 0.0, 1.0], [4.0, 3.0, 2.0], [6.0, -2.0, 0.5]])
+    path = np.stack([np.linspace(-2.0, 2.0, epochs), rng.normal(0, 0.5, epochs), np.full(epochs, 1.2)], axis=1)
+    epoch, target = np.repeat(np.arange(epochs), 3), np.tile(np.arange(3), epochs)
+    rows = [measured(kind, a=0, epoch=epoch, target=target, sigma=5e-3) for kind in ("azimuth", "elevation")]
+    means = markers + np.outer([0.0, 1.0, 0.0], [prior_off, 0.0, 0.0])
+    priors = tuple(Prior(f"position[{i}]", mean, np.eye(3) * 0.03**2) for i, mean in enumerate(means))
+    clean = assemble(path[:, None], *rows, motions=(Motion(),) * 3, priors=priors, times=np.arange(epochs) * 1.0)
+    made = simulate(clean, markers.ravel(), 3)
+    z = made.z.copy()
+    for i in bad:
+        z[i] += 0.4
+    return made.with_rows(z=z), markers
+
+
+def test_a_run_names_wrong_priors_and_detections_one_by_one():
+    made, markers = run(bad=(7, 60, 60 + 120), prior_off=0.5)
+    fix = solve(made, "robust")
+    assert set(fix.explanations[()][0].names) == {
+        "azimuth of S0, target 1, epoch 2",
+        "azimuth and elevation of S0, target 0, epoch 20",
+        "prior of position[1]",
+    }
+    assert fix.answered
+    for i, place in enumerate(markers):
+        assert np.linalg.norm(fix.take(f"position[{i}]") - place) < 5.0 * np.linalg.norm(fix.sigma(f"position[{i}]"))
+
+
+def test_a_clean_run_accuses_nobody():
+    accused = 0
+    made, markers = run()
+    for seed in range(8):
+        accused += bool(solve(simulate(made, markers.ravel(), seed), "robust").explanations[()])
+    assert accused <= 1  # 1 % each: two of eight have a probability of 0.003
+
+
+def test_everything_a_robust_fix_rejected_is_questioned():
+    """A fix with weights is refined anew on all rows before it is tested."""
+    made = spoiled(problem(measured("range", a=EACH, sigma=10.0)), r3=400.0)
+    plain = solve(made, "searched")
+    weights = plain.weights.copy()
+    weights[3] = 0.0
+    fix = optloc.suspects(made, replace(plain, weights=weights))
+    assert names(fix) == [("station S3",)]
+
+
+def test_explanations_survive_indexing_and_reshaping():
+    clean = simulate(arrivals(), TARGET, 3, trials=4)
+    z = clean.z.copy()
+    z[1, 2] += 500.0
+    fix = solve(clean.with_rows(z=z), "robust").reshape((2, 2))
+    assert fix.explanations.shape == (2, 2)
+    assert [s.name for s in fix[0, 1].suspects] == ["station S3"]
+    assert fix[0, 1].flat().explanations.shape == (1,)
+    assert fix.suspects.shape == (2, 2)
+
+
+def command(*arguments):
+    result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    assert result.exit_code in {0, 1}, result.output  # 1: the rest leaves a mirror image
+    return result.stdout
+
+
+def test_the_command_line_names_suspects(tmp_path):
+    demo = (files("optloc") / "scenarios" / "demo.toml").read_text()
+    file, table = tmp_path / "late.toml", tmp_path / "out.csv"
+    file.write_text(demo.replace("z = 16002.9", "z = 19002.9"))
+    out = command("fix", file, "--method", "robust")
+    assert "station Summit" in out
+    written = json.loads(command("fix", file, "--method", "robust", "--json", "--out", table))
+    (explanation,) = written["fixes"][0]["explanations"]
+    (suspect,) = explanation["suspects"]
+    assert suspect["name"] == "station Summit"
+    assert suspect["error"][0] == pytest.approx(3000.0 * 0.299792458, abs=5 * suspect["sigma"][0])
+    assert "station Summit" in table.read_text()
+    assert "explanations" in json.loads(command("fix", file, "--json"))["fixes"][0]
