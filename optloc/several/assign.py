@@ -16,13 +16,13 @@ from optloc.several.propose import proposed
 from optloc.several.report import reported
 from optloc.several.scene import Scene, scenes
 from optloc.several.search import TOLERANCE, Region, Searched, search
-from optloc.several.tuples import Tuples, fitted, nearby, nothing, thinned, together
+from optloc.several.tuples import Tuples, fitted, nearby, nothing, thinned, together, worth
 from optloc.solve.reasons import AMBIGUOUS_GAP
 from optloc.track.sets import Clutter
 from optloc.types import Array
 
 # Turns of prices and searches; and those after which a number of emitters that nobody found is given up.
-_ROUNDS, _HOPELESS = 40, 4
+_ROUNDS, _HOPELESS = 80, 4
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +58,7 @@ def separate(
     count: int | None = None,
     region: tuple[Any, Any] | None = None,
     penalty: float | None = None,
-    boxes: int = 100_000,
+    boxes: int = 400_000,
 ) -> tuple[Emitters, ...]:
     """Return the emitters of each epoch of a problem whose rows do not say whose they are, without a guess.
 
@@ -140,7 +140,7 @@ def _solved(scene: Scene, region: Region, count: int | None, boxes: int) -> Solv
     for turn in range(_ROUNDS):
         tuples = _paying(together(tuples, fresh), limit)
         taken, cost = chosen(tuples, scene.z.shape[1], count)
-        prices = priced(tuples, taken, scene.z.shape, count)
+        prices = priced(tuples, taken, worth(scene, tuples.take(taken)), count)
         found = search(scene, prices, region, boxes)
         total += found.boxes
         bound = max(bound, prices.bound(count, most, found.floor))
@@ -159,7 +159,9 @@ def _worth(scene: Scene, prices: Prices, found: Searched) -> Tuples:
     enough = (found.picks >= 0).sum(-1) >= d
     own = fitted(scene, found.picks[enough], found.places[enough])[0]
     sets = together(own, more)
-    return sets.take(prices.reduced(sets) < -0.5 * TOLERANCE)
+    fresh = sets.take(prices.reduced(sets) < -0.5 * TOLERANCE)
+    # Prices that are too high for one set are too high for its neighbours as well.
+    return together(fresh, thinned(scene, fresh))
 
 
 def _promising(tuples: Tuples, most: int = 40) -> Tuples:

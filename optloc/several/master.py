@@ -98,8 +98,10 @@ def chosen(tuples: Tuples, width: int, count: int | None, forced: int | None = N
     return taken, float(tuples.cost[taken].sum())
 
 
-def priced(tuples: Tuples, taken: Array, shape: tuple[int, int], count: int | None) -> Prices:
-    """Return the prices of the rows: the dual of the linear relaxation, shared evenly among the rows of a taken set.
+def priced(tuples: Tuples, taken: Array, worth: Array, count: int | None) -> Prices:
+    """Return the prices of the rows: the dual of the linear relaxation.
+
+    Of the many duals, one is taken in which the rows of a taken set share its price as their worth has it.
 
     Parameters
     ----------
@@ -107,22 +109,22 @@ def priced(tuples: Tuples, taken: Array, shape: tuple[int, int], count: int | No
         Sets to choose from.
     taken : int array (n,)
         Those that are taken.
-    shape : tuple of two int
-        Of the values, (m, c).
+    worth : array (m, c)
+        By how much each row lowers the cost of its set, above 0.
     count : int or None
         How many sets must be taken.
     """
-    m, width = shape
+    m, width = shape = worth.shape
     if not len(tuples.cost):
         return Prices(np.zeros(shape), 0.0)
     inside, k = incidence(tuples, width), len(taken)
-    # Unknowns: a price for each row, one for each emitter, and the highest price within each taken set.
+    # Unknowns: a price for each row, one for each emitter, and the highest price over worth within each taken set.
     one, none = sparse.csr_array(np.ones((len(tuples.cost), 1))), sparse.csr_array((len(tuples.cost), k))
-    worth: Any = sparse.hstack([-inside.T, one, none])
+    sets: Any = sparse.hstack([-inside.T, one, none])
     row, number = inside[:, taken].nonzero()
     even = sparse.csr_array(
         (
-            np.concatenate([np.ones(len(row)), -np.ones(len(row))]),
+            np.concatenate([1.0 / worth.ravel()[row], -np.ones(len(row))]),
             (np.tile(np.arange(len(row)), 2), np.concatenate([row, m * width + 1 + number])),
         ),
         shape=(len(row), m * width + 1 + k),
@@ -131,7 +133,7 @@ def priced(tuples: Tuples, taken: Array, shape: tuple[int, int], count: int | No
     free = (0.0, 0.0) if count is None else (None, None)
     bounds = [(0.0, None)] * (m * width) + [free] + [(0.0, None)] * k
     limits = np.concatenate([tuples.cost, np.zeros(len(row))])
-    solved = linprog(total, A_ub=sparse.vstack([worth, even]), b_ub=limits, bounds=bounds)
+    solved = linprog(total, A_ub=sparse.vstack([sets, even]), b_ub=limits, bounds=bounds)
     if solved.x is None:
         return Prices(np.zeros(shape), 0.0)
     return Prices(np.maximum(solved.x[: m * width], 0.0).reshape(shape), float(solved.x[m * width]))

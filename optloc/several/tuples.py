@@ -14,6 +14,8 @@ from optloc.track.track import State
 from optloc.types import Array
 
 _PASSES = 4
+# Share of what a row is worth that it keeps however badly it fits.
+_LEAST = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,3 +132,16 @@ def thinned(scene: Scene, tuples: Tuples) -> Tuples:
     picks[np.arange(len(which)), channel] = -1
     enough = (picks >= 0).sum(-1) > scene.scan.dimension
     return fitted(scene, picks[enough], tuples.x[which[enough]])[0]
+
+
+def worth(scene: Scene, tuples: Tuples) -> Array:
+    """Return by how much each row (m, c) lowers the cost of its set, at its place; 1 for rows of no set."""
+    out = np.ones_like(scene.z)
+    variance = scene.sigma**2
+    most = scene.missed + scene.gain - np.log(2.0 * np.pi * variance)
+    for picks, x in zip(tuples.picks, tuples.x, strict=True):
+        used = np.flatnonzero(picks >= 0)
+        apart = offsets(scene.scan, State(0.0, x[None], np.zeros((1, len(x), len(x)))), scene.z)[0][0]
+        lost = most[used] - apart[used, picks[used]] ** 2 / variance[used]
+        out[used, picks[used]] = np.maximum(lost, _LEAST * np.maximum(most[used], 1.0))
+    return out

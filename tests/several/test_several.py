@@ -137,7 +137,7 @@ def test_the_packing_is_the_best_and_its_prices_bound_it():
     assert total == pytest.approx(packed(numbered, cost)[0])
     for count in (None, 1, 2):
         taken, total = chosen(tuples, 3, count)
-        prices = priced(tuples, taken, (4, 3), count)
+        prices = priced(tuples, taken, np.ones((4, 3)), count)
         reduced = prices.reduced(tuples).min()
         assert reduced > -1e-6
         assert prices.bound(count, 6, reduced) <= total + 1e-6
