@@ -1,14 +1,27 @@
 """Configuration of the documentation; nothing is fetched while it is built."""
 
+import sys
 from importlib.metadata import version as installed_version
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parent))
+from generated import filled  # the folder is no package
 
 project = "optloc"
 author = "optloc contributors"
 copyright = "2026, optloc contributors"
 release = version = installed_version("optloc")
 
-extensions = ["myst_parser", "numpydoc", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx.ext.viewcode"]
-exclude_patterns = ["_build"]
+extensions = [
+    "myst_parser",
+    "numpydoc",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.viewcode",
+    "sphinx_gallery.gen_gallery",
+]
+exclude_patterns = ["_build", "examples"]
 html_theme = "furo"
 html_title = f"optloc {release}"
 
@@ -19,3 +32,29 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "none"
 # Attributes and methods follow from the members themselves, in their own place.
 numpydoc_show_class_members = False
+
+sphinx_gallery_conf = {
+    "examples_dirs": "examples",
+    "gallery_dirs": "gallery",
+    "filename_pattern": "/plot_",
+    "within_subsection_order": "FileNameSortKey",
+    "image_scrapers": ("scraper.figures",),
+    "reset_modules": (),
+    "capture_repr": (),
+    "remove_config_comments": True,
+    "show_memory": False,
+    "show_signature": False,
+    "download_all_examples": False,
+    "write_computation_times": False,
+    "min_reported_time": 1e9,
+    "abort_on_example_error": True,
+}
+
+
+def _fill(app: Any, page: str, source: list[str]) -> None:
+    source[0] = filled(source[0])
+
+
+def setup(app: Any) -> None:
+    """Fill in what is generated before a page is read."""
+    app.connect("source-read", _fill)

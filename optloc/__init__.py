@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from typing import Any
 
 from optloc.bias import with_bias
@@ -115,6 +116,8 @@ def __getattr__(name: str) -> Any:
         from optloc import several  # scipy.optimize is loaded when emitters are told apart
 
         return getattr(several, name)
+    if name == "datasets":
+        return import_module("optloc.datasets")
     raise AttributeError(f"module 'optloc' has no attribute {name!r}")
 
 

@@ -111,11 +111,11 @@ def _cauchy_weight(u: Array, c: float) -> Array:
 
 
 def _truncated(u: Array, c: float) -> Array:
-    return np.minimum(u**2, c**2)
+    return np.asarray(np.minimum(u**2, c**2))
 
 
 def _truncated_weight(u: Array, c: float) -> Array:
-    return 1.0 * (np.abs(u) <= c)
+    return np.asarray(1.0 * (np.abs(u) <= c))
 
 
 def _late(u: Array, c: float) -> Array:

@@ -81,7 +81,7 @@ class Scene:
 def scene_of(problem: Problem, fixes: Sequence[Fix]) -> Scene:
     """Return what is to be drawn of a problem and its fixes."""
     stations = problem.stations.position.reshape(-1, problem.stations.count, problem.dimension)[0]
-    parts = [part for fix in fixes for part in _states(fix)]
+    parts = [part for fix in fixes for part in states_of(fix)]
     d = problem.dimension
     position = np.concatenate([p for p, _, _ in parts] or [np.zeros((0, d))])
     covariance = np.concatenate([c for _, c, _ in parts] or [np.zeros((0, d, d))])
@@ -102,10 +102,27 @@ def scene_of(problem: Problem, fixes: Sequence[Fix]) -> Scene:
     return _local(problem, scene) if problem.frame.kind == "ecef" else scene
 
 
+def local_frame(problem: Problem) -> Frame | None:
+    """Return east, north and up at the centre of stations in ECEF, in which they are drawn; None in other frames."""
+    if problem.frame.kind != "ecef":
+        return None
+    stations = problem.stations.position.reshape(-1, problem.stations.count, problem.dimension)[0]
+    lat, lon, height = problem.frame.to_geodetic(stations.mean(0))
+    return Frame("enu", (float(lat), float(lon), float(height)))
+
+
+def placed_points(problem: Problem, points: Array) -> tuple[Array, Array]:
+    """Return points (n, d) along the picture's axes in the problem's frame, and the axes (d, d) in its rows."""
+    local = local_frame(problem)
+    if local is None:
+        return points, np.eye(problem.dimension)
+    return local.to_ecef(points), local.rotation_to_ecef().T
+
+
 def _local(problem: Problem, scene: Scene) -> Scene:
     """Return a scene in ECEF along east, north and up at the stations' centre."""
-    lat, lon, height = problem.frame.to_geodetic(scene.stations.mean(0))
-    local = Frame("enu", (float(lat), float(lon), float(height)))
+    local = local_frame(problem)
+    assert local is not None
     turn = local.rotation_to_ecef().T
     moved = scene.moved(lambda place: local.from_ecef(place.reshape(-1, 3)))
     return replace(moved, covariances=turn @ scene.covariances @ turn.T)
@@ -165,7 +182,7 @@ def _regions(problem: Problem, reach: Array) -> tuple[Array, ...]:
     return (*boxes, *(c.vertices for c in problem.constraints if isinstance(c, Polygon)))
 
 
-def _states(fix: Fix) -> list[tuple[Array, Array, Array]]:
+def states_of(fix: Fix) -> list[tuple[Array, Array, Array]]:
     """Return positions (n, d), covariances (n, d, d) and whether they are clean (n,) of every target."""
     flat = fix if len(fix.shape) == 1 else fix.flat()
     found = []

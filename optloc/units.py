@@ -5,9 +5,9 @@ second. Three conversions are more than a factor:
 
 * A propagation time (``ns``) is a length once multiplied by the propagation speed: light in vacuum
   unless told otherwise, some 343 m/s for sound in air.
-* A level difference in ``dB`` is a ratio of ranges. Amplitude falls with ``1 / r``, so the level at
+* A gain ratio in ``dB`` is a ratio of ranges. Amplitude falls with ``1 / r``, so the level at
   station b above the level at station a, ``20 log10(A_b / A_a)``, is ``20 log10(r_a / r_b)``. Decibels of
-  power, ``10 log10(P_b / P_a)``, are the same number.
+  power, ``10 log10(P_b / P_a)``, are the same number. A quantity that is itself a level stays in decibels.
 * A frequency difference in ``Hz`` is a range-rate difference: a receding emitter lowers the received
   frequency, ``f = f_c (1 - r' / c)``, so ``r_a' - r_b' = -(c / f_c) (f_a - f_b)``.
 
@@ -40,7 +40,7 @@ __all__ = [
     "to_si",
 ]
 
-Quantity = Literal["length", "angle", "ratio", "speed", "time", "plain"]
+Quantity = Literal["length", "angle", "ratio", "level", "speed", "time", "plain"]
 """What a number measures; it decides which units make sense."""
 
 AzimuthConvention = Literal["east-counterclockwise", "north-clockwise"]
@@ -74,6 +74,7 @@ UNITS: Final[Mapping[Quantity, Mapping[str, float]]] = MappingProxyType(
             "arcsec": math.pi / 648_000,
         },
         "ratio": {"1": 1.0, "dB": 1.0},
+        "level": {"dB": 1.0, "Np": 20.0 / math.log(10)},
         "speed": {
             "m/s": 1.0,
             "km/s": 1e3,
@@ -88,10 +89,10 @@ UNITS: Final[Mapping[Quantity, Mapping[str, float]]] = MappingProxyType(
     }
 )
 """Known units of each quantity and their size in SI; times that stand for lengths are in seconds,
-``Hz`` in 1/s and ``dB`` is logarithmic (see the module's text)."""
+``Hz`` in 1/s and ``dB`` of a ratio is logarithmic (see the module's text)."""
 
 SI_UNIT: Final[Mapping[Quantity, str]] = MappingProxyType({q: next(iter(table)) for q, table in UNITS.items()})
-"""The unit of each quantity in memory."""
+"""The unit of each quantity in memory; levels are in decibels, which SI accepts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,7 +172,7 @@ def conversion(
     ----------
     unit : str
         One of ``UNITS[quantity]``.
-    quantity : {"length", "angle", "ratio", "speed", "time", "plain"}
+    quantity : {"length", "angle", "ratio", "level", "speed", "time", "plain"}
         What the numbers measure.
     propagation_speed : float
         Speed in m/s that turns propagation times into lengths and frequencies into speeds.
@@ -196,7 +197,7 @@ def conversion(
     factor = UNITS[quantity][unit]
     if quantity == "length" and unit in _TIME:
         return Conversion(factor * propagation_speed)
-    if unit == "dB":
+    if unit == "dB" and quantity == "ratio":
         return Conversion(math.log(10) / 20, logarithmic=True)
     if unit == "Hz":
         if carrier is None or not (math.isfinite(carrier) and carrier > 0):

@@ -76,6 +76,11 @@ def _groa(d: int) -> Problem:
     return assemble(STATIONS[d], measured("groa", a=a, b=b, sigma=0.002))
 
 
+def _rss_difference(d: int) -> Problem:
+    a, b = pairs(d)
+    return assemble(STATIONS[d], measured("rss_difference", a=a, b=b, sigma=0.02))
+
+
 def _range(d: int) -> Problem:
     return assemble(STATIONS[d], measured("range", a=np.arange(len(STATIONS[d])), sigma=5.0))
 
@@ -115,6 +120,7 @@ def _fdoa(d: int) -> Problem:
 BUILD: dict[str, Callable[[int], Problem]] = {
     "tdoa": _tdoa,
     "groa": _groa,
+    "rss_difference": _rss_difference,
     "range": _range,
     "toa": _toa,
     "range_sum": _range_sum,
@@ -246,6 +252,8 @@ def plain_h(kind: str, p, v, sa, va, sb, vb, axes, frame=None):
         return ra - rb
     if kind == "groa":
         return ra / rb
+    if kind == "rss_difference":
+        return -20.0 * np.log10(ra / rb)
     if kind in ("range", "toa"):
         return ra
     if kind == "range_sum":
@@ -436,7 +444,9 @@ def quick(problem: Problem) -> Callable[[np.ndarray], np.ndarray]:
         out = []
         for rows in problem.rows:
             a, b = rows.a, rows.b
-            if rows.kind in ("tdoa", "groa", "range", "toa", "range_sum"):
+            if rows.kind == "rss_difference":
+                out.append(20.0 * (np.log10(r[b]) - np.log10(r[a])))
+            elif rows.kind in ("tdoa", "groa", "range", "toa", "range_sum"):
                 two = {"tdoa": np.subtract, "groa": np.divide, "range_sum": np.add}.get(rows.kind)
                 one = r[a] + (x[-1] if rows.kind == "toa" else 0.0)
                 out.append(one if two is None else two(r[a], r[b]))

@@ -10,14 +10,14 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 
 FLOORS = {
-    0: "types errors units frames status noise linalg ellipse arrays threads",
+    0: "types errors units frames status noise linalg ellipse arrays threads entries",
     1: "models",
     2: "layout problem linear normal fix tables kernels states build check check_constraints check_unknowns arguments "
     "epochs constraints tangent symbolic plan evaluate weigh windows equations blocks priors learnt bias gauss_newton "
     "loss suspects",
     3: "solve proof bounds maps simulate observe quality",
     4: "track several",
-    5: "study papers scenario files",
+    5: "study papers scenario files datasets convert",
     6: "cli plot scene report maps plugins demo __main__",
 }
 FLOOR = {name: floor for floor, names in FLOORS.items() for name in names.split()}

@@ -33,7 +33,7 @@ def test_no_weighing_raises_the_cost(name):
     case = spoilt("toa", 30, 8, bad=2)
     start = case.truth + np.random.default_rng(2).normal(0.0, 60.0, case.truth.shape)
     doubt, costs = Doubt.of(case.problem, start), [_cost(LOSSES[name], case.problem, start)]
-    for limit in range(1, 16):
+    for limit in (1, 2, 3, 5, 8, 12):
         done = reweighted(case.problem, start, LOSSES[name], doubt, limit=limit)
         np.testing.assert_allclose(done.cost, _cost(LOSSES[name], case.problem, done.x), rtol=1e-9)
         costs.append(done.cost)

@@ -1,8 +1,11 @@
-"""The command line: ``optloc fix``, ``simulate``, ``crlb``, ``check``, ``study``, ``list``, ``schema``, ``demo``."""
+"""The command line: ``optloc fix``, ``check``, ``track`` and so on; ``optloc --help`` lists them."""
 
-from optloc.cli.app import app, main
+from optloc.cli import begin, lookup
+from optloc.cli.app import ANSWERS, MORE, app, main
+from optloc.cli.plot import EXAMPLES, plot
 from optloc.cli.study import study
 
-app.add_typer(study, name="study")
+app.command(rich_help_panel=ANSWERS, epilog=EXAMPLES)(plot)
+app.add_typer(study, name="study", rich_help_panel=MORE)
 
-__all__ = ["app", "main"]
+__all__ = ["app", "begin", "lookup", "main"]

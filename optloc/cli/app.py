@@ -3,37 +3,38 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from typer.core import TyperGroup
 
-from optloc.cli.options import AboveGround, Box, Geodetic, Height, Json, Method, NoiseFromData, Plot, ProblemPath, Quiet
-from optloc.errors import InvalidProblem
+from optloc.cli.group import EXIT_CODES, Group, example
+from optloc.cli.options import (
+    AboveGround,
+    Box,
+    Geodetic,
+    Height,
+    Html,
+    Json,
+    Method,
+    NoiseFromData,
+    Plot,
+    ProblemPath,
+    Quiet,
+    Verbose,
+)
 
 # Heavy libraries are imported inside the commands, so that --help answers at once.
 
-
-class Group(TyperGroup):
-    """Commands whose bad input is a sentence, not a traceback."""
-
-    def invoke(self, ctx: Any) -> Any:
-        """Run a command; malformed input ends in exit code 2."""
-        try:
-            return super().invoke(ctx)
-        except InvalidProblem as error:
-            typer.echo(" ".join(str(error).split()), err=True)
-            raise typer.Exit(2) from None
-
+FIRST, ANSWERS, MORE = "First steps", "Answers", "More"
 
 app = typer.Typer(
     cls=Group,
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
     help="Position fixes from time, gain, angle and Doppler measurements, with covariance and verdict.",
-    epilog="Exit codes: 0 all fixes are ok, 1 some are not, 2 bad input.",
+    epilog=f"{EXIT_CODES} With --install-completion the Tab key completes commands, options and their values.\n\n"
+    + example("optloc demo", "optloc new tdoa --out site.toml", "optloc fix site.toml --plot fix.png"),
 )
 
 
@@ -57,18 +58,15 @@ def _options(
     pass
 
 
-def example(*lines: str) -> str:
-    """Return an epilogue of examples for a help text."""
-    return "[bold]Examples[/bold]\n\n" + "\n\n".join(f"[cyan]{line}[/cyan]" for line in lines)
-
-
 @app.command(
+    rich_help_panel=ANSWERS,
     epilog=example(
         "optloc fix site.toml",
         "optloc fix flight.toml --out fixes.csv",
+        "optloc fix site.toml --html map.html",
         "optloc fix site.toml --json | jq .fixes",
         "optloc fix site.toml --height '1640 ft'",
-    )
+    ),
 )
 def fix(
     file: ProblemPath,
@@ -77,11 +75,13 @@ def fix(
     geojson: Annotated[Path | None, typer.Option(metavar="OUT", help="Write GeoJSON; - is standard output.")] = None,
     plot: Plot = None,
     out: Annotated[Path | None, typer.Option(metavar="OUT", help="Write all fixes as .csv or .parquet.")] = None,
+    html: Html = None,
     height: Height = None,
     above_ground: AboveGround = False,
     box: Box = None,
     noise: NoiseFromData = None,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Fix the target of a problem file, at every epoch if there are several.
 
@@ -91,17 +91,18 @@ def fix(
     from optloc.cli.constraints import demanded
 
     more = demanded(height, above_ground, box)
-    files = {"geojson_path": geojson, "plot": plot, "out": out}
+    files = {"geojson_path": geojson, "plot": plot, "out": out, "html": html}
     code = run_fix(file, method, more, as_json=as_json, **files, quiet=quiet, noise=noise)
     raise typer.Exit(code)
 
 
 @app.command(
+    rich_help_panel=ANSWERS,
     epilog=example(
         "optloc track flight.toml --out track.csv --plot track.png",
         "optloc track flight.toml --model csm --noise 30 --filter ekf",
         "optloc track flight.toml --json | jq '.scans[-1]'",
-    )
+    ),
 )
 def track(
     file: ProblemPath,
@@ -126,6 +127,7 @@ def track(
     out: Annotated[Path | None, typer.Option(metavar="OUT", help="Write the track as .csv or .parquet.")] = None,
     as_json: Json = False,
     plot: Annotated[Path | None, typer.Option("--plot", metavar="OUT.png", help="Draw track, sigma and NIS.")] = None,
+    html: Html = None,
     gap: Annotated[
         float | None,
         typer.Option(
@@ -142,19 +144,21 @@ def track(
         str | None, typer.Option(metavar="P[,V[,A]]", help="Its standard deviations: position, velocity, acceleration.")
     ] = None,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Track the targets of a problem file through its scans, from fixes of its first ones, without a guess."""
     from optloc.cli.tracking import Wanted, rules, run_track
 
     wanted = Wanted(model, filter_, noise, memory, rules(gate, gap), start, start_sigma)
-    raise typer.Exit(run_track(file, wanted, out=out, as_json=as_json, plot=plot, quiet=quiet))
+    raise typer.Exit(run_track(file, wanted, out=out, as_json=as_json, plot=plot, html=html, quiet=quiet))
 
 
 @app.command(
+    rich_help_panel=ANSWERS,
     epilog=example(
         "optloc separate site.toml --detection 0.9 --false 1",
         "optloc separate site.toml --emitters 2 --region 0,0:20e3,30e3",
-    )
+    ),
 )
 def separate(
     file: ProblemPath,
@@ -173,6 +177,7 @@ def separate(
     ] = None,
     as_json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Tell several emitters apart whose rows do not say whose they are; a channel is a kind at its stations."""
     from optloc.cli.several import run_separate
@@ -180,21 +185,10 @@ def separate(
     raise typer.Exit(run_separate(file, detection, false, emitters, region, as_json=as_json, quiet=quiet))
 
 
-@app.command(epilog=example("optloc demo", "optloc demo ambiguous --plot two.png"))
-def demo(
-    name: Annotated[
-        str, typer.Argument(help="Name of a shipped problem: demo, ambiguous, run, registration.")
-    ] = "demo",
-    plot: Annotated[Path, typer.Option(metavar="OUT.png", help="Where to draw the fix.")] = Path("optloc-demo.png"),
-    quiet: Quiet = False,
-) -> None:
-    """Fix a problem file that is shipped with optloc, as a table and a picture."""
-    from optloc.cli.commands import run_demo
-
-    raise typer.Exit(run_demo(name, plot, quiet))
-
-
-@app.command(epilog=example("optloc simulate site.toml --truth 1200,800,50 --seed 7 --trials 100 --out trials.toml"))
+@app.command(
+    rich_help_panel=ANSWERS,
+    epilog=example("optloc simulate site.toml --truth 1200,800,50 --seed 7 --trials 100 --out trials.toml"),
+)
 def simulate(
     file: ProblemPath,
     truth: Annotated[str, typer.Option(metavar="X,Y[,Z]", help="True position, metres in the frame of the file.")],
@@ -208,6 +202,7 @@ def simulate(
     seed: Annotated[int, typer.Option(help="Decides the draw.")] = 0,
     trials: Annotated[int, typer.Option(min=1, help="Independent draws; each becomes an epoch.")] = 1,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Draw measurements of a known target and write them as a problem file."""
     from optloc.cli.bounds import run_simulate
@@ -216,13 +211,14 @@ def simulate(
 
 
 @app.command(
+    rich_help_panel=ANSWERS,
     epilog=example(
         "optloc crlb site.toml --at 1200,800,50",
         "optloc crlb site.toml",
         "optloc crlb flight.toml --at 200e3,300e3,0 --plot bound.png",
         "optloc crlb site.toml --map bound.html --height '1200 m'",
         "optloc crlb site.toml --map bound.geojson --extent 11,11.5,47.6,48",
-    )
+    ),
 )
 def crlb(
     file: ProblemPath,
@@ -245,6 +241,8 @@ def crlb(
     ] = None,
     dilution: Annotated[bool, typer.Option("--dilution", help="Map the geometric dilution of precision.")] = False,
     as_json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Print the Cramer-Rao bound: the accuracy that no unbiased estimate beats.
 
@@ -257,10 +255,13 @@ def crlb(
         raise typer.Exit(run_map(file, map_, at, height, extent, velocity, geodetic=geodetic, dilution=dilution))
     from optloc.cli.bounds import run_crlb
 
-    raise typer.Exit(run_crlb(file, at, velocity, geodetic=geodetic, as_json=as_json, plot=plot))
+    raise typer.Exit(run_crlb(file, at, velocity, geodetic=geodetic, as_json=as_json, plot=plot, quiet=quiet))
 
 
-@app.command(epilog=example("optloc check site.toml", "optloc check flight.toml --plot health.svg --out health.csv"))
+@app.command(
+    rich_help_panel=ANSWERS,
+    epilog=example("optloc check site.toml", "optloc check flight.toml --plot health.svg --out health.csv"),
+)
 def check(
     file: ProblemPath,
     as_json: Json = False,
@@ -272,6 +273,7 @@ def check(
     out: Annotated[Path | None, typer.Option(metavar="OUT", help="Write station health as .csv or .parquet.")] = None,
     plot: Annotated[Path | None, typer.Option("--plot", metavar="OUT.svg", help="Draw the residuals.")] = None,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Say what a file holds (rows, redundancy, geometry) and, of many epochs, how healthy its stations are.
 
@@ -280,47 +282,6 @@ def check(
     from optloc.cli.checking import Asked, run_check
 
     raise typer.Exit(run_check(file, as_json, Asked(not no_solve, method, by, out, plot), quiet=quiet))
-
-
-@app.command(epilog=example("optloc reproduce registration", "optloc reproduce registration --size full --out tables"))
-def reproduce(
-    name: Annotated[str, typer.Argument(metavar="PAPER", help="Name of a paper: registration.")],
-    size: Annotated[str, typer.Option(metavar="quick|full", help="Two minutes, or the sample sizes of the paper.")] = (
-        "quick"
-    ),
-    out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Where tables and pictures go; optloc-PAPER by default.")
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Decides all draws.")] = 1,
-    quiet: Quiet = False,
-) -> None:
-    """Make the simulations of a paper again: tables and pictures with printed value, reproduced value and bound."""
-    from optloc.cli.reproduce import run_reproduce
-
-    raise typer.Exit(run_reproduce(name, size, out, seed, quiet))
-
-
-@app.command("list", epilog=example("optloc list kinds", "optloc list solvers", "optloc list studies"))
-def list_(
-    what: Annotated[
-        str,
-        typer.Argument(metavar="kinds|formulations|solvers|methods|baselines|executors|studies", help="Which table."),
-    ],
-    as_json: Json = False,
-) -> None:
-    """List measurement kinds, formulations, solvers with the back ends found here, or what studies are made of."""
-    from optloc.cli.listing import run_list
-
-    raise typer.Exit(run_list(what, as_json))
-
-
-@app.command()
-def schema() -> None:
-    """Print the JSON schema of problem files."""
-    from optloc.cli.output import dumps
-    from optloc.files import schema as of_files
-
-    typer.echo(dumps(of_files()))
 
 
 def main() -> None:

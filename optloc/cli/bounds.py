@@ -22,7 +22,14 @@ from optloc.types import Array
 
 
 def run_crlb(
-    file: Path, at: str | None, velocity: str | None, *, geodetic: bool, as_json: bool, plot: Path | None = None
+    file: Path,
+    at: str | None,
+    velocity: str | None,
+    *,
+    geodetic: bool,
+    as_json: bool,
+    plot: Path | None = None,
+    quiet: bool = False,
 ) -> int:
     """Print the Cramer-Rao bound at a truth or at the fix, draw it against time, and return the exit code."""
     from optloc.bounds import crlb
@@ -44,7 +51,7 @@ def run_crlb(
     if as_json:
         course = [] if over_time is None else course_records(*over_time)
         write_text(Path("-"), dumps({"file": loaded.source, "bounds": rows, "course": course}))
-    else:
+    elif not quiet:
         console = Console()
         console.print(_bound_table(loaded, rows))
         if over_time is not None:

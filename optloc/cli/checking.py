@@ -19,7 +19,7 @@ from optloc.files import Loaded, read
 from optloc.models import MODELS
 from optloc.problem import Problem
 from optloc.quality.groups import GROUPINGS, By
-from optloc.solve.catalogue import SOLVERS
+from optloc.solve.catalogue import SOLVERS, branches_of
 from optloc.types import Array, Bias
 
 
@@ -61,6 +61,7 @@ def _health(loaded: Loaded, asked: Asked, quiet: bool) -> Checked | None:
     if asked.by not in GROUPINGS:
         raise InvalidProblem(f"unknown grouping {asked.by!r}", "--by", nearest(asked.by, GROUPINGS))
     method = asked.method or ("cauchy" if "cauchy" in SOLVERS else "auto")
+    branches_of(method)
     checked = checked_health(loaded, method, cast("By", asked.by), quiet)
     if asked.out is not None:
         if checked.health is None:

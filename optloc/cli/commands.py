@@ -1,9 +1,8 @@
-"""What ``optloc fix`` and ``optloc demo`` do."""
+"""What ``optloc fix`` does."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.resources import as_file, files
 from pathlib import Path
 
 from rich.console import Console
@@ -26,6 +25,7 @@ def run_fix(
     geojson_path: Path | None = None,
     plot: Path | None = None,
     out: Path | None = None,
+    html: Path | None = None,
     quiet: bool = False,
     noise: str | None = None,
 ) -> int:
@@ -39,6 +39,8 @@ def run_fix(
         write_text(geojson_path, dumps(geojson(fixed)))
     if plot is not None:
         draw(fixed, plot)
+    if html is not None:
+        write_text(html, _map(fixed))
     if as_json:
         levels = fixed.loaded.levels
         noted = {} if levels is None else {"noise": levels_json(levels)}
@@ -51,20 +53,11 @@ def run_fix(
     return 0 if fixed.clean else 1
 
 
-def run_demo(name: str, plot: Path, quiet: bool) -> int:
-    """Fix a shipped problem file, and return the exit code."""
-    folder = files("optloc") / "scenarios"
-    names = sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
-    if name not in names:
-        raise InvalidProblem(f"there is no demo {name!r}", "demo", f"known are {', '.join(names)}")
-    with as_file(folder) as place:
-        fixed = fix_file(read(place / f"{name}.toml"), "auto", quiet)
-    if not quiet:
-        show(fixed, Console())
-    draw(fixed, plot)
-    if not quiet:
-        Console().print(f"The picture is in {plot}.", highlight=False)
-    return 0 if fixed.clean else 1
+def _map(fixed: Fixed) -> str:
+    from optloc.report import fix_page
+
+    loaded = fixed.loaded
+    return fix_page(loaded.problem, fixed.fixes, loaded.title, [str(label) for label in fixed.columns["epoch"]])
 
 
 def draw(fixed: Fixed, path: Path) -> None:

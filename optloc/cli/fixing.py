@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,6 +18,7 @@ from optloc.observe import Observability, observability
 from optloc.problem import Problem
 
 CHUNK = 1024
+LOG = logging.getLogger("optloc.fix")
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,6 +62,7 @@ def fix_file(loaded: Loaded, method: str, quiet: bool) -> Fixed:
     if not separable(loaded.problem):
         with bar(loaded.title, 1, quiet) as advance:
             fix = solve(loaded.problem, method=method)
+            note(fix)
             advance(1)
         return Fixed(loaded, (fix,), fix_columns(loaded, fix, None), _seen(loaded.problem, fix))
     fixes, tables = [], []
@@ -67,10 +70,17 @@ def fix_file(loaded: Loaded, method: str, quiet: bool) -> Fixed:
     with bar(loaded.title, loaded.problem.epochs, quiet) as advance:
         for first, part in _parts(batch, loaded.problem.epochs):
             fix = solve(part, method=method)
+            note(fix)
             fixes.append(fix)
             tables.append(fix_columns(loaded, fix, first))
             advance(len(fix))
     return Fixed(loaded, tuple(fixes), joined(tables))
+
+
+def note(fix: Fix) -> None:
+    """Log the stages of a fix or of a batch of fixes."""
+    for stage in fix.stages:
+        LOG.info("%s: %.3g ms%s", stage.name, 1e3 * stage.seconds, f", {stage.detail}" if stage.detail else "")
 
 
 def _seen(problem: Problem, fix: Fix) -> Observability | None:

@@ -11,7 +11,7 @@ from rich.padding import Padding
 from rich.table import Table
 
 from optloc.cli.output import dumps
-from optloc.errors import InvalidProblem
+from optloc.errors import InvalidProblem, nearest
 from optloc.models import MODELS
 from optloc.units import UNITS
 
@@ -73,6 +73,34 @@ def _studies() -> list[dict[str, str]]:
     return [{"study": name, "summary": data.get("title", data["name"])} for name, data in texts.items()]
 
 
+def _datasets() -> list[dict[str, str]]:
+    from optloc.datasets import available
+    from optloc.datasets.catalogue import ENTRIES
+
+    here = available()
+    return [
+        {
+            "dataset": name,
+            "here": "yes" if name in here else "no",
+            "licence": entry.licence,
+            "summary": entry.description,
+        }
+        for name, entry in ENTRIES.items()
+    ]
+
+
+def _demos() -> list[dict[str, str]]:
+    from optloc.cli.demo import titles
+
+    return [{"demo": name, "summary": title} for name, title in titles().items()]
+
+
+def _starters() -> list[dict[str, str]]:
+    from optloc.cli.starters import starters
+
+    return [{"starter": name, "summary": starter.summary} for name, starter in starters().items()]
+
+
 def _entries(title: str, table: Mapping[str, Any]) -> list[dict[str, str]]:
     """Return name and the text fields of every entry, its summary last."""
     rows = []
@@ -92,7 +120,7 @@ def _text(value: Any) -> Any:
     return None
 
 
-_LISTS: dict[str, Callable[[], list[dict[str, str]]]] = {
+LISTS: dict[str, Callable[[], list[dict[str, str]]]] = {
     "kinds": _kinds,
     "formulations": _formulations,
     "solvers": _solvers,
@@ -100,14 +128,17 @@ _LISTS: dict[str, Callable[[], list[dict[str, str]]]] = {
     "baselines": _baselines,
     "executors": _executors,
     "studies": _studies,
+    "datasets": _datasets,
+    "demos": _demos,
+    "starters": _starters,
 }
 
 
 def run_list(what: str, as_json: bool) -> int:
     """Print one of the tables."""
-    if what not in _LISTS:
-        raise InvalidProblem(f"there is no list of {what!r}", "list", f"use {', '.join(_LISTS)}")
-    rows = _LISTS[what]()
+    if what not in LISTS:
+        raise InvalidProblem(f"there is no list of {what!r}", "list", nearest(what, LISTS))
+    rows = LISTS[what]()
     if as_json:
         typer.echo(dumps(rows))
         return 0

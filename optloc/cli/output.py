@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import sys
 from dataclasses import asdict, fields
 from pathlib import Path
@@ -24,6 +25,8 @@ from optloc.types import Array
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+LOG = logging.getLogger("optloc.write")
+
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file, or standard output where the path is "-"; raise InvalidProblem where that fails."""
@@ -34,6 +37,7 @@ def write_text(path: Path, text: str) -> None:
         path.write_text(text + "\n", encoding="utf-8")
     except OSError as error:
         raise _unwritable(path, error) from None
+    LOG.info("wrote %s", path)
 
 
 def _unwritable(path: Path, error: OSError) -> InvalidProblem:
@@ -60,6 +64,7 @@ def write_table(path: Path, columns: Columns) -> None:
             parquet.write_table(table, path)
     except OSError as error:
         raise _unwritable(path, error) from None
+    LOG.info("wrote %s: %d rows", path, table.num_rows)
 
 
 def saved(figure: Figure, path: Path) -> None:
@@ -70,6 +75,7 @@ def saved(figure: Figure, path: Path) -> None:
         save(figure, path)
     except (OSError, ValueError) as error:
         raise InvalidProblem(f"the picture cannot be written ({error})", str(path), "use .png, .svg or .pdf") from None
+    LOG.info("wrote %s", path)
 
 
 def plain(value: Any) -> Any:

@@ -13,8 +13,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from optloc.cli.app import Group, example
-from optloc.cli.options import Json, Quiet
+from optloc.cli.group import STOPPED, Group, example
+from optloc.cli.options import Json, Quiet, Verbose, names
 
 # Heavy libraries are imported inside the commands, so that --help answers at once.
 
@@ -22,12 +22,11 @@ study = typer.Typer(
     cls=Group,
     no_args_is_help=True,
     rich_markup_mode="rich",
+    epilog=example("optloc list studies", "optloc study run divergence --out divergence"),
     help="Compare methods and solvers over scenarios, noise levels and many trials.",
 )
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Output folder of a study.")]
-STOPPED = 130
-"""Exit code after Ctrl-C."""
 
 
 @study.command(
@@ -38,7 +37,12 @@ STOPPED = 130
     )
 )
 def run(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Study file, or the name of a shipped study.")],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE", autocompletion=names("studies"), help="Study file, or the name of a shipped study."
+        ),
+    ],
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Output folder; NAME-study by default. Goes on where it stopped.")
     ] = None,
@@ -55,6 +59,7 @@ def run(
     seed: Annotated[int | None, typer.Option(min=0, help="Seed, in the place of that of the file.")] = None,
     as_json: Json = False,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Run a study, or go on with one that was stopped: finished parts are kept."""
     from optloc.study.execute import executor as chosen
@@ -79,14 +84,14 @@ def run(
 
 
 @study.command(epilog=example("optloc study status runs/my"))
-def status(folder: Folder, as_json: Json = False) -> None:
+def status(folder: Folder, as_json: Json = False, quiet: Quiet = False, verbose: Verbose = False) -> None:
     """Say how far a study is, and what its methods answered. Exit code 1 while something is left to do."""
     from optloc.study.run import progress
 
     found = progress(folder)
     if as_json:
         _print_json(_record(found))
-    else:
+    elif not quiet:
         _show(found, Console())
     raise typer.Exit(0 if found.complete else 1)
 
@@ -98,6 +103,7 @@ def report(
         Path | None, typer.Option(metavar="DIR", help="Where the report goes; report in the study's folder by default.")
     ] = None,
     quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Make one HTML page of a study, and its tables (CSV, LaTeX) and figures (PNG, SVG) as files.
 
@@ -119,6 +125,8 @@ def compare(
     one: Annotated[Path, typer.Argument(metavar="A", help="Output folder of a study.")],
     two: Annotated[Path, typer.Argument(metavar="B", help="Another one.")],
     as_json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
 ) -> None:
     """Set two studies side by side, cell by cell. Exit code 1 where a share of answers differs by 3 sigma."""
     from dataclasses import asdict
@@ -128,13 +136,13 @@ def compare(
     found = compared(one, two)
     if as_json:
         _print_json([asdict(difference) for difference in found])
-    else:
+    elif not quiet:
         _show_comparison(found, one, two, Console())
     raise typer.Exit(int(any(abs(difference.z) > 3.0 for difference in found)))
 
 
-@study.command()
-def schema() -> None:
+@study.command(epilog=example("optloc study schema > study.schema.json"))
+def schema(verbose: Verbose = False) -> None:
     """Print the JSON schema of study files."""
     from optloc.study.document import study_schema
 

@@ -80,14 +80,23 @@ class One:
     entries: list[Entry]
 
 
-def run_track(file: Path, wanted: Wanted, *, out: Path | None, as_json: bool, plot: Path | None, quiet: bool) -> int:
+def run_track(
+    file: Path,
+    wanted: Wanted,
+    *,
+    out: Path | None = None,
+    as_json: bool = False,
+    plot: Path | None = None,
+    html: Path | None = None,
+    quiet: bool = False,
+) -> int:
     """Track the targets of a file, write what was asked for, and return the exit code.
 
     Whatever goes wrong on the way, the track up to there is written first.
     """
     dynamics = dynamics_of(wanted)
     filter_of(wanted.filter)
-    _check_places(out, plot)
+    _check_places(out, plot, html)
     loaded = read(file)
     ones = [One(*parts, []) for parts in runs_of(loaded)]
     if wanted.start is not None and len(ones) > 1:
@@ -103,6 +112,8 @@ def run_track(file: Path, wanted: Wanted, *, out: Path | None, as_json: bool, pl
         columns = joined([track_columns(one) for one in ones if one.entries]) if any(o.entries for o in ones) else {}
         if columns:
             _write(loaded, ones, columns, out=out, as_json=as_json, plot=plot)
+            if html is not None:
+                write_text(html, _map(loaded, ones))
     if not quiet and not as_json:
         _show(loaded, columns, Console())
     return 0 if set(columns["status"].tolist()) <= _CLEAN else 1
@@ -118,12 +129,12 @@ def dynamics_of(wanted: Wanted) -> Dynamics:
     return (singer if wanted.model == "singer" else current_statistical)(wanted.memory, noise)
 
 
-def _check_places(out: Path | None, plot: Path | None) -> None:
+def _check_places(out: Path | None, plot: Path | None, html: Path | None) -> None:
     """Refuse places that cannot be written before there is a track to lose."""
     if out is not None and out.suffix.lower() not in {".csv", ".parquet", ".pq"}:
         what = f"results of type {out.suffix or out.name!r} are unknown"
         raise InvalidProblem(what, str(out), "use .csv or .parquet")
-    for path in (out, plot):
+    for path in (out, plot, html):
         if path is not None and not path.parent.is_dir():
             raise InvalidProblem("the file cannot be written (no such folder)", str(path), "choose another place")
 
@@ -211,6 +222,26 @@ def track_columns(one: One) -> Columns:
     columns["rows"] = np.array([int(e.updated.count) for e in entries])
     columns["rejected"] = np.array([e.rejected for e in entries])
     return columns
+
+
+def _map(loaded: Loaded, ones: list[One]) -> str:
+    """Return the page with the map of all tracks."""
+    from optloc.report import track_page
+    from optloc.report.spots import degrees, sentence, spots
+
+    problem, d = loaded.problem, loaded.problem.dimension
+    entries = [(one.name, label, e) for one in ones for label, e in zip(one.labels, one.entries, strict=False)]
+    position = np.stack([e.updated.mean[:d] for _, _, e in entries])
+    covariance = np.stack([e.updated.cov[:d, :d] for _, _, e in entries])
+    clean = np.array([e.label in _CLEAN for _, _, e in entries])
+    sigma = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
+    place = degrees(problem, position) if problem.frame.geodetic else position
+    names = [f"{name} {label}" if len(ones) > 1 else label for name, label, _ in entries]
+    text = [
+        sentence(name, e.label, *told)
+        for name, (_, _, e), told in zip(names, entries, zip(place, sigma, strict=True), strict=True)
+    ]
+    return track_page(problem, spots(problem, position, covariance, clean, text), loaded.title)
 
 
 def _write(

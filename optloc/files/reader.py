@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +32,8 @@ from optloc.problem import Problem
 from optloc.quality.levels import NoiseLevels
 from optloc.types import Array, Rows, Stations
 from optloc.units import SPEED_OF_LIGHT
+
+LOG = logging.getLogger("optloc.read")
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +103,10 @@ def read(path: str | Path, *, values: bool = True, more: Mapping[str, Constraint
     InvalidProblem
         As `load`.
     """
-    return draft(Path(path), values=values, more=more or {}).loaded
+    loaded = draft(Path(path), values=values, more=more or {}).loaded
+    p = loaded.problem
+    LOG.info("read %s: %d rows, %d epochs, %d stations", loaded.source, p.count, p.epochs, p.stations.count)
+    return loaded
 
 
 @dataclass(frozen=True, slots=True)

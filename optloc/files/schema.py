@@ -83,7 +83,7 @@ class StationsTable(DataTable):
 class MeasurementsTable(DataTable):
     """Measurements of one kind. Columns: a, b, z; optional ones are listed in the manual."""
 
-    kind: str | None = Field(default=None, json_schema_extra={"enum": [*sorted(MODELS), None]})
+    kind: str | None = Field(default=None, json_schema_extra=lambda schema: schema.update(enum=[*sorted(MODELS), None]))
     """Measurement kind; None where the rows have a column `kind`."""
     unit: str | dict[str, str] | None = None
     """Unit of z, or one unit for each kind; SI by default."""

@@ -17,7 +17,7 @@ ESTIMATE = "estimate"
 """Word in the place of a standard deviation that is to be found from the data."""
 
 # Where the search for a level begins, in SI units: it decides nothing but how kinds are weighed in the first fixes.
-_BEGIN = {"length": 1.0, "angle": 1e-2, "ratio": 1e-2, "speed": 0.1}
+_BEGIN = {"angle": 1e-2, "ratio": 1e-2, "speed": 0.1}
 
 
 def spread_of(
@@ -46,7 +46,7 @@ def spread_of(
     if column:
         return _positive(c, unit.sigma_to_si(c.table.numbers("sigma"), z), column=True), None, None
     if section.sigma == ESTIMATE:
-        return np.full(z.shape, _BEGIN[model.quantity]), None, None
+        return np.full(z.shape, _BEGIN.get(model.quantity, 1.0)), None, None
     if section.sigma is not None:
         number, own = units.amount(section.sigma, unit, join(c.where, "key 'sigma'"))
         return _positive(c, np.broadcast_to(own.sigma_to_si(number, z), z.shape), column=False), None, None

@@ -1,19 +1,35 @@
 """Measurement kinds: every h(x) is written here, once, elementwise.
 
-The same entry serves numbers (NumPy), symbols (CasADi) and derivatives (Jet). To add a kind, add one entry.
+The same entry serves numbers (NumPy), symbols (CasADi) and derivatives (Jet). To add a kind, add one entry, or from
+another package an entry point of the group ``optloc.models``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from math import tau
+from math import log, tau
 from typing import Any
 
+from optloc.entries import Table
+from optloc.errors import InvalidProblem, nearest
 from optloc.models.namespace import namespace
 from optloc.models.primitives import Components, Point, distance, dot, geodetic_height, local, range_rate, wrap
+from optloc.units import UNITS
 
-__all__ = ["MODELS", "LiftedRow", "Model", "Point", "lifted_row", "wrap"]
+__all__ = [
+    "MODELS",
+    "LiftedRow",
+    "Model",
+    "Point",
+    "distance",
+    "lifted_row",
+    "local",
+    "namespace",
+    "range_rate",
+    "rss_difference",
+    "wrap",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +64,8 @@ class Model:
     h : callable of (t, a, b)
         The measurement of target `t` by stations `a` and `b`, elementwise on `Point` components, SI units and radians.
     quantity : str
-        What it measures: "length", "angle", "ratio" or "speed"; decides which units a file may use.
+        What it measures, a key of `optloc.units.UNITS`: "length", "angle", "ratio", "level" (decibels), "speed" or
+        "plain" (a number); decides which units a file may use.
     stations : int
         How many stations it takes: 0, 1 or 2.
     summary : str
@@ -65,6 +82,11 @@ class Model:
         What the points must carry beyond their position.
     dimensions : tuple of int
         Dimensions in which the kind makes sense.
+
+    Raises
+    ------
+    InvalidProblem
+        For an unknown quantity or a number of stations that no row can name.
     """
 
     h: Callable[[Point, Point, Point], Any]
@@ -79,6 +101,12 @@ class Model:
     axes: bool = False
     ecef: bool = False
     dimensions: tuple[int, ...] = (2, 3)
+
+    def __post_init__(self) -> None:
+        if self.quantity not in UNITS:
+            raise InvalidProblem(f"unknown quantity {self.quantity!r}", "quantity", nearest(self.quantity, list(UNITS)))
+        if self.stations not in (0, 1, 2):
+            raise InvalidProblem(f"a row names 0, 1 or 2 stations, not {self.stations}", "stations")
 
 
 def _azimuth(t: Point, a: Point, b: Point) -> Any:
@@ -95,6 +123,37 @@ def _elevation(t: Point, a: Point, b: Point) -> Any:
 def _height(t: Point, a: Point, b: Point) -> Any:
     assert t.ecef is not None
     return geodetic_height(t.ecef)
+
+
+def rss_difference(exponent: float = 2.0) -> Model:
+    """Return the kind "difference of received signal strengths" for a path-loss exponent.
+
+    Power falls with ``r^-exponent``: ``h = 10 exponent log10(r_b / r_a)`` decibels, positive where a hears more.
+    A measured z means ``r_a = 10^(-z / (10 exponent)) r_b``, which is linear in the ranges. The table has the kind for
+    free space, 2; values and standard deviations of another exponent n times ``2 / n`` are of that kind.
+
+    Parameters
+    ----------
+    exponent : float
+        Path-loss exponent (1): 2 in free space.
+
+    References
+    ----------
+    T. S. Rappaport, "Wireless Communications" (2002), eq. 4.67 to 4.69; A. J. Weiss, "On the accuracy of a cellular
+    location system based on RSS measurements", IEEE Trans. Veh. Technol. 52 (2003).
+    """
+    decibels = 10.0 * exponent / log(10.0)
+
+    def h(t: Point, a: Point, b: Point) -> Any:
+        ratio = distance(t, b) / distance(t, a)
+        return decibels * namespace(ratio).log(ratio)
+
+    def lifted(m: Any, a: Point, b: Point) -> LiftedRow:
+        ratio = namespace(m).exp(m / -decibels)
+        return LiftedRow(None, 1.0, -1.0 * ratio, 0.0, lambda t, a, b: ratio / decibels * distance(t, b))
+
+    summary = f"difference of received signal strengths, {10.0 * exponent:g} log10(r_b / r_a)"
+    return Model(h, "level", 2, summary, lifted=lifted)
 
 
 def _basis(a: Point) -> tuple[Components, ...]:
@@ -124,7 +183,7 @@ def _lifted_elevation(m: Any, a: Point, b: Point) -> LiftedRow:
     )
 
 
-MODELS: dict[str, Model] = {
+_KINDS: dict[str, Model] = {
     "tdoa": Model(
         lambda t, a, b: distance(t, a) - distance(t, b),
         "length",
@@ -182,7 +241,9 @@ MODELS: dict[str, Model] = {
         "frequency difference of arrival as range-rate difference, r'_a - r'_b",
         velocity=True,
     ),
+    "rss_difference": rss_difference(),
 }
+MODELS: Table[Model] = Table("optloc.models", lambda value: isinstance(value, Model), _KINDS)
 
 
 def lifted_row(model: Model, m: Any, a: Point, b: Point) -> LiftedRow | None:

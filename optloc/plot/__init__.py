@@ -1,12 +1,31 @@
-"""Pictures: fixes with their stations, tracks, the Cramer-Rao bound against time and as a map.
+"""Pictures: fixes and the cost around them, where iterations end, residuals, biases, tracks, bounds, errors of methods.
 
 matplotlib is imported where it is used. Colours are those of Okabe and Ito, and every kind of point has its own mark.
 """
 
+from optloc.plot.accuracy import plot_accuracy
+from optloc.plot.biases import plot_biases
 from optloc.plot.bound_map import map_geojson, plot_bound_map
+from optloc.plot.convergence import plot_convergence
 from optloc.plot.course import plot_course
 from optloc.plot.fixes import plot_fixes
+from optloc.plot.health import plot_health
+from optloc.plot.landscape import plot_landscape
+from optloc.plot.residuals import plot_residuals
 from optloc.plot.style import save
 from optloc.plot.track import plot_tracks
 
-__all__ = ["map_geojson", "plot_bound_map", "plot_course", "plot_fixes", "plot_tracks", "save"]
+__all__ = [
+    "map_geojson",
+    "plot_accuracy",
+    "plot_biases",
+    "plot_bound_map",
+    "plot_convergence",
+    "plot_course",
+    "plot_fixes",
+    "plot_health",
+    "plot_landscape",
+    "plot_residuals",
+    "plot_tracks",
+    "save",
+]

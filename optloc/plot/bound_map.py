@@ -8,7 +8,7 @@ import numpy as np
 
 from optloc.errors import InvalidProblem
 from optloc.maps import BoundMap
-from optloc.plot.style import BLACK, GREY, figure_class
+from optloc.plot.style import BLACK, GREY, apart, figure_class
 from optloc.types import Array
 
 if TYPE_CHECKING:
@@ -56,7 +56,9 @@ def plot_bound_map(found: BoundMap, title: str = "", *, dilution: bool = False) 
     drawn = axes.pcolormesh(x, y, values, norm=norm, cmap=COLOURS, shading="nearest", rasterized=True)
     lines = axes.contour(x, y, values, levels=steps, colors=BLACK, linewidths=0.8)
     axes.clabel(lines, fmt=lambda value: f"{value:g}", fontsize=8)
-    axes.plot(*stations.T, "^", color="white", mec=BLACK, ms=7, mew=1.2, zorder=4, clip_on=True)
+    axes.scatter(
+        stations[:, 0], stations[:, 1], marker="^", s=50, color="white", edgecolors=BLACK, linewidths=1.2, zorder=4
+    )
     inside = (np.abs(stations - [x.mean(), y.mean()]) <= [np.ptp(x) / 2, np.ptp(y) / 2]).all(-1)
     for place, text in zip(stations[inside], np.array(found.names)[inside], strict=True):
         if len(found.names) <= 12:
@@ -72,6 +74,7 @@ def plot_bound_map(found: BoundMap, title: str = "", *, dilution: bool = False) 
     bar.ax.minorticks_off()
     if title:
         axes.set_title(title, fontsize=11)
+    apart(figure)
     return figure
 
 

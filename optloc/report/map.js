@@ -1,5 +1,5 @@
 "use strict";
-// Maps: drag, wheel, pinch and buttons move them; a pointer or a tap tells the bound.
+// Maps: drag, wheel, pinch and buttons move them; a pointer or a tap tells a mark, or the bound or the place.
 for (const map of document.querySelectorAll(".map")) {
   const svg = map.querySelector("svg"), out = map.querySelector("output"), help = out.textContent;
   const data = JSON.parse(map.querySelector("script").textContent);
@@ -20,17 +20,30 @@ for (const map of document.querySelectorAll(".map")) {
       view[1] + view[3] / 2 + (event.clientY - box.top - box.height / 2) * u];
   };
   const zoom = (by, [x, y] = [view[0] + view[2] / 2, view[1] + view[3] / 2]) => {
-    const size = Math.min(Math.max(view[2] / by, whole[2] / 200), whole[2] * 2.5), f = size / view[2];
+    const size = Math.min(Math.max(view[2] / by, whole[2] / (data.nearest ?? 200)), whole[2] * 2.5), f = size / view[2];
     view = [x + (view[0] - x) * f, y + (view[1] - y) * f, size, view[3] * f];
     show();
   };
-  const tell = ([px, py]) => {
+  const where = ([px, py]) => {
     const lon = data.middle[0] + px / data.scale[0], lat = data.middle[1] + py / data.scale[1];
+    const turned = ((lon + 540) % 360) - 180, digits = data.values ? 4 : 5;
+    const text = `${Math.abs(lat).toFixed(digits)}° ${lat < 0 ? "S" : "N"}, ${Math.abs(turned).toFixed(digits)}° ${turned < 0 ? "W" : "E"}`;
+    return [lon, lat, text];
+  };
+  // What stands at a pixel or a little beside it: marks are small, and fingers are not.
+  const marked = event => {
+    for (const [dx, dy] of [[0, 0], [6, 0], [-6, 0], [0, 6], [0, -6]]) {
+      const mark = document.elementFromPoint(event.clientX + dx, event.clientY + dy)?.closest?.("[data-tell]");
+      if (mark && svg.contains(mark)) return mark.dataset.tell;
+    }
+    return null;
+  };
+  const tell = event => {
+    const text = marked(event), [lon, lat, at] = where(place(event));
+    if (text !== null || !data.values) { out.textContent = text ?? at; return; }
     const [x0, x1, nx] = data.x, [y0, y1, ny] = data.y;
     const i = Math.round((lon - x0) / (x1 - x0) * (nx - 1)), j = Math.round((lat - y0) / (y1 - y0) * (ny - 1));
     const value = i >= 0 && i < nx && j >= 0 && j < ny ? data.values[j * nx + i] : null;
-    const turned = ((lon + 540) % 360) - 180;
-    const at = `${Math.abs(lat).toFixed(4)}° ${lat < 0 ? "S" : "N"}, ${Math.abs(turned).toFixed(4)}° ${turned < 0 ? "W" : "E"}`;
     out.textContent = value === null ? `${at}: no bound here` : `${at}: bound ${value < 1000 ? value + " m" : value / 1000 + " km"}`;
   };
   const fingers = new Map();
@@ -41,7 +54,7 @@ for (const map of document.querySelectorAll(".map")) {
   svg.addEventListener("pointerdown", event => { svg.setPointerCapture(event.pointerId); fingers.set(event.pointerId, event); });
   svg.addEventListener("pointermove", event => {
     const old = fingers.get(event.pointerId);
-    if (!old) { tell(place(event)); return; }
+    if (!old) { tell(event); return; }
     if (fingers.size === 1) {
       const u = unit();
       view[0] -= (event.clientX - old.clientX) * u;
@@ -53,10 +66,10 @@ for (const map of document.querySelectorAll(".map")) {
       fingers.set(event.pointerId, event);
       if (before > 0) zoom(spread() / before, place(event));
     }
-    tell(place(event));
+    tell(event);
   });
   for (const end of ["pointerup", "pointercancel"])
-    svg.addEventListener(end, event => { fingers.delete(event.pointerId); if (end === "pointerup") tell(place(event)); });
+    svg.addEventListener(end, event => { fingers.delete(event.pointerId); if (end === "pointerup") tell(event); });
   svg.addEventListener("pointerleave", () => { if (!fingers.size) out.textContent = help; });
   svg.addEventListener("wheel", event => { event.preventDefault(); zoom(event.deltaY < 0 ? 1.2 : 1 / 1.2, place(event)); }, { passive: false });
   map.querySelector(".tools").addEventListener("click", event => {
@@ -64,6 +77,11 @@ for (const map of document.querySelectorAll(".map")) {
     if (what === "in") zoom(1.5);
     else if (what === "out") zoom(1 / 1.5);
     else if (what === "all") { view = [...whole]; show(); }
+    else if (what === "focus") {
+      const [x, y, width] = data.focus, height = width * whole[3] / whole[2];
+      view = [x - width / 2, y - height / 2, width, height];
+      show();
+    }
   });
   map.querySelector(".layers").addEventListener("change", event => {
     svg.querySelector(`[data-layer="${event.target.value}"]`).style.display = event.target.checked ? "" : "none";

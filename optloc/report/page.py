@@ -30,7 +30,7 @@ def page(title: str, parts: Sequence[tuple[str, str, str]], opening: str, legend
     maps : bool
         Whether there are maps, which need their script.
     """
-    links = "".join(f'<a href="#{name}">{escape(text)}</a>' for name, text, _ in parts)
+    links = "".join(f'<a href="#{name}">{escape(text)}</a>' for name, text, _ in parts if len(parts) > 1)
     body = "".join(f'<section id="{name}"><h2>{escape(text)}</h2>{inner}</section>' for name, text, inner in parts)
     scripts = ["page.js", *(["map.js"] if maps else [])]
     return (

@@ -24,7 +24,7 @@ _OWN = 1e-9
 class Scene:
     """The values measured in each channel (a kind at its stations) of one epoch, and the prices of sets of them.
 
-    A set T of values, one or none of each channel, costs as one emitter, against all of them being false,
+    A set T of values, one or none of each channel, costs as one emitter, against all of them being false, ::
 
         c(T) = min_x chi2(T, x) + ln|2 pi R_T| - sum_T 2 ln(pd / density) - (m - |T|) 2 ln(1 - pd) + penalty,
 

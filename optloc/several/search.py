@@ -73,7 +73,7 @@ def search(scene: Scene, prices: Prices, region: Region, most: int) -> Searched:
     is f(x) = penalty - v + sum_i min(missed, min_j (z_ij - h_i(x))^2 / s_i^2 + ln 2 pi s_i^2 - gain_i + u_ij):
     truncated least squares with several values. Over a box each h_i moves by no more than its enclosure says, which
     bounds every term; terms that are sure, one value being the cheapest everywhere in the box, are bounded together by
-    their linear least squares. With correlated errors chi2 >= |r / s|^2 / (largest eigenvalue of their correlation),
+    their linear least squares. With correlated errors chi2 >= (r/s)'(r/s) / (largest eigenvalue of their correlation),
     and a determinant is at least the product of what each row has of its own.
 
     Parameters

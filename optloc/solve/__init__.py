@@ -10,14 +10,15 @@ from optloc.epochs import by_epoch, separable
 from optloc.errors import InvalidProblem
 from optloc.fix import Fix
 from optloc.problem import Problem
-from optloc.solve.catalogue import FORMULATIONS, METHODS, SOLVERS, WORTH, stages_of
+from optloc.solve.catalogue import FORMULATIONS, METHODS, SOLVERS, WORTH, Entry, Formulation, stages_of
 from optloc.solve.direct import Quick, shortened
 from optloc.solve.parts import in_parts
 from optloc.solve.reasons import without_open_epochs
-from optloc.solve.stages import given
+from optloc.solve.stages import Solver, given
+from optloc.solve.start import vectors
 from optloc.types import Array
 
-__all__ = ["FORMULATIONS", "METHODS", "SOLVERS", "solve"]
+__all__ = ["FORMULATIONS", "METHODS", "SOLVERS", "Entry", "Formulation", "Solver", "given", "solve", "vectors"]
 
 
 def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:

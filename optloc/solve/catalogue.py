@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from optloc.entries import Table
 from optloc.errors import InvalidProblem, nearest
 from optloc.fix import Fix
 from optloc.problem import Problem
@@ -68,7 +69,7 @@ class Formulation:
     source: str
 
 
-SOLVERS: dict[str, Entry] = {
+_STAGES: dict[str, Entry] = {
     "gtrs": Entry(stages.gtrs, "minimiser of the weighted squared-range problem: the cheapest start", "start"),
     "roots": Entry(stages.roots, "every stationary point of the squared-range problem", "start"),
     "sdp": Entry(stages.sdp, "Shor's semidefinite relaxation of the squared-range problem (Clarabel)", "start"),
@@ -98,9 +99,10 @@ SOLVERS: dict[str, Entry] = {
     "taylor": Entry(stages.taylor, "plain undamped Taylor iteration; a baseline, it diverges", "refinement"),
     "huber": Entry(ROBUST["huber"], "Huber's convex loss: gross errors pull no harder than 1.3 sigma", "start"),
     "cauchy": Entry(ROBUST["cauchy"], "Cauchy's loss: the larger an error the less it pulls", "start"),
-    "truncated": Entry(ROBUST["truncated"], "least squares without the rows that are 2.8 sigma off", "start"),
+    "truncated": Entry(ROBUST["truncated"], "least squares without the rows that are 3.4 sigma off", "start"),
     "late": Entry(ROBUST["late"], "doubts ranges and arrivals that are too long: blocked paths", "start"),
 }
+SOLVERS: Table[Entry] = Table("optloc.solvers", lambda value: isinstance(value, Entry), _STAGES)
 
 # Machine code takes time to load, more than the stages take for fewer problems.
 WORTH = 16
@@ -114,7 +116,7 @@ METHODS = {
 
 _RANGES = "range, toa, tdoa, range_sum; azimuth, elevation and groa rows linear in (x, r)"
 
-FORMULATIONS: dict[str, Formulation] = {
+_PROGRAMS: dict[str, Formulation] = {
     "squared_range": Formulation(
         "squared-range least squares with one quadratic constraint (GTRS), all stationary points",
         _RANGES,
@@ -231,6 +233,8 @@ FORMULATIONS: dict[str, Formulation] = {
         "Waechter, Biegler 2006",
     ),
 }
+
+FORMULATIONS: Table[Formulation] = Table("optloc.formulations", lambda value: isinstance(value, Formulation), _PROGRAMS)
 
 
 def stages_of(method: str) -> list[Entry]:

@@ -9,7 +9,7 @@ import numpy as np
 from formulations.registration import Course, candidates
 from optloc import linalg
 from optloc.epochs import by_epoch, untied
-from optloc.models import MODELS
+from optloc.models import MODELS, Model
 from optloc.plan import elapsed, plans
 from optloc.priors import prior_parts
 from optloc.problem import Problem
@@ -24,12 +24,17 @@ _LOOSE = 1e-2
 
 
 def registrable(problem: Problem) -> bool:
-    """Return whether a problem is a run of range differences whose only target lasts it, and is not one fix."""
+    """Return whether a problem is a run of sums or ratios of ranges whose only target lasts it, and is not one fix."""
     if len(problem.motions) != 1 or problem.epochs < 2:
         return False
     motion, moving = problem.motions[0], problem.stations.position.shape[-3] > 1
-    differences = any(MODELS[rows.kind].ranges is not None for rows in problem.rows)
+    differences = any(_of_ranges(MODELS[rows.kind]) for rows in problem.rows)
     return differences and motion.known is None and motion.span == "run" and (moving or motion.order > 0)
+
+
+def _of_ranges(model: Model) -> bool:
+    """Return whether a kind is a sum or a ratio of ranges."""
+    return model.ranges is not None or (model.lifted is not None and not model.axes)
 
 
 @dataclass(frozen=True, slots=True)

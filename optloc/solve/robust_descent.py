@@ -53,7 +53,7 @@ def reweighted(
     loss: Loss,
     doubt: Doubt,
     *,
-    limit: int = 100,
+    limit: int = 50,
     tolerance: float = 1e-6,
     face: Face = (),
 ) -> Minima:
@@ -151,7 +151,7 @@ def _lowered(loss: Loss, problem: Problem, doubt: Doubt, here: Array, there: Arr
         if not worse.any():
             break
         share = np.where(worse, 0.5 * share, share)
-    return here + share[:, None] * (there - here)
+    return np.asarray(here + share[:, None] * (there - here))
 
 
 def _further(loss: Loss, problem: Problem, doubt: Doubt, step: _Step, weight: Array) -> Array:

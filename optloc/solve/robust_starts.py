@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 
 from optloc.constraints import exact
 from optloc.loss import LOSSES, Loss
-from optloc.models import MODELS
 from optloc.noise import independent, variances
 from optloc.problem import Problem
 from optloc.solve.pieces import one_position
 from optloc.solve.refine import refine
 from optloc.solve.robust_descent import weighed_by
+from optloc.solve.robust_subsets import subsets
 from optloc.solve.robust_weights import Doubt, doubted
 from optloc.solve.stages import lsr, packed, pooled, roots, search, widen
 from optloc.solve.verdict import Candidates
@@ -22,12 +21,13 @@ from optloc.status import Status
 from optloc.types import Array
 from optloc.weigh import depends_on_place, weighed
 
-# Subsets of a problem, starts of it that are screened and kept at most; rows up to which single ones are left out.
-_SUBSETS, _SCREENED, _KEPT, _ROWS = 80, 30, 12, 12
-# Problems times subsets, and starts times rows, that are worked on at a time.
-_PAIRS, _NUMBERS = 2048, 2**20
+# Starts of a problem that are screened and kept at most.
+_SCREENED, _KEPT = 30, 12
+# Problems, and starts times rows, that are worked on at a time.
+_EACH, _NUMBERS = 64, 2**20
 # Starts whose residuals differ by less than this many sigma are one.
 _SAME = 0.5
+# Rows that are tried on the other side of a cut; halvings of the scale; growth and most steps of the graduation.
 _FLIPPED = 10
 _HALVINGS, _GROWTH, _GRADES = 6, 1.4, 40
 
@@ -53,52 +53,25 @@ def robust_starts(problem: Problem, loss: Loss) -> Array:
     return packed(np.concatenate(parts, axis=1))
 
 
-def subsets(problem: Problem) -> Array:
-    """Return which rows are left (S, m) when one or two stations, or single rows of a short problem, are left out."""
-    touched = _touched(problem)
-    used = np.flatnonzero(touched.any(1))
-    stations = [touched[s] for s in used]
-    left = [~one for one in stations]
-    if problem.count <= _ROWS:
-        left += [~row for row in np.eye(problem.count, dtype=bool)]
-    left += [~(one | two) for one, two in combinations(stations, 2)]
-    if len(used) <= _ROWS // 2 + 2:
-        left += [~(one | two | three) for one, two, three in combinations(stations, 3)]
-    some = [keep for keep in left if keep.sum() >= problem.dimension]
-    return np.unique(np.array(some[:_SUBSETS]).reshape(-1, problem.count), axis=0)
-
-
-def _touched(problem: Problem) -> Array:
-    """Return which rows (s, m) each station takes part in."""
-    ends = []
-    for rows in problem.rows:
-        taken = MODELS[rows.kind].stations
-        every = np.arange(problem.stations.count)[:, None]
-        ends.append(((rows.a == every) & (taken > 0)) | ((rows.b == every) & (taken > 1)))
-    return np.concatenate(ends, axis=1)
-
-
 def _left_out(problem: Problem, loss: Loss) -> Array:
     """Return the best starts (N, q, size) from closed forms of all subsets."""
-    kept, size = subsets(problem), problem.batch_shape[0]
-    if not len(kept):
-        return np.full((size, 0, problem.layout.size), np.nan)
     # Correlation matters for the answer, hardly for where to look for it, and it costs time.
     noise = weighed(problem).noise if not depends_on_place(problem) else problem.noise
     problem = replace(problem, noise=independent(variances(noise, problem.count)))
-    each = max(1, _PAIRS // len(kept))
-    parts = [_of_subsets(problem.take(np.arange(i, min(i + each, size))), kept, loss) for i in range(0, size, each)]
+    size = problem.batch_shape[0]
+    parts = [_of_subsets(problem.take(np.arange(i, min(i + _EACH, size))), loss) for i in range(0, size, _EACH)]
     out = np.full((size, max(part.shape[1] for part in parts), problem.layout.size), np.nan)
     for i, part in enumerate(parts):
-        out[i * each : i * each + len(part), : part.shape[1]] = part
+        out[i * _EACH : i * _EACH + len(part), : part.shape[1]] = part
     return out
 
 
-def _of_subsets(problem: Problem, kept: Array, loss: Loss) -> Array:
-    size, count = problem.batch_shape[0], len(kept)
-    item = np.repeat(np.arange(size), count)
+def _of_subsets(problem: Problem, loss: Loss) -> Array:
+    item, kept = subsets(problem)
+    if not len(item):
+        return np.full((problem.batch_shape[0], 0, problem.layout.size), np.nan)
     part = problem.take(item)
-    part = part.with_rows(weight=np.where(np.tile(kept, (size, 1)), part.weight, 0.0))
+    part = part.with_rows(weight=np.where(kept, part.weight, 0.0))
     points, pair, slot = pooled(roots(part, None))
     x = refine(part, points[pair, slot], item=pair, limit=5, face=exact(problem)).x
     pool = _cheapest(problem, x, item[pair], loss, _SCREENED, anneal=False)
@@ -154,7 +127,7 @@ def flipped(problem: Problem, loss: Loss, pool: Candidates) -> Array:
     x = pool.x[np.arange(len(best)), best]
     item = np.flatnonzero(np.isfinite(x).all(-1))
     if not len(item):
-        return x[:, None]
+        return np.asarray(x[:, None])
     part = problem.take(item)
     doubt, q = Doubt.of(part, x[item]), min(_FLIPPED, problem.count)
     weight = weighed_by(loss, part, doubt, x[item], np.ones(doubt.base.shape))

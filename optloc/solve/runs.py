@@ -29,6 +29,8 @@ _SAME = 1e-4
 _WEAK = 1e-2
 _AZIMUTHS = 6
 _RADII = (1.5, 5.0)
+# Without a closed form also among the stations.
+_ANYWHERE = (0.3, 0.8, 1.5, 5.0)
 _STEPS = (-8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0)
 # Fixes with an error beyond this share of their distance may have another minimum that block averages do not show.
 _BLURRED = 2e-3
@@ -68,13 +70,13 @@ def alike(problem: Problem) -> list[Array]:
 def _starts(problem: Problem, begin: Callable[[Problem], Array | None]) -> Array:
     blocks = averaged(problem, BLOCKS)
     x = begin(blocks)
-    x = _around(blocks) if x is None else x
+    x = _around(blocks, _ANYWHERE) if x is None else x
     pool = _minima(blocks, x)
     pool = _pooled(pool, _minima(blocks, mirrored_courses(blocks, pool[0][:, :1])))
     doubtful = np.flatnonzero(~_settled(blocks, pool))
     if len(doubtful):
         part = blocks.take(doubtful)
-        wider = _minima(part, np.concatenate([_around(part), _valley(part, pool[0][doubtful, 0])], axis=1))
+        wider = _minima(part, np.concatenate([_around(part, _RADII), _valley(part, pool[0][doubtful, 0])], axis=1))
         pool = _pooled(pool, _spread(wider, doubtful, len(x)))
     return completed(problem, _best(blocks, *pool)[..., : problem.layout.n_shared])
 
@@ -133,14 +135,14 @@ def _length(blocks: Problem) -> Array:
     return np.asarray(spread_of(blocks)[1])
 
 
-def _around(blocks: Problem) -> Array:
+def _around(blocks: Problem, radii: tuple[float, ...]) -> Array:
     """Return vectors (N, C, size) of targets at rest on circles around the stations, and above and below."""
     d, centre = blocks.dimension, spread_of(blocks)[0]
     angle = 2.0 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
     level = np.stack([np.cos(angle), np.sin(angle), *([0.0 * angle] * (d - 2))], axis=-1)
     poles = np.eye(d)[2:]
     direction = np.concatenate([level, poles, -poles])
-    away = (np.array(_RADII)[:, None, None] * direction).reshape(-1, d)
+    away = (np.array(radii)[:, None, None] * direction).reshape(-1, d)
     x = np.repeat(vectors(blocks, None)[:, None], len(away), axis=1)
     slot, _ = blocks.layout.find("position")
     x[..., slot.start : slot.start + slot.size] = centre[:, None] + _length(blocks)[:, None, None] * away

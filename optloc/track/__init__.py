@@ -9,7 +9,7 @@ from optloc.track.measurement_space import lines
 from optloc.track.run import Entry, Rules, collected, tracked
 from optloc.track.start import begun, two_point
 from optloc.track.track import State, Track, followed, predicted
-from optloc.track.updates import UPDATES
+from optloc.track.updates import UPDATES, Updated, ekf, whitened
 
 __all__ = [
     "UPDATES",
@@ -18,10 +18,12 @@ __all__ = [
     "Rules",
     "State",
     "Track",
+    "Updated",
     "begun",
     "begun_with_constants",
     "collected",
     "current_statistical",
+    "ekf",
     "fitted",
     "followed",
     "followed_with_constants",
@@ -34,4 +36,5 @@ __all__ = [
     "smoothed",
     "tracked",
     "two_point",
+    "whitened",
 ]

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from optloc import linalg
+from optloc.entries import Table
 from optloc.linear import linearise
 from optloc.noise import Whitener
 from optloc.problem import Problem
@@ -154,8 +155,8 @@ def mvekf(scan: Problem, mean: Array, cov: Array) -> Updated:
     return _finished(white, cov, x, joseph(after.H, _gain(after.H, cov), cov))
 
 
-UPDATES: dict[str, Update] = {"ekf": ekf, "iekf": iekf, "mgekf": mgekf, "mvekf": mvekf}
-"""Filters by name: add one function and one line."""
+UPDATES: Table[Update] = Table("optloc.trackers", callable, {"ekf": ekf, "iekf": iekf, "mgekf": mgekf, "mvekf": mvekf})
+"""Filters by name: add one function and one line, or from another package an entry point of ``optloc.trackers``."""
 
 _NODES = 5
 _HALVINGS = 8

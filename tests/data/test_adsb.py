@@ -1,12 +1,15 @@
 """Airliners heard by five stations or three, with a known height: fixed without a guess against starts at the truth."""
 
+from functools import partial
+
 import numpy as np
 import pytest
-from data import adsb
+from data import truths
 from data.reference import law, listed
 from data.windows import quantiles, report
 
 from optloc import Status, solve
+from optloc.datasets import adsb
 
 pytestmark = pytest.mark.data
 
@@ -29,8 +32,8 @@ def folder(data_dir):
 def test_five_stations_and_the_height(folder, given, refraction):
     data = adsb.heard(folder, refraction=refraction)
     assert len(data.truth) == 763
-    fix, reference = solve(data.problem(given)), data.from_truth(given)
-    ours, theirs = data.horizontal(fix.position), data.horizontal(reference.position)
+    fix, reference = solve(data.problem(given)), truths.adsb(data, given)
+    ours, theirs = truths.adsb_horizontal(data, fix.position), truths.adsb_horizontal(data, reference.position)
     name = f"ADS-B, five stations, height {given}{', refraction' * refraction}"
     assert law(name, fix, ours, theirs, reference) == pytest.approx(README[refraction], rel=0.05)
     assert not _silent(fix, reference).any()
@@ -41,10 +44,10 @@ def test_three_stations_and_the_height(folder):
     chosen = np.sort(np.random.default_rng(10).choice(len(whole.truth), 30, replace=False))
     data = whole.take(chosen).triplets()
     # Stations 147 and 632 are 22 m apart: three with both of them are two, and say nothing that can be judged.
-    data = data.take(np.flatnonzero(data.width > 50.0))
-    fix, reference = solve(data.problem("exactly")), data.from_truth("exactly")
+    data = data.take(np.flatnonzero(truths.adsb_width(data) > 50.0))
+    fix, reference = solve(data.problem("exactly")), truths.adsb(data, "exactly")
     name = "ADS-B, three stations and height"
-    theirs, best = data.horizontal(reference.position), listed(fix, data.horizontal)
+    theirs, best = truths.adsb_horizontal(data, reference.position), listed(fix, partial(truths.adsb_horizontal, data))
     law(name, fix, best, theirs, reference, answered=0.97)
     near = listed(fix, lambda x: np.linalg.norm(x - reference.position, axis=-1)) < 1.0
     silent = np.flatnonzero(_silent(fix, reference))
@@ -56,7 +59,7 @@ def test_three_stations_and_the_height(folder):
 def test_the_reference_of_three_stations_is_the_published_one(folder):
     # Each line of the README's table adds to the one above: refraction, then the stations' biases.
     data = adsb.heard(folder, refraction=True).unbiased().take(np.arange(0, 763, 4)).triplets()
-    ten = data.horizontal(data.from_truth("exactly").position).reshape(-1, 10)
+    ten = truths.adsb_horizontal(data, truths.adsb(data, "exactly").position).reshape(-1, 10)
     best, middle = quantiles(ten.min(1)), quantiles(np.median(ten, axis=1))
     report(f"ADS-B, of ten triplets started at the truth: best {best}, median {middle} m")
     assert best == pytest.approx(BEST_TRIPLET, rel=0.3)

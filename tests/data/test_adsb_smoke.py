@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from data import adsb
 from data.windows import quantiles, report, statuses
 
 from optloc import solve
+from optloc.datasets import adsb
 
 pytestmark = pytest.mark.data
 

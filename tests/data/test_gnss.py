@@ -1,12 +1,15 @@
 """Satellites heard by a fixed receiver: all of them, or three and the height; no guess where on Earth it is."""
 
+from functools import partial
+
 import numpy as np
 import pytest
-from data import gnss
+from data import truths
 from data.reference import law, listed
 from data.windows import quantiles, report, statuses
 
 from optloc import Status, solve
+from optloc.datasets import gnss
 
 pytestmark = pytest.mark.data
 
@@ -27,8 +30,8 @@ def session(data_dir, case):
 @pytest.mark.parametrize("case", CASES, ids="-".join)
 def test_all_satellites_by_arrival_with_system_offsets(session, case, offset):
     data = session.epochs(every=6)
-    fix, reference = solve(data.by_arrival(offset)), data.epochs_from_truth(offset)
-    ours, theirs = data.horizontal(fix.position), data.horizontal(reference.position)
+    fix, reference = solve(data.by_arrival(offset)), truths.gnss_epochs(data, offset)
+    ours, theirs = truths.gnss_horizontal(data, fix.position), truths.gnss_horizontal(data, reference.position)
     found = law(f"GNSS {case} offset of {offset}", fix, ours, theirs, reference)
     up = (fix.position - data.truth) @ data.truth / np.linalg.norm(data.truth)
     report(f"   height error {up.mean():.2f} m, offset {np.median(fix.bias['system'], axis=0).ravel()} m")
@@ -40,16 +43,19 @@ def test_all_satellites_by_arrival_with_system_offsets(session, case, offset):
 @pytest.mark.parametrize("case", CASES, ids="-".join)
 def test_three_satellites_and_the_height(session, case):
     data = session.draws(1500, seed=3)
-    fix, reference = solve(data.by_difference()), data.draws_from_truth()
+    fix, reference = solve(data.by_difference()), truths.gnss_draws(data)
     name = f"GNSS {case}, three satellites"
     right = np.linalg.norm(fix.position - reference.position, axis=-1) < 1.0
     near = listed(fix, lambda x: np.linalg.norm(x - reference.position, axis=-1)) < 1.0
-    best = listed(fix, data.horizontal)
+    best = listed(fix, partial(truths.gnss_horizontal, data))
     report(f"{name}: the fix is the truth's minimum in {right.sum()}, it is listed in {near.sum()} of {len(right)}")
-    law(name, fix, best, data.horizontal(reference.position), reference, answered=0.98)
+    law(name, fix, best, truths.gnss_horizontal(data, reference.position), reference, answered=0.98)
     # The README's own 95 % leaves out what the draws hold in nearly one plane: compare the median and the third of them
     # that is well conditioned.
-    theirs, good = data.horizontal(reference.position), data.conditioned > 0.5
+    theirs, good = (
+        truths.gnss_horizontal(data, reference.position),
+        gnss.conditioned(data.satellites, data.truth, data.geodetic) > 0.5,
+    )
     assert good.mean() == pytest.approx(1.0 / 3.0, abs=0.04)
     assert quantiles(theirs)[0] == pytest.approx(THREE[case][0], rel=0.3)
     assert quantiles(theirs[good]) == pytest.approx(CONDITIONED[case], rel=0.2)
@@ -68,7 +74,7 @@ def test_three_satellites_and_the_height(session, case):
 def test_the_elevation_mask_leaves_fewer_answers(data_dir):
     data = gnss.load(data_dir / "gnss_static", "K078", "prc_l1_m").draws(100, seed=3)
     reference, free, masked = (
-        data.draws_from_truth(),
+        truths.gnss_draws(data),
         solve(data.by_difference()),
         solve(data.by_difference(masked=True)),
     )

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from data import adsb
 from data.registration import part
 from data.windows import report
 from scipy.stats import spearmanr
 
 from optloc import health, solve
+from optloc.datasets import adsb
 
 pytestmark = pytest.mark.data
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from data import uwb
 from data.registration import part
 from data.windows import report
 
 from optloc import health
+from optloc.datasets import uwb
 
 pytestmark = pytest.mark.data
 

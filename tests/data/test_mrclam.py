@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from data import mrclam
+from data import truths
 from data.reference import law, listed
 from data.windows import quantiles, report
 
 from optloc import Status, solve
+from optloc.datasets import mrclam
 
 pytestmark = pytest.mark.data
 
@@ -33,7 +34,7 @@ def test_fixes_reach_the_published_accuracy(data_dir, number, kinds):
     # Ranges to landmarks in one camera view nearly mirror in their line: dear to settle, and often truly ambiguous.
     thinned = {1: 2, 2: 8, 5: 32}[number] if kinds == RANGE else 3 if kinds == AOA + RANGE else 1
     data = whole.every(thinned)
-    fix, reference = solve(data.problem(kinds)), data.from_truth(kinds)
+    fix, reference = solve(data.problem(kinds)), truths.mrclam(data, kinds)
     ours, theirs = (np.linalg.norm(x - data.truth, axis=-1) for x in (fix.position, reference.position))
     name = f"MRCLAM {number} by {' and '.join(kinds)}"
     if kinds == RANGE:

@@ -1,10 +1,10 @@
 """Plaza radio ranges of a mower: fixes without a guess against least squares started at the truth."""
 
 import pytest
-from data import plaza
 from data.windows import judge, judge_consistency
 
 from optloc import solve
+from optloc.datasets import plaza
 
 pytestmark = pytest.mark.data
 

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from data import adsb
 from data.registration import calibrating, corrected, fixed, learnt, lines, not_beaten, part, plausible
 from data.windows import report
 
 from optloc import solve, with_bias
+from optloc.datasets import adsb
 from optloc.observe import observability
 
 pytestmark = pytest.mark.data

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from data import gnss
 from data.registration import calibrating, corrected, fixed, learnt, lines, part
 from data.windows import report
 
 from optloc import Motion, Status, solve, with_bias
+from optloc.datasets import gnss
 from optloc.observe import observability
 
 pytestmark = pytest.mark.data

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
-from data import plaza
 from data.registration import calibrating, corrected, fixed, learnt, lines, not_beaten, part
 from data.windows import report
 
 from optloc import Status, by_epoch, solve, with_bias
+from optloc.datasets import plaza
 from optloc.observe import observability
 
 pytestmark = pytest.mark.data

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from data import starloc
 from data.registration import fixed, lines, not_beaten
 from data.windows import report
 
 from optloc import Motion, solve, with_bias
+from optloc.datasets import starloc
 from optloc.observe import observability
 
 pytestmark = pytest.mark.data
@@ -38,7 +38,7 @@ def errors(run, turn, count=500):
 
 @pytest.mark.parametrize("half", FIRST, ids=["even", "odd"])
 def test_the_mount_learnt_on_one_half_helps_the_other(data_dir, half):
-    run = starloc.run(data_dir / "starloc_aoa", "R1", "nom")
+    run = starloc.read_run(data_dir / "starloc_aoa", "R1", "nom")
     _, blind, known = learn(run.half(half))
     turns = {"before": np.zeros(3), "calibration": known.take("mount"), "blind": blind.take("mount")}
     degrees = {case: np.rad2deg(turn).round(3).tolist() for case, turn in turns.items()}
@@ -55,7 +55,7 @@ def test_the_mount_learnt_on_one_half_helps_the_other(data_dir, half):
 
 
 def test_a_mount_that_is_far_off_is_learnt_without_a_guess(data_dir):
-    run = starloc.run(data_dir / "starloc_aoa", "R2", "nom", without=WRONG["R2"])
+    run = starloc.read_run(data_dir / "starloc_aoa", "R2", "nom", without=WRONG["R2"])
     _, blind, known = learn(run.half(0))
     turns = {"before": np.zeros(3), "calibration": known.take("mount"), "blind": blind.take("mount")}
     degrees = {case: np.rad2deg(turn).round(2).tolist() for case, turn in turns.items()}
@@ -67,7 +67,7 @@ def test_a_mount_that_is_far_off_is_learnt_without_a_guess(data_dir):
 
 
 def test_the_blind_run_starts_without_a_guess_and_sees_the_mount(data_dir):
-    run = starloc.run(data_dir / "starloc_aoa", "R1", "nom").half(1)
+    run = starloc.read_run(data_dir / "starloc_aoa", "R1", "nom").half(1)
     blind, fix, calibration = learn(run)
     assert len(blind.motions) == 45
     not_beaten(blind, fix, np.concatenate([run.often().truth.ravel(), calibration.take("mount")]))
@@ -79,7 +79,7 @@ def test_the_blind_run_starts_without_a_guess_and_sees_the_mount(data_dir):
 
 
 def test_the_calibrated_mount_has_little_left(data_dir):
-    run = starloc.run(data_dir / "starloc_aoa", "R1", "cal")
+    run = starloc.read_run(data_dir / "starloc_aoa", "R1", "cal")
     _, _, known = learn(run)
     left = np.rad2deg(known.take("mount"))
     report(f"STAR-loc R1, calibrated mount: rotation left {left.round(3)} deg")

@@ -6,11 +6,11 @@ than 0.5 m, and by plain least squares the offsets do not lower the error of the
 
 import numpy as np
 import pytest
-from data import uwb
 from data.registration import calibrating, corrected, fixed, learnt, lines, part, robust
 from data.windows import report
 
 from optloc import by_epoch, with_bias
+from optloc.datasets import uwb
 from optloc.observe import observability
 
 pytestmark = pytest.mark.data

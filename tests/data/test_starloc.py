@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from data import starloc
+from data import truths
 from data.reference import law
 
 from optloc import solve
+from optloc.datasets import starloc
 
 pytestmark = pytest.mark.data
 
@@ -16,7 +17,7 @@ README = {("R1", "nom"): (0.072, 0.35), ("R1", "cal"): (0.042, 0.27)}
 @pytest.mark.parametrize(("run", "attitude"), README)
 def test_fixes_reach_the_published_accuracy(data_dir, run, attitude):
     data = starloc.load(data_dir / "starloc_aoa", run, attitude, groups=1500, seed=6)
-    fix, reference = solve(data.problem()), data.from_truth()
+    fix, reference = solve(data.problem()), truths.starloc(data)
     ours, theirs = (np.linalg.norm(x - data.truth, axis=-1) for x in (fix.position, reference.position))
     found = law(f"STAR-loc {run} {attitude}", fix, ours, theirs, reference)
     assert found == pytest.approx(README[run, attitude], rel=0.25)

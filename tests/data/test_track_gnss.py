@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
-from data import gnss
+from data.reference import horizontal
 from data.windows import report
 
 from optloc import ECEF
+from optloc.datasets import gnss
 from optloc.track import UPDATES, collected, polynomial, tracked
 
 pytestmark = pytest.mark.data
@@ -23,7 +24,7 @@ def test_three_satellites_and_the_height_are_tracked(data_dir, case, dynamics):
     labels = [entry.label for entry in entries]
     first = labels.index("started")
     lat, lon, height = session.geodetic
-    off = gnss.horizontal(track.position[first:], session.truth, np.asarray(lat), np.asarray(lon))
+    off = horizontal(track.position[first:], session.truth, np.asarray(lat), np.asarray(lon))
     report(
         f"GNSS {case}, {dynamics.name}: {len(entries)} scans, started at scan {first}, horizontal rms "
         f"{np.sqrt(np.mean(off**2)):.2f} m, largest {off.max():.2f} m"

@@ -6,10 +6,10 @@ from functools import cache
 import numpy as np
 import pandas as pd
 import pytest
-from data import uwb
 from data.windows import report
 from monte_carlo.tables import write
 
+from optloc.datasets import uwb
 from optloc.track import Rules, collected, polynomial, tracked
 
 pytestmark = pytest.mark.data

@@ -4,10 +4,10 @@ from functools import cache
 
 import numpy as np
 import pytest
-from data import uwb
 from data.windows import judge, judge_consistency
 
 from optloc import solve
+from optloc.datasets import uwb
 
 pytestmark = pytest.mark.data
 

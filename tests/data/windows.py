@@ -1,52 +1,15 @@
-"""What the tests of real data share: a set as windows, and least squares started at the truth to judge a fix by."""
+"""What the tests of real data share: least squares started at the truth to judge a fix by."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-import pandas as pd
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from optloc import Fix, Problem, Status
-
-
-@dataclass(frozen=True)
-class Window:
-    """Rows of one short window: stations, measured values less known corrections, covariance, true position."""
-
-    a: np.ndarray
-    b: np.ndarray | None
-    z: np.ndarray
-    covariance: np.ndarray
-    truth: np.ndarray
-
-
-@dataclass(frozen=True)
-class Windows:
-    """A data set: the stations, its windows, and the problem whose epochs they are."""
-
-    name: str
-    stations: np.ndarray
-    windows: tuple[Window, ...]
-    problem: Problem
-
-    @property
-    def truth(self) -> np.ndarray:
-        return np.array([window.truth for window in self.windows])
-
-
-def windowed(
-    rows: pd.DataFrame, truth: pd.DataFrame, times: np.ndarray, width: float
-) -> tuple[pd.DataFrame, np.ndarray]:
-    """Return the rows that fall into windows centred at `times`, with their `window`, and the truth (k, d) there."""
-    columns = [c for c in ("x_m", "y_m", "z_m") if c in truth]
-    at = np.stack([np.interp(times, truth["t_s"], truth[c]) for c in columns], axis=-1)
-    window = np.searchsorted(times - width / 2, rows["t_s"], side="right") - 1
-    inside = (window >= 0) & (rows["t_s"].to_numpy() < times[np.maximum(window, 0)] + width / 2)
-    return rows.assign(window=window)[inside], at
+from optloc import Fix, Status
+from optloc.datasets.windows import Window, Windows
 
 
 def from_truth(data: Windows) -> tuple[np.ndarray, np.ndarray]:

@@ -1,11 +1,11 @@
-"""Reader of `plaza_range`: windows of outdoor radio ranges of a mower, in the plane, each one epoch of a free target.
+"""Radio ranges of a mower, in the plane: windows, each one epoch of a free target.
 
 Windows are 1.5 s long, centred at every 3 s from 2 s after the first range; the 155 that hear at least 3 beacons are
 kept. The motion within a window is taken out with the truth: what the true range at a row's time exceeds the true range
 at the window's centre is the row's known `correction`.
 
-Three forms, as in the set's README: the ranges as they are ("raw"), less the mean residual of each beacon ("offset"),
-or with the affine fit of each beacon's residual undone ("affine"). Rows are independent; sigma is the rms of all
+Three forms: the ranges as they are ("raw"), less the mean residual of each beacon ("offset"), or with the affine fit
+of each beacon's residual undone ("affine"). Rows are independent; sigma is the rms of all
 residuals: 3.0 m raw (2.8 m of it a mean, as ranges are 7 % too long), 1.15 m less the means, 0.53 m after the fit.
 Where the scale is to be learnt, "scaled", the ranges are as they are, with the sigma that the scale leaves: 0.53 m.
 """
@@ -15,46 +15,54 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
-from data.windows import Window, Windows, windowed
 
-from optloc import Motion, assemble, measured
+from optloc.build import assemble, measured
+from optloc.datasets.folder import chosen, places, table
+from optloc.datasets.windows import Window, Windows, along, windowed
+from optloc.problem import Problem
+from optloc.types import Array, Motion
 
 SIGMA = {"raw": 3.0, "offset": 1.15, "affine": 0.53, "scaled": 0.53}
 STEP, WIDTH, LEAD = 3.0, 1.5, 2.0
 
 
+def dataset(folder: Path, *, form: str = "raw") -> tuple[Problem, Array]:
+    """Return the windows as epochs, and the truth (k, 2)."""
+    data = load(folder, form)
+    return data.problem, data.truth
+
+
 def load(folder: Path, form: str) -> Windows:
     """Return the windows; `form` is "raw", "offset", "affine" or "scaled"."""
-    beacons = pd.read_csv(folder / "stations.csv")
-    truth = pd.read_csv(folder / "truth.csv")
-    rows = pd.read_csv(folder / "ranges.csv").sort_values("t_s", kind="stable")
-    stations = beacons[["x_m", "y_m"]].to_numpy()
+    import pandas as pd
+
+    sigma = SIGMA[chosen(form, SIGMA, "form")]
+    beacons, truth = table(folder, "stations"), table(folder, "truth")
+    rows = table(folder, "ranges").sort_values("t_s", kind="stable")
+    stations = places(beacons)
     a = pd.Index(beacons["beacon"]).get_indexer(rows["beacon"])
-    there = np.stack([np.interp(rows["t_s"], truth["t_s"], truth[c]) for c in ("x_m", "y_m")], axis=-1)
-    distance = np.linalg.norm(there - stations[a], axis=1)
+    distance = np.linalg.norm(along(rows["t_s"].to_numpy(), truth) - stations[a], axis=1)
     rows = rows.assign(a=a, distance=distance, z=_calibrated(form, rows["range_m"].to_numpy(), distance, a))
     times = np.arange(rows["t_s"].iloc[0] + LEAD, truth["t_s"].iloc[-1], STEP)
-    rows, at = windowed(rows, truth, times, WIDTH)
+    rows, at = windowed(rows, times, WIDTH), along(times, truth)
     rows = rows[rows.groupby("window")["a"].transform("nunique") >= 3]
     kept, epoch = np.unique(rows["window"], return_inverse=True)
     a, z = rows["a"].to_numpy(), rows["z"].to_numpy()
     moved = rows["distance"].to_numpy() - np.linalg.norm(at[rows["window"]] - stations[a], axis=1)
-    places = [np.flatnonzero(epoch == k) for k in range(len(kept))]
+    inside = [np.flatnonzero(epoch == k) for k in range(len(kept))]
     windows = tuple(
-        Window(a[i], None, (z - moved)[i], SIGMA[form] ** 2 * np.eye(len(i)), at[k])
-        for i, k in zip(places, kept, strict=True)
+        Window(a[i], None, (z - moved)[i], sigma**2 * np.eye(len(i)), at[k]) for i, k in zip(inside, kept, strict=True)
     )
     problem = assemble(
         stations,
-        measured("range", z, a=a, sigma=SIGMA[form], epoch=epoch, correction=moved),
+        measured("range", z, a=a, sigma=sigma, epoch=epoch, correction=moved),
         times=times[kept],
         motions=(Motion(span="epoch"),),
     )
     return Windows(f"Plaza {form}", stations, windows, problem)
 
 
-def _calibrated(form: str, z: np.ndarray, distance: np.ndarray, a: np.ndarray) -> np.ndarray:
+def _calibrated(form: str, z: Array, distance: Array, a: Array) -> Array:
     if form in ("raw", "scaled"):
         return z
     out = np.empty_like(z)

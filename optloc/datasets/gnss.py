@@ -1,8 +1,8 @@
-"""Reader of `gnss_static`: pseudoranges of two fixed receivers, as epochs of many satellites or draws of three. ECEF.
+"""Pseudoranges of two fixed receivers, as epochs of many satellites or draws of three. ECEF.
 
 Satellites move, so every problem of a batch has stations of its own. Noise: 1 m a pseudorange in a draw of three, about
-the robust spread in the README (0.4 to 2 m, mostly slow errors of each satellite); 1 m over the sine of the elevation
-where an epoch has all its satellites, which is the loss that reproduces the README's table.
+the robust spread that comes with the set (0.4 to 2 m, mostly slow errors of each satellite); 1 m over the sine of the
+elevation where an epoch has all its satellites. Satellites below 10 deg are left out.
 """
 
 from __future__ import annotations
@@ -10,31 +10,38 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
-from data.reference import Reference, centred, descend, ecef, horizontal
 
-from optloc import ECEF, Bias, Motion, Problem, assemble, measured, station_array
+from optloc.build import assemble, measured, station_array
 from optloc.constraints import height, visible
+from optloc.datasets.folder import chosen, places, table
+from optloc.frames import ECEF
+from optloc.problem import Problem
+from optloc.types import Array, Bias, Motion
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 SIGMA = 1.0
 MASK = np.deg2rad(10.0)
+_XYZ = ("sat_x_m", "sat_y_m", "sat_z_m")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Receptions:
     """Problems of one session: satellites (n, s, 3), pseudoranges, sigmas and weights (n, s), their systems (s,).
 
     `truth` is the receiver (3,), `geodetic` its latitude, longitude (radians) and height.
     """
 
-    satellites: np.ndarray
-    z: np.ndarray
-    sigma: np.ndarray
-    weight: np.ndarray
+    satellites: Array
+    z: Array
+    sigma: Array
+    weight: Array
     systems: tuple[str, ...]
-    truth: np.ndarray
+    truth: Array
     geodetic: tuple[float, float, float]
 
     def by_arrival(self, offset: tuple[str, ...]) -> Problem:
@@ -67,51 +74,14 @@ class Receptions:
             constraints=[known],
         )
 
-    def epochs_from_truth(self, offset: tuple[str, ...]) -> Reference:
-        """Return least squares of `by_arrival` started at the truth."""
-        shared = [np.ones(len(self.systems)), *(np.array([s == n for s in self.systems], dtype=float) for n in offset)]
-        whiten = self.weight / self.sigma
-        nuisance = np.stack([column * whiten for column in shared], axis=-1)
-        inverse = np.linalg.pinv(nuisance)
 
-        def residual(x: np.ndarray) -> np.ndarray:
-            off = (self._off(x) * whiten)[..., None]
-            return (off - nuisance @ (inverse @ off))[..., 0]
-
-        return Reference(*descend(residual, np.tile(self.truth, (len(self.z), 1)), 10.0))
-
-    def draws_from_truth(self) -> Reference:
-        """Return least squares of `by_difference` started at the truth: arrivals with a common clock."""
-        lat, lon, h = self.geodetic
-        start = np.tile([lat, lon], (len(self.z), 1))
-        coordinates, cost = descend(lambda u: centred(self._off(ecef(u, h)), self.weight) / SIGMA, start, 1e-6)
-        return Reference(ecef(coordinates, h), cost)
-
-    def horizontal(self, position: np.ndarray) -> np.ndarray:
-        """Return horizontal errors (...), metres."""
-        return horizontal(position, self.truth, *(np.asarray(v) for v in self.geodetic[:2]))
-
-    @property
-    def conditioned(self) -> np.ndarray:
-        """Return the smallest singular value (n,) of a draw's horizontal difference directions, as in the README."""
-        lat, lon = self.geodetic[:2]
-        up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
-        line = self.satellites - self.truth
-        line = line / np.linalg.norm(line, axis=-1, keepdims=True)
-        apart = line[:, 1:] - line[:, :1]
-        return np.linalg.svd(apart - (apart @ up)[..., None] * up, compute_uv=False)[:, 1]
-
-    def _off(self, x: np.ndarray) -> np.ndarray:
-        return self.z - np.linalg.norm(x[:, None] - self.satellites, axis=-1)
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Session:
-    """All rows of one session above the mask, and its receiver."""
+    """All rows of one session above the mask, and its receiver (3,), ECEF metres, and geodetic in radians."""
 
     rows: pd.DataFrame
     column: str
-    truth: np.ndarray
+    truth: Array
     geodetic: tuple[float, float, float]
 
     def epochs(self, every: int = 1) -> Receptions:
@@ -123,17 +93,17 @@ class Session:
         shape = (len(times), len(names))
         z, sigma, weight = np.zeros(shape), np.ones(shape), np.zeros(shape)
         place = np.empty((*shape, 3))
-        place[:] = rows.groupby("sat")[list(_XYZ)].first().loc[names].to_numpy()
-        z[k, s], weight[k, s], place[k, s] = rows[self.column], 1.0, rows[list(_XYZ)].to_numpy()
+        place[:] = places(rows.groupby("sat")[list(_XYZ)].first().loc[names], _XYZ)
+        z[k, s], weight[k, s], place[k, s] = rows[self.column], 1.0, places(rows, _XYZ)
         sigma[k, s] = SIGMA / np.sin(rows["el_rad"])
         return Receptions(place, z, sigma, weight, tuple(n[0] for n in names), self.truth, self.geodetic)
 
     def run(self, column: str | None = None) -> Problem:
         """Return all epochs as one problem of a receiver that stays: arrivals at a clock of each epoch."""
         rows, column = self.rows, column or self.column
-        (times, k), (names, s) = (np.unique(rows[c], return_inverse=True) for c in ("t_gps_s", "sat"))
+        (times, k), (names, s) = (np.unique(rows[c].to_numpy(), return_inverse=True) for c in ("t_gps_s", "sat"))
         place = np.zeros((len(times), len(names), 3))
-        place[k, s] = rows[list(_XYZ)]
+        place[k, s] = places(rows, _XYZ)
         return assemble(
             station_array(place, names.tolist()),
             measured("toa", rows[column].to_numpy(), a=s, epoch=k, sigma=SIGMA / np.sin(rows["el_rad"].to_numpy())),
@@ -148,15 +118,12 @@ class Session:
         """
         times = np.unique(self.rows["t_gps_s"])
         rows = self.rows[self.rows["sat"].str.startswith("G")]
-        always = [name for name, heard in rows.groupby("sat").size().items() if heard == len(times)]
-        table = rows[rows["sat"].isin(always)].pivot_table([*_XYZ, self.column], "t_gps_s", "sat")
-        place = np.stack([table[column][always].to_numpy() for column in _XYZ], axis=-1)
+        always = [str(name) for name, heard in rows.groupby("sat").size().items() if heard == len(times)]
+        wide = rows[rows["sat"].isin(always)].pivot_table([*_XYZ, self.column], "t_gps_s", "sat")
+        place = np.stack([wide[column][always].to_numpy() for column in _XYZ], axis=-1)
         triples = np.array(list(combinations(range(len(always)), 3)))
-        first = np.stack([place[0, chosen] for chosen in triples])
-        one = np.ones(first.shape[:2])
-        conditioned = Receptions(first, one, one, one, ("", "", ""), self.truth, self.geodetic).conditioned
-        best = triples[np.argmax(conditioned)]
-        z = table[self.column][always].to_numpy()[:, best]
+        best = triples[np.argmax(conditioned(place[0, triples], self.truth, self.geodetic))]
+        z = wide[self.column][always].to_numpy()[:, best]
         k = len(times)
         rows_of = measured(
             "tdoa",
@@ -178,20 +145,45 @@ class Session:
         """Return three random satellites of a random epoch, `count` times."""
         rng = np.random.default_rng(seed)
         members = list(self.rows.groupby("t_gps_s").indices.values())
-        chosen = np.array([rng.choice(members[rng.integers(len(members))], 3, replace=False) for _ in range(count)])
-        place = self.rows[list(_XYZ)].to_numpy()[chosen]
-        z = self.rows[self.column].to_numpy()[chosen]
+        drawn = np.array([rng.choice(members[rng.integers(len(members))], 3, replace=False) for _ in range(count)])
+        place = places(self.rows, _XYZ)[drawn]
+        z = self.rows[self.column].to_numpy()[drawn]
         return Receptions(place, z, np.full_like(z, SIGMA), np.ones_like(z), ("", "", ""), self.truth, self.geodetic)
 
 
-_XYZ = ("sat_x_m", "sat_y_m", "sat_z_m")
+def conditioned(satellites: Array, truth: Array, geodetic: tuple[float, float, float]) -> Array:
+    """Return the smallest singular value (n,) of the horizontal difference directions of satellites (n, s, 3)."""
+    lat, lon = geodetic[:2]
+    up = np.array([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)])
+    line = satellites - truth
+    line = line / np.linalg.norm(line, axis=-1, keepdims=True)
+    apart = line[:, 1:] - line[:, :1]
+    return np.asarray(np.linalg.svd(apart - (apart @ up)[..., None] * up, compute_uv=False)[:, 1])
+
+
+def dataset(
+    folder: Path, *, session: str = "K078", column: str = "prc_l1_m", form: str = "epochs", every: int = 1
+) -> tuple[Problem, Array]:
+    """Return a session, and the receiver (3,).
+
+    `form` is "epochs", a batch of arrivals with the offsets of Galileo and QZSS; "run", all epochs of a receiver that
+    stays; or "three", differences of three satellites and the known height.
+    """
+    chosen(form, ("epochs", "run", "three"), "form")
+    data = load(folder, session, column)
+    if form == "epochs":
+        found = data.epochs(every)
+        return found.by_arrival(tuple(sorted(set(found.systems) - {"G"}))), data.truth
+    return data.run() if form == "run" else data.three(), data.truth
 
 
 def load(folder: Path, session: str, column: str) -> Session:
     """Return one session by `column`, "prc_l1_m" or "prc_if_m"."""
-    tables = [pd.read_csv(folder / f"{name}.csv") for name in ("truth", "measurements")]
-    truth, rows = (table[table["session"] == session] for table in tables)
+    tables = [table(folder, name) for name in ("truth", "measurements")]
+    chosen(session, tables[0]["session"], "session")
+    chosen(column, ("prc_l1_m", "prc_if_m"), "column")
+    truth, rows = (found[found["session"] == session] for found in tables)
     site = truth.iloc[0]
     rows = rows[(rows["el_rad"] > MASK) & rows[column].notna()]
-    place = (np.deg2rad(site["lat_deg"]), np.deg2rad(site["lon_deg"]), float(site["h_m"]))
-    return Session(rows, column, site[["x_m", "y_m", "z_m"]].to_numpy(dtype=float), place)
+    place = (float(np.deg2rad(site["lat_deg"])), float(np.deg2rad(site["lon_deg"])), float(site["h_m"]))
+    return Session(rows, column, places(truth)[0], place)

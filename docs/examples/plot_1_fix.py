@@ -1,0 +1,16 @@
+"""
+A fix and its ellipse
+=====================
+
+Six receivers hear one pulse. The fix needs no first guess; the ellipse holds the target with a probability of 95 %.
+"""
+
+from importlib.resources import files
+
+import optloc
+from optloc.plot import plot_fixes
+
+problem = optloc.load(files("optloc") / "scenarios" / "demo.toml")
+fix = optloc.solve(problem)
+figure = plot_fixes(problem, fix, "Six receivers, one pulse")
+print(fix.status.label, fix.position.round(1), fix.sigma().round(1))

@@ -1,0 +1,20 @@
+"""
+Clock errors that a run reveals
+===============================
+
+Four clocks are estimated together with the place of the emitter. Bands are 95 %; dotted are the true errors.
+"""
+
+from importlib.resources import files
+
+import numpy as np
+
+import optloc
+from optloc.plot import plot_biases
+from optloc.solve.growing import growing
+from optloc.units import SPEED_OF_LIGHT
+
+problem = optloc.load(files("optloc") / "scenarios" / "registration.toml")
+found = growing(problem, optloc.solve(problem), np.unique(np.geomspace(4, 200, 30).astype(int)))
+truth = {"clock": SPEED_OF_LIGHT * 1e-9 * np.array([100.0, -133.0, 167.0, -100.0])}
+figure = plot_biases(found, "Five aircraft, one emitter, four clock errors", truth=truth)

@@ -1,0 +1,19 @@
+"""
+Where a fix would be accurate
+=============================
+
+The Cramer-Rao bound over the place of the target: how accurate a fix can be there, with the noise and the stations that
+the file states.
+"""
+
+from importlib.resources import files
+
+import numpy as np
+
+import optloc
+from optloc.maps import bound_map
+from optloc.plot import plot_bound_map
+
+problem = optloc.load(files("optloc") / "scenarios" / "demo.toml")
+lon, lat = np.linspace(10.95, 11.5, 96), np.linspace(47.65, 47.95, 96)
+figure = plot_bound_map(bound_map(problem, optloc.solve(problem).x, lon, lat, height=2000.0), "Target at 2000 m")

@@ -1,0 +1,18 @@
+"""
+A track from nothing
+====================
+
+The drive past five beacons again, now as a track: its start is a fix of the first scans.
+"""
+
+from importlib.resources import files
+
+from optloc.files import read
+from optloc.plot import plot_tracks
+from optloc.plot.track import Drawn
+from optloc.track.dynamics import polynomial
+from optloc.track.run import tracked
+
+problem = read(files("optloc") / "scenarios" / "run.toml").problem
+entries = tuple(tracked(problem, polynomial(1, 1.0)))
+figure = plot_tracks([Drawn("target", problem, entries)], "A drive past five beacons")

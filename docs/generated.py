@@ -1,0 +1,125 @@
+"""What pages say that only the code or the measured tables know: filled in while the documentation is built."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+DOCS = Path(__file__).parent
+PLACE = re.compile(r"^<!-- generated: (\w+)(?: (.+?))? -->$", re.MULTILINE)
+
+
+def filled(text: str) -> str:
+    """Return a page with every ``<!-- generated: NAME ARGUMENTS -->`` followed by what it stands for."""
+    return PLACE.sub(lambda found: GENERATED[found[1]](*(found[2] or "").split(maxsplit=1)), text)
+
+
+def rows(file: str, pattern: str = "") -> str:
+    """Return the lines of a measured table whose first cell matches a pattern, and what was measured when."""
+    lines = (DOCS / "measured" / f"{file}.md").read_text(encoding="utf-8").splitlines()
+    about = next(line for line in lines if line.startswith("optloc "))
+    table = [line for line in lines if line.startswith("|")]
+    chosen = [line for line in table[2:] if re.search(pattern, line)]
+    if not chosen:
+        raise ValueError(f"no row of measured/{file}.md matches {pattern!r}")
+    return "\n".join([*table[:2], *chosen, "", f"*{about}*"])
+
+
+def formulation(name: str) -> str:
+    """Return what the catalogue says of a formulation."""
+    from optloc.solve import FORMULATIONS
+
+    parts = [key for key in FORMULATIONS if key.split(":")[0] == name]
+    lines = []
+    for key in parts:
+        line, head = FORMULATIONS[key], f"`{key.partition(': ')[2]}` " if len(parts) > 1 else ""
+        lines += [f"- {head}serves {line.kinds}.", f"- {head}answer: {line.tight}.", f"- {head}time: {line.cost}."]
+    return "\n".join(lines)
+
+
+def costs() -> str:
+    """Return the formulations as a table: what each serves, how good its answer is, what it takes."""
+    from optloc.solve import FORMULATIONS
+
+    head = ["| formulation | rows | its answer | time |", "|---|---|---|---|"]
+    lines = [
+        f"| [{name}]({name.split(':')[0]}.md) | {line.kinds} | {line.tight} | {line.cost} |"
+        for name, line in FORMULATIONS.items()
+    ]
+    return "\n".join([*head, *lines])
+
+
+def kinds() -> str:
+    """Return the measurement kinds as a table."""
+    from optloc import MODELS
+    from optloc.units import UNITS
+
+    head = ["| kind | stations | dimensions | what is measured | units of a file |", "|---|---|---|---|---|"]
+    lines = []
+    for name, model in MODELS.items():
+        where = " ".join(str(d) for d in model.dimensions)
+        units = " ".join(f"`{unit}`" for unit in UNITS.get(model.quantity, {}))
+        lines.append(f"| `{name}` | {model.stations} | {where} | {model.summary} | {units} |")
+    return "\n".join([*head, *lines])
+
+
+def commands() -> str:
+    """Return every command with its help, arguments, options and examples."""
+    from typer.main import get_command
+
+    from optloc.cli import app
+
+    return "\n\n".join(_help(words, command) for words, command in _walk("optloc", get_command(app)))
+
+
+def _walk(words: str, command: Any) -> Iterator[tuple[str, Any]]:
+    for name, inner in getattr(command, "commands", {}).items():
+        if not inner.hidden:
+            yield from _walk(f"{words} {name}", inner)
+    if not hasattr(command, "commands"):
+        yield words, command
+
+
+def _help(words: str, command: Any) -> str:
+    lines = [f"## `{words}`", "", _marked(_plain(command.help or ""))]
+    shown = [parameter for parameter in command.params if parameter.name != "help"]
+    if shown:
+        lines += ["", "| argument or option | |", "|---|---|", *(_option(parameter) for parameter in shown)]
+    if command.epilog:
+        examples = [line.strip() for line in _plain(command.epilog).splitlines()]
+        lines += ["", "```sh", *(line for line in examples if line.startswith("optloc")), "```"]
+    return "\n".join(lines)
+
+
+def _option(parameter: Any) -> str:
+    value = "" if getattr(parameter, "is_flag", False) else (parameter.metavar or parameter.name.upper())
+    if parameter.param_type_name == "argument":
+        names = f"`{value}`"
+    else:
+        names = ", ".join(f"`{name} {value}`" if value else f"`{name}`" for name in parameter.opts)
+    default = parameter.default
+    known = default is not None and default is not False and not callable(default) and default != ()
+    text = _marked(_plain(getattr(parameter, "help", "") or ""))
+    names, text = names.replace("|", "\\|"), text.replace("|", "\\|")
+    return f"| {names} | {text}{f' Default: `{default}`.' if known and not parameter.required else ''} |"
+
+
+def _plain(text: str) -> str:
+    """Return text without rich's marks."""
+    return re.sub(r"\[/?(?:bold|cyan|dim|italic)\]", "", text).replace("\f", "").strip()
+
+
+def _marked(text: str) -> str:
+    """Return text with its options as code: two dashes would become one."""
+    return re.sub(r"(?<![`\w-])(--[a-z][a-z-]*)", r"`\1`", text)
+
+
+GENERATED: dict[str, Callable[..., str]] = {
+    "rows": rows,
+    "formulation": formulation,
+    "costs": costs,
+    "kinds": kinds,
+    "commands": commands,
+}

@@ -1,0 +1,182 @@
+"""What ``optloc plot`` draws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from rich.console import Console
+
+from optloc.cli.output import saved
+from optloc.epochs import by_epoch, separable
+from optloc.errors import InvalidProblem, nearest
+from optloc.files import Loaded, read
+from optloc.fix import Fix
+from optloc.problem import Problem
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What is to be drawn.
+
+    Parameters
+    ----------
+    file : Path
+        Problem file, or the folder of a study.
+    out : Path
+        The picture.
+    method : str
+        How fixes are made.
+    epoch : str, optional
+        Label of the epoch, or case of a study; the first by default.
+    """
+
+    file: Path
+    out: Path
+    method: str
+    epoch: str | None
+
+
+def run_plot(what: str, asked: Asked, quiet: bool) -> int:
+    """Draw a picture, and return the exit code."""
+    if what not in PICTURES:
+        raise InvalidProblem(f"there is no picture {what!r}", "plot", nearest(what, list(PICTURES)))
+    with problem_file(asked.file) as file:
+        PICTURES[what](Asked(file, asked.out, asked.method, asked.epoch))
+    if not quiet:
+        Console().print(f"The picture is in {asked.out}.", highlight=False)
+    return 0
+
+
+@contextmanager
+def problem_file(file: Path) -> Iterator[Path]:
+    """Yield a path as it is, or that of the shipped problem of that name where there is no such path."""
+    shipped = files("optloc") / "scenarios"
+    if file.exists() or file.name != str(file) or not (shipped / f"{file}.toml").is_file():
+        yield file
+        return
+    with as_file(shipped) as folder:
+        yield folder / f"{file}.toml"
+
+
+def _fixed(asked: Asked) -> tuple[Loaded, Problem, Fix]:
+    """Return a file, its problem (epochs that share nothing as a batch) and its fixes."""
+    from optloc.solve import solve
+
+    loaded = read(asked.file)
+    problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
+    return loaded, problem, solve(problem, asked.method)
+
+
+def _one(asked: Asked) -> tuple[Problem, Fix, str]:
+    """Return the problem of one epoch, or of a run, with its fix and a title."""
+    from optloc.solve import solve
+
+    loaded = read(asked.file)
+    if not separable(loaded.problem):
+        return loaded.problem, solve(loaded.problem, asked.method), loaded.title
+    labels = [str(label) for label in loaded.epochs]
+    label = labels[0] if asked.epoch is None else asked.epoch
+    if label not in labels:
+        raise InvalidProblem(f"there is no epoch {label!r}", "--epoch", nearest(label, labels))
+    problem = by_epoch(loaded.problem).take(np.array([labels.index(label)]))
+    return problem, solve(problem, asked.method), f"{loaded.title}, epoch {label}"
+
+
+def _fix(asked: Asked) -> None:
+    from optloc.plot import plot_fixes
+
+    loaded, _, fix = _fixed(asked)
+    saved(plot_fixes(loaded.problem, fix, loaded.title), asked.out)
+
+
+def _residuals(asked: Asked) -> None:
+    from optloc.plot import plot_residuals
+
+    loaded, problem, fix = _fixed(asked)
+    saved(plot_residuals(problem, fix, loaded.title), asked.out)
+
+
+def _of_one(draw: Callable[..., Figure], asked: Asked) -> None:
+    problem, fix, title = _one(asked)
+    saved(draw(problem, fix, title), asked.out)
+
+
+def _landscape(asked: Asked) -> None:
+    from optloc.plot import plot_landscape
+
+    _of_one(plot_landscape, asked)
+
+
+def _convergence(asked: Asked) -> None:
+    from optloc.plot import plot_convergence
+
+    _of_one(plot_convergence, asked)
+
+
+def _biases(asked: Asked) -> None:
+    from optloc.plot import plot_biases
+    from optloc.solve.growing import growing
+
+    loaded, problem, fix = _fixed(asked)
+    saved(plot_biases(growing(problem, fix), loaded.title), asked.out)
+
+
+def _bound(asked: Asked) -> None:
+    from optloc.cli.bound_map import run_map
+
+    run_map(asked.file, asked.out, None, None, None, None, geodetic=False, dilution=False)
+
+
+def _track(asked: Asked) -> None:
+    from optloc.cli.tracking import Wanted, rules, run_track
+
+    wanted = Wanted("cv", "iekf", None, 10.0, rules(5.0, None), None, None)
+    run_track(asked.file, wanted, out=None, as_json=False, plot=asked.out, quiet=True)
+
+
+def _accuracy(asked: Asked) -> None:
+    from optloc.plot import plot_accuracy
+    from optloc.study import summary
+    from optloc.study.table import read_frame
+
+    if not asked.file.is_dir():
+        raise InvalidProblem("the errors of methods are those of a study", str(asked.file), "name its output folder")
+    rows = read_frame(asked.file, [*summary.COLUMNS])
+    if not len(rows):
+        raise InvalidProblem("nothing of the study is finished yet", str(asked.file), "run the study")
+    cells = summary.cells(summary.judged(rows))
+    names = list(dict.fromkeys(str(case) for case in cells["case"]))
+    name = names[0] if asked.epoch is None else asked.epoch
+    if name not in names:
+        raise InvalidProblem(f"there is no case {name!r}", "--epoch", nearest(name, names))
+    case = cells[cells["case"].astype(str) == name]
+    noise = np.unique(case["noise"].to_numpy(dtype=float))
+    bound = case.groupby("noise")["bound"].max().reindex(noise).to_numpy(dtype=float)
+    errors = {
+        str(method): part.groupby("noise")["rmse"].first().reindex(noise).to_numpy(dtype=float)
+        for method, part in case.groupby("method", sort=False, observed=True)
+    }
+    unit = str(case["noise_unit"].iloc[0])
+    saved(plot_accuracy(noise, errors, bound, name, unit="" if unit == "x" else unit), asked.out)
+
+
+PICTURES: dict[str, Callable[[Asked], None]] = {
+    "fix": _fix,
+    "landscape": _landscape,
+    "convergence": _convergence,
+    "residuals": _residuals,
+    "biases": _biases,
+    "bound": _bound,
+    "track": _track,
+    "accuracy": _accuracy,
+}
+"""Pictures by name."""

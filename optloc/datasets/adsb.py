@@ -1,0 +1,148 @@
+"""Messages of airliners, each heard by five of 27 receivers, as arrivals and a height. ECEF.
+
+Each message is an epoch with a free position and an unknown emission time; arrival times are counted from the first
+arrival of their message, so that metres keep their digits. The height is the aircraft's own, by GNSS.
+
+Noise: arrivals 30 m, the robust residual spread that comes with the set (10 m of it is timing; the rest are station
+biases, refraction and errors of the truth), height 30 m (the quantum is 25 ft). Propagation is taken as in vacuum, or
+through air whose refractivity is 315 ppm at sea level with a scale height of 7.5 km, as a known correction of each
+arrival.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from optloc.build import assemble, measured, station_array
+from optloc.constraints import height
+from optloc.datasets.folder import chosen, places, table
+from optloc.frames import ECEF
+from optloc.problem import Problem
+from optloc.types import Array, Motion
+from optloc.units import SPEED_OF_LIGHT
+
+ARRIVAL, HEIGHT = 30.0, 30.0
+REFRACTIVITY, SCALE_HEIGHT = 315e-6, 7500.0
+
+
+@dataclass(frozen=True, slots=True)
+class Messages:
+    """The problem and the true positions (k, 3), ECEF metres."""
+
+    problem: Problem
+    truth: Array
+
+    def horizontal(self, position: Array, messages: Array) -> Array:
+        """Return horizontal errors (n,) of the positions (n, 3) of some messages, metres."""
+        there = self.truth[messages]
+        local = np.einsum("kij,kj->ki", ECEF.enu_axes(there), position - there)
+        return np.asarray(np.linalg.norm(local[:, :2], axis=1))
+
+
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """Messages with stations of their own: places (n, s, 3), arrivals (n, s), known excess of each (n, s), metres.
+
+    `geodetic` is the true latitude, longitude (radians) and height of each aircraft, (n, 3).
+    """
+
+    stations: Array
+    arrival: Array
+    excess: Array
+    geodetic: Array
+
+    @property
+    def truth(self) -> Array:
+        """Return the true positions (n, 3), ECEF metres."""
+        return ECEF.from_geodetic(*np.moveaxis(self.geodetic, -1, 0))
+
+    def problem(self, given: str) -> Problem:
+        """Return the messages as a batch; `given` is how the height enters: "exactly", "row", or "nothing"."""
+        chosen(given, ("exactly", "row", "nothing"), "given")
+        each = np.arange(self.arrival.shape[1])
+        rows = [measured("toa", self.arrival, a=each, sigma=ARRIVAL, correction=self.excess)]
+        if given == "row":
+            rows.append(measured("height", self.geodetic[:, 2:], sigma=HEIGHT))
+        known = [height(exactly=self.geodetic[:, 2])] if given == "exactly" else []
+        return assemble(station_array(self.stations[:, None]), *rows, frame=ECEF, constraints=known)
+
+    def triplets(self) -> Heard:
+        """Return every three of the five stations, ten problems for each message in turn."""
+        picked = np.array(list(combinations(range(self.arrival.shape[1]), 3)))
+        stations, arrival, excess = (v[:, picked] for v in (self.stations, self.arrival, self.excess))
+        geodetic = np.repeat(self.geodetic, len(picked), axis=0)
+        return Heard(stations.reshape(-1, 3, 3), arrival.reshape(-1, 3), excess.reshape(-1, 3), geodetic)
+
+    def unbiased(self) -> Heard:
+        """Return the messages less the median residual of each station at the truth."""
+        off = self.arrival - self.excess - np.linalg.norm(self.truth[:, None] - self.stations, axis=-1)
+        off = off - np.median(off, axis=1, keepdims=True)
+        _, station = np.unique(self.stations.reshape(-1, 3), axis=0, return_inverse=True)
+        station = station.reshape(off.shape)
+        bias = np.array([np.median(off[station == s]) for s in range(station.max() + 1)])
+        return replace(self, excess=self.excess + bias[station])
+
+    def take(self, index: Array) -> Heard:
+        """Return some messages."""
+        return Heard(self.stations[index], self.arrival[index], self.excess[index], self.geodetic[index])
+
+
+def dataset(folder: Path, *, refraction: bool = False) -> tuple[Problem, Array]:
+    """Return the messages as epochs with a row of height each, and the truth (k, 3)."""
+    data = load(folder, refraction=refraction)
+    return data.problem, data.truth
+
+
+def load(folder: Path, *, refraction: bool = False) -> Messages:
+    """Return all messages as one problem."""
+    import pandas as pd
+
+    stations, rows, truth = (table(folder, name) for name in ("stations", "measurements", "truth"))
+    messages = pd.MultiIndex.from_frame(truth[["set", "msg"]])
+    epoch = messages.get_indexer(pd.MultiIndex.from_frame(rows[["set", "msg"]]))
+    first = rows.groupby(["set", "msg"])["toa_s"].transform("min")
+    z = SPEED_OF_LIGHT * (rows["toa_s"] - first).to_numpy()
+    place, there = places(stations), places(truth)
+    a, excess = pd.Index(stations["station"]).get_indexer(rows["station"]), np.zeros(len(rows))
+    if refraction:
+        distance = np.linalg.norm(there[epoch] - place[a], axis=-1)
+        excess = _refracted(stations["h_m"].to_numpy()[a], truth["h_geo_m"].to_numpy()[epoch], distance)
+    problem = assemble(
+        station_array(place, stations["station"].astype(str).tolist()),
+        measured("toa", z, a=a, sigma=ARRIVAL, epoch=epoch, correction=excess),
+        measured("height", truth["h_geo_m"].to_numpy(), sigma=HEIGHT, epoch=np.arange(len(truth))),
+        motions=(Motion(span="epoch"),),
+        frame=ECEF,
+    )
+    return Messages(problem, there)
+
+
+def heard(folder: Path, *, refraction: bool = False) -> Heard:
+    """Return all messages, each with the five stations that heard it."""
+    import pandas as pd
+
+    stations, rows, truth = (table(folder, name) for name in ("stations", "measurements", "truth"))
+    stations = stations.set_index("station")
+    keys = pd.MultiIndex.from_frame(truth[["set", "msg"]])
+    message = keys.get_indexer(pd.MultiIndex.from_frame(rows[["set", "msg"]]))
+    rows = rows.iloc[np.argsort(message, kind="stable")]
+    toa = rows["toa_s"].to_numpy().reshape(len(truth), -1)
+    own = stations.loc[rows["station"]]
+    place = places(own).reshape(*toa.shape, 3)
+    geodetic = np.column_stack([np.deg2rad(truth[["lat_deg", "lon_deg"]]), truth["h_geo_m"]])
+    arrival = SPEED_OF_LIGHT * (toa - toa.min(-1, keepdims=True))
+    made = Heard(place, arrival, np.zeros_like(arrival), geodetic)
+    if not refraction:
+        return made
+    distance = np.linalg.norm(made.truth[:, None] - place, axis=-1)
+    return replace(made, excess=_refracted(own["h_m"].to_numpy().reshape(toa.shape), geodetic[:, 2:], distance))
+
+
+def _refracted(low: Array, high: Array, distance: Array) -> Array:
+    """Return by how much air lengthens paths between two heights, metres."""
+    drop = np.exp(-low / SCALE_HEIGHT) - np.exp(-high / SCALE_HEIGHT)
+    return np.asarray(REFRACTIVITY * SCALE_HEIGHT * drop / (high - low) * distance)

@@ -1,0 +1,71 @@
+"""Where the data are, and whether they are those that are meant."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optloc.errors import InvalidProblem, nearest
+from optloc.types import Array
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+VARIABLE = "OPTLOC_DATA"
+XYZ = ("x_m", "y_m", "z_m")
+
+
+def root(folder: str | Path | None = None) -> Path:
+    """Return the folder of all data sets; raise InvalidProblem where there is none."""
+    given = os.environ.get(VARIABLE, "") if folder is None else folder
+    if not str(given):
+        advice = f"set the variable {VARIABLE} to the folder that holds the data sets, or name it by folder="
+        raise InvalidProblem("no folder of data sets is known, and optloc holds no data itself", VARIABLE, advice)
+    place = Path(given).expanduser()
+    if not place.is_dir():
+        raise InvalidProblem("there is no such folder", str(place), f"correct {VARIABLE}, or name it by folder=")
+    return place
+
+
+def verify(folder: Path, sha256: Mapping[str, str]) -> None:
+    """Raise InvalidProblem where a file is missing or has another SHA-256."""
+    for name, expected in sha256.items():
+        path = folder / name
+        try:
+            found = hashlib.sha256(path.read_bytes()).hexdigest()
+        except OSError as error:
+            advice = "put the whole data set there"
+            raise InvalidProblem(f"the file cannot be read ({error.strerror})", str(path), advice) from None
+        if found != expected:
+            what = f"this is not the file that is meant: its SHA-256 begins {found[:12]}, not {expected[:12]}"
+            raise InvalidProblem(what, str(path), "fetch it again, or read it nonetheless with verify=False")
+
+
+def table(folder: Path, name: str) -> pd.DataFrame:
+    """Return a table of a data set; raise InvalidProblem where it cannot be read."""
+    import pandas as pd
+
+    path = folder / f"{name}.csv"
+    try:
+        return pd.read_csv(path)
+    except (OSError, ValueError) as error:
+        what = f"the table cannot be read ({getattr(error, 'strerror', None) or error})"
+        raise InvalidProblem(what, str(path), "put the whole data set there") from None
+
+
+def chosen(value: Any, known: Iterable[Any], option: str) -> Any:
+    """Return an option's value; raise InvalidProblem where it is none of the known ones."""
+    names = list(known)
+    if value not in names:
+        raise InvalidProblem(f"{value!r} is unknown", option, nearest(str(value), map(str, names)))
+    return value
+
+
+def places(table: pd.DataFrame, columns: Iterable[str] = XYZ) -> Array:
+    """Return coordinates (n, d) in metres, of the columns that the table has."""
+    return table[[column for column in columns if column in table]].to_numpy(dtype=np.float64)

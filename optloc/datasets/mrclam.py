@@ -1,0 +1,79 @@
+"""A robot that sees landmarks, in the plane: near-instant epochs, each with a free target.
+
+The azimuth is from landmark to robot in world axes. Noise: 2 deg an azimuth (their robust
+spread is 0.5 deg; 1 in 100 is beyond 5 deg) and 0.1 m a range. Ranges alone get 0.15 m, the spread of their residuals:
+what they say apart depends on it, where they put the minima does not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from optloc.build import assemble, measured
+from optloc.datasets.folder import chosen, places, table
+from optloc.problem import Problem
+from optloc.types import Array, Motion
+
+SIGMA = {"azimuth": np.deg2rad(2.0), "range": 0.1}
+ALONE = {**SIGMA, "range": 0.15}
+COLUMN = {"azimuth": "az_rad", "range": "range_m"}
+
+
+@dataclass(frozen=True, slots=True)
+class Sightings:
+    """One set: landmarks (s, 2), true positions (k, 2), and its rows: landmark, epoch, value by kind."""
+
+    landmarks: Array
+    truth: Array
+    a: Array
+    epoch: Array
+    z: dict[str, Array]
+
+    def every(self, n: int) -> Sightings:
+        """Return every n-th epoch."""
+        kept = self.epoch % n == 0
+        z = {kind: values[kept] for kind, values in self.z.items()}
+        return Sightings(self.landmarks, self.truth[::n], self.a[kept], self.epoch[kept] // n, z)
+
+    def problem(self, kinds: tuple[str, ...]) -> Problem:
+        """Return the epochs by some kinds of rows as one problem."""
+        sigma = sigmas(kinds)
+        rows = [measured(kind, self.z[kind], a=self.a, sigma=sigma[kind], epoch=self.epoch) for kind in kinds]
+        return assemble(self.landmarks, *rows, motions=(Motion(span="epoch"),))
+
+
+def sigmas(kinds: tuple[str, ...]) -> dict[str, float]:
+    """Return the standard deviation of each kind, radians or metres."""
+    return ALONE if len(kinds) == 1 else SIGMA
+
+
+def dataset(
+    folder: Path, *, number: int = 1, kinds: tuple[str, ...] = ("azimuth", "range"), every: int = 1
+) -> tuple[Problem, Array]:
+    """Return every n-th epoch of a set by some kinds of rows, and the truth (k, 2)."""
+    for kind in kinds:
+        chosen(kind, COLUMN, "kinds")
+    data = load(folder, number).every(every)
+    return data.problem(tuple(kinds)), data.truth
+
+
+def load(folder: Path, number: int) -> Sightings:
+    """Return one set: 1, 2 or 5."""
+    import pandas as pd
+
+    tables = [table(folder, name) for name in ("stations", "truth", "measurements")]
+    chosen(number, np.unique(tables[0]["set"]).tolist(), "number")
+    stations, truth, rows = (found[found["set"] == number] for found in tables)
+    epoch = pd.Index(truth["epoch"]).get_indexer(rows["epoch"])
+    order = np.argsort(epoch, kind="stable")
+    rows = rows.iloc[order]
+    return Sightings(
+        places(stations),
+        places(truth),
+        pd.Index(stations["station"]).get_indexer(rows["station"]),
+        epoch[order],
+        {kind: rows[column].to_numpy() for kind, column in COLUMN.items()},
+    )

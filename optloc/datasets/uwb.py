@@ -1,0 +1,119 @@
+"""Range differences of a quadrotor among anchors: windows, each one epoch of a free target.
+
+Windows are 0.1 s long, 0.3 s where the anchors take turns (TDOA3), and centred at every half second of a flight in
+which the tag is higher than 0.5 m. The file's `rdiff_m` is |tag - anchor_b| - |tag - anchor_a|, so a row is optloc's
+tdoa, r_a - r_b, with a and b exchanged.
+
+Noise. A row is off by 0.22 m (F01) or 0.19 m (F03; robust spread that comes with the set), but not independently of
+the other rows of its window: the rows of one pair repeat within 0.05 m (robust; 0.11 m rms in F01, as the tails are
+heavy and the tag moves by up to 0.1 m), whereas their means scatter by 0.20 m (F01) and 0.18 m (F03) from window to
+window. The means of neighbouring pairs are correlated, by -0.9 to 0: what lasts for a window is mostly an error of each
+anchor's arrival (antenna pattern, multipath), which enters its two pairs with opposite signs. Hence
+
+    R = 0.10^2 I + 0.14^2 D D',       D = +1 at a, -1 at b,
+
+with 0.14 = 0.20 / sqrt(2); its diagonal, (0.22 m)^2 for two arrivals and a row, is the robust spread. That no
+plausible fix is 5 sigma off does not hang on the numbers: it holds for 0.06 to 0.15 m a row and 0.14 to 0.17 m an
+arrival. At 0.10 m a row the chi-square rejects 26 % (F01) and 39 % (F03) of the windows, which is what heavy tails do.
+The only two fixes that are 5 sigma off, of F03, rest on one value wrong by 26 or 27 m, and p says so.
+
+With `shared=False` rows are independent with 0.2 m: this is plain least squares, but its covariance averages
+over some 40 rows an error that does not average. It says 0.07 m where 0.18 m is the truth, and one plausible fix in
+five is then more than 5 of its own sigma off.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optloc.build import assemble, measured
+from optloc.datasets.folder import chosen, places, table
+from optloc.datasets.windows import Window, Windows, along, windowed
+from optloc.errors import InvalidProblem
+from optloc.noise import Block, Noise, group
+from optloc.problem import Problem
+from optloc.types import Array, Motion
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+ROW, ARRIVAL, INDEPENDENT = 0.10, 0.14, 0.2
+STEP, AIRBORNE = 0.5, 0.5
+WIDTH = {"TDOA2": 0.1, "TDOA3": 0.3}
+
+
+def dataset(folder: Path, *, flight: str = "F01", shared: bool = True) -> tuple[Problem, Array]:
+    """Return the windows of a flight as epochs, and the truth (k, 3)."""
+    data = load(folder, flight, shared=shared)
+    return data.problem, data.truth
+
+
+def load(folder: Path, flight: str, *, shared: bool = True) -> Windows:
+    """Return the windows of one flight; `shared`: with the errors that a window's rows share through their anchors."""
+    width, stations, rows, truth = _flight(folder, flight)
+    times = np.arange(0.0, truth["t_s"].max() + 0.01, STEP)
+    rows, at = windowed(rows, times, width), along(times, truth)
+    rows = rows[at[rows["window"], 2] > AIRBORNE]
+    kept, epoch = np.unique(rows["window"], return_inverse=True)
+    a, b, z = rows["anchor_b"].to_numpy(), rows["anchor_a"].to_numpy(), rows["rdiff_m"].to_numpy()
+    inside = [np.flatnonzero(epoch == k) for k in range(len(kept))]
+    covariances = [_covariance(a[i], b[i], len(stations), shared=shared) for i in inside]
+    windows = tuple(Window(a[i], b[i], z[i], r, at[k]) for i, r, k in zip(inside, covariances, kept, strict=True))
+    problem = _problem(stations, a, b, z, epoch, STEP * kept)
+    if shared:
+        problem = replace(problem, noise=_noise(inside, covariances))
+    return Windows(f"{flight}{'' if shared else ', independent rows'}", stations, windows, problem)
+
+
+def course(
+    folder: Path, flight: str, width: float, *, airborne: bool = True, until: float = np.inf
+) -> tuple[Problem, Array]:
+    """Return a flight as one run of windows next to each other, at the mean time of their rows, and the truth there.
+
+    `airborne`: from the first to the last time that the tag is higher than 0.5 m.
+    """
+    _, stations, rows, truth = _flight(folder, flight)
+    rows = rows[rows["t_s"] < until]
+    if airborne:
+        high = truth.loc[truth["z_m"] > AIRBORNE, "t_s"]
+        rows = rows[rows["t_s"].between(high.min(), high.max())]
+    _, epoch = np.unique(np.floor(rows["t_s"] / width), return_inverse=True)
+    times = np.bincount(epoch, rows["t_s"]) / np.bincount(epoch)
+    a, b = rows["anchor_b"].to_numpy(), rows["anchor_a"].to_numpy()
+    problem = _problem(stations, a, b, rows["rdiff_m"].to_numpy(), epoch, times)
+    inside = [np.flatnonzero(epoch == k) for k in range(len(times))]
+    noise = _noise(inside, [_covariance(a[i], b[i], len(stations), shared=True) for i in inside])
+    return replace(problem, noise=noise), along(times, truth)
+
+
+def _flight(folder: Path, flight: str) -> tuple[float, Array, pd.DataFrame, pd.DataFrame]:
+    """Return width of a window in seconds, anchors (s, 3), rows in the order of time and truth of a flight."""
+    flights = table(folder, "flights").set_index("flight")
+    mode = str(flights.loc[chosen(flight, flights.index, "flight"), "mode"])
+    if mode not in WIDTH:
+        names = ", ".join(flights.index[flights["mode"].isin(list(WIDTH))])
+        raise InvalidProblem(f"the flight {flight!r} has ranges, not differences", "flight", f"use {names}")
+    anchors = table(folder, "stations").sort_values("anchor")
+    stations = places(anchors[anchors["session"] == flights.loc[flight, "session"]])
+    truth, rows = (found[found["flight"] == flight] for found in (table(folder, "truth"), table(folder, "tdoa")))
+    return WIDTH[mode], stations, rows.sort_values("t_s", kind="stable"), truth
+
+
+def _problem(stations: Array, a: Array, b: Array, z: Array, epoch: Array, times: Array) -> Problem:
+    rows = measured("tdoa", z, a=a, b=b, sigma=INDEPENDENT, epoch=epoch)
+    return assemble(stations, rows, times=times, motions=(Motion(span="epoch"),))
+
+
+def _covariance(a: Array, b: Array, stations: int, *, shared: bool) -> Array:
+    if not shared:
+        return INDEPENDENT**2 * np.eye(len(a))
+    design = np.eye(stations)[a] - np.eye(stations)[b]
+    return ROW**2 * np.eye(len(a)) + ARRIVAL**2 * design @ design.T
+
+
+def _noise(inside: list[Array], covariances: list[Array]) -> Noise:
+    return group([Block(rows[None], covariance[None]) for rows, covariance in zip(inside, covariances, strict=True)])

@@ -1,0 +1,168 @@
+"""The cost over the place of a target: why a fix is where it is, and where else it could be."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optloc.errors import InvalidProblem
+from optloc.fix import Fix
+from optloc.plot import parts
+from optloc.plot.bound_map import levels
+from optloc.plot.parts import PLAN
+from optloc.plot.style import BLACK, BLUE, ORANGE, apart, figure_class, unit_of
+from optloc.problem import Problem
+from optloc.scene import Scene, placed_points, scene_of
+from optloc.solve.profile import profile_cost
+from optloc.types import Array
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLOURS = "YlGnBu_r"
+_POINTS = 121
+_SIGMAS = (1, 2, 3, 4, 5, 7, 10)
+_CHI2_95 = 5.991464547107979
+_NAME = "cost above that of the fix, square root (standard deviations)"
+
+
+def plot_landscape(problem: Problem, fix: Fix, title: str = "") -> Figure:
+    """Return a plan of the cost around a fix: of everything, and of the surroundings of the fix.
+
+    Colour is the root of the cost above that of the fix, in standard deviations. What else is unknown takes the values
+    that fit best at each place. In space the plan of everything is at the height of the fix; around the fix the height
+    takes the value that fits best, too, so that the line of 95 % and the ellipse say the same.
+
+    Parameters
+    ----------
+    problem : Problem
+        A single problem with one target that stands for the run.
+    fix : Fix
+        Its fix.
+    title : str
+        Title of the picture.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        To be written with `optloc.plot.save`.
+
+    Raises
+    ------
+    InvalidProblem
+        Where there are several fixes or targets, or no answer.
+    """
+    flat, answer = single(problem, fix)
+    scene = scene_of(flat, [answer])
+    figure = figure_class()(figsize=(12.0, 5.4), layout="constrained")
+    whole, near = figure.subplots(1, 2)
+    _whole(whole, flat, answer, scene)
+    _near(near, flat, answer, scene)
+    handles, labels = whole.get_legend_handles_labels()
+    more, names = near.get_legend_handles_labels()
+    figure.legend([*handles, *more], [*labels, *names], loc="outside lower center", ncols=5, frameon=False)
+    if title:
+        figure.suptitle(title)
+    apart(figure)
+    return figure
+
+
+def single(problem: Problem, fix: Fix) -> tuple[Problem, Fix]:
+    """Return a problem and its fix as flat batches of one; refuse what has no answer or not one position."""
+    flat, answer = problem.flat(), fix.flat()
+    sought = sum(motion.known is None for motion in problem.motions)
+    if len(answer) != 1 or sought != 1 or not any(slot.name == "position" for slot in flat.layout.shared):
+        what = f"{len(answer)} fixes of {sought} targets are more than one position"
+        raise InvalidProblem(what, "plot", "draw one epoch, or a run of one target")
+    if not np.isfinite(answer.x).all():
+        raise InvalidProblem(f"there is no fix to draw around: {answer.reason[0]}", "plot", "see `optloc fix`")
+    return flat, answer
+
+
+def limits(scene: Scene, widen: float = 0.25) -> Array:
+    """Return the square [[x0, y0], [x1, y1]] that holds stations, fix and alternatives with a rim, metres."""
+    points = np.concatenate([scene.stations, scene.fixes, scene.alternatives])[:, :2]
+    low, high = points.min(0), points.max(0)
+    half = (0.5 + widen) * float((high - low).max() or 1.0)
+    middle = 0.5 * (low + high)
+    return np.stack([middle - half, middle + half])
+
+
+def plane(corners: Array, count: int, above: Array) -> tuple[Array, Array, Array]:
+    """Return the grid of a square as x (n,), y (n,) and points (n n, d), at the height of a point (d,)."""
+    x, y = (np.linspace(low, high, count) for low, high in corners.T)
+    east, north = np.meshgrid(x, y)
+    points = np.tile(above, (count * count, 1))
+    points[:, 0], points[:, 1] = east.ravel(), north.ravel()
+    return x, y, points
+
+
+def _excess(problem: Problem, fix: Fix, points: Array, held: int) -> Array:
+    """Return the root (n,) of the cost at points (n, d) along the picture's axes above the fix's.
+
+    Parameters
+    ----------
+    problem, fix : Problem, Fix
+        Of one position.
+    points : array (n, d)
+        Along the picture's axes.
+    held : int
+        Coordinates that stay: all, or the plan while the height takes the value that fits best.
+    """
+    places, axes = placed_points(problem, points)
+    cost = profile_cost(problem, fix.x[0], places, axes[:held])
+    return np.asarray(np.sqrt(np.maximum(cost - fix.cost[0], 0.0)))
+
+
+def _whole(panel: Axes, problem: Problem, fix: Fix, scene: Scene) -> None:
+    from matplotlib.colors import LogNorm
+
+    corners = limits(scene)
+    unit, size = unit_of(corners)
+    x, y, grid = plane(corners, _POINTS, scene.fixes[0])
+    excess = _excess(problem, fix, grid, problem.dimension).reshape(_POINTS, _POINTS)
+    steps = levels(excess)
+    norm = LogNorm(steps[0], max(steps[-1], 2.0 * steps[0]), clip=True)
+    drawn = panel.pcolormesh(x / size, y / size, excess, norm=norm, cmap=COLOURS, rasterized=True, shading="nearest")
+    panel.contour(x / size, y / size, excess, levels=steps, colors="white", linewidths=0.7)
+    parts.stations(panel, scene, PLAN, size, edgecolors="white", linewidths=0.8)
+    parts.points(panel, scene, PLAN, size)
+    _square(panel, scene, corners / size, unit)
+    panel.set_title("everything" if problem.dimension == 2 else "everything, at the height of the fix")
+    bar = panel.figure.colorbar(drawn, ax=panel, label=_NAME, ticks=steps, format=lambda value, _: f"{value:g}")
+    bar.ax.minorticks_off()
+
+
+def _near(panel: Axes, problem: Problem, fix: Fix, scene: Scene) -> None:
+    centre, spread = scene.fixes[0], np.sqrt(np.diagonal(scene.covariances[0])[:2])
+    if not np.isfinite(spread).all():
+        panel.set_axis_off()
+        panel.text(0.5, 0.5, "no covariance", ha="center", va="center", transform=panel.transAxes)
+        return
+    half = 4.2 * spread.max()
+    corners = np.stack([centre[:2] - half, centre[:2] + half])
+    unit, size = unit_of(corners - centre[:2])
+    x, y, grid = plane(corners, _POINTS, centre)
+    excess = _excess(problem, fix, grid, 2).reshape(_POINTS, _POINTS)
+    x, y, corners = (x - centre[0]) / size, (y - centre[1]) / size, (corners - centre[:2]) / size
+    drawn = panel.contourf(x, y, excess, levels=[0, *_SIGMAS], cmap=COLOURS, extend="max")
+    panel.contour(x, y, excess, levels=_SIGMAS, colors="white", linewidths=0.7)
+    panel.figure.colorbar(drawn, ax=panel, label="the same (standard deviations)")
+    style: dict[str, Any] = {"levels": [np.sqrt(_CHI2_95)], "colors": ORANGE, "linewidths": 2.0}
+    panel.contour(x, y, excess, **style)
+    panel.plot([], [], color=ORANGE, linewidth=2.0, label="95 % by the cost")
+    moved = scene.moved(lambda place: place - np.pad(centre[:2], (0, len(centre) - 2)))
+    parts.ellipses(panel, moved, PLAN, size, color=BLACK, linestyle="--", linewidth=1.4)
+    panel.scatter(0.0, 0.0, marker="o", s=50, color=BLUE, edgecolors="white", zorder=4)
+    _square(panel, scene, corners, unit)
+    panel.set_title(f"around {scene.axes[0]} {centre[0]:.1f} m, {scene.axes[1]} {centre[1]:.1f} m")
+
+
+def _square(panel: Axes, scene: Scene, corners: Array, unit: str) -> None:
+    parts.name_axes(panel, scene, PLAN, unit)
+    panel.grid(visible=False)
+    panel.set_aspect("equal", adjustable="box")
+    panel.set_xlim(*corners[:, 0])
+    panel.set_ylim(*corners[:, 1])

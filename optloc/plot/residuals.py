@@ -1,0 +1,141 @@
+"""Residuals of fixes by station: what each measurement says against its fix."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optloc.errors import InvalidProblem
+from optloc.evaluate import differentiate
+from optloc.fix import Fix
+from optloc.models import MODELS
+from optloc.noise import variances
+from optloc.plot.style import BLACK, BLUE, GREY, ORANGE, SKY, figure_class, grid
+from optloc.problem import Problem
+from optloc.types import Array, Rows
+from optloc.units import SI_UNIT
+from optloc.weigh import weighed
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_SHOWN, _FEW = 40, 12
+
+
+def plot_residuals(problem: Problem, fix: Fix, title: str = "") -> Figure:
+    """Return a picture of the residuals z - h(x) by station or pair of stations, one panel for each kind.
+
+    A bar reaches over twice the standard deviation of a row, the other way of its zero too. Of many residuals the box
+    holds the middle half. A fix follows its measurements, so that residuals are smaller than errors: `optloc.health`
+    compares each station with what the others say.
+
+    Parameters
+    ----------
+    problem : Problem
+        Batch (...) of problems; one whose epochs are fixed by themselves is to be given as `optloc.by_epoch` makes it.
+    fix : Fix
+        Their fixes, with the same batch axes.
+    title : str
+        Title of the picture.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        To be written with `optloc.plot.save`.
+
+    Raises
+    ------
+    InvalidProblem
+        Where the batch axes differ, or nothing was fixed.
+    """
+    flat, answers = problem.flat(), fix.flat()
+    good = np.flatnonzero(np.isfinite(answers.x).all(-1))
+    if len(answers) != flat.batch_shape[0]:
+        what = f"{len(answers)} fixes do not belong to {flat.batch_shape[0]} problems"
+        raise InvalidProblem(what, "plot", "give the problem that was fixed; see `optloc.by_epoch`")
+    if not len(good):
+        raise InvalidProblem("nothing was fixed, so there are no residuals", "plot", "see `optloc fix` for the reasons")
+    part, vectors = flat.take(good), answers.x[good]
+    residual = differentiate(part, vectors)[0]
+    sigma = np.broadcast_to(np.sqrt(variances(weighed(part, vectors).noise, part.count)), residual.shape)
+    weight = np.broadcast_to(part.weight, residual.shape)
+    sets = [
+        _sets(part, rows, residual[:, cols], sigma[:, cols], weight[:, cols])
+        for rows, start in zip(part.rows, part.starts, strict=True)
+        for cols in [slice(start, start + rows.count)]
+    ]
+    return _drawn([rows.kind for rows in part.rows], sets, title)
+
+
+Sets = dict[str, tuple[Array, float]]
+"""Residuals (n,) and the median standard deviation of a row, by the name of the stations."""
+
+
+def _sets(problem: Problem, rows: Rows, residual: Array, sigma: Array, weight: Array) -> Sets:
+    names = problem.stations.names
+    labels = [_label(names, a, b) for a, b in zip(rows.a, rows.b, strict=True)]
+    found: Sets = {}
+    for name in dict.fromkeys(labels):
+        own = np.array([label == name for label in labels])
+        present = weight[:, own] > 0.0
+        if present.any():
+            found[name] = (residual[:, own][present], float(np.median(sigma[:, own][present])))
+    worst = sorted(found, key=lambda name: -float(np.abs(found[name][0]).max() / found[name][1]))[:_SHOWN]
+    return {name: values for name, values in found.items() if name in worst}
+
+
+def _label(names: Sequence[str], a: int, b: int) -> str:
+    return " – ".join(names[i] for i in (a, b) if i >= 0) or "all"
+
+
+def _drawn(kinds: Sequence[str], sets: Sequence[Sets], title: str) -> Figure:
+    tall = [max(2, len(one)) for one in sets]
+    figure = figure_class()(figsize=(7.6, 1.0 + sum(0.9 + 0.3 * n for n in tall)), layout="constrained")
+    panels = figure.subplots(len(sets), 1, squeeze=False, height_ratios=tall)[:, 0]
+    for panel, kind, one in zip(panels, kinds, sets, strict=True):
+        _panel(panel, kind, one)
+    shown: dict[str, Any] = {}
+    for panel in panels:
+        handles, labels = panel.get_legend_handles_labels()
+        shown |= dict(zip(labels, handles, strict=True))
+    figure.legend(shown.values(), shown, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
+    if title:
+        figure.suptitle(title)
+    return figure
+
+
+def _panel(panel: Axes, kind: str, sets: Sets) -> None:
+    unit = SI_UNIT[MODELS[kind].quantity]  # type: ignore[index]  # the table holds known quantities only
+    factor, unit = (1e3, f"m{unit}") if unit == "rad" else (1.0, unit)
+    for place, (values, sigma) in enumerate(sets.values()):
+        own, bar = factor * values, 2.0 * factor * sigma
+        panel.hlines(place, -bar, bar, color=GREY, linewidth=5.0, alpha=0.5, label=_once(place, "± 2 sigma of a row"))
+        if len(own) > _FEW:
+            low, left, middle, right, high = np.percentile(own, (2.5, 25.0, 50.0, 75.0, 97.5))
+            panel.hlines(place, low, high, color=BLUE, linewidth=1.2, zorder=3, label=_once(place, "95 % of residuals"))
+            style: dict[str, Any] = {"height": 0.5, "color": SKY, "edgecolor": BLUE, "zorder": 3}
+            panel.barh(place, right - left, left=left, label=_once(place, "middle half"), **style)
+            panel.scatter(middle, place, marker="|", s=70, color=BLACK, zorder=4, label=_once(place, "median"))
+            continue
+        far = np.abs(own) > 1.5 * bar
+        for chosen, colour, mark, name in (
+            (~far, BLUE, "o", "residual"),
+            (far, ORANGE, "X", "residual beyond 3 sigma"),
+        ):
+            if chosen.any():
+                panel.scatter(
+                    own[chosen], np.full(chosen.sum(), place), color=colour, marker=mark, zorder=4, label=name
+                )
+    panel.axvline(0.0, color=BLACK, linewidth=0.8, zorder=1)
+    panel.set_yticks(range(len(sets)), list(sets))
+    panel.set_ylim(len(sets) - 0.4, -0.6)
+    panel.set_xlabel(f"measured less modelled ({unit})" if unit != "1" else "measured less modelled")
+    panel.set_title(kind, fontsize=10)
+    grid(panel)
+
+
+def _once(place: int, label: str) -> str:
+    return "" if place else label

@@ -1,0 +1,85 @@
+"""Losses counted: gross errors of several sizes, from no guess and from the truth, and what sigma is worth."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from monte_carlo.tables import ledger
+from robust_cases import least_squares, nees, rmse, spoilt
+
+from optloc import Status, rejected, solve
+from optloc.loss import LOSSES
+
+DEFAULT, FULL = 60, 400
+# Name: kind, stations, wrong rows, their size in sigma, whether they are late.
+CASES = {
+    f"{kind}, {stations} stations, {label}": (kind, stations, bad, size, late)
+    for kind, stations in (("toa", 8), ("range", 8))
+    for label, bad, size, late in (
+        ("clean", 0, 0.0, False),
+        ("1 bad, 10 sigma", 1, 10.0, False),
+        ("1 bad, 100 sigma", 1, 100.0, False),
+        ("2 bad, 30 sigma", 2, 30.0, False),
+        ("2 bad, 1000 sigma", 2, 1000.0, False),
+        ("2 late, 30 sigma", 2, 30.0, True),
+    )
+}
+NAMES = [f"{case}, {loss}" for case in CASES for loss in LOSSES]
+HEADER = [
+    "case, loss",
+    "truth finds better",
+    "ok",
+    "ok, beyond 5 sigma",
+    "bad rows rejected",
+    "good rows rejected",
+    "RMSE of ok, m",
+    "least squares, good rows, m",
+    "NEES of ok",
+]
+
+
+@pytest.fixture(scope="module")
+def book():
+    facts = f"{FULL} trials a case (seed 1 of `tests/robust_cases.py`), 10 m a row, emitter in the box of the stations"
+    with ledger("robust", HEADER, NAMES, facts) as made:
+        yield made
+
+
+def counted(name: str, loss: str, trials: int) -> tuple[int, int, int, tuple[object, ...]]:
+    """Return trials in which the truth finds better, that are ok, that are then beyond 5 sigma, and the other cells."""
+    kind, stations, bad, size, late = CASES[name]
+    case = spoilt(kind, trials, stations, bad=bad, size=size, late=late)
+    fix, best = solve(case.problem, loss), solve(case.problem, loss, start=case.truth)
+    worse = int((~(fix.cost <= best.cost + 1e-3) & np.isfinite(best.cost)).sum())
+    ok, lost, own = fix.code == Status.OK, rejected(case.problem, fix), nees(fix, case.truth)
+    good = case.problem.with_rows(weight=np.where(case.wrong, 0.0, 1.0))
+    alone = least_squares(type(case)(good, case.truth, case.wrong))
+    far = int((3.0 * own[ok] > 25.0).sum())
+    cells = (
+        f"{100 * lost[ok][case.wrong[ok]].mean():.1f} %" if bad else "",
+        f"{100 * lost[ok][~case.wrong[ok]].mean():.1f} %",
+        f"{rmse(fix.position[ok], case.truth[ok]):.1f}",
+        f"{rmse(alone[ok], case.truth[ok]):.1f}",
+        f"{np.mean(own[ok]):.2f}",
+    )
+    return worse, int(ok.sum()), far, cells
+
+
+@pytest.mark.parametrize("loss", ["cauchy", "truncated"])
+@pytest.mark.parametrize("name", ["toa, 8 stations, 1 bad, 100 sigma", "range, 8 stations, 2 bad, 1000 sigma"])
+def test_the_truth_hardly_ever_finds_better(name, loss):
+    worse, ok, far, _ = counted(name, loss, DEFAULT)
+    assert worse <= 1
+    assert ok >= 0.7 * DEFAULT
+    assert far <= 0.03 * DEFAULT
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("loss", LOSSES)
+@pytest.mark.parametrize("name", CASES)
+def test_counts(name, loss, book):
+    worse, ok, far, cells = counted(name, loss, FULL)
+    book.add(f"{name}, {loss}", worse, ok, far, *cells)
+    assert worse <= 0.01 * FULL
+    if loss == "truncated":
+        assert far <= 0.01 * FULL

@@ -1,0 +1,117 @@
+"""Maps of fixes and tracks: what is drawn is where it is, and a browser opens the page on a desk and on a phone."""
+
+from importlib.resources import files as package_files
+
+import numpy as np
+import pytest
+from report.browser import Browser, executable
+from typer.testing import CliRunner
+
+import optloc
+from optloc.cli import app
+from optloc.errors import InvalidProblem
+from optloc.report import fix_page
+from optloc.report.spots import fixed_spots, lines_of_position
+
+RUN = CliRunner()
+DEMO = package_files("optloc") / "scenarios" / "demo.toml"
+TRACK = """
+format = 1
+title = "pulses <&> more"
+[frame]
+kind = "enu"
+origin = {{ lat_deg = {lat}, lon_deg = {lon}, height = 0.0 }}
+[stations]
+rows = [
+  {{ name = "A", x = 0.0, y = 0.0 }}, {{ name = "B", x = 8e3, y = 1e3 }},
+  {{ name = "C", x = 3e3, y = 7e3 }}, {{ name = "</script>", x = 9e3, y = 9e3 }},
+]
+[[measurements]]
+kind = "range"
+unit = "m"
+sigma = 5.0
+rows = [{rows}]
+"""
+
+
+@pytest.fixture(scope="module")
+def demo():
+    problem = optloc.load(DEMO)
+    return problem, optloc.solve(problem)
+
+
+def test_the_ring_is_the_ellipse(demo):
+    problem, fix = demo
+    made = fixed_spots(problem, [fix], [])
+    lat, lon, height = fix.geodetic
+    back = problem.frame.from_geodetic(*np.radians(made.rings[0].T[::-1]), np.full(73, height))
+    axes = problem.frame.enu_axes(fix.position)[:2]
+    away = (back - fix.position) @ axes.T
+    square = np.einsum("ni,ij,nj->n", away, np.linalg.inv(axes @ fix.covariance() @ axes.T), away)
+    np.testing.assert_allclose(square, 5.991, rtol=2e-3)
+    np.testing.assert_allclose(made.place[0], np.degrees([lon, lat]), rtol=1e-12)
+
+
+def test_lines_of_position_meet_their_rows(demo):
+    problem, fix = demo
+    lon, lat = np.degrees(fix.geodetic[1]), np.degrees(fix.geodetic[0])
+    lines = lines_of_position(problem, fix, (lon - 0.1, lon + 0.1, lat - 0.07, lat + 0.07))
+    assert {name for name, _ in lines} == {f"tdoa {n} – Lake" for n in ("Chapel", "Quarry", "Summit", "Mill", "Tower")}
+    for name, line in lines:
+        row = [f"tdoa {problem.stations.names[a]} – Lake" for a in problem.rows[0].a].index(name)
+        x = problem.frame.from_geodetic(*np.radians(line.T[::-1]), np.full(len(line), fix.geodetic[2]))
+        assert np.abs(optloc.predict(problem, x)[:, row] - problem.z[row]).max() < 30.0
+
+
+def test_a_plane_frame_is_refused():
+    problem = optloc.load(DEMO.parent / "ambiguous.toml")
+    with pytest.raises(InvalidProblem, match="positions on Earth"):
+        fix_page(problem, optloc.solve(problem), "")
+
+
+def moving(folder, lat=47.0, lon=11.0):
+    """Write a file of twelve epochs, and return its path."""
+    stations = np.array([[0.0, 0.0], [8e3, 1e3], [3e3, 7e3], [9e3, 9e3]])
+    names, rng, rows = ("A", "B", "C", "</script>"), np.random.default_rng(4), []
+    for k in range(12):
+        place = np.array([2e3 + 150.0 * k, 3e3 + 90.0 * k])
+        for name, r in zip(names, np.linalg.norm(stations - place, axis=-1), strict=True):
+            z = r + 5.0 * rng.standard_normal()
+            rows.append(f'{{ a = "{name}", z = {z:.2f}, epoch = "e{k}", time = {float(k)} }}')
+    path = folder / "run.toml"
+    path.write_text(TRACK.format(rows=", ".join(rows), lat=lat, lon=lon), encoding="utf-8")
+    return path
+
+
+@pytest.mark.skipif(executable() is None, reason="needs chromium (Debian's package of that name)")
+def test_a_browser_opens_the_pages(tmp_path):
+    assert RUN.invoke(app, ["fix", str(DEMO), "--html", str(tmp_path / "fix.html"), "-q"]).exit_code == 0
+    run = str(moving(tmp_path, lon=179.98))
+    assert RUN.invoke(app, ["fix", run, "--html", str(tmp_path / "fixes.html"), "-q"]).exit_code == 0
+    assert RUN.invoke(app, ["track", run, "--html", str(tmp_path / "track.html"), "-q"]).exit_code == 0
+    with Browser() as browser:
+        # The first scan alone does not tell the velocity, so that the track begins with the second.
+        for name, marks in (("fix", 1), ("fixes", 12), ("track", 11)):
+            for width, phone in ((1280, False), (390, True)):
+                browser.open(tmp_path / f"{name}.html", width, 844, phone=phone)
+                assert browser.messages == []
+                assert browser.run("document.documentElement.scrollWidth") <= width
+                layer = "fix" if name == "fixes" else name
+                shown = f"document.querySelectorAll('[data-layer={layer}] .dot').length"
+                assert browser.run(shown) == marks
+                assert browser.run(_OUTSIDE) == 0
+        assert browser.requests == [url for url in browser.requests if url.startswith("file:")]
+        browser.open(tmp_path / "fix.html")
+        told = browser.run(_POINT)
+        assert told.startswith("ok, 47.8")
+        assert browser.run("document.querySelector('[data-do=focus]').click()") is None
+        assert browser.run("document.querySelector('.ring').getBoundingClientRect().width") > 60
+
+
+_OUTSIDE = """(() => { const box = document.querySelector('.map svg').getBoundingClientRect();
+  return [...document.querySelectorAll('.map .dot')].filter(dot => { const b = dot.getBoundingClientRect();
+    return b.x < box.x || b.x > box.right || b.y < box.y || b.y > box.bottom; }).length; })()"""
+_POINT = """(() => { const dot = document.querySelector('[data-layer=fix] .dot'), b = dot.getBoundingClientRect();
+  document.querySelector('.map svg').dispatchEvent(
+    new PointerEvent('pointermove', { clientX: b.x + b.width / 2, clientY: b.y + b.height / 2, bubbles: true }));
+  return document.querySelector('.map output').textContent; })()"""

@@ -1,0 +1,154 @@
+"""The documentation: every block of code runs, and nothing that the code has is missing from it.
+
+``OPTLOC_WRITE_DOCS=1 pytest tests/test_docs.py`` writes the outputs of the blocks into the pages.
+"""
+
+import ast
+import dataclasses
+import importlib
+import inspect
+import os
+import re
+import warnings
+
+import pytest
+from doc_pages import DOCS, MARKS, blocks, run_page
+from typer.main import get_command
+
+import optloc
+from optloc.cli import app
+from optloc.errors import OptlocError
+
+# Generated pages hold no code; the recipes of contributors have a test of their own.
+ELSEWHERE = ("measured", "papers", "examples", "gallery", "_build")
+PAGES = [page for page in sorted(DOCS.rglob("*.md")) if page.relative_to(DOCS).parts[0] not in ELSEWHERE]
+RUN = [page for page in PAGES if any(block.kind in ("python", "console", "sh") for block in blocks(page))]
+THEORY = DOCS / "theory"
+DATA_DEFAULT = DOCS.parents[1] / "shared" / "data"  # as in conftest.py
+
+
+def text_of(name):
+    return " ".join((DOCS / name).read_text(encoding="utf-8").split())
+
+
+@pytest.mark.parametrize("page", RUN, ids=lambda page: str(page.relative_to(DOCS)))
+def test_every_block_runs_and_prints_what_is_shown(page, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+    monkeypatch.setenv("COLUMNS", "100")
+    monkeypatch.setenv("NO_COLOR", "1")
+    if DATA_DEFAULT.is_dir() and not os.environ.get("OPTLOC_DATA"):
+        monkeypatch.setenv("OPTLOC_DATA", str(DATA_DEFAULT))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)
+        warnings.simplefilter("error", RuntimeWarning)
+        wrong, fresh = run_page(page)
+    if os.environ.get("OPTLOC_WRITE_DOCS"):
+        page.write_text(fresh, encoding="utf-8")
+    assert wrong == [], "\n".join(wrong)
+
+
+def test_marks_are_known_and_few_blocks_are_not_run():
+    marks = [block.mark for page in PAGES for block in blocks(page) if block.mark]
+    assert [mark for mark in marks if not mark.startswith(MARKS)] == []
+    assert sum(mark.startswith("not run: ") for mark in marks) <= 12
+
+
+@pytest.mark.parametrize("name", sorted({key.split(":")[0] for key in optloc.FORMULATIONS}))
+def test_every_formulation_has_a_page_with_all_its_arguments(name):
+    page = THEORY / f"{name}.md"
+    assert page.exists()
+    text = page.read_text(encoding="utf-8")
+    assert f"<!-- generated: formulation {name} -->" in text
+    table = text.split("## Symbols and arguments")[1].split("\n## ")[0]
+    documented = {word for line in table.splitlines() if line.startswith("|") for word in re.findall(r"`(\w+)`", line)}
+    module = importlib.import_module(f"formulations.{name}")
+    own = {
+        key: value
+        for key, value in vars(module).items()
+        if not key.startswith("_") and getattr(value, "__module__", None) == module.__name__ and callable(value)
+    }
+    asked = " ".join(str(p.annotation) for f in own.values() for p in signature(f))
+    missing, functions = set(), 0
+    for key, value in own.items():
+        answer = dataclasses.is_dataclass(value) and key not in asked  # it comes out and is no argument
+        if not answer:
+            functions += 1
+            calls = [value, *([value.solve] if hasattr(value, "solve") else [])]
+            missing |= {p.name for call in calls for p in signature(call) if p.name != "self"} - documented
+        assert re.search(rf"auto(?:function|class):: {key}\b", text), f"{key} has no entry"
+    assert functions > 0
+    assert missing == set()
+
+
+def signature(call):
+    return inspect.signature(call).parameters.values()
+
+
+def test_every_public_name_is_in_the_reference():
+    text = (DOCS / "reference.md").read_text(encoding="utf-8")
+    directives = re.findall(r"auto(?:function|class|data|exception):: (\S+)", text)
+    modules = re.findall(r"automodule:: (\S+)\n   :members: ([^\n]*)", text)
+    listed = {name.split(".")[-1] for name in directives}
+    listed |= {member.strip() for _, members in modules for member in members.split(",")}
+    whole = re.findall(r"automodule:: (\S+)\n   :members:\s*\n", text)
+    listed |= {name for module in whole for name in vars(importlib.import_module(module))}
+    assert set(optloc.__all__) - listed == set()
+
+
+def test_every_status_is_explained():
+    text = text_of("errors.md")
+    for status in optloc.Status:
+        assert f"### {status.label} {status.sentence}" in text, f"{status.name}: {status.sentence}"
+
+
+def test_every_exception_and_exit_code_is_explained():
+    text = text_of("errors.md")
+
+    def below(kind):
+        yield kind
+        for inner in kind.__subclasses__():
+            yield from below(inner)
+
+    names = {kind.__name__ for kind in below(OptlocError) if kind.__module__.startswith("optloc")}
+    assert {"InvalidProblem", "NoSolution"} <= names
+    assert [name for name in names if f"`{name}`" not in text] == []
+    codes = {int(code) for code in re.findall(r"^\| (\d+) \|", (DOCS / "errors.md").read_text("utf-8"), re.MULTILINE)}
+    assert codes >= exit_codes()
+
+
+def exit_codes():
+    """Return the exit codes that the source of the command line names."""
+    found = set()
+    for path in (DOCS.parent / "optloc" / "cli").glob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "Exit" and node.args:
+                found |= {leaf.value for leaf in ast.walk(node.args[0]) if isinstance(leaf, ast.Constant)}
+            if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "STOPPED":
+                found.add(node.value.value)
+    return {code for code in found if isinstance(code, int)}
+
+
+def test_every_kind_and_every_method_is_in_the_page_on_choosing():
+    text = text_of("how-to-choose.md")
+    assert [name for name in [*optloc.MODELS, *optloc.METHODS] if f"`{name}`" not in text] == []
+    stages = [name for name, entry in optloc.SOLVERS.items() if entry.role == "start"]
+    assert [name for name in stages if not re.search(rf"`{name}\b|\b{name}\+", text)] == []
+
+
+def test_every_command_is_generated_into_its_page():
+    from importlib.util import module_from_spec, spec_from_file_location
+
+    spec = spec_from_file_location("generated", DOCS / "generated.py")
+    generated = module_from_spec(spec)
+    spec.loader.exec_module(generated)
+    page = generated.filled((DOCS / "command-line.md").read_text(encoding="utf-8"))
+    for name, command in get_command(app).commands.items():
+        inner = [f"{name} {word}" for word in getattr(command, "commands", {})] or [name]
+        assert [words for words in inner if f"## `optloc {words}`" not in page] == []
+
+
+def test_links_of_the_readme_lead_somewhere():
+    root = DOCS.parent
+    links = re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", (root / "README.md").read_text(encoding="utf-8"))
+    assert [link for link in links if not link.startswith("http") and not (root / link).exists()] == []
