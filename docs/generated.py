@@ -60,7 +60,7 @@ def kinds() -> str:
     lines = []
     for name, model in MODELS.items():
         where = " ".join(str(d) for d in model.dimensions)
-        units = " ".join(f"`{unit}`" for unit in UNITS.get(model.quantity, {}))
+        units = " ".join(f"`{unit}`" for unit in UNITS[model.quantity])  # type: ignore[index]  # known quantities only
         lines.append(f"| `{name}` | {model.stations} | {where} | {model.summary} | {units} |")
     return "\n".join([*head, *lines])
 

@@ -49,9 +49,12 @@ def test_every_block_runs_and_prints_what_is_shown(page, tmp_path, monkeypatch):
 
 
 def test_marks_are_known_and_few_blocks_are_not_run():
-    marks = [block.mark for page in PAGES for block in blocks(page) if block.mark]
-    assert [mark for mark in marks if not mark.startswith(MARKS)] == []
-    assert sum(mark.startswith("not run: ") for mark in marks) <= 12
+    found = [block for page in PAGES for block in blocks(page)]
+    assert [block.mark for block in found if block.mark and not block.mark.startswith(MARKS)] == []
+    code = [block for block in found if block.kind in ("python", "console", "sh")]
+    left = [block for block in code if block.mark.startswith("not run: ")]
+    assert sum(block.kind == "python" for block in left) <= 1  # the one of a library that is no dependency
+    assert len(left) <= len(code) / 5
 
 
 @pytest.mark.parametrize("name", sorted({key.split(":")[0] for key in optloc.FORMULATIONS}))

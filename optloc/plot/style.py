@@ -55,7 +55,7 @@ def grid(panel: Axes) -> None:
 def apart(figure: Figure) -> None:
     """Move the notes at points of a finished figure until none covers another or a mark, or leaves its panel.
 
-    Each takes the first place around its point that is free; a note that finds none stands above its point to the right.
+    Each takes the first free place around its point; a note that finds none stands above it to the right.
     """
     from matplotlib.text import Annotation
 

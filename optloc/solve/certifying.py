@@ -33,7 +33,7 @@ _MARGINS = (LISTED_GAP, AMBIGUOUS_GAP, 0.0)
 _ROUNDS = 6
 # Boxes for the proof of a gap and of the value, with up to so many nodes. Plain Python takes a thousand times longer
 # for each: a budget of all.
-_BUDGETS, _NODES, _SLOW_BUDGET = (1000, 4000), 12, 2000
+_BUDGETS, _NODES, _SLOW_BUDGET = (3000, 8000), 12, 2000
 # Cost that counts as equal, relative: covers the rounding of two ways to compute it.
 _EQUAL = 1e-6
 # Minima behind the Earth that are set aside at most.
