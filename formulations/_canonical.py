@@ -207,7 +207,7 @@ def _recovery(problem: Any, chain: Any, inverse: Any, name: int, n: int) -> list
 
     columns: dict[int, list[Array]] = {variable.id: [] for variable in problem.variables()}
     for unit in np.eye(n):
-        solution = Solution("optimal", 0.0, {name: unit}, {}, {})
+        solution = Solution("optimal", 0.0, {name: unit}, None, {})
         for reduction, data in zip(reversed(chain.reductions[:-1]), reversed(inverse[:-1]), strict=True):
             solution = reduction.invert(solution, data)
         for variable in problem.variables():

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from bad_input import BAD, GEODETIC, HEAD, TDOA, bad_files, tdoa, write
+from scipy.stats import kstest
 from typer.testing import CliRunner
 
 from optloc.cli import app
@@ -209,6 +210,16 @@ def test_simulate_keeps_units_kinds_and_geodesy(tmp_path):
     )
     assert "no list" in run("simulate", path, "--truth", "1;2", "--out", out, code=2).stderr
     assert "dimensions" in run("simulate", path, "--truth", "1,2", "--out", out, code=2).stderr
+
+
+def test_simulate_knows_that_a_spread_in_decibels_goes_with_the_ratio(tmp_path):
+    path, out = tmp_path / "levels.toml", tmp_path / "drawn.toml"
+    run("new", "groa", "--out", path)
+    run("simulate", path, "--truth", "1500,900", "--trials", 200, "--out", out)
+    fixes = tmp_path / "fixes.csv"
+    run("fix", out, "--method", "gtrs+lsr", "--out", fixes)
+    p_value = pd.read_csv(fixes)["p_value"]
+    assert kstest(p_value, "uniform").pvalue > 1e-3
 
 
 def test_values_may_be_missing_until_they_are_needed(tmp_path):

@@ -163,11 +163,17 @@ def run_simulate(
     file: Path, truth: str, velocity: str | None, out: Path, *, geodetic: bool, seed: int, trials: int, quiet: bool
 ) -> int:
     """Draw measurements, write them as a problem file, and return the exit code."""
+    from tempfile import TemporaryDirectory
+
+    from optloc.evaluate import predict
     from optloc.files.writer import write_measured
     from optloc.simulate import simulate
 
-    loaded = read(file, values=False)
-    drawn = simulate(loaded.problem, vector(loaded.problem, truth, velocity, geodetic), seed, trials)
+    problem = read(file, values=False).problem
+    x = vector(problem, truth, velocity, geodetic)
+    with TemporaryDirectory() as folder:  # a spread in decibels depends on the values
+        exact, *_ = write_measured(file, Path(folder) / out.name, np.atleast_2d(predict(problem, x)), note="")
+        drawn = simulate(read(exact).problem, x, seed, trials)
     z = np.concatenate([rows.z for rows in drawn.rows], axis=-1)
     written = write_measured(file, out, z, note=f"drawn at {truth} with seed {seed}")
     if not quiet:

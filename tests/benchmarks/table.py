@@ -220,6 +220,35 @@ def cells(found: list[Line], scene: str) -> list[list[str]]:
     ]
 
 
+SHOWN = (
+    "optloc, gtrs+lsr",
+    "optloc, auto",
+    SCIPY,
+    "CasADi + IPOPT from the truth",
+    "cvxpy, order-1 SDP, solved again",
+    "ewgeo, Chan-Ho",
+    "ewgeo, least squares from the middle",
+    "ewgeo, Chan-Ho, then least squares",
+    "Stone Soup, extended Kalman update of a wide prior",
+    "Stone Soup, iterated Kalman update of a wide prior",
+)
+SUMMARY = ("method", "us a fix", "global minimum", "within 5 sigma", "error / bound", "proven global")
+
+
+def summary(found: list[Line]) -> list[list[str]]:
+    """Return a row for each of the methods that are compared at a glance: inside / outside."""
+    rows = []
+    for name in SHOWN:
+        lines = [line for scene in SCENES for line in found if (line.scene, line.one.name) == (scene, name)]
+        if lines:
+            shares = [[f"{100 * line.verdict[key]:.1f}" for line in lines] for key in ("global", "near")]
+            proven = [f"{100 * line.verdict['proven']:.1f}" for line in lines if line.verdict.get("proven")]
+            times, errors = [f"{x.times.microseconds:.3g}" for x in lines], [f"{x.verdict['error']:.2f}" for x in lines]
+            cells = [times, *([f"{a} %" for a in share] for share in shares), errors, [f"{a} %" for a in proven]]
+            rows.append([name, *(" / ".join(cell).replace("nan", "-") for cell in cells)])
+    return rows
+
+
 def save_csv(found: list[Line], path: Path) -> None:
     """Write all numbers, one line for each method and scene."""
     with path.open("w", newline="", encoding="utf-8") as file:
