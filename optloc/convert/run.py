@@ -16,7 +16,8 @@ from optloc.convert.pseudoranges import pseudoranges
 from optloc.convert.roles import GUESSES, Roles, read_table
 from optloc.convert.rows import Measured
 from optloc.errors import InvalidProblem, nearest
-from optloc.files.reader import Loaded, read
+from optloc.files.loaded import Loaded
+from optloc.files.reader import read
 
 INPUTS = ("arrivals", "pseudoranges", "stations")
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +15,7 @@ from optloc.files.constraints import constraints_of
 from optloc.files.document import read_document
 from optloc.files.epochs import Epochs, Keys, epochs_of, need_clock
 from optloc.files.known import known_of, places_of
+from optloc.files.loaded import Draft, Loaded
 from optloc.files.measurements import chunks_of, with_baseline
 from optloc.files.noise import noise_of, per_epoch, with_noise
 from optloc.files.repeats import check_repeats
@@ -29,45 +29,10 @@ from optloc.files.words import Units, join
 from optloc.frames import Frame
 from optloc.noise import Noise
 from optloc.problem import Problem
-from optloc.quality.levels import NoiseLevels
 from optloc.types import Array, Rows, Stations
 from optloc.units import SPEED_OF_LIGHT
 
 LOG = logging.getLogger("optloc.read")
-
-
-@dataclass(frozen=True, slots=True)
-class Loaded:
-    """A problem and what its file calls things.
-
-    Parameters
-    ----------
-    problem : Problem
-        In SI units.
-    source : str
-        Name of the file.
-    title : str
-        What the file says it is, or its name.
-    epochs : tuple of k str
-        Labels of the epochs.
-    times : array (k,)
-        Seconds as the file gives them; NaN where it gives none.
-    targets : tuple of str
-        Name of each target; of the target of each epoch where `own_epochs`.
-    own_epochs : bool
-        Whether every epoch belongs to one target.
-    levels : NoiseLevels, optional
-        What the data say of the noise, where it is left to them.
-    """
-
-    problem: Problem
-    source: str
-    title: str
-    epochs: tuple[str, ...]
-    times: Array
-    targets: tuple[str, ...]
-    own_epochs: bool = False
-    levels: NoiseLevels | None = None
 
 
 def load(path: str | Path) -> Problem:
@@ -107,34 +72,6 @@ def read(path: str | Path, *, values: bool = True, more: Mapping[str, Constraint
     p = loaded.problem
     LOG.info("read %s: %d rows, %d epochs, %d stations", loaded.source, p.count, p.epochs, p.stations.count)
     return loaded
-
-
-@dataclass(frozen=True, slots=True)
-class Draft:
-    """A problem with everything that is needed to write its file again.
-
-    Parameters
-    ----------
-    loaded : Loaded
-        The problem.
-    file : ProblemFile
-        Settings.
-    tables : tuple of Table
-        Rows of each ``[[measurements]]``.
-    chunks : tuple of Chunk
-        The same in SI units, one for each kind of each table.
-    numbers : tuple of int array (m,)
-        Global row number of each row of each chunk.
-    moving : bool
-        Whether stations or known targets move.
-    """
-
-    loaded: Loaded
-    file: ProblemFile
-    tables: tuple[Table, ...]
-    chunks: tuple[Chunk, ...]
-    numbers: tuple[Array, ...]
-    moving: bool
 
 
 def draft(path: Path, *, values: bool, more: Mapping[str, ConstraintTable] | None = None) -> Draft:

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from optloc.errors import InvalidProblem
-from optloc.files.reader import Draft, draft
+from optloc.files.loaded import Draft
+from optloc.files.reader import draft
 from optloc.files.table import Table
 from optloc.types import Array
 

@@ -84,7 +84,7 @@ def claimed(problem: Problem, start: Array, x: Array) -> Fix:
     x : array (N, size)
         Points.
     """
-    found = np.isfinite(x).all(-1)
+    found = np.asarray(np.isfinite(x).all(-1))
     with np.errstate(all="ignore"):
         cost = np.where(found, equations_at(problem, np.where(found[:, None], x, start)).cost, np.inf)
     code = np.where(found, Status.OK, Status.NUMERICAL).astype(np.int8)

@@ -73,11 +73,8 @@ class Influence:
         scale = 1.0 / np.sqrt(np.where(weight > 0.0, weight, 1.0))
         values, vectors = np.linalg.eigh(self.block(rows) * scale[..., :, None] * scale[..., None, :])
         kept = values > _NOTHING
-        return (
-            scale[..., :, None]
-            * vectors
-            * np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)[..., None, :]
-        )
+        lengths = np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)
+        return np.asarray(scale[..., :, None] * vectors * lengths[..., None, :])
 
 
 @dataclass(frozen=True, slots=True)

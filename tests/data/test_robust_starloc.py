@@ -8,6 +8,7 @@ from data.windows import quantiles, report, statuses
 
 from optloc import Prior, Status, predict, rejected, solve
 from optloc.datasets import starloc
+from optloc.noise import independent
 
 pytestmark = pytest.mark.data
 
@@ -35,11 +36,13 @@ def test_groups_of_six_bearings_bear_wrong_detections(data_dir):
 
 @pytest.fixture(scope="module")
 def mapped(data_dir):
-    """Return the bearings and the run as one problem with a prior on the place of every marker."""
+    """Return the bearings and the run as one problem with a prior on the place of every marker, all equally good."""
     bearings = starloc.read_run(data_dir / "starloc_aoa", "R2", "cal").often()
     places = enumerate(bearings.truth)
     priors = tuple(Prior(f"position[{i}]", place, MAP**2 * np.eye(3)) for i, place in places)
-    return bearings, replace(bearings.problem(), priors=priors)
+    problem = bearings.problem()
+    noise = independent(np.full(problem.count, starloc.SIGMA**2))
+    return bearings, replace(problem, priors=priors, noise=noise)
 
 
 def test_exchanged_markers_and_wrong_detections_are_named(mapped):

@@ -80,6 +80,11 @@ def test_the_truth_hardly_ever_finds_better(name, loss):
 def test_counts(name, loss, book):
     worse, ok, far, cells = counted(name, loss, FULL)
     book.add(f"{name}, {loss}", worse, ok, far, *cells)
-    assert worse <= 0.01 * FULL
-    if loss == "truncated":
-        assert far <= 0.01 * FULL
+    _, _, bad, size, late = CASES[name]
+    # Errors that shorten ranges are none that the one-sided loss knows.
+    if late or not bad or loss != "late":
+        assert worse <= 0.01 * FULL
+    # Small errors hide where the other rows hardly check them; large ones must not.
+    if loss in ("cauchy", "truncated") and (not bad or size >= 100.0):
+        assert ok >= 0.98 * FULL
+        assert far <= 0.005 * FULL
