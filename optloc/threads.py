@@ -6,11 +6,14 @@ import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
+from time import perf_counter
 from typing import TypeVar
 
 from optloc.errors import InvalidProblem
 
 _VARIABLE = "OPTLOC_THREADS"
+# Seconds of a call below which threads that pass the interpreter lock to and fro gain nothing.
+WORTH = 1e-3
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -37,7 +40,9 @@ def thread_count() -> int:
     return int(given)
 
 
-def mapped(function: Callable[[_Item], _Result], items: Iterable[_Item], threads: int | None = None) -> list[_Result]:
+def mapped(
+    function: Callable[[_Item], _Result], items: Iterable[_Item], threads: int | None = None, *, least: float = 0.0
+) -> list[_Result]:
     """Return the function of every item, in the order of the items whatever the number of threads.
 
     Parameters
@@ -48,6 +53,9 @@ def mapped(function: Callable[[_Item], _Result], items: Iterable[_Item], threads
         The work; each item should take far longer than a thread takes to pick it up (20 us).
     threads : int, optional
         At most so many at a time; `thread_count` if absent. One runs in the calling thread.
+    least : float
+        Seconds that an item must take to be worth a thread, by the quicker of the first two; all run in the calling
+        thread where it takes less.
 
     Returns
     -------
@@ -58,9 +66,23 @@ def mapped(function: Callable[[_Item], _Result], items: Iterable[_Item], threads
     count = min(thread_count() if threads is None else max(threads, 1), len(work))
     if count <= 1:
         return [function(item) for item in work]
+    if least > 0.0:
+        begun, seconds = _timed(function, work[:2])
+        some = mapped(function, work[2:], 1 if seconds < least else count)
+        return begun + some
     contexts = [copy_context() for _ in work]  # what holds for the caller, such as a chosen back end, holds for them
     with ThreadPoolExecutor(count, thread_name_prefix="optloc") as pool:
         return list(pool.map(lambda context, item: context.run(function, item), contexts, work))
+
+
+def _timed(function: Callable[[_Item], _Result], work: list[_Item]) -> tuple[list[_Result], float]:
+    """Return the results of a few items, and the time of the quickest: the first may build what others share."""
+    results, times = [], []
+    for item in work:
+        began = perf_counter()
+        results.append(function(item))
+        times.append(perf_counter() - began)
+    return results, min(times)
 
 
 def _processors() -> int:

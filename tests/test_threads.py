@@ -82,3 +82,15 @@ def test_the_conic_solver_lets_other_threads_run():
         pause, last, rounds = max(pause, now - last), now, rounds + 1
     assert rounds > 1000
     assert pause < 0.5 * spans[0], (pause, spans)
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.02])
+def test_items_that_take_less_than_threads_are_worth_stay_where_they_are(seconds):
+    def slept(i: int) -> int:
+        time.sleep(seconds)
+        who.add(threading.get_ident())
+        return i
+
+    who: set[int] = set()
+    assert mapped(slept, range(8), 2, least=5e-3) == list(range(8))
+    assert len(who) == (1 if seconds == 0.0 else 3)

@@ -11,7 +11,7 @@ from formulations.bearing_ls import rays, sight
 from optloc.noise import variances
 from optloc.plan import elapsed
 from optloc.problem import Problem
-from optloc.threads import mapped
+from optloc.threads import WORTH, mapped
 from optloc.types import Array, Rows
 
 
@@ -160,7 +160,7 @@ def by_directions(seen: Bearings) -> Array:
         axes = None if seen.axes is None else seen.axes[i, use]
         out[i, 0] = directions(seen.angle[i, use], 1.0 / seen.weight[i, use], seen.station[i, use], axes=axes).point
 
-    mapped(relaxed, _complete(seen))
+    mapped(relaxed, _complete(seen), least=WORTH)
     return seen.metres(out)
 
 
@@ -178,7 +178,7 @@ def least_worst(seen: Bearings) -> Array:
             sigma = 1.0 / seen.weight[i, use, : d - 1].min(-1)
             out[i, 0] = minimax(ahead[i, use], seen.station[i, use], sigma).point
 
-    mapped(bisected, range(len(out)))
+    mapped(bisected, range(len(out)), least=WORTH)
     return seen.metres(out)
 
 
@@ -204,7 +204,7 @@ def angle_bounds(seen: Bearings, point: Array) -> Array:
             sigma = 1.0 / seen.weight[i, use]
             out[i] = angle_bound(seen.angle[i, use], sigma, seen.station[i, use], scaled[i], axes=axes).bound
 
-    mapped(bounded, _complete(seen))
+    mapped(bounded, _complete(seen), least=WORTH)
     return out
 
 

@@ -19,7 +19,7 @@ from optloc.solve.stages import finished, given, unrefined
 from optloc.solve.start import vectors
 from optloc.solve.verdict import Candidates
 from optloc.status import Status
-from optloc.threads import mapped
+from optloc.threads import WORTH, mapped
 from optloc.types import Array
 from optloc.weigh import weighed
 
@@ -119,7 +119,7 @@ def lifted_sdp(problem: Problem) -> Fix:
             found = lifted_ranges(K, z, (stations[i, 0] - centre[i]) / scale[i])
             position[i, 0] = found.point * scale[i] + centre[i]
 
-        mapped(relaxed, range(size))
+        mapped(relaxed, range(size), least=WORTH)
     return unrefined(problem, vectors(problem, position), None, "lifted-sdp", began)
 
 

@@ -11,7 +11,7 @@ from formulations.range_height import locate, locate_by_ranges
 from optloc.models.primitives import WGS84_A, WGS84_F
 from optloc.problem import Problem
 from optloc.solve.reduce import Ranges, ranges
-from optloc.threads import mapped
+from optloc.threads import WORTH, mapped
 from optloc.types import Array, Band
 
 _SUBSETS = 6
@@ -106,7 +106,7 @@ def _relaxed(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask
         below = own.centre + (above - own.centre) / np.sqrt(own.polar(above, above))
         out[i, 0] = lifted(stations, found.sign[i, nodes[i]].astype(float), offset, own, below).x
 
-    mapped(relaxed, np.flatnonzero(mask & np.isfinite(whole.shape).all((-1, -2))).tolist())
+    mapped(relaxed, np.flatnonzero(mask & np.isfinite(whole.shape).all((-1, -2))).tolist(), least=WORTH)
     return out
 
 

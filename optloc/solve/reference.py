@@ -20,7 +20,7 @@ from optloc.solve.pieces import one_position
 from optloc.solve.reduce import Ranges, ranges
 from optloc.solve.start import static
 from optloc.status import Certificate
-from optloc.threads import mapped
+from optloc.threads import WORTH, mapped
 from optloc.types import Array
 
 TIGHT = 1e-3
@@ -227,7 +227,7 @@ def _by_moments(problem: Problem, fix: Fix, region: float | None) -> Reference:
         if answer.rank_ratio < _RANK_ONE:
             out.point[i] = centre + size * answer.point
 
-    mapped(bounded, range(len(place)))
+    mapped(bounded, range(len(place)), least=WORTH)
     return out
 
 

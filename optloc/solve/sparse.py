@@ -19,7 +19,7 @@ from optloc.solve.pieces import from_pieces, one_position
 from optloc.solve.sparse_rows import RowWise, row_wise
 from optloc.solve.stages import given, gtrs, lsr, packed, unrefined
 from optloc.solve.start import static, vectors
-from optloc.threads import mapped
+from optloc.threads import WORTH, mapped
 from optloc.types import Array
 
 _LEVEL = 0.01
@@ -135,7 +135,7 @@ def _fitted(rows: Array, right: Array, sigma: Array, lifts: RowWise | None = Non
         y[i], errors[i] = 0.0, found.errors
         y[i, used] = found.y
 
-    mapped(fit, range(len(rows)))
+    mapped(fit, range(len(rows)), least=WORTH)
     return y, errors
 
 

@@ -13,7 +13,7 @@ from optloc import linalg
 from optloc.problem import Problem
 from optloc.solve.lifted import Coordinates, Lifted, lifted_rows
 from optloc.solve.reduce import Ranges
-from optloc.threads import mapped
+from optloc.threads import WORTH, mapped
 from optloc.types import Array
 
 Pick = Callable[[Array, Array, Quadric], tuple[Array, Array]]
@@ -120,7 +120,7 @@ def _one_by_one(relax: Callable[..., Any], rows: Array, right: Array, quadric: Q
     def relaxed(i: int) -> None:
         y[i, 0] = relax(rows[i], right[i], quadric, bound=False).y
 
-    mapped(relaxed, np.flatnonzero(usable).tolist())
+    mapped(relaxed, np.flatnonzero(usable).tolist(), least=WORTH)
     return y, np.isfinite(y).all(-1)
 
 
