@@ -81,9 +81,12 @@ class NoSolution(OptlocError):  # noqa: N818  (a verdict about the problem)
         refused = [verdict.sentence for verdict in verdicts if verdict is not Status.OK]
         return " ".join(refused or [verdict.sentence for verdict in verdicts])
 
+# So many names are still read.
+_FEW = 20
+
 
 def nearest(word: str, known: Iterable[str]) -> str:
-    """Return advice for an unknown word: the nearest known ones, then all of them.
+    """Return advice for an unknown word: the nearest known ones, then all of them where they are few.
 
     Parameters
     ----------
@@ -100,5 +103,6 @@ def nearest(word: str, known: Iterable[str]) -> str:
     names = list(known)
     folded = {name.lower(): name for name in names}
     close = [repr(folded[name]) for name in get_close_matches(str(word).lower(), folded, n=2, cutoff=0.5)]
-    hint = f"did you mean {' or '.join(close)}? " if close else ""
-    return f"{hint}known are {', '.join(names)}"
+    hint = f"did you mean {' or '.join(close)}?" if close else ""
+    listed = "" if close and len(names) > _FEW else f"known are {', '.join(names)}"
+    return " ".join(part for part in (hint, listed) if part)
