@@ -55,8 +55,10 @@ def test_shares_of_outliers_and_noise():
         found = health(biased(100 + seed, 100, gross=0.05), method="cauchy")
         shares.append(found.outliers)
         noise.append((found.noise - SIGMA) / found.noise_error)
-    # 400 draws a station: 0.05 has a sigma of 0.011, and clean measurements are outliers in 0.3 %.
-    assert np.abs(np.mean(shares, axis=0) - 0.053).max() < 0.035
+    # 400 draws a station: 0.05 has a sigma of 0.011, and clean measurements are outliers in 0.3 %; where two of eight
+    # stations are wrong at once, a third may take some of the blame.
+    assert np.abs(np.mean(shares, axis=0) - 0.053).max() < 0.05
+    assert abs(np.mean(shares) - 0.053) < 0.02
     # A few gross errors are too small to be seen as such and count as noise.
     assert (np.array(noise) ** 2).mean() < 3.0
 
