@@ -89,7 +89,7 @@ def test_biases_of_a_file_are_known_drawn_or_zero():
 def test_every_kind_of_stations_at_rest_can_be_laid_out():
     for kind, model in MODELS.items():
         if model.stations and not model.velocity and 3 in model.dimensions:
-            level = {"length": "10 m", "angle": "5 mrad", "ratio": "0.5 dB"}[model.quantity]
+            level = {"length": "10 m", "angle": "5 mrad", "ratio": "0.5 dB", "level": "0.5 dB"}[model.quantity]
             text = SHELL.replace("stations = 6", f'stations = 6, kinds = ["{kind}"]').replace("10 m", level)
             drawn = draw(case(text), 0, 50)
             error = drawn.problem.z - predict(drawn.problem, drawn.truth)
