@@ -44,7 +44,7 @@ def test_a_million_fixes_in_two_minutes_and_two_gigabytes(tmp_path):
 @pytest.mark.skipif(workers() < 2, reason="needs two processors")
 def test_two_workers_do_the_work_of_nearly_two(tmp_path):
     """The rate after the first parts of each worker, so that beginning processes does not count."""
-    text, rates = SLOW.replace("2000", "8000").replace("chunk = 500", "chunk = 200"), []
+    text, rates = SLOW.replace("2000", "16_000").replace("chunk = 500", "chunk = 1000"), []
     for jobs in (1, 2):
         told: list[tuple[float, int]] = []
         by = executor("processes", jobs)
