@@ -81,6 +81,7 @@ class NoSolution(OptlocError):  # noqa: N818  (a verdict about the problem)
         refused = [verdict.sentence for verdict in verdicts if verdict is not Status.OK]
         return " ".join(refused or [verdict.sentence for verdict in verdicts])
 
+
 # So many names are still read.
 _FEW = 20
 

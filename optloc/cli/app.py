@@ -113,6 +113,10 @@ def track(
     filter_: Annotated[
         str, typer.Option("--filter", metavar="iekf|ekf|mgekf|mvekf", help="How a scan updates the state.")
     ] = "iekf",
+    loss: Annotated[
+        str | None,
+        typer.Option(metavar="huber|cauchy|truncated|late", help="Weigh the rows of a scan by a robust loss."),
+    ] = None,
     noise: Annotated[
         float | None,
         typer.Option(
@@ -149,7 +153,7 @@ def track(
     """Track the targets of a problem file through its scans, from fixes of its first ones, without a guess."""
     from optloc.cli.tracking import Wanted, rules, run_track
 
-    wanted = Wanted(model, filter_, noise, memory, rules(gate, gap), start, start_sigma)
+    wanted = Wanted(model, filter_, noise, memory, rules(gate, gap), start, start_sigma, loss)
     raise typer.Exit(run_track(file, wanted, out=out, as_json=as_json, plot=plot, html=html, quiet=quiet))
 
 

@@ -20,6 +20,7 @@ from optloc.errors import InvalidProblem, nearest
 from optloc.files import Loaded, read
 from optloc.problem import Problem
 from optloc.track import Dynamics, State, current_statistical, polynomial, singer
+from optloc.track.robust import reweighted
 from optloc.track.run import Entry, Rules, tracked
 from optloc.track.targets import alone
 from optloc.track.track import filter_of
@@ -47,6 +48,8 @@ class Wanted:
         When rows are left out and tracks begin anew.
     start, sigma : str, optional
         Initial state and its standard deviations.
+    loss : str, optional
+        By which rows are weighed.
     """
 
     model: str
@@ -56,6 +59,7 @@ class Wanted:
     rules: Rules
     start: str | None = None
     sigma: str | None = None
+    loss: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +99,7 @@ def run_track(
     Whatever goes wrong on the way, the track up to there is written first.
     """
     dynamics = dynamics_of(wanted)
-    filter_of(wanted.filter)
+    update = filter_of(wanted.filter) if wanted.loss is None else reweighted(wanted.filter, wanted.loss)
     _check_places(out, plot, html)
     loaded = read(file)
     ones = [One(*parts, []) for parts in runs_of(loaded)]
@@ -105,7 +109,7 @@ def run_track(
         with bar(loaded.title, sum(one.problem.epochs for one in ones), quiet or as_json) as advance:
             for one in ones:
                 start = _start(one.problem, dynamics, wanted)
-                for entry in tracked(one.problem, dynamics, wanted.filter, start=start, rules=wanted.rules):
+                for entry in tracked(one.problem, dynamics, update, start=start, rules=wanted.rules):
                     one.entries.append(entry)
                     advance(1)
     finally:

@@ -6,6 +6,7 @@ from optloc.track.bound import posterior_bound
 from optloc.track.constants import begun_with_constants, followed_with_constants
 from optloc.track.dynamics import Dynamics, current_statistical, polynomial, singer
 from optloc.track.measurement_space import lines
+from optloc.track.robust import reweighted
 from optloc.track.run import Entry, Rules, collected, tracked
 from optloc.track.start import begun, two_point
 from optloc.track.track import State, Track, followed, predicted
@@ -31,6 +32,7 @@ __all__ = [
     "polynomial",
     "posterior_bound",
     "predicted",
+    "reweighted",
     "simplified",
     "singer",
     "smoothed",
