@@ -43,16 +43,19 @@ def test_a_million_fixes_in_two_minutes_and_two_gigabytes(tmp_path):
 @pytest.mark.full
 @pytest.mark.skipif(workers() < 2, reason="needs two processors")
 def test_two_workers_do_the_work_of_nearly_two(tmp_path):
-    """The rate after the first parts of each worker, so that beginning processes does not count."""
-    text, rates = SLOW.replace("2000", "16_000").replace("chunk = 500", "chunk = 1000"), []
-    for jobs in (1, 2):
-        told: list[tuple[float, int]] = []
-        by = executor("processes", jobs)
-        run_plan(plan(text), tmp_path / str(jobs), by, lambda rows, _, told=told: told.append((perf_counter(), rows)))
-        steady = told[2 * jobs :]
-        rates.append(sum(rows for _, rows in steady[1:]) / (steady[-1][0] - steady[0][0]))
-    print(f"two workers are {rates[1] / rates[0]:.2f} times as fast as one")  # noqa: T201  (what a benchmark is for)
-    assert rates[1] > 1.7 * rates[0]
+    """The rate after the first parts of each worker, so that beginning processes does not count; quietest of rounds."""
+    text = SLOW.replace("2000", "16_000").replace("chunk = 500", "chunk = 1000")
+    rates = {1: 0.0, 2: 0.0}
+    for i in range(3):
+        for jobs in (1, 2):
+            told: list[tuple[float, int]] = []
+            by, out = executor("processes", jobs), tmp_path / f"{i}-{jobs}"
+            run_plan(plan(text), out, by, lambda rows, _, told=told: told.append((perf_counter(), rows)))
+            steady = told[2 * jobs :]
+            rate = sum(rows for _, rows in steady[1:]) / (steady[-1][0] - steady[0][0])
+            rates[jobs] = max(rates[jobs], rate)
+    print(f"two workers are {rates[2] / rates[1]:.2f} times as fast as one")  # noqa: T201  (what a benchmark is for)
+    assert rates[2] > 1.7 * rates[1]
 
 
 def test_overhead_of_the_machinery_at_tasks_of_a_millisecond(tmp_path, monkeypatch):
