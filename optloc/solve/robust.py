@@ -26,6 +26,8 @@ from optloc.types import Array
 # A row that a loss leaves less than this of its weight is called rejected: four sigma of the Cauchy loss.
 REJECTED = 0.25
 _SHOWN = 8
+# Times that the weights of correlated rows are made anew at an answer.
+_WEIGHINGS = 30
 # Gap of a rival that leaves out no more than the cheapest candidate does.
 _CLOSE = 1e-2
 
@@ -123,9 +125,6 @@ def _equations(problem: Problem, loss: Loss, x: Array) -> tuple[Normal, Array]:
         for _ in range(_WEIGHINGS if any(b.row.shape[1] > 1 for b in problem.noise.blocks) else 1):
             weight = weighed_by(loss, problem, doubt, x, weight)
         return robust_equations(loss, problem, doubt, x, weight), doubt.row_weight(weight)
-
-
-_WEIGHINGS = 30
 
 
 def _apart(problem: Problem, loss: Loss, pool: Candidates) -> Candidates:

@@ -6,9 +6,9 @@ from itertools import combinations
 
 import numpy as np
 
-from optloc.models import MODELS
 from optloc.problem import Problem
 from optloc.solve.freedom import degrees_of_freedom
+from optloc.solve.start import rows_of_stations
 from optloc.types import Array
 
 # Subsets of a problem at most; stations up to which three are left out, rows up to which single ones are.
@@ -26,7 +26,7 @@ def subsets(problem: Problem) -> tuple[Array, Array]:
         N problems; what is left out of each are its own stations, those that it has rows of.
     """
     present = np.broadcast_to(problem.weight > 0.0, (problem.batch_shape[0], problem.count))
-    touched, single = _touched(problem), np.eye(problem.count, dtype=bool)
+    touched, single = rows_of_stations(problem), np.eye(problem.count, dtype=bool)
     heard = np.asarray((present[:, None] & touched).any(-1))
     short = np.flatnonzero(present.sum(1) <= _ROWS)
     stations, rows = _combined(heard, touched, 3), _combined(present[short], single, 1)
@@ -50,13 +50,3 @@ def _combined(own: Array, touched: Array, size: int) -> tuple[Array, Array]:
         items.append(item)
         unions.append(np.asarray(touched[local[item][:, members]].any(1)))
     return np.concatenate(items), np.concatenate(unions)
-
-
-def _touched(problem: Problem) -> Array:
-    """Return which rows (s, m) each station takes part in."""
-    ends = []
-    every = np.arange(problem.stations.count)[:, None]
-    for rows in problem.rows:
-        taken = MODELS[rows.kind].stations
-        ends.append(((rows.a == every) & (taken > 0)) | ((rows.b == every) & (taken > 1)))
-    return np.concatenate(ends, axis=1)

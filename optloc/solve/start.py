@@ -89,12 +89,8 @@ def along_the_valley(problem: Problem, position: Array, covariance: Array) -> Ar
 def subarray_starts(problem: Problem) -> Array:
     """Return the candidates (N, q, d) of all arrays that lack one station; NaN where there is none."""
     parts = []
-    for station in range(problem.stations.count):
-        weight = np.broadcast_to(problem.weight, (*problem.batch_shape, problem.count)).copy()
-        for rows, start in zip(problem.rows, problem.starts, strict=True):
-            taken = MODELS[rows.kind].stations
-            touched = ((rows.a == station) & (taken > 0)) | ((rows.b == station) & (taken > 1))
-            weight[:, start + np.flatnonzero(touched)] = 0.0
+    for touched in rows_of_stations(problem):
+        weight = np.where(touched, 0.0, np.broadcast_to(problem.weight, (*problem.batch_shape, problem.count)))
         touching = np.flatnonzero((weight != problem.weight).any(1) & (weight > 0.0).any(1))
         if len(touching):
             rest = problem.with_rows(weight=weight).take(touching)
@@ -104,6 +100,15 @@ def subarray_starts(problem: Problem) -> Array:
             parts.append(spread)
     if not parts:
         return np.full((problem.batch_shape[0], 0, problem.dimension), np.nan)
+    return np.concatenate(parts, axis=1)
+
+
+def rows_of_stations(problem: Problem) -> Array:
+    """Return which rows (s, m) each station takes part in."""
+    every, parts = np.arange(problem.stations.count)[:, None], []
+    for rows in problem.rows:
+        taken = MODELS[rows.kind].stations
+        parts.append(((rows.a == every) & (taken > 0)) | ((rows.b == every) & (taken > 1)))
     return np.concatenate(parts, axis=1)
 
 
