@@ -23,7 +23,7 @@ def with_alone(kinds: Array, data: Array, K: Array, w: Array) -> Array:
     ----------
     kinds : int array (J,)
         Codes of the nodes.
-    data : array (B, J, WIDTH)
+    data : array (B, J, width)
         Their numbers; B is N, or 1 where all share.
     K : array (B, q, J)
         Whitened rows.
@@ -32,7 +32,7 @@ def with_alone(kinds: Array, data: Array, K: Array, w: Array) -> Array:
 
     Returns
     -------
-    array (B or N, J, WIDTH)
+    array (B or N, J, width)
         N where there are ratios, whose measured values are written too.
     """
     angles, ratios = kinds == AZIMUTH, kinds == RATIO

@@ -270,7 +270,7 @@ def cube(kinds: Array, data: Array) -> tuple[Array, float]:
 
     Parameters
     ----------
-    kinds, data : array (J,), (J, WIDTH)
+    kinds, data : array (J,), (J, width)
         Nodes that have stations.
     """
     low, high = np.full(3, inf), np.full(3, -inf)

@@ -21,7 +21,7 @@ def around_node(
 
     Parameters
     ----------
-    kind, data : int, array (WIDTH,)
+    kind, data : int, array (width,)
         The node.
     least, most : float
         Its interval.

@@ -9,13 +9,16 @@ from typing import Any
 import numpy as np
 
 from optloc.kernels.jit import compiled, enabled, plain, ready
+from optloc.proof.chart import Cost, cost_of, empty_box, set_geometry
 from optloc.proof.everywhere import prove_everywhere
+from optloc.proof.groups import empty_groups
 from optloc.proof.pose import Posed, taken
 from optloc.proof.search import BUDGET, OPEN, prove
 from optloc.threads import mapped
 from optloc.types import Array
 
-_STRETCH = 64
+# Fixes that one call of machine code proves, fewest and most.
+_STRETCH = 16, 512
 # So few proofs over so few nodes are begun in plain Python, with so many boxes in all: about half a second.
 _FEW, _SMALL, _FIRST_BOXES = 16, 24, 400
 
@@ -110,15 +113,17 @@ def _proven(pose: Posed, asked: Asked) -> Answered:
     own = [_plain(a) for a in (pose.w, *(getattr(asked, name) for name in Asked.__slots__))]
     geometry = [_plain(pose.data), _plain(pose.K)]
 
+    length = max(_STRETCH[0], min(_STRETCH[1], n // 32))
+
     def stretch(first: int) -> None:
-        part = slice(first, min(first + _STRETCH, n))
+        part = slice(first, min(first + length, n))
         given: list[Any] = [array if len(array) == 1 else array[part] for array in geometry]
         given += [array[part] for array in own]
         given += [getattr(out, name)[part] for name in Answered.__slots__]
         with np.errstate(all="ignore"):  # plain Python would warn of what has no bound
             _loop(pose.kinds, *given)
 
-    mapped(stretch, range(0, n, _STRETCH), None if enabled() else 1)
+    mapped(stretch, range(0, n, length), None if enabled() else 1)
     return out
 
 
@@ -147,27 +152,36 @@ def _loop(
     everywhere: Array,
     found: Array,
 ) -> None:
+    A, weight, groups = np.empty((K.shape[2], K.shape[2])), np.empty(K.shape[2]), empty_groups(K.shape[2])
+    box = empty_box(K.shape[1], K.shape[2])
     for i in range(len(x)):
-        codes, numbers, rows, values = _present(kinds, data[i if len(data) > 1 else 0], K[i if len(K) > 1 else 0], w[i])
+        rows = K[i if len(K) > 1 else 0]
+        if i == 0 or len(K) > 1:
+            set_geometry(kinds, rows, A, weight, groups)
+        cost, own = Cost(kinds, data[i if len(data) > 1 else 0], rows, w[i], A, weight, groups), box
+        if (weight == 0.0).any():
+            cost = _present(cost)
+            own = empty_box(cost.K.shape[0], cost.K.shape[1])
         minima, low, high = others[i, : known[i]], region[i, 0], region[i, 1]
         everywhere[i] = isnan(low[0])
         if everywhere[i]:
             verdict[i], boxes[i], bound[i] = prove_everywhere(
-                codes, numbers, rows, values, x[i], minima, kappa[i], eps[i], budget[i], found[i]
+                cost, own, x[i], minima, kappa[i], eps[i], budget[i], found[i]
             )
             if verdict[i] != OPEN:
                 continue
             everywhere[i] = False
             low, high = fallback[i, 0], fallback[i, 1]
         verdict[i], more, bound[i] = prove(
-            codes, numbers, rows, values, x[i], minima, kappa[i], eps[i], budget[i], low, high, False, found[i]
+            cost, own, x[i], minima, kappa[i], eps[i], budget[i], low, high, False, found[i]
         )
         boxes[i] += more
 
 
 @compiled
-def _present(kinds: Array, data: Array, K: Array, w: Array) -> tuple[Array, Array, Array, Array]:
-    """Return a problem without nodes that no row has: time goes with the square of the nodes."""
+def _present(cost: Cost) -> Cost:
+    """Return a cost without nodes that no row has: time goes with the square of the nodes."""
+    K, w = cost.K, cost.w
     nodes, rows = np.empty(K.shape[1], dtype=np.int64), np.empty(K.shape[0], dtype=np.int64)
     J = q = 0
     for j in range(K.shape[1]):
@@ -183,4 +197,4 @@ def _present(kinds: Array, data: Array, K: Array, w: Array) -> tuple[Array, Arra
         values[i] = w[rows[i]]
         for j in range(J):
             own[i, j] = K[rows[i], nodes[j]]
-    return kinds[nodes[:J]], data[nodes[:J]], own, values
+    return cost_of(cost.kinds[nodes[:J]], cost.data[nodes[:J]], own, values)

@@ -39,7 +39,7 @@ def bound_nodes(
 
     Parameters
     ----------
-    kinds, data : array (J,), (J, WIDTH)
+    kinds, data : array (J,), (J, width)
         The nodes.
     centre : array (3,)
         Centre of the box, metres.

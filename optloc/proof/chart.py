@@ -8,9 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.kernels.jit import compiled, inlined
-from optloc.proof.boxes import NODE_WIDTH, ROW_WIDTH, bound_nodes, cost_at, linearise_rows
+from optloc.proof.boxes import NODE_WIDTH, ROW_WIDTH, bound_nodes, cost_at
 from optloc.proof.convex import CURVE_WIDTH, SUMS, convex, curve_nodes, sum_up
-from optloc.proof.linear3 import principal
+from optloc.proof.groups import Groups, empty_groups, set_groups
+from optloc.proof.linear3 import roughly_principal
 from optloc.proof.nodes import LINEAR, RANGE
 from optloc.types import Array
 
@@ -20,7 +21,7 @@ class Cost(NamedTuple):
 
     Parameters
     ----------
-    kinds, data : array (J,), (J, WIDTH)
+    kinds, data : array (J,), (J, width)
         The nodes.
     K, w : array (q, J), (q,)
         Whitened rows.
@@ -28,6 +29,8 @@ class Cost(NamedTuple):
         ``K'K``.
     weight : array (J,)
         Lengths of the columns of K.
+    groups : Groups
+        The nodes in groups.
     """
 
     kinds: Array
@@ -36,6 +39,7 @@ class Cost(NamedTuple):
     w: Array
     A: Array
     weight: Array
+    groups: Groups
 
 
 class Chart(NamedTuple):
@@ -89,16 +93,22 @@ class Box(NamedTuple):
 @compiled
 def cost_of(kinds: Array, data: Array, K: Array, w: Array) -> Cost:
     """Return the cost of nodes and whitened rows."""
-    q, J = K.shape
-    A, weight = np.empty((J, J)), np.empty(J)
-    for j in range(J):
-        for m in range(j, J):
+    A, weight, groups = np.empty((K.shape[1], K.shape[1])), np.empty(K.shape[1]), empty_groups(K.shape[1])
+    set_geometry(kinds, K, A, weight, groups)
+    return Cost(kinds, data, K, w, A, weight, groups)
+
+
+@compiled
+def set_geometry(kinds: Array, K: Array, A: Array, weight: Array, groups: Groups) -> None:
+    """Write what a cost takes from its rows alone: `A`, `weight` and `groups` of `Cost`."""
+    for j in range(K.shape[1]):
+        for m in range(j, K.shape[1]):
             total = 0.0
-            for i in range(q):
+            for i in range(K.shape[0]):
                 total += K[i, j] * K[i, m]
             A[j, m] = A[m, j] = total
         weight[j] = sqrt(A[j, j])
-    return Cost(kinds, data, K, w, A, weight)
+    set_groups(kinds, A, groups)
 
 
 @compiled
@@ -120,23 +130,27 @@ def empty_box(q: int, J: int) -> Box:
 
 @compiled
 def chart_at(cost: Cost, x: Array, box: Box) -> tuple[Chart, bool]:
-    """Return the search coordinates around a fix x (D,), and whether the rows determine them."""
+    """Return the search coordinates around a fix x (D,), and whether the rows determine them.
+
+    The tables of the box are those of the fix afterwards: values of the nodes, forces (`CURVE_WIDTH`), and sums, whose
+    gradient is that along the search coordinates.
+    """
     D = x.shape[0]
-    origin, sense, back, gram = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
+    origin, numbers = np.zeros(3), np.zeros((3, 3, 3))
+    sense, back, gram = numbers[0], numbers[1], numbers[2]
+    nodes, curves, sums, information = box.nodes, box.curves, box.sums, box.solve
     for k in range(D):
         origin[k] = x[k]
         sense[k, k] = gram[k, k] = 1.0
     box.half[:] = 0.0
-    bound_nodes(cost.kinds, cost.data, origin, sense, gram, box.half, box.line, box.nodes)
-    linearise_rows(cost.K, cost.w, box.nodes, box.rows)
-    rows, information = box.rows, box.solve
-    for k in range(3):
-        for m in range(k, 3):
-            total = 0.0
-            for i in range(rows.shape[0]):
-                total += rows[i, 1 + k] * rows[i, 1 + m]
-            information[k, m] = information[m, k] = total
-    principal(information, gram)
+    bound_nodes(cost.kinds, cost.data, origin, sense, gram, box.half, box.line, nodes)
+    curves[:] = 0.0
+    sum_up(cost.K, cost.w, nodes, curves, sums)
+    information[0, 0], information[1, 1], information[2, 2] = sums[0], sums[3], sums[5]
+    information[0, 1] = information[1, 0] = sums[1]
+    information[0, 2] = information[2, 0] = sums[2]
+    information[1, 2] = information[2, 1] = sums[4]
+    roughly_principal(information, gram)
     most = max(information[0, 0], information[1, 1], information[2, 2])
     good = True
     for k in range(D):
@@ -148,6 +162,9 @@ def chart_at(cost: Cost, x: Array, box: Box) -> tuple[Chart, bool]:
     for k in range(3):
         for m in range(3):
             gram[k, m] = sense[0, k] * sense[0, m] + sense[1, k] * sense[1, m] + sense[2, k] * sense[2, m]
+    g0, g1, g2 = sums[6], sums[7], sums[8]
+    for k in range(3):
+        sums[6 + k] = sense[0, k] * g0 + sense[1, k] * g1 + sense[2, k] * g2
     return Chart(origin, sense, back, gram), good
 
 
@@ -185,22 +202,12 @@ def value_at(cost: Cost, chart: Chart, box: Box) -> float:
     return cost_at(cost.K, cost.w, box.nodes)
 
 
-@compiled
+@inlined
 def curve_box(cost: Cost, chart: Chart, box: Box) -> None:
     """Fill the tables of second derivatives of a box whose nodes are bounded."""
-    curve_nodes(
-        cost.kinds,
-        cost.data,
-        box.centre,
-        chart.sense,
-        chart.gram,
-        box.half,
-        box.line,
-        box.solve,
-        box.nodes,
-        box.curves,
-    )
-    sum_up(cost.K, cost.w, box.nodes, box.curves, box.sums)
+    sense, gram, half, line, nodes, curves = chart.sense, chart.gram, box.half, box.line, box.nodes, box.curves
+    curve_nodes(cost.kinds, cost.data, box.centre, sense, gram, half, line, box.solve, nodes, curves)
+    sum_up(cost.K, cost.w, nodes, curves, box.sums)
 
 
 @compiled

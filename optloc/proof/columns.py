@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from optloc.models import MODELS
 from optloc.problem import Problem
-from optloc.proof.nodes import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO, WIDTH
+from optloc.proof.nodes import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO, width
 from optloc.types import Array, Rows
 
 _CODES = {"azimuth": AZIMUTH, "elevation": ELEVATION, "groa": RATIO, "height": HEIGHT}
@@ -24,7 +25,7 @@ class Columns:
         Whose rows they are.
     kinds : list of int
         Codes of the nodes.
-    data : list of array (B, WIDTH)
+    data : list of array (B, n)
         Their numbers, B = 1 where all problems share them.
     row, column, coefficient : list
         Sparse design: row of the problem, node, factor.
@@ -64,9 +65,16 @@ class Columns:
 
     @property
     def numbers(self) -> Array:
-        """Return the numbers (B, J, WIDTH) of all nodes."""
-        count = max((len(data) for data in self.data), default=1)
-        return np.stack([np.broadcast_to(data, (count, WIDTH)) for data in self.data], axis=1)
+        """Return the numbers (B, J, width) of all nodes."""
+        return stacked(self.kinds, self.data)
+
+
+def stacked(kinds: Sequence[int] | Array, data: Sequence[Array]) -> Array:
+    """Return the numbers (B, J, width) of nodes that have (B, n) or (1, n) each."""
+    out = np.zeros((max((len(part) for part in data), default=1), len(data), width(kinds)))
+    for j, part in enumerate(data):
+        out[:, j, : part.shape[1]] = part
+    return out
 
 
 def columns_of(problem: Problem, observed: Array) -> Columns:
@@ -116,19 +124,20 @@ def _own(made: Columns, rows: Rows, i: int, measured: Array | None) -> int:
 
 
 def height_numbers(problem: Problem) -> Array:
-    """Return the numbers (1, WIDTH) of the node that is the geodetic height of a position in the problem's frame."""
+    """Return the numbers (1, n) of the node that is the geodetic height of a position in the problem's frame."""
     frame = problem.frame
     return _numbers({3: frame.origin_ecef()[None], 6: frame.rotation_to_ecef().reshape(1, 9)})
 
 
 def linear_numbers(coefficients: Array, origin: Array | None = None) -> Array:
-    """Return the numbers (B, WIDTH) of a linear node with coefficients (B, d), zero at an origin (B, d)."""
+    """Return the numbers (B, n) of a linear node with coefficients (B, d), zero at an origin (B, d)."""
     parts = {3: coefficients}
     return _numbers(parts if origin is None else parts | {0: origin})
 
 
 def _numbers(parts: dict[int, Array]) -> Array:
-    out = np.zeros((max(len(part) for part in parts.values()), WIDTH))
+    last = max(start + part.shape[1] for start, part in parts.items())
+    out = np.zeros((max(len(part) for part in parts.values()), last))
     for start, part in parts.items():
         out[:, start : start + part.shape[1]] = part
     return out

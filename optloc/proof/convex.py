@@ -19,6 +19,7 @@ from optloc.types import Array
 # Columns of a table of second derivatives (J, 14): Hessian (00, 01, 02, 11, 12, 22), bounds of the change of the
 # gradient (6:9) and of the Hessian (9), K'(K phi - w) (10), and K'J (11:14).
 CURVE_WIDTH = 14
+FORCE = 10
 # A vector of sums: Hessian of f/2 at the centre (0:6), its gradient (6:9), and bounds of its change (9:15).
 SUMS = 15
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from optloc.kernels.jit import compiled
 from optloc.proof.atlas import atlas_of, cube, first_minima, with_minima
-from optloc.proof.chart import chart_at, cost_of, empty_box, value_at
+from optloc.proof.boxes import cost_at
+from optloc.proof.chart import Box, Cost, chart_at
 from optloc.proof.far import reaches_infinity
 from optloc.proof.far_search import ANOTHER, CHEAPER, CLEAR, INFINITE, search_everywhere
 from optloc.proof.search import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove
@@ -25,16 +26,7 @@ _CLOSE = 1e-3
 
 @compiled
 def prove_everywhere(
-    kinds: Array,
-    data: Array,
-    K: Array,
-    w: Array,
-    x: Array,
-    others: Array,
-    kappa: float,
-    eps: float,
-    budget: int,
-    found: Array,
+    cost: Cost, box: Box, x: Array, others: Array, kappa: float, eps: float, budget: int, found: Array
 ) -> tuple[int, int, float]:
     """Prove that no position costs less than a fix, and that no other minimum has a gap below kappa.
 
@@ -44,7 +36,7 @@ def prove_everywhere(
 
     Parameters
     ----------
-    kinds, data, K, w, x, others, kappa, eps, budget, found
+    cost, box, x, others, kappa, eps, budget, found
         As of `optloc.proof.search.prove`.
 
     Returns
@@ -56,36 +48,24 @@ def prove_everywhere(
     bound : float
         A certified lower bound of f over all positions; -inf where there is none.
     """
-    nowhere, open_end = np.full(x.shape[0], np.nan), reaches_infinity(kinds, K)
+    nowhere, open_end = np.full(x.shape[0], np.nan), reaches_infinity(cost.kinds, cost.K)
     first = min(budget, _SOON) if open_end else budget
-    verdict, boxes, bound = prove(kinds, data, K, w, x, others, kappa, eps, first, nowhere, nowhere, False, found)
+    verdict, boxes, bound = prove(cost, box, x, others, kappa, eps, first, nowhere, nowhere, False, found)
     again = verdict in (OPEN, BUDGET, STATIONARY, SINGULAR) or (verdict == OTHER and _listed(x, others, found))
     if not open_end or not again or boxes >= budget:
         return verdict, boxes, bound
-    verdict, more, bound = prove_atlas(kinds, data, K, w, x, others, kappa, eps, budget - boxes, found)
+    verdict, more, bound = prove_atlas(cost, box, x, others, kappa, eps, budget - boxes, found)
     return verdict, boxes + more, bound
 
 
 @compiled
 def prove_atlas(
-    kinds: Array,
-    data: Array,
-    K: Array,
-    w: Array,
-    x: Array,
-    others: Array,
-    kappa: float,
-    eps: float,
-    budget: int,
-    found: Array,
+    cost: Cost, box: Box, x: Array, others: Array, kappa: float, eps: float, budget: int, found: Array
 ) -> tuple[int, int, float]:
     """Prove the same as `prove_everywhere`, with the atlas alone; `optloc.proof.far.reaches_infinity` must hold."""
-    cost, box = cost_of(kinds, data, K, w), empty_box(K.shape[0], K.shape[1])
     chart, _ = chart_at(cost, x, box)
-    box.half[:] = 0.0
-    box.at[:] = 0.0
-    least = value_at(cost, chart, box)
-    middle, radius = cube(kinds, data)
+    least = cost_at(cost.K, cost.w, box.nodes)
+    middle, radius = cube(cost.kinds, cost.data)
     atlas = atlas_of(middle, radius, x.shape[0], 1 + (others.shape[0] if kappa > 0.0 else 0))
     known, place = 0, np.empty(x.shape[0])
     for p in range(atlas.minima.home.shape[0]):

@@ -114,7 +114,7 @@ def bound_pieces(atlas: Atlas, kinds: Array, data: Array, half: Array, nodes: Ar
     ----------
     atlas : Atlas
         The pieces.
-    kinds, data : array (J,), (J, WIDTH)
+    kinds, data : array (J,), (J, width)
         The nodes.
     half : array (3,)
         Half-widths in the coordinates of the piece.

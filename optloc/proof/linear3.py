@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import hypot, sqrt
+from math import sqrt
 
 from optloc.kernels.jit import compiled
 from optloc.types import Array
@@ -22,12 +22,27 @@ def positive(a: float, b: float, c: float, d: float, e: float, f: float) -> bool
 @compiled
 def principal(matrix: Array, vectors: Array) -> None:
     """Make a symmetric 3x3 matrix diagonal by Jacobi rotations, in place; `vectors` receives the columns."""
+    _rotate_until(matrix, vectors, 0.0)
+
+
+@compiled
+def roughly_principal(matrix: Array, vectors: Array) -> None:
+    """Make a positive definite 3x3 matrix nearly diagonal: correlations of a hundredth are left."""
+    _rotate_until(matrix, vectors, 1e-2)
+
+
+@compiled
+def _rotate_until(matrix: Array, vectors: Array, correlation: float) -> None:
     for i in range(3):
         for j in range(3):
             vectors[i, j] = 1.0 if i == j else 0.0
     for _ in range(12):
-        off = abs(matrix[0, 1]) + abs(matrix[0, 2]) + abs(matrix[1, 2])
-        if not off > 1e-15 * (abs(matrix[0, 0]) + abs(matrix[1, 1]) + abs(matrix[2, 2])):
+        b, c, e = matrix[0, 1], matrix[0, 2], matrix[1, 2]
+        a, d, f = abs(matrix[0, 0]), abs(matrix[1, 1]), abs(matrix[2, 2])
+        if not abs(b) + abs(c) + abs(e) > 1e-15 * (a + d + f):
+            return
+        share = correlation * correlation
+        if b * b <= share * a * d and c * c <= share * a * f and e * e <= share * d * f:
             return
         for p in range(2):
             for q in range(p + 1, 3):
@@ -40,8 +55,8 @@ def _rotate(matrix: Array, vectors: Array, p: int, q: int) -> None:
     if away == 0.0:
         return
     ratio = (matrix[q, q] - matrix[p, p]) / (2.0 * away)
-    tangent = (1.0 if ratio >= 0.0 else -1.0) / (abs(ratio) + hypot(1.0, ratio))
-    cosine = 1.0 / hypot(1.0, tangent)
+    tangent = (1.0 if ratio >= 0.0 else -1.0) / (abs(ratio) + sqrt(1.0 + ratio * ratio))
+    cosine = 1.0 / sqrt(1.0 + tangent * tangent)
     sine = tangent * cosine
     for k in range(3):
         first, second = matrix[k, p], matrix[k, q]

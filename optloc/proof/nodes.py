@@ -1,6 +1,6 @@
 """The scalar functions ("nodes") that residuals are sums of: codes, data, and ranges and linear forms over a box.
 
-Residuals are ``K phi(x) - w``, whitened, with one node phi_j a column. A node is a row of `WIDTH` numbers and a code:
+Residuals are ``K phi(x) - w``, whitened, with one node phi_j a column. A node is a code and a row of numbers:
 
 ======== ============ =====================================================================================
 code     node         numbers
@@ -37,5 +37,13 @@ Over a box (centre c, half-widths h in search coordinates s, x = c + T s) a node
 
 from __future__ import annotations
 
-WIDTH = 24
+from collections.abc import Iterable
+
 RANGE, LINEAR, AZIMUTH, ELEVATION, RATIO, HEIGHT = range(6)
+WIDTH = 17
+"""How many numbers a node has at most."""
+
+
+def width(kinds: Iterable[int]) -> int:
+    """Return how many numbers are kept of each node of a problem: a million problems of ranges need no more."""
+    return max((3 if kind == RANGE else 6 if kind == LINEAR else WIDTH for kind in kinds), default=3)

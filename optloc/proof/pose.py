@@ -28,7 +28,7 @@ class Posed:
     ----------
     kinds : int array (J,)
         Codes of the nodes.
-    data : array (B, J, WIDTH)
+    data : array (B, J, width)
         Numbers of the nodes.
     K : array (B, q, J)
         Whitened rows over the nodes.

@@ -33,7 +33,7 @@ def bound_ranges(kinds: Array, data: Array, centre: Array, sense: Array, gram: A
 
     Parameters
     ----------
-    kinds, data : array (J,), (J, WIDTH)
+    kinds, data : array (J,), (J, width)
         The nodes.
     centre, half : array (3,)
         Centre of the box, metres, and half-widths in search coordinates.

@@ -23,7 +23,7 @@ def around_rays(kinds: Array, data: Array, x: Array, back: Array, swing: Array, 
 
     Parameters
     ----------
-    kinds, data : array (J,), (J, WIDTH)
+    kinds, data : array (J,), (J, width)
         The nodes.
     x, back : array (3,), (3, 3)
         The fix, and the derivative of the search coordinates with respect to the position.

@@ -6,23 +6,12 @@ from math import inf, isnan, sqrt
 
 import numpy as np
 
-from optloc.kernels.jit import compiled
+from optloc.kernels.jit import compiled, inlined
+from optloc.proof.boxes import cost_at
 from optloc.proof.branch import CHEAPER, CLEAR, SPENT, Aim, branch
-from optloc.proof.chart import (
-    Box,
-    Chart,
-    Cost,
-    accuracy_floor,
-    chart_at,
-    cost_of,
-    curve_box,
-    empty_box,
-    is_convex,
-    value_at,
-)
-from optloc.proof.convex import convex
+from optloc.proof.chart import Box, Chart, Cost, accuracy_floor, chart_at, is_convex
 from optloc.proof.enclosure import enclose
-from optloc.proof.grow import grow
+from optloc.proof.grow import set_convex
 from optloc.proof.stack import CAPACITY, DEPTH, push_around
 from optloc.types import Array
 
@@ -32,10 +21,8 @@ UNIQUE, VALUE, BETTER, OTHER, BUDGET, OPEN, STATIONARY, SINGULAR = range(8)
 
 @compiled
 def prove(
-    kinds: Array,
-    data: Array,
-    K: Array,
-    w: Array,
+    cost: Cost,
+    box: Box,
     x: Array,
     others: Array,
     kappa: float,
@@ -50,14 +37,10 @@ def prove(
 
     Parameters
     ----------
-    kinds : int64 array (J,)
-        Codes of the nodes (`optloc.proof.nodes`).
-    data : array (J, WIDTH)
-        Their numbers.
-    K : array (q, J)
-        Whitened rows; unknowns other than the position have been projected out.
-    w : array (q,)
-        Whitened measurements.
+    cost : Cost
+        The cost; unknowns other than the position have been projected out.
+    box : Box
+        Tables to work with, see `optloc.proof.chart.empty_box`.
     x : array (D,)
         The fix, polished.
     others : array (P, D)
@@ -89,20 +72,15 @@ def prove(
     bound : float
         A certified lower bound of f over the region or over all positions; -inf where there is none.
     """
-    cost, box = cost_of(kinds, data, K, w), empty_box(K.shape[0], K.shape[1])
     chart, good = chart_at(cost, x, box)
     if not good:
         return SINGULAR, 0, -inf
-    box.half[:] = 0.0
-    box.at[:] = 0.0
-    least = value_at(cost, chart, box)
-    curve_box(cost, chart, box)
-    sums = box.sums
+    least, sums = cost_at(cost.K, cost.w, box.nodes), box.sums
+    # On a box whose Hessian exceeds a margin the cost falls below that of its centre by slope^2 / margin at most.
     margin = (sums[6] * sums[6] + sums[7] * sums[7] + sums[8] * sums[8]) / eps
-    if not convex(kinds, cost.A, box.half, box.nodes, box.curves, sums, margin):
-        return STATIONARY, 0, -inf
     level = least + kappa if kappa > 0.0 else least - eps
-    low, high = np.empty(3), np.empty(3)
+    corners = np.empty((2, 3))
+    low, high = corners[0], corners[1]
     if not _start(cost, chart, box, sqrt(least + kappa), lower, upper, low, high):
         return OPEN, 0, -inf
     minima, sides, known = _minima(cost, chart, box, others, low, high, margin)
@@ -123,23 +101,12 @@ def prove(
     return BETTER if outcome == CHEAPER else OTHER, boxes, 0.0
 
 
-@compiled
+@inlined
 def _start(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper: Array, low: Array, high: Array) -> bool:
     """Write the corners of the box to search: the region, or an enclosure of all that costs less than rho^2."""
     if isnan(lower[0]):
-        if not enclose(
-            cost.kinds,
-            cost.data,
-            cost.A,
-            box.curves[:, 10].copy(),
-            box.nodes[:, 0].copy(),
-            chart.origin,
-            chart.sense,
-            chart.back,
-            rho,
-            low,
-            high,
-        ):
+        chosen = chart.origin, chart.sense, chart.back
+        if not enclose(cost.kinds, cost.data, cost.A, cost.groups, box.nodes, box.curves, *chosen, rho, low, high):
             return False
     else:
         for k in range(3):
@@ -156,7 +123,7 @@ def _start(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper: 
     return widest < 1e300
 
 
-@compiled
+@inlined
 def _minima(
     cost: Cost, chart: Chart, box: Box, others: Array, low: Array, high: Array, margin: float
 ) -> tuple[Array, Array, int]:
@@ -180,8 +147,8 @@ def _minima(
             margin = 100.0 * sqrt(sums[6] * sums[6] + sums[7] * sums[7] + sums[8] * sums[8])
         for k in range(3):
             hull[k] = max(high[k] - box.at[k], box.at[k] - low[k], 0.0)
-        if grow(cost, chart, box, hull, margin, sides[count]):
-            minima[count] = box.at
+        if set_convex(cost, chart, box, hull, margin):
+            minima[count], sides[count] = box.at, box.half
             count += 1
         elif p == 0:
             return minima, sides, 0

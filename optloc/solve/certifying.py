@@ -139,13 +139,14 @@ def _round(work: Work, items: Array) -> None:
     asked = _asked(work, items, part.extra)
     turning = part.able & (part.pose.level < work.fix.cost[items] + asked.kappa)
     _lower(work, items[turning], claims.TURNS)
-    good = np.flatnonzero(part.able & ~turning)
-    items, asked, extra = items[good], asked.take(good), part.extra[good]
-    if not len(items):
+    good, pose, extra = np.flatnonzero(part.able & ~turning), part.pose, part.extra
+    if not len(good):
         return
-    answer = prove_all(taken(part.pose, good), asked)
+    if len(good) < len(items):
+        items, asked, extra, pose = items[good], asked.take(good), extra[good], taken(pose, good)
+    answer = prove_all(pose, asked)
     done = np.isin(answer.verdict, (UNIQUE, VALUE))
-    _claim(work, items[done], asked.take(done), answer.take(done), extra[done])
+    _claim(work, items, asked, answer, extra, np.flatnonzero(done))
     short = answer.verdict == BUDGET
     _lower(work, items[short], claims.BUDGET)
     remote = answer.verdict == UNBOUNDED
@@ -200,16 +201,19 @@ def _give_up(work: Work, items: Array, why: str) -> None:
     work.pending[items] = False
 
 
-def _claim(work: Work, items: Array, asked: Asked, answer: Answered, extra: Array) -> None:
-    """Write the certificates of proven fixes."""
-    cost, kappa, boxes = work.fix.cost[items].tolist(), asked.kappa.tolist(), answer.boxes.tolist()
-    bound, everywhere = (answer.bound - extra).tolist(), answer.everywhere.tolist()
-    listed = (work.fix.alternatives.gap[items] < asked.kappa[:, None]).sum(1).tolist()
-    for k, i in enumerate(items.tolist()):
-        own = asked.fallback[k] if np.isnan(asked.region[k, 0, 0]) else asked.region[k]
-        corners = None if everywhere[k] else (own[0], own[1])
-        work.fix.certificate[i] = claims.claimed(cost[k], bound[k], kappa[k], boxes[k], listed[k], corners)
-    work.pending[items] = False
+def _claim(work: Work, items: Array, asked: Asked, answer: Answered, extra: Array, done: Array) -> None:
+    """Write the certificates of those of some fixes that are proven."""
+    proven, kappa = items[done], asked.kappa[done]
+    bound, listed = (answer.bound - extra)[done], work.fix.alternatives.gap[proven] < kappa[:, None]
+    region: list[tuple[claims.Corner, claims.Corner] | None] = [None] * len(done)
+    for k in np.flatnonzero(~answer.everywhere[done]).tolist():
+        whole = np.isnan(asked.region[done[k], 0, 0])
+        low, high = (asked.fallback if whole else asked.region)[done[k]].tolist()
+        region[k] = tuple(low), tuple(high)
+    numbers = (work.fix.cost[proven], bound, kappa, answer.boxes[done], listed.sum(1))
+    given = zip(*(values.tolist() for values in numbers), region, strict=True)
+    work.fix.certificate[proven] = claims.column([claims.claimed(*each) for each in given])
+    work.pending[proven] = False
 
 
 def _add(work: Work, items: Array, points: Array, better: Array) -> None:

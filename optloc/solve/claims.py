@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from functools import lru_cache
 
 import numpy as np
 
 from optloc.status import Certificate
 from optloc.types import Array
+
+Corner = tuple[float, ...]
 
 METHOD = "branch and bound"
 # Reasons for which nothing is proven.
@@ -26,7 +28,7 @@ def unknown(reason: str) -> Certificate:
 
 
 def claimed(
-    cost: float, bound: float, margin: float, boxes: int, listed: int, region: tuple[Array, Array] | None
+    cost: float, bound: float, margin: float, boxes: int, listed: int, region: tuple[Corner, Corner] | None
 ) -> Certificate:
     """Return the certificate of a proven fix.
 
@@ -43,36 +45,27 @@ def claimed(
     region : (lower, upper), optional
         Corners of the region of the claim; None: all positions.
     """
-    corners = None if region is None else (_tuple(region[0]), _tuple(region[1]))
-    where = "no position" if corners is None else f"no position from {_text(corners[0])} to {_text(corners[1])} m"
+    proof, sentence = "global" if region is None else "region", _sentence(margin, listed, region)
+    return Certificate(proof, sentence, METHOD, bound, cost - bound, margin > 0.0, margin, boxes, region)
+
+
+@lru_cache(maxsize=256)
+def _sentence(margin: float, listed: int, region: tuple[Corner, Corner] | None) -> str:
+    where = "no position" if region is None else f"no position from {_text(region[0])} to {_text(region[1])} m"
     beside = "" if not listed else " but that listed" if listed == 1 else f" but the {listed} listed"
     if margin > 0.0:
         rest = f"no other minimum{beside} has a cost within {margin:g} of it"
     else:
         rest = "other minima were searched for, not excluded"
-    return Certificate(
-        "global" if corners is None else "region",
-        f"{where} costs less; {rest}",
-        METHOD,
-        bound,
-        cost - bound,
-        margin > 0.0,
-        margin,
-        boxes,
-        corners,
-    )
+    return f"{where} costs less; {rest}"
 
 
-def _tuple(corner: Array) -> tuple[float, ...]:
-    return tuple(float(v) for v in corner)
-
-
-def _text(corner: tuple[float, ...]) -> str:
+def _text(corner: Corner) -> str:
     return "(" + ", ".join(f"{v:.6g}" for v in corner) + ")"
 
 
-def filled(size: int, value: Any) -> Array:
-    """Return an object array (size,) of one value."""
-    out = np.empty(size, dtype=object)
-    out[:] = value
+def column(certificates: list[Certificate]) -> Array:
+    """Return certificates as an object array."""
+    out = np.empty(len(certificates), dtype=object)
+    out[:] = certificates
     return out

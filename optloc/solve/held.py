@@ -9,8 +9,8 @@ import numpy as np
 from optloc.constraints import exact
 from optloc.fix import Fix
 from optloc.problem import Problem
-from optloc.proof.columns import height_numbers, linear_numbers
-from optloc.proof.nodes import HEIGHT, LINEAR, WIDTH
+from optloc.proof.columns import height_numbers, linear_numbers, stacked
+from optloc.proof.nodes import HEIGHT, LINEAR
 from optloc.proof.pose import Posed
 from optloc.types import Array, Band
 
@@ -64,7 +64,7 @@ def held(problem: Problem, fix: Fix, pose: Posed) -> Held:
 
 
 def _node(problem: Problem, constraint: Band) -> tuple[int, Array]:
-    """Return code and numbers (B, WIDTH) of the node that an equality sets."""
+    """Return code and numbers (B, n) of the node that an equality sets."""
     if constraint.kind == "height":
         return HEIGHT, height_numbers(problem)
     coefficients = constraint.coefficients
@@ -77,6 +77,6 @@ def _with_row(pose: Posed, kind: int, numbers: Array, value: Array, scale: Array
     K = np.zeros((size, q + 1, nodes + 1))
     K[:, :q, :nodes], K[:, q, nodes] = pose.K, 1.0 / scale
     w = np.concatenate([pose.w, (np.broadcast_to(value, (size,)) / scale - shift * scale)[:, None]], axis=1)
-    wide = max(len(pose.data), len(numbers))
-    data = [np.broadcast_to(pose.data, (wide, nodes, WIDTH)), np.broadcast_to(numbers, (wide, WIDTH))[:, None]]
-    return replace(pose, kinds=np.append(pose.kinds, kind), data=np.concatenate(data, axis=1), K=K, w=w)
+    kinds = np.append(pose.kinds, kind)
+    data = stacked(kinds, [*(pose.data[:, j] for j in range(nodes)), numbers])
+    return replace(pose, kinds=kinds, data=data, K=K, w=w)

@@ -23,8 +23,8 @@ def enclosed(case, x, rho):
     box.curves[:] = 0.0
     sum_up(cost.K, cost.w, box.nodes, box.curves, box.sums)
     low, high = np.empty(3), np.empty(3)
-    force, phi = box.curves[:, 10].copy(), box.nodes[:, 0].copy()
-    arguments = (cost.kinds, cost.data, cost.A, force, phi, chart.origin, chart.sense, chart.back, rho, low, high)
+    tables, chosen = (box.nodes, box.curves), (chart.origin, chart.sense, chart.back)
+    arguments = (cost.kinds, cost.data, cost.A, cost.groups, *tables, *chosen, rho, low, high)
     return chart, (low, high) if enclose(*arguments) else None
 
 

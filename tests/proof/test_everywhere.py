@@ -69,7 +69,8 @@ def proven(prover, kinds, data, K, w, x, others, kappa, budget=4000):
         found = np.full(len(x), np.nan)
         rest = np.array(others).reshape(-1, len(x))
         f = K @ np.linalg.norm(x - data[:, : len(x)], axis=1) - w if (kinds == RANGE).all() else np.zeros(1)
-        verdict, more, _ = prover(kinds, data, K, w, x, rest, kappa, 1e-6 * (1.0 + f @ f), budget, found)
+        cost, box = cost_of(kinds, data, K, w), empty_box(*K.shape)
+        verdict, more, _ = prover(cost, box, x, rest, kappa, 1e-6 * (1.0 + f @ f), budget, found)
         boxes += more
         if verdict != OTHER:
             break
@@ -77,9 +78,9 @@ def proven(prover, kinds, data, K, w, x, others, kappa, budget=4000):
     return verdict, boxes
 
 
-def by_enclosure(kinds, data, K, w, x, others, kappa, eps, budget, found):
+def by_enclosure(cost, box, x, others, kappa, eps, budget, found):
     nowhere = np.full(len(x), np.nan)
-    return prove(kinds, data, K, w, x, others, kappa, eps, budget, nowhere, nowhere, False, found)
+    return prove(cost, box, x, others, kappa, eps, budget, nowhere, nowhere, False, found)
 
 
 def test_in_the_plane_verdicts_are_those_of_brute_force():
@@ -98,8 +99,8 @@ def test_in_the_plane_verdicts_are_those_of_brute_force():
             continue
         for cost, x in minima:
             found = np.full(2, np.nan)
-            args = (kinds, data, K, w, x, np.zeros((0, 2)), 0.0, 1e-6 * (1.0 + cost), 4000)
-            verdict = prove_atlas(*args, found)[0]
+            args = (x, np.zeros((0, 2)), 0.0, 1e-6 * (1.0 + cost), 4000)
+            verdict = prove_atlas(cost_of(kinds, data, K, w), empty_box(*K.shape), *args, found)[0]
             if verdict == BETTER:
                 assert ((K @ np.linalg.norm(found - S, axis=1) - w) ** 2).sum() < cost
                 wrong += 1
@@ -161,7 +162,8 @@ def test_a_cost_that_falls_to_infinity_is_no_proof():
     kinds, data, K, w = differences(S, 1.0, np.array([0.0, 1e9]), rng)
     w = w + 0.5 * K @ np.array([-200.0, 0.0, -200.0, 0.0]) / 100.0
     x = least_squares(lambda p: K @ np.linalg.norm(p - S, axis=1) - w, [0.0, 1e5]).x
-    verdict = prove_atlas(kinds, data, K, w, x, np.zeros((0, 2)), 9.0, 1e-6, 4000, np.zeros(2))[0]
+    args = (x, np.zeros((0, 2)), 9.0, 1e-6, 4000, np.zeros(2))
+    verdict = prove_atlas(cost_of(kinds, data, K, w), empty_box(*K.shape), *args)[0]
     assert verdict not in (UNIQUE, VALUE)
 
 
@@ -172,18 +174,10 @@ def test_costs_that_grow_without_end_are_not_for_the_atlas():
     for kind in (LINEAR, HEIGHT):
         assert not reaches_infinity(np.array([RANGE, RANGE, kind]), K)
     assert reaches_infinity(np.array([AZIMUTH, ELEVATION, RATIO]), np.eye(3))
-    verdict = prove_everywhere(
-        np.append(kinds, LINEAR),
-        np.concatenate([data, np.zeros((1, WIDTH))]),
-        np.pad(K, ((0, 0), (0, 1))),
-        np.zeros(2),
-        np.array([3.0, 4.0, 5.0]),
-        np.zeros((0, 3)),
-        0.0,
-        1e-6,
-        10,
-        np.zeros(3),
-    )[0]
+    data, K = np.concatenate([data, np.zeros((1, WIDTH))]), np.pad(K, ((0, 0), (0, 1)))
+    cost, box = cost_of(np.append(kinds, LINEAR), data, K, np.zeros(2)), empty_box(*K.shape)
+    x = np.array([3.0, 4.0, 5.0])
+    verdict = prove_everywhere(cost, box, x, np.zeros((0, 3)), 0.0, 1e-6, 10, np.zeros(3))[0]
     assert verdict not in (UNIQUE, VALUE)
 
 

@@ -5,6 +5,7 @@ import pytest
 from proof.costs import NO_REGION, combined, differences, random_case
 
 from optloc.kernels.jit import enabled
+from optloc.proof.chart import cost_of, empty_box
 from optloc.proof.search import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove
 
 CASES, BUDGET_HERE = (24, 20_000) if enabled() else (3, 300)
@@ -19,7 +20,8 @@ def proof(case, x, kappa=0.0, others=(), region=None, budget=BUDGET_HERE, closed
     known = np.array(others, dtype=float).reshape(-1, d)
     eps = 1e-6 * (1.0 + case.cost(x))
     K = np.ascontiguousarray(case.K)
-    answer = prove(case.kinds, case.data, K, case.w, x, known, kappa, eps, budget, low, high, closed, found)
+    cost, box = cost_of(case.kinds, case.data, K, case.w), empty_box(*K.shape)
+    answer = prove(cost, box, x, known, kappa, eps, budget, low, high, closed, found)
     return *answer, found
 
 

@@ -1,0 +1,109 @@
+"""Groups of nodes that correlated rows tie to each other, solved for what the rows say of each node."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from optloc.kernels.jit import compiled
+from optloc.proof.linear3 import invert
+from optloc.proof.nodes import RANGE
+from optloc.types import Array
+
+# Nodes whose rows are tied to each other by less than this share count as independent.
+_APART = 1e-13
+# References of a group that needs none, and of one whose rows are too few.
+NONE, LOOSE = -1, -2
+
+
+class Groups(NamedTuple):
+    """Nodes in groups: rows say ``phi_j = n_j r_p + z_j + e_j`` of a node, r_p the reference range of its group.
+
+    Parameters
+    ----------
+    order : int array (3, J)
+        The nodes, group behind group, the reference last; sizes of the groups, ended by a zero; their references: a
+        node, NONE or LOOSE.
+    R : array (J, J)
+        Covariances of the errors e of each group but of its reference, in that order.
+    tie : array (J,)
+        Factors n_j by node: -1, 0 or 1.
+    """
+
+    order: Array
+    R: Array
+    tie: Array
+
+
+@compiled
+def empty_groups(J: int) -> Groups:
+    """Return room for groups of J nodes."""
+    return Groups(np.empty((3, J), np.int64), np.empty((J, J)), np.empty(J))
+
+
+@compiled
+def set_groups(kinds: Array, A: Array, groups: Groups) -> None:
+    """Write the groups of nodes (codes `kinds`) whose rows have ``A = K'K`` (J, J)."""
+    J, order = kinds.shape[0], groups.order
+    first = number = 0
+    for j in range(J):
+        order[0, j] = j
+    while first < J:
+        count = _gather(A, order[0], first)
+        order[1, number] = count
+        order[2, number] = _solve(kinds, A, order[0], first, count, groups.R, groups.tie)
+        first += count
+        number += 1
+    order[1, number:] = 0
+
+
+@compiled
+def _gather(A: Array, member: Array, first: int) -> int:
+    """Move the nodes that are tied to that at `first` behind it; return how many the group has."""
+    seen, end = first, first + 1
+    while seen < end:
+        j = member[seen]
+        seen += 1
+        for i in range(end, A.shape[0]):
+            m = member[i]
+            if A[j, m] * A[j, m] > _APART * _APART * A[j, j] * A[m, m]:
+                member[i], member[end] = member[end], m
+                end += 1
+    return int(end - first)
+
+
+@compiled
+def _solve(kinds: Array, A: Array, member: Array, first: int, count: int, R: Array, tie: Array) -> int:
+    """Solve the rows of a group for its nodes; return its reference, which is moved to the end."""
+    if _ties(kinds, A, member, first, count, NONE, R, tie):
+        return NONE
+    for i in range(first, first + count):
+        if kinds[member[i]] == RANGE:
+            last, reference = first + count - 1, member[i]
+            member[i], member[last] = member[last], reference
+            return reference if _ties(kinds, A, member, first, count - 1, reference, R, tie) else LOOSE
+    return LOOSE
+
+
+@compiled
+def _ties(kinds: Array, A: Array, member: Array, first: int, size: int, reference: int, R: Array, tie: Array) -> bool:
+    """Write the covariance of the errors, and how nodes follow the reference; False where rows say otherwise."""
+    own = R[first : first + size, first : first + size]
+    for i in range(size):
+        for j in range(size):
+            own[i, j] = A[member[first + i], member[first + j]]
+    if size == 0 or not invert(own, size, 1e-9):
+        return False
+    if reference >= 0:
+        tie[reference] = 0.0
+    for i in range(size):
+        factor = 0.0
+        if reference >= 0:
+            for j in range(size):
+                factor -= own[i, j] * A[member[first + j], reference]
+        nearest = 0.0 if abs(factor) < 0.5 else (1.0 if factor > 0.0 else -1.0)
+        if not abs(factor - nearest) <= 1e-9 or (nearest != 0.0 and kinds[member[first + i]] != RANGE):
+            return False
+        tie[member[first + i]] = nearest
+    return True
