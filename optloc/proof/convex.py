@@ -112,7 +112,7 @@ def sum_up(K: Array, w: Array, nodes: Array, curves: Array, sums: Array) -> None
             sums[k] += curves[j, 10] * curves[j, k]
 
 
-@compiled
+@inlined
 def force_change(A: Array, half: Array, nodes: Array, curves: Array, j: int) -> tuple[float, float]:
     """Return how far component j of K'(K phi - w) can fall and rise over the box; A = K'K (J, J)."""
     spread = abs(curves[j, 11]) * half[0] + abs(curves[j, 12]) * half[1] + abs(curves[j, 13]) * half[2]

@@ -6,7 +6,7 @@ from math import inf
 
 import numpy as np
 
-from optloc.kernels.jit import compiled
+from optloc.kernels.jit import compiled, inlined
 from optloc.proof.atlas import atlas_of, cube, first_minima, with_minima
 from optloc.proof.boxes import cost_at
 from optloc.proof.chart import Box, Cost, chart_at
@@ -24,7 +24,7 @@ _SOON = 500
 _CLOSE = 1e-3
 
 
-@compiled
+@inlined
 def prove_everywhere(
     cost: Cost, box: Box, x: Array, others: Array, kappa: float, eps: float, budget: int, found: Array
 ) -> tuple[int, int, float]:

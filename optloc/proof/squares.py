@@ -6,7 +6,7 @@ from math import sqrt
 
 import numpy as np
 
-from optloc.kernels.jit import compiled
+from optloc.kernels.jit import inlined
 from optloc.proof.linear3 import invert
 from optloc.proof.nodes import LINEAR, RANGE
 from optloc.types import Array
@@ -19,7 +19,7 @@ SLACK = 1e-6
 ERROR, SWING, FIRST, SECOND, THIRD, ROW, WEIGHTED, LEFT, WEIGHT, TIE_WIDTH = 0, 1, 2, 3, 4, 5, 9, 13, 17, 18
 
 
-@compiled
+@inlined
 def around_squares(
     kinds: Array,
     data: Array,
@@ -65,7 +65,7 @@ def around_squares(
         lower[k], upper[k] = max(lower[k], centre - reach), min(upper[k], centre + reach)
 
 
-@compiled
+@inlined
 def _rows(
     kinds: Array, data: Array, nodes: Array, member: Array, reference: int, tie: Array, ties: Array
 ) -> tuple[int, bool]:
@@ -99,7 +99,7 @@ def _rows(
     return count, ranges
 
 
-@compiled
+@inlined
 def _left_inverse(A: Array, nodes: Array, kinds: Array, member: Array, ties: Array, ranges: bool, plane: bool) -> bool:
     """Write the left inverse of the rows that is best for the errors at the fix; False where there is none."""
     normal = np.zeros((4, 4))
@@ -128,7 +128,7 @@ def _left_inverse(A: Array, nodes: Array, kinds: Array, member: Array, ties: Arr
     return True
 
 
-@compiled
+@inlined
 def _sums(R: Array, member: Array, ties: Array, near: float, middle: float) -> tuple[float, float, float, float]:
     """Return what the errors make of a weighted sum of squared rows.
 
