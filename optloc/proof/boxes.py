@@ -76,7 +76,7 @@ def bound_nodes(
             nodes[j, 0], nodes[j, 4], nodes[j, 5] = value, low, high
 
 
-@compiled
+@inlined
 def linearise_rows(K: Array, w: Array, nodes: Array, rows: Array) -> None:
     """Fill residuals (in the middle of the remainders) and Jacobian of the table of rows (q, ROW_WIDTH)."""
     for i in range(K.shape[0]):
@@ -90,7 +90,7 @@ def linearise_rows(K: Array, w: Array, nodes: Array, rows: Array) -> None:
         rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3] = middle, j0, j1, j2
 
 
-@compiled
+@inlined
 def cost_at(K: Array, w: Array, nodes: Array) -> float:
     """Return f at the centre of a box whose table of nodes is filled."""
     total = 0.0
@@ -102,7 +102,7 @@ def cost_at(K: Array, w: Array, nodes: Array) -> float:
     return total
 
 
-@compiled
+@inlined
 def least_residual(K: Array, weight: Array, floor: float, half: Array, nodes: Array, rows: Array) -> float:
     """Return a lower bound of ``|K phi - w|`` over a box, negative where it says nothing.
 
@@ -144,7 +144,7 @@ def least_residual(K: Array, weight: Array, floor: float, half: Array, nodes: Ar
     return float(reach / sqrt(length)) - rounding(K, weight, floor, nodes)
 
 
-@compiled
+@inlined
 def rounding(K: Array, weight: Array, floor: float, nodes: Array) -> float:
     """Return a bound of the rounding errors of a residual (its length); arguments as of `least_residual`."""
     size = floor
@@ -179,7 +179,7 @@ def within(s: float, half: float) -> float:
     return max(s, -half)
 
 
-@compiled
+@inlined
 def _nearest(half: Array, rows: Array) -> None:
     """Write the direction v = middle + J s with s nearly the least-squares solution inside the box."""
     a00, a01, a02, a11, a12, a22, b0, b1, b2 = normal_of(rows)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from math import inf, sqrt
 from typing import NamedTuple
 
-from optloc.kernels.jit import compiled
+from optloc.kernels.jit import compiled, inlined
 from optloc.proof.boxes import bound_nodes, cost_at, least_residual, linearise_rows, rounding
 from optloc.proof.chart import Box, Chart, Cost, place
 from optloc.proof.clip import cut_out, is_empty, shrink, uncut
@@ -153,7 +153,7 @@ def is_known(at: Array, half: Array, minima: Array, sides: Array) -> bool:
     return False
 
 
-@compiled
+@inlined
 def cut_side(kinds: Array, K: Array, gram: Array, half: Array, nodes: Array, rows: Array, inside: bool) -> int:
     """Return the coordinate across which to cut a box: where the remainders that matter shrink most.
 
@@ -185,7 +185,7 @@ def cut_side(kinds: Array, K: Array, gram: Array, half: Array, nodes: Array, row
     return 0 if t0 == most else (1 if t1 == most else 2)
 
 
-@compiled
+@inlined
 def _widest(half: Array) -> int:
     if half[0] >= half[1] and half[0] >= half[2]:
         return 0

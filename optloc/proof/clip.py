@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from math import sqrt
 
-from optloc.kernels.jit import compiled
+from optloc.kernels.jit import compiled, inlined
 from optloc.proof.boxes import normal_of
 from optloc.proof.linear3 import inverse
 from optloc.types import Array
 
 
-@compiled
+@inlined
 def shrink(K: Array, rho: float, plane: bool, nodes: Array, rows: Array, cut: Array, solve: Array) -> None:
     """Clip a box to where the residual may be shorter than rho.
 
@@ -59,7 +59,7 @@ def shrink(K: Array, rho: float, plane: bool, nodes: Array, rows: Array, cut: Ar
         clip(cut, 2, -c2, r2)
 
 
-@compiled
+@inlined
 def uncut(half: Array, cut: Array) -> None:
     """Write the ends of a whole box."""
     for k in range(3):
@@ -73,7 +73,7 @@ def clip(cut: Array, k: int, centre: float, reach: float) -> None:
     cut[k], cut[3 + k] = max(cut[k], centre - reach), min(cut[3 + k], centre + reach)
 
 
-@compiled
+@inlined
 def cut_out(cut: Array, at: Array, half: Array) -> float:
     """Replace a box by its part between the ends of a cut; return the share of its volume that this is."""
     share = 1.0
