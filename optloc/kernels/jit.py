@@ -80,3 +80,9 @@ def compiled(function: _Function) -> _Function:
 def inlined(function: _Function) -> _Function:
     """Return a function like `compiled`, of which compiled callers take in the source: every array handed on costs."""
     return cast(_Function, _Kernel(function, "always"))
+
+
+@compiled
+def zero() -> int:
+    """Return 0 as the start of a count: numba would compile what is handed a constant once more for a variable."""
+    return int(0.0)  # not 0, which it takes for a constant again

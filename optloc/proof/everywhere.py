@@ -6,7 +6,7 @@ from math import inf
 
 import numpy as np
 
-from optloc.kernels.jit import compiled, inlined
+from optloc.kernels.jit import compiled, inlined, zero
 from optloc.proof.atlas import atlas_of, cube, first_minima, with_minima
 from optloc.proof.boxes import cost_at
 from optloc.proof.chart import Box, Cost, chart_at
@@ -67,7 +67,7 @@ def prove_atlas(
     least = cost_at(cost.K, cost.w, box.nodes)
     middle, radius = cube(cost.kinds, cost.data)
     atlas = atlas_of(middle, radius, x.shape[0], 1 + (others.shape[0] if kappa > 0.0 else 0))
-    known, place = 0, np.empty(x.shape[0])
+    known, place = zero(), np.empty(x.shape[0])
     for p in range(atlas.minima.home.shape[0]):
         place[:] = x if p == 0 else others[p - 1]
         if set_minimum(cost, box, atlas, known, place, eps):

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optloc.kernels.jit import compiled
+from optloc.kernels.jit import compiled, zero
 from optloc.proof.linear3 import invert
 from optloc.proof.nodes import RANGE
 from optloc.types import Array
@@ -46,7 +46,7 @@ def empty_groups(J: int) -> Groups:
 def set_groups(kinds: Array, A: Array, groups: Groups) -> None:
     """Write the groups of nodes (codes `kinds`) whose rows have ``A = K'K`` (J, J)."""
     J, order = kinds.shape[0], groups.order
-    first = number = 0
+    first = number = zero()
     for j in range(J):
         order[0, j] = j
     while first < J:
@@ -76,32 +76,34 @@ def _gather(A: Array, member: Array, first: int) -> int:
 @compiled
 def _solve(kinds: Array, A: Array, member: Array, first: int, count: int, R: Array, tie: Array) -> int:
     """Solve the rows of a group for its nodes; return its reference, which is moved to the end."""
-    if _ties(kinds, A, member, first, count, NONE, R, tie):
+    if _ties(kinds, A, member, first, count, count, R, tie):
         return NONE
     for i in range(first, first + count):
         if kinds[member[i]] == RANGE:
             last, reference = first + count - 1, member[i]
             member[i], member[last] = member[last], reference
-            return reference if _ties(kinds, A, member, first, count - 1, reference, R, tie) else LOOSE
+            return reference if _ties(kinds, A, member, first, count - 1, count, R, tie) else LOOSE
     return LOOSE
 
 
 @compiled
-def _ties(kinds: Array, A: Array, member: Array, first: int, size: int, reference: int, R: Array, tie: Array) -> bool:
-    """Write the covariance of the errors, and how nodes follow the reference; False where rows say otherwise."""
+def _ties(kinds: Array, A: Array, member: Array, first: int, size: int, count: int, R: Array, tie: Array) -> bool:
+    """Write the covariance of the errors, and how nodes follow the reference; False where rows say otherwise.
+
+    Where the group has more nodes than the `size` that are solved for, the last is the reference.
+    """
     own = R[first : first + size, first : first + size]
     for i in range(size):
         for j in range(size):
             own[i, j] = A[member[first + i], member[first + j]]
     if size == 0 or not invert(own, size, 1e-9):
         return False
-    if reference >= 0:
-        tie[reference] = 0.0
+    for i in range(size, count):
+        tie[member[first + i]] = 0.0
     for i in range(size):
         factor = 0.0
-        if reference >= 0:
-            for j in range(size):
-                factor -= own[i, j] * A[member[first + j], reference]
+        for j in range(size if size < count else 0):
+            factor -= own[i, j] * A[member[first + j], member[first + size]]
         nearest = 0.0 if abs(factor) < 0.5 else (1.0 if factor > 0.0 else -1.0)
         if not abs(factor - nearest) <= 1e-9 or (nearest != 0.0 and kinds[member[first + i]] != RANGE):
             return False

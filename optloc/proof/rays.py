@@ -6,7 +6,7 @@ from math import cos, hypot, pi, sin, sqrt
 
 import numpy as np
 
-from optloc.kernels.jit import compiled
+from optloc.kernels.jit import compiled, zero
 from optloc.proof.linear3 import inverse
 from optloc.proof.nodes import AZIMUTH, ELEVATION
 from optloc.types import Array
@@ -34,7 +34,7 @@ def around_rays(kinds: Array, data: Array, x: Array, back: Array, swing: Array, 
     """
     J = kinds.shape[0]
     rows, reach, far = np.empty((J, 3)), np.empty(J), np.empty(J)
-    count = 0
+    count = zero()
     for j in range(J):
         if kinds[j] == AZIMUTH and swing[j] < 0.5 * pi:
             count = _add_azimuth(data[j], x, sin(swing[j]), rows, reach, far, count)
