@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from optloc.constraints import is_exact
+from optloc.kernels.jit import enabled
 from optloc.models import MODELS
 from optloc.priors import prior_parts
 from optloc.problem import Problem
@@ -15,8 +16,9 @@ from optloc.types import Band
 ANGLES = ("azimuth", "elevation")
 # Kinds that are nodes of their own; every other kind must be a sum of ranges.
 OWN = (*ANGLES, "groa", "height")
-# Different ranges, angles and ratios, and unknowns beside the position, of a problem whose proof is worth the time.
-MOST_NODES, MOST_UNKNOWNS = 128, 128
+# Different ranges, angles and ratios, and unknowns beside the position, of a problem whose proof is worth the time. Time
+# goes with the square of the nodes, and plain Python takes a thousand times longer.
+MOST_NODES, MOST_NODES_PLAIN, MOST_UNKNOWNS = 128, 24, 128
 
 
 def unsupported(problem: Problem) -> str:
@@ -56,8 +58,10 @@ def _of_rows(problem: Problem) -> Iterator[str]:
             yield f"{rows.kind} rows depend on velocities, which the proof does not bound"
         elif rows.kind not in OWN and model.ranges is None:
             yield f"{rows.kind} rows are neither sums of ranges nor a kind whose bounds are known"
-    if problem.count > MOST_NODES and _nodes(problem) > MOST_NODES:
-        yield f"there are {_nodes(problem)} different ranges and angles, and the proof takes {MOST_NODES}"
+    most = MOST_NODES if enabled() else MOST_NODES_PLAIN
+    if problem.count > most and _nodes(problem) > most:
+        without = "" if enabled() else " without machine code"
+        yield f"there are {_nodes(problem)} different ranges and angles, and the proof takes {most}{without}"
     if problem.layout.size - problem.dimension > MOST_UNKNOWNS:
         yield f"there are {problem.layout.size} unknowns, and the proof takes {MOST_UNKNOWNS}"
 
