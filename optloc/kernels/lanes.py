@@ -89,7 +89,7 @@ def measure(t: Tables, common: Array, m: Array, r: Array, room: Room, packet: in
     lanes : int
         How many lanes hold a problem.
     """
-    index, together = t.table, max(1, LENGTH // lanes)
+    index, together = t.table, LENGTH // max(1, min(lanes, LENGTH))
     for number in range(t.kinds):
         kind, part = t.kind + number, t.part + packet * (t.kinds + 1) + number
         for row in range(index[part, 0], index[part + 1, 0], together):

@@ -16,7 +16,7 @@ from optloc.types import Band
 ANGLES = ("azimuth", "elevation")
 # Kinds that are nodes of their own; every other kind must be a sum of ranges.
 OWN = (*ANGLES, "groa", "height")
-# Different ranges, angles and ratios, and unknowns beside the position, of a problem whose proof is worth the time. Time
+# Different ranges, angles and ratios, and unknowns beside the position, of a problem whose proof is worth the time. It
 # goes with the square of the nodes, and plain Python takes a thousand times longer.
 MOST_NODES, MOST_NODES_PLAIN, MOST_UNKNOWNS = 128, 24, 128
 
