@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 _SHOWN = 40
 _MIDDLE, _WHISKERS = (25.0, 75.0), (2.5, 97.5)
+# Bias, in whiskers of the others, beyond which a station is not drawn but named.
+_FAR = 10.0
 
 
 def plot_health(health: Health, *, title: str = "") -> Figure:
@@ -50,6 +52,21 @@ def plot_health(health: Health, *, title: str = "") -> Figure:
     if title:
         figure.suptitle(title)
     return figure
+
+
+def _limit(panel: Axes, whisker: Array, bias: Array, unit: str) -> None:
+    """Set the limits so that boxes can be told apart; of a station far beyond the others the edge tells the bias."""
+    most = np.quantile(whisker, 0.8)
+    bias = np.nan_to_num(bias)
+    far = np.abs(bias) > _FAR * most
+    reach = 1.2 * max(most, *np.abs(bias[~far]), *np.minimum(whisker[~far], 2.0 * most))
+    panel.set_xlim(-reach, reach)
+    for place in np.flatnonzero(far).tolist():
+        if bias[place] > 0.0:
+            words, side, align = f"{bias[place]:.3g} {unit} \N{RIGHTWARDS ARROW}", reach, "right"
+        else:
+            words, side, align = f"\N{LEFTWARDS ARROW} {bias[place]:.3g} {unit}", -reach, "left"
+        panel.text(0.99 * side, place, words, ha=align, va="center", fontsize=8, color=ORANGE)
 
 
 def _chosen(health: Health, unit: str) -> Array:
@@ -87,8 +104,7 @@ def _panel(panel: Axes, health: Health, unit: str, groups: Array) -> None:
         label="bias ± 2 standard errors",
         zorder=4,
     )
-    reach = 1.3 * np.quantile(np.maximum(np.abs(high), np.abs(low)), 0.8)
-    panel.set_xlim(-reach, reach)
+    _limit(panel, np.abs([low, high]).max(0), factor * health.bias[groups], shown)
     panel.axvline(0.0, color=BLACK, linewidth=0.8, zorder=0)
     panel.set_yticks(place, [health.names[g] for g in groups])
     panel.set_xlabel(f"measured less predicted by the others ({shown})" if shown != "1" else "measured less predicted")

@@ -171,6 +171,18 @@ def test_many_units_are_many_panels(tmp_path):
     assert (tmp_path / "h.pdf").stat().st_size > 2_000
 
 
+def test_the_worst_station_is_in_the_picture():
+    """Its bias lies within the limits, or where it is far beyond the others the edge tells it."""
+    found = health(biased(5, 60))
+    (panel,) = plot_health(found).axes
+    assert np.abs(found.bias).max() < panel.get_xlim()[1]
+    worst = int(np.argmax(np.abs(found.bias)))
+    found.bias[worst] *= 1e3
+    (panel,) = plot_health(found).axes
+    assert panel.get_xlim()[1] < 1e3
+    assert f"{found.bias[worst]:.3g} m" in panel.texts[0].get_text()
+
+
 def test_no_epoch_fixed_is_said():
     problem = ranged(np.random.default_rng(2), 5)
     with pytest.raises(InvalidProblem, match="no epoch has a fix"):
