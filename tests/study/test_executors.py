@@ -34,7 +34,9 @@ def undisturbed(tmp_path_factory):
 def process(*arguments, **options):
     """Run a Python process until the end of the block."""
     own = {**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-    with subprocess.Popen([sys.executable, *arguments], env=own, **options) as running:
+    # Where tests run in the background of a shell, they ignore Ctrl-C, and so would their children.
+    heard = {} if os.name == "nt" else {"preexec_fn": lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)}
+    with subprocess.Popen([sys.executable, *arguments], env=own, **heard, **options) as running:
         try:
             yield running
         finally:
