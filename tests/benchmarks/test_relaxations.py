@@ -87,8 +87,8 @@ def bounds(case: str, method: str, count: int) -> Work:
 
 
 TDOA, ANGLES = "TDOA, 5 stations, inside, 10 m", "azimuth and elevation, 4 stations, inside, 5 mrad"
-# Batches whose programs are long enough for threads: of a tenth of a millisecond half is Python's own.
-LONG = ("Shor relaxation", "unit directions", "moments", "stage directions", "reference bound, moments")
+# Batches whose programs are long enough for threads: of shorter ones handing over the interpreter lock takes the gain.
+LONG = ("unit directions", "moments", "stage directions", "reference bound, moments")
 WORK: dict[str, Callable[[], Work]] = {
     "Shor relaxation": lambda: squared(shor),
     "cone relaxation": lambda: squared(hull),
