@@ -101,7 +101,7 @@ def branch(
             return CHEAPER, boxes, 0.0
         uncut(half, cut)
         shrink(K, rho + rounding(K, weight, aim.floor, nodes), half[2] == 0.0, nodes, rows, cut, solve)
-        if unique:
+        if unique or aim.whole:
             sound = aim.whole or (low > 0.0 and low * low >= aim.value)
             if sound and is_known(at, half, minima, sides):
                 continue

@@ -93,6 +93,8 @@ def test_write_the_table(monkeypatch):
             rows.append(
                 [f"{scene}: a million fixes, {threads} threads", f"{took:.2f} s", f"{took / MILLION * 1e6:.2f}"]
             )
+            each = 1e6 * seconds(batch(scene)[0], "gtrs+lsr+value", 7) / COUNT
+            rows.append([f"{scene}: with a proof of the value, {threads} threads", "", f"{each:.1f}"])
         rows.append([f"{scene}: memory of a million fixes", f"{megabytes(problem, 'gtrs+lsr'):.0f} MB", ""])
         rows.append([f"{scene}: scipy least_squares from the truth", "", f"{general_microseconds(scene):.0f}"])
     methods = ("gtrs+lsr", "auto")
