@@ -44,3 +44,12 @@ def write(file: str, header: Sequence[str], rows: Sequence[Sequence[str]], facts
     path = FOLDER / f"{file}.md"
     path.write_text(f"---\norphan: true\n---\n\n{START}\n\n{made}\n\n{table}\n", encoding="utf-8")
     return path
+
+
+def repeat(file: Path, page: Path) -> None:
+    """Put the table of a file in the place of the one with the same header in a page."""
+    rows = [line for line in file.read_text(encoding="utf-8").splitlines() if line.startswith("|")]
+    before, _, rest = page.read_text(encoding="utf-8").partition(rows[0])
+    _, blank, after = rest.partition("\n\n")
+    assert blank, f"{page} has no table that begins with {rows[0]}"
+    page.write_text(before + "\n".join(rows) + blank + after, encoding="utf-8")
