@@ -29,7 +29,7 @@ def rows(file: str, pattern: str = "") -> str:
 
 def formulation(name: str) -> str:
     """Return what the catalogue says of a formulation."""
-    from optloc.solve import FORMULATIONS
+    from optloc.solvers import FORMULATIONS
 
     parts = [key for key in FORMULATIONS if key.split(":")[0] == name]
     lines = []
@@ -41,7 +41,7 @@ def formulation(name: str) -> str:
 
 def costs() -> str:
     """Return the formulations as a table: what each serves, how good its answer is, what it takes."""
-    from optloc.solve import FORMULATIONS
+    from optloc.solvers import FORMULATIONS
 
     head = ["| formulation | rows | its answer | time |", "|---|---|---|---|"]
     lines = [
@@ -54,7 +54,7 @@ def costs() -> str:
 def kinds() -> str:
     """Return the measurement kinds as a table."""
     from optloc import MODELS
-    from optloc.units import UNITS
+    from optloc.base.units import UNITS
 
     head = ["| kind | stations | dimensions | what is measured | units of a file |", "|---|---|---|---|---|"]
     lines = []

@@ -27,8 +27,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from formulations._polynomial import span, uncentred
 from formulations.bearing_ls import Rays, rays
+from formulations.secular import span, uncentred
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

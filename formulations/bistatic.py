@@ -27,7 +27,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from formulations._polynomial import span, uncentred
+from formulations.secular import span, uncentred
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

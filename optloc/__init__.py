@@ -5,37 +5,34 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from optloc.bias import with_bias
-from optloc.bounds import Course, crlb, crlb_course
-from optloc.build import assemble, measured, station_array
-from optloc.epochs import by_epoch
-from optloc.errors import InvalidProblem, NoSolution, OptlocError
-from optloc.evaluate import predict
-from optloc.fix import Alternatives, Fix, Stage
-from optloc.frames import CARTESIAN, ECEF, Frame
-from optloc.gauss_newton import gauss_newton
-from optloc.layout import Layout
-from optloc.learnt import with_known_bias
-from optloc.linear import Linear, linearise
-from optloc.loss import LOSSES, Loss
+from optloc.base.errors import InvalidProblem, NoSolution, OptlocError
+from optloc.base.frames import CARTESIAN, ECEF, Frame
+from optloc.base.status import Certificate, Status
+from optloc.base.types import Bias, Motion, Prior, Rows, Stations
+from optloc.bounds.crlb import Course, crlb, crlb_course
+from optloc.bounds.observability import Observability, observability
+from optloc.linear.evaluate import predict
+from optloc.linear.gauss_newton import gauss_newton
+from optloc.linear.normal import Linear, Normal, linearise, normal
+from optloc.linear.simulate import simulate
 from optloc.models import MODELS, Model
-from optloc.noise import Noise
-from optloc.normal import Normal, normal
-from optloc.observe import Observability, observability
-from optloc.problem import Problem
+from optloc.problem.bias import with_bias, with_known_bias
+from optloc.problem.build import assemble, measured, station_array
+from optloc.problem.epochs import by_epoch
+from optloc.problem.fix import Alternatives, Explanation, Fix, Stage, Suspect
+from optloc.problem.layout import Layout
+from optloc.problem.loss import LOSSES, Loss
+from optloc.problem.noise import Noise
+from optloc.problem.problem import Problem
 from optloc.quality.health import Health, health
 from optloc.quality.levels import NoiseLevels, noise_levels, with_estimated_noise, with_noise_levels
-from optloc.simulate import simulate
-from optloc.solve import FORMULATIONS, METHODS, SOLVERS, solve
-from optloc.solve.certify import certify
-from optloc.solve.prepared import Prepared, prepare
-from optloc.solve.reduce import reduce
-from optloc.solve.robust import rejected
-from optloc.solve.running import Running
-from optloc.solve.suspects import suspects
-from optloc.status import Certificate, Status
-from optloc.suspects import Explanation, Suspect
-from optloc.types import Bias, Motion, Prior, Rows, Stations
+from optloc.solvers import FORMULATIONS, METHODS, SOLVERS, solve
+from optloc.solvers.certify.branch_and_bound import certify
+from optloc.solvers.prepared import Prepared, prepare
+from optloc.solvers.robust.stage import rejected
+from optloc.solvers.running import Running
+from optloc.solvers.starts.least_squares_ranges import reduce
+from optloc.solvers.suspects.stage import suspects
 
 __version__ = "0.1.0"
 

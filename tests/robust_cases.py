@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from optloc import Fix, Problem, assemble, measured, solve
-from optloc.solve.refine import refine
+from optloc.solvers.refine import refine
 
 BOX, SIGMA = np.array([10e3, 10e3, 6e3]), 10.0
 

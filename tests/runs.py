@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 import optloc
-from optloc.types import Bias, Motion, Stations
+from optloc.base.types import Bias, Motion, Stations
 
 PLACES = 1e3 * np.array([[0, 0, 10], [-15, 0, 10], [15, 0, 10], [-5, 30, 0], [5, 30, 0]])
 SPEEDS = np.array([[0, 300, 0], [0, 300, 0], [0, 300, 0], [100, 300, 0], [-100, 300, 0]])

@@ -9,7 +9,7 @@ from cases import CASES, kitchen_sink, random_vector
 from runs import drawn, estimated, run, truth
 
 from optloc import InvalidProblem, gauss_newton, linearise, normal, predict, simulate, solve
-from optloc.types import Prior
+from optloc.base.types import Prior
 
 LIBRARIES = ("array_api_strict", "torch", "jax.numpy")
 STARTS = 4

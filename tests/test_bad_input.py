@@ -20,7 +20,7 @@ from optloc import (
     solve,
     station_array,
 )
-from optloc.layout import Layout
+from optloc.problem.layout import Layout
 
 SIX = np.arange(6)
 ENU = Frame.enu(lat_deg=47.0, lon_deg=8.0)
@@ -268,14 +268,14 @@ def test_nan_measurements_are_a_result_not_an_error():
 
 
 def test_every_case_passes_the_checks_again():
-    from optloc.check import checked
+    from optloc.problem.check import checked
 
     for case in CASES.values():
         assert checked(case.problem) is case.problem
 
 
 def test_a_problem_put_together_by_hand_can_be_checked():
-    from optloc.check import checked
+    from optloc.problem.check import checked
 
     good = posed()
     wrong = replace(good, stations=Stations(good.stations.position, ("a",)))

@@ -5,10 +5,10 @@ import pytest
 from runs import drawn, run, truth
 
 import optloc
-from optloc.blocks import averaged
-from optloc.noise import dense
-from optloc.solve.refine import refine
-from optloc.weigh import weighed
+from optloc.linear.station_noise import weighed
+from optloc.problem.noise import dense
+from optloc.solvers.refine import refine
+from optloc.solvers.starts.block_averages import averaged
 
 
 def test_blocks_of_one_epoch_are_the_run():

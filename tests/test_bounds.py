@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from optloc import InvalidProblem, Motion, Prior, Stations, assemble, crlb, measured, with_bias
-from optloc.bounds import crlb_course
-from optloc.constraints import height
-from optloc.frames import Frame
-from optloc.linear import linearise
-from optloc.observe import observability
-from optloc.papers.registration import scenario as scenes
-from optloc.priors import prior_parts
+from optloc.base.frames import Frame
+from optloc.bounds.crlb import crlb_course
+from optloc.bounds.observability import observability
+from optloc.linear.constraints import height
+from optloc.linear.normal import linearise, prior_parts
+from optloc.papers import registration as scenes
 
 
 def posed(epochs, *, moving=True, prior=None, span="noise", station_sigma=1.0, scene=scenes.SPATIAL, gain=None):

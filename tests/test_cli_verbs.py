@@ -186,7 +186,7 @@ def test_ctrl_c_is_one_line(monkeypatch):
     def stopped(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("optloc.cli.commands.run_fix", lambda *a, **k: stopped())
+    monkeypatch.setattr("optloc.cli.fix.run_fix", lambda *a, **k: stopped())
     result = RUN.invoke(app, ["fix", "demo"])
     assert (result.exit_code, result.stdout, result.stderr) == (130, "", "Stopped.\n")
 
@@ -195,7 +195,7 @@ def test_an_error_of_the_system_is_one_line(monkeypatch):
     def full(*_, **__):
         raise OSError(28, "No space left on device", "fixes.csv")
 
-    monkeypatch.setattr("optloc.cli.commands.run_fix", full)
+    monkeypatch.setattr("optloc.cli.fix.run_fix", full)
     one_line(["fix", "demo"], "fixes.csv: No space left on device")
 
 
@@ -203,7 +203,7 @@ def test_a_mistake_of_optloc_is_not_hidden(monkeypatch):
     def wrong(*_, **__):
         raise ZeroDivisionError
 
-    monkeypatch.setattr("optloc.cli.commands.run_fix", wrong)
+    monkeypatch.setattr("optloc.cli.fix.run_fix", wrong)
     assert isinstance(RUN.invoke(app, ["fix", "demo"]).exception, ZeroDivisionError)
 
 

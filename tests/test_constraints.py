@@ -7,8 +7,8 @@ import pytest
 from scipy.optimize import minimize
 
 from optloc import Frame, InvalidProblem, Motion, Status, assemble, measured, simulate, solve
-from optloc.constraints import box, height, polygon, speed, visible
-from optloc.types import Band, Polygon
+from optloc.base.types import Band, Polygon
+from optloc.linear.constraints import box, height, polygon, speed, visible
 
 ENU = Frame.enu(lat_deg=47.0, lon_deg=8.0, height=400.0)
 PLANE = np.array([[0.0, 0.0], [5e3, 400.0], [300.0, 5e3], [5e3, 5200.0], [2.5e3, -2e3]])

@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 from test_constraints import ENU, PLANE, SPACE, above, moving
 
 from optloc import Frame, Status, assemble, measured, solve
-from optloc.constraints import box, height, polygon, speed
+from optloc.linear.constraints import box, height, polygon, speed
 
 SIGMA = 30.0
 TIMES, A, EPOCH = np.arange(5.0) * 4.0, np.tile(np.arange(5), 5), np.repeat(np.arange(5), 5)

@@ -9,8 +9,8 @@ from test_constraint_files import ranges, ranging, run
 from test_constraints import ENU, PLANE, SPACE, above, drawn, moving
 
 from optloc import Status, assemble, measured, simulate, solve, suspects
-from optloc.constraints import box, height, polygon, speed
-from optloc.loss import LOSSES
+from optloc.linear.constraints import box, height, polygon, speed
+from optloc.problem.loss import LOSSES
 
 RING = np.array([[np.cos(t), np.sin(t)] for t in np.linspace(0.0, 2.0 * np.pi, 9)[:-1]]) * 3e3 + 2.5e3
 CORNER = ((0.0, 0.0), (2000.0, 9e3))

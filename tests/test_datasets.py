@@ -12,7 +12,7 @@ import optloc
 from optloc import InvalidProblem, datasets
 from optloc.datasets.catalogue import ENTRIES
 from optloc.datasets.folder import VARIABLE
-from optloc.noise import variances
+from optloc.problem.noise import variances
 
 
 def test_without_a_folder_there_is_nothing_and_a_sentence(monkeypatch):

@@ -17,9 +17,9 @@ from doc_pages import DOCS, MARKS, blocks, run_page
 from typer.main import get_command
 
 import optloc
+from optloc.base.errors import OptlocError
 from optloc.cli import app
-from optloc.errors import OptlocError
-from optloc.kernels.jit import enabled
+from optloc.compute.jit import enabled
 
 # Generated pages hold no code; the recipes of contributors have a test of their own.
 ELSEWHERE = ("measured", "papers", "examples", "gallery", "_build")

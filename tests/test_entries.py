@@ -8,7 +8,7 @@ import pytest
 from recipes import installed, write_package
 
 from optloc import MODELS, InvalidProblem, Model
-from optloc.entries import Table
+from optloc.base.registry import Table
 from optloc.track import UPDATES
 
 BAD = {

@@ -4,8 +4,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from optloc.errors import InvalidProblem, NoSolution, OptlocError, nearest
-from optloc.status import Status
+from optloc.base.errors import InvalidProblem, NoSolution, OptlocError, nearest
+from optloc.base.status import Status
 
 
 @pytest.mark.parametrize(

@@ -11,11 +11,11 @@ from bad_input import BAD, GEODETIC, HEAD, STATIONS, TDOA, bad_files, inline, td
 from hypothesis import given
 from hypothesis import strategies as st
 
-from optloc.errors import InvalidProblem
+from optloc.base.errors import InvalidProblem
+from optloc.base.frames import ECEF, Frame
+from optloc.base.units import SPEED_OF_LIGHT
 from optloc.files import from_table, load, read, schema
-from optloc.frames import ECEF, Frame
-from optloc.noise import dense
-from optloc.units import SPEED_OF_LIGHT
+from optloc.problem.noise import dense
 
 
 def same(one, two, rtol=1e-12, path="problem"):
@@ -116,7 +116,7 @@ def test_compass_bearings_and_counterclockwise_azimuths_agree(bearings):
 
 @given(st.floats(-5e3, 5e3), st.sampled_from(["m", "km", "ft", "ns", "us"]), st.floats(0.01, 100.0))
 def test_any_unit_of_length(value, unit, sigma):
-    from optloc.units import to_si
+    from optloc.base.units import to_si
 
     problem = from_table({"a": ["B"], "b": ["A"], "z": [value]}, STATIONS, kind="tdoa", unit=unit, sigma=sigma)
     np.testing.assert_allclose(problem.z, to_si([value], unit, "length"))

@@ -3,8 +3,8 @@ import math
 import numpy as np
 import pytest
 
-from optloc.errors import InvalidProblem
-from optloc.frames import CARTESIAN, ECEF, Frame, ecef_to_geodetic, geodetic_to_ecef
+from optloc.base.errors import InvalidProblem
+from optloc.base.frames import CARTESIAN, ECEF, Frame, ecef_to_geodetic, geodetic_to_ecef
 
 HOME = Frame.enu(lat_deg=47.4, lon_deg=8.5, height=440.0)
 A, B = 6378137.0, 6356752.314245

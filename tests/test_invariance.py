@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from optloc import MODELS, assemble, crlb, measured, simulate, solve
-from optloc.noise import Block, Noise
+from optloc.problem.noise import Block, Noise
 
 STARTED = sorted(name for name, case in CASES.items() if case.start)
 FLAT = [name for name in STARTED if "height" not in name]  # a height is measured from the Earth, which does not turn

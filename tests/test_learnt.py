@@ -5,8 +5,8 @@ import pytest
 from runs import run
 
 import optloc
-from optloc.errors import InvalidProblem
-from optloc.types import Motion
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Motion
 
 PLACES = np.array([[0.0, 0.0, 0.0], [30.0, 0.0, 5.0], [0.0, 40.0, 2.0]])
 TARGET = np.array([12.0, 17.0, 9.0])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from optloc import linalg
+from optloc.base import linalg
 
 
 def positive(rng, *shape):

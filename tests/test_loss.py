@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from optloc.loss import LOSSES
+from optloc.problem.loss import LOSSES
 
 GRID = np.linspace(-30.0, 30.0, 6001) + 1e-4
 

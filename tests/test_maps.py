@@ -6,12 +6,12 @@ from importlib.resources import files as package_files
 import numpy as np
 import pytest
 
-from optloc.bounds import crlb
-from optloc.errors import InvalidProblem
+from optloc.base.errors import InvalidProblem
+from optloc.bounds.bound_map import bound_map, extent
+from optloc.bounds.crlb import crlb
 from optloc.files import from_table, read
-from optloc.maps import bound_map, extent
 from optloc.plot.bound_map import isolines, levels, map_geojson, plot_bound_map
-from optloc.report.coast import land, rings
+from optloc.report.map import land, rings
 
 DEMOS = package_files("optloc") / "scenarios"
 

@@ -7,10 +7,10 @@ import pytest
 from cases import CASES, STATIONS, TARGET, dense_covariance, kitchen_sink
 
 from optloc import assemble, measured, normal, simulate, solve
-from optloc import noise as noises
-from optloc.linear import linearise
-from optloc.noise import Block, Noise
-from optloc.simulate import draw
+from optloc.linear.normal import linearise
+from optloc.linear.simulate import draw
+from optloc.problem import noise as noises
+from optloc.problem.noise import Block, Noise
 
 
 def weighed(noise, weight):
@@ -218,7 +218,7 @@ def test_station_errors_at_one_point_weigh_like_noise():
             Qs[i * d : (i + 1) * d, i * d : (i + 1) * d] = block
         R = dense_covariance(sure) + G @ Qs @ G.T
         H, e = linear.shared, linear.residual
-        from optloc.normal import marginal
+        from optloc.linear.normal import marginal
 
         information, vector, ok = marginal(joint)
         assert ok
@@ -227,6 +227,6 @@ def test_station_errors_at_one_point_weigh_like_noise():
 
 
 def normal_of(problem, x):
-    from optloc.priors import with_priors
+    from optloc.linear.normal import with_priors
 
     return with_priors(problem, x, normal(linearise(problem, x), problem.epochs))

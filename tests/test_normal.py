@@ -8,8 +8,7 @@ import pytest
 from cases import CASES, STATIONS, TARGET, dense_covariance, kitchen_sink, plain_predict, random_vector, wrapped
 
 from optloc import Bias, Motion, Prior, assemble, crlb, linearise, measured, normal, simulate
-from optloc.normal import covariance, decrement, marginal, step
-from optloc.priors import with_priors
+from optloc.linear.normal import covariance, decrement, marginal, step, with_priors
 
 
 def equations(problem, x):

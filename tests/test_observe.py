@@ -8,11 +8,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from optloc import Motion, Prior, Stations, assemble, crlb, measured, simulate, solve, with_bias
-from optloc.constraints import height
-from optloc.frames import Frame
-from optloc.linear import linearise
-from optloc.observe import observability
-from optloc.papers.registration import scenario as scenes
+from optloc.base.frames import Frame
+from optloc.bounds.observability import observability
+from optloc.linear.constraints import height
+from optloc.linear.normal import linearise
+from optloc.papers import registration as scenes
 
 NAMES = tuple("ABCDEF")
 PLACE = np.random.default_rng(3).uniform(-5e3, 5e3, (6, 3))

@@ -11,15 +11,14 @@ from typer.testing import CliRunner
 
 import optloc
 from optloc import plot
+from optloc.base.errors import InvalidProblem
+from optloc.bounds.bound_map import bound_map
 from optloc.cli import app
-from optloc.equations import equations_at
-from optloc.errors import InvalidProblem
-from optloc.maps import bound_map
+from optloc.compute.sums import equations_at
 from optloc.plot.landscape import limits, plane
-from optloc.scene import scene_of
-from optloc.solve.basins import End, basins
-from optloc.solve.growing import growing
-from optloc.solve.profile import profile_cost
+from optloc.plot.style import scene_of
+from optloc.solvers.landscape import End, basins, profile_cost
+from optloc.solvers.running import growing
 
 DEMOS = package_files("optloc") / "scenarios"
 RUN = CliRunner()

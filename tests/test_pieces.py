@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from optloc import Motion, Status, assemble, measured, simulate, solve, station_array, with_bias
-from optloc.noise import Block, Noise, dense
-from optloc.solve.pieces import _noise_of, from_pieces
+from optloc.problem.noise import Block, Noise, dense
+from optloc.solvers.starts.several_positions import _noise_of, from_pieces
 
 TAGS = np.array([[4.0, 1.0, 0.5], [-3.0, 2.0, 1.5], [1.0, -4.0, 2.0], [0.0, 5.0, 0.0]])
 

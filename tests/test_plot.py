@@ -5,12 +5,12 @@ from importlib.resources import files as package_files
 import numpy as np
 import pytest
 
-from optloc.cli.fixing import fix_file
-from optloc.ellipse import error_ellipse
+from optloc.base.linalg import error_ellipse
+from optloc.cli.fixed import fix_file
 from optloc.files import from_table, read
 from optloc.plot import plot_fixes, save
-from optloc.scene import scene_of
-from optloc.solve import solve
+from optloc.plot.style import scene_of
+from optloc.solvers import solve
 
 DEMOS = package_files("optloc") / "scenarios"
 

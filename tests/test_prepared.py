@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from optloc import InvalidProblem, Motion, Status, assemble, crlb, measured, prepare, simulate, solve, station_array
-from optloc.kernels.jit import enabled
-from optloc.solve.maps import direct
-from optloc.solve.parts import in_parts
-from optloc.solve.stages import gtrs, lsr
+from optloc.compute.jit import enabled
+from optloc.solvers.pool import in_parts
+from optloc.solvers.range_fixes import direct
+from optloc.solvers.stages import gtrs, lsr
 
 compiled = pytest.mark.skipif(not enabled(), reason="there is no direct way without machine code")
 TRIALS = 100

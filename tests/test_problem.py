@@ -22,9 +22,9 @@ from optloc import (
     simulate,
     solve,
 )
-from optloc.epochs import separable
-from optloc.noise import Block, Noise
-from optloc.types import Band
+from optloc.base.types import Band
+from optloc.problem.epochs import separable
+from optloc.problem.noise import Block, Noise
 
 
 def batch_of(count=6):

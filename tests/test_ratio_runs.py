@@ -5,7 +5,7 @@ import pytest
 
 import optloc
 from optloc import Motion, Status, solve
-from optloc.types import Stations
+from optloc.base.types import Stations
 
 PLACES = 1e3 * np.array([[0, 0, 0], [9, 1, 0.5], [8, 10, 1], [-1, 8, 0.3], [4, 5, 2]])
 SPEEDS = np.array([[0, 50, 0], [20, 40, 0], [0, 60, 5], [-30, 30, 0], [10, 50, 0]])

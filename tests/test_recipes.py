@@ -18,12 +18,11 @@ from typer.testing import CliRunner
 import optloc
 from optloc import MODELS, InvalidProblem, Motion, Status, solve
 from optloc.cli import app
-from optloc.equations import equations_at
-from optloc.kernels.tape import evaluated
-from optloc.kernels.trace import traced
-from optloc.linear import linearise
-from optloc.plan import plans
-from optloc.states import given
+from optloc.compute.sums import equations_at
+from optloc.compute.trace import evaluated, traced
+from optloc.linear.evaluate import given
+from optloc.linear.indices import plans
+from optloc.linear.normal import linearise
 from optloc.study.chunk import compute
 from optloc.track import collected, polynomial, tracked
 

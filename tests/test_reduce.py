@@ -20,7 +20,7 @@ from optloc import (
     simulate,
     solve,
 )
-from optloc.normal import covariance, step
+from optloc.linear.normal import covariance, step
 
 PAIRS = {d: np.triu_indices(len(STATIONS[d]), 1) for d in (2, 3)}
 

@@ -9,7 +9,7 @@ from cases import STATIONS, TARGET, stations
 
 import optloc
 from optloc import Bias, Motion, Prior, assemble, measured, simulate
-from optloc.solve.reference import METHODS, by_reference, reference_bound
+from optloc.solvers.certify.relaxations import METHODS, by_reference, reference_bound
 
 S = STATIONS[3][:5]
 COUNT = 5

@@ -13,11 +13,10 @@ from scipy.optimize import least_squares
 
 import optloc
 from optloc import Frame, Status, crlb, observability, simulate, solve
-from optloc.constraints import box, height, speed
-from optloc.papers.registration.scenario import PRINTED
-from optloc.papers.registration.trials import Setting, rms, wander
-from optloc.solve.refine import refine
-from optloc.types import Motion, Stations
+from optloc.base.types import Motion, Stations
+from optloc.linear.constraints import box, height, speed
+from optloc.papers.registration import PRINTED, Setting, rms, wander
+from optloc.solvers.refine import refine
 
 TIE = 1e-3
 # The band that all cases of this file together meet with 99 %.

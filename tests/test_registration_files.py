@@ -13,10 +13,10 @@ from bad_input import HEAD, write
 from typer.testing import CliRunner
 
 from optloc.cli import app
-from optloc.cli.fixing import fix_file
+from optloc.cli.fixed import fix_file
 from optloc.files import load, read
 from optloc.plot import plot_course, plot_fixes
-from optloc.scene import scene_of
+from optloc.plot.style import scene_of
 
 DEMO = package_files("optloc") / "scenarios" / "registration.toml"
 RUN = CliRunner()
@@ -172,7 +172,7 @@ def test_tracks_are_drawn(fixed):
 
 
 def _courses(problem):
-    from optloc.cli.course import courses
+    from optloc.cli.crlb import courses
 
     found = courses(problem, np.array([*PLACE, 0.0, 0.0, 0.0, 0.0]))
     assert found is not None

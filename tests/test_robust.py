@@ -12,10 +12,9 @@ from typer.testing import CliRunner
 
 from optloc import Status, assemble, measured, rejected, simulate, solve
 from optloc.cli import app
-from optloc.loss import LOSSES
-from optloc.noise import Block, Noise
-from optloc.solve.robust_descent import reweighted
-from optloc.solve.robust_weights import Doubt
+from optloc.problem.loss import LOSSES
+from optloc.problem.noise import Block, Noise
+from optloc.solvers.robust.reweighting import Doubt, reweighted
 
 REDESCENDING = ("cauchy", "truncated")
 

@@ -5,9 +5,9 @@ import pytest
 from runs import drawn, estimated, run, truth
 
 import optloc
-from optloc.errors import InvalidProblem
-from optloc.types import Motion
-from optloc.windows import cut
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Motion
+from optloc.problem.epochs import cut
 
 
 @pytest.mark.parametrize("case", ["fixed", "moving", "prior, gains", "eliminated"])

@@ -6,8 +6,8 @@ from cases import CASES
 
 import optloc
 from optloc import ECEF, Motion, Status, assemble, measured, predict, simulate, solve
-from optloc.constraints import height
-from optloc.frames import geodetic_to_ecef
+from optloc.base.frames import geodetic_to_ecef
+from optloc.linear.constraints import height
 from optloc.models.primitives import geodetic_normal
 
 SATELLITES = geodetic_to_ecef(*np.radians([[24.44, 25.09, 24.44], [125.21, 125.68, 125.99]]), np.full(3, 800e3))

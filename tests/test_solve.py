@@ -20,7 +20,7 @@ from cases import (
 from scipy.optimize import least_squares
 
 from optloc import InvalidProblem, Motion, NoSolution, Status, assemble, crlb, measured, simulate, solve, station_array
-from optloc.solve import METHODS
+from optloc.solvers import METHODS
 
 STARTED = sorted(name for name, case in CASES.items() if case.start)
 TRIALS, STARTS = 10, 8

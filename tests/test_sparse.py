@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 
 from optloc import Motion, Status, assemble, measured, simulate, solve
-from optloc.evaluate import predict
-from optloc.noise import variances
-from optloc.solve.sparse import sparse_errors
-from optloc.solve.sparse_rows import row_wise
+from optloc.linear.evaluate import predict
+from optloc.problem.noise import variances
+from optloc.solvers.sparse import row_wise, sparse_errors
 
 BOX = np.array([10e3, 10e3, 6e3])
 STATIONS = np.random.default_rng(7).uniform(-0.5, 0.5, (12, 3)) * BOX

@@ -12,10 +12,10 @@ from typer.testing import CliRunner
 import optloc
 from optloc import InvalidProblem, Motion, Prior, Status, assemble, measured, simulate, solve, with_bias
 from optloc.cli import app
-from optloc.solve.arrivals import as_arrivals, original
-from optloc.solve.refine import refine
-from optloc.solve.suspect_evidence import errors, influence, log_tail, significance
-from optloc.solve.suspect_groups import groups_of
+from optloc.solvers.refine import refine
+from optloc.solvers.starts.arrivals import as_arrivals, original
+from optloc.solvers.suspects.evidence import errors, influence, log_tail, significance
+from optloc.solvers.suspects.groups import groups_of
 
 RNG = np.random.default_rng(20251121)
 STATIONS = RNG.uniform(-0.5, 0.5, (8, 3)) * [10e3, 10e3, 6e3]

@@ -10,7 +10,7 @@ import pytest
 from formulations.conic import Relaxation
 from formulations.moment_sdp import moment_problem
 from optloc import InvalidProblem
-from optloc.threads import mapped, thread_count
+from optloc.base.threads import mapped, thread_count
 
 
 @pytest.mark.parametrize("threads", [1, 2, 7])

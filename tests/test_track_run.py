@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from optloc import ECEF, InvalidProblem, Motion, Status, assemble, measured, station_array
-from optloc.constraints import box, height
+from optloc.linear.constraints import box, height
 from optloc.track import Rules, State, collected, current_statistical, followed, polynomial, singer, tracked
-from optloc.track.targets import alone
+from optloc.track.several_targets import alone
 
 STATIONS = np.array([[0.0, 0, 0], [1000, 0, 300], [0, 1000, 250], [1000, 1000, 20], [500, 1300, 400], [-200, 500, 120]])
 PAIRS = np.array([[1, 0], [2, 0], [3, 0], [4, 0], [5, 0]])

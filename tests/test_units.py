@@ -5,8 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from optloc.errors import InvalidProblem
-from optloc.units import SI_UNIT, SPEED_OF_LIGHT, UNITS, conversion, sigma_to_si, to_si
+from optloc.base.errors import InvalidProblem
+from optloc.base.units import SI_UNIT, SPEED_OF_LIGHT, UNITS, conversion, sigma_to_si, to_si
 
 KNOWN = [
     (2.5, "km", "length", {}, 2500.0),

@@ -7,12 +7,11 @@ import pytest
 from runs import drawn, estimated, run, truth
 
 import optloc
-from optloc.equations import equations_at
-from optloc.linear import linearise
-from optloc.noise import dense
-from optloc.normal import marginal
-from optloc.solve.refine import refine
-from optloc.weigh import weighed
+from optloc.compute.sums import equations_at
+from optloc.linear.normal import linearise, marginal
+from optloc.linear.station_noise import weighed
+from optloc.problem.noise import dense
+from optloc.solvers.refine import refine
 
 
 def oblong(problem):

@@ -7,14 +7,12 @@ import pytest
 from runs import drawn, estimated, run, truth
 
 import optloc
-from optloc import windows as stretches
-from optloc.equations import equations_at
-from optloc.errors import InvalidProblem
-from optloc.linear import linearise
-from optloc.normal import normal
-from optloc.priors import with_priors
-from optloc.types import Motion
-from optloc.windows import cut, joined, windows
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Motion
+from optloc.compute.sums import equations_at
+from optloc.linear.normal import linearise, normal, with_priors
+from optloc.problem import epochs as stretches
+from optloc.problem.epochs import cut, joined, windows
 
 
 def shuffled(problem):

@@ -10,9 +10,9 @@ from importlib.resources import files
 import numpy as np
 
 import optloc
+from optloc.base.units import SPEED_OF_LIGHT
 from optloc.plot import plot_biases
-from optloc.solve.growing import growing
-from optloc.units import SPEED_OF_LIGHT
+from optloc.solvers.running import growing
 
 problem = optloc.load(files("optloc") / "scenarios" / "registration.toml")
 found = growing(problem, optloc.solve(problem), np.unique(np.geomspace(4, 200, 30).astype(int)))

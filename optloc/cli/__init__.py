@@ -1,8 +1,8 @@
 """The command line: ``optloc fix``, ``check``, ``track`` and so on; ``optloc --help`` lists them."""
 
-from optloc.cli import begin, lookup
-from optloc.cli.app import ANSWERS, MORE, app, main
-from optloc.cli.plot import EXAMPLES, plot
+from optloc.cli import app as begin
+from optloc.cli import app as lookup
+from optloc.cli.app import ANSWERS, EXAMPLES, MORE, app, main, plot
 from optloc.cli.study import study
 
 app.command(rich_help_panel=ANSWERS, epilog=EXAMPLES)(plot)

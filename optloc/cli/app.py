@@ -7,11 +7,12 @@ from typing import Annotated
 
 import typer
 
-from optloc.cli.group import EXIT_CODES, Group, example
 from optloc.cli.options import (
+    EXIT_CODES,
     AboveGround,
     Box,
     Geodetic,
+    Group,
     Height,
     Html,
     Json,
@@ -21,6 +22,8 @@ from optloc.cli.options import (
     ProblemPath,
     Quiet,
     Verbose,
+    example,
+    names,
 )
 
 # Heavy libraries are imported inside the commands, so that --help answers at once.
@@ -87,8 +90,8 @@ def fix(
 
     Options such as --height add to the constraints of the file.
     """
-    from optloc.cli.commands import run_fix
-    from optloc.cli.constraints import demanded
+    from optloc.cli.fix import run_fix
+    from optloc.cli.options import demanded
 
     more = demanded(height, above_ground, box)
     files = {"geojson_path": geojson, "plot": plot, "out": out, "html": html}
@@ -151,7 +154,7 @@ def track(
     verbose: Verbose = False,
 ) -> None:
     """Track the targets of a problem file through its scans, from fixes of its first ones, without a guess."""
-    from optloc.cli.tracking import Wanted, rules, run_track
+    from optloc.cli.track import Wanted, rules, run_track
 
     wanted = Wanted(model, filter_, noise, memory, rules(gate, gap), start, start_sigma, loss)
     raise typer.Exit(run_track(file, wanted, out=out, as_json=as_json, plot=plot, html=html, quiet=quiet))
@@ -184,7 +187,7 @@ def separate(
     verbose: Verbose = False,
 ) -> None:
     """Tell several emitters apart whose rows do not say whose they are; a channel is a kind at its stations."""
-    from optloc.cli.several import run_separate
+    from optloc.cli.separate import run_separate
 
     raise typer.Exit(run_separate(file, detection, false, emitters, region, as_json=as_json, quiet=quiet))
 
@@ -209,7 +212,7 @@ def simulate(
     verbose: Verbose = False,
 ) -> None:
     """Draw measurements of a known target and write them as a problem file."""
-    from optloc.cli.bounds import run_simulate
+    from optloc.cli.crlb import run_simulate
 
     raise typer.Exit(run_simulate(file, truth, velocity, out, geodetic=geodetic, seed=seed, trials=trials, quiet=quiet))
 
@@ -254,10 +257,10 @@ def crlb(
     With --map it is drawn over the place of the target instead.
     """
     if map_ is not None:
-        from optloc.cli.bound_map import run_map
+        from optloc.cli.crlb import run_map
 
         raise typer.Exit(run_map(file, map_, at, height, extent, velocity, geodetic=geodetic, dilution=dilution))
-    from optloc.cli.bounds import run_crlb
+    from optloc.cli.crlb import run_crlb
 
     raise typer.Exit(run_crlb(file, at, velocity, geodetic=geodetic, as_json=as_json, plot=plot, quiet=quiet))
 
@@ -283,7 +286,7 @@ def check(
 
     Each epoch is fixed, and each station compared with what the others say: bias, scale, noise, outliers.
     """
-    from optloc.cli.checking import Asked, run_check
+    from optloc.cli.check import Asked, run_check
 
     raise typer.Exit(run_check(file, as_json, Asked(not no_solve, method, by, out, plot), quiet=quiet))
 
@@ -291,3 +294,218 @@ def check(
 def main() -> None:
     """Run the command line."""
     app()
+
+
+# The commands of the first minutes: demo, new, convert.
+
+
+@app.command(
+    rich_help_panel=FIRST, epilog=example("optloc demo", "optloc demo ambiguous --plot two.png", "optloc list demos")
+)
+def demo(
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="[NAME]",
+            autocompletion=names("demos"),
+            help="A shipped problem: demo, ambiguous, run, registration.",
+        ),
+    ] = None,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="OUT.png", help="Where to draw the fix; optloc-demo.png by default.")
+    ] = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Walk through a fix, a registration and a proof; or fix one shipped problem."""
+    from optloc.cli.first_steps import run_demo
+
+    raise typer.Exit(run_demo(name, plot, as_json=as_json, quiet=quiet))
+
+
+@app.command(
+    rich_help_panel=FIRST,
+    epilog=example("optloc new tdoa", "optloc new satellites --out site.toml", "optloc list starters"),
+)
+def new(
+    kind: Annotated[
+        str,
+        typer.Argument(
+            metavar="KIND",
+            autocompletion=names("starters"),
+            help="A measurement kind (tdoa, range, ...) or a common mixture; see [bold]optloc list starters[/bold].",
+        ),
+    ],
+    out: Annotated[
+        Path | None, typer.Option(metavar="OUT.toml", help="File to write; standard output by default.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Write over a file that exists.")] = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Write a problem file with comments that can be fixed as it is, to begin with."""
+    from optloc.cli.first_steps import run_new
+
+    raise typer.Exit(run_new(kind, out, force=force, quiet=quiet))
+
+
+@app.command(
+    rich_help_panel=FIRST,
+    epilog=example(
+        "optloc convert toa.csv --stations sites.geojson --sigma '20 ns' --out a.toml",
+        "optloc convert log.csv --column time=when --stations rx.csv --sigma '6 m' --out b.toml",
+        "optloc convert gnss.csv --column pseudorange=C1C --sigma '3 m' --out gnss.toml",
+        "optloc convert sites.geojson --out stations.csv",
+    ),
+)
+def convert(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Arrival times or pseudoranges (CSV, Parquet), or GeoJSON stations.")
+    ],
+    out: Annotated[
+        Path, typer.Option(metavar="OUT.toml", help="Problem file to write; its tables go to CSV files beside it.")
+    ],
+    stations: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Where the stations are: GeoJSON, CSV or Parquet.")
+    ] = None,
+    sigma: Annotated[
+        str | None, typer.Option(metavar="AMOUNT", help="Error of each row: '20 ns', '6 m', or estimate.")
+    ] = None,
+    column: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="ROLE=NAME",
+            help="Column of a role that its name does not tell: message, station, time; epoch, satellite, x, y, z, "
+            "pseudorange; name, lat, lon, height. Give it once for each; message=set+msg joins two columns.",
+        ),
+    ] = None,
+    unit: Annotated[
+        str | None, typer.Option(metavar="UNIT", help="Of the values; by default what the column's name ends in.")
+    ] = None,
+    as_: Annotated[
+        str | None,
+        typer.Option("--as", metavar="WHAT", help="arrivals, pseudoranges or stations, where columns do not tell."),
+    ] = None,
+    frame: Annotated[
+        str | None, typer.Option(metavar="cartesian|ecef", help="Frame of stations in x, y, z; cartesian by default.")
+    ] = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Read a table of arrival times or pseudoranges, or GeoJSON stations, into a problem file."""
+    from optloc.cli.first_steps import run_convert
+
+    options = {"stations": stations, "sigma": sigma, "unit": unit, "what": as_, "frame": frame}
+    raise typer.Exit(run_convert(file, out, column or [], as_json=as_json, quiet=quiet, **options))
+
+
+# The commands that make papers again and list what there is: reproduce, list, schema.
+
+
+@app.command(
+    rich_help_panel=MORE,
+    epilog=example("optloc reproduce registration", "optloc reproduce registration --size full --out tables"),
+)
+def reproduce(
+    name: Annotated[
+        str,
+        typer.Argument(metavar="PAPER", help="Name of a paper: angles, bistatic, kinematic, registration, satellites."),
+    ],
+    size: Annotated[str, typer.Option(metavar="quick|full", help="Two minutes, or the sample sizes of the paper.")] = (
+        "quick"
+    ),
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Where tables and pictures go; optloc-PAPER by default.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Decides all draws.")] = 1,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Make the simulations of a paper again: tables and pictures with printed value, reproduced value and bound."""
+    from optloc.cli.listing import run_reproduce
+
+    raise typer.Exit(run_reproduce(name, size, out, seed, quiet))
+
+
+def _tables() -> list[str]:
+    from optloc.cli.listing import LISTS
+
+    return list(LISTS)
+
+
+@app.command(
+    "list", rich_help_panel=MORE, epilog=example("optloc list kinds", "optloc list methods", "optloc list starters")
+)
+def list_(
+    what: Annotated[
+        str,
+        typer.Argument(
+            metavar="WHAT",
+            autocompletion=_tables,
+            help="kinds, formulations, solvers, methods, baselines, executors, studies, datasets, demos or starters.",
+        ),
+    ],
+    as_json: Json = False,
+    verbose: Verbose = False,
+) -> None:
+    """List measurement kinds, methods, solvers with the back ends found here, and everything else that has a name."""
+    from optloc.cli.listing import run_list
+
+    raise typer.Exit(run_list(what, as_json))
+
+
+@app.command(rich_help_panel=MORE, epilog=example("optloc schema > optloc.schema.json"))
+def schema(verbose: Verbose = False) -> None:
+    """Print the JSON schema of problem files, from which editors complete and check them."""
+    from optloc.cli.output import dumps
+    from optloc.files import schema as of_files
+
+    typer.echo(dumps(of_files()))
+
+
+# The verb ``optloc plot``.
+
+WHAT = "fix, landscape, convergence, residuals, biases, bound, track or accuracy."
+
+
+def _pictures() -> list[str]:
+    from optloc.cli.pictures import PICTURES
+
+    return list(PICTURES)
+
+
+EXAMPLES = example(
+    "optloc plot landscape site.toml",
+    "optloc plot convergence demo --out story.svg",
+    "optloc plot residuals flight.toml --out residuals.pdf",
+    "optloc plot accuracy shootout-study",
+)
+
+
+def plot(
+    what: Annotated[str, typer.Argument(metavar="WHAT", autocompletion=_pictures, help=WHAT)],
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Problem file, name of a shipped problem, or folder of a study.")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(metavar="OUT", help="Picture to write: .png, .svg or .pdf; WHAT.png by default.")
+    ] = None,
+    method: Method = "auto",
+    epoch: Annotated[
+        str | None, typer.Option(metavar="LABEL", help="Epoch that is drawn, or case of a study; the first by default.")
+    ] = None,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Draw a picture of a problem and its fix.
+
+    fix: stations, fix, 95 % ellipse and alternatives. landscape: the cost over the place of the target. convergence:
+    where iterations from many starts end. residuals: by station. biases: of a run against time, with 95 %. bound: map
+    of the Cramer-Rao bound. track: of a run. accuracy: errors of a study's methods against the bound.
+    """
+    from optloc.cli.pictures import Asked, run_plot
+
+    place = Path(f"{what}.png") if out is None else out
+    raise typer.Exit(run_plot(what, Asked(file, place, method, epoch), quiet))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import typer
@@ -10,10 +11,13 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.table import Table
 
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.units import UNITS
+from optloc.cli.fixed import bar
 from optloc.cli.output import dumps
-from optloc.errors import InvalidProblem, nearest
 from optloc.models import MODELS
-from optloc.units import UNITS
+from optloc.papers import Size, paper, planned, write
+from optloc.papers import Table as PaperTable
 
 
 def _kinds() -> list[dict[str, str]]:
@@ -30,13 +34,13 @@ def _kinds() -> list[dict[str, str]]:
 
 
 def _formulations() -> list[dict[str, str]]:
-    from optloc.solve.catalogue import FORMULATIONS
+    from optloc.solvers.methods import FORMULATIONS
 
     return _entries("formulation", FORMULATIONS)
 
 
 def _solvers() -> list[dict[str, str]]:
-    from optloc.solve.catalogue import SOLVERS
+    from optloc.solvers.methods import SOLVERS
     from optloc.study.backends import backends
 
     found = {
@@ -47,7 +51,7 @@ def _solvers() -> list[dict[str, str]]:
 
 
 def _methods() -> list[dict[str, str]]:
-    from optloc.solve.catalogue import METHODS
+    from optloc.solvers.methods import METHODS
 
     return [{"method": name, "summary": stages} for name, stages in METHODS.items()]
 
@@ -90,13 +94,13 @@ def _datasets() -> list[dict[str, str]]:
 
 
 def _demos() -> list[dict[str, str]]:
-    from optloc.cli.demo import titles
+    from optloc.cli.first_steps import titles
 
     return [{"demo": name, "summary": title} for name, title in titles().items()]
 
 
 def _starters() -> list[dict[str, str]]:
-    from optloc.cli.starters import starters
+    from optloc.cli.first_steps import starters
 
     return [{"starter": name, "summary": starter.summary} for name, starter in starters().items()]
 
@@ -162,3 +166,47 @@ def _print(rows: list[dict[str, str]], console: Console) -> None:
     for row in rows:
         table.add_row(row[title], *(row.get(name, "") for name in names))
     console.print(table)
+
+
+# What ``optloc reproduce`` does.
+
+SIZES: tuple[Size, ...] = ("quick", "full")
+
+
+def run_reproduce(name: str, size: str, out: Path | None, seed: int, quiet: bool) -> int:
+    """Make the tables and pictures of a paper again, print the tables, and return the exit code."""
+    paper(name)
+    chosen = next((known for known in SIZES if known == size), None)
+    if chosen is None:
+        raise InvalidProblem(f"there is no size {size!r}", "--size", nearest(size, SIZES))
+    folder = Path(f"optloc-{name}") if out is None else out
+    _usable(folder)
+    plan = planned(name, chosen, seed)
+    with bar(name, plan.work, quiet) as advance:
+        report = plan.run(lambda: advance(1))
+    written = write(report, folder)
+    if not quiet:
+        console = Console()
+        for table in report.tables:
+            console.print(_shown(table))
+        console.print(f"{len(written)} files are in {folder}; begin with README.md.", highlight=False, markup=False)
+    return 0
+
+
+def _usable(folder: Path) -> None:
+    """Make the folder before the work, so that a place that cannot be written is known at once."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InvalidProblem(
+            f"the folder cannot be made ({error.strerror or error})", str(folder), "choose another place"
+        ) from None
+
+
+def _shown(table: PaperTable) -> Table:
+    shown = Table(title=table.title, title_justify="left", caption=table.note, caption_justify="left")
+    for i, name in enumerate(table.header):
+        shown.add_column(name, justify="right" if i else "left", overflow="fold")
+    for row in table.rows:
+        shown.add_row(*row)
+    return shown

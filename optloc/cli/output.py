@@ -10,20 +10,83 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from rich.console import Console
+from rich.table import Table
 
-from optloc.cli.biases import bias_records
-from optloc.cli.columns import Columns
-from optloc.cli.fixing import Fixed
-from optloc.errors import InvalidProblem
-from optloc.fix import Active, Fix
-from optloc.loss import LOSSES
-from optloc.observe import Observability
-from optloc.status import Status
-from optloc.suspects import Explanation
-from optloc.types import Array
+from optloc.base.errors import InvalidProblem
+from optloc.base.status import Status
+from optloc.base.types import Array
+from optloc.bounds.observability import Observability
+from optloc.cli.fixed import Columns, Fixed
+from optloc.problem.fix import Active, Explanation, Fix
+from optloc.problem.loss import LOSSES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+
+# Numbers as people read them.
+
+
+def with_sigma(value: float, sigma: float, unit: str) -> str:
+    """Return a number with its standard deviation, rounded to it; a constraint may leave it none."""
+    unit = unit if unit != "1" else ""
+    if sigma <= 1e-12 * (1.0 + abs(value)):
+        return f"{value:.10g} {unit} (held)"
+    if not np.isfinite(sigma):
+        return f"{value:.6g} {unit}"
+    digits = int(max(0, 1 - np.floor(np.log10(sigma))))
+    return f"{value:.{digits}f} ± {sigma:.{digits}f} {unit}"
+
+
+# Biases of a registration as records, and as tables for people.
+
+_LONG = 40
+
+
+def bias_records(fix: Fix, seen: Observability | None) -> list[dict[str, Any]]:
+    """Return one record for each bias of a single fix: name, member, value, sigma, unit, from_data.
+
+    Parameters
+    ----------
+    fix : Fix
+        A single fix.
+    seen : Observability, optional
+        What its data show.
+    """
+    records = []
+    for slot in fix.layout.shared:
+        if not slot.members:
+            continue
+        values, sigmas = fix.take(slot.name), fix.sigma(slot.name)
+        shares = np.full(slot.size, np.nan) if seen is None else seen.from_data[slot.start : slot.start + slot.size]
+        for member, value, sigma, share in zip(slot.entries, values, sigmas, shares, strict=True):
+            record = {"name": slot.name, "member": member, "value": float(value), "sigma": float(sigma)}
+            records.append(record | {"unit": slot.unit, "from_data": float(share)})
+    return records
+
+
+def show_biases(fix: Fix, seen: Observability | None, console: Console) -> None:
+    """Print the biases of a single fix, and what cannot be told apart; nothing where there is none."""
+    records = bias_records(fix, seen) if np.isfinite(fix.x).all() else []
+    if records:
+        console.print(_table(records))
+    for sentence in () if seen is None else seen.sentences:
+        console.print(f"{sentence[0].upper()}{sentence[1:]}.", highlight=False, markup=False, soft_wrap=True)
+
+
+def _table(records: list[dict[str, Any]]) -> Table:
+    table = Table(title="Biases", title_justify="left")
+    for name in ("name", "member", "estimate", "from data"):
+        table.add_column(name, justify="right" if name == "from data" else "left")
+    for record in records[:_LONG]:
+        share = f"{100.0 * record['from_data']:.3g} %" if np.isfinite(record["from_data"]) else "-"
+        estimate = with_sigma(record["value"], record["sigma"], record["unit"]).strip()
+        table.add_row(record["name"], record["member"], estimate, share)
+    if len(records) > _LONG:
+        table.add_row("...", f"{len(records) - _LONG} more", "--json prints all", "")
+    return table
+
 
 LOG = logging.getLogger("optloc.write")
 
@@ -198,7 +261,7 @@ def _degrees(fixed: Fixed, position: Array) -> list[list[float]]:
 
 def _ring(fixed: Fixed, row: dict[str, Any], points: int) -> list[list[float]]:
     """Return the closed ring, counter-clockwise, of the horizontal 95 % ellipse of a row."""
-    from optloc.ellipse import error_ellipse
+    from optloc.base.linalg import error_ellipse
 
     covariance = np.array([[row["cov_ee"], row["cov_en"]], [row["cov_en"], row["cov_nn"]]])
     semi_axes, directions = error_ellipse(covariance)

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from rich.console import Console
 
+from optloc.base.errors import InvalidProblem, nearest
 from optloc.cli.output import saved
-from optloc.epochs import by_epoch, separable
-from optloc.errors import InvalidProblem, nearest
 from optloc.files import Loaded, read
-from optloc.fix import Fix
-from optloc.problem import Problem
+from optloc.problem.epochs import by_epoch, separable
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -69,7 +69,7 @@ def problem_file(file: Path) -> Iterator[Path]:
 
 def _fixed(asked: Asked) -> tuple[Loaded, Problem, Fix]:
     """Return a file, its problem (epochs that share nothing as a batch) and its fixes."""
-    from optloc.solve import solve
+    from optloc.solvers import solve
 
     loaded = read(asked.file)
     problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
@@ -78,7 +78,7 @@ def _fixed(asked: Asked) -> tuple[Loaded, Problem, Fix]:
 
 def _one(asked: Asked) -> tuple[Problem, Fix, str]:
     """Return the problem of one epoch, or of a run, with its fix and a title."""
-    from optloc.solve import solve
+    from optloc.solvers import solve
 
     loaded = read(asked.file)
     if not separable(loaded.problem):
@@ -124,20 +124,20 @@ def _convergence(asked: Asked) -> None:
 
 def _biases(asked: Asked) -> None:
     from optloc.plot import plot_biases
-    from optloc.solve.growing import growing
+    from optloc.solvers.running import growing
 
     loaded, problem, fix = _fixed(asked)
     saved(plot_biases(growing(problem, fix), loaded.title), asked.out)
 
 
 def _bound(asked: Asked) -> None:
-    from optloc.cli.bound_map import run_map
+    from optloc.cli.crlb import run_map
 
     run_map(asked.file, asked.out, None, None, None, None, geodetic=False, dilution=False)
 
 
 def _track(asked: Asked) -> None:
-    from optloc.cli.tracking import Wanted, rules, run_track
+    from optloc.cli.track import Wanted, rules, run_track
 
     wanted = Wanted("cv", "iekf", None, 10.0, rules(5.0, None), None, None)
     run_track(asked.file, wanted, out=None, as_json=False, plot=asked.out, quiet=True)
@@ -146,7 +146,7 @@ def _track(asked: Asked) -> None:
 def _accuracy(asked: Asked) -> None:
     from optloc.plot import plot_accuracy
     from optloc.study import summary
-    from optloc.study.table import read_frame
+    from optloc.study.folder import read_frame
 
     if not asked.file.is_dir():
         raise InvalidProblem("the errors of methods are those of a study", str(asked.file), "name its output folder")

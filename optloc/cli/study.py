@@ -13,8 +13,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from optloc.cli.group import STOPPED, Group, example
-from optloc.cli.options import Json, Quiet, Verbose, names
+from optloc.cli.options import STOPPED, Group, Json, Quiet, Verbose, example, names
 
 # Heavy libraries are imported inside the commands, so that --help answers at once.
 
@@ -131,7 +130,7 @@ def compare(
     """Set two studies side by side, cell by cell. Exit code 1 where a share of answers differs by 3 sigma."""
     from dataclasses import asdict
 
-    from optloc.study.compare import compared
+    from optloc.study.summary import compared
 
     found = compared(one, two)
     if as_json:

@@ -17,13 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
-from optloc.build import assemble, measured, station_array
-from optloc.constraints import height
+from optloc.base.frames import ECEF
+from optloc.base.types import Array, Motion
+from optloc.base.units import SPEED_OF_LIGHT
 from optloc.datasets.folder import chosen, places, table
-from optloc.frames import ECEF
-from optloc.problem import Problem
-from optloc.types import Array, Motion
-from optloc.units import SPEED_OF_LIGHT
+from optloc.linear.constraints import height
+from optloc.problem.build import assemble, measured, station_array
+from optloc.problem.problem import Problem
 
 ARRIVAL, HEIGHT = 30.0, 30.0
 REFRACTIVITY, SCALE_HEIGHT = 315e-6, 7500.0

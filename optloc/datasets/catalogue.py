@@ -10,11 +10,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.types import Array
 from optloc.datasets.folder import root
 from optloc.datasets.folder import verify as verified
-from optloc.errors import InvalidProblem, nearest
-from optloc.problem import Problem
-from optloc.types import Array
+from optloc.problem.problem import Problem
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optloc.errors import InvalidProblem, nearest
-from optloc.types import Array
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.types import Array
 
 if TYPE_CHECKING:
     import pandas as pd

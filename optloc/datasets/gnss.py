@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optloc.build import assemble, measured, station_array
-from optloc.constraints import height, visible
+from optloc.base.frames import ECEF
+from optloc.base.types import Array, Bias, Motion
 from optloc.datasets.folder import chosen, places, table
-from optloc.frames import ECEF
-from optloc.problem import Problem
-from optloc.types import Array, Bias, Motion
+from optloc.linear.constraints import height, visible
+from optloc.problem.build import assemble, measured, station_array
+from optloc.problem.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
-from optloc.build import assemble, measured
+from optloc.base.types import Array, Motion
 from optloc.datasets.folder import chosen, places, table
-from optloc.problem import Problem
-from optloc.types import Array, Motion
+from optloc.problem.build import assemble, measured
+from optloc.problem.problem import Problem
 
 SIGMA = {"azimuth": np.deg2rad(2.0), "range": 0.1}
 ALONE = {**SIGMA, "range": 0.15}

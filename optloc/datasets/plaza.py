@@ -16,11 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from optloc.build import assemble, measured
+from optloc.base.types import Array, Motion
 from optloc.datasets.folder import chosen, places, table
 from optloc.datasets.windows import Window, Windows, along, windowed
-from optloc.problem import Problem
-from optloc.types import Array, Motion
+from optloc.problem.build import assemble, measured
+from optloc.problem.problem import Problem
 
 SIGMA = {"raw": 3.0, "offset": 1.15, "affine": 0.53, "scaled": 0.53}
 STEP, WIDTH, LEAD = 3.0, 1.5, 2.0

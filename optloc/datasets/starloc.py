@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optloc.build import assemble, measured, station_array
+from optloc.base.types import Array, Motion
 from optloc.datasets.folder import chosen, places, table
-from optloc.problem import Problem
-from optloc.types import Array, Motion
+from optloc.problem.build import assemble, measured, station_array
+from optloc.problem.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd

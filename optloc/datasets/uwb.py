@@ -30,13 +30,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optloc.build import assemble, measured
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array, Motion
 from optloc.datasets.folder import chosen, places, table
 from optloc.datasets.windows import Window, Windows, along, windowed
-from optloc.errors import InvalidProblem
-from optloc.noise import Block, Noise, group
-from optloc.problem import Problem
-from optloc.types import Array, Motion
+from optloc.problem.build import assemble, measured
+from optloc.problem.noise import Block, Noise, group
+from optloc.problem.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd

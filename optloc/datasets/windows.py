@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from optloc.problem import Problem
-from optloc.types import Array
+from optloc.base.types import Array
+from optloc.problem.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd

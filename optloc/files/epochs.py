@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optloc.errors import InvalidProblem
-from optloc.types import Array
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array
 
 
 @dataclass(frozen=True, slots=True)

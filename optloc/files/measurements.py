@@ -2,19 +2,185 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optloc.errors import InvalidProblem
-from optloc.files.chunk import Chunk, Context
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.types import Array
+from optloc.base.units import Conversion
+from optloc.files.epochs import Epochs
 from optloc.files.schema import MeasurementsTable
-from optloc.files.sigmas import spread_of
 from optloc.files.table import Table
-from optloc.files.words import Units, join, kind_model, nearest
+from optloc.files.words import Units, join, kind_model
 from optloc.models import Model
-from optloc.types import Array
-from optloc.units import Conversion
+
+# Rows of one kind between their file and the problem.
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """Rows of one kind.
+
+    Parameters
+    ----------
+    kind : str
+        Their kind.
+    row : int array (m,)
+        Row of each in its table, from 0.
+    z, a, b, weight, correction : array (m,)
+        As in `optloc.base.types.Rows`; NaN where a value is to be simulated.
+    unit : Conversion
+        Of z.
+    slope : array (m,)
+        SI units in one unit of the file, with sign.
+    baseline : array (m,)
+        Distance of the two stations that was added to z, metres.
+    sigma : array (m,), optional
+        Standard deviation of each row.
+    arrival : array (s,), optional
+        Standard deviation of each station's arrival.
+    covariance : array (r, r), optional
+        Covariance of the rows of one epoch, in the file's unit squared.
+    label, time, written, target : array (m,), optional
+        Columns epoch, time (seconds; as written) and target.
+    excess : bool
+        Whether the distance of the two stations is still to be added to z.
+    table : Table
+        Where the rows come from.
+    """
+
+    kind: str
+    row: Array
+    z: Array
+    a: Array
+    b: Array
+    weight: Array
+    correction: Array
+    unit: Conversion
+    slope: Array
+    baseline: Array
+    sigma: Array | None
+    arrival: Array | None
+    covariance: Array | None
+    label: Array | None
+    time: Array | None
+    written: Array | None
+    target: Array | None
+    excess: bool
+    table: Table
+
+
+@dataclass(frozen=True, slots=True)
+class Context:
+    """What all rows of a section share."""
+
+    section: MeasurementsTable
+    table: Table
+    stations: tuple[str, ...]
+    where: str
+    speed: float
+    values: bool
+
+
+# What a table of measurements says about its noise.
+
+ESTIMATE = "estimate"
+"""Word in the place of a standard deviation that is to be found from the data."""
+
+# Where the search for a level begins, in SI units: it decides nothing but how kinds are weighed in the first fixes.
+_BEGIN = {"angle": 1e-2, "ratio": 1e-2, "speed": 0.1}
+
+
+def spread_of(
+    c: Context, model: Model, units: Units, unit: Conversion, z: Array
+) -> tuple[Array | None, Array | None, Array | None]:
+    """Return standard deviations (m,), arrival standard deviations (s,) and covariance (r, r): one of them, or none.
+
+    Parameters
+    ----------
+    c : Context
+        Settings and rows.
+    model : Model
+        Of their kind.
+    units : Units
+        What they measure.
+    unit : Conversion
+        Of z, and of bare numbers.
+    z : array (m,)
+        Measured values in SI.
+    """
+    section = c.section
+    column = c.table.has("sigma")
+    given = [column or section.sigma is not None, section.arrival_sigma is not None, section.covariance is not None]
+    if sum(given) > 1:
+        raise InvalidProblem("the noise is given more than once", c.where, "give sigma, arrival_sigma or covariance")
+    if column:
+        return _positive(c, unit.sigma_to_si(c.table.numbers("sigma"), z), column=True), None, None
+    if section.sigma == ESTIMATE:
+        return np.full(z.shape, _BEGIN.get(model.quantity, 1.0)), None, None
+    if section.sigma is not None:
+        number, own = units.amount(section.sigma, unit, join(c.where, "key 'sigma'"))
+        return _positive(c, np.broadcast_to(own.sigma_to_si(number, z), z.shape), column=False), None, None
+    if section.arrival_sigma is not None:
+        return None, _arrival(c, model, units, unit, section.arrival_sigma), None
+    covariance = None if section.covariance is None else square(section.covariance, join(c.where, "key 'covariance'"))
+    return None, None, covariance
+
+
+def _positive(c: Context, sigma: Array, *, column: bool) -> Array:
+    bad = np.flatnonzero(sigma <= 0.0)
+    if len(bad):
+        place = c.table.where("sigma", int(bad[0])) if column else join(c.where, "key 'sigma'")
+        raise InvalidProblem("the standard deviation is not positive", place, "give a positive number")
+    return sigma
+
+
+def _arrival(
+    c: Context, model: Model, units: Units, unit: Conversion, given: float | str | Mapping[str, float | str]
+) -> Array:
+    place = join(c.where, "key 'arrival_sigma'")
+    if model.ranges is None:
+        raise InvalidProblem("these rows do not combine arrival times", place, "give sigma or covariance")
+    if not isinstance(given, Mapping):
+        given = dict.fromkeys(c.stations, given)
+    unknown = [name for name in given if name not in c.stations]
+    if unknown:
+        raise InvalidProblem(f"there is no station {unknown[0]!r}", place, nearest(unknown[0], list(c.stations)))
+    sigma = np.zeros(len(c.stations))
+    for name, value in given.items():
+        number, own = units.amount(value, unit, place)
+        sigma[c.stations.index(name)] = own.sigma_to_si(number)
+        if number <= 0.0:
+            raise InvalidProblem("the standard deviation is not positive", place, "give a positive number")
+    return sigma
+
+
+def square(rows: list[list[float]], where: str) -> Array:
+    """Return a covariance (r, r) as an array; raise InvalidProblem where it is none."""
+    r = len(rows)
+    if r == 0:
+        raise InvalidProblem("the covariance is empty", where, "give a square matrix")
+    for i, row in enumerate(rows):
+        if len(row) != r:
+            what = f"row {i + 1} of the covariance has {len(row)} numbers, not {r}"
+            raise InvalidProblem(what, where, "give a square matrix")
+    matrix = np.array(rows, dtype=float)
+    i, j = divmod(int(np.argmax(np.abs(matrix - matrix.T))), r)
+    if abs(matrix[i, j] - matrix[j, i]) > 1e-9 * np.abs(matrix).max():
+        entries = f"({i + 1}, {j + 1}) is {matrix[i, j]:g}, ({j + 1}, {i + 1}) is {matrix[j, i]:g}"
+        raise InvalidProblem(f"the covariance is not symmetric: entry {entries}", where, "make both equal")
+    diagonal = np.diagonal(matrix)
+    if (diagonal <= 0.0).any():
+        place = int(np.flatnonzero(diagonal <= 0.0)[0]) + 1
+        raise InvalidProblem(
+            f"the variance ({place}, {place}) is {diagonal[place - 1]:g}, not positive", where, "give a covariance"
+        )
+    lowest = np.linalg.eigvalsh(matrix)[0]
+    if lowest < -1e-9 * diagonal.max():
+        raise InvalidProblem(f"the covariance has the negative eigenvalue {lowest:g}", where, "give a covariance")
+    return matrix
 
 
 def chunks_of(
@@ -173,3 +339,71 @@ def _size(unit: Conversion, c: Context) -> float:
 def with_baseline(chunk: Chunk, baseline: Array) -> Chunk:
     """Return a chunk of excess paths with the distance (m,) of its stations added."""
     return replace(chunk, z=chunk.z + baseline * (chunk.weight > 0.0), baseline=baseline)
+
+
+# Rows that a file has twice, most often because it was put together of overlapping parts.
+
+
+def check_repeats(
+    chunks: Sequence[Chunk], index: Sequence[Array], target: Sequence[Array], stations: Sequence[str], epochs: Epochs
+) -> None:
+    """Refuse a row that another one repeats.
+
+    Two measurements of the same stations at the same epoch are welcome where each has noise of its own; the same value
+    at the same stated time or epoch is a copy. Where the noise is that of arrivals, both have the same noise and only
+    one can be right.
+
+    Parameters
+    ----------
+    chunks : sequence of Chunk
+        Rows of each kind of each table.
+    index, target : sequence of int array (m,)
+        Epoch and target of each row of each chunk.
+    stations : sequence of str
+        Names of the stations.
+    epochs : Epochs
+        The epochs.
+
+    Raises
+    ------
+    InvalidProblem
+        Naming the row and the one that it repeats.
+    """
+    for kind in dict.fromkeys(chunk.kind for chunk in chunks):
+        same = [i for i, chunk in enumerate(chunks) if chunk.kind == kind]
+        table = np.concatenate([_table(chunks[i], index[i], target[i], i) for i in same], axis=1)
+        order = np.lexsort(table[_PLACE:0:-1])
+        keys = table[1:_PLACE, order]
+        twice = np.flatnonzero((keys[:, 1:] == keys[:, :-1]).all(0))
+        if len(twice):
+            at = twice[np.argmin(order[twice + 1])]
+            one, two = (table[[0, _PLACE], order[i]].astype(int) for i in (at, at + 1))
+            epoch = epochs.labels[int(table[3, order[at]])]
+            raise _repeated((chunks[two[0]], two[1]), (chunks[one[0]], one[1]), stations, epoch)
+
+
+_PLACE = 8
+
+
+def _table(chunk: Chunk, index: Array, target: Array, number: int) -> Array:
+    """Return the number of the chunk, what makes rows equal, and the place in the chunk, as columns (9, present)."""
+    own = chunk.arrival is None
+    time = np.zeros(len(index)) if chunk.time is None or not own else chunk.time
+    value = chunk.z if own else np.zeros(len(index))
+    same = (chunk.a, chunk.b, index, target, np.full(len(index), own), value, time)
+    table = np.array([np.full(len(index), number), *same, np.arange(len(index))], dtype=float)
+    dated = not own or chunk.label is not None or chunk.time is not None
+    return table[:, (chunk.weight > 0.0) & ~np.isnan(value) & dated]
+
+
+def _repeated(
+    again: tuple[Chunk, int], first: tuple[Chunk, int], stations: Sequence[str], epoch: str
+) -> InvalidProblem:
+    (chunk, i), (other, j) = again, first
+    names = "-".join(stations[s] for s in (chunk.a[i], chunk.b[i]) if s >= 0)
+    row = f"row {other.row[j] + 1}" + ("" if other.table is chunk.table else f" of {other.table.source}")
+    what = " ".join(f"{chunk.kind} {names} of epoch {epoch!r} is already in {row}".split())
+    advice = "leave one of them out, or give each an epoch of its own"
+    if chunk.arrival is not None:
+        what += ", and by arrival_sigma both have the same noise"
+    return InvalidProblem(what, chunk.table.where("z", int(chunk.row[i])), advice)

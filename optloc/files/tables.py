@@ -7,13 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from optloc.errors import InvalidProblem
-from optloc.files.document import validated
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Stations
 from optloc.files.reader import assemble
-from optloc.files.sources import of_frame
-from optloc.files.table import Table
-from optloc.problem import Problem
-from optloc.types import Stations
+from optloc.files.schema import validated
+from optloc.files.table import Table, of_frame
+from optloc.problem.problem import Problem
 
 
 def from_table(

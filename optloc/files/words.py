@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from optloc.errors import InvalidProblem, nearest
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.units import SI_UNIT, SPEED_OF_LIGHT, AzimuthConvention, Conversion, Quantity, conversion
 from optloc.models import MODELS, Model
-from optloc.units import SI_UNIT, SPEED_OF_LIGHT, AzimuthConvention, Conversion, Quantity, conversion
 
 __all__ = ["Units", "join", "kind_model", "nearest"]
 

@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from optloc.errors import InvalidProblem
-from optloc.files.loaded import Draft
-from optloc.files.reader import draft
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array
+from optloc.files.reader import Draft, draft
 from optloc.files.table import Table
-from optloc.types import Array
 
 
 def write_measured(source: Path, out: Path, z: Array, note: str = "") -> list[Path]:

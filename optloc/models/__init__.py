@@ -11,11 +11,11 @@ from dataclasses import dataclass
 from math import log, tau
 from typing import Any
 
-from optloc.entries import Table
-from optloc.errors import InvalidProblem, nearest
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.registry import Table
+from optloc.base.units import UNITS
 from optloc.models.namespace import namespace
 from optloc.models.primitives import Components, Point, distance, dot, geodetic_height, local, range_rate, wrap
-from optloc.units import UNITS
 
 __all__ = [
     "MODELS",
@@ -64,7 +64,7 @@ class Model:
     h : callable of (t, a, b)
         The measurement of target `t` by stations `a` and `b`, elementwise on `Point` components, SI units and radians.
     quantity : str
-        What it measures, a key of `optloc.units.UNITS`: "length", "angle", "ratio", "level" (decibels), "speed" or
+        What it measures, a key of `optloc.base.units.UNITS`: "length", "angle", "ratio", "level" (decibels), "speed" or
         "plain" (a number); decides which units a file may use.
     stations : int
         How many stations it takes: 0, 1 or 2.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from typing import Any
 
-from optloc.arrays import library
+from optloc.base.arrays import library
 
 
 def namespace(value: Any) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from importlib import import_module
 
-from optloc.errors import InvalidProblem, nearest
+from optloc.base.errors import InvalidProblem, nearest
 from optloc.papers.report import Plan, Report, Size, Table, write
 
 __all__ = ["PAPERS", "Paper", "Plan", "Report", "Size", "Table", "paper", "planned", "write"]
@@ -67,6 +67,6 @@ def planned(name: str, size: Size, seed: int) -> Plan:
         For an unknown paper, or where matplotlib is missing.
     """
     paper(name)
-    study = import_module(f"optloc.papers.{name}.study").STUDY
+    study = import_module(f"optloc.papers.{name}_page").STUDY
     plan: Plan = study.plan(study.sizes[size], seed)
     return plan

@@ -11,7 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
-from optloc.errors import InvalidProblem
+from optloc.base.errors import InvalidProblem
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

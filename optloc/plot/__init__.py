@@ -3,15 +3,11 @@
 matplotlib is imported where it is used. Colours are those of Okabe and Ito, and every kind of point has its own mark.
 """
 
-from optloc.plot.accuracy import plot_accuracy
-from optloc.plot.biases import plot_biases
 from optloc.plot.bound_map import map_geojson, plot_bound_map
-from optloc.plot.convergence import plot_convergence
-from optloc.plot.course import plot_course
 from optloc.plot.fixes import plot_fixes
-from optloc.plot.health import plot_health
-from optloc.plot.landscape import plot_landscape
-from optloc.plot.residuals import plot_residuals
+from optloc.plot.landscape import plot_convergence, plot_landscape
+from optloc.plot.residuals import plot_health, plot_residuals
+from optloc.plot.runs import plot_accuracy, plot_biases, plot_course
 from optloc.plot.style import save
 from optloc.plot.track import plot_tracks
 

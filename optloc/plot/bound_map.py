@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optloc.errors import InvalidProblem
-from optloc.maps import BoundMap
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array
+from optloc.bounds.bound_map import BoundMap
 from optloc.plot.style import BLACK, GREY, apart, figure_class
-from optloc.types import Array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -8,14 +8,26 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optloc.ellipse import error_ellipse
-from optloc.fix import Fix
-from optloc.plot import parts
-from optloc.plot.parts import PLAN, View, xy
-from optloc.plot.style import BLACK, BLUE, GREEN, GREY, ORANGE, apart, figure_class, unit_of
-from optloc.problem import Problem
-from optloc.scene import Scene, scene_of
-from optloc.types import Array
+from optloc.base.linalg import error_ellipse
+from optloc.base.types import Array
+from optloc.plot import style as parts
+from optloc.plot.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PLAN,
+    Scene,
+    View,
+    apart,
+    figure_class,
+    scene_of,
+    unit_of,
+    xy,
+)
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

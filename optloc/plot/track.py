@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from optloc.ellipse import error_ellipse
-from optloc.frames import Frame
+from optloc.base.frames import Frame
+from optloc.base.linalg import error_ellipse
+from optloc.base.types import Array
 from optloc.plot.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, YELLOW, figure_class
-from optloc.problem import Problem
+from optloc.problem.problem import Problem
 from optloc.track.run import Entry
-from optloc.types import Array
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -18,10 +18,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optloc.kernels.jit import compiled
-from optloc.proof.forms import Triple, blend, inner, pull, triple
-from optloc.proof.nodes import RATIO
-from optloc.types import Array
+from optloc.base.types import Array
+from optloc.compute.jit import compiled
+from optloc.proof.nodes.codes import RATIO
+from optloc.proof.nodes.forms import Triple, blend, inner, pull, triple
 
 # Half-width of the cube, reaches of the stations.
 _REACHES = 1.25

@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from optloc.kernels.jit import compiled, enabled, plain, ready
+from optloc.base.threads import mapped
+from optloc.base.types import Array
+from optloc.compute.jit import compiled, enabled, plain, ready
 from optloc.proof.chart import Cost, cost_of, empty_box, set_geometry
 from optloc.proof.everywhere import prove_everywhere
 from optloc.proof.groups import empty_groups
+from optloc.proof.near import BUDGET, OPEN, prove
 from optloc.proof.pose import Posed, taken
-from optloc.proof.search import BUDGET, OPEN, prove
-from optloc.threads import mapped
-from optloc.types import Array
 
 # Fixes that one call of machine code proves, fewest and most.
 _STRETCH = 16, 512
@@ -66,7 +66,7 @@ class Answered:
     Parameters
     ----------
     verdict : int array (n,)
-        As `optloc.proof.search.prove` or `optloc.proof.everywhere.prove_everywhere` returns it.
+        As `optloc.proof.near.prove` or `optloc.proof.everywhere.prove_everywhere` returns it.
     boxes : int array (n,)
         Boxes looked at.
     bound : array (n,)

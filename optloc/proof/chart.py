@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optloc.kernels.jit import compiled, inlined
-from optloc.proof.boxes import NODE_WIDTH, ROW_WIDTH, bound_nodes, cost_at
+from optloc.base.types import Array
+from optloc.compute.jit import compiled, inlined
+from optloc.proof.box import NODE_WIDTH, ROW_WIDTH, bound_nodes, cost_at
 from optloc.proof.convex import CURVE_WIDTH, SUMS, convex, curve_nodes, sum_up
 from optloc.proof.groups import Groups, empty_groups, set_groups
-from optloc.proof.linear3 import roughly_principal
-from optloc.proof.nodes import LINEAR, RANGE
-from optloc.types import Array
+from optloc.proof.nodes.codes import LINEAR, RANGE
+from optloc.proof.nodes.linear3 import roughly_principal
 
 
 class Cost(NamedTuple):
@@ -71,7 +71,7 @@ class Box(NamedTuple):
     line : array (6,)
         Working memory.
     nodes, rows, curves, sums : array (J, NODE_WIDTH), (q, ROW_WIDTH), (J, CURVE_WIDTH), (SUMS,)
-        Tables, see `optloc.proof.boxes` and `optloc.proof.convex`.
+        Tables, see `optloc.proof.box` and `optloc.proof.convex`.
     solve : array (3, 3)
         Working memory.
     cut : array (6,)

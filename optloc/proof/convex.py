@@ -6,15 +6,15 @@ from math import inf, sqrt
 
 import numpy as np
 
-from optloc.kernels.jit import compiled, inlined
-from optloc.proof.angles import curve_azimuth, curve_elevation
-from optloc.proof.clip import clip, is_empty
-from optloc.proof.height import curve_height
-from optloc.proof.linear3 import inverse, positive
-from optloc.proof.nodes import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO
-from optloc.proof.ranges import curve_ranges
-from optloc.proof.ratio import curve_ratio
-from optloc.types import Array
+from optloc.base.types import Array
+from optloc.compute.jit import compiled, inlined
+from optloc.proof.box import clip, is_empty
+from optloc.proof.nodes.angles import curve_azimuth, curve_elevation
+from optloc.proof.nodes.codes import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO
+from optloc.proof.nodes.height import curve_height
+from optloc.proof.nodes.linear3 import inverse, positive
+from optloc.proof.nodes.ranges import curve_ranges
+from optloc.proof.nodes.ratio import curve_ratio
 
 # Columns of a table of second derivatives (J, 14): Hessian (00, 01, 02, 11, 12, 22), bounds of the change of the
 # gradient (6:9) and of the Hessian (9), K'(K phi - w) (10), and K'J (11:14).

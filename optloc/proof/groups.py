@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from optloc.kernels.jit import compiled, zero
-from optloc.proof.linear3 import invert
-from optloc.proof.nodes import RANGE
-from optloc.types import Array
+from optloc.base.types import Array
+from optloc.compute.jit import compiled, zero
+from optloc.proof.nodes.codes import RANGE
+from optloc.proof.nodes.linear3 import invert
 
 # Nodes whose rows are tied to each other by less than this share count as independent.
 _APART = 1e-13

@@ -2,20 +2,227 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from optloc.noise import variances, whiten
-from optloc.plan import columns, plans
-from optloc.priors import prior_parts
-from optloc.problem import Problem
-from optloc.proof.alone import with_alone
-from optloc.proof.columns import Columns, columns_of, linear_nodes
-from optloc.proof.eliminate import compressed, roots, whitened, without
+from optloc.base.types import Array, Rows
+from optloc.linear.indices import columns, plans
+from optloc.linear.normal import prior_parts
+from optloc.linear.station_noise import weighed
+from optloc.models import MODELS
+from optloc.problem.noise import Whitener, variances, whiten
+from optloc.problem.problem import Problem
+from optloc.proof.nodes.codes import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO, width, with_alone
 from optloc.proof.scope import ANGLES
-from optloc.types import Array
-from optloc.weigh import weighed
+
+# From rows of measurements to nodes: which scalar functions the rows are sums of, and their numbers.
+
+_CODES = {"azimuth": AZIMUTH, "elevation": ELEVATION, "groa": RATIO, "height": HEIGHT}
+
+
+@dataclass(slots=True)
+class Columns:
+    """The nodes of a flat batch of problems as they are collected, and the design of the rows over them.
+
+    Parameters
+    ----------
+    problem : Problem
+        Whose rows they are.
+    kinds : list of int
+        Codes of the nodes.
+    data : list of array (B, n)
+        Their numbers, B = 1 where all problems share them.
+    row, column, coefficient : list
+        Sparse design: row of the problem, node, factor.
+    station, epoch : list of int
+        Of each node that is a range; -1 for the others.
+    """
+
+    problem: Problem
+    kinds: list[int] = field(default_factory=list)
+    data: list[Array] = field(default_factory=list)
+    row: list[int] = field(default_factory=list)
+    column: list[int] = field(default_factory=list)
+    coefficient: list[float] = field(default_factory=list)
+    station: list[int] = field(default_factory=list)
+    epoch: list[int] = field(default_factory=list)
+
+    def add(self, kind: int, data: Array, station: int = -1, epoch: int = -1) -> int:
+        """Add a node and return its number."""
+        self.kinds.append(kind)
+        self.data.append(data)
+        self.station.append(station)
+        self.epoch.append(epoch)
+        return len(self.kinds) - 1
+
+    def touch(self, row: int, column: int, coefficient: float) -> None:
+        """Let a row of the problem contain a node."""
+        self.row.append(row)
+        self.column.append(column)
+        self.coefficient.append(coefficient)
+
+    @property
+    def design(self) -> Array:
+        """Return the matrix (m, J) of the rows over the nodes."""
+        out = np.zeros((self.problem.count, len(self.kinds)))
+        np.add.at(out, (self.row, self.column), self.coefficient)
+        return out
+
+    @property
+    def numbers(self) -> Array:
+        """Return the numbers (B, J, width) of all nodes."""
+        return stacked(self.kinds, self.data)
+
+
+def stacked(kinds: Sequence[int] | Array, data: Sequence[Array]) -> Array:
+    """Return the numbers (B, J, width) of nodes that have (B, n) or (1, n) each."""
+    out = np.zeros((max((len(part) for part in data), default=1), len(data), width(kinds)))
+    for j, part in enumerate(data):
+        out[:, j, : part.shape[1]] = part
+    return out
+
+
+def columns_of(problem: Problem, observed: Array) -> Columns:
+    """Return the nodes that the rows of a flat batch of problems are sums of.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems within the scope of the proof.
+    observed : array (N, m)
+        Measurements less everything that is known to be added to them; azimuths are counted from them.
+    """
+    made, ranges = Columns(problem), {}
+    moving = problem.stations.position.shape[-3] > 1
+    for rows, start in zip(problem.rows, problem.starts, strict=True):
+        signs = MODELS[rows.kind].ranges
+        for i in range(rows.count):
+            epoch = int(rows.epoch[i]) if moving else 0
+            if signs is None:
+                own = observed[:, start + i] if rows.kind == "azimuth" else None
+                made.touch(start + i, _own(made, rows, i, own), 1.0)
+                continue
+            for sign, station in zip(signs, (int(rows.a[i]), int(rows.b[i])), strict=True):
+                if not sign:
+                    continue
+                if (station, epoch) not in ranges:
+                    place = _numbers({0: _at(problem, station, epoch)})
+                    ranges[station, epoch] = made.add(RANGE, place, station, epoch)
+                made.touch(start + i, ranges[station, epoch], float(sign))
+    return made
+
+
+def _own(made: Columns, rows: Rows, i: int, measured: Array | None) -> int:
+    """Add the node that is the measured quantity of one row itself, and return its number."""
+    problem, kind = made.problem, _CODES[rows.kind]
+    if kind == HEIGHT:
+        return made.add(HEIGHT, height_numbers(problem))
+    a, epoch = int(rows.a[i]), int(rows.epoch[i])
+    parts = {0: _at(problem, a, epoch)}
+    if kind == RATIO:
+        parts[3] = _at(problem, int(rows.b[i]), epoch)
+    else:
+        parts[6] = _axes(problem, a, epoch)
+    if measured is not None:
+        parts[15] = measured[:, None]
+    return made.add(kind, _numbers(parts))
+
+
+def height_numbers(problem: Problem) -> Array:
+    """Return the numbers (1, n) of the node that is the geodetic height of a position in the problem's frame."""
+    frame = problem.frame
+    return _numbers({3: frame.origin_ecef()[None], 6: frame.rotation_to_ecef().reshape(1, 9)})
+
+
+def linear_numbers(coefficients: Array, origin: Array | None = None) -> Array:
+    """Return the numbers (B, n) of a linear node with coefficients (B, d), zero at an origin (B, d)."""
+    parts = {3: coefficients}
+    return _numbers(parts if origin is None else parts | {0: origin})
+
+
+def _numbers(parts: dict[int, Array]) -> Array:
+    last = max(start + part.shape[1] for start, part in parts.items())
+    out = np.zeros((max(len(part) for part in parts.values()), last))
+    for start, part in parts.items():
+        out[:, start : start + part.shape[1]] = part
+    return out
+
+
+def _at(problem: Problem, station: int, epoch: int) -> Array:
+    """Return the position (B, d) of a station at an epoch."""
+    position = problem.stations.position
+    picked = position[..., epoch if position.shape[-3] > 1 else 0, station, :]
+    return picked if picked.ndim == 2 else picked[None]
+
+
+def _axes(problem: Problem, station: int, epoch: int) -> Array:
+    """Return the axes (B, 9) of a station at an epoch, rows of three."""
+    axes, d = problem.stations.axes, problem.dimension
+    if axes is None:
+        return np.eye(3).reshape(1, 9)
+    picked = axes[..., epoch if axes.shape[-4] > 1 else 0, station, :, :]
+    picked = picked if picked.ndim == 3 else picked[None]
+    out = np.zeros((len(picked), 3, 3))
+    out[:, :d, :d] = picked
+    return out.reshape(len(picked), 9)
+
+
+def linear_nodes(made: Columns, rows: Array, origin: Array | None = None) -> list[int]:
+    """Add linear nodes of coefficients (B, q, d), zero at an origin (B, d), and return their numbers."""
+    return [made.add(LINEAR, linear_numbers(rows[:, i], origin)) for i in range(rows.shape[1])]
+
+
+# Least squares over a position alone: what else is unknown, and enters linearly, takes its best value.
+
+
+def whitened(noise: tuple[Whitener, ...], values: Array) -> Array:
+    """Return whitened values (..., q, p) of values (..., m, p) of all rows, block under block."""
+    parts = [whitener.apply(values) for whitener in noise]
+    shape = np.broadcast_shapes(*(part.shape[:-2] for part in parts))
+    return np.concatenate([np.broadcast_to(part, (*shape, *part.shape[-2:])) for part in parts], axis=-2)
+
+
+def roots(precision: Array) -> Array:
+    """Return L' (..., n, n) with L L' a symmetric positive semidefinite precision."""
+    values, vectors = np.linalg.eigh(precision)
+    return np.asarray(np.sqrt(np.maximum(values, 0.0))[..., :, None] * np.swapaxes(vectors, -1, -2))
+
+
+def without(unknowns: Array, values: Array) -> Array:
+    """Return values (..., q, p) less their projection onto the span of unknowns (..., q, n).
+
+    Columns of unknowns are scaled to one length first; what then is shorter than 1e-12 counts as dependent.
+    """
+    if not unknowns.shape[-1]:
+        return values
+    length = np.sqrt((unknowns**2).sum(-2, keepdims=True))
+    u, s, _ = np.linalg.svd(unknowns / np.where(length > 0.0, length, 1.0), full_matrices=False)
+    basis = u * (s > 1e-12 * np.maximum(s[..., :1], 1e-300))[..., None, :]
+    once = values - basis @ (np.swapaxes(basis, -1, -2) @ values)
+    return np.asarray(once - basis @ (np.swapaxes(basis, -1, -2) @ once))
+
+
+def compressed(K: Array, w: Array) -> tuple[Array, Array]:
+    """Return rows that have the same sum of squares ``|K phi - w|^2`` for every phi, at most one more than nodes.
+
+    Parameters
+    ----------
+    K : array (B, q, J)
+        Whitened rows over the nodes, B = 1 or N.
+    w : array (N, q)
+        Whitened measurements.
+    """
+    q, nodes = K.shape[-2:]
+    if q <= nodes + 1:
+        return K, w
+    basis, upper = np.linalg.qr(K)
+    inside = (np.swapaxes(basis, -1, -2) @ w[..., None])[..., 0]
+    rest = w - (basis @ inside[..., None])[..., 0]
+    last = np.sqrt((rest**2).sum(-1, keepdims=True))
+    upper = np.concatenate([upper, np.zeros((*upper.shape[:-2], 1, nodes))], axis=-2)
+    return upper, np.concatenate([inside, last], axis=-1)
 
 
 @dataclass(frozen=True, slots=True)

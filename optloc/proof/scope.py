@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from optloc.constraints import is_exact
-from optloc.kernels.jit import enabled
+from optloc.base.types import Band
+from optloc.compute.jit import enabled
+from optloc.linear.constraints import is_exact
+from optloc.linear.normal import prior_parts
 from optloc.models import MODELS
-from optloc.priors import prior_parts
-from optloc.problem import Problem
-from optloc.types import Band
+from optloc.problem.problem import Problem
 
 ANGLES = ("azimuth", "elevation")
 # Kinds that are nodes of their own; every other kind must be a sum of ranges.

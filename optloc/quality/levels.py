@@ -6,15 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optloc.errors import InvalidProblem
-from optloc.fix import Fix
-from optloc.noise import Block, Noise
-from optloc.problem import Problem
-from optloc.quality.components import KEPT, Fitted, fit, total, without
-from optloc.quality.elements import Elements, batch_of, elements
-from optloc.quality.groups import By, split
-from optloc.quality.redundancy import Tested, tested
-from optloc.types import Array
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array
+from optloc.problem.fix import Fix
+from optloc.problem.noise import Block, Noise
+from optloc.problem.problem import Problem
+from optloc.quality.elements import By, Elements, batch_of, elements, split
+from optloc.quality.variance_components import KEPT, Fitted, Tested, fit, tested, total, without
 
 _ROUNDS, _CLOSE = 4, 0.02
 
@@ -111,7 +109,7 @@ def noise_levels(problem: Problem, by: By = "station", *, method: str = "auto", 
     D. A. Harville, "Maximum likelihood approaches to variance component estimation" (1977), section 5.
     K. R. Koch, "Maximum likelihood estimate of variance components" (1986), equation 4.
     """
-    from optloc.solve import solve
+    from optloc.solvers import solve
 
     batch = batch_of(problem)
     if fix is None and batch.layout.size:

@@ -2,22 +2,68 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
+from dataclasses import dataclass
+from io import StringIO
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from optloc.base.types import Array
 from optloc.papers.report import Picture
-from optloc.plot.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, figure_class
-from optloc.report.marks import Mark
-from optloc.study.stats import distribution, performance_profile, wilson
+from optloc.plot.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, YELLOW, figure_class
+from optloc.study.score import distribution, performance_profile, wilson
 from optloc.study.summary import counted, instances, noise_text
-from optloc.types import Array
 
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+
+# How methods look in every figure of a report: a colour, a mark and a dash each, told apart without colour too.
+
+_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, YELLOW, BLACK, GREY)
+_MARKS = "osD^vP*X<>hp"
+_DASHES = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)), (0, (5, 1.2, 1.2, 1.2)))
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    """The look of a method.
+
+    Parameters
+    ----------
+    number : int
+        Of the method, in the order of the report.
+    name : str
+        The method.
+    colour, mark : str
+        As matplotlib takes them.
+    dash : str or tuple
+        Line style of matplotlib.
+    """
+
+    number: int
+    name: str
+    colour: str
+    mark: str
+    dash: str | tuple[float, tuple[float, ...]]
+
+    @property
+    def line(self) -> str:
+        """Return the identity of the method's lines in SVG, by which a page finds them."""
+        return f"method-{self.number}"
+
+
+def marks(methods: list[str]) -> dict[str, Mark]:
+    """Return the look of every method."""
+    return {
+        name: Mark(i, name, _COLOURS[i % 8], _MARKS[i % 12], _DASHES[(i // 2 + i // 8) % 4])
+        for i, name in enumerate(methods)
+    }
+
 
 Looks = dict[str, Mark]
 
@@ -226,3 +272,45 @@ def timing(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
         axes.set_xlabel("measurements of a trial")
         axes.set_ylabel("time of a fix (s)")
         yield Picture(f"time-{number + 1}", f"Time of a fix against its size: {kinds}", figure)
+
+
+# Figures of matplotlib as SVG that stands in the text of a page.
+
+_IDENTITY = re.compile(r'\bid="([^"]*)"')
+_METHOD = re.compile(r'<g id="(method-\d+)"')
+
+
+def svg_text(figure: Figure) -> str:
+    """Return a figure as an SVG file, with text as text and equal bytes for equal figures."""
+    from matplotlib import rc_context
+
+    text = StringIO()
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "optloc"}):
+        figure.savefig(text, format="svg", metadata={"Date": None})
+    return text.getvalue()
+
+
+def inline(figure: Figure, name: str, title: str) -> str:
+    """Return a figure as an element of a page.
+
+    Identities are made unique by the name of the figure, lines of methods get a class, and the width is that of the
+    place where it stands.
+    """
+    text = svg_text(figure)
+    text = text[text.index("<svg") :]
+    text = re.sub(r"\s*<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
+    text = _METHOD.sub(r'<g class="\1"', text)
+    known = set(_IDENTITY.findall(text))
+    text = _IDENTITY.sub(lambda m: f'id="{name}-{m[1]}"', text)
+    text = re.sub(r"url\(#([^)]*)\)", lambda m: f"url(#{name}-{m[1]})", text)
+    text = re.sub(r'href="#([^"]*)"', lambda m: f'href="#{name}-{m[1]}"' if m[1] in known else m[0], text)
+    opening, rest = text.split(">", 1)
+    opening = re.sub(r'\s(width|height)="[^"]*"', "", opening)
+    opening = re.sub(r"\s+", " ", opening)
+    return f'{opening} role="img" aria-label="{_quoted(title)}">{rest}'
+
+
+def _quoted(text: str) -> str:
+    from html import escape
+
+    return escape(text, quote=True)

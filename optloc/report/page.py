@@ -7,9 +7,8 @@ from html import escape
 from importlib.resources import files
 
 from optloc.papers.report import Picture
-from optloc.report.marks import Mark
+from optloc.report.figures import Mark, inline
 from optloc.report.sheets import Sheet
-from optloc.report.svg import inline
 
 _LONG = 60
 

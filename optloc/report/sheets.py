@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optloc.papers.report import Table
-from optloc.study.stats import clopper_pearson, wilson
+from optloc.study.score import clopper_pearson, wilson
 from optloc.study.summary import PROVEN, noise_text, ranking
 
 if TYPE_CHECKING:
     import pandas as pd
+
 
 SHIFT = 1e-5
 """Shift of geometric means of times, seconds."""
@@ -45,12 +46,12 @@ def number(value: float, digits: int = 3) -> str:
         return "–"
     if value and not 1e-3 <= abs(value) < 1e5:
         mantissa, _, power = f"{value:.{digits - 1}e}".partition("e")
-        return f"{mantissa}·10{str(int(power)).translate(_RAISED)}"
+        return f"{mantissa}·10{str(int(power)).translate(_SUPERSCRIPT)}"
     places = max(0, digits - 1 - int(np.floor(np.log10(abs(value))))) if value else 0
     return f"{value:.{places}f}"
 
 
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+_SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def duration(seconds: float) -> str:
@@ -241,3 +242,68 @@ def sheets(frame: pd.DataFrame, rivals: pd.DataFrame, cells: pd.DataFrame, order
     yield certificates(frame, order)
     yield timing(cells)
     yield made_with(frame)
+
+
+# Tables for papers: LaTeX with the rules of booktabs.
+
+_SPECIAL = {
+    **{sign: f"\\{sign}" for sign in "&%$#_{}"},
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "<": r"\ensuremath{<}",
+    ">": r"\ensuremath{>}",
+    "≤": r"\ensuremath{\le}",
+    "±": r"\ensuremath{\pm}",
+    "·": r"\ensuremath{\cdot}",
+    "×": r"\ensuremath{\times}",
+    "µ": r"\ensuremath{\mu}",
+    "–": "--",
+    "°": r"\ensuremath{^\circ}",
+}
+_RAISED = dict(zip("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789", strict=True))
+
+
+def escaped(text: str) -> str:
+    """Return text as LaTeX sets it."""
+    out, power = [], ""
+    for sign in [*text, ""]:
+        if sign in _RAISED and sign:
+            power += _RAISED[sign]
+            continue
+        if power:
+            out.append(rf"\ensuremath{{^{{{power}}}}}")
+            power = ""
+        out.append(_SPECIAL.get(sign, sign))
+    return "".join(out)
+
+
+def latex(table: Table, words: int = 1) -> str:
+    """Return a table that breaks across pages; it needs the packages booktabs and longtable.
+
+    Parameters
+    ----------
+    table : Table
+        Text cells.
+    words : int
+        How many columns at the left are words; the others stand to the right.
+    """
+    columns = "l" * words + "r" * (len(table.header) - words)
+    head = " & ".join(map(escaped, table.header)) + r" \\"
+    rows = [" & ".join(map(escaped, row)) + r" \\" for row in table.rows]
+    caption = escaped(f"{table.title}. {table.note}".strip())
+    lines = [
+        "% needs \\usepackage{booktabs, longtable}",
+        rf"\begin{{longtable}}{{{columns}}}",
+        rf"\caption{{{caption}}}\label{{tab:{table.name}}}\\",
+        r"\toprule",
+        head,
+        r"\midrule\endfirsthead",
+        r"\toprule",
+        head,
+        r"\midrule\endhead",
+        r"\bottomrule\endlastfoot",
+        *rows,
+        r"\end{longtable}",
+    ]
+    return "\n".join(lines) + "\n"

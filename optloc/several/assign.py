@@ -4,22 +4,179 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
 
-from optloc.errors import InvalidProblem
-from optloc.problem import Problem
-from optloc.several.answer import Emitters
-from optloc.several.master import Prices, chosen, priced
-from optloc.several.propose import proposed
-from optloc.several.report import reported
-from optloc.several.scene import Scene, scenes
-from optloc.several.search import TOLERANCE, Region, Searched, search
-from optloc.several.tuples import Tuples, fitted, nearby, nothing, thinned, together, worth
-from optloc.solve.reasons import AMBIGUOUS_GAP
-from optloc.track.sets import Clutter
-from optloc.types import Array
+from optloc.base.errors import InvalidProblem
+from optloc.base.status import Status
+from optloc.base.types import Array
+from optloc.compute.sums import equations_at
+from optloc.linear.normal import covariance
+from optloc.models import MODELS
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
+from optloc.several.answer import Emitters, Ghost
+from optloc.several.pricing_search import TOLERANCE, Region, Searched, search
+from optloc.several.set_packing import Prices, cheapest_sets, priced
+from optloc.several.sets import Scene, Tuples, fitted, nearby, nothing, of_picks, scenes, thinned, together, worth
+from optloc.solvers import solve
+from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP
+from optloc.track.associate import Clutter
+
+# Places where emitters may be: closed-form fixes of as few rows as it takes.
+
+# Fixes of few rows that are tried, and those of them that are followed.
+_TRIED, _FOLLOWED = 800, 800
+# Chi-square above which a point of a closed form is none that the rows have in common.
+_FITS = 100.0
+
+
+def proposed(scene: Scene, seed: int = 0) -> Tuples:
+    """Return sets of rows around the closed-form fixes of d rows each; all of them, or a seeded draw where many."""
+    picks = _few(scene, np.random.default_rng(seed))
+    if not len(picks):
+        return nothing(scene)
+    problem = scene.scan.with_rows(z=of_picks(scene.z, picks), weight=(picks >= 0).astype(float))
+    fix = solve(problem, "roots")
+    x = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
+    which, slot = np.nonzero(np.isfinite(x).all(-1))
+    with np.errstate(all="ignore"):  # some points of the closed form are stations
+        equations = equations_at(problem.take(which), x[which, slot])
+        cov = covariance(equations)[0]
+    good = np.flatnonzero(np.isfinite(cov).all((-1, -2)) & (equations.cost < _FITS))[:_FOLLOWED]
+    return nearby(scene, x[which, slot][good], cov[good], np.zeros_like(scene.z))
+
+
+def _few(scene: Scene, rng: np.random.Generator) -> Array:
+    """Return sets of d rows (q, m) that place an emitter."""
+    d, count = scene.scan.dimension, scene.scan.count
+    ends = _ends(scene)
+    values = [np.flatnonzero(np.isfinite(channel)) for channel in scene.z]
+    present = [i for i in range(count) if len(values[i])]
+    subsets = [subset for subset in combinations(present, d) if _linked([ends[i] for i in subset])]
+    picks = []
+    for number in rng.permutation(len(subsets)):
+        subset = subsets[number]
+        for chosen in product(*(values[i] for i in subset)):
+            one = np.full(count, -1)
+            one[list(subset)] = chosen
+            picks.append(one)
+        if len(picks) >= _TRIED:
+            break
+    return np.array(picks).reshape(-1, count)
+
+
+def _ends(scene: Scene) -> list[tuple[int, int] | None]:
+    """Return the stations of each channel of two, None for channels of one."""
+    found: list[tuple[int, int] | None] = []
+    for block in scene.scan.rows:
+        two = MODELS[block.kind].stations > 1
+        found += [(int(a), int(b)) if two else None for a, b in zip(block.a, block.b, strict=True)]
+    return found
+
+
+def _linked(pairs: list[tuple[int, int] | None]) -> bool:
+    """Return whether pairs of stations form one tree: only then do they fix a place in closed form."""
+    own = [set(pair) for pair in pairs if pair is not None]
+    while len(own) > 1:
+        joined = next((other for other in own[1:] if own[0] & other), None)
+        if joined is None or len(own[0] & joined) > 1:
+            return False
+        own = [own[0] | joined, *(other for other in own[1:] if other is not joined)]
+    return True
+
+
+# From the best assignment to the emitters: fixes, ghosts, and how sure their number is.
+
+# Ghosts that are listed at most; squared distance in sigmas from which a place is another one.
+_LISTED, _APART = 12, 16.0
+# Cost above its bound from which an assignment is not called proven.
+_PROVEN = 2.0
+
+
+def reported(problem: Problem, scene: Scene, solved: Solved, count: int | None) -> Emitters:
+    """Return the emitters of an assignment of one epoch."""
+    taken = solved.taken[np.argsort(solved.tuples.cost[solved.taken], kind="stable")]
+    best, width = solved.tuples.take(taken), scene.z.shape[1]
+    fixes = fixed(scene, best.picks)
+    assignment = np.full(problem.count, -1)
+    for number, picks in enumerate(best.picks):
+        used = np.flatnonzero(picks >= 0)
+        assignment[scene.row[used, picks[used]]] = number
+    costs = np.array([cheapest_sets(solved.tuples, width, k)[1] for k in range(len(taken) + 2)])
+    ghosts = _ghosts(scene, solved, fixes, width, count)
+    numbers = [] if count is not None else [costs[k] - solved.cost for k in (len(taken) - 1, len(taken) + 1) if k >= 0]
+    margin = float(min([*numbers, *(ghost.gap for ghost in ghosts)], default=np.inf))
+    status, reason = _verdict(scene, solved, fixes, ghosts, costs, count)
+    return Emitters(fixes, assignment, solved.cost, solved.bound, costs, margin, ghosts, status, reason, solved.boxes)
+
+
+def fixed(scene: Scene, picks: Array) -> tuple[Fix, ...]:
+    """Return the fixes of sets of rows (n, m)."""
+    if not len(picks):
+        return ()
+    fix = solve(scene.scan.with_rows(z=of_picks(scene.z, picks), weight=(picks >= 0).astype(float)))
+    return tuple(fix[i] for i in range(len(picks)))
+
+
+def _ghosts(scene: Scene, solved: Solved, fixes: tuple[Fix, ...], width: int, count: int | None) -> tuple[Ghost, ...]:
+    """Return the places of other sets that an assignment of nearly the least cost takes."""
+    tuples, found = solved.tuples, list[Ghost]()
+    known = [(fix.position, _information(fix.covariance())) for fix in fixes]
+    # A reduced cost is a lower bound of what it costs to take a set.
+    lowest = solved.prices.reduced(tuples)
+    for i in np.argsort(lowest, kind="stable"):
+        if len(found) == _LISTED or lowest[i] >= LISTED_GAP:
+            break
+        if any((tuples.x[i] - at) @ weight @ (tuples.x[i] - at) < _APART for at, weight in known):
+            continue
+        gap = cheapest_sets(tuples, width, count, forced=int(i))[1] - solved.cost
+        if not gap < LISTED_GAP:
+            continue
+        used = np.flatnonzero(tuples.picks[i] >= 0)
+        found.append(Ghost(tuples.x[i], scene.row[used, tuples.picks[i][used]], float(gap)))
+        own = fixed(scene, tuples.picks[i : i + 1])[0]
+        known.append((tuples.x[i], _information(own.covariance())))
+    return tuple(sorted(found, key=lambda ghost: ghost.gap))
+
+
+def _information(cov: Array) -> Array:
+    """Return the inverse of a covariance, zero where there is none: everything is then near."""
+    return np.linalg.pinv(cov) if np.isfinite(cov).all() else np.zeros_like(cov)
+
+
+def _verdict(
+    scene: Scene, solved: Solved, fixes: tuple[Fix, ...], ghosts: tuple[Ghost, ...], costs: Array, count: int | None
+) -> tuple[Status, str]:
+    """Return status and reason."""
+    rows, n = int(np.isfinite(scene.z).sum()), len(fixes)
+    present = int(np.isfinite(scene.z).any(1).sum())
+    if count is not None and not np.isfinite(solved.cost):
+        return Status.INFEASIBLE, f"no {count} emitters were found that share no row"
+    if n == 0 and present < scene.least:
+        what = "none can" if scene.least > len(scene.z) else f"an emitter takes {scene.least}"
+        return Status.TOO_FEW_ROWS, f"rows in {present} channels cannot tell an emitter from false rows: {what}"
+    doubts = [
+        f"{_counted(k)} would cost only {costs[k] - solved.cost:.1f} more"
+        for k in (n - 1, n + 1)
+        if count is None and k >= 0 and costs[k] - solved.cost < AMBIGUOUS_GAP
+    ]
+    near = [ghost for ghost in ghosts if ghost.gap < AMBIGUOUS_GAP]
+    if near:
+        doubts.append(f"another place costs only {near[0].gap:.1f} more, {len(near)} such in all")
+    doubts += [f"emitter {i}: {fix.status.label}" for i, fix in enumerate(fixes) if fix.status != Status.OK]
+    open_ = solved.cost - solved.bound > _PROVEN
+    unproven = [f"not proven: another assignment may cost {solved.cost - solved.bound:.1f} less"] if open_ else []
+    if doubts or unproven:
+        return Status.AMBIGUOUS if doubts else Status.SEARCHED, "; ".join([*doubts, *unproven])
+    return Status.OK, f"{_counted(n)}; false rows: {rows - int((solved.tuples.picks[solved.taken] >= 0).sum())}"
+
+
+def _counted(emitters: int) -> str:
+    return {0: "no emitter", 1: "one emitter"}.get(emitters, f"{emitters} emitters")
+
 
 # Turns of prices and searches; and those after which a number of emitters that nobody found is given up.
 _ROUNDS, _HOPELESS = 80, 4
@@ -64,7 +221,7 @@ def separate(
 
     Each emitter gives at most one row to a channel (a kind at its stations), and a row is at most one emitter's. Of
     all assignments the one with the greatest likelihood is sought, every emitter at the best place for its own rows,
-    and with as many emitters as pay their penalty: see `optloc.several.scene.Scene`. Sets of rows are columns of a set
+    and with as many emitters as pay their penalty: see `optloc.several.sets.Scene`. Sets of rows are columns of a set
     packing; they are proposed by closed-form fixes of as few rows as it takes, and branch and bound over all places of
     the region adds columns until no other can lower the cost.
 
@@ -139,7 +296,7 @@ def _solved(scene: Scene, region: Region, count: int | None, boxes: int) -> Solv
     fresh, bound = thinned(scene, _promising(tuples)), -np.inf
     for turn in range(_ROUNDS):
         tuples = _paying(together(tuples, fresh), limit)
-        taken, cost = chosen(tuples, scene.z.shape[1], count)
+        taken, cost = cheapest_sets(tuples, scene.z.shape[1], count)
         prices = priced(tuples, taken, worth(scene, tuples.take(taken)), count)
         found = search(scene, prices, region, boxes)
         total += found.boxes

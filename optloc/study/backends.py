@@ -7,7 +7,7 @@ from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Literal
 
-from optloc.errors import InvalidProblem, nearest
+from optloc.base.errors import InvalidProblem, nearest
 
 
 @dataclass(frozen=True, slots=True)

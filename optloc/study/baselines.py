@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optloc.fix import Fix
-from optloc.problem import Problem
+from optloc.base.types import Array
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
 from optloc.study.draws import Drawn
 from optloc.study.originals import recursion, single_step
-from optloc.types import Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,14 +64,14 @@ def start_of(kind: str, width: float, drawn: Drawn) -> Array:
 
 
 def _truth(drawn: Drawn, start: Array) -> Fix:
-    from optloc.solve import solve
+    from optloc.solvers import solve
 
     return solve(drawn.problem, "lsr", start=drawn.truth)
 
 
 def _iterated(method: str) -> Callable[[Drawn, Array], Fix]:
     def run(drawn: Drawn, start: Array) -> Fix:
-        from optloc.solve import solve
+        from optloc.solvers import solve
 
         return solve(drawn.problem, method, start=start)
 
@@ -80,8 +80,8 @@ def _iterated(method: str) -> Callable[[Drawn, Array], Fix]:
 
 def _printed(drawn: Drawn, start: Array) -> Fix:
     """Return the undamped iteration with the residual's sign as the paper prints it."""
-    from optloc.papers.kinematic.wrong import taylor
-    from optloc.solve.stages import given
+    from optloc.papers.kinematic import taylor
+    from optloc.solvers.pool import given
 
     size = drawn.problem.dimension
     x = start.copy()
@@ -93,7 +93,7 @@ def _original(steps: Callable[[Problem, Array], Array]) -> Callable[[Drawn, Arra
     """Return the method of a paper; it claims whatever it arrives at."""
 
     def run(drawn: Drawn, start: Array) -> Fix:
-        from optloc.solve.general import claimed
+        from optloc.study.originals import claimed
 
         return claimed(drawn.problem, start, steps(drawn.problem, start))
 
@@ -101,13 +101,13 @@ def _original(steps: Callable[[Problem, Array], Array]) -> Callable[[Drawn, Arra
 
 
 def _general(drawn: Drawn, start: Array) -> Fix:
-    from optloc.solve.general import least_squares
+    from optloc.study.originals import least_squares
 
     return least_squares(drawn.problem, start)
 
 
 def _lifted(drawn: Drawn, start: Array) -> Fix:
-    from optloc.solve.general import lifted_sdp
+    from optloc.study.originals import lifted_sdp
 
     return lifted_sdp(drawn.problem)
 

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
+
+from optloc.base.errors import InvalidProblem
+from optloc.files.words import Units
+from optloc.models import MODELS
 
 Amount = float | str
 """A number in the SI unit, or text such as "30 ns"."""
@@ -167,3 +172,17 @@ class StudyFile(_Table):
 def study_schema() -> dict[str, Any]:
     """Return the JSON schema (draft 2020-12) of a study file."""
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **StudyFile.model_json_schema()}
+
+
+# Amounts of a study file as numbers.
+
+
+def sigma_of(kind: str, amount: Amount, where: str) -> float:
+    """Return a standard deviation of rows of a kind in SI units; of ratios in decibels, at a ratio of one."""
+    quantity = MODELS[kind].quantity
+    units = Units(quantity)  # type: ignore[arg-type]  # models hold known quantities only
+    number, unit = units.amount(amount, None if isinstance(amount, str) else units.conversion(None, where), where)
+    value = float(unit.sigma_to_si(number, np.ones(()))) if unit.logarithmic else abs(unit.factor) * number
+    if not value > 0.0:
+        raise InvalidProblem(f"{amount!r} is not positive", where, "give a positive standard deviation")
+    return value

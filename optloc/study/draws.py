@@ -6,15 +6,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optloc.errors import InvalidProblem
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array, Bias
 from optloc.files.words import Units, join
-from optloc.problem import Problem
-from optloc.simulate import simulate
-from optloc.study.amounts import sigma_of
-from optloc.study.cases import Case
-from optloc.study.flaws import errors_of, flawed
-from optloc.study.geometry import placed, places, velocities
-from optloc.types import Array, Bias
+from optloc.linear.simulate import simulate
+from optloc.problem.problem import Problem
+from optloc.study.cases import Case, errors_of, flawed, placed, places, velocities
+from optloc.study.document import sigma_of
 
 _NUMBERS = 25_000
 """Measurements in a block of trials, about; a block is what one seed decides."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from typing import Any, Self
 
-from optloc.errors import InvalidProblem, nearest
+from optloc.base.errors import InvalidProblem, nearest
 from optloc.study.chunk import Part, compute, failure, part_of, spread
 from optloc.study.draws import draw
 from optloc.study.plan import Chunk, workers

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from optloc.errors import InvalidProblem, nearest
+from optloc.base.errors import InvalidProblem, nearest
 from optloc.files.words import Units, join
-from optloc.fix import Fix
+from optloc.problem.fix import Fix
 from optloc.study.backends import kind_of
 from optloc.study.baselines import BASELINES, start_of
 from optloc.study.document import MethodTable
@@ -64,7 +64,7 @@ class Method:
         """Return whether fixes are solved one by one."""
         if self.baseline is not None:
             return BASELINES[self.baseline].slow
-        from optloc.solve.catalogue import SOLVERS, branches_of
+        from optloc.solvers.methods import SOLVERS, branches_of
 
         assert self.method is not None
         stages = {entry.solver for branch in branches_of(self.method) for entry in branch}
@@ -96,7 +96,7 @@ def methods_of(table: MethodTable, number: int) -> Iterator[Method]:
     names = _listed(table.method) or _listed(table.baseline)
     for name, solver in product(names, solvers):
         if table.method is not None:
-            from optloc.solve.catalogue import stages_of
+            from optloc.solvers.methods import stages_of
 
             try:
                 stages_of(name)
@@ -161,7 +161,7 @@ def run(method: Method, drawn: Drawn) -> Run:
     InvalidProblem
         Where the method solved nothing with the back end that was asked for.
     """
-    from optloc.solve.choice import Choice, counting, using
+    from formulations.backend import Choice, counting, using
 
     choice = None
     if method.solver:
@@ -179,7 +179,7 @@ def run(method: Method, drawn: Drawn) -> Run:
 def _solved(method: Method, drawn: Drawn) -> Fix:
     if method.baseline is not None:
         return BASELINES[method.baseline].run(drawn, start_of(method.start, method.width, drawn))
-    from optloc.solve import solve
+    from optloc.solvers import solve
 
     assert method.method is not None
     fix = solve(drawn.problem, method.method)

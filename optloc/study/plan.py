@@ -12,9 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from optloc.errors import InvalidProblem
-from optloc.files.document import fitted, parsed, read_text
-from optloc.files.words import nearest
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.files.schema import fitted, parsed, read_text
 from optloc.study.cases import Case, cases_of
 from optloc.study.document import StudyFile
 from optloc.study.methods import Method, methods_of

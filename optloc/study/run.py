@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from optloc.study.execute import Executor, computed
-from optloc.study.parts import Manifest, begin, finished, locked, part_files, read_manifest, store
+from optloc.study.folder import Manifest, begin, finished, locked, part_files, read_manifest, store
 from optloc.study.plan import Plan
 
 Tell = Callable[[int, dict[str, int]], None]

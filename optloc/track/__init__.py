@@ -1,12 +1,10 @@
 """Trackers: fixes in time, started by the fixes of `optloc.solve`."""
 
-from optloc.track.batch import fitted, smoothed
-from optloc.track.bistatic import simplified
-from optloc.track.bound import posterior_bound
+from optloc.track.batch import fitted, posterior_bound, smoothed
 from optloc.track.constants import begun_with_constants, followed_with_constants
 from optloc.track.dynamics import Dynamics, current_statistical, polynomial, singer
-from optloc.track.measurement_space import lines
-from optloc.track.robust import reweighted
+from optloc.track.measurement_space import lines, simplified
+from optloc.track.robust_update import reweighted
 from optloc.track.run import Entry, Rules, collected, tracked
 from optloc.track.start import begun, two_point
 from optloc.track.track import State, Track, followed, predicted

@@ -6,15 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
-from optloc.errors import InvalidProblem
-from optloc.fix import Fix
-from optloc.problem import Problem
-from optloc.solve import solve
-from optloc.status import Status
-from optloc.track.dynamics import polynomial
+from optloc.base import linalg
+from optloc.base.errors import InvalidProblem
+from optloc.base.status import Status
+from optloc.base.types import Array, Motion
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
+from optloc.solvers import solve
+from optloc.track.dynamics import Dynamics, polynomial
 from optloc.track.track import State, Track, check_trackable, gathered, scans
-from optloc.track.updates import Updated, whitened
-from optloc.types import Array, Motion
+from optloc.track.updates import Updated, joseph, whitened
 
 
 def fitted(problem: Problem, order: int, *, reference: float | None = None, method: str = "auto") -> Fix:
@@ -114,3 +115,47 @@ def smoothed(problem: Problem, order: int, *, method: str = "auto") -> Track:
         code = np.where(white.count > 0, fix.code, int(Status.TOO_FEW_ROWS)).astype(np.int8)
         steps.append((found, np.broadcast_to(code, none.shape)))
     return gathered(np.asarray(problem.times), steps, problem.dimension)
+
+
+# The posterior Cramer-Rao bound: what no filter of a model of motion can beat on average.
+
+
+def posterior_bound(problem: Problem, truth: Array, start: State, dynamics: Dynamics) -> Array:
+    """Return the posterior Cramer-Rao bound of the state after each scan that is later than the start.
+
+    In covariance form, so that process noise may be singular: the extended Kalman filter's covariance with rows
+    linearised at the truth. With noise, it averages over the tracks of the model: a smoother track can beat it.
+
+    Parameters
+    ----------
+    problem : Problem
+        A run of k epochs, see `optloc.track.track.scans`; its measurements do not matter.
+    truth : array (..., k, n)
+        True state [p, v, a] at every epoch.
+    start : State
+        Its covariance is the prior's.
+    dynamics : Dynamics
+        Model of motion; where its noise depends on the state, it is that of the true one.
+
+    Returns
+    -------
+    array (..., q, n, n)
+        Covariance bound at the q epochs that are later than the start.
+
+    References
+    ----------
+    P. Tichavsky, C. H. Muravchik, A. Nehorai, "Posterior Cramer-Rao bounds for discrete-time nonlinear filtering",
+    IEEE Trans. Signal Process. 46 (1998), eq. 21 with the truth for the average.
+    """
+    cov, at, now, out = start.cov, start.mean, start.time, []
+    for k, (time, scan) in enumerate(scans(problem, dynamics.order)):
+        if time <= start.time:
+            continue
+        F, Q, _ = dynamics.step(time - now, at, problem.dimension)
+        cov, at, now = F @ cov @ F.T + Q, truth[..., k, :], time
+        if scan.count:
+            H = whitened(scan, at).H
+            gain, _ = linalg.solve(H @ cov @ np.swapaxes(H, -1, -2) + np.eye(H.shape[-2]), H @ cov)
+            cov = joseph(H, np.swapaxes(gain, -1, -2), cov)
+        out.append(cov)
+    return np.stack(out, axis=-3)

@@ -6,9 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from optloc.errors import InvalidProblem
-from optloc.problem import Problem
-from optloc.solve import solve
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array, Motion
+from optloc.problem.epochs import cut
+from optloc.problem.problem import Problem
+from optloc.solvers import solve
 from optloc.track.dynamics import Dynamics
 from optloc.track.track import (
     State,
@@ -22,8 +24,6 @@ from optloc.track.track import (
     taken,
 )
 from optloc.track.updates import Update
-from optloc.types import Array, Motion
-from optloc.windows import cut
 
 
 def begun_with_constants(problem: Problem, dynamics: Dynamics, epochs: int) -> State:

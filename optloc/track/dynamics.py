@@ -9,8 +9,8 @@ from math import factorial
 
 import numpy as np
 
-from optloc.errors import InvalidProblem
-from optloc.types import Array
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array
 
 Step = Callable[[float, Array, int], tuple[Array, Array, Array]]
 """Maps seconds, means (..., n) and dimension d to F (n, n), Q (..., n, n) and the drive (..., n) that is added."""

@@ -7,13 +7,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optloc.errors import InvalidProblem, nearest
-from optloc.problem import Problem
-from optloc.status import Status
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.status import Status
+from optloc.base.types import Array, Motion
+from optloc.problem.epochs import cut
+from optloc.problem.problem import Problem
 from optloc.track.dynamics import Dynamics
 from optloc.track.updates import UPDATES, Update, Updated
-from optloc.types import Array, Motion
-from optloc.windows import cut
 
 
 @dataclass(frozen=True, slots=True)

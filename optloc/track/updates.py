@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optloc import linalg
-from optloc.entries import Table
-from optloc.linear import linearise
-from optloc.noise import Whitener
-from optloc.problem import Problem
-from optloc.types import Array
+from optloc.base import linalg
+from optloc.base.registry import Table
+from optloc.base.types import Array
+from optloc.linear.normal import linearise
+from optloc.problem.noise import Whitener
+from optloc.problem.problem import Problem
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ from runs import DELAYS, FIXED, drawn, estimated, run
 from scipy.optimize import least_squares
 
 from optloc import Fix, Problem, Running, solve
-from optloc.windows import cut
+from optloc.problem.epochs import cut
 
 EPOCHS = (1000, 2500, 5000, 10_000)
 FLIGHT = 600.0

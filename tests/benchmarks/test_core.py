@@ -10,13 +10,12 @@ from benchmarks.speed import SCENES, batch
 from monte_carlo.tables import write
 from runs import drawn, estimated, run, truth
 
-from optloc.kernels.jit import enabled
-from optloc.kernels.pack import packed
-from optloc.kernels.refine import Rules, answers, refine_block
-from optloc.kernels.runs import refine_runs
-from optloc.noise import whiten
-from optloc.solve.refine import refine
-from optloc.weigh import weighed
+from optloc.compute.jit import enabled
+from optloc.compute.pack import packed
+from optloc.compute.refine import Rules, answers, refine_block, refine_runs
+from optloc.linear.station_noise import weighed
+from optloc.problem.noise import whiten
+from optloc.solvers.refine import refine
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="kernels are not compiled")
 ROUNDS, EPOCHS, RUNS = 9, 700, 64
@@ -63,7 +62,7 @@ def iteration(scene):
 def by_numpy(scene, monkeypatch):
     """Microseconds of a fix by numpy."""
     problem, start = array(scene)
-    monkeypatch.setattr(import_module("optloc.solve.machine_code"), "serves", lambda problem, starts: False)
+    monkeypatch.setattr(import_module("optloc.solvers.refine"), "serves", lambda problem, starts: False)
     many = problem.take(np.arange(1000)), start[:1000]
     return 1e6 * quickest(lambda: refine(*many), 3) / 1000
 

@@ -17,8 +17,8 @@ from formulations.range_enclosure import Ranged, enclosure
 from formulations.squared_range import cone
 from formulations.squared_range_conic import hull, shor
 from optloc import solve
-from optloc.solve.reference import reference_bound
-from optloc.threads import mapped
+from optloc.base.threads import mapped
+from optloc.solvers.certify.relaxations import reference_bound
 
 ROUNDS = 7
 Work = Callable[[int], object]

@@ -10,6 +10,7 @@ from study.texts import plan
 
 from optloc.study import chunk as chunks
 from optloc.study.execute import executor
+from optloc.study.methods import run
 from optloc.study.plan import workers
 from optloc.study.run import run_plan
 
@@ -60,7 +61,7 @@ def test_two_workers_do_the_work_of_nearly_two(tmp_path):
 
 def test_overhead_of_the_machinery_at_tasks_of_a_millisecond(tmp_path, monkeypatch):
     """Everything but the solver, storing included, costs less than a tenth of the solver's time."""
-    inside, solved = [], chunks.run
+    inside, solved = [], run
 
     def timed(method, drawn):
         began = perf_counter()

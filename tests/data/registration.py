@@ -10,7 +10,7 @@ import numpy as np
 from data.windows import quantiles, report
 
 from optloc import Fix, Noise, Problem, Status, predict, solve, with_bias, with_known_bias
-from optloc.noise import Block
+from optloc.problem.noise import Block
 
 ROUNDS = 6
 

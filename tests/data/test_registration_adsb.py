@@ -6,8 +6,8 @@ from data.registration import calibrating, corrected, fixed, learnt, lines, not_
 from data.windows import report
 
 from optloc import solve, with_bias
+from optloc.bounds.observability import observability
 from optloc.datasets import adsb
-from optloc.observe import observability
 
 pytestmark = pytest.mark.data
 

@@ -8,8 +8,8 @@ from data.registration import calibrating, corrected, fixed, learnt, lines, part
 from data.windows import report
 
 from optloc import Motion, Status, solve, with_bias
+from optloc.bounds.observability import observability
 from optloc.datasets import gnss
-from optloc.observe import observability
 
 pytestmark = pytest.mark.data
 

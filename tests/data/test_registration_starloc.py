@@ -8,8 +8,8 @@ from data.registration import fixed, lines, not_beaten
 from data.windows import report
 
 from optloc import Motion, solve, with_bias
+from optloc.bounds.observability import observability
 from optloc.datasets import starloc
-from optloc.observe import observability
 
 pytestmark = pytest.mark.data
 

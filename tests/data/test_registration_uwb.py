@@ -10,8 +10,8 @@ from data.registration import calibrating, corrected, fixed, learnt, lines, part
 from data.windows import report
 
 from optloc import by_epoch, with_bias
+from optloc.bounds.observability import observability
 from optloc.datasets import uwb
-from optloc.observe import observability
 
 pytestmark = pytest.mark.data
 

@@ -8,7 +8,7 @@ from data.windows import quantiles, report, statuses
 
 from optloc import Prior, Status, predict, rejected, solve
 from optloc.datasets import starloc
-from optloc.noise import independent
+from optloc.problem.noise import independent
 
 pytestmark = pytest.mark.data
 

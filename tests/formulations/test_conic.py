@@ -4,7 +4,7 @@ import cvxpy as cp
 import numpy as np
 import pytest
 
-from formulations import _dual
+from formulations import conic
 from formulations.conic import Relaxation
 from formulations.squared_range import cone, minimiser, paraboloid
 from formulations.squared_range_conic import hull, shor
@@ -133,7 +133,7 @@ def test_cone_projections():
     rng = np.random.default_rng(5)
     for _ in range(50):
         z = rng.normal(size=6)
-        for project in (_dual._second_order, lambda v: _dual._semidefinite(v, 3)):
+        for project in (conic._second_order, lambda v: conic._semidefinite(v, 3)):
             once = project(z)
             np.testing.assert_allclose(project(once), once, atol=1e-12)
             # Moreau: what is cut off is orthogonal to what is left

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from formulations._minorant import minorant
 from formulations.bearing_ls import meeting, predicted, rays
-from formulations.direction_sdp import angle_bound, directions
+from formulations.direction_sdp import angle_bound, directions, minorant
 
 
 def errors(point, station, angle, axes=None):

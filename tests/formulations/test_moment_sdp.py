@@ -5,9 +5,8 @@ import pytest
 from ranged import drawn, minimum, whitened
 from scipy.optimize import least_squares
 
-from formulations._moments import moments, upper
 from formulations.conic import Relaxation
-from formulations.moment_sdp import _forms, moment_bound, moment_problem
+from formulations.moment_sdp import _forms, moment_bound, moment_problem, moments, upper
 from formulations.range_enclosure import Ranged, ball, enclosure
 
 TIGHT = 1e-4

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from formulations._windows import Windows
-from formulations.registration_sdp import PRICES, _parameters, registration, registration_problem
+from formulations.registration_sdp import PRICES, Windows, _parameters, registration, registration_problem
 
 # Four stations that fly side by side and two pairs that cross: coplanar at every moment.
 STATION = 1e3 * np.array([[0, 0, 10], [-15, 0, 10], [15, 0, 10], [-5, 30, 0], [5, 30, 0]])

@@ -13,7 +13,7 @@ from runs import truth
 
 import optloc
 from optloc import Problem
-from optloc.solve.refine import refine
+from optloc.solvers.refine import refine
 
 Array = np.ndarray
 SLACK = 1e-3

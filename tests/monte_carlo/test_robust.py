@@ -8,7 +8,7 @@ from monte_carlo.tables import ledger
 from robust_cases import least_squares, nees, rmse, spoilt
 
 from optloc import Status, rejected, solve
-from optloc.loss import LOSSES
+from optloc.problem.loss import LOSSES
 
 DEFAULT, FULL = 60, 400
 # Name: kind, stations, wrong rows, their size in sigma, whether they are late.

@@ -8,8 +8,8 @@ from monte_carlo.tables import write
 from runs import drawn, run, truth
 
 import optloc
-from optloc.blocks import averaged
-from optloc.solve.register import closed_form, relaxed
+from optloc.solvers.starts.block_averages import averaged
+from optloc.solvers.starts.registration import closed_form, relaxed
 
 SEED, TRIALS = 41, 12
 CASES = {

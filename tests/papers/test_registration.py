@@ -9,17 +9,31 @@ from typer.testing import CliRunner
 
 from optloc import crlb, linearise, simulate, solve
 from optloc.cli import app
-from optloc.evaluate import predict
 from optloc.files import read
-from optloc.normal import normal
-from optloc.normal import step as house_step
-from optloc.papers.registration import printed, shipped, study
-from optloc.papers.registration.extras import flatness, separation
-from optloc.papers.registration.minima import ghost, mirror
-from optloc.papers.registration.recursion import FIRST, recursion, step
-from optloc.papers.registration.scenario import MOVING, NANOSECOND, PRINTED, SPATIAL, problem, truth
-from optloc.papers.registration.tables import accuracy, metres
-from optloc.papers.registration.trials import Setting, branch, one_shot, rms, score, wander
+from optloc.linear.evaluate import predict
+from optloc.linear.normal import normal
+from optloc.linear.normal import step as house_step
+from optloc.papers import registration, registration_page
+from optloc.papers.registration import (
+    FIRST,
+    MOVING,
+    NANOSECOND,
+    PRINTED,
+    SPATIAL,
+    Setting,
+    branch,
+    ghost,
+    mirror,
+    one_shot,
+    problem,
+    recursion,
+    rms,
+    score,
+    step,
+    truth,
+    wander,
+)
+from optloc.papers.registration_page import accuracy, flatness, metres, separation
 from optloc.papers.report import Study
 
 RUN = CliRunner()
@@ -53,7 +67,7 @@ def test_bounds_of_the_fixed_target(epochs, shape, delay, wanted):
 
 def test_the_one_shot_bound_is_the_printed_one():
     assert one_shot() == pytest.approx([1855.63, 2758.83, 160.337], abs=5e-3)
-    assert tuple(np.floor(one_shot())) == printed.SIGMA0
+    assert tuple(np.floor(one_shot())) == registration_page.SIGMA0
 
 
 def test_the_moving_bound_is_that_of_the_initial_place():
@@ -202,22 +216,22 @@ def test_the_nearest_branch_is_scored():
 
 def test_the_shipped_problem_is_made_by_its_script_and_solved():
     folder = package_files("optloc") / "scenarios"
-    for name, text in shipped.files().items():
+    for name, text in registration.files().items():
         assert (folder / name).read_text(encoding="utf-8") == text, f"write {name} anew"
     loaded = read(folder / "registration.toml")
     fix = solve(loaded.problem).require()
     assert np.abs(fix.position - SPATIAL.target).max() < 4.0 * fix.sigma().max()
-    late = 0.299792458 * np.array(shipped.DELAYS)
+    late = 0.299792458 * np.array(registration.DELAYS)
     assert (np.abs(fix.take("clock") - late) < 4.0 * fix.sigma("clock")).all()
     assert 1e-3 < fix.p_value < 0.999
 
 
-TINY = study.Sample(4, 6, (150, 200, 300, 400), (300, 400, 550, 700), last=150)
+TINY = registration_page.Sample(4, 6, (150, 200, 300, 400), (300, 400, 550, 700), last=150)
 
 
 @pytest.fixture(scope="module")
 def report():
-    ticks, plan = [], study.STUDY.plan(TINY, 3)
+    ticks, plan = [], registration_page.STUDY.plan(TINY, 3)
     made = plan.run(lambda: ticks.append(1))
     assert len(ticks) == plan.work
     return made
@@ -239,8 +253,8 @@ def test_a_reproduction_has_every_table_and_figure(report):
 
 def test_reproduce_writes_tables_and_pictures(report, tmp_path, monkeypatch):
     seeds = []
-    cheap = Study(study.STUDY.sizes, lambda _: 1, lambda _, seed, tick: seeds.append(seed) or report)
-    monkeypatch.setattr(study, "STUDY", cheap)
+    cheap = Study(registration_page.STUDY.sizes, lambda _: 1, lambda _, seed, tick: seeds.append(seed) or report)
+    monkeypatch.setattr(registration_page, "STUDY", cheap)
     folder = tmp_path / "new"
     result = RUN.invoke(app, ["reproduce", "registration", "--out", str(folder), "--seed", "3"])
     assert result.exit_code == 0, result.output

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optloc.proof.nodes import LINEAR, RANGE, WIDTH
+from optloc.proof.nodes.codes import LINEAR, RANGE, WIDTH
 
 Array = np.ndarray
 NO_REGION = np.full(3, np.nan)

@@ -9,7 +9,7 @@ from zlib import crc32
 import numpy as np
 
 from optloc import Frame, Problem, Stations, assemble, measured
-from optloc.constraints import height
+from optloc.linear.constraints import height
 
 Array = np.ndarray
 Rng = np.random.Generator

@@ -4,10 +4,10 @@ import numpy as np
 
 from optloc import MODELS
 from optloc.models import Point
-from optloc.proof.angles import bound_azimuth, bound_elevation, curve_azimuth, curve_elevation
-from optloc.proof.height import bound_height, curve_height
-from optloc.proof.nodes import WIDTH
-from optloc.proof.ratio import bound_ratio, curve_ratio
+from optloc.proof.nodes.angles import bound_azimuth, bound_elevation, curve_azimuth, curve_elevation
+from optloc.proof.nodes.codes import WIDTH
+from optloc.proof.nodes.height import bound_height, curve_height
+from optloc.proof.nodes.ratio import bound_ratio, curve_ratio
 
 BOUND = {"azimuth": bound_azimuth, "elevation": bound_elevation, "groa": bound_ratio, "height": bound_height}
 CURVE = {"azimuth": curve_azimuth, "elevation": curve_elevation, "groa": curve_ratio, "height": curve_height}

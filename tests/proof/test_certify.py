@@ -10,10 +10,11 @@ from proof.plain import cost_of
 
 import optloc
 from optloc import Fix, InvalidProblem, Status, assemble, certify, measured, simulate, solve, with_bias
-from optloc.constraints import box, height
-from optloc.kernels.jit import enabled
-from optloc.solve import certifying
-from optloc.solve.stages import given, lsr
+from optloc.compute.jit import enabled
+from optloc.linear.constraints import box, height
+from optloc.solvers.certify import rounds
+from optloc.solvers.pool import given
+from optloc.solvers.stages import lsr
 
 machine_code = pytest.mark.skipif(not enabled(), reason="plain Python takes a thousand times longer for a box")
 SQUARE = 1e3 * np.array([[-5.0, -5, 0], [5, -5, 0], [5, 5, 0], [-5, 5, 0], [0, 2, 0], [1, -3, 0]])
@@ -149,8 +150,8 @@ def test_a_fix_of_another_problem_is_refused():
 def test_a_spent_budget_says_so_and_changes_nothing(monkeypatch):
     problem = drawn("TDOA, 5 stations, outside, 30 m", 6)
     fix = solve(problem, "gtrs+lsr")
-    monkeypatch.setattr(certifying, "enabled", lambda: True)
-    monkeypatch.setattr(certifying, "_BUDGETS", (0, 0))
+    monkeypatch.setattr(rounds, "enabled", lambda: True)
+    monkeypatch.setattr(rounds, "_BUDGETS", (0, 0))
     poor = certify(problem, fix)
     open_ones = [c for c in poor.certificate if c.boxes or c.proof != "global"]
     assert open_ones

@@ -5,12 +5,12 @@ import pytest
 from proof.costs import random_case
 from proof.test_ranges import bound_box, bounded, charted, drawn_box, ways
 
-from optloc.kernels.jit import enabled
+from optloc.compute.jit import enabled
 from optloc.proof.chart import curve_box, is_convex
 from optloc.proof.convex import CURVE_WIDTH, convex, slopes_everywhere, spread_of
-from optloc.proof.grow import set_convex
-from optloc.proof.nodes import RANGE
-from optloc.proof.ranges import curve_ranges
+from optloc.proof.near import set_convex
+from optloc.proof.nodes.codes import RANGE
+from optloc.proof.nodes.ranges import curve_ranges
 
 BOXES, POINTS = (500, 200) if enabled() else (40, 200)
 

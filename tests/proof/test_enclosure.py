@@ -5,13 +5,11 @@ import pytest
 from proof.costs import random_case
 from proof.test_ranges import charted
 
-from optloc.kernels.jit import enabled
-from optloc.proof.balls import around_node
+from optloc.compute.jit import enabled
 from optloc.proof.chart import value_at
 from optloc.proof.convex import sum_up
-from optloc.proof.enclosure import enclose
-from optloc.proof.nodes import AZIMUTH, ELEVATION, RANGE, RATIO, WIDTH
-from optloc.proof.rays import around_rays
+from optloc.proof.enclosure import around_node, around_rays, enclose
+from optloc.proof.nodes.codes import AZIMUTH, ELEVATION, RANGE, RATIO, WIDTH
 
 CASES, RAYS = (18, 500) if enabled() else (6, 200)
 

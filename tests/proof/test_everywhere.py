@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from optloc.kernels.jit import enabled
+from optloc.compute.jit import enabled
 from optloc.proof.atlas import atlas_of, cube
 from optloc.proof.chart import cost_of, empty_box
-from optloc.proof.everywhere import UNBOUNDED, prove_atlas, prove_everywhere
-from optloc.proof.far import reaches_infinity
-from optloc.proof.nodes import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO, WIDTH
-from optloc.proof.search import BETTER, OTHER, UNIQUE, VALUE, prove
-from optloc.proof.surroundings import set_minimum
+from optloc.proof.everywhere import UNBOUNDED, prove_atlas, prove_everywhere, set_minimum
+from optloc.proof.near import BETTER, OTHER, UNIQUE, VALUE, prove
+from optloc.proof.nodes.codes import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO, WIDTH
+from optloc.proof.nodes.far import reaches_infinity
 
 
 def differences(S, sigma, x, rng):

@@ -8,10 +8,10 @@ from cases import CASES, STATIONS, TARGET, pairs, stations
 from proof.plain import cost_of
 
 from optloc import Motion, Prior, Stations, assemble, measured, simulate, with_bias
-from optloc.equations import equations_at
+from optloc.base.types import Bias
+from optloc.compute.sums import equations_at
 from optloc.proof.pose import posed
 from optloc.proof.scope import unsupported
-from optloc.types import Bias
 
 PLACES = 12
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from proof.sampling import bounded, changes, curved, differences, numbers, remainders, samples, value
 
-from optloc.proof.alone import ALONE, MEASURED, with_alone
-from optloc.proof.nodes import AZIMUTH, RANGE, RATIO, WIDTH
+from optloc.proof.nodes.codes import ALONE, AZIMUTH, MEASURED, RANGE, RATIO, WIDTH, with_alone
 
 
 @pytest.mark.parametrize("d", [2, 3])

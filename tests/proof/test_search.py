@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from proof.costs import NO_REGION, combined, differences, random_case
 
-from optloc.kernels.jit import enabled
+from optloc.compute.jit import enabled
 from optloc.proof.chart import cost_of, empty_box
-from optloc.proof.search import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove
+from optloc.proof.near import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove
 
 CASES, BUDGET_HERE = (24, 20_000) if enabled() else (3, 300)
 KAPPAS = (0.0, 9.0, 25.0)

@@ -6,10 +6,10 @@ from proof.independent import Trial
 from proof.layouts import BY_NAME, CELLS
 
 from optloc import solve
-from optloc.kernels.jit import enabled
+from optloc.compute.jit import enabled
 from optloc.proof.batch import Asked, prove_all
+from optloc.proof.near import UNIQUE, VALUE
 from optloc.proof.pose import posed, taken
-from optloc.proof.search import UNIQUE, VALUE
 
 EQUAL = 1e-6
 # Formulas of their own exist for all cells but that of satellites, which is in geodetic coordinates.

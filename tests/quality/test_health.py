@@ -12,7 +12,7 @@ from optloc import InvalidProblem, assemble, by_epoch, health, measured, predict
 from optloc.cli import app
 from optloc.files import read
 from optloc.plot import save
-from optloc.plot.health import plot_health
+from optloc.plot.residuals import plot_health
 
 RUN = CliRunner()
 BIAS = np.array([0.0, 0.0, 60.0, 0.0, -15.0, 0.0, 0.0, 200.0])

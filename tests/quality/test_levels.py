@@ -10,9 +10,9 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 from optloc import InvalidProblem, assemble, linearise, measured, noise_levels, solve, with_noise_levels
-from optloc.epochs import by_epoch
-from optloc.noise import Block, Noise, variances
-from optloc.quality import components as rules
+from optloc.problem.epochs import by_epoch
+from optloc.problem.noise import Block, Noise, variances
+from optloc.quality import variance_components as rules
 from optloc.quality.elements import batch_of
 from optloc.quality.levels import with_estimated_noise
 

@@ -9,17 +9,15 @@ import pytest
 from report.browser import Browser, executable
 from typer.testing import CliRunner
 
+from optloc.base.errors import InvalidProblem
 from optloc.cli import app
-from optloc.errors import InvalidProblem
 from optloc.papers.report import Table
 from optloc.report import write_report
-from optloc.report.latex import latex
-from optloc.report.sheets import duration, number, percent
+from optloc.report.sheets import duration, latex, number, percent
 from optloc.study.execute import executor
-from optloc.study.parts import begin
+from optloc.study.folder import begin, read_frame
 from optloc.study.plan import plan_of
 from optloc.study.run import run_plan
-from optloc.study.table import read_frame
 
 RUN = CliRunner()
 TEXT = """

@@ -10,12 +10,10 @@ from several.scenes import RING, STAR, drawn, model
 import optloc
 from optloc import InvalidProblem, Status
 from optloc.several import Clutter, evenly, separate
-from optloc.several.enclose import around, changes
-from optloc.several.master import Prices, chosen, priced
-from optloc.several.scene import scenes
-from optloc.several.search import TOLERANCE, Region, search
-from optloc.several.tuples import Tuples, of_picks
-from optloc.several.tuples import fitted as refined
+from optloc.several.pricing_search import TOLERANCE, Region, search
+from optloc.several.set_packing import Prices, cheapest_sets, priced
+from optloc.several.sets import Tuples, around, changes, of_picks, scenes
+from optloc.several.sets import fitted as refined
 
 AZIMUTHS = {"kind": "azimuth", "channels": [0, 1, 2, 3, 4]}
 
@@ -133,10 +131,10 @@ def test_the_packing_is_the_best_and_its_prices_bound_it():
     cost = rng.normal(-3.0, 4.0, len(picks))
     tuples = Tuples(picks, np.zeros((len(picks), 2)), cost)
     numbered = np.where(picks >= 0, picks + 3 * np.arange(4), -1)
-    taken, total = chosen(tuples, 3, None)
+    taken, total = cheapest_sets(tuples, 3, None)
     assert total == pytest.approx(packed(numbered, cost)[0])
     for count in (None, 1, 2):
-        taken, total = chosen(tuples, 3, count)
+        taken, total = cheapest_sets(tuples, 3, count)
         prices = priced(tuples, taken, np.ones((4, 3)), count)
         reduced = prices.reduced(tuples).min()
         assert reduced > -1e-6

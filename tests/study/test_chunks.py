@@ -6,9 +6,9 @@ from study.texts import plan
 
 import optloc
 from optloc.study import chunk as chunks
-from optloc.study.chunk import compute
-from optloc.study.columns import COLUMNS, DIED, arrow_schema
+from optloc.study.chunk import COLUMNS, DIED, arrow_schema, compute
 from optloc.study.draws import draw
+from optloc.study.methods import run
 from optloc.study.plan import Chunk
 
 
@@ -53,7 +53,7 @@ def test_costs_of_unrefined_starts_are_those_of_the_likelihood():
 
 def test_a_failing_trial_costs_its_row(monkeypatch):
     made = next(plan().chunks)
-    whole, bad, solved = frame(made), draw(made.cell.case, 4, 1).truth, chunks.run
+    whole, bad, solved = frame(made), draw(made.cell.case, 4, 1).truth, run
 
     def brittle(method, drawn):
         if (drawn.truth == bad).all(-1).any():

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from study.texts import QUICK, SMALL, assert_identical, plan
 
-from optloc.errors import InvalidProblem
+from optloc.base.errors import InvalidProblem
 from optloc.study import execute
 from optloc.study.chunk import compute
 from optloc.study.execute import EXECUTORS, executor
+from optloc.study.folder import read_frame
 from optloc.study.run import progress, run_plan
-from optloc.study.table import read_frame
 
 LONG = QUICK.replace("trials = 60", "trials = 600")
 

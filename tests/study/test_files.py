@@ -6,8 +6,8 @@ import pytest
 from study.texts import QUICK, plan
 from typer.testing import CliRunner
 
+from optloc.base.errors import InvalidProblem
 from optloc.cli import app
-from optloc.errors import InvalidProblem
 from optloc.study.chunk import compute
 from optloc.study.plan import plan_of, shipped
 

@@ -9,12 +9,12 @@ import sys
 import pytest
 from study.texts import QUICK, assert_identical, plan, values
 
-from optloc.errors import InvalidProblem
-from optloc.study import parts
-from optloc.study.compare import compared
+from optloc.base.errors import InvalidProblem
+from optloc.study import folder as parts
 from optloc.study.execute import executor
+from optloc.study.folder import read_arrow, read_frame, swept
 from optloc.study.run import progress, run_plan
-from optloc.study.table import read_arrow, read_frame, swept
+from optloc.study.summary import compared
 
 HERE = executor("in-process")
 
@@ -94,7 +94,7 @@ def test_folders_that_hold_no_study(tmp_path):
 def test_two_runs_do_not_write_to_one_folder(whole):
     pytest.importorskip("fcntl")
     held = (
-        "import pathlib, sys\nfrom optloc.study.parts import locked\n"
+        "import pathlib, sys\nfrom optloc.study.folder import locked\n"
         "with locked(pathlib.Path(sys.argv[1])):\n    print('held', flush=True)\n    sys.stdin.read()\n"
     )
     command = [sys.executable, "-c", held, str(whole)]

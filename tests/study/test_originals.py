@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from study.texts import plan
 
-from optloc.papers.registration.recursion import recursion as printed
-from optloc.papers.registration.scenario import PRINTED
-from optloc.papers.registration.trials import Setting
-from optloc.solve.stages import given, lsr
-from optloc.status import Status
+from optloc.base.status import Status
+from optloc.papers.registration import PRINTED, Setting
+from optloc.papers.registration import recursion as printed
+from optloc.solvers.pool import given
+from optloc.solvers.stages import lsr
 from optloc.study.baselines import BASELINES
 from optloc.study.chunk import compute
 from optloc.study.draws import draw

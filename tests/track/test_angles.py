@@ -8,8 +8,11 @@ from scipy.linalg import block_diag, expm
 from scipy.optimize import least_squares
 
 import optloc
-from optloc.papers.angles.scenario import READINGS, REPAIRED, STRAIGHT
-from optloc.papers.angles.trials import (
+from optloc.base.types import Motion
+from optloc.papers.angles import (
+    READINGS,
+    REPAIRED,
+    STRAIGHT,
     bound,
     draw,
     errors,
@@ -23,10 +26,9 @@ from optloc.papers.angles.trials import (
     snapshot_bound,
     tracked,
 )
+from optloc.problem.epochs import cut
 from optloc.track import State, begun, current_statistical, followed, polynomial, singer
-from optloc.track.bound import posterior_bound
-from optloc.types import Motion
-from optloc.windows import cut
+from optloc.track.batch import posterior_bound
 
 # --- a second implementation, in the order [x vx ax | y vy ay | z vz az] -------------------------------------------
 

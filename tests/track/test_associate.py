@@ -6,20 +6,16 @@ import numpy as np
 import pytest
 
 import optloc
-from optloc.errors import InvalidProblem
-from optloc.evaluate import predict
-from optloc.papers.kinematic.scenario import Scenario, draw, unlabelled
-from optloc.papers.kinematic.trials import started
-from optloc.simulate import simulate
-from optloc.status import Status
+from optloc.base.errors import InvalidProblem
+from optloc.base.status import Status
+from optloc.base.types import Motion
+from optloc.linear.evaluate import predict
+from optloc.linear.simulate import simulate
+from optloc.papers.kinematic import Scenario, draw, started, unlabelled
 from optloc.track import State, followed, polynomial
-from optloc.track.associate import Clutter, assigned, joint, nearest
-from optloc.track.candidates import Candidates, candidates
-from optloc.track.gate import gated, innovation
-from optloc.track.multiple import associated
-from optloc.track.sets import scored
+from optloc.track.associate import Clutter, assigned, gated, innovation, joint, nearest, scored
+from optloc.track.several_targets import Candidates, associated, candidates
 from optloc.track.track import scans
-from optloc.types import Motion
 
 STATIONS = np.array([[0.0, 0.0], [20e3, 1e3], [-3e3, 18e3], [12e3, -15e3]])
 TARGETS = np.array([[40e3, 25e3], [40.2e3, 25.1e3], [39.9e3, 25.2e3]])

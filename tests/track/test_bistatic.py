@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from optloc import InvalidProblem, Motion, assemble, crlb, linearise, measured, simulate, solve
-from optloc.constraints import box
-from optloc.solve.bistatic import course_starts
-from optloc.status import Status
-from optloc.track.bistatic import simplified
-from optloc.track.measurement_space import lines
-from optloc.types import Stations
+from optloc.base.status import Status
+from optloc.base.types import Stations
+from optloc.linear.constraints import box
+from optloc.solvers.starts.angles import course_starts
+from optloc.track.measurement_space import lines, simplified
 
 D, R0, AZ0, EL0 = 150e3, 81.2e3, 1.446, 0.123
 PATH, ANGLE = 20e-9 * 299792458.0, np.radians(1.0)

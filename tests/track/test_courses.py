@@ -7,12 +7,11 @@ import pytest
 
 import optloc
 from optloc import InvalidProblem, Status
-from optloc.papers.angles.scenario import STRAIGHT, WINDING
-from optloc.papers.angles.trials import draw, errors, placed, tracked
-from optloc.solve.angles import courses
+from optloc.base.types import Motion, Stations
+from optloc.papers.angles import STRAIGHT, WINDING, draw, errors, placed, tracked
+from optloc.solvers.starts.angles import courses
 from optloc.track import State, current_statistical, fitted, polynomial, posterior_bound, smoothed
 from optloc.track.batch import along
-from optloc.types import Motion, Stations
 
 
 def course_of(scenario, order, trials=None, seed=1):

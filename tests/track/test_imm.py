@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 
-from optloc.errors import InvalidProblem
-from optloc.papers.kinematic.scenario import Scenario, draw
-from optloc.papers.kinematic.trials import FILTERS, scored
-from optloc.status import Status
+from optloc.base.errors import InvalidProblem
+from optloc.base.status import Status
+from optloc.papers.kinematic import FILTERS, Scenario, draw, scored
 from optloc.track import UPDATES, State, polynomial, predicted
-from optloc.track.imm import imm, mixed, moments
-from optloc.track.parallel import parallel, resized
+from optloc.track.several_models import imm, mixed, moments, parallel, resized
 from optloc.track.track import scans
 
 CHAIN = np.array([[0.9, 0.07, 0.03], [0.05, 0.9, 0.05], [0.1, 0.1, 0.8]])

@@ -6,14 +6,13 @@ import numpy as np
 import pytest
 
 import optloc
-from optloc.errors import InvalidProblem
-from optloc.papers.kinematic.scenario import Scenario, draw
-from optloc.papers.kinematic.trials import started
-from optloc.status import Status
+from optloc.base.errors import InvalidProblem
+from optloc.base.status import Status
+from optloc.base.types import Motion
+from optloc.papers.kinematic import Scenario, draw, started
+from optloc.problem.epochs import cut
 from optloc.track import State, followed, polynomial
-from optloc.track.parallel import parallel, resized, softmax
-from optloc.types import Motion
-from optloc.windows import cut
+from optloc.track.several_models import parallel, resized, softmax
 
 C = 299792.458  # km/s
 STATIONS = np.array([[0.0, 0.0]] + [[100.0 * np.cos(a), 100.0 * np.sin(a)] for a in np.radians([90.0, 210.0, 330.0])])

@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize
 
 from optloc import LOSSES, InvalidProblem, Motion, assemble, measured, simulate
-from optloc.evaluate import predict
+from optloc.linear.evaluate import predict
 from optloc.track import Rules, State, collected, polynomial, reweighted, tracked
 from optloc.track.updates import iekf
 

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 import optloc
-from optloc.errors import InvalidProblem, NoSolution
-from optloc.status import Status
+from optloc.base.errors import InvalidProblem, NoSolution
+from optloc.base.status import Status
+from optloc.base.types import Motion
+from optloc.problem.epochs import cut
 from optloc.track import State, begun, followed, polynomial, predicted
 from optloc.track.start import two_point
-from optloc.types import Motion
-from optloc.windows import cut
 
 STATIONS = np.array([[0.0, 0.0], [20e3, 1e3], [-3e3, 18e3], [12e3, -15e3]])
 START = np.array([9e3, 5e3, 90.0, -40.0])

@@ -12,9 +12,9 @@ from stonesoup.buffered_generator import BufferedGenerator
 from stonesoup.feeder.base import DetectionFeeder
 from stonesoup.types.detection import Detection
 
-from optloc.errors import InvalidProblem
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array
 from optloc.plugins.stonesoup.models import TDOA, arrival_covariance, values_of
-from optloc.types import Array
 
 
 class PairFeeder(DetectionFeeder):  # type: ignore[misc]  # untyped base

@@ -15,13 +15,13 @@ from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.track import Track
 from stonesoup.types.update import GaussianStateUpdate
 
-from optloc.errors import InvalidProblem
-from optloc.fix import Fix
+from optloc.base.errors import InvalidProblem
+from optloc.base.status import Status
+from optloc.base.types import Motion, Prior
 from optloc.plugins.stonesoup.models import StationMeasurement, problem_of, rows_by_kind, values_of
-from optloc.problem import Problem
-from optloc.solve import solve
-from optloc.status import Status
-from optloc.types import Motion, Prior
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
+from optloc.solvers import solve
 
 # A fix is trusted as a Gaussian where no other minimum costs less than this more, and where its largest standard
 # deviation is below this share of the nearest range.

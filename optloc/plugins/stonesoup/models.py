@@ -14,15 +14,15 @@ from stonesoup.models.measurement.nonlinear import NonLinearGaussianMeasurement
 from stonesoup.types.angle import Bearing, Elevation
 from stonesoup.types.array import StateVector, StateVectors
 
-from optloc.build import assemble, measured
-from optloc.errors import InvalidProblem
-from optloc.evaluate import predict
-from optloc.linear import linearise
-from optloc.noise import Block, arrivals, group
-from optloc.problem import Problem
-from optloc.solve import solve
-from optloc.status import Status
-from optloc.types import Array
+from optloc.base.errors import InvalidProblem
+from optloc.base.status import Status
+from optloc.base.types import Array
+from optloc.linear.evaluate import predict
+from optloc.linear.normal import linearise
+from optloc.problem.build import assemble, measured
+from optloc.problem.noise import Block, arrivals, group
+from optloc.problem.problem import Problem
+from optloc.solvers import solve
 
 _TYPES = {"azimuth": Bearing, "elevation": Elevation}
 

@@ -1,0 +1,1 @@
+"""What everything stands on: types, status, units, frames, arrays, linear algebra, registries."""

@@ -1,0 +1,109 @@
+"""Exceptions of optloc: malformed input is an error, a problem without an answer is data.
+
+A well-posed call that finds no trustworthy answer returns a fix whose status says so; only
+``fix.require()`` turns that status into :class:`NoSolution`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+from typing import Any
+
+import numpy as np
+
+from optloc.base.status import Status
+
+__all__ = ["InvalidProblem", "NoSolution", "OptlocError", "nearest"]
+
+
+class OptlocError(Exception):
+    """Base class of every exception that optloc raises on purpose."""
+
+
+class InvalidProblem(OptlocError, ValueError):  # noqa: N818  (named for what the caller handed over)
+    """The input cannot be read as a problem; the message names the culprit.
+
+    Parameters
+    ----------
+    what : str
+        What is wrong, with the offending value: ``"latitude 95 deg is outside -90 to 90 deg"``.
+    where : str, optional
+        The place: a file, a file and row, a column or an argument.
+    advice : str, optional
+        What to do about it.
+
+    Notes
+    -----
+    ``str(error)`` is one sentence, ``where: what; advice.``
+    """
+
+    def __init__(self, what: str, where: str | None = None, advice: str | None = None) -> None:
+        # Only positional arguments survive pickling on their way back from a worker process.
+        super().__init__(what, where, advice)
+        self.what = what
+        self.where = where
+        self.advice = advice
+
+    def __str__(self) -> str:
+        """Return the sentence."""
+        place = f"{self.where}: " if self.where else ""
+        advice = f"; {self.advice.strip().rstrip('.')}" if self.advice else ""
+        return f"{place}{self.what.strip().rstrip('.')}{advice}."
+
+
+class NoSolution(OptlocError):  # noqa: N818  (a verdict about the problem)
+    """A fix was required but its status is not a clean one.
+
+    Parameters
+    ----------
+    problem : Problem
+        The problem that was to be solved.
+    fix : Fix
+        The fix that was refused; its status, alternatives and certificate say why.
+
+    Notes
+    -----
+    ``str(error)`` is the sentence of ``fix.status``, with its advice; a batch gives each distinct one once.
+    """
+
+    def __init__(self, problem: Any, fix: Any) -> None:
+        super().__init__(problem, fix)
+        self.problem = problem
+        self.fix = fix
+
+    def __str__(self) -> str:
+        """Return the sentence of the status; of a batch, one sentence a distinct status."""
+        status = getattr(self.fix, "status", None)
+        if status is None:
+            return "There is no fix."
+        verdicts = {Status(int(code)): None for code in np.ravel(status)}
+        refused = [verdict.sentence for verdict in verdicts if verdict is not Status.OK]
+        return " ".join(refused or [verdict.sentence for verdict in verdicts])
+
+
+# So many names are still read.
+_FEW = 20
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """Return advice for an unknown word: the nearest known ones, then all of them where they are few.
+
+    Parameters
+    ----------
+    word : str
+        What the user wrote.
+    known : iterable of str
+        What would have been understood.
+
+    Returns
+    -------
+    str
+        ``"did you mean 'km'? known are m, km"``.
+    """
+    names = list(known)
+    folded = {name.lower(): name for name in names}
+    close = [repr(folded[name]) for name in get_close_matches(str(word).lower(), folded, n=2, cutoff=0.5)]
+    hint = f"did you mean {' or '.join(close)}?" if close else ""
+    listed = "" if close and len(names) > _FEW else f"known are {', '.join(names)}"
+    return " ".join(part for part in (hint, listed) if part)

@@ -1,0 +1,287 @@
+"""Small symmetric positive definite systems in batches: one singular item never disturbs the others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from optloc.base import arrays
+from optloc.base.types import Array
+
+
+def factor(matrix: Array, least: float = 1e-15) -> tuple[Array, Array]:
+    """Return Cholesky factors of a batch of symmetric matrices.
+
+    Parameters
+    ----------
+    matrix : array (..., n, n)
+        Symmetric matrices.
+    least : float
+        Share of its diagonal that a pivot must exceed.
+
+    Returns
+    -------
+    lower : array (..., n, n)
+        Lower factors; meaningless where not ok.
+    ok : bool array (...)
+        Whether the matrix is numerically positive definite.
+    """
+    n = matrix.shape[-1]
+    if arrays.foreign(matrix):
+        return _factor(matrix, least)
+    lower = np.zeros(matrix.shape)
+    ok = np.ones(matrix.shape[:-2], dtype=bool)
+    for j in range(n):
+        known = lower[..., j:, :j]
+        column = matrix[..., j:, j] - (known * lower[..., j, None, :j]).sum(-1)
+        pivot = column[..., 0]
+        positive = pivot > least * np.abs(matrix[..., j, j])
+        ok &= positive
+        lower[..., j:, j] = column / np.sqrt(np.where(positive, pivot, 1.0))[..., None]
+    return lower, ok
+
+
+def _factor(matrix: Any, least: float) -> tuple[Any, Any]:
+    """Return what `factor` does without writing into an array: column by column, the rest less what each explains."""
+    xp, n = arrays.library(matrix), matrix.shape[-1]
+    below = arrays.placed(np.tril(np.ones((n, n))), matrix)
+    rest, columns, ok = matrix, [], matrix[..., 0, 0] == matrix[..., 0, 0]
+    for j in range(n):
+        pivot = rest[..., j, j]
+        positive = pivot > least * xp.abs(matrix[..., j, j])
+        ok = ok & positive
+        column = below[:, j] * rest[..., :, j] / xp.sqrt(xp.where(positive, pivot, 1.0))[..., None]
+        rest = rest - column[..., :, None] * column[..., None, :]
+        columns.append(column)
+    return xp.stack(columns, axis=-1), ok
+
+
+def _substituted(lower: Any, right: Any, order: range) -> Array:
+    """Return the solution of a triangular system whose rows are solved in a given order; it writes into no array."""
+    xp, rows = arrays.library(lower), dict[int, Any]()
+    for j in order:
+        left = right[..., j, :]
+        for i, row in rows.items():
+            left = left - lower[..., j, i, None] * row
+        rows[j] = left / lower[..., j, j, None]
+    solved: Array = xp.stack([rows[j] for j in range(len(order))], axis=-2)
+    return solved
+
+
+def _forward(lower: Array, right: Array) -> Array:
+    if arrays.foreign(lower):
+        return _substituted(lower, right, range(lower.shape[-1]))
+    out = np.empty(np.broadcast_shapes(lower.shape[:-2], right.shape[:-2]) + right.shape[-2:])
+    for j in range(lower.shape[-1]):
+        known = (lower[..., j, :j, None] * out[..., :j, :]).sum(-2)
+        out[..., j, :] = (right[..., j, :] - known) / lower[..., j, j, None]
+    return out
+
+
+def _backward(lower: Array, right: Array) -> Array:
+    if arrays.foreign(lower):
+        return _substituted(lower.mT, right, range(lower.shape[-1])[::-1])
+    out = np.empty(right.shape)
+    for j in reversed(range(lower.shape[-1])):
+        known = (lower[..., j + 1 :, j, None] * out[..., j + 1 :, :]).sum(-2)
+        out[..., j, :] = (right[..., j, :] - known) / lower[..., j, j, None]
+    return out
+
+
+def solve(matrix: Array, right: Array, least: float = 1e-15) -> tuple[Array, Array]:
+    """Return the solution of ``matrix @ x = right`` for symmetric positive definite matrices.
+
+    The matrix is first scaled to a unit diagonal (Jacobi).
+
+    Parameters
+    ----------
+    matrix : array (..., n, n)
+        Symmetric matrices.
+    right : array (..., n, q)
+        Right-hand sides.
+    least : float
+        Share of its diagonal that a pivot must exceed.
+
+    Returns
+    -------
+    x : array (..., n, q)
+        Solutions; zero where not ok.
+    ok : bool array (...)
+        Whether the matrix is numerically positive definite.
+    """
+    xp = arrays.library(matrix)
+    diagonal = xp.linalg.diagonal(matrix)
+    good = diagonal > 0.0
+    scale = 1.0 / xp.sqrt(xp.where(good, diagonal, 1.0))
+    lower, ok = factor(matrix * scale[..., :, None] * scale[..., None, :], least)
+    ok = ok & xp.all(good, axis=-1)
+    lower = xp.where(ok[..., None, None], lower, arrays.eye(matrix.shape[-1], matrix))
+    x = scale[..., None] * _backward(lower, _forward(lower, scale[..., None] * right))
+    return xp.where(ok[..., None, None], x, 0.0), ok
+
+
+def inverse(matrix: Array, least: float = 1e-15) -> tuple[Array, Array]:
+    """Return inverses (..., n, n) of symmetric positive definite matrices, NaN where not ok, and ok (...)."""
+    xp = arrays.library(matrix)
+    out, ok = solve(matrix, xp.broadcast_to(arrays.eye(matrix.shape[-1], matrix), matrix.shape), least)
+    return xp.where(ok[..., None, None], 0.5 * (out + out.mT), xp.nan), ok
+
+
+def root(matrix: Array, cut: float = 1e-12) -> tuple[Array, Array]:
+    """Return A with ``A A'`` the pseudo-inverse of symmetric positive semidefinite matrices.
+
+    Parameters
+    ----------
+    matrix : array (..., n, n)
+        Symmetric matrices.
+    cut : float
+        Directions with less than this share of the largest eigenvalue, columns scaled, count as nothing.
+
+    Returns
+    -------
+    root : array (..., n, n)
+        Zero columns for directions of nothing.
+    regular : bool array (...)
+        Whether there are none.
+    """
+    xp = arrays.library(matrix)
+    diagonal = xp.linalg.diagonal(matrix)
+    scale = 1.0 / xp.sqrt(xp.where(diagonal > 0.0, diagonal, 1.0))
+    scaled = matrix * scale[..., :, None] * scale[..., None, :]
+    finite = xp.all(xp.isfinite(scaled), axis=(-1, -2))
+    values, vectors = xp.linalg.eigh(xp.where(finite[..., None, None], scaled, 0.0))
+    largest = values[..., -1:]
+    kept = values > cut * xp.where(largest > cut, largest, cut)
+    inverse = xp.where(kept, 1.0 / xp.sqrt(xp.where(kept, values, 1.0)), 0.0)
+    return scale[..., :, None] * vectors * inverse[..., None, :], xp.all(kept, axis=-1)
+
+
+def whitening(covariance: Array) -> Array:
+    """Return W with ``W' W`` the inverse of a covariance, or its pseudo-inverse where it is singular.
+
+    Parameters
+    ----------
+    covariance : array (..., r, r)
+        Symmetric positive semidefinite; a row and column of zeros is absent.
+
+    Returns
+    -------
+    array (..., r, r)
+        Lower triangular where the covariance of the rows present is regular; its rank is that of the covariance, and
+        rows beyond it, like the columns of absent rows, are exactly zero.
+    """
+    xp = arrays.library(covariance)
+    diagonal = xp.linalg.diagonal(covariance)
+    absent = diagonal == 0.0
+    if covariance.shape[-1] == 1:
+        single: Array = xp.where(absent[..., None], 0.0, 1.0 / xp.sqrt(xp.where(absent[..., None], 1.0, covariance)))
+        return single
+    scale = 1.0 / xp.sqrt(xp.where(diagonal > 0.0, diagonal, 1.0))
+    unit = covariance * scale[..., :, None] * scale[..., None, :]
+    eye = xp.broadcast_to(arrays.eye(covariance.shape[-1], covariance), covariance.shape)
+    lower, ok = factor(xp.where(absent[..., None], eye, unit))
+    ok = ok & xp.all(xp.linalg.diagonal(lower) > 1e-6, axis=-1)
+    matrix = _forward(xp.where(ok[..., None, None], lower, eye), eye)
+    if not bool(xp.all(ok)):
+        values, vectors = xp.linalg.eigh(xp.where(xp.isfinite(unit), unit, 0.0))
+        kept = values > 1e-10 * values[..., -1:]
+        roots = xp.where(kept, 1.0 / xp.sqrt(xp.where(kept, values, 1.0)), 0.0)
+        matrix = xp.where(ok[..., None, None], matrix, roots[..., :, None] * vectors.mT)
+    whitened: Array = matrix * xp.where(absent, 0.0, scale)[..., None, :]
+    return whitened
+
+
+# Least squares on the tangent space of equality constraints.
+
+
+@dataclass(frozen=True, slots=True)
+class Tangent:
+    """Directions along which equalities hold to first order, and the directions across.
+
+    Parameters
+    ----------
+    along : array (N, n, n - c)
+        Basis of the tangent space.
+    across : array (N, n, c)
+        ``across @ g`` is the shortest step that restores the equalities.
+    """
+
+    along: Array
+    across: Array
+
+
+def tangent(gradients: Array, scale: Array) -> Tangent:
+    """Return the tangent space of equalities.
+
+    Parameters
+    ----------
+    gradients : array (N, c, n)
+        Gradients of the equalities.
+    scale : array (N, n)
+        Typical size of each unknown: decides what "shortest" means.
+    """
+    c = gradients.shape[-2]
+    scaled = np.swapaxes(gradients * scale[:, None], -1, -2)
+    scaled = np.where(np.isfinite(scaled), scaled, 0.0)
+    q, r = np.linalg.qr(scaled, mode="complete")
+    size = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
+    regular = size > 1e-12 * np.maximum(size.max(-1, keepdims=True), 1e-300)
+    lower = np.swapaxes(r[:, :c], -1, -2)
+    restore = np.zeros_like(lower)
+    for i in range(c):  # inverse of the small triangle, column by column; a dependent equality restores nothing
+        for j in range(c):
+            known = (lower[:, i, :i] * restore[:, :i, j]).sum(-1)
+            value = (float(i == j) - known) / np.where(regular[:, i], lower[:, i, i], 1.0)
+            restore[:, i, j] = np.where(regular[:, i], value, 0.0)
+    return Tangent(scale[..., None] * q[..., c:], scale[..., None] * (q[..., :c] @ restore))
+
+
+def solve_within(information: Array, vector: Array, space: Tangent) -> tuple[Array, Array]:
+    """Return the step (N, n) within the tangent space that solves the normal equations, and where it exists (N,)."""
+    z = space.along
+    if z.shape[-1] == 0:
+        return np.zeros_like(vector), np.ones(len(vector), dtype=bool)
+    transposed = np.swapaxes(z, -1, -2)
+    part, ok = solve(transposed @ information @ z, transposed @ vector[..., None])
+    return (z @ part)[..., 0], ok
+
+
+def inverse_within(information: Array, space: Tangent) -> tuple[Array, Array]:
+    """Return the covariance (N, n, n) on the tangent space, zero across it, and where it exists (N,)."""
+    z = space.along
+    if z.shape[-1] == 0:
+        return np.zeros_like(information), np.ones(len(information), dtype=bool)
+    transposed = np.swapaxes(z, -1, -2)
+    inner, ok = inverse(transposed @ information @ z)
+    return z @ inner @ transposed, ok
+
+
+# Error ellipses and ellipsoids of covariances.
+
+
+def error_ellipse(covariance: Array, probability: float = 0.95) -> tuple[Array, Array]:
+    """Return the ellipse or ellipsoid that holds a Gaussian with a given probability.
+
+    Parameters
+    ----------
+    covariance : array (..., d, d)
+        Square metres; NaN where there is none.
+    probability : float
+        Between 0 and 1.
+
+    Returns
+    -------
+    semi_axes : array (..., d)
+        Lengths in metres, ascending; NaN where there is no covariance.
+    directions : array (..., d, d)
+        Unit vectors of the axes in columns.
+    """
+    from scipy.special import gammaincinv
+
+    known = np.asarray(np.isfinite(covariance).all((-1, -2)))
+    values, vectors = np.linalg.eigh(np.where(known[..., None, None], covariance, 0.0))
+    scale = np.sqrt(2.0 * gammaincinv(covariance.shape[-1] / 2, probability))
+    axes = scale * np.sqrt(np.maximum(values, 0.0))
+    return np.where(known[..., None], axes, np.nan), np.where(known[..., None, None], vectors, np.nan)

@@ -1,0 +1,262 @@
+"""Units of files and tables, converted to SI and radians at the border only.
+
+Inside optloc every length is in metres, angle in radians, time in seconds and speed in metres per
+second. Three conversions are more than a factor:
+
+* A propagation time (``ns``) is a length once multiplied by the propagation speed: light in vacuum
+  unless told otherwise, some 343 m/s for sound in air.
+* A gain ratio in ``dB`` is a ratio of ranges. Amplitude falls with ``1 / r``, so the level at
+  station b above the level at station a, ``20 log10(A_b / A_a)``, is ``20 log10(r_a / r_b)``. Decibels of
+  power, ``10 log10(P_b / P_a)``, are the same number. A quantity that is itself a level stays in decibels.
+* A frequency difference in ``Hz`` is a range-rate difference: a receding emitter lowers the received
+  frequency, ``f = f_c (1 - r' / c)``, so ``r_a' - r_b' = -(c / f_c) (f_a - f_b)``.
+
+Sources: BIPM, The International System of Units, 9th edition (2019), sections 2.3.1 and 4, for c, the
+nautical mile, the knot, degrees and the decibel; the international foot of 1959 for foot, yard and mile.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from optloc.base.errors import InvalidProblem, nearest
+
+__all__ = [
+    "SI_UNIT",
+    "SPEED_OF_LIGHT",
+    "UNITS",
+    "AzimuthConvention",
+    "Conversion",
+    "Quantity",
+    "conversion",
+    "sigma_to_si",
+    "to_si",
+]
+
+Quantity = Literal["length", "angle", "ratio", "level", "speed", "time", "plain"]
+"""What a number measures; it decides which units make sense."""
+
+AzimuthConvention = Literal["east-counterclockwise", "north-clockwise"]
+"""Where azimuth zero is and which way it grows; the first is the one used in memory."""
+
+SPEED_OF_LIGHT: Final = 299_792_458.0
+"""Speed of light in vacuum in m/s (exact, SI)."""
+
+_TIME: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "ps": 1e-12}
+_FOOT: Final = 0.3048
+_NAUTICAL_MILE: Final = 1852.0
+
+UNITS: Final[Mapping[Quantity, Mapping[str, float]]] = MappingProxyType(
+    {
+        "length": {
+            "m": 1.0,
+            "km": 1e3,
+            "cm": 1e-2,
+            "mm": 1e-3,
+            "ft": _FOOT,
+            "yd": 3 * _FOOT,
+            "mi": 5280 * _FOOT,
+            "nmi": _NAUTICAL_MILE,
+            **_TIME,
+        },
+        "angle": {
+            "rad": 1.0,
+            "mrad": 1e-3,
+            "deg": math.pi / 180,
+            "arcmin": math.pi / 10_800,
+            "arcsec": math.pi / 648_000,
+        },
+        "ratio": {"1": 1.0, "dB": 1.0},
+        "level": {"dB": 1.0, "Np": 20.0 / math.log(10)},
+        "speed": {
+            "m/s": 1.0,
+            "km/s": 1e3,
+            "km/h": 1 / 3.6,
+            "ft/s": _FOOT,
+            "mph": 5280 * _FOOT / 3600,
+            "kn": _NAUTICAL_MILE / 3600,
+            "Hz": 1.0,
+        },
+        "time": {**_TIME, "min": 60.0, "h": 3600.0},
+        "plain": {"1": 1.0},
+    }
+)
+"""Known units of each quantity and their size in SI; times that stand for lengths are in seconds,
+``Hz`` in 1/s and ``dB`` of a ratio is logarithmic (see the module's text)."""
+
+SI_UNIT: Final[Mapping[Quantity, str]] = MappingProxyType({q: next(iter(table)) for q, table in UNITS.items()})
+"""The unit of each quantity in memory; levels are in decibels, which SI accepts."""
+
+
+@dataclass(frozen=True, slots=True)
+class Conversion:
+    """The map from numbers in a file to numbers in memory: ``offset + factor * u``, or a decibel.
+
+    Parameters
+    ----------
+    factor : float
+        SI units in one unit of the file, with sign; for decibels, nepers in one decibel.
+    offset : float
+        Value in SI of the file's zero.
+    logarithmic : bool
+        Whether the file holds a logarithm: memory then holds ``exp(factor * u)``.
+    """
+
+    factor: float
+    offset: float = 0.0
+    logarithmic: bool = False
+
+    def to_si(self, values: ArrayLike) -> NDArray[np.float64]:
+        """Convert values of any shape to SI.
+
+        Angles are not wrapped: 350 deg stays above pi.
+        """
+        u = np.asarray(values, dtype=np.float64)
+        return np.exp(self.factor * u) if self.logarithmic else self.offset + self.factor * u
+
+    def from_si(self, values: ArrayLike) -> NDArray[np.float64]:
+        """Convert SI values of any shape to the file's unit."""
+        z = np.asarray(values, dtype=np.float64)
+        return np.log(z) / self.factor if self.logarithmic else (z - self.offset) / self.factor
+
+    def slope(self, values_si: ArrayLike | None = None) -> NDArray[np.float64]:
+        """Return d(SI) / d(file unit), with sign.
+
+        A covariance C in file units becomes ``slope[:, None] * C * slope`` in SI. The sign matters for
+        the cross terms of clockwise azimuths and frequency differences.
+
+        Parameters
+        ----------
+        values_si : array_like, shape (...), optional
+            The measured values in SI; a logarithmic unit needs them.
+
+        Returns
+        -------
+        ndarray, shape (...) or ()
+            Slope, to first order at `values_si`.
+        """
+        if not self.logarithmic:
+            return np.asarray(self.factor)
+        if values_si is None:
+            raise InvalidProblem(
+                "an error in dB has no fixed size as a ratio",
+                advice="give the measured values with it, or state the error in unit '1'",
+            )
+        return self.factor * np.asarray(values_si, dtype=np.float64)
+
+    def sigma_to_si(self, sigma: ArrayLike, values_si: ArrayLike | None = None) -> NDArray[np.float64]:
+        """Convert standard deviations to SI, to first order at the measured values."""
+        scaled: NDArray[np.float64] = np.abs(self.slope(values_si)) * np.asarray(sigma, dtype=np.float64)
+        return scaled
+
+
+def conversion(
+    unit: str,
+    quantity: Quantity,
+    *,
+    propagation_speed: float = SPEED_OF_LIGHT,
+    carrier: float | None = None,
+    convention: AzimuthConvention = "east-counterclockwise",
+    where: str | None = None,
+) -> Conversion:
+    """Look up how a unit becomes SI.
+
+    Parameters
+    ----------
+    unit : str
+        One of ``UNITS[quantity]``.
+    quantity : {"length", "angle", "ratio", "level", "speed", "time", "plain"}
+        What the numbers measure.
+    propagation_speed : float
+        Speed in m/s that turns propagation times into lengths and frequencies into speeds.
+    carrier : float, optional
+        Carrier frequency in Hz; needed when a speed is given in Hz.
+    convention : {"east-counterclockwise", "north-clockwise"}
+        For azimuths: a compass bearing A is ``pi / 2 - A`` in memory.
+    where : str, optional
+        Place to name when something is wrong.
+
+    Returns
+    -------
+    Conversion
+        The map between file and memory.
+
+    Raises
+    ------
+    InvalidProblem
+        Unknown unit, quantity or convention; a speed or carrier that is not positive.
+    """
+    _check_options(unit, quantity, propagation_speed, convention, where)
+    factor = UNITS[quantity][unit]
+    if quantity == "length" and unit in _TIME:
+        return Conversion(factor * propagation_speed)
+    if unit == "dB" and quantity == "ratio":
+        return Conversion(math.log(10) / 20, logarithmic=True)
+    if unit == "Hz":
+        if carrier is None or not (math.isfinite(carrier) and carrier > 0):
+            given = "is missing" if carrier is None else f"must be positive, not {carrier:g} Hz"
+            raise InvalidProblem(
+                f"the carrier frequency {given}",
+                where,
+                "a frequency difference in Hz is a speed only beside its carrier",
+            )
+        return Conversion(-propagation_speed / carrier)
+    if quantity == "angle" and convention == "north-clockwise":
+        return Conversion(-factor, offset=math.pi / 2)
+    return Conversion(factor)
+
+
+def to_si(
+    values: ArrayLike,
+    unit: str,
+    quantity: Quantity,
+    *,
+    propagation_speed: float = SPEED_OF_LIGHT,
+    carrier: float | None = None,
+    convention: AzimuthConvention = "east-counterclockwise",
+    where: str | None = None,
+) -> NDArray[np.float64]:
+    """Convert values of any shape to SI; the options are those of :func:`conversion`."""
+    return conversion(
+        unit, quantity, propagation_speed=propagation_speed, carrier=carrier, convention=convention, where=where
+    ).to_si(values)
+
+
+def sigma_to_si(
+    sigma: ArrayLike,
+    unit: str,
+    quantity: Quantity,
+    *,
+    values_si: ArrayLike | None = None,
+    propagation_speed: float = SPEED_OF_LIGHT,
+    carrier: float | None = None,
+    where: str | None = None,
+) -> NDArray[np.float64]:
+    """Convert standard deviations of any shape to SI.
+
+    The options are those of :func:`conversion`; decibels also need the measured values in SI, since a
+    sigma of s dB is, to first order, a sigma of ``ratio * s * ln(10) / 20``.
+    """
+    return conversion(unit, quantity, propagation_speed=propagation_speed, carrier=carrier, where=where).sigma_to_si(
+        sigma, values_si
+    )
+
+
+def _check_options(unit: str, quantity: str, propagation_speed: float, convention: str, where: str | None) -> None:
+    if quantity not in UNITS:
+        raise InvalidProblem(f"unknown quantity {quantity!r}", where, nearest(quantity, list(UNITS)))
+    if unit not in UNITS[quantity]:  # type: ignore[index]  # just checked
+        table = list(UNITS[quantity])  # type: ignore[index]
+        raise InvalidProblem(f"unknown unit {unit!r} for the quantity {quantity!r}", where, nearest(unit, table))
+    if convention not in get_args(AzimuthConvention):
+        advice = nearest(convention, list(get_args(AzimuthConvention)))
+        raise InvalidProblem(f"unknown azimuth convention {convention!r}", where, advice)
+    if not (math.isfinite(propagation_speed) and propagation_speed > 0):
+        raise InvalidProblem(f"the propagation speed must be positive, not {propagation_speed:g} m/s", where)

@@ -1,0 +1,1 @@
+"""How good a fix can be: the bound, what is observable, maps of both."""

@@ -1,0 +1,171 @@
+"""Maps of the Cramer-Rao bound: how accurate a fix can be, depending on where the target is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.frames import Frame
+from optloc.base.types import Array
+from optloc.bounds.crlb import crlb
+from optloc.models import MODELS
+from optloc.problem.layout import state_names
+from optloc.problem.noise import variances
+from optloc.problem.problem import Problem
+
+_AT_ONCE = 2000
+
+
+@dataclass(frozen=True, slots=True)
+class BoundMap:
+    """The bound of the position over a grid of places, at one height.
+
+    Parameters
+    ----------
+    x, y : array (nx,), (ny,)
+        The grid: longitude and latitude in degrees on Earth, else metres of the frame.
+    height : float
+        Above the ellipsoid on Earth, else the third coordinate; 0 in the plane; metres.
+    sigma : array (ny, nx)
+        Root of the trace of the bound of the position, metres; NaN where the geometry is singular.
+    horizontal, vertical : array (ny, nx)
+        The same of its plan, and of its height (NaN in the plane).
+    row : float
+        Root mean square standard deviation of a row, metres; NaN where not all rows are lengths.
+    stations : array (s, 2)
+        As x and y.
+    names : tuple of s str
+        Of the stations.
+    geodetic : bool
+        Whether x and y are degrees.
+    """
+
+    x: Array
+    y: Array
+    height: float
+    sigma: Array
+    horizontal: Array
+    vertical: Array
+    row: float
+    stations: Array
+    names: tuple[str, ...]
+    geodetic: bool
+
+    @property
+    def dilution(self) -> Array:
+        """Return the geometric dilution of precision (ny, nx): the bound over the deviation of a row."""
+        return np.asarray(self.sigma / self.row)
+
+
+def bound_map(
+    problem: Problem, truth: Array, x: Array, y: Array, height: float = 0.0, *, geodetic: bool | None = None
+) -> BoundMap:
+    """Return the Cramer-Rao bound of a target that is at every point of a grid.
+
+    Noise, station errors and biases count as the problem has them.
+
+    Parameters
+    ----------
+    problem : Problem
+        A single problem of one target that is sought; of a batch, the first. Its measurements do not matter.
+    truth : array (size,)
+        True parameter vector; its position is replaced by the points of the grid.
+    x, y : array (nx,), (ny,)
+        Longitudes and latitudes in degrees on Earth, else metres of the frame.
+    height : float
+        Of the target, metres: above the ellipsoid, or its third coordinate.
+    geodetic : bool, optional
+        Whether x and y are degrees; by default in three-dimensional frames of the Earth.
+
+    Raises
+    ------
+    InvalidProblem
+        Where no position or more than one is sought, or every epoch of a run has one of its own.
+    """
+    slot = _slot(problem)
+    earth = problem.frame.geodetic and problem.dimension == 3 if geodetic is None else geodetic
+    east, north = np.meshgrid(np.asarray(x, dtype=float), np.asarray(y, dtype=float))
+    places = _places(problem.frame, east.ravel(), north.ravel(), height, problem.dimension, earth)
+    single = problem.flat().take(np.zeros(1, dtype=int)) if problem.batch_shape else problem
+    vectors = np.tile(np.asarray(truth, dtype=float), (len(places), 1))
+    vectors[:, slot] = places
+    parts = []
+    for first in range(0, len(places), _AT_ONCE):
+        bound = np.asarray(crlb(single, vectors[first : first + _AT_ONCE]))
+        parts.append(bound[..., slot, slot])
+    covariance = np.concatenate(parts)
+    axes = problem.frame.enu_axes(places)
+    variance = np.maximum(np.diagonal(axes @ covariance @ np.swapaxes(axes, -1, -2), axis1=-2, axis2=-1), 0.0)
+    plan, shape = np.sqrt(variance[:, :2].sum(-1)), east.shape
+    up = np.sqrt(variance[:, 2]) if problem.dimension == 3 else np.full(len(places), np.nan)
+    stations = problem.stations.position.reshape(-1, problem.stations.count, problem.dimension)[0]
+    return BoundMap(
+        np.asarray(x, dtype=float),
+        np.asarray(y, dtype=float),
+        float(height),
+        np.sqrt(variance.sum(-1)).reshape(shape),
+        plan.reshape(shape),
+        up.reshape(shape),
+        _deviation(problem),
+        plan_of(problem.frame, stations, earth)[:, :2],
+        problem.stations.names,
+        earth,
+    )
+
+
+def _slot(problem: Problem) -> slice:
+    """Return where the position of the one target that is sought stands in the shared unknowns."""
+    sought = [i for i, motion in enumerate(problem.motions) if motion.known is None]
+    advice = "map the bound of a file with one target"
+    if len(sought) != 1:
+        raise InvalidProblem(f"{len(sought)} targets are sought, and a map moves one", "map", advice)
+    motion = problem.motions[sought[0]]
+    name = state_names(sought[0], len(problem.motions), motion.order)[0]
+    slot, shared = problem.layout.find(name)
+    if not shared:
+        advice = "give the target a motion, or map one epoch"
+        raise InvalidProblem("every epoch has a position of its own", "map", advice)
+    return slice(slot.start, slot.start + slot.size)
+
+
+def _places(frame: Frame, x: Array, y: Array, height: float, dimension: int, earth: bool) -> Array:
+    if earth:
+        return frame.from_geodetic(np.radians(y), np.radians((x + 180.0) % 360.0 - 180.0), np.full(len(x), height))
+    return np.stack([x, y, np.full(len(x), height)][:dimension], axis=-1)
+
+
+def plan_of(frame: Frame, position: Array, earth: bool) -> Array:
+    """Return positions (n, d) as longitude, latitude (deg) and height (m) where they are on Earth, else as they are."""
+    if not earth:
+        return position
+    lat, lon, height = frame.to_geodetic(position)
+    return np.stack([np.degrees(lon), np.degrees(lat), height], axis=-1)
+
+
+def _deviation(problem: Problem) -> float:
+    """Return the root mean square standard deviation of the rows, NaN where they are not all lengths."""
+    if {MODELS[rows.kind].quantity for rows in problem.rows} != {"length"}:
+        return float("nan")
+    return float(np.sqrt(np.mean(variances(problem.noise, problem.count))))
+
+
+def extent(problem: Problem, places: Array | None = None, *, widen: float = 0.5) -> tuple[float, float, float, float]:
+    """Return x and y limits that hold stations and places (n, d), widened on every side by a share of the larger side.
+
+    Degrees in three-dimensional frames of the Earth, else metres.
+    """
+    earth = problem.frame.geodetic and problem.dimension == 3
+    stations = problem.stations.position.reshape(-1, problem.dimension)
+    points = stations if places is None else np.concatenate([stations, places])
+    flat = plan_of(problem.frame, points[np.isfinite(points).all(-1)], earth)[:, :2]
+    if earth:  # longitudes as one piece, also across the date line
+        flat[:, 0] = (flat[:, 0] - flat[0, 0] + 180.0) % 360.0 - 180.0 + flat[0, 0]
+    low, high = flat.min(0), flat.max(0)
+    squeeze = np.array([np.cos(np.radians(np.clip(flat[:, 1].mean(), -85.0, 85.0))) if earth else 1.0, 1.0])
+    side = max(float(((high - low) * squeeze).max()), 1e-3 if earth else 1.0)
+    low, high = low - widen * side / squeeze, high + widen * side / squeeze
+    if earth:
+        low[1], high[1] = max(low[1], -89.0), min(high[1], 89.0)
+    return float(low[0]), float(high[0]), float(low[1]), float(high[1])

@@ -1,0 +1,220 @@
+"""The Cramer-Rao bound: what no unbiased estimate can beat."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optloc.base import linalg
+from optloc.base import linalg as tangents
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array
+from optloc.compute.sums import equations_at
+from optloc.linear.constraints import exact, levels, tangent_at
+from optloc.linear.normal import Linear, Normal, covariance, linearise, marginal, normal, prior_parts
+from optloc.problem.epochs import tied, windows
+from optloc.problem.layout import Layout
+from optloc.problem.problem import Problem
+
+OPEN = 1e-12
+"""Share of its information, scaled to one, below which a combination of unknowns counts as open."""
+
+
+def crlb(problem: Problem, truth: Array) -> Array:
+    """Return the Cramer-Rao lower bound of the shared unknowns.
+
+    The inverse of the same normal matrix that refines a fix, taken at the truth; unknowns local to an epoch are
+    eliminated, priors count as information, and equalities such as an exact height leave their tangent space.
+
+    Parameters
+    ----------
+    problem : Problem
+        Stations, rows and noise; its measurements do not matter.
+    truth : array (..., size)
+        True parameter vectors.
+
+    Returns
+    -------
+    array (..., n, n)
+        Covariance bound in SI units; NaN where the geometry is singular.
+
+    References
+    ----------
+    S. M. Kay, "Fundamentals of Statistical Signal Processing: Estimation Theory" (1993), eq. 3.31.
+    J. D. Gorman and A. O. Hero, "Lower bounds for parametric estimation with constraints" (1990), theorem 1.
+    """
+    x, held = np.asarray(truth, dtype=float), exact(problem)
+    equations = equations_at(problem, x)
+    if not held:
+        return covariance(equations)[0]
+    information, _, ok = marginal(equations)
+    vectors = np.broadcast_to(x, (*ok.shape, x.shape[-1])).reshape(-1, x.shape[-1])
+    space = tangent_at(problem.flat(), held, vectors)
+    bound, good = tangents.inverse_within(information.reshape(-1, *information.shape[-2:]), space)
+    return np.where((ok.ravel() & good)[:, None, None], bound, np.nan).reshape(information.shape)
+
+
+@dataclass(frozen=True, slots=True)
+class Course:
+    """The bound after the first epochs of a run.
+
+    Parameters
+    ----------
+    counts : int array (q,)
+        How many epochs count.
+    times : array (q,)
+        Seconds of the last of them.
+    covariance : array (q, n, n)
+        Bound of the shared unknowns in SI units; NaN where they are not yet determined.
+    layout : Layout
+        What each entry means.
+    """
+
+    counts: Array
+    times: Array
+    covariance: Array
+    layout: Layout
+
+    def sigma(self, name: str) -> Array:
+        """Return the bound (q, size) of the standard deviations of a named unknown."""
+        slot, _ = self.layout.find(name)
+        variance = np.diagonal(self.covariance, axis1=-2, axis2=-1)[:, slot.start : slot.start + slot.size]
+        return np.asarray(np.sqrt(variance))
+
+    def total(self, name: str) -> Array:
+        """Return the root of the sum of variances (q,) of a named unknown: of a position, its error in space."""
+        return np.asarray(np.linalg.norm(self.sigma(name), axis=-1))
+
+
+def crlb_course(
+    problem: Problem, truth: Array, counts: Sequence[int] | Array | None = None, *, known: Sequence[str] = ()
+) -> Course:
+    """Return the Cramer-Rao bound after the first 1, 2, ... epochs of a run.
+
+    What every epoch says of the shared unknowns, its own unknowns eliminated, adds up; the prior counts once. Time is
+    proportional to the number of epochs, and memory beyond the answer does not depend on it.
+
+    Parameters
+    ----------
+    problem : Problem
+        A single problem whose epochs share unknowns; its measurements do not matter.
+    truth : array (size,)
+        True parameter vector.
+    counts : sequence of int, optional
+        Numbers of epochs, 1 to k; all by default.
+    known : sequence of str
+        Names of shared unknowns that are taken as known; their bound is zero.
+
+    Raises
+    ------
+    InvalidProblem
+        Where noise ties the epochs together, a count is out of range, or a name is unknown.
+
+    References
+    ----------
+    S. M. Kay, "Fundamentals of Statistical Signal Processing: Estimation Theory" (1993), sections 3.7 and 8.4.
+    """
+    x, layout, k = np.asarray(truth, dtype=float), problem.layout, problem.epochs
+    if tied(problem):
+        advice = "ask for the bound of the whole run"
+        raise InvalidProblem("noise correlates the epochs, so that what they say does not add up", "noise", advice)
+    chosen = np.arange(1, k + 1) if counts is None else np.asarray(counts, dtype=np.int64)
+    if chosen.ndim != 1 or not len(chosen) or chosen.min() < 1 or chosen.max() > k:
+        raise InvalidProblem(f"the counts are not among 1 to {k}", "counts", "give numbers of epochs")
+    total, size = _totals(problem, x, chosen)
+    prior = shared_priors(problem)
+    bound = _inverse(total + prior, size + np.diagonal(prior), free_directions(problem, x, known))
+    return Course(chosen, problem.times[chosen - 1], bound, layout)
+
+
+def free_directions(problem: Problem, x: Array, known: Sequence[str] = ()) -> Array:
+    """Return a basis (n, p) of what equalities, at a vector (size,), and names that are known leave free."""
+    layout, held = problem.layout, exact(problem)
+    fixed = np.zeros(layout.n_shared, dtype=bool)
+    for slot in (layout.find(name)[0] for name in known):
+        fixed[slot.start : slot.start + slot.size] = True
+    eye = np.eye(layout.n_shared)
+    if not held:
+        return eye[:, ~fixed]
+    gradients = levels(problem.flat(), held, x[None])[1]
+    across = np.concatenate([gradients, eye[None, fixed]], axis=1)
+    return np.asarray(tangents.tangent(across, np.ones((1, len(eye)))).along[0])
+
+
+def _totals(problem: Problem, x: Array, counts: Array) -> tuple[Array, Array]:
+    """Return what the first epochs say together (q, n, n), and its diagonal (q, n) before anything was eliminated."""
+    n = problem.layout.n_shared
+    total, size = np.zeros((len(counts), n, n)), np.zeros((len(counts), n))
+    so_far, size_so_far = np.zeros((n, n)), np.zeros(n)
+    for first, each, known in _each_epoch(problem, x):
+        sums, sizes = so_far + np.cumsum(each, axis=0), size_so_far + np.cumsum(known, axis=0)
+        inside = np.flatnonzero((counts > first) & (counts <= first + len(each)))
+        total[inside], size[inside] = sums[counts[inside] - first - 1], sizes[counts[inside] - first - 1]
+        so_far, size_so_far = sums[-1], sizes[-1]
+    return total, size
+
+
+def _each_epoch(problem: Problem, x: Array) -> Iterator[tuple[int, Array, Array]]:
+    """Yield the first epoch of stretches, what each epoch says of the shared unknowns (k, n, n), and its size.
+
+    The size is the diagonal (k, n) before elimination.
+    """
+    n = problem.layout.n_shared
+    for first, last, part in windows(problem):
+        linear = linearise(part, x)
+        # As if every epoch had all unknowns to itself: the local blocks are then what each epoch says.
+        both = np.concatenate([linear.shared, linear.local], axis=-1)
+        own = Linear(linear.residual, linear.shared[..., :0], both, linear.epoch - first, linear.noise)
+        gram = normal(own, last - first).local
+        none, here = np.zeros(len(gram)), gram[:, None]
+        equations = Normal(
+            gram[:, :n, :n], here[..., n:, n:], here[..., :n, n:], none[:, None], none[:, None, None], none
+        )
+        yield first, eliminated(with_local_priors(problem, equations)), np.diagonal(gram[:, :n, :n], 0, -2, -1)
+
+
+def _inverse(information: Array, size: Array, basis: Array) -> Array:
+    """Return inverses (q, n, n) on a basis (n, p), NaN where a combination is open.
+
+    `size` (q, n), the diagonal before elimination, tells what rounding leaves of zero.
+    """
+    inner, size = basis.T @ information @ basis, size @ basis**2
+    inverse, _ = linalg.inverse(inner)
+    scale = 1.0 / np.sqrt(np.where(size > 0.0, size, 1.0))
+    weakest = np.linalg.eigvalsh(inner * scale[..., :, None] * scale[..., None, :]).min(-1, initial=1.0)
+    return np.where((weakest > OPEN)[..., None, None], basis @ inverse @ basis.T, np.nan)
+
+
+def with_local_priors(problem: Problem, equations: Normal) -> Normal:
+    """Return equations of the data with what is known of the unknowns of single epochs, such as station errors."""
+    local = equations.local.copy()
+    for name, _, precision in prior_parts(problem):
+        slot, shared = problem.layout.find(name)
+        if not shared:
+            part = slice(slot.start, slot.start + slot.size)
+            local[..., part, part] += precision
+    return replace(equations, local=local)
+
+
+def shared_priors(problem: Problem) -> Array:
+    """Return the precision (n, n) of the priors of shared unknowns."""
+    layout = problem.layout
+    precision = np.zeros((layout.n_shared, layout.n_shared))
+    for name, _, part in prior_parts(problem):
+        slot, shared = layout.find(name)
+        if shared:
+            where = slice(slot.start, slot.start + slot.size)
+            precision[where, where] += part
+    return precision
+
+
+def eliminated(equations: Normal) -> Array:
+    """Return the information (..., n, n) of the shared unknowns; an epoch that leaves some of its own open counts too.
+
+    Where all local blocks are regular it is that of `optloc.linear.normal.marginal`.
+    """
+    root, _ = linalg.root(equations.local)
+    seen = equations.cross @ root
+    return np.asarray(equations.shared - (seen @ np.swapaxes(seen, -1, -2)).sum(-3))

@@ -1,0 +1,241 @@
+"""What the data say about each unknown, what the priors say, and which combinations stay open."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.bounds.crlb import OPEN, eliminated, free_directions, shared_priors, with_local_priors
+from optloc.compute.sums import summed
+from optloc.problem.layout import Layout, Slot
+from optloc.problem.problem import Problem
+
+TIED = 0.99
+"""Correlation from which a bias counts as hard to tell from another unknown."""
+
+_SHOWN, _FEW = 8, 2
+
+
+@dataclass(frozen=True, slots=True)
+class Observability:
+    """What is known of each shared unknown of a problem, from what.
+
+    Parameters
+    ----------
+    labels : tuple of n str
+        Names of the unknowns, for instance "position x" or "clock B".
+    units : tuple of n str
+        Their SI units.
+    data : array (n,)
+        Standard deviation from the measurements alone; infinite where they leave the unknown open.
+    prior : array (n,)
+        Standard deviation of the prior; infinite where there is none.
+    posterior : array (n,)
+        Standard deviation from both.
+    rank : int
+        Number of combinations of the unknowns that the measurements determine.
+    open : tuple of str
+        Sentences that name the combinations that the measurements leave open.
+    tied : tuple of str
+        One sentence for each group of unknowns, biases among them, that are hard to tell apart even so.
+    """
+
+    labels: tuple[str, ...]
+    units: tuple[str, ...]
+    data: Array
+    prior: Array
+    posterior: Array
+    rank: int
+    open: tuple[str, ...]
+    tied: tuple[str, ...]
+
+    @property
+    def from_data(self) -> Array:
+        """Return the share (n,) of what is known that the measurements contribute.
+
+        One less the posterior variance over the prior one: 0 where the prior says it all, 1 without a prior, NaN where
+        nothing is known.
+        """
+        with np.errstate(invalid="ignore", divide="ignore"):
+            left = np.where(np.isinf(self.prior), 0.0, (self.posterior / self.prior) ** 2)
+        return np.where(np.isinf(self.posterior), np.nan, np.clip(1.0 - left, 0.0, 1.0))
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """Return what is not separable, one sentence each; empty where everything is."""
+        return (*self.open, *self.tied)
+
+
+def observability(problem: Problem, x: Array) -> Observability:
+    """Return what the data and the priors say about each shared unknown of a problem.
+
+    The normal matrix of the measurements at x, unknowns of single epochs eliminated and columns scaled, is taken apart
+    into its eigenvectors: those of eigenvalue zero are combinations of unknowns that no measurement sees, all others
+    have a finite variance. Errors of station positions that last one epoch, and equality constraints, count with the
+    measurements; priors of shared unknowns do not.
+
+    Parameters
+    ----------
+    problem : Problem
+        A single problem.
+    x : array (size,)
+        Where it is linearised: a fix, or a truth.
+
+    Returns
+    -------
+    Observability
+        In SI units.
+
+    References
+    ----------
+    S. M. Kay, "Fundamentals of Statistical Signal Processing: Estimation Theory" (1993), sections 3.7 and 10.4.
+    G. H. Golub and C. F. Van Loan, "Matrix Computations" (2013), section 5.5.
+    """
+    x = np.asarray(x, dtype=float)
+    layout = problem.layout
+    equations = with_local_priors(problem, summed(problem, x))
+    information, size = eliminated(equations), equations.shared
+    basis = free_directions(problem, x)
+    precision = shared_priors(problem)
+    data = _taken_apart(information, size, basis)
+    both = _taken_apart(information + precision, size + precision, basis)
+    shown = np.isfinite(data.sigma)  # what is open is named as such
+    return Observability(
+        layout.labels(),
+        tuple(slot.unit for slot in layout.shared for _ in range(slot.size)),
+        data.sigma,
+        _taken_apart(precision, precision, np.eye(layout.n_shared)).sigma,
+        both.sigma,
+        basis.shape[1] - len(data.open),
+        tuple(_open_sentences(layout, data)),
+        tuple(_tied_sentences(layout, both.correlation * np.outer(shown, shown))),
+    )
+
+
+def open_sentences(layout: Layout, information: Array) -> tuple[str, ...]:
+    """Return sentences that name the combinations of shared unknowns on which an information matrix is silent."""
+    return tuple(_open_sentences(layout, _taken_apart(information, information, np.eye(layout.n_shared))))
+
+
+@dataclass(frozen=True, slots=True)
+class _Parts:
+    """Standard deviations (n,), correlations (n, n), and a basis (q, n) of what is open, in units of `reach` (n,)."""
+
+    sigma: Array
+    correlation: Array
+    open: Array
+    reach: Array
+
+
+def _taken_apart(information: Array, size: Array, basis: Array) -> _Parts:
+    """Return what information (n, n) on a basis (n, p) determines.
+
+    `size` is the information before anything was eliminated: its rounding errors decide what counts as zero.
+    """
+    weight = np.sqrt(np.einsum("ip,ij,jp->p", basis, size, basis).clip(0.0))
+    basis = basis / np.where(weight > 0.0, weight, 1.0)
+    values, vectors = np.linalg.eigh(basis.T @ information @ basis)
+    directions = basis @ vectors
+    reach = np.linalg.norm(directions, axis=-1, keepdims=True)
+    reach = np.where(reach > 0.0, reach, 1.0)
+    shut = values > OPEN
+    known, null = directions[:, shut] / np.sqrt(values[shut]), directions[:, ~shut] / reach
+    sigma = np.linalg.norm(known, axis=-1)
+    loose = (np.abs(null) > 1e-6).any(-1)
+    unit = known / np.where(sigma > 0.0, sigma, 1.0)[:, None]
+    correlation = np.where(loose[:, None] | loose, 0.0, unit @ unit.T)
+    return _Parts(np.where(loose, np.inf, sigma), correlation, null.T, reach[:, 0])
+
+
+def _open_sentences(layout: Layout, parts: _Parts) -> Iterator[str]:
+    """Yield sentences that name what is open: a common change of a family first, then what is left."""
+    common = np.array([_entries(layout, slot) for slot in layout.shared if slot.members]).reshape(-1, layout.n_shared)
+    found = [row for row in common / parts.reach if _inside(row, parts.open)]
+    for row in found:
+        yield _open_sentence(layout, row * parts.reach)
+    rest = _sparse(_without(parts.open, found))
+    if len(rest) <= _FEW:
+        yield from (_open_sentence(layout, row * parts.reach) for row in rest)
+    else:
+        names = [label for label, used in zip(layout.labels(), np.asarray(rest.any(0)), strict=True) if used]
+        yield f"the data leave {len(rest)} combinations of {_listed(names)} open"
+
+
+def _entries(layout: Layout, slot: Slot) -> Array:
+    """Return the change (n,) of all entries of a slot by one."""
+    place = np.arange(layout.n_shared) - slot.start
+    return ((place >= 0) & (place < slot.size)).astype(float)
+
+
+def _inside(row: Array, basis: Array) -> bool:
+    """Return whether a vector (n,) lies in the span of a basis (q, n)."""
+    away = row - np.linalg.lstsq(basis.T, row, rcond=None)[0] @ basis
+    return float(np.linalg.norm(away)) < 1e-6 * float(np.linalg.norm(row))
+
+
+def _without(basis: Array, found: list[Array]) -> Array:
+    """Return a basis (q - f, n) of what a basis (q, n) spans beside f vectors within it."""
+    if not found:
+        return basis
+    taken, _ = np.linalg.qr(np.array(found).T)
+    _, _, right = np.linalg.svd(basis - basis @ taken @ taken.T)
+    return np.asarray(right[: len(basis) - len(found)])
+
+
+def _sparse(rows: Array) -> Array:
+    """Return a basis (q, n) of the same space in which each row has an entry of one that no other row has."""
+    rows = rows.copy()
+    for i in range(len(rows)):
+        at, pivot = divmod(int(np.argmax(np.abs(rows[i:]))), rows.shape[1])
+        rows[[i, i + at]] = rows[[i + at, i]]
+        rows[i] /= rows[i, pivot]
+        others = np.arange(len(rows)) != i
+        rows[others] -= rows[others, pivot, None] * rows[i]
+    return np.where(np.abs(rows) > 1e-5, rows, 0.0)
+
+
+def _open_sentence(layout: Layout, direction: Array) -> str:
+    """Return the sentence of a combination (n,) of unknowns that no measurement sees."""
+    labels, names, amounts = layout.labels(), [], []
+    for slot in layout.shared:
+        unit = "" if slot.unit == "1" else slot.unit
+        part = direction[slot.start : slot.start + slot.size]
+        if slot.size > 2 and part[0] and np.allclose(part, part[0], rtol=1e-4):
+            names.append(f"every {slot.name}")
+            amounts.append((float(part[0]), unit))
+        else:
+            names += [labels[slot.start + i] for i in np.flatnonzero(part)]
+            amounts += [(float(value), unit) for value in part[part != 0.0]]
+    values = np.array([value for value, _ in amounts])
+    if len(names) == 1 and not names[0].startswith("every "):
+        return f"the data do not show {names[0]}"
+    if len({unit for _, unit in amounts}) == 1 and np.allclose(values, values[0], rtol=1e-4):
+        return f"the data do not show a common change of {_listed(names)}"
+    values = values / values[0]
+    shown = [f"{name} by {v:+.3g} {u}".rstrip() for name, v, (_, u) in zip(names, values, amounts, strict=True)]
+    return f"the data do not show a change of {_listed(shown)}"
+
+
+def _tied_sentences(layout: Layout, correlation: Array) -> list[str]:
+    """Return a sentence for each group of unknowns with biases in it that are strongly correlated."""
+    from scipy.sparse.csgraph import connected_components
+
+    labels, found = layout.labels(), []
+    bias = np.array([bool(slot.members) for slot in layout.shared for _ in range(slot.size)])
+    close = np.abs(np.triu(correlation, 1)) > TIED
+    _, group = connected_components(close, directed=False)
+    for number in np.unique(group[bias]):
+        members = np.flatnonzero(group == number)
+        if len(members) > 1:
+            most = np.abs(np.triu(correlation[np.ix_(members, members)], 1)).max()
+            found.append(f"hard to tell apart: {_listed([labels[i] for i in members])} (correlated up to {most:.5f})")
+    return found
+
+
+def _listed(names: list[str]) -> str:
+    if len(names) > _SHOWN:
+        names = [*names[: _SHOWN - 1], f"{len(names) - _SHOWN + 1} more"]
+    return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))

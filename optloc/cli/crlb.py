@@ -1,0 +1,351 @@
+"""What ``optloc crlb`` and ``optloc simulate`` do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.linalg import error_ellipse
+from optloc.base.types import Array
+from optloc.bounds.bound_map import BoundMap, bound_map, extent, plan_of
+from optloc.bounds.crlb import Course, crlb_course
+from optloc.cli.output import dumps, saved, write_text
+from optloc.files import Loaded, read
+from optloc.files.words import Units
+from optloc.problem.epochs import by_epoch, separable, tied
+from optloc.problem.layout import Layout, Slot, state_names
+from optloc.problem.problem import Problem
+
+# The Cramer-Rao bound of a run against time, as a table and as records.
+
+_LINES, _POINTS, _UNKNOWNS = 10, 400, 100
+_RMS = {True: " (rms)", False: ""}
+
+
+def courses(problem: Problem, truth: Array) -> tuple[Course, Course | None] | None:
+    """Return the bound against time with biases unknown and, if there are some, known; None where it has none."""
+    n, k = problem.layout.n_shared, problem.epochs
+    if k == 1 or not 0 < n <= _UNKNOWNS or tied(problem) or problem.batch_shape:
+        return None
+    counts = np.arange(1, k + 1) if k <= _POINTS else np.unique(np.geomspace(1, k, _POINTS).round().astype(int))
+    names = [slot.name for slot in problem.layout.shared if slot.members]
+    course = crlb_course(problem, truth, counts)
+    targets = len(names) < len(problem.layout.shared)
+    return course, crlb_course(problem, truth, counts, known=names) if names and targets else None
+
+
+def course_records(course: Course, known: Course | None) -> list[dict[str, Any]]:
+    """Return the bound at a few times: epochs, time, sigma of every unknown by name, and with biases known."""
+    labels = course.layout.labels()
+    return [
+        {
+            "epochs": int(course.counts[i]),
+            "time": float(course.times[i]),
+            "sigma": dict(zip(labels, _course_sigmas(course, i), strict=True)),
+            "biases_known": None if known is None else dict(zip(labels, _course_sigmas(known, i), strict=True)),
+        }
+        for i in _few(course)
+    ]
+
+
+def _course_sigmas(course: Course, i: int) -> Array:
+    return np.asarray(np.sqrt(np.diagonal(course.covariance[i])))
+
+
+def _few(course: Course) -> list[int]:
+    """Return the places of a few times, closer together at the start."""
+    wanted = np.geomspace(1, course.counts[-1], _LINES)
+    return [int(i) for i in np.unique(np.searchsorted(course.counts, np.floor(wanted)))]
+
+
+def shown(layout: Layout) -> tuple[str, ...]:
+    """Return the names of the unknowns that a table or a picture has room for: of two targets, and four biases."""
+    states = [slot.name for slot in layout.shared if not slot.members]
+    biases = [slot.name for slot in layout.shared if slot.members]
+    return (*states[:4], *biases[:4])
+
+
+def course_table(course: Course, known: Course | None) -> Table:
+    """Return the bound at a few times, as root sum of squares over coordinates and root mean square over members."""
+    table = Table(title="Bound after the first epochs", title_justify="left")
+    for name in ("epochs", "time, s"):
+        table.add_column(name, justify="right")
+    columns: list[tuple[Course, Slot]] = []
+    for slot in (course.layout.find(name)[0] for name in shown(course.layout)):
+        table.add_column(f"{slot.name}{_RMS[bool(slot.members)]}, {slot.unit}".rstrip(", "), justify="right")
+        columns.append((course, slot))
+        if known is not None and not slot.members:
+            table.add_column("biases known", justify="right")
+            columns.append((known, slot))
+    values = [which.total(slot.name) / np.sqrt(slot.size if slot.members else 1) for which, slot in columns]
+    for i in _few(course):
+        numbers = [f"{value[i]:.4g}" if np.isfinite(value[i]) else "-" for value in values]
+        table.add_row(str(course.counts[i]), f"{course.times[i]:g}", *numbers)
+    return table
+
+
+def run_crlb(
+    file: Path,
+    at: str | None,
+    velocity: str | None,
+    *,
+    geodetic: bool,
+    as_json: bool,
+    plot: Path | None = None,
+    quiet: bool = False,
+) -> int:
+    """Print the Cramer-Rao bound at a truth or at the fix, draw it against time, and return the exit code."""
+    from optloc.bounds.crlb import crlb
+
+    loaded = read(file, values=False)
+    problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
+    truth = _fixed(file) if at is None and _sought(problem) else vector(problem, at, velocity, geodetic)
+    bound = np.asarray(crlb(problem, truth))
+    bound = np.broadcast_to(bound, (*problem.batch_shape, *bound.shape[-2:])).reshape(-1, *bound.shape[-2:])
+    labels = loaded.epochs if problem.batch_shape else ("run" if loaded.problem.epochs > 1 else loaded.epochs[0],)
+    rows = [
+        _bound(label, slot, cov[slot.start : slot.start + slot.size, slot.start : slot.start + slot.size])
+        for label, cov in zip(labels, bound, strict=True)
+        for slot in problem.layout.shared
+    ]
+    over_time = courses(problem, truth)
+    if plot is not None:
+        _draw(plot, loaded, over_time)
+    if as_json:
+        course = [] if over_time is None else course_records(*over_time)
+        write_text(Path("-"), dumps({"file": loaded.source, "bounds": rows, "course": course}))
+    elif not quiet:
+        console = Console()
+        console.print(_bound_table(loaded, rows))
+        if over_time is not None:
+            console.print(course_table(*over_time))
+    return 0 if all(np.isfinite(row["sigma"]).all() for row in rows) and rows else 1
+
+
+def _sought(problem: Problem) -> bool:
+    """Return whether the position of some target is unknown, so that it matters where it is."""
+    return any(motion.known is None for motion in problem.motions)
+
+
+def _fixed(file: Path) -> Array:
+    """Return the fix of a file that has measured values."""
+    from optloc.solvers import solve
+
+    problem = read(file).problem
+    return solve(problem).x
+
+
+def _draw(path: Path, loaded: Loaded, over_time: tuple[Course, Course | None] | None) -> None:
+    from optloc.plot import plot_course
+
+    if over_time is None:
+        advice = "give the epochs something in common, a motion or biases, but not hundreds of targets"
+        raise InvalidProblem("the epochs share no unknowns, or too many to be drawn", "--plot", advice)
+    names = shown(over_time[0].layout)
+    saved(plot_course(*over_time, title=f"{loaded.title}: Cramer-Rao bound", names=names), path)
+
+
+def _bound(label: str, slot: Slot, covariance: Array) -> dict[str, Any]:
+    record = {"epoch": label, "unknown": slot.name, "entries": slot.entries, "unit": slot.unit}
+    record |= {"sigma": np.sqrt(np.diagonal(covariance))}
+    if not slot.name.startswith("position"):
+        return record
+    return record | {"ellipse95": error_ellipse(covariance)[0][::-1], "covariance": covariance}
+
+
+def _bound_table(loaded: Loaded, rows: list[dict[str, Any]], limit: int = 30) -> Table:
+    table = Table(title=f"{loaded.title}: Cramer-Rao bound", title_justify="left")
+    for name in ("epoch", "unknown", "sigma", "95 % ellipse, m (semi-axes)"):
+        table.add_column(name)
+    for row in rows[:limit]:
+        ellipse = ", ".join(f"{v:.4g}" for v in row.get("ellipse95", ()))
+        table.add_row(row["epoch"], row["unknown"], _sigmas(row), ellipse)
+    if len(rows) > limit:
+        table.add_row("...", "", f"{len(rows) - limit} more", "--json prints all")
+    return table
+
+
+def _sigmas(row: dict[str, Any], limit: int = 16) -> str:
+    """Return standard deviations in a line, those of members one below the other."""
+    if set(row["entries"]) <= set("xyz"):
+        return f"{', '.join(f'{v:.4g}' for v in row['sigma'])} {row['unit']}"
+    named = zip(row["entries"][:limit], row["sigma"], strict=False)
+    lines = [f"{entry}: {v:.4g} {row['unit']}".strip(": ") for entry, v in named]
+    return "\n".join(
+        [*lines, *([f"... and {len(row['entries']) - limit} more"] if len(row["entries"]) > limit else [])]
+    )
+
+
+def vector(problem: Problem, position: str | None, velocity: str | None, geodetic: bool) -> Array:
+    """Return the true parameter vector of targets at a position; biases have their prior means, the rest is zero."""
+    place = None if position is None else _coordinates(position, "position")
+    if geodetic and place is not None:
+        if not problem.frame.geodetic or len(place) != 3:
+            raise InvalidProblem(
+                "latitude, longitude and height need a geodetic frame and three numbers", "--geodetic", "leave it out"
+            )
+        place = problem.frame.from_geodetic(np.radians(place[0]), np.radians(place[1]), place[2])[: problem.dimension]
+    values = {"position": place, "velocity": None if velocity is None else _coordinates(velocity, "--velocity")}
+    layout = problem.layout
+    shared, local = np.zeros(layout.n_shared), np.zeros((problem.epochs, layout.n_local))
+    for i, motion in enumerate(problem.motions):
+        if motion.known is not None:
+            continue
+        for name in state_names(i, len(problem.motions), motion.order):
+            value = values.get(name.partition("[")[0])
+            if value is None:
+                continue
+            if len(value) != problem.dimension:
+                raise InvalidProblem(
+                    f"{len(value)} coordinates do not fit {problem.dimension} dimensions", name, "give one each"
+                )
+            slot, is_shared = layout.find(name)
+            (shared if is_shared else local)[..., slot.start : slot.start + slot.size] = value
+    for bias in problem.biases:
+        if bias.sigma is not None:
+            slot, _ = layout.find(bias.name)
+            shared[slot.start : slot.start + slot.size] = np.ravel(bias.mean)
+    if velocity is not None and all(motion.order == 0 for motion in problem.motions):
+        raise InvalidProblem(
+            "the target of this file does not move", "--velocity", 'write motion = "constant_velocity"'
+        )
+    return np.concatenate([shared, local.ravel()])
+
+
+def _coordinates(text: str, where: str) -> Array:
+    try:
+        values = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        values = np.array([np.nan])
+    if not np.isfinite(values).all():
+        raise InvalidProblem(f"{text!r} is no list of numbers", where, "write them as 1200,800,50")
+    return values
+
+
+def run_simulate(
+    file: Path, truth: str, velocity: str | None, out: Path, *, geodetic: bool, seed: int, trials: int, quiet: bool
+) -> int:
+    """Draw measurements, write them as a problem file, and return the exit code."""
+    from tempfile import TemporaryDirectory
+
+    from optloc.files.writer import write_measured
+    from optloc.linear.evaluate import predict
+    from optloc.linear.simulate import simulate
+
+    problem = read(file, values=False).problem
+    x = vector(problem, truth, velocity, geodetic)
+    with TemporaryDirectory() as folder:  # a spread in decibels depends on the values
+        exact, *_ = write_measured(file, Path(folder) / out.name, np.atleast_2d(predict(problem, x)), note="")
+        drawn = simulate(read(exact).problem, x, seed, trials)
+    z = np.concatenate([rows.z for rows in drawn.rows], axis=-1)
+    written = write_measured(file, out, z, note=f"drawn at {truth} with seed {seed}")
+    if not quiet:
+        Console().print(
+            f"{trials} trial(s) of {z.shape[-1]} rows are in {', '.join(str(p) for p in written)}.", highlight=False
+        )
+    return 0
+
+
+# What ``optloc crlb --map`` does.
+
+_MAP_POINTS = 96
+_PICTURES = (".png", ".svg", ".pdf")
+
+
+def run_map(
+    file: Path,
+    out: Path,
+    at: str | None,
+    height: str | None,
+    limits: str | None,
+    velocity: str | None,
+    *,
+    geodetic: bool,
+    dilution: bool,
+) -> int:
+    """Write the map of the bound of a file, of the first epoch where each has a position of its own."""
+    if out.suffix.lower() not in (*_PICTURES, ".html", ".geojson"):
+        advice = "use .png, .svg, .pdf, .geojson or .html"
+        raise InvalidProblem(f"maps of type {out.suffix or out.name!r} are unknown", str(out), advice)
+    loaded = read(file, values=False)
+    problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
+    problem = problem.flat().take(np.zeros(1, dtype=int)) if problem.batch_shape else problem
+    truth = vector(problem, at, velocity, geodetic)
+    place = _place(file, problem, at, truth, needed=height is None and problem.dimension == 3)
+    x0, x1, y0, y1 = extent(problem, place) if limits is None else _limits(limits, problem)
+    grid = np.linspace(x0, x1, _MAP_POINTS), np.linspace(y0, y1, _MAP_POINTS)
+    found = bound_map(problem, truth, *grid, _height(problem, place, height))
+    what = "dilution of precision" if dilution else "bound of the position error"
+    _write(found, out, f"{loaded.title}: {what}", dilution=dilution)
+    return 0
+
+
+def _place(file: Path, problem: Problem, at: str | None, truth: Array, *, needed: bool) -> Array | None:
+    """Return the place (1, d) that is given or fixed, None where it is not needed."""
+    sought = [i for i, motion in enumerate(problem.motions) if motion.known is None]
+    names = [slot for slot in problem.layout.shared if slot.name.partition("[")[0] == "position"]
+    if at is not None and len(sought) == 1 and names:
+        return np.asarray(truth[None, names[0].start : names[0].start + names[0].size])
+    if not needed:
+        return None
+    from optloc.solvers import solve
+
+    fix = solve(read(file).problem)
+    place = fix.position.reshape(-1, problem.dimension)
+    good = place[np.isfinite(place).all(-1)]
+    if not len(good):
+        advice = "give the height of the map with --height, or a place with --at"
+        raise InvalidProblem("the file has no fix that tells the height", "--map", advice)
+    return np.asarray(good[:1])
+
+
+def _height(problem: Problem, place: Array | None, height: str | None) -> float:
+    if problem.dimension == 2:
+        return 0.0
+    if height is not None:
+        return float(Units("length").plain(_number(height), "m", "--height"))
+    assert place is not None
+    return float(plan_of(problem.frame, place, problem.frame.geodetic)[0, 2])
+
+
+def _number(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _limits(text: str, problem: Problem) -> tuple[float, float, float, float]:
+    """Return the limits of a map; raise InvalidProblem where they are none."""
+    try:
+        x0, x1, y0, y1 = (float(part) for part in text.split(","))
+    except ValueError:
+        x0 = x1 = y0 = y1 = float("nan")
+    earth = problem.frame.geodetic and problem.dimension == 3
+    fits = not earth or (-360.0 <= x0 and x1 <= 540.0 and x1 - x0 <= 360.0 and y0 >= -90.0 and y1 <= 90.0)
+    if not (x0 < x1 and y0 < y1 and np.isfinite([x0, x1, y0, y1]).all() and fits):
+        advice = "write west,east,south,north in degrees" if earth else "write least x, greatest x, least y, greatest y"
+        raise InvalidProblem(f"{text!r} is no extent of a map", "--extent", advice)
+    return x0, x1, y0, y1
+
+
+def _write(found: BoundMap, out: Path, title: str, *, dilution: bool) -> None:
+    from optloc.plot.bound_map import map_geojson, plot_bound_map
+
+    ending = out.suffix.lower()
+    if ending in _PICTURES:
+        saved(plot_bound_map(found, title, dilution=dilution), out)
+        return
+    if dilution:
+        raise InvalidProblem("the dilution is drawn as a picture only", str(out), "use .png, .svg or .pdf")
+    if ending == ".geojson":
+        write_text(out, dumps(map_geojson(found)))
+        return
+    from optloc.report import map_pages
+
+    write_text(out, map_pages(found, title))

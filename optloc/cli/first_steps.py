@@ -1,0 +1,267 @@
+"""What ``optloc demo`` does: fix a shipped problem, or walk through a fix, a registration and a proof."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.resources import as_file, files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.markdown import Markdown
+
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.units import SI_UNIT, UNITS
+from optloc.cli.fix import draw, show
+from optloc.cli.fixed import Fixed, fix_file
+from optloc.cli.output import dumps, fixed_json, write_text
+from optloc.files import read
+from optloc.files.convert import Converted, convert
+from optloc.models import MODELS, Model
+
+_FIX = """
+# 1. A fix
+
+Six receivers heard one pulse. When it was sent nobody knows, so all there is are five differences of arrival times,
+each good to about 28 ns. From these, and from no first guess, comes the table below: the most likely position, what it
+is off by (±, one standard deviation), and `status ok`: an answer that can be used.
+
+`chi-square` compares the residuals with the stated noise: p near 0 would say that something does not fit.
+"""
+_REGISTRATION = """
+# 2. A registration
+
+Five aircraft time an emitter some 360 km away for ten minutes, 200 times, each by a clock of its own. The errors of
+four of these clocks are unknown: a fix that believed them would be more than a kilometre off. They are estimated
+together with the position, and `from data` says how much of each estimate is measurement, not assumption.
+
+The line `certificate` says `unknown`: so many rows are more than a proof takes, and what is not proven is not claimed.
+"""
+_PROOF = """
+# 3. A proof
+
+Three receivers in the plane give two differences, and two places explain them exactly. An iteration finds the one that
+is nearer to its first guess, and says nothing of the other. The line `certificate` is no iteration: all places were
+enclosed in boxes, and each box that was dropped was proven to hold nothing better. So the status is
+`ambiguous`, both places are listed, and it is proven that there is no third.
+"""
+_END = """
+# Next
+
+- `optloc new tdoa --out site.toml` writes a problem file with comments, to be filled with your own numbers;
+  `optloc list starters` shows what else there is.
+- `optloc check site.toml`, then `optloc fix site.toml --plot fix.png`.
+- `optloc convert` reads tables of arrival times, pseudoranges and GeoJSON stations.
+"""
+_STEPS = ((_FIX, "demo"), (_REGISTRATION, "registration"), (_PROOF, "ambiguous"))
+PICTURE = Path("optloc-demo.png")
+
+
+def titles() -> dict[str, str]:
+    """Return the titles of the shipped problems by name."""
+    import tomllib
+
+    folder = files("optloc") / "scenarios"
+    found = {entry.name.removesuffix(".toml"): entry for entry in folder.iterdir() if entry.name.endswith(".toml")}
+    return {name: tomllib.loads(found[name].read_text(encoding="utf-8"))["title"] for name in sorted(found)}
+
+
+def run_demo(name: str | None, plot: Path | None, *, as_json: bool, quiet: bool) -> int:
+    """Fix one shipped problem, or walk through three of them, and return the exit code."""
+    known = titles()
+    if name is not None and name not in known:
+        raise InvalidProblem(f"there is no demo {name!r}", "demo", nearest(name, known))
+    if name is None and not as_json:
+        return _walk(plot, quiet)
+    fixed = _fixed(name or "demo", quiet or as_json)
+    if as_json:
+        write_text(Path("-"), dumps(fixed_json(fixed)))
+    elif not quiet:
+        show(fixed, Console())
+    if plot is not None or not as_json:
+        _draw(fixed, plot, quiet or as_json)
+    return 0 if fixed.clean else 1
+
+
+def _walk(plot: Path | None, quiet: bool) -> int:
+    """Fix three shipped problems and say what is seen; the exit code is that of the first."""
+    console = Console(quiet=quiet)
+    code = 0
+    for i, (text, name) in enumerate(_STEPS):
+        _say(text, console)
+        fixed = _fixed(name, quiet)
+        show(fixed, console)
+        if i == 0:
+            _draw(fixed, plot, quiet)
+            code = 0 if fixed.clean else 1
+    _say(_END, console)
+    return code
+
+
+def _fixed(name: str, quiet: bool) -> Fixed:
+    with as_file(files("optloc") / "scenarios") as place:
+        return fix_file(read(place / f"{name}.toml"), "auto", quiet)
+
+
+def _say(text: str, console: Console) -> None:
+    shown: Any = Markdown(text, hyperlinks=False)
+    console.print(shown)
+    console.print()
+
+
+def _draw(fixed: Fixed, plot: Path | None, quiet: bool) -> None:
+    """Draw a fix; where no picture was asked for and none can be drawn, say so and go on."""
+    from importlib.util import find_spec
+
+    console = Console(quiet=quiet)
+    if plot is None and find_spec("matplotlib") is None:
+        line = "There is no picture, as matplotlib is not installed: pip install 'optloc[plot]'."
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+        return
+    draw(fixed, plot or PICTURE)
+    console.print(f"The picture is in {plot or PICTURE}.", highlight=False, markup=False, soft_wrap=True)
+
+
+# Starter problems: commented files that can be fixed as they are, one for each kind and for common mixtures.
+
+
+@dataclass(frozen=True, slots=True)
+class Starter:
+    """One line on what it is, and the text of its file."""
+
+    summary: str
+    text: str
+
+
+def starters() -> dict[str, Starter]:
+    """Return the starters by name: the shipped ones, then those of kinds that have none."""
+    folder = files("optloc") / "starters"
+    found = {}
+    for entry in sorted(folder.iterdir(), key=lambda entry: entry.name):
+        if entry.name.endswith(".toml"):
+            text = entry.read_text(encoding="utf-8")
+            found[entry.name.removesuffix(".toml")] = Starter(text.partition("\n")[0].removeprefix("# "), text)
+    for kind, model in MODELS.items():
+        if kind not in found and not model.ecef:
+            found[kind] = Starter(f"{kind}: {model.summary}.", _drawn(kind, model))
+    return found
+
+
+def run_new(kind: str, out: Path | None, *, force: bool, quiet: bool) -> int:
+    """Write a starter, to standard output where no file is named, and return the exit code."""
+    from optloc.cli.output import write_text
+
+    known = starters()
+    if kind not in known:
+        raise InvalidProblem(f"there is no starter {kind!r}", "new", nearest(kind, known))
+    if out is None or str(out) == "-":
+        write_text(Path("-"), known[kind].text.rstrip("\n"))
+        return 0
+    if out.suffix.lower() != ".toml":
+        raise InvalidProblem("a problem file ends in .toml", str(out), f"write --out {out.with_suffix('.toml')}")
+    if out.exists() and not force:
+        raise InvalidProblem("there is such a file already", str(out), "choose another name, or add --force")
+    write_text(out, known[kind].text.rstrip("\n"))
+    if not quiet:
+        from rich.console import Console
+
+        line = f"{out} can be changed and fixed: optloc check {out}, then optloc fix {out}."
+        Console().print(line, highlight=False, markup=False, soft_wrap=True)
+    return 0
+
+
+_PLACES = {
+    "North": (200.0, 4100.0, 35.0),
+    "East": (4300.0, 300.0, 80.0),
+    "South": (-150.0, -3900.0, 20.0),
+    "West": (-4000.0, -250.0, 310.0),
+    "Hill": (1800.0, 2200.0, 640.0),
+    "Tower": (-1900.0, 1500.0, 120.0),
+}
+_TRUTH = (1500.0, 900.0, 400.0)
+_SIGMA = {"length": 3.0, "angle": 0.005, "ratio": 0.01, "speed": 0.5}
+
+
+def _drawn(kind: str, model: Model) -> str:
+    """Return a starter of a kind that has none of its own: rows of it beside ranges, drawn at a known place."""
+    from optloc.base.types import Motion
+    from optloc.linear.simulate import simulate
+    from optloc.problem.build import assemble, measured, station_array
+
+    names, d = list(_PLACES), max(model.dimensions)
+    one = np.arange(len(names)) if model.stations == 1 else np.arange(1, len(names))
+    a, b = (one if model.stations else None), (np.zeros_like(one) if model.stations == 2 else None)
+    sigma = _SIGMA.get(model.quantity, 0.1)
+    place = np.array(list(_PLACES.values()))[:, :d]
+    rows = [measured(kind, a=a, b=b, sigma=sigma), measured("range", a=np.arange(len(names)), sigma=3.0)]
+    motion = Motion(order=1) if model.velocity else Motion()
+    problem = assemble(station_array(place, names), *rows, motions=(motion,))
+    truth = np.concatenate([_TRUTH[:d], (60.0, -35.0, 5.0)[:d]])[: problem.layout.size]
+    drawn = simulate(problem, truth, 1)
+    lines = [
+        f"# {kind}: {model.summary}.",
+        f"# truth: {', '.join(f'{v:g}' for v in _TRUTH[:d])}",
+        "format = 1",
+        f'title = "Rows of {kind} beside ranges"',
+        "",
+        "[stations]",
+        'unit = "m"',
+        "rows = [",
+        *(
+            f'  {{ name = "{name}", ' + ", ".join(f"{c} = {v}" for c, v in zip("xyz", p, strict=False)) + " },"
+            for name, p in zip(names, place.tolist(), strict=True)
+        ),
+        "]",
+    ]
+    lines += ["", "[target]", 'motion = "constant_velocity"'] if model.velocity else []
+    for block, noise in zip(drawn.rows, (sigma, 3.0), strict=True):
+        quantity = MODELS[block.kind].quantity
+        known = f"                           # one of {', '.join(UNITS[quantity])}"  # type: ignore[index]  # models hold known quantities only
+        lines += ["", "[[measurements]]", f'kind = "{block.kind}"', f'unit = "{SI_UNIT[quantity]}"{known}']  # type: ignore[index]  # as above
+        lines += [f"sigma = {noise}", "rows = ["]
+        for i, z in enumerate(np.ravel(block.z).tolist()):
+            ends = [f'a = "{names[block.a[i]]}"'] if MODELS[block.kind].stations else []
+            ends += [f'b = "{names[block.b[i]]}"'] if MODELS[block.kind].stations == 2 else []
+            lines.append("  { " + ", ".join([*ends, f"z = {z:.6g}"]) + " },")
+        lines.append("]")
+    return "\n".join(lines) + "\n"
+
+
+# What ``optloc convert`` does.
+
+
+def run_convert(file: Path, out: Path, column: list[str], *, as_json: bool, quiet: bool, **options: Any) -> int:
+    """Convert a file, say what was made of it, and return the exit code."""
+    columns = {}
+    for pair in column:
+        role, sign, name = pair.partition("=")
+        if not (role and sign and name):
+            raise InvalidProblem(f"{pair!r} names no column", "--column", "write ROLE=NAME, such as station=receiver")
+        columns[role] = name
+    found = convert(file, out, columns=columns, **options)
+    if as_json:
+        write_text(Path("-"), dumps(_record(found)))
+    elif not quiet:
+        _show(found, Console(), out)
+    return 0
+
+
+def _record(found: Converted) -> dict[str, Any]:
+    about = {"files": [str(path) for path in found.written], "notes": list(found.notes)}
+    if found.loaded is None:
+        return about
+    problem = found.loaded.problem
+    return about | {"stations": problem.stations.count, "epochs": problem.epochs, "rows": problem.count}
+
+
+def _show(found: Converted, console: Console, out: Path) -> None:
+    for note in found.notes:
+        console.print(f"{note[0].upper()}{note[1:]}.", highlight=False, markup=False, soft_wrap=True)
+    if found.loaded is None:
+        line = f'{out} is a table of stations: name it in a problem file, [stations] file = "{out.name}".'
+    else:
+        problem = found.loaded.problem
+        held = f"{problem.count} rows of {problem.epochs} epochs at {problem.stations.count} stations"
+        line = f"{', '.join(str(path) for path in found.written)}: {held}. Next: optloc check {out}."
+    console.print(line, highlight=False, markup=False, soft_wrap=True)

@@ -1,0 +1,124 @@
+"""What ``optloc separate`` does: tell the rows of several emitters apart."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.status import Status
+from optloc.cli.crlb import vector
+from optloc.cli.output import dumps, write_text
+from optloc.files import Loaded, read
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
+from optloc.several import Emitters, evenly, separate
+
+
+def run_separate(
+    file: Path,
+    detection: float,
+    false: float,
+    emitters: str,
+    region: str | None,
+    *,
+    as_json: bool = False,
+    quiet: bool = False,
+) -> int:
+    """Tell the emitters of each epoch of a file apart, and return the exit code: 1 where some status is not ok."""
+    loaded = read(file)
+    problem = loaded.problem
+    clutter = evenly(problem, detection, false)
+    found = separate(problem, clutter, count=_count(emitters), region=_region(problem, region))
+    labels = [loaded.epochs[k] for k in np.unique(problem.epoch)]
+    if as_json:
+        epochs = [{"epoch": label, **_record(loaded, one)} for label, one in zip(labels, found, strict=True)]
+        write_text(Path("-"), dumps({"file": loaded.source, "title": loaded.title, "epochs": epochs}))
+    elif not quiet:
+        for label, one in zip(labels, found, strict=True):
+            _show(loaded, label if len(labels) > 1 else "", one)
+    return 0 if all(one.status == Status.OK for one in found) else 1
+
+
+def _count(text: str) -> int | None:
+    if text == "auto":
+        return None
+    if not text.isdigit():
+        raise InvalidProblem(f"{text!r} is no number of emitters", "--emitters", "give a whole number, or auto")
+    return int(text)
+
+
+def _region(problem: Problem, text: str | None) -> tuple[Any, Any] | None:
+    if text is None:
+        return None
+    lower, colon, upper = text.partition(":")
+    if not colon:
+        raise InvalidProblem(f"{text!r} is no region", "--region", "give LOW:HIGH, such as 0,0:2000,3000")
+    return vector(problem, lower, None, False), vector(problem, upper, None, False)
+
+
+def _record(loaded: Loaded, found: Emitters) -> dict[str, Any]:
+    return {
+        "status": found.status.label,
+        "reason": found.reason,
+        "cost": found.cost,
+        "bound": found.bound,
+        "gap": found.gap,
+        "margin": found.margin,
+        "costs_of_numbers": found.costs,
+        "emitters": [
+            {
+                "position": fix.position,
+                "covariance": fix.covariance(),
+                "status": Status(int(fix.code)).label,
+                "chi2": fix.cost,
+                "rows": _names(loaded, found.rows(i)),
+            }
+            for i, fix in enumerate(found.fixes)
+        ],
+        "ghosts": [
+            {"position": ghost.position, "gap": ghost.gap, "rows": _names(loaded, ghost.rows)} for ghost in found.ghosts
+        ],
+        "assignment": found.assignment,
+    }
+
+
+def _names(loaded: Loaded, wanted: Any) -> list[str]:
+    """Return rows in words: kind, stations, and the number of the row."""
+    stations, words = loaded.problem.stations.names, list[str]()
+    for block, start in zip(loaded.problem.rows, loaded.problem.starts, strict=True):
+        for i in np.asarray(wanted)[(np.asarray(wanted) >= start) & (np.asarray(wanted) < start + block.count)]:
+            ends = [stations[k] for k in (block.a[i - start], block.b[i - start]) if k >= 0]
+            words.append(f"{block.kind} {' - '.join(ends)} (row {int(i)})")
+    return words
+
+
+def _show(loaded: Loaded, label: str, found: Emitters) -> None:
+    table = Table(title=f"{loaded.title} {label}".strip(), title_justify="left", caption_justify="left")
+    for heading in ("", "position (m)", "sigma (m)", "rows", "chi-square", "status"):
+        table.add_column(heading)
+    for cells in _rows(found):
+        table.add_row(*cells)
+    table.caption = f"{found.status.label}: {found.reason}; cost {found.cost:.1f}, at least {found.bound:.1f}"
+    Console().print(table)
+
+
+def _rows(found: Emitters) -> Iterator[tuple[str, ...]]:
+    for i, fix in enumerate(found.fixes):
+        rows, status = found.rows(i), Status(int(fix.code)).label
+        yield f"emitter {i}", _numbers(fix.position), _sigma(fix), str(len(rows)), f"{float(fix.cost):.1f}", status
+    for ghost in found.ghosts:
+        yield "ghost", _numbers(ghost.position), "", str(len(ghost.rows)), "", f"costs {ghost.gap:.1f} more"
+
+
+def _numbers(values: Any) -> str:
+    return ", ".join(f"{value:.1f}" for value in values)
+
+
+def _sigma(fix: Fix) -> str:
+    return _numbers(fix.sigma())

@@ -1,0 +1,287 @@
+"""What ``optloc track`` does."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.types import Array
+from optloc.cli.fixed import Columns, bar, geodetic_columns, joined
+from optloc.cli.output import dumps, plain, saved, write_table, write_text
+from optloc.files import Loaded, read
+from optloc.problem.problem import Problem
+from optloc.track import Dynamics, State, current_statistical, polynomial, singer
+from optloc.track.robust_update import reweighted
+from optloc.track.run import Entry, Rules, tracked
+from optloc.track.several_targets import alone
+from optloc.track.track import filter_of
+
+# Standard deviations in SI units of what drives the target where --noise does not say; csm: the largest acceleration.
+_NOISE = {"static": 0.0, "cv": 1.0, "ca": 1.0, "singer": 1.0, "csm": 10.0}
+_ORDERS = {"static": 0, "cv": 1, "ca": 2}
+_CLEAN = {"ok", "started", "starting"}
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """How a file is to be tracked; see the help of the command.
+
+    Parameters
+    ----------
+    model, filter : str
+        Names.
+    noise : float, optional
+        Standard deviation of what drives the target.
+    memory : float
+        Seconds over which an acceleration is correlated.
+    rules : Rules
+        When rows are left out and tracks begin anew.
+    start, sigma : str, optional
+        Initial state and its standard deviations.
+    loss : str, optional
+        By which rows are weighed.
+    """
+
+    model: str
+    filter: str
+    noise: float | None
+    memory: float
+    rules: Rules
+    start: str | None = None
+    sigma: str | None = None
+    loss: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class One:
+    """The track of one target so far.
+
+    Parameters
+    ----------
+    name : str
+        Of the target.
+    problem : Problem
+        Its run.
+    labels : tuple of k str
+        Labels of its epochs.
+    entries : list of Entry
+        What became of the scans.
+    """
+
+    name: str
+    problem: Problem
+    labels: tuple[str, ...]
+    entries: list[Entry]
+
+
+def run_track(
+    file: Path,
+    wanted: Wanted,
+    *,
+    out: Path | None = None,
+    as_json: bool = False,
+    plot: Path | None = None,
+    html: Path | None = None,
+    quiet: bool = False,
+) -> int:
+    """Track the targets of a file, write what was asked for, and return the exit code.
+
+    Whatever goes wrong on the way, the track up to there is written first.
+    """
+    dynamics = dynamics_of(wanted)
+    update = filter_of(wanted.filter) if wanted.loss is None else reweighted(wanted.filter, wanted.loss)
+    _check_places(out, plot, html)
+    loaded = read(file)
+    ones = [One(*parts, []) for parts in runs_of(loaded)]
+    if wanted.start is not None and len(ones) > 1:
+        raise InvalidProblem("one initial state does not fit several targets", "--start", "leave it out")
+    try:
+        with bar(loaded.title, sum(one.problem.epochs for one in ones), quiet or as_json) as advance:
+            for one in ones:
+                start = _start(one.problem, dynamics, wanted)
+                for entry in tracked(one.problem, dynamics, update, start=start, rules=wanted.rules):
+                    one.entries.append(entry)
+                    advance(1)
+    finally:
+        columns = joined([track_columns(one) for one in ones if one.entries]) if any(o.entries for o in ones) else {}
+        if columns:
+            _write(loaded, ones, columns, out=out, as_json=as_json, plot=plot)
+            if html is not None:
+                write_text(html, _map(loaded, ones))
+    if not quiet and not as_json:
+        _show(loaded, columns, Console())
+    return 0 if set(columns["status"].tolist()) <= _CLEAN else 1
+
+
+def dynamics_of(wanted: Wanted) -> Dynamics:
+    """Return the model of motion; raise InvalidProblem for an unknown one."""
+    if wanted.model not in _NOISE:
+        raise InvalidProblem(f"unknown model {wanted.model!r}", "--model", nearest(wanted.model, list(_NOISE)))
+    noise = _NOISE[wanted.model] if wanted.noise is None else wanted.noise
+    if wanted.model in _ORDERS:
+        return polynomial(_ORDERS[wanted.model], noise)
+    return (singer if wanted.model == "singer" else current_statistical)(wanted.memory, noise)
+
+
+def _check_places(out: Path | None, plot: Path | None, html: Path | None) -> None:
+    """Refuse places that cannot be written before there is a track to lose."""
+    if out is not None and out.suffix.lower() not in {".csv", ".parquet", ".pq"}:
+        what = f"results of type {out.suffix or out.name!r} are unknown"
+        raise InvalidProblem(what, str(out), "use .csv or .parquet")
+    for path in (out, plot, html):
+        if path is not None and not path.parent.is_dir():
+            raise InvalidProblem("the file cannot be written (no such folder)", str(path), "choose another place")
+
+
+def rules(gate: float, gap: float | None) -> Rules:
+    """Return the rules of options; raise InvalidProblem for a gate or a gap that is none."""
+    for value, where in ((gate, "--gate"), (gap, "--gap")):
+        if value is not None and not value > 0.0:
+            raise InvalidProblem(f"{value:g} is not positive", where, "give a positive number")
+    return Rules(gate=gate, gap=gap)
+
+
+def runs_of(loaded: Loaded) -> Iterator[tuple[str, Problem, tuple[str, ...]]]:
+    """Yield name, run and labels of the epochs of each target of a file that is to be found."""
+    problem, source = loaded.problem, loaded.source
+    if problem.priors:
+        what = f"the file has a prior of {problem.priors[0].name!r}, which a track does not take"
+        raise InvalidProblem(what, source, "leave it out, and give --start and --start-sigma")
+    if problem.epochs > 1 and not np.isfinite(loaded.times).all():
+        raise InvalidProblem("a track needs the time of each epoch", source, "give the measurements a column 'time'")
+    own = np.array(loaded.targets)[problem.epoch] if loaded.own_epochs else None
+    names = dict.fromkeys(loaded.targets)
+    for i, name in enumerate(names):
+        if not loaded.own_epochs and problem.motions[i].known is not None:
+            continue
+        target = np.concatenate([rows.target for rows in problem.rows])
+        kept = own == name if own is not None else target == i
+        epochs = np.unique(problem.epoch[kept])
+        again = np.flatnonzero(np.diff(loaded.times[epochs]) <= 0.0)
+        if len(again):
+            one, two = (loaded.epochs[epochs[again[0] + j]] for j in (0, 1))
+            what = f"the epochs {one!r} and {two!r} of {name} have the same time"
+            raise InvalidProblem(what, source, "correct the times, or give both one label")
+        times = loaded.times if np.isfinite(loaded.times).all() else problem.times
+        yield name, alone(problem, kept, times), tuple(loaded.epochs[k] for k in epochs)
+
+
+def _start(problem: Problem, dynamics: Dynamics, wanted: Wanted) -> State | None:
+    """Return the initial state that options give."""
+    if (wanted.start is None) != (wanted.sigma is None):
+        lacking = "--start" if wanted.start is None else "--start-sigma"
+        raise InvalidProblem("an initial state needs numbers and standard deviations", lacking, "give both or neither")
+    if wanted.start is None or wanted.sigma is None:
+        return None
+    d, parts = problem.dimension, dynamics.order + 1
+    mean, sigma = _numbers(wanted.start, "--start"), _numbers(wanted.sigma, "--start-sigma")
+    if len(mean) != d * parts:
+        advice = "give position, velocity and acceleration as far as the model has them"
+        raise InvalidProblem(f"{len(mean)} numbers for a state of {d * parts}", "--start", advice)
+    if len(sigma) != parts or (sigma <= 0.0).any():
+        what = f"{wanted.sigma!r} are no standard deviations of {'position velocity acceleration'.split()[:parts]}"
+        raise InvalidProblem(what.replace("'", ""), "--start-sigma", f"give {parts} positive numbers")
+    return State(float(problem.times[0]), mean, np.diag(np.repeat(sigma, d) ** 2))
+
+
+def _numbers(text: str, where: str) -> Array:
+    try:
+        values = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        raise InvalidProblem(f"{text!r} are no numbers", where, "separate them by commas") from None
+    if not np.isfinite(values).all():
+        raise InvalidProblem(f"{text!r} are not all finite", where, "give finite numbers")
+    return values
+
+
+def track_columns(one: One) -> Columns:
+    """Return the long table of a track: one row for each scan; metres, seconds, degrees; NaN where there is nothing."""
+    entries, d = one.entries, one.problem.dimension
+    mean = np.stack([e.updated.mean for e in entries])
+    cov = np.stack([e.updated.cov for e in entries])
+    sigma = np.sqrt(np.diagonal(cov, axis1=-2, axis2=-1))
+    columns: Columns = {
+        "epoch": np.array(one.labels[: len(entries)], dtype=object),
+        "time": np.array([e.time for e in entries]),
+        "target": np.array([one.name] * len(entries), dtype=object),
+        "status": np.array([e.label for e in entries], dtype=object),
+        "reason": np.array([e.reason for e in entries], dtype=object),
+    }
+    names = [f"{letter}{axis}" for letter in ("", "v", "a") for axis in "xyz"[:d]][: mean.shape[-1]]
+    columns |= {name: mean[:, i] for i, name in enumerate(names)}
+    columns |= {f"sigma_{name}": sigma[:, i] for i, name in enumerate(names)}
+    columns |= {f"cov_{'xyz'[i]}{'xyz'[j]}": cov[:, i, j] for i in range(d) for j in range(i, d)}
+    columns |= geodetic_columns(one.problem.frame, mean[:, :d], cov[:, :d, :d])
+    columns["nis"] = np.array([float(e.updated.nis) for e in entries])
+    columns["rows"] = np.array([int(e.updated.count) for e in entries])
+    columns["rejected"] = np.array([e.rejected for e in entries])
+    return columns
+
+
+def _map(loaded: Loaded, ones: list[One]) -> str:
+    """Return the page with the map of all tracks."""
+    from optloc.report import track_page
+    from optloc.report.map import degrees, sentence, spots
+
+    problem, d = loaded.problem, loaded.problem.dimension
+    entries = [(one.name, label, e) for one in ones for label, e in zip(one.labels, one.entries, strict=False)]
+    position = np.stack([e.updated.mean[:d] for _, _, e in entries])
+    covariance = np.stack([e.updated.cov[:d, :d] for _, _, e in entries])
+    clean = np.array([e.label in _CLEAN for _, _, e in entries])
+    sigma = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
+    place = degrees(problem, position) if problem.frame.geodetic else position
+    names = [f"{name} {label}" if len(ones) > 1 else label for name, label, _ in entries]
+    text = [
+        sentence(name, e.label, *told)
+        for name, (_, _, e), told in zip(names, entries, zip(place, sigma, strict=True), strict=True)
+    ]
+    return track_page(problem, spots(problem, position, covariance, clean, text), loaded.title)
+
+
+def _write(
+    loaded: Loaded, ones: list[One], columns: Columns, *, out: Path | None, as_json: bool, plot: Path | None
+) -> None:
+    if out is not None:
+        write_table(out, columns)
+    if plot is not None:
+        from optloc.plot.track import Drawn, plot_tracks
+
+        drawn = [Drawn(one.name, one.problem, tuple(one.entries)) for one in ones if one.entries]
+        saved(plot_tracks(drawn, title=loaded.title), plot)
+    if as_json:
+        lists = {name: plain(values) for name, values in columns.items()}
+        scans: list[dict[str, Any]] = [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)]
+        write_text(Path("-"), dumps({"file": loaded.source, "title": loaded.title, "scans": scans}))
+
+
+def _show(loaded: Loaded, columns: Columns, console: Console, limit: int = 10) -> None:
+    """Print the status of the scans, and the sentences of those that are not ok."""
+    table = Table(title=f"{loaded.title}: {len(columns['time'])} scans", title_justify="left")
+    for name in ("target", "status", "scans", "median sigma, m", "NIS a row"):
+        table.add_column(name, justify="left" if name in ("target", "status") else "right")
+    sigma = np.sqrt(sum(columns[f"sigma_{axis}"] ** 2 for axis in "xyz" if axis in columns))
+    for (target, label), count in Counter(zip(columns["target"], columns["status"], strict=True)).items():
+        inside = (columns["target"] == target) & (columns["status"] == label)
+        tested = inside & np.isfinite(columns["nis"])
+        rows = float(columns["rows"][tested].sum())
+        nis = f"{columns['nis'][tested].sum() / rows:.2f}" if rows else "-"
+        finite = sigma[inside][np.isfinite(sigma[inside])]
+        median = f"{np.median(finite):.3g}" if len(finite) else "-"
+        colour = "green" if label in _CLEAN else "yellow"
+        table.add_row(target, Text(label, style=colour), str(count), median, nis)
+    console.print(table)
+    told = np.flatnonzero(columns["reason"] != "")
+    for i in told[:limit]:
+        line = f"{columns['target'][i]}, {columns['time'][i]:g} s: {columns['status'][i]}: {columns['reason'][i]}"
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    if len(told) > limit:
+        console.print(f"... and {len(told) - limit} more; --out writes all of them", highlight=False)

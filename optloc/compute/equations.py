@@ -1,0 +1,165 @@
+"""Normal equations of many problems in one call: sums over the epochs of a run, unknowns of each epoch kept apart."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+
+from optloc.base.threads import mapped, thread_count
+from optloc.base.types import Array
+from optloc.compute.jit import compiled
+from optloc.compute.lanes import Room, add_group, add_prior, blocks, clear, furnished, gather, load, measure, memory
+from optloc.compute.pack import Numbers, Packed
+from optloc.compute.tables import Tables
+from optloc.linear.normal import Normal
+
+_SHARE = 64  # starts that are worth a thread of their own
+
+
+class Sums(NamedTuple):
+    """The arrays of `optloc.linear.normal.Normal`, of M vectors."""
+
+    shared: Array
+    local: Array
+    cross: Array
+    shared_vector: Array
+    local_vector: Array
+    cost: Array
+
+
+def chunks(count: int, least: int = _SHARE) -> list[tuple[int, int]]:
+    """Return stretches (first, last) of a number of starts, one for each thread that is worth it."""
+    parts = max(1, min(thread_count(), count // least))
+    ends = np.linspace(0, count, parts + 1).round().astype(int).tolist()
+    return list(pairwise(ends))
+
+
+def normal_at(packed: Packed, x: Array, item: Array, *, priors: bool = False) -> Normal:
+    """Return the normal equations of problems at vectors.
+
+    Parameters
+    ----------
+    packed : Packed
+        N problems.
+    x : array (M, size)
+        Parameter vectors.
+    item : int64 array (M,)
+        Problem of each vector.
+    priors : bool
+        Whether Gaussian priors are added.
+    """
+    t, count = packed.tables, len(x)
+    n, local, epochs = t.shared, t.local, t.epochs if t.local else 1
+    sums = Sums(
+        np.empty((count, n, n)),
+        np.empty((count, epochs, local, local)),
+        np.empty((count, epochs, n, local)),
+        np.empty((count, n)),
+        np.empty((count, epochs, local)),
+        np.empty(count),
+    )
+    at = np.require(x, np.float64, ["C", "W"])
+    mapped(lambda part: normal_block(packed, at, item, part[0], part[1], priors, sums), chunks(count))
+    return Normal(*sums)
+
+
+@compiled
+def normal_block(packed: Packed, x: Array, item: Array, first: int, last: int, priors: bool, out: Sums) -> None:
+    """Write the normal equations at the vectors first <= i < last."""
+    t, c = packed
+    size = x.shape[1]
+    lanes, room = blocks(packed, size, last - first), furnished(t, c, size)
+    m, r = memory(t, room, lanes)
+    width = t.shared + t.local + 1
+    for begin in range(first, last, lanes):
+        used = min(lanes, last - begin)
+        for b in range(used):
+            load(m, b, item[begin + b], c.source, c.white, c.prior, c.observed, c.present)
+            for i in range(size):
+                m[room.trial + i, b] = x[begin + b, i]
+        if t.local > 0 and t.epochs > 1:
+            _epochs(t, c, m, r, room, begin, used, priors, out.local, out.cross, out.local_vector)
+        else:
+            gather(t, c, m, r, room, priors, used)
+            _own(m, room.after, t.shared, t.local, begin, 0, used, out.local, out.cross, out.local_vector)
+        _whole(m, room.after, t.shared, width, begin, used, out.shared, out.shared_vector, out.cost)
+
+
+@compiled
+def _epochs(
+    t: Tables,
+    c: Numbers,
+    m: Array,
+    r: Array,
+    room: Room,
+    begin: int,
+    used: int,
+    priors: bool,
+    local: Array,
+    cross: Array,
+    vector: Array,
+) -> None:
+    """Write the equations of each epoch's own unknowns; sum up those of the shared ones in `room.after`."""
+    group, packet, last = 0, 0, t.shared + t.local
+    clear(m, room.now, (last + 1) ** 2, used)
+    for epoch in range(t.epochs):
+        clear(m, room.after, (last + 1) ** 2, used)
+        while group < t.groups and t.table[t.group + group, 2] == epoch:
+            if packet < t.packets and t.table[t.packet + packet, 0] == group:
+                measure(t, c.common, m, r, room, packet, room.trial, used)
+                packet += 1
+            add_group(t, c.common, c.place, m, room, group, used)
+            group += 1
+        for i in range(t.groups, c.place.shape[0]):
+            if priors and c.place[i, 3]:
+                start = t.shared + c.place[i, 1]
+                x = room.trial + start + epoch * t.local
+                add_prior(c.common, c.place[i, 0], c.place[i, 2], m, room, x, start, last, used)
+        _own(m, room.after, t.shared, t.local, begin, epoch, used, local, cross, vector)
+        for i in range(last + 1):
+            if i < t.shared or i == last:
+                for j in range(i + 1):
+                    cell = i * (last + 1) + j
+                    for b in range(used):
+                        m[room.now + cell, b] += m[room.after + cell, b]
+    for cell in range((last + 1) ** 2):
+        for b in range(used):
+            m[room.after + cell, b] = m[room.now + cell, b]
+    for i in range(t.groups, c.place.shape[0]):
+        if priors and not c.place[i, 3]:
+            start = c.place[i, 1]
+            add_prior(c.common, c.place[i, 0], c.place[i, 2], m, room, room.trial + start, start, last, used)
+
+
+@compiled
+def _own(
+    m: Array, to: int, n: int, size: int, begin: int, epoch: int, used: int, local: Array, cross: Array, vector: Array
+) -> None:
+    """Write what concerns the unknowns of one epoch."""
+    width = n + size + 1
+    for i in range(size):
+        line = to + (n + i) * width
+        for b in range(used):
+            vector[begin + b, epoch, i] = m[to + (width - 1) * width + n + i, b]
+            for j in range(n):
+                cross[begin + b, epoch, j, i] = m[line + j, b]
+            for j in range(i + 1):
+                local[begin + b, epoch, i, j] = m[line + n + j, b]
+                local[begin + b, epoch, j, i] = m[line + n + j, b]
+
+
+@compiled
+def _whole(
+    m: Array, to: int, n: int, width: int, begin: int, used: int, shared: Array, vector: Array, cost: Array
+) -> None:
+    """Write what concerns the unknowns of all epochs, and the cost."""
+    last = to + (width - 1) * width
+    for b in range(used):
+        cost[begin + b] = m[last + width - 1, b]
+        for i in range(n):
+            vector[begin + b, i] = m[last + i, b]
+            for j in range(i + 1):
+                shared[begin + b, i, j] = m[to + i * width + j, b]
+                shared[begin + b, j, i] = m[to + i * width + j, b]

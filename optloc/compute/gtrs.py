@@ -1,0 +1,266 @@
+"""Squared-range least squares on lanes: Newton on the multiplier, many problems side by side.
+
+Minimise ``|B y - g|^2`` over the cone ``y = (x, r)``, ``|x|^2 = r^2``, or the paraboloid ``y = (x, w)``, ``|x|^2 = w``.
+The last axis of every array here counts W = LANES problems, so that one instruction serves several of them. Problems
+whose normal matrix is not definite, or whose iteration does not settle, are flagged: they need the eigenvalues of
+their pencil, which a batch of few hard problems computes elsewhere.
+
+Source: J. J. More, "Generalizations of the trust region problem", Optim. Methods Softw. 2 (1993), theorem 3.2.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled
+
+LANES = 64
+_STEPS = 12
+_WEAK = 1e-7  # a pivot below this share of the largest entry: the eigenvalues are the better tool
+_SETTLED = 1e-7  # relative change of y below which the last, polishing step squares the error away
+
+
+@compiled
+def scratch(n: int) -> int:
+    """Return how many rows of lanes `minimise` needs as scratch for y of length n."""
+    return 2 * n * n + 5 * n + 7
+
+
+@compiled
+def minimise(rows: Array, on_cone: bool, y: Array, settled: Array, work: Array) -> None:
+    """Find the global minimisers of squared-range problems, one in each lane.
+
+    Parameters
+    ----------
+    rows : array (q, n + 1, W)
+        B and behind it g: whitened rows, numbers of order one; absent rows are zero.
+    on_cone : bool
+        Whether the last entry of y is a range r; else it is ``|x|^2``.
+    y : array (n, W)
+        Written: the minimisers; meaningless where not settled.
+    settled : float array (W,)
+        Written: 1.0 where the iteration converged inside the interval where ``B'B + multiplier C`` is positive
+        definite, else 0.0.
+    work : array (at least ``scratch(n)``, W)
+        Scratch.
+
+    Notes
+    -----
+    More (1993), theorem 3.2: the function ``y'Cy + 2h'y`` of the multiplier falls on that interval, and its only zero
+    is the global minimiser.
+    """
+    n = len(y)
+    A, lower = work[: n * n].reshape(n, n, LANES), work[n * n : 2 * n * n].reshape(n, n, LANES)
+    rest = work[2 * n * n :]
+    b, inverse, across, p = rest[:n], rest[n : 2 * n], rest[2 * n : 3 * n], rest[3 * n : 4 * n]
+    slope, spare = rest[4 * n : 5 * n], rest[5 * n : 5 * n + 7]
+    multiplier, bend, todo, least, value, last, definite = (
+        spare[0],
+        spare[1],
+        spare[2],
+        spare[3],
+        spare[4],
+        spare[5],
+        spare[6],
+    )
+    _normal(rows, A, b, least)
+    for lane in range(LANES):
+        multiplier[lane], last[lane], todo[lane] = 0.0, 0.0, 1.0
+    for _ in range(_STEPS):
+        _shifted(A, b, multiplier, on_cone, slope, y)
+        factor(A, slope, lower, inverse)
+        for lane in range(LANES):
+            definite[lane] = 1.0
+        for i in range(n):
+            for lane in range(LANES):
+                positive = 0.0 < inverse[i, lane] and inverse[i, lane] * least[lane] < 1.0
+                definite[lane] = definite[lane] if positive else 0.0
+        solve(lower, inverse, y)
+        _gradient(y, on_cone, across, p)
+        solve(lower, inverse, p)
+        if not _advance(y, across, p, on_cone, spare, slope):
+            break
+    _residual_slope(rows, y, across, multiplier, slope, value)
+    solve(lower, inverse, slope)
+    _step(y, across, p, on_cone, slope, bend, value)
+    for lane in range(LANES):
+        settled[lane] = 1.0 if todo[lane] == 0.0 else 0.0
+    for i in range(n):
+        for lane in range(LANES):
+            settled[lane] = settled[lane] if abs(y[i, lane]) < np.inf else 0.0
+
+
+@compiled
+def _normal(rows: Array, A: Array, b: Array, least: Array) -> None:
+    """Find the lower half of ``B'B``, ``B'g``, and the smallest pivot that counts."""
+    q, n = len(rows), len(b)
+    for lane in range(LANES):
+        least[lane] = 0.0
+    for i in range(n):
+        for lane in range(LANES):
+            b[i, lane] = rows[0, i, lane] * rows[0, n, lane]
+        for k in range(1, q):
+            for lane in range(LANES):
+                b[i, lane] += rows[k, i, lane] * rows[k, n, lane]
+        for j in range(i + 1):
+            for lane in range(LANES):
+                A[i, j, lane] = rows[0, i, lane] * rows[0, j, lane]
+            for k in range(1, q):
+                for lane in range(LANES):
+                    A[i, j, lane] += rows[k, i, lane] * rows[k, j, lane]
+        for lane in range(LANES):
+            least[lane] = max(least[lane], _WEAK * A[i, i, lane])
+
+
+@compiled
+def _shifted(A: Array, b: Array, multiplier: Array, on_cone: bool, diagonal: Array, right: Array) -> None:
+    """Write the diagonal of ``A + multiplier C`` and the right side ``b - multiplier h``."""
+    n = len(b)
+    sign, shift = (-1.0, 0.0) if on_cone else (0.0, 0.5)
+    for i in range(n):
+        turn, more = (1.0, 0.0) if i < n - 1 else (sign, shift)
+        for lane in range(LANES):
+            diagonal[i, lane] = A[i, i, lane] + turn * multiplier[lane]
+            right[i, lane] = b[i, lane] + more * multiplier[lane]
+
+
+@compiled
+def factor(A: Array, diagonal: Array, lower: Array, inverse: Array) -> None:
+    """Find the unit lower factors of symmetric matrices, and one over each pivot.
+
+    Parameters
+    ----------
+    A : array (n, n, W)
+        Read below the diagonal.
+    diagonal : array (n, W)
+        Read in its place.
+    lower : array (n, n, W)
+        Written: the factors below the diagonal; above it is scratch.
+    inverse : array (n, W)
+        Written: one over each pivot.
+    """
+    n = len(diagonal)
+    for i in range(n):
+        pivot = inverse[i]
+        for lane in range(LANES):
+            pivot[lane] = diagonal[i, lane]
+        for j in range(i):
+            # above the diagonal stay the entries before they are divided by their pivot
+            for lane in range(LANES):
+                lower[j, i, lane] = A[i, j, lane]
+            for k in range(j):
+                for lane in range(LANES):
+                    lower[j, i, lane] -= lower[k, i, lane] * lower[j, k, lane]
+            for lane in range(LANES):
+                lower[i, j, lane] = lower[j, i, lane] * inverse[j, lane]
+                pivot[lane] -= lower[j, i, lane] * lower[i, j, lane]
+        for lane in range(LANES):
+            pivot[lane] = 1.0 / pivot[lane]
+
+
+@compiled
+def solve(lower: Array, inverse: Array, right: Array) -> None:
+    """Solve with a factorisation of `factor`, in place.
+
+    Parameters
+    ----------
+    lower, inverse : array (n, n, W), (n, W)
+        Unit lower factors and inverse pivots.
+    right : array (n, W)
+        Overwritten with the solutions.
+    """
+    n = len(inverse)
+    for i in range(n):
+        for j in range(i):
+            for lane in range(LANES):
+                right[i, lane] -= lower[i, j, lane] * right[j, lane]
+    for i in range(n - 1, -1, -1):
+        for lane in range(LANES):
+            right[i, lane] *= inverse[i, lane]
+        for j in range(i + 1, n):
+            for lane in range(LANES):
+                right[i, lane] -= lower[j, i, lane] * right[j, lane]
+
+
+@compiled
+def _gradient(y: Array, on_cone: bool, across: Array, p: Array) -> None:
+    """Write ``C y + h`` twice."""
+    n = len(y)
+    for i in range(n - 1):
+        for lane in range(LANES):
+            across[i, lane] = p[i, lane] = y[i, lane]
+    for lane in range(LANES):
+        across[n - 1, lane] = p[n - 1, lane] = -y[n - 1, lane] if on_cone else -0.5
+
+
+@compiled
+def _value(y: Array, across: Array, on_cone: bool, out: Array) -> None:
+    """Write half of ``y'Cy + 2h'y``."""
+    n = len(y)
+    for lane in range(LANES):
+        out[lane] = 0.0 if on_cone else -0.25 * y[n - 1, lane]
+    for i in range(n):
+        for lane in range(LANES):
+            out[lane] += 0.5 * y[i, lane] * across[i, lane]
+
+
+@compiled
+def _advance(y: Array, across: Array, p: Array, on_cone: bool, spare: Array, free: Array) -> bool:
+    """Move the multipliers of the lanes that still change, and return whether there are any.
+
+    Newton's step; a step that left the definite interval is halved.
+    """
+    n = len(y)
+    multiplier, bend, todo, last, definite = spare[0], spare[1], spare[2], spare[5], spare[6]
+    value, big, far = spare[4], free[0], free[1]
+    _value(y, across, on_cone, value)
+    for lane in range(LANES):
+        bend[lane], big[lane], far[lane] = 0.0, 0.0, 0.0
+    for i in range(n):
+        for lane in range(LANES):
+            bend[lane] += across[i, lane] * p[i, lane]
+            big[lane], far[lane] = max(big[lane], abs(y[i, lane])), max(far[lane], abs(p[i, lane]))
+    for lane in range(LANES):
+        inside, now = definite[lane] != 0.0, multiplier[lane]
+        step = value[lane] / bend[lane]
+        moves = abs(step) * far[lane] > _SETTLED * big[lane]
+        todo[lane] = todo[lane] if moves or not inside else 0.0
+        target = now + step if inside else 0.5 * (now + last[lane])
+        last[lane] = now if inside else last[lane]
+        multiplier[lane] = target if todo[lane] != 0.0 else now
+    moving = 0.0
+    for lane in range(LANES):
+        moving += todo[lane]
+    return moving > 0.0
+
+
+@compiled
+def _residual_slope(rows: Array, y: Array, across: Array, multiplier: Array, slope: Array, left: Array) -> None:
+    """Write ``B'(B y - g) + multiplier (C y + h)``: near the answer its digits are those of B, not of B'B."""
+    q, n = len(rows), len(y)
+    for i in range(n):
+        for lane in range(LANES):
+            slope[i, lane] = multiplier[lane] * across[i, lane]
+    for k in range(q):
+        for lane in range(LANES):
+            left[lane] = -rows[k, n, lane]
+        for j in range(n):
+            for lane in range(LANES):
+                left[lane] += rows[k, j, lane] * y[j, lane]
+        for i in range(n):
+            for lane in range(LANES):
+                slope[i, lane] += rows[k, i, lane] * left[lane]
+
+
+@compiled
+def _step(y: Array, across: Array, p: Array, on_cone: bool, slope: Array, bend: Array, value: Array) -> None:
+    """Take the Newton step on the optimality conditions: slope and constraint to zero."""
+    n = len(y)
+    _value(y, across, on_cone, value)
+    for i in range(n):
+        for lane in range(LANES):
+            value[lane] -= across[i, lane] * slope[i, lane]
+    for i in range(n):
+        for lane in range(LANES):
+            y[i, lane] -= slope[i, lane] + p[i, lane] * (value[lane] / bend[lane])

@@ -1,0 +1,655 @@
+"""Measurements and derivatives of many problems at once: one interpreter runs the tape of a kind over lanes.
+
+Numbers are reached by whole indices, never by views of arrays: a view counts references, which takes longer than what
+is done with it.
+"""
+
+from __future__ import annotations
+
+from math import pi
+from typing import NamedTuple
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled
+from optloc.compute.pack import Numbers, Packed
+from optloc.compute.tables import Tables
+from optloc.compute.trace import ADD, ATAN2, COS, DIV, HYPOT, LOG, MUL, NEG, SIN, SQRT, SUB
+
+# Working memory of a block of lanes: one array of cells, and where everything stands in it.
+#
+# A lane is a problem; a cell holds one number of every lane. One array instead of many, because each array that is
+# handed to a kernel costs as much time as dozens of multiplications.
+
+LENGTH = 128
+"""Length of a register: rows of one kind are put behind each other, lanes of one and then of the next."""
+
+
+class Room(NamedTuple):
+    """First cell of each part, for p unknowns of which n are shared and l local."""
+
+    own: int  # sources, whitening matrices and priors that each problem has to itself
+    observed: int  # (m,)
+    present: int  # (m,), or none where all rows count
+    rows: int  # (rows of a packet, columns and residual)
+    whitened: int  # (rows of a group, columns and residual)
+    error: int  # (2 * largest prior,)
+    scale: int
+    trial: int  # (p,): where equations are wanted
+    best: int  # (p,)
+    after: int  # (n + l + 1, n + l + 1): equations at `trial`, lower triangle, then vector and cost
+    now: int  # the same at `best`
+    step: int  # (n + l,)
+    shared: int  # (n, n): factor of the shared system
+    shared_scale: int  # (n,)
+    local: int  # (l, l)
+    local_scale: int  # (l,)
+    half: int  # (n + 1, l): the local factor's inverse times coupling and vector
+    state: int  # what a refinement remembers
+    cells: int
+    absent: int  # 1 where some rows do not count
+
+
+STATE = 10
+"""Cells that a refinement keeps of every problem."""
+
+# Lanes of a block: as many as keep the cells that are used again and again in the cache, and all of them in bounds.
+_LANES, _FEWEST, _CELLS, _MOST = 64, 8, 2**18, 2**23
+
+
+@compiled
+def furnished(t: Tables, c: Numbers, size: int) -> Room:
+    """Return where things stand for problems of p = `size` unknowns."""
+    n, local, largest = t.shared, t.local, 0
+    for i in range(t.groups, c.place.shape[0]):
+        largest = max(largest, c.place[i, 2])
+    own = 0
+    observed = own + c.source.shape[1] + c.white.shape[1] + c.prior.shape[1]
+    present = observed + c.observed.shape[1]
+    rows = present + c.present.shape[1]
+    whitened = rows + t.rows * t.width
+    error = whitened + t.size * t.width
+    scale = error + 2 * largest
+    trial = scale + 1
+    best = trial + size
+    after = best + size
+    now = after + (n + local + 1) ** 2
+    step = now + (n + local + 1) ** 2
+    shared = step + n + local
+    shared_scale = shared + n * n
+    own_local = shared_scale + n
+    local_scale = own_local + local * local
+    half = local_scale + local
+    state = half + (n + 1) * local
+    return Room(
+        own,
+        observed,
+        present,
+        rows,
+        whitened,
+        error,
+        scale,
+        trial,
+        best,
+        after,
+        now,
+        step,
+        shared,
+        shared_scale,
+        own_local,
+        local_scale,
+        half,
+        state,
+        state + STATE,
+        min(1, c.present.shape[1]),
+    )
+
+
+@compiled
+def load(
+    m: Array, lane: int, item: int, source: Array, white: Array, prior: Array, observed: Array, present: Array
+) -> None:
+    """Bring the numbers of a problem into a lane of the memory (cells, B); the arrays are those of `Numbers`."""
+    cell = _filled(m, 0, lane, source, item)
+    cell = _filled(m, cell, lane, white, item)
+    cell = _filled(m, cell, lane, prior, item)
+    cell = _filled(m, cell, lane, observed, item)
+    _filled(m, cell, lane, present, item)
+
+
+@compiled
+def _filled(m: Array, cell: int, lane: int, source: Array, item: int) -> int:
+    row = item if source.shape[0] > 1 else 0
+    for i in range(source.shape[1]):
+        m[cell + i, lane] = source[row, i]
+    return int(cell + source.shape[1])
+
+
+@compiled
+def blocks(packed: Packed, size: int, count: int) -> int:
+    """Return how many of a number of problems of p = `size` unknowns are worked on together: they fit the cache."""
+    t = packed.tables
+    each = t.rows * t.width + 2 * (t.shared + t.local + 1) ** 2
+    fitting = min(_CELLS // each, _MOST // (each + 2 * size + packed.numbers.observed.shape[1]))
+    return int(max(1, min(count, _LANES, max(_FEWEST, _FEWEST * (fitting // _FEWEST)))))
+
+
+@compiled
+def memory(t: Tables, room: Room, lanes: int) -> tuple[Array, Array]:
+    """Return cells and registers for a number of lanes."""
+    return np.zeros((room.cells, lanes)), np.zeros((t.registers, max(LENGTH, lanes)))
+
+
+@compiled
+def run(code: Array, first: int, last: int, r: Array, count: int) -> None:
+    """Run operations on the first numbers of registers; see `Tape` and `symbol.OPERATIONS`."""
+    for step in range(first, last):
+        operation, to, u, v = code[step, 0], code[step, 1], code[step, 2], code[step, 3]
+        if operation == MUL:
+            for i in range(count):
+                r[to, i] = r[u, i] * r[v, i]
+        elif operation == ADD:
+            for i in range(count):
+                r[to, i] = r[u, i] + r[v, i]
+        elif operation == SUB:
+            for i in range(count):
+                r[to, i] = r[u, i] - r[v, i]
+        elif operation == DIV:
+            for i in range(count):
+                r[to, i] = r[u, i] / r[v, i]
+        elif operation == SQRT:
+            for i in range(count):
+                r[to, i] = np.sqrt(r[u, i])
+        else:
+            _rare(operation, r, to, u, v, count)
+
+
+@compiled
+def _rare(operation: int, r: Array, to: int, u: int, v: int, count: int) -> None:
+    if operation == NEG:
+        for i in range(count):
+            r[to, i] = -r[u, i]
+    elif operation == HYPOT:
+        for i in range(count):
+            r[to, i] = np.sqrt(r[u, i] * r[u, i] + r[v, i] * r[v, i])
+    elif operation == ATAN2:
+        for i in range(count):
+            r[to, i] = np.arctan2(r[u, i], r[v, i])
+    elif operation == SIN:
+        for i in range(count):
+            r[to, i] = np.sin(r[u, i])
+    elif operation == COS:
+        for i in range(count):
+            r[to, i] = np.cos(r[u, i])
+    elif operation == LOG:
+        for i in range(count):
+            r[to, i] = np.log(r[u, i])
+    else:
+        for i in range(count):
+            r[to, i] = np.exp(r[u, i])
+
+
+@compiled
+def measure(t: Tables, common: Array, m: Array, r: Array, room: Room, packet: int, x: int, lanes: int) -> None:
+    """Write derivatives and residuals of a packet: columns of the row's group, then the residual.
+
+    Parameters
+    ----------
+    t : Tables
+        Indices.
+    common : array
+        What the problems share.
+    m : array (cells, B)
+        Memory; the rows of the packet are written to `room.rows`.
+    r : array (registers, LENGTH)
+        Registers.
+    room : Room
+        Where things stand.
+    packet : int
+        Which rows.
+    x : int
+        Cell of the parameter vectors.
+    lanes : int
+        How many lanes hold a problem.
+    """
+    index, together = t.table, LENGTH // max(1, min(lanes, LENGTH))
+    for number in range(t.kinds):
+        kind, part = t.kind + number, t.part + packet * (t.kinds + 1) + number
+        for row in range(index[part, 0], index[part + 1, 0], together):
+            end = min(row + together, index[part + 1, 0])
+            count, begin = (end - row) * lanes, t.input + index[kind, 2]
+            _inputs(t, common, m, room.own, r, begin, row, end, x, lanes)
+            for i in range(index[kind, 1], index[kind + 1, 1]):
+                for j in range(count):
+                    r[index[t.constant + i, 0], j] = t.real[i]
+            run(index, t.code + index[kind, 0], t.code + index[kind + 1, 0], r, count)
+            for one in range(row, end):
+                line, low = t.row + one, (one - row) * lanes
+                to = room.rows + index[line, 1] * t.width
+                _derivatives(t, m, r, begin, line, low, to, lanes)
+                _measurement(t, m, r, index[kind, 3], line, low, to, x, room.scale, lanes)
+                _residual(m, to + index[line, 2], room.observed + index[line, 0], index[kind, 4], lanes)
+                if room.absent:
+                    _masked(m, to + index[line, 2], room.present + index[line, 0], lanes)
+
+
+@compiled
+def _inputs(
+    t: Tables, common: Array, m: Array, own: int, r: Array, begin: int, row: int, end: int, x: int, lanes: int
+) -> None:
+    """Write the inputs of rows of one kind, which `begin` in the table of inputs, into their registers."""
+    index = t.table
+    for one in range(row, end):
+        low, source = (one - row) * lanes, index[t.row + one, 3]
+        for i in range(index[t.row + one + 1, 3] - source):
+            to, line = index[begin + i, 0], t.source + source + i
+            place = index[line, 0]
+            if place >= 0:
+                for b in range(lanes):
+                    r[to, low + b] = common[place]
+            else:
+                for b in range(lanes):
+                    r[to, low + b] = m[own - 1 - place, b]
+            for f in range(index[line, 1], index[line + 1, 1]):
+                column, factor = x + index[t.term + f, 0], t.real[t.factor + f]
+                for b in range(lanes):
+                    r[to, low + b] += factor * m[column, b]
+
+
+@compiled
+def _derivatives(t: Tables, m: Array, r: Array, begin: int, line: int, low: int, to: int, lanes: int) -> None:
+    """Write the derivatives of h of one row by the unknowns that move its inputs."""
+    index = t.table
+    source = index[line, 3]
+    for j in range(index[line, 2]):
+        for b in range(lanes):
+            m[to + j, b] = 0.0
+    for i in range(index[line + 1, 3] - source):
+        place = index[begin + i, 1]
+        if place >= 0:
+            for f in range(index[t.source + source + i, 1], index[t.source + source + i + 1, 1]):
+                cell, factor = to + index[t.term + f, 1], t.real[t.factor + f]
+                for b in range(lanes):
+                    m[cell, b] += factor * r[place, low + b]
+
+
+@compiled
+def _measurement(
+    t: Tables, m: Array, r: Array, place: int, line: int, low: int, to: int, x: int, scale: int, lanes: int
+) -> None:
+    """Write the value of one row behind its derivatives, and what scales and offsets do to both."""
+    index = t.table
+    value, first, last, end = to + index[line, 2], index[line, 4], index[line + 1, 4], index[line + 1, 5]
+    for b in range(lanes):
+        m[value, b] = r[place, low + b]
+    if last > first:
+        for b in range(lanes):
+            m[scale, b] = 1.0
+        for i in range(first, last):
+            for b in range(lanes):
+                m[scale, b] += t.real[t.factor + i] * m[x + index[t.term + i, 0], b]
+        for cell in range(to, value):
+            for b in range(lanes):
+                m[cell, b] *= m[scale, b]
+        for i in range(first, last):
+            for b in range(lanes):
+                m[to + index[t.term + i, 1], b] += t.real[t.factor + i] * m[value, b]
+        for b in range(lanes):
+            m[value, b] *= m[scale, b]
+    for i in range(index[line, 5], end):
+        factor, cell, column = t.real[t.factor + i], to + index[t.term + i, 1], x + index[t.term + i, 0]
+        for b in range(lanes):
+            m[cell, b] += factor
+        for b in range(lanes):
+            m[value, b] += factor * m[column, b]
+
+
+@compiled
+def _residual(m: Array, value: int, observed: int, periodic: int, lanes: int) -> None:
+    """Replace values by residuals, angles wrapped."""
+    for b in range(lanes):
+        m[value, b] = m[observed, b] - m[value, b]
+    if periodic:
+        for b in range(lanes):
+            if not -pi < m[value, b] <= pi:
+                m[value, b] = np.arctan2(np.sin(m[value, b]), np.cos(m[value, b]))
+
+
+@compiled
+def _masked(m: Array, value: int, present: int, lanes: int) -> None:
+    """Make the residuals of absent rows zero."""
+    for b in range(lanes):
+        m[value, b] = m[value, b] if m[present, b] != 0.0 else 0.0
+
+
+# Small symmetric positive definite systems in lanes: one singular lane never disturbs the others.
+#
+# Matrices and vectors stand in cells of a memory (cells, B), row by row.
+
+_LEAST = 1e-15  # share of its diagonal that a pivot must exceed, as in `optloc.base.linalg`
+OPEN = 1e-12
+"""The same for unknowns of one epoch of a run, as in `optloc.normal`."""
+
+
+@compiled
+def factor(m: Array, matrix: int, n: int, scale: int, ok: int, least: float, lanes: int) -> None:
+    """Replace the lower triangle (n, n) by the factor of the matrix scaled to a unit diagonal.
+
+    Its diagonal holds inverse pivots.
+
+    Parameters
+    ----------
+    m : array (cells, B)
+        Memory.
+    matrix : int
+        Cell of the matrix.
+    n : int
+        Its size.
+    scale : int
+        Cell that receives the scales (n,).
+    ok : int
+        Cell that becomes 0.0 where a matrix is not numerically positive definite.
+    least : float
+        Share of its diagonal that a pivot must exceed.
+    lanes : int
+        How many lanes count.
+    """
+    for i in range(n):
+        for b in range(lanes):
+            positive = m[matrix + i * n + i, b] > 0.0
+            m[scale + i, b] = 1.0 / np.sqrt(m[matrix + i * n + i, b] if positive else 1.0)
+            m[ok, b] = m[ok, b] if positive else 0.0
+        for j in range(i + 1):
+            for b in range(lanes):
+                m[matrix + i * n + j, b] *= m[scale + i, b] * m[scale + j, b]
+    for j in range(n):
+        pivot = matrix + j * n + j
+        for k in range(j):
+            for b in range(lanes):
+                m[pivot, b] -= m[matrix + j * n + k, b] * m[matrix + j * n + k, b]
+        for b in range(lanes):
+            positive = m[pivot, b] > least
+            m[ok, b] = m[ok, b] if positive else 0.0
+            m[pivot, b] = 1.0 / np.sqrt(m[pivot, b] if positive else 1.0)
+        for i in range(j + 1, n):
+            entry = matrix + i * n + j
+            for k in range(j):
+                for b in range(lanes):
+                    m[entry, b] -= m[matrix + i * n + k, b] * m[matrix + j * n + k, b]
+            for b in range(lanes):
+                m[entry, b] *= m[pivot, b]
+
+
+@compiled
+def forward(m: Array, lower: int, n: int, scale: int, right: int, lanes: int) -> None:
+    """Replace a vector by the factor's inverse times it, scaled."""
+    for i in range(n):
+        for b in range(lanes):
+            m[right + i, b] *= m[scale + i, b]
+        for k in range(i):
+            for b in range(lanes):
+                m[right + i, b] -= m[lower + i * n + k, b] * m[right + k, b]
+        for b in range(lanes):
+            m[right + i, b] *= m[lower + i * n + i, b]
+
+
+@compiled
+def backward(m: Array, lower: int, n: int, scale: int, right: int, lanes: int) -> None:
+    """Replace a vector that `forward` returned by the solution."""
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            for b in range(lanes):
+                m[right + i, b] -= m[lower + k * n + i, b] * m[right + k, b]
+        for b in range(lanes):
+            m[right + i, b] *= m[lower + i * n + i, b]
+    for i in range(n):
+        for b in range(lanes):
+            m[right + i, b] *= m[scale + i, b]
+
+
+@compiled
+def step(m: Array, room: Room, n: int, local: int, damping: int, ok: int, lanes: int) -> None:
+    """Write the damped step from `room.now` into `room.step`, zero where cell `ok` becomes 0.0.
+
+    Parameters
+    ----------
+    m : array (cells, B)
+        Memory.
+    room : Room
+        Where things stand.
+    n, local : int
+        Numbers of shared and of local unknowns.
+    damping : int
+        Cell of Marquardt's factor: the diagonal of the information is multiplied by one more than it.
+    ok : int
+        Cell that says where the systems can be solved.
+    lanes : int
+        How many lanes count.
+    """
+    size = n + local
+    line = size + 1
+    for b in range(lanes):
+        m[ok, b] = 1.0
+    for i in range(n):
+        for j in range(i + 1):
+            for b in range(lanes):
+                m[room.shared + i * n + j, b] = m[room.now + i * line + j, b]
+        for b in range(lanes):
+            m[room.shared + i * n + i, b] *= 1.0 + m[damping, b]
+            m[room.step + i, b] = m[room.now + size * line + i, b]
+    if local > 0:
+        factor_local(m, room, room.now, n, local, damping, ok, _LEAST, lanes)
+        eliminate(m, room, n, local, lanes)
+    factor(m, room.shared, n, room.shared_scale, ok, _LEAST, lanes)
+    forward(m, room.shared, n, room.shared_scale, room.step, lanes)
+    backward(m, room.shared, n, room.shared_scale, room.step, lanes)
+    if local > 0:
+        complete(m, room, n, local, lanes)
+    for i in range(size):
+        for b in range(lanes):
+            m[room.step + i, b] = m[room.step + i, b] if m[ok, b] != 0.0 else 0.0
+
+
+@compiled
+def factor_local(
+    m: Array, room: Room, source: int, n: int, local: int, damping: int, ok: int, least: float, lanes: int
+) -> None:
+    """Factor the damped system of the local unknowns of equations at cell `source`; prepare what couples it."""
+    line, half = n + local + 1, room.half
+    for i in range(local):
+        row, own = source + (n + i) * line, room.local + i * local
+        for j in range(i + 1):
+            for b in range(lanes):
+                m[own + j, b] = m[row + n + j, b]
+        for b in range(lanes):
+            grown = m[own + i, b] * (1.0 + m[damping, b])
+            m[own + i, b] = grown if grown != 0.0 else 1.0  # what no row touches stays where it is
+        for j in range(n):
+            for b in range(lanes):
+                m[half + j * local + i, b] = m[row + j, b]
+        for b in range(lanes):
+            m[half + n * local + i, b] = m[source + (n + local) * line + n + i, b]
+    factor(m, room.local, local, room.local_scale, ok, least, lanes)
+    for j in range(n + 1):
+        forward(m, room.local, local, room.local_scale, half + j * local, lanes)
+
+
+@compiled
+def eliminate(m: Array, room: Room, n: int, local: int, lanes: int) -> None:
+    """Take from the shared system (in `room.shared` and `room.step`) what the local unknowns cost it."""
+    half = room.half
+    for a in range(local):
+        for i in range(n):
+            u, v = half + i * local + a, half + n * local + a
+            for b in range(lanes):
+                m[room.step + i, b] -= m[u, b] * m[v, b]
+            for j in range(i + 1):
+                for b in range(lanes):
+                    m[room.shared + i * n + j, b] -= m[u, b] * m[half + j * local + a, b]
+
+
+@compiled
+def complete(m: Array, room: Room, n: int, local: int, lanes: int) -> None:
+    """Write the step of the local unknowns behind that of the shared ones; their system is factored."""
+    own = room.step + n
+    for a in range(local):
+        for b in range(lanes):
+            m[own + a, b] = m[room.half + n * local + a, b]
+        for i in range(n):
+            for b in range(lanes):
+                m[own + a, b] -= m[room.half + i * local + a, b] * m[room.step + i, b]
+    backward(m, room.local, local, room.local_scale, own, lanes)
+
+
+# From derivatives and residuals to normal equations: whitened, multiplied with themselves, summed over groups.
+
+
+@compiled
+def gather(t: Tables, c: Numbers, m: Array, r: Array, room: Room, priors: bool, lanes: int) -> None:
+    """Write the normal equations at `room.trial` into `room.after`.
+
+    Parameters
+    ----------
+    t : Tables
+        Indices of problems of one epoch, or without unknowns local to the epochs.
+    c : Numbers
+        What the problems share.
+    m : array (cells, B)
+        Memory.
+    r : array (registers, LENGTH)
+        Registers.
+    room : Room
+        Where things stand.
+    priors : bool
+        Whether Gaussian priors are added.
+    lanes : int
+        How many lanes hold a problem.
+    """
+    last = t.shared + t.local
+    clear(m, room.after, (last + 1) ** 2, lanes)
+    for packet in range(t.packets):
+        measure(t, c.common, m, r, room, packet, room.trial, lanes)
+        for group in range(t.table[t.packet + packet, 0], t.table[t.packet + packet + 1, 0]):
+            add_group(t, c.common, c.place, m, room, group, lanes)
+    for i in range(t.groups, c.place.shape[0] if priors else t.groups):
+        start = c.place[i, 1] + (t.shared if c.place[i, 3] else 0)
+        add_prior(c.common, c.place[i, 0], c.place[i, 2], m, room, room.trial + start, start, last, lanes)
+
+
+@compiled
+def clear(m: Array, first: int, count: int, lanes: int) -> None:
+    """Write zeros."""
+    for cell in range(first, first + count):
+        for b in range(lanes):
+            m[cell, b] = 0.0
+
+
+@compiled
+def add_group(t: Tables, common: Array, place: Array, m: Array, room: Room, group: int, lanes: int) -> None:
+    """Add the whitened rows of a group to the equations in `room.after`."""
+    line = t.group + group
+    columns, column = t.table[line + 1, 3] - t.table[line, 3] + 1, t.column + t.table[line, 3]
+    first = whiten_group(t, common, place, m, room, group, False, lanes)
+    _square(t.table, column, m, first, t.width, t.table[line, 1], columns, room.after, t.shared + t.local, lanes)
+
+
+@compiled
+def whiten_group(
+    t: Tables, common: Array, place: Array, m: Array, room: Room, group: int, residual: bool, lanes: int
+) -> int:
+    """Whiten the rows of a group, or their residuals alone, and return the cell of the first."""
+    line = t.group + group
+    columns = t.table[line + 1, 3] - t.table[line, 3]
+    begin = room.rows + t.table[line, 0] * t.width + (columns if residual else 0)
+    count, size = (1 if residual else columns + 1), t.table[line, 1]
+    _whiten(common, place[group, 0], place[group, 1], m, room.own, begin, t.width, size, count, room.whitened, lanes)
+    return room.whitened
+
+
+@compiled
+def _whiten(
+    common: Array,
+    place: int,
+    full: int,
+    m: Array,
+    own: int,
+    first: int,
+    width: int,
+    size: int,
+    columns: int,
+    to: int,
+    lanes: int,
+) -> None:
+    """Write `size` rows from cell `first` on, whitened, to cell `to`."""
+    for i in range(size):
+        for s in range(columns):
+            cell = to + i * width + s
+            for b in range(lanes):
+                m[cell, b] = 0.0
+            for j in range(size if full else i + 1):
+                row = first + j * width + s
+                if place >= 0:
+                    factor = common[place + i * size + j]
+                    for b in range(lanes):
+                        m[cell, b] += factor * m[row, b]
+                else:
+                    matrix = own - 1 - place + i * size + j
+                    for b in range(lanes):
+                        m[cell, b] += m[matrix, b] * m[row, b]
+
+
+@compiled
+def _square(
+    index: Array,
+    column: int,
+    m: Array,
+    first: int,
+    width: int,
+    size: int,
+    columns: int,
+    to: int,
+    last: int,
+    lanes: int,
+) -> None:
+    """Add the products of the columns of whitened rows; the last column is the residual."""
+    for i in range(columns):
+        line = to + (index[column + i, 0] if i < columns - 1 else last) * (last + 1)
+        for j in range(i + 1):
+            cell = line + (index[column + j, 0] if j < columns - 1 else last)
+            r, u, v = 0, first + i, first + j
+            while r + 3 < size:
+                for b in range(lanes):
+                    m[cell, b] += (m[u, b] * m[v, b] + m[u + width, b] * m[v + width, b]) + (
+                        m[u + 2 * width, b] * m[v + 2 * width, b] + m[u + 3 * width, b] * m[v + 3 * width, b]
+                    )
+                r, u, v = r + 4, u + 4 * width, v + 4 * width
+            while r < size:
+                for b in range(lanes):
+                    m[cell, b] += m[u, b] * m[v, b]
+                r, u, v = r + 1, u + width, v + width
+
+
+@compiled
+def add_prior(
+    common: Array, place: int, size: int, m: Array, room: Room, x: int, start: int, last: int, lanes: int
+) -> None:
+    """Add a Gaussian prior of the `size` unknowns at cell x on, whose first column is `start`."""
+    error, pull, to = room.error, room.error + size, room.after
+    vector = to + last * (last + 1)
+    for i in range(size):
+        for b in range(lanes):
+            m[error + i, b] = (common[place + i] if place >= 0 else m[room.own - 1 - place + i, b]) - m[x + i, b]
+            m[pull + i, b] = 0.0
+    for i in range(size):
+        for j in range(size):
+            at, cell = size + i * size + j, to + (start + i) * (last + 1) + start + j
+            for b in range(lanes):
+                precision = common[place + at] if place >= 0 else m[room.own - 1 - place + at, b]
+                m[pull + i, b] += precision * m[error + j, b]
+                if j <= i:
+                    m[cell, b] += precision
+    for i in range(size):
+        for b in range(lanes):
+            m[vector + start + i, b] += m[pull + i, b]
+            m[vector + last, b] += m[error + i, b] * m[pull + i, b]

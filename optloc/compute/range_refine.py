@@ -1,0 +1,225 @@
+"""Damped Gauss-Newton of a position from ranges, many problems side by side: the rules of `optloc.solvers.refine`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.gtrs import LANES, factor, solve
+from optloc.compute.jit import compiled
+
+_FLOOR = 1e-13  # rounding error of a cost, relative to one more than it
+_PIVOT = 1e-15  # share of its diagonal that a pivot must exceed
+# Rows of the arrays `vector` and `matrix` at the position and at the one tried, and scratch.
+X, TRIAL, MOVE, G, G_TRIAL, DIAGONAL, INVERSE, ROW, ORIGIN, CENTRE = range(10)
+H, H_TRIAL, LOWER = range(3)
+# Rows of the array `scalar`.
+COST, COST_TRIAL, LOOP, BLUR, DAMPING, GROWTH, GAIN, SOLVABLE, SPARE, ALIVE, GOOD, STEPS, SCALE, SPREAD = range(14)
+
+
+@compiled
+def refine(
+    K: Array,
+    u: Array,
+    place: Array,
+    r: Array,
+    unit: Array,
+    vector: Array,
+    matrix: Array,
+    scalar: Array,
+    tolerance: float,
+    limit: int,
+) -> None:
+    """Refine the positions of the lanes that are good; those that do not finish in time stay alive.
+
+    Parameters
+    ----------
+    K, u : array (q, s), (q, W)
+        The cost is ``|u - K r|^2`` and that of the loops.
+    place : array (s, d, W)
+        Stations, metres.
+    r, unit : array (s, W), (s, d, W)
+        Scratch: ranges and unit vectors.
+    vector, matrix, scalar : array (10, d, W), (3, d, d, W), (14, W)
+        Positions in row X, cost of the loops, rounding error and which lanes are good in; positions, right-hand
+        sides, information (lower half), costs, steps, which are alive and which good out.
+    tolerance : float
+        A fix is finished when its next step is shorter than this many of its own standard deviations.
+    limit : int
+        Steps tried at most.
+
+    Notes
+    -----
+    Levenberg's method with Marquardt's scaling; the damping follows H. B. Nielsen, "Damping parameter in Marquardt's
+    method", IMM-REP-1999-05, Technical University of Denmark.
+    """
+    equations(
+        K, u, place, r, unit, vector[X], vector[ROW], scalar[SPARE], scalar[LOOP], matrix[H], vector[G], scalar[COST]
+    )
+    for lane in range(LANES):
+        scalar[GOOD, lane] = scalar[GOOD, lane] if scalar[COST, lane] < np.inf else 0.0
+        scalar[ALIVE, lane] = scalar[GOOD, lane]
+        scalar[DAMPING, lane], scalar[GROWTH, lane], scalar[STEPS, lane] = 1e-6, 2.0, 0.0
+    for _ in range(limit):
+        _propose(vector, matrix, scalar)
+        equations(
+            K,
+            u,
+            place,
+            r,
+            unit,
+            vector[TRIAL],
+            vector[ROW],
+            scalar[SPARE],
+            scalar[LOOP],
+            matrix[H_TRIAL],
+            vector[G_TRIAL],
+            scalar[COST_TRIAL],
+        )
+        if not _decide(vector, matrix, scalar, tolerance):
+            break
+
+
+@compiled
+def equations(
+    K: Array,
+    u: Array,
+    place: Array,
+    r: Array,
+    unit: Array,
+    x: Array,
+    row: Array,
+    left: Array,
+    loop: Array,
+    information: Array,
+    right: Array,
+    cost: Array,
+) -> None:
+    """Find information (lower half), right-hand side and cost at positions x (d, W); `row` and `left` are scratch."""
+    d = len(x)
+    ranges(place, x, r, unit, left)
+    for lane in range(LANES):
+        cost[lane] = loop[lane]
+    for i in range(d):
+        for lane in range(LANES):
+            right[i, lane] = 0.0
+        for j in range(i + 1):
+            for lane in range(LANES):
+                information[i, j, lane] = 0.0
+    for k in range(len(K)):
+        _row(K[k], u[k], r, unit, row, left)
+        for lane in range(LANES):
+            cost[lane] += left[lane] * left[lane]
+        for i in range(d):
+            for lane in range(LANES):
+                right[i, lane] += row[i, lane] * left[lane]
+            for j in range(i + 1):
+                for lane in range(LANES):
+                    information[i, j, lane] += row[i, lane] * row[j, lane]
+
+
+@compiled
+def _row(share: Array, seen: Array, r: Array, unit: Array, row: Array, left: Array) -> None:
+    """Find one whitened row (d, W) of the Jacobian and its residual (W,): what is seen less shares of the ranges."""
+    s, d = unit.shape[:2]
+    for lane in range(LANES):
+        left[lane] = seen[lane]
+    for j in range(d):
+        for lane in range(LANES):
+            row[j, lane] = 0.0
+    for i in range(s):
+        part = share[i]
+        if part != 0.0:
+            for lane in range(LANES):
+                left[lane] -= part * r[i, lane]
+            for j in range(d):
+                for lane in range(LANES):
+                    row[j, lane] += part * unit[i, j, lane]
+
+
+@compiled
+def ranges(place: Array, x: Array, r: Array, unit: Array, spare: Array) -> None:
+    """Find ranges (s, W) and unit vectors (s, d, W) from the stations at positions x (d, W)."""
+    s, d = place.shape[:2]
+    for i in range(s):
+        for lane in range(LANES):
+            spare[lane] = 0.0
+        for j in range(d):
+            for lane in range(LANES):
+                apart = x[j, lane] - place[i, j, lane]
+                unit[i, j, lane] = apart
+                spare[lane] += apart * apart
+        for lane in range(LANES):
+            r[i, lane] = np.sqrt(spare[lane])
+            spare[lane] = 1.0 / r[i, lane]
+        for j in range(d):
+            for lane in range(LANES):
+                unit[i, j, lane] *= spare[lane]
+
+
+@compiled
+def _propose(vector: Array, matrix: Array, scalar: Array) -> None:
+    """Find the damped step, its squared length in its own standard deviations, and whether it exists."""
+    d = vector.shape[1]
+    diagonal, inverse, move, right, damping = (
+        vector[DIAGONAL],
+        vector[INVERSE],
+        vector[MOVE],
+        vector[G],
+        scalar[DAMPING],
+    )
+    gain, solvable, information = scalar[GAIN], scalar[SOLVABLE], matrix[H]
+    for lane in range(LANES):
+        gain[lane], solvable[lane] = 0.0, 1.0
+    for i in range(d):
+        for lane in range(LANES):
+            diagonal[i, lane] = information[i, i, lane] * (1.0 + damping[lane])
+            move[i, lane] = right[i, lane]
+    factor(information, diagonal, matrix[LOWER], inverse)
+    solve(matrix[LOWER], inverse, move)
+    x, trial = vector[X], vector[TRIAL]
+    for i in range(d):
+        for lane in range(LANES):
+            gain[lane] += move[i, lane] * right[i, lane]
+            trial[i, lane] = x[i, lane] + move[i, lane]
+            share = inverse[i, lane] * diagonal[i, lane]
+            solvable[lane] = solvable[lane] if 0.0 < share < 1.0 / _PIVOT else 0.0
+
+
+@compiled
+def _decide(vector: Array, matrix: Array, scalar: Array, tolerance: float) -> bool:
+    """Keep the steps that lower the cost, move the damping, end lanes whose step was small; return if any is alive."""
+    d = vector.shape[1]
+    kept, alive = scalar[SPARE], scalar[ALIVE]
+    for lane in range(LANES):
+        cost, gain, damping, blur = scalar[COST, lane], scalar[GAIN, lane], scalar[DAMPING, lane], scalar[BLUR, lane]
+        after, floor = scalar[COST_TRIAL, lane], _FLOOR * (1.0 + cost)
+        achieved = cost - after
+        rounding = floor + 2.0 * blur * np.sqrt(1.0 + cost)
+        solvable = alive[lane] * scalar[SOLVABLE, lane]
+        better = solvable if achieved >= -rounding and after < np.inf else 0.0
+        small = solvable if abs(gain) * (1.0 + damping) <= max(tolerance * tolerance, floor + blur * blur) else 0.0
+        ratio = min(max(achieved / (gain if gain > 0.0 else 1.0), 0.0), 1.0)
+        shape = 2.0 * ratio - 1.0
+        change = 0.1 if ratio > 0.9 else max(1.0 / 3.0, 1.0 - shape * shape * shape)
+        growth = scalar[GROWTH, lane]
+        damping = max(damping * change, 1e-12) if better != 0.0 else damping * growth + 1e-12
+        lost = alive[lane] if better == 0.0 and damping > 1e12 and small == 0.0 else 0.0
+        scalar[DAMPING, lane] = damping
+        scalar[GROWTH, lane] = 2.0 if better != 0.0 else 2.0 * growth
+        scalar[COST, lane] = after if better != 0.0 else cost
+        scalar[STEPS, lane] += alive[lane]
+        scalar[GOOD, lane] = scalar[GOOD, lane] if lost == 0.0 else 0.0
+        alive[lane] = alive[lane] if small + lost == 0.0 else 0.0
+        kept[lane] = better
+    for i in range(d):
+        for lane in range(LANES):
+            vector[X, i, lane] = vector[TRIAL, i, lane] if kept[lane] != 0.0 else vector[X, i, lane]
+            vector[G, i, lane] = vector[G_TRIAL, i, lane] if kept[lane] != 0.0 else vector[G, i, lane]
+        for j in range(i + 1):
+            for lane in range(LANES):
+                matrix[H, i, j, lane] = matrix[H_TRIAL, i, j, lane] if kept[lane] != 0.0 else matrix[H, i, j, lane]
+    left = 0.0
+    for lane in range(LANES):
+        left += alive[lane]
+    return left > 0.0

@@ -1,0 +1,473 @@
+"""Damped Gauss-Newton for many problems in one call: the rules of `optloc.solvers.refine`, lane by lane.
+
+A lane whose problem is finished takes the next one, so that the lanes are full until the problems run out.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from optloc.base.status import Status
+from optloc.base.threads import mapped
+from optloc.base.types import Array
+from optloc.compute.equations import chunks, normal_at
+from optloc.compute.jit import compiled
+from optloc.compute.lanes import (
+    OPEN,
+    Room,
+    add_group,
+    add_prior,
+    backward,
+    blocks,
+    clear,
+    complete,
+    eliminate,
+    factor,
+    factor_local,
+    forward,
+    furnished,
+    gather,
+    load,
+    measure,
+    memory,
+    step,
+    whiten_group,
+)
+from optloc.compute.pack import Numbers, Packed
+from optloc.compute.tables import Tables
+from optloc.linear.normal import Normal
+
+_OK, LIMIT, _STALLED, NUMERICAL = (
+    int(status) for status in (Status.OK, Status.MAX_ITERATIONS, Status.STALLED, Status.NUMERICAL)
+)
+_EPSILON = float(np.finfo(float).eps)
+
+
+class Rules(NamedTuple):
+    """When a refinement ends; see `optloc.solvers.refine.refine`."""
+
+    tolerance: float = 1e-7
+    limit: int = 60
+    damped: bool = True
+
+
+class Answers(NamedTuple):
+    """Where the refinements of M starts ended; p unknowns, shared ones and then local ones."""
+
+    x: Array  # (M, p): starts, replaced by the answers
+    cost: Array  # (M,)
+    status: Array  # int8 (M,)
+    iterations: Array  # int32 (M,)
+    matrix: Array  # (M, p, p): information at the answers
+    vector: Array  # (M, p)
+
+
+# Cells that a refinement keeps of every problem, from `room.state` on; `room.STATE` of them.
+DAMPING, GROWTH, BLUR, GAIN, SOLVABLE, BETTER, COST, TRIED, CLOSED = range(9)
+# What it keeps beside them: which start it is, 1 while nothing but the start is
+# known and 2 before it is there, steps tried, status.
+START, FRESH, STEPS, STATUS = range(4)
+EMPTY = 2
+
+
+def answers(start: Array, kept: int | None = None) -> Answers:
+    """Return room for the answers of starts (M, p), which are copied, and equations of `kept` unknowns (all)."""
+    count, size = len(start), start.shape[1] if kept is None else kept
+    return Answers(
+        np.array(start, dtype=float, order="C"),
+        np.empty(count),
+        np.empty(count, dtype=np.int8),
+        np.empty(count, dtype=np.int32),
+        np.empty((count, size, size)),
+        np.empty((count, size)),
+    )
+
+
+@compiled
+def refine_block(packed: Packed, item: Array, first: int, last: int, rules: Rules, out: Answers) -> None:
+    """Refine the starts first <= i < last; several threads may work on one set of answers.
+
+    Parameters
+    ----------
+    packed : Packed
+        N problems of one epoch, or without unknowns local to the epochs.
+    item : int64 array (M,)
+        Problem of each start.
+    first, last : int
+        Which starts.
+    rules : Rules
+        When to stop.
+    out : Answers
+        Starts; they become the answers. Status: ok, max iterations, stalled, numerical.
+    """
+    t, c = packed
+    size = out.x.shape[1]
+    lanes, room = blocks(packed, size, last - first), furnished(t, c, size)
+    m, r = memory(t, room, lanes)
+    tag, used, following = np.zeros((4, lanes), np.int64), lanes, first + lanes
+    for b in range(lanes):
+        tag[START, b], tag[FRESH, b] = first + b, EMPTY
+    while used > 0:
+        begin(c, m, room, tag, used, item, out.x)
+        gather(t, c, m, r, room, True, used)
+        _judge(m, room, size, tag, rules, used)
+        for b in range(used):
+            if ended(tag, b, rules.limit):
+                _finish(m, room, tag, b, out)
+        used, following = refilled(m, room.cells, tag, used, following, last, rules.limit)
+        _advance(m, room, t.shared, t.local, tag, rules.damped, used)
+
+
+@compiled
+def ended(tag: Array, lane: int, limit: int) -> bool:
+    """Return whether the start in a lane needs no further step."""
+    return bool(tag[STATUS, lane] != LIMIT or tag[STEPS, lane] >= limit)
+
+
+@compiled
+def refilled(m: Array, cells: int, tag: Array, used: int, following: int, last: int, limit: int) -> tuple[int, int]:
+    """Give the lanes of ended starts to the following ones, or close them; return lanes in use and the next start."""
+    b = 0
+    while b < used:
+        if not ended(tag, b, limit):
+            b += 1
+        elif following < last:
+            tag[START, b], tag[FRESH, b], tag[STATUS, b], tag[STEPS, b] = following, EMPTY, LIMIT, 0
+            following, b = following + 1, b + 1
+        else:
+            used -= 1
+            move(m, cells, tag, b, used)
+    return used, following
+
+
+@compiled
+def begin(c: Numbers, m: Array, room: Room, tag: Array, used: int, item: Array, x: Array) -> None:
+    """Bring the starts of empty lanes into them."""
+    for b in range(used):
+        if tag[FRESH, b] == EMPTY:
+            start = tag[START, b]
+            tag[FRESH, b], tag[STEPS, b], tag[STATUS, b] = 1, 0, LIMIT
+            load(m, b, item[start], c.source, c.white, c.prior, c.observed, c.present)
+            for i in range(x.shape[1]):
+                m[room.trial + i, b] = x[start, i]
+            m[room.state + DAMPING, b], m[room.state + GROWTH, b] = 1e-6, 2.0
+            m[room.state + BLUR, b] = _blur(c.sigma, c.size, m, room, b, item[start])
+
+
+@compiled
+def _blur(sigma: Array, size: Array, m: Array, room: Room, lane: int, item: int) -> float:
+    """Return the rounding error of the whitened residuals: arrival times that count from long ago are coarse."""
+    row, squares = item if sigma.shape[0] > 1 else 0, 0.0
+    for i in range(sigma.shape[1]):
+        if not room.absent or m[room.present + i, lane] != 0.0:
+            ratio = (abs(m[room.observed + i, lane]) + size[i]) / sigma[row, i]
+            squares += ratio * ratio
+    coarse = 4.0 * _EPSILON * np.sqrt(squares)
+    return coarse if np.isfinite(coarse) else 0.0
+
+
+@compiled
+def move(m: Array, cells: int, tag: Array, to: int, lane: int) -> None:
+    """Bring the problem of one lane into another."""
+    if to != lane:
+        for i in range(tag.shape[0]):
+            tag[i, to] = tag[i, lane]
+        for i in range(cells):
+            m[i, to] = m[i, lane]
+
+
+@compiled
+def _judge(m: Array, room: Room, size: int, tag: Array, rules: Rules, used: int) -> None:
+    """Take the places tried that are better, and set damping and status."""
+    line = size + 1
+    better, cost = room.state + BETTER, line * line - 1
+    for b in range(used):
+        if tag[FRESH, b]:
+            m[better, b], tag[FRESH, b] = 1.0, 0
+            if not np.isfinite(m[room.after + cost, b]):
+                tag[STATUS, b] = NUMERICAL
+        else:
+            tag[STATUS, b] = judged(m, room, room.now + cost, room.after + cost, rules, b)
+    for i in range(size):
+        for b in range(used):
+            m[room.best + i, b] = m[room.trial + i, b] if m[better, b] != 0.0 else m[room.best + i, b]
+    for i in range(line):
+        for cell in range(i * line, i * line + i + 1):
+            for b in range(used):
+                m[room.now + cell, b] = m[room.after + cell, b] if m[better, b] != 0.0 else m[room.now + cell, b]
+
+
+@compiled
+def judged(m: Array, room: Room, now: int, after: int, rules: Rules, b: int) -> int:
+    """Return the status of a lane after a step; say whether it is better and set the damping."""
+    state, status = room.state, LIMIT
+    cost, new, gain, blur = m[now, b], m[after, b], m[state + GAIN, b], m[state + BLUR, b]
+    damping, solvable = m[state + DAMPING, b], m[state + SOLVABLE, b] != 0.0
+    achieved, floor = cost - new, 1e-13 * (1.0 + cost)
+    rounding = floor + 2.0 * blur * np.sqrt(1.0 + cost)
+    better = solvable and np.isfinite(new) and (achieved >= -rounding or not rules.damped)
+    if solvable and abs(gain) * (1.0 + damping) <= max(rules.tolerance * rules.tolerance, floor + blur * blur):
+        status = _OK
+    if better:
+        ratio = achieved / (gain if gain > 0.0 else 1.0)
+        middle = 2.0 * min(max(ratio, 0.0), 1.0) - 1.0
+        change = 0.1 if ratio > 0.9 else max(1.0 / 3.0, 1.0 - middle * middle * middle)
+        m[state + DAMPING, b], m[state + GROWTH, b] = max(damping * change, 1e-12), 2.0
+    else:
+        m[state + DAMPING, b] = damping * m[state + GROWTH, b] + 1e-12
+        m[state + GROWTH, b] *= 2.0
+        if m[state + DAMPING, b] > 1e12:
+            status = _STALLED
+        if not rules.damped:
+            status = NUMERICAL
+    m[state + BETTER, b] = 1.0 if better else 0.0
+    return status
+
+
+@compiled
+def _finish(m: Array, room: Room, tag: Array, lane: int, out: Answers) -> None:
+    """Write the answer of a lane."""
+    start, size = tag[START, lane], out.x.shape[1]
+    last = room.now + size * (size + 1)
+    out.cost[start], out.iterations[start] = m[last + size, lane], tag[STEPS, lane]
+    out.status[start] = tag[STATUS, lane]
+    for i in range(size):
+        out.x[start, i], out.vector[start, i] = m[room.best + i, lane], m[last + i, lane]
+        for j in range(i + 1):
+            entry = m[room.now + i * (size + 1) + j, lane]
+            out.matrix[start, i, j], out.matrix[start, j, i] = entry, entry
+
+
+@compiled
+def _advance(m: Array, room: Room, n: int, local: int, tag: Array, damped: bool, used: int) -> None:
+    """Write the next place to try of every lane that is not fresh, and the squared length of the step."""
+    size, damping, gain = n + local, room.state + DAMPING, room.state + GAIN
+    vector = room.now + size * (size + 1)
+    for b in range(used):
+        m[damping, b] = m[damping, b] if damped else 0.0
+        m[gain, b] = 0.0
+    step(m, room, n, local, damping, room.state + SOLVABLE, used)
+    for i in range(size):
+        for b in range(used):
+            m[gain, b] += m[room.step + i, b] * m[vector + i, b]
+            m[room.trial + i, b] = m[room.trial + i, b] if tag[FRESH, b] else m[room.best + i, b] + m[room.step + i, b]
+    for b in range(used):
+        tag[STEPS, b] += 1 - tag[FRESH, b]
+
+
+# Damped Gauss-Newton for runs whose epochs have unknowns of their own: eliminated epoch by epoch, nothing is kept.
+#
+# The rules are those of `optloc.compute.refine`. A step takes two passes over the epochs: one sums up what they say
+# about the shared unknowns, one works out their own; a third one finds the cost of the place tried.
+
+LEFT_OPEN = -1
+"""Status of a start on whose way an epoch left its own unknowns open: what then holds is left to numpy."""
+_LEAST = 1e-15
+
+
+@compiled
+def refine_runs(packed: Packed, item: Array, first: int, last: int, rules: Rules, out: Answers) -> None:
+    """Refine the starts first <= i < last of runs; see `optloc.compute.refine.refine_block`.
+
+    Neither information nor vector are written.
+    """
+    t, c = packed
+    size = out.x.shape[1]
+    lanes, room = blocks(packed, size, last - first), furnished(t, c, size)
+    m, r = memory(t, room, lanes)
+    tag, used, following = np.zeros((4, lanes), np.int64), lanes, first + lanes
+    for b in range(lanes):
+        tag[START, b], tag[FRESH, b] = first + b, EMPTY
+    while used > 0:
+        begin(c, m, room, tag, used, item, out.x)
+        _price(t, c, m, r, room, used)
+        _judge_run(m, room, size, tag, rules, used)
+        for b in range(used):
+            if ended(tag, b, rules.limit):
+                _finish_run(m, room, tag, b, out)
+        used, following = refilled(m, room.cells, tag, used, following, last, rules.limit)
+        _advance_run(t, c, m, r, room, tag, rules.damped, used)
+
+
+@compiled
+def _price(t: Tables, c: Numbers, m: Array, r: Array, room: Room, lanes: int) -> None:
+    """Write the cost at `room.trial`."""
+    cost, last = room.state + TRIED, t.shared + t.local
+    total = room.after + (last + 1) ** 2 - 1
+    for b in range(lanes):
+        m[total, b] = 0.0
+    for packet in range(t.packets):
+        measure(t, c.common, m, r, room, packet, room.trial, lanes)
+        for group in range(t.table[t.packet + packet, 0], t.table[t.packet + packet + 1, 0]):
+            residual = whiten_group(t, c.common, c.place, m, room, group, True, lanes)
+            for i in range(t.table[t.group + group, 1]):
+                for b in range(lanes):
+                    m[total, b] += m[residual + i * t.width, b] * m[residual + i * t.width, b]
+    _priors(t, c, m, room, room.trial, False, 0, lanes)
+    for epoch in range(t.epochs):
+        _priors(t, c, m, room, room.trial, True, epoch, lanes)
+    for b in range(lanes):
+        m[cost, b] = m[total, b]
+
+
+@compiled
+def _priors(t: Tables, c: Numbers, m: Array, room: Room, x: int, local: bool, epoch: int, lanes: int) -> None:
+    """Add the priors of the shared unknowns, or of those of an epoch, to the equations in `room.after`."""
+    for i in range(t.groups, c.place.shape[0]):
+        if (c.place[i, 3] == 1) == local:
+            start = c.place[i, 1] + (t.shared if local else 0)
+            at = x + start + (epoch * t.local if local else 0)
+            add_prior(c.common, c.place[i, 0], c.place[i, 2], m, room, at, start, t.shared + t.local, lanes)
+
+
+@compiled
+def _judge_run(m: Array, room: Room, size: int, tag: Array, rules: Rules, used: int) -> None:
+    """Take the places tried that are better, and set damping and status."""
+    better, cost, tried = room.state + BETTER, room.state + COST, room.state + TRIED
+    for b in range(used):
+        if tag[FRESH, b]:
+            m[better, b], m[room.state + CLOSED, b], tag[FRESH, b] = 1.0, 1.0, 0
+            if not np.isfinite(m[tried, b]):
+                tag[STATUS, b] = NUMERICAL
+        elif m[room.state + CLOSED, b] == 0.0:
+            m[better, b], tag[STATUS, b] = 0.0, LEFT_OPEN
+        else:
+            tag[STATUS, b] = judged(m, room, cost, tried, rules, b)
+        m[cost, b] = m[tried, b] if m[better, b] != 0.0 else m[cost, b]
+    for i in range(size):
+        for b in range(used):
+            m[room.best + i, b] = m[room.trial + i, b] if m[better, b] != 0.0 else m[room.best + i, b]
+
+
+@compiled
+def _finish_run(m: Array, room: Room, tag: Array, lane: int, out: Answers) -> None:
+    """Write the answer of a lane."""
+    start = tag[START, lane]
+    out.cost[start], out.iterations[start] = m[room.state + COST, lane], tag[STEPS, lane]
+    out.status[start] = tag[STATUS, lane]
+    for i in range(out.x.shape[1]):
+        out.x[start, i] = m[room.best + i, lane]
+
+
+@compiled
+def _advance_run(t: Tables, c: Numbers, m: Array, r: Array, room: Room, tag: Array, damped: bool, used: int) -> None:
+    """Write the next place to try of every lane that is not fresh, and the squared length of the step."""
+    n, damping, gain = t.shared, room.state + DAMPING, room.state + GAIN
+    vector = room.now + (n + t.local) * (n + t.local + 1)
+    for b in range(used):
+        m[damping, b] = m[damping, b] if damped else 0.0
+    _pass(t, c, m, r, room, tag, True, used)
+    factor(m, room.shared, n, room.shared_scale, room.state + SOLVABLE, _LEAST, used)
+    forward(m, room.shared, n, room.shared_scale, room.step, used)
+    backward(m, room.shared, n, room.shared_scale, room.step, used)
+    for b in range(used):
+        m[gain, b] = 0.0
+    for i in range(n):
+        for b in range(used):
+            m[room.step + i, b] = m[room.step + i, b] if m[room.state + SOLVABLE, b] != 0.0 else 0.0
+            m[gain, b] += m[room.step + i, b] * m[vector + i, b]
+            if tag[FRESH, b] == 0:
+                m[room.trial + i, b] = m[room.best + i, b] + m[room.step + i, b]
+    _pass(t, c, m, r, room, tag, False, used)
+    for b in range(used):
+        tag[STEPS, b] += 1 - tag[FRESH, b]
+
+
+@compiled
+def _pass(t: Tables, c: Numbers, m: Array, r: Array, room: Room, tag: Array, summing: bool, lanes: int) -> None:
+    """Go through the epochs at `room.best`: sum up the shared system (in `room.now` undamped), or step their own."""
+    n, local, last = t.shared, t.local, t.shared + t.local
+    group, packet, line = 0, 0, last + 1
+    if summing:
+        clear(m, room.now, line * line, lanes)
+        clear(m, room.shared, n * n, lanes)
+        clear(m, room.step, n, lanes)
+        for b in range(lanes):
+            m[room.state + SOLVABLE, b], m[room.state + CLOSED, b] = 1.0, 1.0
+    for epoch in range(t.epochs + 1):
+        clear(m, room.after, line * line, lanes)
+        while group < t.groups and t.table[t.group + group, 2] == epoch:
+            if packet < t.packets and t.table[t.packet + packet, 0] == group:
+                measure(t, c.common, m, r, room, packet, room.best, lanes)
+                packet += 1
+            add_group(t, c.common, c.place, m, room, group, lanes)
+            group += 1
+        whole = epoch == t.epochs  # behind the last epoch come the priors of what lasts the run
+        _priors(t, c, m, room, room.best, not whole, epoch, lanes)
+        if not whole:
+            closed = room.state + CLOSED
+            factor_local(m, room, room.after, n, local, room.state + DAMPING, closed, OPEN, lanes)
+            if summing:
+                eliminate(m, room, n, local, lanes)
+            else:
+                _own(m, room, tag, n, local, epoch, lanes)
+        if summing:
+            for cell in range(line * line):
+                for b in range(lanes):
+                    m[room.now + cell, b] += m[room.after + cell, b]
+    if summing:
+        _added(m, room, n, line, lanes)
+
+
+@compiled
+def _own(m: Array, room: Room, tag: Array, n: int, local: int, epoch: int, lanes: int) -> None:
+    """Write the step of the unknowns of an epoch."""
+    complete(m, room, n, local, lanes)
+    vector, at = room.after + (n + local) * (n + local + 1) + n, n + epoch * local
+    for a in range(local):
+        for b in range(lanes):
+            m[room.state + GAIN, b] += m[room.step + n + a, b] * m[vector + a, b]
+            if tag[FRESH, b] == 0:
+                m[room.trial + at + a, b] = m[room.best + at + a, b] + m[room.step + n + a, b]
+
+
+@compiled
+def _added(m: Array, room: Room, n: int, line: int, lanes: int) -> None:
+    """Add the damped sums of all epochs to what their unknowns cost them."""
+    for i in range(n):
+        for j in range(i + 1):
+            for b in range(lanes):
+                grown = 1.0 + m[room.state + DAMPING, b] if i == j else 1.0
+                m[room.shared + i * n + j, b] += m[room.now + i * line + j, b] * grown
+        for b in range(lanes):
+            m[room.step + i, b] += m[room.now + (line - 1) * line + i, b]
+
+
+# Refinements of many starts spread over threads, by the kernel that serves the problem.
+
+
+def refined(packed: Packed, item: Array, start: Array, rules: Rules) -> tuple[Answers, Array]:
+    """Return where the refinements of starts (M, size) of given problems end, and where numpy must take over, (M,).
+
+    Parameters
+    ----------
+    packed : Packed
+        N problems.
+    item : int64 array (M,)
+        Problem of each start.
+    start : array (M, size)
+        Starting vectors.
+    rules : Rules
+        When to stop.
+    """
+    of_epochs = packed.tables.local > 0 and packed.tables.epochs > 1
+    out, kernel = answers(start, 0 if of_epochs else None), refine_runs if of_epochs else refine_block
+    mapped(lambda part: kernel(packed, item, part[0], part[1], rules, out), chunks(len(start)))
+    return out, np.asarray(out.status == LEFT_OPEN)
+
+
+def equations(packed: Packed, item: Array, done: Answers) -> Normal:
+    """Return the normal equations at the answers."""
+    n, matrix, vector = packed.tables.shared, done.matrix, done.vector
+    if matrix.shape[-1] == 0:
+        return normal_at(packed, done.x, item, priors=True)
+    return Normal(
+        matrix[:, :n, :n],
+        matrix[:, None, n:, n:],
+        matrix[:, None, :n, n:],
+        vector[:, :n],
+        vector[:, None, n:],
+        done.cost,
+    )

@@ -1,0 +1,78 @@
+"""The normal equations of a run: sums over its epochs, window by window."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import enabled
+from optloc.compute.pack import packed
+from optloc.linear.normal import Normal, linearise, normal, with_priors
+from optloc.linear.station_noise import depends_on_place, whitener_at
+from optloc.problem.epochs import windows
+from optloc.problem.noise import Whitener
+from optloc.problem.problem import Problem
+
+# Numbers of rows, over all problems, from which machine code saves more than it takes to get it going; tables of longer
+# runs would not be constant in memory.
+_WORTH, _LONGEST = 2000, 2**13
+
+
+def equations_at(
+    problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = None, *, at: Array | None = None
+) -> Normal:
+    """Return the normal equations, priors included, of a batch of problems.
+
+    Working memory beyond the measurements does not depend on the number of epochs: only sums are kept, and the local
+    blocks of epochs that have unknowns of their own.
+
+    Parameters
+    ----------
+    problem : Problem
+        Batch of problems (...).
+    x : array (..., size)
+        Parameter vectors.
+    noise : tuple of Whitener, optional
+        Whitening matrices of all rows, used where the run is one window; None: made from the problem.
+    at : array (..., size), optional
+        Where station errors of span "noise" are weighed; None: at `x`.
+    """
+    return with_priors(problem, x, summed(problem, x, noise, at=at))
+
+
+def summed(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = None, *, at: Array | None = None) -> Normal:
+    """Return the normal equations of the measurements alone; arguments as of `equations_at`."""
+    quick = _compiled(problem, x, noise) if at is None else None
+    if quick is not None:
+        return quick
+    total = None
+    for first, last, part in windows(problem, x.size // x.shape[-1]):
+        own = noise if last - first == problem.epochs else None
+        if own is None and at is not None:
+            own = whitener_at(part, at)
+        linear = linearise(part, x, own)
+        sums = normal(replace(linear, epoch=linear.epoch - first), last - first)
+        total = sums if total is None else total + sums
+    assert total is not None
+    return total
+
+
+def _compiled(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None) -> Normal | None:
+    """Return the sums by machine code, or None where it does not serve the problem or does not pay."""
+    count = x.size // x.shape[-1]
+    alike = problem.batch_shape in {(), (1,), (count,)} and x.ndim == 2
+    if not alike or not serves(problem, count) or (noise is None and depends_on_place(problem)):
+        return None
+    found = packed(problem, whitener_at(problem, x) if noise is None else noise)
+    if found is None:
+        return None
+    from optloc.compute.equations import normal_at
+
+    return normal_at(found, x, np.arange(count) % max(1, *problem.batch_shape, 1))
+
+
+def serves(problem: Problem, starts: int) -> bool:
+    """Return whether machine code is at hand and pays for a number of vectors of a problem."""
+    return problem.count <= _LONGEST and starts * problem.count >= _WORTH and enabled()

@@ -1,0 +1,441 @@
+"""Which number goes where: the indices that the compiled core follows, made once for problems of equal structure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.trace import Traced, traced
+from optloc.linear.evaluate import given
+from optloc.linear.indices import Plan, Terms, plans
+from optloc.problem.problem import Problem
+
+# The order in which rows are evaluated, and the unknowns that each group of them touches.
+
+# Rows whose derivatives are at hand together: about this many numbers a lane, so that they stay in the cache.
+_NUMBERS, _MOST, _LEAST = 512, 128, 8
+
+
+def starts(counts: Any) -> Array:
+    """Return where each of several parts of given lengths begins, and the end."""
+    return np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class Groups:
+    """Groups of correlated rows in the order of their epochs.
+
+    Parameters
+    ----------
+    of : int array (m,)
+        Group of each row of the problem.
+    member : int array (m,)
+        Its place in the group.
+    size, epoch : int array (g,)
+        Rows of each group, and the epoch of its first.
+    number : int array (g,)
+        Which of the groups handed in each is, counted through all of them.
+    """
+
+    of: Array
+    member: Array
+    size: Array
+    epoch: Array
+    number: Array
+
+    @classmethod
+    def sorted(cls, problem: Problem, groups: tuple[Array, ...]) -> Groups:
+        """Return the groups (g, r) of a problem, sorted."""
+        rows = np.concatenate([group.ravel() for group in groups])
+        size = np.concatenate([np.full(len(group), group.shape[1]) for group in groups])
+        head = starts(size)[:-1]
+        epoch = problem.epoch[rows[head]]
+        number = np.argsort(epoch, kind="stable")
+        rank = np.empty_like(number)
+        rank[number] = np.arange(len(number))
+        of, member = np.full(problem.count, -1), np.zeros(problem.count, dtype=np.int64)
+        of[rows] = np.repeat(rank, size)
+        member[rows] = np.arange(len(rows)) - np.repeat(head, size)
+        return cls(of, member, size[number], epoch[number], number)
+
+
+@dataclass(frozen=True, slots=True)
+class Entries:
+    """Which unknown moves what: one entry for each, rows counted through the problem.
+
+    Parameters
+    ----------
+    row, column : int array (n,)
+        Row, and column of the full parameter vector.
+    factor : array (n,)
+        How strongly.
+    place : int array (n,)
+        Which input of the row's kind; zero where it acts on the measurement itself.
+    """
+
+    row: Array
+    column: Array
+    factor: Array
+    place: Array
+
+    @classmethod
+    def joined(cls, parts: list[Entries]) -> Entries:
+        """Return the entries of several."""
+        none = np.zeros(0, dtype=np.int64)
+        parts = [cls(none, none, np.zeros(0), none), *parts]
+        return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.__slots__))
+
+    @classmethod
+    def terms(cls, terms: Terms, start: int) -> Entries:
+        """Return those of linear terms of a block whose first row has a given number."""
+        return cls(start + terms.row, terms.column, terms.coefficient, np.zeros_like(terms.row))
+
+    @classmethod
+    def feeds(cls, plan: Plan, trace: Traced, start: int) -> Entries:
+        """Return those of the inputs of a block that its function needs."""
+        place, parts = {seed: i for i, (seed, _) in enumerate(trace.tape.inputs)}, []
+        for feed in plan.feeds:
+            if feed.seed in place:
+                rows = np.arange(plan.block.count)[feed.rows]
+                gain = np.broadcast_to(np.asarray(feed.gain, dtype=float), rows.shape)
+                parts.append(cls(start + rows, feed.column, gain, np.full(rows.shape, place[feed.seed])))
+        return cls.joined(parts)
+
+
+@dataclass(frozen=True, slots=True)
+class Columns:
+    """The unknowns that each group touches: shared ones, then the local ones of its epoch.
+
+    Parameters
+    ----------
+    column : int array (c,)
+        Of all groups, one after the other, ascending in each.
+    at : int array (g + 1,)
+        Where each group begins.
+    """
+
+    column: Array
+    at: Array
+
+    @classmethod
+    def of(cls, problem: Problem, groups: Groups, entries: list[Entries]) -> tuple[Columns, list[Array]]:
+        """Return the columns, and the place of each entry among those of its group."""
+        n, length = problem.layout.n_shared, problem.layout.n_local
+        keys = []
+        for part in entries:
+            folded = np.where(part.column < n, part.column, n + (part.column - n) % max(length, 1))
+            keys.append(groups.of[part.row] * (n + length) + folded)
+        found, place = np.unique(np.concatenate(keys), return_inverse=True)
+        at = np.searchsorted(found, np.arange(len(groups.size) + 1) * (n + length))
+        slots = place - at[np.concatenate(keys) // (n + length)]
+        return cls(found % (n + length), at), np.split(slots, starts([len(key) for key in keys])[1:-1])
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """The order of evaluation: packets of groups, and in each packet its rows kind by kind.
+
+    Parameters
+    ----------
+    row : int array (m,)
+        Number in the problem of each row evaluated.
+    at : int array (m,)
+        When each row of the problem is evaluated.
+    place : int array (m,)
+        Place of each row evaluated among those of its packet; rows of a group follow each other there.
+    packet_group : int array (p + 1,)
+        First group of each packet.
+    packet_row : int array (p, q + 1)
+        First row evaluated of each kind in each packet.
+    """
+
+    row: Array
+    at: Array
+    place: Array
+    packet_group: Array
+    packet_row: Array
+
+    @classmethod
+    def of(cls, problem: Problem, groups: Groups, width: int) -> Order:
+        """Return the order for groups whose rows have a number of columns at most."""
+        limit = int(np.clip(_NUMBERS // width, _LEAST, _MOST))
+        first = starts(groups.size)
+        packet = np.unique(first[:-1] // limit, return_inverse=True)[1]
+        packets, kinds = int(packet[-1]) + 1, len(problem.rows)
+        packet_group = np.searchsorted(packet, np.arange(packets + 1))
+        kind = np.repeat(np.arange(kinds), [rows.count for rows in problem.rows])
+        place = first[groups.of] + groups.member
+        mine = packet[groups.of]
+        row = np.lexsort((place, kind, mine))
+        at = np.empty_like(row)
+        at[row] = np.arange(len(row))
+        counts = np.bincount(mine * kinds + kind, minlength=packets * kinds)
+        begin = starts(counts)[np.arange(packets)[:, None] * kinds + np.arange(kinds + 1)]
+        return cls(row, at, (place - first[packet_group[mine]])[row], packet_group, begin)
+
+
+class Tables(NamedTuple):
+    """The indices of a structure; rows are numbered in the order in which they are evaluated.
+
+    Rows whose noise is correlated form a group, groups follow each other in time, and a stretch of groups whose rows
+    are evaluated together is a packet. All tables stand below each other, for every array that is handed to
+    a kernel takes time. Where a table says "first", its next line says where that ends.
+    """
+
+    table: Array  # int64 (n, 6): all tables below each other
+    real: Array  # constants and factors
+    # Where each table begins in `table`.
+    code: int  # operation, target, operands, see `Tape`; the tapes of all kinds
+    kind: int  # first operation, constant, input; register of the value; 1 for an angle
+    constant: int  # register; its values are the first of `real`
+    input: int  # register, and the register of the derivative by it; -1 for none
+    row: int  # number in the problem, place in the packet, columns of the group; first source, scale, addend
+    source: int  # input of a row: >= 0 a number that all problems share, else -1 - one of its own; first feed
+    term: int  # column of the vector, place among the columns of the group: of feeds, scales, addends
+    packet: int  # first group
+    part: int  # first row, for each packet and kind
+    group: int  # first row in the packet, rows, epoch; first column
+    column: int  # unknowns of a group, ascending: shared ones, then local ones of its epoch
+    factor: int  # where the factors of the terms begin in `real`
+    kinds: int
+    packets: int
+    groups: int
+    shared: int
+    local: int
+    epochs: int
+    registers: int
+    width: int  # most columns of a group, and one for the residual
+    rows: int  # most rows of a packet
+    size: int  # most rows of a group
+
+
+@dataclass(frozen=True, slots=True)
+class Kept:
+    """Tables, and which of the groups of the whiteners each group is: int array (groups,)."""
+
+    tables: Tables
+    number: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Sources:
+    """The data arrays that inputs come from, in order, and where each begins: the first number of all is zero.
+
+    Parameters
+    ----------
+    arrays : tuple of (array, core rank)
+        Station positions, rates, axes, known targets.
+    start : tuple of int
+        Number of the first entry of each, counted over one problem.
+    """
+
+    arrays: tuple[tuple[Array, int], ...]
+    start: tuple[int, ...]
+
+    @classmethod
+    def of(cls, problem: Problem) -> Sources:
+        """Return the data arrays of a flat batch of problems."""
+        s = problem.stations
+        found = [(s.position, 3), (s.velocity, 3), (s.axes, 4), *((m.known, 3) for m in problem.motions)]
+        arrays = tuple((array, core) for array, core in found if array is not None)
+        sizes = [int(np.prod(array.shape[array.ndim - core :])) for array, core in arrays]
+        return cls(arrays, tuple(int(n) for n in np.cumsum([1, *sizes[:-1]])))
+
+    @property
+    def own(self) -> tuple[bool, ...]:
+        """Return whether each problem of the batch has its own array."""
+        return tuple(array.ndim > core and array.shape[0] > 1 for array, core in self.arrays)
+
+    def numbered(self, problem: Problem) -> Problem:
+        """Return the problem with every number of these arrays replaced by its place among them."""
+        places = iter(
+            start + np.arange(np.prod(array.shape[array.ndim - core :]), dtype=float).reshape(array.shape[-core:])
+            for (array, core), start in zip(self.arrays, self.start, strict=True)
+        )
+
+        def place(array: Array | None) -> Array | None:
+            return None if array is None else next(places)
+
+        s = problem.stations
+        stations = replace(s, position=next(places), velocity=place(s.velocity), axes=place(s.axes))
+        motions = tuple(replace(m, known=place(m.known)) for m in problem.motions)
+        return replace(problem, stations=stations, motions=motions)
+
+    def lookup(self) -> Array:
+        """Return for each number its place among those that all problems share, or -1 - its place among their own."""
+        shared, own, out = 1, 0, [np.zeros(1, dtype=np.int64)]
+        for (array, core), mine in zip(self.arrays, self.own, strict=True):
+            count = int(np.prod(array.shape[array.ndim - core :]))
+            out.append(-1 - own - np.arange(count) if mine else shared + np.arange(count))
+            own, shared = (own + count, shared) if mine else (own, shared + count)
+        return np.concatenate(out)
+
+
+_KEPT: dict[tuple[Any, ...], Kept | None] = {}
+# Tables of longer problems are made anew each time: that takes less time than a fix, and no memory that lasts.
+_KEPT_ROWS, _KEPT_LINES = 2**13, 2**19
+
+
+def tables(problem: Problem, groups: tuple[Array, ...]) -> Kept | None:
+    """Return the tables of a flat batch of problems, or None where the compiled core does not serve it.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    groups : tuple of int array (g, r)
+        Rows whose noise is correlated, every row in exactly one group.
+    """
+    sources = Sources.of(problem)
+    if problem.count > _KEPT_ROWS:
+        return _tables(problem, groups, sources)
+    shapes = tuple(array.shape[array.ndim - core :] for array, core in sources.arrays)
+    key = (problem.structure, shapes, sources.own, *((g.shape, g.tobytes()) for g in groups))
+    if key not in _KEPT:
+        if sum(len(kept.tables.table) for kept in _KEPT.values() if kept is not None) > _KEPT_LINES:
+            _KEPT.clear()
+        _KEPT[key] = _tables(problem, groups, sources)
+    return _KEPT[key]
+
+
+def _tables(problem: Problem, groups: tuple[Array, ...], sources: Sources) -> Kept | None:
+    layout = problem.layout
+    if layout.n_shared + layout.n_local == 0 or _spanning(problem, groups):
+        return None
+    numbered, found = sources.numbered(problem), []
+    for plan in plans(problem):
+        inputs = given(numbered, plan)
+        moved = frozenset(feed.seed for feed in plan.feeds)
+        trace = traced(problem, plan, frozenset(inputs), moved)
+        if trace is None:
+            return None
+        found.append(_Kind(plan, trace, inputs))
+    return _filled(problem, Groups.sorted(problem, groups), found, sources.lookup())
+
+
+def _spanning(problem: Problem, groups: tuple[Array, ...]) -> bool:
+    """Return whether noise ties epochs that have unknowns of their own."""
+    epoch = problem.epoch
+    several = problem.layout.n_local > 0 and problem.epochs > 1
+    return several and any(bool((epoch[group] != epoch[group[:, :1]]).any()) for group in groups)
+
+
+@dataclass(frozen=True, slots=True)
+class _Kind:
+    """A block of rows, its tape, and the number of each input of each row among the sources."""
+
+    plan: Plan
+    trace: Traced
+    inputs: dict[int, Array]
+
+
+def _filled(problem: Problem, groups: Groups, found: list[_Kind], lookup: Array) -> Kept:
+    pairs = list(zip(found, problem.starts, strict=True))
+    feeds = Entries.joined([Entries.feeds(kind.plan, kind.trace, start) for kind, start in pairs])
+    scales = Entries.joined([Entries.terms(kind.plan.gains, start) for kind, start in pairs])
+    adds = Entries.joined([Entries.terms(kind.plan.adds, start) for kind, start in pairs])
+    columns, slots = Columns.of(problem, groups, [feeds, scales, adds])
+    count, tapes = np.diff(columns.at), [kind.trace.tape for kind in found]
+    order = Order.of(problem, groups, int(count.max()) + 1)
+    inputs = np.concatenate([np.full(k.plan.block.count, len(t.inputs)) for k, t in zip(found, tapes, strict=True)])
+    source_at = starts(inputs[order.row])
+    place = source_at[order.at[feeds.row]] + feeds.place
+    term, factor, at = _listed(
+        [feeds, scales, adds],
+        slots,
+        [place, order.at[scales.row], order.at[adds.row]],
+        [int(source_at[-1]), problem.count, problem.count],
+    )
+    first = starts(groups.size)[:-1]
+    head = first[np.repeat(order.packet_group[:-1], np.diff(order.packet_group))]
+    constant, parts = _tapes(found)
+    parts |= {
+        "row": _table(order.row, order.place, count[groups.of[order.row]], source_at, at[1], at[2]),
+        "source": _table(_sources(found, source_at, order, lookup), at[0]),
+        "term": term,
+        "packet": _table(order.packet_group),
+        "part": _table(order.packet_row.ravel()),
+        "group": _table(first - head, groups.size, groups.epoch, columns.at),
+        "column": _table(columns.column),
+    }
+    begin = starts([len(part) for part in parts.values()])
+    index = np.zeros((int(begin[-1]), 6), dtype=np.int64)
+    for start, part in zip(begin, parts.values(), strict=False):
+        index[start : start + len(part), : part.shape[1]] = part
+    tables = Tables(
+        index,
+        np.concatenate([constant, factor]),
+        **dict(zip(parts, begin.tolist(), strict=False)),
+        factor=len(constant),
+        kinds=len(found),
+        packets=len(order.packet_row),
+        groups=len(groups.size),
+        shared=problem.layout.n_shared,
+        local=problem.layout.n_local,
+        epochs=problem.epochs,
+        registers=max(tape.registers for tape in tapes),
+        width=int(count.max()) + 1,
+        rows=int(order.place.max()) + 1,
+        size=int(groups.size.max()),
+    )
+    return Kept(tables, groups.number)
+
+
+def _table(*columns: Array) -> Array:
+    """Return columns side by side; shorter ones end with a zero."""
+    out = np.zeros((max(len(column) for column in columns), len(columns)), dtype=np.int64)
+    for i, column in enumerate(columns):
+        out[: len(column), i] = column
+    return out
+
+
+def _sources(found: list[_Kind], source_at: Array, order: Order, lookup: Array) -> Array:
+    """Return where each input of each row evaluated is found."""
+    out, start = np.zeros(int(source_at[-1]), dtype=np.int64), 0
+    for kind in found:
+        count = kind.plan.block.count
+        first = source_at[order.at[start : start + count]]
+        for i, (seed, _) in enumerate(kind.trace.tape.inputs):
+            if seed in kind.inputs:
+                out[first + i] = kind.inputs[seed]
+        start += count
+    return np.asarray(lookup[out])
+
+
+def _listed(
+    parts: list[Entries], slots: list[Array], owners: list[Array], counts: list[int]
+) -> tuple[Array, Array, list[Array]]:
+    """Return entries one after the other, owner by owner: indices, factors, and where each owner begins."""
+    terms, factors, at, start = [], [], [], 0
+    for part, slot, owner, count in zip(parts, slots, owners, counts, strict=True):
+        order = np.argsort(owner, kind="stable")
+        terms.append(_table(part.column, slot)[order])
+        factors.append(part.factor[order].astype(float))
+        at.append(start + starts(np.bincount(owner, minlength=count)))
+        start += len(order)
+    return np.concatenate(terms), np.concatenate(factors), at
+
+
+def _tapes(found: list[_Kind]) -> tuple[Array, dict[str, Array]]:
+    """Return the constants of the tapes of all kinds, and the tapes one after the other."""
+    tapes = [kind.trace.tape for kind in found]
+    constants = [pair for tape in tapes for pair in tape.constants]
+    inputs: list[tuple[int, int]] = []
+    for kind in found:
+        where = dict(zip(kind.trace.seeds, kind.trace.tape.outputs[1:], strict=True))
+        inputs.extend((register, where.get(seed, -1)) for seed, register in kind.trace.tape.inputs)
+    parts = [[len(t.code) for t in tapes], [len(t.constants) for t in tapes], [len(t.inputs) for t in tapes]]
+    kinds = _table(
+        *(starts(part) for part in parts),
+        np.array([tape.outputs[0] for tape in tapes]),
+        np.array([kind.plan.model.period is not None for kind in found]),
+    )
+    return np.array([value for _, value in constants], dtype=float), {
+        "code": np.concatenate([tape.code for tape in tapes]),
+        "kind": kinds,
+        "constant": np.array([register for register, _ in constants], dtype=np.int64).reshape(-1, 1),
+        "input": np.array(inputs, dtype=np.int64).reshape(-1, 2),
+    }

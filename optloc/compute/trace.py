@@ -1,0 +1,386 @@
+"""Measurement functions with their derivatives as tapes: each kind is traced once, whoever registered it."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.linear.evaluate import joined
+from optloc.linear.indices import Plan
+from optloc.models import Model
+from optloc.models.jet import Jet
+from optloc.problem.problem import Problem
+
+# Numbers that are not known yet: what a function does with them is written down, each operation once.
+
+OPERATIONS = ("add", "sub", "mul", "div", "neg", "sqrt", "hypot", "atan2", "sin", "cos", "log", "exp")
+ADD, SUB, MUL, DIV, NEG, SQRT, HYPOT, ATAN2, SIN, COS, LOG, EXP = range(len(OPERATIONS))
+INPUT, CONSTANT = -1, -2
+UNARY = (NEG, SQRT, SIN, COS, LOG, EXP)
+
+_FUNCTIONS: tuple[Any, ...] = (
+    np.add,
+    np.subtract,
+    np.multiply,
+    np.divide,
+    np.negative,
+    np.sqrt,
+    np.hypot,
+    np.arctan2,
+    np.sin,
+    np.cos,
+    np.log,
+    np.exp,
+)
+_NUMBER = {function.__name__: number for number, function in enumerate(_FUNCTIONS)}
+
+
+def computed(operation: int, left: Any, right: Any) -> Any:
+    """Return the value of an operation on numbers or arrays, by numpy."""
+    with np.errstate(all="ignore"):
+        return _FUNCTIONS[operation](left) if operation in UNARY else _FUNCTIONS[operation](left, right)
+
+
+@dataclass(slots=True)
+class Recorder:
+    """Every operation of a function, each of them once.
+
+    Parameters
+    ----------
+    nodes : list of (operation, left, right)
+        What each node is made of; inputs and constants have negative operations.
+    known : dict
+        The number of each node.
+    """
+
+    nodes: list[tuple[int, Any, Any]] = field(default_factory=list)
+    known: dict[tuple[int, Any, Any], int] = field(default_factory=dict)
+
+    def input(self, seed: int) -> Symbol:
+        """Return the symbol of an input."""
+        return Symbol(self, self._number((INPUT, seed, 0)))
+
+    def node(self, value: Any) -> int:
+        """Return the number of the node of a symbol or a constant."""
+        if isinstance(value, Symbol):
+            return value.node
+        number = float(value)
+        # Keyed by its bits: -0.0 is not 0.0, and one NaN is as good as another.
+        return self._number((CONSTANT, number, math.copysign(1.0, number)))
+
+    def constant(self, node: int) -> float | None:
+        """Return the value of a constant node, None for any other."""
+        operation, value, _ = self.nodes[node]
+        return float(value) if operation == CONSTANT else None
+
+    def apply(self, operation: int, left: Any, right: Any = None) -> Symbol:
+        """Return the symbol of an operation on symbols or numbers."""
+        u = self.node(left)
+        v = u if operation in UNARY else self.node(right)
+        return Symbol(self, self._simplified(operation, u, v))
+
+    def _number(self, key: tuple[int, Any, Any]) -> int:
+        if key not in self.known:
+            self.known[key] = len(self.nodes)
+            self.nodes.append(key)
+        return self.known[key]
+
+    def _simplified(self, operation: int, u: int, v: int) -> int:
+        """Return the node of an operation: folded, or another form that gives the same number to the last bit."""
+        left, right = self.constant(u), self.constant(v)
+        if left is not None and right is not None:
+            return self.node(computed(operation, left, right))
+        rule = {ADD: self._add, SUB: self._sub, MUL: self._mul, DIV: self._div, NEG: self._neg}.get(operation)
+        found = None if rule is None else rule(u, v)
+        if found is not None:
+            return found
+        if operation in (ADD, MUL, HYPOT):
+            u, v = min(u, v), max(u, v)
+        return self._number((operation, u, v))
+
+    def _is(self, node: int, operation: int) -> bool:
+        return self.nodes[node][0] == operation
+
+    def _add(self, u: int, v: int) -> int | None:
+        if self.constant(u) == 0.0:
+            return v
+        if self.constant(v) == 0.0:
+            return u
+        if u == v:
+            return self._simplified(MUL, self.node(2.0), u)
+        if self._is(v, NEG):
+            return self._simplified(SUB, u, self.nodes[v][1])
+        return self._simplified(SUB, v, self.nodes[u][1]) if self._is(u, NEG) else None
+
+    def _sub(self, u: int, v: int) -> int | None:
+        if self.constant(v) == 0.0:
+            return u
+        if self.constant(u) == 0.0:
+            return self._simplified(NEG, v, v)
+        return self._simplified(ADD, u, self.nodes[v][1]) if self._is(v, NEG) else None
+
+    def _mul(self, u: int, v: int) -> int | None:
+        for one, other in ((u, v), (v, u)):
+            value = self.constant(one)
+            if value == 0.0:
+                return self.node(0.0)
+            if value in (1.0, -1.0):
+                return other if value == 1.0 else self._simplified(NEG, other, other)
+            if self._is(one, NEG):
+                product = self._simplified(MUL, self.nodes[one][1], other)
+                return self._simplified(NEG, product, product)
+            scaled = self._scaled(one, other)
+            if scaled is not None:
+                return scaled
+        return None
+
+    def _scaled(self, u: int, v: int) -> int | None:
+        """Return ``(2^k a) (c / b)`` as ``a (2^k c / b)``: the derivative of a root of squares has this form."""
+        operation, factor, a = self.nodes[u]
+        if operation != MUL or not self._is(v, DIV):
+            return None
+        if self.constant(factor) is None:
+            factor, a = a, factor
+        power, top = self.constant(factor), self.constant(self.nodes[v][1])
+        if power is None or top is None or math.frexp(power)[0] != 0.5:
+            return None
+        return self._simplified(MUL, a, self._simplified(DIV, self.node(power * top), self.nodes[v][2]))
+
+    def _div(self, u: int, v: int) -> int | None:
+        if self.constant(v) == 1.0:
+            return u
+        if self._is(u, NEG):
+            ratio = self._simplified(DIV, self.nodes[u][1], v)
+            return self._simplified(NEG, ratio, ratio)
+        return None
+
+    def _neg(self, u: int, v: int) -> int | None:
+        operation, left, right = self.nodes[u]
+        if operation == NEG:
+            return int(left)
+        return self._simplified(SUB, right, left) if operation == SUB else None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Symbol:
+    """A number that is not known yet: arithmetic on it is written down.
+
+    Parameters
+    ----------
+    recorder : Recorder
+        Where.
+    node : int
+        Its own node.
+    """
+
+    recorder: Recorder
+    node: int
+
+    def __elementary__(self) -> ModuleType:
+        return sys.modules[__name__]
+
+    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **options: Any) -> Any:
+        if method != "__call__" or options or ufunc.__name__ not in _NUMBER:
+            return NotImplemented
+        return self.recorder.apply(_NUMBER[ufunc.__name__], *inputs)
+
+    def __add__(self, other: Any) -> Any:
+        return self._with(ADD, self, other)
+
+    def __radd__(self, other: Any) -> Any:
+        return self._with(ADD, other, self)
+
+    def __sub__(self, other: Any) -> Any:
+        return self._with(SUB, self, other)
+
+    def __rsub__(self, other: Any) -> Any:
+        return self._with(SUB, other, self)
+
+    def __mul__(self, other: Any) -> Any:
+        return self._with(MUL, self, other)
+
+    def __rmul__(self, other: Any) -> Any:
+        return self._with(MUL, other, self)
+
+    def __truediv__(self, other: Any) -> Any:
+        return self._with(DIV, self, other)
+
+    def __rtruediv__(self, other: Any) -> Any:
+        return self._with(DIV, other, self)
+
+    def __neg__(self) -> Symbol:
+        return self.recorder.apply(NEG, self)
+
+    def __bool__(self) -> bool:
+        raise TypeError("a measurement function must not test its arguments")
+
+    def _with(self, operation: int, left: Any, right: Any) -> Any:
+        for one in (left, right):
+            if not isinstance(one, Symbol | int | float | np.number):
+                return NotImplemented
+        return self.recorder.apply(operation, left, right)
+
+
+def _function(operation: int) -> Callable[..., Symbol]:
+    def record(u: Any, v: Any = None) -> Symbol:
+        owner = u if isinstance(u, Symbol) else v
+        return owner.recorder.apply(operation, u, v)
+
+    return record
+
+
+# What a measurement function finds here by way of `optloc.models.namespace`.
+sqrt, hypot, atan2, sin, cos, log, exp = (_function(op) for op in (SQRT, HYPOT, ATAN2, SIN, COS, LOG, EXP))
+
+
+# A function of numbers as a straight list of operations on registers: only what is needed, registers used again.
+
+
+@dataclass(frozen=True, slots=True)
+class Tape:
+    """A straight list of operations on registers.
+
+    Parameters
+    ----------
+    code : int array (n, 4)
+        Operation, target register, left and right operand; a target is never an operand of its own operation.
+    inputs : tuple of (seed, register)
+        Where each input is expected.
+    constants : tuple of (register, value)
+        What must be there before the first operation.
+    outputs : tuple of int
+        Registers of the outputs.
+    registers : int
+        How many there are.
+    """
+
+    code: Array
+    inputs: tuple[tuple[int, int], ...]
+    constants: tuple[tuple[int, float], ...]
+    outputs: tuple[int, ...]
+    registers: int
+
+
+def tape(recorder: Recorder, outputs: list[Any]) -> Tape:
+    """Return the operations that given outputs (symbols or numbers) need, in order, registers used again and again."""
+    wanted = [recorder.node(value) for value in outputs]
+    needed = _needed(recorder, wanted)
+    last = _last_uses(recorder, needed, wanted)
+    free: list[int] = []
+    code: list[tuple[int, int, int, int]] = []
+    loaded = [node for node in needed if recorder.nodes[node][0] < 0]
+    register = {node: number for number, node in enumerate(loaded)}
+    count = len(loaded)
+    for node in needed:
+        operation, left, right = recorder.nodes[node]
+        if operation < 0:
+            continue
+        count += not free
+        register[node] = free.pop() if free else count - 1
+        code.append((operation, register[node], register[left], register[right]))
+        free.extend(register[used] for used in {left, right} if last[used] == node)
+    return Tape(
+        np.array(code, dtype=np.int64).reshape(-1, 4),
+        tuple((int(recorder.nodes[n][1]), register[n]) for n in loaded if recorder.nodes[n][0] == INPUT),
+        tuple((register[n], float(recorder.nodes[n][1])) for n in loaded if recorder.nodes[n][0] == CONSTANT),
+        tuple(register[node] for node in wanted),
+        count,
+    )
+
+
+def _needed(recorder: Recorder, wanted: list[int]) -> list[int]:
+    """Return the nodes that others need, in the order in which they were written down."""
+    found: set[int] = set()
+    ahead = list(wanted)
+    while ahead:
+        node = ahead.pop()
+        if node not in found:
+            found.add(node)
+            operation, left, right = recorder.nodes[node]
+            ahead.extend((left, right) if operation >= 0 else ())
+    return sorted(found)
+
+
+def _last_uses(recorder: Recorder, needed: list[int], wanted: list[int]) -> dict[int, int]:
+    last: dict[int, int] = {}
+    for node in needed:
+        operation, left, right = recorder.nodes[node]
+        if operation >= 0:
+            last[left] = last[right] = node
+    return last | dict.fromkeys(wanted, len(recorder.nodes))
+
+
+def evaluated(tape: Tape, inputs: dict[int, Any]) -> list[Any]:
+    """Return the outputs of a tape for numbers or arrays, in plain numpy: what the compiled interpreter is held to."""
+    own: list[Any] = [0.0] * tape.registers
+    for seed, register in tape.inputs:
+        own[register] = inputs[seed]
+    for register, value in tape.constants:
+        own[register] = value
+    for operation, target, left, right in tape.code.tolist():
+        own[target] = computed(operation, own[left], own[right])
+    return [own[register] for register in tape.outputs]
+
+
+@dataclass(frozen=True, slots=True)
+class Traced:
+    """A measurement function on registers.
+
+    Parameters
+    ----------
+    tape : Tape
+        Its first output is the value, the others are the derivatives.
+    seeds : tuple of int
+        Which input each derivative belongs to; a seed that does not move the value is missing.
+    """
+
+    tape: Tape
+    seeds: tuple[int, ...]
+
+
+_TRACED: dict[tuple[Any, ...], Traced | None] = {}
+
+
+def traced(problem: Problem, plan: Plan, given: frozenset[int], moved: frozenset[int]) -> Traced | None:
+    """Return the tape of a block of rows, or None where its function cannot be traced.
+
+    Parameters
+    ----------
+    problem : Problem
+        Gives dimension and frame.
+    plan : Plan
+        The block.
+    given : set of int
+        Inputs that are data.
+    moved : set of int
+        Inputs that unknowns move: those that derivatives are wanted of.
+    """
+    model = plan.model
+    frame = problem.frame if model.ecef else None
+    key = (model, given, moved, problem.dimension, frame)
+    if key not in _TRACED:
+        _TRACED[key] = _trace(problem, model, given, moved)
+    return _TRACED[key]
+
+
+def _trace(problem: Problem, model: Model, given: frozenset[int], moved: frozenset[int]) -> Traced | None:
+    recorder = Recorder()
+    inputs: dict[int, Any] = {seed: recorder.input(seed) for seed in sorted(given | moved)}
+    inputs |= {seed: Jet(inputs[seed], {seed: 1.0}) for seed in sorted(moved)}
+    try:
+        value = model.h(*joined(problem, model, inputs))
+        partials = dict(value.partials) if isinstance(value, Jet) else {}
+        value = value.value if isinstance(value, Jet) else value
+        if not isinstance(value, Symbol | int | float):
+            return None
+        seeds = tuple(seed for seed in sorted(partials) if recorder.constant(recorder.node(partials[seed])) != 0.0)
+        return Traced(tape(recorder, [value, *(partials[seed] for seed in seeds)]), seeds)
+    except (TypeError, AttributeError, ValueError):  # it asks for more than the elementary functions
+        return None

@@ -1,0 +1,276 @@
+"""Write foreign tables as a problem file with CSV tables beside it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.types import Array
+from optloc.base.units import UNITS
+from optloc.files.convert.roles import GEOJSON, GUESSES, Places, Roles, places_of, read_table, stem, unit_of
+from optloc.files.reader import Loaded, read
+from optloc.files.words import Units
+
+# What every foreign table becomes: rows of arrivals.
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """The columns (m,) of a measurements table, their unit, what they are, and what had to be assumed."""
+
+    columns: Mapping[str, Any]
+    unit: str
+    comment: str
+    notes: tuple[str, ...] = ()
+
+
+# A table of arrival times: which station heard which message when.
+
+
+def arrivals(roles: Roles, stations: Sequence[str], where: str, unit: str | None) -> Measured:
+    """Return arrivals, each counted from the first of its message so that no digit is lost.
+
+    Parameters
+    ----------
+    roles : Roles
+        The table: message, station, time.
+    stations : sequence of str
+        Names of the known stations.
+    where : str
+        Where these are known from.
+    unit : str, optional
+        Of the times; by default what the column's name ends in, else seconds.
+    """
+    message, heard, times = roles.labels("message"), roles.labels("station"), roles.exact("time")
+    named = roles.column("time")
+    stated = unit or unit_of(named, UNITS["time"])
+    unit = stated or "s"
+    factor = Decimal(repr(float(Units("time").conversion(unit, "--unit").factor)))
+    known = set(stations)
+    for row, name in enumerate(heard.tolist()):
+        if name not in known:
+            place = roles.table.where(roles.column("station"), row)
+            raise InvalidProblem(f"there is no station {name!r} in {where}", place, nearest(name, stations))
+    _once(roles, message, heard)
+    first: dict[str, Decimal] = {}
+    for label, time in zip(message.tolist(), times, strict=True):
+        first[label] = min(time, first.get(label, time))
+    columns = {
+        "epoch": message,
+        "time": [float(first[label] * factor) for label in message.tolist()],
+        "a": heard,
+        "z": [f"{time - first[label]:f}" for label, time in zip(message.tolist(), times, strict=True)],
+    }
+    lone = np.unique(message, return_counts=True)[1]
+    few = int((lone < 3).sum())
+    assumed = () if stated else (f"the column {named!r} is taken to be in seconds; --unit says another",)
+    notes = (f"{few} of {len(lone)} messages were heard by fewer than three stations",) if few else ()
+    return Measured(columns, unit, "arrivals, counted from the first of each message", (*assumed, *notes))
+
+
+def _once(roles: Roles, message: Array, heard: Array) -> None:
+    """Raise InvalidProblem where a station hears a message twice."""
+    seen: dict[tuple[str, str], int] = {}
+    for row, key in enumerate(zip(message.tolist(), heard.tolist(), strict=True)):
+        if key in seen:
+            what = f"station {key[1]!r} hears message {key[0]!r} again, first in row {seen[key] + 1}"
+            advice = "leave one of them out, or put columns together: --column message=ONE+TWO"
+            raise InvalidProblem(what, roles.table.at(row), advice)
+        seen[key] = row
+
+
+# A table of pseudoranges: which satellite was received when, from where, and how far it seemed.
+
+
+def pseudoranges(roles: Roles, unit: str | None) -> tuple[Measured, Places]:
+    """Return pseudoranges as arrivals with a clock of each epoch, and the satellites as stations that move, in ECEF."""
+    epoch, satellite, z = roles.labels("epoch"), roles.labels("satellite"), roles.numbers("pseudorange")
+    unit = unit or unit_of(roles.column("pseudorange"), UNITS["length"]) or "m"
+    Units("length").conversion(unit, "--unit")
+    length = unit_of(roles.column("x"), UNITS["length"]) or "m"
+    place = np.stack([roles.numbers(axis) for axis in "xyz"], axis=-1)
+    _far_enough(roles, place * UNITS["length"][length])
+    seen: dict[tuple[str, str], int] = {}
+    for row, key in enumerate(zip(epoch.tolist(), satellite.tolist(), strict=True)):
+        if key in seen:
+            what = f"satellite {key[1]!r} occurs again at epoch {key[0]!r}, first in row {seen[key] + 1}"
+            raise InvalidProblem(what, roles.table.at(row), "leave one of them out")
+        seen[key] = row
+    columns = {"epoch": epoch, "a": satellite, "z": z}
+    if stem(roles.column("epoch")) != "epoch" and "+" not in roles.column("epoch"):
+        columns["time"] = roles.numbers("epoch")
+    satellites = {"name": satellite, "epoch": epoch} | dict(zip("xyz", place.T, strict=True))
+    return Measured(columns, unit, "the range and the receiver's clock"), Places(satellites, "ecef", length)
+
+
+def _far_enough(roles: Roles, place: np.ndarray) -> None:
+    """Raise InvalidProblem where a satellite is within the Earth: its unit or its columns are other ones."""
+    near = np.flatnonzero(np.linalg.norm(place, axis=-1) < 6.4e6)
+    if len(near):
+        where = roles.table.where(roles.column("x"), int(near[0]))
+        away = np.linalg.norm(place[near[0]]) / 1e3
+        what = f"the satellite is {away:.4g} km from the centre of the Earth"
+        raise InvalidProblem(what, where, "name the columns with --column x=NAME and so on; a unit is seen from x_km")
+
+
+INPUTS = ("arrivals", "pseudoranges", "stations")
+
+
+@dataclass(frozen=True, slots=True)
+class Converted:
+    """What was written, the problem that it is (None of stations alone), and what had to be assumed."""
+
+    written: tuple[Path, ...]
+    loaded: Loaded | None
+    notes: tuple[str, ...] = ()
+
+
+def convert(
+    source: Path,
+    out: Path,
+    *,
+    stations: Path | None = None,
+    sigma: str | None = None,
+    what: str | None = None,
+    columns: Mapping[str, str] | None = None,
+    unit: str | None = None,
+    frame: str | None = None,
+) -> Converted:
+    """Write a table as a problem file.
+
+    Parameters
+    ----------
+    source : Path
+        Arrival times or pseudoranges as CSV or Parquet; or stations, as such a table or as GeoJSON.
+    out : Path
+        Problem file to write, .toml; its tables go to CSV files beside it. Of stations alone: the CSV file.
+    stations : Path, optional
+        Where the stations of arrival times are: CSV, Parquet or GeoJSON.
+    sigma : str, optional
+        Standard deviation of each row with its unit, such as "20 ns"; "estimate" finds it from many epochs.
+    what : "arrivals", "pseudoranges" or "stations", optional
+        What `source` holds; by default what its columns suggest.
+    columns : mapping of str to str, optional
+        Column of each role that is not found by its name: "message", "station", "time", "epoch", "satellite",
+        "pseudorange", "name", "x", "y", "z", "lat", "lon", "height". "set+msg" puts two columns together.
+    unit : str, optional
+        Unit of the values; by default what the column's name ends in, else s of times and m of pseudoranges.
+    frame : "cartesian" or "ecef", optional
+        Frame of stations in x, y, z; cartesian by default.
+
+    Returns
+    -------
+    Converted
+        The files, and the problem as it is read back from them.
+
+    Raises
+    ------
+    InvalidProblem
+        Naming the file, the row and the column.
+    """
+    told = dict(columns or {})
+    for role in told:
+        if role not in GUESSES:
+            raise InvalidProblem(f"there is no role {role!r}", "--column", nearest(role, GUESSES))
+    if frame not in (None, "cartesian", "ecef"):
+        raise InvalidProblem(f"there is no frame {frame!r}", "--frame", nearest(str(frame), ("cartesian", "ecef")))
+    if what is not None and what not in INPUTS:
+        raise InvalidProblem(f"there is no input {what!r}", "--as", nearest(what, INPUTS))
+    if what == "stations" or source.suffix.lower() in GEOJSON:
+        return _stations(source, out, told, frame)
+    if out.suffix.lower() != ".toml":
+        raise InvalidProblem("the problem file must end in .toml", str(out), f"write --out {out.with_suffix('.toml')}")
+    roles = Roles(read_table(source), told)
+    seen = what or _seen(roles)
+    if seen == "stations":
+        return _stations(source, out, told, frame)
+    if sigma is None:
+        advice = "say it with --sigma '20 ns' (or metres); --sigma estimate finds it from many epochs"
+        raise InvalidProblem("nothing is known of how accurate the rows are", "--sigma", advice)
+    if seen == "arrivals":
+        if stations is None:
+            advice = "name a table or GeoJSON file with --stations"
+            raise InvalidProblem("nothing is known of where the stations are", "--stations", advice)
+        own = {role: name for role, name in told.items() if role in ("name", "x", "y", "z", "lat", "lon", "height")}
+        place = places_of(stations, own, frame)
+        found = arrivals(roles, place.names, stations.name, unit)
+    else:
+        found, place = pseudoranges(roles, unit)
+    return _written(source, out, found, place, sigma)
+
+
+def _seen(roles: Roles) -> str:
+    """Return what a table holds by its columns; raise InvalidProblem where they do not tell."""
+    if roles.find("pseudorange") is not None and roles.find("satellite") is not None:
+        return "pseudoranges"
+    if roles.find("station") is not None and roles.find("time") is not None:
+        return "arrivals"
+    what = f"the columns {', '.join(roles.table.columns)} do not tell what this is"
+    advice = f"say it with --as {', --as '.join(INPUTS)}, and name columns with --column ROLE=NAME"
+    raise InvalidProblem(what, roles.table.source, advice)
+
+
+def _stations(source: Path, out: Path, told: Mapping[str, str], frame: str | None) -> Converted:
+    if out.suffix.lower() != ".csv":
+        what = "stations alone are no problem: they become a CSV table"
+        raise InvalidProblem(what, str(out), f"write --out {out.with_suffix('.csv')}, or convert the measurements")
+    found = places_of(source, told, frame)
+    _csv(out, found.columns)
+    return Converted((out,), None, (found.note,) if found.note else ())
+
+
+def _written(source: Path, out: Path, found: Measured, place: Places, sigma: str) -> Converted:
+    tables = {out.with_name(f"{out.stem}-stations.csv"): place.columns}
+    tables[out.with_name(f"{out.stem}-rows.csv")] = found.columns
+    for path, columns in tables.items():
+        _csv(path, columns)
+    one, two = (json.dumps(path.name) for path in tables)
+    text = f"""# Made from {source.name} by optloc convert.
+format = 1
+title = {json.dumps(source.stem)}
+
+[frame]
+kind = "{place.frame}"
+
+[stations]
+file = {one}
+unit = "{place.unit}"
+
+[[measurements]]
+kind = "toa"                         # {found.comment}
+file = {two}
+unit = "{found.unit}"
+sigma = {json.dumps(sigma)}
+"""
+    _written_text(out, text)
+    notes = (*found.notes, *((place.note,) if place.note else ()))
+    return Converted((out, *tables), read(out), notes)
+
+
+def _csv(path: Path, columns: Mapping[str, Any]) -> None:
+    import pyarrow as pa
+    from pyarrow import csv
+
+    table = pa.table({name: pa.array(list(np.asarray(values).tolist())) for name, values in columns.items()})
+    try:
+        csv.write_csv(table, path, csv.WriteOptions(quoting_style="needed"))
+    except OSError as error:
+        raise _refused(path, error) from None
+
+
+def _written_text(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise _refused(path, error) from None
+
+
+def _refused(path: Path, error: OSError) -> InvalidProblem:
+    return InvalidProblem(f"the file cannot be written ({error.strerror or error})", str(path), "choose another place")

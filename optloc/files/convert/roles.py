@@ -1,0 +1,226 @@
+"""Which column of a foreign table plays which role: as it is told, or as its name suggests."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.types import Array
+from optloc.base.units import UNITS
+from optloc.files.schema import existing, read_text
+from optloc.files.table import Table, csv, parquet
+
+# Role: names that suggest it, the likeliest first; without case, unit and what is no letter.
+GUESSES = {
+    "message": "message msg messageid msgid pulse frame epoch event burst id",
+    "station": "station receiver rx sensor anchor node site stationid receiverid sensorid",
+    "time": "toa arrival timeofarrival arrivaltime rxtime time timestamp t",
+    "epoch": "epoch time tgps gpstime tow t timestamp",
+    "satellite": "satellite sat prn sv svid satid",
+    "pseudorange": "pseudorange pr prange rho c1c prm",
+    "name": "name station receiver sensor anchor beacon id site callsign",
+    "x": "x satx xecef ecefx xsat",
+    "y": "y saty yecef ecefy ysat",
+    "z": "z satz zecef ecefz zsat",
+    "lat": "lat latitude",
+    "lon": "lon long lng longitude",
+    "height": "height h alt altitude elevation ellipsoidalheight",
+}
+_UNITS = sorted({*UNITS["length"], *UNITS["angle"]}, key=len, reverse=True)
+_SUFFIX = re.compile(rf"[_ \[(]+({'|'.join(_UNITS)})[\])]?$", re.IGNORECASE)
+
+
+def read_table(path: Path) -> Table:
+    """Return a CSV or Parquet table; what separates the fields of a CSV file is seen from its header."""
+    if path.suffix.lower() in (".parquet", ".pq"):
+        return parquet(existing(path), {})
+    if path.suffix.lower() not in (".csv", ".tsv", ".txt") and path.is_file():
+        known = "use .csv, .tsv, .txt or .parquet, and .geojson for stations"
+        raise InvalidProblem(f"files of type {path.suffix or path.name!r} are unknown", str(path), known)
+    with existing(path).open("rb") as stream:
+        header = stream.readline()
+    separator = max(b",;\t", key=header.count)
+    found = csv(path, chr(separator), {})
+    if not found.count:
+        raise InvalidProblem("the table has no rows", found.source, "give at least one")
+    return found
+
+
+def stem(column: str) -> str:
+    """Return a column's name without case, unit and signs: "TOA_ns" is "toa"."""
+    return re.sub(r"[^a-z0-9]", "", _SUFFIX.sub("", column.strip()).lower())
+
+
+def unit_of(column: str, known: Iterable[str]) -> str | None:
+    """Return the unit that a column's name ends in, None where it is none of those known."""
+    found = _SUFFIX.search(column.strip())
+    return None if found is None else {unit.lower(): unit for unit in known}.get(found.group(1).lower())
+
+
+@dataclass(frozen=True, slots=True)
+class Roles:
+    """The columns of a table by role.
+
+    Parameters
+    ----------
+    table : Table
+        The table.
+    told : mapping of str to str
+        What the user says: column by role; several columns with "+" between them.
+    """
+
+    table: Table
+    told: Mapping[str, str]
+
+    def find(self, role: str) -> str | None:
+        """Return the column of a role, None where no name suggests it; a told one that is none is InvalidProblem."""
+        columns = list(self.table.columns)
+        if role in self.told:
+            for part in self.told[role].split("+"):
+                if part not in columns:
+                    advice = nearest(part, columns)
+                    raise InvalidProblem(f"there is no column {part!r} for the {role}", self.table.source, advice)
+            return self.told[role]
+        stems = {stem(name): name for name in reversed(columns)}
+        return next((stems[guess] for guess in GUESSES[role].split() if guess in stems), None)
+
+    def column(self, role: str) -> str:
+        """Return the column of a role; raise InvalidProblem where there is none."""
+        found = self.find(role)
+        if found is None:
+            columns = ", ".join(self.table.columns)
+            advice = f"name it with --column {role}=NAME; the columns are {columns}"
+            raise InvalidProblem(f"no column looks like the {role}", self.table.source, advice)
+        return found
+
+    def labels(self, role: str) -> Array:
+        """Return text (m,), that of several columns with "-" between it."""
+        parts = [self.table.labels(part) for part in self.column(role).split("+")]
+        return np.array(["-".join(row) for row in zip(*parts, strict=True)], dtype=object)
+
+    def numbers(self, role: str) -> Array:
+        """Return finite numbers (m,)."""
+        return self.table.numbers(self.column(role))
+
+    def exact(self, role: str) -> list[Decimal]:
+        """Return numbers with all their digits: an instant of today in seconds has more than a float keeps."""
+        name = self.column(role)
+        column = self.table.raw(name)
+        if column.dtype.kind == "M":
+            return [Decimal(int(cell)).scaleb(-9) for cell in column.astype("datetime64[ns]").astype(np.int64)]
+        out = []
+        for row, cell in enumerate(column.tolist()):
+            try:
+                number = Decimal(str(cell).strip()) if cell is not None else Decimal("nan")
+            except InvalidOperation:
+                number = Decimal("nan")
+            if not number.is_finite():
+                what = "the cell is empty" if cell in (None, "") else f"{cell!r} is not a finite number"
+                raise InvalidProblem(what, self.table.where(name, row), "give a number, or leave the row out")
+            out.append(number)
+        return out
+
+
+# Stations from a table or from GeoJSON points.
+
+GEOJSON = (".geojson", ".json")
+_NAMES = ("name", "station", "title", "callsign", "id", "receiver", "sensor")
+_HEIGHTS = ("height", "height_m", "altitude", "alt", "elevation", "ele", "h_m", "h")
+
+
+@dataclass(frozen=True, slots=True)
+class Places:
+    """Stations: the columns of a stations table (s,), the frame that they need, and the unit of lengths."""
+
+    columns: Mapping[str, Array]
+    frame: str
+    unit: str = "m"
+    note: str = ""
+
+    @property
+    def names(self) -> list[str]:
+        """Return the names of the stations."""
+        return [str(name) for name in self.columns["name"]]
+
+
+def places_of(path: Path, told: Mapping[str, str], frame: str | None) -> Places:
+    """Return the stations of a file; `frame` is that of x, y, z."""
+    return _of_geojson(path) if path.suffix.lower() in GEOJSON else _of_table(path, told, frame or "cartesian")
+
+
+def _of_table(path: Path, told: Mapping[str, str], frame: str) -> Places:
+    roles = Roles(read_table(path), told)
+    names = roles.labels("name")
+    lat, x = roles.find("lat"), roles.find("x")
+    if lat is None and x is None:
+        columns = ", ".join(roles.table.columns)
+        advice = f"name them with --column lat=NAME or --column x=NAME; the columns are {columns}"
+        raise InvalidProblem("no columns look like latitude and longitude, or x and y", roles.table.source, advice)
+    if lat is not None:
+        height = roles.find("height")
+        unit = "m" if height is None else unit_of(height, UNITS["length"]) or "m"
+        degrees = {"lat_deg": roles.numbers("lat"), "lon_deg": roles.numbers("lon")}
+        degrees["height"] = np.zeros(len(names)) if height is None else roles.numbers("height")
+        return Places({"name": names} | degrees, "geodetic", unit, "" if height else _FLAT)
+    axes = [axis for axis in "xyz" if roles.find(axis) is not None]
+    assert x is not None
+    unit = unit_of(x, UNITS["length"]) or "m"
+    return Places({"name": names} | {axis: roles.numbers(axis) for axis in axes}, frame, unit)
+
+
+_FLAT = "no heights are given: all stations are taken to be at height 0"
+
+
+def _of_geojson(path: Path) -> Places:
+    """Return the points of a GeoJSON feature collection (RFC 7946: longitude, latitude, height above WGS 84)."""
+    try:
+        data = json.loads(read_text(path))
+    except json.JSONDecodeError as error:
+        what = f"this is not JSON: {error.msg.lower()}"
+        raise InvalidProblem(what, f"{path.name}, line {error.lineno}", "write it again") from None
+    features = data.get("features") if isinstance(data, dict) else None
+    if not isinstance(features, list):
+        raise InvalidProblem("there is no list of features", path.name, "give a GeoJSON FeatureCollection of points")
+    points = [
+        _point(feature, f"{path.name}, feature {i + 1}")
+        for i, feature in enumerate(features)
+        if isinstance(feature, dict) and _kind(feature) == "Point"
+    ]
+    if not points:
+        raise InvalidProblem("there is no point among the features", path.name, "give each station as a Point")
+    names, lon, lat, height = (list(column) for column in zip(*points, strict=True))
+    columns = {"name": np.array(names, dtype=object), "lat_deg": np.array(lat), "lon_deg": np.array(lon)}
+    known = [h is not None for h in height]
+    columns["height"] = np.array([0.0 if h is None else h for h in height])
+    lacking = "" if all(known) else f"{known.count(False)} of {len(known)} points have no height: it is taken to be 0"
+    return Places(columns, "geodetic", "m", _FLAT if not any(known) else lacking)
+
+
+def _kind(feature: Mapping[str, Any]) -> Any:
+    geometry = feature.get("geometry")
+    return geometry.get("type") if isinstance(geometry, dict) else None
+
+
+def _point(feature: Mapping[str, Any], where: str) -> tuple[str, float, float, float | None]:
+    """Return name, longitude, latitude and height of a point."""
+    about = feature.get("properties") or {}
+    name = next((about[key] for key in _NAMES if about.get(key) not in (None, "")), feature.get("id"))
+    if name is None:
+        raise InvalidProblem("the point has no name", where, 'give it a property "name"')
+    place = feature["geometry"].get("coordinates")
+    number = isinstance(place, list) and all(isinstance(v, int | float) and np.isfinite(v) for v in place)
+    if not number or len(place) not in (2, 3) or abs(place[1]) > 90.0:
+        raise InvalidProblem(f"{place} is no point", where, "write [longitude, latitude, height]")
+    height = place[2] if len(place) == 3 else next((about[key] for key in _HEIGHTS if key in about), None)
+    try:
+        return str(name), float(place[0]), float(place[1]), None if height is None else float(height)
+    except (TypeError, ValueError):
+        raise InvalidProblem(f"the height {height!r} is not a number", where, "give metres") from None

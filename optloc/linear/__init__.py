@@ -1,0 +1,1 @@
+"""One problem at one point: residual, Jacobian, normal equations, constraints."""

@@ -1,0 +1,256 @@
+"""Modelled measurements and their derivatives at a point, all rows at once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from optloc.base.arrays import foreign, gather, library, placed
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array, Rows
+from optloc.linear.indices import AXES_A, AXES_B, RATE_A, RATE_B, TARGET, TARGET_RATE, TURN, A, B, Feed, Plan, plans
+from optloc.models import Model, Point
+from optloc.models.jet import Jet
+from optloc.models.primitives import rotate, wrap
+from optloc.problem.problem import Problem
+
+# How the points of a measurement come out of the parameter vector, as values or with derivatives.
+
+
+def fitting(problem: Problem, x: Array) -> Array:
+    """Return parameter vectors (..., size) of a problem; refuse those of another length."""
+    size = problem.layout.size
+    if x.shape[-1:] != (size,):
+        raise InvalidProblem(f"a vector of shape {x.shape} for {size} unknowns", "vector", "order it by problem.layout")
+    return x
+
+
+def points(problem: Problem, plan: Plan, x: Array, differentiate: bool) -> tuple[Point, Point, Point]:
+    """Return target, first and second station of every row of a block.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its numbers.
+    plan : Plan
+        The block's indices.
+    x : array (..., size)
+        Parameter vector.
+    differentiate : bool
+        Whether fed inputs become `Jet` values seeded with one.
+    """
+    inputs = {seed: placed(value, x) for seed, value in given(problem, plan).items()}
+    for feed in plan.feeds:
+        inputs[feed.seed] = _fed(inputs.get(feed.seed, 0.0), feed, x, plan.block.count)
+    if differentiate:
+        fed = {feed.seed for feed in plan.feeds}
+        # Arrays of other libraries need not hand arithmetic with a Jet on the right to the Jet: there all are jets.
+        for seed in inputs if foreign(x) else fed:
+            inputs[seed] = Jet(inputs[seed], {seed: placed(np.ones(1), x)} if seed in fed else {})
+    return joined(problem, plan.model, inputs)
+
+
+def joined(problem: Problem, model: Model, inputs: dict[int, Any]) -> tuple[Point, Point, Point]:
+    """Return target, first and second station made of inputs of any type: arrays, jets or symbols.
+
+    Parameters
+    ----------
+    problem : Problem
+        Gives dimension and frame.
+    model : Model
+        Says what the points must carry.
+    inputs : dict of seed to number
+        Components; an absent one is zero.
+    """
+    d = problem.dimension
+
+    def vector(seed: int) -> tuple[Any, ...]:
+        return tuple(inputs.get(seed + c, 0.0) for c in range(d))
+
+    def station(place: int, rate: int, axes: int) -> Point:
+        own = tuple(vector(axes + 3 * i) for i in range(d)) if axes in inputs else None
+        if TURN in inputs:
+            identity = tuple(tuple(float(i == j) for j in range(d)) for i in range(d))
+            own = rotate(own or identity, tuple(inputs[TURN + c] for c in range(1 if d == 2 else 3)))
+        return Point(vector(place), vector(rate) if model.velocity else None, own)
+
+    place = vector(TARGET)
+    ecef = to_ecef(problem, place) if model.ecef else None
+    target = Point(place, vector(TARGET_RATE) if model.velocity else None, None, ecef)
+    a = station(A, RATE_A, AXES_A) if model.stations else target
+    return target, a, station(B, RATE_B, AXES_B) if model.stations > 1 else a
+
+
+def given(problem: Problem, plan: Plan) -> dict[int, Any]:
+    """Return the inputs that are data, each (..., m): surveyed stations, their rates and axes, known targets."""
+    block, model, stations = plan.block, plan.model, problem.stations
+    inputs: dict[int, Any] = {}
+    for place, rate, axes, index in ((A, RATE_A, AXES_A, block.a), (B, RATE_B, AXES_B, block.b))[: model.stations]:
+        inputs |= _at_rows(stations.position, 1, block, index, place)
+        if model.velocity and stations.velocity is not None:
+            inputs |= _at_rows(stations.velocity, 1, block, index, rate)
+        if model.axes and stations.axes is not None:
+            inputs |= _at_rows(stations.axes, 2, block, index, axes)
+    for i, motion in enumerate(problem.motions):
+        rows = np.flatnonzero(block.target == i)
+        if motion.known is None or not len(rows):
+            continue
+        epoch = block.epoch if motion.known.shape[-3] > 1 else np.zeros_like(block.epoch)
+        mine = placed(1.0 * (block.target == i), motion.known)
+        for seed, order in ((TARGET, 0), (TARGET_RATE, 1)):
+            for c in range(problem.dimension if order < motion.known.shape[-2] else 0):
+                values = mine * gather(motion.known[..., order, c], epoch)
+                inputs[seed + c] = inputs.get(seed + c, 0.0) + values
+    return inputs
+
+
+def _at_rows(array: Array, rank: int, block: Rows, index: Array, seed: int) -> dict[int, Any]:
+    """Return the components of a per-station vector (rank 1) or set of axes (rank 2) at each row."""
+    epochs, count = array.shape[-2 - rank : -rank]
+    joint = library(array).reshape(array, (*array.shape[: -2 - rank], epochs * count, *array.shape[-rank:]))
+    picked = gather(joint, index + (count * block.epoch if epochs > 1 else 0), -1 - rank)
+    if rank == 1:
+        return {seed + c: picked[..., c] for c in range(array.shape[-1])}
+    d = range(array.shape[-1])
+    return {seed + 3 * i + c: picked[..., i, c] for i in d for c in d}
+
+
+def _fed(value: Any, feed: Feed, x: Array, count: int) -> Any:
+    column, gain = feed.table(count)
+    part = gather(x, column)
+    return value + (part if np.all(gain == 1.0) else part * placed(gain, x))
+
+
+def to_ecef(problem: Problem, position: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return a position of the problem's frame as ECEF components of the same type."""
+    turn, origin = problem.frame.rotation_to_ecef(), problem.frame.origin_ecef()
+    if problem.frame.kind == "ecef":
+        return position
+    return tuple(
+        sum((float(turn[i, c]) * position[c] for c in range(1, 3)), float(turn[i, 0]) * position[0]) + float(origin[i])
+        for i in range(3)
+    )
+
+
+def predict(problem: Problem, x: Array) -> Array:
+    """Return the modelled measurements h(x), (..., m), of a problem at vectors x (..., size)."""
+    values, x, xp = [], fitting(problem, x), library(x)
+    for plan in plans(problem):
+        value = placed(plan.model.h(*points(problem, plan, x, differentiate=False)), x)
+        value = xp.broadcast_to(value, np.broadcast_shapes(value.shape, (plan.block.count,)))
+        values.append(_biased(plan, x, value)[0])
+    return _joined(values)
+
+
+def differentiate(problem: Problem, x: Array) -> tuple[Array, Array]:
+    """Return residuals and derivatives of a problem at a point.
+
+    Parameters
+    ----------
+    problem : Problem
+        Batch of problems (...).
+    x : array (..., size)
+        Parameter vectors, ordered by ``problem.layout``, of any array library; so are the answers.
+
+    Returns
+    -------
+    residual : array (..., m)
+        z - h(x), angles wrapped; zero for absent rows.
+    jacobian : array (..., m, n + l)
+        Derivatives of h with respect to the shared unknowns and to the local ones of each row's epoch.
+    """
+    layout, x, xp = problem.layout, fitting(problem, x), library(x)
+    width = layout.n_shared + layout.n_local
+    batch = np.broadcast_shapes(problem.batch_shape, x.shape[:-1])
+    place = None if foreign(x) else np.zeros((*batch, problem.count, width))
+    residuals, jacobians = [], []
+    for plan, block, start in zip(plans(problem), problem.rows, problem.starts, strict=True):
+        m = block.count
+        value, terms = _derived(problem, plan, x)
+        residual = _residual(block, value, plan.model.period is not None)
+        residuals.append(xp.broadcast_to(residual, (*batch, m)))
+        if place is None:
+            jacobians.append(_stacked(terms, (*batch, m), width, x))
+        else:
+            _added(terms, place[..., start : start + m, :])
+    return _joined(residuals), xp.concat(jacobians, axis=-2) if place is None else place
+
+
+# Derivatives of a block of m rows: folded column (m,) and coefficient (m,) of each row, times a factor (..., m or 1).
+_Terms = list[tuple[Array, Array, Any]]
+
+
+def _derived(problem: Problem, plan: Plan, x: Array) -> tuple[Any, _Terms]:
+    """Return the values (..., m) of one block, biases included, and their derivatives."""
+    jet, m, fold = plan.model.h(*points(problem, plan, x, differentiate=True)), plan.block.count, _folded(problem)
+    if not isinstance(jet, Jet):
+        jet = Jet(placed(np.asarray(jet), x), {})
+    value, gain = _biased(plan, x, jet.value)
+    terms: _Terms = []
+    for feed in plan.feeds:
+        partial = jet.partials.get(feed.seed)
+        if partial is not None:
+            column, coefficient = feed.table(m)
+            terms.append((fold(column), coefficient, partial if gain is None else partial * gain))
+    unit = placed(np.ones(1), x)
+    for found, factor in ((plan.gains, jet.value), (plan.adds, unit)):
+        terms += [(fold(column), coefficient, factor) for column, coefficient in found.tables(m)]
+    return value, terms
+
+
+def _folded(problem: Problem) -> Any:
+    """Return the map from columns of the full vector to columns of [shared, local of the row's epoch]."""
+    n, length = problem.layout.n_shared, problem.layout.n_local
+
+    def fold(column: Array) -> Array:
+        return column if length == 0 else np.where(column < n, column, n + (column - n) % length)
+
+    return fold
+
+
+def _biased(plan: Plan, x: Array, value: Any) -> tuple[Any, Any]:
+    """Return values with scales, offsets, drifts and emission times, and the factor that scales them or None."""
+    m, gain = plan.block.count, None
+    if plan.gains.row.size:
+        gain = 1.0 + plan.gains.total(x, m)
+        value = value * gain
+    return value + plan.adds.total(x, m) if plan.adds.row.size else value, gain
+
+
+def _residual(block: Rows, value: Any, periodic: bool) -> Any:
+    """Return what is measured less the values of one block; absent rows count as met."""
+    residual = placed(block.z - block.correction, value) - value
+    residual = wrap(residual) if periodic else residual
+    if not foreign(block.weight) and np.all(block.weight > 0.0):
+        return residual
+    return library(residual).where(placed(block.weight, residual) > 0.0, residual, 0.0)
+
+
+def _added(terms: _Terms, jacobian: Array) -> None:
+    """Add derivatives to a block's part of the Jacobian."""
+    for column, coefficient, factor in terms:
+        if np.all(column == column[:1]):
+            jacobian[..., column[0]] += factor if np.all(coefficient == 1.0) else factor * coefficient
+            continue
+        rows = np.flatnonzero(coefficient)
+        picked = factor if factor.shape[-1:] in ((), (1,)) else factor[..., rows]
+        jacobian[..., rows, column[rows]] += picked * coefficient[rows]
+
+
+def _stacked(terms: _Terms, shape: tuple[int, ...], width: int, x: Array) -> Any:
+    """Return the Jacobian (*shape, width) of a block, column by column: in some libraries nothing can be written."""
+    columns: dict[int, Any] = {}
+    for column, coefficient, factor in terms:
+        for j in np.unique(column[coefficient != 0.0]):
+            part = factor * placed(np.where(column == j, coefficient, 0.0), x)
+            columns[int(j)] = columns[int(j)] + part if int(j) in columns else part
+    zero, xp = placed(np.zeros(1), x), library(x)
+    return xp.stack([xp.broadcast_to(columns.get(j, zero), shape) for j in range(width)], axis=-1)
+
+
+def _joined(parts: list[Any]) -> Array:
+    xp = library(parts[0])
+    shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
+    joined: Array = xp.concat([xp.broadcast_to(part, (*shape, part.shape[-1])) for part in parts], axis=-1)
+    return joined

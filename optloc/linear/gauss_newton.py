@@ -1,0 +1,101 @@
+"""A fixed number of Gauss-Newton steps on arrays of any library: for accelerators, and inside other people's loops."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from optloc.base.arrays import foreign, library, placed
+from optloc.base.errors import InvalidProblem
+from optloc.linear.normal import Normal, covariance, linearise, normal, step, with_priors
+from optloc.linear.station_noise import depends_on_place, whitener_at
+from optloc.problem.noise import Whitener
+from optloc.problem.problem import Problem
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Where a fixed number of steps ended; no verdict is part of it.
+
+    Parameters
+    ----------
+    x : array (..., size)
+        Parameter vectors, ordered by ``problem.layout``.
+    covariance : array (..., n, n)
+        Covariance of the shared unknowns at `x`; NaN where the geometry is singular.
+    cost : array (...)
+        Weighted sum of squared residuals and prior penalties at `x`.
+    regular : bool array (...)
+        Whether every step had a solution; a problem without one stays where it is.
+    """
+
+    x: Any
+    covariance: Any
+    cost: Any
+    regular: Any
+
+
+def gauss_newton(problem: Problem, x: Any, *, steps: int = 10, damping: float = 0.0) -> Estimate:
+    """Return the vectors after a fixed number of Gauss-Newton steps from given starts.
+
+    Only operations of the array-API standard are used and nothing is tested on the way, so that arrays of JAX, PyTorch,
+    CuPy or another library stay in their library and on their device. Whether the answer is a minimum, and the best
+    one, is for `optloc.solve` to say. Constraints are not kept.
+
+    Parameters
+    ----------
+    problem : Problem
+        Batch of problems (...). Its numbers are numpy arrays or, made so by ``problem.placed(x)``, arrays of the
+        library of `x`.
+    x : array (..., size)
+        Starts, ordered by ``problem.layout``; decide library, device and float type.
+    steps : int
+        Number of steps, at least one.
+    damping : float
+        Marquardt's factor: the diagonal of the information is multiplied by ``1 + damping``; 0 for plain steps.
+
+    Returns
+    -------
+    Estimate
+        Arrays of the library of `x`.
+
+    Raises
+    ------
+    InvalidProblem
+        If `steps` or `damping` is out of range, or if the noise of the rows depends on the place of the target, which
+        only numpy arrays support.
+
+    References
+    ----------
+    W. H. Foy, "Position-location solutions by Taylor-series estimation", IEEE Trans. Aerosp. Electron. Syst. 12
+    (1976) 187-194.
+    """
+    if steps < 1 or not damping >= 0.0:
+        raise InvalidProblem(f"{steps} steps with damping {damping:g}", "gauss_newton", "give steps >= 1, damping >= 0")
+    noise = whiteners(problem, x)
+    equations = _equations(problem, x, noise)
+    factor = placed(damping, equations.cost) + 0.0 * equations.cost
+    regular: Any = equations.cost == equations.cost
+    for _ in range(steps):
+        move, solvable = step(equations, factor)
+        x, regular = x + move, regular & solvable
+        equations = _equations(problem, x, noise)
+    spread, _ = covariance(equations)
+    return Estimate(x, spread, equations.cost, regular)
+
+
+def whiteners(problem: Problem, x: Any) -> tuple[Whitener, ...] | None:
+    """Return the whitening matrices of a problem where they do not depend on `x`, else None; refuse foreign arrays."""
+    if not depends_on_place(problem):
+        return whitener_at(problem, x)
+    if foreign(x):
+        raise InvalidProblem(
+            f"station errors that depend on the target, with arrays of {library(x).__name__}",
+            "stations",
+            'use numpy arrays, or station errors of span "epoch"',
+        )
+    return None
+
+
+def _equations(problem: Problem, x: Any, noise: tuple[Whitener, ...] | None) -> Normal:
+    return with_priors(problem, x, normal(linearise(problem, x, noise), problem.epochs))

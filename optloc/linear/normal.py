@@ -1,0 +1,373 @@
+"""Normal equations with the shape of an arrow: one shared block, one local block for each epoch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from optloc.base import linalg
+from optloc.base import linalg as tangents
+from optloc.base.arrays import as_number, eye, gather, library, placed
+from optloc.base.linalg import Tangent
+from optloc.base.types import Array
+from optloc.linear.evaluate import differentiate
+from optloc.linear.station_noise import whitener_at
+from optloc.problem.noise import Whitener
+from optloc.problem.problem import Problem
+
+# One linearisation for everything: residual and Jacobian of a problem at a point.
+
+
+@dataclass(frozen=True, slots=True)
+class Linear:
+    """A problem linearised at a point.
+
+    Parameters
+    ----------
+    residual : array (..., m)
+        Measured less modelled, z - h(x); angles wrapped.
+    shared : array (..., m, n)
+        Derivative of h with respect to the shared unknowns.
+    local : array (..., m, l)
+        Derivative of h with respect to the local unknowns of the row's epoch.
+    epoch : int array (m,)
+        Epoch of each row.
+    noise : tuple of Whitener
+        Whitening matrices of the noise blocks.
+    """
+
+    residual: Array
+    shared: Array
+    local: Array
+    epoch: Array
+    noise: tuple[Whitener, ...]
+
+
+def linearise(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = None) -> Linear:
+    """Return residual, Jacobian and noise of a problem at a point.
+
+    Parameters
+    ----------
+    problem : Problem
+        Batch of problems (...).
+    x : array (..., size)
+        Parameter vectors, ordered by ``problem.layout``.
+    noise : tuple of Whitener, optional
+        Whitening matrices made before; None: made from the problem, station errors of span "noise" at `x` included.
+
+    Returns
+    -------
+    Linear
+        With leading axes (...).
+    """
+    residual, jacobian = differentiate(problem, x)
+    n = problem.layout.n_shared
+    return Linear(
+        residual,
+        jacobian[..., :n],
+        jacobian[..., n:],
+        problem.epoch,
+        whitener_at(problem, x) if noise is None else noise,
+    )
+
+
+# Share of its information below which an epoch of a run leaves a combination of its own unknowns open.
+_OPEN = 1e-12
+
+
+@dataclass(frozen=True, slots=True)
+class Normal:
+    """Information about shared and local unknowns.
+
+    Parameters
+    ----------
+    shared : array (..., n, n)
+        Information of the shared unknowns.
+    local : array (..., k, l, l)
+        Information of the local unknowns of each epoch.
+    cross : array (..., k, n, l)
+        Coupling.
+    shared_vector : array (..., n)
+        Right-hand side of the shared unknowns.
+    local_vector : array (..., k, l)
+        Right-hand side of the local unknowns.
+    cost : array (...)
+        Weighted sum of squared residuals, without a factor 1/2.
+    """
+
+    shared: Array
+    local: Array
+    cross: Array
+    shared_vector: Array
+    local_vector: Array
+    cost: Array
+
+    def __add__(self, other: Normal) -> Normal:
+        """Return the sum of the information of disjoint epochs: shared parts add, local parts are joined."""
+        if self.local.shape[-1] == 0 == other.local.shape[-1]:
+            return Normal(
+                self.shared + other.shared,
+                self.local,
+                self.cross,
+                self.shared_vector + other.shared_vector,
+                self.local_vector,
+                self.cost + other.cost,
+            )
+        return Normal(
+            self.shared + other.shared,
+            np.concatenate([self.local, other.local], axis=-3),
+            np.concatenate([self.cross, other.cross], axis=-3),
+            self.shared_vector + other.shared_vector,
+            np.concatenate([self.local_vector, other.local_vector], axis=-2),
+            self.cost + other.cost,
+        )
+
+
+def normal(linear: Linear, epochs: int) -> Normal:
+    """Return the normal equations of a linearised problem.
+
+    Parameters
+    ----------
+    linear : Linear
+        Residual, Jacobian, noise.
+    epochs : int
+        Number of epochs k.
+    """
+    n, length, xp = linear.shared.shape[-1], linear.local.shape[-1], library(linear.residual)
+    stacked = xp.concat([linear.shared, linear.local, linear.residual[..., None]], axis=-1)
+    single = epochs == 1 or length == 0
+    gram: Any = placed(np.zeros(()), linear.residual)
+    for whitener in linear.noise:
+        white = whitener.apply(stacked)
+        if not single:
+            white = _by_epoch(white, linear.epoch[whitener.row].reshape(-1), epochs)
+        gram = gram + (white.mT @ white if not single else (white.mT @ white)[..., None, :, :])
+    last = n + length
+    flat = gram[..., 0, :, :] if single else xp.sum(gram, axis=-3)
+    k = epochs if length else 1
+    batch = flat.shape[:-2]
+    return Normal(
+        flat[..., :n, :n],
+        xp.broadcast_to(gram[..., n:last, n:last], (*batch, k, length, length)),
+        xp.broadcast_to(gram[..., :n, n:last], (*batch, k, n, length)),
+        flat[..., :n, last],
+        xp.broadcast_to(gram[..., n:last, last], (*batch, k, length)),
+        flat[..., last, last],
+    )
+
+
+def _by_epoch(white: Any, epoch: Array, epochs: int) -> Any:
+    """Return the rows (..., m, p) of each epoch (..., k, r, p), zero beyond its own number of rows."""
+    order = np.argsort(epoch, kind="stable")
+    sizes = np.bincount(epoch, minlength=epochs)
+    most = max(1, int(sizes.max(initial=0)))
+    slot = np.arange(most)
+    used = slot < sizes[:, None]
+    table = order[np.where(used, (np.cumsum(sizes) - sizes)[:, None] + slot, 0)]
+    rows = gather(white, table, -2)
+    return rows if used.all() else rows * placed(1.0 * used, white)[..., None]
+
+
+def marginal(equations: Normal) -> tuple[Array, Array, Array]:
+    """Return information (..., n, n) and vector (..., n) of the shared unknowns with the local ones eliminated, and ok.
+
+    Schur complement epoch by epoch. Of several epochs one may leave some of its own unknowns open: what it says about
+    the shared ones counts all the same. `ok` (...) is False where the only epoch does so.
+    """
+    xp = library(equations.cost)
+    if equations.local.shape[-1] == 0:
+        return equations.shared, equations.shared_vector, xp.ones_like(equations.cost, dtype=xp.bool)
+    right = xp.concat([equations.cross.mT, equations.local_vector[..., None]], axis=-1)
+    solved, ok = _solved(equations.local, right)
+    lost = xp.sum(equations.cross @ solved, axis=-3)
+    return equations.shared - lost[..., :-1], equations.shared_vector - lost[..., -1], ok
+
+
+def eliminated(equations: Normal) -> Normal:
+    """Return the information about the shared unknowns alone: local ones take the values that fit best."""
+    information, vector, _ = marginal(equations)
+    cost = equations.cost
+    if equations.local.shape[-1]:
+        rest, _ = _solved(equations.local, equations.local_vector[..., None])
+        cost = cost - (rest[..., 0] * equations.local_vector).sum((-1, -2))
+    none = np.zeros((*cost.shape, 1, 0))
+    return Normal(information, none[..., None], np.zeros((*cost.shape, 1, vector.shape[-1], 0)), vector, none, cost)
+
+
+def _solved(local: Array, right: Array) -> tuple[Array, Array]:
+    """Return solutions (..., k, l, p) of the local systems, of least norm where they are singular, and ok (...)."""
+    xp = library(local)
+    if local.shape[-3] == 1:
+        solved, good = linalg.solve(_measured(local), right)
+        return solved, xp.all(good, axis=-1)
+    solved, good = linalg.solve(local, right, _OPEN)
+    if xp is np and not good.all():
+        root, _ = linalg.root(local[~good])
+        solved[~good] = root @ (root.mT @ np.broadcast_to(right, solved.shape)[~good])
+    elif xp is not np:
+        root, _ = linalg.root(local)
+        solved = xp.where(good[..., None, None], solved, root @ (root.mT @ right))
+    return solved, xp.ones_like(solved[..., 0, 0, 0], dtype=xp.bool)
+
+
+def _measured(local: Array) -> Array:
+    """Return local blocks with a one for every unknown that no row touches: it stays where it is and hides no other."""
+    dead = library(local).linalg.diagonal(local) == 0.0
+    grown: Array = local + as_number(dead, local)[..., None] * eye(local.shape[-1], local)
+    return grown
+
+
+def local_covariance(equations: Normal, shared: Array, size: int) -> Array:
+    """Return the covariance (..., k, size, size) of the first local unknowns of each epoch; NaN where they are open.
+
+    Parameters
+    ----------
+    equations : Normal
+        Normal equations at an answer.
+    shared : array (..., n, n)
+        Covariance of the shared unknowns there.
+    size : int
+        How many of the local unknowns are wanted.
+    """
+    inverse, good = linalg.inverse(equations.local, _OPEN)
+    gain = inverse @ np.swapaxes(equations.cross, -1, -2)
+    full = inverse + gain @ shared[..., None, :, :] @ np.swapaxes(gain, -1, -2)
+    return np.where(good[..., None, None], full, np.nan)[..., :size, :size]
+
+
+def step(equations: Normal, damping: Array, space: Tangent | None = None) -> tuple[Array, Array]:
+    """Return the damped step (..., size) of the full parameter vector, and where it exists (...).
+
+    Parameters
+    ----------
+    equations : Normal
+        Information and right-hand side.
+    damping : array (...)
+        Marquardt's factor: the diagonal of the information is multiplied by ``1 + damping``.
+    space : Tangent, optional
+        Tangent space of equalities that the step keeps to first order.
+    """
+    damped = _damped(equations, damping)
+    information, vector, ok = marginal(damped)
+    if space is not None:
+        shared, good = tangents.solve_within(information, vector, space)
+        ok = ok & good
+    elif information.shape[-1]:
+        shared, good = linalg.solve(information, vector[..., None])
+        shared, ok = shared[..., 0], ok & good
+    else:
+        shared = vector
+    if damped.local.shape[-1] == 0:
+        return shared, ok
+    rest = damped.local_vector - (damped.cross.mT @ shared[..., None, :, None])[..., 0]
+    local, good = _solved(damped.local, rest[..., None])
+    xp = library(local)
+    flat = xp.reshape(local[..., 0], (*local.shape[:-3], -1))
+    return xp.concat([shared, flat], axis=-1), ok & good
+
+
+def _damped(equations: Normal, damping: Array) -> Normal:
+    def grow(matrix: Array, factor: Array) -> Array:
+        grown: Array = matrix * (1.0 + factor[..., None, None] * eye(matrix.shape[-1], matrix))
+        return grown
+
+    return Normal(
+        grow(equations.shared, damping),
+        grow(equations.local, damping[..., None]),
+        equations.cross,
+        equations.shared_vector,
+        equations.local_vector,
+        equations.cost,
+    )
+
+
+def covariance(equations: Normal, space: Tangent | None = None) -> tuple[Array, Array]:
+    """Return the covariance (..., n, n) of the shared unknowns, NaN where singular, and where it exists (...).
+
+    With equalities it is the covariance on their tangent space.
+    """
+    information, _, ok = marginal(equations)
+    inverse, good = linalg.inverse(information) if space is None else tangents.inverse_within(information, space)
+    xp = library(inverse)
+    return xp.where((ok & good)[..., None, None], inverse, xp.nan), ok & good
+
+
+def decrement(equations: Normal, move: Array, layout_n: int) -> Array:
+    """Return the squared length of a step in units of its own standard deviations, (...)."""
+    shared = move[..., :layout_n]
+    local = move[..., layout_n:].reshape(*equations.local_vector.shape)
+    return np.asarray((shared * equations.shared_vector).sum(-1) + (local * equations.local_vector).sum((-1, -2)))
+
+
+# Gaussian prior knowledge of named unknowns, as information.
+
+
+def with_priors(problem: Problem, x: Array, equations: Normal, *, shared: bool = True, local: bool = True) -> Normal:
+    """Return normal equations with the Gaussian priors of a problem added.
+
+    Parameters
+    ----------
+    problem : Problem
+        Priors on named unknowns, biases and station positions.
+    x : array (..., size)
+        Where the problem was linearised.
+    equations : Normal
+        Of the measurements alone.
+    shared, local : bool
+        Which priors are added: those of shared unknowns, those of unknowns local to each epoch.
+    """
+    layout = problem.layout
+    parts = [part for part in prior_parts(problem) if (shared if layout.find(part[0])[1] else local)]
+    if not parts:
+        return equations
+    (at_shared, at_local), xp = layout.split(x), library(x)
+    matrix, vector, cost = equations.shared, equations.shared_vector, equations.cost
+    blocks, local_vector = equations.local, equations.local_vector
+    for name, mean, precision in parts:
+        slot, is_shared = layout.find(name)
+        width = layout.n_shared if is_shared else layout.n_local
+        pick = placed(np.eye(width)[:, slot.start : slot.start + slot.size], x)
+        precision = placed(precision, x)  # noqa: PLW2901  # the same numbers, elsewhere
+        error = placed(mean, x) - (at_shared if is_shared else at_local)[..., slot.start : slot.start + slot.size]
+        pull = (precision @ error[..., None])[..., 0]
+        penalty = xp.sum(error * pull, axis=-1)
+        if is_shared:
+            matrix, vector = matrix + pick @ precision @ pick.mT, vector + (pick @ pull[..., None])[..., 0]
+            cost = cost + penalty
+        else:
+            blocks, local_vector = (
+                blocks + pick @ precision @ pick.mT,
+                local_vector + (pick @ pull[..., None])[..., 0],
+            )
+            cost = cost + xp.sum(penalty, axis=-1)
+    return Normal(matrix, blocks, equations.cross, vector, local_vector, cost)
+
+
+def prior_parts(problem: Problem) -> list[tuple[str, Array, Array]]:
+    """Return (name, mean, precision) of every prior; local ones have an epoch axis of length one."""
+    parts, layout = [], problem.layout
+    for prior in problem.priors:
+        precision, _ = linalg.inverse(prior.covariance)
+        _, is_shared = layout.find(prior.name)
+        mean = prior.mean if is_shared else prior.mean[..., None, :]
+        parts.append((prior.name, mean, precision if is_shared else precision[..., None, :, :]))
+    for bias in problem.biases:
+        if bias.sigma is not None:
+            sigma = np.ravel(bias.sigma)
+            parts.append((bias.name, np.broadcast_to(np.ravel(bias.mean), sigma.shape), np.diag(sigma**-2.0)))
+    stations = problem.stations
+    if stations.covariance is not None and stations.span != "noise":
+        precision = _block_diagonal(linalg.inverse(stations.covariance)[0])
+        if stations.span == "epoch":
+            precision = precision[..., None, :, :]
+        parts.append(("stations", np.zeros(precision.shape[-1]), precision))
+    return parts
+
+
+def _block_diagonal(blocks: Array) -> Array:
+    s, d = blocks.shape[-3], blocks.shape[-1]
+    apart = placed(np.eye(s)[:, None, :, None], blocks) * blocks[..., :, :, None, :]
+    whole: Array = library(blocks).reshape(apart, (*blocks.shape[:-3], s * d, s * d))
+    return whole

@@ -1,0 +1,116 @@
+"""The same problem on CasADi symbols: residuals for nonlinear programs, from the same models and the same indices."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from optloc.base.types import Array, Band
+from optloc.linear.constraints import conjunction
+from optloc.linear.evaluate import given, joined, to_ecef
+from optloc.linear.indices import Terms, plans
+from optloc.models.primitives import Point, wrap
+from optloc.models.surfaces import SURFACES
+from optloc.problem.layout import state_names
+from optloc.problem.problem import Problem
+
+
+def parameters(problem: Problem) -> Array:
+    """Return the numbers (p,) that the symbolic residual of a single problem needs beside x and z."""
+    values = [np.zeros(0)]
+    for plan in plans(problem):
+        inputs = given(problem, plan)
+        values.extend(np.ravel(inputs[seed] + np.zeros(plan.block.count)) for seed in sorted(inputs))
+    return np.concatenate(values)
+
+
+def residual(problem: Problem, x: Any, p: Any, z: Any) -> list[Any]:
+    """Return z - h(x) of every row as CasADi expressions; angles are wrapped.
+
+    Parameters
+    ----------
+    problem : Problem
+        A single problem; only its structure enters the expressions.
+    x : casadi.SX (size, 1)
+        Parameter vector.
+    p : casadi.SX (p, 1)
+        Numbers in the order of `parameters`.
+    z : casadi.SX (m, 1)
+        Measurements less their corrections.
+    """
+    out, used = [], 0
+    for plan, start in zip(plans(problem), problem.starts, strict=True):
+        seeds = sorted(given(problem, plan))
+        for i in range(plan.block.count):
+            inputs = {seed: p[used + j * plan.block.count + i] for j, seed in enumerate(seeds)}
+            for feed in plan.feeds:
+                rows = np.arange(plan.block.count)[feed.rows]
+                for at in np.flatnonzero(rows == i):
+                    gain = np.broadcast_to(feed.gain, feed.column.shape)[at]
+                    inputs[feed.seed] = inputs.get(feed.seed, 0.0) + float(gain) * x[int(feed.column[at])]
+            value = plan.model.h(*joined(problem, plan.model, inputs))
+            value = value * (1.0 + _total(plan.gains, i, x)) + _total(plan.adds, i, x)
+            misfit = z[start + i] - value
+            out.append(wrap(misfit) if plan.model.period is not None else misfit)
+        used += len(seeds) * plan.block.count
+    return out
+
+
+def _total(terms: Terms, row: int, x: Any) -> Any:
+    return sum(float(terms.coefficient[i]) * x[int(terms.column[i])] for i in np.flatnonzero(terms.row == row))
+
+
+def bounds(problem: Problem) -> Array:
+    """Return the numbers (q,) that the symbolic constraints of a single problem need: coefficients, lower, upper."""
+    values = [np.zeros(0)]
+    for band in conjunction(problem):
+        values += [np.ravel(band.coefficients), np.ravel(band.lower), np.ravel(band.upper)]
+    return np.concatenate(values)
+
+
+def constrained(problem: Problem, x: Any, p: Any, length: Any) -> tuple[list[Any], list[Any]]:
+    """Return the equalities c(x) = 0 and inequalities d(x) >= 0 of a problem as CasADi expressions.
+
+    Parameters
+    ----------
+    problem : Problem
+        A single problem; only its structure enters the expressions.
+    x : casadi.SX (size, 1)
+        Parameter vector.
+    p : casadi.SX (q, 1)
+        Numbers in the order of `bounds`.
+    length : casadi.SX
+        By which quantities in metres are divided.
+    """
+    equal: list[Any] = []
+    more: list[Any] = []
+    used = 0
+    for band in conjunction(problem):
+        surface, count = SURFACES[band.kind], band.coefficients.shape[-1]
+        c = tuple(p[used + i] for i in range(count))
+        lower, upper = p[used + count], p[used + count + 1]
+        used += count + 2
+        unit = length if surface.unit == "m" else 1.0
+        value = surface.g(_target(problem, band, x), c)
+        if np.all(band.lower == band.upper):
+            equal.append((value - lower) / unit)
+            continue
+        if np.isfinite(band.lower).all():
+            more.append((value - lower) / unit)
+        if np.isfinite(band.upper).all():
+            more.append((upper - value) / unit)
+    return equal, more
+
+
+def _target(problem: Problem, band: Band, x: Any) -> Point:
+    names, d = state_names(band.target, len(problem.motions), 2), problem.dimension
+    surface = SURFACES[band.kind]
+    start = problem.layout.find(names[0])[0].start
+    position = tuple(x[start + i] for i in range(d))
+    velocity = None
+    if surface.velocity:
+        start = problem.layout.find(names[1])[0].start
+        velocity = tuple(x[start + i] for i in range(d))
+    ecef = to_ecef(problem, position) if surface.ecef else None
+    return Point(position[: band.coefficients.shape[-1]] if band.kind == "plane" else position, velocity, None, ecef)

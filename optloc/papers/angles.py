@@ -1,0 +1,649 @@
+"""Draws, starts, tracks and their scores; all trials of a setting run as one batch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optloc.base.types import Array, Motion
+from optloc.bounds.crlb import crlb
+from optloc.linear.simulate import simulate
+from optloc.papers.report import Tick
+from optloc.problem.build import assemble, measured
+from optloc.problem.epochs import by_epoch, cut
+from optloc.problem.problem import Problem
+from optloc.solvers import solve
+from optloc.solvers.starts.angles import courses
+from optloc.track import Dynamics, State, Track, current_statistical, followed, polynomial, singer
+from optloc.track.batch import fitted, posterior_bound
+from optloc.track.dynamics import correlated
+
+# The three simulations of the paper, as printed where they can be and repaired where not.
+
+TIME_CONSTANT = 10.0
+"""The "manoeuvre constant 10": seconds after which a deviation of the acceleration has fallen to 1/e."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """Two stations that stay, and a target whose states are written down.
+
+    Parameters
+    ----------
+    name : str
+        For tables.
+    stations : array (s, d)
+        Metres; in the plane there are azimuths only.
+    states : array (k + 1, 3, d)
+        Position, velocity and acceleration of the target at 0, 1, ... k seconds; it is measured from 1 s on.
+    sigma : float
+        Standard deviation of an angle, radians.
+    phases : tuple of int
+        Last second of each phase.
+    """
+
+    name: str
+    stations: Array
+    states: Array
+    sigma: float
+    phases: tuple[int, ...]
+
+    @property
+    def epochs(self) -> int:
+        """Return the number of epochs k."""
+        return len(self.states) - 1
+
+    @property
+    def dimension(self) -> int:
+        """Return 2 or 3."""
+        return int(self.stations.shape[1])
+
+    @property
+    def truth(self) -> Array:
+        """Return the true states (k + 1, 3 d), ordered [p, v, a]."""
+        return self.states.reshape(len(self.states), -1)
+
+    def problem(self) -> Problem:
+        """Return the run without measurements; every epoch has a position of its own."""
+        count, k = len(self.stations), self.epochs
+        a, epoch = np.tile(np.arange(count), k), np.repeat(np.arange(k), count)
+        kinds = ("azimuth", "elevation")[: self.dimension - 1]
+        rows = [measured(kind, a=a, epoch=epoch, sigma=self.sigma) for kind in kinds]
+        return assemble(self.stations, *rows, times=np.arange(1.0, k + 1.0), motions=(Motion(span="epoch"),))
+
+
+def _states(*parts: tuple[Array, Array, Array]) -> Array:
+    """Return positions, velocities and accelerations (k + 1, d) as states; each part begins where the last ended."""
+    return np.concatenate([np.stack(part, axis=1)[i > 0 :] for i, part in enumerate(parts)])
+
+
+def _straight() -> Scenario:
+    t, still = np.arange(51.0)[:, None], np.zeros((51, 2))
+    ahead = np.array([1.0, 0.0])
+    states = _states(((2.0 * t + 0.1 * t**2) * ahead, (2.0 + 0.2 * t) * ahead, still + 0.2 * ahead))
+    return Scenario("simulation 1", _BASE, states, _FINE, (50,))
+
+
+def _winding() -> Scenario:
+    t, rate = np.arange(51.0), np.pi / 36.0
+    wave, zero = np.exp(1j * rate * t), np.zeros(51)
+    parts = [
+        np.stack(pair, axis=-1)
+        for pair in (
+            (2.0 * t, 10.0 * wave.imag),
+            (zero + 2.0, 10.0 * rate * wave.real),
+            (zero, -10.0 * rate**2 * wave.imag),
+        )
+    ]
+    return Scenario("simulation 2", _BASE, _states((parts[0], parts[1], parts[2])), _FINE, (50,))
+
+
+def circling(name: str, slow: float, fast: float, rate: float, seconds: tuple[int, int, int]) -> Scenario:
+    """Return simulation 3: straight, in a circle, straight.
+
+    Parameters
+    ----------
+    name : str
+        For tables.
+    slow, fast : float
+        Speed on the straight parts, which begin towards (2, 1, 0), and in the circle, m/s.
+    rate : float
+        Turn to the left, radians per second.
+    seconds : tuple of three int
+        How long each part lasts.
+
+    Notes
+    -----
+    The last part has the velocity of the first, as printed, whatever the heading at the end of the circle.
+    """
+    ahead, left = np.array([2.0, 1.0, 0.0]) / np.sqrt(5.0), np.array([-1.0, 2.0, 0.0]) / np.sqrt(5.0)
+    one, two, three = (np.arange(n + 1.0)[:, None] for n in seconds)
+    begin, radius = np.array([-10e3, 50e3, 10e3]), fast / rate
+    leave = begin + slow * seconds[0] * ahead
+    sine, cosine = np.sin(rate * two), np.cos(rate * two)
+    circle = leave + radius * (sine * ahead + (1.0 - cosine) * left)
+    states = _states(
+        (begin + slow * one * ahead, slow * ahead + 0.0 * one, 0.0 * one * ahead),
+        (circle, fast * (cosine * ahead + sine * left), fast * rate * (cosine * left - sine * ahead)),
+        (circle[-1] + slow * three * ahead, slow * ahead + 0.0 * three, 0.0 * three * ahead),
+    )
+    ends = np.cumsum(seconds)
+    return Scenario(name, _WIDE, states, 5e-3, (int(ends[0]), int(ends[1]), int(ends[2])))
+
+
+_BASE = np.array([[0.0, 50.0], [0.0, 100.0]])
+_WIDE = np.array([[-40e3, 0.0, 0.0], [40e3, 0.0, 0.0]])
+_FINE = float(np.deg2rad(1e-3))
+_RATE, _RADIUS = 0.157, 3e3
+_PRINTED = (1500, 500, 1000)
+
+STRAIGHT = _straight()
+"""Simulation 1: constant acceleration. The stations and the place at t = 0 lie on one line."""
+
+WINDING = _winding()
+"""Simulation 2: a sine."""
+
+REPAIRED = circling("repaired", _RADIUS * np.pi / 20.0, _RADIUS * np.pi / 20.0, np.pi / 20.0, (100, 40, 100))
+"""Simulation 3 with one speed, 471 m/s, one full turn in 40 s, and straight parts of 100 s."""
+
+READINGS = (
+    circling("as printed, in m/s", float(np.hypot(0.2, 0.1)), _RADIUS * _RATE, _RATE, _PRINTED),
+    circling("as printed, in km/s", 1e3 * float(np.hypot(0.2, 0.1)), _RADIUS * _RATE, _RATE, _PRINTED),
+)
+"""Simulation 3 as printed: the speed of the straight parts has no unit."""
+
+
+LOST = 10.0
+"""A track of simulation 1 or 2 that ends further from the truth than this is lost, metres."""
+
+Sigmas = tuple[float, float, float]
+"""Standard deviations of each coordinate of position, velocity and acceleration at the start."""
+
+
+@dataclass(frozen=True, slots=True)
+class Draw:
+    """Trials of a simulation.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        What is simulated.
+    problem : Problem
+        Its run, measured (trials,) times.
+    trials : int
+        Number of them.
+    rng : callable
+        ``() -> Generator`` of the starts, the same at each call.
+    """
+
+    scenario: Scenario
+    problem: Problem
+    trials: int
+    rng: Callable[[], np.random.Generator]
+
+
+def draw(scenario: Scenario, trials: int, seed: int, key: int) -> Draw:
+    """Return trials of a simulation that depend on seed and key alone."""
+    one, two = np.random.SeedSequence(seed, spawn_key=(key,)).spawn(2)
+    truth = scenario.states[1:, 0].ravel()
+    problem = simulate(scenario.problem(), truth, one, trials=trials)
+    return Draw(scenario, problem, trials, lambda: np.random.default_rng(two))
+
+
+def placed(drawn: Draw, sigmas: Sigmas, *, known: int = 3) -> State:
+    """Return starts at t = 0 that are the truth, but for derivatives from `known` on, which are zero."""
+    d, mean = drawn.scenario.dimension, drawn.scenario.truth[0].copy()
+    mean[known * d :] = 0.0
+    return _repeated(mean, _diagonal(sigmas, d), drawn.trials)
+
+
+def scattered(drawn: Draw, sigmas: Sigmas) -> State:
+    """Return starts at t = 0 drawn around the truth with the covariance that they claim."""
+    d = drawn.scenario.dimension
+    state = _repeated(drawn.scenario.truth[0], _diagonal(sigmas, d), drawn.trials)
+    error = drawn.rng().standard_normal(state.mean.shape) * np.repeat(sigmas, d)
+    return replace(state, mean=state.mean + error)
+
+
+def fitted_start(drawn: Draw, epochs: int, order: int = 2) -> State:
+    """Return the states after some epochs, fitted to them without a guess."""
+    fix = fitted(cut(drawn.problem, 0, epochs), order)
+    mean, cov = fix.gaussian()
+    return State(float(epochs), np.asarray(mean), np.asarray(cov))
+
+
+def first_fix(drawn: Draw, speed: float, rate: float) -> State:
+    """Return the fix of the first epoch, with velocity and acceleration zero of given standard deviations."""
+    d = drawn.scenario.dimension
+    fix = solve(replace(cut(drawn.problem, 0, 1), motions=(Motion(),)))
+    cov = np.zeros((drawn.trials, 3 * d, 3 * d))
+    cov[:] = _diagonal((0.0, speed, rate), d)
+    cov[:, :d, :d] = fix.covariance()
+    return State(1.0, np.concatenate([fix.position, np.zeros((drawn.trials, 2 * d))], axis=-1), cov)
+
+
+def fixes(drawn: Draw) -> tuple[Array, Array]:
+    """Return the fix (trials, k, d) of every epoch by itself, and its covariance (trials, k, d, d)."""
+    fix = solve(drawn.problem, "wiv+lsr")
+    return fix.position, fix.covariance()
+
+
+def linear_track(places: tuple[Array, Array], start: State, dynamics: Dynamics) -> Array:
+    """Return the states (trials, k, n) of a linear Kalman filter whose measurements are fixes.
+
+    Parameters
+    ----------
+    places : tuple of array
+        Fixes at 1, 2, ... seconds and their covariances.
+    start : State
+        Before the first fix used.
+    dynamics : Dynamics
+        Model of motion.
+    """
+    mean, cov, out = start.mean, start.cov, []
+    d = places[0].shape[-1]
+    for k in range(int(start.time), places[0].shape[1]):
+        F, Q, drive = dynamics.step(1.0, mean, d)
+        mean, cov = (F @ mean[..., None])[..., 0] + drive, F @ cov @ F.T + Q
+        S = cov[..., :d, :d] + places[1][:, k]
+        gain = np.swapaxes(np.linalg.solve(S, cov[..., :d, :]), -1, -2)
+        mean = mean + (gain @ (places[0][:, k] - mean[..., :d])[..., None])[..., 0]
+        cov = cov - gain @ S @ np.swapaxes(gain, -1, -2)
+        out.append(mean)
+    return np.stack(out, axis=1)
+
+
+def fixed_variance(limit: float) -> Dynamics:
+    """Return Singer's model with the variance that the current statistical model has where it sees no acceleration."""
+    return singer(TIME_CONSTANT, float(np.sqrt((4.0 - np.pi) / np.pi)) * limit)
+
+
+def errors(drawn: Draw, track: Track | Array) -> Array:
+    """Return the errors (trials, q, 3, d) of position, velocity and acceleration at the last q epochs."""
+    mean = track.mean if isinstance(track, Track) else track
+    true = drawn.scenario.states[-mean.shape[1] :]
+    return np.asarray(mean.reshape(*mean.shape[:2], 3, -1) - true)
+
+
+def rms(error: Array, axes: tuple[int, ...] = (0, 1)) -> Array:
+    """Return root mean square lengths of errors (trials, q, ..., d) over trials and epochs."""
+    return np.asarray(np.sqrt((error**2).sum(-1).mean(axes)))
+
+
+def distances(drawn: Draw, track: Track) -> Array:
+    """Return the distances (trials,) of the last states from the truth, metres."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(np.sqrt((errors(drawn, track)[:, -1, 0] ** 2).sum(-1)))
+
+
+def lost(drawn: Draw, track: Track) -> float:
+    """Return the share of tracks that end further than `LOST` from the truth, or nowhere."""
+    return float((~(distances(drawn, track) < LOST)).mean())
+
+
+def tracked(drawn: Draw, start: State, dynamics: Dynamics, update: str = "ekf") -> Track:
+    """Return the tracks of all trials."""
+    return followed(drawn.problem, start, dynamics, update)
+
+
+def bound(scenario: Scenario, start: State, dynamics: Dynamics) -> Array:
+    """Return the posterior bound (q, 3) of the root mean square error of position, velocity and acceleration."""
+    alone = State(start.time, scenario.truth[int(start.time)], start.cov[0])
+    cov = posterior_bound(scenario.problem(), scenario.truth[1:], alone, dynamics)
+    variance = np.diagonal(cov, axis1=-2, axis2=-1).reshape(len(cov), 3, -1)
+    return np.asarray(np.sqrt(variance.sum(-1)))
+
+
+def snapshot_bound(scenario: Scenario) -> Array:
+    """Return the bound (k,) of the position error of every epoch by itself, metres."""
+    cov = crlb(by_epoch(scenario.problem()), scenario.states[1:, 0])
+    return np.asarray(np.sqrt(np.trace(cov, axis1=-2, axis2=-1)))
+
+
+def _diagonal(sigmas: Sigmas, d: int) -> Array:
+    return np.diag(np.repeat(np.square(sigmas), d))
+
+
+def _repeated(mean: Array, cov: Array, trials: int) -> State:
+    return State(0.0, np.tile(mean, (trials, 1)), np.tile(cov, (trials, 1, 1)))
+
+
+# What the paper and its source print, kept for comparison: never use these to track.
+
+
+def printed_transition(time_constant: float, limit: float) -> Dynamics:
+    """Return the current statistical model with the printed f33 = 1 - exp(-alpha T) in the place of exp(-alpha T).
+
+    Parameters
+    ----------
+    time_constant : float
+        Seconds.
+    limit : float
+        Largest acceleration of an axis, m/s^2.
+    """
+    right = current_statistical(time_constant, limit)
+
+    def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
+        F, Q, drive = right.step(dt, mean, d)
+        F = F.copy()
+        F[2 * d :, 2 * d :] = (1.0 - np.exp(-dt / time_constant)) * np.eye(d)
+        return F, Q, drive
+
+    return replace(right, name="printed f33", step=step)
+
+
+def printed_variance(time_constant: float, limit: float) -> Dynamics:
+    """Return the current statistical model with the variance as published: (4 - pi)/pi (limit - abs(a))^2, no clamp.
+
+    The variance vanishes where the acceleration comes near its limit, and grows without bound beyond it.
+
+    Parameters
+    ----------
+    time_constant : float
+        Seconds.
+    limit : float
+        Largest acceleration of an axis, m/s^2.
+    """
+    right = current_statistical(time_constant, limit)
+
+    def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
+        F, _, drive = right.step(dt, mean, d)
+        _, Q, _ = correlated(1.0 / time_constant, dt)
+        variance = (4.0 - np.pi) / np.pi * (limit - np.abs(mean[..., 2 * d :])) ** 2
+        noise = np.einsum("ij,...c,cb->...icjb", Q, variance, np.eye(d))
+        return F, noise.reshape(*mean.shape, mean.shape[-1]), drive
+
+    return replace(right, name="no clamp", step=step)
+
+
+# Filters in the three simulations: errors against time, bounds and lost tracks.
+
+STRAIGHT_START: Sigmas = (0.1, 0.1, 0.2)
+WINDING_START: Sigmas = (0.1, 2.0, 1.0)
+CIRCLE_START = (500.0, 50.0)
+"""Standard deviations of the starts; of velocity and acceleration in simulation 3, which begins at a fix."""
+
+SETTLED = 20
+"""Seconds of simulation 3 that are not scored."""
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """Errors against time.
+
+    Parameters
+    ----------
+    label : str
+        What made them.
+    seconds : array (q,)
+        When.
+    error : array (q, 3)
+        Root mean square errors, or bounds, of position, velocity and acceleration.
+    """
+
+    label: str
+    seconds: Array
+    error: Array
+
+    def total(self, first: int = 0, last: int | None = None) -> Array:
+        """Return the root mean square (3,) over first < t <= last seconds."""
+        inside = (self.seconds > first) & (self.seconds <= (np.inf if last is None else last))
+        return np.asarray(np.sqrt((self.error[inside] ** 2).mean(0)))
+
+    def phases(self, scenario: Scenario) -> list[float]:
+        """Return the root mean square position error of each phase; the first `SETTLED` seconds do not count."""
+        first = (SETTLED, *scenario.phases[:-1])
+        return [float(self.total(a, b)[0]) for a, b in zip(first, scenario.phases, strict=True)]
+
+
+def curve(label: str, drawn: Draw, start: State, dynamics: Dynamics, update: str = "ekf") -> Curve:
+    """Return the errors of the tracks from a start."""
+    return scored(label, drawn, tracked(drawn, start, dynamics, update).mean)
+
+
+def scored(label: str, drawn: Draw, mean: Array) -> Curve:
+    """Return the errors of states (trials, q, n) at the last q epochs."""
+    error = rms(errors(drawn, mean), (0,))
+    last = drawn.scenario.epochs
+    return Curve(label, np.arange(last - len(error) + 1.0, last + 1.0), error)
+
+
+def bounded(label: str, scenario: Scenario, start: State, dynamics: Dynamics) -> Curve:
+    """Return the posterior bound from a start."""
+    least = bound(scenario, start, dynamics)
+    return Curve(label, np.arange(start.time + 1.0, scenario.epochs + 1.0), least)
+
+
+def straight(drawn: Draw, tick: Tick) -> list[Curve]:
+    """Return simulation 1: the filter with the right and the printed transition, three limits, and bounds."""
+    start, out = placed(drawn, STRAIGHT_START, known=2), []
+    for limit in (30.0, 2.0, 0.3):
+        for label, make in (("filter", current_statistical), ("printed f33", printed_transition)):
+            out.append(curve(f"{label}, a_max {limit:g}", drawn, start, make(TIME_CONSTANT, limit)))
+            tick()
+    out.append(bounded("posterior bound, a_max 2", STRAIGHT, start, fixed_variance(2.0)))
+    out.append(bounded("bound of one track", STRAIGHT, start, polynomial(2)))
+    tick()
+    return out
+
+
+def winding(drawn: Draw, tick: Tick) -> list[Curve]:
+    """Return simulation 2: started at rest, and by a fit of the first three epochs."""
+    model = current_statistical(TIME_CONSTANT, 30.0)
+    start = placed(drawn, WINDING_START, known=1)
+    out = [
+        curve("filter, started at rest", drawn, start, model),
+        curve("filter, started by a fit of 3 s", drawn, fitted_start(drawn, 3), model, "iekf"),
+        bounded("posterior bound", WINDING, start, fixed_variance(30.0)),
+    ]
+    tick()
+    return out
+
+
+def circles(drawn: Draw, tick: Tick) -> dict[float, list[Curve]]:
+    """Return the repaired simulation 3 by limit: three filters and the bound."""
+    start, out = first_fix(drawn, *CIRCLE_START), {}
+    places = fixes(drawn)
+    tick()
+    for limit in (100.0, 300.0):
+        model = current_statistical(TIME_CONSTANT, limit)
+        out[limit] = [
+            curve("single step", drawn, start, model),
+            curve("converged", drawn, start, model, "iekf"),
+            scored("fixes, then a linear filter", drawn, linear_track(places, start, model)),
+            bounded("posterior bound", REPAIRED, start, fixed_variance(limit)),
+        ]
+        tick()
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """Position errors and bounds of the phases of simulation 3 as printed.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        One of `READINGS`.
+    limit : float
+        Largest acceleration of the model.
+    error, bound : list of float
+        Metres, by phase.
+    """
+
+    scenario: Scenario
+    limit: float
+    error: list[float]
+    bound: list[float]
+
+
+def readings(count: int, seed: int, key: int, tick: Tick) -> list[Reading]:
+    """Return simulation 3 as printed."""
+    out = []
+    for i, scenario in enumerate(READINGS):
+        drawn = draw(scenario, count, seed, key + i)
+        start = first_fix(drawn, *CIRCLE_START)
+        for limit in (100.0, 300.0):
+            found = curve("", drawn, start, current_statistical(TIME_CONSTANT, limit))
+            tick()
+            least = bounded("", scenario, start, fixed_variance(limit))
+            out.append(Reading(scenario, limit, found.phases(scenario), least.phases(scenario)))
+            tick()
+    return out
+
+
+def snapshot() -> Curve:
+    """Return the bound of every second of the repaired simulation 3 by itself, whose last two columns are NaN."""
+    least = snapshot_bound(REPAIRED)
+    error = np.full((len(least), 3), np.nan)
+    error[:, 0] = least
+    return Curve("snapshot", np.arange(1.0, len(least) + 1.0), error)
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """Shares of lost tracks of simulation 1.
+
+    Parameters
+    ----------
+    sigma : float
+        Standard deviation of each coordinate of the start, metres; 0 for a fit of the first epochs.
+    limit : float
+        Largest acceleration of the model.
+    share : mapping of str to float
+        By filter.
+    """
+
+    sigma: float
+    limit: float
+    share: dict[str, float]
+
+
+def starts(drawn: Draw, tick: Tick) -> list[Lost]:
+    """Return who is lost from starts on the line through the stations, and from a fit of three epochs."""
+    out = []
+    fit = fitted_start(drawn, 3)
+    for sigma, limit in ((1.0, 5.0), (1.0, 30.0), (3.0, 5.0), (3.0, 30.0), (0.0, 30.0)):
+        start = scattered(drawn, (sigma, 0.1, 0.2)) if sigma else fit
+        model = current_statistical(TIME_CONSTANT, limit)
+        names = ("ekf", "iekf", "mgekf", "mvekf")
+        out.append(Lost(sigma, limit, {n: lost(drawn, tracked(drawn, start, model, n)) for n in names}))
+        tick()
+    return out
+
+
+def clamps(drawn: Draw, tick: Tick) -> dict[str, float]:
+    """Return the share of lost tracks with the variance as published and clamped, from 3 m and with a_max 0.3."""
+    start = scattered(drawn, (3.0, 0.1, 0.2))
+    models = {"as published": printed_variance, "clamped": current_statistical}
+    found = {name: lost(drawn, tracked(drawn, start, make(TIME_CONSTANT, 0.3))) for name, make in models.items()}
+    tick()
+    return found
+
+
+def ends(drawn: Draw, tick: Tick) -> dict[str, Array]:
+    """Return the distances (trials,) from the truth at the end of simulation 1, by start and filter."""
+    model = current_statistical(TIME_CONSTANT, 30.0)
+    start = scattered(drawn, (1.0, 0.1, 0.2))
+    tracks = {
+        "single step (the paper), start of 1 m": tracked(drawn, start, model, "ekf"),
+        "converged, start of 1 m": tracked(drawn, start, model, "iekf"),
+        "single step, started by a fit of 3 s": tracked(drawn, fitted_start(drawn, 3), model, "ekf"),
+    }
+    tick()
+    return {name: distances(drawn, track) for name, track in tracks.items()}
+
+
+# Fits to whole tracks, and to a target that stays: pseudo-linear, instrumental, maximum likelihood.
+
+PLACE = np.array([-10e3, 50e3, 10e3])
+"""A target that stays, metres."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rays:
+    """Fixes of a target that stays.
+
+    Parameters
+    ----------
+    stations : int
+        How many there are.
+    sigma : float
+        Standard deviation of an angle, radians.
+    bound : float
+        Root of the trace of the Cramer-Rao bound, metres.
+    fixes : tuple of tuple of float
+        Length of the mean error, and root mean square error, of each fix in metres: plain, weighted, instrumental,
+        maximum likelihood.
+    """
+
+    stations: int
+    sigma: float
+    bound: float
+    fixes: tuple[tuple[float, float], ...]
+
+
+def whole_track_bound() -> Array:
+    """Return the bound (3,) of position, velocity and acceleration at the end of simulation 1."""
+    run = replace(STRAIGHT.problem(), motions=(Motion(2, reference=float(STRAIGHT.epochs)),))
+    return np.asarray(np.sqrt(np.diagonal(crlb(run, STRAIGHT.truth[-1])).reshape(3, -1).sum(-1)))
+
+
+def wholes(drawn: Draw, tick: Tick) -> list[tuple[str, Array]]:
+    """Return errors (3,) at the end of simulation 1 of fits to the whole track, and of the filter."""
+    run = replace(drawn.problem, motions=(Motion(2, reference=float(STRAIGHT.epochs)),))
+    exact, unit = STRAIGHT.truth[-1], np.array([1.0, 1.0, 2.0])[:, None]
+    found = courses(run)
+    assert found is not None
+    parts = {"plain": found.plain, "weighted": found.weighted, "instrumental variables": found.instrumental}
+    out = [(name, _parts((unit * c).reshape(len(c), -1) - exact)) for name, c in parts.items()]
+    out.append(("maximum likelihood (optloc)", _parts(fitted(drawn.problem, 2).x - exact)))
+    start = placed(drawn, STRAIGHT_START, known=2)
+    for limit in (30.0, 2.0):
+        track = tracked(drawn, start, current_statistical(TIME_CONSTANT, limit))
+        out.append((f"filter, a_max {limit:g}", _parts(track.mean[:, -1] - exact)))
+    tick()
+    return out
+
+
+def rays(count: int, seed: int, key: int, tick: Tick) -> list[Rays]:
+    """Return fixes of a target that stays, from few stations and from many."""
+    out = []
+    for i, (stations, sigma) in enumerate(((2, 0.05), (4, 0.05), (50, 0.02), (50, 0.05))):
+        run = still(stations, sigma)
+        drawn = simulate(run, PLACE, np.random.SeedSequence(seed, spawn_key=(key + i,)), trials=count)
+        found = courses(drawn)
+        assert found is not None
+        fixes = [c[:, 0] for c in (found.plain, found.weighted, found.instrumental)]
+        fixes.append(solve(drawn).position)
+        least = float(np.sqrt(np.trace(crlb(run, PLACE))))
+        out.append(Rays(stations, sigma, least, tuple(_bias(each - PLACE) for each in fixes)))
+        tick()
+    return out
+
+
+def still(count: int, sigma: float) -> Problem:
+    """Return one epoch of the angles of a target that stays.
+
+    Two stations are those of simulation 3. More, whose places the text does not give, stand between them, every other
+    one 20 km further away from the target.
+    """
+    place = np.zeros((count, 3))
+    place[:, 0] = np.linspace(-40e3, 40e3, count)
+    place[:, 1] = np.where(np.arange(count) % 2, 0.0, -20e3) * (count > 2)
+    a = np.arange(count)
+    return assemble(place, *(measured(kind, a=a, sigma=sigma) for kind in ("azimuth", "elevation")))
+
+
+def _parts(error: Array) -> Array:
+    return np.asarray(np.sqrt((error.reshape(len(error), 3, -1) ** 2).sum(-1).mean(0)))
+
+
+def _bias(error: Array) -> tuple[float, float]:
+    good = error[np.isfinite(error).all(-1)]
+    return float(np.linalg.norm(good.mean(0))), float(np.sqrt((good**2).sum(-1).mean()))
+
+
+# Tracking by azimuth and elevation with the current statistical model: section 3 of the paper.

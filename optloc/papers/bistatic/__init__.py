@@ -1,1 +1,0 @@
-"""Location of slow targets by one receiver with one illuminator: excess path, azimuth and elevation."""

@@ -1,0 +1,500 @@
+"""Filters on the scene of the paper, and what is measured of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from optloc.base import linalg
+from optloc.base.types import Array, Motion, Prior
+from optloc.base.units import SPEED_OF_LIGHT
+from optloc.bounds.crlb import crlb
+from optloc.linear.normal import linearise, normal, step
+from optloc.linear.simulate import simulate
+from optloc.problem.build import assemble, measured
+from optloc.problem.epochs import cut
+from optloc.problem.problem import Problem
+from optloc.solvers import solve
+from optloc.track import Dynamics, State, Track, followed, polynomial
+from optloc.track.associate import Associate, Clutter, assigned, joint, nearest
+from optloc.track.batch import posterior_bound
+from optloc.track.several_models import imm, parallel, resized
+from optloc.track.several_targets import Candidates, Missing, associated
+from optloc.track.updates import Update, Updated, joseph, whitened
+
+# The scene of the paper: three targets, four stations, twenty updates behind one fix.
+
+ORDERS = {"static": 0, "CV": 1, "CA": 2}
+"""Models of motion, and how targets move, by name."""
+
+
+def _star(radius: float) -> Array:
+    """Return the reference station at the origin and three around it, at 90, 210 and 330 degrees."""
+    angle = np.radians([90.0, 210.0, 330.0])
+    return np.vstack([np.zeros(2), radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)])
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """Stations and targets in the plane; the first station is the reference.
+
+    The paper gives targets, speeds, accelerations and the number of steps; the rest was chosen, see the text of the
+    reproduction.
+
+    Parameters
+    ----------
+    stations : array (s, 2)
+        Metres.
+    position, velocity, acceleration : array (t, 2)
+        Targets at the first epoch, SI units.
+    sigma : float
+        Standard deviation of a range difference, metres; differences are independent.
+    interval : float
+        Seconds between epochs.
+    steps : int
+        Updates behind the first fix.
+    speed, rate : float
+        Prior standard deviation of each coordinate of velocity and acceleration, SI units.
+    """
+
+    stations: Array = field(default_factory=lambda: _star(100e3))
+    position: Array = field(default_factory=lambda: 1e3 * np.array([[300.0, 400.0], [350.0, 450.0], [250.0, 350.0]]))
+    velocity: Array = field(default_factory=lambda: 1e3 * np.array([[0.0, 1.0], [0.0, -1.0], [0.0, 1.0]]))
+    acceleration: Array = field(default_factory=lambda: 1e3 * np.array([[0.0, -0.1], [0.0, 0.1], [0.0, 0.1]]))
+    sigma: float = 80e-9 * SPEED_OF_LIGHT
+    interval: float = 2.25
+    steps: int = 20
+    speed: float = 2e3
+    rate: float = 1e3
+
+    @property
+    def times(self) -> Array:
+        """Return the seconds (k,) of the epochs."""
+        return self.interval * np.arange(self.steps + 1)
+
+    def course(self, order: int, since: float = 0.0) -> Array:
+        """Return the states [p, v, a] (t, k, 6) of targets that stand (0), fly on (1) or accelerate (2).
+
+        Parameters
+        ----------
+        order : 0, 1 or 2
+            Which derivatives are not zero.
+        since : float
+            Time at which an acceleration begins, seconds.
+        """
+        t = self.times[:, None]
+        late = np.maximum(t - since, 0.0)
+        v = self.velocity[:, None] * (order > 0)
+        a = self.acceleration[:, None] * (order > 1)
+        place = self.position[:, None] + v * t + 0.5 * a * late**2
+        return np.concatenate([place, v + a * late, a * (t >= since)], axis=-1)
+
+    def problem(self) -> Problem:
+        """Return a run of one target without measurements; a state is free at each epoch."""
+        k, others = self.steps + 1, len(self.stations) - 1
+        a, epoch = np.tile(np.arange(1, others + 1), k), np.repeat(np.arange(k), others)
+        rows = measured("tdoa", a=a, b=0, epoch=epoch, sigma=self.sigma)
+        return assemble(self.stations, rows, times=self.times, motions=[Motion(0, span="epoch")])
+
+
+@dataclass(frozen=True, slots=True)
+class Draw:
+    """Measurements of all targets.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The scene.
+    truth : array (t, k, 6)
+        States of the targets.
+    runs : Problem
+        Batch (n, t) of runs of one target.
+    fix : State
+        Positions (n, t) that the first epoch gives.
+    """
+
+    scenario: Scenario
+    truth: Array
+    runs: Problem
+    fix: State
+
+    @property
+    def position(self) -> Array:
+        """Return the true positions (t, k - 1, 2) behind the first epoch, metres."""
+        return self.truth[:, 1:, :2]
+
+
+def draw(scenario: Scenario, truth: Array, trials: int, key: tuple[int, ...]) -> Draw:
+    """Return measurements of targets, and the fix of the first epoch, without a guess.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The scene.
+    truth : array (t, k, 6)
+        See `Scenario.course`.
+    trials : int
+        Independent trials n.
+    key : tuple of int
+        Decides the draw.
+    """
+    places = truth[..., :2].reshape(len(truth), -1)
+    runs = simulate(scenario.problem(), places, np.random.SeedSequence(key), trials=trials)
+    runs = replace(runs, motions=(Motion(0),))
+    first = solve(cut(runs, 0, 1))
+    return Draw(scenario, truth, runs, State(float(scenario.times[0]), first.position, first.covariance()))
+
+
+def unlabelled(drawn: Draw, detection: float, false: float, key: tuple[int, ...]) -> Candidates:
+    """Return the rows of all targets without their names, some lost, among false ones.
+
+    Parameters
+    ----------
+    drawn : Draw
+        Measurements.
+    detection : float
+        Probability that a row is seen.
+    false : float
+        Mean number of false rows of a channel and epoch; they are uniform over the baseline.
+    key : tuple of int
+        Decides what is lost and added.
+    """
+    rng = np.random.default_rng(np.random.SeedSequence(key))
+    seen = np.moveaxis(drawn.runs.z, 1, -1)
+    seen = np.where(rng.random(seen.shape) < detection, seen, np.nan)
+    count = rng.poisson(false, seen.shape[:-1])[..., None]
+    reach = baseline(drawn.scenario)
+    more = rng.uniform(-reach, reach, (*seen.shape[:-1], int(count.max(initial=0))))
+    more = np.where(np.arange(more.shape[-1]) < count, more, np.nan)
+    channels = replace(drawn.scenario.problem(), motions=(Motion(0),))
+    return Candidates(channels, np.concatenate([seen, more], axis=-1))
+
+
+def baseline(scenario: Scenario) -> float:
+    """Return the longest distance of a station from the reference, metres: the largest possible range difference."""
+    return float(np.linalg.norm(scenario.stations - scenario.stations[0], axis=-1).max())
+
+
+LOST = 10e3
+"""An error at the last epoch from which a track counts as lost, metres."""
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """Errors of many tracks.
+
+    Parameters
+    ----------
+    error : array (n, t, k)
+        Distances from the truth, metres.
+    nees : array (n, t, k)
+        Normalised estimation errors squared of the positions; 2 on average where covariances are right.
+    """
+
+    error: Array
+    nees: Array
+
+    @property
+    def mean(self) -> float:
+        """Return the mean error over runs, targets and steps, metres."""
+        return float(self.error.mean())
+
+    @property
+    def spread(self) -> float:
+        """Return the standard error of the mean, metres: a run, with all its targets and steps, is one sample."""
+        each = self.error.mean((-2, -1))
+        return float(each.std() / np.sqrt(each.size))
+
+    @property
+    def last(self) -> float:
+        """Return the root mean square error at the last step, metres."""
+        return float(np.sqrt((self.error[..., -1] ** 2).mean()))
+
+    @property
+    def lost(self) -> float:
+        """Return the share of tracks that end further than `LOST` from the truth."""
+        return float((self.error[..., -1] > LOST).mean())
+
+
+def score(drawn: Draw, position: Array, cov: Array | None = None) -> Score:
+    """Return the errors of positions (n, t, k, 2) behind the first epoch, with their covariances where known."""
+    away = position - drawn.position
+    nees = np.full(away.shape[:-1], np.nan)
+    if cov is not None:
+        nees = (away * np.linalg.solve(cov, away[..., None])[..., 0]).sum(-1)
+    return Score(np.linalg.norm(away, axis=-1), nees)
+
+
+def started(drawn: Draw, order: int) -> State:
+    """Return the state of the first epoch: the fix, and priors of what it does not see."""
+    return resized(drawn.fix, order, 2, speed=drawn.scenario.speed, rate=drawn.scenario.rate)
+
+
+def tracked(drawn: Draw, dynamics: Dynamics, update: Update | str = "ekf") -> Track:
+    """Return the tracks of all runs by one model."""
+    return followed(drawn.runs, started(drawn, dynamics.order), dynamics, update)
+
+
+def scored(drawn: Draw, track: Track) -> Score:
+    """Return the errors of tracks."""
+    return score(drawn, track.position, track.cov[..., :2, :2])
+
+
+def fixes(drawn: Draw) -> Score:
+    """Return the errors of fixes of single epochs, each without a guess and without the others.
+
+    The first epoch is left out, as it is with tracks.
+    """
+    found = solve(replace(drawn.runs, motions=(Motion(0, span="epoch"),)))
+    return score(drawn, found.position[..., 1:, :], found.covariance()[..., 1:, :, :])
+
+
+def batch(drawn: Draw, order: int) -> Score:
+    """Return the errors at the last epoch of maximum-likelihood estimates of whole runs, without a guess."""
+    sizes = {"velocity": drawn.scenario.speed, "acceleration": drawn.scenario.rate}
+    priors = [Prior(name, np.zeros(2), size**2 * np.eye(2)) for name, size in list(sizes.items())[:order]]
+    found = solve(replace(drawn.runs, motions=(Motion(order),), priors=tuple(priors)))
+    T = float(drawn.scenario.times[-1])
+    ahead = np.kron([1.0, T, 0.5 * T * T][: order + 1], np.eye(2))
+    away = found.x @ ahead.T - drawn.position[:, -1]
+    cov = ahead @ found.cov @ ahead.T
+    nees = (away * np.linalg.solve(cov, away[..., None])[..., 0]).sum(-1)
+    return Score(np.linalg.norm(away, axis=-1)[..., None], nees[..., None])
+
+
+def bounds(scenario: Scenario, truth: Array, order: int) -> Array:
+    """Return the posterior Cramer-Rao bound of the position (t, k, 2, 2), that of the first fix included."""
+    made = replace(scenario.problem(), motions=(Motion(0),))
+    first = crlb(cut(made, 0, 1), truth[:, 0, :2])
+    n = 2 * (order + 1)
+    fix = State(float(scenario.times[0]), truth[:, 0, :2], first)
+    start = resized(fix, order, 2, speed=scenario.speed, rate=scenario.rate)
+    later = posterior_bound(made, truth[..., :n], start, polynomial(order))
+    return np.concatenate([first[:, None], later[..., :2, :2]], axis=1)
+
+
+def mean_error(cov: Array) -> Array:
+    """Return the mean distance (...) from its mean of a normal vector in the plane with covariances (..., 2, 2).
+
+    References
+    ----------
+    M. Abramowitz, I. A. Stegun, "Handbook of Mathematical Functions" (1964), 17.3.3, applied to the mean over angles.
+    """
+    from scipy.special import ellipe
+
+    small, large = np.moveaxis(np.linalg.eigvalsh(cov), -1, 0)
+    return np.asarray(np.sqrt(2.0 / np.pi * large) * ellipe(1.0 - small / large))
+
+
+def polynomial_ratio(order: int, points: int) -> float:
+    """Return the end-point error of a line (order 1) or parabola (2) through equally good points, over that of one."""
+    k = points
+    if order == 1:
+        return float(np.sqrt(2.0 * (2 * k - 1) / (k * (k + 1))))
+    return float(np.sqrt(3.0 * (3 * k * k - 3 * k + 2) / (k * (k + 1) * (k + 2))))
+
+
+def theory(order: int, steps: int) -> float:
+    """Return the mean of `polynomial_ratio` over the steps behind one fix."""
+    return float(np.mean([polynomial_ratio(order, k) for k in range(2, steps + 2)]))
+
+
+@dataclass(frozen=True, slots=True)
+class Filter:
+    """A way from measurements to positions.
+
+    Parameters
+    ----------
+    name : str
+        As tables call it.
+    models : tuple of Dynamics
+        One model, or several.
+    switch : float
+        Probability to change the model from scan to scan; 0: the models run side by side and the best is taken.
+    """
+
+    name: str
+    models: tuple[Dynamics, ...]
+    switch: float = 0.0
+
+    def run(self, drawn: Draw) -> Score:
+        """Return the errors of a draw."""
+        scene = drawn.scenario
+        if len(self.models) == 1:
+            return scored(drawn, tracked(drawn, self.models[0]))
+        if not self.switch:
+            made = parallel(drawn.runs, drawn.fix, self.models, speed=scene.speed, rate=scene.rate, update="ekf")
+            return score(drawn, made.position)
+        q = len(self.models)
+        chain = np.full((q, q), self.switch / (q - 1)) + (1.0 - self.switch * q / (q - 1)) * np.eye(q)
+        found = imm(drawn.runs, drawn.fix, self.models, chain, speed=scene.speed, rate=scene.rate, update="ekf")
+        return scored(drawn, found.track)
+
+
+PLAIN = tuple(polynomial(order) for order in (0, 1, 2))
+"""Static, uniform and accelerated, without process noise."""
+
+FILTERS = (
+    Filter("CV, Q = 0 (paper)", PLAIN[1:2]),
+    Filter("CV, sd(a) = 0.1 km/s²", (polynomial(1, 100.0),)),
+    Filter("CA, Q = 0 (paper)", PLAIN[2:]),
+    Filter("best of static, CV, CA by likelihood", PLAIN),
+    Filter("IMM of CV and CA with sd(jerk) = 0.05 km/s³", (polynomial(1), polynomial(2, 50.0)), 0.05),
+)
+"""What is tried against a motion that is not the model's."""
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """A way to tell whose a row is.
+
+    Parameters
+    ----------
+    name : str
+        As tables call it.
+    associate : Associate
+        The rule.
+    missing : "drop" or "expect"
+        "expect" where a missed row repeats the prediction.
+    """
+
+    name: str
+    associate: Associate
+    missing: Missing = "drop"
+
+
+@dataclass(frozen=True, slots=True)
+class Association:
+    """The association test of one motion.
+
+    Parameters
+    ----------
+    drawn : Draw
+        The truth, and labelled measurements.
+    scores : dict of str to Score
+        By rule.
+    """
+
+    drawn: Draw
+    scores: dict[str, Score]
+
+
+def rules(scenario: Scenario, detection: float, false: float) -> tuple[Rule, ...]:
+    """Return the rules that are compared."""
+    known = Clutter(detection, false / (2.0 * baseline(scenario)))
+    return (
+        Rule("nearest, missed := predicted (paper)", nearest(), "expect"),
+        Rule("nearest, missed row dropped", nearest()),
+        Rule("whole sets, each target alone", joint(known)),
+        Rule("whole sets, one to one", assigned(known)),
+    )
+
+
+def association(
+    scenario: Scenario, order: int, trials: int, key: tuple[int, ...], detection: float = 0.7, false: float = 2.0
+) -> Association:
+    """Return the errors of every rule on the same unlabelled rows.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        The scene.
+    order : 0 or 1
+        Motion of the targets and model of the filter.
+    trials : int
+        Independent trials, three targets each.
+    key : tuple of int
+        Decides the draw.
+    detection, false : float
+        Probability that a row is seen; mean number of false rows of a channel and epoch.
+    """
+    drawn = draw(scenario, scenario.course(order), trials, (*key, 0))
+    given = unlabelled(drawn, detection, false, (*key, 1))
+    scores = {}
+    for rule in rules(scenario, detection, false):
+        found = associated(given, started(drawn, order), polynomial(order), rule.associate, "ekf", missing=rule.missing)
+        scores[rule.name] = scored(drawn, found.track)
+    return Association(drawn, scores)
+
+
+# What the equations do as they are printed.
+
+
+def twice_predicted(dynamics: Dynamics, interval: float, dimension: int) -> Update:
+    """Return the update of equations 28 to 31 as printed: the transition is applied once more within H.
+
+    Parameters
+    ----------
+    dynamics : Dynamics
+        Model of motion.
+    interval : float
+        Seconds between epochs.
+    dimension : int
+        2 or 3.
+    """
+    n = (dynamics.order + 1) * dimension
+    F = dynamics.step(interval, np.zeros(n), dimension)[0]
+
+    def update(scan: Problem, mean: Array, cov: Array) -> Updated:
+        white = whitened(scan, mean)
+        H = white.H @ F
+        S = H @ cov @ np.swapaxes(H, -1, -2) + np.eye(H.shape[-2])
+        gain = np.swapaxes(linalg.solve(S, H @ cov)[0], -1, -2)
+        solved = linalg.solve(S, white.residual[..., None])[0][..., 0]
+        nis = (white.residual * solved).sum(-1)
+        lower, _ = linalg.factor(S)
+        logdet = white.logdet + 2.0 * np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(-1)
+        moved = mean + (gain @ white.residual[..., None])[..., 0]
+        return Updated(moved, joseph(H, gain, cov), nis, -0.5 * (nis + logdet), white.count)
+
+    return update
+
+
+def taylor(problem: Problem, start: Array, *, sign: float = 1.0, steps: int = 50) -> Array:
+    """Return positions after undamped steps of the linearised fix, equations 5 to 8.
+
+    Parameters
+    ----------
+    problem : Problem
+        Batch (...) of single epochs.
+    start : array (..., d)
+        Starting positions, metres.
+    sign : float
+        1, or -1 for the residual with the sign that equations 8 and 15 print.
+    steps : int
+        Number of steps.
+
+    Returns
+    -------
+    array (..., d)
+        Not finite where the steps ran away.
+    """
+    x = np.broadcast_to(start, (*problem.batch_shape, start.shape[-1]))
+    with np.errstate(all="ignore"):
+        for _ in range(steps):
+            linear = linearise(problem, x)
+            move, ok = step(normal(replace(linear, residual=sign * linear.residual), 1), np.zeros(x.shape[:-1]))
+            x = x + np.where(ok[..., None], move, np.nan)
+    return x
+
+
+def weighting(problem: Problem, place: Array, covariance: Array) -> tuple[float, float]:
+    """Return root mean square errors of a fix with equal weights and with those of the covariance, to first order.
+
+    Parameters
+    ----------
+    problem : Problem
+        One epoch.
+    place : array (d,)
+        Target, metres.
+    covariance : array (m, m)
+        True covariance of the rows.
+    """
+    H = linearise(problem, place).shared
+    plain = np.linalg.solve(H.T @ H, H.T)
+    best = np.linalg.inv(H.T @ np.linalg.solve(covariance, H))
+    return float(np.sqrt(np.trace(plain @ covariance @ plain.T))), float(np.sqrt(np.trace(best)))
+
+
+# Location of moving targets by TDOA with static, uniform and accelerated models: section 3 of the paper.

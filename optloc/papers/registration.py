@@ -1,0 +1,627 @@
+"""Monte Carlo trials of a scene: the paper's recursion and the route without a guess on the same data."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from math import erfc, sqrt
+from typing import Literal
+
+import numpy as np
+
+from optloc.base import linalg
+from optloc.base.status import Status
+from optloc.base.types import Array, Motion, Stations
+from optloc.base.units import SPEED_OF_LIGHT
+from optloc.bounds.crlb import crlb, crlb_course
+from optloc.linear.evaluate import predict
+from optloc.linear.simulate import simulate
+from optloc.papers.report import Tick
+from optloc.problem.bias import with_bias
+from optloc.problem.build import assemble, measured
+from optloc.problem.fix import Fix
+from optloc.problem.noise import Block, Noise
+from optloc.problem.problem import Problem
+from optloc.solvers import solve
+
+# The scenes of the paper, as printed, and one more whose stations span space and never meet.
+
+SPEED = 3e8
+"""Speed of light of the paper, metres per second; with it 100 ns are exactly 30 m."""
+
+NANOSECOND = 1e-9 * SPEED
+
+Shape = Literal["full", "half", "diag"]
+
+# Variance of a row's own noise, and of what all rows of an epoch share, over sigma squared.
+_SHAPES: dict[Shape, tuple[float, float]] = {"full": (1.0, 1.0), "half": (0.5, 0.5), "diag": (1.0, 0.0)}
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """Stations that fly straight, one target, and the systematic errors of their channels.
+
+    The first station is the reference of every difference and ratio.
+
+    Parameters
+    ----------
+    position, velocity : array (s, 3)
+        Stations at t = 0, metres and metres per second.
+    target : array (3,)
+        Its place at t = 0, metres.
+    course : array (3,), optional
+        Its velocity, metres per second; None: it stays, and nothing but its place is unknown.
+    delays : array (s - 1,)
+        Biases of the range differences, metres.
+    gains : array (s - 1,)
+        Biases of the gain ratios.
+    sigma : float
+        Standard deviation of an arrival, metres.
+    interval : float
+        Seconds between epochs.
+    """
+
+    position: Array
+    velocity: Array
+    target: Array
+    course: Array | None = None
+    delays: Array = field(default_factory=lambda: np.array([30.0, -40.0, 50.0, -30.0]))
+    gains: Array = field(default_factory=lambda: np.array([0.3, -0.4, 0.5, -0.3]))
+    sigma: float = 3.0
+    interval: float = 1.0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Return the names of the stations: "1", "2" and so on."""
+        return tuple(str(i + 1) for i in range(len(self.position)))
+
+    def times(self, epochs: int) -> Array:
+        """Return the seconds (k,) of the first epochs."""
+        return self.interval * np.arange(epochs)
+
+    def track(self, epochs: int) -> Array:
+        """Return the positions (k, s, 3) of the stations, metres."""
+        return np.asarray(self.position + self.times(epochs)[:, None, None] * self.velocity)
+
+
+def _fleet(*rows: tuple[float, ...]) -> tuple[Array, Array]:
+    """Return positions and velocities of stations given in kilometres and metres per second."""
+    table = np.array(rows, dtype=float)
+    return 1e3 * table[:, :3], table[:, 3:]
+
+
+PRINTED = Scenario(
+    *_fleet(
+        (0, 0, 10, 0, 300, 0),
+        (-15, 0, 10, 0, 300, 0),
+        (15, 0, 10, 0, 300, 0),
+        (-5, 30, 0, 100, 300, 0),
+        (5, 30, 0, -100, 300, 0),
+    ),
+    target=np.array([200e3, 300e3, 0.0]),
+)
+"""Table 1 as printed: all stations lie in one plane at every epoch, and the fourth and fifth meet at 50 s."""
+
+MOVING = replace(PRINTED, target=np.array([200e3, 300e3, 5e3]), course=np.array([-100.0, 0.0, 0.0]))
+"""The same stations and the target of section 4.4, which flies straight."""
+
+SPATIAL = Scenario(
+    *_fleet(
+        (0, 0, 10, 0, 300, 0),
+        (-15, 0, 6, -20, 290, 0),
+        (15, 0, 9, 20, 290, 0),
+        (-8, 30, 3, -60, 300, 0),
+        (8, 30, 11, 60, 280, 0),
+    ),
+    target=np.array([200e3, 300e3, 0.0]),
+)
+"""Stations of like size and speed that span space at every epoch and keep their distance."""
+
+
+def problem(
+    scenario: Scenario,
+    epochs: int,
+    *,
+    sigma: float | None = None,
+    station_sigma: float = 1.0,
+    gain_sigma: float | None = None,
+    prior: float | None = None,
+    shape: Shape = "full",
+) -> Problem:
+    """Return the estimation problem of the first epochs of a scene, without measurements.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Stations and target.
+    epochs : int
+        Number of epochs K.
+    sigma : float, optional
+        Standard deviation of an arrival, metres; that of the scene by default.
+    station_sigma : float
+        Standard deviation of each coordinate of a station, drawn anew at each epoch, metres; 0 for exact stations.
+    gain_sigma : float, optional
+        Standard deviation of a gain ratio; None: time differences only.
+    prior : float, optional
+        Prior standard deviation of the biases of the range differences, metres; None: unknown.
+    shape : "full", "half" or "diag"
+        Covariance of the rows of one kind and epoch: sigma^2 times I + 11', its half, or I. The paper's text allows
+        all three, its numbers only the first.
+
+    Returns
+    -------
+    Problem
+        Unknowns: position, velocity where the target moves, "delay", and "gain" with gain ratios.
+    """
+    count, spread = len(scenario.position), scenario.sigma if sigma is None else sigma
+    a, epoch = np.tile(np.arange(1, count), epochs), np.repeat(np.arange(epochs), count - 1)
+    kinds = {"tdoa": spread} if gain_sigma is None else {"tdoa": spread, "groa": gain_sigma}
+    rows = [measured(kind, a=a, b=0, epoch=epoch, sigma=size) for kind, size in kinds.items()]
+    covariance = np.broadcast_to(station_sigma**2 * np.eye(3), (count, 3, 3)) if station_sigma else None
+    made = assemble(
+        Stations(scenario.track(epochs), scenario.names, covariance=covariance, span="noise"),
+        *rows,
+        times=scenario.times(epochs),
+        motions=[Motion(order=0 if scenario.course is None else 1)],
+    )
+    own, common = _SHAPES[shape]
+    unit = own * np.eye(count - 1) + common
+    members = np.arange(made.count).reshape(-1, count - 1)
+    blocks = [
+        Block(part, size**2 * unit[None])
+        for part, size in zip(np.split(members, len(kinds)), kinds.values(), strict=True)
+    ]
+    made = with_bias(replace(made, noise=Noise(tuple(blocks))), "delay", per="pair", kind="tdoa", sigma=prior)
+    return made if gain_sigma is None else with_bias(made, "gain", per="pair", kind="groa")
+
+
+def truth(scenario: Scenario, problem: Problem) -> Array:
+    """Return the true parameter vector (size,) of a problem of a scene."""
+    values = {
+        "position": scenario.target,
+        "velocity": scenario.course,
+        "delay": scenario.delays,
+        "gain": scenario.gains,
+    }
+    return np.concatenate([np.asarray(values[slot.name], dtype=float) for slot in problem.layout.shared])
+
+
+# The algorithm of the paper as printed: two undamped steps over all past data at every new epoch.
+#
+# It starts from a given place at the fortieth epoch and never looks for another minimum: a baseline.
+
+FIRST = 40
+"""Epochs that are collected before the first estimate."""
+
+_BLOCK = 8  # trials whose arrays fit the cache together
+
+
+def recursion(scenario: Scenario, z: Array, start: Array, *, first: int = FIRST, iterations: int = 2) -> Array:
+    """Return the estimates of the paper's recursion after every epoch.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Stations.
+    z : array (trials, k, s - 1)
+        Range differences against the first station, metres.
+    start : array (trials, n)
+        Position, or position and velocity at time zero, from which the first estimate is made.
+    first : int
+        Epochs of the first estimate.
+    iterations : int
+        Steps at each epoch.
+
+    Returns
+    -------
+    array (trials, k - first + 1, n + s - 1)
+        State and biases after `first`, `first + 1` ... epochs; NaN from where the steps ran away.
+    """
+    trials, epochs = z.shape[:2]
+    out = np.empty((trials, epochs - first + 1, start.shape[-1] + z.shape[-1]))
+    arrivals = np.zeros((trials, z.shape[-1] + 1, epochs))
+    arrivals[:, 1:] = z.swapaxes(1, 2)
+    track, times = np.ascontiguousarray(scenario.track(epochs).T), scenario.times(epochs)
+    with np.errstate(all="ignore"):
+        for low in range(0, trials, _BLOCK):
+            part = slice(low, low + _BLOCK)
+            state = start[part]
+            for k in range(first, epochs + 1):
+                for _ in range(iterations):
+                    move, bias = step(state, arrivals[part, :, :k], track[..., :k], times[:k])
+                    state = state + move
+                out[part, k - first] = np.concatenate([state, bias], axis=-1)
+    return out
+
+
+def step(state: Array, arrivals: Array, track: Array, times: Array) -> tuple[Array, Array]:
+    """Return one Gauss-Newton step (trials, n) of the state and the biases (trials, s - 1) that go with it.
+
+    The sums of eq. 11 and 12 over the epochs. The inverse of R, proportional to I + 11', takes the mean of each epoch
+    out of the arrivals, and eliminating the unknown biases takes the mean of the run out of each channel: what is left
+    are outer products.
+
+    Parameters
+    ----------
+    state : array (trials, n)
+        Position, or position and velocity at time zero.
+    arrivals : array (trials, s, k)
+        Range differences against the first station, whose own are zero.
+    track : array (3, s, k)
+        Stations.
+    times : array (k,)
+        Seconds.
+    """
+    trials, n = state.shape
+    target = state[:, :3, None, None]
+    if n > 3:
+        target = target + state[:, 3:, None, None] * times
+    slope = target - track
+    distance = np.sqrt(np.einsum("tcsk,tcsk->tsk", slope, slope))
+    slope /= distance[:, None]
+    misfit = arrivals - distance
+    misfit -= misfit.mean(1, keepdims=True)
+    slope -= slope.mean(2, keepdims=True)
+    if n > 3:
+        slope = np.concatenate([slope, slope * times], axis=1)
+    rows, mean, left = slope.reshape(trials, n, -1), slope.mean(3), misfit.mean(2)
+    information = rows @ rows.swapaxes(1, 2) - len(times) * (mean @ mean.swapaxes(1, 2))
+    vector = rows @ misfit.reshape(trials, -1, 1) - len(times) * (mean @ left[..., None])
+    solved, ok = linalg.solve(information, vector)
+    move = np.where(ok[:, None], solved[..., 0], np.nan)
+    left = left - (move[:, None] @ mean)[:, 0]
+    return move, left[:, 1:] - left[:, :1]
+
+
+FAR = 10.0
+"""An estimate further from the truth than this many bounds is lost."""
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """What is drawn.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Stations and target.
+    trials : int
+        Independent draws.
+    seed : int
+        Seed of the whole reproduction.
+    key : int
+        Number of this draw within it.
+    sigma, station_sigma, gain_sigma : float, optional
+        As `problem` takes them.
+    """
+
+    scenario: Scenario
+    trials: int
+    seed: int
+    key: int
+    sigma: float | None = None
+    station_sigma: float = 1.0
+    gain_sigma: float | None = None
+
+    def problem(self, epochs: int) -> Problem:
+        """Return the problem of the first epochs, without measurements."""
+        return problem(
+            self.scenario,
+            epochs,
+            sigma=self.sigma,
+            station_sigma=self.station_sigma,
+            gain_sigma=self.gain_sigma,
+        )
+
+    def draw(self, epochs: int) -> Problem:
+        """Return all trials, measured."""
+        made = self.problem(epochs)
+        return simulate(made, truth(self.scenario, made), self._sequence(0), self.trials)
+
+    def first(self, drawn: Problem, epochs: int) -> Problem:
+        """Return the first epochs of what was drawn."""
+        return self.problem(epochs).with_rows(z=drawn.z[..., drawn.epoch < epochs])
+
+    def bound(self, epochs: int) -> Array:
+        """Return the Cramer-Rao bound of the shared unknowns (n, n) after some epochs."""
+        return np.asarray(self.bounds((epochs,))[0])
+
+    def bounds(self, epochs: Sequence[int] | Array) -> Array:
+        """Return the bounds (t, n, n) after several numbers of epochs."""
+        made = self.problem(max(epochs))
+        return crlb_course(made, truth(self.scenario, made), epochs).covariance
+
+    def starts(self, width: float) -> Array:
+        """Return Gaussian starts (trials, n) around the truth, `width` one-shot standard deviations wide.
+
+        The velocity of a moving target is wrong by `width` times 10 m/s in each coordinate.
+        """
+        scene = self.scenario
+        rng = np.random.default_rng(self._sequence(1))
+        spread, centre = one_shot(scene, sigma=self.sigma), scene.target
+        if scene.course is not None:
+            spread, centre = np.concatenate([spread, np.full(3, 10.0)]), np.concatenate([centre, scene.course])
+        return np.asarray(centre + width * spread * rng.standard_normal((self.trials, len(centre))))
+
+    def _sequence(self, purpose: int) -> np.random.SeedSequence:
+        return np.random.SeedSequence(self.seed, spawn_key=(self.key, purpose))
+
+
+def one_shot(scenario: Scenario = PRINTED, *, sigma: float | None = None, shape: Shape = "full") -> Array:
+    """Return the paper's sigma0, metres: the bound of each coordinate (3,) from the first epoch with known biases."""
+    still = replace(scenario, course=None)
+    made = problem(still, 1, sigma=sigma, prior=1e-6, shape=shape)
+    return np.asarray(np.sqrt(np.diagonal(crlb(made, truth(still, made)))[:3]))
+
+
+def rms(bound: Array) -> float:
+    """Return the root mean square of the length of a position error with a covariance (n, n)."""
+    return float(np.sqrt(np.trace(bound[:3, :3])))
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """Estimates of one kind of all trials, against the truth.
+
+    Parameters
+    ----------
+    error : array (trials, n)
+        Estimate less truth, SI units; not finite where there is none.
+    lost : bool array (trials,)
+        Estimates without sense: not finite, or further away than `FAR` bounds.
+    """
+
+    error: Array
+    lost: Array
+
+    @property
+    def rmse(self) -> float:
+        """Return the root mean square position error of the trials that are not lost, metres."""
+        kept = self.error[~self.lost, :3]
+        return float(np.sqrt((kept**2).sum(-1).mean())) if len(kept) else float("nan")
+
+    @property
+    def share(self) -> float:
+        """Return the share of lost trials."""
+        return float(self.lost.mean())
+
+
+def score(estimate: Array, exact: Array, bound: Array) -> Score:
+    """Return the score of estimates (trials, n) of a truth (n,) with a bound (n, n)."""
+    error = estimate - exact
+    with np.errstate(invalid="ignore", over="ignore"):
+        far = ~((error[:, :3] ** 2).sum(-1) < (FAR * rms(bound)) ** 2)
+    return Score(error, far | ~np.isfinite(error).all(-1))
+
+
+def branch(fix: Fix, exact: Array) -> Array:
+    """Return of every fix and its alternatives the vector (trials, n) nearest to a truth in position.
+
+    For a target that moves straight two mirror images explain the data exactly; both are listed.
+    """
+    pool = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
+    with np.errstate(invalid="ignore"):
+        apart = ((pool[..., :3] - exact[:3]) ** 2).sum(-1)
+    best = np.argmin(np.where(np.isfinite(apart), apart, np.inf), axis=1)
+    return np.asarray(pool[np.arange(len(pool)), best])
+
+
+@dataclass(frozen=True, slots=True)
+class History:
+    """Scores after growing numbers of epochs.
+
+    Parameters
+    ----------
+    setting : Setting
+        What was drawn.
+    epochs : tuple of int
+        Numbers of epochs.
+    bounds : array (t, n, n)
+        Cramer-Rao bound at each.
+    plain : tuple of Score, or None
+        The paper's recursion on the range differences.
+    found : tuple of Score
+        The fix without a guess.
+    ambiguous : tuple of float
+        Share of fixes that say that the data allow another place.
+    silent : tuple of float
+        Share of fixes that are lost and say ok.
+    """
+
+    setting: Setting
+    epochs: tuple[int, ...]
+    bounds: Array
+    plain: tuple[Score, ...] | None
+    found: tuple[Score, ...]
+    ambiguous: tuple[float, ...]
+    silent: tuple[float, ...]
+
+
+def run_history(
+    setting: Setting, epochs: Sequence[int], tick: Tick, *, plain: bool = True, first: int = FIRST
+) -> History:
+    """Return the scores of both routes on the same data.
+
+    Parameters
+    ----------
+    setting : Setting
+        What is drawn.
+    epochs : sequence of int
+        Numbers of epochs to look at.
+    tick : callable
+        Called after each of them, and after the recursion.
+    plain : bool
+        Whether the recursion runs as well.
+    first : int
+        Epochs of its first estimate.
+    """
+    drawn = setting.draw(max(epochs))
+    bounds = setting.bounds(epochs)
+    exact = truth(setting.scenario, drawn)
+    wandered = None
+    if plain:
+        wandered = wander(setting, drawn, epochs, bounds, first=first)
+        tick()
+    found, ambiguous, silent = [], [], []
+    for k, bound in zip(epochs, bounds, strict=True):
+        fix = solve(setting.first(drawn, k))
+        found.append(score(fix.x if setting.scenario.course is None else branch(fix, exact), exact, bound))
+        ambiguous.append(float((fix.code == Status.AMBIGUOUS).mean()))
+        silent.append(float((found[-1].lost & (fix.code == Status.OK)).mean()))
+        tick()
+    return History(setting, tuple(epochs), bounds, wandered, tuple(found), tuple(ambiguous), tuple(silent))
+
+
+def wander(
+    setting: Setting,
+    drawn: Problem,
+    epochs: Sequence[int],
+    bounds: Sequence[Array] | Array,
+    *,
+    width: float = 1.0,
+    first: int = FIRST,
+) -> tuple[Score, ...]:
+    """Return the scores of the paper's recursion after some numbers of epochs; arguments as `course`.
+
+    Parameters
+    ----------
+    width : float
+        Width of the starts in one-shot standard deviations.
+    """
+    scene = setting.scenario
+    z = drawn.rows[0].z.reshape(setting.trials, drawn.epochs, -1)
+    estimates = recursion(scene, z[:, : max(epochs)], setting.starts(width), first=first)
+    exact = truth(scene, drawn)[: estimates.shape[-1]]
+    return tuple(score(estimates[:, k - first], exact, bound) for k, bound in zip(epochs, bounds, strict=True))
+
+
+# The second minimum of a flat array: the target's image in the plane of the stations.
+
+_SAME = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Ghost:
+    """Another minimum of the cost of noise-free measurements.
+
+    Parameters
+    ----------
+    x : array (n,)
+        Its parameter vector.
+    gap : float
+        Its cost: a weighted sum of squares, zero at the truth.
+    """
+
+    x: Array
+    gap: float
+
+    @property
+    def doubt(self) -> float:
+        """Return the probability that noise makes it cheaper than the truth."""
+        return 0.5 * erfc(sqrt(self.gap) / 2.0 / sqrt(2.0))
+
+
+def mirror(scenario: Scenario) -> tuple[Array, Array]:
+    """Return place at t = 0 and velocity, (3,) each, of the target's image in the plane of the stations.
+
+    The plane is the one that fits the stations best at t = 0, and moves with their mean velocity.
+    """
+    centre = scenario.position.mean(0)
+    normal = np.linalg.svd(scenario.position - centre)[2][-1]
+    course = np.zeros(3) if scenario.course is None else scenario.course
+    drift = scenario.velocity.mean(0)
+    place = scenario.target - 2.0 * ((scenario.target - centre) @ normal) * normal
+    return place, course - 2.0 * ((course - drift) @ normal) * normal
+
+
+def ghost(scenario: Scenario, epochs: int, *, sigma: float | None = None, station_sigma: float = 1.0) -> Ghost | None:
+    """Return the minimum to which the mirror image of the target leads, or None where that is the truth.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        Stations and target.
+    epochs : int
+        Number of epochs.
+    sigma, station_sigma : float
+        As `problem` takes them.
+    """
+    made = problem(scenario, epochs, sigma=sigma, station_sigma=station_sigma)
+    exact = truth(scenario, made)
+    place, velocity = mirror(scenario)
+    if scenario.course is None:
+        state = place + 0.5 * scenario.times(epochs)[-1] * velocity
+    else:
+        state = np.concatenate([place, velocity])
+    start = np.concatenate([state, exact[len(state) :]])
+    fix = solve(made.with_rows(z=predict(made, exact)), "lsr", start=start)
+    if np.linalg.norm(fix.x[:3] - exact[:3]) < _SAME:
+        return None
+    return Ghost(fix.x, float(fix.cost))
+
+
+# The problem file ``registration.toml`` that is shipped with optloc: stations that span space, ten minutes.
+
+NAMES = ("R1", "R2", "R3", "R4", "R5")
+DELAYS = (100.0, -133.0, 167.0, -100.0)
+"""Nanoseconds by which the clocks of R2 to R5 are late."""
+
+_EPOCHS, _INTERVAL, _SEED = 200, 3.0, 20170502
+_ARRIVAL, _STATION = 10.0, 1.0  # ns, m
+
+_PROBLEM = """\
+# Five aircraft time an emitter 360 km away for ten minutes, each by a clock of its own. The emitter stands at 200 km,
+# 300 km, 0; the clocks of R2 to R5 are 100, -133, 167 and -100 ns late against that of R1.
+format = 1
+title = "Five aircraft, one emitter, four clock errors"
+
+[stations]
+file = "registration-stations.csv"   # where each aircraft is at the first and at the last second
+sigma = "1 m"                        # of each coordinate of its position
+span = "noise"                       # drawn anew at every epoch
+
+[[measurements]]
+kind = "tdoa"
+file = "registration-rows.csv"
+unit = "ns"
+b = "R1"
+arrival_sigma = 10.0
+
+[target]
+motion = "static"
+
+[[biases]]
+name = "clock"
+members = ["R2", "R3", "R4", "R5"]   # against that of R1
+"""
+
+
+def files() -> Mapping[str, str]:
+    """Return the texts of the problem file and its tables, by name.
+
+    The measurements are drawn here from arrivals at displaced stations, apart from `optloc.simulate`.
+    """
+    rng = np.random.default_rng(_SEED)
+    times = _INTERVAL * np.arange(_EPOCHS)
+    track = SPATIAL.position + times[:, None, None] * SPATIAL.velocity
+    true = track + _STATION * rng.standard_normal(track.shape)
+    arrival = 1e9 / SPEED_OF_LIGHT * np.sqrt(((SPATIAL.target - true) ** 2).sum(-1))
+    arrival += _ARRIVAL * rng.standard_normal(arrival.shape) + np.array([0.0, *DELAYS])
+    rows = [
+        f"{t:.0f},{name},{value:.1f}"
+        for t, late in zip(times, arrival - arrival[:, :1], strict=True)
+        for name, value in zip(NAMES[1:], late[1:], strict=True)
+    ]
+    ends = [
+        f"{name},{times[k]:.0f},{x:.0f},{y:.0f},{z:.0f}"
+        for k in (0, -1)
+        for name, (x, y, z) in zip(NAMES, track[k], strict=True)
+    ]
+    return {
+        "registration.toml": _PROBLEM,
+        "registration-stations.csv": "\n".join(["name,time,x,y,z", *ends]) + "\n",
+        "registration-rows.csv": "\n".join(["time,a,z", *rows]) + "\n",
+    }
+
+
+# Error registration of several moving stations by time differences and gain ratios: section 4 of the paper.

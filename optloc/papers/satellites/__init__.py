@@ -1,1 +1,0 @@
-"""Tracking of ships by the time differences of three satellites and a known height: four Kalman filters."""

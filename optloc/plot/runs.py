@@ -1,0 +1,223 @@
+"""Errors of methods against the Cramer-Rao bound, over noise."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array
+from optloc.bounds.crlb import Course
+from optloc.plot.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, YELLOW, figure_class, grid
+from optloc.problem.layout import Slot
+from optloc.solvers.running import Growing
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+_LOOKS = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "D"), (PURPLE, "^"), (SKY, "v"), (YELLOW, "P"))
+
+
+def plot_accuracy(
+    noise: Array, errors: Mapping[str, Array], bound: Array, title: str = "", *, unit: str = "m", what: str = "position"
+) -> Figure:
+    """Return a picture of root mean square errors and the Cramer-Rao bound against noise, both axes logarithmic.
+
+    Parameters
+    ----------
+    noise : array (q,)
+        Standard deviations of a row, or factors on those of a problem where `unit` is empty.
+    errors : mapping of str to array (q,)
+        Root mean square error of each method, metres; NaN where it has none.
+    bound : array (q,)
+        Root of the trace of the bound, metres.
+    title : str
+        Title of the picture.
+    unit : str
+        Of the noise.
+    what : str
+        Of what the errors are.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        To be written with `optloc.plot.save`.
+
+    Raises
+    ------
+    InvalidProblem
+        Where numbers of points differ, or a noise is not positive.
+    """
+    noise, bound = np.asarray(noise, dtype=float), np.asarray(bound, dtype=float)
+    for name, values in {"the bound": bound, **errors}.items():
+        if np.shape(values) != noise.shape:
+            raise InvalidProblem(
+                f"{name} has {np.size(values)} values for {noise.size} noises", "plot", "give one each"
+            )
+    if not (noise > 0.0).all():
+        raise InvalidProblem("a noise is not positive", "noise", "leave it out: the axis is logarithmic")
+    figure = figure_class()(figsize=(6.2, 4.4), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(noise, bound, color=BLACK, linewidth=4.0, alpha=0.3, label="Cramer-Rao bound", zorder=2)
+    for i, (name, values) in enumerate(errors.items()):
+        colour, mark = _LOOKS[i % len(_LOOKS)]
+        axes.plot(noise, values, color=colour, marker=mark, markersize=5, linewidth=1.3, label=name, zorder=3)
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    axes.set_xlabel(f"standard deviation of a row ({unit})" if unit else "factor on the noise")
+    axes.set_ylabel(f"root mean square error of the {what} (m)")
+    axes.legend(frameon=False, fontsize=9)
+    grid(axes)
+    if title:
+        axes.set_title(title, fontsize=11)
+    return figure
+
+
+# The Cramer-Rao bound against time.
+
+_COURSE_COLOURS = (ORANGE, GREEN, PURPLE, SKY, YELLOW, GREY, BLACK)
+_MANY = 10
+_WORDS = {"position": ("position", "m"), "velocity": ("velocity", "m/s"), "acceleration": ("acceleration", "m/s²")}
+
+
+def plot_course(
+    course: Course, known: Course | None = None, title: str = "", names: Sequence[str] | None = None
+) -> Figure:
+    """Return a picture of the bound against time, one panel for each state of a target and each family of biases.
+
+    Parameters
+    ----------
+    course : Course
+        The bound of everything that is unknown.
+    known : Course, optional
+        The same with biases known, drawn dashed.
+    title : str
+        Title of the picture.
+    names : sequence of str, optional
+        Names of the unknowns that are drawn; all by default.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        To be written with `optloc.plot.save`.
+    """
+    slots = [slot for slot in course.layout.shared if names is None or slot.name in names]
+    columns = min(len(slots), 3)
+    rows = -(-len(slots) // columns)
+    figure = figure_class()(figsize=(0.6 + 4.8 * columns, 0.4 + 4.2 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for panel, slot in zip(panels, slots, strict=False):
+        _course_panel(panel, course, known, slot)
+    for panel in panels[len(slots) :]:
+        panel.set_axis_off()
+    if title:
+        figure.suptitle(title)
+    return figure
+
+
+def _course_panel(panel: Axes, course: Course, known: Course | None, slot: Slot) -> None:
+    word, unit = _WORDS.get(slot.name.partition("[")[0], (slot.name, slot.unit))
+    sigma, entries = course.sigma(slot.name), slot.entries
+    if slot.members and slot.size > _MANY:
+        entries, sigma = ("root mean square",), course.total(slot.name)[:, None] / np.sqrt(slot.size)
+    for entry, values, colour in zip(entries, sigma.T, _COURSE_COLOURS * 2, strict=False):
+        label = f"{word} {entry}".strip() if slot.members else f"along {entry}"
+        panel.plot(course.times, values, color=colour, linewidth=1.8 if slot.members else 1.0, label=label, zorder=3)
+    if not slot.members:
+        panel.plot(course.times, course.total(slot.name), color=BLUE, linewidth=3.5, label=f"in {_SPACE[slot.size]}")
+        if known is not None:
+            total = known.total(slot.name)
+            panel.plot(known.times, total, color=BLUE, linewidth=1.6, linestyle="--", label="the same, biases known")
+    panel.set_yscale("log")
+    panel.set_xlabel("time (s)")
+    panel.set_ylabel(f"bound of the standard deviation ({unit})")
+    panel.set_title(slot.name)
+    panel.grid(which="both", color=GREY, alpha=0.3, linewidth=0.6)
+    panel.legend(frameon=False, fontsize=8)
+
+
+_SPACE = {2: "the plane", 3: "space"}
+
+
+# Estimates of a run against time, with their intervals: biases, and whatever else its epochs share.
+
+_BIAS_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, YELLOW)
+_DASHES = ("-", "--", "-.", ":")
+_MOST = 6
+_95 = 1.959963984540054
+
+
+def plot_biases(
+    found: Growing, title: str = "", *, names: Sequence[str] | None = None, truth: Mapping[str, Array] | None = None
+) -> Figure:
+    """Return a picture of estimates against the length of a run, with 95 % intervals, one panel for each family.
+
+    Parameters
+    ----------
+    found : Growing
+        Estimates after the first epochs, of `optloc.solvers.running.growing`.
+    title : str
+        Title of the picture.
+    names : sequence of str, optional
+        What is drawn; all families of biases by default.
+    truth : mapping of str to array, optional
+        True values by name, drawn dotted.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        To be written with `optloc.plot.save`.
+
+    Raises
+    ------
+    InvalidProblem
+        Where there is nothing to draw.
+    """
+    slots = [slot for slot in found.layout.shared if (bool(slot.members) if names is None else slot.name in names)]
+    if not slots:
+        advice = f"choose from {', '.join(slot.name for slot in found.layout.shared)}"
+        raise InvalidProblem("the run has no biases to draw", "names", advice)
+    columns = min(len(slots), 2)
+    rows = -(-len(slots) // columns)
+    figure = figure_class()(figsize=(0.8 + 5.4 * columns, 0.4 + 4.0 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel()
+    for panel, slot in zip(panels, slots, strict=False):
+        _bias_panel(panel, found, slot, None if truth is None else truth.get(slot.name))
+    for panel in panels[len(slots) :]:
+        panel.set_axis_off()
+    if title:
+        figure.suptitle(title)
+    return figure
+
+
+def _bias_panel(panel: Axes, found: Growing, slot: Slot, truth: Array | None) -> None:
+    values, sigma = found.take(slot.name)
+    for i, entry in enumerate(slot.entries[:_MOST]):
+        colour, band = _BIAS_COLOURS[i % len(_BIAS_COLOURS)], _95 * sigma[:, i]
+        style: dict[str, Any] = {"color": colour, "linewidth": 1.5, "linestyle": _DASHES[i % len(_DASHES)]}
+        panel.plot(found.times, values[:, i], label=str(entry), zorder=3, **style)
+        panel.fill_between(
+            found.times, values[:, i] - band, values[:, i] + band, color=colour, alpha=0.18, linewidth=0.0
+        )
+        if truth is not None:
+            panel.axhline(np.ravel(truth)[i], color=BLACK, linewidth=1.0, linestyle=":", zorder=2)
+    _window(panel, values[:, :_MOST], sigma[:, :_MOST])
+    hidden = len(slot.entries) - _MOST
+    panel.set_title(slot.name + (f" (first {_MOST} of {len(slot.entries)})" if hidden > 0 else ""))
+    panel.set_xlabel("time (s)")
+    panel.set_ylabel(f"estimate and 95 % ({slot.unit})" if slot.unit else "estimate and 95 %")
+    panel.legend(frameon=False, fontsize=8, ncols=2)
+    grid(panel)
+
+
+def _window(panel: Axes, values: Array, sigma: Array) -> None:
+    """Limit the vertical axis to the last estimates and what their intervals were half way."""
+    known = np.flatnonzero(np.isfinite(values).all(-1))
+    if not len(known):
+        return
+    last, rim = values[known[-1]], 8.0 * np.nanmax(sigma[known[len(known) // 2]])
+    panel.set_ylim(float(last.min() - rim), float(last.max() + rim))

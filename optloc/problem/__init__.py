@@ -1,0 +1,1 @@
+"""One estimation problem and its answer as values."""

@@ -1,0 +1,319 @@
+"""Families of systematic errors by name: one for each station, group of stations, pair or kind."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Literal
+
+import numpy as np
+
+from optloc.base.arrays import numbers
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.types import Array, Bias, Rows
+from optloc.models import MODELS
+from optloc.models.primitives import rotate
+from optloc.problem.check import check_unknowns
+from optloc.problem.problem import Problem
+
+Form = Literal["offset", "scale", "drift", "rotation"]
+Per = Literal["station", "pair", "kind"]
+Members = Sequence[str] | Mapping[str, Sequence[str]] | None
+_Touch = tuple[Array, Array, Array]
+_TAKEN = ("position", "velocity", "acceleration", "emission", "stations")
+
+
+def with_bias(
+    problem: Problem,
+    name: str,
+    *,
+    per: Per = "station",
+    form: Form = "offset",
+    kind: str | None = None,
+    members: Members = None,
+    mean: Any = 0.0,
+    sigma: Any = None,
+) -> Problem:
+    """Return the problem with one more family of unknown systematic errors.
+
+    Parameters
+    ----------
+    problem : Problem
+        A problem; its earlier biases stay.
+    name : str
+        Name of the family, for instance "clock".
+    per : "station", "pair" or "kind"
+        Who has an error of its own: a station, entering with the sign of its arrival; a pair of stations; or all rows
+        of a kind together.
+    form : "offset", "scale", "drift" or "rotation"
+        Added to the measurement; times the measured quantity; times the seconds since the first epoch; or a turn of
+        the station's axes.
+    kind : str, optional
+        Kind of the rows that are touched; all by default, for a rotation all that are measured in axes of stations.
+    members : sequence of str, or mapping of str to sequence of str, optional
+        Stations (or pairs, "A-B") that have one, all that measure by default; or groups of stations that share one, by
+        the name of the group. Of differences alone, leave out the reference: what all stations share has no effect.
+    mean : float or array (q,) or (q, 3)
+        Prior mean of each member in the unit of the measurements, 1 for a scale, unit per second for a drift, radians
+        for a rotation (three angles in space).
+    sigma : float or array like `mean`, optional
+        Prior standard deviation; None: unknown.
+
+    Raises
+    ------
+    InvalidProblem
+        Naming the bias and what is wrong: a name that is taken, an unknown kind or member, a member that touches no
+        row, rows of several quantities, a rotation of rows without axes, a prior that does not fit.
+    """
+    where = f"bias {name!r}"
+    bias = family(problem.rows, problem.stations.names, name, per=per, form=form, kind=kind, members=members)
+    shape = (len(bias.members), *((3,) if form == "rotation" and problem.dimension == 3 else ()))
+    centre = _each(0.0 if mean is None else mean, shape, where, "mean")
+    spread = None if sigma is None else _each(sigma, shape, where, "sigma")
+    made = replace(problem, biases=(*problem.biases, replace(bias, mean=centre, sigma=spread)))
+    check_unknowns(made)
+    return made
+
+
+def family(
+    rows: Sequence[Rows],
+    stations: Sequence[str],
+    name: str,
+    *,
+    per: Per = "station",
+    form: Form = "offset",
+    kind: str | None = None,
+    members: Members = None,
+    where: str | None = None,
+) -> Bias:
+    """Return a bias without prior over the rows of a problem; arguments as `with_bias`.
+
+    Parameters
+    ----------
+    rows : sequence of Rows
+        All rows of the problem.
+    stations : sequence of str
+        Names of the stations.
+    where : str, optional
+        Place that complaints name; the bias by default.
+    """
+    where = where or f"bias {name!r}"
+    if not name or name.partition("[")[0] in _TAKEN:
+        advice = f"other unknowns are called {', '.join(_TAKEN)}"
+        raise InvalidProblem(f"the name {name!r} is taken" if name else "the name is empty", where, advice)
+    for value, known, what in (
+        (per, ("station", "pair", "kind"), "per"),
+        (form, ("offset", "scale", "drift", "rotation"), "form"),
+    ):
+        if value not in known:
+            raise InvalidProblem(f"unknown {what} {value!r}", where, nearest(str(value), known))
+    touched = _touched(rows, form, kind, where)
+    if per == "kind":
+        if members is not None:
+            raise InvalidProblem("a kind has no members", where, "leave members out, or use per = 'station'")
+        names, touches = tuple(block.kind for block, _ in touched), _by_kind(touched)
+    elif per == "pair":
+        names, touches = _by_pair(touched, stations, members, where)
+    else:
+        names, touches = _by_station(touched, form, stations, members, where)
+    row, member, coefficient = (np.concatenate(parts) for parts in zip(*touches, strict=True))
+    idle = sorted(set(range(len(names))) - set(member.tolist()))
+    if idle:
+        raise InvalidProblem(f"{names[idle[0]]} touches no row", f"{where}, members", "leave it out")
+    return Bias(name, names, row, member, coefficient, form, np.zeros(1))
+
+
+def _touched(rows: Sequence[Rows], form: Form, kind: str | None, where: str) -> list[tuple[Rows, int]]:
+    """Return the blocks of rows that a bias may touch, each with the global number of its first row."""
+    starts = np.cumsum([0, *(block.count for block in rows)]).tolist()
+    kinds = [block.kind for block in rows]
+    if kind is not None and kind not in kinds:
+        raise InvalidProblem(f"there are no rows of kind {kind!r}", f"{where}, kind", nearest(kind, kinds))
+    chosen = [
+        (block, start)
+        for block, start in zip(rows, starts, strict=False)
+        if kind == block.kind or (kind is None and (form != "rotation" or MODELS[block.kind].axes))
+    ]
+    if not chosen:
+        raise InvalidProblem("no rows depend on the axes of stations", where, "leave the bias out")
+    if form == "rotation" and not MODELS[chosen[0][0].kind].axes:
+        raise InvalidProblem(f"{kind} has no axes that could be turned", where, "use the form offset")
+    if len({MODELS[block.kind].quantity for block, _ in chosen}) > 1:
+        raise InvalidProblem("the rows measure different quantities", where, "name the kind that it touches")
+    return chosen
+
+
+def _touch(row: Array, member: Array, sign: float) -> _Touch:
+    """Return row, member and coefficient where there is a member."""
+    inside = member >= 0
+    return row[inside], member[inside], np.full(int(inside.sum()), sign)
+
+
+def _by_kind(touched: list[tuple[Rows, int]]) -> list[_Touch]:
+    return [
+        _touch(start + np.arange(block.count), np.full(block.count, i), 1.0) for i, (block, start) in enumerate(touched)
+    ]
+
+
+def _by_pair(
+    touched: list[tuple[Rows, int]], stations: Sequence[str], members: Members, where: str
+) -> tuple[tuple[str, ...], list[_Touch]]:
+    named = (*stations, "")  # index -1, no station, is the last
+    codes = [block.a * len(named) + block.b % len(named) for block, _ in touched]
+    found = np.unique(np.concatenate(codes))
+    present = tuple("-".join(filter(None, (named[i // len(named)], named[i % len(named)]))) for i in found.tolist())
+    if isinstance(members, Mapping):
+        raise InvalidProblem("pairs have no groups", f"{where}, members", "give names such as 'A-B'")
+    names = present if members is None else _listed(members, present, "pair", where)
+    place = np.array([names.index(label) if label in names else -1 for label in present])
+    return names, [
+        _touch(start + np.arange(block.count), place[np.searchsorted(found, code)], 1.0)
+        for (block, start), code in zip(touched, codes, strict=True)
+    ]
+
+
+def _by_station(
+    touched: list[tuple[Rows, int]], form: Form, stations: Sequence[str], members: Members, where: str
+) -> tuple[tuple[str, ...], list[_Touch]]:
+    measuring = np.unique(np.concatenate([index for block, _ in touched for index in (block.a, block.b)]))
+    if isinstance(members, Mapping):
+        owner = dict(_owners(members, stations, where))
+        names = tuple(members)
+    else:
+        used = [stations[i] for i in measuring.tolist() if i >= 0]
+        names = tuple(used) if members is None else _listed(members, stations, "station", where)
+        owner = {name: i for i, name in enumerate(names)}
+    place = np.array([*(owner.get(name, -1) for name in stations), -1])  # index -1, no station, is the last
+    return names, [
+        _touch(start + np.arange(block.count), place[index], float(sign))
+        for block, start in touched
+        for index, sign in zip((block.a, block.b), _signs(block.kind, form), strict=True)
+        if sign
+    ]
+
+
+def _owners(members: Mapping[str, Sequence[str]], stations: Sequence[str], where: str) -> Iterator[tuple[str, int]]:
+    """Yield each station of a group with the number of its group."""
+    seen: set[str] = set()
+    for i, (group, names) in enumerate(members.items()):
+        for name in _listed(names, stations, "station", f"{where}, {group!r}"):
+            if name in seen:
+                raise InvalidProblem(f"{name} is in two groups", f"{where}, {group!r}", "name it once")
+            seen.add(name)
+            yield name, i
+
+
+def _listed(given: Sequence[str], known: Sequence[str], what: str, where: str) -> tuple[str, ...]:
+    """Return names that are known and differ."""
+    names = (given,) if isinstance(given, str) else tuple(given)
+    place = f"{where}, members"
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise InvalidProblem(f"there is no {what} {unknown[0]!r}", place, nearest(unknown[0], list(known)))
+    if not names or len(set(names)) < len(names):
+        twice = next((name for name in names if names.count(name) > 1), None)
+        raise InvalidProblem("no one is named" if twice is None else f"{twice} is named twice", place, "name each once")
+    return names
+
+
+def _signs(kind: str, form: Form) -> tuple[int, int]:
+    """Return how a station's error enters as first and as second station of a row."""
+    model = MODELS[kind]
+    if form == "rotation" or model.stations == 1:
+        return (1, 0)
+    return model.ranges or (1, -1)
+
+
+def _each(values: Any, shape: tuple[int, ...], where: str, what: str) -> Array:
+    """Return one value for each member (and angle) of what may be one for all, or one for each member."""
+    array = np.asarray(numbers(values, f"{where}, {what}"))
+    if array.shape == shape[:1]:
+        array = array.reshape(*array.shape, *(1,) * (len(shape) - 1))
+    elif array.size == np.prod(shape):
+        array = array.reshape(shape)
+    if array.ndim and array.shape[0] != shape[0]:
+        raise InvalidProblem(
+            f"{what} has {array.size} entries for {shape[0]} members", where, "give one, or one for each member"
+        )
+    return np.array(np.broadcast_to(array, shape))
+
+
+# Biases that were learnt elsewhere: taken as known, they leave the problem.
+
+
+def with_known_bias(problem: Problem, name: str, values: Any) -> Problem:
+    """Return the problem with one of its families of biases taken as known.
+
+    Learn on one run, apply to another: ``with_known_bias(later, "clock", fix.take("clock"))``.
+
+    Parameters
+    ----------
+    problem : Problem
+        Has the family among its biases.
+    name : str
+        Name of the family.
+    values : array (q,) or (q, 3), or mapping of str to number
+        Value of each member in the order of the family, in its unit (radians for a rotation), or by the name of the
+        member; members that a mapping lacks have none.
+
+    Returns
+    -------
+    Problem
+        Without the family: its rows are corrected, or the axes of its stations turned.
+
+    Raises
+    ------
+    InvalidProblem
+        Where there is no such family or member, or values do not fit.
+    """
+    names = [bias.name for bias in problem.biases]
+    if name not in names:
+        raise InvalidProblem(f"there is no bias {name!r}", "name", nearest(name, names) if names else "there are none")
+    bias = problem.biases[names.index(name)]
+    known = _ordered(bias, values, (3,) if bias.form == "rotation" and problem.dimension == 3 else ())
+    rest = replace(problem, biases=tuple(b for b in problem.biases if b is not bias))
+    return _turned(rest, bias, known) if bias.form == "rotation" else _corrected(rest, bias, known)
+
+
+def _ordered(bias: Bias, values: Any, inner: tuple[int, ...]) -> Array:
+    """Return values (q,) or (q, 3) in the order of the members."""
+    where = f"values of {bias.name!r}"
+    if isinstance(values, Mapping):
+        strange = [member for member in values if member not in bias.members]
+        if strange:
+            raise InvalidProblem(f"{strange[0]!r} is no member", where, nearest(str(strange[0]), list(bias.members)))
+        values = [values.get(member, np.zeros(inner)) for member in bias.members]
+    array, shape = np.asarray(numbers(values, where)), (len(bias.members), *inner)
+    if array.size != np.prod(shape):
+        raise InvalidProblem(f"there are {array.size} values", where, f"give an array of shape {shape}")
+    if not np.isfinite(array).all():
+        raise InvalidProblem("a value is not finite", where, "take the biases of a fix that has an answer")
+    return array.reshape(shape)
+
+
+def _corrected(problem: Problem, bias: Bias, known: Array) -> Problem:
+    """Return the problem with offsets, drifts or scales in the known corrections of its rows."""
+    amount = np.zeros(problem.count)
+    since = (problem.times - problem.origin)[problem.epoch[bias.row]] if bias.form == "drift" else 1.0
+    np.add.at(amount, bias.row, bias.coefficient * since * known[bias.member])
+    rows = []
+    for block, start in zip(problem.rows, problem.starts, strict=True):
+        own: Any = amount[start : start + block.count]
+        if bias.form == "scale":
+            own = (block.z - block.correction) * own / (1.0 + own)
+        rows.append(replace(block, correction=block.correction + own))
+    return replace(problem, rows=tuple(rows))
+
+
+def _turned(problem: Problem, bias: Bias, known: Array) -> Problem:
+    """Return the problem with the axes of its stations turned."""
+    d, stations = problem.dimension, problem.stations
+    turn = np.zeros((stations.count, 1 if d == 2 else 3))
+    first = np.concatenate([block.a for block in problem.rows])[bias.row]
+    turn[first] = bias.coefficient[:, None] * known.reshape(len(known), -1)[bias.member]
+    axes = np.eye(d) + np.zeros((1, stations.count, d, d)) if stations.axes is None else stations.axes
+    own = tuple(tuple(axes[..., i, c] for c in range(d)) for i in range(d))
+    rows = rotate(own, tuple(turn[:, c] for c in range(turn.shape[1])))
+    return replace(
+        problem, stations=replace(stations, axes=np.stack([np.stack(row, axis=-1) for row in rows], axis=-2))
+    )

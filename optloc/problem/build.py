@@ -1,0 +1,266 @@
+"""Put a problem together from arrays: stations, a few lines of measurements, noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from optloc.base.arrays import numbers, positive, whole
+from optloc.base.errors import InvalidProblem
+from optloc.base.frames import CARTESIAN, Frame
+from optloc.base.types import Array, Bias, Motion, Prior, Rows, Stations
+from optloc.models import MODELS
+from optloc.problem import noise as noises
+from optloc.problem.check import checked
+from optloc.problem.problem import Problem
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """Rows of one kind together with their noise, before they are put into a problem.
+
+    Parameters
+    ----------
+    rows : Rows
+        The rows.
+    variance : array (..., m), optional
+        Independent variance of each row.
+    arrival : array (..., s) or (), optional
+        Variance of each station's arrival; rows that share a station and an epoch are then correlated. It adds to
+        `variance`.
+    covariance : array (..., m, m), optional
+        Full covariance of these rows.
+    """
+
+    rows: Rows
+    variance: Array | None = None
+    arrival: Array | None = None
+    covariance: Array | None = None
+
+
+def measured(
+    kind: str,
+    z: Any = None,
+    *,
+    a: Any = None,
+    b: Any = None,
+    sigma: Any = None,
+    arrival_sigma: Any = None,
+    covariance: Any = None,
+    epoch: Any = 0,
+    target: Any = 0,
+    weight: Any = 1.0,
+    correction: Any = 0.0,
+) -> Measured:
+    """Return measurements of one kind.
+
+    Parameters
+    ----------
+    kind : str
+        A key of `optloc.MODELS`, for instance "tdoa".
+    z : array (..., m), optional
+        Measured values: metres, metres per second, radians or ratios; None to be simulated.
+    a, b : int array (m,) or int
+        Stations of each row, as indices.
+    sigma : float or array (..., m), optional
+        Standard deviation of each row; rows are then independent.
+    arrival_sigma : float or array (..., s), optional
+        Standard deviation of each station's arrival (metres); rows get the covariance D diag(sigma^2) D'. With
+        `sigma` as well, the two add.
+    covariance : array (..., m, m), optional
+        Full covariance of these rows, in the place of both.
+    epoch, target : int array (m,) or int
+        Epoch and target of each row.
+    weight : float or array (..., m)
+        1 for a row as measured, 0 for an absent one.
+    correction : float or array (..., m)
+        Known amount by which the measurement exceeds the model.
+
+    Returns
+    -------
+    Measured
+        To be given to `assemble`.
+
+    Raises
+    ------
+    InvalidProblem
+        For an unknown kind, missing stations or a noise given not exactly once.
+    """
+    model = MODELS.get(kind)
+    if model is None:
+        raise InvalidProblem(f"unknown kind {kind!r}", where="kind", advice=f"use one of {', '.join(sorted(MODELS))}")
+    z, sigma, arrival_sigma = (
+        numbers(z, "z"),
+        positive(sigma, "sigma", kind),
+        positive(arrival_sigma, "arrival_sigma", kind),
+    )
+    covariance, weight, correction = (
+        numbers(v, name) for v, name in ((covariance, "covariance"), (weight, "weight"), (correction, "correction"))
+    )
+    a, b, epoch, target = (whole(v, name) for v, name in ((a, "a"), (b, "b"), (epoch, "epoch"), (target, "target")))
+    count = _count(kind, (z, sigma, covariance, a, b, epoch, target, weight, correction), covariance)
+
+    def index(values: Array | None, needed: bool, name: str) -> Array:
+        if needed and values is None:
+            raise InvalidProblem(f"{kind} needs station {name}", where=name, advice="give station indices")
+        return np.array(np.broadcast_to(values if needed and values is not None else np.int64(-1), (count,)))
+
+    def row(values: Array | None) -> Array:
+        array = np.asarray(np.nan) if values is None else values
+        return np.array(np.broadcast_to(array, (*array.shape[:-1], count)))
+
+    if (covariance is None) == (sigma is None and arrival_sigma is None):
+        advice = "give covariance, or sigma, or arrival_sigma, or the last two together"
+        raise InvalidProblem(f"the noise of {kind} must be given once", where=kind, advice=advice)
+    rows = Rows(
+        kind,
+        row(z),
+        index(a, model.stations > 0, "a"),
+        index(b, model.stations > 1, "b"),
+        index(epoch, True, "epoch"),
+        index(target, True, "target"),
+        row(weight),
+        row(correction),
+    )
+    return Measured(
+        rows,
+        None if sigma is None else row(sigma) ** 2,
+        None if arrival_sigma is None else arrival_sigma**2,
+        covariance,
+    )
+
+
+def _count(kind: str, given: Sequence[Array | None], covariance: Array | None) -> int:
+    """Return the number of rows of measurements; refuse arguments that disagree about it."""
+    sizes = [v.shape[-1] for v in given if v is not None and v.ndim]
+    count = max(sizes, default=1)
+    if covariance is not None and covariance.shape[-2:] != (count, count):
+        raise InvalidProblem(
+            f"the covariance of {kind} has shape {covariance.shape}", "covariance", f"give one of {count} x {count}"
+        )
+    if any(size not in (1, count) for size in sizes):
+        raise InvalidProblem(f"arguments of {kind} have {sorted(set(sizes))} rows", where=kind, advice="give one each")
+    return count
+
+
+def assemble(
+    stations: Any,
+    *measurements: Measured,
+    times: Any = None,
+    motions: Sequence[Motion] = (Motion(),),
+    biases: Sequence[Bias] = (),
+    priors: Sequence[Prior] = (),
+    frame: Frame = CARTESIAN,
+    covariance: Any = None,
+    constraints: Sequence[Any] = (),
+) -> Problem:
+    """Return a problem, or a batch of problems where arrays have leading axes.
+
+    Parameters
+    ----------
+    stations : Stations, or array (s, d), or array (..., k, s, d)
+        Positions in metres.
+    *measurements : Measured
+        One or more of `measured`.
+    times : array (k,), optional
+        Seconds of each epoch; 0, 1, 2 ... by default.
+    motions : sequence of Motion
+        How each target moves; one static target by default.
+    biases : sequence of Bias
+        Unknown systematic errors.
+    priors : sequence of Prior
+        Prior knowledge of named unknowns.
+    frame : Frame
+        What the coordinates mean.
+    covariance : array (..., m, m), optional
+        Covariance of all rows together, across kinds; replaces what the measurements say.
+    constraints : sequence of Band, Polygon or tuples of them
+        What the answer must meet, see `optloc.linear.constraints`.
+
+    Raises
+    ------
+    InvalidProblem
+        Naming the argument, row or station that cannot be right.
+    """
+    if not measurements:
+        raise InvalidProblem("there are no measurements", where="measurements", advice="give at least one")
+    blocks = _numbered(measurements)
+    epochs = 1 + max(int(m.rows.epoch.max(initial=0)) for m in measurements)
+    made = Problem(
+        stations if isinstance(stations, Stations) else station_array(stations),
+        tuple(m.rows for m in measurements),
+        noises.Noise(()),
+        np.arange(float(epochs)) if times is None else np.asarray(numbers(times, "times")),
+        tuple(motions),
+        tuple(biases),
+        tuple(priors),
+        frame,
+        tuple(c for given in constraints for c in (given if isinstance(given, tuple | list) else (given,))),
+    )
+    if covariance is None:
+        noise = noises.group([block for m, start in blocks for block in _noise(m, start, made.stations.count)])
+    else:
+        full = np.asarray(numbers(covariance, "covariance"))
+        if full.shape[-2:] != (made.count, made.count):
+            raise InvalidProblem(
+                f"the joint covariance has shape {full.shape}", "covariance", f"give one of {made.count} x {made.count}"
+            )
+        noise = noises.Noise((noises.Block(np.arange(made.count)[None], full[..., None, :, :]),))
+    return checked(replace(made, noise=noise))
+
+
+def station_array(position: Any, names: Sequence[str] | None = None) -> Stations:
+    """Return stations at positions (s, d), or (..., k, s, d) where they move or differ from problem to problem."""
+    array = np.asarray(numbers(position, "stations"))
+    if array.ndim < 2 or array.shape[-1] not in (2, 3):
+        raise InvalidProblem(
+            f"stations have shape {array.shape}", where="stations", advice="give an array (stations, 2 or 3) in metres"
+        )
+    if array.ndim == 2:
+        array = array[None]
+    labels = tuple(names) if names is not None else tuple(f"S{i}" for i in range(array.shape[-2]))
+    return Stations(array, labels)
+
+
+def _numbered(measurements: Sequence[Measured]) -> list[tuple[Measured, int]]:
+    starts = np.cumsum([0, *(m.rows.count for m in measurements)])
+    return [(m, int(start)) for m, start in zip(measurements, starts, strict=False)]
+
+
+def _noise(m: Measured, start: int, stations: int) -> list[noises.Block]:
+    rows = np.arange(start, start + m.rows.count)
+    if m.variance is not None and m.arrival is None:
+        return [noises.Block(rows[:, None], m.variance[..., None, None])]
+    if m.covariance is not None:
+        return [noises.Block(rows[None], m.covariance[..., None, :, :])]
+    assert m.arrival is not None
+    variance = m.arrival if m.arrival.ndim else np.full(stations, float(m.arrival))
+    if variance.shape[-1] != stations:
+        raise InvalidProblem(
+            f"there are {variance.shape[-1]} values for {stations} stations",
+            "arrival_sigma",
+            "give one for each station",
+        )
+    return _arrival_blocks(m, start, variance)
+
+
+def _arrival_blocks(m: Measured, start: int, variance: Array) -> list[noises.Block]:
+    """Return one block for each epoch and target: its rows combine the same arrivals, and have noise of their own."""
+    rows, signs = m.rows, MODELS[m.rows.kind].ranges
+    if signs is None:
+        raise InvalidProblem(
+            f"{rows.kind} does not combine arrival times", where="arrival_sigma", advice="give sigma or covariance"
+        )
+    blocks = []
+    for members in noises.together(rows.epoch * (rows.target.max(initial=0) + 2) + rows.target):
+        covariance = noises.arrivals([(rows.a[members], signs[0]), (rows.b[members], signs[1])], variance)
+        if m.variance is not None:
+            covariance = covariance + m.variance[..., members, None] * np.eye(members.shape[1])
+        blocks.append(noises.Block(start + members, covariance))
+    return blocks
+
+
+problem = assemble

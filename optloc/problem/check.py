@@ -1,0 +1,458 @@
+"""What cannot be a problem: malformed input is refused with a sentence that names the culprit."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.frames import Frame
+from optloc.base.types import Array, Band, Bias, Motion, Polygon, Prior, Rows, Stations
+from optloc.models import MODELS
+from optloc.models.surfaces import SURFACES
+from optloc.problem.epochs import separable, tied, untied
+from optloc.problem.noise import Noise
+from optloc.problem.problem import Problem
+
+# What cannot be unknown: malformed motions, biases and priors are refused with a sentence that names them.
+
+_FORMS = ("offset", "scale", "drift", "rotation")
+
+
+def check_unknowns(problem: Problem) -> None:
+    """Refuse motions, biases and priors that cannot be what is meant.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its stations, rows and times are in order.
+
+    Raises
+    ------
+    InvalidProblem
+        Naming the motion, bias or prior.
+    """
+    for number, motion in enumerate(problem.motions):
+        _check_motion(problem, motion, number)
+    for bias in problem.biases:
+        _check_bias(problem, bias, f"bias {bias.name!r}")
+    layout = problem.layout
+    names = Counter(slot.name for slot in (*layout.shared, *layout.local))
+    twice = [name for name, count in names.items() if count > 1]
+    if twice:
+        raise InvalidProblem(f"the name {twice[0]!r} is taken twice", "biases", "give every unknown its own name")
+    for prior in problem.priors:
+        _check_prior(problem, prior)
+
+
+def _check_motion(problem: Problem, motion: Motion, number: int) -> None:
+    where = f"motions[{number}]"
+    if motion.order not in (0, 1, 2):
+        raise InvalidProblem(f"a motion of order {motion.order}", where, "use order 0, 1 or 2")
+    if motion.span not in ("run", "epoch"):
+        raise InvalidProblem(f"unknown span {motion.span!r}", where, "use 'run' or 'epoch'")
+    if motion.reference is not None and not np.isfinite(motion.reference):
+        raise InvalidProblem(f"the reference time is {motion.reference}", where, "give finite seconds")
+    if motion.known is None:
+        return
+    shape = motion.known.shape
+    if len(shape) < 3 or shape[-1] != problem.dimension:
+        raise InvalidProblem(
+            f"known states of shape {shape}", where, f"give (epochs or 1, order + 1, {problem.dimension})"
+        )
+    if shape[-3] not in (1, problem.epochs):
+        counts = f"{problem.epochs} epoch{'s' if problem.epochs > 1 else ''}"
+        raise InvalidProblem(f"known states for {shape[-3]} epochs, not {counts}", where, "give one, or one an epoch")
+    if not np.isfinite(motion.known).all():
+        raise InvalidProblem("a known state is not finite", where, "give metres and metres per second")
+    if shape[-3] > 1 and shape[-2] == 1:
+        for rows in problem.rows:
+            if MODELS[rows.kind].velocity and (rows.target == number).any():
+                raise InvalidProblem(f"{rows.kind} needs the velocity of this known target", where, "give it as well")
+
+
+def _check_bias(problem: Problem, bias: Bias, where: str) -> None:
+    if bias.form not in _FORMS:
+        raise InvalidProblem(f"unknown form {bias.form!r}", where, f"use {', '.join(_FORMS)}")
+    sizes = [len(bias.row), len(bias.member), len(bias.coefficient)]
+    if len(set(sizes)) > 1:
+        raise InvalidProblem(
+            f"row, member and coefficient have {sizes} entries", where, "give one each for every touch"
+        )
+    for name, index, limit in (("row", bias.row, problem.count), ("member", bias.member, len(bias.members))):
+        bad = (index < 0) | (index >= limit)
+        if bad.any():
+            raise InvalidProblem(f"there is no {name} {index[bad][0]}", where, f"use 0 to {limit - 1}")
+    if not np.isfinite(bias.coefficient).all():
+        raise InvalidProblem("a coefficient is not finite", where, "give numbers such as 1 and -1")
+    if bias.form == "rotation":
+        _check_turned(problem, bias, where)
+    turns = (1 if problem.dimension == 2 else 3) if bias.form == "rotation" else 1
+    if bias.sigma is None:
+        return
+    wanted = len(bias.members) * turns
+    for name, values, sizes in (("sigma", bias.sigma, [wanted]), ("mean", bias.mean, [1, wanted])):
+        if np.size(values) not in sizes:
+            raise InvalidProblem(
+                f"{name} has {np.size(values)} entries, not {wanted}", where, "give one for each unknown"
+            )
+    if not ((np.asarray(bias.sigma) > 0.0) & np.isfinite(bias.sigma)).all() or not np.isfinite(bias.mean).all():
+        raise InvalidProblem("sigma is not positive or mean is not finite", where, "give true numbers, or no sigma")
+
+
+def _check_turned(problem: Problem, bias: Bias, where: str) -> None:
+    for rows, start in zip(problem.rows, problem.starts, strict=True):
+        inside = (bias.row >= start) & (bias.row < start + rows.count)
+        if inside.any() and not MODELS[rows.kind].axes:
+            advice = "let it touch rows that are measured in the station's axes"
+            raise InvalidProblem(
+                f"a rotation does not change {rows.kind} row {bias.row[inside][0] - start}", where, advice
+            )
+
+
+def _check_prior(problem: Problem, prior: Prior) -> None:
+    where = f"prior on {prior.name}"
+    slot, _ = problem.layout.find(prior.name)
+    if prior.mean.shape[-1:] != (slot.size,) or prior.covariance.shape[-2:] != (slot.size, slot.size):
+        raise InvalidProblem(
+            f"mean {prior.mean.shape} and covariance {prior.covariance.shape} do not fit",
+            where,
+            f"give {slot.size} entries",
+        )
+    if not np.isfinite(prior.mean).all():
+        raise InvalidProblem("the mean is not finite", where, "give SI units, or no prior")
+
+
+# What cannot be demanded: malformed or contradictory constraints are refused with a sentence that names them.
+
+_SLIVER = 1e-12
+
+
+def check_constraints(problem: Problem) -> None:
+    """Refuse constraints that cannot be what is meant; that no position meets them is a status, not an error.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its stations, rows and motions are in order.
+
+    Raises
+    ------
+    InvalidProblem
+        Naming the constraint.
+    """
+    for constraint in problem.constraints:
+        where = f"constraint {constraint.name!r}"
+        _check_target(problem, constraint, where)
+        if isinstance(constraint, Polygon):
+            _check_plan(problem, where)
+            check_polygon(constraint.vertices, where)
+        else:
+            _check_band(problem, constraint, where)
+    for same in like(problem.constraints):
+        _check_agreement(same)
+
+
+def like(constraints: Sequence[Band | Polygon]) -> list[list[Band]]:
+    """Return the bands on one quantity of one target together, in the order of their first."""
+    groups: dict[tuple[str, int, bytes], list[Band]] = {}
+    for c in constraints:
+        if isinstance(c, Band):
+            groups.setdefault((c.kind, c.target, np.asarray(c.coefficients, dtype=float).tobytes()), []).append(c)
+    return list(groups.values())
+
+
+def _check_target(problem: Problem, constraint: Band | Polygon, where: str) -> None:
+    count = len(problem.motions)
+    if not 0 <= constraint.target < count:
+        raise InvalidProblem(f"there is no target {constraint.target}", where, f"use 0 to {count - 1}")
+    motion = problem.motions[constraint.target]
+    if motion.known is not None:
+        raise InvalidProblem("the target's motion is known", where, "leave the constraint out")
+    if motion.span == "epoch" and problem.epochs > 1 and not separable(problem):
+        advice = "let the target be static or move uniformly, or leave out what ties the epochs together"
+        raise InvalidProblem("the epochs of this free target are tied together by other unknowns", where, advice)
+
+
+def _check_plan(problem: Problem, where: str) -> None:
+    if problem.frame.kind == "ecef":
+        advice = "use the frame enu, whose first two coordinates are east and north"
+        raise InvalidProblem("a polygon needs a plan, and the frame is ECEF", where, advice)
+
+
+def check_polygon(vertices: Array, where: str) -> None:
+    """Refuse corners (v, 2) that do not bound a simple polygon."""
+    if vertices.ndim != 2 or vertices.shape[-1] != 2 or len(vertices) < 3:
+        count = "no pairs" if vertices.ndim != 2 or vertices.shape[-1] != 2 else f"only {len(vertices)} corners"
+        raise InvalidProblem(f"the polygon has {count}", where, "give three corners or more, two coordinates each")
+    if not np.isfinite(vertices).all():
+        corner = int(np.flatnonzero(~np.isfinite(vertices).all(-1))[0])
+        raise InvalidProblem(f"corner {corner + 1} is not finite", where, "give two numbers")
+    v = vertices - vertices.mean(0)
+    size = np.abs(v).max()
+    i, j = np.triu_indices(len(v), 1)
+    twice = np.flatnonzero((np.abs(v[i] - v[j]) <= _SLIVER * size).all(-1))
+    if len(twice):
+        one, two = int(i[twice[0]]) + 1, int(j[twice[0]]) + 1
+        raise InvalidProblem(f"corner {two} repeats corner {one}", where, "leave one out; the polygon closes by itself")
+    if abs(_cross(v, np.roll(v, -1, axis=0)).sum()) <= _SLIVER * size**2:
+        raise InvalidProblem("the polygon has no area", where, "give corners in order around the region")
+    crossing = _crossing(v, size)
+    if crossing is not None:
+        edges = " and ".join(f"{e + 1}-{(e + 1) % len(v) + 1}" for e in crossing)
+        raise InvalidProblem(f"the polygon is not simple: its edges {edges} meet", where, "give corners in order")
+
+
+def _crossing(v: Array, size: float) -> tuple[int, int] | None:
+    """Return two edges of a polygon that meet elsewhere than at their common corner, or None."""
+    a, b, n = v, np.roll(v, -1, axis=0), len(v)
+    i, j = np.triu_indices(n, 1)
+    apart = (j - i > 1) & (j - i < n - 1)
+    along = b - a
+    straddle = np.ones(len(i), dtype=bool)
+    for p, q in ((i, j), (j, i)):
+        sides = _cross(along[p], a[q] - a[p]), _cross(along[p], b[q] - a[p])
+        straddle &= np.sign(_flat(sides[0], size)) * np.sign(_flat(sides[1], size)) <= 0
+    low, high = np.minimum(a, b), np.maximum(a, b)
+    overlap = ((low[i] <= high[j]) & (low[j] <= high[i])).all(-1)
+    # Neighbours always meet at their corner; they run into each other only where one turns straight back.
+    back = (np.abs(_cross(along[i], along[j])) <= _SLIVER * size**2) & ((along[i] * along[j]).sum(-1) < 0.0)
+    bad = np.flatnonzero(np.where(apart, straddle & overlap, back & ((j - i == 1) | (j - i == n - 1))))
+    return (int(i[bad[0]]), int(j[bad[0]])) if len(bad) else None
+
+
+def _flat(area: Array, size: float) -> Array:
+    return np.where(np.abs(area) <= _SLIVER * size**2, 0.0, area)
+
+
+def _cross(a: Array, b: Array) -> Array:
+    return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
+
+
+def _check_band(problem: Problem, band: Band, where: str) -> None:
+    surface = SURFACES.get(band.kind)
+    if surface is None:
+        raise InvalidProblem(f"unknown quantity {band.kind!r}", where, nearest(band.kind, SURFACES))
+    if surface.ecef and not problem.frame.geodetic:
+        raise InvalidProblem(f"{band.kind} needs a geodetic frame", where, "use frame ecef or enu with an origin")
+    if surface.ecef and problem.dimension != 3:
+        raise InvalidProblem(f"{band.kind} needs three dimensions", where, "use 3-D stations")
+    if surface.velocity and problem.motions[band.target].order == 0:
+        raise InvalidProblem(f"{band.kind} needs a target that moves", where, "give it a velocity, or leave this out")
+    size = problem.dimension if surface.coefficients < 0 else surface.coefficients
+    given = np.shape(band.coefficients)[-1:]
+    if given != (size,):
+        raise InvalidProblem(f"coefficients of shape {np.shape(band.coefficients)}", where, f"give {size} numbers")
+    if not np.isfinite(band.coefficients).all():
+        raise InvalidProblem("a coefficient is not finite", where, "give numbers")
+    for name, bound, absent in (("lower", band.lower, -np.inf), ("upper", band.upper, np.inf)):
+        bad = np.isnan(bound) | (np.isinf(bound) & (bound != absent))
+        if np.any(bad):
+            raise InvalidProblem(
+                f"the {name} bound is {np.asarray(bound)[bad][0]:g}", where, f"give a number, or {absent:g} for none"
+            )
+
+
+def _check_agreement(bands: Sequence[Band]) -> None:
+    """Refuse bands on one quantity that cannot hold together, and equalities that are given twice."""
+    where, unit = f"constraint {bands[0].name!r}", SURFACES[bands[0].kind].unit.replace("1", "")
+    exact = [band.lower for band in bands if np.all(band.lower == band.upper)]
+    low = np.max(np.broadcast_arrays(*(band.lower for band in bands)), axis=0)
+    high = np.min(np.broadcast_arrays(*(band.upper for band in bands)), axis=0)
+    clash = np.broadcast_arrays(low, high, low > high)
+    if clash[2].any():
+        least, most = (f"{np.ravel(bound[clash[2]])[0]:.10g} {unit}".strip() for bound in clash[:2])
+        what = f"it must be at least {least} and at most {most}"
+        raise InvalidProblem(what, where, "correct the bounds, they contradict each other")
+    if len(exact) > 1:
+        raise InvalidProblem("the same equality is given twice", where, "leave one of them out")
+
+
+def checked(problem: Problem) -> Problem:
+    """Return the problem if it is well formed.
+
+    Parameters
+    ----------
+    problem : Problem
+        Any problem. NaN measurements pass: they are simulated later, or become a status of their own fix.
+
+    Returns
+    -------
+    Problem
+        The same; a noise block that holds several uncorrelated epochs is cut.
+
+    Raises
+    ------
+    InvalidProblem
+        Naming the station, row or argument and what to do.
+    """
+    if not isinstance(problem.frame, Frame):
+        raise InvalidProblem(f"{problem.frame!r} is not a frame", "frame", "give an optloc.Frame, such as optloc.ECEF")
+    if problem.count == 0:
+        raise InvalidProblem("there are no measurements", "measurements", "give at least one row")
+    _check_stations(problem)
+    for rows in problem.rows:
+        _check_rows(problem, rows)
+    _check_noise(problem.noise, problem.count)
+    _check_times(problem)
+    _check_moving(problem)
+    check_unknowns(problem)
+    try:
+        problem.batch_shape  # noqa: B018  (raises where leading axes disagree)
+    except ValueError:
+        raise InvalidProblem("leading axes disagree", "problem", "give every array the same batch axes") from None
+    for prior in problem.priors:
+        _check_covariance(prior.covariance[..., None, :, :], f"prior on {prior.name}", None)
+    check_constraints(problem)
+    return _arrowed(problem)
+
+
+def _arrowed(problem: Problem) -> Problem:
+    """Return the problem with noise in blocks of one epoch each, as the elimination of local unknowns needs it."""
+    if not tied(problem):
+        return untied(problem)
+    if problem.layout.n_local:
+        name = problem.layout.local[0].name
+        what = f"rows of different epochs are correlated, but every epoch has its own {name!r}"
+        raise InvalidProblem(what, "covariance", "correlate rows of one epoch only, or share the unknown")
+    return problem
+
+
+def _check_stations(problem: Problem) -> None:
+    stations: Stations = problem.stations
+    bad = ~np.isfinite(stations.position).all(-1)
+    if bad.any():
+        name = stations.names[int(np.argwhere(bad)[0][-1])]
+        raise InvalidProblem(f"the position of station {name!r} is not finite", "stations", "give metres")
+    if len(stations.names) != stations.count:
+        raise InvalidProblem(
+            f"{stations.count} stations have {len(stations.names)} names", "stations", "give one name each"
+        )
+    twice = [name for name, n in Counter(stations.names).items() if n > 1]
+    if twice:
+        raise InvalidProblem(f"station name {twice[0]!r} is used twice", "stations", "rename one of them")
+    if problem.frame.kind == "ecef" and stations.dimension != 3:
+        raise InvalidProblem("stations in ECEF need three coordinates", "stations", "give x, y and z")
+    if stations.covariance is not None:
+        shape = (stations.count, stations.dimension, stations.dimension)
+        if stations.covariance.shape[-3:] != shape:
+            raise InvalidProblem(
+                f"the covariance of their errors has shape {stations.covariance.shape}", "stations", f"give {shape}"
+            )
+        _check_covariance(stations.covariance, "position error of station", stations.names)
+    if stations.span not in ("epoch", "run", "noise"):
+        what = f"unknown span {stations.span!r} of position errors"
+        raise InvalidProblem(what, "stations", "use 'epoch', 'run' or 'noise'")
+
+
+def _check_moving(problem: Problem) -> None:
+    """Refuse velocities, axes and moving positions that do not fit the stations and epochs."""
+    s, d, count = problem.stations, problem.dimension, problem.stations.count
+    for name, array, tail in (
+        ("position", s.position, (count, d)),
+        ("velocity", s.velocity, (count, d)),
+        ("axes", s.axes, (count, d, d)),
+    ):
+        if array is None:
+            continue
+        core = len(tail) + 1
+        if array.ndim < core or array.shape[-core + 1 :] != tail:
+            raise InvalidProblem(f"station {name} has shape {array.shape}", "stations", "match the positions")
+        if array.shape[-core] not in (1, problem.epochs):
+            counts = f"{array.shape[-core]} epochs of station {name} for {problem.epochs} epochs of measurements"
+            raise InvalidProblem(counts, "stations", "give one, or one for each epoch")
+        bad = ~np.isfinite(array).all(tuple(range(-core + 2, 0)))
+        if bad.any():
+            label = s.names[int(np.argwhere(bad)[0][-1])]
+            raise InvalidProblem(f"the {name} of station {label!r} is not finite", "stations", "give SI units")
+    if s.axes is not None:
+        skew = np.abs(s.axes @ np.swapaxes(s.axes, -1, -2) - np.eye(d)).max((-1, -2)) > 1e-6
+        if skew.any():
+            label = s.names[int(np.argwhere(skew)[0][-1])]
+            raise InvalidProblem(
+                f"the axes of station {label!r} are not unit vectors at right angles",
+                "stations",
+                "give a rotation matrix",
+            )
+
+
+def _check_rows(problem: Problem, rows: Rows) -> None:
+    model = MODELS[rows.kind]
+    if problem.dimension not in model.dimensions:
+        raise InvalidProblem(
+            f"{rows.kind} has no meaning in {problem.dimension} dimensions", rows.kind, "use 3-D stations"
+        )
+    if model.axes and problem.frame.kind == "ecef" and problem.stations.axes is None:
+        advice = "give the stations axes, for instance frame.enu_axes(positions)"
+        raise InvalidProblem(f"{rows.kind} rows in ECEF need the stations' own axes", rows.kind, advice)
+    if model.ecef and not problem.frame.geodetic:
+        raise InvalidProblem(f"{rows.kind} needs a geodetic frame", "frame", "use frame ecef or enu with an origin")
+    if model.ecef and problem.dimension != 3:
+        raise InvalidProblem(f"{rows.kind} needs three dimensions", "frame", "use 3-D stations")
+    for name, index, limit in (
+        ("a", rows.a if model.stations > 0 else None, problem.stations.count),
+        ("b", rows.b if model.stations > 1 else None, problem.stations.count),
+        ("epoch", rows.epoch, problem.epochs),
+        ("target", rows.target, len(problem.motions)),
+    ):
+        if index is None:
+            continue
+        lowest = -1 if name == "target" else 0
+        bad = np.flatnonzero((index < lowest) | (index >= limit))
+        if len(bad):
+            raise InvalidProblem(
+                f"{rows.kind} row {bad[0]} has {name} = {index[bad[0]]}", name, f"use {lowest} to {limit - 1}"
+            )
+    if model.stations > 1 and np.any(rows.a == rows.b):
+        row = int(np.flatnonzero(rows.a == rows.b)[0])
+        raise InvalidProblem(f"{rows.kind} row {row} names one station twice", "a, b", "name two stations")
+    infinite = np.argwhere(np.isinf(rows.z))
+    if len(infinite):
+        row = infinite[0][-1]
+        raise InvalidProblem(f"{rows.kind} row {row} is infinite", "z", "remove the row or give it weight zero")
+    if not np.isfinite(rows.correction).all():
+        raise InvalidProblem(
+            f"{rows.kind} has a correction that is not finite", "correction", "give 0 where none is known"
+        )
+    if not ((rows.weight >= 0.0) & (rows.weight <= 1.0)).all():
+        raise InvalidProblem(f"{rows.kind} has a weight outside 0 to 1", "weight", "use 0 for absent, 1 for present")
+
+
+def _check_noise(noise: Noise, count: int) -> None:
+    seen = np.sort(np.concatenate([block.row.ravel() for block in noise.blocks] or [np.zeros(0, dtype=int)]))
+    if not np.array_equal(seen, np.arange(count)):
+        raise InvalidProblem("the noise does not cover every row exactly once", "noise", "give each row one covariance")
+    for block in noise.blocks:
+        _check_covariance(block.covariance, "noise of row", tuple(str(row) for row in block.row[:, 0]))
+
+
+def _check_covariance(covariance: Array, what: str, names: tuple[str, ...] | None) -> None:
+    def fail(bad: Any, why: str) -> None:
+        if np.any(bad):
+            place = int(np.argwhere(bad)[0][-1])
+            label = f" {names[place]}" if names and place < len(names) else ""
+            raise InvalidProblem(f"the covariance in {what}{label} is {why}", "covariance", "give a true covariance")
+
+    fail(~np.isfinite(covariance).all((-1, -2)), "not finite")
+    diagonal = np.diagonal(covariance, axis1=-2, axis2=-1)
+    fail((diagonal <= 0.0).any(-1), "not positive on its diagonal")
+    if covariance.shape[-1] == 1:
+        return
+    scale = np.sqrt(diagonal)
+    unit = covariance / (scale[..., :, None] * scale[..., None, :])
+    fail((np.abs(unit - np.swapaxes(unit, -1, -2)) > 1e-9).any((-1, -2)), "not symmetric")
+    fail(np.linalg.eigvalsh(unit)[..., 0] < -1e-9 * unit.shape[-1], "not positive semidefinite")
+
+
+def _check_times(problem: Problem) -> None:
+    times = problem.times
+    if times.ndim != 1 or not np.isfinite(times).all():
+        raise InvalidProblem("times are not a list of finite seconds", "times", "give one number per epoch")
+    if (np.diff(times) <= 0.0).any():
+        place = int(np.flatnonzero(np.diff(times) <= 0.0)[0]) + 1
+        raise InvalidProblem(f"epoch {place} is not later than the one before", "times", "sort the epochs")
+    if any(rows.epoch.max(initial=0) >= len(times) for rows in problem.rows):
+        raise InvalidProblem(f"there are only {len(times)} times", "times", "give one for each epoch")

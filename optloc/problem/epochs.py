@@ -1,0 +1,469 @@
+"""Stretches of epochs: what is summed over a run is worked on window by window, in constant memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array, Band, Bias, Motion, Polygon, Rows, Stations
+from optloc.problem.noise import Block, Noise, group
+from optloc.problem.problem import Problem
+
+# Epochs that share nothing become one batch of problems with a single epoch each.
+
+
+def separable(problem: Problem) -> bool:
+    """Return whether no unknown is shared between the epochs of a problem."""
+    run_long_errors = problem.stations.covariance is not None and problem.stations.span == "run"
+    free = all(motion.span == "epoch" for motion in problem.motions)
+    return problem.epochs > 1 and free and not problem.biases and not run_long_errors and not tied(problem)
+
+
+def tied(problem: Problem) -> bool:
+    """Return whether the noise of rows of different epochs is correlated."""
+    epoch = problem.epoch
+    for block in problem.noise.blocks:
+        when = epoch[block.row]
+        apart = when[:, :, None] != when[:, None, :]
+        if apart.any() and np.any(np.where(apart, block.covariance, 0.0)):
+            return True
+    return False
+
+
+def by_epoch(problem: Problem) -> Problem:
+    """Return the epochs of a problem as a batch of independent problems.
+
+    Rows of the same kind, stations and target meet in one row of the batch; a row that an epoch lacks has weight zero.
+
+    Parameters
+    ----------
+    problem : Problem
+        Leading axes (...), k epochs. Biases must not be shared; the targets' states become those of their epoch.
+
+    Returns
+    -------
+    Problem
+        Leading axes (..., k), one epoch.
+
+    Raises
+    ------
+    InvalidProblem
+        Where biases or the noise tie the epochs together.
+    """
+    if problem.biases or tied(problem):
+        tie = f"the bias {problem.biases[0].name!r} is" if problem.biases else "correlated noise is"
+        raise InvalidProblem(f"{tie} shared by several epochs", "by_epoch", "solve them as one problem")
+    places = [_places(rows) for rows in problem.rows]
+    sizes = [len(keys) for keys, _ in places]
+    starts = np.cumsum([0, *sizes])
+    where = np.concatenate([start + place for (_, place), start in zip(places, starts, strict=False)])
+    batch, k = problem.batch_shape, problem.epochs
+    rows = []
+    for old, (keys, place) in zip(problem.rows, places, strict=True):
+        a, b, target, _ = np.array(keys, dtype=np.int64).reshape(-1, 4).T
+
+        def spread(values: Array, old: Rows = old, place: Array = place, size: int = len(keys)) -> Array:
+            out = np.zeros((*batch, k, size))
+            out[..., old.epoch, place] = values
+            return out
+
+        rows.append(
+            Rows(old.kind, spread(old.z), a, b, np.zeros_like(a), target, spread(old.weight), spread(old.correction))
+        )
+    motions = tuple(
+        replace(m, span="run", known=None if m.known is None else _split(m.known, 3)) for m in problem.motions
+    )
+    s = problem.stations
+    stations = replace(
+        s,
+        position=_split(s.position, 3),
+        velocity=None if s.velocity is None else _split(s.velocity, 3),
+        axes=None if s.axes is None else _split(s.axes, 4),
+        covariance=None if s.covariance is None else _same(s.covariance, 3),
+    )
+    priors = tuple(replace(p, mean=_same(p.mean, 1), covariance=_same(p.covariance, 2)) for p in problem.priors)
+    constraints = tuple(_spread(c) for c in problem.constraints)
+    noise = _noise(problem, where, int(starts[-1]))
+    return replace(
+        problem,
+        stations=stations,
+        rows=tuple(rows),
+        noise=noise,
+        times=np.zeros(1),
+        motions=motions,
+        priors=priors,
+        constraints=constraints,
+    )
+
+
+def _spread(c: Band | Polygon) -> Band | Polygon:
+    if isinstance(c, Polygon):
+        return c
+    return replace(c, lower=_same(c.lower, 0), upper=_same(c.upper, 0), coefficients=_same(c.coefficients, 1))
+
+
+def untied(problem: Problem) -> Problem:
+    """Return the problem with noise blocks of one epoch each; correlation between epochs is dropped."""
+    epoch = problem.epoch
+    if all((epoch[block.row] == epoch[block.row[:, :1]]).all() for block in problem.noise.blocks):
+        return problem
+    parts = [part for block in problem.noise.blocks for part in _cut(block, epoch)]
+    return replace(problem, noise=group(parts))
+
+
+def _places(rows: Rows) -> tuple[list[tuple[int, int, int, int]], Array]:
+    """Return the distinct rows (a, b, target, occurrence) of all epochs and the place of each row among them."""
+    seen: dict[tuple[int, int, int, int], int] = {}
+    keys: dict[tuple[int, int, int, int], int] = {}
+    place = np.empty(rows.count, dtype=np.int64)
+    for i, key in enumerate(
+        zip(rows.a.tolist(), rows.b.tolist(), rows.target.tolist(), rows.epoch.tolist(), strict=True)
+    ):
+        occurrence = seen.get(key, 0)
+        seen[key] = occurrence + 1
+        place[i] = keys.setdefault((*key[:3], occurrence), len(keys))
+    return list(keys), place
+
+
+def _split(array: Array, core: int) -> Array:
+    """Return a per-epoch quantity (..., k or 1, s, ...) as (..., k, 1, s, ...); unchanged where it is one for all."""
+    if array.ndim == core and array.shape[0] == 1:
+        return array
+    return np.expand_dims(array, array.ndim - core + 1)
+
+
+def _same(array: Array, core: int) -> Array:
+    """Return a quantity of the run (..., ...) as (..., 1, ...), or unchanged where it is one for the whole batch."""
+    return array if array.ndim == core else np.expand_dims(array, array.ndim - core)
+
+
+def _cut(block: Block, epoch: Array) -> list[Block]:
+    """Return a block as blocks whose groups hold rows of one epoch each."""
+    when = epoch[block.row]
+    if (when == when[:, :1]).all():
+        return [block]
+    blocks = []
+    for g, (rows, times) in enumerate(zip(block.row, when, strict=True)):
+        own = block.covariance[..., g if block.covariance.shape[-3] > 1 else 0, :, :]
+        for k in np.unique(times):
+            inside = np.flatnonzero(times == k)
+            blocks.append(Block(rows[None, inside], own[..., None, inside[:, None], inside]))
+    return blocks
+
+
+def _noise(problem: Problem, where: Array, size: int) -> Noise:
+    """Return the noise of the batch: groups of rows that are correlated in some epoch stay together."""
+    epoch, k = problem.epoch, problem.epochs
+    label = np.arange(size)
+    cut = group([part for block in problem.noise.blocks for part in _cut(block, epoch)]).blocks
+    for block in cut:
+        for members in where[block.row]:
+            joined = np.isin(label, label[members])
+            label[joined] = label[members[0]]
+    blocks = []
+    for name in np.unique(label):
+        members = np.flatnonzero(label == name)
+        blocks.append(_gathered(cut, where, epoch, members, k))
+    return _merge(blocks)
+
+
+def _gathered(cut: tuple[Block, ...], where: Array, epoch: Array, members: Array, k: int) -> Block:
+    slot = {int(row): i for i, row in enumerate(members)}
+    shape = np.broadcast_shapes(*(block.covariance.shape[:-3] for block in cut))
+    out = np.zeros((*shape, k, 1, len(members), len(members)))
+    out[..., np.arange(len(members)), np.arange(len(members))] = 1.0
+    for block in cut:
+        inside = np.flatnonzero(np.isin(where[block.row[:, 0]], members))
+        if not len(inside):
+            continue
+        place = np.vectorize(slot.__getitem__)(where[block.row[inside]])
+        covariance = np.broadcast_to(
+            block.covariance, (*block.covariance.shape[:-3], *block.row.shape, block.row.shape[1])
+        )[..., inside, :, :]
+        out[..., epoch[block.row[inside, 0]][:, None, None], 0, place[:, :, None], place[:, None, :]] = covariance
+    return Block(members[None], out)
+
+
+def _merge(blocks: list[Block]) -> Noise:
+    by_size: dict[int, list[Block]] = {}
+    for block in blocks:
+        by_size.setdefault(block.row.shape[1], []).append(block)
+    return Noise(
+        tuple(
+            Block(np.concatenate([b.row for b in same]), np.concatenate([b.covariance for b in same], axis=-3))
+            for same in by_size.values()
+        )
+    )
+
+
+_NUMBERS = 2**16
+_ROW_ARRAYS = ("z", "a", "b", "epoch", "target", "weight", "correction")
+
+
+def windows(problem: Problem, batch: int = 1) -> Iterator[tuple[int, int, Problem]]:
+    """Yield the stretches (first, last, problem) of a run whose Jacobians fit into the cache, in order.
+
+    Parameters
+    ----------
+    problem : Problem
+        A run of k epochs; where noise ties its epochs, it is one stretch.
+    batch : int
+        Number of problems that are worked on together.
+    """
+    length = epochs_of(problem, batch)
+    if length >= problem.epochs:
+        yield 0, problem.epochs, problem
+        return
+    for first in range(0, problem.epochs, length):
+        last = min(first + length, problem.epochs)
+        yield first, last, window(problem, first, last)
+
+
+def whole(problem: Problem, batch: int = 1) -> bool:
+    """Return whether a run is one window."""
+    return epochs_of(problem, batch) >= problem.epochs
+
+
+def epochs_of(problem: Problem, batch: int = 1) -> int:
+    """Return the number of epochs whose Jacobians fit into the cache."""
+    if problem.epochs == 1 or problem.count == 0 or tied(problem):
+        return problem.epochs
+    columns = problem.layout.n_shared + problem.layout.n_local + 1
+    return max(1, int(_NUMBERS * problem.epochs / (batch * problem.count * columns)))
+
+
+def window(problem: Problem, first: int, last: int) -> Problem:
+    """Return the problem with the rows of epochs first <= k < last only; times, stations and unknowns stay.
+
+    Parameters
+    ----------
+    problem : Problem
+        Noise must not tie its epochs.
+    first, last : int
+        Stretch of epochs.
+    """
+    kept = [_inside(block.epoch, first, last) for block in problem.rows]
+    rows = tuple(_rows(block, inside) for block, inside in zip(problem.rows, kept, strict=True))
+    number = _Numbers.of(problem, kept, [block.count for block in rows])
+    blocks = []
+    for block in problem.noise.blocks:
+        groups = _inside(number.epoch(problem, block.row[:, 0]), first, last)
+        covariance = block.covariance if block.covariance.shape[-3] == 1 else block.covariance[..., groups, :, :]
+        if len(block.row[groups]):
+            blocks.append(Block(number.new(block.row[groups]), covariance))
+    biases = tuple(_touches(problem, bias, number, first, last) for bias in problem.biases)
+    return replace(problem, rows=rows, noise=Noise(tuple(blocks)), biases=biases)
+
+
+@dataclass(frozen=True, slots=True)
+class _Numbers:
+    """Row numbers of a run and its window: first row of each kind, what is kept of it, its first row in the window."""
+
+    start: Array
+    kept: list[slice | Array]
+    taken: Array
+
+    @classmethod
+    def of(cls, problem: Problem, kept: list[slice | Array], counts: list[int]) -> _Numbers:
+        return cls(np.array(problem.starts), kept, np.cumsum([0, *counts[:-1]]))
+
+    def epoch(self, problem: Problem, rows: Array) -> Array:
+        """Return the epochs of rows of the run."""
+        if len(self.kept) == 1:
+            return problem.rows[0].epoch[rows]
+        kind = np.searchsorted(self.start, rows, side="right") - 1
+        out = np.empty(rows.shape, dtype=np.int64)
+        for i, block in enumerate(problem.rows):
+            out[kind == i] = block.epoch[rows[kind == i] - self.start[i]]
+        return out
+
+    def new(self, rows: Array) -> Array:
+        """Return the numbers in the window of rows of the run that are in it."""
+        kind = np.searchsorted(self.start, rows, side="right") - 1
+        out = np.empty(rows.shape, dtype=np.int64)
+        for i, kept in enumerate(self.kept):
+            own = rows[kind == i] - self.start[i]
+            out[kind == i] = self.taken[i] + (
+                own - kept.start if isinstance(kept, slice) else np.searchsorted(kept, own)
+            )
+        return out
+
+
+def cut(problem: Problem, first: int, last: int) -> Problem:
+    """Return the epochs first <= k < last of a run as a run of its own; states hold at the same time as before.
+
+    Parameters
+    ----------
+    problem : Problem
+        Noise must not tie its epochs.
+    first, last : int
+        Stretch of epochs, not empty.
+
+    Raises
+    ------
+    InvalidProblem
+        Where no rows belong to these epochs.
+    """
+    part = window(problem, first, last)
+    if part.count == 0:
+        raise InvalidProblem(f"epochs {first} to {last} hold no rows", "cut", "take a longer stretch")
+
+    def own(values: Array | None, core: int) -> Array | None:
+        if values is None or values.shape[-core] == 1:
+            return values
+        return np.moveaxis(np.moveaxis(values, -core, 0)[first:last], 0, -core)
+
+    s = problem.stations
+    position = own(s.position, 3)
+    assert position is not None
+    motions = tuple(replace(m, known=own(m.known, 3), reference=_reference(problem, m)) for m in problem.motions)
+    return replace(
+        part,
+        stations=replace(s, position=position, velocity=own(s.velocity, 3), axes=own(s.axes, 4)),
+        rows=tuple(replace(rows, epoch=rows.epoch - first) for rows in part.rows),
+        times=problem.times[first:last],
+        motions=motions,
+    )
+
+
+def _reference(problem: Problem, motion: Motion) -> float | None:
+    return float(problem.times[0]) if motion.reference is None else motion.reference
+
+
+def _inside(epoch: Array, first: int, last: int) -> slice | Array:
+    """Return the entries whose epoch lies in a stretch: a slice, and so a view, where they are sorted."""
+    if np.all(epoch[1:] >= epoch[:-1]):
+        return slice(*np.searchsorted(epoch, (first, last)).tolist())
+    return np.flatnonzero((epoch >= first) & (epoch < last))
+
+
+def _rows(block: Rows, kept: slice | Array) -> Rows:
+    return Rows(block.kind, *(getattr(block, name)[..., kept] for name in _ROW_ARRAYS))
+
+
+def _touches(problem: Problem, bias: Bias, number: _Numbers, first: int, last: int) -> Bias:
+    kept = _inside(number.epoch(problem, bias.row), first, last)
+    return replace(bias, row=number.new(bias.row[kept]), member=bias.member[kept], coefficient=bias.coefficient[kept])
+
+
+def joined(problem: Problem, more: Problem) -> Problem:
+    """Return one run of two: the epochs of the second follow those of the first.
+
+    Parameters
+    ----------
+    problem, more : Problem
+        The same stations, targets, biases, priors and kinds in the same order; all times of `more` are later.
+
+    Returns
+    -------
+    Problem
+        States hold at the reference time of the first run.
+
+    Raises
+    ------
+    InvalidProblem
+        Naming what differs.
+    """
+    _check_alike(problem, more)
+    k = problem.epochs
+    rows = tuple(
+        _appended(one, replace(two, epoch=two.epoch + k)) for one, two in zip(problem.rows, more.rows, strict=True)
+    )
+    # Where the rows of either run come to stand: kinds stay together, the second run behind the first.
+    counts = [(one.count, two.count) for one, two in zip(problem.rows, more.rows, strict=True)]
+    starts = np.cumsum([0, *(a + b for a, b in counts)])[:-1]
+    mine = np.concatenate([start + np.arange(a) for start, (a, _) in zip(starts, counts, strict=True)])
+    theirs = np.concatenate([start + a + np.arange(b) for start, (a, b) in zip(starts, counts, strict=True)])
+    blocks = [Block(mine[block.row], block.covariance) for block in problem.noise.blocks]
+    blocks += [Block(theirs[block.row], block.covariance) for block in more.noise.blocks]
+    biases = tuple(
+        replace(
+            one,
+            row=np.concatenate([mine[one.row], theirs[two.row]]),
+            member=np.concatenate([one.member, two.member]),
+            coefficient=np.concatenate([one.coefficient, two.coefficient]),
+        )
+        for one, two in zip(problem.biases, more.biases, strict=True)
+    )
+    return replace(
+        problem,
+        stations=_stations(problem, more),
+        rows=rows,
+        noise=Noise(tuple(blocks)),
+        times=np.concatenate([problem.times, more.times]),
+        motions=_motions(problem, more),
+        biases=biases,
+    )
+
+
+def _appended(one: Rows, two: Rows) -> Rows:
+    batch = np.broadcast_shapes(one.z.shape[:-1], two.z.shape[:-1])
+
+    def both(a: Array, b: Array) -> Array:
+        shape = batch if a.ndim > 1 or b.ndim > 1 else ()
+        return np.concatenate([np.broadcast_to(v, (*shape, v.shape[-1])) for v in (a, b)], axis=-1)
+
+    return Rows(one.kind, *(both(getattr(one, name), getattr(two, name)) for name in _ROW_ARRAYS))
+
+
+def _stations(problem: Problem, more: Problem) -> Stations:
+    one, two = problem.stations, more.stations
+
+    def both(a: Array | None, b: Array | None, core: int) -> Array | None:
+        if a is None or b is None:
+            return None
+        return _course(a, problem.epochs, b, more.epochs, core)
+
+    position = _course(one.position, problem.epochs, two.position, more.epochs, 3)
+    return replace(
+        one, position=position, velocity=both(one.velocity, two.velocity, 3), axes=both(one.axes, two.axes, 4)
+    )
+
+
+def _motions(problem: Problem, more: Problem) -> tuple[Motion, ...]:
+    joint = []
+    for one, two in zip(problem.motions, more.motions, strict=True):
+        known = one.known
+        if known is not None and two.known is not None:
+            known = _course(known, problem.epochs, two.known, more.epochs, 3)
+        joint.append(replace(one, known=known, reference=_reference(problem, one)))
+    return tuple(joint)
+
+
+def _course(one: Array, first: int, two: Array, second: int, core: int) -> Array:
+    """Return what holds at each epoch (..., k, ...) of both runs; unchanged where it never changes."""
+    if one.shape[-core] == 1 and two.shape[-core] == 1 and np.array_equal(one, two):
+        return one
+    axis = -core
+    parts = [np.repeat(a, n, axis) if a.shape[axis] == 1 else a for a, n in ((one, first), (two, second))]
+    batch = np.broadcast_shapes(*(part.shape[:axis] for part in parts))
+    return np.concatenate([np.broadcast_to(part, (*batch, *part.shape[axis:])) for part in parts], axis)
+
+
+def _check_alike(problem: Problem, more: Problem) -> None:
+    one, two = problem, more
+    for what, same in (
+        ("stations", one.stations.names == two.stations.names and one.stations.span == two.stations.span),
+        ("kinds", [rows.kind for rows in one.rows] == [rows.kind for rows in two.rows]),
+        (
+            "targets",
+            [(m.order, m.span, m.known is None) for m in one.motions]
+            == [(m.order, m.span, m.known is None) for m in two.motions],
+        ),
+        (
+            "biases",
+            [(b.name, b.members, b.form) for b in one.biases] == [(b.name, b.members, b.form) for b in two.biases],
+        ),
+        ("frames", one.frame == two.frame),
+    ):
+        if not same:
+            raise InvalidProblem(f"the {what} of the two runs differ", "update", "give the same ones in the same order")
+    if two.times[0] <= one.times[-1]:
+        raise InvalidProblem(
+            f"its first epoch, at {two.times[0]} s, is not later than the last one, at {one.times[-1]} s",
+            "update",
+            "give epochs in the order of time",
+        )

@@ -1,0 +1,171 @@
+"""The parameter vector: which unknown lives where, shared by all epochs or local to one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from optloc.base.arrays import library
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array, Bias, Motion, Stations
+
+_STATE = (("position", "m"), ("velocity", "m/s"), ("acceleration", "m/s^2"))
+_OWN_UNIT = {"scale": "1", "rotation": "rad"}
+_RATE = {"m/s": "m/s^2"}
+_Part = tuple[str, int, str, tuple[str, ...]]
+
+
+@dataclass(frozen=True, slots=True)
+class Slot:
+    """A named part of the parameter vector.
+
+    Parameters
+    ----------
+    name : str
+        For instance "position", "velocity[2]", "clock" or "emission".
+    start, size : int
+        Place within the shared part, or within the local part of an epoch.
+    unit : str
+        SI unit.
+    members : tuple of str
+        Who has an equal share of it: the members of a bias, or the stations; empty for the state of a target.
+    """
+
+    name: str
+    start: int
+    size: int
+    unit: str
+    members: tuple[str, ...] = ()
+
+    @property
+    def entries(self) -> tuple[str, ...]:
+        """Return what tells the entries apart: a coordinate, a member, or a member and its coordinate."""
+        per = self.size // max(len(self.members), 1)
+        axes = tuple("xyz"[:per]) if per > 1 else ("",)
+        return tuple(f"{member} {axis}".strip() for member in self.members or ("",) for axis in axes)
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """The order of unknowns: the shared slots first, then the local slots of epoch 0, of epoch 1 and so on.
+
+    Parameters
+    ----------
+    shared, local : tuple of Slot
+        Unknowns of the run, and of each epoch.
+    epochs : int
+        Number of epochs k.
+    """
+
+    shared: tuple[Slot, ...]
+    local: tuple[Slot, ...]
+    epochs: int
+
+    @property
+    def n_shared(self) -> int:
+        """Return the number of shared unknowns."""
+        return sum(slot.size for slot in self.shared)
+
+    @property
+    def n_local(self) -> int:
+        """Return the number of unknowns local to each epoch."""
+        return sum(slot.size for slot in self.local)
+
+    @property
+    def size(self) -> int:
+        """Return the length of the parameter vector."""
+        return self.n_shared + self.epochs * self.n_local
+
+    def find(self, name: str) -> tuple[Slot, bool]:
+        """Return the slot of a name and whether it is shared; raise InvalidProblem for an unknown name."""
+        for slots, is_shared in ((self.shared, True), (self.local, False)):
+            for slot in slots:
+                if slot.name == name:
+                    return slot, is_shared
+        known = ", ".join(slot.name for slot in (*self.shared, *self.local))
+        raise InvalidProblem(f"no unknown is called {name!r}", advice=f"this problem has {known}")
+
+    def split(self, x: Array) -> tuple[Array, Array]:
+        """Return the shared part (..., n) and the local part (..., k, l) of vectors (..., size)."""
+        n = self.n_shared
+        return x[..., :n], library(x).reshape(x[..., n:], (*x.shape[:-1], self.epochs, self.n_local))
+
+    def take(self, x: Array, name: str) -> Array:
+        """Return a named part, (..., q) of the shared unknowns or (..., k, q) of the local ones."""
+        slot, is_shared = self.find(name)
+        shared, local = self.split(x)
+        return (shared if is_shared else local)[..., slot.start : slot.start + slot.size]
+
+    def labels(self) -> tuple[str, ...]:
+        """Return one label for each entry of the shared part, for instance "position x" or "clock B"."""
+        return tuple(f"{slot.name} {entry}".strip() for slot in self.shared for entry in slot.entries)
+
+
+def state_names(target: int, count: int, order: int) -> tuple[str, ...]:
+    """Return the slot names of a target's state, numbered where there are several targets."""
+    suffix = f"[{target}]" if count > 1 else ""
+    return tuple(name + suffix for name, _ in _STATE[: order + 1])
+
+
+def emission_name(target: int, count: int) -> str:
+    """Return the slot name of a target's emission time."""
+    return f"emission[{target}]" if count > 1 else "emission"
+
+
+def layout(
+    stations: Stations,
+    motions: Sequence[Motion],
+    biases: Sequence[Bias],
+    emitting: Sequence[int],
+    epochs: int,
+    bias_units: Sequence[str] = (),
+) -> Layout:
+    """Return the layout of a problem.
+
+    Parameters
+    ----------
+    stations : Stations
+        Gives the dimension, and station offsets where positions are uncertain.
+    motions : sequence of Motion
+        One for each target.
+    biases : sequence of Bias
+        Families of systematic errors.
+    emitting : sequence of int
+        Targets whose emission times are unknown.
+    epochs : int
+        Number of epochs.
+    bias_units : sequence of str
+        SI unit of the rows that each bias touches; empty where they have several, or where it does not matter.
+    """
+    shared: list[_Part] = []
+    local: list[_Part] = []
+    for i, motion in enumerate(motions):
+        if motion.known is None:
+            room = shared if motion.span == "run" else local
+            units = (unit for _, unit in _STATE)
+            names = state_names(i, len(motions), motion.order)
+            room.extend((name, stations.dimension, unit, ()) for name, unit in zip(names, units, strict=False))
+    turns = 1 if stations.dimension == 2 else 3
+    for bias, unit in zip(biases, bias_units or [""] * len(biases), strict=True):
+        size = len(bias.members) * (turns if bias.form == "rotation" else 1)
+        shared.append((bias.name, size, _bias_unit(bias.form, unit), bias.members))
+    local.extend((emission_name(i, len(motions)), 1, "m", ()) for i in emitting)
+    if stations.covariance is not None and stations.span != "noise":
+        room = shared if stations.span == "run" else local
+        room.append(("stations", stations.count * stations.dimension, "m", stations.names))
+    return Layout(_slots(shared), _slots(local), epochs)
+
+
+def _bias_unit(form: str, unit: str) -> str:
+    """Return the unit of a bias on rows of a unit: "1" is that of ratios."""
+    if form in _OWN_UNIT:
+        return _OWN_UNIT[form]
+    return unit if form == "offset" else _RATE.get(unit, f"{unit}/s" if unit else "")
+
+
+def _slots(parts: list[_Part]) -> tuple[Slot, ...]:
+    slots, start = [], 0
+    for name, size, unit, members in parts:
+        slots.append(Slot(name, start, size, unit, members))
+        start += size
+    return tuple(slots)

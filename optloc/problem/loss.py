@@ -1,0 +1,140 @@
+"""Robust losses: how much a residual costs, and how much its row then counts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from types import MappingProxyType
+
+import numpy as np
+
+from optloc.base.types import Array
+
+
+@dataclass(frozen=True, slots=True)
+class Loss:
+    """A loss of residuals u in standard deviations; near zero it is u², far away it grows more slowly.
+
+    Parameters
+    ----------
+    name : str
+        Also the name of the solver stage.
+    constant : float
+        Where it leaves u². They are tuned so that the mean square error of an estimate from clean Gaussian data is that
+        of least squares divided by 0.95; that of the truncated loss by 0.99, as with few rows one that is cut off
+        without need costs more than that.
+    cost : callable of (u, constant)
+        rho(u).
+    importance : callable of (u, constant)
+        The weight psi(u) / u with psi = rho' / 2: in [0, 1], not rising with abs(u).
+    one_sided : bool
+        Whether only positive residuals are doubted. Residuals of either sign of other kinds are then given as abs(u).
+    """
+
+    name: str
+    constant: float
+    cost: Callable[[Array, float], Array]
+    importance: Callable[[Array, float], Array]
+    one_sided: bool = False
+
+    def rho(self, u: Array) -> Array:
+        """Return the cost of residuals u, in sigma, elementwise: u² for small ones."""
+        return self.cost(np.asarray(u, dtype=float), self.constant)
+
+    def weight(self, u: Array) -> Array:
+        """Return the weights in [0, 1] of residuals u, in sigma, elementwise; least squares with them has their psi."""
+        return self.importance(np.asarray(u, dtype=float), self.constant)
+
+    @property
+    def psi_squared(self) -> float:
+        """Return E psi(u)² for a standard normal u."""
+        return _moments(self)[0]
+
+    @property
+    def slope(self) -> float:
+        """Return E psi'(u) for a standard normal u; by parts it is E u psi(u), which steps of psi leave valid."""
+        return _moments(self)[1]
+
+    @property
+    def mean_weight(self) -> float:
+        """Return the expected weight of a standard normal u."""
+        return _moments(self)[2]
+
+    @property
+    def efficiency(self) -> float:
+        """Return the mean square error of least squares over that of this loss, for clean Gaussian data.
+
+        P. J. Huber, "Robust Statistics" (1981), eq. 3.2.13: (E psi')² / E psi².
+        """
+        return self.slope**2 / self.psi_squared
+
+    @property
+    def spread(self) -> float:
+        """Return by what the inverse of the weighted normal matrix is multiplied for a covariance.
+
+        The covariance of an M-estimate is E psi² / (E psi')² times the inverse normal matrix of least squares (Huber
+        1981, eq. 7.6.2); the expected weight turns the weighted normal matrix into that one.
+        """
+        return self.psi_squared * self.mean_weight / self.slope**2
+
+
+_NODES, _REACH = 60, 12.0
+
+
+@lru_cache
+def _moments(loss: Loss) -> tuple[float, float, float]:
+    """Return the expected psi², u psi and weight of a standard normal u, by quadrature between the kinks."""
+    node, share = np.polynomial.legendre.leggauss(_NODES)
+    ends = np.array([-_REACH, -6.0, -loss.constant, 0.0, loss.constant, 6.0, _REACH])
+    half, middle = 0.5 * np.diff(ends)[:, None], 0.5 * (ends[1:] + ends[:-1])[:, None]
+    u = middle + half * node
+    density = half * share * np.exp(-0.5 * u**2) / np.sqrt(2.0 * np.pi)
+    weight = loss.weight(u)
+    return tuple(float((density * value).sum()) for value in ((weight * u) ** 2, weight * u**2, weight))  # type: ignore[return-value]
+
+
+def _huber(u: Array, c: float) -> Array:
+    return np.where(np.abs(u) <= c, u**2, 2.0 * c * np.abs(u) - c**2)
+
+
+def _huber_weight(u: Array, c: float) -> Array:
+    return np.asarray(c / np.maximum(np.abs(u), c))
+
+
+def _cauchy(u: Array, c: float) -> Array:
+    return np.asarray(c**2 * np.log1p((u / c) ** 2))
+
+
+def _cauchy_weight(u: Array, c: float) -> Array:
+    return np.asarray(1.0 / (1.0 + (u / c) ** 2))
+
+
+def _truncated(u: Array, c: float) -> Array:
+    return np.asarray(np.minimum(u**2, c**2))
+
+
+def _truncated_weight(u: Array, c: float) -> Array:
+    return np.asarray(1.0 * (np.abs(u) <= c))
+
+
+def _late(u: Array, c: float) -> Array:
+    return np.where(u > 0.0, _cauchy(u, c), u**2)
+
+
+def _late_weight(u: Array, c: float) -> Array:
+    return _cauchy_weight(np.maximum(u, 0.0), c)
+
+
+LOSSES = MappingProxyType(
+    {
+        loss.name: loss
+        for loss in (
+            Loss("huber", 1.345, _huber, _huber_weight),
+            Loss("cauchy", 2.385, _cauchy, _cauchy_weight),
+            Loss("truncated", 3.368, _truncated, _truncated_weight),
+            Loss("late", 2.328, _late, _late_weight, one_sided=True),
+        )
+    }
+)
+"""Losses by name: Huber 1964; Holland, Welsch 1977; Blake, Zisserman 1987; the Cauchy loss of one side."""

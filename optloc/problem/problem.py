@@ -1,0 +1,241 @@
+"""One estimation problem: stations, rows, noise and unknowns, possibly a batch of problems of one structure."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from optloc.base.arrays import library, placed
+from optloc.base.frames import CARTESIAN, Frame
+from optloc.base.types import Array, Band, Bias, Motion, Polygon, Prior, Rows, Stations
+from optloc.base.units import SI_UNIT
+from optloc.models import MODELS
+from optloc.problem.layout import Layout, layout
+from optloc.problem.noise import Block, Noise
+
+
+@dataclass(frozen=True, slots=True)
+class Problem:
+    """Everything an estimate depends on; leading axes of its arrays are a batch of independent problems.
+
+    Parameters
+    ----------
+    stations : Stations
+        Where the stations are.
+    rows : tuple of Rows
+        Measurements, one entry for each kind; global row numbers count through them in this order.
+    noise : Noise
+        Covariance over global row numbers.
+    times : array (k,)
+        Seconds of each epoch.
+    motions : tuple of Motion
+        One for each target.
+    biases : tuple of Bias
+        Unknown systematic errors.
+    priors : tuple of Prior
+        Gaussian prior knowledge of named unknowns.
+    frame : Frame
+        What the coordinates mean.
+    constraints : tuple of Band or Polygon
+        What the answer must meet.
+    """
+
+    stations: Stations
+    rows: tuple[Rows, ...]
+    noise: Noise
+    times: Array
+    motions: tuple[Motion, ...] = (Motion(),)
+    biases: tuple[Bias, ...] = ()
+    priors: tuple[Prior, ...] = ()
+    frame: Frame = CARTESIAN
+    constraints: tuple[Band | Polygon, ...] = ()
+
+    @property
+    def dimension(self) -> int:
+        """Return 2 or 3."""
+        return self.stations.dimension
+
+    @property
+    def epochs(self) -> int:
+        """Return the number of epochs."""
+        return len(self.times)
+
+    @property
+    def origin(self) -> float:
+        """Return the time from which drifts count: the first target's reference, the first epoch by default."""
+        reference = self.motions[0].reference
+        return float(self.times[0] if reference is None else reference)
+
+    @property
+    def count(self) -> int:
+        """Return the number of rows of all kinds."""
+        return sum(block.count for block in self.rows)
+
+    @property
+    def starts(self) -> tuple[int, ...]:
+        """Return the global number of the first row of each kind."""
+        counts = [block.count for block in self.rows]
+        return tuple(int(n) for n in np.cumsum([0, *counts[:-1]]))
+
+    @property
+    def emitting(self) -> tuple[int, ...]:
+        """Return the targets whose emission times are unknown."""
+        found = {int(t) for block in self.rows if MODELS[block.kind].emission for t in block.target}
+        return tuple(sorted(found))
+
+    @property
+    def layout(self) -> Layout:
+        """Return the order of the unknowns."""
+        units = [self._unit(bias.row) for bias in self.biases]
+        return layout(self.stations, self.motions, self.biases, self.emitting, self.epochs, units)
+
+    def _unit(self, touched: Array) -> str:
+        """Return the SI unit of the rows of given global numbers, empty where they have several."""
+        found = {
+            SI_UNIT[MODELS[block.kind].quantity]  # type: ignore[index]  # the table holds known quantities only
+            for block, start in zip(self.rows, self.starts, strict=True)
+            if np.any((touched >= start) & (touched < start + block.count))
+        }
+        return found.pop() if len(found) == 1 else ""
+
+    @property
+    def weight(self) -> Array:
+        """Return the weights of all rows, (..., m)."""
+        return _join([block.weight for block in self.rows])
+
+    @property
+    def z(self) -> Array:
+        """Return the measurements of all rows as measured, (..., m)."""
+        return _join([block.z for block in self.rows])
+
+    @property
+    def observed(self) -> Array:
+        """Return the measurements of all rows less their known corrections, (..., m): what h(x) is compared with."""
+        return _join([block.z - block.correction for block in self.rows])
+
+    @property
+    def epoch(self) -> Array:
+        """Return the epoch of each row, (m,)."""
+        return np.concatenate([block.epoch for block in self.rows])
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Return the leading axes that all arrays share."""
+        return np.broadcast_shapes(*(array.shape[: array.ndim - core] for array, core in _arrays(self)))
+
+    @property
+    def structure(self) -> tuple[Any, ...]:
+        """Return a hashable key of everything but the numbers; equal keys share compiled and indexed forms."""
+        rows = tuple((r.kind, r.a.tobytes(), r.b.tobytes(), r.epoch.tobytes(), r.target.tobytes()) for r in self.rows)
+        blocks = tuple((b.row.shape, b.row.tobytes()) for b in self.noise.blocks)
+        motions = tuple((m.order, m.span, m.known is None, m.reference) for m in self.motions)
+        biases = tuple(
+            (b.name, b.members, b.form, b.row.tobytes(), b.member.tobytes(), b.coefficient.tobytes())
+            for b in self.biases
+        )
+        stations = (self.stations.count, self.dimension, self.stations.covariance is None, self.stations.span)
+        constraints = tuple((c.kind, c.target) for c in self.constraints if isinstance(c, Band))
+        return (rows, blocks, motions, biases, stations, self.times.tobytes(), self.frame, constraints)
+
+    def flat(self) -> Problem:
+        """Return the same problems with exactly one batch axis."""
+        shape = self.batch_shape
+        if len(shape) == 1:
+            return self
+        size = int(np.prod(shape))
+
+        def reshape(array: Array, core: int) -> Array:
+            if array.ndim == core:
+                return array
+            inner = array.shape[array.ndim - core :]
+            return np.broadcast_to(array, (*shape, *inner)).reshape(size, *inner)
+
+        flat = _map(self, reshape)
+        return flat if shape else _map_z(flat, lambda z: z[None])
+
+    def placed(self, like: Any) -> Problem:
+        """Return the problem with its numbers as arrays of another array's library, device and float type."""
+        return _map(self, lambda array, core: placed(array, like))
+
+    def take(self, index: Array) -> Problem:
+        """Return the problems of a flat batch at an index or mask; structure stays."""
+
+        def pick(array: Array, core: int) -> Array:
+            return array if array.ndim == core or array.shape[0] == 1 else array[index]
+
+        taken = _map(self, pick)
+        if taken.batch_shape == (1,):
+            count = np.arange(self.batch_shape[0])[index].size
+            taken = _map_z(taken, lambda z: np.broadcast_to(z, (count, z.shape[-1])))
+        return taken
+
+    def with_rows(self, z: Array | None = None, weight: Array | None = None) -> Problem:
+        """Return the problem with new measurements or weights of all rows, each (..., m)."""
+        rows, cut = [], np.cumsum([block.count for block in self.rows])[:-1]
+        zs = [block.z for block in self.rows] if z is None else np.split(z, cut, axis=-1)
+        weights = [block.weight for block in self.rows] if weight is None else np.split(weight, cut, axis=-1)
+        for block, values, importance in zip(self.rows, zs, weights, strict=True):
+            rows.append(replace(block, z=values, weight=importance))
+        return replace(self, rows=tuple(rows))
+
+
+def _join(parts: list[Array]) -> Array:
+    xp = library(parts[0])
+    shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
+    joined: Array = xp.concat([xp.broadcast_to(part, (*shape, part.shape[-1])) for part in parts], axis=-1)
+    return joined
+
+
+def _arrays(problem: Problem) -> list[tuple[Array, int]]:
+    found: list[tuple[Array, int]] = []
+
+    def note(array: Array, core: int) -> Array:
+        found.append((array, core))
+        return array
+
+    _map(problem, note)
+    return found
+
+
+def _map(problem: Problem, change: Any) -> Problem:
+    """Return the problem with every numeric array replaced; `change` gets the array and its unbatched rank."""
+
+    def maybe(array: Array | None, core: int) -> Array | None:
+        return None if array is None else change(array, core)
+
+    s = problem.stations
+    stations = replace(
+        s,
+        position=change(s.position, 3),
+        velocity=maybe(s.velocity, 3),
+        axes=maybe(s.axes, 4),
+        covariance=maybe(s.covariance, 3),
+    )
+    rows = tuple(
+        replace(r, z=change(r.z, 1), weight=change(r.weight, 1), correction=change(r.correction, 1))
+        for r in problem.rows
+    )
+    noise = Noise(tuple(Block(b.row, change(b.covariance, 3)) for b in problem.noise.blocks))
+    motions = tuple(replace(m, known=maybe(m.known, 3)) for m in problem.motions)
+    priors = tuple(replace(p, mean=change(p.mean, 1), covariance=change(p.covariance, 2)) for p in problem.priors)
+    constraints = tuple(
+        c
+        if isinstance(c, Polygon)
+        else replace(c, lower=change(c.lower, 0), upper=change(c.upper, 0), coefficients=change(c.coefficients, 1))
+        for c in problem.constraints
+    )
+    return replace(
+        problem,
+        stations=stations,
+        rows=rows,
+        noise=noise,
+        motions=motions,
+        priors=priors,
+        constraints=constraints,
+    )
+
+
+def _map_z(problem: Problem, change: Any) -> Problem:
+    return replace(problem, rows=tuple(replace(r, z=change(r.z)) for r in problem.rows))

@@ -1,0 +1,348 @@
+"""A box: all nodes bounded over it, and the least length that the residual can have there."""
+
+from __future__ import annotations
+
+from math import sqrt
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled, inlined
+from optloc.proof.nodes.angles import bound_azimuth, bound_elevation
+from optloc.proof.nodes.codes import AZIMUTH, ELEVATION, LINEAR, RANGE, RATIO
+from optloc.proof.nodes.height import bound_height
+from optloc.proof.nodes.linear3 import inverse
+from optloc.proof.nodes.ranges import bound_ranges
+from optloc.proof.nodes.ratio import bound_ratio
+
+_ULP = 2.0**-52
+# Coordinate descents towards the least-squares point of a box; any point gives a valid bound.
+_SWEEPS = 3
+# Columns of a table of nodes over a box (J, 6): value at the centre, gradient, enclosure of the remainder.
+NODE_WIDTH = 6
+# Columns of a table of rows over a box (q, 5): residual in the middle of the remainders, Jacobian, direction v.
+ROW_WIDTH = 5
+
+
+@compiled
+def bound_linear(line: Array, sense: Array, data: Array, node: Array) -> None:
+    """Write the row of a linear form n.(x - o), which has no remainder, into the table of nodes."""
+    n0, n1, n2 = data[3], data[4], data[5]
+    node[0] = n0 * line[0] + n1 * line[1] + n2 * line[2]
+    for k in range(3):
+        node[1 + k] = n0 * sense[0, k] + n1 * sense[1, k] + n2 * sense[2, k]
+    node[4] = node[5] = 0.0
+
+
+@inlined
+def bound_nodes(
+    kinds: Array, data: Array, centre: Array, sense: Array, gram: Array, half: Array, line: Array, nodes: Array
+) -> None:
+    """Bound all nodes over a box in the near chart.
+
+    Parameters
+    ----------
+    kinds, data : array (J,), (J, width)
+        The nodes.
+    centre : array (3,)
+        Centre of the box, metres.
+    sense, gram : array (3, 3)
+        T with x = c + T s, and ``T'T``.
+    half : array (3,)
+        Half-widths in search coordinates.
+    line : array (6,)
+        Working memory.
+    nodes : array (J, NODE_WIDTH)
+        Written.
+    """
+    others = bound_ranges(kinds, data, centre, sense, gram, half, nodes)
+    for j in range(kinds.shape[0] if others else 0):
+        kind = kinds[j]
+        if kind == RANGE:
+            continue
+        for k in range(3):
+            line[k] = centre[k] - data[j, k]
+        if kind == LINEAR:
+            bound_linear(line, sense, data[j], nodes[j])
+        else:
+            for k in range(3):
+                line[3 + k] = centre[k] - data[j, 3 + k]
+            own, slope = data[j], nodes[j, 1:4]
+            if kind == AZIMUTH:
+                value, low, high = bound_azimuth(own, line[:3], sense, half, slope)
+            elif kind == ELEVATION:
+                value, low, high = bound_elevation(own, line[:3], sense, half, slope)
+            elif kind == RATIO:
+                value, low, high = bound_ratio(own, line[:3], sense, line[3:], sense, half, slope)
+            else:
+                value, low, high = bound_height(own, line[:3], sense, half, slope)
+            nodes[j, 0], nodes[j, 4], nodes[j, 5] = value, low, high
+
+
+@inlined
+def linearise_rows(K: Array, w: Array, nodes: Array, rows: Array) -> None:
+    """Fill residuals (in the middle of the remainders) and Jacobian of the table of rows (q, ROW_WIDTH)."""
+    for i in range(K.shape[0]):
+        middle, j0, j1, j2 = -w[i], 0.0, 0.0, 0.0
+        for j in range(K.shape[1]):
+            factor = K[i, j]
+            middle += factor * (nodes[j, 0] + 0.5 * (nodes[j, 4] + nodes[j, 5]))
+            j0 += factor * nodes[j, 1]
+            j1 += factor * nodes[j, 2]
+            j2 += factor * nodes[j, 3]
+        rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3] = middle, j0, j1, j2
+
+
+@inlined
+def cost_at(K: Array, w: Array, nodes: Array) -> float:
+    """Return f at the centre of a box whose table of nodes is filled."""
+    total = 0.0
+    for i in range(K.shape[0]):
+        residual = -w[i]
+        for j in range(K.shape[1]):
+            residual += K[i, j] * nodes[j, 0]
+        total += residual * residual
+    return total
+
+
+@inlined
+def least_residual(K: Array, weight: Array, floor: float, half: Array, nodes: Array, rows: Array) -> float:
+    """Return a lower bound of ``|K phi - w|`` over a box, negative where it says nothing.
+
+    For any v, ``v.(K phi - w)`` over the box is at least its value in the middle less what the box and the remainders
+    can change; v is the residual nearest to zero of the linear part (box-constrained least squares).
+
+    Parameters
+    ----------
+    K : array (q, J)
+        Whitened rows.
+    weight : array (J,)
+        Lengths of the columns of K.
+    floor : float
+        What else limits the accuracy of residuals: lengths of w and of the coordinates times their weights.
+    half : array (3,)
+        Half-widths in search coordinates.
+    nodes, rows : array (J, NODE_WIDTH), (q, ROW_WIDTH)
+        Filled tables; the direction v is written.
+    """
+    _nearest(half, rows)
+    length, reach, t0, t1, t2 = 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(K.shape[0]):
+        v = rows[i, 4]
+        length += v * v
+        reach += v * rows[i, 0]
+        t0 += v * rows[i, 1]
+        t1 += v * rows[i, 2]
+        t2 += v * rows[i, 3]
+    if not length > 0.0:
+        return -1.0
+    reach -= abs(t0) * half[0] + abs(t1) * half[1] + abs(t2) * half[2]
+    for j in range(K.shape[1]):
+        radius = 0.5 * (nodes[j, 5] - nodes[j, 4])
+        if radius > 0.0:
+            total = 0.0
+            for i in range(K.shape[0]):
+                total += K[i, j] * rows[i, 4]
+            reach -= abs(total) * radius
+    return float(reach / sqrt(length)) - rounding(K, weight, floor, nodes)
+
+
+@inlined
+def rounding(K: Array, weight: Array, floor: float, nodes: Array) -> float:
+    """Return a bound of the rounding errors of a residual (its length); arguments as of `least_residual`."""
+    size = floor
+    for j in range(K.shape[1]):
+        size += weight[j] * (abs(nodes[j, 0]) + abs(nodes[j, 4]) + abs(nodes[j, 5]))
+    return float((32 + K.shape[0] + K.shape[1]) * _ULP * size)
+
+
+@compiled
+def normal_of(rows: Array) -> tuple[float, float, float, float, float, float, float, float, float]:
+    """Return J'J (00, 01, 02, 11, 12, 22) and J' middle."""
+    a00, a01, a02, a11, a12, a22, b0, b1, b2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for i in range(rows.shape[0]):
+        middle, j0, j1, j2 = rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3]
+        a00 += j0 * j0
+        a01 += j0 * j1
+        a02 += j0 * j2
+        a11 += j1 * j1
+        a12 += j1 * j2
+        a22 += j2 * j2
+        b0 += j0 * middle
+        b1 += j1 * middle
+        b2 += j2 * middle
+    return a00, a01, a02, a11, a12, a22, b0, b1, b2
+
+
+@compiled
+def within(s: float, half: float) -> float:
+    """Return the number nearest to s between -half and half."""
+    if s > half:
+        return half
+    return max(s, -half)
+
+
+@inlined
+def _nearest(half: Array, rows: Array) -> None:
+    """Write the direction v = middle + J s with s nearly the least-squares solution inside the box."""
+    a00, a01, a02, a11, a12, a22, b0, b1, b2 = normal_of(rows)
+    d0, d1 = 1.0 / a00 if a00 > 0.0 else 0.0, 1.0 / a11 if a11 > 0.0 else 0.0
+    d2 = 1.0 / a22 if a22 > 0.0 else 0.0
+    s0, s1, s2 = 0.0, 0.0, 0.0
+    for _ in range(_SWEEPS):
+        s0 = within(-(b0 + a01 * s1 + a02 * s2) * d0, half[0])
+        s1 = within(-(b1 + a01 * s0 + a12 * s2) * d1, half[1])
+        s2 = within(-(b2 + a02 * s0 + a12 * s1) * d2, half[2])
+    for i in range(rows.shape[0]):
+        rows[i, 4] = rows[i, 0] + rows[i, 1] * s0 + rows[i, 2] * s1 + rows[i, 3] * s2
+
+
+# Parts of a box that may be left out: where residuals are too long.
+
+
+@inlined
+def shrink(K: Array, rho: float, plane: bool, nodes: Array, rows: Array, cut: Array, solve: Array) -> None:
+    """Clip a box to where the residual may be shorter than rho.
+
+    With Y = (J'J)^-1 J' every point of the box obeys ``s = Y (residual) - Y (middle) - Y K dq``, dq the remainders
+    from their middle: each coordinate is within ``rho |Y_k| + sum_j |Y_k K_j| (high_j - low_j)/2`` of that of Y middle.
+
+    Parameters
+    ----------
+    K : array (q, J)
+        Whitened rows.
+    rho : float
+        Longest residual of interest, rounding included.
+    plane : bool
+        Whether nothing depends on the third coordinate.
+    nodes, rows : arrays
+        Filled tables of the box.
+    cut : array (6,)
+        Lower and upper ends of the box about its centre; clipped.
+    solve : array (3, 3)
+        Working memory.
+    """
+    a00, a01, a02, a11, a12, a22, b0, b1, b2 = normal_of(rows)
+    if plane:
+        a22 = a22 + 1.0
+    if not inverse(a00, a01, a02, a11, a12, a22, solve):
+        return
+    c0 = solve[0, 0] * b0 + solve[0, 1] * b1 + solve[0, 2] * b2
+    c1 = solve[1, 0] * b0 + solve[1, 1] * b1 + solve[1, 2] * b2
+    c2 = solve[2, 0] * b0 + solve[2, 1] * b1 + solve[2, 2] * b2
+    r0, r1 = rho * sqrt(max(solve[0, 0], 0.0)), rho * sqrt(max(solve[1, 1], 0.0))
+    r2 = rho * sqrt(max(solve[2, 2], 0.0))
+    for j in range(K.shape[1]):
+        radius = 0.5 * (nodes[j, 5] - nodes[j, 4])
+        if radius > 0.0:
+            p0, p1, p2 = 0.0, 0.0, 0.0
+            for i in range(K.shape[0]):
+                p0 += K[i, j] * rows[i, 1]
+                p1 += K[i, j] * rows[i, 2]
+                p2 += K[i, j] * rows[i, 3]
+            r0 += abs(solve[0, 0] * p0 + solve[0, 1] * p1 + solve[0, 2] * p2) * radius
+            r1 += abs(solve[1, 0] * p0 + solve[1, 1] * p1 + solve[1, 2] * p2) * radius
+            r2 += abs(solve[2, 0] * p0 + solve[2, 1] * p1 + solve[2, 2] * p2) * radius
+    clip(cut, 0, -c0, r0)
+    clip(cut, 1, -c1, r1)
+    if not plane:
+        clip(cut, 2, -c2, r2)
+
+
+@inlined
+def uncut(half: Array, cut: Array) -> None:
+    """Write the ends of a whole box."""
+    for k in range(3):
+        cut[k], cut[3 + k] = -half[k], half[k]
+
+
+@compiled
+def clip(cut: Array, k: int, centre: float, reach: float) -> None:
+    """Clip coordinate k of a box to ``|s - centre| <= reach``, with some slack for rounding."""
+    reach += 1e-9 * (abs(centre) + reach)
+    cut[k], cut[3 + k] = max(cut[k], centre - reach), min(cut[3 + k], centre + reach)
+
+
+@inlined
+def cut_out(cut: Array, at: Array, half: Array) -> float:
+    """Replace a box by its part between the ends of a cut; return the share of its volume that this is."""
+    share = 1.0
+    for k in range(3):
+        low, high, old = cut[k], cut[3 + k], half[k]
+        if low > high:
+            return 0.0
+        if low > -old or high < old:
+            middle = at[k] + 0.5 * (low + high)
+            half[k] = min(0.5 * (high - low) * (1.0 + 1e-12) + 1e-15 * (abs(at[k]) + old), old)
+            at[k] = middle
+            share *= half[k] / old
+    return share
+
+
+@compiled
+def is_empty(cut: Array) -> bool:
+    """Return whether nothing is left of a box."""
+    return bool(cut[0] > cut[3] or cut[1] > cut[4] or cut[2] > cut[5])
+
+
+# The stack of boxes still to be looked at: rows of centre, half-widths and the bound of the box they came from.
+
+CAPACITY, DEPTH = 512, 7
+
+
+@compiled
+def push_around(stack: Array, low: Array, high: Array, hole: Array) -> int:
+    """Push the box between two corners, less the box |s_k| <= hole_k around the origin; return how many that makes.
+
+    The hole is cut out along its faces: at most two slabs a dimension. Slabs overlap the hole by a rounding.
+    """
+    size = 0
+    low, high = low.copy(), high.copy()
+    for k in range(3):
+        for side in range(2):
+            first, last = (low[k], min(-hole[k], high[k])) if side == 0 else (max(hole[k], low[k]), high[k])
+            if not last > first:
+                continue
+            for m in range(3):
+                a, b = (first, last) if m == k else (low[m], high[m])
+                stack[size, m], stack[size, 3 + m] = 0.5 * (a + b), _wide(0.5 * (b - a), abs(a) + abs(b))
+            stack[size, 6] = 0.0
+            size += 1
+        if -hole[k] > high[k] or hole[k] < low[k]:
+            return size
+        low[k], high[k] = max(low[k], -hole[k]), min(high[k], hole[k])
+    return size
+
+
+@compiled
+def pop(stack: Array, row: int, at: Array, half: Array) -> None:
+    """Write centre and half-widths of a box on the stack into `at` and `half`."""
+    for k in range(3):
+        at[k], half[k] = stack[row, k], stack[row, 3 + k]
+
+
+@compiled
+def push(stack: Array, size: int, at: Array, half: Array, low: float) -> int:
+    """Push a box; return the size of the stack."""
+    for k in range(3):
+        stack[size, k], stack[size, 3 + k] = at[k], half[k]
+    stack[size, 6] = low
+    return size + 1
+
+
+@compiled
+def push_halves(stack: Array, size: int, k: int, at: Array, half: Array, low: float) -> int:
+    """Push the halves of a box, cut across side k; return the size of the stack."""
+    for side in range(2):
+        for m in range(3):
+            stack[size, m], stack[size, 3 + m] = at[m], half[m]
+        quarter = 0.5 * half[k]
+        stack[size, k] = at[k] + (quarter if side else -quarter)
+        stack[size, 3 + k] = _wide(quarter, abs(at[k]) + half[k])
+        stack[size, 6] = low
+        size += 1
+    return size
+
+
+@compiled
+def _wide(half: float, size: float) -> float:
+    """Return a half-width that covers the rounding of a centre and of a corner of this size."""
+    return half * (1.0 + 1e-12) + 1e-15 * size if half > 0.0 else 0.0

@@ -1,0 +1,460 @@
+"""Branch and bound around a fix: nothing costs less, and no other minimum costs nearly as little."""
+
+from __future__ import annotations
+
+from math import inf, isnan, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled, inlined
+from optloc.proof.box import (
+    CAPACITY,
+    DEPTH,
+    bound_nodes,
+    cost_at,
+    cut_out,
+    is_empty,
+    least_residual,
+    linearise_rows,
+    pop,
+    push,
+    push_around,
+    push_halves,
+    rounding,
+    shrink,
+    uncut,
+)
+from optloc.proof.chart import Box, Chart, Cost, accuracy_floor, chart_at, curve_box, is_convex, place, value_at
+from optloc.proof.convex import clip_to_stationary, convex, curve_nodes, sum_up
+from optloc.proof.enclosure import enclose
+from optloc.proof.nodes.codes import RANGE
+from optloc.proof.nodes.linear3 import inverse, positive
+
+# A few damped Newton steps in search coordinates: which minimum a low point belongs to.
+
+_STEPS = 40
+_CLOSE = 1e-3
+
+
+@compiled
+def descend(cost: Cost, chart: Chart, box: Box) -> float:
+    """Move the centre of a box to a minimum of the cost; return the cost there, or infinity where none is reached.
+
+    The half-widths become zero, and the tables are those of the point. Newton's Hessian where it is positive definite,
+    that of Gauss and Newton elsewhere, damped after Levenberg and Marquardt.
+    """
+    box.half[:] = 0.0
+    start = box.at.copy()
+    cost_now, damping = value_at(cost, chart, box), 1e-6
+    curve_box(cost, chart, box)
+    for _ in range(_STEPS):
+        length = _step(cost, box, damping)
+        if not length >= 0.0:
+            return float("inf")
+        start[:] = box.at
+        for k in range(3):
+            box.at[k] -= box.solve[0, k]
+        after = value_at(cost, chart, box)
+        if after <= cost_now * (1.0 + 1e-14) + 1e-14:
+            cost_now = after
+            curve_box(cost, chart, box)
+            if length < _CLOSE * _CLOSE and damping <= 1e-3:
+                sums = box.sums
+                good = positive(sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] if sums[5] != 0.0 else 1.0)
+                return cost_now if good else float("inf")
+            damping *= 0.1
+        else:
+            box.at[:] = start
+            damping = max(10.0 * damping, 1e-4)
+    return float("inf")
+
+
+@compiled
+def _step(cost: Cost, box: Box, damping: float) -> float:
+    """Write the damped step into the first row of box.solve; return its squared length, NaN where there is none."""
+    sums, solve = box.sums, box.solve
+    h0, h1, h2, h3, h4, h5 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
+    if h5 == 0.0:
+        h5 = 1.0
+    if not positive(h0, h1, h2, h3, h4, h5):
+        for j in range(box.curves.shape[0]):
+            force = box.curves[j, 10]
+            h0 -= force * box.curves[j, 0]
+            h1 -= force * box.curves[j, 1]
+            h2 -= force * box.curves[j, 2]
+            h3 -= force * box.curves[j, 3]
+            h4 -= force * box.curves[j, 4]
+            h5 -= force * box.curves[j, 5]
+    more = 1.0 + damping
+    if not inverse(h0 * more, h1, h2, h3 * more, h4, h5 * more, solve):
+        return float("nan")
+    g0, g1, g2 = sums[6], sums[7], sums[8]
+    s0 = solve[0, 0] * g0 + solve[0, 1] * g1 + solve[0, 2] * g2
+    s1 = solve[1, 0] * g0 + solve[1, 1] * g1 + solve[1, 2] * g2
+    s2 = solve[2, 0] * g0 + solve[2, 1] * g1 + solve[2, 2] * g2
+    solve[0, 0], solve[0, 1], solve[0, 2] = s0, s1, s2
+    return float(s0 * s0 + s1 * s1 + s2 * s2)
+
+
+# Branch and bound over boxes of the near chart.
+
+# What a search finds: nothing, a cheaper point, another minimum below the level, or no end within the budget.
+CLEAR, CHEAPER, ANOTHER, SPENT = range(4)
+# Share of a box below which what is left is looked at again before it is cut.
+_SHRUNK = 0.5
+
+
+class Aim(NamedTuple):
+    """What is to be shown of every box.
+
+    Parameters
+    ----------
+    level : float
+        Cost from which on a box is done.
+    value : float
+        Cost that every point must be shown to have.
+    better : float
+        Cost below which a point refutes the fix; above `value`, so that no sliver is left between the two.
+    whole : bool
+        Whether a box is done as well where the gradient cannot vanish, because the search as a whole leaves no way out;
+        otherwise only if its cost is at least `value`.
+    floor : float
+        See `optloc.proof.box.least_residual`.
+    """
+
+    level: float
+    value: float
+    better: float
+    whole: bool
+    floor: float
+
+
+@compiled
+def branch(
+    cost: Cost, chart: Chart, box: Box, minima: Array, sides: Array, aim: Aim, budget: int, stack: Array, size: int
+) -> tuple[int, int, float]:
+    """Look at the boxes of a stack until none is left.
+
+    Parameters
+    ----------
+    cost, chart : Cost, Chart
+        The cost and its search coordinates.
+    box : Box
+        Tables; holds the point of the outcomes CHEAPER and ANOTHER in the end.
+    minima, sides : array (P, 3)
+        Known minima, and half-widths of boxes around them where the cost is convex.
+    aim : Aim
+        What is to be shown.
+    budget : int
+        How many boxes may be looked at.
+    stack, size : array (CAPACITY, DEPTH), int
+        The boxes (`optloc.proof.box`).
+
+    Returns
+    -------
+    outcome : int
+        CLEAR: all is shown. CHEAPER: a point below `aim.better`. ANOTHER: a minimum below `aim.level`. SPENT: boxes are
+        left.
+    boxes : int
+        How many boxes were looked at.
+    bound : float
+        A lower bound of f in the boxes left; infinite if there are none.
+    """
+    # Arrays by names of their own: to hand a record on counts references to all it holds, at every box.
+    kinds, data, K, w, A = cost.kinds, cost.data, cost.K, cost.w, cost.A
+    sense, gram, at, half, centre, line = chart.sense, chart.gram, box.at, box.half, box.centre, box.line
+    nodes, rows, curves, sums, solve, cut = box.nodes, box.rows, box.curves, box.sums, box.solve, box.cut
+    weight, origin, unique = cost.weight, chart.origin, aim.level > aim.value
+    rho = sqrt(max(aim.level, 0.0))
+    boxes, low_points = 0, 0
+    while size > 0:
+        if boxes >= budget or size + 2 > stack.shape[0]:
+            return SPENT, boxes, _lowest(stack, size)
+        size -= 1
+        pop(stack, size, at, half)
+        boxes += 1
+        place(origin, sense, at, centre)
+        bound_nodes(kinds, data, centre, sense, gram, half, line, nodes)
+        linearise_rows(K, w, nodes, rows)
+        low = least_residual(K, weight, aim.floor, half, nodes, rows)
+        if low > 0.0 and low * low >= aim.level:
+            continue
+        here = cost_at(K, w, nodes)
+        if here < aim.better:
+            return CHEAPER, boxes, 0.0
+        uncut(half, cut)
+        shrink(K, rho + rounding(K, weight, aim.floor, nodes), half[2] == 0.0, nodes, rows, cut, solve)
+        if unique or aim.whole:
+            sound = aim.whole or (low > 0.0 and low * low >= aim.value)
+            if sound and is_known(at, half, minima, sides):
+                continue
+            curve_nodes(kinds, data, centre, sense, gram, half, line, solve, nodes, curves)
+            sum_up(K, w, nodes, curves, sums)
+            if sound:
+                clip_to_stationary(A, half, nodes, curves, sums, cut, solve)
+            if here < aim.level and not is_empty(cut):
+                low_points += 1
+                # Early, then more and more seldom, and wherever a box holds one minimum at most.
+                if low_points & (low_points - 1) == 0 or convex(kinds, A, half, nodes, curves, sums, 0.0):
+                    outcome = _follow(cost, chart, box, minima, sides, aim)
+                    if outcome != CLEAR:
+                        return outcome, boxes, 0.0
+        side = cut_side(kinds, K, gram, half, nodes, rows, here < aim.level)
+        share = cut_out(cut, at, half)
+        if 0.0 < share < _SHRUNK:
+            size = push(stack, size, at, half, low)
+        elif share > 0.0:
+            size = push_halves(stack, size, side, at, half, low)
+    return CLEAR, boxes, inf
+
+
+@compiled
+def _follow(cost: Cost, chart: Chart, box: Box, minima: Array, sides: Array, aim: Aim) -> int:
+    """Descend from the centre of a box to a minimum; return CHEAPER, or ANOTHER if it is not known, or CLEAR.
+
+    The box is the minimum afterwards, or where all is clear what it was, but for its tables.
+    """
+    at, half = box.at.copy(), box.half.copy()
+    least = descend(cost, chart, box)
+    if least < aim.better:
+        return CHEAPER
+    if least < aim.level and not is_known(box.at, box.half, minima, sides):
+        return ANOTHER
+    box.at[:], box.half[:] = at, half
+    return CLEAR
+
+
+@compiled
+def is_known(at: Array, half: Array, minima: Array, sides: Array) -> bool:
+    """Return whether a box lies inside the convex box (half-widths `sides`) of a known minimum."""
+    for p in range(minima.shape[0]):
+        inside = True
+        for k in range(3):
+            inside = inside and abs(at[k] - minima[p, k]) + half[k] <= sides[p, k]
+        if inside:
+            return True
+    return False
+
+
+@inlined
+def cut_side(kinds: Array, K: Array, gram: Array, half: Array, nodes: Array, rows: Array, inside: bool) -> int:
+    """Return the coordinate across which to cut a box: where the remainders that matter shrink most.
+
+    The remainder of a range is nearly ``s'N s / 2``, so coordinate k has the share ``h_k sum_m |N_km| h_m`` in it; it
+    matters with its pull ``|K_j.v|`` on the bound. Where ranges have no part in the bound, and where no bound can do,
+    because the centre lies below the level (`inside`), the widest side is cut.
+    """
+    if inside:
+        return _widest(half)
+    t0, t1, t2, h0, h1, h2 = 0.0, 0.0, 0.0, half[0], half[1], half[2]
+    for j in range(kinds.shape[0]):
+        wide = nodes[j, 5] - nodes[j, 4]
+        if kinds[j] == RANGE and wide > 0.0:
+            pull = 0.0
+            for i in range(K.shape[0]):
+                pull += K[i, j] * rows[i, 4]
+            e0, e1, e2 = nodes[j, 1] * h0, nodes[j, 2] * h1, nodes[j, 3] * h2
+            a, b = abs(gram[0, 1] * h0 * h1 - e0 * e1), abs(gram[0, 2] * h0 * h2 - e0 * e2)
+            c = abs(gram[1, 2] * h1 * h2 - e1 * e2)
+            x, y = gram[0, 0] * h0 * h0 - e0 * e0 + a + b, gram[1, 1] * h1 * h1 - e1 * e1 + a + c
+            z = gram[2, 2] * h2 * h2 - e2 * e2 + b + c
+            pull = abs(pull) * wide / (x + y + z + 1e-300)
+            t0 += pull * x
+            t1 += pull * y
+            t2 += pull * z
+    most = max(t0, t1, t2)
+    if not most > 0.0:
+        return _widest(half)
+    return 0 if t0 == most else (1 if t1 == most else 2)
+
+
+@inlined
+def _widest(half: Array) -> int:
+    if half[0] >= half[1] and half[0] >= half[2]:
+        return 0
+    return 1 if half[1] >= half[2] else 2
+
+
+@compiled
+def _lowest(stack: Array, size: int) -> float:
+    """Return a lower bound of the cost in the boxes left."""
+    least = inf
+    for i in range(size):
+        low = max(stack[i, 6], 0.0)
+        least = min(least, low * low)
+    return least
+
+
+# Boxes around minima on which the cost is convex: no second minimum fits in.
+
+# What is left of a box that is not convex, and how often it is made smaller.
+_SHARE, _SHRINKS = 0.7, 60
+
+
+@inlined
+def set_convex(cost: Cost, chart: Chart, box: Box, hull: Array, margin: float) -> bool:
+    """Make a box around its centre as large as the cost is found convex on it; return False where it is on none.
+
+    Convex over the whole hull in most cases; else the hull is shrunk as a whole.
+
+    Parameters
+    ----------
+    cost, chart : Cost, Chart
+        The cost and its search coordinates.
+    box : Box
+        Its centre `at` is a minimum; its half-widths are written.
+    hull : array (3,)
+        Half-widths beyond which there is nothing to gain.
+    margin : float
+        By how much the Hessian of f/2 must exceed zero.
+    """
+    size = 1.0
+    for _ in range(_SHRINKS):
+        for k in range(3):
+            box.half[k] = size * hull[k]
+        if is_convex(cost, chart, box, margin):
+            return True
+        size *= _SHARE
+    return False
+
+
+# Verdicts of a proof.
+UNIQUE, VALUE, BETTER, OTHER, BUDGET, OPEN, STATIONARY, SINGULAR = range(8)
+
+
+@compiled
+def prove(
+    cost: Cost,
+    box: Box,
+    x: Array,
+    others: Array,
+    kappa: float,
+    eps: float,
+    budget: int,
+    lower: Array,
+    upper: Array,
+    closed: bool,
+    found: Array,
+) -> tuple[int, int, float]:
+    """Prove that a fix is the least point of ``f = |K phi(x) - w|^2``, and the only minimum below ``f(x) + kappa``.
+
+    Parameters
+    ----------
+    cost : Cost
+        The cost; unknowns other than the position have been projected out.
+    box : Box
+        Tables to work with, see `optloc.proof.chart.empty_box`.
+    x : array (D,)
+        The fix, polished.
+    others : array (P, D)
+        Other minima that are known, polished; boxes around them where the cost is convex are set aside.
+    kappa : float
+        Gap to prove; 0 proves the value alone.
+    eps : float
+        How far below the cost of the fix still counts as equal, 1e-6 (1 + f) or so: covers rounding.
+    budget : int
+        How many boxes may be looked at.
+    lower, upper : array (D,)
+        Corners of the region to search, in the frame of x; NaN in lower[0] asks for an enclosure of all points that
+        cost less than f(x) + kappa, which makes the claim a global one.
+    closed : bool
+        With a region: whether points outside it are dealt with elsewhere, so that a place where the gradient cannot
+        vanish need not be bounded. False: the claim is for the region alone.
+    found : array (D,)
+        Written: the better or other point (verdicts BETTER and OTHER).
+
+    Returns
+    -------
+    verdict : int
+        UNIQUE: the value is proven, and no other minimum (beside `others`) has a gap below kappa. VALUE: kappa is 0 and
+        the value is proven. BETTER: `found` costs less. OTHER: `found` is close to another minimum whose gap is below
+        kappa. BUDGET: boxes are left. OPEN: there is no enclosure. STATIONARY: the fix is no strict minimum, or not
+        polished enough. SINGULAR: the rows do not determine a position near the fix.
+    boxes : int
+        How many boxes were looked at.
+    bound : float
+        A certified lower bound of f over the region or over all positions; -inf where there is none.
+    """
+    chart, good = chart_at(cost, x, box)
+    if not good:
+        return SINGULAR, 0, -inf
+    least, sums = cost_at(cost.K, cost.w, box.nodes), box.sums
+    # On a box whose Hessian exceeds a margin the cost falls below that of its centre by slope^2 / margin at most.
+    margin = (sums[6] * sums[6] + sums[7] * sums[7] + sums[8] * sums[8]) / eps
+    level = least + kappa if kappa > 0.0 else least - eps
+    corners = np.empty((2, 3))
+    low, high = corners[0], corners[1]
+    if not _start(cost, chart, box, sqrt(least + kappa), lower, upper, low, high):
+        return OPEN, 0, -inf
+    minima, sides, known = _minima(cost, chart, box, others, low, high, margin)
+    if known == 0:
+        return STATIONARY, 0, -inf
+    if kappa <= 0.0:
+        known = 1
+    aim = Aim(level, least - eps, least - 0.5 * eps, closed or isnan(lower[0]), accuracy_floor(cost, chart))
+    stack = np.empty((CAPACITY, DEPTH))
+    size = push_around(stack, low, high, sides[0])
+    outcome, boxes, bound = branch(cost, chart, box, minima[:known], sides[:known], aim, budget, stack, size)
+    if outcome == CLEAR:
+        return UNIQUE if kappa > 0.0 else VALUE, boxes, least - eps
+    if outcome == SPENT:
+        return BUDGET, boxes, min(bound, least - eps)
+    for k in range(x.shape[0]):
+        found[k] = box.centre[k]
+    return BETTER if outcome == CHEAPER else OTHER, boxes, 0.0
+
+
+@inlined
+def _start(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper: Array, low: Array, high: Array) -> bool:
+    """Write the corners of the box to search: the region, or an enclosure of all that costs less than rho^2."""
+    if isnan(lower[0]):
+        chosen = chart.origin, chart.sense, chart.back
+        if not enclose(cost.kinds, cost.data, cost.A, cost.groups, box.nodes, box.curves, *chosen, rho, low, high):
+            return False
+    else:
+        for k in range(3):
+            middle, reach = 0.0, 0.0
+            for m in range(lower.shape[0]):
+                middle += chart.back[k, m] * (0.5 * (lower[m] + upper[m]) - chart.origin[m])
+                reach += abs(chart.back[k, m]) * 0.5 * (upper[m] - lower[m])
+            low[k], high[k] = middle - reach, middle + reach
+    widest = 0.0
+    for k in range(3):
+        slack = 1e-9 * (1.0 + abs(low[k]) + abs(high[k])) if high[k] > low[k] else 0.0
+        low[k], high[k] = low[k] - slack, high[k] + slack
+        widest = max(widest, abs(low[k]), abs(high[k]))
+    return widest < 1e300
+
+
+@inlined
+def _minima(
+    cost: Cost, chart: Chart, box: Box, others: Array, low: Array, high: Array, margin: float
+) -> tuple[Array, Array, int]:
+    """Return the known minima (1 + P, 3) in search coordinates, half-widths of convex boxes around them, their number.
+
+    The fix comes first; the number is 0 where the cost is not convex around it. Points that are no minima are left out.
+    """
+    count = 0
+    minima, sides, hull = np.zeros((1 + others.shape[0], 3)), np.zeros((1 + others.shape[0], 3)), np.empty(3)
+    for p in range(1 + others.shape[0]):
+        box.at[:] = 0.0
+        if p > 0:
+            for k in range(3):
+                for m in range(others.shape[1]):
+                    box.at[k] += chart.back[k, m] * (others[p - 1, m] - chart.origin[m])
+            box.half[:] = 0.0
+            if not is_convex(cost, chart, box, 0.0):
+                continue
+            sums = box.sums
+            # Within a hundredth of a standard deviation of its minimum.
+            margin = 100.0 * sqrt(sums[6] * sums[6] + sums[7] * sums[7] + sums[8] * sums[8])
+        for k in range(3):
+            hull[k] = max(high[k] - box.at[k], box.at[k] - low[k], 0.0)
+        if set_convex(cost, chart, box, hull, margin):
+            minima[count], sides[count] = box.at, box.half
+            count += 1
+        elif p == 0:
+            return minima, sides, 0
+    return minima, sides, count

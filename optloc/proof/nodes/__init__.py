@@ -1,0 +1,1 @@
+"""What a proof knows of each kind of measurement over a box."""

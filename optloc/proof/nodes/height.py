@@ -1,0 +1,119 @@
+"""Geodetic height over a box: a distance to the ellipsoid, so it curves like the ranges to the centres of two balls.
+
+An ellipsoid contains, at each of its points, the tangent ball of its least radius of curvature b^2/a, and lies in that
+of its greatest, a^2/b (Blaschke's rolling theorem). Above it the height is convex, its Hessian between 0 and
+1/(b^2/a + height) across the normal.
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled
+from optloc.models.primitives import WGS84_A, WGS84_F
+from optloc.proof.nodes.forms import Triple, across, blend, excess, length, pull, reach, triple, unbounded, write
+
+_B = WGS84_A * (1.0 - WGS84_F)
+_E2 = WGS84_F * (2.0 - WGS84_F)
+LEAST_RADIUS = _B * _B / WGS84_A
+# What Bowring's latitude and rounding leave, metres; see `optloc.models.primitives.geodetic_height`.
+_EXACT = 1e-8
+# Deeper than this, where many normals meet, Bowring's latitude is no longer exact.
+_DEEP = -2e6
+
+
+@compiled
+def geodetic(x: float, y: float, z: float) -> tuple[float, float, float, float]:
+    """Return height, distance from the axis, and sine and cosine of the latitude, as `optloc.models.primitives` does.
+
+    Coordinates are Earth-centred Earth-fixed, metres.
+    """
+    p = sqrt(x * x + y * y + 1e-12)
+    rise, run = z * WGS84_A, p * _B
+    whole = sqrt(rise * rise + run * run)
+    su, cu = rise / whole, run / whole
+    sp, cp = su, cu
+    for _ in range(2):
+        rise, run = z + (_E2 / (1.0 - _E2)) * _B * su * su * su, p - _E2 * WGS84_A * cu * cu * cu
+        whole = sqrt(rise * rise + run * run)
+        sp, cp = rise / whole, run / whole
+        rise = (1.0 - WGS84_F) * sp
+        whole = sqrt(rise * rise + cp * cp)
+        su, cu = rise / whole, cp / whole
+    return p * cp + z * sp - WGS84_A * sqrt(1.0 - _E2 * sp * sp), p, sp, cp
+
+
+@compiled
+def _normal(data: Array, line: Array) -> tuple[float, Triple, Triple, Triple, float]:
+    """Return height, upward, eastward and northward unit vectors in the problem's frame, and sine of the latitude."""
+    e = data[6] * line[0] + data[7] * line[1] + data[8] * line[2] + data[3]
+    f = data[9] * line[0] + data[10] * line[1] + data[11] * line[2] + data[4]
+    g = data[12] * line[0] + data[13] * line[1] + data[14] * line[2] + data[5]
+    height, p, sp, cp = geodetic(e, f, g)
+    ce, se = e / p, f / p
+    first, second, third = triple(data, 6), triple(data, 9), triple(data, 12)
+    outward, east = blend(ce, first, se, second), blend(-se, first, ce, second)
+    return height, blend(cp, outward, sp, third), east, blend(-sp, outward, cp, third), sp
+
+
+@compiled
+def bound_height(data: Array, line: Array, sense: Array, half: Array, slope: Array) -> tuple[float, float, float]:
+    """Bound a geodetic height over a box (see `optloc.proof.nodes.codes`), metres.
+
+    Deep in the Earth the model's formula is no exact height; there it lies between ``-|x| - a`` and ``|x| - b``.
+    """
+    height, up, _, _, _ = _normal(data, line)
+    h = triple(half, 0)
+    n = pull(up, sense)
+    swing, aside = reach(n, h), across(sense, n, h)
+    way = sqrt(swing * swing + aside * aside)
+    if not height - way > _DEEP:
+        slope[0] = slope[1] = slope[2] = 0.0
+        farthest = _distance(data, line) + way
+        return height, -farthest - WGS84_A - height, farthest - _B - height
+    write(n, slope)
+    slack = _EXACT * max(1.0, height / LEAST_RADIUS)
+    return height, -slack, excess(LEAST_RADIUS + height - swing, aside) + slack
+
+
+@compiled
+def curve_height(data: Array, line: Array, sense: Array, half: Array, curvature: Array, turn: Array) -> float:
+    """Bound how a geodetic height curves over a box (see `optloc.proof.nodes.codes`).
+
+    The Hessian is ``e e'/(N + h) + n n'/(M + h)`` with e east, n north, and M, N the radii of curvature of meridian and
+    prime vertical. Its derivative is at most 1.2 / (b^2/a + h)^2: ``3 p q^2`` with ``p^2 + q^2 = 1`` (1.155) for the
+    turning normal and the stretching tangents, ``3/2 e^2 (1 + e^2)`` (0.01) for curvature that changes with latitude.
+    """
+    height, up, east, north, sp = _normal(data, line)
+    h = triple(half, 0)
+    n = pull(up, sense)
+    swing, aside = reach(n, h), across(sense, n, h)
+    way = sqrt(swing * swing + aside * aside)
+    if not height - way > _DEEP:
+        return unbounded(curvature, turn)
+    flat = 1.0 - _E2 * sp * sp
+    prime = WGS84_A / sqrt(flat)
+    meridian = prime * (1.0 - _E2) / flat
+    u, v = pull(east, sense), pull(north, sense)
+    bend = 1.0 / (LEAST_RADIUS + height - way)
+    change = 1.2 * bend * bend * way
+    chi = 0.0
+    for k in range(3):
+        for m in range(3):
+            curvature[k, m] = u[k] * u[m] / (prime + height) + v[k] * v[m] / (meridian + height)
+    for k in range(3):
+        column = length((sense[0, k], sense[1, k], sense[2, k]))
+        own = reach((curvature[k, 0], curvature[k, 1], curvature[k, 2]), h)
+        turn[k] = own + change * column * way
+        chi += column * column * change
+    return chi
+
+
+@compiled
+def _distance(data: Array, line: Array) -> float:
+    """Return the distance from the centre of the Earth."""
+    e = data[6] * line[0] + data[7] * line[1] + data[8] * line[2] + data[3]
+    f = data[9] * line[0] + data[10] * line[1] + data[11] * line[2] + data[4]
+    g = data[12] * line[0] + data[13] * line[1] + data[14] * line[2] + data[5]
+    return length((e, f, g))

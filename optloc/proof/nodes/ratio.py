@@ -1,0 +1,214 @@
+"""Gain ratios r_a/r_b over a box: remainder and curvature of a quotient of two ranges."""
+
+from __future__ import annotations
+
+from math import inf, sqrt
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled
+from optloc.proof.nodes.codes import ALONE, MEASURED
+from optloc.proof.nodes.forms import (
+    Triple,
+    blend,
+    length,
+    product,
+    pull,
+    range_bend,
+    range_form,
+    reach,
+    scaled,
+    still,
+    triple,
+    unbounded,
+    write,
+)
+
+
+@compiled
+def bound_ratio(
+    data: Array, line: Array, sense: Array, line_b: Array, sense_b: Array, half: Array, slope: Array
+) -> tuple[float, float, float]:
+    """Bound a ratio of ranges over a box (see `optloc.proof.nodes.codes`).
+
+    In two steps, exact but for the enclosures of what is in them: with ``N = r_a^2 - r_b^2`` (affine in the
+    position), S = r_a + r_b, delta = N/S = r_a - r_b and phi = 1 + delta/r_b, the remainder of a quotient phi = N/S is
+    ``(q_N - (g.s)(u.s) - (phi + g.s) q_S) / S'`` with g its slope, and S' = S + u.s + q_S elsewhere in the box.
+
+    Where the box may touch station b the ratio has no upper end. A row of its own (number `ALONE`) only grows beyond
+    its measured value, so there the lower end may stand for the ratio.
+    """
+    h = triple(half, 0)
+    ra, ua, least_a, most_a, far_a = range_form(line, sense, h)
+    rb, ub, least_b, most_b, far_b = range_form(line_b, sense_b, h)
+    phi = ra / rb if rb > 0.0 else inf
+    low = max(least_a, 0.0) / far_b if far_b > 0.0 else 0.0
+    if least_b > 0.0:
+        high = far_a / least_b
+        n, q = _squares(line, sense, line_b, sense_b, h)
+        size, u, most = ra + rb, blend(1.0, ua, 1.0, ub), most_a + most_b
+        delta = ra - rb
+        g = blend(1.0 / size, n, -delta / size, u)
+        least = least_b + max(least_a, 0.0)
+        q = quotient(delta, g, u, most, q, (least, far_a + far_b), h)
+        g = blend(1.0 / rb, g, -(phi - 1.0) / rb, ub)
+        less, more = quotient(phi - 1.0, g, ub, most_b, q, (least_b, far_b), h)
+        if more - less <= high - low:
+            write(g, slope)
+            return phi, less, more
+    else:
+        high = max(low, data[MEASURED]) if data[ALONE] != 0.0 else inf
+    slope[0] = slope[1] = slope[2] = 0.0
+    return phi, low - phi, high - phi
+
+
+@compiled
+def quotient(
+    phi: float,
+    g: Triple,
+    u: Triple,
+    most: float,
+    above: tuple[float, float],
+    below: tuple[float, float],
+    h: Triple,
+) -> tuple[float, float]:
+    """Return an enclosure of the remainder of a quotient phi = N/S over a box.
+
+    Parameters
+    ----------
+    phi, g : float, triple
+        Its value and slope.
+    u, most : triple, float
+        Slope of S, and the greatest remainder of S, which is not negative.
+    above : pair of float
+        Enclosure of the remainder of N.
+    below : pair of float
+        Least, positive, and greatest S over the box.
+    h : triple
+        Half-widths.
+    """
+    low, high = product(g, u, h)
+    swing = reach(g, h)
+    low, high = low + min((phi - swing) * most, 0.0), high + max((phi + swing) * most, 0.0)
+    return scaled(above[0] - high, above[1] - low, below[0], below[1])
+
+
+@compiled
+def _squares(line: Array, sense: Array, line_b: Array, sense_b: Array, h: Triple) -> tuple[Triple, tuple[float, float]]:
+    """Return slope and remainder of ``|line|^2 - |line_b|^2`` over a box: the product of difference and sum."""
+    apart = (line[0] - line_b[0], line[1] - line_b[1], line[2] - line_b[2])
+    n, low, high = pull(apart, sense), 0.0, 0.0
+    n = blend(1.0, n, 1.0, pull(apart, sense_b))
+    for i in range(3):
+        own, other = triple(sense[i], 0), triple(sense_b[i], 0)
+        differ, both = blend(1.0, own, -1.0, other), blend(1.0, own, 1.0, other)
+        n = blend(1.0, n, line[i] + line_b[i], differ)
+        less, more = product(differ, both, h)
+        low, high = low + less, high + more
+    return n, (low, high)
+
+
+@compiled
+def curve_ratio(
+    data: Array,
+    line: Array,
+    sense: Array,
+    line_b: Array,
+    sense_b: Array,
+    half: Array,
+    curvature: Array,
+    turn: Array,
+) -> float:
+    """Bound how a ratio of ranges curves over a box (`optloc.proof.nodes.codes`), in the two steps of `bound_ratio`."""
+    h = triple(half, 0)
+    bound_ratio(data, line, sense, line_b, sense_b, half, turn)
+    ra, ua, least_a, qa, _ = range_form(line, sense, h)
+    rb, ub, least_b, qb, _ = range_form(line_b, sense_b, h)
+    if still(turn) or not (least_a > 0.0 and least_b > 0.0):
+        return unbounded(curvature, turn)
+    bend, whole = np.empty((3, 3)), np.empty((3, 3))
+    da, chi_a, norm_a = range_bend(sense, h, ra, ua, least_a, qa, whole)
+    db, chi_b, norm_b = range_bend(sense_b, h, rb, ub, least_b, qb, bend)
+    n, _ = _squares(line, sense, line_b, sense_b, h)
+    dn = _square_bend(sense, sense_b, h, curvature)
+    for k in range(3):
+        for m in range(3):
+            whole[k, m] += bend[k, m]
+    size, u, delta = ra + rb, blend(1.0, ua, 1.0, ub), ra - rb
+    g = blend(1.0 / size, n, -delta / size, u)
+    changes = (dn, blend(1.0, da, 1.0, db), 0.0, chi_a + chi_b, norm_a + norm_b, reach(u, h) + qa + qb)
+    chi = quotient_bend(g, u, (delta, size, least_a + least_b), changes, h, curvature, whole, turn)
+    wander = triple(turn, 0)
+    g = blend(1.0 / rb, g, -delta / (rb * rb), ub)
+    changes = (wander, db, chi, chi_b, norm_b, reach(ub, h) + qb)
+    return quotient_bend(g, ub, (delta / rb, rb, least_b), changes, h, curvature, bend, turn)
+
+
+@compiled
+def _square_bend(sense: Array, sense_b: Array, h: Triple, curvature: Array) -> Triple:
+    """Write the Hessian of ``|line|^2 - |line_b|^2``, a constant; return how much the gradient changes over a box."""
+    for k in range(3):
+        for m in range(3):
+            entry = 0.0
+            for i in range(3):
+                entry += sense[i, k] * sense[i, m] - sense_b[i, k] * sense_b[i, m]
+            curvature[k, m] = 2.0 * entry
+    return (
+        reach((curvature[0, 0], curvature[0, 1], curvature[0, 2]), h),
+        reach((curvature[1, 0], curvature[1, 1], curvature[1, 2]), h),
+        reach((curvature[2, 0], curvature[2, 1], curvature[2, 2]), h),
+    )
+
+
+@compiled
+def quotient_bend(
+    g: Triple,
+    u: Triple,
+    centre: tuple[float, float, float],
+    changes: tuple[Triple, Triple, float, float, float, float],
+    h: Triple,
+    curvature: Array,
+    bend: Array,
+    turn: Array,
+) -> float:
+    """Bound how a quotient phi = N/S curves, from how N and S do; return the change of its Hessian.
+
+    Parameters
+    ----------
+    g, u : triple
+        Gradients of phi and of S.
+    centre : three numbers
+        phi, S, and the least S over the box, positive.
+    changes : tuple
+        Bounds of the change of the gradients of N and S (triples), of their Hessians, the norm of the Hessian of S at
+        the centre, and the change of S.
+    h : triple
+        Half-widths.
+    curvature : array (3, 3)
+        The Hessian of N; overwritten by that of phi.
+    bend : array (3, 3)
+        The Hessian of S.
+    turn : array (3,)
+        Written: bounds of the change of the gradient of phi.
+    """
+    phi, size, least = centre
+    dn, ds, chi_n, chi_s, norm_s, widen = changes
+    for k in range(3):
+        for m in range(3):
+            curvature[k, m] = (curvature[k, m] - g[k] * u[m] - u[k] * g[m] - phi * bend[k, m]) / size
+    # phi' r' = N', so the change of phi is (N' - N - phi (S' - S)) / S': its own slope, and what that changes by.
+    rise = reach(g, h) * size / least + (reach(dn, h) + abs(phi) * reach(ds, h)) / least
+    norm = 0.0
+    for k in range(3):
+        for m in range(3):
+            norm += curvature[k, m] * curvature[k, m]
+        change = dn[k] + abs(phi) * ds[k] + rise * (abs(u[k]) + ds[k]) + widen * abs(g[k])
+        turn[k] = change / least
+    wander = (turn[0], turn[1], turn[2])
+    dg, du = length(wander), length(ds)
+    mixed = 2.0 * (dg * length(u) + length(g) * du + dg * du)
+    chi = (chi_n + mixed + abs(phi) * chi_s + rise * (norm_s + chi_s) + widen * sqrt(norm)) / least
+    for k in range(3):
+        turn[k] = min(turn[k], reach((curvature[k, 0], curvature[k, 1], curvature[k, 2]), h) + chi * length(h))
+    return chi

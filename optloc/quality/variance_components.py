@@ -1,0 +1,352 @@
+"""Variance components by restricted maximum likelihood, with gross errors left out one by one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from optloc.base import linalg
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array
+from optloc.quality.elements import Elements
+
+# What the residuals of fixes say of every error and offset: its size, its test, its redundancy.
+#
+# A problem linearised at its fix is v = J dx + B e + E b + n: v residuals, e independent errors of the groups' noise
+# with covariance diag(theta), b offsets of the groups, n what has a covariance C of its own. With V = B diag(theta)
+# B' + C and P = V^-1 - V^-1 J (J' V^-1 J)^-1 J' V^-1, which annihilates J, all that follows needs only T = F' P F and
+# t = F' P v of the columns F = [B, E]: t_j / T_jj is the size of an error along column j that the other rows show
+# (for a row, its leave-one-out residual), 1 / sqrt(T_jj) its standard deviation, and t_j / sqrt(T_jj) is standard
+# normal without one.
+#
+# W. Baarda, "A testing procedure for use in geodetic networks" (1968), section 4.
+
+_NOTHING = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Tested:
+    """T = F' P F and t = F' P v for the columns F = [B, E], and what is left of the residuals.
+
+    Parameters
+    ----------
+    matrix : array (N, q + c, q + c)
+        T.
+    vector : array (N, q + c)
+        t.
+    errors : int
+        q, the number of columns that are errors.
+    cost : array (N,)
+        v' P v, chi-square distributed with `dof` degrees of freedom.
+    dof : array (N,)
+        Rank of P.
+    """
+
+    matrix: Array
+    vector: Array
+    errors: int
+    cost: Array
+    dof: Array
+
+    @property
+    def size(self) -> Array:
+        """Return the diagonal of T, (N, q + c)."""
+        return np.asarray(np.diagonal(self.matrix, axis1=-2, axis2=-1))
+
+    @property
+    def sigmas(self) -> Array:
+        """Return the tests t / sqrt(T) of all columns (N, q + c); 0 where nothing can be tested."""
+        size = self.size
+        return np.where(size > 0.0, self.vector / np.sqrt(np.where(size > 0.0, size, 1.0)), 0.0)
+
+    def without(self, column: Array) -> Tested:
+        """Return the same with an error of unknown size along one column (N,) of each problem; -1 for none."""
+        items = np.flatnonzero(column >= 0)
+        j = column[items]
+        matrix, vector, cost, dof = self.matrix.copy(), self.vector.copy(), self.cost.copy(), self.dof.copy()
+        along, own = matrix[items, :, j], matrix[items, j, j]
+        vector[items] -= along * (self.vector[items, j] / own)[:, None]
+        matrix[items] -= along[:, :, None] * along[:, None, :] / own[:, None, None]
+        cost[items] -= self.vector[items, j] ** 2 / own
+        dof[items] -= 1
+        gone = np.diagonal(matrix[items], axis1=-2, axis2=-1) <= _NOTHING * self.size[items]
+        matrix[items] *= ~(gone[:, :, None] | gone[:, None, :])
+        vector[items] *= ~gone
+        return Tested(matrix, vector, self.errors, cost, dof)
+
+
+def tested(made: Elements, variance: Array) -> Tested:
+    """Return what the residuals say of every error and offset.
+
+    Parameters
+    ----------
+    made : Elements
+        N problems.
+    variance : array (N, q) or ()
+        Theta, the variance of each error.
+    """
+    q = made.effect.shape[-1]
+    scaled = made.effect * np.sqrt(np.broadcast_to(variance, made.of_effect.shape))[:, None]
+    covariance = scaled @ np.swapaxes(scaled, 1, 2) + made.fixed
+    whiten = linalg.whitening(covariance)
+    columns = np.concatenate([made.effect, made.offset, made.residual[..., None]], axis=-1)
+    white, known = whiten @ columns, whiten @ made.jacobian
+    root, _ = linalg.root(np.swapaxes(known, 1, 2) @ known)
+    basis = known @ root
+    free = white - basis @ (np.swapaxes(basis, 1, 2) @ white)
+    gram = np.swapaxes(free, 1, 2) @ free
+    rank = (whiten != 0.0).any(-1).sum(-1) - (root != 0.0).any(-2).sum(-1)
+    matrix = gram[:, :-1, :-1]
+    size = np.diagonal(np.swapaxes(white, 1, 2) @ white, axis1=-2, axis2=-1)[:, :-1]
+    seen = np.diagonal(matrix, axis1=-2, axis2=-1) > _NOTHING * size
+    both = seen[:, :, None] & seen[:, None, :]
+    return Tested(np.where(both, matrix, 0.0), np.where(seen, gram[:, :-1, -1], 0.0), q, gram[:, -1, -1], rank)
+
+
+CUT = 3.0
+"""Size of a test, in standard deviations, from which an error counts as gross."""
+
+KEPT = 0.9733369
+"""Mean square of a standard normal variable that is not beyond the cut."""
+
+LOOSE = 0.5
+"""Relative standard error of a standard deviation from which the data are said not to tell it."""
+
+# Of normal errors within the cut: variance of their square over its mean squared (2 without a cut), and the share of a
+# change of their variance that its mean follows.
+_SCATTER, _SLOPE = 1.836, 0.877
+_MEDIAN = 0.45493642
+_LEAST = 1e-4
+_COARSE, _ROUNDS, _STEPS = 8, 5, 40
+_CLOSE, _SETTLED = 1e-3, 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class Fitted:
+    """Variance factors of g groups of errors.
+
+    Parameters
+    ----------
+    variance : array (g,)
+        What the stated variances are multiplied by.
+    error : array (g,)
+        Standard error of the root of each, as a share of it; NaN where the data do not tell it.
+    shared : bool array (g,)
+        Groups that the data do not tell: they have one factor in common.
+    stay : bool
+        Whether that factor is not told either and stays at one.
+    gross : bool array (N, q)
+        Errors that were left out.
+    tests : Tested
+        What the residuals say, gross errors left out.
+    """
+
+    variance: Array
+    error: Array
+    shared: Array
+    stay: bool
+    gross: Array
+    tests: Tested
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """Variances (c,) of classes of errors, their standard errors (c,), gross errors, and the tests without them."""
+
+    variance: Array
+    error: Array
+    gross: Array
+    tests: Tested
+
+
+def fit(made: Elements, group: Array, count: int) -> Fitted:
+    """Return the variance factors of greatest restricted likelihood.
+
+    Whether the data tell a factor is asked where all groups have the same: a level that turns out to be small is told.
+
+    Parameters
+    ----------
+    made : Elements
+        N linearised problems.
+    group : int array (N, q)
+        Group of each error, 0 to `count` - 1; -1 for none.
+    count : int
+        Number of groups.
+
+    Raises
+    ------
+    InvalidProblem
+        Where no problem has redundancy.
+    """
+    none = np.zeros(count, dtype=bool)
+    if not (tested(made, np.ones(())).dof > 0).any():
+        advice = "add rows, stations or known heights"
+        raise InvalidProblem("no fix has more rows than unknowns: nothing shows the noise", "noise", advice)
+    alike = _maximised(made, np.minimum(group, 0), np.zeros(1), none[:1])
+    begin = np.full(count, np.log(alike.variance[0]))
+    shared = ~(_errors(alike.tests, group, np.exp(begin), none) < LOOSE)
+    merge = np.where(shared, np.flatnonzero(shared)[0] if shared.any() else 0, np.arange(count))
+    kinds, place = np.unique(merge, return_inverse=True)
+    own = np.append(place, -1)[group]
+    alone = np.isin(kinds, np.flatnonzero(shared))
+    if shared.sum() > 1:
+        alone &= ~(_errors(alike.tests, own, np.exp(begin[: len(kinds)]), none[: len(kinds)]) < LOOSE)
+    found = _maximised(made, own, np.where(alone, 0.0, begin[: len(kinds)]), alone)
+    error = np.where(shared, np.nan, found.error[place])
+    return Fitted(found.variance[place], error, shared, bool(alone.any()), found.gross, found.tests)
+
+
+def _maximised(made: Elements, own: Array, level: Array, held: Array) -> _Found:
+    """Return the factors of classes of errors `own` (N, q), from log-factors (c,) on; some are held there."""
+    count, level = len(level), level.copy()
+    for _ in range(_COARSE):
+        step = np.where(held, 0.0, _coarse(tested(made, np.exp(level)[own]), own, np.exp(level)))
+        level += step
+        if np.abs(step).max() < 0.05:
+            break
+    for _ in range(_ROUNDS):
+        before = level.copy()
+        gross, tests = cleaned(made, np.exp(level)[own])
+        for _ in range(_STEPS):
+            step, sure = _step(tests, own, np.exp(level), held)
+            last, level = level, np.maximum(level + step, np.log(_LEAST))
+            tests = without(tested(made, np.exp(level)[own]), gross)
+            if (np.abs(level - last) <= _CLOSE * sure).all():
+                break
+        if (np.abs(level - before) <= _SETTLED * sure).all():
+            break
+    variance = np.exp(level)
+    return _Found(variance, _errors(tests, own, variance, held[:count]), gross, tests)
+
+
+def cleaned(made: Elements, variance: Array) -> tuple[Array, Tested]:
+    """Return which errors are gross (N, q), and the tests without them."""
+    tests = tested(made, variance)
+    found = snooped(tests, slice(0, tests.errors), CUT)
+    return found.gross, found.tests
+
+
+@dataclass(frozen=True, slots=True)
+class Snooped:
+    """Columns along which errors are gross, and what the tests say of all without them.
+
+    Parameters
+    ----------
+    gross : bool array (N, p)
+        Columns of the tests beyond the cut.
+    shift, sigma : array (N, p)
+        Size of an error along each column that the rest shows, and its standard deviation; NaN where nothing does.
+    tests : Tested
+        Without the gross ones.
+    """
+
+    gross: Array
+    shift: Array
+    sigma: Array
+    tests: Tested
+
+
+def snooped(tests: Tested, columns: slice, cut: float) -> Snooped:
+    """Return the gross errors along some columns of tests.
+
+    Of each problem the column with the largest test beyond the cut is left out, and the rest are tested anew, until
+    none is beyond it: data snooping (Baarda 1968, section 4).
+    """
+    n, first = len(tests.vector), range(tests.vector.shape[1])[columns].start
+    shift, sigma = _shown(tests, columns)
+    gross = np.zeros(shift.shape, dtype=bool)
+    while True:
+        sigmas = np.abs(tests.sigmas[:, columns])
+        worst = sigmas.argmax(1)
+        hit = np.flatnonzero(sigmas[np.arange(n), worst] > cut)
+        now = _shown(tests, columns)
+        shift, sigma = (np.where(gross, old, new) for old, new in zip((shift, sigma), now, strict=True))
+        if not len(hit):
+            return Snooped(gross, shift, sigma, tests)
+        gross[hit, worst[hit]] = True
+        column = np.full(n, -1)
+        column[hit] = first + worst[hit]
+        tests = tests.without(column)
+
+
+def _shown(tests: Tested, columns: slice) -> tuple[Array, Array]:
+    size, vector = tests.size[:, columns], tests.vector[:, columns]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(size > 0.0, vector / size, np.nan), np.where(size > 0.0, size**-0.5, np.nan)
+
+
+def without(tests: Tested, gross: Array) -> Tested:
+    """Return tests without the errors (N, q) that are gross."""
+    items = np.arange(len(gross))
+    order = np.argsort(~gross, axis=1, kind="stable")[:, : int(gross.sum(1).max(initial=0))]
+    for column in order.T:
+        tests = tests.without(np.where(gross[items, column] & (tests.size[items, column] > 0.0), column, -1))
+    return tests
+
+
+def total(group: Array, count: int, values: Array | None = None) -> Array:
+    """Return the sum of values (N, q) over each group (g,); their number by default."""
+    number = np.where(group >= 0, group, count).ravel()
+    return np.bincount(number, None if values is None else values.ravel(), count + 1)[:count].astype(float)
+
+
+def _coarse(tests: Tested, own: Array, variance: Array) -> Array:
+    """Return steps of the log-factors (c,) to where the median of the squared tests is that of normal errors."""
+    q = own.shape[1]
+    squared, share = tests.sigmas[:, :q] ** 2, tests.size[:, :q] * variance[own]
+    step = np.zeros(len(variance))
+    for g in range(len(variance)):
+        values = squared[(own == g) & (share > 1e-3)]
+        if len(values):
+            step[g] = np.log(max(float(np.median(values)) / _MEDIAN, 1e-2))
+    return np.clip(step, -4.0, 8.0)
+
+
+def _step(tests: Tested, own: Array, variance: Array, held: Array) -> tuple[Array, Array]:
+    """Return the scoring step of the log-factors (c,), at most one, along what the data see, and their sigmas."""
+    information, per_fix = _scored(tests, own, variance, held)
+    inverse = _inverse(information)
+    return np.clip(inverse @ per_fix.sum(0), -1.0, 1.0), np.sqrt(np.diagonal(inverse))
+
+
+def _scored(tests: Tested, own: Array, variance: Array, held: Array) -> tuple[Array, Array]:
+    """Return information (c, c) and scores of each problem (N, c) of log-factors.
+
+    With T and t of `Tested`, d l / d theta_g is the sum of (t_j^2 - T_jj) / 2 over the errors j of group g, and the
+    information of theta_g and theta_h that of T_ij^2 / 2 (Harville 1977, section 5); t_j^2 is divided by its mean
+    square within the cut.
+    """
+    (n, q), count = own.shape, len(variance)
+    number, scale = np.where(own >= 0, own, count), np.where(held, 0.0, variance)
+    each = 0.5 * (tests.vector[:, :q] ** 2 / KEPT - tests.size[:, :q])
+    place = (np.arange(n)[:, None] * (count + 1) + number).ravel()
+    per_fix = np.bincount(place, each.ravel(), n * (count + 1)).reshape(n, -1)[:, :count] * scale
+    pair = (number[:, :, None] * (count + 1) + number[:, None, :]).ravel()
+    squared = 0.5 * tests.matrix[:, :q, :q].ravel() ** 2
+    information = np.bincount(pair, squared, (count + 1) ** 2).reshape(count + 1, -1)[:count, :count]
+    return information * np.outer(scale, scale), per_fix
+
+
+def _inverse(information: Array) -> Array:
+    """Return the inverse along the directions that an information matrix, scaled to a unit diagonal, sees."""
+    diagonal = np.diagonal(information)
+    size = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), 0.0)
+    values, vectors = np.linalg.eigh(information * np.outer(size, size))
+    seen = values > 1e-9
+    half = size[:, None] * vectors[:, seen]
+    return np.asarray((half / values[seen]) @ half.T)
+
+
+def _errors(tests: Tested, own: Array, variance: Array, held: Array) -> Array:
+    """Return standard errors (c,) of the roots of factors, as shares of them; infinite where they are not told.
+
+    Those of normal errors, or what the scatter of the problems' scores says if that is more.
+    """
+    information, per_fix = _scored(tests, own, variance, held)
+    inverse = _inverse(information)
+    scattered = inverse @ (per_fix.T @ per_fix) @ inverse
+    told = np.diagonal(inverse @ information) > 0.9
+    normal = 0.5 * _SCATTER * np.diagonal(inverse)
+    spread = np.sqrt(np.maximum(normal, np.diagonal(scattered))) / _SLOPE
+    return np.where(told, np.sqrt(1.0 + spread) - 1.0, np.inf)

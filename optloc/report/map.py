@@ -1,0 +1,305 @@
+"""The drawing of an interactive map: a plane of longitude and latitude, paths, dots, layers that come and go."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from html import escape
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+
+from optloc.base.linalg import error_ellipse
+from optloc.base.status import Status
+from optloc.base.types import Array
+from optloc.linear.evaluate import differentiate
+from optloc.models import MODELS
+from optloc.plot.style import figure_class, states_of
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
+
+# Coastlines for maps without a network.
+#
+# The land polygons of Natural Earth at 1:50 million (https://www.naturalearthdata.com, version 4.1, public domain), by
+# way of the package world-atlas 2.0.2, to a hundredth of a degree: differences of the corners of all rings, and the
+# lengths of the rings.
+
+Window = tuple[float, float, float, float]
+"""West, east, south, north in degrees; east may exceed 180."""
+
+
+@cache
+def rings() -> tuple[Array, ...]:
+    """Return the shores of all land, and of seas in it, as closed rings (n, 2) of longitude and latitude in degrees.
+
+    Each is in one piece, so that some go beyond 180 degrees; that of Antarctica goes along the pole.
+    """
+    with (files("optloc.report") / "natural-earth-50m.npz").open("rb") as file, np.load(file) as data:
+        delta, length = data["delta"].astype(np.int64), data["length"]
+    starts = np.cumsum(length)[:-1]
+    return tuple(np.cumsum(part, axis=0) / 100.0 for part in np.split(delta, starts))
+
+
+def land(window: Window) -> list[Array]:
+    """Return the land in a window as polygons (n, 2); to be filled by the even-odd rule."""
+    west, east, south, north = window
+    found = []
+    for ring in rings():
+        low, high = ring.min(0), ring.max(0)
+        if high[1] < south or low[1] > north:
+            continue
+        for turn in (-360.0, 0.0, 360.0):
+            if low[0] + turn < east and high[0] + turn > west:
+                cut = _clipped(ring + np.array([turn, 0.0]), window)
+                if len(cut) > 2:
+                    found.append(cut)
+    return found
+
+
+def _clipped(ring: Array, window: Window) -> Array:
+    """Return a ring cut at four straight lines.
+
+    I. E. Sutherland and G. W. Hodgman, "Reentrant polygon clipping", Communications of the ACM 17 (1974).
+    """
+    for axis, limit, sign in ((0, window[0], 1.0), (0, window[1], -1.0), (1, window[2], 1.0), (1, window[3], -1.0)):
+        if not len(ring):
+            return ring
+        depth = sign * (ring[:, axis] - limit)
+        before, depth_before = np.roll(ring, 1, axis=0), np.roll(depth, 1)
+        crosses = (depth >= 0.0) != (depth_before >= 0.0)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            share = depth_before / (depth_before - depth)
+            edge = before + np.where(crosses, share, 0.0)[:, None] * (ring - before)
+        both = np.stack([edge, ring], axis=1).reshape(-1, 2)
+        ring = both[np.stack([crosses, depth >= 0.0], axis=1).ravel()]
+    return ring
+
+
+_SIZE = 1000.0
+_TOOLS = (("in", "+", "nearer"), ("out", "−", "farther"), ("all", "⌂", "whole map"), ("focus", "◎", "to the fix"))
+_AROUND = np.array([6.0, 4.0])
+
+
+class Plane:
+    """Longitude and latitude to the units of the drawing, true to scale in the middle of the map.
+
+    Parameters
+    ----------
+    west, east, south, north : float
+        Limits of the map, degrees; east may exceed 180.
+    """
+
+    def __init__(self, west: float, east: float, south: float, north: float) -> None:
+        self.middle = np.array([(west + east) / 2.0, (south + north) / 2.0])
+        self.squeeze = float(np.cos(np.radians(self.middle[1])))
+        self.unit = _SIZE / max((east - west) * self.squeeze, north - south)
+        self.half = np.array([(east - west) * self.squeeze, north - south]) * self.unit / 2.0
+
+    def __call__(self, place: Array) -> Array:
+        """Return longitude and latitude (..., 2) in the units of the drawing."""
+        shift = np.asarray(place, dtype=float) - self.middle
+        return np.asarray(shift * [self.squeeze * self.unit, -self.unit])
+
+    @property
+    def scale(self) -> list[float]:
+        """Return units of the drawing in a degree of longitude and of latitude."""
+        return [self.squeeze * self.unit, -self.unit]
+
+    def window(self) -> Window:
+        """Return what is drawn of the coast: the map and its surroundings."""
+        half = np.maximum(self.half, self.half.max() * 0.8) * _AROUND / [self.squeeze * self.unit, self.unit]
+        (west, south), (east, north) = self.middle - half, self.middle + half
+        return max(west, self.middle[0] - 180.0), min(east, self.middle[0] + 180.0), max(south, -90.0), min(north, 90.0)
+
+
+def path(lines: Sequence[Array], *, close: bool, digits: int = 1) -> str:
+    """Return lines (n, 2) of the drawing as the data of an SVG path."""
+    end = "Z" if close else ""
+    return "".join("M" + "L".join(f"{x:.9g} {y:.9g}" for x, y in np.round(line, digits)) + end for line in lines)
+
+
+def dot(x: float, y: float, colour: str, size: float, title: str = "") -> str:
+    """Return a dot whose size does not depend on the zoom; the page shows its title when it is pointed at."""
+    told = f' data-tell="{escape(title, quote=True)}"' if title else ""
+    return f'<path class="dot" d="M{x:.9g} {y:.9g}h0" stroke="{colour}" stroke-width="{size}"{told}/>'
+
+
+def map_canvas(plane: Plane, name: str, title: str, layers: Mapping[str, str], data: dict[str, Any], text: str) -> str:
+    """Return a map as an element of a page that holds the script of maps.
+
+    Parameters
+    ----------
+    plane : Plane
+        Its limits.
+    name : str
+        Identity of the element.
+    title : str
+        What it shows.
+    layers : mapping of str to str
+        SVG of each layer, from the lowest on; a box switches it off.
+    data : dict
+        What the script needs beside the plane: `x`, `y` and `values` of the bound; `focus`, middle and width of a part
+        that deserves a button, and `nearest`, how far one can zoom.
+    text : str
+        Stands below the map while nothing is pointed at.
+    """
+    shore = path([plane(ring) for ring in land(plane.window())], close=True)
+    groups = "".join(f'<g data-layer="{layer}">{inner}</g>' for layer, inner in layers.items())
+    width, height = 2.0 * plane.half
+    box = f"{-plane.half[0]:.1f} {-plane.half[1]:.1f} {width:.1f} {height:.1f}"
+    boxes = "".join(f'<label><input type="checkbox" value="{n}" checked> {n}</label>' for n in layers)
+    buttons = "".join(
+        f'<button type="button" data-do="{do}" aria-label="{label}">{sign}</button>'
+        for do, sign, label in _TOOLS[: 4 if "focus" in data else 3]
+    )
+    numbers = json.dumps({"middle": plane.middle.tolist(), "scale": plane.scale, **data}).replace("</", "<\\/")
+    return (
+        f'<div class="map" id="{name}"><svg viewBox="{box}" role="img" aria-label="{escape(title, quote=True)}">'
+        f'<path class="land" d="{shore}"/>{groups}</svg>'
+        f'<div class="tools">{buttons}</div><div class="layers">{boxes}</div><output>{escape(text)}</output>'
+        f'<script type="application/json">{numbers}</script></div>'
+    )
+
+
+# Fixes and tracks as marks on the Earth: longitude, latitude, ellipse, a line of text.
+
+_RING = 73
+_SKY = 100e3
+_LINES, _GRID = 24, 281
+
+
+@dataclass(frozen=True, slots=True)
+class Spots:
+    """Marks on the Earth.
+
+    Parameters
+    ----------
+    place : array (n, 2)
+        Longitude and latitude, degrees; NaN where there is none.
+    rings : tuple of array (r, 2)
+        The 95 % ellipse of each, degrees; empty where there is no covariance.
+    clean : bool array (n,)
+        Where the status is ok.
+    text : tuple of n str
+        What is told of each.
+    """
+
+    place: Array
+    rings: tuple[Array, ...]
+    clean: Array
+    text: tuple[str, ...]
+
+
+def spots(problem: Problem, position: Array, covariance: Array, clean: Array, text: Sequence[str]) -> Spots:
+    """Return positions (n, d) in a problem's frame, with covariances (n, d, d), as marks on the Earth."""
+    angle = np.linspace(0.0, 2.0 * np.pi, _RING)
+    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    rings = []
+    for centre, spread in zip(position, covariance, strict=True):
+        if not (np.isfinite(centre).all() and np.isfinite(spread).all()):
+            rings.append(np.zeros((0, 2)))
+            continue
+        axes = problem.frame.enu_axes(centre)[:2]
+        semi_axes, directions = error_ellipse(axes @ spread @ axes.T)
+        rings.append(degrees(problem, centre + circle * semi_axes @ directions.T @ axes))
+    return Spots(degrees(problem, position), tuple(rings), clean, tuple(text))
+
+
+def degrees(problem: Problem, position: Array) -> Array:
+    """Return longitude and latitude (n, 2) of positions (n, d), NaN where these are."""
+    out = np.full((len(position), 2), np.nan)
+    known = np.isfinite(position).all(-1)
+    if known.any():
+        lat, lon, _ = problem.frame.to_geodetic(position[known])
+        out[known] = np.degrees(np.stack([lon, lat], axis=-1))
+    return out
+
+
+def fixed_spots(problem: Problem, fixes: Sequence[Fix], labels: Sequence[str]) -> Spots:
+    """Return the marks of fixes; labels name them where there are as many."""
+    parts = [part for fix in fixes for part in states_of(fix)]
+    position, covariance, clean = (np.concatenate(each) for each in zip(*parts, strict=True))
+    status = [Status(int(code)).label for fix in fixes for code in np.ravel(fix.code)]
+    named = list(labels) if len(labels) == len(position) > 1 else [""] * len(position)
+    told = status if len(status) == len(position) else ["" if ok else "status not ok" for ok in clean]
+    sigma = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
+    sentences = [sentence(*each) for each in zip(named, told, degrees(problem, position), sigma, strict=True)]
+    return spots(problem, position, covariance, clean, sentences)
+
+
+def sentence(name: str, status: str, place: Array, sigma: float) -> str:
+    """Return what is told of a fix."""
+    parts = [name, status, f"{place[1]:.5f}°, {place[0]:.5f}°" if np.isfinite(place).all() else "no position"]
+    return ", ".join(part for part in [*parts, f"sigma {sigma:.3g} m" if np.isfinite(sigma) else ""] if part)
+
+
+def other_spots(problem: Problem, fixes: Sequence[Fix]) -> Spots:
+    """Return the marks of the alternatives of single fixes."""
+    places, text = [np.zeros((0, problem.dimension))], []
+    for fix in fixes:
+        flat = fix if len(fix.shape) == 1 else fix.flat()
+        shown = np.isfinite(flat.alternatives.gap)
+        for slot in flat.layout.shared:
+            if slot.name.partition("[")[0] == "position":
+                places.append(flat.layout.take(flat.alternatives.x, slot.name)[shown])
+                text += [f"alternative, costs {gap:.3g} more" for gap in flat.alternatives.gap[shown]]
+    position = np.concatenate(places)
+    count, d = position.shape
+    return spots(problem, position, np.full((count, d, d), np.nan), np.zeros(count, dtype=bool), text)
+
+
+def station_spots(problem: Problem) -> Spots:
+    """Return the marks of the stations of the first epoch; those in the sky have no place on a map."""
+    position = problem.stations.position.reshape(-1, problem.stations.count, problem.dimension)[0]
+    place = degrees(problem, position)
+    place[problem.frame.to_geodetic(position)[2] > _SKY] = np.nan
+    nothing = tuple(np.zeros((0, 2)) for _ in position)
+    return Spots(place, nothing, np.ones(len(position), dtype=bool), problem.stations.names)
+
+
+def lines_of_position(problem: Problem, fix: Fix, limits: tuple[float, float, float, float]) -> list[tuple[str, Array]]:
+    """Return where a target would be by each row alone, at the height of the fix: name, and line (n, 2) in degrees.
+
+    Hyperbolas of time differences, circles of ranges, rays of bearings; other unknowns are as the fix has them.
+    """
+    figure_class()  # one sentence where matplotlib, which brings contourpy, is missing
+    from contourpy import contour_generator
+
+    flat, x = problem.flat(), fix.flat().x[0]
+    if flat.batch_shape != (1,) or flat.count > _LINES or not np.isfinite(x).all():
+        return []
+    slot, shared = flat.layout.find("position") if _positioned(flat) else (None, False)
+    if slot is None or not shared:
+        return []
+    lon, lat = _beyond(*limits[:2]), np.clip(_beyond(*limits[2:]), -89.9, 89.9)
+    own = x[slot.start : slot.start + slot.size]
+    height = float(problem.frame.to_geodetic(own)[2])
+    east, north = (np.radians(v.ravel()) for v in np.meshgrid(lon, lat))
+    vectors = np.tile(x, (east.size, 1))
+    place = problem.frame.from_geodetic(north, (east + np.pi) % (2.0 * np.pi) - np.pi, np.full(east.size, height))
+    vectors[:, slot.start : slot.start + slot.size] = place[:, : slot.size]
+    with np.errstate(all="ignore"):
+        residual = differentiate(flat, vectors)[0]
+    found: list[tuple[str, Array]] = []
+    for rows, start in zip(flat.rows, flat.starts, strict=True):
+        for i in range(rows.count):
+            values = residual[:, start + i].reshape(_GRID, _GRID)
+            if MODELS[rows.kind].period is not None:
+                values = np.where(np.abs(values) < 0.5 * np.pi, values, np.nan)
+            ends = [flat.stations.names[k] for k in (rows.a[i], rows.b[i]) if k >= 0]
+            made = contour_generator(lon, lat, np.ma.masked_invalid(values)).lines(0.0)
+            found += [(f"{rows.kind} {' – '.join(ends)}", np.asarray(line)) for line in made]
+    return found
+
+
+def _beyond(low: float, high: float) -> Array:
+    """Return a grid that goes beyond the limits of a map, whose window may be wider or taller."""
+    rim = 0.75 * (high - low)
+    return np.linspace(low - rim, high + rim, _GRID)
+
+
+def _positioned(problem: Problem) -> bool:
+    return any(slot.name == "position" for slot in problem.layout.shared)

@@ -1,0 +1,277 @@
+"""A page with an interactive map of fixes or a track: stations, ellipses, alternatives, lines of position."""
+
+from __future__ import annotations
+
+from base64 import b64encode
+from collections.abc import Sequence
+from html import escape
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array
+from optloc.bounds.bound_map import BoundMap
+from optloc.plot.bound_map import COLOURS, isolines, levels
+from optloc.plot.style import BLACK, BLUE, ORANGE
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
+from optloc.report.map import (
+    Plane,
+    Spots,
+    dot,
+    fixed_spots,
+    lines_of_position,
+    map_canvas,
+    other_spots,
+    path,
+    station_spots,
+)
+from optloc.report.page import page, paragraph
+
+_ELLIPSES = 200
+_DIGITS = 5
+_LEAST = 1e-5
+_RIM = 0.22
+
+
+def fix_page(problem: Problem, fixes: Fix | Sequence[Fix], title: str, labels: Sequence[str] = ()) -> str:
+    """Return an HTML page with an interactive map of fixes; it needs no server and no network.
+
+    Parameters
+    ----------
+    problem : Problem
+        On Earth; gives the stations.
+    fixes : Fix or sequence of Fix
+        Single fixes or batches.
+    title : str
+        Title of the page.
+    labels : sequence of str
+        Names of the fixes, for instance their epochs.
+
+    Raises
+    ------
+    InvalidProblem
+        Where the frame is not on Earth, nothing has a place, or matplotlib is missing.
+    """
+    _on_earth(problem)
+    several = [fixes] if isinstance(fixes, Fix) else list(fixes)
+    found, others = fixed_spots(problem, several, labels), other_spots(problem, several)
+    single = several[0] if len(several) == 1 and several[0].code.size == 1 else None
+    return _page(problem, found, others, title, "fix", single)
+
+
+def track_page(problem: Problem, tracks: Spots, title: str) -> str:
+    """Return the same of the scans of tracks."""
+    _on_earth(problem)
+    return _page(problem, tracks, Spots(np.zeros((0, 2)), (), np.zeros(0, dtype=bool), ()), title, "track", None)
+
+
+def _on_earth(problem: Problem) -> None:
+    if not problem.frame.geodetic:
+        advice = "write a picture (.png, .svg, .pdf), or give a frame of the Earth"
+        raise InvalidProblem("an interactive map needs positions on Earth", "map", advice)
+
+
+def _page(problem: Problem, found: Spots, others: Spots, title: str, what: str, single: Fix | None) -> str:
+    stations = station_spots(problem)
+    limits = _limits([stations.place, found.place, others.place])
+    plane, middle = Plane(*limits), (limits[0] + limits[1]) / 2.0
+    lines = [] if single is None else lines_of_position(problem, single, limits)
+    layers = {
+        **({"lines of position": _curves(lines, plane)} if lines else {}),
+        "stations": _stations(stations, plane, middle),
+        **({"alternatives": _dots(others, plane, middle, 11)} if len(others.place) else {}),
+        what: _ellipses(found, plane, middle) + _dots(found, plane, middle, 11 if len(found.place) <= 12 else 5),
+    }
+    data: dict[str, object] = {}
+    if focus := _focus(found, plane, middle):
+        data = {"focus": focus, "nearest": max(200.0, 10.0 * 2.0 * float(plane.half[0]) / focus[2])}
+    text = f"Stations (white), {what} (blue; orange where the status is not ok) with 95 % ellipses. Point at a mark."
+    inner = map_canvas(plane, "map-1", title, layers, data, text)
+    note = paragraph("Drag to move, wheel or pinch to zoom. Shores: Natural Earth.", "soft")
+    return page(title, [("map", "Map", inner + note)], "", "", maps=True)
+
+
+def _limits(places: Sequence[Array]) -> tuple[float, float, float, float]:
+    """Return west, east, south, north that hold all places with a rim; of two ways around the Earth the shorter."""
+    points = np.concatenate(places)
+    points = points[np.isfinite(points).all(-1)]
+    if not len(points):
+        raise InvalidProblem("nothing has a place on the map", "map", "see `optloc fix` for the reasons")
+    points = _turned(points, points[0, 0])
+    low, high = points.min(0), points.max(0)
+    squeeze = np.array([np.cos(np.radians((low + high)[1] / 2.0)), 1.0])
+    half = (0.5 + _RIM) * np.maximum((high - low) * squeeze, 0.6 * float(((high - low) * squeeze).max() or _LEAST))
+    (west, south), (east, north) = (low + high) / 2.0 - half / squeeze, (low + high) / 2.0 + half / squeeze
+    return float(west), float(east), float(max(south, -90.0)), float(min(north, 90.0))
+
+
+def _turned(place: Array, middle: float) -> Array:
+    """Return longitude and latitude (n, 2) with longitudes within half a turn of the middle of the map."""
+    out = np.array(place, dtype=float)
+    out[:, 0] = (out[:, 0] - middle + 180.0) % 360.0 - 180.0 + middle
+    return out
+
+
+def _focus(found: Spots, plane: Plane, middle: float) -> list[float] | None:
+    """Return middle and width, in units of the drawing, of what holds a single ellipse, where that is small."""
+    rings = [ring for ring in found.rings if len(ring)]
+    if len(found.place) != 1 or not rings:
+        return None
+    ring = plane(_turned(rings[0], middle))
+    (x, y), width = ring.mean(0), 3.0 * float(np.ptp(ring, axis=0).max())
+    return [float(x), float(y), width] if width < plane.half[0] else None
+
+
+def _curves(lines: Sequence[tuple[str, Array]], plane: Plane) -> str:
+    return "".join(
+        f'<path class="line thin" d="{path([plane(line)], close=False, digits=3)}" data-tell="{_quoted(name)}"/>'
+        for name, line in lines
+    )
+
+
+def _stations(stations: Spots, plane: Plane, middle: float) -> str:
+    parts = []
+    for name, (x, y) in zip(stations.text, plane(_turned(stations.place, middle)), strict=True):
+        if np.isfinite(x):
+            parts += [dot(x, y, BLACK, 11), dot(x, y, "#ffffff", 7, f"station {name}")]
+            parts.append(f'<text class="name" x="{x:.2f}" y="{y:.2f}">{_quoted(name)}</text>')
+    return "".join(parts)
+
+
+def _ellipses(found: Spots, plane: Plane, middle: float) -> str:
+    if len(found.rings) > _ELLIPSES:
+        return ""
+    rings = [plane(_turned(ring, middle)) for ring in found.rings if len(ring)]
+    return f'<path class="ring" stroke="{BLUE}" d="{path(rings, close=True, digits=_DIGITS)}"/>' if rings else ""
+
+
+def _dots(found: Spots, plane: Plane, middle: float, size: float) -> str:
+    return "".join(
+        dot(x, y, BLUE if ok else ORANGE, size, told)
+        for (x, y), ok, told in zip(plane(_turned(found.place, middle)), found.clean, found.text, strict=True)
+        if np.isfinite(x)
+    )
+
+
+def _quoted(text: str) -> str:
+    from html import escape
+
+    return escape(text, quote=True)
+
+
+# An interactive map in a page: coastlines, bound, stations and trials, without a network.
+
+_DOTS = 400
+
+
+def map_element(found: BoundMap, name: str, title: str, trials: tuple[Array, Array] | None = None) -> str:
+    """Return a map as an element of a page that holds `page_scripts`.
+
+    Parameters
+    ----------
+    found : BoundMap
+        The bound over a grid of longitude and latitude.
+    name : str
+        Identity of the element.
+    title : str
+        What it shows.
+    trials : (places, off), optional
+        Longitude and latitude (n, 2) of true places, and which of them (n,) were not answered right.
+    """
+    plane = Plane(found.x[0], found.x[-1], found.y[0], found.y[-1])
+    layers = {
+        "bound": _image(found, plane) + _lines(found, plane),
+        **({} if trials is None else {"trials": _trials(plane, *trials)}),
+        "stations": _map_stations(found, plane),
+    }
+    return map_canvas(plane, name, title, layers, _data(found), _help(found))
+
+
+def _help(found: BoundMap) -> str:
+    steps = levels(found.sigma)
+    low, high = _metres(steps[0]), _metres(steps[-1])
+    return f"Bound from {low} (light) to {high} (dark), {found.height:.0f} m above the ellipsoid. Point at a place."
+
+
+def _metres(level: float) -> str:
+    return f"{level:g} m" if level < 1e3 else f"{level / 1e3:g} km"
+
+
+def _image(found: BoundMap, plane: Plane) -> str:
+    from matplotlib import colormaps
+    from matplotlib.colors import LogNorm
+    from matplotlib.image import imsave
+
+    steps = levels(found.sigma)
+    norm = LogNorm(steps[0], max(steps[-1], 2.0 * steps[0]), clip=True)
+    rgba = colormaps[COLOURS](norm(np.ma.masked_invalid(found.sigma)))
+    rgba[~np.isfinite(found.sigma)] = 0.0
+    file = BytesIO()
+    imsave(file, np.ascontiguousarray(rgba[::-1]), format="png")
+    dx, dy = ((v[1] - v[0]) / 2.0 for v in (found.x, found.y))
+    x, y = plane(np.array([found.x[0] - dx, found.y[-1] + dy]))
+    right, low = plane(np.array([found.x[-1] + dx, found.y[0] - dy]))
+    source = b64encode(file.getvalue()).decode()
+    size = f'x="{x:.2f}" y="{y:.2f}" width="{right - x:.2f}" height="{low - y:.2f}"'
+    return f'<image {size} preserveAspectRatio="none" opacity="0.75" href="data:image/png;base64,{source}"/>'
+
+
+def _lines(found: BoundMap, plane: Plane) -> str:
+    parts = []
+    for level, lines in isolines(found):
+        drawn = [plane(line) for line in lines]
+        if not drawn:
+            continue
+        parts.append(f'<path class="line" d="{path(drawn, close=False)}"/>')
+        longest = max(drawn, key=len)
+        x, y = longest[len(longest) // 2]
+        parts.append(f'<text class="level" x="{x:.1f}" y="{y:.1f}">{_metres(level)}</text>')
+    return "".join(parts)
+
+
+def _map_stations(found: BoundMap, plane: Plane) -> str:
+    parts = []
+    for name, (x, y) in zip(found.names, plane(found.stations), strict=True):
+        parts += [dot(x, y, BLACK, 11), dot(x, y, "#ffffff", 7, name)]
+        parts.append(f'<text class="name" x="{x:.1f}" y="{y:.1f}">{escape(name)}</text>')
+    return "".join(parts)
+
+
+def _trials(plane: Plane, places: Array, off: Array) -> str:
+    kept = np.unique(np.linspace(0, len(places) - 1, min(_DOTS, len(places))).astype(int))
+    order = kept[np.argsort(off[kept], kind="stable")]
+    return "".join(
+        dot(x, y, ORANGE if bad else BLUE, 5 if bad else 3)
+        for (x, y), bad in zip(plane(places[order]), off[order], strict=True)
+    )
+
+
+def _data(found: BoundMap) -> dict[str, Any]:
+    """Return what the script of the page needs to tell the bound at a place."""
+    return {
+        "x": [float(found.x[0]), float(found.x[-1]), len(found.x)],
+        "y": [float(found.y[0]), float(found.y[-1]), len(found.y)],
+        "values": [float(f"{v:.3g}") if np.isfinite(v) else None for v in found.sigma.ravel()],
+    }
+
+
+# A page that holds one interactive map.
+
+
+def map_page(found: BoundMap, title: str) -> str:
+    """Return an HTML page with the interactive map of a bound; it needs no network.
+
+    Raises
+    ------
+    InvalidProblem
+        Where the frame is not on Earth, or matplotlib is missing.
+    """
+    if not found.geodetic:
+        advice = "write a picture (.png, .svg, .pdf), or give a frame of the Earth"
+        raise InvalidProblem("an interactive map needs positions on Earth", "map", advice)
+    text = "Root of the trace of the Cramer-Rao bound of the position, in metres. Shores: Natural Earth."
+    parts = [("map", "Bound of the position error", paragraph(text) + map_element(found, "map-1", title))]
+    return page(title, parts, "", "", maps=True)

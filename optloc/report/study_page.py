@@ -1,0 +1,357 @@
+"""From the folder of a study to its report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array
+from optloc.bounds.bound_map import BoundMap, bound_map, extent, plan_of
+from optloc.papers.report import Picture
+from optloc.plot.bound_map import plot_bound_map
+from optloc.plot.style import figure_class
+from optloc.report import figures as drawn
+from optloc.report import page as html
+from optloc.report.figures import Mark, marks, svg_text
+from optloc.report.map_pages import map_element
+from optloc.report.sheets import Sheet, latex, sheets
+from optloc.study import summary
+from optloc.study.cases import Case
+from optloc.study.draws import draw
+from optloc.study.folder import Manifest, read_frame, read_manifest, unwritable
+from optloc.study.plan import Plan, planned
+from optloc.study.summary import case_label, noise_text
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+# Maps of the scenarios of a study whose stations stand still.
+
+_POINTS = 64
+_MOST = 8
+_REACH = 400
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """The map of a case.
+
+    Parameters
+    ----------
+    title : str
+        Case and noise level.
+    found : BoundMap
+        Its bound.
+    truths : array (n, 2)
+        True places of trials, as x and y of the map.
+    off : bool array (n,)
+        Where a method other than a bare program claimed an answer that is not the best known.
+    """
+
+    title: str
+    found: BoundMap
+    truths: Array
+    off: Array
+
+
+def plan_again(manifest: Manifest) -> Plan | None:
+    """Return the plan of a study from its manifest, None where a problem file cannot be read any more."""
+    try:
+        return planned(manifest.text, manifest.name, Path(manifest.folder or "."), seed=manifest.seed)
+    except InvalidProblem:
+        return None
+
+
+def references(plan: Plan | None) -> set[str]:
+    """Return the names of the methods that begin at the truth, with which nobody competes."""
+    if plan is None:
+        return {"truth"}
+    found = {cell.method.name: cell.method for cell in plan.cells}
+    return {name for name, method in found.items() if method.baseline == "truth" or method.start == "truth"}
+
+
+def scenario_maps(plan: Plan, frame: pd.DataFrame) -> Iterator[Place]:
+    """Yield the map of every case whose stations are the same in all trials, at its first noise level.
+
+    Cases that have no map are left out.
+    """
+    first: dict[str, Case] = {}
+    for cell in plan.cells:
+        first.setdefault(case_label(cell.case.table.name, cell.case.sweep), cell.case)
+    for title, case in list(first.items())[:_MOST]:
+        layout = case.table.layout
+        if layout is not None and (layout.placement == "random" or layout.survey is not None):
+            continue
+        rows = frame[(frame["case"] == title) & (frame["noise_label"] == case.label)]
+        try:
+            yield _place(title, case, rows)
+        except InvalidProblem:
+            continue
+
+
+def _place(title: str, case: Case, rows: pd.DataFrame) -> Place:
+    one = draw(case, 0, 1)
+    problem, d = one.problem.take(np.zeros(1, dtype=int)), one.problem.dimension
+    per_trial = rows.groupby("trial", sort=True).agg(
+        off=("wrong", "any"), x=("truth_x", "first"), y=("truth_y", "first"), z=("truth_z", "first")
+    )
+    position = per_trial[["x", "y", "z"]].to_numpy(dtype=float)[:_REACH, :d]
+    earth = problem.frame.geodetic and d == 3
+    plain = plan_of(problem.frame, position, earth)
+    height = float(np.round(np.median(plain[:, 2]))) if d == 3 and len(plain) else 0.0
+    west, east, south, north = extent(problem, position, widen=0.2)
+    found = bound_map(
+        problem, one.truth[0], np.linspace(west, east, _POINTS), np.linspace(south, north, _POINTS), height
+    )
+    off = per_trial["off"].to_numpy(dtype=bool)[:_REACH]
+    return Place(f"{title}, {noise_text(case.label)}", found, plain[:, :2], off)
+
+
+Tell = Callable[[str], None]
+"""Hears what is being made."""
+
+_DPI = 200
+
+
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """What a report is made of; rivals are the rows of methods that do not begin at the truth."""
+
+    manifest: Manifest
+    frame: pd.DataFrame
+    cells: pd.DataFrame
+    looks: dict[str, Mark]
+    sheets: dict[str, Sheet]
+    places: list[Place]
+    rivals: pd.DataFrame
+
+
+@dataclass(frozen=True, slots=True)
+class _Section:
+    """Figures that belong together, with the text above them."""
+
+    name: str
+    title: str
+    text: str
+    make: Callable[[_Found], list[Picture]]
+    lines: bool = True
+    wide: bool = False
+    tables: tuple[str, ...] = ()
+
+
+def write_report(folder: Path, out: Path | None = None, tell: Tell | None = None) -> list[Path]:
+    """Write the report of a study, as far as it is finished.
+
+    Parameters
+    ----------
+    folder : Path
+        Output folder of a study.
+    out : Path, optional
+        Where ``report.html``, ``tables`` and ``figures`` go; ``report`` in the folder of the study by default.
+    tell : callable, optional
+        Hears what is being made.
+
+    Returns
+    -------
+    list of Path
+        The files, the page first.
+
+    Raises
+    ------
+    InvalidProblem
+        Where the folder holds no study or nothing of it is finished, matplotlib is missing, or a file cannot be
+        written.
+    """
+    figure_class()
+    place = folder / "report" if out is None else out
+    say = tell or (lambda _: None)
+    say("reading")
+    found = _found(folder)
+    try:
+        files = [_table_file(place, sheet, ending) for sheet in found.sheets.values() for ending in ("csv", "tex")]
+        parts, maps = [], False
+        parts.append(("ranking", "Ranking", html.table(found.sheets["ranking"])))
+        for section in _SECTIONS:
+            say(section.title.lower())
+            pictures = section.make(found)
+            if pictures:
+                parts.append((section.name, section.title, _section(section, found, pictures)))
+                files += [path for picture in pictures for path in _figure_files(place, picture, found, section)]
+        if found.places:
+            say("maps")
+            inner, more, maps = _maps(place, found)
+            parts.append(("maps", "Where the bound is small", inner))
+            files += more
+        parts.append(("made", "How it was made", _made(found)))
+        title = found.manifest.title or found.manifest.name
+        page = html.page(title, parts, _opening(found), html.legend(found.looks), maps=maps)
+        target = place / "report.html"
+        target.write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise unwritable(place, error) from None
+    return [target, *files]
+
+
+def _found(folder: Path) -> _Found:
+    manifest = read_manifest(folder)
+    rows = read_frame(folder, [*summary.COLUMNS])
+    if not len(rows):
+        advice = "wait for the first part, or run the study"
+        raise InvalidProblem("nothing of the study is finished yet", str(folder), advice)
+    frame = summary.judged(rows)
+    order, cells = summary.methods(frame), summary.cells(frame)
+    plan = plan_again(manifest)
+    known = references(plan)
+    rivals = frame[~frame["method"].isin(known)]
+    rivals = rivals if len(rivals) else frame
+    tables = {sheet.shown.name: sheet for sheet in sheets(frame, rivals, cells, order)}
+    places = [] if plan is None else list(scenario_maps(plan, frame))
+    return _Found(manifest, frame, cells, marks(order), tables, places, rivals)
+
+
+def _opening(found: _Found) -> str:
+    m, rows = found.manifest, len(found.frame)
+    part = "complete" if rows == m.rows else f"{rows} of {m.rows} rows: not finished, and what follows may change"
+    trials = found.frame[["data", "trial"]].drop_duplicates()
+    facts = (
+        f"{rows} fixes of {len(trials)} trials by {len(found.looks)} methods ({part}). optloc {m.version}, begun "
+        f"{m.created[:10]}, seed {m.seed}, {m.machine}."
+    )
+    return (html.paragraph(m.note) if m.note else "") + html.paragraph(facts, "soft")
+
+
+def _section(section: _Section, found: _Found, pictures: list[Picture]) -> str:
+    tables = "".join(
+        html.folded(f"Table: {found.sheets[name].shown.title.lower()}", html.table(found.sheets[name]))
+        for name in section.tables
+    )
+    return html.paragraph(section.text) + html.figures(pictures, wide=section.wide) + tables
+
+
+def _figure_files(place: Path, picture: Picture, found: _Found, section: _Section) -> list[Path]:
+    """Write a picture as PNG and SVG, with a legend of the methods in it where the page has one."""
+    figure = picture.figure
+    if section.lines:
+        handles, labels = figure.axes[0].get_legend_handles_labels()
+        columns = 2 if max(map(len, labels), default=0) > 22 else 3
+        legend = figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=7)
+        rows = -(-len(labels) // columns)
+        width, height = figure.get_size_inches()
+        figure.set_size_inches(width, height + 0.16 * rows)
+        legend.set_in_layout(True)
+    paths = [place / "figures" / f"{picture.name}.{ending}" for ending in ("png", "svg")]
+    paths[0].parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(paths[0], dpi=_DPI)
+    paths[1].write_text(svg_text(figure), encoding="utf-8")
+    return paths
+
+
+def _table_file(place: Path, sheet: Sheet, ending: str) -> Path:
+    path = place / "tables" / f"{sheet.shown.name}.{ending}"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if ending == "csv":
+        sheet.frame.to_csv(path, index=False, lineterminator="\n")
+    else:
+        path.write_text(latex(sheet.shown, sheet.words), encoding="utf-8")
+    return path
+
+
+def _maps(place: Path, found: _Found) -> tuple[str, list[Path], bool]:
+    """Return the maps of a page, their files, and whether the page needs the script of maps."""
+    text = (
+        "Bound of the position error (root of its trace) at the height of the middle trial, over the place of the "
+        "target. On maps that move, blue dots are true positions, orange ones those where some method was wrong though "
+        "ok."
+    )
+    parts, files, moving, section = (
+        [html.paragraph(text)],
+        [],
+        False,
+        _Section("maps", "", "", lambda _: [], lines=False),
+    )
+    for i, one in enumerate(found.places):
+        picture = Picture(f"map-{i + 1}", f"Bound: {one.title}", plot_bound_map(one.found, one.title))
+        if one.found.geodetic:
+            moving = True
+            parts.append(f"<h3>{escape(one.title)}</h3>")
+            parts.append(map_element(one.found, f"map-{i + 1}", one.title, (one.truths, one.off)))
+        else:
+            parts.append(html.figures([picture], wide=True))
+        files += _figure_files(place, picture, found, section)
+    return "".join(parts), files, moving
+
+
+def _made(found: _Found) -> str:
+    file = f"<pre>{escape(found.manifest.text)}</pre>"
+    return html.table(found.sheets["machine"]) + html.folded("Study file", file)
+
+
+def _of_cells(make: Callable[..., object], found: _Found) -> list[Picture]:
+    return list(make(found.cells, found.looks))  # type: ignore[call-overload,no-any-return]
+
+
+def _of_rows(make: Callable[..., object], found: _Found) -> list[Picture]:
+    return list(make(found.frame, found.looks))  # type: ignore[call-overload,no-any-return]
+
+
+def _profile(found: _Found) -> list[Picture]:
+    return list(drawn.profile(found.rivals, found.looks))
+
+
+_SECTIONS = (
+    _Section(
+        "success",
+        "How often it is right",
+        "Right: the method claims an answer, and no lower cost is known for the same data. Bars are 95 % intervals.",
+        partial(_of_cells, drawn.success),
+        lines=False,
+        tables=("success",),
+    ),
+    _Section(
+        "accuracy",
+        "Error over the bound, against noise",
+        "Root mean square error of the answers over that of the Cramer-Rao bound at the truth; bars are 95 % "
+        "intervals. One gross error is enough to lift a point far, so look at the distributions too.",
+        partial(_of_cells, drawn.accuracy),
+        tables=("accuracy",),
+    ),
+    _Section(
+        "errors",
+        "Distribution of errors",
+        "Share of trials whose error, in units of the bound, is at most so large. A curve ends at the share of trials "
+        "with an answer. The broad grey curve is that of an efficient estimate.",
+        partial(_of_rows, drawn.distributions),
+    ),
+    _Section(
+        "gaps",
+        "How near to the best cost",
+        "Share of trials whose cost exceeds the lowest that is known, of any method or of the truth, by at most so "
+        "much. Positions that are not refined count too: this is how tight a relaxation is. Less than a millionth is "
+        "drawn at a millionth.",
+        partial(_of_rows, drawn.gaps),
+        tables=("certificates",),
+    ),
+    _Section(
+        "profile",
+        "Performance profile",
+        "Share of instances that a method answers right within a multiple of the time of the fastest right one. "
+        "Methods that begin at the truth do not take part.",
+        _profile,
+        wide=True,
+    ),
+    _Section(
+        "time",
+        "Time against size",
+        "Median time of a fix; bars reach from the 10th to the 90th percentile. Points of one size stand side by side.",
+        partial(_of_rows, drawn.timing),
+        tables=("timing",),
+    ),
+)

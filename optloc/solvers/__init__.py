@@ -1,0 +1,74 @@
+"""Solve: from a problem to a fix, without a guess."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array
+from optloc.problem.epochs import by_epoch, separable
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
+from optloc.solvers.methods import FORMULATIONS, METHODS, SOLVERS, WORTH, Entry, Formulation, stages_of
+from optloc.solvers.pool import given, in_parts
+from optloc.solvers.range_fixes import Quick, shortened
+from optloc.solvers.stages import Solver
+from optloc.solvers.starts.position import vectors
+from optloc.solvers.verdict.status import without_open_epochs
+
+__all__ = ["FORMULATIONS", "METHODS", "SOLVERS", "Entry", "Formulation", "Solver", "given", "solve", "vectors"]
+
+
+def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
+    """Return the fix of every problem of a batch, without a first guess.
+
+    Parameters
+    ----------
+    problem : Problem
+        Batch axes (...). Where its epochs share no unknown they are solved as one more batch axis, (..., k).
+    method : str
+        "auto", or stages joined by "+": for instance "gtrs+lsr"; see ``optloc list solvers``.
+    start : array (..., size), optional
+        Starting vector for a method that begins with a refinement, for instance "lsr".
+
+    Returns
+    -------
+    Fix
+        With the problem's batch axes. Failure is a status, never an exception.
+
+    Raises
+    ------
+    InvalidProblem
+        For an unknown method, or where nothing is unknown.
+    """
+    solvers = shortened([stage.solver for stage in stages_of(method)], WORTH)
+    if problem.layout.size == 0:
+        raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
+    if separable(problem):
+        problem = by_epoch(problem)
+    shape, flat = problem.batch_shape, problem.flat()
+    vector = None if start is None else _started(problem, start).reshape(-1, problem.layout.size)
+
+    def work(some: Problem, part: slice) -> Fix:
+        fix = None if vector is None else given(some, vector[part])
+        for solver in solvers:
+            fix = solver(some, fix)
+        assert fix is not None
+        return without_open_epochs(fix)
+
+    whole = len(solvers) == 1 and isinstance(solvers[0], Quick)
+    fix = work(flat, slice(None)) if whole else in_parts(flat, work)
+    return fix.reshape(shape) if shape != (len(fix),) else fix
+
+
+def _started(problem: Problem, start: Any) -> Array:
+    """Return a starting vector for every problem, (..., size)."""
+    vector, wanted = np.asarray(start, dtype=float), (*problem.batch_shape, problem.layout.size)
+    try:
+        return np.broadcast_to(vector, wanted)
+    except ValueError:
+        raise InvalidProblem(
+            f"start has shape {vector.shape}, not {wanted}", "start", "order it by the layout"
+        ) from None

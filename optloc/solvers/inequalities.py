@@ -1,0 +1,155 @@
+"""Answers under inequalities: the minimum lies inside, or on one of the faces; all of them are tried."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from scipy.special import chdtrc
+
+from optloc.base.status import Status
+from optloc.base.types import Array
+from optloc.linear.constraints import TOLERANCE, Face, exact, faces, violation
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
+from optloc.solvers.policy import DOUBT
+from optloc.solvers.pool import Candidates
+from optloc.solvers.refine import refine
+from optloc.solvers.verdict.horizon import hidden
+
+Descend = Callable[[Problem, Array, Array, Face], tuple[Array, Array, Array]]
+
+_STARTS = 3
+
+
+def by_least_squares(problem: Problem, start: Array, item: Array, face: Face) -> tuple[Array, Array, Array]:
+    """Return x (M, size), cost (M,) and status (M,) of the minima on a face next to starts of problems `item` (M,)."""
+    done = refine(problem, start, item=item, face=face, limit=100)
+    return done.x, done.cost, done.status
+
+
+def bounded(problem: Problem, pool: Candidates, descend: Descend = by_least_squares) -> Candidates:
+    """Return the feasible candidates of a flat batch, with those on faces added where the cheapest breaks a constraint.
+
+    A target that the Earth hides from a satellite which hears it is not feasible either.
+
+    Every set of inequalities that can hold with equality together is a face. The cost is minimised on each from the
+    cheapest candidates, and what is feasible competes: the cheapest meets the conditions of Karush, Kuhn and Tucker.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems with constraints.
+    pool : Candidates
+        Refined under the equalities alone.
+    descend : callable
+        Minimises the cost of the pool on a face: of problems, starts, the problem of each start, and the face.
+
+    Returns
+    -------
+    Candidates
+        Infeasible ones have infinite cost and status `infeasible`.
+    """
+    broken = _broken(problem, pool)
+    if not broken.any():
+        return pool
+    sides = faces(problem)
+    first = np.argmin(np.where(np.isfinite(pool.cost), pool.cost, np.inf), axis=1)
+    needy = np.flatnonzero(broken[np.arange(len(first)), first])
+    kept = _without(pool, broken)
+    if not len(needy) or sides == [exact(problem)]:
+        return kept
+    starts = _cheapest(pool, needy)
+    on_faces = [_on_face(problem, sides, number, needy, starts, descend) for number in range(1, len(sides))]
+    size, width = len(pool.x), starts.shape[1] * len(on_faces)
+    x = np.full((size, width, pool.x.shape[-1]), np.nan)
+    cost, code = np.full((size, width), np.inf), np.full((size, width), int(Status.INFEASIBLE), dtype=np.int8)
+    face = np.zeros((size, width), dtype=int)
+    for array, place in ((x, 0), (cost, 1), (code, 2), (face, 3)):
+        array[needy] = np.concatenate([found[place] for found in on_faces], axis=1)
+    return Candidates(
+        np.concatenate([kept.x, x], axis=1),
+        np.concatenate([kept.cost, cost], axis=1),
+        np.concatenate([kept.code, code], axis=1),
+        np.concatenate([kept.face, face], axis=1),
+    )
+
+
+def without_broken(problem: Problem, pool: Candidates) -> Candidates:
+    """Return candidates of which those that break a constraint, or are hidden, have infinite cost."""
+    return _without(pool, _broken(problem, pool))
+
+
+def _broken(problem: Problem, pool: Candidates) -> Array:
+    """Return which candidates break a constraint, or stand where the Earth hides them from a satellite."""
+    broken = np.zeros(pool.cost.shape, dtype=bool)
+    item, slot = np.nonzero(np.isfinite(pool.x).all(-1))
+    if len(item) and (problem.constraints or problem.frame.geodetic):
+        part, x = problem.take(item), pool.x[item, slot]
+        broken[item, slot] = (violation(part, x) > TOLERANCE) | hidden(part, x)
+    return broken
+
+
+def _without(pool: Candidates, broken: Array) -> Candidates:
+    cost = np.where(broken, np.inf, pool.cost)
+    return Candidates(pool.x, cost, np.where(broken, np.int8(Status.INFEASIBLE), pool.code), pool.face)
+
+
+def _cheapest(pool: Candidates, items: Array) -> Array:
+    """Return the cheapest candidates (items, q, size) of some problems; NaN where there are fewer."""
+    order = np.argsort(pool.cost[items], axis=1, kind="stable")[:, :_STARTS]
+    x = np.take_along_axis(pool.x[items], order[..., None], axis=1)
+    good = np.isfinite(np.take_along_axis(pool.cost[items], order, axis=1))
+    return np.where(good[..., None], x, np.nan)
+
+
+def _on_face(
+    problem: Problem, sides: list[Face], number: int, items: Array, starts: Array, descend: Descend
+) -> tuple[Array, ...]:
+    """Return x, cost, code and face (items, q) of the minima on one face."""
+    shape = starts.shape[:2]
+    cost, code = np.full(shape, np.inf), np.full(shape, int(Status.INFEASIBLE), dtype=np.int8)
+    x = np.array(starts)
+    row, slot = np.nonzero(np.isfinite(starts).all(-1))
+    x[row, slot], found, status = descend(problem, starts[row, slot], items[row], sides[number])
+    part = problem.take(items[row])
+    inside = (violation(part, x[row, slot]) <= TOLERANCE) & ~hidden(part, x[row, slot]) & np.isfinite(found)
+    cost[row, slot] = np.where(inside, found, np.inf)
+    code[row, slot] = np.where(inside, status, np.int8(Status.INFEASIBLE))
+    return x, cost, code, np.full(shape, number)
+
+
+def contradicted(fix: Fix, free: Candidates, *, robust: bool = False) -> Fix:
+    """Return fixes whose status says where the data contradict the constraints that hold them.
+
+    They do so where the data agree among themselves without the constraints, and each constraint that holds a fix
+    costs so much that noise does it once in a thousand times: with the true place inside, what k of them cost is not
+    more than chi-square of k degrees of freedom.
+
+    Parameters
+    ----------
+    fix : Fix
+        N fixes under constraints.
+    free : Candidates
+        The same problems refined under the equalities alone.
+    robust : bool
+        Whether the cost bears gross errors, so that the data need not agree among themselves.
+    """
+    if fix.active is None:
+        return fix
+    held = np.array([len(active) for active in fix.active])
+    finished = np.where(free.code == Status.OK, free.cost, np.inf)
+    least = finished.min(1, initial=np.inf)
+    with np.errstate(invalid="ignore"):
+        noise = robust | (fix.dof <= 0) | (chdtrc(np.maximum(fix.dof, 1), least) >= DOUBT)
+        dear = chdtrc(np.maximum(held, 1), np.maximum(fix.cost - least, 0.0)) < DOUBT
+    items = np.flatnonzero((held > 0) & fix.answered & np.isfinite(least) & noise & dear)
+    if not len(items):
+        return fix
+    code, reason = fix.code.copy(), fix.reason.copy()
+    for i in items:
+        names = " and ".join(active.name for active in fix.active[i])
+        code[i] = Status.CONTRADICTORY
+        reason[i] = f"the data contradict {names}: the cost is {fix.cost[i]:.3g}, and {least[i]:.3g} without"
+    return replace(fix, code=code, reason=reason)

@@ -1,0 +1,226 @@
+"""The maximum-likelihood problem as a nonlinear program for IPOPT: a second opinion on the refinement, one by one."""
+
+from __future__ import annotations
+
+import os
+from functools import lru_cache
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from formulations.backend import chosen
+from formulations.nls import Program
+from optloc.base.errors import InvalidProblem
+from optloc.base.status import Status
+from optloc.base.types import Array
+from optloc.compute.sums import equations_at
+from optloc.linear.constraints import conjunction, face_of, faces, tangent_at
+from optloc.linear.normal import decrement, prior_parts, step
+from optloc.linear.station_noise import weighed
+from optloc.linear.symbolic import bounds, constrained, parameters, residual
+from optloc.problem.fix import Fix, Stage
+from optloc.problem.noise import whiten
+from optloc.problem.problem import Problem
+from optloc.solvers.inequalities import without_broken
+from optloc.solvers.pool import Candidates, given, pooled, unrefined
+from optloc.solvers.stages import finished
+from optloc.solvers.starts.block_averages import averaged
+from optloc.solvers.starts.position import completed, spread_of
+from optloc.solvers.starts.registration import BLOCKS, alike, registrable
+
+# "1" has programs compiled by the system's C compiler: worth its seconds for many fixes of one large structure
+_COMPILE = "OPTLOC_COMPILE_NLP"
+
+
+def nlp(problem: Problem, fix: Fix | None) -> Fix:
+    """Return the fix found by IPOPT from every candidate of the stage before.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems.
+    fix : Fix
+        Where to start.
+
+    Returns
+    -------
+    Fix
+        Judged like a refined one; of a long run, the answers for its block averages, to be refined by `lsr`.
+    """
+    if fix is None:
+        raise InvalidProblem("nlp improves a start", "method", "give start= or a method such as 'gtrs+nlp'")
+    began = perf_counter()
+    if registrable(problem) and problem.epochs >= 2 * BLOCKS:
+        return unrefined(problem, _of_blocks(problem, pooled(fix)[0]), fix, "nlp", began)
+    problem = weighed(problem)
+    pool, item, slot = pooled(fix)
+    x, cost, code = (
+        pool.copy(),
+        np.full(pool.shape[:2], np.inf),
+        np.full(pool.shape[:2], int(Status.NUMERICAL), np.int8),
+    )
+    for i in np.unique(item):
+        one = problem.take(np.array([i]))
+        solver = _Scaled(one)
+        for j in slot[item == i]:
+            x[i, j], cost[i, j], code[i, j] = solver.from_start(pool[i, j])
+    face = np.zeros(cost.shape, dtype=int)
+    if len(item):
+        part, points = problem.take(item), x[item, slot]
+        face[item, slot] = face_of(part, points) if problem.constraints else 0
+        code[item, slot] = _stationary(part, points, code[item, slot], face[item, slot])
+    cost[code == Status.NUMERICAL] = np.inf  # a start on a station has no gradient, and IPOPT's last word is no point
+    stage = Stage("nlp", f"{len(item)} programs", perf_counter() - began)
+    return finished(problem, fix, without_broken(problem, Candidates(x, cost, code, face)), stage)
+
+
+def _of_blocks(problem: Problem, x: Array) -> Array:
+    """Return the answers (N, C, size) for the block averages of runs from their candidates."""
+    n, out = problem.layout.n_shared, np.full(x.shape, np.nan)
+    for items in alike(problem):
+        blocks = averaged(problem.take(items), BLOCKS)
+        found, _, _ = pooled(nlp(blocks, given(blocks, completed(blocks, x[items, :, :n]))))
+        width = min(found.shape[1], x.shape[1])
+        out[items, :width] = completed(problem.take(items), found[:, :width, :n])
+    return out
+
+
+def _stationary(problem: Problem, x: Array, code: Array, face: Array) -> Array:
+    """Return `ok` where the next Gauss-Newton step is shorter than 1e-5 sigma, whatever IPOPT calls its own ending."""
+    sides, out = faces(problem) if problem.constraints else [()], np.array(code)
+    for number in np.unique(face):
+        items = np.flatnonzero(face == number)
+        part, here = problem.take(items), x[items]
+        with np.errstate(all="ignore"):
+            space = tangent_at(part, sides[number], here) if sides[number] else None
+            equations = equations_at(part, here, whiten(part.noise, part.weight))
+            move, solvable = step(equations, np.zeros(len(here)), space)
+            small = solvable & (np.abs(decrement(equations, move, problem.layout.n_shared)) < 1e-10)
+        out[items[small]] = Status.OK
+    return out
+
+
+class _Scaled:
+    """One problem in units of its own size, with the compiled program of its structure."""
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+        shift, size = (value[0] for value in spread_of(problem))
+        layout = problem.layout
+        unit = np.concatenate(
+            [_slot_units(layout.shared, size), np.tile(_slot_units(layout.local, size), layout.epochs)]
+        )
+        centre = np.zeros(layout.size)
+        for found in (layout.shared, layout.local):
+            for place in found:
+                if place.name.partition("[")[0] == "position":
+                    base = place.start + (0 if found is layout.shared else layout.n_shared)
+                    step = layout.n_local or 1
+                    for k in range(1 if found is layout.shared else layout.epochs):
+                        centre[base + k * step : base + k * step + place.size] = shift
+        self.unit, self.centre = unit, centre
+        rows = parameters(problem)
+        self.data = np.concatenate([unit, centre, rows, [size], bounds(problem)])
+        self.program = _program(_Key(problem, len(self.data), len(rows)))
+        self.weight = _whitening(problem)
+        self.z = np.where(problem.weight[0] > 0.0, problem.observed[0], 0.0)
+        self.prior = _prior(problem, unit, centre)
+
+    def from_start(self, start: Array) -> tuple[Array, float, int]:
+        found = self.program.solve((start - self.centre) / self.unit, self.z, self.weight, self.data, prior=self.prior)
+        code = (
+            Status.OK if found.success else Status.MAX_ITERATIONS if "Iteration" in found.status else Status.NUMERICAL
+        )
+        return found.x * self.unit + self.centre, found.cost, int(code)
+
+
+class _Key:
+    """A problem that is equal to another of the same structure: the key of a compiled program."""
+
+    def __init__(self, problem: Problem, data: int, rows: int) -> None:
+        self.problem, self.data, self.rows = problem, data, rows
+        s = problem.stations
+        shapes = tuple(None if a is None else a.shape[-3:] for a in (s.position, s.velocity, s.axes))
+        limits = tuple(
+            (bool(np.all(b.lower == b.upper)), bool(np.isfinite(b.lower).all()), bool(np.isfinite(b.upper).all()))
+            for b in conjunction(problem)
+        )
+        self.choice = chosen("nonlinear")
+        self.compiled = os.environ.get(_COMPILE, "") == "1"
+        self.key = (
+            problem.structure,
+            data,
+            shapes,
+            limits,
+            None if self.choice is None else self.choice.key,
+            self.compiled,
+        )
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Key) and self.key == other.key
+
+
+@lru_cache(maxsize=64)
+def _program(key: _Key) -> Program:
+    problem, n = key.problem, key.problem.layout.size
+
+    def scaled(y: Any, p: Any, z: Any) -> list[Any]:
+        return residual(problem, y * p[:n] + p[n : 2 * n], p[2 * n :], z)
+
+    def limited(y: Any, p: Any) -> tuple[list[Any], list[Any]]:
+        last = 2 * n + key.rows
+        return constrained(problem, y * p[:n] + p[n : 2 * n], p[last + 1 :], p[last])
+
+    equal, more = ((lambda y, p, i=i: limited(y, p)[i]) if problem.constraints else None for i in (0, 1))
+    return Program(
+        n,
+        problem.count,
+        key.data,
+        residual=scaled,
+        equalities=equal,
+        inequalities=more,
+        diagonal=_independent(problem),
+        settings={"bound_relax_factor": 0.0, "max_iter": 200},  # by default constraints give way by 1e-8
+        choice=key.choice,
+        compiled=key.compiled,
+    )
+
+
+def _slot_units(slots: Any, size: float) -> Array:
+    units = [np.full(slot.size, size if slot.unit.startswith("m") else 1.0) for slot in slots]
+    return np.concatenate([*units, np.zeros(0)])
+
+
+def _independent(problem: Problem) -> bool:
+    return all(block.row.shape[1] == 1 for block in problem.noise.blocks)
+
+
+def _whitening(problem: Problem) -> Array:
+    """Return the whitening matrix, or the weights alone where errors are independent."""
+    rows = problem.count
+    matrix = np.zeros(rows if _independent(problem) else (rows, rows))
+    for whitener in whiten(problem.noise, problem.weight):
+        full = np.broadcast_to(whitener.matrix, (1, *whitener.row.shape, whitener.row.shape[1]))[0]
+        if matrix.ndim == 1:
+            matrix[whitener.row[:, 0]] = full[:, 0, 0]
+            continue
+        for members, block in zip(whitener.row, full, strict=True):
+            matrix[np.ix_(members, members)] = block
+    return matrix
+
+
+def _prior(problem: Problem, unit: Array, centre: Array) -> tuple[Array, Array]:
+    layout = problem.layout
+    mean, information = np.zeros(layout.size), np.zeros((layout.size, layout.size))
+    for name, value, precision in prior_parts(problem):
+        slot, shared = layout.find(name)
+        for k in range(1 if shared else layout.epochs):
+            start = slot.start + (0 if shared else layout.n_shared + k * layout.n_local)
+            part = slice(start, start + slot.size)
+            mean[part] = value.reshape(-1, value.shape[-1])[0]
+            information[part, part] = precision.reshape(-1, slot.size, slot.size)[0]
+    return (mean - centre) / unit, information * unit[:, None] * unit[None, :]

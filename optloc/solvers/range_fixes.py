@@ -1,0 +1,313 @@
+"""Positions from ranges in one compiled call; what is not plainly good takes the stages of the long way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from optloc.base import linalg
+from optloc.base.frames import Frame
+from optloc.base.status import Status
+from optloc.base.threads import mapped
+from optloc.base.types import Array
+from optloc.compute.jit import enabled
+from optloc.linear.degrees_of_freedom import degrees_of_freedom
+from optloc.linear.station_noise import depends_on_place, weighed
+from optloc.models import MODELS
+from optloc.problem.fix import Alternatives, Fix, Stage
+from optloc.problem.layout import Layout
+from optloc.problem.noise import variances, whiten
+from optloc.problem.problem import Problem
+from optloc.proof.pose import whitened, without
+from optloc.solvers.policy import DOUBT
+from optloc.solvers.pool import in_parts
+from optloc.solvers.stages import Solver, gtrs, lsr
+from optloc.solvers.starts.least_squares_ranges import Ranges, ranges
+from optloc.solvers.verdict.judge import _LOCAL
+from optloc.solvers.verdict.status import doubt
+
+# The linear maps from measurements to all that a fix from ranges needs, made once for a structure.
+
+_MOST = 64  # rows, and epochs with emission times, up to which dense maps pay
+_NOTHING = 1e-12  # share of the largest weight below which a combination of rows is rounding
+
+
+@dataclass(frozen=True, slots=True)
+class Direct:
+    """What turns measurements of one structure into fixes: all but the measurements and the stations.
+
+    Parameters
+    ----------
+    layout : Layout
+        Position, and the emission time of each epoch where rows have one.
+    frame : Frame
+        Of the positions.
+    weight : array (m,)
+        Row weights.
+    dof : int
+        Degrees of freedom.
+    limit : float
+        Cost above which the noise may not allow the residuals.
+    station : int array (s,)
+        Stations that take part.
+    maps : tuple
+        Fields of `optloc.compute.range_fixes.Model`.
+    """
+
+    layout: Layout
+    frame: Frame
+    weight: Array
+    dof: int
+    limit: float
+    station: Array
+    maps: tuple[Array | int, ...]
+
+
+_KEPT: dict[tuple[Any, ...], Direct | None] = {}
+_KEPT_MOST = 64
+
+
+def direct(problem: Problem) -> Direct | None:
+    """Return what fixes problems of one structure directly, or None where they need the stages of the long way.
+
+    One static position; rows that are sums of ranges, which link all stations that take part; stations that stay;
+    weights, corrections and noise shared by the batch; nothing else unknown but emission times. Kept for problems that
+    differ in measurements and station positions only.
+
+    Parameters
+    ----------
+    problem : Problem
+        Batch of problems; their measurements are not looked at.
+    """
+    if not (_simple(problem) and enabled()):
+        return None
+    numbers = [array for r in problem.rows for array in (r.weight, r.correction)]
+    numbers += [block.covariance for block in problem.noise.blocks]
+    numbers += [] if problem.stations.covariance is None else [problem.stations.covariance]
+    key = (problem.structure, *(array.tobytes() for array in numbers))
+    if key not in _KEPT:
+        if len(_KEPT) >= _KEPT_MOST:
+            _KEPT.clear()
+        _KEPT[key] = _direct(problem)
+    return _KEPT[key]
+
+
+def _direct(problem: Problem) -> Direct | None:
+    from scipy.special import gammainccinv
+
+    one = weighed(_probe(problem))
+    found = ranges(one)
+    if found is None or len(found.groups) != 1 or len(found.groups[0]) != 1:
+        return None
+    heard = np.flatnonzero(found.inside[0])
+    white = linalg.whitening(found.covariance[0, heard[:, None], heard])
+    dof = int(degrees_of_freedom(one)[0])
+    if dof < 0 or np.triu(white, 1).any():
+        return None
+    correction = np.concatenate([rows.correction for rows in problem.rows])
+    maps = _maps(one, correction, found, heard, white)
+    limit = 2.0 * float(gammainccinv(dof / 2, DOUBT)) * (1.0 - 1e-9) if dof else np.inf
+    return Direct(problem.layout, problem.frame, one.weight, dof, limit, found.station[heard], maps)
+
+
+def _simple(problem: Problem) -> bool:
+    """Return whether the structure, and what the batch shares, are such that linear maps exist and pay."""
+    stations, motion = problem.stations, problem.motions[0]
+    shared = [r.weight for r in problem.rows] + [r.correction for r in problem.rows]
+    return (
+        not (problem.constraints or problem.biases or problem.priors)
+        and len(problem.motions) == 1
+        and (motion.order, motion.span, motion.known) == (0, "run", None)
+        and all(MODELS[r.kind].ranges is not None and bool((r.target == 0).all()) for r in problem.rows)
+        and stations.position.shape[-3] == 1
+        and (stations.covariance is None or (stations.span == "noise" and stations.covariance.ndim == 3))
+        and not depends_on_place(problem)
+        and 0 < problem.count <= _MOST
+        and problem.epochs <= _MOST
+        and all(array.ndim == 1 for array in shared)
+        and all(block.covariance.ndim == 3 for block in problem.noise.blocks)
+    )
+
+
+def _probe(problem: Problem) -> Problem:
+    """Return one problem for each row, whose measurement is one and all others zero."""
+    parts = np.split(np.eye(problem.count), problem.starts[1:], axis=1)
+    rows = tuple(replace(r, z=part, correction=np.zeros(r.count)) for r, part in zip(problem.rows, parts, strict=True))
+    stations = problem.stations
+    place = stations.position.reshape(-1, *stations.position.shape[-3:])[0]
+    return replace(problem, rows=rows, stations=replace(stations, position=place, velocity=None, axes=None))
+
+
+def _maps(one: Problem, correction: Array, found: Ranges, heard: Array, white: Array) -> tuple[Array | int, ...]:
+    """Return the fields of the compiled model, in its order."""
+    count = one.count
+    design, emitted, anchor, start = _design(one, found.station[heard])
+    alone = whitened(whiten(one.noise, one.weight), np.eye(count))
+    times = alone @ emitted
+    bare = without(times, alone)
+    basis, upper = np.linalg.qr(bare @ design, mode="complete")
+    inside = min(upper.shape)
+    turned = basis.T @ bare
+    loops = turned[inside:]
+    loops = loops[np.abs(loops).max(-1, initial=0.0) > _NOTHING * np.abs(alone).max()]
+    emission = np.linalg.pinv(times) @ alone
+    present = one.weight > 0.0
+    precision = np.where(present, 1.0 / np.where(present, variances(one.noise, count), 1.0), 0.0)
+    return (
+        np.stack([correction, precision]),
+        anchor,
+        np.concatenate([found.offset[:, heard].T, turned[:inside], emission, loops]),
+        np.array(found.sign[0, heard], dtype=float),
+        int(np.searchsorted(heard, found.reference[0])) if found.free.all() else -1,
+        np.array(white, order="C"),
+        np.array(upper[:inside], order="C"),
+        np.array(emission @ design, order="C"),
+        start,
+    )
+
+
+def _design(one: Problem, station: Array) -> tuple[Array, Array, Array, Array]:
+    """Return the rows over ranges (m, s) and emission times (m, k), the anchor of each row and of each time."""
+    epochs = one.epochs if one.layout.n_local else 0
+    design, emitted = np.zeros((one.count, len(station))), np.zeros((one.count, epochs))
+    anchor, start = np.full(one.count, -1), np.full(epochs, -1)
+    place = {int(s): i for i, s in enumerate(station)}
+    for rows, first in zip(one.rows, one.starts, strict=True):
+        model = MODELS[rows.kind]
+        for i in np.flatnonzero(rows.weight > 0.0):
+            for coefficient, end in zip(model.ranges or (), (int(rows.a[i]), int(rows.b[i])), strict=False):
+                if coefficient:
+                    design[first + i, place[end]] += coefficient
+            if model.emission:
+                epoch = int(rows.epoch[i])
+                emitted[first + i, epoch] = 1.0
+                start[epoch] = first + i if start[epoch] < 0 else start[epoch]
+                anchor[first + i] = start[epoch]
+    return design, emitted, anchor, start
+
+
+_CHUNK = 4096
+_TOLERANCE, _LIMIT = 1e-7, 100  # of the refinement of the method "lsr"
+
+
+@dataclass(frozen=True, slots=True)
+class Quick:
+    """The stages "gtrs" and "lsr" as one solver, which takes the direct way where there is one.
+
+    Parameters
+    ----------
+    least : int
+        Batches with fewer problems take the stages as they are.
+    """
+
+    least: int = 1
+
+    def __call__(self, problem: Problem, fix: Fix | None) -> Fix:
+        """Return the fixes of a flat batch of problems."""
+        count = problem.batch_shape[0]
+        plan = direct(problem) if fix is None and count >= self.least else None
+        if plan is None:
+            return in_parts(problem, lambda some, part: lsr(some, gtrs(some, None if fix is None else fix[part])))
+        z = problem.z if len(problem.rows) > 1 else problem.rows[0].z
+        place = problem.stations.position.reshape(-1, *problem.stations.position.shape[-2:])
+        z = z if len(z) == count else np.broadcast_to(z, (count, problem.count))
+        return fixed(plan, z, place, lambda items: by_stages(problem, items))
+
+
+def shortened(solvers: Sequence[Solver], least: int = 1) -> list[Solver]:
+    """Return the solvers of a method, with a leading "gtrs", "lsr" as one `Quick`."""
+    return [Quick(least), *solvers[2:]] if list(solvers[:2]) == [gtrs, lsr] else list(solvers)
+
+
+def by_stages(problem: Problem, items: Array) -> Fix:
+    """Return the fixes of some problems of a flat batch by the stages "gtrs" and "lsr"."""
+    return in_parts(problem.take(items), lambda some, part: lsr(some, gtrs(some, None)))
+
+
+def fixed(direct: Direct, z: Array, position: Array, rest: Callable[[Array], Fix], threads: int | None = None) -> Fix:
+    """Return the fixes of measurements: directly where the answer is plain, else by other means.
+
+    Parameters
+    ----------
+    direct : Direct
+        From `direct` for problems of the same structure.
+    z : array (N, m)
+        Measurements.
+    position : array (N or 1, stations, d)
+        Of all stations.
+    rest : callable
+        Maps the numbers of problems whose answer is not plain to their fixes.
+    threads : int, optional
+        At most so many; as many as `optloc.base.threads.thread_count` says if absent.
+    """
+    from optloc.compute.range_fixes import Model, fixes
+
+    began = perf_counter()
+    model = Model(*direct.maps)  # type: ignore[arg-type]
+    count, d = len(z), position.shape[-1]
+    x, covariance = np.empty((count, direct.layout.size)), np.empty((count, d, d))
+    cost, plain = np.empty(count), np.empty(count, dtype=np.bool_)
+    everyone = len(direct.station) == position.shape[1]
+
+    def work(first: int) -> int:
+        part = slice(first, min(first + _CHUNK, count))
+        stations = position[part] if len(position) > 1 else position
+        stations = _owned(stations if everyone else stations[:, direct.station])
+        rows = _owned(z[part])
+        return int(fixes(model, rows, stations, _TOLERANCE, _LIMIT, x[part], covariance[part], cost[part], plain[part]))
+
+    steps = mapped(work, range(0, count, _CHUNK), threads)
+    detail = f"{count} candidates, {max(steps, default=0)} steps at most"
+    stages = (Stage("gtrs", "1 candidates at most", 0.0), Stage("lsr", detail, perf_counter() - began))
+    fix = _judged(direct, x, covariance, cost, stages)
+    doubt(fix, np.flatnonzero(plain & (cost > direct.limit)))
+    left = np.flatnonzero(~plain)
+    return _replaced(fix, left, rest(left)) if len(left) else fix
+
+
+def _judged(direct: Direct, x: Array, covariance: Array, cost: Array, stages: tuple[Stage, ...]) -> Fix:
+    """Return plain answers as fixes; all share one certificate."""
+    count = len(x)
+    return Fix(
+        x,
+        covariance,
+        direct.layout,
+        direct.frame,
+        np.full(count, int(Status.OK), dtype=np.int8),
+        _filled(count, ""),
+        _filled(count, _LOCAL),
+        Alternatives(np.full((count, 0, x.shape[1]), np.nan), np.full((count, 0), np.inf)),
+        cost,
+        np.full(count, direct.dof, dtype=np.int32),
+        np.broadcast_to(direct.weight, (count, len(direct.weight))),
+        stages,
+        _filled(count, ()),
+        None,
+    )
+
+
+def _owned(values: Array) -> Array:
+    """Return values as the one type of array for which there is machine code: float, C order, writable."""
+    return np.require(values, dtype=float, requirements=["C", "W"])
+
+
+def _filled(count: int, value: object) -> Array:
+    out = np.empty(count, dtype=object)
+    out.fill(value)
+    return out
+
+
+def _replaced(fix: Fix, items: Array, other: Fix) -> Fix:
+    """Return fresh fixes with some of them overwritten by others."""
+    for name in ("x", "cov", "code", "reason", "certificate", "cost", "dof", "active"):
+        getattr(fix, name)[items] = getattr(other, name)
+    width = other.alternatives.gap.shape[1]
+    if not width:
+        return fix
+    more = np.full((len(fix), width, fix.x.shape[1]), np.nan), np.full((len(fix), width), np.inf)
+    more[0][items], more[1][items] = other.alternatives.x, other.alternatives.gap
+    return replace(fix, alternatives=Alternatives(*more))

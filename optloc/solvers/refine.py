@@ -1,0 +1,360 @@
+"""Damped Gauss-Newton (Taylor least squares, LSR) for a batch of problems; finished ones leave the batch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from optloc.base.status import Status
+from optloc.base.threads import mapped
+from optloc.base.types import Array
+from optloc.compute.pack import coarseness, packed
+from optloc.compute.sums import equations_at, serves
+from optloc.linear.constraints import Face, restored, tangent_at
+from optloc.linear.normal import Normal, decrement, step
+from optloc.linear.station_noise import depends_on_place, weighed, whitener_at
+from optloc.problem.epochs import whole, windows
+from optloc.problem.noise import Whitener, variances, whiten
+from optloc.problem.problem import Problem
+
+# Refinements by machine code: which problems it serves, and with which weights.
+
+WEIGHINGS = 2
+"""Station errors are weighed where the target is thought to be; the weights hardly change with it."""
+
+# Systems of more unknowns are better solved one after the other than side by side.
+_UNKNOWNS = 40
+# Numbers of the derivatives from which weights that depend on the place are made at a time.
+_WEIGHED = 2**21
+
+
+@dataclass(frozen=True, slots=True)
+class Refined:
+    """Where the refinement ended.
+
+    Parameters
+    ----------
+    x : array (N, size)
+        Parameter vectors.
+    cost : array (N,)
+        Weighted sum of squared residuals and prior penalties.
+    status : int array (N,)
+        `Status` of each: ok, max iterations, stalled, singular geometry, numerical.
+    iterations : int array (N,)
+        Steps tried.
+    make : callable
+        Returns the normal equations at `x`.
+    """
+
+    x: Array
+    cost: Array
+    status: Array
+    iterations: Array
+    make: Callable[[], Normal]
+
+    @property
+    def equations(self) -> Normal:
+        """Return the normal equations at `x`."""
+        return self.make()
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """What does not change during an iteration: see `optloc.solvers.refine.refine`.
+
+    Parameters
+    ----------
+    n : int
+        Number of shared unknowns.
+    tolerance : float
+        Length of the last step in its own standard deviations.
+    limit : int
+        Steps tried at most.
+    damped : bool
+        Whether steps are damped and refused.
+    face : Face
+        Constraints that hold with equality.
+    """
+
+    n: int
+    tolerance: float
+    limit: int
+    damped: bool
+    face: Face
+
+
+Refinement = Callable[[Problem, Array, Rules], Refined]
+
+
+def by_machine_code(
+    problem: Problem, start: Array, item: Array | None, rules: Rules, otherwise: Refinement
+) -> Refined | None:
+    """Return where a refinement by machine code ends, or None where it does not serve the problem or does not pay.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems.
+    start : array (M, size)
+        Starting vectors.
+    item : int array (M,), optional
+        Problem of each start; None: M = N.
+    rules : Rules
+        When to stop.
+    otherwise : callable
+        Refines what machine code gives up: an epoch of a run left its own unknowns open.
+    """
+    few = problem.layout.n_shared + problem.layout.n_local <= _UNKNOWNS
+    if rules.face or not few or not serves(problem, len(start)):
+        return None
+    own = np.arange(len(start)) if item is None else np.asarray(item, dtype=np.int64)
+    if not depends_on_place(problem):
+        return _at_once(problem, start, own, whiten(weighed(problem).noise, problem.weight), rules, otherwise)
+    width = problem.layout.n_shared + problem.stations.count * problem.dimension
+    parts = np.array_split(np.arange(len(start)), 1 + len(start) * problem.count * width // _WEIGHED)
+    done = mapped(lambda part: _anew(problem.take(own[part]), start[part], rules, otherwise), parts)
+    found = [one for one in done if one is not None]
+    return _joined(found) if len(found) == len(parts) else None
+
+
+def _at_once(
+    problem: Problem, start: Array, item: Array, noise: tuple[Whitener, ...], rules: Rules, otherwise: Refinement
+) -> Refined | None:
+    """Return where machine code ends with given weights, or None where it does not serve."""
+    found = packed(problem, noise)
+    if found is None:
+        return None
+    from optloc.compute import refine
+    from optloc.compute.refine import Rules as Limits
+
+    kernel = Limits(float(rules.tolerance), int(rules.limit), bool(rules.damped))
+    done, lost = refine.refined(found, item, start, kernel)
+    if lost.any():
+        more = otherwise(problem.take(item[lost]), start[lost], rules)
+        for name in ("x", "cost", "status", "iterations"):
+            getattr(done, name)[lost] = getattr(more, name)
+    return Refined(done.x, done.cost, done.status, done.iterations, lambda: refine.equations(found, item, done))
+
+
+def _anew(problem: Problem, start: Array, rules: Rules, otherwise: Refinement) -> Refined | None:
+    """Return where machine code ends for one start of each problem, weighed where they are and once more at the end."""
+    done = None
+    for _ in range(WEIGHINGS):
+        done = _at_once(problem, start, np.arange(len(start)), whitener_at(problem, start), rules, otherwise)
+        if done is None:
+            return None
+        start = done.x
+    return done
+
+
+def _joined(parts: list[Refined]) -> Refined:
+    """Return several refinements as one."""
+
+    def make() -> Normal:
+        made = [part.equations for part in parts]
+        return Normal(*(np.concatenate([getattr(one, name) for one in made]) for name in Normal.__slots__))
+
+    x, cost, status, iterations = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("x", "cost", "status", "iterations")
+    )
+    return Refined(x, cost, status, iterations, make)
+
+
+def refine(
+    problem: Problem,
+    start: Array,
+    *,
+    item: Array | None = None,
+    tolerance: float = 1e-7,
+    limit: int = 60,
+    damped: bool = True,
+    face: Face = (),
+) -> Refined:
+    """Return the local maximum-likelihood estimates next to given starts.
+
+    Levenberg's method with Marquardt's scaling: a step is taken where it lowers the cost, and the damping follows
+    the ratio of the achieved to the predicted decrease (Nielsen 1999).
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems.
+    start : array (M, size)
+        Starting vectors.
+    item : int array (M,), optional
+        Problem of each start; None: one start for each problem, M = N.
+    tolerance : float
+        A fix is finished when its next step is shorter than this many of its own standard deviations.
+    limit : int
+        Steps tried at most.
+    damped : bool
+        False: plain Taylor iteration, every step is taken whatever it does to the cost.
+    face : Face
+        Constraints that hold with equality: steps follow their tangent space and are put back onto them.
+
+    Returns
+    -------
+    Refined
+        One entry for each start.
+    """
+    rules = Rules(problem.layout.n_shared, tolerance, limit, damped, face)
+    quick = by_machine_code(problem, start, item, rules, _remade)
+    if quick is not None:
+        return quick
+    weights = None
+    if not depends_on_place(problem):
+        weights = _Weights.of(problem, start)
+        weights = weights if item is None else weights.take(item)
+    if item is not None:
+        problem = problem.take(item)
+    if weights is not None:
+        return _iterated(problem, start, weights, rules)
+    for _ in range(WEIGHINGS):
+        done = _remade(problem, start, rules)
+        start = done.x
+    return done
+
+
+def _remade(problem: Problem, start: Array, rules: Rules) -> Refined:
+    return _iterated(problem, start, _Weights.of(problem, start), rules)
+
+
+@dataclass(frozen=True, slots=True)
+class _Weights:
+    """What whitens the rows during an iteration: matrices of a run that is one window, else where they are taken."""
+
+    matrices: tuple[Whitener, ...] | None
+    at: Array | None
+
+    @classmethod
+    def of(cls, problem: Problem, start: Array) -> _Weights:
+        at = start if depends_on_place(problem) else None
+        one = whole(problem, len(start))
+        return cls(whiten(weighed(problem, at).noise, problem.weight) if one else None, at)
+
+    def take(self, items: Array) -> _Weights:
+        matrices = None if self.matrices is None else tuple(w.take(items) for w in self.matrices)
+        return _Weights(matrices, None if self.at is None else self.at[items])
+
+    def equations(self, problem: Problem, x: Array) -> Normal:
+        return equations_at(problem, x, self.matrices, at=self.at)
+
+
+def _iterated(problem: Problem, start: Array, weights: _Weights, rules: Rules) -> Refined:
+    """Return where the iteration ends whose weights stay as they are."""
+    with np.errstate(all="ignore"):
+        start = restored(problem, rules.face, start) if rules.face else start
+        state = _State.begin(problem, start, weights)
+        active, blur = np.arange(len(start)), _blur(problem, len(start))
+        for iteration in range(rules.limit):
+            active = active[state.status[active] == Status.MAX_ITERATIONS]
+            if not len(active):
+                break
+            part = _Part.of(problem, weights, blur, active)
+            _advance(part, state, active, rules, iteration)
+    return Refined(state.x, state.equations.cost, state.status, state.iterations, lambda: state.equations)
+
+
+@dataclass(slots=True)
+class _State:
+    """What the iteration remembers of every problem; only the active entries change."""
+
+    x: Array
+    equations: Normal
+    damping: Array
+    growth: Array
+    status: Array
+    iterations: Array
+
+    @classmethod
+    def begin(cls, problem: Problem, start: Array, weights: _Weights) -> _State:
+        count = len(start)
+        equations = _owned(weights.equations(problem, start))
+        status = np.full(count, int(Status.MAX_ITERATIONS), dtype=np.int8)
+        status[~np.isfinite(equations.cost)] = Status.NUMERICAL
+        return cls(
+            np.array(start),
+            equations,
+            np.full(count, 1e-6),
+            np.full(count, 2.0),
+            status,
+            np.zeros(count, dtype=np.int32),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """The problems still moving."""
+
+    problem: Problem
+    weights: _Weights
+    blur: Array
+
+    @classmethod
+    def of(cls, problem: Problem, weights: _Weights, blur: Array, active: Array) -> _Part:
+        if len(active) == len(blur):
+            return cls(problem, weights, blur)
+        return cls(problem.take(active), weights.take(active), blur[active])
+
+
+def _blur(problem: Problem, count: int) -> Array:
+    """Return the rounding error (N,) of the whitened residuals: arrival times that count from long ago are coarse."""
+    squares: Any = 0.0
+    for _, _, part in windows(problem, count):
+        sigma = np.sqrt(variances(part.noise, part.count))
+        ratio = (np.abs(part.observed) + coarseness(part)) / sigma
+        squares = squares + (np.where(part.weight > 0.0, ratio, 0.0) ** 2).sum(-1)
+    coarse = 4.0 * np.finfo(float).eps * np.sqrt(squares)
+    return np.broadcast_to(np.where(np.isfinite(coarse), coarse, 0.0), (count,))
+
+
+def _advance(part: _Part, state: _State, active: Array, rules: Rules, iteration: int) -> None:
+    """Try one step of every problem still moving."""
+    everything = len(active) == len(state.x)
+    now = state.equations if everything else _at(state.equations, active)
+    here = state.x[active]
+    damping = state.damping[active] if rules.damped else np.zeros(len(active))
+    move, solvable = step(now, damping, tangent_at(part.problem, rules.face, here) if rules.face else None)
+    gain = decrement(now, move, rules.n)
+    x = restored(part.problem, rules.face, here + move) if rules.face else here + move
+    after = part.weights.equations(part.problem, x)
+    achieved = now.cost - after.cost
+    floor = 1e-13 * (1.0 + now.cost)
+    rounding = floor + 2.0 * part.blur * np.sqrt(1.0 + now.cost)
+    better = solvable & np.isfinite(after.cost) & ((achieved >= -rounding) if rules.damped else True)
+    state.iterations[active] = iteration + 1
+    small = solvable & (np.abs(gain) * (1.0 + damping) <= np.maximum(rules.tolerance**2, floor + part.blur**2))
+    _keep(state, active, better, x, after)
+    ratio = achieved / np.where(gain > 0.0, gain, 1.0)
+    factor = np.maximum(1.0 / 3.0, 1.0 - (2.0 * np.clip(ratio, 0.0, 1.0) - 1.0) ** 3)
+    factor = np.where(ratio > 0.9, 0.1, factor)
+    state.damping[active] = np.where(
+        better, np.maximum(damping * factor, 1e-12), damping * state.growth[active] + 1e-12
+    )
+    state.growth[active] = np.where(better, 2.0, 2.0 * state.growth[active])
+    state.status[active[small]] = Status.OK
+    state.status[active[~better & (state.damping[active] > 1e12)]] = Status.STALLED
+    if not rules.damped:
+        state.status[active[~better]] = Status.NUMERICAL
+
+
+def _keep(state: _State, active: Array, better: Array, x: Array, after: Normal) -> None:
+    if better.all() and len(active) == len(state.x):
+        state.x, state.equations = x, _owned(after)
+        return
+    to = active[better]
+    state.x[to] = x[better]
+    for name in Normal.__slots__:
+        getattr(state.equations, name)[to] = getattr(after, name)[better]
+
+
+def _owned(equations: Normal) -> Normal:
+    arrays = (getattr(equations, name) for name in Normal.__slots__)
+    return Normal(*(array if array.flags.writeable else np.array(array) for array in arrays))
+
+
+def _at(equations: Normal, index: Array) -> Normal:
+    return Normal(*(getattr(equations, name)[index] for name in Normal.__slots__))

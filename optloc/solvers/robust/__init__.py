@@ -1,0 +1,1 @@
+"""Fits that gross errors do not pull."""

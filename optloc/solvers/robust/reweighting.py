@@ -1,0 +1,310 @@
+"""Iteratively reweighted least squares: the minima of a robust cost next to given starts, for a batch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optloc.base.status import Status
+from optloc.base.types import Array
+from optloc.compute.sums import equations_at, summed
+from optloc.linear.constraints import Face
+from optloc.linear.evaluate import predict
+from optloc.linear.normal import Normal, marginal, with_priors
+from optloc.linear.station_noise import weighed
+from optloc.models import MODELS, wrap
+from optloc.problem.loss import Loss
+from optloc.problem.noise import Noise, variances, whiten
+from optloc.problem.problem import Problem
+from optloc.solvers.refine import refine
+
+# Residuals in sigma and the weights that a loss gives them, for rows of any noise.
+
+# Rows of a correlated group are never quite absent while their weights are sought: their partners still foretell them.
+_LEAST = 1e-6
+_LATE = frozenset(("range", "toa", "range_sum"))
+
+
+@dataclass(frozen=True, slots=True)
+class Doubt:
+    """What a loss needs to know of the rows of a flat batch of N problems; it does not change during an iteration.
+
+    A loss gives row i an error of its own with variance ``t_i = s_i (1 / weight_i - 1)``, where s_i is the variance of
+    the row given all other rows (its own variance where rows are independent). Residuals r and weights then are a
+    stationary point of
+
+        r' (R + diag t)^-1 r  +  sum of rho(u_i) - weight_i u_i^2,
+
+    which for independent rows is the sum of rho(r_i / sigma_i): the line process of a loss (M. J. Black, A. Rangarajan,
+    "On the unification of line processes, outlier rejection, and robust statistics", Int. J. Comput. Vis. 19 (1996),
+    section 3), with a covariance R.
+
+    Parameters
+    ----------
+    noise : Noise
+        Station errors of span "noise" included.
+    base : array (N, m)
+        Weights of the rows before any doubt; 0 = absent.
+    own, given : array (N, m)
+        Variance of each row, and its variance given all others that are present.
+    sided : bool array (m,)
+        Which rows are off to the positive side only when they are late.
+    """
+
+    noise: Noise
+    base: Array
+    own: Array
+    given: Array
+    sided: Array
+
+    @classmethod
+    def of(cls, problem: Problem, at: Array) -> Doubt:
+        """Return what a loss needs to know of N problems; noise that depends on the place is that at x (N, size)."""
+        noise, size = weighed(problem, at).noise, len(at)
+        base = np.broadcast_to(problem.weight, (size, problem.count))
+        own = np.broadcast_to(variances(noise, problem.count), base.shape)
+        given = own / np.where(base > 0.0, base, 1.0)
+        for whitener in whiten(noise, problem.weight):
+            if whitener.row.shape[1] > 1:
+                rows = whitener.row
+                present = base[:, rows] > 0.0
+                full = np.broadcast_to((whitener.matrix != 0.0).any(-1).sum(-1), present.shape[:-1]) == present.sum(-1)
+                precision = (whitener.matrix**2).sum(-2)
+                known = present & full[..., None] & (precision > 0.0)
+                given[:, rows] = np.where(known, 1.0 / np.where(known, precision, 1.0), given[:, rows])
+        kinds = np.concatenate([np.full(rows.count, rows.kind in _LATE) for rows in problem.rows])
+        return cls(noise, base, own, given, kinds)
+
+    def take(self, index: Array) -> Doubt:
+        """Return what belongs to some of the problems."""
+        blocks = tuple(
+            b if b.covariance.ndim == 3 or len(b.covariance) == 1 else replace(b, covariance=b.covariance[index])
+            for b in self.noise.blocks
+        )
+        return Doubt(Noise(blocks), self.base[index], self.own[index], self.given[index], self.sided)
+
+    def row_weight(self, weight: Array) -> Array:
+        """Return weights (N, m) as `Problem.with_rows` takes them, of the weights that a loss gives."""
+        ratio = self.given / self.own
+        with np.errstate(divide="ignore", over="ignore"):
+            total = 1.0 / self.base + ratio * (1.0 / weight - 1.0)
+            return np.where((self.base > 0.0) & (weight > 0.0), 1.0 / total, 0.0)
+
+    def residual(self, problem: Problem, x: Array, weight: Array) -> Array:
+        """Return residuals in sigma (N, m) at vectors x (N, size), zero for absent rows.
+
+        Those of correlated rows are what is left of a row given its partners, which count as much as their weights say.
+        """
+        left = np.where(self.base > 0.0, residuals(problem, x), 0.0)
+        u = left / np.sqrt(self.given)
+        if all(block.row.shape[1] == 1 for block in self.noise.blocks):
+            return u
+        least = np.maximum(weight, _LEAST)
+        for whitener in whiten(self.noise, self.row_weight(least)):
+            rows = whitener.row
+            if rows.shape[1] > 1:
+                white = whitener.matrix @ left[:, rows][..., None]
+                share = (np.swapaxes(whitener.matrix, -1, -2) @ white)[..., 0]
+                u[:, rows] = share * np.sqrt(self.given[:, rows]) / least[:, rows]
+        return u
+
+
+def residuals(problem: Problem, x: Array) -> Array:
+    """Return residuals (N, m) of a flat batch at vectors x (N, size); angles wrapped."""
+    left = problem.observed - predict(problem, x)
+    for rows, start in zip(problem.rows, problem.starts, strict=True):
+        if MODELS[rows.kind].period is not None:
+            part = slice(start, start + rows.count)
+            left[..., part] = wrap(left[..., part])
+    return np.asarray(left)
+
+
+def doubted(loss: Loss, u: Array, sided: Array) -> Array:
+    """Return residuals as a loss takes them: of rows that may be off to either side the size alone counts."""
+    return np.where(sided, u, np.abs(u)) if loss.one_sided else u
+
+
+# Steps between two weighings, and the change of a weight that counts as none.
+_STEPS, _SETTLED = 12, 1e-4
+# Steps that shrink slowly are extrapolated: from which weighing on, every how many, and the largest ratio of two.
+_PATIENCE, _OFTEN, _SLOWEST = 8, 3, 0.98
+_HALVINGS = 8
+_LONG = 1e300
+
+
+@dataclass(frozen=True, slots=True)
+class Minima:
+    """Where reweighting ended, for M starts.
+
+    Parameters
+    ----------
+    x : array (M, size)
+        Parameter vectors.
+    cost : array (M,)
+        Robust cost, priors included.
+    status : int array (M,)
+        `Status` of each.
+    weight : array (M, m)
+        What the loss leaves of the weight of each row.
+    """
+
+    x: Array
+    cost: Array
+    status: Array
+    weight: Array
+
+
+def reweighted(
+    problem: Problem,
+    start: Array,
+    loss: Loss,
+    doubt: Doubt,
+    *,
+    limit: int = 50,
+    tolerance: float = 1e-6,
+    face: Face = (),
+) -> Minima:
+    """Return the minima of a robust cost next to starts.
+
+    Least squares with the weights that the loss gives at the point before: for independent rows its cost touches the
+    robust one there and, if the loss is even, lies above it elsewhere, so that no step raises the robust cost (P. J.
+    Huber, "Robust Statistics" (1981), section 7.8). Otherwise steps that would are halved: they still lead down.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of M problems.
+    start : array (M, size)
+        Starting vectors.
+    loss : Loss
+        Its sigma is that of the rows.
+    doubt : Doubt
+        Of the same problems.
+    limit : int
+        Weighings at most.
+    tolerance : float
+        Finished when a step is shorter than this many standard deviations.
+    face : Face
+        Constraints that hold with equality.
+    """
+    x, weight = np.array(start), np.ones(doubt.base.shape)
+    last = np.zeros(x.shape)
+    status = np.full(len(x), int(Status.MAX_ITERATIONS), dtype=np.int8)
+    active = np.arange(len(x))
+    uneven = loss.one_sided or any(block.row.shape[1] > 1 for block in doubt.noise.blocks)
+    with np.errstate(all="ignore"):
+        for iteration in range(limit):
+            whole = len(active) == len(x)
+            part, own = (problem, doubt) if whole else (problem.take(active), doubt.take(active))
+            here, before = x[active], weight[active]
+            now = weighed_by(loss, part, own, here, before)
+            step = _step(part.with_rows(weight=own.row_weight(now)), here, last[active], face)
+            moved = _lowered(loss, part, own, here, step.x, now) if uneven else step.x
+            if iteration >= _PATIENCE and iteration % _OFTEN == 0 and not face:
+                moved = _further(loss, part, own, step, now)
+            x[active], weight[active], last[active] = moved, now, step.x - here
+            same = np.abs(now - before).max(-1, initial=0.0) <= _SETTLED
+            settled = same & (step.length <= tolerance)
+            status[active[settled]] = step.status[settled]
+            status[active[same & ~settled & (moved == here).all(-1)]] = Status.STALLED
+            status[active[~np.isfinite(step.length)]] = Status.NUMERICAL
+            active = active[status[active] == Status.MAX_ITERATIONS]
+            if not len(active):
+                break
+        weight = weighed_by(loss, problem, doubt, x, weight)
+        cost = robust_cost(loss, problem, doubt, x, weight)
+    status[~np.isfinite(cost)] = Status.NUMERICAL
+    return Minima(x, np.where(np.isfinite(cost), cost, np.inf), status, weight)
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """Where least squares leads, the length in sigma, the status, and where a geometric series of such steps ends."""
+
+    x: Array
+    length: Array
+    status: Array
+    tried: Array
+
+
+def _step(problem: Problem, x: Array, last: Array, face: Face) -> _Step:
+    done = refine(problem, x, limit=_STEPS, face=face)
+    information, _, _ = marginal(done.equations)
+    n, apart = problem.layout.n_shared, done.x - x
+
+    def product(a: Array, b: Array) -> Array:
+        return np.asarray((a[:, None, :n] @ information @ b[:, :n, None])[:, 0, 0])
+
+    length = np.sqrt(np.maximum(product(apart, apart), 0.0))
+    ratio = product(apart, last) / product(last, last)
+    ratio = np.where(np.isfinite(ratio), np.clip(ratio, 0.0, _SLOWEST), 0.0)
+    unfinished = done.status == Status.MAX_ITERATIONS
+    return _Step(
+        done.x,
+        np.where(unfinished, _LONG, length),
+        done.status,
+        done.x + apart * (ratio / (1.0 - ratio))[:, None],
+    )
+
+
+def _lowered(loss: Loss, problem: Problem, doubt: Doubt, here: Array, there: Array, weight: Array) -> Array:
+    """Return points (M, size) on the way from here to there that cost no more than here."""
+    least = robust_cost(loss, problem, doubt, here, weight)
+    share = np.ones(len(here))
+    for _ in range(_HALVINGS):
+        x = here + share[:, None] * (there - here)
+        now = weighed_by(loss, problem, doubt, x, weight)
+        worse = ~(robust_cost(loss, problem, doubt, x, now) <= least + 1e-12 * (1.0 + np.abs(least)))
+        if not worse.any():
+            break
+        share = np.where(worse, 0.5 * share, share)
+    return np.asarray(here + share[:, None] * (there - here))
+
+
+def _further(loss: Loss, problem: Problem, doubt: Doubt, step: _Step, weight: Array) -> Array:
+    """Return where the steps would end if each were shorter by the same ratio (Aitken 1926), if that costs less."""
+    cost = []
+    for x in (step.x, step.tried):
+        now = weighed_by(loss, problem, doubt, x, weight)
+        cost.append(robust_cost(loss, problem, doubt, x, now))
+    return np.where((cost[1] < cost[0])[:, None], step.tried, step.x)
+
+
+def weighed_by(
+    loss: Loss, problem: Problem, doubt: Doubt, x: Array, weight: Array, scale: Array | float = 1.0
+) -> Array:
+    """Return what a loss leaves of the weight of each row (N, m) at vectors x, with sigma times a scale.
+
+    Parameters
+    ----------
+    loss, problem, doubt : Loss, Problem, Doubt
+        N problems.
+    x : array (N, size)
+        Parameter vectors.
+    weight : array (N, m)
+        Weights so far: of the partners of correlated rows.
+    scale : array (N, 1) or float
+        Above 1: fewer rows are doubted.
+    """
+    u = doubted(loss, doubt.residual(problem, x, weight) / scale, doubt.sided)
+    return np.where(np.isfinite(u), loss.weight(u), 0.0)
+
+
+def robust_cost(loss: Loss, problem: Problem, doubt: Doubt, x: Array, weight: Array) -> Array:
+    """Return the robust cost (N,) at vectors x (N, size) with the weights (N, m) of the loss there, priors included."""
+    u = doubted(loss, doubt.residual(problem, x, weight), doubt.sided)
+    quadratic = equations_at(problem.with_rows(weight=doubt.row_weight(weight)), x).cost
+    excess = np.where(doubt.base > 0.0, loss.rho(u) - weight * u**2, 0.0)
+    return np.asarray(quadratic + excess.sum(-1))
+
+
+def robust_equations(loss: Loss, problem: Problem, doubt: Doubt, x: Array, weight: Array) -> Normal:
+    """Return normal equations (N) whose inverse is the covariance of the estimate.
+
+    The weighted normal matrix of the rows over ``loss.spread``, and the priors. The right-hand side is not scaled: it
+    is half the gradient of the robust cost, downhill, from which multipliers are read.
+    """
+    rows = summed(problem.with_rows(weight=doubt.row_weight(weight)), x)
+    information = {name: getattr(rows, name) / loss.spread for name in ("shared", "local", "cross")}
+    return with_priors(problem, x, replace(rows, **information))

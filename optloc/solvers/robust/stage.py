@@ -1,0 +1,247 @@
+"""Robust fixes: the minimum of a loss that gross errors cannot drag away, without a guess."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from time import perf_counter
+
+import numpy as np
+
+from optloc.base.status import Status
+from optloc.base.types import Array
+from optloc.linear.constraints import Face, exact
+from optloc.linear.degrees_of_freedom import degrees_of_freedom
+from optloc.linear.normal import Normal, marginal
+from optloc.problem.fix import Alternatives, Fix, Stage
+from optloc.problem.loss import LOSSES, Loss
+from optloc.problem.problem import Problem
+from optloc.solvers.inequalities import bounded, contradicted
+from optloc.solvers.policy import AMBIGUOUS_GAP, DOUBT
+from optloc.solvers.pool import Candidates, packed, pooled
+from optloc.solvers.robust.reweighting import Doubt, residuals, reweighted, robust_equations, weighed_by
+from optloc.solvers.robust.starts import flipped, robust_starts
+from optloc.solvers.starts.arrivals import Arrivals, as_arrivals, original
+from optloc.solvers.verdict.judge import judge
+
+# Range differences doubted as what they are made of: one arrival time for each station.
+
+Minimise = Callable[[Problem, Array | None], Fix]
+"""Maps a flat batch of problems and starting vectors (N, q, size), or None, to robust fixes."""
+
+
+def by_arrivals(problem: Problem, fix: Fix | None, minimise: Minimise) -> Fix:
+    """Return robust fixes; differences of arrival times are taken apart first, where that is the same problem.
+
+    An error of one arrival is in every difference that it is part of, with either sign: no loss of the differences
+    names it, whereas among the arrivals it is one bad row. A difference then has the lesser weight of its two arrivals.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    fix : Fix or None
+        Whose candidates are the starts.
+    minimise : callable
+        Finds the robust fixes.
+    """
+    start = None if fix is None else packed(pooled(fix)[0])
+    taken = as_arrivals(problem) if problem.epochs == 1 and not problem.layout.n_local else None
+    if taken is None:
+        return minimise(problem, start)
+    found = minimise(taken.problem, None if start is None else _emitted(taken.problem, start))
+    others = found.alternatives
+    return replace(
+        found,
+        x=original(problem, taken.problem, found.x),
+        alternatives=Alternatives(original(problem, taken.problem, others.x), others.gap),
+        layout=problem.layout,
+        dof=degrees_of_freedom(problem),
+        weights=_weights(problem, taken, found),
+    )
+
+
+def _emitted(problem: Problem, x: Array) -> Array:
+    """Return vectors (N, q, size) with the emission time that the median arrival gives, of vectors without it."""
+    whole = np.concatenate([x, np.zeros((*x.shape[:-1], problem.layout.size - x.shape[-1]))], axis=-1)
+    item, slot = np.nonzero(np.isfinite(x).all(-1))
+    if len(item):
+        arrivals = problem.rows[0].count
+        left = residuals(problem.take(item), whole[item, slot])[:, :arrivals]
+        whole[item, slot, -1] = np.median(left, axis=-1)
+    known = np.asarray(np.isfinite(x).all(-1))
+    return np.where(known[..., None], whole, np.nan)
+
+
+def _weights(problem: Problem, taken: Arrivals, fix: Fix) -> Array:
+    """Return the weight (N, m) of each row: the least of those of the rows that were made from it."""
+    weights = np.array(np.broadcast_to(problem.weight, (len(fix), problem.count)))
+    for row, origin in enumerate(taken.origin):
+        weights[:, origin] = np.minimum(weights[:, origin], fix.weights[:, row, None])
+    return weights
+
+
+# A row that a loss leaves less than this of its weight is called rejected: four sigma of the Cauchy loss.
+REJECTED = 0.25
+_SHOWN = 8
+# Times that the weights of correlated rows are made anew at an answer.
+_WEIGHINGS = 30
+# Gap of a rival that leaves out no more than the cheapest candidate does.
+_CLOSE = 1e-2
+
+
+@dataclass(frozen=True, slots=True)
+class Robust:
+    """The stage that minimises a loss: from all candidates of a fix, or without one from starts of its own.
+
+    Parameters
+    ----------
+    loss : Loss
+        For instance ``LOSSES["cauchy"]``.
+    """
+
+    loss: Loss
+
+    def __call__(self, problem: Problem, fix: Fix | None) -> Fix:
+        """Return the fixes of a flat batch of problems; their weights are those of the loss."""
+
+        def minimise(some: Problem, start: Array | None) -> Fix:
+            return _robust(some, self.loss, start, fix.stages if fix else ())
+
+        return by_arrivals(problem, fix, minimise)
+
+
+def _robust(problem: Problem, loss: Loss, start: Array | None, stages: tuple[Stage, ...]) -> Fix:
+    began = perf_counter()
+    pool = _minima(problem, loss, robust_starts(problem, loss) if start is None else start)
+    if start is None and loss.name == "truncated":
+        pool = _more(pool, _minima(problem, loss, _minima(problem, LOSSES["cauchy"], pool.x).x))
+        pool = _more(pool, _minima(problem, loss, flipped(problem, loss, pool)))
+    free, pool = pool, bounded(problem, pool, partial(_on_face, loss))
+    pool = _rivals(problem, loss, _apart(problem, loss, pool))
+    detail = f"{int(np.isfinite(pool.cost).sum(1).max(initial=0))} candidates at most"
+    stages = (*stages, Stage(loss.name, detail, perf_counter() - began))
+    found = judge(problem, pool, lambda some, x: _equations(some, loss, x)[0], stages)
+    answered = np.asarray(np.isfinite(found.x).all(-1))
+    weights = _equations(problem, loss, np.where(answered[:, None], found.x, 0.0))[1]
+    weights = np.where(answered[:, None], weights, found.weights)
+    found = replace(found, weights=weights, reason=_reasons(problem, found, weights))
+    return contradicted(found, free, robust=True) if problem.constraints else found
+
+
+def _on_face(loss: Loss, problem: Problem, start: Array, item: Array, face: Face) -> tuple[Array, Array, Array]:
+    """Return x (M, size), cost (M,) and status (M,) of the minima of a loss on a face of the constraints."""
+    part = problem.take(item)
+    done = reweighted(part, start, loss, Doubt.of(part, start), face=face)
+    return done.x, done.cost, done.status
+
+
+def _more(one: Candidates, two: Candidates) -> Candidates:
+    """Return the candidates of both pools."""
+    return Candidates(
+        np.concatenate([one.x, two.x], axis=1),
+        np.concatenate([one.cost, two.cost], axis=1),
+        np.concatenate([one.code, two.code], axis=1),
+        np.concatenate([one.face, two.face], axis=1),
+    )
+
+
+STAGES = {name: Robust(loss) for name, loss in LOSSES.items()}
+"""Solver stages by the name of their loss."""
+
+
+def rejected(problem: Problem, fix: Fix) -> Array:
+    """Return which rows (..., m) that were present a fix hardly counts: their weight fell below a quarter.
+
+    Parameters
+    ----------
+    problem : Problem
+        As it was solved; epochs that share nothing as a batch, see `optloc.by_epoch`.
+    fix : Fix
+        Of a robust method.
+    """
+    return np.asarray((problem.weight > 0.0) & (fix.weights < REJECTED * problem.weight))
+
+
+def _minima(problem: Problem, loss: Loss, pool: Array) -> Candidates:
+    """Return the minima of a loss next to the starts (N, q, size) of N problems."""
+    x, cost = np.array(pool), np.full(pool.shape[:2], np.inf)
+    code = np.full(pool.shape[:2], int(Status.NUMERICAL), dtype=np.int8)
+    item, slot = np.nonzero(np.isfinite(pool).all(-1))
+    if len(item):
+        part, start = problem.take(item), pool[item, slot]
+        done = reweighted(part, start, loss, Doubt.of(part, start), face=exact(problem))
+        x[item, slot], cost[item, slot], code[item, slot] = done.x, done.cost, done.status
+    return Candidates(x, cost, code, np.zeros(cost.shape, dtype=int))
+
+
+def _equations(problem: Problem, loss: Loss, x: Array) -> tuple[Normal, Array]:
+    """Return the normal equations of the estimates x (N, size), and the weights of all rows there."""
+    doubt = Doubt.of(problem, x)
+    weight = np.ones(doubt.base.shape)
+    with np.errstate(all="ignore"):
+        for _ in range(_WEIGHINGS if any(b.row.shape[1] > 1 for b in problem.noise.blocks) else 1):
+            weight = weighed_by(loss, problem, doubt, x, weight)
+        return robust_equations(loss, problem, doubt, x, weight), doubt.row_weight(weight)
+
+
+def _apart(problem: Problem, loss: Loss, pool: Candidates) -> Candidates:
+    """Return candidates without those that lie in the 95 % ellipsoid of the cheapest: they are the same answer."""
+    from scipy.special import gammaincinv
+
+    finished = np.where(pool.code == Status.OK, pool.cost, np.inf)
+    best = finished.argmin(1)
+    rows = np.flatnonzero(np.isfinite(finished[np.arange(len(best)), best]))
+    if not len(rows):
+        return pool
+    n, cost = problem.layout.n_shared, np.array(pool.cost)
+    x = pool.x[rows, best[rows]]
+    information, _, _ = marginal(_equations(problem.take(rows), loss, x)[0])
+    apart = pool.x[rows, :, :n] - x[:, None, :n]
+    with np.errstate(invalid="ignore"):
+        near = ((apart @ information) * apart).sum(-1) < 2.0 * gammaincinv(n / 2.0, 0.95)
+    near[np.arange(len(rows)), best[rows]] = False
+    cost[rows] = np.where(near, np.inf, cost[rows])
+    return replace(pool, cost=cost)
+
+
+def _rivals(problem: Problem, loss: Loss, pool: Candidates) -> Candidates:
+    """Return candidates with gaps, counted from the cheapest, that tell how well the data exclude them.
+
+    A loss that still rises for gross errors holds it for unlikely that one is larger than another; so large a gap is
+    no evidence. Of truncated least squares, where all gross errors cost the same, it is, if a row that has to be left
+    out costs as much as a rival may: one more than the cheapest leaves out is a reason of its own not to believe it.
+    """
+    found = np.isfinite(pool.cost) & (pool.code == Status.OK)
+    item, slot = np.nonzero(found & (found.sum(1) > 1)[:, None])
+    if not len(item):
+        return pool
+    evidence, truncated = np.full(pool.cost.shape, np.inf), LOSSES["truncated"]
+    part, start = problem.take(item), pool.x[item, slot]
+    doubt = Doubt.of(part, start)
+    done = reweighted(part, start, truncated, doubt, face=exact(problem))
+    out = ((done.weight == 0.0) & (doubt.base > 0.0)).sum(-1)
+    price = AMBIGUOUS_GAP * out
+    evidence[item, slot] = np.where(done.status == Status.OK, done.cost + price, np.inf)
+    best = np.where(found, pool.cost, np.inf).argmin(1)[:, None]
+    least, base = np.take_along_axis(pool.cost, best, 1), np.take_along_axis(evidence, best, 1)
+    with np.errstate(invalid="ignore"):
+        rival = least + np.maximum(evidence - base, _CLOSE)
+    rival = np.where(np.isnan(rival), np.inf, rival)
+    cost = np.where(found, rival if loss is truncated else np.minimum(pool.cost, rival), pool.cost)
+    np.put_along_axis(cost, best, least, 1)
+    return replace(pool, cost=cost)
+
+
+def _reasons(problem: Problem, fix: Fix, weights: Array) -> Array:
+    """Return the reasons, with the rows that were rejected where the residuals are larger than the noise allows."""
+    out = np.array(fix.reason)
+    base = np.broadcast_to(problem.weight, weights.shape)
+    lost = (base > 0.0) & (weights < REJECTED * base)
+    for i in np.flatnonzero((fix.code == Status.OK) & (fix.p_value < DOUBT)):
+        rows = np.flatnonzero(lost[i])
+        if len(rows):
+            shown = ", ".join(map(str, rows[:_SHOWN])) + (" ..." if len(rows) > _SHOWN else "")
+            out[i] = f"{len(rows)} of {int((base[i] > 0.0).sum())} rows are rejected: {shown}; {out[i]}"
+    return out

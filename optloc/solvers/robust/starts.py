@@ -1,0 +1,214 @@
+"""Starts for a robust cost, without a guess: what fits when some stations or rows are left out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+
+from optloc.base.status import Status
+from optloc.base.types import Array
+from optloc.linear.constraints import exact
+from optloc.linear.degrees_of_freedom import degrees_of_freedom
+from optloc.linear.station_noise import depends_on_place, weighed
+from optloc.problem.loss import LOSSES, Loss
+from optloc.problem.noise import independent, variances
+from optloc.problem.problem import Problem
+from optloc.solvers.pool import Candidates, packed, pooled
+from optloc.solvers.refine import refine
+from optloc.solvers.robust.reweighting import Doubt, doubted, weighed_by
+from optloc.solvers.stages import lsr, roots, search, widen
+from optloc.solvers.starts.position import rows_of_stations
+from optloc.solvers.starts.several_positions import one_position
+
+# Which rows to start from: all but those of some stations, or all but one, of the rows that each problem has.
+
+# Subsets of a problem at most; stations up to which three are left out, rows up to which single ones are.
+_MOST, _THREE, _ROWS = 80, 8, 12
+
+
+def subsets(problem: Problem) -> tuple[Array, Array]:
+    """Return the subsets of all problems of a flat batch: problem of each (S,), and its rows (S, m).
+
+    One station is left out, or one row where a problem has few, or two stations, or three of few.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems; what is left out of each are its own stations, those that it has rows of.
+    """
+    present = np.broadcast_to(problem.weight > 0.0, (problem.batch_shape[0], problem.count))
+    touched, single = rows_of_stations(problem), np.eye(problem.count, dtype=bool)
+    heard = np.asarray((present[:, None] & touched).any(-1))
+    short = np.flatnonzero(present.sum(1) <= _ROWS)
+    stations, rows = _combined(heard, touched, 3), _combined(present[short], single, 1)
+    item = np.concatenate([stations[0], short[rows[0]]])
+    kept = present[item] & ~np.concatenate([stations[1], rows[1]])
+    _, first = np.unique(np.column_stack([item, kept]), axis=0, return_index=True)
+    item, kept = item[first], kept[first]
+    enough = degrees_of_freedom(problem.take(item).with_rows(weight=1.0 * kept)) >= 0
+    return item[enough], kept[enough]
+
+
+def _combined(own: Array, touched: Array, size: int) -> tuple[Array, Array]:
+    """Return the unions (S, m) of the rows that up to `size` members touch (g, m), for each problem (S,) of its own."""
+    count = own.sum(1)
+    most = int(count.max(initial=0))
+    local = np.argsort(~own, axis=1, kind="stable")[:, :most]
+    sizes = range(1, 1 + (size if most <= _THREE else min(size, 2)))
+    items, unions = [np.zeros(0, dtype=int)], [np.zeros((0, touched.shape[1]), dtype=bool)]
+    for members in [chosen for q in sizes for chosen in combinations(range(most), q)][:_MOST]:
+        item = np.flatnonzero(count > max(members))
+        items.append(item)
+        unions.append(np.asarray(touched[local[item][:, members]].any(1)))
+    return np.concatenate(items), np.concatenate(unions)
+
+
+# Starts of a problem that are screened and kept at most.
+_SCREENED, _KEPT = 30, 12
+# Problems, and starts times rows, that are worked on at a time.
+_EACH, _NUMBERS = 64, 2**20
+# Starts whose residuals differ by less than this many sigma are one.
+_SAME = 0.5
+# Rows that are tried on the other side of a cut; halvings of the scale; growth and most steps of the graduation.
+_FLIPPED = 10
+_HALVINGS, _GROWTH, _GRADES = 6, 1.4, 40
+
+
+def robust_starts(problem: Problem, loss: Loss) -> Array:
+    """Return starting vectors (N, q, size) of a flat batch; NaN in empty slots.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    loss : Loss
+        Whose cost decides which starts are kept.
+    """
+    plain = search(problem, lsr(problem, widen(problem, lsr(problem, roots(problem, None)))))
+    pool = pooled(plain)[0][:, :_KEPT]
+    parts = [pool, _graduated(problem, pool[:, :1])]
+    if one_position(problem):
+        parts.append(_left_out(problem, loss))
+    else:
+        item, slot = np.nonzero(np.isfinite(pool).all(-1))
+        parts.append(_cheapest(problem, pool[item, slot], item, loss, _KEPT, anneal=True))
+    return packed(np.concatenate(parts, axis=1))
+
+
+def _left_out(problem: Problem, loss: Loss) -> Array:
+    """Return the best starts (N, q, size) from closed forms of all subsets."""
+    # Correlation matters for the answer, hardly for where to look for it, and it costs time.
+    noise = weighed(problem).noise if not depends_on_place(problem) else problem.noise
+    problem = replace(problem, noise=independent(variances(noise, problem.count)))
+    size = problem.batch_shape[0]
+    parts = [_of_subsets(problem.take(np.arange(i, min(i + _EACH, size))), loss) for i in range(0, size, _EACH)]
+    out = np.full((size, max(part.shape[1] for part in parts), problem.layout.size), np.nan)
+    for i, part in enumerate(parts):
+        out[i * _EACH : i * _EACH + len(part), : part.shape[1]] = part
+    return out
+
+
+def _of_subsets(problem: Problem, loss: Loss) -> Array:
+    item, kept = subsets(problem)
+    if not len(item):
+        return np.full((problem.batch_shape[0], 0, problem.layout.size), np.nan)
+    part = problem.take(item)
+    part = part.with_rows(weight=np.where(kept, part.weight, 0.0))
+    points, pair, slot = pooled(roots(part, None))
+    x = refine(part, points[pair, slot], item=pair, limit=5, face=exact(problem)).x
+    pool = _cheapest(problem, x, item[pair], loss, _SCREENED, anneal=False)
+    first, slot = np.nonzero(np.isfinite(pool).all(-1))
+    return _cheapest(problem, pool[first, slot], first, loss, _KEPT, anneal=True)
+
+
+def _cheapest(problem: Problem, x: Array, item: Array, loss: Loss, most: int, *, anneal: bool) -> Array:
+    """Return the cheapest of starts (M, size) of given problems (M,), each once, as (N, most, size)."""
+    size, count = problem.batch_shape[0], len(x)
+    cost, u, x = np.full(count, np.inf), np.zeros((count, problem.count)), np.array(x)
+    usable = np.flatnonzero(np.isfinite(x).all(-1))
+    step = max(1, _NUMBERS // problem.count)
+    for first in range(0, len(usable), step):
+        some = usable[first : first + step]
+        x[some], cost[some], u[some] = _annealed(problem.take(item[some]), x[some], loss, _HALVINGS if anneal else 0)
+    chosen = np.full((size, most, x.shape[1]), np.nan)
+    for slot in range(most if count else 0):
+        order = np.lexsort((cost, item))
+        first = order[np.searchsorted(item[order], np.arange(size), side="left").clip(max=count - 1)]
+        found = (item[first] == np.arange(size)) & np.isfinite(cost[first])
+        if not found.any():
+            return chosen[:, :slot]
+        chosen[found, slot] = x[first[found]]
+        left = np.flatnonzero(np.isfinite(cost) & found[item])
+        same = np.abs(u[left] - u[first[item[left]]]).max(-1) < _SAME
+        cost[left[same]] = np.inf
+    return chosen
+
+
+def _annealed(problem: Problem, x: Array, loss: Loss, halvings: int) -> tuple[Array, Array, Array]:
+    """Return vectors after a few weighings by the Cauchy loss whose scale is halved, their costs and residuals."""
+    doubt, cauchy, face = Doubt.of(problem, x), LOSSES["cauchy"], exact(problem)
+    weight = np.ones(doubt.base.shape)
+    with np.errstate(all="ignore"):
+        u = doubt.residual(problem, x, weight)
+        size = np.where(doubt.base > 0.0, np.abs(u), np.nan)
+        scale = np.maximum(1.0, 1.4826 * np.nanmedian(size, axis=1, keepdims=True)) if halvings else 1.0
+        for halving in range(halvings):
+            weight = weighed_by(cauchy, problem, doubt, x, weight, np.maximum(1.0, scale * 0.5**halving))
+            x = refine(problem.with_rows(weight=doubt.row_weight(weight)), x, limit=2, face=face).x
+        u = doubt.residual(problem, x, weight) if halvings else u
+        cost = np.where(doubt.base > 0.0, loss.rho(doubted(loss, u, doubt.sided)), 0.0).sum(-1)
+    return x, np.where(np.isfinite(cost) & np.isfinite(u).all(-1), cost, np.inf), np.nan_to_num(u)
+
+
+def flipped(problem: Problem, loss: Loss, pool: Candidates) -> Array:
+    """Return starts (N, q, size) beside the cheapest minimum: those with one more row in or out, of rows at the brink.
+
+    A loss that cuts rows off has minima of its own for almost every set of rows; the best ones differ in few rows.
+    """
+    best = np.where(pool.code == Status.OK, pool.cost, np.inf).argmin(1)
+    x = pool.x[np.arange(len(best)), best]
+    item = np.flatnonzero(np.isfinite(x).all(-1))
+    if not len(item):
+        return np.asarray(x[:, None])
+    part = problem.take(item)
+    doubt, q = Doubt.of(part, x[item]), min(_FLIPPED, problem.count)
+    weight = weighed_by(loss, part, doubt, x[item], np.ones(doubt.base.shape))
+    u = np.where(doubt.base > 0.0, np.abs(doubt.residual(part, x[item], weight)), np.inf)
+    brink = np.argsort(np.abs(u - loss.constant), axis=1)[:, :q]
+    each = np.repeat(np.arange(len(item)), q)
+    changed, row = weight[each], (np.arange(len(each)), brink.ravel())
+    changed[row] = 1.0 - changed[row]
+    beside = part.take(each).with_rows(weight=doubt.take(each).row_weight(changed))
+    out = np.full((len(x), q, x.shape[-1]), np.nan)
+    out[item] = refine(beside, x[item][each], limit=5, face=exact(problem)).x.reshape(len(item), q, -1)
+    return out
+
+
+def _graduated(problem: Problem, start: Array) -> Array:
+    """Return where truncated least squares leads (N, q, size) when it begins convex and is bent step by step.
+
+    H. Yang, P. Antonante, V. Tzoumas, L. Carlone, "Graduated non-convexity for robust spatial perception", IEEE Robot.
+    Autom. Lett. 5 (2020), eq. 14 for the weights and section III-C for the schedule.
+    """
+    item, slot = np.nonzero(np.isfinite(start).all(-1))
+    out = np.full(start.shape, np.nan)
+    if not len(item):
+        return out
+    problem, x = problem.take(item), start[item, slot]
+    doubt, face, c = Doubt.of(problem, x), exact(problem), LOSSES["truncated"].constant
+    weight, mu = np.ones(doubt.base.shape), np.full((len(x), 1), np.inf)
+    with np.errstate(all="ignore"):
+        for grade in range(_GRADES):
+            u = np.abs(doubt.residual(problem, x, weight))
+            worst = np.where(doubt.base > 0.0, u, 0.0).max(1, keepdims=True)
+            convex = c**2 / np.maximum(2.0 * worst**2 - c**2, 1e-300)
+            mu = np.minimum(convex, 1e3) if grade == 0 else mu * _GROWTH
+            if (mu > 1e3).all():
+                break
+            bent = c / u * np.sqrt(mu * (mu + 1.0)) - mu
+            weight = np.where(np.isfinite(u), np.clip(bent, 0.0, 1.0), 0.0)
+            x = refine(problem.with_rows(weight=doubt.row_weight(weight)), x, limit=2, face=face).x
+    out[item, slot] = x
+    return out

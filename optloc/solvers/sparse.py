@@ -1,0 +1,377 @@
+"""Starts and suspected rows from a convex programme in which a few rows may be grossly wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from time import perf_counter
+
+import numpy as np
+from scipy.special import ndtri
+
+from formulations.sparse_errors import range_cone, square_cone
+from optloc.base import linalg
+from optloc.base.threads import WORTH, mapped
+from optloc.base.types import Array, Rows
+from optloc.linear.evaluate import differentiate
+from optloc.models import MODELS
+from optloc.problem.fix import Fix
+from optloc.problem.noise import variances
+from optloc.problem.problem import Problem
+from optloc.solvers.pool import given, packed, unrefined
+from optloc.solvers.stages import gtrs, lsr
+from optloc.solvers.starts.arrivals import as_arrivals
+from optloc.solvers.starts.position import spread_of, static, vectors
+from optloc.solvers.starts.several_positions import from_pieces, one_position
+from optloc.solvers.starts.squared_range import Coordinates, lifted_rows
+
+# Rows of one position made linear one by one, so that one wrong measurement is one wrong row.
+#
+# A range row says ``r_a + c r_b + t = m`` with c of 0, 1 or -1 and t the emission time. With ``|x - s|^2 = r^2`` it is
+# linear in the position and in
+#
+# - ``|x|^2`` (range: c = 0, no t), which is not less than the square of x: a cone;
+# - ``t`` and ``|x|^2 - t^2`` (arrival times), of which every value is possible: no cone;
+# - ``r_b`` (pairs), which is not less than ``|x - s_b|``: a cone.
+#
+# No row passes on its error to another one, as it does where the ranges are first reduced to one reference.
+
+_NEAR = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class RowWise:
+    """Rows of N problems of one position, ``rows . y = right``, with y = ((x - origin) / scale, others).
+
+    Parameters
+    ----------
+    origin : array (N, d)
+        Metres.
+    scale : array (N,)
+        Metres.
+    rows, right : array (N, m, n), (N, m)
+        Zero for a row that is absent or does not lift.
+    error : callable
+        Maps scaled points (N, d), or None, to the standard deviations (N, m) of the right sides.
+    apex : array (N, q, d)
+        Stations b, scaled.
+    square : bool
+        Whether y holds ``|x|^2``, behind x; the ranges to the q stations b are the last entries.
+    """
+
+    origin: Array
+    scale: Array
+    rows: Array
+    right: Array
+    error: Callable[[Array | None], Array]
+    apex: Array
+    square: bool
+
+    def cones(self, item: int) -> list[tuple[int, Array]]:
+        """Return the entry of y that each cone bounds, and the cone, of one problem."""
+        n, d, q = self.rows.shape[-1], self.apex.shape[-1], self.apex.shape[1]
+        ranged = [(n - q + j, range_cone(self.apex[item, j], n, n - q + j)) for j in range(q)]
+        return [(d, square_cone(d, n, d)), *ranged] if self.square else ranged
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """Rows of one kind: coefficients of x, of |x|^2 and of others by their column, right side, error at a point."""
+
+    x: Array
+    square: Array
+    others: tuple[tuple[Array, Array], ...]
+    right: Array
+    error: Callable[[Array | None], Array]
+
+
+def row_wise(problem: Problem) -> RowWise:
+    """Return the rows of a flat batch of problems with one static target, each made linear by itself.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+
+    Notes
+    -----
+    A. Beck, P. Stoica, J. Li, "Exact and approximate solutions of source localization problems", IEEE Trans. Signal
+    Process. 56 (2008), sections II and III, with one row for each measurement.
+    """
+    size, d = problem.batch_shape[0], problem.dimension
+    centre, spread = spread_of(problem)
+    origin, scale = np.broadcast_to(centre, (size, d)), np.broadcast_to(spread, (size,))
+    pairs = _references(problem)
+    first = d + 1 + 2 * problem.epochs
+    n = first + len(pairs)
+    rows, right = np.zeros((size, problem.count, n)), np.zeros((size, problem.count))
+    errors: list[tuple[slice, Callable[[Array | None], Array]]] = []
+    for block, start in zip(problem.rows, problem.starts, strict=True):
+        part = _ranged(problem, block, start, origin, scale, pairs, first)
+        part = part or _otherwise(problem, block, start, Coordinates(origin, scale, False))
+        if part is None:
+            continue
+        own = slice(start, start + block.count)
+        rows[:, own, :d], rows[:, own, d], right[:, own] = part.x, part.square, part.right
+        for column, value in part.others:
+            rows[:, np.arange(start, own.stop), column] += value
+        errors.append((own, part.error))
+    usable = (problem.weight > 0.0) & np.isfinite(right) & np.isfinite(rows).all(-1)
+    rows, right = np.where(usable[..., None], rows, 0.0), np.where(usable, right, 0.0)
+
+    def error(point: Array | None) -> Array:
+        out = np.ones(right.shape)
+        for own, each in errors:
+            out[:, own] = each(point)
+        return out
+
+    apex = (np.broadcast_to(problem.stations.position, (size, *problem.stations.position.shape[-3:]))[:, 0, pairs]
+            - origin[:, None]) / scale[:, None, None]  # fmt: skip
+    return RowWise(origin, scale, rows, right, error, apex, bool(rows[..., d].any()))
+
+
+def _references(problem: Problem) -> list[int]:
+    """Return the stations b of rows that combine two ranges."""
+    taken = [rows.b for rows in problem.rows if (form := MODELS[rows.kind].ranges) is not None and form[1] != 0]
+    return sorted({int(b) for each in taken for b in each})
+
+
+def _block_sigma(problem: Problem, block: Rows, start: int) -> Array:
+    weight = np.where(block.weight > 0.0, block.weight, 1.0)
+    return np.sqrt(variances(problem.noise, problem.count)[..., start : start + block.count] / weight)
+
+
+def _ranged(
+    problem: Problem, block: Rows, start: int, origin: Array, scale: Array, pairs: list[int], first: int
+) -> _Part | None:
+    model, form = MODELS[block.kind], MODELS[block.kind].ranges
+    if form is None:
+        return None
+    place = problem.stations.position[..., 0, :, :]
+    a = (place[..., block.a, :] - origin[:, None]) / scale[:, None, None]
+    m = (block.z - block.correction) / scale[:, None]
+    x, right, square = -2.0 * a, -(a**2).sum(-1), np.ones(block.count)
+    others: tuple[tuple[Array, Array], ...] = ()
+    if form[1]:
+        b = (place[..., block.b, :] - origin[:, None]) / scale[:, None, None]
+        x, right, square = x + 2.0 * b, right + (b**2).sum(-1), np.zeros(block.count)
+        column = first + np.searchsorted(pairs, block.b)
+        others = ((column, 2.0 * form[1] * m),)
+    elif model.emission:
+        m = _centred(m, block)
+        column = problem.dimension + 1 + 2 * block.epoch
+        square, others = np.zeros(block.count), ((column, 2.0 * m), (column + 1, np.ones(block.count)))
+    sigma = _block_sigma(problem, block, start) / scale[:, None]
+
+    def error(point: Array | None) -> Array:
+        away = np.maximum(1.0, np.abs(m)) if point is None else np.sqrt(((point[:, None] - a) ** 2).sum(-1))
+        return np.asarray(2.0 * np.maximum(np.where(np.isfinite(away), away, 1.0), _NEAR) * sigma)
+
+    return _Part(x, square, others, right + m**2, error)
+
+
+def _centred(m: Array, block: Rows) -> Array:
+    """Return arrival times (N, m) less the median of their epoch: one that is far off must not decide the origin."""
+    out, heard = np.array(m), np.broadcast_to(block.weight > 0.0, m.shape)
+    for epoch in np.unique(block.epoch):
+        own = block.epoch == epoch
+        with np.errstate(all="ignore"):
+            middle = np.nanmedian(np.where(heard[:, own], m[:, own], np.nan), axis=1, keepdims=True)
+        out[:, own] -= np.where(np.isfinite(middle), middle, 0.0)
+    return out
+
+
+def _otherwise(problem: Problem, block: Rows, start: int, to: Coordinates) -> _Part | None:
+    lifted = lifted_rows(problem, block, start, None, to)
+    if lifted is None:
+        return None
+
+    def error(point: Array | None) -> Array:
+        return np.asarray(np.maximum(np.abs(lifted.factor(point)), _NEAR) * lifted.sigma)
+
+    return _Part(lifted.row[..., :-1], lifted.row[..., -1], (), lifted.right, error)
+
+
+_LEVEL = 0.01
+_PASSES = 8
+
+
+@dataclass(frozen=True, slots=True)
+class SparseErrors:
+    """What the convex programmes say about a flat batch of N problems of one position.
+
+    Parameters
+    ----------
+    position : array (N, 2, d)
+        Point of the last programme, and the fix without the rows in error; NaN where there is none.
+    raw : bool array (N, m)
+        Support of the last programme: rows whose gross error is not zero.
+    wrong : bool array (N, m)
+        Rows in error after the fix without them was tested.
+    """
+
+    position: Array
+    raw: Array
+    wrong: Array
+
+
+def sparse(problem: Problem, fix: Fix | None) -> Fix:
+    """Return the point of the convex programme with sparse errors and the fix without the rows in error, unrefined.
+
+    With fewer than about ten stations this is a start and nothing more: the sum of the errors' sizes then often hides
+    the wrong rows. Search their subsets instead.
+    """
+    began = perf_counter()
+    if not one_position(problem):
+        x = from_pieces(problem, lambda piece: lsr(piece, sparse(piece, None)))
+        return unrefined(problem, x, fix, "sparse", began)
+    alone = static(problem)
+    arrived = as_arrivals(alone)
+    found = sparse_errors(alone if arrived is None else arrived.problem)
+    wrong = found.wrong if arrived is None else spread(found.wrong, arrived.origin, problem.count)
+    weights = np.where(wrong, 0.0, problem.weight)
+    x = vectors(problem.with_rows(weight=weights), packed(found.position))  # emission times fit the rows that are kept
+    start = unrefined(problem, x, fix, "sparse", began)
+    stage = replace(start.stages[-1], detail=f"{int(found.wrong.sum(1).max(initial=0))} wrong rows at most")
+    return replace(start, weights=weights, stages=(*start.stages[:-1], stage))
+
+
+def spread(wrong: Array, origin: Sequence[Array], count: int) -> Array:
+    """Return the rows (N, count) that wrong arrival times (N, m) were made from (`optloc.solvers.starts.arrivals`)."""
+    out = np.zeros((len(wrong), count), dtype=bool)
+    for i, rows in enumerate(origin):
+        out[:, rows] |= wrong[:, i, None]
+    return out
+
+
+def sparse_errors(problem: Problem) -> SparseErrors:
+    """Return positions and suspected rows of a flat batch of problems with one static target.
+
+    Three programmes follow each other: the rows squared one by one, the same weighed by the ranges to the first
+    answer, and the rows linearised at the second one. Then the support is tested: rows are left out, the rest is fixed,
+    and a row is in error if its residual is larger than the greatest of all rows is with a probability of 1 %.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    """
+    x = vectors(problem, _lifted(problem)[:, None])[:, 0]
+    x, raw = _linearised(problem, x)
+    start = problem.layout.take(x, "position")
+    fixed, wrong = _tested(problem, x, raw)
+    return SparseErrors(np.stack([start, fixed], axis=1), raw, wrong)
+
+
+def _lifted(problem: Problem) -> Array:
+    """Return positions (N, d) of the squared rows in two weightings.
+
+    Where these leave a direction open (pairs without a common station have one more unknown each), it is the closed
+    form of all rows.
+    """
+    lifts, point = row_wise(problem), None
+    for _ in range(2):
+        y, _ = _fitted(lifts.rows, lifts.right, lifts.error(point), lifts)
+        point = y[:, : problem.dimension]
+    assert point is not None
+    position = point * lifts.scale[:, None] + lifts.origin
+    lost = np.flatnonzero(np.isnan(position).any(1))
+    if len(lost):
+        position[lost] = gtrs(problem.take(lost), None).position
+    return position
+
+
+def _linearised(problem: Problem, x: Array) -> tuple[Array, Array]:
+    """Return vectors (N, size) after one step with sparse errors, and the support (N, m)."""
+    residual, jacobian = _derivatives(problem, x)
+    move, errors = _fitted(jacobian, residual, _sigma(problem))
+    return x + move, errors != 0.0
+
+
+def _fitted(rows: Array, right: Array, sigma: Array, lifts: RowWise | None = None) -> tuple[Array, Array]:
+    """Return the unknowns (N, n) and errors in sigmas (N, m) of linear rows; unknowns that no row has are zero."""
+    from formulations.sparse_errors import sparse_fit
+
+    y, errors = np.full((len(rows), rows.shape[-1]), np.nan), np.zeros(right.shape)
+    white, side = rows / sigma[..., None], right / sigma
+
+    def fit(i: int) -> None:
+        used = (white[i] != 0.0).any(0)
+        if not (used.any() and np.isfinite(white[i]).all() and np.isfinite(side[i]).all()):
+            return
+        kept = np.append(used, True)
+        cones = [] if lifts is None else [cone[:, kept] for column, cone in lifts.cones(i) if used[column]]
+        found = sparse_fit(white[i][:, used], side[i], cones=cones)
+        y[i], errors[i] = 0.0, found.errors
+        y[i, used] = found.y
+
+    mapped(fit, range(len(rows)), least=WORTH)
+    return y, errors
+
+
+def _tested(problem: Problem, x: Array, wrong: Array) -> tuple[Array, Array]:
+    """Return the positions (N, d) without the rows in error, and these rows (N, m)."""
+    present = np.broadcast_to(problem.weight > 0.0, wrong.shape)
+    limit = -ndtri(0.5 * _LEVEL / np.maximum(present.sum(1, keepdims=True), 1))
+    wrong, active = wrong.copy(), np.arange(len(x))
+    x = x.copy()
+    wrong = _spared(problem, wrong.astype(float), wrong)
+    for _ in range(_PASSES):
+        part, out = problem.take(active), wrong[active]
+        rest = part.with_rows(weight=np.where(out, 0.0, part.weight))
+        starts = np.stack([x[active], gtrs(rest, None).x], axis=1)
+        fixed = lsr(rest, given(rest, starts)).x
+        x[active] = np.where(np.isfinite(fixed), fixed, x[active])
+        size = _standardised(part, x[active], ~out & present[active])
+        found = _spared(part, size, size > limit[active])
+        changed = (found != out).any(1) & np.isfinite(fixed).all(1)
+        wrong[active[changed]] = found[changed]
+        active = active[changed]
+        if not len(active):
+            break
+    return problem.layout.take(x, "position"), wrong
+
+
+def _spared(problem: Problem, size: Array, wrong: Array) -> Array:
+    """Return the largest of the rows in error (N, m), so many that one row more than unknowns is left."""
+    present = np.broadcast_to(problem.weight > 0.0, wrong.shape)
+    unknown = problem.layout.n_shared + problem.layout.n_local * problem.epochs
+    most = np.maximum(present.sum(1, keepdims=True) - unknown - 1, 0)
+    rank = np.argsort(np.argsort(-np.where(wrong, size, -np.inf), axis=1, kind="stable"), axis=1)
+    return np.asarray(wrong & (rank < most))
+
+
+def _standardised(problem: Problem, x: Array, kept: Array) -> Array:
+    """Return residuals (N, m) at the fix of the rows kept, in units of their own standard deviations.
+
+    A row of the fix has residual variance s^2 - J C J', one left out s^2 + J C J'.
+    """
+    residual, jacobian = _derivatives(problem, x)
+    sigma = _sigma(problem)
+    residual, white = residual / sigma, jacobian / sigma[..., None]
+    inside = np.where(kept[..., None], white, 0.0)
+    information = np.swapaxes(inside, -1, -2) @ inside
+    idle = np.einsum("nii->ni", information) == 0.0
+    covariance, _ = linalg.inverse(information + idle[..., None] * np.eye(idle.shape[-1]))
+    lever = np.einsum("nmi,nij,nmj->nm", white, covariance, white)
+    variance = np.where(kept, 1.0 - lever, 1.0 + lever)
+    with np.errstate(invalid="ignore"):
+        told = variance > 1e-6  # what has no redundancy fits whatever its error
+    return np.where(told, np.abs(residual) / np.sqrt(np.where(told, variance, 1.0)), 0.0)
+
+
+def _derivatives(problem: Problem, x: Array) -> tuple[Array, Array]:
+    """Return residuals (N, m) and their derivatives (N, m, size); NaN vectors give NaN."""
+    residual, compact = differentiate(problem, x)
+    n, width = problem.layout.n_shared, problem.layout.n_local
+    full = np.zeros((*compact.shape[:-1], problem.layout.size))
+    full[..., :n] = compact[..., :n]
+    for j in range(width):
+        full[:, np.arange(problem.count), n + problem.epoch * width + j] = compact[..., n + j]
+    return residual, np.where(problem.weight[..., None] > 0.0, full, 0.0)
+
+
+def _sigma(problem: Problem) -> Array:
+    weight = np.where(problem.weight > 0.0, problem.weight, 1.0)
+    sigma = np.sqrt(variances(problem.noise, problem.count) / weight)
+    return np.broadcast_to(sigma, (*problem.batch_shape, problem.count))

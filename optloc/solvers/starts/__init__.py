@@ -1,0 +1,1 @@
+"""Starting points without a guess, by kind of measurement."""

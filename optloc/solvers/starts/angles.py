@@ -1,0 +1,280 @@
+"""Starts and proofs from angles alone: instrumental variables, unit directions, the least worst angle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from formulations.bearing_course import Courses, sighted_courses
+from formulations.bearing_ls import rays, sight
+from formulations.bistatic import course, triad
+from optloc.base.threads import WORTH, mapped
+from optloc.base.types import Array, Rows
+from optloc.linear.indices import elapsed
+from optloc.problem.noise import variances
+from optloc.problem.problem import Problem
+from optloc.solvers.starts.position import spread_of
+
+
+@dataclass(frozen=True, slots=True)
+class Bearings:
+    """The angles of a flat batch of N problems, one bearing for each station and epoch that has an azimuth.
+
+    Parameters
+    ----------
+    station : array (N, m, d)
+        Positions in units of `scale` from `centre`.
+    angle : array (N, m, 2)
+        Azimuth and elevation, radians; the elevation is zero where there is none.
+    weight : array (N, m, 2)
+        One over the standard deviations, 1/radians; zero where absent.
+    axes : array (N, m, d, d), optional
+        Axes of the stations.
+    centre : array (N, d)
+        Metres.
+    scale : array (N,)
+        Metres.
+    """
+
+    station: Array
+    angle: Array
+    weight: Array
+    axes: Array | None
+    centre: Array
+    scale: Array
+
+    def metres(self, point: Array) -> Array:
+        """Return scaled points (N, ..., d) in the problem's frame."""
+        extra = (1,) * (point.ndim - 2)
+        return point * self.scale.reshape(-1, *extra, 1) + self.centre.reshape(-1, *extra, point.shape[-1])
+
+
+def bearings(problem: Problem) -> Bearings | None:
+    """Return the angles of a flat batch with one static target, or None where no azimuth was measured."""
+    rows = {block.kind: (block, start) for block, start in zip(problem.rows, problem.starts, strict=True)}
+    if "azimuth" not in rows:
+        return None
+    block, start = rows["azimuth"]
+    size = problem.batch_shape[0]
+    angle, weight = np.zeros((size, block.count, 2)), np.zeros((size, block.count, 2))
+    angle[..., 0], weight[..., 0] = _measured(problem, block, start)
+    if "elevation" in rows:
+        other, begin = rows["elevation"]
+        value, importance = _measured(problem, other, begin)
+        keys = {key: i for i, key in enumerate(_keys(other))}
+        for i, key in enumerate(_keys(block)):
+            if key in keys:
+                angle[:, i, 1], weight[:, i, 1] = value[:, keys[key]], importance[:, keys[key]]
+    place = _at(problem.stations.position, 3, block, size)
+    axes = None if problem.stations.axes is None else _at(problem.stations.axes, 4, block, size)
+    centre = place.mean(1)
+    spread = np.linalg.norm(place - centre[:, None], axis=-1).max(1)
+    scale = np.where(spread > 0.0, spread, 1.0)
+    return Bearings((place - centre[:, None]) / scale[:, None, None], angle, weight, axes, centre, scale[:size])
+
+
+def _keys(rows: Rows) -> list[tuple[int, int]]:
+    return list(zip(rows.a.tolist(), rows.epoch.tolist(), strict=True))
+
+
+def _measured(problem: Problem, rows: Rows, start: int) -> tuple[Array, Array]:
+    sigma = np.sqrt(variances(problem.noise, problem.count)[..., start : start + rows.count])
+    shape = (problem.batch_shape[0], rows.count)
+    importance = np.where(rows.weight > 0.0, np.sqrt(rows.weight) / sigma, 0.0)
+    return np.broadcast_to(rows.z - rows.correction, shape), np.broadcast_to(importance, shape)
+
+
+def _at(array: Array, core: int, rows: Rows, size: int) -> Array:
+    """Return a per-station quantity (N, m, ...) at the stations and epochs of rows."""
+    full = np.broadcast_to(array, (size, *array.shape[array.ndim - core :]))
+    epoch = rows.epoch if full.shape[1] > 1 else np.zeros_like(rows.epoch)
+    return full[:, epoch, rows.a]
+
+
+def instrumental(seen: Bearings) -> Array:
+    """Return the instrumental-variable fixes (N, 1, d), NaN where there is none."""
+    d = seen.station.shape[-1]
+    steep = (None, None) if d == 2 else (seen.angle[..., 1], seen.weight[..., 1])
+    azimuth, importance = seen.angle[..., 0], seen.weight[..., 0]
+    found = sight(azimuth, seen.station, importance, elevation=steep[0], elevation_weight=steep[1], axes=seen.axes)
+    return seen.metres(np.where(found.ok[:, None], found.instrumental, np.nan))[:, None]
+
+
+def courses(problem: Problem) -> Courses | None:
+    """Return the pseudo-linear courses of a flat batch of runs, or None where its rows are not all angles.
+
+    Parameters
+    ----------
+    problem : Problem
+        N runs of one target that moves as a polynomial all the while; nothing else is unknown.
+
+    Returns
+    -------
+    Courses
+        In metres and seconds since the time at which the target's state holds.
+    """
+    if any(rows.kind not in ("azimuth", "elevation") for rows in problem.rows):
+        return None
+    seen = bearings(problem)
+    if seen is None:
+        return None
+    block = next(rows for rows in problem.rows if rows.kind == "azimuth")
+    found = sighted_courses(
+        seen.angle[..., 0],
+        seen.station,
+        elapsed(problem, 0)[block.epoch],
+        seen.weight[..., 0],
+        elevation=seen.angle[..., 1],
+        elevation_weight=seen.weight[..., 1],
+        axes=seen.axes,
+        order=problem.motions[0].order,
+    )
+
+    def metres(c: Array) -> Array:
+        out = c * seen.scale[:, None, None]
+        out[:, 0] += seen.centre
+        return out
+
+    return Courses(metres(found.plain), metres(found.weighted), metres(found.instrumental), found.ok, found.ahead)
+
+
+def course_states(problem: Problem) -> Array | None:
+    """Return the states (N, order + 1, d) of the instrumental courses, or None where rows are not all angles.
+
+    NaN where the run does not determine a course, or where it is not in front of the stations.
+    """
+    found = courses(problem)
+    if found is None:
+        return None
+    unit = np.array([1.0, 1.0, 2.0])[: found.plain.shape[1], None]
+    return np.where(found.ahead[:, None, None], unit * found.instrumental, np.nan)
+
+
+def by_directions(seen: Bearings) -> Array:
+    """Return the fixes (N, 1, 3) of the unit-direction relaxation, over threads; NaN where an elevation is missing."""
+    from formulations.direction_sdp import directions
+
+    out = np.full((len(seen.station), 1, 3), np.nan)
+
+    def relaxed(item: tuple[int, Array]) -> None:
+        i, use = item
+        axes = None if seen.axes is None else seen.axes[i, use]
+        out[i, 0] = directions(seen.angle[i, use], 1.0 / seen.weight[i, use], seen.station[i, use], axes=axes).point
+
+    mapped(relaxed, _complete(seen), least=WORTH)
+    return seen.metres(out)
+
+
+def least_worst(seen: Bearings) -> Array:
+    """Return the fixes (N, 1, d) whose worst angle in sigma is least."""
+    from formulations.minimax_cone import minimax
+
+    d = seen.station.shape[-1]
+    out = np.full((len(seen.station), 1, d), np.nan)
+    ahead = rays(seen.angle[..., 0], seen.angle[..., 1] if d == 3 else None, seen.axes).ahead
+
+    for i in range(len(out)):  # each is a row of programs of a tenth of a millisecond: too short for threads
+        use = (seen.weight[i, :, : d - 1] > 0.0).all(-1)
+        if use.sum() > 1:
+            sigma = 1.0 / seen.weight[i, use, : d - 1].min(-1)
+            out[i, 0] = minimax(ahead[i, use], seen.station[i, use], sigma).point
+    return seen.metres(out)
+
+
+def angle_bounds(seen: Bearings, point: Array) -> Array:
+    """Return lower bounds (N,) of the maximum-likelihood cost over all positions; minus infinity where there is none.
+
+    Parameters
+    ----------
+    seen : Bearings
+        All the rows of the problems.
+    point : array (N, 3)
+        Refined fixes, metres.
+    """
+    from formulations.direction_sdp import angle_bound
+
+    out = np.full(len(point), -np.inf)
+    scaled = (point - seen.centre) / seen.scale[:, None]
+
+    def bounded(item: tuple[int, Array]) -> None:
+        i, use = item
+        if np.isfinite(scaled[i]).all() and not (seen.weight[i, ~use] > 0.0).any():
+            axes = None if seen.axes is None else seen.axes[i, use]
+            sigma = 1.0 / seen.weight[i, use]
+            out[i] = angle_bound(seen.angle[i, use], sigma, seen.station[i, use], scaled[i], axes=axes).bound
+
+    mapped(bounded, _complete(seen), least=WORTH)
+    return out
+
+
+def _complete(seen: Bearings) -> list[tuple[int, Array]]:
+    """Return the problems with at least two complete bearings, and which bearings those are."""
+    if seen.station.shape[-1] != 3:
+        return []
+    use = np.asarray((seen.weight > 0.0).all(-1) & np.isfinite(seen.angle).all(-1))
+    return [(int(i), use[i]) for i in np.flatnonzero(use.sum(1) > 1)]
+
+
+# One receiver, one illuminator: a polynomial course straight from delays and angles of several epochs.
+
+
+def course_starts(problem: Problem) -> Array | None:
+    """Return the state (N, order + 1, 3) of the only target, or None where the rows are not of one bistatic pair.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems whose rows are range sums of one pair of still stations, and angles of its receiver.
+
+    Returns
+    -------
+    array (N, order + 1, 3)
+        Position, velocity and acceleration; NaN where the epochs do not determine them.
+    """
+    found = pair(problem)
+    if found is None:
+        return None
+    receiver, illuminator = found
+    size, k = problem.batch_shape[0], problem.epochs
+    value, sigma = np.zeros((3, size, k)), np.full((3, size, k), np.inf)
+    deviation = np.sqrt(variances(problem.noise, problem.count))
+    for rows, start in zip(problem.rows, problem.starts, strict=True):
+        kind = ("azimuth", "elevation", "range_sum").index(rows.kind)
+        value[kind][:, rows.epoch] = rows.z - rows.correction
+        own = deviation[..., start : start + rows.count]
+        sigma[kind][:, rows.epoch] = np.where(rows.weight > 0.0, own, np.inf)
+    place = np.broadcast_to(problem.stations.position, (size, *problem.stations.position.shape[-3:]))[:, 0]
+    home, away = place[:, receiver], place[:, illuminator] - place[:, receiver]
+    length = float(spread_of(problem)[1][0])
+    axes = triad(value[0], value[1])
+    if problem.stations.axes is not None:
+        own = np.broadcast_to(problem.stations.axes, (size, *problem.stations.axes.shape[-4:]))[:, 0, receiver]
+        axes = axes @ own[:, None]
+    excess = value[2] - np.sqrt((away**2).sum(-1))[:, None]
+    spread = np.stack([np.cos(value[1]) * sigma[0], sigma[1], sigma[2] / length], axis=-1)
+    since, order = elapsed(problem, 0), problem.motions[0].order
+    fitted = course(excess / length, axes, away / length, np.broadcast_to(since, (size, k)), spread, order=order)
+    state = fitted.coefficients * length * np.array([1.0, 1.0, 2.0])[: order + 1, None]
+    state[:, 0] += home
+    return np.asarray(state)
+
+
+def pair(problem: Problem) -> tuple[int, int] | None:
+    """Return receiver and illuminator of all rows, or None where they are not of one bistatic pair that stays."""
+    kinds = {rows.kind: rows for rows in problem.rows}
+    if problem.dimension != 3 or set(kinds) != {"range_sum", "azimuth", "elevation"} or len(kinds) != len(problem.rows):
+        return None
+    if problem.stations.position.shape[-3] > 1 or not all(_once(rows) for rows in problem.rows):
+        return None
+    ends = {(int(a), int(b)) for a, b in zip(kinds["range_sum"].a, kinds["range_sum"].b, strict=True)}
+    heard = {int(a) for kind in ("azimuth", "elevation") for a in kinds[kind].a}
+    if len(heard) != 1 or len({frozenset(end) for end in ends}) != 1:
+        return None
+    receiver = heard.pop()
+    others = {a if b == receiver else b for a, b in ends if receiver in (a, b)}
+    return (receiver, others.pop()) if len(others) == 1 else None
+
+
+def _once(rows: Rows) -> bool:
+    return len(np.unique(rows.epoch)) == rows.count

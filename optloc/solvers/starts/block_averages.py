@@ -1,0 +1,214 @@
+"""Block averages: a long run as a short one of the same unknowns, to start from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import reduce
+
+import numpy as np
+from scipy import sparse
+
+from optloc.base.types import Array, Bias, Rows, Stations
+from optloc.linear.station_noise import weighed
+from optloc.models import MODELS
+from optloc.models.primitives import wrap
+from optloc.problem.epochs import cut, epochs_of, joined
+from optloc.problem.noise import Block, Noise, together
+from optloc.problem.problem import Problem
+
+# A block that lasts this many times longer than usual has a gap in it, and the line through it means nothing.
+_GAP = 2.0
+
+
+def averaged(problem: Problem, count: int) -> Problem:
+    """Return the run as blocks of equally many epochs, with the values that its rows have in the middle of each block.
+
+    Blocks are equally long so that the curvature that an average leaves out is the same in all of them, and is
+    absorbed by a bias. The last epochs that fill no block are left out, and so are blocks with a gap in time.
+
+    Parameters
+    ----------
+    problem : Problem
+        Batch (...) of runs of k epochs; states last the whole run. Station errors become noise.
+    count : int
+        Number of blocks wanted; at most twice as many result.
+
+    Returns
+    -------
+    Problem
+        Batch (...) with one epoch a block. A row is the line through its values in the block, taken in the middle; it
+        exists where it is present in all problems of the batch. The same biases; states hold at the same time.
+    """
+    length = max(1, problem.epochs // count)
+    if length == 1:
+        return _clear(problem)
+    last = length * (problem.epochs // length)
+    lasting = problem.times[length - 1 : last : length] - problem.times[:last:length]
+    longest = _GAP * float(np.median(lasting))
+    stretch = length * max(1, epochs_of(problem, int(np.prod(problem.batch_shape))) // length)
+    if stretch >= last:
+        return _blocks(_clear(problem), length, longest)
+    parts = (cut(problem, first, min(first + stretch, last)) for first in range(0, last, stretch))
+    return reduce(joined, (_blocks(_clear(part), length, longest) for part in parts))
+
+
+def _blocks(problem: Problem, length: int, longest: float) -> Problem:
+    """Return the blocks of a given length of a run, but for those that last longer than they may."""
+    blocks = problem.epochs // length
+    times = problem.times[: blocks * length].reshape(blocks, length)
+    kept = np.flatnonzero(times[:, -1] - times[:, 0] <= longest)
+    middle = 0.5 * (times[kept, 0] + times[kept, -1])
+    place = np.full(problem.epochs, -1)
+    place[(kept[:, None] * length + np.arange(length)).ravel()] = np.repeat(np.arange(len(kept)), length)
+    since = np.zeros(problem.epochs)
+    since[place >= 0] = (times[kept] - middle[:, None]).ravel()
+    when = _Blocks(place, since, middle)
+    present = np.asarray((problem.weight > 0.0).reshape(-1, problem.count).all(0))
+    means: list[_Mean] = []
+    taken = 0
+    for kind, start in zip(problem.rows, problem.starts, strict=True):
+        means.append(_means(kind, when, present[start : start + kind.count], start, taken))
+        taken += len(means[-1].first)
+    rows = tuple(_averaged(block, mean) for block, mean in zip(problem.rows, means, strict=True))
+    return replace(
+        problem,
+        stations=_stations(problem.stations, when),
+        rows=rows,
+        noise=_noise(problem, means, np.concatenate([block.epoch for block in rows])),
+        times=middle,
+        motions=tuple(replace(m, reference=_reference(problem, m.reference)) for m in problem.motions),
+        biases=tuple(_bias(bias, np.concatenate([mean.first for mean in means])) for bias in problem.biases),
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Blocks:
+    """Block of each epoch (-1 for none), seconds since its middle, and the middles."""
+
+    place: Array
+    since: Array
+    middle: Array
+
+
+@dataclass(frozen=True, slots=True)
+class _Mean:
+    """Which rows of a kind meet in which rows of the blocks: sorted by block, with their coefficients.
+
+    `order` are rows of the kind, `head` the first entry of each new row among them, `row` the new row of each entry.
+    `first` is the global number of one row that goes into each new row.
+    """
+
+    order: Array
+    head: Array
+    row: Array
+    coefficient: Array
+    block: Array
+    first: Array
+    start: int
+    taken: int
+
+
+def _clear(problem: Problem) -> Problem:
+    """Return the problem with its station errors of each epoch in the noise."""
+    stations = problem.stations
+    if stations.covariance is None or stations.span == "run":
+        return problem
+    return weighed(replace(problem, stations=replace(stations, span="noise")))
+
+
+def _reference(problem: Problem, reference: float | None) -> float:
+    return float(problem.times[0]) if reference is None else reference
+
+
+def _means(rows: Rows, when: _Blocks, present: Array, start: int, taken: int) -> _Mean:
+    """Return how the rows of a kind, of global numbers from `start` on, are averaged."""
+    inside = np.flatnonzero((when.place[rows.epoch] >= 0) & present)
+    key = np.stack([when.place[rows.epoch], rows.a, rows.b, rows.target])[:, inside]
+    order = np.lexsort(key[::-1])
+    key, order = key[:, order], inside[order]
+    new = np.ones(len(order), dtype=bool)
+    new[1:] = (key[:, 1:] != key[:, :-1]).any(0)
+    head, row = np.flatnonzero(new), np.cumsum(new) - 1
+    since = when.since[rows.epoch[order]]
+    coefficient = _middle(since, row)
+    return _Mean(order, head, row, coefficient, key[0][head], start + order[head], start, taken)
+
+
+def _middle(since: Array, row: Array) -> Array:
+    """Return the coefficients of the line through the values of each row, taken at time zero."""
+    total = [np.bincount(row, since**j) for j in range(3)]
+    spread = total[0] * total[2] - total[1] ** 2
+    line = spread > 1e-6 * total[0] * total[2]
+    slope = np.where(line, total[1], 0.0)[row] * since
+    level = np.where(line, total[2], 1.0)[row]
+    return np.asarray((level - slope) / np.where(line, spread, total[0])[row])
+
+
+def _averaged(rows: Rows, mean: _Mean) -> Rows:
+    def middle(values: Array, wrapped: bool) -> Array:
+        sorted_, base = values[..., mean.order], np.zeros(())
+        if wrapped:
+            base = sorted_[..., mean.head]
+            sorted_ = wrap(sorted_ - base[..., mean.row])
+        if not len(mean.head):
+            return sorted_
+        return np.asarray(base + np.add.reduceat(sorted_ * mean.coefficient, mean.head, axis=-1))
+
+    one = mean.order[mean.head]
+    z = middle(rows.z, MODELS[rows.kind].period is not None)
+    weight, correction = np.ones(len(one)), middle(rows.correction, wrapped=False)
+    return Rows(rows.kind, z, rows.a[one], rows.b[one], mean.block, rows.target[one], weight, correction)
+
+
+def _stations(stations: Stations, when: _Blocks) -> Stations:
+    inside = np.flatnonzero(when.place >= 0)
+    coefficient = _middle(when.since[inside], when.place[inside])
+    head = np.flatnonzero(np.diff(when.place[inside], prepend=-1))
+
+    def middle(values: Array | None, core: int) -> Array | None:
+        if values is None or values.shape[-core] == 1:
+            return values
+        moved = np.moveaxis(values, -core, -1)[..., inside]
+        return np.moveaxis(np.add.reduceat(moved * coefficient, head, axis=-1), -1, -core)
+
+    position = middle(stations.position, 3)
+    assert position is not None
+    axes = middle(stations.axes, 4)
+    if axes is not None and axes is not stations.axes:
+        left, _, right = np.linalg.svd(axes)  # the rotation next to the mean of rotations
+        axes = left @ right
+    return replace(stations, position=position, velocity=middle(stations.velocity, 3), axes=axes)
+
+
+def _noise(problem: Problem, means: list[_Mean], block: Array) -> Noise:
+    """Return the covariance of the new rows: C R C', of which rows of one block are kept together."""
+    count, size = problem.count, sum(len(mean.head) for mean in means)
+    entries = [(mean.taken + mean.row, mean.start + mean.order, mean.coefficient) for mean in means]
+    place, old, coefficient = (np.concatenate([entry[i] for entry in entries]) for i in range(3))
+    C = sparse.csr_array((coefficient, (place, old)), shape=(size, count))
+    covariance = (C @ _sparse(problem) @ C.T).tocsr()
+    blocks = []
+    for members in together(block):
+        one, two = np.broadcast_arrays(members[:, :, None], members[:, None, :])
+        values = np.asarray(covariance[one.ravel(), two.ravel()]).reshape(one.shape)
+        blocks.append(Block(members, values))
+    return Noise(tuple(blocks))
+
+
+def _sparse(problem: Problem) -> sparse.csr_array:
+    """Return the covariance of all rows; of a batch, the mean."""
+    parts = []
+    for block in problem.noise.blocks:
+        covariance = block.covariance.reshape(-1, *block.covariance.shape[-3:]).mean(0)
+        one, two = np.broadcast_arrays(block.row[:, :, None], block.row[:, None, :])
+        parts.append((np.broadcast_to(covariance, one.shape).ravel(), one.ravel(), two.ravel()))
+    value, one, two = (np.concatenate([part[i] for part in parts]) for i in range(3))
+    return sparse.csr_array((value, (one, two)), shape=(problem.count, problem.count))
+
+
+def _bias(bias: Bias, first: Array) -> Bias:
+    """Return the touches of the new rows: those of one row that went into each."""
+    new = np.full(int(max(first.max(initial=0), bias.row.max(initial=0))) + 1, -1)
+    new[first] = np.arange(len(first))
+    kept = new[bias.row] >= 0
+    return replace(bias, row=new[bias.row[kept]], member=bias.member[kept], coefficient=bias.coefficient[kept])

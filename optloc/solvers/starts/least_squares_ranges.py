@@ -1,0 +1,299 @@
+"""Rows that are linear in ranges carry no more than the least-squares ranges, known up to one common unknown.
+
+Rows z = D r + n (range, tdoa, toa, range_sum; D holds 0 and +-1) link stations into a graph. In each connected
+group the ranges that fit best are r = c + sign * t: known (t = 0), or known up to one unknown t, the range to a
+reference station. c and its covariance are an exact sufficient statistic of these rows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optloc.base import linalg
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array, Rows
+from optloc.models import MODELS
+from optloc.problem.noise import Block, Noise, whiten
+from optloc.problem.problem import Problem
+
+
+@dataclass(frozen=True, slots=True)
+class Graph:
+    """How the range rows that are present link the stations.
+
+    Parameters
+    ----------
+    group : int array (q,)
+        Connected group of each node; -1 for a node without rows. Nodes are (station, epoch), then emission times.
+    sign : int array (q,)
+        Sign with which the unknown of its group enters each node's range; 0 in a group that is determined.
+    main : int
+        Group with the most stations; -1 where there is none.
+    """
+
+    group: Array
+    sign: Array
+    main: int
+
+
+@dataclass(frozen=True, slots=True)
+class Ranges:
+    """Least-squares ranges of a flat batch of problems, r = c + sign * t over the main group of each.
+
+    Parameters
+    ----------
+    station, epoch : int array (s,)
+        Station and epoch of each node; the epoch is 0 where stations stay.
+    inside : bool array (N, s)
+        Whether a node belongs to the main group of its problem.
+    sign : int array (N, s)
+        +1, -1, or 0 where the range is determined.
+    reference : int array (N,)
+        Node whose range is t.
+    offset : array (N, s)
+        c, metres.
+    covariance : array (N or 1, s, s)
+        Covariance of c; identity rows for nodes that carry none.
+    cost : array (N,)
+        Weighted squared misfit of the loops: chi-square of the rows among themselves.
+    groups : tuple of tuple of tuple of int
+        The stations of each group, for each distinct pattern of present rows.
+    pattern : int array (N,)
+        Pattern of each problem.
+    """
+
+    station: Array
+    epoch: Array
+    inside: Array
+    sign: Array
+    reference: Array
+    offset: Array
+    covariance: Array
+    cost: Array
+    groups: tuple[tuple[tuple[int, ...], ...], ...]
+    pattern: Array
+
+    @property
+    def free(self) -> Array:
+        """Return whether the ranges of a problem are known only up to their common unknown, (N,)."""
+        return np.asarray((self.sign != 0).any(-1))
+
+
+def ranges(problem: Problem) -> Ranges | None:
+    """Return the least-squares ranges of a flat batch of problems, or None where no row is linear in ranges.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems with one target.
+    """
+    design, station, epoch = _design(problem)
+    if not len(station):
+        return None
+    weight = np.broadcast_to(problem.weight, (*problem.batch_shape, problem.count))
+    used = np.any(design != 0.0, axis=1)
+    present = weight[:, used] > 0.0
+    patterns, pattern = _patterns(present)
+    graphs = [_graph(design[used][rows], len(station)) for rows in patterns]
+    chosen = [_main(graph, len(station)) for graph in graphs]
+    inside, sign, reference = (np.array([c[i] for c in chosen])[pattern] for i in range(3))
+    groups = tuple(tuple(tuple(int(station[n]) for n in nodes) for nodes in _members(g, len(station))) for g in graphs)
+    offset, covariance, cost = _least_squares(problem, design, _pinned(graphs, chosen, len(station))[pattern])
+    s = len(station)
+    known = covariance[:, :s, :s]
+    return Ranges(station, epoch, inside, sign, reference, offset[:, :s], known, cost, groups, pattern)
+
+
+def reduce(problem: Problem) -> Problem:
+    """Return the problem with all rows that are linear in ranges replaced by their sufficient statistic.
+
+    Redundant differences around a ring of s stations become s - 1 differences to one reference with their full
+    covariance; range sums and arrival times likewise; rows that fix the ranges become ranges. The fix is the same.
+
+    Parameters
+    ----------
+    problem : Problem
+        One target, without biases; one epoch, or target and stations that stay.
+
+    Returns
+    -------
+    Problem
+        Reduced rows first, then the rows of other kinds as they were.
+
+    Raises
+    ------
+    InvalidProblem
+        Where the rows fall into groups without a common station, differ in which rows are present, belong to several
+        targets or to a bias, or where their noise is correlated with that of other kinds.
+    """
+    _check(problem)
+    found = ranges(problem.flat())
+    if found is None:
+        return problem
+    if len(found.groups) > 1 or len(found.groups[0]) > 1:
+        raise InvalidProblem(
+            "the range rows do not form one connected set", "reduce", "reduce connected problems one by one"
+        )
+    kept = [i for i, rows in enumerate(problem.rows) if MODELS[rows.kind].ranges is None]
+    parts = [np.arange(start, start + rows.count) for rows, start in zip(problem.rows, problem.starts, strict=True)]
+    others = np.concatenate([parts[i] for i in kept] or [np.zeros(0, dtype=np.int64)])
+    blocks = _others(problem.noise, others)
+    rows, covariance = _reduced_rows(found, problem.batch_shape)
+    count = sum(r.count for r in rows)
+    shift = np.full(problem.count, -1)
+    shift[others] = count + np.arange(len(others))
+    noise = Noise((Block(np.arange(count)[None], covariance), *(Block(shift[b.row], b.covariance) for b in blocks)))
+    return replace(problem, rows=(*rows, *(problem.rows[i] for i in kept)), noise=noise)
+
+
+def _check(problem: Problem) -> None:
+    """Refuse what has no common ranges: they are those of one target, and free of unknown errors."""
+    if len(problem.motions) > 1:
+        raise InvalidProblem("there are several targets", "reduce", "reduce the rows of one target")
+    if problem.biases:
+        name = problem.biases[0].name
+        raise InvalidProblem(
+            f"the bias {name!r} belongs to rows that would go", "reduce", "solve the problem unreduced"
+        )
+
+
+def _others(noise: Noise, others: Array) -> list[Block]:
+    """Return the noise of the rows that stay."""
+    blocks = []
+    for block in noise.blocks:
+        stays = np.isin(block.row, others)
+        whole = stays.all(1)
+        if (stays.any(1) != whole).any():
+            raise InvalidProblem("range rows are correlated with other kinds", "reduce", "solve the problem unreduced")
+        if whole.any():
+            covariance = block.covariance[..., whole, :, :] if block.covariance.shape[-3] > 1 else block.covariance
+            blocks.append(Block(block.row[whole], covariance))
+    return blocks
+
+
+def _reduced_rows(found: Ranges, shape: tuple[int, ...]) -> tuple[list[Rows], Array]:
+    """Return range, tdoa and range_sum rows of the statistic with batch axes `shape`, and their joint covariance."""
+    free, reference = bool(found.free[0]), int(found.reference[0])
+    nodes = [n for n in np.flatnonzero(found.inside[0]) if not (free and n == reference)]
+    kinds = ["range" if not free else "tdoa" if found.sign[0, n] > 0 else "range_sum" for n in nodes]
+    order, rows = [], []
+    for kind in dict.fromkeys(kinds):
+        own = np.array([n for n, k in zip(nodes, kinds, strict=True) if k == kind])
+        order.extend(own.tolist())
+        other = np.full(len(own), found.station[reference]) if free else np.full(len(own), -1)
+        z = found.offset[:, own].reshape(*shape, len(own))
+        one = np.ones(len(own))
+        rows.append(Rows(kind, z, found.station[own], other, found.epoch[own], np.zeros_like(own), one, 0.0 * one))
+    covariance = found.covariance[:, None, order][..., order]
+    return rows, covariance[0] if len(covariance) == 1 else covariance.reshape(*shape, *covariance.shape[1:])
+
+
+def _patterns(present: Array) -> tuple[Array, Array]:
+    """Return the distinct rows of a mask (N, m), and which of them each problem has."""
+    if present.all() or (present == present[:1]).all():
+        return present[:1], np.zeros(len(present), dtype=int)
+    patterns, pattern = np.unique(present, axis=0, return_inverse=True)
+    return patterns, pattern.reshape(-1)
+
+
+def _stays(problem: Problem) -> bool:
+    return all(motion.order == 0 and motion.span == "run" for motion in problem.motions)
+
+
+def _design(problem: Problem) -> tuple[Array, Array, Array]:
+    """Return D (m, q) over nodes, and station and epoch of the station nodes."""
+    moving = problem.stations.position.shape[-3] > 1 or (problem.epochs > 1 and not _stays(problem))
+    entries: list[tuple[int, tuple[int, int, int], float]] = []
+    coefficient: float
+    for rows, start in zip(problem.rows, problem.starts, strict=True):
+        model = MODELS[rows.kind]
+        if model.ranges is None:
+            continue
+        when = rows.epoch if moving else np.zeros_like(rows.epoch)
+        for i in range(rows.count):
+            for index, coefficient in zip((rows.a[i], rows.b[i]), model.ranges, strict=True):
+                if coefficient:
+                    entries.append((start + i, (0, int(index), int(when[i])), coefficient))
+            if model.emission:
+                entries.append((start + i, (1, int(rows.target[i]), int(rows.epoch[i])), 1.0))
+    nodes = sorted({node for _, node, _ in entries})
+    place = {node: i for i, node in enumerate(nodes)}
+    design = np.zeros((problem.count, len(nodes)))
+    for row, node, coefficient in entries:
+        design[row, place[node]] += coefficient
+    stations = [node for node in nodes if node[0] == 0]
+    return design, np.array([n[1] for n in stations], dtype=int), np.array([n[2] for n in stations], dtype=int)
+
+
+def _graph(design: Array, stations: int) -> Graph:
+    """Return the connected groups of nodes and the null vector of each."""
+    count = design.shape[1]
+    linked = (np.abs(design).T @ np.abs(design)) > 0.0
+    group = np.full(count, -1)
+    for node in range(count):
+        if group[node] < 0 and linked[node, node]:
+            reach = np.zeros(count, dtype=bool)
+            reach[node] = True
+            while True:
+                wider = np.asarray(linked[reach].any(0))
+                if (wider == reach).all():
+                    break
+                reach = wider
+            group[reach] = node
+    sign, determined = np.zeros(count, dtype=int), np.zeros(count, dtype=bool)
+    for name in np.unique(group[group >= 0]):
+        nodes = np.flatnonzero(group == name)
+        inner = design[:, nodes]
+        values, vectors = np.linalg.eigh(inner.T @ inner)
+        if values[0] < 1e-9 * max(values[-1], 1.0):
+            sign[nodes] = np.sign(vectors[:, 0] * vectors[np.argmax(np.abs(vectors[:, 0])), 0]).astype(int)
+        else:
+            determined[nodes] = True
+    group[determined] = count  # ranges that are all known belong together, linked or not
+    sizes = {int(name): int((group[:stations] == name).sum()) for name in np.unique(group[group >= 0])}
+    main = max(sizes, key=lambda name: (sizes[name], -name)) if sizes else -1
+    return Graph(group, sign, main)
+
+
+def _members(graph: Graph, stations: int) -> list[Array]:
+    names = [name for name in np.unique(graph.group) if name >= 0]
+    return [np.flatnonzero(graph.group[:stations] == name) for name in names]
+
+
+def _main(graph: Graph, stations: int) -> tuple[Array, Array, int]:
+    inside = (graph.group == graph.main)[:stations] if graph.main >= 0 else np.zeros(stations, dtype=bool)
+    sign = np.where(inside, graph.sign[:stations], 0)
+    reference = int(np.flatnonzero(inside)[0]) if inside.any() else 0
+    return inside, sign * (sign[reference] or 1), reference
+
+
+def _pinned(graphs: list[Graph], chosen: list[tuple[Array, Array, int]], stations: int) -> Array:
+    """Return which nodes hold no unknown of the least-squares problem: absent ones and one of each free group."""
+    pinned = np.array([graph.group < 0 for graph in graphs])
+    for row, graph, (_, _, reference) in zip(pinned, graphs, chosen, strict=True):
+        for name in np.unique(graph.group[graph.sign != 0]):
+            nodes = np.flatnonzero(graph.group == name)
+            row[reference if name == graph.main and graph.group[reference] == name else nodes[0]] = True
+    return pinned
+
+
+def _least_squares(problem: Problem, design: Array, pinned: Array) -> tuple[Array, Array, Array]:
+    """Return the values of all nodes (N, q), their covariance (N or 1, q, q) and the misfit (N,)."""
+    q = design.shape[1]
+    used = np.any(design != 0.0, axis=1)
+    z = np.where(used & (problem.weight > 0.0), problem.observed, 0.0)[..., None]
+    information, vector, total = np.zeros((1, q, q)), np.zeros((1, q, 1)), np.zeros((1, 1, 1))
+    for whitener in whiten(problem.noise, problem.weight):
+        white, seen = whitener.apply(design), whitener.apply(z)
+        transposed = np.swapaxes(white, -1, -2)
+        information = information + transposed @ white
+        vector = vector + transposed @ seen
+        total = total + np.swapaxes(seen, -1, -2) @ seen
+    held = pinned[:1] if (pinned == pinned[:1]).all() else pinned
+    information = np.where(held[:, :, None] | held[:, None, :], 0.0, information) + held[:, :, None] * np.eye(q)
+    covariance, _ = linalg.inverse(information)
+    offset = (covariance @ np.where(held[..., None], 0.0, vector))[..., 0]
+    cost = total[..., 0, 0] - (offset * vector[..., 0]).sum(-1)
+    return np.broadcast_to(offset, (len(pinned), q)), covariance, np.broadcast_to(cost, (len(pinned),))

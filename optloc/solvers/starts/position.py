@@ -1,0 +1,210 @@
+"""Starts without a guess: closed forms give every candidate worth refining."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.linear.evaluate import predict
+from optloc.linear.indices import columns, plans
+from optloc.models import MODELS
+from optloc.problem.layout import emission_name
+from optloc.problem.problem import Problem
+from optloc.solvers.starts.least_squares_ranges import ranges
+from optloc.solvers.starts.squared_range import Pick, candidates, every
+
+_RADIAL = np.array([0.25, 0.45, 0.7, 1.5, 2.5, 4.0, 8.0])
+_FAR = np.array([3.0, 30.0])
+_STEPS = np.array([-12.0, -6.0, -3.0, -1.5, 1.5, 3.0, 6.0, 12.0])
+
+
+def squared_range_starts(problem: Problem, pick: Pick) -> Array:
+    """Return squared-range candidates (N, q, d) of a flat batch with one static target; NaN where there is none.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems; those whose ranges are determined are solved apart from those whose ranges share an unknown.
+    pick : callable
+        Which points to take, see `optloc.solvers.starts.squared_range`.
+    """
+    found = ranges(problem)
+    if found is None or found.free.all() or not found.free.any():
+        return candidates(problem, found, pick)
+    parts = []
+    for mask in (found.free, ~found.free):
+        some = problem.take(np.flatnonzero(mask))
+        parts.append((mask, candidates(some, ranges(some), pick)))
+    position = np.full((len(found.free), max(points.shape[1] for _, points in parts), problem.dimension), np.nan)
+    for mask, points in parts:
+        position[mask, : points.shape[1]] = points
+    return position
+
+
+def mirrored(problem: Problem, position: Array) -> Array:
+    """Return points (N, ..., d) mirrored in the plane (or line) that fits the stations of each problem best."""
+    stations = problem.stations.position
+    flat = stations.reshape(*stations.shape[:-3], -1, stations.shape[-1])
+    centre = flat.mean(-2, keepdims=True)
+    _, vectors = np.linalg.eigh(np.swapaxes(flat - centre, -1, -2) @ (flat - centre))
+    normal = vectors[..., :, 0]
+    shape = (-1, *(1,) * (position.ndim - 2), position.shape[-1])
+    across, middle = normal.reshape(shape), centre.reshape(shape)
+    return np.asarray(position - 2.0 * ((position - middle) * across).sum(-1, keepdims=True) * across)
+
+
+def along_the_valley(problem: Problem, position: Array, covariance: Array) -> Array:
+    """Return points (N, q, d) where other minima hide beside a badly determined fix.
+
+    Far emitters have a long valley towards the stations, flat networks one across their plane: other minima lie along
+    the line to the stations' centre, or along the longest axis of the error ellipsoid.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    position : array (N, d)
+        Fixes, metres.
+    covariance : array (N, d, d)
+        Of the fixes; where it is not finite there are no steps along its axis.
+    """
+    stations = problem.stations.position
+    places = stations.reshape(*stations.shape[:-3], -1, stations.shape[-1])
+    centre = places.mean(-2)
+    size = np.sqrt(((places - centre[..., None, :]) ** 2).sum(-1)).max(-1)
+    away = position - centre
+    length = np.sqrt((away**2).sum(-1, keepdims=True))
+    ahead = away / np.where(length > 0.0, length, 1.0)
+    scaled = centre[..., None, :] + _RADIAL[:, None] * away[:, None]
+    far = centre[..., None, :] + _FAR[:, None] * (np.broadcast_to(size, (len(away),))[:, None] * ahead)[:, None]
+    known = np.asarray(np.isfinite(covariance).all((-1, -2)))
+    values, vectors = np.linalg.eigh(np.where(known[:, None, None], covariance, 0.0))
+    longest = np.sqrt(np.maximum(values[:, -1:], 0.0)) * vectors[..., -1]
+    stepped = position[:, None] + _STEPS[:, None] * np.where(known[:, None], longest, np.nan)[:, None]
+    return np.concatenate([scaled, far, stepped], axis=1)
+
+
+def subarray_starts(problem: Problem) -> Array:
+    """Return the candidates (N, q, d) of all arrays that lack one station; NaN where there is none."""
+    parts = []
+    for touched in rows_of_stations(problem):
+        weight = np.where(touched, 0.0, np.broadcast_to(problem.weight, (*problem.batch_shape, problem.count)))
+        touching = np.flatnonzero((weight != problem.weight).any(1) & (weight > 0.0).any(1))
+        if len(touching):
+            rest = problem.with_rows(weight=weight).take(touching)
+            found = squared_range_starts(rest, every)
+            spread = np.full((problem.batch_shape[0], *found.shape[1:]), np.nan)
+            spread[touching] = found
+            parts.append(spread)
+    if not parts:
+        return np.full((problem.batch_shape[0], 0, problem.dimension), np.nan)
+    return np.concatenate(parts, axis=1)
+
+
+def rows_of_stations(problem: Problem) -> Array:
+    """Return which rows (s, m) each station takes part in."""
+    every, parts = np.arange(problem.stations.count)[:, None], []
+    for rows in problem.rows:
+        taken = MODELS[rows.kind].stations
+        parts.append(((rows.a == every) & (taken > 0)) | ((rows.b == every) & (taken > 1)))
+    return np.concatenate(parts, axis=1)
+
+
+def vectors(problem: Problem, position: Array | None) -> Array:
+    """Return full parameter vectors (N, q, size) with given positions and every other unknown at its prior mean.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems.
+    position : array (N, q, d), optional
+        Of the only target; None: vectors (N, size) without any state.
+    """
+    layout = problem.layout
+    x = np.zeros(((problem.batch_shape[0],) if position is None else position.shape[:-1]) + (layout.size,))
+    means = [(prior.name, prior.mean) for prior in problem.priors]
+    means += [(bias.name, np.ravel(bias.mean)) for bias in problem.biases if bias.sigma is not None]
+    for name, mean in means:
+        slot, shared = layout.find(name)
+        if shared:
+            each = mean if mean.ndim == 1 or position is None else mean[:, None]
+            x[..., slot.start : slot.start + slot.size] = each
+    if position is not None:
+        slot, _ = layout.find("position")
+        x[..., slot.start : slot.start + slot.size] = position
+        x = _emitted(problem, x) if problem.emitting else x
+    return x
+
+
+def completed(problem: Problem, shared: Array) -> Array:
+    """Return full parameter vectors (N, q, size) of shared unknowns (N, q, n): local ones as fit them, or zero."""
+    x = np.zeros((*shared.shape[:-1], problem.layout.size))
+    x[..., : shared.shape[-1]] = shared
+    x[np.isnan(shared).any(-1)] = np.nan
+    return _emitted(problem, x) if problem.emitting else x
+
+
+def _emitted(problem: Problem, x: Array) -> Array:
+    """Return vectors (N, q, size) with the emission times that fit their positions: the mean of what is left over."""
+    size, q = x.shape[:2]
+    part, out = problem.take(np.repeat(np.arange(size), q)), x.reshape(size * q, -1).copy()
+    usable = np.asarray(np.isfinite(out).all(-1))
+    left = part.observed - predict(part, np.where(usable[:, None], out, 0.0))
+    present, emissions = np.broadcast_to(part.weight > 0.0, left.shape), emission_columns(problem)
+    for plan, start in zip(plans(problem), problem.starts, strict=True):
+        own = np.isin(plan.adds.column, emissions) & plan.model.emission
+        column, rows = plan.adds.column[own], start + plan.adds.row[own]
+        heard, total = np.zeros(out.shape), np.zeros(out.shape)
+        np.add.at(heard, (..., column), present[:, rows])  # type: ignore[arg-type]
+        np.add.at(total, (..., column), np.where(present[:, rows], left[:, rows], 0.0))  # type: ignore[arg-type]
+        out += np.where(usable[:, None], total / np.maximum(heard, 1.0), 0.0)
+    return out.reshape(size, q, -1)
+
+
+def emission_columns(problem: Problem) -> Array:
+    """Return the columns of all emission times in the full parameter vector."""
+    names = [emission_name(target, len(problem.motions)) for target in problem.emitting]
+    return np.concatenate([columns(problem.layout, name, np.arange(problem.epochs)).ravel() for name in names])
+
+
+def static(problem: Problem) -> Problem:
+    """Return the problem of the position alone: one static target, nothing else unknown but emission times."""
+    motions = tuple(replace(motion, order=0) for motion in problem.motions)
+    return replace(unbiased(problem), motions=motions)
+
+
+def unbiased(problem: Problem) -> Problem:
+    """Return a flat batch of problems without biases and priors: what is unknown of them is known as its prior mean.
+
+    Offsets, drifts and scales without a prior are taken for zero, rotations always are.
+    """
+    x, rows = vectors(problem, None), []
+    for plan, block in zip(plans(problem), problem.rows, strict=True):
+        gain, added = plan.gains.total(x, block.count), plan.adds.total(x, block.count)
+        z = (block.z - block.correction - added) / (1.0 + gain)
+        known = replace(block, z=z, correction=np.zeros(block.count))
+        rows.append(known if gain.any() or added.any() else block)
+    return replace(problem, rows=tuple(rows), biases=(), priors=())
+
+
+# The size of a problem: numbers of order one are what solvers need.
+
+
+def spread_of(problem: Problem) -> tuple[Array, Array]:
+    """Return the centre of the stations (N or 1, d) and their greatest distance from it (N or 1,), metres."""
+    stations = problem.stations.position.reshape(*problem.stations.position.shape[:-3], -1, problem.dimension)
+    stations = stations if stations.ndim == 3 else stations[None]
+    centre = stations.mean(-2)
+    spread = np.linalg.norm(stations - centre[:, None], axis=-1).max(-1)
+    return centre, np.where(spread > 0.0, spread, 1.0)
+
+
+def distance_of(problem: Problem, position: Array) -> Array:
+    """Return how far positions (N, ..., d) are from the stations, in units of their spread."""
+    centre, spread = spread_of(problem)
+    extra = (1,) * (position.ndim - 2)
+    with np.errstate(over="ignore", invalid="ignore"):
+        away = position - centre.reshape(-1, *extra, centre.shape[-1])
+        return np.asarray(np.sqrt((away**2).sum(-1)) / spread.reshape(-1, *extra))

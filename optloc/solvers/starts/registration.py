@@ -1,0 +1,447 @@
+"""Starts for a whole run: the minima of its block averages, from a closed form, a relaxation, mirrors and a ring."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from math import factorial
+
+import numpy as np
+
+from formulations.registration import Course, candidates
+from optloc.base import linalg
+from optloc.base.status import Status
+from optloc.base.types import Array
+from optloc.compute.sums import equations_at
+from optloc.linear.degrees_of_freedom import degrees_of_freedom
+from optloc.linear.indices import elapsed, plans
+from optloc.linear.normal import covariance, prior_parts
+from optloc.models import MODELS, Model
+from optloc.problem.epochs import by_epoch, untied
+from optloc.problem.problem import Problem
+from optloc.solvers.policy import DOUBT
+from optloc.solvers.refine import refine
+from optloc.solvers.starts.block_averages import averaged
+from optloc.solvers.starts.least_squares_ranges import Ranges, ranges
+from optloc.solvers.starts.position import completed, distance_of, spread_of, vectors
+
+BLOCKS = 30
+# Rivals that cost more than this on block averages are not refined on all epochs, but for the best of them.
+_RIVAL = 1e3
+_KEPT = 4
+_SAME = 1e-4
+# Where the verdict is not clean: minima beyond the stations' plane and along the valley of a weak fix.
+_WEAK = 1e-2
+_AZIMUTHS = 6
+_RADII = (1.5, 5.0)
+# Without a closed form also among the stations.
+_ANYWHERE = (0.3, 0.8, 1.5, 5.0)
+_STEPS = (-8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0)
+# Fixes with an error beyond this share of their distance may have another minimum that block averages do not show.
+_BLURRED = 2e-3
+_BESIDE = (-6.0, -2.0, 2.0, 6.0)
+
+
+def run_starts(problem: Problem, begin: Callable[[Problem], Array | None]) -> Array:
+    """Return starting vectors (N, C, size) of a flat batch of runs, the cheapest first.
+
+    Parameters
+    ----------
+    problem : Problem
+        N runs of one target that lasts them.
+    begin : callable
+        Maps the block averages to starting vectors (N, C, size of theirs), or None where it cannot: the starts are
+        then places around the stations.
+    """
+    groups = alike(problem)
+    if len(groups) == 1:
+        return _starts(problem, begin)
+    parts = [(items, _starts(problem.take(items), begin)) for items in groups]
+    out = np.full((problem.batch_shape[0], max(part.shape[1] for _, part in parts), problem.layout.size), np.nan)
+    for items, part in parts:
+        out[items, : part.shape[1]] = part
+    return out
+
+
+def alike(problem: Problem) -> list[Array]:
+    """Return the problems of a flat batch in groups that have the same rows: these have block averages in common."""
+    present = np.broadcast_to(problem.weight > 0.0, (problem.batch_shape[0], problem.count))
+    if problem.weight.ndim == 1 or (present == present[:1]).all():
+        return [np.arange(len(present))]
+    _, group = np.unique(present, axis=0, return_inverse=True)
+    return [np.flatnonzero(group.reshape(-1) == i) for i in range(int(group.max()) + 1)]
+
+
+def _starts(problem: Problem, begin: Callable[[Problem], Array | None]) -> Array:
+    blocks = averaged(problem, BLOCKS)
+    x = begin(blocks)
+    x = _around(blocks, _ANYWHERE) if x is None else x
+    pool = _minima(blocks, x)
+    pool = _pooled(pool, _minima(blocks, mirrored_courses(blocks, pool[0][:, :1])))
+    doubtful = np.flatnonzero(~_settled(blocks, pool))
+    if len(doubtful):
+        part = blocks.take(doubtful)
+        wider = _minima(part, np.concatenate([_around(part, _RADII), _valley(part, pool[0][doubtful, 0])], axis=1))
+        pool = _pooled(pool, _spread(wider, doubtful, len(x)))
+    return completed(problem, _best(blocks, *pool)[..., : problem.layout.n_shared])
+
+
+def _minima(blocks: Problem, x: Array) -> tuple[Array, Array]:
+    """Return the refined starts (N, C, size), the cheapest first, and their costs (N, C), infinite where lost."""
+    cost, out = np.full(x.shape[:2], np.inf), x.copy()
+    item, slot = np.nonzero(np.isfinite(x).all(-1))
+    if len(item):
+        done = refine(blocks, x[item, slot], item=item)
+        out[item, slot] = done.x
+        cost[item, slot] = np.where(np.isin(done.status, (Status.OK, Status.MAX_ITERATIONS)), done.cost, np.inf)
+    order = np.argsort(cost, axis=1, kind="stable")
+    return np.take_along_axis(out, order[..., None], axis=1), np.take_along_axis(cost, order, axis=1)
+
+
+def _pooled(one: tuple[Array, Array], two: tuple[Array, Array]) -> tuple[Array, Array]:
+    """Return two sets of minima as one, the cheapest first."""
+    x, cost = (np.concatenate(parts, axis=1) for parts in zip(one, two, strict=True))
+    order = np.argsort(cost, axis=1, kind="stable")
+    return np.take_along_axis(x, order[..., None], axis=1), np.take_along_axis(cost, order, axis=1)
+
+
+def _spread(found: tuple[Array, Array], items: Array, count: int) -> tuple[Array, Array]:
+    x = np.full((count, *found[0].shape[1:]), np.nan)
+    cost = np.full((count, found[1].shape[1]), np.inf)
+    x[items], cost[items] = found
+    return x, cost
+
+
+def _settled(blocks: Problem, pool: tuple[Array, Array]) -> Array:
+    """Return where the best minimum (N,) fits the data and has a small error: where else to look is no question."""
+    from scipy.special import gammaincc
+
+    x, cost = pool[0][:, 0], pool[1][:, 0]
+    found, dof = np.isfinite(cost), np.maximum(degrees_of_freedom(blocks), 1)
+    fits = found & (gammaincc(dof / 2.0, np.where(found, cost, np.inf) / 2.0) > DOUBT)
+    deviation = np.sqrt(np.trace(_covariance(blocks, x), axis1=-2, axis2=-1))
+    with np.errstate(invalid="ignore"):
+        return np.asarray(fits & (deviation < _WEAK * distance_of(blocks, blocks.layout.take(x, "position"))))
+
+
+def _covariance(blocks: Problem, x: Array) -> Array:
+    """Return the covariance of the position (N, d, d) in units of the spread of the stations."""
+    usable = np.asarray(np.isfinite(x).all(-1))
+    slot, _ = blocks.layout.find("position")
+    part = slice(slot.start, slot.start + slot.size)
+    with np.errstate(all="ignore"):
+        full, ok = covariance(equations_at(blocks, np.where(usable[:, None], x, 0.0)))
+    return np.asarray(
+        np.where((usable & ok)[:, None, None], full[:, part, part], np.nan) / _length(blocks)[:, None, None] ** 2
+    )
+
+
+def _length(blocks: Problem) -> Array:
+    return np.asarray(spread_of(blocks)[1])
+
+
+def _around(blocks: Problem, radii: tuple[float, ...]) -> Array:
+    """Return vectors (N, C, size) of targets at rest on circles around the stations, and above and below."""
+    d, centre = blocks.dimension, spread_of(blocks)[0]
+    angle = 2.0 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
+    level = np.stack([np.cos(angle), np.sin(angle), *([0.0 * angle] * (d - 2))], axis=-1)
+    poles = np.eye(d)[2:]
+    direction = np.concatenate([level, poles, -poles])
+    away = (np.array(radii)[:, None, None] * direction).reshape(-1, d)
+    x = np.repeat(vectors(blocks, None)[:, None], len(away), axis=1)
+    slot, _ = blocks.layout.find("position")
+    x[..., slot.start : slot.start + slot.size] = centre[:, None] + _length(blocks)[:, None, None] * away
+    return x
+
+
+def _valley(blocks: Problem, x: Array) -> Array:
+    """Return vectors (N, C, size) along the longest axis of the error ellipsoid of the best minimum."""
+    return _along(blocks, x, _covariance(blocks, x) * _length(blocks)[:, None, None] ** 2, _STEPS)
+
+
+def beside(problem: Problem, x: Array, covariance: Array) -> Array:
+    """Return vectors (N, C, size) along the longest axis of badly determined fixes of runs; NaN for the others.
+
+    Block averages blur minima that lie within a few standard deviations of each other.
+
+    Parameters
+    ----------
+    problem : Problem
+        N runs.
+    x : array (N, size)
+        Their fixes.
+    covariance : array (N, d, d)
+        Of the positions, square metres.
+    """
+    far = distance_of(problem, problem.layout.take(x, "position")) * _length(problem)
+    with np.errstate(invalid="ignore"):
+        weak = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1)) > _BLURRED * far
+    return np.where(weak[:, None, None], _along(problem, x, covariance, _BESIDE), np.nan)
+
+
+def _along(problem: Problem, x: Array, covariance: Array, steps: tuple[float, ...]) -> Array:
+    """Return vectors (N, C, size) moved by steps in standard deviations along the longest axis of their covariances."""
+    usable = np.asarray(np.isfinite(covariance).all((-1, -2)) & np.isfinite(x).all(-1))
+    values, axes = np.linalg.eigh(np.where(usable[:, None, None], covariance, 0.0))
+    longest = np.sqrt(np.maximum(values[:, -1:], 0.0)) * axes[..., -1]
+    out = np.repeat(np.where(usable[:, None], x, np.nan)[:, None], len(steps), axis=1)
+    slot, _ = problem.layout.find("position")
+    out[..., slot.start : slot.start + slot.size] += np.array(steps)[:, None] * longest[:, None]
+    return out
+
+
+def _best(blocks: Problem, x: Array, cost: Array) -> Array:
+    """Return the different minima (N, C, size) worth refining on all epochs; NaN in empty slots."""
+    order = np.argsort(cost, axis=1, kind="stable")
+    x, cost = np.take_along_axis(x, order[..., None], axis=1), np.take_along_axis(cost, order, axis=1)
+    for i in np.flatnonzero(np.isfinite(cost).any(0))[1:]:
+        for j in range(i):
+            cost[:, i] = np.where(_at_one_place(blocks, x[:, i], x[:, j]) & np.isfinite(cost[:, j]), np.inf, cost[:, i])
+    order = np.argsort(cost, axis=1, kind="stable")[:, :_KEPT]
+    x, cost = np.take_along_axis(x, order[..., None], axis=1), np.take_along_axis(cost, order, axis=1)
+    with np.errstate(invalid="ignore"):
+        cost[:, 2:] = np.where(cost[:, 2:] - cost[:, :1] > _RIVAL, np.inf, cost[:, 2:])
+    used = np.isfinite(cost)
+    return np.where(used[..., None], x, np.nan)[:, : max(1, int(used.sum(1).max()))]
+
+
+def _at_one_place(blocks: Problem, x: Array, y: Array) -> Array:
+    """Return where the positions of two vectors (N, size) are one, as measured by the spread of the stations."""
+    apart = blocks.layout.take(x, "position") - blocks.layout.take(y, "position")
+    return np.asarray(np.sqrt((apart**2).sum(-1)) < _SAME * _length(blocks))
+
+
+def mirrored_courses(blocks: Problem, x: Array) -> Array:
+    """Return courses (N, C, size) mirrored at every epoch in the plane (or line) that fits the stations best.
+
+    The mirrored places are those of a course again where the planes are parallel; else the polynomial next to them.
+    """
+    order = blocks.motions[0].order
+    powers = np.stack([elapsed(blocks, 0) ** j / factorial(j) for j in range(order + 1)], axis=-1)
+    slots = [blocks.layout.find(name)[0] for name in ("position", "velocity", "acceleration")[: order + 1]]
+    state = np.stack([x[..., slot.start : slot.start + slot.size] for slot in slots], axis=-2)
+    place = blocks.stations.position
+    place = place if place.ndim == 4 else place[None]
+    centre = place.mean(-2)
+    apart = place - centre[..., None, :]
+    _, vectors = np.linalg.eigh(np.swapaxes(apart, -1, -2) @ apart)
+    normal, centre = vectors[..., 0][:, None], centre[:, None]
+    course = powers @ state
+    course = course - 2.0 * ((course - centre) * normal).sum(-1, keepdims=True) * normal
+    state = np.linalg.pinv(powers) @ course
+    out = x.copy()
+    for j, slot in enumerate(slots):
+        out[..., slot.start : slot.start + slot.size] = state[..., j, :]
+    return out
+
+
+# Registration without a guess: a run of range differences, one target that lasts it, and unknown biases.
+
+_WINDOWS = 6
+# The relaxation needs a prior: biases without one are taken for about this share of the largest range difference.
+_LOOSE = 1e-2
+
+
+def registrable(problem: Problem) -> bool:
+    """Return whether a problem is a run of sums or ratios of ranges whose only target lasts it, and is not one fix."""
+    if len(problem.motions) != 1 or problem.epochs < 2:
+        return False
+    motion, moving = problem.motions[0], problem.stations.position.shape[-3] > 1
+    differences = any(_of_ranges(MODELS[rows.kind]) for rows in problem.rows)
+    return differences and motion.known is None and motion.span == "run" and (moving or motion.order > 0)
+
+
+def _of_ranges(model: Model) -> bool:
+    """Return whether a kind is a sum or a ratio of ranges."""
+    return model.ranges is not None or (model.lifted is not None and not model.axes)
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """The range offsets of a run in units of its own size.
+
+    Parameters
+    ----------
+    course : Course
+        N problems.
+    column : int array (q,)
+        Shared unknown of each bias.
+    origin : array (d,)
+        Metres.
+    length, duration : float
+        Units, metres and seconds.
+    """
+
+    course: Course
+    column: Array
+    origin: Array
+    length: float
+    duration: float
+
+
+def closed_form(problem: Problem) -> Array | None:
+    """Return starting vectors (N, C, size) of runs in closed form, or None where no rows make range differences.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N runs of a few dozen epochs; see `optloc.solvers.starts.block_averages.averaged`.
+    """
+    run = run_of(problem)
+    if run is None:
+        return None
+    state, bias = candidates(run.course, problem.motions[0].order)
+    return started(problem, run, state, np.repeat(bias[:, None], state.shape[1], axis=1))
+
+
+def started(problem: Problem, run: Run, state: Array, bias: Array) -> Array:
+    """Return vectors (N, C, size) of states (N, C, order + 1, d) and biases (N, C, q) in the units of a run."""
+    state = state * (run.length / run.duration ** np.arange(state.shape[2])[:, None])
+    state[:, :, 0] += run.origin
+    x = np.repeat(vectors(problem, None)[:, None], state.shape[1], axis=1)
+    for j, name in enumerate(("position", "velocity", "acceleration")[: state.shape[2]]):
+        slot, _ = problem.layout.find(name)
+        x[..., slot.start : slot.start + slot.size] = state[:, :, j]
+    x[..., run.column] = bias * run.length
+    return x
+
+
+def run_of(problem: Problem) -> Run | None:
+    """Return the range offsets of a flat batch of runs; None where no epoch has any."""
+    found = ranges(_alone(problem).flat())
+    if found is None or not (found.free & (found.inside.sum(-1) > 1)).any():
+        return None
+    size, epochs = problem.batch_shape[0], problem.epochs
+    reference = _usual(found.reference[found.free & (found.inside.sum(-1) > 1)])
+    others = np.flatnonzero(np.arange(len(found.station)) != reference)
+    sign = np.array([_usual(found.sign[found.sign[:, i] != 0, i]) for i in others])
+    heard = (found.reference == reference)[:, None] & found.inside[:, others] & (found.sign[:, others] == sign)
+    centre, spread = spread_of(problem)
+    origin, length, since = centre.mean(0), float(spread.max()), elapsed(problem, 0)
+    duration = float(np.abs(since).max()) or 1.0
+    column, effect = _effects(problem, found)
+    mean, sigma = _prior(problem, column)
+    course = Course(
+        since / duration,
+        (_places(problem, found.station[[reference, *others]]) - origin) / length,
+        np.where(heard, found.offset[:, others], 0.0).reshape(size, epochs, -1) / length,
+        sign.astype(float),
+        np.moveaxis(effect[..., others], 0, -1)[None],
+        _whiten(found, others, heard).reshape(size, epochs, len(others), len(others)) * length,
+        mean / length,
+        sigma / length,
+    )
+    return Run(course, column, origin, length, duration)
+
+
+def _alone(problem: Problem) -> Problem:
+    """Return the epochs of a run as a batch (N, k), without its biases."""
+    return by_epoch(untied(replace(problem, biases=(), priors=(), constraints=())))
+
+
+def _usual(values: Array) -> int:
+    """Return the most common of some integers; 0 of none."""
+    found, count = np.unique(values, return_counts=True)
+    return int(found[count.argmax()]) if len(found) else 0
+
+
+def _places(problem: Problem, station: Array) -> Array:
+    """Return the positions (N or 1, k, s, d) of some stations."""
+    place = problem.stations.position[..., station, :]
+    place = place if place.ndim == 4 else place[None]
+    return np.broadcast_to(place, (len(place), problem.epochs, *place.shape[2:]))
+
+
+def _whiten(found: Ranges, others: Array, heard: Array) -> Array:
+    """Return whitening matrices (N k, s - 1, s - 1) of the offsets, without those not heard."""
+    covariance = found.covariance[:, others][:, :, others]
+    return linalg.whitening(np.where(heard[:, :, None] & heard[:, None, :], covariance, 0.0))
+
+
+def _effects(problem: Problem, found: Ranges) -> tuple[Array, Array]:
+    """Return the columns (q,) of the biases that add to the offsets, and what each adds, (q, k, s).
+
+    The offsets are linear in the rows: they are those of rows that hold nothing but one bias.
+    """
+    column, unit = _units(problem)
+    effect = np.zeros((len(column), problem.epochs, len(found.station)))
+    if len(column):
+        zero = tuple(replace(rows, correction=np.zeros(rows.count)) for rows in problem.rows)
+        single = replace(problem.take(np.zeros(1, dtype=int)), rows=zero)
+        same = ranges(_alone(single.with_rows(z=unit)).flat())
+        assert same is not None
+        effect = same.offset.reshape(effect.shape)
+    return column, effect
+
+
+def _units(problem: Problem) -> tuple[Array, Array]:
+    """Return the columns (q,) of offsets and drifts of range rows, and the rows (q, m) that one unit of each makes."""
+    size = problem.layout.n_shared
+    unit = np.zeros((size, problem.count))
+    for plan, start in zip(plans(problem), problem.starts, strict=True):
+        shared = plan.adds.column < size
+        if plan.model.ranges is not None:
+            np.add.at(unit, (plan.adds.column[shared], start + plan.adds.row[shared]), plan.adds.coefficient[shared])
+    column = np.flatnonzero(unit.any(1))
+    return column, unit[column]
+
+
+def _prior(problem: Problem, column: Array) -> tuple[Array, Array]:
+    """Return prior means and standard deviations (q,) of some shared unknowns; infinite where there is none."""
+    mean, information = np.zeros(problem.layout.n_shared), np.zeros(problem.layout.n_shared)
+    for name, value, precision in prior_parts(problem):
+        slot, shared = problem.layout.find(name)
+        if shared:
+            part = slice(slot.start, slot.start + slot.size)
+            mean[part] = value.reshape(-1, slot.size)[0]
+            information[part] = np.diagonal(precision.reshape(-1, slot.size, slot.size)[0])
+    with np.errstate(divide="ignore"):
+        return mean[column], 1.0 / np.sqrt(information[column])
+
+
+def relaxed(problem: Problem) -> Array | None:
+    """Return starting vectors (N, C, size) of runs from the semidefinite relaxation, or None where it does not apply.
+
+    A few blocks over the whole run are used, of those in which every station is heard.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N runs of a few dozen epochs, fixed targets or constant velocity.
+    """
+    from formulations.registration_sdp import registration
+
+    run, order = run_of(problem), problem.motions[0].order
+    if run is None or order > 1 or (run.course.sign < 0).any():
+        return None
+    course = run.course
+    size, d = len(course.offset), problem.dimension
+    station, bias = (np.broadcast_to(a, (size, *a.shape[1:])) for a in (course.station, course.bias))
+    whiten = np.broadcast_to(course.whiten, (size, *course.offset.shape[1:], course.offset.shape[2]))
+    loose = _LOOSE * np.abs(course.offset).max() if course.offset.size else 1.0
+    sigma = np.where(np.isfinite(course.sigma), course.sigma, loose)
+    found: list[list[tuple[Array, Array]]] = []
+    for i in range(size):
+        whole = np.flatnonzero((whiten[i] != 0.0).any(-1).all(-1))
+        k = whole[np.unique(np.linspace(0, len(whole) - 1, _WINDOWS).round().astype(int))] if len(whole) else whole
+        time = course.time[k] if order else None
+        answers = (
+            registration(
+                station[i, k],
+                course.offset[i, k],
+                whiten[i, k],
+                sigma,
+                design=bias[i, k[0]],
+                mean=course.mean,
+                time=time,
+            )
+            if len(k) > 1
+            else ()
+        )
+        found.append([(one.target, one.bias) for one in answers])
+    width = max(1, *(len(pairs) for pairs in found))
+    state, delta = np.full((size, width, order + 1, d), np.nan), np.zeros((size, width, len(run.column)))
+    for i, pairs in enumerate(found):
+        for j, (target, own) in enumerate(pairs):
+            state[i, j], delta[i, j] = target, own
+    return started(problem, run, state, delta)

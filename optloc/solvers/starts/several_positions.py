@@ -1,0 +1,188 @@
+"""Starts for more than one position: target by target, then all epochs at once, or one by one and a polynomial."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from math import factorial
+
+import numpy as np
+
+from optloc.base import linalg
+from optloc.base.types import Array, Motion, Rows, Stations
+from optloc.linear.constraints import is_exact, needs_velocity
+from optloc.linear.indices import elapsed
+from optloc.models import MODELS
+from optloc.problem.epochs import by_epoch, untied
+from optloc.problem.fix import Fix
+from optloc.problem.layout import state_names
+from optloc.problem.noise import Block, Noise, group
+from optloc.problem.problem import Problem
+from optloc.solvers.starts.angles import course_starts, course_states
+from optloc.solvers.starts.position import static, unbiased, vectors
+
+
+def one_position(problem: Problem) -> bool:
+    """Return whether a single position, seen from stations that stay, is all that needs a start."""
+    if len(problem.motions) != 1 or problem.motions[0].known is not None or problem.motions[0].span == "epoch":
+        return False
+    still = problem.stations.position.shape[-3] == 1 and problem.motions[0].order == 0
+    return still or problem.epochs == 1
+
+
+def from_pieces(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
+    """Return one starting vector (N, 1, size) for a flat batch of problems with several targets or epochs.
+
+    A state that its rows do not tell starts from its prior, where it has one.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    fixed : callable
+        Maps a flat batch of problems of one position to its fix.
+    """
+    x = vectors(problem, None)[:, None]
+    n, length = problem.layout.n_shared, problem.layout.n_local
+    known = {prior.name for prior in problem.priors}
+    for i, motion in enumerate(problem.motions):
+        if motion.known is not None:
+            continue
+        names = state_names(i, len(problem.motions), motion.order)
+        state = np.full((len(x), problem.epochs, len(names), problem.dimension), np.nan)
+        if any((rows.target == i).any() for rows in problem.rows):
+            state = _state(_alone(problem, i), fixed)
+        for j, name in enumerate(names):
+            slot, shared = problem.layout.find(name)
+            if shared:
+                own, found = slice(slot.start, slot.start + slot.size), state[:, 0, j]
+                usable = np.isfinite(found) | (name not in known)  # else its prior mean, which stands there
+                x[:, 0, own] = np.where(usable, found, x[:, 0, own])
+                continue
+            for k in range(problem.epochs):
+                start = n + k * length + slot.start
+                x[:, 0, start : start + slot.size] = state[:, k, j]
+    return x
+
+
+def _alone(problem: Problem, target: int) -> Problem:
+    """Return the problem of one target: its rows and nothing else unknown."""
+    problem = unbiased(problem)
+    problem = _with_rows_of(problem, target) if len(problem.motions) > 1 else problem
+    motion = problem.motions[target]
+    # What bounds a moving target holds at its reference time only, but a known height is as good a start elsewhere.
+    constraints = tuple(
+        replace(c, target=0)
+        for c in problem.constraints
+        if c.target == target and (motion.order == 0 or (is_exact(c) and not needs_velocity(c)))
+    )
+    return replace(problem, motions=(motion,), constraints=constraints)
+
+
+def _with_rows_of(problem: Problem, target: int) -> Problem:
+    """Return the problem with the rows of one target, which becomes the first."""
+    own = [np.flatnonzero(rows.target == target) for rows in problem.rows]
+    rows = [
+        Rows(r.kind, r.z[..., i], r.a[i], r.b[i], r.epoch[i], 0 * i, r.weight[..., i], r.correction[..., i])
+        for r, i in zip(problem.rows, own, strict=True)
+        if len(i)
+    ]
+    kept = np.concatenate([start + i for start, i in zip(problem.starts, own, strict=True)])
+    return replace(problem, rows=tuple(rows), noise=_noise_of(problem.noise, kept, problem.count))
+
+
+def _noise_of(noise: Noise, kept: Array, count: int) -> Noise:
+    """Return the noise of some of the rows, which are numbered anew in their order."""
+    number = np.full(count, -1)
+    number[kept] = np.arange(len(kept))
+    blocks = []
+    for block in noise.blocks:
+        present = number[block.row] >= 0
+        for pattern in np.unique(present, axis=0):
+            inside = np.flatnonzero(pattern)
+            if not len(inside):
+                continue
+            groups = np.flatnonzero((present == pattern).all(1))
+            own = block.covariance if block.covariance.shape[-3] == 1 else block.covariance[..., groups, :, :]
+            blocks.append(Block(number[block.row[groups][:, inside]], own[..., inside[:, None], inside]))
+    return group(blocks)
+
+
+def _state(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
+    """Return the state (N, k or 1, order + 1, d) of the only target; NaN where it has no fix."""
+    motion, size = problem.motions[0], problem.batch_shape[0]
+    if one_position(problem):
+        position = fixed(static(problem)).position
+        state = np.zeros((size, 1, motion.order + 1, problem.dimension))
+        state[:, 0, 0] = position
+        return state
+    if _meets(problem):
+        return fixed(_at_once(problem)).position[:, None, None]
+    ahead = course_starts(problem) if motion.span == "run" else None
+    if ahead is not None and np.isfinite(ahead).all():
+        return ahead[:, None]
+    seen = course_states(problem) if motion.span == "run" else None
+    if seen is not None and np.isfinite(seen).all():
+        return seen[:, None]
+    free = by_epoch(untied(replace(problem, motions=(Motion(span="epoch"),))))
+    fix = fixed(free.flat()).reshape((size, problem.epochs))
+    if motion.span == "epoch":
+        state = np.zeros((size, problem.epochs, motion.order + 1, problem.dimension))
+        state[:, :, 0] = _filled(fix.position)
+        return state
+    state = _polynomial(fix, elapsed(problem, 0), motion.order)
+    if seen is not None:
+        state = np.where(np.isfinite(seen).all((-2, -1), keepdims=True), seen, state)
+    return state[:, None]
+
+
+def _meets(problem: Problem) -> bool:
+    """Return whether the rows of one target that stays meet in one epoch: it takes no two of them to make a range."""
+    motion = problem.motions[0]
+    alone = all(MODELS[rows.kind].stations < 2 for rows in problem.rows)
+    return motion.order == 0 and motion.span == "run" and alone and not problem.emitting
+
+
+def _at_once(problem: Problem) -> Problem:
+    """Return the problem of a target that stays as one epoch: every place it was measured from is a station."""
+    s = problem.stations
+    nodes = [np.where(rows.a < 0, -1, rows.epoch * s.count + rows.a) for rows in problem.rows]
+    used = np.unique(np.concatenate(nodes))
+    used = used[used >= 0]
+    epoch, station = np.divmod(used, s.count)
+
+    def there(array: Array | None, rank: int) -> Array | None:
+        if array is None:
+            return None
+        when = epoch if array.shape[-2 - rank] > 1 else 0 * epoch
+        picked = array[..., when, station, :] if rank == 1 else array[..., when, station, :, :]
+        return np.expand_dims(picked, -2 - rank)
+
+    names = tuple(f"{s.names[i]} at {k}" for k, i in zip(epoch.tolist(), station.tolist(), strict=True))
+    position, velocity, axes = there(s.position, 1), there(s.velocity, 1), there(s.axes, 2)
+    assert position is not None
+    rows = tuple(
+        replace(r, a=np.where(node < 0, -1, np.searchsorted(used, node)), epoch=0 * r.epoch)
+        for r, node in zip(problem.rows, nodes, strict=True)
+    )
+    stations = Stations(position, names, velocity, axes)
+    return replace(problem, stations=stations, rows=rows, times=np.zeros(1))
+
+
+def _filled(position: Array) -> Array:
+    """Return positions (N, k, d) in which an epoch without a fix takes that of the last one before, or of the first."""
+    found = np.asarray(np.isfinite(position).all(-1))
+    last = np.maximum.accumulate(np.where(found, np.arange(position.shape[1]), -1), axis=1)
+    taken = np.where(last < 0, found.argmax(1)[:, None], last)
+    return np.take_along_axis(position, taken[..., None], axis=1)
+
+
+def _polynomial(fix: Fix, since: Array, order: int) -> Array:
+    """Return the state (N, order + 1, d) of the polynomial nearest to the fixes (N, k), weighted by their variances."""
+    variance = np.trace(fix.covariance(), axis1=-2, axis2=-1)
+    good = fix.answered & np.isfinite(variance) & np.isfinite(fix.position).all(-1)
+    weight = np.where(good, 1.0 / np.where(good, variance, 1.0), 0.0)
+    design = np.stack([since**j / factorial(j) for j in range(order + 1)], axis=-1)
+    weighted = np.swapaxes(design, -1, -2) * weight[:, None, :]
+    state, ok = linalg.solve(weighted @ design, weighted @ np.where(good[..., None], fix.position, 0.0))
+    return np.where(ok[:, None, None], state, np.nan)

@@ -1,0 +1,1 @@
+"""Which stations, rows and priors contradict the rest."""

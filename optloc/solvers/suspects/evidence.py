@@ -1,0 +1,228 @@
+"""How much the data speak against each group: the drop of the cost without it, to first order, and its error.
+
+A group g in error shifts its rows by an unknown e_g. With residuals y, weights P = R^-1 and Jacobian J of the full
+fit, Q = P - P J (J'P J)^-1 J'P; leaving the group out lowers the cost by u'Q_gg^-1 u with u = (Q y)_g, and its error is
+Q_gg^-1 u with covariance Q_gg^-1 (Baarda 1968, "A testing procedure for use in geodetic networks"; Teunissen 2006,
+"Testing theory", eqs. 3.21 and 4.23). Priors are rows too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from optloc.base import linalg
+from optloc.base.types import Array
+from optloc.compute.sums import equations_at
+from optloc.linear.normal import Linear, Normal, linearise, marginal, step
+from optloc.problem.problem import Problem
+from optloc.solvers.suspects.groups import Group
+
+_OPEN = 1e-6
+# Share of the weight of a row beyond which the other rows check it.
+_NOTHING = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Influence:
+    """The matrix Q of one problem and Q y, in parts: Q = P - S S' - T T' within each epoch.
+
+    Parameters
+    ----------
+    pull : array (q,)
+        Q y, of the rows and then of the means of the priors.
+    precision : sparse array (q, q)
+        P.
+    shared : array (q, n)
+        S, of the shared unknowns.
+    local : array (q, l)
+        T, of the unknowns of each epoch.
+    epoch : int array (q,)
+        Epoch of each row; -1 of priors.
+    prior : dict of int to array
+        Rows of each prior by its number.
+    """
+
+    pull: Array
+    precision: Any
+    shared: Array
+    local: Array
+    epoch: Array
+    prior: dict[int, Array]
+
+    def rows(self, group: Group) -> Array:
+        """Return the rows of a group, (q,)."""
+        return np.array(group.rows) if group.prior < 0 else self.prior[group.prior]
+
+    def block(self, rows: Array) -> Array:
+        """Return Q (..., r, r) of sets of rows (..., r)."""
+        i, j = np.broadcast_arrays(rows[..., :, None], rows[..., None, :])
+        precision = np.asarray(self.precision[i.ravel(), j.ravel()]).reshape(i.shape)
+        shared, local = self.shared[rows], self.local[rows]
+        same = self.epoch[i] == self.epoch[j]
+        lost = shared @ np.swapaxes(shared, -1, -2) + same * (local @ np.swapaxes(local, -1, -2))
+        return np.asarray(precision - lost)
+
+    def root(self, rows: Array) -> Array:
+        """Return A with A A' the pseudo-inverse of Q (..., r, r) of sets of rows; zero columns where nothing tells."""
+        weight = np.asarray(self.precision.diagonal())[rows]
+        scale = 1.0 / np.sqrt(np.where(weight > 0.0, weight, 1.0))
+        values, vectors = np.linalg.eigh(self.block(rows) * scale[..., :, None] * scale[..., None, :])
+        kept = values > _NOTHING
+        lengths = np.where(kept, 1.0 / np.sqrt(np.where(kept, values, 1.0)), 0.0)
+        return np.asarray(scale[..., :, None] * vectors * lengths[..., None, :])
+
+
+@dataclass(frozen=True, slots=True)
+class Error:
+    """The estimated error of a group.
+
+    Parameters
+    ----------
+    value, sigma : array (q,)
+        Of each of its rows, measured less true, and standard deviations; infinite where nothing else tells.
+    statistic : float
+        Its squared length in its own standard deviations: what the cost rises by, to first order, with the group back.
+    dof : int
+        How many of its components the other rows tell.
+    """
+
+    value: Array
+    sigma: Array
+    statistic: float
+    dof: int
+
+    @property
+    def log_tail(self) -> float:
+        """Return the logarithm of the probability of an estimate at least this far from zero if there is no error."""
+        return float(log_tail(np.array(self.statistic), np.array(self.dof)))
+
+
+def influence(problem: Problem, x: Array, dropped: frozenset[int] = frozenset()) -> Influence:
+    """Return the influence of the rows and priors of a problem.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of one problem, whose noise ties no epochs.
+    x : array (size,)
+        Where it is linearised; it need not be a minimum.
+    dropped : frozenset of int
+        Priors to do without.
+    """
+    from scipy.sparse import block_diag
+
+    layout = problem.layout
+    numbers = [j for j, p in enumerate(problem.priors) if j not in dropped and layout.find(p.name)[1]]
+    problem = replace(problem, priors=tuple(p for j, p in enumerate(problem.priors) if j not in dropped))
+    linear, equations = linearise(problem, x[None]), equations_at(problem, x[None])
+    picks, means, inner = _prior_rows(problem)
+    cuts = np.cumsum([problem.count, *(len(mean) for mean in means)])
+    more = int(cuts[-1]) - problem.count
+    present = np.broadcast_to(problem.weight > 0.0, linear.residual.shape)[0]
+    n = layout.n_shared
+    left = [mean - pick @ x[:n] for mean, pick in zip(means, picks, strict=True)]
+    residual = np.concatenate([np.where(present, linear.residual[0], 0.0), *left])
+    precision = block_diag([_precision(linear, problem.count), *inner], format="csr")
+    A = np.concatenate([linear.shared[0], *picks])
+    B = np.concatenate([linear.local[0], np.zeros((more, layout.n_local))])
+    epoch = np.concatenate([problem.epoch, np.full(more, -1)])
+    shared, local = _roots(equations, A, B, epoch)
+    move, _ = step(equations, np.zeros(1))
+    by_run, by_epoch = layout.split(move[0])
+    fitted = A @ by_run + (B * by_epoch[epoch]).sum(-1)
+    return Influence(
+        precision @ (residual - fitted),
+        precision,
+        precision @ shared,
+        precision @ local,
+        epoch,
+        {j: np.arange(a, b) for j, a, b in zip(numbers, cuts, cuts[1:], strict=False)},
+    )
+
+
+def _prior_rows(problem: Problem) -> tuple[list[Array], list[Array], list[Array]]:
+    """Return the picked unknowns (p, n), means (p,) and precisions (p, p) of the priors on shared unknowns."""
+    layout = problem.layout
+    picks, means, inner = [], [], []
+    for prior in problem.priors:
+        slot, shared = layout.find(prior.name)
+        if shared:
+            picks.append(np.eye(layout.n_shared)[slot.start : slot.start + slot.size])
+            means.append(prior.mean.reshape(slot.size))
+            inner.append(linalg.inverse(prior.covariance.reshape(slot.size, slot.size))[0])
+    return picks, means, inner
+
+
+def _precision(linear: Linear, count: int) -> Any:
+    """Return the inverse covariance of the rows as a sparse array; absent rows are zero."""
+    from scipy.sparse import coo_array
+
+    parts = []
+    for whitener in linear.noise:
+        own = np.swapaxes(whitener.matrix, -1, -2) @ whitener.matrix
+        g, r = whitener.row.shape
+        own = np.broadcast_to(own.reshape(-1, r, r), (g, r, r))
+        i, j = np.broadcast_arrays(whitener.row[:, :, None], whitener.row[:, None, :])
+        parts.append((own.ravel(), i.ravel(), j.ravel()))
+    values, i, j = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return coo_array((values, (i, j)), shape=(count, count)).tocsr()
+
+
+def _roots(equations: Normal, A: Array, B: Array, epoch: Array) -> tuple[Array, Array]:
+    """Return factors (q, n) and (q, l) of J (J'P J)^-1 J', the local unknowns eliminated."""
+    information, _, _ = marginal(equations)
+    root, _ = linalg.root(information[0])
+    if not B.shape[1]:
+        return A @ root, B
+    inner, _ = linalg.root(equations.local[0])
+    gain = inner @ np.swapaxes(inner, -1, -2) @ np.swapaxes(equations.cross[0], -1, -2)
+    left = A - (B[:, None, :] @ gain[epoch])[:, 0]
+    return left @ root, (B[:, None, :] @ inner[epoch])[:, 0]
+
+
+def log_tail(statistic: Array, dof: Array) -> Array:
+    """Return the logarithm of the probability of a chi-square at least this large, also where it is tiny.
+
+    Beyond the range of floating-point numbers by the leading term of its asymptotic series (Abramowitz, Stegun 1964,
+    eq. 6.5.32).
+    """
+    from scipy.special import gammaincc, gammaln
+
+    half, k = np.maximum(np.asarray(statistic, dtype=float), 0.0) / 2, np.maximum(dof, 1) / 2
+    tail = gammaincc(k, half)
+    large = -half + (k - 1.0) * np.log(np.maximum(half, 1.0)) - gammaln(k)
+    return np.where(np.asarray(dof) > 0, np.where(tail > 1e-290, np.log(np.maximum(tail, 1e-290)), large), 0.0)
+
+
+def significance(at: Influence, groups: Sequence[Group]) -> Array:
+    """Return the logarithms (G,) of the probabilities of the drop of the cost without each group."""
+    out, rows = np.zeros(len(groups)), [at.rows(group) for group in groups]
+    sizes = np.array([len(own) for own in rows])
+    for size in np.unique(sizes):
+        members = np.flatnonzero(sizes == size)
+        index = np.stack([rows[i] for i in members])
+        root = at.root(index)
+        drop = (np.swapaxes(root, -1, -2) @ at.pull[index][..., None])[..., 0]
+        out[members] = log_tail((drop**2).sum(-1), (root != 0.0).any(-2).sum(-1))
+    return out
+
+
+def errors(at: Influence, groups: Sequence[Group]) -> list[Error]:
+    """Return the estimated error of each of some groups that are all in error."""
+    rows = [at.rows(group) for group in groups]
+    index = np.concatenate(rows)
+    block, root = at.block(index), at.root(index)
+    covariance = root @ root.T
+    known = np.abs(np.diagonal(covariance @ block) - 1.0) < _OPEN
+    value, sigma = covariance @ at.pull[index], np.where(known, np.sqrt(np.diagonal(covariance)), np.inf)
+    out = []
+    for own in np.split(np.arange(len(index)), np.cumsum([len(one) for one in rows])[:-1]):
+        inside = own[known[own]]
+        information, _ = linalg.root(covariance[np.ix_(inside, inside)]) if len(inside) else (np.zeros((0, 0)), None)
+        squared = ((information.T @ value[inside]) ** 2).sum()
+        out.append(Error(value[own], sigma[own], float(squared), len(inside)))
+    return out

@@ -1,0 +1,149 @@
+"""What may be wrong together: all rows of a station, one measurement, a prior."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.types import Array
+from optloc.models import MODELS
+from optloc.problem.fix import GroupKind
+from optloc.problem.problem import Problem
+
+KINDS: tuple[GroupKind, ...] = ("station", "row", "prior")
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """What is left out together.
+
+    Parameters
+    ----------
+    name : str
+        In words.
+    kind : "station", "row" or "prior"
+        What it is.
+    rows : tuple of int
+        Its rows that are present, as numbers of the problem's rows; empty for a prior.
+    prior : int
+        Number of the prior; -1 for rows.
+    """
+
+    name: str
+    kind: GroupKind
+    rows: tuple[int, ...]
+    prior: int = -1
+
+
+@dataclass(frozen=True, slots=True)
+class _Columns:
+    """What each row is: stations are -1 where its kind takes none; the `place`-th of so many `alike`."""
+
+    kind: list[str]
+    a: Array
+    b: Array
+    epoch: Array
+    target: Array
+    place: Array
+    alike: Array
+
+    @classmethod
+    def of(cls, problem: Problem) -> _Columns:
+        taken = [MODELS[rows.kind].stations for rows in problem.rows]
+        none = [np.full(rows.count, -1) for rows in problem.rows]
+        kind = [rows.kind for rows in problem.rows for _ in range(rows.count)]
+        a = np.concatenate([r.a if n > 0 else no for r, n, no in zip(problem.rows, taken, none, strict=True)])
+        b = np.concatenate([r.b if n > 1 else no for r, n, no in zip(problem.rows, taken, none, strict=True)])
+        epoch, target = problem.epoch, np.concatenate([rows.target for rows in problem.rows])
+        sort = np.unique(kind, return_inverse=True)[1]
+        _, label = np.unique(np.column_stack([sort, a, b, epoch, target]), axis=0, return_inverse=True)
+        label, place = label.reshape(-1), np.empty(len(a), dtype=np.int64)
+        order, sizes = np.argsort(label, kind="stable"), np.bincount(label)
+        place[order] = np.arange(len(a)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+        return cls(kind, a, b, epoch, target, place, sizes[label])
+
+
+def groups_of(problem: Problem, present: Array, by: Sequence[GroupKind] = KINDS) -> tuple[Group, ...]:
+    """Return what may be wrong together, each set of rows once: stations first, then rows, then priors.
+
+    The measurements that the same stations made of one target at one epoch are a group too, for instance an azimuth
+    and an elevation. A station that made all the rows is none: nothing would be left.
+
+    Parameters
+    ----------
+    problem : Problem
+        Any batch.
+    present : bool array (m,)
+        Rows that are there.
+    by : sequence of "station", "row", "prior"
+        Which groups are wanted.
+    """
+    columns, found = _Columns.of(problem), dict[tuple[int, ...], Group]()
+    if "station" in by:
+        for i, name in enumerate(problem.stations.names):
+            rows = _numbers(present & ((columns.a == i) | (columns.b == i)))
+            if rows and len(rows) < present.sum():
+                found.setdefault(rows, Group(f"station {name}", "station", rows))
+    if "row" in by:
+        for rows in [*((int(i),) for i in np.flatnonzero(present)), *_sightings(columns, present)]:
+            found.setdefault(rows, Group(_row_name(problem, columns, rows), "row", rows))
+    groups = list(found.values())
+    if "prior" in by:
+        for j, prior in enumerate(problem.priors):
+            if problem.layout.find(prior.name)[1]:
+                groups.append(Group(f"prior of {prior.name}", "prior", (), j))
+    return tuple(groups)
+
+
+def checked_kinds(by: str | Sequence[str]) -> tuple[GroupKind, ...]:
+    """Return kinds of groups; raise InvalidProblem naming an unknown one."""
+    wanted = (by,) if isinstance(by, str) else tuple(by)
+    for name in wanted:
+        if name not in KINDS:
+            raise InvalidProblem(f"nothing is grouped by {name!r}", "by", nearest(str(name), KINDS))
+    if not wanted:
+        raise InvalidProblem("nobody is suspected", "by", f"name some of {', '.join(KINDS)}")
+    return tuple(kind for kind in KINDS if kind in wanted)
+
+
+def without(problem: Problem, left: Array, dropped: frozenset[int]) -> Problem:
+    """Return a flat batch of problems without some rows (N, m) and without some priors."""
+    weight = np.where(left, 0.0, np.broadcast_to(problem.weight, left.shape))
+    priors = tuple(prior for j, prior in enumerate(problem.priors) if j not in dropped)
+    return replace(problem, priors=priors).with_rows(weight=weight)
+
+
+def mask(groups: Sequence[Group], count: int) -> Array:
+    """Return the rows (count,) of some groups."""
+    out = np.zeros(count, dtype=bool)
+    for group in groups:
+        out[list(group.rows)] = True
+    return out
+
+
+def _sightings(columns: _Columns, present: Array) -> list[tuple[int, ...]]:
+    """Return the rows that the same stations measured of one target at one epoch, where there are several."""
+    keys = np.column_stack([columns.a, columns.b, columns.epoch, columns.target])
+    seen = (columns.a >= 0) & present
+    _, label = np.unique(keys, axis=0, return_inverse=True)
+    order = np.flatnonzero(seen)[np.argsort(label.reshape(-1)[seen], kind="stable")]
+    cuts = np.flatnonzero(np.diff(label.reshape(-1)[order])) + 1
+    return [tuple(part.tolist()) for part in np.split(order, cuts) if len(part) > 1]
+
+
+def _row_name(problem: Problem, columns: _Columns, rows: tuple[int, ...]) -> str:
+    first, names = rows[0], problem.stations.names
+    kinds = " and ".join(dict.fromkeys(columns.kind[i] for i in rows))
+    stations = " and ".join(names[int(s)] for s in (columns.a[first], columns.b[first]) if s >= 0)
+    name = f"{kinds} of {stations}" if stations else kinds
+    if len(rows) == 1 and columns.alike[first] > 1:
+        name += f" ({columns.place[first] + 1} of {columns.alike[first]})"
+    name += f", target {columns.target[first]}" if len(problem.motions) > 1 else ""
+    return name + (f", epoch {columns.epoch[first]}" if problem.epochs > 1 else "")
+
+
+def _numbers(inside: Array) -> tuple[int, ...]:
+    return tuple(np.flatnonzero(inside).tolist())

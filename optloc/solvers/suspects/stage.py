@@ -1,0 +1,162 @@
+"""Which measurement is lying: where the data contradict each other, who has to be left out for the rest to agree."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from time import perf_counter
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.status import Status
+from optloc.base.types import Array
+from optloc.problem.epochs import by_epoch, separable
+from optloc.problem.fix import Fix, GroupKind, Stage
+from optloc.problem.problem import Problem
+from optloc.solvers.pool import merged, pooled, stacked, unrefined
+from optloc.solvers.stages import lsr, roots, search, widen
+from optloc.solvers.starts.arrivals import as_arrivals
+from optloc.solvers.starts.position import completed
+from optloc.solvers.suspects.groups import KINDS, Group, checked_kinds, groups_of
+from optloc.solvers.suspects.report import Case, concluded
+from optloc.solvers.suspects.subsets import TEST, Finding, Rest, enumerable, explained, grown, solved
+
+# No other choice of rows helps these.
+_BEYOND = (Status.REJECTED, Status.TOO_FEW_ROWS, Status.INFEASIBLE, Status.UNAVAILABLE, Status.DISCONNECTED)
+
+
+def suspects(problem: Problem, fix: Fix | None = None, *, by: str | Sequence[str] = KINDS) -> Fix:
+    """Return fixes without the measurements that contradict the rest, and who they are.
+
+    A fix passes where its chi-square probability is 1 % or more: then nothing is left out, so that clean data are
+    accused in 1 % of all cases at most. Else every group, every two of them and so on are left out and the rest fixed
+    anew without a guess; all the smallest sets whose rest passes are its explanations. One explanation is taken;
+    several make the fix ambiguous; none makes it contradictory. Where the sets are too many, and in runs, groups are
+    left out one at a time.
+
+    Parameters
+    ----------
+    problem : Problem
+        Batch axes (...). Where its epochs share no unknown they are one more batch axis, as in `solve`.
+    fix : Fix, optional
+        Of the same problem, by `solve`; None: it is solved first. Rows that a robust method rejected are suspected
+        first.
+    by : "station", "row", "prior" or several of them
+        What may be wrong: all rows of a station, one measurement, a prior.
+
+    Returns
+    -------
+    Fix
+        With `explanations`; its weights are zero on rows that were left out.
+
+    Raises
+    ------
+    InvalidProblem
+        For an unknown group, or a fix of other batch axes.
+    """
+    kinds = checked_kinds(by)
+    problem = by_epoch(problem) if separable(problem) else problem
+    shape, flat = problem.batch_shape, problem.flat()
+    if fix is not None and fix.shape != shape:
+        raise InvalidProblem(f"the fix has batch axes {fix.shape}, not {shape}", "fix", "give the fix of this problem")
+    if fix is None:
+        start = lsr(flat, roots(flat, None))
+        fix = search(flat, lsr(flat, widen(flat, start)))
+    return suspected(flat, fix.flat(), kinds).reshape(shape)
+
+
+def suspected(problem: Problem, fix: Fix | None, by: Sequence[GroupKind] = KINDS) -> Fix:
+    """Return the fixes of a flat batch without what contradicts the rest: the stage behind `suspects`."""
+    if fix is None:
+        raise InvalidProblem(
+            "suspects questions a fix", "method", "put it behind a refinement, as in 'gtrs+lsr+suspects'"
+        )
+    began = perf_counter()
+    given = np.broadcast_to(problem.weight, (len(fix), problem.count))
+    rejected = np.asarray((fix.weights < 0.5) & (given > 0.5))
+    if not np.array_equal(fix.weights, given):
+        fix = lsr(problem, _unweighted(problem, fix))
+    fix = replace(fix, reason=_with_limits(fix), explanations=_none(len(fix)))
+    with np.errstate(invalid="ignore"):
+        noticed = ~fix.answered | (fix.p_value < TEST)
+    noticed |= problem.epochs > 1  # a few of many rows go unnoticed by the chi-square of all
+    items = np.flatnonzero(noticed & (fix.dof > 0) & ~np.isin(fix.code, _BEYOND))
+    done = [part for own in _alike(given[items] > 0.0) for part in _of_pattern(problem, fix, items[own], by, rejected)]
+    stage = Stage("suspects", f"{len(items)} of {len(fix)} contradict themselves", perf_counter() - began)
+    if not done:
+        return replace(fix, stages=(*fix.stages, stage))
+    return merged(fix, np.array([item for item, _ in done]), stacked([one for _, one in done]), stage)
+
+
+def _unweighted(problem: Problem, fix: Fix) -> Fix:
+    return unrefined(problem, pooled(fix)[0], fix, "start", perf_counter())
+
+
+def _alike(present: Array) -> list[Array]:
+    """Return the numbers of the problems (N, m) that have the same rows, for each pattern."""
+    if not len(present):
+        return []
+    _, pattern = np.unique(present, axis=0, return_inverse=True)
+    return [np.flatnonzero(pattern.reshape(-1) == i) for i in range(int(pattern.max()) + 1)]
+
+
+def _of_pattern(
+    problem: Problem, fix: Fix, items: Array, by: Sequence[GroupKind], rejected: Array
+) -> Iterator[tuple[int, Fix]]:
+    """Yield the new fixes of problems in which the same rows are present."""
+    part = problem.take(items)
+    arrivals = as_arrivals(part)
+    work = part if arrivals is None else arrivals.problem
+    present = np.broadcast_to(work.weight, (len(items), work.count))[0] > 0.0
+    groups = groups_of(work, present, by)
+    if problem.epochs > 1 or not enumerable(groups, work.count, 1):
+        findings = [_grown(work, groups, fix, i, item, rejected, None) for i, item in enumerate(items)]
+    else:
+        findings = explained(work, groups, fix[items])
+        for i in [i for i, own in enumerate(findings) if not own.rests and _more(groups, work, int(fix.dof[items[i]]))]:
+            more = _grown(work, groups, fix, i, items[i], rejected, findings[i].closest)
+            findings[i] = replace(more, p_value=findings[i].p_value | more.p_value, nearly=findings[i].nearly)
+    for i, found in enumerate(findings):
+        finding = found if found.rests else replace(found, rests=found.nearly)
+        one = None if arrivals is None else replace(arrivals, problem=arrivals.problem.take(np.array([i])))
+        case = Case(part.take(np.array([i])), one, groups, fix[items[i]])
+        yield int(items[i]), concluded(case, finding)
+
+
+def _more(groups: Sequence[Group], problem: Problem, dof: int) -> bool:
+    """Return whether there are sets that the redundancy could name but that were too many to be tried."""
+    return not all(enumerable(groups, problem.count, size) for size in range(1, dof // 2 + 1))
+
+
+def _grown(
+    problem: Problem, groups: Sequence[Group], fix: Fix, i: int, item: int, rejected: Array, start: Rest | None
+) -> Finding:
+    """Return what explains the i-th of some problems, that of the fix numbered `item`, found group by group."""
+    one, own = problem.take(np.array([i])), fix[item]
+    if own.layout != one.layout or not np.isfinite(own.x).all():
+        n = one.layout.n_shared
+        known = np.isfinite(own.x[:n]).all()
+        near = completed(one, own.x[None, None, :n]) if known else None
+        own = (solved(one) if near is None else lsr(one, unrefined(one, near, None, "start", perf_counter())))[0]
+    mine = rejected[item] if one.count == rejected.shape[1] else np.zeros(one.count, dtype=bool)
+    return grown(one, groups, own, mine, start)
+
+
+def _with_limits(fix: Fix) -> Array:
+    """Return the reasons of fixes, and where nobody could be named why."""
+    reason = np.array(fix.reason, dtype=object)
+    for dof, limit in (
+        (0, "an error in a measurement would not be noticed"),
+        (1, "an error would be noticed, not named"),
+    ):
+        for i in np.flatnonzero(fix.answered & (fix.dof == dof)):
+            told = f"redundancy {dof}: {limit}"
+            reason[i] = f"{reason[i]}; {told}" if reason[i] else told
+    return reason
+
+
+def _none(size: int) -> Array:
+    out = np.empty(size, dtype=object)
+    out[:] = [()] * size
+    return out

@@ -1,0 +1,1 @@
+"""From refined candidates to a fix with a status."""

@@ -1,0 +1,274 @@
+"""Several targets at once from rows without labels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.status import Status
+from optloc.base.types import Array, Motion, Rows
+from optloc.linear.evaluate import predict
+from optloc.problem import noise as noises
+from optloc.problem.noise import Block, Noise
+from optloc.problem.problem import Problem
+from optloc.track.associate import Associate
+from optloc.track.dynamics import Dynamics
+from optloc.track.several_models import spread
+from optloc.track.track import State, Track, check_state, filter_of, gathered, predicted, scans, taken
+from optloc.track.updates import Update
+
+# Unlabelled measurements: for each channel of each scan, the values one of which may be a target's.
+
+
+@dataclass(frozen=True, slots=True)
+class Candidates:
+    """What may belong to one of several targets.
+
+    Parameters
+    ----------
+    channels : Problem
+        A run of one target with one row for each channel (kind and stations) and epoch; its measurements do not
+        matter, and it has no batch axes.
+    z : array (..., m, c)
+        Values measured in the channel of each row, SI units or radians; NaN where there are fewer than c.
+    """
+
+    channels: Problem
+    z: Array
+
+    def scans(self, order: int) -> Iterator[tuple[float, Problem, Array]]:
+        """Yield time, channels and candidates (..., m, c) of each scan; the unknown is a state of an order."""
+        for k, (time, scan) in enumerate(scans(self.channels, order)):
+            yield time, scan, self.z[..., self.channels.epoch == k, :]
+
+
+def candidates(problem: Problem) -> Candidates:
+    """Return the rows of a run as candidates: rows of one kind, epoch and pair of stations are one channel.
+
+    Known corrections are taken off.
+
+    Parameters
+    ----------
+    problem : Problem
+        A single run, or a batch (...) with common stations and noise. The targets of its rows, usually -1, do not
+        matter; a channel has the noise of its first row.
+
+    Raises
+    ------
+    InvalidProblem
+        Where stations or noise differ between the runs of a batch.
+    """
+    first, members = channels_of(problem)
+    rows, values = [], []
+    width = max((len(found) for found in members), default=0)
+    z = np.where(problem.weight > 0.0, problem.observed, np.nan)
+    for found in members:
+        column = z[..., found]
+        gap = np.full((*column.shape[:-1], width - len(found)), np.nan)
+        values.append(np.concatenate([column, gap], axis=-1))
+    start = 0
+    for block in problem.rows:
+        kept = first[(first >= start) & (first < start + block.count)] - start
+        rows.append(_row(block, kept))
+        start += block.count
+    made = replace(problem, rows=tuple(rows), motions=problem.motions[:1])
+    return checked(Candidates(_with_noise(problem, made, first), np.stack(values, axis=-2)))
+
+
+def checked(given: Candidates) -> Candidates:
+    """Return candidates that fit their channels, known corrections taken off; raise InvalidProblem for others."""
+    if given.channels.batch_shape != ():
+        advice = "track runs with stations or noise of their own one by one"
+        raise InvalidProblem("the channels have batch axes", "candidates", advice)
+    if given.z.ndim < 2 or given.z.shape[-2] != given.channels.count or not given.z.shape[-1]:
+        what = f"candidates of shape {given.z.shape} for {given.channels.count} channels"
+        raise InvalidProblem(what, "candidates", "give (..., m, c), c at least 1")
+    correction = np.concatenate([block.correction for block in given.channels.rows])
+    if not correction.any():
+        return given
+    rows = tuple(replace(block, correction=np.zeros(block.count)) for block in given.channels.rows)
+    return Candidates(replace(given.channels, rows=rows), given.z - correction[:, None])
+
+
+def channels_of(problem: Problem) -> tuple[Array, list[Array]]:
+    """Return the first row of each channel, ascending, and all rows of each."""
+    keys = [
+        (kind, int(epoch), int(a), int(b))
+        for kind, block in enumerate(problem.rows)
+        for epoch, a, b in zip(block.epoch, block.a, block.b, strict=True)
+    ]
+    found: dict[tuple[int, ...], list[int]] = {}
+    for i, key in enumerate(keys):
+        found.setdefault(key, []).append(i)
+    members = [np.array(rows) for rows in found.values()]
+    return np.array([rows[0] for rows in members]), members
+
+
+def _row(block: Rows, kept: Array) -> Rows:
+    nan, none = np.full(len(kept), np.nan), np.zeros(len(kept), dtype=np.int64)
+    sure = np.ones(len(kept))
+    return Rows(block.kind, nan, block.a[kept], block.b[kept], block.epoch[kept], none, sure, np.zeros(len(kept)))
+
+
+def _with_noise(problem: Problem, made: Problem, first: Array) -> Problem:
+    """Return the channels with the covariance of their first rows, epoch by epoch."""
+    blocks = [
+        noises.Block(members, noises.gathered(problem.noise, first[members])) for members in noises.together(made.epoch)
+    ]
+    return replace(made, noise=noises.Noise(tuple(blocks)))
+
+
+Missing = Literal["drop", "expect"]
+"""What a channel without a row does; see `associated`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Associated:
+    """Tracks of several targets, and the rows that each took.
+
+    Parameters
+    ----------
+    track : Track
+        With leading axes (..., t).
+    picks : tuple of int array (..., t, m)
+        For each scan of the track, which candidate of each of its m channels a target took; -1 for none.
+    """
+
+    track: Track
+    picks: tuple[Array, ...]
+
+
+def associated(
+    given: Candidates,
+    start: State,
+    dynamics: Dynamics,
+    rule: Associate,
+    update: Update | str = "iekf",
+    *,
+    missing: Missing = "drop",
+) -> Associated:
+    """Return the tracks of several targets from rows that do not say whose they are.
+
+    Parameters
+    ----------
+    given : Candidates
+        Measurements; scans not later than the start are left out.
+    start : State
+        All targets (..., t).
+    dynamics : Dynamics
+        Model of motion.
+    rule : callable
+        For instance `nearest`, `joint` or `assigned` of `optloc.track.associate`.
+    update : callable or str
+        A filter, or its name in `UPDATES`.
+    missing : "drop" or "expect"
+        What a channel without a row does: nothing; or, as one paper has it, it repeats the prediction and so makes
+        the filter believe in it. "expect" is for comparison only.
+
+    Raises
+    ------
+    InvalidProblem
+        For an unknown filter, a state that does not fit the dynamics or has no axis of targets.
+    """
+    given, step = checked(given), filter_of(update)
+    d = given.channels.dimension
+    check_state(start, (dynamics.order + 1) * d)
+    if start.mean.ndim < 2:
+        raise InvalidProblem("the state has no axis of targets", "start", "give means (..., t, n)")
+    state, steps, times, picks = spread(start, (*given.z.shape[:-2], 1)), [], [], []
+    for time, scan, z in given.scans(dynamics.order):
+        if time <= start.time:
+            continue
+        ahead = predicted(state, dynamics, time, d)
+        pick = rule(scan, ahead, z) if scan.rows else np.zeros((*ahead.mean.shape[:-1], 0), dtype=np.int64)
+        if scan.rows:
+            found = np.take_along_axis(z[..., None, :, :], np.maximum(pick, 0)[..., None], axis=-1)[..., 0]
+            expected = predict(scan, ahead.mean)
+            weight = (pick >= 0).astype(float) if missing == "drop" else np.ones(pick.shape)
+            scan = scan.with_rows(z=np.where(pick >= 0, found, expected), weight=weight)  # noqa: PLW2901
+        done, code = taken(scan, ahead, step)
+        seen = np.asarray(np.isfinite(z).any((-1, -2)))[..., None]
+        code = np.where((code == Status.TOO_FEW_ROWS) & seen, Status.REJECTED, code).astype(np.int8)
+        state = State(time, done.mean, done.cov)
+        steps.append((done, code))
+        times.append(time)
+        picks.append(pick)
+    return Associated(gathered(np.array(times), steps, d), tuple(picks))
+
+
+# One target of several: its own rows and scans as a run.
+
+_ROW_ARRAYS = ("z", "weight", "correction")
+
+
+def alone(problem: Problem, kept: Array, times: Array | None = None) -> Problem:
+    """Return the run of one target: some rows of a problem, and the epochs that they belong to.
+
+    Parameters
+    ----------
+    problem : Problem
+        Any run; what it says of motions, and constraints of other targets, is left out.
+    kept : bool array (m,)
+        Rows of the target, of all kinds.
+    times : array (k,), optional
+        Seconds of the epochs of `problem`, in the place of its own.
+
+    Returns
+    -------
+    Problem
+        Of one target that is free at each epoch, to be given to `tracked`.
+
+    Raises
+    ------
+    InvalidProblem
+        Where no row is left.
+    """
+    if not kept.any():
+        raise InvalidProblem("the target has no rows", "track", "name a target that was measured")
+    epochs = np.unique(problem.epoch[kept])
+    number = np.full(problem.epochs, -1)
+    number[epochs] = np.arange(len(epochs))
+    parts = np.split(kept, np.cumsum([rows.count for rows in problem.rows])[:-1])
+    rows = tuple(_rows(block, own, number) for block, own in zip(problem.rows, parts, strict=True) if own.any())
+    target = np.unique(np.concatenate([b.target[own] for b, own in zip(problem.rows, parts, strict=True)]))
+    s = problem.stations
+
+    def at(values: Array | None, core: int) -> Array | None:
+        return values if values is None or values.shape[-core] == 1 else np.take(values, epochs, axis=-core)
+
+    position = at(s.position, 3)
+    assert position is not None
+    return replace(
+        problem,
+        stations=replace(s, position=position, velocity=at(s.velocity, 3), axes=at(s.axes, 4)),
+        rows=rows,
+        noise=Noise(tuple(_blocks(problem.noise, kept))),
+        times=(problem.times if times is None else times)[epochs],
+        motions=(Motion(span="epoch"),),
+        constraints=tuple(replace(c, target=0) for c in problem.constraints if c.target in target),
+    )
+
+
+def _rows(block: Rows, own: Array, number: Array) -> Rows:
+    picked = {name: getattr(block, name)[..., own] for name in _ROW_ARRAYS}
+    a, b = block.a[own], block.b[own]
+    return replace(block, **picked, a=a, b=b, epoch=number[block.epoch[own]], target=np.zeros_like(a))
+
+
+def _blocks(noise: Noise, kept: Array) -> list[Block]:
+    """Return the noise of the rows that are kept: of a group that loses some, the covariance of the others."""
+    place, found = np.cumsum(kept) - 1, []
+    for block in noise.blocks:
+        inside = kept[block.row]
+        for pattern in np.unique(inside, axis=0):
+            if not pattern.any():
+                continue
+            groups = (inside == pattern).all(1)
+            one = block.covariance.shape[-3] == 1
+            covariance = block.covariance if one else block.covariance[..., groups, :, :]
+            found.append(Block(place[block.row[groups][:, pattern]], covariance[..., pattern, :][..., pattern]))
+    return found

@@ -1,0 +1,171 @@
+"""The layers of the house: imports go down only; lazy ones and those for type checking count."""
+
+import ast
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+# From the ground up; docs/layout.md draws the same picture. A folder imports folders of lower layers alone.
+LAYERS = (
+    "base",
+    "models",
+    "problem",
+    "linear",
+    "compute datasets",
+    "proof bounds adequacy",
+    "solvers",
+    "track quality",
+    "files papers several plot plugins",
+    "study",
+    "report",
+    "live placement",
+    "cli",
+)
+LAYER = {room: floor for floor, rooms in enumerate(LAYERS) for room in rooms.split()}
+USERS_OF_FORMULATIONS = {"solvers", "placement"}
+BASELINES = {"optloc.study.methods", "optloc.study.originals"}
+# clarabel: the back end of cvxpy, whose data a warm solve updates directly
+GROUND = {"numpy", "scipy", "cvxpy", "casadi", "clarabel", "formulations"} | sys.stdlib_module_names
+
+
+def modules(root: Path) -> dict[str, Path]:
+    """Return the files of both packages by dotted name."""
+    out = {}
+    for path in sorted([*(root / "optloc").rglob("*.py"), *(root / "formulations").rglob("*.py")]):
+        parts = path.relative_to(root).with_suffix("").parts
+        out[".".join(parts[:-1] if parts[-1] == "__init__" else parts)] = path
+    return out
+
+
+def imports(name: str, path: Path, known: Mapping[str, Path]) -> Iterator[tuple[int, str]]:
+    """Yield line and module of everything imported anywhere in a file; a name of a module counts for the module."""
+    package = name.split(".") if path.name == "__init__.py" else name.split(".")[:-1]
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            source = ".".join([*base, *([node.module] if node.module else [])])
+            for alias in node.names:
+                inner = f"{source}.{alias.name}"
+                yield node.lineno, inner if inner in known else source
+
+
+def arrows(root: Path) -> list[tuple[str, int, str]]:
+    """Return importing module, line and imported module of all imports."""
+    known = modules(root)
+    return [(name, *found) for name, path in known.items() for found in imports(name, path, known)]
+
+
+def room(module: str) -> str:
+    """Return the folder of a module of optloc, empty for optloc itself and all others."""
+    parts = module.split(".")
+    return parts[1] if parts[0] == "optloc" and len(parts) > 1 else ""
+
+
+def wrong_arrows(root: Path) -> list[str]:
+    """Return a sentence for each import that does not go down."""
+    out = []
+    for name, line, target in arrows(root):
+        here, there = room(name), room(target)
+        if not here or here == there:
+            continue
+        if target.split(".")[0] == "formulations" and here not in USERS_OF_FORMULATIONS and name not in BASELINES:
+            out.append(f"{name}:{line} imports {target}: only solvers, placement and the baselines do")
+        if target == "optloc" or (there and LAYER[there] >= LAYER[here]):
+            out.append(f"{name}:{line} imports {target}")
+    return out
+
+
+def circle(graph: Mapping[str, set[str]]) -> list[str]:
+    """Return a circle of a graph, empty if there is none."""
+    done: set[str] = set()
+    for start in graph:
+        trail: list[tuple[str, Iterator[str]]] = [(start, iter(graph[start]))] if start not in done else []
+        while trail:
+            following = next(trail[-1][1], None)
+            if following is None:
+                done.add(trail.pop()[0])
+            elif following in (open_ := [name for name, _ in trail]):
+                return [*open_[open_.index(following) :], following]
+            elif following not in done:
+                trail.append((following, iter(graph[following])))
+    return []
+
+
+def graph_of(root: Path) -> dict[str, set[str]]:
+    known = modules(root)
+    out: dict[str, set[str]] = {name: set() for name in known}
+    for name, _, target in arrows(root):
+        if target in known and target != name:
+            out[name].add(target)
+    return out
+
+
+def test_every_folder_has_a_layer():
+    assert {room(name) for name in modules(ROOT)} - {""} <= LAYER.keys()
+
+
+def test_imports_go_down():
+    assert not wrong_arrows(ROOT)
+
+
+def test_no_circle():
+    assert not circle(graph_of(ROOT))
+
+
+def test_no_loose_module():
+    assert [path.name for path in sorted((ROOT / "optloc").glob("*.py"))] == ["__init__.py"]
+
+
+def test_formulations_know_nothing_of_optloc():
+    foreign = [arrow for arrow in arrows(ROOT) if arrow[0].split(".")[0] == "formulations"]
+    assert not [arrow for arrow in foreign if arrow[2].split(".")[0] not in GROUND]
+
+
+def house(folder: Path, files: Mapping[str, str]) -> Path:
+    for name, text in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return folder
+
+
+def test_the_test_sees_lazy_relative_and_sideways_imports(tmp_path):
+    lazy = "def f():\n    from ..solvers import ipopt\n    from optloc.problem import fix\n    from optloc import cli\n"
+    root = house(
+        tmp_path,
+        {
+            "optloc/base/types.py": lazy,
+            "optloc/problem/fix.py": "from ..base.types import Array\nfrom . import loss\n",
+            "optloc/problem/loss.py": "",
+            "optloc/solvers/ipopt.py": "import formulations.nls\nimport optloc\n",
+            "optloc/bounds/crlb.py": "import formulations.nls\nfrom optloc.proof.box import Box\n",
+            "optloc/cli/__init__.py": "",
+            "formulations/nls.py": "",
+        },
+    )
+    assert [text.split(":")[0] + text.split("imports")[1] for text in wrong_arrows(root)] == [
+        "optloc.base.types optloc.solvers.ipopt",
+        "optloc.base.types optloc.problem.fix",
+        "optloc.base.types optloc.cli",
+        "optloc.bounds.crlb formulations.nls: only solvers, placement and the baselines do",
+        "optloc.bounds.crlb optloc.proof.box",
+        "optloc.solvers.ipopt optloc",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("graph", "found"),
+    [
+        ({"a": {"b"}, "b": {"c"}, "c": set()}, []),
+        ({"a": {"b"}, "b": {"c"}, "c": {"b"}}, ["b", "c", "b"]),
+        ({"a": {"b", "c"}, "b": {"d"}, "c": {"d"}, "d": set()}, []),
+    ],
+)
+def test_circles_are_seen(graph, found):
+    assert circle(graph) == found
