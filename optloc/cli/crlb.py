@@ -346,6 +346,6 @@ def _write(found: BoundMap, out: Path, title: str, *, dilution: bool) -> None:
     if ending == ".geojson":
         write_text(out, dumps(map_geojson(found)))
         return
-    from optloc.report import map_pages
+    from optloc.report import map_page
 
-    write_text(out, map_pages(found, title))
+    write_text(out, map_page(found, title))

@@ -294,10 +294,10 @@ def run_fix(
 
 
 def _map(fixed: Fixed) -> str:
-    from optloc.report import map_pages
+    from optloc.report import fix_page
 
     loaded = fixed.loaded
-    return map_pages(loaded.problem, fixed.fixes, loaded.title, [str(label) for label in fixed.columns["epoch"]])
+    return fix_page(loaded.problem, fixed.fixes, loaded.title, [str(label) for label in fixed.columns["epoch"]])
 
 
 def draw(fixed: Fixed, path: Path) -> None:

@@ -85,7 +85,7 @@ def circles_table(found: Mapping[float, Sequence[Curve]], snapshot: Curve) -> Ta
     return Table("simulation-3", "Simulation 3, repaired", header, tuple(lines), note)
 
 
-def readings(found: Sequence[Reading]) -> Table:
+def readings_table(found: Sequence[Reading]) -> Table:
     """Return the position errors of simulation 3 as printed."""
     lines = []
     for each in found:
@@ -113,14 +113,14 @@ def starts_table(found: Sequence[Lost]) -> Table:
     return Table("starts", "A start on the line through both stations", header, tuple(lines), note)
 
 
-def clamps(found: Mapping[str, float]) -> Table:
+def clamps_table(found: Mapping[str, float]) -> Table:
     """Return the shares of lost tracks with and without a clamped variance."""
     lines = tuple((name, percent(share)) for name, share in found.items())
     note = "Simulation 1 from starts of 3 m with a_max 0.3; the acceleration is 0.2 m/s². Single step."
     return Table("clamp", "The variance near the limit of the acceleration", ("variance", "lost"), lines, note)
 
 
-def wholes(found: Sequence[tuple[str, Array]], bound: Array) -> Table:
+def wholes_table(found: Sequence[tuple[str, Array]], bound: Array) -> Table:
     """Return the errors at the end of simulation 1 of fits to the whole track."""
     lines = [("Cramér-Rao bound", *(short(v) for v in bound))]
     lines += [(name, *(short(v) for v in error)) for name, error in found]
@@ -128,7 +128,7 @@ def wholes(found: Sequence[tuple[str, Array]], bound: Array) -> Table:
     return Table("whole-track", "Simulation 1: fits to the whole track", ("", *_PARTS), tuple(lines), note)
 
 
-def rays(found: Sequence[Rays]) -> Table:
+def rays_table(found: Sequence[Rays]) -> Table:
     """Return bias and error of fixes of a target that stays."""
     header = ("stations", "noise", "fix", "bias", "error", "bound")
     names = ("plain", "weighted", "instrumental", "maximum likelihood")
@@ -371,13 +371,13 @@ def _run(sample: Sample, seed: int, tick: Tick) -> Report:
         CLOSING,
         (
             straight_table(straight),
-            wholes(wholes, angles.whole_track_bound()),
+            wholes_table(wholes, angles.whole_track_bound()),
             starts_table(starts),
-            clamps(clamps),
+            clamps_table(clamps),
             winding_table(winding),
             circles_table(circles, snapshot),
-            readings(readings),
-            rays(rays),
+            readings_table(readings),
+            rays_table(rays),
         ),
         (
             Picture("figure-1-3", "Figures 1 to 3: simulation 1", straight_figure(straight)),

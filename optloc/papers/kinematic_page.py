@@ -282,7 +282,7 @@ _BLACK = "#000000"
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 
 
-def scene(drawn: Draw, position: Array, score: Score, bound: Array | None) -> Figure:
+def scene_figure(drawn: Draw, position: Array, score: Score, bound: Array | None) -> Figure:
     """Return one run in the plane, and the mean error of each target against the step.
 
     Parameters
@@ -459,7 +459,7 @@ def _scenes(drawn: dict[str, Draw]) -> tuple[list[Line], tuple[Picture, ...]]:
         bound = bounds(scene, own.truth, order)[:, 1:] if model == motion else None
         name = f"{model} on {motion}"
         lines.append(Line(name, score, None if bound is None else _mean(bound), seconds, name))
-        figure = scene(own, track.position, score, bound)
+        figure = scene_figure(own, track.position, score, bound)
         pictures.append(Picture(f"figure-{number}", f"Figure {number}: {name}", figure))
     return lines, tuple(pictures)
 

@@ -223,7 +223,7 @@ def errors(
     return Table(name, title, header, tuple(lines), note)
 
 
-def starts(cases: Sequence[Case]) -> Table:
+def starts_table(cases: Sequence[Case]) -> Table:
     """Return table 3: the width of the initial error."""
     header = (
         "n", "printed error", "printed bound", "printed divergence",
@@ -566,7 +566,7 @@ def _run(sample: Sample, seed: int, tick: Tick) -> Report:
         CLOSING,
         (
             *_accuracies(fixed["1 m"], moving, joint["1 m"]),
-            starts(starts),
+            starts_table(starts),
             _noises(noisy, sample.last, tick),
             *tabled,
             scenes({"printed": starts[-1], "spatial": spatial}),

@@ -71,7 +71,7 @@ def fixed_table(found: Mapping[str, Run], bound: Array) -> Table:
     return Table("fixed", "Started by the fixes of the first two epochs", header, tuple(lines), note)
 
 
-def starts(found: Mapping[float, tuple[Mapping[str, Run], Array]], near: float = 1e3) -> Table:
+def starts_table(found: Mapping[float, tuple[Mapping[str, Run], Array]], near: float = 1e3) -> Table:
     """Return the filters after starts that are far off, by the standard deviation of each coordinate, metres."""
     lines = []
     for width, (runs, bound) in found.items():
@@ -338,7 +338,7 @@ def _run(sample: Sample, seed: int, tick: Tick) -> Report:
         CLOSING,
         (
             fixed_table(*begun),
-            starts(starts),
+            starts_table(starts),
             pairs(starts),
             heights_table(known),
             moving_table(flying, begun[1]),

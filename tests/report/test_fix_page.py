@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 import optloc
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
-from optloc.report import map_pages
+from optloc.report import fix_page
 from optloc.report.map import fixed_spots, lines_of_position
 
 RUN = CliRunner()
@@ -66,7 +66,7 @@ def test_lines_of_position_meet_their_rows(demo):
 def test_a_plane_frame_is_refused():
     problem = optloc.load(DEMO.parent / "ambiguous.toml")
     with pytest.raises(InvalidProblem, match="positions on Earth"):
-        map_pages(problem, optloc.solve(problem), "")
+        fix_page(problem, optloc.solve(problem), "")
 
 
 def moving(folder, lat=47.0, lon=11.0):
