@@ -23,7 +23,7 @@ from optloc.compute.trace import evaluated, traced
 from optloc.linear.evaluate import given
 from optloc.linear.indices import plans
 from optloc.linear.normal import linearise
-from optloc.study.chunk import compute
+from optloc.study.trial import compute
 from optloc.track import collected, polynomial, tracked
 
 TRIALS = 200

@@ -41,7 +41,7 @@ def _formulations() -> list[dict[str, str]]:
 
 def _solvers() -> list[dict[str, str]]:
     from optloc.solvers.methods import SOLVERS
-    from optloc.study.backends import backends
+    from optloc.study.methods import backends
 
     found = {
         name: {"solver": name, "role": f"back end, {entry.kind}", "version": entry.version, "summary": entry.summary}

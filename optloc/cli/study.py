@@ -62,8 +62,8 @@ def run(
 ) -> None:
     """Run a study, or go on with one that was stopped: finished parts are kept."""
     from optloc.study.execute import executor as chosen
+    from optloc.study.execute import run_plan
     from optloc.study.plan import plan_of
-    from optloc.study.run import run_plan
 
     by = chosen("dask" if scheduler is not None and executor == "processes" else executor, jobs, scheduler)
     plan = plan_of(file, trials=trials, seed=seed)
@@ -85,7 +85,7 @@ def run(
 @study.command(epilog=example("optloc study status runs/my"))
 def status(folder: Folder, as_json: Json = False, quiet: Quiet = False, verbose: Verbose = False) -> None:
     """Say how far a study is, and what its methods answered. Exit code 1 while something is left to do."""
-    from optloc.study.run import progress
+    from optloc.study.folder import progress
 
     found = progress(folder)
     if as_json:

@@ -13,8 +13,7 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.papers.report import Picture
 from optloc.plot.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, YELLOW, figure_class
-from optloc.study.score import distribution, performance_profile, wilson
-from optloc.study.summary import counted, instances, noise_text
+from optloc.study.summary import counted, distribution, instances, noise_text, performance_profile, wilson
 
 if TYPE_CHECKING:
     import pandas as pd

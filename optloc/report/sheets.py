@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optloc.papers.report import Table
-from optloc.study.score import clopper_pearson, wilson
-from optloc.study.summary import PROVEN, noise_text, ranking
+from optloc.study.summary import PROVEN, clopper_pearson, noise_text, ranking, wilson
 
 if TYPE_CHECKING:
     import pandas as pd

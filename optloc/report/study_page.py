@@ -23,8 +23,8 @@ from optloc.report.figures import Mark, marks, svg_text
 from optloc.report.map_pages import map_element
 from optloc.report.sheets import Sheet, latex, sheets
 from optloc.study import summary
-from optloc.study.cases import Case
-from optloc.study.draws import draw
+from optloc.study.baselines import BASELINES
+from optloc.study.draws import Case, draw
 from optloc.study.folder import Manifest, read_frame, read_manifest, unwritable
 from optloc.study.plan import Plan, planned
 from optloc.study.summary import case_label, noise_text
@@ -73,9 +73,8 @@ def plan_again(manifest: Manifest) -> Plan | None:
 def references(plan: Plan | None) -> set[str]:
     """Return the names of the methods that begin at the truth, with which nobody competes."""
     if plan is None:
-        return {"truth"}
-    found = {cell.method.name: cell.method for cell in plan.cells}
-    return {name for name, method in found.items() if method.baseline == "truth" or method.start == "truth"}
+        return {name for name, baseline in BASELINES.items() if baseline.reference}
+    return {cell.method.name for cell in plan.cells if cell.method.reference}
 
 
 def scenario_maps(plan: Plan, frame: pd.DataFrame) -> Iterator[Place]:

@@ -1,39 +1,43 @@
-"""What studies compare with: iterations from a guess, the papers' originals, general tools, weak relaxations."""
+"""What studies compare with: iterations from a guess, the papers' originals, general tools, weak relaxations.
+
+None of them looks for another minimum, and some claim whatever they arrive at: they are judged by what others find.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from time import perf_counter
 
 import numpy as np
 
+from formulations.backend import count
+from optloc.base.status import Status
+from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array
-from optloc.problem.fix import Fix
+from optloc.compute.sums import equations_at
+from optloc.linear.evaluate import differentiate
+from optloc.linear.normal import step
+from optloc.linear.station_noise import weighed
+from optloc.models import MODELS
+from optloc.problem.epochs import tied, window
+from optloc.problem.fix import Fix, Stage
+from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
+from optloc.solvers.pool import Candidates, given, unrefined
+from optloc.solvers.stages import finished
+from optloc.solvers.starts.position import spread_of, vectors
+from optloc.solvers.starts.several_positions import one_position
 from optloc.study.draws import Drawn
-from optloc.study.originals import recursion, single_step
 
+_ASIDE = 0.2
+"""Width of the box of guesses in the middle, in radii of the array: off every station by chance, near to all alike."""
 
-@dataclass(frozen=True, slots=True)
-class Baseline:
-    """Something to compare with.
+_FIRST = 40
+"""Epochs with which the recursion begins, so that its first normal equations are regular: those of the paper."""
 
-    Parameters
-    ----------
-    run : callable
-        ``(drawn, start) -> Fix``; start is an array (n, size).
-    summary : str
-        One line for listings.
-    guess : bool
-        Whether it begins at the start.
-    slow : bool
-        Whether it solves one by one.
-    """
-
-    run: Callable[[Drawn, Array], Fix]
-    summary: str
-    guess: bool = True
-    slow: bool = False
+_EVALUATIONS = 200
+"""Evaluations of SciPy at most, ten times what a start that leads somewhere takes (8 to 20 in shipped studies)."""
 
 
 def start_of(kind: str, width: float, drawn: Drawn) -> Array:
@@ -55,21 +59,223 @@ def start_of(kind: str, width: float, drawn: Drawn) -> Array:
         return drawn.truth
     stations = drawn.problem.stations.position
     centre = stations.mean((-3, -2))
-    spread = np.linalg.norm(stations - centre[..., None, None, :], axis=-1).max((-2, -1))
-    place = centre + (width if kind == "box" else 0.2 * spread[..., None]) * drawn.wild
+    radius = np.linalg.norm(stations - centre[..., None, None, :], axis=-1).max((-2, -1))
+    place = centre + (width if kind == "box" else _ASIDE * radius[..., None]) * drawn.wild
     start = np.zeros_like(drawn.truth)
     slot, _ = drawn.problem.layout.find(drawn.position)
     start[:, slot.start : slot.start + slot.size] = place
     return start
 
 
-def _truth(drawn: Drawn, start: Array) -> Fix:
-    from optloc.solvers import solve
-
-    return solve(drawn.problem, "lsr", start=drawn.truth)
+# What the papers do between a guess and an answer, for any problem.
 
 
-def _iterated(method: str) -> Callable[[Drawn, Array], Fix]:
+def single_step(problem: Problem, start: Array) -> Array:
+    """Return where one Gauss-Newton step from a guess leads.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems.
+    start : array (N, size)
+        Parameter vectors.
+
+    Returns
+    -------
+    array (N, size)
+        NaN where the normal equations are singular.
+    """
+    with np.errstate(all="ignore"):
+        return _full_step(problem, start)
+
+
+def recursion(problem: Problem, start: Array, *, iterations: int = 2) -> Array:
+    """Return where the registration paper's recursion leads: undamped steps over all data so far, epoch by epoch.
+
+    It begins with the first forty epochs and never takes a step back.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N runs without unknowns of single epochs.
+    start : array (N, size)
+        Parameter vectors.
+    iterations : int
+        Steps at each epoch.
+
+    Returns
+    -------
+    array (N, size)
+        NaN where the steps ran away, and for problems that have unknowns of single epochs.
+    """
+    if problem.layout.n_local or tied(problem):
+        return np.full_like(start, np.nan)
+    x = start
+    with np.errstate(all="ignore"):
+        for last in range(min(_FIRST, problem.epochs), problem.epochs + 1):
+            so_far = window(problem, 0, last) if last < problem.epochs else problem
+            for _ in range(iterations):
+                x = _full_step(so_far, x)
+    return x
+
+
+def _full_step(problem: Problem, x: Array) -> Array:
+    # No damping: a step that is too long is what these baselines show.
+    move, ok = step(equations_at(problem, x), np.zeros(len(x)))
+    return x + np.where(ok[:, None], move, np.nan)
+
+
+def claim(problem: Problem, start: Array, x: Array) -> Fix:
+    """Return points (N, size) as fixes that claim to be answers wherever they are finite.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems.
+    start : array (N, size)
+        Where they come from.
+    x : array (N, size)
+        Points.
+    """
+    found = np.asarray(np.isfinite(x).all(-1))
+    with np.errstate(all="ignore"):
+        cost = np.where(found, equations_at(problem, np.where(found[:, None], x, start)).cost, np.inf)
+    code = np.where(found, Status.OK, Status.NUMERICAL).astype(np.int8)
+    pool = Candidates(x[:, None], cost[:, None], code[:, None], np.zeros((len(x), 1), dtype=int))
+    return finished(problem, given(problem, start), pool, Stage("claimed", f"{found.sum()} points", 0.0))
+
+
+# General tools on the same data: SciPy's least squares from a guess, the plain lift of ranges.
+
+
+def least_squares(problem: Problem, start: Array, limit: int = _EVALUATIONS) -> Fix:
+    """Return the fixes of `scipy.optimize.least_squares` with exact derivatives, one by one.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems without constraints.
+    start : array (N, size)
+        Where each begins.
+    limit : int
+        Evaluations at most.
+
+    Returns
+    -------
+    Fix
+        Judged like a refined one; what did not converge has the status of its ending.
+    """
+    from scipy import optimize
+
+    began = perf_counter()
+    plain = weighed(problem)
+    pool = np.array(start, dtype=float)[:, None]
+    cost, code = np.full(pool.shape[:2], np.inf), np.full(pool.shape[:2], int(Status.NUMERICAL), dtype=np.int8)
+    for i in range(len(pool)):
+        residual, jacobian = _whitened(plain.take(np.array([i])))
+        try:
+            end = optimize.least_squares(residual, start[i], jacobian, method="lm", max_nfev=limit)
+        except ValueError:  # values that are not finite, or fewer rows than unknowns
+            continue
+        pool[i, 0], cost[i, 0] = end.x, 2.0 * end.cost  # SciPy's cost has a half in front
+        code[i, 0] = Status.OK if end.status > 0 else Status.MAX_ITERATIONS
+        count("scipy", int(end.nfev))
+    stage = Stage("scipy", f"{len(pool)} problems", perf_counter() - began)
+    found = Candidates(pool, cost, code, np.zeros(cost.shape, dtype=int))
+    return finished(problem, given(problem, start), found, stage)
+
+
+def _whitened(one: Problem) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
+    """Return residual (m,) and Jacobian (m, size) of one problem in units of the standard deviation, for SciPy."""
+    white = whiten(one.noise, one.weight)
+
+    def residual(x: Array) -> Array:
+        values = differentiate(one, x[None])[0][..., None]
+        return np.concatenate([w.apply(values)[0, :, 0] for w in white])
+
+    def jacobian(x: Array) -> Array:
+        H = differentiate(one, x[None])[1]
+        return -np.concatenate([w.apply(H)[0] for w in white])
+
+    return residual, jacobian
+
+
+def lifted_sdp(problem: Problem) -> Fix:
+    """Return the points of the order-1 lift of ranges, unrefined; nowhere for rows that are not sums of ranges.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems of one epoch with one static target.
+
+    References
+    ----------
+    K. Yang, G. Wang and Z.-Q. Luo (2009); see `formulations.lifted`.
+    """
+    from formulations.lifted import lifted_ranges
+
+    began, problem = perf_counter(), weighed(problem)
+    size, d = problem.batch_shape[0], problem.dimension
+    position = np.full((size, 1, d), np.nan)
+    models = [MODELS[rows.kind] for rows in problem.rows]
+    if one_position(problem) and all(model.ranges is not None and not model.emission for model in models):
+        centre, scale = spread_of(problem)
+
+        def relax(i: int) -> None:
+            K, z = _linear(problem.take(np.array([i])), float(scale[i]))
+            stations = np.broadcast_to(problem.stations.position, (size, *problem.stations.position.shape[-3:]))
+            found = lifted_ranges(K, z, (stations[i, 0] - centre[i]) / scale[i])
+            position[i, 0] = found.point * scale[i] + centre[i]
+
+        mapped(relax, range(size), least=WORTH)
+    return unrefined(problem, vectors(problem, position), None, "lifted-sdp", began)
+
+
+def _linear(one: Problem, scale: float) -> tuple[Array, Array]:
+    """Return the whitened rows K (m, s) and values (m,) of one problem whose rows are sums of ranges."""
+    K, start = np.zeros((one.count, one.stations.count)), 0
+    for rows in one.rows:
+        ends = MODELS[rows.kind].ranges
+        assert ends is not None
+        for index, sign in zip((rows.a, rows.b), ends, strict=True):
+            if sign:
+                K[start + np.arange(rows.count), index] += sign
+        start += rows.count
+    # In units of the scale, as the stations are: whitening takes both to numbers of order one.
+    stacked = np.concatenate([K, one.observed[0][:, None] / scale], axis=1)
+    white = np.concatenate([w.apply(stacked[None])[0] for w in whiten(one.noise, one.weight)])
+    return white[:, :-1] * scale, white[:, -1] * scale
+
+
+# The table.
+
+
+@dataclass(frozen=True, slots=True)
+class Baseline:
+    """Something to compare with.
+
+    Parameters
+    ----------
+    run : callable
+        ``(drawn, start) -> Fix``; start is an array (n, size).
+    summary : str
+        One line for listings.
+    guess : bool
+        Whether it begins at the start.
+    slow : bool
+        Whether it solves one by one.
+    reference : bool
+        Whether it knows the truth: it judges the others, and nobody competes with it.
+    """
+
+    run: Callable[[Drawn, Array], Fix]
+    summary: str
+    guess: bool = True
+    slow: bool = False
+    reference: bool = False
+
+
+def _iterate(method: str) -> Callable[[Drawn, Array], Fix]:
     def run(drawn: Drawn, start: Array) -> Fix:
         from optloc.solvers import solve
 
@@ -78,10 +284,13 @@ def _iterated(method: str) -> Callable[[Drawn, Array], Fix]:
     return run
 
 
+def _truth(drawn: Drawn, start: Array) -> Fix:
+    return _iterate("lsr")(drawn, drawn.truth)
+
+
 def _printed(drawn: Drawn, start: Array) -> Fix:
     """Return the undamped iteration with the residual's sign as the paper prints it."""
     from optloc.papers.kinematic import taylor
-    from optloc.solvers.pool import given
 
     size = drawn.problem.dimension
     x = start.copy()
@@ -91,33 +300,15 @@ def _printed(drawn: Drawn, start: Array) -> Fix:
 
 def _original(steps: Callable[[Problem, Array], Array]) -> Callable[[Drawn, Array], Fix]:
     """Return the method of a paper; it claims whatever it arrives at."""
-
-    def run(drawn: Drawn, start: Array) -> Fix:
-        from optloc.study.originals import claimed
-
-        return claimed(drawn.problem, start, steps(drawn.problem, start))
-
-    return run
-
-
-def _general(drawn: Drawn, start: Array) -> Fix:
-    from optloc.study.originals import least_squares
-
-    return least_squares(drawn.problem, start)
-
-
-def _lifted(drawn: Drawn, start: Array) -> Fix:
-    from optloc.study.originals import lifted_sdp
-
-    return lifted_sdp(drawn.problem)
+    return lambda drawn, start: claim(drawn.problem, start, steps(drawn.problem, start))
 
 
 BASELINES: dict[str, Baseline] = {
-    "truth": Baseline(_truth, "damped least squares from the truth: the best that any start can lead to", guess=False),
-    "gauss-newton": Baseline(_iterated("lsr"), "damped least squares from a guess"),
-    "taylor": Baseline(
-        _iterated("taylor"), "plain undamped Taylor iteration from a guess (Foy 1976), as in the papers"
+    "truth": Baseline(
+        _truth, "damped least squares from the truth: the best that any start can lead to", guess=False, reference=True
     ),
+    "gauss-newton": Baseline(_iterate("lsr"), "damped least squares from a guess"),
+    "taylor": Baseline(_iterate("taylor"), "plain undamped Taylor iteration from a guess (Foy 1976), as in the papers"),
     "taylor-printed": Baseline(_printed, "the same with the sign of equations 8 and 15 of the paper `kinematic`"),
     "single-step": Baseline(
         _original(single_step), "one linearised step from a guess, as in the update of the paper `angles`"
@@ -125,8 +316,17 @@ BASELINES: dict[str, Baseline] = {
     "recursion": Baseline(
         _original(recursion), "two undamped steps over all data at every new epoch, as in the paper `registration`"
     ),
-    "ipopt": Baseline(_iterated("nlp"), "IPOPT from a guess, or another nonlinear solver", slow=True),
-    "scipy": Baseline(_general, "scipy.optimize.least_squares with exact derivatives from a guess", slow=True),
-    "lifted-sdp": Baseline(_lifted, "order-1 lifted ranges, unrefined: never tight for tdoa", guess=False, slow=True),
+    "ipopt": Baseline(_iterate("nlp"), "IPOPT from a guess, or another nonlinear solver", slow=True),
+    "scipy": Baseline(
+        lambda drawn, start: least_squares(drawn.problem, start),
+        "scipy.optimize.least_squares with exact derivatives from a guess",
+        slow=True,
+    ),
+    "lifted-sdp": Baseline(
+        lambda drawn, start: lifted_sdp(drawn.problem),
+        "order-1 lifted ranges, unrefined: never tight for tdoa",
+        guess=False,
+        slow=True,
+    ),
 }
 """Baselines by name."""

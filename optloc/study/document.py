@@ -17,12 +17,16 @@ Amount = float | str
 Level = float | str | dict[str, Amount]
 """A factor on the noise of a file, the standard deviation of every row, or that of every kind."""
 
+# Names stand in every row, in titles of figures and in legends: one line at most.
 Name = Annotated[str, Field(min_length=1, max_length=120)]
 
 
+# Limits of counts catch slips before hours are spent: more stations than any array has, more trials than the nine
+# digits of a part's name can number.
 class _Table(BaseModel):
     """A table of the file; keys that it does not know are refused."""
 
+    # Strict: a number in quotes is text with a unit, and a misspelt key must not be a default in silence.
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
@@ -182,6 +186,7 @@ def sigma_of(kind: str, amount: Amount, where: str) -> float:
     quantity = MODELS[kind].quantity
     units = Units(quantity)  # type: ignore[arg-type]  # models hold known quantities only
     number, unit = units.amount(amount, None if isinstance(amount, str) else units.conversion(None, where), where)
+    # A decibel is a share of the ratio, so its deviation depends on the ratio: one, where nothing is nearer.
     value = float(unit.sigma_to_si(number, np.ones(()))) if unit.logarithmic else abs(unit.factor) * number
     if not value > 0.0:
         raise InvalidProblem(f"{amount!r} is not positive", where, "give a positive standard deviation")

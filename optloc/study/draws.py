@@ -1,21 +1,96 @@
-"""The data of trials: a function of study seed, case and trial number alone, drawn in blocks."""
+"""The trials of a case: where stations and target are, what errors rows suffer; a function of seed, case and number.
+
+Trials are drawn in blocks, one seed each, so that no trial depends on which others are drawn, where, or in what order.
+"""
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.frames import Frame
 from optloc.base.types import Array, Bias
 from optloc.files.words import Units, join
 from optloc.linear.simulate import simulate
+from optloc.problem.bias import with_bias
+from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
-from optloc.study.cases import Case, errors_of, flawed, placed, places, velocities
-from optloc.study.document import sigma_of
+from optloc.study.document import Amount, LayoutTable, ScenarioTable, TruthTable, sigma_of
 
-_NUMBERS = 25_000
-"""Measurements in a block of trials, about; a block is what one seed decides."""
+Rng = np.random.Generator
+
+# Both decide which seed a trial has: other values draw other data, and studies that began before cannot go on. A block
+# is large enough that arrays and not Python draw it, and small enough (25 000 numbers, 200 kB) that a chunk which wants
+# a few of its trials does not pay for many; 500 trials are also the least that a chunk of a fast method has.
+_NUMBERS, _MOST = 25_000, 500
+
+
+@dataclass(frozen=True)
+class Case:
+    """What all trials of one data cell share; it holds data only, so that it travels to workers.
+
+    Parameters
+    ----------
+    table : ScenarioTable
+        The scenario with its swept values in place.
+    sweep : str
+        The swept values as JSON.
+    label, unit : str
+        The noise level as it is written, and the unit of `level`.
+    level : float
+        The noise level as a number.
+    template : Problem
+        Stations, rows and noise; the measurements are NaN.
+    seed : int
+        Of the study.
+    trials : int
+        Number of trials.
+    """
+
+    table: ScenarioTable
+    sweep: str
+    label: str
+    unit: str
+    level: float
+    template: Problem
+    seed: int
+    trials: int
+
+    @cached_property
+    def key(self) -> str:
+        """Return what the data of a trial depend on beside its number, as 16 hexadecimal digits."""
+        # The level and the swept values are in it as text, trials not at all: more of them go on where fewer ended.
+        problem, text = self.template, self.table.model_dump_json(exclude={"noise", "sweep", "trials"})
+        made = hashlib.blake2b(f"{self.seed} {self.label} {self.sweep} {text} {problem.frame}".encode(), digest_size=8)
+        made.update(repr(problem.structure).encode())
+        for array in (
+            problem.stations.position,
+            problem.stations.covariance,
+            problem.weight,
+            *(rows.correction for rows in problem.rows),
+            *(block.covariance for block in problem.noise.blocks),
+            *(part for bias in problem.biases for part in (bias.mean, bias.sigma)),
+        ):
+            made.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
+        return made.hexdigest()
+
+    @property
+    def where(self) -> str:
+        """Return the place that complaints name."""
+        return f"scenario {self.table.name!r}"
+
+    @property
+    def state(self) -> tuple[str, ...]:
+        """Return the names of position, velocity and acceleration of the target that is sought."""
+        motions = self.template.motions
+        i = next(i for i, motion in enumerate(motions) if motion.known is None)
+        return state_names(i, len(motions), motions[i].order)
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +129,7 @@ class Drawn:
 
 def block_size(case: Case) -> int:
     """Return how many trials one seed decides."""
-    return int(np.clip(_NUMBERS // case.template.count, 1, 500))
+    return int(np.clip(_NUMBERS // case.template.count, 1, _MOST))
 
 
 def draw(case: Case, first: int, count: int) -> Drawn:
@@ -72,9 +147,8 @@ def draw(case: Case, first: int, count: int) -> Drawn:
     parts = [_block(case, number, size) for number in blocks]
     kept = slice(first - blocks[0] * size, first - blocks[0] * size + count)
     stations, truth, wild, z, bad = (np.concatenate(arrays)[kept] for arrays in zip(*parts, strict=True))
-    problem = case.template
-    if case.table.layout is not None:
-        problem = replace(problem, stations=replace(problem.stations, position=stations[:, None]))
+    # Stations of a file are the same in all trials, and are stored once.
+    problem = case.template if case.table.layout is None else _at(case.template, stations)
     names = [f"{case.seed}:{case.key}:{number}" for number in blocks]
     seed = tuple(names[trial // size - blocks[0]] for trial in range(first, first + count))
     return Drawn(problem.with_rows(z=z), truth, wild, seed, bad, case.state[0])
@@ -82,46 +156,244 @@ def draw(case: Case, first: int, count: int) -> Drawn:
 
 def _block(case: Case, number: int, size: int) -> tuple[Array, Array, Array, Array, Array]:
     """Return stations, truth, wild places, measurements and numbers of stations that are off, of one block."""
+    # A seed sequence mixes words of 32 bits.
     key = [int(case.key[:8], 16), int(case.key[8:], 16)]
+    # Three streams: what is placed, what is measured and where guesses begin do not shift one another.
     geometry, noise, guess = np.random.SeedSequence([case.seed, *key], spawn_key=(number,)).spawn(3)
     rng, problem, table = np.random.default_rng(geometry), case.template, case.table
     stations = np.broadcast_to(problem.stations.position.mean(0), (size, *problem.stations.position.shape[-2:]))
     if table.layout is not None:
-        if table.layout.placement != "frozen":
-            stations = placed(table.layout, case.where, rng, size)
-        problem = replace(problem, stations=replace(problem.stations, position=stations[:, None]))
-    real, flaws = flawed(problem, table, case.where)
-    names = case.state
-    where = join(case.where, "truth")
-    values = {names[0]: places(table.truth, problem.frame, stations, where, rng)}
+        if table.layout.placement != "frozen":  # the template holds the one draw of frozen ones
+            stations = place_stations(table.layout, case.where, rng, size)
+        problem = _at(problem, stations)
+    real, flaws = add_flaws(problem, table, case.where)
+    where, names = join(case.where, "truth"), case.state
+    # The order of these draws decides the data, like the seed.
+    values = {names[0]: place_targets(table.truth, problem.frame, stations, where, rng)}
     if len(names) > 1:
-        values[names[1]] = velocities(table.truth, problem.dimension, where, rng, size)
+        values[names[1]] = _velocities(table.truth, problem.dimension, where, rng, size)
     values |= {bias.name: _biases(case, bias, rng, size) for bias in problem.biases}
-    errors = errors_of(flaws, {flaw.name: _length(real, flaw.name) for flaw in flaws}, rng, size)
+    errors = _draw_errors(flaws, {flaw.name: _length(real, flaw.name) for flaw in flaws}, rng, size)
     values |= errors
     off = [errors[flaw.name] != 0.0 for flaw in flaws if flaw.share is not None]
     bad = np.any(off, axis=0).sum(-1) if off else np.zeros(size, dtype=int)
-    drawn = simulate(real, _vector(real, values, size), noise)
-    z = np.broadcast_to(drawn.z, (size, problem.count))
+    z = np.broadcast_to(simulate(real, _vector(real, values, size), noise).z, (size, problem.count))
     wild = np.random.default_rng(guess).uniform(-0.5, 0.5, (size, problem.dimension))
     return stations, _vector(problem, values, size), wild, z, bad
 
 
+def _at(problem: Problem, stations: Array) -> Problem:
+    """Return a problem with stations (n, s, d), the same in all its epochs."""
+    return replace(problem, stations=replace(problem.stations, position=stations[:, None]))
+
+
 def _vector(problem: Problem, values: dict[str, Array], size: int) -> Array:
-    """Return parameter vectors (size, n) with named values; what has none is zero."""
+    """Return parameter vectors (size, n) with named values; what has none is zero, unknowns of single epochs too."""
     layout = problem.layout
-    shared = np.zeros((size, layout.n_shared))
+    vectors = np.zeros((size, layout.size))
     for slot in layout.shared:
         if slot.name in values:
-            shared[:, slot.start : slot.start + slot.size] = values[slot.name]
-    return np.concatenate([shared, np.zeros((size, layout.size - layout.n_shared))], axis=1)
+            vectors[:, slot.start : slot.start + slot.size] = values[slot.name]
+    return vectors
 
 
 def _length(problem: Problem, name: str) -> int:
     return problem.layout.find(name)[0].size
 
 
-def _biases(case: Case, bias: Bias, rng: np.random.Generator, size: int) -> Array:
+# Stations.
+
+
+def metres(values: list[Amount], where: str, count: int | None = None) -> Array:
+    """Return amounts of length as an array; raise InvalidProblem where their number is not `count`."""
+    if count is not None and len(values) != count:
+        raise InvalidProblem(f"{len(values)} numbers do not fit {count} dimensions", where, "give one for each")
+    return np.array([Units("length").plain(value, "m", where) for value in values])
+
+
+def place_stations(layout: LayoutTable, where: str, rng: Rng, count: int) -> Array:
+    """Return the stations of trials.
+
+    Parameters
+    ----------
+    layout : LayoutTable
+        The rule.
+    where : str
+        Place to name.
+    rng : Generator
+        Used where they are random.
+    count : int
+        Number of draws.
+
+    Returns
+    -------
+    array (count, s, d)
+        Metres; of rules without a draw all are equal.
+    """
+    s, d = layout.stations, layout.dimension
+    if layout.placement == "given":
+        return np.broadcast_to(_given(layout, where), (count, s, d))
+    box = metres(layout.box[:d], join(where, "box"), d)
+    if layout.placement in ("random", "frozen"):
+        return rng.uniform(-0.5, 0.5, (count, s, d)) * box
+    centre = int(layout.placement == "star")
+    angle = 2.0 * np.pi * np.arange(s - centre) / max(s - centre, 1)
+    # In space stations are high and low in turn: a plane ring would leave the sign of the height open.
+    unit = np.stack([np.cos(angle), np.sin(angle), (-1.0) ** np.arange(s - centre)], axis=-1)[:, :d]
+    ring = np.concatenate([np.zeros((centre, d)), 0.5 * unit * box])
+    return np.broadcast_to(ring, (count, s, d))
+
+
+def _given(layout: LayoutTable, where: str) -> Array:
+    place = join(where, "places")
+    if layout.places is None or len(layout.places) != layout.stations:
+        found = 0 if layout.places is None else len(layout.places)
+        raise InvalidProblem(f"{found} places do not fit {layout.stations} stations", place, "give one for each")
+    if any(len(point) != layout.dimension for point in layout.places):
+        raise InvalidProblem(f"a place has not {layout.dimension} coordinates", place, "give metres")
+    return np.array(layout.places, dtype=float)
+
+
+# Targets: a kind of truth is a function ``(table, frame, stations (n, s, d), place to name, rng) -> positions (n, d)``.
+
+
+def _fixed(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rng) -> Array:
+    count, d = len(stations), stations.shape[-1]
+    if truth.at is not None:
+        return np.broadcast_to(metres(truth.at, join(where, "at"), d), (count, d))
+    assert truth.at_deg is not None
+    if len(truth.at_deg) != 3:
+        raise InvalidProblem("a place on Earth has three numbers", join(where, "at_deg"), "add the height in metres")
+    lat, lon, height = truth.at_deg
+    return np.broadcast_to(frame.from_geodetic(np.radians(lat), np.radians(lon), height), (count, d))
+
+
+def _in_box(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rng) -> Array:
+    (count, _, d), centre = stations.shape, stations.mean(1)
+    assert truth.box is not None
+    box = metres(truth.box, join(where, "box"), d)
+    middle = centre if truth.centre is None else metres(truth.centre, join(where, "centre"), d)
+    return np.asarray(middle + _turn(frame, centre, rng.uniform(-0.5, 0.5, (count, d)) * box))
+
+
+def _in_shell(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rng) -> Array:
+    (count, _, d), centre = stations.shape, stations.mean(1)
+    assert truth.distance is not None
+    low, high = metres(truth.distance, join(where, "distance"))
+    away = _directions(truth, d, count, rng) * rng.uniform(low, high, (count, 1))
+    return np.asarray(centre + _turn(frame, centre, away))
+
+
+def _in_hull(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rng) -> Array:
+    # Even over the weights, not over the volume: in every hull there is a place, however flat it is.
+    share = rng.dirichlet(np.ones(stations.shape[1]), len(stations))
+    return np.asarray((share[..., None] * stations).sum(1))
+
+
+def _in_area(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rng) -> Array:
+    count = len(stations)
+    spans = [np.array(span) for span in (truth.lat_deg, truth.lon_deg) if span]
+    lat, lon = (np.radians(rng.uniform(span[0], span[1], count)) for span in spans)
+    height = metres([truth.height], join(where, "height"))[0]
+    return np.asarray(frame.from_geodetic(lat, lon, np.full(count, height)))
+
+
+def _turn(frame: Frame, at: Array, local: Array) -> Array:
+    """Return vectors (count, d) along east, north and up at points as vectors of the frame."""
+    return np.asarray((local[:, None, :] @ frame.enu_axes(at))[:, 0]) if frame.geodetic else local
+
+
+def _directions(truth: TruthTable, d: int, count: int, rng: Rng) -> Array:
+    """Return unit vectors (count, d), even on the circle, the sphere or a band of elevations of it."""
+    azimuth = rng.uniform(0.0, 2.0 * np.pi, count)
+    flat = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
+    if d == 2:
+        return flat
+    low, high = truth.elevation_deg or (-90.0, 90.0)
+    # Archimedes: areas of a sphere are even in the sine of the elevation, not in the elevation.
+    sine = rng.uniform(np.sin(np.radians(low)), np.sin(np.radians(high)), count)
+    return np.concatenate([flat * np.sqrt(1.0 - sine[:, None] ** 2), sine[:, None]], axis=-1)
+
+
+class _Truth(NamedTuple):
+    """A kind of truth: keys of the table that it must have, keys that it may have, and its positions."""
+
+    needed: tuple[str, ...]
+    more: tuple[str, ...]
+    place: Callable[[TruthTable, Frame, Array, str, Rng], Array]
+
+
+_TRUTHS = {
+    "fixed": _Truth((), ("at", "at_deg"), _fixed),
+    "box": _Truth(("box",), ("centre",), _in_box),
+    "shell": _Truth(("distance",), ("elevation_deg",), _in_shell),
+    "hull": _Truth((), (), _in_hull),
+    "area": _Truth(("lat_deg", "lon_deg"), ("height",), _in_area),
+}
+_ANY = {"kind", "speed", "velocity"}
+
+
+def place_targets(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: Rng) -> Array:
+    """Return true positions of targets.
+
+    Parameters
+    ----------
+    truth : TruthTable
+        The rule.
+    frame : Frame
+        Of the positions.
+    stations : array (count, s, d)
+        Stations of each trial, metres.
+    where : str
+        Place to name.
+    rng : Generator
+        Used where the place is random.
+
+    Returns
+    -------
+    array (count, d)
+        Metres in the frame.
+    """
+    return _TRUTHS[truth.kind].place(truth, frame, stations, where, rng)
+
+
+def check_truth(truth: TruthTable, frame: Frame, dimension: int, where: str) -> None:
+    """Refuse a truth whose keys do not belong to its kind, or that the frame cannot hold."""
+    needed, more, _ = _TRUTHS[truth.kind]
+    foreign = sorted(truth.model_fields_set - _ANY - {*needed, *more})
+    if foreign:
+        advice = f"it takes {', '.join(needed + more)}" if needed + more else "it takes none"
+        raise InvalidProblem(f"a truth of kind {truth.kind!r} has no key {foreign[0]!r}", where, advice)
+    for key in needed:
+        if getattr(truth, key) is None:
+            raise InvalidProblem(f"a truth of kind {truth.kind!r} needs the key {key!r}", where, "add it")
+    if truth.kind == "fixed" and (truth.at is None) == (truth.at_deg is None):
+        raise InvalidProblem("a fixed truth has one place", where, "give at, or at_deg on Earth")
+    if (truth.at_deg is not None or truth.kind == "area") and not (frame.geodetic and dimension == 3):
+        advice = "give a frame of the Earth, or metres"
+        raise InvalidProblem("latitude and longitude need a frame on Earth in three dimensions", where, advice)
+    # Amounts that cannot be read complain here, before anything is computed; stations anywhere will do.
+    place_targets(truth, frame, np.ones((1, 2, dimension)), where, np.random.default_rng(0))
+
+
+def _velocities(truth: TruthTable, dimension: int, where: str, rng: Rng, count: int) -> Array:
+    """Return true velocities (count, d), metres per second."""
+    units = Units("speed")
+    if truth.velocity is not None:
+        if len(truth.velocity) != dimension:
+            raise InvalidProblem(f"the velocity has not {dimension} components", join(where, "velocity"), "give each")
+        given = [units.plain(value, "m/s", join(where, "velocity")) for value in truth.velocity]
+        return np.broadcast_to(np.array(given), (count, dimension))
+    way = rng.standard_normal((count, dimension))
+    # The direction is drawn even for speed zero, so that a sweep of speeds keeps all else.
+    speed = 0.0 if truth.speed is None else units.plain(truth.speed, "m/s", join(where, "speed"))
+    return np.asarray(speed * way / np.linalg.norm(way, axis=-1, keepdims=True))
+
+
+# Errors: biases of the file, which methods may know of; flaws, which no method is told.
+
+
+def _biases(case: Case, bias: Bias, rng: Rng, size: int) -> Array:
     """Return true values (size, q) of a bias of the file."""
     q = _length(case.template, bias.name)
     mean = np.broadcast_to(np.ravel(bias.mean), (q,))
@@ -136,7 +408,8 @@ def _biases(case: Case, bias: Bias, rng: np.random.Generator, size: int) -> Arra
     return np.asarray(mean + _amount(case, bias, given, where) * rng.standard_normal((size, q)))
 
 
-def _amount(case: Case, bias: Bias, value: float | str, where: str) -> float:
+def _amount(case: Case, bias: Bias, value: Amount, where: str) -> float:
+    """Return a value of a bias in SI units: an offset has the unit of its rows, a boresight is an angle."""
     if isinstance(value, int | float):
         return float(value)
     if bias.form == "offset":
@@ -147,3 +420,79 @@ def _amount(case: Case, bias: Bias, value: float | str, where: str) -> float:
         return sign * sigma_of(kind, text.lstrip("-"), where)
     quantity = "angle" if bias.form == "rotation" else "plain"
     return Units(quantity).plain(value, None, where)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, slots=True)
+class Flaw:
+    """Errors of the stations in rows of one kind: constant ones of every station, or gross ones of a few.
+
+    Parameters
+    ----------
+    name : str
+        Name of the unknown that holds them.
+    size : float
+        Their standard deviation; of gross ones how large they are.
+    share : float, optional
+        Probability that a station has a gross error; None: every station has a small one.
+    late : bool
+        Whether gross errors are positive.
+    """
+
+    name: str
+    size: float
+    share: float | None = None
+    late: bool = False
+
+
+def add_flaws(problem: Problem, table: ScenarioTable, where: str) -> tuple[Problem, tuple[Flaw, ...]]:
+    """Return the problem as it really is, with the errors that no method is told, and what they are.
+
+    Parameters
+    ----------
+    problem : Problem
+        As methods get it.
+    table : ScenarioTable
+        The scenario.
+    where : str
+        Its place, for complaints.
+
+    Raises
+    ------
+    InvalidProblem
+        For a kind that the problem lacks, or a size that is not positive.
+    """
+    place, found = join(where, "error"), []
+    offset, outliers = table.error.offset, table.error.outliers
+    if offset is not None:
+        sizes = _sizes(problem, offset, join(place, "offset"))
+        found += [(kind, Flaw(f"unmodelled {kind}", size)) for kind, size in sizes.items()]
+    if outliers is not None:
+        sizes = _sizes(problem, outliers.size, join(place, "outliers"))
+        found += [(kind, Flaw(f"gross {kind}", size, outliers.share, outliers.late)) for kind, size in sizes.items()]
+    for kind, flaw in found:
+        problem = with_bias(problem, flaw.name, kind=kind)
+    return problem, tuple(flaw for _, flaw in found)
+
+
+def _sizes(problem: Problem, given: Amount | dict[str, Amount], where: str) -> dict[str, float]:
+    """Return sizes in SI units by kind."""
+    kinds = [rows.kind for rows in problem.rows]
+    named = given if isinstance(given, dict) else dict.fromkeys(kinds, given)
+    for kind in named:
+        if kind not in kinds:
+            raise InvalidProblem(f"no rows are of kind {kind!r}", where, nearest(kind, kinds))
+    return {kind: sigma_of(kind, amount, where) for kind, amount in named.items()}
+
+
+def _draw_errors(flaws: tuple[Flaw, ...], lengths: dict[str, int], rng: Rng, size: int) -> dict[str, Array]:
+    """Return the errors (size, stations) of each flaw, which has so many stations."""
+    small = [flaw for flaw in flaws if flaw.share is None]
+    drawn: dict[str, Array] = {f.name: f.size * rng.standard_normal((size, lengths[f.name])) for f in small}
+    # One chance and one sign for each station: one that is off is off in all kinds, and in the same direction.
+    most = max(lengths.values(), default=0)
+    chance, sign = rng.random((size, most)), np.where(rng.random((size, most)) < 0.5, -1.0, 1.0)
+    for flaw in flaws:
+        if flaw.share is not None:
+            off = (chance < flaw.share) * (1.0 if flaw.late else sign) * flaw.size
+            drawn[flaw.name] = off[:, : lengths[flaw.name]]
+    return drawn

@@ -1,22 +1,26 @@
-"""Where chunks are computed: in this process, in local ones, on a Dask cluster or on Ray, through one joblib seam."""
+"""Run a study into its folder: here, in local processes, on a Dask cluster or on Ray, through one joblib seam."""
 
 from __future__ import annotations
 
+import logging
 import os
 from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
 from itertools import islice
+from pathlib import Path
 from typing import Any, Self
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.study.chunk import Part, compute, failure, part_of, spread
-from optloc.study.draws import draw
-from optloc.study.plan import Chunk, workers
-from optloc.study.score import exact_of, truth_values
+from optloc.study.folder import Progress, begin, finished, locked, progress, store
+from optloc.study.plan import Chunk, Plan, workers
+from optloc.study.trial import Part, compute, dead_part, join_parts
 
 CONNECT = 10.0
-"""Seconds to wait for a scheduler."""
+"""Seconds to wait for a scheduler: one on the same network answers in less than one; people wait for no more."""
+
+Tell = Callable[[int, dict[str, int]], None]
+"""Called with the number of new rows and their statuses after each part."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,12 +46,47 @@ def executor(name: str, jobs: int | None = None, address: str | None = None) -> 
     """Return an executor; raise InvalidProblem for an unknown one, or an address that it does not take."""
     if name not in EXECUTORS:
         raise InvalidProblem(f"unknown executor {name!r}", "--executor", nearest(name, list(EXECUTORS)))
-    if address is not None and name not in ("dask", "ray"):
+    if address is not None and not EXECUTORS[name].scheduler:
         raise InvalidProblem(f"{name} has no scheduler", "--scheduler", "add --executor dask")
     return Executor(name, jobs, address)
 
 
-def computed(chunks: Iterable[Chunk], by: Executor) -> Generator[Part]:
+def run_plan(plan: Plan, folder: Path, by: Executor, tell: Tell | None = None) -> Progress:
+    """Compute what is missing of a study, and return how far it is.
+
+    Parameters
+    ----------
+    plan : Plan
+        The study.
+    folder : Path
+        Its output folder: new, or begun by the same study and the same version.
+    by : Executor
+        Who computes.
+    tell : callable, optional
+        Hears of every part, and first of those that were there.
+
+    Raises
+    ------
+    InvalidProblem
+        Where the folder belongs to another study or cannot be written; finished parts are kept.
+    """
+    manifest = begin(plan, folder)
+    # From here to the end nobody else writes: what is counted as finished stays so.
+    with locked(folder):
+        done = finished(folder, manifest)
+        if tell is not None and done:
+            had = progress(folder)
+            tell(had.rows, had.counts)
+        left = [chunk for chunk in plan.chunks if chunk.key not in done]
+        with closing(compute_all(left, by)) as parts:
+            for part in parts:
+                store(folder, part)
+                if tell is not None:
+                    tell(sum(part.counts.values()), part.counts)
+    return progress(folder)
+
+
+def compute_all(chunks: Iterable[Chunk], by: Executor) -> Generator[Part]:
     """Yield the parts of chunks as they are finished.
 
     A chunk whose worker died is computed again in a process of its own. If that dies too, halves are tried down to
@@ -69,44 +108,46 @@ def computed(chunks: Iterable[Chunk], by: Executor) -> Generator[Part]:
     if not left:
         return
     with ExitStack() as stack:
-        options, deaths = stack.enter_context(EXECUTORS[by.name].begin(by))
+        begun = stack.enter_context(EXECUTORS[by.name].begin(by))
         alone = stack.enter_context(_Alone())
         while left:
-            begun: dict[str, Chunk] = {}
+            out: dict[str, Chunk] = {}
             try:
-                for part in _parallel(_noted(list(left.values()), begun), options):
-                    begun.pop(part.key, None)
+                for part in _parallel(_note(list(left.values()), out), begun):
+                    out.pop(part.key, None)
                     del left[part.key]
                     yield part
-            except deaths:
-                for key in begun:
+            except begun.deaths:
+                # Which of those handed out was to blame is not told: each is tried apart, where nothing else can die.
+                for key in out:
                     yield alone.part(left.pop(key))
 
 
 def task(chunk: Chunk) -> Part:
     """Compute a chunk in a worker, which is one of several on its machine: on one thread."""
+    # Workers times threads would be more than the processors, and slower than either.
     os.environ.setdefault("OPTLOC_THREADS", "1")
     return compute(chunk)
 
 
-def _noted(chunks: list[Chunk], begun: dict[str, Chunk]) -> Iterator[Chunk]:
+def _note(chunks: list[Chunk], out: dict[str, Chunk]) -> Iterator[Chunk]:
     """Yield chunks, and note which have been handed out."""
     for chunk in chunks:
-        begun[chunk.key] = chunk
+        out[chunk.key] = chunk
         yield chunk
 
 
-def _parallel(chunks: Iterator[Chunk], options: dict[str, Any]) -> Iterator[Part]:
+def _parallel(chunks: Iterator[Chunk], begun: Begun) -> Iterator[Part]:
     from joblib import Parallel, delayed, parallel_config
 
-    work = compute if options["backend"] == "sequential" else task
-    with parallel_config(**options):
-        if options["backend"] != "ray":
+    work = task if begun.apart else compute
+    with parallel_config(**begun.options):
+        if begun.streams:
+            # One chunk a task, two for each worker in hand: none waits for its next, and few are lost when a run stops.
             run = Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs")
             yield from run(delayed(work)(chunk) for chunk in chunks)
             return
-        # Ray's backend hands over lists only: a few chunks a processor at a time.
-        while some := list(islice(chunks, 2 * options["n_jobs"])):
+        while some := list(islice(chunks, 2 * begun.options["n_jobs"])):
             yield from Parallel(batch_size=1)(delayed(work)(chunk) for chunk in some)
 
 
@@ -132,47 +173,49 @@ class _Alone:
         from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
 
         if self._pool is None:
+            # Local even where a cluster computes: another worker of it is not put at risk.
             self._pool = ProcessPoolExecutor(max_workers=1)
         try:
             found: Part = self._pool.submit(task, chunk).result()
         except BrokenProcessPool:
             self._close()
             if chunk.count == 1:
-                return dead(chunk, "the process that solved it died, and died again")
+                return dead_part(chunk, "the process that solved it died, and died again")
+            # Every round costs one process; of 10 000 trials the one to blame is found in 14.
             half = chunk.count // 2
             halves = (replace(chunk, count=half), replace(chunk, first=chunk.first + half, count=chunk.count - half))
-            return merged(chunk, [self.part(some) for some in halves])
+            return join_parts(chunk, [self.part(some) for some in halves])
         return found
 
 
-def dead(chunk: Chunk, reason: str) -> Part:
-    """Return the part of a chunk whose trials have the status `died`."""
-    drawn = draw(chunk.cell.case, chunk.first, chunk.count)
-    values = {name: spread(value, chunk.count) for name, value in failure(reason).items()}
-    return part_of(chunk, values | truth_values(chunk.cell.case, exact_of(drawn)), drawn.seed, 0.0)
+# The executors: how each begins, and which exceptions say that a worker died.
 
 
-def merged(chunk: Chunk, parts: list[Part]) -> Part:
-    """Return the parts of a chunk's pieces as one."""
-    import pyarrow as pa
+@dataclass(frozen=True, slots=True)
+class Begun:
+    """An executor that is ready.
 
-    table = pa.concat_tables([part.table for part in parts]).unify_dictionaries().combine_chunks()
-    name = table.schema.get_field_index("chunk")
-    key = pa.array([chunk.key] * len(table)).dictionary_encode()
-    counts: dict[str, int] = {}
-    for part in parts:
-        for status, count in part.counts.items():
-            counts[status] = counts.get(status, 0) + count
-    return Part(chunk.key, table.set_column(name, table.schema.field(name), key), counts)
+    Parameters
+    ----------
+    options : dict
+        Of joblib.
+    deaths : tuple of exception types
+        Those that say that a worker died.
+    apart : bool
+        Whether chunks are computed in workers.
+    streams : bool
+        Whether it gives each part when it is finished; otherwise it takes lists, a few chunks a processor at a time.
+    """
 
-
-Begun = tuple[dict[str, Any], tuple[type[BaseException], ...]]
-"""Options of joblib, and the exceptions that say that a worker died."""
+    options: dict[str, Any]
+    deaths: tuple[type[BaseException], ...] = ()
+    apart: bool = True
+    streams: bool = True
 
 
 @contextmanager
 def _here(by: Executor) -> Iterator[Begun]:
-    yield {"backend": "sequential", "n_jobs": 1}, ()
+    yield Begun({"backend": "sequential", "n_jobs": 1}, apart=False)
 
 
 @contextmanager
@@ -181,8 +224,10 @@ def _processes(by: Executor) -> Iterator[Begun]:
     from joblib.externals.loky.process_executor import BrokenProcessPool
 
     try:
-        yield {"backend": "loky", "n_jobs": by.jobs or workers(), "inner_max_num_threads": 1}, (BrokenProcessPool,)
+        options = {"backend": "loky", "n_jobs": by.jobs or workers(), "inner_max_num_threads": 1}
+        yield Begun(options, (BrokenProcessPool,))
     finally:
+        # Loky keeps its workers for the next call; a study is the last, and Ctrl-C must not leave them behind.
         get_reusable_executor().shutdown(wait=True, kill_workers=True)
 
 
@@ -195,9 +240,9 @@ def _dask(by: Executor) -> Iterator[Begun]:
     with ExitStack() as stack:
         try:
             if by.address is None:
-                cluster = LocalCluster(
-                    n_workers=by.jobs or workers(), threads_per_worker=1, dashboard_address=None, silence_logs=50
-                )
+                # No page of statistics, and no warnings of workers that are lost on purpose when it ends.
+                own = {"threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.CRITICAL}
+                cluster = LocalCluster(n_workers=by.jobs or workers(), **own)
                 client = Client(stack.enter_context(cluster), timeout=CONNECT)
             else:
                 client = Client(by.address, timeout=CONNECT)
@@ -209,7 +254,7 @@ def _dask(by: Executor) -> Iterator[Begun]:
             raise InvalidProblem(
                 "the scheduler has no workers", by.address or "dask", "start one: dask worker ADDRESS --nthreads 1"
             )
-        yield {"backend": "dask", "client": client, "n_jobs": -1}, (KilledWorker,)
+        yield Begun({"backend": "dask", "client": client, "n_jobs": -1}, (KilledWorker,))
 
 
 @contextmanager
@@ -232,7 +277,8 @@ def _ray(by: Executor) -> Iterator[Begun]:
     try:
         register_ray()
         jobs = int(ray.cluster_resources().get("CPU", 1))
-        yield {"backend": "ray", "n_jobs": jobs}, (ray.exceptions.RayActorError, ray.exceptions.WorkerCrashedError)
+        deaths = (ray.exceptions.RayActorError, ray.exceptions.WorkerCrashedError)
+        yield Begun({"backend": "ray", "n_jobs": jobs}, deaths, streams=False)
     finally:
         ray.shutdown()
 
@@ -250,19 +296,22 @@ class Entry:
     Parameters
     ----------
     begin : callable
-        ``(Executor) -> context manager`` of joblib's options and the exceptions of a dead worker.
+        ``(Executor) -> context manager`` of what has begun.
     summary : str
         One line for listings.
+    scheduler : bool
+        Whether it may be one that exists, at an address.
     """
 
     begin: Callable[[Executor], AbstractContextManager[Begun]]
     summary: str
+    scheduler: bool = False
 
 
 EXECUTORS: dict[str, Entry] = {
     "in-process": Entry(_here, "one after the other, without a process of their own"),
     "processes": Entry(_processes, "processes of this machine (loky); the default"),
-    "dask": Entry(_dask, "a Dask cluster that exists (--scheduler), or a local one"),
-    "ray": Entry(_ray, "a Ray cluster that exists (--scheduler), or a local one"),
+    "dask": Entry(_dask, "a Dask cluster that exists (--scheduler), or a local one", scheduler=True),
+    "ray": Entry(_ray, "a Ray cluster that exists (--scheduler), or a local one", scheduler=True),
 }
 """Executors by name."""

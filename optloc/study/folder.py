@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,14 +15,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.study.backends import machine, versions
-from optloc.study.chunk import COLUMNS, GAP, Part, arrow_schema
+from optloc.study.methods import version_of
 from optloc.study.plan import Plan
+from optloc.study.trial import COLUMNS, GAP, Part, arrow_schema, machine, versions
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
+# Another format is refused; other columns or another version of optloc are too, whatever the format.
 MANIFEST = "manifest.json"
 FORMAT = 1
 
@@ -74,12 +76,6 @@ class Manifest:
         return sum(self.chunks.values())
 
 
-def _version() -> str:
-    from importlib.metadata import version
-
-    return version("optloc")
-
-
 def manifest_of(plan: Plan) -> Manifest:
     """Return the manifest of a plan that is about to begin."""
     study = plan.study
@@ -90,7 +86,7 @@ def manifest_of(plan: Plan) -> Manifest:
         plan.text,
         study.seed,
         plan.fingerprint,
-        _version(),
+        version_of("optloc"),
         tuple(column.name for column in COLUMNS),
         {chunk.key: chunk.count for chunk in plan.chunks},
         f"{datetime.now(UTC):%Y-%m-%dT%H:%M:%SZ}",
@@ -156,9 +152,11 @@ def unwritable(path: Path, error: OSError) -> InvalidProblem:
 
 def _replaced(path: Path, write: Any) -> None:
     """Write a file under another name and move it to its place, whole or not at all."""
+    # The dot hides it from what lists parts, the process number keeps two writers apart.
     scratch = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         write(scratch)
+        # On one file system this is one step: a reader sees the old file, the new one or none.
         os.replace(scratch, path)  # noqa: PTH105  (the same, and easier to replace in tests)
     except BaseException:
         scratch.unlink(missing_ok=True)
@@ -197,6 +195,7 @@ def finished(folder: Path, manifest: Manifest) -> set[str]:
         if path.stem not in manifest.chunks:
             continue
         try:
+            # The end of a Parquet file holds its size: a file cut short has none, and no row need be read.
             rows = parquet.read_metadata(path).num_rows
         except (ArrowException, OSError):
             rows = -1
@@ -215,6 +214,7 @@ def locked(folder: Path) -> Iterator[None]:
     except ImportError:  # there is none on this system
         yield
         return
+    # The manifest is there before any part and is never written again: what could be locked better?
     with (folder / MANIFEST).open("rb") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -225,7 +225,59 @@ def locked(folder: Path) -> Iterator[None]:
         yield
 
 
-# Read the parts of a study as one table; the columns are described in `optloc.study.chunk`.
+# How far a study is.
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a study is.
+
+    Parameters
+    ----------
+    manifest : Manifest
+        Of its folder.
+    done, chunks : int
+        Finished chunks, and those of the plan.
+    rows : int
+        Finished rows.
+    counts : dict of str to int
+        How many of them have which status.
+    methods : dict of (str, str) to int
+        How many rows of which method have which status.
+    """
+
+    manifest: Manifest
+    done: int
+    chunks: int
+    rows: int
+    counts: dict[str, int]
+    methods: dict[tuple[str, str], int]
+
+    @property
+    def complete(self) -> bool:
+        """Return whether nothing is left to do."""
+        return self.done == self.chunks
+
+
+def progress(folder: Path) -> Progress:
+    """Return how far the study of a folder is; raise InvalidProblem where it holds none."""
+    from pyarrow import parquet
+
+    manifest = read_manifest(folder)
+    files = part_files(folder)
+    methods: Counter[tuple[str, str]] = Counter()
+    for path in files:
+        # Two columns of fifty, so that looking does not slow down a run of millions of rows.
+        table = parquet.read_table(path, columns=["method", "status"])
+        found = table.group_by(["method", "status"]).aggregate([([], "count_all")]).to_pylist()
+        methods.update({(str(row["method"]), str(row["status"])): int(row["count_all"]) for row in found})
+    counts: Counter[str] = Counter()
+    for (_, status), count in methods.items():
+        counts[status] += count
+    return Progress(manifest, len(files), len(manifest.chunks), counts.total(), dict(counts), dict(methods))
+
+
+# Read the parts of a study as one table; the columns are described in `optloc.study.trial`.
 
 SORTED = ("scenario", "sweep", "noise", "method", "key", "trial")
 
@@ -251,10 +303,12 @@ def read_arrow(folder: Path, columns: Sequence[str] | None = None) -> Any:
 
     schema = arrow_schema()
     wanted = [c.name for c in COLUMNS] if columns is None else [c.name for c in COLUMNS if c.name in set(columns)]
+    # What sorts must be read, though it may not be wanted.
     read = list(dict.fromkeys([*wanted, *SORTED]))
     parts = [parquet.read_table(path, columns=read) for path in part_files(folder)]
     empty = pa.schema([schema.field(name) for name in read]).empty_table()
     table = pa.concat_tables([empty, *(part.cast(empty.schema) for part in parts)]).unify_dictionaries()
+    # Texts sort by themselves, not by their numbers in the dictionary, which depend on the order of parts.
     plain = {name: pc.cast(table[name], pa.string()) if _text(table, name) else table[name] for name in SORTED}
     table = table.take(pc.sort_indices(pa.table(plain), [(name, "ascending") for name in SORTED]))
     table = table.select(wanted).combine_chunks()

@@ -1,20 +1,24 @@
-"""From methods of a study file to functions: a batch of trials in, its fixes and what they took out."""
+"""How problems of a study are solved: methods of a study file as data, the back ends they may ask for, one call.
+
+A method is one of optloc's or a baseline; nothing in a study knows one by its name.
+"""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
 from itertools import product
 from time import perf_counter
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.files.words import Units, join
 from optloc.problem.fix import Fix
-from optloc.study.backends import kind_of
 from optloc.study.baselines import BASELINES, start_of
 from optloc.study.document import MethodTable
 from optloc.study.draws import Drawn
@@ -48,13 +52,14 @@ class Method:
     solver: str = ""
     settings: dict[str, Any] = field(default_factory=dict)
     start: str = "centre"
-    width: float = 1e5
+    width: float = 1e5  # the default of a study file
     batch: int | None = None
     chunk: int | None = None
 
     @property
     def identity(self) -> str:
         """Return what decides the answers, as text."""
+        # Not the chunk: it decides how the work is cut, and the fingerprint of a plan has that.
         settings = json.dumps(self.settings, sort_keys=True)
         parts = (self.name, self.method, self.baseline, self.solver, settings, self.start, self.width, self.batch)
         return json.dumps(parts)
@@ -70,7 +75,15 @@ class Method:
         stages = {entry.solver for branch in branches_of(self.method) for entry in branch}
         return not stages <= {SOLVERS[name].solver for name in _BATCHED}
 
+    @property
+    def reference(self) -> bool:
+        """Return whether it knows the truth, so that it judges the others and is not ranked."""
+        known = BASELINES.get(self.baseline or "")
+        return known is not None and (known.reference or (known.guess and self.start == "truth"))
 
+
+# Stages that take a batch at a time. Any other, an outsider's too, is taken to go one by one: too small a chunk
+# costs a file, too large a one the work of minutes when a run is stopped.
 _BATCHED = {"gtrs", "roots", "wiv", "widen", "search", "lsr", "taylor", "certify", "value"}
 
 
@@ -105,7 +118,7 @@ def methods_of(table: MethodTable, number: int) -> Iterator[Method]:
         elif name not in BASELINES:
             raise InvalidProblem(f"unknown baseline {name!r}", where, nearest(name, list(BASELINES)))
         if solver is not None:
-            kind_of(solver, join(where, "solver"))
+            backend_kind(solver, join(where, "solver"))
         elif table.settings:
             raise InvalidProblem("settings belong to a solver", join(where, "settings"), "name it in 'solver'")
         yield Method(
@@ -126,6 +139,7 @@ def _listed(value: str | list[str] | None) -> list[str]:
 
 
 def _called(table: MethodTable, name: str, solver: str | None, count: int) -> str:
+    # The name says what distinguishes it: settings do not, so methods that differ by them only need names of their own.
     guess = table.baseline is not None and BASELINES[name].guess
     words = [name, *([f"from the {table.start}"] if guess else []), *([f"({solver})"] if solver else [])]
     made = " ".join(words)
@@ -161,15 +175,16 @@ def run(method: Method, drawn: Drawn) -> Run:
     InvalidProblem
         Where the method solved nothing with the back end that was asked for.
     """
-    from formulations.backend import Choice, counting, using
+    from optloc.solvers.methods import Choice, counting, using
 
     choice = None
     if method.solver:
-        choice = Choice(kind_of(method.solver, "solver"), method.solver, method.settings)
+        choice = Choice(backend_kind(method.solver, "solver"), method.solver, method.settings)
     with using(choice), counting() as tally:
         began = perf_counter()
         fix = _solved(method, drawn)
         seconds = perf_counter() - began
+    # A method that never asks the back end would be measured under its name.
     if choice is not None and choice.name not in {name for name, _ in tally}:
         what = f"{method.method or method.baseline} has no program that {choice.name} solves"
         raise InvalidProblem(what, f"method {method.name!r}", "leave the solver out, or use a stage such as sdp or nlp")
@@ -183,4 +198,90 @@ def _solved(method: Method, drawn: Drawn) -> Fix:
 
     assert method.method is not None
     fix = solve(drawn.problem, method.method)
+    # A batch of one has no axis of its own.
     return fix if fix.shape else fix.flat()
+
+
+# Back ends that are installed here: conic solvers of cvxpy, nonlinear ones of CasADi, least squares.
+
+
+@dataclass(frozen=True, slots=True)
+class Backend:
+    """A solver that is installed.
+
+    Parameters
+    ----------
+    kind : "conic", "nonlinear" or "least squares"
+        What it solves.
+    version : str
+        Its version; that of the library that ships it where it has none of its own.
+    summary : str
+        One line for listings.
+    """
+
+    kind: Literal["conic", "nonlinear", "least squares"]
+    version: str
+    summary: str
+
+
+# Where cvxpy's name of a solver is not that of its package.
+_PACKAGES = {"COPT": "coptpy", "CUCLARABEL": "juliacall", "GUROBI": "gurobipy", "MOSEK": "Mosek", "SDPA": "sdpa-python"}
+_NONLINEAR = {
+    "ipopt": "interior point with line search (Waechter, Biegler 2006)",
+    "sqpmethod": "sequential quadratic programming with CasADi's qrqp",
+    "feasiblesqpmethod": "feasible sequential quadratic programming",
+    "blocksqp": "block-structured sequential quadratic programming (Janka et al. 2016)",
+    "fatrop": "structured interior point",
+    "alpaqa": "augmented Lagrangian with PANOC",
+    "sleqp": "sequential linear and equality-constrained quadratic programming",
+    "uno": "unified nonlinear optimisation",
+    "knitro": "Artelys Knitro (licence)",
+    "snopt": "SNOPT (licence)",
+    "worhp": "WORHP (licence)",
+    "madnlp": "interior point in Julia",
+}
+
+
+def version_of(package: str) -> str:
+    """Return the version of an installed distribution, "?" where it has none."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "?"
+
+
+@cache
+def backends() -> dict[str, Backend]:
+    """Return every back end that works here, by the name that a study file uses."""
+    import casadi
+    import cvxpy
+    from cvxpy.reductions.solvers.defines import SOLVER_MAP_CONIC
+
+    found: dict[str, Backend] = {}
+    # Studies compare solvers of cones: those that have neither kind cannot take any program of this package.
+    for name in sorted(set(cvxpy.installed_solvers()) & set(SOLVER_MAP_CONIC)):
+        cones = {cone.__name__ for cone in SOLVER_MAP_CONIC[name].SUPPORTED_CONSTRAINTS}
+        powers = [word for word, cone in (("cones of order 2", "SOC"), ("semidefinite cones", "PSD")) if cone in cones]
+        if powers:
+            found[name] = Backend("conic", version_of(_PACKAGES.get(name, name.lower())), " and ".join(powers))
+    # CasADi can only be asked plugin by plugin: it has no list.
+    for name, summary in _NONLINEAR.items():
+        if casadi.has_nlpsol(name):
+            found[name] = Backend("nonlinear", f"CasADi {version_of('casadi')}", summary)
+    about = "scipy.optimize.least_squares; a baseline of studies"
+    found["scipy"] = Backend("least squares", version_of("scipy"), about)
+    return found
+
+
+def backend_kind(name: str, where: str) -> Literal["conic", "nonlinear"]:
+    """Return what a back end solves; raise InvalidProblem where it is unknown, not installed or no setting."""
+    found = {key: entry.kind for key, entry in backends().items() if entry.kind in ("conic", "nonlinear")}
+    if name not in found:
+        import cvxpy
+
+        known = {*_NONLINEAR, *cvxpy.settings.SOLVERS} - set(found)
+        if name in known:
+            advice = f"install it; here are {', '.join(found)}"
+            raise InvalidProblem(f"the solver {name!r} is not installed, or cannot solve these cones", where, advice)
+        raise InvalidProblem(f"unknown solver {name!r}", where, nearest(name, list(found)))
+    return "conic" if found[name] == "conic" else "nonlinear"

@@ -1,25 +1,48 @@
-"""From a study file to its plan: cells, and the chunks of trials that are computed and stored as one."""
+"""From a study file to its plan: cases times methods are cells; some trials of a cell, a chunk, are a task and a file.
+
+A case is one geometry at one noise level with one set of swept values.
+"""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import as_file, files
 from importlib.resources.abc import Traversable
+from itertools import combinations, product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.types import Array, Stations
+from optloc.base.units import SI_UNIT
+from optloc.files import read
 from optloc.files.schema import fitted, parsed, read_text
-from optloc.study.cases import Case, cases_of
-from optloc.study.document import StudyFile
+from optloc.files.words import join, kind_model
+from optloc.models import MODELS
+from optloc.problem.build import assemble, measured
+from optloc.problem.epochs import separable
+from optloc.problem.noise import Block, Noise, variances
+from optloc.problem.problem import Problem
+from optloc.study.document import Level, ScenarioTable, StudyFile, sigma_of
+from optloc.study.draws import Case, add_flaws, check_truth, metres, place_stations
 from optloc.study.methods import Method, methods_of
 
-_FAST, _SLOW, _LEAST = 10_000, 250, 10
-_NUMBERS = 100_000
+# Trials of a chunk, whose part should take seconds: less, and files and tasks cost as much as fixes; more, and a run
+# that is stopped loses minutes. A fast fix takes about 0.1 ms with everything beside it (a million in two minutes is
+# what tests/benchmarks/test_study.py asks), a slow one 1 to 100 ms. Other values are another plan: a study that has
+# begun would not go on.
+_FAST, _SLOW = 10_000, 250
+# Fewest trials of a chunk of a slow and of a fast method; the latter is a block of draws, which is drawn whole.
+_LEAST, _LEAST_FAST = 10, 500
+# Measurements of a chunk: large problems have fewer trials in it, twenty times fewer where they are solved one by one.
+_NUMBERS, _SLOWER = 100_000, 20
+# Chunks of a cell at least, if they do not become too small: so many workers share it.
 _SHARES = 8
 
 
@@ -46,12 +69,14 @@ class Cell:
     @property
     def stretch(self) -> int:
         """Return how many trials make a chunk: as many as take seconds, but so few that several workers get some."""
-        method = self.method
+        method, case = self.method, self.case
         if method.chunk is not None:
             return method.chunk
-        slow = method.slow
-        most = max(_LEAST, min(_SLOW if slow else _FAST, _NUMBERS // (20 if slow else 1) // self.case.template.count))
-        return int(np.clip(-(-self.case.trials // _SHARES), _LEAST if slow else min(500, most), most))
+        longest, numbers, least = (
+            (_SLOW, _NUMBERS // _SLOWER, _LEAST) if method.slow else (_FAST, _NUMBERS, _LEAST_FAST)
+        )
+        most = max(_LEAST, min(longest, numbers // case.template.count))
+        return int(np.clip(-(-case.trials // _SHARES), min(least, most), most))
 
 
 @dataclass(frozen=True)
@@ -104,6 +129,7 @@ class Plan:
             [Chunk(cell, first, min(n, cell.case.trials - first)) for first in range(0, cell.case.trials, n)]
             for cell, n in ((cell, cell.stretch) for cell in self.cells)
         ]
+        # A study that is stopped early has something of every cell, so its report shows all methods.
         for turn in range(max(len(chunks) for chunks in cut)):
             yield from (chunks[turn] for chunks in cut if turn < len(chunks))
 
@@ -115,6 +141,7 @@ class Plan:
     @property
     def fingerprint(self) -> str:
         """Return hexadecimal digits that are equal for equal data and methods, whatever the remarks of the file."""
+        # Remarks, titles and the order of keys do not count: the folder of the same study is continued.
         text = " ".join(f"{cell.key}:{cell.case.trials}:{cell.stretch}" for cell in self.cells)
         return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
 
@@ -162,6 +189,7 @@ def planned(text: str, source: str, folder: Path, *, trials: int | None = None, 
         methods = [method for i, table in enumerate(study.method) for method in methods_of(table, i + 1)]
         cases = []
         for table in study.scenario:
+            # What the command line says holds for scenarios that have a number of their own, too.
             own = table if trials is None else table.model_copy(update={"trials": None})
             cases += list(cases_of(own, folder, study.seed, study.trials))
     except InvalidProblem as error:
@@ -178,6 +206,158 @@ def _distinct(names: list[str], source: str, what: str) -> None:
         raise InvalidProblem(f"there are two {what}s {twice[0]!r}", source, f"give each {what} a name of its own")
 
 
+# From a scenario to its cases.
+
+
+def cases_of(table: ScenarioTable, folder: Path, seed: int, trials: int) -> Iterator[Case]:
+    """Yield the cases of a scenario: swept values outside, noise levels inside.
+
+    Parameters
+    ----------
+    table : ScenarioTable
+        The scenario.
+    folder : Path
+        Where its problem file is.
+    seed, trials : int
+        Of the study.
+
+    Raises
+    ------
+    InvalidProblem
+        Naming the scenario and what cannot be right.
+    """
+    for swept, chosen in _sweep(table):
+        where = f"scenario {table.name!r}"
+        base = _template(chosen, folder, where, seed)
+        _check(base, chosen, where)
+        for level in chosen.noise:
+            # The number is for axes and sorting, the label for people and for the key of the data.
+            noise, value, unit = _noise(base, level, chosen.layout is None, join(where, "noise"))
+            label = level if isinstance(level, str) else json.dumps(level)
+            named = (json.dumps(swept, sort_keys=True), label, unit, value)
+            yield Case(chosen, *named, replace(base, noise=noise), seed, chosen.trials or trials)
+
+
+def _sweep(table: ScenarioTable) -> Iterator[tuple[dict[str, Any], ScenarioTable]]:
+    where = f"scenario {table.name!r}"
+    for name, values in table.sweep.items():
+        if not values or name in ("name", "sweep", "noise", "trials"):
+            what = "has no values" if not values else "cannot be swept"
+            raise InvalidProblem(f"{name!r} {what}", join(where, "sweep"), "give a list; noise has levels of its own")
+    for chosen in product(*table.sweep.values()):
+        swept = dict(zip(table.sweep, chosen, strict=True))
+        # Swept values are put into what the file says and read again, so that they are checked like written ones.
+        data = table.model_dump(exclude_unset=True, exclude={"sweep"})
+        for name, value in swept.items():
+            *path, last = name.split(".")
+            at = data
+            for part in path:
+                at = at.setdefault(part, {})
+                if not isinstance(at, dict):
+                    raise InvalidProblem(f"{name!r} names no key", join(where, "sweep"), "write table.key")
+            at[last] = value
+        yield swept, fitted(ScenarioTable, data, where) if swept else table
+
+
+def _template(table: ScenarioTable, folder: Path, where: str, seed: int) -> Problem:
+    if (table.problem is None) == (table.layout is None):
+        raise InvalidProblem("a scenario has one geometry", where, "give either problem or [scenario.layout]")
+    if table.layout is not None:
+        return _lay(table, where, seed)
+    assert table.problem is not None
+    shipped = files("optloc") / "scenarios"
+    names = sorted(entry.name.removesuffix(".toml") for entry in shipped.iterdir() if entry.name.endswith(".toml"))
+    path = folder / table.problem
+    if path.suffix == "" and not path.exists():
+        if table.problem not in names:
+            advice = nearest(table.problem, names) + ", or the path of a problem file"
+            raise InvalidProblem(f"unknown problem {table.problem!r}", where, advice)
+        with as_file(shipped) as place:
+            return read(place / f"{table.problem}.toml", values=False).problem
+    return read(path, values=False).problem
+
+
+def _lay(table: ScenarioTable, where: str, seed: int) -> Problem:
+    """Return the problem of a layout with noise of one, in which only the stations of a trial are still to be put."""
+    layout = table.layout
+    assert layout is not None
+    where, s = join(where, "layout"), layout.stations
+    # Frozen stations are a function of seed, number and dimension: scenarios that share these share their stations.
+    rng = np.random.default_rng([seed, s, layout.dimension])
+    pairs = list(combinations(range(s), 2)) if layout.pairs == "all" else [(0, i) for i in range(1, s)]
+    rows = []
+    for kind in layout.kinds:
+        model = kind_model(kind, join(where, "kinds"))
+        if model.stations == 0 or model.velocity:
+            what = f"{kind!r} needs more than stations at rest and a target"
+            raise InvalidProblem(what, join(where, "kinds"), "write a problem file, and name it in 'problem'")
+        if model.stations == 2 and s < 2:
+            raise InvalidProblem(f"{kind!r} needs two stations", join(where, "stations"), "give more")
+        a, b = (np.arange(s), None) if model.stations == 1 else (np.array([p[1] for p in pairs]), [p[0] for p in pairs])
+        # Differences share the arrival at a station, and with it half their variance, unless the file says otherwise.
+        shared = model.stations == 2 and model.ranges is not None and not layout.independent
+        rows.append(measured(kind, a=a, b=b, **({"arrival_sigma" if shared else "sigma": 1.0})))
+    survey = None if layout.survey is None else metres([layout.survey], join(where, "survey"))[0] ** 2
+    spread = None if survey is None else np.tile(survey * np.eye(layout.dimension), (s, 1, 1))
+    place = place_stations(layout, where, rng, 1)
+    names = tuple(f"S{i + 1}" for i in range(s))
+    return assemble(Stations(np.array(place), names, covariance=spread, span="noise"), *rows)
+
+
+def _check(problem: Problem, table: ScenarioTable, where: str) -> None:
+    """Refuse what has no single position to compare, and truths, biases and errors that do not fit."""
+    # A trial is one problem: epochs that share no unknown would be trials of their own, without a number.
+    if separable(problem):
+        what = f"its {problem.epochs} epochs are problems of their own"
+        raise InvalidProblem(what, where, "leave one epoch in the file: the trials are draws of it")
+    sought = [motion for motion in problem.motions if motion.known is None]
+    if len(sought) != 1 or sought[0].span != "run":
+        raise InvalidProblem(f"{len(sought)} targets are sought", where, "give one static or moving target")
+    moving = sought[0].order > 0
+    if not moving and (table.truth.speed is not None or table.truth.velocity is not None):
+        raise InvalidProblem("its target does not move", join(where, "truth"), "leave the velocity out")
+    check_truth(table.truth, problem.frame, problem.dimension, join(where, "truth"))
+    known = [bias.name for bias in problem.biases]
+    for name in table.bias:
+        if name not in known:
+            advice = nearest(name, known) if known else "the problem has none"
+            raise InvalidProblem(f"unknown bias {name!r}", join(where, "bias"), advice)
+    add_flaws(problem, table, where)
+
+
+def _noise(problem: Problem, level: Level, from_file: bool, where: str) -> tuple[Noise, float, str]:
+    """Return the noise of a level, its number and its unit."""
+    kinds = [rows.kind for rows in problem.rows]
+    if isinstance(level, int | float):
+        if not from_file:
+            advice = f'write its unit, such as "10 {SI_UNIT[MODELS[kinds[0]].quantity]}"'  # type: ignore[index]
+            raise InvalidProblem(f"the level {level:g} has no unit", where, advice)
+        if not level > 0.0:
+            raise InvalidProblem(f"the factor {level:g} is not positive", where, "give a positive one")
+        return _scale(problem.noise, np.full(problem.count, float(level))), float(level), "x"
+    if isinstance(level, str):
+        level = dict.fromkeys(kinds, level)
+    if set(level) != set(kinds):
+        odd = min(set(level) ^ set(kinds))
+        raise InvalidProblem(f"the levels do not fit the kinds: {odd!r}", where, f"name {', '.join(kinds)}")
+    wanted = {kind: sigma_of(kind, amount, where) for kind, amount in level.items()}
+    # Rows are scaled to the level, so correlations stay as the file or the layout has them.
+    own = np.sqrt(variances(problem.noise, problem.count))
+    sigma = np.concatenate([np.full(rows.count, wanted[rows.kind]) for rows in problem.rows])
+    unit = SI_UNIT[MODELS[kinds[0]].quantity]  # type: ignore[index]  # models hold known quantities only
+    return _scale(problem.noise, sigma / own), wanted[kinds[0]], unit
+
+
+def _scale(noise: Noise, factor: Array) -> Noise:
+    """Return noise whose rows have standard deviations times a factor (m,)."""
+    blocks = []
+    for block in noise.blocks:
+        own = factor[block.row]
+        blocks.append(Block(block.row, block.covariance * own[:, :, None] * own[:, None, :]))
+    return Noise(tuple(blocks))
+
+
 def workers() -> int:
     """Return how many processes this machine can run at a time."""
+    # Processors that this process may use: containers and schedulers leave it fewer than the machine has.
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -12,9 +12,8 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
-from optloc.study.chunk import VALUES
 from optloc.study.folder import read_frame
-from optloc.study.score import over_bound, performance_profile, shifted_mean
+from optloc.study.trial import DIED, VALUES
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -22,6 +21,9 @@ if TYPE_CHECKING:
 
 SLACK = 0.01
 """Costs that differ by less are equal: a tenth of a standard deviation."""
+
+# Costs of a million and more agree to rounding of their sums only.
+_RELATIVE = 1e-9
 
 PROVEN = "global"
 """Proof that claims that no better point exists anywhere."""
@@ -34,6 +36,9 @@ COLUMNS = tuple(
 """Columns of the study's table that a summary reads."""
 
 CASE = ("scenario", "sweep")
+
+_PENALTY = 10.0
+"""Slowest times of the study that a failure costs, as PAR10 counts in solver competitions."""
 
 
 def judged(frame: pd.DataFrame) -> pd.DataFrame:
@@ -54,11 +59,13 @@ def judged(frame: pd.DataFrame) -> pd.DataFrame:
     import pandas as pd
 
     cost, gap, truth = (frame[name].to_numpy(dtype=float) for name in ("cost", "gap", "cost_truth"))
+    # The truth is a point like any other: what costs more than it is not the minimum.
     best = np.fmin(cost - gap, truth)
     above = cost - best
-    slack = SLACK + 1e-9 * np.abs(best)
+    slack = SLACK + _RELATIVE * np.abs(best)
     answered = frame["answered"].to_numpy(dtype=bool)
     with np.errstate(invalid="ignore"):
+        # A row without a cost is not the best of anything: NaN counts as worse.
         better = ~(above <= slack)
     pairs = frame[list(CASE)].astype(str)
     names = {(a, b): case_label(a, b) for a, b in pairs.drop_duplicates().itertuples(index=False, name=None)}
@@ -74,6 +81,7 @@ def judged(frame: pd.DataFrame) -> pd.DataFrame:
 
 def _natural(text: str) -> list[tuple[bool, float, str]]:
     """Return a key by which texts are sorted as people do: 8 before 25."""
+    # Split at numbers, odd parts are numbers: 0.0 for text keeps the tuples comparable.
     parts = re.split(r"(\d+\.?\d*)", text)
     return [(i % 2 == 0, 0.0 if i % 2 == 0 else float(part), part) for i, part in enumerate(parts)]
 
@@ -136,13 +144,14 @@ def _cell(part: pd.DataFrame) -> dict[str, Any]:
     ratio, half = over_bound(error, bound)
     seconds = part["seconds"].to_numpy(dtype=float)
     nees = part["nees"].to_numpy(dtype=float)[chosen] / float(part["dimension"].iloc[0])
+    # A singular bound says that no error is too large there: such trials count for errors, not for bounds.
     good = np.isfinite(bound)
     return {
         "rows": int(part["rows"].iloc[0]),
         "trials": len(part),
         **{name: int(part[name].sum()) for name in ("answered", "right", "wrong", "false")},
         "proven": int((part["proof"] == PROVEN).sum()),
-        "died": int((part["status"] == "died").sum()),
+        "died": int((part["status"] == DIED).sum()),
         "rmse": float(np.sqrt(np.mean(error**2))) if len(error) else np.nan,
         "bound": float(np.sqrt(np.mean(bound[good] ** 2))) if good.any() else np.nan,
         "ratio": ratio,
@@ -191,6 +200,7 @@ def instances(frame: pd.DataFrame, order: list[str]) -> tuple[Array, Array, int]
     wide = frame.assign(data=numbers, method=names).pivot_table(
         index=["data", "trial"], columns="method", values=["seconds", "right"], aggfunc="first"
     )
+    # A study that still runs has trials that one method has seen and another has not.
     common = wide.dropna()
     times, solved = (np.stack([common[what][name] for name in order]) for what in ("seconds", "right"))
     return times.astype(float), solved.astype(bool), len(wide)
@@ -209,7 +219,7 @@ def ranking(frame: pd.DataFrame, order: list[str], shift: float) -> pd.DataFrame
     import pandas as pd
 
     times, solved, _ = instances(frame, order)
-    limit = 10.0 * times.max(initial=0.0)
+    limit = _PENALTY * times.max(initial=0.0)
     mean = np.array([shifted_mean(np.where(ok, t, limit), shift) for t, ok in zip(times, solved, strict=True)])
     first = performance_profile(times, solved, np.ones(1))[:, 0]
     table = pd.DataFrame(
@@ -296,8 +306,10 @@ def compared(one: Path, two: Path) -> list[Difference]:
 
 
 def _difference(cell: tuple[str, ...], a: pd.DataFrame, b: pd.DataFrame) -> Difference:
+    # The key of the data names seed, geometry and noise: equal keys are equal measurements.
     same_data = set(a["data"]) == set(b["data"])
     one, two = _side(a), _side(b)
+    # Two shares with one variance, that of both together: the usual test of their difference.
     pooled = (one.answered * one.rows + two.answered * two.rows) / (one.rows + two.rows)
     spread = np.sqrt(pooled * (1.0 - pooled) * (1.0 / one.rows + 1.0 / two.rows))
     z = (two.answered - one.answered) / spread if spread > 0.0 else np.nan
@@ -308,6 +320,7 @@ def _identical(a: pd.DataFrame, b: pd.DataFrame) -> bool:
     if len(a) != len(b):
         return False
     names = list(VALUES)
+    # As objects, NaN equals NaN and categories compare by their text.
     left, right = (f[names].sort_values("trial").reset_index(drop=True).astype(object) for f in (a, b))
     return bool(left.equals(right))
 
@@ -317,3 +330,156 @@ def _side(frame: pd.DataFrame) -> Side:
     error, bound = (frame[name].to_numpy(dtype=float)[answered] for name in ("error", "crlb"))
     rmse, limit = (float(np.sqrt(np.mean(v**2))) if len(v) else np.nan for v in (error, bound[np.isfinite(bound)]))
     return Side(len(frame), float(answered.mean()), rmse, limit, float(frame["seconds"].median()))
+
+
+# Statistics that judge methods: shares with intervals, errors against the bound, profiles, shifted means.
+
+LEVEL = 0.95
+"""Confidence of all intervals, as is usual; `_NORMAL` is its quantile of the normal distribution."""
+
+_NORMAL = 1.96
+
+_CURVE = 200
+"""Points of a distribution: more than a figure of 500 pixels shows apart, and a page holds hundreds of curves."""
+
+
+def wilson(hits: Array | float, count: Array | float, level: float = LEVEL) -> tuple[Array, Array]:
+    """Return Wilson's score interval of shares.
+
+    Parameters
+    ----------
+    hits, count : array (...)
+        How many of how many; NaN comes back where there are none.
+    level : float
+        Confidence.
+
+    Returns
+    -------
+    low, high : array (...)
+        Ends of the interval, between 0 and 1.
+
+    References
+    ----------
+    E. B. Wilson, "Probable inference, the law of succession, and statistical inference", JASA 22 (1927).
+    """
+    from scipy.special import ndtri
+
+    z = ndtri(0.5 + level / 2.0)
+    k, n = np.asarray(hits, dtype=float), np.asarray(count, dtype=float)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        share = k / n
+        middle = share + z**2 / (2.0 * n)
+        width = z * np.sqrt(share * (1.0 - share) / n + z**2 / (4.0 * n**2))
+        scale = 1.0 + z**2 / n
+        low, high = (middle - width) / scale, (middle + width) / scale
+    # At the ends the formula is exact, but rounding is not.
+    return np.where(k <= 0.0, np.where(n > 0.0, 0.0, np.nan), low), np.where((k >= n) & (n > 0.0), 1.0, high)
+
+
+def clopper_pearson(hits: Array | float, count: Array | float, level: float = LEVEL) -> tuple[Array, Array]:
+    """Return the exact interval of shares, which never covers less than its level; arguments as `wilson`.
+
+    References
+    ----------
+    C. J. Clopper and E. S. Pearson, "The use of confidence or fiducial limits", Biometrika 26 (1934).
+    """
+    from scipy.special import betaincinv
+
+    k, n = np.asarray(hits, dtype=float), np.asarray(count, dtype=float)
+    tail = (1.0 - level) / 2.0
+    some = n > 0.0
+    low = np.where(k > 0.0, betaincinv(np.maximum(k, 1.0), n - k + 1.0, tail), 0.0)
+    high = np.where(k < n, betaincinv(k + 1.0, np.maximum(n - k, 1.0), 1.0 - tail), 1.0)
+    return np.where(some, low, np.nan), np.where(some, high, np.nan)
+
+
+def over_bound(error: Array, bound: Array) -> tuple[float, float]:
+    """Return the root mean square error over that of the bound, and the half width of its 95 % interval.
+
+    Parameters
+    ----------
+    error, bound : array (n,)
+        Lengths of errors and roots of the traces of their bounds, metres; pairs that are not finite do not count.
+
+    Returns
+    -------
+    ratio, half : float
+        NaN where no pair counts; the half width is that of the delta method, NaN of a single pair.
+    """
+    good = np.isfinite(error) & np.isfinite(bound)
+    count = int(good.sum())
+    if not count:
+        return float("nan"), float("nan")
+    squares = error[good] ** 2 / np.mean(bound[good] ** 2)
+    ratio = float(np.sqrt(squares.mean()))
+    spread = float(squares.std(ddof=1)) if count > 1 else float("nan")
+    # The error of a root is half that of its square over the root; one that is zero, which only noise of zero gives,
+    # must not divide.
+    return ratio, _NORMAL * spread / (2.0 * max(ratio, np.finfo(float).tiny) * np.sqrt(count))
+
+
+def shifted_mean(times: Array, shift: float) -> float:
+    """Return the shifted geometric mean exp(mean(log(t + s))) - s of times; NaN of none.
+
+    Large times count less than in a mean, and times far below the shift are all alike.
+
+    References
+    ----------
+    T. Achterberg, "Constraint Integer Programming", thesis (2007), section A.3.
+    """
+    values = np.asarray(times, dtype=float)
+    return float(np.exp(np.mean(np.log(values + shift))) - shift) if len(values) else float("nan")
+
+
+def performance_profile(times: Array, solved: Array, ratios: Array) -> Array:
+    """Return the share of instances that each method solves within a multiple of the fastest time.
+
+    Parameters
+    ----------
+    times : array (methods, n)
+        Seconds.
+    solved : bool array (methods, n)
+        Where the method found what was sought; elsewhere its time does not matter.
+    ratios : array (q,)
+        Multiples of the time of the fastest method that solved the instance.
+
+    Returns
+    -------
+    array (methods, q)
+        Shares of all n instances, those among them that no method solves.
+
+    References
+    ----------
+    E. D. Dolan and J. J. More, "Benchmarking optimization software with performance profiles",
+    Mathematical Programming 91 (2002).
+    """
+    spent = np.where(solved, times, np.inf)
+    if not spent.shape[-1]:
+        return np.full((len(spent), len(ratios)), np.nan)
+    with np.errstate(invalid="ignore"):
+        slower = np.where(solved, spent / spent.min(0), np.inf)
+    return np.stack([np.searchsorted(np.sort(row), ratios, side="right") / len(row) for row in slower])
+
+
+def distribution(values: Array, count: int, points: int = _CURVE) -> tuple[Array, Array]:
+    """Return an empirical distribution as a curve of few points.
+
+    Parameters
+    ----------
+    values : array (n,)
+        What is not finite is left out of the curve, but not out of the count.
+    count : int
+        Trials, so that the curve ends at the share of those that have a value.
+    points : int
+        Most points of the curve; the least and the greatest value are among them.
+
+    Returns
+    -------
+    x, share : array (q,)
+        Values in order and the share of trials that are not above them.
+    """
+    ordered = np.sort(values[np.isfinite(values)])
+    if not len(ordered):
+        return np.zeros(0), np.zeros(0)
+    at = np.unique(np.linspace(0, len(ordered) - 1, min(points, len(ordered))).astype(int))
+    return ordered[at], (at + 1.0) / count

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from study.texts import plan
 
-from optloc.study import chunk as chunks
-from optloc.study.execute import executor
+from optloc.study import trial
+from optloc.study.execute import executor, run_plan
 from optloc.study.methods import run
 from optloc.study.plan import workers
-from optloc.study.run import run_plan
 
 MILLION = """
 format = 1
@@ -70,7 +69,7 @@ def test_overhead_of_the_machinery_at_tasks_of_a_millisecond(tmp_path, monkeypat
         return found
 
     run_plan(plan(SLOW.replace("2000", "500")), tmp_path / "warm", executor("in-process"))
-    monkeypatch.setattr(chunks, "run", timed)
+    monkeypatch.setattr(trial, "run", timed)
     began = perf_counter()
     found = run_plan(plan(SLOW), tmp_path / "out", executor("in-process"))
     whole, solver = perf_counter() - began, float(np.sum(inside))

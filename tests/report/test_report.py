@@ -14,10 +14,9 @@ from optloc.cli import app
 from optloc.papers.report import Table
 from optloc.report import write_report
 from optloc.report.sheets import duration, latex, number, percent
-from optloc.study.execute import executor
+from optloc.study.execute import executor, run_plan
 from optloc.study.folder import begin, read_frame
 from optloc.study.plan import plan_of
-from optloc.study.run import run_plan
 
 RUN = CliRunner()
 TEXT = """

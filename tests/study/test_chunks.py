@@ -5,11 +5,11 @@ import pytest
 from study.texts import plan
 
 import optloc
-from optloc.study import chunk as chunks
-from optloc.study.chunk import COLUMNS, DIED, arrow_schema, compute
+from optloc.study import trial
 from optloc.study.draws import draw
 from optloc.study.methods import run
 from optloc.study.plan import Chunk
+from optloc.study.trial import COLUMNS, DIED, arrow_schema, compute
 
 
 def frame(made):
@@ -60,7 +60,7 @@ def test_a_failing_trial_costs_its_row(monkeypatch):
             raise FloatingPointError("no such luck")
         return solved(method, drawn)
 
-    monkeypatch.setattr(chunks, "run", brittle)
+    monkeypatch.setattr(trial, "run", brittle)
     found = frame(made)
     assert found["status"].tolist() == ["ok"] * 4 + [DIED] + ["ok"] * 5
     assert found["reason"][4] == "FloatingPointError: no such luck"

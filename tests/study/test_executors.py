@@ -15,10 +15,9 @@ from study.texts import QUICK, SMALL, assert_identical, plan
 
 from optloc.base.errors import InvalidProblem
 from optloc.study import execute
-from optloc.study.chunk import compute
-from optloc.study.execute import EXECUTORS, executor
-from optloc.study.folder import read_frame
-from optloc.study.run import progress, run_plan
+from optloc.study.execute import EXECUTORS, executor, run_plan
+from optloc.study.folder import progress, read_frame
+from optloc.study.trial import compute
 
 LONG = QUICK.replace("trials = 60", "trials = 600")
 

@@ -8,8 +8,8 @@ from typer.testing import CliRunner
 
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
-from optloc.study.chunk import compute
 from optloc.study.plan import plan_of, shipped
+from optloc.study.trial import compute
 
 RUN = CliRunner()
 STUDIES = sorted(shipped())

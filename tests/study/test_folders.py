@@ -11,9 +11,8 @@ from study.texts import QUICK, assert_identical, plan, values
 
 from optloc.base.errors import InvalidProblem
 from optloc.study import folder as parts
-from optloc.study.execute import executor
-from optloc.study.folder import read_arrow, read_frame, swept
-from optloc.study.run import progress, run_plan
+from optloc.study.execute import executor, run_plan
+from optloc.study.folder import progress, read_arrow, read_frame, swept
 from optloc.study.summary import compared
 
 HERE = executor("in-process")

@@ -9,10 +9,9 @@ from optloc.papers.registration import PRINTED, Setting
 from optloc.papers.registration import recursion as printed
 from optloc.solvers.pool import given
 from optloc.solvers.stages import lsr
-from optloc.study.baselines import BASELINES
-from optloc.study.chunk import compute
+from optloc.study.baselines import BASELINES, recursion, single_step
 from optloc.study.draws import draw
-from optloc.study.originals import recursion, single_step
+from optloc.study.trial import compute
 
 
 def test_the_recursion_is_that_of_the_paper():

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import numpy as np
 
-from optloc.study.chunk import VALUES
 from optloc.study.folder import read_arrow
 from optloc.study.plan import planned
+from optloc.study.trial import VALUES
 
 SMALL = """
 format = 1

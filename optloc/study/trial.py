@@ -1,0 +1,507 @@
+"""A trial from its data to its row: solved by a method, scored against truth and bound, one row of documented columns.
+
+The rows of a chunk are one Arrow table: a function of the chunk alone, wherever it runs.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from time import perf_counter
+from typing import Any, Literal
+
+import numpy as np
+
+from optloc.base import linalg
+from optloc.base.errors import InvalidProblem
+from optloc.base.status import Status
+from optloc.base.types import Array
+from optloc.bounds.crlb import crlb
+from optloc.compute.sums import equations_at
+from optloc.linear.constraints import exact
+from optloc.linear.normal import covariance, eliminated
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
+from optloc.study.draws import Case, Drawn, draw
+from optloc.study.methods import run, version_of
+from optloc.study.plan import Cell, Chunk
+
+# The long table of a study, one row for each trial of each method: columns, units and meaning in one place.
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column of the table.
+
+    Parameters
+    ----------
+    name : str
+        Name.
+    kind : "category", "int", "float" or "bool"
+        Category: text, dictionary encoded.
+    unit : str
+        SI unit; empty where there is none.
+    meaning : str
+        One sentence.
+    value : bool
+        Whether it is the same, bit for bit, whenever and on whatever executor the study runs; False for times, the
+        machine and the versions.
+    """
+
+    name: str
+    kind: Literal["category", "int", "float", "bool"]
+    unit: str
+    meaning: str
+    value: bool = True
+
+
+COLUMNS: tuple[Column, ...] = (
+    Column("key", "category", "", "Cell: a scenario at one noise level and one set of swept values, with one method."),
+    Column("data", "category", "", "Cell without the method: equal data and trial mean equal measurements."),
+    Column("scenario", "category", "", "Name of the scenario."),
+    Column("method", "category", "", "Name of the method as tables show it; different settings have different names."),
+    Column("solver", "category", "", "Back end that was asked for, for instance SCS; empty: the method's own."),
+    Column(
+        "noise", "float", "", "Noise level in the unit `noise_unit`: deviation of a row of the first kind, or factor."
+    ),
+    Column("noise_unit", "category", "", "m, m/s, rad or 1; x where levels are factors on the noise of a file."),
+    Column("noise_label", "category", "", "The level as the study file writes it."),
+    Column("sweep", "category", "", "Swept values as a JSON object of name and value; {} without a sweep."),
+    Column("kinds", "category", "", "Measurement kinds of the scenario, joined by +."),
+    Column("dimension", "int", "", "2 or 3."),
+    Column("stations", "int", "", "Number of stations."),
+    Column("rows", "int", "", "Number of measurements of a trial."),
+    Column("epochs", "int", "", "Number of epochs of a trial."),
+    Column("trial", "int", "", "Number of the trial, from 0."),
+    Column("seed", "category", "", "Seed of the trial's block of data: study seed, data cell and block number."),
+    Column("status", "category", "", "Label of the status, for instance ok; 'died' where the process died twice."),
+    Column("answered", "bool", "", "Whether the status claims an answer: ok, ambiguous or searched."),
+    Column("reason", "category", "", "Sentence that belongs to the status."),
+    Column("located", "bool", "", "Whether there is a finite position at all, refined or not."),
+    Column("outliers", "int", "", "Number of stations with a gross error."),
+    Column("rejected", "int", "", "Number of rows to which the method gives less than half their weight."),
+    Column("truth_x", "float", "m", "True position of the target, metres in the frame."),
+    Column("truth_y", "float", "m", "As truth_x."),
+    Column("truth_z", "float", "m", "As truth_x; NaN in the plane."),
+    Column("error_x", "float", "m", "Estimate less truth; NaN without a position."),
+    Column("error_y", "float", "m", "As error_x."),
+    Column("error_z", "float", "m", "As error_x; NaN in the plane."),
+    Column("error", "float", "m", "Distance of the estimate from the truth."),
+    Column("error_nearest", "float", "m", "The same of the nearest of the estimate and its alternatives."),
+    Column("error_velocity", "float", "m/s", "Length of the velocity's error; NaN where the target stands."),
+    Column("error_bias", "float", "m", "Root mean square error of the biases in metres; NaN without such."),
+    Column("crlb", "float", "m", "Root of the trace of the position's Cramer-Rao bound at the truth."),
+    Column("crlb_velocity", "float", "m/s", "The same of the velocity."),
+    Column("crlb_bias", "float", "m", "Root mean square bound of the biases in metres."),
+    Column(
+        "deviation", "float", "1", "Error in units of the bound: sqrt(e' B^-1 e), B the position's bound at the truth."
+    ),
+    Column("sigma", "float", "m", "Root of the trace of the position covariance that the method claims."),
+    Column("nees", "float", "1", "e' C^-1 e with the claimed covariance C; its expectation is `dimension`."),
+    Column("cost", "float", "1", "Maximum-likelihood cost at the estimate, also of estimates that were not refined."),
+    Column("cost_truth", "float", "1", "The same cost at the truth (unknowns of single epochs at their best)."),
+    Column("dof", "int", "", "Degrees of freedom of the cost."),
+    Column("alternatives", "int", "", "Number of other minima that the fix lists."),
+    Column("proof", "category", "", "Proof of the certificate: global, region, local or unknown."),
+    Column("certificate", "category", "", "Method of the certificate."),
+    Column("bound", "float", "1", "Certified lower bound of the cost; NaN without one."),
+    Column(
+        "iterations", "float", "1", "Iterations of solver and refinement, mean over the fixes of one call; NaN unknown."
+    ),
+    Column(
+        "seconds", "float", "s", "Time of the solution: that of the call over the number of its fixes.", value=False
+    ),
+    Column(
+        "build",
+        "float",
+        "s",
+        "Time of the first fix of its kind in its process, before the others: compilation "
+        "and canonicalisation; 0 where that had been done.",
+        value=False,
+    ),
+    Column("batch", "int", "", "Number of fixes in the call."),
+    Column("chunk", "category", "", "Chunk of the plan that holds the row."),
+    Column("machine", "category", "", "Processor, number of cores and system of the worker.", value=False),
+    Column("versions", "category", "", "Versions of optloc, Python and the libraries, as text.", value=False),
+)
+"""Columns of every part file, in this order."""
+
+GAP = Column("gap", "float", "1", "Cost less the lowest cost that any method of the study found for the same data.")
+"""Added when all parts are read: it needs all methods."""
+
+DIED = "died"
+"""Status of a trial that took its process down twice."""
+
+VALUES: tuple[str, ...] = tuple(column.name for column in COLUMNS if column.value)
+"""Columns that are equal bit for bit on one machine, whatever the executor."""
+
+
+@cache
+def arrow_schema() -> Any:
+    """Return the Arrow schema of the part files; unit and meaning are metadata of the fields."""
+    import pyarrow as pa
+
+    types = {
+        "category": pa.dictionary(pa.int32(), pa.string()),
+        "int": pa.int64(),
+        "float": pa.float64(),
+        "bool": pa.bool_(),
+    }
+    return pa.schema(
+        [pa.field(c.name, types[c.kind], metadata={"unit": c.unit, "meaning": c.meaning}) for c in COLUMNS]
+    )
+
+
+# A chunk is drawn, solved and written down.
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """What a chunk gave.
+
+    Parameters
+    ----------
+    key : str
+        Of the chunk.
+    table : pyarrow.Table
+        Its rows.
+    counts : dict of str to int
+        How many rows have which status.
+    """
+
+    key: str
+    table: Any
+    counts: dict[str, int]
+
+
+Values = dict[str, Any]
+"""Columns of some trials: arrays (n,), or one value for all."""
+
+# Cells of which this process has solved a trial: what is compiled or canonicalised once is not timed with the others.
+_warm: set[tuple[str, str]] = set()
+
+
+def compute(chunk: Chunk) -> Part:
+    """Return the rows of a chunk.
+
+    Numerical libraries work on one thread inside, so that the last digit does not depend on where it runs.
+
+    Raises
+    ------
+    InvalidProblem
+        Where the method cannot be run at all. Any other error of a trial becomes the status of its row.
+    """
+    from threadpoolctl import threadpool_limits
+
+    # Sums of BLAS depend on how many threads share them.
+    with threadpool_limits(1):
+        drawn = draw(chunk.cell.case, chunk.first, chunk.count)
+        build = _warm_up(chunk.cell, drawn)
+        known = known_of(drawn)
+        size = chunk.cell.method.batch or chunk.count
+        parts = [
+            part
+            for first in range(0, chunk.count, size)
+            for part in _guarded(chunk.cell, known, first, min(size, chunk.count - first))
+        ]
+    # A trial that failed has no column that only fixes have: what every stretch has is kept.
+    shared = [name for name in parts[0][1] if all(name in values for _, values in parts)]
+    found = {name: np.concatenate([_spread(values[name], count) for count, values in parts]) for name in shared}
+    return _part(chunk, known, found, build)
+
+
+def _warm_up(cell: Cell, drawn: Drawn) -> float:
+    """Solve one trial where that was not done in this process, and return how long it took."""
+    key = (cell.case.key, cell.method.identity)
+    if key in _warm:
+        return 0.0
+    began = perf_counter()
+    try:
+        run(cell.method, drawn.part(0, 1))
+    except InvalidProblem:
+        raise
+    except Exception:  # noqa: BLE001  (it comes again with its row)
+        return 0.0
+    # Only where it went well: a failure may come before what is slow.
+    _warm.add(key)
+    return perf_counter() - began
+
+
+def _guarded(cell: Cell, known: Known, first: int, count: int) -> list[tuple[int, Values]]:
+    """Return the values of some trials; where the call fails, halves are tried until the one trial is found."""
+    try:
+        return [(count, _solve(cell, known.part(first, count)))]
+    except InvalidProblem:
+        raise
+    except Exception as error:  # noqa: BLE001  (a failing trial costs a row, never the study)
+        if count == 1:
+            return [(1, _failure(f"{type(error).__name__}: {error}".splitlines()[0]))]
+    half = count // 2
+    return [*_guarded(cell, known, first, half), *_guarded(cell, known, first + half, count - half)]
+
+
+def _solve(cell: Cell, known: Known) -> Values:
+    count = len(known.drawn.truth)
+    found = run(cell.method, known.drawn)
+    values = fix_values(cell.case, known, found.fix)
+    return values | {"seconds": found.seconds / count, "iterations": found.iterations / count, "batch": count}
+
+
+def _failure(reason: str) -> Values:
+    """Return the values of a trial that failed."""
+    values: Values = {column.name: np.nan for column in COLUMNS if column.kind == "float"}
+    values |= {"status": DIED, "reason": reason, "answered": False, "located": False}
+    values |= dict.fromkeys(("dof", "alternatives", "rejected"), 0)
+    return values | {"proof": "unknown", "certificate": "", "batch": 1}
+
+
+def dead_part(chunk: Chunk, reason: str) -> Part:
+    """Return the part of a chunk whose trials all have the status `died`."""
+    found = {name: _spread(value, chunk.count) for name, value in _failure(reason).items()}
+    return _part(chunk, known_of(draw(chunk.cell.case, chunk.first, chunk.count)), found, 0.0)
+
+
+def join_parts(chunk: Chunk, parts: list[Part]) -> Part:
+    """Return the parts of a chunk's pieces as one."""
+    import pyarrow as pa
+
+    table = pa.concat_tables([part.table for part in parts]).unify_dictionaries().combine_chunks()
+    name = table.schema.get_field_index("chunk")
+    key = pa.array([chunk.key] * len(table)).dictionary_encode()
+    counts: dict[str, int] = {}
+    for part in parts:
+        for status, count in part.counts.items():
+            counts[status] = counts.get(status, 0) + count
+    return Part(chunk.key, table.set_column(name, table.schema.field(name), key), counts)
+
+
+def _spread(value: Any, count: int) -> Any:
+    """Return a value as an array (count,)."""
+    if isinstance(value, np.ndarray):
+        return value
+    # Filled by assignment: a list is one value for each, a text the same for all.
+    out = np.empty(count, dtype=object if isinstance(value, str | list) else None)
+    out[:] = value
+    return out
+
+
+def _part(chunk: Chunk, known: Known, found: Values, build: float) -> Part:
+    """Return the Arrow table of a chunk, whose fixes have the values found."""
+    import pyarrow as pa
+
+    case, method, n = chunk.cell.case, chunk.cell.method, chunk.count
+    problem = case.template
+    # In this order: a trial that failed has NaN for every number, but its truth and its bound are known.
+    values = found | truth_values(case, known)
+    values |= {
+        "key": chunk.cell.key,
+        "data": case.key,
+        "scenario": case.table.name,
+        "method": method.name,
+        "solver": method.solver,
+        "noise": case.level,
+        "noise_unit": case.unit,
+        "noise_label": case.label,
+        "sweep": case.sweep,
+        "kinds": "+".join(rows.kind for rows in problem.rows),
+        "dimension": problem.dimension,
+        "stations": problem.stations.count,
+        "rows": problem.count,
+        "epochs": problem.epochs,
+        "trial": chunk.first + np.arange(n),
+        "seed": list(known.drawn.seed),
+        "build": build,
+        "chunk": chunk.key,
+        "machine": machine(),
+        "versions": versions(),
+    }
+    arrays = [_arrow(column, values[column.name], n) for column in COLUMNS]
+    status, times = np.unique(np.asarray(_spread(values["status"], n), dtype=str), return_counts=True)
+    counts = dict(zip(status.tolist(), times.tolist(), strict=True))
+    return Part(chunk.key, pa.Table.from_arrays(arrays, schema=arrow_schema()), counts)
+
+
+_NUMBERS = {"int": np.int64, "float": np.float64, "bool": np.bool_}
+
+
+def _arrow(column: Column, value: Any, count: int) -> Any:
+    """Return a column (count,) as an Arrow array; one text for all is written once."""
+    import pyarrow as pa
+
+    if column.kind != "category":
+        return pa.array(np.broadcast_to(np.asarray(value, dtype=_NUMBERS[column.kind]), (count,)))
+    if isinstance(value, str):
+        return pa.DictionaryArray.from_arrays(pa.array(np.zeros(count, dtype=np.int32)), pa.array([value]))
+    return pa.array(value, pa.string()).dictionary_encode()
+
+
+# What is written about fixes: errors against truth and bound, consistency, cost, certificate.
+
+# Share of its weight below which a row counts as rejected: what `COLUMNS` says.
+_REJECTED = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Known:
+    """What holds for trials whatever the method.
+
+    Parameters
+    ----------
+    drawn : Drawn
+        The trials.
+    bound : array (n, p, p)
+        Cramer-Rao bound of the shared unknowns at the truth; NaN where the geometry is singular.
+    cost : array (n,)
+        Cost at the truth.
+    """
+
+    drawn: Drawn
+    bound: Array
+    cost: Array
+
+    def part(self, first: int, count: int) -> Known:
+        """Return what holds for some of the trials; of all of them it is the same object, nothing is copied."""
+        if (first, count) == (0, len(self.drawn.truth)):
+            return self
+        kept = slice(first, first + count)
+        return Known(self.drawn.part(first, count), self.bound[kept], self.cost[kept])
+
+
+def known_of(drawn: Drawn) -> Known:
+    """Return bound and cost at the truth of trials."""
+    problem, size = drawn.problem, len(drawn.truth)
+    with np.errstate(all="ignore"):
+        equations = equations_at(problem, drawn.truth)
+        bound = crlb(problem, drawn.truth) if exact(problem) else covariance(equations)[0]
+        cost = eliminated(equations).cost
+    return Known(drawn, np.broadcast_to(bound, (size, *bound.shape[-2:])), np.broadcast_to(cost, (size,)))
+
+
+def truth_values(case: Case, known: Known) -> Values:
+    """Return the columns that do not depend on the method."""
+    problem, truth = known.drawn.problem, known.drawn.truth
+    names = case.state
+    place = _take(problem, truth, names[0])
+    values: Values = {f"truth_{axis}": _component(place, i) for i, axis in enumerate("xyz")}
+    values["outliers"] = known.drawn.bad
+    values |= {"crlb": _root_trace(_block(problem, known.bound, names[0])), "cost_truth": known.cost}
+    moving = len(names) > 1
+    values["crlb_velocity"] = _root_trace(_block(problem, known.bound, names[1])) if moving else np.nan
+    entries = _lengths(problem)
+    variance = np.diagonal(known.bound, axis1=-2, axis2=-1)[:, entries]
+    values["crlb_bias"] = np.sqrt(variance.mean(-1)) if len(entries) else np.nan
+    return values
+
+
+def fix_values(case: Case, known: Known, fix: Fix) -> Values:
+    """Return the columns of fixes (n,) of trials."""
+    problem, truth, names = known.drawn.problem, known.drawn.truth, case.state
+    size = len(truth)
+    x = np.where(np.isfinite(fix.x).all(-1, keepdims=True), fix.x, np.nan)
+    error = _take(problem, x - truth, names[0])
+    claimed = _block(problem, fix.cov, names[0])
+    values: Values = {f"error_{axis}": _component(error, i) for i, axis in enumerate("xyz")}
+    values |= {
+        "answered": fix.answered,
+        "located": np.asarray(np.isfinite(error).all(-1)),
+        "error": np.linalg.norm(error, axis=-1),
+        "error_nearest": _nearest(problem, fix, truth, names[0], error),
+        "deviation": np.sqrt(_squared(error, _block(problem, known.bound, names[0]))),
+        "sigma": _root_trace(claimed),
+        "nees": _squared(error, claimed),
+        "cost": _cost(problem, fix, x),
+        "dof": np.broadcast_to(fix.dof, (size,)),
+        "rejected": np.broadcast_to((fix.weights < _REJECTED * problem.weight).sum(-1), (size,)),
+        "alternatives": np.isfinite(fix.alternatives.gap).sum(-1),
+    }
+    moving = len(names) > 1
+    values["error_velocity"] = np.linalg.norm(_take(problem, x - truth, names[1]), axis=-1) if moving else np.nan
+    entries = _lengths(problem)
+    values["error_bias"] = np.sqrt(((x - truth)[:, entries] ** 2).mean(-1)) if len(entries) else np.nan
+    # Codes index the labels: members of Status are numbered from zero.
+    labels = np.array([status.label for status in Status], dtype=object)
+    values |= {"status": labels[fix.code], "reason": fix.reason}
+    values |= {"proof": [c.proof for c in fix.certificate], "certificate": [c.method for c in fix.certificate]}
+    values["bound"] = np.array([c.bound for c in fix.certificate], dtype=float)
+    return values
+
+
+def _component(place: Array, i: int) -> Any:
+    return place[:, i] if i < place.shape[-1] else np.nan
+
+
+def _take(problem: Problem, x: Array, name: str) -> Array:
+    return problem.layout.take(x, name)
+
+
+def _block(problem: Problem, matrix: Array, name: str) -> Array:
+    slot, _ = problem.layout.find(name)
+    part = slice(slot.start, slot.start + slot.size)
+    return np.asarray(matrix[:, part, part])
+
+
+def _lengths(problem: Problem) -> Array:
+    """Return the entries of the shared unknowns that are biases in metres."""
+    # Clock offsets, not scales or boresights: errors of other units cannot be averaged with them.
+    found = [np.arange(s.start, s.start + s.size) for s in problem.layout.shared if s.members and s.unit == "m"]
+    return np.concatenate([*found, np.zeros(0, dtype=np.int64)])
+
+
+def _root_trace(matrix: Array) -> Array:
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.sqrt(np.trace(matrix, axis1=-2, axis2=-1)))
+
+
+def _squared(error: Array, matrix: Array) -> Array:
+    """Return e' M^-1 e (n,); NaN where there is no error or no regular matrix."""
+    usable = np.asarray(np.isfinite(matrix).all((-1, -2)) & np.isfinite(error).all(-1))
+    # A batch is solved at once: items without a matrix get one, and lose the result.
+    kept = np.where(usable[:, None, None], matrix, np.eye(matrix.shape[-1]))
+    solved, ok = linalg.solve(kept, np.where(usable[:, None], error, 0.0)[..., None])
+    return np.asarray(np.where(usable & ok, (error * solved[..., 0]).sum(-1), np.nan))
+
+
+def _nearest(problem: Problem, fix: Fix, truth: Array, name: str, error: Array) -> Array:
+    best = np.linalg.norm(error, axis=-1)
+    # Where two minima fit, it matters whether the right one is listed at all.
+    for i in range(fix.alternatives.x.shape[1]):
+        with np.errstate(invalid="ignore"):
+            best = np.fmin(best, np.linalg.norm(_take(problem, fix.alternatives.x[:, i] - truth, name), axis=-1))
+    return np.asarray(best)
+
+
+def _cost(problem: Problem, fix: Fix, x: Array) -> Array:
+    """Return the cost of every estimate, that of unrefined ones evaluated here."""
+    # Starts and relaxations carry no cost; only that of the likelihood makes methods comparable.
+    cost = np.where(np.isfinite(fix.cost), fix.cost, np.nan)
+    items = np.flatnonzero(~np.isfinite(cost) & np.isfinite(x).all(-1))
+    if len(items):
+        with np.errstate(all="ignore"):
+            found = eliminated(equations_at(problem.take(items), x[items])).cost
+        cost[items] = np.where(np.isfinite(found), found, np.nan)
+    return cost
+
+
+# Where it was computed, and with what.
+
+
+@cache
+def versions() -> str:
+    """Return the versions of optloc, Python and the libraries that decide numbers, as one line."""
+    names = ("optloc", "numpy", "scipy", "numba", "cvxpy", "clarabel", "casadi", "pyarrow")
+    return "; ".join([f"Python {platform.python_version()}", *(f"{name} {version_of(name)}" for name in names)])
+
+
+@cache
+def machine() -> str:
+    """Return the processor, the number of its cores and the system of this machine as one line."""
+    name = platform.processor() or platform.machine()
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        name = next((line.partition(":")[2].strip() for line in lines if line.startswith("model name")), name)
+    except OSError:
+        pass
+    return f"{name}, {os.cpu_count()} cores, {platform.system()} {platform.release()}"
