@@ -17,6 +17,7 @@ from __future__ import annotations
 import shutil
 import subprocess
 import tempfile
+import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -137,7 +138,7 @@ class Program:
 
     Notes
     -----
-    Waechter and Biegler (2006). Holds a program once built: build one per worker, do not pickle.
+    Waechter and Biegler (2006). Threads may share one: they solve one after the other. Do not pickle.
     """
 
     def __init__(
@@ -177,6 +178,7 @@ class Program:
         faster = library_solver(self._name, self._solver, options) if compiled else None
         self.compiled = faster is not None
         self._solver = self._solver if faster is None else faster
+        self._lock = threading.Lock()
 
     def solve(
         self,
@@ -222,15 +224,16 @@ class Program:
                 _checked("prior information", information, (self.n, self.n)).ravel(order="F"),
             ]
         )
-        found = self._solver(
-            x0=_checked("start", start, (self.n,)),
-            p=data,
-            lbx=_checked("lower", np.full(self.n, -np.inf) if lower is None else lower, (self.n,)),
-            ubx=_checked("upper", np.full(self.n, np.inf) if upper is None else upper, (self.n,)),
-            lbg=np.zeros(self._equal + self._more),
-            ubg=np.concatenate([np.zeros(self._equal), np.full(self._more, np.inf)]),
-        )
-        stats = self._solver.stats()
+        arguments = {
+            "x0": _checked("start", start, (self.n,)),
+            "p": data,
+            "lbx": _checked("lower", np.full(self.n, -np.inf) if lower is None else lower, (self.n,)),
+            "ubx": _checked("upper", np.full(self.n, np.inf) if upper is None else upper, (self.n,)),
+            "lbg": np.zeros(self._equal + self._more),
+            "ubg": np.concatenate([np.zeros(self._equal), np.full(self._more, np.inf)]),
+        }
+        with self._lock:  # the solver has one memory, which threads at once corrupt, and one report, of its last solve
+            found, stats = self._solver(**arguments), self._solver.stats()
         count(self._name, int(stats.get("iter_count", 0)))
         multipliers = _numbers(found["lam_g"])
         return Local(

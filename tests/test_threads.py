@@ -1,7 +1,11 @@
-"""Work over threads: order, errors, what holds for the caller, and that the conic solver lets others run."""
+"""Work over threads: order, errors, caches that all share, and answers that do not depend on who else asks."""
 
+import sys
 import threading
 import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from contextvars import ContextVar
 
 import numpy as np
@@ -9,8 +13,13 @@ import pytest
 
 from formulations.conic import Relaxation
 from formulations.moment_sdp import moment_problem
-from optloc import InvalidProblem
+from formulations.nls import Program
+from optloc import Fix, InvalidProblem, Problem, assemble, measured, simulate, solve
+from optloc.base.cache import Cache
 from optloc.base.threads import mapped, thread_count
+from optloc.compute import tables, trace
+from optloc.linear import indices
+from optloc.solvers import ipopt, range_fixes
 
 
 @pytest.mark.parametrize("threads", [1, 2, 7])
@@ -94,3 +103,149 @@ def test_items_that_take_less_than_threads_are_worth_stay_where_they_are(seconds
     who: set[int] = set()
     assert mapped(slept, range(8), 2, least=5e-3) == list(range(8))
     assert len(who) == (1 if seconds == 0.0 else 3)
+
+
+# Caches that all threads share.
+
+
+@contextmanager
+def restless() -> Iterator[None]:
+    """Let threads interrupt each other every 10 us instead of every 5 ms."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
+
+
+def test_a_cache_makes_a_value_once_whoever_asks():
+    cache: Cache[int] = Cache(1000)
+    made: list[int] = []
+
+    def make(i: int) -> int:
+        time.sleep(1e-4)
+        made.append(i)
+        return i * i
+
+    def ask(i: int) -> int:
+        return cache.find(i % 50, lambda: make(i % 50))
+
+    with restless(), ThreadPoolExecutor(8) as pool:
+        assert list(pool.map(ask, range(4000))) == [(i % 50) ** 2 for i in range(4000)]
+    assert sorted(made) == list(range(50))
+
+
+def test_a_cache_keeps_its_bound_and_what_was_used_last():
+    cache: Cache[int] = Cache(10, lambda value: value)
+    assert [cache.find(key, lambda key=key: key) for key in (4, 3, 2)] == [4, 3, 2]
+    cache.find(4, lambda: pytest.fail("kept"))
+    cache.find(5, lambda: 5)  # 14 of 10: drives out 3 and 2, which were used before 4
+    assert cache.find(4, lambda: pytest.fail("kept")) == 4
+    assert cache.find(3, lambda: 1) == 1
+    assert cache.find(11, lambda: 11) == 11  # too heavy to be kept
+    assert len(cache) == 3
+    cache.clear()
+    assert len(cache) == 0
+
+
+def test_a_cache_of_threads_that_drive_each_other_out_keeps_its_bound():
+    cache: Cache[int] = Cache(30, lambda value: 1 + value % 3)
+    with restless(), ThreadPoolExecutor(8) as pool:
+        found = pool.map(lambda i: cache.find(i * i % 97, lambda: i * i % 97), range(20000))
+        assert list(found) == [i * i % 97 for i in range(20000)]
+    assert 10 <= len(cache) <= 30
+
+
+def test_a_call_that_raises_leaves_nothing_in_a_cache():
+    cache: Cache[int | None] = Cache(5)
+    with pytest.raises(ZeroDivisionError):
+        cache.find("key", lambda: 1 // 0)
+    assert len(cache) == 0
+    assert cache.find("key", lambda: None) is None
+    assert cache.find("key", lambda: pytest.fail("None is a value")) is None
+
+
+KINDS = ("range", "tdoa", "toa", "range_sum", "angles", "mixture", "epochs")
+
+
+def varied(number: int) -> Problem:
+    """Return one of many problems, none of the structure of another: up to 90 rows; every fifth a batch of 20."""
+    rng, kind, d = np.random.default_rng(number), KINDS[number // 2 % len(KINDS)], 2 + number % 2
+    count = int(rng.integers(5, 10))
+    rows = int(rng.integers(count, 14 if number % 3 else 91))
+    a = np.concatenate([rng.permutation(count), rng.integers(0, count, rows - count)])
+    b = (a + rng.integers(1, count, rows)) % count
+    epochs = 3 if kind == "epochs" else 1
+    blocks = {
+        "range": [measured("range", a=a, sigma=5.0)],
+        "tdoa": [measured("tdoa", a=a, b=b, sigma=5.0)],
+        "toa": [measured("toa", a=a, sigma=5.0)],
+        "range_sum": [measured("range_sum", a=a, b=b, sigma=5.0)],
+        "angles": [measured(name, a=a[:45], sigma=2e-3) for name in ("azimuth", "elevation")[: d - 1]],
+        "mixture": [measured("tdoa", a=a[3:], b=b[3:], sigma=5.0), measured("azimuth", a=a[:3], sigma=2e-3)],
+        "epochs": [measured("toa", a=a, epoch=np.sort(rng.integers(0, 3, rows)), sigma=5.0)],
+    }[kind]
+    problem = assemble(rng.uniform(-5e3, 5e3, (count, d)), *blocks, times=np.arange(float(epochs)))
+    truth = np.zeros(problem.layout.size)
+    truth[:d] = rng.uniform(-4e3, 4e3, d)
+    return simulate(problem, np.tile(truth, (20, 1)) if number % 5 == 0 else truth, rng)
+
+
+def assert_same(one: Fix, other: Fix) -> None:
+    """Two fixes are equal to the last bit."""
+    for name in ("x", "cov", "cost", "code", "dof", "weights"):
+        u, v = getattr(one, name), getattr(other, name)
+        assert np.array_equal(u, v, equal_nan=np.asarray(u).dtype.kind == "f"), name
+    for name in ("x", "gap"):
+        assert np.array_equal(getattr(one.alternatives, name), getattr(other.alternatives, name), equal_nan=True), name
+    assert np.array_equal(one.certificate, other.certificate)
+
+
+def solved_in_threads(problems: list[Problem], methods: tuple[str, ...], solves: int) -> None:
+    """Eight threads find the same fixes as one does, with nothing made beforehand."""
+    count = len(problems)
+    tasks = [(i % count, methods[(i + i // count) % len(methods)]) for i in range(solves)]
+    alone = {task: solve(problems[task[0]], task[1]) for task in set(tasks)}
+    for cache in (indices._PLANS, tables._KEPT, trace._TRACED, range_fixes._KEPT, ipopt._PROGRAMS):
+        cache.clear()
+
+    def again(task: tuple[int, str]) -> None:
+        assert_same(solve(problems[task[0]], task[1]), alone[task])
+
+    with restless(), ThreadPoolExecutor(8) as pool:
+        for _ in pool.map(again, tasks):
+            pass
+
+
+def test_threads_solve_different_problems_as_one_thread_does():
+    solved_in_threads([varied(i) for i in range(120)], ("gtrs+lsr", "auto"), 500)
+
+
+@pytest.mark.full
+def test_threads_solve_many_different_problems_as_one_thread_does():
+    solved_in_threads([varied(i) for i in range(400)], ("gtrs+lsr", "auto"), 5000)
+
+
+@pytest.mark.parametrize("methods", [("gtrs+nlp+lsr",), ("sdp+lsr", "socp+lsr"), ("sparse+lsr",)])
+def test_threads_share_the_programs_of_back_ends(methods):
+    """Forty problems of four structures: a program of IPOPT or Clarabel serves several threads at a time."""
+    problems = [
+        simulate(varied(i), np.resize([1e3, -2e3, 500.0], varied(i).layout.size), k)
+        for i in (0, 1, 2, 3)
+        for k in range(10)
+    ]
+    solved_in_threads([p.take(np.arange(1)) if p.batch_shape else p for p in problems], methods, 80)
+
+
+def test_a_nonlinear_program_serves_several_threads_at_a_time():
+    """CasADi's function would corrupt its memory, and report another solve's end."""
+    station = np.random.default_rng(0).uniform(-5.0, 5.0, (6, 2))
+    program = Program(2, 6, h=lambda x, p: [((x[0] - a) ** 2 + (x[1] - b) ** 2) ** 0.5 for a, b in station])
+    draw = np.random.default_rng(1)
+    tasks = [(draw.uniform(-50.0, 50.0, 2), draw.uniform(1.0, 9.0, 6)) for _ in range(100)]
+    alone = [program.solve(*task) for task in tasks]
+    with restless(), ThreadPoolExecutor(8) as pool:
+        for found, other in zip(pool.map(lambda task: program.solve(*task), tasks), alone, strict=True):
+            assert np.array_equal(found.x, other.x)
+            assert (found.status, found.iterations) == (other.status, other.iterations)

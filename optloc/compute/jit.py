@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import cache, cached_property, update_wrapper
+from functools import cache, update_wrapper
+from threading import Lock
 from typing import Any, TypeVar, cast
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 _PLAIN = ContextVar("plain", default=False)
+_LOCK = Lock()
 
 
 @cache
@@ -43,13 +45,18 @@ class _Kernel:
 
     def __init__(self, function: Callable[..., Any], inline: str) -> None:
         self.function, self.inline, self.ready = function, inline, False
+        self._machine: Any = None
         update_wrapper(self, function)
 
-    @cached_property
+    @property
     def machine(self) -> Any:
         """The compiled form; without an entry for C, which nobody calls, it is made a fifth faster."""
-        options = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-        return _numba().njit(**options, inline=self.inline)(self.function)
+        if self._machine is None:
+            with _LOCK:  # one form for all threads: numba compiles, and looks up types, for each form anew
+                if self._machine is None:
+                    options = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+                    self._machine = _numba().njit(**options, inline=self.inline)(self.function)
+        return self._machine
 
     def __getattr__(self, name: str) -> Any:
         """Return what numba wants to know of a function that a kernel calls."""

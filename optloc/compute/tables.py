@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from optloc.base.cache import Cache
 from optloc.base.types import Array
 from optloc.compute.trace import Traced, traced
 from optloc.linear.evaluate import given
@@ -274,9 +275,10 @@ class Sources:
         return np.concatenate(out)
 
 
-_KEPT: dict[tuple[Any, ...], Kept | None] = {}
 # Tables of longer problems are made anew each time: that takes less time than a fix, and no memory that lasts.
-_KEPT_ROWS, _KEPT_LINES = 2**13, 2**19
+_KEPT_ROWS = 2**13
+# 2**19 lines of six whole numbers are 24 MB; a structure without tables counts as one line.
+_KEPT = Cache["Kept | None"](2**19, lambda kept: 1 if kept is None else len(kept.tables.table))
 
 
 def tables(problem: Problem, groups: tuple[Array, ...]) -> Kept | None:
@@ -294,11 +296,7 @@ def tables(problem: Problem, groups: tuple[Array, ...]) -> Kept | None:
         return _tables(problem, groups, sources)
     shapes = tuple(array.shape[array.ndim - core :] for array, core in sources.arrays)
     key = (problem.structure, shapes, sources.own, *((g.shape, g.tobytes()) for g in groups))
-    if key not in _KEPT:
-        if sum(len(kept.tables.table) for kept in _KEPT.values() if kept is not None) > _KEPT_LINES:
-            _KEPT.clear()
-        _KEPT[key] = _tables(problem, groups, sources)
-    return _KEPT[key]
+    return _KEPT.find(key, lambda: _tables(problem, groups, sources))
 
 
 def _tables(problem: Problem, groups: tuple[Array, ...], sources: Sources) -> Kept | None:

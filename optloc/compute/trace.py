@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from optloc.base.cache import Cache
 from optloc.base.types import Array
 from optloc.linear.evaluate import joined
 from optloc.linear.indices import Plan
@@ -345,7 +346,8 @@ class Traced:
     seeds: tuple[int, ...]
 
 
-_TRACED: dict[tuple[Any, ...], Traced | None] = {}
+# A dozen kinds, in two dimensions, with a few sets of unknowns each; every origin of local coordinates has its own.
+_TRACED = Cache["Traced | None"](256)
 
 
 def traced(problem: Problem, plan: Plan, given: frozenset[int], moved: frozenset[int]) -> Traced | None:
@@ -365,9 +367,7 @@ def traced(problem: Problem, plan: Plan, given: frozenset[int], moved: frozenset
     model = plan.model
     frame = problem.frame if model.ecef else None
     key = (model, given, moved, problem.dimension, frame)
-    if key not in _TRACED:
-        _TRACED[key] = _trace(problem, model, given, moved)
-    return _TRACED[key]
+    return _TRACED.find(key, lambda: _trace(problem, model, given, moved))
 
 
 def _trace(problem: Problem, model: Model, given: frozenset[int], moved: frozenset[int]) -> Traced | None:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from optloc.base.arrays import gather, placed
+from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Rows
 from optloc.models import MODELS, Model
@@ -114,21 +115,17 @@ def columns(layout: Layout, name: str, epoch: Array) -> Array:
     return np.broadcast_to(np.asarray(base)[..., None] + np.arange(slot.size), (len(epoch), slot.size))
 
 
-_PLANS: dict[tuple[Any, ...], tuple[Plan, ...]] = {}
-# Plans of longer problems are made anew: that takes less time than their rows do, and no memory that lasts.
+# Rows of a problem whose plans are kept, half of what all kept ones may have: a longer problem is planned anew, which
+# takes less time than its rows do, and no memory that lasts.
 _KEPT_ROWS = 4096
+_PLANS = Cache[tuple[Plan, ...]](2 * _KEPT_ROWS, lambda kept: sum(plan.block.count for plan in kept))
 
 
 def plans(problem: Problem) -> tuple[Plan, ...]:
     """Return the plan of each block of rows; kept for problems of equal structure that are not long."""
     if problem.count > _KEPT_ROWS:
         return _plans(problem)
-    key = problem.structure
-    if key not in _PLANS:
-        if sum(plan.block.count for kept in _PLANS.values() for plan in kept) > 2 * _KEPT_ROWS:
-            _PLANS.clear()
-        _PLANS[key] = _plans(problem)
-    return _PLANS[key]
+    return _PLANS.find(problem.structure, lambda: _plans(problem))
 
 
 def _plans(problem: Problem) -> tuple[Plan, ...]:

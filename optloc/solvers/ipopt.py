@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import os
-from functools import lru_cache
 from time import perf_counter
 from typing import Any
 
 import numpy as np
 
-from formulations.backend import chosen
+from formulations.backend import Choice, chosen
 from formulations.nls import Program
+from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem
 from optloc.base.status import Status
 from optloc.base.types import Array
@@ -122,7 +122,7 @@ class _Scaled:
         self.unit, self.centre = unit, centre
         rows = parameters(problem)
         self.data = np.concatenate([unit, centre, rows, [size], bounds(problem)])
-        self.program = _program(_Key(problem, len(self.data), len(rows)))
+        self.program = _program(problem, len(self.data), len(rows))
         self.weight = _whitening(problem)
         self.z = np.where(problem.weight[0] > 0.0, problem.observed[0], 0.0)
         self.prior = _prior(problem, unit, centre)
@@ -135,58 +135,45 @@ class _Scaled:
         return found.x * self.unit + self.centre, found.cost, int(code)
 
 
-class _Key:
-    """A problem that is equal to another of the same structure: the key of a compiled program."""
-
-    def __init__(self, problem: Problem, data: int, rows: int) -> None:
-        self.problem, self.data, self.rows = problem, data, rows
-        s = problem.stations
-        shapes = tuple(None if a is None else a.shape[-3:] for a in (s.position, s.velocity, s.axes))
-        limits = tuple(
-            (bool(np.all(b.lower == b.upper)), bool(np.isfinite(b.lower).all()), bool(np.isfinite(b.upper).all()))
-            for b in conjunction(problem)
-        )
-        self.choice = chosen("nonlinear")
-        self.compiled = os.environ.get(_COMPILE, "") == "1"
-        self.key = (
-            problem.structure,
-            data,
-            shapes,
-            limits,
-            None if self.choice is None else self.choice.key,
-            self.compiled,
-        )
-
-    def __hash__(self) -> int:
-        return hash(self.key)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Key) and self.key == other.key
+# Programs take up to a second to build, and some megabytes.
+_PROGRAMS = Cache[Program](64)
 
 
-@lru_cache(maxsize=64)
-def _program(key: _Key) -> Program:
-    problem, n = key.problem, key.problem.layout.size
+def _program(problem: Problem, data: int, rows: int) -> Program:
+    """Return the program of a structure, whose parameters are so many data, `rows` of them those of the rows."""
+    choice, compiled = chosen("nonlinear"), os.environ.get(_COMPILE, "") == "1"
+    s = problem.stations
+    shapes = tuple(None if a is None else a.shape[-3:] for a in (s.position, s.velocity, s.axes))
+    limits = tuple(
+        (bool(np.all(b.lower == b.upper)), bool(np.isfinite(b.lower).all()), bool(np.isfinite(b.upper).all()))
+        for b in conjunction(problem)
+    )
+    key = (problem.structure, data, shapes, limits, None if choice is None else choice.key, compiled)
+    return _PROGRAMS.find(key, lambda: _built(problem, data, rows, choice, compiled))
+
+
+def _built(problem: Problem, data: int, rows: int, choice: Choice | None, compiled: bool) -> Program:
+    n = problem.layout.size
 
     def scaled(y: Any, p: Any, z: Any) -> list[Any]:
         return residual(problem, y * p[:n] + p[n : 2 * n], p[2 * n :], z)
 
     def limited(y: Any, p: Any) -> tuple[list[Any], list[Any]]:
-        last = 2 * n + key.rows
+        last = 2 * n + rows
         return constrained(problem, y * p[:n] + p[n : 2 * n], p[last + 1 :], p[last])
 
     equal, more = ((lambda y, p, i=i: limited(y, p)[i]) if problem.constraints else None for i in (0, 1))
     return Program(
         n,
         problem.count,
-        key.data,
+        data,
         residual=scaled,
         equalities=equal,
         inequalities=more,
         diagonal=_independent(problem),
         settings={"bound_relax_factor": 0.0, "max_iter": 200},  # by default constraints give way by 1e-8
-        choice=key.choice,
-        compiled=key.compiled,
+        choice=choice,
+        compiled=compiled,
     )
 
 

@@ -1,0 +1,92 @@
+"""What is made once for problems of equal structure and kept: one type of cache for all of optloc, safe in threads.
+
+Plans, tables, traces, linear maps and programs of IPOPT live in caches of this type, keyed by
+`optloc.problem.problem.Problem.structure` and what else they depend on. Functions of a few plain numbers, such as the
+moments of a loss, are kept by `functools.lru_cache` instead, which is locked and bounded as well; there two threads may
+make the same value at once, which costs microseconds.
+
+What is kept is shared by all threads: nobody writes into it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass, field
+from threading import Lock
+from typing import Generic, TypeVar, cast
+
+Value = TypeVar("Value")
+
+# None is a value (there are no tables for some structures), so a place that waits for its value holds this.
+_NOTHING = object()
+
+
+@dataclass(slots=True, eq=False)
+class _Place:
+    """Where the value of a key stands; its lock is held by the thread that makes the value."""
+
+    value: object = _NOTHING
+    weight: int = 0
+    lock: Lock = field(default_factory=Lock)
+
+
+class Cache(Generic[Value]):
+    """Values by key, made when they are first asked for; those that were not used for longest leave first.
+
+    A value is made once, whichever thread asks first: others wait for it, while values of other keys can be had and
+    made. A call that raises leaves nothing behind. To make a value may take other caches, never the same key of this.
+
+    Parameters
+    ----------
+    most : int
+        Bound on the sum of the weights of the values kept; a heavier value is handed out and not kept.
+    weigh : callable, optional
+        Weight of a value; 1 if absent, which makes `most` a count.
+    """
+
+    __slots__ = ("_lock", "_most", "_places", "_total", "_weigh")
+
+    def __init__(self, most: int, weigh: Callable[[Value], int] | None = None) -> None:
+        self._most, self._weigh = most, weigh
+        self._lock, self._total = Lock(), 0
+        self._places: dict[Hashable, _Place] = {}  # in the order of their last use
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def clear(self) -> None:
+        """Forget all values."""
+        with self._lock:
+            self._places.clear()
+            self._total = 0
+
+    def find(self, key: Hashable, make: Callable[[], Value]) -> Value:
+        """Return the value of a key, made by a call without arguments where it is not kept."""
+        with self._lock:
+            place = self._places.pop(key, None) or _Place()
+            self._places[key] = place
+        if place.value is _NOTHING:
+            # Not under the lock of all: a program takes a second, and plans are needed to make tables.
+            with place.lock:
+                if place.value is _NOTHING:
+                    self._fill(key, place, make)
+        return cast("Value", place.value)
+
+    def _fill(self, key: Hashable, place: _Place, make: Callable[[], Value]) -> None:
+        try:
+            value = make()
+        except BaseException:
+            with self._lock:
+                if self._places.get(key) is place:
+                    del self._places[key]
+            raise
+        with self._lock:
+            place.value, place.weight = value, 1 if self._weigh is None else self._weigh(value)
+            if self._places.get(key) is not place:  # driven out while it was made
+                return
+            if place.weight > self._most:
+                del self._places[key]
+                return
+            self._total += place.weight
+            while self._total > self._most:
+                self._total -= self._places.pop(next(iter(self._places))).weight
