@@ -5,17 +5,20 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
+from optloc.base import frames, units
 from optloc.base.errors import InvalidProblem, NoSolution, OptlocError
 from optloc.base.frames import CARTESIAN, ECEF, Frame
 from optloc.base.status import Certificate, Status
 from optloc.base.types import Bias, Motion, Prior, Rows, Stations
 from optloc.bounds.crlb import Course, crlb, crlb_course
 from optloc.bounds.observability import Observability, observability
+from optloc.linear import constraints
 from optloc.linear.evaluate import predict
 from optloc.linear.gauss_newton import gauss_newton
 from optloc.linear.normal import Linear, Normal, linearise, normal
 from optloc.linear.simulate import simulate
 from optloc.models import MODELS, Model
+from optloc.problem import epochs, noise
 from optloc.problem.bias import with_bias, with_known_bias
 from optloc.problem.build import assemble, measured, station_array
 from optloc.problem.epochs import by_epoch
@@ -77,14 +80,18 @@ __all__ = [
     "assemble",
     "by_epoch",
     "certify",
+    "constraints",
     "crlb",
     "crlb_course",
+    "epochs",
+    "frames",
     "from_table",
     "gauss_newton",
     "health",
     "linearise",
     "load",
     "measured",
+    "noise",
     "noise_levels",
     "normal",
     "observability",
@@ -97,6 +104,7 @@ __all__ = [
     "solve",
     "station_array",
     "suspects",
+    "units",
     "with_bias",
     "with_estimated_noise",
     "with_known_bias",

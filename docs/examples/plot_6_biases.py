@@ -10,11 +10,11 @@ from importlib.resources import files
 import numpy as np
 
 import optloc
-from optloc.base.units import SPEED_OF_LIGHT
+from optloc import units
 from optloc.plot import plot_biases
 from optloc.solvers.running import growing
 
 problem = optloc.load(files("optloc") / "scenarios" / "registration.toml")
 found = growing(problem, optloc.solve(problem), np.unique(np.geomspace(4, 200, 30).astype(int)))
-truth = {"clock": SPEED_OF_LIGHT * 1e-9 * np.array([100.0, -133.0, 167.0, -100.0])}
+truth = {"clock": units.SPEED_OF_LIGHT * 1e-9 * np.array([100.0, -133.0, 167.0, -100.0])}
 figure = plot_biases(found, "Five aircraft, one emitter, four clock errors", truth=truth)
