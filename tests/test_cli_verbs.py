@@ -4,13 +4,15 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import dataclass
 
 import pytest
 import typer
 from typer.testing import CliRunner
 
 from optloc.cli import app
-from optloc.cli.listing import LISTS
+from optloc.cli.listing import LISTS, describe
+from optloc.track import UPDATES
 
 RUN = CliRunner()
 
@@ -239,6 +241,32 @@ def test_every_list_has_names_and_summaries(what):
     rows = json.loads(RUN.invoke(app, ["list", what, "--json"]).stdout)
     assert rows
     assert all(row["summary"] for row in rows)
+
+
+def test_help_names_every_list():
+    words = " ".join(RUN.invoke(app, ["list", "--help"]).stdout.replace("\u2502", " ").split())
+    assert [name for name in LISTS if name not in words] == []
+
+
+def test_an_entry_from_elsewhere_is_listed(monkeypatch):
+    monkeypatch.setitem(UPDATES, "mine", lambda scan, mean, cov: None)
+    rows = json.loads(RUN.invoke(app, ["list", "trackers", "--json"]).stdout)
+    assert "mine" in [row["tracker"] for row in rows]
+
+
+@dataclass
+class Entry:
+    """What an entry is."""
+
+    kinds: tuple[str, ...]
+    bound: object
+    exact: bool = True
+
+
+def test_entries_show_what_they_say_in_words():
+    assert describe("method", {"quick": "gtrs+lsr"}) == [{"method": "quick", "summary": "gtrs+lsr"}]
+    (row,) = describe("way", {"a": Entry(("tdoa", "range"), bound=len)})
+    assert row == {"way": "a", "kinds": "tdoa range", "exact": "True", "summary": "What an entry is."}
 
 
 def test_names_are_completed():

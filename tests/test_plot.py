@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from optloc.base.linalg import error_ellipse
-from optloc.cli.fixed import fix_file
+from optloc.cli.file_fixes import fix_file
 from optloc.files import from_table, read
 from optloc.plot import plot_fixes, save
 from optloc.plot.style import scene_of

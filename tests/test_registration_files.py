@@ -13,7 +13,7 @@ from bad_input import HEAD, write
 from typer.testing import CliRunner
 
 from optloc.cli import app
-from optloc.cli.fixed import fix_file
+from optloc.cli.file_fixes import fix_file
 from optloc.files import load, read
 from optloc.plot import plot_course, plot_fixes
 from optloc.plot.style import scene_of

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from optloc import ECEF, MODELS, Model, Status, by_epoch, solve
 from optloc.cli import app
-from optloc.cli.first_steps import starters
+from optloc.cli.starters import starters
 from optloc.files import read
 from optloc.models.primitives import distance
 from optloc.problem.epochs import separable

@@ -1,4 +1,4 @@
-"""Entry point; bad input ends in one sentence and exit code 2."""
+"""The commands of ``optloc`` with their arguments and help; what each does is in the module that it calls."""
 
 from __future__ import annotations
 
@@ -22,9 +22,12 @@ from optloc.cli.options import (
     ProblemPath,
     Quiet,
     Verbose,
+    complete,
+    constraints,
     example,
-    names,
+    find_problem,
 )
+from optloc.cli.study import study
 
 # Heavy libraries are imported inside the commands, so that --help answers at once.
 
@@ -34,14 +37,19 @@ app = typer.Typer(
     cls=Group,
     no_args_is_help=True,
     rich_markup_mode="rich",
-    pretty_exceptions_enable=False,
+    pretty_exceptions_enable=False,  # a mistake of optloc shows its whole traceback
     help="Position fixes from time, gain, angle and Doppler measurements, with covariance and verdict.",
     epilog=f"{EXIT_CODES} With --install-completion the Tab key completes commands, options and their values.\n\n"
     + example("optloc demo", "optloc new tdoa --out site.toml", "optloc fix site.toml --plot fix.png"),
 )
 
 
-def _version(wanted: bool) -> None:
+def main() -> None:
+    """Run the command line."""
+    app()
+
+
+def _print_version(wanted: bool) -> None:
     if wanted:
         from importlib.metadata import PackageNotFoundError, version
 
@@ -55,7 +63,7 @@ def _version(wanted: bool) -> None:
 @app.callback()
 def _options(
     version: Annotated[
-        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
 ) -> None:
     pass
@@ -91,9 +99,8 @@ def fix(
     Options such as --height add to the constraints of the file.
     """
     from optloc.cli.fix import run_fix
-    from optloc.cli.options import demanded
 
-    more = demanded(height, above_ground, box)
+    more = constraints(height, above_ground, box)
     files = {"geojson_path": geojson, "plot": plot, "out": out, "html": html}
     code = run_fix(file, method, more, as_json=as_json, **files, quiet=quiet, noise=noise)
     raise typer.Exit(code)
@@ -111,21 +118,35 @@ def track(
     file: ProblemPath,
     model: Annotated[
         str,
-        typer.Option(metavar="cv|ca|static|singer|csm", help="How the target moves; csm: current statistical model."),
+        typer.Option(
+            metavar="NAME",
+            autocompletion=complete("motions"),
+            help="How the target moves, such as cv or csm; see [bold]optloc list motions[/bold].",
+        ),
     ] = "cv",
     filter_: Annotated[
-        str, typer.Option("--filter", metavar="iekf|ekf|mgekf|mvekf", help="How a scan updates the state.")
+        str,
+        typer.Option(
+            "--filter",
+            metavar="NAME",
+            autocompletion=complete("trackers"),
+            help="How a scan updates the state; see [bold]optloc list trackers[/bold].",
+        ),
     ] = "iekf",
     loss: Annotated[
         str | None,
-        typer.Option(metavar="huber|cauchy|truncated|late", help="Weigh the rows of a scan by a robust loss."),
+        typer.Option(
+            metavar="NAME",
+            autocompletion=complete("losses"),
+            help="Weigh the rows of a scan by a robust loss; see [bold]optloc list losses[/bold].",
+        ),
     ] = None,
     noise: Annotated[
         float | None,
         typer.Option(
             metavar="SD",
-            help="Standard deviation, SI units, of what drives the target: velocity (static, 0 by default), "
-            "acceleration (cv, singer: 1), jerk (ca: 1); csm: the largest acceleration (10).",
+            help="Standard deviation, SI units, of what drives the target, or csm's largest acceleration; by default "
+            "what [bold]optloc list motions[/bold] says.",
         ),
     ] = None,
     memory: Annotated[
@@ -291,12 +312,52 @@ def check(
     raise typer.Exit(run_check(file, as_json, Asked(not no_solve, method, by, out, plot), quiet=quiet))
 
 
-def main() -> None:
-    """Run the command line."""
-    app()
+@app.command(
+    rich_help_panel=ANSWERS,
+    epilog=example(
+        "optloc plot landscape site.toml",
+        "optloc plot convergence demo --out story.svg",
+        "optloc plot residuals flight.toml --out residuals.pdf",
+        "optloc plot accuracy shootout-study",
+    ),
+)
+def plot(
+    what: Annotated[
+        str,
+        typer.Argument(
+            metavar="WHAT",
+            autocompletion=complete("pictures"),
+            help="Picture; see [bold]optloc list pictures[/bold].",
+        ),
+    ],
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            help="Problem file, name of a shipped problem, or folder of a study.",
+            callback=find_problem,
+        ),
+    ],
+    out: Annotated[
+        Path | None, typer.Option(metavar="OUT", help="Picture to write: .png, .svg or .pdf; WHAT.png by default.")
+    ] = None,
+    method: Method = "auto",
+    epoch: Annotated[
+        str | None, typer.Option(metavar="LABEL", help="Epoch that is drawn, or case of a study; the first by default.")
+    ] = None,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Draw a picture of a problem and its fix.
 
+    fix: stations, fix, 95 % ellipse and alternatives. landscape: the cost over the place of the target. convergence:
+    where iterations from many starts end. residuals: by station. biases: of a run against time, with 95 %. bound: map
+    of the Cramer-Rao bound. track: of a run. accuracy: errors of a study's methods against the bound.
+    """
+    from optloc.cli.pictures import Asked, run_plot
 
-# The commands of the first minutes: demo, new, convert.
+    place = Path(f"{what}.png") if out is None else out
+    raise typer.Exit(run_plot(what, Asked(file, place, method, epoch), quiet))
 
 
 @app.command(
@@ -307,8 +368,8 @@ def demo(
         str | None,
         typer.Argument(
             metavar="[NAME]",
-            autocompletion=names("demos"),
-            help="A shipped problem: demo, ambiguous, run, registration.",
+            autocompletion=complete("demos"),
+            help="A shipped problem; see [bold]optloc list demos[/bold].",
         ),
     ] = None,
     plot: Annotated[
@@ -319,7 +380,7 @@ def demo(
     verbose: Verbose = False,
 ) -> None:
     """Walk through a fix, a registration and a proof; or fix one shipped problem."""
-    from optloc.cli.first_steps import run_demo
+    from optloc.cli.starters import run_demo
 
     raise typer.Exit(run_demo(name, plot, as_json=as_json, quiet=quiet))
 
@@ -333,7 +394,7 @@ def new(
         str,
         typer.Argument(
             metavar="KIND",
-            autocompletion=names("starters"),
+            autocompletion=complete("starters"),
             help="A measurement kind (tdoa, range, ...) or a common mixture; see [bold]optloc list starters[/bold].",
         ),
     ],
@@ -345,7 +406,7 @@ def new(
     verbose: Verbose = False,
 ) -> None:
     """Write a problem file with comments that can be fixed as it is, to begin with."""
-    from optloc.cli.first_steps import run_new
+    from optloc.cli.starters import run_new
 
     raise typer.Exit(run_new(kind, out, force=force, quiet=quiet))
 
@@ -395,13 +456,10 @@ def convert(
     verbose: Verbose = False,
 ) -> None:
     """Read a table of arrival times or pseudoranges, or GeoJSON stations, into a problem file."""
-    from optloc.cli.first_steps import run_convert
+    from optloc.cli.starters import run_convert
 
     options = {"stations": stations, "sigma": sigma, "unit": unit, "what": as_, "frame": frame}
     raise typer.Exit(run_convert(file, out, column or [], as_json=as_json, quiet=quiet, **options))
-
-
-# The commands that make papers again and list what there is: reproduce, list, schema.
 
 
 @app.command(
@@ -411,7 +469,11 @@ def convert(
 def reproduce(
     name: Annotated[
         str,
-        typer.Argument(metavar="PAPER", help="Name of a paper: angles, bistatic, kinematic, registration, satellites."),
+        typer.Argument(
+            metavar="PAPER",
+            autocompletion=complete("papers"),
+            help="Name of a paper; see [bold]optloc list papers[/bold].",
+        ),
     ],
     size: Annotated[str, typer.Option(metavar="quick|full", help="Two minutes, or the sample sizes of the paper.")] = (
         "quick"
@@ -424,12 +486,12 @@ def reproduce(
     verbose: Verbose = False,
 ) -> None:
     """Make the simulations of a paper again: tables and pictures with printed value, reproduced value and bound."""
-    from optloc.cli.listing import run_reproduce
+    from optloc.cli.study import run_reproduce
 
     raise typer.Exit(run_reproduce(name, size, out, seed, quiet))
 
 
-def _tables() -> list[str]:
+def _lists() -> list[str]:
     from optloc.cli.listing import LISTS
 
     return list(LISTS)
@@ -443,8 +505,9 @@ def list_(
         str,
         typer.Argument(
             metavar="WHAT",
-            autocompletion=_tables,
-            help="kinds, formulations, solvers, methods, baselines, executors, studies, datasets, demos or starters.",
+            autocompletion=_lists,
+            help="kinds, formulations, solvers, methods, losses, trackers, motions, baselines, executors, studies, "
+            "papers, datasets, pictures, demos or starters.",
         ),
     ],
     as_json: Json = False,
@@ -465,47 +528,4 @@ def schema(verbose: Verbose = False) -> None:
     typer.echo(dumps(of_files()))
 
 
-# The verb ``optloc plot``.
-
-WHAT = "fix, landscape, convergence, residuals, biases, bound, track or accuracy."
-
-
-def _pictures() -> list[str]:
-    from optloc.cli.pictures import PICTURES
-
-    return list(PICTURES)
-
-
-EXAMPLES = example(
-    "optloc plot landscape site.toml",
-    "optloc plot convergence demo --out story.svg",
-    "optloc plot residuals flight.toml --out residuals.pdf",
-    "optloc plot accuracy shootout-study",
-)
-
-
-def plot(
-    what: Annotated[str, typer.Argument(metavar="WHAT", autocompletion=_pictures, help=WHAT)],
-    file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="Problem file, name of a shipped problem, or folder of a study.")
-    ],
-    out: Annotated[
-        Path | None, typer.Option(metavar="OUT", help="Picture to write: .png, .svg or .pdf; WHAT.png by default.")
-    ] = None,
-    method: Method = "auto",
-    epoch: Annotated[
-        str | None, typer.Option(metavar="LABEL", help="Epoch that is drawn, or case of a study; the first by default.")
-    ] = None,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-) -> None:
-    """Draw a picture of a problem and its fix.
-
-    fix: stations, fix, 95 % ellipse and alternatives. landscape: the cost over the place of the target. convergence:
-    where iterations from many starts end. residuals: by station. biases: of a run against time, with 95 %. bound: map
-    of the Cramer-Rao bound. track: of a run. accuracy: errors of a study's methods against the bound.
-    """
-    from optloc.cli.pictures import Asked, run_plot
-
-    place = Path(f"{what}.png") if out is None else out
-    raise typer.Exit(run_plot(what, Asked(file, place, method, epoch), quiet))
+app.add_typer(study, name="study", rich_help_panel=MORE)

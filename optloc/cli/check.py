@@ -4,155 +4,28 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Bias
-from optloc.cli.fixed import CHUNK, Columns, bar
-from optloc.cli.output import dumps, with_sigma, write_table, write_text
+from optloc.cli.file_fixes import CHUNK
+from optloc.cli.fix import grouping_of
+from optloc.cli.output import Columns, bar, dumps, records, say_all, with_sigma, write_picture, write_table, write_text
 from optloc.files import Loaded, read
 from optloc.linear.constraints import exact
 from optloc.models import MODELS
 from optloc.problem.epochs import separable
 from optloc.problem.problem import Problem
-from optloc.quality.elements import GROUPINGS, By, batch_of
+from optloc.quality.elements import By, batch_of
 from optloc.quality.health import Health, health_of
-from optloc.solvers.methods import SOLVERS, branches_of
+from optloc.solvers.methods import branches_of
 
-# Health of stations for people and machines: made from a file's fixes while a bar moves.
-
-
-@dataclass(frozen=True, slots=True)
-class Checked:
-    """Health of the stations of a file, or why there is none."""
-
-    health: Health | None
-    why: str = ""
-
-
-def checked_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
-    """Return the health of the stations of a file, each of whose epochs is fixed by itself."""
-    problem = loaded.problem
-    if problem.epochs < 2:
-        return Checked(None, "station health needs several epochs, and the file has one")
-    calibrating = all(motion.known is not None for motion in problem.motions)
-    if not separable(problem) and not (calibrating and not problem.biases):
-        return Checked(None, "station health needs epochs that are fixed one by one, and these share unknowns")
-    if not np.isfinite(problem.z[problem.weight > 0.0]).all():
-        return Checked(None, "station health needs measured values")
-    try:
-        return Checked(_made(loaded, method, by, quiet))
-    except InvalidProblem as error:
-        if error.where in ("by", "method"):
-            raise
-        return Checked(None, f"station health could not be told: {error}".removesuffix("."))
-
-
-def _made(loaded: Loaded, method: str, by: By, quiet: bool) -> Health:
-    from optloc.solvers import solve
-
-    batch = batch_of(loaded.problem)
-    count = batch.batch_shape[0]
-    vectors, explained = np.full((count, batch.layout.size), np.nan), np.full(count, None, dtype=object)
-    if not batch.layout.size:
-        return health_of(batch, (np.arange(count), np.zeros((count, 0))), by)
-    with bar(loaded.title, count, quiet) as advance:
-        for first in range(0, count, CHUNK):
-            items = np.arange(first, min(first + CHUNK, count))
-            fix = solve(batch.take(items), method)
-            vectors[items] = np.where(fix.answered[:, None], fix.x, np.nan)
-            found = getattr(fix, "explanations", None)
-            explained[items] = None if found is None else found
-            advance(len(items))
-    kept = np.flatnonzero(np.isfinite(vectors).all(-1))
-    if not len(kept):
-        raise InvalidProblem("no epoch has a fix", loaded.source, "see `optloc fix` for the reasons")
-    asked = any(each is not None for each in explained)
-    return health_of(batch, (kept, vectors[kept]), by, explained if asked else None)
-
-
-def health_columns(health: Health) -> Columns:
-    """Return the table of health: one row for each station, SI units and radians, NaN where there is no number."""
-    return {
-        "name": np.array(health.names, dtype=object),
-        "unit": np.array(health.units, dtype=object),
-        "count": health.count,
-        "bias": health.bias,
-        "bias_error": health.bias_error,
-        "scale": health.scale,
-        "scale_error": health.scale_error,
-        "noise": health.noise,
-        "noise_error": health.noise_error,
-        "outliers": health.outliers,
-        "suspect": health.suspect,
-    }
-
-
-def health_json(checked: Checked) -> dict[str, Any]:
-    """Return health as one JSON value."""
-    if checked.health is None:
-        return {"stations": [], "sentences": [checked.why]}
-    columns = health_columns(checked.health)
-    rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-    levels = checked.health.levels
-    noise = {"by": levels.by, "fixes": levels.fixes, "chi_square_stated": levels.before, "chi_square": levels.after}
-    return {"stations": rows, "noise": noise, "sentences": list(checked.health.sentences)}
-
-
-def show_health(checked: Checked, console: Console) -> None:
-    """Print health as a table, the largest biases first."""
-    health = checked.health
-    if health is None:
-        console.print(_sentence(checked.why), highlight=False, markup=False, soft_wrap=True)
-        return
-    scaled, suspected = np.isfinite(health.scale).any(), np.isfinite(health.suspect).any()
-    table = Table(title=f"Health by {health.by}", title_justify="left")
-    table.add_column(health.by)
-    wanted = ["fixes", "bias", *(["scale, ppm"] if scaled else []), "noise", "outliers"]
-    for name in [*wanted, *(["suspect"] if suspected else [])]:
-        table.add_column(name, justify="right")
-    for i in order(health):
-        cells = [str(health.count[i]), _told(health.bias[i], health.bias_error[i], health.units[i])]
-        cells += [_told(1e6 * health.scale[i], 1e6 * health.scale_error[i], "")] if scaled else []
-        cells += [_told(health.noise[i], health.noise_error[i], health.units[i]), f"{health.outliers[i]:.1%}"]
-        cells += [f"{health.suspect[i]:.1%}"] if suspected else []
-        table.add_row(health.names[i], *cells)
-    console.print(table)
-    levels = health.levels
-    chi = f"chi-square per degree of freedom {levels.before:.3g} with the noise as stated, {levels.after:.3g} as found"
-    what = "bias and noise are of measured less predicted by the rest of each fix"
-    for sentence in (f"{levels.fixes} fixes; {what}; {chi}", *health.sentences):
-        console.print(_sentence(sentence), highlight=False, markup=False, soft_wrap=True)
-
-
-def order(health: Health) -> Array:
-    """Return the groups in the order of their biases, those in one unit together."""
-    bias = np.where(np.isfinite(health.bias), health.bias, np.inf)
-    return np.lexsort((-bias, np.array(health.units)))
-
-
-def _sentence(text: str) -> str:
-    return f"{text[0].upper()}{text[1:]}."
-
-
-def _told(value: float, error: float, unit: str) -> str:
-    if not np.isfinite(value):
-        return "-"
-    return with_sigma(float(value), float(error), unit).strip()
-
-
-def draw_health(checked: Checked, title: str, path: Path) -> None:
-    """Draw health to a picture file; raise InvalidProblem where there is none or that fails."""
-    from optloc.cli.output import saved
-    from optloc.plot.residuals import plot_health
-
-    if checked.health is None:
-        raise InvalidProblem(checked.why, "--plot", "leave it out")
-    saved(plot_health(checked.health, title=title), path)
+# Members of a bias that are named; the others are counted.
+_MEMBERS = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,14 +46,14 @@ def run_check(file: Path, as_json: bool, asked: Asked | None = None, *, quiet: b
     found = summary(loaded)
     checked = _health(loaded, asked, quiet or as_json)
     if as_json:
-        write_text(Path("-"), dumps(found if checked is None else found | {"health": health_json(checked)}))
+        write_text(Path("-"), dumps(found if checked is None else found | {"health": _health_json(checked)}))
     elif not quiet:
         table = Table(title=loaded.title, show_header=False, title_justify="left")
         for name, value in found.items():
             table.add_row(name.replace("_", " "), _spelled(value))
         Console().print(table)
         if checked is not None:
-            show_health(checked, Console())
+            _show_health(checked, Console())
     return 1 if found["epochs_with_too_few_rows"] or found["epochs_with_disconnected_pairs"] else 0
 
 
@@ -190,17 +63,17 @@ def _health(loaded: Loaded, asked: Asked, quiet: bool) -> Checked | None:
         if asked.out is not None or asked.plot is not None:
             raise InvalidProblem("table and picture need the fixes", "--no-solve", "leave it or --out and --plot out")
         return None
-    if asked.by not in GROUPINGS:
-        raise InvalidProblem(f"unknown grouping {asked.by!r}", "--by", nearest(asked.by, GROUPINGS))
-    method = asked.method or ("cauchy" if "cauchy" in SOLVERS else "auto")
-    branches_of(method)
-    checked = checked_health(loaded, method, cast("By", asked.by), quiet)
+    by = grouping_of(asked.by, "--by")
+    # Health is told of stations that may be wrong: by default a loss that turns gross errors down.
+    method = asked.method or "cauchy"
+    branches_of(method)  # a misspelt method is refused before the work
+    checked = _check_health(loaded, method, by, quiet)
     if asked.out is not None:
         if checked.health is None:
             raise InvalidProblem(checked.why, "--out", "leave it out")
-        write_table(asked.out, health_columns(checked.health))
+        write_table(asked.out, _health_columns(checked.health))
     if asked.plot is not None:
-        draw_health(checked, loaded.title, asked.plot)
+        _draw_health(checked, loaded.title, asked.plot)
     return checked
 
 
@@ -219,8 +92,8 @@ def summary(loaded: Loaded) -> dict[str, Any]:
     problem = loaded.problem
     alone = separable(problem)
     redundancy = _redundancy(problem, alone)
-    parts = components(problem)
-    flattest, widest = spread(problem.stations.position)
+    parts = _components(problem)
+    flattest, widest = _spread(problem.stations.position)
     worst = int(np.argmin(flattest / widest))
     return {
         "file": loaded.source,
@@ -263,7 +136,9 @@ def _errors(problem: Problem) -> str:
 def _bias(problem: Problem, bias: Bias) -> str:
     """Return form, members and prior of a bias in words."""
     slot, _ = problem.layout.find(bias.name)
-    names = ", ".join(bias.members[:8]) + (f" and {len(bias.members) - 8} more" if len(bias.members) > 8 else "")
+    names = ", ".join(bias.members[:_MEMBERS]) + (
+        f" and {len(bias.members) - _MEMBERS} more" if len(bias.members) > _MEMBERS else ""
+    )
     if bias.sigma is None:
         return f"{bias.form} of {names}, unknown"
     low, high = np.min(bias.sigma), np.max(bias.sigma)
@@ -278,17 +153,15 @@ def _redundancy(problem: Problem, alone: bool) -> Array:
     known = len(exact(problem)) + sum(len(np.ravel(bias.sigma)) for bias in problem.biases if bias.sigma is not None)
     known += sum(prior.mean.shape[-1] for prior in problem.priors)
     if problem.stations.covariance is not None and problem.stations.span != "noise":
-        known += (
-            problem.stations.count
-            * problem.dimension
-            * (1 if alone or problem.stations.span == "run" else problem.epochs)
-        )
+        # Surveyed positions count as measured: each unknown offset comes with a prior of its own.
+        times = 1 if alone or problem.stations.span == "run" else problem.epochs
+        known += problem.stations.count * problem.dimension * times
     if alone:
         return np.asarray(present + known - layout.size // problem.epochs)
     return np.array([present.sum() + known - layout.size])
 
 
-def components(problem: Problem) -> Array:
+def _components(problem: Problem) -> Array:
     """Return how many groups of stations the differences of each epoch (k,) fall into; 0 where there are none."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -308,10 +181,138 @@ def components(problem: Problem) -> Array:
     return np.bincount(pairs[0], minlength=k)
 
 
-def spread(position: Array) -> tuple[Array, Array]:
+def _spread(position: Array) -> tuple[Array, Array]:
     """Return the least and the greatest root mean square extent (k,) of stations (k, s, d) about their centre."""
     centred = position - position.mean(-2, keepdims=True)
     values = np.linalg.svd(centred, compute_uv=False) / np.sqrt(position.shape[-2])
     if position.shape[-2] <= position.shape[-1]:
         values = np.concatenate([values, np.zeros((*values.shape[:-1], 1))], axis=-1)
-    return values[..., -1], np.maximum(values[..., 0], 1e-300)
+    return values[..., -1], np.maximum(values[..., 0], np.finfo(float).tiny)
+
+
+# Health of stations.
+
+
+@dataclass(frozen=True, slots=True)
+class Checked:
+    """Health of the stations of a file, or why there is none."""
+
+    health: Health | None
+    why: str = ""
+
+
+def _check_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
+    """Return the health of the stations of a file, each of whose epochs is fixed by itself."""
+    problem = loaded.problem
+    if problem.epochs < 2:
+        return Checked(None, "station health needs several epochs, and the file has one")
+    calibrating = all(motion.known is not None for motion in problem.motions)
+    if not separable(problem) and not (calibrating and not problem.biases):
+        return Checked(None, "station health needs epochs that are fixed one by one, and these share unknowns")
+    if not np.isfinite(problem.z[problem.weight > 0.0]).all():
+        return Checked(None, "station health needs measured values")
+    try:
+        return Checked(_solve_health(loaded, method, by, quiet))
+    except InvalidProblem as error:
+        if error.where in ("by", "method"):
+            raise
+        return Checked(None, f"station health could not be told: {error}".removesuffix("."))
+
+
+def _solve_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Health:
+    from optloc.solvers import solve
+
+    batch = batch_of(loaded.problem)
+    count = batch.batch_shape[0]
+    vectors, explained = np.full((count, batch.layout.size), np.nan), np.full(count, None, dtype=object)
+    if not batch.layout.size:
+        return health_of(batch, (np.arange(count), np.zeros((count, 0))), by)
+    with bar(loaded.title, count, quiet) as advance:
+        for first in range(0, count, CHUNK):
+            items = np.arange(first, min(first + CHUNK, count))
+            fix = solve(batch.take(items), method)
+            vectors[items] = np.where(fix.answered[:, None], fix.x, np.nan)
+            found = getattr(fix, "explanations", None)
+            explained[items] = None if found is None else found
+            advance(len(items))
+    kept = np.flatnonzero(np.isfinite(vectors).all(-1))
+    if not len(kept):
+        raise InvalidProblem("no epoch has a fix", loaded.source, "see `optloc fix` for the reasons")
+    asked = any(each is not None for each in explained)
+    return health_of(batch, (kept, vectors[kept]), by, explained if asked else None)
+
+
+def _health_columns(health: Health) -> Columns:
+    """Return the table of health: one row for each station, SI units and radians, NaN where there is no number."""
+    return {
+        "name": np.array(health.names, dtype=object),
+        "unit": np.array(health.units, dtype=object),
+        "count": health.count,
+        "bias": health.bias,
+        "bias_error": health.bias_error,
+        "scale": health.scale,
+        "scale_error": health.scale_error,
+        "noise": health.noise,
+        "noise_error": health.noise_error,
+        "outliers": health.outliers,
+        "suspect": health.suspect,
+    }
+
+
+def _health_json(checked: Checked) -> dict[str, Any]:
+    """Return health as one JSON value."""
+    if checked.health is None:
+        return {"stations": [], "sentences": [checked.why]}
+    levels = checked.health.levels
+    noise = {"by": levels.by, "fixes": levels.fixes, "chi_square_stated": levels.before, "chi_square": levels.after}
+    return {
+        "stations": records(_health_columns(checked.health)),
+        "noise": noise,
+        "sentences": list(checked.health.sentences),
+    }
+
+
+def _show_health(checked: Checked, console: Console) -> None:
+    """Print health as a table, the largest biases first."""
+    health = checked.health
+    if health is None:
+        say_all(console, [checked.why])
+        return
+    scaled, suspected = np.isfinite(health.scale).any(), np.isfinite(health.suspect).any()
+    table = Table(title=f"Health by {health.by}", title_justify="left")
+    table.add_column(health.by)
+    wanted = ["fixes", "bias", *(["scale, ppm"] if scaled else []), "noise", "outliers"]
+    for name in [*wanted, *(["suspect"] if suspected else [])]:
+        table.add_column(name, justify="right")
+    for i in _order(health):
+        cells = [str(health.count[i]), _told(health.bias[i], health.bias_error[i], health.units[i])]
+        cells += [_told(1e6 * health.scale[i], 1e6 * health.scale_error[i], "")] if scaled else []
+        cells += [_told(health.noise[i], health.noise_error[i], health.units[i]), f"{health.outliers[i]:.1%}"]
+        cells += [f"{health.suspect[i]:.1%}"] if suspected else []
+        table.add_row(health.names[i], *cells)
+    console.print(table)
+    levels = health.levels
+    chi = f"chi-square per degree of freedom {levels.before:.3g} with the noise as stated, {levels.after:.3g} as found"
+    what = "bias and noise are of measured less predicted by the rest of each fix"
+    say_all(console, (f"{levels.fixes} fixes; {what}; {chi}", *health.sentences))
+
+
+def _order(health: Health) -> Array:
+    """Return the groups in the order of their biases, those in one unit together."""
+    bias = np.where(np.isfinite(health.bias), health.bias, np.inf)
+    return np.lexsort((-bias, np.array(health.units)))
+
+
+def _told(value: float, error: float, unit: str) -> str:
+    if not np.isfinite(value):
+        return "-"
+    return with_sigma(float(value), float(error), unit).strip()
+
+
+def _draw_health(checked: Checked, title: str, path: Path) -> None:
+    """Draw health to a picture file; raise InvalidProblem where there is none or that fails."""
+    from optloc.plot.residuals import plot_health
+
+    if checked.health is None:
+        raise InvalidProblem(checked.why, "--plot", "leave it out")
+    write_picture(plot_health(checked.health, title=title), path)

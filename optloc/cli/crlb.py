@@ -1,4 +1,4 @@
-"""What ``optloc crlb`` and ``optloc simulate`` do."""
+"""What ``optloc crlb`` and ``optloc simulate`` do: the bound at a place, against time, over a map; and draws."""
 
 from __future__ import annotations
 
@@ -14,79 +14,22 @@ from optloc.base.linalg import error_ellipse
 from optloc.base.types import Array
 from optloc.bounds.bound_map import BoundMap, bound_map, extent, plan_of
 from optloc.bounds.crlb import Course, crlb_course
-from optloc.cli.output import dumps, saved, write_text
+from optloc.cli.options import coordinates
+from optloc.cli.output import dumps, say, write_picture, write_text
 from optloc.files import Loaded, read
 from optloc.files.words import Units
 from optloc.problem.epochs import by_epoch, separable, tied
 from optloc.problem.layout import Layout, Slot, state_names
 from optloc.problem.problem import Problem
 
-# The Cramer-Rao bound of a run against time, as a table and as records.
-
-_LINES, _POINTS, _UNKNOWNS = 10, 400, 100
+# Lines of the table against time, and of the bounds and of their members: what a screen holds.
+_LINES, _BOUNDS, _MEMBERS = 10, 30, 16
+# Points of a course, as many as a picture shows apart; and unknowns beyond which nobody reads a curve of each.
+_POINTS, _UNKNOWNS = 400, 100
+# Points along each side of a map: isolines are smooth, and a bound at each of the 9216 takes about a second.
+_MAP_POINTS = 96
+_PICTURES = (".png", ".svg", ".pdf")
 _RMS = {True: " (rms)", False: ""}
-
-
-def courses(problem: Problem, truth: Array) -> tuple[Course, Course | None] | None:
-    """Return the bound against time with biases unknown and, if there are some, known; None where it has none."""
-    n, k = problem.layout.n_shared, problem.epochs
-    if k == 1 or not 0 < n <= _UNKNOWNS or tied(problem) or problem.batch_shape:
-        return None
-    counts = np.arange(1, k + 1) if k <= _POINTS else np.unique(np.geomspace(1, k, _POINTS).round().astype(int))
-    names = [slot.name for slot in problem.layout.shared if slot.members]
-    course = crlb_course(problem, truth, counts)
-    targets = len(names) < len(problem.layout.shared)
-    return course, crlb_course(problem, truth, counts, known=names) if names and targets else None
-
-
-def course_records(course: Course, known: Course | None) -> list[dict[str, Any]]:
-    """Return the bound at a few times: epochs, time, sigma of every unknown by name, and with biases known."""
-    labels = course.layout.labels()
-    return [
-        {
-            "epochs": int(course.counts[i]),
-            "time": float(course.times[i]),
-            "sigma": dict(zip(labels, _course_sigmas(course, i), strict=True)),
-            "biases_known": None if known is None else dict(zip(labels, _course_sigmas(known, i), strict=True)),
-        }
-        for i in _few(course)
-    ]
-
-
-def _course_sigmas(course: Course, i: int) -> Array:
-    return np.asarray(np.sqrt(np.diagonal(course.covariance[i])))
-
-
-def _few(course: Course) -> list[int]:
-    """Return the places of a few times, closer together at the start."""
-    wanted = np.geomspace(1, course.counts[-1], _LINES)
-    return [int(i) for i in np.unique(np.searchsorted(course.counts, np.floor(wanted)))]
-
-
-def shown(layout: Layout) -> tuple[str, ...]:
-    """Return the names of the unknowns that a table or a picture has room for: of two targets, and four biases."""
-    states = [slot.name for slot in layout.shared if not slot.members]
-    biases = [slot.name for slot in layout.shared if slot.members]
-    return (*states[:4], *biases[:4])
-
-
-def course_table(course: Course, known: Course | None) -> Table:
-    """Return the bound at a few times, as root sum of squares over coordinates and root mean square over members."""
-    table = Table(title="Bound after the first epochs", title_justify="left")
-    for name in ("epochs", "time, s"):
-        table.add_column(name, justify="right")
-    columns: list[tuple[Course, Slot]] = []
-    for slot in (course.layout.find(name)[0] for name in shown(course.layout)):
-        table.add_column(f"{slot.name}{_RMS[bool(slot.members)]}, {slot.unit}".rstrip(", "), justify="right")
-        columns.append((course, slot))
-        if known is not None and not slot.members:
-            table.add_column("biases known", justify="right")
-            columns.append((known, slot))
-    values = [which.total(slot.name) / np.sqrt(slot.size if slot.members else 1) for which, slot in columns]
-    for i in _few(course):
-        numbers = [f"{value[i]:.4g}" if np.isfinite(value[i]) else "-" for value in values]
-        table.add_row(str(course.counts[i]), f"{course.times[i]:g}", *numbers)
-    return table
 
 
 def run_crlb(
@@ -104,12 +47,12 @@ def run_crlb(
 
     loaded = read(file, values=False)
     problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
-    truth = _fixed(file) if at is None and _sought(problem) else vector(problem, at, velocity, geodetic)
+    truth = _solve(file) if at is None and _sought(problem) else vector(problem, at, velocity, geodetic)
     bound = np.asarray(crlb(problem, truth))
     bound = np.broadcast_to(bound, (*problem.batch_shape, *bound.shape[-2:])).reshape(-1, *bound.shape[-2:])
     labels = loaded.epochs if problem.batch_shape else ("run" if loaded.problem.epochs > 1 else loaded.epochs[0],)
     rows = [
-        _bound(label, slot, cov[slot.start : slot.start + slot.size, slot.start : slot.start + slot.size])
+        _record(label, slot, cov[slot.start : slot.start + slot.size, slot.start : slot.start + slot.size])
         for label, cov in zip(labels, bound, strict=True)
         for slot in problem.layout.shared
     ]
@@ -117,13 +60,13 @@ def run_crlb(
     if plot is not None:
         _draw(plot, loaded, over_time)
     if as_json:
-        course = [] if over_time is None else course_records(*over_time)
+        course = [] if over_time is None else _course_records(*over_time)
         write_text(Path("-"), dumps({"file": loaded.source, "bounds": rows, "course": course}))
     elif not quiet:
         console = Console()
         console.print(_bound_table(loaded, rows))
         if over_time is not None:
-            console.print(course_table(*over_time))
+            console.print(_course_table(*over_time))
     return 0 if all(np.isfinite(row["sigma"]).all() for row in rows) and rows else 1
 
 
@@ -132,7 +75,7 @@ def _sought(problem: Problem) -> bool:
     return any(motion.known is None for motion in problem.motions)
 
 
-def _fixed(file: Path) -> Array:
+def _solve(file: Path) -> Array:
     """Return the fix of a file that has measured values."""
     from optloc.solvers import solve
 
@@ -146,11 +89,11 @@ def _draw(path: Path, loaded: Loaded, over_time: tuple[Course, Course | None] | 
     if over_time is None:
         advice = "give the epochs something in common, a motion or biases, but not hundreds of targets"
         raise InvalidProblem("the epochs share no unknowns, or too many to be drawn", "--plot", advice)
-    names = shown(over_time[0].layout)
-    saved(plot_course(*over_time, title=f"{loaded.title}: Cramer-Rao bound", names=names), path)
+    names = _shown(over_time[0].layout)
+    write_picture(plot_course(*over_time, title=f"{loaded.title}: Cramer-Rao bound", names=names), path)
 
 
-def _bound(label: str, slot: Slot, covariance: Array) -> dict[str, Any]:
+def _record(label: str, slot: Slot, covariance: Array) -> dict[str, Any]:
     record = {"epoch": label, "unknown": slot.name, "entries": slot.entries, "unit": slot.unit}
     record |= {"sigma": np.sqrt(np.diagonal(covariance))}
     if not slot.name.startswith("position"):
@@ -158,103 +101,94 @@ def _bound(label: str, slot: Slot, covariance: Array) -> dict[str, Any]:
     return record | {"ellipse95": error_ellipse(covariance)[0][::-1], "covariance": covariance}
 
 
-def _bound_table(loaded: Loaded, rows: list[dict[str, Any]], limit: int = 30) -> Table:
+def _bound_table(loaded: Loaded, rows: list[dict[str, Any]]) -> Table:
     table = Table(title=f"{loaded.title}: Cramer-Rao bound", title_justify="left")
     for name in ("epoch", "unknown", "sigma", "95 % ellipse, m (semi-axes)"):
         table.add_column(name)
-    for row in rows[:limit]:
+    for row in rows[:_BOUNDS]:
         ellipse = ", ".join(f"{v:.4g}" for v in row.get("ellipse95", ()))
         table.add_row(row["epoch"], row["unknown"], _sigmas(row), ellipse)
-    if len(rows) > limit:
-        table.add_row("...", "", f"{len(rows) - limit} more", "--json prints all")
+    if len(rows) > _BOUNDS:
+        table.add_row("...", "", f"{len(rows) - _BOUNDS} more", "--json prints all")
     return table
 
 
-def _sigmas(row: dict[str, Any], limit: int = 16) -> str:
+def _sigmas(row: dict[str, Any]) -> str:
     """Return standard deviations in a line, those of members one below the other."""
     if set(row["entries"]) <= set("xyz"):
         return f"{', '.join(f'{v:.4g}' for v in row['sigma'])} {row['unit']}"
-    named = zip(row["entries"][:limit], row["sigma"], strict=False)
+    named = zip(row["entries"][:_MEMBERS], row["sigma"], strict=False)
     lines = [f"{entry}: {v:.4g} {row['unit']}".strip(": ") for entry, v in named]
-    return "\n".join(
-        [*lines, *([f"... and {len(row['entries']) - limit} more"] if len(row["entries"]) > limit else [])]
-    )
+    more = len(row["entries"]) - _MEMBERS
+    return "\n".join([*lines, *([f"... and {more} more"] if more > 0 else [])])
 
 
-def vector(problem: Problem, position: str | None, velocity: str | None, geodetic: bool) -> Array:
-    """Return the true parameter vector of targets at a position; biases have their prior means, the rest is zero."""
-    place = None if position is None else _coordinates(position, "position")
-    if geodetic and place is not None:
-        if not problem.frame.geodetic or len(place) != 3:
-            raise InvalidProblem(
-                "latitude, longitude and height need a geodetic frame and three numbers", "--geodetic", "leave it out"
-            )
-        place = problem.frame.from_geodetic(np.radians(place[0]), np.radians(place[1]), place[2])[: problem.dimension]
-    values = {"position": place, "velocity": None if velocity is None else _coordinates(velocity, "--velocity")}
-    layout = problem.layout
-    shared, local = np.zeros(layout.n_shared), np.zeros((problem.epochs, layout.n_local))
-    for i, motion in enumerate(problem.motions):
-        if motion.known is not None:
-            continue
-        for name in state_names(i, len(problem.motions), motion.order):
-            value = values.get(name.partition("[")[0])
-            if value is None:
-                continue
-            if len(value) != problem.dimension:
-                raise InvalidProblem(
-                    f"{len(value)} coordinates do not fit {problem.dimension} dimensions", name, "give one each"
-                )
-            slot, is_shared = layout.find(name)
-            (shared if is_shared else local)[..., slot.start : slot.start + slot.size] = value
-    for bias in problem.biases:
-        if bias.sigma is not None:
-            slot, _ = layout.find(bias.name)
-            shared[slot.start : slot.start + slot.size] = np.ravel(bias.mean)
-    if velocity is not None and all(motion.order == 0 for motion in problem.motions):
-        raise InvalidProblem(
-            "the target of this file does not move", "--velocity", 'write motion = "constant_velocity"'
-        )
-    return np.concatenate([shared, local.ravel()])
+# Against time.
 
 
-def _coordinates(text: str, where: str) -> Array:
-    try:
-        values = np.array([float(part) for part in text.split(",")])
-    except ValueError:
-        values = np.array([np.nan])
-    if not np.isfinite(values).all():
-        raise InvalidProblem(f"{text!r} is no list of numbers", where, "write them as 1200,800,50")
-    return values
+def courses(problem: Problem, truth: Array) -> tuple[Course, Course | None] | None:
+    """Return the bound against time with biases unknown and, if there are some, known; None where it has none."""
+    n, k = problem.layout.n_shared, problem.epochs
+    if k == 1 or not 0 < n <= _UNKNOWNS or tied(problem) or problem.batch_shape:
+        return None
+    counts = np.arange(1, k + 1) if k <= _POINTS else np.unique(np.geomspace(1, k, _POINTS).round().astype(int))
+    names = [slot.name for slot in problem.layout.shared if slot.members]
+    course = crlb_course(problem, truth, counts)
+    targets = len(names) < len(problem.layout.shared)
+    return course, crlb_course(problem, truth, counts, known=names) if names and targets else None
 
 
-def run_simulate(
-    file: Path, truth: str, velocity: str | None, out: Path, *, geodetic: bool, seed: int, trials: int, quiet: bool
-) -> int:
-    """Draw measurements, write them as a problem file, and return the exit code."""
-    from tempfile import TemporaryDirectory
-
-    from optloc.files.writer import write_measured
-    from optloc.linear.evaluate import predict
-    from optloc.linear.simulate import simulate
-
-    problem = read(file, values=False).problem
-    x = vector(problem, truth, velocity, geodetic)
-    with TemporaryDirectory() as folder:  # a spread in decibels depends on the values
-        exact, *_ = write_measured(file, Path(folder) / out.name, np.atleast_2d(predict(problem, x)), note="")
-        drawn = simulate(read(exact).problem, x, seed, trials)
-    z = np.concatenate([rows.z for rows in drawn.rows], axis=-1)
-    written = write_measured(file, out, z, note=f"drawn at {truth} with seed {seed}")
-    if not quiet:
-        Console().print(
-            f"{trials} trial(s) of {z.shape[-1]} rows are in {', '.join(str(p) for p in written)}.", highlight=False
-        )
-    return 0
+def _course_records(course: Course, known: Course | None) -> list[dict[str, Any]]:
+    """Return the bound at a few times: epochs, time, sigma of every unknown by name, and with biases known."""
+    labels = course.layout.labels()
+    return [
+        {
+            "epochs": int(course.counts[i]),
+            "time": float(course.times[i]),
+            "sigma": dict(zip(labels, _sigmas_at(course, i), strict=True)),
+            "biases_known": None if known is None else dict(zip(labels, _sigmas_at(known, i), strict=True)),
+        }
+        for i in _few(course)
+    ]
 
 
-# What ``optloc crlb --map`` does.
+def _sigmas_at(course: Course, i: int) -> Array:
+    return np.asarray(np.sqrt(np.diagonal(course.covariance[i])))
 
-_MAP_POINTS = 96
-_PICTURES = (".png", ".svg", ".pdf")
+
+def _few(course: Course) -> list[int]:
+    """Return the places of a few times, closer together at the start."""
+    wanted = np.geomspace(1, course.counts[-1], _LINES)
+    return [int(i) for i in np.unique(np.searchsorted(course.counts, np.floor(wanted)))]
+
+
+def _shown(layout: Layout) -> tuple[str, ...]:
+    """Return the names of the unknowns that a table or a picture has room for: of two targets, and four biases."""
+    states = [slot.name for slot in layout.shared if not slot.members]
+    biases = [slot.name for slot in layout.shared if slot.members]
+    return (*states[:4], *biases[:4])
+
+
+def _course_table(course: Course, known: Course | None) -> Table:
+    """Return the bound at a few times, as root sum of squares over coordinates and root mean square over members."""
+    table = Table(title="Bound after the first epochs", title_justify="left")
+    for name in ("epochs", "time, s"):
+        table.add_column(name, justify="right")
+    columns: list[tuple[Course, Slot]] = []
+    for slot in (course.layout.find(name)[0] for name in _shown(course.layout)):
+        table.add_column(f"{slot.name}{_RMS[bool(slot.members)]}, {slot.unit}".rstrip(", "), justify="right")
+        columns.append((course, slot))
+        if known is not None and not slot.members:
+            table.add_column("biases known", justify="right")
+            columns.append((known, slot))
+    values = [which.total(slot.name) / np.sqrt(slot.size if slot.members else 1) for which, slot in columns]
+    for i in _few(course):
+        numbers = [f"{value[i]:.4g}" if np.isfinite(value[i]) else "-" for value in values]
+        table.add_row(str(course.counts[i]), f"{course.times[i]:g}", *numbers)
+    return table
+
+
+# Over a map.
 
 
 def run_map(
@@ -281,7 +215,7 @@ def run_map(
     grid = np.linspace(x0, x1, _MAP_POINTS), np.linspace(y0, y1, _MAP_POINTS)
     found = bound_map(problem, truth, *grid, _height(problem, place, height))
     what = "dilution of precision" if dilution else "bound of the position error"
-    _write(found, out, f"{loaded.title}: {what}", dilution=dilution)
+    _write_map(found, out, f"{loaded.title}: {what}", dilution=dilution)
     return 0
 
 
@@ -308,38 +242,31 @@ def _height(problem: Problem, place: Array | None, height: str | None) -> float:
     if problem.dimension == 2:
         return 0.0
     if height is not None:
-        return float(Units("length").plain(_number(height), "m", "--height"))
+        return float(Units("length").plain(height, "m", "--height"))
     assert place is not None
     return float(plan_of(problem.frame, place, problem.frame.geodetic)[0, 2])
 
 
-def _number(text: str) -> float | str:
-    try:
-        return float(text)
-    except ValueError:
-        return text
-
-
 def _limits(text: str, problem: Problem) -> tuple[float, float, float, float]:
     """Return the limits of a map; raise InvalidProblem where they are none."""
-    try:
-        x0, x1, y0, y1 = (float(part) for part in text.split(","))
-    except ValueError:
-        x0 = x1 = y0 = y1 = float("nan")
     earth = problem.frame.geodetic and problem.dimension == 3
-    fits = not earth or (-360.0 <= x0 and x1 <= 540.0 and x1 - x0 <= 360.0 and y0 >= -90.0 and y1 <= 90.0)
-    if not (x0 < x1 and y0 < y1 and np.isfinite([x0, x1, y0, y1]).all() and fits):
-        advice = "write west,east,south,north in degrees" if earth else "write least x, greatest x, least y, greatest y"
-        raise InvalidProblem(f"{text!r} is no extent of a map", "--extent", advice)
-    return x0, x1, y0, y1
+    advice = "write west,east,south,north in degrees" if earth else "write least x, greatest x, least y, greatest y"
+    values = coordinates(text, "--extent", advice)
+    if len(values) == 4:
+        x0, x1, y0, y1 = values
+        # East may be beyond 180 degrees, for a map across the date line.
+        fits = not earth or (-360.0 <= x0 and x1 <= 540.0 and x1 - x0 <= 360.0 and y0 >= -90.0 and y1 <= 90.0)
+        if x0 < x1 and y0 < y1 and fits:
+            return x0, x1, y0, y1
+    raise InvalidProblem(f"{text!r} is no extent of a map", "--extent", advice)
 
 
-def _write(found: BoundMap, out: Path, title: str, *, dilution: bool) -> None:
+def _write_map(found: BoundMap, out: Path, title: str, *, dilution: bool) -> None:
     from optloc.plot.bound_map import map_geojson, plot_bound_map
 
     ending = out.suffix.lower()
     if ending in _PICTURES:
-        saved(plot_bound_map(found, title, dilution=dilution), out)
+        write_picture(plot_bound_map(found, title, dilution=dilution), out)
         return
     if dilution:
         raise InvalidProblem("the dilution is drawn as a picture only", str(out), "use .png, .svg or .pdf")
@@ -349,3 +276,61 @@ def _write(found: BoundMap, out: Path, title: str, *, dilution: bool) -> None:
     from optloc.report import map_page
 
     write_text(out, map_page(found, title))
+
+
+# Draws.
+
+
+def run_simulate(
+    file: Path, truth: str, velocity: str | None, out: Path, *, geodetic: bool, seed: int, trials: int, quiet: bool
+) -> int:
+    """Draw measurements, write them as a problem file, and return the exit code."""
+    from tempfile import TemporaryDirectory
+
+    from optloc.files.writer import write_measured
+    from optloc.linear.evaluate import predict
+    from optloc.linear.simulate import simulate
+
+    problem = read(file, values=False).problem
+    x = vector(problem, truth, velocity, geodetic)
+    # A spread in decibels depends on the values: the noise is that of the true ones.
+    with TemporaryDirectory() as folder:
+        exact, *_ = write_measured(file, Path(folder) / out.name, np.atleast_2d(predict(problem, x)), note="")
+        drawn = simulate(read(exact).problem, x, seed, trials)
+    z = np.concatenate([rows.z for rows in drawn.rows], axis=-1)
+    written = write_measured(file, out, z, note=f"drawn at {truth} with seed {seed}")
+    say(Console(quiet=quiet), f"{trials} trial(s) of {z.shape[-1]} rows are in {', '.join(str(p) for p in written)}.")
+    return 0
+
+
+def vector(problem: Problem, position: str | None, velocity: str | None, geodetic: bool) -> Array:
+    """Return the true parameter vector of targets at a position; biases have their prior means, the rest is zero."""
+    if velocity is not None and all(motion.order == 0 for motion in problem.motions):
+        what = "the target of this file does not move"
+        raise InvalidProblem(what, "--velocity", 'write motion = "constant_velocity"')
+    place = None if position is None else np.array(coordinates(position, "position"))
+    if geodetic and place is not None:
+        if not problem.frame.geodetic or len(place) != 3:
+            what = "latitude, longitude and height need a geodetic frame and three numbers"
+            raise InvalidProblem(what, "--geodetic", "leave it out")
+        place = problem.frame.from_geodetic(np.radians(place[0]), np.radians(place[1]), place[2])[: problem.dimension]
+    values = {"position": place, "velocity": None if velocity is None else coordinates(velocity, "--velocity")}
+    layout = problem.layout
+    shared, local = np.zeros(layout.n_shared), np.zeros((problem.epochs, layout.n_local))
+    for i, motion in enumerate(problem.motions):
+        if motion.known is not None:
+            continue
+        for name in state_names(i, len(problem.motions), motion.order):
+            value = values.get(name.partition("[")[0])
+            if value is None:
+                continue
+            if len(value) != problem.dimension:
+                what = f"{len(value)} coordinates do not fit {problem.dimension} dimensions"
+                raise InvalidProblem(what, name, "give one each")
+            slot, is_shared = layout.find(name)
+            (shared if is_shared else local)[..., slot.start : slot.start + slot.size] = value
+    for bias in problem.biases:
+        if bias.sigma is not None:
+            slot, _ = layout.find(bias.name)
+            shared[slot.start : slot.start + slot.size] = np.ravel(bias.mean)
+    return np.concatenate([shared, local.ravel()])

@@ -1,4 +1,4 @@
-"""What ``optloc fix`` does."""
+"""What ``optloc fix`` does, and how fixes are shown to people."""
 
 from __future__ import annotations
 
@@ -15,75 +15,182 @@ from rich.text import Text
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.status import Status
-from optloc.cli.fixed import Columns, Fixed, fix_file
-from optloc.cli.output import (
+from optloc.base.types import Array
+from optloc.cli.file_fixes import (
+    FileFixes,
     active_of,
     alternative_position,
-    dumps,
+    bias_records,
     explanations_of,
-    fixed_json,
+    fix_file,
+    fixes_json,
     geojson,
-    saved,
-    show_biases,
-    with_sigma,
-    write_table,
-    write_text,
 )
+from optloc.cli.output import Columns, dumps, records, say, say_all, with_sigma, write_picture, write_table, write_text
 from optloc.files import Loaded, read
 from optloc.files.schema import ConstraintTable
 from optloc.problem.fix import Fix, Suspect
 from optloc.quality.elements import GROUPINGS, By
 from optloc.quality.levels import NoiseLevels, with_estimated_noise
 
-# Noise from data for people and machines.
+# What a screen holds of each list; the rest is counted, and --json and --out have all of it.
+_STATES, _EXPLANATIONS, _SUSPECTS, _BIASES, _FAILURES = 12, 8, 12, 40, 10
+# p-value below which a misfit is pointed out: one right fix in a thousand.
+_UNLIKELY = 1e-3
+# A cost gap below this is printed as 0: the two places explain the data equally well.
+_NO_GAP = 1e-3
+_GOOD, _CARE, _BAD = "green", "yellow", "red"
 
 
-def noised(loaded: Loaded, by: str | None) -> Loaded:
-    """Return a file's problem with its noise estimated for each station, pair or kind; unchanged where not asked."""
-    if by is None:
-        return loaded
-    if by not in GROUPINGS:
-        raise InvalidProblem(f"unknown grouping {by!r}", "--noise-from-data", nearest(by, GROUPINGS))
-    problem, levels = with_estimated_noise(loaded.problem, cast("By", by))
-    return replace(loaded, problem=problem, levels=levels)
+def run_fix(
+    file: Path,
+    method: str,
+    more: Mapping[str, ConstraintTable],
+    *,
+    as_json: bool = False,
+    geojson_path: Path | None = None,
+    plot: Path | None = None,
+    out: Path | None = None,
+    html: Path | None = None,
+    quiet: bool = False,
+    noise: str | None = None,
+) -> int:
+    """Fix a file under constraints of its own and more, write what was asked for, and return the exit code."""
+    on_output = geojson_path is not None and str(geojson_path) == "-"
+    if as_json and on_output:
+        raise InvalidProblem("JSON and GeoJSON cannot both go to standard output", "--geojson", "name a file")
+    found = fix_file(_estimate_noise(read(file, more=more), noise), method, quiet or as_json)
+    levels = found.loaded.levels
+    if out is not None:
+        write_table(out, found.columns)
+    if geojson_path is not None:
+        write_text(geojson_path, dumps(geojson(found)))
+    if plot is not None:
+        draw(found, plot)
+    if html is not None:
+        from optloc.report import fix_page
+
+        labels = [str(label) for label in found.columns["epoch"]]
+        write_text(html, fix_page(found.loaded.problem, found.fixes, found.loaded.title, labels))
+    if as_json:
+        write_text(Path("-"), dumps(fixes_json(found) | ({} if levels is None else {"noise": _levels_json(levels)})))
+    elif not quiet:
+        console = Console(stderr=on_output)
+        show(found, console)
+        if levels is not None:
+            _show_levels(levels, console)
+    return 0 if found.clean else 1
 
 
-def levels_json(levels: NoiseLevels) -> dict[str, Any]:
-    """Return noise levels as one JSON value, SI units."""
-    columns = {"name": levels.names, "sigma": levels.sigma, "sigma_error": levels.sigma_error}
-    columns |= {"stated": levels.stated, "redundancy": levels.redundancy, "count": levels.count, "gross": levels.gross}
-    return {
-        "by": levels.by,
-        "levels": [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)],
-        "fixes": levels.fixes,
-        "chi_square_stated": levels.before,
-        "chi_square": levels.after,
-        "sentences": list(levels.sentences),
-    }
+def draw(found: FileFixes, path: Path) -> None:
+    """Draw fixes to a picture file; raise InvalidProblem where that fails."""
+    from optloc.plot import plot_fixes
+
+    write_picture(plot_fixes(found.loaded.problem, found.fixes, title=found.loaded.title), path)
 
 
-def show_levels(levels: NoiseLevels, console: Console) -> None:
-    """Print noise levels as a table."""
-    table = Table(title=f"Noise from data, by {levels.by}", title_justify="left")
-    table.add_column(levels.by)
-    for name in ("sigma, SI", "stated", "redundancy", "errors", "gross"):
-        table.add_column(name, justify="right")
-    for i, name in enumerate(levels.names):
-        told = np.isfinite(levels.error[i])
-        sigma = f"{levels.sigma[i]:.3g} ± {levels.sigma_error[i]:.2g}" if told else "not told"
-        cells = (f"{levels.stated[i]:.3g}", f"{levels.redundancy[i]:.0%}", str(levels.count[i]), str(levels.gross[i]))
-        table.add_row(name, sigma, *cells)
+def show(found: FileFixes, console: Console) -> None:
+    """Print fixes: one in full, a few of a run below each other, many as a count by status."""
+    first = found.fixes[0]
+    if len(found.columns["x"]) == 1:
+        _show_one(found, first[0] if first.shape else first, console)
+    elif not first.shape:
+        _show_one(found, first, console)
+    else:
+        _show_many(found, console)
+
+
+def _show_one(found: FileFixes, fix: Fix, console: Console) -> None:
+    verdict = Status(int(fix.code))
+    table = Table(title=found.loaded.title, show_header=False, title_justify="left", min_width=60)
+    table.add_row("status", Text(verdict.label, style=f"bold {_colour(verdict)}"))
+    reason = str(fix.reason[()] or "")
+    table.add_row("", verdict.sentence if verdict is not Status.OK or not reason else reason)
+    if verdict is not Status.OK and reason:
+        table.add_row("reason", reason)
+    rows = len(found.columns["x"])
+    for i in range(min(rows, _STATES)):
+        _add_state(table, found.columns, i, _whose(found.columns, i) if rows > 1 else "")
+    if rows > _STATES:
+        table.add_row("...", f"{rows - _STATES} more; --out writes all of them")
+    for name, values in fix.bias.items():
+        slot, shared = fix.layout.find(name)
+        if not shared:
+            spread = np.sqrt(np.mean(values**2))
+            table.add_row(name, f"{values.size} values, root mean square {spread:.4g} {slot.unit}".strip())
+    for active in active_of(fix):
+        table.add_row(f"held by {active.name}", f"multiplier {active.multiplier:.4g} (cost per SI unit)")
+    table.add_row("chi-square", _chi_square(fix))
+    certificate: Any = fix.certificate[()]
+    if hasattr(certificate, "proof"):
+        table.add_row("certificate", f"{certificate.proof}: {certificate.reason}")
+    table.add_row("stages", " → ".join(stage.name for stage in fix.stages) or "none")
     console.print(table)
-    for sentence in levels.sentences:
-        console.print(f"{sentence[0].upper()}{sentence[1:]}.", highlight=False, markup=False, soft_wrap=True)
+    _show_biases(found, fix, console)
+    _show_suspects(fix, console)
+    _show_alternatives(fix, console)
 
 
-# Suspects as a table for people: who, by how much, and on what evidence.
+def _colour(verdict: Status) -> str:
+    return {Status.OK: _GOOD, Status.AMBIGUOUS: _CARE, Status.SEARCHED: _CARE}.get(verdict, _BAD)
 
-_EXPLANATIONS, _SUSPECTS = 8, 12
+
+def _whose(columns: Columns, i: int) -> str:
+    """Return whose state a row is where there are several."""
+    several = len(set(columns["target"].tolist())) > 1
+    epoch = f" at {columns['epoch'][i]}" if columns["epoch"][i] != "run" else ""
+    return (f" of {columns['target'][i]}" if several else "") + epoch
 
 
-def show_suspects(fix: Fix, console: Console) -> None:
+def _add_state(table: Table, columns: Columns, i: int, whose: str) -> None:
+    if not np.isfinite(columns["x"][i]):
+        return
+    axes = [axis for axis in "xyz" if axis in columns]
+    for axis in axes:
+        table.add_row(f"{axis}{whose}", with_sigma(columns[axis][i], columns[f"sigma_{axis}"][i], "m"))
+    if "lat_deg" in columns:
+        table.add_row(f"latitude{whose}", f"{columns['lat_deg'][i]:.7f} deg")
+        table.add_row(f"longitude{whose}", f"{columns['lon_deg'][i]:.7f} deg")
+        table.add_row(f"height{whose}", f"{columns['height'][i]:.2f} m")
+        local = [columns[f"cov_{axis}{axis}"][i] for axis in "enu" if f"cov_{axis}{axis}" in columns]
+        table.add_row("sigma east, north, up", ", ".join(f"{v:.3g}" for v in np.sqrt(np.maximum(local, 0.0))) + " m")
+    for letter, word, unit in (("v", "velocity", "m/s"), ("a", "acceleration", "m/s²")):
+        for axis in (axis for axis in axes if f"{letter}{axis}" in columns):
+            value, sigma = (columns[f"{prefix}{letter}{axis}"][i] for prefix in ("", "sigma_"))
+            table.add_row(f"{word} {axis}{whose}", with_sigma(value, sigma, unit))
+    semi = [columns[f"ellipse95_{j + 1}"][i] for j in range(len(axes))]
+    if np.isfinite(semi).all():
+        name = "95 % ellipse" if len(axes) == 2 else "95 % ellipsoid"
+        table.add_row(name, " x ".join(f"{v:.3g}" for v in semi) + " m (semi-axes)")
+
+
+def _chi_square(fix: Fix) -> str:
+    if int(fix.dof) <= 0 or not np.isfinite(fix.cost):
+        return "no redundancy: nothing to test"
+    p = float(fix.p_value)
+    warning = "; the residuals are larger than the stated noise" if p < _UNLIKELY else ""
+    return f"{float(fix.cost):.4g} with {int(fix.dof)} degrees of freedom, p = {p:.3g}{warning}"
+
+
+def _show_biases(found: FileFixes, fix: Fix, console: Console) -> None:
+    """Print the biases of a fix, and what cannot be told apart; nothing where there is none."""
+    rows = bias_records(fix, found.seen) if np.isfinite(fix.x).all() else []
+    if rows:
+        table = Table(title="Biases", title_justify="left")
+        for name in ("name", "member", "estimate", "from data"):
+            table.add_column(name, justify="right" if name == "from data" else "left")
+        for row in rows[:_BIASES]:
+            share = f"{100.0 * row['from_data']:.3g} %" if np.isfinite(row["from_data"]) else "-"
+            table.add_row(
+                row["name"], row["member"], with_sigma(row["value"], row["sigma"], row["unit"]).strip(), share
+            )
+        if len(rows) > _BIASES:
+            table.add_row("...", f"{len(rows) - _BIASES} more", "--json prints all", "")
+        console.print(table)
+    say_all(console, () if found.seen is None else found.seen.sentences)
+
+
+def _show_suspects(fix: Fix, console: Console) -> None:
     """Print what explains the data of a single fix that contradict each other; nothing where they agree."""
     found = explanations_of(fix)
     if not found:
@@ -113,99 +220,7 @@ def _p(value: float) -> str:
     return "-" if np.isnan(value) else f"{value:.2g}"
 
 
-# Fixes as tables for people.
-
-_GOOD, _CARE, _BAD = "green", "yellow", "red"
-
-
-def show(fixed: Fixed, console: Console) -> None:
-    """Print fixes: one in full, a few of a run below each other, many as a count by status."""
-    rows = len(next(iter(fixed.columns.values())))
-    first = fixed.fixes[0]
-    if rows == 1:
-        _one(fixed, first[0] if first.shape else first, console)
-    elif not first.shape:
-        _one(fixed, first, console)
-    else:
-        _many(fixed, console)
-
-
-def _one(fixed: Fixed, fix: Fix, console: Console) -> None:
-    verdict = Status(int(fix.code))
-    table = Table(title=fixed.loaded.title, show_header=False, title_justify="left", min_width=60)
-    table.add_row("status", Text(verdict.label, style=f"bold {_colour(verdict)}"))
-    reason = str(fix.reason[()] or "")
-    table.add_row("", verdict.sentence if verdict is not Status.OK or not reason else reason)
-    if verdict is not Status.OK and reason:
-        table.add_row("reason", reason)
-    rows = len(fixed.columns["x"])
-    for i in range(min(rows, 12)):
-        _state_rows(table, fixed.columns, i, _whose(fixed.columns, i) if rows > 1 else "")
-    if rows > 12:
-        table.add_row("...", f"{rows - 12} more; --out writes all of them")
-    for name, values in fix.bias.items():
-        slot, shared = fix.layout.find(name)
-        if not shared:
-            spread = np.sqrt(np.mean(values**2))
-            table.add_row(name, f"{values.size} values, root mean square {spread:.4g} {slot.unit}".strip())
-    for active in active_of(fix):
-        table.add_row(f"held by {active.name}", f"multiplier {active.multiplier:.4g} (cost per SI unit)")
-    table.add_row("chi-square", _chi_square(fix))
-    certificate: Any = fix.certificate[()]
-    if hasattr(certificate, "proof"):
-        table.add_row("certificate", f"{certificate.proof}: {certificate.reason}")
-    table.add_row("stages", " → ".join(stage.name for stage in fix.stages) or "none")
-    console.print(table)
-    show_biases(fix, fixed.seen, console)
-    show_suspects(fix, console)
-    _alternatives(fix, console)
-
-
-def _colour(verdict: Status) -> str:
-    return {Status.OK: _GOOD, Status.AMBIGUOUS: _CARE, Status.SEARCHED: _CARE}.get(verdict, _BAD)
-
-
-def _whose(columns: Columns, i: int) -> str:
-    """Return whose state a row is where there are several."""
-    several = len(set(columns["target"].tolist())) > 1
-    epoch = f" at {columns['epoch'][i]}" if columns["epoch"][i] != "run" else ""
-    return (f" of {columns['target'][i]}" if several else "") + epoch
-
-
-def _state_rows(table: Table, columns: Columns, i: int, whose: str) -> None:
-    if not np.isfinite(columns["x"][i]):
-        return
-    axes = [axis for axis in "xyz" if axis in columns]
-    for axis in axes:
-        table.add_row(f"{axis}{whose}", with_sigma(columns[axis][i], columns[f"sigma_{axis}"][i], "m"))
-    if "lat_deg" in columns:
-        table.add_row(f"latitude{whose}", f"{columns['lat_deg'][i]:.7f} deg")
-        table.add_row(f"longitude{whose}", f"{columns['lon_deg'][i]:.7f} deg")
-        table.add_row(f"height{whose}", f"{columns['height'][i]:.2f} m")
-        local = [columns[f"cov_{axis}{axis}"][i] for axis in "enu" if f"cov_{axis}{axis}" in columns]
-        table.add_row("sigma east, north, up", ", ".join(f"{v:.3g}" for v in np.sqrt(np.maximum(local, 0.0))) + " m")
-    for letter, word, unit in (("v", "velocity", "m/s"), ("a", "acceleration", "m/s²")):
-        found = [axis for axis in axes if f"{letter}{axis}" in columns]
-        for axis in found:
-            value, sigma = (columns[f"{prefix}{letter}{axis}"][i] for prefix in ("", "sigma_"))
-            table.add_row(f"{word} {axis}{whose}", with_sigma(value, sigma, unit))
-    semi = [columns[f"ellipse95_{j + 1}"][i] for j in range(len(axes))]
-    if np.isfinite(semi).all():
-        table.add_row(
-            "95 % ellipse" if len(axes) == 2 else "95 % ellipsoid",
-            " x ".join(f"{v:.3g}" for v in semi) + " m (semi-axes)",
-        )
-
-
-def _chi_square(fix: Fix) -> str:
-    if int(fix.dof) <= 0 or not np.isfinite(fix.cost):
-        return "no redundancy: nothing to test"
-    p = float(fix.p_value)
-    warning = "; the residuals are larger than the stated noise" if p < 1e-3 else ""
-    return f"{float(fix.cost):.4g} with {int(fix.dof)} degrees of freedom, p = {p:.3g}{warning}"
-
-
-def _alternatives(fix: Fix, console: Console) -> None:
+def _show_alternatives(fix: Fix, console: Console) -> None:
     found = np.isfinite(fix.alternatives.gap)
     if not found.any():
         return
@@ -215,93 +230,77 @@ def _alternatives(fix: Fix, console: Console) -> None:
     others = (fix.alternatives.x[found], fix.alternatives.gap[found], fix.alternatives.doubt[found])
     for i, (x, gap, doubt) in enumerate(zip(*others, strict=True)):
         point = ", ".join(f"{v:.1f}" for v in np.ravel(alternative_position(fix, x))[:6])
-        table.add_row(str(i + 1), point, f"{gap:.4g}" if gap >= 1e-3 else "0", f"{doubt:.2g}")
+        table.add_row(str(i + 1), point, f"{gap:.4g}" if gap >= _NO_GAP else "0", f"{doubt:.2g}")
     console.print(table)
 
 
-def _many(fixed: Fixed, console: Console) -> None:
-    columns = fixed.columns
-    table = Table(title=f"{fixed.loaded.title}: {len(columns['x'])} fixes", title_justify="left")
+def _show_many(found: FileFixes, console: Console) -> None:
+    columns = found.columns
+    table = Table(title=f"{found.loaded.title}: {len(columns['x'])} fixes", title_justify="left")
     table.add_column("status")
     for name in ("fixes", "median sigma, m", "95 % of sigmas, m", "median p"):
         table.add_column(name, justify="right")
     sigma = np.sqrt(sum(columns[f"sigma_{axis}"] ** 2 for axis in "xyz" if axis in columns))
     for label, count in Counter(columns["status"].tolist()).most_common():
         inside = columns["status"] == label
-        cells = [
-            _quantile(sigma[inside], 0.5),
-            _quantile(sigma[inside], 0.95),
-            _quantile(columns["p_value"][inside], 0.5),
-        ]
+        shares = ((sigma, 0.5), (sigma, 0.95), (columns["p_value"], 0.5))
+        cells = [_quantile(values[inside], share) for values, share in shares]
         table.add_row(Text(label, style=_colour(Status[label.upper().replace(" ", "_")])), str(count), *cells)
     console.print(table)
-    _failures(columns, console)
+    bad = np.flatnonzero(columns["status"] != Status.OK.label)
+    for i in bad[:_FAILURES]:
+        say(console, f"epoch {columns['epoch'][i]}: {columns['status'][i]}: {columns['reason'][i]}")
+    if len(bad) > _FAILURES:
+        say(console, f"... and {len(bad) - _FAILURES} more; --out writes all of them")
 
 
-def _quantile(values: Any, share: float) -> str:
+def _quantile(values: Array, share: float) -> str:
     finite = values[np.isfinite(values)]
     return f"{np.quantile(finite, share):.3g}" if len(finite) else "-"
 
 
-def _failures(columns: Columns, console: Console, limit: int = 10) -> None:
-    bad = np.flatnonzero(columns["status"] != Status.OK.label)
-    for i in bad[:limit]:
-        console.print(
-            f"epoch {columns['epoch'][i]}: {columns['status'][i]}: {columns['reason'][i]}",
-            highlight=False,
-            markup=False,
-            soft_wrap=True,
-        )
-    if len(bad) > limit:
-        console.print(f"... and {len(bad) - limit} more; --out writes all of them", highlight=False)
+# Noise from data.
 
 
-def run_fix(
-    file: Path,
-    method: str,
-    more: Mapping[str, ConstraintTable],
-    *,
-    as_json: bool = False,
-    geojson_path: Path | None = None,
-    plot: Path | None = None,
-    out: Path | None = None,
-    html: Path | None = None,
-    quiet: bool = False,
-    noise: str | None = None,
-) -> int:
-    """Fix a file under constraints of its own and more, write what was asked for, and return the exit code."""
-    if as_json and geojson_path is not None and str(geojson_path) == "-":
-        raise InvalidProblem("JSON and GeoJSON cannot both go to standard output", "--geojson", "name a file")
-    fixed = fix_file(noised(read(file, more=more), noise), method, quiet or as_json)
-    if out is not None:
-        write_table(out, fixed.columns)
-    if geojson_path is not None:
-        write_text(geojson_path, dumps(geojson(fixed)))
-    if plot is not None:
-        draw(fixed, plot)
-    if html is not None:
-        write_text(html, _map(fixed))
-    if as_json:
-        levels = fixed.loaded.levels
-        noted = {} if levels is None else {"noise": levels_json(levels)}
-        write_text(Path("-"), dumps(fixed_json(fixed) | noted))
-    elif not quiet:
-        console = Console(stderr=geojson_path is not None and str(geojson_path) == "-")
-        show(fixed, console)
-        if fixed.loaded.levels is not None:
-            show_levels(fixed.loaded.levels, console)
-    return 0 if fixed.clean else 1
+def _estimate_noise(loaded: Loaded, by: str | None) -> Loaded:
+    """Return a file's problem with its noise estimated for each station, pair or kind; unchanged where not asked."""
+    if by is None:
+        return loaded
+    problem, levels = with_estimated_noise(loaded.problem, grouping_of(by, "--noise-from-data"))
+    return replace(loaded, problem=problem, levels=levels)
 
 
-def _map(fixed: Fixed) -> str:
-    from optloc.report import fix_page
+def grouping_of(by: str, where: str) -> By:
+    """Return what makes a group of errors; raise InvalidProblem for an unknown word."""
+    if by not in GROUPINGS:
+        raise InvalidProblem(f"unknown grouping {by!r}", where, nearest(by, GROUPINGS))
+    return cast("By", by)
 
-    loaded = fixed.loaded
-    return fix_page(loaded.problem, fixed.fixes, loaded.title, [str(label) for label in fixed.columns["epoch"]])
+
+def _levels_json(levels: NoiseLevels) -> dict[str, Any]:
+    """Return noise levels as one JSON value, SI units."""
+    columns: Columns = {"name": np.array(levels.names), "sigma": levels.sigma, "sigma_error": levels.sigma_error}
+    columns |= {"stated": levels.stated, "redundancy": levels.redundancy, "count": levels.count, "gross": levels.gross}
+    return {
+        "by": levels.by,
+        "levels": records(columns),
+        "fixes": levels.fixes,
+        "chi_square_stated": levels.before,
+        "chi_square": levels.after,
+        "sentences": list(levels.sentences),
+    }
 
 
-def draw(fixed: Fixed, path: Path) -> None:
-    """Draw fixes to a picture file; raise InvalidProblem where that fails."""
-    from optloc.plot import plot_fixes
-
-    saved(plot_fixes(fixed.loaded.problem, fixed.fixes, title=fixed.loaded.title), path)
+def _show_levels(levels: NoiseLevels, console: Console) -> None:
+    """Print noise levels as a table."""
+    table = Table(title=f"Noise from data, by {levels.by}", title_justify="left")
+    table.add_column(levels.by)
+    for name in ("sigma, SI", "stated", "redundancy", "errors", "gross"):
+        table.add_column(name, justify="right")
+    for i, name in enumerate(levels.names):
+        told = np.isfinite(levels.error[i])
+        sigma = f"{levels.sigma[i]:.3g} ± {levels.sigma_error[i]:.2g}" if told else "not told"
+        cells = (f"{levels.stated[i]:.3g}", f"{levels.redundancy[i]:.0%}", str(levels.count[i]), str(levels.gross[i]))
+        table.add_row(name, sigma, *cells)
+    console.print(table)
+    say_all(console, levels.sentences)

@@ -1,9 +1,10 @@
-"""What ``optloc list`` prints: any table of entries that have a summary."""
+"""What ``optloc list`` prints: the tables of everything that has a name, as their entries describe themselves."""
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Mapping
-from pathlib import Path
+from importlib import import_module
 from typing import Any
 
 import typer
@@ -13,14 +14,96 @@ from rich.table import Table
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.units import UNITS
-from optloc.cli.fixed import bar
 from optloc.cli.output import dumps
 from optloc.models import MODELS
-from optloc.papers import Size, paper, planned, write
-from optloc.papers import Table as PaperTable
+
+Rows = list[dict[str, str]]
+
+# Widths of the console that a table may wrap over: beyond, entries are easier to read one below the other.
+_WRAPS = 4
 
 
-def _kinds() -> list[dict[str, str]]:
+def run_list(what: str, as_json: bool) -> int:
+    """Print one of the tables."""
+    if what not in LISTS:
+        raise InvalidProblem(f"there is no list of {what!r}", "list", nearest(what, LISTS))
+    rows = LISTS[what]()
+    if as_json:
+        typer.echo(dumps(rows))
+        return 0
+    _print(rows, Console())
+    return 0
+
+
+def _print(rows: Rows, console: Console) -> None:
+    """Print entries as a table, or one below the other where they are too long for one."""
+    title, *names = dict.fromkeys(name for row in rows for name in row)
+    if sum(max(len(row.get(name, "")) for row in rows) for name in names) > _WRAPS * console.width:
+        for row in rows:
+            console.print(f"[bold]{row[title]}[/bold]: {row['summary']}", highlight=False)
+            for name in names[:-1]:
+                console.print(Padding(f"{name}: {row.get(name, '')}", (0, 0, 0, 4)), highlight=False)
+        return
+    table = Table()
+    table.add_column(title, no_wrap=True)
+    for name in names:
+        table.add_column(name)
+    for row in rows:
+        table.add_row(row[title], *(row.get(name, "") for name in names))
+    console.print(table)
+
+
+# An entry tells what can be said in words of its fields, and its summary last.
+
+
+def describe(title: str, table: Mapping[str, Any]) -> Rows:
+    """Return name, text fields and summary of every entry of a registry.
+
+    Parameters
+    ----------
+    title : str
+        What an entry is.
+    table : mapping of str to anything
+        Dataclasses show their fields of text and numbers; code is left out. The summary is a field, the first line of
+        a function's docstring, or the entry itself where it is text.
+    """
+    rows = []
+    for name, entry in table.items():
+        fields = [field for field in getattr(entry, "__dataclass_fields__", {}) if field not in ("name", "summary")]
+        texts = {field: _spell(getattr(entry, field)) for field in fields}
+        shown = {field: text for field, text in texts.items() if text is not None}
+        rows.append({title: name} | shown | {"summary": _summary(entry)})
+    return rows
+
+
+def _spell(value: Any) -> str | None:
+    if isinstance(value, bool | int | float | str):
+        return str(value)
+    if isinstance(value, tuple | list | frozenset | set) and all(isinstance(v, str | int) for v in value):
+        return " ".join(str(v) for v in value)
+    return None
+
+
+def _summary(entry: Any) -> str:
+    if isinstance(entry, str):
+        return entry
+    return str(
+        getattr(entry, "summary", "") or (inspect.getdoc(entry) or "").partition("\n")[0].removeprefix("Return ")
+    )
+
+
+def _registry(title: str, place: str) -> Callable[[], Rows]:
+    """Return what lists a table, or what a function makes of it, by its place: it is imported when it is asked for."""
+
+    def rows() -> Rows:
+        module, _, name = place.partition(":")
+        found = getattr(import_module(module), name)
+        return describe(title, found() if callable(found) else found)
+
+    return rows
+
+
+def _kinds() -> Rows:
     return [
         {
             "kind": name,
@@ -33,13 +116,7 @@ def _kinds() -> list[dict[str, str]]:
     ]
 
 
-def _formulations() -> list[dict[str, str]]:
-    from optloc.solvers.methods import FORMULATIONS
-
-    return _entries("formulation", FORMULATIONS)
-
-
-def _solvers() -> list[dict[str, str]]:
+def _solvers() -> Rows:
     from optloc.solvers.methods import SOLVERS
     from optloc.study.methods import backends
 
@@ -47,28 +124,10 @@ def _solvers() -> list[dict[str, str]]:
         name: {"solver": name, "role": f"back end, {entry.kind}", "version": entry.version, "summary": entry.summary}
         for name, entry in backends().items()
     }
-    return [*_entries("solver", SOLVERS), *found.values()]
+    return [*describe("solver", SOLVERS), *found.values()]
 
 
-def _methods() -> list[dict[str, str]]:
-    from optloc.solvers.methods import METHODS
-
-    return [{"method": name, "summary": stages} for name, stages in METHODS.items()]
-
-
-def _baselines() -> list[dict[str, str]]:
-    from optloc.study.baselines import BASELINES
-
-    return _entries("baseline", BASELINES)
-
-
-def _executors() -> list[dict[str, str]]:
-    from optloc.study.execute import EXECUTORS
-
-    return _entries("executor", EXECUTORS)
-
-
-def _studies() -> list[dict[str, str]]:
+def _studies() -> Rows:
     import tomllib
 
     from optloc.study.plan import shipped
@@ -77,7 +136,7 @@ def _studies() -> list[dict[str, str]]:
     return [{"study": name, "summary": data.get("title", data["name"])} for name, data in texts.items()]
 
 
-def _datasets() -> list[dict[str, str]]:
+def _datasets() -> Rows:
     from optloc.datasets import available
     from optloc.datasets.catalogue import ENTRIES
 
@@ -93,120 +152,21 @@ def _datasets() -> list[dict[str, str]]:
     ]
 
 
-def _demos() -> list[dict[str, str]]:
-    from optloc.cli.first_steps import titles
-
-    return [{"demo": name, "summary": title} for name, title in titles().items()]
-
-
-def _starters() -> list[dict[str, str]]:
-    from optloc.cli.first_steps import starters
-
-    return [{"starter": name, "summary": starter.summary} for name, starter in starters().items()]
-
-
-def _entries(title: str, table: Mapping[str, Any]) -> list[dict[str, str]]:
-    """Return name and the text fields of every entry, its summary last."""
-    rows = []
-    for name, entry in table.items():
-        names = getattr(type(entry), "__dataclass_fields__", {}) or {"summary": None}
-        texts = {field: getattr(entry, field) for field in names if field != "summary"}
-        shown = {field: _text(value) for field, value in texts.items() if _text(value) is not None}
-        rows.append({title: name} | shown | {"summary": str(entry.summary)})
-    return rows
-
-
-def _text(value: Any) -> Any:
-    if isinstance(value, bool | int | float | str):
-        return str(value)
-    if isinstance(value, tuple | list | frozenset | set) and all(isinstance(v, str | int) for v in value):
-        return " ".join(str(v) for v in value)
-    return None
-
-
-LISTS: dict[str, Callable[[], list[dict[str, str]]]] = {
+LISTS: dict[str, Callable[[], Rows]] = {
     "kinds": _kinds,
-    "formulations": _formulations,
+    "formulations": _registry("formulation", "optloc.solvers:FORMULATIONS"),
     "solvers": _solvers,
-    "methods": _methods,
-    "baselines": _baselines,
-    "executors": _executors,
+    "methods": _registry("method", "optloc:METHODS"),
+    "losses": _registry("loss", "optloc:LOSSES"),
+    "trackers": _registry("tracker", "optloc.track:UPDATES"),
+    "motions": _registry("motion", "optloc.cli.track:MOTIONS"),
+    "baselines": _registry("baseline", "optloc.study.baselines:BASELINES"),
+    "executors": _registry("executor", "optloc.study.execute:EXECUTORS"),
     "studies": _studies,
+    "papers": _registry("paper", "optloc.papers:PAPERS"),
     "datasets": _datasets,
-    "demos": _demos,
-    "starters": _starters,
+    "pictures": _registry("picture", "optloc.cli.pictures:PICTURES"),
+    "demos": _registry("demo", "optloc.cli.starters:titles"),
+    "starters": _registry("starter", "optloc.cli.starters:starters"),
 }
-
-
-def run_list(what: str, as_json: bool) -> int:
-    """Print one of the tables."""
-    if what not in LISTS:
-        raise InvalidProblem(f"there is no list of {what!r}", "list", nearest(what, LISTS))
-    rows = LISTS[what]()
-    if as_json:
-        typer.echo(dumps(rows))
-        return 0
-    _print(rows, Console())
-    return 0
-
-
-def _print(rows: list[dict[str, str]], console: Console) -> None:
-    """Print entries as a table, or one below the other where they are too long for one."""
-    title, *names = dict.fromkeys(name for row in rows for name in row)
-    if sum(max(len(row.get(name, "")) for row in rows) for name in names) > 4 * console.width:
-        for row in rows:
-            console.print(f"[bold]{row[title]}[/bold]: {row['summary']}", highlight=False)
-            for name in names[:-1]:
-                console.print(Padding(f"{name}: {row.get(name, '')}", (0, 0, 0, 4)), highlight=False)
-        return
-    table = Table()
-    table.add_column(title, no_wrap=True)
-    for name in names:
-        table.add_column(name)
-    for row in rows:
-        table.add_row(row[title], *(row.get(name, "") for name in names))
-    console.print(table)
-
-
-# What ``optloc reproduce`` does.
-
-SIZES: tuple[Size, ...] = ("quick", "full")
-
-
-def run_reproduce(name: str, size: str, out: Path | None, seed: int, quiet: bool) -> int:
-    """Make the tables and pictures of a paper again, print the tables, and return the exit code."""
-    paper(name)
-    chosen = next((known for known in SIZES if known == size), None)
-    if chosen is None:
-        raise InvalidProblem(f"there is no size {size!r}", "--size", nearest(size, SIZES))
-    folder = Path(f"optloc-{name}") if out is None else out
-    _usable(folder)
-    plan = planned(name, chosen, seed)
-    with bar(name, plan.work, quiet) as advance:
-        report = plan.run(lambda: advance(1))
-    written = write(report, folder)
-    if not quiet:
-        console = Console()
-        for table in report.tables:
-            console.print(_shown(table))
-        console.print(f"{len(written)} files are in {folder}; begin with README.md.", highlight=False, markup=False)
-    return 0
-
-
-def _usable(folder: Path) -> None:
-    """Make the folder before the work, so that a place that cannot be written is known at once."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InvalidProblem(
-            f"the folder cannot be made ({error.strerror or error})", str(folder), "choose another place"
-        ) from None
-
-
-def _shown(table: PaperTable) -> Table:
-    shown = Table(title=table.title, title_justify="left", caption=table.note, caption_justify="left")
-    for i, name in enumerate(table.header):
-        shown.add_column(name, justify="right" if i else "left", overflow="fold")
-    for row in table.rows:
-        shown.add_row(*row)
-    return shown
+"""What can be listed, by name; `optloc list` and the completion of the shell read it."""

@@ -1,4 +1,4 @@
-"""Options that several commands share."""
+"""What commands share: how they end, their help, the options that several have, and how their values are read."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import logging
 import sys
 from collections.abc import Callable
 from importlib.resources import files
-from math import isnan, nan
+from math import isfinite, isnan, nan
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,10 +16,11 @@ from typer.core import TyperGroup
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.files.schema import ConstraintTable
 
-# Commands that end in one line and a stable exit code, whatever goes wrong.
+BAD_INPUT = 2
+"""Exit code of whatever is wrong with the arguments or a file: what shells and typer use for wrong usage."""
 
-BAD_INPUT, STOPPED = 2, 130
-"""Exit codes: bad input, Ctrl-C."""
+STOPPED = 130
+"""Exit code after Ctrl-C: 128 and the number of SIGINT, as shells count."""
 
 EXIT_CODES = "Exit codes: 0 everything is ok, 1 some status is not ok, 2 bad input, 130 stopped by Ctrl-C."
 
@@ -36,7 +37,7 @@ class Group(TyperGroup):
             # Usage errors. Their classes have another home in each release of typer, but all can be spelled.
             if not standalone or not hasattr(error, "format_message"):
                 raise
-            code = _said(_usage(error))
+            code = _refuse(_usage(error))
         if not standalone:
             return code
         sys.exit(code if isinstance(code, int) else 0)
@@ -46,24 +47,24 @@ class Group(TyperGroup):
         try:
             return super().invoke(ctx)
         except InvalidProblem as error:
-            raise typer.Exit(_said(str(error))) from None
+            raise typer.Exit(_refuse(str(error))) from None
         except BrokenPipeError:
-            raise
+            raise  # the reader of a pipe has gone: click ends quietly
         except OSError as error:
-            raise typer.Exit(_said(f"{error.filename or 'optloc'}: {error.strerror or error}.")) from None
+            raise typer.Exit(_refuse(f"{error.filename or 'optloc'}: {error.strerror or error}.")) from None
         except KeyboardInterrupt:
             typer.echo("Stopped.", err=True)
             raise typer.Exit(STOPPED) from None
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """Return the command that is named; raise InvalidProblem where there is none, naming the nearest."""
-        names = self.list_commands(ctx)
-        if args and args[0] not in names:
-            raise InvalidProblem(f"there is no command {args[0]!r}", ctx.command_path, nearest(args[0], names))
+        known = self.list_commands(ctx)
+        if args and args[0] not in known:
+            raise InvalidProblem(f"there is no command {args[0]!r}", ctx.command_path, nearest(args[0], known))
         return super().resolve_command(ctx, args)
 
 
-def _said(sentence: str) -> int:
+def _refuse(sentence: str) -> int:
     """Print one line on standard error, and return the exit code of bad input."""
     typer.echo(" ".join(sentence.split()), err=True)
     return BAD_INPUT
@@ -83,9 +84,10 @@ def example(*lines: str) -> str:
     return "[bold]Examples[/bold]\n\n" + "\n\n".join(f"[cyan]{line}[/cyan]" for line in lines)
 
 
-def told(wanted: bool) -> bool:
+def start_log(wanted: bool) -> bool:
     """Let optloc's log go to standard error, with all its steps where that is wanted."""
     log = logging.getLogger("optloc")
+    # One process may run several commands, in tests for instance, each with a standard error of its own.
     for old in [handler for handler in log.handlers if handler.name == "command line"]:
         log.removeHandler(old)
     handler = logging.StreamHandler(sys.stderr)
@@ -96,23 +98,26 @@ def told(wanted: bool) -> bool:
     return wanted
 
 
-def _shipped(path: Path) -> Path:
+def shipped_problems() -> dict[str, Path]:
+    """Return the problem files that come with optloc, by name."""
+    return {path.stem: path for path in sorted(Path(str(files("optloc") / "scenarios")).glob("*.toml"))}
+
+
+def find_problem(path: Path) -> Path:
     """Return the path, or that of the shipped problem of this name where no such file is there."""
     if path.name != str(path) or path.suffix or path.exists():
         return path
-    folder = files("optloc") / "scenarios"
-    known = sorted(entry.name.removesuffix(".toml") for entry in folder.iterdir() if entry.name.endswith(".toml"))
+    known = shipped_problems()
     if str(path) in known:
-        return Path(str(folder / f"{path}.toml"))
-    raise InvalidProblem(
-        "there is no such file, and no shipped problem of this name", str(path), nearest(str(path), known)
-    )
+        return known[str(path)]
+    what = "there is no such file, and no shipped problem of this name"
+    raise InvalidProblem(what, str(path), nearest(str(path), list(known)))
 
 
 ProblemPath = Annotated[
     Path,
     typer.Argument(
-        metavar="FILE", help="Problem file (TOML, format = 1), or the name of a shipped one.", callback=_shipped
+        metavar="FILE", help="Problem file (TOML, format = 1), or the name of a shipped one.", callback=find_problem
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON on standard output and nothing else.")]
@@ -123,11 +128,13 @@ Html = Annotated[
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 Verbose = Annotated[
     bool,
-    typer.Option("--verbose", "-v", callback=told, help="Say on standard error what is done, and how long it takes."),
+    typer.Option(
+        "--verbose", "-v", callback=start_log, help="Say on standard error what is done, and how long it takes."
+    ),
 ]
 
 
-def names(what: str) -> Callable[[str], list[str]]:
+def complete(what: str) -> Callable[[str], list[str]]:
     """Return a completion of the names in one of the tables of `optloc list`."""
 
     def found(incomplete: str) -> list[str]:
@@ -141,7 +148,7 @@ def names(what: str) -> Callable[[str], list[str]]:
 Method = Annotated[
     str,
     typer.Option(
-        "--method", "-m", autocompletion=names("methods"), help="How to solve; see [bold]optloc list methods[/bold]."
+        "--method", "-m", autocompletion=complete("methods"), help="How to solve; see [bold]optloc list methods[/bold]."
     ),
 ]
 Geodetic = Annotated[
@@ -161,11 +168,27 @@ NoiseFromData = Annotated[
 ]
 
 
-# Constraints that options of ``optloc fix`` add to those of the file.
+def coordinates(
+    text: str, where: str, advice: str = "write them as 1200,800,50", *, bounds: bool = False
+) -> list[float]:
+    """Return the numbers of a list such as 1200,800,50; of `bounds` some may be infinite.
+
+    Raises
+    ------
+    InvalidProblem
+        Naming the option `where` they were given.
+    """
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        values = [nan]
+    if any(map(isnan, values)) or not (bounds or all(map(isfinite, values))):
+        raise InvalidProblem(f"{text!r} is no list of numbers", where, advice)
+    return values
 
 
-def demanded(height: str | None, above_ground: bool, box: str | None) -> dict[str, ConstraintTable]:
-    """Return the constraints of options, each behind the name of its option.
+def constraints(height: str | None, above_ground: bool, box: str | None) -> dict[str, ConstraintTable]:
+    """Return the constraints that options add to those of a file, each behind the name of its option.
 
     Parameters
     ----------
@@ -182,18 +205,9 @@ def demanded(height: str | None, above_ground: bool, box: str | None) -> dict[st
     if above_ground:
         found["--above-ground"] = ConstraintTable(kind="above-ground")
     if box is not None:
-        low, found_both, high = box.partition(":")
-        if not found_both:
+        if ":" not in box:
             raise InvalidProblem(f"{box!r} has one corner", "--box", "write both, such as 0,0:5000,4000")
-        found["--box"] = ConstraintTable(kind="box", min=_corner(low), max=_corner(high))
+        advice = "write a corner as 1200,800 or 1200,800,50"
+        low, high = (coordinates(corner, "--box", advice, bounds=True) for corner in box.split(":", 1))
+        found["--box"] = ConstraintTable(kind="box", min=low, max=high)
     return found
-
-
-def _corner(text: str) -> list[float]:
-    try:
-        values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = [nan]
-    if any(map(isnan, values)):
-        raise InvalidProblem(f"{text!r} is no list of numbers", "--box", "write a corner as 1200,800 or 1200,800,50")
-    return values

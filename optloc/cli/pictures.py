@@ -1,11 +1,9 @@
-"""What ``optloc plot`` draws."""
+"""What ``optloc plot`` draws: one function for each picture, whose first line is what ``optloc list pictures`` says."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.resources import as_file, files
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -13,7 +11,7 @@ import numpy as np
 from rich.console import Console
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.cli.output import saved
+from optloc.cli.output import say, write_picture
 from optloc.files import Loaded, read
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix
@@ -49,25 +47,12 @@ def run_plot(what: str, asked: Asked, quiet: bool) -> int:
     """Draw a picture, and return the exit code."""
     if what not in PICTURES:
         raise InvalidProblem(f"there is no picture {what!r}", "plot", nearest(what, list(PICTURES)))
-    with problem_file(asked.file) as file:
-        PICTURES[what](Asked(file, asked.out, asked.method, asked.epoch))
-    if not quiet:
-        Console().print(f"The picture is in {asked.out}.", highlight=False)
+    PICTURES[what](asked)
+    say(Console(quiet=quiet), f"The picture is in {asked.out}.")
     return 0
 
 
-@contextmanager
-def problem_file(file: Path) -> Iterator[Path]:
-    """Yield a path as it is, or that of the shipped problem of that name where there is no such path."""
-    shipped = files("optloc") / "scenarios"
-    if file.exists() or file.name != str(file) or not (shipped / f"{file}.toml").is_file():
-        yield file
-        return
-    with as_file(shipped) as folder:
-        yield folder / f"{file}.toml"
-
-
-def _fixed(asked: Asked) -> tuple[Loaded, Problem, Fix]:
+def _solve_all(asked: Asked) -> tuple[Loaded, Problem, Fix]:
     """Return a file, its problem (epochs that share nothing as a batch) and its fixes."""
     from optloc.solvers import solve
 
@@ -76,7 +61,7 @@ def _fixed(asked: Asked) -> tuple[Loaded, Problem, Fix]:
     return loaded, problem, solve(problem, asked.method)
 
 
-def _one(asked: Asked) -> tuple[Problem, Fix, str]:
+def _solve_one(asked: Asked) -> tuple[Problem, Fix, str]:
     """Return the problem of one epoch, or of a run, with its fix and a title."""
     from optloc.solvers import solve
 
@@ -92,58 +77,65 @@ def _one(asked: Asked) -> tuple[Problem, Fix, str]:
 
 
 def _fix(asked: Asked) -> None:
+    """Stations, fix, 95 % ellipse and alternatives."""
     from optloc.plot import plot_fixes
 
-    loaded, _, fix = _fixed(asked)
-    saved(plot_fixes(loaded.problem, fix, loaded.title), asked.out)
+    loaded, _, fix = _solve_all(asked)
+    write_picture(plot_fixes(loaded.problem, fix, loaded.title), asked.out)
 
 
 def _residuals(asked: Asked) -> None:
+    """Residuals by station."""
     from optloc.plot import plot_residuals
 
-    loaded, problem, fix = _fixed(asked)
-    saved(plot_residuals(problem, fix, loaded.title), asked.out)
+    loaded, problem, fix = _solve_all(asked)
+    write_picture(plot_residuals(problem, fix, loaded.title), asked.out)
 
 
-def _of_one(draw: Callable[..., Figure], asked: Asked) -> None:
-    problem, fix, title = _one(asked)
-    saved(draw(problem, fix, title), asked.out)
+def _draw_one(draw: Callable[..., Figure], asked: Asked) -> None:
+    problem, fix, title = _solve_one(asked)
+    write_picture(draw(problem, fix, title), asked.out)
 
 
 def _landscape(asked: Asked) -> None:
+    """Cost over the place of the target."""
     from optloc.plot import plot_landscape
 
-    _of_one(plot_landscape, asked)
+    _draw_one(plot_landscape, asked)
 
 
 def _convergence(asked: Asked) -> None:
+    """Where iterations from many starts end."""
     from optloc.plot import plot_convergence
 
-    _of_one(plot_convergence, asked)
+    _draw_one(plot_convergence, asked)
 
 
 def _biases(asked: Asked) -> None:
+    """Biases of a run against time, with 95 %."""
     from optloc.plot import plot_biases
     from optloc.solvers.running import growing
 
-    loaded, problem, fix = _fixed(asked)
-    saved(plot_biases(growing(problem, fix), loaded.title), asked.out)
+    loaded, problem, fix = _solve_all(asked)
+    write_picture(plot_biases(growing(problem, fix), loaded.title), asked.out)
 
 
 def _bound(asked: Asked) -> None:
+    """Map of the Cramer-Rao bound."""
     from optloc.cli.crlb import run_map
 
     run_map(asked.file, asked.out, None, None, None, None, geodetic=False, dilution=False)
 
 
 def _track(asked: Asked) -> None:
-    from optloc.cli.track import Wanted, rules, run_track
+    """Track of a run, with sigma and NIS."""
+    from optloc.cli.track import Wanted, run_track
 
-    wanted = Wanted("cv", "iekf", None, 10.0, rules(5.0, None), None, None)
-    run_track(asked.file, wanted, out=None, as_json=False, plot=asked.out, quiet=True)
+    run_track(asked.file, Wanted(), plot=asked.out, quiet=True)
 
 
 def _accuracy(asked: Asked) -> None:
+    """Errors of a study's methods against the bound."""
     from optloc.plot import plot_accuracy
     from optloc.study import summary
     from optloc.study.folder import read_frame
@@ -166,7 +158,7 @@ def _accuracy(asked: Asked) -> None:
         for method, part in case.groupby("method", sort=False, observed=True)
     }
     unit = str(case["noise_unit"].iloc[0])
-    saved(plot_accuracy(noise, errors, bound, name, unit="" if unit == "x" else unit), asked.out)
+    write_picture(plot_accuracy(noise, errors, bound, name, unit="" if unit == "x" else unit), asked.out)
 
 
 PICTURES: dict[str, Callable[[Asked], None]] = {

@@ -15,7 +15,6 @@ from optloc.base.status import Status
 from optloc.cli.crlb import vector
 from optloc.cli.output import dumps, write_text
 from optloc.files import Loaded, read
-from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.several import Emitters, evenly, separate
 
@@ -111,14 +110,17 @@ def _show(loaded: Loaded, label: str, found: Emitters) -> None:
 def _rows(found: Emitters) -> Iterator[tuple[str, ...]]:
     for i, fix in enumerate(found.fixes):
         rows, status = found.rows(i), Status(int(fix.code)).label
-        yield f"emitter {i}", _numbers(fix.position), _sigma(fix), str(len(rows)), f"{float(fix.cost):.1f}", status
+        yield (
+            f"emitter {i}",
+            _numbers(fix.position),
+            _numbers(fix.sigma()),
+            str(len(rows)),
+            f"{float(fix.cost):.1f}",
+            status,
+        )
     for ghost in found.ghosts:
         yield "ghost", _numbers(ghost.position), "", str(len(ghost.rows)), "", f"costs {ghost.gap:.1f} more"
 
 
 def _numbers(values: Any) -> str:
     return ", ".join(f"{value:.1f}" for value in values)
-
-
-def _sigma(fix: Fix) -> str:
-    return _numbers(fix.sigma())

@@ -1,4 +1,4 @@
-"""What ``optloc study`` does: run, status, report, compare."""
+"""What ``optloc study`` does (run, status, report, compare), and ``optloc reproduce``: the study of a paper."""
 
 from __future__ import annotations
 
@@ -6,16 +6,21 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from itertools import groupby
+from math import isnan, nan
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, cast, get_args
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from optloc.cli.options import STOPPED, Group, Json, Quiet, Verbose, example, names
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.cli.options import STOPPED, Group, Json, Quiet, Verbose, complete, example
 
 # Heavy libraries are imported inside the commands, so that --help answers at once.
+
+# Difference of two shares of answers, in its standard deviations, that is called one: 3 in 1000 by chance.
+_DIFFERS = 3.0
 
 study = typer.Typer(
     cls=Group,
@@ -39,7 +44,7 @@ def run(
     file: Annotated[
         Path,
         typer.Argument(
-            metavar="FILE", autocompletion=names("studies"), help="Study file, or the name of a shipped study."
+            metavar="FILE", autocompletion=complete("studies"), help="Study file, or the name of a shipped study."
         ),
     ],
     out: Annotated[
@@ -78,8 +83,7 @@ def run(
         _print_json(_record(found))
     elif not quiet:
         _show(found, Console())
-        line = f"The table is in {folder}; optloc study report {folder} makes the report."
-        Console().print(line, highlight=False, markup=False, soft_wrap=True)
+        _say(f"The table is in {folder}; optloc study report {folder} makes the report.")
 
 
 @study.command(epilog=example("optloc study status runs/my"))
@@ -115,8 +119,7 @@ def report(
     with console.status("report") if shown else nullcontext() as status:
         files = write_report(folder, out, (lambda text: status.update(f"report: {text}")) if status else None)
     if not quiet:
-        line = f"{files[0]} is the report; {len(files) - 1} tables and figures are beside it."
-        Console().print(line, highlight=False, markup=False, soft_wrap=True)
+        _say(f"{files[0]} is the report; {len(files) - 1} tables and figures are beside it.")
 
 
 @study.command(epilog=example("optloc study compare runs/before runs/after"))
@@ -137,7 +140,7 @@ def compare(
         _print_json([asdict(difference) for difference in found])
     elif not quiet:
         _show_comparison(found, one, two, Console())
-    raise typer.Exit(int(any(abs(difference.z) > 3.0 for difference in found)))
+    raise typer.Exit(int(any(abs(difference.z) > _DIFFERS for difference in found)))
 
 
 @study.command(epilog=example("optloc study schema > study.schema.json"))
@@ -152,6 +155,12 @@ def _print_json(value: Any) -> None:
     from optloc.cli.output import dumps
 
     typer.echo(dumps(value))
+
+
+def _say(line: str) -> None:
+    from optloc.cli.output import say
+
+    say(Console(), line)
 
 
 def _record(found: Any) -> dict[str, Any]:
@@ -204,9 +213,8 @@ def _show(found: Any, console: Console) -> None:
     state = "complete" if found.complete else f"{found.done} of {found.chunks} chunks"
     line = f"{m.title or m.name}: {state}, {found.rows} of {m.rows} rows"
     console.print(line, style="bold", highlight=False, markup=False, soft_wrap=True)
-    table = Table()
+    table = Table("method")
     statuses = [status for status, _ in Counter(found.counts).most_common()]
-    table.add_column("method")
     for name in statuses:
         table.add_column(name, justify="right")
     for method in dict.fromkeys(method for method, _ in found.methods):
@@ -225,7 +233,40 @@ def _show_comparison(found: list[Any], one: Path, two: Path, console: Console) -
             table.add_column(name, justify="right", no_wrap=True)
         for d in same:
             values = "identical" if d.identical else "same data" if d.same_data else "other data"
-            times = d.two.seconds / d.one.seconds if d.one.seconds else float("nan")
+            times = d.two.seconds / d.one.seconds if d.one.seconds else nan
             numbers = (100 * d.one.answered, 100 * d.two.answered, d.z, d.one.rmse, d.two.rmse, times)
-            table.add_row(d.cell[3], *("-" if n != n else f"{n:.4g}" for n in numbers), values)  # noqa: PLR0124
+            table.add_row(d.cell[3], *("-" if isnan(n) else f"{n:.4g}" for n in numbers), values)
         console.print(table)
+
+
+# A paper is a study of its own: its trials, tables and pictures are made again.
+
+
+def run_reproduce(name: str, size: str, out: Path | None, seed: int, quiet: bool) -> int:
+    """Make the tables and pictures of a paper again, print the tables, and return the exit code."""
+    from optloc.cli.output import bar, say
+    from optloc.papers import Size, paper, planned, write
+
+    paper(name)
+    if size not in get_args(Size):
+        raise InvalidProblem(f"there is no size {size!r}", "--size", nearest(size, get_args(Size)))
+    folder = Path(f"optloc-{name}") if out is None else out
+    try:  # before the work, so that a place that cannot be written is known at once
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        what = f"the folder cannot be made ({error.strerror or error})"
+        raise InvalidProblem(what, str(folder), "choose another place") from None
+    plan = planned(name, cast(Size, size), seed)
+    with bar(name, plan.work, quiet) as advance:
+        report = plan.run(lambda: advance(1))
+    written = write(report, folder)
+    console = Console(quiet=quiet)
+    for found in report.tables:
+        table = Table(title=found.title, title_justify="left", caption=found.note, caption_justify="left")
+        for i, heading in enumerate(found.header):
+            table.add_column(heading, justify="right" if i else "left", overflow="fold")
+        for row in found.rows:
+            table.add_row(*row)
+        console.print(table)
+    say(console, f"{len(written)} files are in {folder}; begin with README.md.")
+    return 0

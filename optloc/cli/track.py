@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -14,9 +13,21 @@ from rich.table import Table
 from rich.text import Text
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.types import Array
-from optloc.cli.fixed import Columns, bar, geodetic_columns, joined
-from optloc.cli.output import dumps, plain, saved, write_table, write_text
+from optloc.cli.options import coordinates
+from optloc.cli.output import (
+    Columns,
+    bar,
+    check_table_name,
+    covariance_columns,
+    dumps,
+    geodetic_columns,
+    join_tables,
+    records,
+    say,
+    write_picture,
+    write_table,
+    write_text,
+)
 from optloc.files import Loaded, read
 from optloc.problem.problem import Problem
 from optloc.track import Dynamics, State, current_statistical, polynomial, singer
@@ -25,10 +36,43 @@ from optloc.track.run import Entry, Rules, tracked
 from optloc.track.several_targets import alone
 from optloc.track.track import filter_of
 
-# Standard deviations in SI units of what drives the target where --noise does not say; csm: the largest acceleration.
-_NOISE = {"static": 0.0, "cv": 1.0, "ca": 1.0, "singer": 1.0, "csm": 10.0}
-_ORDERS = {"static": 0, "cv": 1, "ca": 2}
+
+@dataclass(frozen=True, slots=True)
+class MotionModel:
+    """A model of motion that a track can be asked for by name.
+
+    Parameters
+    ----------
+    noise : float
+        Standard deviation of what drives it where ``--noise`` does not say, SI units.
+    summary : str
+        One line for listings.
+    make : callable
+        Dynamics of a standard deviation of the noise and of seconds over which accelerations last.
+    """
+
+    noise: float
+    summary: str
+    make: Callable[[float, float], Dynamics]
+
+
+# Of the order of ordinary traffic, which brakes and turns by 1 m/s^2; csm is told the largest acceleration, about 1 g.
+MOTIONS = {
+    "cv": MotionModel(1.0, "constant velocity, driven by an acceleration", lambda noise, _: polynomial(1, noise)),
+    "ca": MotionModel(1.0, "constant acceleration, driven by a jerk", lambda noise, _: polynomial(2, noise)),
+    "static": MotionModel(0.0, "a target that stays, driven by a velocity", lambda noise, _: polynomial(0, noise)),
+    "singer": MotionModel(1.0, "Singer's: an acceleration that lasts", lambda noise, memory: singer(memory, noise)),
+    "csm": MotionModel(
+        10.0,
+        "current statistical: Singer's about the present acceleration; the noise is its largest acceleration",
+        lambda noise, memory: current_statistical(memory, noise),
+    ),
+}
+"""Models of motion by name."""
+
 _CLEAN = {"ok", "started", "starting"}
+# Scans that are told of one by one; --out has all of them.
+_REASONS = 10
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,18 +95,18 @@ class Wanted:
         By which rows are weighed.
     """
 
-    model: str
-    filter: str
-    noise: float | None
-    memory: float
-    rules: Rules
+    model: str = "cv"
+    filter: str = "iekf"
+    noise: float | None = None
+    memory: float = 10.0
+    rules: Rules = field(default_factory=Rules)
     start: str | None = None
     sigma: str | None = None
     loss: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class One:
+class TargetTrack:
     """The track of one target so far.
 
     Parameters
@@ -101,7 +145,7 @@ def run_track(
     update = filter_of(wanted.filter) if wanted.loss is None else reweighted(wanted.filter, wanted.loss)
     _check_places(out, plot, html)
     loaded = read(file)
-    ones = [One(*parts, []) for parts in runs_of(loaded)]
+    ones = [TargetTrack(*parts, []) for parts in runs_of(loaded)]
     if wanted.start is not None and len(ones) > 1:
         raise InvalidProblem("one initial state does not fit several targets", "--start", "leave it out")
     try:
@@ -112,7 +156,9 @@ def run_track(
                     one.entries.append(entry)
                     advance(1)
     finally:
-        columns = joined([track_columns(one) for one in ones if one.entries]) if any(o.entries for o in ones) else {}
+        columns = (
+            join_tables([track_columns(one) for one in ones if one.entries]) if any(o.entries for o in ones) else {}
+        )
         if columns:
             _write(loaded, ones, columns, out=out, as_json=as_json, plot=plot)
             if html is not None:
@@ -124,19 +170,16 @@ def run_track(
 
 def dynamics_of(wanted: Wanted) -> Dynamics:
     """Return the model of motion; raise InvalidProblem for an unknown one."""
-    if wanted.model not in _NOISE:
-        raise InvalidProblem(f"unknown model {wanted.model!r}", "--model", nearest(wanted.model, list(_NOISE)))
-    noise = _NOISE[wanted.model] if wanted.noise is None else wanted.noise
-    if wanted.model in _ORDERS:
-        return polynomial(_ORDERS[wanted.model], noise)
-    return (singer if wanted.model == "singer" else current_statistical)(wanted.memory, noise)
+    if wanted.model not in MOTIONS:
+        raise InvalidProblem(f"unknown model {wanted.model!r}", "--model", nearest(wanted.model, list(MOTIONS)))
+    motion = MOTIONS[wanted.model]
+    return motion.make(motion.noise if wanted.noise is None else wanted.noise, wanted.memory)
 
 
 def _check_places(out: Path | None, plot: Path | None, html: Path | None) -> None:
     """Refuse places that cannot be written before there is a track to lose."""
-    if out is not None and out.suffix.lower() not in {".csv", ".parquet", ".pq"}:
-        what = f"results of type {out.suffix or out.name!r} are unknown"
-        raise InvalidProblem(what, str(out), "use .csv or .parquet")
+    if out is not None:
+        check_table_name(out)
     for path in (out, plot, html):
         if path is not None and not path.parent.is_dir():
             raise InvalidProblem("the file cannot be written (no such folder)", str(path), "choose another place")
@@ -183,7 +226,8 @@ def _start(problem: Problem, dynamics: Dynamics, wanted: Wanted) -> State | None
     if wanted.start is None or wanted.sigma is None:
         return None
     d, parts = problem.dimension, dynamics.order + 1
-    mean, sigma = _numbers(wanted.start, "--start"), _numbers(wanted.sigma, "--start-sigma")
+    mean = np.array(coordinates(wanted.start, "--start", "separate finite numbers by commas"))
+    sigma = np.array(coordinates(wanted.sigma, "--start-sigma", "separate finite numbers by commas"))
     if len(mean) != d * parts:
         advice = "give position, velocity and acceleration as far as the model has them"
         raise InvalidProblem(f"{len(mean)} numbers for a state of {d * parts}", "--start", advice)
@@ -193,17 +237,7 @@ def _start(problem: Problem, dynamics: Dynamics, wanted: Wanted) -> State | None
     return State(float(problem.times[0]), mean, np.diag(np.repeat(sigma, d) ** 2))
 
 
-def _numbers(text: str, where: str) -> Array:
-    try:
-        values = np.array([float(part) for part in text.split(",")])
-    except ValueError:
-        raise InvalidProblem(f"{text!r} are no numbers", where, "separate them by commas") from None
-    if not np.isfinite(values).all():
-        raise InvalidProblem(f"{text!r} are not all finite", where, "give finite numbers")
-    return values
-
-
-def track_columns(one: One) -> Columns:
+def track_columns(one: TargetTrack) -> Columns:
     """Return the long table of a track: one row for each scan; metres, seconds, degrees; NaN where there is nothing."""
     entries, d = one.entries, one.problem.dimension
     mean = np.stack([e.updated.mean for e in entries])
@@ -219,7 +253,7 @@ def track_columns(one: One) -> Columns:
     names = [f"{letter}{axis}" for letter in ("", "v", "a") for axis in "xyz"[:d]][: mean.shape[-1]]
     columns |= {name: mean[:, i] for i, name in enumerate(names)}
     columns |= {f"sigma_{name}": sigma[:, i] for i, name in enumerate(names)}
-    columns |= {f"cov_{'xyz'[i]}{'xyz'[j]}": cov[:, i, j] for i in range(d) for j in range(i, d)}
+    columns |= covariance_columns(cov[:, :d, :d], "xyz")
     columns |= geodetic_columns(one.problem.frame, mean[:, :d], cov[:, :d, :d])
     columns["nis"] = np.array([float(e.updated.nis) for e in entries])
     columns["rows"] = np.array([int(e.updated.count) for e in entries])
@@ -227,7 +261,7 @@ def track_columns(one: One) -> Columns:
     return columns
 
 
-def _map(loaded: Loaded, ones: list[One]) -> str:
+def _map(loaded: Loaded, ones: list[TargetTrack]) -> str:
     """Return the page with the map of all tracks."""
     from optloc.report import track_page
     from optloc.report.map import degrees, sentence, spots
@@ -248,7 +282,7 @@ def _map(loaded: Loaded, ones: list[One]) -> str:
 
 
 def _write(
-    loaded: Loaded, ones: list[One], columns: Columns, *, out: Path | None, as_json: bool, plot: Path | None
+    loaded: Loaded, ones: list[TargetTrack], columns: Columns, *, out: Path | None, as_json: bool, plot: Path | None
 ) -> None:
     if out is not None:
         write_table(out, columns)
@@ -256,14 +290,12 @@ def _write(
         from optloc.plot.track import Drawn, plot_tracks
 
         drawn = [Drawn(one.name, one.problem, tuple(one.entries)) for one in ones if one.entries]
-        saved(plot_tracks(drawn, title=loaded.title), plot)
+        write_picture(plot_tracks(drawn, title=loaded.title), plot)
     if as_json:
-        lists = {name: plain(values) for name, values in columns.items()}
-        scans: list[dict[str, Any]] = [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)]
-        write_text(Path("-"), dumps({"file": loaded.source, "title": loaded.title, "scans": scans}))
+        write_text(Path("-"), dumps({"file": loaded.source, "title": loaded.title, "scans": records(columns)}))
 
 
-def _show(loaded: Loaded, columns: Columns, console: Console, limit: int = 10) -> None:
+def _show(loaded: Loaded, columns: Columns, console: Console) -> None:
     """Print the status of the scans, and the sentences of those that are not ok."""
     table = Table(title=f"{loaded.title}: {len(columns['time'])} scans", title_justify="left")
     for name in ("target", "status", "scans", "median sigma, m", "NIS a row"):
@@ -280,8 +312,9 @@ def _show(loaded: Loaded, columns: Columns, console: Console, limit: int = 10) -
         table.add_row(target, Text(label, style=colour), str(count), median, nis)
     console.print(table)
     told = np.flatnonzero(columns["reason"] != "")
-    for i in told[:limit]:
-        line = f"{columns['target'][i]}, {columns['time'][i]:g} s: {columns['status'][i]}: {columns['reason'][i]}"
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
-    if len(told) > limit:
-        console.print(f"... and {len(told) - limit} more; --out writes all of them", highlight=False)
+    for i in told[:_REASONS]:
+        say(
+            console, f"{columns['target'][i]}, {columns['time'][i]:g} s: {columns['status'][i]}: {columns['reason'][i]}"
+        )
+    if len(told) > _REASONS:
+        say(console, f"... and {len(told) - _REASONS} more; --out writes all of them")

@@ -1,9 +1,10 @@
-"""Write a problem file again, with other measured values in the units and signs of its author."""
+"""Write tables, and a problem file again with other measured values in the units and signs of its author."""
 
 from __future__ import annotations
 
 import json
 import os
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,26 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.files.reader import Draft, draft
 from optloc.files.table import Table
+
+# Columns of measurements that are written again; the others are of no meaning to optloc.
+_COLUMNS = ("kind", "epoch", "time", "target", "a", "b", "z", "sigma", "weight", "correction")
+
+
+def write_csv(path: Path, columns: Mapping[str, Any]) -> None:
+    """Write columns as CSV, NaN as an empty cell; raise InvalidProblem where that fails."""
+    import pyarrow as pa
+    from pyarrow import csv
+
+    table = pa.table({name: pa.array(values, from_pandas=True) for name, values in columns.items()})
+    try:
+        csv.write_csv(table, path)
+    except OSError as error:
+        raise unwritable(path, error) from None
+
+
+def unwritable(path: Path, error: OSError) -> InvalidProblem:
+    """Return what is said of a file that cannot be written."""
+    return InvalidProblem(f"the file cannot be written ({error.strerror or error})", str(path), "choose another place")
 
 
 def write_measured(source: Path, out: Path, z: Array, note: str = "") -> list[Path]:
@@ -51,42 +72,33 @@ def write_measured(source: Path, out: Path, z: Array, note: str = "") -> list[Pa
         if "file" in section:
             section["file"] = os.path.relpath(source.parent / section["file"], out.parent)
     written = [out]
+    for i, (section, table) in enumerate(zip(settings["measurements"], made.tables, strict=True)):
+        path = out.with_name(f"{out.stem}-{i + 1}.csv")
+        write_csv(path, _rows(made, table, z))
+        for key in ("rows", "columns", "separator"):
+            section.pop(key, None)
+        section["file"] = path.name
+        written.append(path)
     try:
-        for i, (section, table) in enumerate(zip(settings["measurements"], made.tables, strict=True)):
-            path = out.with_name(f"{out.stem}-{i + 1}.csv")
-            _write_rows(path, made, table, z)
-            for key in ("rows", "columns", "separator"):
-                section.pop(key, None)
-            section["file"] = path.name
-            written.append(path)
         out.write_text("format = 1\n" + _toml({k: v for k, v in settings.items() if k != "format"}), encoding="utf-8")
     except OSError as error:
-        raise InvalidProblem(
-            f"the file cannot be written ({error.strerror})", str(out), "choose another place"
-        ) from None
+        raise unwritable(out, error) from None
     return written
 
 
-def _write_rows(path: Path, made: Draft, table: Table, z: Array) -> None:
-    """Write one table: its known columns under their own names, the values of each trial below each other."""
-    import pyarrow as pa
-    from pyarrow import csv
-
+def _rows(made: Draft, table: Table, z: Array) -> dict[str, Any]:
+    """Return one table: its known columns under their own names, the values of each trial below each other."""
     trials = len(z)
     values = np.full((trials, table.count), np.nan)
     for chunk, number in zip(made.chunks, made.numbers, strict=True):
         if chunk.table is table:
             values[:, chunk.row] = chunk.unit.from_si(z[:, number] - chunk.baseline)
-    known = {key: table.raw(key) for key in COLUMNS if key != "z" and table.has(key)}
+    known = {key: table.raw(key) for key in _COLUMNS if key != "z" and table.has(key)}
     columns: dict[str, Any] = {key: np.tile(column, trials) for key, column in known.items()}
-    if trials > 1:
+    if trials > 1:  # each trial is an epoch, whose time would only say that all are one
         columns["epoch"] = np.repeat(np.arange(trials), table.count)
         columns.pop("time", None)
-    columns["z"] = values.ravel()
-    csv.write_csv(pa.table({key: pa.array(column, from_pandas=True) for key, column in columns.items()}), path)
-
-
-COLUMNS = ("kind", "epoch", "time", "target", "a", "b", "z", "sigma", "weight", "correction")
+    return columns | {"z": values.ravel()}
 
 
 def _toml(settings: dict[str, Any], path: tuple[str, ...] = ()) -> str:

@@ -138,13 +138,13 @@ def map_geojson(found: BoundMap) -> dict[str, Any]:
         advice = 'give a [frame] of kind "geodetic", "ecef" or "enu"'
         raise InvalidProblem("GeoJSON needs positions on Earth, but the frame is cartesian", "map", advice)
     features = [
-        _feature("Point", _wrapped(place[None])[0], {"role": "station", "name": name})
+        feature("Point", _wrapped(place[None])[0], {"role": "station", "name": name})
         for name, place in zip(found.names, found.stations, strict=True)
     ]
     for level, lines in isolines(found):
         if lines:
             about = {"role": "bound", "sigma_m": level, "height": found.height}
-            features.append(_feature("MultiLineString", [piece for line in lines for piece in _pieces(line)], about))
+            features.append(feature("MultiLineString", [piece for line in lines for piece in _pieces(line)], about))
     return {"type": "FeatureCollection", "features": features}
 
 
@@ -160,5 +160,6 @@ def _wrapped(line: Array) -> list[list[float]]:
     return np.round(np.stack([lon, line[:, 1]], axis=-1), 6).tolist()  # type: ignore[no-any-return]
 
 
-def _feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> dict[str, Any]:
+def feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> dict[str, Any]:
+    """Return a feature of GeoJSON."""
     return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": properties}

@@ -1,4 +1,4 @@
-"""Write foreign tables as a problem file with CSV tables beside it."""
+"""Common inputs as a problem file with CSV tables beside it: arrival times, pseudoranges, stations."""
 
 from __future__ import annotations
 
@@ -17,8 +17,14 @@ from optloc.base.units import UNITS
 from optloc.files.convert.roles import GEOJSON, GUESSES, Places, Roles, places_of, read_table, stem, unit_of
 from optloc.files.reader import Loaded, read
 from optloc.files.words import Units
+from optloc.files.writer import unwritable, write_csv
 
-# What every foreign table becomes: rows of arrivals.
+INPUTS = ("arrivals", "pseudoranges", "stations")
+
+# Nothing is nearer to the centre of the Earth than its poles but what has another unit, metres.
+_SURFACE = 6.4e6
+# Arrivals that place a target in the plane; of fewer the user is told.
+_FEW = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,98 +35,6 @@ class Measured:
     unit: str
     comment: str
     notes: tuple[str, ...] = ()
-
-
-# A table of arrival times: which station heard which message when.
-
-
-def arrivals(roles: Roles, stations: Sequence[str], where: str, unit: str | None) -> Measured:
-    """Return arrivals, each counted from the first of its message so that no digit is lost.
-
-    Parameters
-    ----------
-    roles : Roles
-        The table: message, station, time.
-    stations : sequence of str
-        Names of the known stations.
-    where : str
-        Where these are known from.
-    unit : str, optional
-        Of the times; by default what the column's name ends in, else seconds.
-    """
-    message, heard, times = roles.labels("message"), roles.labels("station"), roles.exact("time")
-    named = roles.column("time")
-    stated = unit or unit_of(named, UNITS["time"])
-    unit = stated or "s"
-    factor = Decimal(repr(float(Units("time").conversion(unit, "--unit").factor)))
-    known = set(stations)
-    for row, name in enumerate(heard.tolist()):
-        if name not in known:
-            place = roles.table.where(roles.column("station"), row)
-            raise InvalidProblem(f"there is no station {name!r} in {where}", place, nearest(name, stations))
-    _once(roles, message, heard)
-    first: dict[str, Decimal] = {}
-    for label, time in zip(message.tolist(), times, strict=True):
-        first[label] = min(time, first.get(label, time))
-    columns = {
-        "epoch": message,
-        "time": [float(first[label] * factor) for label in message.tolist()],
-        "a": heard,
-        "z": [f"{time - first[label]:f}" for label, time in zip(message.tolist(), times, strict=True)],
-    }
-    lone = np.unique(message, return_counts=True)[1]
-    few = int((lone < 3).sum())
-    assumed = () if stated else (f"the column {named!r} is taken to be in seconds; --unit says another",)
-    notes = (f"{few} of {len(lone)} messages were heard by fewer than three stations",) if few else ()
-    return Measured(columns, unit, "arrivals, counted from the first of each message", (*assumed, *notes))
-
-
-def _once(roles: Roles, message: Array, heard: Array) -> None:
-    """Raise InvalidProblem where a station hears a message twice."""
-    seen: dict[tuple[str, str], int] = {}
-    for row, key in enumerate(zip(message.tolist(), heard.tolist(), strict=True)):
-        if key in seen:
-            what = f"station {key[1]!r} hears message {key[0]!r} again, first in row {seen[key] + 1}"
-            advice = "leave one of them out, or put columns together: --column message=ONE+TWO"
-            raise InvalidProblem(what, roles.table.at(row), advice)
-        seen[key] = row
-
-
-# A table of pseudoranges: which satellite was received when, from where, and how far it seemed.
-
-
-def pseudoranges(roles: Roles, unit: str | None) -> tuple[Measured, Places]:
-    """Return pseudoranges as arrivals with a clock of each epoch, and the satellites as stations that move, in ECEF."""
-    epoch, satellite, z = roles.labels("epoch"), roles.labels("satellite"), roles.numbers("pseudorange")
-    unit = unit or unit_of(roles.column("pseudorange"), UNITS["length"]) or "m"
-    Units("length").conversion(unit, "--unit")
-    length = unit_of(roles.column("x"), UNITS["length"]) or "m"
-    place = np.stack([roles.numbers(axis) for axis in "xyz"], axis=-1)
-    _far_enough(roles, place * UNITS["length"][length])
-    seen: dict[tuple[str, str], int] = {}
-    for row, key in enumerate(zip(epoch.tolist(), satellite.tolist(), strict=True)):
-        if key in seen:
-            what = f"satellite {key[1]!r} occurs again at epoch {key[0]!r}, first in row {seen[key] + 1}"
-            raise InvalidProblem(what, roles.table.at(row), "leave one of them out")
-        seen[key] = row
-    columns = {"epoch": epoch, "a": satellite, "z": z}
-    if stem(roles.column("epoch")) != "epoch" and "+" not in roles.column("epoch"):
-        columns["time"] = roles.numbers("epoch")
-    satellites = {"name": satellite, "epoch": epoch} | dict(zip("xyz", place.T, strict=True))
-    return Measured(columns, unit, "the range and the receiver's clock"), Places(satellites, "ecef", length)
-
-
-def _far_enough(roles: Roles, place: np.ndarray) -> None:
-    """Raise InvalidProblem where a satellite is within the Earth: its unit or its columns are other ones."""
-    near = np.flatnonzero(np.linalg.norm(place, axis=-1) < 6.4e6)
-    if len(near):
-        where = roles.table.where(roles.column("x"), int(near[0]))
-        away = np.linalg.norm(place[near[0]]) / 1e3
-        what = f"the satellite is {away:.4g} km from the centre of the Earth"
-        raise InvalidProblem(what, where, "name the columns with --column x=NAME and so on; a unit is seen from x_km")
-
-
-INPUTS = ("arrivals", "pseudoranges", "stations")
 
 
 @dataclass(frozen=True, slots=True)
@@ -184,13 +98,13 @@ def convert(
     if what is not None and what not in INPUTS:
         raise InvalidProblem(f"there is no input {what!r}", "--as", nearest(what, INPUTS))
     if what == "stations" or source.suffix.lower() in GEOJSON:
-        return _stations(source, out, told, frame)
+        return _write_stations(source, out, told, frame)
     if out.suffix.lower() != ".toml":
         raise InvalidProblem("the problem file must end in .toml", str(out), f"write --out {out.with_suffix('.toml')}")
     roles = Roles(read_table(source), told)
-    seen = what or _seen(roles)
+    seen = what or _recognise(roles)
     if seen == "stations":
-        return _stations(source, out, told, frame)
+        return _write_stations(source, out, told, frame)
     if sigma is None:
         advice = "say it with --sigma '20 ns' (or metres); --sigma estimate finds it from many epochs"
         raise InvalidProblem("nothing is known of how accurate the rows are", "--sigma", advice)
@@ -203,10 +117,10 @@ def convert(
         found = arrivals(roles, place.names, stations.name, unit)
     else:
         found, place = pseudoranges(roles, unit)
-    return _written(source, out, found, place, sigma)
+    return _write(source, out, found, place, sigma)
 
 
-def _seen(roles: Roles) -> str:
+def _recognise(roles: Roles) -> str:
     """Return what a table holds by its columns; raise InvalidProblem where they do not tell."""
     if roles.find("pseudorange") is not None and roles.find("satellite") is not None:
         return "pseudoranges"
@@ -217,20 +131,20 @@ def _seen(roles: Roles) -> str:
     raise InvalidProblem(what, roles.table.source, advice)
 
 
-def _stations(source: Path, out: Path, told: Mapping[str, str], frame: str | None) -> Converted:
+def _write_stations(source: Path, out: Path, told: Mapping[str, str], frame: str | None) -> Converted:
     if out.suffix.lower() != ".csv":
         what = "stations alone are no problem: they become a CSV table"
         raise InvalidProblem(what, str(out), f"write --out {out.with_suffix('.csv')}, or convert the measurements")
     found = places_of(source, told, frame)
-    _csv(out, found.columns)
+    write_csv(out, found.columns)
     return Converted((out,), None, (found.note,) if found.note else ())
 
 
-def _written(source: Path, out: Path, found: Measured, place: Places, sigma: str) -> Converted:
+def _write(source: Path, out: Path, found: Measured, place: Places, sigma: str) -> Converted:
     tables = {out.with_name(f"{out.stem}-stations.csv"): place.columns}
     tables[out.with_name(f"{out.stem}-rows.csv")] = found.columns
     for path, columns in tables.items():
-        _csv(path, columns)
+        write_csv(path, columns)
     one, two = (json.dumps(path.name) for path in tables)
     text = f"""# Made from {source.name} by optloc convert.
 format = 1
@@ -249,28 +163,94 @@ file = {two}
 unit = "{found.unit}"
 sigma = {json.dumps(sigma)}
 """
-    _written_text(out, text)
+    try:
+        out.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise unwritable(out, error) from None
     notes = (*found.notes, *((place.note,) if place.note else ()))
     return Converted((out, *tables), read(out), notes)
 
 
-def _csv(path: Path, columns: Mapping[str, Any]) -> None:
-    import pyarrow as pa
-    from pyarrow import csv
-
-    table = pa.table({name: pa.array(list(np.asarray(values).tolist())) for name, values in columns.items()})
-    try:
-        csv.write_csv(table, path, csv.WriteOptions(quoting_style="needed"))
-    except OSError as error:
-        raise _refused(path, error) from None
+# A table of arrival times: which station heard which message when.
 
 
-def _written_text(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise _refused(path, error) from None
+def arrivals(roles: Roles, stations: Sequence[str], where: str, unit: str | None) -> Measured:
+    """Return arrivals, each counted from the first of its message so that no digit is lost.
+
+    Parameters
+    ----------
+    roles : Roles
+        The table: message, station, time.
+    stations : sequence of str
+        Names of the known stations.
+    where : str
+        Where these are known from.
+    unit : str, optional
+        Of the times; by default what the column's name ends in, else seconds.
+    """
+    message, heard, times = roles.labels("message"), roles.labels("station"), roles.exact("time")
+    named = roles.column("time")
+    stated = unit or unit_of(named, UNITS["time"])
+    unit = stated or "s"
+    factor = Decimal(repr(float(Units("time").conversion(unit, "--unit").factor)))
+    known = set(stations)
+    for row, name in enumerate(heard.tolist()):
+        if name not in known:
+            place = roles.table.where(roles.column("station"), row)
+            raise InvalidProblem(f"there is no station {name!r} in {where}", place, nearest(name, stations))
+    advice = "leave one of them out, or put columns together: --column message=ONE+TWO"
+    _check_once(roles, message, heard, "station {1!r} hears message {0!r} again, first in row {2}", advice)
+    # Seconds of today in nanoseconds have 19 digits, a float 16: differences are taken before anything is rounded.
+    first: dict[str, Decimal] = {}
+    for label, time in zip(message.tolist(), times, strict=True):
+        first[label] = min(time, first.get(label, time))
+    columns = {
+        "epoch": message,
+        "time": [float(first[label] * factor) for label in message.tolist()],
+        "a": heard,
+        "z": [f"{time - first[label]:f}" for label, time in zip(message.tolist(), times, strict=True)],
+    }
+    lone = np.unique(message, return_counts=True)[1]
+    few = int((lone < _FEW).sum())
+    assumed = () if stated else (f"the column {named!r} is taken to be in seconds; --unit says another",)
+    notes = (f"{few} of {len(lone)} messages were heard by fewer than three stations",) if few else ()
+    return Measured(columns, unit, "arrivals, counted from the first of each message", (*assumed, *notes))
 
 
-def _refused(path: Path, error: OSError) -> InvalidProblem:
-    return InvalidProblem(f"the file cannot be written ({error.strerror or error})", str(path), "choose another place")
+def _check_once(roles: Roles, group: Array, member: Array, what: str, advice: str) -> None:
+    """Refuse a member that a group has twice; {0}, {1} and {2} of `what` are both names and the first row."""
+    seen: dict[tuple[str, str], int] = {}
+    for row, key in enumerate(zip(group.tolist(), member.tolist(), strict=True)):
+        if key in seen:
+            raise InvalidProblem(what.format(*key, seen[key] + 1), roles.table.at(row), advice)
+        seen[key] = row
+
+
+# A table of pseudoranges: which satellite was received when, from where, and how far it seemed.
+
+
+def pseudoranges(roles: Roles, unit: str | None) -> tuple[Measured, Places]:
+    """Return pseudoranges as arrivals with a clock of each epoch, and the satellites as stations that move, in ECEF."""
+    epoch, satellite, z = roles.labels("epoch"), roles.labels("satellite"), roles.numbers("pseudorange")
+    unit = unit or unit_of(roles.column("pseudorange"), UNITS["length"]) or "m"
+    Units("length").conversion(unit, "--unit")
+    length = unit_of(roles.column("x"), UNITS["length"]) or "m"
+    place = np.stack([roles.numbers(axis) for axis in "xyz"], axis=-1)
+    _check_far(roles, place * UNITS["length"][length])
+    advice = "leave one of them out"
+    _check_once(roles, epoch, satellite, "satellite {1!r} occurs again at epoch {0!r}, first in row {2}", advice)
+    columns = {"epoch": epoch, "a": satellite, "z": z}
+    if stem(roles.column("epoch")) != "epoch" and "+" not in roles.column("epoch"):
+        columns["time"] = roles.numbers("epoch")
+    satellites = {"name": satellite, "epoch": epoch} | dict(zip("xyz", place.T, strict=True))
+    return Measured(columns, unit, "the range and the receiver's clock"), Places(satellites, "ecef", length)
+
+
+def _check_far(roles: Roles, place: np.ndarray) -> None:
+    """Raise InvalidProblem where a satellite is within the Earth: its unit or its columns are other ones."""
+    near = np.flatnonzero(np.linalg.norm(place, axis=-1) < _SURFACE)
+    if len(near):
+        where = roles.table.where(roles.column("x"), int(near[0]))
+        away = np.linalg.norm(place[near[0]]) / 1e3
+        what = f"the satellite is {away:.4g} km from the centre of the Earth"
+        raise InvalidProblem(what, where, "name the columns with --column x=NAME and so on; a unit is seen from x_km")

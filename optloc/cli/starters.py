@@ -1,9 +1,9 @@
-"""What ``optloc demo`` does: fix a shipped problem, or walk through a fix, a registration and a proof."""
+"""What ``optloc demo``, ``new`` and ``convert`` do: a first problem file, shipped, written or made of tables."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.resources import as_file, files
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,12 @@ from rich.console import Console
 from rich.markdown import Markdown
 
 from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.types import Rows
 from optloc.base.units import SI_UNIT, UNITS
+from optloc.cli.file_fixes import FileFixes, fix_file, fixes_json
 from optloc.cli.fix import draw, show
-from optloc.cli.fixed import Fixed, fix_file
-from optloc.cli.output import dumps, fixed_json, write_text
+from optloc.cli.options import shipped_problems
+from optloc.cli.output import dumps, say, say_all, write_text
 from optloc.files import read
 from optloc.files.convert import Converted, convert
 from optloc.models import MODELS, Model
@@ -62,26 +64,25 @@ def titles() -> dict[str, str]:
     """Return the titles of the shipped problems by name."""
     import tomllib
 
-    folder = files("optloc") / "scenarios"
-    found = {entry.name.removesuffix(".toml"): entry for entry in folder.iterdir() if entry.name.endswith(".toml")}
-    return {name: tomllib.loads(found[name].read_text(encoding="utf-8"))["title"] for name in sorted(found)}
+    found = shipped_problems()
+    return {name: tomllib.loads(path.read_text(encoding="utf-8"))["title"] for name, path in found.items()}
 
 
 def run_demo(name: str | None, plot: Path | None, *, as_json: bool, quiet: bool) -> int:
     """Fix one shipped problem, or walk through three of them, and return the exit code."""
-    known = titles()
+    known = shipped_problems()
     if name is not None and name not in known:
-        raise InvalidProblem(f"there is no demo {name!r}", "demo", nearest(name, known))
+        raise InvalidProblem(f"there is no demo {name!r}", "demo", nearest(name, list(known)))
     if name is None and not as_json:
         return _walk(plot, quiet)
-    fixed = _fixed(name or "demo", quiet or as_json)
+    found = _fix(name or "demo", quiet or as_json)
     if as_json:
-        write_text(Path("-"), dumps(fixed_json(fixed)))
+        write_text(Path("-"), dumps(fixes_json(found)))
     elif not quiet:
-        show(fixed, Console())
+        show(found, Console())
     if plot is not None or not as_json:
-        _draw(fixed, plot, quiet or as_json)
-    return 0 if fixed.clean else 1
+        _draw(found, plot, quiet or as_json)
+    return 0 if found.clean else 1
 
 
 def _walk(plot: Path | None, quiet: bool) -> int:
@@ -89,38 +90,36 @@ def _walk(plot: Path | None, quiet: bool) -> int:
     console = Console(quiet=quiet)
     code = 0
     for i, (text, name) in enumerate(_STEPS):
-        _say(text, console)
-        fixed = _fixed(name, quiet)
-        show(fixed, console)
+        _explain(text, console)
+        found = _fix(name, quiet)
+        show(found, console)
         if i == 0:
-            _draw(fixed, plot, quiet)
-            code = 0 if fixed.clean else 1
-    _say(_END, console)
+            _draw(found, plot, quiet)
+            code = 0 if found.clean else 1
+    _explain(_END, console)
     return code
 
 
-def _fixed(name: str, quiet: bool) -> Fixed:
-    with as_file(files("optloc") / "scenarios") as place:
-        return fix_file(read(place / f"{name}.toml"), "auto", quiet)
+def _fix(name: str, quiet: bool) -> FileFixes:
+    return fix_file(read(shipped_problems()[name]), "auto", quiet)
 
 
-def _say(text: str, console: Console) -> None:
+def _explain(text: str, console: Console) -> None:
     shown: Any = Markdown(text, hyperlinks=False)
     console.print(shown)
     console.print()
 
 
-def _draw(fixed: Fixed, plot: Path | None, quiet: bool) -> None:
+def _draw(found: FileFixes, plot: Path | None, quiet: bool) -> None:
     """Draw a fix; where no picture was asked for and none can be drawn, say so and go on."""
     from importlib.util import find_spec
 
     console = Console(quiet=quiet)
     if plot is None and find_spec("matplotlib") is None:
-        line = "There is no picture, as matplotlib is not installed: pip install 'optloc[plot]'."
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+        say(console, "There is no picture, as matplotlib is not installed: pip install 'optloc[plot]'.")
         return
-    draw(fixed, plot or PICTURE)
-    console.print(f"The picture is in {plot or PICTURE}.", highlight=False, markup=False, soft_wrap=True)
+    draw(found, plot or PICTURE)
+    say(console, f"The picture is in {plot or PICTURE}.")
 
 
 # Starter problems: commented files that can be fixed as they are, one for each kind and for common mixtures.
@@ -144,14 +143,12 @@ def starters() -> dict[str, Starter]:
             found[entry.name.removesuffix(".toml")] = Starter(text.partition("\n")[0].removeprefix("# "), text)
     for kind, model in MODELS.items():
         if kind not in found and not model.ecef:
-            found[kind] = Starter(f"{kind}: {model.summary}.", _drawn(kind, model))
+            found[kind] = Starter(f"{kind}: {model.summary}.", _compose(kind, model))
     return found
 
 
 def run_new(kind: str, out: Path | None, *, force: bool, quiet: bool) -> int:
     """Write a starter, to standard output where no file is named, and return the exit code."""
-    from optloc.cli.output import write_text
-
     known = starters()
     if kind not in known:
         raise InvalidProblem(f"there is no starter {kind!r}", "new", nearest(kind, known))
@@ -163,14 +160,12 @@ def run_new(kind: str, out: Path | None, *, force: bool, quiet: bool) -> int:
     if out.exists() and not force:
         raise InvalidProblem("there is such a file already", str(out), "choose another name, or add --force")
     write_text(out, known[kind].text.rstrip("\n"))
-    if not quiet:
-        from rich.console import Console
-
-        line = f"{out} can be changed and fixed: optloc check {out}, then optloc fix {out}."
-        Console().print(line, highlight=False, markup=False, soft_wrap=True)
+    say(Console(quiet=quiet), f"{out} can be changed and fixed: optloc check {out}, then optloc fix {out}.")
     return 0
 
 
+# Six stations some 4 km around the origin, two of them high, so that heights are seen as well as plans; the truth is
+# inside, moves like a small aircraft, and each kind has the error of an ordinary receiver.
 _PLACES = {
     "North": (200.0, 4100.0, 35.0),
     "East": (4300.0, 300.0, 80.0),
@@ -179,11 +174,11 @@ _PLACES = {
     "Hill": (1800.0, 2200.0, 640.0),
     "Tower": (-1900.0, 1500.0, 120.0),
 }
-_TRUTH = (1500.0, 900.0, 400.0)
+_TRUTH, _SPEED, _RANGE_SIGMA = (1500.0, 900.0, 400.0), (60.0, -35.0, 5.0), 3.0
 _SIGMA = {"length": 3.0, "angle": 0.005, "ratio": 0.01, "speed": 0.5}
 
 
-def _drawn(kind: str, model: Model) -> str:
+def _compose(kind: str, model: Model) -> str:
     """Return a starter of a kind that has none of its own: rows of it beside ranges, drawn at a known place."""
     from optloc.base.types import Motion
     from optloc.linear.simulate import simulate
@@ -194,11 +189,10 @@ def _drawn(kind: str, model: Model) -> str:
     a, b = (one if model.stations else None), (np.zeros_like(one) if model.stations == 2 else None)
     sigma = _SIGMA.get(model.quantity, 0.1)
     place = np.array(list(_PLACES.values()))[:, :d]
-    rows = [measured(kind, a=a, b=b, sigma=sigma), measured("range", a=np.arange(len(names)), sigma=3.0)]
+    rows = [measured(kind, a=a, b=b, sigma=sigma), measured("range", a=np.arange(len(names)), sigma=_RANGE_SIGMA)]
     motion = Motion(order=1) if model.velocity else Motion()
     problem = assemble(station_array(place, names), *rows, motions=(motion,))
-    truth = np.concatenate([_TRUTH[:d], (60.0, -35.0, 5.0)[:d]])[: problem.layout.size]
-    drawn = simulate(problem, truth, 1)
+    drawn = simulate(problem, np.concatenate([_TRUTH[:d], _SPEED[:d]])[: problem.layout.size], 1)
     lines = [
         f"# {kind}: {model.summary}.",
         f"# truth: {', '.join(f'{v:g}' for v in _TRUTH[:d])}",
@@ -208,27 +202,29 @@ def _drawn(kind: str, model: Model) -> str:
         "[stations]",
         'unit = "m"',
         "rows = [",
-        *(
-            f'  {{ name = "{name}", ' + ", ".join(f"{c} = {v}" for c, v in zip("xyz", p, strict=False)) + " },"
-            for name, p in zip(names, place.tolist(), strict=True)
-        ),
-        "]",
     ]
-    lines += ["", "[target]", 'motion = "constant_velocity"'] if model.velocity else []
-    for block, noise in zip(drawn.rows, (sigma, 3.0), strict=True):
-        quantity = MODELS[block.kind].quantity
-        known = f"                           # one of {', '.join(UNITS[quantity])}"  # type: ignore[index]  # models hold known quantities only
-        lines += ["", "[[measurements]]", f'kind = "{block.kind}"', f'unit = "{SI_UNIT[quantity]}"{known}']  # type: ignore[index]  # as above
-        lines += [f"sigma = {noise}", "rows = ["]
-        for i, z in enumerate(np.ravel(block.z).tolist()):
-            ends = [f'a = "{names[block.a[i]]}"'] if MODELS[block.kind].stations else []
-            ends += [f'b = "{names[block.b[i]]}"'] if MODELS[block.kind].stations == 2 else []
-            lines.append("  { " + ", ".join([*ends, f"z = {z:.6g}"]) + " },")
-        lines.append("]")
+    for name, point in zip(names, place.tolist(), strict=True):
+        lines.append(f'  {{ name = "{name}", {", ".join(f"{c} = {v}" for c, v in zip("xyz", point, strict=False))} }},')
+    lines += ["]", *(["", "[target]", 'motion = "constant_velocity"'] if model.velocity else [])]
+    for block, noise in zip(drawn.rows, (sigma, _RANGE_SIGMA), strict=True):
+        lines += _measurements(block, noise, names)
     return "\n".join(lines) + "\n"
 
 
-# What ``optloc convert`` does.
+def _measurements(block: Rows, sigma: float, names: list[str]) -> list[str]:
+    """Return the lines of a table of measurements."""
+    model = MODELS[block.kind]
+    known = ", ".join(UNITS[model.quantity])  # type: ignore[index]  # models hold known quantities only
+    unit = SI_UNIT[model.quantity]  # type: ignore[index]  # as above
+    lines = ["", "[[measurements]]", f'kind = "{block.kind}"', f'unit = "{unit}"{" " * 27}# one of {known}']
+    lines += [f"sigma = {sigma}", "rows = ["]
+    for i, z in enumerate(np.ravel(block.z).tolist()):
+        ends = [f'{end} = "{names[index[i]]}"' for end, index in (("a", block.a), ("b", block.b))][: model.stations]
+        lines.append("  { " + ", ".join([*ends, f"z = {z:.6g}"]) + " },")
+    return [*lines, "]"]
+
+
+# Tables of others.
 
 
 def run_convert(file: Path, out: Path, column: list[str], *, as_json: bool, quiet: bool, **options: Any) -> int:
@@ -241,13 +237,13 @@ def run_convert(file: Path, out: Path, column: list[str], *, as_json: bool, quie
         columns[role] = name
     found = convert(file, out, columns=columns, **options)
     if as_json:
-        write_text(Path("-"), dumps(_record(found)))
+        write_text(Path("-"), dumps(_conversion_json(found)))
     elif not quiet:
-        _show(found, Console(), out)
+        _show_conversion(found, Console(), out)
     return 0
 
 
-def _record(found: Converted) -> dict[str, Any]:
+def _conversion_json(found: Converted) -> dict[str, Any]:
     about = {"files": [str(path) for path in found.written], "notes": list(found.notes)}
     if found.loaded is None:
         return about
@@ -255,13 +251,11 @@ def _record(found: Converted) -> dict[str, Any]:
     return about | {"stations": problem.stations.count, "epochs": problem.epochs, "rows": problem.count}
 
 
-def _show(found: Converted, console: Console, out: Path) -> None:
-    for note in found.notes:
-        console.print(f"{note[0].upper()}{note[1:]}.", highlight=False, markup=False, soft_wrap=True)
+def _show_conversion(found: Converted, console: Console, out: Path) -> None:
+    say_all(console, found.notes)
     if found.loaded is None:
-        line = f'{out} is a table of stations: name it in a problem file, [stations] file = "{out.name}".'
-    else:
-        problem = found.loaded.problem
-        held = f"{problem.count} rows of {problem.epochs} epochs at {problem.stations.count} stations"
-        line = f"{', '.join(str(path) for path in found.written)}: {held}. Next: optloc check {out}."
-    console.print(line, highlight=False, markup=False, soft_wrap=True)
+        say(console, f'{out} is a table of stations: name it in a problem file, [stations] file = "{out.name}".')
+        return
+    problem = found.loaded.problem
+    held = f"{problem.count} rows of {problem.epochs} epochs at {problem.stations.count} stations"
+    say(console, f"{', '.join(str(path) for path in found.written)}: {held}. Next: optloc check {out}.")

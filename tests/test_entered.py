@@ -1,0 +1,38 @@
+"""How much of the house a simple question walks through: the modules that `optloc fix` of the shipped demo enters."""
+
+import subprocess
+import sys
+
+# A module is entered where a function of it runs; what runs while modules are imported does not count.
+COUNT = """
+import sys, threading
+from optloc.cli import app
+
+entered, importing = set(), [0]
+
+def look(frame, event, _):
+    code = frame.f_code
+    if code.co_name == "<module>":
+        importing[0] += {"call": 1, "return": -1}.get(event, 0)
+    elif event == "call" and not importing[0]:
+        name = frame.f_globals.get("__name__", "")
+        if name.partition(".")[0] in ("optloc", "formulations"):
+            entered.add(name)
+
+threading.setprofile(look)
+sys.setprofile(look)
+try:
+    app(["fix", "demo", "--quiet"])
+finally:
+    sys.setprofile(None)
+    print(*sorted(entered))
+"""
+MOST = 75
+
+
+def test_a_simple_fix_enters_few_modules():
+    run = subprocess.run([sys.executable, "-c", COUNT], capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    entered = run.stdout.split()
+    assert len(entered) <= MOST, "\n".join(entered)
+    assert {"optloc.cli.fix", "optloc.files.reader", "optloc.solvers"} <= set(entered)
