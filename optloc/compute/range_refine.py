@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from optloc.base.types import Array
+from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge_lane
 from optloc.compute.gtrs import LANES, factor, solve
 from optloc.compute.jit import compiled
 
-_FLOOR = 1e-13  # rounding error of a cost, relative to one more than it
 _PIVOT = 1e-15  # share of its diagonal that a pivot must exceed
 # Rows of the arrays `vector` and `matrix` at the position and at the one tried, and scratch.
 X, TRIAL, MOVE, G, G_TRIAL, DIAGONAL, INVERSE, ROW, ORIGIN, CENTRE = range(10)
@@ -59,7 +59,7 @@ def refine(
     for lane in range(LANES):
         scalar[GOOD, lane] = scalar[GOOD, lane] if scalar[COST, lane] < np.inf else 0.0
         scalar[ALIVE, lane] = scalar[GOOD, lane]
-        scalar[DAMPING, lane], scalar[GROWTH, lane], scalar[STEPS, lane] = 1e-6, 2.0, 0.0
+        scalar[DAMPING, lane], scalar[GROWTH, lane], scalar[STEPS, lane] = FIRST_DAMPING, FIRST_GROWTH, 0.0
     for _ in range(limit):
         _propose(vector, matrix, scalar)
         equations(
@@ -192,26 +192,22 @@ def _decide(vector: Array, matrix: Array, scalar: Array, tolerance: float) -> bo
     d = vector.shape[1]
     kept, alive = scalar[SPARE], scalar[ALIVE]
     for lane in range(LANES):
-        cost, gain, damping, blur = scalar[COST, lane], scalar[GAIN, lane], scalar[DAMPING, lane], scalar[BLUR, lane]
-        after, floor = scalar[COST_TRIAL, lane], _FLOOR * (1.0 + cost)
-        achieved = cost - after
-        rounding = floor + 2.0 * blur * np.sqrt(1.0 + cost)
-        solvable = alive[lane] * scalar[SOLVABLE, lane]
-        better = solvable if achieved >= -rounding and after < np.inf else 0.0
-        small = solvable if abs(gain) * (1.0 + damping) <= max(tolerance * tolerance, floor + blur * blur) else 0.0
-        ratio = min(max(achieved / (gain if gain > 0.0 else 1.0), 0.0), 1.0)
-        shape = 2.0 * ratio - 1.0
-        change = 0.1 if ratio > 0.9 else max(1.0 / 3.0, 1.0 - shape * shape * shape)
-        growth = scalar[GROWTH, lane]
-        damping = max(damping * change, 1e-12) if better != 0.0 else damping * growth + 1e-12
-        lost = alive[lane] if better == 0.0 and damping > 1e12 and small == 0.0 else 0.0
-        scalar[DAMPING, lane] = damping
-        scalar[GROWTH, lane] = 2.0 if better != 0.0 else 2.0 * growth
-        scalar[COST, lane] = after if better != 0.0 else cost
+        better, small, stuck, scalar[DAMPING, lane], scalar[GROWTH, lane] = judge_lane(
+            scalar[COST, lane],
+            scalar[COST_TRIAL, lane],
+            scalar[GAIN, lane],
+            alive[lane] * scalar[SOLVABLE, lane] != 0.0,
+            scalar[BLUR, lane],
+            scalar[DAMPING, lane],
+            scalar[GROWTH, lane],
+            tolerance,
+            True,
+        )
+        scalar[COST, lane] = scalar[COST_TRIAL, lane] if better else scalar[COST, lane]
         scalar[STEPS, lane] += alive[lane]
-        scalar[GOOD, lane] = scalar[GOOD, lane] if lost == 0.0 else 0.0
-        alive[lane] = alive[lane] if small + lost == 0.0 else 0.0
-        kept[lane] = better
+        scalar[GOOD, lane] = 0.0 if stuck and alive[lane] != 0.0 else scalar[GOOD, lane]
+        alive[lane] = 0.0 if small or stuck else alive[lane]
+        kept[lane] = 1.0 if better else 0.0
     for i in range(d):
         for lane in range(LANES):
             vector[X, i, lane] = vector[TRIAL, i, lane] if kept[lane] != 0.0 else vector[X, i, lane]

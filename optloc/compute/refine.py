@@ -12,6 +12,7 @@ import numpy as np
 from optloc.base.status import Status
 from optloc.base.threads import mapped
 from optloc.base.types import Array
+from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge_lane
 from optloc.compute.equations import chunks, normal_at
 from optloc.compute.jit import compiled
 from optloc.compute.lanes import (
@@ -152,7 +153,7 @@ def begin(c: Numbers, m: Array, room: Room, tag: Array, used: int, item: Array, 
             load(m, b, item[start], c.source, c.white, c.prior, c.observed, c.present)
             for i in range(x.shape[1]):
                 m[room.trial + i, b] = x[start, i]
-            m[room.state + DAMPING, b], m[room.state + GROWTH, b] = 1e-6, 2.0
+            m[room.state + DAMPING, b], m[room.state + GROWTH, b] = FIRST_DAMPING, FIRST_GROWTH
             m[room.state + BLUR, b] = _blur(c.sigma, c.size, m, room, b, item[start])
 
 
@@ -202,28 +203,22 @@ def _judge(m: Array, room: Room, size: int, tag: Array, rules: Rules, used: int)
 @compiled
 def judged(m: Array, room: Room, now: int, after: int, rules: Rules, b: int) -> int:
     """Return the status of a lane after a step; say whether it is better and set the damping."""
-    state, status = room.state, LIMIT
-    cost, new, gain, blur = m[now, b], m[after, b], m[state + GAIN, b], m[state + BLUR, b]
-    damping, solvable = m[state + DAMPING, b], m[state + SOLVABLE, b] != 0.0
-    achieved, floor = cost - new, 1e-13 * (1.0 + cost)
-    rounding = floor + 2.0 * blur * np.sqrt(1.0 + cost)
-    better = solvable and np.isfinite(new) and (achieved >= -rounding or not rules.damped)
-    if solvable and abs(gain) * (1.0 + damping) <= max(rules.tolerance * rules.tolerance, floor + blur * blur):
-        status = _OK
-    if better:
-        ratio = achieved / (gain if gain > 0.0 else 1.0)
-        middle = 2.0 * min(max(ratio, 0.0), 1.0) - 1.0
-        change = 0.1 if ratio > 0.9 else max(1.0 / 3.0, 1.0 - middle * middle * middle)
-        m[state + DAMPING, b], m[state + GROWTH, b] = max(damping * change, 1e-12), 2.0
-    else:
-        m[state + DAMPING, b] = damping * m[state + GROWTH, b] + 1e-12
-        m[state + GROWTH, b] *= 2.0
-        if m[state + DAMPING, b] > 1e12:
-            status = _STALLED
-        if not rules.damped:
-            status = NUMERICAL
+    state = room.state
+    better, small, stuck, m[state + DAMPING, b], m[state + GROWTH, b] = judge_lane(
+        m[now, b],
+        m[after, b],
+        m[state + GAIN, b],
+        m[state + SOLVABLE, b] != 0.0,
+        m[state + BLUR, b],
+        m[state + DAMPING, b],
+        m[state + GROWTH, b],
+        rules.tolerance,
+        rules.damped,
+    )
     m[state + BETTER, b] = 1.0 if better else 0.0
-    return status
+    if not better and not rules.damped:
+        return NUMERICAL
+    return _STALLED if stuck else _OK if small else LIMIT
 
 
 @compiled

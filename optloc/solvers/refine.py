@@ -11,6 +11,7 @@ import numpy as np
 from optloc.base.status import Status
 from optloc.base.threads import mapped
 from optloc.base.types import Array
+from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge
 from optloc.compute.pack import coarseness, packed
 from optloc.compute.sums import equations_at, serves
 from optloc.linear.constraints import Face, restored, tangent_at
@@ -278,8 +279,8 @@ class _State:
         return cls(
             np.array(start),
             equations,
-            np.full(count, 1e-6),
-            np.full(count, 2.0),
+            np.full(count, FIRST_DAMPING),
+            np.full(count, FIRST_GROWTH),
             status,
             np.zeros(count, dtype=np.int32),
         )
@@ -318,27 +319,26 @@ def _advance(part: _Part, state: _State, active: Array, rules: Rules, iteration:
     here = state.x[active]
     damping = state.damping[active] if rules.damped else np.zeros(len(active))
     move, solvable = step(now, damping, tangent_at(part.problem, rules.face, here) if rules.face else None)
-    gain = decrement(now, move, rules.n)
     x = restored(part.problem, rules.face, here + move) if rules.face else here + move
     after = part.weights.equations(part.problem, x)
-    achieved = now.cost - after.cost
-    floor = 1e-13 * (1.0 + now.cost)
-    rounding = floor + 2.0 * part.blur * np.sqrt(1.0 + now.cost)
-    better = solvable & np.isfinite(after.cost) & ((achieved >= -rounding) if rules.damped else True)
-    state.iterations[active] = iteration + 1
-    small = solvable & (np.abs(gain) * (1.0 + damping) <= np.maximum(rules.tolerance**2, floor + part.blur**2))
-    _keep(state, active, better, x, after)
-    ratio = achieved / np.where(gain > 0.0, gain, 1.0)
-    factor = np.maximum(1.0 / 3.0, 1.0 - (2.0 * np.clip(ratio, 0.0, 1.0) - 1.0) ** 3)
-    factor = np.where(ratio > 0.9, 0.1, factor)
-    state.damping[active] = np.where(
-        better, np.maximum(damping * factor, 1e-12), damping * state.growth[active] + 1e-12
+    found = judge(
+        now.cost,
+        after.cost,
+        decrement(now, move, rules.n),
+        solvable,
+        part.blur,
+        damping,
+        state.growth[active],
+        rules.tolerance,
+        rules.damped,
     )
-    state.growth[active] = np.where(better, 2.0, 2.0 * state.growth[active])
-    state.status[active[small]] = Status.OK
-    state.status[active[~better & (state.damping[active] > 1e12)]] = Status.STALLED
+    state.iterations[active] = iteration + 1
+    _keep(state, active, found.better, x, after)
+    state.damping[active], state.growth[active] = found.damping, found.growth
+    state.status[active[found.small]] = Status.OK
+    state.status[active[found.stuck]] = Status.STALLED
     if not rules.damped:
-        state.status[active[~better]] = Status.NUMERICAL
+        state.status[active[~found.better]] = Status.NUMERICAL
 
 
 def _keep(state: _State, active: Array, better: Array, x: Array, after: Normal) -> None:

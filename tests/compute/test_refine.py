@@ -12,6 +12,7 @@ from test_normal import regular_sink
 from optloc import Bias, Motion, Prior, assemble, measured, simulate, station_array
 from optloc.base.linalg import inverse
 from optloc.base.status import Status
+from optloc.compute.damping import judge, judge_lane
 from optloc.compute.jit import enabled
 from optloc.linear.normal import marginal
 
@@ -201,3 +202,25 @@ def test_an_epoch_that_leaves_its_own_unknowns_open(both):
     ours, theirs = both(problem, np.tile(x + 5.0, (len(weight), 1)))
     assert (ours.status == theirs.status).all()
     assert np.allclose(ours.x[:, 0], theirs.x[:, 0], rtol=0.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("damped", [True, False])
+def test_a_step_is_judged_the_same_by_both_forms(damped):
+    rng = np.random.default_rng(3)
+    size = 3000
+    cost = 10.0 ** rng.uniform(-12.0, 12.0, size)
+    gain = cost * 10.0 ** rng.uniform(-18.0, 1.0, size) * rng.choice([1.0, 1.0, 1.0, -1.0, 0.0], size)
+    after = cost - gain * rng.choice([1.0, 0.95, 0.5, 0.0, -1e-15, -3.0], size)
+    after[::50], after[1::50], after[2::50] = np.nan, np.inf, cost[2::50]
+    solvable, blur = rng.random(size) < 0.9, np.where(rng.random(size) < 0.5, 0.0, 10.0 ** rng.uniform(-16, -3, size))
+    damping, growth = 10.0 ** rng.uniform(-13.0, 13.0, size), 2.0 ** rng.integers(1, 12, size)
+    with np.errstate(all="ignore"):
+        whole = judge(cost, after, gain, solvable, blur, damping, growth, 1e-7, damped)
+    lanes = [
+        judge_lane(*(value.item() for value in values), 1e-7, damped)
+        for values in zip(cost, after, gain, solvable, blur, damping, growth, strict=True)
+    ]
+    for one, other in zip(whole, zip(*lanes, strict=True), strict=True):
+        assert np.array_equal(one, other)
+    for flag in whole[:3]:
+        assert 0 < np.count_nonzero(flag) < size
