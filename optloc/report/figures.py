@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from html import escape
 from io import StringIO
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
 
 # How methods look in every figure of a report: a colour, a mark and a dash each, told apart without colour too.
 
+# Colours and marks together repeat after 24 methods, and then the dashes differ: 96 methods look different. Dashes
+# change every second method, and once more where the colours begin again.
 _COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, YELLOW, BLACK, GREY)
 _MARKS = "osD^vP*X<>hp"
 _DASHES = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)), (0, (5, 1.2, 1.2, 1.2)))
@@ -51,6 +54,11 @@ class Mark:
     dash: str | tuple[float, tuple[float, ...]]
 
     @property
+    def dashes(self) -> str:
+        """Return its dashes as SVG has them, at twice the size of a figure; empty of a whole line."""
+        return "" if isinstance(self.dash, str) else " ".join(f"{2 * length:g}" for length in self.dash[1])
+
+    @property
     def line(self) -> str:
         """Return the identity of the method's lines in SVG, by which a page finds them."""
         return f"method-{self.number}"
@@ -59,17 +67,23 @@ class Mark:
 def marks(methods: list[str]) -> dict[str, Mark]:
     """Return the look of every method."""
     return {
-        name: Mark(i, name, _COLOURS[i % 8], _MARKS[i % 12], _DASHES[(i // 2 + i // 8) % 4])
+        name: Mark(i, name, _COLOURS[i % len(_COLOURS)], _MARKS[i % len(_MARKS)], _DASHES[(i // 2 + i // 8) % 4])
         for i, name in enumerate(methods)
     }
 
 
 Looks = dict[str, Mark]
 
+# Noise levels of one panel, which share a method's row.
 _LEVELS = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "D"), (PURPLE, "^"), (BLACK, "v"), (GREY, "P"))
+# Panels of distributions at most: with more, one panel shows all noise levels of its case.
 _MOST = 12
+# Least cost above the best that is drawn: below it is what rounding leaves.
 _LEAST = 1e-6
+# Inches, with texts of 8 to 10 points: two panels beside each other on a desk, one on a phone, and both can be read.
 _SIZE = (5.2, 3.5)
+# Ranges of logarithmic axes: errors in units of the bound, costs above the best. Beyond them all is equally bad.
+_FARTHEST, _DEAREST = 1e4, 1e8
 
 
 def panel(title: str, size: tuple[float, float] = _SIZE) -> tuple[Figure, Axes]:
@@ -79,8 +93,13 @@ def panel(title: str, size: tuple[float, float] = _SIZE) -> tuple[Figure, Axes]:
     axes.grid(color=GREY, alpha=0.3, linewidth=0.6)
     axes.set_axisbelow(True)
     if title:
-        axes.set_title(title, fontsize=10)
+        axes.set_title(literal(title), fontsize=10)
     return figure, axes
+
+
+def literal(text: str) -> str:
+    """Return a text of a study file as matplotlib shows it letter by letter: its dollars begin no formula."""
+    return text.replace("$", r"\$")
 
 
 def success(table: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
@@ -88,6 +107,8 @@ def success(table: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
     for number, (case, part) in enumerate(table.groupby("case", observed=True)):
         levels = list(dict.fromkeys(part["noise_label"]))
         names = [name for name in looks if name in set(part["method"])]
+        # Levels of a method stand close together: of a row, one high, a fifth stays free; a row is a quarter of an inch
+        # high at least, so that names of eight points do not touch.
         step = min(0.24, 0.8 / len(levels))
         height = 1.35 + len(names) * max(0.26, 0.12 * len(levels))
         figure, axes = panel(str(case), (_SIZE[0], height))
@@ -101,10 +122,12 @@ def success(table: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
             axes.errorbar(
                 100 * share, y, xerr=bars, fmt=mark, color=colour, ms=4, lw=1.1, capsize=2, label=noise_text(level)
             )
-        axes.set_yticks(np.arange(len(names)), names, fontsize=8)
+        axes.set_yticks(np.arange(len(names)), [literal(name) for name in names], fontsize=8)
         axes.set_ylim(len(names) - 0.45, -0.55)
+        # Marks at 0 and 100 are whole.
         axes.set_xlim(-3, 103)
         axes.set_xlabel("right answers (%)")
+        # So many short labels fit beside each other below a panel.
         short = max(len(noise_text(level)) for level in levels) < 12
         figure.legend(loc="outside lower center", ncols=len(levels) if short and len(levels) < 5 else 2, **_PLAIN)
         yield Picture(f"success-{number + 1}", f"Right answers: {case}", figure)
@@ -124,6 +147,7 @@ def accuracy(table: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
             ratio, half = some["ratio"].to_numpy(dtype=float), some["ratio_half"].to_numpy(dtype=float)
             if not np.isfinite(ratio).any():
                 continue
+            # On a logarithmic axis a bar must end above zero.
             low = np.minimum(np.nan_to_num(half), 0.9 * ratio)
             _line(axes, mark, x, ratio, marker=True)
             axes.errorbar(x, ratio, yerr=[low, np.nan_to_num(half)], fmt="none", ecolor=mark.colour, lw=0.8, capsize=2)
@@ -152,6 +176,7 @@ def _noise_axis(part: pd.DataFrame) -> tuple[dict[str, float], list[str], str]:
 def _ticks(axes: Axes, place: dict[str, float], labels: list[str]) -> None:
     x = np.array(list(place.values()))
     axes.set_xticks(x, labels, fontsize=8)
+    # An eighth of the axis on each side for marks and their bars; one level alone has an axis too.
     margin = 0.12 * max(float(np.ptp(x)), 0.5)
     axes.set_xlim(x.min() - margin, x.max() + margin)
 
@@ -161,6 +186,7 @@ def _log(axis: Any, scale: Any, low: float, high: float) -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
 
     scale("log")
+    # A decade and a half: with less, ticks at powers of ten would leave one label or none.
     if high / max(low, 1e-300) < 30.0 and low > 0.0:
         axis.set_major_locator(LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0)))
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
@@ -178,7 +204,7 @@ def _line(axes: Axes, mark: Mark, x: Array, y: Array, *, marker: bool, steps: bo
         markersize=4.5,
         linewidth=1.5,
         drawstyle="steps-post" if steps else "default",
-        label=mark.name,
+        label=literal(mark.name),
     )
     line.set_gid(mark.line)
 
@@ -196,12 +222,14 @@ def distributions(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
             some = part[part["method"] == mark.name]
             if len(some):
                 values = some["deviation"].to_numpy(dtype=float)[counted(some)]
+                # Zero has no logarithm, and the axis begins at a tenth.
                 _line(axes, mark, *distribution(np.maximum(values, 1e-2), len(some)), marker=False, steps=True)
         x = np.geomspace(0.1, 10.0, 120)
+        # The squared error of an efficient estimate in units of its bound has a chi-square distribution.
         theory = gammainc(part["dimension"].iloc[0] / 2.0, x**2 / 2.0)
         axes.plot(x, theory, color=BLACK, linewidth=3.5, alpha=0.18, zorder=1)
         axes.set_xscale("log")
-        axes.set_xlim(0.1, float(np.clip(np.nanmax([10.0, *axes.get_xlim()]), 10.0, 1e4)))
+        axes.set_xlim(0.1, float(np.clip(np.nanmax([10.0, *axes.get_xlim()]), 10.0, _FARTHEST)))
         axes.set_ylim(-0.02, 1.02)
         axes.set_xlabel("error in units of the bound")
         axes.set_ylabel("share of trials")
@@ -218,7 +246,7 @@ def gaps(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
             if len(values):
                 _line(axes, mark, *distribution(np.maximum(values, _LEAST), len(some)), marker=False, steps=True)
         axes.set_xscale("log")
-        axes.set_xlim(_LEAST * 0.7, float(np.clip(axes.get_xlim()[1], 10.0, 1e8)))
+        axes.set_xlim(_LEAST * 0.7, float(np.clip(axes.get_xlim()[1], 10.0, _DEAREST)))
         axes.set_ylim(-0.02, 1.02)
         axes.set_xlabel("cost above the best known")
         axes.set_ylabel("share of trials")
@@ -234,6 +262,7 @@ def profile(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
     spent = np.where(solved, times, np.inf)
     with np.errstate(invalid="ignore"):
         slower = np.where(solved, spent / spent.min(0), 1.0)
+    # To half beyond the slowest that is right, where no curve rises any more.
     ratios = np.geomspace(1.0, max(10.0, 1.5 * float(slower.max())), 240)
     figure, axes = panel("", (6.0, 3.8))
     for name, shares in zip(names, performance_profile(times, solved, ratios), strict=True):
@@ -254,6 +283,7 @@ def timing(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
     for number, (kinds, part) in enumerate(frame.groupby("kinds", observed=True)):
         figure, axes = panel(str(kinds).replace("+", " + "))
         sizes = sorted(part["rows"].unique())
+        # Methods of one size stand apart by 1.2 % of it, by half where one size has an axis from 0.9 to 1.1 of it.
         step = 1.006 if len(sizes) == 1 else 1.012
         for mark in looks.values():
             grouped = part[part["method"] == mark.name].groupby("rows")["seconds"]
@@ -284,21 +314,32 @@ def svg_text(figure: Figure) -> str:
     from matplotlib import rc_context
 
     text = StringIO()
+    # Text stays text, to be found and read aloud; the salt makes identities depend on the figure alone.
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "optloc"}):
         figure.savefig(text, format="svg", metadata={"Date": None})
     return text.getvalue()
 
 
-def inline(figure: Figure, name: str, title: str) -> str:
+@dataclass(frozen=True, slots=True)
+class Drawing:
+    """A figure as SVG that stands in the text of a page, and its name."""
+
+    name: str
+    svg: str
+
+
+def inline(picture: Picture) -> Drawing:
     """Return a figure as an element of a page.
 
     Identities are made unique by the name of the figure, lines of methods get a class, and the width is that of the
     place where it stands.
     """
-    text = svg_text(figure)
+    name, text = picture.name, svg_text(picture.figure)
     text = text[text.index("<svg") :]
+    # Every figure would bring its own: who made it, and when.
     text = re.sub(r"\s*<metadata>.*?</metadata>", "", text, flags=re.DOTALL)
     text = _METHOD.sub(r'<g class="\1"', text)
+    # Identities of one page must differ, and matplotlib gives equal ones to equal shapes of two figures.
     known = set(_IDENTITY.findall(text))
     text = _IDENTITY.sub(lambda m: f'id="{name}-{m[1]}"', text)
     text = re.sub(r"url\(#([^)]*)\)", lambda m: f"url(#{name}-{m[1]})", text)
@@ -306,10 +347,4 @@ def inline(figure: Figure, name: str, title: str) -> str:
     opening, rest = text.split(">", 1)
     opening = re.sub(r'\s(width|height)="[^"]*"', "", opening)
     opening = re.sub(r"\s+", " ", opening)
-    return f'{opening} role="img" aria-label="{_quoted(title)}">{rest}'
-
-
-def _quoted(text: str) -> str:
-    from html import escape
-
-    return escape(text, quote=True)
+    return Drawing(name, f'{opening} role="img" aria-label="{escape(picture.title)}">{rest}')

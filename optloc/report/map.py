@@ -1,14 +1,12 @@
-"""The drawing of an interactive map: a plane of longitude and latitude, paths, dots, layers that come and go."""
+"""What an interactive map shows: a plane of longitude and latitude, coasts, marks in layers; fixes as such marks."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from html import escape
 from importlib.resources import files
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -37,6 +35,7 @@ def rings() -> tuple[Array, ...]:
 
     Each is in one piece, so that some go beyond 180 degrees; that of Antarctica goes along the pole.
     """
+    # Differences in hundredths of a degree: integers that a zip archive makes small.
     with (files("optloc.report") / "natural-earth-50m.npz").open("rb") as file, np.load(file) as data:
         delta, length = data["delta"].astype(np.int64), data["length"]
     starts = np.cumsum(length)[:-1]
@@ -51,6 +50,7 @@ def land(window: Window) -> list[Array]:
         low, high = ring.min(0), ring.max(0)
         if high[1] < south or low[1] > north:
             continue
+        # A ring that crosses the date line is in one piece, on one side of it or the other.
         for turn in (-360.0, 0.0, 360.0):
             if low[0] + turn < east and high[0] + turn > west:
                 cut = _clipped(ring + np.array([turn, 0.0]), window)
@@ -78,9 +78,13 @@ def _clipped(ring: Array, window: Window) -> Array:
     return ring
 
 
+# Units of the drawing along its longer side; with one decimal a coast is true to a ten-thousandth of the map.
 _SIZE = 1000.0
-_TOOLS = (("in", "+", "nearer"), ("out", "−", "farther"), ("all", "⌂", "whole map"), ("focus", "◎", "to the fix"))
+# What is drawn of the coast, in halves of the map along x and y: the script zooms out to 2.5 times the map, on screens
+# that are wider than it, and then it can be dragged.
 _AROUND = np.array([6.0, 4.0])
+# A map that is narrow has surroundings like one of this shape: its window is as wide as the page.
+_NARROWEST = 0.8
 
 
 class Plane:
@@ -94,6 +98,7 @@ class Plane:
 
     def __init__(self, west: float, east: float, south: float, north: float) -> None:
         self.middle = np.array([(west + east) / 2.0, (south + north) / 2.0])
+        # A degree of longitude is so much shorter than one of latitude.
         self.squeeze = float(np.cos(np.radians(self.middle[1])))
         self.unit = _SIZE / max((east - west) * self.squeeze, north - south)
         self.half = np.array([(east - west) * self.squeeze, north - south]) * self.unit / 2.0
@@ -110,9 +115,103 @@ class Plane:
 
     def window(self) -> Window:
         """Return what is drawn of the coast: the map and its surroundings."""
-        half = np.maximum(self.half, self.half.max() * 0.8) * _AROUND / [self.squeeze * self.unit, self.unit]
+        half = np.maximum(self.half, self.half.max() * _NARROWEST) * _AROUND / [self.squeeze * self.unit, self.unit]
         (west, south), (east, north) = self.middle - half, self.middle + half
         return max(west, self.middle[0] - 180.0), min(east, self.middle[0] + 180.0), max(south, -90.0), min(north, 90.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """A path of SVG; a dot is one without length, whose round end is as wide as its stroke.
+
+    Parameters
+    ----------
+    kind : str
+        Its class in the style sheet.
+    d : str
+        Its data, units of the drawing.
+    colour : str
+        Of the stroke, where the style sheet has none.
+    width : float
+        Of the stroke, pixels at any zoom.
+    tell : str
+        What the page says when it is pointed at.
+    """
+
+    kind: str
+    d: str
+    colour: str = ""
+    width: float = 0.0
+    tell: str = ""
+    shape: ClassVar = "curve"
+
+
+@dataclass(frozen=True, slots=True)
+class Label:
+    """A text (`kind` is its class in the style sheet) at a place of the drawing."""
+
+    kind: str
+    x: float
+    y: float
+    text: str
+    shape: ClassVar = "label"
+
+
+@dataclass(frozen=True, slots=True)
+class Image:
+    """A picture whose corner is at a place of the drawing; its source is an address that holds it."""
+
+    x: float
+    y: float
+    width: float
+    height: float
+    source: str
+    shape: ClassVar = "image"
+
+
+Drawn = Curve | Label | Image
+
+
+@dataclass(frozen=True, slots=True)
+class Canvas:
+    """A map as a template draws it.
+
+    Parameters
+    ----------
+    name : str
+        Identity of the element.
+    title : str
+        What it shows.
+    layers : mapping of str to sequence of Curve, Label and Image
+        What is drawn, from the lowest layer on; a box switches it off.
+    text : str
+        Stands below the map while nothing is pointed at.
+    box, shore : str
+        View box of the SVG, and data of the path of all land.
+    data : dict
+        What the script needs: `middle` and `scale` of the plane; `x`, `y` and `values` of a bound; `focus`, middle and
+        width of a part that deserves a button, and `nearest`, how far one can zoom.
+    """
+
+    name: str
+    title: str
+    layers: Mapping[str, Sequence[Drawn]]
+    text: str
+    box: str
+    shore: str
+    data: dict[str, Any]
+
+
+def map_canvas(
+    plane: Plane, name: str, title: str, layers: Mapping[str, Sequence[Drawn]], data: dict[str, Any], text: str
+) -> Canvas:
+    """Return a map of a plane; the arguments are those of `Canvas`, `data` without middle and scale."""
+    shore = path([plane(ring) for ring in land(plane.window())], close=True)
+    width, height = 2.0 * plane.half
+    box = f"{-plane.half[0]:.1f} {-plane.half[1]:.1f} {width:.1f} {height:.1f}"
+    return Canvas(
+        name, title, layers, text, box, shore, {"middle": plane.middle.tolist(), "scale": plane.scale, **data}
+    )
 
 
 def path(lines: Sequence[Array], *, close: bool, digits: int = 1) -> str:
@@ -121,54 +220,24 @@ def path(lines: Sequence[Array], *, close: bool, digits: int = 1) -> str:
     return "".join("M" + "L".join(f"{x:.9g} {y:.9g}" for x, y in np.round(line, digits)) + end for line in lines)
 
 
-def dot(x: float, y: float, colour: str, size: float, title: str = "") -> str:
+def dot(x: float, y: float, colour: str, size: float, title: str = "") -> Curve:
     """Return a dot whose size does not depend on the zoom; the page shows its title when it is pointed at."""
-    told = f' data-tell="{escape(title, quote=True)}"' if title else ""
-    return f'<path class="dot" d="M{x:.9g} {y:.9g}h0" stroke="{colour}" stroke-width="{size}"{told}/>'
-
-
-def map_canvas(plane: Plane, name: str, title: str, layers: Mapping[str, str], data: dict[str, Any], text: str) -> str:
-    """Return a map as an element of a page that holds the script of maps.
-
-    Parameters
-    ----------
-    plane : Plane
-        Its limits.
-    name : str
-        Identity of the element.
-    title : str
-        What it shows.
-    layers : mapping of str to str
-        SVG of each layer, from the lowest on; a box switches it off.
-    data : dict
-        What the script needs beside the plane: `x`, `y` and `values` of the bound; `focus`, middle and width of a part
-        that deserves a button, and `nearest`, how far one can zoom.
-    text : str
-        Stands below the map while nothing is pointed at.
-    """
-    shore = path([plane(ring) for ring in land(plane.window())], close=True)
-    groups = "".join(f'<g data-layer="{layer}">{inner}</g>' for layer, inner in layers.items())
-    width, height = 2.0 * plane.half
-    box = f"{-plane.half[0]:.1f} {-plane.half[1]:.1f} {width:.1f} {height:.1f}"
-    boxes = "".join(f'<label><input type="checkbox" value="{n}" checked> {n}</label>' for n in layers)
-    buttons = "".join(
-        f'<button type="button" data-do="{do}" aria-label="{label}">{sign}</button>'
-        for do, sign, label in _TOOLS[: 4 if "focus" in data else 3]
-    )
-    numbers = json.dumps({"middle": plane.middle.tolist(), "scale": plane.scale, **data}).replace("</", "<\\/")
-    return (
-        f'<div class="map" id="{name}"><svg viewBox="{box}" role="img" aria-label="{escape(title, quote=True)}">'
-        f'<path class="land" d="{shore}"/>{groups}</svg>'
-        f'<div class="tools">{buttons}</div><div class="layers">{boxes}</div><output>{escape(text)}</output>'
-        f'<script type="application/json">{numbers}</script></div>'
-    )
+    return Curve("dot", f"M{x:.9g} {y:.9g}h0", colour, size, title)
 
 
 # Fixes and tracks as marks on the Earth: longitude, latitude, ellipse, a line of text.
 
+# Corners of an ellipse: one every five degrees, the first again as the last.
 _RING = 73
+# Metres above the ellipsoid where space begins by convention: satellites have no place on a map.
 _SKY = 100e3
-_LINES, _GRID = 24, 281
+# Rows that have lines of position: more cannot be told apart.
+_LINES = 24
+# Points along an axis on which lines of position are sought: 112 steps across the map, and beyond each of its sides as
+# much as `_RIM` says in widths, for windows that are wider or taller; 80 000 points are evaluated in one batch.
+_GRID, _RIM = 281, 0.75
+# Short of the poles, where longitude has no meaning.
+_POLE = 89.9
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,6 +271,7 @@ def spots(problem: Problem, position: Array, covariance: Array, clean: Array, te
         if not (np.isfinite(centre).all() and np.isfinite(spread).all()):
             rings.append(np.zeros((0, 2)))
             continue
+        # The ellipse of east and north, whatever the height is worth.
         axes = problem.frame.enu_axes(centre)[:2]
         semi_axes, directions = error_ellipse(axes @ spread @ axes.T)
         rings.append(degrees(problem, centre + circle * semi_axes @ directions.T @ axes))
@@ -274,11 +344,12 @@ def lines_of_position(problem: Problem, fix: Fix, limits: tuple[float, float, fl
     slot, shared = flat.layout.find("position") if _positioned(flat) else (None, False)
     if slot is None or not shared:
         return []
-    lon, lat = _beyond(*limits[:2]), np.clip(_beyond(*limits[2:]), -89.9, 89.9)
+    lon, lat = _beyond(*limits[:2]), np.clip(_beyond(*limits[2:]), -_POLE, _POLE)
     own = x[slot.start : slot.start + slot.size]
     height = float(problem.frame.to_geodetic(own)[2])
     east, north = (np.radians(v.ravel()) for v in np.meshgrid(lon, lat))
     vectors = np.tile(x, (east.size, 1))
+    # Longitudes back between half a turn west and east: the grid goes on beyond the date line.
     place = problem.frame.from_geodetic(north, (east + np.pi) % (2.0 * np.pi) - np.pi, np.full(east.size, height))
     vectors[:, slot.start : slot.start + slot.size] = place[:, : slot.size]
     with np.errstate(all="ignore"):
@@ -288,6 +359,7 @@ def lines_of_position(problem: Problem, fix: Fix, limits: tuple[float, float, fl
         for i in range(rows.count):
             values = residual[:, start + i].reshape(_GRID, _GRID)
             if MODELS[rows.kind].period is not None:
+                # Behind a station a bearing jumps by a turn: a change of sign there is no line.
                 values = np.where(np.abs(values) < 0.5 * np.pi, values, np.nan)
             ends = [flat.stations.names[k] for k in (rows.a[i], rows.b[i]) if k >= 0]
             made = contour_generator(lon, lat, np.ma.masked_invalid(values)).lines(0.0)
@@ -297,7 +369,7 @@ def lines_of_position(problem: Problem, fix: Fix, limits: tuple[float, float, fl
 
 def _beyond(low: float, high: float) -> Array:
     """Return a grid that goes beyond the limits of a map, whose window may be wider or taller."""
-    rim = 0.75 * (high - low)
+    rim = _RIM * (high - low)
     return np.linspace(low - rim, high + rim, _GRID)
 
 

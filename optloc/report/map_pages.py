@@ -1,10 +1,9 @@
-"""A page with an interactive map of fixes or a track: stations, ellipses, alternatives, lines of position."""
+"""Pages with an interactive map: fixes or tracks with ellipses and lines of position; a bound, as reports show it."""
 
 from __future__ import annotations
 
 from base64 import b64encode
 from collections.abc import Sequence
-from html import escape
 from io import BytesIO
 from typing import Any
 
@@ -18,6 +17,11 @@ from optloc.plot.style import BLACK, BLUE, ORANGE
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.report.map import (
+    Canvas,
+    Curve,
+    Drawn,
+    Image,
+    Label,
     Plane,
     Spots,
     dot,
@@ -28,12 +32,21 @@ from optloc.report.map import (
     path,
     station_spots,
 )
-from optloc.report.page import page, paragraph
+from optloc.report.page import Part, write_page
 
+# Ellipses of more fixes are left out: a thicket that nobody reads, and 70 corners each.
 _ELLIPSES = 200
+# Decimals of the units of the drawing: an ellipse of centimetres on a map of 1000 km is still round.
 _DIGITS = 5
+# Degrees; a map of a single place is so wide at least, some metres.
 _LEAST = 1e-5
+# Share of the map on each side that stays free of marks, so that names of stations have room.
 _RIM = 0.22
+# The shorter side of a map over the longer, at least.
+_SLIMMEST = 0.6
+# Pixels of a dot: of a station and its white middle, of a mark, and of a mark where there are more than `_FEW`.
+_STATION, _MIDDLE, _MARK, _SMALL = 11, 7, 11, 5
+_FEW = 12
 
 
 def fix_page(problem: Problem, fixes: Fix | Sequence[Fix], title: str, labels: Sequence[str] = ()) -> str:
@@ -55,7 +68,7 @@ def fix_page(problem: Problem, fixes: Fix | Sequence[Fix], title: str, labels: S
     InvalidProblem
         Where the frame is not on Earth, nothing has a place, or matplotlib is missing.
     """
-    _on_earth(problem)
+    _on_earth(problem.frame.geodetic)
     several = [fixes] if isinstance(fixes, Fix) else list(fixes)
     found, others = fixed_spots(problem, several, labels), other_spots(problem, several)
     single = several[0] if len(several) == 1 and several[0].code.size == 1 else None
@@ -64,12 +77,26 @@ def fix_page(problem: Problem, fixes: Fix | Sequence[Fix], title: str, labels: S
 
 def track_page(problem: Problem, tracks: Spots, title: str) -> str:
     """Return the same of the scans of tracks."""
-    _on_earth(problem)
+    _on_earth(problem.frame.geodetic)
     return _page(problem, tracks, Spots(np.zeros((0, 2)), (), np.zeros(0, dtype=bool), ()), title, "track", None)
 
 
-def _on_earth(problem: Problem) -> None:
-    if not problem.frame.geodetic:
+def map_page(found: BoundMap, title: str) -> str:
+    """Return an HTML page with the interactive map of a bound; it needs no network.
+
+    Raises
+    ------
+    InvalidProblem
+        Where the frame is not on Earth, or matplotlib is missing.
+    """
+    _on_earth(found.geodetic)
+    text = "Root of the trace of the Cramer-Rao bound of the position, in metres. Shores: Natural Earth."
+    part = Part("map", "Bound of the position error", text, maps=[map_element(found, "map-1", title)])
+    return write_page(title, [part])
+
+
+def _on_earth(geodetic: bool) -> None:
+    if not geodetic:
         advice = "write a picture (.png, .svg, .pdf), or give a frame of the Earth"
         raise InvalidProblem("an interactive map needs positions on Earth", "map", advice)
 
@@ -79,19 +106,22 @@ def _page(problem: Problem, found: Spots, others: Spots, title: str, what: str, 
     limits = _limits([stations.place, found.place, others.place])
     plane, middle = Plane(*limits), (limits[0] + limits[1]) / 2.0
     lines = [] if single is None else lines_of_position(problem, single, limits)
-    layers = {
+    few = len(found.place) <= _FEW
+    layers: dict[str, Sequence[Drawn]] = {
         **({"lines of position": _curves(lines, plane)} if lines else {}),
         "stations": _stations(stations, plane, middle),
-        **({"alternatives": _dots(others, plane, middle, 11)} if len(others.place) else {}),
-        what: _ellipses(found, plane, middle) + _dots(found, plane, middle, 11 if len(found.place) <= 12 else 5),
+        **({"alternatives": _dots(others, plane, middle, _MARK)} if len(others.place) else {}),
+        what: [*_ellipses(found, plane, middle), *_dots(found, plane, middle, _MARK if few else _SMALL)],
     }
+    # The part that deserves a button is three ellipses wide; a map that is not wider needs none.
     data: dict[str, object] = {}
     if focus := _focus(found, plane, middle):
+        # One can zoom until the part fills a tenth of the width, at least as far as on maps without one.
         data = {"focus": focus, "nearest": max(200.0, 10.0 * 2.0 * float(plane.half[0]) / focus[2])}
     text = f"Stations (white), {what} (blue; orange where the status is not ok) with 95 % ellipses. Point at a mark."
-    inner = map_canvas(plane, "map-1", title, layers, data, text)
-    note = paragraph("Drag to move, wheel or pinch to zoom. Shores: Natural Earth.", "soft")
-    return page(title, [("map", "Map", inner + note)], "", "", maps=True)
+    canvas = map_canvas(plane, "map-1", title, layers, data, text)
+    note = "Drag to move, wheel or pinch to zoom. Shores: Natural Earth."
+    return write_page(title, [Part("map", "Map", maps=[canvas], note=note)])
 
 
 def _limits(places: Sequence[Array]) -> tuple[float, float, float, float]:
@@ -100,15 +130,18 @@ def _limits(places: Sequence[Array]) -> tuple[float, float, float, float]:
     points = points[np.isfinite(points).all(-1)]
     if not len(points):
         raise InvalidProblem("nothing has a place on the map", "map", "see `optloc fix` for the reasons")
-    points = _turned(points, points[0, 0])
+    # Everything within half a turn of the first place.
+    points = _turn(points, points[0, 0])
     low, high = points.min(0), points.max(0)
     squeeze = np.array([np.cos(np.radians((low + high)[1] / 2.0)), 1.0])
-    half = (0.5 + _RIM) * np.maximum((high - low) * squeeze, 0.6 * float(((high - low) * squeeze).max() or _LEAST))
+    half = (0.5 + _RIM) * np.maximum(
+        (high - low) * squeeze, _SLIMMEST * float(((high - low) * squeeze).max() or _LEAST)
+    )
     (west, south), (east, north) = (low + high) / 2.0 - half / squeeze, (low + high) / 2.0 + half / squeeze
     return float(west), float(east), float(max(south, -90.0)), float(min(north, 90.0))
 
 
-def _turned(place: Array, middle: float) -> Array:
+def _turn(place: Array, middle: float) -> Array:
     """Return longitude and latitude (n, 2) with longitudes within half a turn of the middle of the map."""
     out = np.array(place, dtype=float)
     out[:, 0] = (out[:, 0] - middle + 180.0) % 360.0 - 180.0 + middle
@@ -120,55 +153,49 @@ def _focus(found: Spots, plane: Plane, middle: float) -> list[float] | None:
     rings = [ring for ring in found.rings if len(ring)]
     if len(found.place) != 1 or not rings:
         return None
-    ring = plane(_turned(rings[0], middle))
+    ring = plane(_turn(rings[0], middle))
     (x, y), width = ring.mean(0), 3.0 * float(np.ptp(ring, axis=0).max())
     return [float(x), float(y), width] if width < plane.half[0] else None
 
 
-def _curves(lines: Sequence[tuple[str, Array]], plane: Plane) -> str:
-    return "".join(
-        f'<path class="line thin" d="{path([plane(line)], close=False, digits=3)}" data-tell="{_quoted(name)}"/>'
-        for name, line in lines
-    )
+def _curves(lines: Sequence[tuple[str, Array]], plane: Plane) -> list[Drawn]:
+    return [Curve("line thin", path([plane(line)], close=False, digits=3), tell=name) for name, line in lines]
 
 
-def _stations(stations: Spots, plane: Plane, middle: float) -> str:
-    parts = []
-    for name, (x, y) in zip(stations.text, plane(_turned(stations.place, middle)), strict=True):
-        if np.isfinite(x):
-            parts += [dot(x, y, BLACK, 11), dot(x, y, "#ffffff", 7, f"station {name}")]
-            parts.append(f'<text class="name" x="{x:.2f}" y="{y:.2f}">{_quoted(name)}</text>')
-    return "".join(parts)
+def _stations(stations: Spots, plane: Plane, middle: float) -> list[Drawn]:
+    places = plane(_turn(stations.place, middle))
+    marks = [_station(name, x, y, f"station {name}") for name, (x, y) in zip(stations.text, places, strict=True)]
+    return [one for mark, seen in zip(marks, np.isfinite(places[:, 0]), strict=True) if seen for one in mark]
 
 
-def _ellipses(found: Spots, plane: Plane, middle: float) -> str:
-    if len(found.rings) > _ELLIPSES:
-        return ""
-    rings = [plane(_turned(ring, middle)) for ring in found.rings if len(ring)]
-    return f'<path class="ring" stroke="{BLUE}" d="{path(rings, close=True, digits=_DIGITS)}"/>' if rings else ""
+def _station(name: str, x: float, y: float, tell: str) -> tuple[Drawn, ...]:
+    return dot(x, y, BLACK, _STATION), dot(x, y, "#ffffff", _MIDDLE, tell), Label("name", x, y, name)
 
 
-def _dots(found: Spots, plane: Plane, middle: float, size: float) -> str:
-    return "".join(
+def _ellipses(found: Spots, plane: Plane, middle: float) -> list[Drawn]:
+    rings = [plane(_turn(ring, middle)) for ring in found.rings if len(ring)]
+    if not rings or len(found.rings) > _ELLIPSES:
+        return []
+    return [Curve("ring", path(rings, close=True, digits=_DIGITS), BLUE)]
+
+
+def _dots(found: Spots, plane: Plane, middle: float, size: float) -> list[Drawn]:
+    return [
         dot(x, y, BLUE if ok else ORANGE, size, told)
-        for (x, y), ok, told in zip(plane(_turned(found.place, middle)), found.clean, found.text, strict=True)
+        for (x, y), ok, told in zip(plane(_turn(found.place, middle)), found.clean, found.text, strict=True)
         if np.isfinite(x)
-    )
+    ]
 
 
-def _quoted(text: str) -> str:
-    from html import escape
+# The map of a bound: coastlines, bound, stations and trials.
 
-    return escape(text, quote=True)
-
-
-# An interactive map in a page: coastlines, bound, stations and trials, without a network.
-
+# Dots of trials: enough to show where they are, few enough that the bound below is seen and the page moves smoothly.
 _DOTS = 400
+_RIGHT, _WRONG = 3, 5  # pixels: those that were answered wrong must be seen among many that were not
 
 
-def map_element(found: BoundMap, name: str, title: str, trials: tuple[Array, Array] | None = None) -> str:
-    """Return a map as an element of a page that holds `page_scripts`.
+def map_element(found: BoundMap, name: str, title: str, trials: tuple[Array, Array] | None = None) -> Canvas:
+    """Return the map of a bound.
 
     Parameters
     ----------
@@ -182,8 +209,8 @@ def map_element(found: BoundMap, name: str, title: str, trials: tuple[Array, Arr
         Longitude and latitude (n, 2) of true places, and which of them (n,) were not answered right.
     """
     plane = Plane(found.x[0], found.x[-1], found.y[0], found.y[-1])
-    layers = {
-        "bound": _image(found, plane) + _lines(found, plane),
+    layers: dict[str, Sequence[Drawn]] = {
+        "bound": [_image(found, plane), *_lines(found, plane)],
         **({} if trials is None else {"trials": _trials(plane, *trials)}),
         "stations": _map_stations(found, plane),
     }
@@ -200,53 +227,51 @@ def _metres(level: float) -> str:
     return f"{level:g} m" if level < 1e3 else f"{level / 1e3:g} km"
 
 
-def _image(found: BoundMap, plane: Plane) -> str:
+def _image(found: BoundMap, plane: Plane) -> Image:
     from matplotlib import colormaps
     from matplotlib.colors import LogNorm
     from matplotlib.image import imsave
 
     steps = levels(found.sigma)
+    # A bound that is the same everywhere still has two ends of a scale.
     norm = LogNorm(steps[0], max(steps[-1], 2.0 * steps[0]), clip=True)
     rgba = colormaps[COLOURS](norm(np.ma.masked_invalid(found.sigma)))
+    # Where there is no bound nothing is drawn.
     rgba[~np.isfinite(found.sigma)] = 0.0
     file = BytesIO()
     imsave(file, np.ascontiguousarray(rgba[::-1]), format="png")
+    # A pixel stands around its point, so the picture reaches half a step beyond the grid.
     dx, dy = ((v[1] - v[0]) / 2.0 for v in (found.x, found.y))
     x, y = plane(np.array([found.x[0] - dx, found.y[-1] + dy]))
     right, low = plane(np.array([found.x[-1] + dx, found.y[0] - dy]))
-    source = b64encode(file.getvalue()).decode()
-    size = f'x="{x:.2f}" y="{y:.2f}" width="{right - x:.2f}" height="{low - y:.2f}"'
-    return f'<image {size} preserveAspectRatio="none" opacity="0.75" href="data:image/png;base64,{source}"/>'
+    return Image(x, y, right - x, low - y, f"data:image/png;base64,{b64encode(file.getvalue()).decode()}")
 
 
-def _lines(found: BoundMap, plane: Plane) -> str:
-    parts = []
+def _lines(found: BoundMap, plane: Plane) -> list[Drawn]:
+    parts: list[Drawn] = []
     for level, lines in isolines(found):
         drawn = [plane(line) for line in lines]
         if not drawn:
             continue
-        parts.append(f'<path class="line" d="{path(drawn, close=False)}"/>')
+        # One label a level, in the middle of its longest line.
         longest = max(drawn, key=len)
         x, y = longest[len(longest) // 2]
-        parts.append(f'<text class="level" x="{x:.1f}" y="{y:.1f}">{_metres(level)}</text>')
-    return "".join(parts)
+        parts += [Curve("line", path(drawn, close=False)), Label("level", x, y, _metres(level))]
+    return parts
 
 
-def _map_stations(found: BoundMap, plane: Plane) -> str:
-    parts = []
-    for name, (x, y) in zip(found.names, plane(found.stations), strict=True):
-        parts += [dot(x, y, BLACK, 11), dot(x, y, "#ffffff", 7, name)]
-        parts.append(f'<text class="name" x="{x:.1f}" y="{y:.1f}">{escape(name)}</text>')
-    return "".join(parts)
+def _map_stations(found: BoundMap, plane: Plane) -> list[Drawn]:
+    places = zip(found.names, plane(found.stations), strict=True)
+    return [one for name, (x, y) in places for one in _station(name, x, y, name)]
 
 
-def _trials(plane: Plane, places: Array, off: Array) -> str:
+def _trials(plane: Plane, places: Array, off: Array) -> list[Drawn]:
     kept = np.unique(np.linspace(0, len(places) - 1, min(_DOTS, len(places))).astype(int))
-    order = kept[np.argsort(off[kept], kind="stable")]
-    return "".join(
-        dot(x, y, ORANGE if bad else BLUE, 5 if bad else 3)
+    order = kept[np.argsort(off[kept], kind="stable")]  # those that were wrong on top
+    return [
+        dot(x, y, ORANGE if bad else BLUE, _WRONG if bad else _RIGHT)
         for (x, y), bad in zip(plane(places[order]), off[order], strict=True)
-    )
+    ]
 
 
 def _data(found: BoundMap) -> dict[str, Any]:
@@ -256,22 +281,3 @@ def _data(found: BoundMap) -> dict[str, Any]:
         "y": [float(found.y[0]), float(found.y[-1]), len(found.y)],
         "values": [float(f"{v:.3g}") if np.isfinite(v) else None for v in found.sigma.ravel()],
     }
-
-
-# A page that holds one interactive map.
-
-
-def map_page(found: BoundMap, title: str) -> str:
-    """Return an HTML page with the interactive map of a bound; it needs no network.
-
-    Raises
-    ------
-    InvalidProblem
-        Where the frame is not on Earth, or matplotlib is missing.
-    """
-    if not found.geodetic:
-        advice = "write a picture (.png, .svg, .pdf), or give a frame of the Earth"
-        raise InvalidProblem("an interactive map needs positions on Earth", "map", advice)
-    text = "Root of the trace of the Cramer-Rao bound of the position, in metres. Shores: Natural Earth."
-    parts = [("map", "Bound of the position error", paragraph(text) + map_element(found, "map-1", title))]
-    return page(title, parts, "", "", maps=True)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 SHIFT = 1e-5
-"""Shift of geometric means of times, seconds."""
+"""Shift of geometric means of times, seconds: the time of a fast fix, below which faster counts for little."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +43,7 @@ def number(value: float, digits: int = 3) -> str:
     """Return a number with some significant digits, a dash where there is none."""
     if not np.isfinite(value):
         return "–"
+    # Between these a plain number is the shorter one.
     if value and not 1e-3 <= abs(value) < 1e5:
         mantissa, _, power = f"{value:.{digits - 1}e}".partition("e")
         return f"{mantissa}·10{str(int(power)).translate(_SUPERSCRIPT)}"
@@ -55,6 +56,7 @@ _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 def duration(seconds: float) -> str:
     """Return a time with the unit that suits it."""
+    # From 0.9995 on three digits round to 1.00 of the unit.
     for unit, scale in (("s", 1.0), ("ms", 1e-3), ("µs", 1e-6)):
         if seconds >= scale * 0.9995:
             return f"{number(seconds / scale)} {unit}"
@@ -65,9 +67,9 @@ def percent(share: float) -> str:
     """Return a share in per cent; 100 and 0 stand for all and none only."""
     if not np.isfinite(share):
         return "–"
-    near = 0.0005
     text = f"{100 * share:.1f}"
-    if share not in {0.0, 1.0} and not near <= share < 1.0 - near:
+    # Shares that round to 0.0 or 100.0 with one decimal, and are neither.
+    if share not in {0.0, 1.0} and not 0.0005 <= share < 0.9995:
         text = "> 99.9" if share > 0.5 else "< 0.1"
     return text if text not in {"0.0", "100.0"} else text[:-2]
 
@@ -103,6 +105,7 @@ def ranked(frame: pd.DataFrame, order: list[str]) -> Sheet:
     """Return the methods, best first."""
     table = ranking(frame, order, SHIFT)
     sums = frame.groupby("method", observed=True)[["answered", "right", "wrong", "false"]].sum()
+    # Over all rows, not over the instances that every method has seen, as the times are.
     counts = frame.groupby("method", observed=True).size()
     table = table.join(sums, on="method").assign(trials=[int(counts[name]) for name in table["method"]])
     limits = wilson(table["right"].to_numpy(), table["trials"].to_numpy())
@@ -183,6 +186,7 @@ def timing(cells: pd.DataFrame) -> Sheet:
     return _sheet("timing", "Times", note, cells[names.split()], columns, 3)
 
 
+# Proofs that say something of an answer, from the strongest on.
 _PROOFS = (PROVEN, "region", "local")
 
 
@@ -199,6 +203,7 @@ def certificates(frame: pd.DataFrame, order: list[str]) -> Sheet:
         part = frame[frame["method"] == name]
         proofs = part["proof"].astype(str).value_counts()
         share = {f"proven_{kind}": int(proofs.get(kind, 0)) for kind in _PROOFS}
+        # How much of the cost a bound leaves open; NaN where nothing is proven.
         below = (part["cost"] - part["bound"]).to_numpy(dtype=float)
         below = below[np.isfinite(below)]
         by = ", ".join(sorted(set(part["certificate"].astype(str)) - {"none", "nan", ""}))
@@ -266,6 +271,7 @@ _RAISED = dict(zip("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789", strict=True)
 def escaped(text: str) -> str:
     """Return text as LaTeX sets it."""
     out, power = [], ""
+    # Raised signs that follow one another are one power.
     for sign in [*text, ""]:
         if sign in _RAISED and sign:
             power += _RAISED[sign]
@@ -290,6 +296,7 @@ def latex(table: Table, words: int = 1) -> str:
     columns = "l" * words + "r" * (len(table.header) - words)
     head = " & ".join(map(escaped, table.header)) + r" \\"
     rows = [" & ".join(map(escaped, row)) + r" \\" for row in table.rows]
+    # The note goes with the title: a paper has no other place for it.
     caption = escaped(f"{table.title}. {table.note}".strip())
     lines = [
         "% needs \\usepackage{booktabs, longtable}",

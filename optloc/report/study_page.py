@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,9 +17,10 @@ from optloc.papers.report import Picture
 from optloc.plot.bound_map import plot_bound_map
 from optloc.plot.style import figure_class
 from optloc.report import figures as drawn
-from optloc.report import page as html
-from optloc.report.figures import Mark, marks, svg_text
+from optloc.report.figures import Drawing, Mark, inline, literal, marks, svg_text
+from optloc.report.map import Canvas
 from optloc.report.map_pages import map_element
+from optloc.report.page import Part, write_page
 from optloc.report.sheets import Sheet, latex, sheets
 from optloc.study import summary
 from optloc.study.baselines import BASELINES
@@ -35,9 +35,12 @@ if TYPE_CHECKING:
 
 # Maps of the scenarios of a study whose stations stand still.
 
+# Points of a map along each axis: 4096 bounds take a fraction of a second, and isolines are smooth.
 _POINTS = 64
-_MOST = 8
-_REACH = 400
+# Maps of a report at most, and trials whose places decide what a map shows: as many as it has dots.
+_MOST, _REACH = 8, 400
+# How far a map goes beyond stations and true places, in shares of the longer side that they take.
+_WIDEN = 0.2
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +100,7 @@ def scenario_maps(plan: Plan, frame: pd.DataFrame) -> Iterator[Place]:
 
 
 def _place(title: str, case: Case, rows: pd.DataFrame) -> Place:
+    # Stations stand still, so that one trial has those of all.
     one = draw(case, 0, 1)
     problem, d = one.problem.take(np.zeros(1, dtype=int)), one.problem.dimension
     per_trial = rows.groupby("trial", sort=True).agg(
@@ -105,8 +109,9 @@ def _place(title: str, case: Case, rows: pd.DataFrame) -> Place:
     position = per_trial[["x", "y", "z"]].to_numpy(dtype=float)[:_REACH, :d]
     earth = problem.frame.geodetic and d == 3
     plain = plan_of(problem.frame, position, earth)
+    # The height of the middle trial, whole metres because the page says it.
     height = float(np.round(np.median(plain[:, 2]))) if d == 3 and len(plain) else 0.0
-    west, east, south, north = extent(problem, position, widen=0.2)
+    west, east, south, north = extent(problem, position, widen=_WIDEN)
     found = bound_map(
         problem, one.truth[0], np.linspace(west, east, _POINTS), np.linspace(south, north, _POINTS), height
     )
@@ -117,7 +122,10 @@ def _place(title: str, case: Case, rows: pd.DataFrame) -> Place:
 Tell = Callable[[str], None]
 """Hears what is being made."""
 
+# Pixels of an inch in PNG files: a figure of 5.2 inches has 1040, enough for screens of twice the density.
 _DPI = 200
+# Letters of a name with which only two columns of a legend fit the width of a figure; inches of one of its lines.
+_WIDE, _LEGEND_LINE = 22, 0.16
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,24 +184,22 @@ def write_report(folder: Path, out: Path | None = None, tell: Tell | None = None
     found = _found(folder)
     try:
         files = [_table_file(place, sheet, ending) for sheet in found.sheets.values() for ending in ("csv", "tex")]
-        parts, maps = [], False
-        parts.append(("ranking", "Ranking", html.table(found.sheets["ranking"])))
+        parts = [Part("ranking", "Ranking", tables=[found.sheets["ranking"]])]
         for section in _SECTIONS:
             say(section.title.lower())
             pictures = section.make(found)
             if pictures:
-                parts.append((section.name, section.title, _section(section, found, pictures)))
-                files += [path for picture in pictures for path in _figure_files(place, picture, found, section)]
+                parts.append(_part(section, found, pictures))
+                files += [path for one in pictures for path in _figure_files(place, one, legend=section.lines)]
         if found.places:
             say("maps")
-            inner, more, maps = _maps(place, found)
-            parts.append(("maps", "Where the bound is small", inner))
+            part, more = _maps(place, found)
+            parts.append(part)
             files += more
-        parts.append(("made", "How it was made", _made(found)))
-        title = found.manifest.title or found.manifest.name
-        page = html.page(title, parts, _opening(found), html.legend(found.looks), maps=maps)
+        source = found.manifest.text
+        parts.append(Part("made", "How it was made", tables=[found.sheets["machine"]], source=source))
         target = place / "report.html"
-        target.write_text(page, encoding="utf-8")
+        target.write_text(_page(found, parts), encoding="utf-8")
     except OSError as error:
         raise unwritable(place, error) from None
     return [target, *files]
@@ -206,9 +212,11 @@ def _found(folder: Path) -> _Found:
         advice = "wait for the first part, or run the study"
         raise InvalidProblem("nothing of the study is finished yet", str(folder), advice)
     frame = summary.judged(rows)
+    # Best first: the order of tables, legends and colours.
     order, cells = summary.methods(frame), summary.cells(frame)
     plan = plan_again(manifest)
     known = references(plan)
+    # Nobody competes with methods that know the truth, unless there are no others.
     rivals = frame[~frame["method"].isin(known)]
     rivals = rivals if len(rivals) else frame
     tables = {sheet.shown.name: sheet for sheet in sheets(frame, rivals, cells, order)}
@@ -216,36 +224,37 @@ def _found(folder: Path) -> _Found:
     return _Found(manifest, frame, cells, marks(order), tables, places, rivals)
 
 
-def _opening(found: _Found) -> str:
+def _page(found: _Found, parts: list[Part]) -> str:
     m, rows = found.manifest, len(found.frame)
-    part = "complete" if rows == m.rows else f"{rows} of {m.rows} rows: not finished, and what follows may change"
+    state = "complete" if rows == m.rows else f"{rows} of {m.rows} rows: not finished, and what follows may change"
     trials = found.frame[["data", "trial"]].drop_duplicates()
     facts = (
-        f"{rows} fixes of {len(trials)} trials by {len(found.looks)} methods ({part}). optloc {m.version}, begun "
+        f"{rows} fixes of {len(trials)} trials by {len(found.looks)} methods ({state}). optloc {m.version}, begun "
         f"{m.created[:10]}, seed {m.seed}, {m.machine}."
     )
-    return (html.paragraph(m.note) if m.note else "") + html.paragraph(facts, "soft")
+    opening = [m.note] if m.note else []
+    return write_page(m.title or m.name, parts, opening=opening, facts=facts, methods=found.looks.values())
 
 
-def _section(section: _Section, found: _Found, pictures: list[Picture]) -> str:
-    tables = "".join(
-        html.folded(f"Table: {found.sheets[name].shown.title.lower()}", html.table(found.sheets[name]))
-        for name in section.tables
-    )
-    return html.paragraph(section.text) + html.figures(pictures, wide=section.wide) + tables
+def _part(section: _Section, found: _Found, pictures: list[Picture]) -> Part:
+    folded = [found.sheets[name] for name in section.tables]
+    # Before the files are written: these get a legend of their own.
+    drawings = [inline(picture) for picture in pictures]
+    return Part(section.name, section.title, section.text, drawings=drawings, wide=section.wide, folded=folded)
 
 
-def _figure_files(place: Path, picture: Picture, found: _Found, section: _Section) -> list[Path]:
-    """Write a picture as PNG and SVG, with a legend of the methods in it where the page has one."""
+def _figure_files(place: Path, picture: Picture, *, legend: bool) -> list[Path]:
+    """Write a picture as PNG and SVG, with a legend of the methods in it where the page has one.
+
+    The legend is drawn into the figure: what stands in the page is made before.
+    """
     figure = picture.figure
-    if section.lines:
+    if legend:
         handles, labels = figure.axes[0].get_legend_handles_labels()
-        columns = 2 if max(map(len, labels), default=0) > 22 else 3
-        legend = figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=7)
-        rows = -(-len(labels) // columns)
+        columns = 2 if max(map(len, labels), default=0) > _WIDE else 3
+        figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=7)
         width, height = figure.get_size_inches()
-        figure.set_size_inches(width, height + 0.16 * rows)
-        legend.set_in_layout(True)
+        figure.set_size_inches(width, height + _LEGEND_LINE * -(-len(labels) // columns))
     paths = [place / "figures" / f"{picture.name}.{ending}" for ending in ("png", "svg")]
     paths[0].parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(paths[0], dpi=_DPI)
@@ -263,34 +272,22 @@ def _table_file(place: Path, sheet: Sheet, ending: str) -> Path:
     return path
 
 
-def _maps(place: Path, found: _Found) -> tuple[str, list[Path], bool]:
-    """Return the maps of a page, their files, and whether the page needs the script of maps."""
+def _maps(place: Path, found: _Found) -> tuple[Part, list[Path]]:
+    """Return the maps of a page, which move where they are on Earth, and the files of their pictures."""
     text = (
         "Bound of the position error (root of its trace) at the height of the middle trial, over the place of the "
         "target. On maps that move, blue dots are true positions, orange ones those where some method was wrong though "
         "ok."
     )
-    parts, files, moving, section = (
-        [html.paragraph(text)],
-        [],
-        False,
-        _Section("maps", "", "", lambda _: [], lines=False),
-    )
+    maps: list[Canvas | Drawing] = []
+    files = []
     for i, one in enumerate(found.places):
-        picture = Picture(f"map-{i + 1}", f"Bound: {one.title}", plot_bound_map(one.found, one.title))
-        if one.found.geodetic:
-            moving = True
-            parts.append(f"<h3>{escape(one.title)}</h3>")
-            parts.append(map_element(one.found, f"map-{i + 1}", one.title, (one.truths, one.off)))
-        else:
-            parts.append(html.figures([picture], wide=True))
-        files += _figure_files(place, picture, found, section)
-    return "".join(parts), files, moving
-
-
-def _made(found: _Found) -> str:
-    file = f"<pre>{escape(found.manifest.text)}</pre>"
-    return html.table(found.sheets["machine"]) + html.folded("Study file", file)
+        name = f"map-{i + 1}"
+        picture = Picture(name, f"Bound: {one.title}", plot_bound_map(one.found, literal(one.title)))
+        trials = (one.truths, one.off)
+        maps.append(map_element(one.found, name, one.title, trials) if one.found.geodetic else inline(picture))
+        files += _figure_files(place, picture, legend=False)
+    return Part("maps", "Where the bound is small", text, maps=maps, headings=True), files
 
 
 def _of_cells(make: Callable[..., object], found: _Found) -> list[Picture]:

@@ -13,7 +13,11 @@ from optloc.base.errors import InvalidProblem
 from optloc.cli import app
 from optloc.papers.report import Table
 from optloc.report import write_report
-from optloc.report.sheets import duration, latex, number, percent
+from optloc.report.figures import marks as looks_of
+from optloc.report.figures import panel, svg_text
+from optloc.report.map import Canvas, Curve, Label
+from optloc.report.page import Part, write_page
+from optloc.report.sheets import Sheet, duration, latex, number, percent
 from optloc.study.execute import executor, run_plan
 from optloc.study.folder import begin, read_frame
 from optloc.study.plan import plan_of
@@ -109,6 +113,23 @@ def test_the_page_needs_nothing_and_is_not_fooled_by_names(made):
     assert all(link.startswith(("#", "data:")) for link in linked), linked[:5]
     identities = re.findall(r'\bid="([^"]*)"', text)
     assert len(identities) == len(set(identities))
+
+
+def test_every_text_of_a_page_is_escaped():
+    bad = "\"'><script>alert(1)</script>{{ 7 * 7 }}</pre>"
+    marks = [Curve("dot", "M0 0h0", tell=bad), Label("name", 0.0, 0.0, bad)]
+    canvas = Canvas("map-1", bad, {"stations": marks}, bad, "0 0 1 1", "", {"text": bad})
+    sheet = Sheet(None, Table("t", bad, (bad,), ((bad,),), bad))
+    part = Part("p", bad, bad, tables=[sheet], maps=[canvas], headings=True, folded=[sheet], source=bad, note=bad)
+    page = write_page(bad, [part, part], opening=[bad], facts=bad, methods=looks_of([bad]).values())
+    assert "<script>alert" not in page
+    assert page.count("{{ 7 * 7 }}") == page.count("alert(1)") > 15
+    assert all(mark not in page for mark in ("\"'>", "alert(1)</"))
+
+
+def test_dollars_in_a_name_begin_no_formula():
+    figure, _ = panel("gain $\\nosuch$")
+    assert "gain $\\nosuch$" in svg_text(figure)
 
 
 def test_the_same_study_gives_the_same_figures(site, made, tmp_path):
