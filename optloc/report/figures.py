@@ -14,7 +14,7 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.papers.report import Picture
 from optloc.plot.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, YELLOW, figure_class
-from optloc.study.summary import counted, distribution, instances, noise_text, performance_profile, wilson
+from optloc.study.summary import accuracy_rows, distribution, instances, noise_text, performance_profile, wilson
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -221,7 +221,7 @@ def distributions(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
         for mark in looks.values():
             some = part[part["method"] == mark.name]
             if len(some):
-                values = some["deviation"].to_numpy(dtype=float)[counted(some)]
+                values = some["deviation"].to_numpy(dtype=float)[accuracy_rows(some)]
                 # Zero has no logarithm, and the axis begins at a tenth.
                 _line(axes, mark, *distribution(np.maximum(values, 1e-2), len(some)), marker=False, steps=True)
         x = np.geomspace(0.1, 10.0, 120)

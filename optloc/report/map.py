@@ -53,13 +53,13 @@ def land(window: Window) -> list[Array]:
         # A ring that crosses the date line is in one piece, on one side of it or the other.
         for turn in (-360.0, 0.0, 360.0):
             if low[0] + turn < east and high[0] + turn > west:
-                cut = _clipped(ring + np.array([turn, 0.0]), window)
+                cut = _clip(ring + np.array([turn, 0.0]), window)
                 if len(cut) > 2:
                     found.append(cut)
     return found
 
 
-def _clipped(ring: Array, window: Window) -> Array:
+def _clip(ring: Array, window: Window) -> Array:
     """Return a ring cut at four straight lines.
 
     I. E. Sutherland and G. W. Hodgman, "Reentrant polygon clipping", Communications of the ACM 17 (1974).
@@ -341,7 +341,7 @@ def lines_of_position(problem: Problem, fix: Fix, limits: tuple[float, float, fl
     flat, x = problem.flat(), fix.flat().x[0]
     if flat.batch_shape != (1,) or flat.count > _LINES or not np.isfinite(x).all():
         return []
-    slot, shared = flat.layout.find("position") if _positioned(flat) else (None, False)
+    slot, shared = flat.layout.find("position") if _has_position(flat) else (None, False)
     if slot is None or not shared:
         return []
     lon, lat = _beyond(*limits[:2]), np.clip(_beyond(*limits[2:]), -_POLE, _POLE)
@@ -373,5 +373,5 @@ def _beyond(low: float, high: float) -> Array:
     return np.linspace(low - rim, high + rim, _GRID)
 
 
-def _positioned(problem: Problem) -> bool:
+def _has_position(problem: Problem) -> bool:
     return any(slot.name == "position" for slot in problem.layout.shared)

@@ -101,7 +101,7 @@ def _case(words: tuple[str, ...] = ("case", "noise", "method")) -> list[Column]:
     return [columns[word] for word in words]
 
 
-def ranked(frame: pd.DataFrame, order: list[str]) -> Sheet:
+def best_first(frame: pd.DataFrame, order: list[str]) -> Sheet:
     """Return the methods, best first."""
     table = ranking(frame, order, SHIFT)
     sums = frame.groupby("method", observed=True)[["answered", "right", "wrong", "false"]].sum()
@@ -240,7 +240,7 @@ def made_with(frame: pd.DataFrame) -> Sheet:
 
 def sheets(frame: pd.DataFrame, rivals: pd.DataFrame, cells: pd.DataFrame, order: list[str]) -> Iterator[Sheet]:
     """Yield all tables of judged rows, of those that are ranked, and of their cells, in reading order."""
-    yield ranked(rivals, [name for name in order if name in set(rivals["method"])])
+    yield best_first(rivals, [name for name in order if name in set(rivals["method"])])
     yield success(cells)
     yield accuracy(cells)
     yield certificates(frame, order)
@@ -268,7 +268,7 @@ _SPECIAL = {
 _RAISED = dict(zip("⁻⁰¹²³⁴⁵⁶⁷⁸⁹", "-0123456789", strict=True))
 
 
-def escaped(text: str) -> str:
+def latex_text(text: str) -> str:
     """Return text as LaTeX sets it."""
     out, power = [], ""
     # Raised signs that follow one another are one power.
@@ -294,10 +294,10 @@ def latex(table: Table, words: int = 1) -> str:
         How many columns at the left are words; the others stand to the right.
     """
     columns = "l" * words + "r" * (len(table.header) - words)
-    head = " & ".join(map(escaped, table.header)) + r" \\"
-    rows = [" & ".join(map(escaped, row)) + r" \\" for row in table.rows]
+    head = " & ".join(map(latex_text, table.header)) + r" \\"
+    rows = [" & ".join(map(latex_text, row)) + r" \\" for row in table.rows]
     # The note goes with the title: a paper has no other place for it.
-    caption = escaped(f"{table.title}. {table.note}".strip())
+    caption = latex_text(f"{table.title}. {table.note}".strip())
     lines = [
         "% needs \\usepackage{booktabs, longtable}",
         rf"\begin{{longtable}}{{{columns}}}",

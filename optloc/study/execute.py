@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.study.folder import Progress, begin, finished, locked, progress, store
+from optloc.study.folder import Progress, begin, finished_chunks, locked, progress, store
 from optloc.study.plan import Chunk, Plan, workers
 from optloc.study.trial import Part, compute, dead_part, join_parts
 
@@ -73,7 +73,7 @@ def run_plan(plan: Plan, folder: Path, by: Executor, tell: Tell | None = None) -
     manifest = begin(plan, folder)
     # From here to the end nobody else writes: what is counted as finished stays so.
     with locked(folder):
-        done = finished(folder, manifest)
+        done = finished_chunks(folder, manifest)
         if tell is not None and done:
             had = progress(folder)
             tell(had.rows, had.counts)

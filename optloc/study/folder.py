@@ -186,7 +186,7 @@ def part_files(folder: Path) -> list[Path]:
     return [path for path in sorted((folder / "parts").glob("*.parquet")) if path.stem in known]
 
 
-def finished(folder: Path, manifest: Manifest) -> set[str]:
+def finished_chunks(folder: Path, manifest: Manifest) -> set[str]:
     """Return the keys of the chunks whose parts are whole; one that was damaged is removed."""
     from pyarrow import ArrowException, parquet
 

@@ -105,8 +105,8 @@ def methods_of(table: MethodTable, number: int) -> Iterator[Method]:
     where = f"[[method]] {number}" if table.name is None else f"method {table.name!r}"
     if (table.method is None) == (table.baseline is None):
         raise InvalidProblem("a method is one thing", where, "give either method or baseline")
-    solvers: list[str | None] = [*_listed(table.solver)] or [None]
-    names = _listed(table.method) or _listed(table.baseline)
+    solvers: list[str | None] = [*_list(table.solver)] or [None]
+    names = _list(table.method) or _list(table.baseline)
     for name, solver in product(names, solvers):
         if table.method is not None:
             from optloc.solvers.methods import stages_of
@@ -122,7 +122,7 @@ def methods_of(table: MethodTable, number: int) -> Iterator[Method]:
         elif table.settings:
             raise InvalidProblem("settings belong to a solver", join(where, "settings"), "name it in 'solver'")
         yield Method(
-            _called(table, name, solver, len(names) * len(solvers)),
+            _name(table, name, solver, len(names) * len(solvers)),
             None if table.method is None else name,
             None if table.baseline is None else name,
             solver or "",
@@ -134,11 +134,11 @@ def methods_of(table: MethodTable, number: int) -> Iterator[Method]:
         )
 
 
-def _listed(value: str | list[str] | None) -> list[str]:
+def _list(value: str | list[str] | None) -> list[str]:
     return [] if value is None else [value] if isinstance(value, str) else value
 
 
-def _called(table: MethodTable, name: str, solver: str | None, count: int) -> str:
+def _name(table: MethodTable, name: str, solver: str | None, count: int) -> str:
     # The name says what distinguishes it: settings do not, so methods that differ by them only need names of their own.
     guess = table.baseline is not None and BASELINES[name].guess
     words = [name, *([f"from the {table.start}"] if guess else []), *([f"({solver})"] if solver else [])]

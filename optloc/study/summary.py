@@ -139,7 +139,7 @@ def cells(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 def _cell(part: pd.DataFrame) -> dict[str, Any]:
-    chosen = counted(part)
+    chosen = accuracy_rows(part)
     error, bound, off = (part[n].to_numpy(dtype=float)[chosen] for n in ("error", "crlb", "deviation"))
     ratio, half = over_bound(error, bound)
     seconds = part["seconds"].to_numpy(dtype=float)
@@ -167,7 +167,7 @@ def _cell(part: pd.DataFrame) -> dict[str, Any]:
     }
 
 
-def counted(part: pd.DataFrame) -> Array:
+def accuracy_rows(part: pd.DataFrame) -> Array:
     """Return which rows of a method say how accurate it is: its answers, or all its positions if it claims none."""
     answered = part["answered"].to_numpy(dtype=bool)
     return answered if answered.any() else part["located"].to_numpy(dtype=bool)

@@ -205,7 +205,7 @@ def compute(chunk: Chunk) -> Part:
         parts = [
             part
             for first in range(0, chunk.count, size)
-            for part in _guarded(chunk.cell, known, first, min(size, chunk.count - first))
+            for part in _solve_in_halves(chunk.cell, known, first, min(size, chunk.count - first))
         ]
     # A trial that failed has no column that only fixes have: what every stretch has is kept.
     shared = [name for name in parts[0][1] if all(name in values for _, values in parts)]
@@ -230,7 +230,7 @@ def _warm_up(cell: Cell, drawn: Drawn) -> float:
     return perf_counter() - began
 
 
-def _guarded(cell: Cell, known: Known, first: int, count: int) -> list[tuple[int, Values]]:
+def _solve_in_halves(cell: Cell, known: Known, first: int, count: int) -> list[tuple[int, Values]]:
     """Return the values of some trials; where the call fails, halves are tried until the one trial is found."""
     try:
         return [(count, _solve(cell, known.part(first, count)))]
@@ -240,7 +240,7 @@ def _guarded(cell: Cell, known: Known, first: int, count: int) -> list[tuple[int
         if count == 1:
             return [(1, _failure(f"{type(error).__name__}: {error}".splitlines()[0]))]
     half = count // 2
-    return [*_guarded(cell, known, first, half), *_guarded(cell, known, first + half, count - half)]
+    return [*_solve_in_halves(cell, known, first, half), *_solve_in_halves(cell, known, first + half, count - half)]
 
 
 def _solve(cell: Cell, known: Known) -> Values:

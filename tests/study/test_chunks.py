@@ -70,6 +70,20 @@ def test_a_failing_trial_costs_its_row(monkeypatch):
     assert np.allclose(others, whole.drop(index=4)["error"])
 
 
+def test_a_chunk_in_which_all_trials_fail_keeps_what_is_known_of_them(monkeypatch):
+    made = next(plan().chunks)
+    whole = frame(made)
+
+    def broken(method, drawn):
+        raise FloatingPointError
+
+    monkeypatch.setattr(trial, "run", broken)
+    found = frame(made)
+    assert set(found["status"]) == {DIED}
+    for name in ("truth_x", "crlb", "cost_truth", "noise"):
+        assert found[name].equals(whole[name]), name
+
+
 def test_chunks_cover_every_trial_once():
     text = plan().text.replace("trials = 60", "trials = 1237")
     made = plan(text)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from study.texts import plan
+from study.texts import QUICK, plan
 
 from optloc.base.status import Status
 from optloc.papers.registration import PRINTED, Setting
@@ -43,3 +43,10 @@ def test_originals_claim_what_they_arrive_at(name):
     assert (fix.code == Status.OK).all()
     best = BASELINES["truth"].run(drawn, drawn.truth)
     assert (fix.cost >= best.cost - 1e-9).all()
+
+
+def test_methods_that_know_the_truth_are_references_whatever_their_names():
+    text = QUICK + '[[method]]\nname = "judge"\nbaseline = "truth"\n[[method]]\nname = "a"\nbaseline = "taylor"\n'
+    text += '[[method]]\nname = "b"\nbaseline = "taylor"\nstart = "truth"\n'
+    methods = {cell.method.name: cell.method for cell in plan(text).cells}
+    assert {name for name, method in methods.items() if method.reference} == {"judge", "b"}
