@@ -10,8 +10,11 @@ import numpy as np
 from optloc.base import arrays
 from optloc.base.types import Array
 
+PIVOT = 1e-15
+"""Share of its diagonal that a pivot must exceed: five units in the last place, below which no digit of it is known."""
 
-def factor(matrix: Array, least: float = 1e-15) -> tuple[Array, Array]:
+
+def factor(matrix: Array, least: float = PIVOT) -> tuple[Array, Array]:
     """Return Cholesky factors of a batch of symmetric matrices.
 
     Parameters
@@ -90,7 +93,7 @@ def _backward(lower: Array, right: Array) -> Array:
     return out
 
 
-def solve(matrix: Array, right: Array, least: float = 1e-15) -> tuple[Array, Array]:
+def solve(matrix: Array, right: Array, least: float = PIVOT) -> tuple[Array, Array]:
     """Return the solution of ``matrix @ x = right`` for symmetric positive definite matrices.
 
     The matrix is first scaled to a unit diagonal (Jacobi).
@@ -122,7 +125,7 @@ def solve(matrix: Array, right: Array, least: float = 1e-15) -> tuple[Array, Arr
     return xp.where(ok[..., None, None], x, 0.0), ok
 
 
-def inverse(matrix: Array, least: float = 1e-15) -> tuple[Array, Array]:
+def inverse(matrix: Array, least: float = PIVOT) -> tuple[Array, Array]:
     """Return inverses (..., n, n) of symmetric positive definite matrices, NaN where not ok, and ok (...)."""
     xp = arrays.library(matrix)
     out, ok = solve(matrix, xp.broadcast_to(arrays.eye(matrix.shape[-1], matrix), matrix.shape), least)

@@ -14,8 +14,8 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled
+from optloc.compute.systems import LANES, factor_plain, solve_plain
 
-LANES = 64
 _STEPS = 12
 _WEAK = 1e-7  # a pivot below this share of the largest entry: the eigenvalues are the better tool
 _SETTLED = 1e-7  # relative change of y below which the last, polishing step squares the error away
@@ -69,20 +69,20 @@ def minimise(rows: Array, on_cone: bool, y: Array, settled: Array, work: Array) 
         multiplier[lane], last[lane], todo[lane] = 0.0, 0.0, 1.0
     for _ in range(_STEPS):
         _shifted(A, b, multiplier, on_cone, slope, y)
-        factor(A, slope, lower, inverse)
+        factor_plain(A, slope, lower, inverse)
         for lane in range(LANES):
             definite[lane] = 1.0
         for i in range(n):
             for lane in range(LANES):
                 positive = 0.0 < inverse[i, lane] and inverse[i, lane] * least[lane] < 1.0
                 definite[lane] = definite[lane] if positive else 0.0
-        solve(lower, inverse, y)
+        solve_plain(lower, inverse, y)
         _gradient(y, on_cone, across, p)
-        solve(lower, inverse, p)
+        solve_plain(lower, inverse, p)
         if not _advance(y, across, p, on_cone, spare, slope):
             break
     _residual_slope(rows, y, across, multiplier, slope, value)
-    solve(lower, inverse, slope)
+    solve_plain(lower, inverse, slope)
     _step(y, across, p, on_cone, slope, bend, value)
     for lane in range(LANES):
         settled[lane] = 1.0 if todo[lane] == 0.0 else 0.0
@@ -123,64 +123,6 @@ def _shifted(A: Array, b: Array, multiplier: Array, on_cone: bool, diagonal: Arr
         for lane in range(LANES):
             diagonal[i, lane] = A[i, i, lane] + turn * multiplier[lane]
             right[i, lane] = b[i, lane] + more * multiplier[lane]
-
-
-@compiled
-def factor(A: Array, diagonal: Array, lower: Array, inverse: Array) -> None:
-    """Find the unit lower factors of symmetric matrices, and one over each pivot.
-
-    Parameters
-    ----------
-    A : array (n, n, W)
-        Read below the diagonal.
-    diagonal : array (n, W)
-        Read in its place.
-    lower : array (n, n, W)
-        Written: the factors below the diagonal; above it is scratch.
-    inverse : array (n, W)
-        Written: one over each pivot.
-    """
-    n = len(diagonal)
-    for i in range(n):
-        pivot = inverse[i]
-        for lane in range(LANES):
-            pivot[lane] = diagonal[i, lane]
-        for j in range(i):
-            # above the diagonal stay the entries before they are divided by their pivot
-            for lane in range(LANES):
-                lower[j, i, lane] = A[i, j, lane]
-            for k in range(j):
-                for lane in range(LANES):
-                    lower[j, i, lane] -= lower[k, i, lane] * lower[j, k, lane]
-            for lane in range(LANES):
-                lower[i, j, lane] = lower[j, i, lane] * inverse[j, lane]
-                pivot[lane] -= lower[j, i, lane] * lower[i, j, lane]
-        for lane in range(LANES):
-            pivot[lane] = 1.0 / pivot[lane]
-
-
-@compiled
-def solve(lower: Array, inverse: Array, right: Array) -> None:
-    """Solve with a factorisation of `factor`, in place.
-
-    Parameters
-    ----------
-    lower, inverse : array (n, n, W), (n, W)
-        Unit lower factors and inverse pivots.
-    right : array (n, W)
-        Overwritten with the solutions.
-    """
-    n = len(inverse)
-    for i in range(n):
-        for j in range(i):
-            for lane in range(LANES):
-                right[i, lane] -= lower[i, j, lane] * right[j, lane]
-    for i in range(n - 1, -1, -1):
-        for lane in range(LANES):
-            right[i, lane] *= inverse[i, lane]
-        for j in range(i + 1, n):
-            for lane in range(LANES):
-                right[i, lane] -= lower[j, i, lane] * right[j, lane]
 
 
 @compiled

@@ -1,7 +1,9 @@
-"""Measurements and derivatives of many problems at once: one interpreter runs the tape of a kind over lanes.
+"""Normal equations of many problems at once, in lanes: memory, measurements with derivatives, sums over groups of rows.
 
-Numbers are reached by whole indices, never by views of arrays: a view counts references, which takes longer than what
-is done with it.
+A lane is a problem; one interpreter runs the tape of a kind over all of them. A cell of the memory holds one number of
+every lane: one array instead of many, because each array that is handed to a kernel costs as much time as dozens of
+multiplications. Numbers are reached by whole indices, never by views of arrays: a view counts references, which takes
+longer than what is done with it.
 """
 
 from __future__ import annotations
@@ -17,10 +19,7 @@ from optloc.compute.pack import Numbers, Packed
 from optloc.compute.tables import Tables
 from optloc.compute.trace import ADD, ATAN2, COS, DIV, HYPOT, LOG, MUL, NEG, SIN, SQRT, SUB
 
-# Working memory of a block of lanes: one array of cells, and where everything stands in it.
-#
-# A lane is a problem; a cell holds one number of every lane. One array instead of many, because each array that is
-# handed to a kernel costs as much time as dozens of multiplications.
+# Working memory of a block of lanes, and where everything stands in it.
 
 LENGTH = 128
 """Length of a register: rows of one kind are put behind each other, lanes of one and then of the next."""
@@ -321,185 +320,6 @@ def _masked(m: Array, value: int, present: int, lanes: int) -> None:
     """Make the residuals of absent rows zero."""
     for b in range(lanes):
         m[value, b] = m[value, b] if m[present, b] != 0.0 else 0.0
-
-
-# Small symmetric positive definite systems in lanes: one singular lane never disturbs the others.
-#
-# Matrices and vectors stand in cells of a memory (cells, B), row by row.
-
-_LEAST = 1e-15  # share of its diagonal that a pivot must exceed, as in `optloc.base.linalg`
-OPEN = 1e-12
-"""The same for unknowns of one epoch of a run, as in `optloc.normal`."""
-
-
-@compiled
-def factor(m: Array, matrix: int, n: int, scale: int, ok: int, least: float, lanes: int) -> None:
-    """Replace the lower triangle (n, n) by the factor of the matrix scaled to a unit diagonal.
-
-    Its diagonal holds inverse pivots.
-
-    Parameters
-    ----------
-    m : array (cells, B)
-        Memory.
-    matrix : int
-        Cell of the matrix.
-    n : int
-        Its size.
-    scale : int
-        Cell that receives the scales (n,).
-    ok : int
-        Cell that becomes 0.0 where a matrix is not numerically positive definite.
-    least : float
-        Share of its diagonal that a pivot must exceed.
-    lanes : int
-        How many lanes count.
-    """
-    for i in range(n):
-        for b in range(lanes):
-            positive = m[matrix + i * n + i, b] > 0.0
-            m[scale + i, b] = 1.0 / np.sqrt(m[matrix + i * n + i, b] if positive else 1.0)
-            m[ok, b] = m[ok, b] if positive else 0.0
-        for j in range(i + 1):
-            for b in range(lanes):
-                m[matrix + i * n + j, b] *= m[scale + i, b] * m[scale + j, b]
-    for j in range(n):
-        pivot = matrix + j * n + j
-        for k in range(j):
-            for b in range(lanes):
-                m[pivot, b] -= m[matrix + j * n + k, b] * m[matrix + j * n + k, b]
-        for b in range(lanes):
-            positive = m[pivot, b] > least
-            m[ok, b] = m[ok, b] if positive else 0.0
-            m[pivot, b] = 1.0 / np.sqrt(m[pivot, b] if positive else 1.0)
-        for i in range(j + 1, n):
-            entry = matrix + i * n + j
-            for k in range(j):
-                for b in range(lanes):
-                    m[entry, b] -= m[matrix + i * n + k, b] * m[matrix + j * n + k, b]
-            for b in range(lanes):
-                m[entry, b] *= m[pivot, b]
-
-
-@compiled
-def forward(m: Array, lower: int, n: int, scale: int, right: int, lanes: int) -> None:
-    """Replace a vector by the factor's inverse times it, scaled."""
-    for i in range(n):
-        for b in range(lanes):
-            m[right + i, b] *= m[scale + i, b]
-        for k in range(i):
-            for b in range(lanes):
-                m[right + i, b] -= m[lower + i * n + k, b] * m[right + k, b]
-        for b in range(lanes):
-            m[right + i, b] *= m[lower + i * n + i, b]
-
-
-@compiled
-def backward(m: Array, lower: int, n: int, scale: int, right: int, lanes: int) -> None:
-    """Replace a vector that `forward` returned by the solution."""
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            for b in range(lanes):
-                m[right + i, b] -= m[lower + k * n + i, b] * m[right + k, b]
-        for b in range(lanes):
-            m[right + i, b] *= m[lower + i * n + i, b]
-    for i in range(n):
-        for b in range(lanes):
-            m[right + i, b] *= m[scale + i, b]
-
-
-@compiled
-def step(m: Array, room: Room, n: int, local: int, damping: int, ok: int, lanes: int) -> None:
-    """Write the damped step from `room.now` into `room.step`, zero where cell `ok` becomes 0.0.
-
-    Parameters
-    ----------
-    m : array (cells, B)
-        Memory.
-    room : Room
-        Where things stand.
-    n, local : int
-        Numbers of shared and of local unknowns.
-    damping : int
-        Cell of Marquardt's factor: the diagonal of the information is multiplied by one more than it.
-    ok : int
-        Cell that says where the systems can be solved.
-    lanes : int
-        How many lanes count.
-    """
-    size = n + local
-    line = size + 1
-    for b in range(lanes):
-        m[ok, b] = 1.0
-    for i in range(n):
-        for j in range(i + 1):
-            for b in range(lanes):
-                m[room.shared + i * n + j, b] = m[room.now + i * line + j, b]
-        for b in range(lanes):
-            m[room.shared + i * n + i, b] *= 1.0 + m[damping, b]
-            m[room.step + i, b] = m[room.now + size * line + i, b]
-    if local > 0:
-        factor_local(m, room, room.now, n, local, damping, ok, _LEAST, lanes)
-        eliminate(m, room, n, local, lanes)
-    factor(m, room.shared, n, room.shared_scale, ok, _LEAST, lanes)
-    forward(m, room.shared, n, room.shared_scale, room.step, lanes)
-    backward(m, room.shared, n, room.shared_scale, room.step, lanes)
-    if local > 0:
-        complete(m, room, n, local, lanes)
-    for i in range(size):
-        for b in range(lanes):
-            m[room.step + i, b] = m[room.step + i, b] if m[ok, b] != 0.0 else 0.0
-
-
-@compiled
-def factor_local(
-    m: Array, room: Room, source: int, n: int, local: int, damping: int, ok: int, least: float, lanes: int
-) -> None:
-    """Factor the damped system of the local unknowns of equations at cell `source`; prepare what couples it."""
-    line, half = n + local + 1, room.half
-    for i in range(local):
-        row, own = source + (n + i) * line, room.local + i * local
-        for j in range(i + 1):
-            for b in range(lanes):
-                m[own + j, b] = m[row + n + j, b]
-        for b in range(lanes):
-            grown = m[own + i, b] * (1.0 + m[damping, b])
-            m[own + i, b] = grown if grown != 0.0 else 1.0  # what no row touches stays where it is
-        for j in range(n):
-            for b in range(lanes):
-                m[half + j * local + i, b] = m[row + j, b]
-        for b in range(lanes):
-            m[half + n * local + i, b] = m[source + (n + local) * line + n + i, b]
-    factor(m, room.local, local, room.local_scale, ok, least, lanes)
-    for j in range(n + 1):
-        forward(m, room.local, local, room.local_scale, half + j * local, lanes)
-
-
-@compiled
-def eliminate(m: Array, room: Room, n: int, local: int, lanes: int) -> None:
-    """Take from the shared system (in `room.shared` and `room.step`) what the local unknowns cost it."""
-    half = room.half
-    for a in range(local):
-        for i in range(n):
-            u, v = half + i * local + a, half + n * local + a
-            for b in range(lanes):
-                m[room.step + i, b] -= m[u, b] * m[v, b]
-            for j in range(i + 1):
-                for b in range(lanes):
-                    m[room.shared + i * n + j, b] -= m[u, b] * m[half + j * local + a, b]
-
-
-@compiled
-def complete(m: Array, room: Room, n: int, local: int, lanes: int) -> None:
-    """Write the step of the local unknowns behind that of the shared ones; their system is factored."""
-    own = room.step + n
-    for a in range(local):
-        for b in range(lanes):
-            m[own + a, b] = m[room.half + n * local + a, b]
-        for i in range(n):
-            for b in range(lanes):
-                m[own + a, b] -= m[room.half + i * local + a, b] * m[room.step + i, b]
-    backward(m, room.local, local, room.local_scale, own, lanes)
 
 
 # From derivatives and residuals to normal equations: whitened, multiplied with themselves, summed over groups.

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.gtrs import LANES, factor, minimise, scratch, solve
+from optloc.compute.gtrs import minimise, scratch
 from optloc.compute.jit import compiled
 from optloc.compute.range_refine import (
     ALIVE,
@@ -32,6 +32,7 @@ from optloc.compute.range_refine import (
     ranges,
     refine,
 )
+from optloc.compute.systems import LANES, factor_plain, solve_plain
 
 # The start of a fix from ranges: measurements, stations and squared-range rows of a block of problems.
 
@@ -450,12 +451,12 @@ def _invert(vector: Array, matrix: Array, scalar: Array) -> None:
             away[lane] += apart * apart
     for lane in range(LANES):
         fine[lane] = 1.0 if away[lane] <= _FAR * _FAR else 0.0
-    factor(matrix[H], diagonal, matrix[LOWER], inverse)
+    factor_plain(matrix[H], diagonal, matrix[LOWER], inverse)
     for j in range(d):
         for i in range(d):
             for lane in range(LANES):
                 move[i, lane] = 1.0 if i == j else 0.0
-        solve(matrix[LOWER], inverse, move)
+        solve_plain(matrix[LOWER], inverse, move)
         for lane in range(LANES):
             fine[lane] = fine[lane] if 0.0 < inverse[j, lane] * diagonal[j, lane] < 1.0 / _WEAK else 0.0
         for i in range(j, d):

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from optloc.base.linalg import PIVOT
 from optloc.base.types import Array
 from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge_lane
-from optloc.compute.gtrs import LANES, factor, solve
 from optloc.compute.jit import compiled
+from optloc.compute.systems import LANES, factor_plain, solve_plain
 
-_PIVOT = 1e-15  # share of its diagonal that a pivot must exceed
 # Rows of the arrays `vector` and `matrix` at the position and at the one tried, and scratch.
 X, TRIAL, MOVE, G, G_TRIAL, DIAGONAL, INVERSE, ROW, ORIGIN, CENTRE = range(10)
 H, H_TRIAL, LOWER = range(3)
@@ -175,15 +175,15 @@ def _propose(vector: Array, matrix: Array, scalar: Array) -> None:
         for lane in range(LANES):
             diagonal[i, lane] = information[i, i, lane] * (1.0 + damping[lane])
             move[i, lane] = right[i, lane]
-    factor(information, diagonal, matrix[LOWER], inverse)
-    solve(matrix[LOWER], inverse, move)
+    factor_plain(information, diagonal, matrix[LOWER], inverse)
+    solve_plain(matrix[LOWER], inverse, move)
     x, trial = vector[X], vector[TRIAL]
     for i in range(d):
         for lane in range(LANES):
             gain[lane] += move[i, lane] * right[i, lane]
             trial[i, lane] = x[i, lane] + move[i, lane]
             share = inverse[i, lane] * diagonal[i, lane]
-            solvable[lane] = solvable[lane] if 0.0 < share < 1.0 / _PIVOT else 0.0
+            solvable[lane] = solvable[lane] if 0.0 < share < 1.0 / PIVOT else 0.0
 
 
 @compiled

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from optloc.base.linalg import PIVOT
 from optloc.base.status import Status
 from optloc.base.threads import mapped
 from optloc.base.types import Array
@@ -16,29 +17,22 @@ from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge_lane
 from optloc.compute.equations import chunks, normal_at
 from optloc.compute.jit import compiled
 from optloc.compute.lanes import (
-    OPEN,
     Room,
     add_group,
     add_prior,
-    backward,
     blocks,
     clear,
-    complete,
-    eliminate,
-    factor,
-    factor_local,
-    forward,
     furnished,
     gather,
     load,
     measure,
     memory,
-    step,
     whiten_group,
 )
 from optloc.compute.pack import Numbers, Packed
+from optloc.compute.systems import backward, complete, eliminate, factor, factor_local, forward, step
 from optloc.compute.tables import Tables
-from optloc.linear.normal import Normal
+from optloc.linear.normal import OPEN, Normal
 
 _OK, LIMIT, _STALLED, NUMERICAL = (
     int(status) for status in (Status.OK, Status.MAX_ITERATIONS, Status.STALLED, Status.NUMERICAL)
@@ -259,7 +253,6 @@ def _advance(m: Array, room: Room, n: int, local: int, tag: Array, damped: bool,
 
 LEFT_OPEN = -1
 """Status of a start on whose way an epoch left its own unknowns open: what then holds is left to numpy."""
-_LEAST = 1e-15
 
 
 @compiled
@@ -354,7 +347,7 @@ def _advance_run(t: Tables, c: Numbers, m: Array, r: Array, room: Room, tag: Arr
     for b in range(used):
         m[damping, b] = m[damping, b] if damped else 0.0
     _pass(t, c, m, r, room, tag, True, used)
-    factor(m, room.shared, n, room.shared_scale, room.state + SOLVABLE, _LEAST, used)
+    factor(m, room.shared, n, room.shared_scale, room.state + SOLVABLE, PIVOT, used)
     forward(m, room.shared, n, room.shared_scale, room.step, used)
     backward(m, room.shared, n, room.shared_scale, room.step, used)
     for b in range(used):

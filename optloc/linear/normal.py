@@ -73,8 +73,12 @@ def linearise(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = N
     )
 
 
-# Share of its information below which an epoch of a run leaves a combination of its own unknowns open.
-_OPEN = 1e-12
+OPEN = 1e-12
+"""Share of its information below which an epoch of a run leaves a combination of its own unknowns open.
+
+Far above rounding: sums over epochs subtract what such a combination takes from the shared unknowns, so that its digits
+must not be noise.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,7 +206,7 @@ def _solved(local: Array, right: Array) -> tuple[Array, Array]:
     if local.shape[-3] == 1:
         solved, good = linalg.solve(_measured(local), right)
         return solved, xp.all(good, axis=-1)
-    solved, good = linalg.solve(local, right, _OPEN)
+    solved, good = linalg.solve(local, right, OPEN)
     if xp is np and not good.all():
         root, _ = linalg.root(local[~good])
         solved[~good] = root @ (root.mT @ np.broadcast_to(right, solved.shape)[~good])
@@ -231,7 +235,7 @@ def local_covariance(equations: Normal, shared: Array, size: int) -> Array:
     size : int
         How many of the local unknowns are wanted.
     """
-    inverse, good = linalg.inverse(equations.local, _OPEN)
+    inverse, good = linalg.inverse(equations.local, OPEN)
     gain = inverse @ np.swapaxes(equations.cross, -1, -2)
     full = inverse + gain @ shared[..., None, :, :] @ np.swapaxes(gain, -1, -2)
     return np.where(good[..., None, None], full, np.nan)[..., :size, :size]

@@ -1,0 +1,252 @@
+"""Small symmetric positive definite systems side by side in lanes: one that is singular never disturbs the others.
+
+Systems of unknowns of mixed units (metres, radians, seconds) are scaled to a unit diagonal and flagged where a pivot
+vanishes, as `optloc.base.linalg` does; their matrices and vectors stand in cells of a memory (cells, B), row by row.
+Systems of lengths alone, as of positions from ranges, are factored as they are: that takes no roots, and the number of
+lanes is known when they are compiled.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from optloc.base.linalg import PIVOT
+from optloc.base.types import Array
+from optloc.compute.jit import compiled
+from optloc.compute.lanes import Room
+
+# Scaled systems in the memory of a block of lanes.
+
+
+@compiled
+def factor(m: Array, matrix: int, n: int, scale: int, ok: int, least: float, lanes: int) -> None:
+    """Replace the lower triangle (n, n) by the factor of the matrix scaled to a unit diagonal.
+
+    Its diagonal holds inverse pivots.
+
+    Parameters
+    ----------
+    m : array (cells, B)
+        Memory.
+    matrix : int
+        Cell of the matrix.
+    n : int
+        Its size.
+    scale : int
+        Cell that receives the scales (n,).
+    ok : int
+        Cell that becomes 0.0 where a matrix is not numerically positive definite.
+    least : float
+        Share of its diagonal that a pivot must exceed.
+    lanes : int
+        How many lanes count.
+    """
+    for i in range(n):
+        for b in range(lanes):
+            positive = m[matrix + i * n + i, b] > 0.0
+            m[scale + i, b] = 1.0 / np.sqrt(m[matrix + i * n + i, b] if positive else 1.0)
+            m[ok, b] = m[ok, b] if positive else 0.0
+        for j in range(i + 1):
+            for b in range(lanes):
+                m[matrix + i * n + j, b] *= m[scale + i, b] * m[scale + j, b]
+    for j in range(n):
+        pivot = matrix + j * n + j
+        for k in range(j):
+            for b in range(lanes):
+                m[pivot, b] -= m[matrix + j * n + k, b] * m[matrix + j * n + k, b]
+        for b in range(lanes):
+            positive = m[pivot, b] > least
+            m[ok, b] = m[ok, b] if positive else 0.0
+            m[pivot, b] = 1.0 / np.sqrt(m[pivot, b] if positive else 1.0)
+        for i in range(j + 1, n):
+            entry = matrix + i * n + j
+            for k in range(j):
+                for b in range(lanes):
+                    m[entry, b] -= m[matrix + i * n + k, b] * m[matrix + j * n + k, b]
+            for b in range(lanes):
+                m[entry, b] *= m[pivot, b]
+
+
+@compiled
+def forward(m: Array, lower: int, n: int, scale: int, right: int, lanes: int) -> None:
+    """Replace a vector by the factor's inverse times it, scaled."""
+    for i in range(n):
+        for b in range(lanes):
+            m[right + i, b] *= m[scale + i, b]
+        for k in range(i):
+            for b in range(lanes):
+                m[right + i, b] -= m[lower + i * n + k, b] * m[right + k, b]
+        for b in range(lanes):
+            m[right + i, b] *= m[lower + i * n + i, b]
+
+
+@compiled
+def backward(m: Array, lower: int, n: int, scale: int, right: int, lanes: int) -> None:
+    """Replace a vector that `forward` returned by the solution."""
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            for b in range(lanes):
+                m[right + i, b] -= m[lower + k * n + i, b] * m[right + k, b]
+        for b in range(lanes):
+            m[right + i, b] *= m[lower + i * n + i, b]
+    for i in range(n):
+        for b in range(lanes):
+            m[right + i, b] *= m[scale + i, b]
+
+
+@compiled
+def step(m: Array, room: Room, n: int, local: int, damping: int, ok: int, lanes: int) -> None:
+    """Write the damped step from `room.now` into `room.step`, zero where cell `ok` becomes 0.0.
+
+    Parameters
+    ----------
+    m : array (cells, B)
+        Memory.
+    room : Room
+        Where things stand.
+    n, local : int
+        Numbers of shared and of local unknowns.
+    damping : int
+        Cell of Marquardt's factor: the diagonal of the information is multiplied by one more than it.
+    ok : int
+        Cell that says where the systems can be solved.
+    lanes : int
+        How many lanes count.
+    """
+    size = n + local
+    line = size + 1
+    for b in range(lanes):
+        m[ok, b] = 1.0
+    for i in range(n):
+        for j in range(i + 1):
+            for b in range(lanes):
+                m[room.shared + i * n + j, b] = m[room.now + i * line + j, b]
+        for b in range(lanes):
+            m[room.shared + i * n + i, b] *= 1.0 + m[damping, b]
+            m[room.step + i, b] = m[room.now + size * line + i, b]
+    if local > 0:
+        factor_local(m, room, room.now, n, local, damping, ok, PIVOT, lanes)
+        eliminate(m, room, n, local, lanes)
+    factor(m, room.shared, n, room.shared_scale, ok, PIVOT, lanes)
+    forward(m, room.shared, n, room.shared_scale, room.step, lanes)
+    backward(m, room.shared, n, room.shared_scale, room.step, lanes)
+    if local > 0:
+        complete(m, room, n, local, lanes)
+    for i in range(size):
+        for b in range(lanes):
+            m[room.step + i, b] = m[room.step + i, b] if m[ok, b] != 0.0 else 0.0
+
+
+@compiled
+def factor_local(
+    m: Array, room: Room, source: int, n: int, local: int, damping: int, ok: int, least: float, lanes: int
+) -> None:
+    """Factor the damped system of the local unknowns of equations at cell `source`; prepare what couples it."""
+    line, half = n + local + 1, room.half
+    for i in range(local):
+        row, own = source + (n + i) * line, room.local + i * local
+        for j in range(i + 1):
+            for b in range(lanes):
+                m[own + j, b] = m[row + n + j, b]
+        for b in range(lanes):
+            grown = m[own + i, b] * (1.0 + m[damping, b])
+            m[own + i, b] = grown if grown != 0.0 else 1.0  # what no row touches stays where it is
+        for j in range(n):
+            for b in range(lanes):
+                m[half + j * local + i, b] = m[row + j, b]
+        for b in range(lanes):
+            m[half + n * local + i, b] = m[source + (n + local) * line + n + i, b]
+    factor(m, room.local, local, room.local_scale, ok, least, lanes)
+    for j in range(n + 1):
+        forward(m, room.local, local, room.local_scale, half + j * local, lanes)
+
+
+@compiled
+def eliminate(m: Array, room: Room, n: int, local: int, lanes: int) -> None:
+    """Take from the shared system (in `room.shared` and `room.step`) what the local unknowns cost it."""
+    half = room.half
+    for a in range(local):
+        for i in range(n):
+            u, v = half + i * local + a, half + n * local + a
+            for b in range(lanes):
+                m[room.step + i, b] -= m[u, b] * m[v, b]
+            for j in range(i + 1):
+                for b in range(lanes):
+                    m[room.shared + i * n + j, b] -= m[u, b] * m[half + j * local + a, b]
+
+
+@compiled
+def complete(m: Array, room: Room, n: int, local: int, lanes: int) -> None:
+    """Write the step of the local unknowns behind that of the shared ones; their system is factored."""
+    own = room.step + n
+    for a in range(local):
+        for b in range(lanes):
+            m[own + a, b] = m[room.half + n * local + a, b]
+        for i in range(n):
+            for b in range(lanes):
+                m[own + a, b] -= m[room.half + i * local + a, b] * m[room.step + i, b]
+    backward(m, room.local, local, room.local_scale, own, lanes)
+
+
+# Systems of one unit, in arrays whose last axis counts the lanes.
+
+LANES = 64
+"""Problems side by side where only lengths are unknown: eight registers of eight doubles, and 512 bytes a number."""
+
+
+@compiled
+def factor_plain(A: Array, diagonal: Array, lower: Array, inverse: Array) -> None:
+    """Find the unit lower factors of symmetric matrices, and one over each pivot.
+
+    Parameters
+    ----------
+    A : array (n, n, W)
+        Read below the diagonal.
+    diagonal : array (n, W)
+        Read in its place.
+    lower : array (n, n, W)
+        Written: the factors below the diagonal; above it is scratch.
+    inverse : array (n, W)
+        Written: one over each pivot.
+    """
+    n = len(diagonal)
+    for i in range(n):
+        pivot = inverse[i]
+        for lane in range(LANES):
+            pivot[lane] = diagonal[i, lane]
+        for j in range(i):
+            # above the diagonal stay the entries before they are divided by their pivot
+            for lane in range(LANES):
+                lower[j, i, lane] = A[i, j, lane]
+            for k in range(j):
+                for lane in range(LANES):
+                    lower[j, i, lane] -= lower[k, i, lane] * lower[j, k, lane]
+            for lane in range(LANES):
+                lower[i, j, lane] = lower[j, i, lane] * inverse[j, lane]
+                pivot[lane] -= lower[j, i, lane] * lower[i, j, lane]
+        for lane in range(LANES):
+            pivot[lane] = 1.0 / pivot[lane]
+
+
+@compiled
+def solve_plain(lower: Array, inverse: Array, right: Array) -> None:
+    """Solve with a factorisation of `factor_plain`, in place.
+
+    Parameters
+    ----------
+    lower, inverse : array (n, n, W), (n, W)
+        Unit lower factors and inverse pivots.
+    right : array (n, W)
+        Overwritten with the solutions.
+    """
+    n = len(inverse)
+    for i in range(n):
+        for j in range(i):
+            for lane in range(LANES):
+                right[i, lane] -= lower[i, j, lane] * right[j, lane]
+    for i in range(n - 1, -1, -1):
+        for lane in range(LANES):
+            right[i, lane] *= inverse[i, lane]
+        for j in range(i + 1, n):
+            for lane in range(LANES):
+                right[i, lane] -= lower[j, i, lane] * right[j, lane]
