@@ -1,4 +1,4 @@
-"""Published studies, made again from their text: one line here and one package with a `STUDY` for each paper."""
+"""Published studies, made again from their text: for each paper a line here, a module with a `STUDY`, and a page."""
 
 from __future__ import annotations
 
@@ -21,32 +21,40 @@ class Paper:
         One line for listings.
     source : str
         Publication.
+    module : str
+        Module of this package with its `STUDY`.
     """
 
     summary: str
     source: str
+    module: str
 
 
 PAPERS: dict[str, Paper] = {
     "angles": Paper(
         "manoeuvring targets by azimuth and elevation with the current statistical model",
         "Liu Zhe, Wei Junhu, Huang Wenzhun, Huang Shiqi: location and tracking by log-likelihood estimation (Chinese)",
+        "angles_tables",
     ),
     "registration": Paper(
         "biases of moving stations from time differences and gain ratios, many epochs",
         "Journal of Electronics and Information Technology 39 (2017), TDOA and GROA error registration",
+        "registration_tables",
     ),
     "kinematic": Paper(
         "static, uniform and accelerated models of distant targets from time differences, with and without row names",
         "Missiles and Space Vehicles 2024/5, doi:10.7654/j.issn.2097-1974.20240501",
+        "kinematic_tables",
     ),
     "bistatic": Paper(
         "slow targets by one receiver and one illuminator of opportunity, from excess path and direction",
         "Southwest China Institute of Electronic Technology, simplified NLS for single-station location",
+        "bistatic",
     ),
     "satellites": Paper(
         "ships by the time differences of three satellites at a known height, four Kalman filters",
         "modified covariance extended Kalman filtering for passive location and tracking by three satellites",
+        "satellites",
     ),
 }
 
@@ -59,14 +67,13 @@ def paper(name: str) -> Paper:
 
 
 def planned(name: str, size: Size, seed: int) -> Plan:
-    """Return the reproduction of a paper, ready to run; only its own package is loaded.
+    """Return the reproduction of a paper, ready to run; only its own modules are loaded.
 
     Raises
     ------
     InvalidProblem
         For an unknown paper, or where matplotlib is missing.
     """
-    paper(name)
-    study = import_module(f"optloc.papers.{name}_page").STUDY
+    study = import_module(f"optloc.papers.{paper(name).module}").STUDY
     plan: Plan = study.plan(study.sizes[size], seed)
     return plan

@@ -1,4 +1,8 @@
-"""Draws, starts, tracks and their scores; all trials of a setting run as one batch."""
+"""Manoeuvring targets by azimuth and elevation with the current statistical model: three simulations.
+
+All trials of a setting run as one batch. The tables and figures are those of `optloc.papers.angles_tables`, the page is
+``angles.md``.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +20,7 @@ from optloc.problem.epochs import by_epoch, cut
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
 from optloc.solvers.starts.angles import courses
-from optloc.track import Dynamics, State, Track, current_statistical, followed, polynomial, singer
+from optloc.track import Dynamics, State, Track, current_statistical, followed, singer
 from optloc.track.batch import fitted, posterior_bound
 from optloc.track.dynamics import correlated
 
@@ -133,6 +137,7 @@ def circling(name: str, slow: float, fast: float, rate: float, seconds: tuple[in
     return Scenario(name, _WIDE, states, 5e-3, (int(ends[0]), int(ends[1]), int(ends[2])))
 
 
+# Printed, but for the place of the second station of simulation 3: the text gives the same one for both.
 _BASE = np.array([[0.0, 50.0], [0.0, 100.0]])
 _WIDE = np.array([[-40e3, 0.0, 0.0], [40e3, 0.0, 0.0]])
 _FINE = float(np.deg2rad(1e-3))
@@ -145,6 +150,9 @@ STRAIGHT = _straight()
 WINDING = _winding()
 """Simulation 2: a sine."""
 
+WINDING_PEAK = float(np.linalg.norm(WINDING.states[:, 2], axis=-1).max())
+"""Largest acceleration of simulation 2, m/s^2: the printed error is six times as large."""
+
 REPAIRED = circling("repaired", _RADIUS * np.pi / 20.0, _RADIUS * np.pi / 20.0, np.pi / 20.0, (100, 40, 100))
 """Simulation 3 with one speed, 471 m/s, one full turn in 40 s, and straight parts of 100 s."""
 
@@ -156,10 +164,18 @@ READINGS = (
 
 
 LOST = 10.0
-"""A track of simulation 1 or 2 that ends further from the truth than this is lost, metres."""
+"""A track of simulation 1 or 2 that ends further from the truth than this is lost, metres; the others are 0.1 m off."""
 
 Sigmas = tuple[float, float, float]
 """Standard deviations of each coordinate of position, velocity and acceleration at the start."""
+
+STRAIGHT_START: Sigmas = (0.1, 0.1, 0.2)
+WINDING_START: Sigmas = (0.1, 2.0, 1.0)
+CIRCLE_START = (500.0, 50.0)
+"""Standard deviations of the starts; of velocity and acceleration in simulation 3, which begins at a fix.
+
+None is printed. The first two give the printed errors; the last are about the speed, 471 m/s, and the acceleration in
+the circle, 74 m/s^2."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -327,7 +343,7 @@ def printed_transition(time_constant: float, limit: float) -> Dynamics:
 
     def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
         F, Q, drive = right.step(dt, mean, d)
-        F = F.copy()
+        F = F.copy()  # that of the right model is kept for its next step
         F[2 * d :, 2 * d :] = (1.0 - np.exp(-dt / time_constant)) * np.eye(d)
         return F, Q, drive
 
@@ -337,14 +353,8 @@ def printed_transition(time_constant: float, limit: float) -> Dynamics:
 def printed_variance(time_constant: float, limit: float) -> Dynamics:
     """Return the current statistical model with the variance as published: (4 - pi)/pi (limit - abs(a))^2, no clamp.
 
-    The variance vanishes where the acceleration comes near its limit, and grows without bound beyond it.
-
-    Parameters
-    ----------
-    time_constant : float
-        Seconds.
-    limit : float
-        Largest acceleration of an axis, m/s^2.
+    The variance vanishes where the acceleration comes near its limit, and grows without bound beyond it. Parameters are
+    those of `printed_transition`.
     """
     right = current_statistical(time_constant, limit)
 
@@ -358,208 +368,10 @@ def printed_variance(time_constant: float, limit: float) -> Dynamics:
     return replace(right, name="no clamp", step=step)
 
 
-# Filters in the three simulations: errors against time, bounds and lost tracks.
-
-STRAIGHT_START: Sigmas = (0.1, 0.1, 0.2)
-WINDING_START: Sigmas = (0.1, 2.0, 1.0)
-CIRCLE_START = (500.0, 50.0)
-"""Standard deviations of the starts; of velocity and acceleration in simulation 3, which begins at a fix."""
-
-SETTLED = 20
-"""Seconds of simulation 3 that are not scored."""
-
-
-@dataclass(frozen=True, slots=True)
-class Curve:
-    """Errors against time.
-
-    Parameters
-    ----------
-    label : str
-        What made them.
-    seconds : array (q,)
-        When.
-    error : array (q, 3)
-        Root mean square errors, or bounds, of position, velocity and acceleration.
-    """
-
-    label: str
-    seconds: Array
-    error: Array
-
-    def total(self, first: int = 0, last: int | None = None) -> Array:
-        """Return the root mean square (3,) over first < t <= last seconds."""
-        inside = (self.seconds > first) & (self.seconds <= (np.inf if last is None else last))
-        return np.asarray(np.sqrt((self.error[inside] ** 2).mean(0)))
-
-    def phases(self, scenario: Scenario) -> list[float]:
-        """Return the root mean square position error of each phase; the first `SETTLED` seconds do not count."""
-        first = (SETTLED, *scenario.phases[:-1])
-        return [float(self.total(a, b)[0]) for a, b in zip(first, scenario.phases, strict=True)]
-
-
-def curve(label: str, drawn: Draw, start: State, dynamics: Dynamics, update: str = "ekf") -> Curve:
-    """Return the errors of the tracks from a start."""
-    return scored(label, drawn, tracked(drawn, start, dynamics, update).mean)
-
-
-def scored(label: str, drawn: Draw, mean: Array) -> Curve:
-    """Return the errors of states (trials, q, n) at the last q epochs."""
-    error = rms(errors(drawn, mean), (0,))
-    last = drawn.scenario.epochs
-    return Curve(label, np.arange(last - len(error) + 1.0, last + 1.0), error)
-
-
-def bounded(label: str, scenario: Scenario, start: State, dynamics: Dynamics) -> Curve:
-    """Return the posterior bound from a start."""
-    least = bound(scenario, start, dynamics)
-    return Curve(label, np.arange(start.time + 1.0, scenario.epochs + 1.0), least)
-
-
-def straight(drawn: Draw, tick: Tick) -> list[Curve]:
-    """Return simulation 1: the filter with the right and the printed transition, three limits, and bounds."""
-    start, out = placed(drawn, STRAIGHT_START, known=2), []
-    for limit in (30.0, 2.0, 0.3):
-        for label, make in (("filter", current_statistical), ("printed f33", printed_transition)):
-            out.append(curve(f"{label}, a_max {limit:g}", drawn, start, make(TIME_CONSTANT, limit)))
-            tick()
-    out.append(bounded("posterior bound, a_max 2", STRAIGHT, start, fixed_variance(2.0)))
-    out.append(bounded("bound of one track", STRAIGHT, start, polynomial(2)))
-    tick()
-    return out
-
-
-def winding(drawn: Draw, tick: Tick) -> list[Curve]:
-    """Return simulation 2: started at rest, and by a fit of the first three epochs."""
-    model = current_statistical(TIME_CONSTANT, 30.0)
-    start = placed(drawn, WINDING_START, known=1)
-    out = [
-        curve("filter, started at rest", drawn, start, model),
-        curve("filter, started by a fit of 3 s", drawn, fitted_start(drawn, 3), model, "iekf"),
-        bounded("posterior bound", WINDING, start, fixed_variance(30.0)),
-    ]
-    tick()
-    return out
-
-
-def circles(drawn: Draw, tick: Tick) -> dict[float, list[Curve]]:
-    """Return the repaired simulation 3 by limit: three filters and the bound."""
-    start, out = first_fix(drawn, *CIRCLE_START), {}
-    places = fixes(drawn)
-    tick()
-    for limit in (100.0, 300.0):
-        model = current_statistical(TIME_CONSTANT, limit)
-        out[limit] = [
-            curve("single step", drawn, start, model),
-            curve("converged", drawn, start, model, "iekf"),
-            scored("fixes, then a linear filter", drawn, linear_track(places, start, model)),
-            bounded("posterior bound", REPAIRED, start, fixed_variance(limit)),
-        ]
-        tick()
-    return out
-
-
-@dataclass(frozen=True, slots=True)
-class Reading:
-    """Position errors and bounds of the phases of simulation 3 as printed.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        One of `READINGS`.
-    limit : float
-        Largest acceleration of the model.
-    error, bound : list of float
-        Metres, by phase.
-    """
-
-    scenario: Scenario
-    limit: float
-    error: list[float]
-    bound: list[float]
-
-
-def readings(count: int, seed: int, key: int, tick: Tick) -> list[Reading]:
-    """Return simulation 3 as printed."""
-    out = []
-    for i, scenario in enumerate(READINGS):
-        drawn = draw(scenario, count, seed, key + i)
-        start = first_fix(drawn, *CIRCLE_START)
-        for limit in (100.0, 300.0):
-            found = curve("", drawn, start, current_statistical(TIME_CONSTANT, limit))
-            tick()
-            least = bounded("", scenario, start, fixed_variance(limit))
-            out.append(Reading(scenario, limit, found.phases(scenario), least.phases(scenario)))
-            tick()
-    return out
-
-
-def snapshot() -> Curve:
-    """Return the bound of every second of the repaired simulation 3 by itself, whose last two columns are NaN."""
-    least = snapshot_bound(REPAIRED)
-    error = np.full((len(least), 3), np.nan)
-    error[:, 0] = least
-    return Curve("snapshot", np.arange(1.0, len(least) + 1.0), error)
-
-
-@dataclass(frozen=True, slots=True)
-class Lost:
-    """Shares of lost tracks of simulation 1.
-
-    Parameters
-    ----------
-    sigma : float
-        Standard deviation of each coordinate of the start, metres; 0 for a fit of the first epochs.
-    limit : float
-        Largest acceleration of the model.
-    share : mapping of str to float
-        By filter.
-    """
-
-    sigma: float
-    limit: float
-    share: dict[str, float]
-
-
-def starts(drawn: Draw, tick: Tick) -> list[Lost]:
-    """Return who is lost from starts on the line through the stations, and from a fit of three epochs."""
-    out = []
-    fit = fitted_start(drawn, 3)
-    for sigma, limit in ((1.0, 5.0), (1.0, 30.0), (3.0, 5.0), (3.0, 30.0), (0.0, 30.0)):
-        start = scattered(drawn, (sigma, 0.1, 0.2)) if sigma else fit
-        model = current_statistical(TIME_CONSTANT, limit)
-        names = ("ekf", "iekf", "mgekf", "mvekf")
-        out.append(Lost(sigma, limit, {n: lost(drawn, tracked(drawn, start, model, n)) for n in names}))
-        tick()
-    return out
-
-
-def clamps(drawn: Draw, tick: Tick) -> dict[str, float]:
-    """Return the share of lost tracks with the variance as published and clamped, from 3 m and with a_max 0.3."""
-    start = scattered(drawn, (3.0, 0.1, 0.2))
-    models = {"as published": printed_variance, "clamped": current_statistical}
-    found = {name: lost(drawn, tracked(drawn, start, make(TIME_CONSTANT, 0.3))) for name, make in models.items()}
-    tick()
-    return found
-
-
-def ends(drawn: Draw, tick: Tick) -> dict[str, Array]:
-    """Return the distances (trials,) from the truth at the end of simulation 1, by start and filter."""
-    model = current_statistical(TIME_CONSTANT, 30.0)
-    start = scattered(drawn, (1.0, 0.1, 0.2))
-    tracks = {
-        "single step (the paper), start of 1 m": tracked(drawn, start, model, "ekf"),
-        "converged, start of 1 m": tracked(drawn, start, model, "iekf"),
-        "single step, started by a fit of 3 s": tracked(drawn, fitted_start(drawn, 3), model, "ekf"),
-    }
-    tick()
-    return {name: distances(drawn, track) for name, track in tracks.items()}
-
-
 # Fits to whole tracks, and to a target that stays: pseudo-linear, instrumental, maximum likelihood.
 
 PLACE = np.array([-10e3, 50e3, 10e3])
-"""A target that stays, metres."""
+"""A target that stays, metres: where that of simulation 3 begins."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -591,26 +403,27 @@ def whole_track_bound() -> Array:
     return np.asarray(np.sqrt(np.diagonal(crlb(run, STRAIGHT.truth[-1])).reshape(3, -1).sum(-1)))
 
 
-def wholes(drawn: Draw, tick: Tick) -> list[tuple[str, Array]]:
+def run_wholes(drawn: Draw, tick: Tick) -> list[tuple[str, Array]]:
     """Return errors (3,) at the end of simulation 1 of fits to the whole track, and of the filter."""
     run = replace(drawn.problem, motions=(Motion(2, reference=float(STRAIGHT.epochs)),))
-    exact, unit = STRAIGHT.truth[-1], np.array([1.0, 1.0, 2.0])[:, None]
+    exact, unit = STRAIGHT.truth[-1], np.array([1.0, 1.0, 2.0])[:, None]  # the last coefficient is half of a
     found = courses(run)
     assert found is not None
     parts = {"plain": found.plain, "weighted": found.weighted, "instrumental variables": found.instrumental}
-    out = [(name, _parts((unit * c).reshape(len(c), -1) - exact)) for name, c in parts.items()]
-    out.append(("maximum likelihood (optloc)", _parts(fitted(drawn.problem, 2).x - exact)))
+    out = [(name, _size((unit * c).reshape(len(c), -1) - exact)) for name, c in parts.items()]
+    out.append(("maximum likelihood (optloc)", _size(fitted(drawn.problem, 2).x - exact)))
     start = placed(drawn, STRAIGHT_START, known=2)
     for limit in (30.0, 2.0):
         track = tracked(drawn, start, current_statistical(TIME_CONSTANT, limit))
-        out.append((f"filter, a_max {limit:g}", _parts(track.mean[:, -1] - exact)))
+        out.append((f"filter, a_max {limit:g}", _size(track.mean[:, -1] - exact)))
     tick()
     return out
 
 
-def rays(count: int, seed: int, key: int, tick: Tick) -> list[Rays]:
+def run_rays(count: int, seed: int, key: int, tick: Tick) -> list[Rays]:
     """Return fixes of a target that stays, from few stations and from many."""
     out = []
+    # Noise of 0.02 and 0.05 rad is four and ten times that of simulation 3: the bias of plain fixes grows with it.
     for i, (stations, sigma) in enumerate(((2, 0.05), (4, 0.05), (50, 0.02), (50, 0.05))):
         run = still(stations, sigma)
         drawn = simulate(run, PLACE, np.random.SeedSequence(seed, spawn_key=(key + i,)), trials=count)
@@ -637,13 +450,11 @@ def still(count: int, sigma: float) -> Problem:
     return assemble(place, *(measured(kind, a=a, sigma=sigma) for kind in ("azimuth", "elevation")))
 
 
-def _parts(error: Array) -> Array:
-    return np.asarray(np.sqrt((error.reshape(len(error), 3, -1) ** 2).sum(-1).mean(0)))
+def _size(error: Array) -> Array:
+    """Return root mean square lengths (3,) of position, velocity and acceleration of errors (trials, 3 d)."""
+    return rms(error.reshape(len(error), 3, -1), (0,))
 
 
 def _bias(error: Array) -> tuple[float, float]:
     good = error[np.isfinite(error).all(-1)]
     return float(np.linalg.norm(good.mean(0))), float(np.sqrt((good**2).sum(-1).mean()))
-
-
-# Tracking by azimuth and elevation with the current statistical model: section 3 of the paper.

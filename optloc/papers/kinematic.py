@@ -1,4 +1,8 @@
-"""Filters on the scene of the paper, and what is measured of them."""
+"""Targets that stand, fly on or accelerate, by range differences: filters on the scene of the paper, and errors.
+
+The tables and figures that are made of them are those of `optloc.papers.kinematic_tables`, the page is
+``kinematic.md``.
+"""
 
 from __future__ import annotations
 
@@ -62,9 +66,11 @@ class Scenario:
     position: Array = field(default_factory=lambda: 1e3 * np.array([[300.0, 400.0], [350.0, 450.0], [250.0, 350.0]]))
     velocity: Array = field(default_factory=lambda: 1e3 * np.array([[0.0, 1.0], [0.0, -1.0], [0.0, 1.0]]))
     acceleration: Array = field(default_factory=lambda: 1e3 * np.array([[0.0, -0.1], [0.0, 0.1], [0.0, 0.1]]))
+    # 80 ns and 2.25 s are fitted to two lines of table 1: the single fix, and CV on accelerated targets.
     sigma: float = 80e-9 * SPEED_OF_LIGHT
     interval: float = 2.25
     steps: int = 20
+    # Loose: twice the speed and ten times the acceleration of the targets.
     speed: float = 2e3
     rate: float = 1e3
 
@@ -177,7 +183,7 @@ def baseline(scenario: Scenario) -> float:
 
 
 LOST = 10e3
-"""An error at the last epoch from which a track counts as lost, metres."""
+"""An error at the last epoch from which a track counts as lost, metres: ten times that of a single fix."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,6 +216,11 @@ class Score:
     def last(self) -> float:
         """Return the root mean square error at the last step, metres."""
         return float(np.sqrt((self.error[..., -1] ** 2).mean()))
+
+    @property
+    def level(self) -> float:
+        """Return the mean NEES at the last step."""
+        return float(self.nees[..., -1].mean())
 
     @property
     def lost(self) -> float:
@@ -283,6 +294,7 @@ def mean_error(cov: Array) -> Array:
     """
     from scipy.special import ellipe
 
+    # Over angles the length is the root of a quadratic form: a complete elliptic integral of the axes.
     small, large = np.moveaxis(np.linalg.eigvalsh(cov), -1, 0)
     return np.asarray(np.sqrt(2.0 / np.pi * large) * ellipe(1.0 - small / large))
 
@@ -327,6 +339,7 @@ class Filter:
             made = parallel(drawn.runs, drawn.fix, self.models, speed=scene.speed, rate=scene.rate, update="ekf")
             return score(drawn, made.position)
         q = len(self.models)
+        # Rows sum to one: a switch goes to each of the others alike.
         chain = np.full((q, q), self.switch / (q - 1)) + (1.0 - self.switch * q / (q - 1)) * np.eye(q)
         found = imm(drawn.runs, drawn.fix, self.models, chain, speed=scene.speed, rate=scene.rate, update="ekf")
         return scored(drawn, found.track)
@@ -342,7 +355,7 @@ FILTERS = (
     Filter("best of static, CV, CA by likelihood", PLAIN),
     Filter("IMM of CV and CA with sd(jerk) = 0.05 km/s³", (polynomial(1), polynomial(2, 50.0)), 0.05),
 )
-"""What is tried against a motion that is not the model's."""
+"""What is tried against a motion that is not the model's; 0.1 km/s² is the acceleration that comes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -382,6 +395,7 @@ class Association:
 
 def rules(scenario: Scenario, detection: float, false: float) -> tuple[Rule, ...]:
     """Return the rules that are compared."""
+    # False rows are uniform over range differences from minus to plus the longest baseline.
     known = Clutter(detection, false / (2.0 * baseline(scenario)))
     return (
         Rule("nearest, missed := predicted (paper)", nearest(), "expect"),
@@ -438,7 +452,7 @@ def twice_predicted(dynamics: Dynamics, interval: float, dimension: int) -> Upda
 
     def update(scan: Problem, mean: Array, cov: Array) -> Updated:
         white = whitened(scan, mean)
-        H = white.H @ F
+        H = white.H @ F  # the slip: `mean` and `cov` have been predicted already
         S = H @ cov @ np.swapaxes(H, -1, -2) + np.eye(H.shape[-2])
         gain = np.swapaxes(linalg.solve(S, H @ cov)[0], -1, -2)
         solved = linalg.solve(S, white.residual[..., None])[0][..., 0]
@@ -470,6 +484,7 @@ def taylor(problem: Problem, start: Array, *, sign: float = 1.0, steps: int = 50
     array (..., d)
         Not finite where the steps ran away.
     """
+    # Undamped, so steps overflow where they run away: that is what is counted.
     x = np.broadcast_to(start, (*problem.batch_shape, start.shape[-1]))
     with np.errstate(all="ignore"):
         for _ in range(steps):
@@ -495,6 +510,3 @@ def weighting(problem: Problem, place: Array, covariance: Array) -> tuple[float,
     plain = np.linalg.solve(H.T @ H, H.T)
     best = np.linalg.inv(H.T @ np.linalg.solve(covariance, H))
     return float(np.sqrt(np.trace(plain @ covariance @ plain.T))), float(np.sqrt(np.trace(best)))
-
-
-# Location of moving targets by TDOA with static, uniform and accelerated models: section 3 of the paper.

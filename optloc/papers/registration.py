@@ -1,4 +1,8 @@
-"""Monte Carlo trials of a scene: the paper's recursion and the route without a guess on the same data."""
+"""Moving stations with biases, by time differences and gain ratios: the paper's recursion and the fix without a guess.
+
+Both run on the same data. The tables and figures that are made of them are those of
+`optloc.papers.registration_tables`, the page is ``registration.md``.
+"""
 
 from __future__ import annotations
 
@@ -10,13 +14,11 @@ from typing import Literal
 import numpy as np
 
 from optloc.base import linalg
-from optloc.base.status import Status
 from optloc.base.types import Array, Motion, Stations
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.bounds.crlb import crlb, crlb_course
 from optloc.linear.evaluate import predict
 from optloc.linear.simulate import simulate
-from optloc.papers.report import Tick
 from optloc.problem.bias import with_bias
 from optloc.problem.build import assemble, measured
 from optloc.problem.fix import Fix
@@ -193,7 +195,7 @@ def truth(scenario: Scenario, problem: Problem) -> Array:
 FIRST = 40
 """Epochs that are collected before the first estimate."""
 
-_BLOCK = 8  # trials whose arrays fit the cache together
+_BLOCK = 8  # trials whose arrays, 5 stations by 700 epochs by 3 coordinates, fit a cache of 1 MB together
 
 
 def recursion(scenario: Scenario, z: Array, start: Array, *, first: int = FIRST, iterations: int = 2) -> Array:
@@ -222,7 +224,7 @@ def recursion(scenario: Scenario, z: Array, start: Array, *, first: int = FIRST,
     arrivals = np.zeros((trials, z.shape[-1] + 1, epochs))
     arrivals[:, 1:] = z.swapaxes(1, 2)
     track, times = np.ascontiguousarray(scenario.track(epochs).T), scenario.times(epochs)
-    with np.errstate(all="ignore"):
+    with np.errstate(all="ignore"):  # what runs away overflows, and stays lost
         for low in range(0, trials, _BLOCK):
             part = slice(low, low + _BLOCK)
             state = start[part]
@@ -258,7 +260,7 @@ def step(state: Array, arrivals: Array, track: Array, times: Array) -> tuple[Arr
         target = target + state[:, 3:, None, None] * times
     slope = target - track
     distance = np.sqrt(np.einsum("tcsk,tcsk->tsk", slope, slope))
-    slope /= distance[:, None]
+    slope /= distance[:, None]  # unit vectors (trials, 3, s, k)
     misfit = arrivals - distance
     misfit -= misfit.mean(1, keepdims=True)
     slope -= slope.mean(2, keepdims=True)
@@ -274,7 +276,7 @@ def step(state: Array, arrivals: Array, track: Array, times: Array) -> tuple[Arr
 
 
 FAR = 10.0
-"""An estimate further from the truth than this many bounds is lost."""
+"""An estimate further from the truth than this many bounds is lost: no noise moves it there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -350,7 +352,7 @@ class Setting:
 def one_shot(scenario: Scenario = PRINTED, *, sigma: float | None = None, shape: Shape = "full") -> Array:
     """Return the paper's sigma0, metres: the bound of each coordinate (3,) from the first epoch with known biases."""
     still = replace(scenario, course=None)
-    made = problem(still, 1, sigma=sigma, prior=1e-6, shape=shape)
+    made = problem(still, 1, sigma=sigma, prior=1e-6, shape=shape)  # a micrometre: the biases are known
     return np.asarray(np.sqrt(np.diagonal(crlb(made, truth(still, made)))[:3]))
 
 
@@ -406,72 +408,6 @@ def branch(fix: Fix, exact: Array) -> Array:
     return np.asarray(pool[np.arange(len(pool)), best])
 
 
-@dataclass(frozen=True, slots=True)
-class History:
-    """Scores after growing numbers of epochs.
-
-    Parameters
-    ----------
-    setting : Setting
-        What was drawn.
-    epochs : tuple of int
-        Numbers of epochs.
-    bounds : array (t, n, n)
-        Cramer-Rao bound at each.
-    plain : tuple of Score, or None
-        The paper's recursion on the range differences.
-    found : tuple of Score
-        The fix without a guess.
-    ambiguous : tuple of float
-        Share of fixes that say that the data allow another place.
-    silent : tuple of float
-        Share of fixes that are lost and say ok.
-    """
-
-    setting: Setting
-    epochs: tuple[int, ...]
-    bounds: Array
-    plain: tuple[Score, ...] | None
-    found: tuple[Score, ...]
-    ambiguous: tuple[float, ...]
-    silent: tuple[float, ...]
-
-
-def run_history(
-    setting: Setting, epochs: Sequence[int], tick: Tick, *, plain: bool = True, first: int = FIRST
-) -> History:
-    """Return the scores of both routes on the same data.
-
-    Parameters
-    ----------
-    setting : Setting
-        What is drawn.
-    epochs : sequence of int
-        Numbers of epochs to look at.
-    tick : callable
-        Called after each of them, and after the recursion.
-    plain : bool
-        Whether the recursion runs as well.
-    first : int
-        Epochs of its first estimate.
-    """
-    drawn = setting.draw(max(epochs))
-    bounds = setting.bounds(epochs)
-    exact = truth(setting.scenario, drawn)
-    wandered = None
-    if plain:
-        wandered = wander(setting, drawn, epochs, bounds, first=first)
-        tick()
-    found, ambiguous, silent = [], [], []
-    for k, bound in zip(epochs, bounds, strict=True):
-        fix = solve(setting.first(drawn, k))
-        found.append(score(fix.x if setting.scenario.course is None else branch(fix, exact), exact, bound))
-        ambiguous.append(float((fix.code == Status.AMBIGUOUS).mean()))
-        silent.append(float((found[-1].lost & (fix.code == Status.OK)).mean()))
-        tick()
-    return History(setting, tuple(epochs), bounds, wandered, tuple(found), tuple(ambiguous), tuple(silent))
-
-
 def wander(
     setting: Setting,
     drawn: Problem,
@@ -497,7 +433,7 @@ def wander(
 
 # The second minimum of a flat array: the target's image in the plane of the stations.
 
-_SAME = 1.0
+_SAME = 1.0  # metres: without noise the truth is found to far less, and an image is kilometres away
 
 
 @dataclass(frozen=True, slots=True)
@@ -550,6 +486,7 @@ def ghost(scenario: Scenario, epochs: int, *, sigma: float | None = None, statio
     exact = truth(scenario, made)
     place, velocity = mirror(scenario)
     if scenario.course is None:
+        # The image drifts with the stations; one that stays fits best where it is half way.
         state = place + 0.5 * scenario.times(epochs)[-1] * velocity
     else:
         state = np.concatenate([place, velocity])
@@ -566,8 +503,9 @@ NAMES = ("R1", "R2", "R3", "R4", "R5")
 DELAYS = (100.0, -133.0, 167.0, -100.0)
 """Nanoseconds by which the clocks of R2 to R5 are late."""
 
+# Ten minutes in a file of a dozen kilobytes, and the noise of the paper: nanoseconds, metres.
 _EPOCHS, _INTERVAL, _SEED = 200, 3.0, 20170502
-_ARRIVAL, _STATION = 10.0, 1.0  # ns, m
+_ARRIVAL, _STATION = 10.0, 1.0
 
 _PROBLEM = """\
 # Five aircraft time an emitter 360 km away for ten minutes, each by a clock of its own. The emitter stands at 200 km,
@@ -622,6 +560,3 @@ def files() -> Mapping[str, str]:
         "registration-stations.csv": "\n".join(["name,time,x,y,z", *ends]) + "\n",
         "registration-rows.csv": "\n".join(["time,a,z", *rows]) + "\n",
     }
-
-
-# Error registration of several moving stations by time differences and gain ratios: section 4 of the paper.

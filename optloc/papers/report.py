@@ -1,19 +1,35 @@
-"""What the reproduction of a paper gives: text, tables and pictures, and how they are written to a folder."""
+"""A paper made again: its study, its tables and figures, and the page that quotes them.
+
+A paper is one module with a `STUDY` (two where the simulation is long) and one page, ``NAME.md`` beside it: Markdown
+with the essay, the titles and the notes. The page names cells of the recomputed tables where it states a number, so
+that prose and tables cannot disagree. In it
+
+- ``table("slow")`` is a table, whose title is the heading above it and whose note is the text below it;
+- ``cell("slow", "line fit", "mean error, km")`` is a cell as it stands: table, first cells of the row, column;
+- ``value(...)`` is the first number of a cell, ``value(..., part=1)`` the second; ``digits`` rounds what is made of it;
+- ``made``, ``seed`` and ``sample`` say how the numbers were made, and ``scene`` is the module of the paper.
+"""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
+from importlib import import_module
 from importlib.metadata import version
+from importlib.resources import files
+from math import floor, isfinite, log10, nan
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
 from optloc.base.errors import InvalidProblem
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 S = TypeVar("S")
@@ -23,6 +39,10 @@ Tick = Callable[[], None]
 
 Size = Literal["quick", "full"]
 """How much is drawn."""
+
+
+ABSENT = "–"
+"""What stands for a number that there is not: of a smaller sample, or of a trial that is lost."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,6 +75,23 @@ class Table:
         lines = ["| " + " | ".join(cells) + " |" for cells in (self.header, rule, *self.rows)]
         return "\n".join(lines) + (f"\n\n{self.note}" if self.note else "")
 
+    def cell(self, *place: str) -> str:
+        """Return the cell of a row, named by its first cells, and a column; a dash where a sample was too small for it.
+
+        Parameters
+        ----------
+        *place : str
+            First cells of the row, then the name of the column.
+        """
+        *row, column = place
+        found = next((cells for cells in self.rows if list(cells[: len(row)]) == row), None)
+        return ABSENT if found is None or column not in self.header else found[self.header.index(column)]
+
+    def value(self, *place: str, part: int = 0) -> float:
+        """Return a number of such a cell, the first by default; NaN where there is none."""
+        found = re.findall(r"-?\d+\.?\d*(?:e[-+]?\d+)?", self.cell(*place))
+        return float(found[part]) if part < len(found) else nan
+
 
 @dataclass(frozen=True, slots=True)
 class Picture:
@@ -81,35 +118,21 @@ class Report:
 
     Parameters
     ----------
-    title : str
-        Title of the page.
-    facts : str
-        Sample size, seed and whatever else is needed to make it again.
-    opening, closing : str
-        Text before and behind tables and pictures, in Markdown.
+    page : str
+        The whole page in Markdown.
     tables : tuple of Table
-        In reading order.
+        With the titles and notes that they have on the page.
     pictures : tuple of Picture
-        In reading order.
+        The figures that the page shows.
     """
 
-    title: str
-    facts: str
-    opening: str
-    closing: str
+    page: str
     tables: tuple[Table, ...]
     pictures: tuple[Picture, ...]
 
     def markdown(self) -> str:
         """Return the page that holds everything."""
-        parts = [f"# {self.title}", self.made(), self.opening]
-        parts += [f"## {p.title}\n\n![{p.title}]({p.name}.png)" for p in self.pictures]
-        parts += [f"## {table.title}\n\n{table.markdown()}" for table in self.tables]
-        return "\n\n".join([*parts, self.closing]).rstrip() + "\n"
-
-    def made(self) -> str:
-        """Return the sentence that says when and how the numbers were made."""
-        return f"optloc {version('optloc')}, {datetime.now(UTC):%Y-%m-%d}, {self.facts}."
+        return self.page
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,8 +177,110 @@ class Study(Generic[S]):
         InvalidProblem
             Where matplotlib is missing: before the work, not after it.
         """
-        canvas(1.0, 1.0)
+        canvas(1.0, 1.0)  # raises where there is none
         return Plan(self.work(sample), partial(self.run, sample, seed))
+
+
+# The page: a Markdown template whose numbers are cells of the tables.
+
+
+def tabulate(name: str, header: Iterable[str], rows: Iterable[tuple[str, ...]]) -> Table:
+    """Return a table whose title and note stand on the page of its paper."""
+    return Table(name, "", tuple(header), tuple(rows))
+
+
+def typeset(name: str, sample: object, seed: int, tables: Sequence[Table], figures: Mapping[str, Figure]) -> Report:
+    """Return the report of a paper: its page filled from the tables, and what the page says of each of them.
+
+    Parameters
+    ----------
+    name : str
+        The paper; its page is ``NAME.md`` beside this module.
+    sample : object
+        How much was drawn.
+    seed : int
+        What decided the draws.
+    tables : sequence of Table
+        Everything that the page quotes.
+    figures : mapping of str to matplotlib.figure.Figure
+        By the names that the page gives to their files.
+    """
+    made = f"optloc {version('optloc')}, {datetime.now(UTC):%Y-%m-%d}"
+    page = render(name, {each.name: each for each in tables}, made=made, seed=seed, sample=sample)
+    pictures = []
+    for file, figure in figures.items():
+        shown = re.search(rf"!\[(.*)\]\({file}\.png\)", page)
+        assert shown is not None, f"the page of {name} does not show {file}"
+        pictures.append(Picture(file, shown[1], figure))
+    return Report(page, tuple(_entitle(each, page) for each in tables), tuple(pictures))
+
+
+def render(name: str, tables: Mapping[str, Table], *, made: str, seed: int, sample: object) -> str:
+    """Return the page of a paper, filled from tables.
+
+    Parameters
+    ----------
+    name : str
+        The paper.
+    tables : mapping of str to Table
+        By name.
+    made : str
+        Program and day.
+    seed, sample : int, object
+        How the tables were drawn.
+    """
+    import jinja2
+
+    # Markdown, not HTML: nothing is to be escaped. A misspelt name raises instead of leaving a hole in a sentence.
+    house = jinja2.Environment(undefined=jinja2.StrictUndefined, autoescape=False)  # noqa: S701
+    house.filters["digits"] = digits
+    house.globals.update(
+        table=lambda key: tables[key].markdown(),
+        cell=lambda key, *place: tables[key].cell(*place),
+        value=lambda key, *place, part=0: tables[key].value(*place, part=part),
+        scene=import_module(f"optloc.papers.{name}"),
+    )
+    text = files("optloc.papers").joinpath(f"{name}.md").read_text(encoding="utf-8")
+    return _wrap(house.from_string(text).render(made=made, seed=seed, sample=sample)) + "\n"
+
+
+def _wrap(page: str) -> str:
+    """Return a page whose paragraphs and items are broken at 120 characters, whatever was filled in."""
+    out = []
+    for block in page.strip().split("\n\n"):
+        if block.startswith(("#", "|", "!")):
+            out.append(block)
+            continue
+        items = []
+        for item in re.split(r"\n(?=- |\d+\. )", block):
+            lead = re.match(r"- |\d+\. ", item)
+            indent = " " * len(lead[0]) if lead else ""
+            items.append(fill(" ".join(item.split()), 120, subsequent_indent=indent, break_on_hyphens=False))
+        out.append("\n".join(items))
+    return "\n\n".join(out)
+
+
+def digits(number: float, count: int = 3) -> str:
+    """Return a number with so many significant digits and no exponent, a dash where there is none."""
+    if number == 0.0 or not isfinite(number):
+        return "0" if number == 0.0 else ABSENT
+    rounded = float(f"{number:.{count - 1}e}")  # first, since 9.96 has a digit more when it is 10
+    return f"{rounded:.{max(count - 1 - floor(log10(abs(rounded))), 0)}f}"
+
+
+def _entitle(table: Table, page: str) -> Table:
+    """Return a table with the heading above it and the text below it on a page."""
+    before, _, after = page.partition(table.markdown())
+    title = before.rpartition("\n## ")[2].partition("\n")[0]
+    # One line: a page breaks its lines for those who write it, a terminal for those who read it.
+    return replace(table, title=title, note=" ".join(after.partition("\n## ")[0].split()))
+
+
+# Figures: what those of several papers share.
+
+# The palette of Okabe and Ito, which the colour-blind can tell apart.
+BLACK, GREY, BLUE, SKY = "#000000", "#7F7F7F", "#0072B2", "#56B4E9"
+RED, ORANGE, GREEN, PINK = "#D55E00", "#E69F00", "#009E73", "#CC79A7"
 
 
 def canvas(width: float, height: float) -> Figure:
@@ -167,6 +292,34 @@ def canvas(width: float, height: float) -> Figure:
             "pictures need matplotlib", "reproduce", "install it with: pip install 'optloc[plot]'"
         ) from None
     return Figure(figsize=(width, height), layout="constrained")
+
+
+def scale(ax: Axes) -> None:
+    """Make the axis of errors logarithmic, with plain numbers at 1, 2 and 5 of every decade."""
+    ax.set_yscale("log")
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "25" else "")
+
+
+def label(ax: Axes, across: str, up: str) -> None:
+    """Name both axes and draw a faint grid."""
+    ax.set_xlabel(across)
+    ax.set_ylabel(up)
+    ax.grid(visible=True, which="both", alpha=0.25)  # faint: the curves are what is looked at
+
+
+def explain(figure: Figure, columns: int | None = None) -> None:
+    """Put one legend for all panels below them; a name that several panels share stands once."""
+    found = [ax.get_legend_handles_labels() for ax in figure.axes]
+    shown = {name: handle for handles, names in found for handle, name in zip(handles, names, strict=True)}
+    figure.legend(
+        list(shown.values()), list(shown), loc="outside lower center", ncols=columns or len(shown), frameon=False
+    )
+
+
+def percent(share: float) -> str:
+    """Return a share as per cent."""
+    return f"{100.0 * share:.1f} %"
 
 
 def write(report: Report, folder: Path) -> list[Path]:

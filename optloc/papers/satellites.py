@@ -1,9 +1,14 @@
-"""Monte Carlo trials of the four filters: from fixes, from starts that are far off, with several kinds of height."""
+"""Ships by the time differences of three satellites and a known height: four Kalman filters.
+
+Each filter runs from fixes, from starts that are far off, and with several kinds of height; the page is
+``satellites.md``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,6 +18,27 @@ from optloc.base.units import SPEED_OF_LIGHT
 from optloc.bounds.crlb import crlb
 from optloc.linear.constraints import height as known_height
 from optloc.linear.simulate import simulate
+from optloc.papers.report import (
+    ABSENT,
+    BLACK,
+    BLUE,
+    GREEN,
+    ORANGE,
+    PINK,
+    RED,
+    SKY,
+    Report,
+    Size,
+    Study,
+    Table,
+    Tick,
+    canvas,
+    explain,
+    label,
+    scale,
+    tabulate,
+    typeset,
+)
 from optloc.problem.bias import with_bias
 from optloc.problem.build import assemble, measured, station_array
 from optloc.problem.epochs import cut
@@ -24,7 +50,12 @@ from optloc.track.dynamics import Dynamics, polynomial
 from optloc.track.start import two_point, with_height_rows
 from optloc.track.track import State, Track, followed
 
-# The scene of the paper, as printed: three satellites that stay above the Earth, and a slow target on the sea.
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# The scene: three satellites that stay above the Earth, and a slow target on the sea; printed where nothing else is
+# said.
 
 SATELLITES = geodetic_to_ecef(
     np.radians([24.44, 25.09, 24.44]), np.radians([125.21, 125.68, 125.99]), np.full(3, 800e3)
@@ -32,7 +63,7 @@ SATELLITES = geodetic_to_ecef(
 """Positions (3, 3), ECEF metres: 800 km high, about 90 km apart."""
 
 START = geodetic_to_ecef(np.radians(25.80), np.radians(127.37), 0.0)
-"""First position of the target, ECEF metres."""
+"""First position of the target, on the ellipsoid, ECEF metres."""
 
 COURSE = np.array([20.0, 20.0, 0.0])
 """Its velocity as printed, ECEF metres per second: it climbs by 3.4 m/s."""
@@ -44,10 +75,10 @@ HEIGHT = 500.0
 """Standard deviation of the assumed height, metres."""
 
 DRIVE = 0.01
-"""Standard deviation of the acceleration, m/s^2: that of a ship."""
+"""Standard deviation of the acceleration, m/s^2; not printed, and about that of a ship."""
 
 ORBIT = 7.4e3
-"""Speed of satellites that really move, metres per second."""
+"""Speed of satellites that really move, metres per second: a circular orbit 800 km high has 7.45 km/s."""
 
 
 def dynamics() -> Dynamics:
@@ -76,6 +107,7 @@ def orbits(epochs: int, heading: float, *, interval: float = 1.0) -> Array:
     centre = SATELLITES.mean(0)
     east, north, _ = ECEF.enu_axes(centre)
     along = np.cos(heading) * north + np.sin(heading) * east
+    # All turn about one axis by one angle (Rodrigues), so the formation keeps its shape.
     axis = np.cross(centre / np.linalg.norm(centre), along)
     axis /= np.linalg.norm(axis)
     angle = ORBIT * interval * np.arange(epochs)[:, None, None] / np.linalg.norm(centre)
@@ -127,7 +159,7 @@ FILTERS = ("ekf", "iekf", "mgekf", "mvekf")
 """Names in `optloc.track.UPDATES`, in the order of the tables."""
 
 SPEED = 50.0
-"""Standard deviation of each coordinate of the velocity in starts that are far off, metres per second."""
+"""Standard deviation of each coordinate of the velocity in starts that are far off, m/s: the ship makes 28."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,11 +186,15 @@ class Run:
         return np.asarray(np.sqrt((self.error**2).mean(0)))
 
 
+def root_trace(cov: Array) -> Array:
+    """Return the root of the trace of the position part (...,) of covariances (..., n, n)."""
+    return np.asarray(np.sqrt(np.trace(cov[..., :3, :3], axis1=-2, axis2=-1)))
+
+
 def scored(track: Track, exact: Array) -> Run:
     """Return the errors of a track whose last scans are those of true states (epochs, 6)."""
     at = exact[len(exact) - len(track.times) :, :3]
-    own = np.sqrt(np.trace(track.cov[..., :3, :3], axis1=-2, axis2=-1))
-    return Run(track.position, np.linalg.norm(track.position - at, axis=-1), own)
+    return Run(track.position, np.linalg.norm(track.position - at, axis=-1), root_trace(track.cov))
 
 
 def from_fixes(drawn: Problem) -> State:
@@ -171,11 +207,6 @@ def prior(at: Array, satellites: Array = SATELLITES) -> Array:
     """Return the covariance (6, 6) of position and velocity from fixes, a second apart, that reach their bound."""
     one = crlb(problem(1, order=0, satellites=satellites), at)
     return np.block([[one, one], [one, 2.0 * one]])
-
-
-def root_trace(cov: Array) -> Array:
-    """Return the root of the trace of the position part (...,) of covariances (..., n, n)."""
-    return np.asarray(np.sqrt(np.trace(cov[..., :3, :3], axis1=-2, axis2=-1)))
 
 
 def fixed(steps: int, trials: int, sequence: np.random.SeedSequence) -> tuple[dict[str, Run], Array]:
@@ -227,6 +258,7 @@ def heights(steps: int, trials: int, sequence: np.random.SeedSequence) -> dict[s
     level = simulate(problem(epochs, height=None), exact[0], keys[2], trials)
     held = followed(with_height_rows(level), from_fixes(level), dynamics())
     out["known: the ellipsoid itself"] = scored(held, exact)
+    # The truth of the last two: one error of the height for the whole run, and a metre of noise about it.
     assumed = with_bias(problem(epochs, height=1.0), "height", per="kind", kind="height", sigma=HEIGHT)
     wrong = HEIGHT * np.random.default_rng(keys[3]).standard_normal((trials, 1))
     vectors = np.concatenate([np.broadcast_to(exact[0], (trials, 6)), wrong], axis=1)
@@ -242,9 +274,14 @@ def climbing(steps: int, trials: int, sequence: np.random.SeedSequence) -> Run:
     """Return the IEKF on the target as printed, which climbs, while its height is said to be zero within 500 m."""
     exact, (draws, errors) = truth(steps + 2), sequence.spawn(2)
     drawn = simulate(problem(steps + 2), exact[0], draws, trials)
+    # The heights say zero, with their noise, whatever the target does.
     level = HEIGHT * np.random.default_rng(errors).standard_normal((trials, steps + 2))
     said = drawn.with_rows(z=np.concatenate([drawn.rows[0].z, level], axis=-1))
     return scored(followed(said, from_fixes(said), dynamics()), exact)
+
+
+# Radius of the Earth, metres, near enough for a direction: the height is then set to zero.
+_EARTH = 6.37e6
 
 
 def far(angles: Sequence[float], bearings: int = 12) -> Array:
@@ -260,17 +297,245 @@ def far(angles: Sequence[float], bearings: int = 12) -> Array:
     centre = SATELLITES.mean(0)
     up = centre / np.linalg.norm(centre)
     east, north, _ = ECEF.enu_axes(centre)
+    # `up` is that of a sphere, the axes those of the ellipsoid: made square to it again.
     east, north = (v - (v @ up) * up for v in (east, north))
     turn = 2.0 * np.pi * np.arange(bearings) / bearings
     side = np.cos(turn)[:, None] * north + np.sin(turn)[:, None] * east
     side /= np.linalg.norm(side, axis=-1, keepdims=True)
     out = []
     for angle in angles:
-        lat, lon, _ = ecef_to_geodetic(6.37e6 * (np.cos(angle) * up + np.sin(angle) * side))
+        lat, lon, _ = ecef_to_geodetic(_EARTH * (np.cos(angle) * up + np.sin(angle) * side))
         at = geodetic_to_ecef(lat, lon, np.zeros(bearings))
-        cov = crlb(problem(1, order=0, height=None), at)
-        out.append(np.sqrt(np.trace(cov, axis1=-2, axis2=-1).mean()))
+        out.append(np.sqrt((root_trace(crlb(problem(1, order=0, height=None), at)) ** 2).mean()))
     return np.array(out)
 
 
-# Tracking of ships by the time differences of three satellites and a known height: four Kalman filters.
+# The tables: the four filters from fixes and from afar, what the height is worth, and satellites that move.
+
+NAMES = {
+    "ekf": "EKF",
+    "iekf": "IEKF",
+    "mgekf": "MGEKF",
+    "mvekf": "MVEKF",
+    "quartic + ekf": "EKF from two fixes",
+}
+"""How tables and figures call the filters."""
+
+# Steps at which errors are looked at; a shorter sample has the first of them. The height tells late, orbits later.
+_STEPS, _STEPS_HEIGHT, _STEPS_MOVING = (1, 10, 50, 100, 200), (1, 100, 200), (50, 100, 200)
+
+# Steps that do not count where filters are compared: the first fixes still weigh most in them.
+_SETTLED = 10
+
+# A track that ends this near to the truth is not lost, metres: nine times the bound after 100 steps.
+_NEAR = 1e3
+
+
+def metres(value: float) -> str:
+    """Return metres with a sensible number of digits; kilometres are marked."""
+    if value >= 1e4:
+        return f"{value / 1e3:.0f} km"
+    return f"{value:.1f}" if value < 1e3 else f"{value:.0f}"
+
+
+def table_fixed(found: Mapping[str, Run], bound: Array) -> Table:
+    """Return the filters started by fixes; the bound is (steps,), metres."""
+    steps = [step for step in _STEPS if step <= len(bound)]
+    plain = found["ekf"].position
+    lines = []
+    for name, run in found.items():
+        apart = np.linalg.norm(run.position - plain, axis=-1)[:, _SETTLED:].max()
+        share = f"{run.error.mean(0)[-1] / 1e3:.4f} %"  # of the 100 km of the paper: a per mille is 100 m
+        lines.append((NAMES[name], *(metres(run.rms[step - 1]) for step in steps), share, f"{apart:.2f}"))
+    lines.append(("posterior bound", *(metres(bound[step - 1]) for step in steps), ABSENT, ABSENT))
+    last = f"mean error at {len(bound)}, of 100 km"
+    header = ("filter", *(f"step {step}, m" for step in steps), last, "most from EKF after step 10, m")
+    return tabulate("fixed", header, lines)
+
+
+def table_starts(found: Mapping[float, tuple[Mapping[str, Run], Array]]) -> Table:
+    """Return the filters after starts that are far off, by the standard deviation of each coordinate, metres."""
+    lines = []
+    for width, (runs, bound) in found.items():
+        for name, run in runs.items():
+            last = run.error[:, -1]
+            lengths = (float(run.rms[-1]), float(np.median(last)), float(run.claimed[:, -1].mean()))
+            within = f"{100 * (last < _NEAR).mean():.1f} %"
+            lines.append((f"{width / 1e3:.0f} km", NAMES[name], *map(metres, lengths), within, metres(bound[-1])))
+    header = ("start error", "filter", "rms, m", "median, m", "claimed, m", "within 1 km", "posterior bound, m")
+    return tabulate("starts", header, lines)
+
+
+def table_pairs(found: Mapping[float, tuple[Mapping[str, Run], Array]]) -> Table:
+    """Return in how many runs the modified covariance did better than its rivals at the end."""
+    lines = []
+    for width, (runs, _) in found.items():
+        own = runs["mvekf"].error[:, -1]
+        better = [f"{100 * (own < runs[rival].error[:, -1]).mean():.0f} %" for rival in ("ekf", "iekf", "mgekf")]
+        lines.append((f"{width / 1e3:.0f} km", *better))
+    return tabulate("pairs", ("start error", "better than EKF", "better than IEKF", "better than MGEKF"), lines)
+
+
+def table_heights(found: Mapping[str, Run]) -> Table:
+    """Return errors and claims of the IEKF from fixes, by what is known of the height."""
+    steps = [step for step in _STEPS_HEIGHT if step <= len(next(iter(found.values())).rms)]
+    lines = [
+        (name, *(f"{metres(run.rms[s - 1])} ({metres(run.claimed[:, s - 1].mean())})" for s in steps))
+        for name, run in found.items()
+    ]
+    return tabulate("heights", ("height", *(f"step {step}: rms (claimed), m" for step in steps)), lines)
+
+
+def table_moving(found: Mapping[str, tuple[Run, Array]], still: Array) -> Table:
+    """Return errors and bounds with satellites that fly, by heading, beside the bound (steps,) of those that stay."""
+    steps = [step for step in _STEPS_MOVING if step <= len(still)]
+    lines = [("as printed: they stay", *(f"{ABSENT} ({metres(still[s - 1])})" for s in steps))]
+    for name, (run, bound) in found.items():
+        lines.append((name, *(f"{metres(run.rms[s - 1])} ({metres(bound[s - 1])})" for s in steps)))
+    return tabulate("moving", ("heading of the satellites", *(f"step {step}: rms (bound), m" for step in steps)), lines)
+
+
+# Degrees from the point below the satellites: from overhead to where a fix is worth tens of kilometres.
+_AWAY = (0.0, 5.0, 10.0, 20.0, 25.0)
+
+
+def table_one_shot() -> Table:
+    """Return the bounds of a single fix: by what is known, and by distance from the point below the satellites."""
+    cases = {
+        "50 ns each, height 500 m": problem(1, order=0),
+        "50 ns each, height known": problem(1, order=0, height=None),
+        "50 ns correlated, height 500 m": problem(1, order=0, correlated=True),
+        "50 ns correlated, height known": problem(1, order=0, height=None, correlated=True),
+        "50 ns each, height 10 m": problem(1, order=0, height=HEIGHT / 50.0),
+    }
+    lines = [(name, metres(float(root_trace(crlb(case, START))))) for name, case in cases.items()]
+    for angle, value in zip(_AWAY, far(np.radians(_AWAY).tolist()), strict=True):
+        lines.append((f"{angle:.0f}° from the point below, height known", metres(value)))
+    return tabulate("one-shot", ("case", "bound, m"), lines)
+
+
+# The figures: errors of the four filters, and what the height is worth, against time.
+
+# Wide lines below narrow ones: filters that agree are all seen.
+_STYLE = {
+    "ekf": (RED, "-", 5.0),
+    "mvekf": (ORANGE, "-", 3.2),
+    "mgekf": (GREEN, "-", 1.8),
+    "iekf": (BLUE, "--", 1.2),
+    "quartic + ekf": (PINK, ":", 1.8),
+}
+# In the order of `heights`; the fourth and the fifth agree, so one is wide and the other narrow.
+_STYLE_HEIGHT = ((BLUE, 1.8), (GREEN, 1.8), (SKY, 1.8), (RED, 4.0), (PINK, 1.6), (BLACK, 1.8))
+
+
+def figure_filters(panels: Mapping[str, tuple[Mapping[str, Run], Array]]) -> Figure:
+    """Return root mean square errors and the posterior bound against steps, one panel for each start.
+
+    Parameters
+    ----------
+    panels : mapping of str to (mapping of str to Run, array (steps,))
+        Filters and bound by title.
+    """
+    figure = canvas(0.6 + 6.0 * len(panels), 4.8)
+    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for ax, (title, (runs, bound)) in zip(axes, panels.items(), strict=True):
+        for name, (colour, dash, width) in _STYLE.items():
+            if name in runs:
+                run = runs[name]
+                steps = np.arange(len(bound) - len(run.rms) + 1, len(bound) + 1)
+                ax.plot(steps, run.rms, dash, color=colour, lw=width, label=NAMES[name])
+        ax.plot(np.arange(1, len(bound) + 1), bound, color=BLACK, lw=0.9, label="posterior bound")
+        ax.set_title(title)
+        _against_steps(ax)
+    explain(figure)
+    return figure
+
+
+def figure_heights(found: Mapping[str, Run]) -> Figure:
+    """Return errors, and what the filter claims of them (dotted), against steps, by what is known of the height."""
+    figure = canvas(8.0, 5.2)
+    ax = figure.subplots()
+    for (colour, width), (name, run) in zip(_STYLE_HEIGHT, found.items(), strict=True):
+        steps = np.arange(1, run.error.shape[1] + 1)
+        ax.plot(steps, run.rms, color=colour, lw=width, label=name)
+        ax.plot(steps, run.claimed.mean(0), ":", color=colour, lw=1.4)
+    _against_steps(ax)
+    explain(figure, 2)
+    return figure
+
+
+def _against_steps(ax: Axes) -> None:
+    scale(ax)
+    label(ax, "step, one a second", "position error, m (root mean square)")
+
+
+# Everything that the paper shows, in a quick and in a full size.
+
+_HEADINGS = {"north": 0.0, "north-east": 0.25 * np.pi, "east": 0.5 * np.pi, "south-east": 0.75 * np.pi}
+"""Directions in which satellites fly, radians; the opposite ones fly the same circles backwards."""
+
+_PANEL = 100e3
+"""Start error that a figure shows, metres: the first at which the filters come far apart."""
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """How much is drawn.
+
+    Parameters
+    ----------
+    trials : int
+        Trials of each case.
+    others : int
+        Trials of each kind of height, and of each heading of moving satellites.
+    widths : tuple of float
+        Start errors, metres; 100 km, which a figure shows, among them.
+    steps, far : int
+        Steps of the filters, and of those from far starts; more than ten.
+    """
+
+    trials: int
+    others: int
+    widths: tuple[float, ...] = (1e3, 10e3, 30e3, 100e3, 200e3, 400e3)
+    steps: int = 200
+    far: int = 100
+
+
+# Quick: root mean squares within five per cent, in about a minute. Full: within two.
+_SIZES: dict[Size, Sample] = {"quick": Sample(200, 100), "full": Sample(2000, 1000)}
+
+
+def _run(sample: Sample, seed: int, tick: Tick) -> Report:
+    def sequence(key: int) -> np.random.SeedSequence:
+        return np.random.SeedSequence(seed, spawn_key=(key,))
+
+    begun = fixed(sample.steps, sample.trials, sequence(0))
+    tick()
+    starts = {}
+    for width in sample.widths:
+        # The same data for every width: only the start differs.
+        starts[width] = wild(width, sample.far, sample.trials, sequence(1))
+        tick()
+    known = heights(sample.steps, sample.others, sequence(2))
+    tick()
+    known["climbing target, height said to be 0"] = climbing(sample.steps, sample.others, sequence(3))
+    tick()
+    flying = {}
+    for name, heading in _HEADINGS.items():
+        flying[name] = moving(orbits(sample.steps + 2, heading), sample.others, sequence(4))
+        tick()
+    panels = {"from the first two fixes": begun, "start wrong by 100 km": starts[_PANEL]}
+    tables = (
+        table_fixed(*begun),
+        table_starts(starts),
+        table_pairs(starts),
+        table_heights(known),
+        table_moving(flying, begun[1]),
+        table_one_shot(),
+    )
+    figures = {"filters": figure_filters(panels), "heights": figure_heights(known)}
+    return typeset("satellites", sample, seed, tables, figures)
+
+
+STUDY = Study(_SIZES, lambda sample: len(sample.widths) + len(_HEADINGS) + 3, _run)
+"""The reproduction of the paper."""

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from optloc.cli import app
-from optloc.papers import angles, angles_page
+from optloc.papers import angles, angles_tables
 from optloc.papers.angles import READINGS, REPAIRED, STRAIGHT, WINDING, draw
 from optloc.papers.report import Study
 
@@ -30,20 +30,20 @@ BOUNDS = {"posterior bound, a_max 2": (0.0297, 0.182, 0.531), "bound of one trac
 
 
 def test_simulation_1():
-    curves = {c.label: c.total() for c in angles.straight(draw(STRAIGHT, 200, 1, 0), quiet)}
+    curves = {c.label: c.total() for c in angles_tables.run_straight(draw(STRAIGHT, 200, 1, 0), quiet)}
     for label, wanted in FILTERS.items():
         assert curves[label] == pytest.approx(wanted, rel=0.10)
     for label, wanted in BOUNDS.items():
         assert curves[label] == pytest.approx(wanted, rel=0.005)
     # With the printed f33 the acceleration is hardly estimated, whatever the limit; the printed error is of that size.
     slips = [curves[f"printed f33, a_max {limit}"][2] for limit in ("30", "2", "0.3")]
-    assert slips == pytest.approx([angles_page.PRINTED_STRAIGHT[2]] * 3, rel=0.15)
+    assert slips == pytest.approx([angles_tables.PRINTED_STRAIGHT[2]] * 3, rel=0.15)
 
 
 def test_simulation_2_is_a_start_transient():
-    rest, fit, least = angles.winding(draw(WINDING, 200, 1, 1), quiet)
+    rest, fit, least = angles_tables.run_winding(draw(WINDING, 200, 1, 1), quiet)
     assert rest.total() == pytest.approx([0.161, 0.273, 0.409], rel=0.05)
-    assert rest.total() == pytest.approx(angles_page.PRINTED_WINDING, rel=0.15)
+    assert rest.total() == pytest.approx(angles_tables.PRINTED_WINDING, rel=0.15)
     assert rest.total(10) == pytest.approx([0.0078, 0.0267, 0.0357], rel=0.10)
     assert fit.total()[0] < 0.07 * rest.total()[0]
     assert fit.total()[0] == pytest.approx(least.total(3)[0], rel=0.10)
@@ -51,7 +51,7 @@ def test_simulation_2_is_a_start_transient():
 
 
 def test_simulation_3():
-    found = angles.circles(draw(REPAIRED, 50, 1, 2), quiet)
+    found = angles_tables.run_circles(draw(REPAIRED, 50, 1, 2), quiet)
     wanted = {100.0: ((426, 754, 768), (471, 583, 788)), 300.0: ((497, 624, 854), (538, 669, 919))}
     for limit, (error, least) in wanted.items():
         phases = {c.label: c.phases(REPAIRED) for c in found[limit]}
@@ -69,7 +69,7 @@ def test_simulation_3_as_printed():
         ("as printed, in km/s", 100.0): ((3075, None, None), (3468, 7044, 11537)),
         ("as printed, in km/s", 300.0): ((3845, 8052, 13171), (4266, 8743, 14541)),
     }
-    for found in angles.readings(50, 1, 8, quiet):
+    for found in angles_tables.run_readings(50, 1, 8, quiet):
         error, least = wanted[found.scenario.name, found.limit]
         assert found.bound == pytest.approx(least, rel=3e-3)
         for mine, value in zip(found.error, error, strict=True):
@@ -87,7 +87,7 @@ def test_the_circle_as_printed_ends_facing_backwards():
 
 
 def test_the_clamp_saves_tracks():
-    share = angles.clamps(draw(STRAIGHT, 200, 1, 3), quiet)
+    share = angles_tables.run_clamps(draw(STRAIGHT, 200, 1, 3), quiet)
     assert share["as published"] > 0.04
     assert share["clamped"] < 0.5 * share["as published"]
 
@@ -125,7 +125,7 @@ def test_with_the_printed_arctangent_simulation_1_runs_away(limit):
 
 def test_fits_to_the_whole_track():
     assert angles.whole_track_bound() == pytest.approx([0.01129, 6.00e-4, 1.63e-5], rel=1e-3)
-    found = dict(angles.wholes(draw(STRAIGHT, 200, 1, 0), quiet))
+    found = dict(angles.run_wholes(draw(STRAIGHT, 200, 1, 0), quiet))
     assert found["plain"] == pytest.approx([0.0143, 7.9e-4, 2.2e-5], rel=0.10)
     assert found["maximum likelihood (optloc)"] == pytest.approx([0.0117, 6.1e-4, 1.64e-5], rel=0.08)
     assert found["instrumental variables"] == pytest.approx(found["maximum likelihood (optloc)"], rel=2e-3)
@@ -133,7 +133,7 @@ def test_fits_to_the_whole_track():
 
 
 def test_many_rays_need_instrumental_variables_and_few_do_not():
-    few, _, _, many = angles.rays(200, 1, 4, quiet)
+    few, _, _, many = angles.run_rays(200, 1, 4, quiet)
     assert few.bound == pytest.approx(5265.0, rel=1e-3)
     errors = [error for _, error in few.fixes]
     assert errors == pytest.approx([5300.0] * 4, rel=0.10)
@@ -143,16 +143,16 @@ def test_many_rays_need_instrumental_variables_and_few_do_not():
     assert best == pytest.approx(many.bound, rel=0.10)
 
 
-TINY = angles_page.Sample(8, 12, 3, 1)
+TINY = angles_tables.Sample(8, 12, 3, 1)
 
 
 @pytest.fixture(scope="module")
 def report():
     # Simulation 3 as printed lasts 3000 s; here it has two minutes.
     short = tuple(replace(s, states=s.states[:121], phases=(40, 80, 120)) for s in READINGS)
-    ticks, plan = [], angles_page.STUDY.plan(TINY, 3)
+    ticks, plan = [], angles_tables.STUDY.plan(TINY, 3)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(angles, "READINGS", short)
+        patch.setattr(angles_tables, "READINGS", short)
         made = plan.run(lambda: ticks.append(1))
     assert len(ticks) == plan.work
     return made
@@ -173,8 +173,8 @@ def test_a_reproduction_has_every_table_and_figure(report):
 
 
 def test_reproduce_writes_the_page(report, tmp_path, monkeypatch):
-    cheap = Study(angles_page.STUDY.sizes, lambda _: 1, lambda *_: report)
-    monkeypatch.setattr(angles_page, "STUDY", cheap)
+    cheap = Study(angles_tables.STUDY.sizes, lambda _: 1, lambda *_: report)
+    monkeypatch.setattr(angles_tables, "STUDY", cheap)
     result = RUN.invoke(app, ["reproduce", "angles", "--out", str(tmp_path / "new"), "--quiet"])
     assert result.exit_code == 0, result.output
     page = (tmp_path / "new" / "README.md").read_text(encoding="utf-8")
@@ -184,4 +184,4 @@ def test_reproduce_writes_the_page(report, tmp_path, monkeypatch):
 
 def test_numbers_in_cells():
     values = (0.0, 0.01234, 6.0e-4, 5.4321, 1285.7, 2e6, np.nan)
-    assert [angles_page.short(v) for v in values] == ["0", "0.0123", "6.00e-04", "5.43", "1286", "lost", "lost"]
+    assert [angles_tables.short(v) for v in values] == ["0", "0.0123", "6.00e-04", "5.43", "1286", "lost", "lost"]

@@ -5,7 +5,7 @@ import pytest
 from typer.testing import CliRunner
 
 from optloc.cli import app
-from optloc.papers import bistatic, bistatic_page
+from optloc.papers import bistatic
 from optloc.papers.bistatic import (
     BASELINE,
     COURSE,
@@ -85,19 +85,19 @@ def test_short_records_beat_their_bound_where_the_path_is_good():
 
 
 def test_a_ground_repairs_the_height_only():
-    found = {name: errors / 1e3 for name, errors in bistatic.spread(1.446, 0.002463, 200, sequence(4)).items()}
+    found = {name: errors / 1e3 for name, errors in bistatic.fix_grounded(1.446, 0.002463, 200, sequence(4)).items()}
     assert found["free"] == pytest.approx([0.945, 1.416, 2.218], rel=0.15)
     assert found["above ground"][1] == pytest.approx(1.019, rel=0.15)
     assert found["above ground"][0] == pytest.approx(found["free"][0], rel=0.01)
     assert found["known height"][1] < 1e-3
 
 
-TINY = bistatic_page.Sample(20, 4, 4, epochs=60)
+TINY = bistatic.Sample(20, 4, 4, epochs=60)
 
 
 @pytest.fixture(scope="module")
 def report():
-    ticks, plan = [], bistatic_page.STUDY.plan(TINY, 3)
+    ticks, plan = [], bistatic.STUDY.plan(TINY, 3)
     made = plan.run(lambda: ticks.append(1))
     assert len(ticks) == plan.work
     return made
@@ -116,8 +116,8 @@ def test_a_reproduction_has_every_table_and_figure(report):
 
 
 def test_reproduce_writes_the_page(report, tmp_path, monkeypatch):
-    cheap = Study(bistatic_page.STUDY.sizes, lambda _: 1, lambda *_: report)
-    monkeypatch.setattr(bistatic_page, "STUDY", cheap)
+    cheap = Study(bistatic.STUDY.sizes, lambda _: 1, lambda *_: report)
+    monkeypatch.setattr(bistatic, "STUDY", cheap)
     result = RUN.invoke(app, ["reproduce", "bistatic", "--out", str(tmp_path / "new"), "--seed", "3"])
     assert result.exit_code == 0, result.output
     page = (tmp_path / "new" / "README.md").read_text(encoding="utf-8")

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 from optloc import solve
 from optloc.base.types import Motion
 from optloc.cli import app
-from optloc.papers import kinematic_page
+from optloc.papers import kinematic_tables
 from optloc.papers.kinematic import (
     FILTERS,
     ORDERS,
@@ -31,7 +31,7 @@ from optloc.papers.kinematic import (
     unlabelled,
     weighting,
 )
-from optloc.papers.kinematic_page import km
+from optloc.papers.kinematic_tables import km
 from optloc.papers.report import Study
 from optloc.problem.epochs import cut
 
@@ -90,7 +90,7 @@ def test_mean_errors_of_matched_models(matched, name, wanted):
 
 def test_the_fix_and_the_wrong_model_fit_the_printed_ones(drawn, single):
     assert KM * single.mean == pytest.approx(0.9620, rel=0.02)
-    assert KM * single.mean == pytest.approx(kinematic_page.ERROR["static"], rel=0.04)
+    assert KM * single.mean == pytest.approx(kinematic_tables.ERROR["static"], rel=0.04)
     wrong = scored(drawn["CA"], tracked(drawn["CA"], PLAIN[1]))
     assert KM * wrong.mean == pytest.approx(10.304, rel=0.02)
     assert KM * wrong.error[..., -1].mean() == pytest.approx(36.3, rel=0.02)
@@ -101,7 +101,9 @@ def test_the_fix_and_the_wrong_model_fit_the_printed_ones(drawn, single):
 def test_errors_over_that_of_the_fix(matched, single, name, wanted, within):
     ratio = matched[name].mean / single.mean
     assert ratio == pytest.approx(wanted, abs=within)
-    assert ratio == pytest.approx(kinematic_page.ERROR[f"{name} on {name}"] / kinematic_page.ERROR["static"], abs=0.03)
+    assert ratio == pytest.approx(
+        kinematic_tables.ERROR[f"{name} on {name}"] / kinematic_tables.ERROR["static"], abs=0.03
+    )
 
 
 @pytest.mark.parametrize("name", ["static", "CV", "CA"])
@@ -135,7 +137,7 @@ def test_right_and_wrong_models(drawn, index):
 
 
 def test_the_likelihood_chooses_the_right_model(drawn):
-    shares = {name: kinematic_page._sides(own, ORDERS[name])[0] for name, own in drawn.items()}
+    shares = {name: kinematic_tables._sides(own, ORDERS[name])[0] for name, own in drawn.items()}
     assert min(share[4:].min() for share in shares.values()) > 0.99
     third = [shares[name][2] for name in ORDERS]
     assert third == pytest.approx([0.999, 0.997, 0.46], abs=0.05)
@@ -241,12 +243,12 @@ def test_the_course_of_a_target_that_begins_to_accelerate():
     assert end == pytest.approx([300e3, 400e3 + 45e3 - 0.5 * 100.0 * 22.5**2, 0.0, 1e3 - 2250.0, 0.0, -100.0])
 
 
-TINY = kinematic_page.Sample(6, 3)
+TINY = kinematic_tables.Sample(6, 3)
 
 
 @pytest.fixture(scope="module")
 def report():
-    ticks, plan = [], kinematic_page.STUDY.plan(TINY, 3)
+    ticks, plan = [], kinematic_tables.STUDY.plan(TINY, 3)
     made = plan.run(lambda: ticks.append(1))
     assert len(ticks) == plan.work
     return made
@@ -271,8 +273,8 @@ def test_a_reproduction_has_every_table_and_figure(report):
 
 def test_reproduce_writes_tables_and_pictures(report, tmp_path, monkeypatch):
     seeds = []
-    cheap = Study(kinematic_page.STUDY.sizes, lambda _: 1, lambda _, seed, tick: seeds.append(seed) or report)
-    monkeypatch.setattr(kinematic_page, "STUDY", cheap)
+    cheap = Study(kinematic_tables.STUDY.sizes, lambda _: 1, lambda _, seed, tick: seeds.append(seed) or report)
+    monkeypatch.setattr(kinematic_tables, "STUDY", cheap)
     result = RUN.invoke(app, ["reproduce", "kinematic", "--out", str(tmp_path), "--seed", "3"])
     assert result.exit_code == 0, result.output
     assert seeds == [3]

@@ -13,7 +13,7 @@ from optloc.files import read
 from optloc.linear.evaluate import predict
 from optloc.linear.normal import normal
 from optloc.linear.normal import step as house_step
-from optloc.papers import registration, registration_page
+from optloc.papers import registration, registration_tables
 from optloc.papers.registration import (
     FIRST,
     MOVING,
@@ -33,7 +33,7 @@ from optloc.papers.registration import (
     truth,
     wander,
 )
-from optloc.papers.registration_page import accuracy, flatness, metres, separation
+from optloc.papers.registration_tables import accuracy, flatness, metres, separation
 from optloc.papers.report import Study
 
 RUN = CliRunner()
@@ -67,7 +67,7 @@ def test_bounds_of_the_fixed_target(epochs, shape, delay, wanted):
 
 def test_the_one_shot_bound_is_the_printed_one():
     assert one_shot() == pytest.approx([1855.63, 2758.83, 160.337], abs=5e-3)
-    assert tuple(np.floor(one_shot())) == registration_page.SIGMA0
+    assert tuple(np.floor(one_shot())) == registration_tables.SIGMA0
 
 
 def test_the_moving_bound_is_that_of_the_initial_place():
@@ -226,12 +226,12 @@ def test_the_shipped_problem_is_made_by_its_script_and_solved():
     assert 1e-3 < fix.p_value < 0.999
 
 
-TINY = registration_page.Sample(4, 6, (150, 200, 300, 400), (300, 400, 550, 700), last=150)
+TINY = registration_tables.Sample(4, 6, (150, 200, 300, 400), (300, 400, 550, 700), last=150)
 
 
 @pytest.fixture(scope="module")
 def report():
-    ticks, plan = [], registration_page.STUDY.plan(TINY, 3)
+    ticks, plan = [], registration_tables.STUDY.plan(TINY, 3)
     made = plan.run(lambda: ticks.append(1))
     assert len(ticks) == plan.work
     return made
@@ -253,8 +253,8 @@ def test_a_reproduction_has_every_table_and_figure(report):
 
 def test_reproduce_writes_tables_and_pictures(report, tmp_path, monkeypatch):
     seeds = []
-    cheap = Study(registration_page.STUDY.sizes, lambda _: 1, lambda _, seed, tick: seeds.append(seed) or report)
-    monkeypatch.setattr(registration_page, "STUDY", cheap)
+    cheap = Study(registration_tables.STUDY.sizes, lambda _: 1, lambda _, seed, tick: seeds.append(seed) or report)
+    monkeypatch.setattr(registration_tables, "STUDY", cheap)
     folder = tmp_path / "new"
     result = RUN.invoke(app, ["reproduce", "registration", "--out", str(folder), "--seed", "3"])
     assert result.exit_code == 0, result.output

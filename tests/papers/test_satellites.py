@@ -6,7 +6,7 @@ from typer.testing import CliRunner
 
 from optloc import ECEF, crlb, predict
 from optloc.cli import app
-from optloc.papers import satellites_page
+from optloc.papers import satellites
 from optloc.papers.report import Study
 from optloc.papers.satellites import (
     COURSE,
@@ -111,12 +111,12 @@ def test_orbits_keep_the_formation_and_its_height():
     assert np.arctan2(step @ east, step @ north) == pytest.approx(0.7, abs=1e-2)
 
 
-TINY = satellites_page.Sample(4, 4, (100e3,), steps=20, far=12)
+TINY = satellites.Sample(4, 4, (100e3,), steps=20, far=12)
 
 
 @pytest.fixture(scope="module")
 def report():
-    ticks, plan = [], satellites_page.STUDY.plan(TINY, 3)
+    ticks, plan = [], satellites.STUDY.plan(TINY, 3)
     made = plan.run(lambda: ticks.append(1))
     assert len(ticks) == plan.work
     return made
@@ -134,8 +134,8 @@ def test_a_reproduction_has_every_table_and_figure(report):
 
 
 def test_reproduce_writes_the_page(report, tmp_path, monkeypatch):
-    cheap = Study(satellites_page.STUDY.sizes, lambda _: 1, lambda *_: report)
-    monkeypatch.setattr(satellites_page, "STUDY", cheap)
+    cheap = Study(satellites.STUDY.sizes, lambda _: 1, lambda *_: report)
+    monkeypatch.setattr(satellites, "STUDY", cheap)
     result = RUN.invoke(app, ["reproduce", "satellites", "--out", str(tmp_path / "new"), "--seed", "3"])
     assert result.exit_code == 0, result.output
     page = (tmp_path / "new" / "README.md").read_text(encoding="utf-8")

@@ -1,0 +1,506 @@
+"""The paper `angles` made again: what is run, its tables and its figures, with printed value and bound beside each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.papers.angles import (
+    CIRCLE_START,
+    LOST,
+    READINGS,
+    REPAIRED,
+    STRAIGHT,
+    STRAIGHT_START,
+    TIME_CONSTANT,
+    WINDING,
+    WINDING_START,
+    Draw,
+    Rays,
+    Scenario,
+    bound,
+    distances,
+    draw,
+    errors,
+    first_fix,
+    fitted_start,
+    fixed_variance,
+    fixes,
+    linear_track,
+    lost,
+    placed,
+    printed_transition,
+    printed_variance,
+    rms,
+    run_rays,
+    run_wholes,
+    scattered,
+    snapshot_bound,
+    tracked,
+    whole_track_bound,
+)
+from optloc.papers.report import (
+    ABSENT,
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    PINK,
+    RED,
+    Report,
+    Size,
+    Study,
+    Table,
+    Tick,
+    canvas,
+    explain,
+    label,
+    percent,
+    scale,
+    tabulate,
+    typeset,
+)
+from optloc.track import Dynamics, State, current_statistical, polynomial
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+# What the paper prints in section 3.
+
+PRINTED_STRAIGHT = (0.032, 0.0897, 0.176)
+"""Simulation 1: root mean square errors of position (m), velocity (m/s) and acceleration (m/s^2)."""
+
+PRINTED_WINDING = (0.16, 0.267, 0.47)
+"""Simulation 2: the same."""
+
+
+# Filters in the three simulations: errors against time, bounds and lost tracks.
+
+UPDATES = ("ekf", "iekf", "mgekf", "mvekf")
+"""Names in `optloc.track.UPDATES`, in the order of the tables."""
+
+SETTLED = 20
+"""Seconds of simulation 3 that are not scored, two time constants of the model: it begins at the fix of one second."""
+
+_CLOSE = (0.1, 0.2)
+"""Standard deviations of velocity and acceleration where the place of the start is varied; see `STRAIGHT_START`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """Errors against time.
+
+    Parameters
+    ----------
+    label : str
+        What made them.
+    seconds : array (q,)
+        When.
+    error : array (q, 3)
+        Root mean square errors, or bounds, of position, velocity and acceleration.
+    """
+
+    label: str
+    seconds: Array
+    error: Array
+
+    def total(self, first: int = 0, last: int | None = None) -> Array:
+        """Return the root mean square (3,) over first < t <= last seconds."""
+        inside = (self.seconds > first) & (self.seconds <= (np.inf if last is None else last))
+        return np.asarray(np.sqrt((self.error[inside] ** 2).mean(0)))
+
+    def phases(self, scenario: Scenario) -> list[float]:
+        """Return the root mean square position error of each phase; the first `SETTLED` seconds do not count."""
+        first = (SETTLED, *scenario.phases[:-1])
+        return [float(self.total(a, b)[0]) for a, b in zip(first, scenario.phases, strict=True)]
+
+
+def curve(label: str, drawn: Draw, start: State, dynamics: Dynamics, update: str = "ekf") -> Curve:
+    """Return the errors of the tracks from a start."""
+    return scored(label, drawn, tracked(drawn, start, dynamics, update).mean)
+
+
+def scored(label: str, drawn: Draw, mean: Array) -> Curve:
+    """Return the errors of states (trials, q, n) at the last q epochs."""
+    error = rms(errors(drawn, mean), (0,))
+    last = drawn.scenario.epochs
+    return Curve(label, np.arange(last - len(error) + 1.0, last + 1.0), error)
+
+
+def bounded(label: str, scenario: Scenario, start: State, dynamics: Dynamics) -> Curve:
+    """Return the posterior bound from a start."""
+    least = bound(scenario, start, dynamics)
+    return Curve(label, np.arange(start.time + 1.0, scenario.epochs + 1.0), least)
+
+
+def run_straight(drawn: Draw, tick: Tick) -> list[Curve]:
+    """Return simulation 1: the filter with the right and the printed transition, three limits, and bounds."""
+    start, out = placed(drawn, STRAIGHT_START, known=2), []
+    for limit in (30.0, 2.0, 0.3):
+        for name, make in (("filter", current_statistical), ("printed f33", printed_transition)):
+            out.append(curve(f"{name}, a_max {limit:g}", drawn, start, make(TIME_CONSTANT, limit)))
+            tick()
+    out.append(bounded("posterior bound, a_max 2", STRAIGHT, start, fixed_variance(2.0)))
+    out.append(bounded("bound of one track", STRAIGHT, start, polynomial(2)))
+    tick()
+    return out
+
+
+def run_winding(drawn: Draw, tick: Tick) -> list[Curve]:
+    """Return simulation 2: started at rest, and by a fit of the first three epochs."""
+    model = current_statistical(TIME_CONSTANT, 30.0)
+    start = placed(drawn, WINDING_START, known=1)
+    out = [
+        curve("filter, started at rest", drawn, start, model),
+        curve("filter, started by a fit of 3 s", drawn, fitted_start(drawn, 3), model, "iekf"),
+        bounded("posterior bound", WINDING, start, fixed_variance(30.0)),
+    ]
+    tick()
+    return out
+
+
+def run_circles(drawn: Draw, tick: Tick) -> dict[float, list[Curve]]:
+    """Return the repaired simulation 3 by limit: three filters and the bound."""
+    start, out = first_fix(drawn, *CIRCLE_START), {}
+    places = fixes(drawn)
+    tick()
+    for limit in (100.0, 300.0):
+        model = current_statistical(TIME_CONSTANT, limit)
+        out[limit] = [
+            curve("single step", drawn, start, model),
+            curve("converged", drawn, start, model, "iekf"),
+            scored("fixes, then a linear filter", drawn, linear_track(places, start, model)),
+            bounded("posterior bound", REPAIRED, start, fixed_variance(limit)),
+        ]
+        tick()
+    return out
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """Position errors and bounds of the phases of simulation 3 as printed.
+
+    Parameters
+    ----------
+    scenario : Scenario
+        One of `READINGS`.
+    limit : float
+        Largest acceleration of the model.
+    error, bound : list of float
+        Metres, by phase.
+    """
+
+    scenario: Scenario
+    limit: float
+    error: list[float]
+    bound: list[float]
+
+
+def run_readings(count: int, seed: int, key: int, tick: Tick) -> list[Reading]:
+    """Return simulation 3 as printed."""
+    out = []
+    for i, scenario in enumerate(READINGS):
+        drawn = draw(scenario, count, seed, key + i)
+        start = first_fix(drawn, *CIRCLE_START)
+        for limit in (100.0, 300.0):
+            found = curve("", drawn, start, current_statistical(TIME_CONSTANT, limit))
+            tick()
+            least = bounded("", scenario, start, fixed_variance(limit))
+            out.append(Reading(scenario, limit, found.phases(scenario), least.phases(scenario)))
+            tick()
+    return out
+
+
+def run_snapshot() -> Curve:
+    """Return the bound of every second of the repaired simulation 3 by itself, whose last two columns are NaN."""
+    least = snapshot_bound(REPAIRED)
+    error = np.full((len(least), 3), np.nan)
+    error[:, 0] = least
+    return Curve("snapshot", np.arange(1.0, len(least) + 1.0), error)
+
+
+Lost = dict[tuple[float, float], dict[str, float]]
+"""Shares of lost tracks by filter, by standard deviation of the start's coordinates, metres, and largest acceleration.
+
+The first is zero for a start by a fit of the first epochs."""
+
+
+def run_starts(drawn: Draw, tick: Tick) -> Lost:
+    """Return who is lost from starts on the line through the stations, and from a fit of three epochs."""
+    out: Lost = {}
+    fit = fitted_start(drawn, 3)
+    for sigma, limit in ((1.0, 5.0), (1.0, 30.0), (3.0, 5.0), (3.0, 30.0), (0.0, 30.0)):
+        start = scattered(drawn, (sigma, *_CLOSE)) if sigma else fit
+        model = current_statistical(TIME_CONSTANT, limit)
+        out[sigma, limit] = {name: lost(drawn, tracked(drawn, start, model, name)) for name in UPDATES}
+        tick()
+    return out
+
+
+def run_clamps(drawn: Draw, tick: Tick) -> dict[str, float]:
+    """Return the share of lost tracks with the variance as published and clamped, from 3 m and with a_max 0.3."""
+    start = scattered(drawn, (3.0, *_CLOSE))
+    models = {"as published": printed_variance, "clamped": current_statistical}
+    found = {name: lost(drawn, tracked(drawn, start, make(TIME_CONSTANT, 0.3))) for name, make in models.items()}
+    tick()
+    return found
+
+
+def run_ends(drawn: Draw, tick: Tick) -> dict[str, Array]:
+    """Return the distances (trials,) from the truth at the end of simulation 1, by start and filter."""
+    model = current_statistical(TIME_CONSTANT, 30.0)
+    start = scattered(drawn, (1.0, *_CLOSE))
+    tracks = {
+        "single step (the paper), start of 1 m": tracked(drawn, start, model, "ekf"),
+        "converged, start of 1 m": tracked(drawn, start, model, "iekf"),
+        "single step, started by a fit of 3 s": tracked(drawn, fitted_start(drawn, 3), model, "ekf"),
+    }
+    tick()
+    return {name: distances(drawn, track) for name, track in tracks.items()}
+
+
+# The tables.
+
+_PARTS = ("position, m", "velocity, m/s", "acceleration, m/s²")
+_FAR = 1e6  # metres: a track beyond is on its way to nowhere, and its error is the time since it left
+
+
+def short(value: float) -> str:
+    """Return a number with three significant digits, "lost" where it is not finite or beyond 1000 km."""
+    if not np.isfinite(value) or value > _FAR:
+        return "lost"
+    if value == 0.0 or value >= 1e2:
+        return f"{value:.0f}"
+    return f"{value:.2e}" if value < 1e-3 else f"{value:.{2 - int(np.floor(np.log10(value)))}f}"
+
+
+def _row(values: Iterable[float]) -> tuple[str, ...]:
+    return tuple(map(short, values))
+
+
+def table_straight(curves: Sequence[Curve]) -> Table:
+    """Return the errors of simulation 1 over the whole track."""
+    lines = [("printed", *_row(PRINTED_STRAIGHT)), *((c.label, *_row(c.total())) for c in curves)]
+    return tabulate("simulation-1", ("", *_PARTS), lines)
+
+
+def table_winding(curves: Sequence[Curve]) -> Table:
+    """Return the errors of simulation 2, over the whole track and without its first ten seconds."""
+    lines = [("0 to 50 s", "printed", *_row(PRINTED_WINDING))]
+    for first in (0, 10):
+        lines += [(f"{first} to 50 s", c.label, *_row(c.total(first))) for c in curves]
+    return tabulate("simulation-2", ("scored", "", *_PARTS), lines)
+
+
+def table_circles(found: Mapping[float, Sequence[Curve]], snapshot: Curve) -> Table:
+    """Return the position errors of the repaired simulation 3."""
+    lines = [(ABSENT, "bound of every second by itself", *_row(snapshot.phases(REPAIRED)))]
+    for limit, curves in found.items():
+        lines += [(f"{limit:g}", c.label, *_row(c.phases(REPAIRED))) for c in curves]
+    return tabulate("simulation-3", ("a_max", "", "straight", "circle", "straight again"), lines)
+
+
+def table_readings(found: Sequence[Reading]) -> Table:
+    """Return the position errors of simulation 3 as printed."""
+    lines = []
+    for each in found:
+        pairs = [value for pair in zip(each.error, each.bound, strict=True) for value in pair]
+        lines.append((each.scenario.name.removeprefix("as printed, in "), f"{each.limit:g}", *_row(pairs)))
+    header = ("reading", "a_max", "straight", "bound", "circle", "bound", "straight again", "bound")
+    return tabulate("readings", header, lines)
+
+
+def table_starts(found: Lost) -> Table:
+    """Return the shares of lost tracks."""
+    header = ("start", "a_max", "single step", "converged", "modified gain", "modified covariance")
+    lines = [
+        (f"{sigma:g} m" if sigma else "fit of 3 s", f"{limit:g}", *map(percent, shares.values()))
+        for (sigma, limit), shares in found.items()
+    ]
+    return tabulate("starts", header, lines)
+
+
+def table_clamps(found: Mapping[str, float]) -> Table:
+    """Return the shares of lost tracks with and without a clamped variance."""
+    return tabulate("clamp", ("variance", "lost"), [(name, percent(share)) for name, share in found.items()])
+
+
+def table_wholes(found: Sequence[tuple[str, Array]], bound: Array) -> Table:
+    """Return the errors at the end of simulation 1 of fits to the whole track."""
+    lines = [("Cramér-Rao bound", *_row(bound)), *((name, *_row(error)) for name, error in found)]
+    return tabulate("whole-track", ("", *_PARTS), lines)
+
+
+def table_rays(found: Sequence[Rays]) -> Table:
+    """Return bias and error of fixes of a target that stays."""
+    names = ("plain", "weighted", "instrumental", "maximum likelihood")
+    lines = [
+        (f"{each.stations}", f"{1e3 * each.sigma:g} mrad", name, *_row((*values, each.bound)))
+        for each in found
+        for name, values in zip(names, each.fixes, strict=True)
+    ]
+    return tabulate("rays", ("stations", "noise", "fix", "bias", "error", "bound"), lines)
+
+
+# Figures 1 to 7 of the paper as errors and bounds against time, and one of the starts that lose the track.
+
+_EDGES = (1e-3, 1e8)  # of the axis of distances, metres: from far below the noise to where tracks run away
+Style = tuple[str, str, str]
+"""Label, colour and line style of a curve."""
+
+
+def three_parts(curves: Mapping[Style, Curve], values: Sequence[float]) -> Figure:
+    """Return errors of position, velocity and acceleration against time, one panel for each.
+
+    Parameters
+    ----------
+    curves : mapping of (label, colour, line) to Curve
+        What is drawn.
+    values : sequence of three float
+        Printed errors over the whole track.
+    """
+    figure = canvas(13.0, 4.4)
+    for part, (ax, name) in enumerate(zip(figure.subplots(1, 3), _PARTS, strict=True)):
+        for (curve, colour, line), found in curves.items():
+            ax.plot(found.seconds, found.error[:, part], line, color=colour, label=curve)
+        ax.axhline(values[part], color=PINK, linestyle=":", label="printed, over the track")
+        scale(ax)
+        label(ax, "time, s", f"error of {name}")
+    explain(figure)
+    return figure
+
+
+def figure_straight(curves: Sequence[Curve]) -> Figure:
+    """Return figures 1 to 3: simulation 1."""
+    by = {c.label: c for c in curves}
+    return three_parts(
+        {
+            ("filter, a_max 2", BLUE, "-"): by["filter, a_max 2"],
+            ("filter, a_max 30", GREEN, "-"): by["filter, a_max 30"],
+            ("printed f33, a_max 2", RED, "-"): by["printed f33, a_max 2"],
+            ("posterior bound, a_max 2", BLACK, "--"): by["posterior bound, a_max 2"],
+            ("bound of one track", GREY, "--"): by["bound of one track"],
+        },
+        PRINTED_STRAIGHT,
+    )
+
+
+def figure_winding(curves: Sequence[Curve]) -> Figure:
+    """Return figures 4 to 6: simulation 2."""
+    looks = ((RED, "-"), (BLUE, "-"), (BLACK, "--"))
+    return three_parts({(c.label, *look): c for c, look in zip(curves, looks, strict=True)}, PRINTED_WINDING)
+
+
+def figure_circles(found: Mapping[float, Sequence[Curve]], snapshot: Curve) -> Figure:
+    """Return figure 7: position errors of the repaired simulation 3, one panel for each limit."""
+    figure = canvas(13.0, 4.6)
+    axes = figure.subplots(1, len(found), sharey=True, squeeze=False)[0]
+    for ax, (limit, curves) in zip(axes, found.items(), strict=True):
+        ax.axvspan(*REPAIRED.phases[:2], color="#EEEEEE")
+        ax.plot(snapshot.seconds, snapshot.error[:, 0], ":", color=GREY, label="bound of every second by itself")
+        by = {c.label: c for c in curves}
+        # The two filters hardly differ: the converged one is a broad line behind the other.
+        looks = (
+            ("converged", RED, "-", 4.0),
+            ("single step", BLUE, "-", 1.2),
+            ("posterior bound", BLACK, "--", 1.5),
+        )
+        for curve, colour, line, width in looks:
+            ax.plot(by[curve].seconds, by[curve].error[:, 0], line, color=colour, label=curve, lw=width)
+        label(ax, "time, s", "position error, m (root mean square)" if ax is axes[0] else "")
+        ax.set_title(f"a_max = {limit:g} m/s²; shaded: circle with 74 m/s²")
+        ax.set_ylim(0.0, 1800.0)
+    explain(figure)
+    return figure
+
+
+def figure_starts(ends: Mapping[str, Array]) -> Figure:
+    """Return the share of tracks that end nearer to the truth than a distance.
+
+    Parameters
+    ----------
+    ends : mapping of str to array (trials,)
+        Distances at the end, by label.
+    """
+    figure = canvas(7.0, 4.4)
+    ax = figure.subplots()
+    looks = ((RED, "-", 1.5), (BLUE, "-", 4.0), (GREEN, "--", 1.5))
+    for (curve, values), (colour, line, width) in zip(ends.items(), looks, strict=True):
+        ordered = np.sort(np.append(np.where(np.isfinite(values), values, np.inf), _EDGES))
+        share = np.searchsorted(np.sort(values), ordered, side="right") / len(values)
+        ax.step(ordered, share, line, where="post", color=colour, label=curve, lw=width)
+    ax.axvline(LOST, color=GREY, linestyle=":", label="counts as lost")
+    ax.set_xscale("log")
+    ax.set_xlim(*_EDGES)
+    label(ax, "distance from the truth at 50 s, m", "share of tracks")
+    ax.legend(loc="lower right", frameon=False)
+    return figure
+
+
+# Everything that the paper shows, in a quick and in a full size.
+
+_TICKS = 31  # calls of `tick` below
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """How much is drawn.
+
+    Parameters
+    ----------
+    trials : int
+        Trials of simulations 1 and 2 and of fixes.
+    many : int
+        Trials of the table of lost tracks.
+    circles : int
+        Trials of the repaired simulation 3.
+    readings : int
+        Trials of simulation 3 as printed, 3000 s each.
+    """
+
+    trials: int
+    many: int
+    circles: int
+    readings: int
+
+
+# Quick: a minute or two. Full: as many trials as the counts of lost tracks need to be known to a per cent.
+_SIZES: dict[Size, Sample] = {"quick": Sample(200, 200, 60, 10), "full": Sample(1000, 1000, 400, 100)}
+
+
+def _run(sample: Sample, seed: int, tick: Tick) -> Report:
+    one = draw(STRAIGHT, sample.trials, seed, 0)
+    straight = run_straight(one, tick)
+    wholes = run_wholes(one, tick)
+    winding = run_winding(draw(WINDING, sample.trials, seed, 1), tick)
+    circles, snapshot = run_circles(draw(REPAIRED, sample.circles, seed, 2), tick), run_snapshot()
+    many = draw(STRAIGHT, sample.many, seed, 3)
+    starts, clamps, ends = run_starts(many, tick), run_clamps(many, tick), run_ends(many, tick)
+    rays = run_rays(sample.trials, seed, 4, tick)
+    readings = run_readings(sample.readings, seed, 8, tick)
+    tables = (
+        table_straight(straight),
+        table_wholes(wholes, whole_track_bound()),
+        table_starts(starts),
+        table_clamps(clamps),
+        table_winding(winding),
+        table_circles(circles, snapshot),
+        table_readings(readings),
+        table_rays(rays),
+    )
+    figures = {
+        "figure-1-3": figure_straight(straight),
+        "starts": figure_starts(ends),
+        "figure-4-6": figure_winding(winding),
+        "figure-7": figure_circles(circles, snapshot),
+    }
+    return typeset("angles", sample, seed, tables, figures)
+
+
+STUDY = Study(_SIZES, lambda _: _TICKS, _run)
+"""The reproduction of the paper."""
