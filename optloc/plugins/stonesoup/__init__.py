@@ -8,9 +8,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from optloc.plugins.stonesoup.feeder import PairFeeder
 from optloc.plugins.stonesoup.initiator import FixInitiator
-from optloc.plugins.stonesoup.models import AOATDOA, GROA, TDOA, StationMeasurement, arrival_covariance
+from optloc.plugins.stonesoup.models import AOATDOA, GROA, TDOA, PairFeeder, StationMeasurement, arrival_covariance
 
 __all__ = [
     "AOATDOA",
@@ -34,6 +33,7 @@ def register_yaml(yaml: Any) -> None:
     """
     classes = {cls.__name__: cls for cls in (TDOA, GROA, AOATDOA, FixInitiator, PairFeeder)}
 
+    # Stone Soup writes the module of a class into its tag; the class alone is read, so files outlive moves.
     def construct(constructor: Any, suffix: str, node: Any) -> Any:
         constructor.deep_construct = True
         (properties,) = constructor.construct_yaml_omap(node)  # a generator that must be exhausted

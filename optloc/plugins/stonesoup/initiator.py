@@ -23,9 +23,13 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
 
-# A fix is trusted as a Gaussian where no other minimum costs less than this more, and where its largest standard
-# deviation is below this share of the nearest range.
-_GAP, _FLAT = 25.0, 0.05
+# A fix is trusted as a Gaussian where no other minimum costs less than this more: five standard deviations.
+_GAP = 25.0
+# ... and where its largest standard deviation is below this share of the nearest range: a circle bends away from its
+# tangent by half the square of that, which is then 2.5 % of the deviation.
+_FLAT = 0.05
+# Chains that wait for more scans. Each detection is tried on every one of them, a fix each: false alarms must not make
+# scans take longer and longer.
 _REMEMBERED = 40
 
 
@@ -100,18 +104,19 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         fitting = [(new, old) for new, old in tried if new.p >= self.least_p]
         if not fitting:
             return self._chain((detection,))
+        # Longer before likelier: a chain that has fitted many scans is hardly one of false alarms.
         new, old = max(fitting, key=lambda pair: (len(pair[0].detections), pair[0].p))
         self._chains.remove(old)
         return new
 
     def _chain(self, detections: tuple[Any, ...]) -> _Chain:
         fix = solve(self._problem(detections))
-        p = float(fix.p_value)
+        p = float(fix.p_value)  # NaN without redundancy: nothing speaks against the chain then
         return _Chain(detections, fix, 1.0 if np.isnan(p) else p)
 
     def _problem(self, detections: tuple[Any, ...]) -> Problem:
         models = [detection.measurement_model for detection in detections]
-        last = detections[-1].timestamp
+        last = detections[-1].timestamp  # the state is that of the last scan
         times = np.array([(detection.timestamp - last).total_seconds() for detection in detections])
         d = len(models[0].mapping)
         priors = [Prior("velocity", np.zeros(d), self.speed**2 * np.eye(d))] if self.order and self.speed else []

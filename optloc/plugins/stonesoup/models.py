@@ -1,18 +1,26 @@
-"""Measurement models of Stone Soup whose functions, derivatives and inverses are those of optloc."""
+"""Measurement models of Stone Soup whose functions, derivatives and inverses are those of optloc, and their feeder.
+
+A model is one scan of several rows. The feeder makes such scans of detections of single pairs, with the covariance that
+rows share where they share a station.
+"""
 
 from __future__ import annotations
 
+import datetime as dt
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from stonesoup.base import Property, clearable_cached_property
+from stonesoup.buffered_generator import BufferedGenerator
+from stonesoup.feeder.base import DetectionFeeder
 from stonesoup.models.base import ReversibleModel
 from stonesoup.models.measurement.nonlinear import NonLinearGaussianMeasurement
 from stonesoup.types.angle import Bearing, Elevation
 from stonesoup.types.array import StateVector, StateVectors
+from stonesoup.types.detection import Detection
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.status import Status
@@ -90,7 +98,7 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
 
     def function(self, state: Any, noise: Any = False, **kwargs: Any) -> Any:
         """Return the measurement (m, 1) of a state, or (m, N) of N of them, with noise if wanted."""
-        position = np.asarray(state.state_vector, dtype=float)[list(self.mapping)].T
+        position = np.asarray(state.state_vector, dtype=float)[list(self.mapping)].T  # (N, d)
         values = self._ordered(predict(self.problem, position).T)
         if isinstance(noise, bool) or noise is None:
             noise = self.rvs(num_samples=values.shape[1], **kwargs) if noise else 0
@@ -146,7 +154,7 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
         kind: Any = StateVector if values.shape[1] == 1 else StateVectors
         if not any(row[0] in _TYPES for row in self.rows):
             return kind(values)
-        typed = values.astype(object)
+        typed = values.astype(object)  # Stone Soup wraps differences of its own angle types only
         for i, (name, _, _) in enumerate(self.rows):
             if name in _TYPES:
                 typed[i] = [_TYPES[name](value) for value in values[i]]
@@ -224,7 +232,7 @@ def problem_of(stations: Array, scans: Sequence[Sequence[Row]], covariances: Seq
     for kind, rows in kinds.items():
         a, b, k = np.array(rows).T
         parts.append(measured(kind, np.zeros(len(rows)), a=a, b=b, epoch=k, sigma=1.0))
-    place = np.argsort(order)
+    place = np.argsort(order)  # where each row of the scans stands among those sorted by kind
     ends = np.cumsum([0, *(len(rows) for rows in scans)])
     blocks = [
         Block(place[None, first:last], np.asarray(covariance, dtype=float)[None])
@@ -232,3 +240,68 @@ def problem_of(stations: Array, scans: Sequence[Sequence[Row]], covariances: Seq
     ]
     still = stations[:1] if np.array_equal(stations, np.broadcast_to(stations[:1], stations.shape)) else stations
     return replace(assemble(still, *parts, **more), noise=group(blocks))
+
+
+class PairFeeder(DetectionFeeder):  # type: ignore[misc]  # untyped base
+    """Groups the TDOA detections of an instant to one vector detection of each target.
+
+    Rows that share a station share the error of its arrival: their covariance is D diag(arrival_sigma^2) D' plus that
+    of each row's own noise. Without such own noise, pairs that close a loop say nothing new and are left out.
+    """
+
+    arrival_sigma: float = Property(doc="Standard deviation of each station's arrival, metres.")
+    row_sigma: float = Property(default=0.0, doc="Standard deviation of the own noise of each row, metres.")
+    label: str | None = Property(
+        default=None, doc="Key of the metadata that tells targets apart; None: all pairs of an instant are of one."
+    )
+
+    @BufferedGenerator.generator_method  # type: ignore[untyped-decorator]
+    def data_gen(self) -> Iterator[tuple[dt.datetime, set[Detection]]]:
+        """Yield the times and the vector detections.
+
+        Raises
+        ------
+        InvalidProblem
+            For a detection that is no TDOA, or stations that differ within an instant.
+        """
+        for time, detections in self.reader:
+            groups: dict[Any, list[Detection]] = {}
+            for detection in detections:
+                if not isinstance(detection.measurement_model, TDOA):
+                    what = f"a detection has the measurement model {type(detection.measurement_model).__name__}"
+                    raise InvalidProblem(what, "PairFeeder", "feed detections of the model TDOA")
+                name = detection.metadata.get(self.label) if self.label else None
+                groups.setdefault(name, []).append(detection)
+            yield time, {self._joined(group) for group in groups.values()}
+
+    def _joined(self, group: list[Detection]) -> Detection:
+        group = sorted(group, key=lambda detection: np.atleast_2d(detection.measurement_model.pairs).tolist())
+        models = [detection.measurement_model for detection in group]
+        first = models[0]
+        if any(not np.array_equal(model.stations, first.stations) for model in models):
+            raise InvalidProblem("stations differ within an instant", "PairFeeder", "give all pairs the same stations")
+        pairs = np.concatenate([np.atleast_2d(model.pairs) for model in models])
+        z = np.concatenate([values_of(detection) for detection in group])
+        # Noise of arrivals alone is singular on closed loops: their rows are sums of the others.
+        kept = np.ones(len(z), dtype=bool) if self.row_sigma > 0.0 else _forest(pairs, len(first.stations))
+        covariance = arrival_covariance(pairs[kept], self.arrival_sigma, len(first.stations))
+        model = TDOA(
+            ndim_state=first.ndim_state,
+            mapping=first.mapping,
+            noise_covar=covariance + self.row_sigma**2 * np.eye(len(covariance)),
+            stations=first.stations,
+            pairs=pairs[kept],
+        )
+        metadata = {key: value for detection in group for key, value in detection.metadata.items()}
+        return Detection(z[kept][:, None], timestamp=group[0].timestamp, measurement_model=model, metadata=metadata)
+
+
+def _forest(pairs: Array, stations: int) -> Array:
+    """Return which pairs (m,) link stations that those before leave apart."""
+    # Groups of linked stations, each named by one of its members.
+    group, kept = np.arange(stations), np.zeros(len(pairs), dtype=bool)
+    for i, (a, b) in enumerate(pairs):
+        if group[a] != group[b]:
+            kept[i] = True
+            group[group == group[b]] = group[a]
+    return kept
