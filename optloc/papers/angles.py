@@ -84,6 +84,7 @@ def _states(*parts: tuple[Array, Array, Array]) -> Array:
 
 
 def _straight() -> Scenario:
+    # Printed: 2 m/s and 0.2 m/s² for 50 s. The direction is not.
     t, still = np.arange(51.0)[:, None], np.zeros((51, 2))
     ahead = np.array([1.0, 0.0])
     states = _states(((2.0 * t + 0.1 * t**2) * ahead, (2.0 + 0.2 * t) * ahead, still + 0.2 * ahead))
@@ -91,6 +92,7 @@ def _straight() -> Scenario:
 
 
 def _winding() -> Scenario:
+    # Printed: x = 2t, y = 10 sin(5πt/180). A complex wave holds sine and cosine of value and derivatives.
     t, rate = np.arange(51.0), np.pi / 36.0
     wave, zero = np.exp(1j * rate * t), np.zeros(51)
     parts = [
@@ -126,6 +128,7 @@ def circling(name: str, slow: float, fast: float, rate: float, seconds: tuple[in
     one, two, three = (np.arange(n + 1.0)[:, None] for n in seconds)
     begin, radius = np.array([-10e3, 50e3, 10e3]), fast / rate
     leave = begin + slow * seconds[0] * ahead
+    # About the centre, to the left of the course; `0.0 * one` and the like give constants one row a second.
     sine, cosine = np.sin(rate * two), np.cos(rate * two)
     circle = leave + radius * (sine * ahead + (1.0 - cosine) * left)
     states = _states(
@@ -153,6 +156,7 @@ WINDING = _winding()
 WINDING_PEAK = float(np.linalg.norm(WINDING.states[:, 2], axis=-1).max())
 """Largest acceleration of simulation 2, m/s^2: the printed error is six times as large."""
 
+# The radius is the printed one, 3 km; a full turn brings the course back to where it was, so no speed jumps.
 REPAIRED = circling("repaired", _RADIUS * np.pi / 20.0, _RADIUS * np.pi / 20.0, np.pi / 20.0, (100, 40, 100))
 """Simulation 3 with one speed, 471 m/s, one full turn in 40 s, and straight parts of 100 s."""
 
@@ -242,6 +246,7 @@ def first_fix(drawn: Draw, speed: float, rate: float) -> State:
 
 def fixes(drawn: Draw) -> tuple[Array, Array]:
     """Return the fix (trials, k, d) of every epoch by itself, and its covariance (trials, k, d, d)."""
+    # Named, not left to "auto": every epoch of every trial is then solved in one way.
     fix = solve(drawn.problem, "wiv+lsr")
     return fix.position, fix.covariance()
 
@@ -258,6 +263,7 @@ def linear_track(places: tuple[Array, Array], start: State, dynamics: Dynamics) 
     dynamics : Dynamics
         Model of motion.
     """
+    # Written out, for a measurement of the position itself needs no linearisation at all.
     mean, cov, out = start.mean, start.cov, []
     d = places[0].shape[-1]
     for k in range(int(start.time), places[0].shape[1]):
@@ -296,7 +302,7 @@ def distances(drawn: Draw, track: Track) -> Array:
 
 def lost(drawn: Draw, track: Track) -> float:
     """Return the share of tracks that end further than `LOST` from the truth, or nowhere."""
-    return float((~(distances(drawn, track) < LOST)).mean())
+    return float((~(distances(drawn, track) < LOST)).mean())  # so that NaN counts as lost
 
 
 def tracked(drawn: Draw, start: State, dynamics: Dynamics, update: str = "ekf") -> Track:
@@ -306,6 +312,7 @@ def tracked(drawn: Draw, start: State, dynamics: Dynamics, update: str = "ekf") 
 
 def bound(scenario: Scenario, start: State, dynamics: Dynamics) -> Array:
     """Return the posterior bound (q, 3) of the root mean square error of position, velocity and acceleration."""
+    # About the truth, with the covariance of the start that all trials share.
     alone = State(start.time, scenario.truth[int(start.time)], start.cov[0])
     cov = posterior_bound(scenario.problem(), scenario.truth[1:], alone, dynamics)
     variance = np.diagonal(cov, axis1=-2, axis2=-1).reshape(len(cov), 3, -1)
@@ -343,7 +350,6 @@ def printed_transition(time_constant: float, limit: float) -> Dynamics:
 
     def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
         F, Q, drive = right.step(dt, mean, d)
-        F = F.copy()  # that of the right model is kept for its next step
         F[2 * d :, 2 * d :] = (1.0 - np.exp(-dt / time_constant)) * np.eye(d)
         return F, Q, drive
 
