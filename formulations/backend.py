@@ -39,11 +39,13 @@ class Choice:
         return f"{self.kind}:{self.name}:{sorted(self.settings.items())!r}"
 
 
+# Context variables, not globals: a choice inside `using` holds for its thread and task alone. Threads that are meant to
+# share it start in a copy of the caller's context.
 _CHOICE: ContextVar[Choice | None] = ContextVar("choice", default=None)
 _TALLY: ContextVar[list[tuple[str, int]] | None] = ContextVar("tally", default=None)
 
 
-def chosen(kind: Kind) -> Choice | None:
+def choice_for(kind: Kind) -> Choice | None:
     """Return the choice that holds for a kind of program, None for the formulation's own."""
     choice = _CHOICE.get()
     return choice if choice is not None and choice.kind == kind else None
@@ -72,6 +74,6 @@ def counting() -> Iterator[list[tuple[str, int]]]:
 
 def count(name: str, iterations: int) -> None:
     """Add a solve to the tally, where one is kept."""
-    tally = _TALLY.get()
+    tally = _TALLY.get()  # one list for all threads of a caller: appending is atomic
     if tally is not None:
         tally.append((name, iterations))

@@ -25,16 +25,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from formulations.algebra import Array, Mask, dot, span, uncentre
 from formulations.bearing_ls import Rays, rays
-from formulations.secular import span, uncentred
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
-_RANK = 1e-10  # singular value, over the largest one, of scaled rows that counts as zero
-_NEAR = 1e-6  # shortest range, over the size of the array, that a weight is computed from
+# Singular value, over the largest one, of scaled rows that counts as zero: five decades above their rounding errors.
+_RANK = 1e-10
+_NEAR = 1e-6  # shortest range, over the size of the array, that a weight is computed from; as in `bearing_ls`
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,7 +87,7 @@ class _Run:
         flat = np.maximum(np.hypot(line[..., 0], line[..., 1]), self.least)
         return np.concatenate([flat, np.hypot(flat, line[..., 2])], axis=-1) if self.both else flat
 
-    def predicted(self, c: Array) -> Rays:
+    def predict(self, c: Array) -> Rays:
         """Return the directions in which a course would have been seen."""
         line = self.own(self.line(c))
         flat = np.hypot(line[..., 0], line[..., 1])
@@ -156,17 +154,19 @@ def sighted_courses(
         c = plain = _balance(G, G, run.right, W, order)
         for _ in range(passes):
             c = _balance(G, G, run.right, W / run.lengths(c), order)
-        final = _balance(run.design(_normals(run.predicted(c))), G, run.right, W / run.lengths(c), order)
-        front = (run.line(final) * seen.ahead).sum(axis=-1) > 0.0
+        final = _balance(run.design(_normals(run.predict(c))), G, run.right, W / run.lengths(c), order)
+        # a bearing and its opposite give the same row: only now does it count where the target stands
+        front = dot(run.line(final), seen.ahead) > 0.0
         ok = np.asarray(np.isfinite(final).all(axis=(-2, -1)))
-        three = [uncentred(each, middle, half) for each in (plain, c, final)]
+        three = [uncentre(each, middle, half) for each in (plain, c, final)]
     return Courses(three[0], three[1], three[2], ok, ok & (front | ~use).all(axis=-1))
 
 
 def _run(S: Array, axes: Array | None, powers: Array, seen: Rays, both: bool) -> _Run:
     normal = _normals(seen)
-    right = (normal * (np.concatenate([S, S], axis=1) if both else S)).sum(axis=-1)
-    size = np.sqrt((S * S).sum(axis=-1)).max(axis=-1, keepdims=True)
+    right = dot(normal, np.concatenate([S, S], axis=1) if both else S)
+    size = np.sqrt(dot(S, S)).max(axis=-1, keepdims=True)
+    # one station at the origin has no size: any positive length will do
     return _Run(S, axes, powers, normal, right, both, np.maximum(_NEAR * size, 1e-300))
 
 
@@ -178,11 +178,12 @@ def _normals(seen: Rays) -> Array:
 def _balance(Z: Array, G: Array, b: Array, W: Array, order: int) -> Array:
     """Solve ``Z' W^2 (G c - b) = 0``, shape (N, order + 1, d); NaN where it has no single solution."""
     n = G.shape[-1]
+    # triangularised, not squared: an orthonormal base of the instruments' columns takes the place of Z' W
     share = np.where(W > 0.0, W / W.max(axis=-1, keepdims=True), 0.0)[..., None]
     left, right = share * Z, np.concatenate([share * G, share * b[..., None]], axis=-1)
     good = np.isfinite(left).all(axis=(-2, -1)) & np.isfinite(right).all(axis=(-2, -1))
     left, right = (np.where(good[:, None, None], part, 0.0) for part in (left, right))
-    short = max(0, n - left.shape[1])
+    short = max(0, n - left.shape[1])  # rows of zeros where there are fewer than unknowns: the shapes below then hold
     left, right = (np.pad(part, ((0, 0), (0, short), (0, 0))) for part in (left, right))
     sizes = np.sqrt((right[..., :n] ** 2).sum(axis=-2))
     good &= (sizes > 0.0).all(axis=-1)

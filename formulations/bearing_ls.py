@@ -23,13 +23,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from formulations.algebra import Array, Mask, dot
 
-_FLAT = 1e-13  # determinant of a normal matrix, over the product of its row lengths, that counts as zero
-_NEAR = 1e-6  # shortest range, over the size of the array, that a weight is computed from
+# Determinant of a normal matrix, over the product of its row lengths, that counts as zero: some hundred roundings.
+_FLAT = 1e-13
+# Shortest range, over the size of the array, that a weight is computed from: an intermediate fix may fall on a station,
+# and no real target is a millionth of the array away from one.
+_NEAR = 1e-6
+_PARALLEL = 1e13  # condition number from which lines are parallel: less than three digits would be left
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,25 +160,27 @@ def sight(
     turn = None if axes is None else np.asarray(axes, dtype=np.float64)
     with np.errstate(all="ignore"):
         seen = rays(A, E, turn)
+        # about the middle of the stations heard: far from the origin the products g'S lose the digits of the fix
         share = np.where(use, 1.0, 0.0)[..., None]
         middle = (share * S).sum(axis=-2, keepdims=True) / share.sum(axis=-2, keepdims=True)
         S = S - middle
         least = _NEAR * np.sqrt((share * S * S).sum(axis=(-2, -1)))[..., None]
         G, W = _rows(seen), np.concatenate([wA, wE], axis=-1) if E is not None else wA
         own = np.concatenate([S, S], axis=-2) if E is not None else S
-        b = (G * own).sum(axis=-1)
+        b = dot(G, own)
         point = plain = _balance(G, G, b, W)
         for _ in range(passes):
             point = _balance(G, G, b, W / _lengths(point, S, turn, least, E is not None))
         scale = W / _lengths(point, S, turn, least, E is not None)
-        final = _balance(_rows(_predicted(point, S, turn, E is not None)), G, b, scale)
-        front = ((final[..., None, :] - S) * seen.ahead).sum(axis=-1) > 0.0
+        final = _balance(_rows(_predict(point, S, turn, E is not None)), G, b, scale)
+        # an azimuth and its opposite give the same row: only now does it count where the target stands
+        front = dot(final[..., None, :] - S, seen.ahead) > 0.0
     ok = np.asarray(np.isfinite(final).all(axis=-1))
     shift = middle[..., 0, :]
     return Sighted(plain + shift, point + shift, final + shift, ok, ok & (front | ~use).all(axis=-1))
 
 
-def predicted(point: Array, station: Array, axes: ArrayLike | None = None) -> Array:
+def predict(point: Array, station: Array, axes: ArrayLike | None = None) -> Array:
     """Return azimuth and elevation of a point.
 
     Parameters
@@ -224,10 +229,10 @@ def meeting(direction: Array, station: Array) -> Array:
     weight, point = np.ones(len(station)), np.full(3, np.nan)
     for _ in range(2):
         left = np.einsum("n,nij->ij", weight, off)
-        if not np.isfinite(left).all() or np.linalg.cond(left) > 1e13:
+        if not np.isfinite(left).all() or np.linalg.cond(left) > _PARALLEL:
             return np.full(3, np.nan)
         point = np.linalg.solve(left, np.einsum("n,nij,nj->i", weight, off, station))
-        weight = 1.0 / np.maximum(np.sum((point - station) ** 2, axis=1), 1e-12)
+        weight = 1.0 / np.maximum(np.sum((point - station) ** 2, axis=1), _NEAR**2)
     return point
 
 
@@ -248,7 +253,7 @@ def _lengths(point: Array, S: Array, turn: Array | None, least: Array, both: boo
     return np.concatenate([flat, np.hypot(flat, line[..., 2])], axis=-1) if both else flat
 
 
-def _predicted(point: Array, S: Array, turn: Array | None, both: bool) -> Rays:
+def _predict(point: Array, S: Array, turn: Array | None, both: bool) -> Rays:
     line = _local(point, S, turn)
     flat = np.hypot(line[..., 0], line[..., 1])
     return rays(np.arctan2(line[..., 1], line[..., 0]), np.arctan2(line[..., 2], flat) if both else None, turn)
@@ -259,6 +264,7 @@ def _balance(Z: Array, G: Array, b: Array, W: Array) -> Array:
     left = Z * np.where(W > 0.0, W / W.max(axis=-1, keepdims=True), 0.0)[..., None] ** 2
     inverse = _inverse(np.einsum("...ki,...kj->...ij", left, G))
     point = np.zeros(inverse.shape[:-1])
+    # the second round is the refinement: residuals from G, not from the squares in the normal matrix
     for _ in range(2):
         rest = b - np.einsum("...kj,...j->...k", G, point)
         point = point + np.einsum("...ij,...j->...i", inverse, np.einsum("...ki,...k->...i", left, rest))

@@ -25,15 +25,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from formulations.secular import span, uncentred
+from formulations.algebra import Array, Mask, dot, flatten, span, uncentre
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
-_PASSES = 2
-_RANK = 1e-11
+_PASSES = 2  # weights from half the path, then from the course that they gave; a start needs no third
+_RANK = 1e-11  # singular value of the whitened rows, over the largest one, that counts as zero: far above rounding
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,13 +135,14 @@ def range_of(excess: ArrayLike, direction: Array, illuminator: Array, *, least: 
     l = np.asarray(excess, dtype=np.float64)  # noqa: E741
     u, A = np.asarray(direction, dtype=np.float64), np.asarray(illuminator, dtype=np.float64)
     with np.errstate(all="ignore"):
-        d, along = np.sqrt(_dot(A, A)), _dot(u, A)
+        d, along = np.sqrt(dot(A, A)), dot(u, A)
         off = A - along[..., None] * u
-        aside = _dot(off, off)
+        aside = dot(off, off)
         # d - u'A without cancellation near the direction of the illuminator
         behind = np.where(along > 0.0, aside / (d + along), d - along)
         r = (0.5 * l * l + d * l) / (behind + l)
         reach = np.sqrt((r - along) ** 2 + aside)
+        # 1 + (r - u'A) / reach, without cancellation where the target lies before the illuminator
         slope = np.where(along > r, aside / (reach + (along - r)), reach + (r - along)) / reach
         turn = -off * (r / reach)[..., None]
         valid = (l > 0.0) & np.isfinite(r) & np.isfinite(slope) & (slope >= least)
@@ -182,10 +180,10 @@ def course(excess: Array, axes: Array, illuminator: Array, time: Array, sigma: A
         excess.shape, axes.shape[:-2], (*illuminator.shape[:-1], 1), time.shape, sigma.shape[:-1]
     )
     lead, k = lead[:-1], lead[-1]
-    path, when = _flat(excess, (k,), lead), _flat(time, (k,), lead)
-    e, A, deviation = _flat(axes, (k, 3, 3), lead), _flat(illuminator, (3,), lead), _flat(sigma, (k, 3), lead)
+    path, when = flatten(excess, (k,), lead), flatten(time, (k,), lead)
+    e, A, deviation = flatten(axes, (k, 3, 3), lead), flatten(illuminator, (3,), lead), flatten(sigma, (k, 3), lead)
     with np.errstate(all="ignore"):
-        d = np.sqrt(_dot(A, A))[:, None]
+        d = np.sqrt(dot(A, A))[:, None]
         L = path + d
         heard = np.isfinite(L + when + e.sum(axis=(-2, -1))) & (L > 0.0)
         present = heard[..., None] & (deviation > 0.0) & np.isfinite(deviation)
@@ -195,7 +193,8 @@ def course(excess: Array, axes: Array, illuminator: Array, time: Array, sigma: A
         normals = np.concatenate([e[:, :, :2], (e[:, :, 2] - A[:, None] / L[..., None])[:, :, None, :]], axis=2)
         normals = np.where(present[..., None], normals, 0.0)
         right = np.where(present, [0.0, 0.0, 1.0] * ((L * L - d * d) / (2.0 * L))[..., None], 0.0)
-        # an angle error shortens u'p by half its square: small, but not against a good path
+        # An angle error shortens u'p by half its square: small, but not against a good path. Added is the root of the
+        # second moment of half the sum of two squared normal errors, (3 s1^4 + 3 s2^4 + 2 s1^2 s2^2) / 4.
         square = np.where(present[..., :2], deviation[..., :2], 0.0) ** 2
         bend = 0.5 * np.sqrt(3.0 * (square**2).sum(axis=-1) + 2.0 * square.prod(axis=-1))
         far = across = 0.5 * L
@@ -204,15 +203,10 @@ def course(excess: Array, axes: Array, illuminator: Array, time: Array, sigma: A
             scale = np.stack([far * deviation[..., 0], far * deviation[..., 1], path_row], axis=-1)
             c, ok = _fit(normals, right, powers, np.where(present, 1.0 / scale, 0.0))
             p = np.einsum("nkj,nji->nki", powers, c)
-            far, across = np.sqrt(_dot(p, p)), np.sqrt(_dot(p - A[:, None], p - A[:, None]))
-        ok &= ((_dot(p, e[:, :, 2]) > 0.0) | ~heard).all(axis=-1)
-        c = np.where(ok[:, None, None], uncentred(c, middle, spread), np.nan)
+            far, across = np.sqrt(dot(p, p)), np.sqrt(dot(p - A[:, None], p - A[:, None]))
+        ok &= ((dot(p, e[:, :, 2]) > 0.0) | ~heard).all(axis=-1)
+        c = np.where(ok[:, None, None], uncentre(c, middle, spread), np.nan)
     return Course(c.reshape(*lead, order + 1, 3), ok.reshape(lead))
-
-
-def _flat(value: ArrayLike, last: tuple[int, ...], lead: tuple[int, ...]) -> Array:
-    """Give a value one batch axis."""
-    return np.broadcast_to(np.asarray(value, dtype=np.float64), (*lead, *last)).reshape(-1, *last)
 
 
 def _fit(normals: Array, right: Array, powers: Array, weight: Array) -> tuple[Array, Mask]:
@@ -223,6 +217,7 @@ def _fit(normals: Array, right: Array, powers: Array, weight: Array) -> tuple[Ar
     rows = np.concatenate([B.reshape(count, -1, n), (right * weight).reshape(count, -1, 1)], axis=-1)
     good = np.isfinite(rows).all(axis=(-2, -1))
     rows = np.where(good[:, None, None], rows, 0.0)
+    # rows of zeros where there are fewer than unknowns: the triangle is square all the same
     rows = np.pad(rows, ((0, 0), (0, max(0, n + 1 - rows.shape[1])), (0, 0)))
     triangle = np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)[:, :n]
     U, size, V = np.linalg.svd(triangle[..., :n])
@@ -230,7 +225,3 @@ def _fit(normals: Array, right: Array, powers: Array, weight: Array) -> tuple[Ar
     inverse = np.where(good[:, None], 1.0 / np.where(good[:, None], size, 1.0), 0.0)
     c = np.einsum("nji,nj->ni", V, inverse * np.einsum("nkj,nk->nj", U, triangle[..., n]))
     return c.reshape(count, order, 3), good
-
-
-def _dot(a: Array, b: Array) -> Array:
-    return np.asarray(np.sum(a * b, axis=-1))

@@ -13,9 +13,12 @@ dual cone, gives
 for every minimiser with :math:`|x^*| \le \rho`, whatever the solver reports: the "optimal value" is never used as a
 bound.
 
+Threads may share all of it: every thread feeds numbers of its own, and what needs cvxpy itself runs one at a time.
+
 Sources: A. Agrawal et al., "Differentiable convex optimization layers", NeurIPS 2019 (the affine maps); C. Jansson,
 D. Chaykin and C. Keil, "Rigorous error bounds for the optimal value in semidefinite programming", SIAM J. Numer.
-Anal. 46 (2007) (the bound, here with one radius for all of x).
+Anal. 46 (2007) (the bound, here with one radius for all of x); N. Parikh and S. Boyd, "Proximal algorithms", Found.
+Trends Optim. 1 (2014), section 6.3 (the projection).
 """
 
 from __future__ import annotations
@@ -28,94 +31,257 @@ from functools import lru_cache, wraps
 from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from formulations.backend import chosen, count
+from formulations.algebra import Array, Index
+from formulations.backend import choice_for, count
 
-# Projection on the dual of a product of cones: what makes a solver's dual point an honest one.
-#
-# Source: N. Parikh and S. Boyd, "Proximal algorithms", Found. Trends Optim. 1 (2014), section 6.3.
+_Arguments = ParamSpec("_Arguments")
+_Built = TypeVar("_Built")
 
-Array = NDArray[np.float64]
+# cvxpy counts its variables in a global that is read and written in two steps, and keeps the values of parameters in
+# the problem: two threads in it could number two variables alike, or solve each other's data.
+_CVXPY = threading.RLock()
+
+# More sizes of one problem than a study mixes. Building takes 10 ms to 0.5 s, and what is built less than 2 MB (the
+# moments of seven ranges, eight directions), 20 MB for the registration of eight windows of a moving target.
+_KEPT = 64
 
 
-def dual_point(z: Array, dims: Any) -> Array:
-    """Project on the dual cone.
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What one conic solve gave.
 
     Parameters
     ----------
-    z : Array, shape (m,)
-        Dual point in Clarabel's order: zero, nonnegative, second-order and semidefinite cones.
-    dims : Any
-        cvxpy's ``ConeDims``.
+    values : Mapping[str, Array]
+        Values of the variables by name; NaN where the solver gave none.
+    primal : float
+        Objective at the point found.
+    bound : float
+        Lower bound of the optimum, recomputed from the dual point; minus infinity where none is available.
+    status : str
+        The solver's own word for how it ended.
+    solved : bool
+        True where the solver met its full tolerances.
+    iterations : int
+        Interior-point (or other) iterations.
+    """
 
-    Returns
-    -------
-    Array, shape (m,)
-        The nearest dual feasible point; NaN in the rows of any other cone.
+    values: Mapping[str, Array]
+    primal: float
+    bound: float
+    status: str
+    solved: bool
+    iterations: int
+
+
+class Relaxation:
+    """One cvxpy problem with named parameters, solved many times.
+
+    Parameters
+    ----------
+    problem : cvxpy.Problem
+        A minimisation that is DPP; parameters and variables carry unique names. Linear, second-order and
+        semidefinite cones.
+    backend : str
+        ``"CLARABEL"`` for the fast way; any other solver of cvxpy goes through ``problem.solve`` and yields no bound.
+    settings : Mapping[str, Any], optional
+        Settings of the back end.
+    radius : float
+        Factor on ``1 + |x|`` of the solution found that is taken to hold every minimiser, for the bound. Two leaves
+        room for a solution that is off by its own length; where a rigorous length is known, `solve` takes it as reach.
 
     Notes
     -----
-    Parikh and Boyd (2014), section 6.3.
+    Agrawal et al. (2019). Threads may share one: each works on numbers of its own, every solve starts afresh, and
+    Clarabel releases the interpreter lock. An answer therefore depends on its own data alone. Do not pickle.
     """
-    z, at = z.copy(), int(dims.zero)
-    z[at : at + dims.nonneg] = np.maximum(z[at : at + dims.nonneg], 0.0)
-    at += int(dims.nonneg)
-    for size in dims.soc:
-        z[at : at + size] = _second_order(z[at : at + size])
-        at += int(size)
-    for size in dims.psd:
-        count = size * (size + 1) // 2
-        z[at : at + count] = _semidefinite(z[at : at + count], size)
-        at += count
-    if at != len(z):
-        z[at:] = np.nan
-    return z
+
+    def __init__(
+        self,
+        problem: Any,
+        *,
+        backend: str = "CLARABEL",
+        settings: Mapping[str, Any] | None = None,
+        radius: float = 2.0,
+    ) -> None:
+        self.problem, self.backend, self.settings, self.radius = problem, backend, dict(settings or {}), radius
+        self.parameters = {parameter.name(): parameter for parameter in problem.parameters()}
+        with _CVXPY:
+            self._shared = Data(problem) if backend == "CLARABEL" else None
+        self._own = threading.local()
+
+    @property
+    def _data(self) -> Data | None:
+        """The data of this thread."""
+        if self._shared is None:
+            return None
+        if not hasattr(self._own, "data"):
+            self._own.data = self._shared.twin()
+        own: Data = self._own.data
+        return own
+
+    def solve(self, values: Mapping[str, Array], *, bound: bool = True, reach: float | None = None) -> Answer:
+        """Solve with new parameter values.
+
+        Parameters
+        ----------
+        values : Mapping[str, Array]
+            Values of every parameter, by name.
+        bound : bool
+            Whether to recompute the lower bound from the dual; without it the bound is minus infinity.
+        reach : float, optional
+            Length of the variables that no minimiser exceeds, where that is known: it makes the bound rigorous. In
+            the place of ``radius (1 + |x|)``.
+
+        Returns
+        -------
+        Answer
+            Point, value, bound and status; failure is reported, not raised.
+        """
+        if values.keys() != self.parameters.keys():
+            raise ValueError(f"parameters {sorted(values)} given, {sorted(self.parameters)} expected")
+        choice, data = choice_for("conic"), self._data
+        backend, settings = (self.backend, self.settings) if choice is None else (choice.name, dict(choice.settings))
+        if data is None or backend != "CLARABEL":
+            with _CVXPY:
+                answer = self._elsewhere(values, backend, settings)
+        else:
+            answer = self._directly(data, values, {**self.settings, **settings}, bound=bound, reach=reach)
+        count(backend, answer.iterations)
+        return answer
+
+    def _directly(
+        self,
+        data: Data,
+        values: Mapping[str, Array],
+        settings: Mapping[str, Any],
+        *,
+        bound: bool,
+        reach: float | None,
+    ) -> Answer:
+        data.feed(values)
+        solution = _solver(data, settings).solve()
+        x, z, status = np.array(solution.x), np.array(solution.z), str(solution.status)
+        if not (np.isfinite(x).all() and np.isfinite(z).all()):
+            x, z = np.full(len(x), np.nan), np.full(len(z), np.nan)
+        quadratic = float(x @ data.square(x))
+        far = self.radius * (1.0 + float(np.sqrt(x @ x))) if reach is None else reach
+        return Answer(
+            data.recover(x),
+            0.5 * quadratic + float(data.q @ x) + data.d,
+            data.bound(x, z, far) if bound else -np.inf,
+            status,
+            status == "Solved",
+            int(solution.iterations),
+        )
+
+    def _elsewhere(self, values: Mapping[str, Array], backend: str, settings: Mapping[str, Any]) -> Answer:
+        import cvxpy
+
+        for name, value in values.items():
+            self.parameters[name].value = value
+        try:
+            # cvxpy would start from the answer of the solve before: answers would depend on their order
+            self.problem.solve(solver=backend, **{"warm_start": False, **settings})
+        except cvxpy.error.SolverError as trouble:
+            status = str(trouble)
+        else:
+            status = str(self.problem.status)
+        found: dict[str, Array] = {}
+        for variable in self.problem.variables():
+            missing = variable.value is None
+            found[variable.name()] = np.full(variable.shape, np.nan) if missing else np.asarray(variable.value)
+        known = status in ("optimal", "optimal_inaccurate")
+        stats = self.problem.solver_stats if known else None
+        iterations = int(stats.num_iters or 0) if stats is not None else 0
+        primal = float(self.problem.value) if known else np.nan
+        return Answer(found, primal, -np.inf, status, status == "optimal", iterations)
 
 
-def _second_order(z: Array) -> Array:
-    """Projection on ``z_0 >= |z_1..|``."""
-    size = float(np.linalg.norm(z[1:]))
-    if size <= z[0]:
-        return z
-    if size <= -z[0]:
-        return np.zeros_like(z)
-    half = 0.5 * (1.0 + z[0] / size)
-    return np.concatenate([[half * size], half * z[1:]])
+def _solver(data: Data, settings: Mapping[str, Any]) -> Any:
+    import clarabel
+
+    own = clarabel.DefaultSettings()
+    # a presolve or a decomposition would return multipliers of another problem than the one that bounds are read from
+    own.verbose, own.presolve_enable, own.chordal_decomposition_enable = False, False, False
+    own.max_threads = 1  # problems this small lose by threads; several of them run side by side instead
+    for name, value in settings.items():
+        setattr(own, name, value)
+    return clarabel.DefaultSolver(data.P, data.q, data.A, data.b, data.cones, own)
 
 
-def _semidefinite(z: Array, size: int) -> Array:
-    """Projection of a scaled upper triangle, stored column by column, on the semidefinite cone."""
-    if not np.isfinite(z).all():
-        return z
-    column, row, scale = _triangle(size)
-    matrix = np.empty((size, size))
-    matrix[row, column] = matrix[column, row] = z * scale
-    try:
-        np.linalg.cholesky(matrix)
-    except np.linalg.LinAlgError:
-        values, vectors = np.linalg.eigh(matrix)
-    else:
-        # the usual case: an interior-point dual is strictly inside
-        return z
-    fixed = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    return np.asarray(fixed[row, column] / scale)
+def keep(build: Callable[_Arguments, _Built]) -> Callable[_Arguments, _Built]:
+    """Build once for each set of arguments in each process, whichever thread asks first.
+
+    Parameters
+    ----------
+    build : callable
+        A function with hashable arguments, which is decorated.
+
+    Returns
+    -------
+    callable
+        The same function; the 64 latest used of what it built are kept.
+    """
+
+    def alone(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Built:
+        with _CVXPY:
+            return build(*args, **kwargs)
+
+    # A hit waits for builds of the same function only; without this lock two threads would build the same twice.
+    cached, lock = lru_cache(_KEPT)(alone), threading.Lock()
+
+    @wraps(build)
+    def once(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Built:
+        with lock:
+            return cached(*args, **kwargs)  # type: ignore[arg-type]  # arguments are hashable
+
+    return once
 
 
-@lru_cache(maxsize=64)
-def _triangle(size: int) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Columns and rows of a stored upper triangle, and what undoes the scale of its off-diagonal entries."""
-    column, row = np.tril_indices(size)
-    return column, row, np.where(row == column, 1.0, np.sqrt(0.5))
+def tight(backend: str, tolerance: float, **more: float) -> dict[str, float]:
+    """Return settings that have Clarabel stop at one relative tolerance; other back ends keep their own settings.
+
+    Parameters
+    ----------
+    backend : str
+        Conic solver.
+    tolerance : float
+        Of the gap, absolute and relative, and of feasibility. Clarabel's own is 1e-8.
+    **more
+        Further settings of Clarabel.
+
+    Returns
+    -------
+    dict
+        Settings of a `Relaxation`.
+    """
+    if backend != "CLARABEL":
+        return {}
+    return {"tol_gap_abs": tolerance, "tol_gap_rel": tolerance, "tol_feas": tolerance, **more}
 
 
-# A cvxpy problem taken apart once: Clarabel's data as affine functions of the parameters.
-#
-# .. math:: \min_x \tfrac12 x^\top P x + q^\top x + d \quad\text{subject to}\quad A x + s = b, \; s \in K
-#
-# Sources: A. Agrawal et al., "Differentiable convex optimization layers", NeurIPS 2019 (the affine maps); C. Jansson,
-# D. Chaykin and C. Keil, "Rigorous error bounds for the optimal value in semidefinite programming", SIAM J. Numer.
-# Anal. 46 (2007) (the bound).
+def rank_ratio(lift: Array) -> float:
+    """Second over first eigenvalue of a lift: near zero where the relaxation is tight.
+
+    Parameters
+    ----------
+    lift : Array, shape (n, n)
+        Symmetric.
+
+    Returns
+    -------
+    float
+        NaN where the solver gave no lift.
+    """
+    if not np.isfinite(lift).all():
+        return np.nan
+    values = np.linalg.eigvalsh(lift)
+    return float(abs(values[-2]) / values[-1])
+
+
+# A cvxpy problem taken apart.
 
 
 class Data:
@@ -148,10 +314,12 @@ class Data:
         self.slots = {p.name(): (columns[p.id], p.shape) for p in problem.parameters() if p.id in columns}
         if len(self.slots) != len(problem.parameters()):
             raise ValueError("parameters need unique names and no symmetric, diagonal or semidefinite attribute")
+        # all parameters in one vector; the one behind them carries the constants of the affine maps
         self.vector = np.zeros(self.program.total_param_size + 1)
         self.vector[-1] = 1.0
         n = self.program.x.size
         self._linear = _Product.of(self.program.q)
+        # cvxpy stores [A, b] as one matrix: the columns of A, then that of b, whose entries need not be all rows
         self._matrix, pattern = _affine(self.program.reduced_A)
         m = pattern[2][0]
         self.q, self.d, self.b = np.zeros(n), 0.0, np.zeros(m)
@@ -163,6 +331,7 @@ class Data:
         self.P = sp.csc_array((n, n))
         if self.program.P is not None:
             self._quadratic, pattern = _affine(self.program.reduced_P)
+            # Clarabel takes the upper triangle of P only
             column = np.repeat(np.arange(n), np.diff(pattern[1]))
             self._upper = np.flatnonzero(pattern[0] <= column)
             row, column = pattern[0][self._upper], column[self._upper]
@@ -170,6 +339,7 @@ class Data:
             self.P = sp.csc_array((np.zeros(len(row)), row, start), shape=(n, n))
         self.across, self.below = _Product.transposed(self.A), _Product.transposed(self.P)
         self.above = _Product(n, self.below.source, self.below.row, self.P.data)
+        # P x is the triangle times x and its transpose times x, less the diagonal that both hold
         self._ridge = np.where(self.below.row == self.below.source, 0.0, 1.0)
         self._recover = _recovery(problem, chain, inverse, self.program.x.id, n)
 
@@ -188,6 +358,7 @@ class Data:
             self.vector[start : start + value.size] = value.ravel(order="F")
         linear = self._linear(self.vector)
         self.q, self.d = linear[:-1].copy(), float(linear[-1])
+        # cvxpy writes A x + b in K, Clarabel A x + s = b with s in K: the sign of A changes
         entries = self._matrix(self.vector)
         self.A.data[:] = -entries[self._left]
         self.b = np.zeros(self.A.shape[0])
@@ -268,8 +439,8 @@ class _Product:
     """A sparse matrix as a product only: on problems of tens of entries scipy's own costs more than the solver."""
 
     size: int
-    row: NDArray[np.int64]
-    source: NDArray[np.int64]
+    row: Index
+    source: Index
     data: Array
 
     @classmethod
@@ -289,7 +460,7 @@ class _Product:
         return np.asarray(total, dtype=np.float64)
 
 
-def _affine(reduced: Any) -> tuple[_Product, tuple[NDArray[np.int64], NDArray[np.int64], tuple[int, int]]]:
+def _affine(reduced: Any) -> tuple[_Product, tuple[Index, Index, tuple[int, int]]]:
     """Map from the parameter vector to the stored entries, and their compressed-column pattern."""
     reduced.cache()
     if reduced.problem_data_index is None:
@@ -313,193 +484,74 @@ def _recovery(problem: Any, chain: Any, inverse: Any, name: int, n: int) -> list
     return [(v.name(), np.stack(columns[v.id], axis=1), v.shape) for v in problem.variables()]
 
 
-_Arguments = ParamSpec("_Arguments")
-_Built = TypeVar("_Built")
+# Projection on the dual of a product of cones: what makes a solver's dual point an honest one.
 
 
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """What one conic solve gave.
+def dual_point(z: Array, dims: Any) -> Array:
+    """Project on the dual cone.
 
     Parameters
     ----------
-    values : Mapping[str, Array]
-        Values of the variables by name; NaN where the solver gave none.
-    primal : float
-        Objective at the point found.
-    bound : float
-        Lower bound of the optimum, recomputed from the dual point; minus infinity where none is available.
-    status : str
-        The solver's own word for how it ended.
-    solved : bool
-        True where the solver met its full tolerances.
-    iterations : int
-        Interior-point (or other) iterations.
-    """
-
-    values: Mapping[str, Array]
-    primal: float
-    bound: float
-    status: str
-    solved: bool
-    iterations: int
-
-
-class Relaxation:
-    """One cvxpy problem with named parameters, solved many times.
-
-    Parameters
-    ----------
-    problem : cvxpy.Problem
-        A minimisation that is DPP; parameters and variables carry unique names. Linear, second-order and
-        semidefinite cones.
-    backend : str
-        ``"CLARABEL"`` for the fast way; any other solver of cvxpy goes through ``problem.solve`` and yields no bound.
-    settings : Mapping[str, Any], optional
-        Settings of the back end.
-    radius : float
-        Factor on ``1 + |x|`` of the solution found that is taken to hold every minimiser, for the bound.
-
-    Notes
-    -----
-    Agrawal et al. (2019). Threads may share one: each works on numbers of its own, every solve starts afresh, and
-    Clarabel releases the interpreter lock. An answer therefore depends on its own data alone. Do not pickle.
-    """
-
-    def __init__(
-        self,
-        problem: Any,
-        *,
-        backend: str = "CLARABEL",
-        settings: Mapping[str, Any] | None = None,
-        radius: float = 2.0,
-    ) -> None:
-        self.problem, self.backend, self.settings, self.radius = problem, backend, dict(settings or {}), radius
-        self.parameters = {parameter.name(): parameter for parameter in problem.parameters()}
-        self._shared = Data(problem) if backend == "CLARABEL" else None
-        self._own, self._lock = threading.local(), threading.Lock()
-
-    @property
-    def _data(self) -> Data | None:
-        """The data of this thread."""
-        if self._shared is None:
-            return None
-        if not hasattr(self._own, "data"):
-            self._own.data = self._shared.twin()
-        own: Data = self._own.data
-        return own
-
-    def solve(self, values: Mapping[str, Array], *, bound: bool = True, reach: float | None = None) -> Answer:
-        """Solve with new parameter values.
-
-        Parameters
-        ----------
-        values : Mapping[str, Array]
-            Values of every parameter, by name.
-        bound : bool
-            Whether to recompute the lower bound from the dual; without it the bound is minus infinity.
-        reach : float, optional
-            Length of the variables that no minimiser exceeds, where that is known: it makes the bound rigorous. In
-            the place of ``radius (1 + |x|)``.
-
-        Returns
-        -------
-        Answer
-            Point, value, bound and status; failure is reported, not raised.
-        """
-        if values.keys() != self.parameters.keys():
-            raise ValueError(f"parameters {sorted(values)} given, {sorted(self.parameters)} expected")
-        choice, data = chosen("conic"), self._data
-        backend, settings = (self.backend, self.settings) if choice is None else (choice.name, dict(choice.settings))
-        if data is None or backend != "CLARABEL":
-            with self._lock:  # the values are those of the one problem
-                answer = self._elsewhere(values, backend, settings)
-        else:
-            answer = self._directly(data, values, {**self.settings, **settings}, bound=bound, reach=reach)
-        count(backend, answer.iterations)
-        return answer
-
-    def _directly(
-        self,
-        data: Data,
-        values: Mapping[str, Array],
-        settings: Mapping[str, Any],
-        *,
-        bound: bool,
-        reach: float | None,
-    ) -> Answer:
-        data.feed(values)
-        solution = _solver(data, settings).solve()
-        x, z, status = np.array(solution.x), np.array(solution.z), str(solution.status)
-        if not (np.isfinite(x).all() and np.isfinite(z).all()):
-            x, z = np.full(len(x), np.nan), np.full(len(z), np.nan)
-        quadratic = float(x @ data.square(x))
-        far = self.radius * (1.0 + float(np.sqrt(x @ x))) if reach is None else reach
-        return Answer(
-            data.recover(x),
-            0.5 * quadratic + float(data.q @ x) + data.d,
-            data.bound(x, z, far) if bound else -np.inf,
-            status,
-            status == "Solved",
-            int(solution.iterations),
-        )
-
-    def _elsewhere(self, values: Mapping[str, Array], backend: str, settings: Mapping[str, Any]) -> Answer:
-        import cvxpy
-
-        for name, value in values.items():
-            self.parameters[name].value = value
-        try:
-            self.problem.solve(solver=backend, **settings)
-        except cvxpy.error.SolverError as trouble:
-            status = str(trouble)
-        else:
-            status = str(self.problem.status)
-        found: dict[str, Array] = {}
-        for variable in self.problem.variables():
-            missing = variable.value is None
-            found[variable.name()] = np.full(variable.shape, np.nan) if missing else np.asarray(variable.value)
-        known = status in ("optimal", "optimal_inaccurate")
-        stats = self.problem.solver_stats if known else None
-        count = int(stats.num_iters or 0) if stats is not None else 0
-        primal = float(self.problem.value) if known else np.nan
-        return Answer(found, primal, -np.inf, status, status == "optimal", count)
-
-
-def _solver(data: Data, settings: Mapping[str, Any]) -> Any:
-    import clarabel
-
-    chosen = clarabel.DefaultSettings()
-    # a presolve or a decomposition would return multipliers of another problem than the one that bounds are read from
-    chosen.verbose, chosen.presolve_enable, chosen.chordal_decomposition_enable = False, False, False
-    chosen.max_threads = 1
-    for name, value in settings.items():
-        setattr(chosen, name, value)
-    return clarabel.DefaultSolver(data.P, data.q, data.A, data.b, data.cones, chosen)
-
-
-def kept(maxsize: int) -> Callable[[Callable[_Arguments, _Built]], Callable[_Arguments, _Built]]:
-    """Build once for each set of arguments in each process, whichever thread asks first.
-
-    Parameters
-    ----------
-    maxsize : int
-        How many are kept, the latest used.
+    z : Array, shape (m,)
+        Dual point in Clarabel's order: zero, nonnegative, second-order and semidefinite cones.
+    dims : Any
+        cvxpy's ``ConeDims``.
 
     Returns
     -------
-    callable
-        A decorator of functions with hashable arguments.
+    Array, shape (m,)
+        The nearest dual feasible point; NaN in the rows of any other cone.
+
+    Notes
+    -----
+    Parikh and Boyd (2014), section 6.3.
     """
+    z, at = z.copy(), int(dims.zero)
+    z[at : at + dims.nonneg] = np.maximum(z[at : at + dims.nonneg], 0.0)
+    at += int(dims.nonneg)
+    for size in dims.soc:
+        z[at : at + size] = _second_order(z[at : at + size])
+        at += int(size)
+    for size in dims.psd:
+        count = size * (size + 1) // 2
+        z[at : at + count] = _semidefinite(z[at : at + count], size)
+        at += count
+    if at != len(z):
+        z[at:] = np.nan
+    return z
 
-    def decorate(build: Callable[_Arguments, _Built]) -> Callable[_Arguments, _Built]:
-        cached, lock = lru_cache(maxsize)(build), threading.Lock()
 
-        @wraps(build)
-        def once(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Built:
-            with lock:
-                return cached(*args, **kwargs)  # type: ignore[arg-type]  # arguments are hashable
+def _second_order(z: Array) -> Array:
+    """Projection on ``z_0 >= |z_1..|``."""
+    size = float(np.linalg.norm(z[1:]))
+    if size <= z[0]:
+        return z
+    if size <= -z[0]:
+        return np.zeros_like(z)
+    half = 0.5 * (1.0 + z[0] / size)
+    return np.concatenate([[half * size], half * z[1:]])
 
-        return once
 
-    return decorate
+def _semidefinite(z: Array, size: int) -> Array:
+    """Projection of a scaled upper triangle, stored column by column, on the semidefinite cone."""
+    if not np.isfinite(z).all():
+        return z
+    column, row, scale = _triangle(size)
+    matrix = np.empty((size, size))
+    matrix[row, column] = matrix[column, row] = z * scale
+    try:
+        np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        values, vectors = np.linalg.eigh(matrix)
+    else:
+        # the usual case: an interior-point dual is strictly inside
+        return z
+    fixed = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return np.asarray(fixed[row, column] / scale)
+
+
+@lru_cache(maxsize=64)
+def _triangle(size: int) -> tuple[Index, Index, Array]:
+    """Columns and rows of a stored upper triangle, and what undoes the scale of its off-diagonal entries."""
+    column, row = np.tril_indices(size)
+    return column, row, np.where(row == column, 1.0, np.sqrt(0.5))

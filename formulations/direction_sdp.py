@@ -16,7 +16,7 @@ F_i^\top (e_1 + \sigma w_i)`, the rows of :math:`F_i` being a reference directio
 sphere :math:`a^\top v = \cos E_v \sin\delta`, so the two costs differ to first order in :math:`\sigma \tan E`.
 
 *Touching* (a proof): :math:`q_i` is a quadratic that nowhere exceeds the squared angle errors and equals them at a
-given fix (:mod:`formulations.direction_sdp`). Its bound is rigorous for the ML cost itself, and equal to it where the
+given fix (`minorant`). Its bound is rigorous for the ML cost itself, and equal to it where the
 relaxation is tight and the fix is the best point.
 
 Sources: N. Z. Shor, "Quadratic optimization problems", Sov. J. Comput. Syst. Sci. 25 (1987) (the lift); R. Hartley
@@ -30,117 +30,14 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from formulations.bearing_ls import meeting, predicted, rays
-from formulations.conic import Answer, Relaxation, kept
+from formulations.algebra import Array
+from formulations.bearing_ls import meeting, predict, rays
+from formulations.conic import Answer, Relaxation, keep, rank_ratio, tight
 
-# Quadratic functions of a unit direction that stay below its squared angle errors and touch them at one direction.
-#
-# Let :math:`\hat v` (azimuth :math:`\hat A`, elevation :math:`\hat E`) be predicted by a fix, `v` any direction,
-# :math:`\eta = A_v - \hat A`, :math:`\epsilon = E_v - \hat E`, and :math:`\hat\delta`, :math:`\hat\varepsilon` the
-# fix's own errors against the measured angles, so that the cost of `v` is
-#
-# .. math:: f(v) = \frac{(\hat\delta + \eta)^2}{\sigma_A^2} + \frac{(\hat\varepsilon + \epsilon)^2}{\sigma_E^2} .
-#
-# In the frame :math:`(\hat v, \hat a, \hat e)` of the fix's direction and tangents, with :math:`c = \cos E_v`,
-#
-# .. math:: \hat a^\top v = c \sin\eta, \qquad \hat e^\top v = \sin\epsilon + \sin\hat E \, c \, (1 - \cos\eta), \qquad
-#    |v - \hat v|^2 = 4 \sin^2\tfrac{\epsilon}{2} + 4 c \cos\hat E \sin^2\tfrac{\eta}{2} .
-#
-# On the cap :math:`|\hat\delta + \eta| \le \rho \sigma_A`, :math:`|\hat\varepsilon + \epsilon| \le \rho \sigma_E`
-# every remainder of
-#
-# .. math:: q(v) = f(\hat v) + \frac{2 \hat\delta \, \hat a^\top v}{\sigma_A^2 \cos\hat E} + \frac{2 \hat\varepsilon \,
-#    \hat e^\top v}{\sigma_E^2} + w_A (\hat a^\top v)^2 + w_E (\hat e^\top v)^2 + w_0 |v - \hat v|^2
-#
-# is at most a multiple of :math:`\eta^2` or :math:`\epsilon^2` (from :math:`|x - \sin x| \le |x|^3/6`, :math:`1 -
-# \cos x \le x^2/2` and the mean value theorem for cos), and the three weights are what is left of :math:`1/\sigma^2`.
-# Hence :math:`q \le f` on the cap and :math:`q(\hat v) = f(\hat v)`. A point with total cost at most :math:`\rho^2`
-# has all its directions in their caps, so the least sum of `q` over any set that holds the best point is at most the
-# least sum of `f`.
-#
-# Source: derived here.
-
-Array = NDArray[np.float64]
-
-_ISOTROPIC = 1.0  # share of the possible weight that is put on the chord |v - v^|; what is left goes to the tangents
-
-
-@dataclass(frozen=True, slots=True)
-class Minorant:
-    """``constant + 2 linear'w + sum square w^2`` for each direction, ``w = (v^, a^, e^)'v - (1, 0, 0)``.
-
-    Parameters
-    ----------
-    constant : Array, shape (N,)
-        Cost of the fix itself; zero where nothing better than ``f >= 0`` is known.
-    linear, square : Array, shape (N, 3)
-        Coefficients.
-    reach : Array, shape (N,)
-        Largest ``|v - v^|`` on the cap.
-    """
-
-    constant: Array
-    linear: Array
-    square: Array
-    reach: Array
-
-
-def minorant(error: Array, sigma: Array, elevation: Array, cost: float) -> Minorant:
-    """Build the touching quadratics of one fix.
-
-    Parameters
-    ----------
-    error : Array, shape (N, 2)
-        Predicted minus measured azimuth (wrapped) and elevation.
-    sigma : Array, shape (N, 2)
-        Standard deviations.
-    elevation : Array, shape (N,)
-        Predicted by the fix.
-    cost : float
-        Total cost of the fix, the square of rho; only points at most as costly are bounded.
-
-    Returns
-    -------
-    Minorant
-        One quadratic per direction.
-
-    Notes
-    -----
-    The module's text. Near the zenith, or with caps so wide that a remainder eats a weight, that direction's quadratic
-    is zero: still a minorant.
-    """
-    (dA, dE), (sA, sE), rho = error.T, sigma.T, np.sqrt(cost)
-    low = np.maximum(elevation - dE - rho * sE, -0.5 * np.pi)
-    high = np.minimum(elevation - dE + rho * sE, 0.5 * np.pi)
-    own = np.cos(elevation)
-    widest = np.where((low <= 0.0) & (high >= 0.0), 1.0, np.maximum(np.cos(low), np.cos(high)))
-    steep = np.sin(np.maximum(np.abs(low), np.abs(high)))
-    turn = np.minimum(rho * sA, np.pi) + np.abs(dA)
-    tilt = np.maximum(high - elevation, elevation - low)
-    with np.errstate(all="ignore"):
-        # |eta epsilon| is split so that both weights lose the same share
-        mixed = np.abs(dA) * steep / (own * sA * sE)
-        left_A = 1.0 / sA**2 - mixed * (sE / sA) ** 2 - np.abs(dA) * widest * turn / (3.0 * own * sA**2)
-        left_A -= np.maximum(dE * np.sin(elevation), 0.0) * widest / sE**2
-        left_E = 1.0 / sE**2 - mixed - np.abs(dE) * tilt / (3.0 * sE**2)
-        # (e^'v)^2 <= epsilon^2 + spill eta^2
-        spill = widest * steep * tilt + 0.5 * widest**2 * np.minimum(2.0, 0.5 * turn**2)
-        chord = _ISOTROPIC * np.minimum(left_E, left_A / (widest * own))
-        rest = left_A - chord * widest * own
-        up = np.minimum(left_E - chord, rest / spill)
-        across = (rest - up * spill) / widest**2
-        square = np.stack([chord, across + chord, up + chord], axis=-1)
-        linear = np.stack([np.zeros_like(own), dA / (sA**2 * own), dE / sE**2], axis=-1)
-        constant = (dA / sA) ** 2 + (dE / sE) ** 2
-        known = (left_A > 0.0) & (left_E > 0.0) & np.isfinite(square).all(axis=-1) & np.isfinite(linear).all(axis=-1)
-    return Minorant(
-        np.where(known, constant, 0.0),
-        np.where(known[:, None], linear, 0.0),
-        np.where(known[:, None], square, 0.0),
-        np.minimum(np.sqrt(tilt**2 + widest * own * turn**2), 2.0),
-    )
+# Least cosine by which an azimuth is weighed: within 0.06 degrees of the zenith it says next to nothing.
+_LEVEL = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,6 +65,196 @@ class Directed:
     bound: float
     rank_ratio: float
     answer: Answer
+
+
+def directions(
+    angle: ArrayLike,
+    sigma: ArrayLike,
+    station: ArrayLike,
+    *,
+    axes: ArrayLike | None = None,
+    radial: float = 1.0,
+    backend: str = "CLARABEL",
+) -> Directed:
+    """Solve the chordal relaxation.
+
+    Parameters
+    ----------
+    angle : array_like, shape (N, 2)
+        Azimuth and elevation, radians.
+    sigma : array_like, shape (N, 2)
+        Standard deviations, positive.
+    station : array_like, shape (N, 3)
+        Positions, numbers of order one.
+    axes : array_like, shape (N, 3, 3), optional
+        Rows are the unit vectors of each station's axes.
+    radial : float
+        Radial weight over the smaller tangent weight; it removes the solution v = -u.
+    backend : str
+        Conic solver.
+
+    Returns
+    -------
+    Directed
+        A start; its bound is not one of the ML cost.
+
+    Notes
+    -----
+    The module's text. Built once per N and back end in each process.
+    """
+    z, s = np.asarray(angle, dtype=np.float64), np.asarray(sigma, dtype=np.float64)
+    flat = 1.0 / (s[:, 0] * np.maximum(np.cos(z[:, 1]), _LEVEL)) ** 2
+    steep = 1.0 / s[:, 1] ** 2
+    square = np.stack([radial * np.minimum(flat, steep), flat, steep], axis=-1)
+    cost = _Cost(0.0, np.zeros_like(square), square, 4.0 * len(z))
+    return _solve(_frames(z, axes), np.asarray(station, dtype=np.float64), cost, backend)
+
+
+def angle_bound(
+    angle: ArrayLike,
+    sigma: ArrayLike,
+    station: ArrayLike,
+    point: ArrayLike,
+    *,
+    axes: ArrayLike | None = None,
+    backend: str = "CLARABEL",
+) -> Directed:
+    """Bound the ML cost ``sum (angle error / sigma)^2`` from below over all points, using a fix.
+
+    Parameters
+    ----------
+    angle, sigma, station, axes, backend
+        As in `directions`.
+    point : array_like, shape (3,)
+        A fix, best a refined one: the bound is valid for any, and can reach its cost only if it is stationary.
+
+    Returns
+    -------
+    Directed
+        ``bound`` is at most the ML cost of every point, up to rounding.
+
+    Notes
+    -----
+    The module's text. The proof: points costlier than the fix need no bound; for the others, the minorant, the
+    equalities and weak duality.
+    """
+    z, s = np.asarray(angle, dtype=np.float64), np.asarray(sigma, dtype=np.float64)
+    S = np.asarray(station, dtype=np.float64)
+    seen = predict(np.asarray(point, dtype=np.float64), S, axes)
+    error = seen - z
+    error[:, 0] = np.arctan2(np.sin(error[:, 0]), np.cos(error[:, 0]))
+    found = minorant(error, s, seen[:, 1], float(((error / s) ** 2).sum()))
+    cost = _Cost(float(found.constant.sum()), found.linear, found.square, float((found.reach**2).sum()))
+    return _solve(_frames(seen, axes), S, cost, backend)
+
+
+# Quadratic functions of a unit direction that stay below its squared angle errors and touch them at one direction.
+
+
+@dataclass(frozen=True, slots=True)
+class Minorant:
+    """``constant + 2 linear'w + sum square w^2`` for each direction, ``w = (v^, a^, e^)'v - (1, 0, 0)``.
+
+    Parameters
+    ----------
+    constant : Array, shape (N,)
+        Cost of the fix itself; zero where nothing better than ``f >= 0`` is known.
+    linear, square : Array, shape (N, 3)
+        Coefficients.
+    reach : Array, shape (N,)
+        Largest ``|v - v^|`` on the cap.
+    """
+
+    constant: Array
+    linear: Array
+    square: Array
+    reach: Array
+
+
+def minorant(error: Array, sigma: Array, elevation: Array, cost: float) -> Minorant:
+    r"""Build the touching quadratics of one fix.
+
+    Parameters
+    ----------
+    error : Array, shape (N, 2)
+        Predicted minus measured azimuth (wrapped) and elevation.
+    sigma : Array, shape (N, 2)
+        Standard deviations.
+    elevation : Array, shape (N,)
+        Predicted by the fix.
+    cost : float
+        Total cost of the fix, the square of rho; only points at most as costly are bounded.
+
+    Returns
+    -------
+    Minorant
+        One quadratic per direction.
+
+    Notes
+    -----
+    Let :math:`\hat v` (azimuth :math:`\hat A`, elevation :math:`\hat E`) be predicted by a fix, `v` any direction,
+    :math:`\eta = A_v - \hat A`, :math:`\epsilon = E_v - \hat E`, and :math:`\hat\delta`, :math:`\hat\varepsilon` the
+    fix's own errors against the measured angles, so that the cost of `v` is
+
+    .. math:: f(v) = \frac{(\hat\delta + \eta)^2}{\sigma_A^2} + \frac{(\hat\varepsilon + \epsilon)^2}{\sigma_E^2} .
+
+    In the frame :math:`(\hat v, \hat a, \hat e)` of the fix's direction and tangents, with :math:`c = \cos E_v`,
+
+    .. math:: \hat a^\top v = c \sin\eta, \qquad \hat e^\top v = \sin\epsilon + \sin\hat E \, c \, (1 - \cos\eta),
+       \qquad |v - \hat v|^2 = 4 \sin^2\tfrac{\epsilon}{2} + 4 c \cos\hat E \sin^2\tfrac{\eta}{2} .
+
+    On the cap :math:`|\hat\delta + \eta| \le \rho \sigma_A`, :math:`|\hat\varepsilon + \epsilon| \le \rho \sigma_E`
+    every remainder of
+
+    .. math:: q(v) = f(\hat v) + \frac{2 \hat\delta \, \hat a^\top v}{\sigma_A^2 \cos\hat E} +
+       \frac{2 \hat\varepsilon \, \hat e^\top v}{\sigma_E^2} + w_A (\hat a^\top v)^2 + w_E (\hat e^\top v)^2 +
+       w_0 |v - \hat v|^2
+
+    is at most a multiple of :math:`\eta^2` or :math:`\epsilon^2` (from :math:`|x - \sin x| \le |x|^3/6`, :math:`1 -
+    \cos x \le x^2/2` and the mean value theorem for cos), and the three weights are what is left of :math:`1/\sigma^2`.
+    Hence :math:`q \le f` on the cap and :math:`q(\hat v) = f(\hat v)`. A point with total cost at most :math:`\rho^2`
+    has all its directions in their caps, so the least sum of `q` over any set that holds the best point is at most the
+    least sum of `f`.
+
+    Near the zenith, or with caps so wide that a remainder eats a weight, that direction's quadratic is zero: still a
+    minorant. Derived here.
+    """
+    (dA, dE), (sA, sE), rho = error.T, sigma.T, np.sqrt(cost)
+    # the cap: its elevations, the largest cosine and sine among them, and the largest eta and epsilon
+    low = np.maximum(elevation - dE - rho * sE, -0.5 * np.pi)
+    high = np.minimum(elevation - dE + rho * sE, 0.5 * np.pi)
+    own = np.cos(elevation)
+    widest = np.where((low <= 0.0) & (high >= 0.0), 1.0, np.maximum(np.cos(low), np.cos(high)))
+    steep = np.sin(np.maximum(np.abs(low), np.abs(high)))
+    turn = np.minimum(rho * sA, np.pi) + np.abs(dA)
+    tilt = np.maximum(high - elevation, elevation - low)
+    with np.errstate(all="ignore"):
+        # |eta epsilon| is split so that both weights lose the same share
+        mixed = np.abs(dA) * steep / (own * sA * sE)
+        # what the remainders leave of 1 / sigma^2
+        left_A = 1.0 / sA**2 - mixed * (sE / sA) ** 2 - np.abs(dA) * widest * turn / (3.0 * own * sA**2)
+        left_A -= np.maximum(dE * np.sin(elevation), 0.0) * widest / sE**2
+        left_E = 1.0 / sE**2 - mixed - np.abs(dE) * tilt / (3.0 * sE**2)
+        # (e^'v)^2 <= epsilon^2 + spill eta^2
+        spill = widest * steep * tilt + 0.5 * widest**2 * np.minimum(2.0, 0.5 * turn**2)
+        # all weight that both tangents can spare goes to the chord |v - v^|, what is left of one of them to its own
+        chord = np.minimum(left_E, left_A / (widest * own))
+        rest = left_A - chord * widest * own
+        up = np.minimum(left_E - chord, rest / spill)
+        across = (rest - up * spill) / widest**2
+        square = np.stack([chord, across + chord, up + chord], axis=-1)
+        linear = np.stack([np.zeros_like(own), dA / (sA**2 * own), dE / sE**2], axis=-1)
+        constant = (dA / sA) ** 2 + (dE / sE) ** 2
+        known = (left_A > 0.0) & (left_E > 0.0) & np.isfinite(square).all(axis=-1) & np.isfinite(linear).all(axis=-1)
+    return Minorant(
+        np.where(known, constant, 0.0),
+        np.where(known[:, None], linear, 0.0),
+        np.where(known[:, None], square, 0.0),
+        np.minimum(np.sqrt(tilt**2 + widest * own * turn**2), 2.0),
+    )
+
+
+# The relaxation.
 
 
 def direction_problem(count: int) -> Any:
@@ -209,93 +296,11 @@ def direction_problem(count: int) -> Any:
     return cp.Problem(cp.Minimize(2 * linear @ w + square @ diagonal), rules)
 
 
-@kept(16)
-def _built(count: int, backend: str) -> Relaxation:
-    tight = {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9, "tol_feas": 1e-9}
+@keep
+def _relaxation(count: int, backend: str) -> Relaxation:
     # the equalities depend on each other at a solution: with Clarabel's own 1e-8 one solve in five stops early
-    settings = {**tight, "static_regularization_constant": 1e-7} if backend == "CLARABEL" else {}
+    settings = tight(backend, 1e-9, static_regularization_constant=1e-7)
     return Relaxation(direction_problem(count), backend=backend, settings=settings)
-
-
-def directions(
-    angle: ArrayLike,
-    sigma: ArrayLike,
-    station: ArrayLike,
-    *,
-    axes: ArrayLike | None = None,
-    radial: float = 1.0,
-    backend: str = "CLARABEL",
-) -> Directed:
-    """Solve the chordal relaxation.
-
-    Parameters
-    ----------
-    angle : array_like, shape (N, 2)
-        Azimuth and elevation, radians.
-    sigma : array_like, shape (N, 2)
-        Standard deviations, positive.
-    station : array_like, shape (N, 3)
-        Positions, numbers of order one.
-    axes : array_like, shape (N, 3, 3), optional
-        Rows are the unit vectors of each station's axes.
-    radial : float
-        Radial weight over the smaller tangent weight; it removes the solution v = -u.
-    backend : str
-        Conic solver.
-
-    Returns
-    -------
-    Directed
-        A start; its bound is not one of the ML cost.
-
-    Notes
-    -----
-    The module's text. Built once per N and back end in each process.
-    """
-    z, s = np.asarray(angle, dtype=np.float64), np.asarray(sigma, dtype=np.float64)
-    flat = 1.0 / (s[:, 0] * np.maximum(np.cos(z[:, 1]), 1e-3)) ** 2
-    steep = 1.0 / s[:, 1] ** 2
-    square = np.stack([radial * np.minimum(flat, steep), flat, steep], axis=-1)
-    cost = _Cost(0.0, np.zeros_like(square), square, 4.0 * len(z))
-    return _solve(_frames(z, axes), np.asarray(station, dtype=np.float64), cost, backend)
-
-
-def angle_bound(
-    angle: ArrayLike,
-    sigma: ArrayLike,
-    station: ArrayLike,
-    point: ArrayLike,
-    *,
-    axes: ArrayLike | None = None,
-    backend: str = "CLARABEL",
-) -> Directed:
-    """Bound the ML cost ``sum (angle error / sigma)^2`` from below over all points, using a fix.
-
-    Parameters
-    ----------
-    angle, sigma, station, axes, backend
-        As in `directions`.
-    point : array_like, shape (3,)
-        A fix, best a refined one: the bound is valid for any, and can reach its cost only if it is stationary.
-
-    Returns
-    -------
-    Directed
-        ``bound`` is at most the ML cost of every point, up to rounding.
-
-    Notes
-    -----
-    The module's text. The proof: points costlier than the fix need no bound; for the others, the minorant, the
-    equalities and weak duality.
-    """
-    z, s = np.asarray(angle, dtype=np.float64), np.asarray(sigma, dtype=np.float64)
-    S = np.asarray(station, dtype=np.float64)
-    seen = predicted(np.asarray(point, dtype=np.float64), S, axes)
-    error = seen - z
-    error[:, 0] = np.arctan2(np.sin(error[:, 0]), np.cos(error[:, 0]))
-    found = minorant(error, s, seen[:, 1], float(((error / s) ** 2).sum()))
-    cost = _Cost(float(found.constant.sum()), found.linear, found.square, float((found.reach**2).sum()))
-    return _solve(_frames(seen, axes), S, cost, backend)
 
 
 @dataclass(frozen=True, slots=True)
@@ -316,6 +321,7 @@ def _frames(angle: Array, axes: ArrayLike | None) -> Array:
 
 def _solve(frame: Array, S: Array, cost: _Cost, backend: str) -> Directed:
     count = len(S)
+    # w in units in which the largest tangent weight is one: a lift of errors of a milliradian would be lost otherwise
     size = float(cost.square[:, 1:].max()) or 1.0
     unit = 1.0 / np.sqrt(size)
     pairs = np.array(list(combinations(range(count), 2)))
@@ -325,8 +331,7 @@ def _solve(frame: Array, S: Array, cost: _Cost, backend: str) -> Directed:
     turn = np.einsum("pai,pbi->pab", frame[pairs[:, 0]], across)
     near = np.einsum("pai,pi->pa", frame[pairs[:, 0]], base)
     far = np.einsum("pai,pi->pa", frame[pairs[:, 1]], base)
-    relaxation = _built(count, backend)
-    answer = relaxation.solve(
+    answer = _relaxation(count, backend).solve(
         {
             "linear": (cost.linear * unit).ravel(),
             "square": (cost.square * unit**2).ravel(),
@@ -341,17 +346,16 @@ def _solve(frame: Array, S: Array, cost: _Cost, backend: str) -> Directed:
         reach=1.0 + cost.reach / unit**2,
     )
     lift = answer.values["lift"]
-    v, ratio = np.full((count, 3), np.nan), np.nan
+    v, plain = np.full((count, 3), np.nan), lift
     if np.isfinite(lift).all():
+        # from (1, w) back to (1, v): the rank is told apart in the directions themselves, not in scaled differences
         change = np.zeros_like(lift)
         change[0, 0] = 1.0
         for i in range(count):
             own = slice(1 + 3 * i, 4 + 3 * i)
             change[own, 0], change[own, own] = frame[i, 0], unit * frame[i].T
         plain = change @ lift @ change.T
-        values = np.linalg.eigvalsh(plain)
-        ratio = float(abs(values[-2]) / values[-1])
         v = plain[1:, 0].reshape(count, 3)
         v = v / np.linalg.norm(v, axis=1, keepdims=True)
     bound = cost.constant + answer.bound
-    return Directed(meeting(v, S), v, cost.constant + answer.primal, max(bound, 0.0), ratio, answer)
+    return Directed(meeting(v, S), v, cost.constant + answer.primal, max(bound, 0.0), rank_ratio(plain), answer)

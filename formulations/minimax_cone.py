@@ -24,16 +24,232 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from formulations.conic import Answer, Relaxation, kept
+from formulations.algebra import Array
+from formulations.conic import Answer, Relaxation, keep, tight
 
-# The cone programs of bearings with bounded errors, as cvxpy problems and as their parameters.
-#
-# Source: M. S. Lobo, L. Vandenberghe, S. Boyd and H. Lebret, "Applications of second-order cone programming", Linear
-# Algebra Appl. 284 (1998).
+# Largest half-angle that is handled as a cone, radians: at pi/2 the cone is a half-space; here its tangent is 100.
+_WIDEST = 0.5 * np.pi - 0.01
+_RADIUS = 1e3  # distance, in the caller's units of order one, within which a proof of emptiness is asked for
+_EXACT = 1e-6  # level, in the caller's sigma, that counts as zero: bisection would halve it for ever
+# how Clarabel, and cvxpy for all others, say it; in small letters
+_SOLVED = ("solved", "almostsolved", "optimal", "optimal_inaccurate")
+_UNBOUNDED = ("dualinfeasible", "almostdualinfeasible", "unbounded", "unbounded_inaccurate")
 
-Array = NDArray[np.float64]
+
+@dataclass(frozen=True, slots=True)
+class Common:
+    """The common points of cones.
+
+    Parameters
+    ----------
+    point : Array, shape (d,)
+        Centre of the largest ball (of radius at most one) inside all cones; where they do not meet, the point that
+        violates them least.
+    margin : float
+        Radius of that ball; negative where the cones do not meet, then the largest (distance-like) violation.
+    most : float
+        Upper bound of the margin, recomputed from the dual, over points within `_RADIUS` of the origin.
+    meet : bool or None
+        True where `point` was checked to lie in every cone; False where `most` is negative, a proof that no point
+        does; None where neither could be shown.
+    answer : Answer
+        The solver's report.
+    """
+
+    point: Array
+    margin: float
+    most: float
+    meet: bool | None
+    answer: Answer
+
+
+@dataclass(frozen=True, slots=True)
+class Minimax:
+    """The fix whose worst scaled angle is least.
+
+    Parameters
+    ----------
+    point : Array, shape (d,)
+        The fix; NaN where no point is in front of all stations.
+    level : float
+        Its worst ``angle_i / sigma_i``.
+    least : float
+        No point within `_WIDEST` of every bearing has a smaller one: the largest level proven empty.
+    meet : bool or None
+        As in `Common`, at the widest level.
+    solves : int
+        Cone programs solved.
+    """
+
+    point: Array
+    level: float
+    least: float
+    meet: bool | None
+    solves: int
+
+
+def common(direction: ArrayLike, station: ArrayLike, bound: ArrayLike, *, backend: str = "CLARABEL") -> Common:
+    """Do the cones meet, and where is their middle?
+
+    Parameters
+    ----------
+    direction : array_like, shape (N, d)
+        Measured unit directions.
+    station : array_like, shape (N, d)
+        Positions, numbers of order one.
+    bound : array_like, shape (N,)
+        Largest possible angle to the true direction, radians, positive and below pi/2; infinite drops a cone.
+    backend : str
+        Conic solver; other ones than Clarabel prove nothing.
+
+    Returns
+    -------
+    Common
+        Verdict, centre and margin.
+
+    Notes
+    -----
+    The module's text.
+    """
+    u, S, theta = (np.asarray(part, dtype=np.float64) for part in (direction, station, bound))
+    relaxation = _relaxation("ball", u.shape[0], u.shape[1], backend)
+    answer = relaxation.solve(_cone_data(u, S, theta, ball=True))
+    point, margin = answer.values["point"], -answer.primal
+    inside = bool((angles(point, u, S) <= theta).all())
+    meet = True if inside else (False if -answer.bound < 0.0 else None)
+    return Common(point, margin, -answer.bound, meet, answer)
+
+
+def extent(
+    direction: ArrayLike, station: ArrayLike, bound: ArrayLike, towards: ArrayLike, *, backend: str = "CLARABEL"
+) -> Array:
+    """How far do the common points of the cones reach?
+
+    Parameters
+    ----------
+    direction, station, bound, backend
+        As in `common`.
+    towards : array_like, shape (K, d)
+        Directions asked for.
+
+    Returns
+    -------
+    Array, shape (K,)
+        Upper bounds of ``towards'p`` over the set, recomputed from the dual and attained up to the solver's accuracy;
+        infinite where the set is not bounded, NaN where it is empty or the solver failed.
+
+    Notes
+    -----
+    Lobo et al. (1998).
+    """
+    u, S, theta = (np.asarray(part, dtype=np.float64) for part in (direction, station, bound))
+    relaxation, data = _relaxation("edge", u.shape[0], u.shape[1], backend), _cone_data(u, S, theta, ball=False)
+    out = []
+    for line in np.asarray(towards, dtype=np.float64):
+        answer = relaxation.solve({**data, "towards": -line})
+        if answer.status.lower() in _UNBOUNDED:
+            out.append(np.inf)
+        else:
+            known = answer.status.lower() in _SOLVED
+            out.append((-answer.bound if np.isfinite(answer.bound) else -answer.primal) if known else np.nan)
+    return np.array(out)
+
+
+def minimax(
+    direction: ArrayLike,
+    station: ArrayLike,
+    sigma: ArrayLike,
+    *,
+    tolerance: float = 1e-4,
+    most: int = 60,
+    backend: str = "CLARABEL",
+) -> Minimax:
+    """Find the point whose largest scaled angle to the bearings is least, over all points.
+
+    Parameters
+    ----------
+    direction, station, backend
+        As in `common`.
+    sigma : array_like, shape (N,)
+        Scale of each angle, radians; infinite drops a bearing.
+    tolerance : float
+        Relative width of the bracket at which to stop.
+    most : int
+        Largest number of cone programs.
+
+    Returns
+    -------
+    Minimax
+        Fix, level, and the level proven empty.
+
+    Notes
+    -----
+    Kahl and Hartley (2008), bisection; a level is raised from below only by a proof.
+    """
+    u, S, scale = (np.asarray(part, dtype=np.float64) for part in (direction, station, sigma))
+    # the widest cones first: where they do not meet, no point is in front of all stations
+    level, low = _WIDEST / float(scale[np.isfinite(scale)].min()), 0.0
+    found = _at(u, S, scale, level, backend)
+    if not found.meet:
+        nowhere = level if found.meet is False else 0.0
+        return Minimax(np.full(u.shape[1], np.nan), np.inf, nowhere, found.meet, 1)
+    point, solves = found.point, 1
+    level = float((angles(point, u, S) / scale).max())
+    while level - low > tolerance * level and level > _EXACT and solves < most:
+        middle = 0.5 * (low + level)
+        found, solves = _at(u, S, scale, middle, backend), solves + 1
+        if found.meet:
+            # the angles attained at the point found lie below the level asked for: faster than bisection alone
+            point, level = found.point, float((angles(found.point, u, S) / scale).max())
+        elif found.meet is False:
+            low = middle
+        else:
+            break
+    return Minimax(point, level, low, True, solves)
+
+
+def angles(point: Array, direction: Array, station: Array) -> Array:
+    """Return the angles between measured directions and a point.
+
+    Parameters
+    ----------
+    point : Array, shape (d,)
+        Target.
+    direction, station : Array, shape (N, d)
+        Unit vectors and positions.
+
+    Returns
+    -------
+    Array, shape (N,)
+        Radians, from 0 to pi.
+
+    Notes
+    -----
+    W. Kahan's form: accurate for small and for nearly opposite directions.
+    """
+    line = point - station
+    line = line / np.linalg.norm(line, axis=1, keepdims=True)
+    away, along = np.linalg.norm(line - direction, axis=1), np.linalg.norm(line + direction, axis=1)
+    return np.asarray(2.0 * np.arctan2(away, along))
+
+
+def _at(u: Array, S: Array, scale: Array, level: float, backend: str) -> Common:
+    theta = np.where(np.isfinite(scale), np.minimum(level * scale, _WIDEST), np.inf)
+    return common(u, S, theta, backend=backend)
+
+
+# The cone programs and their parameters.
+
+
+@keep
+def _relaxation(kind: str, count: int, dim: int, backend: str) -> Relaxation:
+    settings = tight(backend, 1e-10)  # margins are proven by their sign: two decades below Clarabel's own
+    if kind == "edge":
+        return Relaxation(edge_problem(count, dim), backend=backend, settings=settings)
+    # (p, 0) is feasible for every common point p: emptiness is proven for all p with |p| <= radius (1 + ..)
+    return Relaxation(ball_problem(count, dim), backend=backend, settings=settings, radius=_RADIUS)
 
 
 def ball_problem(count: int, dim: int) -> Any:
@@ -97,255 +313,23 @@ def _cones(point: Any, radius: Any, count: int, dim: int) -> list[Any]:
     return [cp.SOC(reach[i], off[i * rows : (i + 1) * rows]) for i in range(count)]
 
 
-def cone_data(u: Array, S: Array, theta: Array, *, ball: bool) -> dict[str, Array]:
-    """Return the parameters of the two problems.
+def _cone_data(u: Array, S: Array, theta: Array, *, ball: bool) -> dict[str, Array]:
+    """Parameters of both problems at half-angles (N,) below pi/2; an infinite one drops its cone.
 
-    Parameters
-    ----------
-    u, S : Array, shape (N, d)
-        Unit directions and stations.
-    theta : Array, shape (N,)
-        Half-angles below pi/2; infinite drops a cone.
-    ball : bool
-        For `ball_problem` (True) or `edge_problem`.
-
-    Returns
-    -------
-    dict of Arrays
-        By the parameters' names; each cone is multiplied by its cosine, so that wide ones keep small numbers.
-
-    Notes
-    -----
-    See :mod:`formulations.minimax_cone`.
+    Each cone is multiplied by its cosine, so that wide ones keep small numbers.
     """
     _count, dim = u.shape
-    kept = np.isfinite(theta)
-    half = np.where(kept, theta, 0.0)
+    held = np.isfinite(theta)
+    half = np.where(held, theta, 0.0)
     # the complement of u: the last left singular vectors of a column
     side = np.linalg.svd(u[:, :, None])[0][:, :, 1:].transpose(0, 2, 1)
-    side = np.where(kept[:, None, None], np.cos(half)[:, None, None] * side, 0.0)
-    slope = np.where(kept, np.sin(half), 0.0)[:, None] * u
+    side = np.where(held[:, None, None], np.cos(half)[:, None, None] * side, 0.0)
+    slope = np.where(held, np.sin(half), 0.0)[:, None] * u
     at = (slope * S).sum(axis=1)
     data = {
         "side": side.reshape(-1, dim),
         "side_at": np.einsum("nrd,nd->nr", side, S).ravel(),
         "slope": slope,
-        "slope_at": np.where(kept, at, -1.0),
+        "slope_at": np.where(held, at, -1.0),
     }
-    return {**data, "widen": np.where(kept, 1.0, 0.0)} if ball else data
-
-
-_WIDEST = 0.5 * np.pi - 0.01  # largest half-angle that is handled as a cone, radians
-_RADIUS = 1e3  # distance, in the caller's scaled units, within which a proof of emptiness is asked for
-_EXACT = 1e-6  # level, in the caller's sigma, that counts as zero
-_SOLVED = ("solved", "almostsolved", "optimal", "optimal_inaccurate")
-_UNBOUNDED = ("dualinfeasible", "almostdualinfeasible", "unbounded", "unbounded_inaccurate")
-
-
-@dataclass(frozen=True, slots=True)
-class Common:
-    """The common points of cones.
-
-    Parameters
-    ----------
-    point : Array, shape (d,)
-        Centre of the largest ball (of radius at most one) inside all cones; where they do not meet, the point that
-        violates them least.
-    margin : float
-        Radius of that ball; negative where the cones do not meet, then the largest (distance-like) violation.
-    most : float
-        Upper bound of the margin, recomputed from the dual, over points within `_RADIUS` of the origin.
-    meet : bool or None
-        True where `point` was checked to lie in every cone; False where `most` is negative, a proof that no point
-        does; None where neither could be shown.
-    answer : Answer
-        The solver's report.
-    """
-
-    point: Array
-    margin: float
-    most: float
-    meet: bool | None
-    answer: Answer
-
-
-@dataclass(frozen=True, slots=True)
-class Minimax:
-    """The fix whose worst scaled angle is least.
-
-    Parameters
-    ----------
-    point : Array, shape (d,)
-        The fix; NaN where no point is in front of all stations.
-    level : float
-        Its worst ``angle_i / sigma_i``.
-    least : float
-        No point within `_WIDEST` of every bearing has a smaller one: the largest level proven empty.
-    meet : bool or None
-        As in `Common`, at the widest level.
-    solves : int
-        Cone programs solved.
-    """
-
-    point: Array
-    level: float
-    least: float
-    meet: bool | None
-    solves: int
-
-
-@kept(32)
-def _built(kind: str, count: int, dim: int, backend: str) -> Relaxation:
-    tight = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10} if backend == "CLARABEL" else {}
-    if kind == "edge":
-        return Relaxation(edge_problem(count, dim), backend=backend, settings=tight)
-    # (p, 0) is feasible for every common point p: emptiness is proven for all p with |p| <= radius (1 + ..)
-    return Relaxation(ball_problem(count, dim), backend=backend, settings=tight, radius=_RADIUS)
-
-
-def common(direction: ArrayLike, station: ArrayLike, bound: ArrayLike, *, backend: str = "CLARABEL") -> Common:
-    """Do the cones meet, and where is their middle?
-
-    Parameters
-    ----------
-    direction : array_like, shape (N, d)
-        Measured unit directions.
-    station : array_like, shape (N, d)
-        Positions, numbers of order one.
-    bound : array_like, shape (N,)
-        Largest possible angle to the true direction, radians, positive and below pi/2; infinite drops a cone.
-    backend : str
-        Conic solver; other ones than Clarabel prove nothing.
-
-    Returns
-    -------
-    Common
-        Verdict, centre and margin.
-
-    Notes
-    -----
-    The module's text.
-    """
-    u, S, theta = (np.asarray(part, dtype=np.float64) for part in (direction, station, bound))
-    relaxation = _built("ball", u.shape[0], u.shape[1], backend)
-    answer = relaxation.solve(cone_data(u, S, theta, ball=True))
-    point, margin = answer.values["point"], -answer.primal
-    inside = bool((angles(point, u, S) <= theta).all())
-    meet = True if inside else (False if -answer.bound < 0.0 else None)
-    return Common(point, margin, -answer.bound, meet, answer)
-
-
-def extent(
-    direction: ArrayLike, station: ArrayLike, bound: ArrayLike, towards: ArrayLike, *, backend: str = "CLARABEL"
-) -> Array:
-    """How far do the common points of the cones reach?
-
-    Parameters
-    ----------
-    direction, station, bound, backend
-        As in `common`.
-    towards : array_like, shape (K, d)
-        Directions asked for.
-
-    Returns
-    -------
-    Array, shape (K,)
-        Upper bounds of ``towards'p`` over the set, recomputed from the dual and attained up to the solver's accuracy;
-        infinite where the set is not bounded, NaN where it is empty or the solver failed.
-
-    Notes
-    -----
-    Lobo et al. (1998).
-    """
-    u, S, theta = (np.asarray(part, dtype=np.float64) for part in (direction, station, bound))
-    relaxation, data = _built("edge", u.shape[0], u.shape[1], backend), cone_data(u, S, theta, ball=False)
-    out = []
-    for line in np.asarray(towards, dtype=np.float64):
-        answer = relaxation.solve({**data, "towards": -line})
-        if answer.status.lower() in _UNBOUNDED:
-            out.append(np.inf)
-        else:
-            known = answer.status.lower() in _SOLVED
-            out.append((-answer.bound if np.isfinite(answer.bound) else -answer.primal) if known else np.nan)
-    return np.array(out)
-
-
-def minimax(
-    direction: ArrayLike,
-    station: ArrayLike,
-    sigma: ArrayLike,
-    *,
-    tolerance: float = 1e-4,
-    most: int = 60,
-    backend: str = "CLARABEL",
-) -> Minimax:
-    """Find the point whose largest scaled angle to the bearings is least, over all points.
-
-    Parameters
-    ----------
-    direction, station, backend
-        As in `common`.
-    sigma : array_like, shape (N,)
-        Scale of each angle, radians; infinite drops a bearing.
-    tolerance : float
-        Relative width of the bracket at which to stop.
-    most : int
-        Largest number of cone programs.
-
-    Returns
-    -------
-    Minimax
-        Fix, level, and the level proven empty.
-
-    Notes
-    -----
-    Kahl and Hartley (2008), bisection; a level is raised from below only by a proof.
-    """
-    u, S, scale = (np.asarray(part, dtype=np.float64) for part in (direction, station, sigma))
-    level, low = _WIDEST / float(scale[np.isfinite(scale)].min()), 0.0
-    found = _at(u, S, scale, level, backend)
-    if not found.meet:
-        nowhere = level if found.meet is False else 0.0
-        return Minimax(np.full(u.shape[1], np.nan), np.inf, nowhere, found.meet, 1)
-    point, solves = found.point, 1
-    level = float((angles(point, u, S) / scale).max())
-    while level - low > tolerance * level and level > _EXACT and solves < most:
-        middle = 0.5 * (low + level)
-        found, solves = _at(u, S, scale, middle, backend), solves + 1
-        if found.meet:
-            point, level = found.point, float((angles(found.point, u, S) / scale).max())
-        elif found.meet is False:
-            low = middle
-        else:
-            break
-    return Minimax(point, level, low, True, solves)
-
-
-def angles(point: Array, direction: Array, station: Array) -> Array:
-    """Return the angles between measured directions and a point.
-
-    Parameters
-    ----------
-    point : Array, shape (d,)
-        Target.
-    direction, station : Array, shape (N, d)
-        Unit vectors and positions.
-
-    Returns
-    -------
-    Array, shape (N,)
-        Radians, from 0 to pi.
-
-    Notes
-    -----
-    W. Kahan's form: accurate for small and for nearly opposite directions.
-    """
-    line = point - station
-    line = line / np.linalg.norm(line, axis=1, keepdims=True)
-    away, along = np.linalg.norm(line - direction, axis=1), np.linalg.norm(line + direction, axis=1)
-    return np.asarray(2.0 * np.arctan2(away, along))
-
-
-def _at(u: Array, S: Array, scale: Array, level: float, backend: str) -> Common:
-    theta = np.where(np.isfinite(scale), np.minimum(level * scale, _WIDEST), np.inf)
-    return common(u, S, theta, backend=backend)
+    return {**data, "widen": np.where(held, 1.0, 0.0)} if ball else data

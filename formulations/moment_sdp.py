@@ -26,23 +26,18 @@ from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from formulations.conic import Answer, Relaxation, kept
+from formulations.algebra import Array, Index
+from formulations.conic import Answer, Relaxation, keep, rank_ratio, tight
 from formulations.range_enclosure import Box, Ranged
-
-# Moments of a point and of range errors: the monomials, and what matrices and rules are made of them.
-#
-# A monomial is a product of two of ``(1, s, t)`` (position and reference range) and two of ``(1, w)`` (errors): these
-# are the entries of the moment matrix of ``(1, s, t) x (1, w)``.
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True, slots=True)
 class Moments:
     """Numbers of the monomials of M ranges in d dimensions, with p = d + 2 places.
+
+    A monomial is a product of two of ``(1, s, t)`` (position and reference range) and two of ``(1, w)`` (errors): these
+    are the entries of the moment matrix of ``(1, s, t) x (1, w)``.
 
     Parameters
     ----------
@@ -68,7 +63,7 @@ class Moments:
     cost: Index
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=32)  # arrays that nobody writes to: threads may share them
 def moments(stations: int, dimension: int) -> Moments:
     """Return numbers of the monomials; pairs are upper triangles, row by row.
 
@@ -100,23 +95,6 @@ def moments(stations: int, dimension: int) -> Moments:
     cost = np.array([table[u[0], v[0], u[1], v[1]] for u, v in combinations_with_replacement(terms, 2)])
     matrix = table.transpose(0, 2, 1, 3).reshape(p * M, p * M)
     return Moments(len(place) * len(error), table, matrix, cone, rules, cost)
-
-
-def upper(form: Array) -> Array:
-    """Return the coefficients of a quadratic form on the products of pairs.
-
-    Parameters
-    ----------
-    form : Array, shape (n, n)
-        Symmetric.
-
-    Returns
-    -------
-    Array, shape (n (n + 1) / 2,)
-        Upper triangle row by row, the entries off the diagonal doubled.
-    """
-    row, column = np.triu_indices(len(form))
-    return np.asarray(np.where(row == column, 1.0, 2.0) * form[row, column])
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,21 +149,21 @@ def moment_problem(stations: int, dimension: int) -> Any:
     cone = cp.Parameter(own.cone.shape[1], name="cone")
     rule = cp.Parameter((stations - 1, dimension + 5), name="rule")
 
-    def arranged(index: NDArray[np.int64]) -> Any:
+    def arranged(index: Index) -> Any:
         return cp.reshape(y[index.ravel()], index.shape, order="C")
 
     errors = arranged(own.table[0, 0])
+    # the moment matrix, then those of (1 - t^2), (1 - s_k^2) times two errors; the rules times 1, s and t
     demands = [arranged(own.matrix) >> 0, y[0] == 1, arranged(own.cone) @ cone == 0]
     demands += [errors - arranged(own.table[k, k]) >> 0 for k in range(1, dimension + 2)]
     demands += [arranged(index) @ rule[i] == 0 for i, index in enumerate(own.rules)]
     return cp.Problem(cp.Minimize(cost @ y[own.cost]), demands)
 
 
-@kept(16)
-def _built(stations: int, dimension: int, backend: str) -> Relaxation:
-    tight = {"tol_gap_abs": 1e-8, "tol_gap_rel": 1e-8, "tol_feas": 1e-8}
+@keep
+def _relaxation(stations: int, dimension: int, backend: str) -> Relaxation:
     # the equalities depend on each other at a solution: with Clarabel's own 1e-8 one solve in four stops early
-    settings = {**tight, "static_regularization_constant": 1e-7} if backend == "CLARABEL" else {}
+    settings = tight(backend, 1e-8, static_regularization_constant=1e-7)
     return Relaxation(moment_problem(stations, dimension), backend=backend, settings=settings)
 
 
@@ -214,23 +192,20 @@ def moment_bound(ranged: Ranged, box: Box, cost: float, *, backend: str = "CLARA
     """
     M, d = ranged.station.shape
     own = moments(M, d)
+    # errors in units of the largest that a point of this cost can have: with the box, every monomial is at most one
     unit = np.sqrt(cost * np.diag(ranged.spread))
     cone, rule, form = _forms(ranged, box, unit)
     size = float(np.abs(form).max())
     values = {
-        "cost": upper(form / size),
-        "cone": upper(cone / np.abs(cone).max()),
+        "cost": _upper(form / size),
+        "cone": _upper(cone / np.abs(cone).max()),
         "rule": rule / np.abs(rule).max(1, keepdims=True),
     }
     # no monomial of a point that matters exceeds one
-    answer = _built(M, d, backend).solve(values, reach=float(np.sqrt(own.count)))
+    answer = _relaxation(M, d, backend).solve(values, reach=float(np.sqrt(own.count)))
     place = answer.values["y"][own.table[:, :, 0, 0]]
-    ratio = np.nan
-    if np.isfinite(place).all():
-        found = np.linalg.eigvalsh(place)
-        ratio = float(abs(found[-2]) / found[-1])
     point = box.centre + box.axes @ place[0, 1:-1]
-    return Bounded(point, answer.primal * size, min(answer.bound * size, cost), ratio, answer)
+    return Bounded(point, answer.primal * size, min(answer.bound * size, cost), rank_ratio(place), answer)
 
 
 def _forms(ranged: Ranged, box: Box, unit: Array) -> tuple[Array, Array, Array]:
@@ -253,6 +228,7 @@ def _forms(ranged: Ranged, box: Box, unit: Array) -> tuple[Array, Array, Array]:
             unit * unit,
         ]
     )
+    # from (1, t, omega) to (1, r_1, w)
     change = np.diag(np.concatenate([[1.0, half], unit]))
     change[1, 0] = middle
     return cone, rule, change.T @ _cost(ranged) @ change
@@ -268,3 +244,9 @@ def _cost(ranged: Ranged) -> Array:
     error = np.zeros((M, M + 1))
     error[:, 0], error[:, 1], error[1:, 2:] = -ranged.offset[0], 1.0, np.eye(M - 1)
     return np.asarray(error.T @ np.linalg.solve(ranged.covariance, error))
+
+
+def _upper(form: Array) -> Array:
+    """Coefficients of a quadratic form on the products of pairs: its upper triangle row by row, others doubled."""
+    row, column = np.triu_indices(len(form))
+    return np.asarray(np.where(row == column, 1.0, 2.0) * form[row, column])

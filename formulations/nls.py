@@ -5,11 +5,11 @@ r"""Weighted nonlinear least squares with bounds, equalities and inequalities, a
 
 with :math:`e = z - h(x, p)` unless another residual is given (angles must wrap). The functions h, c, d are injected
 and differentiated exactly by CasADi; data, weights, prior, bounds and start are arguments of the solve, so that a
-program is compiled once per structure.
+program is compiled once per structure. Threads may share a program: they take turns.
 
 Sources: A. Waechter and L. T. Biegler, "On the implementation of an interior-point filter line-search algorithm for
 large-scale nonlinear programming", Math. Program. 106 (2006); J. A. E. Andersson et al., "CasADi", Math. Program.
-Comput. 11 (2019).
+Comput. 11 (2019), section 5 (code generation).
 """
 
 from __future__ import annotations
@@ -24,59 +24,33 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from formulations.algebra import Array
 from formulations.backend import Choice, count
 
-# Functions of a nonlinear program as machine code, made by the C compiler of the system where there is one.
-#
-# Source: J. A. E. Andersson et al., "CasADi", Math. Program. Comput. 11 (2019), section 5 (code generation).
-
-_COMPILERS = ("cc", "gcc", "clang")
-_PATIENCE = 600.0  # seconds; large programs are long source
-
-
-def library_solver(name: str, solver: Any, options: dict[str, Any]) -> Any:
-    """Build a nonlinear solver again with its functions compiled.
-
-    Parameters
-    ----------
-    name : str
-        CasADi's name of the solver, for instance ``"ipopt"``.
-    solver : casadi.Function
-        The solver with interpreted functions.
-    options : dict
-        Its options.
-
-    Returns
-    -------
-    casadi.Function or None
-        The same solver on machine code; None where there is no compiler or it fails.
-    """
-    import casadi as ca
-
-    compiler = next((found for found in map(shutil.which, _COMPILERS) if found), None)
-    if compiler is None:
-        return None
-    generator = ca.CodeGenerator("program.c")
-    generator.add(solver.oracle())
-    for part in solver.get_function():
-        generator.add(solver.get_function(part))
-    with tempfile.TemporaryDirectory(prefix="casadi", ignore_cleanup_errors=True) as folder:
-        source, library = Path(folder) / "program.c", Path(folder) / "program.so"
-        source.write_text(generator.dump(), encoding="utf-8")
-        command = [compiler, "-O1", "-shared", "-fPIC", str(source), "-o", str(library), "-lm"]
-        try:
-            subprocess.run(command, check=True, capture_output=True, timeout=_PATIENCE)  # noqa: S603  (no shell)
-            # what is loaded stays when its file is gone
-            return ca.nlpsol("nls", name, str(library), options)
-        except (subprocess.SubprocessError, OSError, RuntimeError):
-            return None
-
-
-Array = NDArray[np.float64]
 Function = Callable[[Any, Any], Any]
 Residual = Callable[[Any, Any, Any], Any]
+
+_QUIET = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False, "calc_lam_p": False}
+# What keeps solvers of CasADi silent, and their inner solvers from failing. IPOPT's tolerance is two decades below its
+# own 1e-8: its answers are second opinions on those of a Gauss-Newton iteration.
+_SILENCE: dict[str, dict[str, Any]] = {
+    "ipopt": {"ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-10}},
+    "sqpmethod": {
+        "print_header": False,
+        "print_iteration": False,
+        "print_status": False,
+        "qpsol": "qrqp",
+        "qpsol_options": {"print_iter": False, "print_header": False, "print_info": False, "error_on_fail": False},
+        "hessian_approximation": "exact",
+        "convexify_strategy": "regularize",
+    },
+    "blocksqp": {"print_header": False, "print_iteration": False},
+}
+
+_COMPILERS = ("cc", "gcc", "clang")
+_PATIENCE = 600.0  # seconds; some 10 for 200 rows, and large programs are long source
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,14 +144,17 @@ class Program:
         c = _column(equalities(x, given)) if equalities else ca.SX(0, 1)
         d = _column(inequalities(x, given)) if inequalities else ca.SX(0, 1)
         self._equal, self._more = c.shape[0], d.shape[0]
+        # everything that changes from solve to solve is one parameter vector: the program is built and compiled once
         data = ca.vertcat(given, z, ca.vec(weight), mean, ca.vec(information))
         program = {"x": x, "p": data, "f": cost, "g": ca.vertcat(c, d)}
         self._name = "ipopt" if choice is None else choice.name
         options = _options(choice, settings or {})
-        self._solver = ca.nlpsol("nls", self._name, program, options)
-        faster = library_solver(self._name, self._solver, options) if compiled else None
+        solver = ca.nlpsol("nls", self._name, program, options)
+        faster = _compile(self._name, solver, options) if compiled else None
         self.compiled = faster is not None
-        self._solver = self._solver if faster is None else faster
+        self._solver = solver if faster is None else faster
+        # CasADi releases the interpreter lock while it solves, and the solver has one memory, which threads at once
+        # corrupt, and one report, of its last solve
         self._lock = threading.Lock()
 
     def solve(
@@ -217,24 +194,25 @@ class Program:
         mean, information = prior if prior is not None else (np.zeros(self.n), np.zeros((self.n, self.n)))
         data = np.concatenate(
             [
-                _checked("p", p, (self.p,)),
-                _checked("z", z, (self.m,)),
-                _checked("weight", identity if weight is None else weight, identity.shape).ravel(order="F"),
-                _checked("prior mean", mean, (self.n,)),
-                _checked("prior information", information, (self.n, self.n)).ravel(order="F"),
+                _check("p", p, (self.p,)),
+                _check("z", z, (self.m,)),
+                _check("weight", identity if weight is None else weight, identity.shape).ravel(order="F"),
+                _check("prior mean", mean, (self.n,)),
+                _check("prior information", information, (self.n, self.n)).ravel(order="F"),
             ]
         )
-        arguments = {
-            "x0": _checked("start", start, (self.n,)),
+        given = {
+            "x0": _check("start", start, (self.n,)),
             "p": data,
-            "lbx": _checked("lower", np.full(self.n, -np.inf) if lower is None else lower, (self.n,)),
-            "ubx": _checked("upper", np.full(self.n, np.inf) if upper is None else upper, (self.n,)),
+            "lbx": _check("lower", np.full(self.n, -np.inf) if lower is None else lower, (self.n,)),
+            "ubx": _check("upper", np.full(self.n, np.inf) if upper is None else upper, (self.n,)),
             "lbg": np.zeros(self._equal + self._more),
             "ubg": np.concatenate([np.zeros(self._equal), np.full(self._more, np.inf)]),
         }
-        with self._lock:  # the solver has one memory, which threads at once corrupt, and one report, of its last solve
-            found, stats = self._solver(**arguments), self._solver.stats()
-        count(self._name, int(stats.get("iter_count", 0)))
+        with self._lock:
+            found, stats = self._solver(**given), self._solver.stats()
+        iterations = int(stats.get("iter_count", 0))
+        count(self._name, iterations)
         multipliers = _numbers(found["lam_g"])
         return Local(
             x=_numbers(found["x"]),
@@ -244,25 +222,8 @@ class Program:
             inequalities=multipliers[self._equal :],
             status=str(stats["return_status"]),
             success=bool(stats["success"]),
-            iterations=int(stats.get("iter_count", 0)),
+            iterations=iterations,
         )
-
-
-_QUIET = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False, "calc_lam_p": False}
-_SILENCE: dict[str, dict[str, Any]] = {
-    "ipopt": {"ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-10}},
-    "sqpmethod": {
-        "print_header": False,
-        "print_iteration": False,
-        "print_status": False,
-        "qpsol": "qrqp",
-        "qpsol_options": {"print_iter": False, "print_header": False, "print_info": False, "error_on_fail": False},
-        "hessian_approximation": "exact",
-        "convexify_strategy": "regularize",
-    },
-    "blocksqp": {"print_header": False, "print_iteration": False},
-}
-"""Options of solvers of CasADi that keep them silent, and their inner solvers from failing."""
 
 
 def _options(choice: Choice | None, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -286,7 +247,7 @@ def _column(expressions: Any, count: int | None = None) -> Any:
     return column
 
 
-def _checked(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+def _check(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
     array = np.asarray(value, dtype=np.float64)
     if array.shape != shape:
         raise ValueError(f"{name} has shape {array.shape}, {shape} expected")
@@ -295,3 +256,27 @@ def _checked(name: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
 
 def _numbers(value: Any) -> Array:
     return np.asarray(value.full(), dtype=np.float64).ravel()
+
+
+def _compile(name: str, solver: Any, options: dict[str, Any]) -> Any:
+    """Build a CasADi solver again with its functions as machine code; None where no compiler does it."""
+    import casadi as ca
+
+    compiler = next((found for found in map(shutil.which, _COMPILERS) if found), None)
+    if compiler is None:
+        return None
+    generator = ca.CodeGenerator("program.c")
+    generator.add(solver.oracle())
+    for part in solver.get_function():
+        generator.add(solver.get_function(part))
+    with tempfile.TemporaryDirectory(prefix="casadi", ignore_cleanup_errors=True) as folder:
+        source, library = Path(folder) / "program.c", Path(folder) / "program.so"
+        source.write_text(generator.dump(), encoding="utf-8")
+        # for 200 ranges -O2 compiled 2.4 times as long and solved no faster; -O0 solved at a third of the speed
+        command = [compiler, "-O1", "-shared", "-fPIC", str(source), "-o", str(library), "-lm"]
+        try:
+            subprocess.run(command, check=True, capture_output=True, timeout=_PATIENCE)  # noqa: S603  (no shell)
+            # what is loaded stays when its file is gone
+            return ca.nlpsol("nls", name, str(library), options)
+        except (subprocess.SubprocessError, OSError, RuntimeError):
+            return None

@@ -20,12 +20,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from formulations.algebra import Array
 
-_FLAT = 1e-12  # relative singular value below which a system of squared ranges determines nothing
-_ROUND = 1.0 + 1e-6  # boxes are this much larger, for rounding
+_FLAT = 1e-12  # relative singular value below which a system of squared ranges determines nothing: above rounding
+# Boxes are this much larger than the inequalities ask for: far more than rounding errors of numbers of order one, which
+# an ill-conditioned left inverse magnifies, and too little to loosen a bound.
+_ROUND = 1.0 + 1e-6
+_NEAR = 1e-6  # shortest distance that a row is weighed by: the point may be a station, and any weight gives a valid box
+_LONG = 1e-9  # share of the largest information below which an axis gets no longer: directions that the rows leave open
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,11 +139,12 @@ def enclosure(ranged: Ranged, point: Array, cost: float) -> Box | None:
     a, side, d, rho = ranged.station[1:] - ranged.station[0], ranged.side, ranged.excess, float(np.sqrt(cost))
     right = (a * a).sum(1) - d * d
     system = 2.0 * (np.column_stack([a, side * d]) if ranged.free else a)
-    away = np.maximum(np.linalg.norm(point - ranged.station[1:], axis=1), 1e-6)
+    away = np.maximum(np.linalg.norm(point - ranged.station[1:], axis=1), _NEAR)
     root: Array = np.asarray(np.linalg.cholesky(ranged.spread), dtype=np.float64)
     left = _left_inverse(system, away, root)
     error = _Error(rho, root, side, d, np.array(np.diag(ranged.spread)))
     if not ranged.free:
+        # the reference is measured itself: an unknown in an interval, not a column of the system
         slack = rho * float(np.sqrt(ranged.covariance[0, 0]))
         reach = max(0.0, ranged.offset[0] - slack), ranged.offset[0] + slack
         if left is None:
@@ -197,6 +201,7 @@ class _Error:
 
     def reference(self, row: Array, middle: float) -> tuple[float, float] | None:
         """Bound r_1 by the row of the left inverse that belongs to it."""
+        # r_1 <= middle + rest + slope r_1: where the slope reaches one, the errors grow with the range without end
         slope = self._along(row * self.side)
         rest = self._along(row * self.excess) + self._square(row)
         if slope >= 1.0 or middle + rest < 0.0:
@@ -230,10 +235,11 @@ def _box(ranged: Ranged, point: Array, left: Array, right: Array, error: _Error,
 def _principal(ranged: Ranged, point: Array) -> Array:
     """Principal axes of the errors of a fix, one standard deviation long, in columns."""
     apart = point - ranged.station
+    # a point on a station sees it nowhere: no row there, not a division by zero
     unit = apart / np.maximum(np.linalg.norm(apart, axis=1, keepdims=True), 1e-9)
     if ranged.free:
         slope, matrix = unit[1:] - ranged.side[:, None] * unit[0], ranged.spread
     else:
         slope, matrix = unit, ranged.covariance
     values, vectors = np.linalg.eigh(slope.T @ np.linalg.solve(matrix, slope))
-    return np.asarray(vectors / np.sqrt(np.maximum(values, 1e-9 * values[-1])))
+    return np.asarray(vectors / np.sqrt(np.maximum(values, _LONG * values[-1])))

@@ -2,19 +2,31 @@ r"""Points of an ellipsoid from ranges known up to one unknown: a quartic, and t
 
 .. math:: (x - c)^\top A\,(x - c) = 1, \qquad |x - s_i| = \sigma_i \tau + c_i \quad (i = 1, 2, 3)
 
-Two range differences and a known height: eliminating the ranges leaves a conic in its plane,
-:math:`x = b + p\,t + n\,\mu`, :math:`\mu^2 = q(t)` (:mod:`formulations._curve`), on which the ellipsoid reads
-:math:`E(t) + L(t)\,\mu + \alpha\,\mu^2 = 0`. With :math:`Q = E + \alpha q` the first coordinate is a root of
+Two range differences and a known height. Squared and subtracted, :math:`r_i = \sigma_i r_1 + e_i` gives :math:`2
+a_i^\top (x - s_1) = |a_i|^2 - e_i^2 - 2 \sigma_i e_i r_1` with :math:`a_i = s_i - s_1`: the ranges leave a conic in its
+own plane,
+
+.. math:: x(t, \mu) = b + p\,t + n\,\mu, \qquad \mu^2 = q(t) = q_0 + q_1 t + q_2 t^2, \qquad r_i = \rho_i t + e_i,
+
+in which `n` is the unit normal of the plane of the stations and `t` is :math:`r_1`, shifted and scaled so that `p` is
+at most a unit long and `b` near the stations (nearly collinear stations make both huge otherwise). Two known ranges
+leave a circle about the line of their stations, which has the same form, `t` and :math:`\mu` being cosine and sine.
+On the conic the ellipsoid reads :math:`E(t) + L(t)\,\mu + \alpha\,\mu^2 = 0`. With :math:`Q = E + \alpha q` the first
+coordinate is a root of
 
 .. math:: Q(t)^2 - L(t)^2\, q(t) = 0,
 
 at most four real ones. Squaring also admits the sign-flipped problem, whose points have a negative range; they are
-dropped. Two known ranges lie on a circle, which has the same form. Each root starts a Newton iteration on the two
-conics from both signs of :math:`\mu`, which gives back the digits the squares lost and needs no rule for
-:math:`L = 0`.
+dropped. Each root starts a Newton iteration on the two conics from both signs of :math:`\mu`, which gives back the
+digits the squares lost and needs no rule for :math:`L = 0`.
 
-Source: K. C. Ho and Y. T. Chan, "Geolocation of a known altitude object from TDOA and FDOA measurements", IEEE Trans.
-Aerosp. Electron. Syst. 33 (1997), section III (there for a sphere and iterated; here exact for the ellipsoid).
+What is left on the far side is not seen. The polar plane of an outside point `s`, :math:`(x - c)^\top A (s - c) = 1`,
+touches the ellipsoid where the tangents from `s` do: it cuts off exactly the part that is seen from `s`. In numbers of
+order one (semi-axes as units) the form keeps all digits; in metres it loses eight of them.
+
+Sources: K. C. Ho and Y. T. Chan, "Geolocation of a known altitude object from TDOA and FDOA measurements", IEEE Trans.
+Aerosp. Electron. Syst. 33 (1997), section III (the elimination, there for a sphere and iterated; here exact for the
+ellipsoid); D. Hilbert and S. Cohn-Vossen, "Geometry and the Imagination", 1932, chapter III (poles and polar planes).
 """
 
 from __future__ import annotations
@@ -22,21 +34,105 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from formulations._curve import Curve, three_stations, two_stations
-from formulations.ellipsoid import Ellipsoid
+from formulations.algebra import Array, Mask, dot, flatten
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
-_SLOTS = 4
-_NEWTON = 30
-# how far from an intersection, relatively, an iteration may start
+_SLOTS = 4  # roots of a quartic
+# Sine of the angle at the first station below which three stations count as one line: the normal of their plane, a
+# difference of products, has half its digits there.
+_THIN = 1e-7
+_AXIAL = 1e-12  # squared sine of the angle between a direction and the axis below which it is no direction off the axis
+_LEAD = 1e-14  # leading coefficient of the quartic, over the largest, that is rounding: a root at infinity
+# Relative miss of the two conics at which an iteration may still start: eigenvalues of the companion matrix are good to
+# 1e-8 at a double root, and a pair that has just left the real axis is off by the root of what moved it.
 _NEAR = 1e-3
-# of a range and of the ellipsoid's form; and two points closer than the second are one
-_TOLERANCE = 1e-11
-_SAME = 1e-7
+_NEWTON = 30  # steps; quadratic at simple roots, one binary digit a step at double ones, which are found to 1e-8
+_RESTS = 1e-14  # relative step at which a slot rests
+_TOLERANCE = 1e-11  # of a range, relative, and of the ellipsoid's form: what Newton's iteration leaves, with room
+_SAME = 1e-7  # two points closer than this are one, found from both signs or from both halves of a double root
+
+
+@dataclass(frozen=True, slots=True)
+class Ellipsoid:
+    """The surface ``(x - centre)' shape (x - centre) = 1``.
+
+    Parameters
+    ----------
+    shape : Array, shape (..., 3, 3)
+        Symmetric positive definite.
+    centre : Array, shape (..., 3)
+        Centre.
+    """
+
+    shape: Array
+    centre: Array
+
+    def polar(self, x: Array, s: Array) -> Array:
+        """Bilinear form ``(x - centre)' shape (s - centre)``.
+
+        Parameters
+        ----------
+        x, s : Array, shape (..., 3)
+            Points.
+
+        Returns
+        -------
+        Array, shape (...)
+            Equal points: 1 on the surface, more outside.
+        """
+        left = np.einsum("...i,...ij->...j", x - self.centre, self.shape)
+        return np.asarray(np.sum(left * (s - self.centre), axis=-1))
+
+
+def ellipsoid(
+    axes: ArrayLike, height: ArrayLike = 0.0, *, origin: ArrayLike = 0.0, rotation: ArrayLike | None = None
+) -> Ellipsoid:
+    """Ellipsoid with all semi-axes grown by a height: the surface of that height to about 1e-3 of the flattening.
+
+    Parameters
+    ----------
+    axes : array_like, shape (..., 3)
+        Semi-axes along the coordinates of the ellipsoid's own frame, for instance (a, a, b).
+    height : array_like, shape (...)
+        Added to each semi-axis.
+    origin : array_like, shape (..., 3)
+        Origin of the frame wanted, in the ellipsoid's own frame.
+    rotation : array_like, shape (..., 3, 3), optional
+        Rows are the axes of the frame wanted, in the ellipsoid's own frame: ``rotation @ (x - origin)`` are its
+        coordinates.
+
+    Returns
+    -------
+    Ellipsoid
+        In the frame wanted.
+    """
+    inverse = (np.asarray(axes, dtype=np.float64) + np.asarray(height, dtype=np.float64)[..., None]) ** -2
+    R = np.eye(3) if rotation is None else np.asarray(rotation, dtype=np.float64)
+    centre = np.broadcast_to(-np.asarray(origin, dtype=np.float64), (*np.shape(origin)[:-1], 3))
+    return Ellipsoid(np.einsum("...ik,...k,...jk->...ij", R, inverse, R), np.einsum("...ij,...j->...i", R, centre))
+
+
+def visible(x: Array, surface: Ellipsoid, s: Array) -> Mask:
+    """Whether a point of the ellipsoid is seen from a station: nothing of the ellipsoid lies between.
+
+    Parameters
+    ----------
+    x : Array, shape (..., 3)
+        Points of the surface.
+    surface : Ellipsoid
+        Shape (..., 3, 3) and centre (..., 3) broadcast against the points.
+    s : Array, shape (..., 3)
+        Stations. One inside the ellipsoid sees all of it.
+
+    Returns
+    -------
+    Mask, shape (...)
+        False where x or s is not finite.
+    """
+    inside = surface.polar(s, s) <= 1.0
+    # a station of finite size sees the tangent points of its cone
+    return np.asarray((surface.polar(x, s) >= 1.0) | (inside & np.isfinite(x).all(axis=-1)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,12 +186,12 @@ def locate(stations: Array, sign: ArrayLike, offset: Array, surface: Ellipsoid, 
         surface.centre.shape[:-1],
     )  # fmt: skip
     flat, A, centre = (
-        _flat(stations, (3, 3), lead),
-        _flat(surface.shape, (3, 3), lead),
-        _flat(surface.centre, (3,), lead),
+        flatten(stations, (3, 3), lead),
+        flatten(surface.shape, (3, 3), lead),
+        flatten(surface.centre, (3,), lead),
     )
-    curve = three_stations(flat, _flat(sign, (3,), lead), _flat(offset, (3,), lead))
-    return _shaped(_meet(curve, flat, A, centre, positive=positive), lead)
+    curve = three_stations(flat, flatten(sign, (3,), lead), flatten(offset, (3,), lead))
+    return _reshape(_meet(curve, flat, A, centre, positive=positive), lead)
 
 
 def locate_by_ranges(stations: Array, ranges: Array, surface: Ellipsoid) -> Candidates:
@@ -123,21 +219,16 @@ def locate_by_ranges(stations: Array, ranges: Array, surface: Ellipsoid) -> Cand
         np.shape(stations)[:-2], np.shape(ranges)[:-1], surface.shape.shape[:-2], surface.centre.shape[:-1]
     )
     flat, A, centre = (
-        _flat(stations, (2, 3), lead),
-        _flat(surface.shape, (3, 3), lead),
-        _flat(surface.centre, (3,), lead),
+        flatten(stations, (2, 3), lead),
+        flatten(surface.shape, (3, 3), lead),
+        flatten(surface.centre, (3,), lead),
     )
-    known = _flat(ranges, (2,), lead)
+    known = flatten(ranges, (2,), lead)
     curve = two_stations(flat, known, centre)
-    return _shaped(_meet(curve, flat, A, centre, positive=True), lead)
+    return _reshape(_meet(curve, flat, A, centre, positive=True), lead)
 
 
-def _flat(value: ArrayLike, last: tuple[int, ...], lead: tuple[int, ...]) -> Array:
-    """Give a value one batch axis."""
-    return np.broadcast_to(np.asarray(value, dtype=np.float64), (*lead, *last)).reshape(-1, *last)
-
-
-def _shaped(found: Candidates, lead: tuple[int, ...]) -> Candidates:
+def _reshape(found: Candidates, lead: tuple[int, ...]) -> Candidates:
     """Give the batch axis its shape back."""
     x, ranges = (v.reshape(*lead, *v.shape[1:]) for v in (found.x, found.ranges))
     return Candidates(x, ranges, found.valid.reshape(*lead, _SLOTS))
@@ -153,7 +244,7 @@ def _meet(curve: Curve, stations: Array, A: Array, centre: Array, *, positive: b
         ranges = curve.rate[:, None] * t[..., None] + curve.offset[:, None]
         away = x[:, :, None] - stations[:, None]
         size = 1.0 + np.max(np.abs(ranges), axis=-1)
-        miss = np.max(np.abs(np.sqrt(_dot(away, away)) - np.abs(ranges)), axis=-1)
+        miss = np.max(np.abs(np.sqrt(dot(away, away)) - np.abs(ranges)), axis=-1)
         off = x - centre[:, None]
         height = np.abs(np.einsum("nki,nij,nkj->nk", off, A, off) - 1.0)
         valid = curve.ok[:, None] & (miss <= _TOLERANCE * size) & (height <= _TOLERANCE)
@@ -168,6 +259,172 @@ def _meet(curve: Curve, stations: Array, A: Array, centre: Array, *, positive: b
     x, ranges = (np.take_along_axis(v, order[..., None], axis=1) for v in (x, ranges))
     x[~valid], ranges[~valid] = np.nan, np.nan
     return Candidates(x, ranges, valid)
+
+
+# Curves on which a point has measured ranges.
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """A batch of N curves.
+
+    Parameters
+    ----------
+    base, along, across : Array, shape (N, 3)
+        The vectors b, p and n.
+    square : Array, shape (N, 3)
+        The coefficients q, constant first.
+    rate, offset : Array, shape (N, s)
+        Ranges ``rate t + offset`` of the s stations.
+    ok : Mask, shape (N,)
+        False where the stations fix no such curve; the other arrays are finite all the same.
+    """
+
+    base: Array
+    along: Array
+    across: Array
+    square: Array
+    rate: Array
+    offset: Array
+    ok: Mask
+
+    def points(self, t: Array, mu: Array) -> Array:
+        """Points of the planes of the curves.
+
+        Parameters
+        ----------
+        t, mu : Array, shape (N, K)
+            Coordinates.
+
+        Returns
+        -------
+        Array, shape (N, K, 3)
+            The points x.
+        """
+        return np.asarray(
+            self.base[:, None] + self.along[:, None] * t[..., None] + self.across[:, None] * mu[..., None]
+        )
+
+    def on_ellipsoid(self, A: Array, centre: Array) -> tuple[Array, Array, Array]:
+        """Coefficients of the ellipsoid ``(x - centre)'A(x - centre) = 1`` on the planes of the curves.
+
+        Parameters
+        ----------
+        A : Array, shape (N, 3, 3)
+            Shapes.
+        centre : Array, shape (N, 3)
+            Centres.
+
+        Returns
+        -------
+        E : Array, shape (N, 3)
+            Coefficients of 1, t, t^2.
+        L : Array, shape (N, 2)
+            Coefficients of mu, t mu.
+        alpha : Array, shape (N,)
+            Coefficient of mu^2; the sum vanishes on the ellipsoid.
+        """
+        c = self.base - centre
+        Ac, Ap, An = (np.einsum("nij,nj->ni", A, v) for v in (c, self.along, self.across))
+        E = np.stack([dot(c, Ac) - 1.0, 2.0 * dot(self.along, Ac), dot(self.along, Ap)], axis=-1)
+        L = 2.0 * np.stack([dot(self.across, Ac), dot(self.across, Ap)], axis=-1)
+        return E, L, dot(self.across, An)
+
+
+def three_stations(stations: Array, sign: Array, offset: Array) -> Curve:
+    """Curve of the points whose ranges to three stations are known up to one unknown.
+
+    Parameters
+    ----------
+    stations : Array, shape (N, 3, 3)
+        Positions, one a row.
+    sign, offset : Array, shape (N, 3)
+        Ranges ``sign tau + offset`` with one unknown tau; signs are 1 or -1.
+
+    Returns
+    -------
+    Curve
+        Not ok where the stations lie on a line.
+
+    Notes
+    -----
+    Ho and Chan (1997), section III.
+    """
+    turn = sign * sign[:, :1]
+    gap = offset - turn * offset[:, :1]
+    a = stations[:, 1:] - stations[:, :1]
+    length = np.sum(a * a, axis=-1)
+    normal = np.cross(a[:, 0], a[:, 1])
+    size = np.sum(normal * normal, axis=-1)
+    ok = np.isfinite(gap).all(axis=-1)
+    ok &= size > _THIN**2 * length[:, 0] * length[:, 1]
+    size, gap = np.where(ok, size, 1.0), np.where(ok[:, None], gap, 0.0)
+    a = np.where(ok[:, None, None], a, np.eye(3)[1:])
+    normal = np.where(ok[:, None], normal, np.eye(3)[0])
+    length = np.where(ok[:, None], length, 1.0)
+    # the reciprocal basis of the plane
+    first, second = np.cross(a[:, 1], normal) / size[:, None], np.cross(normal, a[:, 0]) / size[:, None]
+    fixed, slope = 0.5 * (length - gap[:, 1:] ** 2), -turn[:, 1:] * gap[:, 1:]
+    p = slope[:, :1] * first + slope[:, 1:] * second
+    start = fixed[:, :1] * first + fixed[:, 1:] * second
+    long = np.maximum(dot(p, p), 1.0)
+    shift = -dot(start, p) / long
+    start, scale = start + p * shift[:, None], 1.0 / np.sqrt(long)
+    square = [shift**2 - dot(start, start), 2.0 * scale * (shift - dot(start, p)), (1.0 - dot(p, p)) / long]
+    return Curve(
+        np.where(ok[:, None], stations[:, 0], 0.0) + start,
+        p * scale[:, None],
+        normal / np.sqrt(size)[:, None],
+        np.stack(square, axis=-1),
+        turn * scale[:, None],
+        gap + turn * shift[:, None],
+        ok,
+    )
+
+
+def two_stations(stations: Array, ranges: Array, towards: Array) -> Curve:
+    """Circle of the points with known ranges to two stations.
+
+    Parameters
+    ----------
+    stations : Array, shape (N, 2, 3)
+        Positions, one a row.
+    ranges : Array, shape (N, 2)
+        Ranges.
+    towards : Array, shape (N, 3)
+        A point; mu grows towards it where it is off the line of the stations.
+
+    Returns
+    -------
+    Curve
+        The parameters (t, mu) lie on the unit circle. Not ok where the spheres do not meet.
+    """
+    a = stations[:, 1] - stations[:, 0]
+    length = np.sqrt(dot(a, a))
+    usable = np.isfinite(ranges).all(axis=-1) & np.isfinite(towards).all(axis=-1) & (length > 0.0)
+    axis = np.where(usable[:, None], a, np.eye(3)[0]) / np.where(usable, length, 1.0)[:, None]
+    length, ranges = np.where(usable, length, 1.0), np.where(usable[:, None], ranges, 0.0)
+    foot = 0.5 * (length + (ranges[:, 0] - ranges[:, 1]) * (ranges[:, 0] + ranges[:, 1]) / length)
+    radius = (ranges[:, 0] - foot) * (ranges[:, 0] + foot)
+    ok = usable & (radius >= 0.0)
+    radius = np.sqrt(np.where(ok, radius, 0.0))
+    base = np.where(usable[:, None], stations[:, 0], 0.0) + axis * foot[:, None]
+    up = _perpendicular(axis, np.where(usable[:, None], towards, 0.0) - base)
+    square = np.broadcast_to([1.0, 0.0, -1.0], base.shape)
+    along = np.cross(axis, up) * radius[:, None]
+    return Curve(base, along, up * radius[:, None], square, np.zeros_like(ranges), ranges, ok)
+
+
+def _perpendicular(axis: Array, hint: Array) -> Array:
+    """Find the unit vector normal to the axis, towards the hint where that is off the axis."""
+    least = np.eye(3)[np.argmin(np.abs(axis), axis=-1)]
+    off = hint - axis * dot(axis, hint)[:, None]
+    weak = dot(off, off) <= _AXIAL * dot(hint, hint)
+    off = np.where(weak[:, None], least - axis * dot(axis, least)[:, None], off)
+    return np.asarray(off / np.sqrt(dot(off, off))[:, None])
+
+
+# Where a curve meets the ellipsoid.
 
 
 def quartic(square: Array, E: Array, L: Array, alpha: Array) -> Array:
@@ -207,7 +464,7 @@ def _roots(c: Array) -> Array:
     size = np.max(np.abs(c), axis=-1)
     c = c / np.where(size > 0.0, size, 1.0)[:, None]
     # a lost leading coefficient is a root at infinity
-    lead = np.where(np.abs(c[:, 4]) > 1e-14, c[:, 4], 1e-14)
+    lead = np.where(np.abs(c[:, 4]) > _LEAD, c[:, 4], _LEAD)
     companion = np.zeros((len(c), 4, 4))
     companion[:, [1, 2, 3], [0, 1, 2]] = 1.0
     companion[:, :, 3] = -c[:, :4] / lead[:, None]
@@ -241,7 +498,7 @@ def _newton(t: Array, mu: Array, square: Array, E: Array, L: Array, alpha: Array
         go &= np.isfinite(move_t) & np.isfinite(move_mu)
         t, mu = np.where(go, t + move_t, t), np.where(go, mu + move_mu, mu)
         # a slot that has settled rests: the length of the iteration depends on its neighbours
-        go &= np.abs(move_t) + np.abs(move_mu) > 1e-14 * (np.abs(t) + np.abs(mu))
+        go &= np.abs(move_t) + np.abs(move_mu) > _RESTS * (np.abs(t) + np.abs(mu))
         if not go.any():
             break
     return t, mu
@@ -249,7 +506,3 @@ def _newton(t: Array, mu: Array, square: Array, E: Array, L: Array, alpha: Array
 
 def _value(c: Array, t: Array) -> Array:
     return np.asarray(c[:, :1] + t * (c[:, 1:2] + t * c[:, 2:]))
-
-
-def _dot(a: Array, b: Array) -> Array:
-    return np.asarray(np.sum(a * b, axis=-1))

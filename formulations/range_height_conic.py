@@ -3,11 +3,11 @@ r"""Semidefinite relaxation of the fix on an ellipsoid from ranges known up to o
 .. math:: \min_{t, \mu} \; |x(t, \mu) - \bar x|^2 + (r_1(t) - |\bar x - s_1|)^2 \quad\text{subject to}\quad
    \mu^2 = q(t), \quad E(t) + L(t)\,\mu + \alpha\,\mu^2 = 0
 
-with :math:`x = b + p\,t + n\,\mu` (:mod:`formulations._curve`): the range equations are eliminated *before* lifting
-:math:`(1, t, \mu)` to a 3 by 3 matrix. The system is square, its points are isolated and the least-squares cost is zero
-at all of them, so the objective is a choice: :math:`\bar x` is a point near the target (the one below the satellites).
-Its second term puts the mirror point of negative range at a distance; without it the relaxation mixes the two. The
-full lift of (x, r) is never tight here. A range guess that is wrong by a factor of two loses exactness.
+with :math:`x = b + p\,t + n\,\mu` (:mod:`formulations.range_height`): the range equations are eliminated *before*
+lifting :math:`(1, t, \mu)` to a 3 by 3 matrix. The system is square, its points are isolated and the least-squares cost
+is zero at all of them, so the objective is a choice: :math:`\bar x` is a point near the target (the one below the
+satellites). Its second term puts the mirror point of negative range at a distance; without it the relaxation mixes the
+two. The full lift of (x, r) is never tight here. A range guess that is wrong by a factor of two loses exactness.
 
 Source: N. Z. Shor, "Quadratic optimization problems", Sov. J. Comput. Syst. Sci. 25 (1987); elimination before
 lifting is facial reduction: D. Drusvyatskiy and H. Wolkowicz, "The many faces of degeneracy in conic optimization",
@@ -20,13 +20,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from formulations._curve import Curve, three_stations
-from formulations.conic import Answer, Relaxation, kept
-from formulations.ellipsoid import Ellipsoid
-
-Array = NDArray[np.float64]
+from formulations.algebra import Array
+from formulations.conic import Answer, Relaxation, keep, rank_ratio, tight
+from formulations.range_height import Curve, Ellipsoid, three_stations
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,10 +71,10 @@ def lifted_problem() -> Any:
     return cp.Problem(cp.Minimize(cp.sum(cp.multiply(objective, lift))), [lift >> 0, lift[0, 0] == 1, *zero])
 
 
-@kept(8)
-def _built(backend: str) -> Relaxation:
-    tight = {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-11} if backend == "CLARABEL" else {}
-    return Relaxation(lifted_problem(), backend=backend, settings=tight)
+@keep
+def _relaxation(backend: str) -> Relaxation:
+    # a tenth of a millimetre in Earth radii; a matrix of size three takes it
+    return Relaxation(lifted_problem(), backend=backend, settings=tight(backend, 1e-11))
 
 
 def lifted(
@@ -113,16 +110,14 @@ def lifted(
     if not (curve.ok[0] and all(np.isfinite(form).all() for form in forms.values())):
         nothing = Answer({}, np.nan, -np.inf, "not posed", solved=False, iterations=0)
         return Lifted(np.full(3, np.nan), np.full(3, np.nan), -np.inf, np.nan, nothing)
+    # each form divided by its largest entry: an equality may be, and the bound is multiplied back
     scale = float(np.abs(forms["objective"]).max())
     data = {name: form / np.abs(form).max() for name, form in forms.items()}
-    answer = _built(backend).solve(data, reach=_reach(curve, stations[0], surface, guess))
-    lift, ratio = answer.values["lift"], np.nan
-    if np.isfinite(lift).all():
-        values = np.linalg.eigvalsh(lift)
-        ratio = float(abs(values[-2]) / values[-1])
+    answer = _relaxation(backend).solve(data, reach=_reach(curve, stations[0], surface, guess))
+    lift = answer.values["lift"]
     _, t, mu = change @ lift[:, 0]
     x = curve.points(np.array([[t]]), np.array([[mu]]))[0, 0]
-    return Lifted(x, curve.rate[0] * t + curve.offset[0], answer.bound * scale, ratio, answer)
+    return Lifted(x, curve.rate[0] * t + curve.offset[0], answer.bound * scale, rank_ratio(lift), answer)
 
 
 def _forms(curve: Curve, surface: Ellipsoid, near: Array, guess: float) -> tuple[dict[str, Array], Array]:
@@ -133,6 +128,7 @@ def _forms(curve: Curve, surface: Ellipsoid, near: Array, guess: float) -> tuple
     on_curve = -0.5 * np.array([[2.0 * q[0], q[1], 0.0], [q[1], 2.0 * q[2], 0.0], [0.0, 0.0, -2.0]])
     away = np.stack([curve.base[0] - near, curve.along[0], curve.across[0]], axis=1)
     late = np.array([offset - guess, rate, 0.0])
+    # t = (guess / rate) u + (guess - offset) / rate: u is zero where r_1 is the guess, and of order one elsewhere
     change = np.diag([1.0, guess / rate, guess])
     change[1, 0] = (guess - offset) / rate
     forms = {"objective": away.T @ away + np.outer(late, late), "curve": on_curve, "surface": on_surface}

@@ -33,16 +33,25 @@ from dataclasses import dataclass
 from math import factorial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from formulations.algebra import Array
 from formulations.squared_range import paraboloid, stationary
 
-Array = NDArray[np.float64]
-
+# Measured on random runs of 30 epochs, five stations and errors of 1e-3 of their spread. A fixed target two spreads
+# away needs one pass; of one 30 spreads away the 90 % error falls from 7.3 to 0.4 by the second, and of a moving one
+# from 31 to 19 by the fourth.
 _PASSES = 4
+# The same runs: the second pass takes a quarter off the 90 % error of far fixed targets; later ones change little.
 _LIFTED_PASSES = 3
+# Eigenvalues of the scaled normal matrix, over the largest, that count as none. At 1e-6 the same runs lose weak
+# directions of far courses (90 % error 35 in the place of 19); from 1e-10 down little changes.
 _CUT = 1e-10
+# Lower, for the lifts add columns that differ little from each other: anything from 1e-8 to 1e-16 gave the same.
 _LIFTED_CUT = 1e-14
+
+# Ranges of the reference start at one, and squared ones may come out negative: what they are then taken to be, in units
+# of the stations' spread. No station is as near to its target.
+_NEAREST = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +128,7 @@ def _powers(course: Course, count: int) -> Array:
 def _rows(course: Course, guess: _Guess) -> tuple[Array, Array, Array, Array]:
     """Return ranges r, and of the rows over r the columns of x and of r_0 and the right side, each (N, B, S, ...)."""
     m = course.offset - (course.bias @ guess.bias[:, None, :, None])[..., 0]
-    r = np.maximum(m + course.sign * guess.reference[..., None], 1e-3)
+    r = np.maximum(m + course.sign * guess.reference[..., None], _NEAREST)
     first, others = course.station[..., :1, :], course.station[..., 1:, :]
     right = ((others**2).sum(-1) - (first**2).sum(-1) - m**2) / (2.0 * r)
     return r, (others - first) / r[..., None], course.sign * m / r, right
@@ -144,6 +153,7 @@ def _free_ranges(course: Course, order: int) -> _Guess:
         if turn:
             columns.append(np.broadcast_to(-course.bias, (*right.shape, q)))
         seen = course.whiten @ np.concatenate([*columns, gain[..., None], right[..., None]], axis=-1)
+        # the column of the free reference range is projected out of every epoch, row by whitened row
         free = seen[..., -2]
         norm = (free**2).sum(-1, keepdims=True)
         unit = free / np.sqrt(np.where(norm > 0.0, norm, 1.0))
@@ -190,14 +200,16 @@ def _smoothed(course: Course, reference: Array, order: int) -> Array:
     basis = np.concatenate([np.broadcast_to(lifts, (*along.shape[:-1], lifts.shape[-1])), along], axis=-1)
     known = (first**2).sum(-1)
     square = (reference**2 - known)[..., None]
+    # singular values, where the cut above is of their squares; many lifts and few times leave some undetermined
     fitted = basis @ (np.linalg.pinv(basis, rcond=1e-9) @ square)
-    return np.asarray(np.sqrt(np.maximum(fitted[..., 0] + known, 1e-6)))
+    return np.asarray(np.sqrt(np.maximum(fitted[..., 0] + known, _NEAREST**2)))
 
 
 def _lifted_ranges(course: Course, guess: _Guess, order: int) -> tuple[Array, _Guess]:
     """Return the candidates of stage 1 (N, C, order + 1, d), and biases and reference ranges of the best."""
     q, d, n = course.bias.shape[-1], course.station.shape[-1], (order + 1) * course.station.shape[-1]
     _, place, gain, right = _rows(course, guess)
+    # rows in (bias, course, lifts): the reference range is replaced by its tangent parabola at the guess
     first, r = course.station[..., :1, :], guess.reference[..., None]
     square = (first**2).sum(-1)
     lifts = (gain / (2.0 * r))[..., None] * _powers(course, 2 * order + 1)[:, None, :]
@@ -216,7 +228,7 @@ def _lifted_ranges(course: Course, guess: _Guess, order: int) -> tuple[Array, _G
         y = _solved(matrix, vector, _LIFTED_CUT)
         more = y[:, None, q : q + n]
     state = more.reshape(len(more), -1, order + 1, d)
-    distance = np.maximum(_reference(course, y[:, q : q + n], y[:, q + n :], order), 1e-6)
+    distance = np.maximum(_reference(course, y[:, q : q + n], y[:, q + n :], order), _NEAREST**2)
     return state, _Guess(guess.bias + y[:, :q], np.sqrt(distance))
 
 
@@ -235,6 +247,7 @@ def _constrained(rows: Array, q: int, d: int) -> tuple[Array, Array]:
 
     The biases are free and leave the problem by a triangular factor; what is left is a squared-range problem.
     """
+    # biases in units in which their columns are one long: they are small, and the triangular factor would not see them
     usable = np.asarray(np.isfinite(rows).all((-1, -2)))
     scale = np.ones((len(rows), rows.shape[-1]))
     norm = np.sqrt((rows[..., :q] ** 2).sum(1))
@@ -259,6 +272,7 @@ def _reference(course: Course, theta: Array, lifts: Array, order: int) -> Array:
 def _branches(course: Course, state: Array, reference: Array) -> Array:
     """Return two courses (N, 2, order + 1, d) on either side of the plane that the stations spread in most."""
     first = course.station[..., 0, :]
+    # the normal is the direction in which the stations spread least; beside it the distance from the plane follows
     apart = course.station[..., 1:, :] - first[..., None, :]
     apart = apart.reshape(len(apart), -1, apart.shape[-1])
     _, vectors = np.linalg.eigh(np.swapaxes(apart, -1, -2) @ apart)

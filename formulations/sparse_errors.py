@@ -34,13 +34,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, erfc
 
-from formulations.conic import Answer, Relaxation, kept
+from formulations.algebra import Array
+from formulations.conic import Answer, Relaxation, keep, tight
 
-Array = NDArray[np.float64]
-Index = NDArray[np.intp]
+Groups = NDArray[np.intp]
 
-_RANK = 1e-10
-_TIGHT = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10}
+_RANK = 1e-10  # singular value of the rows, over the largest one, from which a direction of y counts as open
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +67,7 @@ class SparseFit:
     answer: Answer | None
 
 
-def thresholds(sizes: NDArray[np.intp]) -> Array:
+def thresholds(sizes: Groups) -> Array:
     """Universal threshold of each group of rows.
 
     Parameters
@@ -118,6 +117,7 @@ def sparse_problem(n: int, groups: tuple[int, ...], cones: tuple[int, ...]) -> A
     rows, right = cp.Parameter((m, n), name="rows"), cp.Parameter(m, name="right")
     price = cp.Parameter(int(member.max(initial=-1)) + 1, nonneg=True, name="price")
     y, error = cp.Variable(n, name="y"), cp.Variable(m, name="error")
+    # single rows as absolute values: linear inequalities are cheaper than as many cones of length two
     if len(set(groups)) == m:
         size = price[member] @ cp.abs(error)
     else:
@@ -130,17 +130,16 @@ def sparse_problem(n: int, groups: tuple[int, ...], cones: tuple[int, ...]) -> A
     return cp.Problem(cp.Minimize(0.5 * cp.sum_squares(rows @ y - right - error) + size), inside)
 
 
-@kept(64)
-def _built(n: int, groups: tuple[int, ...], cones: tuple[int, ...], backend: str) -> Relaxation:
-    return Relaxation(
-        sparse_problem(n, groups, cones), backend=backend, settings=_TIGHT if backend == "CLARABEL" else {}
-    )
+@keep
+def _relaxation(n: int, groups: tuple[int, ...], cones: tuple[int, ...], backend: str) -> Relaxation:
+    # errors within a threshold are told from exact zeros by their size: two decades below Clarabel's own tolerance
+    return Relaxation(sparse_problem(n, groups, cones), backend=backend, settings=tight(backend, 1e-10))
 
 
 def sparse_fit(
     B: Array,
     g: Array,
-    groups: Index | None = None,
+    groups: Groups | None = None,
     *,
     price: Array | None = None,
     cones: Sequence[Array] = (),
@@ -200,17 +199,18 @@ def sparse_fit(
     values = {"rows": left, "right": off / scale, "price": price / scale}
     for k, given in enumerate(cones):
         moved = np.concatenate([given[:, :n] @ back, (given[:, :n] @ centre + given[:, n])[:, None] / scale], axis=1)
-        values[f"cone {k}"] = moved / np.abs(moved).max()
+        values[f"cone {k}"] = moved / np.abs(moved).max()  # a cone may be multiplied by a factor
     structure = (n, tuple(member.tolist()), tuple(len(c) - 1 for c in cones))
-    answer = _built(*structure, backend).solve(values, bound=bound)
+    answer = _relaxation(*structure, backend).solve(values, bound=bound)
     y = centre + back @ (scale * answer.values["y"])
-    errors = shrunk(B @ y - g, member, price)
+    # in closed form at the y found: exact zeros, where the solver's own errors are only small
+    errors = shrink(B @ y - g, member, price)
     rest = B @ y - g - errors
     value = 0.5 * float(rest @ rest) + float(price @ group_sizes(errors, member, len(price)))
     return SparseFit(y, errors, value, answer.bound * scale**2, answer)
 
 
-def group_sizes(values: Array, groups: Index, count: int) -> Array:
+def group_sizes(values: Array, groups: Groups, count: int) -> Array:
     """Euclidean length of the values of each group.
 
     Parameters
@@ -228,7 +228,7 @@ def group_sizes(values: Array, groups: Index, count: int) -> Array:
     return np.sqrt(np.bincount(groups, weights=values * values, minlength=count))
 
 
-def shrunk(residual: Array, groups: Index, price: Array) -> Array:
+def shrink(residual: Array, groups: Groups, price: Array) -> Array:
     """Gross errors that cost least at given residuals.
 
     Parameters

@@ -22,12 +22,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from formulations.conic import Answer, Relaxation, kept
+from formulations.algebra import Array
+from formulations.conic import Answer, Relaxation, keep, rank_ratio, tight
 from formulations.squared_range import Quadric
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,11 +109,12 @@ def hull_problem(quadric: Quadric) -> Any:
     return cp.Problem(cp.Minimize(cp.norm(factor[:, :n] @ y + factor[:, n])), [inside])
 
 
-@kept(32)
-def _built(kind: str, quadric: Quadric, backend: str) -> Relaxation:
-    tight = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10} if backend == "CLARABEL" else {}
+@keep
+def _relaxation(kind: str, quadric: Quadric, backend: str) -> Relaxation:
     problem = shor_problem(quadric) if kind == "shor" else hull_problem(quadric)
-    return Relaxation(problem, backend=backend, settings=tight)
+    # Of 200 random problems in space the worst point of the lift is off by 1e-3 at Clarabel's own 1e-8, and by 1e-4
+    # here, two iterations later; at 1e-11 one solve in seven stops early.
+    return Relaxation(problem, backend=backend, settings=tight(backend, 1e-10))
 
 
 def shor(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL", bound: bool = True) -> Relaxed:
@@ -145,13 +144,9 @@ def shor(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL", bou
     """
     n = quadric.size
     factor, scale = _triangle(B, g)
-    answer = _built("shor", quadric, backend).solve({"gram": factor.T @ factor}, bound=bound)
+    answer = _relaxation("shor", quadric, backend).solve({"gram": factor.T @ factor}, bound=bound)
     lift = answer.values["lift"]
-    ratio = np.nan
-    if np.isfinite(lift).all():
-        values = np.linalg.eigvalsh(lift)
-        ratio = float(abs(values[-2]) / values[-1])
-    return Relaxed(lift[:n, n].copy(), answer.primal * scale**2, answer.bound * scale**2, ratio, answer)
+    return Relaxed(lift[:n, n].copy(), answer.primal * scale**2, answer.bound * scale**2, rank_ratio(lift), answer)
 
 
 def hull(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL", bound: bool = True) -> Relaxed:
@@ -180,10 +175,10 @@ def hull(B: Array, g: Array, quadric: Quadric, *, backend: str = "CLARABEL", bou
     Its objective is the norm; value and bound are squared.
     """
     factor, scale = _triangle(B, g)
-    answer = _built("hull", quadric, backend).solve({"factor": factor}, bound=bound)
+    answer = _relaxation("hull", quadric, backend).solve({"factor": factor}, bound=bound)
     y = answer.values["y"]
     off = float(abs(quadric.value(y)) / (1.0 + np.sum(y * y)))
-    value, low = answer.primal * scale, max(answer.bound, 0.0) * scale
+    value, low = answer.primal * scale, max(answer.bound, 0.0) * scale  # norms: squared below, so no sign may be lost
     return Relaxed(y, value**2, low**2, off, answer)
 
 

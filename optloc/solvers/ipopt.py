@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from formulations.backend import Choice, chosen
+from formulations.backend import Choice, choice_for
 from formulations.nls import Program
 from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem
@@ -141,7 +141,7 @@ _PROGRAMS = Cache[Program](64)
 
 def _program(problem: Problem, data: int, rows: int) -> Program:
     """Return the program of a structure, whose parameters are so many data, `rows` of them those of the rows."""
-    choice, compiled = chosen("nonlinear"), os.environ.get(_COMPILE, "") == "1"
+    choice, compiled = choice_for("nonlinear"), os.environ.get(_COMPILE, "") == "1"
     s = problem.stations
     shapes = tuple(None if a is None else a.shape[-3:] for a in (s.position, s.velocity, s.axes))
     limits = tuple(

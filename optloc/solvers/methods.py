@@ -220,13 +220,6 @@ _PROGRAMS: dict[str, Formulation] = {
         "1 ms",
         "Shor 1987",
     ),
-    "range_height_nlp": Formulation(
-        "the same with more rows: height as hard equality, polar planes as inequalities (IPOPT)",
-        "tdoa, range with a height",
-        "a local minimum; the planes remove the far side",
-        "5 ms",
-        "Waechter, Biegler 2006",
-    ),
     "bearing_ls": Formulation(
         "pseudo-linear least squares of angles, weighted, with an instrumental-variable pass",
         "azimuth, elevation",

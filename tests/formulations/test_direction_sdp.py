@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from formulations.bearing_ls import meeting, predicted, rays
+from formulations.bearing_ls import meeting, predict, rays
 from formulations.direction_sdp import angle_bound, directions, minorant
 
 
 def errors(point, station, angle, axes=None):
-    error = predicted(point, station, axes) - angle
+    error = predict(point, station, axes) - angle
     error[:, 0] = np.arctan2(np.sin(error[:, 0]), np.cos(error[:, 0]))
     return error
 
@@ -19,7 +19,7 @@ def case(rng, count, sigma):
     r, a = rng.uniform(1, 4), rng.uniform(0, 2 * np.pi)
     P = np.array([r * np.cos(a), r * np.sin(a), rng.uniform(0.1, 1.5)])
     s = np.broadcast_to(sigma, (count, 2)) * 1.0
-    return S, P, s, predicted(P, S) + s * rng.normal(size=(count, 2))
+    return S, P, s, predict(P, S) + s * rng.normal(size=(count, 2))
 
 
 def best(S, z, s, starts, axes=None):
@@ -84,7 +84,7 @@ def test_bound_holds_for_any_fix_noise_and_layout():
         count = int(rng.integers(2, 5))
         S, P = rng.uniform(-1, 1, (count, 3)), 2 * rng.normal(size=3)
         s = np.exp(rng.uniform(np.log(0.003), np.log(0.3), (count, 2)))
-        z = predicted(P, S) + s * rng.normal(size=(count, 2))
+        z = predict(P, S) + s * rng.normal(size=(count, 2))
         z[:, 1] = np.clip(z[:, 1], -1.57, 1.57)
         cost = best(S, z, s, [P, *rng.normal(0, 3, (2, 3))])[1]
         for point in (P, 2 * rng.normal(size=3)):
@@ -114,7 +114,7 @@ def test_start_needs_no_guess():
 def test_exact_angles_in_own_axes():
     rng = np.random.default_rng(4)
     S, P, axes = rng.normal(size=(3, 3)), np.array([3.0, 1.0, 2.0]), np.linalg.qr(rng.normal(size=(3, 3, 3)))[0]
-    z, s = predicted(P, S, axes), np.full((3, 2), 0.01)
+    z, s = predict(P, S, axes), np.full((3, 2), 0.01)
     found = directions(z, s, S, axes=axes)
     np.testing.assert_allclose(found.point, P, atol=1e-5)
     assert angle_bound(z, s, S, P, axes=axes).bound <= 1e-9

@@ -6,7 +6,7 @@ from ranged import drawn, minimum, whitened
 from scipy.optimize import least_squares
 
 from formulations.conic import Relaxation
-from formulations.moment_sdp import _forms, moment_bound, moment_problem, moments, upper
+from formulations.moment_sdp import _forms, _upper, moment_bound, moment_problem, moments
 from formulations.range_enclosure import Ranged, ball, enclosure
 
 TIGHT = 1e-4
@@ -37,10 +37,10 @@ def test_every_point_is_feasible_and_costs_what_it_costs(kind, d):
         w = (r[1:] - ranged.side * r[0] - ranged.excess) / unit
         y = monomials(own, np.concatenate([[1.0], s, [t]]), np.concatenate([[1.0], w]))
         assert np.isfinite(y).all()
-        np.testing.assert_allclose(y[own.cone] @ upper(cone), 0.0, atol=1e-9 * np.abs(y).max())
+        np.testing.assert_allclose(y[own.cone] @ _upper(cone), 0.0, atol=1e-9 * np.abs(y).max())
         for i, index in enumerate(own.rules):
             np.testing.assert_allclose(y[index] @ rule[i], 0.0, atol=1e-9 * np.abs(y).max())
-        assert upper(form) @ y[own.cost] == pytest.approx(float(ranged.cost(x)), rel=1e-9)
+        assert _upper(form) @ y[own.cost] == pytest.approx(float(ranged.cost(x)), rel=1e-9)
         assert (np.linalg.eigvalsh(y[own.matrix])[:-1] < 1e-9 * np.abs(y).max()).all()
 
 
@@ -107,7 +107,7 @@ def test_a_solver_that_stops_early_still_bounds(monkeypatch):
     bounds = []
     for steps in (1, 3, 5, 30):
         early = Relaxation(moment_problem(5, 3), settings={"max_iter": steps, "static_regularization_constant": 1e-7})
-        monkeypatch.setattr("formulations.moment_sdp._built", lambda *_, own=early: own)
+        monkeypatch.setattr("formulations.moment_sdp._relaxation", lambda *_, own=early: own)
         bounds.append(moment_bound(ranged, box, cost + 0.1).bound)
     assert max(bounds) <= cost + 1e-9
     assert bounds[0] < bounds[-1]

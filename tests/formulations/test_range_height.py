@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from formulations.ellipsoid import ellipsoid, visible
-from formulations.range_height import locate, locate_by_ranges
+from formulations.range_height import ellipsoid, locate, locate_by_ranges, visible
 
 EARTH = 6378137.0
 FLATTENING = 1 / 298.257223563

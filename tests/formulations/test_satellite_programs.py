@@ -1,13 +1,18 @@
 """Three satellites and a height as semidefinite and as nonlinear programs, against the quartic."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from formulations._curve import three_stations
-from formulations.ellipsoid import ellipsoid, visible
-from formulations.range_height import locate
+from formulations.nls import Program
+from formulations.range_height import ellipsoid, locate, three_stations, visible
 from formulations.range_height_conic import _reach, lifted
-from formulations.range_height_nlp import HeightProgram
+from optloc import Status, solve
+from optloc.base.frames import ECEF
+from optloc.linear.constraints import height
+from optloc.linear.constraints import visible as sight
+from optloc.problem.build import assemble, measured, station_array
 
 EARTH = 6378137.0
 AXES = np.array([1.0, 1.0, 1 - 1 / 298.257223563])
@@ -86,9 +91,60 @@ def test_reduced_lift_reports_what_it_cannot_pose():
         assert not a.answer.solved
 
 
+# Stations and a known height as a program: the polar planes are the horizons of the stations.
+
+
+def polar(p, x, y):
+    """``(x - c)'A(y - c)`` on CasADi symbols; the first nine parameters are A, the next three c."""
+    left, right = [x[i] - p[9 + i] for i in range(3)], [y[i] - p[9 + i] for i in range(3)]
+    return sum(p[3 * i + j] * left[i] * right[j] for i in range(3) for j in range(3))
+
+
+def height_program(rows, count, *, diagonal=True):
+    """Rows ``r_a - r_b``, or ``r_a`` where b is negative; parameters: the surface, then each station and its limit."""
+
+    def station(p, i):
+        return p[12 + 4 * i : 15 + 4 * i]
+
+    def distance(x, p, i):
+        away = x - station(p, i)
+        return (away[0] ** 2 + away[1] ** 2 + away[2] ** 2) ** 0.5
+
+    def h(x, p):
+        return [distance(x, p, a) - (distance(x, p, b) if b >= 0 else 0.0) for a, b in rows]
+
+    return Program(
+        3,
+        len(rows),
+        12 + 4 * count,
+        h,
+        equalities=lambda x, p: [polar(p, x, x) - 1.0],
+        inequalities=lambda x, p: [polar(p, x, station(p, i)) - p[15 + 4 * i] for i in range(count)],
+        diagonal=diagonal,
+        # IPOPT's own scaling looks at the gradient of the start, which vanishes where the start is the fix
+        settings={"nlp_scaling_method": "none"},
+    )
+
+
+def on_height(program, start, z, stations, surface, weight, *, horizon=True):
+    """Solve at three sizes of the weights in turn; a station inside the ellipsoid sees all of it and gets no plane."""
+    planes = (surface.polar(stations, stations) > 1.0) & horizon
+    limit = np.where(planes, 1.0, -10.0)  # the left side is at least -1 for points of the closed ellipsoid
+    p = np.concatenate([surface.shape.ravel(), surface.centre, np.column_stack([stations, limit]).ravel()])
+    for aim in (1e3, 1e2, 1e1):
+        unit = aim / np.abs(weight).max()
+        found = program.solve(start, z, unit * weight, p)
+        if found.success or "Infeasible" in found.status:
+            break
+    return replace(
+        found, cost=found.cost / unit**2, equalities=found.equalities / unit**2,
+        inequalities=found.inequalities / unit**2,
+    )  # fmt: skip
+
+
 @pytest.fixture(scope="module")
 def program():
-    return HeightProgram([(0, 1), (0, 2)], 3)
+    return height_program([(0, 1), (0, 2)], 3)
 
 
 @pytest.mark.parametrize("start", ["below", "antipode", "centre", "random", "fix"])
@@ -104,7 +160,7 @@ def test_polar_planes_lead_from_anywhere(program, start):
         "random": on_surface(rng.normal(size=(100, 3))),
     }[start]
     for first, data, y in zip(starts, z, x, strict=True):
-        found = program.solve(first, data, SATELLITES, WGS84, np.full(2, 1 / SIGMA))
+        found = on_height(program, first, data, SATELLITES, WGS84, np.full(2, 1 / SIGMA))
         assert found.success
         assert np.linalg.norm(found.x - y) * EARTH < 0.01
         assert np.abs(found.inequalities).max() < 1e-3
@@ -113,7 +169,7 @@ def test_polar_planes_lead_from_anywhere(program, start):
 def test_without_polar_planes_most_starts_end_elsewhere(program):
     z, _, x = problems(20, SIGMA, 7)
     ends = [
-        program.solve(-BELOW, data, SATELLITES, WGS84, np.full(2, 1 / SIGMA), horizon=False).x for data in z
+        on_height(program, -BELOW, data, SATELLITES, WGS84, np.full(2, 1 / SIGMA), horizon=False).x for data in z
     ]  # fmt: skip
     assert np.mean(np.linalg.norm(np.array(ends) - x, axis=-1) * EARTH < 10) < 0.5
 
@@ -121,7 +177,7 @@ def test_without_polar_planes_most_starts_end_elsewhere(program):
 def test_multipliers_say_what_is_active(program):
     # no point has a difference as large as the baseline: the best one lies on a horizon
     z = np.array([1.0, 0.3]) * np.linalg.norm(SATELLITES[0] - SATELLITES[1])
-    found = program.solve(BELOW, z, SATELLITES, WGS84, np.full(2, 1e3))
+    found = on_height(program, BELOW, z, SATELLITES, WGS84, np.full(2, 1e3))
     assert found.success
     assert found.inequalities.min() < -1e-3
     active = int(np.argmin(found.inequalities))
@@ -141,18 +197,40 @@ def test_more_stations_ranges_and_a_station_below_the_surface():
     x = (BELOW + 0.004) / np.sqrt(high.polar(BELOW + 0.004, BELOW + 0.004))
     s = np.concatenate([ground, SATELLITES[:1]])
     r = np.linalg.norm(x - s, axis=-1)
-    program = HeightProgram([(0, 1), (0, 2), (3, -1)], 4, diagonal=False)
+    program = height_program([(0, 1), (0, 2), (3, -1)], 4, diagonal=False)
     root = np.eye(3) + 0.1 * rng.normal(size=(3, 3))
-    found = program.solve(BELOW, [r[0] - r[1], r[0] - r[2], r[3]], s, high, root / SIGMA)
+    found = on_height(program, BELOW, [r[0] - r[1], r[0] - r[2], r[3]], s, high, root / SIGMA)
     assert found.success
     np.testing.assert_allclose(found.x, x, atol=1e-8)
 
 
-def test_malformed_input_names_the_culprit(program):
-    with pytest.raises(ValueError, match="rows"):
-        HeightProgram([(0, 3)], 3)
-    with pytest.raises(ValueError, match="stations have shape"):
-        program.solve(BELOW, np.zeros(2), SATELLITES[:2], WGS84)
+def problem(z, *known):
+    """The same data as a problem of optloc, with constraints."""
+    stations = station_array(np.broadcast_to(SATELLITES * EARTH, (len(z), 1, 3, 3)))
+    rows = measured("tdoa", z * EARTH, a=np.zeros(2, int), b=np.array([1, 2]), sigma=SIGMA * EARTH)
+    return assemble(stations, rows, frame=ECEF, constraints=known)
+
+
+@pytest.mark.parametrize("planes", [False, True])
+def test_optloc_needs_no_planes_where_it_starts_from_the_quartic(planes):
+    """The generic program with the height as a constraint finds the visible point from the stage `roots`."""
+    z, _, x = problems(100, SIGMA, 7)
+    horizon = sight(SATELLITES * EARTH) if planes else ()
+    found = solve(problem(z, height(exactly=0.0) + horizon), method="roots+nlp")
+    assert (found.code == Status.OK).all()
+    assert (np.linalg.norm(found.position - x * EARTH, axis=-1) < 0.01).all()
+
+
+def test_the_horizon_as_a_constraint_is_the_polar_plane():
+    """On the surface: a station above the horizon of a point is one whose polar plane leaves that point."""
+    rng = np.random.default_rng(10)
+    x = on_surface(rng.normal(size=(500, 3)))
+    lat, lon, _ = ECEF.to_geodetic(x * EARTH)
+    up = np.stack([np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)], axis=-1)
+    above = np.einsum("ki,ksi->ks", up, SATELLITES - x[:, None]) > 0.0
+    plane = np.stack([WGS84.polar(x, np.broadcast_to(s, x.shape)) > 1.0 for s in SATELLITES], axis=-1)
+    assert np.array_equal(above, plane)
+    assert 0 < above.sum() < above.size
 
 
 def test_the_reach_holds_every_point_of_the_ellipsoid():

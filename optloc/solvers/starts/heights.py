@@ -6,8 +6,7 @@ from itertools import combinations
 
 import numpy as np
 
-from formulations.ellipsoid import Ellipsoid, ellipsoid
-from formulations.range_height import locate, locate_by_ranges
+from formulations.range_height import Ellipsoid, ellipsoid, locate, locate_by_ranges
 from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array, Band
 from optloc.models.primitives import WGS84_A, WGS84_F
