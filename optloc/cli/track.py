@@ -31,10 +31,9 @@ from optloc.cli.output import (
 from optloc.files import Loaded, read
 from optloc.problem.problem import Problem
 from optloc.track import Dynamics, State, current_statistical, polynomial, singer
-from optloc.track.robust_update import reweighted
 from optloc.track.run import Entry, Rules, tracked
 from optloc.track.several_targets import alone
-from optloc.track.track import filter_of
+from optloc.track.updates import filter_of, reweighted
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,11 +4,10 @@ from optloc.track.batch import fitted, posterior_bound, smoothed
 from optloc.track.constants import begun_with_constants, followed_with_constants
 from optloc.track.dynamics import Dynamics, current_statistical, polynomial, singer
 from optloc.track.measurement_space import lines, simplified
-from optloc.track.robust_update import reweighted
 from optloc.track.run import Entry, Rules, collected, tracked
 from optloc.track.start import begun, two_point
 from optloc.track.track import State, Track, followed, predicted
-from optloc.track.updates import UPDATES, Updated, ekf, whitened
+from optloc.track.updates import UPDATES, Updated, ekf, reweighted, whitened
 
 __all__ = [
     "UPDATES",

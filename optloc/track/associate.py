@@ -16,96 +16,137 @@ from optloc.models import MODELS
 from optloc.models.primitives import wrap
 from optloc.problem import noise as noises
 from optloc.problem.problem import Problem
-from optloc.track.track import State, filter_of
-from optloc.track.updates import Update, Updated
+from optloc.track.track import State
+from optloc.track.updates import Update, filter_of
 
-# Gates: which rows of a scan can be those of a predicted state.
+Associate = Callable[[Problem, State, Array], Array]
+"""Maps a scan of one row a channel, predicted targets (..., t) and candidates (..., m, c) to picks, ints (..., t, m).
+
+A pick is the index of the candidate that is taken for a target in a channel, or -1 for none.
+"""
+
+# Sets of a target and scan that are followed at once: with m channels of c candidates in the gate there are (c + 1)^m,
+# and the best is lost only where a thousand beginnings of it score better.
+_SETS = 1000
+# Best sets of a target among which an assignment chooses: rivals share few rows, so that one of the next sets is free.
+_RIVALS = 200
+# What is left of a variance, as a share, where station pairs close a loop: rounding, which a quotient must not blow up.
+_LEFT = 1e-12
 
 
-@dataclass(frozen=True, slots=True)
-class Innovation:
-    """What a scan measures less what a predicted state lets expect.
+def nearest(width: float = 5.0) -> Associate:
+    """Return the rule that takes, for each target and channel, the candidate nearest to the prediction.
+
+    Channels do not know of each other, nor targets: two targets may take the same row.
 
     Parameters
     ----------
-    value : array (..., m)
-        z - h(x) of each row in its SI unit, angles wrapped; zero for absent rows.
-    covariance : array (..., m, m)
-        S = H P H' + R.
+    width : float
+        Half width of the gate in standard deviations of the innovation, prediction included.
     """
+    check_width(width)
 
-    value: Array
-    covariance: Array
+    def rule(scan: Problem, ahead: State, z: Array) -> Array:
+        apart, S = offsets(scan, ahead, z)
+        # argmin of a row without a candidate is 0: it is told from a real 0 by the infinite distance.
+        distance = distances(apart, S, width)
+        return np.where(np.isfinite(distance).any(-1), distance.argmin(-1), -1)
 
-    @property
-    def normalised(self) -> Array:
-        """Return each row's innovation in units of its own standard deviation, (..., m)."""
-        return np.asarray(self.value / np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1)))
+    return rule
 
 
-def innovation(scan: Problem, mean: Array, cov: Array) -> Innovation:
-    """Return the innovation of every row of a scan.
+def joint(clutter: Clutter) -> Associate:
+    """Return the rule that scores whole sets of rows, one or none of each channel, and takes each target's best.
+
+    The score of a set of n rows of m channels is chi-square + ln|2 pi S| - 2 n ln(pd / density) - 2 (m - n) ln(1 - pd)
+    with the joint covariance S of its innovations: twice the negative logarithm of its likelihood against false rows.
+    Targets do not know of each other.
 
     Parameters
     ----------
-    scan : Problem
-        A problem of one epoch whose only unknown is the state.
-    mean : array (..., n)
-        Predicted states.
-    cov : array (..., n, n)
-        Their covariances.
+    clutter : Clutter
+        Detection and false rows.
 
     References
     ----------
-    Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), eq.
-    5.2.3-9.
+    Y. Bar-Shalom, T. E. Fortmann, "Tracking and Data Association" (1988), section 9.3.
     """
-    linear = linearise(scan, mean)
-    H = linear.shared
-    R = noises.dense(weighed(scan, mean).noise, np.arange(scan.count))
-    return Innovation(linear.residual, H @ cov @ np.swapaxes(H, -1, -2) + R)
+
+    def rule(scan: Problem, ahead: State, z: Array) -> Array:
+        sets = scored(scan, ahead, z, clutter)
+        return sets.chosen(sets.score.argmin(-1))
+
+    return rule
 
 
-def gated(update: Update | str, width: float = 5.0) -> Update:
-    """Return a filter that leaves out the rows whose innovation is too large to be true.
+def assigned(clutter: Clutter) -> Associate:
+    """Return the rule that takes the best sets of all targets together, no row for more than one of them.
+
+    The sum of the scores of `joint` is least, exactly: an assignment in several dimensions, solved as an integer
+    programme where targets compete for a row.
 
     Parameters
     ----------
-    update : callable or str
-        The filter, or its name in `UPDATES`.
-    width : float
-        Half width of the gate in standard deviations of each row's innovation, prediction included.
+    clutter : Clutter
+        Detection and false rows.
 
-    Returns
-    -------
-    callable
-        A filter; `Updated.count` tells how many rows passed.
-
-    Raises
-    ------
-    InvalidProblem
-        For an unknown filter or a width that is not positive.
+    References
+    ----------
+    C. L. Morefield, "Application of 0-1 integer programming to multitarget tracking problems", IEEE Trans. Autom.
+    Control 22 (1977).
     """
-    rule = filter_of(update)
-    check_width(width)
 
-    def gate(scan: Problem, mean: Array, cov: Array) -> Updated:
-        inside = np.abs(innovation(scan, mean, cov).normalised) <= width
-        return rule(scan.with_rows(weight=scan.weight * inside), mean, cov)
+    def rule(scan: Problem, ahead: State, z: Array) -> Array:
+        # Most scans need no programme: each target's own best set, where no row is wanted twice, is the least sum.
+        sets = scored(scan, ahead, z, clutter)
+        pick = sets.chosen(sets.score.argmin(-1))
+        for index in np.ndindex(pick.shape[:-2]):
+            if _compete(pick[index]):
+                own = Sets(sets.score[index], sets.picks[index])
+                pick[index] = own.chosen(_assign(own))
+        return pick
 
-    return gate
+    return rule
 
 
-def check_width(width: float) -> None:
-    """Refuse a gate that is not open; raise InvalidProblem."""
-    if not width > 0.0:
-        raise InvalidProblem(f"the gate is {width} wide", "width", "give a number of standard deviations above 0")
+def _compete(pick: Array) -> bool:
+    """Return whether any two targets take the same candidate, picks (t, m)."""
+    same = (pick[:, None] == pick[None]) & (pick[:, None] >= 0)
+    return bool(same.any(-1).sum() > (pick >= 0).any(-1).sum())
+
+
+def _assign(sets: Sets) -> Array:
+    """Return the numbers (t,) of the sets with the least sum of scores, one for a target, that share no candidate."""
+    from scipy.optimize import Bounds, LinearConstraint, milp
+    from scipy.sparse import csr_array
+
+    owner, number, wanted = [], [], []
+    for target, own in enumerate(sets.score):
+        # The empty set is the first, and never in anybody's way: a set that is worse need not be looked at.
+        better = np.flatnonzero(own < own[0])
+        better = better[np.argsort(own[better], kind="stable")][:_RIVALS]
+        numbers = np.concatenate([[0], better])
+        owner.append(np.full(len(numbers), target))
+        number.append(numbers)
+        wanted.append(sets.picks[target, numbers])
+    who, which, pick = np.concatenate(owner), np.concatenate(number), np.concatenate(wanted)
+    column, channel = np.nonzero(pick >= 0)
+    _, row = np.unique(np.stack([channel, pick[column, channel]]), axis=1, return_inverse=True)
+    # One set for every target, the empty one among them; no row in two of the sets taken.
+    everyone = csr_array((np.ones(len(who)), (who, np.arange(len(who)))))
+    once = csr_array((np.ones(len(row)), (row, column)), shape=(int(row.max()) + 1, len(who)))
+    solved = milp(
+        sets.score[who, which],
+        integrality=np.ones(len(who), dtype=np.int64),
+        bounds=Bounds(0.0, 1.0),
+        constraints=[LinearConstraint(everyone, 1.0, 1.0), LinearConstraint(once, -np.inf, 1.0)],
+    )
+    assert solved.x is not None  # all targets with nothing is always allowed
+    taken = np.flatnonzero(solved.x > 0.5)
+    return np.asarray(which[taken[np.argsort(who[taken])]])
 
 
 # Whole sets of rows, one or none of each channel, scored against predicted targets.
-
-# Sets of a target and scan that are followed at once.
-_SETS = 1000
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,6 +228,7 @@ def scored(scan: Problem, ahead: State, z: Array, clutter: Clutter) -> Sets:
     """
     apart, S = offsets(scan, ahead, z)
     distance = distances(apart, S, clutter.width)
+    # Candidates in the gate first: channels are cut to as many as the fullest one has.
     kept = max(1, int(np.isfinite(distance).sum(-1).max(initial=0)))
     order = np.argsort(distance, axis=-1, kind="stable")[..., :kept]
     near = np.take_along_axis(np.where(np.isfinite(distance), apart, np.nan), order, axis=-1)
@@ -194,14 +236,15 @@ def scored(scan: Problem, ahead: State, z: Array, clutter: Clutter) -> Sets:
     shape, m = near.shape[:-2], near.shape[-2]
     score, picks = np.zeros((*shape, 1)), np.zeros((*shape, 1, 0), dtype=np.int64)
     mean = np.zeros((*shape, 1, m))
+    # mean and V: of the rows that are still to come, given those that a set already holds; every set has its own.
     V = np.broadcast_to(S, (*shape, m, m))[..., None, :, :]
     for i in range(m):
-        # Station pairs that close a loop may leave nothing of a variance but rounding.
-        s = np.maximum(V[..., i, i], 1e-12 * S[..., None, i, i])
+        s = np.maximum(V[..., i, i], _LEFT * S[..., None, i, i])
         away = near[..., None, i, :] - mean[..., i, None]
         seen = (score + np.log(2.0 * np.pi * s) - gain[i])[..., None] + away**2 / s[..., None]
+        # Option 0 of a channel is to miss it, option j + 1 its j-th nearest candidate.
         both = np.concatenate([(score + missed)[..., None], np.where(np.isnan(seen), np.inf, seen)], axis=-1)
-        number = _best(both.reshape(*shape, -1))
+        number = _keep_best(both.reshape(*shape, -1))
         parent, option = np.divmod(number, kept + 1)
         score = np.take_along_axis(both.reshape(*shape, -1), number, axis=-1)
         picks, mean = (np.take_along_axis(part, parent[..., None], axis=-2) for part in (picks, mean))
@@ -211,10 +254,108 @@ def scored(scan: Problem, ahead: State, z: Array, clutter: Clutter) -> Sets:
         value = np.take_along_axis(near[..., i, :], np.maximum(option - 1, 0), axis=-1)
         used = (option > 0) & np.isfinite(score)
         across, s = V[..., :, i], np.take_along_axis(s, parent, axis=-1)
+        # A set that took a row conditions the rest on it; one that missed the channel learns nothing.
         share = np.where(used[..., None], across / s[..., None], 0.0)
         mean = mean + share * np.where(used, value - mean[..., i], 0.0)[..., None]
         V = V - share[..., :, None] * across[..., None, :]
     return Sets(score, picks)
+
+
+def _keep_best(score: Array) -> Array:
+    """Return which of the sets (..., q) are kept, (..., p): the empty one first, and no more than can be followed."""
+    possible = np.flatnonzero(np.isfinite(score).any(tuple(range(score.ndim - 1))))
+    if len(possible) <= _SETS:
+        return np.broadcast_to(possible, (*score.shape[:-1], len(possible)))
+    # The empty set stays first: it is what every target can always have.
+    key = score.copy()
+    key[..., 0] = -np.inf
+    return np.argsort(key, axis=-1, kind="stable")[..., :_SETS]
+
+
+# Gates: which rows of a scan can be those of a predicted state.
+
+
+@dataclass(frozen=True, slots=True)
+class Innovation:
+    """What a scan measures less what a predicted state lets expect.
+
+    Parameters
+    ----------
+    value : array (..., m)
+        z - h(x) of each row in its SI unit, angles wrapped; zero for absent rows.
+    covariance : array (..., m, m)
+        S = H P H' + R.
+    """
+
+    value: Array
+    covariance: Array
+
+    @property
+    def normalised(self) -> Array:
+        """Return each row's innovation in units of its own standard deviation, (..., m)."""
+        return np.asarray(self.value / np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1)))
+
+
+def innovation(scan: Problem, mean: Array, cov: Array) -> Innovation:
+    """Return the innovation of every row of a scan.
+
+    Parameters
+    ----------
+    scan : Problem
+        A problem of one epoch whose only unknown is the state.
+    mean : array (..., n)
+        Predicted states.
+    cov : array (..., n, n)
+        Their covariances.
+
+    References
+    ----------
+    Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), eq.
+    5.2.3-9.
+    """
+    linear = linearise(scan, mean)
+    H = linear.shared
+    # Station errors are part of the noise, and grow with the place of the target.
+    R = noises.dense(weighed(scan, mean).noise, np.arange(scan.count))
+    return Innovation(linear.residual, H @ cov @ np.swapaxes(H, -1, -2) + R)
+
+
+def gated(update: Update | str, width: float = 5.0) -> Update:
+    """Return a filter that leaves out the rows whose innovation is too large to be true.
+
+    Parameters
+    ----------
+    update : callable or str
+        The filter, or its name in `UPDATES`.
+    width : float
+        Half width of the gate in standard deviations of each row's innovation, prediction included.
+
+    Returns
+    -------
+    callable
+        A filter; `Updated.count` tells how many rows passed.
+
+    Raises
+    ------
+    InvalidProblem
+        For an unknown filter or a width that is not positive.
+    """
+    rule = filter_of(update)
+    check_width(width)
+    return lambda scan, mean, cov: rule(scan.with_rows(weight=weights_within(scan, mean, cov, width)), mean, cov)
+
+
+def weights_within(scan: Problem, mean: Array, cov: Array, width: float) -> Array:
+    """Return the weights (..., m) of a scan's rows, zero where the innovation is outside a gate."""
+    with np.errstate(invalid="ignore"):  # a state that is lost has no row in its gate
+        inside = np.abs(innovation(scan, mean, cov).normalised) <= width
+    return np.asarray(np.where(inside, scan.weight, 0.0))
+
+
+def check_width(width: float) -> None:
+    """Refuse a gate that is not open; raise InvalidProblem."""
+    if not width > 0.0:
+        raise InvalidProblem(f"the gate is {width} wide", "width", "give a number of standard deviations above 0")
 
 
 def offsets(scan: Problem, ahead: State, z: Array) -> tuple[Array, Array]:
@@ -230,13 +371,19 @@ def offsets(scan: Problem, ahead: State, z: Array) -> tuple[Array, Array]:
         Candidates.
     """
     expected = predict(scan, ahead.mean)
+    apart = misfits(scan, z, expected)
+    S = innovation(scan.with_rows(z=expected), ahead.mean, ahead.cov).covariance
+    return apart, S
+
+
+def misfits(scan: Problem, z: Array, expected: Array) -> Array:
+    """Return candidates (..., m, c) less values expected of each target (..., t, m), angles wrapped: (..., t, m, c)."""
     apart = z[..., None, :, :] - expected[..., None]
     for block, start in zip(scan.rows, scan.starts, strict=True):
         if MODELS[block.kind].period is not None:
             part = slice(start, start + block.count)
             apart[..., part, :] = wrap(apart[..., part, :])
-    S = innovation(scan.with_rows(z=expected), ahead.mean, ahead.cov).covariance
-    return apart, S
+    return np.asarray(apart)
 
 
 def distances(apart: Array, S: Array, width: float) -> Array:
@@ -251,134 +398,3 @@ def distances(apart: Array, S: Array, width: float) -> Array:
     """
     distance = np.abs(apart) / np.sqrt(np.diagonal(S, axis1=-2, axis2=-1))[..., None]
     return np.where(distance <= width, distance, np.inf)
-
-
-def _best(score: Array) -> Array:
-    """Return which of the sets (..., q) are kept, (..., p): the empty one first, and no more than can be followed."""
-    possible = np.flatnonzero(np.isfinite(score).any(tuple(range(score.ndim - 1))))
-    if len(possible) <= _SETS:
-        return np.broadcast_to(possible, (*score.shape[:-1], len(possible)))
-    key = score.copy()
-    key[..., 0] = -np.inf
-    return np.argsort(key, axis=-1, kind="stable")[..., :_SETS]
-
-
-__all__ = ["Associate", "Clutter", "assigned", "joint", "nearest"]
-
-Associate = Callable[[Problem, State, Array], Array]
-"""Maps a scan of one row a channel, predicted targets (..., t) and candidates (..., m, c) to picks, ints (..., t, m).
-
-A pick is the index of the candidate that is taken for a target in a channel, or -1 for none.
-"""
-
-# Best sets of a target among which an assignment chooses.
-_RIVALS = 200
-
-
-def nearest(width: float = 5.0) -> Associate:
-    """Return the rule that takes, for each target and channel, the candidate nearest to the prediction.
-
-    Channels do not know of each other, nor targets: two targets may take the same row.
-
-    Parameters
-    ----------
-    width : float
-        Half width of the gate in standard deviations of the innovation, prediction included.
-    """
-    check_width(width)
-
-    def rule(scan: Problem, ahead: State, z: Array) -> Array:
-        apart, S = offsets(scan, ahead, z)
-        distance = distances(apart, S, width)
-        return np.where(np.isfinite(distance).any(-1), distance.argmin(-1), -1)
-
-    return rule
-
-
-def joint(clutter: Clutter) -> Associate:
-    """Return the rule that scores whole sets of rows, one or none of each channel, and takes each target's best.
-
-    The score of a set of n rows of m channels is chi-square + ln|2 pi S| - 2 n ln(pd / density) - 2 (m - n) ln(1 - pd)
-    with the joint covariance S of its innovations: twice the negative logarithm of its likelihood against false rows.
-    Targets do not know of each other.
-
-    Parameters
-    ----------
-    clutter : Clutter
-        Detection and false rows.
-
-    References
-    ----------
-    Y. Bar-Shalom, T. E. Fortmann, "Tracking and Data Association" (1988), section 9.3.
-    """
-
-    def rule(scan: Problem, ahead: State, z: Array) -> Array:
-        sets = scored(scan, ahead, z, clutter)
-        return sets.chosen(sets.score.argmin(-1))
-
-    return rule
-
-
-def assigned(clutter: Clutter) -> Associate:
-    """Return the rule that takes the best sets of all targets together, no row for more than one of them.
-
-    The sum of the scores of `joint` is least, exactly: an assignment in several dimensions, solved as an integer
-    programme where targets compete for a row.
-
-    Parameters
-    ----------
-    clutter : Clutter
-        Detection and false rows.
-
-    References
-    ----------
-    C. L. Morefield, "Application of 0-1 integer programming to multitarget tracking problems", IEEE Trans. Autom.
-    Control 22 (1977).
-    """
-
-    def rule(scan: Problem, ahead: State, z: Array) -> Array:
-        sets = scored(scan, ahead, z, clutter)
-        pick = sets.chosen(sets.score.argmin(-1))
-        for index in np.ndindex(pick.shape[:-2]):
-            if _shared(pick[index]):
-                own = Sets(sets.score[index], sets.picks[index])
-                pick[index] = own.chosen(_without_rivals(own))
-        return pick
-
-    return rule
-
-
-def _shared(pick: Array) -> bool:
-    """Return whether any two targets take the same candidate, picks (t, m)."""
-    same = (pick[:, None] == pick[None]) & (pick[:, None] >= 0)
-    return bool(same.any(-1).sum() > (pick >= 0).any(-1).sum())
-
-
-def _without_rivals(sets: Sets) -> Array:
-    """Return the numbers (t,) of the sets with the least sum of scores, one for a target, that share no candidate."""
-    from scipy.optimize import Bounds, LinearConstraint, milp
-    from scipy.sparse import csr_array
-
-    owner, number, wanted = [], [], []
-    for target, own in enumerate(sets.score):
-        # The empty set is the first, and never in anybody's way: a set that is worse need not be looked at.
-        better = np.flatnonzero(own < own[0])
-        better = better[np.argsort(own[better], kind="stable")][:_RIVALS]
-        numbers = np.concatenate([[0], better])
-        owner.append(np.full(len(numbers), target))
-        number.append(numbers)
-        wanted.append(sets.picks[target, numbers])
-    who, which, pick = np.concatenate(owner), np.concatenate(number), np.concatenate(wanted)
-    column, channel = np.nonzero(pick >= 0)
-    _, row = np.unique(np.stack([channel, pick[column, channel]]), axis=1, return_inverse=True)
-    everyone = csr_array((np.ones(len(who)), (who, np.arange(len(who)))))
-    once = csr_array((np.ones(len(row)), (row, column)), shape=(int(row.max()) + 1, len(who)))
-    solved = milp(
-        sets.score[who, which],
-        integrality=np.ones(len(who), dtype=np.int64),
-        bounds=Bounds(0.0, 1.0),
-        constraints=[LinearConstraint(everyone, 1.0, 1.0), LinearConstraint(once, -np.inf, 1.0)],
-    )
-    assert solved.x is not None  # all targets with nothing is always allowed
-    taken = np.flatnonzero(solved.x > 0.5)
-    return np.asarray(which[taken[np.argsort(who[taken])]])

@@ -14,7 +14,7 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
 from optloc.track.dynamics import Dynamics, polynomial
-from optloc.track.track import State, Track, check_trackable, gathered, scans
+from optloc.track.track import State, Track, check_trackable, collect, scans
 from optloc.track.updates import Updated, joseph, whitened
 
 
@@ -68,6 +68,7 @@ def along(state: State, times: Array, dimension: int) -> tuple[Array, Array]:
     tuple of array
         Means (..., k, n) and covariances (..., k, n, n).
     """
+    # Without process noise the transition is exact in either direction of time.
     model = polynomial(state.mean.shape[-1] // dimension - 1)
     F = np.stack([model.step(float(t) - state.time, state.mean, dimension)[0] for t in np.asarray(times)])
     mean = (F @ state.mean[..., None, :, None])[..., 0]
@@ -101,6 +102,7 @@ def smoothed(problem: Problem, order: int, *, method: str = "auto") -> Track:
     state = State(float(problem.times[-1]), *(np.asarray(part) for part in (fix.x, fix.cov)))
     mean, cov = along(state, problem.times, problem.dimension)
     steps = []
+    # All states come from one fit: what a scan adds to its chi-square is that of its rows at its own state.
     for k, (_, scan) in enumerate(scans(problem, order)):
         at, spread = mean[..., k, :], cov[..., k, :, :]
         none = np.zeros(at.shape[:-1])
@@ -114,10 +116,7 @@ def smoothed(problem: Problem, order: int, *, method: str = "auto") -> Track:
         found = Updated(at, spread, square, -0.5 * (square + white.logdet), np.broadcast_to(white.count, none.shape))
         code = np.where(white.count > 0, fix.code, int(Status.TOO_FEW_ROWS)).astype(np.int8)
         steps.append((found, np.broadcast_to(code, none.shape)))
-    return gathered(np.asarray(problem.times), steps, problem.dimension)
-
-
-# The posterior Cramer-Rao bound: what no filter of a model of motion can beat on average.
+    return collect(np.asarray(problem.times), steps, problem.dimension)
 
 
 def posterior_bound(problem: Problem, truth: Array, start: State, dynamics: Dynamics) -> Array:
@@ -152,6 +151,7 @@ def posterior_bound(problem: Problem, truth: Array, start: State, dynamics: Dyna
         if time <= start.time:
             continue
         F, Q, _ = dynamics.step(time - now, at, problem.dimension)
+        # Noise that depends on the state is that of the true one, at the time before.
         cov, at, now = F @ cov @ F.T + Q, truth[..., k, :], time
         if scan.count:
             H = whitened(scan, at).H

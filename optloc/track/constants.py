@@ -12,18 +12,8 @@ from optloc.problem.epochs import cut
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
 from optloc.track.dynamics import Dynamics
-from optloc.track.track import (
-    State,
-    Track,
-    check_state,
-    check_trackable,
-    filter_of,
-    gathered,
-    predicted,
-    scan_at,
-    taken,
-)
-from optloc.track.updates import Update
+from optloc.track.track import State, Track, check_state, check_trackable, follow, scan_at
+from optloc.track.updates import Update, filter_of
 
 
 def begun_with_constants(problem: Problem, dynamics: Dynamics, epochs: int) -> State:
@@ -46,6 +36,7 @@ def begun_with_constants(problem: Problem, dynamics: Dynamics, epochs: int) -> S
     """
     _check(problem)
     time = float(problem.times[epochs - 1])
+    # The state is asked for at the last epoch used: from there on scans are new, none counts twice.
     fix = solve(replace(cut(problem, 0, epochs), motions=(Motion(dynamics.order, reference=time),)))
     mean, cov = fix.gaussian()
     return State(time, np.where(fix.answered[..., None], mean, np.nan), np.array(cov))
@@ -83,29 +74,23 @@ def followed_with_constants(problem: Problem, start: State, dynamics: Dynamics, 
     B. Friedland, "Treatment of bias in recursive filtering", IEEE Trans. Autom. Control 14 (1969): the augmented state.
     """
     _check(problem)
-    rule, d = filter_of(update), problem.dimension
+    d = problem.dimension
+    # Whatever the layout shares between epochs beside the states of motion is a constant of the run.
     constants = problem.layout.n_shared - sum((motion.order + 1) * d for motion in problem.motions)
     check_state(start, (dynamics.order + 1) * d + constants)
-    joint, state, steps, times = _joint(dynamics, constants), start, [], []
-    for k, time in enumerate(problem.times.tolist()):
-        if time <= start.time:
-            continue
-        ahead = predicted(state, joint, time, d)
-        done, code = taken(scan_at(problem, k, dynamics.order), ahead, rule)
-        state = State(time, done.mean, done.cov)
-        steps.append((done, code))
-        times.append(time)
-    return gathered(np.array(times), steps, d)
+    given = ((time, scan_at(problem, k, dynamics.order)) for k, time in enumerate(problem.times.tolist()))
+    return follow(given, start, _with_constants(dynamics, constants), filter_of(update), d)
 
 
 def _check(problem: Problem) -> None:
     check_trackable(replace(problem, biases=()))
+    # A drift times the seconds of the run is no constant of one scan: its model would need the time.
     drifting = next((bias.name for bias in problem.biases if bias.form == "drift"), None)
     if drifting is not None:
         raise InvalidProblem(f"the bias {drifting!r} drifts", "track", "learn it first, then `with_known_bias`")
 
 
-def _joint(dynamics: Dynamics, constants: int) -> Dynamics:
+def _with_constants(dynamics: Dynamics, constants: int) -> Dynamics:
     """Return dynamics of a state that is followed by constants."""
 
     def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
@@ -113,6 +98,7 @@ def _joint(dynamics: Dynamics, constants: int) -> Dynamics:
         F, Q, drive = dynamics.step(dt, mean[..., :n], d)
         none = [(0, 0)] * (Q.ndim - 2)
         pad = (0, constants)
+        # Constants stay as they are: identity in F, zero in Q and drive.
         whole = np.pad(F, [(0, 0)] * (F.ndim - 2) + [pad, pad])
         whole[..., range(n, n + constants), range(n, n + constants)] = 1.0
         return whole, np.pad(Q, [*none, pad, pad]), np.pad(drive, [(0, 0)] * (drive.ndim - 1) + [pad])

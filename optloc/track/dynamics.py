@@ -15,11 +15,15 @@ from optloc.base.types import Array
 Step = Callable[[float, Array, int], tuple[Array, Array, Array]]
 """Maps seconds, means (..., n) and dimension d to F (n, n), Q (..., n, n) and the drive (..., n) that is added."""
 
-# Accelerations nearer to the limit of the current statistical model than this share of it, or beyond, count as here.
+# Accelerations nearer to the limit of the current statistical model than this share of it, or beyond, count as here: at
+# the limit the variance of the published rule is zero, and beyond it grows without bound.
 _CLAMP = 0.05
+# Powers of the step in the answers of position, velocity and acceleration to an impulse of acceleration.
 _POWERS = np.array([2.0, 1.0, 0.0])
-# Below this share of the time constant, steps are summed as power series, of so many terms.
+# Share of the time constant below which steps are summed as power series: the closed form is a
+# difference of order x^5 of numbers of order 1: from here on it loses two digits at most.
 _SERIES = 1.0
+# Terms of the series: the next, x^18 / 18! at most, is below the rounding of the sum.
 _TERMS = 18
 
 
@@ -65,6 +69,7 @@ def polynomial(order: int, noise: float = 0.0) -> Dynamics:
     def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
         powers = np.array([dt**j / factorial(j) for j in range(order + 2)])
         F = sum(powers[j] * np.eye(order + 1, k=j) for j in range(order + 1))
+        # The next derivative is constant between scans: one number enters position, velocity, ... by dt^j / j!.
         drive = noise * powers[order + 1 : 0 : -1]
         return *_blocked(np.asarray(F), np.outer(drive, drive), d), np.zeros(mean.shape)
 
@@ -125,7 +130,9 @@ def current_statistical(time_constant: float, limit: float, floor: float = 0.0) 
         F, Q, u = correlated(alpha, dt)
         present = mean[..., 2 * d :]
         gap = np.maximum(limit - np.abs(present), _CLAMP * limit)
+        # The variance of Rayleigh's density between the present acceleration and the limit.
         variance = np.maximum((4.0 - np.pi) / np.pi * gap**2, floor**2)
+        # Axes do not mix: Q of one axis times the variance of each, blocked as [p, v, a].
         noise = np.einsum("ij,...c,cb->...icjb", Q, variance, np.eye(d))
         drive = (u[:, None] * present[..., None, :]).reshape(mean.shape)
         return np.kron(F, np.eye(d)), noise.reshape(*mean.shape, mean.shape[-1]), drive
@@ -157,6 +164,7 @@ def _series(x: float) -> tuple[Array, Array, Array]:
     """Return f at the end of the step, Q and U from power series in x."""
     n = np.arange(_TERMS)
     terms = (-x) ** n / np.array([[float(factorial(k + p)) for k in range(_TERMS)] for p in (2, 1, 0)])
+    # The product of two terms s^i and s^j of f, integrated over the step, is 1 / (i + j + 1).
     order = n + _POWERS[:, None]
     lengths = order[:, None, :, None] + order[None, :, None, :] + 1.0
     Q = 2.0 * x * (terms[:, None, :, None] * terms[None, :, None, :] / lengths).sum((-2, -1))

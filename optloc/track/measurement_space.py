@@ -20,6 +20,14 @@ from optloc.solvers import solve
 from optloc.solvers.starts.angles import course_starts, pair
 from optloc.track.track import Track, check_trackable
 
+# What a scan of the simplified recursion holds, in the order of its state: range, azimuth, elevation.
+_KINDS = ("range_sum", "azimuth", "elevation")
+# Pivot of a normal matrix of powers, as a share of its diagonal, below which the window leaves the polynomial open.
+_SINGULAR = 1e-12
+
+
+# Polynomials through all rows.
+
 
 def lines(problem: Problem, order: int = 1, window: int | None = None) -> Track:
     """Return the track of a slow target seen by stations that stay, from polynomials fitted to its measurements.
@@ -56,14 +64,16 @@ def lines(problem: Problem, order: int = 1, window: int | None = None) -> Track:
     """
     check_trackable(problem)
     _check_lines(problem, order, window)
+    # Every epoch as a problem of its own: the rows of one are solved as if the target stood still.
     apart = by_epoch(replace(problem, motions=(Motion(0, "epoch"),)))
-    z, weight = _unwrapped(apart), _weights(apart)
+    z, weight = _unwrap(apart), _weights(apart)
+    # One estimator for each length of the past: it depends on times and weights alone, not on what was measured.
     values, covs, known = [], [], []
     for k in range(order, problem.epochs):
         past = slice(0 if window is None else max(0, k + 1 - window), k + 1)
         estimator, ok = _estimator(problem.times[past] - problem.times[k], weight[..., past, :], order)
         values.append(np.einsum("...qkm,...km->...qm", estimator, z[..., past, :]))
-        covs.append(_propagated(estimator, apart, past))
+        covs.append(_propagate(estimator, apart, past))
         known.append(ok)
     fitted, cov, ok = np.stack(values, -3), np.stack(covs, -5), np.stack(known, -1)
     return _line_track(problem, apart, fitted, cov, ok)
@@ -86,12 +96,13 @@ def _check_lines(problem: Problem, order: int, window: int | None) -> None:
         )
 
 
-def _unwrapped(apart: Problem) -> Array:
+def _unwrap(apart: Problem) -> Array:
     """Return the measured values (..., k, m) less their corrections, angles without jumps, absent ones repeated."""
     weight = _weights(apart)
     columns = []
     period = [MODELS[rows.kind].period for rows in apart.rows for _ in range(rows.count)]
     for i, full in enumerate(period):
+        # An absent row repeats the last present one, so that the angle makes no turn there; its weight is zero.
         there = np.broadcast_to(weight[..., i] > 0.0, apart.observed.shape[:-1])
         last = np.maximum.accumulate(np.where(there, np.arange(there.shape[-1]), -1), axis=-1)
         first = there.argmax(-1)[..., None]
@@ -104,16 +115,19 @@ def _weights(apart: Problem) -> Array:
     """Return weights (..., k, m) over variances; zero for rows that are absent or not finite."""
     variance = noises.variances(apart.noise, apart.count)
     weight = np.asarray(np.where(np.isfinite(apart.z), apart.weight, 0.0) / variance)
+    # Weights that all runs of a batch share are kept once: the estimator is then made once, too.
     one = weight[(0,) * (weight.ndim - 2)]
     return one if np.array_equal(np.broadcast_to(one, weight.shape), weight) else weight
 
 
 def _estimator(since: Array, weight: Array, order: int) -> tuple[Array, Array]:
     """Return what maps values (..., k, m) to value and rate now, (..., 1 or 2, k, m), and where it exists (...)."""
+    # Times as shares of the window: powers of seconds would ruin the condition of the normal matrix.
     span = float(np.abs(since).max(initial=0.0)) or 1.0
     powers = (since / span)[:, None] ** np.arange(order + 1)
     information = np.einsum("kqr,...km->...mqr", powers[:, :, None] * powers[:, None, :], weight)
-    inverse, ok = linalg.inverse(information, 1e-12)
+    inverse, ok = linalg.inverse(information, _SINGULAR)
+    # Value and rate now; a curvature is fitted, but places need no more than these two.
     kept = min(order, 1) + 1
     both = (inverse[..., :kept, :] @ powers.T).swapaxes(-1, -3).swapaxes(-1, -2)  # (..., k, m, q)
     scale = np.array([1.0, 1.0 / span])[:kept]
@@ -122,7 +136,7 @@ def _estimator(since: Array, weight: Array, order: int) -> tuple[Array, Array]:
     return np.where(good[..., None, None, None], estimator, 0.0), good
 
 
-def _propagated(estimator: Array, apart: Problem, past: slice) -> Array:
+def _propagate(estimator: Array, apart: Problem, past: slice) -> Array:
     """Return the covariance (..., q, m, q, m) of values and rates."""
     R = noises.dense(apart.noise, np.arange(apart.count))
     k = estimator.shape[-2]
@@ -135,12 +149,14 @@ def _line_track(problem: Problem, apart: Problem, fitted: Array, cov: Array, ok:
     """Return places and velocities of fitted values (..., k, q, m) with covariance (..., k, q, m, q, m)."""
     d, m, batch = problem.dimension, apart.count, fitted.shape[:-2]
     n = fitted.shape[-2] * d
+    # The fitted values as a scan: their covariance is its noise; a unit matrix where there is no fit.
     alone = np.where(ok[..., None, None], cov[..., 0, :, 0, :], np.eye(m))
     rows = tuple(replace(block, correction=np.zeros(block.count)) for block in apart.rows)
     scan = replace(apart, rows=rows, noise=Noise((Block(np.arange(m)[None], alone[..., None, :, :]),)))
     scan = scan.with_rows(z=fitted[..., 0, :], weight=np.ones(m))
-    position, code = _solved(scan)
+    position, code = _solve_scans(scan)
     linear = linearise(scan, position)
+    # d place / d value of least squares with this noise maps rates to a velocity, and covariances to those of states.
     W = np.concatenate([w.apply(np.broadcast_to(np.eye(m), (*batch, m, m))) for w in linear.noise], axis=-2)
     white = W @ linear.shared
     back, _ = linalg.solve(np.swapaxes(white, -1, -2) @ white, np.swapaxes(white, -1, -2) @ W)
@@ -162,7 +178,7 @@ def _line_track(problem: Problem, apart: Problem, fitted: Array, cov: Array, ok:
     )
 
 
-def _solved(scan: Problem) -> tuple[Array, Array]:
+def _solve_scans(scan: Problem) -> tuple[Array, Array]:
     """Return position (..., k, d) and status (..., k); solved at the last epoch, which starts the others."""
     shape, flat = scan.batch_shape, scan.flat()
     size, count = int(np.prod(shape)), shape[-1]
@@ -170,12 +186,14 @@ def _solved(scan: Problem) -> tuple[Array, Array]:
     if course is not None:  # one bistatic pair: in closed form, and there is no other place
         start = course[:, 0]
     else:
+        # The last epoch has the longest past, so the best values; its place starts the iterations at the others.
         last = solve(flat.take(np.arange(count - 1, size, count)))
         start, doubt = np.repeat(last.position, count, axis=0), np.repeat(last.code == Status.AMBIGUOUS, count)
     fix = solve(flat, "lsr", start=np.where(np.isfinite(start), start, 0.0))
     position, code = np.array(fix.position), np.array(fix.code)
     # Another place that explains the last epoch may explain the others.
     code = np.where((code == Status.OK) & doubt, Status.AMBIGUOUS, code)
+    # Early epochs may be too far from there: these are solved without a start.
     again = np.flatnonzero((code != Status.OK) & (code != Status.AMBIGUOUS))
     if len(again):
         redone = solve(flat.take(again))
@@ -184,9 +202,6 @@ def _solved(scan: Problem) -> tuple[Array, Array]:
 
 
 # One receiver and one illuminator: the simplified recursion in range, azimuth and elevation.
-
-KINDS = ("range_sum", "azimuth", "elevation")
-"""What a scan holds."""
 
 
 def simplified(problem: Problem, *, restart: int | None = None, mean: int = 1, floor: float = 0.0) -> Track:
@@ -234,14 +249,15 @@ def simplified(problem: Problem, *, restart: int | None = None, mean: int = 1, f
     for k in range(epochs):
         scan = apart.take(np.arange(k, size * epochs, epochs))
         heard = np.asarray((np.isfinite(scan.z) & (scan.weight > 0.0)).all(-1))
+        # Begin anew while the first mean is not full, at every restart, and wherever the state is lost.
         again = heard & ((k < mean or (restart is not None and k % restart == 0)) | ~np.isfinite(state.value).all(-1))
         with np.errstate(invalid="ignore"):
-            moved = _moved(state, scan, home, floor)
-        state = _chosen(heard & ~again, moved, state)
+            moved = _advance(state, scan, home, floor)
+        state = _choose(heard & ~again, moved, state)
         if again.any():
-            begun = _begun(cut(flat, max(0, k + 1 - mean), k + 1), scan, home)
-            state = _chosen(again, begun, state)
-        at, axes, _, _ = _seen(state.value, scan, home)
+            begun = _restart(cut(flat, max(0, k + 1 - mean), k + 1), scan, home)
+            state = _choose(again, begun, state)
+        at, axes, _, _ = _linearise_at(state.value, scan, home)
         code = np.where(heard, np.where(np.isfinite(at).all(-1), Status.OK, Status.NUMERICAL), Status.TOO_FEW_ROWS)
         steps.append((at, axes @ state.cov @ np.swapaxes(axes, -1, -2), np.where(heard, 3, 0), code))
     return _bistatic_track(problem, steps)
@@ -274,7 +290,7 @@ def _receiver(problem: Problem) -> int:
     return found[0]
 
 
-def _chosen(mask: Array, one: _State, other: _State) -> _State:
+def _choose(mask: Array, one: _State, other: _State) -> _State:
     return _State(
         np.where(mask[:, None], one.value, other.value),
         np.where(mask[:, None, None], one.cov, other.cov),
@@ -285,10 +301,10 @@ def _chosen(mask: Array, one: _State, other: _State) -> _State:
 
 def _rows(scan: Problem) -> list[int]:
     kinds = [block.kind for block in scan.rows]
-    return [kinds.index(kind) for kind in KINDS]
+    return [kinds.index(kind) for kind in _KINDS]
 
 
-def _seen(value: Array, scan: Problem, home: int) -> tuple[Array, Array, Array, Array]:
+def _linearise_at(value: Array, scan: Problem, home: int) -> tuple[Array, Array, Array, Array]:
     """Return, at (range, azimuth, elevation), the place (N, 3), its partials (N, 3, 3), residuals and path partials."""
     r, azimuth, elevation = value.T
     ahead = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
@@ -304,16 +320,19 @@ def _seen(value: Array, scan: Problem, home: int) -> tuple[Array, Array, Array, 
     return at, axes, linear.residual[:, order], (H[:, :1] @ axes)[:, 0]
 
 
-def _moved(state: _State, scan: Problem, home: int, floor: float) -> _State:
+def _advance(state: _State, scan: Problem, home: int, floor: float) -> _State:
     """Return the state after one more scan: a step of the angles, and one of the range by what the path says beyond."""
-    _, _, residual, slopes = _seen(state.value, scan, home)
+    _, _, residual, slopes = _linearise_at(state.value, scan, home)
     x, across = slopes[:, 0], slopes[:, 1:]
+    # Running means of the angles: the n-th has a share of 1/n, and never less than the floor.
     share = np.maximum(1.0 / (state.count + 1.0), floor)
     turned = share[:, None] * residual[:, 1:]
+    # What the path says beyond what the turn of the angles already explains.
     y = residual[:, 0] - (across * turned).sum(-1)
     optimal = state.P * x / (1.0 + x * state.P * x)
     gain = np.maximum(optimal, floor / np.where(x > 0.0, x, np.inf))
     value = state.value + np.concatenate([(gain * y)[:, None], turned], axis=-1)
+    # New error = A old error + B noise, to first order; the first row is the range, coupled to the angles.
     A = np.eye(3) * (1.0 - share)[:, None, None]
     B = np.eye(3) * share[:, None, None]
     A[:, 0, 0], B[:, 0, 0] = 1.0 - gain * x, gain
@@ -324,11 +343,12 @@ def _moved(state: _State, scan: Problem, home: int, floor: float) -> _State:
     return _State(value, cov, state.P - optimal * x * state.P, state.count + 1.0)
 
 
-def _begun(stretch: Problem, scan: Problem, home: int) -> _State:
+def _restart(stretch: Problem, scan: Problem, home: int) -> _State:
     """Return the state of the mean measurement of a stretch, solved in closed form and refined."""
     track = lines(stretch, 0)
     start, used = track.last, (track.count > 0).sum(-1)
     at = scan.stations.position[..., 0, home, :]
+    # Where nothing was solved any direction serves: the value is set to NaN below.
     away = np.where(np.isfinite(start.mean), start.mean - at, 1.0)
     r = np.sqrt((away**2).sum(-1))
     linear = linearise(scan, at + away)

@@ -14,7 +14,7 @@ from optloc.base.types import Array
 from optloc.problem.epochs import cut
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.track.associate import innovation
+from optloc.track.associate import weights_within
 from optloc.track.dynamics import Dynamics
 from optloc.track.start import counts, first_fix, state_of, with_height_rows
 from optloc.track.track import (
@@ -22,141 +22,25 @@ from optloc.track.track import (
     Track,
     check_state,
     check_trackable,
-    filter_of,
-    gathered,
+    collect,
     predicted,
     scan_at,
-    taken,
+    take_scan,
 )
-from optloc.track.updates import Update, Updated
+from optloc.track.updates import Update, Updated, filter_of
 
-# Where a track begins: the first scans that determine a state and do not contradict each other.
-
-# Rows of a start whose chi-square is less likely than this contradict each other: the next scan is tried.
+# Rows of a start whose chi-square is less likely than this contradict each other: the next scan is tried. One good start
+# in ten thousand is passed over, which costs a scan; a wrong one costs the track.
 _PLAUSIBLE = 1e-4
-# So many first scans are tried before a start that contradicts itself is taken, and so many scans for a clear one.
-_SLIDES, _CLEAR = 20, 24
-
-
-@dataclass(frozen=True, slots=True)
-class Begun:
-    """A start, or why there is none.
-
-    Parameters
-    ----------
-    last : int
-        Last scan that was used, or given up.
-    state : State or None
-        At that scan.
-    code : Status
-        Ok; ambiguous where the state has alternatives; rejected where the rows contradict each other.
-    waiting : Status
-        Of the scans before: ok where a start follows.
-    reason : str
-        A sentence where the status is not ok.
-    """
-
-    last: int
-    state: State | None
-    code: Status
-    waiting: Status
-    reason: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class _Found:
-    fix: Fix
-    last: int
-    state: State
-    p: float
-
-
-def beginning(problem: Problem, first: int, dynamics: Dynamics, speed: float | None, rate: float | None) -> Begun:
-    """Return a start from the scan `first` on, without a guess.
-
-    The fewest scans that determine the state are solved as one problem. Where their rows contradict each other the
-    stretch begins one scan later, where several states explain them it is made longer.
-
-    Parameters
-    ----------
-    problem : Problem
-        A single run of one target.
-    first : int
-        First scan that may be used.
-    dynamics : Dynamics
-        Gives the order of the state.
-    speed, rate : float, optional
-        Prior standard deviations, see `begun`.
-    """
-    doubtful: list[_Found] = []
-    verdict = Status.TOO_FEW_ROWS
-    heard = _heard(problem, first)
-    for k in heard[:_SLIDES].tolist():
-        found, verdict = _stretch(problem, k, dynamics, speed, rate)
-        if found is None:
-            break  # what all later scans leave open, fewer of them do too
-        if found.p >= _PLAUSIBLE and int(found.fix.code) == Status.OK:
-            return Begun(found.last, found.state, Status.OK, Status.OK)
-        doubtful.append(found)
-        if found.p >= _PLAUSIBLE:
-            break
-    if not doubtful:
-        reason = f"the scans that are left do not determine a state: {verdict.label}"
-        return Begun(problem.epochs - 1, None, verdict, verdict, reason)
-    best = max(doubtful, key=lambda each: each.p)
-    if best.p < _PLAUSIBLE:
-        reason = f"the rows of the start contradict each other (p = {best.p:.2g})"
-        return Begun(best.last, best.state, Status.REJECTED, Status.OK, reason)
-    others = int(np.isfinite(best.fix.alternatives.gap).sum())
-    reason = f"the start has {others} alternative{'s' if others > 1 else ''}"
-    return Begun(best.last, best.state, Status.AMBIGUOUS, Status.OK, reason)
-
-
-def reach(problem: Problem, position: Array) -> float:
-    """Return the spread of the stations, or the range of a position (d,) from their centre if that is more, metres."""
-    stations = problem.stations.position.reshape(-1, problem.dimension)
-    centre = stations.mean(0)
-    spread = float(np.linalg.norm(stations - centre, axis=-1).max())
-    return max(spread, float(np.linalg.norm(position - centre)))
-
-
-def _heard(problem: Problem, first: int) -> Array:
-    """Return the scans from `first` on that have a valid row."""
-    scans = np.unique(problem.epoch[problem.weight > 0.0])
-    return np.asarray(scans[scans >= first])
-
-
-def _stretch(
-    problem: Problem, k: int, dynamics: Dynamics, speed: float | None, rate: float | None
-) -> tuple[_Found | None, Status]:
-    """Return the first clear start from scan k on, else the first one that is answered, and the last verdict."""
-    run, ambiguous, verdict = cut(problem, k, problem.epochs), None, Status.TOO_FEW_ROWS
-    for count in counts(run.epochs, dynamics.order, speed, rate):
-        if ambiguous is not None and count > _CLEAR:
-            break
-        fix = first_fix(run, dynamics, count, speed=speed, rate=rate)
-        verdict = Status(int(fix.code))
-        if verdict not in (Status.OK, Status.AMBIGUOUS, Status.SEARCHED):
-            continue
-        state = state_of(run, fix, count)
-        d = problem.dimension
-        sigma = float(np.sqrt(np.linalg.eigvalsh(state.cov[:d, :d])[-1]))
-        if not sigma <= reach(problem, state.mean[:d]):
-            continue
-        p = float(fix.p_value)
-        found = _Found(fix, k + count - 1, state, 1.0 if np.isnan(p) else p)
-        if found.p < _PLAUSIBLE:
-            return ambiguous or found, verdict
-        if verdict == Status.OK:
-            return found, verdict
-        ambiguous = ambiguous or found
-    return ambiguous, verdict
-
-
-Event = Literal["starting", "started", "restarted", ""]
-
-# A given state whose first scan is less likely than this contradicts it.
+# First scans that are tried before a start that contradicts itself is taken: every try costs fixes, and a run that is
+# wrong for longer deserves a status more than a search.
+_SLIDES = 20
+# Scans of a stretch that is made longer until its state is clear: a longer one asks more of the model of motion, which
+# has no noise here, than of the rows.
+_CLEAR = 24
+# A given state whose first scan is less likely than this contradicts it: the run is refused, so this is nearly sure.
 _ABSURD = 1e-9
+Event = Literal["starting", "started", "restarted", ""]
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,7 +138,7 @@ def tracked(
     _check_run(problem)
     if start is not None:
         _check_start(start, problem, dynamics)
-    cleaned, broken = _cleaned(problem)
+    cleaned, broken = _clean(problem)
     # The checks above are made at the call, not at the first scan.
     return _Run(with_height_rows(cleaned), broken, dynamics, rule, rules or Rules()).entries(start)
 
@@ -270,11 +154,13 @@ def collected(entries: Sequence[Entry], dimension: int) -> Track:
         2 or 3.
     """
     times = np.array([entry.time for entry in entries])
-    return gathered(times, [(entry.updated, np.asarray(int(entry.code))) for entry in entries], dimension)
+    return collect(times, [(entry.updated, np.asarray(int(entry.code))) for entry in entries], dimension)
 
 
 @dataclass(frozen=True, slots=True)
 class _Run:
+    """One run with its rules; `broken` says which of its rows (m,) are not finite."""
+
     problem: Problem
     broken: Array
     dynamics: Dynamics
@@ -283,15 +169,17 @@ class _Run:
 
     def entries(self, start: State | None) -> Iterator[Entry]:
         """Yield all entries."""
+        # heard: the time of the last valid row. missed: scans in succession whose rows the gate mostly refused.
+        # fresh: whether a given state has yet to meet its first row.
         times, k, state, why = self.problem.times, 0, start, ""
         heard = float(times[0]) if start is None else start.time
         missed, fresh = 0, start is not None
         while k < len(times):
             if state is None:
-                begun = beginning(self.problem, k, self.dynamics, self.rules.speed, self.rules.rate)
-                yield from self._begun(begun, k, why)
-                k, state, missed = begun.last + 1, begun.state, 0
-                heard = float(times[begun.last])
+                start_here = begin(self.problem, k, self.dynamics, self.rules.speed, self.rules.rate)
+                yield from self._starting(start_here, k, why)
+                k, state, missed = start_here.last + 1, start_here.state, 0
+                heard = float(times[start_here.last])
                 continue
             ahead = predicted(state, self.dynamics, float(times[k]), self.problem.dimension)
             why = self._unbridged(ahead, times[k] - heard)
@@ -302,6 +190,8 @@ class _Run:
             if fresh and entry.updated.count + entry.rejected > 0:
                 _check_agrees(entry)
                 fresh = False
+            # Rows that are not finite say nothing of the state: only those that the gate refused end a track. A scan
+            # without rows leaves the count as it was.
             gated, used = entry.rejected - self._bad(k), int(entry.updated.count)
             missed = missed + 1 if gated > used else missed * int(used == 0)
             heard = float(times[k]) if entry.updated.count > 0 else heard
@@ -310,9 +200,10 @@ class _Run:
             if missed >= self.rules.patience:
                 state, why = None, f"most rows of {missed} scans did not fit the prediction"
 
-    def _begun(self, begun: Begun, k: int, why: str) -> Iterator[Entry]:
+    def _starting(self, begun: Beginning, k: int, why: str) -> Iterator[Entry]:
         """Yield the scans of a start, of which the last one has the state."""
         n = (self.dynamics.order + 1) * self.problem.dimension
+        # Scans of a start have no state of their own: the fix of all of them holds at the last one.
         none = Updated(np.full(n, np.nan), np.full((n, n), np.nan), np.array(np.nan), np.array(0.0), np.array(0))
         for i in range(k, begun.last + 1):
             time = float(self.problem.times[i])
@@ -326,6 +217,7 @@ class _Run:
 
     def _bad(self, k: int) -> int:
         """Return how many rows of a scan are not finite."""
+        # Rows of an exact height stand behind those of the file, and are never broken.
         return int(self.broken[self.problem.epoch[: len(self.broken)] == k].sum())
 
     def _unbridged(self, ahead: State, silence: float) -> str:
@@ -334,16 +226,18 @@ class _Run:
             return f"no valid row for {silence:.6g} s" if silence > self.rules.gap else ""
         d = self.problem.dimension
         sigma = float(np.sqrt(max(np.linalg.eigvalsh(ahead.cov[:d, :d])[-1], 0.0)))
+        # Where a prediction may be anywhere between the stations, a fix without a guess tells more.
         limit = reach(self.problem, ahead.mean[:d])
         return f"the prediction was uncertain by {sigma:.3g} m after {silence:.6g} s" if sigma > limit else ""
 
     def _updated(self, k: int, ahead: State) -> Entry:
         """Return the update of a prediction by the rows of a scan that pass the gate."""
         scan = scan_at(self.problem, k, self.dynamics.order)
-        kept = self._gated(scan, ahead) if scan.rows else np.zeros(0)
+        # Gate first, update then: an iterated update would be drawn by what it should not believe.
+        kept = weights_within(scan, ahead.mean, ahead.cov, self.rules.gate) if scan.rows else np.zeros(0)
         lost = int(((scan.weight > 0.0) & (kept == 0.0)).sum()) if scan.rows else 0
         used = scan.with_rows(weight=kept) if lost else scan
-        done, code = taken(used, ahead, self.rule)
+        done, code = take_scan(used, ahead, self.rule)
         status, rejected, reason = Status(int(code)), lost + self._bad(k), ""
         if status == Status.TOO_FEW_ROWS and not rejected:
             reason = "no valid row: the state was only predicted"
@@ -353,14 +247,8 @@ class _Run:
             reason = "the update failed: the state was only predicted"
         return Entry(ahead.time, done, status, rejected, "", reason)
 
-    def _gated(self, scan: Problem, ahead: State) -> Array:
-        """Return the weights (m,) of a scan, zero where a row lies beyond the gate."""
-        with np.errstate(invalid="ignore"):
-            near = np.abs(innovation(scan, ahead.mean, ahead.cov).normalised) <= self.rules.gate
-        return np.where(near, scan.weight, 0.0)
 
-
-def _cleaned(problem: Problem) -> tuple[Problem, Array]:
+def _clean(problem: Problem) -> tuple[Problem, Array]:
     """Return the run with weight zero for rows that are not finite, and which of the present ones these are (m,)."""
     broken = ~np.isfinite(problem.z) & (problem.weight > 0.0)
     if not broken.any():
@@ -395,3 +283,127 @@ def _check_agrees(entry: Entry) -> None:
         what = f"the initial state contradicts the first scan, at {entry.time:.10g} s"
         advice = "correct it, make its standard deviation larger, or leave it out: a start needs no guess"
         raise InvalidProblem(what, "start", advice)
+
+
+# Where a track begins: the first scans that determine a state and do not contradict each other.
+
+
+@dataclass(frozen=True, slots=True)
+class Beginning:
+    """A start, or why there is none.
+
+    Parameters
+    ----------
+    last : int
+        Last scan that was used, or given up.
+    state : State or None
+        At that scan.
+    code : Status
+        Ok; ambiguous where the state has alternatives; rejected where the rows contradict each other.
+    waiting : Status
+        Of the scans before: ok where a start follows.
+    reason : str
+        A sentence where the status is not ok.
+    """
+
+    last: int
+    state: State | None
+    code: Status
+    waiting: Status
+    reason: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Stretch:
+    """Scans that determine a state: their fix, the last of them, the state there, and the p-value of their rows."""
+
+    fix: Fix
+    last: int
+    state: State
+    p: float
+
+
+def begin(problem: Problem, first: int, dynamics: Dynamics, speed: float | None, rate: float | None) -> Beginning:
+    """Return a start from the scan `first` on, without a guess.
+
+    The fewest scans that determine the state are solved as one problem. Where their rows contradict each other the
+    stretch begins one scan later, where several states explain them it is made longer.
+
+    Parameters
+    ----------
+    problem : Problem
+        A single run of one target.
+    first : int
+        First scan that may be used.
+    dynamics : Dynamics
+        Gives the order of the state.
+    speed, rate : float, optional
+        Prior standard deviations, see `begun`.
+    """
+    doubtful: list[_Stretch] = []
+    verdict = Status.TOO_FEW_ROWS
+    heard = _heard(problem, first)
+    for k in heard[:_SLIDES].tolist():
+        found, verdict = _stretch(problem, k, dynamics, speed, rate)
+        if found is None:
+            break  # what all later scans leave open, fewer of them do too
+        if found.p >= _PLAUSIBLE and int(found.fix.code) == Status.OK:
+            return Beginning(found.last, found.state, Status.OK, Status.OK)
+        doubtful.append(found)
+        if found.p >= _PLAUSIBLE:
+            break
+    if not doubtful:
+        reason = f"the scans that are left do not determine a state: {verdict.label}"
+        return Beginning(problem.epochs - 1, None, verdict, verdict, reason)
+    # None is clean: the most plausible start, with a status that says what is wrong with it.
+    best = max(doubtful, key=lambda each: each.p)
+    if best.p < _PLAUSIBLE:
+        reason = f"the rows of the start contradict each other (p = {best.p:.2g})"
+        return Beginning(best.last, best.state, Status.REJECTED, Status.OK, reason)
+    others = int(np.isfinite(best.fix.alternatives.gap).sum())
+    reason = f"the start has {others} alternative{'s' if others > 1 else ''}"
+    return Beginning(best.last, best.state, Status.AMBIGUOUS, Status.OK, reason)
+
+
+def _stretch(
+    problem: Problem, k: int, dynamics: Dynamics, speed: float | None, rate: float | None
+) -> tuple[_Stretch | None, Status]:
+    """Return the first clear start from scan k on, else the first one that is answered, and the last verdict."""
+    run, ambiguous, verdict = cut(problem, k, problem.epochs), None, Status.TOO_FEW_ROWS
+    for count in counts(run.epochs, dynamics.order, speed, rate):
+        if ambiguous is not None and count > _CLEAR:
+            break
+        fix = first_fix(run, dynamics, count, speed=speed, rate=rate)
+        verdict = Status(int(fix.code))
+        if verdict not in (Status.OK, Status.AMBIGUOUS, Status.SEARCHED):
+            continue
+        state = state_of(run, fix, count)
+        d = problem.dimension
+        sigma = float(np.sqrt(np.linalg.eigvalsh(state.cov[:d, :d])[-1]))
+        # A state that is vaguer than the range of the target begins nothing; NaN is vague, too.
+        if not sigma <= reach(problem, state.mean[:d]):
+            continue
+        p = float(fix.p_value)
+        # Without redundancy there is no p-value, and nothing that contradicts.
+        found = _Stretch(fix, k + count - 1, state, 1.0 if np.isnan(p) else p)
+        # More scans do not mend rows that contradict each other.
+        if found.p < _PLAUSIBLE:
+            return ambiguous or found, verdict
+        if verdict == Status.OK:
+            return found, verdict
+        ambiguous = ambiguous or found
+    return ambiguous, verdict
+
+
+def _heard(problem: Problem, first: int) -> Array:
+    """Return the scans from `first` on that have a valid row."""
+    scans = np.unique(problem.epoch[problem.weight > 0.0])
+    return np.asarray(scans[scans >= first])
+
+
+def reach(problem: Problem, position: Array) -> float:
+    """Return the spread of the stations, or the range of a position (d,) from their centre if that is more, metres."""
+    stations = problem.stations.position.reshape(-1, problem.dimension)
+    centre = stations.mean(0)
+    spread = float(np.linalg.norm(stations - centre, axis=-1).max())
+    return max(spread, float(np.linalg.norm(position - centre)))

@@ -1,4 +1,4 @@
-"""Interacting multiple models: a target that changes its motion."""
+"""Several models of motion for one target: side by side, or interacting where it changes its motion."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from optloc.base.status import Status
 from optloc.base.types import Array
 from optloc.problem.problem import Problem
 from optloc.track.dynamics import Dynamics
-from optloc.track.track import State, Track, check_state, filter_of, followed, gathered, predicted, scans, taken
-from optloc.track.updates import Update, Updated
+from optloc.track.track import State, Track, check_state, collect, followed, predicted, scans, take_scan
+from optloc.track.updates import Update, Updated, filter_of
 
-# Several models of motion from one start, side by side: the data say which is right.
+# Side by side from one start: the data say which model is right.
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,74 +95,12 @@ def parallel(
     tracks = tuple(
         followed(problem, resized(start, model.order, d, speed=speed, rate=rate), model, update) for model in models
     )
+    # A model that lost the state has no likelihood from there on.
     each = [np.where(track.code == Status.NUMERICAL, -np.inf, track.loglikelihood) for track in tracks]
     return Parallel(tuple(models), tracks, np.stack([np.cumsum(value, axis=-1) for value in each], axis=-1))
 
 
-def resized(
-    state: State, order: int, dimension: int, *, speed: float | None = None, rate: float | None = None
-) -> State:
-    """Return a state of another order: parts that are too many are left out, missing ones are added as priors.
-
-    Parameters
-    ----------
-    state : State
-        Of any order.
-    order : 0, 1 or 2
-        Order wanted.
-    dimension : int
-        2 or 3.
-    speed, rate : float, optional
-        Standard deviation of each coordinate of velocity (m/s) and acceleration (m/s^2), about zero, where they are
-        missing.
-
-    Raises
-    ------
-    InvalidProblem
-        Where a missing part has no prior.
-    """
-    n, held = (order + 1) * dimension, state.mean.shape[-1]
-    if held >= n:
-        return State(state.time, state.mean[..., :n], state.cov[..., :n, :n])
-    sizes = {1: ("velocity", "speed", speed), 2: ("acceleration", "rate", rate)}
-    variance = []
-    for part in range(held // dimension, order + 1):
-        name, argument, size = sizes[part]
-        if size is None:
-            raise InvalidProblem(f"the start has no {name}", argument, "give its prior standard deviation")
-        variance += [float(size) ** 2] * dimension
-    batch = np.broadcast_shapes(state.mean.shape[:-1], state.cov.shape[:-2])
-    mean, cov = np.zeros((*batch, n)), np.zeros((*batch, n, n))
-    mean[..., :held], cov[..., :held, :held] = state.mean, state.cov
-    cov[..., range(held, n), range(held, n)] = variance
-    return State(state.time, mean, cov)
-
-
-def spread(state: State, batch: tuple[int, ...]) -> State:
-    """Return a state with at least the leading axes of a batch.
-
-    Parameters
-    ----------
-    state : State
-        With leading axes that fit.
-    batch : tuple of int
-        Leading axes.
-    """
-    shape, n = np.broadcast_shapes(state.mean.shape[:-1], state.cov.shape[:-2], batch), state.mean.shape[-1]
-    return State(state.time, np.broadcast_to(state.mean, (*shape, n)), np.broadcast_to(state.cov, (*shape, n, n)))
-
-
-def check_models(models: Sequence[Dynamics]) -> None:
-    """Refuse an empty list of models; raise InvalidProblem."""
-    if not models:
-        raise InvalidProblem("there are no models of motion", "models", "give at least one")
-
-
-def softmax(score: Array) -> Array:
-    """Return exp(score) over its sum along the last axis; equal shares where all are minus infinity."""
-    top = score.max(-1, keepdims=True)
-    weight = np.where(np.isfinite(top), np.exp(score - np.where(np.isfinite(top), top, 0.0)), 1.0)
-    return np.asarray(weight / weight.sum(-1, keepdims=True))
+# Interacting: the model may change from scan to scan.
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,20 +172,22 @@ def imm(
     states = [resized(start, model.order, d, speed=speed, rate=rate) for model in models]
     for model, state in zip(models, states, strict=True):
         check_state(state, (model.order + 1) * d)
+    # Before the first scan nothing speaks for one model.
     weight = np.full((*start.mean.shape[:-1], len(models)), 1.0 / len(models))
     steps, times, weights = [], [], []
     for time, scan in scans(problem, max(model.order for model in models)):
         if time <= start.time:
             continue
+        # Mixing comes before prediction: each model starts from what all of them believe.
         states, coming = mixed(states, weight, chain)
         ahead = [predicted(state, model, time, d) for state, model in zip(states, models, strict=True)]
-        done = [taken(_of_order(scan, model), state, rule) for state, model in zip(ahead, models, strict=True)]
+        done = [take_scan(_of_order(scan, model), state, rule) for state, model in zip(ahead, models, strict=True)]
         states = [State(time, each.mean, each.cov) for each, _ in done]
-        weight, total = _weighed(done, coming)
-        steps.append(_output(done, weight, total))
+        weight, total = _weigh(done, coming)
+        steps.append(_combine(done, weight, total))
         times.append(time)
         weights.append(weight)
-    return Mixed(tuple(models), gathered(np.array(times), steps, d), np.stack(weights, axis=-2))
+    return Mixed(tuple(models), collect(np.array(times), steps, d), np.stack(weights, axis=-2))
 
 
 def mixed(states: Sequence[State], weight: Array, transition: Array) -> tuple[list[State], Array]:
@@ -270,16 +210,146 @@ def mixed(states: Sequence[State], weight: Array, transition: Array) -> tuple[li
         Probabilities.
     """
     coming = weight @ transition
+    # Probability that the model was i, given that it is j now; a model nobody leads to divides nothing by nothing.
     share = weight[..., :, None] * transition / np.maximum(coming, np.finfo(float).tiny)[..., None, :]
     out = []
     for j, own in enumerate(states):
-        parts = [_lent(state, own) for state in states]
+        parts = [_lend(state, own) for state in states]
         mean, cov = moments([p.mean for p in parts], [p.cov for p in parts], share[..., j])
         # A model that no other leads to, and that is itself impossible, keeps its state.
         kept = coming[..., j] <= 0.0
         mean = np.where(kept[..., None], own.mean, mean)
         out.append(State(own.time, mean, np.where(kept[..., None, None], own.cov, cov)))
     return out, coming
+
+
+def _transition(transition: Array, count: int) -> Array:
+    chain = np.asarray(transition, dtype=float)
+    good = chain.shape == (count, count) and bool(np.all(chain >= 0.0))
+    if not good or not np.allclose(chain.sum(-1), 1.0, atol=1e-9):
+        raise InvalidProblem(
+            f"the transition is no {count} x {count} table of probabilities", "transition", "let each row add up to one"
+        )
+    return chain
+
+
+def _of_order(scan: Problem, model: Dynamics) -> Problem:
+    return replace(scan, motions=(replace(scan.motions[0], order=model.order),))
+
+
+def _lend(state: State, own: State) -> State:
+    """Return a state in the order of another one, what it lacks taken from there."""
+    n, held = own.mean.shape[-1], state.mean.shape[-1]
+    if held >= n:
+        return State(state.time, state.mean[..., :n], state.cov[..., :n, :n])
+    batch = np.broadcast_shapes(state.mean.shape[:-1], own.mean.shape[:-1])
+    mean, cov = np.broadcast_to(own.mean, (*batch, n)).copy(), np.zeros((*batch, n, n))
+    mean[..., :held] = state.mean
+    cov[..., :held, :held], cov[..., held:, held:] = state.cov, own.cov[..., held:, held:]
+    return State(state.time, mean, cov)
+
+
+def _weigh(done: Sequence[tuple[Updated, Array]], coming: Array) -> tuple[Array, Array]:
+    """Return the probabilities (..., q) after a scan, and the logarithm (...) of its likelihood."""
+    fit = [np.where(code == Status.NUMERICAL, -np.inf, each.loglikelihood) for each, code in done]
+    with np.errstate(divide="ignore"):
+        score = np.log(coming) + np.stack(fit, axis=-1)
+    # The greatest score is taken out before the exponential: likelihoods of many rows underflow.
+    top = score.max(-1)
+    known = np.isfinite(top)
+    # Where no model has a likelihood the scan says nothing of them.
+    weight = np.where(known[..., None], softmax(score), coming)
+    peak = np.where(known, top, 0.0)
+    total = peak + np.log(np.where(known[..., None], np.exp(score - peak[..., None]), 1.0 / score.shape[-1]).sum(-1))
+    return weight, total
+
+
+def _combine(done: Sequence[tuple[Updated, Array]], weight: Array, total: Array) -> tuple[Updated, Array]:
+    """Return the update over all models, and its status: the best one of the models."""
+    n = max(each.mean.shape[-1] for each, _ in done)
+    means, covs = [], []
+    for each, _ in done:
+        # A model without velocity or acceleration says that they are zero, and is sure of it.
+        pad = n - each.mean.shape[-1]
+        means.append(np.pad(each.mean, [(0, 0)] * (each.mean.ndim - 1) + [(0, pad)]))
+        covs.append(np.pad(each.cov, [(0, 0)] * (each.cov.ndim - 2) + [(0, pad)] * 2))
+    mean, cov = moments(means, covs, weight)
+    nis = np.stack([each.nis for each, _ in done], axis=-1)
+    used = np.where(weight > 0.0, nis, 0.0)
+    count = np.max([np.broadcast_to(each.count, total.shape) for each, _ in done], axis=0)
+    # Ok is the least code: one model that follows the target is enough.
+    code = np.min([code for _, code in done], axis=0).astype(np.int8)
+    return Updated(mean, cov, (weight * used).sum(-1), total, count), code
+
+
+# What both are made of.
+
+
+def check_models(models: Sequence[Dynamics]) -> None:
+    """Refuse an empty list of models; raise InvalidProblem."""
+    if not models:
+        raise InvalidProblem("there are no models of motion", "models", "give at least one")
+
+
+def resized(
+    state: State, order: int, dimension: int, *, speed: float | None = None, rate: float | None = None
+) -> State:
+    """Return a state of another order: parts that are too many are left out, missing ones are added as priors.
+
+    Parameters
+    ----------
+    state : State
+        Of any order.
+    order : 0, 1 or 2
+        Order wanted.
+    dimension : int
+        2 or 3.
+    speed, rate : float, optional
+        Standard deviation of each coordinate of velocity (m/s) and acceleration (m/s^2), about zero, where they are
+        missing.
+
+    Raises
+    ------
+    InvalidProblem
+        Where a missing part has no prior.
+    """
+    n, held = (order + 1) * dimension, state.mean.shape[-1]
+    if held >= n:
+        return State(state.time, state.mean[..., :n], state.cov[..., :n, :n])
+    sizes = {1: ("velocity", "speed", speed), 2: ("acceleration", "rate", rate)}
+    variance = []
+    for part in range(held // dimension, order + 1):
+        name, argument, size = sizes[part]
+        if size is None:
+            raise InvalidProblem(f"the start has no {name}", argument, "give its prior standard deviation")
+        variance += [float(size) ** 2] * dimension
+    batch = np.broadcast_shapes(state.mean.shape[:-1], state.cov.shape[:-2])
+    mean, cov = np.zeros((*batch, n)), np.zeros((*batch, n, n))
+    mean[..., :held], cov[..., :held, :held] = state.mean, state.cov
+    # Priors of single coordinates, independent of what the start holds.
+    cov[..., range(held, n), range(held, n)] = variance
+    return State(state.time, mean, cov)
+
+
+def spread(state: State, batch: tuple[int, ...]) -> State:
+    """Return a state with at least the leading axes of a batch.
+
+    Parameters
+    ----------
+    state : State
+        With leading axes that fit.
+    batch : tuple of int
+        Leading axes.
+    """
+    shape, n = np.broadcast_shapes(state.mean.shape[:-1], state.cov.shape[:-2], batch), state.mean.shape[-1]
+    return State(state.time, np.broadcast_to(state.mean, (*shape, n)), np.broadcast_to(state.cov, (*shape, n, n)))
+
+
+def softmax(score: Array) -> Array:
+    """Return exp(score) over its sum along the last axis; equal shares where all are minus infinity."""
+    top = score.max(-1, keepdims=True)
+    weight = np.where(np.isfinite(top), np.exp(score - np.where(np.isfinite(top), top, 0.0)), 1.0)
+    return np.asarray(weight / weight.sum(-1, keepdims=True))
 
 
 def moments(means: Sequence[Array], covs: Sequence[Array], weight: Array) -> tuple[Array, Array]:
@@ -298,58 +368,3 @@ def moments(means: Sequence[Array], covs: Sequence[Array], weight: Array) -> tup
         away = one - mean
         cov = cov + weight[..., i, None, None] * (around + away[..., :, None] * away[..., None, :])
     return mean, cov
-
-
-def _transition(transition: Array, count: int) -> Array:
-    chain = np.asarray(transition, dtype=float)
-    good = chain.shape == (count, count) and bool(np.all(chain >= 0.0))
-    if not good or not np.allclose(chain.sum(-1), 1.0, atol=1e-9):
-        raise InvalidProblem(
-            f"the transition is no {count} x {count} table of probabilities", "transition", "let each row add up to one"
-        )
-    return chain
-
-
-def _of_order(scan: Problem, model: Dynamics) -> Problem:
-    return replace(scan, motions=(replace(scan.motions[0], order=model.order),))
-
-
-def _lent(state: State, own: State) -> State:
-    """Return a state in the order of another one, what it lacks taken from there."""
-    n, held = own.mean.shape[-1], state.mean.shape[-1]
-    if held >= n:
-        return State(state.time, state.mean[..., :n], state.cov[..., :n, :n])
-    batch = np.broadcast_shapes(state.mean.shape[:-1], own.mean.shape[:-1])
-    mean, cov = np.broadcast_to(own.mean, (*batch, n)).copy(), np.zeros((*batch, n, n))
-    mean[..., :held] = state.mean
-    cov[..., :held, :held], cov[..., held:, held:] = state.cov, own.cov[..., held:, held:]
-    return State(state.time, mean, cov)
-
-
-def _weighed(done: Sequence[tuple[Updated, Array]], coming: Array) -> tuple[Array, Array]:
-    """Return the probabilities (..., q) after a scan, and the logarithm (...) of its likelihood."""
-    fit = [np.where(code == Status.NUMERICAL, -np.inf, each.loglikelihood) for each, code in done]
-    with np.errstate(divide="ignore"):
-        score = np.log(coming) + np.stack(fit, axis=-1)
-    top = score.max(-1)
-    known = np.isfinite(top)
-    weight = np.where(known[..., None], softmax(score), coming)
-    peak = np.where(known, top, 0.0)
-    total = peak + np.log(np.where(known[..., None], np.exp(score - peak[..., None]), 1.0 / score.shape[-1]).sum(-1))
-    return weight, total
-
-
-def _output(done: Sequence[tuple[Updated, Array]], weight: Array, total: Array) -> tuple[Updated, Array]:
-    """Return the update over all models, and its status: the best one of the models."""
-    n = max(each.mean.shape[-1] for each, _ in done)
-    means, covs = [], []
-    for each, _ in done:
-        pad = n - each.mean.shape[-1]
-        means.append(np.pad(each.mean, [(0, 0)] * (each.mean.ndim - 1) + [(0, pad)]))
-        covs.append(np.pad(each.cov, [(0, 0)] * (each.cov.ndim - 2) + [(0, pad)] * 2))
-    mean, cov = moments(means, covs, weight)
-    nis = np.stack([each.nis for each, _ in done], axis=-1)
-    used = np.where(weight > 0.0, nis, 0.0)
-    count = np.max([np.broadcast_to(each.count, total.shape) for each, _ in done], axis=0)
-    code = np.min([code for _, code in done], axis=0).astype(np.int8)
-    return Updated(mean, cov, (weight * used).sum(-1), total, count), code

@@ -1,4 +1,4 @@
-"""Several targets at once from rows without labels."""
+"""Several targets at once from rows without labels, or one of several by its own rows."""
 
 from __future__ import annotations
 
@@ -18,109 +18,8 @@ from optloc.problem.problem import Problem
 from optloc.track.associate import Associate
 from optloc.track.dynamics import Dynamics
 from optloc.track.several_models import spread
-from optloc.track.track import State, Track, check_state, filter_of, gathered, predicted, scans, taken
-from optloc.track.updates import Update
-
-# Unlabelled measurements: for each channel of each scan, the values one of which may be a target's.
-
-
-@dataclass(frozen=True, slots=True)
-class Candidates:
-    """What may belong to one of several targets.
-
-    Parameters
-    ----------
-    channels : Problem
-        A run of one target with one row for each channel (kind and stations) and epoch; its measurements do not
-        matter, and it has no batch axes.
-    z : array (..., m, c)
-        Values measured in the channel of each row, SI units or radians; NaN where there are fewer than c.
-    """
-
-    channels: Problem
-    z: Array
-
-    def scans(self, order: int) -> Iterator[tuple[float, Problem, Array]]:
-        """Yield time, channels and candidates (..., m, c) of each scan; the unknown is a state of an order."""
-        for k, (time, scan) in enumerate(scans(self.channels, order)):
-            yield time, scan, self.z[..., self.channels.epoch == k, :]
-
-
-def candidates(problem: Problem) -> Candidates:
-    """Return the rows of a run as candidates: rows of one kind, epoch and pair of stations are one channel.
-
-    Known corrections are taken off.
-
-    Parameters
-    ----------
-    problem : Problem
-        A single run, or a batch (...) with common stations and noise. The targets of its rows, usually -1, do not
-        matter; a channel has the noise of its first row.
-
-    Raises
-    ------
-    InvalidProblem
-        Where stations or noise differ between the runs of a batch.
-    """
-    first, members = channels_of(problem)
-    rows, values = [], []
-    width = max((len(found) for found in members), default=0)
-    z = np.where(problem.weight > 0.0, problem.observed, np.nan)
-    for found in members:
-        column = z[..., found]
-        gap = np.full((*column.shape[:-1], width - len(found)), np.nan)
-        values.append(np.concatenate([column, gap], axis=-1))
-    start = 0
-    for block in problem.rows:
-        kept = first[(first >= start) & (first < start + block.count)] - start
-        rows.append(_row(block, kept))
-        start += block.count
-    made = replace(problem, rows=tuple(rows), motions=problem.motions[:1])
-    return checked(Candidates(_with_noise(problem, made, first), np.stack(values, axis=-2)))
-
-
-def checked(given: Candidates) -> Candidates:
-    """Return candidates that fit their channels, known corrections taken off; raise InvalidProblem for others."""
-    if given.channels.batch_shape != ():
-        advice = "track runs with stations or noise of their own one by one"
-        raise InvalidProblem("the channels have batch axes", "candidates", advice)
-    if given.z.ndim < 2 or given.z.shape[-2] != given.channels.count or not given.z.shape[-1]:
-        what = f"candidates of shape {given.z.shape} for {given.channels.count} channels"
-        raise InvalidProblem(what, "candidates", "give (..., m, c), c at least 1")
-    correction = np.concatenate([block.correction for block in given.channels.rows])
-    if not correction.any():
-        return given
-    rows = tuple(replace(block, correction=np.zeros(block.count)) for block in given.channels.rows)
-    return Candidates(replace(given.channels, rows=rows), given.z - correction[:, None])
-
-
-def channels_of(problem: Problem) -> tuple[Array, list[Array]]:
-    """Return the first row of each channel, ascending, and all rows of each."""
-    keys = [
-        (kind, int(epoch), int(a), int(b))
-        for kind, block in enumerate(problem.rows)
-        for epoch, a, b in zip(block.epoch, block.a, block.b, strict=True)
-    ]
-    found: dict[tuple[int, ...], list[int]] = {}
-    for i, key in enumerate(keys):
-        found.setdefault(key, []).append(i)
-    members = [np.array(rows) for rows in found.values()]
-    return np.array([rows[0] for rows in members]), members
-
-
-def _row(block: Rows, kept: Array) -> Rows:
-    nan, none = np.full(len(kept), np.nan), np.zeros(len(kept), dtype=np.int64)
-    sure = np.ones(len(kept))
-    return Rows(block.kind, nan, block.a[kept], block.b[kept], block.epoch[kept], none, sure, np.zeros(len(kept)))
-
-
-def _with_noise(problem: Problem, made: Problem, first: Array) -> Problem:
-    """Return the channels with the covariance of their first rows, epoch by epoch."""
-    blocks = [
-        noises.Block(members, noises.gathered(problem.noise, first[members])) for members in noises.together(made.epoch)
-    ]
-    return replace(made, noise=noises.Noise(tuple(blocks)))
-
+from optloc.track.track import State, Track, check_state, collect, predicted, scans, take_scan
+from optloc.track.updates import Update, filter_of
 
 Missing = Literal["drop", "expect"]
 """What a channel without a row does; see `associated`."""
@@ -174,11 +73,12 @@ def associated(
     InvalidProblem
         For an unknown filter, a state that does not fit the dynamics or has no axis of targets.
     """
-    given, step = checked(given), filter_of(update)
+    given, step = _check(given), filter_of(update)
     d = given.channels.dimension
     check_state(start, (dynamics.order + 1) * d)
     if start.mean.ndim < 2:
         raise InvalidProblem("the state has no axis of targets", "start", "give means (..., t, n)")
+    # The start gets the leading axes of the candidates, and its axis of targets behind them.
     state, steps, times, picks = spread(start, (*given.z.shape[:-2], 1)), [], [], []
     for time, scan, z in given.scans(dynamics.order):
         if time <= start.time:
@@ -188,21 +88,125 @@ def associated(
         if scan.rows:
             found = np.take_along_axis(z[..., None, :, :], np.maximum(pick, 0)[..., None], axis=-1)[..., 0]
             expected = predict(scan, ahead.mean)
+            # A channel that "expects" has the prediction as its row: an innovation of zero shrinks the covariance.
             weight = (pick >= 0).astype(float) if missing == "drop" else np.ones(pick.shape)
             scan = scan.with_rows(z=np.where(pick >= 0, found, expected), weight=weight)  # noqa: PLW2901
-        done, code = taken(scan, ahead, step)
+        done, code = take_scan(scan, ahead, step)
+        # Rows that no target took were there, but did not fit: that is another status than silence.
         seen = np.asarray(np.isfinite(z).any((-1, -2)))[..., None]
         code = np.where((code == Status.TOO_FEW_ROWS) & seen, Status.REJECTED, code).astype(np.int8)
         state = State(time, done.mean, done.cov)
         steps.append((done, code))
         times.append(time)
         picks.append(pick)
-    return Associated(gathered(np.array(times), steps, d), tuple(picks))
+    return Associated(collect(np.array(times), steps, d), tuple(picks))
+
+
+# Unlabelled measurements: for each channel of each scan, the values one of which may be a target's.
+
+
+@dataclass(frozen=True, slots=True)
+class Candidates:
+    """What may belong to one of several targets.
+
+    Parameters
+    ----------
+    channels : Problem
+        A run of one target with one row for each channel (kind and stations) and epoch; its measurements do not
+        matter, and it has no batch axes.
+    z : array (..., m, c)
+        Values measured in the channel of each row, SI units or radians; NaN where there are fewer than c.
+    """
+
+    channels: Problem
+    z: Array
+
+    def scans(self, order: int) -> Iterator[tuple[float, Problem, Array]]:
+        """Yield time, channels and candidates (..., m, c) of each scan; the unknown is a state of an order."""
+        for k, (time, scan) in enumerate(scans(self.channels, order)):
+            yield time, scan, self.z[..., self.channels.epoch == k, :]
+
+
+def candidates(problem: Problem) -> Candidates:
+    """Return the rows of a run as candidates: rows of one kind, epoch and pair of stations are one channel.
+
+    Known corrections are taken off.
+
+    Parameters
+    ----------
+    problem : Problem
+        A single run, or a batch (...) with common stations and noise. The targets of its rows, usually -1, do not
+        matter; a channel has the noise of its first row.
+
+    Raises
+    ------
+    InvalidProblem
+        Where stations or noise differ between the runs of a batch.
+    """
+    first, members = channels_of(problem)
+    rows, values = [], []
+    width = max((len(found) for found in members), default=0)
+    # Absent rows are no candidates.
+    z = np.where(problem.weight > 0.0, problem.observed, np.nan)
+    for found in members:
+        column = z[..., found]
+        # All channels have room for as many values as the fullest one; the rest is NaN.
+        gap = np.full((*column.shape[:-1], width - len(found)), np.nan)
+        values.append(np.concatenate([column, gap], axis=-1))
+    start = 0
+    for block in problem.rows:
+        kept = first[(first >= start) & (first < start + block.count)] - start
+        rows.append(_row(block, kept))
+        start += block.count
+    made = replace(problem, rows=tuple(rows), motions=problem.motions[:1])
+    return _check(Candidates(_with_noise(problem, made, first), np.stack(values, axis=-2)))
+
+
+def _check(given: Candidates) -> Candidates:
+    """Return candidates that fit their channels, known corrections taken off; raise InvalidProblem for others."""
+    if given.channels.batch_shape != ():
+        advice = "track runs with stations or noise of their own one by one"
+        raise InvalidProblem("the channels have batch axes", "candidates", advice)
+    if given.z.ndim < 2 or given.z.shape[-2] != given.channels.count or not given.z.shape[-1]:
+        what = f"candidates of shape {given.z.shape} for {given.channels.count} channels"
+        raise InvalidProblem(what, "candidates", "give (..., m, c), c at least 1")
+    correction = np.concatenate([block.correction for block in given.channels.rows])
+    if not correction.any():
+        return given
+    rows = tuple(replace(block, correction=np.zeros(block.count)) for block in given.channels.rows)
+    return Candidates(replace(given.channels, rows=rows), given.z - correction[:, None])
+
+
+def channels_of(problem: Problem) -> tuple[Array, list[Array]]:
+    """Return the first row of each channel, ascending, and all rows of each."""
+    # A channel is a kind at its stations in one epoch; a row of b against a is another one than a against b.
+    keys = [
+        (kind, int(epoch), int(a), int(b))
+        for kind, block in enumerate(problem.rows)
+        for epoch, a, b in zip(block.epoch, block.a, block.b, strict=True)
+    ]
+    found: dict[tuple[int, ...], list[int]] = {}
+    for i, key in enumerate(keys):
+        found.setdefault(key, []).append(i)
+    members = [np.array(rows) for rows in found.values()]
+    return np.array([rows[0] for rows in members]), members
+
+
+def _row(block: Rows, kept: Array) -> Rows:
+    nan, none = np.full(len(kept), np.nan), np.zeros(len(kept), dtype=np.int64)
+    sure = np.ones(len(kept))
+    return Rows(block.kind, nan, block.a[kept], block.b[kept], block.epoch[kept], none, sure, np.zeros(len(kept)))
+
+
+def _with_noise(problem: Problem, made: Problem, first: Array) -> Problem:
+    """Return the channels with the covariance of their first rows, epoch by epoch."""
+    blocks = [
+        noises.Block(members, noises.gathered(problem.noise, first[members])) for members in noises.together(made.epoch)
+    ]
+    return replace(made, noise=noises.Noise(tuple(blocks)))
 
 
 # One target of several: its own rows and scans as a run.
-
-_ROW_ARRAYS = ("z", "weight", "correction")
 
 
 def alone(problem: Problem, kept: Array, times: Array | None = None) -> Problem:
@@ -254,7 +258,7 @@ def alone(problem: Problem, kept: Array, times: Array | None = None) -> Problem:
 
 
 def _rows(block: Rows, own: Array, number: Array) -> Rows:
-    picked = {name: getattr(block, name)[..., own] for name in _ROW_ARRAYS}
+    picked = {name: getattr(block, name)[..., own] for name in ("z", "weight", "correction")}
     a, b = block.a[own], block.b[own]
     return replace(block, **picked, a=a, b=b, epoch=number[block.epoch[own]], target=np.zeros_like(a))
 
@@ -264,6 +268,7 @@ def _blocks(noise: Noise, kept: Array) -> list[Block]:
     place, found = np.cumsum(kept) - 1, []
     for block in noise.blocks:
         inside = kept[block.row]
+        # Groups that lose the same rows stay one block; what is left of a group has the covariance of its rows.
         for pattern in np.unique(inside, axis=0):
             if not pattern.any():
                 continue

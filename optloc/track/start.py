@@ -17,6 +17,9 @@ from optloc.solvers import solve
 from optloc.track.dynamics import Dynamics
 from optloc.track.track import State, check_trackable
 
+# Metres: below every other error; of ECEF coordinates a millimetre has too few digits to converge on.
+_EXACT = 1e-2
+
 
 def begun(
     problem: Problem,
@@ -86,6 +89,7 @@ def two_point(first: Fix, second: Fix, times: tuple[float, float]) -> State:
     Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), eq.
     5.5.3-4, with the covariance of each fix.
     """
+    # The error of the second fix is in both parts of the state: its covariance is what ties velocity to position.
     T = times[1] - times[0]
     if not T > 0.0:
         raise InvalidProblem(f"fixes at {times[0]} and {times[1]} s", "times", "give the earlier fix first")
@@ -98,11 +102,13 @@ def two_point(first: Fix, second: Fix, times: tuple[float, float]) -> State:
 
 def counts(epochs: int, order: int, speed: float | None = None, rate: float | None = None) -> list[int]:
     """Return the numbers of first epochs, of so many, that a start tries: each next by half more; as `begun`."""
+    # With a prior of every rate one epoch may do; else a state of order q has q + 1 scans at the least.
     known = speed is not None and (order < 2 or rate is not None)
     count = 1 if order == 0 or known else order + 1
     out = []
     while count < epochs:
         out.append(count)
+        # Half more each time: the work of all tries together is some three times that of the last.
         count = max(count + 1, count * 3 // 2)
     return [*out, epochs]
 
@@ -114,12 +120,6 @@ def first_fix(
     return solve(_first(problem, count, dynamics.order, speed, rate))
 
 
-def state_of(problem: Problem, fix: Fix, used: int) -> State:
-    """Return the `first_fix` of so many epochs as a state at the last of them."""
-    mean, cov = fix.gaussian()
-    return State(float(problem.times[used - 1]), np.array(mean), np.array(cov))
-
-
 def _first(problem: Problem, count: int, order: int, speed: float | None, rate: float | None) -> Problem:
     part = cut(problem, 0, count)
     d = problem.dimension
@@ -128,14 +128,15 @@ def _first(problem: Problem, count: int, order: int, speed: float | None, rate: 
         for name, sigma in (("velocity", speed), ("acceleration", rate))[:order]
         if sigma is not None
     ]
+    # The state is asked for at the last scan used, where tracking goes on.
     motion = Motion(order, reference=float(problem.times[count - 1]))
     return replace(part, motions=(motion,), priors=tuple(priors))
 
 
-# An exact height as a row of every scan, so that updates hold it as starts do.
-
-# Metres: below every other error; of ECEF coordinates a millimetre has too few digits to converge on.
-_EXACT = 1e-2
+def state_of(problem: Problem, fix: Fix, used: int) -> State:
+    """Return the `first_fix` of so many epochs as a state at the last of them."""
+    mean, cov = fix.gaussian()
+    return State(float(problem.times[used - 1]), np.array(mean), np.array(cov))
 
 
 def with_height_rows(problem: Problem) -> Problem:
@@ -153,6 +154,7 @@ def with_height_rows(problem: Problem) -> Problem:
     InvalidProblem
         For an equality other than that of the height: updates would not hold it.
     """
+    # An exact height as a row of every scan, so that updates hold it as starts do.
     exact = [c for c in problem.constraints if isinstance(c, Band) and np.array_equal(c.lower, c.upper)]
     if not exact:
         return problem

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.errors import InvalidProblem
 from optloc.base.status import Status
 from optloc.base.types import Array, Motion
 from optloc.problem.epochs import cut
 from optloc.problem.problem import Problem
 from optloc.track.dynamics import Dynamics
-from optloc.track.updates import UPDATES, Update, Updated
+from optloc.track.updates import Update, Updated, filter_of
+
+# Eigenvalue below zero, as a share of the largest entry, that rounding makes of a covariance which is singular.
+_NEGATIVE = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,6 +90,45 @@ class Track:
         return State(float(self.times[-1]), self.mean[..., -1, :], self.cov[..., -1, :, :])
 
 
+def followed(problem: Problem, start: State, dynamics: Dynamics, update: Update | str = "iekf") -> Track:
+    """Return the track of a target from a state on.
+
+    Parameters
+    ----------
+    problem : Problem
+        Batch (...) of runs, see `scans`; scans not later than the start are left out.
+    start : State
+        At or before the first scan used.
+    dynamics : Dynamics
+        Model of motion.
+    update : callable or str
+        A filter, or its name in `UPDATES`.
+
+    Raises
+    ------
+    InvalidProblem
+        For an unknown filter, a state that does not fit the dynamics, or a run that is not one target's.
+    """
+    check_state(start, (dynamics.order + 1) * problem.dimension)
+    return follow(scans(problem, dynamics.order), start, dynamics, filter_of(update), problem.dimension)
+
+
+def follow(
+    given: Iterable[tuple[float, Problem]], start: State, dynamics: Dynamics, rule: Update, dimension: int
+) -> Track:
+    """Return the track of a state through scans with their times; those not later than the start are left out."""
+    state, steps, times = start, [], []
+    for time, scan in given:
+        if time <= start.time:
+            continue
+        ahead = predicted(state, dynamics, time, dimension)
+        done, code = take_scan(scan, ahead, rule)
+        state = State(time, done.mean, done.cov)
+        steps.append((done, code))
+        times.append(time)
+    return collect(np.array(times), steps, dimension)
+
+
 def predicted(state: State, dynamics: Dynamics, time: float, dimension: int) -> State:
     """Return a state at a later time.
 
@@ -104,11 +146,69 @@ def predicted(state: State, dynamics: Dynamics, time: float, dimension: int) -> 
     dt = time - state.time
     if dt < 0.0:
         raise InvalidProblem(f"the scan at {time} s is before the state at {state.time} s", "times", "sort the scans")
+    # Two scans of one instant: models that divide by the step are not asked.
     if dt == 0.0:
         return state
+    # The drive is what the model adds to the mean beyond F: the present acceleration of the current statistical model.
     F, Q, drive = dynamics.step(dt, state.mean, dimension)
     cov = F @ state.cov @ F.T + Q
     return State(time, (F @ state.mean[..., None])[..., 0] + drive, 0.5 * (cov + np.swapaxes(cov, -1, -2)))
+
+
+def take_scan(scan: Problem, ahead: State, rule: Update) -> tuple[Updated, Array]:
+    """Return the update of a predicted state by a scan, and its status (...): bad scans leave the prediction."""
+    shape = ahead.mean.shape[:-1]
+    if not scan.rows or not scan.count:
+        return _keep(ahead), np.full(shape, int(Status.TOO_FEW_ROWS), dtype=np.int8)
+    # One scan may serve many targets, and one target many runs: weights take the axes of both.
+    weight = np.broadcast_to(scan.weight, np.broadcast_shapes((*shape, scan.count), scan.z.shape))
+    broken = ~np.isfinite(scan.z) & (weight > 0.0)
+    usable = scan if not broken.any() else scan.with_rows(z=np.where(broken, 0.0, scan.z), weight=weight * ~broken)
+    # A lost state is a status, not a warning: it is found out below.
+    with np.errstate(all="ignore"):
+        done = rule(usable, ahead.mean, ahead.cov)
+    lost = ~(np.isfinite(done.mean).all(-1) & np.isfinite(done.cov).all((-1, -2)))
+    silent = done.count == 0
+    # What is lost outweighs what is silent, and that outweighs rows that were not finite.
+    code = np.where(lost, Status.NUMERICAL, np.where(silent, Status.TOO_FEW_ROWS, Status.OK))
+    code = np.where(broken.any(-1) & ~lost, Status.REJECTED, code).astype(np.int8)
+    # Without a row, or with a wrong one, the prediction is the best there is.
+    kept = lost | silent
+    mean = np.where(kept[..., None], ahead.mean, done.mean)
+    cov = np.where(kept[..., None, None], ahead.cov, done.cov)
+    return Updated(
+        mean, cov, np.where(kept, np.nan, done.nis), np.where(kept, 0.0, done.loglikelihood), done.count
+    ), code
+
+
+def _keep(ahead: State) -> Updated:
+    """Return the prediction as an update by nothing."""
+    shape = ahead.mean.shape[:-1]
+    none = np.zeros(shape)
+    return Updated(ahead.mean, ahead.cov, np.full(shape, np.nan), none, none)
+
+
+def collect(times: Array, steps: list[tuple[Updated, Array]], dimension: int) -> Track:
+    """Return updates and their status, scan by scan, as a track."""
+    if not steps:
+        raise InvalidProblem("no scan is later than the start", "start", "start before the last scan")
+
+    def stacked(name: str, core: int) -> Array:
+        return np.stack([getattr(done, name) for done, _ in steps], axis=-1 - core)
+
+    return Track(
+        times,
+        stacked("mean", 1),
+        stacked("cov", 2),
+        stacked("nis", 0),
+        stacked("count", 0).astype(int),
+        stacked("loglikelihood", 0),
+        np.stack([code for _, code in steps], axis=-1),
+        dimension,
+    )
+
+
+# Scans of a run, and what a tracker of one target can take.
 
 
 def scans(problem: Problem, order: int) -> Iterator[tuple[float, Problem]]:
@@ -131,6 +231,7 @@ def scan_at(problem: Problem, k: int, order: int) -> Problem:
     """Return one scan of a run, see `scans`; it has no rows where the epoch has none."""
     if not (problem.epoch == k).any():
         return replace(problem, rows=())
+    # The unknown of a scan is the state at its own time: with the time as reference rows see no motion within it.
     scan = cut(replace(problem, motions=(Motion(order),)), k, k + 1)
     return replace(scan, motions=(Motion(order, reference=float(problem.times[k])),))
 
@@ -148,98 +249,6 @@ def check_trackable(problem: Problem) -> None:
         raise InvalidProblem("station offsets are unknown", "stations", 'give their errors span = "noise"')
 
 
-def followed(problem: Problem, start: State, dynamics: Dynamics, update: Update | str = "iekf") -> Track:
-    """Return the track of a target from a state on.
-
-    Parameters
-    ----------
-    problem : Problem
-        Batch (...) of runs, see `scans`; scans not later than the start are left out.
-    start : State
-        At or before the first scan used.
-    dynamics : Dynamics
-        Model of motion.
-    update : callable or str
-        A filter, or its name in `UPDATES`.
-
-    Raises
-    ------
-    InvalidProblem
-        For an unknown filter, a state that does not fit the dynamics, or a run that is not one target's.
-    """
-    rule = filter_of(update)
-    d, n = problem.dimension, (dynamics.order + 1) * problem.dimension
-    check_state(start, n)
-    state, steps, times = start, [], []
-    for time, scan in scans(problem, dynamics.order):
-        if time <= start.time:
-            continue
-        ahead = predicted(state, dynamics, time, d)
-        done, code = taken(scan, ahead, rule)
-        state = State(time, done.mean, done.cov)
-        steps.append((done, code))
-        times.append(time)
-    return gathered(np.array(times), steps, d)
-
-
-def taken(scan: Problem, ahead: State, rule: Update) -> tuple[Updated, Array]:
-    """Return the update of a predicted state by a scan, and its status (...): bad scans leave the prediction."""
-    shape = ahead.mean.shape[:-1]
-    if not scan.rows or not scan.count:
-        return unchanged(ahead), np.full(shape, int(Status.TOO_FEW_ROWS), dtype=np.int8)
-    weight = np.broadcast_to(scan.weight, np.broadcast_shapes((*shape, scan.count), scan.z.shape))
-    broken = ~np.isfinite(scan.z) & (weight > 0.0)
-    usable = scan if not broken.any() else scan.with_rows(z=np.where(broken, 0.0, scan.z), weight=weight * ~broken)
-    with np.errstate(all="ignore"):
-        done = rule(usable, ahead.mean, ahead.cov)
-    lost = ~(np.isfinite(done.mean).all(-1) & np.isfinite(done.cov).all((-1, -2)))
-    silent = done.count == 0
-    code = np.where(lost, Status.NUMERICAL, np.where(silent, Status.TOO_FEW_ROWS, Status.OK))
-    code = np.where(broken.any(-1) & ~lost, Status.REJECTED, code).astype(np.int8)
-    kept = lost | silent
-    mean = np.where(kept[..., None], ahead.mean, done.mean)
-    cov = np.where(kept[..., None, None], ahead.cov, done.cov)
-    return Updated(
-        mean, cov, np.where(kept, np.nan, done.nis), np.where(kept, 0.0, done.loglikelihood), done.count
-    ), code
-
-
-def unchanged(ahead: State) -> Updated:
-    """Return the prediction as an update by nothing."""
-    shape = ahead.mean.shape[:-1]
-    none = np.zeros(shape)
-    return Updated(ahead.mean, ahead.cov, np.full(shape, np.nan), none, none)
-
-
-def gathered(times: Array, steps: list[tuple[Updated, Array]], dimension: int) -> Track:
-    """Return updates and their status, scan by scan, as a track."""
-    if not steps:
-        raise InvalidProblem("no scan is later than the start", "start", "start before the last scan")
-
-    def stacked(name: str, core: int) -> Array:
-        return np.stack([getattr(done, name) for done, _ in steps], axis=-1 - core)
-
-    return Track(
-        times,
-        stacked("mean", 1),
-        stacked("cov", 2),
-        stacked("nis", 0),
-        stacked("count", 0).astype(int),
-        stacked("loglikelihood", 0),
-        np.stack([code for _, code in steps], axis=-1),
-        dimension,
-    )
-
-
-def filter_of(update: Update | str) -> Update:
-    """Return a filter by name; raise InvalidProblem for an unknown one."""
-    if not isinstance(update, str):
-        return update
-    if update not in UPDATES:
-        raise InvalidProblem(f"unknown filter {update!r}", "filter", nearest(update, list(UPDATES)))
-    return UPDATES[update]
-
-
 def check_state(state: State, n: int) -> None:
     """Refuse states of the wrong size, or whose covariance is none; raise InvalidProblem."""
     if state.mean.shape[-1:] != (n,) or state.cov.shape[-2:] != (n, n):
@@ -250,5 +259,5 @@ def check_state(state: State, n: int) -> None:
         )
     if not (np.isfinite(state.mean).all() and np.isfinite(state.cov).all()):
         raise InvalidProblem("the state is not finite", "start", "start from a fix that has an answer")
-    if (np.linalg.eigvalsh(state.cov)[..., 0] < -1e-9 * np.abs(state.cov).max((-1, -2))).any():
+    if (np.linalg.eigvalsh(state.cov)[..., 0] < -_NEGATIVE * np.abs(state.cov).max((-1, -2))).any():
         raise InvalidProblem("the covariance is not positive semidefinite", "start", "give a true covariance")

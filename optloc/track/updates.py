@@ -8,33 +8,24 @@ from dataclasses import dataclass
 import numpy as np
 
 from optloc.base import linalg
+from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.registry import Table
 from optloc.base.types import Array
+from optloc.linear.evaluate import differentiate
 from optloc.linear.normal import linearise
+from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.noise import Whitener
 from optloc.problem.problem import Problem
+from optloc.solvers.robust.reweighting import Doubt, doubted
 
-
-@dataclass(frozen=True, slots=True)
-class White:
-    """The rows of one scan, linearised, with unit covariance.
-
-    Parameters
-    ----------
-    residual : array (..., m)
-        Whitened z - h(x).
-    H : array (..., m, n)
-        Whitened derivative.
-    count : array (...)
-        Number of rows that are present.
-    logdet : array (...)
-        Logarithm of the determinant of 2 pi R of the rows that are present.
-    """
-
-    residual: Array
-    H: Array
-    count: Array
-    logdet: Array
+# Gauss-Legendre nodes along the step: exact up to degree 9, and derivatives of ranges and angles are smooth over it.
+_NODES = 5
+# Halvings of a step that raises the cost: the last is a 256th, beyond which the point is as good as stationary.
+_HALVINGS = 8
+# Rise of a cost, as a share of it, that is rounding and no reason to halve.
+_RISE = 1e-9
+# Turns of weights and updates, and the change of all weights that ends them: it moves a state by far less than a sigma.
+_TURNS, _SETTLED = 30, 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,21 +57,6 @@ Update = Callable[[Problem, Array, Array], Updated]
 """Maps a scan (a problem of one epoch whose only unknown is the state), means and covariances to the updated state."""
 
 
-def whitened(scan: Problem, x: Array, noise: tuple[Whitener, ...] | None = None) -> White:
-    """Return the rows of a scan linearised at states x (..., n), whitened; absent rows are zero."""
-    linear = linearise(scan, x, noise)
-    both = np.concatenate([linear.shared, linear.residual[..., None]], axis=-1)
-    white = np.concatenate([w.apply(both) for w in linear.noise], axis=-2)
-    count, logdet = np.zeros(white.shape[:-2]), np.zeros(white.shape[:-2])
-    for w in linear.noise:
-        pivots = np.diagonal(w.matrix, axis1=-2, axis2=-1)
-        present = pivots > 0.0
-        share = len(w.row) if w.matrix.shape[-3] == 1 else 1
-        count = count + share * present.sum((-1, -2))
-        logdet = logdet - 2.0 * share * np.log(np.where(present, pivots, 1.0)).sum((-1, -2))
-    return White(white[..., -1], white[..., :-1], count, logdet + count * np.log(2.0 * np.pi))
-
-
 def ekf(scan: Problem, mean: Array, cov: Array) -> Updated:
     """Return the update of the extended Kalman filter: one linearisation at the prediction.
 
@@ -94,7 +70,7 @@ def ekf(scan: Problem, mean: Array, cov: Array) -> Updated:
     white = whitened(scan, mean)
     gain = _gain(white.H, cov)
     moved = mean + (gain @ white.residual[..., None])[..., 0]
-    return _finished(white, cov, moved, joseph(white.H, gain, cov))
+    return _finish(white, cov, moved, joseph(white.H, gain, cov))
 
 
 def iekf(scan: Problem, mean: Array, cov: Array, *, limit: int = 20, tolerance: float = 1e-6) -> Updated:
@@ -108,18 +84,21 @@ def iekf(scan: Problem, mean: Array, cov: Array, *, limit: int = 20, tolerance: 
     38 (1993).
     """
     first = whitened(scan, mean)
+    # The prior is one more whitened row block: the cost that steps may not raise is that of rows and prior together.
     prior = linalg.whitening(cov)
     x, white, moving = mean, first, np.ones(mean.shape[:-1], dtype=bool)
     cost = (first.residual**2).sum(-1)
     for _ in range(limit):
         gain = _gain(white.H, cov)
+        # Gauss-Newton in the form of the filter: rows linearised at x, prior at the prediction.
         misfit = white.residual - (white.H @ (mean - x)[..., None])[..., 0]
         step = mean + (gain @ misfit[..., None])[..., 0] - x
-        x, white, cost, length = _shortened(scan, mean, prior, x, step, cost, moving)
+        x, white, cost, length = _shorten(scan, mean, prior, x, step, cost, moving)
+        # Each target of a batch stops by itself, at a step of a millionth of a standard deviation.
         moving &= length > tolerance
         if not moving.any():
             break
-    return _finished(first, cov, x, joseph(white.H, _gain(white.H, cov), cov))
+    return _finish(first, cov, x, joseph(white.H, _gain(white.H, cov), cov))
 
 
 def mgekf(scan: Problem, mean: Array, cov: Array) -> Updated:
@@ -135,13 +114,14 @@ def mgekf(scan: Problem, mean: Array, cov: Array) -> Updated:
     """
     white = whitened(scan, mean)
     gain = _gain(white.H, cov)
+    # The state moves as in `ekf`; only the covariance is another one.
     x = mean + (gain @ white.residual[..., None])[..., 0]
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     g = sum(
         0.5 * weight * whitened(scan, mean + 0.5 * (1.0 + node) * (x - mean)).H
         for node, weight in zip(nodes, weights, strict=True)
     )
-    return _finished(white, cov, x, joseph(np.asarray(g), gain, cov))
+    return _finish(white, cov, x, joseph(np.asarray(g), gain, cov))
 
 
 def mvekf(scan: Problem, mean: Array, cov: Array) -> Updated:
@@ -152,31 +132,135 @@ def mvekf(scan: Problem, mean: Array, cov: Array) -> Updated:
     white = whitened(scan, mean)
     x = mean + (_gain(white.H, cov) @ white.residual[..., None])[..., 0]
     after = whitened(scan, x)
-    return _finished(white, cov, x, joseph(after.H, _gain(after.H, cov), cov))
+    return _finish(white, cov, x, joseph(after.H, _gain(after.H, cov), cov))
 
 
 UPDATES: Table[Update] = Table("optloc.trackers", callable, {"ekf": ekf, "iekf": iekf, "mgekf": mgekf, "mvekf": mvekf})
 """Filters by name: add one function and one line, or from another package an entry point of ``optloc.trackers``."""
 
-_NODES = 5
-_HALVINGS = 8
+
+def filter_of(update: Update | str) -> Update:
+    """Return a filter by name; raise InvalidProblem for an unknown one."""
+    if not isinstance(update, str):
+        return update
+    if update not in UPDATES:
+        raise InvalidProblem(f"unknown filter {update!r}", "filter", nearest(update, list(UPDATES)))
+    return UPDATES[update]
+
+
+def reweighted(update: Update | str, loss: Loss | str) -> Update:
+    """Return a filter whose update is repeated with rows weighed by a loss of their residuals, until the weights stay.
+
+    The first weights are those of the innovations in their own standard deviations, prediction included; later ones
+    those of the residuals at the updated state, as in `optloc.solve` with this loss. With "iekf" the state is then a
+    stationary point of prior and loss together; the covariance is that of least squares with these weights.
+
+    Parameters
+    ----------
+    update : callable or str
+        A filter, or its name in `UPDATES`.
+    loss : Loss or str
+        A loss, or its name in `optloc.LOSSES`.
+
+    Raises
+    ------
+    InvalidProblem
+        For an unknown filter or loss.
+
+    References
+    ----------
+    C. J. Masreliez, R. D. Martin, "Robust Bayesian estimation for the linear model and robustifying the Kalman filter",
+    IEEE Trans. Autom. Control 22 (1977).
+    """
+    rule = filter_of(update)
+    if isinstance(loss, str):
+        if loss not in LOSSES:
+            raise InvalidProblem(f"unknown loss {loss!r}", "loss", nearest(loss, list(LOSSES)))
+        loss = LOSSES[loss]
+    chosen: Loss = loss
+
+    def robust(scan: Problem, mean: Array, cov: Array) -> Updated:
+        # Scan and state may each have the leading axes that the other lacks; the loss works on a flat batch.
+        many = np.broadcast_shapes(scan.batch_shape, mean.shape[:-1])
+        x, flat = np.broadcast_to(mean, (*many, mean.shape[-1])).reshape(-1, mean.shape[-1]), scan.flat()
+        doubt = Doubt.of(flat, x)
+        # An innovation has the prediction's uncertainty: a row is not doubted for what the state is unsure of.
+        residual, H = differentiate(flat, x)
+        spread = ((H @ np.broadcast_to(cov, (*many, *cov.shape[-2:])).reshape(-1, *cov.shape[-2:])) * H).sum(-1)
+        u = np.where(doubt.base > 0.0, residual, 0.0) / np.sqrt(doubt.own + spread)
+        weight = chosen.weight(doubted(chosen, u, doubt.sided))
+        for _ in range(_TURNS):
+            found = rule(scan.with_rows(weight=doubt.row_weight(weight).reshape(*many, -1)), mean, cov)
+            # From here on residuals at the updated state, as in a fix: the update has taken what it believes.
+            u = doubt.residual(flat, found.mean.reshape(x.shape), weight)
+            before, weight = weight, chosen.weight(doubted(chosen, u, doubt.sided))
+            if not np.abs(weight - before).max(initial=0.0) >= _SETTLED:
+                break
+        return found
+
+    return robust
+
+
+# Rows of a scan, whitened, and what all filters make of them.
+
+
+@dataclass(frozen=True, slots=True)
+class White:
+    """The rows of one scan, linearised, with unit covariance.
+
+    Parameters
+    ----------
+    residual : array (..., m)
+        Whitened z - h(x).
+    H : array (..., m, n)
+        Whitened derivative.
+    count : array (...)
+        Number of rows that are present.
+    logdet : array (...)
+        Logarithm of the determinant of 2 pi R of the rows that are present.
+    """
+
+    residual: Array
+    H: Array
+    count: Array
+    logdet: Array
+
+
+def whitened(scan: Problem, x: Array, noise: tuple[Whitener, ...] | None = None) -> White:
+    """Return the rows of a scan linearised at states x (..., n), whitened; absent rows are zero."""
+    linear = linearise(scan, x, noise)
+    both = np.concatenate([linear.shared, linear.residual[..., None]], axis=-1)
+    white = np.concatenate([w.apply(both) for w in linear.noise], axis=-2)
+    count, logdet = np.zeros(white.shape[:-2]), np.zeros(white.shape[:-2])
+    for w in linear.noise:
+        # A whitener is triangular: the product of its pivots is one over the root of |R|; absent rows have none.
+        pivots = np.diagonal(w.matrix, axis1=-2, axis2=-1)
+        present = pivots > 0.0
+        # A block that is common to many groups of rows is stored once.
+        share = len(w.row) if w.matrix.shape[-3] == 1 else 1
+        count = count + share * present.sum((-1, -2))
+        logdet = logdet - 2.0 * share * np.log(np.where(present, pivots, 1.0)).sum((-1, -2))
+    return White(white[..., -1], white[..., :-1], count, logdet + count * np.log(2.0 * np.pi))
 
 
 def joseph(H: Array, gain: Array, cov: Array) -> Array:
     """Return (I - K H) P (I - K H)' + K K', (..., n, n), for whitened rows: symmetric and positive for any gain."""
+    # The short form (I - K H) P is right for the optimal gain alone, and loses symmetry by rounding.
     left = np.eye(cov.shape[-1]) - gain @ H
     out = left @ cov @ np.swapaxes(left, -1, -2) + gain @ np.swapaxes(gain, -1, -2)
     return np.asarray(0.5 * (out + np.swapaxes(out, -1, -2)))
 
 
 def _gain(H: Array, cov: Array) -> Array:
+    # Whitened rows: S is regular whatever the prior is, even where a state is known exactly.
     S = H @ cov @ np.swapaxes(H, -1, -2) + np.eye(H.shape[-2])
     solved, _ = linalg.solve(S, H @ cov)
     return np.swapaxes(solved, -1, -2)
 
 
-def _finished(white: White, cov: Array, mean: Array, after: Array) -> Updated:
+def _finish(white: White, cov: Array, mean: Array, after: Array) -> Updated:
     S = white.H @ cov @ np.swapaxes(white.H, -1, -2) + np.eye(white.H.shape[-2])
+    # ln|2 pi S| of the rows as measured: that of the whitened ones, and what whitening took out.
     lower, _ = linalg.factor(S)
     solved, _ = linalg.solve(S, white.residual[..., None])
     nis = (white.residual * solved[..., 0]).sum(-1)
@@ -184,7 +268,7 @@ def _finished(white: White, cov: Array, mean: Array, after: Array) -> Updated:
     return Updated(mean, after, nis, -0.5 * (nis + logdet), white.count)
 
 
-def _shortened(
+def _shorten(
     scan: Problem, mean: Array, prior: Array, x: Array, step: Array, cost: Array, moving: Array
 ) -> tuple[Array, White, Array, Array]:
     """Return the states after steps that do not raise the cost, their rows and costs, and the lengths in sigma."""
@@ -194,7 +278,8 @@ def _shortened(
         white = whitened(scan, tried)
         away = (prior @ (tried - mean)[..., None])[..., 0]
         now = (white.residual**2).sum(-1) + (away**2).sum(-1)
-        worse = moving & ~(now <= cost + 1e-9 * (1.0 + np.abs(cost)))
+        # NaN counts as worse: a step beyond where h is defined is halved, too.
+        worse = moving & ~(now <= cost + _RISE * (1.0 + np.abs(cost)))
         if not worse.any():
             break
         share = np.where(worse, 0.5 * share, share)
