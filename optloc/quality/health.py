@@ -17,145 +17,25 @@ from optloc.quality.elements import By, Elements, batch_of, elements, ends_of
 from optloc.quality.levels import NoiseLevels, levels_of, usable
 from optloc.quality.variance_components import Tested, snooped, tested
 
-# Offsets of stations that many fixes share, from what the rest of each fix says of every station, robustly.
-
+# Where Huber's function turns, in sigmas: 95 % efficient for normal errors (Holland and Welsch 1977).
 _HUBER = 1.345
+# Median of the absolute value of a standard normal variable: turns a median into a sigma.
 _MAD = 0.6744897501960817
-_STEPS = 60
+# Reweighted steps, and the move of every offset in its sigmas that ends them: far below what anybody reads.
+_STEPS, _STILL = 60, 1e-4
+# Fixes of a station below which a growth with the path is not asked for: it would follow single errors.
 _FEW = 10
-
-
-@dataclass(frozen=True, slots=True)
-class Offsets:
-    """Offsets of G groups, and how much each grows with the length of the path.
-
-    Parameters
-    ----------
-    value, error : array (G,)
-        Offset and its standard error, SI units; NaN of groups without rows.
-    slope, slope_error : array (G,)
-        Growth in metres a metre and its standard error; NaN where it is not seen.
-    open : array (r, G)
-        Combinations of offsets that the data do not show, unit vectors: the offsets have none of them.
-    """
-
-    value: Array
-    error: Array
-    slope: Array
-    slope_error: Array
-    open: Array
-
-
-def offsets_of(made: Elements, tests: Tested) -> Offsets:
-    """Return the offsets that many problems share.
-
-    The test of group g in one problem is w_g = (t_g - sum_h T_gh b_h) / sqrt(T_gg), standard normal at the true offsets
-    b of all groups: its residual against what the others say, their offsets taken out. The b minimise the sum of
-    Huber's function of all w, which is convex, by weighted least squares. Combinations that no w sees, such as a
-    common delay where emission times are unknown, are zero on average over the rows. Standard errors are those of the
-    sandwich form with the problems as clusters, or
-    those of normal tests where these are larger.
-
-    Parameters
-    ----------
-    made : Elements
-        N linearised problems.
-    tests : Tested
-        Their tests.
-
-    References
-    ----------
-    P. J. Huber, "Robust Statistics" (1981), sections 7.3 to 7.6.
-    """
-    count, q = len(made.names), tests.errors
-    matrix, vector = tests.matrix[:, q:, q:], tests.vector[:, q:]
-    size = np.diagonal(matrix, axis1=-2, axis2=-1)
-    item, own = np.nonzero((size > 0.0) & (made.of_offset >= 0))
-    scale = np.sqrt(size[item, own])
-    y = vector[item, own] / scale
-    other = made.of_offset[item]
-    design = _sparse(matrix[item, own] / scale[:, None], other, count)
-    group = made.of_offset[item, own]
-    number = np.bincount(group, minlength=count).astype(float)
-    value, error, lost = _regressed(design, y, item, number)
-    away, spread = _centred(made, group, item, own, count)
-    steep = np.isfinite(spread) & (spread > 0.0) & (number >= _FEW)
-    slope, slope_error = np.full(count, np.nan), np.full(count, np.nan)
-    if steep.any():
-        units = np.where(steep, spread, 1.0)
-        grown = matrix[item, own] / scale[:, None] * np.nan_to_num(away[item] / np.append(units, 1.0)[other])
-        more = sparse.hstack([design, _sparse(grown, other, count)]).tocsr()
-        both, errors, _ = _regressed(more, y, item, np.tile(number, 2))
-        slope, slope_error = (np.where(steep, v[count:] / units, np.nan) for v in (both, errors))
-    seen = number > 0.0
-    return Offsets(np.where(seen, value, np.nan), np.where(seen, error, np.nan), slope, slope_error, lost)
-
-
-def _sparse(values: Array, column: Array, count: int) -> sparse.csr_array:
-    """Return rows with values (n, c) at columns (n, c), -1 for none, as a sparse matrix (n, count)."""
-    kept = (column >= 0) & (values != 0.0)
-    row = np.broadcast_to(np.arange(len(column))[:, None], column.shape)
-    return sparse.csr_array((values[kept], (row[kept], column[kept])), shape=(len(column), count))
-
-
-def _centred(made: Elements, group: Array, item: Array, own: Array, count: int) -> tuple[Array, Array]:
-    """Return the paths (N, c) less their mean over each group, and the standard deviation (G,) of each."""
-    path = made.path[item, own]
-    number = np.maximum(np.bincount(group, minlength=count), 1)
-    mean = np.bincount(group, path, count) / number
-    spread = np.sqrt(np.bincount(group, (path - mean[group]) ** 2, count) / number)
-    return made.path - np.append(mean, 0.0)[made.of_offset], spread
-
-
-def _regressed(design: sparse.csr_array, y: Array, item: Array, number: Array) -> tuple[Array, Array, Array]:
-    """Return coefficients (p,) of Huber's regression, standard errors, and the combinations (r, p) not seen."""
-    value = np.zeros(design.shape[1])
-    for _ in range(_STEPS):
-        off = y - design @ value
-        bound = _HUBER * max(float(np.median(np.abs(off))) / _MAD, 1e-12)
-        weight = bound / np.maximum(np.abs(off), bound)
-        inverse, lost = _pseudo_inverse((design.T @ (design * weight[:, None])), number)
-        move = inverse @ (design.T @ (weight * off))
-        value = value + move
-        if np.abs(move / np.sqrt(np.maximum(np.diagonal(inverse), 1e-300))).max() < 1e-4:
-            break
-    off = y - design @ value
-    inside = (np.abs(off) <= bound).astype(float)
-    bread, lost = _pseudo_inverse(design.T @ (design * inside[:, None]), number)
-    pull = design * np.clip(off, -bound, bound)[:, None]
-    each = sparse.csr_array((np.ones(len(item)), (item, np.arange(len(item))))) @ pull
-    covariance = bread @ (each.T @ each).toarray() @ bread
-    stated = (bound / _HUBER) ** 2 * np.diagonal(bread)
-    error = np.sqrt(np.maximum(np.diagonal(covariance), stated))
-    return value, np.where(np.diagonal(bread) > 0.0, error, np.nan), lost
-
-
-def _pseudo_inverse(matrix: sparse.csr_array, number: Array) -> tuple[Array, Array]:
-    """Return the inverse along what the data see, least in the mean square over rows, and what they do not see."""
-    weigh = 1.0 / np.sqrt(np.maximum(number, 1.0))
-    scaled = matrix.toarray() * weigh[:, None] * weigh
-    values, vectors = np.linalg.eigh(scaled)
-    seen = values > 1e-9 * max(float(values[-1]), 1e-300)
-    half = weigh[:, None] * vectors
-    return (half[:, seen] / values[seen]) @ half[:, seen].T, _apart(vectors[:, ~seen], weigh, number > 0.0)
-
-
-def _apart(basis: Array, weigh: Array, used: Array) -> Array:
-    """Return unit vectors (r, p) that span what is not seen (p, r), as many as can be each of a group of its own."""
-    projector = basis @ basis.T * np.outer(used, used)
-    count, label = connected_components(np.abs(projector) > 1e-6, directed=False)
-    found = []
-    for part in range(count):
-        inside = np.where(label == part, projector, 0.0) * (label == part)[:, None]
-        values, vectors = np.linalg.eigh(inside)
-        found += [weigh * vector for vector in vectors[:, values > 0.5].T]
-    return np.array([vector / np.linalg.norm(vector) for vector in found]).reshape(-1, len(weigh))
-
-
+# Eigenvalue of the scaled normal matrix, as a share of the largest, below which a combination of offsets is not seen;
+# and entry of a projector below which two groups have nothing to do with each other. Both are rounding.
+_UNSEEN, _TIED = 1e-9, 1e-6
+# Share of the largest entry of a direction below which a group takes no part in it, and two entries are equal.
+_PART = 1e-3
+# What stands for a scale of zero in a quotient.
+_TINY = 1e-300
+# Turns of levels and offsets, each found with the other known: the noise is but a weight of the offsets, so few do.
+_ROUNDS = 2
 OUTLIER = 3.0
 """Size of a test, in standard deviations, from which a measurement is called an outlier."""
-
-_ROUNDS = 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -265,9 +145,10 @@ def health_of(batch: Problem, fixed: tuple[Array, Array], by: By, explained: Arr
     """
     kept, x = fixed
     made = elements(batch.take(kept), x, by)
-    levels, offsets = _settled(made, by)
+    # Gross errors are looked for when noise and offsets are known: a bias is not an outlier of every fix.
+    levels, offsets = _settle(made, by)
     found = snooped(
-        tested(_unbiased(made, offsets), _variance(made, levels)), slice(made.effect.shape[-1], None), OUTLIER
+        tested(_take_out(made, offsets), _variance(made, levels)), slice(made.effect.shape[-1], None), OUTLIER
     )
     item, own = np.nonzero(np.isfinite(found.sigma) & (made.of_offset >= 0))
     group = made.of_offset[item, own]
@@ -291,7 +172,7 @@ def health_of(batch: Problem, fixed: tuple[Array, Array], by: By, explained: Arr
         noise=noise,
         noise_error=noise_error,
         outliers=np.bincount(group, outlying, len(made.names))[used] / count[used],
-        suspect=_suspected(batch, explained, by, names),
+        suspect=_suspect_shares(batch, explained, by, names),
         levels=levels,
         epoch=kept[item],
         group=number[group],
@@ -302,16 +183,17 @@ def health_of(batch: Problem, fixed: tuple[Array, Array], by: By, explained: Arr
     )
 
 
-def _settled(made: Elements, by: By) -> tuple[NoiseLevels, Offsets]:
+def _settle(made: Elements, by: By) -> tuple[NoiseLevels, Offsets]:
     """Return noise levels and offsets that belong together: each is found with the other known."""
+    # Offsets first, with the noise as stated: a bias in the residuals would be taken for noise.
     offsets = offsets_of(made, tested(made, np.ones(())))
     for _ in range(_ROUNDS):
-        levels = levels_of(_unbiased(made, offsets), by)
+        levels = levels_of(_take_out(made, offsets), by)
         offsets = offsets_of(made, tested(made, _variance(made, levels)))
     return levels, offsets
 
 
-def _unbiased(made: Elements, offsets: Offsets) -> Elements:
+def _take_out(made: Elements, offsets: Offsets) -> Elements:
     """Return the elements with the offsets taken out of the residuals."""
     value = np.append(np.nan_to_num(offsets.value), 0.0)[made.of_offset]
     return replace(made, residual=made.residual - (made.offset @ value[..., None])[..., 0])
@@ -332,7 +214,7 @@ def _units(batch: Problem, by: By, names: tuple[str, ...]) -> tuple[str, ...]:
     return tuple(found[name] for name in names)
 
 
-def _suspected(batch: Problem, explained: Array | None, by: By, names: tuple[str, ...]) -> Array:
+def _suspect_shares(batch: Problem, explained: Array | None, by: By, names: tuple[str, ...]) -> Array:
     """Return the share (G,) of the fixes with a group that name it, or one of its rows, as a suspect."""
     if explained is None:
         return np.full(len(names), np.nan)
@@ -343,16 +225,17 @@ def _suspected(batch: Problem, explained: Array | None, by: By, names: tuple[str
         for name in {*ends[present].ravel().tolist()} & heard.keys():
             heard[name] += 1
         suspects = own[0].suspects if own else ()
-        for name in {n for s in suspects for n in _named(s.name, s.group, ends[list(s.rows)], by)} & hits.keys():
+        for name in {n for s in suspects for n in _groups_meant(s.name, s.group, ends[list(s.rows)], by)} & hits.keys():
             hits[name] += 1
     return np.array([hits[name] / max(heard[name], 1) for name in names])
 
 
-def _named(name: str, group: str, ends: Array, by: By) -> set[str]:
+def _groups_meant(name: str, group: str, ends: Array, by: By) -> set[str]:
     """Return the groups that a suspect means: those of its rows, or of a station those that bear its name."""
     touched = {*ends.ravel().tolist()} - {""}
     if group != "station" or by != "station":
         return touched
+    # A station that measures several kinds makes a group with each.
     own = name.removeprefix("station ")
     return {n for n in touched if n == own or n.startswith(f"{own} ")}
 
@@ -361,13 +244,149 @@ def _sentences(offsets: Offsets, names: tuple[str, ...], used: Array) -> tuple[s
     """Return one sentence for each combination of offsets that the data do not show."""
     said = []
     for direction in offsets.open:
-        share = np.abs(direction[used]) > 1e-3 * np.abs(direction).max()
+        share = np.abs(direction[used]) > _PART * np.abs(direction).max()
         who = [names[g] for g in used[share]]
         listed = ", ".join(who[:6]) + (f" and {len(who) - 6} more" if len(who) > 6 else "")
         if len(who) == 1:
             said.append(f"the data do not show a bias of {listed}")
-        elif np.ptp(direction[used][share]) < 1e-3 * np.abs(direction).max():
+        elif np.ptp(direction[used][share]) < _PART * np.abs(direction).max():
             said.append(f"biases of {listed} are relative to their mean over all rows: a common one is not seen")
         else:
             said.append(f"the data do not show every combination of the biases of {listed}: others are taken as zero")
     return tuple(dict.fromkeys(said))
+
+
+# Offsets that many fixes share, from what the rest of each fix says of every station, robustly.
+
+
+@dataclass(frozen=True, slots=True)
+class Offsets:
+    """Offsets of G groups, and how much each grows with the length of the path.
+
+    Parameters
+    ----------
+    value, error : array (G,)
+        Offset and its standard error, SI units; NaN of groups without rows.
+    slope, slope_error : array (G,)
+        Growth in metres a metre and its standard error; NaN where it is not seen.
+    open : array (r, G)
+        Combinations of offsets that the data do not show, unit vectors: the offsets have none of them.
+    """
+
+    value: Array
+    error: Array
+    slope: Array
+    slope_error: Array
+    open: Array
+
+
+def offsets_of(made: Elements, tests: Tested) -> Offsets:
+    """Return the offsets that many problems share.
+
+    The test of group g in one problem is w_g = (t_g - sum_h T_gh b_h) / sqrt(T_gg), standard normal at the true offsets
+    b of all groups: its residual against what the others say, their offsets taken out. The b minimise the sum of
+    Huber's function of all w, which is convex, by weighted least squares. Combinations that no w sees, such as a
+    common delay where emission times are unknown, are zero on average over the rows. Standard errors are those of the
+    sandwich form with the problems as clusters, or those of normal tests where these are larger.
+
+    Parameters
+    ----------
+    made : Elements
+        N linearised problems.
+    tests : Tested
+        Their tests.
+
+    References
+    ----------
+    P. J. Huber, "Robust Statistics" (1981), sections 7.3 to 7.6.
+    """
+    count, q = len(made.names), tests.errors
+    matrix, vector = tests.matrix[:, q:, q:], tests.vector[:, q:]
+    size = np.diagonal(matrix, axis1=-2, axis2=-1)
+    item, own = np.nonzero((size > 0.0) & (made.of_offset >= 0))
+    scale = np.sqrt(size[item, own])
+    # One equation for every test that the fix allows: unit variance, its own offset and those of the others.
+    y = vector[item, own] / scale
+    other = made.of_offset[item]
+    design = _sparse(matrix[item, own] / scale[:, None], other, count)
+    group = made.of_offset[item, own]
+    number = np.bincount(group, minlength=count).astype(float)
+    value, error, lost = _regress(design, y, item, number)
+    away, spread = _centre(made, group, item, own, count)
+    steep = np.isfinite(spread) & (spread > 0.0) & (number >= _FEW)
+    slope, slope_error = np.full(count, np.nan), np.full(count, np.nan)
+    if steep.any():
+        # Growth in units of the spread of the paths, so that both kinds of columns are of one size.
+        units = np.where(steep, spread, 1.0)
+        grown = matrix[item, own] / scale[:, None] * np.nan_to_num(away[item] / np.append(units, 1.0)[other])
+        more = sparse.hstack([design, _sparse(grown, other, count)]).tocsr()
+        both, errors, _ = _regress(more, y, item, np.tile(number, 2))
+        slope, slope_error = (np.where(steep, v[count:] / units, np.nan) for v in (both, errors))
+    seen = number > 0.0
+    return Offsets(np.where(seen, value, np.nan), np.where(seen, error, np.nan), slope, slope_error, lost)
+
+
+def _sparse(values: Array, column: Array, count: int) -> sparse.csr_array:
+    """Return rows with values (n, c) at columns (n, c), -1 for none, as a sparse matrix (n, count)."""
+    kept = (column >= 0) & (values != 0.0)
+    row = np.broadcast_to(np.arange(len(column))[:, None], column.shape)
+    return sparse.csr_array((values[kept], (row[kept], column[kept])), shape=(len(column), count))
+
+
+def _centre(made: Elements, group: Array, item: Array, own: Array, count: int) -> tuple[Array, Array]:
+    """Return the paths (N, c) less their mean over each group, and the standard deviation (G,) of each."""
+    path = made.path[item, own]
+    number = np.maximum(np.bincount(group, minlength=count), 1)
+    mean = np.bincount(group, path, count) / number
+    spread = np.sqrt(np.bincount(group, (path - mean[group]) ** 2, count) / number)
+    return made.path - np.append(mean, 0.0)[made.of_offset], spread
+
+
+def _regress(design: sparse.csr_array, y: Array, item: Array, number: Array) -> tuple[Array, Array, Array]:
+    """Return coefficients (p,) of Huber's regression, standard errors, and the combinations (r, p) not seen."""
+    value = np.zeros(design.shape[1])
+    for _ in range(_STEPS):
+        off = y - design @ value
+        # The scale is found anew at every step, from the median: gross errors do not widen it.
+        bound = _HUBER * max(float(np.median(np.abs(off))) / _MAD, 1e-12)
+        weight = bound / np.maximum(np.abs(off), bound)
+        inverse, lost = _pseudo_inverse((design.T @ (design * weight[:, None])), number)
+        move = inverse @ (design.T @ (weight * off))
+        value = value + move
+        if np.abs(move / np.sqrt(np.maximum(np.diagonal(inverse), _TINY))).max() < _STILL:
+            break
+    # Sandwich: bread of the rows within the bound, filling of each problem's pull as a whole, as its tests correlate.
+    off = y - design @ value
+    inside = (np.abs(off) <= bound).astype(float)
+    bread, lost = _pseudo_inverse(design.T @ (design * inside[:, None]), number)
+    pull = design * np.clip(off, -bound, bound)[:, None]
+    each = sparse.csr_array((np.ones(len(item)), (item, np.arange(len(item))))) @ pull
+    covariance = bread @ (each.T @ each).toarray() @ bread
+    stated = (bound / _HUBER) ** 2 * np.diagonal(bread)
+    error = np.sqrt(np.maximum(np.diagonal(covariance), stated))
+    return value, np.where(np.diagonal(bread) > 0.0, error, np.nan), lost
+
+
+def _pseudo_inverse(matrix: sparse.csr_array, number: Array) -> tuple[Array, Array]:
+    """Return the inverse along what the data see, least in the mean square over rows, and what they do not see."""
+    # Scaled so that the shortest solution is the one with the least mean square over rows.
+    weigh = 1.0 / np.sqrt(np.maximum(number, 1.0))
+    scaled = matrix.toarray() * weigh[:, None] * weigh
+    values, vectors = np.linalg.eigh(scaled)
+    seen = values > _UNSEEN * max(float(values[-1]), _TINY)
+    half = weigh[:, None] * vectors
+    return (half[:, seen] / values[seen]) @ half[:, seen].T, _separate(vectors[:, ~seen], weigh, number > 0.0)
+
+
+def _separate(basis: Array, weigh: Array, used: Array) -> Array:
+    """Return unit vectors (r, p) that span what is not seen (p, r), as many as can be each of a group of its own."""
+    # Any basis of what is not seen is as good: groups that it does not tie are told of one by one.
+    projector = basis @ basis.T * np.outer(used, used)
+    count, label = connected_components(np.abs(projector) > _TIED, directed=False)
+    found = []
+    # The projector restricted to groups that are tied: its eigenvectors of one span what is open among them.
+    for part in range(count):
+        inside = np.where(label == part, projector, 0.0) * (label == part)[:, None]
+        values, vectors = np.linalg.eigh(inside)
+        found += [weigh * vector for vector in vectors[:, values > 0.5].T]
+    return np.array([vector / np.linalg.norm(vector) for vector in found]).reshape(-1, len(weigh))

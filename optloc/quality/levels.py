@@ -14,7 +14,11 @@ from optloc.problem.problem import Problem
 from optloc.quality.elements import By, Elements, batch_of, elements, split
 from optloc.quality.variance_components import KEPT, Fitted, Tested, fit, tested, total, without
 
+# Turns of fixes and levels, and the change of all levels that ends them: 2 % is below the standard error that a
+# thousand errors leave (1 / sqrt(2 n)), and each turn fixes every epoch again.
 _ROUNDS, _CLOSE = 4, 0.02
+# Groups that a sentence names; the others are counted.
+_NAMED = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +123,63 @@ def noise_levels(problem: Problem, by: By = "station", *, method: str = "auto", 
     return levels_of(made, by)
 
 
+def with_estimated_noise(problem: Problem, by: By = "kind", *, method: str = "auto") -> tuple[Problem, NoiseLevels]:
+    """Return the problem with its noise from the data, and the levels: fixes and levels are made until they agree.
+
+    Parameters
+    ----------
+    problem : Problem
+        What its noise states is only where to begin; ratios within a group are kept.
+    by, method
+        As in `noise_levels`.
+
+    Raises
+    ------
+    InvalidProblem
+        As `noise_levels`, and where the data do not tell any level.
+    """
+    # Better weights move the fixes, and these the residuals: turns until nothing moves.
+    first = levels = noise_levels(problem, by, method=method)
+    factor = levels.factor
+    for _ in range(_ROUNDS):
+        problem = with_noise_levels(problem, levels)
+        levels = noise_levels(problem, by, method=method)
+        factor = factor * levels.factor
+        if np.abs(levels.factor - 1.0).max() < _CLOSE:
+            break
+    if levels.names != first.names or np.isnan(levels.error).all():
+        advice = "state a sigma, or add rows, stations or epochs"
+        raise InvalidProblem("the data do not tell the noise", "noise", advice)
+    whole = replace(levels, stated=first.stated, factor=factor, error=levels.error * factor, before=first.before)
+    return with_noise_levels(problem, levels), whole
+
+
+def with_noise_levels(problem: Problem, levels: NoiseLevels) -> Problem:
+    """Return the problem with its noise scaled as the levels say.
+
+    Parameters
+    ----------
+    problem : Problem
+        The problem that the levels were estimated from, or another one of the same stations and kinds.
+    levels : NoiseLevels
+        Of `noise_levels`; groups that it does not have stay as they are.
+    """
+    factor = dict(zip(levels.names, levels.factor.tolist(), strict=True))
+    present = problem.weight > 0.0
+    blocks = [_scale(problem, block, levels.by, factor, present) for block in problem.noise.blocks]
+    return replace(problem, noise=Noise(tuple(blocks)))
+
+
+def _scale(problem: Problem, block: Block, by: By, factor: dict[str, float], present: Array) -> Block:
+    effect, names, _ = split(problem, block, by, present)
+    own = np.array([[factor.get(name, 1.0) for name in row] for row in names.tolist()])
+    scaled = effect * own[:, None, :]
+    here = present[..., block.row]
+    # Rows that are absent keep what was stated of them: nothing was learnt there.
+    both = here[..., :, None] & here[..., None, :]
+    return Block(block.row, np.where(both, scaled @ np.swapaxes(scaled, -1, -2), block.covariance))
+
+
 def usable(batch: Problem, fix: Fix | None) -> tuple[Array, Array]:
     """Return which problems of a flat batch have a fix (n,), and their parameter vectors (n, size).
 
@@ -139,14 +200,17 @@ def usable(batch: Problem, fix: Fix | None) -> tuple[Array, Array]:
 
 def levels_of(made: Elements, by: By) -> NoiseLevels:
     """Return the noise levels of linearised fixes; see `noise_levels`."""
+    # Groups that have errors, numbered from 0; -1, no group, comes first where it occurs.
     used, inverse = np.unique(made.of_effect, return_inverse=True)
     none = int(used[0] == -1)
     group, used = inverse.reshape(made.of_effect.shape) - none, used[none:]
     fitted = fit(made, group, len(used))
     names = tuple(made.names[i] for i in used)
     count, gross = total(group, len(used)), total(group, len(used), fitted.gross)
+    # T_jj times the variance: what share of an error the residuals show.
     redundancy = fitted.tests.size[:, : group.shape[1]] * fitted.variance[group]
     factor = np.sqrt(fitted.variance)
+    # Gross errors of the fitted noise are left out of both ratios: else they would differ by these alone.
     stated = without(tested(made, np.ones(())), fitted.gross)
     return NoiseLevels(
         by,
@@ -165,6 +229,7 @@ def levels_of(made: Elements, by: By) -> NoiseLevels:
 
 
 def _ratio(tests: Tested) -> float:
+    # Residuals were cut at three sigmas: their mean square is that much below one.
     return float(tests.cost.sum() / KEPT / max(int(tests.dof.sum()), 1))
 
 
@@ -173,62 +238,7 @@ def _sentences(fitted: Fitted, names: tuple[str, ...]) -> tuple[str, ...]:
     open_ = [names[i] for i in np.flatnonzero(fitted.shared)]
     if not open_:
         return ()
-    who = ", ".join(open_[:8]) + (f" and {len(open_) - 8} more" if len(open_) > 8 else "")
+    who = ", ".join(open_[:_NAMED]) + (f" and {len(open_) - _NAMED} more" if len(open_) > _NAMED else "")
     if fitted.stay:
         return (f"the data do not tell the noise of {who}: it stays as stated",)
     return (f"the data do not tell the noise of {who} apart: one factor for all of them",)
-
-
-def with_noise_levels(problem: Problem, levels: NoiseLevels) -> Problem:
-    """Return the problem with its noise scaled as the levels say.
-
-    Parameters
-    ----------
-    problem : Problem
-        The problem that the levels were estimated from, or another one of the same stations and kinds.
-    levels : NoiseLevels
-        Of `noise_levels`; groups that it does not have stay as they are.
-    """
-    factor = dict(zip(levels.names, levels.factor.tolist(), strict=True))
-    present = problem.weight > 0.0
-    blocks = [_scaled(problem, block, levels.by, factor, present) for block in problem.noise.blocks]
-    return replace(problem, noise=Noise(tuple(blocks)))
-
-
-def with_estimated_noise(problem: Problem, by: By = "kind", *, method: str = "auto") -> tuple[Problem, NoiseLevels]:
-    """Return the problem with its noise from the data, and the levels: fixes and levels are made until they agree.
-
-    Parameters
-    ----------
-    problem : Problem
-        What its noise states is only where to begin; ratios within a group are kept.
-    by, method
-        As in `noise_levels`.
-
-    Raises
-    ------
-    InvalidProblem
-        As `noise_levels`, and where the data do not tell any level.
-    """
-    first = levels = noise_levels(problem, by, method=method)
-    factor = levels.factor
-    for _ in range(_ROUNDS):
-        problem = with_noise_levels(problem, levels)
-        levels = noise_levels(problem, by, method=method)
-        factor = factor * levels.factor
-        if np.abs(levels.factor - 1.0).max() < _CLOSE:
-            break
-    if levels.names != first.names or np.isnan(levels.error).all():
-        advice = "state a sigma, or add rows, stations or epochs"
-        raise InvalidProblem("the data do not tell the noise", "noise", advice)
-    whole = replace(levels, stated=first.stated, factor=factor, error=levels.error * factor, before=first.before)
-    return with_noise_levels(problem, levels), whole
-
-
-def _scaled(problem: Problem, block: Block, by: By, factor: dict[str, float], present: Array) -> Block:
-    effect, names, _ = split(problem, block, by, present)
-    own = np.array([[factor.get(name, 1.0) for name in row] for row in names.tolist()])
-    scaled = effect * own[:, None, :]
-    here = present[..., block.row]
-    both = here[..., :, None] & here[..., None, :]
-    return Block(block.row, np.where(both, scaled @ np.swapaxes(scaled, -1, -2), block.covariance))

@@ -1,4 +1,13 @@
-"""Variance components by restricted maximum likelihood, with gross errors left out one by one."""
+"""Variance components by restricted maximum likelihood, with gross errors left out one by one.
+
+A problem linearised at its fix is v = J dx + B e + E b + n: v residuals, e independent errors of the groups' noise with
+covariance diag(theta), b offsets of the groups, n what has a covariance C of its own. With V = B diag(theta) B' + C and
+P = V^-1 - V^-1 J (J' V^-1 J)^-1 J' V^-1, which annihilates J, all that follows needs only T = F' P F and t = F' P v of
+the columns F = [B, E]: t_j / T_jj is the size of an error along column j that the other rows show (for a row, its
+leave-one-out residual), 1 / sqrt(T_jj) its standard deviation, and t_j / sqrt(T_jj) is standard normal without one.
+
+W. Baarda, "A testing procedure for use in geodetic networks" (1968), section 4.
+"""
 
 from __future__ import annotations
 
@@ -11,99 +20,6 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.quality.elements import Elements
 
-# What the residuals of fixes say of every error and offset: its size, its test, its redundancy.
-#
-# A problem linearised at its fix is v = J dx + B e + E b + n: v residuals, e independent errors of the groups' noise
-# with covariance diag(theta), b offsets of the groups, n what has a covariance C of its own. With V = B diag(theta)
-# B' + C and P = V^-1 - V^-1 J (J' V^-1 J)^-1 J' V^-1, which annihilates J, all that follows needs only T = F' P F and
-# t = F' P v of the columns F = [B, E]: t_j / T_jj is the size of an error along column j that the other rows show
-# (for a row, its leave-one-out residual), 1 / sqrt(T_jj) its standard deviation, and t_j / sqrt(T_jj) is standard
-# normal without one.
-#
-# W. Baarda, "A testing procedure for use in geodetic networks" (1968), section 4.
-
-_NOTHING = 1e-9
-
-
-@dataclass(frozen=True, slots=True)
-class Tested:
-    """T = F' P F and t = F' P v for the columns F = [B, E], and what is left of the residuals.
-
-    Parameters
-    ----------
-    matrix : array (N, q + c, q + c)
-        T.
-    vector : array (N, q + c)
-        t.
-    errors : int
-        q, the number of columns that are errors.
-    cost : array (N,)
-        v' P v, chi-square distributed with `dof` degrees of freedom.
-    dof : array (N,)
-        Rank of P.
-    """
-
-    matrix: Array
-    vector: Array
-    errors: int
-    cost: Array
-    dof: Array
-
-    @property
-    def size(self) -> Array:
-        """Return the diagonal of T, (N, q + c)."""
-        return np.asarray(np.diagonal(self.matrix, axis1=-2, axis2=-1))
-
-    @property
-    def sigmas(self) -> Array:
-        """Return the tests t / sqrt(T) of all columns (N, q + c); 0 where nothing can be tested."""
-        size = self.size
-        return np.where(size > 0.0, self.vector / np.sqrt(np.where(size > 0.0, size, 1.0)), 0.0)
-
-    def without(self, column: Array) -> Tested:
-        """Return the same with an error of unknown size along one column (N,) of each problem; -1 for none."""
-        items = np.flatnonzero(column >= 0)
-        j = column[items]
-        matrix, vector, cost, dof = self.matrix.copy(), self.vector.copy(), self.cost.copy(), self.dof.copy()
-        along, own = matrix[items, :, j], matrix[items, j, j]
-        vector[items] -= along * (self.vector[items, j] / own)[:, None]
-        matrix[items] -= along[:, :, None] * along[:, None, :] / own[:, None, None]
-        cost[items] -= self.vector[items, j] ** 2 / own
-        dof[items] -= 1
-        gone = np.diagonal(matrix[items], axis1=-2, axis2=-1) <= _NOTHING * self.size[items]
-        matrix[items] *= ~(gone[:, :, None] | gone[:, None, :])
-        vector[items] *= ~gone
-        return Tested(matrix, vector, self.errors, cost, dof)
-
-
-def tested(made: Elements, variance: Array) -> Tested:
-    """Return what the residuals say of every error and offset.
-
-    Parameters
-    ----------
-    made : Elements
-        N problems.
-    variance : array (N, q) or ()
-        Theta, the variance of each error.
-    """
-    q = made.effect.shape[-1]
-    scaled = made.effect * np.sqrt(np.broadcast_to(variance, made.of_effect.shape))[:, None]
-    covariance = scaled @ np.swapaxes(scaled, 1, 2) + made.fixed
-    whiten = linalg.whitening(covariance)
-    columns = np.concatenate([made.effect, made.offset, made.residual[..., None]], axis=-1)
-    white, known = whiten @ columns, whiten @ made.jacobian
-    root, _ = linalg.root(np.swapaxes(known, 1, 2) @ known)
-    basis = known @ root
-    free = white - basis @ (np.swapaxes(basis, 1, 2) @ white)
-    gram = np.swapaxes(free, 1, 2) @ free
-    rank = (whiten != 0.0).any(-1).sum(-1) - (root != 0.0).any(-2).sum(-1)
-    matrix = gram[:, :-1, :-1]
-    size = np.diagonal(np.swapaxes(white, 1, 2) @ white, axis1=-2, axis2=-1)[:, :-1]
-    seen = np.diagonal(matrix, axis1=-2, axis2=-1) > _NOTHING * size
-    both = seen[:, :, None] & seen[:, None, :]
-    return Tested(np.where(both, matrix, 0.0), np.where(seen, gram[:, :-1, -1], 0.0), q, gram[:, -1, -1], rank)
-
-
 CUT = 3.0
 """Size of a test, in standard deviations, from which an error counts as gross."""
 
@@ -113,13 +29,27 @@ KEPT = 0.9733369
 LOOSE = 0.5
 """Relative standard error of a standard deviation from which the data are said not to tell it."""
 
+# Share of a column's size below which what P leaves of it is rounding: the fix absorbs it whole.
+_NOTHING = 1e-9
 # Of normal errors within the cut: variance of their square over its mean squared (2 without a cut), and the share of a
 # change of their variance that its mean follows.
 _SCATTER, _SLOPE = 1.836, 0.877
+# Median of the square of a standard normal variable.
 _MEDIAN = 0.45493642
+# Factor of a variance below which none falls: its sigma is a hundredth of the stated one, which no data tell from zero.
 _LEAST = 1e-4
+# Steps of the medians, which only bring the factors near; turns of gross errors and steps; scoring steps of a turn.
 _COARSE, _ROUNDS, _STEPS = 8, 5, 40
-_CLOSE, _SETTLED = 1e-3, 0.05
+# Moves that end them: of a coarse step in log-factors; of a scoring step and of a turn in standard errors.
+_NEAR, _CLOSE, _SETTLED = 0.05, 1e-3, 0.05
+# Redundancy of an error from which its test counts for a median, and what stands for a median of zero.
+_SHOWN, _SMALL = 1e-3, 1e-2
+# Bounds of a coarse step of a log-factor: medians of few errors are rough.
+_DOWN, _UP = -4.0, 8.0
+# Eigenvalue of an information matrix of unit diagonal below which a combination of factors is not seen: rounding.
+_UNSEEN = 1e-9
+# Share of a factor's own direction that the data must see to tell it.
+_OWN = 0.9
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,30 +113,35 @@ def fit(made: Elements, group: Array, count: int) -> Fitted:
     if not (tested(made, np.ones(())).dof > 0).any():
         advice = "add rows, stations or known heights"
         raise InvalidProblem("no fix has more rows than unknowns: nothing shows the noise", "noise", advice)
-    alike = _maximised(made, np.minimum(group, 0), np.zeros(1), none[:1])
+    # One factor for all: where even that is not told, nothing is.
+    alike = _maximise(made, np.minimum(group, 0), np.zeros(1), none[:1])
     begin = np.full(count, np.log(alike.variance[0]))
     shared = ~(_errors(alike.tests, group, np.exp(begin), none) < LOOSE)
+    # Groups that are not told by themselves become one, in the place of the first of them.
     merge = np.where(shared, np.flatnonzero(shared)[0] if shared.any() else 0, np.arange(count))
     kinds, place = np.unique(merge, return_inverse=True)
     own = np.append(place, -1)[group]
+    # Together they may be told, if there are several.
     alone = np.isin(kinds, np.flatnonzero(shared))
     if shared.sum() > 1:
         alone &= ~(_errors(alike.tests, own, np.exp(begin[: len(kinds)]), none[: len(kinds)]) < LOOSE)
-    found = _maximised(made, own, np.where(alone, 0.0, begin[: len(kinds)]), alone)
+    found = _maximise(made, own, np.where(alone, 0.0, begin[: len(kinds)]), alone)
     error = np.where(shared, np.nan, found.error[place])
     return Fitted(found.variance[place], error, shared, bool(alone.any()), found.gross, found.tests)
 
 
-def _maximised(made: Elements, own: Array, level: Array, held: Array) -> _Found:
+def _maximise(made: Elements, own: Array, level: Array, held: Array) -> _Found:
     """Return the factors of classes of errors `own` (N, q), from log-factors (c,) on; some are held there."""
     count, level = len(level), level.copy()
+    # Medians first: they stand half of the errors being gross, the scores of the likelihood do not.
     for _ in range(_COARSE):
         step = np.where(held, 0.0, _coarse(tested(made, np.exp(level)[own]), own, np.exp(level)))
         level += step
-        if np.abs(step).max() < 0.05:
+        if np.abs(step).max() < _NEAR:
             break
     for _ in range(_ROUNDS):
         before = level.copy()
+        # Gross errors are chosen once a turn, not at every step: else steps would jump as errors come and go.
         gross, tests = cleaned(made, np.exp(level)[own])
         for _ in range(_STEPS):
             step, sure = _step(tests, own, np.exp(level), held)
@@ -218,6 +153,172 @@ def _maximised(made: Elements, own: Array, level: Array, held: Array) -> _Found:
             break
     variance = np.exp(level)
     return _Found(variance, _errors(tests, own, variance, held[:count]), gross, tests)
+
+
+def _coarse(tests: Tested, own: Array, variance: Array) -> Array:
+    """Return steps of the log-factors (c,) to where the median of the squared tests is that of normal errors."""
+    q = own.shape[1]
+    squared, share = tests.sigmas[:, :q] ** 2, tests.size[:, :q] * variance[own]
+    step = np.zeros(len(variance))
+    for g in range(len(variance)):
+        values = squared[(own == g) & (share > _SHOWN)]
+        if len(values):
+            step[g] = np.log(max(float(np.median(values)) / _MEDIAN, _SMALL))
+    return np.clip(step, _DOWN, _UP)
+
+
+def _step(tests: Tested, own: Array, variance: Array, held: Array) -> tuple[Array, Array]:
+    """Return the scoring step of the log-factors (c,), at most one, along what the data see, and their sigmas."""
+    information, per_fix = _score(tests, own, variance, held)
+    inverse = _inverse(information)
+    # A step of at most e: the quadratic model of the likelihood holds no further.
+    return np.clip(inverse @ per_fix.sum(0), -1.0, 1.0), np.sqrt(np.diagonal(inverse))
+
+
+def _score(tests: Tested, own: Array, variance: Array, held: Array) -> tuple[Array, Array]:
+    """Return information (c, c) and scores of each problem (N, c) of log-factors.
+
+    With T and t of `Tested`, d l / d theta_g is the sum of (t_j^2 - T_jj) / 2 over the errors j of group g, and the
+    information of theta_g and theta_h that of T_ij^2 / 2 (Harville 1977, section 5); t_j^2 is divided by its mean
+    square within the cut.
+    """
+    (n, q), count = own.shape, len(variance)
+    # Errors of no group are counted in a class of their own, behind the others, and dropped.
+    number, scale = np.where(own >= 0, own, count), np.where(held, 0.0, variance)
+    each = 0.5 * (tests.vector[:, :q] ** 2 / KEPT - tests.size[:, :q])
+    place = (np.arange(n)[:, None] * (count + 1) + number).ravel()
+    per_fix = np.bincount(place, each.ravel(), n * (count + 1)).reshape(n, -1)[:, :count] * scale
+    pair = (number[:, :, None] * (count + 1) + number[:, None, :]).ravel()
+    squared = 0.5 * tests.matrix[:, :q, :q].ravel() ** 2
+    information = np.bincount(pair, squared, (count + 1) ** 2).reshape(count + 1, -1)[:count, :count]
+    return information * np.outer(scale, scale), per_fix
+
+
+def _inverse(information: Array) -> Array:
+    """Return the inverse along the directions that an information matrix, scaled to a unit diagonal, sees."""
+    half, _ = linalg.root(information, _UNSEEN)
+    return np.asarray(half @ half.T)
+
+
+def _errors(tests: Tested, own: Array, variance: Array, held: Array) -> Array:
+    """Return standard errors (c,) of the roots of factors, as shares of them; infinite where they are not told.
+
+    Those of normal errors, or what the scatter of the problems' scores says if that is more.
+    """
+    information, per_fix = _score(tests, own, variance, held)
+    inverse = _inverse(information)
+    # Sandwich of the problems' scores: what normal errors do not explain, such as tails, widens the error.
+    scattered = inverse @ (per_fix.T @ per_fix) @ inverse
+    told = np.diagonal(inverse @ information) > _OWN
+    normal = 0.5 * _SCATTER * np.diagonal(inverse)
+    spread = np.sqrt(np.maximum(normal, np.diagonal(scattered))) / _SLOPE
+    # From the error of a log-variance to that of its root.
+    return np.where(told, np.sqrt(1.0 + spread) - 1.0, np.inf)
+
+
+def total(group: Array, count: int, values: Array | None = None) -> Array:
+    """Return the sum of values (N, q) over each group (g,); their number by default."""
+    number = np.where(group >= 0, group, count).ravel()
+    return np.bincount(number, None if values is None else values.ravel(), count + 1)[:count].astype(float)
+
+
+# Tests of single errors and offsets.
+
+
+@dataclass(frozen=True, slots=True)
+class Tested:
+    """T = F' P F and t = F' P v for the columns F = [B, E], and what is left of the residuals.
+
+    Parameters
+    ----------
+    matrix : array (N, q + c, q + c)
+        T.
+    vector : array (N, q + c)
+        t.
+    errors : int
+        q, the number of columns that are errors.
+    cost : array (N,)
+        v' P v, chi-square distributed with `dof` degrees of freedom.
+    dof : array (N,)
+        Rank of P.
+    """
+
+    matrix: Array
+    vector: Array
+    errors: int
+    cost: Array
+    dof: Array
+
+    @property
+    def size(self) -> Array:
+        """Return the diagonal of T, (N, q + c)."""
+        return np.asarray(np.diagonal(self.matrix, axis1=-2, axis2=-1))
+
+    @property
+    def sigmas(self) -> Array:
+        """Return the tests t / sqrt(T) of all columns (N, q + c); 0 where nothing can be tested."""
+        size = self.size
+        return np.where(size > 0.0, self.vector / np.sqrt(np.where(size > 0.0, size, 1.0)), 0.0)
+
+    def without(self, column: Array) -> Tested:
+        """Return the same with an error of unknown size along one column (N,) of each problem; -1 for none."""
+        items = np.flatnonzero(column >= 0)
+        j = column[items]
+        matrix, vector, cost, dof = self.matrix.copy(), self.vector.copy(), self.cost.copy(), self.dof.copy()
+        # An unknown along column j is eliminated: a Schur complement of one row and column.
+        along, own = matrix[items, :, j], matrix[items, j, j]
+        vector[items] -= along * (self.vector[items, j] / own)[:, None]
+        matrix[items] -= along[:, :, None] * along[:, None, :] / own[:, None, None]
+        cost[items] -= self.vector[items, j] ** 2 / own
+        dof[items] -= 1
+        # Columns that this one explains are not tested any more; rounding would make them outliers.
+        gone = np.diagonal(matrix[items], axis1=-2, axis2=-1) <= _NOTHING * self.size[items]
+        matrix[items] *= ~(gone[:, :, None] | gone[:, None, :])
+        vector[items] *= ~gone
+        return Tested(matrix, vector, self.errors, cost, dof)
+
+
+def tested(made: Elements, variance: Array) -> Tested:
+    """Return what the residuals say of every error and offset.
+
+    Parameters
+    ----------
+    made : Elements
+        N problems.
+    variance : array (N, q) or ()
+        Theta, the variance of each error.
+    """
+    q = made.effect.shape[-1]
+    scaled = made.effect * np.sqrt(np.broadcast_to(variance, made.of_effect.shape))[:, None]
+    covariance = scaled @ np.swapaxes(scaled, 1, 2) + made.fixed
+    # P = W' (I - Q Q') W with W whitening V and Q an orthonormal basis of W J: no inverse of V is formed.
+    whiten = linalg.whitening(covariance)
+    columns = np.concatenate([made.effect, made.offset, made.residual[..., None]], axis=-1)
+    white, known = whiten @ columns, whiten @ made.jacobian
+    root, _ = linalg.root(np.swapaxes(known, 1, 2) @ known)
+    basis = known @ root
+    free = white - basis @ (np.swapaxes(basis, 1, 2) @ white)
+    gram = np.swapaxes(free, 1, 2) @ free
+    # Rows that whitening keeps less unknowns that the Jacobian sees.
+    rank = (whiten != 0.0).any(-1).sum(-1) - (root != 0.0).any(-2).sum(-1)
+    matrix = gram[:, :-1, :-1]
+    size = np.diagonal(np.swapaxes(white, 1, 2) @ white, axis1=-2, axis2=-1)[:, :-1]
+    seen = np.diagonal(matrix, axis1=-2, axis2=-1) > _NOTHING * size
+    both = seen[:, :, None] & seen[:, None, :]
+    return Tested(np.where(both, matrix, 0.0), np.where(seen, gram[:, :-1, -1], 0.0), q, gram[:, -1, -1], rank)
+
+
+def without(tests: Tested, gross: Array) -> Tested:
+    """Return tests without the errors (N, q) that are gross."""
+    items = np.arange(len(gross))
+    # As many turns as the problem with most gross errors has.
+    order = np.argsort(~gross, axis=1, kind="stable")[:, : int(gross.sum(1).max(initial=0))]
+    for column in order.T:
+        tests = tests.without(np.where(gross[items, column] & (tests.size[items, column] > 0.0), column, -1))
+    return tests
+
+
+# Data snooping.
 
 
 def cleaned(made: Elements, variance: Array) -> tuple[Array, Tested]:
@@ -265,6 +366,7 @@ def snooped(tests: Tested, columns: slice, cut: float) -> Snooped:
         if not len(hit):
             return Snooped(gross, shift, sigma, tests)
         gross[hit, worst[hit]] = True
+        # One column a problem and turn: two that are beyond the cut may be one error, seen twice.
         column = np.full(n, -1)
         column[hit] = first + worst[hit]
         tests = tests.without(column)
@@ -274,79 +376,3 @@ def _shown(tests: Tested, columns: slice) -> tuple[Array, Array]:
     size, vector = tests.size[:, columns], tests.vector[:, columns]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(size > 0.0, vector / size, np.nan), np.where(size > 0.0, size**-0.5, np.nan)
-
-
-def without(tests: Tested, gross: Array) -> Tested:
-    """Return tests without the errors (N, q) that are gross."""
-    items = np.arange(len(gross))
-    order = np.argsort(~gross, axis=1, kind="stable")[:, : int(gross.sum(1).max(initial=0))]
-    for column in order.T:
-        tests = tests.without(np.where(gross[items, column] & (tests.size[items, column] > 0.0), column, -1))
-    return tests
-
-
-def total(group: Array, count: int, values: Array | None = None) -> Array:
-    """Return the sum of values (N, q) over each group (g,); their number by default."""
-    number = np.where(group >= 0, group, count).ravel()
-    return np.bincount(number, None if values is None else values.ravel(), count + 1)[:count].astype(float)
-
-
-def _coarse(tests: Tested, own: Array, variance: Array) -> Array:
-    """Return steps of the log-factors (c,) to where the median of the squared tests is that of normal errors."""
-    q = own.shape[1]
-    squared, share = tests.sigmas[:, :q] ** 2, tests.size[:, :q] * variance[own]
-    step = np.zeros(len(variance))
-    for g in range(len(variance)):
-        values = squared[(own == g) & (share > 1e-3)]
-        if len(values):
-            step[g] = np.log(max(float(np.median(values)) / _MEDIAN, 1e-2))
-    return np.clip(step, -4.0, 8.0)
-
-
-def _step(tests: Tested, own: Array, variance: Array, held: Array) -> tuple[Array, Array]:
-    """Return the scoring step of the log-factors (c,), at most one, along what the data see, and their sigmas."""
-    information, per_fix = _scored(tests, own, variance, held)
-    inverse = _inverse(information)
-    return np.clip(inverse @ per_fix.sum(0), -1.0, 1.0), np.sqrt(np.diagonal(inverse))
-
-
-def _scored(tests: Tested, own: Array, variance: Array, held: Array) -> tuple[Array, Array]:
-    """Return information (c, c) and scores of each problem (N, c) of log-factors.
-
-    With T and t of `Tested`, d l / d theta_g is the sum of (t_j^2 - T_jj) / 2 over the errors j of group g, and the
-    information of theta_g and theta_h that of T_ij^2 / 2 (Harville 1977, section 5); t_j^2 is divided by its mean
-    square within the cut.
-    """
-    (n, q), count = own.shape, len(variance)
-    number, scale = np.where(own >= 0, own, count), np.where(held, 0.0, variance)
-    each = 0.5 * (tests.vector[:, :q] ** 2 / KEPT - tests.size[:, :q])
-    place = (np.arange(n)[:, None] * (count + 1) + number).ravel()
-    per_fix = np.bincount(place, each.ravel(), n * (count + 1)).reshape(n, -1)[:, :count] * scale
-    pair = (number[:, :, None] * (count + 1) + number[:, None, :]).ravel()
-    squared = 0.5 * tests.matrix[:, :q, :q].ravel() ** 2
-    information = np.bincount(pair, squared, (count + 1) ** 2).reshape(count + 1, -1)[:count, :count]
-    return information * np.outer(scale, scale), per_fix
-
-
-def _inverse(information: Array) -> Array:
-    """Return the inverse along the directions that an information matrix, scaled to a unit diagonal, sees."""
-    diagonal = np.diagonal(information)
-    size = np.where(diagonal > 0.0, 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0)), 0.0)
-    values, vectors = np.linalg.eigh(information * np.outer(size, size))
-    seen = values > 1e-9
-    half = size[:, None] * vectors[:, seen]
-    return np.asarray((half / values[seen]) @ half.T)
-
-
-def _errors(tests: Tested, own: Array, variance: Array, held: Array) -> Array:
-    """Return standard errors (c,) of the roots of factors, as shares of them; infinite where they are not told.
-
-    Those of normal errors, or what the scatter of the problems' scores says if that is more.
-    """
-    information, per_fix = _scored(tests, own, variance, held)
-    inverse = _inverse(information)
-    scattered = inverse @ (per_fix.T @ per_fix) @ inverse
-    told = np.diagonal(inverse @ information) > 0.9
-    normal = 0.5 * _SCATTER * np.diagonal(inverse)
-    spread = np.sqrt(np.maximum(normal, np.diagonal(scattered))) / _SLOPE
-    return np.where(told, np.sqrt(1.0 + spread) - 1.0, np.inf)

@@ -8,9 +8,10 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.status import Status
-from optloc.base.types import Array, Rows
+from optloc.base.types import Array
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
+from optloc.several.sets import value_width
 from optloc.track.associate import Clutter
 
 
@@ -93,9 +94,6 @@ class Emitters:
         return np.flatnonzero(self.assignment == emitter)
 
 
-# What is known of false rows from how many there are in a channel.
-
-
 def evenly(problem: Problem, detection: float, false: float) -> Clutter:
     """Return the density of false rows that lie anywhere a true one can: as many in each channel, spread evenly.
 
@@ -116,17 +114,14 @@ def evenly(problem: Problem, detection: float, false: float) -> Clutter:
     """
     if not 0.0 < false < np.inf:
         raise InvalidProblem(f"{false} false rows in a channel", "false", "give a mean number above 0")
-    density = {block.kind: float(false / np.mean(_width(problem, block))) for block in problem.rows if block.count}
+    density = {}
+    for block in problem.rows:
+        width = value_width(problem, block)
+        if width is None:
+            what = f"there is no end to possible values of {block.kind}"
+            raise InvalidProblem(what, "false", "give the density of false rows, optloc.several.Clutter")
+        if block.count:
+            # One density for a kind: pairs of stations differ in width, and the mean keeps the mean number of false
+            # rows.
+            density[block.kind] = float(false / np.mean(width))
     return Clutter(detection, density)
-
-
-def _width(problem: Problem, block: Rows) -> Array:
-    """Return the length of the interval of possible values of each row."""
-    if block.kind == "tdoa":
-        place = problem.stations.position[..., 0, :, :]
-        apart = place[..., block.a, :] - place[..., block.b, :]
-        return np.asarray(2.0 * np.sqrt((apart**2).sum(-1)))
-    if block.kind in ("azimuth", "elevation"):
-        return np.asarray(2.0 * np.pi if block.kind == "azimuth" else np.pi)
-    what = f"there is no end to possible values of {block.kind}"
-    raise InvalidProblem(what, "false", "give the density of false rows, optloc.several.Clutter")

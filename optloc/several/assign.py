@@ -1,4 +1,4 @@
-"""Tell the rows of several emitters apart: columns, prices, and a proof that no column is missing."""
+"""Tell the rows of several emitters apart: sets of rows as columns, prices, and a proof that no column is missing."""
 
 from __future__ import annotations
 
@@ -19,193 +19,28 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.several.answer import Emitters, Ghost
 from optloc.several.pricing_search import TOLERANCE, Region, Searched, search
-from optloc.several.set_packing import Prices, cheapest_sets, priced
-from optloc.several.sets import Scene, Tuples, fitted, nearby, nothing, of_picks, scenes, thinned, together, worth
+from optloc.several.set_packing import Prices, cheapest_sets, price_rows
+from optloc.several.sets import Scene, Tuples, merge, no_sets, of_picks, refine_sets, row_worth, scenes, sets_near, thin
 from optloc.solvers import solve
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP
 from optloc.track.associate import Clutter
 
-# Places where emitters may be: closed-form fixes of as few rows as it takes.
-
-# Fixes of few rows that are tried, and those of them that are followed.
+# Fixes of few rows that are tried, and those that are followed: one batch. What they miss the
+# search finds, box by box.
 _TRIED, _FOLLOWED = 800, 800
-# Chi-square above which a point of a closed form is none that the rows have in common.
+# Chi-square above which a point of a closed form is none that the rows have in common: d rows fit their fix exactly,
+# and what remains is rounding near a station or a branch with a negative range.
 _FITS = 100.0
-
-
-def proposed(scene: Scene, seed: int = 0) -> Tuples:
-    """Return sets of rows around the closed-form fixes of d rows each; all of them, or a seeded draw where many."""
-    picks = _few(scene, np.random.default_rng(seed))
-    if not len(picks):
-        return nothing(scene)
-    problem = scene.scan.with_rows(z=of_picks(scene.z, picks), weight=(picks >= 0).astype(float))
-    fix = solve(problem, "roots")
-    x = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
-    which, slot = np.nonzero(np.isfinite(x).all(-1))
-    with np.errstate(all="ignore"):  # some points of the closed form are stations
-        equations = equations_at(problem.take(which), x[which, slot])
-        cov = covariance(equations)[0]
-    good = np.flatnonzero(np.isfinite(cov).all((-1, -2)) & (equations.cost < _FITS))[:_FOLLOWED]
-    return nearby(scene, x[which, slot][good], cov[good], np.zeros_like(scene.z))
-
-
-def _few(scene: Scene, rng: np.random.Generator) -> Array:
-    """Return sets of d rows (q, m) that place an emitter."""
-    d, count = scene.scan.dimension, scene.scan.count
-    ends = _ends(scene)
-    values = [np.flatnonzero(np.isfinite(channel)) for channel in scene.z]
-    present = [i for i in range(count) if len(values[i])]
-    subsets = [subset for subset in combinations(present, d) if _linked([ends[i] for i in subset])]
-    picks = []
-    for number in rng.permutation(len(subsets)):
-        subset = subsets[number]
-        for chosen in product(*(values[i] for i in subset)):
-            one = np.full(count, -1)
-            one[list(subset)] = chosen
-            picks.append(one)
-        if len(picks) >= _TRIED:
-            break
-    return np.array(picks).reshape(-1, count)
-
-
-def _ends(scene: Scene) -> list[tuple[int, int] | None]:
-    """Return the stations of each channel of two, None for channels of one."""
-    found: list[tuple[int, int] | None] = []
-    for block in scene.scan.rows:
-        two = MODELS[block.kind].stations > 1
-        found += [(int(a), int(b)) if two else None for a, b in zip(block.a, block.b, strict=True)]
-    return found
-
-
-def _linked(pairs: list[tuple[int, int] | None]) -> bool:
-    """Return whether pairs of stations form one tree: only then do they fix a place in closed form."""
-    own = [set(pair) for pair in pairs if pair is not None]
-    while len(own) > 1:
-        joined = next((other for other in own[1:] if own[0] & other), None)
-        if joined is None or len(own[0] & joined) > 1:
-            return False
-        own = [own[0] | joined, *(other for other in own[1:] if other is not joined)]
-    return True
-
-
-# From the best assignment to the emitters: fixes, ghosts, and how sure their number is.
-
-# Ghosts that are listed at most; squared distance in sigmas from which a place is another one.
+# Ghosts that are listed at most; squared distance from which a place is another one, four sigmas.
 _LISTED, _APART = 12, 16.0
-# Cost above its bound from which an assignment is not called proven.
+# Cost above its bound from which an assignment is not called proven: above what the tolerance of the search leaves for
+# dozens of emitters, and far below the gap of an ambiguity.
 _PROVEN = 2.0
-
-
-def reported(problem: Problem, scene: Scene, solved: Solved, count: int | None) -> Emitters:
-    """Return the emitters of an assignment of one epoch."""
-    taken = solved.taken[np.argsort(solved.tuples.cost[solved.taken], kind="stable")]
-    best, width = solved.tuples.take(taken), scene.z.shape[1]
-    fixes = fixed(scene, best.picks)
-    assignment = np.full(problem.count, -1)
-    for number, picks in enumerate(best.picks):
-        used = np.flatnonzero(picks >= 0)
-        assignment[scene.row[used, picks[used]]] = number
-    costs = np.array([cheapest_sets(solved.tuples, width, k)[1] for k in range(len(taken) + 2)])
-    ghosts = _ghosts(scene, solved, fixes, width, count)
-    numbers = [] if count is not None else [costs[k] - solved.cost for k in (len(taken) - 1, len(taken) + 1) if k >= 0]
-    margin = float(min([*numbers, *(ghost.gap for ghost in ghosts)], default=np.inf))
-    status, reason = _verdict(scene, solved, fixes, ghosts, costs, count)
-    return Emitters(fixes, assignment, solved.cost, solved.bound, costs, margin, ghosts, status, reason, solved.boxes)
-
-
-def fixed(scene: Scene, picks: Array) -> tuple[Fix, ...]:
-    """Return the fixes of sets of rows (n, m)."""
-    if not len(picks):
-        return ()
-    fix = solve(scene.scan.with_rows(z=of_picks(scene.z, picks), weight=(picks >= 0).astype(float)))
-    return tuple(fix[i] for i in range(len(picks)))
-
-
-def _ghosts(scene: Scene, solved: Solved, fixes: tuple[Fix, ...], width: int, count: int | None) -> tuple[Ghost, ...]:
-    """Return the places of other sets that an assignment of nearly the least cost takes."""
-    tuples, found = solved.tuples, list[Ghost]()
-    known = [(fix.position, _information(fix.covariance())) for fix in fixes]
-    # A reduced cost is a lower bound of what it costs to take a set.
-    lowest = solved.prices.reduced(tuples)
-    for i in np.argsort(lowest, kind="stable"):
-        if len(found) == _LISTED or lowest[i] >= LISTED_GAP:
-            break
-        if any((tuples.x[i] - at) @ weight @ (tuples.x[i] - at) < _APART for at, weight in known):
-            continue
-        gap = cheapest_sets(tuples, width, count, forced=int(i))[1] - solved.cost
-        if not gap < LISTED_GAP:
-            continue
-        used = np.flatnonzero(tuples.picks[i] >= 0)
-        found.append(Ghost(tuples.x[i], scene.row[used, tuples.picks[i][used]], float(gap)))
-        own = fixed(scene, tuples.picks[i : i + 1])[0]
-        known.append((tuples.x[i], _information(own.covariance())))
-    return tuple(sorted(found, key=lambda ghost: ghost.gap))
-
-
-def _information(cov: Array) -> Array:
-    """Return the inverse of a covariance, zero where there is none: everything is then near."""
-    return np.linalg.pinv(cov) if np.isfinite(cov).all() else np.zeros_like(cov)
-
-
-def _verdict(
-    scene: Scene, solved: Solved, fixes: tuple[Fix, ...], ghosts: tuple[Ghost, ...], costs: Array, count: int | None
-) -> tuple[Status, str]:
-    """Return status and reason."""
-    rows, n = int(np.isfinite(scene.z).sum()), len(fixes)
-    present = int(np.isfinite(scene.z).any(1).sum())
-    if count is not None and not np.isfinite(solved.cost):
-        return Status.INFEASIBLE, f"no {count} emitters were found that share no row"
-    if n == 0 and present < scene.least:
-        what = "none can" if scene.least > len(scene.z) else f"an emitter takes {scene.least}"
-        return Status.TOO_FEW_ROWS, f"rows in {present} channels cannot tell an emitter from false rows: {what}"
-    doubts = [
-        f"{_counted(k)} would cost only {costs[k] - solved.cost:.1f} more"
-        for k in (n - 1, n + 1)
-        if count is None and k >= 0 and costs[k] - solved.cost < AMBIGUOUS_GAP
-    ]
-    near = [ghost for ghost in ghosts if ghost.gap < AMBIGUOUS_GAP]
-    if near:
-        doubts.append(f"another place costs only {near[0].gap:.1f} more, {len(near)} such in all")
-    doubts += [f"emitter {i}: {fix.status.label}" for i, fix in enumerate(fixes) if fix.status != Status.OK]
-    open_ = solved.cost - solved.bound > _PROVEN
-    unproven = [f"not proven: another assignment may cost {solved.cost - solved.bound:.1f} less"] if open_ else []
-    if doubts or unproven:
-        return Status.AMBIGUOUS if doubts else Status.SEARCHED, "; ".join([*doubts, *unproven])
-    return Status.OK, f"{_counted(n)}; false rows: {rows - int((solved.tuples.picks[solved.taken] >= 0).sum())}"
-
-
-def _counted(emitters: int) -> str:
-    return {0: "no emitter", 1: "one emitter"}.get(emitters, f"{emitters} emitters")
-
-
-# Turns of prices and searches; and those after which a number of emitters that nobody found is given up.
+# Turns of prices and searches; and those after which a number of emitters that nobody found is given up: four times
+# the best columns of the whole region did not make it possible.
 _ROUNDS, _HOPELESS = 80, 4
-
-
-@dataclass(frozen=True, slots=True)
-class Solved:
-    """An assignment with its bound.
-
-    Parameters
-    ----------
-    tuples : Tuples
-        All sets of rows that were looked at.
-    taken : int array (n,)
-        Those of the assignment.
-    prices : Prices
-        Of the rows, with which no set that was looked at has a negative reduced cost.
-    cost, bound : float
-        Its cost, and a lower bound of that of any.
-    boxes : int
-        How many boxes the bound took.
-    """
-
-    tuples: Tuples
-    taken: Array
-    prices: Prices
-    cost: float
-    bound: float
-    boxes: int
+# Sets with a row left out that the first turn begins with: neighbours of the cheapest.
+_PROMISING = 40
 
 
 def separate(
@@ -264,7 +99,10 @@ def separate(
     if penalty is not None and not np.isfinite(penalty):
         raise InvalidProblem(f"a penalty of {penalty}", "penalty", "give a finite number, or None")
     within = _region(problem, region)
-    return tuple(_separated(problem, scene, within, count, boxes) for scene in scenes(problem, clutter, penalty))
+    return tuple(
+        report(problem, scene, _solve_epoch(scene, within, count, boxes), count)
+        for scene in scenes(problem, clutter, penalty)
+    )
 
 
 def _region(problem: Problem, given: Sequence[Any] | None) -> Region:
@@ -282,48 +120,216 @@ def _region(problem: Problem, given: Sequence[Any] | None) -> Region:
     return Region(lower, upper)
 
 
-def _separated(problem: Problem, scene: Scene, region: Region, count: int | None, boxes: int) -> Emitters:
-    solved = _solved(scene, region, count, boxes)
-    return reported(problem, scene, solved, count)
+@dataclass(frozen=True, slots=True)
+class Solved:
+    """An assignment with its bound.
+
+    Parameters
+    ----------
+    tuples : Tuples
+        All sets of rows that were looked at.
+    taken : int array (n,)
+        Those of the assignment.
+    prices : Prices
+        Of the rows, with which no set that was looked at has a negative reduced cost.
+    cost, bound : float
+        Its cost, and a lower bound of that of any.
+    boxes : int
+        How many boxes the bound took.
+    """
+
+    tuples: Tuples
+    taken: Array
+    prices: Prices
+    cost: float
+    bound: float
+    boxes: int
 
 
-def _solved(scene: Scene, region: Region, count: int | None, boxes: int) -> Solved:
+def _solve_epoch(scene: Scene, region: Region, count: int | None, boxes: int) -> Solved:
     """Return the best assignment: columns are added while the search finds one that is worth its price."""
     # Sets that do not pay by themselves are kept where they may have to be taken, or be listed as ghosts.
     limit = AMBIGUOUS_GAP + (scene.penalty if count is not None else 0.0)
+    # No assignment has more emitters than its rows can speak for.
     most = int(np.isfinite(scene.z).sum()) // scene.least
-    tuples, total = _paying(proposed(scene), limit), 0
-    fresh, bound = thinned(scene, _promising(tuples)), -np.inf
+    tuples, total = _keep_paying(propose(scene), limit), 0
+    fresh, bound = thin(scene, tuples.take(np.arange(min(_PROMISING, len(tuples.cost))))), -np.inf
     for turn in range(_ROUNDS):
-        tuples = _paying(together(tuples, fresh), limit)
+        tuples = _keep_paying(merge(tuples, fresh), limit)
         taken, cost = cheapest_sets(tuples, scene.z.shape[1], count)
-        prices = priced(tuples, taken, worth(scene, tuples.take(taken)), count)
+        # Prices at which no column looked at so far pays: the search asks whether any other does.
+        prices = price_rows(tuples, taken, row_worth(scene, tuples.take(taken)), count)
         found = search(scene, prices, region, boxes)
         total += found.boxes
+        # Every turn gives a valid bound; the best one stays.
         bound = max(bound, prices.bound(count, most, found.floor))
-        fresh = _worth(scene, prices, found)
+        fresh = _fresh_sets(scene, prices, found)
         if not len(fresh.cost) or (turn >= _HOPELESS and not np.isfinite(cost)):
             break
     return Solved(tuples, taken, prices, cost, min(bound, cost), total)
 
 
-def _worth(scene: Scene, prices: Prices, found: Searched) -> Tuples:
+def _fresh_sets(scene: Scene, prices: Prices, found: Searched) -> Tuples:
     """Return the sets found, and others near their places, that are worth more than their price."""
     if not len(found.places):
-        return nothing(scene)
+        return no_sets(scene)
     d = scene.scan.dimension
-    more = nearby(scene, found.places, np.zeros((len(found.places), d, d)), prices.row)
+    more = sets_near(scene, found.places, np.zeros((len(found.places), d, d)), prices.row)
+    # Cheapest row by row at one place: fewer than d of them have no place of their own.
     enough = (found.picks >= 0).sum(-1) >= d
-    own = fitted(scene, found.picks[enough], found.places[enough])[0]
-    sets = together(own, more)
+    own = refine_sets(scene, found.picks[enough], found.places[enough])[0]
+    sets = merge(own, more)
     fresh = sets.take(prices.reduced(sets) < -0.5 * TOLERANCE)
     # Prices that are too high for one set are too high for its neighbours as well.
-    return together(fresh, thinned(scene, fresh))
+    return merge(fresh, thin(scene, fresh))
 
 
-def _promising(tuples: Tuples, most: int = 40) -> Tuples:
-    return tuples.take(np.arange(min(most, len(tuples.cost))))
-
-
-def _paying(tuples: Tuples, limit: float) -> Tuples:
+def _keep_paying(tuples: Tuples, limit: float) -> Tuples:
     return tuples.take(np.flatnonzero(tuples.cost < limit))
+
+
+# Places where emitters may be: closed-form fixes of as few rows as it takes.
+
+
+def propose(scene: Scene, seed: int = 0) -> Tuples:
+    """Return sets of rows around the closed-form fixes of d rows each; all of them, or a seeded draw where many."""
+    picks = _few(scene, np.random.default_rng(seed))
+    if not len(picks):
+        return no_sets(scene)
+    problem = scene.scan.with_rows(z=of_picks(scene.z, picks), weight=(picks >= 0).astype(float))
+    fix = solve(problem, "roots")
+    # All roots of the closed form: d rows may meet in several places.
+    x = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
+    which, slot = np.nonzero(np.isfinite(x).all(-1))
+    with np.errstate(all="ignore"):  # some points of the closed form are stations
+        equations = equations_at(problem.take(which), x[which, slot])
+        cov = covariance(equations)[0]
+    good = np.flatnonzero(np.isfinite(cov).all((-1, -2)) & (equations.cost < _FITS))[:_FOLLOWED]
+    return sets_near(scene, x[which, slot][good], cov[good], np.zeros_like(scene.z))
+
+
+def _few(scene: Scene, rng: np.random.Generator) -> Array:
+    """Return sets of d rows (q, m) that place an emitter."""
+    d, count = scene.scan.dimension, scene.scan.count
+    ends = _ends(scene)
+    values = [np.flatnonzero(np.isfinite(channel)) for channel in scene.z]
+    present = [i for i in range(count) if len(values[i])]
+    subsets = [subset for subset in combinations(present, d) if _form_tree([ends[i] for i in subset])]
+    picks = []
+    # A seeded draw, so that a table does not depend on the machine.
+    for number in rng.permutation(len(subsets)):
+        subset = subsets[number]
+        # One value of each channel of the subset: all of them, as nobody knows whose a row is.
+        for chosen in product(*(values[i] for i in subset)):
+            one = np.full(count, -1)
+            one[list(subset)] = chosen
+            picks.append(one)
+        if len(picks) >= _TRIED:
+            break
+    return np.array(picks).reshape(-1, count)
+
+
+def _ends(scene: Scene) -> list[tuple[int, int] | None]:
+    """Return the stations of each channel of two, None for channels of one."""
+    found: list[tuple[int, int] | None] = []
+    for block in scene.scan.rows:
+        two = MODELS[block.kind].stations > 1
+        found += [(int(a), int(b)) if two else None for a, b in zip(block.a, block.b, strict=True)]
+    return found
+
+
+def _form_tree(pairs: list[tuple[int, int] | None]) -> bool:
+    """Return whether pairs of stations form one tree: only then do they fix a place in closed form."""
+    own = [set(pair) for pair in pairs if pair is not None]
+    while len(own) > 1:
+        joined = next((other for other in own[1:] if own[0] & other), None)
+        if joined is None or len(own[0] & joined) > 1:
+            return False
+        own = [own[0] | joined, *(other for other in own[1:] if other is not joined)]
+    return True
+
+
+# From the best assignment to the emitters: fixes, ghosts, and how sure their number is.
+
+
+def report(problem: Problem, scene: Scene, solved: Solved, count: int | None) -> Emitters:
+    """Return the emitters of an assignment of one epoch."""
+    # The emitter whose rows speak loudest first.
+    taken = solved.taken[np.argsort(solved.tuples.cost[solved.taken], kind="stable")]
+    best, width = solved.tuples.take(taken), scene.z.shape[1]
+    fixes = fix_sets(scene, best.picks)
+    assignment = np.full(problem.count, -1)
+    for number, picks in enumerate(best.picks):
+        used = np.flatnonzero(picks >= 0)
+        assignment[scene.row[used, picks[used]]] = number
+    costs = np.array([cheapest_sets(solved.tuples, width, k)[1] for k in range(len(taken) + 2)])
+    ghosts = _ghosts(scene, solved, fixes, width, count)
+    numbers = [] if count is not None else [costs[k] - solved.cost for k in (len(taken) - 1, len(taken) + 1) if k >= 0]
+    margin = float(min([*numbers, *(ghost.gap for ghost in ghosts)], default=np.inf))
+    status, reason = _verdict(scene, solved, fixes, ghosts, costs, count)
+    return Emitters(fixes, assignment, solved.cost, solved.bound, costs, margin, ghosts, status, reason, solved.boxes)
+
+
+def fix_sets(scene: Scene, picks: Array) -> tuple[Fix, ...]:
+    """Return the fixes of sets of rows (n, m)."""
+    if not len(picks):
+        return ()
+    fix = solve(scene.scan.with_rows(z=of_picks(scene.z, picks), weight=(picks >= 0).astype(float)))
+    return tuple(fix[i] for i in range(len(picks)))
+
+
+def _ghosts(scene: Scene, solved: Solved, fixes: tuple[Fix, ...], width: int, count: int | None) -> tuple[Ghost, ...]:
+    """Return the places of other sets that an assignment of nearly the least cost takes."""
+    tuples, found = solved.tuples, list[Ghost]()
+    known = [(fix.position, _information(fix.covariance())) for fix in fixes]
+    # A reduced cost is a lower bound of what it costs to take a set.
+    lowest = solved.prices.reduced(tuples)
+    for i in np.argsort(lowest, kind="stable"):
+        if len(found) == _LISTED or lowest[i] >= LISTED_GAP:
+            break
+        if any((tuples.x[i] - at) @ weight @ (tuples.x[i] - at) < _APART for at, weight in known):
+            continue
+        gap = cheapest_sets(tuples, width, count, forced=int(i))[1] - solved.cost
+        if not gap < LISTED_GAP:
+            continue
+        used = np.flatnonzero(tuples.picks[i] >= 0)
+        found.append(Ghost(tuples.x[i], scene.row[used, tuples.picks[i][used]], float(gap)))
+        own = fix_sets(scene, tuples.picks[i : i + 1])[0]
+        known.append((tuples.x[i], _information(own.covariance())))
+    return tuple(sorted(found, key=lambda ghost: ghost.gap))
+
+
+def _information(cov: Array) -> Array:
+    """Return the inverse of a covariance, zero where there is none: everything is then near."""
+    return np.linalg.pinv(cov) if np.isfinite(cov).all() else np.zeros_like(cov)
+
+
+def _verdict(
+    scene: Scene, solved: Solved, fixes: tuple[Fix, ...], ghosts: tuple[Ghost, ...], costs: Array, count: int | None
+) -> tuple[Status, str]:
+    """Return status and reason."""
+    rows, n = int(np.isfinite(scene.z).sum()), len(fixes)
+    present = int(np.isfinite(scene.z).any(1).sum())
+    if count is not None and not np.isfinite(solved.cost):
+        return Status.INFEASIBLE, f"no {count} emitters were found that share no row"
+    if n == 0 and present < scene.least:
+        what = "none can" if scene.least > len(scene.z) else f"an emitter takes {scene.least}"
+        return Status.TOO_FEW_ROWS, f"rows in {present} channels cannot tell an emitter from false rows: {what}"
+    doubts = [
+        f"{_spell(k)} would cost only {costs[k] - solved.cost:.1f} more"
+        for k in (n - 1, n + 1)
+        if count is None and k >= 0 and costs[k] - solved.cost < AMBIGUOUS_GAP
+    ]
+    near = [ghost for ghost in ghosts if ghost.gap < AMBIGUOUS_GAP]
+    if near:
+        doubts.append(f"another place costs only {near[0].gap:.1f} more, {len(near)} such in all")
+    doubts += [f"emitter {i}: {fix.status.label}" for i, fix in enumerate(fixes) if fix.status != Status.OK]
+    open_ = solved.cost - solved.bound > _PROVEN
+    unproven = [f"not proven: another assignment may cost {solved.cost - solved.bound:.1f} less"] if open_ else []
+    if doubts or unproven:
+        return Status.AMBIGUOUS if doubts else Status.SEARCHED, "; ".join([*doubts, *unproven])
+    return Status.OK, f"{_spell(n)}; false rows: {rows - int((solved.tuples.picks[solved.taken] >= 0).sum())}"
+
+
+def _spell(emitters: int) -> str:
+    return {0: "no emitter", 1: "one emitter"}.get(emitters, f"{emitters} emitters")

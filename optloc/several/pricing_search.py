@@ -9,12 +9,16 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.linear.evaluate import predict
 from optloc.several.set_packing import Prices
-from optloc.several.sets import Scene, around, changes, of_picks, own_variance
+from optloc.several.sets import Scene, around, changes, cheapest_rows, correlation, of_picks, own_variance
+from optloc.track.associate import misfits
 
 TOLERANCE = 0.05
-"""Reduced costs above minus this are as good as none."""
+"""Reduced costs above minus this are as good as none: at a smaller one the boxes around every set that is taken, whose
+reduced cost is zero, are halved down to rounding. The bound is lower by this much for each emitter."""
 
+# Boxes that are bounded at once: with ten channels of ten values their options take a few megabytes.
 _CHUNK = 4096
+# Places that are told of at once: each becomes sets that are refined, and the best of them change all prices.
 _SHOWN = 60
 
 
@@ -55,15 +59,6 @@ class Searched:
     boxes: int
 
 
-@dataclass(frozen=True, slots=True)
-class _Bounds:
-    """Of boxes: lower bounds (q,) of the reduced cost, its value at the centre (q,), and the side (q,) to halve."""
-
-    low: Array
-    at: Array
-    side: Array
-
-
 def search(scene: Scene, prices: Prices, region: Region, most: int) -> Searched:
     """Return whether some set of rows has a negative reduced cost.
 
@@ -88,38 +83,40 @@ def search(scene: Scene, prices: Prices, region: Region, most: int) -> Searched:
     centre = 0.5 * (region.lower + region.upper)[None]
     half = 0.5 * (region.upper - region.lower)[None]
     boxes, floor = 0, -TOLERANCE
+    # All open boxes of one size at a time: nothing is gained by the best first, as none may stay open.
     while len(centre):
-        found = _bounded(scene, prices, centre, half)
+        found = _bound_all(scene, prices, centre, half)
         boxes += len(centre)
         open_ = found.low < -TOLERANCE
+        # Centres first: a set found there ends the search, and new prices make most boxes dull.
         first = centre[np.argsort(found.at, kind="stable")[:_SHOWN]]
-        value, picks = _at(scene, prices, first)
+        value, picks = _cheapest_at(scene, prices, first)
         if value.min() < -TOLERANCE:
             worth = value < -TOLERANCE
             return Searched(-np.inf, first[worth], picks[worth], boxes)
+        # Given up: the least bound of what is open is the floor, and its places are looked at once more.
         if boxes + 2 * open_.sum() > most:
             lowest = centre[np.argsort(found.low, kind="stable")[:_SHOWN]]
-            return Searched(float(found.low.min()), lowest, _at(scene, prices, lowest)[1], boxes)
-        centre, half = _halved(centre[open_], half[open_], found.side[open_])
+            return Searched(float(found.low.min()), lowest, _cheapest_at(scene, prices, lowest)[1], boxes)
+        centre, half = _halve(centre[open_], half[open_], found.side[open_])
     return Searched(floor, centre, np.zeros((0, scene.scan.count), dtype=np.int64), boxes)
 
 
-def _at(scene: Scene, prices: Prices, x: Array) -> tuple[Array, Array]:
+def _cheapest_at(scene: Scene, prices: Prices, x: Array) -> tuple[Array, Array]:
     """Return the reduced costs (q,) of the rows (q, m) that are the cheapest one by one at places (q, d)."""
-    apart = _apart(scene, predict(scene.scan, x))
+    apart = misfits(scene.scan, scene.z, predict(scene.scan, x))
     s = scene.sigma[:, None]
     option = (apart / s) ** 2 + np.log(2.0 * np.pi * s**2) - scene.gain[:, None] + prices.row
-    option = np.where(np.isnan(option), np.inf, option)
-    best = option.argmin(-1)
-    picks = np.where(np.take_along_axis(option, best[..., None], axis=-1)[..., 0] < scene.missed, best, -1)
+    picks = cheapest_rows(scene, option)
     used = picks >= 0
-    r = np.where(used, np.take_along_axis(apart, best[..., None], axis=-1)[..., 0], 0.0)
+    r = np.where(used, np.take_along_axis(apart, np.maximum(picks, 0)[..., None], axis=-1)[..., 0], 0.0)
+    # Rows that are not used keep their variance and no correlation: their r is zero.
     R = np.where(used[:, :, None] & used[:, None, :], scene.R, np.diag(np.diagonal(scene.R)))
     chi2 = (r * np.linalg.solve(R, r[..., None])[..., 0]).sum(-1)
     return chi2 + scene.constant(picks) + of_picks(prices.row, picks).sum(-1) - prices.emitter, picks
 
 
-def _halved(centre: Array, half: Array, side: Array) -> tuple[Array, Array]:
+def _halve(centre: Array, half: Array, side: Array) -> tuple[Array, Array]:
     """Return both halves of boxes cut across a side each."""
     rows = np.arange(len(centre))
     half = half.copy()
@@ -129,7 +126,16 @@ def _halved(centre: Array, half: Array, side: Array) -> tuple[Array, Array]:
     return np.concatenate([centre - move, centre + move]), np.concatenate([half, half])
 
 
-def _bounded(scene: Scene, prices: Prices, centre: Array, half: Array) -> _Bounds:
+@dataclass(frozen=True, slots=True)
+class _Bounds:
+    """Of boxes: lower bounds (q,) of the reduced cost, its value at the centre (q,), and the side (q,) to halve."""
+
+    low: Array
+    at: Array
+    side: Array
+
+
+def _bound_all(scene: Scene, prices: Prices, centre: Array, half: Array) -> _Bounds:
     parts = [
         _bound(scene, prices, centre[first : first + _CHUNK], half[first : first + _CHUNK])
         for first in range(0, len(centre), _CHUNK)
@@ -141,8 +147,9 @@ def _bound(scene: Scene, prices: Prices, centre: Array, half: Array) -> _Bounds:
     radius = np.sqrt((half**2).sum(-1))
     value, slope, remainder = around(scene.scan, centre, radius)
     change = changes(scene.scan, slope, remainder, half)
-    apart = _apart(scene, value)
+    apart = misfits(scene.scan, scene.z, value)
     s, (own, shrink, _) = scene.sigma[:, None], _errors(scene)
+    # A lower bound of what a row costs beside its chi-square, whichever others are taken with it.
     base = np.log(2.0 * np.pi * own)[:, None] - scene.gain[:, None] + prices.row
     near = np.maximum(np.abs(apart) - change[..., None], 0.0) / s
     option = np.where(np.isnan(near), np.inf, near**2 / shrink + base)
@@ -150,16 +157,19 @@ def _bound(scene: Scene, prices: Prices, centre: Array, half: Array) -> _Bounds:
     low = constant + np.minimum(option.min(-1), scene.missed).sum(-1)
     here = np.where(np.isnan(apart), np.inf, (apart / s) ** 2 + base)
     at = constant + np.minimum(here.min(-1), scene.missed).sum(-1)
+    # The joint bound is dearer by far, and only for boxes that the sum of the single bounds leaves open.
     alive = np.flatnonzero(low < -TOLERANCE)
     if len(alive):
         worst = np.where(np.isnan(apart), np.inf, ((np.abs(apart) + change[..., None]) / s) ** 2 + base)
-        picks = _sure(scene, option[alive], worst[alive], low[alive])
+        picks = _sure_rows(scene, option[alive], worst[alive], low[alive])
+        # With correlated errors the chi-square of the others is within that of the sure ones already.
         rest = option if scene.independent else np.where(np.isnan(near), np.inf, base)
         others = np.where(picks >= 0, 0.0, np.minimum(rest[alive].min(-1), scene.missed)).sum(-1)
-        whole = _jointly(scene, picks, apart[alive], slope[alive], remainder[alive])
+        whole = _bound_jointly(scene, picks, apart[alive], slope[alive], remainder[alive])
         sure = scene.determinant(picks) + np.where(picks >= 0, -scene.gain, 0.0).sum(-1)
         paid = of_picks(prices.row, picks).sum(-1)
         low[alive] = np.maximum(low[alive], constant + whole + sure + paid + others)
+    # The side that moves the rows most, in sigmas; at a station, where slopes are not finite, the longest.
     weight = np.where(np.isfinite(slope), slope / s, 1.0 / s)
     return _Bounds(low, at, ((weight**2).sum(1) * half**2).argmax(-1))
 
@@ -168,19 +178,11 @@ def _errors(scene: Scene) -> tuple[Array, float, float]:
     """Return each row's own variance (m,), and the largest and the least eigenvalue of the correlation of the rows."""
     if scene.independent:
         return scene.sigma**2, 1.0, 1.0
-    values = np.linalg.eigvalsh(scene.R / scene.sigma / scene.sigma[:, None])
+    values = np.linalg.eigvalsh(correlation(scene.R))
     return own_variance(scene.R), float(values[-1]), float(values[0])
 
 
-def _apart(scene: Scene, value: Array) -> Array:
-    """Return the values of the channels less those expected at places, (q, m, c), angles wrapped."""
-    apart = scene.z - value[..., None]
-    turn = scene.periodic
-    apart[:, turn] = np.arctan2(np.sin(apart[:, turn]), np.cos(apart[:, turn]))
-    return np.asarray(apart)
-
-
-def _sure(scene: Scene, option: Array, worst: Array, low: Array) -> Array:
+def _sure_rows(scene: Scene, option: Array, worst: Array, low: Array) -> Array:
     """Return the values (q, m) that every set of a box has that may be worth its price, or -1 where that is open.
 
     Either any other choice in that channel is too dear already, or, where errors are independent, the value is the
@@ -189,6 +191,7 @@ def _sure(scene: Scene, option: Array, worst: Array, low: Array) -> Array:
     best = option.argmin(-1)
     least = np.take_along_axis(option, best[..., None], axis=-1)[..., 0]
     most = np.take_along_axis(worst, best[..., None], axis=-1)[..., 0]
+    # The second best of each channel, missing it included.
     others = option.copy()
     np.put_along_axis(others, best[..., None], np.inf, axis=-1)
     other = np.minimum(others.min(-1), scene.missed)
@@ -198,7 +201,7 @@ def _sure(scene: Scene, option: Array, worst: Array, low: Array) -> Array:
     return np.where(sure, best, -1)
 
 
-def _jointly(scene: Scene, picks: Array, apart: Array, slope: Array, remainder: Array) -> Array:
+def _bound_jointly(scene: Scene, picks: Array, apart: Array, slope: Array, remainder: Array) -> Array:
     """Return lower bounds (q,) of the chi-squares of sure rows in boxes.
 
     With r = z - h at the centre: |r - J s - q| >= min_s |r - J s| - |q|, all whitened, for remainders q.
@@ -214,5 +217,6 @@ def _jointly(scene: Scene, picks: Array, apart: Array, slope: Array, remainder: 
         L = np.linalg.cholesky(np.where(both, scene.R, np.diag(np.diagonal(scene.R))))
         r, J = np.linalg.solve(L, r[..., None])[..., 0], np.linalg.solve(L, J)
     left = r - (J @ (np.linalg.pinv(J) @ r[..., None]))[..., 0]
+    # |q| whitened is at most |q / s| over the root of the least eigenvalue of the correlation.
     blur = np.sqrt(((q / scene.sigma) ** 2).sum(-1) / _errors(scene)[2])
     return np.asarray(np.maximum(np.sqrt((left**2).sum(-1)) - blur, 0.0) ** 2)

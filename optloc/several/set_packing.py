@@ -12,7 +12,8 @@ from scipy.optimize import Bounds, LinearConstraint, linprog, milp
 from optloc.base.types import Array
 from optloc.several.sets import Tuples
 
-# Weight of even prices against the value of the bound.
+# Weight of even prices against the value of the bound: small enough to choose among duals of one value
+# without moving the bound.
 _EVEN = 1e-4
 
 
@@ -50,6 +51,7 @@ class Prices:
         floor : float
             No set has a lower reduced cost.
         """
+        # Each set taken lowers the sum by the floor at the most, so a number of sets by that number of floors.
         number = most if count is None else count
         return number * (min(0.0, floor) + self.emitter) - float(self.row.sum())
 
@@ -82,23 +84,26 @@ def cheapest_sets(tuples: Tuples, width: int, count: int | None, forced: int | N
     Control 22 (1977).
     """
     size = len(tuples.cost)
+    # milp refuses an empty programme.
     if not size or count == 0:
         empty = count in (None, 0) and forced is None
         return np.zeros(0, dtype=np.int64), 0.0 if empty else np.inf
     rules = [LinearConstraint(incidence(tuples, width), -np.inf, 1.0)]
     if count is not None:
         rules.append(LinearConstraint(np.ones((1, size)), count, count))
+    # A set that must be taken has its bounds at one.
     lower = np.zeros(size)
     if forced is not None:
         lower[forced] = 1.0
     solved = milp(tuples.cost, integrality=np.ones(size, dtype=np.int64), bounds=Bounds(lower, 1.0), constraints=rules)
     if solved.x is None:
         return np.zeros(0, dtype=np.int64), np.inf
+    # HiGHS answers ones that are ones to within its tolerance.
     taken = np.flatnonzero(solved.x > 0.5)
     return taken, float(tuples.cost[taken].sum())
 
 
-def priced(tuples: Tuples, taken: Array, worth: Array, count: int | None) -> Prices:
+def price_rows(tuples: Tuples, taken: Array, worth: Array, count: int | None) -> Prices:
     """Return the prices of the rows: the dual of the linear relaxation.
 
     Of the many duals, one is taken in which the rows of a taken set share its price as their worth has it.
@@ -130,10 +135,12 @@ def priced(tuples: Tuples, taken: Array, worth: Array, count: int | None) -> Pri
         shape=(len(row), m * width + 1 + k),
     )
     total = np.concatenate([np.ones(m * width), [-float(count or 0)], np.full(k, _EVEN)])
+    # Without a given number there is no rule on it, and so no price of an emitter.
     free = (0.0, 0.0) if count is None else (None, None)
     bounds = [(0.0, None)] * (m * width) + [free] + [(0.0, None)] * k
     limits = np.concatenate([tuples.cost, np.zeros(len(row))])
     solved = linprog(total, A_ub=sparse.vstack([sets, even]), b_ub=limits, bounds=bounds)
     if solved.x is None:
         return Prices(np.zeros(shape), 0.0)
+    # A price below zero by rounding would make the bound a wrong one.
     return Prices(np.maximum(solved.x[: m * width], 0.0).reshape(shape), float(solved.x[m * width]))

@@ -29,8 +29,8 @@ from optloc.track.track import (
 )
 from optloc.track.updates import Update, Updated, filter_of
 
-# Rows of a start whose chi-square is less likely than this contradict each other: the next scan is tried. One good start
-# in ten thousand is passed over, which costs a scan; a wrong one costs the track.
+# Rows of a start whose chi-square is less likely than this contradict each other: the next scan is tried. One good
+# start in ten thousand is passed over, which costs a scan; a wrong one costs the track.
 _PLAUSIBLE = 1e-4
 # First scans that are tried before a start that contradicts itself is taken: every try costs fixes, and a run that is
 # wrong for longer deserves a status more than a search.

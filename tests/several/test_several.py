@@ -11,9 +11,9 @@ import optloc
 from optloc import InvalidProblem, Status
 from optloc.several import Clutter, evenly, separate
 from optloc.several.pricing_search import TOLERANCE, Region, search
-from optloc.several.set_packing import Prices, cheapest_sets, priced
+from optloc.several.set_packing import Prices, cheapest_sets, price_rows
 from optloc.several.sets import Tuples, around, changes, of_picks, scenes
-from optloc.several.sets import fitted as refined
+from optloc.several.sets import refine_sets as refined
 
 AZIMUTHS = {"kind": "azimuth", "channels": [0, 1, 2, 3, 4]}
 
@@ -135,7 +135,7 @@ def test_the_packing_is_the_best_and_its_prices_bound_it():
     assert total == pytest.approx(packed(numbered, cost)[0])
     for count in (None, 1, 2):
         taken, total = cheapest_sets(tuples, 3, count)
-        prices = priced(tuples, taken, np.ones((4, 3)), count)
+        prices = price_rows(tuples, taken, np.ones((4, 3)), count)
         reduced = prices.reduced(tuples).min()
         assert reduced > -1e-6
         assert prices.bound(count, 6, reduced) <= total + 1e-6
