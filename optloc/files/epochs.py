@@ -10,6 +10,9 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 
+# Share of a window by which a time may be short of the next one: times such as 0.3 are not multiples of 0.1 in binary.
+_ROUNDING = 1e-9
+
 
 @dataclass(frozen=True, slots=True)
 class Keys:
@@ -93,13 +96,15 @@ def epochs_of(keys: Keys, count: int, window: float | None, free: bool | None, s
     InvalidProblem
         Where the times of an epoch have a whole other epoch between them.
     """
-    index, labels, times = _grouped(keys, count, window)
+    index, labels, times = _group(keys, count, window)
     _check_instants(keys, labels, index, source)
     if keys.target is None:
         return Epochs(index, np.zeros(count, dtype=np.int64), labels, times, ("target",))
     names, target = np.unique(keys.target.astype(str), return_inverse=True)
+    # Rows of a moving target or of one epoch stay together: its targets share the epoch.
     if len(names) == 1 or not (len(labels) > 1 if free is None else free):
         return Epochs(index, target, labels, times, tuple(names.tolist()))
+    # Targets that are free share nothing between epochs or with each other: each pair is an epoch of its own.
     pairs, index = np.unique(index * len(names) + target, return_inverse=True)
     epoch, owner = pairs // len(names), pairs % len(names)
     owners = tuple(names[owner].tolist())
@@ -107,19 +112,20 @@ def epochs_of(keys: Keys, count: int, window: float | None, free: bool | None, s
     return Epochs(index, np.zeros(count, dtype=np.int64), chosen, times[epoch], owners, own=True)
 
 
-def _grouped(keys: Keys, count: int, window: float | None) -> tuple[Array, tuple[str, ...], Array]:
+def _group(keys: Keys, count: int, window: float | None) -> tuple[Array, tuple[str, ...], Array]:
     """Return index (m,), labels and times (k,), in the order of time, else of number, else of appearance."""
     if keys.label is None and keys.time is None:
         return np.zeros(count, dtype=np.int64), ("0",), np.full(1, np.nan)
     if keys.label is not None:
         values, first, index = np.unique(keys.label.astype(str), return_index=True, return_inverse=True)
+        # Labels that are numbers go by size (2 before 10), others as they appear; times, where given, outweigh both.
         rank = _numbers(values)
         order = np.argsort(first if rank is None else rank, kind="stable")
         labels = values.astype(object)
     else:
         assert keys.time is not None
         assert keys.written is not None
-        bins = keys.time if window is None else np.floor((keys.time - keys.time.min()) / window + 1e-9)
+        bins = keys.time if window is None else np.floor((keys.time - keys.time.min()) / window + _ROUNDING)
         _, first, index = np.unique(bins, return_index=True, return_inverse=True)
         order, labels = np.arange(len(first)), keys.written[first].astype(str).astype(object)
     times = np.full(len(first), np.nan)
@@ -128,6 +134,7 @@ def _grouped(keys: Keys, count: int, window: float | None) -> tuple[Array, tuple
         base = keys.time[first]
         times = base + np.bincount(index, keys.time - base[index]) / np.bincount(index)
         order = order[np.argsort(times[order], kind="stable")]
+    # The inverse of a permutation: the place of each group in the order.
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
     return place[index], tuple(labels[order].tolist()), times[order]
@@ -140,6 +147,7 @@ def _check_instants(keys: Keys, labels: Sequence[str], index: Array, source: str
     first, last = np.full(len(labels), np.inf), np.full(len(labels), -np.inf)
     np.minimum.at(first, index, keys.time)
     np.maximum.at(last, index, keys.time)
+    # Neighbours in the order of their first times are enough: a label that holds any other epoch holds the next.
     order = np.argsort(first, kind="stable")
     outer, inner = order[:-1], order[1:]
     held = np.flatnonzero((first[outer] < first[inner]) & (last[inner] < last[outer]))

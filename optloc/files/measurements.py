@@ -16,7 +16,15 @@ from optloc.files.table import Table
 from optloc.files.words import Units, join, kind_model
 from optloc.models import Model
 
-# Rows of one kind between their file and the problem.
+ESTIMATE = "estimate"
+"""Word in the place of a standard deviation that is to be found from the data."""
+
+# Where the search for a level begins, in SI units: it decides nothing but how kinds are weighed in the first fixes.
+_BEGIN = {"angle": 1e-2, "ratio": 1e-2, "speed": 0.1}
+# Columns of the table of repeats: chunk, then what makes rows equal, then the place in the chunk.
+_PLACE = 8
+# Differences and eigenvalues of a covariance, as shares of its size, that are rounding of what was written.
+_ROUNDING = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,105 +92,6 @@ class Context:
     values: bool
 
 
-# What a table of measurements says about its noise.
-
-ESTIMATE = "estimate"
-"""Word in the place of a standard deviation that is to be found from the data."""
-
-# Where the search for a level begins, in SI units: it decides nothing but how kinds are weighed in the first fixes.
-_BEGIN = {"angle": 1e-2, "ratio": 1e-2, "speed": 0.1}
-
-
-def spread_of(
-    c: Context, model: Model, units: Units, unit: Conversion, z: Array
-) -> tuple[Array | None, Array | None, Array | None]:
-    """Return standard deviations (m,), arrival standard deviations (s,) and covariance (r, r): one of them, or none.
-
-    Parameters
-    ----------
-    c : Context
-        Settings and rows.
-    model : Model
-        Of their kind.
-    units : Units
-        What they measure.
-    unit : Conversion
-        Of z, and of bare numbers.
-    z : array (m,)
-        Measured values in SI.
-    """
-    section = c.section
-    column = c.table.has("sigma")
-    given = [column or section.sigma is not None, section.arrival_sigma is not None, section.covariance is not None]
-    if sum(given) > 1:
-        raise InvalidProblem("the noise is given more than once", c.where, "give sigma, arrival_sigma or covariance")
-    if column:
-        return _positive(c, unit.sigma_to_si(c.table.numbers("sigma"), z), column=True), None, None
-    if section.sigma == ESTIMATE:
-        return np.full(z.shape, _BEGIN.get(model.quantity, 1.0)), None, None
-    if section.sigma is not None:
-        number, own = units.amount(section.sigma, unit, join(c.where, "key 'sigma'"))
-        return _positive(c, np.broadcast_to(own.sigma_to_si(number, z), z.shape), column=False), None, None
-    if section.arrival_sigma is not None:
-        return None, _arrival(c, model, units, unit, section.arrival_sigma), None
-    covariance = None if section.covariance is None else square(section.covariance, join(c.where, "key 'covariance'"))
-    return None, None, covariance
-
-
-def _positive(c: Context, sigma: Array, *, column: bool) -> Array:
-    bad = np.flatnonzero(sigma <= 0.0)
-    if len(bad):
-        place = c.table.where("sigma", int(bad[0])) if column else join(c.where, "key 'sigma'")
-        raise InvalidProblem("the standard deviation is not positive", place, "give a positive number")
-    return sigma
-
-
-def _arrival(
-    c: Context, model: Model, units: Units, unit: Conversion, given: float | str | Mapping[str, float | str]
-) -> Array:
-    place = join(c.where, "key 'arrival_sigma'")
-    if model.ranges is None:
-        raise InvalidProblem("these rows do not combine arrival times", place, "give sigma or covariance")
-    if not isinstance(given, Mapping):
-        given = dict.fromkeys(c.stations, given)
-    unknown = [name for name in given if name not in c.stations]
-    if unknown:
-        raise InvalidProblem(f"there is no station {unknown[0]!r}", place, nearest(unknown[0], list(c.stations)))
-    sigma = np.zeros(len(c.stations))
-    for name, value in given.items():
-        number, own = units.amount(value, unit, place)
-        sigma[c.stations.index(name)] = own.sigma_to_si(number)
-        if number <= 0.0:
-            raise InvalidProblem("the standard deviation is not positive", place, "give a positive number")
-    return sigma
-
-
-def square(rows: list[list[float]], where: str) -> Array:
-    """Return a covariance (r, r) as an array; raise InvalidProblem where it is none."""
-    r = len(rows)
-    if r == 0:
-        raise InvalidProblem("the covariance is empty", where, "give a square matrix")
-    for i, row in enumerate(rows):
-        if len(row) != r:
-            what = f"row {i + 1} of the covariance has {len(row)} numbers, not {r}"
-            raise InvalidProblem(what, where, "give a square matrix")
-    matrix = np.array(rows, dtype=float)
-    i, j = divmod(int(np.argmax(np.abs(matrix - matrix.T))), r)
-    if abs(matrix[i, j] - matrix[j, i]) > 1e-9 * np.abs(matrix).max():
-        entries = f"({i + 1}, {j + 1}) is {matrix[i, j]:g}, ({j + 1}, {i + 1}) is {matrix[j, i]:g}"
-        raise InvalidProblem(f"the covariance is not symmetric: entry {entries}", where, "make both equal")
-    diagonal = np.diagonal(matrix)
-    if (diagonal <= 0.0).any():
-        place = int(np.flatnonzero(diagonal <= 0.0)[0]) + 1
-        raise InvalidProblem(
-            f"the variance ({place}, {place}) is {diagonal[place - 1]:g}, not positive", where, "give a covariance"
-        )
-    lowest = np.linalg.eigvalsh(matrix)[0]
-    if lowest < -1e-9 * diagonal.max():
-        raise InvalidProblem(f"the covariance has the negative eigenvalue {lowest:g}", where, "give a covariance")
-    return matrix
-
-
 def chunks_of(
     section: MeasurementsTable, table: Table, stations: tuple[str, ...], where: str, speed: float, *, values: bool
 ) -> list[Chunk]:
@@ -215,6 +124,7 @@ def chunks_of(
     labels = table.labels("kind")
     kinds, first = np.unique(labels.astype(str), return_index=True)
     made = []
+    # Kinds in the order of their first rows, so that a covariance across kinds keeps the order of the file.
     for kind, row in zip(kinds[np.argsort(first)].tolist(), np.sort(first).tolist(), strict=True):
         kind_model(kind, table.where("kind", row))
         made.append(chunk(kind, np.flatnonzero(labels == kind)))
@@ -234,6 +144,7 @@ def _chunk(c: Context, kind: str) -> Chunk:
     a, b = (_stations(c, key, needed) for key, needed in (("a", model.stations > 0), ("b", model.stations > 1)))
     if model.stations > 1:
         _check_pairs(c, kind, a, b)
+    # The sign of a difference is turned by its stations, not its value: noise and biases then need no second thought.
     if section.positive == "b-farther" and model.stations > 1 and kind != "range_sum":
         a, b = b, a
     sigma, arrival, covariance = spread_of(c, model, units, unit, z)
@@ -294,8 +205,10 @@ def _values(c: Context, unit: Conversion, weight: Array) -> Array:
     raw = c.table.numbers("z", optional=bool((weight == 0.0).any()) or not c.values)
     empty = np.flatnonzero(np.isnan(raw) & (weight > 0.0))
     if len(empty) and c.values:
+        # Read once more as numbers that must be there: the table names the empty cell.
         c.table.numbers("z")
         raise AssertionError
+    # An absent row may have any value, or none: zero keeps sums finite.
     return np.where(weight > 0.0, unit.to_si(raw), 0.0)
 
 
@@ -305,6 +218,7 @@ def _stations(c: Context, key: str, needed: bool) -> Array:
     single = getattr(c.section, key)
     column = c.table.has(key) or single is None
     labels = c.table.labels(key) if column else np.full(c.table.count, single, dtype=object)
+    # One look-up for each of what may be millions of rows.
     numbers = {name: i for i, name in enumerate(c.stations)}
     unknown = set(labels.tolist()) - numbers.keys()
     if unknown:
@@ -341,6 +255,101 @@ def with_baseline(chunk: Chunk, baseline: Array) -> Chunk:
     return replace(chunk, z=chunk.z + baseline * (chunk.weight > 0.0), baseline=baseline)
 
 
+# What a table says about its noise.
+
+
+def spread_of(
+    c: Context, model: Model, units: Units, unit: Conversion, z: Array
+) -> tuple[Array | None, Array | None, Array | None]:
+    """Return standard deviations (m,), arrival standard deviations (s,) and covariance (r, r): one of them, or none.
+
+    Parameters
+    ----------
+    c : Context
+        Settings and rows.
+    model : Model
+        Of their kind.
+    units : Units
+        What they measure.
+    unit : Conversion
+        Of z, and of bare numbers.
+    z : array (m,)
+        Measured values in SI.
+    """
+    section = c.section
+    column = c.table.has("sigma")
+    given = [column or section.sigma is not None, section.arrival_sigma is not None, section.covariance is not None]
+    if sum(given) > 1:
+        raise InvalidProblem("the noise is given more than once", c.where, "give sigma, arrival_sigma or covariance")
+    if column:
+        return _positive(c, unit.sigma_to_si(c.table.numbers("sigma"), z), column=True), None, None
+    if section.sigma == ESTIMATE:
+        return np.full(z.shape, _BEGIN.get(model.quantity, 1.0)), None, None
+    if section.sigma is not None:
+        number, own = units.amount(section.sigma, unit, join(c.where, "key 'sigma'"))
+        return _positive(c, np.broadcast_to(own.sigma_to_si(number, z), z.shape), column=False), None, None
+    if section.arrival_sigma is not None:
+        return None, _arrival(c, model, units, unit, section.arrival_sigma), None
+    # A matrix stays in the file's unit until the slope of each row is known.
+    covariance = None if section.covariance is None else square(section.covariance, join(c.where, "key 'covariance'"))
+    return None, None, covariance
+
+
+def _positive(c: Context, sigma: Array, *, column: bool) -> Array:
+    bad = np.flatnonzero(sigma <= 0.0)
+    if len(bad):
+        place = c.table.where("sigma", int(bad[0])) if column else join(c.where, "key 'sigma'")
+        raise InvalidProblem("the standard deviation is not positive", place, "give a positive number")
+    return sigma
+
+
+def _arrival(
+    c: Context, model: Model, units: Units, unit: Conversion, given: float | str | Mapping[str, float | str]
+) -> Array:
+    place = join(c.where, "key 'arrival_sigma'")
+    if model.ranges is None:
+        raise InvalidProblem("these rows do not combine arrival times", place, "give sigma or covariance")
+    if not isinstance(given, Mapping):
+        given = dict.fromkeys(c.stations, given)
+    unknown = [name for name in given if name not in c.stations]
+    if unknown:
+        raise InvalidProblem(f"there is no station {unknown[0]!r}", place, nearest(unknown[0], list(c.stations)))
+    # A station that is not named measures exactly; rows without any noise are refused later.
+    sigma = np.zeros(len(c.stations))
+    for name, value in given.items():
+        number, own = units.amount(value, unit, place)
+        sigma[c.stations.index(name)] = own.sigma_to_si(number)
+        if number <= 0.0:
+            raise InvalidProblem("the standard deviation is not positive", place, "give a positive number")
+    return sigma
+
+
+def square(rows: list[list[float]], where: str) -> Array:
+    """Return a covariance (r, r) as an array; raise InvalidProblem where it is none."""
+    r = len(rows)
+    if r == 0:
+        raise InvalidProblem("the covariance is empty", where, "give a square matrix")
+    for i, row in enumerate(rows):
+        if len(row) != r:
+            what = f"row {i + 1} of the covariance has {len(row)} numbers, not {r}"
+            raise InvalidProblem(what, where, "give a square matrix")
+    matrix = np.array(rows, dtype=float)
+    i, j = divmod(int(np.argmax(np.abs(matrix - matrix.T))), r)
+    if abs(matrix[i, j] - matrix[j, i]) > _ROUNDING * np.abs(matrix).max():
+        entries = f"({i + 1}, {j + 1}) is {matrix[i, j]:g}, ({j + 1}, {i + 1}) is {matrix[j, i]:g}"
+        raise InvalidProblem(f"the covariance is not symmetric: entry {entries}", where, "make both equal")
+    diagonal = np.diagonal(matrix)
+    if (diagonal <= 0.0).any():
+        place = int(np.flatnonzero(diagonal <= 0.0)[0]) + 1
+        raise InvalidProblem(
+            f"the variance ({place}, {place}) is {diagonal[place - 1]:g}, not positive", where, "give a covariance"
+        )
+    lowest = np.linalg.eigvalsh(matrix)[0]
+    if lowest < -_ROUNDING * diagonal.max():
+        raise InvalidProblem(f"the covariance has the negative eigenvalue {lowest:g}", where, "give a covariance")
+    return matrix
+
+
 # Rows that a file has twice, most often because it was put together of overlapping parts.
 
 
@@ -371,6 +380,7 @@ def check_repeats(
     """
     for kind in dict.fromkeys(chunk.kind for chunk in chunks):
         same = [i for i, chunk in enumerate(chunks) if chunk.kind == kind]
+        # Sorted by all that makes rows equal, equal ones are neighbours, the first of the file first.
         table = np.concatenate([_table(chunks[i], index[i], target[i], i) for i in same], axis=1)
         order = np.lexsort(table[_PLACE:0:-1])
         keys = table[1:_PLACE, order]
@@ -382,16 +392,15 @@ def check_repeats(
             raise _repeated((chunks[two[0]], two[1]), (chunks[one[0]], one[1]), stations, epoch)
 
 
-_PLACE = 8
-
-
 def _table(chunk: Chunk, index: Array, target: Array, number: int) -> Array:
     """Return the number of the chunk, what makes rows equal, and the place in the chunk, as columns (9, present)."""
+    # With noise of arrivals a second row of the same stations has the same noise, whatever its value: a copy, too.
     own = chunk.arrival is None
     time = np.zeros(len(index)) if chunk.time is None or not own else chunk.time
     value = chunk.z if own else np.zeros(len(index))
     same = (chunk.a, chunk.b, index, target, np.full(len(index), own), value, time)
     table = np.array([np.full(len(index), number), *same, np.arange(len(index))], dtype=float)
+    # Rows without time and label may be repeated measurements of one still target.
     dated = not own or chunk.label is not None or chunk.time is not None
     return table[:, (chunk.weight > 0.0) & ~np.isnan(value) & dated]
 

@@ -26,7 +26,7 @@ from optloc.problem.noise import Block, Noise, arrivals, group, together
 from optloc.problem.problem import Problem
 from optloc.quality.levels import NoiseLevels, with_estimated_noise
 
-# What reading a problem file gives.
+LOG = logging.getLogger("optloc.read")
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,102 +91,6 @@ class Draft:
     moving: bool
 
 
-# Covariance blocks of measurements read from a file: independent rows, arrivals, a matrix for each epoch.
-
-
-def noise_of(
-    chunks: Sequence[Chunk], numbers: Sequence[Array], epochs: Sequence[Array], targets: Sequence[Array]
-) -> Noise:
-    """Return the noise of chunks.
-
-    Parameters
-    ----------
-    chunks : sequence of Chunk
-        Rows with their own noise.
-    numbers, epochs, targets : sequence of int array (m,)
-        Global row number, epoch and target of each row of each chunk.
-    """
-    blocks: list[Block] = []
-    for chunk, number, epoch, target in zip(chunks, numbers, epochs, targets, strict=True):
-        if chunk.sigma is not None:
-            blocks.append(Block(number[:, None], chunk.sigma[:, None, None] ** 2))
-        elif chunk.arrival is not None:
-            members = together(epoch * (target.max(initial=0) + 1) + target)
-            blocks += [Block(number[m], _arrivals(chunk, m)) for m in members]
-        elif chunk.covariance is not None:
-            blocks.append(_repeated(chunk, number, epoch, chunk.covariance))
-        else:
-            advice = "give sigma, arrival_sigma or covariance, or rows with a column sigma"
-            raise InvalidProblem("the measurements have no noise", chunk.table.source, advice)
-    return group([Block(b.row, b.covariance) for b in blocks])
-
-
-def _arrivals(chunk: Chunk, members: Array) -> Array:
-    """Return the covariance (g, r, r) of groups of rows (g, r) that combine independent arrivals."""
-    signs = MODELS[chunk.kind].ranges
-    assert signs is not None
-    assert chunk.arrival is not None
-    ends = [(index[members], sign) for index, sign in zip((chunk.a, chunk.b), signs, strict=True)]
-    covariance = arrivals(ends, chunk.arrival**2)
-    row, column = np.nonzero(np.diagonal(covariance, axis1=-2, axis2=-1) <= 0.0)
-    if len(row):
-        place = join(chunk.table.source, f"row {chunk.row[members[row[0], column[0]]] + 1}")
-        raise InvalidProblem("no station of this row has an arrival_sigma", place, "name its stations there")
-    return covariance
-
-
-def _repeated(chunk: Chunk, number: Array, epoch: Array, matrix: Array) -> Block:
-    return per_epoch(number, epoch, chunk.slope, matrix, join(chunk.table.source, "covariance"), int(chunk.row[0]))
-
-
-def per_epoch(number: Array, epoch: Array, slope: Array, matrix: Array, where: str, first: int = 0) -> Block:
-    """Return the block of a matrix (r, r) that holds for the r rows of every epoch, in the order of the file.
-
-    Parameters
-    ----------
-    number, epoch : int array (m,)
-        Global row number and epoch of each row.
-    slope : array (m,)
-        SI units in one unit of the file.
-    matrix : array (r, r)
-        In the file's units.
-    where : str
-        Place to name.
-    first : int
-        Row that the first stands in.
-    """
-    groups = together(epoch)
-    wrong = [g for g in groups if g.shape[1] != len(matrix)]
-    if wrong:
-        row = int(wrong[0][0, 0])
-        what = f"the epoch of row {row + first + 1} has {wrong[0].shape[1]} rows, but the covariance {len(matrix)}"
-        raise InvalidProblem(what, where, "give every epoch all rows, absent ones with weight 0")
-    members = groups[0]
-    sizes = slope[members]
-    if not np.isfinite(sizes).all():
-        raise InvalidProblem("a covariance in dB needs the measured values", where, "state it in unit '1'")
-    return Block(number[members], matrix * sizes[:, :, None] * sizes[:, None, :])
-
-
-def with_noise(file: ProblemFile, problem: Problem, source: str) -> tuple[Problem, NoiseLevels | None]:
-    """Return the problem with its noise found from the data, where the file leaves it to them."""
-    if all(section.sigma != ESTIMATE for section in file.measurements):
-        return problem, None
-    place = join(source, "key 'sigma'")
-    if any(section.sigma != ESTIMATE for section in file.measurements):
-        what = "the noise of some measurements is stated and that of others is to be estimated"
-        raise InvalidProblem(what, place, f'state all, or give sigma = "{ESTIMATE}" to all')
-    if not np.isfinite(problem.z[problem.weight > 0.0]).all():
-        raise InvalidProblem("without measured values there is no noise to estimate", place, "state a sigma")
-    try:
-        return with_estimated_noise(problem)
-    except InvalidProblem as error:
-        raise InvalidProblem(error.what, place, error.advice) from None
-
-
-LOG = logging.getLogger("optloc.read")
-
-
 def load(path: str | Path) -> Problem:
     """Return the problem of a file.
 
@@ -229,6 +133,7 @@ def read(path: str | Path, *, values: bool = True, more: Mapping[str, Constraint
 def draft(path: Path, *, values: bool, more: Mapping[str, ConstraintTable] | None = None) -> Draft:
     """Return the problem of a file together with its tables; arguments as `read`."""
     file = read_document(path)
+    # Tables are read before anything is converted: a missing file is told before a wrong unit.
     known = places_of(file, path.parent, path.name)
     stations = table_of(file.stations, path.parent, join(path.name, "[stations]"))
     places = [join(path.name, f"[[measurements]] {i + 1}") for i in range(len(file.measurements))]
@@ -271,19 +176,25 @@ def assemble(
     for i, (section, table) in enumerate(zip(file.measurements, tables, strict=True)):
         place = join(source, f"[[measurements]] {i + 1}")
         chunks += chunks_of(section, table, found.names, place, speed, values=values)
+    # Epochs come from the rows of all tables together: one instant may have rows of several kinds.
     epochs = _epochs(file, chunks, source)
     cuts = np.cumsum([len(chunk.z) for chunk in chunks])[:-1]
     index, target = np.split(epochs.index, cuts), np.split(epochs.target, cuts)
     check_repeats(chunks, index, target, found.names, epochs)
-    stations = over_epochs(found, file.stations, epochs, [_used(c, i) for c, i in zip(chunks, index, strict=True)])
-    chunks = [_completed(chunk, i, stations) for chunk, i in zip(chunks, index, strict=True)]
+    # Stations that move are needed only where somebody measured; elsewhere they may be unknown.
+    stations = over_epochs(
+        found, file.stations, epochs, [_stations_used(c, i) for c, i in zip(chunks, index, strict=True)]
+    )
+    # Excess paths become path sums only now, when it is known where their stations were.
+    chunks = [_add_baseline(chunk, i, stations) for chunk, i in zip(chunks, index, strict=True)]
     rows, numbers = _rows(chunks, index, target)
     noise = _noise(file, chunks, numbers, index, target, source)
     problem = _problem(file, epochs, stations, rows, noise, frame, source, known or {}, more or {})
+    # Noise that is left to the data needs fixes, so the whole problem: it comes last.
     problem, levels = with_noise(file, problem, source)
     title = file.title or source
     loaded = Loaded(problem, source, title, epochs.labels, epochs.times, epochs.targets, epochs.own, levels)
-    return Draft(loaded, file, tuple(tables), tuple(chunks), tuple(numbers), found.moving or _led(problem))
+    return Draft(loaded, file, tuple(tables), tuple(chunks), tuple(numbers), found.moving or _follows(problem))
 
 
 def _problem(
@@ -299,6 +210,7 @@ def _problem(
 ) -> Problem:
     speed = file.propagation_speed or SPEED_OF_LIGHT
     motions = motions_of(file, epochs, known_of(file, known, epochs, frame, stations.dimension), source)
+    # Times matter to what moves or drifts; other files may leave them out, or date epochs alike.
     why = needs_clock(motions, file.biases)
     times = epochs.clock if why is None else need_clock(epochs, why, source)
     biases = tuple(bias_of(b, rows, stations.names, stations.dimension, speed, source) for b in file.biases)
@@ -306,18 +218,7 @@ def _problem(
     demands = {join(source, f"[[constraints]] {i + 1}"): table for i, table in enumerate(file.constraints)}
     constraints = constraints_of({**demands, **more}, stations, frame, motions, epochs.targets, speed)
     made = Problem(stations, rows, noise, times, motions, biases, priors, frame, constraints)
-    return _checked(made, source)
-
-
-def _led(problem: Problem) -> bool:
-    return any(motion.known is not None and len(motion.known) > 1 for motion in problem.motions)
-
-
-def _checked(problem: Problem, source: str) -> Problem:
-    try:
-        return checked(problem)
-    except InvalidProblem as error:
-        raise InvalidProblem(error.what, join(source, error.where), error.advice) from None
+    return _check(made, source)
 
 
 def _epochs(file: ProblemFile, chunks: Sequence[Chunk], source: str) -> Epochs:
@@ -336,18 +237,19 @@ def _epochs(file: ProblemFile, chunks: Sequence[Chunk], source: str) -> Epochs:
     if window is not None and (window <= 0.0 or columns["time"] is None or columns["label"] is not None):
         what = "the window is not positive" if window <= 0.0 else "a window needs a column 'time' and no column 'epoch'"
         raise InvalidProblem(what, place, "leave the key out, or correct the columns")
+    # A stated motion decides whether targets are free at each epoch; none leaves it to the number of epochs.
     motion = {table.moves for table in (file.target, *file.targets.values())} - {None}
     free = None if not motion else motion == {"free"}
     keys = Keys(columns["label"], columns["time"], columns["written"], columns["target"])
     return epochs_of(keys, sum(len(chunk.z) for chunk in chunks), window, free, source)
 
 
-def _used(chunk: Chunk, epoch: Array) -> Array:
+def _stations_used(chunk: Chunk, epoch: Array) -> Array:
     pairs = [np.stack([epoch, station], axis=-1)[(station >= 0) & (chunk.weight > 0)] for station in (chunk.a, chunk.b)]
     return np.concatenate(pairs)
 
 
-def _completed(chunk: Chunk, epoch: Array, stations: Stations) -> Chunk:
+def _add_baseline(chunk: Chunk, epoch: Array, stations: Stations) -> Chunk:
     if not chunk.excess:
         return chunk
     place = stations.position[epoch if len(stations.position) > 1 else np.zeros_like(epoch)]
@@ -359,6 +261,7 @@ def _rows(
     chunks: Sequence[Chunk], index: Sequence[Array], target: Sequence[Array]
 ) -> tuple[tuple[Rows, ...], list[Array]]:
     """Return the rows of each kind, and the global number of each row of each chunk."""
+    # A problem has one block of rows for each kind, in the order of appearance; numbers lead back to the chunks.
     kinds = dict.fromkeys(chunk.kind for chunk in chunks)
     rows, numbers, start = [], [np.zeros(0, dtype=np.int64)] * len(chunks), 0
     for kind in kinds:
@@ -378,6 +281,9 @@ def _rows(
     return tuple(rows), numbers
 
 
+# Covariance blocks of measurements: independent rows, arrivals, a matrix for each epoch, or one over all kinds.
+
+
 def _noise(
     file: ProblemFile,
     chunks: Sequence[Chunk],
@@ -394,3 +300,108 @@ def _noise(
     matrix = square(file.covariance, place)
     slope = np.concatenate([chunk.slope for chunk in chunks])
     return Noise((per_epoch(np.concatenate(list(numbers)), np.concatenate(list(index)), slope, matrix, place),))
+
+
+def noise_of(
+    chunks: Sequence[Chunk], numbers: Sequence[Array], epochs: Sequence[Array], targets: Sequence[Array]
+) -> Noise:
+    """Return the noise of chunks.
+
+    Parameters
+    ----------
+    chunks : sequence of Chunk
+        Rows with their own noise.
+    numbers, epochs, targets : sequence of int array (m,)
+        Global row number, epoch and target of each row of each chunk.
+    """
+    blocks: list[Block] = []
+    for chunk, number, epoch, target in zip(chunks, numbers, epochs, targets, strict=True):
+        if chunk.sigma is not None:
+            blocks.append(Block(number[:, None], chunk.sigma[:, None, None] ** 2))
+        elif chunk.arrival is not None:
+            # Arrivals are common to the rows of one epoch and one target: another pulse has other errors.
+            members = together(epoch * (target.max(initial=0) + 1) + target)
+            blocks += [Block(number[m], _arrivals(chunk, m)) for m in members]
+        elif chunk.covariance is not None:
+            blocks.append(_per_epoch_block(chunk, number, epoch, chunk.covariance))
+        else:
+            advice = "give sigma, arrival_sigma or covariance, or rows with a column sigma"
+            raise InvalidProblem("the measurements have no noise", chunk.table.source, advice)
+    return group(blocks)
+
+
+def _arrivals(chunk: Chunk, members: Array) -> Array:
+    """Return the covariance (g, r, r) of groups of rows (g, r) that combine independent arrivals."""
+    signs = MODELS[chunk.kind].ranges
+    assert signs is not None
+    assert chunk.arrival is not None
+    ends = [(index[members], sign) for index, sign in zip((chunk.a, chunk.b), signs, strict=True)]
+    covariance = arrivals(ends, chunk.arrival**2)
+    row, column = np.nonzero(np.diagonal(covariance, axis1=-2, axis2=-1) <= 0.0)
+    if len(row):
+        place = join(chunk.table.source, f"row {chunk.row[members[row[0], column[0]]] + 1}")
+        raise InvalidProblem("no station of this row has an arrival_sigma", place, "name its stations there")
+    return covariance
+
+
+def _per_epoch_block(chunk: Chunk, number: Array, epoch: Array, matrix: Array) -> Block:
+    return per_epoch(number, epoch, chunk.slope, matrix, join(chunk.table.source, "covariance"), int(chunk.row[0]))
+
+
+def per_epoch(number: Array, epoch: Array, slope: Array, matrix: Array, where: str, first: int = 0) -> Block:
+    """Return the block of a matrix (r, r) that holds for the r rows of every epoch, in the order of the file.
+
+    Parameters
+    ----------
+    number, epoch : int array (m,)
+        Global row number and epoch of each row.
+    slope : array (m,)
+        SI units in one unit of the file.
+    matrix : array (r, r)
+        In the file's units.
+    where : str
+        Place to name.
+    first : int
+        Row that the first stands in.
+    """
+    groups = together(epoch)
+    # One matrix for every epoch: absent rows keep their place with weight 0.
+    wrong = [g for g in groups if g.shape[1] != len(matrix)]
+    if wrong:
+        row = int(wrong[0][0, 0])
+        what = f"the epoch of row {row + first + 1} has {wrong[0].shape[1]} rows, but the covariance {len(matrix)}"
+        raise InvalidProblem(what, where, "give every epoch all rows, absent ones with weight 0")
+    members = groups[0]
+    # SI units in one unit of the file, per row: of decibels it depends on the value.
+    sizes = slope[members]
+    if not np.isfinite(sizes).all():
+        raise InvalidProblem("a covariance in dB needs the measured values", where, "state it in unit '1'")
+    return Block(number[members], matrix * sizes[:, :, None] * sizes[:, None, :])
+
+
+def with_noise(file: ProblemFile, problem: Problem, source: str) -> tuple[Problem, NoiseLevels | None]:
+    """Return the problem with its noise found from the data, where the file leaves it to them."""
+    if all(section.sigma != ESTIMATE for section in file.measurements):
+        return problem, None
+    place = join(source, "key 'sigma'")
+    if any(section.sigma != ESTIMATE for section in file.measurements):
+        what = "the noise of some measurements is stated and that of others is to be estimated"
+        raise InvalidProblem(what, place, f'state all, or give sigma = "{ESTIMATE}" to all')
+    if not np.isfinite(problem.z[problem.weight > 0.0]).all():
+        raise InvalidProblem("without measured values there is no noise to estimate", place, "state a sigma")
+    try:
+        return with_estimated_noise(problem)
+    except InvalidProblem as error:
+        raise InvalidProblem(error.what, place, error.advice) from None
+
+
+def _check(problem: Problem, source: str) -> Problem:
+    try:
+        return checked(problem)
+    # A complaint of the problem gets the name of the file in front.
+    except InvalidProblem as error:
+        raise InvalidProblem(error.what, join(source, error.where), error.advice) from None
+
+
+def _follows(problem: Problem) -> bool:
+    return any(motion.known is not None and len(motion.known) > 1 for motion in problem.motions)

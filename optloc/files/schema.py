@@ -20,13 +20,20 @@ Bound = Annotated[float, Field(allow_inf_nan=True)]
 """One coordinate of a box; infinite where there is no bound."""
 
 Cell = str | int | float
-
 Row = dict[str, Cell]
+_Model = TypeVar("_Model", bound=BaseModel)
+# Complaints of pydantic that need words of their own; all others are quoted.
+_WHAT = {
+    "missing": "the key {key!r} is missing",
+    "extra_forbidden": "unknown key {key!r}",
+    "finite_number": "{key} is {value}, not a finite number",
+}
 
 
 class _Table(BaseModel):
     """A table of the file; keys that it does not know are refused."""
 
+    # Strict and closed: a number in quotes or a misspelt key is refused, never guessed.
     model_config = ConfigDict(
         extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
     )
@@ -233,8 +240,6 @@ def schema() -> dict[str, Any]:
 
 # Read a TOML file and hold it against the schema; every complaint is one sentence with its place.
 
-_Model = TypeVar("_Model", bound=BaseModel)
-
 
 def read_document(path: Path) -> ProblemFile:
     """Return the contents of a problem file; raise InvalidProblem where it is none."""
@@ -244,6 +249,7 @@ def read_document(path: Path) -> ProblemFile:
 def parsed(text: str, source: str) -> dict[str, Any]:
     """Return TOML of format 1 as data; `source` is the place to name."""
     data = _toml(text, source)
+    # true equals 1 in Python.
     if data.get("format") != 1 or isinstance(data.get("format"), bool):
         given = f"format {data['format']!r} is unknown" if "format" in data else "the key 'format' is missing"
         raise InvalidProblem(given, source, "begin the file with the line format = 1")
@@ -276,6 +282,7 @@ def fitted(model: type[_Model], data: dict[str, Any], source: str) -> _Model:
 def read_text(path: Path) -> str:
     """Return the text of a file; raise InvalidProblem where it is missing, a folder or not UTF-8."""
     try:
+        # Editors of Windows begin files with a byte order mark.
         return existing(path).read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = error.object[: error.start].count(b"\n") + 1
@@ -293,6 +300,7 @@ def existing(path: Path) -> Path:
         )
         raise InvalidProblem("there is no such file", str(path), hint)
     try:
+        # Opening it is the only sure test of permissions.
         path.open("rb").close()
     except OSError as error:
         raise InvalidProblem(
@@ -307,18 +315,12 @@ def _toml(text: str, source: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
+        # tomllib has the place in its message only.
         what, _, place = str(error).partition(" (at ")
         line = place.rstrip(")").partition(",")[0] if place else None
         raise InvalidProblem(
             f"this is not TOML: {what[0].lower()}{what[1:]}", join(source, line), "see toml.io"
         ) from None
-
-
-_WHAT = {
-    "missing": "the key {key!r} is missing",
-    "extra_forbidden": "unknown key {key!r}",
-    "finite_number": "{key} is {value}, not a finite number",
-}
 
 
 def _sentence(error: ValidationError, source: str, data: dict[str, Any], model: type[BaseModel]) -> InvalidProblem:
@@ -346,6 +348,7 @@ def _path(loc: tuple[int | str, ...], data: Any) -> tuple[list[int | str], str]:
     """Return the path of the table and the key of a complaint, without the names of union members."""
     path: list[int | str] = []
     at: Any = data
+    # pydantic puts the names of a union's members between keys: what is not in the data is one of them.
     for part in loc:
         if (isinstance(at, dict) and part in at) or (isinstance(at, list) and part in range(len(at))):
             at = at[part]  # type: ignore[index]  # just checked
@@ -353,6 +356,7 @@ def _path(loc: tuple[int | str, ...], data: Any) -> tuple[list[int | str], str]:
             continue
         path.append(part)
     *table, key = path or ["file"]
+    # The key of a complaint about an entry of a list is that of the list.
     while table and isinstance(key, int):
         key = table.pop()
     return table, str(key)

@@ -17,6 +17,10 @@ from optloc.files.words import Units, join
 
 _XYZ, _GEODETIC, _RATES = ("x", "y", "z"), ("lat_deg", "lon_deg", "height"), ("vx", "vy", "vz")
 _QUATERNION = ("qw", "qx", "qy", "qz")
+# Length of a quaternion beyond 1 that is more than the rounding of two or three written digits: another order of parts.
+_UNIT = 1e-2
+# Difference of axes from the frame's that is rounding of a rotation: such stations need no axes of their own.
+_SAME = 1e-15
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +68,7 @@ def survey(section: StationsTable, table: Table, frame_table: FrameTable, where:
     found, first, index = np.unique(labels.astype(str), return_index=True, return_inverse=True)
     order = np.argsort(first)
     names = tuple(found[order].tolist())
+    # Stations in the order of appearance, as messages and results list them; np.unique sorts by name.
     index = np.argsort(order)[index]
     if len(names) < table.count and not (table.has("time") or table.has("epoch")):
         row = int(np.setdiff1d(np.arange(table.count), first)[0])
@@ -76,6 +81,7 @@ def survey(section: StationsTable, table: Table, frame_table: FrameTable, where:
     if rates:
         factor = Units("speed").conversion(section.speed_unit, where).factor
         velocity = factor * np.stack([table.numbers(key) for key in _RATES[:d]], axis=-1)
+        # Velocities beside latitude and longitude are east, north, up; the frame is ECEF.
         if frame.geodetic and frame_table.kind == "geodetic":
             velocity = np.einsum("nij,ni->nj", frame.enu_axes(position), velocity)
     axes = _axes(section, table, frame, position)
@@ -100,6 +106,7 @@ def _positions(table: Table, wanted: FrameTable, factor: float, where: str) -> t
     lat, lon = (np.radians(table.numbers(key)) for key in _GEODETIC[:2])
     height = factor * table.numbers("height") if table.has("height") else np.zeros(table.count)
     ecef = ECEF.from_geodetic(lat, lon, height, where=table.source, first_row=1)
+    # An origin amid the stations keeps coordinates small, and the plane near the ground.
     if wanted.kind == "enu" and wanted.origin is None:
         frame = Frame("enu", tuple(float(v) for v in ecef_to_geodetic(ecef.mean(0))))  # type: ignore[arg-type]
     else:
@@ -134,10 +141,11 @@ def _axes(section: StationsTable, table: Table, frame: Frame, position: Array) -
     n, d = position.shape
     local = section.axes == "enu" or (section.axes is None and frame.geodetic)
     base = frame.enu_axes(position) if local else np.broadcast_to(np.eye(d), (n, d, d))
+    # Turned axes are the station's own relative to the frame's, or to east, north, up.
     turn = _turn(table, d)
     if turn is None:
         stated = frame.kind == "ecef" and section.axes is not None
-        return base if stated or not np.allclose(base, np.eye(d), rtol=0.0, atol=1e-15) else None
+        return base if stated or not np.allclose(base, np.eye(d), rtol=0.0, atol=_SAME) else None
     return np.asarray(np.swapaxes(turn, -1, -2) @ base)
 
 
@@ -145,6 +153,7 @@ def _turn(table: Table, d: int) -> Array | None:
     """Return the rotations (n, d, d) that columns of the table give, from the station's axes to the base axes."""
     from scipy.spatial.transform import Rotation
 
+    # Yaw counts from x towards y, a heading from north towards east: the other way round.
     if table.has("yaw_deg") or table.has("heading_deg"):
         yaw = table.numbers("yaw_deg") if table.has("yaw_deg") else -table.numbers("heading_deg")
         return np.asarray(Rotation.from_euler("z", yaw[:, None], degrees=True).as_matrix()[:, :d, :d])
@@ -156,10 +165,11 @@ def _turn(table: Table, d: int) -> Array | None:
         )
     parts = np.stack([table.numbers(key) for key in _QUATERNION], axis=-1)
     length = np.linalg.norm(parts, axis=-1)
-    bad = np.flatnonzero(np.abs(length - 1.0) > 1e-2)
+    bad = np.flatnonzero(np.abs(length - 1.0) > _UNIT)
     if len(bad):
         what = f"the quaternion has length {length[bad[0]]:.4g}, not 1"
         raise InvalidProblem(what, table.where("qw", int(bad[0])), "check the order w, x, y, z")
+    # scipy has the scalar part last, files have it first.
     return np.asarray(Rotation.from_quat(parts[:, [1, 2, 3, 0]]).as_matrix())
 
 
@@ -226,12 +236,14 @@ def spread(
         what = f"{found.noun} {found.names[station]!r} has no position at epoch {epochs.labels[epoch]!r}"
         raise InvalidProblem(what, found.table.source, "add it, or leave out what it measured then")
     first = np.array([np.flatnonzero(found.index == i)[0] for i in range(len(found.names))])
+    # Wherever it is not needed a station stands where it was first seen: finite, and of no weight.
     low, high = np.where(low < 0, first, low), np.where(high < 0, first, high)
 
     def between(values: Array) -> Array:
         weight = share.reshape(*share.shape, *[1] * (values.ndim - 1))
         return np.asarray(np.where(weight == 0.0, values[low], (1.0 - weight) * values[low] + weight * values[high]))
 
+    # Positions are interpolated on a line; rotations are not, as nobody says how the station turned.
     if found.axes is not None and np.any((share > 0.0) & (low != high)) and _turning(found):
         raise InvalidProblem(
             "the axes of stations turn between the times of their rows",
@@ -251,6 +263,7 @@ def _by_label(found: Survey, epochs: Epochs) -> tuple[Array, Array, Array]:
     known, place = np.unique(labels, return_inverse=True)
     at = np.searchsorted(known, np.array(epochs.labels)).clip(max=len(known) - 1)
     at = np.where(known[at] == np.array(epochs.labels), at, -1)
+    # Row of each label and station; the last line, -1, is that of labels that the table lacks.
     grid = np.full((len(known) + 1, len(found.names)), -1)
     grid[place, found.index] = np.arange(len(labels))
     again = np.flatnonzero(grid[place, found.index] != np.arange(len(labels)))
@@ -282,6 +295,7 @@ def _by_time(found: Survey, section: StationsTable, epochs: Epochs) -> tuple[Arr
             what = f"{found.noun} {found.names[station]!r} occurs twice at time {own[again[0]]:.10g} s"
             raise InvalidProblem(what, found.table.where("name", row), "leave one of them out")
         inside = (epochs.times >= own[0]) & (epochs.times <= own[-1])
+        # Outside its rows a station is unknown, not extrapolated.
         before = np.searchsorted(own, epochs.times, side="right").clip(1, len(own)) - 1
         after = (before + 1).clip(max=len(own) - 1)
         gap = np.where(after > before, own[after] - own[before], 1.0)

@@ -14,6 +14,9 @@ from optloc.base.types import Array
 from optloc.files.schema import DataTable, existing, read_text
 from optloc.files.words import join
 
+_PARQUET = (".parquet", ".pq")
+_FILES = (".csv", ".txt", ".tsv", *_PARQUET)
+
 
 @dataclass(frozen=True, slots=True)
 class Table:
@@ -65,6 +68,7 @@ class Table:
         name = self.name(key)
         if name not in self.columns:
             what = f"there is no column {name!r}" + (f" (for {key})" if name != key else "")
+            # Columns that already have a role are no suggestion.
             renamed = set(self.names.values())
             advice = nearest(name, sorted(set(self.columns) - renamed) or sorted(self.columns))
             hint = "" if key in self.names else f', or name it by columns = {{ {key} = "..." }}'
@@ -89,9 +93,12 @@ class Table:
         if column.dtype.kind in "iu":
             return column.astype(str).astype(object)
         if column.dtype.kind == "f":
+            # Labels that a table has as floats: 3.0 is the station 3; 15 digits keep every whole number that a float
+            # can.
             column = np.array([None if np.isnan(v) else f"{v:.15g}" for v in column], dtype=object)
         elif column.dtype.kind == "M":
             column = np.datetime_as_string(column).astype(object)
+        # Each different cell is spelled once: millions of rows have few names.
         spelled = {cell: "" if _empty(cell) else str(cell).strip() for cell in set(column.tolist())}
         out = np.array(list(map(spelled.__getitem__, column.tolist())), dtype=object)
         if "" in spelled.values():
@@ -101,6 +108,7 @@ class Table:
     def times(self, key: str, factor: float) -> Array:
         """Return a column of numbers (times `factor` seconds) or ISO 8601 dates as seconds (m,)."""
         column = self.raw(key)
+        # A date has two hyphens: 2024-05-01; a negative number has one.
         if column.dtype.kind == "O" and len(column) and isinstance(column[0], str) and column[0].count("-") >= 2:
             try:
                 column = column.astype("datetime64[ns]")
@@ -111,6 +119,7 @@ class Table:
         return self.numbers(key) * factor
 
     def _parsed(self, key: str, column: Array) -> Array:
+        # All at once where all are numbers; else cell by cell, to name the one that is not.
         try:
             return column.astype(np.float64)
         except (TypeError, ValueError):
@@ -131,9 +140,6 @@ def _empty(cell: object) -> bool:
 
 
 # Tables from CSV and Parquet files, from rows in a problem file and from data frames.
-
-_PARQUET = (".parquet", ".pq")
-_FILES = (".csv", ".txt", ".tsv", *_PARQUET)
 
 
 def table_of(section: DataTable, folder: Path, where: str) -> Table:
@@ -164,7 +170,7 @@ def of_rows(rows: Sequence[Mapping[str, Any]], where: str, names: Mapping[str, s
     if not rows:
         raise InvalidProblem("the table has no rows", where, "give at least one")
     keys = dict.fromkeys(key for row in rows for key in row)
-    return Table(where, {key: _typed([row.get(key) for row in rows]) for key in keys}, len(rows), names)
+    return Table(where, {key: _to_column([row.get(key) for row in rows]) for key in keys}, len(rows), names)
 
 
 def of_frame(frame: Any, where: str, names: Mapping[str, str]) -> Table:
@@ -182,6 +188,7 @@ def csv(path: Path, separator: str, names: Mapping[str, str]) -> Table:
     from pyarrow import csv as reader
 
     text = read_text(path)
+    # The header is read by hand: its names may stand twice or be empty, and pyarrow would go on.
     header = [name.strip().strip('"') for name in text.partition("\n")[0].strip().split(separator)]
     if not any(header):
         raise InvalidProblem("the file is empty or has no header", path.name, "begin it with the names of its columns")
@@ -193,11 +200,13 @@ def csv(path: Path, separator: str, names: Mapping[str, str]) -> Table:
             pa.BufferReader(text.encode()),
             read_options=reader.ReadOptions(column_names=header, skip_rows=1, use_threads=False),
             parse_options=reader.ParseOptions(delimiter=separator),
+            # All cells as text: what a number is, is decided where the column is known, and told with its row.
             convert_options=reader.ConvertOptions(
                 column_types=dict.fromkeys(header, pa.string()), strings_can_be_null=True, null_values=[""]
             ),
         )
     except pa.ArrowInvalid as error:
+        # pyarrow counts from the first line after the header that it skipped.
         what = str(error).partition("CSV parse error: ")[2] or str(error)
         line, _, rest = what.splitlines()[0].rpartition(": Expected")
         number = line.removeprefix("Row #")
@@ -221,7 +230,8 @@ def parquet(path: Path, names: Mapping[str, str]) -> Table:
     return Table(path.name, columns, read.num_rows, names)
 
 
-def _typed(cells: list[Any]) -> Array:
+def _to_column(cells: list[Any]) -> Array:
+    # A column of numbers is an array of them; anything else stays as it was written.
     if all(isinstance(cell, int | float) and not isinstance(cell, bool) for cell in cells):
         return np.array(cells)
     column = np.empty(len(cells), dtype=object)

@@ -1,4 +1,4 @@
-"""Motions, biases and priors of a problem file."""
+"""What a problem file says of its unknowns: motions, known targets, biases, priors, constraints."""
 
 from __future__ import annotations
 
@@ -32,17 +32,30 @@ from optloc.models import MODELS
 from optloc.problem.bias import family
 from optloc.problem.check import check_polygon, like
 
+# Derivatives of the position that a motion estimates.
 _ORDERS = {"static": 0, "free": 0, "constant_velocity": 1, "constant_acceleration": 2}
+# What an unknown measures, and the unit of its bare numbers; units know no acceleration, so that is SI only.
 _STATES: dict[str, tuple[Quantity, str]] = {
     "position": ("length", "m"),
     "velocity": ("speed", "m/s"),
     "acceleration": ("plain", "1"),
     "emission": ("length", "m"),
 }
+# Keys of each kind of constraint beside "kind" and "target".
+_KEYS = {
+    "box": ("min", "max", "unit"),
+    "height": ("exactly", "min", "max", "unit"),
+    "above-ground": (),
+    "polygon": ("corners", "corners_deg", "unit"),
+    "visible": ("stations", "elevation"),
+    "speed": ("min", "max", "unit"),
+}
+Constraint = Band | Polygon
 
 
 def motions_of(file: ProblemFile, epochs: Epochs, known: Mapping[str, Array], source: str) -> tuple[Motion, ...]:
     """Return the motion of each target; `known` holds the states of those that are given."""
+    # Free targets with epochs of their own are one motion: which target an epoch belongs to is a label.
     names = ("target",) if epochs.own else epochs.targets
     unknown = [name for name in file.targets if name not in epochs.targets]
     if unknown:
@@ -68,6 +81,68 @@ def needs_clock(motions: Sequence[Motion], biases: Sequence[BiasTable]) -> str |
     return "a drift" if any(bias.form == "drift" for bias in biases) else None
 
 
+# Targets whose positions are given, for calibration: their tables are read like those of stations.
+
+
+def places_of(file: ProblemFile, folder: Path, source: str) -> dict[str | None, Table]:
+    """Return the tables of targets whose motion is known, by name; None is the table ``[target]``."""
+    sections: list[tuple[str | None, TargetTable]] = [(None, file.target), *file.targets.items()]
+    found = {}
+    for name, section in sections:
+        where = join(source, "[target]" if name is None else f"[targets.{name}]")
+        if section.moves == "known":
+            found[name] = table_of(section, folder, where)
+        elif section.file is not None or section.rows is not None:
+            advice = 'write motion = "known", or leave the rows out'
+            raise InvalidProblem(f"the motion is {section.motion}, but its places are given", where, advice)
+    return found
+
+
+def known_of(
+    file: ProblemFile, places: Mapping[str | None, Table], epochs: Epochs, frame: Frame, dimension: int
+) -> dict[str, Array]:
+    """Return the states (k or 1, order + 1, d) of the known targets by name; arguments as `places_of` returns them."""
+    states = {}
+    for i, name in enumerate(epochs.targets):
+        key = name if name in file.targets else None
+        if key in places:
+            section = file.target if key is None else file.targets[key]
+            wanted = _settle_frame(file.frame, frame, dimension)
+            states[name] = _states(
+                section, places[key], name, epochs, np.unique(epochs.index[epochs.target == i]), wanted
+            )
+    return states
+
+
+def _states(section: TargetTable, table: Table, name: str, epochs: Epochs, heard: Array, wanted: FrameTable) -> Array:
+    dated = table.has("time") or table.has("epoch")
+    if table.count > 1 and not dated:
+        raise InvalidProblem(f"target {name!r} has several places", table.source, "give a column 'time' or 'epoch'")
+    own = {key: value for key, value in table.names.items() if key != "name"}
+    # A known target is read as a station of its name.
+    named = Table(table.source, {**table.columns, "name": np.full(table.count, name, dtype=object)}, table.count, own)
+    units = StationsTable(unit=section.unit, speed_unit=section.speed_unit, time_unit=section.time_unit)
+    found = replace(survey(units, named, wanted, table.source)[0], noun="target")
+    position, velocity = found.position[:, None], None if found.velocity is None else found.velocity[:, None]
+    if dated:
+        used = np.stack([heard, np.zeros_like(heard)], axis=-1)
+        position, velocity, _ = spread(found, units, epochs, used)
+    return position if velocity is None else np.concatenate([position, velocity], axis=-2)
+
+
+def _settle_frame(wanted: FrameTable, frame: Frame, dimension: int) -> FrameTable:
+    """Return the frame table with the origin and the dimension that the stations decided."""
+    # The frame as the stations settled it: a target must not choose an origin of its own.
+    origin = None
+    if frame.origin is not None:
+        lat, lon = np.degrees(frame.origin[:2]).tolist()
+        origin = Origin(lat_deg=lat, lon_deg=lon, height=frame.origin[2])
+    return wanted.model_copy(update={"dimension": dimension, "origin": origin})
+
+
+# Biases and priors.
+
+
 def bias_of(
     table: BiasTable, rows: Sequence[Rows], stations: Sequence[str], dimension: int, speed: float, source: str
 ) -> Bias:
@@ -84,8 +159,10 @@ def bias_of(
         where=where,
     )
     ends = np.cumsum([block.count for block in rows])
+    # All rows of a bias are of one kind: that of the first tells the quantity.
     block = rows[int(np.searchsorted(ends, bias.row[0], side="right"))]
     quantity: Quantity = MODELS[block.kind].quantity  # type: ignore[assignment]  # the table holds known quantities only
+    # A rotation in space has three angles, in the plane one.
     turns = (3,) if table.form == "rotation" and dimension == 3 else ()
     mean, sigma = _prior(table, quantity, speed, (len(bias.members), *turns), where)
     return replace(bias, mean=mean, sigma=sigma)
@@ -94,12 +171,14 @@ def bias_of(
 def _prior(
     table: BiasTable, quantity: Quantity, speed: float, shape: tuple[int, ...], where: str
 ) -> tuple[Array, Array | None]:
+    # A scale is a number whatever the rows measure, a rotation an angle.
     own: dict[str, Quantity] = {"scale": "plain", "rotation": "angle"}
     units = Units(own.get(table.form, quantity), speed)
 
     def si(value: float | str, key: str) -> float:
         place, text = join(where, f"key {key!r}"), value
         bare = "1" if units.quantity in {"plain", "ratio"} and table.form != "drift" else None
+        # A drift has the unit of its rows per second, or per second squared of a drift of a rate.
         if table.form == "drift":
             number, _, unit = str(value).strip().partition(" ")
             amount, slash, _ = unit.replace("^2", "/s").rpartition("/s")
@@ -142,17 +221,6 @@ def prior_of(table: PriorTable, dimension: int, source: str) -> Prior:
 
 # Constraints of a problem file, and those that a command line adds to it.
 
-Constraint = Band | Polygon
-
-_KEYS = {
-    "box": ("min", "max", "unit"),
-    "height": ("exactly", "min", "max", "unit"),
-    "above-ground": (),
-    "polygon": ("corners", "corners_deg", "unit"),
-    "visible": ("stations", "elevation"),
-    "speed": ("min", "max", "unit"),
-}
-
 
 def constraints_of(
     tables: Mapping[str, ConstraintTable],
@@ -182,11 +250,12 @@ def constraints_of(
     found: list[Constraint] = []
     for where, table in tables.items():
         _check_keys(table, where)
+        # A constraint without a target is one for each that is estimated, named after it.
         for target in _targets(table, motions, names, where):
             suffix = f" of {names[target]}" if len(motions) > 1 else ""
-            made = _made(table, stations, frame, where, speed)
+            made = _make(table, stations, frame, where, speed)
             found += [replace(c, target=target, name=c.name + suffix) for c in made]
-    return tuple(_merged(found))
+    return tuple(_merge(found))
 
 
 def _check_keys(table: ConstraintTable, where: str) -> None:
@@ -217,7 +286,7 @@ def _targets(table: ConstraintTable, motions: Sequence[Motion], names: Sequence[
     return [list(names).index(table.target) if len(motions) > 1 else 0]
 
 
-def _made(table: ConstraintTable, stations: Stations, frame: Frame, where: str, c: float) -> Sequence[Constraint]:
+def _make(table: ConstraintTable, stations: Stations, frame: Frame, where: str, c: float) -> Sequence[Constraint]:
     if table.kind == "box":
         low, high = (_corner(table, key, stations.dimension, where, c) for key in ("min", "max"))
         return box(low.tolist(), high.tolist())
@@ -278,6 +347,7 @@ def _region(table: ConstraintTable, frame: Frame, where: str, c: float) -> Seque
     else:
         assert frame.origin is not None
         lat, lon = np.radians(corners).T
+        # At the height of the plan: a point above the ground has another x and y in it.
         level = np.full(len(corners), frame.origin[2])
         corners = frame.from_geodetic(lat, lon, level, where=place, first_row=1)[:, :2]
     check_polygon(corners, place)
@@ -306,67 +376,11 @@ def _sight(table: ConstraintTable, stations: Stations, frame: Frame, where: str)
     return [replace(band, name=f"sight of {name}") for band, name in zip(seen, chosen, strict=True)]
 
 
-def _merged(constraints: Sequence[Constraint]) -> Iterator[Constraint]:
+def _merge(constraints: Sequence[Constraint]) -> Iterator[Constraint]:
     """Yield the intersection of the bands on each quantity, and every polygon once."""
+    # Two bands on one quantity may contradict each other: that is found by the problem's own check, not hidden here.
     for bands in like(constraints):
         lower, upper = np.max([band.lower for band in bands], axis=0), np.min([band.upper for band in bands], axis=0)
         if np.isfinite(lower) or np.isfinite(upper) or lower > upper or np.isnan([lower, upper]).any():
             yield replace(bands[0], lower=lower, upper=upper)
     yield from {(c.target, c.vertices.tobytes()): c for c in constraints if isinstance(c, Polygon)}.values()
-
-
-# Targets whose positions are given, for calibration: their tables are read like those of stations.
-
-
-def places_of(file: ProblemFile, folder: Path, source: str) -> dict[str | None, Table]:
-    """Return the tables of targets whose motion is known, by name; None is the table ``[target]``."""
-    sections: list[tuple[str | None, TargetTable]] = [(None, file.target), *file.targets.items()]
-    found = {}
-    for name, section in sections:
-        where = join(source, "[target]" if name is None else f"[targets.{name}]")
-        if section.moves == "known":
-            found[name] = table_of(section, folder, where)
-        elif section.file is not None or section.rows is not None:
-            advice = 'write motion = "known", or leave the rows out'
-            raise InvalidProblem(f"the motion is {section.motion}, but its places are given", where, advice)
-    return found
-
-
-def known_of(
-    file: ProblemFile, places: Mapping[str | None, Table], epochs: Epochs, frame: Frame, dimension: int
-) -> dict[str, Array]:
-    """Return the states (k or 1, order + 1, d) of the known targets by name; arguments as `places_of` returns them."""
-    states = {}
-    for i, name in enumerate(epochs.targets):
-        key = name if name in file.targets else None
-        if key in places:
-            section = file.target if key is None else file.targets[key]
-            wanted = _settled(file.frame, frame, dimension)
-            states[name] = _states(
-                section, places[key], name, epochs, np.unique(epochs.index[epochs.target == i]), wanted
-            )
-    return states
-
-
-def _states(section: TargetTable, table: Table, name: str, epochs: Epochs, heard: Array, wanted: FrameTable) -> Array:
-    dated = table.has("time") or table.has("epoch")
-    if table.count > 1 and not dated:
-        raise InvalidProblem(f"target {name!r} has several places", table.source, "give a column 'time' or 'epoch'")
-    own = {key: value for key, value in table.names.items() if key != "name"}
-    named = Table(table.source, {**table.columns, "name": np.full(table.count, name, dtype=object)}, table.count, own)
-    units = StationsTable(unit=section.unit, speed_unit=section.speed_unit, time_unit=section.time_unit)
-    found = replace(survey(units, named, wanted, table.source)[0], noun="target")
-    position, velocity = found.position[:, None], None if found.velocity is None else found.velocity[:, None]
-    if dated:
-        used = np.stack([heard, np.zeros_like(heard)], axis=-1)
-        position, velocity, _ = spread(found, units, epochs, used)
-    return position if velocity is None else np.concatenate([position, velocity], axis=-2)
-
-
-def _settled(wanted: FrameTable, frame: Frame, dimension: int) -> FrameTable:
-    """Return the frame table with the origin and the dimension that the stations decided."""
-    origin = None
-    if frame.origin is not None:
-        lat, lon = np.degrees(frame.origin[:2]).tolist()
-        origin = Origin(lat_deg=lat, lon_deg=lon, height=frame.origin[2])
-    return wanted.model_copy(update={"dimension": dimension, "origin": origin})

@@ -9,8 +9,6 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.units import SI_UNIT, SPEED_OF_LIGHT, AzimuthConvention, Conversion, Quantity, conversion
 from optloc.models import MODELS, Model
 
-__all__ = ["Units", "join", "kind_model", "nearest"]
-
 
 def join(*places: str | None) -> str:
     """Return one place out of several, from the file inwards."""
@@ -72,11 +70,13 @@ class Units:
         where : str
             Place to name.
         """
+        # A number that TOML read is spelled again: one way for both.
         text, _, unit = str(value).strip().partition(" ")
         try:
             number = float(text)
         except ValueError:
             number = math.nan
+        # The example repeats the number that was written, so that it can be copied.
         example = f'"{text if math.isfinite(number) else 1.5} {SI_UNIT[self.quantity]}"'
         if not math.isfinite(number):
             raise InvalidProblem(f"{value!r} is no amount", where, f"write a number and a unit, such as {example}")

@@ -66,10 +66,12 @@ def write_measured(source: Path, out: Path, z: Array, note: str = "") -> list[Pa
         raise InvalidProblem("several trials of a run of epochs do not fit one file", str(out), advice)
     if out.suffix.lower() != ".toml":
         raise InvalidProblem("a simulation is written as a problem file", str(out), "let its name end in .toml")
+    # What the author left out stays out, and takes the same defaults again.
     settings = made.file.model_dump(exclude_defaults=True)
     settings["title"] = " ".join(part for part in (made.loaded.title, f"({note})" if note else "") if part)
     for section in (settings["stations"], settings.get("target", {}), *settings.get("targets", {}).values()):
         if "file" in section:
+            # Tables that are not written again stay where they are: their paths are relative to the new file.
             section["file"] = os.path.relpath(source.parent / section["file"], out.parent)
     written = [out]
     for i, (section, table) in enumerate(zip(settings["measurements"], made.tables, strict=True)):
@@ -106,6 +108,7 @@ def _toml(settings: dict[str, Any], path: tuple[str, ...] = ()) -> str:
     plain, tables = [], []
     for key, value in settings.items():
         name = (*path, key)
+        # Tables of the first level get a header; deeper ones are written inline, which TOML allows everywhere.
         if isinstance(value, dict) and len(path) < 1:
             tables.append(f"\n[{'.'.join(map(_key, name))}]\n" + _toml(value, name))
         elif isinstance(value, list) and value and isinstance(value[0], dict) and not path:
@@ -124,4 +127,5 @@ def _value(value: Any) -> str:
         return "{ " + ", ".join(f"{_key(k)} = {_value(v)}" for k, v in value.items() if v is not None) + " }"
     if isinstance(value, list):
         return "[" + ", ".join(_value(item) for item in value) + "]"
+    # repr keeps every digit; JSON spells strings, booleans and whole numbers as TOML does.
     return repr(value) if isinstance(value, float) else json.dumps(value, ensure_ascii=False)

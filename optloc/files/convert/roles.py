@@ -34,35 +34,14 @@ GUESSES = {
     "lon": "lon long lng longitude",
     "height": "height h alt altitude elevation ellipsoidalheight",
 }
+GEOJSON = (".geojson", ".json")
+# Properties of a GeoJSON point that may be its name or its height, the likeliest first.
+_NAMES = ("name", "station", "title", "callsign", "id", "receiver", "sensor")
+_HEIGHTS = ("height", "height_m", "altitude", "alt", "elevation", "ele", "h_m", "h")
+_FLAT = "no heights are given: all stations are taken to be at height 0"
+# Longest first: of toa_ns the unit is ns, not s.
 _UNITS = sorted({*UNITS["length"], *UNITS["angle"]}, key=len, reverse=True)
 _SUFFIX = re.compile(rf"[_ \[(]+({'|'.join(_UNITS)})[\])]?$", re.IGNORECASE)
-
-
-def read_table(path: Path) -> Table:
-    """Return a CSV or Parquet table; what separates the fields of a CSV file is seen from its header."""
-    if path.suffix.lower() in (".parquet", ".pq"):
-        return parquet(existing(path), {})
-    if path.suffix.lower() not in (".csv", ".tsv", ".txt") and path.is_file():
-        known = "use .csv, .tsv, .txt or .parquet, and .geojson for stations"
-        raise InvalidProblem(f"files of type {path.suffix or path.name!r} are unknown", str(path), known)
-    with existing(path).open("rb") as stream:
-        header = stream.readline()
-    separator = max(b",;\t", key=header.count)
-    found = csv(path, chr(separator), {})
-    if not found.count:
-        raise InvalidProblem("the table has no rows", found.source, "give at least one")
-    return found
-
-
-def stem(column: str) -> str:
-    """Return a column's name without case, unit and signs: "TOA_ns" is "toa"."""
-    return re.sub(r"[^a-z0-9]", "", _SUFFIX.sub("", column.strip()).lower())
-
-
-def unit_of(column: str, known: Iterable[str]) -> str | None:
-    """Return the unit that a column's name ends in, None where it is none of those known."""
-    found = _SUFFIX.search(column.strip())
-    return None if found is None else {unit.lower(): unit for unit in known}.get(found.group(1).lower())
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +68,7 @@ class Roles:
                     advice = nearest(part, columns)
                     raise InvalidProblem(f"there is no column {part!r} for the {role}", self.table.source, advice)
             return self.told[role]
+        # Reversed, so that of two columns with one stem the first one counts.
         stems = {stem(name): name for name in reversed(columns)}
         return next((stems[guess] for guess in GUESSES[role].split() if guess in stems), None)
 
@@ -129,11 +109,35 @@ class Roles:
         return out
 
 
-# Stations from a table or from GeoJSON points.
+def read_table(path: Path) -> Table:
+    """Return a CSV or Parquet table; what separates the fields of a CSV file is seen from its header."""
+    if path.suffix.lower() in (".parquet", ".pq"):
+        return parquet(existing(path), {})
+    if path.suffix.lower() not in (".csv", ".tsv", ".txt") and path.is_file():
+        known = "use .csv, .tsv, .txt or .parquet, and .geojson for stations"
+        raise InvalidProblem(f"files of type {path.suffix or path.name!r} are unknown", str(path), known)
+    with existing(path).open("rb") as stream:
+        header = stream.readline()
+    # What separates is what the header has most of.
+    separator = max(b",;\t", key=header.count)
+    found = csv(path, chr(separator), {})
+    if not found.count:
+        raise InvalidProblem("the table has no rows", found.source, "give at least one")
+    return found
 
-GEOJSON = (".geojson", ".json")
-_NAMES = ("name", "station", "title", "callsign", "id", "receiver", "sensor")
-_HEIGHTS = ("height", "height_m", "altitude", "alt", "elevation", "ele", "h_m", "h")
+
+def stem(column: str) -> str:
+    """Return a column's name without case, unit and signs: "TOA_ns" is "toa"."""
+    return re.sub(r"[^a-z0-9]", "", _SUFFIX.sub("", column.strip()).lower())
+
+
+def unit_of(column: str, known: Iterable[str]) -> str | None:
+    """Return the unit that a column's name ends in, None where it is none of those known."""
+    found = _SUFFIX.search(column.strip())
+    return None if found is None else {unit.lower(): unit for unit in known}.get(found.group(1).lower())
+
+
+# Stations from a table or from GeoJSON points.
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,9 +178,6 @@ def _of_table(path: Path, told: Mapping[str, str], frame: str) -> Places:
     assert x is not None
     unit = unit_of(x, UNITS["length"]) or "m"
     return Places({"name": names} | {axis: roles.numbers(axis) for axis in axes}, frame, unit)
-
-
-_FLAT = "no heights are given: all stations are taken to be at height 0"
 
 
 def _of_geojson(path: Path) -> Places:

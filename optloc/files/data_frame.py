@@ -80,6 +80,7 @@ def from_table(
     place: dict[str, Any] = {"kind": frame} if isinstance(frame, str) else dict(frame)
     station_table = _station_table(stations, (station_options or {}).get("columns", {}))
     measured = {"kind": kind, "unit": dict(unit) if isinstance(unit, Mapping) else unit, "sigma": sigma, **options}
+    # The arguments as a problem file: one reader serves both, and complaints name "arguments".
     settings = {
         "format": 1,
         "propagation_speed": propagation_speed,
@@ -99,6 +100,7 @@ def _station_table(stations: Any, names: Mapping[str, str]) -> Table:
         if stations.position.shape[:-2] != (1,):
             raise InvalidProblem("these stations move or are a batch", "stations", "give a table with a column 'time'")
         stations = dict(zip(stations.names, stations.position[0], strict=True))
+    # A mapping of names to coordinates, unless it has a column of names.
     if isinstance(stations, Mapping) and "name" not in stations and names.get("name") not in stations:
         try:
             position = np.array([np.asarray(value, dtype=float) for value in stations.values()])
