@@ -20,6 +20,7 @@ def library(array: Any) -> Any:
     """Return the module of an array's library: numpy for numbers and numpy arrays."""
     if isinstance(array, np.ndarray):
         return np
+    # PyTorch's arrays do not offer `__array_namespace__`, and its module follows the standard well enough.
     if type(array).__module__ == "torch":
         return sys.modules["torch"]
     own = getattr(array, "__array_namespace__", None)
@@ -71,6 +72,7 @@ def gather(array: Any, index: Array, axis: int = -1) -> Any:
         flat = xp.take(array, index.reshape(-1), axis=axis)
     else:
         flat = xp.take(array, xp.asarray(index.reshape(-1), device=array.device), axis=axis)
+    # The standard takes along a flat index table only.
     place = array.ndim + axis
     return xp.reshape(flat, (*array.shape[:place], *index.shape, *array.shape[place + 1 :]))
 
@@ -117,6 +119,7 @@ def whole(values: Any, name: str) -> Array | None:
     array = numbers(values, name)
     if array is None:
         return None
+    # Written so that NaN passes for whole numbers nowhere: NaN differs from its own floor.
     bad = array != np.floor(array)
     if bad.any():
         raise InvalidProblem(f"{array[bad][0]:g} is not a whole number", name, "give indices")

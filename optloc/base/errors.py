@@ -77,6 +77,7 @@ class NoSolution(OptlocError):  # noqa: N818  (a verdict about the problem)
         status = getattr(self.fix, "status", None)
         if status is None:
             return "There is no fix."
+        # A dictionary instead of a set keeps the order in which the verdicts occur in the batch.
         verdicts = {Status(int(code)): None for code in np.ravel(status)}
         refused = [verdict.sentence for verdict in verdicts if verdict is not Status.OK]
         return " ".join(refused or [verdict.sentence for verdict in verdicts])

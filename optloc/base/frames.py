@@ -97,6 +97,7 @@ class Frame:
 
     def from_ecef(self, position: ArrayLike) -> Array:
         """Convert ECEF positions, shape (..., 3) in metres, to this frame."""
+        # Subtracted before it is turned: turned numbers of the Earth's size are rounded to a nanometre.
         return (_vectors(position, (3,)) - self.origin_ecef()) @ self.rotation_to_ecef()
 
     def to_geodetic(self, position: ArrayLike) -> tuple[Array, Array, Array]:
@@ -142,6 +143,7 @@ class Frame:
         """
         p = _vectors(position, (2, 3))
         d = p.shape[-1]
+        # In the plane the frame's own axes are meant, as they are where there is no Earth.
         if not self.geodetic or (self.kind == "enu" and d == 2):
             return np.broadcast_to(np.eye(d), (*p.shape, d)).copy()
         lat, lon, _ = self.to_geodetic(p)
@@ -227,6 +229,7 @@ def check_geodetic(
         or that has a coordinate that is not finite.
     """
     slack = 1e-9  # a right angle converted from degrees may exceed pi / 2 by rounding
+    # Longitudes come as -180 to 180 and as 0 to 360 deg; both mean the same place.
     ranges = {"latitude": (lat, -90.0, 90.0), "longitude": (lon, -180.0, 360.0)}
     for name, (values, low, high) in ranges.items():
         degrees = np.degrees(np.asarray(values, dtype=np.float64)).ravel()

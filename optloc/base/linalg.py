@@ -33,6 +33,7 @@ def factor(matrix: Array, least: float = PIVOT) -> tuple[Array, Array]:
     """
     n = matrix.shape[-1]
     if arrays.foreign(matrix):
+        # Arrays of some libraries cannot be written; in numpy, writing column by column is the quicker way.
         return _factor(matrix, least)
     lower = np.zeros(matrix.shape)
     ok = np.ones(matrix.shape[:-2], dtype=bool)
@@ -42,6 +43,7 @@ def factor(matrix: Array, least: float = PIVOT) -> tuple[Array, Array]:
         pivot = column[..., 0]
         positive = pivot > least * np.abs(matrix[..., j, j])
         ok &= positive
+        # An item that is not definite goes on with a pivot of one: its numbers stay finite, and mean nothing.
         lower[..., j:, j] = column / np.sqrt(np.where(positive, pivot, 1.0))[..., None]
     return lower, ok
 
@@ -50,6 +52,7 @@ def _factor(matrix: Any, least: float) -> tuple[Any, Any]:
     """Return what `factor` does without writing into an array: column by column, the rest less what each explains."""
     xp, n = arrays.library(matrix), matrix.shape[-1]
     below = arrays.placed(np.tril(np.ones((n, n))), matrix)
+    # The first comparison makes a mask of the batch's shape on the array's own device; a NaN there is not ok.
     rest, columns, ok = matrix, [], matrix[..., 0, 0] == matrix[..., 0, 0]
     for j in range(n):
         pivot = rest[..., j, j]
@@ -117,6 +120,7 @@ def solve(matrix: Array, right: Array, least: float = PIVOT) -> tuple[Array, Arr
     xp = arrays.library(matrix)
     diagonal = xp.linalg.diagonal(matrix)
     good = diagonal > 0.0
+    # Metres beside radians and seconds: scaled, a pivot says how much of its unknown is known, whatever its unit.
     scale = 1.0 / xp.sqrt(xp.where(good, diagonal, 1.0))
     lower, ok = factor(matrix * scale[..., :, None] * scale[..., None, :], least)
     ok = ok & xp.all(good, axis=-1)
@@ -129,6 +133,7 @@ def inverse(matrix: Array, least: float = PIVOT) -> tuple[Array, Array]:
     """Return inverses (..., n, n) of symmetric positive definite matrices, NaN where not ok, and ok (...)."""
     xp = arrays.library(matrix)
     out, ok = solve(matrix, xp.broadcast_to(arrays.eye(matrix.shape[-1], matrix), matrix.shape), least)
+    # Rounding of the two substitutions differs across the diagonal; covariances are symmetric to the last bit.
     return xp.where(ok[..., None, None], 0.5 * (out + out.mT), xp.nan), ok
 
 
@@ -153,9 +158,12 @@ def root(matrix: Array, cut: float = 1e-12) -> tuple[Array, Array]:
     diagonal = xp.linalg.diagonal(matrix)
     scale = 1.0 / xp.sqrt(xp.where(diagonal > 0.0, diagonal, 1.0))
     scaled = matrix * scale[..., :, None] * scale[..., None, :]
+    # LAPACK refuses a matrix with a NaN, and with it the whole batch: such an item is handed zeros, and keeps no
+    # direction.
     finite = xp.all(xp.isfinite(scaled), axis=(-1, -2))
     values, vectors = xp.linalg.eigh(xp.where(finite[..., None, None], scaled, 0.0))
     largest = values[..., -1:]
+    # Of a matrix of zeros nothing is kept: the largest counts as no less than the cut.
     kept = values > cut * xp.where(largest > cut, largest, cut)
     inverse = xp.where(kept, 1.0 / xp.sqrt(xp.where(kept, values, 1.0)), 0.0)
     return scale[..., :, None] * vectors * inverse[..., None, :], xp.all(kept, axis=-1)
@@ -178,6 +186,7 @@ def whitening(covariance: Array) -> Array:
     xp = arrays.library(covariance)
     diagonal = xp.linalg.diagonal(covariance)
     absent = diagonal == 0.0
+    # Independent rows are the usual case, and a square root is all that they need.
     if covariance.shape[-1] == 1:
         single: Array = xp.where(absent[..., None], 0.0, 1.0 / xp.sqrt(xp.where(absent[..., None], 1.0, covariance)))
         return single
@@ -185,10 +194,14 @@ def whitening(covariance: Array) -> Array:
     unit = covariance * scale[..., :, None] * scale[..., None, :]
     eye = xp.broadcast_to(arrays.eye(covariance.shape[-1], covariance), covariance.shape)
     lower, ok = factor(xp.where(absent[..., None], eye, unit))
+    # A pivot of a millionth (its square 1e-12) is left of a loop of rows whose errors cancel: only the eigenvalues
+    # tell what of it is noise.
     ok = ok & xp.all(xp.linalg.diagonal(lower) > 1e-6, axis=-1)
     matrix = _forward(xp.where(ok[..., None, None], lower, eye), eye)
     if not bool(xp.all(ok)):
         values, vectors = xp.linalg.eigh(xp.where(xp.isfinite(unit), unit, 0.0))
+        # Rounding leaves eigenvalues of some 1e-15 to directions without noise; sigmas up to 1e5 times smaller than
+        # others are meant.
         kept = values > 1e-10 * values[..., -1:]
         roots = xp.where(kept, 1.0 / xp.sqrt(xp.where(kept, values, 1.0)), 0.0)
         matrix = xp.where(ok[..., None, None], matrix, roots[..., :, None] * vectors.mT)
@@ -226,10 +239,12 @@ def tangent(gradients: Array, scale: Array) -> Tangent:
         Typical size of each unknown: decides what "shortest" means.
     """
     c = gradients.shape[-2]
+    # Columns of the scaled gradients: their QR factors split the space into across (first c) and along.
     scaled = np.swapaxes(gradients * scale[:, None], -1, -2)
     scaled = np.where(np.isfinite(scaled), scaled, 0.0)
     q, r = np.linalg.qr(scaled, mode="complete")
     size = np.abs(np.diagonal(r, axis1=-2, axis2=-1))
+    # Four digits above rounding; 1e-300 keeps gradients of zero from being their own scale.
     regular = size > 1e-12 * np.maximum(size.max(-1, keepdims=True), 1e-300)
     lower = np.swapaxes(r[:, :c], -1, -2)
     restore = np.zeros_like(lower)
@@ -245,6 +260,7 @@ def solve_within(information: Array, vector: Array, space: Tangent) -> tuple[Arr
     """Return the step (N, n) within the tangent space that solves the normal equations, and where it exists (N,)."""
     z = space.along
     if z.shape[-1] == 0:
+        # As many equalities as unknowns leave no step, which is an answer and no failure.
         return np.zeros_like(vector), np.ones(len(vector), dtype=bool)
     transposed = np.swapaxes(z, -1, -2)
     part, ok = solve(transposed @ information @ z, transposed @ vector[..., None])
@@ -285,6 +301,7 @@ def error_ellipse(covariance: Array, probability: float = 0.95) -> tuple[Array, 
 
     known = np.asarray(np.isfinite(covariance).all((-1, -2)))
     values, vectors = np.linalg.eigh(np.where(known[..., None, None], covariance, 0.0))
+    # The quantile of chi-square by the incomplete gamma function: `scipy.stats` takes a second to load.
     scale = np.sqrt(2.0 * gammaincinv(covariance.shape[-1] / 2, probability))
     axes = scale * np.sqrt(np.maximum(values, 0.0))
     return np.where(known[..., None], axes, np.nan), np.where(known[..., None, None], vectors, np.nan)

@@ -32,6 +32,7 @@ class Table(MutableMapping[str, T]):
         self._group, self._fits, self._own = group, fits, own
         self._found: dict[str, T] | None = None
 
+    # What optloc has is found without looking for entry points, which takes some ten milliseconds.
     def __getitem__(self, name: str) -> T:
         return self._own[name] if name in self._own else self._added[name]
 

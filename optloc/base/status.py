@@ -9,6 +9,7 @@ from enum import IntEnum
 class Status(IntEnum):
     """Whether a fix holds an answer; every member carries a sentence with advice."""
 
+    # The numbers stand in stored studies: a new member takes the next one, none changes.
     OK = 0
     AMBIGUOUS = 1
     SEARCHED = 2
@@ -35,6 +36,7 @@ class Status(IntEnum):
         return self.name.lower().replace("_", " ")
 
 
+# What happened, then what helps: a user reads this sentence and no code.
 _SENTENCES: dict[Status, str] = {
     Status.OK: "A refined maximum-likelihood fix.",
     Status.AMBIGUOUS: "Several positions explain the data about equally well; see the alternatives, or add a row, a "

@@ -63,10 +63,12 @@ def mapped(
         The results. If a call raises, the error of the earliest such item is raised.
     """
     work = list(items)
+    # A single item, or a single thread, runs where it is called: no pool, plain tracebacks.
     count = min(thread_count() if threads is None else max(threads, 1), len(work))
     if count <= 1:
         return [function(item) for item in work]
     if least > 0.0:
+        # Two, because the first call may build what the others share; the quicker one tells.
         begun, seconds = _timed(function, work[:2])
         some = mapped(function, work[2:], 1 if seconds < least else count)
         return begun + some

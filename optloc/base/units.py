@@ -49,7 +49,9 @@ AzimuthConvention = Literal["east-counterclockwise", "north-clockwise"]
 SPEED_OF_LIGHT: Final = 299_792_458.0
 """Speed of light in vacuum in m/s (exact, SI)."""
 
+# Apart, because a length may be given as a time too: it is multiplied by the speed of propagation.
 _TIME: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "ps": 1e-12}
+# Exact by definition since 1959, as the nautical mile since 1929, in metres.
 _FOOT: Final = 0.3048
 _NAUTICAL_MILE: Final = 1852.0
 
@@ -74,6 +76,7 @@ UNITS: Final[Mapping[Quantity, Mapping[str, float]]] = MappingProxyType(
             "arcsec": math.pi / 648_000,
         },
         "ratio": {"1": 1.0, "dB": 1.0},
+        # A neper is a factor e of amplitudes, 20 log10(e) decibels.
         "level": {"dB": 1.0, "Np": 20.0 / math.log(10)},
         "speed": {
             "m/s": 1.0,
@@ -195,9 +198,11 @@ def conversion(
     """
     _check_options(unit, quantity, propagation_speed, convention, where)
     factor = UNITS[quantity][unit]
+    # A travel time stands for the way that it takes.
     if quantity == "length" and unit in _TIME:
         return Conversion(factor * propagation_speed)
     if unit == "dB" and quantity == "ratio":
+        # Amplitude falls with the range, so that 20 decibels are a factor of ten in range.
         return Conversion(math.log(10) / 20, logarithmic=True)
     if unit == "Hz":
         if carrier is None or not (math.isfinite(carrier) and carrier > 0):
@@ -207,8 +212,10 @@ def conversion(
                 where,
                 "a frequency difference in Hz is a speed only beside its carrier",
             )
+        # Negative: a receding emitter is heard at a lower frequency.
         return Conversion(-propagation_speed / carrier)
     if quantity == "angle" and convention == "north-clockwise":
+        # A compass turns the other way and begins at north.
         return Conversion(-factor, offset=math.pi / 2)
     return Conversion(factor)
 

@@ -15,7 +15,8 @@ from optloc.compute.pack import Numbers, Packed
 from optloc.compute.tables import Tables
 from optloc.linear.normal import Normal
 
-_SHARE = 64  # starts that are worth a thread of their own
+# Starts that are worth a thread of their own: one block of lanes, see `optloc.compute.lanes`.
+_SHARE = 64
 
 
 class Sums(NamedTuple):
@@ -31,6 +32,7 @@ class Sums(NamedTuple):
 
 def chunks(count: int, least: int = _SHARE) -> list[tuple[int, int]]:
     """Return stretches (first, last) of a number of starts, one for each thread that is worth it."""
+    # Threads get stretches of equal length: starts take about the same time, and each stretch keeps its memory.
     parts = max(1, min(thread_count(), count // least))
     ends = np.linspace(0, count, parts + 1).round().astype(int).tolist()
     return list(pairwise(ends))
@@ -79,6 +81,7 @@ def normal_block(packed: Packed, x: Array, item: Array, first: int, last: int, p
             load(m, b, item[begin + b], c.source, c.white, c.prior, c.observed, c.present)
             for i in range(size):
                 m[room.trial + i, b] = x[begin + b, i]
+        # Of one epoch the own unknowns are columns beside the shared ones; of several they would be mostly zeros.
         if t.local > 0 and t.epochs > 1:
             _epochs(t, c, m, r, room, begin, used, priors, out.local, out.cross, out.local_vector)
         else:
@@ -106,6 +109,7 @@ def _epochs(
     clear(m, room.now, (last + 1) ** 2, used)
     for epoch in range(t.epochs):
         clear(m, room.after, (last + 1) ** 2, used)
+        # Groups come in the order of their epochs, packets in that of their groups: one pass goes through all.
         while group < t.groups and t.table[t.group + group, 2] == epoch:
             if packet < t.packets and t.table[t.packet + packet, 0] == group:
                 measure(t, c.common, m, r, room, packet, room.trial, used)
@@ -118,6 +122,7 @@ def _epochs(
                 x = room.trial + start + epoch * t.local
                 add_prior(c.common, c.place[i, 0], c.place[i, 2], m, room, x, start, last, used)
         _own(m, room.after, t.shared, t.local, begin, epoch, used, local, cross, vector)
+        # Only what concerns the shared unknowns is summed; couplings belong to the epoch and are written out.
         for i in range(last + 1):
             if i < t.shared or i == last:
                 for j in range(i + 1):

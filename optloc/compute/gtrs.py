@@ -16,14 +16,20 @@ from optloc.base.types import Array
 from optloc.compute.jit import compiled
 from optloc.compute.systems import LANES, factor_plain, solve_plain
 
+# Newton's steps: with range differences and ranges of five and six stations all lanes settled in three or four; what
+# has not settled after three times as many needs the other tool.
 _STEPS = 12
-_WEAK = 1e-7  # a pivot below this share of the largest entry: the eigenvalues are the better tool
-_SETTLED = 1e-7  # relative change of y below which the last, polishing step squares the error away
+# A pivot below this share of the largest entry of B'B: half of the digits are gone, and the eigenvalues of the pencil
+# are the better tool.
+_WEAK = 1e-7
+# Relative change of y below which the last, polishing step squares the error away: 1e-14.
+_SETTLED = 1e-7
 
 
 @compiled
 def scratch(n: int) -> int:
     """Return how many rows of lanes `minimise` needs as scratch for y of length n."""
+    # Two matrices, five vectors and seven numbers of each lane: see the split in `minimise`.
     return 2 * n * n + 5 * n + 7
 
 
@@ -66,6 +72,7 @@ def minimise(rows: Array, on_cone: bool, y: Array, settled: Array, work: Array) 
     )
     _normal(rows, A, b, least)
     for lane in range(LANES):
+        # Least squares without the constraint is the start: multiplier zero, inside where B'B is definite.
         multiplier[lane], last[lane], todo[lane] = 0.0, 0.0, 1.0
     for _ in range(_STEPS):
         _shifted(A, b, multiplier, on_cone, slope, y)
@@ -81,6 +88,7 @@ def minimise(rows: Array, on_cone: bool, y: Array, settled: Array, work: Array) 
         solve_plain(lower, inverse, p)
         if not _advance(y, across, p, on_cone, spare, slope):
             break
+    # One more Newton step on the optimality conditions themselves restores the digits that B'B has lost.
     _residual_slope(rows, y, across, multiplier, slope, value)
     solve_plain(lower, inverse, slope)
     _step(y, across, p, on_cone, slope, bend, value)
@@ -141,6 +149,7 @@ def _value(y: Array, across: Array, on_cone: bool, out: Array) -> None:
     """Write half of ``y'Cy + 2h'y``."""
     n = len(y)
     for lane in range(LANES):
+        # h is zero for the cone, and minus a half in its last entry for the paraboloid.
         out[lane] = 0.0 if on_cone else -0.25 * y[n - 1, lane]
     for i in range(n):
         for lane in range(LANES):
@@ -166,8 +175,10 @@ def _advance(y: Array, across: Array, p: Array, on_cone: bool, spare: Array, fre
     for lane in range(LANES):
         inside, now = definite[lane] != 0.0, multiplier[lane]
         step = value[lane] / bend[lane]
+        # By how much the answer moves, not the multiplier, whose size says little.
         moves = abs(step) * far[lane] > _SETTLED * big[lane]
         todo[lane] = todo[lane] if moves or not inside else 0.0
+        # The last multiplier inside is known to be definite: halving towards it must come back.
         target = now + step if inside else 0.5 * (now + last[lane])
         last[lane] = now if inside else last[lane]
         multiplier[lane] = target if todo[lane] != 0.0 else now

@@ -11,6 +11,7 @@ from typing import Any, TypeVar, cast
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
+# A context variable: one thread may run plainly while others run machine code.
 _PLAIN = ContextVar("plain", default=False)
 _LOCK = Lock()
 
@@ -21,6 +22,8 @@ def _numba() -> Any:
         import numba
     except ImportError:
         return None
+    # numba reads the variable NUMBA_DISABLE_JIT; its kernels would then be plain functions, without its rules of
+    # division.
     settings: Any = numba.config
     return None if settings.DISABLE_JIT else numba
 

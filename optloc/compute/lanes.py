@@ -22,7 +22,10 @@ from optloc.compute.trace import ADD, ATAN2, COS, DIV, HYPOT, LOG, MUL, NEG, SIN
 # Working memory of a block of lanes, and where everything stands in it.
 
 LENGTH = 128
-"""Length of a register: rows of one kind are put behind each other, lanes of one and then of the next."""
+"""Length of a register: rows of one kind are put behind each other, lanes of one and then of the next.
+
+A few lanes share the choice of an operation over several rows; twice the most lanes, so that full blocks take two.
+"""
 
 
 class Room(NamedTuple):
@@ -53,7 +56,8 @@ class Room(NamedTuple):
 STATE = 10
 """Cells that a refinement keeps of every problem."""
 
-# Lanes of a block: as many as keep the cells that are used again and again in the cache, and all of them in bounds.
+# Lanes of a block: as many as keep the cells that are used again and again (2**18 doubles, 2 MB) in the cache, and all
+# of them in bounds (64 MB). 64 lanes share the cost of choosing an operation; eight fill a vector register.
 _LANES, _FEWEST, _CELLS, _MOST = 64, 8, 2**18, 2**23
 
 
@@ -129,6 +133,7 @@ def _filled(m: Array, cell: int, lane: int, source: Array, item: int) -> int:
 def blocks(packed: Packed, size: int, count: int) -> int:
     """Return how many of a number of problems of p = `size` unknowns are worked on together: they fit the cache."""
     t = packed.tables
+    # Cells that one step touches again and again: rows of a packet, and the equations at two places.
     each = t.rows * t.width + 2 * (t.shared + t.local + 1) ** 2
     fitting = min(_CELLS // each, _MOST // (each + 2 * size + packed.numbers.observed.shape[1]))
     return int(max(1, min(count, _LANES, max(_FEWEST, _FEWEST * (fitting // _FEWEST)))))
@@ -143,6 +148,8 @@ def memory(t: Tables, room: Room, lanes: int) -> tuple[Array, Array]:
 @compiled
 def run(code: Array, first: int, last: int, r: Array, count: int) -> None:
     """Run operations on the first numbers of registers; see `Tape` and `symbol.OPERATIONS`."""
+    # The operation is chosen once for all lanes, and each loop is one that the compiler turns into vector
+    # instructions.
     for step in range(first, last):
         operation, to, u, v = code[step, 0], code[step, 1], code[step, 2], code[step, 3]
         if operation == MUL:
@@ -171,6 +178,7 @@ def _rare(operation: int, r: Array, to: int, u: int, v: int, count: int) -> None
             r[to, i] = -r[u, i]
     elif operation == HYPOT:
         for i in range(count):
+            # Squares of metres do not overflow, and a call of hypot would end the vector loop.
             r[to, i] = np.sqrt(r[u, i] * r[u, i] + r[v, i] * r[v, i])
     elif operation == ATAN2:
         for i in range(count):
@@ -282,6 +290,7 @@ def _measurement(
     value, first, last, end = to + index[line, 2], index[line, 4], index[line + 1, 4], index[line + 1, 5]
     for b in range(lanes):
         m[value, b] = r[place, low + b]
+    # Rows without a scale, nearly all of them, are left as they are.
     if last > first:
         for b in range(lanes):
             m[scale, b] = 1.0
@@ -311,6 +320,7 @@ def _residual(m: Array, value: int, observed: int, periodic: int, lanes: int) ->
         m[value, b] = m[observed, b] - m[value, b]
     if periodic:
         for b in range(lanes):
+            # Wrapped only where it must be: that takes three transcendental functions.
             if not -pi < m[value, b] <= pi:
                 m[value, b] = np.arctan2(np.sin(m[value, b]), np.cos(m[value, b]))
 
@@ -407,6 +417,7 @@ def _whiten(
             cell = to + i * width + s
             for b in range(lanes):
                 m[cell, b] = 0.0
+            # Whitening matrices are lower triangular but for singular covariances.
             for j in range(size if full else i + 1):
                 row = first + j * width + s
                 if place >= 0:
@@ -438,6 +449,7 @@ def _square(
         for j in range(i + 1):
             cell = line + (index[column + j, 0] if j < columns - 1 else last)
             r, u, v = 0, first + i, first + j
+            # Four rows at a time in two sums: a cell is loaded and stored once for four products.
             while r + 3 < size:
                 for b in range(lanes):
                     m[cell, b] += (m[u, b] * m[v, b] + m[u + width, b] * m[v + width, b]) + (

@@ -69,6 +69,7 @@ def packed(problem: Problem, noise: tuple[Whitener, ...]) -> Packed | None:
     for one, before in ((white, (source,)), (prior, (source, white))):
         shared, own = (sum(part.size(mine) for part in before) for mine in (False, True))
         one.place[:, 0] += np.where(one.place[:, 0] >= 0, shared, -own)
+    # Presence is looked at where some row is absent only: an empty array says that all count.
     weight = problem.weight
     present = np.zeros((1, 0)) if np.all(weight > 0.0) else _plain(weight > 0.0, 1)
     return Packed(
@@ -128,6 +129,7 @@ class _Divided:
         shared, own = ([part for part in parts if (len(part) > 1) == mine] for mine in (False, True))
         flat = np.concatenate([part[0] for part in shared]) if shared else np.zeros(0)
         if len(own) > 1:
+            # A single array of the problems' own numbers, mostly that of the stations, is taken without a copy.
             own = [np.concatenate(own, axis=1)]
         return cls(flat, own[0] if own else np.zeros((1, 0)), place)
 

@@ -36,7 +36,10 @@ from optloc.compute.systems import LANES, factor_plain, solve_plain
 
 # The start of a fix from ranges: measurements, stations and squared-range rows of a block of problems.
 
-_NEAR = 1e-3  # least distance from a station that weighs a row, in units of the stations' spread
+# Least distance from a station that weighs a row, in units of the stations' spread: at the station itself a squared
+# range has no first-order error, and its weight would be infinite.
+_NEAR = 1e-3
+# Four roundings of a double lie between a measurement and its residual.
 _ROUNDING = 4.0 * 2.220446049250313e-16
 
 
@@ -71,6 +74,7 @@ def read(
     for lane in range(LANES):
         blur[lane], good[lane] = 0.0, 1.0
     for j in range(m):
+        # An absent row may hold NaN, which no share of zero would remove.
         if row[1, j] == 0.0:
             for lane in range(LANES):
                 out[j, lane] = 0.0
@@ -129,6 +133,7 @@ def stand(
                 place[i, j, lane] = station[0 if shared else item[lane], i, j]
                 centre[j, lane] += place[i, j, lane] / s
         for lane in range(LANES):
+            # Where the range to one station is unknown it is the apex of the cone: |x| = t holds about it.
             origin[j, lane] = place[reference, j, lane] if reference >= 0 else centre[j, lane]
             centre[j, lane] -= origin[j, lane]
     for lane in range(LANES):
@@ -181,8 +186,10 @@ def square(
         scale[lane] = scale[lane] if scale[lane] > 0.0 else 1.0
         spare[lane] = 1.0 / scale[lane]
     for i in range(s):
+        # The reference's own row would read 0 = 0.
         used = 0.0 if free and (i == reference or sign[i] == 0.0) else 1.0
         for lane in range(LANES):
+            # r_i = c_i + s_i t squared, less |x|^2 = t^2: linear in x and t.
             known = used * c[i, lane] * spare[lane]
             rows[i, d + 1, lane] = known * known
             rows[i, d, lane] = 2.0 * sign[i] * known if free else 1.0
@@ -230,6 +237,7 @@ def weigh(
         for j in range(d + 2):
             for lane in range(LANES):
                 out[i, j, lane] = spare[lane] * rows[i, j, lane]
+    # From the last row up: each needs those above it as they were.
     for i in range(s - 1, -1, -1):
         for j in range(d + 2):
             for lane in range(LANES):
@@ -242,9 +250,13 @@ def weigh(
                         out[i, j, lane] += share * out[k, j, lane]
 
 
-_FEW = 6  # steps after which the problems of a block that still move wait for each other
-_WEAK = 1e-11  # a tenfold margin to the pivot below which a direction counts as open
-_FAR = 2.5e3  # a fourfold margin to the spreads of the stations from which on a fix is doubted
+# Steps after which the problems of a block that still move wait for each other: fixes near their stations take two to
+# five.
+_FEW = 6
+# A tenfold margin to the share below which a direction counts as open (1e-12): between them the long way decides.
+_WEAK = 1e-11
+# A fourfold margin to the spreads of the stations from which on a fix is doubted.
+_FAR = 2.5e3
 
 
 class Model(NamedTuple):
@@ -328,6 +340,7 @@ def fixes(
     vector, matrix, scalar = np.zeros((10, d, LANES)), np.zeros((3, d, d, LANES)), np.zeros((14, LANES))
     c, u, emission, loops = value[:s], value[s : s + q], value[s + q : s + q + e], value[s + q + e :]
     spare, good = scalar[SPARE], scalar[GOOD]
+    # First all blocks with a few steps, then those that still move, collected in full blocks.
     waiting, first, steps, again = 0, 0, 0, False
     while first < (waiting if again else count):
         size = min(LANES, (waiting if again else count) - first)
@@ -342,6 +355,8 @@ def fixes(
             _resume(x, item, vector)
         else:
             square(c, sign, reference, place, scalar[SPREAD], scalar[SCALE], squared, spare)
+            # All ranges as equal first, then weighed by the ranges of that answer: near to maximum likelihood, and no
+            # guess.
             for turn in range(2):
                 weigh(squared, place, y, scalar[SCALE], white, turn == 0, rows, spare)
                 minimise(rows, reference >= 0, y, scalar[SOLVABLE], work)
@@ -450,6 +465,7 @@ def _invert(vector: Array, matrix: Array, scalar: Array) -> None:
             apart = (vector[X, i, lane] - vector[CENTRE, i, lane]) / scalar[SPREAD, lane]
             away[lane] += apart * apart
     for lane in range(LANES):
+        # Far away the cost hardly depends on the distance: verdicts there need the stages of the long way.
         fine[lane] = 1.0 if away[lane] <= _FAR * _FAR else 0.0
     factor_plain(matrix[H], diagonal, matrix[LOWER], inverse)
     for j in range(d):

@@ -60,6 +60,7 @@ def refine(
         scalar[GOOD, lane] = scalar[GOOD, lane] if scalar[COST, lane] < np.inf else 0.0
         scalar[ALIVE, lane] = scalar[GOOD, lane]
         scalar[DAMPING, lane], scalar[GROWTH, lane], scalar[STEPS, lane] = FIRST_DAMPING, FIRST_GROWTH, 0.0
+    # All lanes step until none is alive: a lane that is finished takes no more steps that count.
     for _ in range(limit):
         _propose(vector, matrix, scalar)
         equations(
@@ -129,6 +130,7 @@ def _row(share: Array, seen: Array, r: Array, unit: Array, row: Array, left: Arr
             row[j, lane] = 0.0
     for i in range(s):
         part = share[i]
+        # Pairs of stations: of a row over all ranges two entries are not zero.
         if part != 0.0:
             for lane in range(LANES):
                 left[lane] -= part * r[i, lane]
@@ -182,6 +184,8 @@ def _propose(vector: Array, matrix: Array, scalar: Array) -> None:
         for lane in range(LANES):
             gain[lane] += move[i, lane] * right[i, lane]
             trial[i, lane] = x[i, lane] + move[i, lane]
+            # One over the share of its diagonal that a pivot keeps: at least one, infinite or negative where there is
+            # no pivot.
             share = inverse[i, lane] * diagonal[i, lane]
             solvable[lane] = solvable[lane] if 0.0 < share < 1.0 / PIVOT else 0.0
 
@@ -210,6 +214,7 @@ def _decide(vector: Array, matrix: Array, scalar: Array, tolerance: float) -> bo
         kept[lane] = 1.0 if better else 0.0
     for i in range(d):
         for lane in range(LANES):
+            # Selections instead of branches: lanes that keep and lanes that refuse go through one instruction.
             vector[X, i, lane] = vector[TRIAL, i, lane] if kept[lane] != 0.0 else vector[X, i, lane]
             vector[G, i, lane] = vector[G_TRIAL, i, lane] if kept[lane] != 0.0 else vector[G, i, lane]
         for j in range(i + 1):

@@ -64,6 +64,7 @@ DAMPING, GROWTH, BLUR, GAIN, SOLVABLE, BETTER, COST, TRIED, CLOSED = range(9)
 # What it keeps beside them: which start it is, 1 while nothing but the start is
 # known and 2 before it is there, steps tried, status.
 START, FRESH, STEPS, STATUS = range(4)
+# The lane waits for its start.
 EMPTY = 2
 
 

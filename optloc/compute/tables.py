@@ -54,6 +54,7 @@ class Groups:
         size = np.concatenate([np.full(len(group), group.shape[1]) for group in groups])
         head = starts(size)[:-1]
         epoch = problem.epoch[rows[head]]
+        # By epoch, so that sums over a run pass each epoch once.
         number = np.argsort(epoch, kind="stable")
         rank = np.empty_like(number)
         rank[number] = np.arange(len(number))
@@ -127,6 +128,7 @@ class Columns:
         n, length = problem.layout.n_shared, problem.layout.n_local
         keys = []
         for part in entries:
+            # Local columns of all epochs fall on those of one: a group has rows of a single epoch.
             folded = np.where(part.column < n, part.column, n + (part.column - n) % max(length, 1))
             keys.append(groups.of[part.row] * (n + length) + folded)
         found, place = np.unique(np.concatenate(keys), return_inverse=True)
@@ -162,6 +164,7 @@ class Order:
     @classmethod
     def of(cls, problem: Problem, groups: Groups, width: int) -> Order:
         """Return the order for groups whose rows have a number of columns at most."""
+        # Wide rows, fewer of them: a packet keeps its numbers in the first cache.
         limit = int(np.clip(_NUMBERS // width, _LEAST, _MOST))
         first = starts(groups.size)
         packet = np.unique(first[:-1] // limit, return_inverse=True)[1]
@@ -170,6 +173,7 @@ class Order:
         kind = np.repeat(np.arange(kinds), [rows.count for rows in problem.rows])
         place = first[groups.of] + groups.member
         mine = packet[groups.of]
+        # Packet by packet, in it kind by kind: a tape runs over as many rows as possible.
         row = np.lexsort((place, kind, mine))
         at = np.empty_like(row)
         at[row] = np.arange(len(row))
@@ -303,6 +307,8 @@ def _tables(problem: Problem, groups: tuple[Array, ...], sources: Sources) -> Ke
     layout = problem.layout
     if layout.n_shared + layout.n_local == 0 or _spanning(problem, groups):
         return None
+    # What is done to the data on their way to the inputs is done to their numbers: so it is known what comes from
+    # where.
     numbered, found = sources.numbered(problem), []
     for plan in plans(problem):
         inputs = given(numbered, plan)
@@ -360,6 +366,7 @@ def _filled(problem: Problem, groups: Groups, found: list[_Kind], lookup: Array)
         "column": _table(columns.column),
     }
     begin = starts([len(part) for part in parts.values()])
+    # Six columns are what the widest of the tables, that of rows, needs.
     index = np.zeros((int(begin[-1]), 6), dtype=np.int64)
     for start, part in zip(begin, parts.values(), strict=False):
         index[start : start + len(part), : part.shape[1]] = part

@@ -102,6 +102,7 @@ class Recorder:
         found = None if rule is None else rule(u, v)
         if found is not None:
             return found
+        # Operands of commutative operations in one order, so that equal ones are found.
         if operation in (ADD, MUL, HYPOT):
             u, v = min(u, v), max(u, v)
         return self._number((operation, u, v))
@@ -114,6 +115,7 @@ class Recorder:
             return v
         if self.constant(v) == 0.0:
             return u
+        # Doubling is exact, and a derivative of a square then meets its root: see `_scaled`.
         if u == v:
             return self._simplified(MUL, self.node(2.0), u)
         if self._is(v, NEG):
@@ -130,6 +132,8 @@ class Recorder:
     def _mul(self, u: int, v: int) -> int | None:
         for one, other in ((u, v), (v, u)):
             value = self.constant(one)
+            # Zero times infinity or NaN is given up here: derivatives have many zeros, and h is finite where it is
+            # used.
             if value == 0.0:
                 return self.node(0.0)
             if value in (1.0, -1.0):
@@ -150,6 +154,7 @@ class Recorder:
         if self.constant(factor) is None:
             factor, a = a, factor
         power, top = self.constant(factor), self.constant(self.nodes[v][1])
+        # A power of two moves no digit; any other factor would round differently.
         if power is None or top is None or math.frexp(power)[0] != 0.5:
             return None
         return self._simplified(MUL, a, self._simplified(DIV, self.node(power * top), self.nodes[v][2]))
@@ -274,6 +279,7 @@ def tape(recorder: Recorder, outputs: list[Any]) -> Tape:
     wanted = [recorder.node(value) for value in outputs]
     needed = _needed(recorder, wanted)
     last = _last_uses(recorder, needed, wanted)
+    # Registers of operands that are not needed later are used again: fewer of them stay in the cache.
     free: list[int] = []
     code: list[tuple[int, int, int, int]] = []
     loaded = [node for node in needed if recorder.nodes[node][0] < 0]
@@ -286,6 +292,7 @@ def tape(recorder: Recorder, outputs: list[Any]) -> Tape:
         count += not free
         register[node] = free.pop() if free else count - 1
         code.append((operation, register[node], register[left], register[right]))
+        # Freed after the target was chosen: no operation writes over an operand of its own.
         free.extend(register[used] for used in {left, right} if last[used] == node)
     return Tape(
         np.array(code, dtype=np.int64).reshape(-1, 4),
@@ -380,6 +387,7 @@ def _trace(problem: Problem, model: Model, given: frozenset[int], moved: frozens
         value = value.value if isinstance(value, Jet) else value
         if not isinstance(value, Symbol | int | float):
             return None
+        # A derivative that is zero whatever the inputs is left out.
         seeds = tuple(seed for seed in sorted(partials) if recorder.constant(recorder.node(partials[seed])) != 0.0)
         return Traced(tape(recorder, [value, *(partials[seed] for seed in seeds)]), seeds)
     except (TypeError, AttributeError, ValueError):  # it asks for more than the elementary functions

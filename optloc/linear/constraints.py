@@ -18,6 +18,8 @@ from optloc.models.surfaces import SURFACES
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
 
+# Share of its size by which a constraint may be broken, a micrometre where the bound is zero: rounding of coordinates
+# of the Earth's size (a nanometre) passes, and no measurement is as good.
 TOLERANCE = 1e-6
 
 
@@ -66,6 +68,7 @@ def visible(points: Any, *, elevation: float = 0.0, target: int = 0) -> tuple[Ba
     target : int
         Which target.
     """
+    # Bounded is the sine, see `optloc.models.surfaces`; it grows with the elevation.
     least = _number(np.sin(elevation))
     return tuple(
         Band("visible", least, _number(np.inf), point, f"sight of point {i}", target)
@@ -75,6 +78,7 @@ def visible(points: Any, *, elevation: float = 0.0, target: int = 0) -> tuple[Ba
 
 def speed(upper: float, *, lower: float = 0.0, target: int = 0) -> tuple[Band, ...]:
     """Return the constraint on a target's speed, metres per second."""
+    # No speed is negative: a lower bound of zero would be a side on which nothing can lie with a gradient.
     return (Band("speed", _number(lower if lower > 0.0 else -np.inf), _number(upper), np.zeros(0), "speed", target),)
 
 
@@ -116,6 +120,7 @@ def faces(problem: Problem) -> list[Face]:
     found = [exact(problem)]
     for i, constraint in enumerate(problem.constraints):
         sides = [] if is_exact(constraint) else list(_sides(i, constraint))
+        # More sides than dimensions meet in no point; speeds bound other unknowns, and do not count.
         wider = [(*face, *side) for face in found for side in sides]
         found += [face for face in wider if sum(_kind(problem, v) != "speed" for v in face) <= problem.dimension]
     return sorted(found, key=len)
@@ -151,6 +156,7 @@ def _sides(i: int, constraint: Band | Polygon) -> Iterator[Face]:
         if np.isfinite(constraint.upper).all():
             yield (Level(i, "upper"),)
         return
+    # An answer lies on an edge, or in the corner where it meets the one before.
     for edge in range(len(constraint.vertices)):
         yield (Level(i, edge),)
         yield (Level(i, (edge - 1) % len(constraint.vertices)), Level(i, edge))
@@ -172,8 +178,10 @@ def levels(problem: Problem, face: Face, x: Array) -> tuple[Array, Array]:
 def restored(problem: Problem, face: Face, x: Array) -> Array:
     """Return vectors (N, size) moved onto a face along the shortest way, by Newton steps."""
     n = problem.layout.n_shared
+    # Newton squares a small relative distance: 1e-2 becomes rounding in three steps, and five are to spare.
     for _ in range(8):
         values, gradients = levels(problem, face, x)
+        # A nanometre is the last digit of an ECEF coordinate; vectors that are NaN must not keep the others going.
         if np.nanmax(np.abs(values), initial=0.0) < 1e-9:
             break
         space = tangent(gradients, np.ones((len(x), n)))
@@ -192,6 +200,7 @@ def _band(constraint: Band | Polygon, side: str | int) -> Band:
     assert isinstance(side, int)
     here, there = constraint.vertices[side], constraint.vertices[(side + 1) % len(constraint.vertices)]
     along = there - here
+    # Unit length, so that a level is in metres; it points outwards where corners go counter-clockwise.
     normal = np.array([along[1], -along[0]]) / np.hypot(*along)
     value = _number(normal @ here)
     return Band("plane", value, value, normal, constraint.name, constraint.target)
@@ -207,6 +216,7 @@ def conjunction(problem: Problem) -> list[Band]:
         corners = c.vertices
         edge = np.roll(corners, -1, axis=0) - corners
         turn = edge[:, 0] * np.roll(edge, -1, axis=0)[:, 1] - edge[:, 1] * np.roll(edge, -1, axis=0)[:, 0]
+        # Edges of a concave polygon need not all hold: such a region is no conjunction.
         if (turn >= 0.0).all() or (turn <= 0.0).all():
             sign = 1.0 if turn.sum() > 0.0 else -1.0
             for i in range(len(corners)):
@@ -225,6 +235,7 @@ def face_of(problem: Problem, x: Array) -> Array:
     for number, face in enumerate(faces(problem)):
         if face:
             values, _ = levels(problem, face, x)
+            # Faces come with fewest levels first, so that the last one that fits has the most.
             found[(np.abs(values) <= 10.0 * TOLERANCE * (1.0 + np.abs(x).max(1, keepdims=True))).all(1)] = number
     return found
 
@@ -241,6 +252,8 @@ def violation(problem: Problem, x: Array) -> Array:
         for bound, sign in ((c.lower, 1.0), (c.upper, -1.0)):
             with np.errstate(invalid="ignore"):
                 short = np.where(np.isfinite(bound), sign * (bound - value), -np.inf)
+            # Metres of an altitude and sines of an elevation by one measure: relative to the bound, absolute near
+            # zero.
             size = 1.0 + np.where(np.isfinite(bound), np.abs(bound), 0.0)
             worst = np.maximum(worst, short / size)
     return worst
@@ -268,6 +281,7 @@ def _quantity(problem: Problem, band: Band, x: Array) -> tuple[Jet, dict[int, in
         columns |= {d + i: start + i for i in range(d)}
         velocity = tuple(Jet(x[:, start + i], {d + i: np.ones(1)}) for i in range(d))
     ecef = to_ecef(problem, position) if surface.ecef else None
+    # An edge of a polygon is a plane with two coefficients: it bounds the plan of a target in space.
     used = position[: c.shape[-1]] if band.kind == "plane" else position
     value = surface.g(Point(used, velocity, None, ecef), tuple(c[..., i] for i in range(c.shape[-1])))
     return value, columns
@@ -285,6 +299,7 @@ def _outside(region: Polygon, points: Array) -> Array:
     along, to = b - a, p - a
     share = np.clip((to * along).sum(-1) / (along**2).sum(-1), 0.0, 1.0)
     distance = np.sqrt(((to - share[..., None] * along) ** 2).sum(-1)).min(1)
+    # Even-odd rule: a ray to the right crosses the boundary an odd number of times from inside.
     crosses = (a[:, 1] > p[..., 1]) != (b[:, 1] > p[..., 1])
     with np.errstate(divide="ignore", invalid="ignore"):
         at = a[:, 0] + (p[..., 1] - a[:, 1]) * along[:, 0] / along[:, 1]

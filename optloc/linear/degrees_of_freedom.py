@@ -19,9 +19,12 @@ def degrees_of_freedom(problem: Problem) -> Array:
     heard: Any = 0
     for _, _, part in windows(problem, len(problem.weight) if problem.weight.ndim > 1 else 1):
         for whitener in whiten(part.noise, part.weight):
+            # One matrix may stand for all groups; a whitener has as many rows that are not zero as its covariance has
+            # rank.
             same = len(whitener.row) if whitener.matrix.shape[-3] == 1 else 1
             rank = rank + same * (whitener.matrix != 0.0).any(-1).sum((-1, -2))
         heard = heard + _heard(part)
+    # What has a prior brings a row of its own, and counts for nothing.
     known = (
         {prior.name for prior in problem.priors}
         | {b.name for b in problem.biases if b.sigma is not None}
@@ -35,6 +38,7 @@ def degrees_of_freedom(problem: Problem) -> Array:
 
 def _heard(problem: Problem) -> Array:
     """Return the number of epochs with a row that is present, (...)."""
+    # Local unknowns of an epoch without a row are no unknowns of these data.
     order = np.argsort(problem.epoch, kind="stable")
     _, first = np.unique(problem.epoch[order], return_index=True)
     return np.asarray(np.maximum.reduceat(problem.weight[..., order] > 0.0, first, axis=-1).sum(-1))

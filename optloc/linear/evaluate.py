@@ -40,6 +40,7 @@ def points(problem: Problem, plan: Plan, x: Array, differentiate: bool) -> tuple
     differentiate : bool
         Whether fed inputs become `Jet` values seeded with one.
     """
+    # Data first, then what unknowns add: an offset of a station adds to its surveyed place.
     inputs = {seed: placed(value, x) for seed, value in given(problem, plan).items()}
     for feed in plan.feeds:
         inputs[feed.seed] = _fed(inputs.get(feed.seed, 0.0), feed, x, plan.block.count)
@@ -69,6 +70,7 @@ def joined(problem: Problem, model: Model, inputs: dict[int, Any]) -> tuple[Poin
         return tuple(inputs.get(seed + c, 0.0) for c in range(d))
 
     def station(place: int, rate: int, axes: int) -> Point:
+        # Seeds stand 16 apart and axes 3: nine numbers of one set of axes fit below the next input.
         own = tuple(vector(axes + 3 * i) for i in range(d)) if axes in inputs else None
         if TURN in inputs:
             identity = tuple(tuple(float(i == j) for j in range(d)) for i in range(d))
@@ -78,6 +80,7 @@ def joined(problem: Problem, model: Model, inputs: dict[int, Any]) -> tuple[Poin
     place = vector(TARGET)
     ecef = to_ecef(problem, place) if model.ecef else None
     target = Point(place, vector(TARGET_RATE) if model.velocity else None, None, ecef)
+    # A kind without stations gets the target in their place, which its h does not look at.
     a = station(A, RATE_A, AXES_A) if model.stations else target
     return target, a, station(B, RATE_B, AXES_B) if model.stations > 1 else a
 
@@ -97,6 +100,7 @@ def given(problem: Problem, plan: Plan) -> dict[int, Any]:
         if motion.known is None or not len(rows):
             continue
         epoch = block.epoch if motion.known.shape[-3] > 1 else np.zeros_like(block.epoch)
+        # Every row gets a sum over targets in which its own counts: no scatter, which some libraries lack.
         mine = placed(1.0 * (block.target == i), motion.known)
         for seed, order in ((TARGET, 0), (TARGET_RATE, 1)):
             for c in range(problem.dimension if order < motion.known.shape[-2] else 0):
@@ -108,6 +112,7 @@ def given(problem: Problem, plan: Plan) -> dict[int, Any]:
 def _at_rows(array: Array, rank: int, block: Rows, index: Array, seed: int) -> dict[int, Any]:
     """Return the components of a per-station vector (rank 1) or set of axes (rank 2) at each row."""
     epochs, count = array.shape[-2 - rank : -rank]
+    # Epoch and station as one index: a single table gathers rows of moving stations.
     joint = library(array).reshape(array, (*array.shape[: -2 - rank], epochs * count, *array.shape[-rank:]))
     picked = gather(joint, index + (count * block.epoch if epochs > 1 else 0), -1 - rank)
     if rank == 1:
@@ -119,11 +124,13 @@ def _at_rows(array: Array, rank: int, block: Rows, index: Array, seed: int) -> d
 def _fed(value: Any, feed: Feed, x: Array, count: int) -> Any:
     column, gain = feed.table(count)
     part = gather(x, column)
+    # Most unknowns enter as they are; a product with ones would cost as much as the rest.
     return value + (part if np.all(gain == 1.0) else part * placed(gain, x))
 
 
 def to_ecef(problem: Problem, position: tuple[Any, ...]) -> tuple[Any, ...]:
     """Return a position of the problem's frame as ECEF components of the same type."""
+    # Spelled out with numbers as factors: components may be jets or symbols, which know no matrices.
     turn, origin = problem.frame.rotation_to_ecef(), problem.frame.origin_ecef()
     if problem.frame.kind == "ecef":
         return position
@@ -163,6 +170,7 @@ def differentiate(problem: Problem, x: Array) -> tuple[Array, Array]:
     layout, x, xp = problem.layout, fitting(problem, x), library(x)
     width = layout.n_shared + layout.n_local
     batch = np.broadcast_shapes(problem.batch_shape, x.shape[:-1])
+    # In numpy derivatives are written where they belong; other libraries stack columns.
     place = None if foreign(x) else np.zeros((*batch, problem.count, width))
     residuals, jacobians = [], []
     for plan, block, start in zip(plans(problem), problem.rows, problem.starts, strict=True):
@@ -184,6 +192,7 @@ _Terms = list[tuple[Array, Array, Any]]
 def _derived(problem: Problem, plan: Plan, x: Array) -> tuple[Any, _Terms]:
     """Return the values (..., m) of one block, biases included, and their derivatives."""
     jet, m, fold = plan.model.h(*points(problem, plan, x, differentiate=True)), plan.block.count, _folded(problem)
+    # A kind that nothing moves (known targets and stations) has a value without derivatives.
     if not isinstance(jet, Jet):
         jet = Jet(placed(np.asarray(jet), x), {})
     value, gain = _biased(plan, x, jet.value)
@@ -222,6 +231,7 @@ def _residual(block: Rows, value: Any, periodic: bool) -> Any:
     """Return what is measured less the values of one block; absent rows count as met."""
     residual = placed(block.z - block.correction, value) - value
     residual = wrap(residual) if periodic else residual
+    # Absent rows may hold NaN, which zero times would keep.
     if not foreign(block.weight) and np.all(block.weight > 0.0):
         return residual
     return library(residual).where(placed(block.weight, residual) > 0.0, residual, 0.0)
@@ -230,6 +240,7 @@ def _residual(block: Rows, value: Any, periodic: bool) -> Any:
 def _added(terms: _Terms, jacobian: Array) -> None:
     """Add derivatives to a block's part of the Jacobian."""
     for column, coefficient, factor in terms:
+        # One column for all rows of the block (a shared position) is a slice, where others need a scatter.
         if np.all(column == column[:1]):
             jacobian[..., column[0]] += factor if np.all(coefficient == 1.0) else factor * coefficient
             continue

@@ -74,9 +74,12 @@ def gauss_newton(problem: Problem, x: Any, *, steps: int = 10, damping: float = 
         raise InvalidProblem(f"{steps} steps with damping {damping:g}", "gauss_newton", "give steps >= 1, damping >= 0")
     noise = whiteners(problem, x)
     equations = _equations(problem, x, noise)
+    # Of the shape and library of the cost, whatever they are.
     factor = placed(damping, equations.cost) + 0.0 * equations.cost
+    # True but for NaN, as a mask on the array's own device.
     regular: Any = equations.cost == equations.cost
     for _ in range(steps):
+        # A step that does not exist is zero: the problem stays where it is and its batch goes on.
         move, solvable = step(equations, factor)
         x, regular = x + move, regular & solvable
         equations = _equations(problem, x, noise)

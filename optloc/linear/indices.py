@@ -17,6 +17,7 @@ from optloc.problem.layout import Layout, emission_name, state_names
 from optloc.problem.problem import Problem
 
 # Inputs of a measurement function: target, its rate, both stations, their rates, axes and the turn of the axes.
+# Sixteen apart: the largest input, a set of axes, has nine components.
 TARGET, TARGET_RATE, A, B, RATE_A, RATE_B, AXES_A, AXES_B, TURN = (16 * i for i in range(9))
 
 
@@ -43,6 +44,7 @@ class Feed:
 
     def table(self, count: int) -> tuple[Array, Array]:
         """Return column and factor, each (count,), for all rows of the block: factor zero where it does not apply."""
+        # Column zero with factor zero where it does not apply: a gather needs some column.
         column, gain = np.zeros(count, dtype=np.int64), np.zeros(count)
         column[self.rows], gain[self.rows] = self.column, self.gain
         return column, gain
@@ -111,6 +113,7 @@ class Plan:
 def columns(layout: Layout, name: str, epoch: Array) -> Array:
     """Return the columns (m, size) of a slot in the full parameter vector for rows of given epochs."""
     slot, shared = layout.find(name)
+    # Local unknowns of epoch k stand behind those of all epochs before it.
     base = slot.start + (0 if shared else layout.n_shared + epoch * layout.n_local)
     return np.broadcast_to(np.asarray(base)[..., None] + np.arange(slot.size), (len(epoch), slot.size))
 
@@ -159,6 +162,7 @@ def _terms(problem: Problem, block: Rows, start: int, forms: tuple[str, ...]) ->
         inside = (bias.row >= start) & (bias.row < start + block.count)
         rows, member, coefficient = bias.row[inside] - start, bias.member[inside], bias.coefficient[inside]
         if bias.form == "drift":
+            # A drift is an offset that grows: here is where seconds enter, nowhere else.
             coefficient = coefficient * (problem.times - problem.origin)[block.epoch[rows]]
         column = columns(problem.layout, bias.name, rows)[np.arange(len(rows)), member]
         parts.append(Terms(rows, column, coefficient))
@@ -182,6 +186,7 @@ def _motion_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
         for j, name in enumerate(state_names(i, count, motion.order)):
             column = columns(problem.layout, name, epoch)
             for c in range(problem.dimension):
+                # Taylor's polynomial of the course; its derivative feeds the rate.
                 feeds.append(Feed(TARGET + c, column[:, c], since**j / factorial(j), rows))
                 if model.velocity and j:
                     feeds.append(Feed(TARGET_RATE + c, column[:, c], since ** (j - 1) / factorial(j - 1), rows))
@@ -193,11 +198,13 @@ def elapsed(problem: Problem, target: int) -> Array:
     motion = problem.motions[target]
     if motion.span == "epoch":
         return np.zeros(problem.epochs)
+    # The first epoch by default, so that adding later epochs does not move what a state means.
     reference = problem.times[0] if motion.reference is None else motion.reference
     return np.asarray(problem.times - reference)
 
 
 def _station_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
+    # Errors that are noise are no unknowns: `optloc.linear.station_noise` puts them into the covariance of rows.
     if problem.stations.covariance is None or problem.stations.span == "noise":
         return []
     d, feeds = problem.dimension, []

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from optloc.base import linalg
-from optloc.base import linalg as tangents
 from optloc.base.arrays import as_number, eye, gather, library, placed
 from optloc.base.linalg import Tangent
 from optloc.base.types import Array
@@ -110,6 +109,7 @@ class Normal:
 
     def __add__(self, other: Normal) -> Normal:
         """Return the sum of the information of disjoint epochs: shared parts add, local parts are joined."""
+        # Without local unknowns nothing is joined: blocks of length zero stay as they are.
         if self.local.shape[-1] == 0 == other.local.shape[-1]:
             return Normal(
                 self.shared + other.shared,
@@ -140,6 +140,7 @@ def normal(linear: Linear, epochs: int) -> Normal:
         Number of epochs k.
     """
     n, length, xp = linear.shared.shape[-1], linear.local.shape[-1], library(linear.residual)
+    # Jacobian and residual as one matrix: its Gram matrix holds information, vector and cost.
     stacked = xp.concat([linear.shared, linear.local, linear.residual[..., None]], axis=-1)
     single = epochs == 1 or length == 0
     gram: Any = placed(np.zeros(()), linear.residual)
@@ -150,6 +151,7 @@ def normal(linear: Linear, epochs: int) -> Normal:
         gram = gram + (white.mT @ white if not single else (white.mT @ white)[..., None, :, :])
     last = n + length
     flat = gram[..., 0, :, :] if single else xp.sum(gram, axis=-3)
+    # Without local unknowns one empty block stands for all epochs.
     k = epochs if length else 1
     batch = flat.shape[:-2]
     return Normal(
@@ -164,6 +166,7 @@ def normal(linear: Linear, epochs: int) -> Normal:
 
 def _by_epoch(white: Any, epoch: Array, epochs: int) -> Any:
     """Return the rows (..., m, p) of each epoch (..., k, r, p), zero beyond its own number of rows."""
+    # Epochs of equal length in one array: rows of shorter ones are filled up with zeros, which add nothing.
     order = np.argsort(epoch, kind="stable")
     sizes = np.bincount(epoch, minlength=epochs)
     most = max(1, int(sizes.max(initial=0)))
@@ -183,6 +186,7 @@ def marginal(equations: Normal) -> tuple[Array, Array, Array]:
     xp = library(equations.cost)
     if equations.local.shape[-1] == 0:
         return equations.shared, equations.shared_vector, xp.ones_like(equations.cost, dtype=xp.bool)
+    # Coupling and vector are solved for at once.
     right = xp.concat([equations.cross.mT, equations.local_vector[..., None]], axis=-1)
     solved, ok = _solved(equations.local, right)
     lost = xp.sum(equations.cross @ solved, axis=-3)
@@ -203,10 +207,13 @@ def eliminated(equations: Normal) -> Normal:
 def _solved(local: Array, right: Array) -> tuple[Array, Array]:
     """Return solutions (..., k, l, p) of the local systems, of least norm where they are singular, and ok (...)."""
     xp = library(local)
+    # A single epoch that leaves its own unknowns open leaves the fix open: that is for the caller to see.
     if local.shape[-3] == 1:
         solved, good = linalg.solve(_measured(local), right)
         return solved, xp.all(good, axis=-1)
     solved, good = linalg.solve(local, right, OPEN)
+    # Of a run, an epoch may leave a combination open (one arrival, no emission time): least norm moves only what it
+    # knows.
     if xp is np and not good.all():
         root, _ = linalg.root(local[~good])
         solved[~good] = root @ (root.mT @ np.broadcast_to(right, solved.shape)[~good])
@@ -237,6 +244,7 @@ def local_covariance(equations: Normal, shared: Array, size: int) -> Array:
     """
     inverse, good = linalg.inverse(equations.local, OPEN)
     gain = inverse @ np.swapaxes(equations.cross, -1, -2)
+    # Own errors, and those that come from the shared unknowns.
     full = inverse + gain @ shared[..., None, :, :] @ np.swapaxes(gain, -1, -2)
     return np.where(good[..., None, None], full, np.nan)[..., :size, :size]
 
@@ -256,7 +264,7 @@ def step(equations: Normal, damping: Array, space: Tangent | None = None) -> tup
     damped = _damped(equations, damping)
     information, vector, ok = marginal(damped)
     if space is not None:
-        shared, good = tangents.solve_within(information, vector, space)
+        shared, good = linalg.solve_within(information, vector, space)
         ok = ok & good
     elif information.shape[-1]:
         shared, good = linalg.solve(information, vector[..., None])
@@ -265,6 +273,7 @@ def step(equations: Normal, damping: Array, space: Tangent | None = None) -> tup
         shared = vector
     if damped.local.shape[-1] == 0:
         return shared, ok
+    # Back substitution: given the shared step, each epoch solves for its own.
     rest = damped.local_vector - (damped.cross.mT @ shared[..., None, :, None])[..., 0]
     local, good = _solved(damped.local, rest[..., None])
     xp = library(local)
@@ -274,6 +283,7 @@ def step(equations: Normal, damping: Array, space: Tangent | None = None) -> tup
 
 def _damped(equations: Normal, damping: Array) -> Normal:
     def grow(matrix: Array, factor: Array) -> Array:
+        # Diagonal times (1 + damping), all else times one: Marquardt's scaling knows no units.
         grown: Array = matrix * (1.0 + factor[..., None, None] * eye(matrix.shape[-1], matrix))
         return grown
 
@@ -293,7 +303,7 @@ def covariance(equations: Normal, space: Tangent | None = None) -> tuple[Array, 
     With equalities it is the covariance on their tangent space.
     """
     information, _, ok = marginal(equations)
-    inverse, good = linalg.inverse(information) if space is None else tangents.inverse_within(information, space)
+    inverse, good = linalg.inverse(information) if space is None else linalg.inverse_within(information, space)
     xp = library(inverse)
     return xp.where((ok & good)[..., None, None], inverse, xp.nan), ok & good
 
@@ -332,6 +342,7 @@ def with_priors(problem: Problem, x: Array, equations: Normal, *, shared: bool =
     for name, mean, precision in parts:
         slot, is_shared = layout.find(name)
         width = layout.n_shared if is_shared else layout.n_local
+        # Columns of the unit matrix put a block where it belongs: some libraries cannot write into an array.
         pick = placed(np.eye(width)[:, slot.start : slot.start + slot.size], x)
         precision = placed(precision, x)  # noqa: PLW2901  # the same numbers, elsewhere
         error = placed(mean, x) - (at_shared if is_shared else at_local)[..., slot.start : slot.start + slot.size]
@@ -360,6 +371,7 @@ def prior_parts(problem: Problem) -> list[tuple[str, Array, Array]]:
     for bias in problem.biases:
         if bias.sigma is not None:
             sigma = np.ravel(bias.sigma)
+            # Members of a bias are independent of each other a priori.
             parts.append((bias.name, np.broadcast_to(np.ravel(bias.mean), sigma.shape), np.diag(sigma**-2.0)))
     stations = problem.stations
     if stations.covariance is not None and stations.span != "noise":

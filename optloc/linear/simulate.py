@@ -38,6 +38,7 @@ def simulate(problem: Problem, truth: Array, seed: int | np.random.SeedSequence,
     if trials is not None:
         shape = (trials, *shape)
     noise = draw(problem.noise, problem.count, shape, rng)
+    # Noise is drawn before station errors: problems with and without those meet the same noise.
     z = noise + predict(*_displaced(problem, truth, shape, rng))
     values = []
     for rows, start in zip(problem.rows, problem.starts, strict=True):
@@ -59,6 +60,7 @@ def _displaced(
 
 def samples(covariance: Array, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
     """Return normal samples (*shape, r) of covariances (..., r, r) whose leading axes fit the shape."""
+    # Not by Cholesky: rows that close a loop have a singular covariance.
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
     return np.asarray((root @ rng.standard_normal((*shape, covariance.shape[-1], 1)))[..., 0])

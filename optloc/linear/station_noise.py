@@ -40,6 +40,7 @@ def weighed(problem: Problem, x: Array | None = None) -> Problem:
     if x is None or not depends_on_place(problem):
         more = [_alike(problem, members, covariance) for members in groups]
     else:
+        # G is the Jacobian to station offsets as if they were unknowns; they stand last among the local ones.
         named, x = with_offsets(problem, x, np.zeros(()))
         _, jacobian = differentiate(named, x)
         last = covariance.shape[-3] * problem.dimension
@@ -55,6 +56,7 @@ def depends_on_place(problem: Problem) -> bool:
     covariance = problem.stations.covariance
     if covariance is None or problem.stations.span != "noise":
         return False
+    # Isotropic errors of ranges project to the same variance along every line of sight.
     same = np.eye(problem.dimension) * covariance[..., :1, :1]
     return not np.array_equal(covariance, same) or any(MODELS[rows.kind].ranges is None for rows in problem.rows)
 
@@ -96,6 +98,7 @@ def _groups(problem: Problem) -> list[Array]:
 
 def _alike(problem: Problem, members: Array, covariance: Array) -> Array:
     """Return what isotropic errors add to groups of rows (g, r): arrival errors of the mean variance of an axis."""
+    # Of isotropic errors this is the variance of each axis; of others it is their mean over all directions.
     variance = np.trace(covariance, axis1=-2, axis2=-1) / problem.dimension
     ends = []
     for place in (0, 1):
@@ -112,6 +115,7 @@ def _signs(rows: Rows) -> tuple[int, int]:
 def _propagated(sensitivity: Array, covariance: Array) -> Array:
     """Return G P G' (..., g, r, r) of derivatives G (..., g, r, s * d) and station covariances P (..., s, d, d)."""
     s, d = covariance.shape[-3:-1]
+    # Stations err independently: P is applied station by station, never as one s d by s d matrix.
     own = sensitivity.reshape(*sensitivity.shape[:-1], s, d)
     spread = np.einsum("...grsd,...sde->...grse", own, covariance).reshape(sensitivity.shape)
     return np.asarray(spread @ np.swapaxes(sensitivity, -1, -2))

@@ -41,15 +41,18 @@ def residual(problem: Problem, x: Any, p: Any, z: Any) -> list[Any]:
     """
     out, used = [], 0
     for plan, start in zip(plans(problem), problem.starts, strict=True):
+        # Sorted in `parameters` too: numbers and symbols meet by their place.
         seeds = sorted(given(problem, plan))
         for i in range(plan.block.count):
             inputs = {seed: p[used + j * plan.block.count + i] for j, seed in enumerate(seeds)}
             for feed in plan.feeds:
                 rows = np.arange(plan.block.count)[feed.rows]
+                # Row by row: symbols are scalars, and the expression is built once for each structure.
                 for at in np.flatnonzero(rows == i):
                     gain = np.broadcast_to(feed.gain, feed.column.shape)[at]
                     inputs[feed.seed] = inputs.get(feed.seed, 0.0) + float(gain) * x[int(feed.column[at])]
             value = plan.model.h(*joined(problem, plan.model, inputs))
+            # The same order as in `optloc.linear.evaluate`: scaled, then shifted.
             value = value * (1.0 + _total(plan.gains, i, x)) + _total(plan.adds, i, x)
             misfit = z[start + i] - value
             out.append(wrap(misfit) if plan.model.period is not None else misfit)
@@ -93,6 +96,7 @@ def constrained(problem: Problem, x: Any, p: Any, length: Any) -> tuple[list[Any
         used += count + 2
         unit = length if surface.unit == "m" else 1.0
         value = surface.g(_target(problem, band, x), c)
+        # Which side exists is part of the structure; where it lies is a parameter.
         if np.all(band.lower == band.upper):
             equal.append((value - lower) / unit)
             continue

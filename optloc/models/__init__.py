@@ -116,6 +116,7 @@ def _azimuth(t: Point, a: Point, b: Point) -> Any:
 
 def _elevation(t: Point, a: Point, b: Point) -> Any:
     line = local(t, a)
+    # By both legs: the arcsine of a ratio loses its digits overhead.
     xp = namespace(line[2])
     return xp.atan2(line[2], xp.hypot(line[0], line[1]))
 
@@ -166,10 +167,12 @@ def _basis(a: Point) -> tuple[Components, ...]:
 def _lifted_azimuth(m: Any, a: Point, b: Point) -> LiftedRow:
     xp = namespace(m)
     basis = _basis(a)
+    # The normal of the vertical plane through the station that the azimuth names: the target lies in it.
     across = tuple(xp.cos(m) * v - xp.sin(m) * u for u, v in zip(basis[0], basis[1], strict=True))
 
     def horizontal(t: Point, a: Point, b: Point) -> Any:
         line = local(t, a)
+        # An error of the angle moves the row by the horizontal range.
         return -1.0 * namespace(line[0]).hypot(line[0], line[1])
 
     return LiftedRow(across, 0.0, 0.0, -1.0 * dot(across, a.position), horizontal)
@@ -183,6 +186,7 @@ def _lifted_elevation(m: Any, a: Point, b: Point) -> LiftedRow:
     )
 
 
+# Signs and units are those of files after conversion: metres, radians; a is the first station named.
 _KINDS: dict[str, Model] = {
     "tdoa": Model(
         lambda t, a, b: distance(t, a) - distance(t, b),
@@ -259,5 +263,6 @@ def lifted_row(model: Model, m: Any, a: Point, b: Point) -> LiftedRow | None:
         Its stations.
     """
     if model.ranges is not None:
+        # Sums of ranges are linear in them as they are; an error of the measurement is one of the row.
         return LiftedRow(None, float(model.ranges[0]), float(model.ranges[1]), -1.0 * m, lambda t, a, b: -1.0)
     return None if model.lifted is None else model.lifted(m, a, b)

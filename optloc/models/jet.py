@@ -56,6 +56,7 @@ class Jet:
         value, theirs = _parts(other)
         ratio = self.value / value
         inverse = 1.0 / value
+        # (u / v)' = u' / v - (u / v) v' / v: the ratio is at hand, and no square is formed that could overflow.
         return Jet(ratio, _sum(_scaled(self.partials, inverse), _scaled(theirs, -ratio * inverse)))
 
     def __rtruediv__(self, other: Any) -> Jet:
@@ -95,6 +96,7 @@ def exp(u: Jet) -> Jet:
 def hypot(u: Any, v: Any) -> Jet:
     """Return ``sqrt(u^2 + v^2)``."""
     (p, du), (q, dv) = _parts(u), _parts(v)
+    # The derivative is the unit vector; at the origin it is NaN, as it should be.
     length = namespace(p).hypot(p, q)
     return Jet(length, _sum(_scaled(du, p / length), _scaled(dv, q / length)))
 
@@ -115,6 +117,7 @@ def _scaled(partials: dict[int, Any], factor: Any) -> dict[int, Any]:
 
 
 def _sum(left: dict[int, Any], right: dict[int, Any]) -> dict[int, Any]:
+    # Most operands are constants or single seeds: dictionaries are copied where both have entries only.
     if not right:
         return left
     total = dict(left)

@@ -9,6 +9,7 @@ from optloc.models.namespace import namespace
 
 Components = tuple[Any, ...]
 
+# Semi-major axis in metres and flattening: defining constants of WGS 84.
 WGS84_A = 6378137.0
 WGS84_F = 1.0 / 298.257223563
 
@@ -76,6 +77,7 @@ def local(t: Point, a: Point) -> Components:
 def wrap(angle: Any) -> Any:
     """Return an angle wrapped to (-pi, pi], radians."""
     xp = namespace(angle)
+    # Remainders mean different things in different libraries, and jump for symbols; this is smooth but at the seam.
     return xp.atan2(xp.sin(angle), xp.cos(angle))
 
 
@@ -105,6 +107,7 @@ def rotate(axes: tuple[Components, ...], turn: Components) -> tuple[Components, 
             (2.0 * (x * y - z) * scale, (1.0 + yy - xx - zz) * scale, 2.0 * (y * z + x) * scale),
             (2.0 * (x * z + y) * scale, 2.0 * (y * z - x) * scale, (1.0 + zz - xx - yy) * scale),
         )
+    # Rows of the matrix times the axes: each new axis is a combination of the old ones.
     columns = tuple(zip(*axes, strict=True))
     return tuple(tuple(dot(row, column) for column in columns) for row in matrix)
 
@@ -139,6 +142,7 @@ def _latitude(ecef: Components) -> tuple[Any, Any, Any]:
     b = WGS84_A * (1.0 - WGS84_F)
     p = xp.sqrt(x * x + y * y + 1e-12)  # a micrometre off the axis, so that the poles have a derivative
     sin_u, cos_u = _direction(z * WGS84_A, p * b)
+    # Two steps of Bowring, from the parametric latitude on: see `geodetic_height` for what is left.
     for _ in range(2):
         up = z + (e2 / (1.0 - e2)) * b * sin_u * sin_u * sin_u
         out = p - e2 * WGS84_A * cos_u * cos_u * cos_u

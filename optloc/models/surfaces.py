@@ -43,6 +43,7 @@ def _height(t: Point, c: Components) -> Any:
 def _visible(t: Point, c: Components) -> Any:
     assert t.ecef is not None
     line = subtract(c, t.ecef)
+    # The sine and not the angle: it is smooth, and grows with it from nadir to zenith.
     return dot(line, geodetic_normal(t.ecef)) / norm(line)
 
 

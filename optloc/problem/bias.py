@@ -20,6 +20,7 @@ Form = Literal["offset", "scale", "drift", "rotation"]
 Per = Literal["station", "pair", "kind"]
 Members = Sequence[str] | Mapping[str, Sequence[str]] | None
 _Touch = tuple[Array, Array, Array]
+# Slots of the layout that are not biases: a bias of such a name would hide one.
 _TAKEN = ("position", "velocity", "acceleration", "emission", "stations")
 
 
@@ -107,6 +108,7 @@ def family(
     ):
         if value not in known:
             raise InvalidProblem(f"unknown {what} {value!r}", where, nearest(str(value), known))
+    # Who has an error decides how members are named, and with which sign a row feels it.
     touched = _touched(rows, form, kind, where)
     if per == "kind":
         if members is not None:
@@ -117,6 +119,7 @@ def family(
     else:
         names, touches = _by_station(touched, form, stations, members, where)
     row, member, coefficient = (np.concatenate(parts) for parts in zip(*touches, strict=True))
+    # A member without a row would be an unknown that nothing determines.
     idle = sorted(set(range(len(names))) - set(member.tolist()))
     if idle:
         raise InvalidProblem(f"{names[idle[0]]} touches no row", f"{where}, members", "leave it out")
@@ -138,6 +141,7 @@ def _touched(rows: Sequence[Rows], form: Form, kind: str | None, where: str) -> 
         raise InvalidProblem("no rows depend on the axes of stations", where, "leave the bias out")
     if form == "rotation" and not MODELS[chosen[0][0].kind].axes:
         raise InvalidProblem(f"{kind} has no axes that could be turned", where, "use the form offset")
+    # One number cannot be metres for one row and radians for another.
     if len({MODELS[block.kind].quantity for block, _ in chosen}) > 1:
         raise InvalidProblem("the rows measure different quantities", where, "name the kind that it touches")
     return chosen
@@ -159,6 +163,7 @@ def _by_pair(
     touched: list[tuple[Rows, int]], stations: Sequence[str], members: Members, where: str
 ) -> tuple[tuple[str, ...], list[_Touch]]:
     named = (*stations, "")  # index -1, no station, is the last
+    # A pair as one number; a missing second station (-1) counts as the unnamed one behind the others.
     codes = [block.a * len(named) + block.b % len(named) for block, _ in touched]
     found = np.unique(np.concatenate(codes))
     present = tuple("-".join(filter(None, (named[i // len(named)], named[i % len(named)]))) for i in found.tolist())
@@ -221,6 +226,7 @@ def _signs(kind: str, form: Form) -> tuple[int, int]:
     model = MODELS[kind]
     if form == "rotation" or model.stations == 1:
         return (1, 0)
+    # Of two stations in a kind that is no sum of ranges, a difference is meant: gains, rates, levels.
     return model.ranges or (1, -1)
 
 
@@ -298,6 +304,7 @@ def _corrected(problem: Problem, bias: Bias, known: Array) -> Problem:
     np.add.at(amount, bias.row, bias.coefficient * since * known[bias.member])
     rows = []
     for block, start in zip(problem.rows, problem.starts, strict=True):
+        # What the measurement exceeds the model by; for a scale it depends on the measurement: z = h (1 + s).
         own: Any = amount[start : start + block.count]
         if bias.form == "scale":
             own = (block.z - block.correction) * own / (1.0 + own)
@@ -313,6 +320,7 @@ def _turned(problem: Problem, bias: Bias, known: Array) -> Problem:
     turn[first] = bias.coefficient[:, None] * known.reshape(len(known), -1)[bias.member]
     axes = np.eye(d) + np.zeros((1, stations.count, d, d)) if stations.axes is None else stations.axes
     own = tuple(tuple(axes[..., i, c] for c in range(d)) for i in range(d))
+    # `rotate` is the function that rows of an unknown turn are modelled with, so that known and unknown agree.
     rows = rotate(own, tuple(turn[:, c] for c in range(turn.shape[1])))
     return replace(
         problem, stations=replace(stations, axes=np.stack([np.stack(row, axis=-1) for row in rows], axis=-2))

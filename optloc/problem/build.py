@@ -92,6 +92,7 @@ def measured(
     model = MODELS.get(kind)
     if model is None:
         raise InvalidProblem(f"unknown kind {kind!r}", where="kind", advice=f"use one of {', '.join(sorted(MODELS))}")
+    # Everything becomes arrays first, so that what follows speaks of shapes and never of types.
     z, sigma, arrival_sigma = (
         numbers(z, "z"),
         positive(sigma, "sigma", kind),
@@ -103,6 +104,7 @@ def measured(
     a, b, epoch, target = (whole(v, name) for v, name in ((a, "a"), (b, "b"), (epoch, "epoch"), (target, "target")))
     count = _count(kind, (z, sigma, covariance, a, b, epoch, target, weight, correction), covariance)
 
+    # Own, writable copies: what a caller does to its arrays later must not change a problem.
     def index(values: Array | None, needed: bool, name: str) -> Array:
         if needed and values is None:
             raise InvalidProblem(f"{kind} needs station {name}", where=name, advice="give station indices")
@@ -112,6 +114,7 @@ def measured(
         array = np.asarray(np.nan) if values is None else values
         return np.array(np.broadcast_to(array, (*array.shape[:-1], count)))
 
+    # Exactly one of: a covariance; standard deviations, of rows, of arrivals, or of both.
     if (covariance is None) == (sigma is None and arrival_sigma is None):
         advice = "give covariance, or sigma, or arrival_sigma, or the last two together"
         raise InvalidProblem(f"the noise of {kind} must be given once", where=kind, advice=advice)
@@ -136,6 +139,7 @@ def measured(
 def _count(kind: str, given: Sequence[Array | None], covariance: Array | None) -> int:
     """Return the number of rows of measurements; refuse arguments that disagree about it."""
     sizes = [v.shape[-1] for v in given if v is not None and v.ndim]
+    # A single number stands for all rows; without any array there is one row.
     count = max(sizes, default=1)
     if covariance is not None and covariance.shape[-2:] != (count, count):
         raise InvalidProblem(
@@ -187,7 +191,9 @@ def assemble(
     """
     if not measurements:
         raise InvalidProblem("there are no measurements", where="measurements", advice="give at least one")
+    # Rows are numbered through all kinds in the order of the arguments; noise and biases go by these numbers.
     blocks = _numbered(measurements)
+    # Epochs without rows are epochs all the same where later ones have some.
     epochs = 1 + max(int(m.rows.epoch.max(initial=0)) for m in measurements)
     made = Problem(
         stations if isinstance(stations, Stations) else station_array(stations),
@@ -219,6 +225,7 @@ def station_array(position: Any, names: Sequence[str] | None = None) -> Stations
         raise InvalidProblem(
             f"stations have shape {array.shape}", where="stations", advice="give an array (stations, 2 or 3) in metres"
         )
+    # Stations that stay have an epoch axis of length one.
     if array.ndim == 2:
         array = array[None]
     labels = tuple(names) if names is not None else tuple(f"S{i}" for i in range(array.shape[-2]))
@@ -255,7 +262,10 @@ def _arrival_blocks(m: Measured, start: int, variance: Array) -> list[noises.Blo
             f"{rows.kind} does not combine arrival times", where="arrival_sigma", advice="give sigma or covariance"
         )
     blocks = []
+    # Each epoch and target has arrivals of its own; a key for each pair of them, -1 (no target) included.
     for members in noises.together(rows.epoch * (rows.target.max(initial=0) + 2) + rows.target):
+        # D diag(sigma^2) D' of the members: a station that two rows share correlates them, by the product of its
+        # signs.
         covariance = noises.arrivals([(rows.a[members], signs[0]), (rows.b[members], signs[1])], variance)
         if m.variance is not None:
             covariance = covariance + m.variance[..., members, None] * np.eye(members.shape[1])

@@ -19,6 +19,7 @@ from optloc.problem.problem import Problem
 
 # What cannot be unknown: malformed motions, biases and priors are refused with a sentence that names them.
 
+# As in `optloc.base.types.Bias`, which types alone do not enforce.
 _FORMS = ("offset", "scale", "drift", "rotation")
 
 
@@ -40,6 +41,7 @@ def check_unknowns(problem: Problem) -> None:
     for bias in problem.biases:
         _check_bias(problem, bias, f"bias {bias.name!r}")
     layout = problem.layout
+    # Vectors are taken apart by name: `layout.find` returns the first of equal ones.
     names = Counter(slot.name for slot in (*layout.shared, *layout.local))
     twice = [name for name, count in names.items() if count > 1]
     if twice:
@@ -128,6 +130,8 @@ def _check_prior(problem: Problem, prior: Prior) -> None:
 
 # What cannot be demanded: malformed or contradictory constraints are refused with a sentence that names them.
 
+# Lengths relative to the polygon's size, and areas to its square, below which corners and edges count as meeting: four
+# digits above rounding.
 _SLIVER = 1e-12
 
 
@@ -191,6 +195,7 @@ def check_polygon(vertices: Array, where: str) -> None:
     if not np.isfinite(vertices).all():
         corner = int(np.flatnonzero(~np.isfinite(vertices).all(-1))[0])
         raise InvalidProblem(f"corner {corner + 1} is not finite", where, "give two numbers")
+    # Centred: corners in metres from a far origin would lose the digits that areas need.
     v = vertices - vertices.mean(0)
     size = np.abs(v).max()
     i, j = np.triu_indices(len(v), 1)
@@ -210,8 +215,11 @@ def _crossing(v: Array, size: float) -> tuple[int, int] | None:
     """Return two edges of a polygon that meet elsewhere than at their common corner, or None."""
     a, b, n = v, np.roll(v, -1, axis=0), len(v)
     i, j = np.triu_indices(n, 1)
+    # Pairs of edges without a common corner; the last edge is a neighbour of the first.
     apart = (j - i > 1) & (j - i < n - 1)
     along = b - a
+    # Two segments meet where the ends of each lie on different sides of the other, or on it; for collinear ones their
+    # boxes decide.
     straddle = np.ones(len(i), dtype=bool)
     for p, q in ((i, j), (j, i)):
         sides = _cross(along[p], a[q] - a[p]), _cross(along[p], b[q] - a[p])
@@ -260,6 +268,7 @@ def _check_agreement(bands: Sequence[Band]) -> None:
     """Refuse bands on one quantity that cannot hold together, and equalities that are given twice."""
     where, unit = f"constraint {bands[0].name!r}", SURFACES[bands[0].kind].unit.replace("1", "")
     exact = [band.lower for band in bands if np.all(band.lower == band.upper)]
+    # Bands on one quantity hold together: the highest lower bound against the lowest upper one.
     low = np.max(np.broadcast_arrays(*(band.lower for band in bands)), axis=0)
     high = np.min(np.broadcast_arrays(*(band.upper for band in bands)), axis=0)
     clash = np.broadcast_arrays(low, high, low > high)
@@ -312,6 +321,7 @@ def checked(problem: Problem) -> Problem:
 
 def _arrowed(problem: Problem) -> Problem:
     """Return the problem with noise in blocks of one epoch each, as the elimination of local unknowns needs it."""
+    # Correlation between epochs that are independent of each other would couple what is eliminated epoch by epoch.
     if not tied(problem):
         return untied(problem)
     if problem.layout.n_local:
@@ -369,6 +379,7 @@ def _check_moving(problem: Problem) -> None:
             label = s.names[int(np.argwhere(bad)[0][-1])]
             raise InvalidProblem(f"the {name} of station {label!r} is not finite", "stations", "give SI units")
     if s.axes is not None:
+        # A microradian: single precision and angles with seven digits pass, degrees in the place of radians do not.
         skew = np.abs(s.axes @ np.swapaxes(s.axes, -1, -2) - np.eye(d)).max((-1, -2)) > 1e-6
         if skew.any():
             label = s.names[int(np.argwhere(skew)[0][-1])]
@@ -400,6 +411,7 @@ def _check_rows(problem: Problem, rows: Rows) -> None:
     ):
         if index is None:
             continue
+        # -1 is a row that nobody has assigned to a target yet.
         lowest = -1 if name == "target" else 0
         bad = np.flatnonzero((index < lowest) | (index >= limit))
         if len(bad):
@@ -409,6 +421,7 @@ def _check_rows(problem: Problem, rows: Rows) -> None:
     if model.stations > 1 and np.any(rows.a == rows.b):
         row = int(np.flatnonzero(rows.a == rows.b)[0])
         raise InvalidProblem(f"{rows.kind} row {row} names one station twice", "a, b", "name two stations")
+    # NaN passes: it stands for a measurement that is simulated later, or that rejects its own fix alone.
     infinite = np.argwhere(np.isinf(rows.z))
     if len(infinite):
         row = infinite[0][-1]
@@ -441,8 +454,11 @@ def _check_covariance(covariance: Array, what: str, names: tuple[str, ...] | Non
     fail((diagonal <= 0.0).any(-1), "not positive on its diagonal")
     if covariance.shape[-1] == 1:
         return
+    # As correlations, so that one tolerance fits metres, radians and ratios.
     scale = np.sqrt(diagonal)
     unit = covariance / (scale[..., :, None] * scale[..., None, :])
+    # Nine digits: covariances that went through text pass, and an eigenvalue may be negative by what their rounding
+    # adds up to.
     fail((np.abs(unit - np.swapaxes(unit, -1, -2)) > 1e-9).any((-1, -2)), "not symmetric")
     fail(np.linalg.eigvalsh(unit)[..., 0] < -1e-9 * unit.shape[-1], "not positive semidefinite")
 

@@ -18,6 +18,7 @@ from optloc.problem.problem import Problem
 def separable(problem: Problem) -> bool:
     """Return whether no unknown is shared between the epochs of a problem."""
     run_long_errors = problem.stations.covariance is not None and problem.stations.span == "run"
+    # A target that is known for the run ties nothing, and counts as free only where its span says so.
     free = all(motion.span == "epoch" for motion in problem.motions)
     return problem.epochs > 1 and free and not problem.biases and not run_long_errors and not tied(problem)
 
@@ -27,6 +28,8 @@ def tied(problem: Problem) -> bool:
     epoch = problem.epoch
     for block in problem.noise.blocks:
         when = epoch[block.row]
+        # Groups may hold several epochs, as those of one joint covariance do: what counts is correlation that is not
+        # zero.
         apart = when[:, :, None] != when[:, None, :]
         if apart.any() and np.any(np.where(apart, block.covariance, 0.0)):
             return True
@@ -53,6 +56,7 @@ def by_epoch(problem: Problem) -> Problem:
     InvalidProblem
         Where biases or the noise tie the epochs together.
     """
+    # One more batch axis has no room for what several of its problems share.
     if problem.biases or tied(problem):
         tie = f"the bias {problem.biases[0].name!r} is" if problem.biases else "correlated noise is"
         raise InvalidProblem(f"{tie} shared by several epochs", "by_epoch", "solve them as one problem")
@@ -63,6 +67,7 @@ def by_epoch(problem: Problem) -> Problem:
     batch, k = problem.batch_shape, problem.epochs
     rows = []
     for old, (keys, place) in zip(problem.rows, places, strict=True):
+        # A row of the batch is one (stations, target, occurrence): twice measured in an epoch, twice in the batch.
         a, b, target, _ = np.array(keys, dtype=np.int64).reshape(-1, 4).T
 
         def spread(values: Array, old: Rows = old, place: Array = place, size: int = len(keys)) -> Array:
@@ -130,6 +135,7 @@ def _places(rows: Rows) -> tuple[list[tuple[int, int, int, int]], Array]:
 
 def _split(array: Array, core: int) -> Array:
     """Return a per-epoch quantity (..., k or 1, s, ...) as (..., k, 1, s, ...); unchanged where it is one for all."""
+    # One for all epochs and problems broadcasts as it is.
     if array.ndim == core and array.shape[0] == 1:
         return array
     return np.expand_dims(array, array.ndim - core + 1)
@@ -157,6 +163,7 @@ def _cut(block: Block, epoch: Array) -> list[Block]:
 def _noise(problem: Problem, where: Array, size: int) -> Noise:
     """Return the noise of the batch: groups of rows that are correlated in some epoch stay together."""
     epoch, k = problem.epoch, problem.epochs
+    # Rows of the batch that are correlated in any epoch end with one label: groups are merged member by member.
     label = np.arange(size)
     cut = group([part for block in problem.noise.blocks for part in _cut(block, epoch)]).blocks
     for block in cut:
@@ -167,13 +174,14 @@ def _noise(problem: Problem, where: Array, size: int) -> Noise:
     for name in np.unique(label):
         members = np.flatnonzero(label == name)
         blocks.append(_gathered(cut, where, epoch, members, k))
-    return _merge(blocks)
+    return group(blocks)
 
 
 def _gathered(cut: tuple[Block, ...], where: Array, epoch: Array, members: Array, k: int) -> Block:
     slot = {int(row): i for i, row in enumerate(members)}
     shape = np.broadcast_shapes(*(block.covariance.shape[:-3] for block in cut))
     out = np.zeros((*shape, k, 1, len(members), len(members)))
+    # A row that an epoch lacks has weight zero; a variance of one keeps its group regular.
     out[..., np.arange(len(members)), np.arange(len(members))] = 1.0
     for block in cut:
         inside = np.flatnonzero(np.isin(where[block.row[:, 0]], members))
@@ -187,18 +195,8 @@ def _gathered(cut: tuple[Block, ...], where: Array, epoch: Array, members: Array
     return Block(members[None], out)
 
 
-def _merge(blocks: list[Block]) -> Noise:
-    by_size: dict[int, list[Block]] = {}
-    for block in blocks:
-        by_size.setdefault(block.row.shape[1], []).append(block)
-    return Noise(
-        tuple(
-            Block(np.concatenate([b.row for b in same]), np.concatenate([b.covariance for b in same], axis=-3))
-            for same in by_size.values()
-        )
-    )
-
-
+# Numbers of a window's Jacobians, 512 kB of doubles: they stay in a cache of the second level, and memory does not
+# grow with the run.
 _NUMBERS = 2**16
 _ROW_ARRAYS = ("z", "a", "b", "epoch", "target", "weight", "correction")
 
@@ -231,6 +229,7 @@ def epochs_of(problem: Problem, batch: int = 1) -> int:
     """Return the number of epochs whose Jacobians fit into the cache."""
     if problem.epochs == 1 or problem.count == 0 or tied(problem):
         return problem.epochs
+    # And one for the residual.
     columns = problem.layout.n_shared + problem.layout.n_local + 1
     return max(1, int(_NUMBERS * problem.epochs / (batch * problem.count * columns)))
 
@@ -251,6 +250,7 @@ def window(problem: Problem, first: int, last: int) -> Problem:
     blocks = []
     for block in problem.noise.blocks:
         groups = _inside(number.epoch(problem, block.row[:, 0]), first, last)
+        # Blocks hold groups of one epoch, so that the epoch of the first row is that of all.
         covariance = block.covariance if block.covariance.shape[-3] == 1 else block.covariance[..., groups, :, :]
         if len(block.row[groups]):
             blocks.append(Block(number.new(block.row[groups]), covariance))
@@ -317,6 +317,7 @@ def cut(problem: Problem, first: int, last: int) -> Problem:
         return np.moveaxis(np.moveaxis(values, -core, 0)[first:last], 0, -core)
 
     s = problem.stations
+    # Station numbers, times and unknowns of the run stay; only what counts epochs begins anew.
     position = own(s.position, 3)
     assert position is not None
     motions = tuple(replace(m, known=own(m.known, 3), reference=_reference(problem, m)) for m in problem.motions)
@@ -336,6 +337,7 @@ def _reference(problem: Problem, motion: Motion) -> float | None:
 def _inside(epoch: Array, first: int, last: int) -> slice | Array:
     """Return the entries whose epoch lies in a stretch: a slice, and so a view, where they are sorted."""
     if np.all(epoch[1:] >= epoch[:-1]):
+        # Real runs come sorted: views of millions of rows cost nothing, copies would double them.
         return slice(*np.searchsorted(epoch, (first, last)).tolist())
     return np.flatnonzero((epoch >= first) & (epoch < last))
 
@@ -438,6 +440,7 @@ def _course(one: Array, first: int, two: Array, second: int, core: int) -> Array
     if one.shape[-core] == 1 and two.shape[-core] == 1 and np.array_equal(one, two):
         return one
     axis = -core
+    # What stood still in one run and moves in the other is written out for each epoch.
     parts = [np.repeat(a, n, axis) if a.shape[axis] == 1 else a for a, n in ((one, first), (two, second))]
     batch = np.broadcast_shapes(*(part.shape[:axis] for part in parts))
     return np.concatenate([np.broadcast_to(part, (*batch, *part.shape[axis:])) for part in parts], axis)

@@ -9,8 +9,10 @@ from optloc.base.arrays import library
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Bias, Motion, Stations
 
+# Units are those of reports: inside all is SI.
 _STATE = (("position", "m"), ("velocity", "m/s"), ("acceleration", "m/s^2"))
 _OWN_UNIT = {"scale": "1", "rotation": "rad"}
+# A drift is per second; of a speed that is an acceleration.
 _RATE = {"m/s": "m/s^2"}
 _Part = tuple[str, int, str, tuple[str, ...]]
 
@@ -88,6 +90,7 @@ class Layout:
     def split(self, x: Array) -> tuple[Array, Array]:
         """Return the shared part (..., n) and the local part (..., k, l) of vectors (..., size)."""
         n = self.n_shared
+        # Shared unknowns stand first, so that an arrow of blocks is a split of the vector.
         return x[..., :n], library(x).reshape(x[..., n:], (*x.shape[:-1], self.epochs, self.n_local))
 
     def take(self, x: Array, name: str) -> Array:
@@ -145,10 +148,12 @@ def layout(
             units = (unit for _, unit in _STATE)
             names = state_names(i, len(motions), motion.order)
             room.extend((name, stations.dimension, unit, ()) for name, unit in zip(names, units, strict=False))
+    # Angles of a rotation: one in the plane, a vector in space.
     turns = 1 if stations.dimension == 2 else 3
     for bias, unit in zip(biases, bias_units or [""] * len(biases), strict=True):
         size = len(bias.members) * (turns if bias.form == "rotation" else 1)
         shared.append((bias.name, size, _bias_unit(bias.form, unit), bias.members))
+    # Emission times last one epoch by their nature; station errors where their span says so.
     local.extend((emission_name(i, len(motions)), 1, "m", ()) for i in emitting)
     if stations.covariance is not None and stations.span != "noise":
         room = shared if stations.span == "run" else local

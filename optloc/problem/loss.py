@@ -79,6 +79,7 @@ class Loss:
         return self.psi_squared * self.mean_weight / self.slope**2
 
 
+# Nodes of Gauss and Legendre between two kinks, and where the density (e^-72) ends: more of either changes no digit.
 _NODES, _REACH = 60, 12.0
 
 
@@ -86,6 +87,8 @@ _NODES, _REACH = 60, 12.0
 def _moments(loss: Loss) -> tuple[float, float, float]:
     """Return the expected psi², u psi and weight of a standard normal u, by quadrature between the kinks."""
     node, share = np.polynomial.legendre.leggauss(_NODES)
+    # Between the kinks at 0 and at the constant everything is smooth; at 6 sigma a panel ends, so that nodes are dense
+    # where the density is.
     ends = np.array([-_REACH, -6.0, -loss.constant, 0.0, loss.constant, 6.0, _REACH])
     half, middle = 0.5 * np.diff(ends)[:, None], 0.5 * (ends[1:] + ends[:-1])[:, None]
     u = middle + half * node
@@ -129,6 +132,7 @@ def _late_weight(u: Array, c: float) -> Array:
 LOSSES = MappingProxyType(
     {
         loss.name: loss
+        # Each constant is where `efficiency` says 95 %, for the truncated loss 99 %.
         for loss in (
             Loss("huber", 1.345, _huber, _huber_weight),
             Loss("cauchy", 2.385, _cauchy, _cauchy_weight),

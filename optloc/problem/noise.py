@@ -66,6 +66,7 @@ class Whitener:
         matrix, count = arrays.placed(self.matrix, values), values.shape[-2]
         whole = self.row.size == count and np.array_equal(self.row.ravel(), np.arange(count))
         white: Array
+        # Independent rows and one group of all rows are the usual cases: they need no gathering and no reshape.
         if r == 1:
             white = matrix[..., 0] * (values if whole else arrays.gather(values, self.row[:, 0], -2))
         elif g == 1:
@@ -90,6 +91,7 @@ def independent(variance: Array) -> Noise:
 
 def together(key: Array) -> list[Array]:
     """Return the members (g, r) of equal keys (m,), one array for each size of group r."""
+    # Stable: members keep the order of the rows, on which the covariance is written down.
     order = np.argsort(key, kind="stable")
     _, first, sizes = np.unique(key[order], return_index=True, return_counts=True)
     return [order[first[sizes == r][:, None] + np.arange(r)] for r in np.unique(sizes)]
@@ -113,6 +115,8 @@ def arrivals(ends: Sequence[tuple[Array, int | Array]], variance: Array) -> Arra
     used = [(index, np.broadcast_to(sign, index.shape)) for index, sign in ends if np.any(sign)]
     shape = ends[0][0].shape
     covariance = np.zeros((*variance.shape[:-1], *shape, shape[-1]))
+    # An end of a row meets an end of another where they name one station: + for the same end of differences, - for
+    # opposite ones.
     for one, sign in used:
         for two, other in used:
             shared = (one[:, :, None] == two[:, None, :]) * (sign[:, :, None] * other[:, None, :])
@@ -161,11 +165,13 @@ def whiten(noise: Noise, weight: Array) -> tuple[Whitener, ...]:
 
 def _whitener(block: Block, weight: Array) -> Whitener:
     picked, xp = arrays.gather(weight, block.row), arrays.library(weight)
+    # All rows as measured: the matrices of the covariance itself, shared by the batch where that is.
     if bool(xp.all(picked == 1.0)):
         return Whitener(block.row, linalg.whitening(block.covariance))
     present = picked > 0.0
     variance = xp.linalg.diagonal(block.covariance)
     extra = xp.where(present, (1.0 / xp.where(present, picked, 1.0) - 1.0) * variance, 0.0)
+    # Rows and columns of zeros are absent for `linalg.whitening`, exactly and without a limit.
     both = present[..., :, None] & present[..., None, :]
     covariance = xp.where(both, block.covariance, 0.0) + extra[..., None] * arrays.eye(block.row.shape[1], weight)
     return Whitener(block.row, linalg.whitening(covariance))
@@ -187,6 +193,7 @@ def gathered(noise: Noise, members: Array) -> Array:
         In the given order.
     """
     count = 1 + max(int(members.max()), *(int(block.row.max()) for block in noise.blocks))
+    # Row number to group and place in it, -1 for rows that nobody asked for.
     group_of, slot = np.full(count, -1), np.zeros(count, dtype=np.int64)
     group_of[members], slot[members] = np.arange(len(members))[:, None], np.arange(members.shape[1])
     shape = np.broadcast_shapes(*(block.covariance.shape[:-3] for block in noise.blocks))

@@ -82,6 +82,7 @@ class Problem:
     @property
     def emitting(self) -> tuple[int, ...]:
         """Return the targets whose emission times are unknown."""
+        # An unlabelled row (-1) has an emission time of a target that is found later.
         found = {int(t) for block in self.rows if MODELS[block.kind].emission for t in block.target}
         return tuple(sorted(found))
 
@@ -135,7 +136,9 @@ class Problem:
             (b.name, b.members, b.form, b.row.tobytes(), b.member.tobytes(), b.coefficient.tobytes())
             for b in self.biases
         )
+        # Numbers are left out: positions, measurements, weights, covariances change from solve to solve.
         stations = (self.stations.count, self.dimension, self.stations.covariance is None, self.stations.span)
+        # Polygons enter nothing that is kept by structure but programs, whose keys hold the bands of their edges.
         constraints = tuple((c.kind, c.target) for c in self.constraints if isinstance(c, Band))
         return (rows, blocks, motions, biases, stations, self.times.tobytes(), self.frame, constraints)
 
@@ -163,9 +166,11 @@ class Problem:
         """Return the problems of a flat batch at an index or mask; structure stays."""
 
         def pick(array: Array, core: int) -> Array:
+            # A batch axis of length one is shared like none at all.
             return array if array.ndim == core or array.shape[0] == 1 else array[index]
 
         taken = _map(self, pick)
+        # Where no array has the batch axis the measurements carry it: problems that are equal stay as many.
         if taken.batch_shape == (1,):
             count = np.arange(self.batch_shape[0])[index].size
             taken = _map_z(taken, lambda z: np.broadcast_to(z, (count, z.shape[-1])))

@@ -26,9 +26,9 @@ from optloc.problem.problem import Problem
 WEIGHINGS = 2
 """Station errors are weighed where the target is thought to be; the weights hardly change with it."""
 
-# Systems of more unknowns are better solved one after the other than side by side.
+# Systems of more unknowns are better solved one after the other, by LAPACK, than side by side in lanes.
 _UNKNOWNS = 40
-# Numbers of the derivatives from which weights that depend on the place are made at a time.
+# Numbers of the derivatives from which weights that depend on the place are made at a time: 16 MB.
 _WEIGHED = 2**21
 
 
@@ -115,6 +115,7 @@ def by_machine_code(
     if not depends_on_place(problem):
         return _at_once(problem, start, own, whiten(weighed(problem).noise, problem.weight), rules, otherwise)
     width = problem.layout.n_shared + problem.stations.count * problem.dimension
+    # Each problem has weights of its own: made in parts, so that their derivatives stay in memory.
     parts = np.array_split(np.arange(len(start)), 1 + len(start) * problem.count * width // _WEIGHED)
     done = mapped(lambda part: _anew(problem.take(own[part]), start[part], rules, otherwise), parts)
     found = [one for one in done if one is not None]
@@ -133,6 +134,7 @@ def _at_once(
 
     kernel = Limits(float(rules.tolerance), int(rules.limit), bool(rules.damped))
     done, lost = refine.refined(found, item, start, kernel)
+    # Runs of which an epoch left a combination of its own unknowns open: numpy takes the step of least norm.
     if lost.any():
         more = otherwise(problem.take(item[lost]), start[lost], rules)
         for name in ("x", "cost", "status", "iterations"):
@@ -208,6 +210,7 @@ def refine(
     weights = None
     if not depends_on_place(problem):
         weights = _Weights.of(problem, start)
+        # One matrix for each problem, however many starts it has.
         weights = weights if item is None else weights.take(item)
     if item is not None:
         problem = problem.take(item)
@@ -251,6 +254,7 @@ def _iterated(problem: Problem, start: Array, weights: _Weights, rules: Rules) -
         state = _State.begin(problem, start, weights)
         active, blur = np.arange(len(start)), _blur(problem, len(start))
         for iteration in range(rules.limit):
+            # The status until another is found: what still moves.
             active = active[state.status[active] == Status.MAX_ITERATIONS]
             if not len(active):
                 break
@@ -296,6 +300,7 @@ class _Part:
 
     @classmethod
     def of(cls, problem: Problem, weights: _Weights, blur: Array, active: Array) -> _Part:
+        # All still move: nothing is copied.
         if len(active) == len(blur):
             return cls(problem, weights, blur)
         return cls(problem.take(active), weights.take(active), blur[active])
@@ -314,6 +319,7 @@ def _blur(problem: Problem, count: int) -> Array:
 
 def _advance(part: _Part, state: _State, active: Array, rules: Rules, iteration: int) -> None:
     """Try one step of every problem still moving."""
+    # Most batches end together: as long as all move, arrays are handed on instead of gathered.
     everything = len(active) == len(state.x)
     now = state.equations if everything else _at(state.equations, active)
     here = state.x[active]
