@@ -26,7 +26,7 @@ from optloc.problem.problem import Problem
 _LINES, _BOUNDS, _MEMBERS = 10, 30, 16
 # Points of a course, as many as a picture shows apart; and unknowns beyond which nobody reads a curve of each.
 _POINTS, _UNKNOWNS = 400, 100
-# Points along each side of a map: isolines are smooth, and a bound at each of the 9216 takes about a second.
+# Points along each side of a map: isolines are smooth, and the 9216 bounds take less than a second.
 _MAP_POINTS = 96
 _PICTURES = (".png", ".svg", ".pdf")
 _RMS = {True: " (rms)", False: ""}

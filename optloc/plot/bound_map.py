@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,12 +13,21 @@ from optloc.bounds.bound_map import BoundMap
 from optloc.plot.style import BLACK, GREY, apart, figure_class
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 COLOURS = "GnBu"
 """Light to dark in one hue: legible in grey and without colour vision, and black lines stay visible."""
 
+# Levels in each decade, and what may stand between them where there are few.
 _STEPS = (1.0, 2.0, 5.0)
+_BETWEEN = {1.0: (1.2, 1.5), 2.0: (3.0,), 5.0: (7.0,)}
+# Levels at most: lines of more run into each other.
+_LEVELS = 9
+# Stations that are named.
+_NAMED = 12
+# Side of a map from which it is in kilometres, metres.
+_FAR = 5e3
 
 
 def plot_bound_map(found: BoundMap, title: str = "", *, dilution: bool = False) -> Figure:
@@ -46,8 +56,9 @@ def plot_bound_map(found: BoundMap, title: str = "", *, dilution: bool = False) 
 
     values, name = _drawn(found, dilution=dilution)
     steps = levels(values)
-    scale = 1.0 if found.geodetic or max(np.ptp(found.x), np.ptp(found.y)) < 5e3 else 1e-3
-    x, y, stations = found.x * scale, found.y * scale, found.stations * scale
+    scale = 1.0 if found.geodetic or max(np.ptp(found.x), np.ptp(found.y)) < _FAR else 1e-3
+    x, y = found.x * scale, found.y * scale
+    # A degree of longitude is shorter than one of latitude: one scale on both axes, at the middle of the map.
     squeeze = np.cos(np.radians(found.y.mean())) if found.geodetic else 1.0
     tall = float(np.clip(np.ptp(y) / (np.ptp(x) * squeeze), 0.4, 1.6))
     figure = figure_class()(figsize=(6.4, 0.9 + 5.2 * tall), layout="compressed")
@@ -56,14 +67,7 @@ def plot_bound_map(found: BoundMap, title: str = "", *, dilution: bool = False) 
     drawn = axes.pcolormesh(x, y, values, norm=norm, cmap=COLOURS, shading="nearest", rasterized=True)
     lines = axes.contour(x, y, values, levels=steps, colors=BLACK, linewidths=0.8)
     axes.clabel(lines, fmt=lambda value: f"{value:g}", fontsize=8)
-    axes.scatter(
-        stations[:, 0], stations[:, 1], marker="^", s=50, color="white", edgecolors=BLACK, linewidths=1.2, zorder=4
-    )
-    inside = (np.abs(stations - [x.mean(), y.mean()]) <= [np.ptp(x) / 2, np.ptp(y) / 2]).all(-1)
-    for place, text in zip(stations[inside], np.array(found.names)[inside], strict=True):
-        if len(found.names) <= 12:
-            note = axes.annotate(str(text), place, (4, 5), textcoords="offset points", fontsize=8, zorder=5)
-            note.set_bbox({"facecolor": "white", "edgecolor": GREY, "alpha": 0.75, "pad": 1, "linewidth": 0.4})
+    _mark_stations(axes, found.stations * scale, found.names, x, y)
     axes.set_xlim(x[0], x[-1])
     axes.set_ylim(y[0], y[-1])
     axes.set_aspect(1.0 / squeeze)
@@ -78,6 +82,17 @@ def plot_bound_map(found: BoundMap, title: str = "", *, dilution: bool = False) 
     return figure
 
 
+def _mark_stations(axes: Axes, stations: Array, names: Sequence[str], x: Array, y: Array) -> None:
+    """Draw stations, and name those on the map where they are few."""
+    style: dict[str, Any] = {"marker": "^", "s": 50, "color": "white", "edgecolors": BLACK, "linewidths": 1.2}
+    axes.scatter(stations[:, 0], stations[:, 1], zorder=4, **style)
+    inside = (np.abs(stations - [x.mean(), y.mean()]) <= [np.ptp(x) / 2, np.ptp(y) / 2]).all(-1)
+    for place, text in zip(stations[inside], np.array(names)[inside], strict=True):
+        if len(names) <= _NAMED:
+            note = axes.annotate(str(text), place, (4, 5), textcoords="offset points", fontsize=8, zorder=5)
+            note.set_bbox({"facecolor": "white", "edgecolor": GREY, "alpha": 0.75, "pad": 1, "linewidth": 0.4})
+
+
 def _drawn(found: BoundMap, *, dilution: bool) -> tuple[Array, str]:
     values = found.dilution if dilution else found.sigma
     if dilution and not np.isfinite(found.row):
@@ -89,18 +104,19 @@ def _drawn(found: BoundMap, *, dilution: bool) -> tuple[Array, str]:
     return values, "dilution of precision" if dilution else "bound of the position error (m)"
 
 
-def levels(values: Array, most: int = 9) -> list[float]:
+def levels(values: Array) -> list[float]:
     """Return the levels of isolines: 1, 2, 5 times powers of ten that hold the middle 98 % of values."""
     good = values[np.isfinite(values) & (values > 0.0)]
+    # Near stations and beyond them the bound runs to zero and infinity: one per cent at either end has no line.
     low, high = (float(np.quantile(good, share)) for share in (0.01, 0.99))
     decades = range(int(np.floor(np.log10(low))) - 1, int(np.ceil(np.log10(high))) + 1)
     steps = [step * 10.0**power for power in decades for step in _STEPS]
     first = max(i for i, step in enumerate(steps) if step <= low)
     last = min((i for i, step in enumerate(steps) if step >= high), default=len(steps) - 1)
     chosen = steps[first : max(last, first + 1) + 1]
-    if len(chosen) <= most // 2:
+    if len(chosen) <= _LEVELS // 2:
         return [round(step, 12) for step in _finer(chosen)]
-    if len(chosen) > most:
+    if len(chosen) > _LEVELS:
         whole = [step for step in chosen if np.isclose(np.log10(step) % 1.0, [0.0, 1.0]).any()]
         chosen = whole if len(whole) > 2 else chosen[::2]
     return [round(step, 12) for step in chosen]
@@ -108,11 +124,11 @@ def levels(values: Array, most: int = 9) -> list[float]:
 
 def _finer(steps: list[float]) -> list[float]:
     """Return steps with one or two round numbers between each."""
-    between = {1.0: (1.2, 1.5), 2.0: (3.0,), 5.0: (7.0,)}
     full = []
     for step in steps[:-1]:
+        # A hair more than the step, as the logarithm of 1000 may be less than 3.
         power = 10.0 ** np.floor(np.log10(step * 1.0001))
-        full += [step, *(more * power for more in between[float(round(step / power))])]
+        full += [step, *(more * power for more in _BETWEEN[float(round(step / power))])]
     return [*full, steps[-1]]
 
 
@@ -150,6 +166,7 @@ def map_geojson(found: BoundMap) -> dict[str, Any]:
 
 def _pieces(line: Array) -> list[list[list[float]]]:
     """Return a line cut where it crosses the date line, as the standard asks."""
+    # Maps across the date line have longitudes beyond 180 degrees; files do not.
     turn = np.floor((line[:, 0] + 180.0) / 360.0)
     cuts = np.flatnonzero(np.diff(turn)) + 1
     return [_wrapped(part) for part in np.split(line, cuts) if len(part) > 1]
@@ -157,6 +174,7 @@ def _pieces(line: Array) -> list[list[list[float]]]:
 
 def _wrapped(line: Array) -> list[list[float]]:
     lon = (line[:, 0] + 180.0) % 360.0 - 180.0
+    # Six decimals of a degree are a tenth of a metre.
     return np.round(np.stack([lon, line[:, 1]], axis=-1), 6).tolist()  # type: ignore[no-any-return]
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from optloc.base.linalg import error_ellipse
 from optloc.base.types import Array
-from optloc.plot import style as parts
+from optloc.plot import style
 from optloc.plot.style import (
     BLACK,
     BLUE,
@@ -22,6 +22,7 @@ from optloc.plot.style import (
     View,
     apart,
     figure_class,
+    finish,
     scene_of,
     unit_of,
     xy,
@@ -32,6 +33,13 @@ from optloc.problem.problem import Problem
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+
+# Reach of the fixes, as a share of the spread of the stations, from which the overview shows them well enough.
+_CLOSE = 0.3
+# Panel around the fixes: so many semi-axes of the largest ellipse, and of the distance that holds 95 % of the fixes.
+# The last is the share of the stations' spread where both are zero, as of a fix that constraints hold.
+_SEMI_AXES, _SPREAD, _HELD = 1.6, 1.1, 0.1
 
 
 def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") -> Figure:
@@ -58,16 +66,14 @@ def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") ->
     spatial = scene.stations.shape[-1] == 3
     count = 1 + spatial + (near := _nearby(scene))
     figure = figure_class()(figsize=(0.4 + 5.0 * count, 5.2), layout="constrained")
+    # Overview, height in space, and the surroundings where the overview shows no more than a dot.
     panels = figure.subplots(1, count, squeeze=False)[0]
     _overview(panels[0], scene, PLAN)
     if spatial:
         _overview(panels[1], scene, (0, 2))
     if near:
         _close(panels[-1], scene)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)
-    if title:
-        figure.suptitle(title)
+    finish(figure, title, panels[:1])
     apart(figure)
     return figure
 
@@ -78,11 +84,11 @@ def _overview(panel: Axes, scene: Scene, view: View) -> None:
     unit, size = unit_of(everything[:, view])
     if view == PLAN:
         _edges(panel, scene, size)
-    parts.ellipses(panel, scene, view, size)
+    style.ellipses(panel, scene, view, size)
     _lines(panel, scene, view, size)
-    parts.stations(panel, scene, view, size)
-    parts.points(panel, scene, view, size)
-    parts.name_axes(panel, scene, view, unit)
+    style.stations(panel, scene, view, size)
+    style.points(panel, scene, view, size)
+    style.name_axes(panel, scene, view, unit)
     panel.set_title("plan" if view == PLAN else "height")
 
 
@@ -104,9 +110,9 @@ def _lines(panel: Axes, scene: Scene, view: View, size: float) -> None:
         (scene.other_paths, {"label": "path of an alternative", "color": ORANGE, "linewidth": 1.2, "linestyle": "--"}),
         (scene.known, {"label": "known target", "color": GREEN, "linewidth": 1.2, **spots}),
     )
-    for lines, style in styles:
+    for lines, look in styles:
         for i, part in enumerate(lines):
-            panel.plot(*xy(part, view, size), zorder=2, **(style if i == 0 else style | {"label": None}))
+            panel.plot(*xy(part, view, size), zorder=2, **(look if i == 0 else look | {"label": None}))
 
 
 def _nearby(scene: Scene) -> bool:
@@ -114,36 +120,36 @@ def _nearby(scene: Scene) -> bool:
     known = np.asarray(np.isfinite(scene.fixes).all(-1))
     if not known.any():
         return True
-    return _reach(scene, known, np.median(scene.fixes[known][:, :2], axis=0)) < 0.3 * float(
-        np.ptp(scene.stations[:, :2])
-    )
+    reach = _reach(scene, known, np.median(scene.fixes[known][:, :2], axis=0))
+    return reach < _CLOSE * float(np.ptp(scene.stations[:, :2]))
 
 
 def _close(panel: Axes, scene: Scene) -> None:
-    """Draw the surroundings of the fixes: three times their ellipse, or their own spread."""
+    """Draw the surroundings of the fixes: what is beyond their ellipses, or their own spread."""
     known: Array = np.asarray(np.isfinite(scene.fixes).all(-1))
     view = PLAN
     if not known.any():
         panel.set_axis_off()
         panel.text(0.5, 0.5, "no fix", ha="center", va="center", transform=panel.transAxes)
         return
+    # Medians: one wild fix of many must not move the panel.
     centre = np.median(scene.fixes[known][:, view], axis=0)
     extent = _reach(scene, known, centre)
     unit, size = unit_of(np.array([centre - extent, centre + extent]) - centre)
-    shifted = _moved(scene, centre)
+    shifted = _shift(scene, centre)
     _edges(panel, shifted, size)
-    parts.ellipses(panel, shifted, view, size)
+    style.ellipses(panel, shifted, view, size)
     _lines(panel, shifted, view, size)
-    parts.points(panel, shifted, view, size)
-    parts.stations(panel, shifted, view, size, named=False)
-    parts.name_axes(panel, shifted, view, unit)
+    style.points(panel, shifted, view, size)
+    style.stations(panel, shifted, view, size, named=False)
+    style.name_axes(panel, shifted, view, unit)
     panel.set_aspect("equal", adjustable="box")
     panel.set_xlim(-extent / size, extent / size)
     panel.set_ylim(-extent / size, extent / size)
     panel.set_title(f"around {scene.axes[0]} {centre[0]:.1f} m, {scene.axes[1]} {centre[1]:.1f} m")
 
 
-def _moved(scene: Scene, centre: Array) -> Scene:
+def _shift(scene: Scene, centre: Array) -> Scene:
     shift = np.zeros(scene.stations.shape[-1])
     shift[:2] = centre
     return replace(scene.moved(lambda place: place - shift), regions=tuple(ring - centre for ring in scene.regions))
@@ -153,5 +159,5 @@ def _reach(scene: Scene, known: Array, centre: Array) -> float:
     semi_axes, _ = error_ellipse(scene.covariances[known][:, :2, :2])
     largest = np.max(semi_axes[np.isfinite(semi_axes)], initial=0.0)
     away = np.abs(scene.fixes[known][:, :2] - centre).max(-1)
-    reach = 1.6 * float(largest) + 1.1 * float(np.quantile(away, 0.95))
-    return reach if reach > 0.0 else 0.1 * float(np.ptp(scene.stations[:, :2]) or 1.0)
+    reach = _SEMI_AXES * float(largest) + _SPREAD * float(np.quantile(away, 0.95))
+    return reach if reach > 0.0 else _HELD * float(np.ptp(scene.stations[:, :2]) or 1.0)

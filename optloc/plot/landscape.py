@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -10,7 +10,6 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.status import Status
 from optloc.base.types import Array
 from optloc.plot import style
-from optloc.plot import style as parts
 from optloc.plot.bound_map import levels
 from optloc.plot.style import (
     BLACK,
@@ -21,6 +20,7 @@ from optloc.plot.style import (
     Scene,
     apart,
     figure_class,
+    finish,
     placed_points,
     scene_of,
     unit_of,
@@ -33,12 +33,27 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
 COLOURS = "YlGnBu_r"
+"""Dark where the cost is low, in steps of lightness."""
+
+# Points along each side of a panel: each is a problem of its own, and lines drawn through fewer show corners.
 _POINTS = 121
+# Levels of the surroundings, standard deviations: a covariance holds near the fix, curvature shows further out.
 _SIGMAS = (1, 2, 3, 4, 5, 7, 10)
+# Chi-square of two degrees of freedom that holds 95 %: a plan has two coordinates.
 _CHI2_95 = 5.991464547107979
+# Half the side of the surroundings in standard deviations of the larger coordinate: the 95 % ellipse and as much again.
+_AROUND = 4.2
 _NAME = "cost above that of the fix, square root (standard deviations)"
+# Rows times starts that are iterated at once, which memory holds; and the starts along a side that this allows.
+_ROWS, _STARTS = 4e6, (31, 161)
+_NAMES = {"taylor": "plain Taylor iteration", "lsr": "damped least squares"}
+_ENDS = {
+    End.REACHED: "the best fit",
+    End.ELSEWHERE: "a worse fit elsewhere",
+    End.NOWHERE: "nowhere: it does not converge",
+}
+_COLOURS = {End.REACHED: BLUE, End.ELSEWHERE: YELLOW, End.NOWHERE: "#e4e4e4"}
 
 
 def plot_landscape(problem: Problem, fix: Fix, title: str = "") -> Figure:
@@ -73,11 +88,7 @@ def plot_landscape(problem: Problem, fix: Fix, title: str = "") -> Figure:
     whole, near = figure.subplots(1, 2)
     _whole(whole, flat, answer, scene)
     _near(near, flat, answer, scene)
-    handles, labels = whole.get_legend_handles_labels()
-    more, names = near.get_legend_handles_labels()
-    figure.legend([*handles, *more], [*labels, *names], loc="outside lower center", ncols=5, frameon=False)
-    if title:
-        figure.suptitle(title)
+    finish(figure, title, (whole, near))
     apart(figure)
     return figure
 
@@ -124,6 +135,7 @@ def _excess(problem: Problem, fix: Fix, points: Array, held: int) -> Array:
     held : int
         Coordinates that stay: all, or the plan while the height takes the value that fits best.
     """
+    # The solver works in the problem's frame; what is held are directions of the picture.
     places, axes = placed_points(problem, points)
     cost = profile_cost(problem, fix.x[0], places, axes[:held])
     return np.asarray(np.sqrt(np.maximum(cost - fix.cost[0], 0.0)))
@@ -137,11 +149,12 @@ def _whole(panel: Axes, problem: Problem, fix: Fix, scene: Scene) -> None:
     x, y, grid = plane(corners, _POINTS, scene.fixes[0])
     excess = _excess(problem, fix, grid, problem.dimension).reshape(_POINTS, _POINTS)
     steps = levels(excess)
+    # At least a factor of two, or the scale would have one colour.
     norm = LogNorm(steps[0], max(steps[-1], 2.0 * steps[0]), clip=True)
     drawn = panel.pcolormesh(x / size, y / size, excess, norm=norm, cmap=COLOURS, rasterized=True, shading="nearest")
     panel.contour(x / size, y / size, excess, levels=steps, colors="white", linewidths=0.7)
-    parts.stations(panel, scene, PLAN, size, edgecolors="white", linewidths=0.8)
-    parts.points(panel, scene, PLAN, size)
+    style.stations(panel, scene, PLAN, size, edgecolors="white", linewidths=0.8)
+    style.points(panel, scene, PLAN, size)
     _square(panel, scene, corners / size, unit)
     panel.set_title("everything" if problem.dimension == 2 else "everything, at the height of the fix")
     bar = panel.figure.colorbar(drawn, ax=panel, label=_NAME, ticks=steps, format=lambda value, _: f"{value:g}")
@@ -154,27 +167,27 @@ def _near(panel: Axes, problem: Problem, fix: Fix, scene: Scene) -> None:
         panel.set_axis_off()
         panel.text(0.5, 0.5, "no covariance", ha="center", va="center", transform=panel.transAxes)
         return
-    half = 4.2 * spread.max()
+    half = _AROUND * spread.max()
     corners = np.stack([centre[:2] - half, centre[:2] + half])
     unit, size = unit_of(corners - centre[:2])
     x, y, grid = plane(corners, _POINTS, centre)
+    # The height takes the value that fits best: what the line of 95 % is then is the ellipse of the plan.
     excess = _excess(problem, fix, grid, 2).reshape(_POINTS, _POINTS)
     x, y, corners = (x - centre[0]) / size, (y - centre[1]) / size, (corners - centre[:2]) / size
     drawn = panel.contourf(x, y, excess, levels=[0, *_SIGMAS], cmap=COLOURS, extend="max")
     panel.contour(x, y, excess, levels=_SIGMAS, colors="white", linewidths=0.7)
     panel.figure.colorbar(drawn, ax=panel, label="the same (standard deviations)")
-    style: dict[str, Any] = {"levels": [np.sqrt(_CHI2_95)], "colors": ORANGE, "linewidths": 2.0}
-    panel.contour(x, y, excess, **style)
+    panel.contour(x, y, excess, levels=[np.sqrt(_CHI2_95)], colors=ORANGE, linewidths=2.0)
     panel.plot([], [], color=ORANGE, linewidth=2.0, label="95 % by the cost")
     moved = scene.moved(lambda place: place - np.pad(centre[:2], (0, len(centre) - 2)))
-    parts.ellipses(panel, moved, PLAN, size, color=BLACK, linestyle="--", linewidth=1.4)
+    style.ellipses(panel, moved, PLAN, size, color=BLACK, linestyle="--", linewidth=1.4)
     panel.scatter(0.0, 0.0, marker="o", s=50, color=BLUE, edgecolors="white", zorder=4)
     _square(panel, scene, corners, unit)
     panel.set_title(f"around {scene.axes[0]} {centre[0]:.1f} m, {scene.axes[1]} {centre[1]:.1f} m")
 
 
 def _square(panel: Axes, scene: Scene, corners: Array, unit: str) -> None:
-    parts.name_axes(panel, scene, PLAN, unit)
+    style.name_axes(panel, scene, PLAN, unit)
     panel.grid(visible=False)
     panel.set_aspect("equal", adjustable="box")
     panel.set_xlim(*corners[:, 0])
@@ -182,15 +195,6 @@ def _square(panel: Axes, scene: Scene, corners: Array, unit: str) -> None:
 
 
 # Where iterations from many starts end, beside the fix that needs no start.
-
-_ROWS = 4e6
-_NAMES = {"taylor": "plain Taylor iteration", "lsr": "damped least squares"}
-_ENDS = {
-    End.REACHED: "the best fit",
-    End.ELSEWHERE: "a worse fit elsewhere",
-    End.NOWHERE: "nowhere: it does not converge",
-}
-_COLOURS = {End.REACHED: BLUE, End.ELSEWHERE: YELLOW, End.NOWHERE: "#e4e4e4"}
 
 
 def plot_convergence(
@@ -228,7 +232,7 @@ def plot_convergence(
     corners = limits(scene, 1.0)
     if reach is not None:
         corners = corners.mean(0) + np.array([[-reach], [reach]])
-    starts = int(np.clip(np.sqrt(_ROWS / flat.count), 31, 161)) if starts is None else starts
+    starts = int(np.clip(np.sqrt(_ROWS / flat.count), *_STARTS)) if starts is None else starts
     x, y, points = plane(corners, starts, scene.fixes[0])
     places, _ = placed_points(flat, points)
     figure = figure_class()(figsize=(13.0, 5.2), layout="constrained")
@@ -243,8 +247,7 @@ def plot_convergence(
     for panel in panels:
         _marks(panel, scene, size, corners / size, unit, last=panel is panels[2])
     _legend(figure, panels[2])
-    if title:
-        figure.suptitle(title)
+    finish(figure, title)
     apart(figure)
     return figure
 

@@ -13,7 +13,7 @@ from optloc.base.units import SI_UNIT
 from optloc.linear.evaluate import differentiate
 from optloc.linear.station_noise import weighed
 from optloc.models import MODELS
-from optloc.plot.style import BLACK, BLUE, GREY, ORANGE, SKY, figure_class, grid
+from optloc.plot.style import BLACK, BLUE, GREY, ORANGE, SKY, figure_class, finish, grid
 from optloc.problem.fix import Fix
 from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
@@ -23,8 +23,18 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
+# Stations or pairs of a panel, those with the largest residuals in sigmas; and residuals that are drawn one by one.
 _SHOWN, _FEW = 40, 12
+# Residuals, in sigmas, beyond which they are marked.
+_BEYOND = 3.0
+# Percentiles of a box and of its whiskers.
+_MIDDLE, _WHISKERS = (25.0, 75.0), (2.5, 97.5)
+# Standard deviation of a left-out residual, in that of the median, beyond which it says little of its station.
+_VAGUE = 3.0
+# Bias, in whiskers of the others, beyond which a station is not drawn but named.
+_FAR = 10.0
+Sets = dict[str, tuple[Array, float]]
+"""Residuals (n,) and the median standard deviation of a row, by the name of the stations."""
 
 
 def plot_residuals(problem: Problem, fix: Fix, title: str = "") -> Figure:
@@ -69,11 +79,7 @@ def plot_residuals(problem: Problem, fix: Fix, title: str = "") -> Figure:
         for rows, start in zip(part.rows, part.starts, strict=True)
         for cols in [slice(start, start + rows.count)]
     ]
-    return _drawn([rows.kind for rows in part.rows], sets, title)
-
-
-Sets = dict[str, tuple[Array, float]]
-"""Residuals (n,) and the median standard deviation of a row, by the name of the stations."""
+    return _draw([rows.kind for rows in part.rows], sets, title)
 
 
 def _sets(problem: Problem, rows: Rows, residual: Array, sigma: Array, weight: Array) -> Sets:
@@ -85,6 +91,7 @@ def _sets(problem: Problem, rows: Rows, residual: Array, sigma: Array, weight: A
         present = weight[:, own] > 0.0
         if present.any():
             found[name] = (residual[:, own][present], float(np.median(sigma[:, own][present])))
+    # The largest residual in sigmas decides who is drawn; the order stays that of the file.
     worst = sorted(found, key=lambda name: -float(np.abs(found[name][0]).max() / found[name][1]))[:_SHOWN]
     return {name: values for name, values in found.items() if name in worst}
 
@@ -93,36 +100,38 @@ def _label(names: Sequence[str], a: int, b: int) -> str:
     return " – ".join(names[i] for i in (a, b) if i >= 0) or "all"
 
 
-def _drawn(kinds: Sequence[str], sets: Sequence[Sets], title: str) -> Figure:
-    tall = [max(2, len(one)) for one in sets]
-    figure = figure_class()(figsize=(7.6, 1.0 + sum(0.9 + 0.3 * n for n in tall)), layout="constrained")
-    panels = figure.subplots(len(sets), 1, squeeze=False, height_ratios=tall)[:, 0]
+def _draw(kinds: Sequence[str], sets: Sequence[Sets], title: str) -> Figure:
+    figure, panels = _rows_of_panels([len(one) for one in sets], 7.6, 0.3)
     for panel, kind, one in zip(panels, kinds, sets, strict=True):
         _panel(panel, kind, one)
-    shown: dict[str, Any] = {}
-    for panel in panels:
-        handles, labels = panel.get_legend_handles_labels()
-        shown |= dict(zip(labels, handles, strict=True))
-    figure.legend(shown.values(), shown, loc="outside lower center", ncols=4, frameon=False, fontsize=8)
-    if title:
-        figure.suptitle(title)
-    return figure
+    return finish(figure, title, panels, 4, fontsize=8)
+
+
+def _rows_of_panels(counts: Sequence[int], width: float, line: float) -> tuple[Figure, Any]:
+    """Return a figure with a panel for each count of lines, one below the other, as tall as its lines (inches)."""
+    tall = [max(2, count) for count in counts]
+    size = (width, 1.1 + sum(0.9 + line * n for n in tall))
+    figure = figure_class()(figsize=size, layout="constrained")
+    return figure, figure.subplots(len(tall), 1, squeeze=False, height_ratios=tall)[:, 0]
 
 
 def _panel(panel: Axes, kind: str, sets: Sets) -> None:
     unit = SI_UNIT[MODELS[kind].quantity]  # type: ignore[index]  # the table holds known quantities only
+    # Milliradians: angles of residuals have too many zeros otherwise.
     factor, unit = (1e3, f"m{unit}") if unit == "rad" else (1.0, unit)
     for place, (values, sigma) in enumerate(sets.values()):
         own, bar = factor * values, 2.0 * factor * sigma
         panel.hlines(place, -bar, bar, color=GREY, linewidth=5.0, alpha=0.5, label=_once(place, "± 2 sigma of a row"))
         if len(own) > _FEW:
-            low, left, middle, right, high = np.percentile(own, (2.5, 25.0, 50.0, 75.0, 97.5))
+            low, left, middle, right, high = np.percentile(
+                own, (_WHISKERS[0], _MIDDLE[0], 50.0, _MIDDLE[1], _WHISKERS[1])
+            )
             panel.hlines(place, low, high, color=BLUE, linewidth=1.2, zorder=3, label=_once(place, "95 % of residuals"))
             style: dict[str, Any] = {"height": 0.5, "color": SKY, "edgecolor": BLUE, "zorder": 3}
             panel.barh(place, right - left, left=left, label=_once(place, "middle half"), **style)
             panel.scatter(middle, place, marker="|", s=70, color=BLACK, zorder=4, label=_once(place, "median"))
             continue
-        far = np.abs(own) > 1.5 * bar
+        far = np.abs(own) > _BEYOND * factor * sigma
         for chosen, colour, mark, name in (
             (~far, BLUE, "o", "residual"),
             (far, ORANGE, "X", "residual beyond 3 sigma"),
@@ -145,11 +154,6 @@ def _once(place: int, label: str) -> str:
 
 # Health of stations: left-out residuals as boxes, the largest bias on top.
 
-_STATIONS_SHOWN = 40
-_MIDDLE, _WHISKERS = (25.0, 75.0), (2.5, 97.5)
-# Bias, in whiskers of the others, beyond which a station is not drawn but named.
-_FAR = 10.0
-
 
 def plot_health(health: Health, *, title: str = "") -> Figure:
     """Return a picture of the left-out residuals of every station, one panel for each unit.
@@ -171,47 +175,18 @@ def plot_health(health: Health, *, title: str = "") -> Figure:
         To be written with `optloc.plot.save`.
     """
     units = list(dict.fromkeys(health.units))
-    chosen = [_chosen(health, unit) for unit in units]
-    tall = [max(2, len(groups)) for groups in chosen]
-    size = (8.0, 1.2 + sum(0.9 + 0.27 * n for n in tall))
-    figure = figure_class()(figsize=size, layout="constrained")
-    panels = figure.subplots(len(units), 1, squeeze=False, height_ratios=tall)[:, 0]
+    chosen = [_choose(health, unit) for unit in units]
+    figure, panels = _rows_of_panels([len(groups) for groups in chosen], 8.0, 0.27)
     for panel, unit, groups in zip(panels, units, chosen, strict=True):
         _health_panel(panel, health, unit, groups)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=len(labels), frameon=False, fontsize=8)
-    if title:
-        figure.suptitle(title)
-    return figure
+    return finish(figure, title, panels[:1], 4, fontsize=8)
 
 
-def _limit(panel: Axes, whisker: Array, bias: Array, unit: str) -> None:
-    """Set the limits so that boxes can be told apart; of a station far beyond the others the edge tells the bias."""
-    most = np.quantile(whisker, 0.8)
-    bias = np.nan_to_num(bias)
-    far = np.abs(bias) > _FAR * most
-    reach = 1.2 * max(most, *np.abs(bias[~far]), *np.minimum(whisker[~far], 2.0 * most))
-    panel.set_xlim(-reach, reach)
-    for place in np.flatnonzero(far).tolist():
-        if bias[place] > 0.0:
-            words, side, align = f"{bias[place]:.3g} {unit} \N{RIGHTWARDS ARROW}", reach, "right"
-        else:
-            words, side, align = f"\N{LEFTWARDS ARROW} {bias[place]:.3g} {unit}", -reach, "left"
-        panel.text(0.99 * side, place, words, ha=align, va="center", fontsize=8, color=ORANGE)
-
-
-def _chosen(health: Health, unit: str) -> Array:
+def _choose(health: Health, unit: str) -> Array:
     """Return the groups of a unit that are drawn, those with the smallest bias first."""
     groups = np.flatnonzero(np.array(health.units) == unit)
-    groups = groups[np.argsort(-health.count[groups], kind="stable")[:_STATIONS_SHOWN]]
+    groups = groups[np.argsort(-health.count[groups], kind="stable")[:_SHOWN]]
     return groups[np.argsort(np.nan_to_num(health.bias[groups]), kind="stable")]
-
-
-def _well_checked(health: Health, group: int) -> Array:
-    """Return the residuals of a group but for those that the others predict several times worse than most."""
-    own = health.group == group
-    sigma = health.sigma[own]
-    return np.asarray(health.residual[own][sigma <= 3.0 * np.median(sigma)])
 
 
 def _health_panel(panel: Axes, health: Health, unit: str, groups: Array) -> None:
@@ -224,17 +199,9 @@ def _health_panel(panel: Axes, health: Health, unit: str, groups: Array) -> None
         place, right - left, left=left, height=0.6, color=SKY, edgecolor=BLUE, linewidth=0.8, label="middle half"
     )
     panel.scatter(middle, place, marker="|", s=90, color=BLUE, linewidth=2.0, label="median", zorder=3)
-    panel.errorbar(
-        factor * health.bias[groups],
-        place,
-        xerr=2.0 * factor * health.bias_error[groups],
-        fmt="D",
-        color=ORANGE,
-        markersize=4,
-        capsize=3,
-        label="bias ± 2 standard errors",
-        zorder=4,
-    )
+    style: dict[str, Any] = {"fmt": "D", "color": ORANGE, "markersize": 4, "capsize": 3, "zorder": 4}
+    error = 2.0 * factor * health.bias_error[groups]
+    panel.errorbar(factor * health.bias[groups], place, xerr=error, label="bias ± 2 standard errors", **style)
     _limit(panel, np.abs([low, high]).max(0), factor * health.bias[groups], shown)
     panel.axvline(0.0, color=BLACK, linewidth=0.8, zorder=0)
     panel.set_yticks(place, [health.names[g] for g in groups])
@@ -246,3 +213,26 @@ def _health_panel(panel: Axes, health: Health, unit: str, groups: Array) -> None
     right_axis.set_yticks(place, words, fontsize=8)
     right_axis.tick_params(length=0)
     right_axis.set_ylabel("outliers")
+
+
+def _well_checked(health: Health, group: int) -> Array:
+    """Return the residuals of a group but for those that the others predict several times worse than most."""
+    own = health.group == group
+    sigma = health.sigma[own]
+    return np.asarray(health.residual[own][sigma <= _VAGUE * np.median(sigma)])
+
+
+def _limit(panel: Axes, whisker: Array, bias: Array, unit: str) -> None:
+    """Set the limits so that boxes can be told apart; of a station far beyond the others the edge tells the bias."""
+    # A fifth of the stations may be worse without squeezing the boxes of the others.
+    most = np.quantile(whisker, 0.8)
+    bias = np.nan_to_num(bias)
+    far = np.abs(bias) > _FAR * most
+    reach = 1.2 * max(most, *np.abs(bias[~far]), *np.minimum(whisker[~far], 2.0 * most))
+    panel.set_xlim(-reach, reach)
+    for place in np.flatnonzero(far).tolist():
+        if bias[place] > 0.0:
+            words, side, align = f"{bias[place]:.3g} {unit} \N{RIGHTWARDS ARROW}", reach, "right"
+        else:
+            words, side, align = f"\N{LEFTWARDS ARROW} {bias[place]:.3g} {unit}", -reach, "left"
+        panel.text(0.99 * side, place, words, ha=align, va="center", fontsize=8, color=ORANGE)

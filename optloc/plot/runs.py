@@ -1,4 +1,4 @@
-"""Errors of methods against the Cramer-Rao bound, over noise."""
+"""Curves: errors of methods over noise, the bound of a run and its estimates against time."""
 
 from __future__ import annotations
 
@@ -10,7 +10,20 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.bounds.crlb import Course
-from optloc.plot.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, YELLOW, figure_class, grid
+from optloc.plot.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    SKY,
+    YELLOW,
+    figure_class,
+    finish,
+    grid,
+    panels_for,
+)
 from optloc.problem.layout import Slot
 from optloc.solvers.running import Growing
 
@@ -18,8 +31,22 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-
+# Each method has a colour and a mark, so that print in grey tells them apart.
 _LOOKS = ((BLUE, "o"), (ORANGE, "s"), (GREEN, "D"), (PURPLE, "^"), (SKY, "v"), (YELLOW, "P"))
+_COURSE_COLOURS = (ORANGE, GREEN, PURPLE, SKY, YELLOW, GREY, BLACK)
+_WORDS = {"position": ("position", "m"), "velocity": ("velocity", "m/s"), "acceleration": ("acceleration", "m/s²")}
+_SPACE = {2: "the plane", 3: "space"}
+# Members of a family of biases that have a curve each; more are told by their root mean square.
+_MANY = 10
+_BIAS_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, YELLOW)
+_DASHES = ("-", "--", "-.", ":")
+# Members that are drawn: as many as there are colours.
+_MOST = 6
+# Quantile of a standard normal variable that leaves 2.5 % above it.
+_95 = 1.959963984540054
+# Half the height of a panel of estimates, in their standard deviation half way of the run: the first intervals, which
+# are far wider, are cut off.
+_RIM = 8.0
 
 
 def plot_accuracy(
@@ -62,6 +89,7 @@ def plot_accuracy(
         raise InvalidProblem("a noise is not positive", "noise", "leave it out: the axis is logarithmic")
     figure = figure_class()(figsize=(6.2, 4.4), layout="constrained")
     axes = figure.subplots()
+    # Wide and pale behind the methods: those that attain it lie on it.
     axes.plot(noise, bound, color=BLACK, linewidth=4.0, alpha=0.3, label="Cramer-Rao bound", zorder=2)
     for i, (name, values) in enumerate(errors.items()):
         colour, mark = _LOOKS[i % len(_LOOKS)]
@@ -78,10 +106,6 @@ def plot_accuracy(
 
 
 # The Cramer-Rao bound against time.
-
-_COURSE_COLOURS = (ORANGE, GREEN, PURPLE, SKY, YELLOW, GREY, BLACK)
-_MANY = 10
-_WORDS = {"position": ("position", "m"), "velocity": ("velocity", "m/s"), "acceleration": ("acceleration", "m/s²")}
 
 
 def plot_course(
@@ -106,17 +130,10 @@ def plot_course(
         To be written with `optloc.plot.save`.
     """
     slots = [slot for slot in course.layout.shared if names is None or slot.name in names]
-    columns = min(len(slots), 3)
-    rows = -(-len(slots) // columns)
-    figure = figure_class()(figsize=(0.6 + 4.8 * columns, 0.4 + 4.2 * rows), layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    for panel, slot in zip(panels, slots, strict=False):
+    figure, panels = panels_for(len(slots), 3, 4.8, 4.2)
+    for panel, slot in zip(panels, slots, strict=True):
         _course_panel(panel, course, known, slot)
-    for panel in panels[len(slots) :]:
-        panel.set_axis_off()
-    if title:
-        figure.suptitle(title)
-    return figure
+    return finish(figure, title)
 
 
 def _course_panel(panel: Axes, course: Course, known: Course | None, slot: Slot) -> None:
@@ -140,15 +157,7 @@ def _course_panel(panel: Axes, course: Course, known: Course | None, slot: Slot)
     panel.legend(frameon=False, fontsize=8)
 
 
-_SPACE = {2: "the plane", 3: "space"}
-
-
 # Estimates of a run against time, with their intervals: biases, and whatever else its epochs share.
-
-_BIAS_COLOURS = (BLUE, ORANGE, GREEN, PURPLE, SKY, YELLOW)
-_DASHES = ("-", "--", "-.", ":")
-_MOST = 6
-_95 = 1.959963984540054
 
 
 def plot_biases(
@@ -181,17 +190,10 @@ def plot_biases(
     if not slots:
         advice = f"choose from {', '.join(slot.name for slot in found.layout.shared)}"
         raise InvalidProblem("the run has no biases to draw", "names", advice)
-    columns = min(len(slots), 2)
-    rows = -(-len(slots) // columns)
-    figure = figure_class()(figsize=(0.8 + 5.4 * columns, 0.4 + 4.0 * rows), layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False).ravel()
-    for panel, slot in zip(panels, slots, strict=False):
+    figure, panels = panels_for(len(slots), 2, 5.4, 4.0)
+    for panel, slot in zip(panels, slots, strict=True):
         _bias_panel(panel, found, slot, None if truth is None else truth.get(slot.name))
-    for panel in panels[len(slots) :]:
-        panel.set_axis_off()
-    if title:
-        figure.suptitle(title)
-    return figure
+    return finish(figure, title)
 
 
 def _bias_panel(panel: Axes, found: Growing, slot: Slot, truth: Array | None) -> None:
@@ -219,5 +221,5 @@ def _window(panel: Axes, values: Array, sigma: Array) -> None:
     known = np.flatnonzero(np.isfinite(values).all(-1))
     if not len(known):
         return
-    last, rim = values[known[-1]], 8.0 * np.nanmax(sigma[known[len(known) // 2]])
+    last, rim = values[known[-1]], _RIM * np.nanmax(sigma[known[len(known) // 2]])
     panel.set_ylim(float(last.min() - rim), float(last.max() + rim))

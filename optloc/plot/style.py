@@ -24,14 +24,30 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.text import Annotation
 
-
+# Okabe and Ito: told apart with any colour vision, and in grey by lightness.
 BLACK, BLUE, ORANGE, GREY = "#000000", "#0072B2", "#D55E00", "#999999"
 GREEN, SKY, PURPLE, YELLOW = "#009E73", "#56B4E9", "#CC79A7", "#E69F00"
+View = tuple[int, int]
+"""Which two of the scene's axes a panel shows."""
 
+PLAN: View = (0, 1)
+# Places of a note around its point, points of 1/72 inch, the usual one first; and where text ends on either side of it.
 _PLACES = ((5, 5), (-5, 5), (5, -5), (-5, -5), (0, 8), (0, -8), (9, 0), (-9, 0), (14, 14), (-14, 14), (14, -14))
-_MARK, _MANY = 5.0, 200
 _ASIDE: dict[int, Literal["left", "center", "right"]] = {-1: "right", 0: "center", 1: "left"}
 _ABOVE: dict[int, Literal["bottom", "center", "top"]] = {-1: "top", 0: "center", 1: "bottom"}
+# Half the side of a mark, pixels, that no note may cover; and marks of a panel that are heeded: beyond, all is covered.
+_MARK, _MANY = 5.0, 200
+# Stations that are named: the names of more would hide each other.
+_NAMED = 20
+# Fixes of which alternatives are drawn and marks are large, and those that have ellipses: beyond, dots are all one
+# sees.
+_FEW_FIXES, _ELLIPSES = 12, 200
+# Cost gap below which two places explain the data equally well: "+0".
+_NO_GAP = 1e-3
+# Points of a path or track that a picture needs, and corners of an ellipse: finer than its pixels.
+_PATH, _CORNERS = 200, 181
+# Greatest coordinate from which a plan is in kilometres, metres.
+_FAR = 5e3
 
 
 def figure_class() -> type[Figure]:
@@ -45,6 +61,32 @@ def figure_class() -> type[Figure]:
     return Figure
 
 
+def panels_for(count: int, most: int, width: float, height: float) -> tuple[Figure, list[Axes]]:
+    """Return a figure with a panel for each of some things, at most so many side by side, inches each."""
+    columns = min(count, most)
+    rows = -(-count // columns)
+    size = (0.6 + width * columns, 0.4 + height * rows)
+    figure = figure_class()(figsize=size, layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False).ravel().tolist()
+    for panel in panels[count:]:
+        panel.set_axis_off()
+    return figure, panels[:count]
+
+
+def finish(figure: Figure, title: str, panels: Sequence[Axes] = (), ncols: int = 5, **style: Any) -> Figure:
+    """Give a figure its title, and below it the legend of some of its panels, each label once."""
+    shown: dict[str, Any] = {}
+    for panel in panels:
+        handles, labels = panel.get_legend_handles_labels()
+        for label, handle in zip(labels, handles, strict=True):
+            shown.setdefault(label, handle)
+    if shown:
+        figure.legend(shown.values(), shown, loc="outside lower center", ncols=ncols, frameon=False, **style)
+    if title:
+        figure.suptitle(title)
+    return figure
+
+
 def save(figure: Figure, path: Path) -> None:
     """Write a picture; the ending of the name decides the type."""
     figure.savefig(path, dpi=120)
@@ -53,13 +95,16 @@ def save(figure: Figure, path: Path) -> None:
 def unit_of(points: Array) -> tuple[str, float]:
     """Return the unit in which points (n, 2) of metres read best, and its size."""
     reach = np.nanmax(np.abs(points), initial=1e-3)
-    return ("km", 1e3) if reach >= 5e3 else ("m", 1.0) if reach >= 1.0 else ("mm", 1e-3)
+    return ("km", 1e3) if reach >= _FAR else ("m", 1.0) if reach >= 1.0 else ("mm", 1e-3)
 
 
 def grid(panel: Axes) -> None:
     """Draw the grid of a panel."""
     panel.grid(color=GREY, alpha=0.35, linewidth=0.6)
     panel.set_axisbelow(True)
+
+
+# Notes that keep apart.
 
 
 def apart(figure: Figure) -> None:
@@ -69,6 +114,7 @@ def apart(figure: Figure) -> None:
     """
     from matplotlib.text import Annotation
 
+    # Sizes of texts are known only once the figure was laid out.
     figure.draw_without_rendering()
     for panel in figure.axes:
         notes = [text for text in panel.texts if isinstance(text, Annotation) and _movable(text)]
@@ -78,7 +124,8 @@ def apart(figure: Figure) -> None:
         taken = [_box(x - _MARK, y - _MARK, x + _MARK, y + _MARK) for x, y in _marks(panel)]
         taken += [text.get_window_extent() for text in panel.texts if text not in notes and text.get_visible()]
         for note, (x, y) in zip(notes, spots, strict=True):
-            taken.append(_settled(note, panel, [box for box in taken if not box.contains(x, y)]))
+            # The box of a mark that the note belongs to may be touched: it is drawn beside it.
+            taken.append(_settle(note, panel, [box for box in taken if not box.contains(x, y)]))
 
 
 def _marks(panel: Axes) -> Array:
@@ -100,7 +147,7 @@ def _box(*corners: float) -> Any:
     return Bbox.from_extents(*corners)
 
 
-def _settled(note: Annotation, panel: Axes, taken: list[Any]) -> Any:
+def _settle(note: Annotation, panel: Axes, taken: list[Any]) -> Any:
     """Move a note to its first free place, and return the box it then has."""
     inside = panel.get_window_extent()
     for place in _PLACES:
@@ -186,15 +233,17 @@ class Scene:
 
 def scene_of(problem: Problem, fixes: Sequence[Fix]) -> Scene:
     """Return what is to be drawn of a problem and its fixes."""
+    # Of moving stations the first epoch, of a batch the first problem: tracks are drawn as lines.
     stations = problem.stations.position.reshape(-1, problem.stations.count, problem.dimension)[0]
     parts = [part for fix in fixes for part in states_of(fix)]
     d = problem.dimension
     position = np.concatenate([p for p, _, _ in parts] or [np.zeros((0, d))])
     covariance = np.concatenate([c for _, c, _ in parts] or [np.zeros((0, d, d))])
     clean = np.concatenate([ok for _, _, ok in parts] or [np.zeros(0, dtype=bool)])
-    others, gaps = _alternatives(fixes, d) if len(position) <= 12 else (np.zeros((0, d)), np.zeros(0))
+    others, gaps = _alternatives(fixes, d) if len(position) <= _FEW_FIXES else (np.zeros((0, d)), np.zeros(0))
     axes = ("east", "north", "up") if problem.frame.geodetic else ("x", "y", "z")
     reach = np.concatenate([stations, position[np.isfinite(position).all(-1)]])[:, :2]
+    # A box in ECEF is no shape of a plan.
     regions = () if problem.frame.kind == "ecef" else _regions(problem, reach)
     paths, other = _paths(problem, fixes)
     known = tuple(m.known.reshape(-1, *m.known.shape[-2:])[:, 0] for m in problem.motions if m.known is not None)
@@ -203,7 +252,7 @@ def scene_of(problem: Problem, fixes: Sequence[Fix]) -> Scene:
         tracks=_tracks(problem),
         paths=paths,
         other_paths=other,
-        known=tuple(_thinned(place) for place in known),
+        known=tuple(_thin(place) for place in known),
     )
     return _local(problem, scene) if problem.frame.kind == "ecef" else scene
 
@@ -239,13 +288,13 @@ def _tracks(problem: Problem) -> tuple[Array, ...]:
     position = problem.stations.position
     if position.ndim > 3:
         return ()
-    tracks = (_thinned(track) for track in np.swapaxes(position, 0, 1))
+    tracks = (_thin(track) for track in np.swapaxes(position, 0, 1))
     return tuple(track for track in tracks if np.ptp(track, axis=0).max() > 0.0)
 
 
-def _thinned(track: Array, most: int = 200) -> Array:
+def _thin(track: Array) -> Array:
     """Return a track (k, d) with no more points than a picture needs, the first and the last among them."""
-    return np.asarray(track[np.unique(np.linspace(0, len(track) - 1, most).astype(int))])
+    return np.asarray(track[np.unique(np.linspace(0, len(track) - 1, _PATH).astype(int))])
 
 
 def _paths(problem: Problem, fixes: Sequence[Fix]) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
@@ -260,7 +309,7 @@ def _paths(problem: Problem, fixes: Sequence[Fix]) -> tuple[tuple[Array, ...], t
             continue
         for i, motion in enumerate(problem.motions):
             if motion.known is None and (motion.order or motion.span == "epoch"):
-                paths[number > 0].append(_thinned(_path(problem, fixes[0], i, x)))
+                paths[number > 0].append(_thin(_path(problem, fixes[0], i, x)))
     return tuple(paths[0]), tuple(paths[1])
 
 
@@ -269,6 +318,7 @@ def _path(problem: Problem, fix: Fix, target: int, x: Array) -> Array:
     states = [fix.layout.take(x, name) for name in state_names(target, len(problem.motions), motion.order)]
     if motion.span == "epoch":
         return states[0]
+    # A polynomial about the reference: position, velocity, acceleration by the powers of time over factorials.
     since = problem.times - (problem.times[0] if motion.reference is None else motion.reference)
     return np.asarray(sum(since[:, None] ** i / factorial(i) * state for i, state in enumerate(states)))
 
@@ -278,6 +328,7 @@ def _regions(problem: Problem, reach: Array) -> tuple[Array, ...]:
     rim = 0.1 * np.ptp(reach, axis=0)
     sides: dict[int, tuple[Array, Array]] = {}
     for c in problem.constraints:
+        # A box is stored as bounds of single coordinates; other planes have no edges to be drawn.
         if isinstance(c, Band) and c.kind == "plane" and np.ndim(c.lower) == np.ndim(c.upper) == 0:
             along = np.flatnonzero(c.coefficients)
             if len(along) == 1 and along[0] < 2 and c.coefficients[along[0]] == 1.0:
@@ -299,6 +350,7 @@ def states_of(fix: Fix) -> list[tuple[Array, Array, Array]]:
             values = flat.take(slot.name)
             d = values.shape[-1]
             position = values.reshape(-1, d)
+            # Positions of single epochs of a run have no covariance unless it was asked for.
             covariance = flat.covariance(slot.name) if shared else np.full((len(position), d, d), np.nan)
             found.append((position, covariance, np.repeat(flat.code == Status.OK, len(position) // len(flat))))
     return found
@@ -317,12 +369,6 @@ def _alternatives(fixes: Sequence[Fix], d: int) -> tuple[Array, Array]:
 
 
 # What plans are made of: stations, fixes, alternatives, ellipses, axes with units.
-
-View = tuple[int, int]
-"""Which two of the scene's axes a panel shows."""
-
-PLAN: View = (0, 1)
-_NAMED = 20
 
 
 def xy(points: Array, view: View, size: float) -> tuple[Array, Array]:
@@ -346,48 +392,48 @@ def note(panel: Axes, text: str, x: float, y: float, colour: str = BLACK) -> Non
 
     style: dict[str, Any] = {"fontsize": 8, "color": colour, "zorder": 6, "annotation_clip": True}
     made = panel.annotate(text, (x, y), xytext=(5, 5), textcoords="offset points", **style)
+    # A white rim: readable over lines and colours.
     made.set_path_effects([withStroke(linewidth=2.0, foreground="white")])
 
 
 def points(panel: Axes, scene: Scene, view: View, size: float) -> None:
     """Draw fixes, and alternatives with their cost gaps."""
-    many = len(scene.fixes) > 12
+    many = len(scene.fixes) > _FEW_FIXES
     for clean, colour, mark, label in ((True, BLUE, "o", "fix"), (False, ORANGE, "X", "fix, status not ok")):
         chosen = scene.fixes[scene.clean == clean]
         if len(chosen):
-            look: dict[str, Any] = {
-                "marker": mark,
-                "s": 12 if many else 70,
-                "color": colour,
-                "label": label,
-                "zorder": 4,
-            }
-            panel.scatter(*xy(chosen, view, size), **look)
+            look: dict[str, Any] = {"marker": mark, "s": 12 if many else 70, "color": colour, "zorder": 4}
+            panel.scatter(*xy(chosen, view, size), label=label, **look)
     if len(scene.alternatives):
         style: dict[str, Any] = {"marker": "D", "s": 70, "facecolors": "none", "edgecolors": ORANGE, "linewidths": 1.8}
         panel.scatter(*xy(scene.alternatives, view, size), label="alternative, with its cost gap", zorder=4, **style)
     for gap, x, y in zip(scene.gaps, *xy(scene.alternatives, view, size), strict=True):
-        note(panel, f"+{gap:.3g}" if gap >= 1e-3 else "+0", x, y, ORANGE)
+        note(panel, f"+{gap:.3g}" if gap >= _NO_GAP else "+0", x, y, ORANGE)
 
 
 def ellipses(panel: Axes, scene: Scene, view: View, size: float, **style: Any) -> None:
     """Draw the 95 % ellipses of the fixes."""
-    if len(scene.fixes) > 200:
+    if len(scene.fixes) > _ELLIPSES:
         return
-    angle = np.linspace(0.0, 2.0 * np.pi, 181)
-    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     look: dict[str, Any] = {"color": BLUE, "linewidth": 1.5, "label": "95 % ellipse", "zorder": 2} | style
     for centre, covariance in zip(scene.fixes, scene.covariances, strict=True):
-        semi_axes, directions = error_ellipse(covariance[np.ix_(view, view)])
-        if np.isfinite(semi_axes).all() and np.isfinite(centre).all():
-            line = centre[list(view)] + circle * semi_axes @ directions.T
+        line = centre[list(view)] + ring(covariance[np.ix_(view, view)])
+        if np.isfinite(line).all():
             panel.plot(*(line.T / size), **look)
             look["label"] = None
+
+
+def ring(covariance: Array) -> Array:
+    """Return the 95 % ellipse of a covariance (2, 2) about the origin as a closed line; NaN where there is none."""
+    angle = np.linspace(0.0, 2.0 * np.pi, _CORNERS)
+    semi_axes, directions = error_ellipse(covariance)
+    return np.asarray(np.stack([np.cos(angle), np.sin(angle)], axis=-1) * semi_axes @ directions.T)
 
 
 def name_axes(panel: Axes, scene: Scene, view: View, unit: str) -> None:
     """Give both axes of a plan one scale, names and units."""
     panel.margins(0.12)
+    # One scale on both axes, or an ellipse would have another shape.
     panel.set_aspect("equal", adjustable="datalim")
     grid(panel)
     panel.set_xlabel(f"{scene.axes[view[0]]} ({unit})")

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from optloc.base.frames import Frame
-from optloc.base.linalg import error_ellipse
 from optloc.base.types import Array
-from optloc.plot.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, YELLOW, figure_class
+from optloc.plot.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, YELLOW, figure_class, finish, ring, unit_of
 from optloc.problem.problem import Problem
 from optloc.track.run import Entry
 
@@ -20,7 +19,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _CYCLE = (BLUE, GREEN, PURPLE, SKY, YELLOW)
+# Ellipses along a track: more would be a band.
 _ELLIPSES = 25
+# Distance of a station, in the extent of the tracks, from which it is out of the picture: satellites.
+_OUT = 100.0
+# Share of scans whose NIS is below the line: one in a thousand above it is chance.
+_ALLOWED = 0.999
+# Quantile of a standard normal variable that leaves 2.5 % above it.
+_95 = 1.96
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,6 +50,8 @@ class Drawn:
 
 @dataclass(frozen=True, slots=True)
 class _Line:
+    """A track as arrays over its k scans, along the picture's axes; `starts` and `bad` say which scans are such."""
+
     name: str
     times: Array
     position: Array
@@ -83,11 +91,7 @@ def plot_tracks(drawn: Sequence[Drawn], title: str = "") -> Figure:
     for name in names:
         panels[name].grid(color=GREY, alpha=0.35, linewidth=0.6)
         panels[name].sharex(panels[names[-1]]) if name != names[-1] else panels[name].set_xlabel("time (s)")
-    handles, labels = panels["plan"].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=6, frameon=False)
-    if title:
-        figure.suptitle(title)
-    return figure
+    return finish(figure, title, [panels["plan"]], 6)
 
 
 def _along(drawn: Sequence[Drawn]) -> tuple[list[_Line], Array, tuple[str, ...]]:
@@ -100,15 +104,12 @@ def _along(drawn: Sequence[Drawn]) -> tuple[list[_Line], Array, tuple[str, ...]]
     if first.frame.kind != "ecef":
         return lines, stations, axes[:d]
     known = [line.position[np.isfinite(line.position).all(-1)] for line in lines]
+    # Satellites are far above the ground: the plan is that at the first position.
     lat, lon, height = first.frame.to_geodetic(next((p[0] for p in known if len(p)), stations.mean(0)))
     local = Frame("enu", (float(lat), float(lon), float(height)))
     turn = local.rotation_to_ecef().T
-    moved = [_Line(n.name, n.times, local.from_ecef(n.position), turn @ n.cov @ turn.T, *_rest(n)) for n in lines]
+    moved = [replace(n, position=local.from_ecef(n.position), cov=turn @ n.cov @ turn.T) for n in lines]
     return moved, local.from_ecef(stations), axes
-
-
-def _rest(line: _Line) -> tuple[Array, Array, Array, Array, Array]:
-    return line.sigma, line.nis, line.count, line.starts, line.bad
 
 
 def _line(drawn: Drawn, d: int) -> _Line:
@@ -127,7 +128,7 @@ def _line(drawn: Drawn, d: int) -> _Line:
     )
 
 
-def _coloured(lines: Sequence[_Line]) -> list[tuple[_Line, str]]:
+def _colour(lines: Sequence[_Line]) -> list[tuple[_Line, str]]:
     return [(line, _CYCLE[i % len(_CYCLE)]) for i, line in enumerate(lines)]
 
 
@@ -135,12 +136,12 @@ def _plan(panel: Axes, lines: Sequence[_Line], stations: Array, axes: Sequence[s
     position = np.concatenate([line.position for line in lines])[:, :2]
     known = position[np.isfinite(position).all(-1)]
     spots = stations[_near(stations[:, :2], known), :2]
-    unit, size = ("km", 1e3) if np.abs(np.concatenate([spots, known])).max(initial=0.0) >= 5e3 else ("m", 1.0)
+    unit, size = unit_of(np.concatenate([spots, known]))
     if len(spots):
         panel.scatter(
             spots[:, 0] / size, spots[:, 1] / size, marker="^", s=50, color=BLACK, label="station, first scan", zorder=3
         )
-    for i, (line, colour) in enumerate(_coloured(lines)):
+    for i, (line, colour) in enumerate(_colour(lines)):
         path = line.position[:, :2] / size
         panel.plot(*path.T, color=colour, linewidth=1.5, zorder=4, label=line.name if len(lines) > 1 else "track")
         marks: dict[str, Any] = {"marker": "o", "s": 45, "color": colour, "edgecolors": BLACK, "zorder": 6}
@@ -162,32 +163,29 @@ def _near(stations: Array, known: Array) -> Array:
     if not len(known):
         return np.ones(len(stations), dtype=bool)
     centre, extent = known.mean(0), max(float(np.ptp(known, axis=0).max()), 1.0)
-    return np.asarray(np.linalg.norm(stations - centre, axis=-1) < 100.0 * extent)
+    return np.asarray(np.linalg.norm(stations - centre, axis=-1) < _OUT * extent)
 
 
 def _ellipses(panel: Axes, line: _Line, size: float, label: str | None) -> None:
     known = np.flatnonzero(np.isfinite(line.cov).all((-1, -2)))
-    angle = np.linspace(0.0, 2.0 * np.pi, 91)
-    circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     for i in known[:: max(1, len(known) // _ELLIPSES)]:
-        semi_axes, directions = error_ellipse(line.cov[i, :2, :2])
-        ring = (line.position[i, :2] + circle * semi_axes @ directions.T) / size
-        panel.plot(*ring.T, color=GREY, linewidth=0.8, zorder=2, label=label)
+        edge = (line.position[i, :2] + ring(line.cov[i, :2, :2])) / size
+        panel.plot(*edge.T, color=GREY, linewidth=0.8, zorder=2, label=label)
         label = None
 
 
 def _heights(panel: Axes, lines: Sequence[_Line], name: str) -> None:
-    for line, colour in _coloured(lines):
+    for line, colour in _colour(lines):
         sigma = np.sqrt(line.cov[:, 2, 2])
         panel.plot(line.times, line.position[:, 2], color=colour, linewidth=1.2)
-        band = (line.position[:, 2] - 1.96 * sigma, line.position[:, 2] + 1.96 * sigma)
+        band = (line.position[:, 2] - _95 * sigma, line.position[:, 2] + _95 * sigma)
         panel.fill_between(line.times, *band, color=colour, alpha=0.2, linewidth=0.0)
     panel.set_ylabel(f"{name} (m)")
     panel.set_title("height, and 95 % of it")
 
 
 def _sigmas(panel: Axes, lines: Sequence[_Line]) -> None:
-    for line, colour in _coloured(lines):
+    for line, colour in _colour(lines):
         panel.plot(line.times, line.sigma, color=colour, linewidth=1.2)
     _decades(panel, np.concatenate([line.sigma for line in lines]))
     panel.set_ylabel("sigma (m)")
@@ -198,10 +196,11 @@ def _innovations(panel: Axes, lines: Sequence[_Line]) -> None:
     """Draw the NIS, and the 99.9 % that the chi-square of as many rows allows."""
     from scipy.special import gammaincinv
 
-    for i, (line, colour) in enumerate(_coloured(lines)):
+    # NIS of m rows is chi-square with m degrees of freedom: the line follows the rows of each scan.
+    for i, (line, colour) in enumerate(_colour(lines)):
         tested = np.isfinite(line.nis) & (line.count > 0)
         panel.plot(line.times[tested], line.nis[tested], color=colour, linestyle="", marker=".", markersize=4)
-        limit = 2.0 * gammaincinv(0.5 * np.maximum(line.count, 1), 0.999)
+        limit = 2.0 * gammaincinv(0.5 * np.maximum(line.count, 1), _ALLOWED)
         label = None if i else "99.9 % of the chi-square"
         panel.plot(line.times, np.where(tested, limit, np.nan), color=ORANGE, linewidth=1.0, label=label)
     _decades(panel, np.concatenate([line.nis for line in lines]))
@@ -218,6 +217,7 @@ def _decades(panel: Axes, values: Array) -> None:
     if not len(known) or known.max() < 10.0 * known.min():
         return
     panel.set_yscale("log")
+    # Over many decades a tick each; over few, at 2 and 5 as well.
     wide = known.max() > 1e3 * known.min()
     panel.yaxis.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0)))
     panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
