@@ -15,7 +15,13 @@ from optloc.problem.layout import state_names
 from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
 
+# Places linearised together: enough that numpy's calls do not count, some ten megabytes for hundreds of rows.
 _AT_ONCE = 2000
+# Degrees beyond which a map is cut: a plate of longitude and latitude has no end at the poles.
+_POLE = 89.0
+# Degrees of latitude up to which a map is squeezed by the cosine; beyond, a side in longitude would go round the Earth.
+_SQUEEZED = 85.0
+_LEAST = (1e-3, 1.0)  # least side of a map, about 100 m in degrees, or 1 m: a single point has none
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +102,7 @@ def bound_map(
         bound = np.asarray(crlb(single, vectors[first : first + _AT_ONCE]))
         parts.append(bound[..., slot, slot])
     covariance = np.concatenate(parts)
+    # in east, north and up at each place: plan and height are of the place, not of the frame
     axes = problem.frame.enu_axes(places)
     variance = np.maximum(np.diagonal(axes @ covariance @ np.swapaxes(axes, -1, -2), axis1=-2, axis2=-1), 0.0)
     plan, shape = np.sqrt(variance[:, :2].sum(-1)), east.shape
@@ -163,9 +170,9 @@ def extent(problem: Problem, places: Array | None = None, *, widen: float = 0.5)
     if earth:  # longitudes as one piece, also across the date line
         flat[:, 0] = (flat[:, 0] - flat[0, 0] + 180.0) % 360.0 - 180.0 + flat[0, 0]
     low, high = flat.min(0), flat.max(0)
-    squeeze = np.array([np.cos(np.radians(np.clip(flat[:, 1].mean(), -85.0, 85.0))) if earth else 1.0, 1.0])
-    side = max(float(((high - low) * squeeze).max()), 1e-3 if earth else 1.0)
+    squeeze = np.array([np.cos(np.radians(np.clip(flat[:, 1].mean(), -_SQUEEZED, _SQUEEZED))) if earth else 1.0, 1.0])
+    side = max(float(((high - low) * squeeze).max()), _LEAST[0] if earth else _LEAST[1])
     low, high = low - widen * side / squeeze, high + widen * side / squeeze
     if earth:
-        low[1], high[1] = max(low[1], -89.0), min(high[1], 89.0)
+        low[1], high[1] = max(low[1], -_POLE), min(high[1], _POLE)
     return float(low[0]), float(high[0]), float(low[1]), float(high[1])

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optloc.base import linalg
-from optloc.base import linalg as tangents
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.compute.sums import equations_at
@@ -18,6 +17,7 @@ from optloc.problem.epochs import tied, windows
 from optloc.problem.layout import Layout
 from optloc.problem.problem import Problem
 
+# Rounding errors of a sum of squares are 1e-16 of the whole; four decades are left for sums over long runs.
 OPEN = 1e-12
 """Share of its information, scaled to one, below which a combination of unknowns counts as open."""
 
@@ -52,7 +52,7 @@ def crlb(problem: Problem, truth: Array) -> Array:
     information, _, ok = marginal(equations)
     vectors = np.broadcast_to(x, (*ok.shape, x.shape[-1])).reshape(-1, x.shape[-1])
     space = tangent_at(problem.flat(), held, vectors)
-    bound, good = tangents.inverse_within(information.reshape(-1, *information.shape[-2:]), space)
+    bound, good = linalg.inverse_within(information.reshape(-1, *information.shape[-2:]), space)
     return np.where((ok.ravel() & good)[:, None, None], bound, np.nan).reshape(information.shape)
 
 
@@ -138,9 +138,10 @@ def free_directions(problem: Problem, x: Array, known: Sequence[str] = ()) -> Ar
     eye = np.eye(layout.n_shared)
     if not held:
         return eye[:, ~fixed]
+    # names that are known are equalities too: the tangent space of both at once
     gradients = levels(problem.flat(), held, x[None])[1]
     across = np.concatenate([gradients, eye[None, fixed]], axis=1)
-    return np.asarray(tangents.tangent(across, np.ones((1, len(eye)))).along[0])
+    return np.asarray(linalg.tangent(across, np.ones((1, len(eye)))).along[0])
 
 
 def _totals(problem: Problem, x: Array, counts: Array) -> tuple[Array, Array]:
@@ -149,6 +150,7 @@ def _totals(problem: Problem, x: Array, counts: Array) -> tuple[Array, Array]:
     total, size = np.zeros((len(counts), n, n)), np.zeros((len(counts), n))
     so_far, size_so_far = np.zeros((n, n)), np.zeros(n)
     for first, each, known in _each_epoch(problem, x):
+        # sums within a stretch of epochs, carried over from stretch to stretch: memory does not grow with the run
         sums, sizes = so_far + np.cumsum(each, axis=0), size_so_far + np.cumsum(known, axis=0)
         inside = np.flatnonzero((counts > first) & (counts <= first + len(each)))
         total[inside], size[inside] = sums[counts[inside] - first - 1], sizes[counts[inside] - first - 1]
@@ -164,7 +166,7 @@ def _each_epoch(problem: Problem, x: Array) -> Iterator[tuple[int, Array, Array]
     n = problem.layout.n_shared
     for first, last, part in windows(problem):
         linear = linearise(part, x)
-        # As if every epoch had all unknowns to itself: the local blocks are then what each epoch says.
+        # as if every epoch had all unknowns to itself: the local blocks are then what each epoch says
         both = np.concatenate([linear.shared, linear.local], axis=-1)
         own = Linear(linear.residual, linear.shared[..., :0], both, linear.epoch - first, linear.noise)
         gram = normal(own, last - first).local
@@ -172,7 +174,7 @@ def _each_epoch(problem: Problem, x: Array) -> Iterator[tuple[int, Array, Array]
         equations = Normal(
             gram[:, :n, :n], here[..., n:, n:], here[..., :n, n:], none[:, None], none[:, None, None], none
         )
-        yield first, eliminated(with_local_priors(problem, equations)), np.diagonal(gram[:, :n, :n], 0, -2, -1)
+        yield first, shared_information(with_local_priors(problem, equations)), np.diagonal(gram[:, :n, :n], 0, -2, -1)
 
 
 def _inverse(information: Array, size: Array, basis: Array) -> Array:
@@ -180,6 +182,7 @@ def _inverse(information: Array, size: Array, basis: Array) -> Array:
 
     `size` (q, n), the diagonal before elimination, tells what rounding leaves of zero.
     """
+    # scaled by what was there before elimination: what elimination leaves of nothing is rounding, not information
     inner, size = basis.T @ information @ basis, size @ basis**2
     inverse, _ = linalg.inverse(inner)
     scale = 1.0 / np.sqrt(np.where(size > 0.0, size, 1.0))
@@ -210,11 +213,12 @@ def shared_priors(problem: Problem) -> Array:
     return precision
 
 
-def eliminated(equations: Normal) -> Array:
+def shared_information(equations: Normal) -> Array:
     """Return the information (..., n, n) of the shared unknowns; an epoch that leaves some of its own open counts too.
 
     Where all local blocks are regular it is that of `optloc.linear.normal.marginal`.
     """
+    # a root of the pseudo-inverse: directions of local unknowns that no row sees take nothing away
     root, _ = linalg.root(equations.local)
     seen = equations.cross @ root
     return np.asarray(equations.shared - (seen @ np.swapaxes(seen, -1, -2)).sum(-3))

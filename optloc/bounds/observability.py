@@ -8,15 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.bounds.crlb import OPEN, eliminated, free_directions, shared_priors, with_local_priors
+from optloc.bounds.crlb import OPEN, free_directions, shared_information, shared_priors, with_local_priors
 from optloc.compute.sums import summed
 from optloc.problem.layout import Layout, Slot
 from optloc.problem.problem import Problem
 
+# Known alone, either of two unknowns that correlated would be known seven times as well: 1 / sqrt(1 - 0.99^2).
 TIED = 0.99
 """Correlation from which a bias counts as hard to tell from another unknown."""
 
-_SHOWN, _FEW = 8, 2
+_SHOWN = 8  # names in one sentence, the rest as a number: a line of text
+_FEW = 2  # combinations that are spelt out; more of them only confuse, and the names of those involved are told
+_NOTHING = 1e-6  # part of a unit vector below which it is rounding, which eigenvectors of close eigenvalues share out
+_ROUNDED = 1e-5  # the same after elimination, which magnifies it
+_ALIKE = 1e-4  # relative difference of two changes that are told as one common change, as printed to three digits
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,17 +102,17 @@ def observability(problem: Problem, x: Array) -> Observability:
     x = np.asarray(x, dtype=float)
     layout = problem.layout
     equations = with_local_priors(problem, summed(problem, x))
-    information, size = eliminated(equations), equations.shared
+    information, size = shared_information(equations), equations.shared
     basis = free_directions(problem, x)
     precision = shared_priors(problem)
-    data = _taken_apart(information, size, basis)
-    both = _taken_apart(information + precision, size + precision, basis)
+    data = _take_apart(information, size, basis)
+    both = _take_apart(information + precision, size + precision, basis)
     shown = np.isfinite(data.sigma)  # what is open is named as such
     return Observability(
         layout.labels(),
         tuple(slot.unit for slot in layout.shared for _ in range(slot.size)),
         data.sigma,
-        _taken_apart(precision, precision, np.eye(layout.n_shared)).sigma,
+        _take_apart(precision, precision, np.eye(layout.n_shared)).sigma,
         both.sigma,
         basis.shape[1] - len(data.open),
         tuple(_open_sentences(layout, data)),
@@ -117,7 +122,7 @@ def observability(problem: Problem, x: Array) -> Observability:
 
 def open_sentences(layout: Layout, information: Array) -> tuple[str, ...]:
     """Return sentences that name the combinations of shared unknowns on which an information matrix is silent."""
-    return tuple(_open_sentences(layout, _taken_apart(information, information, np.eye(layout.n_shared))))
+    return tuple(_open_sentences(layout, _take_apart(information, information, np.eye(layout.n_shared))))
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,11 +135,12 @@ class _Parts:
     reach: Array
 
 
-def _taken_apart(information: Array, size: Array, basis: Array) -> _Parts:
+def _take_apart(information: Array, size: Array, basis: Array) -> _Parts:
     """Return what information (n, n) on a basis (n, p) determines.
 
     `size` is the information before anything was eliminated: its rounding errors decide what counts as zero.
     """
+    # columns scaled to unit information, so that metres and seconds compare; then eigenvectors, open ones and others
     weight = np.sqrt(np.einsum("ip,ij,jp->p", basis, size, basis).clip(0.0))
     basis = basis / np.where(weight > 0.0, weight, 1.0)
     values, vectors = np.linalg.eigh(basis.T @ information @ basis)
@@ -144,7 +150,8 @@ def _taken_apart(information: Array, size: Array, basis: Array) -> _Parts:
     shut = values > OPEN
     known, null = directions[:, shut] / np.sqrt(values[shut]), directions[:, ~shut] / reach
     sigma = np.linalg.norm(known, axis=-1)
-    loose = (np.abs(null) > 1e-6).any(-1)
+    # an unknown that takes part in any open combination is open itself
+    loose = (np.abs(null) > _NOTHING).any(-1)
     unit = known / np.where(sigma > 0.0, sigma, 1.0)[:, None]
     correlation = np.where(loose[:, None] | loose, 0.0, unit @ unit.T)
     return _Parts(np.where(loose, np.inf, sigma), correlation, null.T, reach[:, 0])
@@ -156,12 +163,12 @@ def _open_sentences(layout: Layout, parts: _Parts) -> Iterator[str]:
     found = [row for row in common / parts.reach if _inside(row, parts.open)]
     for row in found:
         yield _open_sentence(layout, row * parts.reach)
-    rest = _sparse(_without(parts.open, found))
+    rest = _reduce(_without(parts.open, found))
     if len(rest) <= _FEW:
         yield from (_open_sentence(layout, row * parts.reach) for row in rest)
     else:
         names = [label for label, used in zip(layout.labels(), np.asarray(rest.any(0)), strict=True) if used]
-        yield f"the data leave {len(rest)} combinations of {_listed(names)} open"
+        yield f"the data leave {len(rest)} combinations of {_enumerate(names)} open"
 
 
 def _entries(layout: Layout, slot: Slot) -> Array:
@@ -173,7 +180,7 @@ def _entries(layout: Layout, slot: Slot) -> Array:
 def _inside(row: Array, basis: Array) -> bool:
     """Return whether a vector (n,) lies in the span of a basis (q, n)."""
     away = row - np.linalg.lstsq(basis.T, row, rcond=None)[0] @ basis
-    return float(np.linalg.norm(away)) < 1e-6 * float(np.linalg.norm(row))
+    return float(np.linalg.norm(away)) < _NOTHING * float(np.linalg.norm(row))
 
 
 def _without(basis: Array, found: list[Array]) -> Array:
@@ -181,20 +188,22 @@ def _without(basis: Array, found: list[Array]) -> Array:
     if not found:
         return basis
     taken, _ = np.linalg.qr(np.array(found).T)
+    # the projection off what was found has the rank that is left
     _, _, right = np.linalg.svd(basis - basis @ taken @ taken.T)
     return np.asarray(right[: len(basis) - len(found)])
 
 
-def _sparse(rows: Array) -> Array:
+def _reduce(rows: Array) -> Array:
     """Return a basis (q, n) of the same space in which each row has an entry of one that no other row has."""
     rows = rows.copy()
     for i in range(len(rows)):
+        # Gauss-Jordan with full pivoting: the largest entry that is left becomes one, and the only one of its column
         at, pivot = divmod(int(np.argmax(np.abs(rows[i:]))), rows.shape[1])
         rows[[i, i + at]] = rows[[i + at, i]]
         rows[i] /= rows[i, pivot]
         others = np.arange(len(rows)) != i
         rows[others] -= rows[others, pivot, None] * rows[i]
-    return np.where(np.abs(rows) > 1e-5, rows, 0.0)
+    return np.where(np.abs(rows) > _ROUNDED, rows, 0.0)
 
 
 def _open_sentence(layout: Layout, direction: Array) -> str:
@@ -203,7 +212,7 @@ def _open_sentence(layout: Layout, direction: Array) -> str:
     for slot in layout.shared:
         unit = "" if slot.unit == "1" else slot.unit
         part = direction[slot.start : slot.start + slot.size]
-        if slot.size > 2 and part[0] and np.allclose(part, part[0], rtol=1e-4):
+        if slot.size > 2 and part[0] and np.allclose(part, part[0], rtol=_ALIKE):
             names.append(f"every {slot.name}")
             amounts.append((float(part[0]), unit))
         else:
@@ -212,11 +221,11 @@ def _open_sentence(layout: Layout, direction: Array) -> str:
     values = np.array([value for value, _ in amounts])
     if len(names) == 1 and not names[0].startswith("every "):
         return f"the data do not show {names[0]}"
-    if len({unit for _, unit in amounts}) == 1 and np.allclose(values, values[0], rtol=1e-4):
-        return f"the data do not show a common change of {_listed(names)}"
+    if len({unit for _, unit in amounts}) == 1 and np.allclose(values, values[0], rtol=_ALIKE):
+        return f"the data do not show a common change of {_enumerate(names)}"
     values = values / values[0]
     shown = [f"{name} by {v:+.3g} {u}".rstrip() for name, v, (_, u) in zip(names, values, amounts, strict=True)]
-    return f"the data do not show a change of {_listed(shown)}"
+    return f"the data do not show a change of {_enumerate(shown)}"
 
 
 def _tied_sentences(layout: Layout, correlation: Array) -> list[str]:
@@ -231,11 +240,13 @@ def _tied_sentences(layout: Layout, correlation: Array) -> list[str]:
         members = np.flatnonzero(group == number)
         if len(members) > 1:
             most = np.abs(np.triu(correlation[np.ix_(members, members)], 1)).max()
-            found.append(f"hard to tell apart: {_listed([labels[i] for i in members])} (correlated up to {most:.5f})")
+            found.append(
+                f"hard to tell apart: {_enumerate([labels[i] for i in members])} (correlated up to {most:.5f})"
+            )
     return found
 
 
-def _listed(names: list[str]) -> str:
+def _enumerate(names: list[str]) -> str:
     if len(names) > _SHOWN:
         names = [*names[: _SHOWN - 1], f"{len(names) - _SHOWN + 1} more"]
     return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))

@@ -20,12 +20,14 @@ import numpy as np
 from optloc.base.frames import ECEF
 from optloc.base.types import Array, Motion
 from optloc.base.units import SPEED_OF_LIGHT
-from optloc.datasets.folder import chosen, places, table
+from optloc.datasets.folder import choose, places, table
 from optloc.linear.constraints import height
 from optloc.problem.build import assemble, measured, station_array
 from optloc.problem.problem import Problem
 
-ARRIVAL, HEIGHT = 30.0, 30.0
+ARRIVAL = 30.0  # metres: the robust spread of the residuals at the truth that comes with the set
+HEIGHT = 30.0  # metres: four times the quantum of the reports, 25 ft
+# Mean refractivity at sea level, and the height in metres over which it falls to 1/e: a standard atmosphere.
 REFRACTIVITY, SCALE_HEIGHT = 315e-6, 7500.0
 
 
@@ -62,7 +64,7 @@ class Heard:
 
     def problem(self, given: str) -> Problem:
         """Return the messages as a batch; `given` is how the height enters: "exactly", "row", or "nothing"."""
-        chosen(given, ("exactly", "row", "nothing"), "given")
+        choose(given, ("exactly", "row", "nothing"), "given")
         each = np.arange(self.arrival.shape[1])
         rows = [measured("toa", self.arrival, a=each, sigma=ARRIVAL, correction=self.excess)]
         if given == "row":
@@ -80,6 +82,7 @@ class Heard:
     def unbiased(self) -> Heard:
         """Return the messages less the median residual of each station at the truth."""
         off = self.arrival - self.excess - np.linalg.norm(self.truth[:, None] - self.stations, axis=-1)
+        # less the emission time of each message, of which the median of its five residuals tells
         off = off - np.median(off, axis=1, keepdims=True)
         _, station = np.unique(self.stations.reshape(-1, 3), axis=0, return_inverse=True)
         station = station.reshape(off.shape)
@@ -104,13 +107,14 @@ def load(folder: Path, *, refraction: bool = False) -> Messages:
     stations, rows, truth = (table(folder, name) for name in ("stations", "measurements", "truth"))
     messages = pd.MultiIndex.from_frame(truth[["set", "msg"]])
     epoch = messages.get_indexer(pd.MultiIndex.from_frame(rows[["set", "msg"]]))
+    # from the first arrival of each message: seconds of the day times c would leave metres their last digits only
     first = rows.groupby(["set", "msg"])["toa_s"].transform("min")
     z = SPEED_OF_LIGHT * (rows["toa_s"] - first).to_numpy()
     place, there = places(stations), places(truth)
     a, excess = pd.Index(stations["station"]).get_indexer(rows["station"]), np.zeros(len(rows))
     if refraction:
         distance = np.linalg.norm(there[epoch] - place[a], axis=-1)
-        excess = _refracted(stations["h_m"].to_numpy()[a], truth["h_geo_m"].to_numpy()[epoch], distance)
+        excess = _refraction(stations["h_m"].to_numpy()[a], truth["h_geo_m"].to_numpy()[epoch], distance)
     problem = assemble(
         station_array(place, stations["station"].astype(str).tolist()),
         measured("toa", z, a=a, sigma=ARRIVAL, epoch=epoch, correction=excess),
@@ -129,6 +133,7 @@ def heard(folder: Path, *, refraction: bool = False) -> Heard:
     stations = stations.set_index("station")
     keys = pd.MultiIndex.from_frame(truth[["set", "msg"]])
     message = keys.get_indexer(pd.MultiIndex.from_frame(rows[["set", "msg"]]))
+    # five rows a message, in the order of the messages: the tables then fold to (n, 5)
     rows = rows.iloc[np.argsort(message, kind="stable")]
     toa = rows["toa_s"].to_numpy().reshape(len(truth), -1)
     own = stations.loc[rows["station"]]
@@ -139,10 +144,11 @@ def heard(folder: Path, *, refraction: bool = False) -> Heard:
     if not refraction:
         return made
     distance = np.linalg.norm(made.truth[:, None] - place, axis=-1)
-    return replace(made, excess=_refracted(own["h_m"].to_numpy().reshape(toa.shape), geodetic[:, 2:], distance))
+    return replace(made, excess=_refraction(own["h_m"].to_numpy().reshape(toa.shape), geodetic[:, 2:], distance))
 
 
-def _refracted(low: Array, high: Array, distance: Array) -> Array:
+def _refraction(low: Array, high: Array, distance: Array) -> Array:
     """Return by how much air lengthens paths between two heights, metres."""
+    # the mean of an exponential atmosphere along a straight path between the heights
     drop = np.exp(-low / SCALE_HEIGHT) - np.exp(-high / SCALE_HEIGHT)
     return np.asarray(REFRACTIVITY * SCALE_HEIGHT * drop / (high - low) * distance)

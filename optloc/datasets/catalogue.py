@@ -13,7 +13,7 @@ from typing import Any
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
 from optloc.datasets.folder import root
-from optloc.datasets.folder import verify as verified
+from optloc.datasets.folder import verify as check_files
 from optloc.problem.problem import Problem
 
 
@@ -60,6 +60,7 @@ class Entry:
         return import_module(f"optloc.datasets.{name}").dataset  # type: ignore[no-any-return]
 
 
+# SHA-256 of the files that the numbers of the documentation were made from.
 _ENTRIES = {
     "uwb": Entry(
         "util_uwb_tdoa",
@@ -150,6 +151,7 @@ def available(folder: str | Path | None = None) -> tuple[str, ...]:
         Folder that holds one folder for each set; by default what the variable OPTLOC_DATA names.
     """
     try:
+        # the files are looked for, not read: checking their sums is left to `load`
         place = root(folder)
     except InvalidProblem:
         return ()
@@ -179,12 +181,12 @@ def load(name: str, *, folder: str | Path | None = None, verify: bool = True, **
         raise InvalidProblem(f"there is no data set {name!r}", "datasets.load", nearest(name, NAMES))
     entry = ENTRIES[name]
     read = entry.reader(name)
-    known = list(signature(read).parameters)[1:]
+    known = list(signature(read).parameters)[1:]  # the first is the folder
     for option in options:
         if option not in known:
             raise InvalidProblem(f"the data set {name!r} has no option {option!r}", "options", nearest(option, known))
     place = root(folder) / entry.folder
     if verify:
-        verified(place, entry.sha256)
+        check_files(place, entry.sha256)
     problem, truth = read(place, **options)
     return Dataset(name, problem, truth, entry.description, entry.source, entry.licence)

@@ -16,6 +16,7 @@ from optloc.base.types import Array
 if TYPE_CHECKING:
     import pandas as pd
 
+# A variable and no default folder: optloc holds no data, and does not fetch any.
 VARIABLE = "OPTLOC_DATA"
 XYZ = ("x_m", "y_m", "z_m")
 
@@ -58,7 +59,7 @@ def table(folder: Path, name: str) -> pd.DataFrame:
         raise InvalidProblem(what, str(path), "put the whole data set there") from None
 
 
-def chosen(value: Any, known: Iterable[Any], option: str) -> Any:
+def choose(value: Any, known: Iterable[Any], option: str) -> Any:
     """Return an option's value; raise InvalidProblem where it is none of the known ones."""
     names = list(known)
     if value not in names:

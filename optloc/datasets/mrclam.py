@@ -13,12 +13,13 @@ from pathlib import Path
 import numpy as np
 
 from optloc.base.types import Array, Motion
-from optloc.datasets.folder import chosen, places, table
+from optloc.datasets.folder import choose, places, table
 from optloc.problem.build import assemble, measured
 from optloc.problem.problem import Problem
 
+# Radians and metres. Four times the robust spread of azimuths, for one in a hundred is beyond 5 degrees.
 SIGMA = {"azimuth": np.deg2rad(2.0), "range": 0.1}
-ALONE = {**SIGMA, "range": 0.15}
+ALONE = {**SIGMA, "range": 0.15}  # the spread of the residuals of ranges that no azimuth corrects
 COLUMN = {"azimuth": "az_rad", "range": "range_m"}
 
 
@@ -34,9 +35,9 @@ class Sightings:
 
     def every(self, n: int) -> Sightings:
         """Return every n-th epoch."""
-        kept = self.epoch % n == 0
-        z = {kind: values[kept] for kind, values in self.z.items()}
-        return Sightings(self.landmarks, self.truth[::n], self.a[kept], self.epoch[kept] // n, z)
+        inside = self.epoch % n == 0
+        z = {kind: values[inside] for kind, values in self.z.items()}
+        return Sightings(self.landmarks, self.truth[::n], self.a[inside], self.epoch[inside] // n, z)
 
     def problem(self, kinds: tuple[str, ...]) -> Problem:
         """Return the epochs by some kinds of rows as one problem."""
@@ -55,7 +56,7 @@ def dataset(
 ) -> tuple[Problem, Array]:
     """Return every n-th epoch of a set by some kinds of rows, and the truth (k, 2)."""
     for kind in kinds:
-        chosen(kind, COLUMN, "kinds")
+        choose(kind, COLUMN, "kinds")
     data = load(folder, number).every(every)
     return data.problem(tuple(kinds)), data.truth
 
@@ -65,10 +66,10 @@ def load(folder: Path, number: int) -> Sightings:
     import pandas as pd
 
     tables = [table(folder, name) for name in ("stations", "truth", "measurements")]
-    chosen(number, np.unique(tables[0]["set"]).tolist(), "number")
+    choose(number, np.unique(tables[0]["set"]).tolist(), "number")
     stations, truth, rows = (found[found["set"] == number] for found in tables)
     epoch = pd.Index(truth["epoch"]).get_indexer(rows["epoch"])
-    order = np.argsort(epoch, kind="stable")
+    order = np.argsort(epoch, kind="stable")  # stable: rows of one epoch stay as the file has them
     rows = rows.iloc[order]
     return Sightings(
         places(stations),

@@ -17,13 +17,17 @@ from pathlib import Path
 import numpy as np
 
 from optloc.base.types import Array, Motion
-from optloc.datasets.folder import chosen, places, table
-from optloc.datasets.windows import Window, Windows, along, windowed
+from optloc.datasets.folder import choose, places, table
+from optloc.datasets.windows import Window, Windows, along, cut_windows
 from optloc.problem.build import assemble, measured
 from optloc.problem.problem import Problem
 
+# Metres: the rms of the residuals at the truth after each calibration, see above.
 SIGMA = {"raw": 3.0, "offset": 1.15, "affine": 0.53, "scaled": 0.53}
+# Seconds: windows do not overlap, and the first one lies within the data. At 1.7 m/s the mower moves by up to 2.5 m in
+# one, which the truth takes out.
 STEP, WIDTH, LEAD = 3.0, 1.5, 2.0
+LEAST = 3  # beacons in a window that fix a place in the plane; two leave its mirror image
 
 
 def dataset(folder: Path, *, form: str = "raw") -> tuple[Problem, Array]:
@@ -36,16 +40,16 @@ def load(folder: Path, form: str) -> Windows:
     """Return the windows; `form` is "raw", "offset", "affine" or "scaled"."""
     import pandas as pd
 
-    sigma = SIGMA[chosen(form, SIGMA, "form")]
+    sigma = SIGMA[choose(form, SIGMA, "form")]
     beacons, truth = table(folder, "stations"), table(folder, "truth")
     rows = table(folder, "ranges").sort_values("t_s", kind="stable")
     stations = places(beacons)
     a = pd.Index(beacons["beacon"]).get_indexer(rows["beacon"])
     distance = np.linalg.norm(along(rows["t_s"].to_numpy(), truth) - stations[a], axis=1)
-    rows = rows.assign(a=a, distance=distance, z=_calibrated(form, rows["range_m"].to_numpy(), distance, a))
+    rows = rows.assign(a=a, distance=distance, z=_calibrate(form, rows["range_m"].to_numpy(), distance, a))
     times = np.arange(rows["t_s"].iloc[0] + LEAD, truth["t_s"].iloc[-1], STEP)
-    rows, at = windowed(rows, times, WIDTH), along(times, truth)
-    rows = rows[rows.groupby("window")["a"].transform("nunique") >= 3]
+    rows, at = cut_windows(rows, times, WIDTH), along(times, truth)
+    rows = rows[rows.groupby("window")["a"].transform("nunique") >= LEAST]
     kept, epoch = np.unique(rows["window"], return_inverse=True)
     a, z = rows["a"].to_numpy(), rows["z"].to_numpy()
     moved = rows["distance"].to_numpy() - np.linalg.norm(at[rows["window"]] - stations[a], axis=1)
@@ -62,7 +66,7 @@ def load(folder: Path, form: str) -> Windows:
     return Windows(f"Plaza {form}", stations, windows, problem)
 
 
-def _calibrated(form: str, z: Array, distance: Array, a: Array) -> Array:
+def _calibrate(form: str, z: Array, distance: Array, a: Array) -> Array:
     if form in ("raw", "scaled"):
         return z
     out = np.empty_like(z)

@@ -15,18 +15,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optloc.base.types import Array, Motion
-from optloc.datasets.folder import chosen, places, table
+from optloc.datasets.folder import choose, places, table
 from optloc.problem.build import assemble, measured, station_array
 from optloc.problem.problem import Problem
 
 if TYPE_CHECKING:
     import pandas as pd
 
-SIGMA = np.deg2rad(0.3)
+SIGMA = np.deg2rad(0.3)  # of an angle in a group: half as much again as its robust spread
 # Where a whole run is one problem the noise grows as the camera turns: bearings and poses are 0.09 s apart, by a fit of
 # the residuals at the true places to the rate.
 STILL, LAG = np.deg2rad(0.2), 0.09
-SIZE = 6
+SIZE = 6  # bearings in a group; markers that were seen less often are left out
 _QUATERNION = ["qx", "qy", "qz", "qw"]
 
 
@@ -104,6 +104,7 @@ class Bearings:
         rng = np.random.default_rng(seed)
         counts = self.rows["tag"].value_counts().sort_index()
         counts = counts[counts >= SIZE]
+        # groups fall to markers as their bearings do, so that every bearing is as likely
         tags = rng.choice(counts.index.to_numpy(), count, p=counts.to_numpy() / counts.sum())
         members = np.stack([rng.choice(np.flatnonzero(self.rows["tag"] == tag), SIZE, replace=False) for tag in tags])
         pose = self.poses.loc[self.rows["frame"].to_numpy()[members].ravel()]
@@ -130,7 +131,7 @@ def dataset(
     `form` is "groups", a batch of `count` groups of six bearings of one marker, or "run", the whole run with the
     markers that were seen at least six times.
     """
-    chosen(form, ("groups", "run"), "form")
+    choose(form, ("groups", "run"), "form")
     data = read_run(folder, run, attitude, without=without)
     if form == "run":
         return data.often().problem(), data.often().truth
@@ -141,8 +142,8 @@ def dataset(
 def read_run(folder: Path, name: str, attitude: str, *, without: tuple[int, ...] = ()) -> Bearings:
     """Return one run, with the attitude of the mount by design ("nom") or calibrated ("cal"), without some markers."""
     tables = [table(folder, file) for file in ("stations", "truth", "measurements")]
-    chosen(name, tables[0]["run"].unique(), "run")
-    chosen(attitude, ("nom", "cal"), "attitude")
+    choose(name, tables[0]["run"].unique(), "run")
+    choose(attitude, ("nom", "cal"), "attitude")
     stations, truth, rows = (found[found["run"] == name] for found in tables)
     poses = stations.set_index("frame").sort_index()
     poses = poses.rename(columns={f"{attitude}_{c}": c for c in ("x_m", "y_m", "z_m", *_QUATERNION)})
@@ -165,6 +166,7 @@ def _rate(poses: pd.DataFrame) -> Array:
     """Return how fast the camera turns at each frame, radians a second: the faster of the steps before and after."""
     from scipy.spatial.transform import Rotation
 
+    # the first and the last frame have one step only
     attitude, times = Rotation.from_quat(poses[_QUATERNION].to_numpy()), poses["t_s"].to_numpy()
     step = (attitude[:-1].inv() * attitude[1:]).magnitude() / np.diff(times)
     return np.asarray(np.maximum(np.append(step, 0.0), np.insert(step, 0, 0.0)))

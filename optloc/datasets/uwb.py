@@ -32,8 +32,8 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Motion
-from optloc.datasets.folder import chosen, places, table
-from optloc.datasets.windows import Window, Windows, along, windowed
+from optloc.datasets.folder import choose, places, table
+from optloc.datasets.windows import Window, Windows, along, cut_windows
 from optloc.problem.build import assemble, measured
 from optloc.problem.noise import Block, Noise, group
 from optloc.problem.problem import Problem
@@ -41,8 +41,10 @@ from optloc.problem.problem import Problem
 if TYPE_CHECKING:
     import pandas as pd
 
+# Metres: what a row, and each anchor's arrival in a window, is off by; and a row where all are taken as independent.
 ROW, ARRIVAL, INDEPENDENT = 0.10, 0.14, 0.2
-STEP, AIRBORNE = 0.5, 0.5
+STEP, AIRBORNE = 0.5, 0.5  # seconds from window to window; metres above which the tag counts as flying
+# Seconds: some 40 rows of the eight pairs of neighbours; where the anchors take turns, some 60 of 35 pairs.
 WIDTH = {"TDOA2": 0.1, "TDOA3": 0.3}
 
 
@@ -56,7 +58,7 @@ def load(folder: Path, flight: str, *, shared: bool = True) -> Windows:
     """Return the windows of one flight; `shared`: with the errors that a window's rows share through their anchors."""
     width, stations, rows, truth = _flight(folder, flight)
     times = np.arange(0.0, truth["t_s"].max() + 0.01, STEP)
-    rows, at = windowed(rows, times, width), along(times, truth)
+    rows, at = cut_windows(rows, times, width), along(times, truth)
     rows = rows[at[rows["window"], 2] > AIRBORNE]
     kept, epoch = np.unique(rows["window"], return_inverse=True)
     a, b, z = rows["anchor_b"].to_numpy(), rows["anchor_a"].to_numpy(), rows["rdiff_m"].to_numpy()
@@ -81,6 +83,7 @@ def course(
     if airborne:
         high = truth.loc[truth["z_m"] > AIRBORNE, "t_s"]
         rows = rows[rows["t_s"].between(high.min(), high.max())]
+    # windows next to each other that heard something, at the mean time of what they heard
     _, epoch = np.unique(np.floor(rows["t_s"] / width), return_inverse=True)
     times = np.bincount(epoch, rows["t_s"]) / np.bincount(epoch)
     a, b = rows["anchor_b"].to_numpy(), rows["anchor_a"].to_numpy()
@@ -93,7 +96,7 @@ def course(
 def _flight(folder: Path, flight: str) -> tuple[float, Array, pd.DataFrame, pd.DataFrame]:
     """Return width of a window in seconds, anchors (s, 3), rows in the order of time and truth of a flight."""
     flights = table(folder, "flights").set_index("flight")
-    mode = str(flights.loc[chosen(flight, flights.index, "flight"), "mode"])
+    mode = str(flights.loc[choose(flight, flights.index, "flight"), "mode"])
     if mode not in WIDTH:
         names = ", ".join(flights.index[flights["mode"].isin(list(WIDTH))])
         raise InvalidProblem(f"the flight {flight!r} has ranges, not differences", "flight", f"use {names}")
@@ -111,6 +114,7 @@ def _problem(stations: Array, a: Array, b: Array, z: Array, epoch: Array, times:
 def _covariance(a: Array, b: Array, stations: int, *, shared: bool) -> Array:
     if not shared:
         return INDEPENDENT**2 * np.eye(len(a))
+    # an anchor's error enters all its rows of the window, with the sign it has in the difference
     design = np.eye(stations)[a] - np.eye(stations)[b]
     return ROW**2 * np.eye(len(a)) + ARRIVAL**2 * design @ design.T
 

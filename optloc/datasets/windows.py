@@ -58,8 +58,9 @@ def along(times: Array, truth: pd.DataFrame) -> Array:
     return np.stack([np.interp(times, truth["t_s"], truth[c]) for c in columns], axis=-1)
 
 
-def windowed(rows: pd.DataFrame, times: Array, width: float) -> pd.DataFrame:
+def cut_windows(rows: pd.DataFrame, times: Array, width: float) -> pd.DataFrame:
     """Return the rows that fall into windows of a width in seconds centred at `times` (k,), with their `window`."""
+    # the last window that has begun by then, unless it has ended as well
     window = np.searchsorted(times - width / 2, rows["t_s"].to_numpy(), side="right") - 1
     inside = (window >= 0) & (rows["t_s"].to_numpy() < times[np.maximum(window, 0)] + width / 2)
     return rows.assign(window=window)[inside]

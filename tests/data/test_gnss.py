@@ -54,7 +54,7 @@ def test_three_satellites_and_the_height(session, case):
     # that is well conditioned.
     theirs, good = (
         truths.gnss_horizontal(data, reference.position),
-        gnss.conditioned(data.satellites, data.truth, data.geodetic) > 0.5,
+        gnss.conditioning(data.satellites, data.truth, data.geodetic) > 0.5,
     )
     assert good.mean() == pytest.approx(1.0 / 3.0, abs=0.04)
     assert quantiles(theirs)[0] == pytest.approx(THREE[case][0], rel=0.3)
