@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import ast
 import re
 from collections.abc import Callable, Iterator
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +67,46 @@ def kinds() -> str:
     return "\n".join([*head, *lines])
 
 
+def layers() -> str:
+    """Return the layers of the house as a drawing: every folder on its floor, with what its docstring says."""
+    source = ast.parse((DOCS.parent / "tests" / "test_layers.py").read_text(encoding="utf-8"))
+    assigned = {ast.unparse(node.targets[0]): node.value for node in source.body if isinstance(node, ast.Assign)}
+    floors = [
+        [room for room in rooms.split() if (DOCS.parent / "optloc" / room).is_dir()]
+        for rooms in ast.literal_eval(assigned["LAYERS"])
+    ]
+    floors = [rooms for rooms in floors if rooms]
+    width, height, gap = 760, 46, 6
+    total = len(floors) * (height + gap) + gap
+    parts = [f'<svg viewBox="0 0 {width} {total}" role="img" aria-label="The layers of optloc" class="layers">']
+    floors[0].append("formulations")  # beside the lowest floor
+    for floor, rooms in enumerate(floors):
+        y, wide = total - (floor + 1) * (height + gap), (width - gap * (len(rooms) + 1)) / len(rooms)
+        for i, room in enumerate(rooms):
+            x, about = gap + i * (wide + gap), _about(room)
+            parts.append(
+                f'<g><title>{escape(about)}</title><rect x="{x:.1f}" y="{y}" width="{wide:.1f}" height="{height}" '
+                f'rx="4" fill="none" stroke="currentColor"/><text x="{x + 8:.1f}" y="{y + 19}" font-weight="bold" '
+                f'fill="currentColor">{room}</text><text x="{x + 8:.1f}" y="{y + 37}" font-size="11" '
+                f'fill="currentColor">{escape(_short(about, int(wide / 5.6)))}</text></g>'
+            )
+    return "\n".join([*parts, "</svg>"])
+
+
+def _about(room: str) -> str:
+    """Return the first line of a package's docstring."""
+    place = DOCS.parent / ("formulations" if room == "formulations" else f"optloc/{room}") / "__init__.py"
+    text = ast.get_docstring(ast.parse(place.read_text(encoding="utf-8"))) or ""
+    return text.partition("\n")[0].replace("`", "")
+
+
+def _short(text: str, most: int) -> str:
+    """Return as many whole words as fit into so many letters."""
+    if len(text) <= most:
+        return text
+    return text[: most - 1].rsplit(" ", 1)[0].rstrip(",;:.") + " …"
+
+
 def commands() -> str:
     """Return every command with its help, arguments, options and examples."""
     from typer.main import get_command
@@ -122,4 +164,5 @@ GENERATED: dict[str, Callable[..., str]] = {
     "costs": costs,
     "kinds": kinds,
     "commands": commands,
+    "layers": layers,
 }

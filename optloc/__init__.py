@@ -29,7 +29,7 @@ from optloc.problem.noise import Noise
 from optloc.problem.problem import Problem
 from optloc.quality.health import Health, health
 from optloc.quality.levels import NoiseLevels, noise_levels, with_estimated_noise, with_noise_levels
-from optloc.solvers import FORMULATIONS, METHODS, SOLVERS, solve
+from optloc.solvers import FORMULATIONS, METHODS, SOLVERS, Formulation, solve
 from optloc.solvers.certify.branch_and_bound import certify
 from optloc.solvers.prepared import Prepared, prepare
 from optloc.solvers.robust.stage import rejected
@@ -54,6 +54,7 @@ __all__ = [
     "Emitters",
     "Explanation",
     "Fix",
+    "Formulation",
     "Frame",
     "Health",
     "InvalidProblem",

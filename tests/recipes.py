@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from optloc import FORMULATIONS, MODELS, SOLVERS
+from optloc import FORMULATIONS, LOSSES, MODELS, SOLVERS
 from optloc.track import UPDATES
 
 PAGE = Path(__file__).parents[1] / "docs" / "contributing.md"
-TABLES = {"models": MODELS, "solvers": SOLVERS, "formulations": FORMULATIONS, "trackers": UPDATES}
+TABLES = {"models": MODELS, "formulations": FORMULATIONS, "losses": LOSSES, "solvers": SOLVERS, "trackers": UPDATES}
 _BLOCK = re.compile(r"^```\{code-block\} \w+\n:caption: (\S+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 

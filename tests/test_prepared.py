@@ -14,6 +14,7 @@ from optloc.compute.jit import enabled
 from optloc.solvers.pool import in_parts
 from optloc.solvers.range_fixes import direct
 from optloc.solvers.stages import gtrs, lsr
+from optloc.solvers.verdict.judge import judge
 
 compiled = pytest.mark.skipif(not enabled(), reason="there is no direct way without machine code")
 TRIALS = 100
@@ -21,7 +22,7 @@ TRIALS = 100
 
 def by_stages(problem):
     """Return the fixes of a flat batch by the stages, never directly."""
-    return lsr(problem, gtrs(problem, None))
+    return judge(problem, lsr(problem, gtrs(problem, None)))
 
 
 def without_numbers(sentence):

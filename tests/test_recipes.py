@@ -285,13 +285,13 @@ def test_other_processes_find_it_too(package, file):
     assert found.stderr == ""
 
 
-# --------------------------------------------------------------------------------- formulation, solver and tracker
+# --------------------------------------------------------------------------- formulation, loss, solver and tracker
 def test_the_formulation_is_listed():
     assert optloc.FORMULATIONS["discs"].source.endswith("2001")
     assert any(row["formulation"] == "discs" for row in json.loads(run("list", "formulations", "--json")))
 
 
-def test_the_solver_starts_fixes_from_ranges_over_blocked_paths():
+def test_the_formulation_starts_fixes_from_ranges_over_blocked_paths():
     truth = places(20, seed=2)
     template = optloc.assemble(STATIONS, optloc.measured("range", a=np.arange(8), sigma=5.0))
     drawn = optloc.simulate(template, truth=truth, seed=1)
@@ -307,9 +307,56 @@ def test_the_solver_starts_fixes_from_ranges_over_blocked_paths():
         assert others.max() <= depth + 1e-2
 
 
-def test_the_solver_leaves_other_rows_without_an_answer():
+def test_the_formulation_leaves_other_rows_without_an_answer():
     drawn = optloc.simulate(strengths(), truth=[900.0, 400.0], seed=1)
     assert not solve(drawn, "discs+lsr").answered.any()
+
+
+def test_one_entry_is_enough_for_a_formulation_and_for_a_loss():
+    text = files_of_the_page()["pyproject.toml"]
+    assert text.count("optloc.formulations") == text.count("optloc.losses") == 1
+    words = [row["solver"] for row in json.loads(run("list", "solvers", "--json"))]
+    assert {"discs", "welsch", "simplex"} <= set(words)
+
+
+def test_the_formulation_starts_each_of_several_epochs():
+    truth = places(4, seed=5)
+    epoch, a = np.repeat(np.arange(4), 8), np.tile(np.arange(8), 4)
+    run_of_four = optloc.assemble(
+        STATIONS,
+        optloc.measured("range", a=a, epoch=epoch, sigma=1.0),
+        times=np.arange(4.0),
+        motions=(Motion(span="epoch"),),
+    )
+    drawn = optloc.simulate(run_of_four, truth=truth.reshape(1, -1)[0], seed=2)
+    fix = solve(drawn, "discs+lsr")
+    assert np.linalg.norm(fix.position - truth, axis=-1).max() < 5.0
+
+
+def test_the_loss_leaves_a_liar_aside():
+    truth = places(50, seed=9)
+    template = optloc.assemble(STATIONS, optloc.measured("range", a=np.arange(8), sigma=5.0))
+    drawn = optloc.simulate(template, truth=truth, seed=1)
+    z = np.array(drawn.z)
+    z[:, 3] += 500.0
+    fix, plain = solve(drawn.with_rows(z=z), "welsch"), solve(drawn)
+    assert (fix.weights[:, 3] < 1e-3).all()
+    assert (np.linalg.norm(fix.position - plain.position, axis=-1) < 20.0).all()
+    # By its definition: the derivative of the cost is twice the weighted residual.
+    loss, u = optloc.LOSSES["welsch"], np.linspace(-6.0, 6.0, 121)
+    slope = (loss.rho(u + 1e-6) - loss.rho(u - 1e-6)) / 2e-6
+    np.testing.assert_allclose(slope, 2.0 * u * loss.weight(u), atol=1e-6)
+    assert abs(loss.efficiency - 0.95) < 2e-3
+
+
+def test_the_solver_descends_to_the_minimum():
+    drawn = optloc.simulate(strengths(), truth=[900.0, 400.0], seed=1)
+    rough, fine = solve(drawn, "gtrs+simplex"), solve(drawn, "gtrs+simplex+lsr")
+    best = solve(drawn)
+    np.testing.assert_allclose(rough.position, best.position, atol=1.0)
+    assert fine.status == Status.OK
+    np.testing.assert_allclose(fine.position, best.position, atol=1e-4)
+    assert [stage.name for stage in fine.stages][-1] == "lsr"
 
 
 def test_the_filter_is_the_kalman_update_of_a_larger_prediction():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, MutableMapping
+from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, TypeVar, cast
 
@@ -24,17 +24,27 @@ class Table(MutableMapping[str, T]):
         Whether an object may stand in the table.
     own : dict
         What optloc has. No package replaces it.
+    derived : callable, optional
+        Returns entries that follow from other tables, for names that stand nowhere else.
     """
 
-    __slots__ = ("_fits", "_found", "_group", "_own")
+    __slots__ = ("_derived", "_fits", "_found", "_group", "_own")
 
-    def __init__(self, group: str, fits: Callable[[Any], bool], own: dict[str, T]) -> None:
-        self._group, self._fits, self._own = group, fits, own
+    def __init__(
+        self,
+        group: str,
+        fits: Callable[[Any], bool],
+        own: dict[str, T],
+        derived: Callable[[], Mapping[str, T]] | None = None,
+    ) -> None:
+        self._group, self._fits, self._own, self._derived = group, fits, own, derived or dict
         self._found: dict[str, T] | None = None
 
     # What optloc has is found without looking for entry points, which takes some ten milliseconds.
     def __getitem__(self, name: str) -> T:
-        return self._own[name] if name in self._own else self._added[name]
+        if name in self._own:
+            return self._own[name]
+        return self._added[name] if name in self._added else self._derived()[name]
 
     def __setitem__(self, name: str, value: T) -> None:
         self._own[name] = value
@@ -43,11 +53,10 @@ class Table(MutableMapping[str, T]):
         del self._own[name]
 
     def __iter__(self) -> Iterator[str]:
-        yield from self._own
-        yield from (name for name in self._added if name not in self._own)
+        yield from {**self._own, **self._added, **self._derived()}
 
     def __len__(self) -> int:
-        return len(self._own | self._added)
+        return sum(1 for _ in self)
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}({self._group!r}: {', '.join(self)})"

@@ -22,7 +22,7 @@ from optloc.problem.epochs import separable
 from optloc.problem.problem import Problem
 from optloc.quality.elements import By, batch_of
 from optloc.quality.health import Health, health_of
-from optloc.solvers.methods import branches_of
+from optloc.solvers import Method
 
 # Members of a bias that are named; the others are counted.
 _MEMBERS = 8
@@ -66,7 +66,7 @@ def _health(loaded: Loaded, asked: Asked, quiet: bool) -> Checked | None:
     by = grouping_of(asked.by, "--by")
     # Health is told of stations that may be wrong: by default a loss that turns gross errors down.
     method = asked.method or "cauchy"
-    branches_of(method)  # a misspelt method is refused before the work
+    Method.parse(method)  # a misspelt method is refused before the work
     checked = _check_health(loaded, method, by, quiet)
     if asked.out is not None:
         if checked.health is None:

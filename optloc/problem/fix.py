@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, NoSolution
 from optloc.base.frames import Frame
+from optloc.base.records import Axes, change
 from optloc.base.status import Certificate, Status
 from optloc.base.types import Array
 from optloc.problem.layout import Layout
@@ -52,250 +53,6 @@ class Active:
     name: str
     multiplier: float
 
-
-@dataclass(frozen=True, slots=True)
-class Alternatives:
-    """Other minima of the cost that were found, cheapest first.
-
-    Parameters
-    ----------
-    x : array (..., q, size)
-        Parameter vectors; NaN where there is none.
-    gap : array (..., q)
-        Their cost less the cost of the fix; infinite where there is none.
-    """
-
-    x: Array
-    gap: Array
-
-    @property
-    def doubt(self) -> Array:
-        """Return the probability (..., q) that an alternative is the right one, if it is this one or the fix.
-
-        Each is as likely before the measurement, and the data then weigh them by exp(-cost / 2).
-        """
-        from scipy.special import expit
-
-        return np.asarray(expit(-0.5 * self.gap))
-
-
-@dataclass(frozen=True, slots=True)
-class Fix:
-    """Estimates of a batch of problems; a single problem has no leading axes.
-
-    Parameters
-    ----------
-    x : array (..., size)
-        Parameter vector in the order of `layout`; NaN where there is no answer.
-    cov : array (..., n, n)
-        Covariance of the shared unknowns; NaN where it does not exist.
-    layout : Layout
-        What each entry means.
-    frame : Frame
-        What the coordinates mean.
-    code : int array (...)
-        `Status` numbers.
-    reason : object array (...)
-        Sentence that belongs to the status: the direction, the groups, the count.
-    certificate : object array (...)
-        `Certificate` of each fix.
-    alternatives : Alternatives
-        Other minima.
-    cost : array (...)
-        Weighted sum of squared residuals, chi-square distributed if the model is right.
-    dof : int array (...)
-        Degrees of freedom: rows present less unknowns without a prior.
-    weights : array (..., m)
-        Row weights that were used.
-    stages : tuple of Stage
-        How it was found.
-    active : object array (...), optional
-        Constraints that hold each fix with equality, a tuple of `Active`.
-    local : array (..., k, p, p), optional
-        Covariance of the states that targets have at each epoch of a run, in the order of the layout; NaN where an
-        epoch leaves them open.
-    explanations : object array (...), optional
-        Where the data contradict each other, a tuple of `Explanation`: all the ways of leaving out least, the most
-        plausible first, which is the one that was taken; an empty tuple elsewhere. None where nobody asked.
-    """
-
-    x: Array
-    cov: Array
-    layout: Layout
-    frame: Frame
-    code: Array
-    reason: Array
-    certificate: Array
-    alternatives: Alternatives
-    cost: Array
-    dof: Array
-    weights: Array
-    stages: tuple[Stage, ...] = ()
-    active: Array | None = None
-    local: Array | None = None
-    explanations: Array | None = None
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Return the batch axes; () for a single fix."""
-        return tuple(self.x.shape[:-1])
-
-    @property
-    def status(self) -> Any:
-        """Return the `Status` of a single fix, or the int array (...) of a batch (compare with `Status` members)."""
-        return Status(int(self.code)) if self.shape == () else self.code
-
-    @property
-    def position(self) -> Array:
-        """Return the position (..., d) of the only target, or of each epoch (..., k, d), metres."""
-        return self.layout.take(self.x, "position")
-
-    @property
-    def velocity(self) -> Array:
-        """Return the velocity like `position`, metres per second."""
-        return self.layout.take(self.x, "velocity")
-
-    def take(self, name: str) -> Array:
-        """Return a named part of the estimate, for instance "position[1]" or "clock"."""
-        return self.layout.take(self.x, name)
-
-    @property
-    def bias(self) -> Mapping[str, Array]:
-        """Return the estimates of everything that is not the state of a target, by name."""
-        names = (slot.name for slot in (*self.layout.shared, *self.layout.local))
-        return {name: self.take(name) for name in names if name.partition("[")[0] not in _STATES}
-
-    def members(self, name: str) -> tuple[str, ...]:
-        """Return what the entries of a named part are called, for instance the stations of "clock"."""
-        return self.layout.find(name)[0].entries
-
-    def covariance(self, name: str = "position") -> Array:
-        """Return the covariance of a named part: (..., q, q), or (..., k, q, q) of a state at each epoch."""
-        slot, shared = self.layout.find(name)
-        part = slice(slot.start, slot.start + slot.size)
-        if shared:
-            return self.cov[..., part, part]
-        if self.local is None or slot.start + slot.size > self.local.shape[-1]:
-            raise InvalidProblem(
-                f"{name} is an unknown of each epoch whose covariance is not kept", name, "ask for others"
-            )
-        return self.local[..., part, part]
-
-    def sigma(self, name: str = "position") -> Array:
-        """Return the standard deviations of a named part: (..., q), or (..., k, q) of a state at each epoch."""
-        return np.asarray(np.sqrt(np.diagonal(self.covariance(name), axis1=-2, axis2=-1)))
-
-    @property
-    def p_value(self) -> Array:
-        """Return the probability (...) of a cost at least this large if the model is right; NaN without redundancy."""
-        from scipy.special import gammaincc
-
-        redundant = (self.dof > 0) & np.isfinite(self.cost)
-        return np.where(
-            redundant, gammaincc(np.where(redundant, self.dof, 1) / 2, np.where(redundant, self.cost, 0.0) / 2), np.nan
-        )
-
-    @property
-    def geodetic(self) -> tuple[Array, Array, Array]:
-        """Return latitude, longitude (radians) and ellipsoidal height (metres) of the position."""
-        return self.frame.to_geodetic(self.position)
-
-    def ellipse(self, probability: float = 0.95) -> tuple[Array, Array]:
-        """Return the error ellipse or ellipsoid of the position.
-
-        Parameters
-        ----------
-        probability : float
-            Probability that it contains the target.
-
-        Returns
-        -------
-        semi_axes : array (..., d)
-            Lengths in metres, ascending.
-        directions : array (..., d, d)
-            Unit vectors of the axes in columns.
-        """
-        from scipy.special import gammaincinv
-
-        cov = self.covariance()
-        known = np.asarray(np.isfinite(cov).all((-1, -2)))
-        values, vectors = np.linalg.eigh(np.where(known[..., None, None], cov, 0.0))
-        scale = np.sqrt(2.0 * gammaincinv(cov.shape[-1] / 2, probability))
-        axes = scale * np.sqrt(np.maximum(values, 0.0))
-        return np.where(known[..., None], axes, np.nan), np.where(known[..., None, None], vectors, np.nan)
-
-    def gaussian(self) -> tuple[Array, Array]:
-        """Return mean (..., n) and covariance (..., n, n) of the shared unknowns: an initial state for a tracker."""
-        return self.x[..., : self.layout.n_shared], self.cov
-
-    @property
-    def suspects(self) -> Any:
-        """Return what was left out of a single fix, a tuple of `Suspect`, or an object array (...) of them of a batch.
-
-        They are those of the first of `explanations`: where there are several, others are suspected as much.
-        """
-        out = np.empty(self.shape, dtype=object)
-        for i in np.ndindex(self.shape):
-            found = () if self.explanations is None else self.explanations[i]
-            out[i] = found[0].suspects if found else ()
-        return out[()]
-
-    @property
-    def answered(self) -> Array:
-        """Return where there is an answer with a covariance, possibly one of several, (...)."""
-        return np.isin(self.code, (Status.OK, Status.AMBIGUOUS, Status.SEARCHED))
-
-    def require(self) -> Fix:
-        """Return the fix if every status in it is ok; raise NoSolution with the first that is not."""
-        bad = np.flatnonzero(np.ravel(self.code) != Status.OK)
-        if len(bad):
-            flat = self.flat()
-            raise NoSolution(None, flat[int(bad[0])])
-        return self
-
-    def flat(self) -> Fix:
-        """Return the same fixes with exactly one batch axis."""
-        return self.reshape((self.code.size,))
-
-    def reshape(self, shape: tuple[int, ...]) -> Fix:
-        """Return the fixes of a flat batch with other batch axes."""
-        return self._map(lambda array, core: array.reshape((*shape, *array.shape[array.ndim - core :])))
-
-    def __getitem__(self, index: Any) -> Fix:
-        """Return some fixes of a batch."""
-        return self._map(lambda array, core: _as_array(array[index]))
-
-    def __len__(self) -> int:
-        """Return the length of the first batch axis."""
-        return int(self.x.shape[0])
-
-    def _map(self, change: Any) -> Fix:
-        return replace(
-            self,
-            x=change(self.x, 1),
-            cov=change(self.cov, 2),
-            code=change(self.code, 0),
-            reason=change(self.reason, 0),
-            certificate=change(self.certificate, 0),
-            alternatives=Alternatives(change(self.alternatives.x, 2), change(self.alternatives.gap, 1)),
-            cost=change(self.cost, 0),
-            dof=change(self.dof, 0),
-            weights=change(self.weights, 1),
-            active=None if self.active is None else change(self.active, 0),
-            local=None if self.local is None else change(self.local, 3),
-            explanations=None if self.explanations is None else change(self.explanations, 0),
-        )
-
-
-def _as_array(value: Any) -> Array:
-    if isinstance(value, np.ndarray):
-        return value
-    out = np.empty(1, dtype=object if isinstance(value, str | tuple | Certificate) else None)
-    out[0] = value
-    return out.reshape(())
-
-
-# Measurements that may be wrong: who is suspected, of how large an error, and on what evidence.
 
 GroupKind = Literal["station", "row", "prior"]
 
@@ -361,3 +118,231 @@ class Explanation:
     def names(self) -> tuple[str, ...]:
         """Return the names of its suspects."""
         return tuple(suspect.name for suspect in self.suspects)
+
+
+@dataclass(frozen=True, slots=True)
+class Alternatives:
+    """Other minima of the cost that were found, cheapest first.
+
+    Parameters
+    ----------
+    x : array (..., q, size)
+        Parameter vectors; NaN where there is none.
+    gap : array (..., q)
+        Their cost less the cost of the fix; infinite where there is none.
+    """
+
+    x: Annotated[Array, Axes(2, slots=True)]
+    gap: Annotated[Array, Axes(1, slots=True, empty=np.inf)]
+
+    @property
+    def doubt(self) -> Array:
+        """Return the probability (..., q) that an alternative is the right one, if it is this one or the fix.
+
+        Each is as likely before the measurement, and the data then weigh them by exp(-cost / 2).
+        """
+        from scipy.special import expit
+
+        return np.asarray(expit(-0.5 * self.gap))
+
+
+@dataclass(frozen=True, slots=True)
+class Fix:
+    """Estimates of a batch of problems; a single problem has no leading axes.
+
+    Parameters
+    ----------
+    x : array (..., size)
+        Parameter vector in the order of `layout`; NaN where there is no answer.
+    cov : array (..., n, n)
+        Covariance of the shared unknowns; NaN where it does not exist.
+    layout : Layout
+        What each entry means.
+    frame : Frame
+        What the coordinates mean.
+    code : int array (...)
+        `Status` numbers.
+    reason : object array (...)
+        Sentence that belongs to the status: the direction, the groups, the count.
+    certificate : object array (...)
+        `Certificate` of each fix.
+    alternatives : Alternatives
+        Other minima.
+    cost : array (...)
+        Weighted sum of squared residuals, chi-square distributed if the model is right.
+    dof : int array (...)
+        Degrees of freedom: rows present less unknowns without a prior.
+    weights : array (..., m)
+        Row weights that were used.
+    stages : tuple of Stage
+        How it was found.
+    active : object array (...), optional
+        Constraints that hold each fix with equality, a tuple of `Active`.
+    local : array (..., k, p, p), optional
+        Covariance of the states that targets have at each epoch of a run, in the order of the layout; NaN where an
+        epoch leaves them open.
+    explanations : object array (...), optional
+        Where the data contradict each other, a tuple of `Explanation`: all the ways of leaving out least, the most
+        plausible first, which is the one that was taken; an empty tuple elsewhere. None where nobody asked.
+    """
+
+    x: Annotated[Array, Axes(1)]
+    cov: Annotated[Array, Axes(2)]
+    layout: Layout
+    frame: Frame
+    code: Annotated[Array, Axes(0)]
+    reason: Annotated[Array, Axes(0, empty="")]
+    certificate: Annotated[Array, Axes(0)]
+    alternatives: Alternatives
+    cost: Annotated[Array, Axes(0)]
+    dof: Annotated[Array, Axes(0)]
+    weights: Annotated[Array, Axes(1)]
+    stages: tuple[Stage, ...] = ()
+    active: Annotated[Array, Axes(0, empty=())] | None = None
+    local: Annotated[Array, Axes(3)] | None = None
+    explanations: Annotated[Array, Axes(0, empty=())] | None = None
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Return the batch axes; () for a single fix."""
+        return tuple(self.x.shape[:-1])
+
+    @property
+    def status(self) -> Any:
+        """Return the `Status` of a single fix, or the int array (...) of a batch (compare with `Status` members)."""
+        return Status(int(self.code)) if self.shape == () else self.code
+
+    @property
+    def position(self) -> Array:
+        """Return the position (..., d) of the only target, or of each epoch (..., k, d), metres."""
+        return self.layout.take(self.x, "position")
+
+    @property
+    def velocity(self) -> Array:
+        """Return the velocity like `position`, metres per second."""
+        return self.layout.take(self.x, "velocity")
+
+    def take(self, name: str) -> Array:
+        """Return a named part of the estimate, for instance "position[1]" or "clock"."""
+        return self.layout.take(self.x, name)
+
+    @property
+    def bias(self) -> Mapping[str, Array]:
+        """Return the estimates of everything that is not the state of a target, by name."""
+        names = (slot.name for slot in (*self.layout.shared, *self.layout.local))
+        return {name: self.take(name) for name in names if name.partition("[")[0] not in _STATES}
+
+    def members(self, name: str) -> tuple[str, ...]:
+        """Return what the entries of a named part are called, for instance the stations of "clock"."""
+        return self.layout.find(name)[0].entries
+
+    def covariance(self, name: str = "position") -> Array:
+        """Return the covariance of a named part: (..., q, q), or (..., k, q, q) of a state at each epoch."""
+        slot, shared = self.layout.find(name)
+        part = slice(slot.start, slot.start + slot.size)
+        if shared:
+            return self.cov[..., part, part]
+        if self.local is None or slot.start + slot.size > self.local.shape[-1]:
+            raise InvalidProblem(
+                f"{name} is an unknown of each epoch whose covariance is not kept", name, "ask for others"
+            )
+        return self.local[..., part, part]
+
+    def sigma(self, name: str = "position") -> Array:
+        """Return the standard deviations of a named part: (..., q), or (..., k, q) of a state at each epoch."""
+        return np.asarray(np.sqrt(np.diagonal(self.covariance(name), axis1=-2, axis2=-1)))
+
+    @property
+    def p_value(self) -> Array:
+        """Return the probability (...) of a cost at least this large if the model is right; NaN without redundancy."""
+        return tail_probability(self.cost, self.dof)
+
+    @property
+    def geodetic(self) -> tuple[Array, Array, Array]:
+        """Return latitude, longitude (radians) and ellipsoidal height (metres) of the position."""
+        return self.frame.to_geodetic(self.position)
+
+    def ellipse(self, probability: float = 0.95) -> tuple[Array, Array]:
+        """Return the error ellipse or ellipsoid of the position.
+
+        Parameters
+        ----------
+        probability : float
+            Probability that it contains the target.
+
+        Returns
+        -------
+        semi_axes : array (..., d)
+            Lengths in metres, ascending.
+        directions : array (..., d, d)
+            Unit vectors of the axes in columns.
+        """
+        from scipy.special import gammaincinv
+
+        cov = self.covariance()
+        known = np.asarray(np.isfinite(cov).all((-1, -2)))
+        values, vectors = np.linalg.eigh(np.where(known[..., None, None], cov, 0.0))
+        scale = np.sqrt(2.0 * gammaincinv(cov.shape[-1] / 2, probability))
+        axes = scale * np.sqrt(np.maximum(values, 0.0))
+        return np.where(known[..., None], axes, np.nan), np.where(known[..., None, None], vectors, np.nan)
+
+    def gaussian(self) -> tuple[Array, Array]:
+        """Return mean (..., n) and covariance (..., n, n) of the shared unknowns: an initial state for a tracker."""
+        return self.x[..., : self.layout.n_shared], self.cov
+
+    @property
+    def suspects(self) -> Any:
+        """Return what was left out of a single fix, a tuple of `Suspect`, or an object array (...) of them of a batch.
+
+        They are those of the first of `explanations`: where there are several, others are suspected as much.
+        """
+        out = np.empty(self.shape, dtype=object)
+        for i in np.ndindex(self.shape):
+            found = () if self.explanations is None else self.explanations[i]
+            out[i] = found[0].suspects if found else ()
+        return out[()]
+
+    @property
+    def answered(self) -> Array:
+        """Return where there is an answer with a covariance, possibly one of several, (...)."""
+        return np.isin(self.code, (Status.OK, Status.AMBIGUOUS, Status.SEARCHED))
+
+    def require(self) -> Fix:
+        """Return the fix if every status in it is ok; raise NoSolution with the first that is not."""
+        bad = np.flatnonzero(np.ravel(self.code) != Status.OK)
+        if len(bad):
+            flat = self.flat()
+            raise NoSolution(None, flat[int(bad[0])])
+        return self
+
+    def flat(self) -> Fix:
+        """Return the same fixes with exactly one batch axis."""
+        return self.reshape((self.code.size,))
+
+    def reshape(self, shape: tuple[int, ...]) -> Fix:
+        """Return the fixes of a flat batch with other batch axes."""
+        return change(self, lambda array, core: array.reshape((*shape, *array.shape[array.ndim - core :])))
+
+    def __getitem__(self, index: Any) -> Fix:
+        """Return some fixes of a batch."""
+        return change(self, lambda array, core: _as_array(array[index]))
+
+    def __len__(self) -> int:
+        """Return the length of the first batch axis."""
+        return int(self.x.shape[0])
+
+
+def tail_probability(cost: Array, dof: Array) -> Array:
+    """Return the chi-square probability (...) of a cost at least this large; NaN without redundancy or cost."""
+    from scipy.special import gammaincc
+
+    redundant = (dof > 0) & np.isfinite(cost)
+    return np.where(redundant, gammaincc(np.where(redundant, dof, 1) / 2, np.where(redundant, cost, 0.0) / 2), np.nan)
+
+
+def _as_array(value: Any) -> Array:
+    if isinstance(value, np.ndarray):
+        return value
+    out = np.empty(1, dtype=object if isinstance(value, str | tuple | Certificate) else None)
+    out[0] = value
+    return out.reshape(())

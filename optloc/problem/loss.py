@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from types import MappingProxyType
 
 import numpy as np
 
+from optloc.base.registry import Table
 from optloc.base.types import Array
 
 
@@ -28,15 +28,22 @@ class Loss:
         rho(u).
     importance : callable of (u, constant)
         The weight psi(u) / u with psi = rho' / 2: in [0, 1], not rising with abs(u).
+    summary : str
+        One line for listings.
     one_sided : bool
         Whether only positive residuals are doubted. Residuals of either sign of other kinds are then given as abs(u).
+    flat : bool
+        Whether all gross errors cost the same: how many there are is then evidence, and it takes a loss that still
+        rises to lead the way to its minima.
     """
 
     name: str
     constant: float
     cost: Callable[[Array, float], Array]
     importance: Callable[[Array, float], Array]
+    summary: str = ""
     one_sided: bool = False
+    flat: bool = False
 
     def rho(self, u: Array) -> Array:
         """Return the cost of residuals u, in sigma, elementwise: u² for small ones."""
@@ -129,16 +136,22 @@ def _late_weight(u: Array, c: float) -> Array:
     return _cauchy_weight(np.maximum(u, 0.0), c)
 
 
-LOSSES = MappingProxyType(
-    {
-        loss.name: loss
-        # Each constant is where `efficiency` says 95 %, for the truncated loss 99 %.
-        for loss in (
-            Loss("huber", 1.345, _huber, _huber_weight),
-            Loss("cauchy", 2.385, _cauchy, _cauchy_weight),
-            Loss("truncated", 3.368, _truncated, _truncated_weight),
-            Loss("late", 2.328, _late, _late_weight, one_sided=True),
-        )
-    }
+# Each constant is where `efficiency` says 95 %, for the truncated loss 99 %.
+_OWN = (
+    Loss("huber", 1.345, _huber, _huber_weight, "Huber's convex loss: gross errors pull no harder than 1.3 sigma"),
+    Loss("cauchy", 2.385, _cauchy, _cauchy_weight, "Cauchy's loss: the larger an error the less it pulls"),
+    Loss("truncated", 3.368, _truncated, _truncated_weight, "least squares without the rows 3.4 sigma off", flat=True),
+    Loss(
+        "late",
+        2.328,
+        _late,
+        _late_weight,
+        "doubts ranges and arrivals that are too long: blocked paths",
+        one_sided=True,
+    ),
 )
-"""Losses by name: Huber 1964; Holland, Welsch 1977; Blake, Zisserman 1987; the Cauchy loss of one side."""
+LOSSES: Table[Loss] = Table("optloc.losses", lambda value: isinstance(value, Loss), {loss.name: loss for loss in _OWN})
+"""Losses by name, each a stage of a method: Huber 1964; Holland, Welsch 1977; Blake, Zisserman 1987; Cauchy one-sided.
+
+Add one with one entry, or from another package with an entry point of ``optloc.losses``.
+"""

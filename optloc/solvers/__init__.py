@@ -11,14 +11,13 @@ from optloc.base.types import Array
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.solvers.methods import FORMULATIONS, METHODS, SOLVERS, WORTH, Entry, Formulation, stages_of
-from optloc.solvers.pool import given, in_parts
-from optloc.solvers.range_fixes import Quick, shortened
-from optloc.solvers.stages import Solver
+from optloc.solvers.methods import FORMULATIONS, METHODS, SOLVERS, Entry, Formulation, Method, shortcut
+from optloc.solvers.outside import given
+from optloc.solvers.pool import begin, in_parts
 from optloc.solvers.starts.position import vectors
-from optloc.solvers.verdict.status import without_open_epochs
+from optloc.solvers.verdict.judge import hide_open_epochs, judge
 
-__all__ = ["FORMULATIONS", "METHODS", "SOLVERS", "Entry", "Formulation", "Solver", "given", "solve", "vectors"]
+__all__ = ["FORMULATIONS", "METHODS", "SOLVERS", "Entry", "Formulation", "Method", "given", "solve", "vectors"]
 
 
 def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
@@ -43,27 +42,24 @@ def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
     InvalidProblem
         For an unknown method, or where nothing is unknown.
     """
-    solvers = shortened([stage.solver for stage in stages_of(method)], WORTH)
+    run = Method.parse(method)
     if problem.layout.size == 0:
         raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
     if separable(problem):
         problem = by_epoch(problem)
     shape, flat = problem.batch_shape, problem.flat()
-    vector = None if start is None else _started(problem, start).reshape(-1, problem.layout.size)
+    vector = None if start is None else _broadcast_start(problem, start).reshape(-1, problem.layout.size)
 
     def work(some: Problem, part: slice) -> Fix:
-        fix = None if vector is None else given(some, vector[part])
-        for solver in solvers:
-            fix = solver(some, fix)
-        assert fix is not None
-        return without_open_epochs(fix)
+        pool = None if vector is None else begin(some, vector[part])
+        return hide_open_epochs(judge(some, run(some, pool)))
 
-    whole = len(solvers) == 1 and isinstance(solvers[0], Quick)
-    fix = work(flat, slice(None)) if whole else in_parts(flat, work)
+    # the shortcut divides its work itself, and shares it among threads
+    fix = work(flat, slice(None)) if shortcut(run) and vector is None else in_parts(flat, work)
     return fix.reshape(shape) if shape != (len(fix),) else fix
 
 
-def _started(problem: Problem, start: Any) -> Array:
+def _broadcast_start(problem: Problem, start: Any) -> Array:
     """Return a starting vector for every problem, (..., size)."""
     vector, wanted = np.asarray(start, dtype=float), (*problem.batch_shape, problem.layout.size)
     try:

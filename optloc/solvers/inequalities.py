@@ -6,15 +6,12 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import chdtrc
 
 from optloc.base.status import Status
 from optloc.base.types import Array
 from optloc.linear.constraints import TOLERANCE, Face, exact, faces, violation
-from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.solvers.policy import DOUBT
-from optloc.solvers.pool import Candidates
+from optloc.solvers.pool import Pool
 from optloc.solvers.refine import refine
 from optloc.solvers.verdict.horizon import hidden
 
@@ -29,7 +26,7 @@ def by_least_squares(problem: Problem, start: Array, item: Array, face: Face) ->
     return done.x, done.cost, done.status
 
 
-def bounded(problem: Problem, pool: Candidates, descend: Descend = by_least_squares) -> Candidates:
+def bound_pool(problem: Problem, pool: Pool, descend: Descend = by_least_squares) -> Pool:
     """Return the feasible candidates of a flat batch, with those on faces added where the cheapest breaks a constraint.
 
     A target that the Earth hides from a satellite which hears it is not feasible either.
@@ -41,14 +38,14 @@ def bounded(problem: Problem, pool: Candidates, descend: Descend = by_least_squa
     ----------
     problem : Problem
         N problems with constraints.
-    pool : Candidates
+    pool : Pool
         Refined under the equalities alone.
     descend : callable
         Minimises the cost of the pool on a face: of problems, starts, the problem of each start, and the face.
 
     Returns
     -------
-    Candidates
+    Pool
         Infeasible ones have infinite cost and status `infeasible`.
     """
     broken = _broken(problem, pool)
@@ -68,20 +65,21 @@ def bounded(problem: Problem, pool: Candidates, descend: Descend = by_least_squa
     face = np.zeros((size, width), dtype=int)
     for array, place in ((x, 0), (cost, 1), (code, 2), (face, 3)):
         array[needy] = np.concatenate([found[place] for found in on_faces], axis=1)
-    return Candidates(
-        np.concatenate([kept.x, x], axis=1),
-        np.concatenate([kept.cost, cost], axis=1),
-        np.concatenate([kept.code, code], axis=1),
-        np.concatenate([kept.face, face], axis=1),
+    return replace(
+        kept,
+        x=np.concatenate([kept.x, x], axis=1),
+        cost=np.concatenate([kept.cost, cost], axis=1),
+        code=np.concatenate([kept.code, code], axis=1),
+        face=np.concatenate([kept.face, face], axis=1),
     )
 
 
-def without_broken(problem: Problem, pool: Candidates) -> Candidates:
+def without_broken(problem: Problem, pool: Pool) -> Pool:
     """Return candidates of which those that break a constraint, or are hidden, have infinite cost."""
     return _without(pool, _broken(problem, pool))
 
 
-def _broken(problem: Problem, pool: Candidates) -> Array:
+def _broken(problem: Problem, pool: Pool) -> Array:
     """Return which candidates break a constraint, or stand where the Earth hides them from a satellite."""
     broken = np.zeros(pool.cost.shape, dtype=bool)
     item, slot = np.nonzero(np.isfinite(pool.x).all(-1))
@@ -91,12 +89,12 @@ def _broken(problem: Problem, pool: Candidates) -> Array:
     return broken
 
 
-def _without(pool: Candidates, broken: Array) -> Candidates:
+def _without(pool: Pool, broken: Array) -> Pool:
     cost = np.where(broken, np.inf, pool.cost)
-    return Candidates(pool.x, cost, np.where(broken, np.int8(Status.INFEASIBLE), pool.code), pool.face)
+    return replace(pool, cost=cost, code=np.where(broken, np.int8(Status.INFEASIBLE), pool.code))
 
 
-def _cheapest(pool: Candidates, items: Array) -> Array:
+def _cheapest(pool: Pool, items: Array) -> Array:
     """Return the cheapest candidates (items, q, size) of some problems; NaN where there are fewer."""
     order = np.argsort(pool.cost[items], axis=1, kind="stable")[:, :_STARTS]
     x = np.take_along_axis(pool.x[items], order[..., None], axis=1)
@@ -120,36 +118,6 @@ def _on_face(
     return x, cost, code, np.full(shape, number)
 
 
-def contradicted(fix: Fix, free: Candidates, *, robust: bool = False) -> Fix:
-    """Return fixes whose status says where the data contradict the constraints that hold them.
-
-    They do so where the data agree among themselves without the constraints, and each constraint that holds a fix
-    costs so much that noise does it once in a thousand times: with the true place inside, what k of them cost is not
-    more than chi-square of k degrees of freedom.
-
-    Parameters
-    ----------
-    fix : Fix
-        N fixes under constraints.
-    free : Candidates
-        The same problems refined under the equalities alone.
-    robust : bool
-        Whether the cost bears gross errors, so that the data need not agree among themselves.
-    """
-    if fix.active is None:
-        return fix
-    held = np.array([len(active) for active in fix.active])
-    finished = np.where(free.code == Status.OK, free.cost, np.inf)
-    least = finished.min(1, initial=np.inf)
-    with np.errstate(invalid="ignore"):
-        noise = robust | (fix.dof <= 0) | (chdtrc(np.maximum(fix.dof, 1), least) >= DOUBT)
-        dear = chdtrc(np.maximum(held, 1), np.maximum(fix.cost - least, 0.0)) < DOUBT
-    items = np.flatnonzero((held > 0) & fix.answered & np.isfinite(least) & noise & dear)
-    if not len(items):
-        return fix
-    code, reason = fix.code.copy(), fix.reason.copy()
-    for i in items:
-        names = " and ".join(active.name for active in fix.active[i])
-        code[i] = Status.CONTRADICTORY
-        reason[i] = f"the data contradict {names}: the cost is {fix.cost[i]:.3g}, and {least[i]:.3g} without"
-    return replace(fix, code=code, reason=reason)
+def least_finished(pool: Pool) -> Array:
+    """Return the least cost (N,) of the finished candidates; infinite where there is none."""
+    return np.asarray(np.where(pool.code == Status.OK, pool.cost, np.inf).min(1, initial=np.inf))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from time import perf_counter
 from typing import Any
 
@@ -19,60 +20,60 @@ from optloc.linear.constraints import conjunction, face_of, faces, tangent_at
 from optloc.linear.normal import decrement, prior_parts, step
 from optloc.linear.station_noise import weighed
 from optloc.linear.symbolic import bounds, constrained, parameters, residual
-from optloc.problem.fix import Fix, Stage
+from optloc.problem.fix import Stage
 from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
 from optloc.solvers.inequalities import without_broken
-from optloc.solvers.pool import Candidates, given, pooled, unrefined
-from optloc.solvers.stages import finished
+from optloc.solvers.pool import Pool, begin, offer
 from optloc.solvers.starts.block_averages import averaged
 from optloc.solvers.starts.position import completed, spread_of
 from optloc.solvers.starts.registration import BLOCKS, alike, registrable
+from optloc.solvers.verdict.judge import judge, standing
+from optloc.solvers.verdict.minima import settle
 
 # "1" has programs compiled by the system's C compiler: worth its seconds for many fixes of one large structure
 _COMPILE = "OPTLOC_COMPILE_NLP"
 
 
-def nlp(problem: Problem, fix: Fix | None) -> Fix:
-    """Return the fix found by IPOPT from every candidate of the stage before.
+def nlp(problem: Problem, pool: Pool | None) -> Pool:
+    """Return the minima that IPOPT reaches from all candidates of the pool before.
 
     Parameters
     ----------
     problem : Problem
         Flat batch of N problems.
-    fix : Fix
+    pool : Pool
         Where to start.
 
     Returns
     -------
-    Fix
-        Judged like a refined one; of a long run, the answers for its block averages, to be refined by `lsr`.
+    Pool
+        Settled; of a long run, the answers for its block averages, to be refined by `lsr`.
     """
-    if fix is None:
+    if pool is None:
         raise InvalidProblem("nlp improves a start", "method", "give start= or a method such as 'gtrs+nlp'")
     began = perf_counter()
     if registrable(problem) and problem.epochs >= 2 * BLOCKS:
-        return unrefined(problem, _of_blocks(problem, pooled(fix)[0]), fix, "nlp", began)
+        return offer(problem, _of_blocks(problem, pool.x), pool, "nlp", began)
     problem = weighed(problem)
-    pool, item, slot = pooled(fix)
-    x, cost, code = (
-        pool.copy(),
-        np.full(pool.shape[:2], np.inf),
-        np.full(pool.shape[:2], int(Status.NUMERICAL), np.int8),
-    )
+    x, shape = pool.x.copy(), pool.x.shape[:2]
+    cost, code = np.full(shape, np.inf), np.full(shape, int(Status.NUMERICAL), dtype=np.int8)
+    item, slot = pool.occupied
     for i in np.unique(item):
         one = problem.take(np.array([i]))
         solver = _Scaled(one)
         for j in slot[item == i]:
-            x[i, j], cost[i, j], code[i, j] = solver.from_start(pool[i, j])
-    face = np.zeros(cost.shape, dtype=int)
+            x[i, j], cost[i, j], code[i, j] = solver.from_start(pool.x[i, j])
+    face = np.zeros(shape, dtype=int)
     if len(item):
         part, points = problem.take(item), x[item, slot]
         face[item, slot] = face_of(part, points) if problem.constraints else 0
         code[item, slot] = _stationary(part, points, code[item, slot], face[item, slot])
     cost[code == Status.NUMERICAL] = np.inf  # a start on a station has no gradient, and IPOPT's last word is no point
-    stage = Stage("nlp", f"{len(item)} programs", perf_counter() - began)
-    return finished(problem, fix, without_broken(problem, Candidates(x, cost, code, face)), stage)
+    weights = np.broadcast_to(problem.weight, (len(pool), problem.count))
+    found = without_broken(problem, Pool(x, cost, code, face, weights, pool.dof, pool.stages))
+    settled = settle(problem, found, Stage("nlp", f"{len(item)} programs", perf_counter() - began))
+    return replace(settled, refined=False)  # least squares has the last word where it follows
 
 
 def _of_blocks(problem: Problem, x: Array) -> Array:
@@ -80,7 +81,8 @@ def _of_blocks(problem: Problem, x: Array) -> Array:
     n, out = problem.layout.n_shared, np.full(x.shape, np.nan)
     for items in alike(problem):
         blocks = averaged(problem.take(items), BLOCKS)
-        found, _, _ = pooled(nlp(blocks, given(blocks, completed(blocks, x[items, :, :n]))))
+        pool = nlp(blocks, begin(blocks, completed(blocks, x[items, :, :n])))
+        found = standing(pool, judge(blocks, pool))
         width = min(found.shape[1], x.shape[1])
         out[items, :width] = completed(problem.take(items), found[:, :width, :n])
     return out

@@ -1,8 +1,8 @@
-"""What a method can be made of: one line for each solver stage and for each formulation behind it."""
+"""Methods: pipelines as data, made of words that name stages."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from time import perf_counter
 
@@ -10,84 +10,41 @@ import numpy as np
 
 from formulations.backend import Choice, Kind, counting, using
 from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.records import take
 from optloc.base.registry import Table
-from optloc.base.status import Status
+from optloc.base.status import Certificate, Status
 from optloc.base.types import Array
 from optloc.problem.fix import Fix, Stage
+from optloc.problem.loss import LOSSES
 from optloc.problem.problem import Problem
 from optloc.proof.scope import unsupported
 from optloc.solvers import stages
+from optloc.solvers.catalogue import FORMULATIONS, Formulation
 from optloc.solvers.certify.branch_and_bound import certified, value_certified
-from optloc.solvers.certify.relaxations import by_reference
+from optloc.solvers.outside import FixSolver, adapt
 from optloc.solvers.policy import LISTED_GAP
-from optloc.solvers.pool import merged, packed, pooled, unrefined
-from optloc.solvers.range_fixes import shortened
-from optloc.solvers.robust.stage import STAGES as ROBUST
+from optloc.solvers.pool import Pool, offer, pack
+from optloc.solvers.range_fixes import Quick
+from optloc.solvers.robust.stage import Robust
 from optloc.solvers.sparse import sparse
 from optloc.solvers.stages import Solver
-from optloc.solvers.suspects.stage import suspected
+from optloc.solvers.suspects.stage import suspect
+from optloc.solvers.verdict.judge import judge, standing
+from optloc.solvers.verdict.status import fill
 
-# Ways one after the other: the next is taken for the problems of which the one before leaves something to prove.
-
-# More candidates change nothing about these.
-_SETTLED = (Status.REJECTED, Status.TOO_FEW_ROWS)
-
-
-def first_that_proves(branches: Sequence[Sequence[Solver]]) -> Solver:
-    """Return the solver that takes the first branch, and each further one for what is not proven by then.
-
-    What the earlier branches found competes in the later ones. Problems beyond the scope of the proof take the last
-    branch alone.
-
-    Parameters
-    ----------
-    branches : sequence of sequences of solvers
-        Each ends with a proof.
-    """
-
-    def solver(problem: Problem, fix: Fix | None) -> Fix:
-        taken = branches[-1:] if unsupported(problem) else branches
-        for branch in taken:
-            fix = _next(problem, fix, branch)
-        assert fix is not None
-        return fix
-
-    return solver
-
-
-def unproven(fix: Fix) -> Array:
-    """Return which fixes (N,) could still change: no proof that all minima within the listed gap are known."""
-    sure = [c.proof == "global" and c.margin >= LISTED_GAP for c in fix.certificate]
-    return np.asarray(~np.array(sure, dtype=bool) & ~np.isin(fix.code, _SETTLED))
-
-
-def _next(problem: Problem, fix: Fix | None, branch: Sequence[Solver]) -> Fix:
-    if fix is None or not fix.stages or fix.stages[-1].name != "certify":
-        for stage in branch:
-            fix = stage(problem, fix)
-        assert fix is not None
-        return fix
-    items = np.flatnonzero(unproven(fix))
-    if not len(items):
-        return fix
-    part, own = problem.take(items), fix[items]
-    new = _beside(part, branch[0](part, None), own)
-    for stage in branch[1:]:
-        new = stage(part, new)
-    joint = merged(fix, items, new, Stage("", "", 0.0))
-    return replace(joint, stages=(*fix.stages, *new.stages))
-
-
-def _beside(problem: Problem, start: Fix, fix: Fix) -> Fix:
-    """Return starts with what an earlier branch found beside them."""
-    pool = packed(np.concatenate([pooled(start)[0], pooled(fix)[0]], axis=1))
-    return replace(unrefined(problem, pool, None, "", perf_counter()), stages=start.stages)
-
-
-def _nlp(problem: Problem, fix: Fix | None) -> Fix:
-    from optloc.solvers.ipopt import nlp  # IPOPT is loaded when it is used
-
-    return nlp(problem, fix)
+# The back end that holds for a stretch of code (`formulations.backend`), for layers that know formulations from here.
+__all__ = [
+    "FORMULATIONS",
+    "METHODS",
+    "SOLVERS",
+    "Choice",
+    "Entry",
+    "Formulation",
+    "Kind",
+    "Method",
+    "counting",
+    "using",
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,80 +54,125 @@ class Entry:
     Parameters
     ----------
     solver : callable
-        ``(problem, fix or None) -> fix``.
+        ``(problem, fix or None) -> fix`` of a flat batch of problems.
     summary : str
         One line for listings.
     role : "start" or "refinement"
         Whether it needs no fix before it, or improves one.
+    stage : callable, optional
+        ``(problem, pool or None) -> pool``: takes the place of `solver` among optloc's own stages.
+    batched : bool
+        Whether it works on a batch at a time. Any other is taken to go one by one: too small a chunk of a study costs a
+        file, too large a one the work of minutes when a run is stopped.
     """
 
-    solver: Solver
+    solver: FixSolver | None
     summary: str
     role: str
+    stage: Solver | None = None
+    batched: bool = False
+
+    @property
+    def run(self) -> Solver:
+        """Return the stage."""
+        if self.stage is not None:
+            return self.stage
+        assert self.solver is not None
+        return adapt(self.solver)
 
 
-@dataclass(frozen=True, slots=True)
-class Formulation:
-    """An optimisation problem of the package `formulations`.
+def _nlp(problem: Problem, pool: Pool | None) -> Pool:
+    from optloc.solvers.ipopt import nlp  # IPOPT is loaded when it is used
 
-    Parameters
-    ----------
-    summary : str
-        What it minimises.
-    kinds : str
-        Measurement kinds it serves.
-    tight : str
-        How good its answer is.
-    cost : str
-        Typical time for one fix.
-    source : str
-        Publication.
+    return nlp(problem, pool)
+
+
+def compare_bounds(problem: Problem, pool: Pool | None) -> Pool:
+    """Return a pool whose certificates compare costs with the lower bound of a relaxation: the stage "bound".
+
+    The first formulation whose bound holds for the rows decides; fixes that are proven already stay as they are.
     """
+    if pool is None:
+        raise InvalidProblem("bound examines a fix", "method", "put it behind a refinement")
+    began, fix = perf_counter(), judge(problem, pool)
+    for formulation in FORMULATIONS.values():
+        found = None if formulation.bound is None else formulation.bound(problem, fix)
+        if found is None or not np.isfinite(found.bound).any():
+            continue
+        tight, known = found.tight(fix.cost), np.flatnonzero(np.isfinite(found.bound))
+        certificate = fill(len(pool), None) if pool.certificate is None else np.array(pool.certificate)
+        for i in known:
+            proven = fix.certificate[i].proof
+            if proven != "global" and (tight[i] or proven != "region"):
+                certificate[i] = _bounded(float(fix.cost[i]), float(found.bound[i]), bool(tight[i]), found.method)
+        stage = Stage("bound", f"{int(tight[known].sum())} of {len(tight)} proven", perf_counter() - began)
+        return replace(pool, certificate=certificate, stages=(*pool.stages, stage))
+    return pool
 
-    summary: str
-    kinds: str
-    tight: str
-    cost: str
-    source: str
+
+def _bounded(cost: float, bound: float, tight: bool, name: str) -> Certificate:
+    reason = "no position costs less" if tight else f"a lower bound leaves a gap of {cost - bound:.2g}"
+    text = f"{reason}; other minima were searched for, not excluded"
+    return Certificate(
+        "global" if tight else "local", text, f"{name.removesuffix('s')} relaxation", bound, cost - bound
+    )
+
+
+def _start(stage: Solver, summary: str, *, batched: bool = False) -> Entry:
+    return Entry(None, summary, "start", stage, batched)
+
+
+def _refinement(stage: Solver, summary: str, *, batched: bool = False) -> Entry:
+    return Entry(None, summary, "refinement", stage, batched)
 
 
 _STAGES: dict[str, Entry] = {
-    "gtrs": Entry(stages.gtrs, "minimiser of the weighted squared-range problem: the cheapest start", "start"),
-    "roots": Entry(stages.roots, "every stationary point of the squared-range problem", "start"),
-    "sdp": Entry(stages.sdp, "Shor's semidefinite relaxation of the squared-range problem (Clarabel)", "start"),
-    "socp": Entry(stages.socp, "second-order cone relaxation of the squared-range problem (Clarabel)", "start"),
-    "sparse": Entry(
-        sparse, "convex start in which a few rows are grossly wrong, and the fix without them (Clarabel)", "start"
+    "gtrs": _start(stages.gtrs, "minimiser of the weighted squared-range problem: the cheapest start", batched=True),
+    "roots": _start(stages.roots, "every stationary point of the squared-range problem", batched=True),
+    "sdp": _start(stages.start_with("sdp"), "Shor's semidefinite relaxation of the squared-range problem (Clarabel)"),
+    "socp": _start(stages.start_with("socp"), "second-order cone relaxation of the squared-range problem (Clarabel)"),
+    "sparse": _start(sparse, "convex start in which a few rows are grossly wrong, and the fix without them (Clarabel)"),
+    "wiv": _start(stages.start_with("wiv"), "pseudo-linear angles with an instrumental-variable pass", batched=True),
+    "directions": _start(
+        stages.start_with("directions"), "semidefinite relaxation over unit directions (Clarabel); angles"
     ),
-    "wiv": Entry(stages.wiv, "pseudo-linear angles with an instrumental-variable pass", "start"),
-    "directions": Entry(stages.directions, "semidefinite relaxation over unit directions (Clarabel); angles", "start"),
-    "minimax": Entry(stages.minimax, "least worst angle by second-order cones (Clarabel); bounded errors", "start"),
-    "widen": Entry(stages.widen, "more candidates beside a fix: mirror image, sub-arrays", "refinement"),
-    "search": Entry(
-        stages.search, "a seeded search from many places for problems still without an answer", "refinement"
+    "minimax": _start(
+        stages.start_with("minimax"), "least worst angle by second-order cones (Clarabel); bounded errors"
     ),
-    "lsr": Entry(stages.lsr, "damped Taylor least squares (Gauss-Newton) from every candidate", "refinement"),
-    "nlp": Entry(_nlp, "the maximum-likelihood cost by IPOPT from every candidate", "refinement"),
-    "certify": Entry(
-        certified, "branch and bound: no position costs less, and no other minimum comes near", "refinement"
+    "widen": _refinement(stages.widen, "more candidates beside a fix: mirror image, sub-arrays", batched=True),
+    "search": _refinement(
+        stages.search, "a seeded search from many places for problems still without an answer", batched=True
     ),
-    "value": Entry(value_certified, "the same for the cost alone, without other minima: quicker", "refinement"),
-    "bound": Entry(
-        by_reference, "compares the cost with the bound of a relaxation (Clarabel): angles, ranges", "refinement"
+    "lsr": _refinement(stages.lsr, "damped Taylor least squares (Gauss-Newton) from every candidate", batched=True),
+    "nlp": _refinement(_nlp, "the maximum-likelihood cost by IPOPT from every candidate"),
+    "certify": _refinement(
+        certified, "branch and bound: no position costs less, and no other minimum comes near", batched=True
     ),
-    "suspects": Entry(
-        suspected, "leaves out the stations, rows and priors that contradict the rest, and names them", "refinement"
+    "value": _refinement(value_certified, "the same for the cost alone, without other minima: quicker", batched=True),
+    "bound": _refinement(compare_bounds, "compares the cost with the bound of a relaxation (Clarabel): angles, ranges"),
+    "suspects": _refinement(
+        suspect, "leaves out the stations, rows and priors that contradict the rest, and names them"
     ),
-    "taylor": Entry(stages.taylor, "plain undamped Taylor iteration; a baseline, it diverges", "refinement"),
-    "huber": Entry(ROBUST["huber"], "Huber's convex loss: gross errors pull no harder than 1.3 sigma", "start"),
-    "cauchy": Entry(ROBUST["cauchy"], "Cauchy's loss: the larger an error the less it pulls", "start"),
-    "truncated": Entry(ROBUST["truncated"], "least squares without the rows that are 3.4 sigma off", "start"),
-    "late": Entry(ROBUST["late"], "doubts ranges and arrivals that are too long: blocked paths", "start"),
+    "taylor": _refinement(stages.taylor, "plain undamped Taylor iteration; a baseline, it diverges", batched=True),
 }
-SOLVERS: Table[Entry] = Table("optloc.solvers", lambda value: isinstance(value, Entry), _STAGES)
+
+
+def _derived() -> Mapping[str, Entry]:
+    """Return the stages that follow from other tables: of each loss, and of each start of a formulation."""
+    out = {name: _start(Robust(loss), loss.summary) for name, loss in LOSSES.items()}
+    for formulation in FORMULATIONS.values():
+        for word in formulation.starts:
+            out.setdefault(word, _start(stages.start_with(word), formulation.summary))
+    return out
+
+
+SOLVERS: Table[Entry] = Table("optloc.solvers", lambda value: isinstance(value, Entry), _STAGES, _derived)
 
 # Machine code takes time to load, more than the stages take for fewer problems.
 WORTH = 16
+# Beginnings of methods for which there is a stage that does the same in one.
+SHORTCUTS: Mapping[tuple[str, ...], Solver] = {("gtrs", "lsr"): Quick(WORTH)}
+
 # What stands behind "|" is for the problems of which not everything is proven by then.
 METHODS = {
     "auto": "gtrs+lsr+certify|roots+lsr+widen+lsr+search+certify",
@@ -179,145 +181,98 @@ METHODS = {
     "robust": "roots+lsr+widen+lsr+search+suspects",
 }
 
-_RANGES = "range, toa, tdoa, range_sum; azimuth, elevation and groa rows linear in (x, r)"
-
-_PROGRAMS: dict[str, Formulation] = {
-    "squared_range": Formulation(
-        "squared-range least squares with one quadratic constraint (GTRS), all stationary points",
-        _RANGES,
-        "exact for its own cost; second weighting close to maximum likelihood",
-        "2 us the minimiser, 12 us all points",
-        "More 1993; Beck, Stoica, Li 2008",
-    ),
-    "squared_range_conic: shor": Formulation(
-        "semidefinite twin of the same problem", _RANGES, "rank one, equal to the GTRS", "0.5 ms", "Shor 1987"
-    ),
-    "squared_range_conic: hull": Formulation(
-        "second-order cone relaxation |x| <= r of the same problem",
-        _RANGES,
-        "a lower bound; tight where the linear fit violates |x| <= r, about half of all TDOA cases",
-        "0.2 ms",
-        "convex hull of the cone",
-    ),
-    "sparse_errors": Formulation(
-        "linear rows with gross errors of a few, priced by the sum of their sizes, on the cones of the ranges",
-        _RANGES,
-        "convex, not exact: a start and a guess of the wrong rows; from about 20 stations both are good",
-        "1 ms",
-        "Donoho, Johnstone 1994; Yuan, Lin 2006; She, Owen 2011",
-    ),
-    "range_height": Formulation(
-        "ranges known up to one unknown meet an ellipsoid: a quartic, with horizon",
-        "tdoa, toa, range_sum with a known height",
-        "exact: all points that fit",
-        "0.1 ms",
-        "Ho, Chan 1997, exact for the ellipsoid",
-    ),
-    "range_height_conic": Formulation(
-        "3 x 3 lift after elimination of the range differences, nearest to the point below the satellites",
-        "two differences and a height",
-        "rank one within 25 degrees of the point below",
-        "1 ms",
-        "Shor 1987",
-    ),
-    "bearing_ls": Formulation(
-        "pseudo-linear least squares of angles, weighted, with an instrumental-variable pass",
-        "azimuth, elevation",
-        "asymptotically unbiased; as good as maximum likelihood to 0.1 %",
-        "30 us",
-        "Dogancay 2006, 2015",
-    ),
-    "bearing_course": Formulation(
-        "the same for a target on a polynomial course, over all epochs at once; one station that turns may do",
-        "azimuth, elevation of a moving target",
-        "asymptotically unbiased; as good as maximum likelihood to 0.1 %",
-        "0.5 ms for 100 angles",
-        "Dogancay 2006, 2015",
-    ),
-    "direction_sdp": Formulation(
-        "unknown unit directions that meet in a point, lifted; with a minorant a bound of the angular cost",
-        "azimuth and elevation",
-        "100 % to 20 mrad, 98 % at 50 mrad",
-        "2 ms two stations, 10 ms four",
-        "epipolar equalities; Shor 1987",
-    ),
-    "moment_sdp": Formulation(
-        "order-2 moments of position and range errors in a box: a lower bound of the likelihood's cost",
-        "range, toa, tdoa, range_sum",
-        "89-100 % to 30 m",
-        "50 ms five stations, 100 ms six",
-        "Lasserre 2001",
-    ),
-    "minimax_cone": Formulation(
-        "least worst angle by bisection over second-order cones; proves that bounds contradict each other",
-        "azimuth, elevation with bounded errors",
-        "exact for its own cost",
-        "10 ms",
-        "Kahl, Hartley 2008",
-    ),
-    "bistatic": Formulation(
-        "closed-form range of one receiver and one illuminator; polynomial course of several epochs",
-        "range_sum with azimuth and elevation",
-        "exact without noise",
-        "50 us",
-        "Skolnik 1961",
-    ),
-    "registration": Formulation(
-        "place, course and biases of a run: reference ranges projected out, then tied to the lifted course",
-        "tdoa, toa, range_sum of moving stations or a moving target",
-        "exact without noise; with noise a start near the bound",
-        "0.3 ms",
-        "Chan, Ho 1994; Beck, Stoica, Li 2008",
-    ),
-    "registration_sdp": Formulation(
-        "the same lifted with its reference ranges; price on the trace, prior on the biases",
-        "tdoa, toa of moving stations",
-        "never tight: a start",
-        "1 s",
-        "Shor 1987",
-    ),
-    "lifted": Formulation(
-        "order-1 lift [1, x, r]: a baseline for studies, never a default",
-        "tdoa, range",
-        "never for tdoa: its optimum is zero for any data",
-        "2 ms",
-        "Shor 1987",
-    ),
-    "nls": Formulation(
-        "weighted nonlinear least squares with bounds, equalities and inequalities (IPOPT)",
-        "all",
-        "a local minimum",
-        "2 ms",
-        "Waechter, Biegler 2006",
-    ),
-}
-
-FORMULATIONS: Table[Formulation] = Table("optloc.formulations", lambda value: isinstance(value, Formulation), _PROGRAMS)
+# More candidates change nothing about these.
+_SETTLED = (Status.REJECTED, Status.TOO_FEW_ROWS)
 
 
-def stages_of(method: str) -> list[Entry]:
-    """Return the stages of a method such as "auto" or "gtrs+lsr"; raise InvalidProblem naming an unknown one.
+@dataclass(frozen=True, slots=True)
+class Method:
+    """A pipeline: stages one after the other, and what takes over where they leave something to prove.
 
-    Branches joined by "|" become one stage, which takes the second where the first leaves something to prove.
+    Parameters
+    ----------
+    words : tuple of str
+        Names of the stages, keys of `SOLVERS`.
+    then : Method, optional
+        For the problems of which not everything is proven by then; what was found competes in it.
     """
-    branches = branches_of(method)
-    if len(branches) == 1:
-        return branches[0]
-    solver = first_that_proves([shortened([entry.solver for entry in branch], WORTH) for branch in branches])
-    return [Entry(solver, METHODS.get(method, method), branches[0][0].role)]
+
+    words: tuple[str, ...]
+    then: Method | None = None
+
+    @classmethod
+    def parse(cls, text: str) -> Method:
+        """Return a method such as "auto" or "gtrs+lsr"; raise InvalidProblem naming an unknown word."""
+        first, _, rest = METHODS.get(text, text).partition("|")
+        words = tuple(first.split("+"))
+        for word in words:
+            if word not in SOLVERS:
+                raise InvalidProblem(f"unknown method {word!r}", "method", nearest(word, [*METHODS, *SOLVERS]))
+        return cls(words, cls.parse(rest) if rest else None)
+
+    @property
+    def branches(self) -> Iterator[Method]:
+        """Yield the method and all that take over from it."""
+        method: Method | None = self
+        while method is not None:
+            yield method
+            method = method.then
+
+    @property
+    def entries(self) -> list[Entry]:
+        """Return what its words name, those of all branches."""
+        return [SOLVERS[word] for branch in self.branches for word in branch.words]
+
+    @property
+    def runs(self) -> list[Solver]:
+        """Return the stages, in as few as do the same."""
+        for words, short in SHORTCUTS.items():
+            if self.words[: len(words)] == words:
+                return [short, *(SOLVERS[word].run for word in self.words[len(words) :])]
+        return [SOLVERS[word].run for word in self.words]
+
+    def __call__(self, problem: Problem, pool: Pool | None = None) -> Pool:
+        """Return the pool of a flat batch of problems.
+
+        Problems beyond the scope of the proof take the last branch alone.
+        """
+        branches = list(self.branches)
+        if len(branches) > 1 and unsupported(problem):
+            branches = branches[-1:]
+        pool = _run_through(branches[0], problem, pool)
+        for branch in branches[1:]:
+            pool = _take_over(branch, problem, pool)
+        return pool
 
 
-def branches_of(method: str) -> list[list[Entry]]:
-    """Return the stages of each branch of a method; raise InvalidProblem naming an unknown one."""
-    return [[_named(name) for name in branch.split("+")] for branch in METHODS.get(method, method).split("|")]
+def _run_through(method: Method, problem: Problem, pool: Pool | None) -> Pool:
+    for stage in method.runs:
+        pool = stage(problem, pool)
+    assert pool is not None
+    return pool
 
 
-def _named(name: str) -> Entry:
-    if name not in SOLVERS:
-        raise InvalidProblem(f"unknown method {name!r}", "method", nearest(name, [*METHODS, *SOLVERS]))
-    return SOLVERS[name]
+def _take_over(method: Method, problem: Problem, pool: Pool) -> Pool:
+    """Return a pool whose unproven problems went through a method, beside what was found before."""
+    fix = judge(problem, pool)
+    items = np.flatnonzero(unproven(fix))
+    if not len(items):
+        return pool
+    part, (first, *others) = problem.take(items), method.runs
+    start = first(part, None)
+    x = np.concatenate([start.x, standing(take(pool, items), fix[items])], axis=1)
+    new = replace(offer(part, pack(x), None, "", perf_counter()), stages=start.stages)
+    for stage in others:
+        new = stage(part, new)
+    return replace(pool.merge(items, new), stages=(*pool.stages, *new.stages))
 
 
-# The back end that holds for a stretch of code, for floors above: see `formulations.backend`.
+def unproven(fix: Fix) -> Array:
+    """Return which fixes (N,) could still change: no proof that all minima within the listed gap are known."""
+    sure = [c.proof == "global" and c.margin >= LISTED_GAP for c in fix.certificate]
+    return np.asarray(~np.array(sure, dtype=bool) & ~np.isin(fix.code, _SETTLED))
 
-__all__ = ["Choice", "Kind", "counting", "using"]
+
+def shortcut(method: Method) -> bool:
+    """Return whether a method is one that a single stage does, so that it may be prepared."""
+    return method.then is None and method.words in SHORTCUTS

@@ -1,15 +1,27 @@
-"""policy."""
+"""The thresholds of a verdict: each is a promise to the reader of a status, so they stand in one place."""
 
 from __future__ import annotations
 
-LISTED_GAP = 25.0
-
-
 AMBIGUOUS_GAP = 9.0
+"""Cost by which another minimum must exceed the best: at three sigma of one number the data tell them apart."""
 
+LISTED_GAP = 25.0
+"""Cost up to which other minima are listed: with five stations a gap of less still misleads one fix in a thousand."""
 
 DOUBT = 1e-3
+"""Probability of the chi-square test below which the noise does not allow the residuals."""
 
-
-# Spreads of the stations: from here on a fix must be a good one, and from there on every wave front is flat.
 FAR, FLAT = 1e4, 1e6
+"""Spreads of the stations: from here on a fix must be a good one, and from there on every wave front is flat."""
+
+EQUAL_COST = 1e-6
+"""Relative difference of costs that rounding and the refinement's tolerance leave: such minima cost the same."""
+
+SAME_PLACE = 1e-2
+"""Squared distance in standard deviations below which two minima are one: a tenth of a sigma tells nobody anything."""
+
+WEAK = 1e-12
+"""Squared pivot of the scaled information below which a direction is open: rounding leaves 1e-13 of a zero."""
+
+REJECTED = 0.25
+"""Share of its weight below which a row that a loss doubts is called rejected: four sigma of the Cauchy loss."""

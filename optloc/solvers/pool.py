@@ -1,144 +1,179 @@
-"""Put better fixes of some problems into the fixes of all."""
+"""The pool: the candidates that stages hand on, and what is known of them; only the verdict makes a fix of it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from time import perf_counter
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 
-from optloc.base.status import Certificate, Status
+from optloc.base.records import Axes, join, overwrite
+from optloc.base.status import Status
 from optloc.base.types import Array
 from optloc.linear.degrees_of_freedom import degrees_of_freedom
-from optloc.problem.fix import Alternatives, Fix, Stage
+from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 
-_NAMES = "x cov code reason certificate cost dof weights active local explanations".split()
+PART = 2**15
+"""Problems that are worked on at a time: beyond it arrays of a part no longer fit the caches and memory grows."""
+
+Answer = TypeVar("Answer", "Pool", Fix)
 
 
-def merged(fix: Fix, items: Array, other: Fix, stage: Stage) -> Fix:
-    """Return a flat batch of fixes with some of them replaced by others, and one more stage.
+@dataclass(frozen=True, slots=True)
+class Curvature:
+    """What the normal equations say at the best candidates of a flat batch of N problems.
 
     Parameters
     ----------
-    fix : Fix
-        N fixes.
-    items : int array (q,)
-        Which are replaced.
-    other : Fix
-        The q fixes that take their place.
-    stage : Stage
-        What was done.
+    covariance : array (N, n, n)
+        Inverse of the information on the tangent space of the constraints that hold with equality.
+    information : array (N, n, n), optional
+        Of the shared unknowns, local ones eliminated.
+    regular : bool array (N,), optional
+        Whether that inverse exists; it does where this is not said.
+    weakest : array (N,), optional
+        Smallest squared pivot of the information scaled to a unit diagonal: near zero means a direction is open.
+    active : object array (N,), optional
+        Tuples of `Active` constraints.
+    local : array (N, k, p, p), optional
+        Covariance of the states that targets have at each epoch of a run.
     """
-    width = max(fix.alternatives.gap.shape[1], other.alternatives.gap.shape[1])
-    mine, theirs = _padded(fix.alternatives, width), _padded(other.alternatives, width)
-    mine.x[items], mine.gap[items] = theirs.x, theirs.gap
-    changed: dict[str, Array] = {}
-    for name in _NAMES:
-        if (old := getattr(fix, name)) is not None:
-            changed[name] = np.array(old)
-            changed[name][items] = getattr(other, name)
-    return replace(fix, alternatives=mine, stages=(*fix.stages, stage), **changed)  # type: ignore[arg-type]
+
+    covariance: Annotated[Array, Axes(2)]
+    information: Annotated[Array, Axes(2)] | None = None
+    regular: Annotated[Array, Axes(0, empty=True)] | None = None
+    weakest: Annotated[Array, Axes(0, empty=np.inf)] | None = None
+    active: Annotated[Array, Axes(0, empty=())] | None = None
+    local: Annotated[Array, Axes(3)] | None = None
 
 
-def stacked(fixes: Sequence[Fix]) -> Fix:
-    """Return single fixes of one layout as a batch."""
-    width = max(len(fix.alternatives.gap) for fix in fixes)
-    every = [_padded(fix.flat().alternatives, width) for fix in fixes]
-    others = Alternatives(np.concatenate([a.x for a in every]), np.concatenate([a.gap for a in every]))
-    arrays = {name: np.stack([getattr(fix, name) for fix in fixes]) for name in _NAMES if _has(fixes, name)}
-    return replace(fixes[0], alternatives=others, **arrays)  # type: ignore[arg-type]
+@dataclass(frozen=True, slots=True)
+class Pool:
+    """Candidates of a flat batch of N problems, q slots each, with the evidence that stages have gathered.
+
+    Once it is settled (`optloc.solvers.verdict.minima.settle`) the best candidate is in the first slot, and the other
+    minima that the data allow follow, cheapest first.
+
+    Parameters
+    ----------
+    x : array (N, q, size)
+        Parameter vectors; NaN in empty slots.
+    cost : array (N, q)
+        NaN of a start, infinite in empty slots and where a constraint forbids a candidate.
+    code : int array (N, q)
+        `Status` of their refinement.
+    face : int array (N, q)
+        Number of the face of `optloc.linear.constraints.faces` on which each was refined; 0 without inequalities.
+    weights : array (N, m)
+        Row weights that were used.
+    dof : int array (N,)
+        Degrees of freedom.
+    stages : tuple of Stage
+        What was done.
+    refined : bool
+        Whether least squares has refined all that is in it.
+    curvature : Curvature, optional
+        At the candidates in the first slots; None before anything is settled.
+    plain : bool array (N,), optional
+        Where nothing stands against the best candidate: near, regular, finished and without a rival.
+    endless : bool array (N,), optional
+        Where positions ever farther away explain the data about as well.
+    free : array (N,), optional
+        Least cost without the inequalities, where there are some.
+    loss : str
+        Name of the loss that doubts rows, or "" where all are believed.
+    searched : bool array (N,), optional
+        Where the candidates are the best of a search, not of starts that are known to be safe.
+    remark : object array (N,), optional
+        What a stage has to say beside the status.
+    certificate : object array (N,), optional
+        `Certificate` of what is proven of the best candidates, None where nobody has tried.
+    asked : bool
+        Whether contradictions were looked into.
+    conclusion : object array (N,), optional
+        What explains the data where they contradict each other, an `optloc.solvers.verdict.explained.Conclusion`; or
+        a `Fix` from outside that stands as it is.
+    """
+
+    x: Annotated[Array, Axes(2, slots=True)]
+    cost: Annotated[Array, Axes(1, slots=True, empty=np.inf)]
+    code: Annotated[Array, Axes(1, slots=True, empty=int(Status.UNAVAILABLE))]
+    face: Annotated[Array, Axes(1, slots=True, empty=0)]
+    weights: Annotated[Array, Axes(1)]
+    dof: Annotated[Array, Axes(0)]
+    stages: tuple[Stage, ...] = ()
+    refined: bool = False
+    curvature: Curvature | None = None
+    plain: Annotated[Array, Axes(0, empty=False)] | None = None
+    endless: Annotated[Array, Axes(0, empty=False)] | None = None
+    free: Annotated[Array, Axes(0)] | None = None
+    loss: str = ""
+    searched: Annotated[Array, Axes(0, empty=False)] | None = None
+    remark: Annotated[Array, Axes(0, empty="")] | None = None
+    certificate: Annotated[Array, Axes(0, empty=None)] | None = None
+    asked: bool = False
+    conclusion: Annotated[Array, Axes(0, empty=None)] | None = None
+
+    def __len__(self) -> int:
+        """Return the number of problems."""
+        return len(self.x)
+
+    @property
+    def occupied(self) -> tuple[Array, Array]:
+        """Return item and slot of every candidate."""
+        item, slot = np.nonzero(np.isfinite(self.x).all(-1))
+        return item, slot
+
+    @property
+    def unfinished(self) -> bool:
+        """Return whether the refinement of a best candidate ended before it had converged."""
+        return bool(np.isin(self.code[:, 0], (Status.MAX_ITERATIONS, Status.STALLED)).any())
+
+    def merge(self, items: Array, other: Pool, stage: Stage | None = None) -> Pool:
+        """Return the pool with those of other problems in the place of some, and one more stage."""
+        stages = self.stages if stage is None else (*self.stages, stage)
+        return replace(overwrite(self, items, other), stages=stages)
 
 
-def _has(fixes: Sequence[Fix], name: str) -> bool:
-    return all(getattr(fix, name) is not None for fix in fixes)
-
-
-def _padded(alternatives: Alternatives, width: int) -> Alternatives:
-    more = width - alternatives.gap.shape[1]
-    x = np.pad(alternatives.x, ((0, 0), (0, more), (0, 0)), constant_values=np.nan)
-    return Alternatives(x, np.pad(alternatives.gap, ((0, 0), (0, more)), constant_values=np.inf))
-
-
-# Very large batches are worked on part by part: memory beyond the answers does not grow with the batch.
-
-PART = 2**15
-_FIELDS = ("x", "cov", "code", "reason", "certificate", "cost", "dof", "active", "local", "explanations")
-
-
-def in_parts(problem: Problem, work: Callable[[Problem, slice], Fix], most: int = PART) -> Fix:
-    """Return the fixes of a flat batch of problems, at most so many at a time.
+def offer(problem: Problem, x: Array, before: Pool | None, name: str, began: float) -> Pool:
+    """Return starts (N, q, size) as a pool, behind the stages of the one before.
 
     Parameters
     ----------
     problem : Problem
         N problems.
-    work : callable
-        Maps some of the problems, and which they are, to their fixes.
-    most : int
-        Problems in one part.
+    x : array (N, q, size)
+        Starts; NaN in empty slots.
+    before : Pool, optional
+        What was known; its candidates are not kept.
+    name : str
+        Stage that makes the starts.
+    began : float
+        When it began, by `time.perf_counter`.
     """
-    count = problem.batch_shape[0]
-    if count <= most:
-        return work(problem, slice(0, count))
-    arrays: dict[str, Array] = {}
-    others: list[Alternatives] = []
-    stages: list[tuple[Stage, ...]] = []
-    weights: list[Array] = []
-    fix = None
-    for first in range(0, count, most):
-        part = slice(first, min(first + most, count))
-        fix = work(problem.take(np.arange(part.start, part.stop)), part)
-        for name in _FIELDS:
-            value = getattr(fix, name)
-            if value is not None:
-                if name not in arrays:
-                    arrays[name] = np.empty((count, *value.shape[1:]), dtype=value.dtype)
-                arrays[name][part] = value
-        others.append(fix.alternatives)
-        stages.append(fix.stages)
-        weights.append(fix.weights)
-    assert fix is not None
-    given = np.broadcast_to(problem.weight, (count, problem.count))
-    kept = all(np.array_equal(part, given[: len(part)]) for part in weights) and not given.strides[0]
-    used = given if kept else np.concatenate(weights)
-    whole = replace(fix, alternatives=_joined(others), weights=used, stages=_summed(stages))
-    return replace(whole, **arrays)  # type: ignore[arg-type]
-
-
-def _joined(parts: list[Alternatives]) -> Alternatives:
-    """Return the alternatives of all parts, with as many slots as the fullest needs."""
-    count, width = sum(len(part.gap) for part in parts), max(part.gap.shape[1] for part in parts)
-    x, gap = np.full((count, width, parts[0].x.shape[2]), np.nan), np.full((count, width), np.inf)
-    first = 0
-    for part in parts:
-        rows, slots = slice(first, first + len(part.gap)), slice(0, part.gap.shape[1])
-        x[rows, slots], gap[rows, slots] = part.x, part.gap
-        first += len(part.gap)
-    return Alternatives(x, gap)
-
-
-def _summed(parts: list[tuple[Stage, ...]]) -> tuple[Stage, ...]:
-    """Return the stages of the part that took most of them, with the seconds of all."""
-    longest = max(parts, key=len)
-    seconds = dict.fromkeys(range(len(longest)), 0.0)
-    for stages in parts:
-        for i, stage in enumerate(stages):
-            seconds[i] += stage.seconds
-    return tuple(
-        Stage(stage.name, f"{stage.detail} (one of {len(parts)} parts)", seconds[i]) for i, stage in enumerate(longest)
+    shape = x.shape[:2]
+    stage = Stage(name, f"{x.shape[1]} candidates at most", perf_counter() - began)
+    return Pool(
+        x,
+        np.full(shape, np.nan),
+        np.full(shape, int(Status.UNAVAILABLE), dtype=np.int8),
+        np.zeros(shape, dtype=int),
+        np.broadcast_to(problem.weight, (len(x), problem.count)),
+        degrees_of_freedom(problem) if before is None else before.dof,
+        (*(before.stages if before else ()), stage),
     )
 
 
-def pooled(fix: Fix) -> tuple[Array, Array, Array]:
-    """Return a fix and its alternatives as one pool (N, q, size), and item and slot of every point in it."""
-    pool = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
-    item, slot = np.nonzero(np.isfinite(pool).all(-1))
-    return pool, item, slot
+def begin(problem: Problem, start: Array) -> Pool:
+    """Return given starts (N, size) or (N, q, size) as a pool."""
+    x = np.asarray(start, dtype=float)
+    return offer(problem, x[:, None] if x.ndim == 2 else x, None, "start", perf_counter())
 
 
-def packed(points: Array) -> Array:
+def pack(points: Array) -> Array:
     """Return points (N, q, n) with the finite ones of each problem first, and no more slots than needed."""
     if points.shape[1] <= 1:
         return points
@@ -148,53 +183,41 @@ def packed(points: Array) -> Array:
     return np.take_along_axis(points, order[..., None], axis=1)[:, :keep]
 
 
-def unrefined(problem: Problem, x: Array, fix: Fix | None, name: str, began: float) -> Fix:
-    """Return starts (N, q, size) as a fix whose status says that they are not refined."""
-    size, n = len(x), problem.layout.n_shared
-    reason, certificate = np.empty(size, dtype=object), np.empty(size, dtype=object)
-    reason[:], certificate[:] = "not refined", Certificate("unknown", "a start, not refined", name)
-    stage = Stage(name, f"{x.shape[1]} candidates at most", perf_counter() - began)
-    return Fix(
-        x[:, 0],
-        np.full((size, n, n), np.nan),
-        problem.layout,
-        problem.frame,
-        np.full(size, int(Status.UNAVAILABLE), dtype=np.int8),
-        reason,
-        certificate,
-        Alternatives(x[:, 1:], np.full((size, x.shape[1] - 1), np.nan)),
-        np.full(size, np.nan),
-        degrees_of_freedom(problem),
-        np.broadcast_to(problem.weight, (size, problem.count)),
-        (*(fix.stages if fix else ()), stage),
-    )
-
-
-def given(problem: Problem, start: Array) -> Fix:
-    """Return a given start (N, size) or (N, q, size) as an unrefined fix."""
-    began = perf_counter()
-    x = np.asarray(start, dtype=float)
-    x = x[:, None] if x.ndim == 2 else x
-    return unrefined(problem, x, None, "start", began)
-
-
-@dataclass(frozen=True, slots=True)
-class Candidates:
-    """Points that compete for each problem of a flat batch of N, q slots each.
+def in_parts(problem: Problem, work: Callable[[Problem, slice], Answer], most: int = PART) -> Answer:
+    """Return the answers for a flat batch of problems, at most so many at a time.
 
     Parameters
     ----------
-    x : array (N, q, size)
-        Parameter vectors; NaN in empty slots.
-    cost : array (N, q)
-        Infinite in empty slots.
-    code : int array (N, q)
-        `Status` of their refinement.
-    face : int array (N, q)
-        Number of the face of `optloc.linear.constraints.faces` on which each was refined; 0 without inequalities.
+    problem : Problem
+        N problems.
+    work : callable
+        Maps some of the problems, and which they are, to their pool or fix.
+    most : int
+        Problems in one part.
     """
+    count = problem.batch_shape[0]
+    if count <= most:
+        return work(problem, slice(0, count))
+    stages: list[tuple[Stage, ...]] = []
 
-    x: Array
-    cost: Array
-    code: Array
-    face: Array
+    def answers() -> Any:
+        for first in range(0, count, most):
+            part = slice(first, min(first + most, count))
+            answer = work(problem.take(np.arange(part.start, part.stop)), part)
+            stages.append(answer.stages)
+            yield answer
+
+    whole: Answer = join(answers(), count)
+    return replace(whole, stages=_sum_stages(stages))
+
+
+def _sum_stages(parts: list[tuple[Stage, ...]]) -> tuple[Stage, ...]:
+    """Return the stages of the part that took most of them, with the seconds of all."""
+    longest = max(parts, key=len)
+    seconds = dict.fromkeys(range(len(longest)), 0.0)
+    for stages in parts:
+        for i, stage in enumerate(stages):
+            seconds[i] += stage.seconds
+    return tuple(
+        Stage(stage.name, f"{stage.detail} (one of {len(parts)} parts)", seconds[i]) for i, stage in enumerate(longest)
+    )

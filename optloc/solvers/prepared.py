@@ -13,9 +13,9 @@ from optloc.problem.epochs import separable
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
-from optloc.solvers.methods import stages_of
-from optloc.solvers.range_fixes import Direct, by_stages, direct, fixed
-from optloc.solvers.stages import gtrs, lsr
+from optloc.solvers.methods import Method, shortcut
+from optloc.solvers.range_fixes import Direct, by_stages, direct, settle_directly
+from optloc.solvers.verdict.judge import judge
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +75,9 @@ class Prepared:
         if len(place) > 1:
             wide = np.broadcast_to(place.reshape(*self.shape, *place.shape[1:]), (*shape, *place.shape[1:]))
             place = wide.reshape(-1, *place.shape[1:])
-        fix = fixed(self.plan, flat, place, lambda items: by_stages(self._flat(values, shape), items))
+        pool = settle_directly(self.plan, flat, place, lambda items: by_stages(self._flat(values, shape), items))
+        plain = pool.plain is not None and bool(pool.plain.all())
+        fix = judge(self.problem if plain else self._flat(values, shape), pool)
         return fix if len(shape) == 1 else fix.reshape(shape)
 
     def _flat(self, z: Array, shape: tuple[int, ...]) -> Problem:
@@ -121,11 +123,10 @@ def prepare(problem: Problem, method: str = "gtrs+lsr") -> Prepared:
     InvalidProblem
         For an unknown method, or where nothing is unknown.
     """
-    stages = stages_of(method)
+    parsed = Method.parse(method)
     if problem.layout.size == 0:
         raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
     bare = problem.with_rows(z=np.zeros(problem.count))
-    short = [stage.solver for stage in stages] == [gtrs, lsr] and not separable(bare)
-    plan = direct(bare) if short else None
+    plan = direct(bare) if shortcut(parsed) and not separable(bare) else None
     position = problem.stations.position
     return Prepared(bare, method, plan, position.reshape(-1, *position.shape[-2:]), bare.batch_shape)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from time import perf_counter
 
@@ -11,6 +11,7 @@ import numpy as np
 from optloc.base import linalg
 from optloc.base.cache import Cache
 from optloc.base.frames import Frame
+from optloc.base.records import take
 from optloc.base.status import Status
 from optloc.base.threads import mapped
 from optloc.base.types import Array
@@ -18,17 +19,14 @@ from optloc.compute.jit import enabled
 from optloc.linear.degrees_of_freedom import degrees_of_freedom
 from optloc.linear.station_noise import depends_on_place, weighed
 from optloc.models import MODELS
-from optloc.problem.fix import Alternatives, Fix, Stage
+from optloc.problem.fix import Stage
 from optloc.problem.layout import Layout
 from optloc.problem.noise import variances, whiten
 from optloc.problem.problem import Problem
 from optloc.proof.pose import whitened, without
-from optloc.solvers.policy import DOUBT
-from optloc.solvers.pool import in_parts
-from optloc.solvers.stages import Solver, gtrs, lsr
+from optloc.solvers.pool import Curvature, Pool, in_parts
+from optloc.solvers.stages import gtrs, lsr
 from optloc.solvers.starts.least_squares_ranges import Ranges, ranges
-from optloc.solvers.verdict.judge import _LOCAL
-from optloc.solvers.verdict.status import doubt
 
 # The linear maps from measurements to all that a fix from ranges needs, made once for a structure.
 
@@ -52,8 +50,6 @@ class Direct:
         Row weights.
     dof : int
         Degrees of freedom.
-    limit : float
-        Cost above which the noise may not allow the residuals.
     station : int array (s,)
         Stations that take part.
     maps : tuple
@@ -64,7 +60,6 @@ class Direct:
     frame: Frame
     weight: Array
     dof: int
-    limit: float
     station: Array
     maps: tuple[Array | int, ...]
 
@@ -96,8 +91,6 @@ def direct(problem: Problem) -> Direct | None:
 
 
 def _direct(problem: Problem) -> Direct | None:
-    from scipy.special import gammainccinv
-
     one = weighed(_probe(problem))
     found = ranges(one)
     # Stations that no row links would have ranges that nothing relates.
@@ -111,10 +104,7 @@ def _direct(problem: Problem) -> Direct | None:
         return None
     correction = np.concatenate([rows.correction for rows in problem.rows])
     maps = _maps(one, correction, found, heard, white)
-    # The quantile of chi-square beyond which a fix is doubted, a hair lower: what is doubted is looked at again
-    # anyway.
-    limit = 2.0 * float(gammainccinv(dof / 2, DOUBT)) * (1.0 - 1e-9) if dof else np.inf
-    return Direct(problem.layout, problem.frame, one.weight, dof, limit, found.station[heard], maps)
+    return Direct(problem.layout, problem.frame, one.weight, dof, found.station[heard], maps)
 
 
 def _simple(problem: Problem) -> bool:
@@ -205,7 +195,7 @@ _TOLERANCE, _LIMIT = 1e-7, 100
 
 @dataclass(frozen=True, slots=True)
 class Quick:
-    """The stages "gtrs" and "lsr" as one solver, which takes the direct way where there is one.
+    """The stages "gtrs" and "lsr" as one, which takes the direct way where there is one.
 
     Parameters
     ----------
@@ -215,30 +205,30 @@ class Quick:
 
     least: int = 1
 
-    def __call__(self, problem: Problem, fix: Fix | None) -> Fix:
-        """Return the fixes of a flat batch of problems."""
+    def __call__(self, problem: Problem, pool: Pool | None) -> Pool:
+        """Return the settled pools of a flat batch of problems."""
         count = problem.batch_shape[0]
-        plan = direct(problem) if fix is None and count >= self.least else None
+        plan = direct(problem) if pool is None and count >= self.least else None
         if plan is None:
-            return in_parts(problem, lambda some, part: lsr(some, gtrs(some, None if fix is None else fix[part])))
+            start = pool
+            return in_parts(
+                problem, lambda some, part: lsr(some, gtrs(some, None if start is None else take(start, part)))
+            )
         z = problem.z if len(problem.rows) > 1 else problem.rows[0].z
         place = problem.stations.position.reshape(-1, *problem.stations.position.shape[-2:])
         z = z if len(z) == count else np.broadcast_to(z, (count, problem.count))
-        return fixed(plan, z, place, lambda items: by_stages(problem, items))
+        return settle_directly(plan, z, place, lambda items: by_stages(problem, items))
 
 
-def shortened(solvers: Sequence[Solver], least: int = 1) -> list[Solver]:
-    """Return the solvers of a method, with a leading "gtrs", "lsr" as one `Quick`."""
-    return [Quick(least), *solvers[2:]] if list(solvers[:2]) == [gtrs, lsr] else list(solvers)
-
-
-def by_stages(problem: Problem, items: Array) -> Fix:
-    """Return the fixes of some problems of a flat batch by the stages "gtrs" and "lsr"."""
+def by_stages(problem: Problem, items: Array) -> Pool:
+    """Return the pools of some problems of a flat batch by the stages "gtrs" and "lsr"."""
     return in_parts(problem.take(items), lambda some, part: lsr(some, gtrs(some, None)))
 
 
-def fixed(direct: Direct, z: Array, position: Array, rest: Callable[[Array], Fix], threads: int | None = None) -> Fix:
-    """Return the fixes of measurements: directly where the answer is plain, else by other means.
+def settle_directly(
+    direct: Direct, z: Array, position: Array, rest: Callable[[Array], Pool], threads: int | None = None
+) -> Pool:
+    """Return the settled pools of measurements: directly where the answer is plain, else by other means.
 
     Parameters
     ----------
@@ -249,7 +239,7 @@ def fixed(direct: Direct, z: Array, position: Array, rest: Callable[[Array], Fix
     position : array (N or 1, stations, d)
         Of all stations.
     rest : callable
-        Maps the numbers of problems whose answer is not plain to their fixes.
+        Maps the numbers of problems whose answer is not plain to their pools.
     threads : int, optional
         At most so many; as many as `optloc.base.threads.thread_count` says if absent.
     """
@@ -272,52 +262,22 @@ def fixed(direct: Direct, z: Array, position: Array, rest: Callable[[Array], Fix
 
     steps = mapped(work, range(0, count, _CHUNK), threads)
     detail = f"{count} candidates, {max(steps, default=0)} steps at most"
-    stages = (Stage("gtrs", "1 candidates at most", 0.0), Stage("lsr", detail, perf_counter() - began))
-    fix = _judged(direct, x, covariance, cost, stages)
-    doubt(fix, np.flatnonzero(plain & (cost > direct.limit)))
-    left = np.flatnonzero(~plain)
-    return _replaced(fix, left, rest(left)) if len(left) else fix
-
-
-def _judged(direct: Direct, x: Array, covariance: Array, cost: Array, stages: tuple[Stage, ...]) -> Fix:
-    """Return plain answers as fixes; all share one certificate."""
-    count = len(x)
-    return Fix(
-        x,
-        covariance,
-        direct.layout,
-        direct.frame,
-        np.full(count, int(Status.OK), dtype=np.int8),
-        _filled(count, ""),
-        _filled(count, _LOCAL),
-        Alternatives(np.full((count, 0, x.shape[1]), np.nan), np.full((count, 0), np.inf)),
-        cost,
-        np.full(count, direct.dof, dtype=np.int32),
+    pool = Pool(
+        x[:, None],
+        cost[:, None],
+        np.broadcast_to(np.int8(Status.OK), (count, 1)),
+        np.broadcast_to(0, (count, 1)),
         np.broadcast_to(direct.weight, (count, len(direct.weight))),
-        stages,
-        _filled(count, ()),
-        None,
+        np.broadcast_to(np.int32(direct.dof), count),
+        (Stage("gtrs", "1 candidates at most", 0.0), Stage("lsr", detail, perf_counter() - began)),
+        refined=True,
+        curvature=Curvature(covariance),
+        plain=plain,
     )
+    left = np.flatnonzero(~plain)
+    return pool.merge(left, rest(left)) if len(left) else pool
 
 
 def _owned(values: Array) -> Array:
     """Return values as the one type of array for which there is machine code: float, C order, writable."""
     return np.require(values, dtype=float, requirements=["C", "W"])
-
-
-def _filled(count: int, value: object) -> Array:
-    out = np.empty(count, dtype=object)
-    out.fill(value)
-    return out
-
-
-def _replaced(fix: Fix, items: Array, other: Fix) -> Fix:
-    """Return fresh fixes with some of them overwritten by others."""
-    for name in ("x", "cov", "code", "reason", "certificate", "cost", "dof", "active"):
-        getattr(fix, name)[items] = getattr(other, name)
-    width = other.alternatives.gap.shape[1]
-    if not width:
-        return fix
-    more = np.full((len(fix), width, fix.x.shape[1]), np.nan), np.full((len(fix), width), np.inf)
-    more[0][items], more[1][items] = other.alternatives.x, other.alternatives.gap
-    return replace(fix, alternatives=Alternatives(*more))

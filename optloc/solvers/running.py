@@ -17,10 +17,11 @@ from optloc.problem.epochs import cut, joined, tied, window
 from optloc.problem.fix import Fix
 from optloc.problem.layout import Layout
 from optloc.problem.problem import Problem
-from optloc.solvers.pool import given
+from optloc.solvers.pool import begin
 from optloc.solvers.refine import refine
 from optloc.solvers.stages import lsr
 from optloc.solvers.starts.position import completed
+from optloc.solvers.verdict.judge import judge
 
 # One standard deviation: the sums then err by thousandths of it.
 _TOLERANCE = 1.0
@@ -110,7 +111,8 @@ class Running:
 
     def fix(self) -> Fix:
         """Return the fix of all epochs, (N,), refined from the running solution and judged."""
-        return lsr(self.problem, given(self.problem, completed(self.problem, self.x[:, None])))
+        start = begin(self.problem, completed(self.problem, self.x[:, None]))
+        return judge(self.problem, lsr(self.problem, start))
 
 
 def _linearised(problem: Problem, at: Array, before: int, tolerance: float) -> Running:

@@ -15,15 +15,15 @@ from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array, Rows
 from optloc.linear.evaluate import differentiate
 from optloc.models import MODELS
-from optloc.problem.fix import Fix
 from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
-from optloc.solvers.pool import given, packed, unrefined
-from optloc.solvers.stages import gtrs, lsr
+from optloc.solvers.pool import Pool, begin, offer, pack
+from optloc.solvers.stages import fix_by, gtrs, lsr
 from optloc.solvers.starts.arrivals import as_arrivals
 from optloc.solvers.starts.position import spread_of, static, vectors
 from optloc.solvers.starts.several_positions import from_pieces, one_position
 from optloc.solvers.starts.squared_range import Coordinates, lifted_rows
+from optloc.solvers.verdict.judge import judge
 
 # Rows of one position made linear one by one, so that one wrong measurement is one wrong row.
 #
@@ -215,23 +215,23 @@ class SparseErrors:
     wrong: Array
 
 
-def sparse(problem: Problem, fix: Fix | None) -> Fix:
-    """Return the point of the convex programme with sparse errors and the fix without the rows in error, unrefined.
+def sparse(problem: Problem, pool: Pool | None) -> Pool:
+    """Return the point of the convex programme with sparse errors and the fix without the rows in error.
 
     With fewer than about ten stations this is a start and nothing more: the sum of the errors' sizes then often hides
     the wrong rows. Search their subsets instead.
     """
     began = perf_counter()
     if not one_position(problem):
-        x = from_pieces(problem, lambda piece: lsr(piece, sparse(piece, None)))
-        return unrefined(problem, x, fix, "sparse", began)
+        x = from_pieces(problem, lambda piece: fix_by(piece, lambda one: sparse(one, None)))
+        return offer(problem, x, pool, "sparse", began)
     alone = static(problem)
     arrived = as_arrivals(alone)
     found = sparse_errors(alone if arrived is None else arrived.problem)
     wrong = found.wrong if arrived is None else spread(found.wrong, arrived.origin, problem.count)
     weights = np.where(wrong, 0.0, problem.weight)
-    x = vectors(problem.with_rows(weight=weights), packed(found.position))  # emission times fit the rows that are kept
-    start = unrefined(problem, x, fix, "sparse", began)
+    x = vectors(problem.with_rows(weight=weights), pack(found.position))  # emission times fit the rows that are kept
+    start = offer(problem, x, pool, "sparse", began)
     stage = replace(start.stages[-1], detail=f"{int(found.wrong.sum(1).max(initial=0))} wrong rows at most")
     return replace(start, weights=weights, stages=(*start.stages[:-1], stage))
 
@@ -277,7 +277,8 @@ def _lifted(problem: Problem) -> Array:
     position = point * lifts.scale[:, None] + lifts.origin
     lost = np.flatnonzero(np.isnan(position).any(1))
     if len(lost):
-        position[lost] = gtrs(problem.take(lost), None).position
+        rest = problem.take(lost)
+        position[lost] = rest.layout.take(gtrs(rest, None).x[:, 0], "position")
     return position
 
 
@@ -319,8 +320,8 @@ def _tested(problem: Problem, x: Array, wrong: Array) -> tuple[Array, Array]:
     for _ in range(_PASSES):
         part, out = problem.take(active), wrong[active]
         rest = part.with_rows(weight=np.where(out, 0.0, part.weight))
-        starts = np.stack([x[active], gtrs(rest, None).x], axis=1)
-        fixed = lsr(rest, given(rest, starts)).x
+        starts = np.stack([x[active], gtrs(rest, None).x[:, 0]], axis=1)
+        fixed = judge(rest, lsr(rest, begin(rest, starts))).x
         x[active] = np.where(np.isfinite(fixed), fixed, x[active])
         size = _standardised(part, x[active], ~out & present[active])
         found = _spared(part, size, size > limit[active])

@@ -1,8 +1,9 @@
-"""The stages that a method is made of; each is a solver of its own: (problem, fix or None) -> fix."""
+"""The stages that a method is made of: (problem, pool or None) -> pool."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
@@ -10,111 +11,78 @@ import numpy as np
 from formulations.backend import count
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
+from optloc.base.records import take
 from optloc.base.status import Status
 from optloc.base.types import Array
-from optloc.compute.sums import equations_at
 from optloc.linear.constraints import exact
-from optloc.linear.normal import Normal
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
-from optloc.solvers.inequalities import bounded, contradicted
+from optloc.solvers.catalogue import FORMULATIONS
+from optloc.solvers.inequalities import bound_pool, least_finished
 from optloc.solvers.policy import DOUBT
-from optloc.solvers.pool import Candidates, merged, packed, pooled, unrefined
+from optloc.solvers.pool import Pool, offer, pack
 from optloc.solvers.refine import refine
 from optloc.solvers.search import PLACES, searched_starts
-from optloc.solvers.starts.angles import Bearings, bearings, by_directions, instrumental, least_worst
-from optloc.solvers.starts.heights import height_starts
 from optloc.solvers.starts.position import (
     along_the_valley,
     mirrored,
-    squared_range_starts,
     static,
     subarray_starts,
     vectors,
 )
-from optloc.solvers.starts.registration import beside, closed_form, registrable, relaxed, run_starts
+from optloc.solvers.starts.registration import beside, registrable
 from optloc.solvers.starts.several_positions import from_pieces, one_position
-from optloc.solvers.starts.squared_range import Pick, every, hull, minimum, shor
-from optloc.solvers.verdict.judge import judge
+from optloc.solvers.verdict.judge import judge, standing
+from optloc.solvers.verdict.minima import settle
 
-Solver = Callable[[Problem, Fix | None], Fix]
+Solver = Callable[[Problem, Pool | None], Pool]
 
+# Share of its distance from the stations beyond which the error of a fix calls for a look along the valley.
 _WEAK = 1e-2
 
 
-def gtrs(problem: Problem, fix: Fix | None) -> Fix:
-    """Return the minimiser of the weighted squared-range problem, unrefined: one candidate, the cheapest start."""
-    return _squared(problem, fix, "gtrs", minimum)
+def start_with(word: str) -> Solver:
+    """Return the stage that offers the candidates of all formulations which start fixes under a word of a method."""
+
+    def start(problem: Problem, pool: Pool | None) -> Pool:
+        began = perf_counter()
+        serving = [form for form in FORMULATIONS.values() if word in form.starts and form.serves(problem)]
+        if one_position(problem):
+            alone = static(problem)
+            nowhere = np.full((problem.batch_shape[0], 1, problem.dimension), np.nan)
+            position = np.concatenate([*(form.starts[word](alone) for form in serving), nowhere], axis=1)
+            return _place(problem, position, pool, word, began)
+        if serving:
+            x = np.concatenate([form.starts[word](problem) for form in serving], axis=1)
+        else:
+            x = from_pieces(problem, lambda piece: fix_by(piece, lambda one: start(one, None)))
+        return offer(problem, x, pool, word, began)
+
+    return start
 
 
-def roots(problem: Problem, fix: Fix | None) -> Fix:
-    """Return every stationary point of the squared-range problem in two weightings, unrefined."""
-    return _squared(problem, fix, "roots", every)
+gtrs, roots = start_with("gtrs"), start_with("roots")
 
 
-def sdp(problem: Problem, fix: Fix | None) -> Fix:
-    """Return the answer of Shor's semidefinite relaxation of the squared-range problem, unrefined."""
-    return _squared(problem, fix, "sdp", shor)
+def fix_by(problem: Problem, start: Callable[[Problem], Pool]) -> Fix:
+    """Return the refined and judged fixes of a flat batch of problems from starts."""
+    return judge(problem, lsr(problem, start(problem)))
 
 
-def socp(problem: Problem, fix: Fix | None) -> Fix:
-    """Return the answer of the second-order cone relaxation of the squared-range problem, unrefined."""
-    return _squared(problem, fix, "socp", hull)
-
-
-def wiv(problem: Problem, fix: Fix | None) -> Fix:
-    """Return the instrumental-variable fix of the angles, unrefined: the pseudo-linear start without its bias."""
-    return _angular(problem, fix, "wiv", instrumental)
-
-
-def directions(problem: Problem, fix: Fix | None) -> Fix:
-    """Return the fix of the unit-direction semidefinite relaxation of the angles, unrefined."""
-    return _angular(problem, fix, "directions", by_directions)
-
-
-def minimax(problem: Problem, fix: Fix | None) -> Fix:
-    """Return the fix whose worst angle in sigma is least, unrefined: for bounded errors."""
-    return _angular(problem, fix, "minimax", least_worst)
-
-
-def _angular(problem: Problem, fix: Fix | None, name: str, locate: Callable[[Bearings], Array]) -> Fix:
-    began = perf_counter()
-    if not one_position(problem):
-        x = from_pieces(problem, lambda piece: lsr(piece, _angular(piece, None, name, locate)))
-        return unrefined(problem, x, fix, name, began)
-    seen = bearings(static(problem))
-    nowhere = np.full((problem.batch_shape[0], 1, problem.dimension), np.nan)
-    return _placed(problem, nowhere if seen is None else locate(seen), fix, name, began)
-
-
-def _squared(problem: Problem, fix: Fix | None, name: str, pick: Pick) -> Fix:
-    began = perf_counter()
-    if one_position(problem):
-        alone = static(problem)
-        heights = height_starts(alone, relax=pick is shor)
-        position = np.concatenate([squared_range_starts(alone, pick), heights], axis=1)
-        return _placed(problem, position, fix, name, began)
-    if registrable(problem):
-        return unrefined(problem, run_starts(problem, relaxed if pick is shor else closed_form), fix, name, began)
-    x = from_pieces(problem, lambda piece: lsr(piece, _squared(piece, None, name, pick)))
-    return unrefined(problem, x, fix, name, began)
-
-
-def widen(problem: Problem, fix: Fix | None) -> Fix:
-    """Return a refined fix with its mirror image beside it, and where the verdict is not clean those of sub-arrays."""
-    if fix is None:
+def widen(problem: Problem, pool: Pool | None) -> Pool:
+    """Return a refined pool with mirror images beside it, and where the verdict is not clean starts of sub-arrays."""
+    if pool is None:
         raise InvalidProblem("widen adds candidates to a fix", "method", "put it behind a refinement")
     began = perf_counter()
     if registrable(problem):
+        fix = judge(problem, pool)
         around = beside(problem, fix.x, fix.covariance())
-        if not np.isfinite(around).any():
-            return fix
-        return unrefined(problem, packed(np.concatenate([pooled(fix)[0], around], axis=1)), fix, "widen", began)
+        return _beside(problem, pool, fix, around, began) if np.isfinite(around).any() else pool
     if not one_position(problem):
-        return fix
-    alone = static(problem)
-    seen = _positions(problem, fix)
-    parts = [mirrored(alone, seen[:, :1])]
+        return pool
+    fix, alone = judge(problem, pool), static(problem)
+    seen = problem.layout.take(standing(pool, fix), "position")
+    parts = [mirrored(alone, fix.position[:, None])]
     unsettled = (fix.code != Status.OK) | (fix.p_value < DOUBT)
     valley = np.flatnonzero(unsettled | _weak(problem, fix))
     for items, more in (
@@ -127,7 +95,11 @@ def widen(problem: Problem, fix: Fix | None) -> Fix:
             spread[items] = found
             parts.append(spread)
     fresh = vectors(problem, _fresh(problem, fix, seen, np.concatenate(parts, axis=1)))
-    return unrefined(problem, packed(np.concatenate([pooled(fix)[0], fresh], axis=1)), fix, "widen", began)
+    return _beside(problem, pool, fix, fresh, began)
+
+
+def _beside(problem: Problem, pool: Pool, fix: Fix, x: Array, began: float) -> Pool:
+    return offer(problem, pack(np.concatenate([standing(pool, fix), x], axis=1)), pool, "widen", began)
 
 
 def _subarrays(problem: Problem, fix: Fix) -> Array:
@@ -157,75 +129,71 @@ def _fresh(problem: Problem, fix: Fix, seen: Array, more: Array) -> Array:
     return np.where((near & (usable & ok)[:, None])[..., None], np.nan, more)
 
 
-def search(problem: Problem, fix: Fix | None) -> Fix:
-    """Return a fix whose unanswered problems were searched from many places; such answers say so in their status."""
-    if fix is None:
+# More starts change nothing about these.
+_SETTLED = (Status.REJECTED, Status.TOO_FEW_ROWS, Status.INFEASIBLE, Status.CONTRADICTORY)
+
+
+def search(problem: Problem, pool: Pool | None) -> Pool:
+    """Return a pool whose unanswered problems were searched from many places, and which says so of them."""
+    if pool is None:
         raise InvalidProblem("search fills the gaps of a fix", "method", "put it behind a refinement")
-    settled = (Status.REJECTED, Status.TOO_FEW_ROWS, Status.INFEASIBLE, Status.CONTRADICTORY)
-    lost = ~fix.answered & ~np.isin(fix.code, settled)
+    if not one_position(problem):
+        return pool
+    fix = judge(problem, pool)
+    lost = ~fix.answered & ~np.isin(fix.code, _SETTLED)
     lost &= fix.dof >= np.where(fix.code == Status.DISCONNECTED, 1, 0)
     items = np.flatnonzero(lost)
-    if not len(items) or not one_position(problem):
-        return fix
+    if not len(items):
+        return pool
     began = perf_counter()
     part = problem.take(items)
-    found = lsr(part, _placed(part, searched_starts(part), fix[items], "search", began))
-    good = np.flatnonzero(found.answered)
-    found.code[found.code == Status.OK] = Status.SEARCHED
-    for i in good:
-        why = fix.reason[items[i]]
-        found.reason[i] = f"{why}; best of a search from {PLACES} places" if why else f"best of {PLACES} places"
+    found = lsr(part, _place(part, searched_starts(part), take(pool, items), "search", began))
+    good = np.flatnonzero(judge(part, found).answered)
+    remark = np.array([_searched_sentence(why) for why in fix.reason[items]], dtype=object)
+    found = replace(found, searched=np.ones(len(items), dtype=bool), remark=remark)
     stage = Stage("search", f"{len(good)} of {len(items)} found", perf_counter() - began)
-    return merged(fix, items[good], found[good], stage)
+    return pool.merge(items[good], take(found, good), stage)
 
 
-def lsr(problem: Problem, fix: Fix | None, *, damped: bool = True, limit: int = 100) -> Fix:
-    """Return the refined maximum-likelihood fix: best of all candidates of the stage before."""
-    if fix is None:
+def _searched_sentence(why: str) -> str:
+    return f"{why}; best of a search from {PLACES} places" if why else f"best of {PLACES} places"
+
+
+def search_widely(problem: Problem) -> Pool:
+    """Return what the method "searched" returns: every start that is known, and a search where there is none."""
+    return search(problem, lsr(problem, widen(problem, lsr(problem, roots(problem, None)))))
+
+
+def lsr(problem: Problem, pool: Pool | None, *, damped: bool = True, limit: int = 100) -> Pool:
+    """Return the minima that damped least squares reaches from all candidates of the pool before."""
+    if pool is None:
         raise InvalidProblem("lsr refines a start", "method", "give start= or a method such as 'gtrs+lsr'")
-    unfinished = np.isin(fix.code, (Status.MAX_ITERATIONS, Status.STALLED)).any()
-    if damped and fix.stages and fix.stages[-1].name == "lsr" and not unfinished:
-        return fix  # nothing was added since
+    if damped and pool.refined and not pool.unfinished:
+        return pool  # nothing was added since
     began = perf_counter()
-    pool, item, slot = pooled(fix)
-    cost, code = np.full(pool.shape[:2], np.inf), np.full(pool.shape[:2], int(Status.NUMERICAL), dtype=np.int8)
+    x, shape = pool.x.copy(), pool.x.shape[:2]
+    cost, code = np.full(shape, np.inf), np.full(shape, int(Status.NUMERICAL), dtype=np.int8)
+    item, slot = pool.occupied
     detail = "nothing to refine"
     if len(item):
         whole = len(item) == len(pool) and bool((item == np.arange(len(pool))).all())
         face = exact(problem) if damped else ()
         own = None if whole else item
-        done = refine(problem, pool[item, slot], item=own, damped=damped, limit=limit, face=face)
-        pool[item, slot], cost[item, slot], code[item, slot] = done.x, done.cost, done.status
+        done = refine(problem, x[item, slot], item=own, damped=damped, limit=limit, face=face)
+        x[item, slot], cost[item, slot], code[item, slot] = done.x, done.cost, done.status
         detail = f"{len(item)} candidates, {int(done.iterations.max())} steps at most"
         count("lsr", int(done.iterations.sum()))
-    candidates = Candidates(pool, cost, code, np.zeros(cost.shape, dtype=int))
-    free = candidates
-    if damped:
-        candidates = bounded(problem, candidates)
-    refined = finished(problem, fix, candidates, Stage("lsr" if damped else "taylor", detail, perf_counter() - began))
-    return contradicted(refined, free) if problem.constraints else refined
+    weights = np.broadcast_to(problem.weight, (len(pool), problem.count))
+    refined = Pool(x, cost, code, np.zeros(shape, dtype=int), weights, pool.dof, pool.stages)
+    free = least_finished(refined) if problem.constraints else None
+    refined = replace(bound_pool(problem, refined) if damped else refined, free=free)
+    return settle(problem, refined, Stage("lsr" if damped else "taylor", detail, perf_counter() - began))
 
 
-def finished(problem: Problem, fix: Fix, pool: Candidates, stage: Stage) -> Fix:
-    """Return the judged fix of refined candidates."""
-    pool = Candidates(pool.x, np.where(np.isfinite(pool.cost), pool.cost, np.inf), pool.code, pool.face)
-    return judge(problem, pool, _equations, (*fix.stages, stage))
-
-
-def taylor(problem: Problem, fix: Fix | None) -> Fix:
+def taylor(problem: Problem, pool: Pool | None) -> Pool:
     """Return the result of plain undamped Taylor iteration: a baseline that diverges silently, kept for comparison."""
-    return lsr(problem, fix, damped=False, limit=50)
+    return lsr(problem, pool, damped=False, limit=50)
 
 
-def _positions(problem: Problem, fix: Fix) -> Array:
-    """Return the positions (N, q, d) of a fix and its alternatives."""
-    slot, _ = problem.layout.find("position")
-    return pooled(fix)[0][..., slot.start : slot.start + slot.size]
-
-
-def _placed(problem: Problem, position: Array, fix: Fix | None, name: str, began: float) -> Fix:
-    return unrefined(problem, vectors(problem, packed(position)), fix, name, began)
-
-
-def _equations(problem: Problem, x: Array) -> Normal:
-    return equations_at(problem, x)
+def _place(problem: Problem, position: Array, pool: Pool | None, name: str, began: float) -> Pool:
+    return offer(problem, vectors(problem, pack(position)), pool, name, began)

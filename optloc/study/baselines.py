@@ -24,10 +24,11 @@ from optloc.problem.epochs import tied, window
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
-from optloc.solvers.pool import Candidates, given, unrefined
-from optloc.solvers.stages import finished
+from optloc.solvers.outside import given, judge_points
+from optloc.solvers.pool import offer
 from optloc.solvers.starts.position import spread_of, vectors
 from optloc.solvers.starts.several_positions import one_position
+from optloc.solvers.verdict.judge import judge
 from optloc.study.draws import Drawn
 
 _ASIDE = 0.2
@@ -141,8 +142,8 @@ def claim(problem: Problem, start: Array, x: Array) -> Fix:
     with np.errstate(all="ignore"):
         cost = np.where(found, equations_at(problem, np.where(found[:, None], x, start)).cost, np.inf)
     code = np.where(found, Status.OK, Status.NUMERICAL).astype(np.int8)
-    pool = Candidates(x[:, None], cost[:, None], code[:, None], np.zeros((len(x), 1), dtype=int))
-    return finished(problem, given(problem, start), pool, Stage("claimed", f"{found.sum()} points", 0.0))
+    stage = Stage("claimed", f"{found.sum()} points", 0.0)
+    return judge_points(problem, start, x[:, None], cost[:, None], code[:, None], stage)
 
 
 # General tools on the same data: SciPy's least squares from a guess, the plain lift of ranges.
@@ -181,8 +182,7 @@ def least_squares(problem: Problem, start: Array, limit: int = _EVALUATIONS) -> 
         code[i, 0] = Status.OK if end.status > 0 else Status.MAX_ITERATIONS
         count("scipy", int(end.nfev))
     stage = Stage("scipy", f"{len(pool)} problems", perf_counter() - began)
-    found = Candidates(pool, cost, code, np.zeros(cost.shape, dtype=int))
-    return finished(problem, given(problem, start), found, stage)
+    return judge_points(problem, start, pool, cost, code, stage)
 
 
 def _whiten_one(one: Problem) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
@@ -228,7 +228,7 @@ def lifted_sdp(problem: Problem) -> Fix:
             position[i, 0] = found.point * scale[i] + centre[i]
 
         mapped(relax, range(size), least=WORTH)
-    return unrefined(problem, vectors(problem, position), None, "lifted-sdp", began)
+    return judge(problem, offer(problem, vectors(problem, position), None, "lifted-sdp", began))
 
 
 def _linear(one: Problem, scale: float) -> tuple[Array, Array]:

@@ -69,22 +69,16 @@ class Method:
         """Return whether fixes are solved one by one."""
         if self.baseline is not None:
             return BASELINES[self.baseline].slow
-        from optloc.solvers.methods import SOLVERS, branches_of
+        from optloc.solvers import Method as Pipeline
 
         assert self.method is not None
-        stages = {entry.solver for branch in branches_of(self.method) for entry in branch}
-        return not stages <= {SOLVERS[name].solver for name in _BATCHED}
+        return not all(entry.batched for entry in Pipeline.parse(self.method).entries)
 
     @property
     def reference(self) -> bool:
         """Return whether it knows the truth, so that it judges the others and is not ranked."""
         known = BASELINES.get(self.baseline or "")
         return known is not None and (known.reference or (known.guess and self.start == "truth"))
-
-
-# Stages that take a batch at a time. Any other, an outsider's too, is taken to go one by one: too small a chunk
-# costs a file, too large a one the work of minutes when a run is stopped.
-_BATCHED = {"gtrs", "roots", "wiv", "widen", "search", "lsr", "taylor", "certify", "value"}
 
 
 def methods_of(table: MethodTable, number: int) -> Iterator[Method]:
@@ -109,10 +103,10 @@ def methods_of(table: MethodTable, number: int) -> Iterator[Method]:
     names = _list(table.method) or _list(table.baseline)
     for name, solver in product(names, solvers):
         if table.method is not None:
-            from optloc.solvers.methods import stages_of
+            from optloc.solvers import Method as Pipeline
 
             try:
-                stages_of(name)
+                Pipeline.parse(name)
             except InvalidProblem as error:
                 raise InvalidProblem(error.what, where, error.advice) from None
         elif name not in BASELINES:

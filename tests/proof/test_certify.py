@@ -13,8 +13,6 @@ from optloc import Fix, InvalidProblem, Status, assemble, certify, measured, sim
 from optloc.compute.jit import enabled
 from optloc.linear.constraints import box, height
 from optloc.solvers.certify import rounds
-from optloc.solvers.pool import given
-from optloc.solvers.stages import lsr
 
 machine_code = pytest.mark.skipif(not enabled(), reason="plain Python takes a thousand times longer for a box")
 SQUARE = 1e3 * np.array([[-5.0, -5, 0], [5, -5, 0], [5, 5, 0], [-5, 5, 0], [0, 2, 0], [1, -3, 0]])
@@ -27,7 +25,7 @@ def drawn(name: str, trials: int):
 def at(problem, position) -> Fix:
     """Return the fix of one problem that refines to the minimum next to a position, whatever else there is."""
     flat = problem.flat()
-    return lsr(flat, given(flat, np.atleast_2d(position))).reshape(problem.batch_shape)
+    return optloc.solve(flat, "lsr", start=np.atleast_2d(position)).reshape(problem.batch_shape)
 
 
 @pytest.mark.parametrize("name", ["tdoa-3d", "range-2d", "toa-3d", "range_sum-3d", "toa+tdoa-2d", "range+range_sum-3d"])
@@ -80,7 +78,7 @@ def twofold():
 @machine_code
 def test_a_better_position_takes_the_place_of_a_wrong_one(twofold):
     problem, best = twofold
-    wrong = lsr(problem, given(problem, best.alternatives.x[:, 0]))
+    wrong = optloc.solve(problem, "lsr", start=best.alternatives.x[:, 0])
     assert np.all(wrong.cost > best.cost + 1e-3)
     fix = certify(problem, wrong)
     np.testing.assert_allclose(fix.cost, best.cost, rtol=1e-6, atol=1e-6)
@@ -92,7 +90,7 @@ def test_a_better_position_takes_the_place_of_a_wrong_one(twofold):
 @machine_code
 def test_other_minima_are_found_and_the_list_is_complete(twofold):
     problem, best = twofold
-    alone = lsr(problem, given(problem, best.x))
+    alone = optloc.solve(problem, "lsr", start=best.x)
     assert alone.alternatives.gap.shape[1] == 0
     fix = certify(problem, alone)
     found, expected = np.isfinite(fix.alternatives.gap).sum(1), np.isfinite(best.alternatives.gap).sum(1)

@@ -7,8 +7,9 @@ from study.texts import QUICK, plan
 from optloc.base.status import Status
 from optloc.papers.registration import PRINTED, Setting
 from optloc.papers.registration import recursion as printed
-from optloc.solvers.pool import given
+from optloc.solvers.pool import begin
 from optloc.solvers.stages import lsr
+from optloc.solvers.verdict.judge import judge
 from optloc.study.baselines import BASELINES, recursion, single_step
 from optloc.study.draws import draw
 from optloc.study.trial import compute
@@ -25,7 +26,7 @@ def test_the_recursion_is_that_of_the_paper():
 def test_a_single_step_is_the_first_of_an_iteration():
     drawn = draw(next(plan().chunks).cell.case, 0, 5)
     start = drawn.truth + 500.0
-    once = lsr(drawn.problem, given(drawn.problem, start), damped=False, limit=1)
+    once = judge(drawn.problem, lsr(drawn.problem, begin(drawn.problem, start), damped=False, limit=1))
     np.testing.assert_allclose(single_step(drawn.problem, start), once.x, rtol=1e-9)
 
 

@@ -14,7 +14,11 @@ from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.proof.scope import unsupported
 from optloc.solvers.certify.rounds import unknown
+from optloc.solvers.outside import accept
 from optloc.solvers.policy import LISTED_GAP
+from optloc.solvers.pool import Pool
+from optloc.solvers.verdict.judge import judge
+from optloc.solvers.verdict.status import fill
 
 # Who asks for a proof gives it more time than a method that goes on without one.
 _EFFORT = 4
@@ -63,35 +67,39 @@ def certify(
     if not 0.0 <= margin < np.inf:
         raise InvalidProblem(f"the margin is {margin}", "margin", "give 0 or a positive number")
     corners = None if region is None else _corners(problem, region)
-    out = certified(flat, fix.reshape((flat.batch_shape[0],)), corners, margin, _EFFORT)
-    return out.reshape(shape)
+    pool = certified(flat, accept(flat, fix.reshape((flat.batch_shape[0],))), corners, margin, _EFFORT)
+    return judge(flat, pool).reshape(shape)
 
 
-def value_certified(problem: Problem, fix: Fix | None) -> Fix:
-    """Return the fixes of a flat batch of problems with a proof that nothing costs less: the stage "value"."""
-    return certified(problem, fix, margin=0.0)
+def value_certified(problem: Problem, pool: Pool | None) -> Pool:
+    """Return the pools of a flat batch of problems with a proof that nothing costs less: the stage "value"."""
+    return certified(problem, pool, margin=0.0)
 
 
 def certified(
-    problem: Problem, fix: Fix | None, region: Array | None = None, margin: float = LISTED_GAP, effort: int = 1
-) -> Fix:
-    """Return the certified fixes of a flat batch of problems: the stage "certify"; region (2, d) as of `certify`.
+    problem: Problem, pool: Pool | None, region: Array | None = None, margin: float = LISTED_GAP, effort: int = 1
+) -> Pool:
+    """Return the pools of a flat batch with certificates: the stage "certify"; region (2, d) as of `certify`.
 
     `effort` multiplies the boxes that a proof may take.
     """
-    if fix is None:
+    if pool is None:
         raise InvalidProblem("certify examines a fix", "method", "put it behind a refinement")
     began = perf_counter()
+    fix = judge(problem, pool)
     answered = fix.answered & np.isfinite(fix.cost)
+    if pool.conclusion is not None:
+        answered &= np.asarray(pool.conclusion == None)  # noqa: E711  element by element: the rows are not all there
     why = unsupported(problem)
     if why or not answered.any():
-        certificate = np.array(fix.certificate)
+        certificate = fill(len(pool), None) if pool.certificate is None else np.array(pool.certificate)
         certificate[answered] = unknown(why)
-        return replace(fix, certificate=certificate, stages=(*fix.stages, _stage(why or "nothing to prove", began)))
+        return replace(pool, certificate=certificate, stages=(*pool.stages, _stage(why or "nothing to prove", began)))
     from optloc.solvers.certify.rounds import Work, settled_by_rounds  # machine code is loaded when it is used
 
-    work = settled_by_rounds(Work.begin(problem, fix, answered, region, margin, effort))
-    return replace(work.fix, stages=(*fix.stages, _stage(work.summary(), began)))
+    work = settled_by_rounds(Work.begin(problem, pool, fix, answered, region, margin, effort))
+    stages = (*pool.stages, _stage(work.summary(), began))
+    return replace(work.pool, certificate=work.certificate, stages=stages)
 
 
 def _stage(detail: str, began: float) -> Stage:

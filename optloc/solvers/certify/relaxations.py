@@ -6,17 +6,15 @@ belongs to another cost than the likelihood answers NaN and says so.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from time import perf_counter
+from dataclasses import dataclass
 
 import numpy as np
 
 from formulations.range_enclosure import Box, Ranged, ball, enclosure
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.status import Certificate
 from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array
-from optloc.problem.fix import Fix, Stage
+from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.starts.angles import angle_bounds, bearings
 from optloc.solvers.starts.least_squares_ranges import Ranges, ranges
@@ -37,7 +35,6 @@ _OTHER_COSTS = {
     "minimax": "the cones bound the worst angle, not the likelihood",
     "heights": "the satellite relaxation bounds the distance from the point below, not the likelihood",
 }
-_NAMES = {"moment": "moment relaxation", "directions": "direction relaxation"}
 METHODS = ("moment", "directions", *_OTHER_COSTS)
 
 
@@ -112,36 +109,6 @@ def reference_bound(problem: Problem, fix: Fix, method: str, *, region: float | 
     if why:
         return _nothing(problem, method, why)
     return _by_moments(problem, fix, region) if method == "moment" else _by_directions(problem, fix)
-
-
-def by_reference(problem: Problem, fix: Fix | None) -> Fix:
-    """Return a fix whose certificates compare its cost with the lower bound of the relaxation for its kinds of rows.
-
-    A stage: unit directions for angles, order-2 moments for ranges; fixes of other kinds, and those already proven,
-    stay as they are.
-    """
-    if fix is None:
-        raise InvalidProblem("bound examines a fix", "method", "put it behind a refinement")
-    began = perf_counter()
-    angular = all(rows.kind in ("azimuth", "elevation") for rows in problem.rows)
-    found = reference_bound(problem, fix, "directions" if angular else "moment")
-    certificate, tight = np.array(fix.certificate), found.tight(fix.cost)
-    known = np.flatnonzero(np.isfinite(found.bound))
-    if not len(known):
-        return fix
-    for i in known:
-        if certificate[i].proof != "global" and (tight[i] or certificate[i].proof != "region"):
-            gap = float(fix.cost[i] - found.bound[i])
-            reason = "no position costs less" if tight[i] else f"a lower bound leaves a gap of {gap:.2g}"
-            certificate[i] = Certificate(
-                "global" if tight[i] else "local",
-                f"{reason}; other minima were searched for, not excluded",
-                _NAMES[found.method],
-                float(found.bound[i]),
-                gap,
-            )
-    detail = f"{int(tight[known].sum())} of {len(tight)} proven"
-    return replace(fix, certificate=certificate, stages=(*fix.stages, Stage("bound", detail, perf_counter() - began)))
 
 
 def _beyond(problem: Problem) -> str:

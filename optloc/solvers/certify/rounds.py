@@ -8,11 +8,12 @@ from time import perf_counter
 
 import numpy as np
 
-from optloc.base.status import Certificate, Status
+from optloc.base.records import overwrite, take
+from optloc.base.status import Certificate
 from optloc.base.types import Array, Band
 from optloc.compute.jit import enabled
 from optloc.linear.constraints import exact
-from optloc.problem.fix import Fix, Stage
+from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.proof.batch import Answered, Asked, prove_all
 from optloc.proof.everywhere import UNBOUNDED
@@ -20,11 +21,13 @@ from optloc.proof.near import BETTER, BUDGET, OTHER, UNIQUE, VALUE
 from optloc.proof.nodes.codes import HEIGHT, LINEAR
 from optloc.proof.pose import Posed, height_numbers, linear_numbers, posed, stacked, taken
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP
-from optloc.solvers.pool import merged, packed, pooled, unrefined
+from optloc.solvers.pool import Pool, offer, pack
 from optloc.solvers.refine import refine
 from optloc.solvers.stages import lsr
 from optloc.solvers.starts.position import spread_of, vectors
 from optloc.solvers.verdict.horizon import hidden
+from optloc.solvers.verdict.judge import judge, standing
+from optloc.solvers.verdict.status import fill
 
 # What a proof lets a certificate say, in sentences.
 
@@ -178,14 +181,18 @@ _SPREADS, _DISTANCES = 10.0, 2.0
 
 @dataclass(slots=True)
 class Work:
-    """A flat batch of N fixes while they are proven; entries of `fix` are replaced as better ones are found.
+    """A flat batch of N pools while they are proven; entries are replaced as better candidates are found.
 
     Parameters
     ----------
     problem : Problem
         N problems within the scope of the proof.
+    pool : Pool
+        Their candidates.
     fix : Fix
-        Their fixes.
+        The verdict of the pool.
+    certificate : object array (N,)
+        What is claimed of each; None where nothing was tried.
     pose : Posed
         Their costs over the position, equalities apart.
     ignored : array (N, h, d)
@@ -200,8 +207,6 @@ class Work:
         Which of the margins is tried.
     pending : bool array (N,)
         What is not settled.
-    before : Fix
-        The fixes at first.
     effort : int
         By how much budgets and rounds are multiplied.
     replaced, listed : int
@@ -209,7 +214,9 @@ class Work:
     """
 
     problem: Problem
+    pool: Pool
     fix: Fix
+    certificate: Array
     pose: Posed
     ignored: Array
     region: Array
@@ -217,21 +224,22 @@ class Work:
     margins: Array
     level: Array
     pending: Array
-    before: Fix
     effort: int
     replaced: int = 0
     listed: int = 0
 
     @classmethod
     def begin(
-        cls, problem: Problem, fix: Fix, answered: Array, region: Array | None, margin: float, effort: int
+        cls, problem: Problem, pool: Pool, fix: Fix, answered: Array, region: Array | None, margin: float, effort: int
     ) -> Work:
         """Return the work before the first round."""
         size, d = len(fix.x), problem.dimension
         corners = np.full((2, d), np.nan) if region is None else region
         return cls(
             problem,
-            replace(fix, certificate=np.array(fix.certificate), code=np.array(fix.code), reason=np.array(fix.reason)),
+            pool,
+            fix,
+            fill(size, None) if pool.certificate is None else np.array(pool.certificate),
             posed(problem),
             np.full((size, 0, d), np.nan),
             np.array(np.broadcast_to(corners, (size, 2, d))),
@@ -239,13 +247,13 @@ class Work:
             np.array([margin, *(m for m in _MARGINS if m < margin)]),
             np.zeros(size, dtype=np.int64),
             np.array(answered),
-            fix,
             effort,
         )
 
     def summary(self) -> str:
         """Return what was proven, in a few words."""
-        proofs = [c.proof for c in self.fix.certificate]
+        claims = [own or other for own, other in zip(self.certificate, self.fix.certificate, strict=True)]
+        proofs = [claim.proof for claim in claims]
         counts = [f"{proofs.count(name)} {name}" for name in ("global", "region", "unknown") if name in proofs]
         more = [f"{self.replaced} fixes replaced by better ones"] if self.replaced else []
         more += [f"{self.listed} other minima found"] if self.listed else []
@@ -260,7 +268,6 @@ def settled_by_rounds(work: Work) -> Work:
             break
         _round(work, items)
     _give_up(work, np.flatnonzero(work.pending), RESTLESS)
-    _judge_again(work)
     return work
 
 
@@ -296,7 +303,7 @@ def _asked(work: Work, items: Array, extra: Array) -> Asked:
     with np.errstate(invalid="ignore"):
         listed = np.isfinite(gap) & (gap < np.maximum(kappa, AMBIGUOUS_GAP)[:, None])
     place = fix.layout.take(fix.alternatives.x[items], "position")
-    others = packed(np.concatenate([np.where(listed[..., None], place, np.nan), ignored], axis=1))
+    others = pack(np.concatenate([np.where(listed[..., None], place, np.nan), ignored], axis=1))
     return Asked(
         fix.position[items],
         np.where(np.isfinite(others), others, 0.0),
@@ -329,7 +336,7 @@ def _lower(work: Work, items: Array, why: str) -> None:
 
 
 def _give_up(work: Work, items: Array, why: str) -> None:
-    work.fix.certificate[items] = unknown(why)
+    work.certificate[items] = unknown(why)
     work.pending[items] = False
 
 
@@ -344,16 +351,17 @@ def _claim(work: Work, items: Array, asked: Asked, answer: Answered, extra: Arra
         region[k] = tuple(low), tuple(high)
     numbers = (work.fix.cost[proven], bound, kappa, answer.boxes[done], listed.sum(1))
     given = zip(*(values.tolist() for values in numbers), region, strict=True)
-    work.fix.certificate[proven] = column([claimed(*each) for each in given])
+    work.certificate[proven] = column([claimed(*each) for each in given])
     work.pending[proven] = False
 
 
 def _add(work: Work, items: Array, points: Array, better: Array) -> None:
     """Refine points that were found beside some fixes, and let them compete."""
     began = perf_counter()
-    part, own = work.problem.take(items), work.fix[items]
-    pool = np.concatenate([pooled(own)[0], vectors(part, points[:, None])], axis=1)
-    new = lsr(part, unrefined(part, packed(pool), own, "certify", began))
+    part, own, before = work.problem.take(items), work.fix[items], take(work.pool, items)
+    x = pack(np.concatenate([standing(before, own), vectors(part, points[:, None])], axis=1))
+    pool = _keep_evidence(lsr(part, offer(part, x, before, "certify", began)), before)
+    new = judge(part, pool)
     with np.errstate(invalid="ignore"):
         lower = new.cost < own.cost - _EQUAL * (1.0 + own.cost)
         more = np.isfinite(new.alternatives.gap).sum(1) > np.isfinite(own.alternatives.gap).sum(1)
@@ -362,7 +370,8 @@ def _add(work: Work, items: Array, points: Array, better: Array) -> None:
     work.listed += int(more.sum())
     keep = np.flatnonzero(changed)
     if len(keep):
-        work.fix = merged(work.fix, items[keep], new[keep], Stage("certify", "", 0.0))
+        work.pool = work.pool.merge(items[keep], take(pool, keep))
+        work.fix = overwrite(work.fix, items[keep], new[keep])
         work.pending[items[keep]] = new.answered[keep]
     stuck = np.flatnonzero(~changed)
     stuck = stuck[~_ignore(work, items[stuck], points[stuck])]
@@ -398,19 +407,12 @@ def _deep(problem: Problem, x: Array) -> Array:
     return out
 
 
-def _judge_again(work: Work) -> None:
-    """Restore what a status said before the proof, but for searched fixes that are proven now."""
-    fix, before = work.fix, work.before
-    for i in np.flatnonzero(before.code == Status.SEARCHED):
-        certificate: Certificate = fix.certificate[i]
-        if fix.code[i] not in (Status.OK, Status.SEARCHED):
-            continue
-        sure = certificate.proof == "global" and certificate.unique
-        fix.code[i] = Status.OK if sure else Status.SEARCHED
-        fix.reason[i] = before.reason[i] if not sure else ""
-    lone = (before.code == Status.AMBIGUOUS) & ~(before.alternatives.gap < AMBIGUOUS_GAP).any(1)
-    for i in np.flatnonzero(lone & (fix.code == Status.OK)):
-        fix.code[i], fix.reason[i] = Status.AMBIGUOUS, before.reason[i]
+def _keep_evidence(pool: Pool, before: Pool) -> Pool:
+    """Return a pool with what was known of its problems before one more candidate was refined."""
+    endless = pool.endless if before.endless is None else before.endless
+    if pool.endless is not None and before.endless is not None:
+        endless = pool.endless | before.endless
+    return replace(pool, endless=endless, searched=before.searched, remark=before.remark, asked=before.asked)
 
 
 def _around(problem: Problem, position: Array) -> Array:

@@ -14,25 +14,24 @@ from optloc.base.types import Array
 from optloc.linear.constraints import Face, exact
 from optloc.linear.degrees_of_freedom import degrees_of_freedom
 from optloc.linear.normal import Normal, marginal
-from optloc.problem.fix import Alternatives, Fix, Stage
+from optloc.problem.fix import Fix, Stage
 from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.problem import Problem
-from optloc.solvers.inequalities import bounded, contradicted
-from optloc.solvers.policy import AMBIGUOUS_GAP, DOUBT
-from optloc.solvers.pool import Candidates, packed, pooled
+from optloc.solvers.inequalities import bound_pool, least_finished
+from optloc.solvers.policy import AMBIGUOUS_GAP, REJECTED
+from optloc.solvers.pool import Pool, pack
 from optloc.solvers.robust.reweighting import Doubt, residuals, reweighted, robust_equations, weighed_by
 from optloc.solvers.robust.starts import flipped, robust_starts
 from optloc.solvers.starts.arrivals import Arrivals, as_arrivals, original
-from optloc.solvers.verdict.judge import judge
+from optloc.solvers.verdict.judge import judge, standing
+from optloc.solvers.verdict.minima import settle
 
-# Range differences doubted as what they are made of: one arrival time for each station.
-
-Minimise = Callable[[Problem, Array | None], Fix]
-"""Maps a flat batch of problems and starting vectors (N, q, size), or None, to robust fixes."""
+Minimise = Callable[[Problem, Array | None], Pool]
+"""Maps a flat batch of problems and starting vectors (N, q, size), or None, to the settled minima of a loss."""
 
 
-def by_arrivals(problem: Problem, fix: Fix | None, minimise: Minimise) -> Fix:
-    """Return robust fixes; differences of arrival times are taken apart first, where that is the same problem.
+def by_arrivals(problem: Problem, start: Array | None, minimise: Minimise) -> Pool:
+    """Return the minima of a loss; differences of arrival times are taken apart first, where that is the same problem.
 
     An error of one arrival is in every difference that it is part of, with either sign: no loss of the differences
     names it, whereas among the arrivals it is one bad row. A difference then has the lesser weight of its two arrivals.
@@ -41,24 +40,22 @@ def by_arrivals(problem: Problem, fix: Fix | None, minimise: Minimise) -> Fix:
     ----------
     problem : Problem
         N problems.
-    fix : Fix or None
-        Whose candidates are the starts.
+    start : array (N, q, size), optional
+        Where to begin.
     minimise : callable
-        Finds the robust fixes.
+        Finds the minima.
     """
-    start = None if fix is None else packed(pooled(fix)[0])
     taken = as_arrivals(problem) if problem.epochs == 1 and not problem.layout.n_local else None
     if taken is None:
         return minimise(problem, start)
     found = minimise(taken.problem, None if start is None else _emitted(taken.problem, start))
-    others = found.alternatives
+    assert found.curvature is not None
     return replace(
         found,
         x=original(problem, taken.problem, found.x),
-        alternatives=Alternatives(original(problem, taken.problem, others.x), others.gap),
-        layout=problem.layout,
         dof=degrees_of_freedom(problem),
         weights=_weights(problem, taken, found),
+        curvature=replace(found.curvature, local=None),
     )
 
 
@@ -74,20 +71,17 @@ def _emitted(problem: Problem, x: Array) -> Array:
     return np.where(known[..., None], whole, np.nan)
 
 
-def _weights(problem: Problem, taken: Arrivals, fix: Fix) -> Array:
+def _weights(problem: Problem, taken: Arrivals, found: Pool) -> Array:
     """Return the weight (N, m) of each row: the least of those of the rows that were made from it."""
-    weights = np.array(np.broadcast_to(problem.weight, (len(fix), problem.count)))
+    weights = np.array(np.broadcast_to(problem.weight, (len(found), problem.count)))
     for row, origin in enumerate(taken.origin):
-        weights[:, origin] = np.minimum(weights[:, origin], fix.weights[:, row, None])
+        weights[:, origin] = np.minimum(weights[:, origin], found.weights[:, row, None])
     return weights
 
 
-# A row that a loss leaves less than this of its weight is called rejected: four sigma of the Cauchy loss.
-REJECTED = 0.25
-_SHOWN = 8
-# Times that the weights of correlated rows are made anew at an answer.
+# Times that the weights of correlated rows are made anew at an answer: each time they change by less.
 _WEIGHINGS = 30
-# Gap of a rival that leaves out no more than the cheapest candidate does.
+# Gap of a rival that leaves out no more than the cheapest candidate does: the loss alone is no evidence between them.
 _CLOSE = 1e-2
 
 
@@ -103,31 +97,29 @@ class Robust:
 
     loss: Loss
 
-    def __call__(self, problem: Problem, fix: Fix | None) -> Fix:
-        """Return the fixes of a flat batch of problems; their weights are those of the loss."""
-
-        def minimise(some: Problem, start: Array | None) -> Fix:
-            return _robust(some, self.loss, start, fix.stages if fix else ())
-
-        return by_arrivals(problem, fix, minimise)
+    def __call__(self, problem: Problem, pool: Pool | None) -> Pool:
+        """Return the settled minima for a flat batch of problems; their weights are those of the loss."""
+        start = None if pool is None else pack(standing(pool, judge(problem, pool)))
+        stages = () if pool is None else pool.stages
+        return by_arrivals(problem, start, lambda some, x: _minimise(some, self.loss, x, stages))
 
 
-def _robust(problem: Problem, loss: Loss, start: Array | None, stages: tuple[Stage, ...]) -> Fix:
+def _minimise(problem: Problem, loss: Loss, start: Array | None, stages: tuple[Stage, ...]) -> Pool:
     began = perf_counter()
     pool = _minima(problem, loss, robust_starts(problem, loss) if start is None else start)
-    if start is None and loss.name == "truncated":
+    if start is None and loss.flat:
         pool = _more(pool, _minima(problem, loss, _minima(problem, LOSSES["cauchy"], pool.x).x))
         pool = _more(pool, _minima(problem, loss, flipped(problem, loss, pool)))
-    free, pool = pool, bounded(problem, pool, partial(_on_face, loss))
+    free = least_finished(pool) if problem.constraints else None
+    pool = bound_pool(problem, pool, partial(_on_face, loss))
     pool = _rivals(problem, loss, _apart(problem, loss, pool))
     detail = f"{int(np.isfinite(pool.cost).sum(1).max(initial=0))} candidates at most"
-    stages = (*stages, Stage(loss.name, detail, perf_counter() - began))
-    found = judge(problem, pool, lambda some, x: _equations(some, loss, x)[0], stages)
-    answered = np.asarray(np.isfinite(found.x).all(-1))
-    weights = _equations(problem, loss, np.where(answered[:, None], found.x, 0.0))[1]
-    weights = np.where(answered[:, None], weights, found.weights)
-    found = replace(found, weights=weights, reason=_reasons(problem, found, weights))
-    return contradicted(found, free, robust=True) if problem.constraints else found
+    stage = Stage(loss.name, detail, perf_counter() - began)
+    pool = replace(pool, stages=stages, free=free, loss=loss.name)
+    found = settle(problem, pool, stage, lambda some, x: _equations(some, loss, x)[0])
+    answered = np.asarray(np.isfinite(standing(found, judge(problem, found))[:, 0]).all(-1))
+    weights = _equations(problem, loss, np.where(answered[:, None], found.x[:, 0], 0.0))[1]
+    return replace(found, refined=False, weights=np.where(answered[:, None], weights, found.weights))
 
 
 def _on_face(loss: Loss, problem: Problem, start: Array, item: Array, face: Face) -> tuple[Array, Array, Array]:
@@ -137,18 +129,15 @@ def _on_face(loss: Loss, problem: Problem, start: Array, item: Array, face: Face
     return done.x, done.cost, done.status
 
 
-def _more(one: Candidates, two: Candidates) -> Candidates:
+def _more(one: Pool, two: Pool) -> Pool:
     """Return the candidates of both pools."""
-    return Candidates(
-        np.concatenate([one.x, two.x], axis=1),
-        np.concatenate([one.cost, two.cost], axis=1),
-        np.concatenate([one.code, two.code], axis=1),
-        np.concatenate([one.face, two.face], axis=1),
+    return replace(
+        one,
+        x=np.concatenate([one.x, two.x], axis=1),
+        cost=np.concatenate([one.cost, two.cost], axis=1),
+        code=np.concatenate([one.code, two.code], axis=1),
+        face=np.concatenate([one.face, two.face], axis=1),
     )
-
-
-STAGES = {name: Robust(loss) for name, loss in LOSSES.items()}
-"""Solver stages by the name of their loss."""
 
 
 def rejected(problem: Problem, fix: Fix) -> Array:
@@ -164,7 +153,7 @@ def rejected(problem: Problem, fix: Fix) -> Array:
     return np.asarray((problem.weight > 0.0) & (fix.weights < REJECTED * problem.weight))
 
 
-def _minima(problem: Problem, loss: Loss, pool: Array) -> Candidates:
+def _minima(problem: Problem, loss: Loss, pool: Array) -> Pool:
     """Return the minima of a loss next to the starts (N, q, size) of N problems."""
     x, cost = np.array(pool), np.full(pool.shape[:2], np.inf)
     code = np.full(pool.shape[:2], int(Status.NUMERICAL), dtype=np.int8)
@@ -173,7 +162,8 @@ def _minima(problem: Problem, loss: Loss, pool: Array) -> Candidates:
         part, start = problem.take(item), pool[item, slot]
         done = reweighted(part, start, loss, Doubt.of(part, start), face=exact(problem))
         x[item, slot], cost[item, slot], code[item, slot] = done.x, done.cost, done.status
-    return Candidates(x, cost, code, np.zeros(cost.shape, dtype=int))
+    weights = np.broadcast_to(problem.weight, (len(x), problem.count))
+    return Pool(x, cost, code, np.zeros(cost.shape, dtype=int), weights, degrees_of_freedom(problem))
 
 
 def _equations(problem: Problem, loss: Loss, x: Array) -> tuple[Normal, Array]:
@@ -186,7 +176,7 @@ def _equations(problem: Problem, loss: Loss, x: Array) -> tuple[Normal, Array]:
         return robust_equations(loss, problem, doubt, x, weight), doubt.row_weight(weight)
 
 
-def _apart(problem: Problem, loss: Loss, pool: Candidates) -> Candidates:
+def _apart(problem: Problem, loss: Loss, pool: Pool) -> Pool:
     """Return candidates without those that lie in the 95 % ellipsoid of the cheapest: they are the same answer."""
     from scipy.special import gammaincinv
 
@@ -206,7 +196,7 @@ def _apart(problem: Problem, loss: Loss, pool: Candidates) -> Candidates:
     return replace(pool, cost=cost)
 
 
-def _rivals(problem: Problem, loss: Loss, pool: Candidates) -> Candidates:
+def _rivals(problem: Problem, loss: Loss, pool: Pool) -> Pool:
     """Return candidates with gaps, counted from the cheapest, that tell how well the data exclude them.
 
     A loss that still rises for gross errors holds it for unlikely that one is larger than another; so large a gap is
@@ -229,19 +219,6 @@ def _rivals(problem: Problem, loss: Loss, pool: Candidates) -> Candidates:
     with np.errstate(invalid="ignore"):
         rival = least + np.maximum(evidence - base, _CLOSE)
     rival = np.where(np.isnan(rival), np.inf, rival)
-    cost = np.where(found, rival if loss is truncated else np.minimum(pool.cost, rival), pool.cost)
+    cost = np.where(found, rival if loss.flat else np.minimum(pool.cost, rival), pool.cost)
     np.put_along_axis(cost, best, least, 1)
     return replace(pool, cost=cost)
-
-
-def _reasons(problem: Problem, fix: Fix, weights: Array) -> Array:
-    """Return the reasons, with the rows that were rejected where the residuals are larger than the noise allows."""
-    out = np.array(fix.reason)
-    base = np.broadcast_to(problem.weight, weights.shape)
-    lost = (base > 0.0) & (weights < REJECTED * base)
-    for i in np.flatnonzero((fix.code == Status.OK) & (fix.p_value < DOUBT)):
-        rows = np.flatnonzero(lost[i])
-        if len(rows):
-            shown = ", ".join(map(str, rows[:_SHOWN])) + (" ..." if len(rows) > _SHOWN else "")
-            out[i] = f"{len(rows)} of {int((base[i] > 0.0).sum())} rows are rejected: {shown}; {out[i]}"
-    return out

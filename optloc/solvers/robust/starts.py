@@ -15,12 +15,13 @@ from optloc.linear.station_noise import depends_on_place, weighed
 from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.noise import independent, variances
 from optloc.problem.problem import Problem
-from optloc.solvers.pool import Candidates, packed, pooled
+from optloc.solvers.pool import Pool, pack
 from optloc.solvers.refine import refine
 from optloc.solvers.robust.reweighting import Doubt, doubted, weighed_by
-from optloc.solvers.stages import lsr, roots, search, widen
+from optloc.solvers.stages import roots, search_widely
 from optloc.solvers.starts.position import rows_of_stations
 from optloc.solvers.starts.several_positions import one_position
+from optloc.solvers.verdict.judge import judge, standing
 
 # Which rows to start from: all but those of some stations, or all but one, of the rows that each problem has.
 
@@ -86,15 +87,15 @@ def robust_starts(problem: Problem, loss: Loss) -> Array:
     loss : Loss
         Whose cost decides which starts are kept.
     """
-    plain = search(problem, lsr(problem, widen(problem, lsr(problem, roots(problem, None)))))
-    pool = pooled(plain)[0][:, :_KEPT]
+    plain = search_widely(problem)
+    pool = standing(plain, judge(problem, plain))[:, :_KEPT]
     parts = [pool, _graduated(problem, pool[:, :1])]
     if one_position(problem):
         parts.append(_left_out(problem, loss))
     else:
         item, slot = np.nonzero(np.isfinite(pool).all(-1))
         parts.append(_cheapest(problem, pool[item, slot], item, loss, _KEPT, anneal=True))
-    return packed(np.concatenate(parts, axis=1))
+    return pack(np.concatenate(parts, axis=1))
 
 
 def _left_out(problem: Problem, loss: Loss) -> Array:
@@ -116,8 +117,9 @@ def _of_subsets(problem: Problem, loss: Loss) -> Array:
         return np.full((problem.batch_shape[0], 0, problem.layout.size), np.nan)
     part = problem.take(item)
     part = part.with_rows(weight=np.where(kept, part.weight, 0.0))
-    points, pair, slot = pooled(roots(part, None))
-    x = refine(part, points[pair, slot], item=pair, limit=5, face=exact(problem)).x
+    found = roots(part, None)
+    pair, slot = found.occupied
+    x = refine(part, found.x[pair, slot], item=pair, limit=5, face=exact(problem)).x
     pool = _cheapest(problem, x, item[pair], loss, _SCREENED, anneal=False)
     first, slot = np.nonzero(np.isfinite(pool).all(-1))
     return _cheapest(problem, pool[first, slot], first, loss, _KEPT, anneal=True)
@@ -162,7 +164,7 @@ def _annealed(problem: Problem, x: Array, loss: Loss, halvings: int) -> tuple[Ar
     return x, np.where(np.isfinite(cost) & np.isfinite(u).all(-1), cost, np.inf), np.nan_to_num(u)
 
 
-def flipped(problem: Problem, loss: Loss, pool: Candidates) -> Array:
+def flipped(problem: Problem, loss: Loss, pool: Pool) -> Array:
     """Return starts (N, q, size) beside the cheapest minimum: those with one more row in or out, of rows at the brink.
 
     A loss that cuts rows off has minima of its own for almost every set of rows; the best ones differ in few rows.

@@ -1,13 +1,12 @@
-"""From what explains the data to a fix: explanations with their evidence, status and reason in words."""
+"""From what explains the data of one problem to explanations: who is left out, how large an error, what evidence."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from optloc.base.status import Certificate, Status
 from optloc.base.types import Array
 from optloc.problem.fix import Alternatives, Explanation, Fix, Suspect
 from optloc.problem.problem import Problem
@@ -15,9 +14,7 @@ from optloc.solvers.starts.arrivals import Arrivals, original
 from optloc.solvers.suspects.evidence import Error, errors, influence
 from optloc.solvers.suspects.groups import Group
 from optloc.solvers.suspects.subsets import Finding, Rest
-
-_SHOWN = 4
-_UNKNOWN = Certificate("unknown", "the data contradict each other", "none")
+from optloc.solvers.verdict.explained import Conclusion, list_names
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,54 +54,25 @@ class Case:
         return tuple(sorted({int(i) for row in group.rows for i in self.arrivals.origin[row]}))
 
 
-def concluded(case: Case, finding: Finding) -> Fix:
-    """Return the fix of one problem, without batch axes, that a finding means."""
-    if not finding.rests:
-        settled = case.whole.answered and set(finding.p_value) == {()} and not finding.note
-        return case.whole if settled else _contradictory(case, finding)
-    explanations = tuple(_explanation(case, rest, finding) for rest in finding.rests)
-    first = finding.rests[0].fix
-    others = _alternatives(case, finding.rests, explanations)
-    weights = np.array(np.broadcast_to(case.problem.weight, (1, case.problem.count))[0])
-    weights[[row for suspect in explanations[0].suspects for row in suspect.rows]] = 0.0
-    several = len(explanations) > 1
-    return replace(
-        case.whole,
-        x=explanations[0].x,
-        cov=first.cov,
-        code=np.array(int(Status.AMBIGUOUS) if several and first.answered else int(first.code), dtype=np.int8),
-        reason=_object(_rivals(explanations) if several else _named(explanations[0], first)),
-        certificate=first.certificate,
-        alternatives=others,
-        cost=first.cost,
-        dof=first.dof,
-        weights=weights,
-        active=first.active,
-        local=first.local if case.arrivals is None else None,
-        explanations=_object(explanations),
-    )
+def conclude_case(case: Case, finding: Finding) -> Conclusion | None:
+    """Return what a finding means for its problem; None where the fix of all the data stands."""
+    if finding.rests:
+        explanations = tuple(_explanation(case, rest, finding) for rest in finding.rests)
+        return Conclusion(explanations, finding.rests[0].fix, _alternatives(case, finding.rests, explanations))
+    if case.whole.answered and set(finding.p_value) == {()} and not finding.note:
+        return None
+    return Conclusion((), case.whole, case.whole.alternatives, _tried(case, finding))
 
 
-def _contradictory(case: Case, finding: Finding) -> Fix:
-    """Return the fix with nothing left out, without a covariance: the noise that it would follow from is refuted."""
-    whole, tested = case.whole, {left: p for left, p in finding.p_value.items() if left and np.isfinite(p)}
-    reason = finding.note
-    if tested:
-        best = max(tested, key=tested.__getitem__)
-        names = _listed([case.groups[i].name for i in best])
-        reason = f"nothing explains it; best is to leave out {names} (p = {tested[best]:.1g})"
-        reason += f"; {finding.note}" if finding.note else ""
-    if whole.status == Status.CONTRADICTORY and whole.reason[()]:  # what the constraints have to do with it
-        reason = f"{whole.reason[()]}; {reason}"
-    return replace(
-        whole,
-        cov=np.full_like(whole.cov, np.nan),
-        code=np.array(int(Status.CONTRADICTORY), dtype=np.int8),
-        reason=_object(reason),
-        certificate=_object(_UNKNOWN),
-        local=None if whole.local is None else np.full_like(whole.local, np.nan),
-        explanations=_object(()),
-    )
+def _tried(case: Case, finding: Finding) -> str:
+    """Return what came closest to an explanation, in words."""
+    tested = {left: p for left, p in finding.p_value.items() if left and np.isfinite(p)}
+    if not tested:
+        return finding.note
+    best = max(tested, key=tested.__getitem__)
+    names = list_names([case.groups[i].name for i in best])
+    reason = f"nothing explains it; best is to leave out {names} (p = {tested[best]:.1g})"
+    return reason + (f"; {finding.note}" if finding.note else "")
 
 
 def _explanation(case: Case, rest: Rest, finding: Finding) -> Explanation:
@@ -141,44 +109,3 @@ def _alternatives(case: Case, rests: Sequence[Rest], explanations: Sequence[Expl
     kept = np.isfinite(gaps) & np.isfinite(points).all(-1)
     order = np.argsort(gaps[kept], kind="stable")
     return Alternatives(points[kept][order], gaps[kept][order])
-
-
-def _named(explanation: Explanation, fix: Fix) -> str:
-    parts = [f"{suspect.name}{_error(suspect)}" for suspect in explanation.suspects]
-    reason = f"left out: {_listed(parts)}; p = {_p(explanation.suspects[0].p_with)} with"
-    reason += "" if len(parts) == 1 else " the first"
-    own = str(fix.reason[()] or "")
-    return f"{reason}, {_p(explanation.p_value)} without" + (f"; {own}" if own else "")
-
-
-def _rivals(explanations: Sequence[Explanation]) -> str:
-    shown = [" and ".join(one.names) for one in explanations[:_SHOWN]]
-    more = f" or {len(explanations) - _SHOWN} others" if len(explanations) > _SHOWN else ""
-    common = set(explanations[0].names).intersection(*(one.names for one in explanations[1:]))
-    sure = f"; {_listed(sorted(common))} in all of them" if common else ""
-    blind = all(one.dof == 0 for one in explanations)
-    why = "an error is there, but redundancy 1 does not tell where" if blind else "several explanations pass"
-    return f"{why}: {' or '.join(shown)}{more}{sure}"
-
-
-def _error(suspect: Suspect) -> str:
-    """Return the error of a suspect of one number in words."""
-    if len(suspect.error) != 1 or not np.isfinite(suspect.error[0]):
-        return ""
-    return f" (error {suspect.error[0]:+.3g}, sigma {suspect.sigma[0]:.2g})"
-
-
-def _p(value: float) -> str:
-    return "none" if np.isnan(value) else f"{value:.1g}"
-
-
-def _listed(parts: Sequence[str]) -> str:
-    if len(parts) > _SHOWN:
-        parts = [*parts[:_SHOWN], f"{len(parts) - _SHOWN} more"]
-    return parts[0] if len(parts) == 1 else ", ".join(parts[:-1]) + " and " + parts[-1]
-
-
-def _object(value: object) -> Array:
-    out = np.empty((), dtype=object)
-    out[()] = value
-    return out

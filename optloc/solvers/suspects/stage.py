@@ -14,13 +14,17 @@ from optloc.base.types import Array
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix, GroupKind, Stage
 from optloc.problem.problem import Problem
-from optloc.solvers.pool import merged, pooled, stacked, unrefined
-from optloc.solvers.stages import lsr, roots, search, widen
+from optloc.solvers.outside import accept
+from optloc.solvers.pool import Pool, begin, offer
+from optloc.solvers.stages import fix_by, lsr, search_widely
 from optloc.solvers.starts.arrivals import as_arrivals
 from optloc.solvers.starts.position import completed
 from optloc.solvers.suspects.groups import KINDS, Group, checked_kinds, groups_of
-from optloc.solvers.suspects.report import Case, concluded
-from optloc.solvers.suspects.subsets import TEST, Finding, Rest, enumerable, explained, grown, solved
+from optloc.solvers.suspects.report import Case, conclude_case
+from optloc.solvers.suspects.subsets import TEST, Finding, Rest, enumerable, explained, fix_rest, grown
+from optloc.solvers.verdict.explained import Conclusion
+from optloc.solvers.verdict.judge import judge, standing
+from optloc.solvers.verdict.status import fill
 
 # No other choice of rows helps these.
 _BEYOND = (Status.REJECTED, Status.TOO_FEW_ROWS, Status.INFEASIBLE, Status.UNAVAILABLE, Status.DISCONNECTED)
@@ -60,40 +64,36 @@ def suspects(problem: Problem, fix: Fix | None = None, *, by: str | Sequence[str
     shape, flat = problem.batch_shape, problem.flat()
     if fix is not None and fix.shape != shape:
         raise InvalidProblem(f"the fix has batch axes {fix.shape}, not {shape}", "fix", "give the fix of this problem")
-    if fix is None:
-        start = lsr(flat, roots(flat, None))
-        fix = search(flat, lsr(flat, widen(flat, start)))
-    return suspected(flat, fix.flat(), kinds).reshape(shape)
+    pool = search_widely(flat) if fix is None else accept(flat, fix.flat())
+    return judge(flat, suspect(flat, pool, kinds)).reshape(shape)
 
 
-def suspected(problem: Problem, fix: Fix | None, by: Sequence[GroupKind] = KINDS) -> Fix:
-    """Return the fixes of a flat batch without what contradicts the rest: the stage behind `suspects`."""
-    if fix is None:
+def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS) -> Pool:
+    """Return the pool of a flat batch with what contradicts the rest left out: the stage behind `suspects`."""
+    if pool is None:
         raise InvalidProblem(
             "suspects questions a fix", "method", "put it behind a refinement, as in 'gtrs+lsr+suspects'"
         )
     began = perf_counter()
-    given = np.broadcast_to(problem.weight, (len(fix), problem.count))
-    rejected = np.asarray((fix.weights < 0.5) & (given > 0.5))
-    if not np.array_equal(fix.weights, given):
-        fix = lsr(problem, _unweighted(problem, fix))
-    fix = replace(fix, reason=_with_limits(fix), explanations=_none(len(fix)))
+    present = np.broadcast_to(problem.weight, (len(pool), problem.count))
+    rejected = np.asarray((pool.weights < 0.5) & (present > 0.5))
+    if not np.array_equal(pool.weights, present):
+        pool = lsr(problem, offer(problem, standing(pool, judge(problem, pool)), pool, "start", perf_counter()))
+    pool = replace(pool, asked=True)
+    fix = judge(problem, pool)
     with np.errstate(invalid="ignore"):
         noticed = ~fix.answered | (fix.p_value < TEST)
     noticed |= problem.epochs > 1  # a few of many rows go unnoticed by the chi-square of all
     items = np.flatnonzero(noticed & (fix.dof > 0) & ~np.isin(fix.code, _BEYOND))
-    done = [part for own in _alike(given[items] > 0.0) for part in _of_pattern(problem, fix, items[own], by, rejected)]
+    conclusion = fill(len(pool), None)
+    for own in _group_alike(present[items] > 0.0):
+        for item, found in _conclude_pattern(problem, fix, items[own], by, rejected):
+            conclusion[item] = found
     stage = Stage("suspects", f"{len(items)} of {len(fix)} contradict themselves", perf_counter() - began)
-    if not done:
-        return replace(fix, stages=(*fix.stages, stage))
-    return merged(fix, np.array([item for item, _ in done]), stacked([one for _, one in done]), stage)
+    return replace(pool, conclusion=conclusion, stages=(*pool.stages, stage))
 
 
-def _unweighted(problem: Problem, fix: Fix) -> Fix:
-    return unrefined(problem, pooled(fix)[0], fix, "start", perf_counter())
-
-
-def _alike(present: Array) -> list[Array]:
+def _group_alike(present: Array) -> list[Array]:
     """Return the numbers of the problems (N, m) that have the same rows, for each pattern."""
     if not len(present):
         return []
@@ -101,10 +101,10 @@ def _alike(present: Array) -> list[Array]:
     return [np.flatnonzero(pattern.reshape(-1) == i) for i in range(int(pattern.max()) + 1)]
 
 
-def _of_pattern(
+def _conclude_pattern(
     problem: Problem, fix: Fix, items: Array, by: Sequence[GroupKind], rejected: Array
-) -> Iterator[tuple[int, Fix]]:
-    """Yield the new fixes of problems in which the same rows are present."""
+) -> Iterator[tuple[int, Conclusion | None]]:
+    """Yield what is concluded of problems in which the same rows are present."""
     part = problem.take(items)
     arrivals = as_arrivals(part)
     work = part if arrivals is None else arrivals.problem
@@ -121,7 +121,7 @@ def _of_pattern(
         finding = found if found.rests else replace(found, rests=found.nearly)
         one = None if arrivals is None else replace(arrivals, problem=arrivals.problem.take(np.array([i])))
         case = Case(part.take(np.array([i])), one, groups, fix[items[i]])
-        yield int(items[i]), concluded(case, finding)
+        yield int(items[i]), conclude_case(case, finding)
 
 
 def _more(groups: Sequence[Group], problem: Problem, dof: int) -> bool:
@@ -138,25 +138,6 @@ def _grown(
         n = one.layout.n_shared
         known = np.isfinite(own.x[:n]).all()
         near = completed(one, own.x[None, None, :n]) if known else None
-        own = (solved(one) if near is None else lsr(one, unrefined(one, near, None, "start", perf_counter())))[0]
+        own = (fix_rest(one) if near is None else fix_by(one, lambda _: begin(one, near)))[0]
     mine = rejected[item] if one.count == rejected.shape[1] else np.zeros(one.count, dtype=bool)
     return grown(one, groups, own, mine, start)
-
-
-def _with_limits(fix: Fix) -> Array:
-    """Return the reasons of fixes, and where nobody could be named why."""
-    reason = np.array(fix.reason, dtype=object)
-    for dof, limit in (
-        (0, "an error in a measurement would not be noticed"),
-        (1, "an error would be noticed, not named"),
-    ):
-        for i in np.flatnonzero(fix.answered & (fix.dof == dof)):
-            told = f"redundancy {dof}: {limit}"
-            reason[i] = f"{reason[i]}; {told}" if reason[i] else told
-    return reason
-
-
-def _none(size: int) -> Array:
-    out = np.empty(size, dtype=object)
-    out[:] = [()] * size
-    return out

@@ -10,13 +10,15 @@ from time import perf_counter
 
 import numpy as np
 
+from optloc.base.records import take
 from optloc.base.types import Array
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
-from optloc.solvers.pool import given, in_parts, merged, packed, pooled, unrefined
-from optloc.solvers.stages import gtrs, lsr, roots, search, widen
+from optloc.solvers.pool import Pool, begin, in_parts, offer, pack
+from optloc.solvers.stages import fix_by, gtrs, lsr, roots, search, widen
 from optloc.solvers.suspects.evidence import Influence, errors, influence, significance
 from optloc.solvers.suspects.groups import Group, mask, without
+from optloc.solvers.verdict.judge import judge, standing
 
 TEST = 0.01
 """Probability of the chi-square test: a fit less likely than this is contradicted."""
@@ -151,7 +153,7 @@ def _tried(
     closest: list[Rest | None] = [None] * count
     for dropped in dict.fromkeys(priors for _, _, priors in sets):
         own = [(left, rows) for left, rows, priors in sets if priors == dropped]
-        fix = _fixed(problem, np.stack([rows for _, rows in own]), dropped)
+        fix = _fix_rests(problem, np.stack([rows for _, rows in own]), dropped)
         good, p_value = plausible(fix, size, LAST), fix.p_value
         cost = np.where(np.isfinite(fix.cost), fix.cost, np.inf).reshape(count, len(own))
         for item in range(count):
@@ -179,39 +181,41 @@ def _subsets(groups: Sequence[Group], count: int, size: int) -> Iterator[tuple[t
             yield left, rows, frozenset(groups[i].prior for i in left if groups[i].prior >= 0)
 
 
-def _fixed(problem: Problem, left: Array, dropped: frozenset[int]) -> Fix:
+def _fix_rests(problem: Problem, left: Array, dropped: frozenset[int]) -> Fix:
     """Return the fixes (N * C,) of N problems without each of C sets of rows (C, m), set after set of each problem."""
     count = problem.batch_shape[0]
     many = problem.take(np.repeat(np.arange(count), len(left)))
-    return in_parts(without(many, np.tile(left, (count, 1)), dropped), lambda part, _: solved(part))
+    return in_parts(without(many, np.tile(left, (count, 1)), dropped), lambda part, _: fix_rest(part))
 
 
-def solved(problem: Problem) -> Fix:
+def fix_rest(problem: Problem) -> Fix:
     """Return the fixes of a flat batch by the cheapest start, and in more ways where that one may have missed.
 
     A rest that fails by less than `_NEAR` gets every stationary point of the squared-range problem as a start, and one
     that passes, or fails by little, all candidates: its other positions explain the data as well.
     """
-    fix = lsr(problem, gtrs(problem, None))
-    fix = _again(problem, fix, _NEAR, lambda part, own: lsr(part, _beside(part, roots(part, None), own)))
-    fix = _again(problem, fix, _CLOSE, lambda part, own: lsr(part, widen(part, own)))
-    if np.isnan(fix.cost).all() and (fix.dof >= 0).any():
-        fix = search(problem, fix)  # no closed form starts from these kinds
-    return fix
+    pool = lsr(problem, gtrs(problem, None))
+    pool = _again(problem, pool, _NEAR, lambda part, own: lsr(part, _beside(part, roots(part, None), own)))
+    pool = _again(problem, pool, _CLOSE, lambda part, own: lsr(part, widen(part, own)))
+    if not np.isfinite(pool.cost[:, 0]).any() and (pool.dof >= 0).any():
+        pool = search(problem, pool)  # no closed form starts from these kinds
+    return judge(problem, pool)
 
 
-def _again(problem: Problem, fix: Fix, near: float, better: Callable[[Problem, Fix], Fix]) -> Fix:
-    """Return fixes of which those whose cost is not that many times too large were made anew."""
+def _again(problem: Problem, pool: Pool, near: float, better: Callable[[Problem, Pool], Pool]) -> Pool:
+    """Return pools of which those whose cost is not that many times too large were made anew."""
+    cost = np.where(np.isfinite(pool.cost[:, 0]), pool.cost[:, 0], np.nan)
     with np.errstate(invalid="ignore"):
-        items = np.flatnonzero(~(fix.cost > near * _limit(fix.dof)) & (fix.dof >= 0))
+        items = np.flatnonzero(~(cost > near * _limit(pool.dof)) & (pool.dof >= 0))
     if not len(items):
-        return fix
-    return merged(fix, items, better(problem.take(items), fix[items]), Stage("again", f"{len(items)} anew", 0.0))
+        return pool
+    other = better(problem.take(items), take(pool, items))
+    return pool.merge(items, other, Stage("again", f"{len(items)} anew", 0.0))
 
 
-def _beside(problem: Problem, start: Fix, fix: Fix) -> Fix:
-    pool = packed(np.concatenate([pooled(start)[0], pooled(fix)[0]], axis=1))
-    return unrefined(problem, pool, None, "roots", perf_counter())
+def _beside(problem: Problem, start: Pool, pool: Pool) -> Pool:
+    x = np.concatenate([start.x, standing(pool, judge(problem, pool))], axis=1)
+    return offer(problem, pack(x), None, "roots", perf_counter())
 
 
 def _limit(dof: Array) -> Array:
@@ -251,7 +255,7 @@ def grown(problem: Problem, groups: Sequence[Group], fix: Fix, rejected: Array, 
     """
     level = float(np.log(TEST / len(groups)))
     left = [i for i, group in enumerate(groups) if len(group.rows) == 1 and rejected[group.rows[0]]]
-    rest = fixed_without(problem, groups, left, fix.x) if left else fix
+    rest = fix_without(problem, groups, left, fix.x) if left else fix
     if start is not None and not left:
         left, rest = list(start.left), start.fix
     while (worst := _worst(problem, groups, left, rest, level)) is not None:
@@ -260,7 +264,7 @@ def grown(problem: Problem, groups: Sequence[Group], fix: Fix, rejected: Array, 
                 (), {(): float(fix.p_value)}, f"{len(left)} of {len(groups)} left out, and still no rest agrees"
             )
         left = [*(i for i in left if not _inside(groups[i], groups[worst])), worst]
-        rest = fixed_without(problem, groups, left, rest.x)
+        rest = fix_without(problem, groups, left, rest.x)
     left, rest = _taken_back(problem, groups, left, rest, level)
     if not left or not rest.answered:
         return Finding((), {(): float(fix.p_value)}, "" if rest.answered else str(rest.reason))
@@ -268,10 +272,10 @@ def grown(problem: Problem, groups: Sequence[Group], fix: Fix, rejected: Array, 
     return Finding(found, {(): float(fix.p_value)})
 
 
-def fixed_without(problem: Problem, groups: Sequence[Group], left: Sequence[int], x: Array) -> Fix:
+def fix_without(problem: Problem, groups: Sequence[Group], left: Sequence[int], x: Array) -> Fix:
     """Return the fix of one problem without some groups, refined from a vector (size,)."""
     part = _part(problem, groups, left)
-    return lsr(part, given(part, x[None]))[0]
+    return fix_by(part, lambda one: begin(one, x[None]))[0]
 
 
 def _part(problem: Problem, groups: Sequence[Group], left: Sequence[int]) -> Problem:
@@ -323,7 +327,7 @@ def _taken_back(
         if tail[best] > -level:
             break
         left = [i for i in left if i != left[best]]
-        rest = fixed_without(problem, groups, left, rest.x)
+        rest = fix_without(problem, groups, left, rest.x)
     return left, rest
 
 
@@ -332,7 +336,7 @@ def _rivals(problem: Problem, groups: Sequence[Group], left: list[int], rest: Fi
     found: dict[tuple[int, ...], Rest] = {}
     for i in left if len(left) <= _MOST_LEFT_OUT else ():
         others = [j for j in left if j != i]
-        fix = fixed_without(problem, groups, others, rest.x)
+        fix = fix_without(problem, groups, others, rest.x)
         gone = mask([groups[j] for j in others], problem.count)
         open_ = [j for j, g in enumerate(groups) if j not in left and not _overlap(g, gone)]
         if not np.isfinite(fix.x).all() or not open_:
@@ -342,7 +346,7 @@ def _rivals(problem: Problem, groups: Sequence[Group], left: list[int], rest: Fi
             key = tuple(sorted([*others, open_[int(j)]]))
             if key in found or tail[j] > level:
                 continue
-            other = fixed_without(problem, groups, key, fix.x)
+            other = fix_without(problem, groups, key, fix.x)
             agrees = bool(other.answered) and (
                 np.isnan(rest.p_value) or other.p_value >= min(TEST, float(rest.p_value))
             )

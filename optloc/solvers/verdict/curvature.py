@@ -2,49 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from optloc.base import linalg
-from optloc.base import linalg as tangents
 from optloc.base.types import Array
 from optloc.linear.constraints import Face, face_names, faces, levels, tangent_at
-from optloc.linear.normal import Normal, marginal
+from optloc.linear.normal import Normal, local_covariance, marginal
 from optloc.problem.fix import Active
+from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
+from optloc.solvers.pool import Curvature
 
 
-@dataclass(frozen=True, slots=True)
-class Curvature:
-    """What the normal equations say at the answers of a flat batch of N problems.
-
-    Parameters
-    ----------
-    information : array (N, n, n)
-        Of the shared unknowns, local ones eliminated.
-    covariance : array (N, n, n)
-        Its inverse on the tangent space of the constraints that hold with equality.
-    regular : bool array (N,)
-        Whether that inverse exists.
-    weakest : array (N,)
-        Smallest squared pivot of the information scaled to a unit diagonal: near zero means a direction is open.
-    active : object array (N,)
-        Tuples of `Active` constraints.
-    """
-
-    information: Array
-    covariance: Array
-    regular: Array
-    weakest: Array
-    active: Array
-
-
-def curved(problem: Problem, equations: Normal, x: Array, face: Array) -> Curvature:
+def measure_curvature(problem: Problem, equations: Normal, x: Array, face: Array) -> Curvature:
     """Return the curvature at vectors x (N, size) that lie on given faces (N,) of the constraints."""
     information, vector, ok = marginal(equations)
     covariance, regular = linalg.inverse(information)
-    weakest = _weakest(information)
+    weakest = _smallest_pivot(information)
     active: Array = np.frompyfunc(lambda _: (), 1, 1)(np.arange(len(x)))
     sides = faces(problem) if problem.constraints else [()]
     for number in np.unique(face):
@@ -53,11 +27,21 @@ def curved(problem: Problem, equations: Normal, x: Array, face: Array) -> Curvat
         items = np.flatnonzero(face == number)
         part = problem.take(items)
         space = tangent_at(part, sides[number], x[items])
-        covariance[items], regular[items] = tangents.inverse_within(information[items], space)
+        covariance[items], regular[items] = linalg.inverse_within(information[items], space)
         inner = np.swapaxes(space.along, -1, -2) @ information[items] @ space.along
-        weakest[items] = _weakest(inner) if inner.shape[-1] else 1.0
+        weakest[items] = _smallest_pivot(inner) if inner.shape[-1] else 1.0
         active[items] = _multipliers(part, sides[number], x[items], vector[items])
-    return Curvature(information, covariance, ok & regular, weakest, active)
+    regular = ok & regular
+    local = _local_covariance(problem, equations, covariance)
+    return Curvature(covariance, information, regular, weakest, active, local)
+
+
+def _local_covariance(problem: Problem, equations: Normal, shared: Array) -> Array | None:
+    """Return the covariance of the states that targets have at each epoch of a run, or None where there are none."""
+    names = {name for i, m in enumerate(problem.motions) for name in state_names(i, len(problem.motions), m.order)}
+    size = sum(slot.size for slot in problem.layout.local if slot.name in names)
+    with np.errstate(all="ignore"):
+        return local_covariance(equations, shared, size) if size else None
 
 
 def _multipliers(problem: Problem, face: Face, x: Array, vector: Array) -> Array:
@@ -73,7 +57,7 @@ def _multipliers(problem: Problem, face: Face, x: Array, vector: Array) -> Array
     return out
 
 
-def _weakest(information: Array) -> Array:
+def _smallest_pivot(information: Array) -> Array:
     """Return the smallest squared pivot of the information scaled to a unit diagonal, (N,)."""
     diagonal = np.diagonal(information, axis1=-2, axis2=-1)
     with np.errstate(invalid="ignore", divide="ignore"):

@@ -1,176 +1,149 @@
-"""From refined candidates to a fix: the best one, the others that the data allow, and the status."""
+"""The verdict: the only place where a pool becomes a fix, so that a status means the same whatever the method."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 
+from optloc.base.records import overwrite, take
 from optloc.base.status import Certificate, Status
 from optloc.base.types import Array
-from optloc.linear.degrees_of_freedom import degrees_of_freedom
-from optloc.linear.normal import Normal, local_covariance
-from optloc.problem.fix import Alternatives, Fix, Stage
-from optloc.problem.layout import state_names
+from optloc.problem.fix import Alternatives, Fix
 from optloc.problem.problem import Problem
-from optloc.solvers.policy import AMBIGUOUS_GAP, FAR, FLAT, LISTED_GAP
-from optloc.solvers.pool import Candidates
-from optloc.solvers.starts.position import distance_of
-from optloc.solvers.verdict.curvature import Curvature, curved
-from optloc.solvers.verdict.horizon import lowest
-from optloc.solvers.verdict.status import explain
+from optloc.solvers.pool import Curvature, Pool
+from optloc.solvers.verdict.explained import conclude
+from optloc.solvers.verdict.status import LOCAL, doubt_sentence, doubtful, fill, rule
 
-_SAME = 1e-2
-
-_LOCAL = Certificate(
-    "local",
-    "a stationary point with a positive definite normal matrix; the best of all candidates refined",
-    "refinement",
-)
+_EPOCHS_SHOWN = 8  # epochs that a sentence names
 
 
-def judge(problem: Problem, pool: Candidates, equations: Any, stages: tuple[Stage, ...]) -> Fix:
-    """Return the fix of a flat batch of problems from their refined candidates.
+def judge(problem: Problem, pool: Pool) -> Fix:
+    """Return the fixes of a flat batch of problems.
 
     Parameters
     ----------
     problem : Problem
         N problems.
-    pool : Candidates
-        Their refined candidates.
-    equations : callable
-        Maps (problem, x) to `Normal` equations at x (N, size).
-    stages : tuple of Stage
-        What was done so far.
+    pool : Pool
+        Their candidates; starts that nobody has refined get the status `unavailable`.
     """
-    size = len(pool.x)
-    pool, endless = _finite(problem, pool)
-    pool = _sorted(pool)
-    best = _preferred(problem, pool)
-    rows = np.arange(size)
-    chosen, value, face = pool.x[rows, best], pool.cost[rows, best], pool.face[rows, best]
-    found = np.isfinite(value)
-    with np.errstate(all="ignore"):
-        at = equations(problem, np.where(found[:, None], chosen, 0.0))
-        curvature = curved(problem, at, chosen, np.where(found, face, 0))
-    others = _alternatives(problem, pool, chosen, value, curvature)
-    reason = np.empty(size, dtype=object)
-    reason[:] = ""
-    fix = Fix(
-        np.where(found[:, None], chosen, np.nan),
-        np.where((found & curvature.regular)[:, None, None], curvature.covariance, np.nan),
-        problem.layout,
-        problem.frame,
-        pool.code[rows, best].astype(np.int8),
-        reason,
-        _fill(size, _LOCAL),
-        others,
-        np.where(found, value, np.nan),
-        degrees_of_freedom(problem),
-        np.broadcast_to(problem.weight, (size, problem.count)),
-        stages,
-        curvature.active,
-        _local(problem, at, curvature.covariance),
-    )
-    explain(problem, fix, curvature)
-    rivalled = endless & (fix.code == Status.OK)
-    fix.code[rivalled], fix.reason[rivalled] = Status.AMBIGUOUS, "positions ever farther away explain the data as well"
+    if pool.curvature is None:
+        return _unrefined(problem, pool)
+    fix = _plain(problem, pool, pool.curvature)
+    if pool.plain is None:
+        fix = _ruled(problem, pool, fix)
+    elif not pool.plain.all():
+        items = np.flatnonzero(~pool.plain)
+        fix = overwrite(fix, items, _ruled(problem.take(items), take(pool, items), fix[items]))
+    if pool.conclusion is not None:
+        for i in np.flatnonzero(pool.conclusion != None):  # noqa: E711  element by element
+            told = pool.conclusion[i]
+            own = told.reshape((1,)) if isinstance(told, Fix) else conclude(problem.take(np.array([i])), told)
+            fix = overwrite(fix, np.array([i]), own)
     return fix
 
 
-def _finite(problem: Problem, pool: Candidates) -> tuple[Candidates, Array]:
-    """Return the pool without runs to infinity where a finite minimum rivals them, and where that was so, (N,)."""
-    none = np.zeros(len(pool.x), dtype=bool)
-    if not any(slot.name == "position" for slot in problem.layout.shared):
-        return pool, none
-    distance = distance_of(problem, problem.layout.take(pool.x, "position"))
+def standing(pool: Pool, fix: Fix) -> Array:
+    """Return the candidates (N, q, size) of a pool that its verdict lets stand: those without a position are NaN."""
+    if pool.curvature is None:
+        return pool.x
+    best = np.where(np.isnan(fix.x).all(-1, keepdims=True), np.nan, pool.x[:, 0])
+    return np.concatenate([best[:, None], pool.x[:, 1:]], axis=1)
+
+
+def _plain(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
+    """Return the fixes of pools as if nothing stood against their best candidates."""
+    count, cost = len(pool), pool.cost[:, 0]
+    reason = fill(count, "")
+    if pool.plain is not None:
+        p_value = doubtful(cost, pool.dof)
+        for i in np.flatnonzero(np.isfinite(p_value) & pool.plain):
+            reason[i] = doubt_sentence(p_value[i])
     with np.errstate(invalid="ignore"):
-        remote = (distance > FLAT) | ((distance > FAR) & (pool.code != Status.OK))
-    if not remote.any():
-        return pool, none
-    near = np.where(~remote & (pool.code == Status.OK), pool.cost, np.inf).min(1)
-    far = np.where(remote, pool.cost, np.inf).min(1)
-    with np.errstate(invalid="ignore"):
-        rivals = np.isfinite(near) & (near - far <= AMBIGUOUS_GAP)
-        alike = rivals & (far - near < AMBIGUOUS_GAP)
-    return replace(pool, cost=np.where(remote & rivals[:, None], np.inf, pool.cost)), alike
-
-
-def _sorted(pool: Candidates) -> Candidates:
-    """Return the candidates of every problem, the cheapest first."""
-    if pool.cost.shape[1] == 1:
-        return pool
-    order = np.argsort(pool.cost, axis=1, kind="stable")
-    cost, code, face = (np.take_along_axis(a, order, axis=1) for a in (pool.cost, pool.code, pool.face))
-    return Candidates(np.take_along_axis(pool.x, order[..., None], axis=1), cost, code, face)
-
-
-def _preferred(problem: Problem, pool: Candidates) -> Array:
-    """Return the slot to answer with: the cheapest, or of finished ones that cost the same that with the best sight."""
-    finished, lowest_cost = pool.code == Status.OK, pool.cost[:, :1]
-    with np.errstate(invalid="ignore"):
-        near = finished & (pool.cost <= lowest_cost + 1e-6 * (1.0 + np.abs(lowest_cost)))
-    best = np.where(near.any(1), near.argmax(1), 0)
-    tied, slot = np.nonzero(near & (near.sum(1) > 1)[:, None])
-    if len(tied) and problem.frame.geodetic:
-        sight = np.full(pool.cost.shape, -np.inf)
-        sight[tied, slot] = np.round(lowest(problem.take(tied), pool.x[tied, slot]), 6)
-        best[tied] = sight[tied].argmax(1)
-    return best
-
-
-def _alternatives(
-    problem: Problem, pool: Candidates, chosen: Array, value: Array, curvature: Curvature
-) -> Alternatives:
-    """Return the other finished minima within the listed gap, each once; those of a run whatever they cost.
-
-    The rivals of a run are few, and by how much the data exclude them is what its user asks.
-    """
-    n, x = problem.layout.n_shared, pool.x
-    limit = np.inf if problem.epochs > 1 else LISTED_GAP
-    with np.errstate(invalid="ignore"):
-        gap = np.where(pool.code == Status.OK, pool.cost - value[:, None], np.inf)
-    gap = np.where(np.isfinite(gap) & (gap < limit), gap, np.inf)
-    kept: list[tuple[Array, Array]] = [(chosen, np.full(len(x), -1.0))]
-    used = np.isfinite(gap).any(0)
-    for slot in np.flatnonzero(used):
-        new = np.isfinite(gap[:, slot])
-        for other, other_gap in kept:
-            new &= ~_same(x[:, slot, :n], other[:, :n], curvature) | ~np.isfinite(other_gap)
-        if new.any():
-            kept.append((np.where(new[:, None], x[:, slot], np.nan), np.where(new, gap[:, slot], np.inf)))
-    if len(kept) == 1:
-        return Alternatives(np.full((len(x), 0, x.shape[-1]), np.nan), np.full((len(x), 0), np.inf))
-    points, gaps = np.stack([k[0] for k in kept[1:]], axis=1), np.stack([k[1] for k in kept[1:]], axis=1)
-    order = np.argsort(gaps, axis=1, kind="stable")
-    keep = int(np.isfinite(gaps).sum(1).max())
-    return Alternatives(
-        np.take_along_axis(points, order[..., None], axis=1)[:, :keep],
-        np.take_along_axis(gaps, order, axis=1)[:, :keep],
+        gap = np.where(np.isfinite(pool.cost[:, 1:]), pool.cost[:, 1:] - cost[:, None], np.inf)
+    return Fix(
+        pool.x[:, 0],
+        curvature.covariance,
+        problem.layout,
+        problem.frame,
+        np.full(count, int(Status.OK), dtype=np.int8),
+        reason,
+        _claims(pool),
+        Alternatives(pool.x[:, 1:], gap),
+        cost,
+        pool.dof,
+        pool.weights,
+        pool.stages,
+        fill(count, ()) if curvature.active is None else curvature.active,
+        curvature.local,
+        fill(count, ()) if pool.asked else None,
     )
 
 
-def _same(x: Array, y: Array, curvature: Curvature) -> Array:
-    """Return where two points are nearer than a tenth of a standard deviation in every direction, or equal."""
-    difference = x - y
-    with np.errstate(all="ignore"):  # a point that constraints hold has no spread
-        squared = (difference[:, None, :] @ curvature.information @ difference[..., None])[:, 0, 0]
-        spread = np.trace(curvature.covariance, axis1=-2, axis2=-1)  # constraints leave directions without information
-        squared = np.maximum(squared, (difference**2).sum(-1) / spread)
-        equal = (np.abs(difference) <= 1e-9 * (1.0 + np.abs(x))).all(-1)
-    return np.asarray(equal | (squared < _SAME))
+def _claims(pool: Pool) -> Array:
+    """Return the certificates (N,) of refined answers: what was proven of them, or that they are minima."""
+    local = fill(len(pool), LOCAL)
+    if pool.certificate is None:
+        return local
+    claimed = np.asarray(pool.certificate != None)  # noqa: E711  element by element
+    return np.where(claimed, pool.certificate, local)
 
 
-def _fill(size: int, value: Any) -> Array:
-    out = np.empty(size, dtype=object)
-    out[:] = value
-    return out
+def _ruled(problem: Problem, pool: Pool, fix: Fix) -> Fix:
+    """Return the fixes with the statuses of the rules."""
+    ruling = rule(problem, pool, fix.alternatives.gap)
+    assert pool.curvature is not None
+    regular = pool.curvature.regular
+    unknown = ruling.gone if regular is None else ruling.gone | ~regular
+    return replace(
+        fix,
+        x=np.where(ruling.gone[:, None], np.nan, fix.x),
+        cov=np.where(unknown[:, None, None], np.nan, fix.cov),
+        code=ruling.code,
+        reason=ruling.reason,
+        certificate=ruling.certificate,
+        cost=np.where(np.isfinite(fix.cost), fix.cost, np.nan),
+    )
 
 
-def _local(problem: Problem, equations: Normal, shared: Array) -> Array | None:
-    """Return the covariance of the states that targets have at each epoch of a run, or None where there are none."""
-    names = {name for i, m in enumerate(problem.motions) for name in state_names(i, len(problem.motions), m.order)}
-    size = sum(slot.size for slot in problem.layout.local if slot.name in names)
-    with np.errstate(all="ignore"):
-        return local_covariance(equations, shared, size) if size else None
+def _unrefined(problem: Problem, pool: Pool) -> Fix:
+    """Return starts as fixes whose status says that they are not refined."""
+    count, n = len(pool), problem.layout.n_shared
+    name = pool.stages[-1].name if pool.stages else "start"
+    return Fix(
+        pool.x[:, 0],
+        np.full((count, n, n), np.nan),
+        problem.layout,
+        problem.frame,
+        np.full(count, int(Status.UNAVAILABLE), dtype=np.int8),
+        fill(count, "not refined"),
+        fill(count, Certificate("unknown", "a start, not refined", name)),
+        Alternatives(pool.x[:, 1:], np.full((count, pool.x.shape[1] - 1), np.nan)),
+        np.full(count, np.nan),
+        pool.dof,
+        pool.weights,
+        pool.stages,
+    )
+
+
+def hide_open_epochs(fix: Fix) -> Fix:
+    """Return the fixes of runs without the states of epochs that leave them open: NaN, and named in the reason."""
+    if fix.local is None or not fix.answered.any():
+        return fix
+    size = fix.local.shape[-1]
+    undone = np.isnan(np.diagonal(fix.local, axis1=-2, axis2=-1)).any(-1) & fix.answered[..., None]
+    if not undone.any():
+        return fix
+    x, reason = fix.x.copy(), fix.reason.copy()
+    n, length = fix.layout.n_shared, fix.layout.n_local
+    states = x[..., n:].reshape(*undone.shape, length)
+    states[undone, :size] = np.nan
+    for i in np.ndindex(reason.shape):
+        where = np.flatnonzero(undone[i])
+        if len(where):
+            shown = ", ".join(map(str, where[:_EPOCHS_SHOWN])) + (" ..." if len(where) > _EPOCHS_SHOWN else "")
+            left = f"{len(where)} of {undone.shape[-1]} epochs do not place their targets: {shown}"
+            reason[i] = f"{reason[i]}; {left}" if reason[i] else left
+    x[..., n:] = states.reshape(*x.shape[:-1], -1)
+    return replace(fix, x=x, reason=reason)

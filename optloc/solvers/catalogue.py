@@ -1,0 +1,216 @@
+"""The optimisation problems behind the starts and bounds: what each serves, how it starts a fix, what it bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+
+from optloc.base.registry import Table
+from optloc.base.types import Array
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
+from optloc.solvers.certify.relaxations import Reference, reference_bound
+from optloc.solvers.starts.angles import Bearings, bearings, by_directions, instrumental, least_worst
+from optloc.solvers.starts.heights import height_starts
+from optloc.solvers.starts.position import squared_range_starts
+from optloc.solvers.starts.registration import closed_form, registrable, relaxed, run_starts
+from optloc.solvers.starts.several_positions import one_position
+from optloc.solvers.starts.squared_range import every, hull, minimum, shor
+
+
+@dataclass(frozen=True, slots=True)
+class Formulation:
+    """An optimisation problem of the package `formulations`, and how a problem is put to it.
+
+    Parameters
+    ----------
+    summary : str
+        What it minimises.
+    kinds : str
+        Measurement kinds it serves.
+    tight : str
+        How good its answer is.
+    cost : str
+        Typical time for one fix.
+    source : str
+        Publication.
+    serves : callable
+        Tells of a flat batch of problems whether `starts` may be asked: problems of one position by default.
+    starts : dict of str to callable
+        By word of a method, what maps a flat batch of N problems to candidates: of one static target with nothing else
+        unknown to positions (N, q, d), metres, else to full vectors (N, q, size); NaN where there is none. Words may
+        be shared: the stage takes the candidates of all formulations that serve.
+    bound : callable, optional
+        Maps a flat batch of problems and their fixes to lower bounds of the maximum-likelihood cost.
+    words : tuple of str
+        Other words of a method behind which it stands.
+    """
+
+    summary: str
+    kinds: str
+    tight: str
+    cost: str
+    source: str
+    serves: Callable[[Problem], bool] = one_position
+    starts: Mapping[str, Callable[[Problem], Array]] = field(default_factory=dict)
+    bound: Callable[[Problem, Fix], Reference] | None = None
+    words: tuple[str, ...] = ()
+
+
+def _seen(locate: Callable[[Bearings], Array]) -> Callable[[Problem], Array]:
+    """Return a start from the bearings of a problem."""
+
+    def start(problem: Problem) -> Array:
+        seen = bearings(problem)
+        nowhere = np.full((problem.batch_shape[0], 1, problem.dimension), np.nan)
+        return nowhere if seen is None else locate(seen)
+
+    return start
+
+
+_run_solved, _run_relaxed = partial(run_starts, begin=closed_form), partial(run_starts, begin=relaxed)
+
+_RANGES = "range, toa, tdoa, range_sum; azimuth, elevation and groa rows linear in (x, r)"
+
+_PROGRAMS: dict[str, Formulation] = {
+    "squared_range": Formulation(
+        "squared-range least squares with one quadratic constraint (GTRS), all stationary points",
+        _RANGES,
+        "exact for its own cost; second weighting close to maximum likelihood",
+        "2 us the minimiser, 12 us all points",
+        "More 1993; Beck, Stoica, Li 2008",
+        starts={
+            "gtrs": partial(squared_range_starts, pick=minimum),
+            "roots": partial(squared_range_starts, pick=every),
+        },
+    ),
+    "squared_range_conic: shor": Formulation(
+        "semidefinite twin of the same problem",
+        _RANGES,
+        "rank one, equal to the GTRS",
+        "0.5 ms",
+        "Shor 1987",
+        starts={"sdp": partial(squared_range_starts, pick=shor)},
+    ),
+    "squared_range_conic: hull": Formulation(
+        "second-order cone relaxation |x| <= r of the same problem",
+        _RANGES,
+        "a lower bound; tight where the linear fit violates |x| <= r, about half of all TDOA cases",
+        "0.2 ms",
+        "convex hull of the cone",
+        starts={"socp": partial(squared_range_starts, pick=hull)},
+    ),
+    "sparse_errors": Formulation(
+        "linear rows with gross errors of a few, priced by the sum of their sizes, on the cones of the ranges",
+        _RANGES,
+        "convex, not exact: a start and a guess of the wrong rows; from about 20 stations both are good",
+        "1 ms",
+        "Donoho, Johnstone 1994; Yuan, Lin 2006; She, Owen 2011",
+        words=("sparse",),
+    ),
+    "range_height": Formulation(
+        "ranges known up to one unknown meet an ellipsoid: a quartic, with horizon",
+        "tdoa, toa, range_sum with a known height",
+        "exact: all points that fit",
+        "0.1 ms",
+        "Ho, Chan 1997, exact for the ellipsoid",
+        starts={"gtrs": height_starts, "roots": height_starts, "socp": height_starts},
+    ),
+    "range_height_conic": Formulation(
+        "3 x 3 lift after elimination of the range differences, nearest to the point below the satellites",
+        "two differences and a height",
+        "rank one within 25 degrees of the point below",
+        "1 ms",
+        "Shor 1987",
+        starts={"sdp": partial(height_starts, relax=True)},
+    ),
+    "bearing_ls": Formulation(
+        "pseudo-linear least squares of angles, weighted, with an instrumental-variable pass",
+        "azimuth, elevation",
+        "asymptotically unbiased; as good as maximum likelihood to 0.1 %",
+        "30 us",
+        "Dogancay 2006, 2015",
+        starts={"wiv": _seen(instrumental)},
+    ),
+    "bearing_course": Formulation(
+        "the same for a target on a polynomial course, over all epochs at once; one station that turns may do",
+        "azimuth, elevation of a moving target",
+        "asymptotically unbiased; as good as maximum likelihood to 0.1 %",
+        "0.5 ms for 100 angles",
+        "Dogancay 2006, 2015",
+        words=("gtrs", "roots", "wiv"),
+    ),
+    "direction_sdp": Formulation(
+        "unknown unit directions that meet in a point, lifted; with a minorant a bound of the angular cost",
+        "azimuth and elevation",
+        "100 % to 20 mrad, 98 % at 50 mrad",
+        "2 ms two stations, 10 ms four",
+        "epipolar equalities; Shor 1987",
+        starts={"directions": _seen(by_directions)},
+        bound=partial(reference_bound, method="directions"),
+    ),
+    "moment_sdp": Formulation(
+        "order-2 moments of position and range errors in a box: a lower bound of the likelihood's cost",
+        "range, toa, tdoa, range_sum",
+        "89-100 % to 30 m",
+        "50 ms five stations, 100 ms six",
+        "Lasserre 2001",
+        bound=partial(reference_bound, method="moment"),
+    ),
+    "minimax_cone": Formulation(
+        "least worst angle by bisection over second-order cones; proves that bounds contradict each other",
+        "azimuth, elevation with bounded errors",
+        "exact for its own cost",
+        "10 ms",
+        "Kahl, Hartley 2008",
+        starts={"minimax": _seen(least_worst)},
+    ),
+    "bistatic": Formulation(
+        "closed-form range of one receiver and one illuminator; polynomial course of several epochs",
+        "range_sum with azimuth and elevation",
+        "exact without noise",
+        "50 us",
+        "Skolnik 1961",
+        words=("gtrs", "roots"),
+    ),
+    "registration": Formulation(
+        "place, course and biases of a run: reference ranges projected out, then tied to the lifted course",
+        "tdoa, toa, range_sum of moving stations or a moving target",
+        "exact without noise; with noise a start near the bound",
+        "0.3 ms",
+        "Chan, Ho 1994; Beck, Stoica, Li 2008",
+        serves=registrable,
+        starts={"gtrs": _run_solved, "roots": _run_solved, "socp": _run_solved},
+    ),
+    "registration_sdp": Formulation(
+        "the same lifted with its reference ranges; price on the trace, prior on the biases",
+        "tdoa, toa of moving stations",
+        "never tight: a start",
+        "1 s",
+        "Shor 1987",
+        serves=registrable,
+        starts={"sdp": _run_relaxed},
+    ),
+    "lifted": Formulation(
+        "order-1 lift [1, x, r]: a baseline for studies, never a default",
+        "tdoa, range",
+        "never for tdoa: its optimum is zero for any data",
+        "2 ms",
+        "Shor 1987",
+    ),
+    "nls": Formulation(
+        "weighted nonlinear least squares with bounds, equalities and inequalities (IPOPT)",
+        "all",
+        "a local minimum",
+        "2 ms",
+        "Waechter, Biegler 2006",
+        words=("nlp",),
+    ),
+}
+
+FORMULATIONS: Table[Formulation] = Table("optloc.formulations", lambda value: isinstance(value, Formulation), _PROGRAMS)
+"""Formulations by name: add one with one file and one entry, or from another package with an entry point of
+``optloc.formulations``."""

@@ -1,0 +1,117 @@
+"""What comes from outside: fixes as pools, and solvers that take and return fixes as stages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from optloc.base import linalg
+from optloc.base.status import Status
+from optloc.base.types import Array
+from optloc.problem.fix import Fix, Stage
+from optloc.problem.problem import Problem
+from optloc.solvers.policy import AMBIGUOUS_GAP
+from optloc.solvers.pool import Curvature, Pool, begin
+from optloc.solvers.stages import Solver
+from optloc.solvers.verdict.judge import judge
+from optloc.solvers.verdict.minima import settle
+from optloc.solvers.verdict.status import LOCAL, UNKNOWN, fill
+
+FixSolver = Callable[[Problem, Fix | None], Fix]
+"""A solver as others write it: it maps a flat batch of problems, and their fixes or None, to fixes."""
+
+
+def adapt(solver: FixSolver) -> Solver:
+    """Return a solver of others as a stage."""
+
+    def stage(problem: Problem, pool: Pool | None) -> Pool:
+        fix = solver(problem, None if pool is None else judge(problem, pool))
+        return accept(problem, fix)
+
+    return stage
+
+
+def given(problem: Problem, start: Any) -> Fix:
+    """Return given starts (N, size) or (N, q, size) of a flat batch as fixes that nobody has refined."""
+    return judge(problem, begin(problem, np.asarray(start, dtype=float)))
+
+
+def judge_points(problem: Problem, start: Array, x: Array, cost: Array, code: Array, stage: Stage) -> Fix:
+    """Return the verdict on points that a solver of others has reached.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems.
+    start : array (N, size) or (N, q, size)
+        Where it began.
+    x : array (N, q, size)
+        Where it ended.
+    cost : array (N, q)
+        Cost there; infinite where it ended nowhere.
+    code : int array (N, q)
+        `Status` that it claims.
+    stage : Stage
+        What it did.
+    """
+    faces = np.zeros(cost.shape, dtype=int)
+    found = replace(begin(problem, start), x=x, cost=cost, code=code.astype(np.int8), face=faces)
+    return judge(problem, settle(problem, found, stage))
+
+
+def accept(problem: Problem, fix: Fix) -> Pool:
+    """Return fixes of a flat batch as a pool whose verdict they are.
+
+    Starts stay starts. What a verdict cannot find in the numbers of a fix (why there is no answer, what was left out)
+    is taken over word for word.
+    """
+    x = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
+    shape = x.shape[:2]
+    if np.isnan(fix.cost).all() and (fix.code == Status.UNAVAILABLE).all():
+        code = np.full(shape, int(Status.UNAVAILABLE), dtype=np.int8)
+        return Pool(x, np.full(shape, np.nan), code, np.zeros(shape, dtype=int), fix.weights, fix.dof, fix.stages)
+    cost = np.concatenate([fix.cost[:, None], fix.cost[:, None] + fix.alternatives.gap], axis=1)
+    listed = np.where(np.isfinite(fix.alternatives.gap), int(Status.OK), int(Status.UNAVAILABLE))
+    known = np.asarray(np.isfinite(fix.cov).all((-1, -2)))
+    information, regular = linalg.inverse(np.where(known[:, None, None], fix.cov, np.eye(fix.cov.shape[-1])))
+    near = (fix.alternatives.gap < AMBIGUOUS_GAP).any(1)
+    verbatim = ~fix.answered if fix.explanations is None else ~fix.answered | (_lengths(fix.explanations) > 0)
+    return Pool(
+        x,
+        np.where(np.isfinite(cost), cost, np.inf),
+        np.concatenate([np.where(fix.answered, int(Status.OK), fix.code)[:, None], listed], axis=1).astype(np.int8),
+        np.zeros(shape, dtype=int),
+        fix.weights,
+        fix.dof,
+        fix.stages,
+        refined=True,
+        curvature=Curvature(fix.cov, information, known & regular, None, fix.active, fix.local),
+        endless=(fix.code == Status.AMBIGUOUS) & ~near,
+        loss="" if np.array_equal(fix.weights, np.broadcast_to(problem.weight, fix.weights.shape)) else "given",
+        searched=fix.code == Status.SEARCHED,
+        remark=np.where(fix.code == Status.SEARCHED, fix.reason, ""),
+        certificate=_claims(fix.certificate),
+        asked=fix.explanations is not None,
+        conclusion=_verbatim(fix, verbatim),
+    )
+
+
+def _lengths(explanations: Array) -> Array:
+    return np.array([len(found) for found in explanations], dtype=int)
+
+
+def _claims(certificate: Array) -> Array:
+    """Return certificates that claim something; None in the place of the others."""
+    out = np.array(certificate)
+    out[[each in (LOCAL, UNKNOWN) for each in certificate]] = None
+    return out
+
+
+def _verbatim(fix: Fix, items: Array) -> Array:
+    out = fill(len(fix), None)
+    for i in np.flatnonzero(items):
+        out[i] = fix[int(i)]
+    return out

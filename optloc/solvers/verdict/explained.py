@@ -1,0 +1,120 @@
+"""Data that contradict each other: what the explanations that a search has found mean for status and sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optloc.base.status import Certificate, Status
+from optloc.base.types import Array
+from optloc.problem.fix import Alternatives, Explanation, Fix, Suspect
+from optloc.problem.problem import Problem
+
+_SHOWN = 4  # names in a sentence; more are not read
+_UNKNOWN = Certificate("unknown", "the data contradict each other", "none")
+
+
+@dataclass(frozen=True, slots=True)
+class Conclusion:
+    """What a search for suspects says about one problem.
+
+    Parameters
+    ----------
+    explanations : tuple of Explanation
+        All ways of leaving out least, the most plausible first; empty where none passes.
+    rest : Fix
+        Of what the first explanation leaves, without batch axes; of all the data where there is none.
+    alternatives : Alternatives
+        Other positions, of the first explanation and of the others.
+    tried : str
+        Where there is no explanation: what came closest.
+    """
+
+    explanations: tuple[Explanation, ...]
+    rest: Fix
+    alternatives: Alternatives
+    tried: str = ""
+
+
+def conclude(problem: Problem, conclusion: Conclusion) -> Fix:
+    """Return the fix, a flat batch of one, that a conclusion means for its problem.
+
+    One explanation is taken; several make the fix ambiguous, none makes it contradictory.
+    """
+    rest, explanations = conclusion.rest, conclusion.explanations
+    if not explanations:
+        return _contradictory(conclusion).reshape((1,))
+    weights = np.array(np.broadcast_to(problem.weight, (1, problem.count))[0])
+    weights[[row for suspect in explanations[0].suspects for row in suspect.rows]] = 0.0
+    several = len(explanations) > 1
+    return replace(
+        rest,
+        x=explanations[0].x,
+        layout=problem.layout,
+        code=np.array(int(Status.AMBIGUOUS) if several and rest.answered else int(rest.code), dtype=np.int8),
+        reason=_object(_rivals(explanations) if several else _named(explanations[0], rest)),
+        alternatives=conclusion.alternatives,
+        weights=weights,
+        local=rest.local if rest.layout == problem.layout else None,
+        explanations=_object(explanations),
+    ).reshape((1,))
+
+
+def _contradictory(conclusion: Conclusion) -> Fix:
+    """Return the fix with nothing left out, without a covariance: the noise that it would follow from is refuted."""
+    whole, reason = conclusion.rest, conclusion.tried
+    if whole.status == Status.CONTRADICTORY and whole.reason[()]:  # what the constraints have to do with it
+        reason = f"{whole.reason[()]}; {reason}"
+    return replace(
+        whole,
+        cov=np.full_like(whole.cov, np.nan),
+        code=np.array(int(Status.CONTRADICTORY), dtype=np.int8),
+        reason=_object(reason),
+        certificate=_object(_UNKNOWN),
+        local=None if whole.local is None else np.full_like(whole.local, np.nan),
+        explanations=_object(()),
+    )
+
+
+def list_names(parts: Sequence[str]) -> str:
+    """Return names as a sentence has them: "a, b and c"."""
+    if len(parts) > _SHOWN:
+        parts = [*parts[:_SHOWN], f"{len(parts) - _SHOWN} more"]
+    return parts[0] if len(parts) == 1 else ", ".join(parts[:-1]) + " and " + parts[-1]
+
+
+def _named(explanation: Explanation, rest: Fix) -> str:
+    parts = [f"{suspect.name}{_error(suspect)}" for suspect in explanation.suspects]
+    reason = f"left out: {list_names(parts)}; p = {_p(explanation.suspects[0].p_with)} with"
+    reason += "" if len(parts) == 1 else " the first"
+    own = str(rest.reason[()] or "")
+    return f"{reason}, {_p(explanation.p_value)} without" + (f"; {own}" if own else "")
+
+
+def _rivals(explanations: Sequence[Explanation]) -> str:
+    shown = [" and ".join(one.names) for one in explanations[:_SHOWN]]
+    more = f" or {len(explanations) - _SHOWN} others" if len(explanations) > _SHOWN else ""
+    common = set(explanations[0].names).intersection(*(one.names for one in explanations[1:]))
+    sure = f"; {list_names(sorted(common))} in all of them" if common else ""
+    blind = all(one.dof == 0 for one in explanations)
+    why = "an error is there, but redundancy 1 does not tell where" if blind else "several explanations pass"
+    return f"{why}: {' or '.join(shown)}{more}{sure}"
+
+
+def _error(suspect: Suspect) -> str:
+    """Return the error of a suspect of one number in words."""
+    if len(suspect.error) != 1 or not np.isfinite(suspect.error[0]):
+        return ""
+    return f" (error {suspect.error[0]:+.3g}, sigma {suspect.sigma[0]:.2g})"
+
+
+def _p(value: float) -> str:
+    return "none" if np.isnan(value) else f"{value:.1g}"
+
+
+def _object(value: object) -> Array:
+    out = np.empty((), dtype=object)
+    out[()] = value
+    return out
