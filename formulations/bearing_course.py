@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from formulations.algebra import Array, Mask, dot, span, uncentre
-from formulations.bearing_ls import Rays, rays
+from formulations.bearing_ls import Rays, lengths, look, rays
 
 # Singular value, over the largest one, of scaled rows that counts as zero: five decades above their rounding errors.
 _RANK = 1e-10
@@ -77,25 +77,12 @@ class _Run:
         """Return the lines of sight (N, m, d) to a course, in the frame of the stations."""
         return np.asarray(self.powers @ c - self.station)
 
-    def own(self, line: Array) -> Array:
-        """Return lines of sight in the axes of each station."""
-        return line if self.axes is None else np.einsum("nmij,nmj->nmi", self.axes, line)
-
-    def lengths(self, c: Array) -> Array:
-        """Return horizontal, then slant ranges: what turns an angle's error into a row's."""
-        line = self.own(self.line(c))
-        flat = np.maximum(np.hypot(line[..., 0], line[..., 1]), self.least)
-        return np.concatenate([flat, np.hypot(flat, line[..., 2])], axis=-1) if self.both else flat
-
-    def predict(self, c: Array) -> Rays:
-        """Return the directions in which a course would have been seen."""
-        line = self.own(self.line(c))
-        flat = np.hypot(line[..., 0], line[..., 1])
-        azimuth = np.arctan2(line[..., 1], line[..., 0])
-        return rays(azimuth, np.arctan2(line[..., 2], flat) if self.both else None, self.axes)
+    def own(self, c: Array) -> Array:
+        """Return the same in the axes of each station."""
+        return self.line(c) if self.axes is None else np.einsum("nmij,nmj->nmi", self.axes, self.line(c))
 
 
-def sighted_courses(
+def sight_courses(
     azimuth: ArrayLike,
     station: ArrayLike,
     time: ArrayLike,
@@ -153,8 +140,10 @@ def sighted_courses(
         G = run.design(run.normal)
         c = plain = _balance(G, G, run.right, W, order)
         for _ in range(passes):
-            c = _balance(G, G, run.right, W / run.lengths(c), order)
-        final = _balance(run.design(_normals(run.predict(c))), G, run.right, W / run.lengths(c), order)
+            c = _balance(G, G, run.right, W / lengths(run.own(c), run.least), order)
+        own = run.own(c)
+        instruments = run.design(look(own, axes).normals)
+        final = _balance(instruments, G, run.right, W / lengths(own, run.least), order)
         # a bearing and its opposite give the same row: only now does it count where the target stands
         front = dot(run.line(final), seen.ahead) > 0.0
         ok = np.asarray(np.isfinite(final).all(axis=(-2, -1)))
@@ -163,16 +152,11 @@ def sighted_courses(
 
 
 def _run(S: Array, axes: Array | None, powers: Array, seen: Rays, both: bool) -> _Run:
-    normal = _normals(seen)
+    normal = seen.normals
     right = dot(normal, np.concatenate([S, S], axis=1) if both else S)
     size = np.sqrt(dot(S, S)).max(axis=-1, keepdims=True)
     # one station at the origin has no size: any positive length will do
     return _Run(S, axes, powers, normal, right, both, np.maximum(_NEAR * size, 1e-300))
-
-
-def _normals(seen: Rays) -> Array:
-    """Rows ``g`` (up to sign): the azimuths' first, then the elevations'."""
-    return seen.across if seen.upward is None else np.concatenate([seen.across, seen.upward], axis=-2)
 
 
 def _balance(Z: Array, G: Array, b: Array, W: Array, order: int) -> Array:

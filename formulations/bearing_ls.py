@@ -53,6 +53,11 @@ class Rays:
     across: Array
     upward: Array | None
 
+    @property
+    def normals(self) -> Array:
+        """Rows ``g`` (up to sign), shape (..., N or 2 N, d): those of the azimuths, then those of the elevations."""
+        return self.across if self.upward is None else np.concatenate([self.across, self.upward], axis=-2)
+
 
 @dataclass(frozen=True, slots=True)
 class Sighted:
@@ -165,14 +170,14 @@ def sight(
         middle = (share * S).sum(axis=-2, keepdims=True) / share.sum(axis=-2, keepdims=True)
         S = S - middle
         least = _NEAR * np.sqrt((share * S * S).sum(axis=(-2, -1)))[..., None]
-        G, W = _rows(seen), np.concatenate([wA, wE], axis=-1) if E is not None else wA
+        G, W = seen.normals, np.concatenate([wA, wE], axis=-1) if E is not None else wA
         own = np.concatenate([S, S], axis=-2) if E is not None else S
         b = dot(G, own)
         point = plain = _balance(G, G, b, W)
         for _ in range(passes):
-            point = _balance(G, G, b, W / _lengths(point, S, turn, least, E is not None))
-        scale = W / _lengths(point, S, turn, least, E is not None)
-        final = _balance(_rows(_predict(point, S, turn, E is not None)), G, b, scale)
+            point = _balance(G, G, b, W / lengths(_local(point, S, turn), least))
+        line = _local(point, S, turn)
+        final = _balance(look(line, turn).normals, G, b, W / lengths(line, least))
         # an azimuth and its opposite give the same row: only now does it count where the target stands
         front = dot(final[..., None, :] - S, seen.ahead) > 0.0
     ok = np.asarray(np.isfinite(final).all(axis=-1))
@@ -236,27 +241,49 @@ def meeting(direction: Array, station: Array) -> Array:
     return point
 
 
-def _rows(seen: Rays) -> Array:
-    """Rows ``g`` (up to sign): the azimuths' first, then the elevations'."""
-    return seen.across if seen.upward is None else np.concatenate([seen.across, seen.upward], axis=-2)
+def look(line: Array, axes: ArrayLike | None = None) -> Rays:
+    """Turn lines of sight into directions.
+
+    Parameters
+    ----------
+    line : Array, shape (..., N, d)
+        From each station to the target, in the station's axes; with elevations in space.
+    axes : array_like, shape (..., N, d, d), optional
+        Rows are the unit vectors of each station's axes; None: those of the frame.
+
+    Returns
+    -------
+    Rays
+        Unit vectors in the frame.
+    """
+    azimuth = np.arctan2(line[..., 1], line[..., 0])
+    if line.shape[-1] == 2:
+        return rays(azimuth, None, axes)
+    return rays(azimuth, np.arctan2(line[..., 2], np.hypot(line[..., 0], line[..., 1])), axes)
+
+
+def lengths(line: Array, least: Array) -> Array:
+    """Return what turns an angle's error into a row's: horizontal ranges, then, in space, slant ranges.
+
+    Parameters
+    ----------
+    line : Array, shape (..., N, d)
+        From each station to the target, in the station's axes.
+    least : Array, broadcast to shape (..., N)
+        Shortest horizontal range.
+
+    Returns
+    -------
+    Array, shape (..., N) or (..., 2 N)
+        One for each row.
+    """
+    flat = np.maximum(np.hypot(line[..., 0], line[..., 1]), least)
+    return flat if line.shape[-1] == 2 else np.concatenate([flat, np.hypot(flat, line[..., 2])], axis=-1)
 
 
 def _local(point: Array, S: Array, turn: Array | None) -> Array:
     line = point[..., None, :] - S
     return line if turn is None else np.einsum("...ij,...j->...i", turn, line)
-
-
-def _lengths(point: Array, S: Array, turn: Array | None, least: Array, both: bool) -> Array:
-    """Horizontal ranges, then slant ranges: what turns an angle's error into a row's."""
-    line = _local(point, S, turn)
-    flat = np.maximum(np.hypot(line[..., 0], line[..., 1]), least)
-    return np.concatenate([flat, np.hypot(flat, line[..., 2])], axis=-1) if both else flat
-
-
-def _predict(point: Array, S: Array, turn: Array | None, both: bool) -> Rays:
-    line = _local(point, S, turn)
-    flat = np.hypot(line[..., 0], line[..., 1])
-    return rays(np.arctan2(line[..., 1], line[..., 0]), np.arctan2(line[..., 2], flat) if both else None, turn)
 
 
 def _balance(Z: Array, G: Array, b: Array, W: Array) -> Array:

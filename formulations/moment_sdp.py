@@ -149,14 +149,14 @@ def moment_problem(stations: int, dimension: int) -> Any:
     cone = cp.Parameter(own.cone.shape[1], name="cone")
     rule = cp.Parameter((stations - 1, dimension + 5), name="rule")
 
-    def arranged(index: Index) -> Any:
+    def arrange(index: Index) -> Any:
         return cp.reshape(y[index.ravel()], index.shape, order="C")
 
-    errors = arranged(own.table[0, 0])
+    errors = arrange(own.table[0, 0])
     # the moment matrix, then those of (1 - t^2), (1 - s_k^2) times two errors; the rules times 1, s and t
-    demands = [arranged(own.matrix) >> 0, y[0] == 1, arranged(own.cone) @ cone == 0]
-    demands += [errors - arranged(own.table[k, k]) >> 0 for k in range(1, dimension + 2)]
-    demands += [arranged(index) @ rule[i] == 0 for i, index in enumerate(own.rules)]
+    demands = [arrange(own.matrix) >> 0, y[0] == 1, arrange(own.cone) @ cone == 0]
+    demands += [errors - arrange(own.table[k, k]) >> 0 for k in range(1, dimension + 2)]
+    demands += [arrange(index) @ rule[i] == 0 for i, index in enumerate(own.rules)]
     return cp.Problem(cp.Minimize(cost @ y[own.cost]), demands)
 
 

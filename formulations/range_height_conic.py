@@ -77,7 +77,7 @@ def _relaxation(backend: str) -> Relaxation:
     return Relaxation(lifted_problem(), backend=backend, settings=tight(backend, 1e-11))
 
 
-def lifted(
+def lift(
     stations: Array, sign: Array, offset: Array, surface: Ellipsoid, near: Array, *, backend: str = "CLARABEL"
 ) -> Lifted:
     """Solve the relaxation.

@@ -115,7 +115,7 @@ def candidates(course: Course, order: int = 0) -> tuple[Array, Array]:
         guess = _free_ranges(course, order)
         state = np.full((len(course.offset), 1, order + 1, course.station.shape[-1]), np.nan)
         for _ in range(_LIFTED_PASSES):
-            state, guess = _lifted_ranges(course, guess, order)
+            state, guess = _tie_ranges(course, guess, order)
         branches = _branches(course, state[:, 0], guess.reference)
     return np.concatenate([state, branches], axis=1), guess.bias
 
@@ -134,7 +134,7 @@ def _rows(course: Course, guess: _Guess) -> tuple[Array, Array, Array, Array]:
     return r, (others - first) / r[..., None], course.sign * m / r, right
 
 
-def _moved(course: Course, columns: Array, order: int) -> Array:
+def _course_columns(course: Course, columns: Array, order: int) -> Array:
     """Return columns (N, B, S, d) of a place as columns (N, B, S, (order + 1) d) of a course."""
     powers = _powers(course, order + 1)
     spread = powers[:, None, :, None] * columns[..., None, :]
@@ -149,7 +149,7 @@ def _free_ranges(course: Course, order: int) -> _Guess:
         r, place, gain, right = _rows(course, guess)
         if turn == 0:  # no ranges are known yet: all rows weigh alike, and biases stay at their prior means
             place, gain, right = place * r[..., None], gain * r, right * r
-        columns = [_moved(course, place, order)]
+        columns = [_course_columns(course, place, order)]
         if turn:
             columns.append(np.broadcast_to(-course.bias, (*right.shape, q)))
         seen = course.whiten @ np.concatenate([*columns, gain[..., None], right[..., None]], axis=-1)
@@ -163,7 +163,7 @@ def _free_ranges(course: Course, order: int) -> _Guess:
         rest = seen[..., -1] - (seen[..., :-2] @ y[:, None, :, None])[..., 0]
         reference = (free * rest).sum(-1) / np.where(norm > 0.0, norm, 1.0)[..., 0]
         bias = guess.bias + y[:, -q:] if turn and q else guess.bias
-        guess = _Guess(bias, _smoothed(course, reference, order))
+        guess = _Guess(bias, _smooth(course, reference, order))
     return guess
 
 
@@ -176,10 +176,10 @@ def _least_squares(rows: Array, course: Course, bias: Array | None, cut: float) 
         index = np.arange(matrix.shape[-1])[-bias.shape[1] :]
         matrix[:, index, index] += course.sigma**-2.0
         vector[:, index] += (course.mean - bias) * course.sigma**-2.0
-    return _solved(matrix, vector, cut)
+    return _solve(matrix, vector, cut)
 
 
-def _solved(matrix: Array, vector: Array, cut: float) -> Array:
+def _solve(matrix: Array, vector: Array, cut: float) -> Array:
     """Return the solution of scaled normal equations without their directions of (almost) no information."""
     diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
     scale = 1.0 / np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
@@ -192,11 +192,11 @@ def _solved(matrix: Array, vector: Array, cut: float) -> Array:
     return np.where(good[:, None], y, np.nan)
 
 
-def _smoothed(course: Course, reference: Array, order: int) -> Array:
+def _smooth(course: Course, reference: Array, order: int) -> Array:
     """Return reference ranges whose squares are those of some course: r^2 - |s|^2 = lifts(t) - 2 s' x(t)."""
     first = course.station[..., 0, :]
     lifts = _powers(course, 2 * order + 1)
-    along = _moved(course, first[..., None, :], order)[..., 0, :]
+    along = _course_columns(course, first[..., None, :], order)[..., 0, :]
     basis = np.concatenate([np.broadcast_to(lifts, (*along.shape[:-1], lifts.shape[-1])), along], axis=-1)
     known = (first**2).sum(-1)
     square = (reference**2 - known)[..., None]
@@ -205,7 +205,7 @@ def _smoothed(course: Course, reference: Array, order: int) -> Array:
     return np.asarray(np.sqrt(np.maximum(fitted[..., 0] + known, _NEAREST**2)))
 
 
-def _lifted_ranges(course: Course, guess: _Guess, order: int) -> tuple[Array, _Guess]:
+def _tie_ranges(course: Course, guess: _Guess, order: int) -> tuple[Array, _Guess]:
     """Return the candidates of stage 1 (N, C, order + 1, d), and biases and reference ranges of the best."""
     q, d, n = course.bias.shape[-1], course.station.shape[-1], (order + 1) * course.station.shape[-1]
     _, place, gain, right = _rows(course, guess)
@@ -215,24 +215,24 @@ def _lifted_ranges(course: Course, guess: _Guess, order: int) -> tuple[Array, _G
     lifts = (gain / (2.0 * r))[..., None] * _powers(course, 2 * order + 1)[:, None, :]
     columns = [
         np.broadcast_to(-course.bias, (*right.shape, q)),
-        _moved(course, place - (gain / r)[..., None] * first, order),
+        _course_columns(course, place - (gain / r)[..., None] * first, order),
         lifts,
         (right - gain * (r**2 + square) / (2.0 * r))[..., None],
     ]
     seen = course.whiten @ np.concatenate(columns, axis=-1)
-    rows = _with_prior(seen.reshape(len(seen), -1, seen.shape[-1]), course, guess.bias)
+    rows = _add_prior(seen.reshape(len(seen), -1, seen.shape[-1]), course, guess.bias)
     if order == 0:
-        y, more = _constrained(rows, q, d)
+        y, more = _solve_constrained(rows, q, d)
     else:
         matrix, vector = np.swapaxes(rows[..., :-1], -1, -2) @ rows[..., :-1], (rows[..., :-1] * rows[..., -1:]).sum(-2)
-        y = _solved(matrix, vector, _LIFTED_CUT)
+        y = _solve(matrix, vector, _LIFTED_CUT)
         more = y[:, None, q : q + n]
     state = more.reshape(len(more), -1, order + 1, d)
     distance = np.maximum(_reference(course, y[:, q : q + n], y[:, q + n :], order), _NEAREST**2)
     return state, _Guess(guess.bias + y[:, :q], np.sqrt(distance))
 
 
-def _with_prior(rows: Array, course: Course, bias: Array) -> Array:
+def _add_prior(rows: Array, course: Course, bias: Array) -> Array:
     """Return rows (N, R, q + n + 1) with those of the prior of the biases, whose columns are the first."""
     q = bias.shape[1]
     prior = np.zeros((len(rows), q, rows.shape[-1]))
@@ -242,7 +242,7 @@ def _with_prior(rows: Array, course: Course, bias: Array) -> Array:
     return np.concatenate([rows, prior], axis=1)
 
 
-def _constrained(rows: Array, q: int, d: int) -> tuple[Array, Array]:
+def _solve_constrained(rows: Array, q: int, d: int) -> tuple[Array, Array]:
     """Return biases, place and its square (N, q + d + 1), and all places (N, C, d), of rows [E | x | |x|^2 | right].
 
     The biases are free and leave the problem by a triangular factor; what is left is a squared-range problem.
@@ -257,14 +257,14 @@ def _constrained(rows: Array, q: int, d: int) -> tuple[Array, Array]:
     points = np.where((valid & usable[:, None])[..., None], points, np.nan)
     left = upper[:, :q, -1] - (upper[:, :q, q:-1] @ points[:, 0, :, None])[..., 0]
     inner = upper[:, :q, :q]
-    bias = _solved(np.swapaxes(inner, -1, -2) @ inner, (inner * left[..., None]).sum(-2), 0.0) / scale[:, :q]
+    bias = _solve(np.swapaxes(inner, -1, -2) @ inner, (inner * left[..., None]).sum(-2), 0.0) / scale[:, :q]
     return np.concatenate([bias, points[:, 0]], axis=-1), points[..., :d]
 
 
 def _reference(course: Course, theta: Array, lifts: Array, order: int) -> Array:
     """Return the squared ranges (N, B) of the reference station."""
     first = course.station[..., 0, :]
-    along = _moved(course, first[..., None, :], order)[..., 0, :]
+    along = _course_columns(course, first[..., None, :], order)[..., 0, :]
     inner = (along @ theta[..., None])[..., 0]
     return np.asarray(lifts @ _powers(course, 2 * order + 1).T - 2.0 * inner + (first**2).sum(-1))
 

@@ -147,7 +147,7 @@ def registration(
     for price in prices:
         answer = relaxation.solve({**data, "price": price * weight}, bound=False)
         if np.isfinite(answer.values["lift"]).all():
-            found.append(_started(run, weight, price, answer))
+            found.append(_read_off(run, weight, price, answer))
     return tuple(sorted(found, key=lambda one: one.cost))
 
 
@@ -330,7 +330,7 @@ def _parameters(run: Windows) -> dict[str, Array]:
     }
 
 
-def _started(run: Windows, weight: Array, price: float, answer: Answer) -> Started:
+def _read_off(run: Windows, weight: Array, price: float, answer: Answer) -> Started:
     lift = answer.values["lift"]
     inside = slice(1, 1 + len(weight))
     target = lift[0, inside]

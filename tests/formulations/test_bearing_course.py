@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from formulations.bearing_course import sighted_courses
+from formulations.bearing_course import sight_courses
 
 RNG = np.random.default_rng(3)
 TIMES = np.arange(12.0) + 40.0
@@ -35,7 +35,7 @@ def seen(order, axes=None, d=3):
 def test_exact_bearings_of_one_moving_station_give_the_course(order, turned):
     axes = np.linalg.qr(RNG.standard_normal((12, 3, 3)))[0] if turned else None
     args, more = seen(order, axes)
-    found = sighted_courses(*args, **more, axes=None if axes is None else axes[None], order=order)
+    found = sight_courses(*args, **more, axes=None if axes is None else axes[None], order=order)
     assert found.ahead.all()
     for course in (found.plain, found.weighted, found.instrumental):
         where = path(course[0]) - path(COURSE[: order + 1])
@@ -44,7 +44,7 @@ def test_exact_bearings_of_one_moving_station_give_the_course(order, turned):
 
 def test_azimuths_give_a_course_in_the_plane():
     args, _ = seen(1, d=2)
-    found = sighted_courses(*args, order=1)
+    found = sight_courses(*args, order=1)
     assert path(found.instrumental[0]) == pytest.approx(path(COURSE[:2, :2]), abs=1e-9)
 
 
@@ -55,7 +55,7 @@ def test_absent_angles_are_not_read_and_a_batch_is_one_by_one():
     A[0, 3], w[0, 3] = np.nan, 0.0
     E[1, 5], v[1, 5] = np.nan, 0.0
     A[2, 0] = np.nan
-    found = sighted_courses(A, S, t, w, elevation=E, elevation_weight=v, order=1)
+    found = sight_courses(A, S, t, w, elevation=E, elevation_weight=v, order=1)
     assert found.ok.tolist() == [True, True, False]
     assert np.isnan(found.instrumental[2]).all()
     for i in (0, 1):
@@ -66,20 +66,20 @@ def test_what_the_bearings_leave_open_is_nan():
     still = np.zeros((1, 12, 3))
     A, E = angles(path(COURSE[:2]))
     ones = np.ones((1, 12))
-    one_place = sighted_courses(A[None], still, TIMES, ones, elevation=E[None], elevation_weight=ones, order=1)
+    one_place = sight_courses(A[None], still, TIMES, ones, elevation=E[None], elevation_weight=ones, order=1)
     assert not one_place.ok.any()
     args, more = seen(1)
-    no_heights = sighted_courses(*args, order=1)
+    no_heights = sight_courses(*args, order=1)
     assert not no_heights.ok.any()
     few = [value[:, :2] if np.ndim(value) > 1 else value[:2] for value in args]
-    two_epochs = sighted_courses(*few, **{name: value[:, :2] for name, value in more.items()}, order=2)
+    two_epochs = sight_courses(*few, **{name: value[:, :2] for name, value in more.items()}, order=2)
     assert not two_epochs.ok.any()
     assert np.isnan(two_epochs.plain).all()
 
 
 def test_bearings_from_behind_are_not_ahead():
     args, more = seen(0)
-    back = sighted_courses(args[0] + np.pi, *args[1:], elevation=-more["elevation"], elevation_weight=args[3], order=0)
+    back = sight_courses(args[0] + np.pi, *args[1:], elevation=-more["elevation"], elevation_weight=args[3], order=0)
     assert back.ok.all()
     assert not back.ahead.any()
 
@@ -90,7 +90,7 @@ def test_many_rays_bias_least_squares_and_not_the_instrumental_course():
     places = np.stack([0.3 * np.cos(times), 0.3 * np.sin(1.3 * times), 0.1 * np.cos(0.7 * times)], axis=-1)
     A, E = angles(path(COURSE[:2], times) - places)
     ones = np.full((trials, 120), 1.0 / sigma)
-    found = sighted_courses(
+    found = sight_courses(
         A + sigma * RNG.standard_normal((trials, 120)),
         np.broadcast_to(places, (trials, 120, 3)),
         times,

@@ -7,7 +7,7 @@ import pytest
 
 from formulations.nls import Program
 from formulations.range_height import ellipsoid, locate, three_stations, visible
-from formulations.range_height_conic import _reach, lifted
+from formulations.range_height_conic import _reach, lift
 from optloc import Status, solve
 from optloc.base.frames import ECEF
 from optloc.linear.constraints import height
@@ -52,7 +52,7 @@ def problems(count, sigma, seed):
 @pytest.mark.parametrize("sigma", [0.0, SIGMA, 10 * SIGMA], ids=["0 ns", "50 ns", "500 ns"])
 def test_reduced_lift_is_exact(sigma):
     _, offset, x = problems(200, sigma, 5)
-    answers = [lifted(SATELLITES, ALL, c, WGS84, BELOW) for c in offset]
+    answers = [lift(SATELLITES, ALL, c, WGS84, BELOW) for c in offset]
     off = np.array([np.linalg.norm(a.x - y) for a, y in zip(answers, x, strict=True)]) * EARTH
     ratio = np.array([a.rank_ratio for a in answers])
     assert (off < 10).mean() >= 0.995
@@ -73,7 +73,7 @@ def test_reduced_lift_with_a_bad_guess_is_loose_or_another_root():
     every = locate(SATELLITES, ALL, offset, WGS84, positive=False)
     loose = 0
     for i, near in enumerate([-BELOW, 0.01 * BELOW] * 20):
-        found = lifted(SATELLITES, ALL, offset[i], WGS84, near)
+        found = lift(SATELLITES, ALL, offset[i], WGS84, near)
         if np.linalg.norm(found.x - x[i]) * EARTH > 10:
             loose += found.rank_ratio > 1e-6
             # a lift of rank one is a point that fits, though not the one wanted
@@ -85,7 +85,7 @@ def test_reduced_lift_with_a_bad_guess_is_loose_or_another_root():
 def test_reduced_lift_reports_what_it_cannot_pose():
     line = np.array([[1.2, 0, 0], [1.2, 0.1, 0], [1.2, 0.2, 0]])
     for s, offset in ((line, np.zeros(3)), (SATELLITES, np.array([0.0, np.nan, 0.0]))):
-        a = lifted(s, ALL, offset, WGS84, BELOW)
+        a = lift(s, ALL, offset, WGS84, BELOW)
         assert np.isnan(a.x).all()
         assert a.bound == -np.inf
         assert not a.answer.solved

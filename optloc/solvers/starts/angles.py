@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from formulations.bearing_course import Courses, sighted_courses
+from formulations.bearing_course import Courses, sight_courses
 from formulations.bearing_ls import rays, sight
 from formulations.bistatic import course, triad
 from optloc.base.threads import WORTH, mapped
@@ -120,7 +120,7 @@ def courses(problem: Problem) -> Courses | None:
     if seen is None:
         return None
     block = next(rows for rows in problem.rows if rows.kind == "azimuth")
-    found = sighted_courses(
+    found = sight_courses(
         seen.angle[..., 0],
         seen.station,
         elapsed(problem, 0)[block.epoch],

@@ -91,7 +91,7 @@ def _subsets(place: Array, found: Ranges, mask: Array, count: int) -> list[Array
 
 def _relaxed(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask: Array) -> Array:
     """Return the answers (N, 1, 3) of the reduced relaxation, nearest to the point below the stations."""
-    from formulations.range_height_conic import lifted
+    from formulations.range_height_conic import lift
 
     out = np.full((len(place), 1, 3), np.nan)
     whole = Ellipsoid(
@@ -103,7 +103,7 @@ def _relaxed(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask
         stations, offset = place[i, nodes[i]], found.offset[i, nodes[i]] / WGS84_A
         above = stations.mean(0)
         below = own.centre + (above - own.centre) / np.sqrt(own.polar(above, above))
-        out[i, 0] = lifted(stations, found.sign[i, nodes[i]].astype(float), offset, own, below).x
+        out[i, 0] = lift(stations, found.sign[i, nodes[i]].astype(float), offset, own, below).x
 
     mapped(relaxed, np.flatnonzero(mask & np.isfinite(whole.shape).all((-1, -2))).tolist(), least=WORTH)
     return out
