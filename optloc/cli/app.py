@@ -22,10 +22,10 @@ from optloc.cli.options import (
     ProblemPath,
     Quiet,
     Verbose,
-    complete,
     constraints,
     example,
     find_problem,
+    name_in,
 )
 from optloc.cli.study import study
 
@@ -116,31 +116,9 @@ def fix(
 )
 def track(
     file: ProblemPath,
-    model: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            autocompletion=complete("motions"),
-            help="How the target moves, such as cv or csm; see [bold]optloc list motions[/bold].",
-        ),
-    ] = "cv",
-    filter_: Annotated[
-        str,
-        typer.Option(
-            "--filter",
-            metavar="NAME",
-            autocompletion=complete("trackers"),
-            help="How a scan updates the state; see [bold]optloc list trackers[/bold].",
-        ),
-    ] = "iekf",
-    loss: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            autocompletion=complete("losses"),
-            help="Weigh the rows of a scan by a robust loss; see [bold]optloc list losses[/bold].",
-        ),
-    ] = None,
+    model: Annotated[str, name_in("motions", "How the target moves, such as cv or csm", "--model")] = "cv",
+    filter_: Annotated[str, name_in("trackers", "How a scan updates the state", "--filter")] = "iekf",
+    loss: Annotated[str | None, name_in("losses", "Weigh the rows of a scan by a robust loss", "--loss")] = None,
     noise: Annotated[
         float | None,
         typer.Option(
@@ -277,6 +255,7 @@ def crlb(
     Of a run whose epochs share unknowns (a motion, biases) it is also given after its first 1, 2, ... epochs.
     With --map it is drawn over the place of the target instead.
     """
+    # A map needs no truth: it is drawn around the stations, or the place of the fix.
     if map_ is not None:
         from optloc.cli.crlb import run_map
 
@@ -322,14 +301,7 @@ def check(
     ),
 )
 def plot(
-    what: Annotated[
-        str,
-        typer.Argument(
-            metavar="WHAT",
-            autocompletion=complete("pictures"),
-            help="Picture; see [bold]optloc list pictures[/bold].",
-        ),
-    ],
+    what: Annotated[str, name_in("pictures", "Picture")],
     file: Annotated[
         Path,
         typer.Argument(
@@ -339,7 +311,7 @@ def plot(
         ),
     ],
     out: Annotated[
-        Path | None, typer.Option(metavar="OUT", help="Picture to write: .png, .svg or .pdf; WHAT.png by default.")
+        Path | None, typer.Option(metavar="OUT", help="Picture to write: .png, .svg or .pdf; NAME.png by default.")
     ] = None,
     method: Method = "auto",
     epoch: Annotated[
@@ -364,14 +336,7 @@ def plot(
     rich_help_panel=FIRST, epilog=example("optloc demo", "optloc demo ambiguous --plot two.png", "optloc list demos")
 )
 def demo(
-    name: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="[NAME]",
-            autocompletion=complete("demos"),
-            help="A shipped problem; see [bold]optloc list demos[/bold].",
-        ),
-    ] = None,
+    name: Annotated[str | None, name_in("demos", "A shipped problem")] = None,
     plot: Annotated[
         Path | None, typer.Option(metavar="OUT.png", help="Where to draw the fix; optloc-demo.png by default.")
     ] = None,
@@ -390,14 +355,7 @@ def demo(
     epilog=example("optloc new tdoa", "optloc new satellites --out site.toml", "optloc list starters"),
 )
 def new(
-    kind: Annotated[
-        str,
-        typer.Argument(
-            metavar="KIND",
-            autocompletion=complete("starters"),
-            help="A measurement kind (tdoa, range, ...) or a common mixture; see [bold]optloc list starters[/bold].",
-        ),
-    ],
+    kind: Annotated[str, name_in("starters", "A measurement kind (tdoa, range, ...) or a common mixture")],
     out: Annotated[
         Path | None, typer.Option(metavar="OUT.toml", help="File to write; standard output by default.")
     ] = None,
@@ -467,19 +425,12 @@ def convert(
     epilog=example("optloc reproduce registration", "optloc reproduce registration --size full --out tables"),
 )
 def reproduce(
-    name: Annotated[
-        str,
-        typer.Argument(
-            metavar="PAPER",
-            autocompletion=complete("papers"),
-            help="Name of a paper; see [bold]optloc list papers[/bold].",
-        ),
-    ],
+    name: Annotated[str, name_in("papers", "Paper")],
     size: Annotated[str, typer.Option(metavar="quick|full", help="Two minutes, or the sample sizes of the paper.")] = (
         "quick"
     ),
     out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Where tables and pictures go; optloc-PAPER by default.")
+        Path | None, typer.Option(metavar="DIR", help="Where tables and pictures go; optloc-NAME by default.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Decides all draws.")] = 1,
     quiet: Quiet = False,
@@ -491,6 +442,7 @@ def reproduce(
     raise typer.Exit(run_reproduce(name, size, out, seed, quiet))
 
 
+# The names of the lists are known without making one of them.
 def _lists() -> list[str]:
     from optloc.cli.listing import LISTS
 
@@ -528,4 +480,5 @@ def schema(verbose: Verbose = False) -> None:
     typer.echo(dumps(of_files()))
 
 
+# Last, so that help lists it behind the other commands of its panel.
 app.add_typer(study, name="study", rich_help_panel=MORE)

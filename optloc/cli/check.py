@@ -42,6 +42,7 @@ class Asked:
 def run_check(file: Path, as_json: bool, asked: Asked | None = None, *, quiet: bool = False) -> int:
     """Print a summary of a file and its health; the exit code is 1 where some epoch cannot be fixed."""
     asked = asked or Asked()
+    # A file without measured values can be checked, too, before the campaign.
     loaded = read(file, values=False)
     found = summary(loaded)
     checked = _health(loaded, asked, quiet or as_json)
@@ -68,6 +69,7 @@ def _health(loaded: Loaded, asked: Asked, quiet: bool) -> Checked | None:
     method = asked.method or "cauchy"
     Method.parse(method)  # a misspelt method is refused before the work
     checked = _check_health(loaded, method, by, quiet)
+    # A table or picture that was asked for and cannot be made is an error, where a summary would say why.
     if asked.out is not None:
         if checked.health is None:
             raise InvalidProblem(checked.why, "--out", "leave it out")
@@ -94,6 +96,7 @@ def summary(loaded: Loaded) -> dict[str, Any]:
     redundancy = _redundancy(problem, alone)
     parts = _components(problem)
     flattest, widest = _spread(problem.stations.position)
+    # Of stations that move, the epoch at which they are nearest to a line or plane.
     worst = int(np.argmin(flattest / widest))
     return {
         "file": loaded.source,
@@ -170,8 +173,10 @@ def _components(problem: Problem) -> Array:
     ends = []
     for block in problem.rows:
         ranges = MODELS[block.kind].ranges
+        # Differences and ratios tie two stations; ranges and angles stand by themselves, sums of ranges too.
         if MODELS[block.kind].stations == 2 and (ranges is None or sum(ranges) == 0):
             present = block.weight > 0.0
+            # One graph of all epochs: station i of epoch k is node k s + i.
             ends.append(np.stack([block.epoch * s + block.a, block.epoch * s + block.b])[:, present])
     edges = np.concatenate(ends, axis=-1) if ends else np.zeros((2, 0), dtype=int)
     graph = coo_array((np.ones(edges.shape[1]), (edges[0], edges[1])), shape=(k * s, k * s))
@@ -185,6 +190,7 @@ def _spread(position: Array) -> tuple[Array, Array]:
     """Return the least and the greatest root mean square extent (k,) of stations (k, s, d) about their centre."""
     centred = position - position.mean(-2, keepdims=True)
     values = np.linalg.svd(centred, compute_uv=False) / np.sqrt(position.shape[-2])
+    # Too few stations to span the space have no extent in the last direction.
     if position.shape[-2] <= position.shape[-1]:
         values = np.concatenate([values, np.zeros((*values.shape[:-1], 1))], axis=-1)
     return values[..., -1], np.maximum(values[..., 0], np.finfo(float).tiny)
@@ -206,6 +212,7 @@ def _check_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
     problem = loaded.problem
     if problem.epochs < 2:
         return Checked(None, "station health needs several epochs, and the file has one")
+    # Epochs of a calibration share nothing, though a known track ties their problem together.
     calibrating = all(motion.known is not None for motion in problem.motions)
     if not separable(problem) and not (calibrating and not problem.biases):
         return Checked(None, "station health needs epochs that are fixed one by one, and these share unknowns")
@@ -214,6 +221,7 @@ def _check_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
     try:
         return Checked(_solve_health(loaded, method, by, quiet))
     except InvalidProblem as error:
+        # A wrong word is the user's error; data that cannot tell are a sentence of the answer.
         if error.where in ("by", "method"):
             raise
         return Checked(None, f"station health could not be told: {error}".removesuffix("."))
@@ -231,6 +239,7 @@ def _solve_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Health:
         for first in range(0, count, CHUNK):
             items = np.arange(first, min(first + CHUNK, count))
             fix = solve(batch.take(items), method)
+            # What has no answer is NaN, and left out below.
             vectors[items] = np.where(fix.answered[:, None], fix.x, np.nan)
             found = getattr(fix, "explanations", None)
             explained[items] = None if found is None else found
@@ -278,6 +287,7 @@ def _show_health(checked: Checked, console: Console) -> None:
     if health is None:
         say_all(console, [checked.why])
         return
+    # Columns that no station has a number in are left out.
     scaled, suspected = np.isfinite(health.scale).any(), np.isfinite(health.suspect).any()
     table = Table(title=f"Health by {health.by}", title_justify="left")
     table.add_column(health.by)
@@ -300,6 +310,7 @@ def _show_health(checked: Checked, console: Console) -> None:
 def _order(health: Health) -> Array:
     """Return the groups in the order of their biases, those in one unit together."""
     bias = np.where(np.isfinite(health.bias), health.bias, np.inf)
+    # Biases of one unit can be compared; metres and radians cannot.
     return np.lexsort((-bias, np.array(health.units)))
 
 

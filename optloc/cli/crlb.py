@@ -47,8 +47,10 @@ def run_crlb(
 
     loaded = read(file, values=False)
     problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
+    # Biases alone, of known targets, need no place: their bound does not depend on a guess.
     truth = _solve(file) if at is None and _sought(problem) else vector(problem, at, velocity, geodetic)
     bound = np.asarray(crlb(problem, truth))
+    # One bound for all epochs where they are alike.
     bound = np.broadcast_to(bound, (*problem.batch_shape, *bound.shape[-2:])).reshape(-1, *bound.shape[-2:])
     labels = loaded.epochs if problem.batch_shape else ("run" if loaded.problem.epochs > 1 else loaded.epochs[0],)
     rows = [
@@ -132,6 +134,7 @@ def courses(problem: Problem, truth: Array) -> tuple[Course, Course | None] | No
     if k == 1 or not 0 < n <= _UNKNOWNS or tied(problem) or problem.batch_shape:
         return None
     counts = np.arange(1, k + 1) if k <= _POINTS else np.unique(np.geomspace(1, k, _POINTS).round().astype(int))
+    # Families of biases have members; states of targets have not.
     names = [slot.name for slot in problem.layout.shared if slot.members]
     course = crlb_course(problem, truth, counts)
     targets = len(names) < len(problem.layout.shared)
@@ -159,6 +162,7 @@ def _sigmas_at(course: Course, i: int) -> Array:
 def _few(course: Course) -> list[int]:
     """Return the places of a few times, closer together at the start."""
     wanted = np.geomspace(1, course.counts[-1], _LINES)
+    # Geometric: a bound falls with the root of the number of epochs.
     return [int(i) for i in np.unique(np.searchsorted(course.counts, np.floor(wanted)))]
 
 
@@ -208,6 +212,7 @@ def run_map(
         raise InvalidProblem(f"maps of type {out.suffix or out.name!r} are unknown", str(out), advice)
     loaded = read(file, values=False)
     problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
+    # One map: epochs apart are mapped as the first of them is.
     problem = problem.flat().take(np.zeros(1, dtype=int)) if problem.batch_shape else problem
     truth = vector(problem, at, velocity, geodetic)
     place = _place(file, problem, at, truth, needed=height is None and problem.dimension == 3)
@@ -314,6 +319,7 @@ def vector(problem: Problem, position: str | None, velocity: str | None, geodeti
             what = "latitude, longitude and height need a geodetic frame and three numbers"
             raise InvalidProblem(what, "--geodetic", "leave it out")
         place = problem.frame.from_geodetic(np.radians(place[0]), np.radians(place[1]), place[2])[: problem.dimension]
+    # Several targets, if there are, are all put at the same place and velocity.
     values = {"position": place, "velocity": None if velocity is None else coordinates(velocity, "--velocity")}
     layout = problem.layout
     shared, local = np.zeros(layout.n_shared), np.zeros((problem.epochs, layout.n_local))

@@ -73,6 +73,7 @@ def fix_file(loaded: Loaded, method: str, quiet: bool) -> FileFixes:
     from optloc.solvers import solve
 
     apart = separable(loaded.problem)
+    # Epochs that share nothing are a batch of problems; else the whole run is one.
     problem = by_epoch(loaded.problem) if apart else loaded.problem
     fixes, tables, reweighted = [], [], False
     with bar(loaded.title, loaded.problem.epochs if apart else 1, quiet) as advance:
@@ -81,6 +82,7 @@ def fix_file(loaded: Loaded, method: str, quiet: bool) -> FileFixes:
             _log_stages(fix)
             fixes.append(fix)
             tables.append(fix_columns(loaded, fix, first))
+            # A loss or a search for suspects shows in the weights, whatever the method is called.
             reweighted |= bool((fix.weights != part.weight)[fix.answered].any())
             advance(len(fix) if apart else 1)
     seen = None if apart else _observe(problem, fixes[0])
@@ -156,6 +158,7 @@ def _of_target(loaded: Loaded, fix: Fix, first: int | None, target: int, names: 
             columns |= {f"{prefix}{axis}": v for axis, v in zip("xyz", values.T, strict=False)}
     columns |= geodetic_columns(loaded.problem.frame, position, covariance)
     semi_axes, _ = error_ellipse(covariance)
+    # Longest axis first.
     columns |= {f"ellipse95_{i + 1}": semi_axes[:, d - 1 - i] for i in range(d)}
     for name, numbers in {"cost": fix.cost, "dof": fix.dof, "p_value": np.asarray(fix.p_value)}.items():
         columns[name] = np.repeat(numbers, count)
@@ -209,6 +212,7 @@ def active_of(fix: Fix) -> tuple[Active, ...]:
 
 def alternative_position(fix: Fix, x: Array) -> Array:
     """Return the positions of all targets of a parameter vector, metres."""
+    # Two targets are called position[0] and position[1].
     names = [slot.name for slot in (*fix.layout.shared, *fix.layout.local) if slot.name.partition("[")[0] == "position"]
     parts = [fix.layout.take(x, name) for name in names]
     return parts[0] if len(parts) == 1 else np.stack(parts)

@@ -105,14 +105,17 @@ def _show_one(found: FileFixes, fix: Fix, console: Console) -> None:
     table = Table(title=found.loaded.title, show_header=False, title_justify="left", min_width=60)
     table.add_row("status", Text(verdict.label, style=f"bold {_colour(verdict)}"))
     reason = str(fix.reason[()] or "")
+    # The verdict in general; of a clean fix the reason is all there is to say.
     table.add_row("", verdict.sentence if verdict is not Status.OK or not reason else reason)
     if verdict is not Status.OK and reason:
         table.add_row("reason", reason)
+    # A run may have a state of each epoch: those that fit on a screen.
     rows = len(found.columns["x"])
     for i in range(min(rows, _STATES)):
         _add_state(table, found.columns, i, _whose(found.columns, i) if rows > 1 else "")
     if rows > _STATES:
         table.add_row("...", f"{rows - _STATES} more; --out writes all of them")
+    # Errors of single epochs, such as clocks, are too many to list: their size is told.
     for name, values in fix.bias.items():
         slot, shared = fix.layout.find(name)
         if not shared:
@@ -229,6 +232,7 @@ def _show_alternatives(fix: Fix, console: Console) -> None:
         table.add_column(name, justify="right")
     others = (fix.alternatives.x[found], fix.alternatives.gap[found], fix.alternatives.doubt[found])
     for i, (x, gap, doubt) in enumerate(zip(*others, strict=True)):
+        # Two positions of a pair of targets at the most.
         point = ", ".join(f"{v:.1f}" for v in np.ravel(alternative_position(fix, x))[:6])
         table.add_row(str(i + 1), point, f"{gap:.4g}" if gap >= _NO_GAP else "0", f"{doubt:.2g}")
     console.print(table)
@@ -240,6 +244,7 @@ def _show_many(found: FileFixes, console: Console) -> None:
     table.add_column("status")
     for name in ("fixes", "median sigma, m", "95 % of sigmas, m", "median p"):
         table.add_column(name, justify="right")
+    # One number for the error of a position: the root of the trace of its covariance.
     sigma = np.sqrt(sum(columns[f"sigma_{axis}"] ** 2 for axis in "xyz" if axis in columns))
     for label, count in Counter(columns["status"].tolist()).most_common():
         inside = columns["status"] == label

@@ -37,6 +37,7 @@ def run_list(what: str, as_json: bool) -> int:
 
 def _print(rows: Rows, console: Console) -> None:
     """Print entries as a table, or one below the other where they are too long for one."""
+    # Entries of one table may have different fields: all of them, in the order in which they first occur.
     title, *names = dict.fromkeys(name for row in rows for name in row)
     if sum(max(len(row.get(name, "")) for row in rows) for name in names) > _WRAPS * console.width:
         for row in rows:
@@ -120,6 +121,7 @@ def _solvers() -> Rows:
     from optloc.solvers.methods import SOLVERS
     from optloc.study.methods import backends
 
+    # Back ends of the relaxations are found at run time: those of packages that are installed.
     found = {
         name: {"solver": name, "role": f"back end, {entry.kind}", "version": entry.version, "summary": entry.summary}
         for name, entry in backends().items()

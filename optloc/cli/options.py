@@ -92,6 +92,7 @@ def start_log(wanted: bool) -> bool:
         log.removeHandler(old)
     handler = logging.StreamHandler(sys.stderr)
     handler.name = "command line"
+    # Time since the start of the process: what a step took is the difference of two lines.
     handler.setFormatter(logging.Formatter("%(relativeCreated)6.0f ms  %(message)s"))
     log.addHandler(handler)
     log.setLevel(logging.INFO if wanted else logging.WARNING)
@@ -105,6 +106,7 @@ def shipped_problems() -> dict[str, Path]:
 
 def find_problem(path: Path) -> Path:
     """Return the path, or that of the shipped problem of this name where no such file is there."""
+    # A bare word that is no file may be the name of a shipped problem; a path or a name with an ending never is.
     if path.name != str(path) or path.suffix or path.exists():
         return path
     known = shipped_problems()
@@ -138,6 +140,7 @@ def complete(what: str) -> Callable[[str], list[str]]:
     """Return a completion of the names in one of the tables of `optloc list`."""
 
     def found(incomplete: str) -> list[str]:
+        # Completion runs a process for every Tab: nothing is imported before it is known what is asked.
         from optloc.cli.listing import LISTS
 
         return [next(iter(row.values())) for row in LISTS[what]()]
@@ -145,12 +148,14 @@ def complete(what: str) -> Callable[[str], list[str]]:
     return found
 
 
-Method = Annotated[
-    str,
-    typer.Option(
-        "--method", "-m", autocompletion=complete("methods"), help="How to solve; see [bold]optloc list methods[/bold]."
-    ),
-]
+def name_in(what: str, text: str, *flags: str) -> Any:
+    """Return an option, or without flags an argument, whose value is a name in one of the tables of `optloc list`."""
+    given: dict[str, Any] = {"metavar": "NAME", "autocompletion": complete(what)}
+    words = f"{text}; see [bold]optloc list {what}[/bold]."
+    return typer.Option(*flags, help=words, **given) if flags else typer.Argument(help=words, **given)
+
+
+Method = Annotated[str, name_in("methods", "How to solve", "--method", "-m")]
 Geodetic = Annotated[
     bool, typer.Option("--geodetic", help="The coordinates are latitude, longitude (deg) and height (m).")
 ]
@@ -182,6 +187,7 @@ def coordinates(
         values = [float(part) for part in text.split(",")]
     except ValueError:
         values = [nan]
+    # inf is a bound that is none; NaN would pass every comparison.
     if any(map(isnan, values)) or not (bounds or all(map(isfinite, values))):
         raise InvalidProblem(f"{text!r} is no list of numbers", where, advice)
     return values

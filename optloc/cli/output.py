@@ -68,6 +68,7 @@ def plain(value: Any) -> Any:
 
 def dumps(value: Any) -> str:
     """Return strict JSON."""
+    # NaN and infinity are no JSON: they were made null, and a leftover is a mistake.
     return json.dumps(plain(value), allow_nan=False, indent=2)
 
 
@@ -126,6 +127,7 @@ def write_table(path: Path, columns: Columns) -> None:
         import pyarrow as pa
         from pyarrow import parquet
 
+        # from_pandas: NaN is a missing value.
         table = pa.table({name: pa.array(values, from_pandas=True) for name, values in columns.items()})
         try:
             parquet.write_table(table, path)
@@ -157,6 +159,7 @@ def bar(title: str, total: int, quiet: bool) -> Iterator[Callable[[int], None]]:
     """Yield a function that moves a progress bar on standard error; it is drawn on terminals only."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+    # Results may be piped from standard output; one step is too short for a bar.
     console = Console(stderr=True)
     shown = console.is_terminal and not quiet and total > 1
     parts = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

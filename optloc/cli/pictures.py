@@ -72,6 +72,7 @@ def _solve_one(asked: Asked) -> tuple[Problem, Fix, str]:
     label = labels[0] if asked.epoch is None else asked.epoch
     if label not in labels:
         raise InvalidProblem(f"there is no epoch {label!r}", "--epoch", nearest(label, labels))
+    # One epoch as a batch of one: its picture says the label.
     problem = by_epoch(loaded.problem).take(np.array([labels.index(label)]))
     return problem, solve(problem, asked.method), f"{loaded.title}, epoch {label}"
 
@@ -151,6 +152,7 @@ def _accuracy(asked: Asked) -> None:
     if name not in names:
         raise InvalidProblem(f"there is no case {name!r}", "--epoch", nearest(name, names))
     case = cells[cells["case"].astype(str) == name]
+    # Methods may lack some noise levels: reindexed, so that all have values (or NaN) at the same ones.
     noise = np.unique(case["noise"].to_numpy(dtype=float))
     bound = case.groupby("noise")["bound"].max().reindex(noise).to_numpy(dtype=float)
     errors = {

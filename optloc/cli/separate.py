@@ -34,6 +34,7 @@ def run_separate(
     problem = loaded.problem
     clutter = evenly(problem, detection, false)
     found = separate(problem, clutter, count=_count(emitters), region=_region(problem, region))
+    # Epochs without rows have no answer, and no label.
     labels = [loaded.epochs[k] for k in np.unique(problem.epoch)]
     if as_json:
         epochs = [{"epoch": label, **_record(loaded, one)} for label, one in zip(labels, found, strict=True)]
@@ -58,6 +59,7 @@ def _region(problem: Problem, text: str | None) -> tuple[Any, Any] | None:
     lower, colon, upper = text.partition(":")
     if not colon:
         raise InvalidProblem(f"{text!r} is no region", "--region", "give LOW:HIGH, such as 0,0:2000,3000")
+    # A corner is written as a place: the same units and the same complaints.
     return vector(problem, lower, None, False), vector(problem, upper, None, False)
 
 

@@ -115,6 +115,7 @@ def _draw(found: FileFixes, plot: Path | None, quiet: bool) -> None:
     from importlib.util import find_spec
 
     console = Console(quiet=quiet)
+    # Without a request a missing library is no error: the numbers are there.
     if plot is None and find_spec("matplotlib") is None:
         say(console, "There is no picture, as matplotlib is not installed: pip install 'optloc[plot]'.")
         return
@@ -141,6 +142,7 @@ def starters() -> dict[str, Starter]:
         if entry.name.endswith(".toml"):
             text = entry.read_text(encoding="utf-8")
             found[entry.name.removesuffix(".toml")] = Starter(text.partition("\n")[0].removeprefix("# "), text)
+    # A kind of another package gets a starter, too. One that needs ECEF has no place among stations around an origin.
     for kind, model in MODELS.items():
         if kind not in found and not model.ecef:
             found[kind] = Starter(f"{kind}: {model.summary}.", _compose(kind, model))
@@ -186,6 +188,7 @@ def _compose(kind: str, model: Model) -> str:
 
     names, d = list(_PLACES), max(model.dimensions)
     one = np.arange(len(names)) if model.stations == 1 else np.arange(1, len(names))
+    # Differences against the first station; ranges beside them make every kind solvable.
     a, b = (one if model.stations else None), (np.zeros_like(one) if model.stations == 2 else None)
     sigma = _SIGMA.get(model.quantity, 0.1)
     place = np.array(list(_PLACES.values()))[:, :d]

@@ -70,12 +70,14 @@ def run(
     from optloc.study.execute import run_plan
     from optloc.study.plan import plan_of
 
+    # A scheduler can only be meant for dask.
     by = chosen("dask" if scheduler is not None and executor == "processes" else executor, jobs, scheduler)
     plan = plan_of(file, trials=trials, seed=seed)
     folder = Path(f"{plan.study.name}-study".replace(" ", "-").replace("/", "-")) if out is None else out
     try:
         with _bar(plan.study.name, plan.rows, quiet or as_json) as tell:
             found = run_plan(plan, folder, by, tell)
+    # Not an error: parts are written as they are finished.
     except KeyboardInterrupt:
         typer.echo(f"Stopped. What is finished is in {folder}; the same command goes on from there.", err=True)
         raise typer.Exit(STOPPED) from None

@@ -141,6 +141,7 @@ def run_track(
     Whatever goes wrong on the way, the track up to there is written first.
     """
     dynamics = dynamics_of(wanted)
+    # Wrong words are refused before the file is read.
     update = filter_of(wanted.filter) if wanted.loss is None else reweighted(wanted.filter, wanted.loss)
     _check_places(out, plot, html)
     loaded = read(file)
@@ -154,6 +155,7 @@ def run_track(
                 for entry in tracked(one.problem, dynamics, update, start=start, rules=wanted.rules):
                     one.entries.append(entry)
                     advance(1)
+    # Interrupted or refused half way: what is known by then is written.
     finally:
         columns = (
             join_tables([track_columns(one) for one in ones if one.entries]) if any(o.entries for o in ones) else {}
@@ -200,6 +202,7 @@ def runs_of(loaded: Loaded) -> Iterator[tuple[str, Problem, tuple[str, ...]]]:
         raise InvalidProblem(what, source, "leave it out, and give --start and --start-sigma")
     if problem.epochs > 1 and not np.isfinite(loaded.times).all():
         raise InvalidProblem("a track needs the time of each epoch", source, "give the measurements a column 'time'")
+    # Targets free at each epoch have epochs of their own; others share them, told apart by their rows.
     own = np.array(loaded.targets)[problem.epoch] if loaded.own_epochs else None
     names = dict.fromkeys(loaded.targets)
     for i, name in enumerate(names):
@@ -213,6 +216,7 @@ def runs_of(loaded: Loaded) -> Iterator[tuple[str, Problem, tuple[str, ...]]]:
             one, two = (loaded.epochs[epochs[again[0] + j]] for j in (0, 1))
             what = f"the epochs {one!r} and {two!r} of {name} have the same time"
             raise InvalidProblem(what, source, "correct the times, or give both one label")
+        # A file without times has one epoch: any time serves.
         times = loaded.times if np.isfinite(loaded.times).all() else problem.times
         yield name, alone(problem, kept, times), tuple(loaded.epochs[k] for k in epochs)
 
@@ -233,6 +237,7 @@ def _start(problem: Problem, dynamics: Dynamics, wanted: Wanted) -> State | None
     if len(sigma) != parts or (sigma <= 0.0).any():
         what = f"{wanted.sigma!r} are no standard deviations of {'position velocity acceleration'.split()[:parts]}"
         raise InvalidProblem(what.replace("'", ""), "--start-sigma", f"give {parts} positive numbers")
+    # One standard deviation for all axes of a derivative, and nothing correlated.
     return State(float(problem.times[0]), mean, np.diag(np.repeat(sigma, d) ** 2))
 
 
@@ -303,6 +308,7 @@ def _show(loaded: Loaded, columns: Columns, console: Console) -> None:
     for (target, label), count in Counter(zip(columns["target"], columns["status"], strict=True)).items():
         inside = (columns["target"] == target) & (columns["status"] == label)
         tested = inside & np.isfinite(columns["nis"])
+        # Chi-square of all scans over their rows: about one where the noise is as stated.
         rows = float(columns["rows"][tested].sum())
         nis = f"{columns['nis'][tested].sum() / rows:.2f}" if rows else "-"
         finite = sigma[inside][np.isfinite(sigma[inside])]
