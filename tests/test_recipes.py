@@ -19,7 +19,7 @@ import optloc
 from optloc import MODELS, InvalidProblem, Motion, Status, solve
 from optloc.cli import app
 from optloc.compute.sums import equations_at
-from optloc.compute.trace import evaluated, traced
+from optloc.compute.trace import evaluate, trace
 from optloc.linear.evaluate import given
 from optloc.linear.indices import plans
 from optloc.linear.normal import linearise
@@ -99,10 +99,10 @@ def test_machine_code_symbols_and_numpy_agree():
     x = np.array([1200.0, -300.0])
     (only,) = plans(problem)
     inputs = given(problem, only)
-    tape = traced(problem, only, frozenset(inputs), frozenset(feed.seed for feed in only.feeds)).tape
+    tape = trace(problem, only, frozenset(inputs), frozenset(feed.seed for feed in only.feeds)).tape
     for feed in only.feeds:
         inputs[feed.seed] = inputs.get(feed.seed, 0.0) + x[feed.column] * feed.gain
-    value, *partials = evaluated(tape, inputs)
+    value, *partials = evaluate(tape, inputs)
     away = np.linalg.norm(x - STATIONS, axis=1)
     expected = 30.0 * np.log10(away[0] / away[1:])
     np.testing.assert_allclose(value, expected, rtol=1e-12, atol=1e-12)

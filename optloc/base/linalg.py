@@ -64,7 +64,7 @@ def _factor(matrix: Any, least: float) -> tuple[Any, Any]:
     return xp.stack(columns, axis=-1), ok
 
 
-def _substituted(lower: Any, right: Any, order: range) -> Array:
+def _substitute(lower: Any, right: Any, order: range) -> Array:
     """Return the solution of a triangular system whose rows are solved in a given order; it writes into no array."""
     xp, rows = arrays.library(lower), dict[int, Any]()
     for j in order:
@@ -78,7 +78,7 @@ def _substituted(lower: Any, right: Any, order: range) -> Array:
 
 def _forward(lower: Array, right: Array) -> Array:
     if arrays.foreign(lower):
-        return _substituted(lower, right, range(lower.shape[-1]))
+        return _substitute(lower, right, range(lower.shape[-1]))
     out = np.empty(np.broadcast_shapes(lower.shape[:-2], right.shape[:-2]) + right.shape[-2:])
     for j in range(lower.shape[-1]):
         known = (lower[..., j, :j, None] * out[..., :j, :]).sum(-2)
@@ -88,7 +88,7 @@ def _forward(lower: Array, right: Array) -> Array:
 
 def _backward(lower: Array, right: Array) -> Array:
     if arrays.foreign(lower):
-        return _substituted(lower.mT, right, range(lower.shape[-1])[::-1])
+        return _substitute(lower.mT, right, range(lower.shape[-1])[::-1])
     out = np.empty(right.shape)
     for j in reversed(range(lower.shape[-1])):
         known = (lower[..., j + 1 :, j, None] * out[..., j + 1 :, :]).sum(-2)

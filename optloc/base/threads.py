@@ -69,7 +69,7 @@ def mapped(
         return [function(item) for item in work]
     if least > 0.0:
         # Two, because the first call may build what the others share; the quicker one tells.
-        begun, seconds = _timed(function, work[:2])
+        begun, seconds = _time(function, work[:2])
         some = mapped(function, work[2:], 1 if seconds < least else count)
         return begun + some
     results: dict[int, _Result] = {}
@@ -93,7 +93,7 @@ def mapped(
     return [results[i] for i in range(len(work))]
 
 
-def _timed(function: Callable[[_Item], _Result], work: list[_Item]) -> tuple[list[_Result], float]:
+def _time(function: Callable[[_Item], _Result], work: list[_Item]) -> tuple[list[_Result], float]:
     """Return the results of a few items, and the time of the quickest: the first may build what others share."""
     results, times = [], []
     for item in work:

@@ -10,7 +10,7 @@ import numpy as np
 from optloc.base.threads import mapped, thread_count
 from optloc.base.types import Array
 from optloc.compute.jit import compiled
-from optloc.compute.lanes import Room, add_group, add_prior, blocks, clear, furnished, gather, load, measure, memory
+from optloc.compute.lanes import Room, add_group, add_prior, arrange, blocks, clear, gather, load, measure, memory
 from optloc.compute.pack import Numbers, Packed
 from optloc.compute.tables import Tables
 from optloc.linear.normal import Normal
@@ -72,7 +72,7 @@ def normal_block(packed: Packed, x: Array, item: Array, first: int, last: int, p
     """Write the normal equations at the vectors first <= i < last."""
     t, c = packed
     size = x.shape[1]
-    lanes, room = blocks(packed, size, last - first), furnished(t, c, size)
+    lanes, room = blocks(packed, size, last - first), arrange(t, c, size)
     m, r = memory(t, room, lanes)
     width = t.shared + t.local + 1
     for begin in range(first, last, lanes):

@@ -75,7 +75,7 @@ def minimise(rows: Array, on_cone: bool, y: Array, settled: Array, work: Array) 
         # Least squares without the constraint is the start: multiplier zero, inside where B'B is definite.
         multiplier[lane], last[lane], todo[lane] = 0.0, 0.0, 1.0
     for _ in range(_STEPS):
-        _shifted(A, b, multiplier, on_cone, slope, y)
+        _shift(A, b, multiplier, on_cone, slope, y)
         factor_plain(A, slope, lower, inverse)
         for lane in range(LANES):
             definite[lane] = 1.0
@@ -122,7 +122,7 @@ def _normal(rows: Array, A: Array, b: Array, least: Array) -> None:
 
 
 @compiled
-def _shifted(A: Array, b: Array, multiplier: Array, on_cone: bool, diagonal: Array, right: Array) -> None:
+def _shift(A: Array, b: Array, multiplier: Array, on_cone: bool, diagonal: Array, right: Array) -> None:
     """Write the diagonal of ``A + multiplier C`` and the right side ``b - multiplier h``."""
     n = len(b)
     sign, shift = (-1.0, 0.0) if on_cone else (0.0, 0.5)

@@ -62,7 +62,7 @@ _LANES, _FEWEST, _CELLS, _MOST = 64, 8, 2**18, 2**23
 
 
 @compiled
-def furnished(t: Tables, c: Numbers, size: int) -> Room:
+def arrange(t: Tables, c: Numbers, size: int) -> Room:
     """Return where things stand for problems of p = `size` unknowns."""
     n, local, largest = t.shared, t.local, 0
     for i in range(t.groups, c.place.shape[0]):
@@ -114,15 +114,15 @@ def load(
     m: Array, lane: int, item: int, source: Array, white: Array, prior: Array, observed: Array, present: Array
 ) -> None:
     """Bring the numbers of a problem into a lane of the memory (cells, B); the arrays are those of `Numbers`."""
-    cell = _filled(m, 0, lane, source, item)
-    cell = _filled(m, cell, lane, white, item)
-    cell = _filled(m, cell, lane, prior, item)
-    cell = _filled(m, cell, lane, observed, item)
-    _filled(m, cell, lane, present, item)
+    cell = _fill(m, 0, lane, source, item)
+    cell = _fill(m, cell, lane, white, item)
+    cell = _fill(m, cell, lane, prior, item)
+    cell = _fill(m, cell, lane, observed, item)
+    _fill(m, cell, lane, present, item)
 
 
 @compiled
-def _filled(m: Array, cell: int, lane: int, source: Array, item: int) -> int:
+def _fill(m: Array, cell: int, lane: int, source: Array, item: int) -> int:
     row = item if source.shape[0] > 1 else 0
     for i in range(source.shape[1]):
         m[cell + i, lane] = source[row, i]
@@ -238,7 +238,7 @@ def measure(t: Tables, common: Array, m: Array, r: Array, room: Room, packet: in
                 _measurement(t, m, r, index[kind, 3], line, low, to, x, room.scale, lanes)
                 _residual(m, to + index[line, 2], room.observed + index[line, 0], index[kind, 4], lanes)
                 if room.absent:
-                    _masked(m, to + index[line, 2], room.present + index[line, 0], lanes)
+                    _mask(m, to + index[line, 2], room.present + index[line, 0], lanes)
 
 
 @compiled
@@ -326,7 +326,7 @@ def _residual(m: Array, value: int, observed: int, periodic: int, lanes: int) ->
 
 
 @compiled
-def _masked(m: Array, value: int, present: int, lanes: int) -> None:
+def _mask(m: Array, value: int, present: int, lanes: int) -> None:
     """Make the residuals of absent rows zero."""
     for b in range(lanes):
         m[value, b] = m[value, b] if m[present, b] != 0.0 else 0.0

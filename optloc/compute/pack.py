@@ -51,7 +51,7 @@ class Packed(NamedTuple):
     numbers: Numbers
 
 
-def packed(problem: Problem, noise: tuple[Whitener, ...]) -> Packed | None:
+def pack(problem: Problem, noise: tuple[Whitener, ...]) -> Packed | None:
     """Return a flat batch of problems for the compiled core, or None where it does not serve them.
 
     Parameters

@@ -250,6 +250,8 @@ def weigh(
                         out[i, j, lane] += share * out[k, j, lane]
 
 
+# The fix: start, refinement and covariance, and what makes it plainly good.
+
 # Steps after which the problems of a block that still move wait for each other: fixes near their stations take two to
 # five.
 _FEW = 6

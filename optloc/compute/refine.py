@@ -20,9 +20,9 @@ from optloc.compute.lanes import (
     Room,
     add_group,
     add_prior,
+    arrange,
     blocks,
     clear,
-    furnished,
     gather,
     load,
     measure,
@@ -100,7 +100,7 @@ def refine_block(packed: Packed, item: Array, first: int, last: int, rules: Rule
     """
     t, c = packed
     size = out.x.shape[1]
-    lanes, room = blocks(packed, size, last - first), furnished(t, c, size)
+    lanes, room = blocks(packed, size, last - first), arrange(t, c, size)
     m, r = memory(t, room, lanes)
     tag, used, following = np.zeros((4, lanes), np.int64), lanes, first + lanes
     for b in range(lanes):
@@ -110,24 +110,24 @@ def refine_block(packed: Packed, item: Array, first: int, last: int, rules: Rule
         gather(t, c, m, r, room, True, used)
         _judge(m, room, size, tag, rules, used)
         for b in range(used):
-            if ended(tag, b, rules.limit):
+            if is_over(tag, b, rules.limit):
                 _finish(m, room, tag, b, out)
-        used, following = refilled(m, room.cells, tag, used, following, last, rules.limit)
+        used, following = refill(m, room.cells, tag, used, following, last, rules.limit)
         _advance(m, room, t.shared, t.local, tag, rules.damped, used)
 
 
 @compiled
-def ended(tag: Array, lane: int, limit: int) -> bool:
+def is_over(tag: Array, lane: int, limit: int) -> bool:
     """Return whether the start in a lane needs no further step."""
     return bool(tag[STATUS, lane] != LIMIT or tag[STEPS, lane] >= limit)
 
 
 @compiled
-def refilled(m: Array, cells: int, tag: Array, used: int, following: int, last: int, limit: int) -> tuple[int, int]:
+def refill(m: Array, cells: int, tag: Array, used: int, following: int, last: int, limit: int) -> tuple[int, int]:
     """Give the lanes of ended starts to the following ones, or close them; return lanes in use and the next start."""
     b = 0
     while b < used:
-        if not ended(tag, b, limit):
+        if not is_over(tag, b, limit):
             b += 1
         elif following < last:
             tag[START, b], tag[FRESH, b], tag[STATUS, b], tag[STEPS, b] = following, EMPTY, LIMIT, 0
@@ -185,7 +185,7 @@ def _judge(m: Array, room: Room, size: int, tag: Array, rules: Rules, used: int)
             if not np.isfinite(m[room.after + cost, b]):
                 tag[STATUS, b] = NUMERICAL
         else:
-            tag[STATUS, b] = judged(m, room, room.now + cost, room.after + cost, rules, b)
+            tag[STATUS, b] = judge_trial(m, room, room.now + cost, room.after + cost, rules, b)
     for i in range(size):
         for b in range(used):
             m[room.best + i, b] = m[room.trial + i, b] if m[better, b] != 0.0 else m[room.best + i, b]
@@ -196,7 +196,7 @@ def _judge(m: Array, room: Room, size: int, tag: Array, rules: Rules, used: int)
 
 
 @compiled
-def judged(m: Array, room: Room, now: int, after: int, rules: Rules, b: int) -> int:
+def judge_trial(m: Array, room: Room, now: int, after: int, rules: Rules, b: int) -> int:
     """Return the status of a lane after a step; say whether it is better and set the damping."""
     state = room.state
     better, small, stuck, m[state + DAMPING, b], m[state + GROWTH, b] = judge_lane(
@@ -264,7 +264,7 @@ def refine_runs(packed: Packed, item: Array, first: int, last: int, rules: Rules
     """
     t, c = packed
     size = out.x.shape[1]
-    lanes, room = blocks(packed, size, last - first), furnished(t, c, size)
+    lanes, room = blocks(packed, size, last - first), arrange(t, c, size)
     m, r = memory(t, room, lanes)
     tag, used, following = np.zeros((4, lanes), np.int64), lanes, first + lanes
     for b in range(lanes):
@@ -274,9 +274,9 @@ def refine_runs(packed: Packed, item: Array, first: int, last: int, rules: Rules
         _price(t, c, m, r, room, used)
         _judge_run(m, room, size, tag, rules, used)
         for b in range(used):
-            if ended(tag, b, rules.limit):
+            if is_over(tag, b, rules.limit):
                 _finish_run(m, room, tag, b, out)
-        used, following = refilled(m, room.cells, tag, used, following, last, rules.limit)
+        used, following = refill(m, room.cells, tag, used, following, last, rules.limit)
         _advance_run(t, c, m, r, room, tag, rules.damped, used)
 
 
@@ -323,7 +323,7 @@ def _judge_run(m: Array, room: Room, size: int, tag: Array, rules: Rules, used: 
         elif m[room.state + CLOSED, b] == 0.0:
             m[better, b], tag[STATUS, b] = 0.0, LEFT_OPEN
         else:
-            tag[STATUS, b] = judged(m, room, cost, tried, rules, b)
+            tag[STATUS, b] = judge_trial(m, room, cost, tried, rules, b)
         m[cost, b] = m[tried, b] if m[better, b] != 0.0 else m[cost, b]
     for i in range(size):
         for b in range(used):
@@ -397,7 +397,7 @@ def _pass(t: Tables, c: Numbers, m: Array, r: Array, room: Room, tag: Array, sum
                 for b in range(lanes):
                     m[room.now + cell, b] += m[room.after + cell, b]
     if summing:
-        _added(m, room, n, line, lanes)
+        _add(m, room, n, line, lanes)
 
 
 @compiled
@@ -413,7 +413,7 @@ def _own(m: Array, room: Room, tag: Array, n: int, local: int, epoch: int, lanes
 
 
 @compiled
-def _added(m: Array, room: Room, n: int, line: int, lanes: int) -> None:
+def _add(m: Array, room: Room, n: int, line: int, lanes: int) -> None:
     """Add the damped sums of all epochs to what their unknowns cost them."""
     for i in range(n):
         for j in range(i + 1):

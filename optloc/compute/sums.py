@@ -8,7 +8,7 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import enabled
-from optloc.compute.pack import packed
+from optloc.compute.pack import pack
 from optloc.linear.normal import Normal, linearise, normal, with_priors
 from optloc.linear.station_noise import depends_on_place, whitener_at
 from optloc.problem.epochs import windows
@@ -44,7 +44,7 @@ def equations_at(
 
 def summed(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = None, *, at: Array | None = None) -> Normal:
     """Return the normal equations of the measurements alone; arguments as of `equations_at`."""
-    quick = _compiled(problem, x, noise) if at is None else None
+    quick = _by_machine_code(problem, x, noise) if at is None else None
     if quick is not None:
         return quick
     total = None
@@ -59,13 +59,13 @@ def summed(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = None
     return total
 
 
-def _compiled(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None) -> Normal | None:
+def _by_machine_code(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None) -> Normal | None:
     """Return the sums by machine code, or None where it does not serve the problem or does not pay."""
     count = x.size // x.shape[-1]
     alike = problem.batch_shape in {(), (1,), (count,)} and x.ndim == 2
     if not alike or not serves(problem, count) or (noise is None and depends_on_place(problem)):
         return None
-    found = packed(problem, whitener_at(problem, x) if noise is None else noise)
+    found = pack(problem, whitener_at(problem, x) if noise is None else noise)
     if found is None:
         return None
     from optloc.compute.equations import normal_at

@@ -9,7 +9,7 @@ import numpy as np
 
 from optloc.base.cache import Cache
 from optloc.base.types import Array
-from optloc.compute.trace import Traced, traced
+from optloc.compute.trace import Traced, trace
 from optloc.linear.evaluate import given
 from optloc.linear.indices import Plan, Terms, plans
 from optloc.problem.problem import Problem
@@ -313,11 +313,11 @@ def _tables(problem: Problem, groups: tuple[Array, ...], sources: Sources) -> Ke
     for plan in plans(problem):
         inputs = given(numbered, plan)
         moved = frozenset(feed.seed for feed in plan.feeds)
-        trace = traced(problem, plan, frozenset(inputs), moved)
-        if trace is None:
+        made = trace(problem, plan, frozenset(inputs), moved)
+        if made is None:
             return None
-        found.append(_Kind(plan, trace, inputs))
-    return _filled(problem, Groups.sorted(problem, groups), found, sources.lookup())
+        found.append(_Kind(plan, made, inputs))
+    return _fill(problem, Groups.sorted(problem, groups), found, sources.lookup())
 
 
 def _spanning(problem: Problem, groups: tuple[Array, ...]) -> bool:
@@ -336,7 +336,7 @@ class _Kind:
     inputs: dict[int, Array]
 
 
-def _filled(problem: Problem, groups: Groups, found: list[_Kind], lookup: Array) -> Kept:
+def _fill(problem: Problem, groups: Groups, found: list[_Kind], lookup: Array) -> Kept:
     pairs = list(zip(found, problem.starts, strict=True))
     feeds = Entries.joined([Entries.feeds(kind.plan, kind.trace, start) for kind, start in pairs])
     scales = Entries.joined([Entries.terms(kind.plan.gains, start) for kind, start in pairs])
@@ -347,7 +347,7 @@ def _filled(problem: Problem, groups: Groups, found: list[_Kind], lookup: Array)
     inputs = np.concatenate([np.full(k.plan.block.count, len(t.inputs)) for k, t in zip(found, tapes, strict=True)])
     source_at = starts(inputs[order.row])
     place = source_at[order.at[feeds.row]] + feeds.place
-    term, factor, at = _listed(
+    term, factor, at = _list(
         [feeds, scales, adds],
         slots,
         [place, order.at[scales.row], order.at[adds.row]],
@@ -410,7 +410,7 @@ def _sources(found: list[_Kind], source_at: Array, order: Order, lookup: Array) 
     return np.asarray(lookup[out])
 
 
-def _listed(
+def _list(
     parts: list[Entries], slots: list[Array], owners: list[Array], counts: list[int]
 ) -> tuple[Array, Array, list[Array]]:
     """Return entries one after the other, owner by owner: indices, factors, and where each owner begins."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from optloc.base.cache import Cache
 from optloc.base.types import Array
-from optloc.linear.evaluate import joined
+from optloc.linear.evaluate import join
 from optloc.linear.indices import Plan
 from optloc.models import Model
 from optloc.models.jet import Jet
@@ -43,7 +43,7 @@ _FUNCTIONS: tuple[Any, ...] = (
 _NUMBER = {function.__name__: number for number, function in enumerate(_FUNCTIONS)}
 
 
-def computed(operation: int, left: Any, right: Any) -> Any:
+def operate(operation: int, left: Any, right: Any) -> Any:
     """Return the value of an operation on numbers or arrays, by numpy."""
     with np.errstate(all="ignore"):
         return _FUNCTIONS[operation](left) if operation in UNARY else _FUNCTIONS[operation](left, right)
@@ -85,7 +85,7 @@ class Recorder:
         """Return the symbol of an operation on symbols or numbers."""
         u = self.node(left)
         v = u if operation in UNARY else self.node(right)
-        return Symbol(self, self._simplified(operation, u, v))
+        return Symbol(self, self._simplify(operation, u, v))
 
     def _number(self, key: tuple[int, Any, Any]) -> int:
         if key not in self.known:
@@ -93,11 +93,11 @@ class Recorder:
             self.nodes.append(key)
         return self.known[key]
 
-    def _simplified(self, operation: int, u: int, v: int) -> int:
+    def _simplify(self, operation: int, u: int, v: int) -> int:
         """Return the node of an operation: folded, or another form that gives the same number to the last bit."""
         left, right = self.constant(u), self.constant(v)
         if left is not None and right is not None:
-            return self.node(computed(operation, left, right))
+            return self.node(operate(operation, left, right))
         rule = {ADD: self._add, SUB: self._sub, MUL: self._mul, DIV: self._div, NEG: self._neg}.get(operation)
         found = None if rule is None else rule(u, v)
         if found is not None:
@@ -115,19 +115,19 @@ class Recorder:
             return v
         if self.constant(v) == 0.0:
             return u
-        # Doubling is exact, and a derivative of a square then meets its root: see `_scaled`.
+        # Doubling is exact, and a derivative of a square then meets its root: see `_rescale`.
         if u == v:
-            return self._simplified(MUL, self.node(2.0), u)
+            return self._simplify(MUL, self.node(2.0), u)
         if self._is(v, NEG):
-            return self._simplified(SUB, u, self.nodes[v][1])
-        return self._simplified(SUB, v, self.nodes[u][1]) if self._is(u, NEG) else None
+            return self._simplify(SUB, u, self.nodes[v][1])
+        return self._simplify(SUB, v, self.nodes[u][1]) if self._is(u, NEG) else None
 
     def _sub(self, u: int, v: int) -> int | None:
         if self.constant(v) == 0.0:
             return u
         if self.constant(u) == 0.0:
-            return self._simplified(NEG, v, v)
-        return self._simplified(ADD, u, self.nodes[v][1]) if self._is(v, NEG) else None
+            return self._simplify(NEG, v, v)
+        return self._simplify(ADD, u, self.nodes[v][1]) if self._is(v, NEG) else None
 
     def _mul(self, u: int, v: int) -> int | None:
         for one, other in ((u, v), (v, u)):
@@ -137,16 +137,16 @@ class Recorder:
             if value == 0.0:
                 return self.node(0.0)
             if value in (1.0, -1.0):
-                return other if value == 1.0 else self._simplified(NEG, other, other)
+                return other if value == 1.0 else self._simplify(NEG, other, other)
             if self._is(one, NEG):
-                product = self._simplified(MUL, self.nodes[one][1], other)
-                return self._simplified(NEG, product, product)
-            scaled = self._scaled(one, other)
+                product = self._simplify(MUL, self.nodes[one][1], other)
+                return self._simplify(NEG, product, product)
+            scaled = self._rescale(one, other)
             if scaled is not None:
                 return scaled
         return None
 
-    def _scaled(self, u: int, v: int) -> int | None:
+    def _rescale(self, u: int, v: int) -> int | None:
         """Return ``(2^k a) (c / b)`` as ``a (2^k c / b)``: the derivative of a root of squares has this form."""
         operation, factor, a = self.nodes[u]
         if operation != MUL or not self._is(v, DIV):
@@ -157,21 +157,21 @@ class Recorder:
         # A power of two moves no digit; any other factor would round differently.
         if power is None or top is None or math.frexp(power)[0] != 0.5:
             return None
-        return self._simplified(MUL, a, self._simplified(DIV, self.node(power * top), self.nodes[v][2]))
+        return self._simplify(MUL, a, self._simplify(DIV, self.node(power * top), self.nodes[v][2]))
 
     def _div(self, u: int, v: int) -> int | None:
         if self.constant(v) == 1.0:
             return u
         if self._is(u, NEG):
-            ratio = self._simplified(DIV, self.nodes[u][1], v)
-            return self._simplified(NEG, ratio, ratio)
+            ratio = self._simplify(DIV, self.nodes[u][1], v)
+            return self._simplify(NEG, ratio, ratio)
         return None
 
     def _neg(self, u: int, v: int) -> int | None:
         operation, left, right = self.nodes[u]
         if operation == NEG:
             return int(left)
-        return self._simplified(SUB, right, left) if operation == SUB else None
+        return self._simplify(SUB, right, left) if operation == SUB else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -277,7 +277,7 @@ class Tape:
 def tape(recorder: Recorder, outputs: list[Any]) -> Tape:
     """Return the operations that given outputs (symbols or numbers) need, in order, registers used again and again."""
     wanted = [recorder.node(value) for value in outputs]
-    needed = _needed(recorder, wanted)
+    needed = _trace_back(recorder, wanted)
     last = _last_uses(recorder, needed, wanted)
     # Registers of operands that are not needed later are used again: fewer of them stay in the cache.
     free: list[int] = []
@@ -303,7 +303,7 @@ def tape(recorder: Recorder, outputs: list[Any]) -> Tape:
     )
 
 
-def _needed(recorder: Recorder, wanted: list[int]) -> list[int]:
+def _trace_back(recorder: Recorder, wanted: list[int]) -> list[int]:
     """Return the nodes that others need, in the order in which they were written down."""
     found: set[int] = set()
     ahead = list(wanted)
@@ -325,7 +325,7 @@ def _last_uses(recorder: Recorder, needed: list[int], wanted: list[int]) -> dict
     return last | dict.fromkeys(wanted, len(recorder.nodes))
 
 
-def evaluated(tape: Tape, inputs: dict[int, Any]) -> list[Any]:
+def evaluate(tape: Tape, inputs: dict[int, Any]) -> list[Any]:
     """Return the outputs of a tape for numbers or arrays, in plain numpy: what the compiled interpreter is held to."""
     own: list[Any] = [0.0] * tape.registers
     for seed, register in tape.inputs:
@@ -333,7 +333,7 @@ def evaluated(tape: Tape, inputs: dict[int, Any]) -> list[Any]:
     for register, value in tape.constants:
         own[register] = value
     for operation, target, left, right in tape.code.tolist():
-        own[target] = computed(operation, own[left], own[right])
+        own[target] = operate(operation, own[left], own[right])
     return [own[register] for register in tape.outputs]
 
 
@@ -357,7 +357,7 @@ class Traced:
 _TRACED = Cache["Traced | None"](256)
 
 
-def traced(problem: Problem, plan: Plan, given: frozenset[int], moved: frozenset[int]) -> Traced | None:
+def trace(problem: Problem, plan: Plan, given: frozenset[int], moved: frozenset[int]) -> Traced | None:
     """Return the tape of a block of rows, or None where its function cannot be traced.
 
     Parameters
@@ -382,7 +382,7 @@ def _trace(problem: Problem, model: Model, given: frozenset[int], moved: frozens
     inputs: dict[int, Any] = {seed: recorder.input(seed) for seed in sorted(given | moved)}
     inputs |= {seed: Jet(inputs[seed], {seed: 1.0}) for seed in sorted(moved)}
     try:
-        value = model.h(*joined(problem, model, inputs))
+        value = model.h(*join(problem, model, inputs))
         partials = dict(value.partials) if isinstance(value, Jet) else {}
         value = value.value if isinstance(value, Jet) else value
         if not isinstance(value, Symbol | int | float):

@@ -22,6 +22,8 @@ from optloc.problem.problem import Problem
 # of the Earth's size (a nanometre) passes, and no measurement is as good.
 TOLERANCE = 1e-6
 
+# How users state constraints.
+
 
 def box(lower: Sequence[float], upper: Sequence[float], *, target: int = 0) -> tuple[Band, ...]:
     """Return the constraint that a target lies in a box; infinite bounds are none.
@@ -89,6 +91,9 @@ def polygon(vertices: Any, *, target: int = 0) -> tuple[Polygon, ...]:
 
 def _number(value: Any) -> Array:
     return np.asarray(value, dtype=float)
+
+
+# Faces: the sides that hold with equality together, and how vectors are brought onto them.
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +180,7 @@ def levels(problem: Problem, face: Face, x: Array) -> tuple[Array, Array]:
     return values, gradients
 
 
-def restored(problem: Problem, face: Face, x: Array) -> Array:
+def restore(problem: Problem, face: Face, x: Array) -> Array:
     """Return vectors (N, size) moved onto a face along the shortest way, by Newton steps."""
     n = problem.layout.n_shared
     # Newton squares a small relative distance: 1e-2 becomes rounding in three steps, and five are to spare.
@@ -204,6 +209,9 @@ def _band(constraint: Band | Polygon, side: str | int) -> Band:
     normal = np.array([along[1], -along[0]]) / np.hypot(*along)
     value = _number(normal @ here)
     return Band("plane", value, value, normal, constraint.name, constraint.target)
+
+
+# What vectors and programs need to know of the constraints as they are stated.
 
 
 def conjunction(problem: Problem) -> list[Band]:

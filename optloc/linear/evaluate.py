@@ -43,16 +43,16 @@ def points(problem: Problem, plan: Plan, x: Array, differentiate: bool) -> tuple
     # Data first, then what unknowns add: an offset of a station adds to its surveyed place.
     inputs = {seed: placed(value, x) for seed, value in given(problem, plan).items()}
     for feed in plan.feeds:
-        inputs[feed.seed] = _fed(inputs.get(feed.seed, 0.0), feed, x, plan.block.count)
+        inputs[feed.seed] = _feed(inputs.get(feed.seed, 0.0), feed, x, plan.block.count)
     if differentiate:
         fed = {feed.seed for feed in plan.feeds}
         # Arrays of other libraries need not hand arithmetic with a Jet on the right to the Jet: there all are jets.
         for seed in inputs if foreign(x) else fed:
             inputs[seed] = Jet(inputs[seed], {seed: placed(np.ones(1), x)} if seed in fed else {})
-    return joined(problem, plan.model, inputs)
+    return join(problem, plan.model, inputs)
 
 
-def joined(problem: Problem, model: Model, inputs: dict[int, Any]) -> tuple[Point, Point, Point]:
+def join(problem: Problem, model: Model, inputs: dict[int, Any]) -> tuple[Point, Point, Point]:
     """Return target, first and second station made of inputs of any type: arrays, jets or symbols.
 
     Parameters
@@ -121,7 +121,7 @@ def _at_rows(array: Array, rank: int, block: Rows, index: Array, seed: int) -> d
     return {seed + 3 * i + c: picked[..., i, c] for i in d for c in d}
 
 
-def _fed(value: Any, feed: Feed, x: Array, count: int) -> Any:
+def _feed(value: Any, feed: Feed, x: Array, count: int) -> Any:
     column, gain = feed.table(count)
     part = gather(x, column)
     # Most unknowns enter as they are; a product with ones would cost as much as the rest.
@@ -140,13 +140,16 @@ def to_ecef(problem: Problem, position: tuple[Any, ...]) -> tuple[Any, ...]:
     )
 
 
+# Values and derivatives of all rows: those of a kind together, then what biases do to them.
+
+
 def predict(problem: Problem, x: Array) -> Array:
     """Return the modelled measurements h(x), (..., m), of a problem at vectors x (..., size)."""
     values, x, xp = [], fitting(problem, x), library(x)
     for plan in plans(problem):
         value = placed(plan.model.h(*points(problem, plan, x, differentiate=False)), x)
         value = xp.broadcast_to(value, np.broadcast_shapes(value.shape, (plan.block.count,)))
-        values.append(_biased(plan, x, value)[0])
+        values.append(_bias(plan, x, value)[0])
     return _joined(values)
 
 
@@ -175,13 +178,13 @@ def differentiate(problem: Problem, x: Array) -> tuple[Array, Array]:
     residuals, jacobians = [], []
     for plan, block, start in zip(plans(problem), problem.rows, problem.starts, strict=True):
         m = block.count
-        value, terms = _derived(problem, plan, x)
+        value, terms = _derive(problem, plan, x)
         residual = _residual(block, value, plan.model.period is not None)
         residuals.append(xp.broadcast_to(residual, (*batch, m)))
         if place is None:
-            jacobians.append(_stacked(terms, (*batch, m), width, x))
+            jacobians.append(_stack(terms, (*batch, m), width, x))
         else:
-            _added(terms, place[..., start : start + m, :])
+            _add(terms, place[..., start : start + m, :])
     return _joined(residuals), xp.concat(jacobians, axis=-2) if place is None else place
 
 
@@ -189,13 +192,13 @@ def differentiate(problem: Problem, x: Array) -> tuple[Array, Array]:
 _Terms = list[tuple[Array, Array, Any]]
 
 
-def _derived(problem: Problem, plan: Plan, x: Array) -> tuple[Any, _Terms]:
+def _derive(problem: Problem, plan: Plan, x: Array) -> tuple[Any, _Terms]:
     """Return the values (..., m) of one block, biases included, and their derivatives."""
-    jet, m, fold = plan.model.h(*points(problem, plan, x, differentiate=True)), plan.block.count, _folded(problem)
+    jet, m, fold = plan.model.h(*points(problem, plan, x, differentiate=True)), plan.block.count, _fold(problem)
     # A kind that nothing moves (known targets and stations) has a value without derivatives.
     if not isinstance(jet, Jet):
         jet = Jet(placed(np.asarray(jet), x), {})
-    value, gain = _biased(plan, x, jet.value)
+    value, gain = _bias(plan, x, jet.value)
     terms: _Terms = []
     for feed in plan.feeds:
         partial = jet.partials.get(feed.seed)
@@ -208,7 +211,7 @@ def _derived(problem: Problem, plan: Plan, x: Array) -> tuple[Any, _Terms]:
     return value, terms
 
 
-def _folded(problem: Problem) -> Any:
+def _fold(problem: Problem) -> Any:
     """Return the map from columns of the full vector to columns of [shared, local of the row's epoch]."""
     n, length = problem.layout.n_shared, problem.layout.n_local
 
@@ -218,7 +221,7 @@ def _folded(problem: Problem) -> Any:
     return fold
 
 
-def _biased(plan: Plan, x: Array, value: Any) -> tuple[Any, Any]:
+def _bias(plan: Plan, x: Array, value: Any) -> tuple[Any, Any]:
     """Return values with scales, offsets, drifts and emission times, and the factor that scales them or None."""
     m, gain = plan.block.count, None
     if plan.gains.row.size:
@@ -237,7 +240,7 @@ def _residual(block: Rows, value: Any, periodic: bool) -> Any:
     return library(residual).where(placed(block.weight, residual) > 0.0, residual, 0.0)
 
 
-def _added(terms: _Terms, jacobian: Array) -> None:
+def _add(terms: _Terms, jacobian: Array) -> None:
     """Add derivatives to a block's part of the Jacobian."""
     for column, coefficient, factor in terms:
         # One column for all rows of the block (a shared position) is a slice, where others need a scatter.
@@ -249,7 +252,7 @@ def _added(terms: _Terms, jacobian: Array) -> None:
         jacobian[..., rows, column[rows]] += picked * coefficient[rows]
 
 
-def _stacked(terms: _Terms, shape: tuple[int, ...], width: int, x: Array) -> Any:
+def _stack(terms: _Terms, shape: tuple[int, ...], width: int, x: Array) -> Any:
     """Return the Jacobian (*shape, width) of a block, column by column: in some libraries nothing can be written."""
     columns: dict[int, Any] = {}
     for column, coefficient, factor in terms:

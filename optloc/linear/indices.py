@@ -118,6 +118,8 @@ def columns(layout: Layout, name: str, epoch: Array) -> Array:
     return np.broadcast_to(np.asarray(base)[..., None] + np.arange(slot.size), (len(epoch), slot.size))
 
 
+# Plans of problems: made once for each structure.
+
 # Rows of a problem whose plans are kept, half of what all kept ones may have: a longer problem is planned anew, which
 # takes less time than its rows do, and no memory that lasts.
 _KEPT_ROWS = 4096
@@ -151,7 +153,7 @@ def _adds(problem: Problem, block: Rows, start: int) -> Terms:
         rows = np.flatnonzero(block.target == target)
         column = columns(problem.layout, emission_name(target, len(problem.motions)), block.epoch[rows])
         parts.append(Terms(rows, column[:, 0], np.ones(len(rows))))
-    return _appended(parts)
+    return _append(parts)
 
 
 def _terms(problem: Problem, block: Rows, start: int, forms: tuple[str, ...]) -> Terms:
@@ -166,10 +168,10 @@ def _terms(problem: Problem, block: Rows, start: int, forms: tuple[str, ...]) ->
             coefficient = coefficient * (problem.times - problem.origin)[block.epoch[rows]]
         column = columns(problem.layout, bias.name, rows)[np.arange(len(rows)), member]
         parts.append(Terms(rows, column, coefficient))
-    return _appended(parts)
+    return _append(parts)
 
 
-def _appended(parts: list[Terms]) -> Terms:
+def _append(parts: list[Terms]) -> Terms:
     return Terms(
         *(np.concatenate([getattr(part, name) for part in parts]) for name in ("row", "column", "coefficient"))
     )

@@ -72,6 +72,8 @@ def linearise(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = N
     )
 
 
+# Sums of information, and what is read off them: local unknowns eliminated, steps, covariances.
+
 OPEN = 1e-12
 """Share of its information below which an epoch of a run leaves a combination of its own unknowns open.
 
@@ -188,7 +190,7 @@ def marginal(equations: Normal) -> tuple[Array, Array, Array]:
         return equations.shared, equations.shared_vector, xp.ones_like(equations.cost, dtype=xp.bool)
     # Coupling and vector are solved for at once.
     right = xp.concat([equations.cross.mT, equations.local_vector[..., None]], axis=-1)
-    solved, ok = _solved(equations.local, right)
+    solved, ok = _solve_local(equations.local, right)
     lost = xp.sum(equations.cross @ solved, axis=-3)
     return equations.shared - lost[..., :-1], equations.shared_vector - lost[..., -1], ok
 
@@ -198,18 +200,18 @@ def eliminated(equations: Normal) -> Normal:
     information, vector, _ = marginal(equations)
     cost = equations.cost
     if equations.local.shape[-1]:
-        rest, _ = _solved(equations.local, equations.local_vector[..., None])
+        rest, _ = _solve_local(equations.local, equations.local_vector[..., None])
         cost = cost - (rest[..., 0] * equations.local_vector).sum((-1, -2))
     none = np.zeros((*cost.shape, 1, 0))
     return Normal(information, none[..., None], np.zeros((*cost.shape, 1, vector.shape[-1], 0)), vector, none, cost)
 
 
-def _solved(local: Array, right: Array) -> tuple[Array, Array]:
+def _solve_local(local: Array, right: Array) -> tuple[Array, Array]:
     """Return solutions (..., k, l, p) of the local systems, of least norm where they are singular, and ok (...)."""
     xp = library(local)
     # A single epoch that leaves its own unknowns open leaves the fix open: that is for the caller to see.
     if local.shape[-3] == 1:
-        solved, good = linalg.solve(_measured(local), right)
+        solved, good = linalg.solve(_hold_untouched(local), right)
         return solved, xp.all(good, axis=-1)
     solved, good = linalg.solve(local, right, OPEN)
     # Of a run, an epoch may leave a combination open (one arrival, no emission time): least norm moves only what it
@@ -223,7 +225,7 @@ def _solved(local: Array, right: Array) -> tuple[Array, Array]:
     return solved, xp.ones_like(solved[..., 0, 0, 0], dtype=xp.bool)
 
 
-def _measured(local: Array) -> Array:
+def _hold_untouched(local: Array) -> Array:
     """Return local blocks with a one for every unknown that no row touches: it stays where it is and hides no other."""
     dead = library(local).linalg.diagonal(local) == 0.0
     grown: Array = local + as_number(dead, local)[..., None] * eye(local.shape[-1], local)
@@ -261,7 +263,7 @@ def step(equations: Normal, damping: Array, space: Tangent | None = None) -> tup
     space : Tangent, optional
         Tangent space of equalities that the step keeps to first order.
     """
-    damped = _damped(equations, damping)
+    damped = _damp(equations, damping)
     information, vector, ok = marginal(damped)
     if space is not None:
         shared, good = linalg.solve_within(information, vector, space)
@@ -275,13 +277,13 @@ def step(equations: Normal, damping: Array, space: Tangent | None = None) -> tup
         return shared, ok
     # Back substitution: given the shared step, each epoch solves for its own.
     rest = damped.local_vector - (damped.cross.mT @ shared[..., None, :, None])[..., 0]
-    local, good = _solved(damped.local, rest[..., None])
+    local, good = _solve_local(damped.local, rest[..., None])
     xp = library(local)
     flat = xp.reshape(local[..., 0], (*local.shape[:-3], -1))
     return xp.concat([shared, flat], axis=-1), ok & good
 
 
-def _damped(equations: Normal, damping: Array) -> Normal:
+def _damp(equations: Normal, damping: Array) -> Normal:
     def grow(matrix: Array, factor: Array) -> Array:
         # Diagonal times (1 + damping), all else times one: Marquardt's scaling knows no units.
         grown: Array = matrix * (1.0 + factor[..., None, None] * eye(matrix.shape[-1], matrix))

@@ -39,7 +39,7 @@ def simulate(problem: Problem, truth: Array, seed: int | np.random.SeedSequence,
         shape = (trials, *shape)
     noise = draw(problem.noise, problem.count, shape, rng)
     # Noise is drawn before station errors: problems with and without those meet the same noise.
-    z = noise + predict(*_displaced(problem, truth, shape, rng))
+    z = noise + predict(*_displace(problem, truth, shape, rng))
     values = []
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         part = z[..., start : start + rows.count]
@@ -47,7 +47,7 @@ def simulate(problem: Problem, truth: Array, seed: int | np.random.SeedSequence,
     return problem.with_rows(z=np.concatenate(values, axis=-1))
 
 
-def _displaced(
+def _displace(
     problem: Problem, truth: Array, shape: tuple[int, ...], rng: np.random.Generator
 ) -> tuple[Problem, Array]:
     """Return the problem with the stations where they really are, as far as their errors are noise, and its truth."""

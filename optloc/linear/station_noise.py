@@ -44,7 +44,7 @@ def weighed(problem: Problem, x: Array | None = None) -> Problem:
         named, x = with_offsets(problem, x, np.zeros(()))
         _, jacobian = differentiate(named, x)
         last = covariance.shape[-3] * problem.dimension
-        more = [_propagated(jacobian[..., members, -last:], covariance) for members in groups]
+        more = [_propagate(jacobian[..., members, -last:], covariance) for members in groups]
     blocks = [
         Block(members, gathered(problem.noise, members) + extra) for members, extra in zip(groups, more, strict=True)
     ]
@@ -112,7 +112,7 @@ def _signs(rows: Rows) -> tuple[int, int]:
     return MODELS[rows.kind].ranges or (0, 0)
 
 
-def _propagated(sensitivity: Array, covariance: Array) -> Array:
+def _propagate(sensitivity: Array, covariance: Array) -> Array:
     """Return G P G' (..., g, r, r) of derivatives G (..., g, r, s * d) and station covariances P (..., s, d, d)."""
     s, d = covariance.shape[-3:-1]
     # Stations err independently: P is applied station by station, never as one s d by s d matrix.

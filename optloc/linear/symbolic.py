@@ -8,7 +8,7 @@ import numpy as np
 
 from optloc.base.types import Array, Band
 from optloc.linear.constraints import conjunction
-from optloc.linear.evaluate import given, joined, to_ecef
+from optloc.linear.evaluate import given, join, to_ecef
 from optloc.linear.indices import Terms, plans
 from optloc.models.primitives import Point, wrap
 from optloc.models.surfaces import SURFACES
@@ -51,7 +51,7 @@ def residual(problem: Problem, x: Any, p: Any, z: Any) -> list[Any]:
                 for at in np.flatnonzero(rows == i):
                     gain = np.broadcast_to(feed.gain, feed.column.shape)[at]
                     inputs[feed.seed] = inputs.get(feed.seed, 0.0) + float(gain) * x[int(feed.column[at])]
-            value = plan.model.h(*joined(problem, plan.model, inputs))
+            value = plan.model.h(*join(problem, plan.model, inputs))
             # The same order as in `optloc.linear.evaluate`: scaled, then shifted.
             value = value * (1.0 + _total(plan.gains, i, x)) + _total(plan.adds, i, x)
             misfit = z[start + i] - value

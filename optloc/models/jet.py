@@ -48,7 +48,7 @@ class Jet:
 
     def __mul__(self, other: Any) -> Jet:
         value, theirs = _parts(other)
-        return Jet(self.value * value, _sum(_scaled(self.partials, value), _scaled(theirs, self.value)))
+        return Jet(self.value * value, _sum(_scale(self.partials, value), _scale(theirs, self.value)))
 
     __rmul__ = __mul__
 
@@ -57,40 +57,40 @@ class Jet:
         ratio = self.value / value
         inverse = 1.0 / value
         # (u / v)' = u' / v - (u / v) v' / v: the ratio is at hand, and no square is formed that could overflow.
-        return Jet(ratio, _sum(_scaled(self.partials, inverse), _scaled(theirs, -ratio * inverse)))
+        return Jet(ratio, _sum(_scale(self.partials, inverse), _scale(theirs, -ratio * inverse)))
 
     def __rtruediv__(self, other: Any) -> Jet:
         ratio = other / self.value
-        return Jet(ratio, _scaled(self.partials, -ratio / self.value))
+        return Jet(ratio, _scale(self.partials, -ratio / self.value))
 
 
 def sqrt(u: Jet) -> Jet:
     """Return the square root."""
     root = namespace(u.value).sqrt(u.value)
-    return Jet(root, _scaled(u.partials, 0.5 / root))
+    return Jet(root, _scale(u.partials, 0.5 / root))
 
 
 def sin(u: Jet) -> Jet:
     """Return the sine."""
     xp = namespace(u.value)
-    return Jet(xp.sin(u.value), _scaled(u.partials, xp.cos(u.value)))
+    return Jet(xp.sin(u.value), _scale(u.partials, xp.cos(u.value)))
 
 
 def cos(u: Jet) -> Jet:
     """Return the cosine."""
     xp = namespace(u.value)
-    return Jet(xp.cos(u.value), _scaled(u.partials, -xp.sin(u.value)))
+    return Jet(xp.cos(u.value), _scale(u.partials, -xp.sin(u.value)))
 
 
 def log(u: Jet) -> Jet:
     """Return the natural logarithm."""
-    return Jet(namespace(u.value).log(u.value), _scaled(u.partials, 1.0 / u.value))
+    return Jet(namespace(u.value).log(u.value), _scale(u.partials, 1.0 / u.value))
 
 
 def exp(u: Jet) -> Jet:
     """Return the exponential."""
     value = namespace(u.value).exp(u.value)
-    return Jet(value, _scaled(u.partials, value))
+    return Jet(value, _scale(u.partials, value))
 
 
 def hypot(u: Any, v: Any) -> Jet:
@@ -98,21 +98,21 @@ def hypot(u: Any, v: Any) -> Jet:
     (p, du), (q, dv) = _parts(u), _parts(v)
     # The derivative is the unit vector; at the origin it is NaN, as it should be.
     length = namespace(p).hypot(p, q)
-    return Jet(length, _sum(_scaled(du, p / length), _scaled(dv, q / length)))
+    return Jet(length, _sum(_scale(du, p / length), _scale(dv, q / length)))
 
 
 def atan2(u: Any, v: Any) -> Jet:
     """Return the angle of the vector (v, u), radians."""
     (p, du), (q, dv) = _parts(u), _parts(v)
     squared = p * p + q * q
-    return Jet(namespace(p).atan2(p, q), _sum(_scaled(du, q / squared), _scaled(dv, -p / squared)))
+    return Jet(namespace(p).atan2(p, q), _sum(_scale(du, q / squared), _scale(dv, -p / squared)))
 
 
 def _parts(other: Any) -> tuple[Any, dict[int, Any]]:
     return (other.value, other.partials) if isinstance(other, Jet) else (other, {})
 
 
-def _scaled(partials: dict[int, Any], factor: Any) -> dict[int, Any]:
+def _scale(partials: dict[int, Any], factor: Any) -> dict[int, Any]:
     return {k: v * factor for k, v in partials.items()}
 
 

@@ -109,7 +109,7 @@ def family(
         if value not in known:
             raise InvalidProblem(f"unknown {what} {value!r}", where, nearest(str(value), known))
     # Who has an error decides how members are named, and with which sign a row feels it.
-    touched = _touched(rows, form, kind, where)
+    touched = _select_rows(rows, form, kind, where)
     if per == "kind":
         if members is not None:
             raise InvalidProblem("a kind has no members", where, "leave members out, or use per = 'station'")
@@ -126,7 +126,7 @@ def family(
     return Bias(name, names, row, member, coefficient, form, np.zeros(1))
 
 
-def _touched(rows: Sequence[Rows], form: Form, kind: str | None, where: str) -> list[tuple[Rows, int]]:
+def _select_rows(rows: Sequence[Rows], form: Form, kind: str | None, where: str) -> list[tuple[Rows, int]]:
     """Return the blocks of rows that a bias may touch, each with the global number of its first row."""
     starts = np.cumsum([0, *(block.count for block in rows)]).tolist()
     kinds = [block.kind for block in rows]
@@ -169,7 +169,7 @@ def _by_pair(
     present = tuple("-".join(filter(None, (named[i // len(named)], named[i % len(named)]))) for i in found.tolist())
     if isinstance(members, Mapping):
         raise InvalidProblem("pairs have no groups", f"{where}, members", "give names such as 'A-B'")
-    names = present if members is None else _listed(members, present, "pair", where)
+    names = present if members is None else _check_names(members, present, "pair", where)
     place = np.array([names.index(label) if label in names else -1 for label in present])
     return names, [
         _touch(start + np.arange(block.count), place[np.searchsorted(found, code)], 1.0)
@@ -186,7 +186,7 @@ def _by_station(
         names = tuple(members)
     else:
         used = [stations[i] for i in measuring.tolist() if i >= 0]
-        names = tuple(used) if members is None else _listed(members, stations, "station", where)
+        names = tuple(used) if members is None else _check_names(members, stations, "station", where)
         owner = {name: i for i, name in enumerate(names)}
     place = np.array([*(owner.get(name, -1) for name in stations), -1])  # index -1, no station, is the last
     return names, [
@@ -201,14 +201,14 @@ def _owners(members: Mapping[str, Sequence[str]], stations: Sequence[str], where
     """Yield each station of a group with the number of its group."""
     seen: set[str] = set()
     for i, (group, names) in enumerate(members.items()):
-        for name in _listed(names, stations, "station", f"{where}, {group!r}"):
+        for name in _check_names(names, stations, "station", f"{where}, {group!r}"):
             if name in seen:
                 raise InvalidProblem(f"{name} is in two groups", f"{where}, {group!r}", "name it once")
             seen.add(name)
             yield name, i
 
 
-def _listed(given: Sequence[str], known: Sequence[str], what: str, where: str) -> tuple[str, ...]:
+def _check_names(given: Sequence[str], known: Sequence[str], what: str, where: str) -> tuple[str, ...]:
     """Return names that are known and differ."""
     names = (given,) if isinstance(given, str) else tuple(given)
     place = f"{where}, members"
@@ -276,12 +276,12 @@ def with_known_bias(problem: Problem, name: str, values: Any) -> Problem:
     if name not in names:
         raise InvalidProblem(f"there is no bias {name!r}", "name", nearest(name, names) if names else "there are none")
     bias = problem.biases[names.index(name)]
-    known = _ordered(bias, values, (3,) if bias.form == "rotation" and problem.dimension == 3 else ())
+    known = _order(bias, values, (3,) if bias.form == "rotation" and problem.dimension == 3 else ())
     rest = replace(problem, biases=tuple(b for b in problem.biases if b is not bias))
-    return _turned(rest, bias, known) if bias.form == "rotation" else _corrected(rest, bias, known)
+    return _turn(rest, bias, known) if bias.form == "rotation" else _correct(rest, bias, known)
 
 
-def _ordered(bias: Bias, values: Any, inner: tuple[int, ...]) -> Array:
+def _order(bias: Bias, values: Any, inner: tuple[int, ...]) -> Array:
     """Return values (q,) or (q, 3) in the order of the members."""
     where = f"values of {bias.name!r}"
     if isinstance(values, Mapping):
@@ -297,7 +297,7 @@ def _ordered(bias: Bias, values: Any, inner: tuple[int, ...]) -> Array:
     return array.reshape(shape)
 
 
-def _corrected(problem: Problem, bias: Bias, known: Array) -> Problem:
+def _correct(problem: Problem, bias: Bias, known: Array) -> Problem:
     """Return the problem with offsets, drifts or scales in the known corrections of its rows."""
     amount = np.zeros(problem.count)
     since = (problem.times - problem.origin)[problem.epoch[bias.row]] if bias.form == "drift" else 1.0
@@ -312,7 +312,7 @@ def _corrected(problem: Problem, bias: Bias, known: Array) -> Problem:
     return replace(problem, rows=tuple(rows))
 
 
-def _turned(problem: Problem, bias: Bias, known: Array) -> Problem:
+def _turn(problem: Problem, bias: Bias, known: Array) -> Problem:
     """Return the problem with the axes of its stations turned."""
     d, stations = problem.dimension, problem.stations
     turn = np.zeros((stations.count, 1 if d == 2 else 3))

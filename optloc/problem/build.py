@@ -192,7 +192,7 @@ def assemble(
     if not measurements:
         raise InvalidProblem("there are no measurements", where="measurements", advice="give at least one")
     # Rows are numbered through all kinds in the order of the arguments; noise and biases go by these numbers.
-    blocks = _numbered(measurements)
+    blocks = _number(measurements)
     # Epochs without rows are epochs all the same where later ones have some.
     epochs = 1 + max(int(m.rows.epoch.max(initial=0)) for m in measurements)
     made = Problem(
@@ -232,7 +232,7 @@ def station_array(position: Any, names: Sequence[str] | None = None) -> Stations
     return Stations(array, labels)
 
 
-def _numbered(measurements: Sequence[Measured]) -> list[tuple[Measured, int]]:
+def _number(measurements: Sequence[Measured]) -> list[tuple[Measured, int]]:
     starts = np.cumsum([0, *(m.rows.count for m in measurements)])
     return [(m, int(start)) for m, start in zip(measurements, starts, strict=False)]
 

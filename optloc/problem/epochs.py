@@ -1,4 +1,4 @@
-"""Stretches of epochs: what is summed over a run is worked on window by window, in constant memory."""
+"""Epochs of a run: as one batch where they share nothing, window by window in constant memory, cut and joined."""
 
 from __future__ import annotations
 
@@ -173,11 +173,11 @@ def _noise(problem: Problem, where: Array, size: int) -> Noise:
     blocks = []
     for name in np.unique(label):
         members = np.flatnonzero(label == name)
-        blocks.append(_gathered(cut, where, epoch, members, k))
+        blocks.append(_gather(cut, where, epoch, members, k))
     return group(blocks)
 
 
-def _gathered(cut: tuple[Block, ...], where: Array, epoch: Array, members: Array, k: int) -> Block:
+def _gather(cut: tuple[Block, ...], where: Array, epoch: Array, members: Array, k: int) -> Block:
     slot = {int(row): i for i, row in enumerate(members)}
     shape = np.broadcast_shapes(*(block.covariance.shape[:-3] for block in cut))
     out = np.zeros((*shape, k, 1, len(members), len(members)))
@@ -194,6 +194,8 @@ def _gathered(cut: tuple[Block, ...], where: Array, epoch: Array, members: Array
         out[..., epoch[block.row[inside, 0]][:, None, None], 0, place[:, :, None], place[:, None, :]] = covariance
     return Block(members[None], out)
 
+
+# Stretches of epochs: what is summed over a run is worked on window by window.
 
 # Numbers of a window's Jacobians, 512 kB of doubles: they stay in a cache of the second level, and memory does not
 # grow with the run.
@@ -351,6 +353,9 @@ def _touches(problem: Problem, bias: Bias, number: _Numbers, first: int, last: i
     return replace(bias, row=number.new(bias.row[kept]), member=bias.member[kept], coefficient=bias.coefficient[kept])
 
 
+# Two runs as one.
+
+
 def joined(problem: Problem, more: Problem) -> Problem:
     """Return one run of two: the epochs of the second follow those of the first.
 
@@ -372,7 +377,7 @@ def joined(problem: Problem, more: Problem) -> Problem:
     _check_alike(problem, more)
     k = problem.epochs
     rows = tuple(
-        _appended(one, replace(two, epoch=two.epoch + k)) for one, two in zip(problem.rows, more.rows, strict=True)
+        _append(one, replace(two, epoch=two.epoch + k)) for one, two in zip(problem.rows, more.rows, strict=True)
     )
     # Where the rows of either run come to stand: kinds stay together, the second run behind the first.
     counts = [(one.count, two.count) for one, two in zip(problem.rows, more.rows, strict=True)]
@@ -401,7 +406,7 @@ def joined(problem: Problem, more: Problem) -> Problem:
     )
 
 
-def _appended(one: Rows, two: Rows) -> Rows:
+def _append(one: Rows, two: Rows) -> Rows:
     batch = np.broadcast_shapes(one.z.shape[:-1], two.z.shape[:-1])
 
     def both(a: Array, b: Array) -> Array:

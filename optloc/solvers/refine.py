@@ -12,24 +12,17 @@ from optloc.base.status import Status
 from optloc.base.threads import mapped
 from optloc.base.types import Array
 from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge
-from optloc.compute.pack import coarseness, packed
+from optloc.compute.pack import coarseness, pack
 from optloc.compute.sums import equations_at, serves
-from optloc.linear.constraints import Face, restored, tangent_at
+from optloc.linear.constraints import Face, restore, tangent_at
 from optloc.linear.normal import Normal, decrement, step
 from optloc.linear.station_noise import depends_on_place, weighed, whitener_at
 from optloc.problem.epochs import whole, windows
 from optloc.problem.noise import Whitener, variances, whiten
 from optloc.problem.problem import Problem
 
-# Refinements by machine code: which problems it serves, and with which weights.
-
 WEIGHINGS = 2
 """Station errors are weighed where the target is thought to be; the weights hardly change with it."""
-
-# Systems of more unknowns are better solved one after the other, by LAPACK, than side by side in lanes.
-_UNKNOWNS = 40
-# Numbers of the derivatives from which weights that depend on the place are made at a time: 16 MB.
-_WEIGHED = 2**21
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,85 +80,6 @@ class Rules:
     face: Face
 
 
-Refinement = Callable[[Problem, Array, Rules], Refined]
-
-
-def by_machine_code(
-    problem: Problem, start: Array, item: Array | None, rules: Rules, otherwise: Refinement
-) -> Refined | None:
-    """Return where a refinement by machine code ends, or None where it does not serve the problem or does not pay.
-
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of N problems.
-    start : array (M, size)
-        Starting vectors.
-    item : int array (M,), optional
-        Problem of each start; None: M = N.
-    rules : Rules
-        When to stop.
-    otherwise : callable
-        Refines what machine code gives up: an epoch of a run left its own unknowns open.
-    """
-    few = problem.layout.n_shared + problem.layout.n_local <= _UNKNOWNS
-    if rules.face or not few or not serves(problem, len(start)):
-        return None
-    own = np.arange(len(start)) if item is None else np.asarray(item, dtype=np.int64)
-    if not depends_on_place(problem):
-        return _at_once(problem, start, own, whiten(weighed(problem).noise, problem.weight), rules, otherwise)
-    width = problem.layout.n_shared + problem.stations.count * problem.dimension
-    # Each problem has weights of its own: made in parts, so that their derivatives stay in memory.
-    parts = np.array_split(np.arange(len(start)), 1 + len(start) * problem.count * width // _WEIGHED)
-    done = mapped(lambda part: _anew(problem.take(own[part]), start[part], rules, otherwise), parts)
-    found = [one for one in done if one is not None]
-    return _joined(found) if len(found) == len(parts) else None
-
-
-def _at_once(
-    problem: Problem, start: Array, item: Array, noise: tuple[Whitener, ...], rules: Rules, otherwise: Refinement
-) -> Refined | None:
-    """Return where machine code ends with given weights, or None where it does not serve."""
-    found = packed(problem, noise)
-    if found is None:
-        return None
-    from optloc.compute import refine
-    from optloc.compute.refine import Rules as Limits
-
-    kernel = Limits(float(rules.tolerance), int(rules.limit), bool(rules.damped))
-    done, lost = refine.refined(found, item, start, kernel)
-    # Runs of which an epoch left a combination of its own unknowns open: numpy takes the step of least norm.
-    if lost.any():
-        more = otherwise(problem.take(item[lost]), start[lost], rules)
-        for name in ("x", "cost", "status", "iterations"):
-            getattr(done, name)[lost] = getattr(more, name)
-    return Refined(done.x, done.cost, done.status, done.iterations, lambda: refine.equations(found, item, done))
-
-
-def _anew(problem: Problem, start: Array, rules: Rules, otherwise: Refinement) -> Refined | None:
-    """Return where machine code ends for one start of each problem, weighed where they are and once more at the end."""
-    done = None
-    for _ in range(WEIGHINGS):
-        done = _at_once(problem, start, np.arange(len(start)), whitener_at(problem, start), rules, otherwise)
-        if done is None:
-            return None
-        start = done.x
-    return done
-
-
-def _joined(parts: list[Refined]) -> Refined:
-    """Return several refinements as one."""
-
-    def make() -> Normal:
-        made = [part.equations for part in parts]
-        return Normal(*(np.concatenate([getattr(one, name) for one in made]) for name in Normal.__slots__))
-
-    x, cost, status, iterations = (
-        np.concatenate([getattr(part, name) for part in parts]) for name in ("x", "cost", "status", "iterations")
-    )
-    return Refined(x, cost, status, iterations, make)
-
-
 def refine(
     problem: Problem,
     start: Array,
@@ -215,15 +129,18 @@ def refine(
     if item is not None:
         problem = problem.take(item)
     if weights is not None:
-        return _iterated(problem, start, weights, rules)
+        return _iterate(problem, start, weights, rules)
     for _ in range(WEIGHINGS):
         done = _remade(problem, start, rules)
         start = done.x
     return done
 
 
+# By numpy: all problems of a batch side by side, those that are finished leave it.
+
+
 def _remade(problem: Problem, start: Array, rules: Rules) -> Refined:
-    return _iterated(problem, start, _Weights.of(problem, start), rules)
+    return _iterate(problem, start, _Weights.of(problem, start), rules)
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,10 +164,10 @@ class _Weights:
         return equations_at(problem, x, self.matrices, at=self.at)
 
 
-def _iterated(problem: Problem, start: Array, weights: _Weights, rules: Rules) -> Refined:
+def _iterate(problem: Problem, start: Array, weights: _Weights, rules: Rules) -> Refined:
     """Return where the iteration ends whose weights stay as they are."""
     with np.errstate(all="ignore"):
-        start = restored(problem, rules.face, start) if rules.face else start
+        start = restore(problem, rules.face, start) if rules.face else start
         state = _State.begin(problem, start, weights)
         active, blur = np.arange(len(start)), _blur(problem, len(start))
         for iteration in range(rules.limit):
@@ -277,7 +194,7 @@ class _State:
     @classmethod
     def begin(cls, problem: Problem, start: Array, weights: _Weights) -> _State:
         count = len(start)
-        equations = _owned(weights.equations(problem, start))
+        equations = _own(weights.equations(problem, start))
         status = np.full(count, int(Status.MAX_ITERATIONS), dtype=np.int8)
         status[~np.isfinite(equations.cost)] = Status.NUMERICAL
         return cls(
@@ -325,7 +242,7 @@ def _advance(part: _Part, state: _State, active: Array, rules: Rules, iteration:
     here = state.x[active]
     damping = state.damping[active] if rules.damped else np.zeros(len(active))
     move, solvable = step(now, damping, tangent_at(part.problem, rules.face, here) if rules.face else None)
-    x = restored(part.problem, rules.face, here + move) if rules.face else here + move
+    x = restore(part.problem, rules.face, here + move) if rules.face else here + move
     after = part.weights.equations(part.problem, x)
     found = judge(
         now.cost,
@@ -349,7 +266,7 @@ def _advance(part: _Part, state: _State, active: Array, rules: Rules, iteration:
 
 def _keep(state: _State, active: Array, better: Array, x: Array, after: Normal) -> None:
     if better.all() and len(active) == len(state.x):
-        state.x, state.equations = x, _owned(after)
+        state.x, state.equations = x, _own(after)
         return
     to = active[better]
     state.x[to] = x[better]
@@ -357,10 +274,96 @@ def _keep(state: _State, active: Array, better: Array, x: Array, after: Normal) 
         getattr(state.equations, name)[to] = getattr(after, name)[better]
 
 
-def _owned(equations: Normal) -> Normal:
+def _own(equations: Normal) -> Normal:
     arrays = (getattr(equations, name) for name in Normal.__slots__)
     return Normal(*(array if array.flags.writeable else np.array(array) for array in arrays))
 
 
 def _at(equations: Normal, index: Array) -> Normal:
     return Normal(*(getattr(equations, name)[index] for name in Normal.__slots__))
+
+
+# By machine code: which problems it serves, and with which weights.
+
+# Systems of more unknowns are better solved one after the other, by LAPACK, than side by side in lanes.
+_UNKNOWNS = 40
+# Numbers of the derivatives from which weights that depend on the place are made at a time: 16 MB.
+_WEIGHED = 2**21
+
+Refinement = Callable[[Problem, Array, Rules], Refined]
+
+
+def by_machine_code(
+    problem: Problem, start: Array, item: Array | None, rules: Rules, otherwise: Refinement
+) -> Refined | None:
+    """Return where a refinement by machine code ends, or None where it does not serve the problem or does not pay.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems.
+    start : array (M, size)
+        Starting vectors.
+    item : int array (M,), optional
+        Problem of each start; None: M = N.
+    rules : Rules
+        When to stop.
+    otherwise : callable
+        Refines what machine code gives up: an epoch of a run left its own unknowns open.
+    """
+    few = problem.layout.n_shared + problem.layout.n_local <= _UNKNOWNS
+    if rules.face or not few or not serves(problem, len(start)):
+        return None
+    own = np.arange(len(start)) if item is None else np.asarray(item, dtype=np.int64)
+    if not depends_on_place(problem):
+        return _at_once(problem, start, own, whiten(weighed(problem).noise, problem.weight), rules, otherwise)
+    width = problem.layout.n_shared + problem.stations.count * problem.dimension
+    # Each problem has weights of its own: made in parts, so that their derivatives stay in memory.
+    parts = np.array_split(np.arange(len(start)), 1 + len(start) * problem.count * width // _WEIGHED)
+    done = mapped(lambda part: _anew(problem.take(own[part]), start[part], rules, otherwise), parts)
+    found = [one for one in done if one is not None]
+    return _join(found) if len(found) == len(parts) else None
+
+
+def _at_once(
+    problem: Problem, start: Array, item: Array, noise: tuple[Whitener, ...], rules: Rules, otherwise: Refinement
+) -> Refined | None:
+    """Return where machine code ends with given weights, or None where it does not serve."""
+    found = pack(problem, noise)
+    if found is None:
+        return None
+    from optloc.compute import refine
+    from optloc.compute.refine import Rules as Limits
+
+    kernel = Limits(float(rules.tolerance), int(rules.limit), bool(rules.damped))
+    done, lost = refine.refined(found, item, start, kernel)
+    # Runs of which an epoch left a combination of its own unknowns open: numpy takes the step of least norm.
+    if lost.any():
+        more = otherwise(problem.take(item[lost]), start[lost], rules)
+        for name in ("x", "cost", "status", "iterations"):
+            getattr(done, name)[lost] = getattr(more, name)
+    return Refined(done.x, done.cost, done.status, done.iterations, lambda: refine.equations(found, item, done))
+
+
+def _anew(problem: Problem, start: Array, rules: Rules, otherwise: Refinement) -> Refined | None:
+    """Return where machine code ends for one start of each problem, weighed where they are and once more at the end."""
+    done = None
+    for _ in range(WEIGHINGS):
+        done = _at_once(problem, start, np.arange(len(start)), whitener_at(problem, start), rules, otherwise)
+        if done is None:
+            return None
+        start = done.x
+    return done
+
+
+def _join(parts: list[Refined]) -> Refined:
+    """Return several refinements as one."""
+
+    def make() -> Normal:
+        made = [part.equations for part in parts]
+        return Normal(*(np.concatenate([getattr(one, name) for one in made]) for name in Normal.__slots__))
+
+    x, cost, status, iterations = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("x", "cost", "status", "iterations")
+    )
+    return Refined(x, cost, status, iterations, make)

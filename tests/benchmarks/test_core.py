@@ -11,7 +11,7 @@ from monte_carlo.tables import write
 from runs import drawn, estimated, run, truth
 
 from optloc.compute.jit import enabled
-from optloc.compute.pack import packed
+from optloc.compute.pack import pack
 from optloc.compute.refine import Rules, answers, refine_block, refine_runs
 from optloc.linear.station_noise import weighed
 from optloc.problem.noise import whiten
@@ -39,7 +39,7 @@ def product():
 
 
 def ready(problem):
-    return packed(problem, whiten(weighed(problem).noise, problem.weight))
+    return pack(problem, whiten(weighed(problem).noise, problem.weight))
 
 
 def array(scene):

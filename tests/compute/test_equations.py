@@ -11,7 +11,7 @@ from test_normal import regular_sink
 from optloc import MODELS, Motion, Prior, assemble, measured, simulate, station_array
 from optloc.compute import sums as hooks
 from optloc.compute.equations import normal_at
-from optloc.compute.pack import packed
+from optloc.compute.pack import pack
 from optloc.compute.sums import equations_at, summed
 from optloc.linear.normal import linearise, normal, with_priors
 from optloc.linear.station_noise import whitener_at
@@ -25,7 +25,7 @@ def by_numpy(problem, x):
 
 
 def by_kernel(problem, x, **more):
-    found = packed(problem, whitener_at(problem, x))
+    found = pack(problem, whitener_at(problem, x))
     assert found is not None
     return normal_at(found, x, np.arange(len(x)) % max(1, *problem.batch_shape, 1), priors=True, **more)
 
@@ -152,7 +152,7 @@ def test_a_kind_that_a_user_registers(monkeypatch):
 def test_noise_that_ties_epochs_with_their_own_unknowns_is_left_to_numpy():
     problem = estimated(run(3))
     tied = replace(problem, noise=assemble(STATIONS[3], measured("range", a=[0] * 12, covariance=np.eye(12))).noise)
-    assert packed(tied, whitener_at(tied, np.zeros((1, tied.layout.size)))) is None
+    assert pack(tied, whitener_at(tied, np.zeros((1, tied.layout.size)))) is None
 
 
 def test_a_measurement_that_is_not_a_number_stays_where_it_is():

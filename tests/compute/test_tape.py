@@ -7,7 +7,7 @@ import pytest
 from cases import CASES, kitchen_sink, random_vector
 
 from optloc import MODELS
-from optloc.compute.trace import OPERATIONS, Recorder, Symbol, computed, evaluated, tape, traced
+from optloc.compute.trace import OPERATIONS, Recorder, Symbol, evaluate, operate, tape, trace
 from optloc.linear.evaluate import given, points
 from optloc.linear.indices import plans
 from optloc.models.jet import Jet
@@ -21,7 +21,7 @@ PROBLEMS |= {name: (problem, random_vector(problem)) for name, problem in SINKS.
 def tapes(problem):
     for plan in plans(problem):
         inputs = given(problem, plan)
-        yield plan, inputs, traced(problem, plan, frozenset(inputs), frozenset(feed.seed for feed in plan.feeds))
+        yield plan, inputs, trace(problem, plan, frozenset(inputs), frozenset(feed.seed for feed in plan.feeds))
 
 
 def recorded(function, *names):
@@ -41,7 +41,7 @@ def test_value_and_derivatives_are_those_of_the_jets(name):
             full = np.zeros(plan.block.count)
             full[feed.rows] = x[feed.column] * feed.gain
             inputs[feed.seed] = inputs.get(feed.seed, 0.0) + full
-        value, *partials = evaluated(found.tape, inputs)
+        value, *partials = evaluate(found.tape, inputs)
         size = np.abs(jet.value) + (6.4e6 if plan.model.ecef else 1.0)
         assert (np.abs(value - jet.value) <= 1e-13 * size).all()
         nonzero = {seed for seed, part in parts.items() if np.any(part)}
@@ -63,10 +63,10 @@ def test_every_operation(name):
     operation = OPERATIONS.index(name)
     u, v = np.array([0.3, 1.7, 2.0]), np.array([1.1, 0.4, 3.0])
     found = recorded(lambda p, q: p.recorder.apply(operation, p, q), "u", "v")
-    assert np.array_equal(evaluated(found, {0: u, 1: v})[0], computed(operation, u, v))
+    assert np.array_equal(evaluate(found, {0: u, 1: v})[0], operate(operation, u, v))
     folded = Recorder()
     constant = folded.apply(operation, 0.3, 1.1)
-    assert folded.constant(constant.node) == computed(operation, 0.3, 1.1)
+    assert folded.constant(constant.node) == operate(operation, 0.3, 1.1)
 
 
 @pytest.mark.parametrize(
@@ -82,7 +82,7 @@ def test_every_operation(name):
 def test_what_is_simplified_gives_the_same_number_to_the_last_bit(function):
     rng = np.random.default_rng(3)
     u, v = rng.uniform(0.1, 1e7, (2, 200))
-    assert np.array_equal(evaluated(recorded(function, "u", "v"), {0: u, 1: v})[0], function(u, v))
+    assert np.array_equal(evaluate(recorded(function, "u", "v"), {0: u, 1: v})[0], function(u, v))
 
 
 def test_registers_are_used_again_but_never_by_the_operation_that_reads_them():
