@@ -143,7 +143,8 @@ def sight(
     axes : array_like, shape (..., N, d, d), optional
         Rows are the unit vectors of each station's axes; None: those of the frame.
     passes : int
-        Weighted passes before the instrumental one.
+        Weighted passes before the instrumental one: the second moves fixes by some thousandths of their error, a third
+        by nothing.
 
     Returns
     -------

@@ -121,7 +121,7 @@ def range_of(excess: ArrayLike, direction: Array, illuminator: Array, *, least: 
     illuminator : Array, shape (..., 3)
         Position of the illuminator relative to the receiver.
     least : float
-        Least slope at which a range counts.
+        Least slope at which a range counts: here a metre of path is a thousand kilometres of range.
 
     Returns
     -------

@@ -550,7 +550,7 @@ def _semidefinite(z: Array, size: int) -> Array:
     return np.asarray(fixed[row, column] / scale)
 
 
-@lru_cache(maxsize=64)
+@lru_cache(_KEPT)
 def _triangle(size: int) -> tuple[Index, Index, Array]:
     """Columns and rows of a stored upper triangle, and what undoes the scale of its off-diagonal entries."""
     column, row = np.tril_indices(size)

@@ -285,6 +285,7 @@ def direction_problem(count: int) -> Any:
     unit, level = cp.Parameter(count, name="unit"), cp.Parameter(len(pairs), name="level")
     slope, turn = cp.Parameter((len(pairs), 6), name="slope"), cp.Parameter((len(pairs), 9), name="turn")
     start, order = cp.Parameter(len(pairs), name="start"), cp.Parameter((len(pairs), 6), name="order")
+    # three differences w to a direction, so six numbers and nine products to a pair
     w, diagonal = lift[0, 1:], cp.diag(lift)[1:]
     rules = [lift >> 0, lift[0, 0] == 1]
     rules += [2 * w[3 * i] + unit[i] * cp.sum(diagonal[3 * i : 3 * i + 3]) == 0 for i in range(count)]

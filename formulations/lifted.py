@@ -118,7 +118,7 @@ def lifted_ranges(
     station : array_like, shape (M, d)
         Positions, numbers of order one.
     reach : float
-        Largest ``|x|`` allowed.
+        Largest ``|x|`` allowed, ten extents of the array: range differences leave the lift unbounded without it.
     backend : str
         Conic solver.
 

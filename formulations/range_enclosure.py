@@ -186,6 +186,7 @@ def _left_inverse(system: Array, away: Array, root: Array) -> Array | None:
     values = np.linalg.svd(heavy / np.where(size > 0.0, size, 1.0), compute_uv=False)
     if not values[-1] > _FLAT * values[0]:
         return None
+    # no cut beside that: what is not flat is inverted as it is
     return np.asarray(np.linalg.pinv(heavy, rcond=1e-15) @ weight)
 
 

@@ -57,6 +57,7 @@ def dataset(folder: Path, *, flight: str = "F01", shared: bool = True) -> tuple[
 def load(folder: Path, flight: str, *, shared: bool = True) -> Windows:
     """Return the windows of one flight; `shared`: with the errors that a window's rows share through their anchors."""
     width, stations, rows, truth = _flight(folder, flight)
+    # a flight that ends at a half second has a window there
     times = np.arange(0.0, truth["t_s"].max() + 0.01, STEP)
     rows, at = cut_windows(rows, times, width), along(times, truth)
     rows = rows[at[rows["window"], 2] > AIRBORNE]

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from formulations.secular import Secular, everything
-from formulations.squared_range import cone, minimiser, paraboloid, stationary
+from formulations.secular import Secular, everything, largest
+from formulations.squared_range import _descend, _points, cone, minimiser, paraboloid, stationary
 
 
 def tdoa(seed, count, stations, d, sigma, spread=2.0, flat=False):
@@ -228,6 +228,19 @@ def test_no_stationary_point_is_missed(quadric):
         assert (apart < 1e-6 * (1 + np.linalg.norm(point[good], axis=1))).all()
         seen += len(np.unique(point[good].round(5), axis=0))
     assert seen >= 24
+
+
+@quadrics
+def test_both_ways_to_the_multiplier_end_at_the_same_point(quadric):
+    """Newton on the multiplier where it settles, and the root above the last pole: the global minimiser."""
+    make = tdoa if quadric.shape == "cone" else ranges
+    B, g, _ = make(8, 2000, 7, quadric.size - 1, 0.05)
+    y, settled = _descend(np.moveaxis(B, 0, -1).copy(), g.T.copy(), quadric.square, quadric.linear)
+    other, _, valid = _points(B, g, quadric, largest)
+    assert settled.mean() > 0.6
+    assert valid[settled].all()
+    away = np.abs(y.T - other[:, 0]).max(1)[settled]
+    assert (away <= 1e-9 * (1.0 + np.abs(other[settled, 0]).max(1))).all()
 
 
 @pytest.mark.parametrize("d", [2, 3])
