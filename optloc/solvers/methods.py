@@ -19,8 +19,8 @@ from optloc.problem.loss import LOSSES
 from optloc.problem.problem import Problem
 from optloc.proof.scope import unsupported
 from optloc.solvers import stages
-from optloc.solvers.catalogue import FORMULATIONS, Formulation
 from optloc.solvers.certify.branch_and_bound import certified, value_certified
+from optloc.solvers.formulations import FORMULATIONS, Formulation
 from optloc.solvers.outside import FixSolver, adapt
 from optloc.solvers.policy import LISTED_GAP
 from optloc.solvers.pool import Pool, offer, pack

@@ -17,12 +17,11 @@ from optloc.base.types import Array
 from optloc.linear.constraints import exact
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
-from optloc.solvers.catalogue import FORMULATIONS
+from optloc.solvers.formulations import FORMULATIONS
 from optloc.solvers.inequalities import bound_pool, least_finished
 from optloc.solvers.policy import DOUBT
 from optloc.solvers.pool import Pool, offer, pack
 from optloc.solvers.refine import refine
-from optloc.solvers.search import PLACES, searched_starts
 from optloc.solvers.starts.position import (
     along_the_valley,
     mirrored,
@@ -129,6 +128,11 @@ def _fresh(problem: Problem, fix: Fix, seen: Array, more: Array) -> Array:
     return np.where((near & (usable & ok)[:, None])[..., None], np.nan, more)
 
 
+# The last resort, a seeded search from many places, for mixtures that no closed form starts: directions are uniform and
+# distances log-uniform, so many that in space each of the 8 octants is tried at 12 scales; the dozen cheapest go on.
+_PLACES, _KEPT = 96, 12
+_SEED = 20261121  # any: the same problem always gets the same places
+
 # More starts change nothing about these.
 _SETTLED = (Status.REJECTED, Status.TOO_FEW_ROWS, Status.INFEASIBLE, Status.CONTRADICTORY)
 
@@ -147,7 +151,7 @@ def search(problem: Problem, pool: Pool | None) -> Pool:
         return pool
     began = perf_counter()
     part = problem.take(items)
-    found = lsr(part, _place(part, searched_starts(part), take(pool, items), "search", began))
+    found = lsr(part, _place(part, _search_starts(part), take(pool, items), "search", began))
     good = np.flatnonzero(judge(part, found).answered)
     remark = np.array([_searched_sentence(why) for why in fix.reason[items]], dtype=object)
     found = replace(found, searched=np.ones(len(items), dtype=bool), remark=remark)
@@ -155,8 +159,42 @@ def search(problem: Problem, pool: Pool | None) -> Pool:
     return pool.merge(items[good], take(found, good), stage)
 
 
+def _search_starts(problem: Problem) -> Array:
+    """Return the best starting positions (N, q, d) of a flat batch among places around the stations.
+
+    Directions are uniform, distances log-uniform from a tenth of the stations' spread to a hundred times it; every
+    place is refined for a few steps and the cheapest are kept. The same problem always gets the same places.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems with one target.
+    """
+    size, d = problem.batch_shape[0], problem.dimension
+    stations = problem.stations.position.reshape(*problem.stations.position.shape[:-3], -1, d)
+    centre = np.broadcast_to(stations.mean(-2), (size, d))
+    spread = np.linalg.norm(stations - stations.mean(-2, keepdims=True), axis=-1).max(-1)
+    spread = np.broadcast_to(np.where(spread > 0.0, spread, 1.0), (size,))
+    places = centre[:, None] + spread[:, None, None] * _directions(d)
+    x = vectors(problem, places)
+    item = np.repeat(np.arange(size), _PLACES)
+    done = refine(problem, x.reshape(-1, x.shape[-1]), item=item, limit=8, face=exact(problem))
+    cost = np.where(np.isfinite(done.cost), done.cost, np.inf).reshape(size, _PLACES)
+    order = np.argsort(cost, axis=1, kind="stable")[:, :_KEPT]
+    slot, _ = problem.layout.find("position")
+    refined = done.x.reshape(size, _PLACES, -1)[..., slot.start : slot.start + d]
+    return np.take_along_axis(refined, order[..., None], axis=1)
+
+
+def _directions(d: int) -> Array:
+    rng = np.random.default_rng(_SEED)
+    direction = rng.standard_normal((_PLACES, d))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    return direction * 10.0 ** rng.uniform(-1.0, 2.0, (_PLACES, 1))
+
+
 def _searched_sentence(why: str) -> str:
-    return f"{why}; best of a search from {PLACES} places" if why else f"best of {PLACES} places"
+    return f"{why}; best of a search from {_PLACES} places" if why else f"best of {_PLACES} places"
 
 
 def search_widely(problem: Problem) -> Pool:
