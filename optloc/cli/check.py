@@ -51,7 +51,7 @@ def run_check(file: Path, as_json: bool, asked: Asked | None = None, *, quiet: b
     elif not quiet:
         table = Table(title=loaded.title, show_header=False, title_justify="left")
         for name, value in found.items():
-            table.add_row(name.replace("_", " "), _spelled(value))
+            table.add_row(name.replace("_", " "), _spell(value))
         Console().print(table)
         if checked is not None:
             _show_health(checked, Console())
@@ -79,7 +79,7 @@ def _health(loaded: Loaded, asked: Asked, quiet: bool) -> Checked | None:
     return checked
 
 
-def _spelled(value: Any) -> str:
+def _spell(value: Any) -> str:
     if isinstance(value, dict):
         return ", ".join(f"{key}: {inner}" for key, inner in value.items()) or "none"
     if isinstance(value, list):
@@ -103,7 +103,7 @@ def summary(loaded: Loaded) -> dict[str, Any]:
         "frame": problem.frame.kind,
         "dimension": problem.dimension,
         "stations": problem.stations.count,
-        "moving_stations": _moving(problem.stations.position),
+        "moving_stations": _count_moving(problem.stations.position),
         "station_errors": _errors(problem),
         "epochs": problem.epochs,
         "duration_s": float(np.ptp(loaded.times)),
@@ -121,7 +121,7 @@ def summary(loaded: Loaded) -> dict[str, Any]:
     }
 
 
-def _moving(position: Array) -> int:
+def _count_moving(position: Array) -> int:
     """Return how many stations (k, s, d) are not at one place in all epochs."""
     return int((np.ptp(position, axis=0).max(-1) > 0.0).sum())
 

@@ -72,7 +72,7 @@ def describe(title: str, table: Mapping[str, Any]) -> Rows:
     for name, entry in table.items():
         fields = [field for field in getattr(entry, "__dataclass_fields__", {}) if field not in ("name", "summary")]
         texts = {field: _spell(getattr(entry, field)) for field in fields}
-        shown = {field: text for field, text in texts.items() if text is not None}
+        shown = {field: text for field, text in texts.items() if text}
         rows.append({title: name} | shown | {"summary": _summary(entry)})
     return rows
 

@@ -10,7 +10,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Stations
 from optloc.files.reader import assemble
-from optloc.files.schema import validated
+from optloc.files.schema import validate
 from optloc.files.table import Table, of_frame
 from optloc.problem.problem import Problem
 
@@ -91,7 +91,7 @@ def from_table(
         "target": {"motion": motion},
         "constraints": [dict(constraint) for constraint in constraints],
     }
-    file = validated(settings, "arguments")
+    file = validate(settings, "arguments")
     return assemble(file, station_table, [of_frame(table, "table", names)], "arguments", values=values).loaded.problem
 
 

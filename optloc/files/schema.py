@@ -243,10 +243,10 @@ def schema() -> dict[str, Any]:
 
 def read_document(path: Path) -> ProblemFile:
     """Return the contents of a problem file; raise InvalidProblem where it is none."""
-    return validated(parsed(read_text(path), path.name), path.name)
+    return validate(parse_toml(read_text(path), path.name), path.name)
 
 
-def parsed(text: str, source: str) -> dict[str, Any]:
+def parse_toml(text: str, source: str) -> dict[str, Any]:
     """Return TOML of format 1 as data; `source` is the place to name."""
     data = _toml(text, source)
     # true equals 1 in Python.
@@ -256,12 +256,12 @@ def parsed(text: str, source: str) -> dict[str, Any]:
     return data
 
 
-def validated(data: dict[str, Any], source: str) -> ProblemFile:
+def validate(data: dict[str, Any], source: str) -> ProblemFile:
     """Return data as a problem file; `source` is the place to name."""
-    return fitted(ProblemFile, data, source)
+    return conform(ProblemFile, data, source)
 
 
-def fitted(model: type[_Model], data: dict[str, Any], source: str) -> _Model:
+def conform(model: type[_Model], data: dict[str, Any], source: str) -> _Model:
     """Return data as a table of a schema; raise InvalidProblem with the first complaint.
 
     Parameters
@@ -283,13 +283,13 @@ def read_text(path: Path) -> str:
     """Return the text of a file; raise InvalidProblem where it is missing, a folder or not UTF-8."""
     try:
         # Editors of Windows begin files with a byte order mark.
-        return existing(path).read_bytes().decode("utf-8-sig")
+        return find_file(path).read_bytes().decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = error.object[: error.start].count(b"\n") + 1
         raise InvalidProblem("the text is not UTF-8", join(path.name, f"line {line}"), "save it as UTF-8") from None
 
 
-def existing(path: Path) -> Path:
+def find_file(path: Path) -> Path:
     """Return a path that is a readable file; raise InvalidProblem otherwise."""
     if path.is_dir():
         raise InvalidProblem("this is a folder, not a file", str(path), "name a file in it")
@@ -341,7 +341,7 @@ def _sentence(error: ValidationError, source: str, data: dict[str, Any], model: 
     if first["type"] == "literal_error":
         known = [part.strip().strip("'") for part in str(first["ctx"]["expected"]).replace(" or ", ", ").split(",")]
         what, advice = f"{key} = {first['input']!r} is unknown", nearest(str(first["input"]), known)
-    return InvalidProblem(what, join(source, *_spelled(path)), advice)
+    return InvalidProblem(what, join(source, *_spell(path)), advice)
 
 
 def _path(loc: tuple[int | str, ...], data: Any) -> tuple[list[int | str], str]:
@@ -362,7 +362,7 @@ def _path(loc: tuple[int | str, ...], data: Any) -> tuple[list[int | str], str]:
     return table, str(key)
 
 
-def _spelled(path: list[int | str]) -> list[str]:
+def _spell(path: list[int | str]) -> list[str]:
     """Return a path as a file spells it: ``[[measurements]] 2``."""
     names: list[str] = []
     for part in path:

@@ -11,7 +11,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
-from optloc.files.schema import DataTable, existing, read_text
+from optloc.files.schema import DataTable, find_file, read_text
 from optloc.files.words import join
 
 _PARQUET = (".parquet", ".pq")
@@ -78,7 +78,7 @@ class Table:
     def numbers(self, key: str, optional: bool = False) -> Array:
         """Return a column as finite numbers (m,); an empty cell is NaN where `optional`, else refused."""
         column = self.raw(key)
-        values = column.astype(np.float64) if column.dtype.kind in "iuf" else self._parsed(key, column)
+        values = column.astype(np.float64) if column.dtype.kind in "iuf" else self._parse(key, column)
         bad = np.isinf(values) if optional else ~np.isfinite(values)
         if bad.any():
             row = int(np.flatnonzero(bad)[0])
@@ -118,7 +118,7 @@ class Table:
             return column.astype("datetime64[ns]").astype(np.int64) * 1e-9
         return self.numbers(key) * factor
 
-    def _parsed(self, key: str, column: Array) -> Array:
+    def _parse(self, key: str, column: Array) -> Array:
         # All at once where all are numbers; else cell by cell, to name the one that is not.
         try:
             return column.astype(np.float64)
@@ -156,7 +156,7 @@ def table_of(section: DataTable, folder: Path, where: str) -> Table:
             f"{section.file!r} is of no known type", join(where, "key 'file'"), f"use {', '.join(_FILES)}"
         )
     found = (
-        parquet(existing(path), section.columns)
+        parquet(find_file(path), section.columns)
         if suffix in _PARQUET
         else csv(path, section.separator, section.columns)
     )

@@ -22,7 +22,7 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array, Stations
 from optloc.base.units import SI_UNIT
 from optloc.files import read
-from optloc.files.schema import fitted, parsed, read_text
+from optloc.files.schema import conform, parse_toml, read_text
 from optloc.files.words import join, kind_model
 from optloc.models import MODELS
 from optloc.problem.build import assemble, measured
@@ -182,7 +182,7 @@ def plan_of(file: Path, *, trials: int | None = None, seed: int | None = None) -
 
 def planned(text: str, source: str, folder: Path, *, trials: int | None = None, seed: int | None = None) -> Plan:
     """Return the plan of the text of a study file; `folder` is where its problem files are."""
-    study = fitted(StudyFile, parsed(text, source), source)
+    study = conform(StudyFile, parse_toml(text, source), source)
     new = {key: value for key, value in (("trials", trials), ("seed", seed)) if value is not None}
     study = study.model_copy(update=new)
     try:
@@ -256,7 +256,7 @@ def _sweep(table: ScenarioTable) -> Iterator[tuple[dict[str, Any], ScenarioTable
                 if not isinstance(at, dict):
                     raise InvalidProblem(f"{name!r} names no key", join(where, "sweep"), "write table.key")
             at[last] = value
-        yield swept, fitted(ScenarioTable, data, where) if swept else table
+        yield swept, conform(ScenarioTable, data, where) if swept else table
 
 
 def _template(table: ScenarioTable, folder: Path, where: str, seed: int) -> Problem:

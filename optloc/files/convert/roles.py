@@ -15,7 +15,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
 from optloc.base.units import UNITS
-from optloc.files.schema import existing, read_text
+from optloc.files.schema import find_file, read_text
 from optloc.files.table import Table, csv, parquet
 
 # Role: names that suggest it, the likeliest first; without case, unit and what is no letter.
@@ -112,11 +112,11 @@ class Roles:
 def read_table(path: Path) -> Table:
     """Return a CSV or Parquet table; what separates the fields of a CSV file is seen from its header."""
     if path.suffix.lower() in (".parquet", ".pq"):
-        return parquet(existing(path), {})
+        return parquet(find_file(path), {})
     if path.suffix.lower() not in (".csv", ".tsv", ".txt") and path.is_file():
         known = "use .csv, .tsv, .txt or .parquet, and .geojson for stations"
         raise InvalidProblem(f"files of type {path.suffix or path.name!r} are unknown", str(path), known)
-    with existing(path).open("rb") as stream:
+    with find_file(path).open("rb") as stream:
         header = stream.readline()
     # What separates is what the header has most of.
     separator = max(b",;\t", key=header.count)
