@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from optloc.base import linalg
 from optloc.base.types import Array
 from optloc.linear.evaluate import predict
 from optloc.several.set_packing import Prices
@@ -110,9 +111,7 @@ def _cheapest_at(scene: Scene, prices: Prices, x: Array) -> tuple[Array, Array]:
     picks = cheapest_rows(scene, option)
     used = picks >= 0
     r = np.where(used, np.take_along_axis(apart, np.maximum(picks, 0)[..., None], axis=-1)[..., 0], 0.0)
-    # Rows that are not used keep their variance and no correlation: their r is zero.
-    R = np.where(used[:, :, None] & used[:, None, :], scene.R, np.diag(np.diagonal(scene.R)))
-    chi2 = (r * np.linalg.solve(R, r[..., None])[..., 0]).sum(-1)
+    chi2 = (_whiten(scene, used, r[..., None])[..., 0] ** 2).sum(-1)
     return chi2 + scene.constant(picks) + of_picks(prices.row, picks).sum(-1) - prices.emitter, picks
 
 
@@ -210,13 +209,17 @@ def _bound_jointly(scene: Scene, picks: Array, apart: Array, slope: Array, remai
     known = used & np.isfinite(slope).all(-1) & np.isfinite(remainder)
     r = np.where(known, np.take_along_axis(apart, np.maximum(picks, 0)[..., None], axis=-1)[..., 0], 0.0)
     J, q = np.where(known[..., None], slope, 0.0), np.where(known, remainder, 0.0)
-    if scene.independent:
-        r, J = r / scene.sigma, J / scene.sigma[:, None]
-    else:
-        both = known[:, :, None] & known[:, None, :]
-        L = np.linalg.cholesky(np.where(both, scene.R, np.diag(np.diagonal(scene.R))))
-        r, J = np.linalg.solve(L, r[..., None])[..., 0], np.linalg.solve(L, J)
+    white = _whiten(scene, known, np.concatenate([J, r[..., None]], axis=-1))
+    r, J = white[..., -1], white[..., :-1]
     left = r - (J @ (np.linalg.pinv(J) @ r[..., None]))[..., 0]
     # |q| whitened is at most |q / s| over the root of the least eigenvalue of the correlation.
     blur = np.sqrt(((q / scene.sigma) ** 2).sum(-1) / _errors(scene)[2])
     return np.asarray(np.maximum(np.sqrt((left**2).sum(-1)) - blur, 0.0) ** 2)
+
+
+def _whiten(scene: Scene, used: Array, columns: Array) -> Array:
+    """Return columns (q, m, c) of the rows used (q, m), whitened; those of other rows are zero."""
+    if scene.independent:
+        return np.asarray(np.where(used[..., None], columns / scene.sigma[:, None], 0.0))
+    both = used[:, :, None] & used[:, None, :]
+    return np.asarray(linalg.whitening(np.where(both, scene.R, 0.0)) @ columns)

@@ -12,7 +12,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.status import Status
 from optloc.base.types import Array
 from optloc.problem.epochs import cut
-from optloc.problem.fix import Fix
+from optloc.problem.fix import Fix, tail_probability
 from optloc.problem.problem import Problem
 from optloc.track.associate import weights_within
 from optloc.track.dynamics import Dynamics
@@ -276,10 +276,8 @@ def _check_start(start: State, problem: Problem, dynamics: Dynamics) -> None:
 
 def _check_agrees(entry: Entry) -> None:
     """Refuse a given state that its first scan contradicts: by its chi-square, or as no row passed the gate."""
-    from scipy.special import gammaincc
-
-    count, nis = float(entry.updated.count), float(entry.updated.nis)
-    if entry.code == Status.REJECTED or (count > 0 and gammaincc(count / 2.0, nis / 2.0) < _ABSURD):
+    p_value = tail_probability(entry.updated.nis, entry.updated.count)  # NaN without a row
+    if entry.code == Status.REJECTED or p_value < _ABSURD:
         what = f"the initial state contradicts the first scan, at {entry.time:.10g} s"
         advice = "correct it, make its standard deviation larger, or leave it out: a start needs no guess"
         raise InvalidProblem(what, "start", advice)
