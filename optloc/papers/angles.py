@@ -106,7 +106,7 @@ def _winding() -> Scenario:
     return Scenario("simulation 2", _BASE, _states((parts[0], parts[1], parts[2])), _FINE, (50,))
 
 
-def circling(name: str, slow: float, fast: float, rate: float, seconds: tuple[int, int, int]) -> Scenario:
+def fly_circle(name: str, slow: float, fast: float, rate: float, seconds: tuple[int, int, int]) -> Scenario:
     """Return simulation 3: straight, in a circle, straight.
 
     Parameters
@@ -157,12 +157,12 @@ WINDING_PEAK = float(np.linalg.norm(WINDING.states[:, 2], axis=-1).max())
 """Largest acceleration of simulation 2, m/s^2: the printed error is six times as large."""
 
 # The radius is the printed one, 3 km; a full turn brings the course back to where it was, so no speed jumps.
-REPAIRED = circling("repaired", _RADIUS * np.pi / 20.0, _RADIUS * np.pi / 20.0, np.pi / 20.0, (100, 40, 100))
+REPAIRED = fly_circle("repaired", _RADIUS * np.pi / 20.0, _RADIUS * np.pi / 20.0, np.pi / 20.0, (100, 40, 100))
 """Simulation 3 with one speed, 471 m/s, one full turn in 40 s, and straight parts of 100 s."""
 
 READINGS = (
-    circling("as printed, in m/s", float(np.hypot(0.2, 0.1)), _RADIUS * _RATE, _RATE, _PRINTED),
-    circling("as printed, in km/s", 1e3 * float(np.hypot(0.2, 0.1)), _RADIUS * _RATE, _RATE, _PRINTED),
+    fly_circle("as printed, in m/s", float(np.hypot(0.2, 0.1)), _RADIUS * _RATE, _RATE, _PRINTED),
+    fly_circle("as printed, in km/s", 1e3 * float(np.hypot(0.2, 0.1)), _RADIUS * _RATE, _RATE, _PRINTED),
 )
 """Simulation 3 as printed: the speed of the straight parts has no unit."""
 
@@ -212,14 +212,14 @@ def draw(scenario: Scenario, trials: int, seed: int, key: int) -> Draw:
     return Draw(scenario, problem, trials, lambda: np.random.default_rng(two))
 
 
-def placed(drawn: Draw, sigmas: Sigmas, *, known: int = 3) -> State:
+def start_at_truth(drawn: Draw, sigmas: Sigmas, *, known: int = 3) -> State:
     """Return starts at t = 0 that are the truth, but for derivatives from `known` on, which are zero."""
     d, mean = drawn.scenario.dimension, drawn.scenario.truth[0].copy()
     mean[known * d :] = 0.0
     return _repeated(mean, _diagonal(sigmas, d), drawn.trials)
 
 
-def scattered(drawn: Draw, sigmas: Sigmas) -> State:
+def scatter_starts(drawn: Draw, sigmas: Sigmas) -> State:
     """Return starts at t = 0 drawn around the truth with the covariance that they claim."""
     d = drawn.scenario.dimension
     state = _repeated(drawn.scenario.truth[0], _diagonal(sigmas, d), drawn.trials)
@@ -227,7 +227,7 @@ def scattered(drawn: Draw, sigmas: Sigmas) -> State:
     return replace(state, mean=state.mean + error)
 
 
-def fitted_start(drawn: Draw, epochs: int, order: int = 2) -> State:
+def fit_start(drawn: Draw, epochs: int, order: int = 2) -> State:
     """Return the states after some epochs, fitted to them without a guess."""
     fix = fitted(cut(drawn.problem, 0, epochs), order)
     mean, cov = fix.gaussian()
@@ -300,12 +300,12 @@ def distances(drawn: Draw, track: Track) -> Array:
         return np.asarray(np.sqrt((errors(drawn, track)[:, -1, 0] ** 2).sum(-1)))
 
 
-def lost(drawn: Draw, track: Track) -> float:
+def share_lost(drawn: Draw, track: Track) -> float:
     """Return the share of tracks that end further than `LOST` from the truth, or nowhere."""
     return float((~(distances(drawn, track) < LOST)).mean())  # so that NaN counts as lost
 
 
-def tracked(drawn: Draw, start: State, dynamics: Dynamics, update: str = "ekf") -> Track:
+def track_all(drawn: Draw, start: State, dynamics: Dynamics, update: str = "ekf") -> Track:
     """Return the tracks of all trials."""
     return followed(drawn.problem, start, dynamics, update)
 
@@ -418,9 +418,9 @@ def run_wholes(drawn: Draw, tick: Tick) -> list[tuple[str, Array]]:
     parts = {"plain": found.plain, "weighted": found.weighted, "instrumental variables": found.instrumental}
     out = [(name, _size((unit * c).reshape(len(c), -1) - exact)) for name, c in parts.items()]
     out.append(("maximum likelihood (optloc)", _size(fitted(drawn.problem, 2).x - exact)))
-    start = placed(drawn, STRAIGHT_START, known=2)
+    start = start_at_truth(drawn, STRAIGHT_START, known=2)
     for limit in (30.0, 2.0):
-        track = tracked(drawn, start, current_statistical(TIME_CONSTANT, limit))
+        track = track_all(drawn, start, current_statistical(TIME_CONSTANT, limit))
         out.append((f"filter, a_max {limit:g}", _size(track.mean[:, -1] - exact)))
     tick()
     return out

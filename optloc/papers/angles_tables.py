@@ -27,20 +27,20 @@ from optloc.papers.angles import (
     draw,
     errors,
     first_fix,
-    fitted_start,
+    fit_start,
     fixed_variance,
     fixes,
     linear_track,
-    lost,
-    placed,
     printed_transition,
     printed_variance,
     rms,
     run_rays,
     run_wholes,
-    scattered,
+    scatter_starts,
+    share_lost,
     snapshot_bound,
-    tracked,
+    start_at_truth,
+    track_all,
     whole_track_bound,
 )
 from optloc.papers.report import (
@@ -120,19 +120,19 @@ class Curve:
         return [float(self.total(a, b)[0]) for a, b in zip(first, scenario.phases, strict=True)]
 
 
-def curve(label: str, drawn: Draw, start: State, dynamics: Dynamics, update: str = "ekf") -> Curve:
+def track_curve(label: str, drawn: Draw, start: State, dynamics: Dynamics, update: str = "ekf") -> Curve:
     """Return the errors of the tracks from a start."""
-    return scored(label, drawn, tracked(drawn, start, dynamics, update).mean)
+    return score_curve(label, drawn, track_all(drawn, start, dynamics, update).mean)
 
 
-def scored(label: str, drawn: Draw, mean: Array) -> Curve:
+def score_curve(label: str, drawn: Draw, mean: Array) -> Curve:
     """Return the errors of states (trials, q, n) at the last q epochs."""
     error = rms(errors(drawn, mean), (0,))
     last = drawn.scenario.epochs
     return Curve(label, np.arange(last - len(error) + 1.0, last + 1.0), error)
 
 
-def bounded(label: str, scenario: Scenario, start: State, dynamics: Dynamics) -> Curve:
+def bound_curve(label: str, scenario: Scenario, start: State, dynamics: Dynamics) -> Curve:
     """Return the posterior bound from a start."""
     least = bound(scenario, start, dynamics)
     return Curve(label, np.arange(start.time + 1.0, scenario.epochs + 1.0), least)
@@ -141,13 +141,13 @@ def bounded(label: str, scenario: Scenario, start: State, dynamics: Dynamics) ->
 def run_straight(drawn: Draw, tick: Tick) -> list[Curve]:
     """Return simulation 1: the filter with the right and the printed transition, three limits, and bounds."""
     # a_max is not printed: 150, 10 and one and a half times the acceleration of the target.
-    start, out = placed(drawn, STRAIGHT_START, known=2), []
+    start, out = start_at_truth(drawn, STRAIGHT_START, known=2), []
     for limit in (30.0, 2.0, 0.3):
         for name, make in (("filter", current_statistical), ("printed f33", printed_transition)):
-            out.append(curve(f"{name}, a_max {limit:g}", drawn, start, make(TIME_CONSTANT, limit)))
+            out.append(track_curve(f"{name}, a_max {limit:g}", drawn, start, make(TIME_CONSTANT, limit)))
             tick()
-    out.append(bounded("posterior bound, a_max 2", STRAIGHT, start, fixed_variance(2.0)))
-    out.append(bounded("bound of one track", STRAIGHT, start, polynomial(2)))
+    out.append(bound_curve("posterior bound, a_max 2", STRAIGHT, start, fixed_variance(2.0)))
+    out.append(bound_curve("bound of one track", STRAIGHT, start, polynomial(2)))
     tick()
     return out
 
@@ -156,11 +156,11 @@ def run_winding(drawn: Draw, tick: Tick) -> list[Curve]:
     """Return simulation 2: started at rest, and by a fit of the first three epochs."""
     # a_max is not printed: with 30 m/s² and this start the printed errors come out within 15 %.
     model = current_statistical(TIME_CONSTANT, 30.0)
-    start = placed(drawn, WINDING_START, known=1)
+    start = start_at_truth(drawn, WINDING_START, known=1)
     out = [
-        curve("filter, started at rest", drawn, start, model),
-        curve("filter, started by a fit of 3 s", drawn, fitted_start(drawn, 3), model, "iekf"),
-        bounded("posterior bound", WINDING, start, fixed_variance(30.0)),
+        track_curve("filter, started at rest", drawn, start, model),
+        track_curve("filter, started by a fit of 3 s", drawn, fit_start(drawn, 3), model, "iekf"),
+        bound_curve("posterior bound", WINDING, start, fixed_variance(30.0)),
     ]
     tick()
     return out
@@ -174,10 +174,10 @@ def run_circles(drawn: Draw, tick: Tick) -> dict[float, list[Curve]]:
     for limit in (100.0, 300.0):  # a third above the peak of 74 m/s², and four times the peak
         model = current_statistical(TIME_CONSTANT, limit)
         out[limit] = [
-            curve("single step", drawn, start, model),
-            curve("converged", drawn, start, model, "iekf"),
-            scored("fixes, then a linear filter", drawn, linear_track(places, start, model)),
-            bounded("posterior bound", REPAIRED, start, fixed_variance(limit)),
+            track_curve("single step", drawn, start, model),
+            track_curve("converged", drawn, start, model, "iekf"),
+            score_curve("fixes, then a linear filter", drawn, linear_track(places, start, model)),
+            bound_curve("posterior bound", REPAIRED, start, fixed_variance(limit)),
         ]
         tick()
     return out
@@ -210,9 +210,9 @@ def run_readings(count: int, seed: int, key: int, tick: Tick) -> list[Reading]:
         drawn = draw(scenario, count, seed, key + i)
         start = first_fix(drawn, *CIRCLE_START)
         for limit in (100.0, 300.0):
-            found = curve("", drawn, start, current_statistical(TIME_CONSTANT, limit))
+            found = track_curve("", drawn, start, current_statistical(TIME_CONSTANT, limit))
             tick()
-            least = bounded("", scenario, start, fixed_variance(limit))
+            least = bound_curve("", scenario, start, fixed_variance(limit))
             out.append(Reading(scenario, limit, found.phases(scenario), least.phases(scenario)))
             tick()
     return out
@@ -235,12 +235,12 @@ The first is zero for a start by a fit of the first epochs."""
 def run_starts(drawn: Draw, tick: Tick) -> Lost:
     """Return who is lost from starts on the line through the stations, and from a fit of three epochs."""
     out: Lost = {}
-    fit = fitted_start(drawn, 3)
+    fit = fit_start(drawn, 3)
     # Metres off the line through both stations, which are 50 and 100 m away.
     for sigma, limit in ((1.0, 5.0), (1.0, 30.0), (3.0, 5.0), (3.0, 30.0), (0.0, 30.0)):
-        start = scattered(drawn, (sigma, *_CLOSE)) if sigma else fit
+        start = scatter_starts(drawn, (sigma, *_CLOSE)) if sigma else fit
         model = current_statistical(TIME_CONSTANT, limit)
-        out[sigma, limit] = {name: lost(drawn, tracked(drawn, start, model, name)) for name in UPDATES}
+        out[sigma, limit] = {name: share_lost(drawn, track_all(drawn, start, model, name)) for name in UPDATES}
         tick()
     return out
 
@@ -248,9 +248,11 @@ def run_starts(drawn: Draw, tick: Tick) -> Lost:
 def run_clamps(drawn: Draw, tick: Tick) -> dict[str, float]:
     """Return the share of lost tracks with the variance as published and clamped, from 3 m and with a_max 0.3."""
     # 0.3 leaves 0.1 m/s² above the target's acceleration: from starts 0.2 m/s² wide estimates cross the limit.
-    start = scattered(drawn, (3.0, *_CLOSE))
+    start = scatter_starts(drawn, (3.0, *_CLOSE))
     models = {"as published": printed_variance, "clamped": current_statistical}
-    found = {name: lost(drawn, tracked(drawn, start, make(TIME_CONSTANT, 0.3))) for name, make in models.items()}
+    found = {
+        name: share_lost(drawn, track_all(drawn, start, make(TIME_CONSTANT, 0.3))) for name, make in models.items()
+    }
     tick()
     return found
 
@@ -258,11 +260,11 @@ def run_clamps(drawn: Draw, tick: Tick) -> dict[str, float]:
 def run_ends(drawn: Draw, tick: Tick) -> dict[str, Array]:
     """Return the distances (trials,) from the truth at the end of simulation 1, by start and filter."""
     model = current_statistical(TIME_CONSTANT, 30.0)
-    start = scattered(drawn, (1.0, *_CLOSE))
+    start = scatter_starts(drawn, (1.0, *_CLOSE))
     tracks = {
-        "single step (the paper), start of 1 m": tracked(drawn, start, model, "ekf"),
-        "converged, start of 1 m": tracked(drawn, start, model, "iekf"),
-        "single step, started by a fit of 3 s": tracked(drawn, fitted_start(drawn, 3), model, "ekf"),
+        "single step (the paper), start of 1 m": track_all(drawn, start, model, "ekf"),
+        "converged, start of 1 m": track_all(drawn, start, model, "iekf"),
+        "single step, started by a fit of 3 s": track_all(drawn, fit_start(drawn, 3), model, "ekf"),
     }
     tick()
     return {name: distances(drawn, track) for name, track in tracks.items()}

@@ -160,6 +160,7 @@ class Errors:
 def _errors(position: Array, slow: bool, epochs: Array) -> Errors:
     exact = polar(truth(int(epochs.max()), slow=slow)[epochs - 1])
     error = polar(position) - exact
+    # Azimuths are compared on the circle.
     error[..., 1] = np.arctan2(np.sin(error[..., 1]), np.cos(error[..., 1]))
     return Errors(epochs, error)
 
@@ -176,7 +177,7 @@ def kalman(drawn: Problem, update: str) -> Track:
     return followed(drawn, start, dynamics, update)
 
 
-def still(epochs: int, trials: int, sequence: np.random.SeedSequence) -> dict[str, Errors]:
+def run_still(epochs: int, trials: int, sequence: np.random.SeedSequence) -> dict[str, Errors]:
     """Return the errors for a target that stays: of the corrected recursion, and of the closed-form fix."""
     drawn = draw(epochs, trials, sequence)
     return {
@@ -203,7 +204,7 @@ TRACKERS: Mapping[str, Tracker] = {
 """Every tracker of the slow target, by the name that tables give it."""
 
 
-def moving(epochs: int, trials: int, sequence: np.random.SeedSequence, tick: Tick) -> dict[str, Errors]:
+def run_slow(epochs: int, trials: int, sequence: np.random.SeedSequence, tick: Tick) -> dict[str, Errors]:
     """Return the errors of all `TRACKERS` for the slow target."""
     drawn = draw(epochs, trials, sequence, slow=True)
     out = {}
@@ -213,7 +214,7 @@ def moving(epochs: int, trials: int, sequence: np.random.SeedSequence, tick: Tic
     return out
 
 
-def batches(
+def run_batches(
     epochs: int, trials: int, sequence: np.random.SeedSequence, *, path: float = PATH, whole: int | None = None
 ) -> dict[str, Errors]:
     """Return the errors after a number of epochs: of the pseudo-linear course, and of the batch fit started by it.
@@ -232,6 +233,7 @@ def batches(
         Epochs that are drawn, so that shorter records are the beginnings of the same ones.
     """
     drawn = draw(epochs if whole is None else whole, trials, sequence, slow=True, path=path)
+    # The state at the last epoch, where trackers are judged as well.
     run = replace(cut(drawn, 0, epochs), motions=(Motion(1, reference=float(epochs - 1)),))
     course = course_starts(run)
     assert course is not None
@@ -408,7 +410,7 @@ def table_short(trials: int, sequences: Sequence[np.random.SeedSequence], tick: 
     """Return batch fits of ten epochs and their bound, with the noise of the paper and a path ten times as noisy."""
     lines = []
     for sequence, (name, path) in zip(sequences, {"20 ns": PATH, "200 ns": 10.0 * PATH}.items(), strict=True):
-        errors = batches(10, trials, sequence, path=path)["batch maximum likelihood"]
+        errors = run_batches(10, trials, sequence, path=path)["batch maximum likelihood"]
         lengths = (errors.rms(10)[0], errors.mean(10)[0], bound_moving(np.array([10]), path)[0, 0])
         lines.append((name, *map(kilometres, lengths)))
         tick()
@@ -551,12 +553,12 @@ def _run(sample: Sample, seed: int, tick: Tick) -> Report:
     def sequence(key: int) -> np.random.SeedSequence:
         return np.random.SeedSequence(seed, spawn_key=(key,))
 
-    stays = still(sample.epochs, sample.still, sequence(0))
+    stays = run_still(sample.epochs, sample.still, sequence(0))
     tick()
-    tracks = moving(sample.epochs, sample.slow, sequence(1), tick)
+    tracks = run_slow(sample.epochs, sample.slow, sequence(1), tick)
     fits = {}
     for count in (_EARLY, sample.epochs):
-        fits[count] = batches(count, sample.slow, sequence(1), whole=sample.epochs)
+        fits[count] = run_batches(count, sample.slow, sequence(1), whole=sample.epochs)
         tick()
     bounds = {count: bound_moving(np.array([count]))[0] for count in (_EARLY, sample.epochs)}
     counts = [count for count in _COUNTS if count <= sample.epochs]

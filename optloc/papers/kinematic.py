@@ -90,7 +90,7 @@ class Scenario:
             Time at which an acceleration begins, seconds.
         """
         t = self.times[:, None]
-        late = np.maximum(t - since, 0.0)
+        late = np.maximum(t - since, 0.0)  # seconds of acceleration
         v = self.velocity[:, None] * (order > 0)
         a = self.acceleration[:, None] * (order > 1)
         place = self.position[:, None] + v * t + 0.5 * a * late**2
@@ -147,12 +147,13 @@ def draw(scenario: Scenario, truth: Array, trials: int, key: tuple[int, ...]) ->
     """
     places = truth[..., :2].reshape(len(truth), -1)
     runs = simulate(scenario.problem(), places, np.random.SeedSequence(key), trials=trials)
+    # Drawn along the course; a tracker takes scan by scan, each of a target that stands.
     runs = replace(runs, motions=(Motion(0),))
     first = solve(cut(runs, 0, 1))
     return Draw(scenario, truth, runs, State(float(scenario.times[0]), first.position, first.covariance()))
 
 
-def unlabelled(drawn: Draw, detection: float, false: float, key: tuple[int, ...]) -> Candidates:
+def strip_labels(drawn: Draw, detection: float, false: float, key: tuple[int, ...]) -> Candidates:
     """Return the rows of all targets without their names, some lost, among false ones.
 
     Parameters
@@ -167,6 +168,7 @@ def unlabelled(drawn: Draw, detection: float, false: float, key: tuple[int, ...]
         Decides what is lost and added.
     """
     rng = np.random.default_rng(np.random.SeedSequence(key))
+    # (n, k m, t): the rows of a channel lie together and do not say whose they are; NaN is a row that is not there.
     seen = np.moveaxis(drawn.runs.z, 1, -1)
     seen = np.where(rng.random(seen.shape) < detection, seen, np.nan)
     count = rng.poisson(false, seen.shape[:-1])[..., None]
@@ -237,17 +239,17 @@ def score(drawn: Draw, position: Array, cov: Array | None = None) -> Score:
     return Score(np.linalg.norm(away, axis=-1), nees)
 
 
-def started(drawn: Draw, order: int) -> State:
+def start_from_fix(drawn: Draw, order: int) -> State:
     """Return the state of the first epoch: the fix, and priors of what it does not see."""
     return resized(drawn.fix, order, 2, speed=drawn.scenario.speed, rate=drawn.scenario.rate)
 
 
-def tracked(drawn: Draw, dynamics: Dynamics, update: Update | str = "ekf") -> Track:
+def track_all(drawn: Draw, dynamics: Dynamics, update: Update | str = "ekf") -> Track:
     """Return the tracks of all runs by one model."""
-    return followed(drawn.runs, started(drawn, dynamics.order), dynamics, update)
+    return followed(drawn.runs, start_from_fix(drawn, dynamics.order), dynamics, update)
 
 
-def scored(drawn: Draw, track: Track) -> Score:
+def score_track(drawn: Draw, track: Track) -> Score:
     """Return the errors of tracks."""
     return score(drawn, track.position, track.cov[..., :2, :2])
 
@@ -266,6 +268,7 @@ def batch(drawn: Draw, order: int) -> Score:
     sizes = {"velocity": drawn.scenario.speed, "acceleration": drawn.scenario.rate}
     priors = [Prior(name, np.zeros(2), size**2 * np.eye(2)) for name, size in list(sizes.items())[:order]]
     found = solve(replace(drawn.runs, motions=(Motion(order),), priors=tuple(priors)))
+    # Estimates hold at time zero; tracks are judged at the last epoch.
     T = float(drawn.scenario.times[-1])
     ahead = np.kron([1.0, T, 0.5 * T * T][: order + 1], np.eye(2))
     away = found.x @ ahead.T - drawn.position[:, -1]
@@ -301,6 +304,7 @@ def mean_error(cov: Array) -> Array:
 
 def polynomial_ratio(order: int, points: int) -> float:
     """Return the end-point error of a line (order 1) or parabola (2) through equally good points, over that of one."""
+    # The corner of the inverse normal matrix of equidistant points, in closed form.
     k = points
     if order == 1:
         return float(np.sqrt(2.0 * (2 * k - 1) / (k * (k + 1))))
@@ -334,7 +338,7 @@ class Filter:
         """Return the errors of a draw."""
         scene = drawn.scenario
         if len(self.models) == 1:
-            return scored(drawn, tracked(drawn, self.models[0]))
+            return score_track(drawn, track_all(drawn, self.models[0]))
         if not self.switch:
             made = parallel(drawn.runs, drawn.fix, self.models, speed=scene.speed, rate=scene.rate, update="ekf")
             return score(drawn, made.position)
@@ -342,7 +346,7 @@ class Filter:
         # Rows sum to one: a switch goes to each of the others alike.
         chain = np.full((q, q), self.switch / (q - 1)) + (1.0 - self.switch * q / (q - 1)) * np.eye(q)
         found = imm(drawn.runs, drawn.fix, self.models, chain, speed=scene.speed, rate=scene.rate, update="ekf")
-        return scored(drawn, found.track)
+        return score_track(drawn, found.track)
 
 
 PLAIN = tuple(polynomial(order) for order in (0, 1, 2))
@@ -424,18 +428,20 @@ def association(
         Probability that a row is seen; mean number of false rows of a channel and epoch.
     """
     drawn = draw(scenario, scenario.course(order), trials, (*key, 0))
-    given = unlabelled(drawn, detection, false, (*key, 1))
+    given = strip_labels(drawn, detection, false, (*key, 1))
     scores = {}
     for rule in rules(scenario, detection, false):
-        found = associated(given, started(drawn, order), polynomial(order), rule.associate, "ekf", missing=rule.missing)
-        scores[rule.name] = scored(drawn, found.track)
+        found = associated(
+            given, start_from_fix(drawn, order), polynomial(order), rule.associate, "ekf", missing=rule.missing
+        )
+        scores[rule.name] = score_track(drawn, found.track)
     return Association(drawn, scores)
 
 
 # What the equations do as they are printed.
 
 
-def twice_predicted(dynamics: Dynamics, interval: float, dimension: int) -> Update:
+def predict_twice(dynamics: Dynamics, interval: float, dimension: int) -> Update:
     """Return the update of equations 28 to 31 as printed: the transition is applied once more within H.
 
     Parameters
@@ -457,6 +463,7 @@ def twice_predicted(dynamics: Dynamics, interval: float, dimension: int) -> Upda
         gain = np.swapaxes(linalg.solve(S, H @ cov)[0], -1, -2)
         solved = linalg.solve(S, white.residual[..., None])[0][..., 0]
         nis = (white.residual * solved).sum(-1)
+        # The likelihood too is that of the printed update, so that it can be compared with the right one.
         lower, _ = linalg.factor(S)
         logdet = white.logdet + 2.0 * np.log(np.diagonal(lower, axis1=-2, axis2=-1)).sum(-1)
         moved = mean + (gain @ white.residual[..., None])[..., 0]

@@ -26,11 +26,11 @@ from optloc.papers.kinematic import (
     draw,
     fixes,
     mean_error,
-    scored,
+    predict_twice,
+    score_track,
     taylor,
     theory,
-    tracked,
-    twice_predicted,
+    track_all,
     weighting,
 )
 from optloc.papers.report import (
@@ -134,7 +134,7 @@ def table_efficiency(drawn: Mapping[str, Draw]) -> Table:
         own, order = drawn[name], ORDERS[name]
         last = bounds(own.scenario, own.truth, order)[:, -1]
         limit = float(np.sqrt(np.trace(last, axis1=-2, axis2=-1).mean()))
-        plain, iterated = (scored(own, tracked(own, PLAIN[order], update)) for update in ("ekf", "iekf"))
+        plain, iterated = (score_track(own, track_all(own, PLAIN[order], update)) for update in ("ekf", "iekf"))
         lengths = (plain.last, iterated.last, batch(own, order).last, limit)
         rows.append((name, *map(km, lengths), f"{plain.last / limit:.3f}", f"{plain.level:.2f}"))
     header = ("model on its own motion", "EKF", "IEKF", "batch ML", "bound", "EKF / bound", "NEES of the EKF")
@@ -171,6 +171,7 @@ def table_equations(
     seed: int, drawn: Mapping[str, Draw], matched: Mapping[str, Score], tests: Mapping[str, Association]
 ) -> Table:
     """Return what the printed equations do beside their corrected form."""
+    # One row for each equation of the list on the page that can be run.
     rows: list[tuple[str, ...]] = [*_steps_of_a_fix(seed, drawn["static"])]
     scene = drawn["static"].scenario
     # Differences that share the reference station: each of the two arrivals has half the variance.
@@ -180,7 +181,7 @@ def table_equations(
     rows.append(("5: H'H called BLUE", "error of a fix, shared reference, km", *map(km, costs)))
     for name, score in matched.items():
         model = PLAIN[ORDERS[name]]
-        bad = scored(drawn[name], tracked(drawn[name], model, twice_predicted(model, scene.interval, 2)))
+        bad = score_track(drawn[name], track_all(drawn[name], model, predict_twice(model, scene.interval, 2)))
         what = "29: H times the transition"
         rows.append((what, f"mean error of {name}, km", km(bad.mean), km(score.mean)))
         rows.append((what, f"NEES of {name} at the last step", f"{bad.level:.2f}", f"{score.level:.2f}"))
@@ -331,6 +332,7 @@ def _run(sample: Sample, seed: int, tick: Tick) -> Report:
         return value
 
     drawn = {name: done(draw(scene, scene.course(i), sample.trials, (seed, i))) for name, i in ORDERS.items()}
+    # Keys 0 to 2 draw the motions, 3 the one that changes, 4 and 5 the association test, 9 wild starts.
     half = float(scene.times[_HALFWAY])
     late = done(draw(scene, scene.course(2, since=half), sample.trials, (seed, 3)))
     lines, scenes = done(_scenes(drawn))
@@ -364,18 +366,19 @@ def _timed(work: Callable[[], T], runs: int) -> tuple[T, float]:
 
 def _scenes(drawn: Mapping[str, Draw]) -> tuple[list[Line], dict[str, Figure]]:
     """Return the lines of table 1, and figures 2 to 4."""
+    # Times are shares of a batch: what one run costs among many, without the overhead of calls.
     still = drawn["static"]
     scene, runs = still.scenario, len(still.runs.z)
     first, seconds = _timed(partial(fixes, still), runs * scene.steps)
     limit = bounds(scene, still.truth, 0)
     lines = [Line("one fix on static", first, _mean(limit[:, :1]), seconds, "static")]
-    track, seconds = _timed(partial(tracked, still, PLAIN[0]), runs)
-    lines.append(Line("static, 20 updates, on static", scored(still, track), _mean(limit[:, 1:]), seconds))
+    track, seconds = _timed(partial(track_all, still, PLAIN[0]), runs)
+    lines.append(Line("static, 20 updates, on static", score_track(still, track), _mean(limit[:, 1:]), seconds))
     figures = {}
     for number, (model, motion) in enumerate((("CV", "CV"), ("CV", "CA"), ("CA", "CA")), 2):
         own, order = drawn[motion], ORDERS[model]
-        track, seconds = _timed(partial(tracked, own, PLAIN[order]), runs)
-        score = scored(own, track)
+        track, seconds = _timed(partial(track_all, own, PLAIN[order]), runs)
+        score = score_track(own, track)
         bound = bounds(scene, own.truth, order)[:, 1:] if model == motion else None
         name = f"{model} on {motion}"
         lines.append(Line(name, score, None if bound is None else _mean(bound), seconds, name))

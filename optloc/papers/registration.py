@@ -160,6 +160,7 @@ def problem(
     kinds = {"tdoa": spread} if gain_sigma is None else {"tdoa": spread, "groa": gain_sigma}
     rows = [measured(kind, a=a, b=0, epoch=epoch, sigma=size) for kind, size in kinds.items()]
     covariance = np.broadcast_to(station_sigma**2 * np.eye(3), (count, 3, 3)) if station_sigma else None
+    # The reference is row 0 of the stations; a station error that lasts one epoch is noise of its rows.
     made = assemble(
         Stations(scenario.track(epochs), scenario.names, covariance=covariance, span="noise"),
         *rows,
@@ -169,6 +170,7 @@ def problem(
     own, common = _SHAPES[shape]
     unit = own * np.eye(count - 1) + common
     members = np.arange(made.count).reshape(-1, count - 1)
+    # One block for each epoch and kind: (epochs, s - 1) rows that share the arrival at the reference.
     blocks = [
         Block(part, size**2 * unit[None])
         for part, size in zip(np.split(members, len(kinds)), kinds.values(), strict=True)
@@ -261,7 +263,8 @@ def step(state: Array, arrivals: Array, track: Array, times: Array) -> tuple[Arr
     slope = target - track
     distance = np.sqrt(np.einsum("tcsk,tcsk->tsk", slope, slope))
     slope /= distance[:, None]  # unit vectors (trials, 3, s, k)
-    misfit = arrivals - distance
+    misfit = arrivals - distance  # (trials, s, k)
+    # First the mean of each epoch over the stations, then that of each channel over the epochs, in the sums below.
     misfit -= misfit.mean(1, keepdims=True)
     slope -= slope.mean(2, keepdims=True)
     if n > 3:
@@ -270,6 +273,7 @@ def step(state: Array, arrivals: Array, track: Array, times: Array) -> tuple[Arr
     information = rows @ rows.swapaxes(1, 2) - len(times) * (mean @ mean.swapaxes(1, 2))
     vector = rows @ misfit.reshape(trials, -1, 1) - len(times) * (mean @ left[..., None])
     solved, ok = linalg.solve(information, vector)
+    # A singular system has no step: NaN, and lost, instead of one that a solver makes up.
     move = np.where(ok[:, None], solved[..., 0], np.nan)
     left = left - (move[:, None] @ mean)[:, 0]
     return move, left[:, 1:] - left[:, :1]
@@ -341,6 +345,7 @@ class Setting:
         scene = self.scenario
         rng = np.random.default_rng(self._sequence(1))
         spread, centre = one_shot(scene, sigma=self.sigma), scene.target
+        # One epoch says nothing of the velocity: 10 m/s is a tenth of the target's speed.
         if scene.course is not None:
             spread, centre = np.concatenate([spread, np.full(3, 10.0)]), np.concatenate([centre, scene.course])
         return np.asarray(centre + width * spread * rng.standard_normal((self.trials, len(centre))))
@@ -392,6 +397,7 @@ def score(estimate: Array, exact: Array, bound: Array) -> Score:
     """Return the score of estimates (trials, n) of a truth (n,) with a bound (n, n)."""
     error = estimate - exact
     with np.errstate(invalid="ignore", over="ignore"):
+        # Not "further", so that NaN is far too.
         far = ~((error[:, :3] ** 2).sum(-1) < (FAR * rms(bound)) ** 2)
     return Score(error, far | ~np.isfinite(error).all(-1))
 
@@ -417,7 +423,7 @@ def wander(
     width: float = 1.0,
     first: int = FIRST,
 ) -> tuple[Score, ...]:
-    """Return the scores of the paper's recursion after some numbers of epochs; arguments as `course`.
+    """Return the scores of the paper's recursion after some numbers of epochs, whose bounds are given.
 
     Parameters
     ----------
@@ -454,6 +460,7 @@ class Ghost:
     @property
     def doubt(self) -> float:
         """Return the probability that noise makes it cheaper than the truth."""
+        # The difference of both costs is normal with mean `gap` and standard deviation 2 sqrt(gap).
         return 0.5 * erfc(sqrt(self.gap) / 2.0 / sqrt(2.0))
 
 
@@ -463,7 +470,7 @@ def mirror(scenario: Scenario) -> tuple[Array, Array]:
     The plane is the one that fits the stations best at t = 0, and moves with their mean velocity.
     """
     centre = scenario.position.mean(0)
-    normal = np.linalg.svd(scenario.position - centre)[2][-1]
+    normal = np.linalg.svd(scenario.position - centre)[2][-1]  # the direction of least spread
     course = np.zeros(3) if scenario.course is None else scenario.course
     drift = scenario.velocity.mean(0)
     place = scenario.target - 2.0 * ((scenario.target - centre) @ normal) * normal

@@ -153,6 +153,7 @@ def run_history(
     first : int
         Epochs of its first estimate.
     """
+    # One long draw: shorter runs are its beginnings, so that curves against time are of the same trials.
     drawn = setting.draw(max(epochs))
     bounds = setting.bounds(epochs)
     exact = truth(setting.scenario, drawn)

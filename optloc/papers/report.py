@@ -84,6 +84,7 @@ class Table:
             First cells of the row, then the name of the column.
         """
         *row, column = place
+        # The first that fits: rows are told apart by as many cells as the page cares to name.
         found = next((cells for cells in self.rows if list(cells[: len(row)]) == row), None)
         return ABSENT if found is None or column not in self.header else found[self.header.index(column)]
 

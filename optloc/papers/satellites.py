@@ -191,7 +191,7 @@ def root_trace(cov: Array) -> Array:
     return np.asarray(np.sqrt(np.trace(cov[..., :3, :3], axis1=-2, axis2=-1)))
 
 
-def scored(track: Track, exact: Array) -> Run:
+def score(track: Track, exact: Array) -> Run:
     """Return the errors of a track whose last scans are those of true states (epochs, 6)."""
     at = exact[len(exact) - len(track.times) :, :3]
     return Run(track.position, np.linalg.norm(track.position - at, axis=-1), root_trace(track.cov))
@@ -205,21 +205,22 @@ def from_fixes(drawn: Problem) -> State:
 
 def prior(at: Array, satellites: Array = SATELLITES) -> Array:
     """Return the covariance (6, 6) of position and velocity from fixes, a second apart, that reach their bound."""
+    # The second fix is the place, and less the first it is the velocity: both share its error.
     one = crlb(problem(1, order=0, satellites=satellites), at)
     return np.block([[one, one], [one, 2.0 * one]])
 
 
-def fixed(steps: int, trials: int, sequence: np.random.SeedSequence) -> tuple[dict[str, Run], Array]:
+def run_fixed(steps: int, trials: int, sequence: np.random.SeedSequence) -> tuple[dict[str, Run], Array]:
     """Return all filters started by the first two fixes, and the posterior bound (steps,), metres."""
     exact = truth(steps + 2)
     drawn = simulate(problem(steps + 2), exact[0], sequence, trials)
     start = from_fixes(drawn)
-    found = {name: scored(followed(drawn, start, dynamics(), name), exact) for name in FILTERS}
+    found = {name: score(followed(drawn, start, dynamics(), name), exact) for name in FILTERS}
     bound = posterior_bound(problem(steps + 2), exact, State(1.0, exact[1], prior(exact[1, :3])), dynamics())
     return found, root_trace(bound)
 
 
-def wild(width: float, steps: int, trials: int, sequence: np.random.SeedSequence) -> tuple[dict[str, Run], Array]:
+def run_wild(width: float, steps: int, trials: int, sequence: np.random.SeedSequence) -> tuple[dict[str, Run], Array]:
     """Return all filters from starts that are wrong by `width` metres in each coordinate, and the posterior bound.
 
     The same data are tracked from the first two fixes as well, by the filter "quartic + ekf".
@@ -227,57 +228,58 @@ def wild(width: float, steps: int, trials: int, sequence: np.random.SeedSequence
     draws, errors = sequence.spawn(2)
     exact = truth(steps)
     drawn = simulate(problem(steps), exact[0], draws, trials)
+    # A second before the first scan, as a prediction of it: the first update is that of a filter under way.
     sigma = np.repeat([width, SPEED], 3)
     mean = exact[0] - np.concatenate([exact[0, 3:], np.zeros(3)])
     mean = mean + sigma * np.random.default_rng(errors).standard_normal((trials, 6))
     start = State(-1.0, mean, np.broadcast_to(np.diag(sigma**2), (trials, 6, 6)))
-    found = {name: scored(followed(drawn, start, dynamics(), name), exact) for name in FILTERS}
-    found["quartic + ekf"] = scored(followed(drawn, from_fixes(drawn), dynamics(), "ekf"), exact)
+    found = {name: score(followed(drawn, start, dynamics(), name), exact) for name in FILTERS}
+    found["quartic + ekf"] = score(followed(drawn, from_fixes(drawn), dynamics(), "ekf"), exact)
     bound = posterior_bound(problem(steps), exact, State(-1.0, exact[0], np.diag(sigma**2)), dynamics())
     return found, root_trace(bound)
 
 
-def moving(satellites: Array, trials: int, sequence: np.random.SeedSequence) -> tuple[Run, Array]:
+def run_moving(satellites: Array, trials: int, sequence: np.random.SeedSequence) -> tuple[Run, Array]:
     """Return the IEKF with satellites (epochs, 3, 3) that move, from the first two fixes, and the posterior bound."""
     exact = truth(len(satellites))
     drawn = simulate(problem(len(satellites), satellites=satellites), exact[0], sequence, trials)
     start = from_fixes(drawn)
     run, given = problem(len(satellites), satellites=satellites), prior(exact[1, :3], satellites[:1])
     bound = posterior_bound(run, exact, State(1.0, exact[1], given), dynamics())
-    return scored(followed(drawn, start, dynamics(), "iekf"), exact), root_trace(bound)
+    return score(followed(drawn, start, dynamics(), "iekf"), exact), root_trace(bound)
 
 
-def heights(steps: int, trials: int, sequence: np.random.SeedSequence) -> dict[str, Run]:
+def run_heights(steps: int, trials: int, sequence: np.random.SeedSequence) -> dict[str, Run]:
     """Return the IEKF on the same sea-level target with several kinds of height, by what the filter takes it for."""
     exact, epochs = truth(steps + 2, surface_course()), steps + 2
     keys = sequence.spawn(5)
     out = {}
     for key, (name, sigma) in zip(keys, {"white, 500 m": HEIGHT, "white, 10 m": 10.0}.items(), strict=False):
         drawn = simulate(problem(epochs, height=sigma), exact[0], key, trials)
-        out[name] = scored(followed(drawn, from_fixes(drawn), dynamics()), exact)
+        out[name] = score(followed(drawn, from_fixes(drawn), dynamics()), exact)
     level = simulate(problem(epochs, height=None), exact[0], keys[2], trials)
     held = followed(with_height_rows(level), from_fixes(level), dynamics())
-    out["known: the ellipsoid itself"] = scored(held, exact)
+    out["known: the ellipsoid itself"] = score(held, exact)
     # The truth of the last two: one error of the height for the whole run, and a metre of noise about it.
     assumed = with_bias(problem(epochs, height=1.0), "height", per="kind", kind="height", sigma=HEIGHT)
     wrong = HEIGHT * np.random.default_rng(keys[3]).standard_normal((trials, 1))
     vectors = np.concatenate([np.broadcast_to(exact[0], (trials, 6)), wrong], axis=1)
     drawn = simulate(assumed, vectors, keys[4])
     white = problem(epochs).with_rows(z=drawn.z)
-    out["constant error of 500 m, taken for white"] = scored(followed(white, from_fixes(white), dynamics()), exact)
+    out["constant error of 500 m, taken for white"] = score(followed(white, from_fixes(white), dynamics()), exact)
     start = begun_with_constants(drawn, dynamics(), 2)
-    out["constant error of 500 m, as a state"] = scored(followed_with_constants(drawn, start, dynamics()), exact)
+    out["constant error of 500 m, as a state"] = score(followed_with_constants(drawn, start, dynamics()), exact)
     return out
 
 
-def climbing(steps: int, trials: int, sequence: np.random.SeedSequence) -> Run:
+def run_climbing(steps: int, trials: int, sequence: np.random.SeedSequence) -> Run:
     """Return the IEKF on the target as printed, which climbs, while its height is said to be zero within 500 m."""
     exact, (draws, errors) = truth(steps + 2), sequence.spawn(2)
     drawn = simulate(problem(steps + 2), exact[0], draws, trials)
     # The heights say zero, with their noise, whatever the target does.
     level = HEIGHT * np.random.default_rng(errors).standard_normal((trials, steps + 2))
     said = drawn.with_rows(z=np.concatenate([drawn.rows[0].z, level], axis=-1))
-    return scored(followed(said, from_fixes(said), dynamics()), exact)
+    return score(followed(said, from_fixes(said), dynamics()), exact)
 
 
 # Radius of the Earth, metres, near enough for a direction: the height is then set to zero.
@@ -509,20 +511,20 @@ def _run(sample: Sample, seed: int, tick: Tick) -> Report:
     def sequence(key: int) -> np.random.SeedSequence:
         return np.random.SeedSequence(seed, spawn_key=(key,))
 
-    begun = fixed(sample.steps, sample.trials, sequence(0))
+    begun = run_fixed(sample.steps, sample.trials, sequence(0))
     tick()
     starts = {}
     for width in sample.widths:
         # The same data for every width: only the start differs.
-        starts[width] = wild(width, sample.far, sample.trials, sequence(1))
+        starts[width] = run_wild(width, sample.far, sample.trials, sequence(1))
         tick()
-    known = heights(sample.steps, sample.others, sequence(2))
+    known = run_heights(sample.steps, sample.others, sequence(2))
     tick()
-    known["climbing target, height said to be 0"] = climbing(sample.steps, sample.others, sequence(3))
+    known["climbing target, height said to be 0"] = run_climbing(sample.steps, sample.others, sequence(3))
     tick()
     flying = {}
     for name, heading in _HEADINGS.items():
-        flying[name] = moving(orbits(sample.steps + 2, heading), sample.others, sequence(4))
+        flying[name] = run_moving(orbits(sample.steps + 2, heading), sample.others, sequence(4))
         tick()
     panels = {"from the first two fixes": begun, "start wrong by 100 km": starts[_PANEL]}
     tables = (

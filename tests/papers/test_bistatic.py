@@ -11,7 +11,6 @@ from optloc.papers.bistatic import (
     COURSE,
     ELEVATION,
     TRACKERS,
-    batches,
     bound_moving,
     bound_single,
     bound_still,
@@ -19,7 +18,8 @@ from optloc.papers.bistatic import (
     polar,
     printed_angles,
     problem,
-    still,
+    run_batches,
+    run_still,
     truth,
 )
 from optloc.papers.report import Study
@@ -70,7 +70,7 @@ def test_the_printed_sign_diverges():
 
 
 def test_claims_for_ten_epochs_are_those_of_one_run():
-    found = still(10, 600, sequence(2))["simplified"]
+    found = run_still(10, 600, sequence(2))["simplified"]
     last = np.abs(found.error[:, -1])
     assert (last[:, 0] < 1e3).mean() == pytest.approx(0.992, abs=0.012)
     assert (last[:, 1] < 0.005).mean() == pytest.approx(0.64, abs=0.06)
@@ -78,7 +78,7 @@ def test_claims_for_ten_epochs_are_those_of_one_run():
 
 
 def test_short_records_beat_their_bound_where_the_path_is_good():
-    good, poor = (batches(10, 300, sequence(3), path=p * 5.99584916)["batch maximum likelihood"] for p in (1, 10))
+    good, poor = (run_batches(10, 300, sequence(3), path=p * 5.99584916)["batch maximum likelihood"] for p in (1, 10))
     assert good.rms(10)[0] == pytest.approx(405.0, rel=0.12)
     assert poor.rms(10)[0] == pytest.approx(548.0, rel=0.12)
     assert abs(good.mean(10)[0]) < 4 * 405.0 / np.sqrt(300)

@@ -23,12 +23,12 @@ from optloc.papers.kinematic import (
     fixes,
     mean_error,
     polynomial_ratio,
-    scored,
+    predict_twice,
+    score_track,
+    strip_labels,
     taylor,
     theory,
-    tracked,
-    twice_predicted,
-    unlabelled,
+    track_all,
     weighting,
 )
 from optloc.papers.kinematic_tables import km
@@ -47,7 +47,7 @@ def drawn():
 
 @pytest.fixture(scope="module")
 def matched(drawn):
-    return {name: scored(own, tracked(own, PLAIN[ORDERS[name]])) for name, own in drawn.items()}
+    return {name: score_track(own, track_all(own, PLAIN[ORDERS[name]])) for name, own in drawn.items()}
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +91,7 @@ def test_mean_errors_of_matched_models(matched, name, wanted):
 def test_the_fix_and_the_wrong_model_fit_the_printed_ones(drawn, single):
     assert KM * single.mean == pytest.approx(0.9620, rel=0.02)
     assert KM * single.mean == pytest.approx(kinematic_tables.ERROR["static"], rel=0.04)
-    wrong = scored(drawn["CA"], tracked(drawn["CA"], PLAIN[1]))
+    wrong = score_track(drawn["CA"], track_all(drawn["CA"], PLAIN[1]))
     assert KM * wrong.mean == pytest.approx(10.304, rel=0.02)
     assert KM * wrong.error[..., -1].mean() == pytest.approx(36.3, rel=0.02)
     assert (np.diff(wrong.error.mean((0, 1))[3:]) > 0.0).all()  # it grows, as in the printed figure
@@ -111,7 +111,7 @@ def test_filters_sit_on_their_bound(drawn, matched, name):
     order, own = ORDERS[name], drawn[name]
     bound = bounds(SCENE, own.truth, order)[:, 1:]
     limit = np.sqrt(np.trace(bound, axis1=-2, axis2=-1).mean(0))
-    claimed = tracked(own, PLAIN[order]).cov[..., :2, :2]
+    claimed = track_all(own, PLAIN[order]).cov[..., :2, :2]
     spread = np.sqrt(np.trace(claimed, axis1=-2, axis2=-1).mean((0, 1)))
     assert spread == pytest.approx(limit, rel=0.02)
     # 600 tracks know their error to 2 to 3 per cent; the full counts ask for 2 %.
@@ -179,7 +179,7 @@ def test_table_in_full():
     scores, single = {}, None
     for name, order in ORDERS.items():
         own = draw(SCENE, SCENE.course(order), 2000, (8, order))
-        scores[name] = scored(own, tracked(own, PLAIN[order]))
+        scores[name] = score_track(own, track_all(own, PLAIN[order]))
         if name == "static":
             single = fixes(replace(own, runs=own.runs.take(np.arange(500)), truth=own.truth))
         limit = np.sqrt(np.trace(bounds(SCENE, own.truth, order)[:, -1], axis1=-2, axis2=-1).mean())
@@ -214,21 +214,21 @@ def test_equal_weights_cost_13_per_cent_with_a_shared_reference():
 @pytest.mark.parametrize(("name", "error", "level"), [("CV", 0.828, 23.0), ("CA", 4.752, 365.0)])
 def test_equation_29_applies_the_transition_twice(drawn, name, error, level):
     model = PLAIN[ORDERS[name]]
-    score = scored(drawn[name], tracked(drawn[name], model, twice_predicted(model, SCENE.interval, 2)))
+    score = score_track(drawn[name], track_all(drawn[name], model, predict_twice(model, SCENE.interval, 2)))
     assert KM * score.mean == pytest.approx(error, rel=0.05)
     assert score.nees[..., -1].mean() == pytest.approx(level, rel=0.2)
 
 
 def test_the_printed_update_without_a_transition_is_the_filter(drawn):
     model = PLAIN[1]
-    same = tracked(drawn["CV"], model, twice_predicted(model, 0.0, 2))
-    right = tracked(drawn["CV"], model)
+    same = track_all(drawn["CV"], model, predict_twice(model, 0.0, 2))
+    right = track_all(drawn["CV"], model)
     assert same.mean == pytest.approx(right.mean, rel=1e-12)
     assert same.loglikelihood == pytest.approx(right.loglikelihood, rel=1e-9)
 
 
 def test_rows_are_lost_and_added_as_asked(drawn):
-    given = unlabelled(drawn["CV"], 0.7, 2.0, (6,))
+    given = strip_labels(drawn["CV"], 0.7, 2.0, (6,))
     assert np.isfinite(given.z[..., :3]).mean() == pytest.approx(0.7, abs=0.01)
     false = given.z[..., 3:]
     assert np.isfinite(false).sum(-1).mean() == pytest.approx(2.0, abs=0.05)

@@ -13,16 +13,16 @@ from optloc.papers.satellites import (
     FILTERS,
     SATELLITES,
     START,
-    climbing,
     far,
-    fixed,
-    heights,
     orbits,
     problem,
     root_trace,
+    run_climbing,
+    run_fixed,
+    run_heights,
+    run_wild,
     surface_course,
     truth,
-    wild,
 )
 
 RUN = CliRunner()
@@ -68,7 +68,7 @@ def test_a_fix_is_worth_less_and_less_away_from_the_satellites():
 
 
 def test_filters_from_fixes_meet_the_bound():
-    found, bound = fixed(60, 60, sequence(1))
+    found, bound = run_fixed(60, 60, sequence(1))
     assert bound[[0, 9, 49]] == pytest.approx([522.1, 310.5, 156.3], abs=0.05)
     for name in FILTERS:
         assert found[name].rms[[9, 49]] == pytest.approx(bound[[9, 49]], rel=0.25)
@@ -76,7 +76,7 @@ def test_filters_from_fixes_meet_the_bound():
 
 
 def test_far_starts_order_the_filters():
-    found, bound = wild(100e3, 60, 60, sequence(2))
+    found, bound = run_wild(100e3, 60, 60, sequence(2))
     last = {name: run.error[:, -1] for name, run in found.items()}
     median = {name: np.median(error) for name, error in last.items()}
     assert median["iekf"] == pytest.approx(median["quartic + ekf"], rel=0.1)
@@ -88,12 +88,12 @@ def test_far_starts_order_the_filters():
 
 
 def test_what_a_wrong_height_does():
-    found = heights(60, 40, sequence(3))
+    found = run_heights(60, 40, sequence(3))
     careless, honest = (found[f"constant error of 500 m, {how}"] for how in ("taken for white", "as a state"))
     assert careless.rms[-1] > 2.0 * careless.claimed[:, -1].mean()
     assert honest.rms[-1] == pytest.approx(honest.claimed[:, -1].mean(), rel=0.3)
     assert found["known: the ellipsoid itself"].rms[-1] < 0.6 * found["white, 500 m"].rms[-1]
-    lifted = climbing(200, 20, sequence(4))
+    lifted = run_climbing(200, 20, sequence(4))
     assert lifted.rms[-1] == pytest.approx(712.0, rel=0.05)
     assert lifted.claimed[:, -1].mean() == pytest.approx(80.2, abs=0.5)
 

@@ -17,14 +17,14 @@ from optloc.papers.angles import (
     draw,
     errors,
     first_fix,
-    fitted_start,
+    fit_start,
     fixed_variance,
-    lost,
-    placed,
     rms,
-    scattered,
+    scatter_starts,
+    share_lost,
     snapshot_bound,
-    tracked,
+    start_at_truth,
+    track_all,
 )
 from optloc.problem.epochs import cut
 from optloc.track import State, begun, current_statistical, followed, polynomial, singer
@@ -88,8 +88,8 @@ def ours_in_their_order(mean):
 @pytest.mark.parametrize("limit", [100.0, 300.0])
 def test_one_run_agrees_with_a_second_implementation(update, limit):
     drawn = draw(REPAIRED, 1, 4, 0)
-    start = placed(drawn, (1e3, 50.0, 10.0))
-    track = tracked(drawn, start, current_statistical(10.0, limit), update)
+    start = start_at_truth(drawn, (1e3, 50.0, 10.0))
+    track = track_all(drawn, start, current_statistical(10.0, limit), update)
     k = REPAIRED.epochs
     azimuth, elevation = (rows.z[0].reshape(k, 2) for rows in drawn.problem.rows)
     P = np.zeros((3, 3, 3, 3))
@@ -120,9 +120,9 @@ def test_the_convention_station_minus_target_gives_the_same_filter():
 
 def test_the_converged_form_is_the_maximum_a_posteriori_point():
     drawn = draw(STRAIGHT, 1, 2, 0)
-    start = scattered(drawn, (1.0, 0.1, 0.2))
+    start = scatter_starts(drawn, (1.0, 0.1, 0.2))
     model = current_statistical(10.0, 30.0)
-    first = tracked(drawn, start, model, "iekf").mean[0, 0]
+    first = track_all(drawn, start, model, "iekf").mean[0, 0]
     F, Q, drive = model.step(1.0, start.mean, 2)
     ahead, P = F @ start.mean[0] + drive[0], (F @ start.cov @ F.T + Q)[0]
     root, z = np.linalg.inv(np.linalg.cholesky(P)), drawn.problem.z[0, :2]
@@ -158,16 +158,16 @@ def test_a_pass_over_pi_is_no_innovation():
 
 def shares(trials, seed=1):
     drawn = draw(STRAIGHT, trials, seed, 1)
-    start, model = scattered(drawn, (1.0, 0.1, 0.2)), current_statistical(10.0, 30.0)
-    return {name: lost(drawn, tracked(drawn, start, model, name)) for name in ("ekf", "iekf")}, drawn
+    start, model = scatter_starts(drawn, (1.0, 0.1, 0.2)), current_statistical(10.0, 30.0)
+    return {name: share_lost(drawn, track_all(drawn, start, model, name)) for name in ("ekf", "iekf")}, drawn
 
 
 def test_the_single_step_loses_tracks_and_the_converged_form_does_not():
     share, drawn = shares(200)
     assert share["ekf"] > 0.12
     assert share["iekf"] < 0.015
-    fitted_first = fitted_start(drawn, 3)
-    assert lost(drawn, tracked(drawn, fitted_first, current_statistical(10.0, 30.0), "ekf")) == 0.0
+    fitted_first = fit_start(drawn, 3)
+    assert share_lost(drawn, track_all(drawn, fitted_first, current_statistical(10.0, 30.0), "ekf")) == 0.0
 
 
 @pytest.mark.full
@@ -202,7 +202,7 @@ def by_phase(values, scenario, since):
 def repaired(trials, seed, limit):
     drawn = draw(REPAIRED, trials, seed, 3)
     start = first_fix(drawn, 500.0, 50.0)
-    track = tracked(drawn, start, current_statistical(10.0, limit))
+    track = track_all(drawn, start, current_statistical(10.0, limit))
     found = rms(errors(drawn, track)[:, :, 0], (0,))
     limit_of_all = bound(REPAIRED, start, fixed_variance(limit))[:, 0]
     return np.array(by_phase(found, REPAIRED, 1)), np.array(by_phase(limit_of_all, REPAIRED, 1))

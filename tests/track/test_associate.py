@@ -11,7 +11,7 @@ from optloc.base.status import Status
 from optloc.base.types import Motion
 from optloc.linear.evaluate import predict
 from optloc.linear.simulate import simulate
-from optloc.papers.kinematic import Scenario, draw, started, unlabelled
+from optloc.papers.kinematic import Scenario, draw, start_from_fix, strip_labels
 from optloc.track import State, followed, polynomial
 from optloc.track.associate import Clutter, assigned, gated, innovation, joint, nearest, scored
 from optloc.track.several_targets import Candidates, associated, candidates
@@ -254,15 +254,15 @@ def test_known_corrections_are_taken_off():
 def drawn():
     scene = Scenario()
     own = draw(scene, scene.course(1), 4, (31,))
-    return own, unlabelled(own, 0.7, 2.0, (32,))
+    return own, strip_labels(own, 0.7, 2.0, (32,))
 
 
 def test_everything_seen_and_nothing_false_is_the_labelled_track(drawn):
     own = drawn[0]
-    given = unlabelled(own, 1.0 - 1e-12, 0.0, (33,))
+    given = strip_labels(own, 1.0 - 1e-12, 0.0, (33,))
     rule = assigned(Clutter(0.99, 1e-7))
-    found = associated(given, started(own, 1), polynomial(1), rule, "ekf")
-    track = followed(own.runs, started(own, 1), polynomial(1), "ekf")
+    found = associated(given, start_from_fix(own, 1), polynomial(1), rule, "ekf")
+    track = followed(own.runs, start_from_fix(own, 1), polynomial(1), "ekf")
     assert found.track.mean == pytest.approx(track.mean, rel=1e-12)
     assert all((pick == np.arange(3)[:, None]).all() for pick in found.picks)
 
@@ -270,7 +270,7 @@ def test_everything_seen_and_nothing_false_is_the_labelled_track(drawn):
 def test_a_missed_row_is_dropped_or_believed(drawn):
     """Against weights of zero, and against measurements that repeat the prediction."""
     own, given = drawn
-    start = started(own, 1)
+    start = start_from_fix(own, 1)
     found = associated(given, start, polynomial(1), joint(Clutter(0.7, 1e-5)), "ekf")
     for index in ((0, 0), (3, 2)):
         pick = np.concatenate([p[index] for p in found.picks])
@@ -291,7 +291,7 @@ def test_a_missed_row_is_dropped_or_believed(drawn):
 
 def test_runs_may_share_their_targets(drawn):
     own, given = drawn
-    start = started(own, 1)
+    start = start_from_fix(own, 1)
     one = State(0.0, start.mean[0], start.cov[0])
     z = given.z.copy()
     z[:, 3:6] = np.nan  # nothing at all in the first scan
@@ -305,9 +305,9 @@ def test_runs_may_share_their_targets(drawn):
 def test_scans_of_which_nothing_is_taken_say_why(drawn):
     own, given = drawn
     empty = Candidates(given.channels, np.full((4, 63, 1), np.nan))
-    lone = associated(empty, started(own, 1), polynomial(1), joint(CLUTTER))
+    lone = associated(empty, start_from_fix(own, 1), polynomial(1), joint(CLUTTER))
     assert (lone.track.code == Status.TOO_FEW_ROWS).all()
-    shut = associated(given, started(own, 1), polynomial(1), nearest(1e-12))
+    shut = associated(given, start_from_fix(own, 1), polynomial(1), nearest(1e-12))
     assert (shut.track.code == Status.REJECTED).all()
     assert np.isnan(shut.track.nis).all()
 
@@ -326,7 +326,7 @@ def test_impossible_densities_are_refused(density):
 
 def test_what_does_not_fit_is_refused(drawn):
     own, given = drawn
-    state = started(own, 1)
+    state = start_from_fix(own, 1)
     lone = State(0.0, state.mean[0, 0], state.cov[0, 0])
     for bad, words in (
         (lambda: associated(given, lone, polynomial(1), nearest()), "axis of targets"),

@@ -8,7 +8,7 @@ import pytest
 import optloc
 from optloc import InvalidProblem, Status
 from optloc.base.types import Motion, Stations
-from optloc.papers.angles import STRAIGHT, WINDING, draw, errors, placed, tracked
+from optloc.papers.angles import STRAIGHT, WINDING, draw, errors, start_at_truth, track_all
 from optloc.solvers.starts.angles import courses
 from optloc.track import State, current_statistical, fitted, polynomial, posterior_bound, smoothed
 from optloc.track.batch import along
@@ -21,7 +21,7 @@ def course_of(scenario, order, trials=None, seed=1):
 
 def test_the_posterior_bound_without_noise_is_the_bound_of_the_whole_run():
     sigmas = (0.1, 0.1, 0.2)
-    start = placed(draw(STRAIGHT, 1, 1, 0), sigmas)
+    start = start_at_truth(draw(STRAIGHT, 1, 1, 0), sigmas)
     cov = posterior_bound(
         STRAIGHT.problem(), STRAIGHT.truth[1:], State(0.0, start.mean[0], start.cov[0]), polynomial(2)
     )
@@ -58,7 +58,7 @@ def test_the_whole_track_fit_of_simulation_1():
 def test_the_fit_beats_the_filter_where_its_model_is_true():
     drawn = draw(STRAIGHT, 100, 1, 7)
     fit = fitted(drawn.problem, 2).x - STRAIGHT.truth[-1]
-    track = tracked(drawn, placed(drawn, (0.1, 0.1, 0.2), known=2), current_statistical(10.0, 30.0))
+    track = track_all(drawn, start_at_truth(drawn, (0.1, 0.1, 0.2), known=2), current_statistical(10.0, 30.0))
     end = errors(drawn, track)[:, -1]
     gain = np.sqrt((end**2).sum(-1).mean(0)) / parts(fit)
     assert gain[0] > 3.0

@@ -5,7 +5,7 @@ import pytest
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.status import Status
-from optloc.papers.kinematic import FILTERS, Scenario, draw, scored
+from optloc.papers.kinematic import FILTERS, Scenario, draw, score_track
 from optloc.track import UPDATES, State, polynomial, predicted
 from optloc.track.several_models import imm, mixed, moments, parallel, resized
 from optloc.track.track import scans
@@ -147,7 +147,7 @@ def test_a_target_that_begins_to_accelerate_is_followed():
     found = imm(late.runs, late.fix, FILTERS[4].models, np.array([[0.95, 0.05], [0.05, 0.95]]), speed=2e3, rate=1e3)
     assert found.probability[..., 9, 0].mean() > 0.6
     assert found.probability[..., -1, 1].mean() > 0.75
-    assert scored(late, found.track).nees[..., -1].mean() == pytest.approx(2.0, abs=0.6)
+    assert score_track(late, found.track).nees[..., -1].mean() == pytest.approx(2.0, abs=0.6)
 
 
 def test_runs_may_share_a_start_and_begin_with_a_scan_of_no_rows(drawn):

@@ -9,7 +9,7 @@ import optloc
 from optloc.base.errors import InvalidProblem
 from optloc.base.status import Status
 from optloc.base.types import Motion
-from optloc.papers.kinematic import Scenario, draw, started
+from optloc.papers.kinematic import Scenario, draw, start_from_fix
 from optloc.problem.epochs import cut
 from optloc.track import State, followed, polynomial
 from optloc.track.several_models import parallel, resized, softmax
@@ -76,7 +76,7 @@ def tau(runs, index):
 @pytest.mark.parametrize(("order", "noise"), [(0, 0.0), (0, 0.3), (1, 0.0), (1, 0.1), (2, 0.0), (2, 0.02)])
 def test_filters_agree_with_a_plain_second_program(drawn, order, noise):
     own = drawn[order]
-    track = followed(own.runs, started(own, order), polynomial(order, 1e3 * noise), "ekf")
+    track = followed(own.runs, start_from_fix(own, order), polynomial(order, 1e3 * noise), "ekf")
     for index in np.ndindex(2, 3):
         mean, cov, fit = plain(tau(own.runs, index), order, noise)
         assert track.mean[index] / 1e3 == pytest.approx(mean, rel=1e-6, abs=1e-6)
@@ -105,7 +105,7 @@ def test_models_side_by_side_are_their_own_tracks_with_their_likelihoods(drawn):
     own, models = drawn[1], [polynomial(order) for order in (0, 1, 2)]
     made = parallel(own.runs, own.fix, models, speed=2e3, rate=1e3, update="ekf")
     for order, track in enumerate(made.tracks):
-        alone = followed(own.runs, started(own, order), polynomial(order), "ekf")
+        alone = followed(own.runs, start_from_fix(own, order), polynomial(order), "ekf")
         assert (track.mean == alone.mean).all()
         fits = np.array([plain(tau(own.runs, (0, t)), order)[2] for t in range(3)])
         wanted = np.cumsum(fits - 3.0 * np.log(1e3 * C), axis=-1)
