@@ -45,12 +45,7 @@ from optloc.papers.angles import (
 )
 from optloc.papers.report import (
     ABSENT,
-    BLACK,
-    BLUE,
-    GREEN,
-    GREY,
-    PINK,
-    RED,
+    Ink,
     Report,
     Size,
     Study,
@@ -374,7 +369,7 @@ def three_parts(curves: Mapping[Style, Curve], values: Sequence[float]) -> Figur
     for part, (ax, name) in enumerate(zip(figure.subplots(1, 3), _PARTS, strict=True)):
         for (curve, colour, line), found in curves.items():
             ax.plot(found.seconds, found.error[:, part], line, color=colour, label=curve)
-        ax.axhline(values[part], color=PINK, linestyle=":", label="printed, over the track")
+        ax.axhline(values[part], color=Ink.PINK, linestyle=":", label="printed, over the track")
         scale(ax)
         label(ax, "time, s", f"error of {name}")
     explain(figure)
@@ -386,11 +381,11 @@ def figure_straight(curves: Sequence[Curve]) -> Figure:
     by = {c.label: c for c in curves}
     return three_parts(
         {
-            ("filter, a_max 2", BLUE, "-"): by["filter, a_max 2"],
-            ("filter, a_max 30", GREEN, "-"): by["filter, a_max 30"],
-            ("printed f33, a_max 2", RED, "-"): by["printed f33, a_max 2"],
-            ("posterior bound, a_max 2", BLACK, "--"): by["posterior bound, a_max 2"],
-            ("bound of one track", GREY, "--"): by["bound of one track"],
+            ("filter, a_max 2", Ink.BLUE, "-"): by["filter, a_max 2"],
+            ("filter, a_max 30", Ink.GREEN, "-"): by["filter, a_max 30"],
+            ("printed f33, a_max 2", Ink.RED, "-"): by["printed f33, a_max 2"],
+            ("posterior bound, a_max 2", Ink.BLACK, "--"): by["posterior bound, a_max 2"],
+            ("bound of one track", Ink.GREY, "--"): by["bound of one track"],
         },
         PRINTED_STRAIGHT,
     )
@@ -398,7 +393,7 @@ def figure_straight(curves: Sequence[Curve]) -> Figure:
 
 def figure_winding(curves: Sequence[Curve]) -> Figure:
     """Return figures 4 to 6: simulation 2."""
-    looks = ((RED, "-"), (BLUE, "-"), (BLACK, "--"))
+    looks = ((Ink.RED, "-"), (Ink.BLUE, "-"), (Ink.BLACK, "--"))
     return three_parts({(c.label, *look): c for c, look in zip(curves, looks, strict=True)}, PRINTED_WINDING)
 
 
@@ -408,13 +403,13 @@ def figure_circles(found: Mapping[float, Sequence[Curve]], snapshot: Curve) -> F
     axes = figure.subplots(1, len(found), sharey=True, squeeze=False)[0]
     for ax, (limit, curves) in zip(axes, found.items(), strict=True):
         ax.axvspan(*REPAIRED.phases[:2], color="#EEEEEE")
-        ax.plot(snapshot.seconds, snapshot.error[:, 0], ":", color=GREY, label="bound of every second by itself")
+        ax.plot(snapshot.seconds, snapshot.error[:, 0], ":", color=Ink.GREY, label="bound of every second by itself")
         by = {c.label: c for c in curves}
         # The two filters hardly differ: the converged one is a broad line behind the other.
         looks = (
-            ("converged", RED, "-", 4.0),
-            ("single step", BLUE, "-", 1.2),
-            ("posterior bound", BLACK, "--", 1.5),
+            ("converged", Ink.RED, "-", 4.0),
+            ("single step", Ink.BLUE, "-", 1.2),
+            ("posterior bound", Ink.BLACK, "--", 1.5),
         )
         for curve, colour, line, width in looks:
             ax.plot(by[curve].seconds, by[curve].error[:, 0], line, color=colour, label=curve, lw=width)
@@ -435,12 +430,12 @@ def figure_starts(ends: Mapping[str, Array]) -> Figure:
     """
     figure = canvas(7.0, 4.4)
     ax = figure.subplots()
-    looks = ((RED, "-", 1.5), (BLUE, "-", 4.0), (GREEN, "--", 1.5))
+    looks = ((Ink.RED, "-", 1.5), (Ink.BLUE, "-", 4.0), (Ink.GREEN, "--", 1.5))
     for (curve, values), (colour, line, width) in zip(ends.items(), looks, strict=True):
         ordered = np.sort(np.append(np.where(np.isfinite(values), values, np.inf), _EDGES))
         share = np.searchsorted(np.sort(values), ordered, side="right") / len(values)
         ax.step(ordered, share, line, where="post", color=colour, label=curve, lw=width)
-    ax.axvline(LOST, color=GREY, linestyle=":", label="counts as lost")
+    ax.axvline(LOST, color=Ink.GREY, linestyle=":", label="counts as lost")
     ax.set_xscale("log")
     ax.set_xlim(*_EDGES)
     label(ax, "distance from the truth at 50 s, m", "share of tracks")

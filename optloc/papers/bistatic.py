@@ -19,13 +19,7 @@ from optloc.linear.evaluate import predict
 from optloc.linear.simulate import simulate
 from optloc.papers.report import (
     ABSENT,
-    BLACK,
-    BLUE,
-    GREEN,
-    GREY,
-    ORANGE,
-    PINK,
-    RED,
+    Ink,
     Report,
     Size,
     Study,
@@ -448,14 +442,14 @@ def table_printed(azimuth: Array) -> Table:
 
 # Dashes over a full line: two estimators that agree are both seen.
 _STYLE = {
-    "single fix": (GREY, "-"),
-    "simplified": (RED, "-"),
-    "simplified, no restart": (RED, "-"),
-    "maximum likelihood": (BLUE, "--"),
-    "restart every 50": (GREEN, "-"),
-    "gain floor 0.05": (PINK, "-"),
-    "Cartesian EKF": (ORANGE, "-"),
-    "line fit": (BLUE, "-"),
+    "single fix": (Ink.GREY, "-"),
+    "simplified": (Ink.RED, "-"),
+    "simplified, no restart": (Ink.RED, "-"),
+    "maximum likelihood": (Ink.BLUE, "--"),
+    "restart every 50": (Ink.GREEN, "-"),
+    "gain floor 0.05": (Ink.PINK, "-"),
+    "Cartesian EKF": (Ink.ORANGE, "-"),
+    "line fit": (Ink.BLUE, "-"),
 }
 _AXES = {"range, km": 1e-3, "azimuth, rad": 1.0, "elevation, rad": 1.0}  # panels, and what they multiply SI units by
 _SHOWN = ("single fix", "simplified, no restart", "restart every 50", "gain floor 0.05", "Cartesian EKF", "line fit")
@@ -476,13 +470,13 @@ def against_time(found: Mapping[str, Errors], bound: tuple[Array, Array], points
     """
     figure = canvas(15.0, 4.6)
     for i, (ax, (name, unit)) in enumerate(zip(figure.subplots(1, 3), _AXES.items(), strict=True)):
-        ax.plot(bound[0], unit * bound[1][:, i], color=BLACK, lw=1.0, label="Cramér-Rao bound")
+        ax.plot(bound[0], unit * bound[1][:, i], color=Ink.BLACK, lw=1.0, label="Cramér-Rao bound")
         for curve, errors in found.items():
             spread, (colour, dash) = np.sqrt((errors.error[..., i] ** 2).mean(0)), _STYLE[curve]
             ax.plot(errors.epochs, unit * spread, dash, color=colour, lw=1.6, label=curve)
         for point, errors in points.items():
             spread = np.sqrt((errors.error[..., i] ** 2).mean(0))
-            ax.plot(errors.epochs, unit * spread, "D", color=BLACK, mfc="none", ms=7, label=point)
+            ax.plot(errors.epochs, unit * spread, "D", color=Ink.BLACK, mfc="none", ms=7, label=point)
         scale(ax)
         label(ax, "epochs, one a second", f"error of {name} (root mean square)")
     explain(figure, 4)
@@ -496,7 +490,7 @@ def one_run(found: Mapping[str, Errors]) -> Figure:
         for curve, errors in found.items():
             thin = 0.7 if curve == "single fix" else 1.6  # it jumps every second and would hide the others
             ax.plot(errors.epochs, unit * errors.error[0, :, i], color=_STYLE[curve][0], lw=thin, label=curve)
-        ax.axhline(0.0, color=BLACK, lw=0.8)
+        ax.axhline(0.0, color=Ink.BLACK, lw=0.8)
         label(ax, "epochs, one a second", f"error of {name}")
     explain(figure, 4)
     return figure

@@ -35,11 +35,7 @@ from optloc.papers.kinematic import (
 )
 from optloc.papers.report import (
     ABSENT,
-    BLACK,
-    BLUE,
-    GREEN,
-    PINK,
-    RED,
+    Ink,
     Report,
     Size,
     Study,
@@ -178,7 +174,7 @@ def table_equations(
     shared = scene.sigma**2 / 2.0 * (np.eye(3) + 1.0)
     epoch = cut(replace(scene.problem(), motions=(Motion(0),)), 0, 1)
     costs = weighting(epoch, scene.position[0], shared)
-    rows.append(("5: H'H called BLUE", "error of a fix, shared reference, km", *map(km, costs)))
+    rows.append(("5: H'H called Ink.BLUE", "error of a fix, shared reference, km", *map(km, costs)))
     for name, score in matched.items():
         model = PLAIN[ORDERS[name]]
         bad = score_track(drawn[name], track_all(drawn[name], model, predict_twice(model, scene.interval, 2)))
@@ -206,7 +202,7 @@ def _steps_of_a_fix(seed: int, drawn: Draw) -> Iterator[tuple[str, str, str, str
 
 # The figures: tracks and errors of the three scenes, models, association.
 
-_COLOURS = (BLUE, RED, GREEN, PINK)
+_COLOURS = (Ink.BLUE, Ink.RED, Ink.GREEN, Ink.PINK)
 
 
 def figure_scene(drawn: Draw, position: Array, score: Score, bound: Array | None) -> Figure:
@@ -237,7 +233,7 @@ def figure_scene(drawn: Draw, position: Array, score: Score, bound: Array | None
         )
         if bound is not None:
             named = "bound" if target == len(bound) - 1 else None
-            ax.plot(steps, 1e-3 * mean_error(bound[target]), color=BLACK, lw=0.8, ls="--", label=named)
+            ax.plot(steps, 1e-3 * mean_error(bound[target]), color=Ink.BLACK, lw=0.8, ls="--", label=named)
     plan.set_title("one run: line and square the truth, circles the filter")
     label(plan, "x, km", "y, km")
     plan.set_aspect("equal", adjustable="datalim")

@@ -33,10 +33,7 @@ from optloc.papers.registration import (
 )
 from optloc.papers.report import (
     ABSENT,
-    BLACK,
-    BLUE,
-    GREEN,
-    RED,
+    Ink,
     Report,
     Size,
     Study,
@@ -371,13 +368,13 @@ def _panel(ax: Axes, history: History, printed: float, since: int) -> None:
     epochs = [history.epochs[i] for i in keep]
     curve = np.unique(np.linspace(epochs[0], epochs[-1], _CURVE).astype(int))
     bounds = [rms(bound) for bound in history.setting.bounds(curve)]
-    ax.plot(step * curve, bounds, color=BLACK, label="Cramér-Rao bound")
+    ax.plot(step * curve, bounds, color=Ink.BLACK, label="Cramér-Rao bound")
     times = step * np.array(epochs)
     if history.plain is not None:
         plain = [history.plain[i].rmse for i in keep]
-        ax.plot(times, plain, "o", color=RED, mfc="none", ms=9, label="recursion of the paper")
-    ax.plot(times, [history.found[i].rmse for i in keep], "x", color=BLUE, ms=7, mew=2, label="optloc, no guess")
-    ax.plot([600.0], [printed], "D", color=GREEN, ms=6, label="printed at 600 s")
+        ax.plot(times, plain, "o", color=Ink.RED, mfc="none", ms=9, label="recursion of the paper")
+    ax.plot(times, [history.found[i].rmse for i in keep], "x", color=Ink.BLUE, ms=7, mew=2, label="optloc, no guess")
+    ax.plot([600.0], [printed], "D", color=Ink.GREEN, ms=6, label="printed at 600 s")
     if not since:
         scale(ax)
     label(ax, "time, s", "position error, m (root mean square)")

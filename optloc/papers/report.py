@@ -279,9 +279,12 @@ def _entitle(table: Table, page: str) -> Table:
 
 # Figures: what those of several papers share.
 
-# The palette of Okabe and Ito, which the colour-blind can tell apart.
-BLACK, GREY, BLUE, SKY = "#000000", "#7F7F7F", "#0072B2", "#56B4E9"
-RED, ORANGE, GREEN, PINK = "#D55E00", "#E69F00", "#009E73", "#CC79A7"
+
+class Ink:
+    """The palette of Okabe and Ito, which the colour-blind can tell apart."""
+
+    BLACK, GREY, BLUE, SKY = "#000000", "#7F7F7F", "#0072B2", "#56B4E9"
+    RED, ORANGE, GREEN, PINK = "#D55E00", "#E69F00", "#009E73", "#CC79A7"
 
 
 def canvas(width: float, height: float) -> Figure:

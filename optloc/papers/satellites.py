@@ -20,13 +20,7 @@ from optloc.linear.constraints import height as known_height
 from optloc.linear.simulate import simulate
 from optloc.papers.report import (
     ABSENT,
-    BLACK,
-    BLUE,
-    GREEN,
-    ORANGE,
-    PINK,
-    RED,
-    SKY,
+    Ink,
     Report,
     Size,
     Study,
@@ -420,14 +414,14 @@ def table_one_shot() -> Table:
 
 # Wide lines below narrow ones: filters that agree are all seen.
 _STYLE = {
-    "ekf": (RED, "-", 5.0),
-    "mvekf": (ORANGE, "-", 3.2),
-    "mgekf": (GREEN, "-", 1.8),
-    "iekf": (BLUE, "--", 1.2),
-    "quartic + ekf": (PINK, ":", 1.8),
+    "ekf": (Ink.RED, "-", 5.0),
+    "mvekf": (Ink.ORANGE, "-", 3.2),
+    "mgekf": (Ink.GREEN, "-", 1.8),
+    "iekf": (Ink.BLUE, "--", 1.2),
+    "quartic + ekf": (Ink.PINK, ":", 1.8),
 }
 # In the order of `heights`; the fourth and the fifth agree, so one is wide and the other narrow.
-_STYLE_HEIGHT = ((BLUE, 1.8), (GREEN, 1.8), (SKY, 1.8), (RED, 4.0), (PINK, 1.6), (BLACK, 1.8))
+_STYLE_HEIGHT = ((Ink.BLUE, 1.8), (Ink.GREEN, 1.8), (Ink.SKY, 1.8), (Ink.RED, 4.0), (Ink.PINK, 1.6), (Ink.BLACK, 1.8))
 
 
 def figure_filters(panels: Mapping[str, tuple[Mapping[str, Run], Array]]) -> Figure:
@@ -446,7 +440,7 @@ def figure_filters(panels: Mapping[str, tuple[Mapping[str, Run], Array]]) -> Fig
                 run = runs[name]
                 steps = np.arange(len(bound) - len(run.rms) + 1, len(bound) + 1)
                 ax.plot(steps, run.rms, dash, color=colour, lw=width, label=NAMES[name])
-        ax.plot(np.arange(1, len(bound) + 1), bound, color=BLACK, lw=0.9, label="posterior bound")
+        ax.plot(np.arange(1, len(bound) + 1), bound, color=Ink.BLACK, lw=0.9, label="posterior bound")
         ax.set_title(title)
         _against_steps(ax)
     explain(figure)
