@@ -300,9 +300,15 @@ def canvas(width: float, height: float) -> Figure:
 
 def scale(ax: Axes) -> None:
     """Make the axis of errors logarithmic, with plain numbers at 1, 2 and 5 of every decade."""
+
+    def between(value: float, _: float) -> str:
+        low, high = ax.get_ylim()
+        crowded = high > 1e4 * low  # of more than four decades the names of the decades alone can be read
+        return f"{value:g}" if not crowded and f"{value:.0e}"[0] in "25" else ""
+
     ax.set_yscale("log")
     ax.yaxis.set_major_formatter("{x:g}")
-    ax.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:.0e}"[0] in "25" else "")
+    ax.yaxis.set_minor_formatter(between)
 
 
 def label(ax: Axes, across: str, up: str) -> None:
