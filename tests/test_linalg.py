@@ -117,3 +117,15 @@ def test_a_singular_covariance_in_a_batch_leaves_the_others_bit_for_bit():
     W = linalg.whitening(mixed)
     assert np.array_equal(W[:3], linalg.whitening(regular))
     assert np.isfinite(W).all()
+
+
+def test_centre_and_spread_of_points_that_count():
+    points = np.random.default_rng(1).normal(size=(4, 7, 3))
+    inside = np.random.default_rng(2).random((4, 7)) < 0.6
+    centre, spread = linalg.centre_and_spread(points, inside)
+    for i in range(4):
+        own = points[i, inside[i]]
+        assert np.allclose(centre[i], own.mean(0), rtol=1e-15)
+        assert np.isclose(spread[i], np.linalg.norm(own - own.mean(0), axis=1).max(), rtol=1e-14)
+    assert np.array_equal(linalg.centre_and_spread(points)[0], points.mean(-2))
+    assert not linalg.centre_and_spread(points, np.zeros((4, 7), dtype=bool))[1].any()

@@ -277,7 +277,24 @@ def inverse_within(information: Array, space: Tangent) -> tuple[Array, Array]:
     return z @ inner @ transposed, ok
 
 
-# Error ellipses and ellipsoids of covariances.
+# Points: their centre and spread, error ellipses and ellipsoids of covariances.
+
+
+def centre_and_spread(points: Array, inside: Array | None = None) -> tuple[Array, Array]:
+    """Return the mean (..., d) of points (..., s, d) and their greatest distance from it (...).
+
+    Parameters
+    ----------
+    points : array (..., s, d)
+        Finite, those that are left out too.
+    inside : bool array (..., s), optional
+        Which of them count; all if absent. The mean of none is the origin.
+    """
+    if inside is None:
+        inside = np.ones(points.shape[:-1], dtype=bool)
+    centre = (points * inside[..., None]).sum(-2) / np.maximum(inside.sum(-1), 1)[..., None]
+    away = np.linalg.norm(points - centre[..., None, :], axis=-1)
+    return centre, np.where(inside, away, 0.0).max(-1)
 
 
 def error_ellipse(covariance: Array, probability: float = 0.95) -> tuple[Array, Array]:

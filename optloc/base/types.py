@@ -48,6 +48,11 @@ class Stations:
         """Return the number of stations."""
         return int(self.position.shape[-2])
 
+    @property
+    def places(self) -> Array:
+        """Return where stations are at any epoch, (..., k * s, d): moving ones span what they pass."""
+        return self.position.reshape(*self.position.shape[:-3], -1, self.dimension)
+
 
 @dataclass(frozen=True, slots=True)
 class Rows:

@@ -25,6 +25,7 @@ from optloc.solvers.refine import refine
 from optloc.solvers.starts.position import (
     along_the_valley,
     mirrored,
+    spread_of,
     static,
     subarray_starts,
     vectors,
@@ -108,8 +109,7 @@ def _subarrays(problem: Problem, fix: Fix) -> Array:
 
 def _weak(problem: Problem, fix: Fix) -> Array:
     """Return which fixes have an error of more than a hundredth of their distance from the stations, (N,)."""
-    stations = problem.stations.position
-    centre = stations.reshape(*stations.shape[:-3], -1, stations.shape[-1]).mean(-2)
+    centre, _ = spread_of(problem)
     with np.errstate(invalid="ignore"):
         spread = np.sqrt(np.trace(fix.covariance(), axis1=-2, axis2=-1))
         return np.asarray(~(spread < _WEAK * np.sqrt(((fix.position - centre) ** 2).sum(-1))))
@@ -171,11 +171,8 @@ def _search_starts(problem: Problem) -> Array:
         N problems with one target.
     """
     size, d = problem.batch_shape[0], problem.dimension
-    stations = problem.stations.position.reshape(*problem.stations.position.shape[:-3], -1, d)
-    centre = np.broadcast_to(stations.mean(-2), (size, d))
-    spread = np.linalg.norm(stations - stations.mean(-2, keepdims=True), axis=-1).max(-1)
-    spread = np.broadcast_to(np.where(spread > 0.0, spread, 1.0), (size,))
-    places = centre[:, None] + spread[:, None, None] * _directions(d)
+    centre, spread = spread_of(problem)
+    places = np.broadcast_to(centre[:, None] + spread[:, None, None] * _directions(d), (size, _PLACES, d))
     x = vectors(problem, places)
     item = np.repeat(np.arange(size), _PLACES)
     done = refine(problem, x.reshape(-1, x.shape[-1]), item=item, limit=8, face=exact(problem))

@@ -12,6 +12,7 @@ from time import perf_counter
 import numpy as np
 
 from formulations.backend import count
+from optloc.base.linalg import centre_and_spread
 from optloc.base.status import Status
 from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array
@@ -58,9 +59,7 @@ def start_of(kind: str, width: float, drawn: Drawn) -> Array:
     """
     if kind == "truth":
         return drawn.truth
-    stations = drawn.problem.stations.position
-    centre = stations.mean((-3, -2))
-    radius = np.linalg.norm(stations - centre[..., None, None, :], axis=-1).max((-2, -1))
+    centre, radius = centre_and_spread(drawn.problem.stations.places)
     place = centre + (width if kind == "box" else _ASIDE * radius[..., None]) * drawn.wild
     start = np.zeros_like(drawn.truth)
     slot, _ = drawn.problem.layout.find(drawn.position)

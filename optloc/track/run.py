@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
+from optloc.base.linalg import centre_and_spread
 from optloc.base.status import Status
 from optloc.base.types import Array
 from optloc.problem.epochs import cut
@@ -401,7 +402,5 @@ def _heard(problem: Problem, first: int) -> Array:
 
 def reach(problem: Problem, position: Array) -> float:
     """Return the spread of the stations, or the range of a position (d,) from their centre if that is more, metres."""
-    stations = problem.stations.position.reshape(-1, problem.dimension)
-    centre = stations.mean(0)
-    spread = float(np.linalg.norm(stations - centre, axis=-1).max())
-    return max(spread, float(np.linalg.norm(position - centre)))
+    centre, spread = centre_and_spread(problem.stations.places.reshape(-1, problem.dimension))
+    return max(float(spread), float(np.linalg.norm(position - centre)))

@@ -12,6 +12,7 @@ import numpy as np
 
 from formulations.range_enclosure import Box, Ranged, ball, enclosure
 from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.linalg import centre_and_spread
 from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array
 from optloc.problem.fix import Fix
@@ -172,8 +173,8 @@ def _by_moments(problem: Problem, fix: Fix, region: float | None) -> Reference:
         if out.reason[i]:
             return
         nodes = _nodes(found, i)
-        centre = place[i, nodes].mean(0)
-        size = float(np.linalg.norm(place[i, nodes] - centre, axis=1).max()) or 1.0
+        centre, spread = centre_and_spread(place[i, nodes])
+        size = float(spread) or 1.0
         own = _scaled(found, i, nodes, (place[i, nodes] - centre) / size, size)
         point = (fix.position[i] - centre) / size
         cost = float(own.cost(point))

@@ -9,6 +9,7 @@ import numpy as np
 from formulations.bearing_course import Courses, sight_courses
 from formulations.bearing_ls import rays, sight
 from formulations.bistatic import course, triad
+from optloc.base.linalg import centre_and_spread
 from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array, Rows
 from optloc.linear.indices import elapsed
@@ -68,8 +69,7 @@ def bearings(problem: Problem) -> Bearings | None:
                 angle[:, i, 1], weight[:, i, 1] = value[:, keys[key]], importance[:, keys[key]]
     place = _at(problem.stations.position, 3, block, size)
     axes = None if problem.stations.axes is None else _at(problem.stations.axes, 4, block, size)
-    centre = place.mean(1)
-    spread = np.linalg.norm(place - centre[:, None], axis=-1).max(1)
+    centre, spread = centre_and_spread(place)
     scale = np.where(spread > 0.0, spread, 1.0)
     return Bearings((place - centre[:, None]) / scale[:, None, None], angle, weight, axes, centre, scale[:size])
 

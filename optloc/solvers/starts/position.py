@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array
 from optloc.linear.evaluate import predict
 from optloc.linear.indices import columns, plans
@@ -45,8 +46,7 @@ def squared_range_starts(problem: Problem, pick: Pick) -> Array:
 
 def mirrored(problem: Problem, position: Array) -> Array:
     """Return points (N, ..., d) mirrored in the plane (or line) that fits the stations of each problem best."""
-    stations = problem.stations.position
-    flat = stations.reshape(*stations.shape[:-3], -1, stations.shape[-1])
+    flat = problem.stations.places
     centre = flat.mean(-2, keepdims=True)
     _, vectors = np.linalg.eigh(np.swapaxes(flat - centre, -1, -2) @ (flat - centre))
     normal = vectors[..., :, 0]
@@ -70,10 +70,7 @@ def along_the_valley(problem: Problem, position: Array, covariance: Array) -> Ar
     covariance : array (N, d, d)
         Of the fixes; where it is not finite there are no steps along its axis.
     """
-    stations = problem.stations.position
-    places = stations.reshape(*stations.shape[:-3], -1, stations.shape[-1])
-    centre = places.mean(-2)
-    size = np.sqrt(((places - centre[..., None, :]) ** 2).sum(-1)).max(-1)
+    centre, size = centre_and_spread(problem.stations.places)
     away = position - centre
     length = np.sqrt((away**2).sum(-1, keepdims=True))
     ahead = away / np.where(length > 0.0, length, 1.0)
@@ -194,10 +191,8 @@ def unbiased(problem: Problem) -> Problem:
 
 def spread_of(problem: Problem) -> tuple[Array, Array]:
     """Return the centre of the stations (N or 1, d) and their greatest distance from it (N or 1,), metres."""
-    stations = problem.stations.position.reshape(*problem.stations.position.shape[:-3], -1, problem.dimension)
-    stations = stations if stations.ndim == 3 else stations[None]
-    centre = stations.mean(-2)
-    spread = np.linalg.norm(stations - centre[:, None], axis=-1).max(-1)
+    places = problem.stations.places
+    centre, spread = centre_and_spread(places if places.ndim == 3 else places[None])
     return centre, np.where(spread > 0.0, spread, 1.0)
 
 

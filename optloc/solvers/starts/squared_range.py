@@ -10,6 +10,7 @@ import numpy as np
 
 from formulations.squared_range import Quadric, cone, minimiser, paraboloid, stationary
 from optloc.base import linalg
+from optloc.base.linalg import centre_and_spread
 from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array, Rows
 from optloc.models import MODELS, LiftedRow, Point, lifted_row
@@ -324,12 +325,11 @@ def squared_rows(problem: Problem, found: Ranges | None) -> Squared:
     size, d = problem.batch_shape[0], problem.dimension
     on_cone = found is not None and bool(found.free.any())
     place, inside = _station_nodes(problem, found)
-    centre = (place * inside[..., None]).sum(1) / np.maximum(inside.sum(1), 1)[:, None]
+    centre, spread = centre_and_spread(place, inside)
     origin = centre
     if on_cone:
         assert found is not None
         origin = place[np.arange(size), found.reference]
-    spread = np.where(inside, np.linalg.norm(place - centre[:, None], axis=-1), 0.0).max(1)
     if found is not None and not on_cone:
         spread = np.maximum(spread, np.where(found.inside, np.abs(found.offset), 0.0).max(1))
     scale = np.where(spread > 0.0, spread, 1.0)
