@@ -11,7 +11,7 @@ import pytest
 import optloc
 from optloc import InvalidProblem, datasets
 from optloc.datasets.catalogue import ENTRIES
-from optloc.datasets.folder import VARIABLE
+from optloc.datasets.reading import VARIABLE
 from optloc.problem.noise import variances
 
 

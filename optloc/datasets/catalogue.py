@@ -12,8 +12,7 @@ from typing import Any
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
-from optloc.datasets.folder import root
-from optloc.datasets.folder import verify as check_files
+from optloc.datasets.reading import check_files, root
 from optloc.problem.problem import Problem
 
 

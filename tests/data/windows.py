@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from optloc import Fix, Status
-from optloc.datasets.windows import Window, Windows
+from optloc.datasets.reading import Window, Windows
 
 
 def from_truth(data: Windows) -> tuple[np.ndarray, np.ndarray]:
