@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from functools import cache, update_wrapper
 from threading import Lock
+from types import FunctionType
 from typing import Any, TypeVar, cast
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
@@ -43,23 +44,48 @@ def plain() -> Iterator[None]:
         _PLAIN.reset(token)
 
 
+# Machine code on disk is found by file and name of a function, and holds that of what it calls. Where a kernel that
+# others call is replaced, the callers get names of their own.
+_KERNELS: list[_Kernel] = []
+_MARKS: list[tuple[Callable[[str], bool], str]] = []
+
+
+def _marked(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function, under a name of its own where its module is marked."""
+    marks = [mark for callers, mark in _MARKS if callers(function.__module__)]
+    if not marks:
+        return function
+    assert isinstance(function, FunctionType)
+    own = FunctionType(function.__code__, function.__globals__, function.__name__, function.__defaults__)
+    own.__qualname__ = f"{function.__name__}_{marks[-1]}"
+    return own
+
+
 class _Kernel:
     """A function of scalars and arrays in two forms; numba takes it for the compiled one where kernels call it."""
 
     def __init__(self, function: Callable[..., Any], inline: str) -> None:
-        self.function, self.inline, self.ready = function, inline, False
+        self.function, self.inline, self.ready = _marked(function), inline, False
         self._machine: Any = None
         update_wrapper(self, function)
+        _KERNELS.append(self)
 
     @property
     def machine(self) -> Any:
         """The compiled form; without an entry for C, which nobody calls, it is made a fifth faster."""
-        if self._machine is None:
+        made = self._machine  # by a name of its own: another thread may renew the kernel meanwhile
+        if made is None:
             with _LOCK:  # one form for all threads: numba compiles, and looks up types, for each form anew
-                if self._machine is None:
+                made = self._machine
+                if made is None:
                     options = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-                    self._machine = _numba().njit(**options, inline=self.inline)(self.function)
-        return self._machine
+                    made = self._machine = _numba().njit(**options, inline=self.inline)(self.function)
+        return made
+
+    def renew(self) -> None:
+        """Forget the compiled form."""
+        with _LOCK:
+            self.function, self.ready, self._machine = _marked(self.function), False, None
 
     def __getattr__(self, name: str) -> Any:
         """Return what numba wants to know of a function that a kernel calls."""
@@ -77,6 +103,28 @@ class _Kernel:
 def ready(kernel: Callable[..., Any]) -> bool:
     """Return whether machine code of a kernel has been used in this process: the next call need not load it."""
     return bool(getattr(kernel, "ready", False))
+
+
+def replace(kernel: Callable[..., Any], function: Callable[..., Any]) -> None:
+    """Replace the function of a kernel; what calls it must be renewed (`renew`)."""
+    assert isinstance(kernel, _Kernel)
+    kernel.function = _marked(function)
+
+
+def renew(callers: Callable[[str], bool], mark: str) -> None:
+    """Let all kernels of some modules be compiled anew at their next use, because one that they call was replaced.
+
+    Parameters
+    ----------
+    callers : callable
+        Whether a module (its dotted name) is one of them; asked of modules that are loaded later, too.
+    mark : str
+        Tells their machine code on disk from what was kept before.
+    """
+    _MARKS.append((callers, mark))
+    for kernel in _KERNELS:
+        if callers(kernel.function.__module__):
+            kernel.renew()
 
 
 def compiled(function: _Function) -> _Function:

@@ -72,6 +72,9 @@ class Model:
         One line for listings.
     ranges : (ra, rb), optional
         Set where ``h = ra r_a + rb r_b`` exactly.
+    nodes : tuple of (factor, node)
+        What a proof takes h for where it is no sum of ranges: ``h = sum of factor phi``, each phi a node
+        (`optloc.proof.nodes.node.Node`) or the name of one that optloc has. Empty: nothing is proven of such rows.
     lifted : callable of (m, a, b), optional
         The `LiftedRow` of a measured value m, where there is one that is not a sum of ranges.
     period : float, optional
@@ -94,6 +97,7 @@ class Model:
     stations: int
     summary: str
     ranges: tuple[int, int] | None = None
+    nodes: tuple[tuple[float, Any], ...] = ()
     lifted: Callable[[Any, Point, Point], LiftedRow] | None = None
     period: float | None = None
     emission: bool = False
@@ -200,6 +204,7 @@ _KINDS: dict[str, Model] = {
         "ratio",
         2,
         "gain ratio of arrival, r_a / r_b",
+        nodes=((1.0, "ratio"),),
         lifted=lambda m, a, b: LiftedRow(None, 1.0, -1.0 * m, 0.0, lambda t, a, b: -1.0 * distance(t, b)),
     ),
     "range": Model(lambda t, a, b: distance(t, a), "length", 1, "range r_a", ranges=(1, 0)),
@@ -223,6 +228,7 @@ _KINDS: dict[str, Model] = {
         "angle",
         1,
         "azimuth from the station's first axis towards its second",
+        nodes=((1.0, "azimuth"),),
         lifted=_lifted_azimuth,
         period=tau,
         axes=True,
@@ -232,12 +238,21 @@ _KINDS: dict[str, Model] = {
         "angle",
         1,
         "elevation above the plane of the station's first two axes",
+        nodes=((1.0, "elevation"),),
         lifted=_lifted_elevation,
         period=tau,
         axes=True,
         dimensions=(3,),
     ),
-    "height": Model(_height, "length", 0, "height above the WGS 84 ellipsoid", ecef=True, dimensions=(3,)),
+    "height": Model(
+        _height,
+        "length",
+        0,
+        "height above the WGS 84 ellipsoid",
+        nodes=((1.0, "height"),),
+        ecef=True,
+        dimensions=(3,),
+    ),
     "fdoa": Model(
         lambda t, a, b: range_rate(t, a) - range_rate(t, b),
         "speed",

@@ -13,18 +13,14 @@ The line to a station at ``m + R a`` is, but for the factor R/v, ``p - v a``.
 
 from __future__ import annotations
 
-from math import inf, sqrt
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled
-from optloc.proof.nodes.codes import RATIO
 from optloc.proof.nodes.forms import Triple, blend, inner, pull, triple
-
-# Half-width of the cube, reaches of the stations.
-_REACHES = 1.25
 
 
 class Minima(NamedTuple):
@@ -262,23 +258,3 @@ def scaled_station(atlas: Atlas, data: Array) -> tuple[float, float, Triple]:
     squared = inner(a, a)
     n = blend(-2.0, pull(a, atlas.slant), squared, triple(atlas.scale, 1))
     return sqrt(squared), atlas.scale[0] * squared - 2.0 * inner(a, triple(atlas.point, 0)), n
-
-
-@compiled
-def cube(kinds: Array, data: Array) -> tuple[Array, float]:
-    """Return centre (3,) and half-width of a cube that holds all stations well.
-
-    Parameters
-    ----------
-    kinds, data : array (J,), (J, width)
-        Nodes that have stations.
-    """
-    low, high = np.full(3, inf), np.full(3, -inf)
-    for j in range(kinds.shape[0]):
-        for first in range(0, 6 if kinds[j] == RATIO else 3, 3):
-            for k in range(3):
-                low[k], high[k] = min(low[k], data[j, first + k]), max(high[k], data[j, first + k])
-    reach = 0.0
-    for k in range(3):
-        reach = max(reach, 0.5 * (high[k] - low[k]))
-    return 0.5 * (low + high), max(_REACHES * reach, 1.0)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
 from math import isnan
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
 from optloc.base.threads import mapped
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, enabled, plain, ready
-from optloc.proof.chart import Cost, cost_of, empty_box, set_geometry
+from optloc.proof.chart import Cost, cost_of, empty_box, empty_groups, set_geometry
 from optloc.proof.everywhere import prove_everywhere
-from optloc.proof.groups import empty_groups
 from optloc.proof.near import BUDGET, OPEN, prove
 from optloc.proof.pose import Posed, taken
 
@@ -23,8 +21,7 @@ _STRETCH = 16, 512
 _FEW, _SMALL, _FIRST_BOXES = 16, 24, 400
 
 
-@dataclass(frozen=True, slots=True)
-class Asked:
+class Asked(NamedTuple):
     """What is to be proven of each of n fixes.
 
     Parameters
@@ -54,13 +51,12 @@ class Asked:
     fallback: Array
     budget: Array
 
-    def take(self, index: Array) -> Asked:
+    def take(self, index: Array | slice) -> Asked:
         """Return what is asked of some of the fixes."""
-        return Asked(*(getattr(self, name)[index] for name in Asked.__slots__))
+        return Asked(*(array[index] for array in self))
 
 
-@dataclass(frozen=True, slots=True)
-class Answered:
+class Answered(NamedTuple):
     """What became of each of n proofs.
 
     Parameters
@@ -83,9 +79,9 @@ class Answered:
     everywhere: Array
     found: Array
 
-    def take(self, index: Array) -> Answered:
+    def take(self, index: Array | slice) -> Answered:
         """Return what became of some of the proofs."""
-        return Answered(*(getattr(self, name)[index] for name in Answered.__slots__))
+        return Answered(*(array[index] for array in self))
 
 
 def prove_all(pose: Posed, asked: Asked) -> Answered:
@@ -97,31 +93,30 @@ def prove_all(pose: Posed, asked: Asked) -> Answered:
     if n > _FEW or len(pose.kinds) > _SMALL or ready(_loop):
         return _proven(pose, asked)
     with plain():
-        out = _proven(pose, replace(asked, budget=np.minimum(asked.budget, max(5, _FIRST_BOXES // max(n, 1)))))
+        out = _proven(pose, asked._replace(budget=np.minimum(asked.budget, max(5, _FIRST_BOXES // max(n, 1)))))
     short = np.flatnonzero((out.verdict == BUDGET) & (out.boxes < asked.budget))
     if len(short) and enabled():
-        more = _proven(taken(pose, short), asked.take(short))
-        for name in Answered.__slots__:
-            getattr(out, name)[short] = getattr(more, name)
+        for array, more in zip(out, _proven(taken(pose, short), asked.take(short)), strict=True):
+            array[short] = more
     return out
 
 
 def _proven(pose: Posed, asked: Asked) -> Answered:
     n, d = asked.x.shape
-    whole = np.zeros(n, dtype=np.int64)
-    out = Answered(whole, whole.copy(), np.zeros(n), np.zeros(n, dtype=np.bool_), np.full((n, d), np.nan))
-    own = [_plain(a) for a in (pose.w, *(getattr(asked, name) for name in Asked.__slots__))]
-    geometry = [_plain(pose.data), _plain(pose.K)]
-
+    out = Answered(
+        verdict=np.zeros(n, dtype=np.int64),
+        boxes=np.zeros(n, dtype=np.int64),
+        bound=np.zeros(n),
+        everywhere=np.zeros(n, dtype=np.bool_),
+        found=np.full((n, d), np.nan),
+    )
+    pose, asked = Posed(*(_plain(array) for array in pose)), Asked(*(_plain(array) for array in asked))
     length = max(_STRETCH[0], min(_STRETCH[1], n // 32))
 
     def stretch(first: int) -> None:
         part = slice(first, min(first + length, n))
-        given: list[Any] = [array if len(array) == 1 else array[part] for array in geometry]
-        given += [array[part] for array in own]
-        given += [getattr(out, name)[part] for name in Answered.__slots__]
         with np.errstate(all="ignore"):  # plain Python would warn of what has no bound
-            _loop(pose.kinds, *given)
+            _loop(taken(pose, part), asked.take(part), out.take(part))
 
     mapped(stretch, range(0, n, length), None if enabled() else 1)
     return out
@@ -133,49 +128,32 @@ def _plain(array: Array) -> Array:
 
 
 @compiled
-def _loop(
-    kinds: Array,
-    data: Array,
-    K: Array,
-    w: Array,
-    x: Array,
-    others: Array,
-    known: Array,
-    kappa: Array,
-    eps: Array,
-    region: Array,
-    fallback: Array,
-    budget: Array,
-    verdict: Array,
-    boxes: Array,
-    bound: Array,
-    everywhere: Array,
-    found: Array,
-) -> None:
-    A, weight, groups = np.empty((K.shape[2], K.shape[2])), np.empty(K.shape[2]), empty_groups(K.shape[2])
-    box = empty_box(K.shape[1], K.shape[2])
-    for i in range(len(x)):
+def _loop(pose: Posed, asked: Asked, out: Answered) -> None:
+    """Prove what is asked of each fix, and write what became of it."""
+    kinds, data, K = pose.kinds, pose.data, pose.K
+    J = K.shape[2]
+    A, weight, groups, box = np.empty((J, J)), np.empty(J), empty_groups(J), empty_box(K.shape[1], J)
+    for i in range(len(asked.x)):
         rows = K[i if len(K) > 1 else 0]
         if i == 0 or len(K) > 1:
             set_geometry(kinds, rows, A, weight, groups)
-        cost, own = Cost(kinds, data[i if len(data) > 1 else 0], rows, w[i], A, weight, groups), box
+        cost, own = Cost(kinds, data[i if len(data) > 1 else 0], rows, pose.w[i], A, weight, groups), box
         if (weight == 0.0).any():
             cost = _present(cost)
             own = empty_box(cost.K.shape[0], cost.K.shape[1])
-        minima, low, high = others[i, : known[i]], region[i, 0], region[i, 1]
-        everywhere[i] = isnan(low[0])
-        if everywhere[i]:
-            verdict[i], boxes[i], bound[i] = prove_everywhere(
-                cost, own, x[i], minima, kappa[i], eps[i], budget[i], found[i]
-            )
-            if verdict[i] != OPEN:
+        x, kappa, eps, found = asked.x[i], asked.kappa[i], asked.eps[i], out.found[i]
+        minima, low, high = asked.others[i, : asked.known[i]], asked.region[i, 0], asked.region[i, 1]
+        boxes = 0
+        out.everywhere[i] = isnan(low[0])
+        if out.everywhere[i]:
+            verdict, boxes, bound = prove_everywhere(cost, own, x, minima, kappa, eps, asked.budget[i], found)
+            out.verdict[i], out.boxes[i], out.bound[i] = verdict, boxes, bound
+            if verdict != OPEN:
                 continue
-            everywhere[i] = False
-            low, high = fallback[i, 0], fallback[i, 1]
-        verdict[i], more, bound[i] = prove(
-            cost, own, x[i], minima, kappa[i], eps[i], budget[i], low, high, False, found[i]
-        )
-        boxes[i] += more
+            out.everywhere[i] = False
+            low, high = asked.fallback[i, 0], asked.fallback[i, 1]
+        verdict, more, bound = prove(cost, own, x, minima, kappa, eps, asked.budget[i], low, high, False, found)
+        out.verdict[i], out.boxes[i], out.bound[i] = verdict, boxes + more, bound
 
 
 @compiled

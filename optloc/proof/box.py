@@ -2,34 +2,20 @@
 
 from __future__ import annotations
 
-from math import sqrt
+from math import inf, sqrt
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, inlined
-from optloc.proof.nodes.angles import bound_azimuth, bound_elevation
-from optloc.proof.nodes.codes import AZIMUTH, ELEVATION, LINEAR, RANGE, RATIO
-from optloc.proof.nodes.height import bound_height
-from optloc.proof.nodes.linear3 import inverse
-from optloc.proof.nodes.ranges import bound_ranges
-from optloc.proof.nodes.ratio import bound_ratio
+from optloc.proof.linear3 import inverse
+from optloc.proof.nodes.dispatch import bound_others
+from optloc.proof.nodes.node import HIGH, LOW, PHI, SLOPE0, SLOPE1, SLOPE2
+from optloc.proof.nodes.range import bound_ranges
 
 _ULP = 2.0**-52
 # Coordinate descents towards the least-squares point of a box; any point gives a valid bound.
 _SWEEPS = 3
-# Columns of a table of nodes over a box (J, 6): value at the centre, gradient, enclosure of the remainder.
-NODE_WIDTH = 6
-# Columns of a table of rows over a box (q, 5): residual in the middle of the remainders, Jacobian, direction v.
-ROW_WIDTH = 5
-
-
-@compiled
-def bound_linear(line: Array, sense: Array, data: Array, node: Array) -> None:
-    """Write the row of a linear form n.(x - o), which has no remainder, into the table of nodes."""
-    n0, n1, n2 = data[3], data[4], data[5]
-    node[0] = n0 * line[0] + n1 * line[1] + n2 * line[2]
-    for k in range(3):
-        node[1 + k] = n0 * sense[0, k] + n1 * sense[1, k] + n2 * sense[2, k]
-    node[4] = node[5] = 0.0
+# Columns of a table of rows over a box (q, ROW_WIDTH): residual in the middle of the remainders, Jacobian, direction v.
+MIDDLE, J0, J1, J2, DIRECTION, ROW_WIDTH = range(6)
 
 
 @inlined
@@ -54,27 +40,8 @@ def bound_nodes(
         Written.
     """
     others = bound_ranges(kinds, data, centre, sense, gram, half, nodes)
-    for j in range(kinds.shape[0] if others else 0):
-        kind = kinds[j]
-        if kind == RANGE:
-            continue
-        for k in range(3):
-            line[k] = centre[k] - data[j, k]
-        if kind == LINEAR:
-            bound_linear(line, sense, data[j], nodes[j])
-        else:
-            for k in range(3):
-                line[3 + k] = centre[k] - data[j, 3 + k]
-            own, slope = data[j], nodes[j, 1:4]
-            if kind == AZIMUTH:
-                value, low, high = bound_azimuth(own, line[:3], sense, half, slope)
-            elif kind == ELEVATION:
-                value, low, high = bound_elevation(own, line[:3], sense, half, slope)
-            elif kind == RATIO:
-                value, low, high = bound_ratio(own, line[:3], sense, line[3:], sense, half, slope)
-            else:
-                value, low, high = bound_height(own, line[:3], sense, half, slope)
-            nodes[j, 0], nodes[j, 4], nodes[j, 5] = value, low, high
+    if others:
+        bound_others(kinds, data, centre, sense, half, line, nodes)
 
 
 @inlined
@@ -84,11 +51,11 @@ def linearise_rows(K: Array, w: Array, nodes: Array, rows: Array) -> None:
         middle, j0, j1, j2 = -w[i], 0.0, 0.0, 0.0
         for j in range(K.shape[1]):
             factor = K[i, j]
-            middle += factor * (nodes[j, 0] + 0.5 * (nodes[j, 4] + nodes[j, 5]))
-            j0 += factor * nodes[j, 1]
-            j1 += factor * nodes[j, 2]
-            j2 += factor * nodes[j, 3]
-        rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3] = middle, j0, j1, j2
+            middle += factor * (nodes[j, PHI] + 0.5 * (nodes[j, LOW] + nodes[j, HIGH]))
+            j0 += factor * nodes[j, SLOPE0]
+            j1 += factor * nodes[j, SLOPE1]
+            j2 += factor * nodes[j, SLOPE2]
+        rows[i, MIDDLE], rows[i, J0], rows[i, J1], rows[i, J2] = middle, j0, j1, j2
 
 
 @inlined
@@ -98,7 +65,7 @@ def cost_at(K: Array, w: Array, nodes: Array) -> float:
     for i in range(K.shape[0]):
         residual = -w[i]
         for j in range(K.shape[1]):
-            residual += K[i, j] * nodes[j, 0]
+            residual += K[i, j] * nodes[j, PHI]
         total += residual * residual
     return total
 
@@ -126,21 +93,21 @@ def least_residual(K: Array, weight: Array, floor: float, half: Array, nodes: Ar
     _nearest(half, rows)
     length, reach, t0, t1, t2 = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(K.shape[0]):
-        v = rows[i, 4]
+        v = rows[i, DIRECTION]
         length += v * v
-        reach += v * rows[i, 0]
-        t0 += v * rows[i, 1]
-        t1 += v * rows[i, 2]
-        t2 += v * rows[i, 3]
+        reach += v * rows[i, MIDDLE]
+        t0 += v * rows[i, J0]
+        t1 += v * rows[i, J1]
+        t2 += v * rows[i, J2]
     if not length > 0.0:
         return -1.0
     reach -= abs(t0) * half[0] + abs(t1) * half[1] + abs(t2) * half[2]
     for j in range(K.shape[1]):
-        radius = 0.5 * (nodes[j, 5] - nodes[j, 4])
+        radius = 0.5 * (nodes[j, HIGH] - nodes[j, LOW])
         if radius > 0.0:
             total = 0.0
             for i in range(K.shape[0]):
-                total += K[i, j] * rows[i, 4]
+                total += K[i, j] * rows[i, DIRECTION]
             reach -= abs(total) * radius
     return float(reach / sqrt(length)) - rounding(K, weight, floor, nodes)
 
@@ -150,7 +117,7 @@ def rounding(K: Array, weight: Array, floor: float, nodes: Array) -> float:
     """Return a bound of the rounding errors of a residual (its length); arguments as of `least_residual`."""
     size = floor
     for j in range(K.shape[1]):
-        size += weight[j] * (abs(nodes[j, 0]) + abs(nodes[j, 4]) + abs(nodes[j, 5]))
+        size += weight[j] * (abs(nodes[j, PHI]) + abs(nodes[j, LOW]) + abs(nodes[j, HIGH]))
     return float((32 + K.shape[0] + K.shape[1]) * _ULP * size)
 
 
@@ -159,7 +126,7 @@ def normal_of(rows: Array) -> tuple[float, float, float, float, float, float, fl
     """Return J'J (00, 01, 02, 11, 12, 22) and J' middle."""
     a00, a01, a02, a11, a12, a22, b0, b1, b2 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(rows.shape[0]):
-        middle, j0, j1, j2 = rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3]
+        middle, j0, j1, j2 = rows[i, MIDDLE], rows[i, J0], rows[i, J1], rows[i, J2]
         a00 += j0 * j0
         a01 += j0 * j1
         a02 += j0 * j2
@@ -192,7 +159,7 @@ def _nearest(half: Array, rows: Array) -> None:
         s1 = within(-(b1 + a01 * s0 + a12 * s2) * d1, half[1])
         s2 = within(-(b2 + a02 * s0 + a12 * s1) * d2, half[2])
     for i in range(rows.shape[0]):
-        rows[i, 4] = rows[i, 0] + rows[i, 1] * s0 + rows[i, 2] * s1 + rows[i, 3] * s2
+        rows[i, DIRECTION] = rows[i, MIDDLE] + rows[i, J0] * s0 + rows[i, J1] * s1 + rows[i, J2] * s2
 
 
 # Parts of a box that may be left out: where residuals are too long.
@@ -231,13 +198,13 @@ def shrink(K: Array, rho: float, plane: bool, nodes: Array, rows: Array, cut: Ar
     r0, r1 = rho * sqrt(max(solve[0, 0], 0.0)), rho * sqrt(max(solve[1, 1], 0.0))
     r2 = rho * sqrt(max(solve[2, 2], 0.0))
     for j in range(K.shape[1]):
-        radius = 0.5 * (nodes[j, 5] - nodes[j, 4])
+        radius = 0.5 * (nodes[j, HIGH] - nodes[j, LOW])
         if radius > 0.0:
             p0, p1, p2 = 0.0, 0.0, 0.0
             for i in range(K.shape[0]):
-                p0 += K[i, j] * rows[i, 1]
-                p1 += K[i, j] * rows[i, 2]
-                p2 += K[i, j] * rows[i, 3]
+                p0 += K[i, j] * rows[i, J0]
+                p1 += K[i, j] * rows[i, J1]
+                p2 += K[i, j] * rows[i, J2]
             r0 += abs(solve[0, 0] * p0 + solve[0, 1] * p1 + solve[0, 2] * p2) * radius
             r1 += abs(solve[1, 0] * p0 + solve[1, 1] * p1 + solve[1, 2] * p2) * radius
             r2 += abs(solve[2, 0] * p0 + solve[2, 1] * p1 + solve[2, 2] * p2) * radius
@@ -283,18 +250,21 @@ def is_empty(cut: Array) -> bool:
     return bool(cut[0] > cut[3] or cut[1] > cut[4] or cut[2] > cut[5])
 
 
-# The stack of boxes still to be looked at: rows of centre, half-widths and the bound of the box they came from.
+# The boxes still to be looked at: a stack, so that the deepest comes first and few are kept.
 
-CAPACITY, DEPTH = 512, 7
+# Columns of the stack (capacity, DEPTH): centre, half-widths, the bound of the box that it came from, and the piece of
+# an atlas that it lies in (0 in the near chart).
+CENTRE, HALF, LEAST, PIECE, DEPTH = 0, 3, 6, 7, 8
+# A half-width covers the rounding of its centre and corners: relative to itself, and to the sizes of these.
+_WIDER, _SHIFT = 1e-12, 1e-15
 
 
 @compiled
-def push_around(stack: Array, low: Array, high: Array, hole: Array) -> int:
-    """Push the box between two corners, less the box |s_k| <= hole_k around the origin; return how many that makes.
+def push_around(stack: Array, size: int, low: Array, high: Array, hole: Array, piece: int) -> int:
+    """Push the box between two corners, less the box |s_k| <= hole_k around the origin; return the size of the stack.
 
     The hole is cut out along its faces: at most two slabs a dimension. Slabs overlap the hole by a rounding.
     """
-    size = 0
     low, high = low.copy(), high.copy()
     for k in range(3):
         for side in range(2):
@@ -303,8 +273,8 @@ def push_around(stack: Array, low: Array, high: Array, hole: Array) -> int:
                 continue
             for m in range(3):
                 a, b = (first, last) if m == k else (low[m], high[m])
-                stack[size, m], stack[size, 3 + m] = 0.5 * (a + b), _wide(0.5 * (b - a), abs(a) + abs(b))
-            stack[size, 6] = 0.0
+                stack[size, CENTRE + m], stack[size, HALF + m] = 0.5 * (a + b), _wide(0.5 * (b - a), abs(a) + abs(b))
+            stack[size, LEAST], stack[size, PIECE] = 0.0, piece
             size += 1
         if -hole[k] > high[k] or hole[k] < low[k]:
             return size
@@ -316,28 +286,31 @@ def push_around(stack: Array, low: Array, high: Array, hole: Array) -> int:
 def pop(stack: Array, row: int, at: Array, half: Array) -> None:
     """Write centre and half-widths of a box on the stack into `at` and `half`."""
     for k in range(3):
-        at[k], half[k] = stack[row, k], stack[row, 3 + k]
+        at[k], half[k] = stack[row, CENTRE + k], stack[row, HALF + k]
 
 
 @compiled
 def push(stack: Array, size: int, at: Array, half: Array, low: float) -> int:
-    """Push a box; return the size of the stack."""
+    """Push a box of the near chart; return the size of the stack."""
     for k in range(3):
-        stack[size, k], stack[size, 3 + k] = at[k], half[k]
-    stack[size, 6] = low
+        stack[size, CENTRE + k], stack[size, HALF + k] = at[k], half[k]
+    stack[size, LEAST], stack[size, PIECE] = low, 0.0
     return size + 1
 
 
 @compiled
-def push_halves(stack: Array, size: int, k: int, at: Array, half: Array, low: float) -> int:
-    """Push the halves of a box, cut across side k; return the size of the stack."""
+def push_halves(stack: Array, size: int, k: int, at: Array, half: Array, low: float, piece: int, exact: bool) -> int:
+    """Push the halves of a box, cut across side k; return the size of the stack.
+
+    `exact` says that centres and half-widths are sums of powers of two, which halving does not round.
+    """
     for side in range(2):
         for m in range(3):
-            stack[size, m], stack[size, 3 + m] = at[m], half[m]
+            stack[size, CENTRE + m], stack[size, HALF + m] = at[m], half[m]
         quarter = 0.5 * half[k]
-        stack[size, k] = at[k] + (quarter if side else -quarter)
-        stack[size, 3 + k] = _wide(quarter, abs(at[k]) + half[k])
-        stack[size, 6] = low
+        stack[size, CENTRE + k] = at[k] + (quarter if side else -quarter)
+        stack[size, HALF + k] = quarter if exact else _wide(quarter, abs(at[k]) + half[k])
+        stack[size, LEAST], stack[size, PIECE] = low, piece
         size += 1
     return size
 
@@ -345,4 +318,14 @@ def push_halves(stack: Array, size: int, k: int, at: Array, half: Array, low: fl
 @compiled
 def _wide(half: float, size: float) -> float:
     """Return a half-width that covers the rounding of a centre and of a corner of this size."""
-    return half * (1.0 + 1e-12) + 1e-15 * size if half > 0.0 else 0.0
+    return half * (1.0 + _WIDER) + _SHIFT * size if half > 0.0 else 0.0
+
+
+@compiled
+def least_left(stack: Array, size: int) -> float:
+    """Return a lower bound of the cost in the boxes left."""
+    least = inf
+    for i in range(size):
+        low = max(stack[i, LEAST], 0.0)
+        least = min(least, low * low)
+    return least

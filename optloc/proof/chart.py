@@ -8,12 +8,36 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined
-from optloc.proof.box import NODE_WIDTH, ROW_WIDTH, bound_nodes, cost_at
-from optloc.proof.convex import CURVE_WIDTH, SUMS, convex, curve_nodes, sum_up
-from optloc.proof.groups import Groups, empty_groups, set_groups
-from optloc.proof.nodes.codes import LINEAR, RANGE
-from optloc.proof.nodes.linear3 import roughly_principal
+from optloc.compute.jit import compiled, inlined, zero
+from optloc.proof.box import ROW_WIDTH, bound_nodes, cost_at
+from optloc.proof.convex import G0, G1, G2, SUMS, convex, curve_nodes, sum_up
+from optloc.proof.linear3 import invert, roughly_principal
+from optloc.proof.nodes.dispatch import size_of
+from optloc.proof.nodes.node import CURVE_WIDTH, H00, H01, H02, H11, H12, H22, NODE_WIDTH, RANGE
+
+# Nodes whose rows are tied to each other by less than this share count as independent.
+_APART = 1e-13
+# References of a group that needs none, and of one whose rows are too few.
+NONE, LOOSE = -1, -2
+
+
+class Groups(NamedTuple):
+    """Nodes in groups: rows say ``phi_j = n_j r_p + z_j + e_j`` of a node, r_p the reference range of its group.
+
+    Parameters
+    ----------
+    order : int array (3, J)
+        The nodes, group behind group, the reference last; sizes of the groups, ended by a zero; their references: a
+        node, NONE or LOOSE.
+    R : array (J, J)
+        Covariances of the errors e of each group but of its reference, in that order.
+    tie : array (J,)
+        Factors n_j by node: -1, 0 or 1.
+    """
+
+    order: Array
+    R: Array
+    tie: Array
 
 
 class Cost(NamedTuple):
@@ -111,6 +135,87 @@ def set_geometry(kinds: Array, K: Array, A: Array, weight: Array, groups: Groups
     set_groups(kinds, A, groups)
 
 
+# Groups of nodes that correlated rows tie to each other, solved for what the rows say of each node.
+
+
+@compiled
+def empty_groups(J: int) -> Groups:
+    """Return room for groups of J nodes."""
+    return Groups(np.empty((3, J), np.int64), np.empty((J, J)), np.empty(J))
+
+
+@compiled
+def set_groups(kinds: Array, A: Array, groups: Groups) -> None:
+    """Write the groups of nodes (codes `kinds`) whose rows have ``A = K'K`` (J, J)."""
+    J, order = kinds.shape[0], groups.order
+    first = number = zero()
+    for j in range(J):
+        order[0, j] = j
+    while first < J:
+        count = _gather(A, order[0], first)
+        order[1, number] = count
+        order[2, number] = _solve(kinds, A, order[0], first, count, groups.R, groups.tie)
+        first += count
+        number += 1
+    order[1, number:] = 0
+
+
+@compiled
+def _gather(A: Array, member: Array, first: int) -> int:
+    """Move the nodes that are tied to that at `first` behind it; return how many the group has."""
+    seen, end = first, first + 1
+    while seen < end:
+        j = member[seen]
+        seen += 1
+        for i in range(end, A.shape[0]):
+            m = member[i]
+            if A[j, m] * A[j, m] > _APART * _APART * A[j, j] * A[m, m]:
+                member[i], member[end] = member[end], m
+                end += 1
+    return int(end - first)
+
+
+@compiled
+def _solve(kinds: Array, A: Array, member: Array, first: int, count: int, R: Array, tie: Array) -> int:
+    """Solve the rows of a group for its nodes; return its reference, which is moved to the end."""
+    if _ties(kinds, A, member, first, count, count, R, tie):
+        return NONE
+    for i in range(first, first + count):
+        if kinds[member[i]] == RANGE:
+            last, reference = first + count - 1, member[i]
+            member[i], member[last] = member[last], reference
+            return reference if _ties(kinds, A, member, first, count - 1, count, R, tie) else LOOSE
+    return LOOSE
+
+
+@compiled
+def _ties(kinds: Array, A: Array, member: Array, first: int, size: int, count: int, R: Array, tie: Array) -> bool:
+    """Write the covariance of the errors, and how nodes follow the reference; False where rows say otherwise.
+
+    Where the group has more nodes than the `size` that are solved for, the last is the reference.
+    """
+    own = R[first : first + size, first : first + size]
+    for i in range(size):
+        for j in range(size):
+            own[i, j] = A[member[first + i], member[first + j]]
+    if size == 0 or not invert(own, size, 1e-9):
+        return False
+    for i in range(size, count):
+        tie[member[first + i]] = 0.0
+    for i in range(size):
+        factor = 0.0
+        for j in range(size if size < count else 0):
+            factor -= own[i, j] * A[member[first + j], member[first + size]]
+        nearest = 0.0 if abs(factor) < 0.5 else (1.0 if factor > 0.0 else -1.0)
+        if not abs(factor - nearest) <= 1e-9 or (nearest != 0.0 and kinds[member[first + i]] != RANGE):
+            return False
+        tie[member[first + i]] = nearest
+    return True
+
+
+# A box and its tables.
+
+
 @compiled
 def empty_box(q: int, J: int) -> Box:
     """Return tables for boxes of J nodes and q rows."""
@@ -146,10 +251,10 @@ def chart_at(cost: Cost, x: Array, box: Box) -> tuple[Chart, bool]:
     bound_nodes(cost.kinds, cost.data, origin, sense, gram, box.half, box.line, nodes)
     curves[:] = 0.0
     sum_up(cost.K, cost.w, nodes, curves, sums)
-    information[0, 0], information[1, 1], information[2, 2] = sums[0], sums[3], sums[5]
-    information[0, 1] = information[1, 0] = sums[1]
-    information[0, 2] = information[2, 0] = sums[2]
-    information[1, 2] = information[2, 1] = sums[4]
+    information[0, 0], information[1, 1], information[2, 2] = sums[H00], sums[H11], sums[H22]
+    information[0, 1] = information[1, 0] = sums[H01]
+    information[0, 2] = information[2, 0] = sums[H02]
+    information[1, 2] = information[2, 1] = sums[H12]
     roughly_principal(information, gram)
     most = max(information[0, 0], information[1, 1], information[2, 2])
     good = True
@@ -162,9 +267,9 @@ def chart_at(cost: Cost, x: Array, box: Box) -> tuple[Chart, bool]:
     for k in range(3):
         for m in range(3):
             gram[k, m] = sense[0, k] * sense[0, m] + sense[1, k] * sense[1, m] + sense[2, k] * sense[2, m]
-    g0, g1, g2 = sums[6], sums[7], sums[8]
+    g0, g1, g2 = sums[G0], sums[G1], sums[G2]
     for k in range(3):
-        sums[6 + k] = sense[0, k] * g0 + sense[1, k] * g1 + sense[2, k] * g2
+        sums[G0 + k] = sense[0, k] * g0 + sense[1, k] * g1 + sense[2, k] * g2
     return Chart(origin, sense, back, gram), good
 
 
@@ -175,14 +280,9 @@ def accuracy_floor(cost: Cost, chart: Chart) -> float:
     for i in range(cost.w.shape[0]):
         total += cost.w[i] * cost.w[i]
     total = sqrt(total)
+    reach = abs(chart.origin[0]) + abs(chart.origin[1]) + abs(chart.origin[2])
     for j in range(cost.kinds.shape[0]):
-        size = 1.0
-        if cost.kinds[j] in (RANGE, LINEAR):
-            size = abs(chart.origin[0]) + abs(chart.origin[1]) + abs(chart.origin[2])
-            size += abs(cost.data[j, 0]) + abs(cost.data[j, 1]) + abs(cost.data[j, 2])
-            if cost.kinds[j] == LINEAR:
-                size *= abs(cost.data[j, 3]) + abs(cost.data[j, 4]) + abs(cost.data[j, 5])
-        total += cost.weight[j] * size
+        total += cost.weight[j] * size_of(cost.kinds[j], cost.data[j], reach)
     return total
 
 

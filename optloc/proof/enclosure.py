@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from math import cos, hypot, inf, pi, sin, sqrt
+from math import inf, pi, sqrt
 
 import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, inlined, zero
-from optloc.models.primitives import WGS84_A
-from optloc.proof.convex import FORCE
-from optloc.proof.groups import LOOSE, Groups
-from optloc.proof.nodes.codes import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO
-from optloc.proof.nodes.linear3 import inverse, invert
+from optloc.proof.chart import LOOSE, Box, Chart, Cost
+from optloc.proof.linear3 import inverse, invert
+from optloc.proof.nodes.dispatch import ball_of, has_ray, ray_of
+from optloc.proof.nodes.node import FORCE, LINEAR, PHI, RANGE
 
 # Balls that hold all points at which one node lies in an interval.
 
@@ -22,9 +21,6 @@ def around_node(
     kind: int, data: Array, least: float, most: float, x: Array, back: Array, lower: Array, upper: Array
 ) -> None:
     """Clip a box of search coordinates by all points at which a node lies between `least` and `most`.
-
-    A range gives a ball around its station. Points with ``r_a <= q r_b``, q < 1, fill the ball of Apollonius. A
-    geodetic height is at least the distance from the Earth's centre less the equatorial radius. Angles bound nothing.
 
     Parameters
     ----------
@@ -37,25 +33,8 @@ def around_node(
     lower, upper : array (3,)
         Corners of the box, clipped in place.
     """
-    c0, c1, c2, radius = data[0], data[1], data[2], most
-    if kind == RATIO:
-        q = most if most < 1.0 else (1.0 / least if least > 1.0 else 1.0)
-        if not q * q < 1.0 - 1e-9:
-            return
-        near, far = (0, 3) if most < 1.0 else (3, 0)
-        q = max(q, 0.0)
-        scale = 1.0 / (1.0 - q * q)
-        c0 = (data[near] - q * q * data[far]) * scale
-        c1 = (data[near + 1] - q * q * data[far + 1]) * scale
-        c2 = (data[near + 2] - q * q * data[far + 2]) * scale
-        p0, p1, p2 = data[0] - data[3], data[1] - data[4], data[2] - data[5]
-        radius = q * sqrt(p0 * p0 + p1 * p1 + p2 * p2) * scale
-    elif kind == HEIGHT:
-        c0 -= data[6] * data[3] + data[9] * data[4] + data[12] * data[5]
-        c1 -= data[7] * data[3] + data[10] * data[4] + data[13] * data[5]
-        c2 -= data[8] * data[3] + data[11] * data[4] + data[14] * data[5]
-        radius = WGS84_A + most
-    elif kind != RANGE:
+    c0, c1, c2, radius = ball_of(kind, data, least, most)
+    if radius == inf:
         return
     radius = max(radius, 0.0) * (1.0 + 1e-9)
     c0, c1, c2 = c0 - x[0], c1 - x[1], c2 - x[2]
@@ -102,7 +81,7 @@ def around_squares(
     plane = lower[2] == upper[2] == 0.0
     if count < 3 - int(plane) + int(ranges) or not _left_inverse(A, nodes, kinds, member, ties, ranges, plane):
         return
-    near = nodes[reference, 0] if reference >= 0 else 0.0
+    near = nodes[reference, PHI] if reference >= 0 else 0.0
     middle, spread = near, 0.0
     if reference >= 0:
         for j in member:
@@ -140,9 +119,9 @@ def _rows(
             ties[j, FIRST], ties[j, WEIGHT] = -1.0, 1.0
         elif kinds[j] == RANGE and (reference < 0 or tie[j] != 0.0):
             origin = j if origin < 0 else origin
-            apart, near = nodes[j, 0] - ties[j, ERROR], nodes[j, 0]
+            apart, near = nodes[j, PHI] - ties[j, ERROR], nodes[j, PHI]
             if reference >= 0:
-                apart -= tie[j] * nodes[reference, 0]
+                apart -= tie[j] * nodes[reference, PHI]
             for k in range(3):
                 ties[j, ROW + k] = 2.0 * (data[j, k] - data[origin, k])
             ties[j, ROW + 3] = 2.0 * apart * tie[j] if reference >= 0 else -1.0
@@ -243,12 +222,11 @@ def around_rays(kinds: Array, data: Array, x: Array, back: Array, swing: Array, 
     rows, reach, far = np.empty((J, 3)), np.empty(J), np.empty(J)
     count = zero()
     for j in range(J):
-        if kinds[j] == AZIMUTH and swing[j] < 0.5 * pi:
-            count = _add_azimuth(data[j], x, sin(swing[j]), rows, reach, far, count)
-        elif kinds[j] == ELEVATION and swing[j] < 0.5 * pi:
-            turn = _azimuth_beside(kinds, data, swing, j)
-            if turn < 0.5 * pi:
-                count = _add_elevation(data[j], x, sin(swing[j]) + 1.0 - cos(turn), rows, reach, far, count)
+        if has_ray(kinds[j]) and swing[j] < 0.5 * pi:
+            wide, away = ray_of(kinds[j], kinds, data, swing, j, x, rows[count])
+            if wide >= 0.0:
+                reach[count], far[count] = wide, away
+                count += 1
     gamma = np.empty((3, max(count, 1)))
     if not _weighted_inverse(rows, reach, far, count, back, gamma):
         return
@@ -267,57 +245,6 @@ def around_rays(kinds: Array, data: Array, x: Array, back: Array, swing: Array, 
             wide += pull * reach[i] * (far[i] + most)
         wide *= 1.0 + 1e-6
         lower[k], upper[k] = max(lower[k], -wide), min(upper[k], wide)
-
-
-@compiled
-def _azimuth_beside(kinds: Array, data: Array, swing: Array, j: int) -> float:
-    """Return how far the azimuth may swing that the station of elevation j measures, pi if there is none."""
-    least = pi
-    for m in range(kinds.shape[0]):
-        if kinds[m] == AZIMUTH:
-            same = True
-            for k in range(15):
-                same = same and data[m, k] == data[j, k]
-            if same:
-                least = min(least, swing[m])
-    return least
-
-
-@compiled
-def _local(data: Array, x: Array) -> tuple[float, float, float]:
-    """Return the line from station to fix in the station's axes."""
-    a, b, c = x[0] - data[0], x[1] - data[1], x[2] - data[2]
-    return (
-        data[6] * a + data[7] * b + data[8] * c,
-        data[9] * a + data[10] * b + data[11] * c,
-        data[12] * a + data[13] * b + data[14] * c,
-    )
-
-
-@compiled
-def _add_azimuth(data: Array, x: Array, width: float, rows: Array, reach: Array, far: Array, count: int) -> int:
-    p, q, r = _local(data, x)
-    flat = hypot(p, q)
-    if flat > 0.0:
-        for k in range(3):
-            rows[count, k] = (p * data[9 + k] - q * data[6 + k]) / flat
-        reach[count], far[count] = width, hypot(flat, r)
-        count += 1
-    return count
-
-
-@compiled
-def _add_elevation(data: Array, x: Array, width: float, rows: Array, reach: Array, far: Array, count: int) -> int:
-    p, q, r = _local(data, x)
-    flat = hypot(p, q)
-    whole = hypot(flat, r)
-    if flat > 0.0:
-        for k in range(3):
-            outward = (p * data[6 + k] + q * data[9 + k]) / flat
-            rows[count, k] = (flat * data[12 + k] - r * outward) / whole
-        reach[count], far[count] = width, whole
-        count += 1
-    return count
 
 
 @compiled
@@ -358,20 +285,7 @@ def _inverts(gamma: Array, rows: Array, count: int, plane: bool) -> bool:
 
 
 @compiled
-def enclose(
-    kinds: Array,
-    data: Array,
-    A: Array,
-    groups: Groups,
-    nodes: Array,
-    curves: Array,
-    x: Array,
-    sense: Array,
-    back: Array,
-    rho: float,
-    lower: Array,
-    upper: Array,
-) -> bool:
+def enclose(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper: Array) -> bool:
     """Enclose all points with ``|K phi(x) - w| <= rho`` in a box of search coordinates around a fix.
 
     Within a group of nodes (`optloc.proof.groups`) the errors obey ``|m.e| <= rho sqrt(m'R m)`` for every m. Ranges and
@@ -379,18 +293,10 @@ def enclose(
 
     Parameters
     ----------
-    kinds, data : array (J,), (J, width)
-        The nodes.
-    A : array (J, J)
-        ``K'K``.
-    groups : Groups
-        The nodes in groups.
-    nodes, curves : array (J, NODE_WIDTH), (J, CURVE_WIDTH)
+    cost, chart : Cost, Chart
+        The cost, and search coordinates around the fix.
+    box : Box
         Tables of the fix, of which the values of the nodes and the forces ``K'(K phi - w)`` are read.
-    x : array (3,)
-        The fix.
-    sense, back : array (3, 3)
-        T with x + T s, and its inverse.
     rho : float
         Square root of the level.
     lower, upper : array (3,)
@@ -401,7 +307,9 @@ def enclose(
     bool
         Whether the box is bounded.
     """
-    rho, first, angles = rho * (1.0 + SLACK) + SLACK, 0, 0
+    kinds, data, A, groups, nodes, curves = cost.kinds, cost.data, cost.A, cost.groups, box.nodes, box.curves
+    x, sense, back = chart.origin, chart.sense, chart.back
+    rho, first, rays = rho * (1.0 + SLACK) + SLACK, 0, 0
     order, R, ties = groups.order, groups.R, np.empty((kinds.shape[0], TIE_WIDTH))
     for k in range(3):
         plane = sense[0, k] == 0.0 and sense[1, k] == 0.0 and sense[2, k] == 0.0
@@ -422,12 +330,12 @@ def enclose(
                 error += own[i, m] * curves[member[m], FORCE]
             ties[j, ERROR] = error
             if groups.tie[j] == 0.0:
-                middle, reach = nodes[j, 0] - error, rho * sqrt(own[i, i])
+                middle, reach = nodes[j, PHI] - error, rho * sqrt(own[i, i])
                 ties[j, SWING] = abs(error) + reach
-                angles += kinds[j] in (AZIMUTH, ELEVATION)
+                rays += int(has_ray(kinds[j]))
                 around_node(kinds[j], data[j], middle - reach, middle + reach, x, back, lower, upper)
         around_squares(kinds, data, A, nodes, back, rho, member, reference, own, groups.tie, ties, lower, upper)
-    if angles:
+    if rays:
         around_rays(kinds, data, x, back, ties[:, SWING].copy(), lower, upper)
     bounded = True
     for k in range(3):

@@ -12,28 +12,40 @@ from optloc.proof.atlas import (
     Atlas,
     atlas_of,
     coordinates_on,
-    cube,
     first_minima,
-    home_of,
     position,
     set_centre,
     with_minima,
     within,
 )
-from optloc.proof.box import cost_at, least_residual, linearise_rows, push_around
+from optloc.proof.box import (
+    CENTRE,
+    DEPTH,
+    HALF,
+    J0,
+    PIECE,
+    cost_at,
+    least_left,
+    least_residual,
+    linearise_rows,
+    pop,
+    push_around,
+    push_halves,
+)
 from optloc.proof.chart import Box, Chart, Cost, chart_at, empty_box
-from optloc.proof.convex import convex, slopes_everywhere, spread_of, sum_up
+from optloc.proof.convex import C00, G0, slopes_everywhere, spread_of, sum_up
+from optloc.proof.far import accuracy_floor_far, cube, reaches_infinity, set_minimum
+from optloc.proof.linear3 import principal
 from optloc.proof.near import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, descend, prove
-from optloc.proof.nodes.codes import RANGE, RATIO
-from optloc.proof.nodes.far import bound_pieces, curve_pieces, reaches_infinity
-from optloc.proof.nodes.linear3 import principal
+from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
+from optloc.proof.nodes.node import H00, H11, H22
 
 # Branch and bound over all positions, for costs that nothing encloses.
 
 # What a search finds: nothing, a cheaper point, another minimum below the level, no end within the budget, or a cost at
 # infinity below the level.
 CLEAR, CHEAPER, ANOTHER, SPENT, INFINITE = range(5)
-_CAPACITY, _DEPTH = 2048, 8
+_CAPACITY = 2048
 # A box at infinity of this size whose cost is below the level is not split further.
 _TINY = 1e-5
 # Points closer to a minimum than this are that minimum, standard deviations.
@@ -80,15 +92,15 @@ def search_everywhere(
         A lower bound of f: `value`, unless boxes are left.
     """
     box, near = empty_box(cost.K.shape[0], cost.K.shape[1]), empty_box(cost.K.shape[0], cost.K.shape[1])
-    stack, last = np.zeros((_CAPACITY, _DEPTH)), atlas.dimension - 1
-    size, boxes, lows, floor = _pieces(stack, atlas), 0, 0, _floor(cost, atlas)
+    stack, last = np.zeros((_CAPACITY, DEPTH)), atlas.dimension - 1
+    size, boxes, lows, floor = _pieces(stack, atlas), 0, 0, accuracy_floor_far(cost, atlas)
     while size > 0:
         if boxes >= budget or size + 2 > _CAPACITY:
-            return SPENT, boxes, _least(stack, size)
+            return SPENT, boxes, least_left(stack, size)
         size -= 1
         boxes += 1
-        box.at[:], box.half[:] = stack[size, :3], stack[size, 3:6]
-        piece = int(stack[size, 7])
+        pop(stack, size, box.at, box.half)
+        piece = int(stack[size, PIECE])
         set_centre(atlas, piece, box.at)
         if _known(atlas, box, piece):
             continue
@@ -111,7 +123,9 @@ def search_everywhere(
                 return ANOTHER, boxes, 0.0
         if touching and max(box.half[0], box.half[1], box.half[2]) < _TINY and _at_infinity(cost, atlas, box) < level:
             return INFINITE, boxes, 0.0
-        size = _split(stack, size, atlas.dimension, box, low, piece)
+        # Exact but around the fix, where centres and half-widths are no sums of powers of two.
+        exact, side = piece <= 2 * atlas.dimension, _side(box, atlas.dimension)
+        size = push_halves(stack, size, side, box.at, box.half, low, piece, exact)
     return CLEAR, boxes, value
 
 
@@ -159,32 +173,13 @@ def _pieces(stack: Array, atlas: Atlas) -> int:
     size = 2 * d + 1
     for piece in range(size):
         for k in range(d):
-            stack[piece, 3 + k] = 1.0
+            stack[piece, HALF + k] = 1.0
         if piece < 2 * d:
-            stack[piece, d - 1] = stack[piece, d + 2] = 0.5
-        stack[piece, 7] = piece
-    slabs = np.zeros((6, 7))
+            stack[piece, CENTRE + d - 1] = stack[piece, HALF + d - 1] = 0.5
+        stack[piece, PIECE] = piece
     for i in range(atlas.minima.home.shape[0] - 1, -1, -1):
         core = atlas.minima.core[i]
-        for slab in range(push_around(slabs, -core, core, atlas.minima.sides[i])):
-            stack[size, :7] = slabs[slab]
-            stack[size, 7] = 2 * d + 1 + i
-            size += 1
-    return size
-
-
-@compiled
-def _split(stack: Array, size: int, dimension: int, box: Box, low: float, piece: int) -> int:
-    """Push the halves of a box, cut across the side along which the residual changes most; return the stack's size."""
-    k = _side(box, dimension)
-    for side in range(2):
-        stack[size, :3], stack[size, 3:6] = box.at, box.half
-        quarter = 0.5 * box.half[k]
-        stack[size, k] += quarter if side else -quarter
-        # Exact but around the fix, where centres and half-widths are no sums of powers of two.
-        stack[size, 3 + k] = quarter + (1e-15 * (abs(box.at[k]) + quarter) if piece > 2 * dimension else 0.0)
-        stack[size, 6], stack[size, 7] = low, piece
-        size += 1
+        size = push_around(stack, size, -core, core, atlas.minima.sides[i], 2 * d + 1 + i)
     return size
 
 
@@ -208,7 +203,7 @@ def _side(box: Box, dimension: int) -> int:
 def _steepness(box: Box, m: int) -> float:
     total = 0.0
     for i in range(box.rows.shape[0]):
-        total += box.rows[i, 1 + m] * box.rows[i, 1 + m]
+        total += box.rows[i, J0 + m] * box.rows[i, J0 + m]
     return sqrt(total)
 
 
@@ -234,8 +229,8 @@ def _leaves(cost: Cost, atlas: Atlas, box: Box, touching: bool) -> bool:
         change = ball
         for m in range(3):
             entry = _entry(k, m)
-            change += (abs(sums[entry]) + sums[9 + entry]) * h[m]
-        slope, change = sums[6 + k], change * (1.0 + 1e-6) + 1e-9
+            change += (abs(sums[entry]) + sums[C00 + entry]) * h[m]
+        slope, change = sums[G0 + k], change * (1.0 + 1e-6) + 1e-9
         if -slope > change or (k < atlas.dimension - 1 and slope > change):
             return True
     return False
@@ -245,7 +240,7 @@ def _leaves(cost: Cost, atlas: Atlas, box: Box, touching: bool) -> bool:
 def _bends_down(box: Box, ball: float) -> bool:
     """Return whether the cost curves downwards along one direction all over a box, as around a saddle.
 
-    `optloc.proof.convex.spread_of` has filled ``box.sums[9:15]`` and returned `ball`, bounds of the Hessian's change.
+    `optloc.proof.convex.spread_of` has filled ``box.sums[C00:]`` and returned `ball`, bounds of the Hessian's change.
     """
     sums, hessian, vectors = box.sums, box.solve, np.empty((3, 3))
     for k in range(3):
@@ -261,8 +256,8 @@ def _bends_down(box: Box, ball: float) -> bool:
         for m in range(3):
             entry = _entry(k, m)
             z = vectors[k, column] * vectors[m, column]
-            most += sums[entry] * z + sums[9 + entry] * abs(z)
-    size = abs(sums[0]) + abs(sums[3]) + abs(sums[5])
+            most += sums[entry] * z + sums[C00 + entry] * abs(z)
+    size = abs(sums[H00]) + abs(sums[H11]) + abs(sums[H22])
     return bool(most < -1e-9 * size)
 
 
@@ -279,142 +274,6 @@ def _at_infinity(cost: Cost, atlas: Atlas, box: Box) -> float:
     atlas.scale[0] = 0.0
     bound_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes)
     return cost_at(cost.K, cost.w, box.nodes)
-
-
-@compiled
-def _floor(cost: Cost, atlas: Atlas) -> float:
-    """Return the sizes of what residuals are differences of, beside the nodes: measurements and the cube."""
-    total = 0.0
-    for i in range(cost.w.shape[0]):
-        total += cost.w[i] * cost.w[i]
-    total = sqrt(total)
-    size = 4.0 * atlas.radius + abs(atlas.middle[0]) + abs(atlas.middle[1]) + abs(atlas.middle[2])
-    for j in range(cost.kinds.shape[0]):
-        total += cost.weight[j] * (size if cost.kinds[j] == RANGE else 4.0)
-    return total
-
-
-@compiled
-def _least(stack: Array, size: int) -> float:
-    """Return a lower bound of the cost in the boxes left."""
-    least = inf
-    for i in range(size):
-        low = max(stack[i, 6], 0.0)
-        least = min(least, low * low)
-    return least
-
-
-# The surroundings of a known minimum in an atlas: its principal axes, and a box in which it is the only minimum.
-
-# No convex box is looked for beyond this many standard deviations, nor nearer to infinity than a tenth of the way.
-_WIDEST, _SHARE = 1e4, 0.9
-# The box searched along the axes: convex boxes, and standard deviations at least.
-_WIDER, _WIDE = 3.0, 3.0
-
-
-@compiled
-def set_minimum(cost: Cost, box: Box, atlas: Atlas, i: int, x: Array, eps: float) -> bool:
-    """Write a minimum and its surroundings into an atlas; return False where it is none.
-
-    Parameters
-    ----------
-    cost : Cost
-        The cost.
-    box : Box
-        Tables to work with.
-    atlas : Atlas
-        Minimum i is written.
-    i : int
-        Which.
-    x : array (D,)
-        Its position, polished.
-    eps : float
-        How far the cost may fall below that of x in its convex box.
-    """
-    minima, d = atlas.minima, atlas.dimension
-    minima.home[i] = home_of(atlas, x, minima.start[i])
-    if not _set_axes(cost, box, atlas, i):
-        return False
-    _tables(cost, box, atlas, i, np.zeros(3))
-    sums = box.sums
-    # On a box whose Hessian exceeds a margin the cost falls below that of its centre by slope^2 / margin at most.
-    margin = (sums[6] * sums[6] + sums[7] * sums[7] + sums[8] * sums[8]) / eps
-    hull = np.zeros(3)
-    for k in range(d):
-        steep = abs(minima.axes[i, d - 1, k]) * d if minima.home[i] < 2 * d else 0.0
-        hull[k] = min(_WIDEST, _SHARE * minima.start[i, d - 1] / steep if steep > 0.0 else _WIDEST)
-    if not _grow(cost, box, atlas, i, hull, margin):
-        return False
-    for k in range(d):
-        minima.core[i, k] = min(max(_WIDER * minima.sides[i, k], _WIDE), hull[k])
-    return True
-
-
-@compiled
-def _set_axes(cost: Cost, box: Box, atlas: Atlas, i: int) -> bool:
-    """Write the principal axes of minimum i in the coordinates of its home; return False where there are none."""
-    minima, d = atlas.minima, atlas.dimension
-    minima.axes[i], minima.back[i] = np.eye(3), np.eye(3)
-    _tables(cost, box, atlas, i, np.zeros(3))
-    linearise_rows(cost.K, cost.w, box.nodes, box.rows)
-    information, vectors = np.zeros((3, 3)), np.zeros((3, 3))
-    for k in range(d):
-        for m in range(d):
-            for row in range(box.rows.shape[0]):
-                information[k, m] += box.rows[row, 1 + k] * box.rows[row, 1 + m]
-    principal(information, vectors)
-    minima.axes[i], minima.back[i] = 0.0, 0.0
-    for k in range(d):
-        if not information[k, k] > 0.0:
-            return False
-        root = sqrt(information[k, k])
-        for m in range(d):
-            minima.axes[i, m, k], minima.back[i, k, m] = vectors[m, k] / root, vectors[m, k] * root
-    return True
-
-
-@compiled
-def _tables(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array) -> None:
-    """Fill the tables of a box with half-widths (3,) around minimum i."""
-    box.at[:], box.half[:] = 0.0, half
-    set_centre(atlas, 2 * atlas.dimension + 1 + i, box.at)
-    bound_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes)
-    curve_pieces(atlas, cost.kinds, cost.data, box.half, box.curves)
-    sum_up(cost.K, cost.w, box.nodes, box.curves, box.sums)
-
-
-@compiled
-def _convex(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array, margin: float) -> bool:
-    _tables(cost, box, atlas, i, half)
-    # Ranges are differences here, whose Hessians have no sign: the test must take them for ratios.
-    return convex(np.full_like(cost.kinds, RATIO), cost.A, box.half, box.nodes, box.curves, box.sums, margin)
-
-
-@compiled
-def _grow(cost: Cost, box: Box, atlas: Atlas, i: int, hull: Array, margin: float) -> bool:
-    """Write half-widths of a box around minimum i on which the cost is convex; return False where there is none.
-
-    A cube that shrinks or doubles, then its sides one by one, none beyond the hull (3,).
-    """
-    sides = atlas.minima.sides[i]
-    if not _convex(cost, box, atlas, i, np.zeros(3), margin):
-        return False
-    trial, size = np.minimum(hull, 1.0), 1.0
-    while not _convex(cost, box, atlas, i, trial, margin):
-        size *= 0.5
-        trial = np.minimum(hull, size)
-        if size < 1e-6:
-            return False
-    while size < _WIDEST and _convex(cost, box, atlas, i, np.minimum(hull, 1.5 * size), margin):
-        size *= 1.5
-    sides[:] = np.minimum(hull, size)
-    for k in range(atlas.dimension):
-        trial = sides.copy()
-        trial[k] = min(1.5 * sides[k], hull[k])
-        while trial[k] > sides[k] and _convex(cost, box, atlas, i, trial, margin):
-            sides[k] = trial[k]
-            trial[k] = min(1.5 * sides[k], hull[k])
-    return True
 
 
 # A verdict beside those of `optloc.proof.near`: the cost at infinity is within the gap.

@@ -10,12 +10,13 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, inlined
 from optloc.proof.box import (
-    CAPACITY,
     DEPTH,
+    DIRECTION,
     bound_nodes,
     cost_at,
     cut_out,
     is_empty,
+    least_left,
     least_residual,
     linearise_rows,
     pop,
@@ -27,10 +28,10 @@ from optloc.proof.box import (
     uncut,
 )
 from optloc.proof.chart import Box, Chart, Cost, accuracy_floor, chart_at, curve_box, is_convex, place, value_at
-from optloc.proof.convex import clip_to_stationary, convex, curve_nodes, sum_up
+from optloc.proof.convex import G0, G1, G2, clip_to_stationary, convex, curve_nodes, sum_up
 from optloc.proof.enclosure import enclose
-from optloc.proof.nodes.codes import RANGE
-from optloc.proof.nodes.linear3 import inverse, positive
+from optloc.proof.linear3 import inverse, positive
+from optloc.proof.nodes.node import FORCE, H00, H01, H02, H11, H12, H22, HIGH, LOW, RANGE, SLOPE0, SLOPE1, SLOPE2
 
 # A few damped Newton steps in search coordinates: which minimum a low point belongs to.
 
@@ -62,7 +63,9 @@ def descend(cost: Cost, chart: Chart, box: Box) -> float:
             curve_box(cost, chart, box)
             if length < _CLOSE * _CLOSE and damping <= 1e-3:
                 sums = box.sums
-                good = positive(sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] if sums[5] != 0.0 else 1.0)
+                good = positive(
+                    sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], sums[H22] if sums[H22] != 0.0 else 1.0
+                )
                 return cost_now if good else float("inf")
             damping *= 0.1
         else:
@@ -75,22 +78,22 @@ def descend(cost: Cost, chart: Chart, box: Box) -> float:
 def _step(cost: Cost, box: Box, damping: float) -> float:
     """Write the damped step into the first row of box.solve; return its squared length, NaN where there is none."""
     sums, solve = box.sums, box.solve
-    h0, h1, h2, h3, h4, h5 = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
+    h0, h1, h2, h3, h4, h5 = sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], sums[H22]
     if h5 == 0.0:
         h5 = 1.0
     if not positive(h0, h1, h2, h3, h4, h5):
         for j in range(box.curves.shape[0]):
-            force = box.curves[j, 10]
-            h0 -= force * box.curves[j, 0]
-            h1 -= force * box.curves[j, 1]
-            h2 -= force * box.curves[j, 2]
-            h3 -= force * box.curves[j, 3]
-            h4 -= force * box.curves[j, 4]
-            h5 -= force * box.curves[j, 5]
+            force = box.curves[j, FORCE]
+            h0 -= force * box.curves[j, H00]
+            h1 -= force * box.curves[j, H01]
+            h2 -= force * box.curves[j, H02]
+            h3 -= force * box.curves[j, H11]
+            h4 -= force * box.curves[j, H12]
+            h5 -= force * box.curves[j, H22]
     more = 1.0 + damping
     if not inverse(h0 * more, h1, h2, h3 * more, h4, h5 * more, solve):
         return float("nan")
-    g0, g1, g2 = sums[6], sums[7], sums[8]
+    g0, g1, g2 = sums[G0], sums[G1], sums[G2]
     s0 = solve[0, 0] * g0 + solve[0, 1] * g1 + solve[0, 2] * g2
     s1 = solve[1, 0] * g0 + solve[1, 1] * g1 + solve[1, 2] * g2
     s2 = solve[2, 0] * g0 + solve[2, 1] * g1 + solve[2, 2] * g2
@@ -104,6 +107,8 @@ def _step(cost: Cost, box: Box, damping: float) -> float:
 CLEAR, CHEAPER, ANOTHER, SPENT = range(4)
 # Share of a box below which what is left is looked at again before it is cut.
 _SHRUNK = 0.5
+# Boxes on the stack: a stack that goes deep first holds one box a halving, and 512 halvings no box survives.
+_CAPACITY = 512
 
 
 class Aim(NamedTuple):
@@ -149,7 +154,7 @@ def branch(
         What is to be shown.
     budget : int
         How many boxes may be looked at.
-    stack, size : array (CAPACITY, DEPTH), int
+    stack, size : array (capacity, DEPTH), int
         The boxes (`optloc.proof.box`).
 
     Returns
@@ -171,7 +176,7 @@ def branch(
     boxes, low_points = 0, 0
     while size > 0:
         if boxes >= budget or size + 2 > stack.shape[0]:
-            return SPENT, boxes, _lowest(stack, size)
+            return SPENT, boxes, least_left(stack, size)
         size -= 1
         pop(stack, size, at, half)
         boxes += 1
@@ -206,7 +211,7 @@ def branch(
         if 0.0 < share < _SHRUNK:
             size = push(stack, size, at, half, low)
         elif share > 0.0:
-            size = push_halves(stack, size, side, at, half, low)
+            size = push_halves(stack, size, side, at, half, low, 0, False)
     return CLEAR, boxes, inf
 
 
@@ -250,12 +255,12 @@ def cut_side(kinds: Array, K: Array, gram: Array, half: Array, nodes: Array, row
         return _widest(half)
     t0, t1, t2, h0, h1, h2 = 0.0, 0.0, 0.0, half[0], half[1], half[2]
     for j in range(kinds.shape[0]):
-        wide = nodes[j, 5] - nodes[j, 4]
+        wide = nodes[j, HIGH] - nodes[j, LOW]
         if kinds[j] == RANGE and wide > 0.0:
             pull = 0.0
             for i in range(K.shape[0]):
-                pull += K[i, j] * rows[i, 4]
-            e0, e1, e2 = nodes[j, 1] * h0, nodes[j, 2] * h1, nodes[j, 3] * h2
+                pull += K[i, j] * rows[i, DIRECTION]
+            e0, e1, e2 = nodes[j, SLOPE0] * h0, nodes[j, SLOPE1] * h1, nodes[j, SLOPE2] * h2
             a, b = abs(gram[0, 1] * h0 * h1 - e0 * e1), abs(gram[0, 2] * h0 * h2 - e0 * e2)
             c = abs(gram[1, 2] * h1 * h2 - e1 * e2)
             x, y = gram[0, 0] * h0 * h0 - e0 * e0 + a + b, gram[1, 1] * h1 * h1 - e1 * e1 + a + c
@@ -275,16 +280,6 @@ def _widest(half: Array) -> int:
     if half[0] >= half[1] and half[0] >= half[2]:
         return 0
     return 1 if half[1] >= half[2] else 2
-
-
-@compiled
-def _lowest(stack: Array, size: int) -> float:
-    """Return a lower bound of the cost in the boxes left."""
-    least = inf
-    for i in range(size):
-        low = max(stack[i, 6], 0.0)
-        least = min(least, low * low)
-    return least
 
 
 # Boxes around minima on which the cost is convex: no second minimum fits in.
@@ -382,7 +377,7 @@ def prove(
         return SINGULAR, 0, -inf
     least, sums = cost_at(cost.K, cost.w, box.nodes), box.sums
     # On a box whose Hessian exceeds a margin the cost falls below that of its centre by slope^2 / margin at most.
-    margin = (sums[6] * sums[6] + sums[7] * sums[7] + sums[8] * sums[8]) / eps
+    margin = (sums[G0] * sums[G0] + sums[G1] * sums[G1] + sums[G2] * sums[G2]) / eps
     level = least + kappa if kappa > 0.0 else least - eps
     corners = np.empty((2, 3))
     low, high = corners[0], corners[1]
@@ -394,8 +389,8 @@ def prove(
     if kappa <= 0.0:
         known = 1
     aim = Aim(level, least - eps, least - 0.5 * eps, closed or isnan(lower[0]), accuracy_floor(cost, chart))
-    stack = np.empty((CAPACITY, DEPTH))
-    size = push_around(stack, low, high, sides[0])
+    stack = np.empty((_CAPACITY, DEPTH))
+    size = push_around(stack, 0, low, high, sides[0], 0)
     outcome, boxes, bound = branch(cost, chart, box, minima[:known], sides[:known], aim, budget, stack, size)
     if outcome == CLEAR:
         return UNIQUE if kappa > 0.0 else VALUE, boxes, least - eps
@@ -410,8 +405,7 @@ def prove(
 def _start(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper: Array, low: Array, high: Array) -> bool:
     """Write the corners of the box to search: the region, or an enclosure of all that costs less than rho^2."""
     if isnan(lower[0]):
-        chosen = chart.origin, chart.sense, chart.back
-        if not enclose(cost.kinds, cost.data, cost.A, cost.groups, box.nodes, box.curves, *chosen, rho, low, high):
+        if not enclose(cost, chart, box, rho, low, high):
             return False
     else:
         for k in range(3):
@@ -449,7 +443,7 @@ def _minima(
                 continue
             sums = box.sums
             # Within a hundredth of a standard deviation of its minimum.
-            margin = 100.0 * sqrt(sums[6] * sums[6] + sums[7] * sums[7] + sums[8] * sums[8])
+            margin = 100.0 * sqrt(sums[G0] * sums[G0] + sums[G1] * sums[G1] + sums[G2] * sums[G2])
         for k in range(3):
             hull[k] = max(high[k] - box.at[k], box.at[k] - low[k], 0.0)
         if set_convex(cost, chart, box, hull, margin):

@@ -2,24 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from optloc.base.types import Array, Rows
+from optloc.base.types import Array
 from optloc.linear.indices import columns, plans
 from optloc.linear.normal import prior_parts
 from optloc.linear.station_noise import weighed
-from optloc.models import MODELS
+from optloc.models import MODELS, Model
 from optloc.problem.noise import Whitener, variances, whiten
 from optloc.problem.problem import Problem
-from optloc.proof.nodes.codes import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO, width, with_alone
-from optloc.proof.scope import ANGLES
+from optloc.proof.nodes.dispatch import NODES, code_of, named, width
+from optloc.proof.nodes.linear import linear_numbers
+from optloc.proof.nodes.node import LINEAR, RANGE, Node, Row
 
 # From rows of measurements to nodes: which scalar functions the rows are sums of, and their numbers.
 
-_CODES = {"azimuth": AZIMUTH, "elevation": ELEVATION, "groa": RATIO, "height": HEIGHT}
+# Cosine below which two columns of whitened rows count as orthogonal.
+_ORTHOGONAL = 1e-9
 
 
 @dataclass(slots=True)
@@ -38,6 +41,8 @@ class Columns:
         Sparse design: row of the problem, node, factor.
     station, epoch : list of int
         Of each node that is a range; -1 for the others.
+    ranges : dict
+        The node of the range of a station at an epoch, which rows share.
     """
 
     problem: Problem
@@ -48,6 +53,7 @@ class Columns:
     coefficient: list[float] = field(default_factory=list)
     station: list[int] = field(default_factory=list)
     epoch: list[int] = field(default_factory=list)
+    ranges: dict[tuple[int, int], int] = field(default_factory=dict)
 
     def add(self, kind: int, data: Array, station: int = -1, epoch: int = -1) -> int:
         """Add a node and return its number."""
@@ -94,79 +100,34 @@ def columns_of(problem: Problem, observed: Array) -> Columns:
     observed : array (N, m)
         Measurements less everything that is known to be added to them; azimuths are counted from them.
     """
-    made, ranges = Columns(problem), {}
-    moving = problem.stations.position.shape[-3] > 1
+    made = Columns(problem)
     for rows, start in zip(problem.rows, problem.starts, strict=True):
-        signs = MODELS[rows.kind].ranges
+        model = MODELS[rows.kind]
         for i in range(rows.count):
-            epoch = int(rows.epoch[i]) if moving else 0
-            if signs is None:
-                own = observed[:, start + i] if rows.kind == "azimuth" else None
-                made.touch(start + i, _own(made, rows, i, own), 1.0)
+            row = Row(problem, int(rows.a[i]), int(rows.b[i]), int(rows.epoch[i]), observed[:, start + i])
+            if model.ranges is None:
+                for factor, node in model.nodes:
+                    made.touch(start + i, _own(made, row, node), factor)
                 continue
-            for sign, station in zip(signs, (int(rows.a[i]), int(rows.b[i])), strict=True):
-                if not sign:
-                    continue
-                if (station, epoch) not in ranges:
-                    place = _numbers({0: _at(problem, station, epoch)})
-                    ranges[station, epoch] = made.add(RANGE, place, station, epoch)
-                made.touch(start + i, ranges[station, epoch], float(sign))
+            for sign, station in zip(model.ranges, (row.a, row.b), strict=True):
+                if sign:
+                    made.touch(start + i, _range(made, row, station), float(sign))
     return made
 
 
-def _own(made: Columns, rows: Rows, i: int, measured: Array | None) -> int:
-    """Add the node that is the measured quantity of one row itself, and return its number."""
-    problem, kind = made.problem, _CODES[rows.kind]
-    if kind == HEIGHT:
-        return made.add(HEIGHT, height_numbers(problem))
-    a, epoch = int(rows.a[i]), int(rows.epoch[i])
-    parts = {0: _at(problem, a, epoch)}
-    if kind == RATIO:
-        parts[3] = _at(problem, int(rows.b[i]), epoch)
-    else:
-        parts[6] = _axes(problem, a, epoch)
-    if measured is not None:
-        parts[15] = measured[:, None]
-    return made.add(kind, _numbers(parts))
+def _own(made: Columns, row: Row, node: str | Node) -> int:
+    """Return the number of a node of one row, which is added unless it is a range that other rows have as well."""
+    if code_of(node) == RANGE:
+        return _range(made, row, row.a)
+    return made.add(code_of(node), named(node).numbers(row))
 
 
-def height_numbers(problem: Problem) -> Array:
-    """Return the numbers (1, n) of the node that is the geodetic height of a position in the problem's frame."""
-    frame = problem.frame
-    return _numbers({3: frame.origin_ecef()[None], 6: frame.rotation_to_ecef().reshape(1, 9)})
-
-
-def linear_numbers(coefficients: Array, origin: Array | None = None) -> Array:
-    """Return the numbers (B, n) of a linear node with coefficients (B, d), zero at an origin (B, d)."""
-    parts = {3: coefficients}
-    return _numbers(parts if origin is None else parts | {0: origin})
-
-
-def _numbers(parts: dict[int, Array]) -> Array:
-    last = max(start + part.shape[1] for start, part in parts.items())
-    out = np.zeros((max(len(part) for part in parts.values()), last))
-    for start, part in parts.items():
-        out[:, start : start + part.shape[1]] = part
-    return out
-
-
-def _at(problem: Problem, station: int, epoch: int) -> Array:
-    """Return the position (B, d) of a station at an epoch."""
-    position = problem.stations.position
-    picked = position[..., epoch if position.shape[-3] > 1 else 0, station, :]
-    return picked if picked.ndim == 2 else picked[None]
-
-
-def _axes(problem: Problem, station: int, epoch: int) -> Array:
-    """Return the axes (B, 9) of a station at an epoch, rows of three."""
-    axes, d = problem.stations.axes, problem.dimension
-    if axes is None:
-        return np.eye(3).reshape(1, 9)
-    picked = axes[..., epoch if axes.shape[-4] > 1 else 0, station, :, :]
-    picked = picked if picked.ndim == 3 else picked[None]
-    out = np.zeros((len(picked), 3, 3))
-    out[:, :d, :d] = picked
-    return out.reshape(len(picked), 9)
+def _range(made: Columns, row: Row, station: int) -> int:
+    """Return the number of the node that is the range to a station at the epoch of a row."""
+    epoch = row.epoch if made.problem.stations.position.shape[-3] > 1 else 0
+    if (station, epoch) not in made.ranges:
+        made.ranges[station, epoch] = made.add(RANGE, row.place(station), station, epoch)
+    return made.ranges[station, epoch]
 
 
 def linear_nodes(made: Columns, rows: Array, origin: Array | None = None) -> list[int]:
@@ -225,8 +186,50 @@ def compressed(K: Array, w: Array) -> tuple[Array, Array]:
     return upper, np.concatenate([inside, last], axis=-1)
 
 
-@dataclass(frozen=True, slots=True)
-class Posed:
+def with_alone(kinds: Array, data: Array, K: Array, w: Array) -> Array:
+    """Return the numbers of the nodes with a mark on those whose rows are their own, and that make something of it.
+
+    Nodes that share no row with others: their part of the cost is a function of one number, which may be folded.
+
+    Parameters
+    ----------
+    kinds : int array (J,)
+        Codes of the nodes.
+    data : array (B, J, width)
+        Their numbers; B is N, or 1 where all share.
+    K : array (B, q, J)
+        Whitened rows.
+    w : array (N, q)
+        Whitened measurements.
+
+    Returns
+    -------
+    array (B or N, J, width)
+        N where marks differ from problem to problem.
+    """
+    marked = [j for j, kind in enumerate(kinds) if NODES[kind].mark is not None]
+    if not marked:
+        return data
+    information = np.swapaxes(K, -1, -2) @ K
+    size = np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
+    others = np.abs(information - size[..., None] ** 2 * np.eye(len(kinds))).max(-1)
+    alone = others <= _ORTHOGONAL * size * size.max(-1, keepdims=True)
+    force = (np.swapaxes(K, -1, -2) @ w[..., None])[..., 0]
+    centred = (np.abs(force) <= _ORTHOGONAL * size * np.linalg.norm(w, axis=-1, keepdims=True)).all(0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        measured = np.where(size > 0.0, force / size**2, 0.0)
+    differs = any(NODES[kinds[j]].differs for j in marked)
+    out = np.array(np.broadcast_to(data, (len(w), *data.shape[1:])) if differs else data)
+    for kind in {int(kinds[j]) for j in marked}:
+        own, mark = kinds == kind, NODES[kind].mark
+        assert mark is not None
+        numbers = out[:, own]
+        mark(numbers, alone[:, own], centred[own], measured[:, own])
+        out[:, own] = numbers
+    return out
+
+
+class Posed(NamedTuple):
     """The maximum-likelihood costs of a flat batch of N problems over the position; B is N, or 1 where all share.
 
     Every other unknown has the value that is best for the position.
@@ -271,15 +274,14 @@ def posed(problem: Problem) -> Posed:
     known = np.where(usable, known, 0.0)
     made = columns_of(problem, known)
     others = others.with_stations(problem, made)
-    angles = _kind_of_rows(problem)
-    value = np.where(angles == "azimuth", 0.0, known)
+    value = np.where(_of_rows(problem, _counts_from_measured), 0.0, known)
     K, w = _projected(problem, made, others, value)
     K, w = _with_position_prior(problem, made, K, w)
     K, w = compressed(K, w)
-    size, level = problem.batch_shape[0], _turned(problem, others, angles, known)
+    size, level = problem.batch_shape[0], _turned(problem, others, known)
     w, level = np.broadcast_to(w, (size, w.shape[-1])), np.broadcast_to(level, (size,))
     kinds = np.array(made.kinds)
-    return Posed(kinds, with_alone(kinds, made.numbers, K, w), K, w, level)
+    return Posed(kinds, data=with_alone(kinds, made.numbers, K, w), K=K, w=w, level=level)
 
 
 @dataclass(frozen=True, slots=True)
@@ -321,8 +323,13 @@ class _Others:
         return _Others(touch, self.precision, self.mean)
 
 
-def _kind_of_rows(problem: Problem) -> Array:
-    return np.concatenate([np.full(rows.count, rows.kind, dtype=object) for rows in problem.rows])
+def _of_rows(problem: Problem, of_model: Callable[[Model], Any]) -> Array:
+    """Return what is said of the kind of each row (m,)."""
+    return np.concatenate([np.full(rows.count, of_model(MODELS[rows.kind])) for rows in problem.rows])
+
+
+def _counts_from_measured(model: Model) -> bool:
+    return any(named(node).counts_from_measured for _, node in model.nodes)
 
 
 def _projected(problem: Problem, made: Columns, others: _Others, value: Array) -> tuple[Array, Array]:
@@ -362,14 +369,15 @@ def _with_position_prior(problem: Problem, made: Columns, K: Array, w: Array) ->
     return K, w
 
 
-def _turned(problem: Problem, others: _Others, kind: Array, known: Array) -> Array:
+def _turned(problem: Problem, others: _Others, known: Array) -> Array:
     """Return the cost (N,) from which on the sum of an angle and its bias may be off by a turn.
 
     Residuals are wrapped with their bias, nodes without it; a row can differ only where noise and bias together are
     half a turn, and then its own chi-square is at least that squared over their variance.
     """
     level = np.full(len(known), np.inf)
-    rows = np.flatnonzero(np.isin(kind, ANGLES))
+    period = _of_rows(problem, lambda model: model.period or np.nan)
+    rows = np.flatnonzero(np.isfinite(period))
     if not len(rows):
         return level
     variance = variances(problem.noise, problem.count)[..., rows]
@@ -378,17 +386,24 @@ def _turned(problem: Problem, others: _Others, kind: Array, known: Array) -> Arr
     if biased.any():
         covariance = np.linalg.pinv(others.precision, hermitian=True)
         variance = variance + np.einsum("rn,bnm,rm->br", touch, covariance, touch)
-    size = np.abs(known[:, rows])
-    steep = kind[rows] == "elevation"
-    apart = np.where(steep, 1.5 * np.pi - size, np.pi)
-    able = biased | (steep & (size >= 0.5 * np.pi))
+    counted = _of_rows(problem, _counts_from_measured)[rows]
+    most, turn = _of_rows(problem, _most)[rows], period[rows]
+    # From the measured value to the farthest that the node can be: beyond half a turn the residual is the shorter way.
+    size = np.where(counted, 0.0, np.abs(known[:, rows]))
+    apart = turn - most - size
+    able = biased | (~counted & (size >= 0.5 * turn - most))
     return np.asarray(np.where(able, apart * np.abs(apart) / variance, np.inf).min(1))
 
 
-def taken(pose: Posed, items: Array) -> Posed:
+def _most(model: Model) -> float:
+    """Return how large the node of a kind with a period can be."""
+    return sum(abs(factor) * named(node).most for factor, node in model.nodes)
+
+
+def taken(pose: Posed, items: Array | slice) -> Posed:
     """Return the posed costs of some of the problems."""
 
     def own(array: Array) -> Array:
         return array if len(array) == 1 else array[items]
 
-    return Posed(pose.kinds, own(pose.data), own(pose.K), pose.w[items], pose.level[items])
+    return pose._replace(data=own(pose.data), K=own(pose.K), w=pose.w[items], level=pose.level[items])

@@ -13,9 +13,6 @@ from optloc.linear.normal import prior_parts
 from optloc.models import MODELS
 from optloc.problem.problem import Problem
 
-ANGLES = ("azimuth", "elevation")
-# Kinds that are nodes of their own; every other kind must be a sum of ranges.
-OWN = (*ANGLES, "groa", "height")
 # Different ranges, angles and ratios, and unknowns beside the position, of a problem whose proof is worth the time. It
 # goes with the square of the nodes, and plain Python takes a thousand times longer.
 MOST_NODES, MOST_NODES_PLAIN, MOST_UNKNOWNS = 128, 24, 128
@@ -56,7 +53,7 @@ def _of_rows(problem: Problem) -> Iterator[str]:
         model = MODELS[rows.kind]
         if model.velocity:
             yield f"{rows.kind} rows depend on velocities, which the proof does not bound"
-        elif rows.kind not in OWN and model.ranges is None:
+        elif model.ranges is None and not model.nodes:
             yield f"{rows.kind} rows are neither sums of ranges nor a kind whose bounds are known"
     most = MOST_NODES if enabled() else MOST_NODES_PLAIN
     if problem.count > most and _nodes(problem) > most:
@@ -73,7 +70,7 @@ def _nodes(problem: Problem) -> int:
     for rows in problem.rows:
         model = MODELS[rows.kind]
         if model.ranges is None:
-            own += rows.count
+            own += rows.count * len(model.nodes)
             continue
         when = rows.epoch if moving else np.zeros_like(rows.epoch)
         for index in (rows.a, rows.b)[: model.stations]:
@@ -82,7 +79,7 @@ def _nodes(problem: Problem) -> int:
 
 
 def _of_biases(problem: Problem) -> Iterator[str]:
-    angular = np.concatenate([np.full(rows.count, rows.kind in ANGLES) for rows in problem.rows])
+    angular = np.concatenate([np.full(rows.count, MODELS[rows.kind].period is not None) for rows in problem.rows])
     for bias in problem.biases:
         if bias.form not in ("offset", "drift"):
             yield f"the {bias.form} {bias.name!r} multiplies what it touches, and the proof takes what is added"

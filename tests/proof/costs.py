@@ -4,10 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from optloc.proof.nodes.codes import LINEAR, RANGE, WIDTH
+from optloc.proof.nodes.dispatch import NODES
+from optloc.proof.nodes.node import LINEAR, RANGE
 
 Array = np.ndarray
 NO_REGION = np.full(3, np.nan)
+# How many numbers any shipped node has at most.
+WIDTH = max(node.width for node in NODES)
 
 
 @dataclass(frozen=True)

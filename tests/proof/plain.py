@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pymap3d
 
-from optloc.proof.nodes.codes import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO
+from optloc.proof.nodes.node import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO
 from optloc.proof.pose import posed
 
 

@@ -1,11 +1,12 @@
 """Nodes of every kind at random, their values by the measurement functions themselves, and boxes that are sampled."""
 
 import numpy as np
+from proof.costs import WIDTH
 
 from optloc import MODELS
 from optloc.models import Point
-from optloc.proof.nodes.angles import bound_azimuth, bound_elevation, curve_azimuth, curve_elevation
-from optloc.proof.nodes.codes import WIDTH
+from optloc.proof.nodes.azimuth import bound_azimuth, curve_azimuth
+from optloc.proof.nodes.elevation import bound_elevation, curve_elevation
 from optloc.proof.nodes.height import bound_height, curve_height
 from optloc.proof.nodes.ratio import bound_ratio, curve_ratio
 

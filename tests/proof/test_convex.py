@@ -7,10 +7,10 @@ from proof.test_ranges import bound_box, bounded, charted, drawn_box, ways
 
 from optloc.compute.jit import enabled
 from optloc.proof.chart import curve_box, is_convex
-from optloc.proof.convex import CURVE_WIDTH, convex, slopes_everywhere, spread_of
+from optloc.proof.convex import convex, slopes_everywhere, spread_of
 from optloc.proof.near import set_convex
-from optloc.proof.nodes.codes import RANGE
-from optloc.proof.nodes.ranges import curve_ranges
+from optloc.proof.nodes.node import CURVE_WIDTH, RANGE
+from optloc.proof.nodes.range import curve_ranges
 
 BOXES, POINTS = (500, 200) if enabled() else (40, 200)
 

@@ -2,14 +2,14 @@
 
 import numpy as np
 import pytest
-from proof.costs import random_case
+from proof.costs import WIDTH, random_case
 from proof.test_ranges import charted
 
 from optloc.compute.jit import enabled
 from optloc.proof.chart import value_at
 from optloc.proof.convex import sum_up
 from optloc.proof.enclosure import around_node, around_rays, enclose
-from optloc.proof.nodes.codes import AZIMUTH, ELEVATION, RANGE, RATIO, WIDTH
+from optloc.proof.nodes.node import AZIMUTH, ELEVATION, RANGE, RATIO
 
 CASES, RAYS = (18, 500) if enabled() else (6, 200)
 
@@ -21,9 +21,7 @@ def enclosed(case, x, rho):
     box.curves[:] = 0.0
     sum_up(cost.K, cost.w, box.nodes, box.curves, box.sums)
     low, high = np.empty(3), np.empty(3)
-    tables, chosen = (box.nodes, box.curves), (chart.origin, chart.sense, chart.back)
-    arguments = (cost.kinds, cost.data, cost.A, cost.groups, *tables, *chosen, rho, low, high)
-    return chart, (low, high) if enclose(*arguments) else None
+    return chart, (low, high) if enclose(cost, chart, box, rho, low, high) else None
 
 
 def points_below(case, x, rho, rng, d, chart):

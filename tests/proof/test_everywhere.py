@@ -2,15 +2,16 @@
 
 import numpy as np
 import pytest
+from proof.costs import WIDTH
 from scipy.optimize import least_squares
 
 from optloc.compute.jit import enabled
-from optloc.proof.atlas import atlas_of, cube
+from optloc.proof.atlas import atlas_of
 from optloc.proof.chart import cost_of, empty_box
-from optloc.proof.everywhere import UNBOUNDED, prove_atlas, prove_everywhere, set_minimum
+from optloc.proof.everywhere import UNBOUNDED, prove_atlas, prove_everywhere
+from optloc.proof.far import cube, reaches_infinity, set_minimum
 from optloc.proof.near import BETTER, OTHER, UNIQUE, VALUE, prove
-from optloc.proof.nodes.codes import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO, WIDTH
-from optloc.proof.nodes.far import reaches_infinity
+from optloc.proof.nodes.node import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO
 
 
 def differences(S, sigma, x, rng):

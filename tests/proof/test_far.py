@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from proof.sampling import numbers, value
 
-from optloc.proof.atlas import atlas_of, cube, home_of, position, set_centre, within
-from optloc.proof.nodes.codes import AZIMUTH, ELEVATION, RANGE, RATIO
-from optloc.proof.nodes.far import bound_pieces, curve_pieces
+from optloc.proof.atlas import atlas_of, home_of, position, set_centre, within
+from optloc.proof.far import cube
+from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
+from optloc.proof.nodes.node import AZIMUTH, ELEVATION, RANGE, RATIO
 
 NAMES = {2: ("range", "azimuth", "groa"), 3: ("range", "azimuth", "groa", "elevation")}
 CODES = {"range": RANGE, "azimuth": AZIMUTH, "groa": RATIO, "elevation": ELEVATION}

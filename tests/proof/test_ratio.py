@@ -2,9 +2,13 @@
 
 import numpy as np
 import pytest
+from proof.costs import WIDTH
 from proof.sampling import bounded, changes, curved, differences, numbers, remainders, samples, value
 
-from optloc.proof.nodes.codes import ALONE, AZIMUTH, MEASURED, RANGE, RATIO, WIDTH, with_alone
+from optloc.proof.nodes.azimuth import ALONE
+from optloc.proof.nodes.node import AZIMUTH, RANGE, RATIO
+from optloc.proof.nodes.ratio import MEASURED
+from optloc.proof.pose import with_alone
 
 
 @pytest.mark.parametrize("d", [2, 3])

@@ -12,7 +12,12 @@ from math import sqrt
 from optloc.base.types import Array
 from optloc.compute.jit import compiled
 from optloc.models.primitives import WGS84_A, WGS84_F
-from optloc.proof.nodes.forms import Triple, across, blend, excess, length, pull, reach, triple, unbounded, write
+from optloc.problem.problem import Problem
+from optloc.proof.nodes.forms import Triple, across, blend, excess, inner, length, pull, reach, triple, unbounded, write
+from optloc.proof.nodes.node import CONVEX, Node, Row, lay_out
+
+# Numbers: a point o of the frame, its ECEF position, and the rows of the rotation from frame to ECEF.
+POINT, ECEF, ROTATION, _WIDTH = 0, 3, 6, 15
 
 _B = WGS84_A * (1.0 - WGS84_F)
 _E2 = WGS84_F * (2.0 - WGS84_F)
@@ -45,21 +50,30 @@ def geodetic(x: float, y: float, z: float) -> tuple[float, float, float, float]:
 
 
 @compiled
+def _ecef(data: Array, line: Array) -> Triple:
+    """Return Earth-centred Earth-fixed coordinates of the end of a line."""
+    along, origin = triple(line, 0), triple(data, ECEF)
+    return (
+        inner(triple(data, ROTATION), along) + origin[0],
+        inner(triple(data, ROTATION + 3), along) + origin[1],
+        inner(triple(data, ROTATION + 6), along) + origin[2],
+    )
+
+
+@compiled
 def _normal(data: Array, line: Array) -> tuple[float, Triple, Triple, Triple, float]:
     """Return height, upward, eastward and northward unit vectors in the problem's frame, and sine of the latitude."""
-    e = data[6] * line[0] + data[7] * line[1] + data[8] * line[2] + data[3]
-    f = data[9] * line[0] + data[10] * line[1] + data[11] * line[2] + data[4]
-    g = data[12] * line[0] + data[13] * line[1] + data[14] * line[2] + data[5]
+    e, f, g = _ecef(data, line)
     height, p, sp, cp = geodetic(e, f, g)
     ce, se = e / p, f / p
-    first, second, third = triple(data, 6), triple(data, 9), triple(data, 12)
+    first, second, third = triple(data, ROTATION), triple(data, ROTATION + 3), triple(data, ROTATION + 6)
     outward, east = blend(ce, first, se, second), blend(-se, first, ce, second)
     return height, blend(cp, outward, sp, third), east, blend(-sp, outward, cp, third), sp
 
 
 @compiled
 def bound_height(data: Array, line: Array, sense: Array, half: Array, slope: Array) -> tuple[float, float, float]:
-    """Bound a geodetic height over a box (see `optloc.proof.nodes.codes`), metres.
+    """Bound a geodetic height over a box (see `optloc.proof.nodes.node`), metres.
 
     Deep in the Earth the model's formula is no exact height; there it lies between ``-|x| - a`` and ``|x| - b``.
     """
@@ -70,7 +84,7 @@ def bound_height(data: Array, line: Array, sense: Array, half: Array, slope: Arr
     way = sqrt(swing * swing + aside * aside)
     if not height - way > _DEEP:
         slope[0] = slope[1] = slope[2] = 0.0
-        farthest = _distance(data, line) + way
+        farthest = length(_ecef(data, line)) + way
         return height, -farthest - WGS84_A - height, farthest - _B - height
     write(n, slope)
     slack = _EXACT * max(1.0, height / LEAST_RADIUS)
@@ -79,7 +93,7 @@ def bound_height(data: Array, line: Array, sense: Array, half: Array, slope: Arr
 
 @compiled
 def curve_height(data: Array, line: Array, sense: Array, half: Array, curvature: Array, turn: Array) -> float:
-    """Bound how a geodetic height curves over a box (see `optloc.proof.nodes.codes`).
+    """Bound how a geodetic height curves over a box (see `optloc.proof.nodes.node`).
 
     The Hessian is ``e e'/(N + h) + n n'/(M + h)`` with e east, n north, and M, N the radii of curvature of meridian and
     prime vertical. Its derivative is at most 1.2 / (b^2/a + h)^2: ``3 p q^2`` with ``p^2 + q^2 = 1`` (1.155) for the
@@ -111,9 +125,21 @@ def curve_height(data: Array, line: Array, sense: Array, half: Array, curvature:
 
 
 @compiled
-def _distance(data: Array, line: Array) -> float:
-    """Return the distance from the centre of the Earth."""
-    e = data[6] * line[0] + data[7] * line[1] + data[8] * line[2] + data[3]
-    f = data[9] * line[0] + data[10] * line[1] + data[11] * line[2] + data[4]
-    g = data[12] * line[0] + data[13] * line[1] + data[14] * line[2] + data[5]
-    return length((e, f, g))
+def _ball(data: Array, least: float, most: float) -> tuple[float, float, float, float]:
+    """Return a ball around the Earth's centre: a height is at least the distance from there less the equator's."""
+    origin, first, second, third = triple(data, ECEF), triple(data, ROTATION), triple(data, 9), triple(data, 12)
+    c = blend(1.0, blend(origin[0], first, origin[1], second), origin[2], third)
+    return data[POINT] - c[0], data[POINT + 1] - c[1], data[POINT + 2] - c[2], WGS84_A + most
+
+
+def height_numbers(problem: Problem) -> Array:
+    """Return the numbers (1, n) of the node that is the geodetic height of a position in the problem's frame."""
+    frame = problem.frame
+    return lay_out({ECEF: frame.origin_ecef()[None], ROTATION: frame.rotation_to_ecef().reshape(1, 9)})
+
+
+def _numbers(row: Row) -> Array:
+    return height_numbers(row.problem)
+
+
+GEODETIC_HEIGHT = Node("height", _WIDTH, 1, _numbers, bound_height, curve_height, shape=CONVEX, ball=_ball)

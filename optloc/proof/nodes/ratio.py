@@ -8,7 +8,6 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled
-from optloc.proof.nodes.codes import ALONE, MEASURED
 from optloc.proof.nodes.forms import (
     Triple,
     blend,
@@ -24,13 +23,17 @@ from optloc.proof.nodes.forms import (
     unbounded,
     write,
 )
+from optloc.proof.nodes.node import SCALED, Node, Row, lay_out
+
+# Numbers: stations a and b, the measured value, and what is not 0 where the row is the node's own.
+STATION, STATION_B, MEASURED, ALONE, _WIDTH = 0, 3, 15, 16, 17
 
 
 @compiled
 def bound_ratio(
     data: Array, line: Array, sense: Array, line_b: Array, sense_b: Array, half: Array, slope: Array
 ) -> tuple[float, float, float]:
-    """Bound a ratio of ranges over a box (see `optloc.proof.nodes.codes`).
+    """Bound a ratio of ranges over a box (see `optloc.proof.nodes.node`).
 
     In two steps, exact but for the enclosures of what is in them: with ``N = r_a^2 - r_b^2`` (affine in the
     position), S = r_a + r_b, delta = N/S = r_a - r_b and phi = 1 + delta/r_b, the remainder of a quotient phi = N/S is
@@ -120,7 +123,7 @@ def curve_ratio(
     curvature: Array,
     turn: Array,
 ) -> float:
-    """Bound how a ratio of ranges curves over a box (`optloc.proof.nodes.codes`), in the two steps of `bound_ratio`."""
+    """Bound how a ratio of ranges curves over a box (`optloc.proof.nodes.node`), in the two steps of `bound_ratio`."""
     h = triple(half, 0)
     bound_ratio(data, line, sense, line_b, sense_b, half, turn)
     ra, ua, least_a, qa, _ = range_form(line, sense, h)
@@ -212,3 +215,33 @@ def quotient_bend(
     for k in range(3):
         turn[k] = min(turn[k], reach((curvature[k, 0], curvature[k, 1], curvature[k, 2]), h) + chi * length(h))
     return chi
+
+
+@compiled
+def _ball(data: Array, least: float, most: float) -> tuple[float, float, float, float]:
+    """Return the ball of Apollonius: points with ``r_a <= q r_b``, q < 1, fill one."""
+    q = most if most < 1.0 else (1.0 / least if least > 1.0 else 1.0)
+    if not q * q < 1.0 - 1e-9:  # nearly half of space, whose ball says nothing and is badly rounded
+        return 0.0, 0.0, 0.0, inf
+    near, far = (STATION, STATION_B) if most < 1.0 else (STATION_B, STATION)
+    q = max(q, 0.0)
+    scale = 1.0 / (1.0 - q * q)
+    c0 = (data[near] - q * q * data[far]) * scale
+    c1 = (data[near + 1] - q * q * data[far + 1]) * scale
+    c2 = (data[near + 2] - q * q * data[far + 2]) * scale
+    p0, p1, p2 = data[0] - data[3], data[1] - data[4], data[2] - data[5]
+    return c0, c1, c2, q * sqrt(p0 * p0 + p1 * p1 + p2 * p2) * scale
+
+
+def _numbers(row: Row) -> Array:
+    return lay_out({STATION: row.place(row.a), STATION_B: row.place(row.b)})
+
+
+def _mark(numbers: Array, alone: Array, centred: Array, measured: Array) -> None:
+    """Let a ratio alone know its measured value: it only grows beyond, so one without an upper end is cut there."""
+    numbers[..., MEASURED], numbers[..., ALONE] = measured, alone
+
+
+RATIO_OF_RANGES = Node(
+    "ratio", _WIDTH, 2, _numbers, bound_ratio, curve_ratio, infinity=SCALED, ball=_ball, mark=_mark, differs=True
+)

@@ -18,8 +18,10 @@ from optloc.problem.problem import Problem
 from optloc.proof.batch import Answered, Asked, prove_all
 from optloc.proof.everywhere import UNBOUNDED
 from optloc.proof.near import BETTER, BUDGET, OTHER, UNIQUE, VALUE
-from optloc.proof.nodes.codes import HEIGHT, LINEAR
-from optloc.proof.pose import Posed, height_numbers, linear_numbers, posed, stacked, taken
+from optloc.proof.nodes.height import height_numbers
+from optloc.proof.nodes.linear import linear_numbers
+from optloc.proof.nodes.node import HEIGHT, LINEAR
+from optloc.proof.pose import Posed, posed, stacked, taken
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP
 from optloc.solvers.pool import Pool, offer, pack
 from optloc.solvers.refine import refine
@@ -160,7 +162,7 @@ def _with_row(pose: Posed, kind: int, numbers: Array, value: Array, scale: Array
     w = np.concatenate([pose.w, (np.broadcast_to(value, (size,)) / scale - shift * scale)[:, None]], axis=1)
     kinds = np.append(pose.kinds, kind)
     data = stacked(kinds, [*(pose.data[:, j] for j in range(nodes)), numbers])
-    return replace(pose, kinds=kinds, data=data, K=K, w=w)
+    return pose._replace(kinds=kinds, data=data, K=K, w=w)
 
 
 # Gaps to other minima that are tried to prove, one after the other; the last is the value alone.
@@ -305,14 +307,14 @@ def _asked(work: Work, items: Array, extra: Array) -> Asked:
     place = fix.layout.take(fix.alternatives.x[items], "position")
     others = pack(np.concatenate([np.where(listed[..., None], place, np.nan), ignored], axis=1))
     return Asked(
-        fix.position[items],
-        np.where(np.isfinite(others), others, 0.0),
-        np.isfinite(others).all(-1).sum(1),
-        kappa,
-        _EQUAL * (1.0 + fix.cost[items] + extra),
-        work.region[items],
-        work.fallback[items],
-        _budgets(kappa, len(work.pose.kinds), work.effort),
+        x=fix.position[items],
+        others=np.where(np.isfinite(others), others, 0.0),
+        known=np.isfinite(others).all(-1).sum(1),
+        kappa=kappa,
+        eps=_EQUAL * (1.0 + fix.cost[items] + extra),
+        region=work.region[items],
+        fallback=work.fallback[items],
+        budget=_budgets(kappa, len(work.pose.kinds), work.effort),
     )
 
 

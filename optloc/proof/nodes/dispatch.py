@@ -1,0 +1,271 @@
+"""The table of nodes, and the functions that choose by a node's code, written from it.
+
+Machine code calls no function that it does not know when it is made, so for each thing that a proof asks of a node a
+chain of ``if kind == code`` is written out from the table and compiled like any other function. The chain of the nodes
+that optloc ships is always the same, and its machine code is kept on disk. A node from outside lengthens the chain;
+what calls it is compiled anew then, and kept on disk under a name of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from hashlib import sha256
+from inspect import unwrap
+from math import inf
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.compute.jit import compiled, inlined, renew, replace
+from optloc.proof.atlas import set_line
+from optloc.proof.nodes import node as columns
+from optloc.proof.nodes.azimuth import HORIZONTAL_ANGLE
+from optloc.proof.nodes.elevation import VERTICAL_ANGLE
+from optloc.proof.nodes.forms import range_form, triple
+from optloc.proof.nodes.height import GEODETIC_HEIGHT
+from optloc.proof.nodes.linear import LINEAR_FORM
+from optloc.proof.nodes.node import DIFFERENCE, FLAT, GROWS, MIXED, SCALED, Node
+from optloc.proof.nodes.range import DISTANCE, bound_difference, curve_difference
+from optloc.proof.nodes.ratio import RATIO_OF_RANGES
+
+# In the order of their codes (`optloc.proof.nodes.node`); those from outside follow as they are met.
+_SHIPPED = (DISTANCE, LINEAR_FORM, HORIZONTAL_ANGLE, VERTICAL_ANGLE, RATIO_OF_RANGES, GEODETIC_HEIGHT)
+NODES: list[Node] = list(_SHIPPED)
+_CODES = {node: code for code, node in enumerate(NODES)}
+_NAMES = {node.name: node for node in NODES}
+
+
+def named(node: str | Node) -> Node:
+    """Return a node that a `Model` names, or that it holds itself."""
+    if isinstance(node, Node):
+        return node
+    if node not in _NAMES:
+        raise InvalidProblem(f"the proof knows no node {node!r}", "nodes", nearest(node, list(_NAMES)))
+    return _NAMES[node]
+
+
+# Functions that ask one thing of a node by its code: arguments, the answer of a node, and what is said of all others.
+
+_Writer = Callable[[Node, int], str]
+
+
+def _call(field: str, arguments: str) -> _Writer:
+    return lambda node, code: "" if getattr(node, field) is None else f"{field}_{code}({arguments})"
+
+
+def _constant(field: str) -> _Writer:
+    return lambda node, code: repr(getattr(node, field))
+
+
+_QUESTIONS: dict[str, tuple[str, _Writer, str]] = {
+    "size_of": ("kind, data, reach", _call("size", "data, reach"), "1.0"),
+    "ball_of": ("kind, data, least, most", _call("ball", "data, least, most"), "0.0, 0.0, 0.0, inf"),
+    "ray_of": ("kind, kinds, data, swing, j, x, row", _call("ray", "kinds, data, swing, j, x, row"), "-1.0, 0.0"),
+    "has_ray": ("kind", lambda node, code: repr(node.ray is not None), "False"),
+    "shape_of": ("kind", _constant("shape"), repr(MIXED)),
+    "infinity_of": ("kind", _constant("infinity"), repr(GROWS)),
+    "points_of": ("kind", _constant("points"), "1"),
+}
+
+
+def _question(name: str, nodes: list[Node]) -> str:
+    """Return the text of a function that asks one thing of a node."""
+    arguments, answer, others = _QUESTIONS[name]
+    lines = [f"def {name}({arguments}):"]
+    for code, node in enumerate(nodes):
+        said = answer(node, code)
+        if said and said != others:
+            lines.append(f"    if kind == {code}:\n        return {said}")
+    return "\n".join([*lines, f"    return {others}", ""])
+
+
+# Loops over all nodes of a table but ranges in the near chart, and all nodes over a piece of an atlas. They are written
+# out whole, with the cases inside: a function for the cases alone would be handed seven arrays for each node, and to
+# hand on an array counts references, which costs half as much as to bound an angle.
+
+_LOOPS = {
+    "bound_others": """
+def bound_others(kinds, data, centre, sense, half, line, nodes):
+    for j in range(kinds.shape[0]):
+        kind = kinds[j]
+        if kind == RANGE:
+            continue
+        for k in range(3):
+            line[k] = centre[k] - data[j, k]
+        own, slope = data[j], nodes[j, SLOPE0 : SLOPE2 + 1]
+{cases}
+        nodes[j, PHI], nodes[j, LOW], nodes[j, HIGH] = value, low, high
+""",
+    "curve_others": """
+def curve_others(kinds, data, centre, sense, half, line, second, nodes, curves):
+    for j in range(kinds.shape[0]):
+        kind = kinds[j]
+        if kind == RANGE:
+            continue
+        for k in range(3):
+            line[k] = centre[k] - data[j, k]
+        own, turn = data[j], curves[j, TURN0 : TURN2 + 1]
+{cases}
+        # A slope of zero may stand for one that was not used: then the gradient is not that of the node.
+        flat = nodes[j, SLOPE0] == 0.0 and nodes[j, SLOPE1] == 0.0 and nodes[j, SLOPE2] == 0.0
+        curves[j, CHI] = inf if flat else chi
+        column = 0
+        for k in range(3):
+            for m in range(k, 3):
+                curves[j, column] = second[k, m]
+                column += 1
+""",
+    "bound_pieces": """
+def bound_pieces(atlas, kinds, data, half, nodes):
+    away, away_b, sense, sense_b = atlas.away, atlas.away_b, atlas.sense, atlas.sense_b
+    centre = range_form(atlas.point, atlas.slant, triple(half, 0))
+    for j in range(kinds.shape[0]):
+        kind, own, slope = kinds[j], data[j], nodes[j, SLOPE0 : SLOPE2 + 1]
+        if kind == RANGE:
+            value, low, high = bound_difference(atlas, own, centre, half, slope)
+        else:
+            set_line(atlas, own, 0, away, sense)
+{cases}
+        nodes[j, PHI], nodes[j, LOW], nodes[j, HIGH] = value, low, high
+""",
+    "curve_pieces": """
+def curve_pieces(atlas, kinds, data, half, curves):
+    away, away_b, sense, sense_b, bend = atlas.away, atlas.away_b, atlas.sense, atlas.sense_b, atlas.bend
+    centre = range_form(atlas.point, atlas.slant, triple(half, 0))
+    for j in range(kinds.shape[0]):
+        kind, own, turn = kinds[j], data[j], curves[j, TURN0 : TURN2 + 1]
+        if kind == RANGE:
+            chi = curve_difference(atlas, own, centre, half, turn)
+        else:
+            set_line(atlas, own, 0, away, sense)
+{cases}
+        curves[j, CHI] = chi
+        column = 0
+        for k in range(3):
+            for m in range(k, 3):
+                curves[j, column] = bend[k, m]
+                column += 1
+""",
+}
+
+
+def _near_case(node: Node, code: int, call: str) -> list[str]:
+    """Return the lines that bound or curve a node over a box in the near chart."""
+    if node.points == 1:
+        return [call.format(code, "line[:3], sense")]
+    second = ["for k in range(3):", "    line[3 + k] = centre[k] - data[j, 3 + k]"]
+    return [*second, call.format(code, "line[:3], sense, line[3:], sense")]
+
+
+def _far_case(node: Node, code: int, call: str) -> list[str]:
+    """Return the lines that bound or curve a node over a box of an atlas, if scaled lines serve as well."""
+    if node.infinity != SCALED:
+        return []
+    if node.points == 1:
+        return [call.format(code, "away, sense")]
+    return ["set_line(atlas, own, 3, away_b, sense_b)", call.format(code, "away, sense, away_b, sense_b")]
+
+
+def _cases(name: str, nodes: list[Node]) -> Iterator[str]:
+    """Yield the cases of a loop, by the code of the node."""
+    near, bounds = name.endswith("others"), name.startswith("bound")
+    if bounds:
+        call = "value, low, high = bound_{}(own, {}, half, slope)"
+    else:
+        call = f"chi = curve_{{}}(own, {{}}, half, {'second' if near else 'bend'}, turn)"
+    indent, word = " " * (8 if near else 12), "if"
+    for code, node in enumerate(nodes):
+        if node.infinity == DIFFERENCE:
+            continue
+        if near and not bounds and node.shape == FLAT:
+            lines = ["curves[j, :FORCE] = 0.0", "continue"]
+        else:
+            lines = (_near_case if near else _far_case)(node, code, call)
+        if lines:
+            yield f"{indent}{word} kind == {code}:"
+            yield from (f"{indent}    {line}" for line in lines)
+            word = "elif"
+    yield f"{indent}else:"
+    yield f"{indent}    {'value, low, high = 0.0, -inf, inf' if bounds else 'chi = inf'}"
+
+
+def text_of(name: str, nodes: list[Node]) -> str:
+    """Return the text of a function that chooses by the codes of nodes."""
+    return _question(name, nodes) if name in _QUESTIONS else _LOOPS[name].format(cases="\n".join(_cases(name, nodes)))
+
+
+_KERNELS = ("bound", "curve", "size", "ball", "ray")
+# What the loops name beside the functions of the nodes.
+_NAMED = (range_form, triple, set_line, bound_difference, curve_difference)
+_COLUMNS = ("RANGE", "PHI", "SLOPE0", "SLOPE1", "SLOPE2", "LOW", "HIGH", "TURN0", "TURN2", "CHI", "FORCE")
+
+
+def _kernels(node: Node) -> Iterator[tuple[str, Any]]:
+    """Yield the compiled functions of a node with their names."""
+    yield from ((name, getattr(node, name)) for name in _KERNELS if getattr(node, name) is not None)
+
+
+def _written(name: str, nodes: list[Node]) -> Callable[..., Any]:
+    """Return a function that chooses, as if it stood in this file: machine code on disk belongs to a file."""
+    space: dict[str, Any] = {
+        "__name__": __name__,
+        "inf": inf,
+        **{column: getattr(columns, column) for column in _COLUMNS},
+    }
+    space |= {function.__name__: function for function in _NAMED}
+    space |= {f"{field}_{code}": kernel for code, own in enumerate(nodes) for field, kernel in _kernels(own)}
+    exec(compile(text_of(name, nodes), __file__, "exec"), space)  # noqa: S102  # text of our own making
+    made: Callable[..., Any] = space[name]
+    return made
+
+
+bound_others = compiled(_written("bound_others", NODES))
+curve_others = compiled(_written("curve_others", NODES))
+bound_pieces = compiled(_written("bound_pieces", NODES))
+curve_pieces = compiled(_written("curve_pieces", NODES))
+size_of = compiled(_written("size_of", NODES))
+ball_of = compiled(_written("ball_of", NODES))
+ray_of = compiled(_written("ray_of", NODES))
+has_ray = inlined(_written("has_ray", NODES))
+shape_of = inlined(_written("shape_of", NODES))
+infinity_of = inlined(_written("infinity_of", NODES))
+points_of = inlined(_written("points_of", NODES))
+
+# Nodes from outside.
+
+_LOCK = Lock()
+
+
+def code_of(node: str | Node) -> int:
+    """Return the code of a node; one that is new to this process takes its place in the table, and in all chains."""
+    found = named(node)
+    with _LOCK:
+        if found not in _CODES:
+            _CODES[found] = len(NODES)
+            NODES.append(found)
+            _renew()
+        return _CODES[found]
+
+
+def _renew() -> None:
+    """Write the chains anew, and let what calls them be compiled anew at its next use."""
+    for name in (*_LOOPS, *_QUESTIONS):
+        replace(globals()[name], _written(name, NODES))
+    renew(_calls_chains, f"nodes_{_digest(NODES[len(_SHIPPED) :])}")
+
+
+def _calls_chains(module: str) -> bool:
+    """Return whether a module of kernels may call a chain: all of the proof, but not the nodes, which chains call."""
+    return module == __name__ or (module.startswith("optloc.proof.") and not module.startswith("optloc.proof.nodes."))
+
+
+def _digest(nodes: Iterable[Node]) -> str:
+    """Return what tells the machine code of one table of nodes from that of another: the files of its functions."""
+    files = sorted({unwrap(kernel).__code__.co_filename for node in nodes for _, kernel in _kernels(node)})
+    return sha256(b"".join(Path(file).read_bytes() for file in files)).hexdigest()[:16]
+
+
+def width(kinds: Iterable[int]) -> int:
+    """Return how many numbers are kept of each node of a problem: a million problems of ranges need no more."""
+    return max((NODES[kind].width for kind in kinds), default=DISTANCE.width)

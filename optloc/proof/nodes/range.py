@@ -1,0 +1,236 @@
+"""Ranges: all of a problem at once over a box, and less the distance to the centre of an atlas out to infinity.
+
+Most rows are sums of ranges, so their loops are written out: what all of them share is computed once for a box.
+"""
+
+from __future__ import annotations
+
+from math import inf, sqrt
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled
+from optloc.proof.atlas import Atlas, scaled_station, set_line
+from optloc.proof.nodes.forms import (
+    RangeForm,
+    blend,
+    range_bend,
+    range_form,
+    reach,
+    still,
+    triple,
+    unbounded,
+    write,
+)
+from optloc.proof.nodes.node import (
+    CHI,
+    CONVEX,
+    DIFFERENCE,
+    H00,
+    H01,
+    H02,
+    H11,
+    H12,
+    H22,
+    HIGH,
+    LOW,
+    PHI,
+    RANGE,
+    SLOPE0,
+    SLOPE1,
+    SLOPE2,
+    TURN0,
+    TURN1,
+    TURN2,
+    Node,
+    Row,
+)
+from optloc.proof.nodes.ratio import quotient, quotient_bend
+
+
+@compiled
+def greatest(a: float, b: float, c: float, d: float, e: float, f: float) -> float:
+    """Return the maximum of s'[[a, b, c], [b, d, e], [c, e, f]]s, positive semidefinite, over |s_k| <= 1.
+
+    The maximum is at a corner. The signs of a corner make all three mixed terms positive where their product is;
+    otherwise one of them must be negative: the smallest.
+    """
+    u, v, t = abs(b), abs(c), abs(e)
+    mixed = u + v + t
+    if b * c * e < 0.0:
+        mixed -= 2.0 * min(u, v, t)
+    total = a + d + f + 2.0 * mixed
+    return max(0.0, total)
+
+
+@compiled
+def bound_ranges(kinds: Array, data: Array, centre: Array, sense: Array, gram: Array, half: Array, nodes: Array) -> int:
+    """Bound all ranges over a box; return how many nodes are none.
+
+    With u the direction of the line v, a = r + u.d and b = |d - u u.d| the remainder is ``sqrt(a^2 + b^2) - a``, which
+    falls with a (of either sign) and grows with b: it is at most its value at the least a and the greatest b.
+
+    Parameters
+    ----------
+    kinds, data : array (J,), (J, width)
+        The nodes.
+    centre, half : array (3,)
+        Centre of the box, metres, and half-widths in search coordinates.
+    sense, gram : array (3, 3)
+        T with x = c + T s, and ``T'T``.
+    nodes : array (J, NODE_WIDTH)
+        Rows of ranges are written.
+    """
+    others = 0
+    c0, c1, c2, h0, h1, h2 = centre[0], centre[1], centre[2], half[0], half[1], half[2]
+    t00, t01, t02 = sense[0, 0], sense[0, 1], sense[0, 2]
+    t10, t11, t12 = sense[1, 0], sense[1, 1], sense[1, 2]
+    t20, t21, t22 = sense[2, 0], sense[2, 1], sense[2, 2]
+    # Entries of T'T times half-widths: all of a quadratic form over the box but for the direction.
+    m00, m01, m02 = gram[0, 0] * h0 * h0, gram[0, 1] * h0 * h1, gram[0, 2] * h0 * h2
+    m11, m12, m22 = gram[1, 1] * h1 * h1, gram[1, 2] * h1 * h2, gram[2, 2] * h2 * h2
+    for j in range(kinds.shape[0]):
+        if kinds[j] != RANGE:
+            others += 1
+            continue
+        x, y, z = c0 - data[j, 0], c1 - data[j, 1], c2 - data[j, 2]
+        r = sqrt(x * x + y * y + z * z)
+        per = 1.0 / r if r > 0.0 else 0.0
+        g0 = (x * t00 + y * t10 + z * t20) * per
+        g1 = (x * t01 + y * t11 + z * t21) * per
+        g2 = (x * t02 + y * t12 + z * t22) * per
+        e0, e1, e2 = g0 * h0, g1 * h1, g2 * h2
+        least = r - abs(e0) - abs(e1) - abs(e2)
+        across = greatest(m00 - e0 * e0, m01 - e0 * e1, m02 - e0 * e2, m11 - e1 * e1, m12 - e1 * e2, m22 - e2 * e2)
+        root = sqrt(least * least + across)
+        nodes[j, PHI], nodes[j, LOW] = r, 0.0
+        nodes[j, SLOPE0], nodes[j, SLOPE1], nodes[j, SLOPE2] = g0, g1, g2
+        # The same number without cancellation.
+        nodes[j, HIGH] = across / (root + least) if least > 0.0 else root - least
+    return others
+
+
+@compiled
+def curve_ranges(kinds: Array, gram: Array, half: Array, nodes: Array, curves: Array) -> None:
+    """Write Hessians of all ranges, and bounds of their change, into the table of second derivatives.
+
+    With P the projection across the direction u of the line and r' >= A the range elsewhere in the box, the gradient
+    T'u changes by ``(T'P d - q T'u) / r'`` and the Hessian ``T'P T / r`` by a difference of quotients.
+
+    Parameters
+    ----------
+    kinds : array (J,)
+        Codes of the nodes.
+    gram, half : array (3, 3), (3,)
+        ``T'T``, and half-widths of the box.
+    nodes : array (J, NODE_WIDTH)
+        Filled by `bound_ranges`.
+    curves : array (J, CURVE_WIDTH)
+        Rows of ranges are written, see `optloc.proof.convex`.
+    """
+    h0, h1, h2 = half[0], half[1], half[2]
+    m00, m01, m02, m11, m12, m22 = gram[0, 0], gram[0, 1], gram[0, 2], gram[1, 1], gram[1, 2], gram[2, 2]
+    for j in range(kinds.shape[0]):
+        if kinds[j] != RANGE:
+            continue
+        r, g0, g1, g2, most = nodes[j, PHI], nodes[j, SLOPE0], nodes[j, SLOPE1], nodes[j, SLOPE2], nodes[j, HIGH]
+        swing = abs(g0) * h0 + abs(g1) * h1 + abs(g2) * h2
+        least = r - swing
+        n00, n01, n02 = m00 - g0 * g0, m01 - g0 * g1, m02 - g0 * g2
+        n11, n12, n22 = m11 - g1 * g1, m12 - g1 * g2, m22 - g2 * g2
+        if least > 0.0:
+            per, near = 1.0 / r, 1.0 / least
+            e0 = (most * abs(g0) + abs(n00) * h0 + abs(n01) * h1 + abs(n02) * h2) * near
+            e1 = (most * abs(g1) + abs(n01) * h0 + abs(n11) * h1 + abs(n12) * h2) * near
+            e2 = (most * abs(g2) + abs(n02) * h0 + abs(n12) * h1 + abs(n22) * h2) * near
+            eta, slope = sqrt(e0 * e0 + e1 * e1 + e2 * e2), sqrt(g0 * g0 + g1 * g1 + g2 * g2)
+            norm = sqrt(n00 * n00 + n11 * n11 + n22 * n22 + 2.0 * (n01 * n01 + n02 * n02 + n12 * n12))
+            chi = (eta * (2.0 * slope + eta) + norm * (swing + most) * per) * near
+        else:
+            per, chi = 1.0 / r if r > 0.0 else 0.0, inf
+            e0, e1, e2 = sqrt(m00) + abs(g0), sqrt(m11) + abs(g1), sqrt(m22) + abs(g2)
+        curves[j, H00], curves[j, H01], curves[j, H02] = n00 * per, n01 * per, n02 * per
+        curves[j, H11], curves[j, H12], curves[j, H22] = n11 * per, n12 * per, n22 * per
+        curves[j, TURN0], curves[j, TURN1], curves[j, TURN2], curves[j, CHI] = e0, e1, e2, chi
+
+
+# Behaviour at infinity. Where every row's coefficients of ranges sum to zero, the distance to the centre of the cube of
+# an atlas may be taken off every range. What is left,
+#
+#     R (|p - v a| - |p|) / v = R (-2 a.p + v |a|^2) / (|p - v a| + |p|),
+#
+# stays finite and smooth at infinity.
+
+
+@compiled
+def bound_difference(
+    atlas: Atlas, data: Array, centre: RangeForm, half: Array, slope: Array
+) -> tuple[float, float, float]:
+    """Bound a range less the distance to the centre over a box, metres; as the functions of `optloc.proof.nodes.node`.
+
+    A quotient N/S with N linear, as ratios are (`optloc.proof.nodes.ratio.bound_ratio`), and at most ``R |a|`` in size.
+    `centre` is what `optloc.proof.nodes.forms.range_form` says of p.
+    """
+    h, radius = triple(half, 0), atlas.radius
+    set_line(atlas, data, 0, atlas.away, atlas.sense)
+    a, rise, n = scaled_station(atlas, data)
+    r, u, least, q, far = range_form(atlas.away, atlas.sense, h)
+    r0, u0, least0, q0, far0 = centre
+    size, u, most = r + r0, blend(1.0, u, 1.0, u0), q + q0
+    phi, least = rise / size if size > 0.0 else 0.0, max(least, 0.0) + max(least0, 0.0)
+    if least > 0.0:
+        g = blend(1.0 / size, n, -phi / size, u)
+        low, high = quotient(phi, g, u, most, (0.0, 0.0), (least, far + far0), h)
+        if high - low <= 2.0 * a:
+            write(blend(radius, g, 0.0, g), slope)
+            return radius * phi, radius * low, radius * high
+    slope[0] = slope[1] = slope[2] = 0.0
+    return radius * phi, radius * (-a - phi), radius * (a - phi)
+
+
+@compiled
+def curve_difference(atlas: Atlas, data: Array, centre: RangeForm, half: Array, turn: Array) -> float:
+    """Bound how a range less the distance to the centre curves over a box; the Hessian goes into ``atlas.bend``."""
+    h, bend, second = triple(half, 0), atlas.bend, atlas.second
+    bound_difference(atlas, data, centre, half, turn)
+    a, rise, n = scaled_station(atlas, data)
+    if a == 0.0:
+        bend[:] = 0.0
+        return 0.0
+    r, u, least, q, _ = range_form(atlas.away, atlas.sense, h)
+    r0, u0, least0, q0, _ = centre
+    if still(turn) or not (least > 0.0 and least0 > 0.0):
+        return unbounded(bend, turn)
+    ds, chi, norm = range_bend(atlas.sense, h, r, u, least, q, second)
+    ds0, chi0, norm0 = range_bend(atlas.slant, h, r0, u0, least0, q0, bend)
+    for k in range(3):
+        for m in range(3):
+            second[k, m] += bend[k, m]
+            bend[k, m] = 0.0
+    size, u = r + r0, blend(1.0, u, 1.0, u0)
+    phi = rise / size
+    g = blend(1.0 / size, n, -phi / size, u)
+    changes = ((0.0, 0.0, 0.0), blend(1.0, ds, 1.0, ds0), 0.0, chi + chi0, norm + norm0, reach(u, h) + q + q0)
+    change = quotient_bend(g, u, (phi, size, least + least0), changes, h, bend, second, turn)
+    for k in range(3):
+        turn[k] *= atlas.radius
+        for m in range(3):
+            bend[k, m] *= atlas.radius
+    return atlas.radius * change
+
+
+@compiled
+def _size(data: Array, reach: float) -> float:
+    return float(reach + (abs(data[0]) + abs(data[1]) + abs(data[2])))
+
+
+@compiled
+def _ball(data: Array, least: float, most: float) -> tuple[float, float, float, float]:
+    """Return the ball of a range: around its station."""
+    return data[0], data[1], data[2], most
+
+
+def _numbers(row: Row) -> Array:
+    return row.place(row.a)
+
+
+DISTANCE = Node("range", 3, 1, _numbers, shape=CONVEX, infinity=DIFFERENCE, size=_size, ball=_ball)
