@@ -152,6 +152,7 @@ def set_centre(atlas: Atlas, piece: int, at: Array) -> None:
     d, place, linear = atlas.dimension, atlas.place, atlas.linear
     linear[:] = 0.0
     around = piece - 2 * d - 1
+    # All below is in the coordinates of the home; around a minimum these turn with its axes.
     place[0] = piece if around < 0 else atlas.minima.home[around]
     for k in range(d):
         if around < 0:
@@ -232,6 +233,7 @@ def within(atlas: Atlas, half: Array, i: int, sides: Array) -> bool:
             for c in range(d):
                 slope += minima.back[i, k, c] * atlas.linear[c, m]
             reach += abs(slope) * half[m]
+        # Inwards by more than the rounding of the inverse axes: a box left out must be one that was looked at.
         if abs(away) + reach > sides[k] * (1.0 - 1e-9):
             return False
     return True

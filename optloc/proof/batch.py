@@ -15,10 +15,13 @@ from optloc.proof.everywhere import prove_everywhere
 from optloc.proof.near import BUDGET, OPEN, prove
 from optloc.proof.pose import Posed, taken
 
-# Fixes that one call of machine code proves, fewest and most.
-_STRETCH = 16, 512
+# Fixes that one call of machine code proves, fewest and most: a call costs as much as a fix or two, and threads share
+# what is left of a batch by stretches, of which each should get several (`_PARTS` in all).
+_STRETCH, _PARTS = (16, 512), 32
 # So few proofs over so few nodes are begun in plain Python, with so many boxes in all: about half a second.
 _FEW, _SMALL, _FIRST_BOXES = 16, 24, 400
+# Fewest boxes that each of them gets: most proofs inside a network end with the first.
+_AT_LEAST = 5
 
 
 class Asked(NamedTuple):
@@ -93,7 +96,7 @@ def prove_all(pose: Posed, asked: Asked) -> Answered:
     if n > _FEW or len(pose.kinds) > _SMALL or ready(_loop):
         return _proven(pose, asked)
     with plain():
-        out = _proven(pose, asked._replace(budget=np.minimum(asked.budget, max(5, _FIRST_BOXES // max(n, 1)))))
+        out = _proven(pose, asked._replace(budget=np.minimum(asked.budget, max(_AT_LEAST, _FIRST_BOXES // max(n, 1)))))
     short = np.flatnonzero((out.verdict == BUDGET) & (out.boxes < asked.budget))
     if len(short) and enabled():
         for array, more in zip(out, _proven(taken(pose, short), asked.take(short)), strict=True):
@@ -111,7 +114,7 @@ def _proven(pose: Posed, asked: Asked) -> Answered:
         found=np.full((n, d), np.nan),
     )
     pose, asked = Posed(*(_plain(array) for array in pose)), Asked(*(_plain(array) for array in asked))
-    length = max(_STRETCH[0], min(_STRETCH[1], n // 32))
+    length = max(_STRETCH[0], min(_STRETCH[1], n // _PARTS))
 
     def stretch(first: int) -> None:
         part = slice(first, min(first + length, n))

@@ -11,7 +11,11 @@ from optloc.proof.nodes.dispatch import bound_others
 from optloc.proof.nodes.node import HIGH, LOW, PHI, SLOPE0, SLOPE1, SLOPE2
 from optloc.proof.nodes.range import bound_ranges
 
+# Unit in the last place of a double at 1.
 _ULP = 2.0**-52
+# A half-width covers the rounding of its centre and corners: relative to itself, and some units in the last place
+# of these.
+_WIDER, _SHIFT = 1e-12, 1e-15
 # Coordinate descents towards the least-squares point of a box; any point gives a valid bound.
 _SWEEPS = 3
 # Columns of a table of rows over a box (q, ROW_WIDTH): residual in the middle of the remainders, Jacobian, direction v.
@@ -90,6 +94,7 @@ def least_residual(K: Array, weight: Array, floor: float, half: Array, nodes: Ar
     nodes, rows : array (J, NODE_WIDTH), (q, ROW_WIDTH)
         Filled tables; the direction v is written.
     """
+    # Whatever v is, the bound holds; how good it is depends on v alone.
     _nearest(half, rows)
     length, reach, t0, t1, t2 = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(K.shape[0]):
@@ -103,6 +108,7 @@ def least_residual(K: Array, weight: Array, floor: float, half: Array, nodes: Ar
         return -1.0
     reach -= abs(t0) * half[0] + abs(t1) * half[1] + abs(t2) * half[2]
     for j in range(K.shape[1]):
+        # The residual was taken in the middle of the remainders, so each counts with half its width.
         radius = 0.5 * (nodes[j, HIGH] - nodes[j, LOW])
         if radius > 0.0:
             total = 0.0
@@ -118,6 +124,7 @@ def rounding(K: Array, weight: Array, floor: float, nodes: Array) -> float:
     size = floor
     for j in range(K.shape[1]):
         size += weight[j] * (abs(nodes[j, PHI]) + abs(nodes[j, LOW]) + abs(nodes[j, HIGH]))
+    # One rounding for each term of the sums over nodes and rows, and 32 for those within a node and in the slopes.
     return float((32 + K.shape[0] + K.shape[1]) * _ULP * size)
 
 
@@ -188,7 +195,7 @@ def shrink(K: Array, rho: float, plane: bool, nodes: Array, rows: Array, cut: Ar
         Working memory.
     """
     a00, a01, a02, a11, a12, a22, b0, b1, b2 = normal_of(rows)
-    if plane:
+    if plane:  # nothing depends on the third coordinate: any pivot will do
         a22 = a22 + 1.0
     if not inverse(a00, a01, a02, a11, a12, a22, solve):
         return
@@ -224,6 +231,7 @@ def uncut(half: Array, cut: Array) -> None:
 @compiled
 def clip(cut: Array, k: int, centre: float, reach: float) -> None:
     """Clip coordinate k of a box to ``|s - centre| <= reach``, with some slack for rounding."""
+    # The inverse that centre and reach come from is good to some digits less than a double.
     reach += 1e-9 * (abs(centre) + reach)
     cut[k], cut[3 + k] = max(cut[k], centre - reach), min(cut[3 + k], centre + reach)
 
@@ -238,7 +246,7 @@ def cut_out(cut: Array, at: Array, half: Array) -> float:
             return 0.0
         if low > -old or high < old:
             middle = at[k] + 0.5 * (low + high)
-            half[k] = min(0.5 * (high - low) * (1.0 + 1e-12) + 1e-15 * (abs(at[k]) + old), old)
+            half[k] = min(0.5 * (high - low) * (1.0 + _WIDER) + _SHIFT * (abs(at[k]) + old), old)
             at[k] = middle
             share *= half[k] / old
     return share
@@ -255,8 +263,6 @@ def is_empty(cut: Array) -> bool:
 # Columns of the stack (capacity, DEPTH): centre, half-widths, the bound of the box that it came from, and the piece of
 # an atlas that it lies in (0 in the near chart).
 CENTRE, HALF, LEAST, PIECE, DEPTH = 0, 3, 6, 7, 8
-# A half-width covers the rounding of its centre and corners: relative to itself, and to the sizes of these.
-_WIDER, _SHIFT = 1e-12, 1e-15
 
 
 @compiled

@@ -15,8 +15,15 @@ from optloc.proof.linear3 import invert, roughly_principal
 from optloc.proof.nodes.dispatch import size_of
 from optloc.proof.nodes.node import CURVE_WIDTH, H00, H01, H02, H11, H12, H22, NODE_WIDTH, RANGE
 
-# Nodes whose rows are tied to each other by less than this share count as independent.
+# Nodes whose rows are tied to each other by less than this share count as independent: what the rounding of whitened
+# rows leaves of an entry of K'K that is zero.
 _APART = 1e-13
+# Share of its diagonal that a pivot of a group's rows must exceed, and how far ties may be from -1, 0 and 1: a group
+# whose covariance has lost more digits bounds nothing.
+_PIVOT, _TIED = 1e-9, 1e-9
+# Search coordinates along which the information is less than this share of the best are not determined by the rows:
+# the square root, a ratio of standard deviations of three million, is beyond what doubles can tell.
+_DETERMINED = 1e-13
 # References of a group that needs none, and of one whose rows are too few.
 NONE, LOOSE = -1, -2
 
@@ -198,7 +205,7 @@ def _ties(kinds: Array, A: Array, member: Array, first: int, size: int, count: i
     for i in range(size):
         for j in range(size):
             own[i, j] = A[member[first + i], member[first + j]]
-    if size == 0 or not invert(own, size, 1e-9):
+    if size == 0 or not invert(own, size, _PIVOT):
         return False
     for i in range(size, count):
         tie[member[first + i]] = 0.0
@@ -207,7 +214,7 @@ def _ties(kinds: Array, A: Array, member: Array, first: int, size: int, count: i
         for j in range(size if size < count else 0):
             factor -= own[i, j] * A[member[first + j], member[first + size]]
         nearest = 0.0 if abs(factor) < 0.5 else (1.0 if factor > 0.0 else -1.0)
-        if not abs(factor - nearest) <= 1e-9 or (nearest != 0.0 and kinds[member[first + i]] != RANGE):
+        if not abs(factor - nearest) <= _TIED or (nearest != 0.0 and kinds[member[first + i]] != RANGE):
             return False
         tie[member[first + i]] = nearest
     return True
@@ -260,7 +267,7 @@ def chart_at(cost: Cost, x: Array, box: Box) -> tuple[Chart, bool]:
     good = True
     for k in range(D):
         length = information[k, k]
-        good = good and length > 1e-13 * most
+        good = good and length > _DETERMINED * most
         root = sqrt(length) if length > 0.0 else 1.0
         for m in range(3):
             sense[m, k], back[k, m] = gram[m, k] / root, gram[m, k] * root

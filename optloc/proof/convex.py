@@ -150,6 +150,7 @@ def convex(kinds: Array, A: Array, half: Array, nodes: Array, curves: Array, sum
             continue
         fall, rise = force_change(A, half, nodes, curves, j)
         if shape == CONVEX:
+            # A force times a positive semidefinite Hessian is least where the force is: no absolute values are lost.
             h0 += fall * curves[j, H00]
             h1 += fall * curves[j, H01]
             h2 += fall * curves[j, H02]
@@ -165,7 +166,7 @@ def convex(kinds: Array, A: Array, half: Array, nodes: Array, curves: Array, sum
             d2 += most * (abs(curves[j, H22]) + n2 + n4)
             away += (abs(curves[j, FORCE]) + most) * curves[j, CHI]
     h0, h3 = h0 - d0 - away, h3 - d1 - away
-    # In the plane nothing depends on the third coordinate.
+    # In the plane nothing depends on the third coordinate: any positive entry leaves the test to the others.
     h5 = 1.0 if half[2] == 0.0 and sums[H22] == 0.0 else h5 - d2 - away
     return positive(h0, h1, h2, h3, h4, h5)
 
@@ -235,6 +236,7 @@ def clip_to_stationary(
         e0, e1, e2 = e0 - (k == 0), e1 - (k == 1), e2 - (k == 2)
         reach = abs(e0) * h0 + abs(e1) * h1 + abs(e2) * h2 + abs(y0) * w0 + abs(y1) * w1 + abs(y2) * w2
         reach += sqrt(y0 * y0 + y1 * y1 + y2 * y2) * ball
+        # Search coordinates count standard deviations: a billionth of one, for the rounding of the gradient.
         clip(cut, k, -step, reach + 1e-9)
 
 

@@ -36,19 +36,23 @@ def around_node(
     c0, c1, c2, radius = ball_of(kind, data, least, most)
     if radius == inf:
         return
-    radius = max(radius, 0.0) * (1.0 + 1e-9)
+    radius = max(radius, 0.0) * (1.0 + _WIDER)
     c0, c1, c2 = c0 - x[0], c1 - x[1], c2 - x[2]
     for k in range(3):
         b0, b1, b2 = back[k, 0], back[k, 1], back[k, 2]
         centre = b0 * c0 + b1 * c1 + b2 * c2
-        reach = radius * sqrt(b0 * b0 + b1 * b1 + b2 * b2) + 1e-9 * abs(centre)
+        reach = radius * sqrt(b0 * b0 + b1 * b1 + b2 * b2) + _WIDER * abs(centre)
         lower[k], upper[k] = max(lower[k], centre - reach), min(upper[k], centre + reach)
 
 
 # Squared rows of ranges: linear in the position and one more unknown, they bound both.
 
-# A left inverse is exact to this share, and the slack of all bounds from an enclosure.
+# A left inverse is exact to this share, and the slack of all bounds from an enclosure: nothing beside its widths, which
+# are standard deviations or more.
 SLACK = 1e-6
+# Share of the diagonal that a pivot of normal equations must exceed, how far a left inverse may then be from one, and
+# what a ball and its centre are widened by: a weak geometry has no enclosure rather than a wrong one.
+_PIVOT, _INVERSE, _WIDER = 1e-9, 1e-7, 1e-9
 # Columns of a table of nodes: error at the fix, and how far from there the node may be; of its squared row, zero where
 # it has none: coefficients of the error (3), of the position and one more unknown (4), the same weighted (4), the left
 # inverse of all (4), and the weight in a sum of rows.
@@ -88,7 +92,7 @@ def around_squares(
             ties[j, WEIGHT] = ties[j, LEFT + 3]
         own, beta, alpha, square = _sums(R, member, ties, near, 0.0)
         alpha, beta, own = rho * alpha, rho * beta + rho * rho * square, near + own
-        if alpha >= 1.0:
+        if alpha >= 1.0:  # the errors can make up for any reference range
             return
         least, most = max(0.0, (own - beta) / (1.0 + alpha)), (own + beta) / (1.0 - alpha)
         middle, spread = 0.5 * (least + most), 0.5 * (most - least) * (1.0 + SLACK)
@@ -155,7 +159,7 @@ def _left_inverse(A: Array, nodes: Array, kinds: Array, member: Array, ties: Arr
         normal[2, 2] = 1.0
     if not ranges:
         normal[3, 3] = 1.0
-    if not invert(normal, 4, 1e-9):
+    if not invert(normal, 4, _PIVOT):
         return False
     for j in member:
         t0, t1, t2, t3 = ties[j, WEIGHTED], ties[j, WEIGHTED + 1], ties[j, WEIGHTED + 2], ties[j, WEIGHTED + 3]
@@ -235,6 +239,7 @@ def around_rays(kinds: Array, data: Array, x: Array, back: Array, swing: Array, 
         size = sqrt(gamma[0, i] ** 2 + gamma[1, i] ** 2 + gamma[2, i] ** 2) * reach[i]
         steep += size
         most += size * far[i]
+    # The widths grow with y itself; where they outgrow it, y is not bounded.
     if not steep < 1.0 - 1e-9:
         return
     most /= 1.0 - steep
@@ -243,7 +248,7 @@ def around_rays(kinds: Array, data: Array, x: Array, back: Array, swing: Array, 
         for i in range(count):
             pull = abs(back[k, 0] * gamma[0, i] + back[k, 1] * gamma[1, i] + back[k, 2] * gamma[2, i])
             wide += pull * reach[i] * (far[i] + most)
-        wide *= 1.0 + 1e-6
+        wide *= 1.0 + SLACK
         lower[k], upper[k] = max(lower[k], -wide), min(upper[k], wide)
 
 
@@ -279,7 +284,7 @@ def _inverts(gamma: Array, rows: Array, count: int, plane: bool) -> bool:
             total = 0.0
             for i in range(count):
                 total += gamma[k, i] * rows[i, m]
-            if not abs(total - (k == m)) < 1e-7:
+            if not abs(total - (k == m)) < _INVERSE:
                 return False
     return True
 

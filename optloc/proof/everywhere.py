@@ -45,12 +45,17 @@ from optloc.proof.nodes.node import H00, H11, H22
 # What a search finds: nothing, a cheaper point, another minimum below the level, no end within the budget, or a cost at
 # infinity below the level.
 CLEAR, CHEAPER, ANOTHER, SPENT, INFINITE = range(5)
+# Boxes on the stack: 2 D + 1 pieces, six slabs around each known minimum, and one box for each halving of the deepest.
 _CAPACITY = 2048
-# A box at infinity of this size whose cost is below the level is not split further.
+# A box at infinity of this size whose cost is below the level is not split further: across it the cost is the same to
+# many digits, so no smaller one would be dropped either.
 _TINY = 1e-5
-# Points closer to a minimum than this are that minimum, standard deviations.
+# Points closer to a minimum than this are that minimum, standard deviations: a descent ends that near.
 _SAME = 1e-3
+# Share of the steepest side's change that counts for all sides alike: nodes that are only enclosed have no slope.
 _ALIKE = 0.1
+# The test for stationary points is made where the cost at the centre is within so many levels: elsewhere the box is too
+# large, or its bound will do when it is halved.
 _NEAR = 100.0
 
 
@@ -119,6 +124,7 @@ def search_everywhere(
             continue
         if here < level:
             lows += 1
+            # At the first, second, fourth, eighth ... low centre: found early, and seldom looked for in vain.
             if lows & (lows - 1) == 0 and _another(cost, atlas, chart, near, level, found):
                 return ANOTHER, boxes, 0.0
         if touching and max(box.half[0], box.half[1], box.half[2]) < _TINY and _at_infinity(cost, atlas, box) < level:
@@ -230,6 +236,7 @@ def _leaves(cost: Cost, atlas: Atlas, box: Box, touching: bool) -> bool:
         for m in range(3):
             entry = _entry(k, m)
             change += (abs(sums[entry]) + sums[C00 + entry]) * h[m]
+        # As everywhere in search coordinates: slack for the rounding of sums, relative and of a standard deviation.
         slope, change = sums[G0 + k], change * (1.0 + 1e-6) + 1e-9
         if -slope > change or (k < atlas.dimension - 1 and slope > change):
             return True
@@ -258,7 +265,7 @@ def _bends_down(box: Box, ball: float) -> bool:
             z = vectors[k, column] * vectors[m, column]
             most += sums[entry] * z + sums[C00 + entry] * abs(z)
     size = abs(sums[H00]) + abs(sums[H11]) + abs(sums[H22])
-    return bool(most < -1e-9 * size)
+    return bool(most < -1e-9 * size)  # by more than the rounding of the Hessian's entries
 
 
 @compiled
@@ -278,9 +285,9 @@ def _at_infinity(cost: Cost, atlas: Atlas, box: Box) -> float:
 
 # A verdict beside those of `optloc.proof.near`: the cost at infinity is within the gap.
 UNBOUNDED = 8
-# Boxes after which the search of an enclosure is given up for the atlas, which takes some hundred.
+# Boxes after which the search of an enclosure is given up for the atlas, which takes some hundred itself.
 _SOON = 500
-# Distance, relative to that of the fix, within which two minima are the same.
+# Distance, relative to that of the fix, within which two minima are the same: a descent's own accuracy.
 _CLOSE = 1e-3
 
 

@@ -24,9 +24,10 @@ from optloc.proof.nodes.node import (
     GROWS,
 )
 
-# How little the coefficients of ranges in a row may sum to, relative to their sizes.
+# How little the coefficients of ranges in a row may sum to, relative to their sizes: zero but for whitening's rounding.
 _BALANCED = 1e-12
-# Half-width of the cube, reaches of the stations.
+# Half-width of the cube, reaches of the stations: with a margin, so that no station touches a face, where lines to it
+# would vanish.
 _REACHES = 1.25
 
 
@@ -92,9 +93,11 @@ def accuracy_floor_far(cost: Cost, atlas: Atlas) -> float:
 
 # The surroundings of a known minimum in an atlas: its principal axes, and a box in which it is the only minimum.
 
-# No convex box is looked for beyond this many standard deviations, nor nearer to infinity than a tenth of the way.
+# No convex box is looked for beyond this many standard deviations: a fix so well determined needs none wider. Nor
+# nearer to infinity than a tenth of the way, where its coordinates end.
 _WIDEST, _SHARE = 1e4, 0.9
-# The box searched along the axes: convex boxes, and standard deviations at least.
+# The box searched along the axes of a minimum: convex boxes, and standard deviations at least. Beyond it the cost is
+# high enough for boxes along the axes of space.
 _WIDER, _WIDE = 3.0, 3.0
 
 

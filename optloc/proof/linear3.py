@@ -11,6 +11,7 @@ from optloc.compute.jit import compiled
 @compiled
 def positive(a: float, b: float, c: float, d: float, e: float, f: float) -> bool:
     """Return whether the matrix [[a, b, c], [b, d, e], [c, e, f]] is positive definite, rounding taken against it."""
+    # Some thousand times the rounding of the entries, which are sums over rows: what then is positive is so indeed.
     shift = 1e-12 * (abs(a) + abs(d) + abs(f))
     a, d, f = a - shift, d - shift, f - shift
     if not a > 0.0:
@@ -28,6 +29,7 @@ def principal(matrix: Array, vectors: Array) -> None:
 @compiled
 def roughly_principal(matrix: Array, vectors: Array) -> None:
     """Make a positive definite 3x3 matrix nearly diagonal: correlations of a hundredth are left."""
+    # Search coordinates need be no exact axes: at a hundredth a box is no worse, and a sweep or two is spared.
     _rotate_until(matrix, vectors, 1e-2)
 
 
@@ -36,9 +38,10 @@ def _rotate_until(matrix: Array, vectors: Array, correlation: float) -> None:
     for i in range(3):
         for j in range(3):
             vectors[i, j] = 1.0 if i == j else 0.0
-    for _ in range(12):
+    for _ in range(12):  # Jacobi's sweeps converge quadratically: a handful reaches the rounding
         b, c, e = matrix[0, 1], matrix[0, 2], matrix[1, 2]
         a, d, f = abs(matrix[0, 0]), abs(matrix[1, 1]), abs(matrix[2, 2])
+        # Some units in the last place: smaller entries are rounding, and no rotation takes them away.
         if not abs(b) + abs(c) + abs(e) > 1e-15 * (a + d + f):
             return
         share = correlation * correlation
@@ -54,6 +57,7 @@ def _rotate(matrix: Array, vectors: Array, p: int, q: int) -> None:
     away = matrix[p, q]
     if away == 0.0:
         return
+    # The smaller of the two angles that make the entry zero: the order of the axes stays, and nothing cancels.
     ratio = (matrix[q, q] - matrix[p, p]) / (2.0 * away)
     tangent = (1.0 if ratio >= 0.0 else -1.0) / (abs(ratio) + sqrt(1.0 + ratio * ratio))
     cosine = 1.0 / sqrt(1.0 + tangent * tangent)
@@ -73,6 +77,7 @@ def inverse(a: float, b: float, c: float, d: float, e: float, f: float, out: Arr
     """Write the inverse of [[a, b, c], [b, d, e], [c, e, f]] into out (3, 3); return False where it is singular."""
     u, v, t = d * f - e * e, c * e - b * f, b * e - c * d
     determinant = a * u + b * v + c * t
+    # Cancelled to its last four digits: an inverse would be noise.
     if not abs(determinant) > 1e-12 * (abs(a * u) + abs(b * v) + abs(c * t)):
         return False
     scale = 1.0 / determinant

@@ -35,8 +35,15 @@ from optloc.proof.nodes.node import FORCE, H00, H01, H02, H11, H12, H22, HIGH, L
 
 # A few damped Newton steps in search coordinates: which minimum a low point belongs to.
 
+# Steps of a descent: damped Newton needs five to ten from a box near a minimum; beyond forty it creeps along a valley.
 _STEPS = 40
+# A step of so many standard deviations ends it: the next one, of Newton's, would be a millionth.
 _CLOSE = 1e-3
+# Damping at first, its factors after a step that was good and one that was not, and from where on it grows again. Steps
+# that are damped by more than the last are no Newton steps, and do not end a descent.
+_DAMPING, _LESS, _MORE, _LEAST, _FREE = 1e-6, 0.1, 10.0, 1e-4, 1e-3
+# Rounding of two costs of the same point, relative and absolute: a step may raise the cost by it.
+_SAME_COST = 1e-14
 
 
 @compiled
@@ -48,7 +55,7 @@ def descend(cost: Cost, chart: Chart, box: Box) -> float:
     """
     box.half[:] = 0.0
     start = box.at.copy()
-    cost_now, damping = value_at(cost, chart, box), 1e-6
+    cost_now, damping = value_at(cost, chart, box), _DAMPING
     curve_box(cost, chart, box)
     for _ in range(_STEPS):
         length = _step(cost, box, damping)
@@ -58,19 +65,19 @@ def descend(cost: Cost, chart: Chart, box: Box) -> float:
         for k in range(3):
             box.at[k] -= box.solve[0, k]
         after = value_at(cost, chart, box)
-        if after <= cost_now * (1.0 + 1e-14) + 1e-14:
+        if after <= cost_now * (1.0 + _SAME_COST) + _SAME_COST:
             cost_now = after
             curve_box(cost, chart, box)
-            if length < _CLOSE * _CLOSE and damping <= 1e-3:
+            if length < _CLOSE * _CLOSE and damping <= _FREE:
                 sums = box.sums
                 good = positive(
                     sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], sums[H22] if sums[H22] != 0.0 else 1.0
                 )
                 return cost_now if good else float("inf")
-            damping *= 0.1
+            damping *= _LESS
         else:
             box.at[:] = start
-            damping = max(10.0 * damping, 1e-4)
+            damping = max(_MORE * damping, _LEAST)
     return float("inf")
 
 
@@ -82,6 +89,7 @@ def _step(cost: Cost, box: Box, damping: float) -> float:
     if h5 == 0.0:
         h5 = 1.0
     if not positive(h0, h1, h2, h3, h4, h5):
+        # Less the curvature of the nodes, Gauss and Newton's information is left, which always falls.
         for j in range(box.curves.shape[0]):
             force = box.curves[j, FORCE]
             h0 -= force * box.curves[j, H00]
@@ -189,6 +197,7 @@ def branch(
         here = cost_at(K, w, nodes)
         if here < aim.better:
             return CHEAPER, boxes, 0.0
+        # What cannot hold a residual shorter than rho, and below what no minimum, is cut off from all sides.
         uncut(half, cut)
         shrink(K, rho + rounding(K, weight, aim.floor, nodes), half[2] == 0.0, nodes, rows, cut, solve)
         if unique or aim.whole:
@@ -265,7 +274,7 @@ def cut_side(kinds: Array, K: Array, gram: Array, half: Array, nodes: Array, row
             c = abs(gram[1, 2] * h1 * h2 - e1 * e2)
             x, y = gram[0, 0] * h0 * h0 - e0 * e0 + a + b, gram[1, 1] * h1 * h1 - e1 * e1 + a + c
             z = gram[2, 2] * h2 * h2 - e2 * e2 + b + c
-            pull = abs(pull) * wide / (x + y + z + 1e-300)
+            pull = abs(pull) * wide / (x + y + z + 1e-300)  # no width at all: not 0 / 0
             t0 += pull * x
             t1 += pull * y
             t2 += pull * z
@@ -284,8 +293,15 @@ def _widest(half: Array) -> int:
 
 # Boxes around minima on which the cost is convex: no second minimum fits in.
 
-# What is left of a box that is not convex, and how often it is made smaller.
+# What is left of a box that is not convex: a third of its volume. And how often it is made smaller: a hull of a billion
+# standard deviations comes down to half of one.
 _SHARE, _SHRINKS = 0.7, 60
+# Half-width from which on an enclosure is none: its products would overflow.
+_ENDLESS = 1e300
+# Corners of what is searched are moved out by this share, for the rounding of the enclosure.
+_OUTWARDS = 1e-9
+# Other minima must be known to a hundredth of a standard deviation: margin of convexity over slope.
+_POLISHED = 100.0
 
 
 @inlined
@@ -388,7 +404,9 @@ def prove(
         return STATIONARY, 0, -inf
     if kappa <= 0.0:
         known = 1
-    aim = Aim(level, least - eps, least - 0.5 * eps, closed or isnan(lower[0]), accuracy_floor(cost, chart))
+    # Halfway between: a point found to cost less does so by more than rounding, and no box is left that does by less.
+    better, whole = least - 0.5 * eps, closed or isnan(lower[0])
+    aim = Aim(level, value=least - eps, better=better, whole=whole, floor=accuracy_floor(cost, chart))
     stack = np.empty((_CAPACITY, DEPTH))
     size = push_around(stack, 0, low, high, sides[0], 0)
     outcome, boxes, bound = branch(cost, chart, box, minima[:known], sides[:known], aim, budget, stack, size)
@@ -416,10 +434,10 @@ def _start(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper: 
             low[k], high[k] = middle - reach, middle + reach
     widest = 0.0
     for k in range(3):
-        slack = 1e-9 * (1.0 + abs(low[k]) + abs(high[k])) if high[k] > low[k] else 0.0
+        slack = _OUTWARDS * (1.0 + abs(low[k]) + abs(high[k])) if high[k] > low[k] else 0.0
         low[k], high[k] = low[k] - slack, high[k] + slack
         widest = max(widest, abs(low[k]), abs(high[k]))
-    return widest < 1e300
+    return widest < _ENDLESS
 
 
 @inlined
@@ -442,8 +460,8 @@ def _minima(
             if not is_convex(cost, chart, box, 0.0):
                 continue
             sums = box.sums
-            # Within a hundredth of a standard deviation of its minimum.
-            margin = 100.0 * sqrt(sums[G0] * sums[G0] + sums[G1] * sums[G1] + sums[G2] * sums[G2])
+            # Where the Hessian exceeds a margin, the minimum is within slope / margin of any point.
+            margin = _POLISHED * sqrt(sums[G0] * sums[G0] + sums[G1] * sums[G1] + sums[G2] * sums[G2])
         for k in range(3):
             hull[k] = max(high[k] - box.at[k], box.at[k] - low[k], 0.0)
         if set_convex(cost, chart, box, hull, margin):

@@ -167,17 +167,20 @@ def _with_row(pose: Posed, kind: int, numbers: Array, value: Array, scale: Array
 
 # Gaps to other minima that are tried to prove, one after the other; the last is the value alone.
 _MARGINS = (LISTED_GAP, AMBIGUOUS_GAP, 0.0)
+# Rounds of proof and repair: every margin may be lowered and the region tried, with a few minima found in between.
 _ROUNDS = 6
 # Boxes for the proof of a gap and of the value, with up to so many nodes. Plain Python takes a thousand times longer
 # for each: a budget of all.
-_BUDGETS, _NODES, _SLOW_BUDGET = (3000, 8000), 12, 2000
-# Cost that counts as equal, relative: covers the rounding of two ways to compute it.
+_BUDGETS, _NODES, _SLOW_BUDGET, _AT_LEAST = (3000, 8000), 12, 2000, 5
+# Cost that counts as equal, relative: covers the rounding of two ways to compute it, and is nothing beside the gap of 9
+# at which a second minimum matters.
 _EQUAL = 1e-6
-# Minima behind the Earth that are set aside at most.
+# Minima behind the Earth that are set aside at most: mirror images through it; whoever has more gets no proof.
 _HIDDEN = 4
 # How far around such a minimum everything must be hidden too, metres: its convex box is smaller.
 _DEEP = 5e4
-# Half-width of the region where all positions cannot be bounded: spreads of the stations, distances of the fix.
+# Half-width of the region where all positions cannot be bounded: spreads of the stations, or distances of the fix, so
+# that it lies well inside either way.
 _SPREADS, _DISTANCES = 10.0, 2.0
 
 
@@ -321,7 +324,7 @@ def _asked(work: Work, items: Array, extra: Array) -> Asked:
 def _budgets(kappa: Array, nodes: int, effort: int) -> Array:
     """Return the boxes (n,) that proofs may take: a box takes time with the square of the nodes."""
     if not enabled():
-        return np.full(len(kappa), max(5, _SLOW_BUDGET // len(kappa)))
+        return np.full(len(kappa), max(_AT_LEAST, _SLOW_BUDGET // len(kappa)))
     share = max(1.0, (nodes / _NODES) ** 2) / effort
     return np.asarray(np.where(kappa > 0.0, *_BUDGETS) / share).astype(np.int64)
 
@@ -389,6 +392,7 @@ def _ignore(work: Work, items: Array, points: Array) -> Array:
     part = problem.take(items)
     done = refine(part, vectors(part, points[:, None])[:, 0], face=exact(problem))
     place = problem.layout.take(done.x, "position")
+    # The same minimum, refined twice: metres in Earth-centred coordinates.
     known = (np.abs(work.ignored[items] - place[:, None]) <= 1e-6 * np.abs(place[:, None])).all(-1).any(1)
     fresh = _deep(part, done.x) & ~known
     more = np.full((len(work.ignored), 1, place.shape[-1]), np.nan)
