@@ -72,7 +72,7 @@ def search_everywhere(
     Parameters
     ----------
     cost : Cost
-        The cost; `optloc.proof.nodes.far.reaches_infinity` holds.
+        The cost; `optloc.proof.far.reaches_infinity` holds.
     atlas : Atlas
         The pieces, known minima among them.
     chart : Chart

@@ -21,7 +21,7 @@ from optloc.proof.nodes.node import LINEAR, RANGE, Node, Row
 
 # From rows of measurements to nodes: which scalar functions the rows are sums of, and their numbers.
 
-# Cosine below which two columns of whitened rows count as orthogonal: whitening rounds to some digits less than doubles.
+# Cosine below which two columns of whitened rows count as orthogonal: whitening costs some digits of a double.
 _ORTHOGONAL = 1e-9
 
 
