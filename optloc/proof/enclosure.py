@@ -293,8 +293,9 @@ def _inverts(gamma: Array, rows: Array, count: int, plane: bool) -> bool:
 def enclose(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper: Array) -> bool:
     """Enclose all points with ``|K phi(x) - w| <= rho`` in a box of search coordinates around a fix.
 
-    Within a group of nodes (`optloc.proof.chart.Groups`) the errors obey ``|m.e| <= rho sqrt(m'R m)`` for every m. Ranges and
-    linear forms are squared to equations linear in position and one more unknown; other nodes give balls of their own.
+    Within a group of nodes (`optloc.proof.chart.Groups`) the errors obey ``|m.e| <= rho sqrt(m'R m)`` for every m. Ranges
+    and linear forms are squared to equations linear in position and one more unknown; other nodes give balls of their
+    own.
 
     Parameters
     ----------
@@ -319,7 +320,7 @@ def enclose(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper:
     for k in range(3):
         plane = sense[0, k] == 0.0 and sense[1, k] == 0.0 and sense[2, k] == 0.0
         lower[k], upper[k] = (0.0, 0.0) if plane else (-inf, inf)
-    ties[:, SWING] = inf
+    ties[:, SWING] = inf  # until a group says how far
     for number in range(kinds.shape[0]):
         count, reference = order[1, number], order[2, number]
         if count == 0:
@@ -327,7 +328,7 @@ def enclose(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper:
         size = count if reference < 0 else count - 1
         own, member = R[first : first + size, first : first + size], order[0, first : first + size]
         first += count
-        if reference == LOOSE:
+        if reference == LOOSE:  # its rows are too few to say anything of one node
             continue
         for i in range(size):
             j, error = member[i], 0.0

@@ -161,6 +161,7 @@ def without(unknowns: Array, values: Array) -> Array:
     length = np.sqrt((unknowns**2).sum(-2, keepdims=True))
     u, s, _ = np.linalg.svd(unknowns / np.where(length > 0.0, length, 1.0), full_matrices=False)
     basis = u * (s > 1e-12 * np.maximum(s[..., :1], 1e-300))[..., None, :]
+    # Twice: what rounding leaves of the first projection is as large as the values, and they may be large.
     once = values - basis @ (np.swapaxes(basis, -1, -2) @ values)
     return np.asarray(once - basis @ (np.swapaxes(basis, -1, -2) @ once))
 
@@ -182,6 +183,7 @@ def compressed(K: Array, w: Array) -> tuple[Array, Array]:
     inside = (np.swapaxes(basis, -1, -2) @ w[..., None])[..., 0]
     rest = w - (basis @ inside[..., None])[..., 0]
     last = np.sqrt((rest**2).sum(-1, keepdims=True))
+    # What no position can fit stands in a row of its own, so that the cost keeps its value.
     upper = np.concatenate([upper, np.zeros((*upper.shape[:-2], 1, nodes))], axis=-2)
     return upper, np.concatenate([inside, last], axis=-1)
 
@@ -216,6 +218,7 @@ def with_alone(kinds: Array, data: Array, K: Array, w: Array) -> Array:
     alone = others <= _ORTHOGONAL * size * size.max(-1, keepdims=True)
     force = (np.swapaxes(K, -1, -2) @ w[..., None])[..., 0]
     centred = (np.abs(force) <= _ORTHOGONAL * size * np.linalg.norm(w, axis=-1, keepdims=True)).all(0)
+    # Of a column that is orthogonal to all others, the least squares: the value that the rows say of the node.
     with np.errstate(invalid="ignore", divide="ignore"):
         measured = np.where(size > 0.0, force / size**2, 0.0)
     differs = any(NODES[kinds[j]].differs for j in marked)
@@ -270,6 +273,7 @@ def posed(problem: Problem) -> Posed:
     problem = weighed(problem)
     others = _Others.of(problem)
     known = problem.observed - (others.touch @ others.mean[..., None])[..., 0]
+    # Absent rows have weight zero, and any finite value will do.
     usable = (problem.weight > 0.0) & np.isfinite(known)
     known = np.where(usable, known, 0.0)
     made = columns_of(problem, known)
@@ -319,6 +323,7 @@ class _Others:
         epoch = problem.epoch
         for row, node, coefficient in zip(made.row, made.column, made.coefficient, strict=True):
             own = columns(problem.layout, "stations", epoch[row : row + 1])[0]
+            # Isotropic, so any axis stands for the line to the target: the first of the station's d.
             touch[row, own[made.station[node] * d]] += coefficient
         return _Others(touch, self.precision, self.mean)
 
@@ -339,11 +344,12 @@ def _projected(problem: Problem, made: Columns, others: _Others, value: Array) -
     touch, precision = others.touch[:, used], others.precision[:, used][:, :, used]
     geometry = whitened(noise, np.concatenate([made.design, touch], axis=1))
     geometry = geometry if geometry.ndim == 3 else geometry[None]
-    shared = len(geometry) == len(precision) == 1
+    shared = len(geometry) == len(precision) == 1  # one template, many measurements: the usual batch
     # Measurements of all problems are the columns of one matrix where everything else is shared.
     seen = whitened(noise, value.T if shared else value[..., None])
     seen = seen if seen.ndim == 3 else seen[None]
     if used.any():
+        # A prior is a row for the unknown itself; one without a prior has a row of zeros.
         size = max(len(geometry), len(precision))
         tail = np.zeros((size, touch.shape[1], J + touch.shape[1]))
         tail[..., J:] = roots(precision)
