@@ -293,9 +293,9 @@ def _inverts(gamma: Array, rows: Array, count: int, plane: bool) -> bool:
 def enclose(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper: Array) -> bool:
     """Enclose all points with ``|K phi(x) - w| <= rho`` in a box of search coordinates around a fix.
 
-    Within a group of nodes (`optloc.proof.chart.Groups`) the errors obey ``|m.e| <= rho sqrt(m'R m)`` for every m. Ranges
-    and linear forms are squared to equations linear in position and one more unknown; other nodes give balls of their
-    own.
+    Within a group of nodes (`optloc.proof.chart.Groups`) the errors obey ``|m.e| <= rho sqrt(m'R m)`` for every m.
+    Ranges and linear forms are squared to equations linear in position and one more unknown; other nodes give balls of
+    their own.
 
     Parameters
     ----------
