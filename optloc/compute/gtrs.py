@@ -25,12 +25,16 @@ _WEAK = 1e-7
 # Relative change of y below which the last, polishing step squares the error away: 1e-14.
 _SETTLED = 1e-7
 
+# Numbers of each lane in the scratch of `minimise`, behind its matrices and vectors.
+MULTIPLIER, BEND, TODO, LEAST, VALUE, LAST, DEFINITE = range(7)
+_NUMBERS = 7
+
 
 @compiled
 def scratch(n: int) -> int:
     """Return how many rows of lanes `minimise` needs as scratch for y of length n."""
-    # Two matrices, five vectors and seven numbers of each lane: see the split in `minimise`.
-    return 2 * n * n + 5 * n + 7
+    # Two matrices, five vectors and some numbers of each lane: see the split in `minimise`.
+    return 2 * n * n + 5 * n + _NUMBERS
 
 
 @compiled
@@ -60,16 +64,9 @@ def minimise(rows: Array, on_cone: bool, y: Array, settled: Array, work: Array) 
     A, lower = work[: n * n].reshape(n, n, LANES), work[n * n : 2 * n * n].reshape(n, n, LANES)
     rest = work[2 * n * n :]
     b, inverse, across, p = rest[:n], rest[n : 2 * n], rest[2 * n : 3 * n], rest[3 * n : 4 * n]
-    slope, spare = rest[4 * n : 5 * n], rest[5 * n : 5 * n + 7]
-    multiplier, bend, todo, least, value, last, definite = (
-        spare[0],
-        spare[1],
-        spare[2],
-        spare[3],
-        spare[4],
-        spare[5],
-        spare[6],
-    )
+    slope, spare = rest[4 * n : 5 * n], rest[5 * n : 5 * n + _NUMBERS]
+    multiplier, todo, least, value = spare[MULTIPLIER], spare[TODO], spare[LEAST], spare[VALUE]
+    last, definite, bend = spare[LAST], spare[DEFINITE], spare[BEND]
     _normal(rows, A, b, least)
     for lane in range(LANES):
         # Least squares without the constraint is the start: multiplier zero, inside where B'B is definite.
@@ -163,8 +160,9 @@ def _advance(y: Array, across: Array, p: Array, on_cone: bool, spare: Array, fre
     Newton's step; a step that left the definite interval is halved.
     """
     n = len(y)
-    multiplier, bend, todo, last, definite = spare[0], spare[1], spare[2], spare[5], spare[6]
-    value, big, far = spare[4], free[0], free[1]
+    multiplier, todo, value = spare[MULTIPLIER], spare[TODO], spare[VALUE]
+    last, definite, bend = spare[LAST], spare[DEFINITE], spare[BEND]
+    big, far = free[0], free[1]
     _value(y, across, on_cone, value)
     for lane in range(LANES):
         bend[lane], big[lane], far[lane] = 0.0, 0.0, 0.0

@@ -15,8 +15,30 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled
-from optloc.compute.pack import Numbers, Packed
-from optloc.compute.tables import Tables
+from optloc.compute.pack import AT, FULL, PRIOR_LOCAL, PRIOR_SIZE, PRIOR_START, Numbers, Packed
+from optloc.compute.tables import (
+    DERIVATIVE,
+    FIRST,
+    GROUP_COLUMN,
+    GROUP_ROWS,
+    KIND_CODE,
+    KIND_CONSTANT,
+    KIND_INPUT,
+    KIND_PERIODIC,
+    KIND_VALUE,
+    REGISTER,
+    ROW_ADDEND,
+    ROW_NUMBER,
+    ROW_PLACE,
+    ROW_SCALE,
+    ROW_SOURCE,
+    ROW_WIDTH,
+    SOURCE_FEED,
+    SOURCE_NUMBER,
+    TERM_COLUMN,
+    TERM_SLOT,
+    Tables,
+)
 from optloc.compute.trace import ADD, ATAN2, COS, DIV, HYPOT, LOG, MUL, NEG, SIN, SQRT, SUB
 
 # Working memory of a block of lanes, and where everything stands in it.
@@ -66,7 +88,7 @@ def arrange(t: Tables, c: Numbers, size: int) -> Room:
     """Return where things stand for problems of p = `size` unknowns."""
     n, local, largest = t.shared, t.local, 0
     for i in range(t.groups, c.place.shape[0]):
-        largest = max(largest, c.place[i, 2])
+        largest = max(largest, c.place[i, PRIOR_SIZE])
     own = 0
     observed = own + c.source.shape[1] + c.white.shape[1] + c.prior.shape[1]
     present = observed + c.observed.shape[1]
@@ -223,22 +245,23 @@ def measure(t: Tables, common: Array, m: Array, r: Array, room: Room, packet: in
     index, together = t.table, LENGTH // max(1, min(lanes, LENGTH))
     for number in range(t.kinds):
         kind, part = t.kind + number, t.part + packet * (t.kinds + 1) + number
-        for row in range(index[part, 0], index[part + 1, 0], together):
-            end = min(row + together, index[part + 1, 0])
-            count, begin = (end - row) * lanes, t.input + index[kind, 2]
+        for row in range(index[part, FIRST], index[part + 1, FIRST], together):
+            end = min(row + together, index[part + 1, FIRST])
+            count, begin = (end - row) * lanes, t.input + index[kind, KIND_INPUT]
             _inputs(t, common, m, room.own, r, begin, row, end, x, lanes)
-            for i in range(index[kind, 1], index[kind + 1, 1]):
+            for i in range(index[kind, KIND_CONSTANT], index[kind + 1, KIND_CONSTANT]):
                 for j in range(count):
-                    r[index[t.constant + i, 0], j] = t.real[i]
-            run(index, t.code + index[kind, 0], t.code + index[kind + 1, 0], r, count)
+                    r[index[t.constant + i, REGISTER], j] = t.real[i]
+            run(index, t.code + index[kind, KIND_CODE], t.code + index[kind + 1, KIND_CODE], r, count)
             for one in range(row, end):
                 line, low = t.row + one, (one - row) * lanes
-                to = room.rows + index[line, 1] * t.width
+                to = room.rows + index[line, ROW_PLACE] * t.width
                 _derivatives(t, m, r, begin, line, low, to, lanes)
-                _measurement(t, m, r, index[kind, 3], line, low, to, x, room.scale, lanes)
-                _residual(m, to + index[line, 2], room.observed + index[line, 0], index[kind, 4], lanes)
+                _measurement(t, m, r, index[kind, KIND_VALUE], line, low, to, x, room.scale, lanes)
+                value, seen = to + index[line, ROW_WIDTH], index[line, ROW_NUMBER]
+                _residual(m, value, room.observed + seen, index[kind, KIND_PERIODIC], lanes)
                 if room.absent:
-                    _mask(m, to + index[line, 2], room.present + index[line, 0], lanes)
+                    _mask(m, value, room.present + seen, lanes)
 
 
 @compiled
@@ -248,18 +271,18 @@ def _inputs(
     """Write the inputs of rows of one kind, which `begin` in the table of inputs, into their registers."""
     index = t.table
     for one in range(row, end):
-        low, source = (one - row) * lanes, index[t.row + one, 3]
-        for i in range(index[t.row + one + 1, 3] - source):
-            to, line = index[begin + i, 0], t.source + source + i
-            place = index[line, 0]
+        low, source = (one - row) * lanes, index[t.row + one, ROW_SOURCE]
+        for i in range(index[t.row + one + 1, ROW_SOURCE] - source):
+            to, line = index[begin + i, REGISTER], t.source + source + i
+            place = index[line, SOURCE_NUMBER]
             if place >= 0:
                 for b in range(lanes):
                     r[to, low + b] = common[place]
             else:
                 for b in range(lanes):
                     r[to, low + b] = m[own - 1 - place, b]
-            for f in range(index[line, 1], index[line + 1, 1]):
-                column, factor = x + index[t.term + f, 0], t.real[t.factor + f]
+            for f in range(index[line, SOURCE_FEED], index[line + 1, SOURCE_FEED]):
+                column, factor = x + index[t.term + f, TERM_COLUMN], t.real[t.factor + f]
                 for b in range(lanes):
                     r[to, low + b] += factor * m[column, b]
 
@@ -268,15 +291,15 @@ def _inputs(
 def _derivatives(t: Tables, m: Array, r: Array, begin: int, line: int, low: int, to: int, lanes: int) -> None:
     """Write the derivatives of h of one row by the unknowns that move its inputs."""
     index = t.table
-    source = index[line, 3]
-    for j in range(index[line, 2]):
+    source = index[line, ROW_SOURCE]
+    for j in range(index[line, ROW_WIDTH]):
         for b in range(lanes):
             m[to + j, b] = 0.0
-    for i in range(index[line + 1, 3] - source):
-        place = index[begin + i, 1]
+    for i in range(index[line + 1, ROW_SOURCE] - source):
+        place = index[begin + i, DERIVATIVE]
         if place >= 0:
-            for f in range(index[t.source + source + i, 1], index[t.source + source + i + 1, 1]):
-                cell, factor = to + index[t.term + f, 1], t.real[t.factor + f]
+            for f in range(index[t.source + source + i, SOURCE_FEED], index[t.source + source + i + 1, SOURCE_FEED]):
+                cell, factor = to + index[t.term + f, TERM_SLOT], t.real[t.factor + f]
                 for b in range(lanes):
                     m[cell, b] += factor * r[place, low + b]
 
@@ -287,7 +310,8 @@ def _measurement(
 ) -> None:
     """Write the value of one row behind its derivatives, and what scales and offsets do to both."""
     index = t.table
-    value, first, last, end = to + index[line, 2], index[line, 4], index[line + 1, 4], index[line + 1, 5]
+    value, end = to + index[line, ROW_WIDTH], index[line + 1, ROW_ADDEND]
+    first, last = index[line, ROW_SCALE], index[line + 1, ROW_SCALE]
     for b in range(lanes):
         m[value, b] = r[place, low + b]
     # Rows without a scale, nearly all of them, are left as they are.
@@ -296,17 +320,18 @@ def _measurement(
             m[scale, b] = 1.0
         for i in range(first, last):
             for b in range(lanes):
-                m[scale, b] += t.real[t.factor + i] * m[x + index[t.term + i, 0], b]
+                m[scale, b] += t.real[t.factor + i] * m[x + index[t.term + i, TERM_COLUMN], b]
         for cell in range(to, value):
             for b in range(lanes):
                 m[cell, b] *= m[scale, b]
         for i in range(first, last):
             for b in range(lanes):
-                m[to + index[t.term + i, 1], b] += t.real[t.factor + i] * m[value, b]
+                m[to + index[t.term + i, TERM_SLOT], b] += t.real[t.factor + i] * m[value, b]
         for b in range(lanes):
             m[value, b] *= m[scale, b]
-    for i in range(index[line, 5], end):
-        factor, cell, column = t.real[t.factor + i], to + index[t.term + i, 1], x + index[t.term + i, 0]
+    for i in range(index[line, ROW_ADDEND], end):
+        cell, column = to + index[t.term + i, TERM_SLOT], x + index[t.term + i, TERM_COLUMN]
+        factor = t.real[t.factor + i]
         for b in range(lanes):
             m[cell, b] += factor
         for b in range(lanes):
@@ -360,11 +385,11 @@ def gather(t: Tables, c: Numbers, m: Array, r: Array, room: Room, priors: bool, 
     clear(m, room.after, (last + 1) ** 2, lanes)
     for packet in range(t.packets):
         measure(t, c.common, m, r, room, packet, room.trial, lanes)
-        for group in range(t.table[t.packet + packet, 0], t.table[t.packet + packet + 1, 0]):
+        for group in range(t.table[t.packet + packet, FIRST], t.table[t.packet + packet + 1, FIRST]):
             add_group(t, c.common, c.place, m, room, group, lanes)
     for i in range(t.groups, c.place.shape[0] if priors else t.groups):
-        start = c.place[i, 1] + (t.shared if c.place[i, 3] else 0)
-        add_prior(c.common, c.place[i, 0], c.place[i, 2], m, room, room.trial + start, start, last, lanes)
+        start = c.place[i, PRIOR_START] + (t.shared if c.place[i, PRIOR_LOCAL] else 0)
+        add_prior(c.common, c.place[i, AT], c.place[i, PRIOR_SIZE], m, room, room.trial + start, start, last, lanes)
 
 
 @compiled
@@ -379,9 +404,10 @@ def clear(m: Array, first: int, count: int, lanes: int) -> None:
 def add_group(t: Tables, common: Array, place: Array, m: Array, room: Room, group: int, lanes: int) -> None:
     """Add the whitened rows of a group to the equations in `room.after`."""
     line = t.group + group
-    columns, column = t.table[line + 1, 3] - t.table[line, 3] + 1, t.column + t.table[line, 3]
+    begin, size = t.table[line, GROUP_COLUMN], t.table[line, GROUP_ROWS]
+    columns = t.table[line + 1, GROUP_COLUMN] - begin + 1
     first = whiten_group(t, common, place, m, room, group, False, lanes)
-    _square(t.table, column, m, first, t.width, t.table[line, 1], columns, room.after, t.shared + t.local, lanes)
+    _square(t.table, t.column + begin, m, first, t.width, size, columns, room.after, t.shared + t.local, lanes)
 
 
 @compiled
@@ -390,10 +416,11 @@ def whiten_group(
 ) -> int:
     """Whiten the rows of a group, or their residuals alone, and return the cell of the first."""
     line = t.group + group
-    columns = t.table[line + 1, 3] - t.table[line, 3]
-    begin = room.rows + t.table[line, 0] * t.width + (columns if residual else 0)
-    count, size = (1 if residual else columns + 1), t.table[line, 1]
-    _whiten(common, place[group, 0], place[group, 1], m, room.own, begin, t.width, size, count, room.whitened, lanes)
+    columns = t.table[line + 1, GROUP_COLUMN] - t.table[line, GROUP_COLUMN]
+    begin = room.rows + t.table[line, FIRST] * t.width + (columns if residual else 0)
+    count, size = (1 if residual else columns + 1), t.table[line, GROUP_ROWS]
+    at, full = place[group, AT], place[group, FULL]
+    _whiten(common, at, full, m, room.own, begin, t.width, size, count, room.whitened, lanes)
     return room.whitened
 
 
@@ -445,9 +472,9 @@ def _square(
 ) -> None:
     """Add the products of the columns of whitened rows; the last column is the residual."""
     for i in range(columns):
-        line = to + (index[column + i, 0] if i < columns - 1 else last) * (last + 1)
+        line = to + (index[column + i, FIRST] if i < columns - 1 else last) * (last + 1)
         for j in range(i + 1):
-            cell = line + (index[column + j, 0] if j < columns - 1 else last)
+            cell = line + (index[column + j, FIRST] if j < columns - 1 else last)
             r, u, v = 0, first + i, first + j
             # Four rows at a time in two sums: a cell is loaded and stored once for four products.
             while r + 3 < size:

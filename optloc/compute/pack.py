@@ -15,6 +15,12 @@ from optloc.models.primitives import WGS84_A
 from optloc.problem.noise import Whitener, variances
 from optloc.problem.problem import Problem
 
+# Columns of `Numbers.place`. Of a group: place of its whitening matrix, and whether that is not lower triangular. Of a
+# prior: place of its mean, with its precision behind; first unknown, how many, 1 for those of an epoch.
+AT, FULL = range(2)
+PRIOR_START, PRIOR_SIZE, PRIOR_LOCAL = range(1, 4)
+_COLUMNS = 4
+
 
 class Numbers(NamedTuple):
     """The numbers of N problems; what all of them share is kept once.
@@ -24,7 +30,7 @@ class Numbers(NamedTuple):
     """
 
     common: Array  # zero; stations, rates, axes, known targets; whitening matrices; priors
-    place: Array  # int64 (groups + priors, 4), see below
+    place: Array  # int64 (groups + priors, 4): columns as named above
     source: Array  # (N or 1, ...)
     white: Array  # (N or 1, ...)
     prior: Array  # (N or 1, ...)
@@ -32,8 +38,6 @@ class Numbers(NamedTuple):
     present: Array  # (N or 1, m): 1 for a row that counts; (1, 0) where all do
     sigma: Array  # (N or 1, m): standard deviations of the rows
     size: Array  # (m,): numbers of this size, beside the measurement, are rounded to get to the row's value
-    # A line of `place` is, for a group: place of its whitening matrix; 0 where that is lower triangular. For a prior:
-    # place of its mean, with its precision behind; first unknown, how many, 1 for those of an epoch.
 
 
 class Packed(NamedTuple):
@@ -68,7 +72,7 @@ def pack(problem: Problem, noise: tuple[Whitener, ...]) -> Packed | None:
     # Places count on from one kind of numbers to the next.
     for one, before in ((white, (source,)), (prior, (source, white))):
         shared, own = (sum(part.size(mine) for part in before) for mine in (False, True))
-        one.place[:, 0] += np.where(one.place[:, 0] >= 0, shared, -own)
+        one.place[:, AT] += np.where(one.place[:, AT] >= 0, shared, -own)
     # Presence is looked at where some row is absent only: an empty array says that all count.
     weight = problem.weight
     present = np.zeros((1, 0)) if np.all(weight > 0.0) else _plain(weight > 0.0, 1)
@@ -121,10 +125,10 @@ class _Divided:
     @classmethod
     def of(cls, parts: list[Array]) -> _Divided:
         """Return parts (N or 1, numbers) divided; `place` (parts, 4) begins with the place of each."""
-        place, lengths = np.zeros((len(parts), 4), dtype=np.int64), [0, 0]
+        place, lengths = np.zeros((len(parts), _COLUMNS), dtype=np.int64), [0, 0]
         for i, part in enumerate(parts):
             mine = int(len(part) > 1)
-            place[i, 0] = -1 - lengths[1] if mine else lengths[0]
+            place[i, AT] = -1 - lengths[1] if mine else lengths[0]
             lengths[mine] += part.shape[1]
         shared, own = ([part for part in parts if (len(part) > 1) == mine] for mine in (False, True))
         flat = np.concatenate([part[0] for part in shared]) if shared else np.zeros(0)
@@ -142,12 +146,12 @@ def _sources(problem: Problem) -> _Divided:
 def _whiteners(noise: tuple[Whitener, ...]) -> _Divided:
     """Return whitening matrices; a line of `place` for each group."""
     divided, lines = _Divided.of([_plain(w.matrix, 3) for w in noise]), []
-    for start, w in zip(divided.place[:, 0], noise, strict=True):
+    for start, w in zip(divided.place[:, AT], noise, strict=True):
         count, size = w.row.shape
         step = size * size if w.matrix.shape[-3] > 1 else 0
-        line = np.zeros((count, 4), dtype=np.int64)
-        line[:, 0] = start + (step if start >= 0 else -step) * np.arange(count)
-        line[:, 1] = np.triu(w.matrix, 1).reshape(-1, w.matrix.shape[-3], size * size).any((0, 2))
+        line = np.zeros((count, _COLUMNS), dtype=np.int64)
+        line[:, AT] = start + (step if start >= 0 else -step) * np.arange(count)
+        line[:, FULL] = np.triu(w.matrix, 1).reshape(-1, w.matrix.shape[-3], size * size).any((0, 2))
         lines.append(line)
     return _Divided(divided.common, divided.own, np.concatenate(lines))
 

@@ -29,9 +29,9 @@ from optloc.compute.lanes import (
     memory,
     whiten_group,
 )
-from optloc.compute.pack import Numbers, Packed
+from optloc.compute.pack import AT, PRIOR_LOCAL, PRIOR_SIZE, PRIOR_START, Numbers, Packed
 from optloc.compute.systems import backward, complete, eliminate, factor, factor_local, forward, step
-from optloc.compute.tables import Tables
+from optloc.compute.tables import FIRST, GROUP_EPOCH, GROUP_ROWS, Tables
 from optloc.linear.normal import OPEN, Normal
 
 _OK, LIMIT, _STALLED, NUMERICAL = (
@@ -41,7 +41,7 @@ _EPSILON = float(np.finfo(float).eps)
 
 
 class Rules(NamedTuple):
-    """When a refinement ends; see `optloc.solvers.refine.refine`."""
+    """When a refinement ends; see `optloc.solvers.refine.refine`, whose defaults these are."""
 
     tolerance: float = 1e-7
     limit: int = 60
@@ -64,6 +64,7 @@ DAMPING, GROWTH, BLUR, GAIN, SOLVABLE, BETTER, COST, TRIED, CLOSED = range(9)
 # What it keeps beside them: which start it is, 1 while nothing but the start is
 # known and 2 before it is there, steps tried, status.
 START, FRESH, STEPS, STATUS = range(4)
+_TAGS = 4
 # The lane waits for its start.
 EMPTY = 2
 
@@ -102,7 +103,7 @@ def refine_block(packed: Packed, item: Array, first: int, last: int, rules: Rule
     size = out.x.shape[1]
     lanes, room = blocks(packed, size, last - first), arrange(t, c, size)
     m, r = memory(t, room, lanes)
-    tag, used, following = np.zeros((4, lanes), np.int64), lanes, first + lanes
+    tag, used, following = np.zeros((_TAGS, lanes), np.int64), lanes, first + lanes
     for b in range(lanes):
         tag[START, b], tag[FRESH, b] = first + b, EMPTY
     while used > 0:
@@ -160,6 +161,7 @@ def _blur(sigma: Array, size: Array, m: Array, room: Room, lane: int, item: int)
         if not room.absent or m[room.present + i, lane] != 0.0:
             ratio = (abs(m[room.observed + i, lane]) + size[i]) / sigma[row, i]
             squares += ratio * ratio
+    # Four roundings, as in `optloc.solvers.refine`.
     coarse = 4.0 * _EPSILON * np.sqrt(squares)
     return coarse if np.isfinite(coarse) else 0.0
 
@@ -266,7 +268,7 @@ def refine_runs(packed: Packed, item: Array, first: int, last: int, rules: Rules
     size = out.x.shape[1]
     lanes, room = blocks(packed, size, last - first), arrange(t, c, size)
     m, r = memory(t, room, lanes)
-    tag, used, following = np.zeros((4, lanes), np.int64), lanes, first + lanes
+    tag, used, following = np.zeros((_TAGS, lanes), np.int64), lanes, first + lanes
     for b in range(lanes):
         tag[START, b], tag[FRESH, b] = first + b, EMPTY
     while used > 0:
@@ -289,9 +291,9 @@ def _price(t: Tables, c: Numbers, m: Array, r: Array, room: Room, lanes: int) ->
         m[total, b] = 0.0
     for packet in range(t.packets):
         measure(t, c.common, m, r, room, packet, room.trial, lanes)
-        for group in range(t.table[t.packet + packet, 0], t.table[t.packet + packet + 1, 0]):
+        for group in range(t.table[t.packet + packet, FIRST], t.table[t.packet + packet + 1, FIRST]):
             residual = whiten_group(t, c.common, c.place, m, room, group, True, lanes)
-            for i in range(t.table[t.group + group, 1]):
+            for i in range(t.table[t.group + group, GROUP_ROWS]):
                 for b in range(lanes):
                     m[total, b] += m[residual + i * t.width, b] * m[residual + i * t.width, b]
     _priors(t, c, m, room, room.trial, False, 0, lanes)
@@ -305,10 +307,10 @@ def _price(t: Tables, c: Numbers, m: Array, r: Array, room: Room, lanes: int) ->
 def _priors(t: Tables, c: Numbers, m: Array, room: Room, x: int, local: bool, epoch: int, lanes: int) -> None:
     """Add the priors of the shared unknowns, or of those of an epoch, to the equations in `room.after`."""
     for i in range(t.groups, c.place.shape[0]):
-        if (c.place[i, 3] == 1) == local:
-            start = c.place[i, 1] + (t.shared if local else 0)
+        if (c.place[i, PRIOR_LOCAL] == 1) == local:
+            start = c.place[i, PRIOR_START] + (t.shared if local else 0)
             at = x + start + (epoch * t.local if local else 0)
-            add_prior(c.common, c.place[i, 0], c.place[i, 2], m, room, at, start, t.shared + t.local, lanes)
+            add_prior(c.common, c.place[i, AT], c.place[i, PRIOR_SIZE], m, room, at, start, t.shared + t.local, lanes)
 
 
 @compiled
@@ -377,8 +379,8 @@ def _pass(t: Tables, c: Numbers, m: Array, r: Array, room: Room, tag: Array, sum
             m[room.state + SOLVABLE, b], m[room.state + CLOSED, b] = 1.0, 1.0
     for epoch in range(t.epochs + 1):
         clear(m, room.after, line * line, lanes)
-        while group < t.groups and t.table[t.group + group, 2] == epoch:
-            if packet < t.packets and t.table[t.packet + packet, 0] == group:
+        while group < t.groups and t.table[t.group + group, GROUP_EPOCH] == epoch:
+            if packet < t.packets and t.table[t.packet + packet, FIRST] == group:
                 measure(t, c.common, m, r, room, packet, room.best, lanes)
                 packet += 1
             add_group(t, c.common, c.place, m, room, group, lanes)

@@ -182,6 +182,18 @@ class Order:
         return cls(row, at, (place - first[packet_group[mine]])[row], packet_group, begin)
 
 
+# Columns of the tables, each of whole numbers. The operations of `code` are those of `Tape.code`; tables of one column
+# (constant, packet, part, column) are read at FIRST or REGISTER.
+FIRST = REGISTER = 0
+DERIVATIVE = 1  # of an input: the register of the derivative by it, -1 for none
+KIND_CODE, KIND_CONSTANT, KIND_INPUT, KIND_VALUE, KIND_PERIODIC = range(5)
+ROW_NUMBER, ROW_PLACE, ROW_WIDTH, ROW_SOURCE, ROW_SCALE, ROW_ADDEND = range(6)
+SOURCE_NUMBER, SOURCE_FEED = range(2)
+TERM_COLUMN, TERM_SLOT = range(2)
+GROUP_ROWS, GROUP_EPOCH, GROUP_COLUMN = range(1, 4)  # behind its first row in the packet
+_WIDEST = 6
+
+
 class Tables(NamedTuple):
     """The indices of a structure; rows are numbered in the order in which they are evaluated.
 
@@ -366,8 +378,7 @@ def _fill(problem: Problem, groups: Groups, found: list[_Kind], lookup: Array) -
         "column": _table(columns.column),
     }
     begin = starts([len(part) for part in parts.values()])
-    # Six columns are what the widest of the tables, that of rows, needs.
-    index = np.zeros((int(begin[-1]), 6), dtype=np.int64)
+    index = np.zeros((int(begin[-1]), _WIDEST), dtype=np.int64)
     for start, part in zip(begin, parts.values(), strict=False):
         index[start : start + len(part), : part.shape[1]] = part
     tables = Tables(
