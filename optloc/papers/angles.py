@@ -143,9 +143,9 @@ def fly_circle(name: str, slow: float, fast: float, rate: float, seconds: tuple[
 # Printed, but for the place of the second station of simulation 3: the text gives the same one for both.
 _BASE = np.array([[0.0, 50.0], [0.0, 100.0]])
 _WIDE = np.array([[-40e3, 0.0, 0.0], [40e3, 0.0, 0.0]])
-_FINE = float(np.deg2rad(1e-3))
-_RATE, _RADIUS = 0.157, 3e3
-_PRINTED = (1500, 500, 1000)
+_FINE = float(np.deg2rad(1e-3))  # a thousandth of a degree
+_RATE, _RADIUS = 0.157, 3e3  # of the circle: rad/s, metres
+_PRINTED = (1500, 500, 1000)  # seconds: straight, circle, straight
 
 STRAIGHT = _straight()
 """Simulation 1: constant acceleration. The stations and the place at t = 0 lie on one line."""

@@ -69,6 +69,7 @@ class Scenario:
     course: Array | None = None
     delays: Array = field(default_factory=lambda: np.array([30.0, -40.0, 50.0, -30.0]))
     gains: Array = field(default_factory=lambda: np.array([0.3, -0.4, 0.5, -0.3]))
+    # 10 ns, though the text says 20: only so is the printed sigma0 that of this scene.
     sigma: float = 3.0
     interval: float = 1.0
 
@@ -195,7 +196,7 @@ def truth(scenario: Scenario, problem: Problem) -> Array:
 # It starts from a given place at the fortieth epoch and never looks for another minimum: a baseline.
 
 FIRST = 40
-"""Epochs that are collected before the first estimate."""
+"""Epochs that are collected before the first estimate, as printed."""
 
 _BLOCK = 8  # trials whose arrays, 5 stations by 700 epochs by 3 coordinates, fit a cache of 1 MB together
 
@@ -508,7 +509,7 @@ def ghost(scenario: Scenario, epochs: int, *, sigma: float | None = None, statio
 
 NAMES = ("R1", "R2", "R3", "R4", "R5")
 DELAYS = (100.0, -133.0, 167.0, -100.0)
-"""Nanoseconds by which the clocks of R2 to R5 are late."""
+"""Nanoseconds by which the clocks of R2 to R5 are late: 30, -40, 50 and -30 m, the biases of `Scenario`."""
 
 # Ten minutes in a file of a dozen kilobytes, and the noise of the paper: nanoseconds, metres.
 _EPOCHS, _INTERVAL, _SEED = 200, 3.0, 20170502
