@@ -248,6 +248,7 @@ def _show_many(found: FileFixes, console: Console) -> None:
     sigma = np.sqrt(sum(columns[f"sigma_{axis}"] ** 2 for axis in "xyz" if axis in columns))
     for label, count in Counter(columns["status"].tolist()).most_common():
         inside = columns["status"] == label
+        # Half of the fixes are better than the median, all but the worst twentieth better than the other.
         shares = ((sigma, 0.5), (sigma, 0.95), (columns["p_value"], 0.5))
         cells = [_quantile(values[inside], share) for values, share in shares]
         table.add_row(Text(label, style=_colour(Status[label.upper().replace(" ", "_")])), str(count), *cells)

@@ -190,6 +190,7 @@ def _compose(kind: str, model: Model) -> str:
     one = np.arange(len(names)) if model.stations == 1 else np.arange(1, len(names))
     # Differences against the first station; ranges beside them make every kind solvable.
     a, b = (one if model.stations else None), (np.zeros_like(one) if model.stations == 2 else None)
+    # Levels and plain numbers of kinds from elsewhere: a tenth of whatever they are in.
     sigma = _SIGMA.get(model.quantity, 0.1)
     place = np.array(list(_PLACES.values()))[:, :d]
     rows = [measured(kind, a=a, b=b, sigma=sigma), measured("range", a=np.arange(len(names)), sigma=_RANGE_SIGMA)]

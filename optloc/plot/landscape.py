@@ -42,7 +42,7 @@ _POINTS = 121
 _SIGMAS = (1, 2, 3, 4, 5, 7, 10)
 # Chi-square of two degrees of freedom that holds 95 %: a plan has two coordinates.
 _CHI2_95 = 5.991464547107979
-# Half the side of the surroundings in standard deviations of the larger coordinate: the 95 % ellipse and as much again.
+# Half the side of the surroundings in standard deviations of the larger coordinate: the 95 % ellipse (2.4) and a rim.
 _AROUND = 4.2
 _NAME = "cost above that of the fix, square root (standard deviations)"
 # Rows times starts that are iterated at once, which memory holds; and the starts along a side that this allows.

@@ -33,6 +33,7 @@ _MIDDLE, _WHISKERS = (25.0, 75.0), (2.5, 97.5)
 _VAGUE = 3.0
 # Bias, in whiskers of the others, beyond which a station is not drawn but named.
 _FAR = 10.0
+
 Sets = dict[str, tuple[Array, float]]
 """Residuals (n,) and the median standard deviation of a row, by the name of the stations."""
 

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 # Okabe and Ito: told apart with any colour vision, and in grey by lightness.
 BLACK, BLUE, ORANGE, GREY = "#000000", "#0072B2", "#D55E00", "#999999"
 GREEN, SKY, PURPLE, YELLOW = "#009E73", "#56B4E9", "#CC79A7", "#E69F00"
+
 View = tuple[int, int]
 """Which two of the scene's axes a panel shows."""
 

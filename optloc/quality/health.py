@@ -34,6 +34,7 @@ _PART = 1e-3
 _TINY = 1e-300
 # Turns of levels and offsets, each found with the other known: the noise is but a weight of the offsets, so few do.
 _ROUNDS = 2
+
 OUTLIER = 3.0
 """Size of a test, in standard deviations, from which a measurement is called an outlier."""
 

@@ -140,6 +140,7 @@ def current_statistical(time_constant: float, limit: float, floor: float = 0.0) 
     return Dynamics("current statistical", 2, step)
 
 
+# Scans at equal distances have one step; a run of any others has some dozens that recur.
 @lru_cache(maxsize=256)
 def correlated(alpha: float, dt: float) -> tuple[Array, Array, Array]:
     """Return F (3, 3), Q (3, 3) for unit variance and U (3,) of an exponentially correlated acceleration of one axis.

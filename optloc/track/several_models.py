@@ -226,6 +226,7 @@ def mixed(states: Sequence[State], weight: Array, transition: Array) -> tuple[li
 def _transition(transition: Array, count: int) -> Array:
     chain = np.asarray(transition, dtype=float)
     good = chain.shape == (count, count) and bool(np.all(chain >= 0.0))
+    # Rows written with three digits, such as 0.333, do not add up to one: they are refused, not scaled.
     if not good or not np.allclose(chain.sum(-1), 1.0, atol=1e-9):
         raise InvalidProblem(
             f"the transition is no {count} x {count} table of probabilities", "transition", "let each row add up to one"
