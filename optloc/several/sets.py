@@ -424,6 +424,7 @@ class Angle:
     bend: Callable[[Array, Array, Array], Array]
 
 
+# An azimuth is anywhere on a circle, an elevation on half of one; 1/r_h^2 and 1/(r r_h) bound how they bend.
 _ANGLES = {
     "azimuth": Angle(2.0 * np.pi, lambda value, steep, radius: 1.0 / np.maximum(1.0 / steep - radius, 0.0) ** 2),
     "elevation": Angle(
