@@ -174,7 +174,7 @@ def table_equations(
     shared = scene.sigma**2 / 2.0 * (np.eye(3) + 1.0)
     epoch = cut(replace(scene.problem(), motions=(Motion(0),)), 0, 1)
     costs = weighting(epoch, scene.position[0], shared)
-    rows.append(("5: H'H called Ink.BLUE", "error of a fix, shared reference, km", *map(km, costs)))
+    rows.append(("5: H'H called BLUE", "error of a fix, shared reference, km", *map(km, costs)))
     for name, score in matched.items():
         model = PLAIN[ORDERS[name]]
         bad = score_track(drawn[name], track_all(drawn[name], model, predict_twice(model, scene.interval, 2)))

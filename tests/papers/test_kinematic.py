@@ -32,7 +32,7 @@ from optloc.papers.kinematic import (
     weighting,
 )
 from optloc.papers.kinematic_tables import km
-from optloc.papers.report import Study
+from optloc.papers.report import ABSENT, Study
 from optloc.problem.epochs import cut
 
 RUN = CliRunner()
@@ -261,6 +261,7 @@ def test_a_reproduction_has_every_table_and_figure(report):
     assert [row[1] for row in rows["ratios"]] == ["0.602", "0.795"]
     assert [row[3] for row in rows["ratios"]] == ["0.605", "0.776"]
     assert len(rows["association"]) == 8
+    assert [row[0].partition(":")[0] for row in rows["equations"]] == ["8, 15", "8", "5", "29", "29", "29", "29", "12"]
     assert [picture.name for picture in report.pictures] == [
         "figure-2",
         "figure-3",
@@ -269,6 +270,12 @@ def test_a_reproduction_has_every_table_and_figure(report):
         "association",
     ]
     assert all(len(row) == len(table.header) for table in report.tables for row in table.rows)
+
+
+def test_every_number_of_the_essay_has_its_cell(report):
+    essay = report.markdown().partition("## What is wrong in the paper")[2]
+    assert ABSENT not in essay
+    assert "equal weights cost 13 %" in " ".join(essay.split())
 
 
 def test_reproduce_writes_tables_and_pictures(report, tmp_path, monkeypatch):
