@@ -145,7 +145,7 @@ def _chunk(c: Context, kind: str) -> Chunk:
     if model.stations > 1:
         _check_pairs(c, kind, a, b)
     # The sign of a difference is turned by its stations, not its value: noise and biases then need no second thought.
-    if section.positive == "b-farther" and model.stations > 1 and kind != "range_sum":
+    if section.positive == "b-farther" and _compares(model):
         a, b = b, a
     sigma, arrival, covariance = spread_of(c, model, units, unit, z)
     seconds = Units("time").conversion(section.time_unit, join(c.where, "key 'time_unit'")).factor
@@ -157,7 +157,7 @@ def _chunk(c: Context, kind: str) -> Chunk:
         table.times("time", seconds) if table.has("time") else None,
         table.labels("time") if table.has("time") else None,
         table.labels("target") if table.has("target") else None,
-        section.excess and kind == "range_sum", table,
+        section.excess and _adds_up(model), table,
     )  # fmt: skip
 
 
@@ -165,14 +165,24 @@ def _check_options(c: Context, kind: str, model: Model) -> None:
     section = c.section
     if section.kind is None:
         return  # settings of a mixed table apply to the kinds that know them
-    if section.excess and kind != "range_sum":
+    if section.excess and not _adds_up(model):
         raise InvalidProblem(
             f"{kind} has no excess path", join(c.where, "key 'excess'"), "leave it out; it is for range_sum"
         )
-    if section.positive == "b-farther" and (model.stations < 2 or kind == "range_sum"):
+    if section.positive == "b-farther" and not _compares(model):
         raise InvalidProblem(f"{kind} has no sign to turn", join(c.where, "key 'positive'"), "leave it out")
     if section.azimuth == "north-clockwise" and kind != "azimuth":
         raise InvalidProblem(f"{kind} is no azimuth", join(c.where, "key 'azimuth'"), "leave it out")
+
+
+def _adds_up(model: Model) -> bool:
+    """Return whether a row is the sum of two ranges, of which a file may have left out the stations' distance."""
+    return model.ranges is not None and sum(model.ranges) > 1
+
+
+def _compares(model: Model) -> bool:
+    """Return whether a row sets one station against another: a difference or a ratio, which has a sign to turn."""
+    return model.stations > 1 and not _adds_up(model)
 
 
 def _unit(section: MeasurementsTable, kind: str, where: str) -> str | None:
