@@ -195,3 +195,9 @@ def _empty(shape: tuple[int, ...], layout: Axes, dtype: Any) -> Array:
     out = np.empty(shape, dtype=dtype)
     out.fill(layout.empty)
     return out
+
+
+def present(entries: Array) -> Array:
+    """Return which entries (N,) of an array of objects are not None."""
+    # By identity: `entries != None` asks every record whether it is equal to None.
+    return np.array([entry is not None for entry in entries], dtype=bool)

@@ -8,6 +8,7 @@ from time import perf_counter
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
+from optloc.base.records import present
 from optloc.base.types import Array
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix, Stage
@@ -89,7 +90,7 @@ def certified(
     fix = judge(problem, pool)
     answered = fix.answered & np.isfinite(fix.cost)
     if pool.conclusion is not None:
-        answered &= np.asarray(pool.conclusion == None)  # noqa: E711  element by element: the rows are not all there
+        answered &= ~present(pool.conclusion)  # the rows are not all there
     why = unsupported(problem)
     if why or not answered.any():
         certificate = fill(len(pool), None) if pool.certificate is None else np.array(pool.certificate)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from optloc.base.records import overwrite, take
+from optloc.base.records import overwrite, present, take
 from optloc.base.status import Certificate, Status
 from optloc.base.types import Array
 from optloc.problem.fix import Alternatives, Fix
@@ -37,7 +37,7 @@ def judge(problem: Problem, pool: Pool) -> Fix:
         items = np.flatnonzero(~pool.plain)
         fix = overwrite(fix, items, _ruled(problem.take(items), take(pool, items), fix[items]))
     if pool.conclusion is not None:
-        for i in np.flatnonzero(pool.conclusion != None):  # noqa: E711  element by element
+        for i in np.flatnonzero(present(pool.conclusion)):
             told = pool.conclusion[i]
             own = told.reshape((1,)) if isinstance(told, Fix) else conclude(problem.take(np.array([i])), told)
             fix = overwrite(fix, np.array([i]), own)
@@ -86,8 +86,7 @@ def _claims(pool: Pool) -> Array:
     local = fill(len(pool), LOCAL)
     if pool.certificate is None:
         return local
-    claimed = np.asarray(pool.certificate != None)  # noqa: E711  element by element
-    return np.where(claimed, pool.certificate, local)
+    return np.where(present(pool.certificate), pool.certificate, local)
 
 
 def _ruled(problem: Problem, pool: Pool, fix: Fix) -> Fix:

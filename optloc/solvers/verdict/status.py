@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc, gammainccinv
 
+from optloc.base.records import present
 from optloc.base.status import Certificate, Status
 from optloc.base.types import Array
 from optloc.bounds.observability import open_sentences
@@ -261,8 +262,8 @@ def _hold_against_constraints(pool: Pool, cost: Array, code: Array, reason: Arra
 def _weigh_claims(pool: Pool, code: Array, reason: Array, certificate: Array) -> None:
     """Write what proofs, searches and the redundancy of the rows add to the statuses."""
     if pool.certificate is not None:
-        for i in np.flatnonzero(pool.certificate != None):  # noqa: E711  element by element
-            certificate[i] = pool.certificate[i]
+        claimed = present(pool.certificate)
+        certificate[claimed] = pool.certificate[claimed]
     if pool.searched is not None:
         for i in np.flatnonzero(pool.searched & np.isin(code, ANSWERED)):
             sure = certificate[i].proof == "global" and certificate[i].unique
