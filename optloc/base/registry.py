@@ -75,6 +75,7 @@ class Table(MutableMapping[str, T]):
 
     def _take(self, entry: EntryPoint, found: dict[str, T]) -> None:
         """Put what an entry point names among what was found, or say why not."""
+        # No package replaces what optloc has, nor what another package added first.
         if entry.name in self._own or entry.name in found:
             self._refuse(entry, f"the name {entry.name!r} is taken")
             return

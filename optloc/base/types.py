@@ -143,6 +143,7 @@ class Bias:
     member: Array
     coefficient: Array
     form: Literal["offset", "scale", "drift", "rotation"] = "offset"
+    # One zero stands for all members; an array of its own for each bias, for arrays can be written into.
     mean: Array = field(default_factory=lambda: np.zeros(1))
     sigma: Array | None = None
 

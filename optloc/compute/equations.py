@@ -78,6 +78,7 @@ def normal_block(packed: Packed, x: Array, item: Array, first: int, last: int, p
     for begin in range(first, last, lanes):
         used = min(lanes, last - begin)
         for b in range(used):
+            # Several vectors may belong to one problem: its numbers go into each of their lanes.
             load(m, b, item[begin + b], c.source, c.white, c.prior, c.observed, c.present)
             for i in range(size):
                 m[room.trial + i, b] = x[begin + b, i]

@@ -57,6 +57,7 @@ def refine(
         K, u, place, r, unit, vector[X], vector[ROW], scalar[SPARE], scalar[LOOP], matrix[H], vector[G], scalar[COST]
     )
     for lane in range(LANES):
+        # A start that is NaN or infinite is not good, and takes no step.
         scalar[GOOD, lane] = scalar[GOOD, lane] if scalar[COST, lane] < np.inf else 0.0
         scalar[ALIVE, lane] = scalar[GOOD, lane]
         scalar[DAMPING, lane], scalar[GROWTH, lane], scalar[STEPS, lane] = FIRST_DAMPING, FIRST_GROWTH, 0.0
@@ -194,6 +195,7 @@ def _propose(vector: Array, matrix: Array, scalar: Array) -> None:
 def _decide(vector: Array, matrix: Array, scalar: Array, tolerance: float) -> bool:
     """Keep the steps that lower the cost, move the damping, end lanes whose step was small; return if any is alive."""
     d = vector.shape[1]
+    # Lanes that are finished go through the rule too, and are left as they are: their step counts as unsolvable.
     kept, alive = scalar[SPARE], scalar[ALIVE]
     for lane in range(LANES):
         better, small, stuck, scalar[DAMPING, lane], scalar[GROWTH, lane] = judge_lane(

@@ -52,6 +52,7 @@ def _speed(t: Point, c: Components) -> Any:
     return norm(t.velocity)
 
 
+# Each is smooth where targets are, so that an answer can be held on it by its gradient.
 SURFACES: dict[str, Surface] = {
     "plane": Surface(lambda t, c: dot(c, t.position), "linear form c . x of the position", "m", -1),
     "height": Surface(_height, "height above the WGS 84 ellipsoid", "m", ecef=True),

@@ -89,6 +89,7 @@ class Problem:
     @property
     def layout(self) -> Layout:
         """Return the order of the unknowns."""
+        # A bias has the unit of the rows that it touches, which the layout alone does not know.
         units = [self._unit(bias.row) for bias in self.biases]
         return layout(self.stations, self.motions, self.biases, self.emitting, self.epochs, units)
 
@@ -222,6 +223,7 @@ def _map(problem: Problem, change: Any) -> Problem:
         replace(r, z=change(r.z, 1), weight=change(r.weight, 1), correction=change(r.correction, 1))
         for r in problem.rows
     )
+    # Index arrays are shared by the batch and are not numbers: they stay as they are.
     noise = Noise(tuple(Block(b.row, change(b.covariance, 3)) for b in problem.noise.blocks))
     motions = tuple(replace(m, known=maybe(m.known, 3)) for m in problem.motions)
     priors = tuple(replace(p, mean=change(p.mean, 1), covariance=change(p.covariance, 2)) for p in problem.priors)
