@@ -103,6 +103,7 @@ def atlas_of(middle: Array, radius: float, dimension: int, count: int) -> Atlas:
 @compiled
 def with_minima(middle: Array, radius: float, dimension: int, minima: Minima) -> Atlas:
     """Return the pieces around a cube and around known minima."""
+    # One array for all vectors and one for all matrices: an atlas is made for every fix.
     vectors, matrices = np.zeros((3, 3)), np.zeros((6, 3, 3))
     return Atlas(
         middle,
@@ -168,6 +169,7 @@ def set_centre(atlas: Atlas, piece: int, at: Array) -> None:
 @compiled
 def _set_home(atlas: Atlas, home: int) -> None:
     d, place, linear, scale = atlas.dimension, atlas.place, atlas.linear, atlas.scale
+    # Inside the cube v is 1 and does not change; on a face it is the last coordinate.
     scale[:] = 0.0
     scale[0] = 1.0
     column = 0
@@ -201,7 +203,7 @@ def coordinates_on(atlas: Atlas, home: int, x: Array, u: Array) -> bool:
     u[:] = 0.0
     if home < 2 * d:
         out = (x[home // 2] - atlas.middle[home // 2]) / atlas.radius * (1.0 if home % 2 else -1.0)
-        if not out > 0.0:
+        if not out > 0.0:  # on the other side of the cube, or level with its centre: no scale brings it here
             return False
         v = 1.0 / out
         u[d - 1] = v
@@ -223,6 +225,7 @@ def position(atlas: Atlas, x: Array) -> None:
 def within(atlas: Atlas, half: Array, i: int, sides: Array) -> bool:
     """Return whether a box around the centre set lies inside the box ``|s_k| <= sides_k`` (3,) around minimum i."""
     minima, d = atlas.minima, atlas.dimension
+    # Boxes of another face never lie inside: their coordinates are not those of the minimum.
     if minima.home[i] != atlas.place[0]:
         return False
     for k in range(d):

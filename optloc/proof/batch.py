@@ -95,6 +95,7 @@ def prove_all(pose: Posed, asked: Asked) -> Answered:
     n = len(asked.x)
     if n > _FEW or len(pose.kinds) > _SMALL or ready(_loop):
         return _proven(pose, asked)
+    # A budget for each that ends soon; who needs more begins anew in machine code.
     with plain():
         out = _proven(pose, asked._replace(budget=np.minimum(asked.budget, max(_AT_LEAST, _FIRST_BOXES // max(n, 1)))))
     short = np.flatnonzero((out.verdict == BUDGET) & (out.boxes < asked.budget))
@@ -141,6 +142,7 @@ def _loop(pose: Posed, asked: Asked, out: Answered) -> None:
         if i == 0 or len(K) > 1:
             set_geometry(kinds, rows, A, weight, groups)
         cost, own = Cost(kinds, data[i if len(data) > 1 else 0], rows, pose.w[i], A, weight, groups), box
+        # Rows that are absent in this problem alone: the tables of the batch are too wide for it.
         if (weight == 0.0).any():
             cost = _present(cost)
             own = empty_box(cost.K.shape[0], cost.K.shape[1])

@@ -16,7 +16,8 @@ _ULP = 2.0**-52
 # A half-width covers the rounding of its centre and corners: relative to itself, and some units in the last place
 # of these.
 _WIDER, _SHIFT = 1e-12, 1e-15
-# Coordinate descents towards the least-squares point of a box; any point gives a valid bound.
+# Coordinate descents towards the least-squares point of a box; any point gives a valid bound. Over 8 fixes by range
+# differences one descent took 6 % more boxes of an atlas than three, and ten took 0.6 % fewer.
 _SWEEPS = 3
 # Columns of a table of rows over a box (q, ROW_WIDTH): residual in the middle of the remainders, Jacobian, direction v.
 MIDDLE, J0, J1, J2, DIRECTION, ROW_WIDTH = range(6)

@@ -187,6 +187,7 @@ def _solve(kinds: Array, A: Array, member: Array, first: int, count: int, R: Arr
     """Solve the rows of a group for its nodes; return its reference, which is moved to the end."""
     if _ties(kinds, A, member, first, count, count, R, tie):
         return NONE
+    # The rows say differences only: any range may be the reference, the first one is.
     for i in range(first, first + count):
         if kinds[member[i]] == RANGE:
             last, reference = first + count - 1, member[i]
@@ -262,6 +263,7 @@ def chart_at(cost: Cost, x: Array, box: Box) -> tuple[Chart, bool]:
     information[0, 1] = information[1, 0] = sums[H01]
     information[0, 2] = information[2, 0] = sums[H02]
     information[1, 2] = information[2, 1] = sums[H12]
+    # `gram` holds the axes for the moment; it is written anew below.
     roughly_principal(information, gram)
     most = max(information[0, 0], information[1, 1], information[2, 2])
     good = True

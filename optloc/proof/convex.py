@@ -142,6 +142,7 @@ def convex(kinds: Array, A: Array, half: Array, nodes: Array, curves: Array, sum
     for j in range(kinds.shape[0]):
         b0, b1, b2 = abs(curves[j, PULL0]), abs(curves[j, PULL1]), abs(curves[j, PULL2])
         e0, e1, e2 = curves[j, TURN0], curves[j, TURN1], curves[j, TURN2]
+        # Rows of |B|'E + E'|B|: Gershgorin takes them off the diagonal.
         d0 += 2.0 * b0 * e0 + b0 * e1 + b1 * e0 + b0 * e2 + b2 * e0
         d1 += 2.0 * b1 * e1 + b0 * e1 + b1 * e0 + b1 * e2 + b2 * e1
         d2 += 2.0 * b2 * e2 + b0 * e2 + b2 * e0 + b1 * e2 + b2 * e1
@@ -175,7 +176,7 @@ def convex(kinds: Array, A: Array, half: Array, nodes: Array, curves: Array, sum
 def spread_of(A: Array, half: Array, nodes: Array, curves: Array, sums: Array) -> float:
     """Write bounds of the change of each entry of the Hessian into sums[C00:]; return one of the rest's norm."""
     sums[C00:] = 0.0
-    ball = 0.0
+    ball = 0.0  # what is known of a change by its norm alone
     for j in range(A.shape[0]):
         fall, rise = force_change(A, half, nodes, curves, j)
         most = max(-fall, rise)
@@ -219,6 +220,7 @@ def clip_to_stationary(
     ball = spread_of(A, half, nodes, curves, sums)
     if not ball < inf:
         return
+    # The share of the box that the mean reaches: half of the bounds of change, which grow with it at least linearly.
     plane = half[2] == 0.0 and sums[H22] == 0.0
     a, b, c, d, e, f = sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], 1.0 if plane else sums[H22]
     if not inverse(a, b, c, d, e, f, solve):

@@ -52,11 +52,13 @@ _CAPACITY = 2048
 _TINY = 1e-5
 # Points closer to a minimum than this are that minimum, standard deviations: a descent ends that near.
 _SAME = 1e-3
-# Share of the steepest side's change that counts for all sides alike: nodes that are only enclosed have no slope.
-_ALIKE = 0.1
 # The test for stationary points is made where the cost at the centre is within so many levels: elsewhere the box is too
-# large, or its bound will do when it is halved.
+# large, or its bound will do when it is halved. Over 8 fixes by range differences one level took four times as many
+# boxes; a test everywhere took a quarter more time for the same.
 _NEAR = 100.0
+# Share of the steepest side's change that counts for all sides alike: nodes that are only enclosed have no slope. Over
+# the same fixes no share took 10 % more boxes.
+_ALIKE = 0.1
 
 
 @compiled
@@ -199,7 +201,7 @@ def _side(box: Box, dimension: int) -> int:
     for m in range(dimension):
         steepest = max(steepest, _steepness(box, m))
     for m in range(dimension):
-        change = (_steepness(box, m) + _ALIKE * steepest + 1e-300) * box.half[m]
+        change = (_steepness(box, m) + _ALIKE * steepest + 1e-300) * box.half[m]  # all flat: the widest side
         if change > best:
             best, k = change, m
     return k

@@ -85,6 +85,7 @@ def accuracy_floor_far(cost: Cost, atlas: Atlas) -> float:
     for i in range(cost.w.shape[0]):
         total += cost.w[i] * cost.w[i]
     total = sqrt(total)
+    # Lines are p - v a with |p| at most sqrt(3) and |a| below 1: their lengths, and sums of two, are below 4 reaches.
     size = 4.0 * atlas.radius + abs(atlas.middle[0]) + abs(atlas.middle[1]) + abs(atlas.middle[2])
     for j in range(cost.kinds.shape[0]):
         total += cost.weight[j] * (size if infinity_of(cost.kinds[j]) == DIFFERENCE else 4.0)
@@ -99,6 +100,8 @@ _WIDEST, _SHARE = 1e4, 0.9
 # The box searched along the axes of a minimum: convex boxes, and standard deviations at least. Beyond it the cost is
 # high enough for boxes along the axes of space.
 _WIDER, _WIDE = 3.0, 3.0
+# Factor by which convex boxes are tried larger: the last one that is convex is at least two thirds of the largest.
+_GROWTH = 1.5
 
 
 @compiled
@@ -192,15 +195,15 @@ def _grow(cost: Cost, box: Box, atlas: Atlas, i: int, hull: Array, margin: float
     while not _convex(cost, box, atlas, i, trial, margin):
         size *= 0.5
         trial = np.minimum(hull, size)
-        if size < 1e-6:
+        if size < 1e-6:  # a millionth of a standard deviation: no box that could hold the rounding of the minimum
             return False
-    while size < _WIDEST and _convex(cost, box, atlas, i, np.minimum(hull, 1.5 * size), margin):
-        size *= 1.5
+    while size < _WIDEST and _convex(cost, box, atlas, i, np.minimum(hull, _GROWTH * size), margin):
+        size *= _GROWTH
     sides[:] = np.minimum(hull, size)
     for k in range(atlas.dimension):
         trial = sides.copy()
-        trial[k] = min(1.5 * sides[k], hull[k])
+        trial[k] = min(_GROWTH * sides[k], hull[k])
         while trial[k] > sides[k] and _convex(cost, box, atlas, i, trial, margin):
             sides[k] = trial[k]
-            trial[k] = min(1.5 * sides[k], hull[k])
+            trial[k] = min(_GROWTH * sides[k], hull[k])
     return True

@@ -160,6 +160,7 @@ def without(unknowns: Array, values: Array) -> Array:
         return values
     length = np.sqrt((unknowns**2).sum(-2, keepdims=True))
     u, s, _ = np.linalg.svd(unknowns / np.where(length > 0.0, length, 1.0), full_matrices=False)
+    # The rounding of a column that is a sum of others is some thousandth of that; what is dependent changes nothing.
     basis = u * (s > 1e-12 * np.maximum(s[..., :1], 1e-300))[..., None, :]
     # Twice: what rounding leaves of the first projection is as large as the values, and they may be large.
     once = values - basis @ (np.swapaxes(basis, -1, -2) @ values)

@@ -43,6 +43,7 @@ def _reasons(problem: Problem) -> Iterator[str]:
     yield from _of_stations(problem)
     yield from _of_constraints(problem)
     known = {"position", "stations", *(bias.name for bias in problem.biases)}
+    # What `optloc.proof.pose` does not write as rows would be left out of the cost without a word.
     for name, _, _ in prior_parts(problem):
         if name not in known:
             yield f"the prior on {name} is not covered"
@@ -91,6 +92,7 @@ def _of_stations(problem: Problem) -> Iterator[str]:
     covariance = problem.stations.covariance
     if covariance is None:
         return
+    # A sphere is what makes the nearest place to the surveyed one lie on the line to the target.
     same = np.eye(problem.dimension) * covariance[..., :1, :1]
     if not np.allclose(covariance, same, rtol=1e-9, atol=0.0):
         yield "the station errors differ from axis to axis"

@@ -10,7 +10,19 @@ from math import atan, atan2, cos, hypot, inf, pi, sin, sqrt
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled
-from optloc.proof.nodes.forms import Triple, blend, inner, length, product, pull, reach, triple, unbounded, write
+from optloc.proof.nodes.forms import (
+    Triple,
+    blend,
+    inner,
+    length,
+    product,
+    pull,
+    reach,
+    row_reach,
+    triple,
+    unbounded,
+    write,
+)
 from optloc.proof.nodes.node import SCALED, Node, Row, lay_out
 
 # Numbers: the station, its axes (rows), the measured angle from which the node counts, wrapped, and what is not 0 where
@@ -48,7 +60,7 @@ def remainder(back: float, ahead: float, aside: float, bilinear: tuple[float, fl
     wide = departure(back, ahead, aside)
     most = max(back, ahead)
     size = sqrt(most * most + aside * aside)
-    if size >= 1.0:
+    if size >= 1.0:  # the series that the third order is cut from ends at the origin
         return -wide, wide
     third = size * size * size / (3.0 * (1.0 - size)) + _ROUNDING * aside
     return max(-wide, bilinear[0] - third), min(wide, bilinear[1] + third)
@@ -92,6 +104,7 @@ def bound_azimuth(data: Array, line: Array, sense: Array, half: Array, slope: Ar
         radial = blend(x / squared, along, y / squared, beside)
         around = blend(x / squared, beside, -y / squared, along)
         back, aside = reach(radial, h), reach(around, h)
+        # Neither the station's vertical nor the cut behind the measured direction is in the box.
         if back < 1.0 and abs(value) + atan(aside / (1.0 - back)) < pi:
             low, high = product(radial, around, h)
             low, high = remainder(back, back, aside, (-high, -low))
@@ -136,12 +149,13 @@ def curve_azimuth(data: Array, line: Array, sense: Array, half: Array, curvature
         return inf
     front = 1.0 - back
     size = sqrt(back * back + aside * aside)
+    # How far the factors of gradient and Hessian can be from 1, for complex w of at most this size.
     real, imaginary = size / front, aside / (front * front)  # of 1/(1+w) - 1
     real2, imaginary2 = size * size / front, imaginary * size * (2.0 + size)  # of w^2/(1+w)
     for k in range(3):
         whole = abs(around[k]) * real + abs(radial[k]) * imaginary
         second = abs(around[k]) * real2 + abs(radial[k]) * imaginary2
-        turn[k] = min(whole, reach((curvature[k, 0], curvature[k, 1], curvature[k, 2]), h) + second)
+        turn[k] = min(whole, row_reach(curvature, k, h) + second)
     one, other = length(radial), length(around)
     mixed = abs(inner(radial, around)) + one * other
     return max(one, other) ** 2 * 2.0 * imaginary / front + mixed * real * (2.0 + real)

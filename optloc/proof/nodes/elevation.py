@@ -20,6 +20,7 @@ from optloc.proof.nodes.forms import (
     product,
     pull,
     reach,
+    row_reach,
     still,
     triple,
     unbounded,
@@ -36,6 +37,7 @@ def _upright(data: Array, line: Array, sense: Array) -> tuple[float, float, Trip
     """Return horizontal distance and rise of a line, and the pulls of outward, sideways and upward unit vectors."""
     x, y, along, beside = horizontal(data, line, sense)
     rho = sqrt(x * x + y * y)
+    # On the station's vertical any direction is outward; what is bounded there is not used.
     ex, ey = (x / rho, y / rho) if rho > 0.0 else (1.0, 0.0)
     up = triple(data, AXES + 6)
     return rho, inner(up, triple(line, 0)), blend(ex, along, ey, beside), blend(ex, beside, -ey, along), pull(up, sense)
@@ -64,6 +66,7 @@ def bound_elevation(data: Array, line: Array, sense: Array, half: Array, slope: 
             bilinear = -high - cross + min(ahead * shift, 0.0), -low + cross + max(ahead * shift, 0.0)
             low, high = remainder(back, back + ahead, aside + abs(shift), bilinear)
             low, high = low - max(shift, 0.0), high - min(shift, 0.0)
+    # Where the line of sight turns by much, two numbers say more than a slope and its remainder.
     bottom, top = _flat_elevation((rise, reach(upward, h)), max(least, 0.0), rho + reach(outward, h) + bulge)
     if top - bottom < high - low:
         slope[0] = slope[1] = slope[2] = 0.0
@@ -86,7 +89,7 @@ def curve_elevation(data: Array, line: Array, sense: Array, half: Array, curvatu
     In the unit vectors along the line (a), upwards across it (b) and sideways (c), all pulled and divided by the range,
     the gradient is b and the Hessian ``-(a b' + b a') - tan(elevation) c c'``; the frame turns over the box.
     """
-    bound_elevation(data, line, sense, half, turn)
+    bound_elevation(data, line, sense, half, turn)  # for its slope alone: `turn` is overwritten below
     if still(turn):
         return unbounded(curvature, turn)
     rho, rise, outward, sideways, upward = _upright(data, line, sense)
@@ -110,6 +113,7 @@ def curve_elevation(data: Array, line: Array, sense: Array, half: Array, curvatu
     if not (yaw < 1.0 and pitch < 1.0 and abs(tan) * pitch < 1.0):
         turn[0] = turn[1] = turn[2] = inf
         return inf
+    # First the range changes, then the frame turns up or down, then about the vertical.
     near = 1.0 / (1.0 - back)
     stretch = max(back * near, back + aside + bulge)
     steeper = pitch * (1.0 + tan * tan) / (1.0 - abs(tan) * pitch)
@@ -158,7 +162,7 @@ def _frame_turn(
     for k in range(3):
         along = (abs(a[k]) + da[k]) * high + (abs(b[k]) + db[k]) * wide
         whole = along + tan * (abs(c[k]) + dc[k]) * flank
-        turn[k] = min(whole, reach((curvature[k, 0], curvature[k, 1], curvature[k, 2]), h) + chi * length(h))
+        turn[k] = min(whole, row_reach(curvature, k, h) + chi * length(h))
     return chi
 
 

@@ -78,6 +78,12 @@ def reach(u: Triple, h: Triple) -> float:
 
 
 @compiled
+def row_reach(matrix: Array, k: int, h: Triple) -> float:
+    """Return the greatest value over a box of ``|(matrix s)_k|``: with a Hessian, of the change of a gradient."""
+    return float(abs(matrix[k, 0]) * h[0] + abs(matrix[k, 1]) * h[1] + abs(matrix[k, 2]) * h[2])
+
+
+@compiled
 def product(u: Triple, v: Triple, h: Triple) -> tuple[float, float]:
     """Return an enclosure of ``(u.s)(v.s)`` over a box: squares have a sign, which the product of reaches forgets."""
     low = high = 0.0
@@ -94,16 +100,32 @@ def product(u: Triple, v: Triple, h: Triple) -> tuple[float, float]:
 
 
 @compiled
-def scaled(low: float, high: float, least: float, greatest: float) -> tuple[float, float]:
-    """Return an enclosure of a number in [low, high] divided by one in [least, greatest], both of these positive."""
-    return low / (least if low < 0.0 else greatest), high / (least if high > 0.0 else greatest)
+def scaled(low: float, high: float, least: float, most: float) -> tuple[float, float]:
+    """Return an enclosure of a number in [low, high] divided by one in [least, most], both of these positive."""
+    return low / (least if low < 0.0 else most), high / (least if high > 0.0 else most)
 
 
 @compiled
 def excess(along: float, across: float) -> float:
     """Return a bound of ``hypot(a, b) - a`` for all a >= along and |b| <= across: it falls with a."""
     whole = sqrt(along * along + across * across)
+    # The difference of two numbers that are nearly one would lose all digits: as a quotient it loses none.
     return across * across / (whole + along) if along > 0.0 else whole - along
+
+
+@compiled
+def greatest(a: float, b: float, c: float, d: float, e: float, f: float) -> float:
+    """Return the maximum of s'[[a, b, c], [b, d, e], [c, e, f]]s, positive semidefinite, over |s_k| <= 1.
+
+    The maximum is at a corner. The signs of a corner make all three mixed terms positive where their product is;
+    otherwise one of them must be negative: the smallest.
+    """
+    u, v, t = abs(b), abs(c), abs(e)
+    mixed = u + v + t
+    if b * c * e < 0.0:
+        mixed -= 2.0 * min(u, v, t)
+    # Rounding may leave a form that is nowhere positive below zero, of which no root could be taken.
+    return max(0.0, a + d + f + 2.0 * mixed)
 
 
 @compiled
@@ -119,15 +141,15 @@ def across(sense: Array, u: Triple, h: Triple) -> float:
     h : triple
         Half-widths.
     """
-    total = 0.0
-    for k in range(3):
-        total += _gram(sense, u, k, k) * h[k] * h[k]
-    first, second = _gram(sense, u, 0, 1) * h[0] * h[1], _gram(sense, u, 0, 2) * h[0] * h[2]
-    third = _gram(sense, u, 1, 2) * h[1] * h[2]
-    mixed = abs(first) + abs(second) + abs(third)
-    if first * second * third < 0.0:  # at no corner are all three positive
-        mixed -= 2.0 * min(abs(first), abs(second), abs(third))
-    return sqrt(max(total + 2.0 * mixed, 0.0))
+    form = greatest(
+        _gram(sense, u, 0, 0) * h[0] * h[0],
+        _gram(sense, u, 0, 1) * h[0] * h[1],
+        _gram(sense, u, 0, 2) * h[0] * h[2],
+        _gram(sense, u, 1, 1) * h[1] * h[1],
+        _gram(sense, u, 1, 2) * h[1] * h[2],
+        _gram(sense, u, 2, 2) * h[2] * h[2],
+    )
+    return sqrt(form)
 
 
 @compiled
@@ -140,6 +162,7 @@ def range_form(line: Array, sense: Array, h: Triple) -> RangeForm:
     r = length(n)
     u = pull((n[0] / r, n[1] / r, n[2] / r) if r > 0.0 else (1.0, 0.0, 0.0), sense)
     swing, aside = reach(u, h), across(sense, u, h)
+    # The farthest corner, up to the rounding of its root.
     far = sqrt((r + swing) * (r + swing) + aside * aside) * (1.0 + 1e-15)
     return r, u, r - swing, excess(r - swing, aside), far
 
@@ -172,9 +195,9 @@ def range_bend(
         return (inf, inf, inf), inf, trace
     back = r / least
     turn = (
-        reach((hessian[0, 0], hessian[0, 1], hessian[0, 2]), h) * back + remainder * abs(u[0]) / least,
-        reach((hessian[1, 0], hessian[1, 1], hessian[1, 2]), h) * back + remainder * abs(u[1]) / least,
-        reach((hessian[2, 0], hessian[2, 1], hessian[2, 2]), h) * back + remainder * abs(u[2]) / least,
+        row_reach(hessian, 0, h) * back + remainder * abs(u[0]) / least,
+        row_reach(hessian, 1, h) * back + remainder * abs(u[1]) / least,
+        row_reach(hessian, 2, h) * back + remainder * abs(u[2]) / least,
     )
     eta = length(turn)
     change = eta * (2.0 * length(u) + eta) / least + trace * (reach(u, h) + remainder) / least

@@ -13,7 +13,20 @@ from optloc.base.types import Array
 from optloc.compute.jit import compiled
 from optloc.models.primitives import WGS84_A, WGS84_F
 from optloc.problem.problem import Problem
-from optloc.proof.nodes.forms import Triple, across, blend, excess, inner, length, pull, reach, triple, unbounded, write
+from optloc.proof.nodes.forms import (
+    Triple,
+    across,
+    blend,
+    excess,
+    inner,
+    length,
+    pull,
+    reach,
+    row_reach,
+    triple,
+    unbounded,
+    write,
+)
 from optloc.proof.nodes.node import CONVEX, Node, Row, lay_out
 
 # Numbers: a point o of the frame, its ECEF position, and the rows of the rotation from frame to ECEF.
@@ -34,7 +47,7 @@ def geodetic(x: float, y: float, z: float) -> tuple[float, float, float, float]:
 
     Coordinates are Earth-centred Earth-fixed, metres.
     """
-    p = sqrt(x * x + y * y + 1e-12)
+    p = sqrt(x * x + y * y + 1e-12)  # a micrometre off the axis, as in the model: there is a meridian everywhere
     rise, run = z * WGS84_A, p * _B
     whole = sqrt(rise * rise + run * run)
     su, cu = rise / whole, run / whole
@@ -87,6 +100,7 @@ def bound_height(data: Array, line: Array, sense: Array, half: Array, slope: Arr
         farthest = length(_ecef(data, line)) + way
         return height, -farthest - WGS84_A - height, farthest - _B - height
     write(n, slope)
+    # Bowring's error falls with the height, but the rounding of coordinates grows with it.
     slack = _EXACT * max(1.0, height / LEAST_RADIUS)
     return height, -slack, excess(LEAST_RADIUS + height - swing, aside) + slack
 
@@ -110,6 +124,7 @@ def curve_height(data: Array, line: Array, sense: Array, half: Array, curvature:
     prime = WGS84_A / sqrt(flat)
     meridian = prime * (1.0 - _E2) / flat
     u, v = pull(east, sense), pull(north, sense)
+    # The least radius of curvature anywhere in the box, below its lowest point.
     bend = 1.0 / (LEAST_RADIUS + height - way)
     change = 1.2 * bend * bend * way
     chi = 0.0
@@ -118,7 +133,7 @@ def curve_height(data: Array, line: Array, sense: Array, half: Array, curvature:
             curvature[k, m] = u[k] * u[m] / (prime + height) + v[k] * v[m] / (meridian + height)
     for k in range(3):
         column = length((sense[0, k], sense[1, k], sense[2, k]))
-        own = reach((curvature[k, 0], curvature[k, 1], curvature[k, 2]), h)
+        own = row_reach(curvature, k, h)
         turn[k] = own + change * column * way
         chi += column * column * change
     return chi
@@ -127,7 +142,8 @@ def curve_height(data: Array, line: Array, sense: Array, half: Array, curvature:
 @compiled
 def _ball(data: Array, least: float, most: float) -> tuple[float, float, float, float]:
     """Return a ball around the Earth's centre: a height is at least the distance from there less the equator's."""
-    origin, first, second, third = triple(data, ECEF), triple(data, ROTATION), triple(data, 9), triple(data, 12)
+    origin = triple(data, ECEF)
+    first, second, third = triple(data, ROTATION), triple(data, ROTATION + 3), triple(data, ROTATION + 6)
     c = blend(1.0, blend(origin[0], first, origin[1], second), origin[2], third)
     return data[POINT] - c[0], data[POINT + 1] - c[1], data[POINT + 2] - c[2], WGS84_A + most
 

@@ -13,6 +13,7 @@ from optloc.proof.atlas import Atlas, scaled_station, set_line
 from optloc.proof.nodes.forms import (
     RangeForm,
     blend,
+    greatest,
     range_bend,
     range_form,
     reach,
@@ -48,21 +49,6 @@ from optloc.proof.nodes.ratio import quotient, quotient_bend
 
 
 @compiled
-def greatest(a: float, b: float, c: float, d: float, e: float, f: float) -> float:
-    """Return the maximum of s'[[a, b, c], [b, d, e], [c, e, f]]s, positive semidefinite, over |s_k| <= 1.
-
-    The maximum is at a corner. The signs of a corner make all three mixed terms positive where their product is;
-    otherwise one of them must be negative: the smallest.
-    """
-    u, v, t = abs(b), abs(c), abs(e)
-    mixed = u + v + t
-    if b * c * e < 0.0:
-        mixed -= 2.0 * min(u, v, t)
-    total = a + d + f + 2.0 * mixed
-    return max(0.0, total)
-
-
-@compiled
 def bound_ranges(kinds: Array, data: Array, centre: Array, sense: Array, gram: Array, half: Array, nodes: Array) -> int:
     """Bound all ranges over a box; return how many nodes are none.
 
@@ -81,6 +67,7 @@ def bound_ranges(kinds: Array, data: Array, centre: Array, sense: Array, gram: A
         Rows of ranges are written.
     """
     others = 0
+    # Numbers by names of their own: an entry of an array would be loaded anew after every entry that is written.
     c0, c1, c2, h0, h1, h2 = centre[0], centre[1], centre[2], half[0], half[1], half[2]
     t00, t01, t02 = sense[0, 0], sense[0, 1], sense[0, 2]
     t10, t11, t12 = sense[1, 0], sense[1, 1], sense[1, 2]
@@ -145,7 +132,7 @@ def curve_ranges(kinds: Array, gram: Array, half: Array, nodes: Array, curves: A
             eta, slope = sqrt(e0 * e0 + e1 * e1 + e2 * e2), sqrt(g0 * g0 + g1 * g1 + g2 * g2)
             norm = sqrt(n00 * n00 + n11 * n11 + n22 * n22 + 2.0 * (n01 * n01 + n02 * n02 + n12 * n12))
             chi = (eta * (2.0 * slope + eta) + norm * (swing + most) * per) * near
-        else:
+        else:  # the station may be in the box, where the gradient turns by anything
             per, chi = 1.0 / r if r > 0.0 else 0.0, inf
             e0, e1, e2 = sqrt(m00) + abs(g0), sqrt(m11) + abs(g1), sqrt(m22) + abs(g2)
         curves[j, H00], curves[j, H01], curves[j, H02] = n00 * per, n01 * per, n02 * per
@@ -180,6 +167,7 @@ def bound_difference(
     if least > 0.0:
         g = blend(1.0 / size, n, -phi / size, u)
         low, high = quotient(phi, g, u, most, (0.0, 0.0), (least, far + far0), h)
+        # By the triangle inequality the difference of the two distances is within |a| of zero.
         if high - low <= 2.0 * a:
             write(blend(radius, g, 0.0, g), slope)
             return radius * phi, radius * low, radius * high

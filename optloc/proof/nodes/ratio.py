@@ -17,6 +17,7 @@ from optloc.proof.nodes.forms import (
     range_bend,
     range_form,
     reach,
+    row_reach,
     scaled,
     still,
     triple,
@@ -49,6 +50,7 @@ def bound_ratio(
     low = max(least_a, 0.0) / far_b if far_b > 0.0 else 0.0
     if least_b > 0.0:
         high = far_a / least_b
+        # First the difference, whose numerator is affine, then the ratio from it: a range in the numerator would curve.
         n, q = _squares(line, sense, line_b, sense_b, h)
         size, u, most = ra + rb, blend(1.0, ua, 1.0, ub), most_a + most_b
         delta = ra - rb
@@ -57,6 +59,7 @@ def bound_ratio(
         q = quotient(delta, g, u, most, q, (least, far_a + far_b), h)
         g = blend(1.0 / rb, g, -(phi - 1.0) / rb, ub)
         less, more = quotient(phi - 1.0, g, ub, most_b, q, (least_b, far_b), h)
+        # Else two numbers for the whole box say more than a slope and its remainder.
         if more - less <= high - low:
             write(g, slope)
             return phi, less, more
@@ -93,6 +96,7 @@ def quotient(
     """
     low, high = product(g, u, h)
     swing = reach(g, h)
+    # The value of the quotient in the box times what S exceeds its slope by, and that is never negative.
     low, high = low + min((phi - swing) * most, 0.0), high + max((phi + swing) * most, 0.0)
     return scaled(above[0] - high, above[1] - low, below[0], below[1])
 
@@ -142,6 +146,7 @@ def curve_ratio(
     g = blend(1.0 / size, n, -delta / size, u)
     changes = (dn, blend(1.0, da, 1.0, db), 0.0, chi_a + chi_b, norm_a + norm_b, reach(u, h) + qa + qb)
     chi = quotient_bend(g, u, (delta, size, least_a + least_b), changes, h, curvature, whole, turn)
+    # What became of the difference is the numerator of the second step.
     wander = triple(turn, 0)
     g = blend(1.0 / rb, g, -delta / (rb * rb), ub)
     changes = (wander, db, chi, chi_b, norm_b, reach(ub, h) + qb)
@@ -158,9 +163,9 @@ def _square_bend(sense: Array, sense_b: Array, h: Triple, curvature: Array) -> T
                 entry += sense[i, k] * sense[i, m] - sense_b[i, k] * sense_b[i, m]
             curvature[k, m] = 2.0 * entry
     return (
-        reach((curvature[0, 0], curvature[0, 1], curvature[0, 2]), h),
-        reach((curvature[1, 0], curvature[1, 1], curvature[1, 2]), h),
-        reach((curvature[2, 0], curvature[2, 1], curvature[2, 2]), h),
+        row_reach(curvature, 0, h),
+        row_reach(curvature, 1, h),
+        row_reach(curvature, 2, h),
     )
 
 
@@ -213,7 +218,7 @@ def quotient_bend(
     mixed = 2.0 * (dg * length(u) + length(g) * du + dg * du)
     chi = (chi_n + mixed + abs(phi) * chi_s + rise * (norm_s + chi_s) + widen * sqrt(norm)) / least
     for k in range(3):
-        turn[k] = min(turn[k], reach((curvature[k, 0], curvature[k, 1], curvature[k, 2]), h) + chi * length(h))
+        turn[k] = min(turn[k], row_reach(curvature, k, h) + chi * length(h))
     return chi
 
 

@@ -25,15 +25,14 @@ from optloc.solvers.starts.several_positions import one_position
 TIGHT = 1e-3
 """A bound within this of the cost, relative to one plus the cost, leaves nothing to be found."""
 
-_MARGIN = (
-    0.1  # costs up to this above that of the fix are looked at: the wider the box of moments, the looser the bound
-)
-_RANK_ONE = (
-    1e-4  # largest ratio of eigenvalues at which first moments are a point: what an interior-point solver leaves
-)
-_SAME = 1e-3  # relative difference at which two ways to a cost agree, as for a tight bound
+# Costs up to this above that of the fix are looked at: the wider the box of moments, the looser the bound.
+_MARGIN = 0.1
+# Largest ratio of eigenvalues at which first moments are a point: what an interior-point solver leaves of zero.
+_RANK_ONE = 1e-4
+# Relative difference at which two ways to a cost agree, as for a tight bound.
+_SAME = 1e-3
 _OPEN = "the rows do not enclose the positions that cost as little; give a region"
-_MOST_STATIONS = 10  # the time of a relaxation grows with the sixth power
+_MOST_STATIONS = 10  # the time of a relaxation grows with their sixth power
 _OTHER_COSTS = {
     "sdp": "Shor's relaxation bounds the squared-range cost, not the likelihood",
     "socp": "the cone relaxation bounds the squared-range cost, not the likelihood",

@@ -73,6 +73,7 @@ def claimed(
     return Certificate(proof, sentence, METHOD, bound, cost - bound, margin > 0.0, margin, boxes, region)
 
 
+# A batch has few different claims but many fixes, and Python is slow to format numbers.
 @lru_cache(maxsize=256)
 def _sentence(margin: float, listed: int, region: tuple[Corner, Corner] | None) -> str:
     where = "no position" if region is None else f"no position from {_text(region[0])} to {_text(region[1])} m"
@@ -281,6 +282,7 @@ def _round(work: Work, items: Array) -> None:
     part = held(work.problem.take(items), work.fix[items], taken(work.pose, items))
     _give_up(work, items[~part.able], HELD)
     asked = _asked(work, items, part.extra)
+    # Below this level a wrapped residual may stand for another than the node's: no bound of one bounds the other.
     turning = part.able & (part.pose.level < work.fix.cost[items] + asked.kappa)
     _lower(work, items[turning], TURNS)
     good, pose, extra = np.flatnonzero(part.able & ~turning), part.pose, part.extra
@@ -325,6 +327,7 @@ def _budgets(kappa: Array, nodes: int, effort: int) -> Array:
     """Return the boxes (n,) that proofs may take: a box takes time with the square of the nodes."""
     if not enabled():
         return np.full(len(kappa), max(_AT_LEAST, _SLOW_BUDGET // len(kappa)))
+    # The same time whatever the number of nodes, not the same number of boxes.
     share = max(1.0, (nodes / _NODES) ** 2) / effort
     return np.asarray(np.where(kappa > 0.0, *_BUDGETS) / share).astype(np.int64)
 
