@@ -13,7 +13,7 @@ from optloc.compute.jit import compiled, enabled, plain, ready
 from optloc.proof.chart import Cost, cost_of, empty_box, empty_groups, set_geometry
 from optloc.proof.everywhere import prove_everywhere
 from optloc.proof.near import BUDGET, OPEN, prove
-from optloc.proof.pose import Posed, taken
+from optloc.proof.pose import Posed
 
 # Fixes that one call of machine code proves, fewest and most: a call costs as much as a fix or two, and threads share
 # what is left of a batch by stretches, of which each should get several (`_PARTS` in all).
@@ -94,18 +94,18 @@ def prove_all(pose: Posed, asked: Asked) -> Answered:
     """
     n = len(asked.x)
     if n > _FEW or len(pose.kinds) > _SMALL or ready(_loop):
-        return _proven(pose, asked)
+        return _prove(pose, asked)
     # A budget for each that ends soon; who needs more begins anew in machine code.
     with plain():
-        out = _proven(pose, asked._replace(budget=np.minimum(asked.budget, max(_AT_LEAST, _FIRST_BOXES // max(n, 1)))))
+        out = _prove(pose, asked._replace(budget=np.minimum(asked.budget, max(_AT_LEAST, _FIRST_BOXES // max(n, 1)))))
     short = np.flatnonzero((out.verdict == BUDGET) & (out.boxes < asked.budget))
     if len(short) and enabled():
-        for array, more in zip(out, _proven(taken(pose, short), asked.take(short)), strict=True):
+        for array, more in zip(out, _prove(pose.take(short), asked.take(short)), strict=True):
             array[short] = more
     return out
 
 
-def _proven(pose: Posed, asked: Asked) -> Answered:
+def _prove(pose: Posed, asked: Asked) -> Answered:
     n, d = asked.x.shape
     out = Answered(
         verdict=np.zeros(n, dtype=np.int64),
@@ -120,7 +120,7 @@ def _proven(pose: Posed, asked: Asked) -> Answered:
     def stretch(first: int) -> None:
         part = slice(first, min(first + length, n))
         with np.errstate(all="ignore"):  # plain Python would warn of what has no bound
-            _loop(taken(pose, part), asked.take(part), out.take(part))
+            _loop(pose.take(part), asked.take(part), out.take(part))
 
     mapped(stretch, range(0, n, length), None if enabled() else 1)
     return out

@@ -79,10 +79,10 @@ class Columns:
     @property
     def numbers(self) -> Array:
         """Return the numbers (B, J, width) of all nodes."""
-        return stacked(self.kinds, self.data)
+        return stack_numbers(self.kinds, self.data)
 
 
-def stacked(kinds: Sequence[int] | Array, data: Sequence[Array]) -> Array:
+def stack_numbers(kinds: Sequence[int] | Array, data: Sequence[Array]) -> Array:
     """Return the numbers (B, J, width) of nodes that have (B, n) or (1, n) each."""
     out = np.zeros((max((len(part) for part in data), default=1), len(data), width(kinds)))
     for j, part in enumerate(data):
@@ -130,7 +130,7 @@ def _range(made: Columns, row: Row, station: int) -> int:
     return made.ranges[station, epoch]
 
 
-def linear_nodes(made: Columns, rows: Array, origin: Array | None = None) -> list[int]:
+def add_linear(made: Columns, rows: Array, origin: Array | None = None) -> list[int]:
     """Add linear nodes of coefficients (B, q, d), zero at an origin (B, d), and return their numbers."""
     return [made.add(LINEAR, linear_numbers(rows[:, i], origin)) for i in range(rows.shape[1])]
 
@@ -138,7 +138,7 @@ def linear_nodes(made: Columns, rows: Array, origin: Array | None = None) -> lis
 # Least squares over a position alone: what else is unknown, and enters linearly, takes its best value.
 
 
-def whitened(noise: tuple[Whitener, ...], values: Array) -> Array:
+def whiten_rows(noise: tuple[Whitener, ...], values: Array) -> Array:
     """Return whitened values (..., q, p) of values (..., m, p) of all rows, block under block."""
     parts = [whitener.apply(values) for whitener in noise]
     shape = np.broadcast_shapes(*(part.shape[:-2] for part in parts))
@@ -151,7 +151,7 @@ def roots(precision: Array) -> Array:
     return np.asarray(np.sqrt(np.maximum(values, 0.0))[..., :, None] * np.swapaxes(vectors, -1, -2))
 
 
-def without(unknowns: Array, values: Array) -> Array:
+def project_out(unknowns: Array, values: Array) -> Array:
     """Return values (..., q, p) less their projection onto the span of unknowns (..., q, n).
 
     Columns of unknowns are scaled to one length first; what then is shorter than 1e-12 counts as dependent.
@@ -167,7 +167,7 @@ def without(unknowns: Array, values: Array) -> Array:
     return np.asarray(once - basis @ (np.swapaxes(basis, -1, -2) @ once))
 
 
-def compressed(K: Array, w: Array) -> tuple[Array, Array]:
+def compress(K: Array, w: Array) -> tuple[Array, Array]:
     """Return rows that have the same sum of squares ``|K phi - w|^2`` for every phi, at most one more than nodes.
 
     Parameters
@@ -189,7 +189,7 @@ def compressed(K: Array, w: Array) -> tuple[Array, Array]:
     return upper, np.concatenate([inside, last], axis=-1)
 
 
-def with_alone(kinds: Array, data: Array, K: Array, w: Array) -> Array:
+def mark_alone(kinds: Array, data: Array, K: Array, w: Array) -> Array:
     """Return the numbers of the nodes with a mark on those whose rows are their own, and that make something of it.
 
     Nodes that share no row with others: their part of the cost is a function of one number, which may be folded.
@@ -258,8 +258,16 @@ class Posed(NamedTuple):
     w: Array
     level: Array
 
+    def take(self, items: Array | slice) -> Posed:
+        """Return the posed costs of some of the problems."""
 
-def posed(problem: Problem) -> Posed:
+        def own(array: Array) -> Array:
+            return array if len(array) == 1 else array[items]
+
+        return self._replace(data=own(self.data), K=own(self.K), w=self.w[items], level=self.level[items])
+
+
+def pose_costs(problem: Problem) -> Posed:
     """Return the costs of a flat batch of problems over the position.
 
     Unknown emission times and offsets without a prior are projected out; offsets, drifts and isotropic station errors
@@ -282,11 +290,11 @@ def posed(problem: Problem) -> Posed:
     value = np.where(_of_rows(problem, _counts_from_measured), 0.0, known)
     K, w = _projected(problem, made, others, value)
     K, w = _with_position_prior(problem, made, K, w)
-    K, w = compressed(K, w)
+    K, w = compress(K, w)
     size, level = problem.batch_shape[0], _turned(problem, others, known)
     w, level = np.broadcast_to(w, (size, w.shape[-1])), np.broadcast_to(level, (size,))
     kinds = np.array(made.kinds)
-    return Posed(kinds, data=with_alone(kinds, made.numbers, K, w), K=K, w=w, level=level)
+    return Posed(kinds, data=mark_alone(kinds, made.numbers, K, w), K=K, w=w, level=level)
 
 
 @dataclass(frozen=True, slots=True)
@@ -343,11 +351,11 @@ def _projected(problem: Problem, made: Columns, others: _Others, value: Array) -
     noise, J = whiten(problem.noise, problem.weight), len(made.kinds)
     used = others.touch.any(0) | others.precision.any((0, 1))
     touch, precision = others.touch[:, used], others.precision[:, used][:, :, used]
-    geometry = whitened(noise, np.concatenate([made.design, touch], axis=1))
+    geometry = whiten_rows(noise, np.concatenate([made.design, touch], axis=1))
     geometry = geometry if geometry.ndim == 3 else geometry[None]
     shared = len(geometry) == len(precision) == 1  # one template, many measurements: the usual batch
     # Measurements of all problems are the columns of one matrix where everything else is shared.
-    seen = whitened(noise, value.T if shared else value[..., None])
+    seen = whiten_rows(noise, value.T if shared else value[..., None])
     seen = seen if seen.ndim == 3 else seen[None]
     if used.any():
         # A prior is a row for the unknown itself; one without a prior has a row of zeros.
@@ -358,7 +366,7 @@ def _projected(problem: Problem, made: Columns, others: _Others, value: Array) -
         none = np.zeros((len(seen), touch.shape[1], seen.shape[-1]))
         seen = np.concatenate([seen, none], axis=1)
         unknowns = geometry[..., J:]
-        geometry, seen = without(unknowns, geometry[..., :J]), without(unknowns, seen)
+        geometry, seen = project_out(unknowns, geometry[..., :J]), project_out(unknowns, seen)
     return geometry[..., :J], np.ascontiguousarray(seen[0].T) if shared else seen[..., 0]
 
 
@@ -367,7 +375,7 @@ def _with_position_prior(problem: Problem, made: Columns, K: Array, w: Array) ->
     for name, mean, precision in prior_parts(problem):
         if name == "position":
             whole = precision if precision.ndim == 3 else precision[None]
-            nodes = linear_nodes(made, roots(whole), mean if mean.ndim == 2 else mean[None])
+            nodes = add_linear(made, roots(whole), mean if mean.ndim == 2 else mean[None])
             own = np.zeros((len(K), len(nodes), len(made.kinds)))
             own[:, np.arange(len(nodes)), nodes] = 1.0
             wider = np.zeros((*K.shape[:2], len(nodes)))
@@ -405,12 +413,3 @@ def _turned(problem: Problem, others: _Others, known: Array) -> Array:
 def _most(model: Model) -> float:
     """Return how large the node of a kind with a period can be."""
     return sum(abs(factor) * named(node).most for factor, node in model.nodes)
-
-
-def taken(pose: Posed, items: Array | slice) -> Posed:
-    """Return the posed costs of some of the problems."""
-
-    def own(array: Array) -> Array:
-        return array if len(array) == 1 else array[items]
-
-    return pose._replace(data=own(pose.data), K=own(pose.K), w=pose.w[items], level=pose.level[items])

@@ -23,7 +23,7 @@ from optloc.problem.fix import Stage
 from optloc.problem.layout import Layout
 from optloc.problem.noise import variances, whiten
 from optloc.problem.problem import Problem
-from optloc.proof.pose import whitened, without
+from optloc.proof.pose import project_out, whiten_rows
 from optloc.solvers.pool import Curvature, Pool, in_parts
 from optloc.solvers.stages import gtrs, lsr
 from optloc.solvers.starts.least_squares_ranges import Ranges, ranges
@@ -140,10 +140,10 @@ def _maps(one: Problem, correction: Array, found: Ranges, heard: Array, white: A
     """Return the fields of the compiled model, in its order."""
     count = one.count
     design, emitted, anchor, start = _design(one, found.station[heard])
-    alone = whitened(whiten(one.noise, one.weight), np.eye(count))
+    alone = whiten_rows(whiten(one.noise, one.weight), np.eye(count))
     times = alone @ emitted
     # Emission times projected out: what is left of the rows depends on ranges alone.
-    bare = without(times, alone)
+    bare = project_out(times, alone)
     basis, upper = np.linalg.qr(bare @ design, mode="complete")
     inside = min(upper.shape)
     turned = basis.T @ bare

@@ -8,7 +8,7 @@ from proof.sampling import bounded, changes, curved, differences, numbers, remai
 from optloc.proof.nodes.azimuth import ALONE
 from optloc.proof.nodes.node import AZIMUTH, RANGE, RATIO
 from optloc.proof.nodes.ratio import MEASURED
-from optloc.proof.pose import with_alone
+from optloc.proof.pose import mark_alone
 
 
 @pytest.mark.parametrize("d", [2, 3])
@@ -73,8 +73,8 @@ def test_rows_that_nodes_share_are_told_from_rows_of_their_own():
     w = np.array([[0.0, 13.0, 9.0, 4.0], [0.0, 12.0, 8.0, 4.0]])
     turned = np.linalg.qr(np.random.default_rng(5).normal(size=(4, 4)))[0]
     for rows, right in ((K, w), (turned @ K, w @ turned.T)):
-        out = with_alone(kinds, np.zeros((1, 4, WIDTH)), rows[None], right)
+        out = mark_alone(kinds, np.zeros((1, 4, WIDTH)), rows[None], right)
         assert out[:, :, ALONE].tolist() == [[1.0, 1.0, 0.0, 0.0]] * 2
         assert out[:, 1, MEASURED] == pytest.approx([1.3, 1.2])
     shifted = w + np.eye(4)[0]
-    assert with_alone(kinds, np.zeros((1, 4, WIDTH)), K[None], shifted)[0, 0, ALONE] == 0.0
+    assert mark_alone(kinds, np.zeros((1, 4, WIDTH)), K[None], shifted)[0, 0, ALONE] == 0.0

@@ -96,9 +96,9 @@ def certified(
         certificate = fill(len(pool), None) if pool.certificate is None else np.array(pool.certificate)
         certificate[answered] = unknown(why)
         return replace(pool, certificate=certificate, stages=(*pool.stages, _stage(why or "nothing to prove", began)))
-    from optloc.solvers.certify.rounds import Work, settled_by_rounds  # machine code is loaded when it is used
+    from optloc.solvers.certify.rounds import Work, settle  # machine code is loaded when it is used
 
-    work = settled_by_rounds(Work.begin(problem, pool, fix, answered, region, margin, effort))
+    work = settle(Work.begin(problem, pool, fix, answered, region, margin, effort))
     stages = (*pool.stages, _stage(work.summary(), began))
     return replace(work.pool, certificate=work.certificate, stages=stages)
 

@@ -21,7 +21,7 @@ from optloc.proof.near import BETTER, BUDGET, OTHER, UNIQUE, VALUE
 from optloc.proof.nodes.height import height_numbers
 from optloc.proof.nodes.linear import linear_numbers
 from optloc.proof.nodes.node import HEIGHT, LINEAR
-from optloc.proof.pose import Posed, posed, stacked, taken
+from optloc.proof.pose import Posed, pose_costs, stack_numbers
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP
 from optloc.solvers.pool import Pool, offer, pack
 from optloc.solvers.refine import refine
@@ -51,7 +51,7 @@ def unknown(reason: str) -> Certificate:
     return Certificate("unknown", reason, METHOD)
 
 
-def claimed(
+def state_claim(
     cost: float, bound: float, margin: float, boxes: int, listed: int, region: tuple[Corner, Corner] | None
 ) -> Certificate:
     """Return the certificate of a proven fix.
@@ -121,7 +121,7 @@ class Held:
     able: Array
 
 
-def held(problem: Problem, fix: Fix, pose: Posed) -> Held:
+def hold_equalities(problem: Problem, fix: Fix, pose: Posed) -> Held:
     """Return posed costs with the equalities of a flat batch of problems as rows at the multipliers of their fixes.
 
     References
@@ -162,7 +162,7 @@ def _with_row(pose: Posed, kind: int, numbers: Array, value: Array, scale: Array
     K[:, :q, :nodes], K[:, q, nodes] = pose.K, 1.0 / scale
     w = np.concatenate([pose.w, (np.broadcast_to(value, (size,)) / scale - shift * scale)[:, None]], axis=1)
     kinds = np.append(pose.kinds, kind)
-    data = stacked(kinds, [*(pose.data[:, j] for j in range(nodes)), numbers])
+    data = stack_numbers(kinds, [*(pose.data[:, j] for j in range(nodes)), numbers])
     return pose._replace(kinds=kinds, data=data, K=K, w=w)
 
 
@@ -246,7 +246,7 @@ class Work:
             pool,
             fix,
             fill(size, None) if pool.certificate is None else np.array(pool.certificate),
-            posed(problem),
+            pose_costs(problem),
             np.full((size, 0, d), np.nan),
             np.array(np.broadcast_to(corners, (size, 2, d))),
             _around(problem, fix.position),
@@ -266,7 +266,7 @@ class Work:
         return ", ".join(counts + more)
 
 
-def settled_by_rounds(work: Work) -> Work:
+def settle(work: Work) -> Work:
     """Return the work with a certificate for every fix that was to be proven."""
     for _ in range(_ROUNDS * work.effort):
         items = np.flatnonzero(work.pending)
@@ -279,7 +279,7 @@ def settled_by_rounds(work: Work) -> Work:
 
 def _round(work: Work, items: Array) -> None:
     """Try to prove some fixes once, and settle or change what can be."""
-    part = held(work.problem.take(items), work.fix[items], taken(work.pose, items))
+    part = hold_equalities(work.problem.take(items), work.fix[items], work.pose.take(items))
     _give_up(work, items[~part.able], HELD)
     asked = _asked(work, items, part.extra)
     # Below this level a wrapped residual may stand for another than the node's: no bound of one bounds the other.
@@ -289,7 +289,7 @@ def _round(work: Work, items: Array) -> None:
     if not len(good):
         return
     if len(good) < len(items):
-        items, asked, extra, pose = items[good], asked.take(good), extra[good], taken(pose, good)
+        items, asked, extra, pose = items[good], asked.take(good), extra[good], pose.take(good)
     answer = prove_all(pose, asked)
     done = np.isin(answer.verdict, (UNIQUE, VALUE))
     _claim(work, items, asked, answer, extra, np.flatnonzero(done))
@@ -359,7 +359,7 @@ def _claim(work: Work, items: Array, asked: Asked, answer: Answered, extra: Arra
         region[k] = tuple(low), tuple(high)
     numbers = (work.fix.cost[proven], bound, kappa, answer.boxes[done], listed.sum(1))
     given = zip(*(values.tolist() for values in numbers), region, strict=True)
-    work.certificate[proven] = column([claimed(*each) for each in given])
+    work.certificate[proven] = column([state_claim(*each) for each in given])
     work.pending[proven] = False
 
 
