@@ -7,7 +7,7 @@ import pytest
 
 from optloc import Motion, Status, assemble, measured, simulate, solve, station_array, with_bias
 from optloc.problem.noise import Block, Noise, dense
-from optloc.solvers.starts.several_positions import _noise_of, from_pieces
+from optloc.solvers.starts.several_positions import _take_noise, from_pieces
 
 TAGS = np.array([[4.0, 1.0, 0.5], [-3.0, 2.0, 1.5], [1.0, -4.0, 2.0], [0.0, 5.0, 0.0]])
 
@@ -106,7 +106,7 @@ def test_the_noise_of_some_rows_is_the_matching_part():
         )
     )
     kept = np.array([1, 2, 4, 6])
-    part = dense(_noise_of(noise, kept, 7), np.arange(4))
+    part = dense(_take_noise(noise, kept, 7), np.arange(4))
     np.testing.assert_array_equal(part, dense(noise, np.arange(7))[np.ix_(kept, kept)])
 
 

@@ -14,7 +14,7 @@ from optloc import Status, assemble, measured, rejected, simulate, solve
 from optloc.cli import app
 from optloc.problem.loss import LOSSES
 from optloc.problem.noise import Block, Noise
-from optloc.solvers.robust.reweighting import Doubt, reweighted
+from optloc.solvers.robust.reweighting import Doubt, reweight
 
 REDESCENDING = ("cauchy", "truncated")
 
@@ -33,7 +33,7 @@ def test_no_weighing_raises_the_cost(name):
     start = case.truth + np.random.default_rng(2).normal(0.0, 60.0, case.truth.shape)
     doubt, costs = Doubt.of(case.problem, start), [_cost(LOSSES[name], case.problem, start)]
     for limit in (1, 2, 3, 5, 8, 12):
-        done = reweighted(case.problem, start, LOSSES[name], doubt, limit=limit)
+        done = reweight(case.problem, start, LOSSES[name], doubt, limit=limit)
         np.testing.assert_allclose(done.cost, _cost(LOSSES[name], case.problem, done.x), rtol=1e-9)
         costs.append(done.cost)
     assert np.all(np.diff(costs, axis=0) <= 1e-7 * (1.0 + np.abs(costs[0])))

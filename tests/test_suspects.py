@@ -13,7 +13,7 @@ import optloc
 from optloc import InvalidProblem, Motion, Prior, Status, assemble, measured, simulate, solve, with_bias
 from optloc.cli import app
 from optloc.solvers.refine import refine
-from optloc.solvers.starts.arrivals import as_arrivals, original
+from optloc.solvers.starts.arrivals import as_arrivals, restore_order
 from optloc.solvers.suspects.evidence import errors, influence, log_tail, significance
 from optloc.solvers.suspects.groups import groups_of
 
@@ -78,7 +78,7 @@ def test_arrivals_give_the_same_fix():
     flat = simulate(arrivals(), TARGET, 5, trials=4).flat()
     made = as_arrivals(flat)
     fix, other = solve(flat, "searched"), solve(made.problem, "searched")
-    np.testing.assert_allclose(original(flat, made.problem, other.x), fix.x, atol=1e-3)
+    np.testing.assert_allclose(restore_order(flat, made.problem, other.x), fix.x, atol=1e-3)
     np.testing.assert_allclose(other.cov, fix.cov, rtol=1e-5)
     np.testing.assert_allclose(other.cost, fix.cost, rtol=1e-6)
     assert (other.dof == fix.dof).all()

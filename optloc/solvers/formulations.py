@@ -16,7 +16,7 @@ from optloc.solvers.certify.relaxations import Reference, reference_bound
 from optloc.solvers.starts.angles import Bearings, bearings, by_directions, instrumental, least_worst
 from optloc.solvers.starts.heights import height_starts
 from optloc.solvers.starts.position import squared_range_starts
-from optloc.solvers.starts.registration import closed_form, registrable, relaxed, run_starts
+from optloc.solvers.starts.registration import closed_form, registrable, relax_run, run_starts
 from optloc.solvers.starts.several_positions import one_position
 from optloc.solvers.starts.squared_range import every, hull, minimum, shor
 
@@ -60,7 +60,7 @@ class Formulation:
     words: tuple[str, ...] = ()
 
 
-def _seen(locate: Callable[[Bearings], Array]) -> Callable[[Problem], Array]:
+def _from_bearings(locate: Callable[[Bearings], Array]) -> Callable[[Problem], Array]:
     """Return a start from the bearings of a problem."""
 
     def start(problem: Problem) -> Array:
@@ -71,7 +71,7 @@ def _seen(locate: Callable[[Bearings], Array]) -> Callable[[Problem], Array]:
     return start
 
 
-_run_solved, _run_relaxed = partial(run_starts, begin=closed_form), partial(run_starts, begin=relaxed)
+_start_run, _start_relaxed_run = partial(run_starts, begin=closed_form), partial(run_starts, begin=relax_run)
 
 _RANGES = "range, toa, tdoa, range_sum; azimuth, elevation and groa rows linear in (x, r)"
 
@@ -133,7 +133,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "asymptotically unbiased; as good as maximum likelihood to 0.1 %",
         "30 us",
         "Dogancay 2006, 2015",
-        starts={"wiv": _seen(instrumental)},
+        starts={"wiv": _from_bearings(instrumental)},
     ),
     "bearing_course": Formulation(
         "the same for a target on a polynomial course, over all epochs at once; one station that turns may do",
@@ -149,7 +149,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "100 % to 20 mrad, 98 % at 50 mrad",
         "2 ms two stations, 10 ms four",
         "epipolar equalities; Shor 1987",
-        starts={"directions": _seen(by_directions)},
+        starts={"directions": _from_bearings(by_directions)},
         bound=partial(reference_bound, method="directions"),
     ),
     "moment_sdp": Formulation(
@@ -166,7 +166,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "exact for its own cost",
         "10 ms",
         "Kahl, Hartley 2008",
-        starts={"minimax": _seen(least_worst)},
+        starts={"minimax": _from_bearings(least_worst)},
     ),
     "bistatic": Formulation(
         "closed-form range of one receiver and one illuminator; polynomial course of several epochs",
@@ -183,7 +183,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "0.3 ms",
         "Chan, Ho 1994; Beck, Stoica, Li 2008",
         serves=registrable,
-        starts={"gtrs": _run_solved, "roots": _run_solved, "socp": _run_solved},
+        starts={"gtrs": _start_run, "roots": _start_run, "socp": _start_run},
     ),
     "registration_sdp": Formulation(
         "the same lifted with its reference ranges; price on the trace, prior on the biases",
@@ -192,7 +192,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "1 s",
         "Shor 1987",
         serves=registrable,
-        starts={"sdp": _run_relaxed},
+        starts={"sdp": _start_relaxed_run},
     ),
     "lifted": Formulation(
         "order-1 lift [1, x, r]: a baseline for studies, never a default",

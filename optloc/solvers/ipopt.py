@@ -25,9 +25,9 @@ from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
 from optloc.solvers.inequalities import without_broken
 from optloc.solvers.pool import Pool, begin, offer
-from optloc.solvers.starts.block_averages import averaged
-from optloc.solvers.starts.position import completed, spread_of
-from optloc.solvers.starts.registration import BLOCKS, alike, registrable
+from optloc.solvers.starts.block_averages import average_blocks
+from optloc.solvers.starts.position import complete, spread_of
+from optloc.solvers.starts.registration import BLOCKS, group_alike, registrable
 from optloc.solvers.verdict.judge import judge, standing
 from optloc.solvers.verdict.minima import settle
 
@@ -61,7 +61,7 @@ def nlp(problem: Problem, pool: Pool | None) -> Pool:
     item, slot = pool.occupied
     for i in np.unique(item):
         one = problem.take(np.array([i]))
-        solver = _Scaled(one)
+        solver = _ScaledProblem(one)
         for j in slot[item == i]:
             x[i, j], cost[i, j], code[i, j] = solver.from_start(pool.x[i, j])
     face = np.zeros(shape, dtype=int)
@@ -79,12 +79,12 @@ def nlp(problem: Problem, pool: Pool | None) -> Pool:
 def _of_blocks(problem: Problem, x: Array) -> Array:
     """Return the answers (N, C, size) for the block averages of runs from their candidates."""
     n, out = problem.layout.n_shared, np.full(x.shape, np.nan)
-    for items in alike(problem):
-        blocks = averaged(problem.take(items), BLOCKS)
-        pool = nlp(blocks, begin(blocks, completed(blocks, x[items, :, :n])))
+    for items in group_alike(problem):
+        blocks = average_blocks(problem.take(items), BLOCKS)
+        pool = nlp(blocks, begin(blocks, complete(blocks, x[items, :, :n])))
         found = standing(pool, judge(blocks, pool))
         width = min(found.shape[1], x.shape[1])
-        out[items, :width] = completed(problem.take(items), found[:, :width, :n])
+        out[items, :width] = complete(problem.take(items), found[:, :width, :n])
     return out
 
 
@@ -103,7 +103,7 @@ def _stationary(problem: Problem, x: Array, code: Array, face: Array) -> Array:
     return out
 
 
-class _Scaled:
+class _ScaledProblem:
     """One problem in units of its own size, with the compiled program of its structure."""
 
     def __init__(self, problem: Problem) -> None:
@@ -151,10 +151,10 @@ def _program(problem: Problem, data: int, rows: int) -> Program:
         for b in conjunction(problem)
     )
     key = (problem.structure, data, shapes, limits, None if choice is None else choice.key, compiled)
-    return _PROGRAMS.find(key, lambda: _built(problem, data, rows, choice, compiled))
+    return _PROGRAMS.find(key, lambda: _build(problem, data, rows, choice, compiled))
 
 
-def _built(problem: Problem, data: int, rows: int, choice: Choice | None, compiled: bool) -> Program:
+def _build(problem: Problem, data: int, rows: int, choice: Choice | None, compiled: bool) -> Program:
     n = problem.layout.size
 
     def scaled(y: Any, p: Any, z: Any) -> list[Any]:

@@ -104,13 +104,13 @@ def compare_bounds(problem: Problem, pool: Pool | None) -> Pool:
         for i in known:
             proven = fix.certificate[i].proof
             if proven != "global" and (tight[i] or proven != "region"):
-                certificate[i] = _bounded(float(fix.cost[i]), float(found.bound[i]), bool(tight[i]), found.method)
+                certificate[i] = _certificate(float(fix.cost[i]), float(found.bound[i]), bool(tight[i]), found.method)
         stage = Stage("bound", f"{int(tight[known].sum())} of {len(tight)} proven", perf_counter() - began)
         return replace(pool, certificate=certificate, stages=(*pool.stages, stage))
     return pool
 
 
-def _bounded(cost: float, bound: float, tight: bool, name: str) -> Certificate:
+def _certificate(cost: float, bound: float, tight: bool, name: str) -> Certificate:
     reason = "no position costs less" if tight else f"a lower bound leaves a gap of {cost - bound:.2g}"
     text = f"{reason}; other minima were searched for, not excluded"
     return Certificate(

@@ -94,7 +94,7 @@ class Pool:
     asked : bool
         Whether contradictions were looked into.
     conclusion : object array (N,), optional
-        What explains the data where they contradict each other, an `optloc.solvers.verdict.explained.Conclusion`; or
+        What explains the data where they contradict each other, an `optloc.solvers.verdict.conclusion.Conclusion`; or
         a `Fix` from outside that stands as it is.
     """
 

@@ -20,7 +20,7 @@ from optloc.problem.problem import Problem
 from optloc.solvers.pool import begin
 from optloc.solvers.refine import refine
 from optloc.solvers.stages import lsr
-from optloc.solvers.starts.position import completed
+from optloc.solvers.starts.position import complete
 from optloc.solvers.verdict.judge import judge
 
 # One standard deviation: the sums then err by thousandths of it.
@@ -81,7 +81,7 @@ class Running:
             raise InvalidProblem("the fix has no answer to begin from", "fix", "wait for more epochs; see fix.status")
         flat = problem.flat()
         at = fix.x[..., : problem.layout.n_shared].reshape(-1, problem.layout.n_shared)
-        return _linearised(flat, at, 0, tolerance)
+        return _linearise(flat, at, 0, tolerance)
 
     def update(self, more: Problem) -> Running:
         """Return the solution with the epochs of another problem added.
@@ -102,32 +102,32 @@ class Running:
         joint = joined(self.problem, more.flat())
         fresh = window(joint, self.problem.epochs, joint.epochs)
         sums = self.sums + _information(fresh, self.at)
-        x, cov, length = _stepped(joint, sums, self.at)
+        x, cov, length = _step(joint, sums, self.at)
         if np.any(length > self.tolerance):
-            start = completed(joint, x[:, None])[:, 0]
+            start = complete(joint, x[:, None])[:, 0]
             done = refine(joint, start, limit=20)
-            return _linearised(joint, done.x[:, : x.shape[1]], self.linearised, self.tolerance)
+            return _linearise(joint, done.x[:, : x.shape[1]], self.linearised, self.tolerance)
         return replace(self, problem=joint, x=x, cov=cov, sums=sums)
 
     def fix(self) -> Fix:
         """Return the fix of all epochs, (N,), refined from the running solution and judged."""
-        start = begin(self.problem, completed(self.problem, self.x[:, None]))
+        start = begin(self.problem, complete(self.problem, self.x[:, None]))
         return judge(self.problem, lsr(self.problem, start))
 
 
-def _linearised(problem: Problem, at: Array, before: int, tolerance: float) -> Running:
+def _linearise(problem: Problem, at: Array, before: int, tolerance: float) -> Running:
     sums = _information(problem, at)
-    x, cov, _ = _stepped(problem, sums, at)
+    x, cov, _ = _step(problem, sums, at)
     return Running(problem, x, cov, at, sums, before + 1, tolerance)
 
 
 def _information(problem: Problem, at: Array) -> Normal:
     """Return the information of the measurements about the shared unknowns, linearised at vectors (N, n)."""
-    x = completed(problem, at[:, None])[:, 0]
+    x = complete(problem, at[:, None])[:, 0]
     return eliminated(with_priors(problem, x, summed(problem, x), shared=False))
 
 
-def _stepped(problem: Problem, sums: Normal, at: Array) -> tuple[Array, Array, Array]:
+def _step(problem: Problem, sums: Normal, at: Array) -> tuple[Array, Array, Array]:
     """Return estimates (N, n), their covariance and the length (N,) of the step in its own standard deviations."""
     x = np.zeros((len(at), problem.layout.size))
     x[:, : at.shape[1]] = at
@@ -197,7 +197,7 @@ def growing(problem: Problem, fix: Fix, counts: Sequence[int] | Array | None = N
         raise InvalidProblem("the estimate does not grow with the epochs", "problem", advice)
     if fix.shape or not np.isfinite(fix.x).all():
         raise InvalidProblem("the run has no answer to begin from", "fix", "see its status for the reason")
-    chosen = _spread(k) if counts is None else np.asarray(counts, dtype=np.int64)
+    chosen = _space_counts(k) if counts is None else np.asarray(counts, dtype=np.int64)
     if not len(chosen) or chosen.min() < 1 or chosen.max() > k:
         raise InvalidProblem(f"the counts are not among 1 to {k}", "counts", "give numbers of epochs")
     x, cov = np.full((len(chosen), n), np.nan), np.full((len(chosen), n, n), np.nan)
@@ -210,7 +210,7 @@ def growing(problem: Problem, fix: Fix, counts: Sequence[int] | Array | None = N
     return Growing(chosen, problem.times[chosen - 1], x, cov, problem.layout)
 
 
-def _spread(epochs: int) -> Array:
+def _space_counts(epochs: int) -> Array:
     if epochs <= _POINTS:
         return np.arange(1, epochs + 1)
     return np.unique(np.geomspace(1, epochs, _POINTS).round().astype(np.int64))

@@ -20,9 +20,9 @@ from optloc.problem.problem import Problem
 from optloc.solvers.pool import Pool, begin, offer, pack
 from optloc.solvers.stages import fix_by, gtrs, lsr
 from optloc.solvers.starts.arrivals import as_arrivals
-from optloc.solvers.starts.position import spread_of, static, vectors
+from optloc.solvers.starts.position import hold_still, spread_of, vectors
 from optloc.solvers.starts.several_positions import from_pieces, one_position
-from optloc.solvers.starts.squared_range import Coordinates, lifted_rows
+from optloc.solvers.starts.squared_range import Coordinates, lift_rows
 from optloc.solvers.verdict.judge import judge
 
 # Rows of one position made linear one by one, so that one wrong measurement is one wrong row.
@@ -107,8 +107,8 @@ def row_wise(problem: Problem) -> RowWise:
     rows, right = np.zeros((size, problem.count, n)), np.zeros((size, problem.count))
     errors: list[tuple[slice, Callable[[Array | None], Array]]] = []
     for block, start in zip(problem.rows, problem.starts, strict=True):
-        part = _ranged(problem, block, start, origin, scale, pairs, first)
-        part = part or _otherwise(problem, block, start, Coordinates(origin, scale, False))
+        part = _lift_ranges(problem, block, start, origin, scale, pairs, first)
+        part = part or _lift_others(problem, block, start, Coordinates(origin, scale, False))
         if part is None:
             continue
         own = slice(start, start + block.count)
@@ -141,7 +141,7 @@ def _block_sigma(problem: Problem, block: Rows, start: int) -> Array:
     return np.sqrt(variances(problem.noise, problem.count)[..., start : start + block.count] / weight)
 
 
-def _ranged(
+def _lift_ranges(
     problem: Problem, block: Rows, start: int, origin: Array, scale: Array, pairs: list[int], first: int
 ) -> _Part | None:
     model, form = MODELS[block.kind], MODELS[block.kind].ranges
@@ -158,7 +158,7 @@ def _ranged(
         column = first + np.searchsorted(pairs, block.b)
         others = ((column, 2.0 * form[1] * m),)
     elif model.emission:
-        m = _centred(m, block)
+        m = _centre(m, block)
         column = problem.dimension + 1 + 2 * block.epoch
         square, others = np.zeros(block.count), ((column, 2.0 * m), (column + 1, np.ones(block.count)))
     sigma = _block_sigma(problem, block, start) / scale[:, None]
@@ -170,7 +170,7 @@ def _ranged(
     return _Part(x, square, others, right + m**2, error)
 
 
-def _centred(m: Array, block: Rows) -> Array:
+def _centre(m: Array, block: Rows) -> Array:
     """Return arrival times (N, m) less the median of their epoch: one that is far off must not decide the origin."""
     out, heard = np.array(m), np.broadcast_to(block.weight > 0.0, m.shape)
     for epoch in np.unique(block.epoch):
@@ -181,8 +181,8 @@ def _centred(m: Array, block: Rows) -> Array:
     return out
 
 
-def _otherwise(problem: Problem, block: Rows, start: int, to: Coordinates) -> _Part | None:
-    lifted = lifted_rows(problem, block, start, None, to)
+def _lift_others(problem: Problem, block: Rows, start: int, to: Coordinates) -> _Part | None:
+    lifted = lift_rows(problem, block, start, None, to)
     if lifted is None:
         return None
 
@@ -225,10 +225,10 @@ def sparse(problem: Problem, pool: Pool | None) -> Pool:
     if not one_position(problem):
         x = from_pieces(problem, lambda piece: fix_by(piece, lambda one: sparse(one, None)))
         return offer(problem, x, pool, "sparse", began)
-    alone = static(problem)
+    alone = hold_still(problem)
     arrived = as_arrivals(alone)
     found = sparse_errors(alone if arrived is None else arrived.problem)
-    wrong = found.wrong if arrived is None else spread(found.wrong, arrived.origin, problem.count)
+    wrong = found.wrong if arrived is None else spread_rows(found.wrong, arrived.origin, problem.count)
     weights = np.where(wrong, 0.0, problem.weight)
     x = vectors(problem.with_rows(weight=weights), pack(found.position))  # emission times fit the rows that are kept
     start = offer(problem, x, pool, "sparse", began)
@@ -236,7 +236,7 @@ def sparse(problem: Problem, pool: Pool | None) -> Pool:
     return replace(start, weights=weights, stages=(*start.stages[:-1], stage))
 
 
-def spread(wrong: Array, origin: Sequence[Array], count: int) -> Array:
+def spread_rows(wrong: Array, origin: Sequence[Array], count: int) -> Array:
     """Return the rows (N, count) that wrong arrival times (N, m) were made from (`optloc.solvers.starts.arrivals`)."""
     out = np.zeros((len(wrong), count), dtype=bool)
     for i, rows in enumerate(origin):
@@ -256,14 +256,14 @@ def sparse_errors(problem: Problem) -> SparseErrors:
     problem : Problem
         N problems.
     """
-    x = vectors(problem, _lifted(problem)[:, None])[:, 0]
-    x, raw = _linearised(problem, x)
+    x = vectors(problem, _lift(problem)[:, None])[:, 0]
+    x, raw = _linearise(problem, x)
     start = problem.layout.take(x, "position")
-    fixed, wrong = _tested(problem, x, raw)
+    fixed, wrong = _test_support(problem, x, raw)
     return SparseErrors(np.stack([start, fixed], axis=1), raw, wrong)
 
 
-def _lifted(problem: Problem) -> Array:
+def _lift(problem: Problem) -> Array:
     """Return positions (N, d) of the squared rows in two weightings.
 
     Where these leave a direction open (pairs without a common station have one more unknown each), it is the closed
@@ -271,7 +271,7 @@ def _lifted(problem: Problem) -> Array:
     """
     lifts, point = row_wise(problem), None
     for _ in range(2):
-        y, _ = _fitted(lifts.rows, lifts.right, lifts.error(point), lifts)
+        y, _ = _fit(lifts.rows, lifts.right, lifts.error(point), lifts)
         point = y[:, : problem.dimension]
     assert point is not None
     position = point * lifts.scale[:, None] + lifts.origin
@@ -282,14 +282,14 @@ def _lifted(problem: Problem) -> Array:
     return position
 
 
-def _linearised(problem: Problem, x: Array) -> tuple[Array, Array]:
+def _linearise(problem: Problem, x: Array) -> tuple[Array, Array]:
     """Return vectors (N, size) after one step with sparse errors, and the support (N, m)."""
     residual, jacobian = _derivatives(problem, x)
-    move, errors = _fitted(jacobian, residual, _sigma(problem))
+    move, errors = _fit(jacobian, residual, _sigma(problem))
     return x + move, errors != 0.0
 
 
-def _fitted(rows: Array, right: Array, sigma: Array, lifts: RowWise | None = None) -> tuple[Array, Array]:
+def _fit(rows: Array, right: Array, sigma: Array, lifts: RowWise | None = None) -> tuple[Array, Array]:
     """Return the unknowns (N, n) and errors in sigmas (N, m) of linear rows; unknowns that no row has are zero."""
     from formulations.sparse_errors import sparse_fit
 
@@ -310,21 +310,21 @@ def _fitted(rows: Array, right: Array, sigma: Array, lifts: RowWise | None = Non
     return y, errors
 
 
-def _tested(problem: Problem, x: Array, wrong: Array) -> tuple[Array, Array]:
+def _test_support(problem: Problem, x: Array, wrong: Array) -> tuple[Array, Array]:
     """Return the positions (N, d) without the rows in error, and these rows (N, m)."""
     present = np.broadcast_to(problem.weight > 0.0, wrong.shape)
     limit = -ndtri(0.5 * _LEVEL / np.maximum(present.sum(1, keepdims=True), 1))
     wrong, active = wrong.copy(), np.arange(len(x))
     x = x.copy()
-    wrong = _spared(problem, wrong.astype(float), wrong)
+    wrong = _spare(problem, wrong.astype(float), wrong)
     for _ in range(_PASSES):
         part, out = problem.take(active), wrong[active]
         rest = part.with_rows(weight=np.where(out, 0.0, part.weight))
         starts = np.stack([x[active], gtrs(rest, None).x[:, 0]], axis=1)
         fixed = judge(rest, lsr(rest, begin(rest, starts))).x
         x[active] = np.where(np.isfinite(fixed), fixed, x[active])
-        size = _standardised(part, x[active], ~out & present[active])
-        found = _spared(part, size, size > limit[active])
+        size = _standardise(part, x[active], ~out & present[active])
+        found = _spare(part, size, size > limit[active])
         changed = (found != out).any(1) & np.isfinite(fixed).all(1)
         wrong[active[changed]] = found[changed]
         active = active[changed]
@@ -333,7 +333,7 @@ def _tested(problem: Problem, x: Array, wrong: Array) -> tuple[Array, Array]:
     return problem.layout.take(x, "position"), wrong
 
 
-def _spared(problem: Problem, size: Array, wrong: Array) -> Array:
+def _spare(problem: Problem, size: Array, wrong: Array) -> Array:
     """Return the largest of the rows in error (N, m), so many that one row more than unknowns is left."""
     present = np.broadcast_to(problem.weight > 0.0, wrong.shape)
     unknown = problem.layout.n_shared + problem.layout.n_local * problem.epochs
@@ -342,7 +342,7 @@ def _spared(problem: Problem, size: Array, wrong: Array) -> Array:
     return np.asarray(wrong & (rank < most))
 
 
-def _standardised(problem: Problem, x: Array, kept: Array) -> Array:
+def _standardise(problem: Problem, x: Array, kept: Array) -> Array:
     """Return residuals (N, m) at the fix of the rows kept, in units of their own standard deviations.
 
     A row of the fix has residual variance s^2 - J C J', one left out s^2 + J C J'.

@@ -24,13 +24,13 @@ from optloc.solvers.pool import Pool, offer, pack
 from optloc.solvers.refine import refine
 from optloc.solvers.starts.position import (
     along_the_valley,
-    mirrored,
+    mirror,
     spread_of,
-    static,
+    hold_still,
     subarray_starts,
     vectors,
 )
-from optloc.solvers.starts.registration import beside, registrable
+from optloc.solvers.starts.registration import step_beside, registrable
 from optloc.solvers.starts.several_positions import from_pieces, one_position
 from optloc.solvers.verdict.judge import judge, standing
 from optloc.solvers.verdict.minima import settle
@@ -48,7 +48,7 @@ def start_with(word: str) -> Solver:
         began = perf_counter()
         serving = [form for form in FORMULATIONS.values() if word in form.starts and form.serves(problem)]
         if one_position(problem):
-            alone = static(problem)
+            alone = hold_still(problem)
             nowhere = np.full((problem.batch_shape[0], 1, problem.dimension), np.nan)
             position = np.concatenate([*(form.starts[word](alone) for form in serving), nowhere], axis=1)
             return _place(problem, position, pool, word, began)
@@ -76,13 +76,13 @@ def widen(problem: Problem, pool: Pool | None) -> Pool:
     began = perf_counter()
     if registrable(problem):
         fix = judge(problem, pool)
-        around = beside(problem, fix.x, fix.covariance())
+        around = step_beside(problem, fix.x, fix.covariance())
         return _beside(problem, pool, fix, around, began) if np.isfinite(around).any() else pool
     if not one_position(problem):
         return pool
-    fix, alone = judge(problem, pool), static(problem)
+    fix, alone = judge(problem, pool), hold_still(problem)
     seen = problem.layout.take(standing(pool, fix), "position")
-    parts = [mirrored(alone, fix.position[:, None])]
+    parts = [mirror(alone, fix.position[:, None])]
     unsettled = (fix.code != Status.OK) | (fix.p_value < DOUBT)
     valley = np.flatnonzero(unsettled | _weak(problem, fix))
     for items, more in (
@@ -104,7 +104,7 @@ def _beside(problem: Problem, pool: Pool, fix: Fix, x: Array, began: float) -> P
 
 def _subarrays(problem: Problem, fix: Fix) -> Array:
     found = subarray_starts(problem)
-    return np.concatenate([found, mirrored(problem, found)], axis=1)
+    return np.concatenate([found, mirror(problem, found)], axis=1)
 
 
 def _weak(problem: Problem, fix: Fix) -> Array:

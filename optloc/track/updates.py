@@ -16,7 +16,7 @@ from optloc.linear.normal import linearise
 from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.noise import Whitener
 from optloc.problem.problem import Problem
-from optloc.solvers.robust.reweighting import Doubt, doubted
+from optloc.solvers.robust.reweighting import Doubt, fold_signs
 
 # Gauss-Legendre nodes along the step: exact up to degree 9, and derivatives of ranges and angles are smooth over it.
 _NODES = 5
@@ -189,12 +189,12 @@ def reweighted(update: Update | str, loss: Loss | str) -> Update:
         residual, H = differentiate(flat, x)
         spread = ((H @ np.broadcast_to(cov, (*many, *cov.shape[-2:])).reshape(-1, *cov.shape[-2:])) * H).sum(-1)
         u = np.where(doubt.base > 0.0, residual, 0.0) / np.sqrt(doubt.own + spread)
-        weight = chosen.weight(doubted(chosen, u, doubt.sided))
+        weight = chosen.weight(fold_signs(chosen, u, doubt.sided))
         for _ in range(_TURNS):
             found = rule(scan.with_rows(weight=doubt.row_weight(weight).reshape(*many, -1)), mean, cov)
             # From here on residuals at the updated state, as in a fix: the update has taken what it believes.
             u = doubt.residual(flat, found.mean.reshape(x.shape), weight)
-            before, weight = weight, chosen.weight(doubted(chosen, u, doubt.sided))
+            before, weight = weight, chosen.weight(fold_signs(chosen, u, doubt.sided))
             if not np.abs(weight - before).max(initial=0.0) >= _SETTLED:
                 break
         return found

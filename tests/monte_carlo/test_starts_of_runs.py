@@ -8,8 +8,8 @@ from monte_carlo.tables import write
 from runs import drawn, run, truth
 
 import optloc
-from optloc.solvers.starts.block_averages import averaged
-from optloc.solvers.starts.registration import closed_form, relaxed
+from optloc.solvers.starts.block_averages import average_blocks
+from optloc.solvers.starts.registration import closed_form, relax_run
 
 SEED, TRIALS = 41, 12
 CASES = {
@@ -20,7 +20,7 @@ CASES = {
 }
 METHODS = {
     "closed form": (closed_form, "roots+lsr"),
-    "relaxation": (relaxed, "sdp+lsr"),
+    "relaxation": (relax_run, "sdp+lsr"),
     "IPOPT": (None, "roots+nlp+lsr"),
 }
 
@@ -29,7 +29,7 @@ def start_error(problem, begin, x):
     """Return the median and largest distance of the nearest start from the truth, or from its mirror image, metres."""
     if begin is None:
         return "", ""
-    starts = begin(averaged(problem, 30))
+    starts = begin(average_blocks(problem, 30))
     apart = np.linalg.norm(starts[..., :3] - x[:3], axis=-1)
     nearest = np.nanmin(apart, axis=1)
     return f"{np.median(nearest):.0f}", f"{nearest.max():.0f}"

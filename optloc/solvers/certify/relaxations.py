@@ -19,7 +19,7 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.starts.angles import angle_bounds, bearings
 from optloc.solvers.starts.least_squares_ranges import Ranges, ranges
-from optloc.solvers.starts.position import static
+from optloc.solvers.starts.position import hold_still
 from optloc.solvers.starts.several_positions import one_position
 
 TIGHT = 1e-3
@@ -164,7 +164,7 @@ def _by_directions(problem: Problem, fix: Fix) -> Reference:
 def _by_moments(problem: Problem, fix: Fix, region: float | None) -> Reference:
     from formulations.moment_sdp import moment_bound
 
-    out, found = _nothing(problem, "moment", ""), ranges(static(problem))
+    out, found = _nothing(problem, "moment", ""), ranges(hold_still(problem))
     assert found is not None
     position = np.broadcast_to(
         problem.stations.position, (problem.batch_shape[0], *problem.stations.position.shape[-3:])

@@ -120,7 +120,7 @@ def residuals(problem: Problem, x: Array) -> Array:
     return np.asarray(left)
 
 
-def doubted(loss: Loss, u: Array, sided: Array) -> Array:
+def fold_signs(loss: Loss, u: Array, sided: Array) -> Array:
     """Return residuals as a loss takes them: of rows that may be off to either side the size alone counts."""
     return np.where(sided, u, np.abs(u)) if loss.one_sided else u
 
@@ -155,7 +155,7 @@ class Minima:
     weight: Array
 
 
-def reweighted(
+def reweight(
     problem: Problem,
     start: Array,
     loss: Loss,
@@ -198,11 +198,11 @@ def reweighted(
             whole = len(active) == len(x)
             part, own = (problem, doubt) if whole else (problem.take(active), doubt.take(active))
             here, before = x[active], weight[active]
-            now = weighed_by(loss, part, own, here, before)
+            now = weigh_by(loss, part, own, here, before)
             step = _step(part.with_rows(weight=own.row_weight(now)), here, last[active], face)
-            moved = _lowered(loss, part, own, here, step.x, now) if uneven else step.x
+            moved = _backtrack(loss, part, own, here, step.x, now) if uneven else step.x
             if iteration >= _PATIENCE and iteration % _OFTEN == 0 and not face:
-                moved = _further(loss, part, own, step, now)
+                moved = _extrapolate(loss, part, own, step, now)
             x[active], weight[active], last[active] = moved, now, step.x - here
             same = np.abs(now - before).max(-1, initial=0.0) <= _SETTLED
             settled = same & (step.length <= tolerance)
@@ -212,7 +212,7 @@ def reweighted(
             active = active[status[active] == Status.MAX_ITERATIONS]
             if not len(active):
                 break
-        weight = weighed_by(loss, problem, doubt, x, weight)
+        weight = weigh_by(loss, problem, doubt, x, weight)
         cost = robust_cost(loss, problem, doubt, x, weight)
     status[~np.isfinite(cost)] = Status.NUMERICAL
     return Minima(x, np.where(np.isfinite(cost), cost, np.inf), status, weight)
@@ -248,13 +248,13 @@ def _step(problem: Problem, x: Array, last: Array, face: Face) -> _Step:
     )
 
 
-def _lowered(loss: Loss, problem: Problem, doubt: Doubt, here: Array, there: Array, weight: Array) -> Array:
+def _backtrack(loss: Loss, problem: Problem, doubt: Doubt, here: Array, there: Array, weight: Array) -> Array:
     """Return points (M, size) on the way from here to there that cost no more than here."""
     least = robust_cost(loss, problem, doubt, here, weight)
     share = np.ones(len(here))
     for _ in range(_HALVINGS):
         x = here + share[:, None] * (there - here)
-        now = weighed_by(loss, problem, doubt, x, weight)
+        now = weigh_by(loss, problem, doubt, x, weight)
         worse = ~(robust_cost(loss, problem, doubt, x, now) <= least + 1e-12 * (1.0 + np.abs(least)))
         if not worse.any():
             break
@@ -262,18 +262,16 @@ def _lowered(loss: Loss, problem: Problem, doubt: Doubt, here: Array, there: Arr
     return np.asarray(here + share[:, None] * (there - here))
 
 
-def _further(loss: Loss, problem: Problem, doubt: Doubt, step: _Step, weight: Array) -> Array:
+def _extrapolate(loss: Loss, problem: Problem, doubt: Doubt, step: _Step, weight: Array) -> Array:
     """Return where the steps would end if each were shorter by the same ratio (Aitken 1926), if that costs less."""
     cost = []
     for x in (step.x, step.tried):
-        now = weighed_by(loss, problem, doubt, x, weight)
+        now = weigh_by(loss, problem, doubt, x, weight)
         cost.append(robust_cost(loss, problem, doubt, x, now))
     return np.where((cost[1] < cost[0])[:, None], step.tried, step.x)
 
 
-def weighed_by(
-    loss: Loss, problem: Problem, doubt: Doubt, x: Array, weight: Array, scale: Array | float = 1.0
-) -> Array:
+def weigh_by(loss: Loss, problem: Problem, doubt: Doubt, x: Array, weight: Array, scale: Array | float = 1.0) -> Array:
     """Return what a loss leaves of the weight of each row (N, m) at vectors x, with sigma times a scale.
 
     Parameters
@@ -287,13 +285,13 @@ def weighed_by(
     scale : array (N, 1) or float
         Above 1: fewer rows are doubted.
     """
-    u = doubted(loss, doubt.residual(problem, x, weight) / scale, doubt.sided)
+    u = fold_signs(loss, doubt.residual(problem, x, weight) / scale, doubt.sided)
     return np.where(np.isfinite(u), loss.weight(u), 0.0)
 
 
 def robust_cost(loss: Loss, problem: Problem, doubt: Doubt, x: Array, weight: Array) -> Array:
     """Return the robust cost (N,) at vectors x (N, size) with the weights (N, m) of the loss there, priors included."""
-    u = doubted(loss, doubt.residual(problem, x, weight), doubt.sided)
+    u = fold_signs(loss, doubt.residual(problem, x, weight), doubt.sided)
     quadratic = equations_at(problem.with_rows(weight=doubt.row_weight(weight)), x).cost
     excess = np.where(doubt.base > 0.0, loss.rho(u) - weight * u**2, 0.0)
     return np.asarray(quadratic + excess.sum(-1))

@@ -20,9 +20,9 @@ from optloc.problem.problem import Problem
 from optloc.solvers.inequalities import bound_pool, least_finished
 from optloc.solvers.policy import AMBIGUOUS_GAP, REJECTED
 from optloc.solvers.pool import Pool, pack
-from optloc.solvers.robust.reweighting import Doubt, residuals, reweighted, robust_equations, weighed_by
-from optloc.solvers.robust.starts import flipped, robust_starts
-from optloc.solvers.starts.arrivals import Arrivals, as_arrivals, original
+from optloc.solvers.robust.reweighting import Doubt, residuals, reweight, robust_equations, weigh_by
+from optloc.solvers.robust.starts import flip_rows, robust_starts
+from optloc.solvers.starts.arrivals import Arrivals, as_arrivals, restore_order
 from optloc.solvers.verdict.judge import judge, standing
 from optloc.solvers.verdict.minima import settle
 
@@ -48,18 +48,18 @@ def by_arrivals(problem: Problem, start: Array | None, minimise: Minimise) -> Po
     taken = as_arrivals(problem) if problem.epochs == 1 and not problem.layout.n_local else None
     if taken is None:
         return minimise(problem, start)
-    found = minimise(taken.problem, None if start is None else _emitted(taken.problem, start))
+    found = minimise(taken.problem, None if start is None else _add_emission_time(taken.problem, start))
     assert found.curvature is not None
     return replace(
         found,
-        x=original(problem, taken.problem, found.x),
+        x=restore_order(problem, taken.problem, found.x),
         dof=degrees_of_freedom(problem),
         weights=_weights(problem, taken, found),
         curvature=replace(found.curvature, local=None),
     )
 
 
-def _emitted(problem: Problem, x: Array) -> Array:
+def _add_emission_time(problem: Problem, x: Array) -> Array:
     """Return vectors (N, q, size) with the emission time that the median arrival gives, of vectors without it."""
     whole = np.concatenate([x, np.zeros((*x.shape[:-1], problem.layout.size - x.shape[-1]))], axis=-1)
     item, slot = np.nonzero(np.isfinite(x).all(-1))
@@ -108,11 +108,11 @@ def _minimise(problem: Problem, loss: Loss, start: Array | None, stages: tuple[S
     began = perf_counter()
     pool = _minima(problem, loss, robust_starts(problem, loss) if start is None else start)
     if start is None and loss.flat:
-        pool = _more(pool, _minima(problem, loss, _minima(problem, LOSSES["cauchy"], pool.x).x))
-        pool = _more(pool, _minima(problem, loss, flipped(problem, loss, pool)))
+        pool = _join(pool, _minima(problem, loss, _minima(problem, LOSSES["cauchy"], pool.x).x))
+        pool = _join(pool, _minima(problem, loss, flip_rows(problem, loss, pool)))
     free = least_finished(pool) if problem.constraints else None
     pool = bound_pool(problem, pool, partial(_on_face, loss))
-    pool = _rivals(problem, loss, _apart(problem, loss, pool))
+    pool = _rivals(problem, loss, _drop_near(problem, loss, pool))
     detail = f"{int(np.isfinite(pool.cost).sum(1).max(initial=0))} candidates at most"
     stage = Stage(loss.name, detail, perf_counter() - began)
     pool = replace(pool, stages=stages, free=free, loss=loss.name)
@@ -125,11 +125,11 @@ def _minimise(problem: Problem, loss: Loss, start: Array | None, stages: tuple[S
 def _on_face(loss: Loss, problem: Problem, start: Array, item: Array, face: Face) -> tuple[Array, Array, Array]:
     """Return x (M, size), cost (M,) and status (M,) of the minima of a loss on a face of the constraints."""
     part = problem.take(item)
-    done = reweighted(part, start, loss, Doubt.of(part, start), face=face)
+    done = reweight(part, start, loss, Doubt.of(part, start), face=face)
     return done.x, done.cost, done.status
 
 
-def _more(one: Pool, two: Pool) -> Pool:
+def _join(one: Pool, two: Pool) -> Pool:
     """Return the candidates of both pools."""
     return replace(
         one,
@@ -160,7 +160,7 @@ def _minima(problem: Problem, loss: Loss, pool: Array) -> Pool:
     item, slot = np.nonzero(np.isfinite(pool).all(-1))
     if len(item):
         part, start = problem.take(item), pool[item, slot]
-        done = reweighted(part, start, loss, Doubt.of(part, start), face=exact(problem))
+        done = reweight(part, start, loss, Doubt.of(part, start), face=exact(problem))
         x[item, slot], cost[item, slot], code[item, slot] = done.x, done.cost, done.status
     weights = np.broadcast_to(problem.weight, (len(x), problem.count))
     return Pool(x, cost, code, np.zeros(cost.shape, dtype=int), weights, degrees_of_freedom(problem))
@@ -172,11 +172,11 @@ def _equations(problem: Problem, loss: Loss, x: Array) -> tuple[Normal, Array]:
     weight = np.ones(doubt.base.shape)
     with np.errstate(all="ignore"):
         for _ in range(_WEIGHINGS if any(b.row.shape[1] > 1 for b in problem.noise.blocks) else 1):
-            weight = weighed_by(loss, problem, doubt, x, weight)
+            weight = weigh_by(loss, problem, doubt, x, weight)
         return robust_equations(loss, problem, doubt, x, weight), doubt.row_weight(weight)
 
 
-def _apart(problem: Problem, loss: Loss, pool: Pool) -> Pool:
+def _drop_near(problem: Problem, loss: Loss, pool: Pool) -> Pool:
     """Return candidates without those that lie in the 95 % ellipsoid of the cheapest: they are the same answer."""
     from scipy.special import gammaincinv
 
@@ -210,7 +210,7 @@ def _rivals(problem: Problem, loss: Loss, pool: Pool) -> Pool:
     evidence, truncated = np.full(pool.cost.shape, np.inf), LOSSES["truncated"]
     part, start = problem.take(item), pool.x[item, slot]
     doubt = Doubt.of(part, start)
-    done = reweighted(part, start, truncated, doubt, face=exact(problem))
+    done = reweight(part, start, truncated, doubt, face=exact(problem))
     out = ((done.weight == 0.0) & (doubt.base > 0.0)).sum(-1)
     price = AMBIGUOUS_GAP * out
     evidence[item, slot] = np.where(done.status == Status.OK, done.cost + price, np.inf)

@@ -17,7 +17,7 @@ from optloc.problem.noise import independent, variances
 from optloc.problem.problem import Problem
 from optloc.solvers.pool import Pool, pack
 from optloc.solvers.refine import refine
-from optloc.solvers.robust.reweighting import Doubt, doubted, weighed_by
+from optloc.solvers.robust.reweighting import Doubt, fold_signs, weigh_by
 from optloc.solvers.stages import roots, search_widely
 from optloc.solvers.starts.position import rows_of_stations
 from optloc.solvers.starts.several_positions import one_position
@@ -43,7 +43,7 @@ def subsets(problem: Problem) -> tuple[Array, Array]:
     touched, single = rows_of_stations(problem), np.eye(problem.count, dtype=bool)
     heard = np.asarray((present[:, None] & touched).any(-1))
     short = np.flatnonzero(present.sum(1) <= _ROWS)
-    stations, rows = _combined(heard, touched, 3), _combined(present[short], single, 1)
+    stations, rows = _unite(heard, touched, 3), _unite(present[short], single, 1)
     item = np.concatenate([stations[0], short[rows[0]]])
     kept = present[item] & ~np.concatenate([stations[1], rows[1]])
     _, first = np.unique(np.column_stack([item, kept]), axis=0, return_index=True)
@@ -52,7 +52,7 @@ def subsets(problem: Problem) -> tuple[Array, Array]:
     return item[enough], kept[enough]
 
 
-def _combined(own: Array, touched: Array, size: int) -> tuple[Array, Array]:
+def _unite(own: Array, touched: Array, size: int) -> tuple[Array, Array]:
     """Return the unions (S, m) of the rows that up to `size` members touch (g, m), for each problem (S,) of its own."""
     count = own.sum(1)
     most = int(count.max(initial=0))
@@ -89,29 +89,29 @@ def robust_starts(problem: Problem, loss: Loss) -> Array:
     """
     plain = search_widely(problem)
     pool = standing(plain, judge(problem, plain))[:, :_KEPT]
-    parts = [pool, _graduated(problem, pool[:, :1])]
+    parts = [pool, _graduate(problem, pool[:, :1])]
     if one_position(problem):
-        parts.append(_left_out(problem, loss))
+        parts.append(_leave_out(problem, loss))
     else:
         item, slot = np.nonzero(np.isfinite(pool).all(-1))
         parts.append(_cheapest(problem, pool[item, slot], item, loss, _KEPT, anneal=True))
     return pack(np.concatenate(parts, axis=1))
 
 
-def _left_out(problem: Problem, loss: Loss) -> Array:
+def _leave_out(problem: Problem, loss: Loss) -> Array:
     """Return the best starts (N, q, size) from closed forms of all subsets."""
     # Correlation matters for the answer, hardly for where to look for it, and it costs time.
     noise = weighed(problem).noise if not depends_on_place(problem) else problem.noise
     problem = replace(problem, noise=independent(variances(noise, problem.count)))
     size = problem.batch_shape[0]
-    parts = [_of_subsets(problem.take(np.arange(i, min(i + _EACH, size))), loss) for i in range(0, size, _EACH)]
+    parts = [_start_subsets(problem.take(np.arange(i, min(i + _EACH, size))), loss) for i in range(0, size, _EACH)]
     out = np.full((size, max(part.shape[1] for part in parts), problem.layout.size), np.nan)
     for i, part in enumerate(parts):
         out[i * _EACH : i * _EACH + len(part), : part.shape[1]] = part
     return out
 
 
-def _of_subsets(problem: Problem, loss: Loss) -> Array:
+def _start_subsets(problem: Problem, loss: Loss) -> Array:
     item, kept = subsets(problem)
     if not len(item):
         return np.full((problem.batch_shape[0], 0, problem.layout.size), np.nan)
@@ -133,7 +133,7 @@ def _cheapest(problem: Problem, x: Array, item: Array, loss: Loss, most: int, *,
     step = max(1, _NUMBERS // problem.count)
     for first in range(0, len(usable), step):
         some = usable[first : first + step]
-        x[some], cost[some], u[some] = _annealed(problem.take(item[some]), x[some], loss, _HALVINGS if anneal else 0)
+        x[some], cost[some], u[some] = _anneal(problem.take(item[some]), x[some], loss, _HALVINGS if anneal else 0)
     chosen = np.full((size, most, x.shape[1]), np.nan)
     for slot in range(most if count else 0):
         order = np.lexsort((cost, item))
@@ -148,7 +148,7 @@ def _cheapest(problem: Problem, x: Array, item: Array, loss: Loss, most: int, *,
     return chosen
 
 
-def _annealed(problem: Problem, x: Array, loss: Loss, halvings: int) -> tuple[Array, Array, Array]:
+def _anneal(problem: Problem, x: Array, loss: Loss, halvings: int) -> tuple[Array, Array, Array]:
     """Return vectors after a few weighings by the Cauchy loss whose scale is halved, their costs and residuals."""
     doubt, cauchy, face = Doubt.of(problem, x), LOSSES["cauchy"], exact(problem)
     weight = np.ones(doubt.base.shape)
@@ -157,14 +157,14 @@ def _annealed(problem: Problem, x: Array, loss: Loss, halvings: int) -> tuple[Ar
         size = np.where(doubt.base > 0.0, np.abs(u), np.nan)
         scale = np.maximum(1.0, 1.4826 * np.nanmedian(size, axis=1, keepdims=True)) if halvings else 1.0
         for halving in range(halvings):
-            weight = weighed_by(cauchy, problem, doubt, x, weight, np.maximum(1.0, scale * 0.5**halving))
+            weight = weigh_by(cauchy, problem, doubt, x, weight, np.maximum(1.0, scale * 0.5**halving))
             x = refine(problem.with_rows(weight=doubt.row_weight(weight)), x, limit=2, face=face).x
         u = doubt.residual(problem, x, weight) if halvings else u
-        cost = np.where(doubt.base > 0.0, loss.rho(doubted(loss, u, doubt.sided)), 0.0).sum(-1)
+        cost = np.where(doubt.base > 0.0, loss.rho(fold_signs(loss, u, doubt.sided)), 0.0).sum(-1)
     return x, np.where(np.isfinite(cost) & np.isfinite(u).all(-1), cost, np.inf), np.nan_to_num(u)
 
 
-def flipped(problem: Problem, loss: Loss, pool: Pool) -> Array:
+def flip_rows(problem: Problem, loss: Loss, pool: Pool) -> Array:
     """Return starts (N, q, size) beside the cheapest minimum: those with one more row in or out, of rows at the brink.
 
     A loss that cuts rows off has minima of its own for almost every set of rows; the best ones differ in few rows.
@@ -176,7 +176,7 @@ def flipped(problem: Problem, loss: Loss, pool: Pool) -> Array:
         return np.asarray(x[:, None])
     part = problem.take(item)
     doubt, q = Doubt.of(part, x[item]), min(_FLIPPED, problem.count)
-    weight = weighed_by(loss, part, doubt, x[item], np.ones(doubt.base.shape))
+    weight = weigh_by(loss, part, doubt, x[item], np.ones(doubt.base.shape))
     u = np.where(doubt.base > 0.0, np.abs(doubt.residual(part, x[item], weight)), np.inf)
     brink = np.argsort(np.abs(u - loss.constant), axis=1)[:, :q]
     each = np.repeat(np.arange(len(item)), q)
@@ -188,7 +188,7 @@ def flipped(problem: Problem, loss: Loss, pool: Pool) -> Array:
     return out
 
 
-def _graduated(problem: Problem, start: Array) -> Array:
+def _graduate(problem: Problem, start: Array) -> Array:
     """Return where truncated least squares leads (N, q, size) when it begins convex and is bent step by step.
 
     H. Yang, P. Antonante, V. Tzoumas, L. Carlone, "Graduated non-convexity for robust spatial perception", IEEE Robot.

@@ -59,10 +59,10 @@ def bearings(problem: Problem) -> Bearings | None:
     block, start = rows["azimuth"]
     size = problem.batch_shape[0]
     angle, weight = np.zeros((size, block.count, 2)), np.zeros((size, block.count, 2))
-    angle[..., 0], weight[..., 0] = _measured(problem, block, start)
+    angle[..., 0], weight[..., 0] = _values(problem, block, start)
     if "elevation" in rows:
         other, begin = rows["elevation"]
-        value, importance = _measured(problem, other, begin)
+        value, importance = _values(problem, other, begin)
         keys = {key: i for i, key in enumerate(_keys(other))}
         for i, key in enumerate(_keys(block)):
             if key in keys:
@@ -78,7 +78,7 @@ def _keys(rows: Rows) -> list[tuple[int, int]]:
     return list(zip(rows.a.tolist(), rows.epoch.tolist(), strict=True))
 
 
-def _measured(problem: Problem, rows: Rows, start: int) -> tuple[Array, Array]:
+def _values(problem: Problem, rows: Rows, start: int) -> tuple[Array, Array]:
     sigma = np.sqrt(variances(problem.noise, problem.count)[..., start : start + rows.count])
     shape = (problem.batch_shape[0], rows.count)
     importance = np.where(rows.weight > 0.0, np.sqrt(rows.weight) / sigma, 0.0)
@@ -162,7 +162,7 @@ def by_directions(seen: Bearings) -> Array:
         axes = None if seen.axes is None else seen.axes[i, use]
         out[i, 0] = directions(seen.angle[i, use], 1.0 / seen.weight[i, use], seen.station[i, use], axes=axes).point
 
-    mapped(relaxed, _complete(seen), least=WORTH)
+    mapped(relaxed, _complete_bearings(seen), least=WORTH)
     return seen.metres(out)
 
 
@@ -204,11 +204,11 @@ def angle_bounds(seen: Bearings, point: Array) -> Array:
             sigma = 1.0 / seen.weight[i, use]
             out[i] = angle_bound(seen.angle[i, use], sigma, seen.station[i, use], scaled[i], axes=axes).bound
 
-    mapped(bounded, _complete(seen), least=WORTH)
+    mapped(bounded, _complete_bearings(seen), least=WORTH)
     return out
 
 
-def _complete(seen: Bearings) -> list[tuple[int, Array]]:
+def _complete_bearings(seen: Bearings) -> list[tuple[int, Array]]:
     """Return the problems with at least two complete bearings, and which bearings those are."""
     if seen.station.shape[-1] != 3:
         return []
@@ -265,7 +265,7 @@ def pair(problem: Problem) -> tuple[int, int] | None:
     kinds = {rows.kind: rows for rows in problem.rows}
     if problem.dimension != 3 or set(kinds) != {"range_sum", "azimuth", "elevation"} or len(kinds) != len(problem.rows):
         return None
-    if problem.stations.position.shape[-3] > 1 or not all(_once(rows) for rows in problem.rows):
+    if problem.stations.position.shape[-3] > 1 or not all(_once_an_epoch(rows) for rows in problem.rows):
         return None
     ends = {(int(a), int(b)) for a, b in zip(kinds["range_sum"].a, kinds["range_sum"].b, strict=True)}
     heard = {int(a) for kind in ("azimuth", "elevation") for a in kinds[kind].a}
@@ -276,5 +276,5 @@ def pair(problem: Problem) -> tuple[int, int] | None:
     return (receiver, others.pop()) if len(others) == 1 else None
 
 
-def _once(rows: Rows) -> bool:
+def _once_an_epoch(rows: Rows) -> bool:
     return len(np.unique(rows.epoch)) == rows.count

@@ -72,11 +72,15 @@ def as_arrivals(problem: Problem) -> Arrivals | None:
     if ((weight > 0.0) != present).any() or (weight[:, taken[present[taken]]] != 1.0).any():
         return None
     sightings = list(_sightings(problem, taken[present[taken]]))
-    found = [_arrived(problem, one) for one in sightings]
-    if not found or any(one is None for one in found) or not _apart(problem.noise, sightings, taken[~present[taken]]):
+    found = [_find_arrivals(problem, one) for one in sightings]
+    if (
+        not found
+        or any(one is None for one in found)
+        or not _are_apart(problem.noise, sightings, taken[~present[taken]])
+    ):
         return None
     z, variance = (np.concatenate([one[i] for one in found if one is not None], axis=-1) for i in range(2))
-    return _assembled(problem, sightings, z, variance)
+    return _assemble(problem, sightings, z, variance)
 
 
 def _sightings(problem: Problem, taken: Array) -> Iterator[_Sighting]:
@@ -93,7 +97,7 @@ def _sightings(problem: Problem, taken: Array) -> Iterator[_Sighting]:
         yield _Sighting(taken[own], stations, design, k, t)
 
 
-def _arrived(problem: Problem, one: _Sighting) -> tuple[Array, Array] | None:
+def _find_arrivals(problem: Problem, one: _Sighting) -> tuple[Array, Array] | None:
     """Return arrival times (N, s), up to a common one, and variances (N or 1, s); None where they do not exist."""
     design, s = one.design, len(one.stations)
     if np.linalg.matrix_rank(design) < s - 1:
@@ -110,7 +114,7 @@ def _arrived(problem: Problem, one: _Sighting) -> tuple[Array, Array] | None:
     return problem.observed[:, one.rows] @ np.linalg.pinv(design).T, variance.reshape(-1, s)
 
 
-def _apart(noise: Noise, sightings: list[_Sighting], absent: Array) -> bool:
+def _are_apart(noise: Noise, sightings: list[_Sighting], absent: Array) -> bool:
     """Return whether the differences of each sighting are correlated with nothing else."""
     for one in sightings:
         for block in noise.blocks:
@@ -121,7 +125,7 @@ def _apart(noise: Noise, sightings: list[_Sighting], absent: Array) -> bool:
     return True
 
 
-def _assembled(problem: Problem, sightings: list[_Sighting], z: Array, variance: Array) -> Arrivals:
+def _assemble(problem: Problem, sightings: list[_Sighting], z: Array, variance: Array) -> Arrivals:
     """Return the problem of the arrival times and of the rows of other kinds that are present."""
     sizes = [len(one.stations) for one in sightings]
     station = np.concatenate([one.stations for one in sightings])
@@ -147,11 +151,11 @@ def _assembled(problem: Problem, sightings: list[_Sighting], z: Array, variance:
             count += block.count
     variance = variance[0] if len(variance) == 1 else variance
     own = Block(np.arange(len(station))[:, None], variance[..., None, None])
-    noise = group([own, *_others(problem.noise, number)])
+    noise = group([own, *_keep_noise(problem.noise, number)])
     return Arrivals(replace(problem, rows=tuple(rows), noise=noise), tuple(origin))
 
 
-def _others(noise: Noise, number: Array) -> Iterator[Block]:
+def _keep_noise(noise: Noise, number: Array) -> Iterator[Block]:
     """Yield the noise of the rows of other kinds, numbered anew."""
     for block in noise.blocks:
         kept = (number[block.row] >= 0).all(1)
@@ -160,7 +164,7 @@ def _others(noise: Noise, number: Array) -> Iterator[Block]:
             yield Block(number[block.row[kept]], own)
 
 
-def original(problem: Problem, arrivals: Problem, x: Array) -> Array:
+def restore_order(problem: Problem, arrivals: Problem, x: Array) -> Array:
     """Return vectors (..., size) of the problem with arrivals in the order of the problem they were made from."""
     layout, other = problem.layout, arrivals.layout
     shared, local = other.split(x)

@@ -20,7 +20,7 @@ from optloc.problem.problem import Problem
 _GAP = 2.0
 
 
-def averaged(problem: Problem, count: int) -> Problem:
+def average_blocks(problem: Problem, count: int) -> Problem:
     """Return the run as blocks of equally many epochs, with the values that its rows have in the middle of each block.
 
     Blocks are equally long so that the curvature that an average leaves out is the same in all of them, and is
@@ -41,15 +41,15 @@ def averaged(problem: Problem, count: int) -> Problem:
     """
     length = max(1, problem.epochs // count)
     if length == 1:
-        return _clear(problem)
+        return _with_station_noise(problem)
     last = length * (problem.epochs // length)
     lasting = problem.times[length - 1 : last : length] - problem.times[:last:length]
     longest = _GAP * float(np.median(lasting))
     stretch = length * max(1, epochs_of(problem, int(np.prod(problem.batch_shape))) // length)
     if stretch >= last:
-        return _blocks(_clear(problem), length, longest)
+        return _blocks(_with_station_noise(problem), length, longest)
     parts = (cut(problem, first, min(first + stretch, last)) for first in range(0, last, stretch))
-    return reduce(joined, (_blocks(_clear(part), length, longest) for part in parts))
+    return reduce(joined, (_blocks(_with_station_noise(part), length, longest) for part in parts))
 
 
 def _blocks(problem: Problem, length: int, longest: float) -> Problem:
@@ -69,7 +69,7 @@ def _blocks(problem: Problem, length: int, longest: float) -> Problem:
     for kind, start in zip(problem.rows, problem.starts, strict=True):
         means.append(_means(kind, when, present[start : start + kind.count], start, taken))
         taken += len(means[-1].first)
-    rows = tuple(_averaged(block, mean) for block, mean in zip(problem.rows, means, strict=True))
+    rows = tuple(_average_rows(block, mean) for block, mean in zip(problem.rows, means, strict=True))
     return replace(
         problem,
         stations=_stations(problem.stations, when),
@@ -108,7 +108,7 @@ class _Mean:
     taken: int
 
 
-def _clear(problem: Problem) -> Problem:
+def _with_station_noise(problem: Problem) -> Problem:
     """Return the problem with its station errors of each epoch in the noise."""
     stations = problem.stations
     if stations.covariance is None or stations.span == "run":
@@ -144,7 +144,7 @@ def _middle(since: Array, row: Array) -> Array:
     return np.asarray((level - slope) / np.where(line, spread, total[0])[row])
 
 
-def _averaged(rows: Rows, mean: _Mean) -> Rows:
+def _average_rows(rows: Rows, mean: _Mean) -> Rows:
     def middle(values: Array, wrapped: bool) -> Array:
         sorted_, base = values[..., mean.order], np.zeros(())
         if wrapped:

@@ -60,7 +60,7 @@ def height_starts(problem: Problem, *, relax: bool = False) -> Array:
     parts = []
     for count, mask in ((3, found.free), (2, ~found.free)):
         subsets = _subsets(place, found, mask, count)
-        met = _relaxed if relax and count == 3 else _met
+        met = _relax if relax and count == 3 else _intersect
         parts += [met(place, found, nodes, surface, mask & (nodes[:, 0] >= 0)) for nodes in subsets]
     if not parts:
         return np.full((size, 0, 3), np.nan)
@@ -89,7 +89,7 @@ def _subsets(place: Array, found: Ranges, mask: Array, count: int) -> list[Array
     ]
 
 
-def _relaxed(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask: Array) -> Array:
+def _relax(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask: Array) -> Array:
     """Return the answers (N, 1, 3) of the reduced relaxation, nearest to the point below the stations."""
     from formulations.range_height_conic import lift
 
@@ -109,7 +109,7 @@ def _relaxed(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask
     return out
 
 
-def _met(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask: Array) -> Array:
+def _intersect(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask: Array) -> Array:
     """Return where the ellipsoid meets the ranges of some nodes, (N, 4, 3) in Earth radii."""
     items = np.flatnonzero(mask)
     out = np.full((len(place), 4, 3), np.nan)

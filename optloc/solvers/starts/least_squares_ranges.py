@@ -100,7 +100,7 @@ def ranges(problem: Problem) -> Ranges | None:
     chosen = [_main(graph, len(station)) for graph in graphs]
     inside, sign, reference = (np.array([c[i] for c in chosen])[pattern] for i in range(3))
     groups = tuple(tuple(tuple(int(station[n]) for n in nodes) for nodes in _members(g, len(station))) for g in graphs)
-    offset, covariance, cost = _least_squares(problem, design, _pinned(graphs, chosen, len(station))[pattern])
+    offset, covariance, cost = _least_squares(problem, design, _pin(graphs, chosen, len(station))[pattern])
     s = len(station)
     known = covariance[:, :s, :s]
     return Ranges(station, epoch, inside, sign, reference, offset[:, :s], known, cost, groups, pattern)
@@ -139,7 +139,7 @@ def reduce(problem: Problem) -> Problem:
     kept = [i for i, rows in enumerate(problem.rows) if MODELS[rows.kind].ranges is None]
     parts = [np.arange(start, start + rows.count) for rows, start in zip(problem.rows, problem.starts, strict=True)]
     others = np.concatenate([parts[i] for i in kept] or [np.zeros(0, dtype=np.int64)])
-    blocks = _others(problem.noise, others)
+    blocks = _keep_noise(problem.noise, others)
     rows, covariance = _reduced_rows(found, problem.batch_shape)
     count = sum(r.count for r in rows)
     shift = np.full(problem.count, -1)
@@ -159,7 +159,7 @@ def _check(problem: Problem) -> None:
         )
 
 
-def _others(noise: Noise, others: Array) -> list[Block]:
+def _keep_noise(noise: Noise, others: Array) -> list[Block]:
     """Return the noise of the rows that stay."""
     blocks = []
     for block in noise.blocks:
@@ -269,7 +269,7 @@ def _main(graph: Graph, stations: int) -> tuple[Array, Array, int]:
     return inside, sign * (sign[reference] or 1), reference
 
 
-def _pinned(graphs: list[Graph], chosen: list[tuple[Array, Array, int]], stations: int) -> Array:
+def _pin(graphs: list[Graph], chosen: list[tuple[Array, Array, int]], stations: int) -> Array:
     """Return which nodes hold no unknown of the least-squares problem: absent ones and one of each free group."""
     pinned = np.array([graph.group < 0 for graph in graphs])
     for row, graph, (_, _, reference) in zip(pinned, graphs, chosen, strict=True):

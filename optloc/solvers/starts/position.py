@@ -44,7 +44,7 @@ def squared_range_starts(problem: Problem, pick: Pick) -> Array:
     return position
 
 
-def mirrored(problem: Problem, position: Array) -> Array:
+def mirror(problem: Problem, position: Array) -> Array:
     """Return points (N, ..., d) mirrored in the plane (or line) that fits the stations of each problem best."""
     flat = problem.stations.places
     centre = flat.mean(-2, keepdims=True)
@@ -131,19 +131,19 @@ def vectors(problem: Problem, position: Array | None) -> Array:
     if position is not None:
         slot, _ = layout.find("position")
         x[..., slot.start : slot.start + slot.size] = position
-        x = _emitted(problem, x) if problem.emitting else x
+        x = _fit_emission_times(problem, x) if problem.emitting else x
     return x
 
 
-def completed(problem: Problem, shared: Array) -> Array:
+def complete(problem: Problem, shared: Array) -> Array:
     """Return full parameter vectors (N, q, size) of shared unknowns (N, q, n): local ones as fit them, or zero."""
     x = np.zeros((*shared.shape[:-1], problem.layout.size))
     x[..., : shared.shape[-1]] = shared
     x[np.isnan(shared).any(-1)] = np.nan
-    return _emitted(problem, x) if problem.emitting else x
+    return _fit_emission_times(problem, x) if problem.emitting else x
 
 
-def _emitted(problem: Problem, x: Array) -> Array:
+def _fit_emission_times(problem: Problem, x: Array) -> Array:
     """Return vectors (N, q, size) with the emission times that fit their positions: the mean of what is left over."""
     size, q = x.shape[:2]
     part, out = problem.take(np.repeat(np.arange(size), q)), x.reshape(size * q, -1).copy()
@@ -166,13 +166,13 @@ def emission_columns(problem: Problem) -> Array:
     return np.concatenate([columns(problem.layout, name, np.arange(problem.epochs)).ravel() for name in names])
 
 
-def static(problem: Problem) -> Problem:
+def hold_still(problem: Problem) -> Problem:
     """Return the problem of the position alone: one static target, nothing else unknown but emission times."""
     motions = tuple(replace(motion, order=0) for motion in problem.motions)
-    return replace(unbiased(problem), motions=motions)
+    return replace(without_biases(problem), motions=motions)
 
 
-def unbiased(problem: Problem) -> Problem:
+def without_biases(problem: Problem) -> Problem:
     """Return a flat batch of problems without biases and priors: what is unknown of them is known as its prior mean.
 
     Offsets, drifts and scales without a prior are taken for zero, rotations always are.

@@ -21,9 +21,9 @@ from optloc.problem.epochs import by_epoch, untied
 from optloc.problem.problem import Problem
 from optloc.solvers.policy import DOUBT
 from optloc.solvers.refine import refine
-from optloc.solvers.starts.block_averages import averaged
+from optloc.solvers.starts.block_averages import average_blocks
 from optloc.solvers.starts.least_squares_ranges import Ranges, ranges
-from optloc.solvers.starts.position import completed, distance_of, spread_of, vectors
+from optloc.solvers.starts.position import complete, distance_of, spread_of, vectors
 
 BLOCKS = 30
 # Rivals that cost more than this on block averages are not refined on all epochs, but for the best of them.
@@ -53,17 +53,17 @@ def run_starts(problem: Problem, begin: Callable[[Problem], Array | None]) -> Ar
         Maps the block averages to starting vectors (N, C, size of theirs), or None where it cannot: the starts are
         then places around the stations.
     """
-    groups = alike(problem)
+    groups = group_alike(problem)
     if len(groups) == 1:
-        return _starts(problem, begin)
-    parts = [(items, _starts(problem.take(items), begin)) for items in groups]
+        return _start_alike(problem, begin)
+    parts = [(items, _start_alike(problem.take(items), begin)) for items in groups]
     out = np.full((problem.batch_shape[0], max(part.shape[1] for _, part in parts), problem.layout.size), np.nan)
     for items, part in parts:
         out[items, : part.shape[1]] = part
     return out
 
 
-def alike(problem: Problem) -> list[Array]:
+def group_alike(problem: Problem) -> list[Array]:
     """Return the problems of a flat batch in groups that have the same rows: these have block averages in common."""
     present = np.broadcast_to(problem.weight > 0.0, (problem.batch_shape[0], problem.count))
     if problem.weight.ndim == 1 or (present == present[:1]).all():
@@ -72,18 +72,18 @@ def alike(problem: Problem) -> list[Array]:
     return [np.flatnonzero(group.reshape(-1) == i) for i in range(int(group.max()) + 1)]
 
 
-def _starts(problem: Problem, begin: Callable[[Problem], Array | None]) -> Array:
-    blocks = averaged(problem, BLOCKS)
+def _start_alike(problem: Problem, begin: Callable[[Problem], Array | None]) -> Array:
+    blocks = average_blocks(problem, BLOCKS)
     x = begin(blocks)
     x = _around(blocks, _ANYWHERE) if x is None else x
     pool = _minima(blocks, x)
-    pool = _pooled(pool, _minima(blocks, mirrored_courses(blocks, pool[0][:, :1])))
-    doubtful = np.flatnonzero(~_settled(blocks, pool))
+    pool = _merge(pool, _minima(blocks, mirror_courses(blocks, pool[0][:, :1])))
+    doubtful = np.flatnonzero(~_is_settled(blocks, pool))
     if len(doubtful):
         part = blocks.take(doubtful)
         wider = _minima(part, np.concatenate([_around(part, _RADII), _valley(part, pool[0][doubtful, 0])], axis=1))
-        pool = _pooled(pool, _spread(wider, doubtful, len(x)))
-    return completed(problem, _best(blocks, *pool)[..., : problem.layout.n_shared])
+        pool = _merge(pool, _scatter(wider, doubtful, len(x)))
+    return complete(problem, _best(blocks, *pool)[..., : problem.layout.n_shared])
 
 
 def _minima(blocks: Problem, x: Array) -> tuple[Array, Array]:
@@ -98,21 +98,21 @@ def _minima(blocks: Problem, x: Array) -> tuple[Array, Array]:
     return np.take_along_axis(out, order[..., None], axis=1), np.take_along_axis(cost, order, axis=1)
 
 
-def _pooled(one: tuple[Array, Array], two: tuple[Array, Array]) -> tuple[Array, Array]:
+def _merge(one: tuple[Array, Array], two: tuple[Array, Array]) -> tuple[Array, Array]:
     """Return two sets of minima as one, the cheapest first."""
     x, cost = (np.concatenate(parts, axis=1) for parts in zip(one, two, strict=True))
     order = np.argsort(cost, axis=1, kind="stable")
     return np.take_along_axis(x, order[..., None], axis=1), np.take_along_axis(cost, order, axis=1)
 
 
-def _spread(found: tuple[Array, Array], items: Array, count: int) -> tuple[Array, Array]:
+def _scatter(found: tuple[Array, Array], items: Array, count: int) -> tuple[Array, Array]:
     x = np.full((count, *found[0].shape[1:]), np.nan)
     cost = np.full((count, found[1].shape[1]), np.inf)
     x[items], cost[items] = found
     return x, cost
 
 
-def _settled(blocks: Problem, pool: tuple[Array, Array]) -> Array:
+def _is_settled(blocks: Problem, pool: tuple[Array, Array]) -> Array:
     """Return where the best minimum (N,) fits the data and has a small error: where else to look is no question."""
     from scipy.special import gammaincc
 
@@ -159,7 +159,7 @@ def _valley(blocks: Problem, x: Array) -> Array:
     return _along(blocks, x, _covariance(blocks, x) * _length(blocks)[:, None, None] ** 2, _STEPS)
 
 
-def beside(problem: Problem, x: Array, covariance: Array) -> Array:
+def step_beside(problem: Problem, x: Array, covariance: Array) -> Array:
     """Return vectors (N, C, size) along the longest axis of badly determined fixes of runs; NaN for the others.
 
     Block averages blur minima that lie within a few standard deviations of each other.
@@ -211,7 +211,7 @@ def _at_one_place(blocks: Problem, x: Array, y: Array) -> Array:
     return np.asarray(np.sqrt((apart**2).sum(-1)) < _SAME * _length(blocks))
 
 
-def mirrored_courses(blocks: Problem, x: Array) -> Array:
+def mirror_courses(blocks: Problem, x: Array) -> Array:
     """Return courses (N, C, size) mirrored at every epoch in the plane (or line) that fits the stations best.
 
     The mirrored places are those of a course again where the planes are parallel; else the polynomial next to them.
@@ -285,16 +285,16 @@ def closed_form(problem: Problem) -> Array | None:
     Parameters
     ----------
     problem : Problem
-        Flat batch of N runs of a few dozen epochs; see `optloc.solvers.starts.block_averages.averaged`.
+        Flat batch of N runs of a few dozen epochs; see `optloc.solvers.starts.block_averages.average_blocks`.
     """
     run = run_of(problem)
     if run is None:
         return None
     state, bias = candidates(run.course, problem.motions[0].order)
-    return started(problem, run, state, np.repeat(bias[:, None], state.shape[1], axis=1))
+    return place_states(problem, run, state, np.repeat(bias[:, None], state.shape[1], axis=1))
 
 
-def started(problem: Problem, run: Run, state: Array, bias: Array) -> Array:
+def place_states(problem: Problem, run: Run, state: Array, bias: Array) -> Array:
     """Return vectors (N, C, size) of states (N, C, order + 1, d) and biases (N, C, q) in the units of a run."""
     state = state * (run.length / run.duration ** np.arange(state.shape[2])[:, None])
     state[:, :, 0] += run.origin
@@ -308,13 +308,13 @@ def started(problem: Problem, run: Run, state: Array, bias: Array) -> Array:
 
 def run_of(problem: Problem) -> Run | None:
     """Return the range offsets of a flat batch of runs; None where no epoch has any."""
-    found = ranges(_alone(problem).flat())
+    found = ranges(_split_epochs(problem).flat())
     if found is None or not (found.free & (found.inside.sum(-1) > 1)).any():
         return None
     size, epochs = problem.batch_shape[0], problem.epochs
-    reference = _usual(found.reference[found.free & (found.inside.sum(-1) > 1)])
+    reference = _most_common(found.reference[found.free & (found.inside.sum(-1) > 1)])
     others = np.flatnonzero(np.arange(len(found.station)) != reference)
-    sign = np.array([_usual(found.sign[found.sign[:, i] != 0, i]) for i in others])
+    sign = np.array([_most_common(found.sign[found.sign[:, i] != 0, i]) for i in others])
     heard = (found.reference == reference)[:, None] & found.inside[:, others] & (found.sign[:, others] == sign)
     centre, spread = spread_of(problem)
     origin, length, since = centre.mean(0), float(spread.max()), elapsed(problem, 0)
@@ -334,12 +334,12 @@ def run_of(problem: Problem) -> Run | None:
     return Run(course, column, origin, length, duration)
 
 
-def _alone(problem: Problem) -> Problem:
+def _split_epochs(problem: Problem) -> Problem:
     """Return the epochs of a run as a batch (N, k), without its biases."""
     return by_epoch(untied(replace(problem, biases=(), priors=(), constraints=())))
 
 
-def _usual(values: Array) -> int:
+def _most_common(values: Array) -> int:
     """Return the most common of some integers; 0 of none."""
     found, count = np.unique(values, return_counts=True)
     return int(found[count.argmax()]) if len(found) else 0
@@ -368,7 +368,7 @@ def _effects(problem: Problem, found: Ranges) -> tuple[Array, Array]:
     if len(column):
         zero = tuple(replace(rows, correction=np.zeros(rows.count)) for rows in problem.rows)
         single = replace(problem.take(np.zeros(1, dtype=int)), rows=zero)
-        same = ranges(_alone(single.with_rows(z=unit)).flat())
+        same = ranges(_split_epochs(single.with_rows(z=unit)).flat())
         assert same is not None
         effect = same.offset.reshape(effect.shape)
     return column, effect
@@ -399,7 +399,7 @@ def _prior(problem: Problem, column: Array) -> tuple[Array, Array]:
         return mean[column], 1.0 / np.sqrt(information[column])
 
 
-def relaxed(problem: Problem) -> Array | None:
+def relax_run(problem: Problem) -> Array | None:
     """Return starting vectors (N, C, size) of runs from the semidefinite relaxation, or None where it does not apply.
 
     A few blocks over the whole run are used, of those in which every station is heard.
@@ -444,4 +444,4 @@ def relaxed(problem: Problem) -> Array | None:
     for i, pairs in enumerate(found):
         for j, (target, own) in enumerate(pairs):
             state[i, j], delta[i, j] = target, own
-    return started(problem, run, state, delta)
+    return place_states(problem, run, state, delta)

@@ -19,7 +19,7 @@ from optloc.problem.layout import state_names
 from optloc.problem.noise import Block, Noise, group
 from optloc.problem.problem import Problem
 from optloc.solvers.starts.angles import course_starts, course_states
-from optloc.solvers.starts.position import static, unbiased, vectors
+from optloc.solvers.starts.position import hold_still, vectors, without_biases
 
 
 def one_position(problem: Problem) -> bool:
@@ -51,7 +51,7 @@ def from_pieces(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
         names = state_names(i, len(problem.motions), motion.order)
         state = np.full((len(x), problem.epochs, len(names), problem.dimension), np.nan)
         if any((rows.target == i).any() for rows in problem.rows):
-            state = _state(_alone(problem, i), fixed)
+            state = _state(_isolate(problem, i), fixed)
         for j, name in enumerate(names):
             slot, shared = problem.layout.find(name)
             if shared:
@@ -65,10 +65,10 @@ def from_pieces(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
     return x
 
 
-def _alone(problem: Problem, target: int) -> Problem:
+def _isolate(problem: Problem, target: int) -> Problem:
     """Return the problem of one target: its rows and nothing else unknown."""
-    problem = unbiased(problem)
-    problem = _with_rows_of(problem, target) if len(problem.motions) > 1 else problem
+    problem = without_biases(problem)
+    problem = _take_rows(problem, target) if len(problem.motions) > 1 else problem
     motion = problem.motions[target]
     # What bounds a moving target holds at its reference time only, but a known height is as good a start elsewhere.
     constraints = tuple(
@@ -79,7 +79,7 @@ def _alone(problem: Problem, target: int) -> Problem:
     return replace(problem, motions=(motion,), constraints=constraints)
 
 
-def _with_rows_of(problem: Problem, target: int) -> Problem:
+def _take_rows(problem: Problem, target: int) -> Problem:
     """Return the problem with the rows of one target, which becomes the first."""
     own = [np.flatnonzero(rows.target == target) for rows in problem.rows]
     rows = [
@@ -88,10 +88,10 @@ def _with_rows_of(problem: Problem, target: int) -> Problem:
         if len(i)
     ]
     kept = np.concatenate([start + i for start, i in zip(problem.starts, own, strict=True)])
-    return replace(problem, rows=tuple(rows), noise=_noise_of(problem.noise, kept, problem.count))
+    return replace(problem, rows=tuple(rows), noise=_take_noise(problem.noise, kept, problem.count))
 
 
-def _noise_of(noise: Noise, kept: Array, count: int) -> Noise:
+def _take_noise(noise: Noise, kept: Array, count: int) -> Noise:
     """Return the noise of some of the rows, which are numbered anew in their order."""
     number = np.full(count, -1)
     number[kept] = np.arange(len(kept))
@@ -112,12 +112,12 @@ def _state(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
     """Return the state (N, k or 1, order + 1, d) of the only target; NaN where it has no fix."""
     motion, size = problem.motions[0], problem.batch_shape[0]
     if one_position(problem):
-        position = fixed(static(problem)).position
+        position = fixed(hold_still(problem)).position
         state = np.zeros((size, 1, motion.order + 1, problem.dimension))
         state[:, 0, 0] = position
         return state
     if _meets(problem):
-        return fixed(_at_once(problem)).position[:, None, None]
+        return fixed(_merge_epochs(problem)).position[:, None, None]
     ahead = course_starts(problem) if motion.span == "run" else None
     if ahead is not None and np.isfinite(ahead).all():
         return ahead[:, None]
@@ -128,7 +128,7 @@ def _state(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
     fix = fixed(free.flat()).reshape((size, problem.epochs))
     if motion.span == "epoch":
         state = np.zeros((size, problem.epochs, motion.order + 1, problem.dimension))
-        state[:, :, 0] = _filled(fix.position)
+        state[:, :, 0] = _fill_gaps(fix.position)
         return state
     state = _polynomial(fix, elapsed(problem, 0), motion.order)
     if seen is not None:
@@ -143,7 +143,7 @@ def _meets(problem: Problem) -> bool:
     return motion.order == 0 and motion.span == "run" and alone and not problem.emitting
 
 
-def _at_once(problem: Problem) -> Problem:
+def _merge_epochs(problem: Problem) -> Problem:
     """Return the problem of a target that stays as one epoch: every place it was measured from is a station."""
     s = problem.stations
     nodes = [np.where(rows.a < 0, -1, rows.epoch * s.count + rows.a) for rows in problem.rows]
@@ -169,7 +169,7 @@ def _at_once(problem: Problem) -> Problem:
     return replace(problem, stations=stations, rows=rows, times=np.zeros(1))
 
 
-def _filled(position: Array) -> Array:
+def _fill_gaps(position: Array) -> Array:
     """Return positions (N, k, d) in which an epoch without a fix takes that of the last one before, or of the first."""
     found = np.asarray(np.isfinite(position).all(-1))
     last = np.maximum.accumulate(np.where(found, np.arange(position.shape[1]), -1), axis=1)

@@ -65,7 +65,7 @@ class Lifted:
     factor: Factor
 
 
-def lifted_rows(problem: Problem, rows: Rows, start: int, found: Ranges | None, to: Coordinates) -> Lifted | None:
+def lift_rows(problem: Problem, rows: Rows, start: int, found: Ranges | None, to: Coordinates) -> Lifted | None:
     """Return the linear rows of one kind, or None where it has none.
 
     Parameters
@@ -88,11 +88,11 @@ def lifted_rows(problem: Problem, rows: Rows, start: int, found: Ranges | None, 
     m = rows.z - rows.correction
     azimuth, paired = _azimuth_beside(problem, rows) if rows.kind == "elevation" else (None, None)
     if azimuth is not None and (found is None or bool(np.all(paired))):
-        made: Row | None = _paired_elevation(m, azimuth, a)
+        made: Row | None = _pair_elevation(m, azimuth, a)
     else:
         lifted = lifted_row(model, m, a, b)
         assert lifted is not None
-        made, paired = _substituted(lifted, rows, a, b, found, to), None
+        made, paired = _substitute(lifted, rows, a, b, found, to), None
     if made is None:
         return None
     row, right, factor = made
@@ -135,7 +135,7 @@ def _azimuth_beside(problem: Problem, rows: Rows) -> tuple[Array | None, Array |
     return None, None
 
 
-def _paired_elevation(m: Array, azimuth: Array, a: Point) -> Row:
+def _pair_elevation(m: Array, azimuth: Array, a: Point) -> Row:
     """Return [sin E cos A, sin E sin A, -cos E] . (x - s) = 0 in the station's axes; its error is range times n_E."""
     local = (np.sin(m) * np.cos(azimuth), np.sin(m) * np.sin(azimuth), -np.cos(m))
     basis = a.axes or tuple(tuple(float(i == j) for j in range(3)) for i in range(3))
@@ -149,9 +149,7 @@ def _paired_elevation(m: Array, azimuth: Array, a: Point) -> Row:
     return np.concatenate([row, np.zeros((*row.shape[:-1], 1))], axis=-1), (row * place).sum(-1), factor
 
 
-def _substituted(
-    lifted: LiftedRow, rows: Rows, a: Point, b: Point, found: Ranges | None, to: Coordinates
-) -> Row | None:
+def _substitute(lifted: LiftedRow, rows: Rows, a: Point, b: Point, found: Ranges | None, to: Coordinates) -> Row | None:
     """Return a lifted row with its ranges replaced by c + sign t, or None where a range stays unknown."""
     d = len(a.position)
 
@@ -252,16 +250,16 @@ def candidates(problem: Problem, found: Ranges | None, pick: Pick) -> Array:
     Signal Process. 56 (2008), section IV for range differences.
     """
     squared = squared_rows(problem, found)
-    first = _picked(squared, np.ones(squared.ranged_right.shape), None, pick)
+    first = _pick(squared, np.ones(squared.ranged_right.shape), None, pick)
     point = np.where(np.isfinite(first[:, 0]), first[:, 0], 0.0)
     distance = np.maximum(np.sqrt(((point[:, None, :] - squared.place) ** 2).sum(-1)), 1e-3)
-    second = _picked(squared, distance, point, pick)
+    second = _pick(squared, distance, point, pick)
     points = np.concatenate([second, first], axis=1) if pick is every else second
     return points * squared.scale[:, None, None] + squared.origin[:, None, :]
 
 
-def _picked(squared: Squared, distance: Array, point: Array | None, pick: Pick) -> Array:
-    rows, right = _weighted(squared, distance, point)
+def _pick(squared: Squared, distance: Array, point: Array | None, pick: Pick) -> Array:
+    rows, right = _weigh(squared, distance, point)
     linear = squared.quadric.shape == "paraboloid" and not rows[..., -1].any()
     y, valid = _linear(rows[..., :-1], right) if linear else pick(rows, right, squared.quadric)
     return np.where(valid[..., None], y[..., :-1], np.nan)
@@ -345,7 +343,7 @@ def squared_rows(problem: Problem, found: Ranges | None) -> Squared:
     others = tuple(
         other
         for rows, start in zip(problem.rows, problem.starts, strict=True)
-        if (other := lifted_rows(problem, rows, start, found, Coordinates(origin, scale, on_cone))) is not None
+        if (other := lift_rows(problem, rows, start, found, Coordinates(origin, scale, on_cone))) is not None
     )
     return Squared(quadric, origin, scale, ranged, right, whiten, place, others)
 
@@ -376,7 +374,7 @@ def _range_rows(found: Ranges, place: Array, scale: Array, on_cone: bool) -> tup
     return np.where(usable[..., None], rows, 0.0), np.where(usable, right, 0.0)
 
 
-def _weighted(squared: Squared, distance: Array, point: Array | None) -> tuple[Array, Array]:
+def _weigh(squared: Squared, distance: Array, point: Array | None) -> tuple[Array, Array]:
     """Divide each row by the error it inherits from the measurements at an approximate point."""
     factor = 0.5 * squared.scale[:, None] / distance
     stacked = np.concatenate([squared.ranged, squared.ranged_right[..., None]], axis=-1)

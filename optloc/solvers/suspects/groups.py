@@ -98,7 +98,7 @@ def groups_of(problem: Problem, present: Array, by: Sequence[GroupKind] = KINDS)
     return tuple(groups)
 
 
-def checked_kinds(by: str | Sequence[str]) -> tuple[GroupKind, ...]:
+def check_kinds(by: str | Sequence[str]) -> tuple[GroupKind, ...]:
     """Return kinds of groups; raise InvalidProblem naming an unknown one."""
     wanted = (by,) if isinstance(by, str) else tuple(by)
     for name in wanted:
@@ -109,14 +109,14 @@ def checked_kinds(by: str | Sequence[str]) -> tuple[GroupKind, ...]:
     return tuple(kind for kind in KINDS if kind in wanted)
 
 
-def without(problem: Problem, left: Array, dropped: frozenset[int]) -> Problem:
+def leave_out(problem: Problem, left: Array, dropped: frozenset[int]) -> Problem:
     """Return a flat batch of problems without some rows (N, m) and without some priors."""
     weight = np.where(left, 0.0, np.broadcast_to(problem.weight, left.shape))
     priors = tuple(prior for j, prior in enumerate(problem.priors) if j not in dropped)
     return replace(problem, priors=priors).with_rows(weight=weight)
 
 
-def mask(groups: Sequence[Group], count: int) -> Array:
+def mark_rows(groups: Sequence[Group], count: int) -> Array:
     """Return the rows (count,) of some groups."""
     out = np.zeros(count, dtype=bool)
     for group in groups:

@@ -10,11 +10,11 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.problem.fix import Alternatives, Explanation, Fix, Suspect
 from optloc.problem.problem import Problem
-from optloc.solvers.starts.arrivals import Arrivals, original
+from optloc.solvers.starts.arrivals import Arrivals, restore_order
 from optloc.solvers.suspects.evidence import Error, errors, influence
 from optloc.solvers.suspects.groups import Group
 from optloc.solvers.suspects.subsets import Finding, Rest
-from optloc.solvers.verdict.explained import Conclusion, list_names
+from optloc.solvers.verdict.conclusion import Conclusion, list_names
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Case:
 
     def vector(self, x: Array) -> Array:
         """Return vectors (..., size) in the order of the given problem."""
-        return x if self.arrivals is None else original(self.problem, self.arrivals.problem, x)
+        return x if self.arrivals is None else restore_order(self.problem, self.arrivals.problem, x)
 
     def rows(self, group: Group) -> tuple[int, ...]:
         """Return the rows of a group as numbers of the given problem's rows."""
@@ -61,10 +61,10 @@ def conclude_case(case: Case, finding: Finding) -> Conclusion | None:
         return Conclusion(explanations, finding.rests[0].fix, _alternatives(case, finding.rests, explanations))
     if case.whole.answered and set(finding.p_value) == {()} and not finding.note:
         return None
-    return Conclusion((), case.whole, case.whole.alternatives, _tried(case, finding))
+    return Conclusion((), case.whole, case.whole.alternatives, _name_closest(case, finding))
 
 
-def _tried(case: Case, finding: Finding) -> str:
+def _name_closest(case: Case, finding: Finding) -> str:
     """Return what came closest to an explanation, in words."""
     tested = {left: p for left, p in finding.p_value.items() if left and np.isfinite(p)}
     if not tested:
@@ -81,14 +81,14 @@ def _explanation(case: Case, rest: Rest, finding: Finding) -> Explanation:
     found = errors(influence(case.work, fix.x), groups) if np.isfinite(fix.x).all() else [None] * len(groups)
     for i, group, error in zip(rest.left, groups, found, strict=True):
         known = finding.p_value.get(tuple(j for j in rest.left if j != i))
-        p_with = _with(fix, error) if known is None else known
+        p_with = _p_with(fix, error) if known is None else known
         none = np.full(1, np.nan)
         value, sigma = (none, none) if error is None else (error.value, error.sigma)
         suspects.append(Suspect(group.name, group.kind, case.rows(group), value, sigma, p_with, p_without))
     return Explanation(tuple(suspects), case.vector(fix.x), float(fix.cost), int(fix.dof), p_without)
 
 
-def _with(fix: Fix, error: Error | None) -> float:
+def _p_with(fix: Fix, error: Error | None) -> float:
     """Return the chi-square probability of a rest with one of its suspects back, to first order."""
     from scipy.special import gammaincc
 

@@ -18,11 +18,11 @@ from optloc.solvers.outside import accept
 from optloc.solvers.pool import Pool, begin, offer
 from optloc.solvers.stages import fix_by, lsr, search_widely
 from optloc.solvers.starts.arrivals import as_arrivals
-from optloc.solvers.starts.position import completed
-from optloc.solvers.suspects.groups import KINDS, Group, checked_kinds, groups_of
+from optloc.solvers.starts.position import complete
+from optloc.solvers.suspects.groups import KINDS, Group, check_kinds, groups_of
 from optloc.solvers.suspects.report import Case, conclude_case
-from optloc.solvers.suspects.subsets import TEST, Finding, Rest, enumerable, explained, fix_rest, grown
-from optloc.solvers.verdict.explained import Conclusion
+from optloc.solvers.suspects.subsets import TEST, Finding, Rest, enumerable, explain, fix_rest, grow
+from optloc.solvers.verdict.conclusion import Conclusion
 from optloc.solvers.verdict.judge import judge, standing
 from optloc.solvers.verdict.status import fill
 
@@ -59,7 +59,7 @@ def suspects(problem: Problem, fix: Fix | None = None, *, by: str | Sequence[str
     InvalidProblem
         For an unknown group, or a fix of other batch axes.
     """
-    kinds = checked_kinds(by)
+    kinds = check_kinds(by)
     problem = by_epoch(problem) if separable(problem) else problem
     shape, flat = problem.batch_shape, problem.flat()
     if fix is not None and fix.shape != shape:
@@ -111,11 +111,11 @@ def _conclude_pattern(
     present = np.broadcast_to(work.weight, (len(items), work.count))[0] > 0.0
     groups = groups_of(work, present, by)
     if problem.epochs > 1 or not enumerable(groups, work.count, 1):
-        findings = [_grown(work, groups, fix, i, item, rejected, None) for i, item in enumerate(items)]
+        findings = [_grow(work, groups, fix, i, item, rejected, None) for i, item in enumerate(items)]
     else:
-        findings = explained(work, groups, fix[items])
+        findings = explain(work, groups, fix[items])
         for i in [i for i, own in enumerate(findings) if not own.rests and _more(groups, work, int(fix.dof[items[i]]))]:
-            more = _grown(work, groups, fix, i, items[i], rejected, findings[i].closest)
+            more = _grow(work, groups, fix, i, items[i], rejected, findings[i].closest)
             findings[i] = replace(more, p_value=findings[i].p_value | more.p_value, nearly=findings[i].nearly)
     for i, found in enumerate(findings):
         finding = found if found.rests else replace(found, rests=found.nearly)
@@ -129,7 +129,7 @@ def _more(groups: Sequence[Group], problem: Problem, dof: int) -> bool:
     return not all(enumerable(groups, problem.count, size) for size in range(1, dof // 2 + 1))
 
 
-def _grown(
+def _grow(
     problem: Problem, groups: Sequence[Group], fix: Fix, i: int, item: int, rejected: Array, start: Rest | None
 ) -> Finding:
     """Return what explains the i-th of some problems, that of the fix numbered `item`, found group by group."""
@@ -137,7 +137,7 @@ def _grown(
     if own.layout != one.layout or not np.isfinite(own.x).all():
         n = one.layout.n_shared
         known = np.isfinite(own.x[:n]).all()
-        near = completed(one, own.x[None, None, :n]) if known else None
+        near = complete(one, own.x[None, None, :n]) if known else None
         own = (fix_rest(one) if near is None else fix_by(one, lambda _: begin(one, near)))[0]
     mine = rejected[item] if one.count == rejected.shape[1] else np.zeros(one.count, dtype=bool)
-    return grown(one, groups, own, mine, start)
+    return grow(one, groups, own, mine, start)

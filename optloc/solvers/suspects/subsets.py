@@ -17,7 +17,7 @@ from optloc.problem.problem import Problem
 from optloc.solvers.pool import Pool, begin, in_parts, offer, pack
 from optloc.solvers.stages import fix_by, gtrs, lsr, roots, search, widen
 from optloc.solvers.suspects.evidence import Influence, errors, influence, significance
-from optloc.solvers.suspects.groups import Group, mask, without
+from optloc.solvers.suspects.groups import Group, leave_out, mark_rows
 from optloc.solvers.verdict.judge import judge, standing
 
 TEST = 0.01
@@ -91,7 +91,7 @@ def enumerable(groups: Sequence[Group], rows: int, size: int) -> bool:
     return comb(len(groups), size) * rows <= _MOST
 
 
-def explained(problem: Problem, groups: Sequence[Group], whole: Fix) -> list[Finding]:
+def explain(problem: Problem, groups: Sequence[Group], whole: Fix) -> list[Finding]:
     """Return what explains each problem of a flat batch: all the smallest sets of groups without which the rest passes.
 
     Sets of one, of two and so on, as many as the redundancy can name and as are few enough to be tried.
@@ -113,7 +113,9 @@ def explained(problem: Problem, groups: Sequence[Group], whole: Fix) -> list[Fin
         step = max(1, _CHUNK // (comb(len(groups), size) * problem.count + 1))
         for first in range(0, len(open_), step):
             items = open_[first : first + step]
-            for item, (rests, p_value, closest) in zip(items, _tried(problem.take(items), groups, size), strict=True):
+            for item, (rests, p_value, closest) in zip(
+                items, _try_sets(problem.take(items), groups, size), strict=True
+            ):
                 placed = [rest for rest in rests if rest.fix.answered or int(rest.fix.dof) == 0]
                 passing = [rest for rest in placed if plausible(rest.fix, size)]
                 nearly = found[item].nearly or minimal(rests, groups)
@@ -142,7 +144,7 @@ def _implausibility(rest: Rest) -> tuple[bool, float, float]:
     return not bool(rest.fix.answered), -1.0 if np.isnan(p) else -p, float(rest.fix.cost)
 
 
-def _tried(
+def _try_sets(
     problem: Problem, groups: Sequence[Group], size: int
 ) -> list[tuple[list[Rest], dict[tuple[int, ...], float], Rest | None]]:
     """Return the rests of each problem that may pass, the probabilities of all, and the cheapest of all."""
@@ -169,7 +171,7 @@ def _tried(
 
 def _subsets(groups: Sequence[Group], count: int, size: int) -> Iterator[tuple[tuple[int, ...], Array, frozenset[int]]]:
     """Yield sets of groups, their rows and their priors; each of a set must add something to the others."""
-    masks = [mask([group], count) for group in groups]
+    masks = [mark_rows([group], count) for group in groups]
     for left in combinations(range(len(groups)), size):
         rows = np.any([masks[i] for i in left], axis=0)
         idle = any(
@@ -185,7 +187,7 @@ def _fix_rests(problem: Problem, left: Array, dropped: frozenset[int]) -> Fix:
     """Return the fixes (N * C,) of N problems without each of C sets of rows (C, m), set after set of each problem."""
     count = problem.batch_shape[0]
     many = problem.take(np.repeat(np.arange(count), len(left)))
-    return in_parts(without(many, np.tile(left, (count, 1)), dropped), lambda part, _: fix_rest(part))
+    return in_parts(leave_out(many, np.tile(left, (count, 1)), dropped), lambda part, _: fix_rest(part))
 
 
 def fix_rest(problem: Problem) -> Fix:
@@ -195,14 +197,14 @@ def fix_rest(problem: Problem) -> Fix:
     that passes, or fails by little, all candidates: its other positions explain the data as well.
     """
     pool = lsr(problem, gtrs(problem, None))
-    pool = _again(problem, pool, _NEAR, lambda part, own: lsr(part, _beside(part, roots(part, None), own)))
-    pool = _again(problem, pool, _CLOSE, lambda part, own: lsr(part, widen(part, own)))
+    pool = _redo(problem, pool, _NEAR, lambda part, own: lsr(part, _beside(part, roots(part, None), own)))
+    pool = _redo(problem, pool, _CLOSE, lambda part, own: lsr(part, widen(part, own)))
     if not np.isfinite(pool.cost[:, 0]).any() and (pool.dof >= 0).any():
         pool = search(problem, pool)  # no closed form starts from these kinds
     return judge(problem, pool)
 
 
-def _again(problem: Problem, pool: Pool, near: float, better: Callable[[Problem, Pool], Pool]) -> Pool:
+def _redo(problem: Problem, pool: Pool, near: float, better: Callable[[Problem, Pool], Pool]) -> Pool:
     """Return pools of which those whose cost is not that many times too large were made anew."""
     cost = np.where(np.isfinite(pool.cost[:, 0]), pool.cost[:, 0], np.nan)
     with np.errstate(invalid="ignore"):
@@ -237,7 +239,7 @@ _LARGE = 16
 _MOST_LEFT_OUT, _RIVALS = 8, 3
 
 
-def grown(problem: Problem, groups: Sequence[Group], fix: Fix, rejected: Array, start: Rest | None = None) -> Finding:
+def grow(problem: Problem, groups: Sequence[Group], fix: Fix, rejected: Array, start: Rest | None = None) -> Finding:
     """Return what explains one problem, found group by group.
 
     Parameters
@@ -265,7 +267,7 @@ def grown(problem: Problem, groups: Sequence[Group], fix: Fix, rejected: Array, 
             )
         left = [*(i for i in left if not _inside(groups[i], groups[worst])), worst]
         rest = fix_without(problem, groups, left, rest.x)
-    left, rest = _taken_back(problem, groups, left, rest, level)
+    left, rest = _take_back(problem, groups, left, rest, level)
     if not left or not rest.answered:
         return Finding((), {(): float(fix.p_value)}, "" if rest.answered else str(rest.reason))
     found = minimal([Rest(tuple(sorted(left)), rest), *_rivals(problem, groups, left, rest, level)], groups)
@@ -274,21 +276,21 @@ def grown(problem: Problem, groups: Sequence[Group], fix: Fix, rejected: Array, 
 
 def fix_without(problem: Problem, groups: Sequence[Group], left: Sequence[int], x: Array) -> Fix:
     """Return the fix of one problem without some groups, refined from a vector (size,)."""
-    part = _part(problem, groups, left)
+    part = _leave_out(problem, groups, left)
     return fix_by(part, lambda one: begin(one, x[None]))[0]
 
 
-def _part(problem: Problem, groups: Sequence[Group], left: Sequence[int]) -> Problem:
+def _leave_out(problem: Problem, groups: Sequence[Group], left: Sequence[int]) -> Problem:
     chosen = [groups[i] for i in left]
     dropped = frozenset(group.prior for group in chosen if group.prior >= 0)
-    return without(problem, mask(chosen, problem.count)[None], dropped)
+    return leave_out(problem, mark_rows(chosen, problem.count)[None], dropped)
 
 
 def _worst(problem: Problem, groups: Sequence[Group], left: Sequence[int], rest: Fix, level: float) -> int | None:
     """Return the group, not yet left out, that contradicts the rest most; None where none does clearly."""
     if not np.isfinite(rest.x).all():
         return None
-    gone = mask([groups[i] for i in left], problem.count)
+    gone = mark_rows([groups[i] for i in left], problem.count)
     open_ = [i for i, g in enumerate(groups) if i not in set(left) and (g.prior >= 0 or not gone[list(g.rows)].all())]
     at = _influence(problem, groups, left, rest.x)
     small = [i for i in open_ if len(groups[i].rows) <= _LARGE]
@@ -303,8 +305,8 @@ def _worst(problem: Problem, groups: Sequence[Group], left: Sequence[int], rest:
 
 def _influence(problem: Problem, groups: Sequence[Group], left: Sequence[int], x: Array) -> Influence:
     dropped = frozenset(groups[i].prior for i in left if groups[i].prior >= 0)
-    gone = mask([groups[i] for i in left], problem.count)
-    return influence(without(problem, gone[None], frozenset()), x, dropped)
+    gone = mark_rows([groups[i] for i in left], problem.count)
+    return influence(leave_out(problem, gone[None], frozenset()), x, dropped)
 
 
 def _present(group: Group, gone: Array) -> Group:
@@ -316,7 +318,7 @@ def _inside(one: Group, other: Group) -> bool:
     return one.prior < 0 and other.prior < 0 and set(one.rows) <= set(other.rows)
 
 
-def _taken_back(
+def _take_back(
     problem: Problem, groups: Sequence[Group], left: list[int], rest: Fix, level: float
 ) -> tuple[list[int], Fix]:
     """Return what is still left out, and the rest, once every group that fits the rest is taken back."""
@@ -337,7 +339,7 @@ def _rivals(problem: Problem, groups: Sequence[Group], left: list[int], rest: Fi
     for i in left if len(left) <= _MOST_LEFT_OUT else ():
         others = [j for j in left if j != i]
         fix = fix_without(problem, groups, others, rest.x)
-        gone = mask([groups[j] for j in others], problem.count)
+        gone = mark_rows([groups[j] for j in others], problem.count)
         open_ = [j for j, g in enumerate(groups) if j not in left and not _overlap(g, gone)]
         if not np.isfinite(fix.x).all() or not open_:
             continue

@@ -67,7 +67,7 @@ def _blocked(point: Array, station: Array, heard: Array) -> Array:
     return np.asarray(heard & (share > 0.0) & (nearest < limit**2))
 
 
-def lowest(problem: Problem, x: Array) -> Array:
+def lowest_sight(problem: Problem, x: Array) -> Array:
     """Return the sine of the lowest elevation (N,) at which targets x (N, size) see satellites that hear them.
 
     Zero in plain Cartesian frames and without satellites: a rule to order positions that fit equally well.

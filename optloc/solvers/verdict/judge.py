@@ -12,7 +12,7 @@ from optloc.base.types import Array
 from optloc.problem.fix import Alternatives, Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.pool import Curvature, Pool
-from optloc.solvers.verdict.explained import conclude
+from optloc.solvers.verdict.conclusion import conclude
 from optloc.solvers.verdict.status import LOCAL, doubt_sentence, doubtful, fill, rule
 
 _EPOCHS_SHOWN = 8  # epochs that a sentence names
@@ -32,10 +32,10 @@ def judge(problem: Problem, pool: Pool) -> Fix:
         return _unrefined(problem, pool)
     fix = _plain(problem, pool, pool.curvature)
     if pool.plain is None:
-        fix = _ruled(problem, pool, fix)
+        fix = _apply_rules(problem, pool, fix)
     elif not pool.plain.all():
         items = np.flatnonzero(~pool.plain)
-        fix = overwrite(fix, items, _ruled(problem.take(items), take(pool, items), fix[items]))
+        fix = overwrite(fix, items, _apply_rules(problem.take(items), take(pool, items), fix[items]))
     if pool.conclusion is not None:
         for i in np.flatnonzero(present(pool.conclusion)):
             told = pool.conclusion[i]
@@ -89,7 +89,7 @@ def _claims(pool: Pool) -> Array:
     return np.where(present(pool.certificate), pool.certificate, local)
 
 
-def _ruled(problem: Problem, pool: Pool, fix: Fix) -> Fix:
+def _apply_rules(problem: Problem, pool: Pool, fix: Fix) -> Fix:
     """Return the fixes with the statuses of the rules."""
     ruling = rule(problem, pool, fix.alternatives.gap)
     assert pool.curvature is not None

@@ -17,7 +17,7 @@ from optloc.solvers.policy import AMBIGUOUS_GAP, EQUAL_COST, FAR, FLAT, LISTED_G
 from optloc.solvers.pool import Curvature, Pool
 from optloc.solvers.starts.position import distance_of
 from optloc.solvers.verdict.curvature import measure_curvature
-from optloc.solvers.verdict.horizon import lowest
+from optloc.solvers.verdict.horizon import lowest_sight
 
 Equations = Callable[[Problem, Array], Normal]
 
@@ -101,7 +101,7 @@ def _choose(problem: Problem, pool: Pool) -> Array:
     if len(tied) and problem.frame.geodetic:
         sight = np.full(pool.cost.shape, -np.inf)
         # sines of elevations, equal to the last digits for mirror images: rounded, so that the cheaper of them wins
-        sight[tied, slot] = np.round(lowest(problem.take(tied), pool.x[tied, slot]), 6)
+        sight[tied, slot] = np.round(lowest_sight(problem.take(tied), pool.x[tied, slot]), 6)
         best[tied] = sight[tied].argmax(1)
     return best
 

@@ -54,7 +54,7 @@ def conclude(problem: Problem, conclusion: Conclusion) -> Fix:
         x=explanations[0].x,
         layout=problem.layout,
         code=np.array(int(Status.AMBIGUOUS) if several and rest.answered else int(rest.code), dtype=np.int8),
-        reason=_object(_rivals(explanations) if several else _named(explanations[0], rest)),
+        reason=_object(_name_rivals(explanations) if several else _name_suspects(explanations[0], rest)),
         alternatives=conclusion.alternatives,
         weights=weights,
         local=rest.local if rest.layout == problem.layout else None,
@@ -85,7 +85,7 @@ def list_names(parts: Sequence[str]) -> str:
     return parts[0] if len(parts) == 1 else ", ".join(parts[:-1]) + " and " + parts[-1]
 
 
-def _named(explanation: Explanation, rest: Fix) -> str:
+def _name_suspects(explanation: Explanation, rest: Fix) -> str:
     parts = [f"{suspect.name}{_error(suspect)}" for suspect in explanation.suspects]
     reason = f"left out: {list_names(parts)}; p = {_p(explanation.suspects[0].p_with)} with"
     reason += "" if len(parts) == 1 else " the first"
@@ -93,7 +93,7 @@ def _named(explanation: Explanation, rest: Fix) -> str:
     return f"{reason}, {_p(explanation.p_value)} without" + (f"; {own}" if own else "")
 
 
-def _rivals(explanations: Sequence[Explanation]) -> str:
+def _name_rivals(explanations: Sequence[Explanation]) -> str:
     shown = [" and ".join(one.names) for one in explanations[:_SHOWN]]
     more = f" or {len(explanations) - _SHOWN} others" if len(explanations) > _SHOWN else ""
     common = set(explanations[0].names).intersection(*(one.names for one in explanations[1:]))
