@@ -64,6 +64,7 @@ def _from_bearings(locate: Callable[[Bearings], Array]) -> Callable[[Problem], A
     """Return a start from the bearings of a problem."""
 
     def start(problem: Problem) -> Array:
+        # a slot of NaN where no azimuth was measured: other formulations may start the rows
         seen = bearings(problem)
         nowhere = np.full((problem.batch_shape[0], 1, problem.dimension), np.nan)
         return nowhere if seen is None else locate(seen)
@@ -71,6 +72,7 @@ def _from_bearings(locate: Callable[[Bearings], Array]) -> Callable[[Problem], A
     return start
 
 
+# both are refined on block averages; only where they begin differs
 _start_run, _start_relaxed_run = partial(run_starts, begin=closed_form), partial(run_starts, begin=relax_run)
 
 _RANGES = "range, toa, tdoa, range_sum; azimuth, elevation and groa rows linear in (x, r)"

@@ -13,15 +13,19 @@ from optloc.linear.constraints import TOLERANCE, Face, exact, faces, violation
 from optloc.problem.problem import Problem
 from optloc.solvers.pool import Pool
 from optloc.solvers.refine import refine
-from optloc.solvers.verdict.horizon import hidden
+from optloc.solvers.verdict.horizon import is_hidden
 
 Descend = Callable[[Problem, Array, Array, Face], tuple[Array, Array, Array]]
+"""Maps problems, starts (M, size), the problem of each start (M,) and a face to points, costs and statuses there."""
 
+# Candidates from which each face is searched: the cheapest ones that break a constraint lie beyond the face that will
+# hold, and its minimum is next to one of them. Each costs a refinement on every face.
 _STARTS = 3
 
 
 def by_least_squares(problem: Problem, start: Array, item: Array, face: Face) -> tuple[Array, Array, Array]:
     """Return x (M, size), cost (M,) and status (M,) of the minima on a face next to starts of problems `item` (M,)."""
+    # as many steps as `lsr` takes: what competes on a face must be as finished as what lies inside
     done = refine(problem, start, item=item, face=face, limit=100)
     return done.x, done.cost, done.status
 
@@ -48,16 +52,18 @@ def bound_pool(problem: Problem, pool: Pool, descend: Descend = by_least_squares
     Pool
         Infeasible ones have infinite cost and status `infeasible`.
     """
-    broken = _broken(problem, pool)
+    broken = _breaks(problem, pool)
     if not broken.any():
         return pool
     sides = faces(problem)
     first = np.argmin(np.where(np.isfinite(pool.cost), pool.cost, np.inf), axis=1)
     needy = np.flatnonzero(broken[np.arange(len(first)), first])
     kept = _without(pool, broken)
+    # where the cheapest is feasible it is the answer, and without inequalities there is no other face
     if not len(needy) or sides == [exact(problem)]:
         return kept
     starts = _cheapest(pool, needy)
+    # face 0 has no inequality: what lies on it is in the pool already
     on_faces = [_on_face(problem, sides, number, needy, starts, descend) for number in range(1, len(sides))]
     size, width = len(pool.x), starts.shape[1] * len(on_faces)
     x = np.full((size, width, pool.x.shape[-1]), np.nan)
@@ -76,16 +82,16 @@ def bound_pool(problem: Problem, pool: Pool, descend: Descend = by_least_squares
 
 def without_broken(problem: Problem, pool: Pool) -> Pool:
     """Return candidates of which those that break a constraint, or are hidden, have infinite cost."""
-    return _without(pool, _broken(problem, pool))
+    return _without(pool, _breaks(problem, pool))
 
 
-def _broken(problem: Problem, pool: Pool) -> Array:
+def _breaks(problem: Problem, pool: Pool) -> Array:
     """Return which candidates break a constraint, or stand where the Earth hides them from a satellite."""
     broken = np.zeros(pool.cost.shape, dtype=bool)
     item, slot = np.nonzero(np.isfinite(pool.x).all(-1))
     if len(item) and (problem.constraints or problem.frame.geodetic):
         part, x = problem.take(item), pool.x[item, slot]
-        broken[item, slot] = (violation(part, x) > TOLERANCE) | hidden(part, x)
+        broken[item, slot] = (violation(part, x) > TOLERANCE) | is_hidden(part, x)
     return broken
 
 
@@ -112,7 +118,8 @@ def _on_face(
     row, slot = np.nonzero(np.isfinite(starts).all(-1))
     x[row, slot], found, status = descend(problem, starts[row, slot], items[row], sides[number])
     part = problem.take(items[row])
-    inside = (violation(part, x[row, slot]) <= TOLERANCE) & ~hidden(part, x[row, slot]) & np.isfinite(found)
+    # a minimum on a face may break another constraint; the face of both is tried as well
+    inside = (violation(part, x[row, slot]) <= TOLERANCE) & ~is_hidden(part, x[row, slot]) & np.isfinite(found)
     cost[row, slot] = np.where(inside, found, np.inf)
     code[row, slot] = np.where(inside, status, np.int8(Status.INFEASIBLE))
     return x, cost, code, np.full(shape, number)

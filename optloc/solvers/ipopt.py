@@ -53,12 +53,15 @@ def nlp(problem: Problem, pool: Pool | None) -> Pool:
     if pool is None:
         raise InvalidProblem("nlp improves a start", "method", "give start= or a method such as 'gtrs+nlp'")
     began = perf_counter()
+    # a program of thousands of rows is slow to build and to solve; `lsr` behind it has all epochs
     if registrable(problem) and problem.epochs >= 2 * BLOCKS:
         return offer(problem, _of_blocks(problem, pool.x), pool, "nlp", began)
+    # IPOPT sees one covariance: station errors of an epoch are noise to it
     problem = weighed(problem)
     x, shape = pool.x.copy(), pool.x.shape[:2]
     cost, code = np.full(shape, np.inf), np.full(shape, int(Status.NUMERICAL), dtype=np.int8)
     item, slot = pool.occupied
+    # one by one: a program is built for a structure and fed the numbers of each problem
     for i in np.unique(item):
         one = problem.take(np.array([i]))
         solver = _ScaledProblem(one)
@@ -98,7 +101,7 @@ def _stationary(problem: Problem, x: Array, code: Array, face: Array) -> Array:
             space = tangent_at(part, sides[number], here) if sides[number] else None
             equations = equations_at(part, here, whiten(part.noise, part.weight))
             move, solvable = step(equations, np.zeros(len(here)), space)
-            small = solvable & (np.abs(decrement(equations, move, problem.layout.n_shared)) < 1e-10)
+            small = solvable & (np.abs(decrement(equations, move, problem.layout.n_shared)) < _STATIONARY)
         out[items[small]] = Status.OK
     return out
 
@@ -113,6 +116,8 @@ class _ScaledProblem:
         unit = np.concatenate(
             [_slot_units(layout.shared, size), np.tile(_slot_units(layout.local, size), layout.epochs)]
         )
+        # positions count from the stations' centre, everything else from zero; lengths and speeds in the stations'
+        # spread
         centre = np.zeros(layout.size)
         for found in (layout.shared, layout.local):
             for place in found:
@@ -126,6 +131,7 @@ class _ScaledProblem:
         self.data = np.concatenate([unit, centre, rows, [size], bounds(problem)])
         self.program = _program(problem, len(self.data), len(rows))
         self.weight = _whitening(problem)
+        # absent rows have weight zero, but zero times NaN is NaN
         self.z = np.where(problem.weight[0] > 0.0, problem.observed[0], 0.0)
         self.prior = _prior(problem, unit, centre)
 
@@ -137,8 +143,12 @@ class _ScaledProblem:
         return found.x * self.unit + self.centre, found.cost, int(code)
 
 
-# Programs take up to a second to build, and some megabytes.
+# Programs take up to a second to build, and some megabytes each: a study of many layouts must not keep them all.
 _PROGRAMS = Cache[Program](64)
+# Iterations of IPOPT at most: far more than a start near a minimum takes, and one that runs away never ends.
+_ITERATIONS = 200
+# Squared length of the next Gauss-Newton step, in sigma, at a minimum: IPOPT calls some such endings unfinished.
+_STATIONARY = 1e-10
 
 
 def _program(problem: Problem, data: int, rows: int) -> Program:
@@ -150,6 +160,7 @@ def _program(problem: Problem, data: int, rows: int) -> Program:
         (bool(np.all(b.lower == b.upper)), bool(np.isfinite(b.lower).all()), bool(np.isfinite(b.upper).all()))
         for b in conjunction(problem)
     )
+    # what the program is made of, but no number that it is fed with
     key = (problem.structure, data, shapes, limits, None if choice is None else choice.key, compiled)
     return _PROGRAMS.find(key, lambda: _build(problem, data, rows, choice, compiled))
 
@@ -157,29 +168,30 @@ def _program(problem: Problem, data: int, rows: int) -> Program:
 def _build(problem: Problem, data: int, rows: int, choice: Choice | None, compiled: bool) -> Program:
     n = problem.layout.size
 
-    def scaled(y: Any, p: Any, z: Any) -> list[Any]:
+    def scaled_residual(y: Any, p: Any, z: Any) -> list[Any]:
         return residual(problem, y * p[:n] + p[n : 2 * n], p[2 * n :], z)
 
-    def limited(y: Any, p: Any) -> tuple[list[Any], list[Any]]:
+    def limits_at(y: Any, p: Any) -> tuple[list[Any], list[Any]]:
         last = 2 * n + rows
         return constrained(problem, y * p[:n] + p[n : 2 * n], p[last + 1 :], p[last])
 
-    equal, more = ((lambda y, p, i=i: limited(y, p)[i]) if problem.constraints else None for i in (0, 1))
+    equal, more = ((lambda y, p, i=i: limits_at(y, p)[i]) if problem.constraints else None for i in (0, 1))
     return Program(
         n,
         problem.count,
         data,
-        residual=scaled,
+        residual=scaled_residual,
         equalities=equal,
         inequalities=more,
         diagonal=_independent(problem),
-        settings={"bound_relax_factor": 0.0, "max_iter": 200},  # by default constraints give way by 1e-8
+        settings={"bound_relax_factor": 0.0, "max_iter": _ITERATIONS},  # by default constraints give way by 1e-8
         choice=choice,
         compiled=compiled,
     )
 
 
 def _slot_units(slots: Any, size: float) -> Array:
+    # a unit that begins with m is metres, or metres per something
     units = [np.full(slot.size, size if slot.unit.startswith("m") else 1.0) for slot in slots]
     return np.concatenate([*units, np.zeros(0)])
 

@@ -18,9 +18,15 @@ from optloc.problem.problem import Problem
 from optloc.solvers.refine import refine
 from optloc.solvers.starts.position import vectors
 
+# Steps at most: places far from any fit take their time, and a picture does not wait for the last of them.
 _STEPS = 40
+# Marquardt's factor: almost a Gauss-Newton step at first, tenfold less after a step that lowers the cost and tenfold
+# more after one that does not; given up where it leaves no step.
 _FIRST, _STUCK = 1e-3, 1e9
+# Relative drop of the cost that ends the steps: far below what a contour or colour shows.
 _SETTLED = 1e-9
+# Standard deviations within which an iteration has reached a fix.
+_SAME = 0.1
 
 
 def profile_cost(problem: Problem, x: Array, places: Array, held: Array) -> Array:
@@ -53,6 +59,7 @@ def profile_cost(problem: Problem, x: Array, places: Array, held: Array) -> Arra
     slot, _ = layout.find("position")
     vectors = np.tile(np.asarray(x, dtype=float), (len(places), 1))
     vectors[:, slot.start : slot.start + slot.size] = places
+    # steps stay in the space across what is held; the scales decide nothing, as its basis is all that is used
     gradients = np.zeros((1, len(held), layout.n_shared))
     gradients[0, :, slot.start : slot.start + slot.size] = held
     space = tangent(gradients, np.ones((1, layout.n_shared)))
@@ -68,6 +75,7 @@ def profile_cost(problem: Problem, x: Array, places: Array, held: Array) -> Arra
                 better = ok & (after < before)
                 vectors[active[better]], cost[active[better]] = tried[better], after[better]
                 damping[active] *= np.where(better, 0.1, 10.0)
+                # settled, or no damping helps: such a place keeps the least cost that was found
                 done = better & (before - after < _SETTLED * (1.0 + after)) | (damping[active] > _STUCK)
                 active = active[~done]
                 if not len(active):
@@ -77,7 +85,6 @@ def profile_cost(problem: Problem, x: Array, places: Array, held: Array) -> Arra
 
 # Where iterations from many starts end: reached, at another minimum, or nowhere.
 
-_SAME = 0.1
 ITERATIONS = {"taylor": False, "lsr": True}
 """Iterations from a guess, and whether their steps are damped."""
 

@@ -103,6 +103,7 @@ def compare_bounds(problem: Problem, pool: Pool | None) -> Pool:
         certificate = fill(len(pool), None) if pool.certificate is None else np.array(pool.certificate)
         for i in known:
             proven = fix.certificate[i].proof
+            # a proof of the whole space stays, one of a region gives way only to a tight bound
             if proven != "global" and (tight[i] or proven != "region"):
                 certificate[i] = _certificate(float(fix.cost[i]), float(found.bound[i]), bool(tight[i]), found.method)
         stage = Stage("bound", f"{int(tight[known].sum())} of {len(tight)} proven", perf_counter() - began)
@@ -157,7 +158,7 @@ _STAGES: dict[str, Entry] = {
 }
 
 
-def _derived() -> Mapping[str, Entry]:
+def _derive() -> Mapping[str, Entry]:
     """Return the stages that follow from other tables: of each loss, and of each start of a formulation."""
     out = {name: _start(Robust(loss), loss.summary) for name, loss in LOSSES.items()}
     for formulation in FORMULATIONS.values():
@@ -166,9 +167,10 @@ def _derived() -> Mapping[str, Entry]:
     return out
 
 
-SOLVERS: Table[Entry] = Table("optloc.solvers", lambda value: isinstance(value, Entry), _STAGES, _derived)
+SOLVERS: Table[Entry] = Table("optloc.solvers", lambda value: isinstance(value, Entry), _STAGES, _derive)
 
-# Machine code takes time to load, more than the stages take for fewer problems.
+# Problems from which on the compiled shortcut is used: machine code takes time to load, more than the stages take for
+# fewer.
 WORTH = 16
 # Beginnings of methods for which there is a stage that does the same in one.
 SHORTCUTS: Mapping[tuple[str, ...], Solver] = {("gtrs", "lsr"): Quick(WORTH)}
@@ -181,7 +183,7 @@ METHODS = {
     "robust": "roots+lsr+widen+lsr+search+suspects",
 }
 
-# More candidates change nothing about these.
+# More candidates change nothing about these, so that nobody has to prove them.
 _SETTLED = (Status.REJECTED, Status.TOO_FEW_ROWS)
 
 
@@ -237,6 +239,7 @@ class Method:
         Problems beyond the scope of the proof take the last branch alone.
         """
         branches = list(self.branches)
+        # its first branch would end without a proof and be done for nothing
         if len(branches) > 1 and unsupported(problem):
             branches = branches[-1:]
         pool = _run_through(branches[0], problem, pool)
@@ -255,11 +258,12 @@ def _run_through(method: Method, problem: Problem, pool: Pool | None) -> Pool:
 def _take_over(method: Method, problem: Problem, pool: Pool) -> Pool:
     """Return a pool whose unproven problems went through a method, beside what was found before."""
     fix = judge(problem, pool)
-    items = np.flatnonzero(unproven(fix))
+    items = np.flatnonzero(is_unproven(fix))
     if not len(items):
         return pool
     part, (first, *others) = problem.take(items), method.runs
     start = first(part, None)
+    # what was found competes: a branch never answers worse than the one before
     x = np.concatenate([start.x, standing(take(pool, items), fix[items])], axis=1)
     new = replace(offer(part, pack(x), None, "", perf_counter()), stages=start.stages)
     for stage in others:
@@ -267,7 +271,7 @@ def _take_over(method: Method, problem: Problem, pool: Pool) -> Pool:
     return replace(pool.merge(items, new), stages=(*pool.stages, *new.stages))
 
 
-def unproven(fix: Fix) -> Array:
+def is_unproven(fix: Fix) -> Array:
     """Return which fixes (N,) could still change: no proof that all minima within the listed gap are known."""
     sure = [c.proof == "global" and c.margin >= LISTED_GAP for c in fix.certificate]
     return np.asarray(~np.array(sure, dtype=bool) & ~np.isin(fix.code, _SETTLED))

@@ -70,13 +70,17 @@ def accept(problem: Problem, fix: Fix) -> Pool:
     """
     x = np.concatenate([fix.x[:, None], fix.alternatives.x], axis=1)
     shape = x.shape[:2]
+    # nobody has refined them: a verdict would call them minima
     if np.isnan(fix.cost).all() and (fix.code == Status.UNAVAILABLE).all():
         code = np.full(shape, int(Status.UNAVAILABLE), dtype=np.int8)
         return Pool(x, np.full(shape, np.nan), code, np.zeros(shape, dtype=int), fix.weights, fix.dof, fix.stages)
     cost = np.concatenate([fix.cost[:, None], fix.cost[:, None] + fix.alternatives.gap], axis=1)
+    # empty slots have infinite gaps
     listed = np.where(np.isfinite(fix.alternatives.gap), int(Status.OK), int(Status.UNAVAILABLE))
     known = np.asarray(np.isfinite(fix.cov).all((-1, -2)))
+    # a fix keeps its covariance alone: what is weak is not known of it, and not needed, as its verdict stands
     information, regular = linalg.inverse(np.where(known[:, None, None], fix.cov, np.eye(fix.cov.shape[-1])))
+    # ambiguous without a rival that is near: the rival was a run to infinity
     near = (fix.alternatives.gap < AMBIGUOUS_GAP).any(1)
     verbatim = ~fix.answered if fix.explanations is None else ~fix.answered | (_lengths(fix.explanations) > 0)
     return Pool(

@@ -178,6 +178,7 @@ def pack(points: Array) -> Array:
     if points.shape[1] <= 1:
         return points
     finite = np.isfinite(points).all(-1)
+    # stable: finite ones keep their order, which says what is tried first
     order = np.argsort(~finite, axis=1, kind="stable")
     keep = max(1, int(finite.sum(1).max(initial=0)))
     return np.take_along_axis(points, order[..., None], axis=1)[:, :keep]
@@ -204,6 +205,7 @@ def in_parts(problem: Problem, work: Callable[[Problem, slice], Answer], most: i
         for first in range(0, count, most):
             part = slice(first, min(first + most, count))
             answer = work(problem.take(np.arange(part.start, part.stop)), part)
+            # parts differ in them: one may need what others do not
             stages.append(answer.stages)
             yield answer
 

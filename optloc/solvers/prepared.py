@@ -67,6 +67,7 @@ class Prepared:
         """
         values = np.asarray(z, dtype=float)
         shape = self._batch(values)
+        # nothing is ready: the stages of the method do it as ever
         if self.plan is None:
             wide = np.broadcast_to(values, (*shape, values.shape[-1]))
             return solve(self.problem.with_rows(z=wide), self.method)
@@ -76,6 +77,7 @@ class Prepared:
             wide = np.broadcast_to(place.reshape(*self.shape, *place.shape[1:]), (*shape, *place.shape[1:]))
             place = wide.reshape(-1, *place.shape[1:])
         pool = settle_directly(self.plan, flat, place, lambda items: by_stages(self._flat(values, shape), items))
+        # a verdict without exceptions needs no measurements: then no problem is made of them
         plain = pool.plain is not None and bool(pool.plain.all())
         fix = judge(self.problem if plain else self._flat(values, shape), pool)
         return fix if len(shape) == 1 else fix.reshape(shape)
@@ -126,6 +128,7 @@ def prepare(problem: Problem, method: str = "gtrs+lsr") -> Prepared:
     parsed = Method.parse(method)
     if problem.layout.size == 0:
         raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
+    # without measurements, so that nothing prepared can depend on them
     bare = problem.with_rows(z=np.zeros(problem.count))
     plan = direct(bare) if shortcut(parsed) and not separable(bare) else None
     position = problem.stations.position

@@ -25,6 +25,10 @@ from optloc.solvers.verdict.judge import judge
 
 # One standard deviation: the sums then err by thousandths of it.
 _TOLERANCE = 1.0
+# Steps of a new linearisation: it begins a few standard deviations from its end, where two or three would do.
+_STEPS = 20
+# Answers of a growing run, as many as a picture can show.
+_POINTS = 60
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,11 +105,13 @@ class Running:
         """
         joint = joined(self.problem, more.flat())
         fresh = window(joint, self.problem.epochs, joint.epochs)
+        # sums add only where they were linearised at the same place
         sums = self.sums + _information(fresh, self.at)
         x, cov, length = _step(joint, sums, self.at)
+        # the whole batch is linearised together: its sums are one array
         if np.any(length > self.tolerance):
             start = complete(joint, x[:, None])[:, 0]
-            done = refine(joint, start, limit=20)
+            done = refine(joint, start, limit=_STEPS)
             return _linearise(joint, done.x[:, : x.shape[1]], self.linearised, self.tolerance)
         return replace(self, problem=joint, x=x, cov=cov, sums=sums)
 
@@ -124,6 +130,7 @@ def _linearise(problem: Problem, at: Array, before: int, tolerance: float) -> Ru
 def _information(problem: Problem, at: Array) -> Normal:
     """Return the information of the measurements about the shared unknowns, linearised at vectors (N, n)."""
     x = complete(problem, at[:, None])[:, 0]
+    # priors of local unknowns leave with them; those of shared ones would count again with every update
     return eliminated(with_priors(problem, x, summed(problem, x), shared=False))
 
 
@@ -134,13 +141,12 @@ def _step(problem: Problem, sums: Normal, at: Array) -> tuple[Array, Array, Arra
     total = with_priors(problem, x, sums, local=False)
     step, ok = linalg.solve(total.shared, total.shared_vector[..., None])
     cov, _ = linalg.inverse(total.shared)
+    # step' information step: the step in its own standard deviations
     length = np.sqrt(np.maximum((step[..., 0] * total.shared_vector).sum(-1), 0.0))
     return np.where(ok[:, None], at + step[..., 0], np.nan), cov, np.where(ok, length, np.inf)
 
 
 # How the estimate of a run grows: the answer after its first epochs.
-
-_POINTS = 60
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,6 +209,7 @@ def growing(problem: Problem, fix: Fix, counts: Sequence[int] | Array | None = N
     x, cov = np.full((len(chosen), n), np.nan), np.full((len(chosen), n, n), np.nan)
     for i, count in enumerate(chosen):
         part = cut(problem, 0, int(count)).flat()
+        # from the answer of the whole run: the minimum that grows into it, even where the first epochs have others
         done = refine(part, fix.x[None, : part.layout.size])
         spread, ok = covariance(done.equations)
         if ok[0] and done.status[0] == Status.OK:
@@ -213,4 +220,5 @@ def growing(problem: Problem, fix: Fix, counts: Sequence[int] | Array | None = N
 def _space_counts(epochs: int) -> Array:
     if epochs <= _POINTS:
         return np.arange(1, epochs + 1)
+    # geometric: an estimate changes most while its epochs are few
     return np.unique(np.geomspace(1, epochs, _POINTS).round().astype(np.int64))

@@ -25,6 +25,19 @@ from optloc.solvers.starts.several_positions import from_pieces, one_position
 from optloc.solvers.starts.squared_range import Coordinates, lift_rows
 from optloc.solvers.verdict.judge import judge
 
+# Least scaled distance, and factor, by which a row is weighed: a point on a station must not give one row all the
+# weight.
+_NEAR = 1e-3
+# A row is in error if its residual is larger than the greatest of all rows is with this probability: clean data lose a
+# row once in a hundred (docs/measured/sparse.md).
+_LEVEL = 0.01
+# Tests of the rows, each with the fix of those that passed the one before: usually the second confirms the first, and
+# two sets that lead to each other must not go on for ever.
+_PASSES = 8
+# Variance of a residual, in that of its row, below which nothing checks the row: rounding of 1 - J C J'.
+_UNCHECKED = 1e-6
+
+
 # Rows of one position made linear one by one, so that one wrong measurement is one wrong row.
 #
 # A range row says ``r_a + c r_b + t = m`` with c of 0, 1 or -1 and t the emission time. With ``|x - s|^2 = r^2`` it is
@@ -35,8 +48,6 @@ from optloc.solvers.verdict.judge import judge
 # - ``r_b`` (pairs), which is not less than ``|x - s_b|``: a cone.
 #
 # No row passes on its error to another one, as it does where the ranges are first reduced to one reference.
-
-_NEAR = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,6 +113,7 @@ def row_wise(problem: Problem) -> RowWise:
     centre, spread = spread_of(problem)
     origin, scale = np.broadcast_to(centre, (size, d)), np.broadcast_to(spread, (size,))
     pairs = _references(problem)
+    # columns of y: x, |x|^2, for each epoch t and |x|^2 - t^2, then the ranges to stations b
     first = d + 1 + 2 * problem.epochs
     n = first + len(pairs)
     rows, right = np.zeros((size, problem.count, n)), np.zeros((size, problem.count))
@@ -150,20 +162,24 @@ def _lift_ranges(
     place = problem.stations.position[..., 0, :, :]
     a = (place[..., block.a, :] - origin[:, None]) / scale[:, None, None]
     m = (block.z - block.correction) / scale[:, None]
+    # |x - a|^2 = m^2: -2 a x + |x|^2 = m^2 - |a|^2
     x, right, square = -2.0 * a, -(a**2).sum(-1), np.ones(block.count)
     others: tuple[tuple[Array, Array], ...] = ()
     if form[1]:
         b = (place[..., block.b, :] - origin[:, None]) / scale[:, None, None]
+        # r_a = m - c r_b: the difference of both squares has 2 c m r_b for |x|^2
         x, right, square = x + 2.0 * b, right + (b**2).sum(-1), np.zeros(block.count)
         column = first + np.searchsorted(pairs, block.b)
         others = ((column, 2.0 * form[1] * m),)
     elif model.emission:
+        # r = m - t: |x|^2 - t^2 is one more unknown of the epoch, and 2 m t stands on the left
         m = _centre(m, block)
         column = problem.dimension + 1 + 2 * block.epoch
         square, others = np.zeros(block.count), ((column, 2.0 * m), (column + 1, np.ones(block.count)))
     sigma = _block_sigma(problem, block, start) / scale[:, None]
 
     def error(point: Array | None) -> Array:
+        # before there is a point: as if as far away as the measurement says, or a network's size
         away = np.maximum(1.0, np.abs(m)) if point is None else np.sqrt(((point[:, None] - a) ** 2).sum(-1))
         return np.asarray(2.0 * np.maximum(np.where(np.isfinite(away), away, 1.0), _NEAR) * sigma)
 
@@ -192,8 +208,7 @@ def _lift_others(problem: Problem, block: Rows, start: int, to: Coordinates) -> 
     return _Part(lifted.row[..., :-1], lifted.row[..., -1], (), lifted.right, error)
 
 
-_LEVEL = 0.01
-_PASSES = 8
+# The programmes, and the test of what they accuse.
 
 
 @dataclass(frozen=True, slots=True)
@@ -228,6 +243,7 @@ def sparse(problem: Problem, pool: Pool | None) -> Pool:
     alone = hold_still(problem)
     arrived = as_arrivals(alone)
     found = sparse_errors(alone if arrived is None else arrived.problem)
+    # a wrong arrival is in all differences that were made from it
     wrong = found.wrong if arrived is None else spread_rows(found.wrong, arrived.origin, problem.count)
     weights = np.where(wrong, 0.0, problem.weight)
     x = vectors(problem.with_rows(weight=weights), pack(found.position))  # emission times fit the rows that are kept
@@ -300,6 +316,7 @@ def _fit(rows: Array, right: Array, sigma: Array, lifts: RowWise | None = None) 
         used = (white[i] != 0.0).any(0)
         if not (used.any() and np.isfinite(white[i]).all() and np.isfinite(side[i]).all()):
             return
+        # cones have a last column of their own, the constant
         kept = np.append(used, True)
         cones = [] if lifts is None else [cone[:, kept] for column, cone in lifts.cones(i) if used[column]]
         found = sparse_fit(white[i][:, used], side[i], cones=cones)
@@ -313,13 +330,16 @@ def _fit(rows: Array, right: Array, sigma: Array, lifts: RowWise | None = None) 
 def _test_support(problem: Problem, x: Array, wrong: Array) -> tuple[Array, Array]:
     """Return the positions (N, d) without the rows in error, and these rows (N, m)."""
     present = np.broadcast_to(problem.weight > 0.0, wrong.shape)
+    # two-sided, and the greatest of m rows: Bonferroni
     limit = -ndtri(0.5 * _LEVEL / np.maximum(present.sum(1, keepdims=True), 1))
     wrong, active = wrong.copy(), np.arange(len(x))
     x = x.copy()
+    # the support may be too large for a fix: of equals the first rows are kept in it
     wrong = _spare(problem, wrong.astype(float), wrong)
     for _ in range(_PASSES):
         part, out = problem.take(active), wrong[active]
         rest = part.with_rows(weight=np.where(out, 0.0, part.weight))
+        # the rest has a closed form of its own, which the wrong rows have not pulled
         starts = np.stack([x[active], gtrs(rest, None).x[:, 0]], axis=1)
         fixed = judge(rest, lsr(rest, begin(rest, starts))).x
         x[active] = np.where(np.isfinite(fixed), fixed, x[active])
@@ -338,6 +358,7 @@ def _spare(problem: Problem, size: Array, wrong: Array) -> Array:
     present = np.broadcast_to(problem.weight > 0.0, wrong.shape)
     unknown = problem.layout.n_shared + problem.layout.n_local * problem.epochs
     most = np.maximum(present.sum(1, keepdims=True) - unknown - 1, 0)
+    # argsort of argsort is the rank: 0 for the largest
     rank = np.argsort(np.argsort(-np.where(wrong, size, -np.inf), axis=1, kind="stable"), axis=1)
     return np.asarray(wrong & (rank < most))
 
@@ -352,12 +373,13 @@ def _standardise(problem: Problem, x: Array, kept: Array) -> Array:
     residual, white = residual / sigma, jacobian / sigma[..., None]
     inside = np.where(kept[..., None], white, 0.0)
     information = np.swapaxes(inside, -1, -2) @ inside
+    # unknowns that no kept row has: a one on the diagonal keeps the matrix invertible and touches nothing else
     idle = np.einsum("nii->ni", information) == 0.0
     covariance, _ = linalg.inverse(information + idle[..., None] * np.eye(idle.shape[-1]))
     lever = np.einsum("nmi,nij,nmj->nm", white, covariance, white)
     variance = np.where(kept, 1.0 - lever, 1.0 + lever)
     with np.errstate(invalid="ignore"):
-        told = variance > 1e-6  # what has no redundancy fits whatever its error
+        told = variance > _UNCHECKED  # what has no redundancy fits whatever its error
     return np.where(told, np.abs(residual) / np.sqrt(np.where(told, variance, 1.0)), 0.0)
 
 
@@ -367,6 +389,7 @@ def _derivatives(problem: Problem, x: Array) -> tuple[Array, Array]:
     n, width = problem.layout.n_shared, problem.layout.n_local
     full = np.zeros((*compact.shape[:-1], problem.layout.size))
     full[..., :n] = compact[..., :n]
+    # local columns are compact: those of each row belong to its own epoch
     for j in range(width):
         full[:, np.arange(problem.count), n + problem.epoch * width + j] = compact[..., n + j]
     return residual, np.where(problem.weight[..., None] > 0.0, full, 0.0)

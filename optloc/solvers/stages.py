@@ -24,20 +24,21 @@ from optloc.solvers.pool import Pool, offer, pack
 from optloc.solvers.refine import refine
 from optloc.solvers.starts.position import (
     along_the_valley,
+    hold_still,
     mirror,
     spread_of,
-    hold_still,
     subarray_starts,
     vectors,
 )
-from optloc.solvers.starts.registration import step_beside, registrable
+from optloc.solvers.starts.registration import registrable, step_beside
 from optloc.solvers.starts.several_positions import from_pieces, one_position
 from optloc.solvers.verdict.judge import judge, standing
 from optloc.solvers.verdict.minima import settle
 
 Solver = Callable[[Problem, Pool | None], Pool]
 
-# Share of its distance from the stations beyond which the error of a fix calls for a look along the valley.
+# Share of its distance from the stations beyond which the error of a fix calls for a look along the valley: from
+# there on the cost may be far from quadratic over the ellipsoid, and have another minimum a few sigma away.
 _WEAK = 1e-2
 
 
@@ -49,6 +50,7 @@ def start_with(word: str) -> Solver:
         serving = [form for form in FORMULATIONS.values() if word in form.starts and form.serves(problem)]
         if one_position(problem):
             alone = hold_still(problem)
+            # an empty slot, so that rows which no formulation starts give a pool without candidates
             nowhere = np.full((problem.batch_shape[0], 1, problem.dimension), np.nan)
             position = np.concatenate([*(form.starts[word](alone) for form in serving), nowhere], axis=1)
             return _place(problem, position, pool, word, began)
@@ -83,6 +85,7 @@ def widen(problem: Problem, pool: Pool | None) -> Pool:
     fix, alone = judge(problem, pool), hold_still(problem)
     seen = problem.layout.take(standing(pool, fix), "position")
     parts = [mirror(alone, fix.position[:, None])]
+    # the mirror image is one start and always tried; the others are many: where the verdict is not clean
     unsettled = (fix.code != Status.OK) | (fix.p_value < DOUBT)
     valley = np.flatnonzero(unsettled | _weak(problem, fix))
     for items, more in (
@@ -124,13 +127,16 @@ def _fresh(problem: Problem, fix: Fix, seen: Array, more: Array) -> Array:
     for point in np.moveaxis(seen, 1, 0):
         apart = more - point[:, None]
         with np.errstate(invalid="ignore"):
+            # within one sigma refinement of either leads to the same minimum
             near |= ((apart @ information) * apart).sum(-1) < 1.0
     return np.where((near & (usable & ok)[:, None])[..., None], np.nan, more)
 
 
 # The last resort, a seeded search from many places, for mixtures that no closed form starts: directions are uniform and
-# distances log-uniform, so many that in space each of the 8 octants is tried at 12 scales; the dozen cheapest go on.
+# distances log-uniform, so many that in space each of the 8 octants is tried at 12 scales; the dozen cheapest go on:
+# more than a handful, because the few steps before rank them only roughly and many lead to the same minimum.
 _PLACES, _KEPT = 96, 12
+_FEW = 8  # steps that tell promising places from others
 _SEED = 20261121  # any: the same problem always gets the same places
 
 # More starts change nothing about these.
@@ -145,6 +151,7 @@ def search(problem: Problem, pool: Pool | None) -> Pool:
         return pool
     fix = judge(problem, pool)
     lost = ~fix.answered & ~np.isin(fix.code, _SETTLED)
+    # unlinked groups have fewer equations than the count says: without redundancy any place would fit
     lost &= fix.dof >= np.where(fix.code == Status.DISCONNECTED, 1, 0)
     items = np.flatnonzero(lost)
     if not len(items):
@@ -175,7 +182,7 @@ def _search_starts(problem: Problem) -> Array:
     places = np.broadcast_to(centre[:, None] + spread[:, None, None] * _directions(d), (size, _PLACES, d))
     x = vectors(problem, places)
     item = np.repeat(np.arange(size), _PLACES)
-    done = refine(problem, x.reshape(-1, x.shape[-1]), item=item, limit=8, face=exact(problem))
+    done = refine(problem, x.reshape(-1, x.shape[-1]), item=item, limit=_FEW, face=exact(problem))
     cost = np.where(np.isfinite(done.cost), done.cost, np.inf).reshape(size, _PLACES)
     order = np.argsort(cost, axis=1, kind="stable")[:, :_KEPT]
     slot, _ = problem.layout.find("position")
@@ -186,7 +193,9 @@ def _search_starts(problem: Problem) -> Array:
 def _directions(d: int) -> Array:
     rng = np.random.default_rng(_SEED)
     direction = rng.standard_normal((_PLACES, d))
+    # normal deviates over their length are uniform on the sphere, in any dimension
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    # a tenth of the spread is amid the stations; at a hundred of it wave fronts are all but flat
     return direction * 10.0 ** rng.uniform(-1.0, 2.0, (_PLACES, 1))
 
 
@@ -211,14 +220,17 @@ def lsr(problem: Problem, pool: Pool | None, *, damped: bool = True, limit: int 
     item, slot = pool.occupied
     detail = "nothing to refine"
     if len(item):
+        # one candidate each: no copy of the problems is made
         whole = len(item) == len(pool) and bool((item == np.arange(len(pool))).all())
         face = exact(problem) if damped else ()
         own = None if whole else item
+        # a hundred steps by default: damped ones along a flat valley are short; what is unfinished then runs away
         done = refine(problem, x[item, slot], item=own, damped=damped, limit=limit, face=face)
         x[item, slot], cost[item, slot], code[item, slot] = done.x, done.cost, done.status
         detail = f"{len(item)} candidates, {int(done.iterations.max())} steps at most"
         count("lsr", int(done.iterations.sum()))
     weights = np.broadcast_to(problem.weight, (len(pool), problem.count))
+    # on the face without inequalities, number 0; `bound_pool` adds those on others
     refined = Pool(x, cost, code, np.zeros(shape, dtype=int), weights, pool.dof, pool.stages)
     free = least_finished(refined) if problem.constraints else None
     refined = replace(bound_pool(problem, refined) if damped else refined, free=free)
@@ -227,6 +239,7 @@ def lsr(problem: Problem, pool: Pool | None, *, damped: bool = True, limit: int 
 
 def taylor(problem: Problem, pool: Pool | None) -> Pool:
     """Return the result of plain undamped Taylor iteration: a baseline that diverges silently, kept for comparison."""
+    # plain steps converge within a few or never: fifty leave no doubt which
     return lsr(problem, pool, damped=False, limit=50)
 
 

@@ -27,7 +27,7 @@ from optloc.solvers.pool import Pool, offer, pack
 from optloc.solvers.refine import refine
 from optloc.solvers.stages import lsr
 from optloc.solvers.starts.position import spread_of, vectors
-from optloc.solvers.verdict.horizon import hidden
+from optloc.solvers.verdict.horizon import is_hidden
 from optloc.solvers.verdict.judge import judge, standing
 from optloc.solvers.verdict.status import fill
 
@@ -412,7 +412,7 @@ def _deep(problem: Problem, x: Array) -> Array:
         for side in (-_DEEP, _DEEP):
             beside = np.where(np.isfinite(x), x, 0.0)
             beside[:, axis] += side
-            out &= hidden(problem, beside)
+            out &= is_hidden(problem, beside)
     return out
 
 

@@ -19,11 +19,27 @@ from optloc.problem.noise import Noise, variances, whiten
 from optloc.problem.problem import Problem
 from optloc.solvers.refine import refine
 
-# Residuals in sigma and the weights that a loss gives them, for rows of any noise.
-
 # Rows of a correlated group are never quite absent while their weights are sought: their partners still foretell them.
+# At a millionth of its weight a row no longer counts in the sums, and one over it is far from overflow.
 _LEAST = 1e-6
+# A blocked path is longer: these kinds grow with every path they hold. A difference may be off to either side.
 _LATE = frozenset(("range", "toa", "range_sum"))
+
+# Gauss-Newton steps between two weighings, enough for least squares to settle from afar, and the change of a weight
+# that counts as none, well below what shows in a fix.
+_STEPS, _SETTLED = 12, 1e-4
+# Steps shrink by a ratio near one where weights and place trade: after eight weighings every third point is
+# extrapolated, so that the ratio of two plain steps is known again; a ratio of 0.98 is taken to end fifty steps ahead.
+_PATIENCE, _OFTEN, _SLOWEST = 8, 3, 0.98
+# A step that raises the cost is halved; after eight, a 256th of it, the iteration has stalled.
+_HALVINGS = 8
+# Rounding of a robust cost, relative: what a step may raise it by.
+_ROUNDING = 1e-12
+# Length of a step that was not finished: longer than any tolerance, and finite, since what is not finite is a failure.
+_LONG = 1e300
+
+
+# Residuals in sigma and the weights that a loss gives them, for rows of any noise.
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +85,8 @@ class Doubt:
             if whitener.row.shape[1] > 1:
                 rows = whitener.row
                 present = base[:, rows] > 0.0
+                # W'W is the inverse covariance: one over its diagonal is the variance given the partners, if none was
+                # left out
                 full = np.broadcast_to((whitener.matrix != 0.0).any(-1).sum(-1), present.shape[:-1]) == present.sum(-1)
                 precision = (whitener.matrix**2).sum(-2)
                 known = present & full[..., None] & (precision > 0.0)
@@ -86,6 +104,7 @@ class Doubt:
 
     def row_weight(self, weight: Array) -> Array:
         """Return weights (N, m) as `Problem.with_rows` takes them, of the weights that a loss gives."""
+        # own + given (1 / weight - 1) is the variance with the row's own error; base is its weight before
         ratio = self.given / self.own
         with np.errstate(divide="ignore", over="ignore"):
             total = 1.0 / self.base + ratio * (1.0 / weight - 1.0)
@@ -98,6 +117,7 @@ class Doubt:
         """
         left = np.where(self.base > 0.0, residuals(problem, x), 0.0)
         u = left / np.sqrt(self.given)
+        # independent rows: given is own, and the weights of others say nothing
         if all(block.row.shape[1] == 1 for block in self.noise.blocks):
             return u
         least = np.maximum(weight, _LEAST)
@@ -105,6 +125,7 @@ class Doubt:
             rows = whitener.row
             if rows.shape[1] > 1:
                 white = whitener.matrix @ left[:, rows][..., None]
+                # with weights w, (R^-1 r)_i is what is left of row i given its partners, over its variance given / w_i
                 share = (np.swapaxes(whitener.matrix, -1, -2) @ white)[..., 0]
                 u[:, rows] = share * np.sqrt(self.given[:, rows]) / least[:, rows]
         return u
@@ -125,12 +146,7 @@ def fold_signs(loss: Loss, u: Array, sided: Array) -> Array:
     return np.where(sided, u, np.abs(u)) if loss.one_sided else u
 
 
-# Steps between two weighings, and the change of a weight that counts as none.
-_STEPS, _SETTLED = 12, 1e-4
-# Steps that shrink slowly are extrapolated: from which weighing on, every how many, and the largest ratio of two.
-_PATIENCE, _OFTEN, _SLOWEST = 8, 3, 0.98
-_HALVINGS = 8
-_LONG = 1e300
+# The iteration.
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,22 +204,28 @@ def reweight(
     face : Face
         Constraints that hold with equality.
     """
+    # The defaults: a millionth of a sigma is beyond what anybody reads; what takes more than fifty weighings creeps
+    # along a flat valley, and its status says so.
     x, weight = np.array(start), np.ones(doubt.base.shape)
     last = np.zeros(x.shape)
     status = np.full(len(x), int(Status.MAX_ITERATIONS), dtype=np.int8)
     active = np.arange(len(x))
+    # where the weighted cost does not lie above the robust one, steps have to be watched
     uneven = loss.one_sided or any(block.row.shape[1] > 1 for block in doubt.noise.blocks)
     with np.errstate(all="ignore"):
         for iteration in range(limit):
+            # no copy of the batch is made before some have finished
             whole = len(active) == len(x)
             part, own = (problem, doubt) if whole else (problem.take(active), doubt.take(active))
             here, before = x[active], weight[active]
             now = weigh_by(loss, part, own, here, before)
             step = _step(part.with_rows(weight=own.row_weight(now)), here, last[active], face)
             moved = _backtrack(loss, part, own, here, step.x, now) if uneven else step.x
+            # the end of the series leaves a face that constraints hold: there only plain steps are taken
             if iteration >= _PATIENCE and iteration % _OFTEN == 0 and not face:
                 moved = _extrapolate(loss, part, own, step, now)
             x[active], weight[active], last[active] = moved, now, step.x - here
+            # settled: neither weights nor place move; stalled: no step lowers the cost, though one was wanted
             same = np.abs(now - before).max(-1, initial=0.0) <= _SETTLED
             settled = same & (step.length <= tolerance)
             status[active[settled]] = step.status[settled]
@@ -237,6 +259,7 @@ def _step(problem: Problem, x: Array, last: Array, face: Face) -> _Step:
         return np.asarray((a[:, None, :n] @ information @ b[:, :n, None])[:, 0, 0])
 
     length = np.sqrt(np.maximum(product(apart, apart), 0.0))
+    # the ratio of a geometric series, in the metric of the fix; negative ones (zigzag) are not extrapolated
     ratio = product(apart, last) / product(last, last)
     ratio = np.where(np.isfinite(ratio), np.clip(ratio, 0.0, _SLOWEST), 0.0)
     unfinished = done.status == Status.MAX_ITERATIONS
@@ -255,7 +278,7 @@ def _backtrack(loss: Loss, problem: Problem, doubt: Doubt, here: Array, there: A
     for _ in range(_HALVINGS):
         x = here + share[:, None] * (there - here)
         now = weigh_by(loss, problem, doubt, x, weight)
-        worse = ~(robust_cost(loss, problem, doubt, x, now) <= least + 1e-12 * (1.0 + np.abs(least)))
+        worse = ~(robust_cost(loss, problem, doubt, x, now) <= least + _ROUNDING * (1.0 + np.abs(least)))
         if not worse.any():
             break
         share = np.where(worse, 0.5 * share, share)

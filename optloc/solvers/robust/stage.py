@@ -65,6 +65,8 @@ def _add_emission_time(problem: Problem, x: Array) -> Array:
     item, slot = np.nonzero(np.isfinite(x).all(-1))
     if len(item):
         arrivals = problem.rows[0].count
+        # at emission time zero the residual of an arrival is the emission time and its error: gross ones do not move a
+        # median
         left = residuals(problem.take(item), whole[item, slot])[:, :arrivals]
         whole[item, slot, -1] = np.median(left, axis=-1)
     known = np.asarray(np.isfinite(x).all(-1))
@@ -79,10 +81,14 @@ def _weights(problem: Problem, taken: Arrivals, found: Pool) -> Array:
     return weights
 
 
-# Times that the weights of correlated rows are made anew at an answer: each time they change by less.
+# Times that the weights of correlated rows are made anew at an answer: each depends on those of its partners, changes
+# by less each time, and thirty cost as much as a few steps.
 _WEIGHINGS = 30
 # Gap of a rival that leaves out no more than the cheapest candidate does: the loss alone is no evidence between them.
+# Not zero, so that the cheapest stays first.
 _CLOSE = 1e-2
+# Content of the ellipsoid within which candidates are one answer with the same rows doubted a little differently.
+_ONE_ANSWER = 0.95
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +113,7 @@ class Robust:
 def _minimise(problem: Problem, loss: Loss, start: Array | None, stages: tuple[Stage, ...]) -> Pool:
     began = perf_counter()
     pool = _minima(problem, loss, robust_starts(problem, loss) if start is None else start)
+    # a flat loss has a minimum for almost every set of rows: come from a loss that rises, and try sets next to the best
     if start is None and loss.flat:
         pool = _join(pool, _minima(problem, loss, _minima(problem, LOSSES["cauchy"], pool.x).x))
         pool = _join(pool, _minima(problem, loss, flip_rows(problem, loss, pool)))
@@ -117,6 +124,7 @@ def _minimise(problem: Problem, loss: Loss, start: Array | None, stages: tuple[S
     stage = Stage(loss.name, detail, perf_counter() - began)
     pool = replace(pool, stages=stages, free=free, loss=loss.name)
     found = settle(problem, pool, stage, lambda some, x: _equations(some, loss, x)[0])
+    # rows are doubted at a place; where the verdict leaves none they keep the weights that they had
     answered = np.asarray(np.isfinite(standing(found, judge(problem, found))[:, 0]).all(-1))
     weights = _equations(problem, loss, np.where(answered[:, None], found.x[:, 0], 0.0))[1]
     return replace(found, refined=False, weights=np.where(answered[:, None], weights, found.weights))
@@ -190,7 +198,8 @@ def _drop_near(problem: Problem, loss: Loss, pool: Pool) -> Pool:
     information, _, _ = marginal(_equations(problem.take(rows), loss, x)[0])
     apart = pool.x[rows, :, :n] - x[:, None, :n]
     with np.errstate(invalid="ignore"):
-        near = ((apart @ information) * apart).sum(-1) < 2.0 * gammaincinv(n / 2.0, 0.95)
+        near = ((apart @ information) * apart).sum(-1) < 2.0 * gammaincinv(n / 2.0, _ONE_ANSWER)
+    # the cheapest is near itself, and stays
     near[np.arange(len(rows)), best[rows]] = False
     cost[rows] = np.where(near, np.inf, cost[rows])
     return replace(pool, cost=cost)
@@ -212,6 +221,7 @@ def _rivals(problem: Problem, loss: Loss, pool: Pool) -> Pool:
     doubt = Doubt.of(part, start)
     done = reweight(part, start, truncated, doubt, face=exact(problem))
     out = ((done.weight == 0.0) & (doubt.base > 0.0)).sum(-1)
+    # a row left out costs what a rival may: else leaving out more rows would always be the cheaper answer
     price = AMBIGUOUS_GAP * out
     evidence[item, slot] = np.where(done.status == Status.OK, done.cost + price, np.inf)
     best = np.where(found, pool.cost, np.inf).argmin(1)[:, None]
@@ -219,6 +229,7 @@ def _rivals(problem: Problem, loss: Loss, pool: Pool) -> Pool:
     with np.errstate(invalid="ignore"):
         rival = least + np.maximum(evidence - base, _CLOSE)
     rival = np.where(np.isnan(rival), np.inf, rival)
+    # a loss that still rises may only say that a rival is nearer than the evidence says, never farther
     cost = np.where(found, rival if loss.flat else np.minimum(pool.cost, rival), pool.cost)
     np.put_along_axis(cost, best, least, 1)
     return replace(pool, cost=cost)

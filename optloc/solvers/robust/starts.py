@@ -23,10 +23,32 @@ from optloc.solvers.starts.position import rows_of_stations
 from optloc.solvers.starts.several_positions import one_position
 from optloc.solvers.verdict.judge import judge, standing
 
-# Which rows to start from: all but those of some stations, or all but one, of the rows that each problem has.
-
-# Subsets of a problem at most; stations up to which three are left out, rows up to which single ones are.
+# Subsets of a problem at most: each is a closed form and a few steps. Stations up to which three are left out (92 sets
+# of eight, of which 80 are taken), and rows up to which single ones are: of more, a station covers the likely errors.
 _MOST, _THREE, _ROWS = 80, 8, 12
+# Starts of a problem that are screened, cheaply, and annealed and kept.
+_SCREENED, _KEPT = 30, 12
+# Problems, and starts times rows, that are worked on at a time: some ten megabytes an array.
+_EACH, _NUMBERS = 64, 2**20
+# Starts whose residuals differ by less than this many sigma are one: they would doubt the same rows.
+_SAME = 0.5
+# Gauss-Newton steps before starts are compared: enough to leave the closed form's own weighting.
+_FEW = 5
+# Steps between two weighings on the way: the weights change before least squares would settle.
+_BETWEEN = 2
+# Rows that are tried on the other side of a cut: those nearest to it.
+_FLIPPED = 10
+# Standard deviation of normal deviates over the median of their sizes: a scale that half the rows may be wrong without
+# moving much.
+_MEDIAN = 1.4826
+# Halvings of that scale, never below one sigma: what begins 64 sigma wide ends at the noise.
+_HALVINGS = 6
+# Growth of the control parameter and most steps of the graduation (Yang et al.: 1.4), which ends at the value where its
+# weights are those of truncated least squares but in a sliver of a thousandth around the cut.
+_GROWTH, _GRADES, _SHARP = 1.4, 40, 1e3
+
+
+# Which rows to start from: all but those of some stations, or all but one, of the rows that each problem has.
 
 
 def subsets(problem: Problem) -> tuple[Array, Array]:
@@ -46,6 +68,7 @@ def subsets(problem: Problem) -> tuple[Array, Array]:
     stations, rows = _unite(heard, touched, 3), _unite(present[short], single, 1)
     item = np.concatenate([stations[0], short[rows[0]]])
     kept = present[item] & ~np.concatenate([stations[1], rows[1]])
+    # several stations, or one row, may leave the same rest: it is started from once
     _, first = np.unique(np.column_stack([item, kept]), axis=0, return_index=True)
     item, kept = item[first], kept[first]
     enough = degrees_of_freedom(problem.take(item).with_rows(weight=1.0 * kept)) >= 0
@@ -56,6 +79,7 @@ def _unite(own: Array, touched: Array, size: int) -> tuple[Array, Array]:
     """Return the unions (S, m) of the rows that up to `size` members touch (g, m), for each problem (S,) of its own."""
     count = own.sum(1)
     most = int(count.max(initial=0))
+    # numbers of each problem's own members, first: sets are of places in this list, the same for all problems
     local = np.argsort(~own, axis=1, kind="stable")[:, :most]
     sizes = range(1, 1 + (size if most <= _THREE else min(size, 2)))
     items, unions = [np.zeros(0, dtype=int)], [np.zeros((0, touched.shape[1]), dtype=bool)]
@@ -66,15 +90,7 @@ def _unite(own: Array, touched: Array, size: int) -> tuple[Array, Array]:
     return np.concatenate(items), np.concatenate(unions)
 
 
-# Starts of a problem that are screened and kept at most.
-_SCREENED, _KEPT = 30, 12
-# Problems, and starts times rows, that are worked on at a time.
-_EACH, _NUMBERS = 64, 2**20
-# Starts whose residuals differ by less than this many sigma are one.
-_SAME = 0.5
-# Rows that are tried on the other side of a cut; halvings of the scale; growth and most steps of the graduation.
-_FLIPPED = 10
-_HALVINGS, _GROWTH, _GRADES = 6, 1.4, 40
+# Starts from those rows, the best of them, and two ways down to a loss that is not convex.
 
 
 def robust_starts(problem: Problem, loss: Loss) -> Array:
@@ -119,7 +135,7 @@ def _start_subsets(problem: Problem, loss: Loss) -> Array:
     part = part.with_rows(weight=np.where(kept, part.weight, 0.0))
     found = roots(part, None)
     pair, slot = found.occupied
-    x = refine(part, found.x[pair, slot], item=pair, limit=5, face=exact(problem)).x
+    x = refine(part, found.x[pair, slot], item=pair, limit=_FEW, face=exact(problem)).x
     pool = _cheapest(problem, x, item[pair], loss, _SCREENED, anneal=False)
     first, slot = np.nonzero(np.isfinite(pool).all(-1))
     return _cheapest(problem, pool[first, slot], first, loss, _KEPT, anneal=True)
@@ -136,6 +152,7 @@ def _cheapest(problem: Problem, x: Array, item: Array, loss: Loss, most: int, *,
         x[some], cost[some], u[some] = _anneal(problem.take(item[some]), x[some], loss, _HALVINGS if anneal else 0)
     chosen = np.full((size, most, x.shape[1]), np.nan)
     for slot in range(most if count else 0):
+        # by problem, the cheapest of each first
         order = np.lexsort((cost, item))
         first = order[np.searchsorted(item[order], np.arange(size), side="left").clip(max=count - 1)]
         found = (item[first] == np.arange(size)) & np.isfinite(cost[first])
@@ -155,10 +172,10 @@ def _anneal(problem: Problem, x: Array, loss: Loss, halvings: int) -> tuple[Arra
     with np.errstate(all="ignore"):
         u = doubt.residual(problem, x, weight)
         size = np.where(doubt.base > 0.0, np.abs(u), np.nan)
-        scale = np.maximum(1.0, 1.4826 * np.nanmedian(size, axis=1, keepdims=True)) if halvings else 1.0
+        scale = np.maximum(1.0, _MEDIAN * np.nanmedian(size, axis=1, keepdims=True)) if halvings else 1.0
         for halving in range(halvings):
             weight = weigh_by(cauchy, problem, doubt, x, weight, np.maximum(1.0, scale * 0.5**halving))
-            x = refine(problem.with_rows(weight=doubt.row_weight(weight)), x, limit=2, face=face).x
+            x = refine(problem.with_rows(weight=doubt.row_weight(weight)), x, limit=_BETWEEN, face=face).x
         u = doubt.residual(problem, x, weight) if halvings else u
         cost = np.where(doubt.base > 0.0, loss.rho(fold_signs(loss, u, doubt.sided)), 0.0).sum(-1)
     return x, np.where(np.isfinite(cost) & np.isfinite(u).all(-1), cost, np.inf), np.nan_to_num(u)
@@ -184,7 +201,7 @@ def flip_rows(problem: Problem, loss: Loss, pool: Pool) -> Array:
     changed[row] = 1.0 - changed[row]
     beside = part.take(each).with_rows(weight=doubt.take(each).row_weight(changed))
     out = np.full((len(x), q, x.shape[-1]), np.nan)
-    out[item] = refine(beside, x[item][each], limit=5, face=exact(problem)).x.reshape(len(item), q, -1)
+    out[item] = refine(beside, x[item][each], limit=_FEW, face=exact(problem)).x.reshape(len(item), q, -1)
     return out
 
 
@@ -205,12 +222,15 @@ def _graduate(problem: Problem, start: Array) -> Array:
         for grade in range(_GRADES):
             u = np.abs(doubt.residual(problem, x, weight))
             worst = np.where(doubt.base > 0.0, u, 0.0).max(1, keepdims=True)
+            # so small a mu that no residual is beyond the convex part (eq. 14); the floor keeps it finite if all rows
+            # agree
             convex = c**2 / np.maximum(2.0 * worst**2 - c**2, 1e-300)
-            mu = np.minimum(convex, 1e3) if grade == 0 else mu * _GROWTH
-            if (mu > 1e3).all():
+            mu = np.minimum(convex, _SHARP) if grade == 0 else mu * _GROWTH
+            if (mu > _SHARP).all():
                 break
+            # between the cuts where it is 1 and 0: clipped there
             bent = c / u * np.sqrt(mu * (mu + 1.0)) - mu
             weight = np.where(np.isfinite(u), np.clip(bent, 0.0, 1.0), 0.0)
-            x = refine(problem.with_rows(weight=doubt.row_weight(weight)), x, limit=2, face=face).x
+            x = refine(problem.with_rows(weight=doubt.row_weight(weight)), x, limit=_BETWEEN, face=face).x
     out[item, slot] = x
     return out

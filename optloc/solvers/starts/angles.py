@@ -54,6 +54,7 @@ class Bearings:
 def bearings(problem: Problem) -> Bearings | None:
     """Return the angles of a flat batch with one static target, or None where no azimuth was measured."""
     rows = {block.kind: (block, start) for block, start in zip(problem.rows, problem.starts, strict=True)}
+    # an elevation without its azimuth is no bearing: nothing linear is known of the place
     if "azimuth" not in rows:
         return None
     block, start = rows["azimuth"]
@@ -147,6 +148,7 @@ def course_states(problem: Problem) -> Array | None:
     found = courses(problem)
     if found is None:
         return None
+    # coefficients of 1, t, t^2 as place, velocity and acceleration: x = p + v t + a t^2 / 2
     unit = np.array([1.0, 1.0, 2.0])[: found.plain.shape[1], None]
     return np.where(found.ahead[:, None, None], unit * found.instrumental, np.nan)
 
@@ -157,12 +159,12 @@ def by_directions(seen: Bearings) -> Array:
 
     out = np.full((len(seen.station), 1, 3), np.nan)
 
-    def relaxed(item: tuple[int, Array]) -> None:
+    def relax(item: tuple[int, Array]) -> None:
         i, use = item
         axes = None if seen.axes is None else seen.axes[i, use]
         out[i, 0] = directions(seen.angle[i, use], 1.0 / seen.weight[i, use], seen.station[i, use], axes=axes).point
 
-    mapped(relaxed, _complete_bearings(seen), least=WORTH)
+    mapped(relax, _complete_bearings(seen), least=WORTH)
     return seen.metres(out)
 
 
@@ -177,6 +179,7 @@ def least_worst(seen: Bearings) -> Array:
     for i in range(len(out)):  # each is a row of programs of a tenth of a millisecond: too short for threads
         use = (seen.weight[i, :, : d - 1] > 0.0).all(-1)
         if use.sum() > 1:
+            # a cone is as wide in all directions: the larger of the two deviations is its half angle
             sigma = 1.0 / seen.weight[i, use, : d - 1].min(-1)
             out[i, 0] = minimax(ahead[i, use], seen.station[i, use], sigma).point
     return seen.metres(out)
@@ -197,14 +200,15 @@ def angle_bounds(seen: Bearings, point: Array) -> Array:
     out = np.full(len(point), -np.inf)
     scaled = (point - seen.centre) / seen.scale[:, None]
 
-    def bounded(item: tuple[int, Array]) -> None:
+    def bound(item: tuple[int, Array]) -> None:
         i, use = item
+        # a bound of some rows' cost would be one of the whole, but a poor one: none is given
         if np.isfinite(scaled[i]).all() and not (seen.weight[i, ~use] > 0.0).any():
             axes = None if seen.axes is None else seen.axes[i, use]
             sigma = 1.0 / seen.weight[i, use]
             out[i] = angle_bound(seen.angle[i, use], sigma, seen.station[i, use], scaled[i], axes=axes).bound
 
-    mapped(bounded, _complete_bearings(seen), least=WORTH)
+    mapped(bound, _complete_bearings(seen), least=WORTH)
     return out
 
 
@@ -237,6 +241,7 @@ def course_starts(problem: Problem) -> Array | None:
         return None
     receiver, illuminator = found
     size, k = problem.batch_shape[0], problem.epochs
+    # azimuth, elevation and range sum of each epoch; an infinite deviation is an absent row
     value, sigma = np.zeros((3, size, k)), np.full((3, size, k), np.inf)
     deviation = np.sqrt(variances(problem.noise, problem.count))
     for rows, start in zip(problem.rows, problem.starts, strict=True):
@@ -251,10 +256,13 @@ def course_starts(problem: Problem) -> Array | None:
     if problem.stations.axes is not None:
         own = np.broadcast_to(problem.stations.axes, (size, *problem.stations.axes.shape[-4:]))[:, 0, receiver]
         axes = axes @ own[:, None]
+    # what the way by the target is longer than the direct one
     excess = value[2] - np.sqrt((away**2).sum(-1))[:, None]
+    # errors across the line of sight are those of the angles in radians, times the range; azimuth by cos E
     spread = np.stack([np.cos(value[1]) * sigma[0], sigma[1], sigma[2] / length], axis=-1)
     since, order = elapsed(problem, 0), problem.motions[0].order
     fitted = course(excess / length, axes, away / length, np.broadcast_to(since, (size, k)), spread, order=order)
+    # as above: the second derivative is twice the coefficient of t^2
     state = fitted.coefficients * length * np.array([1.0, 1.0, 2.0])[: order + 1, None]
     state[:, 0] += home
     return np.asarray(state)
@@ -273,6 +281,7 @@ def pair(problem: Problem) -> tuple[int, int] | None:
         return None
     receiver = heard.pop()
     others = {a if b == receiver else b for a, b in ends if receiver in (a, b)}
+    # one pair of stations, whichever of the two a row names first
     return (receiver, others.pop()) if len(others) == 1 else None
 
 

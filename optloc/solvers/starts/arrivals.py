@@ -16,6 +16,7 @@ from optloc.base.types import Array, Rows
 from optloc.problem.noise import Block, Noise, dense, group
 from optloc.problem.problem import Problem
 
+# Relative error of a covariance that is taken for D diag(v) D': rounding is below it, noise of another form far above.
 _EXACT = 1e-9
 # Variance, as a share of the mean, of an arrival that the differences take for exact: the least that solvers bear.
 _LEAST = 1e-6
@@ -67,6 +68,7 @@ def as_arrivals(problem: Problem) -> Arrivals | None:
     if not differences or problem.biases or problem.emitting:
         return None
     weight = np.broadcast_to(problem.weight, (*problem.batch_shape, problem.count))
+    # one set of arrivals for the batch: rows that are absent, or of less weight, in some problems forbid it
     present = weight[0] > 0.0
     taken = np.concatenate(differences)
     if ((weight > 0.0) != present).any() or (weight[:, taken[present[taken]]] != 1.0).any():
@@ -100,9 +102,11 @@ def _sightings(problem: Problem, taken: Array) -> Iterator[_Sighting]:
 def _find_arrivals(problem: Problem, one: _Sighting) -> tuple[Array, Array] | None:
     """Return arrival times (N, s), up to a common one, and variances (N or 1, s); None where they do not exist."""
     design, s = one.design, len(one.stations)
+    # fewer differences than stations less one fall into groups, each with a common arrival of its own
     if np.linalg.matrix_rank(design) < s - 1:
         return None
     covariance = dense(problem.noise, one.rows)
+    # D diag(v) D' is linear in v: (r * r, s) times v is the covariance, flattened
     products = (design[:, None] * design[None]).reshape(-1, s)
     flat = covariance.reshape(*covariance.shape[:-2], -1)
     variance = flat @ np.linalg.pinv(products).T
@@ -111,6 +115,7 @@ def _find_arrivals(problem: Problem, one: _Sighting) -> tuple[Array, Array] | No
     if not same.all() or (variance < -_EXACT * scale).any():
         return None
     variance = np.maximum(variance, _LEAST * variance.mean(-1, keepdims=True))
+    # the least-squares arrivals of mean zero: redundant differences agree, since their noise is that of arrivals
     return problem.observed[:, one.rows] @ np.linalg.pinv(design).T, variance.reshape(-1, s)
 
 
@@ -140,6 +145,7 @@ def _assemble(problem: Problem, sightings: list[_Sighting], z: Array, variance: 
         ones,
         0.0 * ones,
     )
+    # an arrival is made from all differences of its station
     origin = [one.rows[column != 0.0] for one in sightings for column in one.design.T]
     rows, number = [arrival], np.full(problem.count, -1)
     count = len(station)

@@ -40,11 +40,14 @@ def average_blocks(problem: Problem, count: int) -> Problem:
         exists where it is present in all problems of the batch. The same biases; states hold at the same time.
     """
     length = max(1, problem.epochs // count)
+    # too short to be averaged: its epochs are the blocks
     if length == 1:
         return _with_station_noise(problem)
     last = length * (problem.epochs // length)
+    # seconds from the first epoch of each block to its last
     lasting = problem.times[length - 1 : last : length] - problem.times[:last:length]
     longest = _GAP * float(np.median(lasting))
+    # whole blocks, as many as fit the memory of a part: averages of a long run need no copy of it
     stretch = length * max(1, epochs_of(problem, int(np.prod(problem.batch_shape))) // length)
     if stretch >= last:
         return _blocks(_with_station_noise(problem), length, longest)
@@ -61,6 +64,7 @@ def _blocks(problem: Problem, length: int, longest: float) -> Problem:
     place = np.full(problem.epochs, -1)
     place[(kept[:, None] * length + np.arange(length)).ravel()] = np.repeat(np.arange(len(kept)), length)
     since = np.zeros(problem.epochs)
+    # seconds since the middle of the own block
     since[place >= 0] = (times[kept] - middle[:, None]).ravel()
     when = _Blocks(place, since, middle)
     present = np.asarray((problem.weight > 0.0).reshape(-1, problem.count).all(0))
@@ -124,9 +128,11 @@ def _means(rows: Rows, when: _Blocks, present: Array, start: int, taken: int) ->
     """Return how the rows of a kind, of global numbers from `start` on, are averaged."""
     inside = np.flatnonzero((when.place[rows.epoch] >= 0) & present)
     key = np.stack([when.place[rows.epoch], rows.a, rows.b, rows.target])[:, inside]
+    # lexsort takes its last key first: block, then stations, then target
     order = np.lexsort(key[::-1])
     key, order = key[:, order], inside[order]
     new = np.ones(len(order), dtype=bool)
+    # an entry that differs from the one before begins a new row
     new[1:] = (key[:, 1:] != key[:, :-1]).any(0)
     head, row = np.flatnonzero(new), np.cumsum(new) - 1
     since = when.since[rows.epoch[order]]
@@ -138,6 +144,8 @@ def _middle(since: Array, row: Array) -> Array:
     """Return the coefficients of the line through the values of each row, taken at time zero."""
     total = [np.bincount(row, since**j) for j in range(3)]
     spread = total[0] * total[2] - total[1] ** 2
+    # A line through values at one time has no slope: by Cauchy and Schwarz the spread is between zero and the product,
+    # and below a millionth of it the slope is rounding. Such rows take their plain mean.
     line = spread > 1e-6 * total[0] * total[2]
     slope = np.where(line, total[1], 0.0)[row] * since
     level = np.where(line, total[2], 1.0)[row]
@@ -149,6 +157,7 @@ def _average_rows(rows: Rows, mean: _Mean) -> Rows:
         sorted_, base = values[..., mean.order], np.zeros(())
         if wrapped:
             base = sorted_[..., mean.head]
+            # angles are averaged about the first of their row: within half a turn of it there is no cut
             sorted_ = wrap(sorted_ - base[..., mean.row])
         if not len(mean.head):
             return sorted_
@@ -156,6 +165,7 @@ def _average_rows(rows: Rows, mean: _Mean) -> Rows:
 
     one = mean.order[mean.head]
     z = middle(rows.z, MODELS[rows.kind].period is not None)
+    # weights are in the noise of the new rows: a row of the blocks is there or it is not
     weight, correction = np.ones(len(one)), middle(rows.correction, wrapped=False)
     return Rows(rows.kind, z, rows.a[one], rows.b[one], mean.block, rows.target[one], weight, correction)
 
@@ -168,6 +178,7 @@ def _stations(stations: Stations, when: _Blocks) -> Stations:
     def middle(values: Array | None, core: int) -> Array | None:
         if values is None or values.shape[-core] == 1:
             return values
+        # epochs last: reduceat adds along it
         moved = np.moveaxis(values, -core, -1)[..., inside]
         return np.moveaxis(np.add.reduceat(moved * coefficient, head, axis=-1), -1, -core)
 
@@ -183,6 +194,7 @@ def _stations(stations: Stations, when: _Blocks) -> Stations:
 def _noise(problem: Problem, means: list[_Mean], block: Array) -> Noise:
     """Return the covariance of the new rows: C R C', of which rows of one block are kept together."""
     count, size = problem.count, sum(len(mean.head) for mean in means)
+    # C (new rows, old rows) is as sparse as the averages are
     entries = [(mean.taken + mean.row, mean.start + mean.order, mean.coefficient) for mean in means]
     place, old, coefficient = (np.concatenate([entry[i] for entry in entries]) for i in range(3))
     C = sparse.csr_array((coefficient, (place, old)), shape=(size, count))
@@ -208,6 +220,7 @@ def _sparse(problem: Problem) -> sparse.csr_array:
 
 def _bias(bias: Bias, first: Array) -> Bias:
     """Return the touches of the new rows: those of one row that went into each."""
+    # rows that meet in one have the same stations and target: a bias touches all of them alike
     new = np.full(int(max(first.max(initial=0), bias.row.max(initial=0))) + 1, -1)
     new[first] = np.arange(len(first))
     kept = new[bias.row] >= 0

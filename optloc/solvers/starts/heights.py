@@ -13,7 +13,10 @@ from optloc.models.primitives import WGS84_A, WGS84_F
 from optloc.problem.problem import Problem
 from optloc.solvers.starts.least_squares_ranges import Ranges, ranges
 
+# Choices of stations, the widest first: the first is good for most places, and the next ones guard against a target for
+# which it is ill placed. Each costs a quartic, or a relaxation of a millisecond.
 _SUBSETS = 6
+# Axes of the ellipsoid in units of its equatorial radius: numbers of order one for the quartic.
 _AXES = np.array([1.0, 1.0, 1.0 - WGS84_F])
 
 
@@ -58,6 +61,7 @@ def height_starts(problem: Problem, *, relax: bool = False) -> Array:
     place = problem.frame.to_ecef(position[:, found.epoch, found.station]) / WGS84_A
     surface = ellipsoid(_AXES, height / WGS84_A)
     parts = []
+    # place and common unknown take three ranges and the height; the place alone takes two known ranges and the height
     for count, mask in ((3, found.free), (2, ~found.free)):
         subsets = _subsets(place, found, mask, count)
         met = _relax if relax and count == 3 else _intersect
@@ -76,9 +80,11 @@ def _subsets(place: Array, found: Ranges, mask: Array, count: int) -> list[Array
     usable = found.inside[:, choices].all(-1) & mask[:, None]
     if count == 3:
         a, b, c = (place[:, choices[:, i]] for i in range(3))
+        # twice the area of the triangle: stations in a line say the same thing
         width = np.linalg.norm(np.cross(b - a, c - a), axis=-1)
     else:
         width = np.linalg.norm(place[:, choices[:, 1]] - place[:, choices[:, 0]], axis=-1)
+    # unusable choices come last and are told by their sign
     width = np.where(usable, width, -1.0)
     order = np.argsort(-width, axis=1)[:, :_SUBSETS]
     best = np.take_along_axis(width, order, axis=1)
@@ -98,14 +104,15 @@ def _relax(place: Array, found: Ranges, nodes: Array, surface: Ellipsoid, mask: 
         np.broadcast_to(surface.shape, (len(place), 3, 3)), np.broadcast_to(surface.centre, (len(place), 3))
     )
 
-    def relaxed(i: int) -> None:
+    def relax(i: int) -> None:
         own = Ellipsoid(whole.shape[i], whole.centre[i])
         stations, offset = place[i, nodes[i]], found.offset[i, nodes[i]] / WGS84_A
         above = stations.mean(0)
+        # stations above the Earth see what is below them: of both places the one on their side is meant
         below = own.centre + (above - own.centre) / np.sqrt(own.polar(above, above))
         out[i, 0] = lift(stations, found.sign[i, nodes[i]].astype(float), offset, own, below).x
 
-    mapped(relaxed, np.flatnonzero(mask & np.isfinite(whole.shape).all((-1, -2))).tolist(), least=WORTH)
+    mapped(relax, np.flatnonzero(mask & np.isfinite(whole.shape).all((-1, -2))).tolist(), least=WORTH)
     return out
 
 

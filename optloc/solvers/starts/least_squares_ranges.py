@@ -18,6 +18,10 @@ from optloc.models import MODELS
 from optloc.problem.noise import Block, Noise, whiten
 from optloc.problem.problem import Problem
 
+# Eigenvalue, as a share of the largest, that is a zero: D holds 0 and +-1, so that the least eigenvalue on a chain of s
+# stations is some 1 / s^2, and rounding leaves 1e-15.
+_SINGULAR = 1e-9
+
 
 @dataclass(frozen=True, slots=True)
 class Graph:
@@ -93,6 +97,7 @@ def ranges(problem: Problem) -> Ranges | None:
     if not len(station):
         return None
     weight = np.broadcast_to(problem.weight, (*problem.batch_shape, problem.count))
+    # rows of other kinds have no part in D
     used = np.any(design != 0.0, axis=1)
     present = weight[:, used] > 0.0
     patterns, pattern = _patterns(present)
@@ -102,6 +107,7 @@ def ranges(problem: Problem) -> Ranges | None:
     groups = tuple(tuple(tuple(int(station[n]) for n in nodes) for nodes in _members(g, len(station))) for g in graphs)
     offset, covariance, cost = _least_squares(problem, design, _pin(graphs, chosen, len(station))[pattern])
     s = len(station)
+    # emission times are nodes behind the stations: they have done their part
     known = covariance[:, :s, :s]
     return Ranges(station, epoch, inside, sign, reference, offset[:, :s], known, cost, groups, pattern)
 
@@ -177,6 +183,7 @@ def _reduced_rows(found: Ranges, shape: tuple[int, ...]) -> tuple[list[Rows], Ar
     """Return range, tdoa and range_sum rows of the statistic with batch axes `shape`, and their joint covariance."""
     free, reference = bool(found.free[0]), int(found.reference[0])
     nodes = [n for n in np.flatnonzero(found.inside[0]) if not (free and n == reference)]
+    # r_i = c_i + t is a difference to the reference, r_i = c_i - t a sum with it
     kinds = ["range" if not free else "tdoa" if found.sign[0, n] > 0 else "range_sum" for n in nodes]
     order, rows = [], []
     for kind in dict.fromkeys(kinds):
@@ -211,6 +218,7 @@ def _design(problem: Problem) -> tuple[Array, Array, Array]:
         model = MODELS[rows.kind]
         if model.ranges is None:
             continue
+        # ranges to stations that stay, from a target that stays, are one and the same at all epochs
         when = rows.epoch if moving else np.zeros_like(rows.epoch)
         for i in range(rows.count):
             for index, coefficient in zip((rows.a[i], rows.b[i]), model.ranges, strict=True):
@@ -230,6 +238,7 @@ def _design(problem: Problem) -> tuple[Array, Array, Array]:
 def _graph(design: Array, stations: int) -> Graph:
     """Return the connected groups of nodes and the null vector of each."""
     count = design.shape[1]
+    # nodes that share a row; signs do not matter
     linked = (np.abs(design).T @ np.abs(design)) > 0.0
     group = np.full(count, -1)
     for node in range(count):
@@ -245,14 +254,17 @@ def _graph(design: Array, stations: int) -> Graph:
     sign, determined = np.zeros(count, dtype=int), np.zeros(count, dtype=bool)
     for name in np.unique(group[group >= 0]):
         nodes = np.flatnonzero(group == name)
+        # what moves all rows of a group by nothing is its unknown t; the graph is connected, so there is one at most
         inner = design[:, nodes]
         values, vectors = np.linalg.eigh(inner.T @ inner)
-        if values[0] < 1e-9 * max(values[-1], 1.0):
+        if values[0] < _SINGULAR * max(values[-1], 1.0):
+            # the null vector holds +-1 / sqrt(n): signs relative to the largest entry, against rounding
             sign[nodes] = np.sign(vectors[:, 0] * vectors[np.argmax(np.abs(vectors[:, 0])), 0]).astype(int)
         else:
             determined[nodes] = True
     group[determined] = count  # ranges that are all known belong together, linked or not
     sizes = {int(name): int((group[:stations] == name).sum()) for name in np.unique(group[group >= 0])}
+    # most stations; of equals the first, so that the same rows always give the same group
     main = max(sizes, key=lambda name: (sizes[name], -name)) if sizes else -1
     return Graph(group, sign, main)
 
@@ -264,6 +276,7 @@ def _members(graph: Graph, stations: int) -> list[Array]:
 
 def _main(graph: Graph, stations: int) -> tuple[Array, Array, int]:
     inside = (graph.group == graph.main)[:stations] if graph.main >= 0 else np.zeros(stations, dtype=bool)
+    # ranges grow with that of the reference: its own sign is plus
     sign = np.where(inside, graph.sign[:stations], 0)
     reference = int(np.flatnonzero(inside)[0]) if inside.any() else 0
     return inside, sign * (sign[reference] or 1), reference
@@ -291,7 +304,9 @@ def _least_squares(problem: Problem, design: Array, pinned: Array) -> tuple[Arra
         information = information + transposed @ white
         vector = vector + transposed @ seen
         total = total + np.swapaxes(seen, -1, -2) @ seen
+    # one pattern of present rows: one inverse serves the batch
     held = pinned[:1] if (pinned == pinned[:1]).all() else pinned
+    # pinned nodes keep a one on the diagonal: their value is zero, and the rest is inverted with them
     information = np.where(held[:, :, None] | held[:, None, :], 0.0, information) + held[:, :, None] * np.eye(q)
     covariance, _ = linalg.inverse(information)
     offset = (covariance @ np.where(held[..., None], 0.0, vector))[..., 0]

@@ -26,18 +26,28 @@ from optloc.solvers.starts.least_squares_ranges import Ranges, ranges
 from optloc.solvers.starts.position import complete, distance_of, spread_of, vectors
 
 BLOCKS = 30
-# Rivals that cost more than this on block averages are not refined on all epochs, but for the best of them.
+"""Blocks that a run is averaged over: far more rows than unknowns, at a cost that does not grow with the run. Fewer and
+longer ones bend more between stations and target: what an average leaves out of a curved course."""
+
+# Which minima on block averages are refined on all epochs, the expensive part: four at most, the best two in any case
+# (averaging may turn the order of a minimum and its mirror image). A difference in cost of a thousand is beyond what
+# averaging blurs.
 _RIVAL = 1e3
 _KEPT = 4
+# Spreads of the stations within which two minima are one: far above the tolerance of refinement, far below a rival.
 _SAME = 1e-4
-# Where the verdict is not clean: minima beyond the stations' plane and along the valley of a weak fix.
+# An error of more than this share of the distance is a weak fix: then minima are sought on circles around the stations
+# and along its valley, and so they are where its chi-square is improbable.
 _WEAK = 1e-2
+# Places on each circle: no azimuth is more than 30 degrees from one, which is near enough for blocks of little noise.
 _AZIMUTHS = 6
+# Radii in spreads of the stations: just outside and far out; without a closed form, also among the stations.
 _RADII = (1.5, 5.0)
-# Without a closed form also among the stations.
 _ANYWHERE = (0.3, 0.8, 1.5, 5.0)
+# Standard deviations along the valley, doubling from one: nearer places lead back to the fix.
 _STEPS = (-8.0, -4.0, -2.0, -1.0, 1.0, 2.0, 4.0, 8.0)
-# Fixes with an error beyond this share of their distance may have another minimum that block averages do not show.
+# Fixes of whole runs with an error beyond this share of their distance may have another minimum within a few sigma,
+# which block averages blur into one. Few steps: each is refined on all epochs.
 _BLURRED = 2e-3
 _BESIDE = (-6.0, -2.0, 2.0, 6.0)
 
@@ -55,8 +65,8 @@ def run_starts(problem: Problem, begin: Callable[[Problem], Array | None]) -> Ar
     """
     groups = group_alike(problem)
     if len(groups) == 1:
-        return _start_alike(problem, begin)
-    parts = [(items, _start_alike(problem.take(items), begin)) for items in groups]
+        return _start_group(problem, begin)
+    parts = [(items, _start_group(problem.take(items), begin)) for items in groups]
     out = np.full((problem.batch_shape[0], max(part.shape[1] for _, part in parts), problem.layout.size), np.nan)
     for items, part in parts:
         out[items, : part.shape[1]] = part
@@ -72,12 +82,16 @@ def group_alike(problem: Problem) -> list[Array]:
     return [np.flatnonzero(group.reshape(-1) == i) for i in range(int(group.max()) + 1)]
 
 
-def _start_alike(problem: Problem, begin: Callable[[Problem], Array | None]) -> Array:
+def _start_group(problem: Problem, begin: Callable[[Problem], Array | None]) -> Array:
+    """Return starting vectors (N, C, size) of runs that have the same rows."""
+    # every candidate is refined on the averages, where a step costs next to nothing; few are on all epochs
     blocks = average_blocks(problem, BLOCKS)
     x = begin(blocks)
     x = _around(blocks, _ANYWHERE) if x is None else x
     pool = _minima(blocks, x)
+    # stations in a plane see the mirror image nearly as well: it is always tried
     pool = _merge(pool, _minima(blocks, mirror_courses(blocks, pool[0][:, :1])))
+    # ring and valley only where something calls for them: they are most of the candidates
     doubtful = np.flatnonzero(~_is_settled(blocks, pool))
     if len(doubtful):
         part = blocks.take(doubtful)
@@ -93,14 +107,19 @@ def _minima(blocks: Problem, x: Array) -> tuple[Array, Array]:
     if len(item):
         done = refine(blocks, x[item, slot], item=item)
         out[item, slot] = done.x
+        # unfinished ones compete: they are refined again on all epochs
         cost[item, slot] = np.where(np.isin(done.status, (Status.OK, Status.MAX_ITERATIONS)), done.cost, np.inf)
-    order = np.argsort(cost, axis=1, kind="stable")
-    return np.take_along_axis(out, order[..., None], axis=1), np.take_along_axis(cost, order, axis=1)
+    return _sort(out, cost)
 
 
 def _merge(one: tuple[Array, Array], two: tuple[Array, Array]) -> tuple[Array, Array]:
     """Return two sets of minima as one, the cheapest first."""
     x, cost = (np.concatenate(parts, axis=1) for parts in zip(one, two, strict=True))
+    return _sort(x, cost)
+
+
+def _sort(x: Array, cost: Array) -> tuple[Array, Array]:
+    """Return minima (N, C, size) and their costs (N, C), the cheapest first."""
     order = np.argsort(cost, axis=1, kind="stable")
     return np.take_along_axis(x, order[..., None], axis=1), np.take_along_axis(cost, order, axis=1)
 
@@ -118,6 +137,7 @@ def _is_settled(blocks: Problem, pool: tuple[Array, Array]) -> Array:
 
     x, cost = pool[0][:, 0], pool[1][:, 0]
     found, dof = np.isfinite(cost), np.maximum(degrees_of_freedom(blocks), 1)
+    # the chi-square of the averages, at the threshold at which a verdict calls residuals too large
     fits = found & (gammaincc(dof / 2.0, np.where(found, cost, np.inf) / 2.0) > DOUBT)
     deviation = np.sqrt(np.trace(_covariance(blocks, x), axis1=-2, axis2=-1))
     with np.errstate(invalid="ignore"):
@@ -144,6 +164,7 @@ def _around(blocks: Problem, radii: tuple[float, ...]) -> Array:
     """Return vectors (N, C, size) of targets at rest on circles around the stations, and above and below."""
     d, centre = blocks.dimension, spread_of(blocks)[0]
     angle = 2.0 * np.pi * np.arange(_AZIMUTHS) / _AZIMUTHS
+    # in space circles are level and the poles (up and down) are added; in the plane there are no poles
     level = np.stack([np.cos(angle), np.sin(angle), *([0.0 * angle] * (d - 2))], axis=-1)
     poles = np.eye(d)[2:]
     direction = np.concatenate([level, poles, -poles])
@@ -192,13 +213,12 @@ def _along(problem: Problem, x: Array, covariance: Array, steps: tuple[float, ..
 
 def _best(blocks: Problem, x: Array, cost: Array) -> Array:
     """Return the different minima (N, C, size) worth refining on all epochs; NaN in empty slots."""
-    order = np.argsort(cost, axis=1, kind="stable")
-    x, cost = np.take_along_axis(x, order[..., None], axis=1), np.take_along_axis(cost, order, axis=1)
+    x, cost = _sort(x, cost)
+    # cheapest first: of two at one place the dearer goes
     for i in np.flatnonzero(np.isfinite(cost).any(0))[1:]:
         for j in range(i):
             cost[:, i] = np.where(_at_one_place(blocks, x[:, i], x[:, j]) & np.isfinite(cost[:, j]), np.inf, cost[:, i])
-    order = np.argsort(cost, axis=1, kind="stable")[:, :_KEPT]
-    x, cost = np.take_along_axis(x, order[..., None], axis=1), np.take_along_axis(cost, order, axis=1)
+    x, cost = (array[:, :_KEPT] for array in _sort(x, cost))
     with np.errstate(invalid="ignore"):
         cost[:, 2:] = np.where(cost[:, 2:] - cost[:, :1] > _RIVAL, np.inf, cost[:, 2:])
     used = np.isfinite(cost)
@@ -217,6 +237,7 @@ def mirror_courses(blocks: Problem, x: Array) -> Array:
     The mirrored places are those of a course again where the planes are parallel; else the polynomial next to them.
     """
     order = blocks.motions[0].order
+    # (k, order + 1): the course at epoch k is the sum of state_j t^j / j!
     powers = np.stack([elapsed(blocks, 0) ** j / factorial(j) for j in range(order + 1)], axis=-1)
     slots = [blocks.layout.find(name)[0] for name in ("position", "velocity", "acceleration")[: order + 1]]
     state = np.stack([x[..., slot.start : slot.start + slot.size] for slot in slots], axis=-2)
@@ -224,10 +245,12 @@ def mirror_courses(blocks: Problem, x: Array) -> Array:
     place = place if place.ndim == 4 else place[None]
     centre = place.mean(-2)
     apart = place - centre[..., None, :]
+    # a plane for each epoch, as stations move; eigenvalues ascend, so the first vector is its normal
     _, vectors = np.linalg.eigh(np.swapaxes(apart, -1, -2) @ apart)
     normal, centre = vectors[..., 0][:, None], centre[:, None]
     course = powers @ state
     course = course - 2.0 * ((course - centre) * normal).sum(-1, keepdims=True) * normal
+    # mirror images in turning planes are no polynomial: the one with least squares next to them
     state = np.linalg.pinv(powers) @ course
     out = x.copy()
     for j, slot in enumerate(slots):
@@ -235,10 +258,12 @@ def mirror_courses(blocks: Problem, x: Array) -> Array:
     return out
 
 
-# Registration without a guess: a run of range differences, one target that lasts it, and unknown biases.
+# Starts on the block averages: a run of range differences, one target that lasts it, and unknown biases.
 
+# Blocks that the relaxation sees: the time of a semidefinite programme grows steeply with them.
 _WINDOWS = 6
-# The relaxation needs a prior: biases without one are taken for about this share of the largest range difference.
+# It needs a prior: biases without one are taken for about this share of the largest range difference. Too loose a prior
+# leaves the lifted biases free, too tight a one pulls the start; only a start hangs on it.
 _LOOSE = 1e-2
 
 
@@ -312,12 +337,14 @@ def run_of(problem: Problem) -> Run | None:
     if found is None or not (found.free & (found.inside.sum(-1) > 1)).any():
         return None
     size, epochs = problem.batch_shape[0], problem.epochs
+    # epochs may differ in who is heard: offsets to one reference, that of most, are compared over the run
     reference = _most_common(found.reference[found.free & (found.inside.sum(-1) > 1)])
     others = np.flatnonzero(np.arange(len(found.station)) != reference)
     sign = np.array([_most_common(found.sign[found.sign[:, i] != 0, i]) for i in others])
     heard = (found.reference == reference)[:, None] & found.inside[:, others] & (found.sign[:, others] == sign)
     centre, spread = spread_of(problem)
     origin, length, since = centre.mean(0), float(spread.max()), elapsed(problem, 0)
+    # a run whose epochs are simultaneous has no duration: any unit does
     duration = float(np.abs(since).max()) or 1.0
     column, effect = _effects(problem, found)
     mean, sigma = _prior(problem, column)
@@ -366,6 +393,7 @@ def _effects(problem: Problem, found: Ranges) -> tuple[Array, Array]:
     column, unit = _units(problem)
     effect = np.zeros((len(column), problem.epochs, len(found.station)))
     if len(column):
+        # a batch whose items are the biases: each item's rows hold one unit of its bias and nothing else
         zero = tuple(replace(rows, correction=np.zeros(rows.count)) for rows in problem.rows)
         single = replace(problem.take(np.zeros(1, dtype=int)), rows=zero)
         same = ranges(_split_epochs(single.with_rows(z=unit)).flat())
@@ -395,6 +423,7 @@ def _prior(problem: Problem, column: Array) -> tuple[Array, Array]:
             part = slice(slot.start, slot.start + slot.size)
             mean[part] = value.reshape(-1, slot.size)[0]
             information[part] = np.diagonal(precision.reshape(-1, slot.size, slot.size)[0])
+    # no information is an infinite standard deviation
     with np.errstate(divide="ignore"):
         return mean[column], 1.0 / np.sqrt(information[column])
 
@@ -418,10 +447,12 @@ def relax_run(problem: Problem) -> Array | None:
     size, d = len(course.offset), problem.dimension
     station, bias = (np.broadcast_to(a, (size, *a.shape[1:])) for a in (course.station, course.bias))
     whiten = np.broadcast_to(course.whiten, (size, *course.offset.shape[1:], course.offset.shape[2]))
+    # offsets are scaled: so is what they are compared with
     loose = _LOOSE * np.abs(course.offset).max() if course.offset.size else 1.0
     sigma = np.where(np.isfinite(course.sigma), course.sigma, loose)
     found: list[list[tuple[Array, Array]]] = []
     for i in range(size):
+        # blocks in which every station is heard, spread evenly over the run
         whole = np.flatnonzero((whiten[i] != 0.0).any(-1).all(-1))
         k = whole[np.unique(np.linspace(0, len(whole) - 1, _WINDOWS).round().astype(int))] if len(whole) else whole
         time = course.time[k] if order else None

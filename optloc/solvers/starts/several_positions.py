@@ -49,6 +49,7 @@ def from_pieces(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
         if motion.known is not None:
             continue
         names = state_names(i, len(problem.motions), motion.order)
+        # a target that no row measures keeps its prior
         state = np.full((len(x), problem.epochs, len(names), problem.dimension), np.nan)
         if any((rows.target == i).any() for rows in problem.rows):
             state = _state(_isolate(problem, i), fixed)
@@ -93,11 +94,13 @@ def _take_rows(problem: Problem, target: int) -> Problem:
 
 def _take_noise(noise: Noise, kept: Array, count: int) -> Noise:
     """Return the noise of some of the rows, which are numbered anew in their order."""
+    # new number of each row; -1 for those that go
     number = np.full(count, -1)
     number[kept] = np.arange(len(kept))
     blocks = []
     for block in noise.blocks:
         present = number[block.row] >= 0
+        # groups of a block may lose different rows: those that lose the same ones stay a block
         for pattern in np.unique(present, axis=0):
             inside = np.flatnonzero(pattern)
             if not len(inside):
@@ -116,14 +119,17 @@ def _state(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
         state = np.zeros((size, 1, motion.order + 1, problem.dimension))
         state[:, 0, 0] = position
         return state
+    # rows of single stations make one fix whenever they were measured, as long as the target stays
     if _meets(problem):
         return fixed(_merge_epochs(problem)).position[:, None, None]
+    # closed forms of whole courses first: epochs by themselves need not determine a position at all
     ahead = course_starts(problem) if motion.span == "run" else None
     if ahead is not None and np.isfinite(ahead).all():
         return ahead[:, None]
     seen = course_states(problem) if motion.span == "run" else None
     if seen is not None and np.isfinite(seen).all():
         return seen[:, None]
+    # else epoch by epoch, and a polynomial through the fixes: rough where epochs are weak, but a start
     free = by_epoch(untied(replace(problem, motions=(Motion(span="epoch"),))))
     fix = fixed(free.flat()).reshape((size, problem.epochs))
     if motion.span == "epoch":
@@ -131,6 +137,7 @@ def _state(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
         state[:, :, 0] = _fill_gaps(fix.position)
         return state
     state = _polynomial(fix, elapsed(problem, 0), motion.order)
+    # where the course from angles alone exists it is the better one: it has seen all epochs at once
     if seen is not None:
         state = np.where(np.isfinite(seen).all((-2, -1), keepdims=True), seen, state)
     return state[:, None]
@@ -172,6 +179,7 @@ def _merge_epochs(problem: Problem) -> Problem:
 def _fill_gaps(position: Array) -> Array:
     """Return positions (N, k, d) in which an epoch without a fix takes that of the last one before, or of the first."""
     found = np.asarray(np.isfinite(position).all(-1))
+    # index of the last fix so far; -1 before the first, which takes the first
     last = np.maximum.accumulate(np.where(found, np.arange(position.shape[1]), -1), axis=1)
     taken = np.where(last < 0, found.argmax(1)[:, None], last)
     return np.take_along_axis(position, taken[..., None], axis=1)
@@ -181,6 +189,7 @@ def _polynomial(fix: Fix, since: Array, order: int) -> Array:
     """Return the state (N, order + 1, d) of the polynomial nearest to the fixes (N, k), weighted by their variances."""
     variance = np.trace(fix.covariance(), axis1=-2, axis2=-1)
     good = fix.answered & np.isfinite(variance) & np.isfinite(fix.position).all(-1)
+    # a fix counts by its own variance; epochs without one not at all
     weight = np.where(good, 1.0 / np.where(good, variance, 1.0), 0.0)
     design = np.stack([since**j / factorial(j) for j in range(order + 1)], axis=-1)
     weighted = np.swapaxes(design, -1, -2) * weight[:, None, :]

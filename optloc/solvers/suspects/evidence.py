@@ -21,9 +21,13 @@ from optloc.linear.normal import Linear, Normal, linearise, marginal, step
 from optloc.problem.problem import Problem
 from optloc.solvers.suspects.groups import Group
 
+# A component of an error is known where Q Q^+ has a one on its diagonal: what is less by more than rounding is open.
 _OPEN = 1e-6
-# Share of the weight of a row beyond which the other rows check it.
+# Eigenvalue of Q, in units of the weights, below which the other rows say nothing: above what rounding leaves of a
+# zero.
 _NOTHING = 1e-9
+# Where the tail of a chi-square leaves the range of floating-point numbers, with room for what is computed from it.
+_TINY = 1e-290
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,6 +66,7 @@ class Influence:
         i, j = np.broadcast_arrays(rows[..., :, None], rows[..., None, :])
         precision = np.asarray(self.precision[i.ravel(), j.ravel()]).reshape(i.shape)
         shared, local = self.shared[rows], self.local[rows]
+        # priors are of epoch -1: their rows have no local unknowns, so that their product is zero
         same = self.epoch[i] == self.epoch[j]
         lost = shared @ np.swapaxes(shared, -1, -2) + same * (local @ np.swapaxes(local, -1, -2))
         return np.asarray(precision - lost)
@@ -118,6 +123,7 @@ def influence(problem: Problem, x: Array, dropped: frozenset[int] = frozenset())
     layout = problem.layout
     numbers = [j for j, p in enumerate(problem.priors) if j not in dropped and layout.find(p.name)[1]]
     problem = replace(problem, priors=tuple(p for j, p in enumerate(problem.priors) if j not in dropped))
+    # whitened in neither: Q needs P and J apart
     linear, equations = linearise(problem, x[None]), equations_at(problem, x[None])
     picks, means, inner = _prior_rows(problem)
     cuts = np.cumsum([problem.count, *(len(mean) for mean in means)])
@@ -131,6 +137,7 @@ def influence(problem: Problem, x: Array, dropped: frozenset[int] = frozenset())
     B = np.concatenate([linear.local[0], np.zeros((more, layout.n_local))])
     epoch = np.concatenate([problem.epoch, np.full(more, -1)])
     shared, local = _roots(equations, A, B, epoch)
+    # x need not be a minimum: Q y is the residual after one more step
     move, _ = step(equations, np.zeros(1))
     by_run, by_epoch = layout.split(move[0])
     fitted = A @ by_run + (B * by_epoch[epoch]).sum(-1)
@@ -180,6 +187,7 @@ def _roots(equations: Normal, A: Array, B: Array, epoch: Array) -> tuple[Array, 
         return A @ root, B
     inner, _ = linalg.root(equations.local[0])
     gain = inner @ np.swapaxes(inner, -1, -2) @ np.swapaxes(equations.cross[0], -1, -2)
+    # J without what the unknowns of its own epoch explain: Schur's complement, row by row
     left = A - (B[:, None, :] @ gain[epoch])[:, 0]
     return left @ root, (B[:, None, :] @ inner[epoch])[:, 0]
 
@@ -195,12 +203,13 @@ def log_tail(statistic: Array, dof: Array) -> Array:
     half, k = np.maximum(np.asarray(statistic, dtype=float), 0.0) / 2, np.maximum(dof, 1) / 2
     tail = gammaincc(k, half)
     large = -half + (k - 1.0) * np.log(np.maximum(half, 1.0)) - gammaln(k)
-    return np.where(np.asarray(dof) > 0, np.where(tail > 1e-290, np.log(np.maximum(tail, 1e-290)), large), 0.0)
+    return np.where(np.asarray(dof) > 0, np.where(tail > _TINY, np.log(np.maximum(tail, _TINY)), large), 0.0)
 
 
 def significance(at: Influence, groups: Sequence[Group]) -> Array:
     """Return the logarithms (G,) of the probabilities of the drop of the cost without each group."""
     out, rows = np.zeros(len(groups)), [at.rows(group) for group in groups]
+    # groups of one size at a time: thousands of small eigenvalue problems as one batch
     sizes = np.array([len(own) for own in rows])
     for size in np.unique(sizes):
         members = np.flatnonzero(sizes == size)
@@ -221,6 +230,7 @@ def errors(at: Influence, groups: Sequence[Group]) -> list[Error]:
     value, sigma = covariance @ at.pull[index], np.where(known, np.sqrt(np.diagonal(covariance)), np.inf)
     out = []
     for own in np.split(np.arange(len(index)), np.cumsum([len(one) for one in rows])[:-1]):
+        # a group's statistic is that of its known components, in their own covariance
         inside = own[known[own]]
         information, _ = linalg.root(covariance[np.ix_(inside, inside)]) if len(inside) else (np.zeros((0, 0)), None)
         squared = ((information.T @ value[inside]) ** 2).sum()

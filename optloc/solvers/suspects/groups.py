@@ -60,6 +60,7 @@ class _Columns:
         epoch, target = problem.epoch, np.concatenate([rows.target for rows in problem.rows])
         sort = np.unique(kind, return_inverse=True)[1]
         _, label = np.unique(np.column_stack([sort, a, b, epoch, target]), axis=0, return_inverse=True)
+        # place: the how-manyth of the rows that look alike, so that a reader can tell them apart
         label, place = label.reshape(-1), np.empty(len(a), dtype=np.int64)
         order, sizes = np.argsort(label, kind="stable"), np.bincount(label)
         place[order] = np.arange(len(a)) - np.repeat(np.cumsum(sizes) - sizes, sizes)
@@ -85,6 +86,7 @@ def groups_of(problem: Problem, present: Array, by: Sequence[GroupKind] = KINDS)
     if "station" in by:
         for i, name in enumerate(problem.stations.names):
             rows = _numbers(present & ((columns.a == i) | (columns.b == i)))
+            # setdefault: rows that two groups share by name are listed once, under the first
             if rows and len(rows) < present.sum():
                 found.setdefault(rows, Group(f"station {name}", "station", rows))
     if "row" in by:
@@ -130,6 +132,7 @@ def _sightings(columns: _Columns, present: Array) -> list[tuple[int, ...]]:
     seen = (columns.a >= 0) & present
     _, label = np.unique(keys, axis=0, return_inverse=True)
     order = np.flatnonzero(seen)[np.argsort(label.reshape(-1)[seen], kind="stable")]
+    # rows of one label lie together now: cut where it changes
     cuts = np.flatnonzero(np.diff(label.reshape(-1)[order])) + 1
     return [tuple(part.tolist()) for part in np.split(order, cuts) if len(part) > 1]
 

@@ -59,6 +59,7 @@ def conclude_case(case: Case, finding: Finding) -> Conclusion | None:
     if finding.rests:
         explanations = tuple(_explanation(case, rest, finding) for rest in finding.rests)
         return Conclusion(explanations, finding.rests[0].fix, _alternatives(case, finding.rests, explanations))
+    # no set was tried and nothing stood out: a run whose noise is larger than stated keeps its fix
     if case.whole.answered and set(finding.p_value) == {()} and not finding.note:
         return None
     return Conclusion((), case.whole, case.whole.alternatives, _name_closest(case, finding))
@@ -94,6 +95,7 @@ def _p_with(fix: Fix, error: Error | None) -> float:
 
     if error is None:
         return float("nan")
+    # the rest with the suspect back: to first order its cost rises by the statistic
     return float(gammaincc((int(fix.dof) + error.dof) / 2, (float(fix.cost) + error.statistic) / 2))
 
 

@@ -26,6 +26,9 @@ from optloc.solvers.verdict.conclusion import Conclusion
 from optloc.solvers.verdict.judge import judge, standing
 from optloc.solvers.verdict.status import fill
 
+# A row that a loss gives less than half its weight is suspected first. More than `REJECTED` names: here it is a hint
+# that is tested, and who fits is taken back.
+_HALF = 0.5
 # No other choice of rows helps these.
 _BEYOND = (Status.REJECTED, Status.TOO_FEW_ROWS, Status.INFEASIBLE, Status.UNAVAILABLE, Status.DISCONNECTED)
 
@@ -76,8 +79,9 @@ def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS
         )
     began = perf_counter()
     present = np.broadcast_to(problem.weight, (len(pool), problem.count))
-    rejected = np.asarray((pool.weights < 0.5) & (present > 0.5))
+    rejected = np.asarray((pool.weights < _HALF) & (present > _HALF))
     if not np.array_equal(pool.weights, present):
+        # a robust fix has its minima elsewhere: the test is that of least squares with every row
         pool = lsr(problem, offer(problem, standing(pool, judge(problem, pool)), pool, "start", perf_counter()))
     pool = replace(pool, asked=True)
     fix = judge(problem, pool)
@@ -110,10 +114,12 @@ def _conclude_pattern(
     work = part if arrivals is None else arrivals.problem
     present = np.broadcast_to(work.weight, (len(items), work.count))[0] > 0.0
     groups = groups_of(work, present, by)
+    # few sets: all are tried, and nothing masks anything; runs and many groups: one at a time
     if problem.epochs > 1 or not enumerable(groups, work.count, 1):
         findings = [_grow(work, groups, fix, i, item, rejected, None) for i, item in enumerate(items)]
     else:
         findings = explain(work, groups, fix[items])
+        # sets that were too many to be tried: group by group from the best that was found
         for i in [i for i, own in enumerate(findings) if not own.rests and _more(groups, work, int(fix.dof[items[i]]))]:
             more = _grow(work, groups, fix, i, items[i], rejected, findings[i].closest)
             findings[i] = replace(more, p_value=findings[i].p_value | more.p_value, nearly=findings[i].nearly)
@@ -133,6 +139,7 @@ def _grow(
     problem: Problem, groups: Sequence[Group], fix: Fix, i: int, item: int, rejected: Array, start: Rest | None
 ) -> Finding:
     """Return what explains the i-th of some problems, that of the fix numbered `item`, found group by group."""
+    # the fix is of the problem as given; with arrivals for differences the layout has emission times besides
     one, own = problem.take(np.array([i])), fix[item]
     if own.layout != one.layout or not np.isfinite(own.x).all():
         n = one.layout.n_shared

@@ -21,14 +21,16 @@ from optloc.solvers.suspects.groups import Group, leave_out, mark_rows
 from optloc.solvers.verdict.judge import judge, standing
 
 TEST = 0.01
-"""Probability of the chi-square test: a fit less likely than this is contradicted."""
+"""Probability of the chi-square test: a fit less likely than this is contradicted. Clean data are accused as often."""
 
 LAST = TEST**2
-"""What is left to be named where nothing passes the test."""
+"""What is left to be named where nothing passes the test: the right rest fails it once in a hundred, too."""
 
-# Rows times subsets of one problem up to which all subsets of a size are tried, and numbers of a batch at a time.
+# Rows times subsets of one problem up to which all subsets of a size are tried: seconds of fixes; and numbers of a
+# batch at a time, some ten megabytes an array.
 _MOST, _CHUNK = 100_000, 1_000_000
-# Rests whose cost is at most so many times that of the test are solved in more ways, and in all of them.
+# Rests whose cost is at most so many times that of the test are solved in more ways, and in all of them. The cheapest
+# start may end at another minimum, and a wrong rest that costs a hundred times too much hardly has one that passes.
 _NEAR, _CLOSE = 100.0, 4.0
 
 
@@ -107,9 +109,11 @@ def explain(problem: Problem, groups: Sequence[Group], whole: Fix) -> list[Findi
     """
     found = [Finding((), {(): float(p)}) for p in whole.p_value]
     open_ = np.arange(len(found))
+    # to name q errors takes a redundancy of 2 q, as to correct them does in a code
     for size in range(1, max(1, int(whole.dof.max()) // 2) + 1):
         if not len(open_) or not enumerable(groups, problem.count, size):
             break
+        # as many problems at a time as fit the memory with all their sets
         step = max(1, _CHUNK // (comb(len(groups), size) * problem.count + 1))
         for first in range(0, len(open_), step):
             items = open_[first : first + step]
@@ -118,6 +122,7 @@ def explain(problem: Problem, groups: Sequence[Group], whole: Fix) -> list[Findi
             ):
                 placed = [rest for rest in rests if rest.fix.answered or int(rest.fix.dof) == 0]
                 passing = [rest for rest in placed if plausible(rest.fix, size)]
+                # of the smallest size that has any
                 nearly = found[item].nearly or minimal(rests, groups)
                 found[item] = Finding(minimal(passing, groups), found[item].p_value | p_value, "", nearly, closest)
         open_ = np.array([item for item in open_ if not found[item].rests], dtype=np.int64)
@@ -153,6 +158,7 @@ def _try_sets(
     rests: list[list[Rest]] = [[] for _ in range(count)]
     probabilities: list[dict[tuple[int, ...], float]] = [{} for _ in range(count)]
     closest: list[Rest | None] = [None] * count
+    # priors are the same for a whole batch: sets that leave out the same ones are fixed together
     for dropped in dict.fromkeys(priors for _, _, priors in sets):
         own = [(left, rows) for left, rows, priors in sets if priors == dropped]
         fix = _fix_rests(problem, np.stack([rows for _, rows in own]), dropped)
@@ -186,6 +192,7 @@ def _subsets(groups: Sequence[Group], count: int, size: int) -> Iterator[tuple[t
 def _fix_rests(problem: Problem, left: Array, dropped: frozenset[int]) -> Fix:
     """Return the fixes (N * C,) of N problems without each of C sets of rows (C, m), set after set of each problem."""
     count = problem.batch_shape[0]
+    # item-major: the C sets of a problem lie together
     many = problem.take(np.repeat(np.arange(count), len(left)))
     return in_parts(leave_out(many, np.tile(left, (count, 1)), dropped), lambda part, _: fix_rest(part))
 
@@ -208,6 +215,7 @@ def _redo(problem: Problem, pool: Pool, near: float, better: Callable[[Problem, 
     """Return pools of which those whose cost is not that many times too large were made anew."""
     cost = np.where(np.isfinite(pool.cost[:, 0]), pool.cost[:, 0], np.nan)
     with np.errstate(invalid="ignore"):
+        # not: NaN, where there is no fix yet, is tried again as well
         items = np.flatnonzero(~(cost > near * _limit(pool.dof)) & (pool.dof >= 0))
     if not len(items):
         return pool
@@ -233,9 +241,11 @@ def _limit(dof: Array) -> Array:
 # the number of groups: the chi-square of thousands of rows does not notice a few that are wrong. It may be masked
 # where many agree on a wrong answer; a robust fix before it lets it start from what that one rejected.
 
-# Groups of more rows than this are tested again only where no smaller one stands out.
+# Groups of more rows than this are tested again only where no smaller one stands out: their test is an eigenvalue
+# problem of their size, and a station that is wrong stood out in the first round, in which all are tested.
 _LARGE = 16
-# Rivals are looked for in the place of each suspect where there are not more, so many for each.
+# Rivals are looked for in the place of each suspect where there are not more, the three that stand out most for each:
+# every one is a fix, and a list of many more explains nothing.
 _MOST_LEFT_OUT, _RIVALS = 8, 3
 
 
@@ -255,16 +265,19 @@ def grow(problem: Problem, groups: Sequence[Group], fix: Fix, rejected: Array, s
     start : Rest, optional
         Where to begin else: the best that was found without a few groups.
     """
+    # Bonferroni: clean data are accused once in a hundred, whatever the number of groups
     level = float(np.log(TEST / len(groups)))
     left = [i for i, group in enumerate(groups) if len(group.rows) == 1 and rejected[group.rows[0]]]
     rest = fix_without(problem, groups, left, fix.x) if left else fix
     if start is not None and not left:
         left, rest = list(start.left), start.fix
     while (worst := _worst(problem, groups, left, rest, level)) is not None:
+        # nothing would be left to agree
         if int(rest.dof) <= len(groups[worst].rows):
             return Finding(
                 (), {(): float(fix.p_value)}, f"{len(left)} of {len(groups)} left out, and still no rest agrees"
             )
+        # a station takes the place of its rows that were left out before
         left = [*(i for i in left if not _inside(groups[i], groups[worst])), worst]
         rest = fix_without(problem, groups, left, rest.x)
     left, rest = _take_back(problem, groups, left, rest, level)
@@ -324,6 +337,7 @@ def _take_back(
     """Return what is still left out, and the rest, once every group that fits the rest is taken back."""
     while left:
         chosen = [groups[i] for i in left]
+        # all errors jointly, to first order: the one that is most likely none is taken back if it does not stand out
         tail = [-error.log_tail for error in errors(influence(problem, rest.x), chosen)]
         best = int(np.argmin(tail))
         if tail[best] > -level:
@@ -349,6 +363,7 @@ def _rivals(problem: Problem, groups: Sequence[Group], left: list[int], rest: Fi
             if key in found or tail[j] > level:
                 continue
             other = fix_without(problem, groups, key, fix.x)
+            # no less likely than the test wants, or than the first explanation is
             agrees = bool(other.answered) and (
                 np.isnan(rest.p_value) or other.p_value >= min(TEST, float(rest.p_value))
             )

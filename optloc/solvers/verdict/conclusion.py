@@ -48,6 +48,7 @@ def conclude(problem: Problem, conclusion: Conclusion) -> Fix:
         return _contradictory(conclusion).reshape((1,))
     weights = np.array(np.broadcast_to(problem.weight, (1, problem.count))[0])
     weights[[row for suspect in explanations[0].suspects for row in suspect.rows]] = 0.0
+    # the rest stays as it was judged; several explanations are several positions
     several = len(explanations) > 1
     return replace(
         rest,

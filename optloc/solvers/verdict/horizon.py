@@ -10,12 +10,14 @@ from optloc.models.primitives import WGS84_A, WGS84_F, geodetic_normal
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
 
-# How deep a line may dip, Earth radii: refraction and low heights for a satellite, 1 600 km along the ground else.
+# Height above which a station is a satellite, Earth radii: above all aircraft, below all orbits.
 _SATELLITE = 1.0 + 100e3 / WGS84_A
+# How deep a line may dip: 5 km to a satellite, for refraction and for targets below the ellipsoid or badly measured; 50
+# km to others, a chord of 1 600 km along the ground: only what is clearly on the other side of the Earth is excluded.
 _GRAZE, _GROUND = 1.0 - 5e3 / WGS84_A, 1.0 - 50e3 / WGS84_A
 
 
-def hidden(problem: Problem, x: Array) -> Array:
+def is_hidden(problem: Problem, x: Array) -> Array:
     """Return which vectors x (N, size) place a target behind the Earth as seen from a station that hears it.
 
     The straight line may pass 5 km below the ellipsoid to a station above 100 km, and 50 km to others.
@@ -31,6 +33,7 @@ def hidden(problem: Problem, x: Array) -> Array:
     if not problem.frame.geodetic or problem.dimension != 3:
         return out
     position = np.broadcast_to(problem.stations.position, (len(x), *problem.stations.position.shape[-3:]))
+    # stretched along the axis the ellipsoid is the unit sphere, and lines stay lines
     stretch = np.array([1.0, 1.0, 1.0 / (1.0 - WGS84_F)]) / WGS84_A
     stations = problem.frame.to_ecef(position) * stretch
     for target, motion in enumerate(problem.motions):
@@ -39,7 +42,7 @@ def hidden(problem: Problem, x: Array) -> Array:
         slot, _ = problem.layout.find(state_names(target, len(problem.motions), 0)[0])
         point = problem.frame.to_ecef(x[:, slot.start : slot.start + 3]) * stretch
         for nodes in _heard(problem, target):
-            out |= _blocked(point, stations[:, nodes[0], nodes[1]], nodes[2])
+            out |= _is_blocked(point, stations[:, nodes[0], nodes[1]], nodes[2])
     return out
 
 
@@ -57,11 +60,12 @@ def _heard(problem: Problem, target: int) -> list[tuple[int, int, Array]]:
     return [(epoch, station, mask) for (epoch, station), mask in found.items()]
 
 
-def _blocked(point: Array, station: Array, heard: Array) -> Array:
+def _is_blocked(point: Array, station: Array, heard: Array) -> Array:
     """Return whether the line from point to station dips too deep; unit sphere coordinates."""
     limit = np.where((station**2).sum(-1) > _SATELLITE**2, _GRAZE, _GROUND)
     line = station - point
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        # the point of the segment next to the centre; at its ends nothing lies in between
         share = np.clip(-(point * line).sum(-1) / (line**2).sum(-1), 0.0, 1.0)
         nearest = ((point + share[:, None] * line) ** 2).sum(-1)
     return np.asarray(heard & (share > 0.0) & (nearest < limit**2))

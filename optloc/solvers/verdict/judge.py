@@ -29,8 +29,9 @@ def judge(problem: Problem, pool: Pool) -> Fix:
         Their candidates; starts that nobody has refined get the status `unavailable`.
     """
     if pool.curvature is None:
-        return _unrefined(problem, pool)
+        return _show_starts(problem, pool)
     fix = _plain(problem, pool, pool.curvature)
+    # rules cost more than a compiled fix: they are asked only where something stands against one
     if pool.plain is None:
         fix = _apply_rules(problem, pool, fix)
     elif not pool.plain.all():
@@ -106,7 +107,7 @@ def _apply_rules(problem: Problem, pool: Pool, fix: Fix) -> Fix:
     )
 
 
-def _unrefined(problem: Problem, pool: Pool) -> Fix:
+def _show_starts(problem: Problem, pool: Pool) -> Fix:
     """Return starts as fixes whose status says that they are not refined."""
     count, n = len(pool), problem.layout.n_shared
     name = pool.stages[-1].name if pool.stages else "start"

@@ -46,6 +46,7 @@ def settle(problem: Problem, pool: Pool, stage: Stage, equations: Equations = eq
     x, cost, face = pool.x[rows, best], pool.cost[rows, best], pool.face[rows, best]
     found = np.isfinite(cost)
     with np.errstate(all="ignore"):
+        # unfound ones are evaluated at zero: a batch has no holes, and their curvature is not shown
         at = equations(problem, np.where(found[:, None], x, 0.0))
         curvature = measure_curvature(problem, at, x, np.where(found, face, 0))
     slots = _rivals(problem, pool, x, cost, curvature)
@@ -71,6 +72,7 @@ def _without_runs_to_infinity(problem: Problem, pool: Pool) -> tuple[Pool, Array
         return pool, none
     distance = distance_of(problem, problem.layout.take(pool.x, "position"))
     with np.errstate(invalid="ignore"):
+        # an unfinished point out there is on its way; a finished one counts up to where fronts are flat
         remote = (distance > FLAT) | ((distance > FAR) & (pool.code != Status.OK))
     if not remote.any():
         return pool, none
@@ -78,6 +80,7 @@ def _without_runs_to_infinity(problem: Problem, pool: Pool) -> tuple[Pool, Array
     far = np.where(remote, pool.cost, np.inf).min(1)
     with np.errstate(invalid="ignore"):
         rivals = np.isfinite(near) & (near - far <= AMBIGUOUS_GAP)
+        # the finite minimum is answered, and the run to infinity is named where it costs no less by the margin
         alike = rivals & (far - near < AMBIGUOUS_GAP)
     return replace(pool, cost=np.where(remote & rivals[:, None], np.inf, pool.cost)), alike
 

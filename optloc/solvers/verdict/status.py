@@ -74,16 +74,20 @@ def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     code, reason = np.array(pool.code[:, 0]), fill(len(pool), "")
     cost = np.where(np.isfinite(pool.cost[:, 0]), pool.cost[:, 0], np.nan)
     p_value, nearest = tail_probability(cost, pool.dof), np.min(gap, axis=1, initial=np.inf)
+    # a row that is absent may hold anything
     broken = ~np.broadcast_to((np.isfinite(problem.z) | (problem.weight == 0.0)).all(-1), code.shape)
     few = (pool.dof < 0) & ~broken
     missing = ~np.isfinite(cost) & ~broken & ~few
     answered = ~(broken | few | missing)
-    weak = answered & ~_determined(curvature)
+    # what is missing, in this order: data, rows, a candidate; what is left is an answer, perhaps a bad one
+    weak = answered & ~_is_determined(curvature)
     distance = distance_of(problem, _position(problem, pool))
     far = answered & _runs_away(problem, curvature, distance, (code != Status.OK) | weak | (p_value < DOUBT))
+    # far away every direction is weak: how far says more
     weak &= ~far
     code[broken], code[few], code[far] = Status.REJECTED, Status.TOO_FEW_ROWS, Status.UNBOUNDED
     code[weak] = Status.SINGULAR_GEOMETRY
+    # of what converged: another status says something worse than that there are two places
     code[(code == Status.OK) & (nearest < AMBIGUOUS_GAP)] = Status.AMBIGUOUS
     _doubt(reason, (code == Status.OK) & (p_value < DOUBT), p_value)
     for i in np.flatnonzero(few):
@@ -102,6 +106,7 @@ def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     if pool.endless is not None:
         rivalled = pool.endless & (code == Status.OK)
         code[rivalled], reason[rivalled] = Status.AMBIGUOUS, "positions ever farther away explain the data as well"
+    # what refinement shows of an answer by itself; claims of proofs replace it below
     certificate = fill(len(pool), LOCAL)
     certificate[~np.isin(code, (Status.OK, Status.AMBIGUOUS))] = UNKNOWN
     if pool.loss:
@@ -144,7 +149,7 @@ def fill(count: int, value: object) -> Array:
     return out
 
 
-def _determined(curvature: Curvature) -> Array:
+def _is_determined(curvature: Curvature) -> Array:
     """Return where the data leave no direction open, (N,)."""
     count = len(curvature.covariance)
     regular = np.ones(count, dtype=bool) if curvature.regular is None else curvature.regular
@@ -158,9 +163,11 @@ def _information(curvature: Curvature) -> Array:
 
 def _runs_away(problem: Problem, curvature: Curvature, distance: Array, lost: Array) -> Array:
     """Return where a position is so far away, and so badly known, that the data say a direction only, (N,)."""
-    covariance = np.where(_determined(curvature)[:, None, None], curvature.covariance, np.nan)
+    covariance = np.where(_is_determined(curvature)[:, None, None], curvature.covariance, np.nan)
     with np.errstate(invalid="ignore"):
+        # an error larger than the distance from the stations: a direction, not a place
         loose = np.trace(covariance, axis1=-2, axis2=-1) > (distance * spread_of(problem)[1]) ** 2
+        # far: only a fix that is otherwise good stands; flat: none does, since wave fronts are
         return np.asarray(((lost | loose) & (distance > FAR)) | (distance > FLAT))
 
 
@@ -181,6 +188,7 @@ def _ambiguous(problem: Problem, gap: float) -> str:
 
 def _open(problem: Problem, information: Array) -> str:
     """Return what the data leave open: combinations of biases by name, else the direction of the position."""
+    # biases trade with each other: that combination says more than a direction
     named = open_sentences(problem.layout, information) if problem.biases and np.isfinite(information).all() else ()
     return "; ".join(named) or weak_direction(problem, information)
 
@@ -190,6 +198,7 @@ def _explain_missing(problem: Problem, items: Array, code: Array, reason: Array)
     if not len(items):
         return
     single = problem.epochs == 1 or problem.stations.position.shape[-3] == 1
+    # the graph of ranges is that of one position: stations of a moving run link themselves
     found = ranges(problem.take(items)) if single else None
     for place, i in enumerate(items):
         groups = () if found is None else found.groups[int(found.pattern[place])]
@@ -251,6 +260,7 @@ def _hold_against_constraints(pool: Pool, cost: Array, code: Array, reason: Arra
     assert free is not None
     held = np.array([len(active) for active in pool.curvature.active])
     with np.errstate(invalid="ignore"):
+        # whether the data agree without constraints; without redundancy they always do
         noise = bool(pool.loss) | (pool.dof <= 0) | (chdtrc(np.maximum(pool.dof, 1), free) >= DOUBT)
         dear = chdtrc(np.maximum(held, 1), np.maximum(cost - free, 0.0)) < DOUBT
     for i in np.flatnonzero((held > 0) & np.isin(code, ANSWERED) & np.isfinite(free) & noise & dear):
