@@ -285,13 +285,14 @@ def chart_at(cost: Cost, x: Array, box: Box) -> tuple[Chart, bool]:
 @compiled
 def accuracy_floor(cost: Cost, chart: Chart) -> float:
     """Return the sizes of what residuals are differences of, beside the nodes: measurements and coordinates."""
+    kinds, data, weight, w, origin = cost.kinds, cost.data, cost.weight, cost.w, chart.origin
     total = 0.0
-    for i in range(cost.w.shape[0]):
-        total += cost.w[i] * cost.w[i]
+    for i in range(w.shape[0]):
+        total += w[i] * w[i]
     total = sqrt(total)
-    reach = abs(chart.origin[0]) + abs(chart.origin[1]) + abs(chart.origin[2])
-    for j in range(cost.kinds.shape[0]):
-        total += cost.weight[j] * size_of(cost.kinds[j], cost.data[j], reach)
+    reach = abs(origin[0]) + abs(origin[1]) + abs(origin[2])
+    for j in range(kinds.shape[0]):
+        total += weight[j] * size_of(kinds[j], data[j], reach)
     return total
 
 
