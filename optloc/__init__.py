@@ -8,8 +8,7 @@ from typing import Any
 from optloc.base import frames, units
 from optloc.base.errors import InvalidProblem, NoSolution, OptlocError
 from optloc.base.frames import CARTESIAN, ECEF, Frame
-from optloc.base.status import Certificate, Status
-from optloc.base.types import Bias, Motion, Prior, Rows, Stations
+from optloc.base.types import Bias, Certificate, Motion, Prior, Rows, Stations, Status
 from optloc.bounds.crlb import Course, crlb, crlb_course
 from optloc.bounds.observability import Observability, observability
 from optloc.linear import constraints

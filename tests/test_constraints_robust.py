@@ -79,8 +79,8 @@ REGIONS = {
 @pytest.mark.parametrize("name", REGIONS)
 def test_a_region_that_the_data_contradict_is_named(name, method):
     fix = solve(REGIONS[name](), method)
-    if (name, method) == ("speed", "cauchy") and fix.status == Status.MAX_ITERATIONS:
-        return  # that no answer was reached is said, too
+    if (name, method) == ("speed", "cauchy") and fix.status in (Status.MAX_ITERATIONS, Status.STALLED):
+        return  # that no answer was reached is said, too; which of both hangs on the last bit of a step
     assert fix.status == Status.CONTRADICTORY
     assert {"box": "x upper", "polygon": "polygon edge 3", "height band": "height lower", "speed": "speed upper"}[
         name

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from optloc.base.errors import InvalidProblem, NoSolution, OptlocError, nearest
-from optloc.base.status import Status
+from optloc.base.types import Status
 
 
 @pytest.mark.parametrize(

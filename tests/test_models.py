@@ -8,8 +8,7 @@ from cases import RATE, STATIONS, TARGET, plain_h, turn_matrix, turned
 
 from optloc import ECEF, MODELS
 from optloc.models import Point, lifted_row
-from optloc.models.jet import Jet
-from optloc.models.primitives import WGS84_A, WGS84_F, geodetic_height, rotate, wrap
+from optloc.models.primitives import WGS84_A, WGS84_F, Jet, geodetic_height, rotate, wrap
 
 KINDS = [(kind, d) for kind, model in MODELS.items() for d in model.dimensions]
 BATCH = 40
@@ -204,7 +203,7 @@ def test_wrap_keeps_the_angle_and_lands_in_one_turn():
 
 # --------------------------------------------------------------------------------------------------- Jet alone
 def test_jet_arithmetic_and_functions_follow_the_rules_of_calculus():
-    from optloc.models import jet as functions
+    from optloc.models import primitives as functions
 
     x0, y0 = np.array([0.7, 1.3, 2.9]), np.array([1.1, -0.4, 0.6])
 

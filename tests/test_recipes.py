@@ -20,8 +20,7 @@ from optloc import MODELS, InvalidProblem, Motion, Status, solve
 from optloc.cli import app
 from optloc.compute.sums import equations_at
 from optloc.compute.trace import evaluate, trace
-from optloc.linear.evaluate import given
-from optloc.linear.indices import plans
+from optloc.linear.evaluate import given, plans
 from optloc.linear.normal import linearise
 from optloc.study.trial import compute
 from optloc.track import collected, polynomial, tracked

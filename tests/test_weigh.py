@@ -8,8 +8,7 @@ from runs import drawn, estimated, run, truth
 
 import optloc
 from optloc.compute.sums import equations_at
-from optloc.linear.normal import linearise, marginal
-from optloc.linear.station_noise import weighed
+from optloc.linear.normal import linearise, marginal, weighed
 from optloc.problem.noise import dense
 from optloc.solvers.refine import refine
 

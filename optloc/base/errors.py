@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from optloc.base.status import Status
+from optloc.base.types import Status
 
 __all__ = ["InvalidProblem", "NoSolution", "OptlocError", "nearest"]
 

@@ -17,7 +17,7 @@ from optloc.bounds.crlb import Course, crlb_course
 from optloc.cli.options import coordinates
 from optloc.cli.output import dumps, say, write_picture, write_text
 from optloc.files import Loaded, read
-from optloc.files.words import Units
+from optloc.files.schema import Units
 from optloc.problem.epochs import by_epoch, separable, tied
 from optloc.problem.layout import Layout, Slot, state_names
 from optloc.problem.problem import Problem

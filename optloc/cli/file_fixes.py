@@ -11,8 +11,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.linalg import error_ellipse
-from optloc.base.status import Status
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.bounds.observability import Observability, observability
 from optloc.cli.output import Columns, bar, covariance_columns, geodetic_columns, join_tables, records
 from optloc.files import Loaded

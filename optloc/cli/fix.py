@@ -14,8 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.status import Status
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.cli.file_fixes import (
     FileFixes,
     active_of,

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.status import Status
+from optloc.base.types import Status
 from optloc.cli.crlb import vector
 from optloc.cli.output import dumps, write_text
 from optloc.files import Loaded, read

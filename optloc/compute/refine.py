@@ -10,9 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.linalg import PIVOT
-from optloc.base.status import Status
 from optloc.base.threads import mapped
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge_lane
 from optloc.compute.equations import chunks, normal_at
 from optloc.compute.jit import compiled

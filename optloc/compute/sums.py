@@ -9,8 +9,7 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.compute.jit import enabled
 from optloc.compute.pack import pack
-from optloc.linear.normal import Normal, linearise, normal, with_priors
-from optloc.linear.station_noise import depends_on_place, whitener_at
+from optloc.linear.normal import Normal, depends_on_place, linearise, normal, whitener_at, with_priors
 from optloc.problem.epochs import windows
 from optloc.problem.noise import Whitener
 from optloc.problem.problem import Problem

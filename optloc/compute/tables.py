@@ -10,8 +10,7 @@ import numpy as np
 from optloc.base.cache import Cache
 from optloc.base.types import Array
 from optloc.compute.trace import Traced, trace
-from optloc.linear.evaluate import given
-from optloc.linear.indices import Plan, Terms, plans
+from optloc.linear.evaluate import Plan, Terms, given, plans
 from optloc.problem.problem import Problem
 
 # The order in which rows are evaluated, and the unknowns that each group of them touches.

@@ -13,10 +13,9 @@ import numpy as np
 
 from optloc.base.cache import Cache
 from optloc.base.types import Array
-from optloc.linear.evaluate import join
-from optloc.linear.indices import Plan
+from optloc.linear.evaluate import Plan, join
 from optloc.models import Model
-from optloc.models.jet import Jet
+from optloc.models.primitives import Jet
 from optloc.problem.problem import Problem
 
 # Numbers that are not known yet: what a function does with them is written down, each operation once.
@@ -242,7 +241,7 @@ def _function(operation: int) -> Callable[..., Symbol]:
     return record
 
 
-# What a measurement function finds here by way of `optloc.models.namespace`.
+# What a measurement function finds here by way of `optloc.models.primitives`.
 sqrt, hypot, atan2, sin, cos, log, exp = (_function(op) for op in (SQRT, HYPOT, ATAN2, SIN, COS, LOG, EXP))
 
 

@@ -10,10 +10,8 @@ import numpy as np
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
 from optloc.base.units import Conversion
-from optloc.files.epochs import Epochs
-from optloc.files.schema import MeasurementsTable
-from optloc.files.table import Table
-from optloc.files.words import Units, join, kind_model
+from optloc.files.schema import MeasurementsTable, Units, join, kind_model
+from optloc.files.table import Epochs, Table
 from optloc.models import Model
 
 ESTIMATE = "estimate"

@@ -13,13 +13,11 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
 from optloc.base.types import Array, Rows, Stations
 from optloc.base.units import SPEED_OF_LIGHT
-from optloc.files.epochs import Epochs, Keys, epochs_of, need_clock
 from optloc.files.measurements import ESTIMATE, Chunk, check_repeats, chunks_of, square, with_baseline
-from optloc.files.schema import ConstraintTable, ProblemFile, read_document
+from optloc.files.schema import ConstraintTable, ProblemFile, Units, join, read_document
 from optloc.files.stations import over_epochs, survey
-from optloc.files.table import Table, table_of
+from optloc.files.table import Epochs, Keys, Table, epochs_of, need_clock, table_of
 from optloc.files.unknowns import bias_of, constraints_of, known_of, motions_of, needs_clock, places_of, prior_of
-from optloc.files.words import Units, join
 from optloc.models import MODELS
 from optloc.problem.check import checked
 from optloc.problem.noise import Block, Noise, arrivals, group, together

@@ -10,10 +10,8 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import CARTESIAN, ECEF, Frame, ecef_to_geodetic
 from optloc.base.types import Array, Stations
-from optloc.files.epochs import Epochs
-from optloc.files.schema import FrameTable, StationsTable
-from optloc.files.table import Table
-from optloc.files.words import Units, join
+from optloc.files.schema import FrameTable, StationsTable, Units, join
+from optloc.files.table import Epochs, Table
 
 _XYZ, _GEODETIC, _RATES = ("x", "y", "z"), ("lat_deg", "lon_deg", "height"), ("vx", "vy", "vz")
 _QUATERNION = ("qw", "qx", "qy", "qz")

@@ -12,7 +12,6 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
 from optloc.base.types import Array, Band, Bias, Motion, Polygon, Prior, Rows, Stations
 from optloc.base.units import SPEED_OF_LIGHT, Quantity
-from optloc.files.epochs import Epochs
 from optloc.files.schema import (
     Amount,
     BiasTable,
@@ -23,10 +22,11 @@ from optloc.files.schema import (
     ProblemFile,
     StationsTable,
     TargetTable,
+    Units,
+    join,
 )
 from optloc.files.stations import spread, survey
-from optloc.files.table import Table, table_of
-from optloc.files.words import Units, join
+from optloc.files.table import Epochs, Table, table_of
 from optloc.linear.constraints import box, height, polygon, speed, visible
 from optloc.models import MODELS
 from optloc.problem.bias import family

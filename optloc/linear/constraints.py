@@ -12,8 +12,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.linalg import Tangent, tangent
 from optloc.base.types import Array, Band, Polygon
 from optloc.linear.evaluate import to_ecef
-from optloc.models.jet import Jet
-from optloc.models.primitives import Point
+from optloc.models.primitives import Jet, Point
 from optloc.models.surfaces import SURFACES
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem

@@ -7,8 +7,7 @@ from typing import Any
 
 from optloc.base.arrays import foreign, library, placed
 from optloc.base.errors import InvalidProblem
-from optloc.linear.normal import Normal, covariance, linearise, normal, step, with_priors
-from optloc.linear.station_noise import depends_on_place, whitener_at
+from optloc.linear.normal import Normal, covariance, depends_on_place, linearise, normal, step, whitener_at, with_priors
 from optloc.problem.noise import Whitener
 from optloc.problem.problem import Problem
 

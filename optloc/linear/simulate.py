@@ -6,7 +6,7 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.linear.evaluate import predict
-from optloc.linear.station_noise import with_offsets
+from optloc.linear.normal import with_offsets
 from optloc.models import MODELS
 from optloc.models.primitives import wrap
 from optloc.problem.noise import Noise

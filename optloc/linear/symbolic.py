@@ -8,8 +8,7 @@ import numpy as np
 
 from optloc.base.types import Array, Band
 from optloc.linear.constraints import conjunction
-from optloc.linear.evaluate import given, join, to_ecef
-from optloc.linear.indices import Terms, plans
+from optloc.linear.evaluate import Terms, given, join, plans, to_ecef
 from optloc.models.primitives import Point, wrap
 from optloc.models.surfaces import SURFACES
 from optloc.problem.layout import state_names

@@ -14,8 +14,17 @@ from typing import Any
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.registry import Table
 from optloc.base.units import UNITS
-from optloc.models.namespace import namespace
-from optloc.models.primitives import Components, Point, distance, dot, geodetic_height, local, range_rate, wrap
+from optloc.models.primitives import (
+    Components,
+    Point,
+    distance,
+    dot,
+    geodetic_height,
+    local,
+    namespace,
+    range_rate,
+    wrap,
+)
 
 __all__ = [
     "MODELS",

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.status import Status
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.plot import style
 from optloc.plot.bound_map import levels
 from optloc.plot.style import (

@@ -11,7 +11,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Rows
 from optloc.base.units import SI_UNIT
 from optloc.linear.evaluate import differentiate
-from optloc.linear.station_noise import weighed
+from optloc.linear.normal import weighed
 from optloc.models import MODELS
 from optloc.plot.style import BLACK, BLUE, GREY, ORANGE, SKY, figure_class, finish, grid
 from optloc.problem.fix import Fix

@@ -13,8 +13,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
 from optloc.base.linalg import error_ellipse
-from optloc.base.status import Status
-from optloc.base.types import Array, Band, Polygon
+from optloc.base.types import Array, Band, Polygon, Status
 from optloc.problem.fix import Fix
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem

@@ -11,8 +11,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem, NoSolution
 from optloc.base.frames import Frame
 from optloc.base.records import Axes, change
-from optloc.base.status import Certificate, Status
-from optloc.base.types import Array
+from optloc.base.types import Array, Certificate, Status
 from optloc.problem.layout import Layout
 
 _STATES = ("position", "velocity", "acceleration")

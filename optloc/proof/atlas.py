@@ -20,7 +20,7 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled
-from optloc.proof.nodes.forms import Triple, blend, inner, pull, triple
+from optloc.proof.nodes.node import Triple, blend, inner, pull, triple
 
 
 class Minima(NamedTuple):

@@ -122,7 +122,11 @@ def _prove(pose: Posed, asked: Asked) -> Answered:
         with np.errstate(all="ignore"):  # plain Python would warn of what has no bound
             _loop(pose.take(part), asked.take(part), out.take(part))
 
-    mapped(stretch, range(0, n, length), None if enabled() else 1)
+    if enabled():
+        mapped(stretch, range(0, n, length))
+        return out
+    for first in range(0, n, length):  # plain Python holds the interpreter: threads would wait for each other
+        stretch(first)
     return out
 
 
@@ -134,36 +138,31 @@ def _plain(array: Array) -> Array:
 @compiled
 def _loop(pose: Posed, asked: Asked, out: Answered) -> None:
     """Prove what is asked of each fix, and write what became of it."""
-    # Arrays by names of their own: every look into a record counts references, here at each fix.
-    kinds, data, K, w = pose.kinds, pose.data, pose.K, pose.w
-    x, others, known, kappa, eps = asked.x, asked.others, asked.known, asked.kappa, asked.eps
-    region, fallback, budget = asked.region, asked.fallback, asked.budget
-    verdict, boxes, bound, everywhere, found = out.verdict, out.boxes, out.bound, out.everywhere, out.found
+    kinds, data, K = pose.kinds, pose.data, pose.K
     J = K.shape[2]
     A, weight, groups, box = np.empty((J, J)), np.empty(J), empty_groups(J), empty_box(K.shape[1], J)
-    for i in range(len(x)):
+    for i in range(len(asked.x)):
         rows = K[i if len(K) > 1 else 0]
         if i == 0 or len(K) > 1:
             set_geometry(kinds, rows, A, weight, groups)
-        cost, own = Cost(kinds, data[i if len(data) > 1 else 0], rows, w[i], A, weight, groups), box
+        cost, own = Cost(kinds, data[i if len(data) > 1 else 0], rows, pose.w[i], A, weight, groups), box
         # Rows that are absent in this problem alone: the tables of the batch are too wide for it.
         if (weight == 0.0).any():
             cost = _present(cost)
             own = empty_box(cost.K.shape[0], cost.K.shape[1])
-        minima, low, high = others[i, : known[i]], region[i, 0], region[i, 1]
-        everywhere[i] = isnan(low[0])
-        if everywhere[i]:
-            verdict[i], boxes[i], bound[i] = prove_everywhere(
-                cost, own, x[i], minima, kappa[i], eps[i], budget[i], found[i]
-            )
-            if verdict[i] != OPEN:
+        x, kappa, eps, found = asked.x[i], asked.kappa[i], asked.eps[i], out.found[i]
+        minima, low, high = asked.others[i, : asked.known[i]], asked.region[i, 0], asked.region[i, 1]
+        boxes = 0
+        out.everywhere[i] = isnan(low[0])
+        if out.everywhere[i]:
+            verdict, boxes, bound = prove_everywhere(cost, own, x, minima, kappa, eps, asked.budget[i], found)
+            out.verdict[i], out.boxes[i], out.bound[i] = verdict, boxes, bound
+            if verdict != OPEN:
                 continue
-            everywhere[i] = False
-            low, high = fallback[i, 0], fallback[i, 1]
-        verdict[i], more, bound[i] = prove(
-            cost, own, x[i], minima, kappa[i], eps[i], budget[i], low, high, False, found[i]
-        )
-        boxes[i] += more
+            out.everywhere[i] = False
+            low, high = asked.fallback[i, 0], asked.fallback[i, 1]
+        verdict, more, bound = prove(cost, own, x, minima, kappa, eps, asked.budget[i], low, high, False, found)
+        out.verdict[i], out.boxes[i], out.bound[i] = verdict, boxes + more, bound
 
 
 @compiled

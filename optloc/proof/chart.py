@@ -9,9 +9,8 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, inlined, zero
-from optloc.proof.box import ROW_WIDTH, bound_nodes, cost_at
-from optloc.proof.convex import G0, G1, G2, SUMS, convex, curve_nodes, sum_up
-from optloc.proof.linear3 import invert, roughly_principal
+from optloc.compute.systems import invert, roughly_principal
+from optloc.proof.box import G0, G1, G2, ROW_WIDTH, SUMS, bound_nodes, convex, cost_at, curve_nodes, sum_up
 from optloc.proof.nodes.dispatch import size_of
 from optloc.proof.nodes.node import CURVE_WIDTH, H00, H01, H02, H11, H12, H22, NODE_WIDTH, RANGE
 
@@ -102,7 +101,7 @@ class Box(NamedTuple):
     line : array (6,)
         Working memory.
     nodes, rows, curves, sums : array (J, NODE_WIDTH), (q, ROW_WIDTH), (J, CURVE_WIDTH), (SUMS,)
-        Tables, see `optloc.proof.box` and `optloc.proof.convex`.
+        Tables, see `optloc.proof.box` and `optloc.proof.box`.
     solve : array (3, 3)
         Working memory.
     cut : array (6,)
@@ -285,14 +284,13 @@ def chart_at(cost: Cost, x: Array, box: Box) -> tuple[Chart, bool]:
 @compiled
 def accuracy_floor(cost: Cost, chart: Chart) -> float:
     """Return the sizes of what residuals are differences of, beside the nodes: measurements and coordinates."""
-    kinds, data, weight, w, origin = cost.kinds, cost.data, cost.weight, cost.w, chart.origin
     total = 0.0
-    for i in range(w.shape[0]):
-        total += w[i] * w[i]
+    for i in range(cost.w.shape[0]):
+        total += cost.w[i] * cost.w[i]
     total = sqrt(total)
-    reach = abs(origin[0]) + abs(origin[1]) + abs(origin[2])
-    for j in range(kinds.shape[0]):
-        total += weight[j] * size_of(kinds[j], data[j], reach)
+    reach = abs(chart.origin[0]) + abs(chart.origin[1]) + abs(chart.origin[2])
+    for j in range(cost.kinds.shape[0]):
+        total += cost.weight[j] * size_of(cost.kinds[j], cost.data[j], reach)
     return total
 
 

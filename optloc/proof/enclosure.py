@@ -8,8 +8,8 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, inlined, zero
+from optloc.compute.systems import inverse, invert
 from optloc.proof.chart import LOOSE, Box, Chart, Cost
-from optloc.proof.linear3 import inverse, invert
 from optloc.proof.nodes.dispatch import ball_of, has_ray, ray_of
 from optloc.proof.nodes.node import FORCE, LINEAR, PHI, RANGE
 

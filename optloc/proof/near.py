@@ -9,11 +9,18 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, inlined
+from optloc.compute.systems import inverse, positive
 from optloc.proof.box import (
     DEPTH,
     DIRECTION,
+    G0,
+    G1,
+    G2,
     bound_nodes,
+    clip_to_stationary,
+    convex,
     cost_at,
+    curve_nodes,
     cut_out,
     is_empty,
     least_left,
@@ -25,12 +32,11 @@ from optloc.proof.box import (
     push_halves,
     rounding,
     shrink,
+    sum_up,
     uncut,
 )
 from optloc.proof.chart import Box, Chart, Cost, accuracy_floor, chart_at, curve_box, is_convex, place, value_at
-from optloc.proof.convex import G0, G1, G2, clip_to_stationary, convex, curve_nodes, sum_up
 from optloc.proof.enclosure import enclose
-from optloc.proof.linear3 import inverse, positive
 from optloc.proof.nodes.node import FORCE, H00, H01, H02, H11, H12, H22, HIGH, LOW, RANGE, SLOPE0, SLOPE1, SLOPE2
 
 # A few damped Newton steps in search coordinates: which minimum a low point belongs to.

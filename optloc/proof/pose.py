@@ -1,17 +1,18 @@
-"""From a batch of problems to what is proven about them: ``f(x) = |K phi(x) - w|^2`` over the position alone."""
+"""From a batch of problems to what is proven of them, ``f(x) = |K phi(x) - w|^2`` over the position, and for which."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from optloc.base.types import Array
-from optloc.linear.indices import columns, plans
-from optloc.linear.normal import prior_parts
-from optloc.linear.station_noise import weighed
+from optloc.base.types import Array, Band
+from optloc.compute.jit import enabled
+from optloc.linear.constraints import is_exact
+from optloc.linear.evaluate import columns, plans
+from optloc.linear.normal import prior_parts, weighed
 from optloc.models import MODELS, Model
 from optloc.problem.noise import Whitener, variances, whiten
 from optloc.problem.problem import Problem
@@ -277,7 +278,7 @@ def pose_costs(problem: Problem) -> Posed:
     Parameters
     ----------
     problem : Problem
-        N problems within the scope of the proof, see `optloc.proof.scope.unsupported`.
+        N problems within the scope of the proof, see `optloc.proof.pose.unsupported`.
     """
     problem = weighed(problem)
     others = _Others.of(problem)
@@ -413,3 +414,99 @@ def _turned(problem: Problem, others: _Others, known: Array) -> Array:
 def _most(model: Model) -> float:
     """Return how large the node of a kind with a period can be."""
     return sum(abs(factor) * named(node).most for factor, node in model.nodes)
+
+
+# What the proof covers: one static position, rows made of ranges, angles, ratios and heights.
+
+# Different ranges, angles and ratios, and unknowns beside the position, of a problem whose proof is worth the time. It
+# goes with the square of the nodes, and plain Python takes a thousand times longer.
+MOST_NODES, MOST_NODES_PLAIN, MOST_UNKNOWNS = 128, 24, 128
+
+
+def unsupported(problem: Problem) -> str:
+    """Return why a problem is beyond the proof, in a sentence that names what, or nothing where it is within.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of problems.
+    """
+    return next(_reasons(problem), "")
+
+
+def _reasons(problem: Problem) -> Iterator[str]:
+    if len(problem.motions) != 1:
+        yield f"there are {len(problem.motions)} targets, and the proof is for one"
+        return
+    motion = problem.motions[0]
+    if motion.known is not None or not any(slot.name == "position" for slot in problem.layout.shared):
+        yield "no position is common to all rows"
+    if motion.order > 0:
+        yield "the target moves, and the proof is for one that stays"
+    yield from _beyond_rows(problem)
+    yield from _beyond_biases(problem)
+    yield from _beyond_stations(problem)
+    yield from _beyond_constraints(problem)
+    known = {"position", "stations", *(bias.name for bias in problem.biases)}
+    # What `optloc.proof.pose` does not write as rows would be left out of the cost without a word.
+    for name, _, _ in prior_parts(problem):
+        if name not in known:
+            yield f"the prior on {name} is not covered"
+
+
+def _beyond_rows(problem: Problem) -> Iterator[str]:
+    for rows in problem.rows:
+        model = MODELS[rows.kind]
+        if model.velocity:
+            yield f"{rows.kind} rows depend on velocities, which the proof does not bound"
+        elif model.ranges is None and not model.nodes:
+            yield f"{rows.kind} rows are neither sums of ranges nor a kind whose bounds are known"
+    most = MOST_NODES if enabled() else MOST_NODES_PLAIN
+    if problem.count > most and _nodes(problem) > most:
+        without = "" if enabled() else " without machine code"
+        yield f"there are {_nodes(problem)} different ranges and angles, and the proof takes {most}{without}"
+    if problem.layout.size - problem.dimension > MOST_UNKNOWNS:
+        yield f"there are {problem.layout.size} unknowns, and the proof takes {MOST_UNKNOWNS}"
+
+
+def _nodes(problem: Problem) -> int:
+    """Return how many different ranges, angles, ratios and heights the rows are made of."""
+    moving, own = problem.stations.position.shape[-3] > 1, 0
+    found: set[tuple[int, int]] = set()
+    for rows in problem.rows:
+        model = MODELS[rows.kind]
+        if model.ranges is None:
+            own += rows.count * len(model.nodes)
+            continue
+        when = rows.epoch if moving else np.zeros_like(rows.epoch)
+        for index in (rows.a, rows.b)[: model.stations]:
+            found.update(zip(index.tolist(), when.tolist(), strict=True))
+    return own + len(found)
+
+
+def _beyond_biases(problem: Problem) -> Iterator[str]:
+    angular = np.concatenate([np.full(rows.count, MODELS[rows.kind].period is not None) for rows in problem.rows])
+    for bias in problem.biases:
+        if bias.form not in ("offset", "drift"):
+            yield f"the {bias.form} {bias.name!r} multiplies what it touches, and the proof takes what is added"
+        elif bias.sigma is None and angular[bias.row].any():
+            yield f"the bias {bias.name!r} of angles has no prior, and may be whole turns"
+
+
+def _beyond_stations(problem: Problem) -> Iterator[str]:
+    covariance = problem.stations.covariance
+    if covariance is None:
+        return
+    # A sphere is what makes the nearest place to the surveyed one lie on the line to the target.
+    same = np.eye(problem.dimension) * covariance[..., :1, :1]
+    if not np.allclose(covariance, same, rtol=1e-9, atol=0.0):
+        yield "the station errors differ from axis to axis"
+    bent = [rows.kind for rows in problem.rows if MODELS[rows.kind].ranges is None and MODELS[rows.kind].stations]
+    if bent:
+        yield f"station errors enter {bent[0]} rows in a way that depends on the place"
+
+
+def _beyond_constraints(problem: Problem) -> Iterator[str]:
+    for constraint in problem.constraints:
+        if is_exact(constraint) and isinstance(constraint, Band) and constraint.kind not in ("height", "plane"):
+            yield f"the equality {constraint.name!r} is neither a height nor a plane"

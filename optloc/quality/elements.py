@@ -12,8 +12,7 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
 from optloc.linear.constraints import exact, tangent_at
 from optloc.linear.evaluate import differentiate
-from optloc.linear.normal import prior_parts
-from optloc.linear.station_noise import weighed
+from optloc.linear.normal import prior_parts, weighed
 from optloc.models import MODELS
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.layout import emission_name

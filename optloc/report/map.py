@@ -11,8 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from optloc.base.linalg import error_ellipse
-from optloc.base.status import Status
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.linear.evaluate import differentiate
 from optloc.models import MODELS
 from optloc.plot.style import figure_class, states_of

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.status import Status
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.several.sets import value_width

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.status import Status
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.compute.sums import equations_at
 from optloc.linear.normal import covariance
 from optloc.models import MODELS

@@ -15,9 +15,8 @@ from optloc.problem.problem import Problem
 from optloc.solvers.certify.relaxations import Reference, reference_bound
 from optloc.solvers.starts.angles import Bearings, bearings, by_directions, instrumental, least_worst
 from optloc.solvers.starts.heights import height_starts
-from optloc.solvers.starts.position import squared_range_starts
-from optloc.solvers.starts.registration import closed_form, registrable, relax_run, run_starts
-from optloc.solvers.starts.several_positions import one_position
+from optloc.solvers.starts.position import one_position, over_ground, registrable, squared_range_starts
+from optloc.solvers.starts.registration import closed_form, relax_run, run_starts
 from optloc.solvers.starts.squared_range import every, hull, minimum, shor
 
 
@@ -119,6 +118,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "exact: all points that fit",
         "0.1 ms",
         "Ho, Chan 1997, exact for the ellipsoid",
+        serves=over_ground,
         starts={"gtrs": height_starts, "roots": height_starts, "socp": height_starts},
     ),
     "range_height_conic": Formulation(
@@ -127,6 +127,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "rank one within 25 degrees of the point below",
         "1 ms",
         "Shor 1987",
+        serves=over_ground,
         starts={"sdp": partial(height_starts, relax=True)},
     ),
     "bearing_ls": Formulation(

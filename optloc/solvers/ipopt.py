@@ -13,12 +13,10 @@ from formulations.backend import Choice, choice_for
 from formulations.nls import Program
 from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem
-from optloc.base.status import Status
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.compute.sums import equations_at
 from optloc.linear.constraints import conjunction, face_of, faces, tangent_at
-from optloc.linear.normal import decrement, prior_parts, step
-from optloc.linear.station_noise import weighed
+from optloc.linear.normal import decrement, prior_parts, step, weighed
 from optloc.linear.symbolic import bounds, constrained, parameters, residual
 from optloc.problem.fix import Stage
 from optloc.problem.noise import whiten
@@ -26,8 +24,8 @@ from optloc.problem.problem import Problem
 from optloc.solvers.inequalities import without_broken
 from optloc.solvers.pool import Pool, begin, offer
 from optloc.solvers.starts.block_averages import average_blocks
-from optloc.solvers.starts.position import complete, spread_of
-from optloc.solvers.starts.registration import BLOCKS, group_alike, registrable
+from optloc.solvers.starts.position import complete, registrable, spread_of
+from optloc.solvers.starts.registration import BLOCKS, group_alike
 from optloc.solvers.verdict.judge import judge, standing
 from optloc.solvers.verdict.minima import settle
 

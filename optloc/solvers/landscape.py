@@ -9,8 +9,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.linalg import tangent
-from optloc.base.status import Status
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.compute.sums import equations_at
 from optloc.linear.normal import eliminated, step
 from optloc.problem.fix import Fix

@@ -12,12 +12,11 @@ from formulations.backend import Choice, Kind, counting, using
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.records import take
 from optloc.base.registry import Table
-from optloc.base.status import Certificate, Status
-from optloc.base.types import Array
+from optloc.base.types import Array, Certificate, Status
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.loss import LOSSES
 from optloc.problem.problem import Problem
-from optloc.proof.scope import unsupported
+from optloc.proof.pose import unsupported
 from optloc.solvers import stages
 from optloc.solvers.certify.branch_and_bound import certified, value_certified
 from optloc.solvers.formulations import FORMULATIONS, Formulation
@@ -29,8 +28,7 @@ from optloc.solvers.robust.stage import Robust
 from optloc.solvers.sparse import sparse
 from optloc.solvers.stages import Solver
 from optloc.solvers.suspects.stage import suspect
-from optloc.solvers.verdict.judge import judge, standing
-from optloc.solvers.verdict.status import fill
+from optloc.solvers.verdict.judge import fill, judge, standing
 
 # The back end that holds for a stretch of code (`formulations.backend`), for layers that know formulations from here.
 __all__ = [
@@ -173,7 +171,7 @@ SOLVERS: Table[Entry] = Table("optloc.solvers", lambda value: isinstance(value, 
 # fewer.
 WORTH = 16
 # Beginnings of methods for which there is a stage that does the same in one.
-SHORTCUTS: Mapping[tuple[str, ...], Solver] = {("gtrs", "lsr"): Quick(WORTH)}
+SHORTCUTS: Mapping[tuple[str, ...], Quick] = {("gtrs", "lsr"): Quick(WORTH)}
 
 # What stands behind "|" is for the problems of which not everything is proven by then.
 METHODS = {
@@ -225,11 +223,10 @@ class Method:
         """Return what its words name, those of all branches."""
         return [SOLVERS[word] for branch in self.branches for word in branch.words]
 
-    @property
-    def runs(self) -> list[Solver]:
-        """Return the stages, in as few as do the same."""
+    def runs(self, count: int) -> list[Solver]:
+        """Return the stages for so many problems, in as few as do the same."""
         for words, short in SHORTCUTS.items():
-            if self.words[: len(words)] == words:
+            if count >= short.least and self.words[: len(words)] == words:
                 return [short, *(SOLVERS[word].run for word in self.words[len(words) :])]
         return [SOLVERS[word].run for word in self.words]
 
@@ -249,7 +246,7 @@ class Method:
 
 
 def _run_through(method: Method, problem: Problem, pool: Pool | None) -> Pool:
-    for stage in method.runs:
+    for stage in method.runs(problem.batch_shape[0]):
         pool = stage(problem, pool)
     assert pool is not None
     return pool
@@ -261,7 +258,7 @@ def _take_over(method: Method, problem: Problem, pool: Pool) -> Pool:
     items = np.flatnonzero(is_unproven(fix))
     if not len(items):
         return pool
-    part, (first, *others) = problem.take(items), method.runs
+    part, (first, *others) = problem.take(items), method.runs(len(items))
     start = first(part, None)
     # what was found competes: a branch never answers worse than the one before
     x = np.concatenate([start.x, standing(take(pool, items), fix[items])], axis=1)

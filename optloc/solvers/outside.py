@@ -9,16 +9,14 @@ from typing import Any
 import numpy as np
 
 from optloc.base import linalg
-from optloc.base.status import Status
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.solvers.policy import AMBIGUOUS_GAP
 from optloc.solvers.pool import Curvature, Pool, begin
 from optloc.solvers.stages import Solver
-from optloc.solvers.verdict.judge import judge
+from optloc.solvers.verdict.judge import LOCAL, UNKNOWN, fill, judge
 from optloc.solvers.verdict.minima import settle
-from optloc.solvers.verdict.status import LOCAL, UNKNOWN, fill
 
 FixSolver = Callable[[Problem, Fix | None], Fix]
 """A solver as others write it: it maps a flat batch of problems, and their fixes or None, to fixes."""

@@ -10,9 +10,8 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 
 from optloc.base.records import Axes, join, overwrite
-from optloc.base.status import Status
-from optloc.base.types import Array
-from optloc.linear.degrees_of_freedom import degrees_of_freedom
+from optloc.base.types import Array, Status
+from optloc.linear.normal import degrees_of_freedom
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 

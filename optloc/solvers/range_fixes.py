@@ -12,12 +12,10 @@ from optloc.base import linalg
 from optloc.base.cache import Cache
 from optloc.base.frames import Frame
 from optloc.base.records import take
-from optloc.base.status import Status
 from optloc.base.threads import mapped
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.compute.jit import enabled
-from optloc.linear.degrees_of_freedom import degrees_of_freedom
-from optloc.linear.station_noise import depends_on_place, weighed
+from optloc.linear.normal import degrees_of_freedom, depends_on_place, weighed
 from optloc.models import MODELS
 from optloc.problem.fix import Stage
 from optloc.problem.layout import Layout

@@ -8,15 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from optloc.base.status import Status
 from optloc.base.threads import mapped
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge
 from optloc.compute.pack import coarseness, pack
 from optloc.compute.sums import equations_at, serves
 from optloc.linear.constraints import Face, restore, tangent_at
-from optloc.linear.normal import Normal, decrement, step
-from optloc.linear.station_noise import depends_on_place, weighed, whitener_at
+from optloc.linear.normal import Normal, decrement, depends_on_place, step, weighed, whitener_at
 from optloc.problem.epochs import whole, windows
 from optloc.problem.noise import Whitener, variances, whiten
 from optloc.problem.problem import Problem
@@ -323,7 +321,11 @@ def by_machine_code(
     width = problem.layout.n_shared + problem.stations.count * problem.dimension
     # Each problem has weights of its own: made in parts, so that their derivatives stay in memory.
     parts = np.array_split(np.arange(len(start)), 1 + len(start) * problem.count * width // _WEIGHED)
-    done = mapped(lambda part: _anew(problem.take(own[part]), start[part], rules, otherwise), parts)
+
+    def work(part: Array) -> Refined | None:
+        return _anew(problem.take(own[part]), start[part], rules, otherwise)
+
+    done = mapped(work, parts) if len(parts) > 1 else [work(parts[0])]
     found = [one for one in done if one is not None]
     return _join(found) if len(found) == len(parts) else None
 

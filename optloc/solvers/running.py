@@ -9,8 +9,7 @@ import numpy as np
 
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
-from optloc.base.status import Status
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.compute.sums import summed
 from optloc.linear.normal import Normal, covariance, eliminated, with_priors
 from optloc.problem.epochs import cut, joined, tied, window

@@ -20,8 +20,8 @@ from optloc.problem.problem import Problem
 from optloc.solvers.pool import Pool, begin, offer, pack
 from optloc.solvers.stages import fix_by, gtrs, lsr
 from optloc.solvers.starts.arrivals import as_arrivals
-from optloc.solvers.starts.position import hold_still, spread_of, vectors
-from optloc.solvers.starts.several_positions import from_pieces, one_position
+from optloc.solvers.starts.position import hold_still, one_position, spread_of, vectors
+from optloc.solvers.starts.several_positions import from_pieces
 from optloc.solvers.starts.squared_range import Coordinates, lift_rows
 from optloc.solvers.verdict.judge import judge
 

@@ -12,8 +12,7 @@ from formulations.backend import count
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
 from optloc.base.records import take
-from optloc.base.status import Status
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.linear.constraints import exact
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
@@ -26,12 +25,14 @@ from optloc.solvers.starts.position import (
     along_the_valley,
     hold_still,
     mirror,
+    one_position,
+    registrable,
     spread_of,
     subarray_starts,
     vectors,
 )
-from optloc.solvers.starts.registration import registrable, step_beside
-from optloc.solvers.starts.several_positions import from_pieces, one_position
+from optloc.solvers.starts.registration import step_beside
+from optloc.solvers.starts.several_positions import from_pieces
 from optloc.solvers.verdict.judge import judge, standing
 from optloc.solvers.verdict.minima import settle
 

@@ -13,13 +13,11 @@ import numpy as np
 
 from formulations.backend import count
 from optloc.base.linalg import centre_and_spread
-from optloc.base.status import Status
 from optloc.base.threads import WORTH, mapped
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.compute.sums import equations_at
 from optloc.linear.evaluate import differentiate
-from optloc.linear.normal import step
-from optloc.linear.station_noise import weighed
+from optloc.linear.normal import step, weighed
 from optloc.models import MODELS
 from optloc.problem.epochs import tied, window
 from optloc.problem.fix import Fix, Stage
@@ -27,8 +25,7 @@ from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
 from optloc.solvers.outside import given, judge_points
 from optloc.solvers.pool import offer
-from optloc.solvers.starts.position import spread_of, vectors
-from optloc.solvers.starts.several_positions import one_position
+from optloc.solvers.starts.position import one_position, spread_of, vectors
 from optloc.solvers.verdict.judge import judge
 from optloc.study.draws import Drawn
 

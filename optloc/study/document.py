@@ -8,7 +8,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from optloc.base.errors import InvalidProblem
-from optloc.files.words import Units
+from optloc.files.schema import Units
 from optloc.models import MODELS
 
 Amount = float | str

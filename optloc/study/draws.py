@@ -16,7 +16,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
 from optloc.base.types import Array, Bias
-from optloc.files.words import Units, join
+from optloc.files.schema import Units, join
 from optloc.linear.simulate import simulate
 from optloc.problem.bias import with_bias
 from optloc.problem.layout import state_names

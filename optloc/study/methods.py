@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.files.words import Units, join
+from optloc.files.schema import Units, join
 from optloc.problem.fix import Fix
 from optloc.study.baselines import BASELINES, start_of
 from optloc.study.document import MethodTable

@@ -22,8 +22,7 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array, Stations
 from optloc.base.units import SI_UNIT
 from optloc.files import read
-from optloc.files.schema import conform, parse_toml, read_text
-from optloc.files.words import join, kind_model
+from optloc.files.schema import conform, join, kind_model, parse_toml, read_text
 from optloc.models import MODELS
 from optloc.problem.build import assemble, measured
 from optloc.problem.epochs import separable

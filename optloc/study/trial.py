@@ -17,8 +17,7 @@ import numpy as np
 
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
-from optloc.base.status import Status
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.bounds.crlb import crlb
 from optloc.compute.sums import equations_at
 from optloc.linear.constraints import exact

@@ -10,8 +10,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.linear.evaluate import predict
-from optloc.linear.normal import linearise
-from optloc.linear.station_noise import weighed
+from optloc.linear.normal import linearise, weighed
 from optloc.models import MODELS
 from optloc.models.primitives import wrap
 from optloc.problem import noise as noises

@@ -8,8 +8,7 @@ import numpy as np
 
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
-from optloc.base.status import Status
-from optloc.base.types import Array, Motion
+from optloc.base.types import Array, Motion, Status
 from optloc.linear.normal import linearise
 from optloc.models import MODELS
 from optloc.problem import noise as noises

@@ -10,24 +10,14 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.linalg import centre_and_spread
-from optloc.base.status import Status
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.problem.epochs import cut
 from optloc.problem.fix import Fix, tail_probability
 from optloc.problem.problem import Problem
 from optloc.track.associate import weights_within
 from optloc.track.dynamics import Dynamics
 from optloc.track.start import counts, first_fix, state_of, with_height_rows
-from optloc.track.track import (
-    State,
-    Track,
-    check_state,
-    check_trackable,
-    collect,
-    predicted,
-    scan_at,
-    take_scan,
-)
+from optloc.track.track import State, Track, check_state, check_trackable, collect, predicted, scan_at, take_scan
 from optloc.track.updates import Update, Updated, filter_of
 
 # Rows of a start whose chi-square is less likely than this contradict each other: the next scan is tried. One good

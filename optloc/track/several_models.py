@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.status import Status
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.problem.problem import Problem
 from optloc.track.dynamics import Dynamics
 from optloc.track.track import State, Track, check_state, collect, followed, predicted, scans, take_scan

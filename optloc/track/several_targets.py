@@ -9,8 +9,7 @@ from typing import Literal
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.status import Status
-from optloc.base.types import Array, Motion, Rows
+from optloc.base.types import Array, Motion, Rows, Status
 from optloc.linear.evaluate import predict
 from optloc.problem import noise as noises
 from optloc.problem.noise import Block, Noise

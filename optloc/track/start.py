@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, NoSolution
-from optloc.base.status import Status
-from optloc.base.types import Band, Motion, Prior, Rows
+from optloc.base.types import Band, Motion, Prior, Rows, Status
 from optloc.problem.epochs import cut
 from optloc.problem.fix import Fix
 from optloc.problem.noise import Block, Noise

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.status import Status
-from optloc.base.types import Array, Motion
+from optloc.base.types import Array, Motion, Status
 from optloc.problem.epochs import cut
 from optloc.problem.problem import Problem
 from optloc.track.dynamics import Dynamics

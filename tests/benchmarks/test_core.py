@@ -13,7 +13,7 @@ from runs import drawn, estimated, run, truth
 from optloc.compute.jit import enabled
 from optloc.compute.pack import pack
 from optloc.compute.refine import Rules, answers, refine_block, refine_runs
-from optloc.linear.station_noise import weighed
+from optloc.linear.normal import weighed
 from optloc.problem.noise import whiten
 from optloc.solvers.refine import refine
 

@@ -13,8 +13,7 @@ from optloc.compute import sums as hooks
 from optloc.compute.equations import normal_at
 from optloc.compute.pack import pack
 from optloc.compute.sums import equations_at, summed
-from optloc.linear.normal import linearise, normal, with_priors
-from optloc.linear.station_noise import whitener_at
+from optloc.linear.normal import linearise, normal, whitener_at, with_priors
 from optloc.models.primitives import distance
 
 COUNT = 4

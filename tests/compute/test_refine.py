@@ -11,7 +11,7 @@ from test_normal import regular_sink
 
 from optloc import Bias, Motion, Prior, assemble, measured, simulate, station_array
 from optloc.base.linalg import inverse
-from optloc.base.status import Status
+from optloc.base.types import Status
 from optloc.compute.damping import judge, judge_lane
 from optloc.compute.jit import enabled
 from optloc.linear.normal import marginal

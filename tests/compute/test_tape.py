@@ -8,10 +8,8 @@ from cases import CASES, kitchen_sink, random_vector
 
 from optloc import MODELS
 from optloc.compute.trace import OPERATIONS, Recorder, Symbol, evaluate, operate, tape, trace
-from optloc.linear.evaluate import given, points
-from optloc.linear.indices import plans
-from optloc.models.jet import Jet
-from optloc.models.namespace import namespace
+from optloc.linear.evaluate import given, plans, points
+from optloc.models.primitives import Jet, namespace
 
 SINKS = {f"sink-{d}d-{span}": kitchen_sink(d, span) for d in (2, 3) for span in ("epoch", "run")}
 PROBLEMS = {name: (case.problem, case.truth + 11.0) for name, case in CASES.items()}

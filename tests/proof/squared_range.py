@@ -8,8 +8,7 @@ from math import sqrt
 
 from optloc.compute.jit import compiled
 from optloc.models import Model
-from optloc.proof.nodes.forms import inner, pull, reach, triple, write
-from optloc.proof.nodes.node import CONVEX, GROWS, Node
+from optloc.proof.nodes.node import CONVEX, GROWS, Node, inner, pull, reach, triple, write
 
 
 @compiled

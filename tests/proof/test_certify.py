@@ -12,7 +12,7 @@ import optloc
 from optloc import Fix, InvalidProblem, Status, assemble, certify, measured, simulate, solve, with_bias
 from optloc.compute.jit import enabled
 from optloc.linear.constraints import box, height
-from optloc.solvers.certify import rounds
+from optloc.solvers.certify import branch_and_bound
 
 machine_code = pytest.mark.skipif(not enabled(), reason="plain Python takes a thousand times longer for a box")
 SQUARE = 1e3 * np.array([[-5.0, -5, 0], [5, -5, 0], [5, 5, 0], [-5, 5, 0], [0, 2, 0], [1, -3, 0]])
@@ -148,8 +148,8 @@ def test_a_fix_of_another_problem_is_refused():
 def test_a_spent_budget_says_so_and_changes_nothing(monkeypatch):
     problem = drawn("TDOA, 5 stations, outside, 30 m", 6)
     fix = solve(problem, "gtrs+lsr")
-    monkeypatch.setattr(rounds, "enabled", lambda: True)
-    monkeypatch.setattr(rounds, "_BUDGETS", (0, 0))
+    monkeypatch.setattr(branch_and_bound, "enabled", lambda: True)
+    monkeypatch.setattr(branch_and_bound, "_BUDGETS", (0, 0))
     poor = certify(problem, fix)
     open_ones = [c for c in poor.certificate if c.boxes or c.proof != "global"]
     assert open_ones

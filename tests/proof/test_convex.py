@@ -6,8 +6,8 @@ from proof.costs import random_case
 from proof.test_ranges import bound_box, bounded, charted, drawn_box, ways
 
 from optloc.compute.jit import enabled
+from optloc.proof.box import convex, slopes_everywhere, spread_of
 from optloc.proof.chart import curve_box, is_convex
-from optloc.proof.convex import convex, slopes_everywhere, spread_of
 from optloc.proof.near import set_convex
 from optloc.proof.nodes.node import CURVE_WIDTH, RANGE
 from optloc.proof.nodes.range import curve_ranges

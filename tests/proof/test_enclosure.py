@@ -6,8 +6,8 @@ from proof.costs import WIDTH, random_case
 from proof.test_ranges import charted
 
 from optloc.compute.jit import enabled
+from optloc.proof.box import sum_up
 from optloc.proof.chart import value_at
-from optloc.proof.convex import sum_up
 from optloc.proof.enclosure import around_node, around_rays, enclose
 from optloc.proof.nodes.node import AZIMUTH, ELEVATION, RANGE, RATIO
 

@@ -7,8 +7,7 @@ from proof.costs import WIDTH, random_case
 from optloc.compute.jit import enabled
 from optloc.proof.box import bound_nodes, cut_out, least_residual, linearise_rows, shrink
 from optloc.proof.chart import accuracy_floor, chart_at, cost_of, empty_box, place
-from optloc.proof.nodes.forms import greatest
-from optloc.proof.nodes.node import NODE_WIDTH, RANGE
+from optloc.proof.nodes.node import NODE_WIDTH, RANGE, greatest
 from optloc.proof.nodes.range import bound_ranges
 
 BOXES, POINTS = (600, 250) if enabled() else (60, 250)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from study.texts import QUICK, plan
 
-from optloc.base.status import Status
+from optloc.base.types import Status
 from optloc.papers.registration import PRINTED, Setting
 from optloc.papers.registration import recursion as printed
 from optloc.solvers.pool import begin

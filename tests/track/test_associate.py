@@ -7,8 +7,7 @@ import pytest
 
 import optloc
 from optloc.base.errors import InvalidProblem
-from optloc.base.status import Status
-from optloc.base.types import Motion
+from optloc.base.types import Motion, Status
 from optloc.linear.evaluate import predict
 from optloc.linear.simulate import simulate
 from optloc.papers.kinematic import Scenario, draw, start_from_fix, strip_labels

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from optloc import InvalidProblem, Motion, assemble, crlb, linearise, measured, simulate, solve
-from optloc.base.status import Status
-from optloc.base.types import Stations
+from optloc.base.types import Stations, Status
 from optloc.linear.constraints import box
 from optloc.solvers.starts.angles import course_starts
 from optloc.track.measurement_space import lines, simplified

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.status import Status
+from optloc.base.types import Status
 from optloc.papers.kinematic import FILTERS, Scenario, draw, score_track
 from optloc.track import UPDATES, State, polynomial, predicted
 from optloc.track.several_models import imm, mixed, moments, parallel, resized

@@ -7,8 +7,7 @@ import pytest
 
 import optloc
 from optloc.base.errors import InvalidProblem
-from optloc.base.status import Status
-from optloc.base.types import Motion
+from optloc.base.types import Motion, Status
 from optloc.papers.kinematic import Scenario, draw, start_from_fix
 from optloc.problem.epochs import cut
 from optloc.track import State, followed, polynomial

@@ -7,7 +7,7 @@ import pytest
 
 from optloc import ECEF, InvalidProblem, Motion, assemble, measured, simulate, solve, station_array, with_bias
 from optloc.base.frames import ecef_to_geodetic, geodetic_to_ecef
-from optloc.base.status import Status
+from optloc.base.types import Status
 from optloc.linear.constraints import height as known_height
 from optloc.problem.epochs import cut
 from optloc.track import followed, polynomial

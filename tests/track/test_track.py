@@ -7,8 +7,7 @@ import pytest
 
 import optloc
 from optloc.base.errors import InvalidProblem, NoSolution
-from optloc.base.status import Status
-from optloc.base.types import Motion
+from optloc.base.types import Motion, Status
 from optloc.problem.epochs import cut
 from optloc.track import State, begun, followed, polynomial, predicted
 from optloc.track.start import two_point

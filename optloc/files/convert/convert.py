@@ -16,7 +16,7 @@ from optloc.base.types import Array
 from optloc.base.units import UNITS
 from optloc.files.convert.roles import GEOJSON, GUESSES, Places, Roles, places_of, read_table, stem, unit_of
 from optloc.files.reader import Loaded, read
-from optloc.files.words import Units
+from optloc.files.schema import Units
 from optloc.files.writer import unwritable, write_csv
 
 INPUTS = ("arrivals", "pseudoranges", "stations")

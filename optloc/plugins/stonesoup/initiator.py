@@ -16,8 +16,7 @@ from stonesoup.types.track import Track
 from stonesoup.types.update import GaussianStateUpdate
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.status import Status
-from optloc.base.types import Motion, Prior
+from optloc.base.types import Motion, Prior, Status
 from optloc.plugins.stonesoup.models import StationMeasurement, problem_of, rows_by_kind, values_of
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem

@@ -23,8 +23,7 @@ from stonesoup.types.array import StateVector, StateVectors
 from stonesoup.types.detection import Detection
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.status import Status
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.linear.evaluate import predict
 from optloc.linear.normal import linearise
 from optloc.problem.build import assemble, measured

@@ -10,10 +10,14 @@ from math import atan, atan2, cos, hypot, inf, pi, sin, sqrt
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled
-from optloc.proof.nodes.forms import (
+from optloc.proof.nodes.node import (
+    SCALED,
+    Node,
+    Row,
     Triple,
     blend,
     inner,
+    lay_out,
     length,
     product,
     pull,
@@ -23,7 +27,6 @@ from optloc.proof.nodes.forms import (
     unbounded,
     write,
 )
-from optloc.proof.nodes.node import SCALED, Node, Row, lay_out
 
 # Numbers: the station, its axes (rows), the measured angle from which the node counts, wrapped, and what is not 0 where
 # the row is the node's own.

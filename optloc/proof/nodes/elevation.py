@@ -11,11 +11,16 @@ from math import atan2, cos, hypot, inf, pi, sin, sqrt
 from optloc.base.types import Array
 from optloc.compute.jit import compiled
 from optloc.proof.nodes.azimuth import AXES, STATION, horizontal, remainder, sight
-from optloc.proof.nodes.forms import (
+from optloc.proof.nodes.node import (
+    AZIMUTH,
+    SCALED,
+    Node,
+    Row,
     Triple,
     blend,
     excess,
     inner,
+    lay_out,
     length,
     product,
     pull,
@@ -26,7 +31,6 @@ from optloc.proof.nodes.forms import (
     unbounded,
     write,
 )
-from optloc.proof.nodes.node import AZIMUTH, SCALED, Node, Row, lay_out
 
 # Numbers: as of an azimuth, but that nothing is measured from anywhere: column 15 stays zero.
 _WIDTH = 16

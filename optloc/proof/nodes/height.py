@@ -13,12 +13,16 @@ from optloc.base.types import Array
 from optloc.compute.jit import compiled
 from optloc.models.primitives import WGS84_A, WGS84_F
 from optloc.problem.problem import Problem
-from optloc.proof.nodes.forms import (
+from optloc.proof.nodes.node import (
+    CONVEX,
+    Node,
+    Row,
     Triple,
     across,
     blend,
     excess,
     inner,
+    lay_out,
     length,
     pull,
     reach,
@@ -27,7 +31,6 @@ from optloc.proof.nodes.forms import (
     unbounded,
     write,
 )
-from optloc.proof.nodes.node import CONVEX, Node, Row, lay_out
 
 # Numbers: a point o of the frame, its ECEF position, and the rows of the rotation from frame to ECEF.
 POINT, ECEF, ROTATION, _WIDTH = 0, 3, 6, 15

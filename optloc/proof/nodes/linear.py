@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled
-from optloc.proof.nodes.forms import inner, pull, triple, write
-from optloc.proof.nodes.node import FLAT, Node, Row, lay_out
+from optloc.proof.nodes.node import FLAT, Node, Row, inner, lay_out, pull, triple, write
 
 # Numbers: where the form n.(x - o) is zero, and its coefficients.
 ORIGIN, COEFFICIENTS, _WIDTH = 0, 3, 6

@@ -10,18 +10,6 @@ from math import inf, sqrt
 from optloc.base.types import Array
 from optloc.compute.jit import compiled
 from optloc.proof.atlas import Atlas, scaled_station, set_line
-from optloc.proof.nodes.forms import (
-    RangeForm,
-    blend,
-    greatest,
-    range_bend,
-    range_form,
-    reach,
-    still,
-    triple,
-    unbounded,
-    write,
-)
 from optloc.proof.nodes.node import (
     CHI,
     CONVEX,
@@ -43,7 +31,17 @@ from optloc.proof.nodes.node import (
     TURN1,
     TURN2,
     Node,
+    RangeForm,
     Row,
+    blend,
+    greatest,
+    range_bend,
+    range_form,
+    reach,
+    still,
+    triple,
+    unbounded,
+    write,
 )
 from optloc.proof.nodes.ratio import quotient, quotient_bend
 
@@ -112,7 +110,7 @@ def curve_ranges(kinds: Array, gram: Array, half: Array, nodes: Array, curves: A
     nodes : array (J, NODE_WIDTH)
         Filled by `bound_ranges`.
     curves : array (J, CURVE_WIDTH)
-        Rows of ranges are written, see `optloc.proof.convex`.
+        Rows of ranges are written, see `optloc.proof.box`.
     """
     h0, h1, h2 = half[0], half[1], half[2]
     m00, m01, m02, m11, m12, m22 = gram[0, 0], gram[0, 1], gram[0, 2], gram[1, 1], gram[1, 2], gram[2, 2]
@@ -155,7 +153,7 @@ def bound_difference(
     """Bound a range less the distance to the centre over a box, metres; as the functions of `optloc.proof.nodes.node`.
 
     A quotient N/S with N linear, as ratios are (`optloc.proof.nodes.ratio.bound_ratio`), and at most ``R |a|`` in size.
-    `centre` is what `optloc.proof.nodes.forms.range_form` says of p.
+    `centre` is what `optloc.proof.nodes.node.range_form` says of p.
     """
     h, radius = triple(half, 0), atlas.radius
     set_line(atlas, data, 0, atlas.away, atlas.sense)

@@ -8,9 +8,13 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled
-from optloc.proof.nodes.forms import (
+from optloc.proof.nodes.node import (
+    SCALED,
+    Node,
+    Row,
     Triple,
     blend,
+    lay_out,
     length,
     product,
     pull,
@@ -24,7 +28,6 @@ from optloc.proof.nodes.forms import (
     unbounded,
     write,
 )
-from optloc.proof.nodes.node import SCALED, Node, Row, lay_out
 
 # Numbers: stations a and b, the measured value, and what is not 0 where the row is the node's own.
 STATION, STATION_B, MEASURED, ALONE, _WIDTH = 0, 3, 15, 16, 17

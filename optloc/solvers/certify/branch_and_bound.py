@@ -2,24 +2,437 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from time import perf_counter
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.records import present
-from optloc.base.types import Array
+from optloc.base.records import overwrite, present, take
+from optloc.base.types import Array, Band, Certificate
+from optloc.compute.jit import enabled
+from optloc.linear.constraints import exact
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
-from optloc.proof.scope import unsupported
-from optloc.solvers.certify.rounds import unknown
+from optloc.proof.batch import Answered, Asked, prove_all
+from optloc.proof.everywhere import UNBOUNDED
+from optloc.proof.near import BETTER, BUDGET, OTHER, UNIQUE, VALUE
+from optloc.proof.nodes.height import height_numbers
+from optloc.proof.nodes.linear import linear_numbers
+from optloc.proof.nodes.node import HEIGHT, LINEAR
+from optloc.proof.pose import Posed, pose_costs, stack_numbers, unsupported
+from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.outside import accept
-from optloc.solvers.policy import LISTED_GAP
-from optloc.solvers.pool import Pool
-from optloc.solvers.verdict.judge import judge
-from optloc.solvers.verdict.status import fill
+from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP
+from optloc.solvers.pool import Pool, offer, pack
+from optloc.solvers.refine import refine
+from optloc.solvers.stages import lsr
+from optloc.solvers.starts.position import spread_of, vectors
+from optloc.solvers.verdict.judge import fill, judge, standing
+
+# What a proof lets a certificate say, in sentences.
+
+Corner = tuple[float, ...]
+
+METHOD = "branch and bound"
+# Reasons for which nothing is proven.
+UNFINISHED = "the proof was not finished within its budget of boxes"
+UNSETTLED = "the rows do not make the fix a strict minimum that stands out from its neighbourhood"
+BARRED = "a position that costs less is not admitted: a constraint or the Earth forbids it"
+HELD = "an inequality holds the fix, and the proof covers equalities only"
+REMOTE = "positions ever farther away explain the data about as well"
+TURNS = "angles may be a whole turn off with their biases at costs that matter"
+RESTLESS = "minima kept turning up"
+
+
+def unknown(reason: str) -> Certificate:
+    """Return the certificate of a fix of which nothing is proven, with the reason."""
+    return Certificate("unknown", reason, METHOD)
+
+
+def state_claim(
+    cost: float, bound: float, margin: float, boxes: int, listed: int, region: tuple[Corner, Corner] | None
+) -> Certificate:
+    """Return the certificate of a proven fix.
+
+    Parameters
+    ----------
+    cost, bound : float
+        Of the fix, and the certified lower bound.
+    margin : float
+        Proven gap to other minima; 0 for the value alone.
+    boxes : int
+        Boxes looked at.
+    listed : int
+        How many alternatives the claim leaves out, because they are listed.
+    region : (lower, upper), optional
+        Corners of the region of the claim; None: all positions.
+    """
+    proof, sentence = "global" if region is None else "region", _sentence(margin, listed, region)
+    return Certificate(proof, sentence, METHOD, bound, cost - bound, margin > 0.0, margin, boxes, region)
+
+
+# A batch has few different claims but many fixes, and Python is slow to format numbers.
+@lru_cache(maxsize=256)
+def _sentence(margin: float, listed: int, region: tuple[Corner, Corner] | None) -> str:
+    where = "no position" if region is None else f"no position from {_text(region[0])} to {_text(region[1])} m"
+    beside = "" if not listed else " but that listed" if listed == 1 else f" but the {listed} listed"
+    if margin > 0.0:
+        rest = f"no other minimum{beside} has a cost within {margin:g} of it"
+    else:
+        rest = "other minima were searched for, not excluded"
+    return f"{where} costs less; {rest}"
+
+
+def _text(corner: Corner) -> str:
+    return "(" + ", ".join(f"{v:.6g}" for v in corner) + ")"
+
+
+def column(certificates: list[Certificate]) -> Array:
+    """Return certificates as an object array."""
+    out = np.empty(len(certificates), dtype=object)
+    out[:] = certificates
+    return out
+
+
+# Known heights and planes in a proof: an equality is worth a row whose residual is its multiplier.
+
+
+@dataclass(frozen=True, slots=True)
+class Held:
+    """Posed costs of a flat batch of N problems with their equalities as rows.
+
+    For a point with ``g(x) = H`` the cost is ``f(x) + ((g(x) - H) / s + l s)^2 - (l s)^2``: for the multiplier l of a
+    fix its gradient vanishes there in all directions, and a bound over all points is one over those that meet it.
+
+    Parameters
+    ----------
+    pose : Posed
+        Costs with the rows.
+    extra : array (N,)
+        By how much the posed cost of a fix exceeds its cost.
+    able : bool array (N,)
+        Where no other constraint holds the fix.
+    """
+
+    pose: Posed
+    extra: Array
+    able: Array
+
+
+def hold_equalities(problem: Problem, fix: Fix, pose: Posed) -> Held:
+    """Return posed costs with the equalities of a flat batch of problems as rows at the multipliers of their fixes.
+
+    References
+    ----------
+    M. J. D. Powell, "A method for nonlinear constraints in minimization problems" (1969); R. T. Rockafellar (1973): the
+    augmented Lagrangian.
+    """
+    face, size = exact(problem), len(fix.x)
+    active = [()] * size if fix.active is None else [tuple(found) for found in fix.active]
+    able = np.array([len(found) == len(face) for found in active])
+    if not face:
+        return Held(pose, np.zeros(size), able)
+    with np.errstate(invalid="ignore"):
+        spread = np.sqrt(np.trace(fix.covariance(), axis1=-2, axis2=-1) / max(problem.dimension - len(face), 1))
+    scale = np.where(np.isfinite(spread), np.maximum(spread, 1.0), 1.0)
+    extra = np.zeros(size)
+    for i, level in enumerate(face):
+        constraint = problem.constraints[level.constraint]
+        assert isinstance(constraint, Band)
+        shift = np.array([0.5 * found[i].multiplier if good else 0.0 for found, good in zip(active, able, strict=True)])
+        pose = _with_row(pose, *_node(problem, constraint), constraint.lower, scale, shift)
+        extra = extra + (shift * scale) ** 2
+    return Held(pose, extra, able)
+
+
+def _node(problem: Problem, constraint: Band) -> tuple[int, Array]:
+    """Return code and numbers (B, n) of the node that an equality sets."""
+    if constraint.kind == "height":
+        return HEIGHT, height_numbers(problem)
+    coefficients = constraint.coefficients
+    return LINEAR, linear_numbers(coefficients if coefficients.ndim == 2 else coefficients[None])
+
+
+def _with_row(pose: Posed, kind: int, numbers: Array, value: Array, scale: Array, shift: Array) -> Posed:
+    """Return costs with the row ``(node - value) / scale + shift * scale`` added."""
+    size, (q, nodes) = len(scale), pose.K.shape[-2:]
+    K = np.zeros((size, q + 1, nodes + 1))
+    K[:, :q, :nodes], K[:, q, nodes] = pose.K, 1.0 / scale
+    w = np.concatenate([pose.w, (np.broadcast_to(value, (size,)) / scale - shift * scale)[:, None]], axis=1)
+    kinds = np.append(pose.kinds, kind)
+    data = stack_numbers(kinds, [*(pose.data[:, j] for j in range(nodes)), numbers])
+    return pose._replace(kinds=kinds, data=data, K=K, w=w)
+
+
+# Gaps to other minima that are tried to prove, one after the other; the last is the value alone.
+_MARGINS = (LISTED_GAP, AMBIGUOUS_GAP, 0.0)
+# Rounds of proof and repair: every margin may be lowered and the region tried, with a few minima found in between.
+_ROUNDS = 6
+# Boxes for the proof of a gap and of the value, with up to so many nodes. Plain Python takes a thousand times longer
+# for each: a budget of all.
+_BUDGETS, _NODES, _SLOW_BUDGET, _AT_LEAST = (3000, 8000), 12, 2000, 5
+# Cost that counts as equal, relative: covers the rounding of two ways to compute it, and is nothing beside the gap of 9
+# at which a second minimum matters.
+_EQUAL = 1e-6
+# Minima behind the Earth that are set aside at most: mirror images through it; whoever has more gets no proof.
+_HIDDEN = 4
+# How far around such a minimum everything must be hidden too, metres: its convex box is smaller.
+_DEEP = 5e4
+# Half-width of the region where all positions cannot be bounded: spreads of the stations, or distances of the fix, so
+# that it lies well inside either way.
+_SPREADS, _DISTANCES = 10.0, 2.0
+
+
+@dataclass(slots=True)
+class Work:
+    """A flat batch of N pools while they are proven; entries are replaced as better candidates are found.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems within the scope of the proof.
+    pool : Pool
+        Their candidates.
+    fix : Fix
+        The verdict of the pool.
+    certificate : object array (N,)
+        What is claimed of each; None where nothing was tried.
+    pose : Posed
+        Their costs over the position, equalities apart.
+    ignored : array (N, h, d)
+        Minima that the Earth hides; NaN in empty slots.
+    region : array (N, 2, d)
+        Corners of the regions of the claims; NaN for all positions.
+    fallback : array (N, 2, d)
+        Corners of the regions that take their place where all positions cannot be bounded.
+    margins : array (q,)
+        Gaps to prove, one after the other where proofs are not finished.
+    level : int array (N,)
+        Which of the margins is tried.
+    pending : bool array (N,)
+        What is not settled.
+    effort : int
+        By how much budgets and rounds are multiplied.
+    replaced, listed : int
+        How many fixes were replaced, and how often another minimum was added to the alternatives.
+    """
+
+    problem: Problem
+    pool: Pool
+    fix: Fix
+    certificate: Array
+    pose: Posed
+    ignored: Array
+    region: Array
+    fallback: Array
+    margins: Array
+    level: Array
+    pending: Array
+    effort: int
+    replaced: int = 0
+    listed: int = 0
+
+    @classmethod
+    def begin(
+        cls, problem: Problem, pool: Pool, fix: Fix, answered: Array, region: Array | None, margin: float, effort: int
+    ) -> Work:
+        """Return the work before the first round."""
+        size, d = len(fix.x), problem.dimension
+        corners = np.full((2, d), np.nan) if region is None else region
+        return cls(
+            problem,
+            pool,
+            fix,
+            fill(size, None) if pool.certificate is None else np.array(pool.certificate),
+            pose_costs(problem),
+            np.full((size, 0, d), np.nan),
+            np.array(np.broadcast_to(corners, (size, 2, d))),
+            _around(problem, fix.position),
+            np.array([margin, *(m for m in _MARGINS if m < margin)]),
+            np.zeros(size, dtype=np.int64),
+            np.array(answered),
+            effort,
+        )
+
+    def summary(self) -> str:
+        """Return what was proven, in a few words."""
+        claims = [own or other for own, other in zip(self.certificate, self.fix.certificate, strict=True)]
+        proofs = [claim.proof for claim in claims]
+        counts = [f"{proofs.count(name)} {name}" for name in ("global", "region", "unknown") if name in proofs]
+        more = [f"{self.replaced} fixes replaced by better ones"] if self.replaced else []
+        more += [f"{self.listed} other minima found"] if self.listed else []
+        return ", ".join(counts + more)
+
+
+def settle(work: Work) -> Work:
+    """Return the work with a certificate for every fix that was to be proven."""
+    for _ in range(_ROUNDS * work.effort):
+        items = np.flatnonzero(work.pending)
+        if not len(items):
+            break
+        _round(work, items)
+    _give_up(work, np.flatnonzero(work.pending), RESTLESS)
+    return work
+
+
+def _round(work: Work, items: Array) -> None:
+    """Try to prove some fixes once, and settle or change what can be."""
+    part = hold_equalities(work.problem.take(items), work.fix[items], work.pose.take(items))
+    _give_up(work, items[~part.able], HELD)
+    asked = _asked(work, items, part.extra)
+    # Below this level a wrapped residual may stand for another than the node's: no bound of one bounds the other.
+    turning = part.able & (part.pose.level < work.fix.cost[items] + asked.kappa)
+    _lower(work, items[turning], TURNS)
+    good, pose, extra = np.flatnonzero(part.able & ~turning), part.pose, part.extra
+    if not len(good):
+        return
+    if len(good) < len(items):
+        items, asked, extra, pose = items[good], asked.take(good), extra[good], pose.take(good)
+    answer = prove_all(pose, asked)
+    done = np.isin(answer.verdict, (UNIQUE, VALUE))
+    _claim(work, items, asked, answer, extra, np.flatnonzero(done))
+    short = answer.verdict == BUDGET
+    _lower(work, items[short], UNFINISHED)
+    remote = answer.verdict == UNBOUNDED
+    _lower(work, items[remote], REMOTE)
+    found = np.isin(answer.verdict, (BETTER, OTHER))
+    if found.any():
+        _add(work, items[found], answer.found[found], answer.verdict[found] == BETTER)
+    _give_up(work, items[~(done | short | remote | found)], UNSETTLED)
+
+
+def _asked(work: Work, items: Array, extra: Array) -> Asked:
+    kappa = work.margins[work.level[items]]
+    fix, ignored = work.fix, work.ignored[items]
+    gap = fix.alternatives.gap[items]
+    with np.errstate(invalid="ignore"):
+        listed = np.isfinite(gap) & (gap < np.maximum(kappa, AMBIGUOUS_GAP)[:, None])
+    place = fix.layout.take(fix.alternatives.x[items], "position")
+    others = pack(np.concatenate([np.where(listed[..., None], place, np.nan), ignored], axis=1))
+    return Asked(
+        x=fix.position[items],
+        others=np.where(np.isfinite(others), others, 0.0),
+        known=np.isfinite(others).all(-1).sum(1),
+        kappa=kappa,
+        eps=_EQUAL * (1.0 + fix.cost[items] + extra),
+        region=work.region[items],
+        fallback=work.fallback[items],
+        budget=_budgets(kappa, len(work.pose.kinds), work.effort),
+    )
+
+
+def _budgets(kappa: Array, nodes: int, effort: int) -> Array:
+    """Return the boxes (n,) that proofs may take: a box takes time with the square of the nodes."""
+    if not enabled():
+        return np.full(len(kappa), max(_AT_LEAST, _SLOW_BUDGET // len(kappa)))
+    # The same time whatever the number of nodes, not the same number of boxes.
+    share = max(1.0, (nodes / _NODES) ** 2) / effort
+    return np.asarray(np.where(kappa > 0.0, *_BUDGETS) / share).astype(np.int64)
+
+
+def _lower(work: Work, items: Array, why: str) -> None:
+    """Let proofs that failed try for a smaller margin, then for a region; give up where that was all."""
+    work.level[items] += 1
+    spent = items[work.level[items] >= len(work.margins)]
+    everywhere = np.isnan(work.region[spent, 0, 0])
+    regional = spent[everywhere]
+    work.region[regional] = work.fallback[regional]
+    work.level[regional] = min(1, len(work.margins) - 1)
+    _give_up(work, spent[~everywhere], why)
+
+
+def _give_up(work: Work, items: Array, why: str) -> None:
+    work.certificate[items] = unknown(why)
+    work.pending[items] = False
+
+
+def _claim(work: Work, items: Array, asked: Asked, answer: Answered, extra: Array, done: Array) -> None:
+    """Write the certificates of those of some fixes that are proven."""
+    proven, kappa = items[done], asked.kappa[done]
+    bound, listed = (answer.bound - extra)[done], work.fix.alternatives.gap[proven] < kappa[:, None]
+    region: list[tuple[Corner, Corner] | None] = [None] * len(done)
+    for k in np.flatnonzero(~answer.everywhere[done]).tolist():
+        whole = np.isnan(asked.region[done[k], 0, 0])
+        low, high = (asked.fallback if whole else asked.region)[done[k]].tolist()
+        region[k] = tuple(low), tuple(high)
+    numbers = (work.fix.cost[proven], bound, kappa, answer.boxes[done], listed.sum(1))
+    given = zip(*(values.tolist() for values in numbers), region, strict=True)
+    work.certificate[proven] = column([state_claim(*each) for each in given])
+    work.pending[proven] = False
+
+
+def _add(work: Work, items: Array, points: Array, better: Array) -> None:
+    """Refine points that were found beside some fixes, and let them compete."""
+    began = perf_counter()
+    part, own, before = work.problem.take(items), work.fix[items], take(work.pool, items)
+    x = pack(np.concatenate([standing(before, own), vectors(part, points[:, None])], axis=1))
+    pool = _keep_evidence(lsr(part, offer(part, x, before, "certify", began)), before)
+    new = judge(part, pool)
+    with np.errstate(invalid="ignore"):
+        lower = new.cost < own.cost - _EQUAL * (1.0 + own.cost)
+        more = np.isfinite(new.alternatives.gap).sum(1) > np.isfinite(own.alternatives.gap).sum(1)
+    changed = lower | more | ~new.answered
+    work.replaced += int(lower.sum())
+    work.listed += int(more.sum())
+    keep = np.flatnonzero(changed)
+    if len(keep):
+        work.pool = work.pool.merge(items[keep], take(pool, keep))
+        work.fix = overwrite(work.fix, items[keep], new[keep])
+        work.pending[items[keep]] = new.answered[keep]
+    stuck = np.flatnonzero(~changed)
+    stuck = stuck[~_ignore(work, items[stuck], points[stuck])]
+    _give_up(work, items[stuck[better[stuck]]], BARRED)
+    _lower(work, items[stuck[~better[stuck]]], UNFINISHED)
+
+
+def _ignore(work: Work, items: Array, points: Array) -> Array:
+    """Note the minima next to points (n, d) that the Earth hides, and return which are new (n,)."""
+    problem = work.problem
+    if not problem.frame.geodetic or not len(items) or work.ignored.shape[1] >= _HIDDEN:
+        return np.zeros(len(items), dtype=bool)
+    part = problem.take(items)
+    done = refine(part, vectors(part, points[:, None])[:, 0], face=exact(problem))
+    place = problem.layout.take(done.x, "position")
+    # The same minimum, refined twice: metres in Earth-centred coordinates.
+    known = (np.abs(work.ignored[items] - place[:, None]) <= 1e-6 * np.abs(place[:, None])).all(-1).any(1)
+    fresh = _deep(part, done.x) & ~known
+    more = np.full((len(work.ignored), 1, place.shape[-1]), np.nan)
+    more[items[fresh], 0] = place[fresh]
+    work.ignored = np.concatenate([work.ignored, more], axis=1)
+    return np.asarray(fresh)
+
+
+def _deep(problem: Problem, x: Array) -> Array:
+    """Return which vectors (N, size) the Earth hides together with all that is near them, (N,)."""
+    slot, _ = problem.layout.find("position")
+    out = np.asarray(np.isfinite(x).all(-1))
+    for axis in range(slot.start, slot.start + slot.size):
+        for side in (-_DEEP, _DEEP):
+            beside = np.where(np.isfinite(x), x, 0.0)
+            beside[:, axis] += side
+            out &= is_hidden(problem, beside)
+    return out
+
+
+def _keep_evidence(pool: Pool, before: Pool) -> Pool:
+    """Return a pool with what was known of its problems before one more candidate was refined."""
+    endless = pool.endless if before.endless is None else before.endless
+    if pool.endless is not None and before.endless is not None:
+        endless = pool.endless | before.endless
+    return replace(pool, endless=endless, searched=before.searched, remark=before.remark, asked=before.asked)
+
+
+def _around(problem: Problem, position: Array) -> Array:
+    """Return the corners (N, 2, d) of cubes around the stations that hold the fixes (N, d) well inside."""
+    centre, spread = spread_of(problem)
+    with np.errstate(invalid="ignore"):
+        away = np.abs(position - centre).max(-1)
+    half = np.maximum(_SPREADS * spread, _DISTANCES * np.where(np.isfinite(away), away, 0.0))
+    return np.stack([centre - half[:, None], centre + half[:, None]], axis=1)
+
 
 # Who asks for a proof gives it more time than a method that goes on without one.
 _EFFORT = 4
@@ -96,7 +509,6 @@ def certified(
         certificate = fill(len(pool), None) if pool.certificate is None else np.array(pool.certificate)
         certificate[answered] = unknown(why)
         return replace(pool, certificate=certificate, stages=(*pool.stages, _stage(why or "nothing to prove", began)))
-    from optloc.solvers.certify.rounds import Work, settle  # machine code is loaded when it is used
 
     work = settle(Work.begin(problem, pool, fix, answered, region, margin, effort))
     stages = (*pool.stages, _stage(work.summary(), began))

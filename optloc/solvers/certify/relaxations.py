@@ -19,8 +19,7 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.starts.angles import angle_bounds, bearings
 from optloc.solvers.starts.least_squares_ranges import Ranges, ranges
-from optloc.solvers.starts.position import hold_still
-from optloc.solvers.starts.several_positions import one_position
+from optloc.solvers.starts.position import hold_still, one_position
 
 TIGHT = 1e-3
 """A bound within this of the cost, relative to one plus the cost, leaves nothing to be found."""

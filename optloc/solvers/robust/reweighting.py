@@ -6,13 +6,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optloc.base.status import Status
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.compute.sums import equations_at, summed
 from optloc.linear.constraints import Face
 from optloc.linear.evaluate import predict
-from optloc.linear.normal import Normal, marginal, with_priors
-from optloc.linear.station_noise import weighed
+from optloc.linear.normal import Normal, marginal, weighed, with_priors
 from optloc.models import MODELS, wrap
 from optloc.problem.loss import Loss
 from optloc.problem.noise import Noise, variances, whiten

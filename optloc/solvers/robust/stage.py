@@ -9,11 +9,9 @@ from time import perf_counter
 
 import numpy as np
 
-from optloc.base.status import Status
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.linear.constraints import Face, exact
-from optloc.linear.degrees_of_freedom import degrees_of_freedom
-from optloc.linear.normal import Normal, marginal
+from optloc.linear.normal import Normal, degrees_of_freedom, marginal
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.problem import Problem

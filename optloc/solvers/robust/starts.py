@@ -7,11 +7,9 @@ from itertools import combinations
 
 import numpy as np
 
-from optloc.base.status import Status
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.linear.constraints import exact
-from optloc.linear.degrees_of_freedom import degrees_of_freedom
-from optloc.linear.station_noise import depends_on_place, weighed
+from optloc.linear.normal import degrees_of_freedom, depends_on_place, weighed
 from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.noise import independent, variances
 from optloc.problem.problem import Problem
@@ -19,8 +17,7 @@ from optloc.solvers.pool import Pool, pack
 from optloc.solvers.refine import refine
 from optloc.solvers.robust.reweighting import Doubt, fold_signs, weigh_by
 from optloc.solvers.stages import roots, search_widely
-from optloc.solvers.starts.position import rows_of_stations
-from optloc.solvers.starts.several_positions import one_position
+from optloc.solvers.starts.position import one_position, rows_of_stations
 from optloc.solvers.verdict.judge import judge, standing
 
 # Subsets of a problem at most: each is a closed form and a few steps. Stations up to which three are left out (92 sets

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import sparse
 
 from optloc.base.types import Array, Bias, Rows, Stations
-from optloc.linear.station_noise import weighed
+from optloc.linear.normal import weighed
 from optloc.models import MODELS
 from optloc.models.primitives import wrap
 from optloc.problem.epochs import cut, epochs_of, joined

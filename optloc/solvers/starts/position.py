@@ -1,4 +1,4 @@
-"""Starts without a guess: closed forms give every candidate worth refining."""
+"""Starts of one position without a guess, and which problems have one: closed forms give every candidate."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ import numpy as np
 
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array
-from optloc.linear.evaluate import predict
-from optloc.linear.indices import columns, plans
-from optloc.models import MODELS
+from optloc.linear.evaluate import columns, plans, predict
+from optloc.models import MODELS, Model
 from optloc.problem.layout import emission_name
 from optloc.problem.problem import Problem
 from optloc.solvers.starts.least_squares_ranges import ranges
@@ -221,3 +220,31 @@ def distance_of(problem: Problem, position: Array) -> Array:
     with np.errstate(over="ignore", invalid="ignore"):
         away = position - centre.reshape(-1, *extra, centre.shape[-1])
         return np.asarray(np.sqrt((away**2).sum(-1)) / spread.reshape(-1, *extra))
+
+
+def one_position(problem: Problem) -> bool:
+    """Return whether a single position, seen from stations that stay, is all that needs a start."""
+    if len(problem.motions) != 1 or problem.motions[0].known is not None or problem.motions[0].span == "epoch":
+        return False
+    still = problem.stations.position.shape[-3] == 1 and problem.motions[0].order == 0
+    return still or problem.epochs == 1
+
+
+def over_ground(problem: Problem) -> bool:
+    """Return whether one position on Earth is sought, and a row or a constraint may tell its height."""
+    told = bool(problem.constraints) or any(rows.kind == "height" for rows in problem.rows)
+    return told and problem.frame.geodetic and problem.dimension == 3 and one_position(problem)
+
+
+def registrable(problem: Problem) -> bool:
+    """Return whether a problem is a run of sums or ratios of ranges whose only target lasts it, and is not one fix."""
+    if len(problem.motions) != 1 or problem.epochs < 2:
+        return False
+    motion, moving = problem.motions[0], problem.stations.position.shape[-3] > 1
+    differences = any(_of_ranges(MODELS[rows.kind]) for rows in problem.rows)
+    return differences and motion.known is None and motion.span == "run" and (moving or motion.order > 0)
+
+
+def _of_ranges(model: Model) -> bool:
+    """Return whether a kind is a sum or a ratio of ranges."""
+    return model.ranges is not None or (model.lifted is not None and not model.axes)

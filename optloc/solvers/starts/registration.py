@@ -10,13 +10,10 @@ import numpy as np
 
 from formulations.registration import Course, candidates
 from optloc.base import linalg
-from optloc.base.status import Status
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.compute.sums import equations_at
-from optloc.linear.degrees_of_freedom import degrees_of_freedom
-from optloc.linear.indices import elapsed, plans
-from optloc.linear.normal import covariance, prior_parts
-from optloc.models import MODELS, Model
+from optloc.linear.evaluate import elapsed, plans
+from optloc.linear.normal import covariance, degrees_of_freedom, prior_parts
 from optloc.problem.epochs import by_epoch, untied
 from optloc.problem.problem import Problem
 from optloc.solvers.policy import DOUBT
@@ -265,20 +262,6 @@ _WINDOWS = 6
 # It needs a prior: biases without one are taken for about this share of the largest range difference. Too loose a prior
 # leaves the lifted biases free, too tight a one pulls the start; only a start hangs on it.
 _LOOSE = 1e-2
-
-
-def registrable(problem: Problem) -> bool:
-    """Return whether a problem is a run of sums or ratios of ranges whose only target lasts it, and is not one fix."""
-    if len(problem.motions) != 1 or problem.epochs < 2:
-        return False
-    motion, moving = problem.motions[0], problem.stations.position.shape[-3] > 1
-    differences = any(_of_ranges(MODELS[rows.kind]) for rows in problem.rows)
-    return differences and motion.known is None and motion.span == "run" and (moving or motion.order > 0)
-
-
-def _of_ranges(model: Model) -> bool:
-    """Return whether a kind is a sum or a ratio of ranges."""
-    return model.ranges is not None or (model.lifted is not None and not model.axes)
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ import numpy as np
 from optloc.base import linalg
 from optloc.base.types import Array, Motion, Rows, Stations
 from optloc.linear.constraints import is_exact, needs_velocity
-from optloc.linear.indices import elapsed
+from optloc.linear.evaluate import elapsed
 from optloc.models import MODELS
 from optloc.problem.epochs import by_epoch, untied
 from optloc.problem.fix import Fix
@@ -19,15 +19,7 @@ from optloc.problem.layout import state_names
 from optloc.problem.noise import Block, Noise, group
 from optloc.problem.problem import Problem
 from optloc.solvers.starts.angles import course_starts, course_states
-from optloc.solvers.starts.position import hold_still, vectors, without_biases
-
-
-def one_position(problem: Problem) -> bool:
-    """Return whether a single position, seen from stations that stay, is all that needs a start."""
-    if len(problem.motions) != 1 or problem.motions[0].known is not None or problem.motions[0].span == "epoch":
-        return False
-    still = problem.stations.position.shape[-3] == 1 and problem.motions[0].order == 0
-    return still or problem.epochs == 1
+from optloc.solvers.starts.position import hold_still, one_position, vectors, without_biases
 
 
 def from_pieces(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:

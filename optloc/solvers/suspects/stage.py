@@ -9,8 +9,7 @@ from time import perf_counter
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.status import Status
-from optloc.base.types import Array
+from optloc.base.types import Array, Status
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix, GroupKind, Stage
 from optloc.problem.problem import Problem
@@ -23,8 +22,7 @@ from optloc.solvers.suspects.groups import KINDS, Group, check_kinds, groups_of
 from optloc.solvers.suspects.report import Case, conclude_case
 from optloc.solvers.suspects.subsets import TEST, Finding, Rest, enumerable, explain, fix_rest, grow
 from optloc.solvers.verdict.conclusion import Conclusion
-from optloc.solvers.verdict.judge import judge, standing
-from optloc.solvers.verdict.status import fill
+from optloc.solvers.verdict.judge import fill, judge, standing
 
 # A row that a loss gives less than half its weight is suspected first. More than `REJECTED` names: here it is a hint
 # that is tested, and who fits is taken back.

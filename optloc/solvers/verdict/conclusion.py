@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optloc.base.status import Certificate, Status
-from optloc.base.types import Array
+from optloc.base.types import Array, Certificate, Status
 from optloc.problem.fix import Alternatives, Explanation, Fix, Suspect
 from optloc.problem.problem import Problem
 

@@ -1,19 +1,295 @@
-"""The verdict: the only place where a pool becomes a fix, so that a status means the same whatever the method."""
+"""The verdict: the only place where a pool becomes a fix, by one set of rules, so that a status means one thing."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import chdtrc, gammainccinv
 
 from optloc.base.records import overwrite, present, take
-from optloc.base.status import Certificate, Status
-from optloc.base.types import Array
-from optloc.problem.fix import Alternatives, Fix
+from optloc.base.types import Array, Certificate, Status
+from optloc.bounds.observability import open_sentences
+from optloc.linear.constraints import violation_names
+from optloc.models import MODELS
+from optloc.problem.fix import Alternatives, Fix, tail_probability
 from optloc.problem.problem import Problem
+from optloc.solvers.policy import AMBIGUOUS_GAP, DOUBT, FAR, FLAT, REJECTED, WEAK
 from optloc.solvers.pool import Curvature, Pool
+from optloc.solvers.starts.least_squares_ranges import ranges
+from optloc.solvers.starts.position import distance_of, spread_of
 from optloc.solvers.verdict.conclusion import conclude
-from optloc.solvers.verdict.status import LOCAL, doubt_sentence, doubtful, fill, rule
+from optloc.solvers.verdict.minima import station_direction, weak_direction
+
+LOCAL = Certificate(
+    "local",
+    "a stationary point with a positive definite normal matrix; the best of all candidates refined",
+    "refinement",
+)
+UNKNOWN = Certificate("unknown", "there is no refined answer to prove anything about", "none")
+
+ANSWERED = (Status.OK, Status.AMBIGUOUS, Status.SEARCHED)
+_UNFINISHED = (Status.UNBOUNDED, Status.MAX_ITERATIONS, Status.STALLED)
+
+_ALIKE = 1e-3  # gaps below this are told as "fits as well": a reader gains nothing from more zeros
+_SHOWN = 8  # names or numbers in a sentence; more are not read
+
+
+@dataclass(frozen=True, slots=True)
+class Ruling:
+    """The statuses of a flat batch of N problems.
+
+    Parameters
+    ----------
+    code : int array (N,)
+        `Status` numbers.
+    reason : object array (N,)
+        Sentences.
+    certificate : object array (N,)
+        `Certificate` of each.
+    gone : bool array (N,)
+        Where there is no position to be shown.
+    """
+
+    code: Array
+    reason: Array
+    certificate: Array
+    gone: Array
+
+
+def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
+    """Return the statuses that settled pools deserve.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    pool : Pool
+        Settled.
+    gap : array (N, r)
+        Costs of the other minima less that of the best; infinite where there is none.
+    """
+    curvature = pool.curvature
+    assert curvature is not None
+    code, reason = np.array(pool.code[:, 0]), fill(len(pool), "")
+    cost = np.where(np.isfinite(pool.cost[:, 0]), pool.cost[:, 0], np.nan)
+    p_value, nearest = tail_probability(cost, pool.dof), np.min(gap, axis=1, initial=np.inf)
+    # a row that is absent may hold anything
+    broken = ~np.broadcast_to((np.isfinite(problem.z) | (problem.weight == 0.0)).all(-1), code.shape)
+    few = (pool.dof < 0) & ~broken
+    missing = ~np.isfinite(cost) & ~broken & ~few
+    answered = ~(broken | few | missing)
+    # what is missing, in this order: data, rows, a candidate; what is left is an answer, perhaps a bad one
+    weak = answered & ~_is_determined(curvature)
+    distance = distance_of(problem, _position(problem, pool))
+    far = answered & _runs_away(problem, curvature, distance, (code != Status.OK) | weak | (p_value < DOUBT))
+    # far away every direction is weak: how far says more
+    weak &= ~far
+    code[broken], code[few], code[far] = Status.REJECTED, Status.TOO_FEW_ROWS, Status.UNBOUNDED
+    code[weak] = Status.SINGULAR_GEOMETRY
+    # of what converged: another status says something worse than that there are two places
+    code[(code == Status.OK) & (nearest < AMBIGUOUS_GAP)] = Status.AMBIGUOUS
+    _doubt(reason, (code == Status.OK) & (p_value < DOUBT), p_value)
+    for i in np.flatnonzero(few):
+        reason[i] = _lacking(-int(pool.dof[i]))
+    for i in np.flatnonzero(answered & np.isin(code, _UNFINISHED)):
+        reason[i] = f"the refinement stopped {distance[i]:.3g} spreads of the stations away"
+    for i in np.flatnonzero(weak):
+        reason[i] = _open(problem, _information(curvature)[i])
+    for i in np.flatnonzero(code == Status.AMBIGUOUS):
+        reason[i] = _ambiguous(problem, nearest[i])
+    barred = missing & (code == Status.INFEASIBLE)
+    for i in np.flatnonzero(barred):
+        names = violation_names(problem)
+        reason[i] = f"no minimum meets all of: {names}" if names else "the Earth hides every position from a satellite"
+    _explain_missing(problem, np.flatnonzero(missing & ~barred), code, reason)
+    if pool.endless is not None:
+        rivalled = pool.endless & (code == Status.OK)
+        code[rivalled], reason[rivalled] = Status.AMBIGUOUS, "positions ever farther away explain the data as well"
+    # what refinement shows of an answer by itself; claims of proofs replace it below
+    certificate = fill(len(pool), LOCAL)
+    certificate[~np.isin(code, (Status.OK, Status.AMBIGUOUS))] = UNKNOWN
+    if pool.loss:
+        _name_rejected(problem, pool, (code == Status.OK) & (p_value < DOUBT), reason)
+    if pool.free is not None:
+        _hold_against_constraints(pool, cost, code, reason)
+    _weigh_claims(pool, code, reason, certificate)
+    return Ruling(code, reason, certificate, broken | few | missing | weak | far)
+
+
+def doubtful(cost: Array, dof: Array) -> Array:
+    """Return the probabilities (N,) of costs that the noise does not allow; NaN for all others.
+
+    Parameters
+    ----------
+    cost : array (N,)
+        Of finished fixes.
+    dof : int array (N,)
+        Degrees of freedom, often one number for all (a view without strides).
+    """
+    out = np.full(len(cost), np.nan)
+    for level in dof[:1] if dof.strides == (0,) else np.unique(dof):
+        if level > 0:
+            limit = 2.0 * gammainccinv(level / 2, DOUBT) * (1.0 - 1e-9)  # the exact test follows for the few above
+            items = np.flatnonzero((cost > limit) & (dof == level) if dof.strides != (0,) else cost > limit)
+            p_value = tail_probability(cost[items], np.full(len(items), level))
+            out[items] = np.where(p_value < DOUBT, p_value, np.nan)
+    return out
+
+
+def doubt_sentence(p_value: float) -> str:
+    """Return what a small chi-square probability means."""
+    return f"the residuals are larger than the noise allows (p = {p_value:.1g})"
+
+
+def fill(count: int, value: object) -> Array:
+    """Return an object array (count,) of one value."""
+    out = np.empty(count, dtype=object)
+    out.fill(value)
+    return out
+
+
+def _is_determined(curvature: Curvature) -> Array:
+    """Return where the data leave no direction open, (N,)."""
+    count = len(curvature.covariance)
+    regular = np.ones(count, dtype=bool) if curvature.regular is None else curvature.regular
+    weakest = np.full(count, np.inf) if curvature.weakest is None else curvature.weakest
+    return np.asarray(regular & (weakest >= WEAK))
+
+
+def _information(curvature: Curvature) -> Array:
+    return np.full(curvature.covariance.shape, np.nan) if curvature.information is None else curvature.information
+
+
+def _runs_away(problem: Problem, curvature: Curvature, distance: Array, lost: Array) -> Array:
+    """Return where a position is so far away, and so badly known, that the data say a direction only, (N,)."""
+    covariance = np.where(_is_determined(curvature)[:, None, None], curvature.covariance, np.nan)
+    with np.errstate(invalid="ignore"):
+        # an error larger than the distance from the stations: a direction, not a place
+        loose = np.trace(covariance, axis1=-2, axis2=-1) > (distance * spread_of(problem)[1]) ** 2
+        # far: only a fix that is otherwise good stands; flat: none does, since wave fronts are
+        return np.asarray(((lost | loose) & (distance > FAR)) | (distance > FLAT))
+
+
+def _doubt(reason: Array, where: Array, p_value: Array) -> None:
+    for i in np.flatnonzero(where):
+        reason[i] = doubt_sentence(p_value[i])
+
+
+def _lacking(count: int) -> str:
+    return f"there {'is 1 measurement' if count == 1 else f'are {count} measurements'} fewer than unknowns"
+
+
+def _ambiguous(problem: Problem, gap: float) -> str:
+    text = "another position " + ("fits as well" if gap < _ALIKE else f"costs only {gap:.2g} more")
+    moving = problem.epochs > 1 and any(motion.order > 0 for motion in problem.motions)
+    return text + (": a bound on height, speed or place would decide" if moving else "")
+
+
+def _open(problem: Problem, information: Array) -> str:
+    """Return what the data leave open: combinations of biases by name, else the direction of the position."""
+    # biases trade with each other: that combination says more than a direction
+    named = open_sentences(problem.layout, information) if problem.biases and np.isfinite(information).all() else ()
+    return "; ".join(named) or weak_direction(problem, information)
+
+
+def _explain_missing(problem: Problem, items: Array, code: Array, reason: Array) -> None:
+    """Write the status of problems without any candidate: what keeps every closed form from a start."""
+    if not len(items):
+        return
+    single = problem.epochs == 1 or problem.stations.position.shape[-3] == 1
+    # the graph of ranges is that of one position: stations of a moving run link themselves
+    found = ranges(problem.take(items)) if single else None
+    for place, i in enumerate(items):
+        groups = () if found is None else found.groups[int(found.pattern[place])]
+        if len(groups) > 1:
+            names = problem.stations.names
+            code[i] = Status.DISCONNECTED
+            reason[i] = "no row links " + " with ".join(
+                "{" + ", ".join(names[s] for s in sorted(set(group))) + "}" for group in groups
+            )
+        elif not any(MODELS[rows.kind].ranges or MODELS[rows.kind].lifted for rows in problem.rows):
+            code[i] = Status.UNAVAILABLE
+            reason[i] = "no closed form starts from " + " and ".join(rows.kind for rows in problem.rows)
+        else:
+            code[i] = Status.SINGULAR_GEOMETRY
+            one = problem.take(np.array([i]))
+            reason[i] = _short(one) or station_direction(one)
+
+
+def _short(problem: Problem) -> str:
+    """Return a sentence that names the targets of a single problem with fewer rows than their states need."""
+    lacking = []
+    target = np.concatenate([rows.target for rows in problem.rows])
+    for i, motion in enumerate(problem.motions):
+        rows = int(((target == i) & (problem.weight[0] > 0.0)).sum())
+        needed = (motion.order + 1) * problem.dimension
+        if motion.known is None and motion.span == "run" and rows < needed:
+            lacking.append(f"target {i} has {rows} measurement{'' if rows == 1 else 's'} for {needed} unknowns")
+    return "; ".join(lacking[:_SHOWN]) if len(problem.motions) > 1 else ""
+
+
+def _position(problem: Problem, pool: Pool) -> Array:
+    """Return the position (N, d) of the only target, or the centre of the stations where there is no such thing."""
+    if any(slot.name == "position" for slot in problem.layout.shared):
+        return problem.layout.take(np.where(np.isfinite(pool.cost[:, :1]), pool.x[:, 0], np.nan), "position")
+    return np.broadcast_to(spread_of(problem)[0], (len(pool), problem.dimension))
+
+
+def _name_rejected(problem: Problem, pool: Pool, items: Array, reason: Array) -> None:
+    """Write which rows a loss rejected, where the residuals are larger than the noise allows."""
+    base = np.broadcast_to(problem.weight, pool.weights.shape)
+    lost = (base > 0.0) & (pool.weights < REJECTED * base)
+    for i in np.flatnonzero(items & lost.any(1)):
+        rows = np.flatnonzero(lost[i])
+        shown = ", ".join(map(str, rows[:_SHOWN])) + (" ..." if len(rows) > _SHOWN else "")
+        reason[i] = f"{len(rows)} of {int((base[i] > 0.0).sum())} rows are rejected: {shown}; {reason[i]}"
+
+
+def _hold_against_constraints(pool: Pool, cost: Array, code: Array, reason: Array) -> None:
+    """Write where the data contradict the constraints that hold an answer.
+
+    They do so where the data agree among themselves without the constraints, and each constraint that holds a fix
+    costs so much that noise does it once in a thousand times: with the true place inside, what k of them cost is not
+    more than chi-square of k degrees of freedom. A loss bears gross errors: under it the data need not agree.
+    """
+    assert pool.curvature is not None
+    if pool.curvature.active is None:
+        return
+    free = pool.free
+    assert free is not None
+    held = np.array([len(active) for active in pool.curvature.active])
+    with np.errstate(invalid="ignore"):
+        # whether the data agree without constraints; without redundancy they always do
+        noise = bool(pool.loss) | (pool.dof <= 0) | (chdtrc(np.maximum(pool.dof, 1), free) >= DOUBT)
+        dear = chdtrc(np.maximum(held, 1), np.maximum(cost - free, 0.0)) < DOUBT
+    for i in np.flatnonzero((held > 0) & np.isin(code, ANSWERED) & np.isfinite(free) & noise & dear):
+        names = " and ".join(active.name for active in pool.curvature.active[i])
+        code[i] = Status.CONTRADICTORY
+        reason[i] = f"the data contradict {names}: the cost is {cost[i]:.3g}, and {free[i]:.3g} without"
+
+
+def _weigh_claims(pool: Pool, code: Array, reason: Array, certificate: Array) -> None:
+    """Write what proofs, searches and the redundancy of the rows add to the statuses."""
+    if pool.certificate is not None:
+        claimed = present(pool.certificate)
+        certificate[claimed] = pool.certificate[claimed]
+    if pool.searched is not None:
+        for i in np.flatnonzero(pool.searched & np.isin(code, ANSWERED)):
+            sure = certificate[i].proof == "global" and certificate[i].unique
+            if code[i] == Status.OK and sure:
+                continue  # a proof makes up for the start that was not safe
+            code[i] = Status.SEARCHED if code[i] == Status.OK else code[i]
+            reason[i] = "" if pool.remark is None else pool.remark[i]
+    if pool.asked:
+        for dof, limit in (
+            (0, "an error in a measurement would not be noticed"),
+            (1, "an error would be noticed, not named"),
+        ):
+            for i in np.flatnonzero(np.isin(code, ANSWERED) & (pool.dof == dof)):
+                told = f"redundancy {dof}: {limit}"
+                reason[i] = f"{reason[i]}; {told}" if reason[i] else told
+
 
 _EPOCHS_SHOWN = 8  # epochs that a sentence names
 
