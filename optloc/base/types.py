@@ -156,7 +156,7 @@ class Band:
     Parameters
     ----------
     kind : str
-        A key of `optloc.SURFACES`, for instance "height".
+        A key of `optloc.models.surfaces.SURFACES`, for instance "height".
     lower, upper : array (...)
         Bounds in SI units; equal for an equality, infinite for none.
     coefficients : array (..., c)
