@@ -453,3 +453,12 @@ def test_require_and_failure_as_data():
         solve(bad).require()
     with pytest.raises(InvalidProblem):
         solve(good, "nonsense")
+
+
+def test_unit_directions_have_nothing_to_say_in_the_plane():
+    """It was an exception: a method that does not apply is a status."""
+    stations = np.array([[0.0, 0.0], [5e3, 0.0], [0.0, 4e3]])
+    template = assemble(stations, measured("azimuth", a=[0, 1, 2], sigma=1e-3))
+    fix = solve(simulate(template, truth=[3e3, 2e3], seed=1), "directions+lsr")
+    assert not fix.answered
+    assert fix.reason[()]

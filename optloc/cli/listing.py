@@ -80,7 +80,7 @@ def describe(title: str, table: Mapping[str, Any]) -> Rows:
 def _spell(value: Any) -> str | None:
     if isinstance(value, bool | int | float | str):
         return str(value)
-    if isinstance(value, tuple | list | frozenset | set) and all(isinstance(v, str | int) for v in value):
+    if isinstance(value, tuple | list | frozenset | set | Mapping) and all(isinstance(v, str | int) for v in value):
         return " ".join(str(v) for v in value)
     return None
 

@@ -154,10 +154,12 @@ def course_states(problem: Problem) -> Array | None:
 
 
 def by_directions(seen: Bearings) -> Array:
-    """Return the fixes (N, 1, 3) of the unit-direction relaxation, over threads; NaN where an elevation is missing."""
+    """Return the fixes (N, 1, d) of the unit-direction relaxation, over threads; NaN without elevations."""
     from formulations.direction_sdp import directions
 
-    out = np.full((len(seen.station), 1, 3), np.nan)
+    out = np.full((len(seen.station), 1, seen.station.shape[-1]), np.nan)
+    if out.shape[-1] == 2:  # directions in a plane are azimuths: nothing is left to relax
+        return out
 
     def relax(item: tuple[int, Array]) -> None:
         i, use = item
