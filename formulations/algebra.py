@@ -56,8 +56,8 @@ def flatten(value: ArrayLike, last: tuple[int, ...], lead: tuple[int, ...]) -> A
 
     Returns
     -------
-    Array, shape (N, *last)
-        N is the product of `lead`.
+    array
+        Of shape ``(N, *last)``, N the product of `lead`.
     """
     return np.broadcast_to(np.asarray(value, dtype=np.float64), (*lead, *last)).reshape(-1, *last)
 
