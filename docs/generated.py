@@ -42,15 +42,23 @@ def formulation(name: str) -> str:
 
 
 def costs() -> str:
-    """Return the formulations as a table: what each serves, how good its answer is, what it takes."""
+    """Return the formulations as a table: what each serves, how good its answer is, what it takes, its words."""
     from optloc.solvers import FORMULATIONS
 
-    head = ["| formulation | rows | its answer | time |", "|---|---|---|---|"]
-    lines = [
-        f"| [{name}]({name.split(':')[0]}.md) | {line.kinds} | {line.tight} | {line.cost} |"
-        for name, line in FORMULATIONS.items()
-    ]
+    head = ["| formulation | rows | its answer | time | words of a method |", "|---|---|---|---|---|"]
+    lines = []
+    for name, line in FORMULATIONS.items():
+        words = " ".join(f"`{word}`" for word in (*line.starts, *line.words)) or "for studies only"
+        lines.append(f"| [{name}]({name.split(':')[0]}.md) | {line.kinds} | {line.tight} | {line.cost} | {words} |")
     return "\n".join([*head, *lines])
+
+
+def words() -> str:
+    """Return the words that a method is made of as a table."""
+    from optloc import SOLVERS
+
+    lines = [f"| `{name}` | {entry.role} | {entry.summary} |" for name, entry in SOLVERS.items()]
+    return "\n".join(["| word | role | what the stage does |", "|---|---|---|", *lines])
 
 
 def kinds() -> str:
@@ -163,6 +171,7 @@ GENERATED: dict[str, Callable[..., str]] = {
     "formulation": formulation,
     "costs": costs,
     "kinds": kinds,
+    "words": words,
     "commands": commands,
     "layers": layers,
 }

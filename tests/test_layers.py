@@ -2,6 +2,7 @@
 
 import ast
 import sys
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -120,6 +121,30 @@ def test_no_circle():
 
 def test_no_loose_module():
     assert [path.name for path in sorted((ROOT / "optloc").glob("*.py"))] == ["__init__.py"]
+
+
+# A file is a concept: what a stranger can hold in mind. Measured on the tree of version 0.1, whose 410 modules nobody could.
+MODULES, LINES, BODY, RECURRING = 250, 600, 60, 20
+
+
+def test_files_and_functions_are_of_a_size_to_be_read():
+    known = modules(ROOT)
+    assert len(known) <= MODULES
+    assert not [name for name, path in known.items() if path.read_text(encoding="utf-8").count("\n") > LINES]
+    long = []
+    for name, path in known.items():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                words = ast.get_docstring(node, clean=False)
+                body = node.end_lineno - node.lineno + 1 - (words.count("\n") + 1 if words else 0)
+                long += [f"{name}.{node.name}"] if body > BODY else []
+    assert not long
+
+
+def test_a_module_name_stands_for_one_thing():
+    """A name recurs only where the folder says what is done with it, as in `cli/track` and `plot/track`."""
+    names = Counter(path.stem for path in modules(ROOT).values() if not path.stem.startswith("__"))
+    assert len([name for name, count in names.items() if count > 1]) <= RECURRING
 
 
 def test_formulations_know_nothing_of_optloc():

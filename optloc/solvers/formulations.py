@@ -154,6 +154,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "epipolar equalities; Shor 1987",
         starts={"directions": _from_bearings(by_directions)},
         bound=partial(reference_bound, method="directions"),
+        words=("bound",),
     ),
     "moment_sdp": Formulation(
         "order-2 moments of position and range errors in a box: a lower bound of the likelihood's cost",
@@ -162,6 +163,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "50 ms five stations, 100 ms six",
         "Lasserre 2001",
         bound=partial(reference_bound, method="moment"),
+        words=("bound",),
     ),
     "minimax_cone": Formulation(
         "least worst angle by bisection over second-order cones; proves that bounds contradict each other",
