@@ -123,7 +123,7 @@ def test_no_loose_module():
     assert [path.name for path in sorted((ROOT / "optloc").glob("*.py"))] == ["__init__.py"]
 
 
-# A file is a concept: what a stranger can hold in mind. Measured on the tree of version 0.1, whose 410 modules nobody could.
+# A file is a concept that a stranger can hold in mind; these are the limits of the contributing guide.
 MODULES, LINES, BODY, RECURRING = 250, 600, 60, 20
 
 
