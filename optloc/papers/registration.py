@@ -32,6 +32,7 @@ SPEED = 3e8
 """Speed of light of the paper, metres per second; with it 100 ns are exactly 30 m."""
 
 NANOSECOND = 1e-9 * SPEED
+"""Metres that a signal travels in a nanosecond."""
 
 Shape = Literal["full", "half", "diag"]
 
