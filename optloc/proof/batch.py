@@ -138,31 +138,35 @@ def _plain(array: Array) -> Array:
 @compiled
 def _loop(pose: Posed, asked: Asked, out: Answered) -> None:
     """Prove what is asked of each fix, and write what became of it."""
-    kinds, data, K = pose.kinds, pose.data, pose.K
+    # Taken out of the records once: every look into one counts the references of an array.
+    kinds, data, K, w = pose.kinds, pose.data, pose.K, pose.w
+    fixes, others, known, kappas, tolerances = asked.x, asked.others, asked.known, asked.kappa, asked.eps
+    regions, fallbacks, budgets = asked.region, asked.fallback, asked.budget
+    verdicts, counts, bounds, wholes, points = out.verdict, out.boxes, out.bound, out.everywhere, out.found
     J = K.shape[2]
     A, weight, groups, box = np.empty((J, J)), np.empty(J), empty_groups(J), empty_box(K.shape[1], J)
-    for i in range(len(asked.x)):
+    for i in range(len(fixes)):
         rows = K[i if len(K) > 1 else 0]
         if i == 0 or len(K) > 1:
             set_geometry(kinds, rows, A, weight, groups)
-        cost, own = Cost(kinds, data[i if len(data) > 1 else 0], rows, pose.w[i], A, weight, groups), box
+        cost, own = Cost(kinds, data[i if len(data) > 1 else 0], rows, w[i], A, weight, groups), box
         # Rows that are absent in this problem alone: the tables of the batch are too wide for it.
         if (weight == 0.0).any():
             cost = _present(cost)
             own = empty_box(cost.K.shape[0], cost.K.shape[1])
-        x, kappa, eps, found = asked.x[i], asked.kappa[i], asked.eps[i], out.found[i]
-        minima, low, high = asked.others[i, : asked.known[i]], asked.region[i, 0], asked.region[i, 1]
+        x, kappa, eps, found = fixes[i], kappas[i], tolerances[i], points[i]
+        minima, low, high = others[i, : known[i]], regions[i, 0], regions[i, 1]
         boxes = 0
-        out.everywhere[i] = isnan(low[0])
-        if out.everywhere[i]:
-            verdict, boxes, bound = prove_everywhere(cost, own, x, minima, kappa, eps, asked.budget[i], found)
-            out.verdict[i], out.boxes[i], out.bound[i] = verdict, boxes, bound
+        wholes[i] = isnan(low[0])
+        if wholes[i]:
+            verdict, boxes, bound = prove_everywhere(cost, own, x, minima, kappa, eps, budgets[i], found)
+            verdicts[i], counts[i], bounds[i] = verdict, boxes, bound
             if verdict != OPEN:
                 continue
-            out.everywhere[i] = False
-            low, high = asked.fallback[i, 0], asked.fallback[i, 1]
-        verdict, more, bound = prove(cost, own, x, minima, kappa, eps, asked.budget[i], low, high, False, found)
-        out.verdict[i], out.boxes[i], out.bound[i] = verdict, boxes + more, bound
+            wholes[i] = False
+            low, high = fallbacks[i, 0], fallbacks[i, 1]
+        verdict, more, bound = prove(cost, own, x, minima, kappa, eps, budgets[i], low, high, False, found)
+        verdicts[i], counts[i], bounds[i] = verdict, boxes + more, bound
 
 
 @compiled

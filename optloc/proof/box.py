@@ -27,6 +27,7 @@ from optloc.proof.nodes.node import (
     PULL0,
     PULL1,
     PULL2,
+    RANGE,
     SLOPE0,
     SLOPE1,
     SLOPE2,
@@ -388,7 +389,10 @@ def curve_nodes(
     Arguments are those of `bound_nodes`, which ran before, and working memory `second` (3, 3).
     """
     curve_ranges(kinds, gram, half, nodes, curves)
-    curve_others(kinds, data, centre, sense, half, line, second, nodes, curves)
+    for j in range(kinds.shape[0]):
+        if kinds[j] != RANGE:  # ranges alone are the common case, and every array that is handed on costs
+            curve_others(kinds, data, centre, sense, half, line, second, nodes, curves)
+            break
 
 
 @compiled
@@ -474,7 +478,7 @@ def convex(kinds: Array, A: Array, half: Array, nodes: Array, curves: Array, sum
         d0 += 2.0 * b0 * e0 + b0 * e1 + b1 * e0 + b0 * e2 + b2 * e0
         d1 += 2.0 * b1 * e1 + b0 * e1 + b1 * e0 + b1 * e2 + b2 * e1
         d2 += 2.0 * b2 * e2 + b0 * e2 + b2 * e0 + b1 * e2 + b2 * e1
-        shape = shape_of(kinds[j])
+        shape = CONVEX if kinds[j] == RANGE else shape_of(kinds[j])  # the common case spares the call
         if shape == FLAT:
             continue
         fall, rise = force_change(A, half, nodes, curves, j)

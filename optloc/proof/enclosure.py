@@ -33,9 +33,11 @@ def around_node(
     lower, upper : array (3,)
         Corners of the box, clipped in place.
     """
-    c0, c1, c2, radius = ball_of(kind, data, least, most)
-    if radius == inf:
-        return
+    c0, c1, c2, radius = data[0], data[1], data[2], most
+    if kind != RANGE:  # whose ball it is: ranges are asked often enough to be spared the call
+        c0, c1, c2, radius = ball_of(kind, data, least, most)
+        if radius == inf:
+            return
     radius = max(radius, 0.0) * (1.0 + _WIDER)
     c0, c1, c2 = c0 - x[0], c1 - x[1], c2 - x[2]
     for k in range(3):
@@ -338,7 +340,7 @@ def enclose(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper:
             if groups.tie[j] == 0.0:
                 middle, reach = nodes[j, PHI] - error, rho * sqrt(own[i, i])
                 ties[j, SWING] = abs(error) + reach
-                rays += int(has_ray(kinds[j]))
+                rays += int(kinds[j] != RANGE and has_ray(kinds[j]))
                 around_node(kinds[j], data[j], middle - reach, middle + reach, x, back, lower, upper)
         around_squares(kinds, data, A, nodes, back, rho, member, reference, own, groups.tie, ties, lower, upper)
     if rays:

@@ -45,7 +45,7 @@ from optloc.proof.box import (
 from optloc.proof.chart import Box, Chart, Cost, chart_at, empty_box
 from optloc.proof.near import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, descend, prove
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces, infinity_of, points_of
-from optloc.proof.nodes.node import ANY, DIFFERENCE, GROWS, H00, H11, H22
+from optloc.proof.nodes.node import ANY, DIFFERENCE, GROWS, H00, H11, H22, RANGE
 
 # The cost over the pieces of an atlas: all nodes over a box, out to infinity, and the surroundings of known minima.
 #
@@ -73,12 +73,13 @@ def reaches_infinity(kinds: Array, K: Array) -> bool:
         Whitened rows.
     """
     for j in range(kinds.shape[0]):
-        if infinity_of(kinds[j]) == GROWS:
+        # Here and below ranges, the common case, spare the call: what they do at infinity is known.
+        if kinds[j] != RANGE and infinity_of(kinds[j]) == GROWS:
             return False
     for i in range(K.shape[0]):
         total = size = 0.0
         for j in range(kinds.shape[0]):
-            if infinity_of(kinds[j]) == DIFFERENCE:
+            if kinds[j] == RANGE or infinity_of(kinds[j]) == DIFFERENCE:
                 total += K[i, j]
                 size += abs(K[i, j])
         if abs(total) > _BALANCED * size:
