@@ -101,7 +101,7 @@ class Box(NamedTuple):
     line : array (6,)
         Working memory.
     nodes, rows, curves, sums : array (J, NODE_WIDTH), (q, ROW_WIDTH), (J, CURVE_WIDTH), (SUMS,)
-        Tables, see `optloc.proof.box` and `optloc.proof.box`.
+        Tables, see `optloc.proof.box`.
     solve : array (3, 3)
         Working memory.
     cut : array (6,)
