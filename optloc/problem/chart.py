@@ -1,0 +1,369 @@
+"""Where a fix is Gaussian: in metres, or in the inverse of the distance from the stations' middle, or in neither.
+
+Seen from the middle c of the stations the position is ``x = c + (r / w)(u0 + B p)``: r and u0 are distance and
+direction of the fix, B spans what is across u0, p is a direction and w an inverse range. The fix is p = 0, w = 1;
+infinity is w = 0, a point like others. A distant emitter is curved in metres and Gaussian in ``y = (p, w)``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+
+from optloc.base import linalg
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.records import Axes
+from optloc.base.types import Array
+
+CARTESIAN, INVERSE_RANGE, CURVED = range(3)
+"""Kinds of a chart: the Gaussian in metres covers, the one in (p, w) does, neither does."""
+
+NAMES = ("cartesian", "inverse range", "curved")
+"""What the kinds are called, in the order of their numbers."""
+
+Extent = Literal["range", "bearing", "elevation", "height"]
+
+# The region shows what a Gaussian cannot: a function of a higher floor, so the advice names it.
+_ADVICE = "ask `optloc.likelihood_region(problem, fix)` for the region that the data allow"
+
+
+def distance_and_direction(position: Array, centre: Array) -> tuple[Array, Array]:
+    """Return distance r (...), metres, and direction u0 (..., d) of positions from centres, both (..., d).
+
+    At the centre itself, where r = 0, the direction is the first axis.
+    """
+    away = np.asarray(position - centre)
+    r = np.sqrt((away**2).sum(-1))
+    first = np.eye(away.shape[-1])[0]
+    return r, np.where(r[..., None] > 0.0, away / np.where(r > 0.0, r, 1.0)[..., None], first)
+
+
+def basis(direction: Array) -> Array:
+    """Return orthonormal vectors (..., d, d - 1), in columns, across unit vectors (..., d) of two or three dimensions.
+
+    References
+    ----------
+    T. Duff et al., "Building an orthonormal basis, revisited", Journal of Computer Graphics Techniques 6 (2017).
+    """
+    u = np.asarray(direction)
+    if u.shape[-1] == 2:
+        return np.stack([-u[..., 1], u[..., 0]], axis=-1)[..., None]
+    x, y, z = u[..., 0], u[..., 1], u[..., 2]
+    sign = np.copysign(1.0, z)
+    a = -1.0 / (sign + z)
+    first = np.stack([1.0 + sign * a * x * x, sign * a * x * y, -sign * x], axis=-1)
+    return np.stack([first, np.stack([a * x * y, sign + a * y * y, -y], axis=-1)], axis=-1)
+
+
+def to_chart(points: Array, position: Array, centre: Array) -> Array:
+    """Return chart coordinates (..., d) of points: p, then w.
+
+    Parameters
+    ----------
+    points : array (..., d)
+        Metres.
+    position, centre : array (..., d)
+        The fix, which is p = 0 and w = 1, and the middle of the stations; they broadcast against the points.
+
+    Returns
+    -------
+    array (..., d)
+        NaN where the fix is at the centre; w is negative for points behind the centre, infinite level with it.
+    """
+    r, u0 = distance_and_direction(position, centre)
+    away = points - centre
+    along, across = np.where(r > 0.0, (away * u0).sum(-1), np.nan), (away[..., None] * basis(u0)).sum(-2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.concatenate([across / along[..., None], (r / along)[..., None]], axis=-1)
+
+
+def to_position(y: Array, position: Array, centre: Array) -> Array:
+    """Return the positions (..., d), metres, that have chart coordinates y (..., d); see `to_chart`."""
+    r, u0 = distance_and_direction(position, centre)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(centre + (r / y[..., -1])[..., None] * _ray(y, u0))
+
+
+def jacobian(y: Array, position: Array, centre: Array) -> Array:
+    """Return dx/dy (..., d, d) at chart coordinates y (..., d): at the fix it is [r B, -r u0]; see `to_chart`."""
+    r, u0 = distance_and_direction(position, centre)
+    shape = np.broadcast_shapes(y.shape, u0.shape)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        size = (r / y[..., -1])[..., None, None]
+        along = -size * (_ray(y, u0) / y[..., -1:])[..., None]
+    across = np.broadcast_to(size * basis(u0), (*shape, shape[-1] - 1))
+    return np.concatenate([across, np.broadcast_to(along, (*shape, 1))], axis=-1)
+
+
+def log_volume(y: Array, position: Array, centre: Array) -> Array:
+    """Return log |det dx/dy| (...) at chart coordinates y (..., d): d log r - (d + 1) log w."""
+    r, d = distance_and_direction(position, centre)[0], y.shape[-1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(d * np.log(r) - (d + 1) * np.log(y[..., -1]))
+
+
+def _ray(y: Array, u0: Array) -> Array:
+    """Return u0 + B p."""
+    return np.asarray(u0 + (basis(u0) * y[..., None, :-1]).sum(-1))
+
+
+def quantile(probability: float, dimension: int) -> float:
+    """Return the quantile of chi-square with so many degrees of freedom.
+
+    Parameters
+    ----------
+    probability : float
+        Above 0 and below 1.
+    dimension : int
+        Degrees of freedom.
+    """
+    from scipy.special import gammaincinv
+
+    if not 0.0 < probability < 1.0:
+        raise InvalidProblem(f"a probability of {probability:g} is not between 0 and 1", "level", "such as 0.95")
+    return float(2.0 * gammaincinv(dimension / 2, probability))
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """The coordinates in which fixes are Gaussian.
+
+    Parameters
+    ----------
+    kind : int8 array (...)
+        `CARTESIAN`: in metres, with `position` and `covariance`. `INVERSE_RANGE`: in the chart, with `mean` and
+        `spread`. `CURVED`: in neither, or there is no covariance.
+    position : array (..., d)
+        The fixes, metres.
+    covariance : array (..., d, d)
+        The inverse of their information, square metres.
+    centre : array (..., d)
+        Mean of the stations, metres.
+    """
+
+    kind: Annotated[Array, Axes(0, empty=CURVED)]
+    position: Annotated[Array, Axes(1)]
+    covariance: Annotated[Array, Axes(2)]
+    centre: Annotated[Array, Axes(1)]
+
+    @property
+    def name(self) -> Any:
+        """Return the name of the kind of a single fix, or an array (...) of names of a batch."""
+        return np.array(NAMES)[self.kind][()]
+
+    @property
+    def distance(self) -> Array:
+        """Return the distances r (...) of the fixes from the centre, metres."""
+        return distance_and_direction(self.position, self.centre)[0]
+
+    @property
+    def direction(self) -> Array:
+        """Return the directions u0 (..., d) of the fixes from the centre."""
+        return distance_and_direction(self.position, self.centre)[1]
+
+    @property
+    def basis(self) -> Array:
+        """Return B (..., d, d - 1): unit vectors across the direction, in columns."""
+        return basis(self.direction)
+
+    @property
+    def mean(self) -> Array:
+        """Return the chart coordinates (..., d) of the fixes: p = 0, w = 1."""
+        y = np.zeros(self.position.shape)
+        y[..., -1] = 1.0
+        return y
+
+    @property
+    def gradient(self) -> Array:
+        """Return G = dx/dy (..., d, d) at the fixes, metres."""
+        return jacobian(self.mean, self.position, self.centre)
+
+    @property
+    def spread(self) -> Array:
+        """Return the covariance (..., d, d) of the chart coordinates at the fixes; infinite or NaN at the centre."""
+        r, u0 = distance_and_direction(self.position, self.centre)
+        # The axes are orthonormal up to the length r: the inverse of the gradient is its transpose over r squared.
+        axes = np.concatenate([basis(u0), -u0[..., None]], axis=-1)
+        turned = (self.covariance[..., :, :, None] * axes[..., None, :, :]).sum(-2)
+        form = (axes[..., :, :, None] * turned[..., :, None, :]).sum(-3)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(form / (r**2)[..., None, None])
+
+    def to_chart(self, points: Array) -> Array:
+        """Return chart coordinates of points (..., d), metres; see `optloc.problem.chart.to_chart`."""
+        return to_chart(np.asarray(points), self.position, self.centre)
+
+    def to_position(self, y: Array) -> Array:
+        """Return positions, metres, of chart coordinates (..., d)."""
+        return to_position(np.asarray(y), self.position, self.centre)
+
+    def log_volume(self, y: Array) -> Array:
+        """Return log |det dx/dy| (...) at chart coordinates (..., d)."""
+        return log_volume(np.asarray(y), self.position, self.centre)
+
+    def distance_squared(self, points: Array) -> Array:
+        """Return squared distances of points from the fixes in standard deviations, in the coordinates that cover.
+
+        Parameters
+        ----------
+        points : array (..., d)
+            Metres; they broadcast against the fixes.
+
+        Returns
+        -------
+        array (...)
+            Chi-square distributed for the truth; infinite behind the centre in the inverse-range chart, NaN for
+            curved fixes.
+        """
+        away = np.asarray(points) - self.position
+        dy = self.to_chart(points) - self.mean
+        # dy' G'A G dy: a step of the chart is one of metres by the gradient at the fix.
+        bent = (self.gradient * np.where(np.isfinite(dy), dy, 0.0)[..., None, :]).sum(-1)
+        step = np.where((self.kind == INVERSE_RANGE)[..., None], bent, away)
+        solved, known = linalg.solve(np.broadcast_to(self.covariance, (*step.shape, step.shape[-1])), step[..., None])
+        form = (step * solved[..., 0]).sum(-1)
+        inverse = self.kind == INVERSE_RANGE
+        behind = inverse & ~((dy[..., -1] > -1.0) & np.isfinite(dy).all(-1))
+        return np.where(known & (self.kind != CURVED), np.where(behind, np.inf, form), np.nan)
+
+    def covers(self, points: Array, level: float = 0.95) -> Array:
+        """Return whether points (..., d), metres, lie in the regions that hold the truth with a given probability.
+
+        Parameters
+        ----------
+        points : array (..., d)
+            Metres; they broadcast against the fixes, (q, d) for one fix and (q, N, d) for N.
+        level : float
+            Probability that the region of a fix contains the target.
+
+        Returns
+        -------
+        bool array (...)
+            Whether a point is in the ellipsoid, or in the one of the chart.
+        """
+        self._demand("region")
+        with np.errstate(invalid="ignore"):
+            return np.asarray(self.distance_squared(points) <= quantile(level, self.position.shape[-1]))
+
+    def interval(self, extent: Extent, level: float = 0.95) -> tuple[Array, Array]:
+        """Return the ends of an interval that holds one number of the truth with a given probability.
+
+        Parameters
+        ----------
+        extent : str
+            "range": distance from the centre along the direction of the fix, metres; the far end is infinite where
+            infinity is not excluded. "bearing": from the centre, radians from the first axis towards the second; the
+            ends are not wrapped, and a turn apart where nothing is known. "elevation": radians above the plane of the
+            first two axes. "height": the last coordinate of three, metres.
+        level : float
+            Probability that the interval contains the truth.
+
+        Returns
+        -------
+        low, high : array (...)
+            The ends.
+
+        Notes
+        -----
+        Where the fix is Gaussian in metres its range is so to first order only: beside the centre it is rough.
+        """
+        if extent not in _EXTENTS:
+            raise InvalidProblem(f"there is no interval of {extent!r}", "extent", nearest(str(extent), _EXTENTS))
+        self._demand(f"interval of the {extent}")
+        if extent in {"elevation", "height"} and self.position.shape[-1] != 3:
+            raise InvalidProblem(f"a fix in the plane has no {extent}", "extent")
+        return _EXTENTS[extent](self, float(np.sqrt(quantile(level, 1))))
+
+    def _demand(self, what: str) -> None:
+        """Raise where no Gaussian covers."""
+        curved = int((self.kind == CURVED).sum())
+        if curved:
+            whose = "this fix is" if self.kind.ndim == 0 else f"{curved} of {self.kind.size} fixes are"
+            raise InvalidProblem(f"{whose} not Gaussian in any coordinates, so there is no {what}", "fix", _ADVICE)
+
+
+def _range(chart: Chart, z: float) -> tuple[Array, Array]:
+    """Return r / (1 +- z sigma_w), or r -+ z sigma_r in metres."""
+    r, step = chart.distance, z * np.sqrt(chart.spread[..., -1, -1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        far = np.where(step < 1.0, r / (1.0 - step), np.inf)
+        near, width = r / (1.0 + step), z * np.sqrt(_form(chart.covariance, chart.direction, chart.direction))
+    inverse = chart.kind == INVERSE_RANGE
+    return np.where(inverse, near, np.maximum(r - width, 0.0)), np.where(inverse, far, r + width)
+
+
+def _bearing(chart: Chart, z: float) -> tuple[Array, Array]:
+    east, _, ahead = _sides(chart)
+    middle = np.arctan2(chart.direction[..., 1], chart.direction[..., 0])
+    low, high = _turn(chart, z, east, ahead)
+    return middle + low, middle + high
+
+
+def _elevation(chart: Chart, z: float) -> tuple[Array, Array]:
+    _, up, _ = _sides(chart)
+    low, high = _turn(chart, z, up, chart.direction)
+    middle = np.arctan2(chart.direction[..., 2], up[..., 2])
+    return np.maximum(middle + low, -0.5 * np.pi), np.minimum(middle + high, 0.5 * np.pi)
+
+
+def _height(chart: Chart, z: float) -> tuple[Array, Array]:
+    if (chart.kind != CARTESIAN).any():
+        raise InvalidProblem("the height of a fix that is not Gaussian in metres has no interval", "extent", _ADVICE)
+    width = z * np.sqrt(chart.covariance[..., 2, 2])
+    return chart.position[..., 2] - width, chart.position[..., 2] + width
+
+
+_EXTENTS: dict[str, Callable[[Chart, float], tuple[Array, Array]]] = {
+    "range": _range,
+    "bearing": _bearing,
+    "elevation": _elevation,
+    "height": _height,
+}
+
+
+def _sides(chart: Chart) -> tuple[Array, Array, Array]:
+    """Return unit vectors (..., d): level and across the direction, upwards and across it, and level along it."""
+    u0 = chart.direction
+    size = np.hypot(u0[..., 0], u0[..., 1])
+    # Of a direction straight up any bearing is as good.
+    c = np.where(size > 0.0, u0[..., 0] / np.where(size > 0.0, size, 1.0), 1.0)
+    s = np.where(size > 0.0, u0[..., 1] / np.where(size > 0.0, size, 1.0), 0.0)
+    if u0.shape[-1] == 2:
+        return np.stack([-s, c], axis=-1), np.zeros_like(u0), np.stack([c, s], axis=-1)
+    o = np.zeros_like(s)
+    up = np.stack([-u0[..., 2] * c, -u0[..., 2] * s, size], axis=-1)
+    return np.stack([-s, c, o], axis=-1), up, np.stack([c, s, o], axis=-1)
+
+
+def _turn(chart: Chart, z: float, side: Array, ahead: Array) -> tuple[Array, Array]:
+    """Return the least and greatest angle (...) from `ahead` towards `side`, both unit vectors (..., d).
+
+    The tangent of the angle is a quotient of two Gaussian numbers, of mean zero above and m below: by Fieller its
+    interval holds all t with ``(t m)^2 <= z^2 var(above - t below)``.
+
+    References
+    ----------
+    E. C. Fieller, "Some problems in interval estimation", Journal of the Royal Statistical Society B 16 (1954).
+    """
+    u0, r = chart.direction, chart.distance
+    middle = r * (ahead * u0).sum(-1)
+    # In the chart only what is across the direction is random; in metres what is along it as well.
+    inverse = (chart.kind == INVERSE_RANGE)[..., None]
+    below = np.where(inverse, ahead - (ahead * u0).sum(-1, keepdims=True) * u0, ahead)
+    v = z**2 * _form(chart.covariance, side, side)
+    mixed = z**2 * _form(chart.covariance, side, below)
+    lead = middle**2 - z**2 * _form(chart.covariance, below, below)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        root = np.sqrt(np.maximum(mixed**2 + lead * v, 0.0))
+        low, high = np.arctan((-mixed - root) / lead), np.arctan((-mixed + root) / lead)
+    # Where the region holds the point without an angle, the centre or straight up, every angle is possible.
+    known = lead > 0.0
+    return np.where(known, low, -np.pi), np.where(known, high, np.pi)
+
+
+def _form(matrix: Array, u: Array, v: Array) -> Array:
+    """Return u'M v (...)."""
+    return np.asarray((u[..., :, None] * matrix * v[..., None, :]).sum((-1, -2)))
