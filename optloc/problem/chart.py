@@ -152,7 +152,7 @@ class Chart:
     @property
     def name(self) -> Any:
         """Return the name of the kind of a single fix, or an array (...) of names of a batch."""
-        return np.array(NAMES)[self.kind][()]
+        return np.array(NAMES)[self.kind]
 
     @property
     def distance(self) -> Array:
