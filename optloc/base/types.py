@@ -234,6 +234,9 @@ class Status(IntEnum):
     UNAVAILABLE = 11
     DISCONNECTED = 12
     CONTRADICTORY = 13
+    MISFIT = 14
+    UNPROVEN = 15
+    CURVED = 16
 
     @property
     def sentence(self) -> str:
@@ -245,26 +248,82 @@ class Status(IntEnum):
         """Return the member's name as people and files spell it, for instance "too few rows"."""
         return self.name.lower().replace("_", " ")
 
+    @property
+    def mark(self) -> int:
+        """Return the bit that stands for the status where all that applies to a fix is kept in one number."""
+        return 1 << int(self)
+
 
 # What happened, then what helps: a user reads this sentence and no code.
 _SENTENCES: dict[Status, str] = {
-    Status.OK: "A refined maximum-likelihood fix.",
+    Status.OK: "The data do not reject the model, no other position explains them about as well, and the covariance "
+    "covers as it promises.",
     Status.AMBIGUOUS: "Several positions explain the data about equally well; see the alternatives, or add a row, a "
     "station or a known height that tells them apart.",
-    Status.SEARCHED: "No safe start is known for this mixture of rows: this is the best of a seeded search.",
+    Status.SEARCHED: "No safe start is known for this mixture of rows: this is the best of a seeded search, and nothing "
+    "proves that no other position explains the data as well.",
     Status.MAX_ITERATIONS: "The refinement used all its iterations; raise the limit or look at the geometry.",
     Status.STALLED: "The refinement could not lower the cost any more although its gradient is not zero.",
     Status.SINGULAR_GEOMETRY: "The rows leave a direction of the answer undetermined; add a station off it.",
     Status.TOO_FEW_ROWS: "There are fewer measurements than unknowns; add rows or fix an unknown.",
     Status.INFEASIBLE: "No position meets the constraints.",
-    Status.UNBOUNDED: "The likelihood keeps rising towards infinity: the data say a direction, not a range.",
+    Status.UNBOUNDED: "Positions ever farther away explain the data about as well: they say a direction and a least "
+    "range; add a station farther off, a bearing or a known height.",
     Status.NUMERICAL: "A solver failed numerically; check the scale and the units of the input.",
     Status.REJECTED: "A measurement is not a finite number; remove the row or give it weight zero.",
     Status.UNAVAILABLE: "The method does not apply to these kinds of rows; choose another or 'auto'.",
     Status.DISCONNECTED: "The station pairs fall into groups without a common station; add a pair that links them.",
     Status.CONTRADICTORY: "The measurements contradict each other, and leaving few of them out does not help, or they "
     "contradict the constraints; check the stations' places and clocks, the noise levels and the bounds.",
+    Status.MISFIT: "The residuals are larger than the stated noise allows, so position and covariance are refuted; see "
+    "'optloc check', look for a wrong row with the method 'robust', or state the noise as it is.",
+    Status.UNPROVEN: "Refined, but nothing proves that no other position explains the data about as well; use the "
+    "method 'auto', or allow this status.",
+    Status.CURVED: "Right, but the covariance in metres does not cover: use the fix's chart, its interval, or "
+    "optloc.likelihood_region.",
 }
+
+PRECEDENCE = (
+    # those without a finished answer exclude each other
+    Status.REJECTED,
+    Status.TOO_FEW_ROWS,
+    Status.DISCONNECTED,
+    Status.UNAVAILABLE,
+    Status.INFEASIBLE,
+    Status.NUMERICAL,
+    Status.SINGULAR_GEOMETRY,
+    Status.STALLED,
+    Status.MAX_ITERATIONS,
+    Status.CONTRADICTORY,
+    # gaps between minima mean nothing under noise that is refuted, and a rival does not close an open region
+    Status.MISFIT,
+    Status.UNBOUNDED,
+    Status.AMBIGUOUS,
+    Status.SEARCHED,
+    Status.UNPROVEN,
+    Status.CURVED,
+    Status.OK,
+)
+"""Which of all that applies to a fix is its status: the first of these."""
+
+ANSWERED = (
+    Status.OK,
+    Status.CURVED,
+    Status.UNPROVEN,
+    Status.SEARCHED,
+    Status.AMBIGUOUS,
+    Status.UNBOUNDED,
+    Status.MISFIT,
+)
+"""Statuses of fixes that have a position with a covariance, as far as there is a finite one."""
+
+
+def first_status(marks: Array) -> Array:
+    """Return the statuses (...) of the marks (...) of all that applies; `ok` where nothing does."""
+    code = np.full(np.shape(marks), int(Status.OK), dtype=np.int8)
+    for status in reversed(PRECEDENCE):
+        code[np.asarray(marks) & status.mark != 0] = int(status)
+    return code
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,6 +39,9 @@ class Curvature:
         Tuples of `Active` constraints.
     local : array (N, k, p, p), optional
         Covariance of the states that targets have at each epoch of a run.
+    kappa : array (N, 2), optional
+        By how much the cost departs from that of a Gaussian three sigma away, in metres and in inverse range
+        (`optloc.uncertainty.shape`); NaN where nobody has looked.
     """
 
     covariance: Annotated[Array, Axes(2)]
@@ -47,6 +50,7 @@ class Curvature:
     weakest: Annotated[Array, Axes(0, empty=np.inf)] | None = None
     active: Annotated[Array, Axes(0, empty=())] | None = None
     local: Annotated[Array, Axes(3)] | None = None
+    kappa: Annotated[Array, Axes(1)] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,8 +82,9 @@ class Pool:
         At the candidates in the first slots; None before anything is settled.
     plain : bool array (N,), optional
         Where nothing stands against the best candidate: near, regular, finished and without a rival.
-    endless : bool array (N,), optional
-        Where positions ever farther away explain the data about as well.
+    infinity : array (N,), optional
+        Least cost known of positions ever farther away; infinite where they cost ever more, NaN where nobody has
+        looked.
     free : array (N,), optional
         Least cost without the inequalities, where there are some.
     loss : str
@@ -107,7 +112,7 @@ class Pool:
     refined: bool = False
     curvature: Curvature | None = None
     plain: Annotated[Array, Axes(0, empty=False)] | None = None
-    endless: Annotated[Array, Axes(0, empty=False)] | None = None
+    infinity: Annotated[Array, Axes(0)] | None = None
     free: Annotated[Array, Axes(0)] | None = None
     loss: str = ""
     searched: Annotated[Array, Axes(0, empty=False)] | None = None
