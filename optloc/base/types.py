@@ -352,6 +352,8 @@ class Certificate:
         How many boxes a proof by branch and bound looked at.
     region : tuple of (lower, upper), optional
         Corners of the region of the claim, each d coordinates in the problem's frame, metres.
+    asked : bool
+        Whether the claim is limited to that region because somebody asked for it, not because more could not be proven.
     """
 
     proof: str
@@ -363,3 +365,4 @@ class Certificate:
     margin: float = 0.0
     boxes: int = 0
     region: tuple[tuple[float, ...], tuple[float, ...]] | None = None
+    asked: bool = False

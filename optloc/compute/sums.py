@@ -60,8 +60,9 @@ def summed(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = None
 
 def _by_machine_code(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None) -> Normal | None:
     """Return the sums by machine code, or None where it does not serve the problem or does not pay."""
-    count = x.size // x.shape[-1]
-    alike = problem.batch_shape in {(), (1,), (count,)} and x.ndim == 2
+    count, shape = x.size // x.shape[-1], x.shape[:-1]
+    # one vector for each problem, or several side by side
+    alike = problem.batch_shape in {(), (1,), (count,)} if x.ndim == 2 else problem.batch_shape == shape[-1:]
     if not alike or not serves(problem, count) or (noise is None and depends_on_place(problem)):
         return None
     found = pack(problem, whitener_at(problem, x) if noise is None else noise)
@@ -69,7 +70,10 @@ def _by_machine_code(problem: Problem, x: Array, noise: tuple[Whitener, ...] | N
         return None
     from optloc.compute.equations import normal_at
 
-    return normal_at(found, x, np.arange(count) % max(1, *problem.batch_shape, 1))
+    sums = normal_at(found, x.reshape(count, -1), np.arange(count) % max(1, *problem.batch_shape, 1))
+    if x.ndim == 2:
+        return sums
+    return Normal(*(part.reshape(*shape, *part.shape[1:]) for part in sums.parts))
 
 
 def serves(problem: Problem, starts: int) -> bool:

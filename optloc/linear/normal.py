@@ -222,6 +222,11 @@ class Normal:
     local_vector: Array
     cost: Array
 
+    @property
+    def parts(self) -> tuple[Array, ...]:
+        """Return its arrays, in their order."""
+        return self.shared, self.local, self.cross, self.shared_vector, self.local_vector, self.cost
+
     def __add__(self, other: Normal) -> Normal:
         """Return the sum of the information of disjoint epochs: shared parts add, local parts are joined."""
         # Without local unknowns nothing is joined: blocks of length zero stay as they are.

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem, NoSolution
+from optloc.base.errors import InvalidProblem, NoSolution, nearest
 from optloc.base.frames import Frame
 from optloc.base.records import Axes, change
-from optloc.base.types import Array, Certificate, Status
+from optloc.base.types import ANSWERED, PRECEDENCE, Array, Certificate, Status
+from optloc.problem.chart import Chart, Extent
 from optloc.problem.layout import Layout
 
 _STATES = ("position", "velocity", "acceleration")
@@ -183,6 +184,12 @@ class Fix:
     explanations : object array (...), optional
         Where the data contradict each other, a tuple of `Explanation`: all the ways of leaving out least, the most
         plausible first, which is the one that was taken; an empty tuple elsewhere. None where nobody asked.
+    marks : int array (...), optional
+        All that applies to each fix, a bit for each `Status`; see `findings`.
+    chart : Chart, optional
+        In which coordinates each is Gaussian; None for problems that are not of one position.
+    infinity : array (...), optional
+        Least cost of positions infinitely far away less that of the fix; NaN where nobody has looked.
     """
 
     x: Annotated[Array, Axes(1)]
@@ -200,6 +207,9 @@ class Fix:
     active: Annotated[Array, Axes(0, empty=())] | None = None
     local: Annotated[Array, Axes(3)] | None = None
     explanations: Annotated[Array, Axes(0, empty=())] | None = None
+    marks: Annotated[Array, Axes(0)] | None = None
+    chart: Chart | None = None
+    infinity: Annotated[Array, Axes(0)] | None = None
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -303,12 +313,77 @@ class Fix:
 
     @property
     def answered(self) -> Array:
-        """Return where there is an answer with a covariance, possibly one of several, (...)."""
-        return np.isin(self.code, (Status.OK, Status.AMBIGUOUS, Status.SEARCHED))
+        """Return where there is a position with a covariance, whatever stands against it, (...)."""
+        # that of a run to infinity has none
+        return np.isin(self.code, ANSWERED) & np.isfinite(self.x).any(-1)
 
-    def require(self) -> Fix:
-        """Return the fix if every status in it is ok; raise NoSolution with the first that is not."""
-        bad = np.flatnonzero(np.ravel(self.code) != Status.OK)
+    @property
+    def findings(self) -> Any:
+        """Return all that stands against a single fix, a tuple of `Status`, or an object array (...) of a batch.
+
+        The most serious comes first: it is the status. An `ok` fix has none.
+        """
+        marks = np.left_shift(1, self.code.astype(np.int32)) if self.marks is None else self.marks
+        out = np.empty(self.shape, dtype=object)
+        for i in np.ndindex(self.shape):
+            found = int(marks[i])
+            out[i] = tuple(one for one in PRECEDENCE if one is not Status.OK and found & one.mark)
+        return out[()]
+
+    def covers(self, points: Array, level: float = 0.95) -> Array:
+        """Return whether points lie in the regions that hold the target with a given probability.
+
+        Parameters
+        ----------
+        points : array (..., d)
+            Metres; they broadcast against the fixes, (q, d) for one fix and (q, N, d) for N.
+        level : float
+            Probability that the region of a fix contains the target.
+
+        Returns
+        -------
+        bool array (...)
+            By the Gaussian in the coordinates where it covers, see `chart`.
+
+        Raises
+        ------
+        InvalidProblem
+            Where no Gaussian covers: `optloc.likelihood_region` shows what does.
+        """
+        return self._gaussian_chart().covers(points, level)
+
+    def interval(self, extent: Extent, level: float = 0.95) -> tuple[Array, Array]:
+        """Return the ends (...) of an interval that holds the range, bearing, elevation or height of the target.
+
+        Parameters
+        ----------
+        extent : "range", "bearing", "elevation" or "height"
+            Seen from the middle of the stations; metres or radians, see `optloc.problem.chart.Chart.interval`.
+        level : float
+            Probability that the interval contains it.
+
+        Raises
+        ------
+        InvalidProblem
+            Where no Gaussian covers: `optloc.likelihood_region` shows what does.
+        """
+        return self._gaussian_chart().interval(extent, level)
+
+    def _gaussian_chart(self) -> Chart:
+        if self.chart is None:
+            raise InvalidProblem("a fix that is not of one position has no chart", "fix", "see its covariance")
+        return self.chart
+
+    def require(self, allow: Iterable[Status | str] = ()) -> Fix:
+        """Return the fix if every status in it is `ok` or allowed; raise NoSolution with the first that is not.
+
+        Parameters
+        ----------
+        allow : iterable of Status or str
+            What passes beside `ok`, for instance ``("curved", "unproven")``.
+        """
+        passing = [Status.OK, *(one if isinstance(one, Status) else status_named(one) for one in allow)]
+        bad = np.flatnonzero(~np.isin(np.ravel(self.code), passing))
         if len(bad):
             flat = self.flat()
             raise NoSolution(None, flat[int(bad[0])])
@@ -329,6 +404,15 @@ class Fix:
     def __len__(self) -> int:
         """Return the length of the first batch axis."""
         return int(self.x.shape[0])
+
+
+def status_named(label: str) -> Status:
+    """Return the status of a label such as "too few rows"; raise InvalidProblem for one that there is not."""
+    wanted = label.strip().lower().replace("_", " ").replace("-", " ")
+    for status in Status:
+        if status.label == wanted:
+            return status
+    raise InvalidProblem(f"there is no status {label!r}", "status", nearest(label, [one.label for one in Status]))
 
 
 def tail_probability(cost: Array, dof: Array) -> Array:

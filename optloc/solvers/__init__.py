@@ -15,7 +15,7 @@ from optloc.solvers.methods import FORMULATIONS, METHODS, SOLVERS, Entry, Formul
 from optloc.solvers.outside import given
 from optloc.solvers.pool import begin, in_parts
 from optloc.solvers.starts.position import vectors
-from optloc.solvers.verdict.judge import hide_open_epochs, judge
+from optloc.solvers.verdict.judge import hide_open_epochs, verdict
 
 __all__ = ["FORMULATIONS", "METHODS", "SOLVERS", "Entry", "Formulation", "Method", "given", "solve", "vectors"]
 
@@ -52,7 +52,7 @@ def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
 
     def work(some: Problem, part: slice) -> Fix:
         pool = None if vector is None else begin(some, vector[part])
-        return hide_open_epochs(judge(some, run(some, pool)))
+        return hide_open_epochs(verdict(some, run(some, pool)))
 
     # the shortcut divides its work itself, and shares it among threads
     fix = work(flat, slice(None)) if shortcut(run) and vector is None else in_parts(flat, work)

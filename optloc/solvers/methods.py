@@ -177,8 +177,8 @@ SHORTCUTS: Mapping[tuple[str, ...], Quick] = {("gtrs", "lsr"): Quick(WORTH)}
 METHODS = {
     "auto": "gtrs+lsr+certify|roots+lsr+widen+lsr+search+certify",
     "searched": "roots+lsr+widen+lsr+search",
-    "proven": "roots+lsr+widen+lsr+search+bound",
-    "robust": "roots+lsr+widen+lsr+search+suspects",
+    "proven": "roots+lsr+widen+lsr+search+certify+bound",
+    "robust": "roots+lsr+widen+lsr+search+suspects+certify",
 }
 
 # More candidates change nothing about these, so that nobody has to prove them.

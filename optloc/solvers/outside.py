@@ -12,10 +12,9 @@ from optloc.base import linalg
 from optloc.base.types import Array, Status
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
-from optloc.solvers.policy import AMBIGUOUS_GAP
 from optloc.solvers.pool import Curvature, Pool, begin
 from optloc.solvers.stages import Solver
-from optloc.solvers.verdict.judge import LOCAL, UNKNOWN, fill, judge
+from optloc.solvers.verdict.judge import LOCAL, UNKNOWN, fill, judge, verdict
 from optloc.solvers.verdict.minima import settle
 
 FixSolver = Callable[[Problem, Fix | None], Fix]
@@ -57,7 +56,7 @@ def judge_points(problem: Problem, start: Array, x: Array, cost: Array, code: Ar
     """
     faces = np.zeros(cost.shape, dtype=int)
     found = replace(begin(problem, start), x=x, cost=cost, code=code.astype(np.int8), face=faces)
-    return judge(problem, settle(problem, found, stage))
+    return verdict(problem, settle(problem, found, stage))
 
 
 def accept(problem: Problem, fix: Fix) -> Pool:
@@ -78,8 +77,8 @@ def accept(problem: Problem, fix: Fix) -> Pool:
     known = np.asarray(np.isfinite(fix.cov).all((-1, -2)))
     # a fix keeps its covariance alone: what is weak is not known of it, and not needed, as its verdict stands
     information, regular = linalg.inverse(np.where(known[:, None, None], fix.cov, np.eye(fix.cov.shape[-1])))
-    # ambiguous without a rival that is near: the rival was a run to infinity
-    near = (fix.alternatives.gap < AMBIGUOUS_GAP).any(1)
+    marks = np.zeros(len(fix.code), dtype=int) if fix.marks is None else fix.marks
+    searched = (fix.code == Status.SEARCHED) | (marks & Status.SEARCHED.mark != 0)
     verbatim = ~fix.answered if fix.explanations is None else ~fix.answered | (_lengths(fix.explanations) > 0)
     return Pool(
         x,
@@ -91,9 +90,9 @@ def accept(problem: Problem, fix: Fix) -> Pool:
         fix.stages,
         refined=True,
         curvature=Curvature(fix.cov, information, known & regular, None, fix.active, fix.local),
-        endless=(fix.code == Status.AMBIGUOUS) & ~near,
+        infinity=None if fix.infinity is None else fix.cost + fix.infinity,
         loss="" if np.array_equal(fix.weights, np.broadcast_to(problem.weight, fix.weights.shape)) else "given",
-        searched=fix.code == Status.SEARCHED,
+        searched=searched,
         remark=np.where(fix.code == Status.SEARCHED, fix.reason, ""),
         certificate=_claims(fix.certificate),
         asked=fix.explanations is not None,

@@ -15,7 +15,7 @@ from optloc.problem.problem import Problem
 from optloc.solvers import solve
 from optloc.solvers.methods import Method, shortcut
 from optloc.solvers.range_fixes import Direct, by_stages, direct, settle_directly
-from optloc.solvers.verdict.judge import judge
+from optloc.solvers.verdict.judge import verdict
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,9 +77,7 @@ class Prepared:
             wide = np.broadcast_to(place.reshape(*self.shape, *place.shape[1:]), (*shape, *place.shape[1:]))
             place = wide.reshape(-1, *place.shape[1:])
         pool = settle_directly(self.plan, flat, place, lambda items: by_stages(self._flat(values, shape), items))
-        # a verdict without exceptions needs no measurements: then no problem is made of them
-        plain = pool.plain is not None and bool(pool.plain.all())
-        fix = judge(self.problem if plain else self._flat(values, shape), pool)
+        fix = verdict(self._flat(values, shape), pool)
         return fix if len(shape) == 1 else fix.reshape(shape)
 
     def _flat(self, z: Array, shape: tuple[int, ...]) -> Problem:

@@ -20,7 +20,7 @@ from optloc.solvers.pool import begin
 from optloc.solvers.refine import refine
 from optloc.solvers.stages import lsr
 from optloc.solvers.starts.position import complete
-from optloc.solvers.verdict.judge import judge
+from optloc.solvers.verdict.judge import verdict
 
 # One standard deviation: the sums then err by thousandths of it.
 _TOLERANCE = 1.0
@@ -117,7 +117,7 @@ class Running:
     def fix(self) -> Fix:
         """Return the fix of all epochs, (N,), refined from the running solution and judged."""
         start = begin(self.problem, complete(self.problem, self.x[:, None]))
-        return judge(self.problem, lsr(self.problem, start))
+        return verdict(self.problem, lsr(self.problem, start))
 
 
 def _linearise(problem: Problem, at: Array, before: int, tolerance: float) -> Running:

@@ -30,7 +30,7 @@ from optloc.solvers.pool import Pool, offer, pack
 from optloc.solvers.refine import refine
 from optloc.solvers.stages import lsr
 from optloc.solvers.starts.position import spread_of, vectors
-from optloc.solvers.verdict.judge import fill, judge, standing
+from optloc.solvers.verdict.judge import fill, judge, standing, verdict
 
 # What a proof lets a certificate say, in sentences.
 
@@ -419,10 +419,10 @@ def _deep(problem: Problem, x: Array) -> Array:
 
 def _keep_evidence(pool: Pool, before: Pool) -> Pool:
     """Return a pool with what was known of its problems before one more candidate was refined."""
-    endless = pool.endless if before.endless is None else before.endless
-    if pool.endless is not None and before.endless is not None:
-        endless = pool.endless | before.endless
-    return replace(pool, endless=endless, searched=before.searched, remark=before.remark, asked=before.asked)
+    infinity = pool.infinity if before.infinity is None else before.infinity
+    if pool.infinity is not None and before.infinity is not None:
+        infinity = np.fmin(pool.infinity, before.infinity)
+    return replace(pool, infinity=infinity, searched=before.searched, remark=before.remark, asked=before.asked)
 
 
 def _around(problem: Problem, position: Array) -> Array:
@@ -482,7 +482,7 @@ def certify(
         raise InvalidProblem(f"the margin is {margin}", "margin", "give 0 or a positive number")
     corners = None if region is None else _corners(problem, region)
     pool = certified(flat, accept(flat, fix.reshape((flat.batch_shape[0],))), corners, margin, _EFFORT)
-    return judge(flat, pool).reshape(shape)
+    return verdict(flat, pool).reshape(shape)
 
 
 def value_certified(problem: Problem, pool: Pool | None) -> Pool:

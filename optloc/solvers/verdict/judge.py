@@ -5,20 +5,21 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.special import chdtrc, gammainccinv
+from scipy.special import chdtrc
 
 from optloc.base.records import overwrite, present, take
-from optloc.base.types import Array, Certificate, Status
+from optloc.base.types import ANSWERED, Array, Certificate, Status, first_status
 from optloc.bounds.observability import open_sentences
 from optloc.linear.constraints import violation_names
 from optloc.models import MODELS
 from optloc.problem.fix import Alternatives, Fix, tail_probability
 from optloc.problem.problem import Problem
-from optloc.solvers.policy import AMBIGUOUS_GAP, DOUBT, FAR, FLAT, REJECTED, WEAK
+from optloc.solvers.policy import DOUBT, FAR, FLAT, REJECTED, WEAK
 from optloc.solvers.pool import Curvature, Pool
 from optloc.solvers.starts.least_squares_ranges import ranges
 from optloc.solvers.starts.position import distance_of, spread_of
 from optloc.solvers.verdict.conclusion import conclude
+from optloc.solvers.verdict.findings import chart_of, examine, explain, is_improbable, mark
 from optloc.solvers.verdict.minima import station_direction, weak_direction
 
 LOCAL = Certificate(
@@ -28,10 +29,8 @@ LOCAL = Certificate(
 )
 UNKNOWN = Certificate("unknown", "there is no refined answer to prove anything about", "none")
 
-ANSWERED = (Status.OK, Status.AMBIGUOUS, Status.SEARCHED)
 _UNFINISHED = (Status.UNBOUNDED, Status.MAX_ITERATIONS, Status.STALLED)
 
-_ALIKE = 1e-3  # gaps below this are told as "fits as well": a reader gains nothing from more zeros
 _SHOWN = 8  # names or numbers in a sentence; more are not read
 
 
@@ -41,8 +40,8 @@ class Ruling:
 
     Parameters
     ----------
-    code : int array (N,)
-        `Status` numbers.
+    marks : int array (N,)
+        All that applies, a bit for each `Status`.
     reason : object array (N,)
         Sentences.
     certificate : object array (N,)
@@ -51,7 +50,7 @@ class Ruling:
         Where there is no position to be shown.
     """
 
-    code: Array
+    marks: Array
     reason: Array
     certificate: Array
     gone: Array
@@ -73,7 +72,6 @@ def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     assert curvature is not None
     code, reason = np.array(pool.code[:, 0]), fill(len(pool), "")
     cost = np.where(np.isfinite(pool.cost[:, 0]), pool.cost[:, 0], np.nan)
-    p_value, nearest = tail_probability(cost, pool.dof), np.min(gap, axis=1, initial=np.inf)
     # a row that is absent may hold anything
     broken = ~np.broadcast_to((np.isfinite(problem.z) | (problem.weight == 0.0)).all(-1), code.shape)
     few = (pool.dof < 0) & ~broken
@@ -82,64 +80,32 @@ def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     # what is missing, in this order: data, rows, a candidate; what is left is an answer, perhaps a bad one
     weak = answered & ~_is_determined(curvature)
     distance = distance_of(problem, _position(problem, pool))
-    far = answered & _runs_away(problem, curvature, distance, (code != Status.OK) | weak | (p_value < DOUBT))
+    with np.errstate(invalid="ignore"):
+        lost = (code != Status.OK) | weak | is_improbable(cost, pool.dof, DOUBT)
+    far = answered & _runs_away(problem, curvature, distance, lost)
     # far away every direction is weak: how far says more
     weak &= ~far
     code[broken], code[few], code[far] = Status.REJECTED, Status.TOO_FEW_ROWS, Status.UNBOUNDED
     code[weak] = Status.SINGULAR_GEOMETRY
-    # of what converged: another status says something worse than that there are two places
-    code[(code == Status.OK) & (nearest < AMBIGUOUS_GAP)] = Status.AMBIGUOUS
-    _doubt(reason, (code == Status.OK) & (p_value < DOUBT), p_value)
     for i in np.flatnonzero(few):
         reason[i] = _lacking(-int(pool.dof[i]))
     for i in np.flatnonzero(answered & np.isin(code, _UNFINISHED)):
         reason[i] = f"the refinement stopped {distance[i]:.3g} spreads of the stations away"
     for i in np.flatnonzero(weak):
         reason[i] = _open(problem, _information(curvature)[i])
-    for i in np.flatnonzero(code == Status.AMBIGUOUS):
-        reason[i] = _ambiguous(problem, nearest[i])
-    barred = missing & (code == Status.INFEASIBLE)
-    for i in np.flatnonzero(barred):
-        names = violation_names(problem)
-        reason[i] = f"no minimum meets all of: {names}" if names else "the Earth hides every position from a satellite"
-    _explain_missing(problem, np.flatnonzero(missing & ~barred), code, reason)
-    if pool.endless is not None:
-        rivalled = pool.endless & (code == Status.OK)
-        code[rivalled], reason[rivalled] = Status.AMBIGUOUS, "positions ever farther away explain the data as well"
-    # what refinement shows of an answer by itself; claims of proofs replace it below
-    certificate = fill(len(pool), LOCAL)
-    certificate[~np.isin(code, (Status.OK, Status.AMBIGUOUS))] = UNKNOWN
-    if pool.loss:
-        _name_rejected(problem, pool, (code == Status.OK) & (p_value < DOUBT), reason)
+    _explain_missing(problem, np.flatnonzero(missing), code, reason)
+    finished = answered & (code == Status.OK)
+    marks = np.where(finished, mark(problem, pool, gap), 1 << code.astype(np.int32)).astype(np.int32)
+    certificate = np.where(finished, _claims(pool), UNKNOWN)
     if pool.free is not None:
-        _hold_against_constraints(pool, cost, code, reason)
-    _weigh_claims(pool, code, reason, certificate)
-    return Ruling(code, reason, certificate, broken | few | missing | weak | far)
-
-
-def doubtful(cost: Array, dof: Array) -> Array:
-    """Return the probabilities (N,) of costs that the noise does not allow; NaN for all others.
-
-    Parameters
-    ----------
-    cost : array (N,)
-        Of finished fixes.
-    dof : int array (N,)
-        Degrees of freedom, often one number for all (a view without strides).
-    """
-    out = np.full(len(cost), np.nan)
-    for level in dof[:1] if dof.strides == (0,) else np.unique(dof):
-        if level > 0:
-            limit = 2.0 * gammainccinv(level / 2, DOUBT) * (1.0 - 1e-9)  # the exact test follows for the few above
-            items = np.flatnonzero((cost > limit) & (dof == level) if dof.strides != (0,) else cost > limit)
-            p_value = tail_probability(cost[items], np.full(len(items), level))
-            out[items] = np.where(p_value < DOUBT, p_value, np.nan)
-    return out
-
-
-def doubt_sentence(p_value: float) -> str:
-    """Return what a small chi-square probability means."""
-    return f"the residuals are larger than the noise allows (p = {p_value:.1g})"
+        _hold_against_constraints(pool, cost, finished, marks, reason)
+    code = first_status(marks)
+    explain(problem, pool, code, gap, certificate, reason)
+    if pool.loss:
+        _name_rejected(problem, pool, finished & is_improbable(cost, pool.dof, DOUBT), reason)
+    if pool.asked:
+        _weigh_redundancy(pool, finished, reason)
+    return Ruling(marks, reason, certificate, broken | few | missing | weak | far)
 
 
 def fill(count: int, value: object) -> Array:
@@ -171,19 +137,8 @@ def _runs_away(problem: Problem, curvature: Curvature, distance: Array, lost: Ar
         return np.asarray(((lost | loose) & (distance > FAR)) | (distance > FLAT))
 
 
-def _doubt(reason: Array, where: Array, p_value: Array) -> None:
-    for i in np.flatnonzero(where):
-        reason[i] = doubt_sentence(p_value[i])
-
-
 def _lacking(count: int) -> str:
     return f"there {'is 1 measurement' if count == 1 else f'are {count} measurements'} fewer than unknowns"
-
-
-def _ambiguous(problem: Problem, gap: float) -> str:
-    text = "another position " + ("fits as well" if gap < _ALIKE else f"costs only {gap:.2g} more")
-    moving = problem.epochs > 1 and any(motion.order > 0 for motion in problem.motions)
-    return text + (": a bound on height, speed or place would decide" if moving else "")
 
 
 def _open(problem: Problem, information: Array) -> str:
@@ -197,9 +152,14 @@ def _explain_missing(problem: Problem, items: Array, code: Array, reason: Array)
     """Write the status of problems without any candidate: what keeps every closed form from a start."""
     if not len(items):
         return
+    barred = items[code[items] == Status.INFEASIBLE]
+    for i in barred:
+        names = violation_names(problem)
+        reason[i] = f"no minimum meets all of: {names}" if names else "the Earth hides every position from a satellite"
+    items = np.setdiff1d(items, barred)
     single = problem.epochs == 1 or problem.stations.position.shape[-3] == 1
     # the graph of ranges is that of one position: stations of a moving run link themselves
-    found = ranges(problem.take(items)) if single else None
+    found = ranges(problem.take(items)) if single and len(items) else None
     for place, i in enumerate(items):
         groups = () if found is None else found.groups[int(found.pattern[place])]
         if len(groups) > 1:
@@ -246,8 +206,8 @@ def _name_rejected(problem: Problem, pool: Pool, items: Array, reason: Array) ->
         reason[i] = f"{len(rows)} of {int((base[i] > 0.0).sum())} rows are rejected: {shown}; {reason[i]}"
 
 
-def _hold_against_constraints(pool: Pool, cost: Array, code: Array, reason: Array) -> None:
-    """Write where the data contradict the constraints that hold an answer.
+def _hold_against_constraints(pool: Pool, cost: Array, finished: Array, marks: Array, reason: Array) -> None:
+    """Mark where the data contradict the constraints that hold an answer.
 
     They do so where the data agree among themselves without the constraints, and each constraint that holds a fix
     costs so much that noise does it once in a thousand times: with the true place inside, what k of them cost is not
@@ -263,39 +223,41 @@ def _hold_against_constraints(pool: Pool, cost: Array, code: Array, reason: Arra
         # whether the data agree without constraints; without redundancy they always do
         noise = bool(pool.loss) | (pool.dof <= 0) | (chdtrc(np.maximum(pool.dof, 1), free) >= DOUBT)
         dear = chdtrc(np.maximum(held, 1), np.maximum(cost - free, 0.0)) < DOUBT
-    for i in np.flatnonzero((held > 0) & np.isin(code, ANSWERED) & np.isfinite(free) & noise & dear):
+    for i in np.flatnonzero((held > 0) & finished & np.isfinite(free) & noise & dear):
         names = " and ".join(active.name for active in pool.curvature.active[i])
-        code[i] = Status.CONTRADICTORY
+        marks[i] |= Status.CONTRADICTORY.mark
         reason[i] = f"the data contradict {names}: the cost is {cost[i]:.3g}, and {free[i]:.3g} without"
 
 
-def _weigh_claims(pool: Pool, code: Array, reason: Array, certificate: Array) -> None:
-    """Write what proofs, searches and the redundancy of the rows add to the statuses."""
-    if pool.certificate is not None:
-        claimed = present(pool.certificate)
-        certificate[claimed] = pool.certificate[claimed]
-    if pool.searched is not None:
-        for i in np.flatnonzero(pool.searched & np.isin(code, ANSWERED)):
-            sure = certificate[i].proof == "global" and certificate[i].unique
-            if code[i] == Status.OK and sure:
-                continue  # a proof makes up for the start that was not safe
-            code[i] = Status.SEARCHED if code[i] == Status.OK else code[i]
-            reason[i] = "" if pool.remark is None else pool.remark[i]
-    if pool.asked:
-        for dof, limit in (
-            (0, "an error in a measurement would not be noticed"),
-            (1, "an error would be noticed, not named"),
-        ):
-            for i in np.flatnonzero(np.isin(code, ANSWERED) & (pool.dof == dof)):
-                told = f"redundancy {dof}: {limit}"
-                reason[i] = f"{reason[i]}; {told}" if reason[i] else told
+def _weigh_redundancy(pool: Pool, finished: Array, reason: Array) -> None:
+    """Write what the redundancy of the rows lets a search for suspects see."""
+    for dof, limit in (
+        (0, "an error in a measurement would not be noticed"),
+        (1, "an error would be noticed, not named"),
+    ):
+        for i in np.flatnonzero(finished & (pool.dof == dof)):
+            told = f"redundancy {dof}: {limit}"
+            reason[i] = f"{reason[i]}; {told}" if reason[i] else told
 
 
 _EPOCHS_SHOWN = 8  # epochs that a sentence names
 
 
+def verdict(problem: Problem, pool: Pool) -> Fix:
+    """Return the fixes of a flat batch of problems after all that an `ok` promises has been looked at.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    pool : Pool
+        Their candidates.
+    """
+    return judge(problem, examine(problem, pool))
+
+
 def judge(problem: Problem, pool: Pool) -> Fix:
-    """Return the fixes of a flat batch of problems.
+    """Return the fixes of a flat batch of problems by what is known so far: what stages between others need.
 
     Parameters
     ----------
@@ -330,23 +292,22 @@ def standing(pool: Pool, fix: Fix) -> Array:
 
 
 def _plain(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
-    """Return the fixes of pools as if nothing stood against their best candidates."""
-    count, cost = len(pool), pool.cost[:, 0]
-    reason = fill(count, "")
-    if pool.plain is not None:
-        p_value = doubtful(cost, pool.dof)
-        for i in np.flatnonzero(np.isfinite(p_value) & pool.plain):
-            reason[i] = doubt_sentence(p_value[i])
+    """Return the fixes of settled pools as if all of them were finished and near."""
+    count, cost, certificate = len(pool), pool.cost[:, 0], _claims(pool)
     with np.errstate(invalid="ignore"):
         gap = np.where(np.isfinite(pool.cost[:, 1:]), pool.cost[:, 1:] - cost[:, None], np.inf)
+    marks, reason = mark(problem, pool, gap), fill(count, "")
+    code = first_status(marks)
+    if pool.plain is not None:
+        explain(problem, pool, code, gap, certificate, reason)
     return Fix(
         pool.x[:, 0],
         curvature.covariance,
         problem.layout,
         problem.frame,
-        np.full(count, int(Status.OK), dtype=np.int8),
+        code,
         reason,
-        _claims(pool),
+        certificate,
         Alternatives(pool.x[:, 1:], gap),
         cost,
         pool.dof,
@@ -355,6 +316,9 @@ def _plain(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
         fill(count, ()) if curvature.active is None else curvature.active,
         curvature.local,
         fill(count, ()) if pool.asked else None,
+        marks,
+        chart_of(problem, pool.x[:, 0], curvature.covariance, curvature),
+        np.full(count, np.nan) if pool.infinity is None else pool.infinity - cost,
     )
 
 
@@ -372,14 +336,18 @@ def _apply_rules(problem: Problem, pool: Pool, fix: Fix) -> Fix:
     assert pool.curvature is not None
     regular = pool.curvature.regular
     unknown = ruling.gone if regular is None else ruling.gone | ~regular
+    x = np.where(ruling.gone[:, None], np.nan, fix.x)
+    covariance = np.where(unknown[:, None, None], np.nan, fix.cov)
     return replace(
         fix,
-        x=np.where(ruling.gone[:, None], np.nan, fix.x),
-        cov=np.where(unknown[:, None, None], np.nan, fix.cov),
-        code=ruling.code,
+        x=x,
+        cov=covariance,
+        code=first_status(ruling.marks),
+        marks=ruling.marks,
         reason=ruling.reason,
         certificate=ruling.certificate,
         cost=np.where(np.isfinite(fix.cost), fix.cost, np.nan),
+        chart=chart_of(problem, x, covariance, pool.curvature),
     )
 
 

@@ -126,7 +126,7 @@ Equations = Callable[[Problem, Array], Normal]
 def settle(problem: Problem, pool: Pool, stage: Stage, equations: Equations = equations_at) -> Pool:
     """Return the pool of the distinct minima of every problem: the best one first, with its curvature.
 
-    Runs to infinity leave the pool where a finite minimum rivals them; candidates that lie within a tenth of a standard
+    Runs to infinity leave the pool where a finite minimum rivals them, and their cost is kept; candidates that lie within a tenth of a standard
     deviation of another, or cost too much to matter, leave it too.
 
     Parameters
@@ -141,7 +141,7 @@ def settle(problem: Problem, pool: Pool, stage: Stage, equations: Equations = eq
         Maps (problem, x) to the `Normal` equations at vectors (N, size) of the cost that was minimised.
     """
     pool = replace(pool, cost=np.where(np.isfinite(pool.cost), pool.cost, np.inf))
-    pool, endless = _without_runs_to_infinity(problem, pool)
+    pool, infinity = _without_runs_to_infinity(problem, pool)
     pool = _sort(pool)
     rows, best = np.arange(len(pool)), _choose(problem, pool)
     x, cost, face = pool.x[rows, best], pool.cost[rows, best], pool.face[rows, best]
@@ -162,13 +162,13 @@ def settle(problem: Problem, pool: Pool, stage: Stage, equations: Equations = eq
         stages=(*pool.stages, stage),
         refined=True,
         curvature=curvature,
-        endless=endless if endless.any() else None,
+        infinity=infinity if np.isfinite(infinity).any() else None,
     )
 
 
 def _without_runs_to_infinity(problem: Problem, pool: Pool) -> tuple[Pool, Array]:
-    """Return the pool without runs to infinity where a finite minimum rivals them, and where that was so, (N,)."""
-    none = np.zeros(len(pool), dtype=bool)
+    """Return the pool without runs to infinity where a finite minimum rivals them, and the least cost of those, (N,)."""
+    none = np.full(len(pool), np.nan)
     if not any(slot.name == "position" for slot in problem.layout.shared):
         return pool, none
     distance = distance_of(problem, problem.layout.take(pool.x, "position"))
@@ -180,10 +180,9 @@ def _without_runs_to_infinity(problem: Problem, pool: Pool) -> tuple[Pool, Array
     near = np.where(~remote & (pool.code == Status.OK), pool.cost, np.inf).min(1)
     far = np.where(remote, pool.cost, np.inf).min(1)
     with np.errstate(invalid="ignore"):
+        # the finite minimum is answered; what infinity costs is for the verdict
         rivals = np.isfinite(near) & (near - far <= AMBIGUOUS_GAP)
-        # the finite minimum is answered, and the run to infinity is named where it costs no less by the margin
-        alike = rivals & (far - near < AMBIGUOUS_GAP)
-    return replace(pool, cost=np.where(remote & rivals[:, None], np.inf, pool.cost)), alike
+    return replace(pool, cost=np.where(remote & rivals[:, None], np.inf, pool.cost)), np.where(np.isfinite(far), far, np.nan)
 
 
 def _sort(pool: Pool) -> Pool:

@@ -1,0 +1,252 @@
+"""What stands against a finished answer: the definition of `ok`, for every method."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+from scipy.special import gammainccinv
+
+from optloc.base.linalg import centre_and_spread
+from optloc.base.records import present, take
+from optloc.base.types import Array, Certificate, Status
+from optloc.linear.constraints import faces
+from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE, Chart, quantile
+from optloc.problem.fix import tail_probability
+from optloc.problem.problem import Problem
+from optloc.solvers.policy import AMBIGUOUS_GAP, BENT, COVERED, DOUBT, REFUTED
+from optloc.solvers.pool import Curvature, Pool
+from optloc.solvers.starts.position import one_position, rows_of_stations
+from optloc.uncertainty.shape import cost_at_infinity, departure
+
+NOT_TRIED = "no proof was tried"
+_ALIKE = 1e-3  # gaps below this are told as "fits as well": a reader gains nothing from more zeros
+# Gaps to infinity below this come from rounding: the fix itself is as far away as counts.
+_NONE = 1e-6
+
+
+def mark(problem: Problem, pool: Pool, gap: Array) -> Array:
+    """Return the marks (N,) of all that stands against settled answers that are finished; zero where nothing does.
+
+    An answer is `ok` where the data do not reject the model, no other minimum within `AMBIGUOUS_GAP` is left (which is
+    proven), infinity lies outside the likelihood region, and the covariance covers.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    pool : Pool
+        Settled; what has not been looked at stands against nothing, but for a proof of uniqueness.
+    gap : array (N, r)
+        Costs of the other minima less that of the best; infinite where there is none.
+    """
+    cost = pool.cost[:, 0]
+    marks = np.zeros(len(pool), dtype=np.int32)
+    if not pool.loss:  # a loss bears gross errors: their cost refutes nothing
+        marks[is_improbable(cost, pool.dof, REFUTED)] |= Status.MISFIT.mark
+    marks[is_open(problem, pool)] |= Status.UNBOUNDED.mark
+    if gap.shape[1]:
+        marks[gap.min(1) < AMBIGUOUS_GAP] |= Status.AMBIGUOUS.mark
+    marks |= np.where(_is_unique(pool), 0, Status.UNPROVEN.mark).astype(np.int32)
+    if pool.searched is not None:
+        # a proof makes up for the start that was not safe
+        unsure = pool.searched & (marks & Status.UNPROVEN.mark != 0)
+        marks[unsure] ^= Status.UNPROVEN.mark | Status.SEARCHED.mark
+    if pool.asked:  # without redundancy a search for suspects sees nothing
+        marks[(pool.dof <= 0) & (marks & Status.SEARCHED.mark == 0)] |= Status.UNPROVEN.mark
+    assert pool.curvature is not None
+    if pool.curvature.kappa is not None:
+        with np.errstate(invalid="ignore"):
+            marks[pool.curvature.kappa[:, 0] > BENT] |= Status.CURVED.mark
+    return marks
+
+
+def is_improbable(cost: Array, dof: Array, probability: float) -> Array:
+    """Return where costs (N,) are so large that noise makes them with less than a probability, (N,)."""
+    # often one number for all, as a view without strides
+    if dof.strides == (0,):
+        level = int(dof[0]) if len(dof) else 0
+        return np.asarray(cost > _limit(level, probability)) if level > 0 else np.zeros(len(cost), dtype=bool)
+    out = np.zeros(len(cost), dtype=bool)
+    for level in np.unique(dof[dof > 0]):
+        out |= (dof == level) & (cost > _limit(int(level), probability))
+    return out
+
+
+@lru_cache(maxsize=512)
+def _limit(dof: int, probability: float) -> float:
+    return float(2.0 * gammainccinv(dof / 2, probability))
+
+
+def is_open(problem: Problem, pool: Pool) -> Array:
+    """Return where infinity lies inside the likelihood region, as far as it was looked at, (N,)."""
+    if pool.infinity is None:
+        return np.zeros(len(pool), dtype=bool)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(pool.infinity <= pool.cost[:, 0] + quantile(COVERED, problem.dimension))
+
+
+def _is_unique(pool: Pool) -> Array:
+    """Return where it is proven that no other minimum than those listed costs less than the gap more, (N,)."""
+    out = np.zeros(len(pool), dtype=bool)
+    if pool.certificate is None or pool.loss:  # what is proven of squares is not of a loss
+        return out
+    between = np.zeros(len(pool)) if pool.infinity is None else pool.infinity - pool.cost[:, 0]
+    for i, claim in enumerate(pool.certificate):
+        if isinstance(claim, Certificate) and claim.unique and (claim.proof == "global" or claim.asked):
+            # where infinity comes before the gap, up to there: what lies beyond is infinity's
+            out[i] = claim.margin >= AMBIGUOUS_GAP or 0.0 < between[i] < AMBIGUOUS_GAP
+    return out
+
+
+def examine(problem: Problem, pool: Pool) -> Pool:
+    """Return a settled pool with the shape of the likelihood about its best candidates, and what infinity costs.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems; only those of one position are looked at.
+    pool : Pool
+        What was measured before is kept.
+    """
+    curvature = pool.curvature
+    if curvature is None or not one_position(problem):
+        return pool
+    good = (pool.code[:, 0] == Status.OK) & np.isfinite(pool.x[:, 0]).all(-1)
+    good &= np.isfinite(curvature.covariance).all((-1, -2))
+    if pool.conclusion is not None:
+        good &= ~present(pool.conclusion)  # not all rows count there, and its fix was examined where it was made
+    kappa = np.full((len(pool), 2), np.nan) if curvature.kappa is None else np.array(curvature.kappa)
+    new = np.flatnonzero(good & np.isnan(kappa[:, 0]))
+    if len(new):
+        kappa[new] = _departure(problem.take(new), take(pool, new))
+    pool = replace(pool, curvature=replace(curvature, kappa=kappa))
+    return pool if pool.loss else replace(pool, infinity=_infinity(problem, pool, good & ~_is_settled(pool)))
+
+
+def _departure(problem: Problem, pool: Pool) -> Array:
+    """Return by how much the cost departs from a Gaussian's, (N, 2)."""
+    assert pool.curvature is not None
+    if pool.loss:
+        problem = problem.with_rows(weight=pool.weights)
+    x, covariance, centre = pool.x[:, 0], pool.curvature.covariance, centre_of(problem)
+    centre = np.broadcast_to(centre, (len(x), centre.shape[-1]))
+    sides = faces(problem) if problem.constraints else [()]
+    out = np.empty((len(x), 2))
+    for number in np.unique(pool.face[:, 0]):
+        items = np.flatnonzero(pool.face[:, 0] == number)
+        out[items] = departure(problem.take(items), x[items], covariance[items], sides[number], centre[items])
+    return out
+
+
+def _is_settled(pool: Pool) -> Array:
+    """Return where infinity need not be looked at, (N,): the fix is proven the only one, and is Gaussian in metres.
+
+    Of 8 233 fixes that are Gaussian in metres none had infinity in its region; what is far is not Gaussian.
+    """
+    assert pool.curvature is not None and pool.curvature.kappa is not None
+    return np.asarray(_is_unique(pool) & (pool.curvature.kappa[:, 0] <= BENT))
+
+
+def _infinity(problem: Problem, pool: Pool, wanted: Array) -> Array:
+    """Return the least costs (N,) of infinity: those known from runs there, and where wanted all directions tried."""
+    known = np.full(len(pool), np.nan) if pool.infinity is None else np.array(pool.infinity)
+    new = np.flatnonzero(wanted & np.isnan(known))
+    if len(new):
+        known[new] = cost_at_infinity(problem.take(new), pool.x[new, 0])
+    return known
+
+
+def centre_of(problem: Problem) -> Array:
+    """Return the mean (N or 1, d) of the stations that rows are present of, metres."""
+    position = problem.stations.position
+    position = position.reshape(-1, *position.shape[-2:])
+    heard = (problem.weight > 0.0).astype(float) @ rows_of_stations(problem).T.astype(float) > 0.0
+    return centre_and_spread(position, heard)[0]
+
+
+def chart_of(problem: Problem, x: Array, covariance: Array, curvature: Curvature) -> Chart | None:
+    """Return in which coordinates fixes are Gaussian, or None for problems that are not of one position.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    x : array (N, size)
+        Fixes.
+    covariance : array (N, n, n)
+        Of their shared unknowns.
+    curvature : Curvature
+        Examined; what was not is taken for curved.
+    """
+    if not one_position(problem):
+        return None
+    slot, _ = problem.layout.find("position")
+    part = slice(slot.start, slot.start + slot.size)
+    kind = np.full(len(x), CURVED, dtype=np.int8)
+    if curvature.kappa is not None:
+        with np.errstate(invalid="ignore"):
+            kind[curvature.kappa[:, 1] <= BENT] = INVERSE_RANGE
+            kind[curvature.kappa[:, 0] <= BENT] = CARTESIAN
+    centre = centre_of(problem)
+    centre = np.broadcast_to(centre, (len(x), centre.shape[-1]))
+    return Chart(kind, x[:, part], covariance[:, part, part], centre)
+
+
+# What applies, in sentences.
+
+
+def explain(problem: Problem, pool: Pool, code: Array, gap: Array, certificate: Array, reason: Array) -> None:
+    """Write the reasons (N,) that belong to the statuses of finished answers, where there is none yet.
+
+    Parameters
+    ----------
+    problem, pool : Problem, Pool
+        N problems and their settled pools.
+    code : int array (N,)
+        `Status` numbers.
+    gap : array (N, r)
+        Costs of the other minima less that of the best.
+    certificate : object array (N,)
+        What is proven.
+    reason : object array (N,)
+        Written where it is empty.
+    """
+    empty = reason == ""
+    bulk = empty & (code == Status.UNPROVEN)
+    if pool.certificate is None:
+        reason[bulk] = NOT_TRIED
+    else:
+        reason[bulk] = [_unproven(claim) for claim in certificate[bulk]]
+    cost = pool.cost[:, 0]
+    doubtful = empty & np.isin(code, (Status.OK, Status.MISFIT)) & is_improbable(cost, pool.dof, DOUBT)
+    for i in np.flatnonzero(doubtful):
+        p_value = tail_probability(cost[i : i + 1], np.array(pool.dof[i : i + 1]))[0]
+        reason[i] = f"the residuals are larger than the noise allows (p = {p_value:.1g})"
+    for i in np.flatnonzero(empty & (code == Status.AMBIGUOUS)):
+        reason[i] = _ambiguous(problem, float(gap[i].min()))
+    for i in np.flatnonzero(empty & (code == Status.UNBOUNDED) & np.isfinite(cost)):
+        assert pool.infinity is not None
+        more = float(pool.infinity[i] - cost[i])
+        reason[i] = f"infinity costs {f'only {more:.2g}' if more > _NONE else 'no'} more"
+    if (code == Status.CURVED).any():
+        assert pool.curvature is not None and pool.curvature.kappa is not None
+        inverse = pool.curvature.kappa[:, 1] <= BENT
+        reason[empty & (code == Status.CURVED) & inverse] = "Gaussian in inverse range, not in metres"
+        reason[empty & (code == Status.CURVED) & ~inverse] = "Gaussian neither in metres nor in inverse range"
+    if pool.searched is not None and pool.remark is not None:
+        told = pool.searched & (code == Status.SEARCHED)
+        reason[told] = pool.remark[told]
+
+
+def _unproven(claim: Certificate) -> str:
+    if claim.proof == "local" and not claim.margin:
+        return NOT_TRIED if claim.method == "refinement" else claim.reason
+    return claim.reason
+
+
+def _ambiguous(problem: Problem, gap: float) -> str:
+    text = "another position " + ("fits as well" if gap < _ALIKE else f"costs only {gap:.2g} more")
+    moving = problem.epochs > 1 and any(motion.order > 0 for motion in problem.motions)
+    return text + (": a bound on height, speed or place would decide" if moving else "")

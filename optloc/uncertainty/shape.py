@@ -1,0 +1,329 @@
+"""The shape of the likelihood about a fix: how far it is Gaussian, in which chart, and what it costs to go to infinity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from optloc.base import linalg
+from optloc.base.linalg import centre_and_spread
+from optloc.base.types import Array
+from optloc.compute.sums import equations_at
+from optloc.linear.constraints import Face, exact, restore, tangent_at, violation
+from optloc.linear.normal import Normal, decrement, depends_on_place, marginal, step
+from optloc.problem.chart import INVERSE_RANGE, Chart, basis
+from optloc.problem.problem import Problem
+
+# The cost over the position alone: other unknowns take the values that fit best there.
+
+
+def profile(problem: Problem, x: Array, at: Array, passes: int = 1) -> tuple[Array, Array, Array]:
+    """Return the least cost over all unknowns but the position, and its normal equations there.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems of one position.
+    x : array (q, N, size)
+        Positions, and where the search for the other unknowns begins.
+    at : array (N, size)
+        Where station errors of span "noise" are weighed.
+    passes : int
+        How often the other unknowns move to where they fit best: once is exact where rows are linear in them, unless
+        they are so far off that rounding shows.
+
+    Returns
+    -------
+    cost : array (q, N)
+        Least costs.
+    information : array (q, N, d, d)
+        Of the position, the other unknowns eliminated.
+    vector : array (q, N, d)
+        Half the negative gradient of the cost.
+    """
+    slot, _ = problem.layout.find("position")
+    part, n = slice(slot.start, slot.start + slot.size), problem.layout.n_shared
+    own = np.r_[0 : slot.start, slot.start + slot.size : n]
+    weighed = np.broadcast_to(at, x.shape) if depends_on_place(problem) else None
+    alone = problem.layout.size == slot.size
+    for left in range(passes - 1, -1, -1):
+        equations = equations_at(problem, x, at=weighed)
+        if alone:
+            return equations.cost, equations.shared, equations.shared_vector
+        rest = _without(equations, own)
+        move, _ = step(rest, np.zeros(rest.cost.shape))
+        if left:
+            x = np.array(x)
+            x[..., own] += move[..., : len(own)]
+            x[..., n:] += move[..., len(own) :]
+    information, vector, _ = marginal(equations)
+    cost = equations.cost - decrement(rest, move, len(own))
+    if not len(own):
+        return cost, information, vector
+    coupling = information[..., part, own]
+    right = np.concatenate([np.swapaxes(coupling, -1, -2), vector[..., own, None]], axis=-1)
+    solved, _ = linalg.solve(information[..., own[:, None], own], right)
+    lost = coupling @ solved
+    return cost, information[..., part, part] - lost[..., :-1], vector[..., part] - lost[..., -1]
+
+
+def _without(equations: Normal, own: Array) -> Normal:
+    """Return the normal equations of the unknowns other than the position, which stays."""
+    return Normal(
+        equations.shared[..., own[:, None], own],
+        equations.local,
+        equations.cross[..., own, :],
+        equations.shared_vector[..., own],
+        equations.local_vector,
+        equations.cost,
+    )
+
+
+# How far the cost is that of a Gaussian.
+
+# Where it is looked at, standard deviations: 2 and 4 tell good covariances from bad ones as well.
+_AWAY = 3.0
+# The cost there is no less than this share of a Gaussian's: beyond, one is as bad as another.
+_FLOOR = 1e-9
+# Variances that differ by less have no axes of their own: those turned by half a right angle are as good.
+_EQUAL = 0.05
+# Least w of the chart: infinity is zero, and no position.
+_NEAR_INFINITY = 1e-6
+# Vectors at a time: their normal equations then take some tens of megabytes.
+_PART = 2**16
+
+
+def departure(problem: Problem, x: Array, covariance: Array, face: Face, centre: Array) -> Array:
+    """Return by how much the cost departs from that of a Gaussian at three sigma, in metres and in inverse range.
+
+    Along each principal axis and both ways, ``|ln((f(x +- 3 t) - f(x)) / 9)|``, the largest; the second chart is looked
+    at only where the first departs by more than a tenth.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems of one position.
+    x : array (N, size)
+        Fixes.
+    covariance : array (N, n, n)
+        Of their shared unknowns.
+    face : Face
+        Constraints that hold all of them.
+    centre : array (N, d)
+        Centre of the stations: that of the inverse-range chart.
+
+    Returns
+    -------
+    array (N, 2)
+        Zero for a Gaussian, infinite where there is no chart.
+
+    References
+    ----------
+    D. M. Bates and D. G. Watts, "Relative curvature measures of nonlinearity" (1980): what is tested here by the cost
+    itself, without second derivatives.
+    """
+    slot, _ = problem.layout.find("position")
+    part = slice(slot.start, slot.start + slot.size)
+    spread = covariance[:, part, part]
+    precision, _ = linalg.inverse(spread)
+    pull = covariance[:, :, part] @ (precision if not face else np.linalg.pinv(spread))  # of the others by the position
+    cost, _, _ = profile(problem, x[None], x)
+    look = _Look(problem, x, cost[0], pull, part, face)
+    out = np.full((len(x), 2), np.inf)
+    position, axes = x[:, part], _axes(spread)
+    with np.errstate(all="ignore"):
+        moved = _AWAY * np.concatenate([axes, -axes], axis=1)
+        out[:, 0] = look.departs(moved, np.full(moved.shape[:2], _AWAY))
+        away = position - centre
+        distance = np.sqrt((away**2).sum(-1))
+        other = np.flatnonzero((out[:, 0] > _SETTLED) & (distance > 0.0)) if not face else np.zeros(0, dtype=int)
+        if len(other):
+            out[other, 1] = _in_inverse_range(look.take(other), centre[other], spread[other])
+    return out
+
+
+# Below it the covariance in metres serves, whatever another chart says.
+_SETTLED = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class _Look:
+    """The cost about a batch of fixes, and how the other unknowns follow the position there."""
+
+    problem: Problem
+    x: Array
+    cost: Array
+    pull: Array
+    part: slice
+    face: Face
+
+    def take(self, items: Array) -> _Look:
+        """Return some fixes."""
+        return _Look(self.problem.take(items), self.x[items], self.cost[items], self.pull[items], self.part, self.face)
+
+    def departs(self, moved: Array, sigmas: Array) -> Array:
+        """Return the largest departure (N,) over displacements (N, k, d) of so many standard deviations (N, k)."""
+        most = max(1, _PART // max(1, moved.shape[1]))
+        if len(moved) > most:
+            parts = [slice(i, i + most) for i in range(0, len(moved), most)]
+            numbers = np.arange(len(moved))
+            return np.concatenate([self.take(numbers[one]).departs(moved[one], sigmas[one]) for one in parts])
+        shift = np.moveaxis((self.pull[:, None] @ moved[..., None])[..., 0], 1, 0)
+        n = self.pull.shape[1]
+        x = np.array(np.broadcast_to(self.x, (len(shift), *self.x.shape)))
+        x[..., :n] += shift
+        if self.face:
+            x = np.stack([restore(self.problem, self.face, one) for one in x])
+        cost, _, _ = profile(self.problem, x, self.x)
+        ratio = (cost - self.cost) / sigmas.T**2
+        found = np.abs(np.log(np.maximum(ratio, _FLOOR)))
+        # what has no width has no axis, and what cannot be evaluated is no Gaussian
+        still = (moved == 0.0).all(-1).T
+        return np.asarray(np.where(still, 0.0, np.where(np.isnan(found), np.inf, found)).max(0, initial=0.0))
+
+
+def _axes(covariance: Array) -> Array:
+    """Return one standard deviation along every principal axis (N, k, d), and turned ones where axes are arbitrary."""
+    known = np.isfinite(covariance).all((-1, -2), keepdims=True)
+    values, vectors = np.linalg.eigh(np.where(known, covariance, 0.0))
+    # rounding, or a constraint, may leave a variance of nothing or less
+    values = np.where(values > _EXACT * values[:, -1:], values, 0.0)
+    axes = np.swapaxes(vectors * np.sqrt(values)[:, None, :], -1, -2)
+    d, more = axes.shape[-1], []
+    for i in range(d):
+        for j in range(i + 1, d):
+            alike = (values[:, j] - values[:, i] < _EQUAL * values[:, j])[:, None]
+            if alike.any():
+                turned = (axes[:, i] + axes[:, j], axes[:, i] - axes[:, j])
+                more += [np.where(alike, each / np.sqrt(2.0), 0.0) for each in turned]
+    return np.concatenate([axes, np.stack(more, axis=1)], axis=1) if more else np.asarray(axes)
+
+
+# Share of the largest variance below which one is rounding.
+_EXACT = 1e-14
+
+
+def _in_inverse_range(look: _Look, centre: Array, covariance: Array) -> Array:
+    """Return the largest departure (N,) along the principal axes of the inverse-range chart."""
+    position = look.x[:, look.part]
+    chart = Chart(np.full(len(position), INVERSE_RANGE, dtype=np.int8), position, covariance, centre)
+    axes = _axes(chart.spread)
+    sigmas = np.full((len(axes), 2 * axes.shape[1]), _AWAY)
+    y = _AWAY * np.concatenate([axes, -axes], axis=1)
+    # a step across infinity ends just before it, and counts for as many sigmas as it has left
+    share = np.where(y[..., -1] < 0.0, np.minimum(1.0, (1.0 - _NEAR_INFINITY) / np.maximum(-y[..., -1], 1e-300)), 1.0)
+    y, sigmas = y * share[..., None], sigmas * share
+    still = (y == 0.0).all(-1)
+    y[..., -1] += 1.0
+    # points (k, N, d) broadcast against the charts of N fixes
+    there = np.moveaxis(chart.to_position(np.moveaxis(y, 1, 0)), 0, 1)
+    return look.departs(np.where(still[..., None], 0.0, there - position[:, None]), sigmas)
+
+
+# What the data say of positions ever farther away.
+
+# Distance that stands for infinity, spreads of the stations: wave fronts bend by 5e-8 of the spread there, and rounding
+# of a difference of ranges is 1e-9 of it.
+_INFINITE = 1e7
+# Directions that are tried: every 22.5 degrees of the plane, in space 50 on a spiral, about 28 degrees apart: the cost of
+# range differences is quadratic in the direction and has two minima at most.
+_DIRECTIONS = {2: 16, 3: 50}
+# Those of them that are refined, beside that of the fix; and steps, of which each squares a small error.
+_REFINED, _STEPS = 3, 12
+# Marquardt's damping to begin with, and what a step that succeeds makes of it.
+_DAMPING, _EASED = 1e-3, 0.1
+# Relative violation of a constraint (`optloc.linear.constraints.violation`) beyond rounding at such distances.
+_BROKEN = 1e-4
+
+
+def cost_at_infinity(problem: Problem, x: Array) -> Array:
+    """Return the least cost (N,) of positions infinitely far away; very large where it grows without bound.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems of one position.
+    x : array (N, size)
+        Their fixes: the first direction that is tried, and where the other unknowns begin.
+    """
+    slot, _ = problem.layout.find("position")
+    part = slice(slot.start, slot.start + slot.size)
+    centre, spread = centre_and_spread(problem.stations.places)
+    centre = np.broadcast_to(centre, x[:, part].shape)
+    along = None if not (face := exact(problem)) else tangent_at(problem, face, x).along[:, part]
+    sphere = _Sphere(problem, x, part, centre, _INFINITE * np.broadcast_to(spread, (len(x),)), along)
+    with np.errstate(all="ignore"):
+        own = sphere.direction(x[:, part] - centre)
+        tried = sphere.direction(np.broadcast_to(_spiral(slot.size)[:, None], (_DIRECTIONS[slot.size], *own.shape)))
+        cost = sphere.look(tried)[0]
+        best = np.argsort(cost, axis=0)[:_REFINED]
+        starts = np.concatenate([own[None], np.take_along_axis(tried, best[..., None], axis=0)])
+        return np.asarray(sphere.descend(starts).min(0))
+
+
+@dataclass(frozen=True, slots=True)
+class _Sphere:
+    """Positions so far away that they are directions."""
+
+    problem: Problem
+    x: Array
+    part: slice
+    centre: Array
+    radius: Array
+    along: Array | None
+
+    def direction(self, vector: Array) -> Array:
+        """Return unit vectors (..., N, d), along the equalities where there are some."""
+        if self.along is not None:
+            vector = (self.along @ (np.swapaxes(self.along, -1, -2) @ vector[..., None]))[..., 0]
+        return _normalised(vector)
+
+    def look(self, direction: Array) -> tuple[Array, Array, Array]:
+        """Return costs (q, N) in directions (q, N, d), and information and vector of the position."""
+        x = np.array(np.broadcast_to(self.x, (len(direction), *self.x.shape)))
+        x[..., self.part] = self.centre + self.radius[:, None] * direction
+        cost, information, vector = profile(self.problem, x, self.x, 2)
+        if self.problem.constraints:
+            broken = np.stack([violation(self.problem, one) for one in x])
+            cost = np.where(broken > _BROKEN, np.inf, cost)
+        return np.where(np.isfinite(cost), cost, np.inf), information, vector
+
+    def descend(self, direction: Array) -> Array:
+        """Return the least costs (q, N) next to directions (q, N, d): damped Gauss-Newton on the sphere."""
+        cost, information, vector = self.look(direction)
+        damping, scale = np.full(cost.shape, _DAMPING), self.radius[:, None, None]
+        for _ in range(_STEPS):
+            across = scale * basis(direction)
+            turned = np.swapaxes(across, -1, -2)
+            inner = turned @ information @ across
+            grown = inner * (1.0 + damping[..., None, None] * np.eye(inner.shape[-1]))
+            move, _ = linalg.solve(grown, turned @ vector[..., None])
+            trial = self.direction(direction + (across @ move)[..., 0] / self.radius[:, None])
+            new, more, other = self.look(trial)
+            better = new < cost
+            direction = np.where(better[..., None], trial, direction)
+            information = np.where(better[..., None, None], more, information)
+            vector = np.where(better[..., None], other, vector)
+            cost, damping = np.where(better, new, cost), damping * np.where(better, _EASED, _EASED**-1)
+        return np.asarray(cost)
+
+
+def _normalised(vector: Array) -> Array:
+    """Return unit vectors (..., d); the first axis for those of no length."""
+    length = np.sqrt((vector**2).sum(-1, keepdims=True))
+    first = np.zeros(vector.shape[-1])
+    first[0] = 1.0
+    return np.where(length > 0.0, vector / np.where(length > 0.0, length, 1.0), first)
+
+
+def _spiral(d: int) -> Array:
+    """Return directions (q, d) spread evenly: the circle, or a spiral of the golden angle on the sphere."""
+    count = _DIRECTIONS[d]
+    number = np.arange(count) + 0.5
+    if d == 2:
+        turn = 2.0 * np.pi * number / count
+        return np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    height, turn = 1.0 - 2.0 * number / count, np.pi * (1.0 + np.sqrt(5.0)) * number
+    across = np.sqrt(1.0 - height**2)
+    return np.stack([across * np.cos(turn), across * np.sin(turn), height], axis=-1)
