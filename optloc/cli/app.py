@@ -10,6 +10,7 @@ import typer
 from optloc.cli.options import (
     EXIT_CODES,
     AboveGround,
+    Allow,
     Box,
     Geodetic,
     Group,
@@ -22,6 +23,7 @@ from optloc.cli.options import (
     ProblemPath,
     Quiet,
     Verbose,
+    allowed,
     constraints,
     example,
     find_problem,
@@ -91,6 +93,7 @@ def fix(
     above_ground: AboveGround = False,
     box: Box = None,
     noise: NoiseFromData = None,
+    allow: Allow = None,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -100,9 +103,9 @@ def fix(
     """
     from optloc.cli.fix import run_fix
 
-    more = constraints(height, above_ground, box)
+    more, passing = constraints(height, above_ground, box), allowed(allow)
     files = {"geojson_path": geojson, "plot": plot, "out": out, "html": html}
-    code = run_fix(file, method, more, as_json=as_json, **files, quiet=quiet, noise=noise)
+    code = run_fix(file, method, more, as_json=as_json, **files, quiet=quiet, noise=noise, allow=passing)
     raise typer.Exit(code)
 
 

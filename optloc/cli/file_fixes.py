@@ -15,6 +15,7 @@ from optloc.base.types import Array, Status
 from optloc.bounds.observability import Observability, observability
 from optloc.cli.output import Columns, bar, covariance_columns, geodetic_columns, join_tables, records
 from optloc.files import Loaded
+from optloc.problem.chart import CURVED, INVERSE_RANGE
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Active, Explanation, Fix
 from optloc.problem.layout import state_names
@@ -54,10 +55,9 @@ class FileFixes:
     reweighted: bool
     seen: Observability | None = None
 
-    @property
-    def clean(self) -> bool:
-        """Return whether every status is ok."""
-        return all(bool((fix.code == 0).all()) for fix in self.fixes)
+    def passes(self, allow: Sequence[Status] = ()) -> bool:
+        """Return whether every status is ok, or among those that are allowed."""
+        return all(bool(np.isin(fix.code, [Status.OK, *allow]).all()) for fix in self.fixes)
 
     @property
     def singles(self) -> Iterator[Fix]:
@@ -173,6 +173,8 @@ def _repeat(count: int, **texts: Sequence[str]) -> Columns:
 def _told_in_words(loaded: Loaded, fix: Fix) -> dict[str, list[str]]:
     """Return the proof of each fix, the constraints that hold it, and its suspects: "A; B" together, "A | B" either."""
     texts = {"proof": [getattr(c, "proof", "unknown") for c in fix.certificate]}
+    texts["findings"] = ["; ".join(one.label for one in each) for each in fix.findings]
+    texts["chart"] = [""] * len(fix) if fix.chart is None else list(fix.chart.name)
     if loaded.problem.constraints:
         held = [()] * len(fix) if fix.active is None else fix.active
         texts["active"] = ["; ".join(active.name for active in each) for each in held]
@@ -266,6 +268,9 @@ def _detail(fix: Fix, found: FileFixes) -> dict[str, Any]:
     shown = np.isfinite(others.gap)
     return {
         "sentence": Status(int(fix.code)).sentence,
+        "findings": [one.label for one in fix.findings],
+        "gap_to_infinity": None if fix.infinity is None else fix.infinity,
+        "chart": _chart_json(fix),
         "alternatives": [
             {"gap": gap, "probability": doubt, "position": alternative_position(fix, x)}
             for x, gap, doubt in zip(others.x[shown], others.gap[shown], others.doubt[shown], strict=True)
@@ -278,6 +283,20 @@ def _detail(fix: Fix, found: FileFixes) -> dict[str, Any]:
         "not_separable": [] if found.seen is None else list(found.seen.sentences),
         "of_each_epoch": {name: values for name, values in fix.bias.items() if not fix.layout.find(name)[1]},
     }
+
+
+def _chart_json(fix: Fix) -> dict[str, Any] | None:
+    """Return in which coordinates a single fix is Gaussian, and its Gaussian there."""
+    chart = fix.chart
+    if chart is None or not bool(fix.answered):
+        return None
+    told: dict[str, Any] = {"name": str(chart.name), "centre": chart.centre}
+    if chart.kind == INVERSE_RANGE:
+        told |= {"distance": chart.distance, "direction": chart.direction, "basis": chart.basis}
+        told |= {"mean": chart.mean, "covariance": chart.spread}
+    if chart.kind != CURVED:
+        told["range95"] = fix.interval("range")
+    return told
 
 
 def geojson(found: FileFixes) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.types import Array, Status
+from optloc.base.types import ANSWERED, Array, Status
 from optloc.cli.file_fixes import (
     FileFixes,
     active_of,
@@ -28,6 +28,7 @@ from optloc.cli.file_fixes import (
 from optloc.cli.output import Columns, dumps, records, say, say_all, with_sigma, write_picture, write_table, write_text
 from optloc.files import Loaded, read
 from optloc.files.schema import ConstraintTable
+from optloc.problem.chart import CARTESIAN, INVERSE_RANGE, NAMES
 from optloc.problem.fix import Fix, Suspect
 from optloc.quality.elements import GROUPINGS, By
 from optloc.quality.levels import NoiseLevels, with_estimated_noise
@@ -53,6 +54,7 @@ def run_fix(
     html: Path | None = None,
     quiet: bool = False,
     noise: str | None = None,
+    allow: tuple[Status, ...] = (),
 ) -> int:
     """Fix a file under constraints of its own and more, write what was asked for, and return the exit code."""
     on_output = geojson_path is not None and str(geojson_path) == "-"
@@ -78,7 +80,7 @@ def run_fix(
         show(found, console)
         if levels is not None:
             _show_levels(levels, console)
-    return 0 if found.clean else 1
+    return 0 if found.passes(allow) else 1
 
 
 def draw(found: FileFixes, path: Path) -> None:
@@ -104,10 +106,12 @@ def _show_one(found: FileFixes, fix: Fix, console: Console) -> None:
     table = Table(title=found.loaded.title, show_header=False, title_justify="left", min_width=60)
     table.add_row("status", Text(verdict.label, style=f"bold {_colour(verdict)}"))
     reason = str(fix.reason[()] or "")
-    # The verdict in general; of a clean fix the reason is all there is to say.
-    table.add_row("", verdict.sentence if verdict is not Status.OK or not reason else reason)
-    if verdict is not Status.OK and reason:
+    table.add_row("", verdict.sentence)
+    if reason:
         table.add_row("reason", reason)
+    others = [one.label for one in fix.findings if one is not verdict]
+    if others:
+        table.add_row("besides", ", ".join(others))
     # A run may have a state of each epoch: those that fit on a screen.
     rows = len(found.columns["x"])
     for i in range(min(rows, _STATES)):
@@ -122,6 +126,7 @@ def _show_one(found: FileFixes, fix: Fix, console: Console) -> None:
             table.add_row(name, f"{values.size} values, root mean square {spread:.4g} {slot.unit}".strip())
     for active in active_of(fix):
         table.add_row(f"held by {active.name}", f"multiplier {active.multiplier:.4g} (cost per SI unit)")
+    _add_extents(table, found, fix)
     table.add_row("chi-square", _chi_square(fix))
     certificate: Any = fix.certificate[()]
     if hasattr(certificate, "proof"):
@@ -134,7 +139,22 @@ def _show_one(found: FileFixes, fix: Fix, console: Console) -> None:
 
 
 def _colour(verdict: Status) -> str:
-    return {Status.OK: _GOOD, Status.AMBIGUOUS: _CARE, Status.SEARCHED: _CARE}.get(verdict, _BAD)
+    return _GOOD if verdict is Status.OK else _CARE if verdict in ANSWERED else _BAD
+
+
+def _add_extents(table: Table, found: FileFixes, fix: Fix) -> None:
+    """Add what covers where the ellipsoid in metres does not."""
+    if fix.chart is None or not fix.answered or fix.chart.kind == CARTESIAN:
+        return
+    if fix.chart.kind != INVERSE_RANGE:
+        table.add_row("95 % region", "curved: the numbers behind ± do not cover; optloc.likelihood_region does")
+        return
+    low, high = (float(end) for end in fix.interval("range"))
+    far = f"to {high:.4g} m" if np.isfinite(high) else "or more, to infinity"
+    table.add_row("95 % range", f"{low:.4g} m {far}, from the middle of the stations")
+    if not found.loaded.problem.frame.geodetic:
+        low, high = (float(np.degrees(end)) for end in fix.interval("bearing"))
+        table.add_row("95 % bearing", f"{low:.4g} to {high:.4g} deg from the first axis towards the second")
 
 
 def _whose(columns: Columns, i: int) -> str:
@@ -161,7 +181,7 @@ def _add_state(table: Table, columns: Columns, i: int, whose: str) -> None:
             value, sigma = (columns[f"{prefix}{letter}{axis}"][i] for prefix in ("", "sigma_"))
             table.add_row(f"{word} {axis}{whose}", with_sigma(value, sigma, unit))
     semi = [columns[f"ellipse95_{j + 1}"][i] for j in range(len(axes))]
-    if np.isfinite(semi).all():
+    if np.isfinite(semi).all() and columns["chart"][i] in {"", NAMES[CARTESIAN]}:
         name = "95 % ellipse" if len(axes) == 2 else "95 % ellipsoid"
         table.add_row(name, " x ".join(f"{v:.3g}" for v in semi) + " m (semi-axes)")
 

@@ -14,7 +14,9 @@ import typer
 from typer.core import TyperGroup
 
 from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.types import Status
 from optloc.files.schema import ConstraintTable
+from optloc.problem.fix import status_named
 
 BAD_INPUT = 2
 """Exit code of whatever is wrong with the arguments or a file: what shells and typer use for wrong usage."""
@@ -22,7 +24,7 @@ BAD_INPUT = 2
 STOPPED = 130
 """Exit code after Ctrl-C: 128 and the number of SIGINT, as shells count."""
 
-EXIT_CODES = "Exit codes: 0 everything is ok, 1 some status is not ok, 2 bad input, 130 stopped by Ctrl-C."
+EXIT_CODES = "Exit codes: 0 everything is ok or allowed, 1 some status is not ok, 2 bad input, 130 stopped by Ctrl-C."
 
 
 class Group(TyperGroup):
@@ -127,6 +129,12 @@ Plot = Annotated[Path | None, typer.Option("--plot", metavar="OUT.png", help="Dr
 Html = Annotated[
     Path | None, typer.Option("--html", metavar="OUT.html", help="Write a page with a map that moves; Earth only.")
 ]
+Allow = Annotated[
+    str | None,
+    typer.Option(
+        "--allow", metavar="STATUS,...", help="Statuses that pass beside ok (exit code 0), such as curved,unproven."
+    ),
+]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 Verbose = Annotated[
     bool,
@@ -191,6 +199,11 @@ def coordinates(
     if any(map(isnan, values)) or not (bounds or all(map(isfinite, values))):
         raise InvalidProblem(f"{text!r} is no list of numbers", where, advice)
     return values
+
+
+def allowed(text: str | None) -> tuple[Status, ...]:
+    """Return the statuses that an option names beside `ok`; raise InvalidProblem for an unknown one."""
+    return tuple(status_named(one) for one in text.split(",")) if text else ()
 
 
 def constraints(height: str | None, above_ground: bool, box: str | None) -> dict[str, ConstraintTable]:

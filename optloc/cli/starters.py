@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.markdown import Markdown
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.types import Rows
+from optloc.base.types import Rows, Status
 from optloc.base.units import SI_UNIT, UNITS
 from optloc.cli.file_fixes import FileFixes, fix_file, fixes_json
 from optloc.cli.fix import draw, show
@@ -58,6 +58,8 @@ _END = """
 """
 _STEPS = ((_FIX, "demo"), (_REGISTRATION, "registration"), (_PROOF, "ambiguous"))
 PICTURE = Path("optloc-demo.png")
+# What a shipped problem is there to show beside an `ok` fix: two places that fit, a run of which nothing is proven.
+_SHOWN = {"ambiguous": (Status.AMBIGUOUS,), "registration": (Status.UNPROVEN,)}
 
 
 def titles() -> dict[str, str]:
@@ -82,11 +84,11 @@ def run_demo(name: str | None, plot: Path | None, *, as_json: bool, quiet: bool)
         show(found, Console())
     if plot is not None or not as_json:
         _draw(found, plot, quiet or as_json)
-    return 0 if found.clean else 1
+    return 0 if _shows(found, name or "demo") else 1
 
 
 def _walk(plot: Path | None, quiet: bool) -> int:
-    """Fix three shipped problems and say what is seen; the exit code is that of the first."""
+    """Fix three shipped problems and say what is seen; the exit code is 0 where each shows what it should."""
     console = Console(quiet=quiet)
     code = 0
     for i, (text, name) in enumerate(_STEPS):
@@ -95,9 +97,14 @@ def _walk(plot: Path | None, quiet: bool) -> int:
         show(found, console)
         if i == 0:
             _draw(found, plot, quiet)
-            code = 0 if found.clean else 1
+        code = code if _shows(found, name) else 1
     _explain(_END, console)
     return code
+
+
+def _shows(found: FileFixes, name: str) -> bool:
+    """Return whether the fixes of a shipped problem have the status that it is there to show."""
+    return found.passes(_SHOWN.get(name, ()))
 
 
 def _fix(name: str, quiet: bool) -> FileFixes:
