@@ -260,8 +260,8 @@ _SENTENCES: dict[Status, str] = {
     "covers as it promises.",
     Status.AMBIGUOUS: "Several positions explain the data about equally well; see the alternatives, or add a row, a "
     "station or a known height that tells them apart.",
-    Status.SEARCHED: "No safe start is known for this mixture of rows: this is the best of a seeded search, and nothing "
-    "proves that no other position explains the data as well.",
+    Status.SEARCHED: "No safe start is known for this mixture of rows: this is the best of a seeded search, and "
+    "nothing proves that no other position explains the data as well.",
     Status.MAX_ITERATIONS: "The refinement used all its iterations; raise the limit or look at the geometry.",
     Status.STALLED: "The refinement could not lower the cost any more although its gradient is not zero.",
     Status.SINGULAR_GEOMETRY: "The rows leave a direction of the answer undetermined; add a station off it.",

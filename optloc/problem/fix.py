@@ -317,14 +317,22 @@ class Fix:
         # that of a run to infinity has none
         return np.isin(self.code, ANSWERED) & np.isfinite(self.x).any(-1)
 
+    def has(self, *statuses: Status) -> Array:
+        """Return where one of some statuses is among the findings, (...)."""
+        return np.asarray((self._all_marks & sum({one.mark for one in statuses})) != 0)
+
+    @property
+    def _all_marks(self) -> Array:
+        # a fix of a solver from outside may have a status alone
+        return np.left_shift(1, self.code.astype(np.int32)) if self.marks is None else self.marks
+
     @property
     def findings(self) -> Any:
         """Return all that stands against a single fix, a tuple of `Status`, or an object array (...) of a batch.
 
         The most serious comes first: it is the status. An `ok` fix has none.
         """
-        marks = np.left_shift(1, self.code.astype(np.int32)) if self.marks is None else self.marks
-        out = np.empty(self.shape, dtype=object)
+        marks, out = self._all_marks, np.empty(self.shape, dtype=object)
         for i in np.ndindex(self.shape):
             found = int(marks[i])
             out[i] = tuple(one for one in PRECEDENCE if one is not Status.OK and found & one.mark)

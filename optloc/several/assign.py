@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array, Status
+from optloc.base.types import Array, Status, first_status
 from optloc.compute.sums import equations_at
 from optloc.linear.normal import covariance
 from optloc.models import MODELS
@@ -322,11 +322,17 @@ def _verdict(
     near = [ghost for ghost in ghosts if ghost.gap < AMBIGUOUS_GAP]
     if near:
         doubts.append(f"another place costs only {near[0].gap:.1f} more, {len(near)} such in all")
-    doubts += [f"emitter {i}: {fix.status.label}" for i, fix in enumerate(fixes) if fix.status != Status.OK]
-    open_ = solved.cost - solved.bound > _PROVEN
-    unproven = [f"not proven: another assignment may cost {solved.cost - solved.bound:.1f} less"] if open_ else []
-    if doubts or unproven:
-        return Status.AMBIGUOUS if doubts else Status.SEARCHED, "; ".join([*doubts, *unproven])
+    marks = Status.AMBIGUOUS.mark if doubts else 0
+    # what stands against one of the emitters stands against all of them together
+    for i, fix in enumerate(fixes):
+        if fix.status != Status.OK:
+            marks |= fix.status.mark
+            doubts.append(f"emitter {i}: {fix.status.label}")
+    if solved.cost - solved.bound > _PROVEN:
+        marks |= Status.UNPROVEN.mark
+        doubts.append(f"not proven: another assignment may cost {solved.cost - solved.bound:.1f} less")
+    if doubts:
+        return Status(int(first_status(np.array(marks)))), "; ".join(doubts)
     return Status.OK, f"{_spell(n)}; false rows: {rows - int((solved.tuples.picks[solved.taken] >= 0).sum())}"
 
 

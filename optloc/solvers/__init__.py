@@ -30,7 +30,8 @@ def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
     method : str
         "auto", or stages joined by "+": for instance "gtrs+lsr"; see ``optloc list solvers``.
     start : array (..., size), optional
-        Starting vector for a method that begins with a refinement, for instance "lsr".
+        Starting vector: all that a method has which begins with a refinement, such as "lsr", and one more candidate
+        of every other.
 
     Returns
     -------

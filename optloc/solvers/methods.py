@@ -245,10 +245,15 @@ class Method:
         return pool
 
 
-def _run_through(method: Method, problem: Problem, pool: Pool | None) -> Pool:
-    for stage in method.runs(problem.batch_shape[0]):
+def _run_through(method: Method, problem: Problem, given: Pool | None) -> Pool:
+    # a shortcut takes no starts
+    first, *others = method.runs(problem.batch_shape[0]) if given is None else [SOLVERS[w].run for w in method.words]
+    pool = first(problem, given)
+    if given is not None and not pool.refined:
+        # what is given competes with the starts that a stage makes
+        pool = _beside(problem, pool, given.x)
+    for stage in others:
         pool = stage(problem, pool)
-    assert pool is not None
     return pool
 
 
@@ -261,11 +266,16 @@ def _take_over(method: Method, problem: Problem, pool: Pool) -> Pool:
     part, (first, *others) = problem.take(items), method.runs(len(items))
     start = first(part, None)
     # what was found competes: a branch never answers worse than the one before
-    x = np.concatenate([start.x, standing(take(pool, items), fix[items])], axis=1)
-    new = replace(offer(part, pack(x), None, "", perf_counter()), stages=start.stages)
+    new = _beside(part, start, standing(take(pool, items), fix[items]))
     for stage in others:
         new = stage(part, new)
     return replace(pool.merge(items, new), stages=(*pool.stages, *new.stages))
+
+
+def _beside(problem: Problem, start: Pool, x: Array) -> Pool:
+    """Return a pool of starts with more of them (N, q, size) beside it."""
+    both = pack(np.concatenate([start.x, x], axis=1))
+    return replace(offer(problem, both, None, "", perf_counter()), stages=start.stages)
 
 
 def is_unproven(fix: Fix) -> Array:

@@ -12,14 +12,17 @@ DOUBT = 1e-3
 """Probability of the chi-square test below which more is looked into: a better minimum, a constraint that is wrong."""
 
 REFUTED = 1e-4
-"""Probability of the chi-square test below which the noise does not allow the residuals: so often good data are refused."""
+"""Probability of the chi-square test below which the noise does not allow the residuals: so rarely good data fail."""
 
 COVERED = 0.95
 """Level of the likelihood region that must not reach to infinity, with d degrees of freedom: what users ask for."""
 
 BENT = 0.3
-"""Logarithm of the cost three sigma away over 9 beyond which no Gaussian covers: at 0.3 the 99.9 % ellipsoids hold 99.8 to
-100 % of the truths; looser ones keep the far fixes that look near by luck, whose ellipsoids hold 79 to 92 %."""
+"""Logarithm of the cost three sigma away over 9 beyond which no Gaussian covers.
+
+At 0.3 the 99.9 % ellipsoids hold 99.8 to 100 % of the truths; at 0.5 far fixes that look near by luck pass as well, and
+theirs hold 79 to 92 %.
+"""
 
 FAR, FLAT = 1e4, 1e6
 """Spreads of the stations: from here on a fix must be a good one, and from there on every wave front is flat."""

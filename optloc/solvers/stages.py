@@ -38,8 +38,8 @@ from optloc.solvers.verdict.minima import settle
 
 Solver = Callable[[Problem, Pool | None], Pool]
 
-# What more candidates change nothing about, or what is known only once all of them are there.
-_FINE = Status.UNPROVEN.mark | Status.CURVED.mark | Status.SEARCHED.mark
+# What more candidates may change; what a proof or a look around the fix says is known only once all of them are there.
+_UNSETTLED = (Status.AMBIGUOUS, Status.UNBOUNDED, Status.CONTRADICTORY, Status.MISFIT)
 # Share of its distance from the stations beyond which the error of a fix calls for a look along the valley: from
 # there on the cost may be far from quadratic over the ellipsoid, and have another minimum a few sigma away.
 _WEAK = 1e-2
@@ -89,7 +89,7 @@ def widen(problem: Problem, pool: Pool | None) -> Pool:
     seen = problem.layout.take(standing(pool, fix), "position")
     parts = [mirror(alone, fix.position[:, None])]
     # the mirror image is one start and always tried; the others are many: where the verdict is not clean
-    unsettled = (fix.marks & ~_FINE != 0) | (fix.p_value < DOUBT)
+    unsettled = ~fix.answered | fix.has(*_UNSETTLED) | (fix.p_value < DOUBT)
     valley = np.flatnonzero(unsettled | _weak(problem, fix))
     for items, more in (
         (np.flatnonzero(unsettled), _subarrays),

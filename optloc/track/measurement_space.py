@@ -13,6 +13,7 @@ from optloc.linear.normal import linearise
 from optloc.models import MODELS
 from optloc.problem import noise as noises
 from optloc.problem.epochs import by_epoch, cut
+from optloc.problem.fix import Fix
 from optloc.problem.noise import Block, Noise
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
@@ -187,17 +188,23 @@ def _solve_scans(scan: Problem) -> tuple[Array, Array]:
     else:
         # The last epoch has the longest past, so the best values; its place starts the iterations at the others.
         last = solve(flat.take(np.arange(count - 1, size, count)))
-        start, doubt = np.repeat(last.position, count, axis=0), np.repeat(last.code == Status.AMBIGUOUS, count)
+        start, doubt = np.repeat(last.position, count, axis=0), np.repeat(last.has(Status.AMBIGUOUS), count)
     fix = solve(flat, "lsr", start=np.where(np.isfinite(start), start, 0.0))
-    position, code = np.array(fix.position), np.array(fix.code)
+    position, code = np.array(fix.position), _status_of_scans(fix)
     # Another place that explains the last epoch may explain the others.
     code = np.where((code == Status.OK) & doubt, Status.AMBIGUOUS, code)
     # Early epochs may be too far from there: these are solved without a start.
     again = np.flatnonzero((code != Status.OK) & (code != Status.AMBIGUOUS))
     if len(again):
         redone = solve(flat.take(again))
-        position[again], code[again] = redone.position, redone.code
+        position[again], code[again] = redone.position, _status_of_scans(redone)
     return position.reshape(*shape, -1), code.reshape(shape)
+
+
+def _status_of_scans(fix: Fix) -> Array:
+    """Return the statuses (...) of fixes as those of a track, in which a place that is alone needs no proof."""
+    alone = fix.answered & ~fix.has(Status.MISFIT, Status.UNBOUNDED, Status.AMBIGUOUS)
+    return np.where(alone, int(Status.OK), fix.code).astype(np.int8)
 
 
 # One receiver and one illuminator: the simplified recursion in range, azimuth and elevation.

@@ -16,7 +16,7 @@ from optloc.problem.fix import Fix, tail_probability
 from optloc.problem.problem import Problem
 from optloc.track.associate import weights_within
 from optloc.track.dynamics import Dynamics
-from optloc.track.start import counts, first_fix, state_of, with_height_rows
+from optloc.track.start import counts, first_fix, is_one_gaussian, state_of, with_height_rows
 from optloc.track.track import State, Track, check_state, check_trackable, collect, predicted, scan_at, take_scan
 from optloc.track.updates import Update, Updated, filter_of
 
@@ -336,7 +336,7 @@ def begin(problem: Problem, first: int, dynamics: Dynamics, speed: float | None,
         found, verdict = _stretch(problem, k, dynamics, speed, rate)
         if found is None:
             break  # what all later scans leave open, fewer of them do too
-        if found.p >= _PLAUSIBLE and int(found.fix.code) == Status.OK:
+        if found.p >= _PLAUSIBLE and is_one_gaussian(found.fix):
             return Beginning(found.last, found.state, Status.OK, Status.OK)
         doubtful.append(found)
         if found.p >= _PLAUSIBLE:
@@ -350,6 +350,8 @@ def begin(problem: Problem, first: int, dynamics: Dynamics, speed: float | None,
         reason = f"the rows of the start contradict each other (p = {best.p:.2g})"
         return Beginning(best.last, best.state, Status.REJECTED, Status.OK, reason)
     others = int(np.isfinite(best.fix.alternatives.gap).sum())
+    if not others:
+        return Beginning(best.last, best.state, Status.CURVED, Status.OK, "the covariance of the start does not cover")
     reason = f"the start has {others} alternative{'s' if others > 1 else ''}"
     return Beginning(best.last, best.state, Status.AMBIGUOUS, Status.OK, reason)
 
@@ -364,7 +366,7 @@ def _stretch(
             break
         fix = first_fix(run, dynamics, count, speed=speed, rate=rate)
         verdict = Status(int(fix.code))
-        if verdict not in (Status.OK, Status.AMBIGUOUS, Status.SEARCHED):
+        if not bool(fix.answered):
             continue
         state = state_of(run, fix, count)
         d = problem.dimension
@@ -378,7 +380,7 @@ def _stretch(
         # More scans do not mend rows that contradict each other.
         if found.p < _PLAUSIBLE:
             return ambiguous or found, verdict
-        if verdict == Status.OK:
+        if is_one_gaussian(fix):
             return found, verdict
         ambiguous = ambiguous or found
     return ambiguous, verdict

@@ -61,11 +61,20 @@ def begun(
     fix, used = None, 0
     for used in [epochs] if epochs is not None else counts(problem.epochs, order, speed, rate):
         fix = first_fix(problem, dynamics, used, speed=speed, rate=rate)
-        if fix.status in (Status.OK, Status.AMBIGUOUS):
+        if is_one_gaussian(fix):
             return state_of(problem, fix, used)
     if fix is None:
         raise InvalidProblem("there are no epochs", "start", "give a run of at least one scan")
     raise NoSolution(problem, fix)
+
+
+def is_one_gaussian(fix: Fix) -> bool:
+    """Return whether a fix is one place with a covariance that covers: what a filter begins with.
+
+    That no other place exists is proven of single scans at most; of runs it is enough that none was found.
+    """
+    against = (Status.MISFIT, Status.UNBOUNDED, Status.AMBIGUOUS, Status.CURVED)
+    return bool(fix.answered) and not bool(fix.has(*against))
 
 
 def two_point(first: Fix, second: Fix, times: tuple[float, float]) -> State:

@@ -1,4 +1,4 @@
-"""The shape of the likelihood about a fix: how far it is Gaussian, in which chart, and what it costs to go to infinity."""
+"""The shape of the likelihood about a fix: how far it is Gaussian, in which chart, and what infinity costs."""
 
 from __future__ import annotations
 
@@ -226,8 +226,8 @@ def _in_inverse_range(look: _Look, centre: Array, covariance: Array) -> Array:
 # Distance that stands for infinity, spreads of the stations: wave fronts bend by 5e-8 of the spread there, and rounding
 # of a difference of ranges is 1e-9 of it.
 _INFINITE = 1e7
-# Directions that are tried: every 22.5 degrees of the plane, in space 50 on a spiral, about 28 degrees apart: the cost of
-# range differences is quadratic in the direction and has two minima at most.
+# Directions that are tried: every 22.5 degrees of the plane, in space 50 on a spiral, about 28 degrees apart: the cost
+# of range differences is quadratic in the direction and has two minima at most.
 _DIRECTIONS = {2: 16, 3: 50}
 # Those of them that are refined, beside that of the fix; and steps, of which each squares a small error.
 _REFINED, _STEPS = 3, 12

@@ -16,11 +16,12 @@ from stonesoup.types.track import Track
 from stonesoup.types.update import GaussianStateUpdate
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.types import Motion, Prior, Status
+from optloc.base.types import Motion, Prior
 from optloc.plugins.stonesoup.models import StationMeasurement, problem_of, rows_by_kind, values_of
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
+from optloc.track.start import is_one_gaussian
 
 # A fix is trusted as a Gaussian where no other minimum costs less than this more: five standard deviations.
 _GAP = 25.0
@@ -133,7 +134,7 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
     def _clear(self, chain: _Chain) -> bool:
         """Return whether a fix is the only one, and nearly Gaussian."""
         fix = chain.fix
-        if fix.status != Status.OK or chain.p < self.least_p or (fix.alternatives.gap < _GAP).any():
+        if not is_one_gaussian(fix) or chain.p < self.least_p or (fix.alternatives.gap < _GAP).any():
             return False
         stations = chain.detections[-1].measurement_model.stations
         nearest = np.linalg.norm(stations - fix.position, axis=-1).min()

@@ -31,6 +31,8 @@ from optloc.problem.noise import Block, arrivals, group
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
 
+# A detection with one of these has no position of its own.
+_NOT_ONE_PLACE = (Status.CONTRADICTORY, Status.MISFIT, Status.UNBOUNDED, Status.AMBIGUOUS)
 _TYPES = {"azimuth": Bearing, "elevation": Elevation}
 
 Row = tuple[str, int, int]
@@ -119,7 +121,7 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
             Where the detection has no clean fix of its own; initiators of Stone Soup can skip such ones.
         """
         fix = solve(self.problem.with_rows(z=values_of(detection)[self.order]))
-        if fix.status != Status.OK:
+        if not bool(fix.answered) or bool(fix.has(*_NOT_ONE_PLACE)):
             raise NotImplementedError(Status(int(fix.code)).sentence)
         out = np.zeros((self.ndim_state, 1))
         out[list(self.mapping), 0] = fix.position

@@ -106,12 +106,12 @@ def examine(problem: Problem, pool: Pool) -> Pool:
     Parameters
     ----------
     problem : Problem
-        N problems; only those of one position are looked at.
+        N problems; those that share a position are looked at, and infinity for those of nothing but one.
     pool : Pool
         What was measured before is kept.
     """
     curvature = pool.curvature
-    if curvature is None or not one_position(problem):
+    if curvature is None or not _has_position(problem):
         return pool
     good = (pool.code[:, 0] == Status.OK) & np.isfinite(pool.x[:, 0]).all(-1)
     good &= np.isfinite(curvature.covariance).all((-1, -2))
@@ -122,7 +122,15 @@ def examine(problem: Problem, pool: Pool) -> Pool:
     if len(new):
         kappa[new] = _departure(problem.take(new), take(pool, new))
     pool = replace(pool, curvature=replace(curvature, kappa=kappa))
-    return pool if pool.loss else replace(pool, infinity=_infinity(problem, pool, good & ~_is_settled(pool)))
+    return (
+        pool
+        if pool.loss or not one_position(problem)
+        else replace(pool, infinity=_infinity(problem, pool, good & ~_is_settled(pool)))
+    )
+
+
+def _has_position(problem: Problem) -> bool:
+    return any(slot.name == "position" for slot in problem.layout.shared)
 
 
 def _departure(problem: Problem, pool: Pool) -> Array:
@@ -145,7 +153,8 @@ def _is_settled(pool: Pool) -> Array:
 
     Of 8 233 fixes that are Gaussian in metres none had infinity in its region; what is far is not Gaussian.
     """
-    assert pool.curvature is not None and pool.curvature.kappa is not None
+    assert pool.curvature is not None
+    assert pool.curvature.kappa is not None
     return np.asarray(_is_unique(pool) & (pool.curvature.kappa[:, 0] <= BENT))
 
 
@@ -167,7 +176,7 @@ def centre_of(problem: Problem) -> Array:
 
 
 def chart_of(problem: Problem, x: Array, covariance: Array, curvature: Curvature) -> Chart | None:
-    """Return in which coordinates fixes are Gaussian, or None for problems that are not of one position.
+    """Return in which coordinates positions are Gaussian, or None for problems that do not share one.
 
     Parameters
     ----------
@@ -180,7 +189,7 @@ def chart_of(problem: Problem, x: Array, covariance: Array, curvature: Curvature
     curvature : Curvature
         Examined; what was not is taken for curved.
     """
-    if not one_position(problem):
+    if not _has_position(problem):
         return None
     slot, _ = problem.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)
@@ -231,7 +240,8 @@ def explain(problem: Problem, pool: Pool, code: Array, gap: Array, certificate: 
         more = float(pool.infinity[i] - cost[i])
         reason[i] = f"infinity costs {f'only {more:.2g}' if more > _NONE else 'no'} more"
     if (code == Status.CURVED).any():
-        assert pool.curvature is not None and pool.curvature.kappa is not None
+        assert pool.curvature is not None
+        assert pool.curvature.kappa is not None
         inverse = pool.curvature.kappa[:, 1] <= BENT
         reason[empty & (code == Status.CURVED) & inverse] = "Gaussian in inverse range, not in metres"
         reason[empty & (code == Status.CURVED) & ~inverse] = "Gaussian neither in metres nor in inverse range"

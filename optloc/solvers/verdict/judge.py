@@ -8,11 +8,11 @@ import numpy as np
 from scipy.special import chdtrc
 
 from optloc.base.records import overwrite, present, take
-from optloc.base.types import ANSWERED, Array, Certificate, Status, first_status
+from optloc.base.types import Array, Certificate, Status, first_status
 from optloc.bounds.observability import open_sentences
 from optloc.linear.constraints import violation_names
 from optloc.models import MODELS
-from optloc.problem.fix import Alternatives, Fix, tail_probability
+from optloc.problem.fix import Alternatives, Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.policy import DOUBT, FAR, FLAT, REJECTED, WEAK
 from optloc.solvers.pool import Curvature, Pool
@@ -96,7 +96,7 @@ def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     _explain_missing(problem, np.flatnonzero(missing), code, reason)
     finished = answered & (code == Status.OK)
     marks = np.where(finished, mark(problem, pool, gap), 1 << code.astype(np.int32)).astype(np.int32)
-    certificate = np.where(finished, _claims(pool), UNKNOWN)
+    certificate = np.where(finished, _claims(pool), fill(len(pool), UNKNOWN))
     if pool.free is not None:
         _hold_against_constraints(pool, cost, finished, marks, reason)
     code = first_status(marks)
@@ -154,8 +154,8 @@ def _explain_missing(problem: Problem, items: Array, code: Array, reason: Array)
         return
     barred = items[code[items] == Status.INFEASIBLE]
     for i in barred:
-        names = violation_names(problem)
-        reason[i] = f"no minimum meets all of: {names}" if names else "the Earth hides every position from a satellite"
+        bounds = violation_names(problem)
+        reason[i] = f"no minimum meets all of: {bounds}" if bounds else "the Earth hides every position from a satellite"
     items = np.setdiff1d(items, barred)
     single = problem.epochs == 1 or problem.stations.position.shape[-3] == 1
     # the graph of ranges is that of one position: stations of a moving run link themselves

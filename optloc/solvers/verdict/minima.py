@@ -126,8 +126,8 @@ Equations = Callable[[Problem, Array], Normal]
 def settle(problem: Problem, pool: Pool, stage: Stage, equations: Equations = equations_at) -> Pool:
     """Return the pool of the distinct minima of every problem: the best one first, with its curvature.
 
-    Runs to infinity leave the pool where a finite minimum rivals them, and their cost is kept; candidates that lie within a tenth of a standard
-    deviation of another, or cost too much to matter, leave it too.
+    Runs to infinity leave the pool where a finite minimum rivals them, and their cost is kept; candidates that lie
+    within a tenth of a standard deviation of another, or cost too much to matter, leave it too.
 
     Parameters
     ----------
@@ -167,7 +167,7 @@ def settle(problem: Problem, pool: Pool, stage: Stage, equations: Equations = eq
 
 
 def _without_runs_to_infinity(problem: Problem, pool: Pool) -> tuple[Pool, Array]:
-    """Return the pool without runs to infinity where a finite minimum rivals them, and the least cost of those, (N,)."""
+    """Return the pool without runs to infinity where a finite minimum rivals them, and their least cost, (N,)."""
     none = np.full(len(pool), np.nan)
     if not any(slot.name == "position" for slot in problem.layout.shared):
         return pool, none
@@ -182,7 +182,9 @@ def _without_runs_to_infinity(problem: Problem, pool: Pool) -> tuple[Pool, Array
     with np.errstate(invalid="ignore"):
         # the finite minimum is answered; what infinity costs is for the verdict
         rivals = np.isfinite(near) & (near - far <= AMBIGUOUS_GAP)
-    return replace(pool, cost=np.where(remote & rivals[:, None], np.inf, pool.cost)), np.where(np.isfinite(far), far, np.nan)
+    return replace(pool, cost=np.where(remote & rivals[:, None], np.inf, pool.cost)), np.where(
+        np.isfinite(far), far, np.nan
+    )
 
 
 def _sort(pool: Pool) -> Pool:
