@@ -27,7 +27,8 @@ finally:
     sys.setprofile(None)
     print(*sorted(entered))
 """
-MOST = 60
+# Three of them since a fix says what stands against it: its chart, the shape of the likelihood, the findings.
+MOST = 63
 
 
 def test_a_simple_fix_enters_few_modules():

@@ -41,7 +41,7 @@ class Curvature:
         Covariance of the states that targets have at each epoch of a run.
     kappa : array (N, 2), optional
         By how much the cost departs from that of a Gaussian three sigma away, in metres and in inverse range
-        (`optloc.uncertainty.shape`); NaN where nobody has looked.
+        (`optloc.adequacy.shape`); NaN where nobody has looked.
     """
 
     covariance: Annotated[Array, Axes(2)]

@@ -8,6 +8,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.special import gammainccinv
 
+from optloc.adequacy.shape import cost_at_infinity, departure
 from optloc.base.linalg import centre_and_spread
 from optloc.base.records import present, take
 from optloc.base.types import Array, Certificate, Status
@@ -18,7 +19,6 @@ from optloc.problem.problem import Problem
 from optloc.solvers.policy import AMBIGUOUS_GAP, BENT, COVERED, DOUBT, REFUTED
 from optloc.solvers.pool import Curvature, Pool
 from optloc.solvers.starts.position import one_position, rows_of_stations
-from optloc.uncertainty.shape import cost_at_infinity, departure
 
 NOT_TRIED = "no proof was tried"
 _ALIKE = 1e-3  # gaps below this are told as "fits as well": a reader gains nothing from more zeros

@@ -155,7 +155,9 @@ def _explain_missing(problem: Problem, items: Array, code: Array, reason: Array)
     barred = items[code[items] == Status.INFEASIBLE]
     for i in barred:
         bounds = violation_names(problem)
-        reason[i] = f"no minimum meets all of: {bounds}" if bounds else "the Earth hides every position from a satellite"
+        reason[i] = (
+            f"no minimum meets all of: {bounds}" if bounds else "the Earth hides every position from a satellite"
+        )
     items = np.setdiff1d(items, barred)
     single = problem.epochs == 1 or problem.stations.position.shape[-3] == 1
     # the graph of ranges is that of one position: stations of a moving run link themselves

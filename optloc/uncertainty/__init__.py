@@ -1,1 +1,0 @@
-"""What a fix leaves open: the shape of its likelihood, regions, arcs and samples."""
