@@ -207,7 +207,7 @@ class Fix:
     active: Annotated[Array, Axes(0, empty=())] | None = None
     local: Annotated[Array, Axes(3)] | None = None
     explanations: Annotated[Array, Axes(0, empty=())] | None = None
-    marks: Annotated[Array, Axes(0)] | None = None
+    marks: Annotated[Array, Axes(0, empty=0)] | None = None
     chart: Chart | None = None
     infinity: Annotated[Array, Axes(0)] | None = None
 
@@ -432,8 +432,8 @@ def tail_probability(cost: Array, dof: Array) -> Array:
 
 
 def _as_array(value: Any) -> Array:
-    if isinstance(value, np.ndarray):
-        return value
+    if isinstance(value, np.ndarray | np.generic):
+        return np.asarray(value)
     out = np.empty(1, dtype=object if isinstance(value, str | tuple | Certificate) else None)
     out[0] = value
     return out.reshape(())

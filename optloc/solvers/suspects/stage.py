@@ -20,7 +20,7 @@ from optloc.solvers.starts.arrivals import as_arrivals
 from optloc.solvers.starts.position import complete
 from optloc.solvers.suspects.groups import KINDS, Group, check_kinds, groups_of
 from optloc.solvers.suspects.report import Case, conclude_case
-from optloc.solvers.suspects.subsets import TEST, Finding, Rest, enumerable, explain, fix_rest, grow
+from optloc.solvers.suspects.subsets import TEST, Finding, Rest, enumerable, explain, fix_rest, grow, prove_rest
 from optloc.solvers.verdict.conclusion import Conclusion
 from optloc.solvers.verdict.judge import fill, judge, standing
 
@@ -123,6 +123,9 @@ def _conclude_pattern(
             findings[i] = replace(more, p_value=findings[i].p_value | more.p_value, nearly=findings[i].nearly)
     for i, found in enumerate(findings):
         finding = found if found.rests else replace(found, rests=found.nearly)
+        if finding.rests:
+            best = prove_rest(work.take(np.array([i])), groups, finding.rests[0])
+            finding = replace(finding, rests=(best, *finding.rests[1:]))
         one = None if arrivals is None else replace(arrivals, problem=arrivals.problem.take(np.array([i])))
         case = Case(part.take(np.array([i])), one, groups, fix[items[i]])
         yield int(items[i]), conclude_case(case, finding)

@@ -14,11 +14,13 @@ from optloc.base.records import take
 from optloc.base.types import Array
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
+from optloc.solvers.certify.branch_and_bound import certified
+from optloc.solvers.outside import accept
 from optloc.solvers.pool import Pool, begin, in_parts, offer, pack
 from optloc.solvers.stages import fix_by, gtrs, lsr, roots, search, widen
 from optloc.solvers.suspects.evidence import Influence, errors, influence, significance
 from optloc.solvers.suspects.groups import Group, leave_out, mark_rows
-from optloc.solvers.verdict.judge import judge, standing
+from optloc.solvers.verdict.judge import judge, standing, verdict
 
 TEST = 0.01
 """Probability of the chi-square test: a fit less likely than this is contradicted. Clean data are accused as often."""
@@ -291,6 +293,14 @@ def fix_without(problem: Problem, groups: Sequence[Group], left: Sequence[int], 
     """Return the fix of one problem without some groups, refined from a vector (size,)."""
     part = _leave_out(problem, groups, left)
     return fix_by(part, lambda one: begin(one, x[None]))[0]
+
+
+def prove_rest(problem: Problem, groups: Sequence[Group], rest: Rest) -> Rest:
+    """Return what one problem is without some groups, after all that an `ok` promises has been looked at."""
+    part = _leave_out(problem, groups, rest.left)
+    if not bool(rest.fix.answered):
+        return rest
+    return Rest(rest.left, verdict(part, certified(part, accept(part, rest.fix.flat())))[0])
 
 
 def _leave_out(problem: Problem, groups: Sequence[Group], left: Sequence[int]) -> Problem:

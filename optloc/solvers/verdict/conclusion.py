@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optloc.base.types import Array, Certificate, Status
+from optloc.base.types import Array, Certificate, Status, first_status
 from optloc.problem.fix import Alternatives, Explanation, Fix, Suspect
 from optloc.problem.problem import Problem
 
@@ -49,12 +49,22 @@ def conclude(problem: Problem, conclusion: Conclusion) -> Fix:
     weights[[row for suspect in explanations[0].suspects for row in suspect.rows]] = 0.0
     # the rest stays as it was judged; several explanations are several positions
     several = len(explanations) > 1
+    marks = int(rest.marks) if rest.marks is not None else rest.status.mark
+    if several and rest.answered:
+        marks |= Status.AMBIGUOUS.mark
+    reason = _name_rivals(explanations) if several else _name_suspects(explanations[0], rest)
+    left_out = len(explanations[0].suspects)
+    if rest.answered and int(rest.dof) <= left_out:
+        # 2 k name k culprits, and one more notices that there is another
+        marks |= Status.UNPROVEN.mark
+        reason += f"; redundancy {int(rest.dof)} without them: another explanation would not be noticed"
     return replace(
         rest,
         x=explanations[0].x,
         layout=problem.layout,
-        code=np.array(int(Status.AMBIGUOUS) if several and rest.answered else int(rest.code), dtype=np.int8),
-        reason=_object(_name_rivals(explanations) if several else _name_suspects(explanations[0], rest)),
+        code=first_status(np.array(marks)),
+        marks=np.array(marks, dtype=np.int32),
+        reason=_object(reason),
         alternatives=conclusion.alternatives,
         weights=weights,
         local=rest.local if rest.layout == problem.layout else None,
@@ -71,6 +81,7 @@ def _contradictory(conclusion: Conclusion) -> Fix:
         whole,
         cov=np.full_like(whole.cov, np.nan),
         code=np.array(int(Status.CONTRADICTORY), dtype=np.int8),
+        marks=np.array(Status.CONTRADICTORY.mark, dtype=np.int32),
         reason=_object(reason),
         certificate=_object(_UNKNOWN),
         local=None if whole.local is None else np.full_like(whole.local, np.nan),
