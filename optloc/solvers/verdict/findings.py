@@ -169,10 +169,10 @@ def _infinity(problem: Problem, pool: Pool, wanted: Array) -> Array:
 
 def centre_of(problem: Problem) -> Array:
     """Return the mean (N or 1, d) of the stations that rows are present of, metres."""
-    position = problem.stations.position
-    position = position.reshape(-1, *position.shape[-2:])
+    places = problem.stations.places
     heard = (problem.weight > 0.0).astype(float) @ rows_of_stations(problem).T.astype(float) > 0.0
-    return centre_and_spread(position, heard)[0]
+    # a station that moves counts wherever it is in the course of the run
+    return centre_and_spread(places, np.tile(heard, places.shape[-2] // problem.stations.count))[0]
 
 
 def chart_of(problem: Problem, x: Array, covariance: Array, curvature: Curvature) -> Chart | None:
