@@ -73,7 +73,7 @@ def _by_machine_code(problem: Problem, x: Array, noise: tuple[Whitener, ...] | N
     sums = normal_at(found, x.reshape(count, -1), np.arange(count) % max(1, *problem.batch_shape, 1))
     if x.ndim == 2:
         return sums
-    return Normal(*(part.reshape(*shape, *part.shape[1:]) for part in sums.parts))
+    return Normal(*(part.reshape((*shape, *part.shape[1:])) for part in sums.parts))
 
 
 def serves(problem: Problem, starts: int) -> bool:
