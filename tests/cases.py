@@ -48,8 +48,12 @@ class Case:
 
 def turned(seed: int, d: int, count: int) -> np.ndarray:
     """Return proper rotations (1, count, d, d)."""
-    q, r = np.linalg.qr(np.random.default_rng(seed).standard_normal((count, d, d)))
-    q = q * np.sign(np.diagonal(r, axis1=-2, axis2=-1))[:, None, :]
+    q = np.random.default_rng(seed).standard_normal((count, d, d))
+    # By Gram and Schmidt in plain sums: a QR of LAPACK has the last bit of its BLAS, and with it the measurements.
+    for j in range(d):
+        for i in range(j):
+            q[..., j] -= (q[..., i] * q[..., j]).sum(-1, keepdims=True) * q[..., i]
+        q[..., j] /= np.linalg.norm(q[..., j], axis=-1, keepdims=True)
     q[np.linalg.det(q) < 0, 0] *= -1.0
     return q[None]
 

@@ -17,6 +17,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from optloc.base.arrays import Portable, product
 from optloc.base.errors import InvalidProblem
 
 __all__ = ["CARTESIAN", "ECEF", "Frame", "check_geodetic", "ecef_to_geodetic", "geodetic_to_ecef"]
@@ -93,12 +94,12 @@ class Frame:
         ndarray, shape (..., 3)
             Metres.
         """
-        return self._spatial(position) @ self.rotation_to_ecef().T + self.origin_ecef()
+        return product(self._spatial(position), self.rotation_to_ecef().T) + self.origin_ecef()
 
     def from_ecef(self, position: ArrayLike) -> Array:
         """Convert ECEF positions, shape (..., 3) in metres, to this frame."""
         # Subtracted before it is turned: turned numbers of the Earth's size are rounded to a nanometre.
-        return (_vectors(position, (3,)) - self.origin_ecef()) @ self.rotation_to_ecef()
+        return product(_vectors(position, (3,)) - self.origin_ecef(), self.rotation_to_ecef())
 
     def to_geodetic(self, position: ArrayLike) -> tuple[Array, Array, Array]:
         """Convert positions of this frame to latitude, longitude (rad) and height (m), each of shape (...)."""
@@ -147,7 +148,7 @@ class Frame:
         if not self.geodetic or (self.kind == "enu" and d == 2):
             return np.broadcast_to(np.eye(d), (*p.shape, d)).copy()
         lat, lon, _ = self.to_geodetic(p)
-        return _axes_in_ecef(lat, lon) @ self.rotation_to_ecef()
+        return product(_axes_in_ecef(lat, lon), self.rotation_to_ecef())
 
     def _place(self) -> tuple[float, float, float] | None:
         """Return the origin, None for ECEF; a frame without a place on Earth is refused."""
@@ -174,7 +175,9 @@ def geodetic_to_ecef(lat: ArrayLike, lon: ArrayLike, height: ArrayLike) -> Array
     from pymap3d import geodetic2ecef
 
     given = np.broadcast_arrays(*(np.asarray(v, dtype=np.float64) for v in (lat, lon, height)))
-    return np.stack(np.broadcast_arrays(*geodetic2ecef(*given, deg=False)), axis=-1)
+    # Scenes on Earth are drawn too: their last bit must not be that of a processor's sine.
+    place = geodetic2ecef(*(v.view(Portable) for v in given), deg=False)
+    return np.stack(np.broadcast_arrays(*map(np.asarray, place)), axis=-1)
 
 
 def ecef_to_geodetic(position: ArrayLike) -> tuple[Array, Array, Array]:
@@ -193,19 +196,21 @@ def ecef_to_geodetic(position: ArrayLike) -> tuple[Array, Array, Array]:
     from pymap3d import Ellipsoid, ecef2geodetic
 
     p = _vectors(position, (3,))
-    x, y, z = p.reshape(-1, 3).T
-    # The library squeezes latitudes, hence the reshapes.
-    lat, lon, _ = (np.reshape(v, x.shape) for v in ecef2geodetic(x, y, z, deg=False))
+    x, y, z = p.reshape(-1, 3).T.view(Portable)
+    # The library squeezes latitudes, hence the reshape.
+    lat = np.reshape(ecef2geodetic(x, y, z, deg=False)[0], x.shape).view(Portable)
     earth = Ellipsoid.from_name("wgs84")
     a, b = earth.semimajor_axis, earth.semiminor_axis
     axial, e2 = np.hypot(x, y), 1 - (b / a) ** 2
     # The library's closed form is 8 mm off at 1000 km of height and 28 m at 20 000 km: two steps of Bowring.
     for _ in range(2):
         beta = np.arctan2(b * np.sin(lat), a * np.cos(lat))
-        lat = np.arctan2(z + e2 * a * a / b * np.sin(beta) ** 3, axial - e2 * a * np.cos(beta) ** 3)
+        sine, cosine = np.sin(beta), np.cos(beta)
+        rise, run = e2 * a * a / b * sine * sine * sine, e2 * a * cosine * cosine * cosine
+        lat = np.arctan2(z + rise, axial - run)
     height = axial * np.cos(lat) + z * np.sin(lat) - a * np.sqrt(1 - e2 * np.sin(lat) ** 2)
-    shape = p.shape[:-1]
-    return lat.reshape(shape), lon.reshape(shape), height.reshape(shape)
+    shape, lon = p.shape[:-1], np.arctan2(y, x)
+    return np.asarray(lat).reshape(shape), np.asarray(lon).reshape(shape), np.asarray(height).reshape(shape)
 
 
 def check_geodetic(
@@ -255,8 +260,8 @@ def _axes_in_ecef(lat: Array, lon: Array) -> Array:
     from pymap3d import enu2uvw
 
     east, north, up = np.eye(3)
-    columns = enu2uvw(east, north, up, lat[..., None], lon[..., None], deg=False)
-    return np.stack(columns, axis=-1)
+    columns = enu2uvw(east, north, up, *(v[..., None].view(Portable) for v in (lat, lon)), deg=False)
+    return np.stack([np.asarray(column) for column in columns], axis=-1)
 
 
 def _vectors(position: ArrayLike, lengths: tuple[int, ...]) -> Array:

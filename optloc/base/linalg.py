@@ -64,6 +64,32 @@ def _factor(matrix: Any, least: float) -> tuple[Any, Any]:
     return xp.stack(columns, axis=-1), ok
 
 
+def factor_semidefinite(covariance: Array) -> Array:
+    """Return lower triangular L with ``L L'`` a covariance, which may be singular.
+
+    Cholesky's columns in the order of the rows, without pivots; a row whose error is a combination of those before it
+    has a column of zeros.
+
+    Parameters
+    ----------
+    covariance : array (..., r, r)
+        Symmetric positive semidefinite.
+    """
+    size = covariance.shape[-1]
+    rest, lower = np.array(covariance, dtype=float), np.zeros(covariance.shape)
+    # Each step rounds a diagonal by half a unit; a remainder of that size may be anything, its sign included.
+    least = 4.0 * size * np.finfo(float).eps * np.abs(np.diagonal(rest, axis1=-2, axis2=-1))
+    for j in range(size):
+        pivot = rest[..., j, j]
+        # Written so that NaN is no remainder: a covariance without a number gives no draw without noise.
+        nothing = pivot <= least[..., j]
+        column = rest[..., j:, j] / np.sqrt(np.where(nothing, 1.0, pivot))[..., None]
+        column = np.where(nothing[..., None], 0.0, column)
+        lower[..., j:, j] = column
+        rest[..., j:, j:] -= column[..., :, None] * column[..., None, :]
+    return lower
+
+
 def _substitute(lower: Any, right: Any, order: range) -> Array:
     """Return the solution of a triangular system whose rows are solved in a given order; it writes into no array."""
     xp, rows = arrays.library(lower), dict[int, Any]()

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from optloc.base.arrays import foreign, gather, library, placed
+from optloc.base.arrays import Portable, foreign, gather, library, placed
 from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Rows
@@ -267,6 +267,8 @@ def points(problem: Problem, plan: Plan, x: Array, differentiate: bool) -> tuple
     inputs = {seed: placed(value, x) for seed, value in given(problem, plan).items()}
     for feed in plan.feeds:
         inputs[feed.seed] = _feed(inputs.get(feed.seed, 0.0), feed, x, plan.block.count)
+    if isinstance(x, Portable):  # what is data only is computed like what the vector feeds
+        inputs = {seed: np.asarray(value).view(Portable) for seed, value in inputs.items()}
     if differentiate:
         fed = {feed.seed for feed in plan.feeds}
         # Arrays of other libraries need not hand arithmetic with a Jet on the right to the Jet: there all are jets.

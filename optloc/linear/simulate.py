@@ -1,9 +1,10 @@
-"""Draw measurements of a known truth."""
+"""Draw measurements of a known truth: from the same seed the same numbers, bit for bit, on every processor."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from optloc.base import arrays, linalg
 from optloc.base.types import Array
 from optloc.linear.evaluate import predict
 from optloc.linear.normal import with_offsets
@@ -23,7 +24,7 @@ def simulate(problem: Problem, truth: Array, seed: int | np.random.SeedSequence,
     truth : array (..., size)
         True parameter vectors in the order of ``problem.layout``; leading axes must fit the problem's.
     seed : int or SeedSequence
-        Decides the draw, whatever else runs.
+        Decides the draw, whatever else runs and wherever.
     trials : int, optional
         Number of independent draws of each truth; they become the first axis.
 
@@ -39,11 +40,14 @@ def simulate(problem: Problem, truth: Array, seed: int | np.random.SeedSequence,
         shape = (trials, *shape)
     noise = draw(problem.noise, problem.count, shape, rng)
     # Noise is drawn before station errors: problems with and without those meet the same noise.
-    z = noise + predict(*_displace(problem, truth, shape, rng))
+    real, x = _displace(problem, truth, shape, rng)
+    # Angles and levels too: the last bit of a sine is otherwise that of a library.
+    z = noise + np.asarray(predict(real, x.view(arrays.Portable)))
     values = []
     for rows, start in zip(problem.rows, problem.starts, strict=True):
         part = z[..., start : start + rows.count]
-        values.append((wrap(part) if MODELS[rows.kind].period is not None else part) + rows.correction)
+        turned = np.asarray(wrap(part.view(arrays.Portable))) if MODELS[rows.kind].period is not None else part
+        values.append(turned + rows.correction)
     return problem.with_rows(z=np.concatenate(values, axis=-1))
 
 
@@ -60,10 +64,9 @@ def _displace(
 
 def samples(covariance: Array, shape: tuple[int, ...], rng: np.random.Generator) -> Array:
     """Return normal samples (*shape, r) of covariances (..., r, r) whose leading axes fit the shape."""
-    # Not by Cholesky: rows that close a loop have a singular covariance.
-    values, vectors = np.linalg.eigh(covariance)
-    root = vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]
-    return np.asarray((root @ rng.standard_normal((*shape, covariance.shape[-1], 1)))[..., 0])
+    # Not by eigenvectors: those of equal eigenvalues are whatever a BLAS makes of them, and so would be the data.
+    factor = linalg.factor_semidefinite(covariance)
+    return arrays.product(rng.standard_normal((*shape, covariance.shape[-1])), np.swapaxes(factor, -1, -2))
 
 
 def draw(noise: Noise, count: int, shape: tuple[int, ...], rng: np.random.Generator) -> Array:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from optloc.base import arrays
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
 from optloc.base.types import Array, Bias
@@ -239,7 +240,7 @@ def place_stations(layout: LayoutTable, where: str, rng: Rng, count: int) -> Arr
     centre = int(layout.placement == "star")
     angle = 2.0 * np.pi * np.arange(s - centre) / max(s - centre, 1)
     # In space stations are high and low in turn: a plane ring would leave the sign of the height open.
-    unit = np.stack([np.cos(angle), np.sin(angle), (-1.0) ** np.arange(s - centre)], axis=-1)[:, :d]
+    unit = np.stack([arrays.cos(angle), arrays.sin(angle), 1.0 - 2.0 * (np.arange(s - centre) % 2)], -1)[:, :d]
     ring = np.concatenate([np.zeros((centre, d)), 0.5 * unit * box])
     return np.broadcast_to(ring, (count, s, d))
 
@@ -300,18 +301,19 @@ def _in_area(truth: TruthTable, frame: Frame, stations: Array, where: str, rng: 
 
 def _turn(frame: Frame, at: Array, local: Array) -> Array:
     """Return vectors (count, d) along east, north and up at points as vectors of the frame."""
-    return np.asarray((local[:, None, :] @ frame.enu_axes(at))[:, 0]) if frame.geodetic else local
+    return arrays.product(local, frame.enu_axes(at)) if frame.geodetic else local
 
 
 def _directions(truth: TruthTable, d: int, count: int, rng: Rng) -> Array:
     """Return unit vectors (count, d), even on the circle, the sphere or a band of elevations of it."""
     azimuth = rng.uniform(0.0, 2.0 * np.pi, count)
-    flat = np.stack([np.cos(azimuth), np.sin(azimuth)], axis=-1)
+    flat = np.stack([arrays.cos(azimuth), arrays.sin(azimuth)], axis=-1)
     if d == 2:
         return flat
     low, high = truth.elevation_deg or (-90.0, 90.0)
     # Archimedes: areas of a sphere are even in the sine of the elevation, not in the elevation.
-    sine = rng.uniform(np.sin(np.radians(low)), np.sin(np.radians(high)), count)
+    lowest, highest = arrays.sin(np.radians([low, high]))
+    sine = rng.uniform(lowest, highest, count)
     return np.concatenate([flat * np.sqrt(1.0 - sine[:, None] ** 2), sine[:, None]], axis=-1)
 
 
