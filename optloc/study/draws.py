@@ -107,7 +107,9 @@ class Drawn:
     wild : array (n, d)
         A place in the unit cube around zero for each: where methods begin that need a guess.
     seed : tuple of n str
-        Names of the seeds of the trials.
+        Names of the seeds of the trials' blocks.
+    digest : tuple of n str
+        Digests of the blocks: what was drawn in them, where the seed only says what should be.
     bad : int array (n,)
         How many stations have a gross error.
     position : str
@@ -118,14 +120,18 @@ class Drawn:
     truth: Array
     wild: Array
     seed: tuple[str, ...]
+    digest: tuple[str, ...]
     bad: Array
     position: str = "position"
 
     def part(self, first: int, count: int) -> Drawn:
         """Return some of the trials."""
         kept = slice(first, first + count)
-        problem = self.problem.take(np.arange(first, first + count))
-        return Drawn(problem, self.truth[kept], self.wild[kept], self.seed[kept], self.bad[kept], self.position)
+        return replace(
+            self,
+            problem=self.problem.take(np.arange(first, first + count)),
+            **{name: getattr(self, name)[kept] for name in ("truth", "wild", "seed", "digest", "bad")},
+        )
 
 
 def block_size(case: Case) -> int:
@@ -151,8 +157,19 @@ def draw(case: Case, first: int, count: int) -> Drawn:
     # Stations of a file are the same in all trials, and are stored once.
     problem = case.template if case.table.layout is None else _at(case.template, stations)
     names = [f"{case.seed}:{case.key}:{number}" for number in blocks]
-    seed = tuple(names[trial // size - blocks[0]] for trial in range(first, first + count))
-    return Drawn(problem.with_rows(z=z), truth, wild, seed, bad, case.state[0])
+    digests = [_digest(case, part) for part in parts]
+    of = [trial // size - blocks[0] for trial in range(first, first + count)]
+    seed, digest = (tuple(texts[block] for block in of) for texts in (names, digests))
+    return Drawn(problem.with_rows(z=z), truth, wild, seed, digest, bad, case.state[0])
+
+
+def _digest(case: Case, block: tuple[Array, ...]) -> str:
+    """Return 16 hexadecimal digits that are equal where all that was drawn for a block is, bit for bit."""
+    # The key says what is not drawn: noise, weights, frame. Without it, equal measurements of other noise were equal.
+    made = hashlib.blake2b(case.key.encode(), digest_size=8)
+    for array in block:
+        made.update(np.ascontiguousarray(array).tobytes())
+    return made.hexdigest()
 
 
 def _block(case: Case, number: int, size: int) -> tuple[Array, Array, Array, Array, Array]:

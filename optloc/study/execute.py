@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.study.folder import Progress, begin, finished_chunks, locked, progress, store
+from optloc.study.folder import Progress, begin, finished_chunks, known_data, locked, note_data, progress, store
 from optloc.study.plan import Chunk, Plan, workers
 from optloc.study.trial import Part, compute, dead_part, join_parts
 
@@ -68,18 +68,20 @@ def run_plan(plan: Plan, folder: Path, by: Executor, tell: Tell | None = None) -
     Raises
     ------
     InvalidProblem
-        Where the folder belongs to another study or cannot be written; finished parts are kept.
+        Where the folder belongs to another study, holds other data or cannot be written; finished parts are kept.
     """
     manifest = begin(plan, folder)
     # From here to the end nobody else writes: what is counted as finished stays so.
     with locked(folder):
         done = finished_chunks(folder, manifest)
+        known = known_data(plan, folder, done)
         if tell is not None and done:
             had = progress(folder)
             tell(had.rows, had.counts)
         left = [chunk for chunk in plan.chunks if chunk.key not in done]
         with closing(compute_all(left, by)) as parts:
             for part in parts:
+                note_data(known, part.table, folder)
                 store(folder, part)
                 if tell is not None:
                     tell(sum(part.counts.values()), part.counts)

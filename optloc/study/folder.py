@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
+from optloc.study.draws import draw
 from optloc.study.methods import version_of
 from optloc.study.plan import Plan
 from optloc.study.trial import COLUMNS, GAP, Part, arrow_schema, machine, versions
@@ -204,6 +205,54 @@ def finished_chunks(folder: Path, manifest: Manifest) -> set[str]:
         else:
             path.unlink(missing_ok=True)
     return done
+
+
+def note_data(known: dict[str, str], table: Any, folder: Path) -> None:
+    """Add the data of the blocks of trials in a table to those that are known.
+
+    Parameters
+    ----------
+    known : dict of str to str
+        Digests of blocks of data by their seeds.
+    table : pyarrow.Table
+        Rows with the columns `seed` and `data`.
+    folder : Path
+        Of the study.
+
+    Raises
+    ------
+    InvalidProblem
+        Where a block has other data than are known of it: methods would be compared on different measurements.
+    """
+    found = table.select(["seed", "data"]).group_by(["seed", "data"]).aggregate([([], "count_all")]).to_pylist()
+    for row in found:
+        if known.setdefault(row["seed"], row["data"]) != row["data"]:
+            what = f"parts of the study hold different data for the same trials (those of the seed {row['seed']})"
+            advice = "choose another folder with --out, and compute all of it with one version of optloc and numpy"
+            raise InvalidProblem(what, str(folder), advice)
+
+
+def known_data(plan: Plan, folder: Path, done: set[str]) -> dict[str, str]:
+    """Return the digests of the blocks of finished chunks by their seeds.
+
+    Raises
+    ------
+    InvalidProblem
+        Where they contradict each other, or what is drawn here for the first finished trial of a case.
+    """
+    from pyarrow import parquet
+
+    known: dict[str, str] = {}
+    first = {chunk.cell.case.key: chunk for chunk in reversed(list(plan.chunks)) if chunk.key in done}
+    for key in sorted(done):
+        note_data(known, parquet.read_table(folder / "parts" / f"{key}.parquet", columns=["seed", "data"]), folder)
+    for chunk in first.values():
+        drawn = draw(chunk.cell.case, chunk.first, 1)
+        if known.get(drawn.seed[0]) != drawn.digest[0]:
+            what = f"its finished trials of {chunk.cell.case.where} hold other data than are drawn here"
+            advice = "choose another folder with --out, or go on with the versions that the manifest names"
+            raise InvalidProblem(what, str(folder), advice)
+    return known
 
 
 @contextmanager

@@ -274,7 +274,7 @@ class Difference:
     one, two : Side
         The studies.
     same_data : bool
-        Whether both solved the same measurements.
+        Whether both solved the same measurements, in the trials that both have.
     identical : bool
         Whether their values are equal bit for bit.
     z : float
@@ -306,8 +306,9 @@ def compared(one: Path, two: Path) -> list[Difference]:
 
 
 def _difference(cell: tuple[str, ...], a: pd.DataFrame, b: pd.DataFrame) -> Difference:
-    # The key of the data names seed, geometry and noise: equal keys are equal measurements.
-    same_data = set(a["data"]) == set(b["data"])
+    # Not the seed, which says what should have been drawn, but a digest of what was; of the trials that both have.
+    both = a[["trial", "data"]].merge(b[["trial", "data"]], on="trial")
+    same_data = bool(len(both)) and bool((both["data_x"].astype(str) == both["data_y"].astype(str)).all())
     one, two = _side(a), _side(b)
     # Two shares with one variance, that of both together: the usual test of their difference.
     pooled = (one.answered * one.rows + two.answered * two.rows) / (one.rows + two.rows)

@@ -59,7 +59,7 @@ class Column:
 
 COLUMNS: tuple[Column, ...] = (
     Column("key", "category", "", "Cell: a scenario at one noise level and one set of swept values, with one method."),
-    Column("data", "category", "", "Cell without the method: equal data and trial mean equal measurements."),
+    Column("data", "category", "", "Digest of what was drawn: equal data and trial mean equal measurements."),
     Column("scenario", "category", "", "Name of the scenario."),
     Column("method", "category", "", "Name of the method as tables show it; different settings have different names."),
     Column("solver", "category", "", "Back end that was asked for, for instance SCS; empty: the method's own."),
@@ -297,7 +297,7 @@ def _part(chunk: Chunk, known: Known, found: Values, build: float) -> Part:
     values = found | truth_values(case, known)
     values |= {
         "key": chunk.cell.key,
-        "data": case.key,
+        "data": list(known.drawn.digest),
         "scenario": case.table.name,
         "method": method.name,
         "solver": method.solver,

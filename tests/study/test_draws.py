@@ -28,6 +28,8 @@ def test_a_trial_does_not_depend_on_what_else_is_drawn():
             assert np.array_equal(getattr(part, name), getattr(whole, name)[first : first + count])
         assert np.array_equal(part.problem.z, whole.problem.z[first : first + count])
         assert part.seed == whole.seed[first : first + count]
+        assert part.digest == whole.digest[first : first + count]
+    assert len(set(whole.digest)) == len(set(whole.seed)) == 3
 
 
 def test_other_scenarios_methods_and_numbers_of_trials_leave_the_data_alone():
@@ -37,6 +39,7 @@ def test_other_scenarios_methods_and_numbers_of_trials_leave_the_data_alone():
     renamed = plan(HEAD.replace('"s"', '"t"') + SHELL).cells[0].case
     assert behind.key == renamed.key
     assert np.array_equal(draw(behind, 5, 9).problem.z, draw(renamed, 5, 9).problem.z)
+    assert draw(behind, 5, 9).digest == draw(renamed, 5, 9).digest
     assert case(SHELL.replace("10 m", "11 m")).key != alone.key
     assert plan(HEAD + SHELL, seed=4).cells[0].case.key != alone.key
 

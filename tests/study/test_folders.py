@@ -3,13 +3,18 @@
 import errno
 import json
 import os
+import shutil
 import subprocess
 import sys
 
+import numpy as np
+import pyarrow as pa
 import pytest
+from pyarrow import parquet
 from study.texts import QUICK, assert_identical, plan, values
 
 from optloc.base.errors import InvalidProblem
+from optloc.study import draws
 from optloc.study import folder as parts
 from optloc.study.execute import executor, run_plan
 from optloc.study.folder import progress, read_arrow, read_frame, swept
@@ -139,6 +144,59 @@ def test_studies_are_compared_cell_by_cell(whole, tmp_path):
     run_plan(plan(QUICK.replace('"arrivals"', '"a"').replace('"differences"', '"d"')), tmp_path / "names", HERE)
     with pytest.raises(InvalidProblem, match="no cell in common"):
         compared(whole, tmp_path / "names")
+
+
+@pytest.fixture
+def elsewhere(monkeypatch):
+    """Draw what a machine draws whose last digit is another."""
+    here = draws.simulate
+    monkeypatch.setattr(draws, "simulate", lambda *given: (made := here(*given)).with_rows(z=np.nextafter(made.z, 1e9)))
+
+
+def test_the_same_seed_is_not_the_same_data(whole, tmp_path, elsewhere):
+    run_plan(plan(QUICK), tmp_path / "other", HERE)
+    other = compared(whole, tmp_path / "other")
+    assert not any(d.identical or d.same_data for d in other)
+    seeds = [set(values(folder)["seed"]) for folder in (whole, tmp_path / "other")]
+    assert seeds[0] == seeds[1]
+
+
+def test_a_study_does_not_go_on_with_other_data(whole, tmp_path, elsewhere):
+    out = tmp_path / "out"
+    shutil.copytree(whole, out)
+    victim = sorted((out / "parts").glob("*.parquet"))[1]
+    victim.unlink()
+    with pytest.raises(InvalidProblem, match=r"finished trials of scenario '.*' hold other data than are drawn here"):
+        run_plan(plan(QUICK), out, HERE)
+    assert not victim.exists()
+
+
+def test_parts_that_contradict_each_other_are_refused(whole, tmp_path):
+    out = tmp_path / "out"
+    shutil.copytree(whole, out)
+    part = sorted((out / "parts").glob("*.parquet"))[1]
+    table = parquet.read_table(part)
+    column = table.schema.get_field_index("data")
+    other = pa.array(["0123456789abcdef"] * len(table)).dictionary_encode()
+    parquet.write_table(table.set_column(column, table.schema.field(column), other), part)
+    with pytest.raises(InvalidProblem, match="hold different data for the same trials"):
+        run_plan(plan(QUICK), out, HERE)
+
+
+def test_a_part_with_other_data_is_not_stored(whole, tmp_path, monkeypatch):
+    """Two methods, of which the second is computed where the same seed draws other data."""
+    text = QUICK.replace('method = "gtrs+lsr"', 'method = ["gtrs+lsr", "gtrs"]')
+    here, calls = draws.simulate, []
+
+    def strays(*given):
+        calls.append(given)
+        made = here(*given)
+        return made if len(calls) == 1 else made.with_rows(z=np.nextafter(made.z, 1e9))
+
+    monkeypatch.setattr(draws, "simulate", strays)
+    with pytest.raises(InvalidProblem, match="hold different data for the same trials"):
+        run_plan(plan(text), tmp_path / "out", HERE)
+    assert progress(tmp_path / "out").done >= 1
 
 
 def test_the_table_does_not_depend_on_the_order_of_parts(whole):
