@@ -32,9 +32,9 @@ class Cell:
     name: str
     build: Callable[[Rng, int], tuple[Problem, Array]]
 
-    def drawn(self, trials: int, more: int = 0) -> tuple[Problem, Array]:
-        """Return problems with measurements and their emitters (N, d); `more` asks for other trials."""
-        return self.build(np.random.default_rng([SEED, crc32(self.name.encode()), more]), trials)
+    def drawn(self, trials: int, more: int = 0, seed: int = 0) -> tuple[Problem, Array]:
+        """Return problems with measurements and their emitters (N, d); `more` and `seed` ask for other trials."""
+        return self.build(np.random.default_rng([SEED + seed, crc32(self.name.encode()), more]), trials)
 
 
 def random_box(rng: Rng, n: int, s: int) -> Array:
