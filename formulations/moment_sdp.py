@@ -231,18 +231,16 @@ def _forms(ranged: Ranged, box: Box, unit: Array) -> tuple[Array, Array, Array]:
     # from (1, t, omega) to (1, r_1, w)
     change = np.diag(np.concatenate([[1.0, half], unit]))
     change[1, 0] = middle
-    return cone, rule, change.T @ _cost(ranged) @ change
+    return cone, rule, _cost(ranged, change)
 
 
-def _cost(ranged: Ranged) -> Array:
-    """Matrix of the cost in (1, r_1, w)."""
-    M = len(ranged.station)
-    out = np.zeros((M + 1, M + 1))
+def _cost(ranged: Ranged, change: Array) -> Array:
+    """Matrix of the cost in the columns of a change of (1, r_1, w)."""
     if ranged.free:
-        out[2:, 2:] = np.linalg.inv(ranged.spread)
-        return out
-    error = np.zeros((M, M + 1))
-    error[:, 0], error[:, 1], error[1:, 2:] = -ranged.offset[0], 1.0, np.eye(M - 1)
+        return np.asarray(change[2:].T @ np.linalg.solve(ranged.spread, change[2:]))
+    # What is measured less the middle of the box is small: subtracted before it is squared, as squares of ranges in
+    # standard deviations have eight digits more than the cost.
+    error = -ranged.offset[0] * np.eye(1, len(change)) + change[1] + np.pad(change[2:], ((1, 0), (0, 0)))
     return np.asarray(error.T @ np.linalg.solve(ranged.covariance, error))
 
 
