@@ -18,11 +18,14 @@ from cases import (
     stations,
 )
 from scipy.optimize import least_squares
+from verdicts import alone
 
 from optloc import InvalidProblem, Motion, NoSolution, Status, assemble, crlb, measured, simulate, solve, station_array
 from optloc.solvers import METHODS
 
 STARTED = sorted(name for name, case in CASES.items() if case.start)
+# Kinds without bounds over boxes, and targets with a velocity.
+WITHOUT_PROOF = {f"{kind}-{d}d" for kind in ("rss_difference", "tdoa+fdoa") for d in (2, 3)}
 TRIALS, STARTS = 10, 8
 TOLERANCE = 1e-5
 
@@ -71,7 +74,7 @@ def best_of_many(problem, rng):
 def test_no_silent_miss_of_the_global_minimum(name):
     case, rng = CASES[name], np.random.default_rng([5, *name.encode()])
     many, fix = scattered(name)
-    answered = np.isin(fix.code, (Status.OK, Status.AMBIGUOUS))
+    answered = fix.answered & ~fix.has(Status.MISFIT, Status.UNBOUNDED, Status.SEARCHED)
     assert answered.sum() >= TRIALS - 1, [fix.reason[i] for i in np.flatnonzero(~answered)]
     for i in np.flatnonzero(answered):
         problem = case.problem.with_rows(z=many.z[i])
@@ -79,7 +82,7 @@ def test_no_silent_miss_of_the_global_minimum(name):
         assert fix.cost[i] == pytest.approx(plain_cost(problem, fix.x[i]), rel=1e-6, abs=1e-6)
         listed = fix.alternatives.gap[i] + fix.cost[i]
         hit = fix.cost[i] <= value + TOLERANCE * (1.0 + value)
-        if fix.code[i] == Status.AMBIGUOUS:
+        if fix.has(Status.AMBIGUOUS)[i]:
             hit = hit or np.any(np.abs(listed - value) < 1e-3)
         assert hit, f"{fix.cost[i]} at {fix.x[i]} but {value} at {where} ({Status(int(fix.code[i])).label})"
 
@@ -99,13 +102,13 @@ def test_alternatives_are_other_minima_cheapest_first(name):
         assert 2.0 * again.cost == pytest.approx(fix.cost[i] + gap[i, q], rel=1e-4, abs=1e-4)
         assert np.linalg.norm(again.x - point) < 1e-2 * np.linalg.norm(point - fix.x[i])
     near = np.where(np.isfinite(gap), gap, np.inf).min(axis=1, initial=np.inf) < 9.0
-    assert (fix.code[near & np.isin(fix.code, (Status.OK, Status.AMBIGUOUS))] == Status.AMBIGUOUS).all()
+    assert fix.has(Status.AMBIGUOUS)[near & fix.answered].all()
 
 
 @pytest.mark.parametrize("name", STARTED)
 def test_the_covariance_is_the_inverse_information_at_the_estimate(name):
     case, fix = CASES[name], fixed(name)
-    assert fix.status == Status.OK
+    assert fix.status == (Status.UNPROVEN if name in WITHOUT_PROOF else Status.OK)
     assert np.allclose(fix.cov, crlb(case.problem, fix.x), rtol=1e-9)
     assert fix.p_value > 1e-6
     bound = np.sqrt(np.diag(crlb(case.problem, case.truth)))
@@ -120,7 +123,7 @@ def test_kinds_without_a_closed_form_say_so_and_refine_a_start(name):
         best_of_many(case.problem, np.random.default_rng(1))[0], rel=1e-4
     )
     refined = solve(case.problem, "lsr", start=case.truth)
-    assert refined.status == Status.OK
+    assert alone(refined)
     assert refined.cost <= plain_cost(case.problem, case.truth)
 
 
@@ -218,7 +221,9 @@ def test_a_height_or_an_angle_resolves_the_mirror():
     )
     for problem in (low, up):
         fix = solve(problem)
-        assert fix.status == Status.OK
+        # heights above the Earth are proven in a region about the stations only
+        assert fix.status == (Status.UNPROVEN if problem is low else Status.OK)
+        assert alone(fix)
         assert np.linalg.norm(fix.position - truth) < 60.0
 
 
@@ -261,8 +266,8 @@ def test_singular_items_leave_the_others_untouched():
     fix = solve(many)
     assert fix.code.tolist() == [Status.OK, Status.SINGULAR_GEOMETRY, Status.OK]
     for i in (0, 2):
-        alone = solve(assemble(place[i], measured("tdoa", many.z[i], a=np.arange(1, 6), b=0, sigma=1.0)))
-        assert np.allclose(fix.x[i], alone.x, rtol=1e-12, atol=1e-8)
+        single = solve(assemble(place[i], measured("tdoa", many.z[i], a=np.arange(1, 6), b=0, sigma=1.0)))
+        assert np.allclose(fix.x[i], single.x, rtol=1e-12, atol=1e-8)
 
 
 def test_absent_rows_can_make_an_item_too_small():
@@ -281,8 +286,7 @@ def test_wild_measurements_are_finite_statuses():
     for scale in (1e6, 1e12):
         z = np.random.default_rng(1).normal(0.0, scale, (3, case.problem.count))
         fix = solve(case.problem.with_rows(z=z))
-        clean = fix.code == Status.OK
-        assert (fix.p_value[clean] < 1e-6).all()
+        assert not (fix.code == Status.OK).any()
 
 
 def test_a_far_emitter_seen_by_two_parallel_bearings():
@@ -294,7 +298,7 @@ def test_a_far_emitter_seen_by_two_parallel_bearings():
         assert front, "an intersection behind the stations is no answer to bearings that look forward"
     diverging = assemble(place, measured("azimuth", np.radians([100.0, 90.0, 80.0]), a=[0, 1, 2], sigma=0.001))
     far = solve(diverging)
-    assert far.status != Status.OK or far.p_value < 1e-3
+    assert far.status != Status.OK
 
 
 # --------------------------------------------------------------------------------------------------- from a start
@@ -302,7 +306,7 @@ def test_refinement_from_a_near_start_is_the_fix():
     for name in STARTED:
         case, fix = CASES[name], fixed(name)
         refined = solve(case.problem, "lsr", start=case.truth)
-        assert refined.status == Status.OK
+        assert refined.status == Status.UNPROVEN  # nothing looked elsewhere
         assert np.allclose(refined.x, fix.x, atol=1e-4)
         assert [stage.name for stage in refined.stages] == ["start", "lsr"]
 
@@ -316,7 +320,7 @@ def test_starts_of_a_batch():
     assert np.allclose(fix.x, solve(many).x, atol=1e-4)
     starts[1] = np.nan
     part = solve(many, "lsr", start=starts)
-    assert part.code[1] not in (Status.OK, Status.AMBIGUOUS)
+    assert not part.answered[1]
     assert np.array_equal(part.x[[0, 2, 3]], fix.x[[0, 2, 3]])
 
 
@@ -333,7 +337,8 @@ def test_wild_starts_never_raise_and_an_unfinished_run_is_never_ok(name, method)
     many = simulate(case.problem, case.truth, 5, trials=count)
     fix = solve(many, method, start=starts)
     reference = solve(many)
-    ok = fix.code == Status.OK
+    assert not (fix.code == Status.OK).any()  # without a proof nothing is
+    ok = alone(fix)
     assert not ok.all()
     for i in np.flatnonzero(ok):
         problem = case.problem.with_rows(z=many.z[i])
@@ -354,7 +359,7 @@ def test_undamped_taylor_fails_where_damping_does_not():
 
     def hits(method):
         fix = solve(many, method, start=starts)
-        return ((fix.code == Status.OK) & (fix.cost < best + 1e-3)).sum()
+        return (alone(fix) & (fix.cost < best + 1e-3)).sum()
 
     assert hits("taylor") < hits("lsr")
 
@@ -369,7 +374,7 @@ def test_a_target_that_moves_steadily():
     )
     truth = np.array([3e3, 6e3, 80.0, -40.0])
     fix = solve(simulate(problem, truth, 4, trials=5))
-    assert (fix.code == Status.OK).all()
+    assert (fix.code == Status.UNPROVEN).all()  # the proof is for targets that stay
     error = fix.x - truth
     squared = np.einsum("ij,ijk,ik->i", error, np.linalg.inv(fix.cov), error)
     assert squared.max() < 25.0
@@ -382,10 +387,10 @@ def test_targets_are_fixed_together_as_they_would_be_alone():
     truth = np.r_[TARGET[2], TARGET[2] - 2e3]
     drawn = simulate(both, truth, 2)
     fix = solve(drawn)
-    assert fix.status == Status.OK
+    assert fix.status == Status.UNPROVEN
     for i in range(2):
-        alone = solve(assemble(STATIONS[2], measured("range", drawn.z[target == i], a=np.arange(6), sigma=3.0)))
-        assert np.allclose(fix.take(f"position[{i}]"), alone.position, atol=1e-4)
+        single = solve(assemble(STATIONS[2], measured("range", drawn.z[target == i], a=np.arange(6), sigma=3.0)))
+        assert np.allclose(fix.take(f"position[{i}]"), single.position, atol=1e-4)
 
 
 def test_everything_at_once_refines_from_near():
@@ -408,7 +413,7 @@ def test_noise_may_tie_epochs_that_share_all_unknowns(order):
     truth = np.r_[TARGET[2], 30.0, -50.0][: 2 + 2 * order]
     drawn = simulate(problem, truth, 2)
     fix = solve(drawn)
-    assert fix.status == Status.OK
+    assert fix.status == (Status.UNPROVEN if order else Status.OK)
     assert fix.cost == pytest.approx(plain_cost(drawn, fix.x))
     for shift in np.random.default_rng(1).normal(0.0, 1.0, (20, len(truth))) * np.sqrt(np.diag(fix.cov)):
         assert plain_cost(drawn, fix.x + 0.1 * shift) > fix.cost

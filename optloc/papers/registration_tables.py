@@ -120,7 +120,7 @@ class History:
     ambiguous : tuple of float
         Share of fixes that say that the data allow another place.
     silent : tuple of float
-        Share of fixes that are lost and say ok.
+        Share of fixes that are lost though nothing speaks against their place: that a run has no other is not proven.
     """
 
     setting: Setting
@@ -163,7 +163,8 @@ def run_history(
         fix = solve(setting.first(drawn, k))
         found.append(score(fix.x if setting.scenario.course is None else branch(fix, exact), exact, bound))
         ambiguous.append(float((fix.code == Status.AMBIGUOUS).mean()))
-        silent.append(float((found[-1].lost & (fix.code == Status.OK)).mean()))
+        sure = fix.answered & ~fix.has(Status.AMBIGUOUS, Status.UNBOUNDED, Status.MISFIT, Status.SEARCHED)
+        silent.append(float((found[-1].lost & sure).mean()))
         tick()
     return History(setting, tuple(epochs), bounds, wandered, tuple(found), tuple(ambiguous), tuple(silent))
 
@@ -285,7 +286,7 @@ def table_errors(name: str, histories: Mapping[str, History], printed: Mapping[s
             lines.append((environment, str(second), named, *lengths, lost, *map(percent, shares)))
     header = (
         "environment", "second", "printed", "recursion", "optloc", "bound",
-        "recursion lost", "optloc lost", "lost and ok", "ambiguous",
+        "recursion lost", "optloc lost", "lost unnoticed", "ambiguous",
     )  # fmt: skip
     return tabulate(name, header, lines)
 

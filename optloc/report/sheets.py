@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optloc.papers.report import Table
-from optloc.study.summary import PROVEN, clopper_pearson, noise_text, ranking, wilson
+from optloc.study.summary import PROVEN, by_status, clopper_pearson, noise_text, ranking, wilson
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -147,6 +147,22 @@ def success(cells: pd.DataFrame) -> Sheet:
     return _sheet("success", "Right answers", "Intervals are Wilson's.", table, columns, 3)
 
 
+def statuses(frame: pd.DataFrame) -> Sheet:
+    """Return what methods said of their answers, status by status, and how often a better point is known."""
+    columns: list[Column] = [
+        ("method", lambda r: str(r.method)),
+        ("status", lambda r: str(r.status)),
+        ("trials", lambda r: str(r.trials)),
+        ("right", lambda r: str(r.right)),
+        ("a lower cost is known", lambda r: _at_most(r.better, r.trials)),
+    ]
+    note = (
+        "Only ok says that nothing stands against a fix: where it does and a lower cost is known, it was wrong though "
+        "ok. The other statuses say what may be wrong; in brackets the greatest share that the count allows (95 %)."
+    )
+    return _sheet("statuses", "Statuses", note, by_status(frame), columns, 2)
+
+
 def accuracy(cells: pd.DataFrame) -> Sheet:
     """Return how near to the bound answers were, cell by cell."""
     names = "case noise noise_unit noise_label method rmse bound ratio ratio_half deviation_median deviation_p95 nees"
@@ -242,6 +258,7 @@ def sheets(frame: pd.DataFrame, rivals: pd.DataFrame, cells: pd.DataFrame, order
     """Yield all tables of judged rows, of those that are ranked, and of their cells, in reading order."""
     yield best_first(rivals, [name for name in order if name in set(rivals["method"])])
     yield success(cells)
+    yield statuses(frame)
     yield accuracy(cells)
     yield certificates(frame, order)
     yield timing(cells)

@@ -309,7 +309,7 @@ _SECTIONS = (
         "Right: the method claims an answer, and no lower cost is known for the same data. Bars are 95 % intervals.",
         partial(_of_cells, drawn.success),
         lines=False,
-        tables=("success",),
+        tables=("success", "statuses"),
     ),
     _Section(
         "accuracy",

@@ -58,11 +58,7 @@ def judged(frame: pd.DataFrame) -> pd.DataFrame:
     """
     import pandas as pd
 
-    cost, gap, truth = (frame[name].to_numpy(dtype=float) for name in ("cost", "gap", "cost_truth"))
-    # The truth is a point like any other: what costs more than it is not the minimum.
-    best = np.fmin(cost - gap, truth)
-    above = cost - best
-    slack = SLACK + _RELATIVE * np.abs(best)
+    above, slack = _above(frame)
     answered = frame["answered"].to_numpy(dtype=bool)
     with np.errstate(invalid="ignore"):
         # A row without a cost is not the best of anything: NaN counts as worse.
@@ -77,6 +73,14 @@ def judged(frame: pd.DataFrame) -> pd.DataFrame:
         false=better & (frame["proof"] == PROVEN).to_numpy(),
         case=pd.Categorical(labels, sorted(set(names.values()), key=_natural), ordered=True),
     )
+
+
+def _above(frame: pd.DataFrame) -> tuple[Array, Array]:
+    """Return the costs less the lowest known (n,), and how much of that is rounding (n,)."""
+    cost, gap, truth = (frame[name].to_numpy(dtype=float) for name in ("cost", "gap", "cost_truth"))
+    # The truth is a point like any other: what costs more than it is not the minimum.
+    best = np.fmin(cost - gap, truth)
+    return cost - best, SLACK + _RELATIVE * np.abs(best)
 
 
 def _natural(text: str) -> list[tuple[bool, float, str]]:
@@ -165,6 +169,33 @@ def _cell(part: pd.DataFrame) -> dict[str, Any]:
         "build": float(part["build"].max()),
         "iterations": float(part["iterations"].mean()),
     }
+
+
+def by_status(frame: pd.DataFrame) -> pd.DataFrame:
+    """Return how often each method gave each status, and how many of these fixes had a better point beside them.
+
+    Parameters
+    ----------
+    frame : DataFrame
+        Judged rows.
+
+    Returns
+    -------
+    DataFrame
+        One row for each method (in the order of `methods`) and status (`ok` first, then the most frequent first), with
+        the columns method and status and the counts trials, right, better (a better point is known) and wrong (that,
+        and the status is ok). Without a cost there is no point to compare: such trials are not right, and not better.
+    """
+    above, slack = _above(frame)
+    with np.errstate(invalid="ignore"):
+        made = frame.assign(better=above > slack, trials=1)
+    pairs = {"method": made["method"].astype(str), "status": made["status"].astype(str)}
+    table = made.assign(**pairs).groupby(["method", "status"], sort=False)[["trials", "right", "better", "wrong"]].sum()
+    table = table.astype(int).reset_index()
+    order = {name: i for i, name in enumerate(methods(frame))}
+    table = table.assign(_method=table["method"].map(order), _ok=table["status"] != "ok", _count=-table["trials"])
+    table = table.sort_values(["_method", "_ok", "_count", "status"], kind="stable", ignore_index=True)
+    return table.drop(columns=["_method", "_ok", "_count"])
 
 
 def accuracy_rows(part: pd.DataFrame) -> Array:

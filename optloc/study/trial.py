@@ -77,7 +77,7 @@ COLUMNS: tuple[Column, ...] = (
     Column("trial", "int", "", "Number of the trial, from 0."),
     Column("seed", "category", "", "Seed of the trial's block of data: study seed, data cell and block number."),
     Column("status", "category", "", "Label of the status, for instance ok; 'died' where the process died twice."),
-    Column("answered", "bool", "", "Whether the status claims an answer: ok, ambiguous or searched."),
+    Column("answered", "bool", "", "Whether the status has a position with a covariance, whatever stands against it."),
     Column("reason", "category", "", "Sentence that belongs to the status."),
     Column("located", "bool", "", "Whether there is a finite position at all, refined or not."),
     Column("outliers", "int", "", "Number of stations with a gross error."),

@@ -6,6 +6,7 @@ from importlib.resources import files as package_files
 import numpy as np
 import pytest
 from typer.testing import CliRunner
+from verdicts import alone
 
 from optloc import crlb, linearise, simulate, solve
 from optloc.cli import app
@@ -144,9 +145,9 @@ def test_both_places_of_a_moving_target_are_listed_and_a_spatial_array_has_one()
         apart = np.linalg.norm(np.concatenate([fix.x[:, None], fix.alternatives.x], 1)[..., :3] - place, axis=-1)
         assert (np.nanmin(apart, axis=1) < 3e3).all()
     flying = replace(SPATIAL, target=MOVING.target, course=MOVING.course)
-    alone = solve(Setting(flying, 10, 1, 1).draw(600))
-    assert (alone.code == 0).all()
-    assert not score(alone.x, truth(flying, problem(flying, 1)), bound(flying, 600)).lost.any()
+    single = solve(Setting(flying, 10, 1, 1).draw(600))
+    assert alone(single).all()
+    assert not score(single.x, truth(flying, problem(flying, 1)), bound(flying, 600)).lost.any()
 
 
 @pytest.mark.parametrize("scenario", [PRINTED, MOVING, SPATIAL])
@@ -219,7 +220,7 @@ def test_the_shipped_problem_is_made_by_its_script_and_solved():
     for name, text in registration.files().items():
         assert (folder / name).read_text(encoding="utf-8") == text, f"write {name} anew"
     loaded = read(folder / "registration.toml")
-    fix = solve(loaded.problem).require()
+    fix = solve(loaded.problem).require(allow=("unproven",))
     assert np.abs(fix.position - SPATIAL.target).max() < 4.0 * fix.sigma().max()
     late = 0.299792458 * np.array(registration.DELAYS)
     assert (np.abs(fix.take("clock") - late) < 4.0 * fix.sigma("clock")).all()

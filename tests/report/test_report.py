@@ -85,6 +85,10 @@ def test_tables_hold_the_numbers_of_the_study(site, made):
         ]  # fmt: skip
         assert int(row["trials"]) == len(part) == 20
         assert int(row["answered"]) == part["answered"].sum()
+    with (site / "report" / "tables" / "statuses.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    told = frame.groupby(["method", "status"], observed=True).size()
+    assert {(row["method"], row["status"]): int(row["trials"]) for row in rows} == told.to_dict()
     with (site / "report" / "tables" / "accuracy.csv").open(encoding="utf-8") as file:
         row = next(r for r in csv.DictReader(file) if r["method"] == "gtrs+lsr" and r["noise_label"] == "4.0")
     part = frame[(frame["scenario"] == "our site") & (frame["method"] == "gtrs+lsr") & (frame["noise_label"] == "4.0")]
@@ -101,7 +105,7 @@ def test_every_figure_is_there_twice_and_every_table_too(site, made):
         assert (folder / "figures" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
         assert ET.parse(folder / "figures" / f"{name}.svg").getroot().tag.endswith("svg")
     assert {p.stem for p in (folder / "tables").iterdir()} == {
-        "ranking", "success", "accuracy", "certificates", "timing", "machine"
+        "ranking", "success", "statuses", "accuracy", "certificates", "timing", "machine"
     }  # fmt: skip
 
 

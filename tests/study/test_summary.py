@@ -4,7 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from optloc.study.summary import case_label, cells, instances, judged, methods, noise_text, ranking
+from optloc.base.types import ANSWERED
+from optloc.study.summary import by_status, case_label, cells, instances, judged, methods, noise_text, ranking
 
 COMMON = {
     "noise": 10.0, "noise_unit": "m", "noise_label": "10 m", "rows": 5, "dimension": 3, "crlb": 2.0, "deviation": 1.0,
@@ -16,7 +17,7 @@ def row(method, trial, cost, **more):
     made = {"method": method, "trial": trial, "cost": cost, "status": "ok", "proof": "local", "seconds": 1e-3}
     made |= {"scenario": "s", "sweep": '{"layout.stations": 8}', "data": "d", "cost_truth": 9.0, "error": 2.0}
     made |= COMMON | more
-    made["answered"] = made["status"] in {"ok", "ambiguous", "searched"}
+    made["answered"] = made["status"] in {one.label for one in ANSWERED}
     made["located"] = np.isfinite(made["cost"])
     return made
 
@@ -53,6 +54,22 @@ def test_cells_count_and_average(frame):
     assert table.loc["a", ["trials", "answered", "right", "wrong", "proven", "false"]].tolist() == [4, 3, 2, 1, 2, 1]
     assert table.loc["b", ["trials", "answered", "right", "wrong", "proven", "false"]].tolist() == [4, 4, 2, 1, 1, 1]
     assert table.loc["a", ["rmse", "bound", "ratio", "nees"]].tolist() == [2.0, 2.0, 1.0, 1.0]
+
+
+def test_counts_by_status_say_where_a_better_point_is_known(frame):
+    names = ["method", "status", "trials", "right", "better", "wrong"]
+    assert by_status(frame)[names].to_numpy().tolist() == [
+        ["a", "ok", 3, 2, 1, 1],
+        ["a", "singular geometry", 1, 0, 0, 0],  # without a cost nothing is better
+        ["b", "ok", 3, 2, 1, 1],
+        ["b", "ambiguous", 1, 0, 1, 0],  # a better point is known, and the status says that there may be one
+    ]
+    # all fixes are counted once, and what was wrong though ok is that of the other tables
+    made = frame.assign(status=np.where(frame["status"] == "ok", "unproven", frame["status"]))
+    table = by_status(judged(made.drop(columns=["above", "right", "wrong", "false", "case"])))
+    assert table["trials"].sum() == len(frame)
+    assert table["wrong"].sum() == 0
+    assert table["better"].sum() == by_status(frame)["better"].sum() == 3
 
 
 def test_a_method_that_claims_nothing_is_judged_by_its_positions():
