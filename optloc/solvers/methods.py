@@ -249,7 +249,7 @@ def _run_through(method: Method, problem: Problem, given: Pool | None) -> Pool:
     # a shortcut takes no starts
     first, *others = method.runs(problem.batch_shape[0]) if given is None else [SOLVERS[w].run for w in method.words]
     pool = first(problem, given)
-    if given is not None and not pool.refined:
+    if given is not None and pool.curvature is None:
         # what is given competes with the starts that a stage makes
         pool = _beside(problem, pool, given.x)
     for stage in others:
