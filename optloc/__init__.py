@@ -20,6 +20,7 @@ from optloc.models import MODELS, Model
 from optloc.problem import epochs, noise
 from optloc.problem.bias import with_bias, with_known_bias
 from optloc.problem.build import assemble, measured, station_array
+from optloc.problem.chart import Chart
 from optloc.problem.epochs import by_epoch
 from optloc.problem.fix import Alternatives, Explanation, Fix, Stage, Suspect
 from optloc.problem.layout import Layout
@@ -46,9 +47,12 @@ __all__ = [
     "METHODS",
     "MODELS",
     "SOLVERS",
+    "Accuracy",
     "Alternatives",
+    "Arc",
     "Bias",
     "Certificate",
+    "Chart",
     "Course",
     "Emitters",
     "Explanation",
@@ -60,6 +64,7 @@ __all__ = [
     "Layout",
     "Linear",
     "Loss",
+    "Mixture",
     "Model",
     "Motion",
     "NoSolution",
@@ -71,12 +76,15 @@ __all__ = [
     "Prepared",
     "Prior",
     "Problem",
+    "Region",
     "Rows",
     "Running",
+    "Samples",
     "Stage",
     "Stations",
     "Status",
     "Suspect",
+    "accuracy",
     "assemble",
     "by_epoch",
     "certify",
@@ -88,9 +96,11 @@ __all__ = [
     "from_table",
     "gauss_newton",
     "health",
+    "likelihood_region",
     "linearise",
     "load",
     "measured",
+    "mixture",
     "noise",
     "noise_levels",
     "normal",
@@ -99,11 +109,13 @@ __all__ = [
     "prepare",
     "reduce",
     "rejected",
+    "samples",
     "separate",
     "simulate",
     "solve",
     "station_array",
     "suspects",
+    "trace_arc",
     "units",
     "with_bias",
     "with_estimated_noise",
@@ -112,7 +124,23 @@ __all__ = [
 ]
 
 
+_UNCERTAINTY = {
+    "Accuracy": "radii",
+    "Arc": "arc",
+    "Mixture": "mixture",
+    "Region": "region",
+    "Samples": "posterior",
+    "accuracy": "radii",
+    "likelihood_region": "region",
+    "mixture": "mixture",
+    "samples": "posterior",
+    "trace_arc": "arc",
+}
+
+
 def __getattr__(name: str) -> Any:
+    if name in _UNCERTAINTY:
+        return getattr(import_module(f"optloc.uncertainty.{_UNCERTAINTY[name]}"), name)
     if name in ("load", "from_table"):
         from optloc import files  # pandas is loaded when a file or a table is read
 

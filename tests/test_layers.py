@@ -18,6 +18,7 @@ LAYERS = (
     "linear",
     "compute datasets",
     "proof bounds adequacy",
+    "uncertainty",
     "solvers",
     "track quality",
     "files papers several plot plugins",

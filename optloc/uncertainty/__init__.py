@@ -1,0 +1,1 @@
+"""What the data say beyond a covariance: regions, arcs, samples, mixtures and the radii of data sheets."""

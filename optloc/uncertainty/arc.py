@@ -1,0 +1,285 @@
+"""The valley of a curved likelihood: a curve along which the data tell little, traced from the fix both ways.
+
+Ranges from stations on a line leave a circle around it, ranges from a plane an arc through the fix and its mirror
+image. Along such a curve no Gaussian covers; across it one does.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from optloc.adequacy.shape import cost_at_infinity
+from optloc.base.types import Array
+from optloc.problem.chart import CARTESIAN, basis, jacobian
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
+from optloc.uncertainty.proposal import student
+from optloc.uncertainty.surface import Surface
+
+# Corrections across the curve, in its standard deviations, below which the next step is longer and above which it is
+# tried again; a step that changes the cost by more is tried again too: a circle takes 300 nodes, an arc 40.
+_EASY, _HARD, _JUMP = 1.5, 4.0, 1.5
+_LONGER, _SHORTER = 1.5, 0.5
+# Cost above the fix's at which a curve ends: a share of 4e-6 of the density is left.
+_END = 25.0
+# First step in standard deviations along the curve, nodes each way at most, and corrections of a node.
+_FIRST, _NODES, _CORRECTIONS = 0.2, 400, 3
+# A node is good where the last correction was so small, standard deviations.
+_SETTLED = 0.05
+# Steps shorter than this share of the first do not go on: the curve has an end or a branch.
+_TINY = 1e-6
+# How much wider than the curve samples are spread across it: chords leave the curve by a standard deviation.
+_WIDER = 1.3
+# Nearest to infinity that a node may come in the inverse-range chart.
+_LEAST_W = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class Arc:
+    """A curve of least cost through a fix.
+
+    Parameters
+    ----------
+    surface : Surface
+        The cost, and the fix.
+    far : bool
+        Whether it is traced in the inverse-range chart, because the data do not exclude infinity; else in metres.
+    node : array (m, d)
+        Points along it, metres, or chart coordinates p and w.
+    cost : array (m,)
+        Their costs.
+    across : array (m, d, d - 1)
+        Standard deviations across the curve, in columns, in the coordinates of the nodes.
+    closed : bool
+        Whether the last node is the first one again.
+    """
+
+    surface: Surface
+    far: bool
+    node: Array
+    cost: Array
+    across: Array
+    closed: bool
+
+    @property
+    def position(self) -> Array:
+        """Return the nodes as positions (m, d), metres."""
+        return self._to_position(self.node)
+
+    @property
+    def mass(self) -> Array:
+        """Return the share (m - 1,) of the probability that lies between each two nodes, for an even prior."""
+        density = self._density()
+        mass = self._lengths() * 0.5 * (density[1:] + density[:-1])
+        return np.asarray(mass / mass.sum())
+
+    def locate(self, points: Array) -> tuple[Array, Array]:
+        """Return where points lie along the curve and how far beside it.
+
+        Parameters
+        ----------
+        points : array (q, d)
+            Metres.
+
+        Returns
+        -------
+        share : array (q,)
+            Share of the probability before each along the curve: 0.025 to 0.975 holds 95 %.
+        beside : array (q,)
+            Distance across the curve, standard deviations.
+        """
+        z = self.surface.chart.to_chart(points) if self.far else np.asarray(points)
+        start, chord = self.node[:-1], np.diff(self.node, axis=0)
+        length = np.maximum((chord**2).sum(-1), np.finfo(float).tiny)
+        at = np.clip(((z[:, None] - start) * chord).sum(-1) / length, 0.0, 1.0)
+        apart = z[:, None] - start - at[..., None] * chord
+        nearest = (apart**2).sum(-1).argmin(1)
+        own = np.arange(len(z))
+        before = np.append(0.0, np.cumsum(self.mass))
+        share = before[nearest] + at[own, nearest] * self.mass[nearest]
+        beside = np.linalg.pinv(self.across[nearest]) @ apart[own, nearest][..., None]
+        return share, np.sqrt((beside[..., 0] ** 2).sum(-1))
+
+    def draw(self, n: int, seed: int) -> tuple[Array, Array, Array]:
+        """Return samples from along the curve.
+
+        Parameters
+        ----------
+        n : int
+            How many.
+        seed : int
+            Decides the draw.
+
+        Returns
+        -------
+        position : array (n, d)
+            Metres.
+        log_weight : array (n,)
+            Logarithms of their weights but for a constant, for an even prior in the coordinates of the nodes.
+        share : array (n,)
+            Where along the curve they were drawn, see `locate`.
+        """
+        mass, d = self.mass, self.node.shape[-1]
+        spaced, wide, density = student(d - 1, n, seed)
+        before = np.append(0.0, np.cumsum(mass))
+        piece = np.searchsorted(before[1:-1], spaced, side="right")
+        at = np.clip((spaced - before[piece]) / np.where(mass[piece] > 0.0, mass[piece], 1.0), 0.0, 1.0)
+        along = self.node[piece] + at[:, None] * np.diff(self.node, axis=0)[piece]
+        z = along + _WIDER * (self.across[piece] @ wide[..., None])[..., 0]
+        with np.errstate(divide="ignore"):
+            density = density + np.log(mass[piece] / self._lengths()[piece]) - self._log_width()[piece]
+        good = z[:, -1] > _LEAST_W if self.far else np.ones(n, dtype=bool)
+        position = self._to_position(np.where(good[:, None], z, along))
+        cost = self.surface.cost(position)
+        return position, np.where(good, -0.5 * (cost - self.surface.least) - density, -np.inf), spaced
+
+    def _to_position(self, z: Array) -> Array:
+        return self.surface.chart.to_position(z) if self.far else z
+
+    def _lengths(self) -> Array:
+        return np.asarray(np.sqrt((np.diff(self.node, axis=0) ** 2).sum(-1)))
+
+    def _log_width(self) -> Array:
+        """Return the logarithm of the volume (m,) of one standard deviation across the curve."""
+        gram = np.swapaxes(self.across, -1, -2) @ self.across
+        return np.asarray(0.5 * np.linalg.slogdet(gram)[1])
+
+    def _density(self) -> Array:
+        """Return the density (m,) along the curve: Laplace's integral of the likelihood across it."""
+        return np.asarray(np.exp(-0.5 * (self.cost - self.surface.least) + self._log_width()))
+
+
+def trace_arc(problem: Problem, fix: Fix) -> Arc:
+    """Return the curve along which the data allow a fix to move, traced both ways.
+
+    Parameters
+    ----------
+    problem : Problem
+        The problem of the fix: one static position.
+    fix : Fix
+        A single fix.
+
+    Notes
+    -----
+    Steps along the axis of least information, corrected by Gauss-Newton across it, until the cost is 25 above that of
+    the fix or the curve comes back.
+    """
+    return trace_from(Surface.of(problem, fix))
+
+
+def trace_from(surface: Surface) -> Arc:
+    """Return the curve through the fix of a surface, see `trace_arc`."""
+    endless = cost_at_infinity(surface.problem, surface.x)[0] <= surface.least + _END
+    far = bool(endless and surface.kind != CARTESIAN and surface.chart.distance > 0.0)
+    valley = _Valley(surface, far)
+    start, first = valley.start()
+    one, closed = valley.walk(start, first)
+    nodes = one
+    if not closed:
+        other, closed = valley.walk(start, -first)
+        nodes = other[:0:-1] + one
+    if closed:
+        # It is cut where it is least likely, so that shares count from there.
+        least = int(np.argmax([node.cost for node in nodes]))
+        nodes = nodes[least:] + nodes[:least]
+        nodes.append(nodes[0])
+    return Arc(
+        surface,
+        far,
+        np.array([node.z for node in nodes]),
+        np.array([node.cost for node in nodes]),
+        np.array([node.across for node in nodes]),
+        closed,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Node:
+    """A point of the curve: coordinates, cost, direction (d,), and standard deviations across it (d, d - 1)."""
+
+    z: Array
+    cost: float
+    along: Array
+    across: Array
+
+
+@dataclass(frozen=True, slots=True)
+class _Valley:
+    """The cost in the coordinates in which a curve is traced."""
+
+    surface: Surface
+    far: bool
+
+    def look(self, z: Array) -> tuple[float, Array, Array]:
+        """Return cost, information (d, d) and vector (d,) at coordinates (d,)."""
+        if not self.far:
+            cost, information, vector = self.surface.look(z)
+            return float(cost), information, vector
+        chart = self.surface.chart
+        cost, information, vector = self.surface.look(chart.to_position(z))
+        G = jacobian(z, chart.position, chart.centre)
+        return float(cost), G.T @ information @ G, G.T @ vector
+
+    def start(self) -> tuple[_Node, Array]:
+        """Return the fix as a node, and the first step (d,)."""
+        z = self.surface.chart.mean if self.far else self.surface.position
+        cost, information, _ = self.look(z)
+        values, vectors = np.linalg.eigh(information)
+        node = self._node(z, cost, information, vectors[:, 0])
+        size = _FIRST / np.sqrt(max(values[0], 1e-12 * values[-1]))
+        return node, size * vectors[:, 0]
+
+    def walk(self, start: _Node, first: Array) -> tuple[list[_Node], bool]:
+        """Return the nodes one way, the fix first, and whether the curve has come back to it."""
+        size = least = float(np.sqrt((first**2).sum()))
+        least *= _TINY
+        nodes, along = [start], first / size
+        while len(nodes) < _NODES and size > least:
+            here = nodes[-1]
+            found, moved = self._settle(here.z + size * along, along)
+            if found is None or moved > _HARD or abs(found.cost - here.cost) > _JUMP:
+                size *= _SHORTER
+                continue
+            if len(nodes) > 3 and self._passes(start, here, found):
+                return nodes, True
+            nodes.append(found)
+            if found.cost > self.surface.least + _END:
+                break
+            along = found.along
+            size *= _LONGER if moved < _EASY else 1.0
+        return nodes, False
+
+    def _settle(self, z: Array, along: Array) -> tuple[_Node | None, float]:
+        """Return the node next to coordinates, and by how many standard deviations it lay beside them."""
+        moved = 0.0
+        for number in range(_CORRECTIONS + 1):
+            if self.far and not z[-1] > _LEAST_W:
+                return None, np.inf
+            cost, information, vector = self.look(z)
+            if not (np.isfinite(cost) and np.isfinite(information).all()):
+                return None, np.inf
+            weakest = np.linalg.eigh(information)[1][:, 0]
+            along = weakest if weakest @ along > 0.0 else -weakest
+            node = self._node(z, cost, information, along)
+            step = node.across.T @ vector
+            size = float(np.sqrt((step**2).sum()))
+            moved = size if number == 0 else moved
+            if size < _SETTLED or number == _CORRECTIONS:
+                return node, moved
+            z = z + node.across @ step
+        return None, np.inf
+
+    def _node(self, z: Array, cost: float, information: Array, along: Array) -> _Node:
+        sides = basis(along)
+        values, vectors = np.linalg.eigh(sides.T @ information @ sides)
+        root = vectors / np.sqrt(np.maximum(values, np.finfo(float).tiny))
+        return _Node(z, cost, along, sides @ root)
+
+    def _passes(self, start: _Node, here: _Node, there: _Node) -> bool:
+        """Return whether the chord between two nodes passes the first one."""
+        chord, away = there.z - here.z, start.z - here.z
+        share = (away @ chord) / max(chord @ chord, np.finfo(float).tiny)
+        beside = np.linalg.pinv(there.across) @ (away - share * chord)
+        return bool(0.0 < share <= 1.0 and np.sqrt((beside**2).sum()) < _HARD)

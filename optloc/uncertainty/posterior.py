@@ -1,0 +1,192 @@
+"""Samples of where the target may be, given the data: where a fix is Gaussian in its chart, and along arcs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array
+from optloc.problem.chart import CURVED, INVERSE_RANGE
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
+from optloc.uncertainty.arc import Arc, trace_from
+from optloc.uncertainty.proposal import student
+from optloc.uncertainty.surface import Surface
+
+Belief = Literal["jeffreys", "flat"]
+
+# By how much wider than the fix's own ellipsoid the proposal is: 0.8 of the samples are effective then (median).
+_WIDER = 1.1
+# Share of the samples below which their effective number is too small to trust a mean: at a tenth, one in ten counts.
+_POOR = 0.1
+# Nearest to infinity that a sample may come in the inverse-range chart: a rounding of w.
+_LEAST_W = 1e-12
+
+
+@dataclass(frozen=True, slots=True)
+class Samples:
+    """Weighted samples of a position.
+
+    Parameters
+    ----------
+    position : array (n, d)
+        Metres.
+    weight : array (n,)
+        They sum to one.
+    prior : str
+        What was believed before the data: "jeffreys", "flat", or "arc": even along an arc.
+    within : float, optional
+        Radius of the ball around the stations' middle that holds all of them, metres.
+    bounded : bool
+        Whether moments exist: not where infinity has density.
+    reason : str
+        What is wrong with the samples, in a sentence; empty where nothing is.
+    """
+
+    position: Array
+    weight: Array
+    prior: str
+    within: float | None
+    bounded: bool
+    reason: str = ""
+
+    @property
+    def effective(self) -> float:
+        """Return how many samples of equal weight would say as much: one over the sum of squared weights."""
+        return float(1.0 / (self.weight**2).sum())
+
+    @property
+    def mean(self) -> Array:
+        """Return the mean (d,), metres; it needs `within` where infinity has density."""
+        self._demand("mean")
+        return np.asarray(self.weight @ self.position)
+
+    @property
+    def covariance(self) -> Array:
+        """Return the covariance (d, d), square metres; it needs `within` where infinity has density."""
+        self._demand("covariance")
+        return moments(self.position, self.weight)[1]
+
+    def drawn(self, n: int, seed: int) -> Array:
+        """Return n positions (n, d) of equal weight: systematic resampling.
+
+        References
+        ----------
+        G. Kitagawa, "Monte Carlo filter and smoother for non-Gaussian nonlinear state space models" (1996).
+        """
+        place = (np.random.default_rng(seed).random() + np.arange(n)) / n
+        chosen = np.searchsorted(np.cumsum(self.weight), place).clip(max=len(self.weight) - 1)
+        return np.asarray(self.position[chosen])
+
+    def _demand(self, what: str) -> None:
+        if not self.bounded:
+            raise InvalidProblem(
+                f"infinity has density, and the {what} in metres does not exist",
+                "samples",
+                "ask for them `within` a ball",
+            )
+
+
+def moments(position: Array, weight: Array) -> tuple[Array, Array]:
+    """Return mean (d,) and covariance (d, d) of weighted positions (n, d)."""
+    share = weight / weight.sum()
+    mean = share @ position
+    apart = position - mean
+    return mean, np.asarray((apart * share[:, None]).T @ apart)
+
+
+def samples(
+    problem: Problem, fix: Fix, n: int = 1024, seed: int = 0, *, prior: Belief = "jeffreys", within: float | None = None
+) -> Samples:
+    """Return weighted samples of the position that the data allow around a fix.
+
+    Parameters
+    ----------
+    problem : Problem
+        The problem of the fix: one static position.
+    fix : Fix
+        A single fix; its alternatives are left out, see `optloc.mixture`.
+    n : int
+        How many samples; powers of two are spread most evenly.
+    seed : int
+        Decides the draw.
+    prior : "jeffreys" or "flat"
+        What is believed before the data. Jeffreys' prior, the root of the determinant of the information, does not
+        depend on the coordinates and is proper at infinity. A flat one is not, where the cost stays finite at infinity:
+        it needs `within`. Where the fix is curved in all coordinates the prior is even along its arc.
+    within : float, optional
+        Radius of a ball around the stations' middle to which the position is limited, metres.
+
+    Notes
+    -----
+    Importance sampling from a Student distribution by Sobol points: where the fix is Gaussian in metres or in the
+    inverse-range chart, in these coordinates; the weights make it exact.
+
+    References
+    ----------
+    H. Jeffreys, "An invariant form for the prior probability in estimation problems" (1946).
+    """
+    if prior not in ("jeffreys", "flat"):
+        raise InvalidProblem(f"there is no prior {prior!r}", "prior", "known are 'jeffreys', 'flat'")
+    if prior == "flat" and within is None:
+        raise InvalidProblem(
+            "a flat prior has no end, and the samples hang on where it is cut", "prior", "say `within` how many metres"
+        )
+    surface = Surface.of(problem, fix)
+    if surface.kind == CURVED:
+        return along(trace_from(surface), n, seed, within)
+    return around(surface, n, seed, prior, within)
+
+
+def around(surface: Surface, n: int, seed: int, prior: str = "jeffreys", within: float | None = None) -> Samples:
+    """Return samples of a fix that is Gaussian in metres or in the inverse-range chart; arguments as of `samples`."""
+    chart, inverse = surface.chart, surface.kind == INVERSE_RANGE
+    start, spread = (chart.mean, chart.spread) if inverse else (chart.position, chart.covariance)
+    _, points, log_proposal = student(len(start), n, seed)
+    scale = np.sqrt(np.diagonal(spread))
+    y = start + _WIDER * scale * (points @ np.linalg.cholesky(spread / np.outer(scale, scale)).T)
+    good = y[:, -1] > _LEAST_W if inverse else np.ones(n, dtype=bool)
+    y = np.where(good[:, None], y, start)
+    position = chart.to_position(y) if inverse else y
+    cost, information, _ = surface.look(position)
+    log_weight = -0.5 * (cost - surface.least) - log_proposal
+    log_weight += chart.log_volume(y) if inverse else 0.0
+    if prior == "jeffreys":
+        log_weight += 0.5 * np.linalg.slogdet(_scaled(information, position, chart.centre, inverse))[1]
+        log_weight -= (len(start) * np.log(np.sqrt(((position - chart.centre) ** 2).sum(-1)))) if inverse else 0.0
+    if within is not None:
+        good &= ((position - chart.centre) ** 2).sum(-1) <= within**2
+    return weighed(position, np.where(good, log_weight, -np.inf), prior, within, not inverse or within is not None)
+
+
+def _scaled(information: Array, position: Array, centre: Array, inverse: bool) -> Array:
+    """Return information per squared distance from the centre: far away that of metres is nothing but rounding."""
+    if not inverse:
+        return information
+    return np.asarray(information * ((position - centre) ** 2).sum(-1)[:, None, None])
+
+
+def along(arc: Arc, n: int, seed: int, within: float | None = None) -> Samples:
+    """Return samples along an arc, see `optloc.uncertainty.arc.Arc.draw`."""
+    position, log_weight, _ = arc.draw(n, seed)
+    if within is not None:
+        away = ((position - arc.surface.chart.centre) ** 2).sum(-1)
+        log_weight = np.where(away <= within**2, log_weight, -np.inf)
+    return weighed(position, log_weight, "arc", within, not arc.far or within is not None)
+
+
+def weighed(position: Array, log_weight: Array, prior: str, within: float | None, bounded: bool) -> Samples:
+    """Return samples with normalised weights, and what is wrong with them."""
+    kept = log_weight > -np.inf
+    if not kept.any():
+        raise InvalidProblem("no sample is within the ball", "within", "the fix lies outside: take a larger one")
+    weight = np.exp(log_weight[kept] - log_weight[kept].max())
+    weight /= weight.sum()
+    found = Samples(position[kept], weight, prior, within, bounded)
+    if found.effective >= _POOR * len(position):
+        return found
+    says = f"{len(position)} samples are worth {found.effective:.0f}: they are drawn where the data hardly allow it"
+    return Samples(found.position, weight, prior, within, bounded, says)

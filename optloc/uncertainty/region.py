@@ -1,0 +1,315 @@
+"""The likelihood region of a fix: all positions whose cost is near enough to its own, as bent and open as they are."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+
+from optloc.adequacy.shape import cost_at_infinity
+from optloc.base.types import Array
+from optloc.compute.jit import enabled
+from optloc.problem.chart import CARTESIAN, INVERSE_RANGE, Chart, quantile
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
+from optloc.proof.chart import Chart as Axes
+from optloc.proof.chart import Cost, cost_of, empty_box
+from optloc.proof.cover import cost_of_point, cover_everywhere, cover_near, room
+from optloc.proof.everywhere import reaches_infinity
+from optloc.proof.pose import pose_costs, unsupported
+from optloc.uncertainty.surface import Surface
+
+# Boxes of a cover at most, by dimension: the hull of an ellipse is then 2 % wider than the ellipse, that of an
+# ellipsoid 10 %, after some 20 and 100 ms. Plain Python takes a thousand times longer for each.
+_MOST, _MOST_PLAIN = {2: 1000, 3: 8000}, 100
+# Share by which the level of a cover is higher, for the rounding of two ways to compute the cost of a fix.
+_EQUAL = 1e-9
+# Share of a cell by which it is taken larger where points are looked up, for the rounding of its inverse.
+_ROUNDED = 1e-7
+NOWHERE = "nothing encloses the positions of a cost this low"
+TURNS = "angles may be a whole turn off with their biases at costs within the region"
+
+
+@dataclass(frozen=True, slots=True)
+class Cells:
+    """Convex cells that together hold a region, some perhaps out to infinity.
+
+    Parameters
+    ----------
+    base : array (d,)
+        A position, metres.
+    edges : array (n, 1 + d, 1 + d)
+        Of each cell its middle, then half of each edge, in homogeneous coordinates: (P, v) is the position
+        ``base + P / v``. The cell is the middle plus the edges times numbers between -1 and 1.
+    inside : int
+        How many of them, the first ones, lie wholly inside the region.
+    """
+
+    base: Array
+    edges: Array
+    inside: int
+
+    @property
+    def corners(self) -> Array:
+        """Return the corners (n, 2^d, d) of the cells, metres; coordinates are infinite where a cell has no end."""
+        return self._finite(self._homogeneous())
+
+    @property
+    def directions(self) -> Array:
+        """Return the corners of the cells as the directions (n, 2^d, d) of points ever farther along their rays."""
+        found = self._homogeneous()[..., :-1]
+        return np.asarray(found / np.sqrt((found**2).sum(-1, keepdims=True)))
+
+    def hold(self, points: Array) -> Array:
+        """Return whether points (q, d), metres, lie in a cell, (q,)."""
+        from_point = np.linalg.inv(np.swapaxes(self.edges, -1, -2))
+        out = np.zeros(len(points), dtype=bool)
+        for i, point in enumerate(np.append(points - self.base, np.ones((len(points), 1)), axis=1)):
+            share = from_point @ point
+            size = np.abs(share[:, 1:]).max(-1) if len(share) else np.zeros(0)
+            out[i] = ((share[:, 0] > 0.0) & (size <= (1.0 + _ROUNDED) * share[:, 0])).any()
+        return out
+
+    def _homogeneous(self) -> Array:
+        d = len(self.base)
+        signs = np.array([(1.0, *corner) for corner in product((-1.0, 1.0), repeat=d)])
+        return np.asarray(signs @ self.edges)
+
+    def _finite(self, corners: Array) -> Array:
+        scale = corners[..., -1:]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            apart = np.where(corners[..., :-1] == 0.0, 0.0, corners[..., :-1] / np.maximum(scale, 0.0))
+        return np.asarray(self.base + apart)
+
+
+@dataclass(frozen=True, slots=True)
+class Region:
+    """All positions whose cost exceeds that of a fix by at most a quantile of chi-square.
+
+    Parameters
+    ----------
+    level : float
+        Probability that it contains the target.
+    surface : Surface
+        The cost over the position, and the fix.
+    threshold : float
+        Highest cost inside.
+    points : array (k, d)
+        Where rays from the fix leave it first, metres: along the principal axes and between them, in the coordinates
+        in which the fix is Gaussian; in the plane one after the other around the fix. NaN where a ray never leaves it.
+    cells : Cells, optional
+        Cells that hold it, whatever its shape and however many parts it has; certified by the bounds of the proof.
+    open : bool
+        Whether it has no end: infinity is as likely. What is known then is a direction (`cone`) and a least range.
+    reason : str
+        Why there are no cells; empty where there are some.
+
+    Notes
+    -----
+    It is that of the measurements and priors alone: inequalities cut it further.
+    """
+
+    level: float
+    surface: Surface
+    threshold: float
+    points: Array
+    cells: Cells | None
+    open: bool
+    reason: str = ""
+
+    def covers(self, points: Array) -> Array:
+        """Return whether positions (..., d), metres, are in the region, (...)."""
+        return np.asarray(self.surface.cost(np.asarray(points, dtype=float)) <= self.threshold)
+
+    @property
+    def box(self) -> tuple[Array, Array] | None:
+        """Return the least and greatest coordinates (d,) of a box that is certain to hold the region, or None."""
+        if self.cells is None:
+            return None
+        corners = self.cells.corners.reshape(-1, len(self.cells.base))
+        return corners.min(0), corners.max(0)
+
+    @property
+    def cone(self) -> tuple[Array, float] | None:
+        """Return axis (d,) and half-angle of a cone from the stations' middle that holds the region.
+
+        The angle is pi where the region surrounds the middle; None without cells.
+        """
+        if self.cells is None:
+            return None
+        away = self._seen_from_middle()
+        axis = self.surface.chart.direction
+        if self.cells.hold(self.surface.chart.centre[None])[0]:
+            return axis, float(np.pi)
+        mean = away.reshape(-1, len(axis)).mean(0)
+        axis = mean / np.sqrt((mean**2).sum()) if (mean**2).sum() > 0.0 else axis
+        half = float(np.arccos(np.clip((away @ axis).min(), -1.0, 1.0)))
+        # Beyond a right angle the corners of a convex cell no longer say how far it reaches.
+        return axis, half if half < 0.5 * np.pi else float(np.pi)
+
+    @property
+    def least_range(self) -> float:
+        """Return a distance from the stations' middle, metres, nearer than which no point is; 0 without cells."""
+        if self.cells is None:
+            return 0.0
+        # Of a convex cell no point is nearer than its corners are along the direction of its middle.
+        middle = self.cells.edges[:, 0]
+        away = self.cells.base - self.surface.chart.centre + middle[:, :-1] / middle[:, -1:]
+        size = np.sqrt((away**2).sum(-1, keepdims=True))
+        toward = away / np.where(size > 0.0, size, 1.0)
+        with np.errstate(invalid="ignore"):
+            along = ((self.cells.corners - self.surface.chart.centre) * toward[:, None]).sum(-1)
+        # A corner at infinity lies ahead of the middle, or is left to the others.
+        return max(0.0, float(np.where(np.isfinite(along), along, np.inf).min()))
+
+    def _seen_from_middle(self) -> Array:
+        """Return the directions (n, 2^d, d) of the corners of all cells from the stations' middle."""
+        assert self.cells is not None
+        away = self.cells.corners - self.surface.chart.centre
+        away = np.where(np.isfinite(away).all(-1, keepdims=True), away, self.cells.directions)
+        return np.asarray(away / np.sqrt((away**2).sum(-1, keepdims=True)))
+
+
+def likelihood_region(problem: Problem, fix: Fix, level: float = 0.95, *, boxes: int | None = None) -> Region:
+    """Return the region of positions that the data do not exclude at a level.
+
+    Parameters
+    ----------
+    problem : Problem
+        The problem of the fix: one static position.
+    fix : Fix
+        A single fix.
+    level : float
+        Probability that the region contains the target.
+    boxes : int, optional
+        How many cells may be used to hold it; more are finer. By default 1 000 in the plane and 8 000 in space.
+
+    Notes
+    -----
+    ``{x: f(x) <= f(fix) + q}``, q the quantile of chi-square with as many degrees of freedom as coordinates: the
+    likelihood-ratio region (S. S. Wilks, 1938). It covers as promised where no Gaussian does, because curvature of the
+    coordinates does not change it.
+    """
+    surface = Surface.of(problem, fix)
+    threshold = surface.least + quantile(level, len(surface.position))
+    points = boundary(surface, threshold)
+    cells, reaches, reason = _cover(surface, threshold, boxes)
+    endless = reaches or bool(cost_at_infinity(surface.problem, surface.x)[0] <= threshold)
+    return Region(level, surface, threshold, points, cells, endless, reason)
+
+
+# The outside: certified cells.
+
+
+def _cover(surface: Surface, threshold: float, boxes: int | None) -> tuple[Cells | None, bool, str]:
+    """Return cells that hold the region, whether they found it open, or why there are none."""
+    why = unsupported(surface.problem)
+    if why:
+        return None, False, why
+    pose = pose_costs(surface.problem)
+    cost, x = _present(pose.kinds, pose.data[0], pose.K[0], pose.w[0]), np.array(surface.position)
+    box, d = empty_box(cost.K.shape[0], cost.K.shape[1]), len(x)
+    level = cost_of_point(cost, box, x) + threshold - surface.least
+    level += _EQUAL * (1.0 + level)
+    if pose.level[0] < level:
+        return None, False, TURNS
+    most = boxes or (_MOST[d] if enabled() else _MOST_PLAIN)
+    lists, endless = room(most), bool(reaches_infinity(cost.kinds, cost.K))
+    if endless and surface.kind != CARTESIAN:
+        return _far_cells(cost, x, level, most, lists)
+    axes = Axes(np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3)))
+    count, inside, _ = cover_near(cost, box, x, level, most, lists, axes)
+    if count >= 0:
+        return _near_cells(lists[2, :count], axes, d, inside), False, ""
+    return _far_cells(cost, x, level, most, lists) if endless else (None, False, NOWHERE)
+
+
+def _present(kinds: Array, data: Array, K: Array, w: Array) -> Cost:
+    """Return the cost without nodes that no row has: the tables of a proof are for nodes that count."""
+    used = (K != 0.0).any(0)
+    rows = (K != 0.0).any(1) | (w != 0.0)
+    return cost_of(*(np.ascontiguousarray(each) for each in (kinds[used], data[used], K[rows][:, used], w[rows])))
+
+
+def _near_cells(boxes: Array, axes: Axes, d: int, inside: int) -> Cells:
+    """Return boxes of search coordinates as cells."""
+    at, half = boxes[:, 0:d], boxes[:, 3 : 3 + d]
+    edges = np.zeros((len(boxes), 1 + d, 1 + d))
+    sense = axes.sense[:d, :d]
+    edges[:, 0, :d], edges[:, 0, d] = at @ sense.T, 1.0
+    edges[:, 1:, :d] = half[:, :, None] * sense.T
+    return Cells(axes.origin[:d], edges, inside)
+
+
+def _far_cells(cost: Cost, x: Array, level: float, most: int, lists: Array) -> tuple[Cells, bool, str]:
+    d, box = len(x), empty_box(cost.K.shape[0], cost.K.shape[1])
+    cells, far = np.zeros((2 * most, 1 + d, 1 + d)), np.zeros(2 * most)
+    base = np.zeros(3)
+    count, inside, _ = cover_everywhere(cost, box, x, level, most, lists, cells, far, base)
+    return Cells(base[:d], cells[:count], inside), bool((far[:count] <= level).any()), ""
+
+
+# The inside: where rays from the fix leave the region.
+
+# Rays in the plane, of which every eighth lies on an axis or a diagonal: enough to draw the outline of an ellipse.
+_RAYS = 64
+# Steps along a ray before the level is met, in units of where a Gaussian meets it: the first, the last, and the factor
+# between two. Narrow enough to leave no bay of a banana unseen that is as wide as its distance.
+_FIRST, _LAST, _FACTOR = 0.05, 1e3, 1.2
+# Halvings of the last step: to the rounding of a double.
+_HALVINGS = 50
+# Least w of a ray in the inverse-range chart: beyond is infinity.
+_NEAR_INFINITY = 1e-6
+
+
+def boundary(surface: Surface, threshold: float) -> Array:
+    """Return where rays from the fix first leave the region of lower cost, (k, d); NaN where they never do."""
+    rays = directions(len(surface.position))
+    q = np.sqrt(threshold - surface.least)
+    count = int(np.ceil(np.log(_LAST / _FIRST) / np.log(_FACTOR)))
+    ladder = q * _FIRST * _FACTOR ** np.arange(count + 1)
+    start, steps = _axes(surface.chart)
+    steps = rays @ steps.T
+    limit = _limit(surface, steps)
+    along = np.minimum(ladder, limit[:, None])
+    costs = surface.cost(_points(surface, start + along[..., None] * steps[:, None]))
+    above = np.asarray(costs > threshold)
+    first = above.argmax(1)
+    own = np.arange(len(rays))
+    low, high = np.where(first > 0, along[own, np.maximum(first - 1, 0)], 0.0), along[own, first]
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        outside = np.asarray(surface.cost(_points(surface, start + middle[:, None] * steps)) > threshold)
+        low, high = np.where(outside, low, middle), np.where(outside, middle, high)
+    found = _points(surface, start + low[:, None] * steps)
+    return np.where(np.asarray(above.any(1))[:, None], found, np.nan)
+
+
+def directions(d: int) -> Array:
+    """Return unit vectors (k, d): around the circle, or the axes of space and all their diagonals."""
+    if d == 2:
+        turn = 2.0 * np.pi * np.arange(_RAYS) / _RAYS
+        return np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    every = np.array([way for way in product((-1.0, 0.0, 1.0), repeat=d) if any(way)])
+    return np.asarray(every / np.sqrt((every**2).sum(-1, keepdims=True)))
+
+
+def _axes(chart: Chart) -> tuple[Array, Array]:
+    """Return the fix (d,) and one standard deviation along principal axes, in columns (d, d), where it is Gaussian."""
+    inverse = int(chart.kind) == INVERSE_RANGE
+    spread = chart.spread if inverse else chart.covariance
+    values, vectors = np.linalg.eigh(spread)
+    return chart.mean if inverse else chart.position, vectors * np.sqrt(np.maximum(values, 0.0))
+
+
+def _points(surface: Surface, at: Array) -> Array:
+    return surface.chart.to_position(at) if surface.kind == INVERSE_RANGE else at
+
+
+def _limit(surface: Surface, steps: Array) -> Array:
+    """Return how far each ray (k, d) may go (k,)."""
+    if surface.kind != INVERSE_RANGE:
+        return np.full(len(steps), np.inf)
+    with np.errstate(divide="ignore"):
+        return np.where(steps[:, -1] < 0.0, (_NEAR_INFINITY - 1.0) / steps[:, -1], np.inf)

@@ -1,0 +1,47 @@
+"""Radii of data sheets: exact for circles, spheres and needles, and by draws for the rest."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2, norm
+
+from optloc import accuracy
+from optloc.uncertainty.radii import radius
+
+
+@pytest.mark.parametrize("d", [1, 2, 3])
+@pytest.mark.parametrize("level", [0.5, 0.95, 0.999])
+def test_balls_are_chi_square(d, level):
+    assert radius(4.0 * np.eye(d), level) == pytest.approx(2 * np.sqrt(chi2.ppf(level, d)), rel=1e-7)
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_a_needle_is_one_normal_number(d):
+    way = np.arange(1.0, d + 1) / np.linalg.norm(np.arange(1.0, d + 1))
+    assert radius(9.0 * np.outer(way, way), 0.95) == pytest.approx(3 * norm.ppf(0.975), rel=1e-6)
+    assert radius(np.zeros((d, d)), 0.5) == 0.0
+
+
+def test_any_ellipsoid_against_draws():
+    rng, n = np.random.default_rng(1), 400_000
+    covariances = np.stack([np.diag([1.0, 0.3, 0.1]), np.diag([5.0, 4.9, 0.01]), np.diag([1.0, 1e-3, 1e-5])])
+    turn = np.linalg.qr(rng.standard_normal((3, 3)))[0]
+    covariances = turn @ covariances @ turn.T
+    found = accuracy(covariances)
+    for i, covariance in enumerate(covariances):
+        x = rng.standard_normal((n, 3)) @ np.linalg.cholesky(covariance).T
+        flat, whole, high = np.hypot(x[:, 0], x[:, 1]), np.linalg.norm(x, axis=1), np.abs(x[:, 2])
+        for size, values, level in (
+            (found.cep50, flat, 0.5),
+            (found.cep95, flat, 0.95),
+            (found.sep50, whole, 0.5),
+            (found.sep95, whole, 0.95),
+            (found.vertical95, high, 0.95),
+        ):
+            assert (values < size[i]).mean() == pytest.approx(level, abs=5 * np.sqrt(level * (1 - level) / n))
+
+
+def test_the_plane_and_what_is_not_known():
+    found = accuracy(np.stack([np.eye(2), np.full((2, 2), np.nan)]))
+    assert found.cep50 == pytest.approx([np.sqrt(2 * np.log(2)), np.nan], nan_ok=True)
+    assert np.isnan(found.sep50).all()
+    assert np.isnan(found.vertical95).all()
