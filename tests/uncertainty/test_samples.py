@@ -155,22 +155,34 @@ def test_samples_along_an_arc_are_the_likelihood(name):
         assert found.weight[share < edge].sum() == pytest.approx(edge, abs=0.03)
 
 
-def test_mixtures_are_as_good_at_the_truth_as_the_chart():
-    difference, metres = [], []
-    for name, n in (("tdoa 2 5 300", 12), ("azel 4 300", 10)):
+def compared(names, n):
+    """Return the log density at the truth of mixtures less that of the chart, and less that of the Gaussian in metres."""
+    out = []
+    for name in names:
         for item in range(n):
             problem, truth, fix = fixed(name, item)
-            if not np.isfinite(fix.cov).all():
+            if not np.isfinite(fix.cov).all() or fix.chart.kind != INVERSE_RANGE:
                 continue
             chart = fix.chart
-            y = chart.to_chart(truth)
+            y, four = chart.to_chart(truth), mixture(problem, fix).log_density(truth)
             own = log_normal(y, chart.mean, chart.spread) - chart.log_volume(y)
-            four = mixture(problem, fix).log_density(truth)
-            difference.append(four - own)
-            metres.append(four - log_normal(truth, chart.position, chart.covariance))
-    # Measured over 400 fixes a case: 0.01 to 0.04 less than the Gaussian in the chart, 1 to 7 more than in metres.
-    assert np.mean(difference) > -0.5
-    assert np.mean(metres) > 0.5
+            out.append((four - own, four - log_normal(truth, chart.position, chart.covariance)))
+    return np.mean(out, axis=0)
+
+
+def test_mixtures_are_as_good_at_the_truth_as_the_chart():
+    chart, metres = compared(("tdoa 2 5 300", "azel 4 300"), 10)
+    assert chart > -0.5
+    assert metres > 0.0
+
+
+@pytest.mark.full
+@pytest.mark.parametrize(("name", "gain"), [("tdoa 2 5 100", 0.3), ("tdoa 2 5 300", 1.0), ("azel 4 300", 0.3)])
+def test_mixtures_are_as_good_at_the_truth_as_the_chart_in_full(name, gain):
+    chart, metres = compared((name,), 400)
+    # Measured over 400 fixes: 0.01 to 0.04 less than the Gaussian in the chart, 0.9 to 7 more than the one in metres.
+    assert chart > -0.2
+    assert metres > gain
 
 
 def log_normal(x, mean, covariance):
