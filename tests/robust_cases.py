@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from verdicts import alone
 
 from optloc import Fix, Problem, assemble, measured, solve
 from optloc.solvers.refine import refine
@@ -62,7 +63,7 @@ def rmse(position: np.ndarray, truth: np.ndarray) -> float:
 
 def nees(fix: Fix, truth: np.ndarray) -> np.ndarray:
     """Return squared errors (N,) of positions in their own sigma, over their number; NaN where nothing is claimed."""
-    claimed = fix.code == 0
+    claimed = alone(fix)
     out, error = np.full(len(fix), np.nan), (fix.position - truth[:, :3])[claimed, :, None]
     solved = np.linalg.solve(fix.covariance()[claimed], error)
     out[claimed] = (np.swapaxes(error, 1, 2) @ solved)[:, 0, 0] / 3.0

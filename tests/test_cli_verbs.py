@@ -231,7 +231,7 @@ def test_without_matplotlib_the_demo_says_so(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     result = RUN.invoke(app, ["demo", "ambiguous"])
-    assert result.exit_code == 1, result.output
+    assert result.exit_code == 0, result.output  # it shows what it is to show
     assert "pip install 'optloc[plot]'" in result.stdout
     assert not list(tmp_path.iterdir())
 

@@ -14,6 +14,7 @@ from monte_carlo.test_consistency import band
 from recipes import TABLES, files_of_the_page, installed, write_package
 from study.texts import plan
 from typer.testing import CliRunner
+from verdicts import alone
 
 import optloc
 from optloc import MODELS, InvalidProblem, Motion, Status, solve
@@ -75,13 +76,15 @@ def test_it_fixes_without_a_guess_on_the_bound():
     problem, truth = strengths(), places(TRIALS)
     drawn = optloc.simulate(problem, truth=truth, seed=3)
     fix = solve(drawn)
-    assert (fix.code == Status.OK).all()
+    assert alone(fix).all()  # the page gives no bounds over boxes: nothing is proven
     assert (fix.cost <= solve(drawn, "lsr", start=truth).cost + 1e-6).all()  # no better minimum near the truth
     error = fix.position - truth
     bound = np.stack([optloc.crlb(problem, place) for place in truth])
-    low, high = band(2 * TRIALS, BAND)
-    assert low < squared(error, fix.covariance()).mean() / 2 < high
-    assert low < squared(error, bound).mean() / 2 < high
+    covers = ~fix.has(Status.CURVED)  # close to a receiver it does not
+    assert covers.mean() > 0.9
+    low, high = band(2 * int(covers.sum()), BAND)
+    assert low < squared(error, fix.covariance())[covers].mean() / 2 < high
+    assert low < squared(error, bound)[covers].mean() / 2 < high
 
 
 def test_its_bound_is_that_of_the_fisher_information_by_hand():
@@ -135,7 +138,7 @@ def test_offsets_of_the_receivers_are_registered():
     run = optloc.with_bias(run, "gain", members=names, kind="rss_urban")
     truth = np.concatenate([[-2e3, -1e3, 90.0, 50.0], np.linspace(-2.0, 2.0, len(names))])
     fix = solve(optloc.simulate(run, truth=np.tile(truth, (trials, 1)), seed=6))
-    assert (fix.code == Status.OK).all()
+    assert alone(fix).all()
     error = fix.x - truth
     low, high = band(len(truth) * trials, BAND)
     assert low < squared(error, fix.cov).mean() / len(truth) < high
@@ -150,7 +153,7 @@ def test_the_exponent_is_a_scale_that_registration_finds():
     run = optloc.with_bias(run, "exponent", per="kind", form="scale")
     truth = np.array([-2e3, -1e3, 70.0, 50.0, 0.1])
     fix = solve(optloc.simulate(run, truth=truth, seed=2))
-    assert fix.status == Status.OK
+    assert alone(fix)
     slot, _ = run.layout.find("exponent")
     sigma = np.sqrt(fix.cov[slot.start, slot.start])
     assert sigma < 0.02
@@ -193,7 +196,7 @@ def test_studies_take_it_in_a_layout():
     found = compute(made).table.to_pandas()
     assert len(found) == 40
     assert np.isfinite(found["crlb"]).all()
-    good = found[found["status"] == "ok"]
+    good = found[found["status"] == "unproven"]
     assert len(good) >= 36
     assert (good["error"] < 6.0 * good["crlb"]).all()
 
@@ -230,23 +233,23 @@ def file(tmp_path):
     return path, truth
 
 
-def run(*arguments):
+def run(*arguments, code=0):
     result = CliRunner().invoke(app, [str(argument) for argument in arguments])
-    assert result.exit_code == 0, result.output + repr(result.exception)
+    assert result.exit_code == code, result.output + repr(result.exception)
     return result.stdout
 
 
 def test_files_and_commands_know_it(file, tmp_path):
     path, truth = file
-    assert '"ok"' in run("fix", path, "--json")
+    assert '"unproven"' in run("fix", path, "--json", code=1)
     fix = solve(optloc.load(path))
     assert np.linalg.norm(fix.position - truth) < 5.0 * np.sqrt(np.trace(fix.cov))
     assert "rss_urban" in run("check", path)
-    run("fix", path, "--method", "robust", "--json")
+    run("fix", path, "--method", "robust", "--allow", "unproven", "--json")
     run("crlb", path, "--at", "900,-700")
     drawn = tmp_path / "drawn.toml"
     run("simulate", path, "--truth", "900,-700", "--seed", "1", "--out", drawn)
-    run("fix", drawn, "--json")
+    run("fix", drawn, "--allow", "unproven", "--json")
     assert "rss_urban" in run("list", "kinds", "--json")
     assert "dB" in next(
         row["units"] for row in json.loads(run("list", "kinds", "--json")) if row["kind"] == "rss_urban"
@@ -271,7 +274,8 @@ def test_an_unknown_name_is_answered_with_those_of_packages():
 
 
 def test_other_processes_find_it_too(package, file):
-    code = "import sys, optloc.cli; sys.argv = ['optloc', 'fix', sys.argv[1], '--json']; optloc.cli.main()"
+    words = "['optloc', 'fix', sys.argv[1], '--allow', 'unproven', '--json']"
+    code = f"import sys, optloc.cli; sys.argv = {words}; optloc.cli.main()"
     environment = os.environ | {"PYTHONPATH": str(package)}
     found = subprocess.run(
         [sys.executable, "-W", "error", "-c", code, str(file[0])],
@@ -296,7 +300,7 @@ def test_the_formulation_starts_fixes_from_ranges_over_blocked_paths():
     drawn = optloc.simulate(template, truth=truth, seed=1)
     rough, fine = solve(drawn, "discs"), solve(drawn, "discs+lsr")
     assert (np.linalg.norm(rough.position - truth, axis=1) < 1e3).all()
-    assert (fine.code == Status.OK).all()
+    assert alone(fine).all()
     np.testing.assert_allclose(fine.position, solve(drawn).position, atol=1e-4)
     # By its definition: no other point is deeper in the discs.
     for i in range(3):
@@ -353,7 +357,7 @@ def test_the_solver_descends_to_the_minimum():
     rough, fine = solve(drawn, "gtrs+simplex"), solve(drawn, "gtrs+simplex+lsr")
     best = solve(drawn)
     np.testing.assert_allclose(rough.position, best.position, atol=1.0)
-    assert fine.status == Status.OK
+    assert alone(fine)
     np.testing.assert_allclose(fine.position, best.position, atol=1e-4)
     assert [stage.name for stage in fine.stages][-1] == "lsr"
 

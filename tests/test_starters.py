@@ -48,7 +48,8 @@ def test_it_is_fixed_as_it_is(name, tmp_path):
     truth = truth_of(STARTERS[name].text, problem)
     problem = by_epoch(problem) if problem.epochs > 1 and separable(problem) else problem
     fix = solve(problem)
-    assert (np.asarray(fix.code) == Status.OK).all(), (fix.status, fix.reason)
+    proven = name not in ("fdoa", "registration", "rss_difference")
+    assert (np.asarray(fix.code) == (Status.OK if proven else Status.UNPROVEN)).all(), (fix.status, fix.reason)
     error = fix.position - truth
     d = error.shape[-1]
     own = np.einsum("...i,...ij,...j->...", error, np.linalg.pinv(fix.covariance()[..., :d, :d]), error)
@@ -71,7 +72,7 @@ def test_a_kind_from_elsewhere_has_one_too(monkeypatch, tmp_path):
     assert re.search(r'kind = "echo"\nunit = "m" +# one of m, km', text)
     path = tmp_path / "echo.toml"
     path.write_text(text)
-    found = RUN.invoke(app, ["fix", str(path), "--json"])
+    found = RUN.invoke(app, ["fix", str(path), "--allow", "unproven", "--json"])
     assert found.exit_code == 0, found.output
 
 

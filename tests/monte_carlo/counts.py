@@ -10,6 +10,7 @@ from zlib import crc32
 import numpy as np
 from monte_carlo.layouts import SEED
 from runs import truth
+from verdicts import alone
 
 import optloc
 from optloc import Problem
@@ -54,6 +55,8 @@ class Counts:
     ----------
     code : int array (N,)
         Statuses.
+    sure : bool array (N,)
+        One place was found and nothing speaks against it; nothing proves that of a run.
     failed : bool array (N,)
         The answer costs more than the optimum that is reached from the truth, or is none.
     away : bool array (N,)
@@ -73,6 +76,7 @@ class Counts:
     """
 
     code: Array
+    sure: Array
     failed: Array
     away: Array
     listed: Array
@@ -122,6 +126,7 @@ def judged(problem: Problem, x: Array, *, starts: bool = False) -> Counts:
     same = _alike(pool, best.x[:, None, :n], best.equations.shared)
     return Counts(
         fix.code,
+        alone(fix),
         ~(fix.answered & (fix.cost <= best.cost + SLACK)),
         ~same[:, 0],
         same[:, 1:].any(1),

@@ -36,7 +36,7 @@ def check(name: str, count: int):
     parts = (found.reached, found.listed, found.declined, found.silent, found.endless, found.claimed)
     counts = [int(part.sum()) for part in parts]
     assert sum(counts) == count
-    return counts, [int((fix.code == Status.AMBIGUOUS).sum()), int(found.lower.sum())], found
+    return counts, [int(fix.has(Status.AMBIGUOUS).sum()), int(found.lower.sum())], found
 
 
 def judge(name: str, counts: list[int], found) -> None:

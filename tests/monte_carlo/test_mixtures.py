@@ -39,14 +39,14 @@ def counted(name: str, count: int) -> list[int]:
     fix = solve(problem)
     slack = TIE * (1.0 + best.cost)
     endless = best.at_infinity
-    answered = np.isin(fix.code, (Status.OK, Status.AMBIGUOUS, Status.SEARCHED))
+    answered = fix.answered & ~fix.has(Status.UNBOUNDED)
     reached = answered & (model.cost(fix.x, z) <= best.cost + slack)
     others = model.cost(fix.alternatives.x, z).min(1, initial=np.inf)
-    listed = ~reached & (fix.code == Status.AMBIGUOUS) & (others <= best.cost + slack)
+    listed = ~reached & fix.has(Status.AMBIGUOUS) & (others <= best.cost + slack)
     endless &= ~reached & ~listed & ~answered
     hidden = ~reached & ~listed & ~endless & (np.linalg.norm(best.x, axis=1) > HORIZON)
     rest = ~(reached | listed | endless | hidden)
-    parts = (reached, listed, rest & ~answered, rest & answered, endless, hidden, fix.code == Status.AMBIGUOUS)
+    parts = (reached, listed, rest & ~answered, rest & answered, endless, hidden, fix.has(Status.AMBIGUOUS))
     return [int(part.sum()) for part in parts]
 
 

@@ -59,7 +59,7 @@ def counted(name: str, trials: int) -> tuple[list[str], float, float]:
         str(counts["global"]),
         str(sum(c.unique for c in proofs)),
         str(counts["region"]),
-        str(int((fix.code == Status.AMBIGUOUS).sum())),
+        str(int(fix.has(Status.AMBIGUOUS).sum())),
         str(int((~answered).sum())),
         str(replaced),
         f"{np.median(boxes):.0f}",

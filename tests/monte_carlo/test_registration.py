@@ -126,7 +126,7 @@ def test_long_runs_meet_the_bound(name, book):
     found, bound, ratios = line(name, FULL, book)
     assert not found.failed.any()
     assert not found.away.any()
-    assert (found.code == Status.OK).all()
+    assert found.sure.all()
     assert found.rmse == pytest.approx(bound, rel=0.05)
     assert all(low < mean < high for mean, low, high in ratios), ratios
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from monte_carlo.tables import ledger
 from robust_cases import least_squares, nees, rmse, spoilt
+from verdicts import alone
 
-from optloc import Status, rejected, solve
+from optloc import rejected, solve
 from optloc.problem.loss import LOSSES
 
 DEFAULT, FULL = 60, 400
@@ -28,13 +29,13 @@ NAMES = [f"{case}, {loss}" for case in CASES for loss in LOSSES]
 HEADER = [
     "case, loss",
     "truth finds better",
-    "ok",
-    "ok, beyond 5 sigma",
+    "one place",
+    "of these beyond 5 sigma",
     "bad rows rejected",
     "good rows rejected",
-    "RMSE of ok, m",
+    "RMSE of these, m",
     "least squares, good rows, m",
-    "NEES of ok",
+    "NEES of these",
 ]
 
 
@@ -46,20 +47,20 @@ def book():
 
 
 def counted(name: str, loss: str, trials: int) -> tuple[int, int, int, tuple[object, ...]]:
-    """Return trials in which the truth finds better, that are ok, that are then beyond 5 sigma, and the other cells."""
+    """Return trials in which the truth finds better, with one place, with one beyond 5 sigma, and the other cells."""
     kind, stations, bad, size, late = CASES[name]
     case = spoilt(kind, trials, stations, bad=bad, size=size, late=late)
     fix, best = solve(case.problem, loss), solve(case.problem, loss, start=case.truth)
     worse = int((~(fix.cost <= best.cost + 1e-3) & np.isfinite(best.cost)).sum())
-    ok, lost, own = fix.code == Status.OK, rejected(case.problem, fix), nees(fix, case.truth)
+    ok, lost, own = alone(fix), rejected(case.problem, fix), nees(fix, case.truth)
     good = case.problem.with_rows(weight=np.where(case.wrong, 0.0, 1.0))
-    alone = least_squares(type(case)(good, case.truth, case.wrong))
+    honest = least_squares(type(case)(good, case.truth, case.wrong))
     far = int((3.0 * own[ok] > 25.0).sum())
     cells = (
         f"{100 * lost[ok][case.wrong[ok]].mean():.1f} %" if bad else "",
         f"{100 * lost[ok][~case.wrong[ok]].mean():.1f} %",
         f"{rmse(fix.position[ok], case.truth[ok]):.1f}",
-        f"{rmse(alone[ok], case.truth[ok]):.1f}",
+        f"{rmse(honest[ok], case.truth[ok]):.1f}",
         f"{np.mean(own[ok]):.2f}",
     )
     return worse, int(ok.sum()), far, cells

@@ -9,6 +9,7 @@ from monte_carlo.layouts import BOX, SEED
 from monte_carlo.tables import ledger
 from scipy.special import ndtri
 from scipy.stats import chi2
+from verdicts import alone
 
 from optloc import Problem, assemble, measured, solve
 from optloc.solvers.sparse import sparse_errors
@@ -122,7 +123,7 @@ def judged(name: str, count: int) -> dict[str, np.ndarray]:
         "gnc": exact(of_gnc),
         "subsets": exact(all_subsets(problem, most)) if most else np.zeros(0),
         "agree": exact(convex.wrong) & exact(of_gnc),
-        "silent": (both.code == 0) & (error(both.position) > 10.0 * spread),
+        "silent": alone(both) & (error(both.position) > 10.0 * spread),
         "errors": np.stack([error(p) for p in (*np.moveaxis(convex.position, 1, 0), gnc.position, honest.position)]),
     }
 

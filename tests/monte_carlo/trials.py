@@ -119,15 +119,16 @@ def outcome(run: Trials, fix: Fix) -> Outcome:
     cost = run.model.cost(position(fix), run.z)
     others = run.model.cost(fix.alternatives.x[..., :d], run.z).min(1, initial=np.inf)
     slack = TIE * (1.0 + run.best.infimum)
-    answered = np.isin(fix.code, (Status.OK, Status.AMBIGUOUS, Status.SEARCHED))
+    # Where infinity explains the data as well, no place is claimed.
+    answered = fix.answered & ~fix.has(Status.UNBOUNDED)
     reached = answered & (cost <= run.best.cost + slack)
-    listed = ~reached & (fix.code == Status.AMBIGUOUS) & (others <= run.best.cost + slack)
+    listed = ~reached & fix.has(Status.AMBIGUOUS) & (others <= run.best.cost + slack)
     # An infimum at infinity is approached, never attained: a finite fix below it is the better point.
     endless = run.best.at_infinity & ~(answered & (cost <= run.best.infimum + slack))
     reached, listed = reached & ~endless, listed & ~endless
     missed = ~(reached | listed | endless)
     # An ambiguous fix says that infinity rivals it.
-    claimed = endless & np.isin(fix.code, (Status.OK, Status.SEARCHED))
+    claimed = endless & answered & ~fix.has(Status.AMBIGUOUS)
     return Outcome(
         len(cost),
         reached,
