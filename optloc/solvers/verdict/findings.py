@@ -122,11 +122,10 @@ def examine(problem: Problem, pool: Pool) -> Pool:
     if len(new):
         kappa[new] = _departure(problem.take(new), take(pool, new))
     pool = replace(pool, curvature=replace(curvature, kappa=kappa))
-    return (
-        pool
-        if pool.loss or not one_position(problem)
-        else replace(pool, infinity=_infinity(problem, pool, good & ~_is_settled(pool)))
-    )
+    # far away a velocity may grow with the range: no least cost is left to compute
+    if pool.loss or not one_position(problem) or problem.motions[0].order:
+        return pool
+    return replace(pool, infinity=_infinity(problem, pool, good & ~_is_settled(pool)))
 
 
 def _has_position(problem: Problem) -> bool:
