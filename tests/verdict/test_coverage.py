@@ -1,0 +1,117 @@
+"""What is `ok` covers as it promises, case by case, and so does the Gaussian in inverse range."""
+
+import numpy as np
+import pytest
+from monte_carlo.tables import ledger
+from scipy.stats import binom, chi2
+from verdict.cases import CASES, GROUND
+
+from optloc import Status, solve
+from optloc.problem.chart import CARTESIAN, INVERSE_RANGE
+
+DEFAULT, FULL = 200, 10_000
+LEVELS = (0.95, 0.999)
+# What is promised of 2 000 fixes and more: the share of truths inside, least and greatest.
+BANDS = {0.95: (0.93, 0.97), 0.999: (0.995, 1.0)}
+# A near case, one that is curved in metres, and one that is curved in truth.
+DAILY = ("tdoa 2 5 0", "tdoa 3 6 30", "azel 4 100", "plane 200 1000")
+INSIDE = ("tdoa 2 5 0", "tdoa 3 6 0", "r2")  # networks around the emitter
+
+
+def solved(name, count, seed, method="auto"):
+    problem, truth = {**CASES, **GROUND}[name](count, [7, seed, *name.encode()])
+    return solve(problem, method), truth
+
+
+def inside(fix, truth, where, level):
+    """Return how many truths of some fixes lie in their regions, and how many fixes these are."""
+    items = np.flatnonzero(where)
+    return int(fix[items].covers(truth[items], level).sum()) if len(items) else 0, len(items)
+
+
+def likely(hits, count, level):
+    """Return whether a count is in the band of its size: binomial for a few, the promise for 2 000 and more."""
+    low, high = BANDS[level]
+    slack = 0 if count >= 2000 else count
+    least = binom.ppf(1e-4, slack, level) / slack if slack else low
+    return hits >= min(least, low) * count and (hits <= high * count or count < 2000)
+
+
+def groups(fix):
+    ok = fix.code == Status.OK
+    return {"ok": ok, "inverse range": fix.answered & (fix.chart.kind == INVERSE_RANGE)}
+
+
+@pytest.mark.parametrize("name", DAILY)
+def test_truths_lie_where_they_are_promised(name, seed):
+    fix, truth = solved(name, DEFAULT, seed)
+    for kind, where in groups(fix).items():
+        for level in LEVELS:
+            hits, count = inside(fix, truth, where, level)
+            assert likely(hits, count, level), (kind, level, hits, count)
+    assert (fix.chart.kind[fix.code == Status.OK] == CARTESIAN).all()
+
+
+def test_a_covariance_alone_would_not_have_covered(seed):
+    """The test of shape is needed: of far emitters the ellipses hold too few truths, and none of them is ok."""
+    fix, truth = solved("tdoa 2 5 300", DEFAULT, seed)
+    away, covariance = truth - fix.position, fix.covariance()
+    known = np.isfinite(covariance).all((1, 2))
+    squared = (away[known] * np.linalg.solve(covariance[known], away[known][..., None])[..., 0]).sum(-1)
+    assert (squared <= chi2.ppf(0.95, 2)).mean() < 0.9
+    assert not (fix.code == Status.OK).any()
+
+
+@pytest.mark.parametrize("method", ["auto", "gtrs+lsr", "searched"])
+@pytest.mark.parametrize("name", GROUND)
+def test_a_mirror_image_is_never_ok(name, method, seed):
+    fix, truth = solved(name, DEFAULT, seed, method)
+    ok = fix.code == Status.OK
+    away = truth - fix.position
+    with np.errstate(invalid="ignore"):
+        squared = (away[..., None, :] @ np.linalg.pinv(np.nan_to_num(fix.covariance())) @ away[..., None])[:, 0, 0]
+    assert not (ok & (squared > chi2.ppf(0.9999, 3))).any()
+
+
+def test_clean_data_are_a_misfit_as_rarely_as_stated(seed):
+    problem, _ = CASES["tdoa 3 6 0"](20_000, [3, seed])
+    fix = solve(problem, "gtrs+lsr")
+    count = int(fix.has(Status.MISFIT).sum())
+    low, high = binom.ppf((1e-4, 1 - 1e-4), len(fix), 1e-4)
+    assert low <= count <= high
+
+
+@pytest.fixture(scope="module")
+def book():
+    header = ["case", "fixes", "ok", "in 95 %", "99.9 %", "Gaussian in inverse range", "in 95 %", "99.9 %", "refused"]
+    with ledger("coverage", header, list(CASES), f"seed 0, {FULL} trials a case, method auto") as made:
+        yield made
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("name", CASES)
+def test_coverage_in_full(name, book):
+    fix, truth = solved(name, FULL, 0)
+    cells = [len(fix)]
+    for kind, where in groups(fix).items():
+        shares = []
+        for level in LEVELS:
+            hits, count = inside(fix, truth, where, level)
+            assert likely(hits, count, level), (kind, level, hits, count)
+            shares.append(f"{hits / count:.4f}" if count else "-")
+        cells += [int(where.sum()), *shares]
+    book.add(name, *cells, int((fix.code != Status.OK).sum()))
+    if name in INSIDE:
+        assert (fix.code == Status.OK).mean() >= 0.92
+
+
+@pytest.mark.full
+@pytest.mark.parametrize("method", ["auto", "gtrs+lsr", "roots+lsr", "searched", "proven", "robust"])
+@pytest.mark.parametrize("name", GROUND)
+def test_mirror_images_in_full(name, method):
+    fix, truth = solved(name, 2000, 0, method)
+    ok = fix.code == Status.OK
+    away = truth - fix.position
+    squared = (away[..., None, :] @ np.linalg.pinv(np.nan_to_num(fix.covariance())) @ away[..., None])[:, 0, 0]
+    print(f"{name}, {method}: ok {ok.mean():.3f}, wrong {int((ok & (squared > chi2.ppf(0.9999, 3))).sum())}")
+    assert not (ok & (squared > chi2.ppf(0.9999, 3))).any()
