@@ -9,7 +9,7 @@ from verdict.cases import CASES, GROUND
 from optloc import Status, solve
 from optloc.problem.chart import CARTESIAN, INVERSE_RANGE
 
-DEFAULT, FULL = 200, 10_000
+DEFAULT, FEW, FULL = 200, 100, 10_000
 LEVELS = (0.95, 0.999)
 # What is promised of 2 000 fixes and more: the share of truths inside, least and greatest.
 BANDS = {0.95: (0.93, 0.97), 0.999: (0.995, 1.0)}
@@ -37,6 +37,17 @@ def likely(hits, count, level):
     return hits >= min(least, low) * count and (hits <= high * count or count < 2000)
 
 
+def missed(fix, truth):
+    """Return which fixes are ok though the truth is beyond 99.99 %: where no alternative is there, and where one is."""
+    away = truth - fix.position
+    with np.errstate(invalid="ignore"):
+        squared = (away[..., None, :] @ np.linalg.pinv(np.nan_to_num(fix.covariance())) @ away[..., None])[:, 0, 0]
+        other = np.linalg.norm(fix.alternatives.x[..., :3] - truth[:, None], axis=-1).min(1, initial=np.inf)
+        told = other < 0.2 * np.linalg.norm(away, axis=-1)
+    beyond = (fix.code == Status.OK) & (squared > chi2.ppf(0.9999, truth.shape[1]))
+    return beyond & ~told, beyond & told
+
+
 def groups(fix):
     ok = fix.code == Status.OK
     return {"ok": ok, "inverse range": fix.answered & (fix.chart.kind == INVERSE_RANGE)}
@@ -62,15 +73,11 @@ def test_a_covariance_alone_would_not_have_covered(seed):
     assert not (fix.code == Status.OK).any()
 
 
-@pytest.mark.parametrize("method", ["auto", "gtrs+lsr", "searched"])
+@pytest.mark.parametrize("method", ["auto", "gtrs+lsr"])
 @pytest.mark.parametrize("name", GROUND)
 def test_a_mirror_image_is_never_ok(name, method, seed):
-    fix, truth = solved(name, DEFAULT, seed, method)
-    ok = fix.code == Status.OK
-    away = truth - fix.position
-    with np.errstate(invalid="ignore"):
-        squared = (away[..., None, :] @ np.linalg.pinv(np.nan_to_num(fix.covariance())) @ away[..., None])[:, 0, 0]
-    assert not (ok & (squared > chi2.ppf(0.9999, 3))).any()
+    fix, truth = solved(name, FEW, seed, method)
+    assert not missed(fix, truth)[0].any()
 
 
 def test_clean_data_are_a_misfit_as_rarely_as_stated(seed):
@@ -105,13 +112,26 @@ def test_coverage_in_full(name, book):
         assert (fix.code == Status.OK).mean() >= 0.92
 
 
+PROVING = ("auto", "gtrs+lsr", "roots+lsr", "searched", "proven", "robust")
+
+
+@pytest.fixture(scope="module")
+def mirrors():
+    header = ["scene, method", "fixes", "ok", "curved", "ambiguous", "ok, and wrong", "ok, the truth listed"]
+    names = [f"{name}, {method}" for name in GROUND for method in PROVING]
+    with ledger("mirrors", header, names, "seed 0, 2000 trials a scene") as made:
+        yield made
+
+
 @pytest.mark.full
-@pytest.mark.parametrize("method", ["auto", "gtrs+lsr", "roots+lsr", "searched", "proven", "robust"])
+@pytest.mark.parametrize("method", PROVING)
 @pytest.mark.parametrize("name", GROUND)
-def test_mirror_images_in_full(name, method):
+def test_mirror_images_in_full(name, method, mirrors):
     fix, truth = solved(name, 2000, 0, method)
-    ok = fix.code == Status.OK
-    away = truth - fix.position
-    squared = (away[..., None, :] @ np.linalg.pinv(np.nan_to_num(fix.covariance())) @ away[..., None])[:, 0, 0]
-    print(f"{name}, {method}: ok {ok.mean():.3f}, wrong {int((ok & (squared > chi2.ppf(0.9999, 3))).sum())}")
-    assert not (ok & (squared > chi2.ppf(0.9999, 3))).any()
+    wrong, told = missed(fix, truth)
+    share = f"{(fix.code == Status.OK).mean():.3f}"
+    others = [int((fix.code == status).sum()) for status in (Status.CURVED, Status.AMBIGUOUS)]
+    mirrors.add(f"{name}, {method}", len(fix), share, *others, int(wrong.sum()), int(told.sum()))
+    assert not wrong.any()
+    # a rival by 9 and more is the right one in e^(-9/2) of its cases at most
+    assert told.sum() <= binom.ppf(1 - 1e-4, int((fix.code == Status.OK).sum()), np.exp(-4.5))

@@ -11,7 +11,7 @@ from verdict.search import Judgement, judge
 
 from optloc import LOSSES, Status, solve
 
-SCENES = 100
+SCENES, FEW = 100, 6
 IN_FULL = {"auto": 1000}  # scenes a seed, of ten; 100 of every other method
 # Others than `auto`; those of a loss can never be `ok`, and only that is looked at.
 METHODS = ("gtrs+lsr", "roots+lsr", "searched", "proven", "robust", "roots+lsr+widen+lsr+value", *LOSSES)
@@ -69,7 +69,7 @@ def attacked(method: str, seed: int, count: int, starts: int = 24, *, only_ok: b
 
 
 def test_no_answer_is_wrong_though_it_is_ok(seed):
-    tally = attacked("auto", seed, SCENES, 12, only_ok=True)
+    tally = attacked("auto", seed, SCENES, 6, only_ok=True)
     assert not tally.said, "\n".join(tally.said)
     assert tally.count["ok"] > SCENES // 3
     assert tally.beyond["ok"] <= 1
@@ -79,7 +79,7 @@ def test_no_answer_is_wrong_though_it_is_ok(seed):
 
 @pytest.mark.parametrize("method", METHODS)
 def test_no_method_claims_what_it_has_not_shown(method, seed):
-    tally = attacked(method, seed, 12, 8, only_ok=True)
+    tally = attacked(method, seed, FEW, 6, only_ok=True)
     assert not tally.said, "\n".join(tally.said)
     if method not in ("proven", "robust"):
         assert not tally.count["ok"], f"{method} proves nothing"
