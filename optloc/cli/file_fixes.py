@@ -165,6 +165,13 @@ def _of_target(loaded: Loaded, fix: Fix, first: int | None, target: int, names: 
     return columns | _repeat(count, **_told_in_words(loaded, fix))
 
 
+def level_covariance(columns: Columns, i: int) -> Array:
+    """Return the covariance (d, d) of one row in level axes: east, north and up where there is a ground."""
+    axes = "enu" if "cov_ee" in columns else "xyz"[: 3 if "z" in columns else 2]
+    pairs = [[f"cov_{min(a, b, key=axes.index)}{max(a, b, key=axes.index)}" for b in axes] for a in axes]
+    return np.array([[float(columns[name][i]) for name in row] for row in pairs])
+
+
 def _repeat(count: int, **texts: Sequence[str]) -> Columns:
     """Return texts of each fix (n,) as columns, each so often as the fix has rows."""
     return {name: np.repeat(np.array(list(values), dtype=object), count) for name, values in texts.items()}
@@ -246,10 +253,14 @@ def bias_records(fix: Fix, seen: Observability | None) -> list[dict[str, Any]]:
 
 def fixes_json(found: FileFixes) -> dict[str, Any]:
     """Return all fixes of a file as one JSON value; lengths in metres, angles in degrees."""
+    from optloc.uncertainty.radii import accuracy
+
     frame, rows = found.loaded.problem.frame, records(found.columns)
     per_fix = [_detail(fix, found) for fix in found.singles]
     # One row a fix wherever it has one target and one epoch; else what belongs to the fix stands with the run.
     single = len(rows) == len(per_fix)
+    if len(rows) == 1 == len(per_fix):  # of one fix: the radii take milliseconds each
+        per_fix[0]["accuracy"] = asdict(accuracy(level_covariance(found.columns, 0)))
     stages = {stage.name: stage for fix in found.fixes for stage in fix.stages}
     origin = None if frame.origin is None else [*np.degrees(frame.origin[:2]).tolist(), frame.origin[2]]
     return {

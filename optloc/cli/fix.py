@@ -24,6 +24,7 @@ from optloc.cli.file_fixes import (
     fix_file,
     fixes_json,
     geojson,
+    level_covariance,
 )
 from optloc.cli.output import Columns, dumps, records, say, say_all, with_sigma, write_picture, write_table, write_text
 from optloc.files import Loaded, read
@@ -184,6 +185,19 @@ def _add_state(table: Table, columns: Columns, i: int, whose: str) -> None:
     if np.isfinite(semi).all() and columns["chart"][i] in {"", NAMES[CARTESIAN]}:
         name = "95 % ellipse" if len(axes) == 2 else "95 % ellipsoid"
         table.add_row(name, " x ".join(f"{v:.3g}" for v in semi) + " m (semi-axes)")
+        if len(columns["x"]) == 1:
+            _add_accuracy(table, level_covariance(columns, i))
+
+
+def _add_accuracy(table: Table, covariance: Array) -> None:
+    """Add the radii that data sheets give."""
+    from optloc.uncertainty.radii import accuracy
+
+    radii = accuracy(covariance)
+    table.add_row("CEP50, CEP95", f"{radii.cep50:.3g}, {radii.cep95:.3g} m (circles)")
+    if len(covariance) == 3:
+        table.add_row("SEP50, SEP95", f"{radii.sep50:.3g}, {radii.sep95:.3g} m (spheres)")
+        table.add_row("vertical 95 %", f"± {radii.vertical95:.3g} m")
 
 
 def _chi_square(fix: Fix) -> str:
