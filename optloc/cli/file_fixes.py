@@ -15,7 +15,8 @@ from optloc.base.types import Array, Status
 from optloc.bounds.observability import Observability, observability
 from optloc.cli.output import Columns, bar, covariance_columns, geodetic_columns, join_tables, records
 from optloc.files import Loaded
-from optloc.problem.chart import CURVED, INVERSE_RANGE
+from optloc.plot.outlines import Pieces, pieces_of, polygons
+from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Active, Explanation, Fix
 from optloc.problem.layout import state_names
@@ -311,7 +312,10 @@ def _chart_json(fix: Fix) -> dict[str, Any] | None:
 
 
 def geojson(found: FileFixes) -> dict[str, Any]:
-    """Return stations, fixes and their 95 % ellipses as a GeoJSON feature collection (RFC 7946)."""
+    """Return stations, fixes and what holds 95 % as a GeoJSON feature collection (RFC 7946).
+
+    An ellipse where it covers, else the outline of the region; a curved fix without one has none.
+    """
     from optloc.plot.bound_map import feature
 
     problem = found.loaded.problem
@@ -323,16 +327,38 @@ def geojson(found: FileFixes) -> dict[str, Any]:
         feature("Point", point, {"role": "station", "name": name})
         for name, point in zip(problem.stations.names, _degrees(problem, place), strict=True)
     ]
+    outlines = _outlines(found)
     skipped = {"x", "y", "z", "lat_deg", "lon_deg", "height"}
-    for row in records(found.columns):
+    for number, row in enumerate(records(found.columns)):
         if row["lat_deg"] is None:
             continue
         about = {name: value for name, value in row.items() if name not in skipped and not name.startswith("cov_")}
         features.append(feature("Point", [row["lon_deg"], row["lat_deg"], row["height"]], {"role": "fix", **about}))
-        if row["cov_ee"] is not None:
-            about = {"role": "ellipse95", "epoch": row["epoch"], "target": row["target"]}
-            features.append(feature("Polygon", [_ring(problem, row)], about))
+        about = {"epoch": row["epoch"], "target": row["target"]}
+        if pieces := outlines.get(number, ()):
+            features.append(feature("MultiPolygon", _polygons(problem, row, pieces), {"role": "region95", **about}))
+        elif row["cov_ee"] is not None and number not in outlines:
+            features.append(feature("Polygon", [_ring(problem, row)], {"role": "ellipse95", **about}))
     return {"type": "FeatureCollection", "features": features}
+
+
+def _outlines(found: FileFixes) -> dict[int, Pieces]:
+    """Return the convex parts of the regions of rows whose ellipses do not cover; empty where they are not known."""
+    charts = [fix.chart for fix in found.fixes]
+    kinds = [np.ravel(chart.kind) for chart in charts if chart is not None]
+    # Fixes of one position each: a row is a fix.
+    if len(kinds) != len(charts) or sum(map(len, kinds)) != len(found.columns["x"]):
+        return {}
+    pieces = [part for fix in found.fixes for part in pieces_of(found.loaded.problem, fix)]
+    return {int(i): pieces[i] for i in np.flatnonzero(np.concatenate(kinds) != CARTESIAN)}
+
+
+def _polygons(problem: Problem, row: dict[str, Any], pieces: Pieces) -> list[list[list[list[float]]]]:
+    """Return the plan of a region of convex parts as the coordinates of a multi-polygon."""
+    centre = np.array([row[axis] for axis in "xyz"[: problem.dimension]])
+    axes = problem.frame.enu_axes(centre)[:2]
+    plan = polygons([(piece - centre) @ axes.T for piece in pieces])
+    return [[_degrees(problem, centre + line @ axes) for line in polygon] for polygon in plan]
 
 
 def _degrees(problem: Problem, position: Array) -> list[list[float]]:

@@ -1,4 +1,4 @@
-"""Pictures of fixes: stations, estimate, 95 % ellipse and the other positions that the data allow."""
+"""Pictures of fixes: stations, estimate, the ellipse or region of 95 % and the other positions that the data allow."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import numpy as np
 from optloc.base.linalg import error_ellipse
 from optloc.base.types import Array
 from optloc.plot import style
+from optloc.plot.outlines import rings
 from optloc.plot.style import (
     BLACK,
     BLUE,
@@ -62,7 +63,7 @@ def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") ->
     matplotlib.figure.Figure
         To be written with `optloc.plot.save`.
     """
-    scene = scene_of(problem, [fixes] if isinstance(fixes, Fix) else fixes)
+    scene = scene_of(problem, [fixes] if isinstance(fixes, Fix) else fixes, outlined=True)
     spatial = scene.stations.shape[-1] == 3
     count = 1 + spatial + (near := _nearby(scene))
     figure = figure_class()(figsize=(0.4 + 5.0 * count, 5.2), layout="constrained")
@@ -156,8 +157,14 @@ def _shift(scene: Scene, centre: Array) -> Scene:
 
 
 def _reach(scene: Scene, known: Array, centre: Array) -> float:
-    semi_axes, _ = error_ellipse(scene.covariances[known][:, :2, :2])
+    outlined = np.array([bool(pieces) for pieces in scene.outlines] or [False] * len(known))
+    semi_axes, _ = error_ellipse(scene.covariances[known & ~outlined][:, :2, :2])
     largest = np.max(semi_axes[np.isfinite(semi_axes)], initial=0.0)
+    for fix, pieces in zip(scene.fixes, scene.outlines, strict=False):
+        for line in rings([piece[:, :2] for piece in pieces]):
+            # The part around the fix, whole; other parts are other positions, which the overview shows.
+            if (line.min(0) <= fix[:2]).all() and (fix[:2] <= line.max(0)).all():
+                largest = max(float(largest), float(np.abs(line - centre).max()) / _SPREAD)
     away = np.abs(scene.fixes[known][:, :2] - centre).max(-1)
     reach = _SEMI_AXES * float(largest) + _SPREAD * float(np.quantile(away, 0.95))
     return reach if reach > 0.0 else _HELD * float(np.ptp(scene.stations[:, :2]) or 1.0)

@@ -14,6 +14,8 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
 from optloc.base.linalg import error_ellipse
 from optloc.base.types import Array, Band, Polygon, Status
+from optloc.plot.outlines import Pieces, pieces_of, rings
+from optloc.problem.chart import CARTESIAN
 from optloc.problem.fix import Fix
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
@@ -201,6 +203,10 @@ class Scene:
         The same as the alternatives have it.
     known : tuple of array (k, d)
         Places of known targets.
+    outlines : tuple of n tuples of array (v, d)
+        Convex parts of the region of each fix that no ellipse covers; empty for the others.
+    local : bool array (n,), optional
+        Where an ellipse does not cover, and what does is not known.
     """
 
     stations: Array
@@ -216,6 +222,8 @@ class Scene:
     paths: tuple[Array, ...] = ()
     other_paths: tuple[Array, ...] = ()
     known: tuple[Array, ...] = ()
+    outlines: tuple[Pieces, ...] = ()
+    local: Array | None = None
 
     def moved(self, change: Callable[[Array], Array]) -> Scene:
         """Return the scene with all positions changed; regions and covariances stay."""
@@ -228,11 +236,20 @@ class Scene:
             paths=tuple(change(part) for part in self.paths),
             other_paths=tuple(change(part) for part in self.other_paths),
             known=tuple(change(part) for part in self.known),
+            outlines=tuple(_changed(pieces, change) for pieces in self.outlines),
         )
 
 
-def scene_of(problem: Problem, fixes: Sequence[Fix]) -> Scene:
-    """Return what is to be drawn of a problem and its fixes."""
+def _changed(pieces: Pieces, change: Callable[[Array], Array]) -> Pieces:
+    """Return convex parts with all corners changed at once: there may be thousands."""
+    if not pieces:
+        return ()
+    ends = np.cumsum([len(piece) for piece in pieces])[:-1]
+    return tuple(np.split(change(np.concatenate(pieces)), ends))
+
+
+def scene_of(problem: Problem, fixes: Sequence[Fix], *, outlined: bool = False) -> Scene:
+    """Return what is to be drawn of a problem and its fixes, and outlines of what no ellipse covers if asked for."""
     # Of moving stations the first epoch, of a batch the first problem: tracks are drawn as lines.
     stations = problem.stations.position.reshape(-1, problem.stations.count, problem.dimension)[0]
     parts = [part for fix in fixes for part in states_of(fix)]
@@ -247,14 +264,30 @@ def scene_of(problem: Problem, fixes: Sequence[Fix]) -> Scene:
     regions = () if problem.frame.kind == "ecef" else _regions(problem, reach)
     paths, other = _paths(problem, fixes)
     known = tuple(m.known.reshape(-1, *m.known.shape[-2:])[:, 0] for m in problem.motions if m.known is not None)
+    outlines = outlines_of(problem, fixes, len(position)) if outlined else ()
     scene = Scene(
         *(stations, problem.stations.names, position, covariance, clean, others, gaps, axes[:d], regions),
         tracks=_tracks(problem),
         paths=paths,
         other_paths=other,
         known=tuple(_thin(place) for place in known),
+        outlines=outlines,
+        local=_is_local(fixes, outlines) if outlines else None,
     )
     return _local(problem, scene) if problem.frame.kind == "ecef" else scene
+
+
+def outlines_of(problem: Problem, fixes: Sequence[Fix], count: int) -> tuple[Pieces, ...]:
+    """Return the regions of fixes of one position each, in their order; none where there are others, or too many."""
+    if count > _ELLIPSES or count != sum(fix.code.size for fix in fixes):
+        return ()
+    return tuple(pieces for fix in fixes for pieces in pieces_of(problem, fix))
+
+
+def _is_local(fixes: Sequence[Fix], outlines: Sequence[Pieces]) -> Array:
+    """Return where an ellipse does not cover and there is no outline (n,)."""
+    kinds = [np.zeros(fix.code.size) if fix.chart is None else np.ravel(fix.chart.kind) for fix in fixes]
+    return np.asarray((np.concatenate(kinds) != CARTESIAN) & np.array([not pieces for pieces in outlines]))
 
 
 def local_frame(problem: Problem) -> Frame | None:
@@ -412,15 +445,21 @@ def points(panel: Axes, scene: Scene, view: View, size: float) -> None:
 
 
 def ellipses(panel: Axes, scene: Scene, view: View, size: float, **style: Any) -> None:
-    """Draw the 95 % ellipses of the fixes."""
+    """Draw the 95 % ellipses of the fixes, and the outlines of the regions where ellipses do not cover."""
     if len(scene.fixes) > _ELLIPSES:
         return
-    look: dict[str, Any] = {"color": BLUE, "linewidth": 1.5, "label": "95 % ellipse", "zorder": 2} | style
-    for centre, covariance in zip(scene.fixes, scene.covariances, strict=True):
-        line = centre[list(view)] + ring(covariance[np.ix_(view, view)])
-        if np.isfinite(line).all():
-            panel.plot(*(line.T / size), **look)
-            look["label"] = None
+    look: dict[str, Any] = {"color": BLUE, "linewidth": 1.5, "zorder": 2} | style
+    seen: set[str] = set()
+    outlines = scene.outlines or ((),) * len(scene.fixes)
+    local = np.zeros(len(scene.fixes), dtype=bool) if scene.local is None else scene.local
+    for i, (centre, covariance, pieces) in enumerate(zip(scene.fixes, scene.covariances, outlines, strict=True)):
+        around = [np.append(line, [[np.nan, np.nan]], axis=0) for line in rings([piece[:, view] for piece in pieces])]
+        label = "95 % region" if pieces else "local ellipse: it does not cover" if local[i] else "95 % ellipse"
+        dashes = {"linestyle": ":"} if local[i] else {}
+        line = np.concatenate(around) if around else centre[list(view)] + ring(covariance[np.ix_(view, view)])
+        if around or np.isfinite(line).all():
+            panel.plot(*(line.T / size), **(look | dashes | {"label": None if label in seen else label}))
+            seen.add(label)
 
 
 def ring(covariance: Array) -> Array:

@@ -14,7 +14,9 @@ from optloc.base.linalg import error_ellipse
 from optloc.base.types import Array, Status
 from optloc.linear.evaluate import differentiate
 from optloc.models import MODELS
-from optloc.plot.style import figure_class, states_of
+from optloc.plot.outlines import Pieces
+from optloc.plot.outlines import rings as around
+from optloc.plot.style import figure_class, outlines_of, states_of
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 
@@ -248,33 +250,65 @@ class Spots:
     place : array (n, 2)
         Longitude and latitude, degrees; NaN where there is none.
     rings : tuple of array (r, 2)
-        The 95 % ellipse of each, degrees; empty where there is no covariance.
+        The 95 % ellipse of each, or the outline of the region where no ellipse covers, degrees; empty where there is no
+        covariance.
     clean : bool array (n,)
         Where the status is ok.
     text : tuple of n str
         What is told of each.
+    more : tuple of array (r, 2)
+        Outlines of the other parts of regions, degrees.
     """
 
     place: Array
     rings: tuple[Array, ...]
     clean: Array
     text: tuple[str, ...]
+    more: tuple[Array, ...] = ()
 
 
-def spots(problem: Problem, position: Array, covariance: Array, clean: Array, text: Sequence[str]) -> Spots:
-    """Return positions (n, d) in a problem's frame, with covariances (n, d, d), as marks on the Earth."""
+def spots(
+    problem: Problem,
+    position: Array,
+    covariance: Array,
+    clean: Array,
+    text: Sequence[str],
+    outlines: Sequence[Pieces] = (),
+) -> Spots:
+    """Return positions in a problem's frame as marks on the Earth.
+
+    Parameters
+    ----------
+    problem : Problem
+        Gives the frame.
+    position, covariance : array (n, d), (n, d, d)
+        Metres, square metres.
+    clean : bool array (n,)
+        Where the status is ok.
+    text : sequence of n str
+        What is told of each.
+    outlines : sequence of n tuples of array (v, d), optional
+        Convex parts of the regions that no ellipse covers; empty for the others.
+    """
     angle = np.linspace(0.0, 2.0 * np.pi, _RING)
     circle = np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    rings = []
-    for centre, spread in zip(position, covariance, strict=True):
+    rings: list[Array] = []
+    more: list[Array] = []
+    for centre, spread, pieces in zip(position, covariance, outlines or [()] * len(position), strict=True):
         if not (np.isfinite(centre).all() and np.isfinite(spread).all()):
             rings.append(np.zeros((0, 2)))
             continue
         # The ellipse of east and north, whatever the height is worth.
         axes = problem.frame.enu_axes(centre)[:2]
+        if pieces:
+            lines = [degrees(problem, centre + line @ axes) for line in around([(p - centre) @ axes.T for p in pieces])]
+            lines.sort(key=len, reverse=True)
+            rings.append(lines[0])
+            more += lines[1:]
+            continue
         semi_axes, directions = error_ellipse(axes @ spread @ axes.T)
         rings.append(degrees(problem, centre + circle * semi_axes @ directions.T @ axes))
-    return Spots(degrees(problem, position), tuple(rings), clean, tuple(text))
+    return Spots(degrees(problem, position), tuple(rings), clean, tuple(text), tuple(more))
 
 
 def degrees(problem: Problem, position: Array) -> Array:
@@ -296,7 +330,7 @@ def fixed_spots(problem: Problem, fixes: Sequence[Fix], labels: Sequence[str]) -
     told = status if len(status) == len(position) else ["" if ok else "status not ok" for ok in clean]
     sigma = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
     sentences = [sentence(*each) for each in zip(named, told, degrees(problem, position), sigma, strict=True)]
-    return spots(problem, position, covariance, clean, sentences)
+    return spots(problem, position, covariance, clean, sentences, outlines_of(problem, fixes, len(position)))
 
 
 def sentence(name: str, status: str, place: Array, sigma: float) -> str:

@@ -118,7 +118,7 @@ def _page(problem: Problem, found: Spots, others: Spots, title: str, what: str, 
     if focus := _focus(found, plane, middle):
         # One can zoom until the part fills a tenth of the width, at least as far as on maps without one.
         data = {"focus": focus, "nearest": max(200.0, 10.0 * 2.0 * float(plane.half[0]) / focus[2])}
-    text = f"Stations (white), {what} (blue; orange where the status is not ok) with 95 % ellipses. Point at a mark."
+    text = f"Stations (white), {what} (blue; orange where the status is not ok) with what holds 95 %. Point at a mark."
     canvas = map_canvas(plane, "map-1", title, layers, data, text)
     note = "Drag to move, wheel or pinch to zoom. Shores: Natural Earth."
     return write_page(title, [Part("map", "Map", maps=[canvas], note=note)])
@@ -173,7 +173,7 @@ def _station(name: str, x: float, y: float, tell: str) -> tuple[Drawn, ...]:
 
 
 def _ellipses(found: Spots, plane: Plane, middle: float) -> list[Drawn]:
-    rings = [plane(_turn(ring, middle)) for ring in found.rings if len(ring)]
+    rings = [plane(_turn(ring, middle)) for ring in (*found.rings, *found.more) if len(ring)]
     if not rings or len(found.rings) > _ELLIPSES:
         return []
     return [Curve("ring", path(rings, close=True, digits=_DIGITS), BLUE)]

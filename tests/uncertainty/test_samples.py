@@ -156,7 +156,7 @@ def test_samples_along_an_arc_are_the_likelihood(name):
 
 
 def compared(names, n):
-    """Return the log density at the truth of mixtures less that of the chart, and less that of the Gaussian in metres."""
+    """Return the log density at the truth of mixtures less that of the chart, and less that in metres."""
     out = []
     for name in names:
         for item in range(n):
