@@ -257,7 +257,8 @@ def test_every_epoch_is_fixed_as_if_it_were_alone(moving, uncertain):
         assert np.allclose(fix.covariance()[k], own.covariance(), rtol=1e-5)
         assert fix.cost[k] == pytest.approx(float(own.cost), rel=1e-5, abs=1e-8)
         assert fix.dof[k] == own.dof
-    good = fix.code == Status.OK
+    # station errors enter angles in a way that depends on the place, which is more than the proof covers
+    good = fix.code == (Status.UNPROVEN if uncertain else Status.OK)
     assert good.sum() >= K - 1
     error = (fix.position - path)[good]
     squared = np.einsum("kd,kde,ke->k", error, np.linalg.inv(fix.covariance()[good]), error)

@@ -28,7 +28,7 @@ def test_its_python_runs(capsys):
     (block,) = re.findall(r"^```python\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
     exec(compile(block, "README.md", "exec"), {})
     said = capsys.readouterr().out
-    assert said.startswith("ok [23817. 17844.  2008.]")
+    assert said.startswith("ok [23811. 17855.  2042.]")
     assert "no position costs less" in said
 
 

@@ -13,7 +13,7 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
 from optloc.track.dynamics import Dynamics, polynomial
-from optloc.track.track import State, Track, check_trackable, collect, scans
+from optloc.track.track import State, Track, check_trackable, collect, scans, status_of_scans
 from optloc.track.updates import Updated, joseph, whitened
 
 
@@ -90,7 +90,8 @@ def smoothed(problem: Problem, order: int, *, method: str = "auto") -> Track:
     -------
     Track
         States at the scans given all of them. `nis` is what the rows of a scan add to the chi-square of the fit, and
-        the status of all scans is that of the fit, but for those without a row.
+        the status of all scans is that of the fit (see `optloc.track.track.status_of_scans`), but for those without a
+        row.
 
     Raises
     ------
@@ -98,6 +99,7 @@ def smoothed(problem: Problem, order: int, *, method: str = "auto") -> Track:
         For an unknown order, or a run that is not one target's.
     """
     fix = fitted(problem, order, method=method)
+    told = status_of_scans(fix)
     state = State(float(problem.times[-1]), *(np.asarray(part) for part in (fix.x, fix.cov)))
     mean, cov = along(state, problem.times, problem.dimension)
     steps = []
@@ -113,7 +115,7 @@ def smoothed(problem: Problem, order: int, *, method: str = "auto") -> Track:
             white = whitened(scan, at)
             square = (white.residual**2).sum(-1)
         found = Updated(at, spread, square, -0.5 * (square + white.logdet), np.broadcast_to(white.count, none.shape))
-        code = np.where(white.count > 0, fix.code, int(Status.TOO_FEW_ROWS)).astype(np.int8)
+        code = np.where(white.count > 0, told, int(Status.TOO_FEW_ROWS)).astype(np.int8)
         steps.append((found, np.broadcast_to(code, none.shape)))
     return collect(np.asarray(problem.times), steps, problem.dimension)
 

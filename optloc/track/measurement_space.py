@@ -13,12 +13,11 @@ from optloc.linear.normal import linearise
 from optloc.models import MODELS
 from optloc.problem import noise as noises
 from optloc.problem.epochs import by_epoch, cut
-from optloc.problem.fix import Fix
 from optloc.problem.noise import Block, Noise
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
 from optloc.solvers.starts.angles import course_starts, pair
-from optloc.track.track import Track, check_trackable
+from optloc.track.track import Track, check_trackable, status_of_scans
 
 # What a scan of the simplified recursion holds, in the order of its state: range, azimuth, elevation.
 _KINDS = ("range_sum", "azimuth", "elevation")
@@ -190,21 +189,15 @@ def _solve_scans(scan: Problem) -> tuple[Array, Array]:
         last = solve(flat.take(np.arange(count - 1, size, count)))
         start, doubt = np.repeat(last.position, count, axis=0), np.repeat(last.has(Status.AMBIGUOUS), count)
     fix = solve(flat, "lsr", start=np.where(np.isfinite(start), start, 0.0))
-    position, code = np.array(fix.position), _status_of_scans(fix)
+    position, code = np.array(fix.position), status_of_scans(fix)
     # Another place that explains the last epoch may explain the others.
     code = np.where((code == Status.OK) & doubt, Status.AMBIGUOUS, code)
     # Early epochs may be too far from there: these are solved without a start.
     again = np.flatnonzero((code != Status.OK) & (code != Status.AMBIGUOUS))
     if len(again):
         redone = solve(flat.take(again))
-        position[again], code[again] = redone.position, _status_of_scans(redone)
+        position[again], code[again] = redone.position, status_of_scans(redone)
     return position.reshape(*shape, -1), code.reshape(shape)
-
-
-def _status_of_scans(fix: Fix) -> Array:
-    """Return the statuses (...) of fixes as those of a track, in which a place that is alone needs no proof."""
-    alone = fix.answered & ~fix.has(Status.MISFIT, Status.UNBOUNDED, Status.AMBIGUOUS)
-    return np.where(alone, int(Status.OK), fix.code).astype(np.int8)
 
 
 # One receiver and one illuminator: the simplified recursion in range, azimuth and elevation.

@@ -10,6 +10,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Motion, Status
 from optloc.problem.epochs import cut
+from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.track.dynamics import Dynamics
 from optloc.track.updates import Update, Updated, filter_of
@@ -260,3 +261,9 @@ def check_state(state: State, n: int) -> None:
         raise InvalidProblem("the state is not finite", "start", "start from a fix that has an answer")
     if (np.linalg.eigvalsh(state.cov)[..., 0] < -_NEGATIVE * np.abs(state.cov).max((-1, -2))).any():
         raise InvalidProblem("the covariance is not positive semidefinite", "start", "give a true covariance")
+
+
+def status_of_scans(fix: Fix) -> Array:
+    """Return the statuses (...) of fixes as those of a track's scans: a place that is alone needs no proof."""
+    alone = fix.answered & ~fix.has(Status.MISFIT, Status.UNBOUNDED, Status.AMBIGUOUS)
+    return np.where(alone, int(Status.OK), fix.code).astype(np.int8)

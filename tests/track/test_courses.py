@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from verdicts import alone
 
 import optloc
 from optloc import InvalidProblem, Status
@@ -42,7 +43,7 @@ def test_the_whole_track_fit_of_simulation_1():
     least = np.sqrt(np.diagonal(cov).reshape(3, 2).sum(-1))
     assert least == pytest.approx([0.01129, 6.00e-4, 1.63e-5], rel=1e-3)
     fix = fitted(run, 2)
-    assert (fix.code == Status.OK).all()
+    assert alone(fix).all()
     error = fix.x - STRAIGHT.truth[-1]
     assert parts(error) == pytest.approx(least, rel=0.10)
     nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(fix.cov), error)
@@ -99,7 +100,7 @@ def turning(turns, sigma, trials, seed):
 def test_one_observer_that_turns_sees_the_course(sigma):
     runs, truth = turning(True, sigma, 200, 1)
     fix = optloc.solve(runs)
-    assert (fix.code == Status.OK).all()
+    assert alone(fix).all()
     error = fix.x - truth
     nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(fix.cov), error)
     assert nees.mean() == pytest.approx(4.0, abs=4.0 * np.sqrt(8.0 / 200))
@@ -110,7 +111,7 @@ def test_one_observer_that_turns_sees_the_course(sigma):
 
 def test_one_observer_that_goes_straight_on_is_told_so():
     runs, _ = turning(False, 1e-3, 20, 1)
-    assert not (optloc.solve(runs).code == Status.OK).any()
+    assert not alone(optloc.solve(runs)).any()
 
 
 @pytest.mark.parametrize(
@@ -131,7 +132,7 @@ def test_no_course_is_better_than_the_fit_without_a_guess(d, stations, epochs, s
     truth = np.concatenate([part[:, :d] for part in state[: order + 1]], axis=1)
     drawn = optloc.simulate(problem, truth, 7)
     fix, best = optloc.solve(drawn), optloc.solve(drawn, "lsr", start=truth)
-    assert (fix.code == Status.OK).all()
+    assert alone(fix).all()
     assert (fix.cost <= best.cost + 1e-6 * (1.0 + best.cost)).all()
 
 
