@@ -59,7 +59,9 @@ def test_moments_reach_the_cost_of_every_kind_of_range(kind):
     assert (found.scope == "global").all(), found.reason
     assert (found.bound <= fix.cost + 1e-7 * (1.0 + fix.cost)).all()
     assert found.tight(fix.cost).all(), fix.cost - found.bound
-    assert (np.linalg.norm(found.point - fix.position, axis=1) < 1.0).all()
+    # along the weakest axis the cost is flat: what the solver leaves is a share of sigma there, not of a metre
+    sigma = np.sqrt(np.trace(fix.covariance(), axis1=1, axis2=2))
+    assert (np.linalg.norm(found.point - fix.position, axis=1) < 0.2 * sigma).all()
 
 
 def test_directions_reach_the_cost_of_angles():

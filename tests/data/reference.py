@@ -11,8 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from data.windows import quantiles, report, statuses
+from verdicts import alone
 
-from optloc import Fix, Status
+from optloc import Fix
 
 Residual = Callable[[np.ndarray], np.ndarray]
 
@@ -108,5 +109,5 @@ def never_a_worse_minimum(name: str, fix: Fix, reference: Reference) -> None:
     """Assert that no answer costs more than the minimum that the truth leads to."""
     excess = fix.cost - reference.cost * (1.0 + 1e-6)
     worse = np.flatnonzero(fix.answered & (excess > 1e-6))
-    silent = worse[fix.code[worse] == Status.OK]
+    silent = worse[alone(fix)[worse]]
     assert not len(worse), f"{name}: the truth leads to a better minimum in {worse}, {len(silent)} of them silent"

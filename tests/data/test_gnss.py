@@ -7,6 +7,7 @@ import pytest
 from data import truths
 from data.reference import law, listed
 from data.windows import quantiles, report, statuses
+from verdicts import alone
 
 from optloc import Status, solve
 from optloc.datasets import gnss
@@ -63,12 +64,12 @@ def test_three_satellites_and_the_height(session, case):
     # Beyond 90 deg from the receiver three satellites may still be in sight: two exact answers, nothing tells which.
     beyond = fix.answered & (fix.position @ data.truth < 0.0)
     report(f"   {beyond.sum()} fixes in the other hemisphere, all with the right one beside them")
-    assert np.all(fix.code[beyond] == Status.AMBIGUOUS)
+    assert np.all(fix.has(Status.AMBIGUOUS)[beyond])
     assert np.all(near[beyond])
     assert beyond.mean() < 0.005
-    silent = np.flatnonzero((fix.code == Status.OK) & ~right)
-    assert not len(silent), f"{name}: says ok and is not the minimum that the truth leads to: {silent}"
-    assert near[fix.code == Status.AMBIGUOUS].all(), name
+    silent = np.flatnonzero(alone(fix) & ~right)
+    assert not len(silent), f"{name}: is alone and is not the minimum that the truth leads to: {silent}"
+    assert near[fix.has(Status.AMBIGUOUS)].all(), name
 
 
 def test_the_elevation_mask_leaves_fewer_answers(data_dir):
@@ -80,9 +81,9 @@ def test_the_elevation_mask_leaves_fewer_answers(data_dir):
     )
     report(f"GNSS, 100 draws: {statuses(free)}; with the mask of 10 deg known: {statuses(masked)}")
     assert masked.answered.all()
-    assert (masked.code == Status.AMBIGUOUS).sum() < (free.code == Status.AMBIGUOUS).sum()
+    assert masked.has(Status.AMBIGUOUS).sum() < free.has(Status.AMBIGUOUS).sum()
     near = listed(masked, lambda x: np.linalg.norm(x - reference.position, axis=-1)) < 1.0
     assert near.all()
     # Draw 4 has a second answer 103 deg away, which one of its satellites would not have reached.
-    assert free.code[4] == Status.AMBIGUOUS
-    assert masked.code[4] == Status.OK
+    assert free.has(Status.AMBIGUOUS)[4]
+    assert alone(masked)[4]

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.stats import chi2
+from verdicts import alone
 
 from optloc import Fix, Status
 from optloc.datasets.reading import Window, Windows
@@ -48,7 +49,7 @@ def statuses(fix: Fix) -> str:
 def judge(data: Windows, fix: Fix, limit: float = 5.0) -> tuple[float, float]:
     """Assert what must hold for the fixes of a data set made without a guess; print and return median and 95 % error.
 
-    `limit` is the error in metres from which on a fix that says ok is called silently wrong.
+    `limit` is the error in metres from which on a fix with nothing against it is called silently wrong.
     """
     answered = fix.answered
     error = np.linalg.norm(fix.position - data.truth, axis=-1)
@@ -65,7 +66,7 @@ def judge(data: Windows, fix: Fix, limit: float = 5.0) -> tuple[float, float]:
     assert ours[1] <= 1.05 * theirs[1], data.name
     worse = answered & (fix.cost > cost * (1.0 + 1e-6) + 1e-6)
     assert not worse.any(), f"{data.name}: the truth leads to a better minimum in windows {np.flatnonzero(worse)}"
-    wrong = (fix.code == Status.OK) & ~(error <= limit)
+    wrong = alone(fix) & ~(error <= limit)
     assert not wrong.any(), f"{data.name}: silently wrong in windows {np.flatnonzero(wrong)}"
     dof = np.array([len(w.z) - data.stations.shape[1] for w in data.windows])
     assert np.array_equal(fix.dof[answered], dof[answered])
