@@ -48,6 +48,7 @@ __all__ = [
     "MODELS",
     "SOLVERS",
     "Accuracy",
+    "Advice",
     "Alternatives",
     "Arc",
     "Bias",
@@ -85,6 +86,7 @@ __all__ = [
     "Status",
     "Suspect",
     "accuracy",
+    "advise",
     "assemble",
     "by_epoch",
     "certify",
@@ -149,6 +151,10 @@ def __getattr__(name: str) -> Any:
         from optloc import several  # scipy.optimize is loaded when emitters are told apart
 
         return getattr(several, name)
+    if name in ("Advice", "advise"):
+        from optloc.adequacy import advice  # only who has something to mend needs it
+
+        return getattr(advice, name)
     if name == "datasets":
         return import_module("optloc.datasets")
     raise AttributeError(f"module 'optloc' has no attribute {name!r}")

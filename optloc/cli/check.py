@@ -1,4 +1,4 @@
-"""What ``optloc check`` does: say what a file holds, and how healthy its stations are."""
+"""What ``optloc check`` does: say what a file holds, how healthy its stations are, and what may be wrong."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from optloc.adequacy.geometry import Advice
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Bias
+from optloc.cli.causes import advice_for_vectors, advice_json, show_advice
 from optloc.cli.file_fixes import CHUNK
 from optloc.cli.fix import grouping_of
 from optloc.cli.output import Columns, bar, dumps, records, say_all, with_sigma, write_picture, write_table, write_text
@@ -46,8 +48,10 @@ def run_check(file: Path, as_json: bool, asked: Asked | None = None, *, quiet: b
     loaded = read(file, values=False)
     found = summary(loaded)
     checked = _health(loaded, asked, quiet or as_json)
+    told = _advice(loaded, checked)
     if as_json:
-        write_text(Path("-"), dumps(found if checked is None else found | {"health": _health_json(checked)}))
+        more = {} if checked is None else {"health": _health_json(checked)}
+        write_text(Path("-"), dumps(found | more | {"advice": advice_json(told)}))
     elif not quiet:
         table = Table(title=loaded.title, show_header=False, title_justify="left")
         for name, value in found.items():
@@ -55,6 +59,7 @@ def run_check(file: Path, as_json: bool, asked: Asked | None = None, *, quiet: b
         Console().print(table)
         if checked is not None:
             _show_health(checked, Console())
+        show_advice(told, Console())
     return 1 if found["epochs_with_too_few_rows"] or found["epochs_with_disconnected_pairs"] else 0
 
 
@@ -77,6 +82,20 @@ def _health(loaded: Loaded, asked: Asked, quiet: bool) -> Checked | None:
     if asked.plot is not None:
         _draw_health(checked, loaded.title, asked.plot)
     return checked
+
+
+def _advice(loaded: Loaded, checked: Checked | None) -> tuple[Advice, ...]:
+    """Return what geometry, and where epochs are solved their values, suggest."""
+    vectors = None if checked is None else checked.vectors
+    problem = loaded.problem
+    if checked is None:
+        # the file was only to be read: what it says of values is not looked at
+        problem = problem.with_rows(z=np.full_like(problem.z, np.nan))
+    elif problem.epochs == 1 and np.isfinite(problem.z[problem.weight > 0.0]).all():
+        from optloc.solvers import solve
+
+        vectors = solve(problem).x
+    return advice_for_vectors(problem, vectors)
 
 
 def _spell(value: Any) -> str:
@@ -201,10 +220,11 @@ def _spread(position: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """Health of the stations of a file, or why there is none."""
+    """Health of the stations of a file, or why there is none; the vectors (k, size) of its epochs, where solved."""
 
     health: Health | None
     why: str = ""
+    vectors: Array | None = None
 
 
 def _check_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
@@ -219,7 +239,7 @@ def _check_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
     if not np.isfinite(problem.z[problem.weight > 0.0]).all():
         return Checked(None, "station health needs measured values")
     try:
-        return Checked(_solve_health(loaded, method, by, quiet))
+        return _solve_health(loaded, method, by, quiet)
     except InvalidProblem as error:
         # A wrong word is the user's error; data that cannot tell are a sentence of the answer.
         if error.where in ("by", "method"):
@@ -227,14 +247,14 @@ def _check_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
         return Checked(None, f"station health could not be told: {error}".removesuffix("."))
 
 
-def _solve_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Health:
+def _solve_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
     from optloc.solvers import solve
 
     batch = batch_of(loaded.problem)
     count = batch.batch_shape[0]
     vectors, explained = np.full((count, batch.layout.size), np.nan), np.full(count, None, dtype=object)
     if not batch.layout.size:
-        return health_of(batch, (np.arange(count), np.zeros((count, 0))), by)
+        return Checked(health_of(batch, (np.arange(count), np.zeros((count, 0))), by))
     with bar(loaded.title, count, quiet) as advance:
         for first in range(0, count, CHUNK):
             items = np.arange(first, min(first + CHUNK, count))
@@ -248,7 +268,8 @@ def _solve_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Health:
     if not len(kept):
         raise InvalidProblem("no epoch has a fix", loaded.source, "see `optloc fix` for the reasons")
     asked = any(each is not None for each in explained)
-    return health_of(batch, (kept, vectors[kept]), by, explained if asked else None)
+    health = health_of(batch, (kept, vectors[kept]), by, explained if asked else None)
+    return Checked(health, vectors=vectors if separable(loaded.problem) else None)
 
 
 def _health_columns(health: Health) -> Columns:

@@ -15,6 +15,7 @@ from rich.text import Text
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import ANSWERED, Array, Status
+from optloc.cli.causes import advice_for_fixes, advice_json, show_advice
 from optloc.cli.file_fixes import (
     FileFixes,
     active_of,
@@ -74,11 +75,15 @@ def run_fix(
 
         labels = [str(label) for label in found.columns["epoch"]]
         write_text(html, fix_page(found.loaded.problem, found.fixes, found.loaded.title, labels))
+    # many statuses are told by their own sentence; causes take a search, which only readers need
+    told = advice_for_fixes(found) if as_json or not quiet else ()
     if as_json:
-        write_text(Path("-"), dumps(fixes_json(found) | ({} if levels is None else {"noise": _levels_json(levels)})))
+        noise_found = {} if levels is None else {"noise": _levels_json(levels)}
+        write_text(Path("-"), dumps(fixes_json(found) | {"advice": advice_json(told)} | noise_found))
     elif not quiet:
         console = Console(stderr=on_output)
         show(found, console)
+        show_advice(told, console)
         if levels is not None:
             _show_levels(levels, console)
     return 0 if found.passes(allow) else 1

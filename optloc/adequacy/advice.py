@@ -1,0 +1,171 @@
+"""Why a fix is not ok, as far as geometry, readings of the values and score tests can name it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from optloc.adequacy.geometry import Advice, advise_on_geometry
+from optloc.adequacy.misread import advise_on_values
+from optloc.adequacy.refit import fit_anywhere, one_place
+from optloc.adequacy.score import Explained, explain_misfit
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array
+from optloc.problem.epochs import by_epoch, cut, separable, tied
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
+
+# Explanations of a misfit that are told where several do as well.
+_SHOWN = 3
+# Rows of a run that are looked at: tests of twenty stations take a second or two with as many.
+_ROWS = 20_000
+
+
+def advise(problem: Problem, fix: Fix | None = None) -> Any:
+    """Return what may be why a fix is not `ok`, and the lines of a problem file or the option that would help.
+
+    Stations in a plane or on a line, no redundancy, values of another unit, sign or convention, and an offset, scale,
+    turn, drift or step of one channel, or of a whole kind, that explains what does not fit.
+
+    Parameters
+    ----------
+    problem : Problem
+        One problem, a run, or a batch (...) of problems.
+    fix : Fix, optional
+        Its fix, (k,) fixes of a run whose epochs share nothing, or those of the batch; None: what the geometry says,
+        and values by a fit of their own.
+
+    Returns
+    -------
+    tuple of Advice, or object array (...) of tuples
+        Empty where nothing is seen. Of data of a right model a score test names something once in a thousand times.
+
+    Raises
+    ------
+    InvalidProblem
+        Where the fix is not one of this problem.
+    """
+    shape = problem.batch_shape
+    if not shape:
+        return advise_at(problem, np.full((1, problem.layout.size), np.nan) if fix is None else fix.x)
+    flat, out = problem.flat(), np.empty(int(np.prod(shape)), dtype=object)
+    if fix is not None and fix.shape != shape:
+        raise InvalidProblem(f"fixes of shape {fix.shape} for problems of shape {shape}", "fix", "give its own")
+    x = np.full((len(out), problem.layout.size), np.nan) if fix is None else fix.flat().x
+    for i in range(len(out)):
+        out[i] = advise_at(flat.take(np.array([i])), x[i])
+    return out.reshape(shape)
+
+
+def advise_at(problem: Problem, x: Array) -> tuple[Advice, ...]:
+    """Return the advice for one problem at a vector (size,), or at those (k, size) of epochs that share nothing.
+
+    Parameters
+    ----------
+    problem : Problem
+        One problem or run.
+    x : array (size,) or (k, size of an epoch)
+        Least squares begin there; NaN where there is no fix.
+    """
+    problem, x = _shortened(*_without_unknown(problem.flat(), _joined(problem, np.asarray(x))))
+    found = list(advise_on_geometry(problem, x))
+    if not bool((problem.weight > 0.0).any()):
+        return tuple(found)
+    values = list(advise_on_values(problem, x))
+    if not np.isfinite(x).all() and one_place(problem):
+        x = fit_anywhere(problem).x
+    # what another reading explains needs no error besides
+    read = any(one.cause != "impossible" for one in values)
+    errors = [] if read else [_tell(problem, one) for one in explain_misfit(problem, x)[:_SHOWN]]
+    return (*values, *errors, *found)
+
+
+def _joined(problem: Problem, x: Array) -> Array:
+    """Return the parameter vector (1, size) of a problem, of its epochs together where they are fixed one by one."""
+    layout = problem.layout
+    if x.size == layout.size and x.ndim < 3 and not (separable(problem) and len(x) == problem.epochs > 1):
+        return x.reshape(1, -1)
+    if not separable(problem) or x.shape != (problem.epochs, by_epoch(problem).layout.size):
+        raise InvalidProblem(f"a fix of shape {x.shape} is not of this problem", "fix", "give the fix of this problem")
+    own = by_epoch(problem).layout
+    parts = [own.take(x, slot.name).reshape(problem.epochs, -1) for slot in layout.local]
+    return np.concatenate(parts, axis=1).reshape(1, -1)
+
+
+def _shortened(problem: Problem, x: Array) -> tuple[Problem, Array]:
+    """Return the first epochs of a long run: what lasts shows in them, and tests of all channels take time."""
+    if problem.count <= _ROWS or problem.epochs == 1 or tied(problem):
+        return problem, x
+    last = max(2, int(problem.epochs * _ROWS / problem.count))
+    n, length = problem.layout.n_shared, problem.layout.n_local
+    return cut(problem, 0, last), x[:, : n + last * length]
+
+
+def _without_unknown(problem: Problem, x: Array) -> tuple[Problem, Array]:
+    """Return the problem without values that are no numbers, and of a run without the epochs that have no fix."""
+    weight = np.where(np.isfinite(problem.z), problem.weight, 0.0)
+    n, length = problem.layout.n_shared, problem.layout.n_local
+    if problem.epochs > 1 and length and np.isfinite(x[:, :n]).all():
+        own = x[:, n:].reshape(-1, length)
+        lost = np.asarray(~np.isfinite(own).all(-1))
+        if lost.any() and not lost.all():
+            weight = np.where(lost[problem.epoch], 0.0, weight)
+            own = np.where(lost[:, None], np.mean(own[~lost], axis=0), own)
+            x = np.concatenate([x[:, :n], own.reshape(1, -1)], axis=1)
+    # an absent value may be anything, but no fit may meet it
+    rows = problem.with_rows(z=np.where(np.isfinite(problem.z), problem.z, 0.0), weight=weight)
+    return rows, x
+
+
+# What a score test has found, in words.
+
+
+def _tell(problem: Problem, one: Explained) -> Advice:
+    bias, who = one.candidate.bias, one.candidate
+    value, unit = _size(problem, one)
+    station = bias.members[0]
+    whose = f"station {station}" if who.per == "station" else f"all {station} rows"
+    rows = f" in its {who.kind} rows" if who.per == "station" and who.kind and len(problem.rows) > 1 else ""
+    kind = "step" if np.isfinite(who.since) else bias.form
+    named = {"offset": "an offset", "scale": "a scale error", "drift": "a drift", "rotation": "a turn of its axes"}
+    what = named.get(kind, "a step")
+    when = f" from t = {who.since:.6g} s on" if kind == "step" else ""
+    seen = f"{what} of {whose}{rows} of {value} {unit}{when} would explain the misfit: p = {one.p_after:.2g}"
+    seen += f" with it, {one.p_before:.2g} without"
+    if kind == "step":
+        return Advice("step", seen, "cut the run there, or give the rows from then on another station name")
+    return Advice(kind, seen, "look at that channel; model it until then", _lines(problem, one))
+
+
+def _size(problem: Problem, one: Explained) -> tuple[str, str]:
+    """Return the estimate with its standard deviation, and its unit; angles in degrees."""
+    slot = _unit(problem, one)
+    unit, scale = (slot.replace("rad", "deg"), np.degrees(1.0)) if "rad" in slot else (slot, 1.0)
+    if one.candidate.bias.form == "scale":
+        unit, scale = "%", 100.0
+    pairs = [f"{scale * v:+.4g} ± {scale * s:.2g}" for v, s in zip(one.value, one.sigma, strict=True)]
+    return ", ".join(pairs), unit
+
+
+def _unit(problem: Problem, one: Explained) -> str:
+    """Return the SI unit of a systematic error."""
+    larger = replace(problem, biases=(*problem.biases, one.candidate.bias))
+    return larger.layout.find(one.candidate.bias.name)[0].unit
+
+
+def _lines(problem: Problem, one: Explained) -> str:
+    """Return the lines of a problem file that model an error."""
+    who, bias = one.candidate, one.candidate.bias
+    taken = {each.name for each in problem.biases}
+    name = next(text for text in (bias.form, *(f"{bias.form} {i}" for i in range(2, 99))) if text not in taken)
+    lines = [f'name = "{name}"', f'form = "{bias.form}"', f'per = "{who.per}"']
+    lines += [f'kind = "{who.kind}"'] if who.kind else []
+    lines += [f"members = [{_quoted(bias.members[0])}]"] if who.per == "station" else []
+    return "\n".join(["[[biases]]", *lines]) + "\n"
+
+
+def _quoted(text: str) -> str:
+    """Return a name as TOML spells it."""
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

@@ -1,0 +1,214 @@
+"""What the places of stations and the number of rows leave open: mirror images, turns, and no redundancy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optloc.adequacy.refit import descend, one_place
+from optloc.base.linalg import centre_and_spread
+from optloc.base.types import Array
+from optloc.linear.constraints import violation
+from optloc.linear.normal import degrees_of_freedom
+from optloc.models import MODELS
+from optloc.problem.epochs import by_epoch, separable
+from optloc.problem.noise import variances
+from optloc.problem.problem import Problem
+
+
+@dataclass(frozen=True, slots=True)
+class Advice:
+    """What is seen in a problem that may be why its fix is not `ok`, and what helps.
+
+    Parameters
+    ----------
+    cause : str
+        A word for programs: "plane", "line", "redundancy", "mirror", "unit", "sign", "compass", "opposite",
+        "impossible", "offset", "scale", "rotation", "drift" or "step".
+    seen : str
+        What is seen, a sentence without its full stop.
+    advice : str
+        What to do about it, the same.
+    toml : str
+        Lines of a problem file that do it, to be put at its end or, where they are keys, into `[[measurements]]`;
+        empty where there is no such line.
+    """
+
+    cause: str
+    seen: str
+    advice: str
+    toml: str = ""
+
+
+# Chi-square by which stations off their plane, at the most, tell a place from its mirror image: below it nowhere do the
+# data tell the two apart by three sigma.
+_TOLD = 9.0
+# Distance, in standard deviations of the stations' own extent, is told as a share: a thousandth of it is a plane drawn
+# on paper, whatever the noise.
+_FLAT = 1e-3
+# Cosine from which a normal counts as an axis of the frame, so that a box is on one side of the plane.
+_ALONG = 0.999
+
+
+def advise_on_geometry(problem: Problem, x: Array) -> Iterator[Advice]:
+    """Yield what places and numbers of rows leave open.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of one problem or run.
+    x : array (1, size)
+        Its fix; NaN where there is none.
+    """
+    yield from _count_rows(problem)
+    yield from _see_mirror(problem, x)
+
+
+def _count_rows(problem: Problem) -> Iterator[Advice]:
+    """Yield what the least redundancy of the epochs lets anyone notice."""
+    alone = separable(problem)
+    dof = np.ravel(degrees_of_freedom(by_epoch(problem) if alone else problem))
+    least, k = int(dof.min()), len(dof)
+    if least > 1:
+        return
+    where = f"{int((dof == least).sum())} of {k} epochs have" if k > 1 else "the rows have"
+    if least < 0:
+        seen = f"{where} {-least} measurement{'s' if least < -1 else ''} fewer than unknowns"
+        yield Advice("redundancy", seen, "add rows, or state what is known: a height, a bias, a prior")
+    elif least == 0:
+        seen = f"{where} no redundancy: every set of values fits, a wrong one as well"
+        yield Advice("redundancy", seen, "add a row, better two: one shows that something is wrong, two show what")
+    else:
+        seen = f"{where} a redundancy of 1: an error would be noticed, and nobody could say which row has it"
+        yield Advice("redundancy", seen, "add a row")
+
+
+# Stations in a plane or on a line.
+
+
+@dataclass(frozen=True, slots=True)
+class _Shape:
+    """Stations about their middle: extents, root mean square, ascending, and their directions in columns."""
+
+    places: Array
+    centre: Array
+    extent: Array
+    axes: Array
+
+    @property
+    def height(self) -> Array:
+        """Return the distances (s,) of the stations from the plane or line that fits them best."""
+        return np.asarray((self.places - self.centre) @ self.axes[:, 0])
+
+
+def _shape(problem: Problem) -> _Shape | None:
+    """Return the shape of the stations whose rows are present; None where the rows tell more than ranges do."""
+    used, weight = set(), np.broadcast_to(problem.weight, (1, problem.count))[0]
+    for rows, start in zip(problem.rows, problem.starts, strict=True):
+        model = MODELS[rows.kind]
+        # angles and heights know above from below, and range rates of moving stations may
+        if model.axes or model.velocity or model.ecef or not model.stations:
+            return None
+        present = weight[start : start + rows.count] > 0.0
+        used |= {int(i) for index in (rows.a, rows.b)[: model.stations] for i in index[present]}
+    if len(used) < 2 or any(prior.name.startswith("position") for prior in problem.priors):
+        return None
+    places = problem.stations.position[..., sorted(used), :].reshape(-1, problem.dimension)
+    centre, _ = centre_and_spread(places)
+    values, vectors = np.linalg.eigh((places - centre).T @ (places - centre) / len(places))
+    return _Shape(places, centre, np.sqrt(np.maximum(values, 0.0)), vectors)
+
+
+def _noise(problem: Problem) -> float:
+    """Return the least standard deviation of rows that are lengths, metres; zero where there are none."""
+    sigma = np.sqrt(variances(problem.noise, problem.count)).reshape(-1, problem.count)[0]
+    weight = np.broadcast_to(problem.weight, (1, problem.count))[0]
+    lengths = np.concatenate([np.full(r.count, MODELS[r.kind].quantity == "length") for r in problem.rows])
+    own = sigma[lengths & (weight > 0.0) & (sigma > 0.0)]
+    return float(own.min()) if len(own) else 0.0
+
+
+def _see_mirror(problem: Problem, x: Array) -> Iterator[Advice]:
+    """Yield that the stations stand in a plane or on a line, or that the mirror image of a fix fits."""
+    shape = _shape(problem)
+    if shape is None or shape.extent[-1] == 0.0:
+        return
+    d, flat = problem.dimension, np.array([_is_flat(problem, shape, i) for i in range(problem.dimension)])
+    if d == 3 and flat[1]:
+        axis = _spell(shape.axes[:, -1])
+        seen = f"the stations stand on one line along {axis}: a turn about it changes no measurement"
+        yield Advice("line", seen, "add a station off the line, or a bearing or height")
+    elif flat[0]:
+        name = "plane" if d == 3 else "line"
+        seen = f"the stations stand {'in one plane' if d == 3 else 'on one line'} within the noise ({_off(shape)})"
+        seen += f": every place has a mirror image on the other side of the {name} that fits as well"
+        yield Advice(name, seen, _say_side(problem, shape)[0], _say_side(problem, shape)[1])
+    elif _mirror_fits(problem, shape, x):
+        name = "plane" if d == 3 else "line"
+        seen = f"the mirror image of the fix in the best {name} of the stations ({_off(shape)}) fits about as well"
+        yield Advice("mirror", seen, _say_side(problem, shape)[0], _say_side(problem, shape)[1])
+
+
+def _is_flat(problem: Problem, shape: _Shape, axis: int) -> bool:
+    """Return whether no place could be told from its mirror image across an axis by three sigma."""
+    height = (shape.places - shape.centre) @ shape.axes[:, axis]
+    # a mirror image changes a range by twice the height of the station at the most
+    noise = _noise(problem)
+    told = np.inf if noise == 0.0 else float(((2.0 * height / noise) ** 2).sum())
+    return bool(told < _TOLD or shape.extent[axis] < _FLAT**2 * shape.extent[-1])
+
+
+def _off(shape: _Shape) -> str:
+    off = np.sqrt((shape.height**2).mean())
+    return f"{off:.2g} m off it, over {shape.extent[-1]:.3g} m"
+
+
+def _mirror_fits(problem: Problem, shape: _Shape, x: Array) -> bool:
+    """Return whether the mirror image of a fix is another minimum that costs less than nine more."""
+    if not one_place(problem) or not np.isfinite(x).all():
+        return False
+    slot, _ = problem.layout.find("position")
+    part = slice(slot.start, slot.start + slot.size)
+    height = float((x[0, part] - shape.centre) @ shape.axes[:, 0])
+    other = np.array(x)
+    other[0, part] -= 2.0 * height * shape.axes[:, 0]
+    both, cost = descend(problem.take(np.zeros(2, dtype=int)), np.concatenate([x, other]))
+    after = (both[:, part] - shape.centre) @ shape.axes[:, 0]
+    inside = not problem.constraints or bool((violation(problem, both[1:]) <= 0.0).all())
+    # on the other side still, and not all the way back to the plane
+    return bool(
+        after[0] * after[1] < 0.0 and abs(after[1]) > 0.1 * abs(height) and cost[1] - cost[0] < _TOLD and inside
+    )
+
+
+def _say_side(problem: Problem, shape: _Shape) -> tuple[str, str]:
+    """Return what decides between the sides of the plane, and the lines that say it."""
+    if problem.constraints:
+        return "see whether a constraint decides between the two; or add a station off it, a bearing or a height", ""
+    normal = shape.axes[:, 0]
+    if problem.frame.geodetic:
+        advice = "say that the target is above ground, `--above-ground`, if that is known; or add a station off it"
+        return f"{advice}, a bearing or a height", '[[constraints]]\nkind = "above-ground"\n'
+    axis = int(np.argmax(np.abs(normal)))
+    if abs(normal[axis]) < _ALONG:
+        return "add a station off it, a bearing, or a constraint that the target meets on one side alone", ""
+    # the side is for the user to say: the line shows the upper one
+    low = ["-inf"] * problem.dimension
+    low[axis] = f"{float(shape.centre[axis]):.6g}"
+    high, bound = ["inf"] * problem.dimension, ",".join(low)
+    advice = f"say on which side the target is, here {'xyz'[axis]} above {low[axis]} m: "
+    advice += f"`--box={bound}:{','.join(high)}`; or add a station off it or a bearing"
+    box = f'[[constraints]]\nkind = "box"\nmin = [{", ".join(low)}]\nmax = [{", ".join(high)}]\n'
+    return advice, box
+
+
+def _spell(vector: Array) -> str:
+    return "(" + ", ".join(f"{v:.2f}" for v in vector) + ")"
+
+
+def without_silent(problem: Problem) -> Problem:
+    """Return a problem whose rows that are no numbers have weight zero."""
+    known = np.isfinite(problem.z)
+    return problem if known.all() else replace(problem.with_rows(weight=np.where(known, problem.weight, 0.0)))

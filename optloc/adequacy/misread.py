@@ -1,0 +1,275 @@
+"""Values that were read wrongly: units off by a thousand or by the speed of light, signs, compass bearings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optloc.adequacy.geometry import Advice
+from optloc.adequacy.refit import descend, fit_anywhere, one_place
+from optloc.base.linalg import centre_and_spread
+from optloc.base.types import Array, Rows
+from optloc.base.units import SPEED_OF_LIGHT, UNITS
+from optloc.linear.normal import degrees_of_freedom
+from optloc.models import MODELS
+from optloc.models.primitives import wrap
+from optloc.problem.epochs import by_epoch, separable
+from optloc.problem.fix import tail_probability
+from optloc.problem.noise import Block, Noise, variances
+from optloc.problem.problem import Problem
+
+# Probability of the chi-square test below which the values as they stand do not fit, that of the status `misfit`; and
+# from which they fit once read otherwise.
+_MISFIT, _FITS = 1e-4, 1e-3
+# Probability, over all readings together, that values without any meaning pass under one of them.
+_CHANCE = 1e-3
+# Standard deviations by which a value is beyond what is possible.
+_BEYOND = 6.0
+# Epochs of a run that are read otherwise: what all rows share shows in a few.
+_EPOCHS = 5
+# Readings that are told where several fit.
+_TOLD = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """Another way to read the values of some kinds: ``z -> shift + factor * z``.
+
+    Parameters
+    ----------
+    cause : str
+        As of `Advice`.
+    kinds : tuple of str
+        Whose values.
+    factor, shift : float
+        SI units and radians.
+    seen, advice : str
+        Sentences.
+    toml : str
+        Keys of ``[[measurements]]``.
+    """
+
+    cause: str
+    kinds: tuple[str, ...]
+    factor: float
+    shift: float
+    seen: str
+    advice: str
+    toml: str
+
+
+def advise_on_values(problem: Problem, x: Array) -> Iterator[Advice]:
+    """Yield how values were perhaps meant that do not fit as they were read.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of one problem or run, whose rows that are present are finite.
+    x : array (1, size)
+        Its fix; NaN where there is none.
+    """
+    batch = by_epoch(problem).flat() if separable(problem) else problem
+    # the first epochs with redundancy
+    items = np.flatnonzero(degrees_of_freedom(batch) > 0)[:_EPOCHS]
+    wrong = list(_impossible(problem))
+    if len(items) and one_place(batch):
+        own = batch.take(items)
+        start = x if len(batch.weight) == len(x) and x.shape[-1] == batch.layout.size else None
+        if bool(wrong) or _is_refuted(own, start if start is None else start[items]):
+            found = list(_explaining(own))
+            # what no reading explains is said all the same
+            yield from found or wrong
+            return
+    yield from wrong
+
+
+def _is_refuted(problem: Problem, start: Array | None) -> bool:
+    """Return whether the values as they stand do not fit any place that is found."""
+    return _p(problem, float(fit_anywhere(problem, start).cost.sum())) < _MISFIT
+
+
+def _p(problem: Problem, cost: float) -> float:
+    """Return the chi-square probability of a batch as a whole; zero where no fit was found."""
+    if not np.isfinite(cost):
+        return 0.0
+    return float(tail_probability(np.array([cost]), np.array([degrees_of_freedom(problem).sum()]))[0])
+
+
+def _explaining(problem: Problem) -> Iterator[Advice]:
+    """Yield the readings under which values fit that would not by chance, the most probable first."""
+    tried = list(_readings(problem))
+    found = []
+    for one in tried:
+        # noise that is stated in a unit of its own keeps its size
+        scaled, stated = _read(problem, one, False), _read(problem, one, True)
+        able = [other for other in (scaled, stated) if _by_chance(other) * 2.0 * len(tried) <= _CHANCE]
+        if not able or _is_impossible(able[0]):
+            continue
+        fitted = fit_anywhere(able[0])
+        costs = [fitted.cost] + [descend(other, fitted.x)[1] for other in able[1:]]
+        p = max(_p(problem, float(cost.sum())) for cost in costs)
+        if p >= _FITS:
+            found.append((p, one))
+    # feet and nanoseconds are so alike that both may pass: the better fit comes first
+    for p, one in sorted(found, key=lambda each: -each[0])[:_TOLD]:
+        yield Advice(one.cause, f"{one.seen} (p = {p:.2g})", one.advice, one.toml)
+
+
+# How values may be read.
+
+
+def _readings(problem: Problem) -> Iterator[Reading]:
+    lengths = tuple(r.kind for r in problem.rows if MODELS[r.kind].quantity == "length" and MODELS[r.kind].stations)
+    angles = tuple(r.kind for r in problem.rows if MODELS[r.kind].quantity == "angle")
+    for kind in lengths:
+        if MODELS[kind].ranges == (1, -1):
+            seen = f"the {kind} values fit with the opposite sign"
+            advice = "say which station is farther where the number is positive (leave the key out if it is there)"
+            yield Reading("sign", (kind,), -1.0, 0.0, seen, advice, 'positive = "b-farther"\n')
+    for group in dict.fromkeys((lengths, *((kind,) for kind in lengths))):
+        yield from _length_units(group) if group else ()
+    yield from _angle_readings(angles)
+
+
+def _length_units(kinds: tuple[str, ...]) -> Iterator[Reading]:
+    """Yield lengths times every ratio of two units, the SI unit first."""
+    table = {name: size * (SPEED_OF_LIGHT if name in _TIMES else 1.0) for name, size in UNITS["length"].items()}
+    what = " and ".join(kinds)
+    seen_before: list[float] = []
+    for said, size in table.items():
+        for meant, other in table.items():
+            ratio = other / size
+            if said not in _SAID or meant not in _MEANT or any(abs(ratio / old - 1.0) < 1e-6 for old in seen_before):
+                continue
+            if ratio == 1.0:
+                continue
+            seen_before.append(ratio)
+            seen = f"the {what} values fit as {meant} where {said} is said, {ratio:.4g} times as large"
+            pairs = [f"{a} for {b}" for b in table for a in table if abs(table[a] / table[b] / ratio - 1.0) < 1e-6]
+            advice = f"state their unit; by its size it may be {_either(pairs)}"
+            yield Reading("unit", kinds, ratio, 0.0, seen, advice, f'unit = "{meant}"\n')
+
+
+_TIMES = ("s", "ms", "us", "ns", "ps")
+# Units that files say, first that which they say by saying nothing, and units that are meant: feet by those who leave
+# the unit out, thousands by those who take the wrong prefix, times by those who forget the speed of light.
+_SAID = ("m", "s", "ns")
+_MEANT = ("m", "km", "mm", "ft", "s", "ms", "us", "ns")
+# Pairs of units that a sentence names.
+_SHOWN = 3
+
+
+def _either(pairs: list[str]) -> str:
+    return " or ".join(pairs[:_SHOWN])
+
+
+def _angle_readings(kinds: tuple[str, ...]) -> Iterator[Reading]:
+    """Yield azimuths of a compass or looking back, and angles in the other unit."""
+    bearings = tuple(kind for kind in kinds if kind == "azimuth")
+    turned = np.pi / 2
+    if bearings:
+        seen = "the azimuths do not meet as they are read, from east counter-clockwise or as stated, and they do as"
+        advice = "state the convention; where it is stated already, leave it out"
+        key = 'azimuth = "north-clockwise"\n'
+        yield Reading("compass", bearings, -1.0, turned, f"{seen} compass bearings", advice, key)
+        seen = "the azimuths meet behind the stations: they point from the target to the station"
+        advice = "take half a turn off"
+        yield Reading("opposite", bearings, 1.0, np.pi, seen, advice, 'correction = "180 deg"\n')
+    for said, meant, factor in (("rad", "deg", np.pi / 180.0), ("deg", "rad", 180.0 / np.pi)):
+        if kinds:
+            seen = f"the {' and '.join(kinds)} values fit as {meant} where {said} is said"
+            key = f'unit = "{meant}"\n'
+            yield Reading("unit", kinds, factor, 0.0, seen, "state their unit", key)
+        if bearings and said == "rad":
+            seen = "the azimuths fit as compass bearings in degrees where radians from east are said"
+            both = f'{key}azimuth = "north-clockwise"\n'
+            yield Reading("compass", bearings, -factor, turned, seen, "state unit and convention", both)
+
+
+def _read(problem: Problem, reading: Reading, stated: bool) -> Problem:
+    """Return the problem with values read otherwise; `stated`: the noise has a unit of its own, and stays."""
+    size = np.ones(problem.count)
+    rows = []
+    for block, start in zip(problem.rows, problem.starts, strict=True):
+        if block.kind in reading.kinds:
+            block = _read_rows(block, reading)  # noqa: PLW2901  # the same rows, read otherwise
+            size[start : start + block.count] = 1.0 if stated else abs(reading.factor)
+        rows.append(block)
+    blocks = tuple(
+        Block(b.row, b.covariance * size[b.row][..., :, None] * size[b.row][..., None, :]) for b in problem.noise.blocks
+    )
+    return replace(problem, rows=tuple(rows), noise=Noise(blocks))
+
+
+def _read_rows(rows: Rows, reading: Reading) -> Rows:
+    z = reading.shift + reading.factor * rows.z
+    return replace(rows, z=z if MODELS[rows.kind].period is None else wrap(z))
+
+
+# What cannot be, and what may be by chance.
+
+
+def _reach(problem: Problem) -> float:
+    """Return the greatest distance between stations, to within a factor of two, metres."""
+    return 2.0 * float(np.max(centre_and_spread(problem.stations.places)[1]))
+
+
+def _by_chance(problem: Problem) -> float:
+    """Return the probability that values without meaning fit: each spare one within four sigma of where it could be.
+
+    Lengths could be anywhere within the array, angles anywhere on the circle.
+    """
+    sigma = np.sqrt(variances(problem.noise, problem.count)).reshape(-1, problem.count).max(0)
+    room = np.concatenate(
+        [np.full(r.count, np.pi if MODELS[r.kind].quantity == "angle" else _reach(problem)) for r in problem.rows]
+    )
+    share = np.minimum(1.0, 4.0 * sigma / np.maximum(room, 1e-300))
+    return float(np.median(share)) ** int(degrees_of_freedom(problem).sum())
+
+
+def _beyond(problem: Problem) -> Iterator[tuple[Rows, int, float]]:
+    """Yield kind, row and limit of differences larger than the distance of their stations, and negative ranges."""
+    sigma = np.sqrt(variances(problem.noise, problem.count)).reshape(-1, problem.count)
+    observed, weight = (np.reshape(a, (-1, problem.count)) for a in (problem.observed, problem.weight))
+    position = problem.stations.position
+    for rows, start in zip(problem.rows, problem.starts, strict=True):
+        ranges, part = MODELS[rows.kind].ranges, slice(start, start + rows.count)
+        if ranges not in ((1, -1), (1, 0), (1, 1)) or MODELS[rows.kind].emission or _is_biased(problem, part):
+            continue
+        moving = rows.epoch if position.shape[-3] > 1 else np.zeros_like(rows.epoch)
+        apart = np.zeros(rows.count)
+        if ranges[1]:
+            line = position[..., moving, rows.a, :] - position[..., moving, rows.b, :]
+            apart = np.sqrt((line**2).sum(-1)).reshape(-1, rows.count)[0]
+        value = observed[:, part] * np.ones((len(observed), 1))
+        over = np.abs(value) - apart if ranges == (1, -1) else apart - value
+        bad = (over > _BEYOND * sigma[:, part]) & (weight[:, part] > 0.0)
+        for i in np.flatnonzero(bad.any(0)):
+            yield rows, int(i), float(apart[i])
+
+
+def _is_biased(problem: Problem, part: slice) -> bool:
+    """Return whether a bias of the problem may take rows beyond what is possible."""
+    return any(((bias.row >= part.start) & (bias.row < part.stop)).any() for bias in problem.biases)
+
+
+def _is_impossible(problem: Problem) -> bool:
+    return next(_beyond(problem), None) is not None
+
+
+def _impossible(problem: Problem) -> Iterator[Advice]:
+    """Yield the first value that no place could have, and how many there are."""
+    found = list(_beyond(problem))
+    if not found:
+        return
+    rows, i, apart = found[0]
+    names, value = problem.stations.names, float(np.reshape(rows.z - rows.correction, (-1, rows.count))[0, i])
+    more = f"; so are {len(found) - 1} more" if len(found) > 1 else ""
+    if MODELS[rows.kind].ranges == (1, -1):
+        seen = f"the {rows.kind} of {names[rows.a[i]]} and {names[rows.b[i]]} is {value:.4g} m"
+        seen += f", and the two stand {apart:.4g} m apart: no place is that much farther from one{more}"
+    else:
+        seen = f"the {rows.kind} at {names[rows.a[i]]} is {value:.4g} m, less than any place can have{more}"
+    yield Advice("impossible", seen, "check the unit of the values and of the stations, and the stations' places")

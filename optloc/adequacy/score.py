@@ -1,0 +1,312 @@
+"""Score tests: would an offset, a scale, a turn, a drift or a step of one channel explain what does not fit?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optloc.adequacy.refit import descend
+from optloc.base.types import Array, Bias
+from optloc.compute.sums import equations_at
+from optloc.linear.constraints import exact, tangent_at
+from optloc.linear.normal import degrees_of_freedom, marginal
+from optloc.models import MODELS
+from optloc.problem.bias import Form, Per, family
+from optloc.problem.chart import quantile
+from optloc.problem.fix import tail_probability
+from optloc.problem.problem import Problem
+
+FALSE_ALARM = 1e-3
+"""Probability that data of a right model are accused by any of the tests together (Bonferroni)."""
+
+FITS = 1e-3
+"""Probability of the chi-square test from which what is left counts as explained."""
+
+# Candidates that are fitted after the tests have ranked them: a gross error bends the fix, and the culprit is then
+# among the first, not always the first.
+_FITTED = 8
+# Cost within which two explanations are told together: three sigma of one number.
+_RIVAL = 9.0
+# Costs that differ by less are equal but for where descents stop.
+_SAME = 1e-2
+# The simplest first.
+_FORMS: tuple[Form, ...] = ("offset", "scale", "drift", "rotation")
+# Share of its information that is left of a candidate once the other unknowns follow it, below which it is rounding.
+_OPEN = 1e-9
+# Relative size of an eigenvalue of scaled information that is rounding.
+_ROUNDING = 1e-12
+# Epochs of a run from which steps are looked for, and how many times of a step are tried.
+_STEP_EPOCHS, _STEP_TIMES = 6, 12
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """One systematic error that a problem does not model.
+
+    Parameters
+    ----------
+    bias : Bias
+        Of one member.
+    per : "station" or "kind"
+        Whether it belongs to one station or to all rows of a kind.
+    kind : str
+        Kind of the rows; empty where several are touched.
+    since : float
+        Time from which it lasts, seconds; NaN: all the time.
+    """
+
+    bias: Bias
+    per: Per
+    kind: str
+    since: float = float("nan")
+
+
+@dataclass(frozen=True, slots=True)
+class Explained:
+    """A systematic error that explains the misfit of a fix.
+
+    Parameters
+    ----------
+    candidate : Candidate
+        Which.
+    value, sigma : array (q,)
+        Estimate and standard deviation in SI units and radians; three angles of a turn in space.
+    score : float
+        Rao's statistic at the fix: chi-square of q degrees of freedom if there is no such error.
+    cost : float
+        What is left of the cost once it is estimated.
+    p_before, p_after : float
+        Chi-square probabilities without and with it.
+    """
+
+    candidate: Candidate
+    value: Array
+    sigma: Array
+    score: float
+    cost: float
+    p_before: float
+    p_after: float
+
+
+def explain_misfit(problem: Problem, x: Array) -> tuple[Explained, ...]:
+    """Return the systematic errors that explain the misfit of a fix, the best first; those that do as well follow.
+
+    An error is named where its score test rejects that there is none, at the level `FALSE_ALARM` over all tests, where
+    the cost falls by as much when it is estimated, and where what is left passes the chi-square test with redundancy
+    to spare.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of one problem; a run is taken as a whole.
+    x : array (1, size)
+        Its fix: least squares begin there.
+
+    References
+    ----------
+    C. R. Rao, "Large sample tests of statistical hypotheses concerning several parameters with applications to problems
+    of estimation", Math. Proc. Cambridge Philos. Soc. 44 (1948) 50-57.
+    """
+    dof = int(degrees_of_freedom(problem)[0])
+    found = candidates(problem)
+    if dof < 2 or not found or not np.isfinite(x).all():
+        return ()
+    x, cost = descend(problem, x)
+    before = float(tail_probability(cost, np.array([dof]))[0])
+    scores = score(problem, x, found)
+    level = 1.0 - FALSE_ALARM / len(found)
+    limit = np.array([quantile(level, max(1, size)) for _, _, size in scores])
+    values = np.array([one for one, _, _ in scores])
+    order = np.argsort(-np.where(values > limit, values - limit, -np.inf), kind="stable")[:_FITTED]
+    told = []
+    for i in order:
+        if values[i] <= limit[i] or dof - scores[i][2] < 1:
+            continue
+        own = _fitted(problem, x, found[i], scores[i])
+        after = float(tail_probability(own.cost + np.zeros(1), np.array([dof - scores[i][2]]))[0])
+        if after >= FITS and cost[0] - own.cost > limit[i]:
+            told.append(replace(own, p_before=before, p_after=after))
+    return _distinct(told)
+
+
+def _distinct(told: list[Explained]) -> tuple[Explained, ...]:
+    """Return explanations that cost about as little as the best, those first; of equal ones the simplest."""
+    # the same channel with the same cost is the same column: one row has an offset, a scale and a drift alike
+    simple = sorted(told, key=lambda one: (_FORMS.index(one.candidate.bias.form), np.isfinite(one.candidate.since)))
+    kept: list[Explained] = []
+    for one in simple:
+        same = [other for other in kept if other.candidate.bias.members == one.candidate.bias.members]
+        if not any(abs(other.cost - one.cost) < _SAME for other in same):
+            kept.append(one)
+    kept.sort(key=lambda one: one.cost)
+    return tuple(one for one in kept if one.cost <= kept[0].cost + _RIVAL)
+
+
+def candidates(problem: Problem) -> tuple[Candidate, ...]:
+    """Return the systematic errors that rows of a problem could have and that its biases do not hold already."""
+    names = problem.stations.names
+    present = np.broadcast_to(problem.weight, (1, problem.count))[0] > 0.0
+    out: list[Candidate] = []
+    for rows, start in zip(problem.rows, problem.starts, strict=True):
+        own = present[start : start + rows.count]
+        if not own.any():
+            continue
+        taken = MODELS[rows.kind].stations
+        heard = np.unique(np.concatenate([index[own] for index in (rows.a, rows.b)[:taken]] or [np.zeros(0, int)]))
+        for form in _forms(problem, rows.kind):
+            out.append(_candidate(problem, form, "kind", rows.kind, None))
+            out += [_candidate(problem, form, "station", rows.kind, names[i]) for i in heard if i >= 0]
+    out += list(_turns(problem, present))
+    return (*out, *_steps(problem, out))
+
+
+def _forms(problem: Problem, kind: str) -> Iterator[Form]:
+    yield "offset"
+    if MODELS[kind].period is None:  # an angle has no scale
+        yield "scale"
+    # a line through two epochs is two offsets
+    if len(np.unique(problem.times)) > 2 and np.isfinite(problem.times).all():
+        yield "drift"
+
+
+def _candidate(problem: Problem, form: Form, per: Per, kind: str | None, station: str | None) -> Candidate:
+    members = None if station is None else (station,)
+    names = problem.stations.names
+    bias = family(problem.rows, names, f"{form} that is tested", per=per, form=form, kind=kind, members=members)
+    return Candidate(bias, per, kind or "")
+
+
+def _turns(problem: Problem, present: Array) -> Iterator[Candidate]:
+    """Yield the turns of stations in space: those in the plane are offsets of the azimuth."""
+    angles = [
+        index
+        for rows, start in zip(problem.rows, problem.starts, strict=True)
+        if MODELS[rows.kind].axes
+        for index in rows.a[present[start : start + rows.count]].tolist()
+    ]
+    # three angles from fewer rows than four say nothing
+    if problem.dimension == 3:
+        for i in sorted(set(angles)):
+            if angles.count(i) > 3:
+                yield _candidate(problem, "rotation", "station", None, problem.stations.names[i])
+
+
+def _steps(problem: Problem, found: list[Candidate]) -> Iterator[Candidate]:
+    """Yield offsets of stations that begin in the middle of a run."""
+    k = problem.epochs
+    if k < _STEP_EPOCHS or not np.isfinite(problem.times).all():
+        return
+    epoch = problem.epoch
+    for first in np.unique(np.linspace(1, k - 1, min(k - 1, _STEP_TIMES)).round().astype(int)):
+        for one in found:
+            if one.bias.form == "offset" and one.per == "station":
+                later = epoch[one.bias.row] >= first
+                if later.any() and not later.all():
+                    touched = (one.bias.row[later], one.bias.member[later], one.bias.coefficient[later])
+                    bias = replace(one.bias, row=touched[0], member=touched[1], coefficient=touched[2])
+                    yield replace(one, bias=bias, since=float(problem.times[first]))
+
+
+# The tests themselves.
+
+
+def score(problem: Problem, x: Array, found: tuple[Candidate, ...]) -> list[tuple[float, Array, int]]:
+    """Return Rao's statistic, the estimate (q,) of one step and q of every candidate.
+
+    With the whitened residual r and columns J of the unknowns and c of the candidate, u = c - J J^+ c, the statistic is
+    ``(u'r)' (u'u)^-1 (u'r)``: what all other unknowns can take up is projected out.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of one problem.
+    x : array (1, size)
+        Its fix.
+    found : tuple of Candidate
+        What is tested.
+    """
+    larger = _with(problem, found)
+    at = _embed(problem, larger, x)
+    information, vector = _shared(larger, at)
+    own = [larger.layout.find(bias.name)[0] for bias in larger.biases[len(problem.biases) :]]
+    inside = np.concatenate([np.arange(slot.start, slot.start + slot.size) for slot in own])
+    rest = np.setdiff1d(np.arange(larger.layout.n_shared), inside)
+    space = np.eye(larger.layout.n_shared)[:, rest]
+    if face := exact(problem):
+        # along the equalities only: the other unknowns cannot leave them
+        along = tangent_at(problem, face, x).along[0]
+        old = [larger.layout.find(slot.name)[0].start + i for slot in problem.layout.shared for i in range(slot.size)]
+        space = np.zeros((larger.layout.n_shared, along.shape[1]))
+        space[old] = along
+    root = space @ _root(space.T @ information @ space)
+    out = []
+    for slot in own:
+        part = slice(slot.start, slot.start + slot.size)
+        coupling = root.T @ information[:, part]
+        left = information[part, part] - coupling.T @ coupling
+        pull = vector[part] - coupling.T @ (root.T @ vector)
+        told = np.diagonal(left) > _OPEN * np.diagonal(information[part, part])
+        inverse = _root(left)
+        inverse = inverse @ inverse.T if told.all() else np.zeros_like(left)
+        value = inverse @ pull
+        out.append((float(pull @ value), value, slot.size))
+    return out
+
+
+def _shared(problem: Problem, x: Array) -> tuple[Array, Array]:
+    """Return information (n, n) and vector (n,) of the shared unknowns of one problem, local ones eliminated."""
+    information, vector, _ = marginal(equations_at(problem, x))
+    return information[0], vector[0]
+
+
+def _root(matrix: Array) -> Array:
+    """Return B (n, r) with B B' the inverse of a matrix where it is regular: open directions are left out."""
+    if not len(matrix):
+        return matrix
+    scale = np.sqrt(np.maximum(np.diagonal(matrix), 0.0))
+    scale = np.where(scale > 0.0, 1.0 / np.where(scale > 0.0, scale, 1.0), 0.0)
+    values, vectors = np.linalg.eigh(matrix * scale[:, None] * scale)
+    kept = values > _ROUNDING
+    return np.asarray(scale[:, None] * vectors[:, kept] / np.sqrt(values[kept]))
+
+
+def _with(problem: Problem, found: tuple[Candidate, ...]) -> Problem:
+    """Return the problem with candidates among its biases, each under a name of its own."""
+    more = tuple(replace(one.bias, name=f"{one.bias.name} {i}") for i, one in enumerate(found))
+    return replace(problem, biases=(*problem.biases, *more))
+
+
+def _embed(problem: Problem, larger: Problem, x: Array) -> Array:
+    """Return vectors (N, size) of a problem with more biases, which are zero."""
+    shared, n = np.zeros((len(x), larger.layout.n_shared)), problem.layout.n_shared
+    for slot in problem.layout.shared:
+        new, _ = larger.layout.find(slot.name)
+        shared[:, new.start : new.start + new.size] = x[:, slot.start : slot.start + slot.size]
+    return np.concatenate([shared, x[:, n:]], axis=1)
+
+
+def _fitted(problem: Problem, x: Array, one: Candidate, scored: tuple[float, Array, int]) -> Explained:
+    """Return what a candidate explains once it is estimated with all other unknowns."""
+    larger = _with(problem, (one,))
+    slot, _ = larger.layout.find(larger.biases[-1].name)
+    part = slice(slot.start, slot.start + slot.size)
+    start = _embed(problem, larger, x)
+    # of a drift or turn that is large the step of the test is as good a start as none: the better descent counts
+    start = np.concatenate([start, start])
+    start[1, part] = scored[1]
+    both, cost = descend(larger.take(np.zeros(2, dtype=int)), start)
+    best = int(np.argmin(cost))
+    sigma = _sigma(larger, both[best][None], part)
+    return Explained(one, both[best, part], sigma, scored[0], float(cost[best]), np.nan, np.nan)
+
+
+def _sigma(problem: Problem, x: Array, part: slice) -> Array:
+    """Return the standard deviations (q,) of a part of the shared unknowns."""
+    information, _ = _shared(problem, x)
+    space = np.eye(len(information))
+    if face := exact(problem):
+        space = tangent_at(problem, face, x).along[0]
+    root = space @ _root(space.T @ information @ space)
+    return np.asarray(np.sqrt((root[part] ** 2).sum(-1)))
