@@ -144,7 +144,8 @@ def bound_pool(problem: Problem, pool: Pool, descend: Descend = by_least_squares
     sides = faces(problem)
     first = np.argmin(np.where(np.isfinite(pool.cost), pool.cost, np.inf), axis=1)
     needy = np.flatnonzero(broken[np.arange(len(first)), first])
-    kept = _without(pool, broken)
+    refused = np.where(broken & (pool.code == Status.OK), pool.cost, np.inf)
+    kept = replace(_without(pool, broken), hidden=_name_hidden(problem, pool.x, refused))
     # where the cheapest is feasible it is the answer, and without inequalities there is no other face
     if not len(needy) or sides == [exact(problem)]:
         return kept
@@ -155,10 +156,12 @@ def bound_pool(problem: Problem, pool: Pool, descend: Descend = by_least_squares
     x = np.full((size, width, pool.x.shape[-1]), np.nan)
     cost, code = np.full((size, width), np.inf), np.full((size, width), int(Status.INFEASIBLE), dtype=np.int8)
     face = np.zeros((size, width), dtype=int)
-    for array, place in ((x, 0), (cost, 1), (code, 2), (face, 3)):
+    beyond = np.full((size, width), np.inf)
+    for array, place in ((x, 0), (cost, 1), (code, 2), (face, 3), (beyond, 4)):
         array[needy] = np.concatenate([found[place] for found in on_faces], axis=1)
     return replace(
         kept,
+        hidden=_first_told(kept.hidden, _name_hidden(problem, x, beyond)),
         x=np.concatenate([kept.x, x], axis=1),
         cost=np.concatenate([kept.cost, cost], axis=1),
         code=np.concatenate([kept.code, code], axis=1),
@@ -197,7 +200,7 @@ def _cheapest(pool: Pool, items: Array) -> Array:
 def _on_face(
     problem: Problem, sides: list[Face], number: int, items: Array, starts: Array, descend: Descend
 ) -> tuple[Array, ...]:
-    """Return x, cost, code and face (items, q) of the minima on one face."""
+    """Return x, cost, code and face (items, q) of the minima on one face, and the costs of those that are refused."""
     shape = starts.shape[:2]
     cost, code = np.full(shape, np.inf), np.full(shape, int(Status.INFEASIBLE), dtype=np.int8)
     x = np.array(starts)
@@ -208,7 +211,69 @@ def _on_face(
     inside = (violation(part, x[row, slot]) <= TOLERANCE) & ~is_hidden(part, x[row, slot]) & np.isfinite(found)
     cost[row, slot] = np.where(inside, found, np.inf)
     code[row, slot] = np.where(inside, status, np.int8(Status.INFEASIBLE))
-    return x, cost, code, np.full(shape, number)
+    refused = np.full(shape, np.inf)
+    refused[row, slot] = np.where(inside | (status != Status.OK), np.inf, found)
+    return x, cost, code, np.full(shape, number), refused
+
+
+# What the Earth hides is told, not dropped.
+
+# Minima that a sentence places; the others are counted.
+_PLACED = 2
+# Two refinements of one minimum differ by less, relative to coordinates from the Earth's centre.
+_SAME = 1e-6
+
+
+def _name_hidden(problem: Problem, x: Array, cost: Array) -> Array | None:
+    """Return what lies behind the Earth and breaks no constraint, in words (N,), or None in plain Cartesian frames.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    x : array (N, q, size)
+        Candidates.
+    cost : array (N, q)
+        Their costs; infinite for those that are not refused.
+    """
+    if not problem.frame.geodetic or problem.dimension != 3:
+        return None
+    out = np.full(len(x), "", dtype=object)
+    item, slot = np.nonzero(np.isfinite(cost) & np.isfinite(x).all(-1))
+    part, points = problem.take(item), x[item, slot]
+    behind = is_hidden(part, points) & (violation(part, points) <= TOLERANCE)
+    for i in np.unique(item[behind]):
+        own = np.flatnonzero(behind & (item == i))
+        out[i] = _describe(problem, points[own], cost[i, slot[own]])
+    return out
+
+
+def _first_told(one: Array | None, other: Array | None) -> Array | None:
+    """Return the words (N,) of one where it has some, else of the other: a face is left where the inside has minima."""
+    return one if one is None or other is None else np.where(one != "", one, other)
+
+
+def _describe(problem: Problem, x: Array, cost: Array) -> str:
+    """Return how many minima (q, size) lie behind the Earth, what they cost, and where the best ones are."""
+    names = {motion: state_names(motion, len(problem.motions), 0)[0] for motion in range(len(problem.motions))}
+    slots = [slot for slot in problem.layout.shared if slot.name in names.values()]
+    kept: list[int] = []
+    for i in np.argsort(cost, kind="stable"):
+        if not any(np.abs(x[i] - x[j]).max() <= _SAME * np.abs(x[j]).max() for j in kept):
+            kept.append(int(i))
+    lines = (
+        f"{len(kept)} minima, the best of cost {cost[kept[0]]:.3g}, lie"
+        if len(kept) > 1
+        else (f"the only minimum, of cost {cost[kept[0]]:.3g}, lies")
+    )
+    text = f"{lines} behind the Earth as a satellite sees it"
+    if len(slots) != 1:
+        return text
+    places = []
+    for j in kept[:_PLACED]:
+        lat, lon, height = problem.frame.to_geodetic(x[j, slots[0].start : slots[0].start + 3])
+        places.append(f"{np.degrees(lat):.3f}, {np.degrees(lon):.3f} deg at {height:.4g} m")
+    return f"{text}: {'; '.join(places)}" + ("; ..." if len(kept) > _PLACED else "")
 
 
 def least_finished(pool: Pool) -> Array:

@@ -95,6 +95,8 @@ class Pool:
         What a stage has to say beside the status.
     certificate : object array (N,), optional
         `Certificate` of what is proven of the best candidates, None where nobody has tried.
+    hidden : object array (N,), optional
+        What lies behind the Earth, in words; "" where nothing does.
     asked : bool
         Whether contradictions were looked into.
     conclusion : object array (N,), optional
@@ -118,6 +120,7 @@ class Pool:
     searched: Annotated[Array, Axes(0, empty=False)] | None = None
     remark: Annotated[Array, Axes(0, empty="")] | None = None
     certificate: Annotated[Array, Axes(0, empty=None)] | None = None
+    hidden: Annotated[Array, Axes(0, empty="")] | None = None
     asked: bool = False
     conclusion: Annotated[Array, Axes(0, empty=None)] | None = None
 

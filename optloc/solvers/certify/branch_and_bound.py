@@ -12,7 +12,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.records import overwrite, present, take
 from optloc.base.types import Array, Band, Certificate
 from optloc.compute.jit import enabled
-from optloc.linear.constraints import exact
+from optloc.linear.constraints import TOLERANCE, exact, violation, violation_names
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
@@ -40,7 +40,8 @@ METHOD = "branch and bound"
 # Reasons for which nothing is proven.
 UNFINISHED = "the proof was not finished within its budget of boxes"
 UNSETTLED = "the rows do not make the fix a strict minimum that stands out from its neighbourhood"
-BARRED = "a position that costs less is not admitted: a constraint or the Earth forbids it"
+BARRED = "a position that costs less is not admitted: {}"
+LOST = "a position that costs less was met, and no minimum next to it was kept"
 HELD = "an inequality holds the fix, and the proof covers equalities only"
 REMOTE = "positions ever farther away explain the data about as well"
 TURNS = "angles may be a whole turn off with their biases at costs that matter"
@@ -384,8 +385,19 @@ def _add(work: Work, items: Array, points: Array, better: Array) -> None:
         work.pending[items[keep]] = new.answered[keep]
     stuck = np.flatnonzero(~changed)
     stuck = stuck[~_ignore(work, items[stuck], points[stuck])]
-    _give_up(work, items[stuck[better[stuck]]], BARRED)
+    _bar(work, items, points, stuck[better[stuck]])
     _lower(work, items[stuck[~better[stuck]]], UNFINISHED)
+
+
+def _bar(work: Work, items: Array, points: Array, barred: Array) -> None:
+    """Give up fixes beside which a point costs less that did not replace them, and say what forbids it."""
+    part = work.problem.take(items[barred])
+    x = vectors(part, points[barred, None])[:, 0]
+    broken, hidden = violation(part, x) > TOLERANCE, is_hidden(part, x)
+    names = violation_names(work.problem)
+    for item, breaks, behind in zip(items[barred], broken, hidden, strict=True):
+        why = f"a constraint forbids it ({names})" if breaks else "the Earth hides it from a satellite"
+        _give_up(work, np.array([item]), BARRED.format(why) if breaks or behind else LOST)
 
 
 def _ignore(work: Work, items: Array, points: Array) -> Array:

@@ -93,7 +93,7 @@ def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
         reason[i] = f"the refinement stopped {distance[i]:.3g} spreads of the stations away"
     for i in np.flatnonzero(weak):
         reason[i] = _open(problem, _information(curvature)[i])
-    _explain_missing(problem, np.flatnonzero(missing), code, reason)
+    _explain_missing(problem, pool, np.flatnonzero(missing), code, reason)
     finished = answered & (code == Status.OK)
     marks = np.where(finished, mark(problem, pool, gap), 1 << code.astype(np.int32)).astype(np.int32)
     certificate = np.where(finished, _claims(pool), fill(len(pool), UNKNOWN))
@@ -101,6 +101,8 @@ def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
         _hold_against_constraints(pool, cost, finished, marks, reason)
     code = first_status(marks)
     explain(problem, pool, code, gap, certificate, reason)
+    if pool.hidden is not None:
+        _name_hidden(pool.hidden, finished & (code == Status.MISFIT), reason)
     if pool.loss:
         _name_rejected(problem, pool, finished & is_improbable(cost, pool.dof, DOUBT), reason)
     if pool.asked:
@@ -148,16 +150,16 @@ def _open(problem: Problem, information: Array) -> str:
     return "; ".join(named) or weak_direction(problem, information)
 
 
-def _explain_missing(problem: Problem, items: Array, code: Array, reason: Array) -> None:
+def _explain_missing(problem: Problem, pool: Pool, items: Array, code: Array, reason: Array) -> None:
     """Write the status of problems without any candidate: what keeps every closed form from a start."""
     if not len(items):
         return
     barred = items[code[items] == Status.INFEASIBLE]
     for i in barred:
+        hidden = "" if pool.hidden is None else pool.hidden[i]
         bounds = violation_names(problem)
-        reason[i] = (
-            f"no minimum meets all of: {bounds}" if bounds else "the Earth hides every position from a satellite"
-        )
+        missed = f"no minimum meets all of: {bounds}" if bounds else "the Earth hides all that was found"
+        reason[i] = hidden or missed
     items = np.setdiff1d(items, barred)
     single = problem.epochs == 1 or problem.stations.position.shape[-3] == 1
     # the graph of ranges is that of one position: stations of a moving run link themselves
@@ -189,6 +191,12 @@ def _short(problem: Problem) -> str:
         if motion.known is None and motion.span == "run" and rows < needed:
             lacking.append(f"target {i} has {rows} measurement{'' if rows == 1 else 's'} for {needed} unknowns")
     return "; ".join(lacking[:_SHOWN]) if len(problem.motions) > 1 else ""
+
+
+def _name_hidden(hidden: Array, items: Array, reason: Array) -> None:
+    """Write what lies behind the Earth where nothing before it fits."""
+    for i in np.flatnonzero(items & (hidden != "")):
+        reason[i] = f"{reason[i]}; {hidden[i]}" if reason[i] else hidden[i]
 
 
 def _position(problem: Problem, pool: Pool) -> Array:

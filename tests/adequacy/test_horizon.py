@@ -1,0 +1,49 @@
+"""What the Earth hides is told with its cost, and a constraint is blamed only where there is one."""
+
+import numpy as np
+import pytest
+
+import optloc
+from optloc.base.frames import ECEF
+from optloc.base.types import Status
+from optloc.solvers.certify.branch_and_bound import BARRED, LOST
+
+UP = np.array([[1.0, 0.2, 0.1], [0.9, -0.3, 0.3], [0.8, 0.5, -0.3], [0.7, -0.4, -0.5], [0.6, 0.1, 0.8]])
+SATELLITES = 26.6e6 * UP / np.linalg.norm(UP, axis=1)[:, None]
+# Half a kilometre above the ellipsoid, on the side that no satellite sees.
+HIDDEN = np.array(ECEF.from_geodetic(np.radians(1.0), np.radians(178.0), 500.0))
+
+
+def heard(constraints=()):
+    rows = optloc.measured("range", a=np.arange(len(SATELLITES)), sigma=10.0)
+    template = optloc.assemble(SATELLITES, rows, frame=ECEF, constraints=list(constraints))
+    return optloc.simulate(template, truth=HIDDEN, seed=1)
+
+
+@pytest.mark.parametrize("bounds", [(), optloc.constraints.height(0.0, 20e3)], ids=["free", "height"])
+def test_a_hidden_minimum_is_told_with_cost_and_place(bounds):
+    fix = optloc.solve(heard(bounds), "gtrs+lsr")
+    reason = str(fix.reason)
+    assert fix.status == Status.INFEASIBLE
+    assert "the only minimum, of cost 0." in reason
+    assert "behind the Earth" in reason
+    assert "1.00" in reason  # its latitude
+    assert "178.00" in reason
+    assert "height" not in reason
+
+
+def test_a_misfit_before_the_horizon_tells_what_lies_behind_it():
+    fix = optloc.solve(heard())
+    assert fix.status == Status.MISFIT
+    assert "behind the Earth" in str(fix.reason)
+    assert fix.certificate.item().reason == BARRED.format("the Earth hides it from a satellite")
+
+
+def test_without_earth_and_constraint_nothing_is_said_to_forbid():
+    assert "constraint" not in LOST
+    assert "Earth" not in LOST
+    place = np.array([[0.0, 0.0], [9e3, 1e3], [8e3, 9e3], [1e3, 8e3], [5e3, 12e3]])
+    template = optloc.assemble(place, optloc.measured("range", a=np.arange(5), sigma=5.0), constraints=[])
+    for seed in range(5):
+        fix = optloc.solve(optloc.simulate(template, truth=[4e3, 3e3], seed=seed))
+        assert "forbids" not in fix.certificate.item().reason
