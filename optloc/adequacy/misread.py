@@ -87,6 +87,9 @@ def advise_on_values(problem: Problem, x: Array) -> Iterator[Advice]:
 
 def _is_refuted(problem: Problem, start: Array | None) -> bool:
     """Return whether the values as they stand do not fit any place that is found."""
+    near = np.inf if start is None or not np.isfinite(start).all() else float(descend(problem, start)[1].sum())
+    if _p(problem, near) >= _MISFIT:
+        return False
     return _p(problem, float(fit_anywhere(problem, start).cost.sum())) < _MISFIT
 
 

@@ -105,7 +105,7 @@ def fit_anywhere(problem: Problem, more: Array | None = None) -> Fitted:
     many = problem.take(np.repeat(np.arange(n), x.shape[1]))
     found, cost = (part.reshape(*x.shape[:2], -1) for part in descend(many, x.reshape(-1, layout.size)))
     away = found[..., slot.start : slot.start + slot.size] - centre[..., None, :]
-    far = np.sqrt((away**2).sum(-1)) > _FLAT * np.reshape(spread, (-1, 1))
+    far = np.abs(away).max(-1) > _FLAT * np.reshape(spread, (-1, 1))
     cost = np.where(far, np.inf, cost[..., 0])
     best, rows = cost.argmin(1), np.arange(n)
     return Fitted(found[rows, best], cost[rows, best])

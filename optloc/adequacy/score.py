@@ -29,8 +29,8 @@ FITS = 1e-3
 _FITTED = 8
 # Cost within which two explanations are told together: three sigma of one number.
 _RIVAL = 9.0
-# Costs that differ by less are equal but for where descents stop.
-_SAME = 1e-2
+# Costs that differ by less decide nothing between two forms of an error of one station: the simpler one is told.
+_SAME = 2.0
 # The simplest first.
 _FORMS: tuple[Form, ...] = ("offset", "scale", "drift", "rotation")
 # Share of its information that is left of a candidate once the other unknowns follow it, below which it is rounding.
@@ -115,8 +115,11 @@ def explain_misfit(problem: Problem, x: Array) -> tuple[Explained, ...]:
         return ()
     x, cost = descend(problem, x)
     before = float(tail_probability(cost, np.array([dof]))[0])
-    scores = score(problem, x, found)
     level = 1.0 - FALSE_ALARM / len(found)
+    # a statistic is the square of a projection of the residual: none is larger than the cost
+    if cost[0] <= quantile(level, 1):
+        return ()
+    scores = score(problem, x, found)
     limit = np.array([quantile(level, max(1, size)) for _, _, size in scores])
     values = np.array([one for one, _, _ in scores])
     order = np.argsort(-np.where(values > limit, values - limit, -np.inf), kind="stable")[:_FITTED]
@@ -133,8 +136,8 @@ def explain_misfit(problem: Problem, x: Array) -> tuple[Explained, ...]:
 
 def _distinct(told: list[Explained]) -> tuple[Explained, ...]:
     """Return explanations that cost about as little as the best, those first; of equal ones the simplest."""
-    # the same channel with the same cost is the same column: one row has an offset, a scale and a drift alike
-    simple = sorted(told, key=lambda one: (_FORMS.index(one.candidate.bias.form), np.isfinite(one.candidate.since)))
+    # one row has an offset, a scale and a drift alike, and so have rows of one place
+    simple = sorted(told, key=lambda one: (np.isfinite(one.candidate.since), _FORMS.index(one.candidate.bias.form)))
     kept: list[Explained] = []
     for one in simple:
         same = [other for other in kept if other.candidate.bias.members == one.candidate.bias.members]
@@ -228,17 +231,17 @@ def score(problem: Problem, x: Array, found: tuple[Candidate, ...]) -> list[tupl
         What is tested.
     """
     larger = _with(problem, found)
-    at = _embed(problem, larger, x)
-    information, vector = _shared(larger, at)
-    own = [larger.layout.find(bias.name)[0] for bias in larger.biases[len(problem.biases) :]]
+    layout = larger.layout
+    information, vector = _shared(larger, _embed(problem, larger, x))
+    own = [layout.find(bias.name)[0] for bias in larger.biases[len(problem.biases) :]]
     inside = np.concatenate([np.arange(slot.start, slot.start + slot.size) for slot in own])
-    rest = np.setdiff1d(np.arange(larger.layout.n_shared), inside)
-    space = np.eye(larger.layout.n_shared)[:, rest]
+    rest = np.setdiff1d(np.arange(layout.n_shared), inside)
+    space = np.eye(layout.n_shared)[:, rest]
     if face := exact(problem):
         # along the equalities only: the other unknowns cannot leave them
         along = tangent_at(problem, face, x).along[0]
-        old = [larger.layout.find(slot.name)[0].start + i for slot in problem.layout.shared for i in range(slot.size)]
-        space = np.zeros((larger.layout.n_shared, along.shape[1]))
+        old = [layout.find(slot.name)[0].start + i for slot in problem.layout.shared for i in range(slot.size)]
+        space = np.zeros((layout.n_shared, along.shape[1]))
         space[old] = along
     root = space @ _root(space.T @ information @ space)
     out = []
