@@ -69,8 +69,10 @@ def advise_at(problem: Problem, x: Array) -> tuple[Advice, ...]:
     x : array (size,) or (k, size of an epoch)
         Least squares begin there; NaN where there is no fix.
     """
-    problem, x = _shortened(*_without_unknown(problem.flat(), _joined(problem, np.asarray(x))))
-    found = list(advise_on_geometry(problem, x))
+    flat, x = problem.flat(), _joined(problem, np.asarray(x))
+    # rows that are not measured yet count for the geometry
+    found = list(advise_on_geometry(flat, x))
+    problem, x = _shortened(*_without_unknown(flat, x))
     if not bool((problem.weight > 0.0).any()):
         return tuple(found)
     values = list(advise_on_values(problem, x))

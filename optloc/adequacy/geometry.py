@@ -45,9 +45,10 @@ class Advice:
 # Chi-square by which stations off their plane, at the most, tell a place from its mirror image: below it nowhere do the
 # data tell the two apart by three sigma.
 _TOLD = 9.0
-# Distance, in standard deviations of the stations' own extent, is told as a share: a thousandth of it is a plane drawn
-# on paper, whatever the noise.
-_FLAT = 1e-3
+# Share of the extent of stations that counts as none whatever the noise: a micrometre a metre.
+_FLAT = 1e-6
+# Share of the extent of stations that is rounding of their coordinates.
+_ROUNDING = 1e-12
 # Cosine from which a normal counts as an axis of the frame, so that a box is on one side of the plane.
 _ALONG = 0.999
 
@@ -62,8 +63,11 @@ def advise_on_geometry(problem: Problem, x: Array) -> Iterator[Advice]:
     x : array (1, size)
         Its fix; NaN where there is none.
     """
-    yield from _count_rows(problem)
-    yield from _see_mirror(problem, x)
+    found = list(_count_rows(problem))
+    yield from found
+    # with fewer rows than unknowns there are more than two places
+    if not any("fewer" in one.seen for one in found):
+        yield from _see_mirror(problem, x)
 
 
 def _count_rows(problem: Problem) -> Iterator[Advice]:
@@ -73,7 +77,8 @@ def _count_rows(problem: Problem) -> Iterator[Advice]:
     least, k = int(dof.min()), len(dof)
     if least > 1:
         return
-    where = f"{int((dof == least).sum())} of {k} epochs have" if k > 1 else "the rows have"
+    count = int((dof == least).sum())
+    where = f"{count} of {k} epochs {'has' if count == 1 else 'have'}" if k > 1 else "the rows have"
     if least < 0:
         seen = f"{where} {-least} measurement{'s' if least < -1 else ''} fewer than unknowns"
         yield Advice("redundancy", seen, "add rows, or state what is known: a height, a bias, a prior")
@@ -157,12 +162,12 @@ def _is_flat(problem: Problem, shape: _Shape, axis: int) -> bool:
     # a mirror image changes a range by twice the height of the station at the most
     noise = _noise(problem)
     told = np.inf if noise == 0.0 else float(((2.0 * height / noise) ** 2).sum())
-    return bool(told < _TOLD or shape.extent[axis] < _FLAT**2 * shape.extent[-1])
+    return bool(told < _TOLD or shape.extent[axis] < _FLAT * shape.extent[-1])
 
 
 def _off(shape: _Shape) -> str:
-    off = np.sqrt((shape.height**2).mean())
-    return f"{off:.2g} m off it, over {shape.extent[-1]:.3g} m"
+    off, size = float(np.sqrt((shape.height**2).mean())), float(shape.extent[-1])
+    return f"{off if off > _ROUNDING * size else 0.0:.2g} m off it, over {size:.3g} m"
 
 
 def _mirror_fits(problem: Problem, shape: _Shape, x: Array) -> bool:
