@@ -272,7 +272,7 @@ def scene_of(problem: Problem, fixes: Sequence[Fix], *, outlined: bool = False) 
         other_paths=other,
         known=tuple(_thin(place) for place in known),
         outlines=outlines,
-        local=_is_local(fixes, outlines) if outlines else None,
+        local=_is_local(fixes, outlines, len(position)),
     )
     return _local(problem, scene) if problem.frame.kind == "ecef" else scene
 
@@ -284,10 +284,13 @@ def outlines_of(problem: Problem, fixes: Sequence[Fix], count: int) -> tuple[Pie
     return tuple(pieces for fix in fixes for pieces in pieces_of(problem, fix))
 
 
-def _is_local(fixes: Sequence[Fix], outlines: Sequence[Pieces]) -> Array:
-    """Return where an ellipse does not cover and there is no outline (n,)."""
+def _is_local(fixes: Sequence[Fix], outlines: Sequence[Pieces], count: int) -> Array | None:
+    """Return where an ellipse does not cover and there is no outline (n,); None unless fixes are one position each."""
+    if count != sum(fix.code.size for fix in fixes):
+        return None
     kinds = [np.zeros(fix.code.size) if fix.chart is None else np.ravel(fix.chart.kind) for fix in fixes]
-    return np.asarray((np.concatenate(kinds) != CARTESIAN) & np.array([not pieces for pieces in outlines]))
+    bare = np.array([not pieces for pieces in outlines] or [True] * count, dtype=bool)
+    return np.asarray((np.concatenate([*kinds, np.zeros(0)]) != CARTESIAN) & bare)
 
 
 def local_frame(problem: Problem) -> Frame | None:

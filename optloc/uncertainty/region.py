@@ -22,7 +22,7 @@ from optloc.uncertainty.surface import Surface
 
 # Boxes of a cover at most, by dimension: the hull of an ellipse is then 2 % wider than the ellipse, that of an
 # ellipsoid 10 %, after some 20 and 100 ms. Plain Python takes a thousand times longer for each.
-_MOST, _MOST_PLAIN = {2: 1000, 3: 8000}, 100
+_MOST, _MOST_PLAIN = {2: 1000, 3: 8000}, 300
 # Share by which the level of a cover is higher, for the rounding of two ways to compute the cost of a fix.
 _EQUAL = 1e-9
 # Share of a cell by which it is taken larger where points are looked up, for the rounding of its inverse.

@@ -72,7 +72,7 @@ def covered(names, n):
 
 
 def test_the_region_covers():
-    share, n = covered(("tdoa 2 5 100", "plane 50 400", "aoa 3 20 10"), 12)
+    share, n = covered(("tdoa 2 5 100", "plane 50 400", "aoa 3 20 10"), 8)
     assert abs(share - 0.95) <= 4 * np.sqrt(0.95 * 0.05 / n)
 
 
