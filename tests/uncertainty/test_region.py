@@ -6,7 +6,7 @@ from uncertainty.scenes import CASES, fixed
 
 import optloc
 from optloc import InvalidProblem, Stations, assemble, likelihood_region, measured
-from optloc.problem.chart import INVERSE_RANGE, quantile
+from optloc.problem.chart import INVERSE_RANGE, jacobian, quantile
 from optloc.uncertainty.arc import trace_from
 from optloc.uncertainty.surface import Surface
 
@@ -173,3 +173,36 @@ def test_who_cannot_have_a_region_is_told():
         likelihood_region(held, optloc.solve(held))
     with pytest.raises(InvalidProblem, match="probability"):
         likelihood_region(problem, fix, 95)
+
+
+def profiled_at_ends(names, n):
+    """Return the cost above the fix's at both ends of 95 % intervals of the range, the direction at its best."""
+    found = []
+    for name in names:
+        for item in range(n):
+            problem, _, fix = fixed(name, item)
+            if not np.isfinite(fix.cov).all() or fix.chart.name != "inverse range":
+                continue
+            surface, chart = Surface.of(problem, fix), fix.chart
+            for end in fix.interval("range"):
+                if np.isfinite(end):
+                    y = np.append(np.zeros(len(fix.position) - 1), chart.distance / end)
+                    for _ in range(8):
+                        G = jacobian(y, chart.position, chart.centre)[:, :-1]
+                        cost, information, vector = surface.look(chart.to_position(y))
+                        y[:-1] += np.linalg.solve(G.T @ information @ G, G.T @ vector)
+                    found.append(float(cost - surface.least))
+    return np.array(found)
+
+
+def test_the_ends_of_a_range_cost_as_much_as_they_should():
+    found = profiled_at_ends(("tdoa 2 5 100", "azel 4 300"), 6)
+    assert np.median(found) == pytest.approx(3.84, rel=0.1)
+
+
+@pytest.mark.full
+def test_the_ends_of_a_range_cost_as_much_as_they_should_in_full():
+    found = profiled_at_ends(("tdoa 2 5 30", "tdoa 2 5 100", "tdoa 2 5 300", "tdoa 3 6 30", "azel 4 300"), 100)
+    # Measured over 2 500 far fixes: 3.6 to 4.1 for nine of ten.
+    assert np.median(found) == pytest.approx(3.84, rel=0.02)
+    assert np.mean(np.abs(found / 3.84 - 1) < 0.1) > 0.85
