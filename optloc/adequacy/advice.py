@@ -79,7 +79,7 @@ def advise_at(problem: Problem, x: Array) -> tuple[Advice, ...]:
     if not np.isfinite(x).all() and one_place(problem):
         x = fit_anywhere(problem).x
     # what another reading explains needs no error besides
-    read = any(one.cause != "impossible" for one in values)
+    read = any(one.cause not in ("impossible", "constraint") for one in values)
     errors = [] if read else [_tell(problem, one) for one in explain_misfit(problem, x)[:_SHOWN]]
     return (*values, *errors, *found)
 

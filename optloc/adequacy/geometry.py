@@ -26,7 +26,7 @@ class Advice:
     ----------
     cause : str
         A word for programs: "plane", "line", "redundancy", "mirror", "unit", "sign", "compass", "opposite",
-        "impossible", "offset", "scale", "rotation", "drift" or "step".
+        "impossible", "constraint", "offset", "scale", "rotation", "drift" or "step".
     seen : str
         What is seen, a sentence without its full stop.
     advice : str

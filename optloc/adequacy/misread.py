@@ -12,6 +12,7 @@ from optloc.adequacy.refit import descend, fit_anywhere, one_place
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Rows
 from optloc.base.units import SPEED_OF_LIGHT, UNITS
+from optloc.linear.constraints import exact, violation_names
 from optloc.linear.normal import degrees_of_freedom
 from optloc.models import MODELS
 from optloc.models.primitives import wrap
@@ -77,27 +78,43 @@ def advise_on_values(problem: Problem, x: Array) -> Iterator[Advice]:
     if len(items) and one_place(batch):
         own = batch.take(items)
         start = x if len(batch.weight) == len(x) and x.shape[-1] == batch.layout.size else None
-        if bool(wrong) or _is_refuted(own, start if start is None else start[items]):
-            found = list(_explaining(own))
+        refuted, free = _is_refuted(own, start if start is None else start[items])
+        if wrong or refuted:
+            held = [] if wrong or free < _FITS else [_without_constraints(own, free)]
             # what no reading explains is said all the same
-            yield from found or wrong
+            yield from held or list(_explaining(own)) or wrong
             return
     yield from wrong
 
 
-def _is_refuted(problem: Problem, start: Array | None) -> bool:
-    """Return whether the values as they stand do not fit any place that is found."""
+def _is_refuted(problem: Problem, start: Array | None) -> tuple[bool, float]:
+    """Return whether the values as they stand do not fit any place that is found, and the p-value free of bounds."""
     near = np.inf if start is None or not np.isfinite(start).all() else float(descend(problem, start)[1].sum())
     if _p(problem, near) >= _MISFIT:
-        return False
-    return _p(problem, float(fit_anywhere(problem, start).cost.sum())) < _MISFIT
+        return False, 1.0
+    return _fit(problem, start) < _MISFIT, _fit(replace(problem, constraints=()), start) if problem.constraints else 0.0
+
+
+def _fit(problem: Problem, start: Array | None = None) -> float:
+    """Return the chi-square probability of the best place that is found; equalities are met, other bounds not."""
+    free = fit_anywhere(replace(problem, constraints=()), start)
+    cost = float(free.cost.sum())
+    if _p(problem, cost) >= _MISFIT and exact(problem):
+        # equalities take most of the time: only what fits without them is asked to meet them
+        cost = float(descend(problem, free.x)[1].sum())
+    return _p(problem, cost)
+
+
+def _without_constraints(problem: Problem, p: float) -> Advice:
+    names = violation_names(problem)
+    seen = f"the values fit without the constraints ({names}; p = {p:.2g}), and no place that was found meets both"
+    return Advice("constraint", seen, "check their values, and heights for being above the ellipsoid, not the sea")
 
 
 def _p(problem: Problem, cost: float) -> float:
-    """Return the chi-square probability of a batch as a whole; zero where no fit was found."""
-    if not np.isfinite(cost):
-        return 0.0
-    return float(tail_probability(np.array([cost]), np.array([degrees_of_freedom(problem).sum()]))[0])
+    """Return the chi-square probability of a batch as a whole; zero where no fit was found or nothing can be tested."""
+    p = float(tail_probability(np.array([cost]), np.array([degrees_of_freedom(problem).sum()]))[0])
+    return p if np.isfinite(p) else 0.0
 
 
 def _explaining(problem: Problem) -> Iterator[Advice]:
@@ -110,9 +127,7 @@ def _explaining(problem: Problem) -> Iterator[Advice]:
         able = [other for other in (scaled, stated) if _by_chance(other) * 2.0 * len(tried) <= _CHANCE]
         if not able or _is_impossible(able[0]):
             continue
-        fitted = fit_anywhere(able[0])
-        costs = [fitted.cost] + [descend(other, fitted.x)[1] for other in able[1:]]
-        p = max(_p(problem, float(cost.sum())) for cost in costs)
+        p = max(_fit(other) for other in able)
         if p >= _FITS:
             found.append((p, one))
     # feet and nanoseconds are so alike that both may pass: the better fit comes first

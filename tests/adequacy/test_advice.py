@@ -188,6 +188,16 @@ def test_a_difference_beyond_the_distance_of_its_stations_is_impossible():
     assert advice[0].cause == "impossible"
 
 
+def test_a_constraint_that_the_data_contradict_is_named():
+    place = np.concatenate([PLACE, HEIGHT[:, None]], axis=1)
+    bounds = optloc.constraints.box([-np.inf, -np.inf, 200.0], [np.inf, np.inf, 200.0])
+    template = optloc.assemble(place, optloc.measured("range", a=np.arange(7), sigma=5.0), constraints=bounds)
+    problem = optloc.simulate(template, truth=[4e3, 3e3, 5e3], seed=1)
+    advice = optloc.advise(problem, optloc.solve(problem))
+    assert advice[0].cause == "constraint"
+    assert "p = 0." in advice[0].seen
+
+
 # Nobody is accused without reason.
 
 
