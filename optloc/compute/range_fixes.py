@@ -1,256 +1,57 @@
-"""A fix from ranges in one compiled call: start, refinement, covariance, and whether the answer is plainly good."""
+"""Fixes from ranges in one compiled call: start, refinement, covariance, and what tells how far each is to be trusted.
+
+Problems go through in blocks of lanes. Some things few problems need: more steps, a mirror image that leads on, another
+look at the shape. Those that do are collected and go through again in full blocks, so that no block waits for one of
+its lanes.
+"""
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.gtrs import minimise, scratch
+from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH
+from optloc.compute.gtrs import minimise
 from optloc.compute.jit import compiled
-from optloc.compute.range_refine import (
+from optloc.compute.range_infinity import measure_infinity, see_far
+from optloc.compute.range_mirror import LISTED, confirm, find_plane, follow, keep_fix, reflect
+from optloc.compute.range_refine import equations, ranges, refine
+from optloc.compute.range_room import (
     ALIVE,
+    BEYOND,
     BLUR,
     CENTRE,
     COST,
+    DAMPING,
     DIAGONAL,
+    FIX_COST,
+    FIX_GOOD,
     GOOD,
+    GROWTH,
     H_TRIAL,
     INVERSE,
     LOOP,
     LOWER,
     MOVE,
+    NORMAL,
     ORIGIN,
+    ROW,
     SCALE,
     SOLVABLE,
     SPARE,
     SPREAD,
     STEPS,
+    Answer,
+    G,
     H,
+    Model,
+    Room,
     X,
-    ranges,
-    refine,
+    make_room,
 )
+from optloc.compute.range_shape import STRAIGHT, find_even, measure_shape
+from optloc.compute.range_start import read, square, stand, weigh
 from optloc.compute.systems import LANES, factor_plain, solve_plain
-
-# The start of a fix from ranges: measurements, stations and squared-range rows of a block of problems.
-
-# Least distance from a station that weighs a row, in units of the stations' spread: at the station itself a squared
-# range has no first-order error, and its weight would be infinite.
-_NEAR = 1e-3
-# Four roundings of a double lie between a measurement and its residual.
-_ROUNDING = 4.0 * 2.220446049250313e-16
-
-
-@compiled
-def read(
-    z: Array, item: Array, row: Array, anchor: Array, linear: Array, out: Array, value: Array, blur: Array, good: Array
-) -> None:
-    """Take the measurements of a block of problems, and everything that is linear in them.
-
-    Parameters
-    ----------
-    z : array (N, m)
-        Measurements, metres.
-    item : int64 array (W,)
-        Problem of each lane.
-    row : array (2, m)
-        Of each row: known amount by which the measurement exceeds the model; one over its variance, 0 where absent.
-    anchor : int64 array (m,)
-        Row that is subtracted from each before anything is added up, -1 for none.
-    linear : array (p, m)
-        Linear maps of the measurements.
-    out : array (m, W)
-        Written: measurements less corrections and anchors; zero where absent.
-    value : array (p, W)
-        Written: their images.
-    blur : array (W,)
-        Written: rounding error of the whitened residuals.
-    good : array (W,)
-        Written: 1.0 where all rows that are present are finite, else 0.0.
-    """
-    m = len(out)
-    for lane in range(LANES):
-        blur[lane], good[lane] = 0.0, 1.0
-    for j in range(m):
-        # An absent row may hold NaN, which no share of zero would remove.
-        if row[1, j] == 0.0:
-            for lane in range(LANES):
-                out[j, lane] = 0.0
-            continue
-        for lane in range(LANES):
-            out[j, lane] = z[item[lane], j] - row[0, j]
-        for lane in range(LANES):
-            blur[lane] += row[1, j] * out[j, lane] * out[j, lane]
-            good[lane] = good[lane] if abs(out[j, lane]) < np.inf else 0.0
-    for lane in range(LANES):
-        blur[lane] = _ROUNDING * np.sqrt(blur[lane])
-    for j in range(m - 1, -1, -1):  # an anchor is the first of its rows: it goes last
-        if anchor[j] >= 0:
-            for lane in range(LANES):
-                out[j, lane] -= out[anchor[j], lane]
-    for i in range(len(linear)):
-        for lane in range(LANES):
-            value[i, lane] = 0.0
-        for j in range(m):
-            share = linear[i, j]
-            if share != 0.0:
-                for lane in range(LANES):
-                    value[i, lane] += share * out[j, lane]
-
-
-@compiled
-def stand(
-    station: Array, item: Array, reference: int, place: Array, origin: Array, centre: Array, spread: Array, spare: Array
-) -> None:
-    """Take the stations of a block of problems.
-
-    Parameters
-    ----------
-    station : array (N or 1, s, d)
-        Positions, metres.
-    item : int64 array (W,)
-        Problem of each lane.
-    reference : int
-        Station that becomes the origin; -1: their mean does.
-    place : array (s, d, W)
-        Written: positions from the origin.
-    origin, centre : array (d, W)
-        Written: the origin, and the mean of the stations from there.
-    spread : array (W,)
-        Written: greatest distance of a station from the mean.
-    spare : array (W,)
-        Scratch.
-    """
-    s, d = place.shape[:2]
-    shared = len(station) == 1
-    for j in range(d):
-        for lane in range(LANES):
-            centre[j, lane] = 0.0
-        for i in range(s):
-            for lane in range(LANES):
-                place[i, j, lane] = station[0 if shared else item[lane], i, j]
-                centre[j, lane] += place[i, j, lane] / s
-        for lane in range(LANES):
-            # Where the range to one station is unknown it is the apex of the cone: |x| = t holds about it.
-            origin[j, lane] = place[reference, j, lane] if reference >= 0 else centre[j, lane]
-            centre[j, lane] -= origin[j, lane]
-    for lane in range(LANES):
-        spread[lane] = 0.0
-    for i in range(s):
-        for lane in range(LANES):
-            spare[lane] = 0.0
-        for j in range(d):
-            for lane in range(LANES):
-                place[i, j, lane] -= origin[j, lane]
-                apart = place[i, j, lane] - centre[j, lane]
-                spare[lane] += apart * apart
-        for lane in range(LANES):
-            spread[lane] = max(spread[lane], np.sqrt(spare[lane]))
-
-
-@compiled
-def square(
-    c: Array, sign: Array, reference: int, place: Array, spread: Array, scale: Array, rows: Array, spare: Array
-) -> None:
-    """Square the ranges ``r = c + sign t``: linear in (x, t) with t from the cone, or in (x, |x|^2).
-
-    Parameters
-    ----------
-    c : array (s, W)
-        Least-squares ranges, metres.
-    sign : array (s,)
-        How the unknown range t enters.
-    reference : int
-        Station whose range is t; -1 where ranges are determined.
-    place, spread : array (s, d, W), (W,)
-        Of `stand`.
-    scale : array (W,)
-        Written: unit of length.
-    rows : array (s, d + 2, W)
-        Written: coefficients of x and of the last entry, and the right side; scaled.
-    spare : array (W,)
-        Scratch.
-    """
-    s, d = place.shape[:2]
-    free = reference >= 0
-    turn = 2.0 if free else -2.0
-    for lane in range(LANES):
-        scale[lane] = spread[lane]
-    if not free:
-        for i in range(s):
-            for lane in range(LANES):
-                scale[lane] = max(scale[lane], abs(c[i, lane]))
-    for lane in range(LANES):
-        scale[lane] = scale[lane] if scale[lane] > 0.0 else 1.0
-        spare[lane] = 1.0 / scale[lane]
-    for i in range(s):
-        # The reference's own row would read 0 = 0.
-        used = 0.0 if free and (i == reference or sign[i] == 0.0) else 1.0
-        for lane in range(LANES):
-            # r_i = c_i + s_i t squared, less |x|^2 = t^2: linear in x and t.
-            known = used * c[i, lane] * spare[lane]
-            rows[i, d + 1, lane] = known * known
-            rows[i, d, lane] = 2.0 * sign[i] * known if free else 1.0
-        for j in range(d):
-            for lane in range(LANES):
-                at = used * place[i, j, lane] * spare[lane]
-                rows[i, j, lane] = turn * at
-                rows[i, d + 1, lane] -= at * at
-        if free:
-            for lane in range(LANES):
-                rows[i, d + 1, lane] = -rows[i, d + 1, lane]
-
-
-@compiled
-def weigh(
-    rows: Array, place: Array, y: Array, scale: Array, white: Array, equal: bool, out: Array, spare: Array
-) -> None:
-    """Divide squared-range rows by twice the ranges, which turns their errors into those of ranges, and whiten them.
-
-    Parameters
-    ----------
-    rows, place, scale : array (s, d + 2, W), (s, d, W), (W,)
-        Of `square` and `stand`.
-    y : array (d + 1, W)
-        Where the ranges are taken, scaled.
-    white : array (s, s)
-        Lower triangular whitening matrix of the ranges, 1/metres.
-    equal : bool
-        Take all ranges as equal instead.
-    out : array (s, d + 2, W)
-        Written.
-    spare : array (W,)
-        Scratch.
-    """
-    s, d = place.shape[:2]
-    for i in range(s):
-        for lane in range(LANES):
-            spare[lane] = 0.0
-        for j in range(d):
-            for lane in range(LANES):
-                apart = y[j, lane] - place[i, j, lane] / scale[lane]
-                spare[lane] += apart * apart
-        for lane in range(LANES):
-            spare[lane] = 0.5 * scale[lane] / (1.0 if equal else max(np.sqrt(spare[lane]), _NEAR))
-        for j in range(d + 2):
-            for lane in range(LANES):
-                out[i, j, lane] = spare[lane] * rows[i, j, lane]
-    # From the last row up: each needs those above it as they were.
-    for i in range(s - 1, -1, -1):
-        for j in range(d + 2):
-            for lane in range(LANES):
-                out[i, j, lane] *= white[i, i]
-        for k in range(i):
-            share = white[i, k]
-            if share != 0.0:
-                for j in range(d + 2):
-                    for lane in range(LANES):
-                        out[i, j, lane] += share * out[k, j, lane]
-
-
-# The fix: start, refinement and covariance, and what makes it plainly good.
 
 # Steps after which the problems of a block that still move wait for each other: fixes near their stations take two to
 # five.
@@ -259,57 +60,12 @@ _FEW = 6
 _WEAK = 1e-11
 # A fourfold margin to the spreads of the stations from which on a fix is doubted.
 _FAR = 2.5e3
-
-
-class Model(NamedTuple):
-    """Linear maps from measurements z to all that a fix needs; every row is a sum of ranges to s stations.
-
-    Parameters
-    ----------
-    row : array (2, m)
-        Known amount by which each measurement exceeds the model, metres; one over its variance, 0 where absent.
-    anchor : int64 array (m,)
-        Row whose measurement is subtracted first, -1 for none: emission times count from it.
-    linear : array (s + q + e + l, m)
-        Maps to the least-squares ranges c, known up to sign * t; to whitened rows u, of which the cost is
-        ``|u - K r|^2 + |loops|^2``; to emission times for zero ranges; and to the loops, which depend on no range.
-    sign : array (s,)
-        How the unknown range t enters each; zeros where the ranges are determined.
-    reference : int
-        Station whose range is t; -1 where the ranges are determined.
-    white : array (s, s)
-        Lower triangular whitening matrix of c.
-    K : array (q, s)
-        Whitened rows over the ranges.
-    travel : array (e, s)
-        How the ranges reduce the emission times.
-    start : int64 array (e,)
-        Anchor of each emission time, -1 where there is no row.
-    """
-
-    row: Array
-    anchor: Array
-    linear: Array
-    sign: Array
-    reference: int
-    white: Array
-    K: Array
-    travel: Array
-    start: Array
+# Lanes of a block from which on it goes on as it is: collecting problems anew costs a start and half a step.
+_WORTH = LANES // 2
 
 
 @compiled
-def fixes(
-    model: Model,
-    z: Array,
-    station: Array,
-    tolerance: float,
-    most: int,
-    x: Array,
-    covariance: Array,
-    cost: Array,
-    plain: Array,
-) -> int:
+def fixes(model: Model, z: Array, station: Array, tolerance: float, most: int, answer: Answer) -> int:
     """Fix N positions from ranges, each from measurements alone, and return the most steps that one took.
 
     Parameters
@@ -319,65 +75,348 @@ def fixes(
     z : array (N, m)
         Measurements, metres.
     station : array (N or 1, s, d)
-        Stations, metres.
+        Stations, metres: those that take part, all of which have rows. Their mean is the centre of the chart.
     tolerance, most : float, int
         Tolerance and limit of `optloc.compute.range_refine.refine`.
-    x : array (N, d + e)
-        Written: positions, then emission times (times c, metres).
-    covariance : array (N, d, d)
-        Written: of the positions.
-    cost : array (N,)
-        Written: weighted sums of squared residuals.
-    plain : bool array (N,)
-        Written: whether the fix is plainly good: a finite input, an exact start, a finished refinement, a regular
-        covariance, a place that is not far away. The others need a closer look.
+    answer : Answer
+        Written.
     """
-    row, anchor, linear, sign, reference, white, K, travel, start = model
-    count, (s, d), q, e = len(z), station.shape[1:], len(K), len(start)
-    item, late = np.empty(LANES, np.int64), np.empty(count, np.int64)
-    seen, value = np.zeros((z.shape[1], LANES)), np.zeros((len(linear), LANES))
-    place, unit, r = np.zeros((s, d, LANES)), np.zeros((s, d, LANES)), np.zeros((s, LANES))
-    squared, rows = np.zeros((s, d + 2, LANES)), np.zeros((s, d + 2, LANES))
-    y, work = np.zeros((d + 1, LANES)), np.zeros((scratch(d + 1), LANES))
-    vector, matrix, scalar = np.zeros((10, d, LANES)), np.zeros((3, d, d, LANES)), np.zeros((14, LANES))
-    c, u, emission, loops = value[:s], value[s : s + q], value[s + q : s + q + e], value[s + q + e :]
-    spare, good = scalar[SPARE], scalar[GOOD]
-    # First all blocks with a few steps, then those that still move, collected in full blocks.
-    waiting, first, steps, again = 0, 0, 0, False
-    while first < (waiting if again else count):
-        size = min(LANES, (waiting if again else count) - first)
-        for lane in range(LANES):
-            at = first + min(lane, size - 1)
-            item[lane] = late[at] if again else at
-        read(z, item, row, anchor, linear, seen, value, scalar[BLUR], good)
-        _loops(loops, scalar[LOOP])
-        if len(station) > 1 or (first == 0 and not again):
-            stand(station, item, reference, place, vector[ORIGIN], vector[CENTRE], scalar[SPREAD], spare)
-        if again:
-            _resume(x, item, vector)
-        else:
-            square(c, sign, reference, place, scalar[SPREAD], scalar[SCALE], squared, spare)
-            # All ranges as equal first, then weighed by the ranges of that answer: near to maximum likelihood, and no
-            # guess.
-            for turn in range(2):
-                weigh(squared, place, y, scalar[SCALE], white, turn == 0, rows, spare)
-                minimise(rows, reference >= 0, y, scalar[SOLVABLE], work)
-                _accept(y, scalar[SOLVABLE], good, scalar[SCALE], vector[X])
-        refine(K, u, place, r, unit, vector, matrix, scalar, tolerance, most - _FEW if again else min(_FEW, most))
-        _invert(vector, matrix, scalar)
-        if e:
-            ranges(place, vector[X], r, unit, spare)
-            _emit(travel, r, start, row, z, item, emission)
-        _write(vector, matrix, scalar, emission, item[:size], x, covariance, cost, plain)
+    count = len(z)
+    room = make_room(model, station.shape[1], station.shape[2])
+    late, hidden, look = np.empty(count, np.int64), np.empty(count, np.int64), np.zeros(count, np.bool_)
+    course = np.empty((3, count))
+    waiting, images, steps = 0, 0, 0
+    for first in range(0, count, LANES):
+        size = _take(room.item, None, first, count)
+        _see(model, z, station, room, first == 0)
+        _begin(model, room)
+        # what is no full block has nothing to wait for
+        limit = min(_FEW, most) if size == LANES else most
+        steps = max(steps, _refine(model, z, room, size, tolerance, limit, answer))
         for lane in range(size):
-            steps = max(steps, int(scalar[STEPS, lane]) + (_FEW if again else 0))
-            if not again and scalar[ALIVE, lane] != 0.0 and most > _FEW:
-                late[waiting] = item[lane]
+            if room.scalar[ALIVE, lane] != 0.0 and most > limit:
+                late[waiting] = room.item[lane]
                 waiting += 1
-        first += LANES
-        if not again and first >= count:
-            first, again = 0, True
+        images = _examine(model, z, room, size, tolerance, answer, look, hidden, images, course)
+    for first in range(0, waiting, LANES):
+        size = _take(room.item, late, first, waiting)
+        _see(model, z, station, room, False)
+        _resume(answer.x, room)
+        steps = max(steps, _FEW + _refine(model, z, room, size, tolerance, most - _FEW, answer))
+        images = _examine(model, z, room, size, tolerance, answer, look, hidden, images, course)
+    _pursue(model, z, station, room, tolerance, answer, look, hidden, images, course)
+    waiting = 0
+    for i in range(count):
+        late[waiting] = i
+        waiting += 1 if look[i] else 0
+    for first in range(0, waiting, LANES):
+        size = _take(room.item, late, first, waiting)
+        _see(model, z, station, room, False)
+        _resume(answer.x, room)
+        _look_again(model, z, room, size, answer, look)
     return steps
+
+
+@compiled
+def _take(item: Array, order: Array | None, first: int, count: int) -> int:
+    """Write the problems of a block, in an order or as they come; return how many there are: the last fills it up."""
+    size = min(LANES, count - first)
+    for lane in range(LANES):
+        at = first + min(lane, size - 1)
+        item[lane] = at if order is None else order[at]
+    return size
+
+
+@compiled
+def _see(model: Model, z: Array, station: Array, room: Room, begins: bool) -> None:
+    """Take measurements and stations of a block; stations that all problems share are taken when a call begins."""
+    scalar, vector = room.scalar, room.vector
+    s, q, e = station.shape[1], len(model.K), len(model.start)
+    read(z, room.item, model.row, model.anchor, model.linear, room.seen, room.value, scalar[BLUR], scalar[GOOD])
+    _loops(room.value[s + q + e :], scalar[LOOP])
+    if len(station) > 1 or begins:
+        stand(
+            station,
+            room.item,
+            model.reference,
+            room.place,
+            vector[ORIGIN],
+            vector[CENTRE],
+            scalar[SPREAD],
+            scalar[SPARE],
+        )
+        find_plane(room)
+        if model.level:
+            see_far(model, room)
+
+
+@compiled
+def _begin(model: Model, room: Room) -> None:
+    """Find starts: squared ranges weighed as equal first, then by the ranges of that answer."""
+    scalar, s = room.scalar, len(room.place)
+    square(
+        room.value[:s],
+        model.sign,
+        model.reference,
+        room.place,
+        scalar[SPREAD],
+        scalar[SCALE],
+        room.squared,
+        scalar[SPARE],
+    )
+    # near to maximum likelihood, and no guess
+    for turn in range(2):
+        weigh(room.squared, room.place, room.y, scalar[SCALE], model.white, turn == 0, room.rows, scalar[SPARE])
+        minimise(room.rows, model.reference >= 0, room.y, scalar[SOLVABLE], room.work)
+        _accept(room.y, scalar[SOLVABLE], scalar[GOOD], scalar[SCALE], room.vector[X])
+
+
+@compiled
+def _refine(model: Model, z: Array, room: Room, size: int, tolerance: float, limit: int, answer: Answer) -> int:
+    """Refine the positions of a block and write them; return the most steps that one took."""
+    s, scalar = len(room.place), room.scalar
+    u = room.value[s : s + len(model.K)]
+    refine(model.K, u, room.place, room.r, room.unit, room.vector, room.matrix, scalar, tolerance, limit)
+    _write_fixes(model, z, room, size, answer)
+    steps = 0
+    for lane in range(size):
+        steps = max(steps, int(scalar[STEPS, lane]))
+    return steps
+
+
+@compiled
+def _write_fixes(model: Model, z: Array, room: Room, size: int, answer: Answer) -> None:
+    """Write positions, covariances and costs of the first lanes, and to FIX_GOOD which are settled."""
+    scalar = room.scalar
+    _invert(room.vector, room.matrix, scalar)
+    if len(model.start):
+        _emit(model, z, room)
+    for lane in range(LANES):
+        good = scalar[SOLVABLE, lane] * scalar[GOOD, lane] > scalar[ALIVE, lane]
+        scalar[FIX_GOOD, lane] = 1.0 if good else 0.0
+        scalar[FIX_COST, lane] = scalar[COST, lane]
+    settled, cost, covariance, found = answer.settled, answer.cost, answer.covariance, room.matrix[H_TRIAL]
+    for lane in range(size):
+        i = room.item[lane]
+        settled[i] = scalar[FIX_GOOD, lane] != 0.0
+        cost[i] = scalar[COST, lane]
+        for j in range(len(found)):
+            for k in range(len(found)):
+                covariance[i, j, k] = found[max(j, k), min(j, k), lane]
+    _place(room.vector, room.sent, room.item, answer.x, scalar[ALIVE], False, size)
+
+
+@compiled
+def _place(vector: Array, sent: Array, item: Array, x: Array, mark: Array, marked: bool, size: int) -> None:
+    """Write positions and emission times of the first lanes to their problems, or of those that are marked."""
+    d = vector.shape[1]
+    for lane in range(size):
+        if marked and mark[lane] == 0.0:
+            continue
+        i = item[lane]
+        for j in range(d):
+            x[i, j] = vector[X, j, lane] + vector[ORIGIN, j, lane]
+        for j in range(len(sent)):
+            x[i, d + j] = sent[j, lane]
+
+
+@compiled
+def _examine(
+    model: Model,
+    z: Array,
+    room: Room,
+    size: int,
+    tolerance: float,
+    answer: Answer,
+    look: Array,
+    hidden: Array,
+    images: int,
+    course: Array,
+) -> int:
+    """Measure shape and infinity of the settled fixes of a block, and refine their mirror images.
+
+    Fixes whose shape needs a closer look are marked, mirror images on their way wait; returns how many wait by now.
+    """
+    s, scalar = len(room.place), room.scalar
+    u, settled = room.value[s : s + len(model.K)], scalar[FIX_GOOD]
+    kappa, even, closer = room.vector[ROW, 0], room.vector[ROW, 1], 0
+    measure_shape(model, u, room, False, False, kappa)
+    find_even(room.matrix, even)
+    shape, rival, infinity, item = answer.kappa, answer.rival_cost, answer.infinity, room.item
+    for lane in range(size):
+        i, good = item[lane], settled[lane] != 0.0
+        shape[i, 0], shape[i, 1] = (kappa[lane] if good else np.nan), np.nan
+        rival[i], infinity[i] = np.inf, np.inf
+        look[i] = good and (kappa[lane] > STRAIGHT or even[lane] != 0.0)
+        closer += 1 if look[i] else 0
+    if closer >= _WORTH or (closer and size < LANES):
+        _measure_closely(model, u, room, size, answer, look)
+    measure_infinity(model, u, room)
+    left = 0.0
+    for lane in range(size):
+        if settled[lane] != 0.0:
+            infinity[item[lane]] = scalar[BEYOND, lane]
+    for lane in range(LANES):
+        scalar[GOOD, lane] = settled[lane]
+        left += settled[lane]
+    if left == 0.0:
+        return images
+    keep_fix(room)
+    reflect(room)
+    follow(model, u, room, tolerance, _WORTH if size == LANES else 1)
+    return _end_images(model, z, room, size, answer, look, hidden, images, course)
+
+
+@compiled
+def _measure_closely(model: Model, u: Array, room: Room, size: int, answer: Answer, look: Array) -> None:
+    """Measure the shape of fixes along turned axes as well, and in inverse range where it is poor in metres."""
+    kappa, far, item, settled, shape = room.vector[ROW, 0], 0, room.item, answer.settled, answer.kappa
+    for inverse in range(2):
+        if inverse == 1 and far == 0:
+            return
+        measure_shape(model, u, room, inverse == 1, True, kappa)
+        for lane in range(size):
+            i = item[lane]
+            if not settled[i]:
+                continue
+            look[i] = False
+            if inverse == 0 or shape[i, 0] > STRAIGHT:
+                shape[i, inverse] = kappa[lane]
+            far += 1 if shape[i, 0] > STRAIGHT else 0
+
+
+@compiled
+def _pursue(
+    model: Model,
+    z: Array,
+    station: Array,
+    room: Room,
+    tolerance: float,
+    answer: Answer,
+    look: Array,
+    hidden: Array,
+    images: int,
+    course: Array,
+) -> None:
+    """Refine the mirror images that are on their way, again and again in full blocks, until none is."""
+    s, scalar, item, cost = station.shape[1], room.scalar, room.item, answer.cost
+    while images:
+        waiting = images
+        images = 0
+        for first in range(0, waiting, LANES):
+            size = _take(room.item, hidden, first, waiting)
+            _see(model, z, station, room, False)
+            u = room.value[s : s + len(model.K)]
+            _resume(answer.x, room)
+            _evaluate_fix(model, u, room)
+            keep_fix(room)
+            _resume(answer.rival, room)
+            for lane in range(LANES):
+                i = item[lane]
+                scalar[FIX_COST, lane], scalar[GOOD, lane], scalar[ALIVE, lane] = cost[i], 1.0, 1.0
+                scalar[DAMPING, lane], scalar[GROWTH, lane] = course[0, i], course[1, i]
+                scalar[STEPS, lane] = course[2, i]
+            follow(model, u, room, tolerance, _WORTH if size == LANES else 1)
+            # those that wait on stand before the blocks that are still to come
+            images = _end_images(model, z, room, size, answer, look, hidden, images, course)
+
+
+@compiled
+def _end_images(
+    model: Model,
+    z: Array,
+    room: Room,
+    size: int,
+    answer: Answer,
+    look: Array,
+    hidden: Array,
+    images: int,
+    course: Array,
+) -> int:
+    """Write the rivals that mirror images arrived at, put those on their way to wait, and return how many do."""
+    s, scalar, item = len(room.place), room.scalar, room.item
+    before = images
+    for lane in range(size):
+        if scalar[ALIVE, lane] != 0.0:
+            i = item[lane]
+            hidden[images] = i
+            images += 1
+            course[0, i], course[1, i] = scalar[DAMPING, lane], scalar[GROWTH, lane]
+            course[2, i] = scalar[STEPS, lane]
+    if images > before:
+        _place(room.vector, room.sent, item, answer.rival, scalar[ALIVE], True, size)
+    if confirm(model, room.value[s : s + len(model.K)], room) == 0.0:
+        return images
+    if len(model.start):
+        _emit(model, z, room)
+    _place(room.vector, room.sent, item, answer.rival, scalar[GOOD], True, size)
+    rival, cost = answer.rival_cost, answer.cost
+    for lane in range(size):
+        if scalar[GOOD, lane] != 0.0:
+            i = item[lane]
+            rival[i] = scalar[COST, lane]
+            if rival[i] < cost[i]:
+                _exchange(answer.x, cost, answer.rival, rival, i)
+                look[i] = True
+                if rival[i] == np.inf:
+                    # so much cheaper that the start was in a wrong place: its own mirror image may lead on
+                    _reflect_lane(room.vector, lane, answer.rival[i])
+                    course[0, i], course[1, i], course[2, i] = FIRST_DAMPING, FIRST_GROWTH, 0.0
+                    hidden[images] = i
+                    images += 1
+    return images
+
+
+@compiled
+def _reflect_lane(vector: Array, lane: int, out: Array) -> None:
+    """Write the mirror image of the position of a lane."""
+    height = 0.0
+    for j in range(vector.shape[1]):
+        height += (vector[X, j, lane] - vector[CENTRE, j, lane]) * vector[NORMAL, j, lane]
+    for j in range(vector.shape[1]):
+        own = vector[X, j, lane] + vector[ORIGIN, j, lane]
+        out[j] = own - 2.0 * height * vector[NORMAL, j, lane]
+
+
+@compiled
+def _exchange(x: Array, cost: Array, rival: Array, rival_cost: Array, i: int) -> None:
+    """Make the rival the fix, and the fix the rival where it still counts as one."""
+    for j in range(x.shape[1]):
+        x[i, j], rival[i, j] = rival[i, j], x[i, j]
+    best, other = rival_cost[i], cost[i]
+    cost[i], rival_cost[i] = best, other if other <= best + LISTED else np.inf
+
+
+@compiled
+def _look_again(model: Model, z: Array, room: Room, size: int, answer: Answer, look: Array) -> None:
+    """Write covariance and shape of fixes in row X anew."""
+    s, scalar = len(room.place), room.scalar
+    u = room.value[s : s + len(model.K)]
+    _evaluate_fix(model, u, room)
+    for lane in range(LANES):
+        scalar[ALIVE, lane] = 0.0
+    _write_fixes(model, z, room, size, answer)
+    _measure_closely(model, u, room, size, answer, look)
+
+
+@compiled
+def _evaluate_fix(model: Model, u: Array, room: Room) -> None:
+    """Find information and cost at row X."""
+    vector, scalar = room.vector, room.scalar
+    equations(
+        model.K,
+        u,
+        room.place,
+        room.r,
+        room.unit,
+        vector[X],
+        vector[ROW],
+        scalar[SPARE],
+        scalar[LOOP],
+        room.matrix[H],
+        vector[G],
+        scalar[COST],
+    )
 
 
 @compiled
@@ -404,48 +443,35 @@ def _accept(y: Array, settled: Array, good: Array, scale: Array, x: Array) -> No
 
 
 @compiled
-def _resume(x: Array, item: Array, vector: Array) -> None:
+def _resume(x: Array, room: Room) -> None:
     """Go on from the positions reached so far."""
+    item, vector = room.item, room.vector
     for j in range(vector.shape[1]):
         for lane in range(LANES):
             vector[X, j, lane] = x[item[lane], j] - vector[ORIGIN, j, lane]
 
 
 @compiled
-def _emit(travel: Array, r: Array, start: Array, row: Array, z: Array, item: Array, emission: Array) -> None:
-    """Complete the emission times: less the ranges' share, plus the measurement that they count from."""
+def _emit(model: Model, z: Array, room: Room) -> None:
+    """Find the emission times at row X: less the ranges' share, plus the measurement that they count from."""
+    first = len(room.place) + len(model.K)
+    ranges(room.place, room.vector[X], room.r, room.unit, room.scalar[SPARE])
+    item, r, value, sent, travel, start, row = (
+        room.item,
+        room.r,
+        room.value,
+        room.sent,
+        model.travel,
+        model.start,
+        model.row,
+    )
     for j in range(len(start)):
         at = start[j]
         for lane in range(LANES):
-            total = emission[j, lane] + (z[item[lane], at] - row[0, at] if at >= 0 else 0.0)
-            for k in range(len(r)):
-                total -= travel[j, k] * r[k, lane]
-            emission[j, lane] = total
-
-
-@compiled
-def _write(
-    vector: Array,
-    matrix: Array,
-    scalar: Array,
-    emission: Array,
-    item: Array,
-    x: Array,
-    covariance: Array,
-    cost: Array,
-    plain: Array,
-) -> None:
-    """Write the first lanes to the fixes of their problems."""
-    d = vector.shape[1]
-    for lane, i in enumerate(item):
-        plain[i] = scalar[SOLVABLE, lane] * scalar[GOOD, lane] > scalar[ALIVE, lane]
-        cost[i] = scalar[COST, lane]
-        for j in range(d):
-            x[i, j] = vector[X, j, lane] + vector[ORIGIN, j, lane]
-            for k in range(d):
-                covariance[i, j, k] = matrix[H_TRIAL, max(j, k), min(j, k), lane]
-        for j in range(len(emission)):
-            x[i, d + j] = emission[j, lane]
+            sent[j, lane] = value[first + j, lane] + (z[item[lane], at] - row[0, at] if at >= 0 else 0.0)
+        for k in range(len(r)):
+            for lane in range(LANES):
+                sent[j, lane] -= travel[j, k] * r[k, lane]
 
 
 @compiled

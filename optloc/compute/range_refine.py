@@ -8,13 +8,32 @@ from optloc.base.linalg import PIVOT
 from optloc.base.types import Array
 from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge_lane
 from optloc.compute.jit import compiled
+from optloc.compute.range_room import (
+    ALIVE,
+    BLUR,
+    COST,
+    COST_TRIAL,
+    DAMPING,
+    DIAGONAL,
+    G_TRIAL,
+    GAIN,
+    GOOD,
+    GROWTH,
+    H_TRIAL,
+    INVERSE,
+    LOOP,
+    LOWER,
+    MOVE,
+    ROW,
+    SOLVABLE,
+    SPARE,
+    STEPS,
+    TRIAL,
+    G,
+    H,
+    X,
+)
 from optloc.compute.systems import LANES, factor_plain, solve_plain
-
-# Rows of the arrays `vector` and `matrix` at the position and at the one tried, and scratch.
-X, TRIAL, MOVE, G, G_TRIAL, DIAGONAL, INVERSE, ROW, ORIGIN, CENTRE = range(10)
-H, H_TRIAL, LOWER = range(3)
-# Rows of the array `scalar`.
-COST, COST_TRIAL, LOOP, BLUR, DAMPING, GROWTH, GAIN, SOLVABLE, SPARE, ALIVE, GOOD, STEPS, SCALE, SPREAD = range(14)
 
 
 @compiled
@@ -40,9 +59,10 @@ def refine(
         Stations, metres.
     r, unit : array (s, W), (s, d, W)
         Scratch: ranges and unit vectors.
-    vector, matrix, scalar : array (10, d, W), (3, d, d, W), (14, W)
-        Positions in row X, cost of the loops, rounding error and which lanes are good in; positions, right-hand
-        sides, information (lower half), costs, steps, which are alive and which good out.
+    vector, matrix, scalar : array (12, d, W), (6, d, d, W), (21, W)
+        Of `optloc.compute.range_room.Room`: positions in row X, cost of the loops, rounding error and which lanes are
+        good in; positions, right-hand sides, information (lower half), costs, steps, which are alive and which good
+        out.
     tolerance : float
         A fix is finished when its next step is shorter than this many of its own standard deviations.
     limit : int
@@ -63,7 +83,7 @@ def refine(
         scalar[DAMPING, lane], scalar[GROWTH, lane], scalar[STEPS, lane] = FIRST_DAMPING, FIRST_GROWTH, 0.0
     # All lanes step until none is alive: a lane that is finished takes no more steps that count.
     for _ in range(limit):
-        _propose(vector, matrix, scalar)
+        propose(vector, matrix, scalar)
         equations(
             K,
             u,
@@ -78,7 +98,7 @@ def refine(
             vector[G_TRIAL],
             scalar[COST_TRIAL],
         )
-        if not _decide(vector, matrix, scalar, tolerance):
+        if not decide(vector, matrix, scalar, tolerance):
             break
 
 
@@ -161,7 +181,7 @@ def ranges(place: Array, x: Array, r: Array, unit: Array, spare: Array) -> None:
 
 
 @compiled
-def _propose(vector: Array, matrix: Array, scalar: Array) -> None:
+def propose(vector: Array, matrix: Array, scalar: Array) -> None:
     """Find the damped step, its squared length in its own standard deviations, and whether it exists."""
     d = vector.shape[1]
     diagonal, inverse, move, right, damping = (
@@ -192,7 +212,7 @@ def _propose(vector: Array, matrix: Array, scalar: Array) -> None:
 
 
 @compiled
-def _decide(vector: Array, matrix: Array, scalar: Array, tolerance: float) -> bool:
+def decide(vector: Array, matrix: Array, scalar: Array, tolerance: float) -> bool:
     """Keep the steps that lower the cost, move the damping, end lanes whose step was small; return if any is alive."""
     d = vector.shape[1]
     # Lanes that are finished go through the rule too, and are left as they are: their step counts as unsolvable.
@@ -226,3 +246,30 @@ def _decide(vector: Array, matrix: Array, scalar: Array, tolerance: float) -> bo
     for lane in range(LANES):
         left += alive[lane]
     return left > 0.0
+
+
+@compiled
+def costs(K: Array, u: Array, place: Array, x: Array, r: Array, left: Array, loop: Array, cost: Array) -> None:
+    """Find the cost alone at positions x (d, W): a third of the work of `equations`; `r` and `left` are scratch."""
+    s, d = place.shape[:2]
+    for i in range(s):
+        for lane in range(LANES):
+            r[i, lane] = 0.0
+        for j in range(d):
+            for lane in range(LANES):
+                apart = x[j, lane] - place[i, j, lane]
+                r[i, lane] += apart * apart
+        for lane in range(LANES):
+            r[i, lane] = np.sqrt(r[i, lane])
+    for lane in range(LANES):
+        cost[lane] = loop[lane]
+    for k in range(len(K)):
+        for lane in range(LANES):
+            left[lane] = u[k, lane]
+        for i in range(s):
+            part = K[k, i]
+            if part != 0.0:
+                for lane in range(LANES):
+                    left[lane] -= part * r[i, lane]
+        for lane in range(LANES):
+            cost[lane] += left[lane] * left[lane]

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from time import perf_counter
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,9 +23,13 @@ from optloc.problem.layout import Layout
 from optloc.problem.noise import variances, whiten
 from optloc.problem.problem import Problem
 from optloc.proof.pose import project_out, whiten_rows
+from optloc.solvers.policy import EQUAL_COST
 from optloc.solvers.pool import Curvature, Pool, in_parts
 from optloc.solvers.stages import gtrs, lsr
 from optloc.solvers.starts.least_squares_ranges import Ranges, ranges
+
+if TYPE_CHECKING:
+    from optloc.compute.range_room import Answer
 
 # The linear maps from measurements to all that a fix from ranges needs, made once for a structure.
 
@@ -32,6 +37,8 @@ from optloc.solvers.starts.least_squares_ranges import Ranges, ranges
 _MOST = 64
 # Share of the largest weight below which a combination of rows is rounding: four digits above it.
 _NOTHING = 1e-12
+# Share of a combination of ranges that their common part may have left by rounding: differences have none of it.
+_LEVEL = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +58,7 @@ class Direct:
     station : int array (s,)
         Stations that take part.
     maps : tuple
-        Fields of `optloc.compute.range_fixes.Model`.
+        Fields of `optloc.compute.range_room.Model`.
     """
 
     layout: Layout
@@ -59,7 +66,7 @@ class Direct:
     weight: Array
     dof: int
     station: Array
-    maps: tuple[Array | int, ...]
+    maps: tuple[Array | float, ...]
 
 
 # The maps of 64 rows take 100 kB, those of six rows 2 kB.
@@ -134,7 +141,7 @@ def _probe(problem: Problem) -> Problem:
     return replace(problem, rows=rows, stations=replace(stations, position=place, velocity=None, axes=None))
 
 
-def _maps(one: Problem, correction: Array, found: Ranges, heard: Array, white: Array) -> tuple[Array | int, ...]:
+def _maps(one: Problem, correction: Array, found: Ranges, heard: Array, white: Array) -> tuple[Array | float, ...]:
     """Return the fields of the compiled model, in its order."""
     count = one.count
     design, emitted, anchor, start = _design(one, found.station[heard])
@@ -149,6 +156,8 @@ def _maps(one: Problem, correction: Array, found: Ranges, heard: Array, white: A
     # Combinations of rows that no range moves: their cost is the misfit of loops.
     loops = loops[np.abs(loops).max(-1, initial=0.0) > _NOTHING * np.abs(alone).max()]
     emission = np.linalg.pinv(times) @ alone
+    share = upper[:inside]
+    norm = float(np.linalg.norm(share, 2)) if share.size else 0.0
     present = one.weight > 0.0
     precision = np.where(present, 1.0 / np.where(present, variances(one.noise, count), 1.0), 0.0)
     return (
@@ -158,9 +167,11 @@ def _maps(one: Problem, correction: Array, found: Ranges, heard: Array, white: A
         np.array(found.sign[0, heard], dtype=float),
         int(np.searchsorted(heard, found.reference[0])) if found.free.all() else -1,
         np.array(white, order="C"),
-        np.array(upper[:inside], order="C"),
+        np.array(share, order="C"),
         np.array(emission @ design, order="C"),
         start,
+        norm,
+        bool(np.abs(share.sum(-1)).max(initial=0.0) <= _LEVEL * norm),
     )
 
 
@@ -241,13 +252,30 @@ def settle_directly(
     threads : int, optional
         At most so many; as many as `optloc.base.threads.thread_count` says if absent.
     """
-    from optloc.compute.range_fixes import Model, fixes
-
     began = perf_counter()
+    answer, steps = fix_directly(direct, z, position, threads)
+    pool = _pool(direct, answer, f"{len(z)} candidates, {steps} steps at most", perf_counter() - began)
+    left = np.flatnonzero(~_is_final(direct, answer))
+    return pool.merge(left, rest(left)) if len(left) else pool
+
+
+def fix_directly(direct: Direct, z: Array, position: Array, threads: int | None = None) -> tuple[Answer, int]:
+    """Return what the compiled call finds, and the most steps that a fix took; see `settle_directly`."""
+    from optloc.compute.range_fixes import fixes
+    from optloc.compute.range_room import Answer, Model
+
     model = Model(*direct.maps)  # type: ignore[arg-type]
-    count, d = len(z), position.shape[-1]
-    x, covariance = np.empty((count, direct.layout.size)), np.empty((count, d, d))
-    cost, plain = np.empty(count), np.empty(count, dtype=np.bool_)
+    count, d, size = len(z), position.shape[-1], direct.layout.size
+    answer = Answer(
+        np.empty((count, size)),
+        np.empty((count, d, d)),
+        np.empty(count),
+        np.empty(count, dtype=np.bool_),
+        np.empty((count, size)),
+        np.empty(count),
+        np.empty((count, 2)),
+        np.empty(count),
+    )
     # Usually all stations take part, and their positions need no copy.
     everyone = len(direct.station) == position.shape[1]
 
@@ -256,24 +284,45 @@ def settle_directly(
         stations = position[part] if len(position) > 1 else position
         stations = _owned(stations if everyone else stations[:, direct.station])
         rows = _owned(z[part])
-        return int(fixes(model, rows, stations, _TOLERANCE, _LIMIT, x[part], covariance[part], cost[part], plain[part]))
+        return int(fixes(model, rows, stations, _TOLERANCE, _LIMIT, Answer(*(array[part] for array in answer))))
 
-    steps = mapped(work, range(0, count, _CHUNK), threads)
-    detail = f"{count} candidates, {max(steps, default=0)} steps at most"
-    pool = Pool(
-        x[:, None],
-        cost[:, None],
-        np.broadcast_to(np.int8(Status.OK), (count, 1)),
-        np.broadcast_to(0, (count, 1)),
+    return answer, max(mapped(work, range(0, count, _CHUNK), threads), default=0)
+
+
+def _is_final(direct: Direct, answer: Answer) -> Array:
+    """Return which fixes (N,) need no other means: settled ones that are not one of a pair that costs the same."""
+    if not direct.frame.geodetic:
+        return answer.settled
+    # of minima on Earth that cost the same the one that is seen better is the answer: the verdict has the rule
+    apart = np.abs(answer.rival_cost - answer.cost)
+    return np.asarray(answer.settled & ~(apart <= EQUAL_COST * (1.0 + answer.cost)))
+
+
+def _pool(direct: Direct, answer: Answer, detail: str, seconds: float) -> Pool:
+    """Return the pool of fixes that were found directly, with a second slot where some have a rival."""
+    count = len(answer.cost)
+    rivalled = np.isfinite(answer.rival_cost) & answer.settled
+    x, cost = answer.x[:, None], answer.cost[:, None]
+    code = np.broadcast_to(np.int8(Status.OK), (count, 1))
+    if rivalled.any():
+        rival = np.where(rivalled[:, None], answer.rival, np.nan)
+        x = np.concatenate([x, rival[:, None]], axis=1)
+        cost = np.stack([answer.cost, np.where(rivalled, answer.rival_cost, np.inf)], axis=1)
+        # an empty slot is one that nobody has refined
+        second = np.where(rivalled, np.int8(Status.OK), np.int8(Status.UNAVAILABLE))
+        code = np.concatenate([code, second[:, None]], axis=1)
+    return Pool(
+        x,
+        cost,
+        code,
+        np.broadcast_to(0, cost.shape),
         np.broadcast_to(direct.weight, (count, len(direct.weight))),
         np.broadcast_to(np.int32(direct.dof), count),
-        (Stage("gtrs", "1 candidates at most", 0.0), Stage("lsr", detail, perf_counter() - began)),
+        (Stage("gtrs", "1 candidates at most", 0.0), Stage("lsr", detail, seconds)),
         refined=True,
-        curvature=Curvature(covariance),
-        plain=plain,
+        curvature=Curvature(answer.covariance),
+        plain=answer.settled & ~rivalled,
     )
-    left = np.flatnonzero(~plain)
-    return pool.merge(left, rest(left)) if len(left) else pool
 
 
 def _owned(values: Array) -> Array:

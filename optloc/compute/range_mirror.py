@@ -1,0 +1,331 @@
+"""The mirror image of a fix in the stations' best plane, refined: where flat networks have their second minimum.
+
+A refinement is given up where it cannot lead to a rival of the fix: see `watch`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH
+from optloc.compute.jit import compiled
+from optloc.compute.principal import principal_axes
+from optloc.compute.range_refine import decide, equations, propose, ranges
+from optloc.compute.range_room import (
+    ALIVE,
+    AXES,
+    CENTRE,
+    COST,
+    DAMPING,
+    DIAGONAL,
+    FIX,
+    FIX_COST,
+    FIX_H,
+    GAIN,
+    GOOD,
+    GROWTH,
+    H_TRIAL,
+    HEIGHT,
+    HIGH,
+    INVERSE,
+    LOOP,
+    LOW,
+    LOWER,
+    MOVE,
+    NORMAL,
+    ROW,
+    SHARE,
+    SPARE,
+    STEPS,
+    G,
+    H,
+    Model,
+    Room,
+    X,
+)
+from optloc.compute.systems import LANES, factor_plain, solve_plain
+
+LISTED = 25.0
+"""Cost above that of the fix up to which a rival counts (`optloc.solvers.policy.LISTED_GAP`)."""
+SAME = 1e-2
+"""Squared distance in standard deviations below which two minima are one (`optloc.solvers.policy.SAME_PLACE`)."""
+
+# Share of the fix's height above the plane: the ball about the image in which a rival is looked for. Among 1 760 rivals
+# in flat networks (heights of 30, 100 and 300 m, range differences and ranges) none was lost with a fifth.
+_BALL = 0.2
+# Steps of a mirror image: half of the rivals in flat networks are reached in seven, nine of ten in fifteen, the last
+# in fifty.
+_MOST = 60
+# Squared standard deviations about the fix in which a point belongs to it, if its cost has at least this share of the
+# rise that the fix's own curvature says: another minimum would be cheaper.
+_NEAR, _RISEN = 9.0, 0.5
+# Squared length of the undamped step, in standard deviations, below which a refinement has arrived: a hundredth of one.
+_ARRIVED = 1e-4
+# Share of its diagonal that a pivot must keep: below it the curvature is rounding.
+_WEAK = 1e-11
+
+
+@compiled
+def find_plane(room: Room) -> None:
+    """Write the direction in which the stations spread least to row NORMAL."""
+    s, d = room.place.shape[:2]
+    matrix, normal, least, spare = room.matrix, room.vector[NORMAL], room.scalar[LOW], room.scalar[SPARE]
+    work, axes = matrix[H_TRIAL], matrix[AXES]
+    for i in range(d):
+        for j in range(i + 1):
+            for lane in range(LANES):
+                work[i, j, lane] = 0.0
+            for k in range(s):
+                for lane in range(LANES):
+                    first = room.place[k, i, lane] - room.vector[CENTRE, i, lane]
+                    work[i, j, lane] += first * (room.place[k, j, lane] - room.vector[CENTRE, j, lane])
+    principal_axes(work, axes, spare)
+    for lane in range(LANES):
+        least[lane] = np.inf
+    for k in range(d):
+        for lane in range(LANES):
+            spare[lane] = 1.0 if work[k, k, lane] < least[lane] else 0.0
+            least[lane] = min(least[lane], work[k, k, lane])
+        for i in range(d):
+            for lane in range(LANES):
+                normal[i, lane] = axes[i, k, lane] if spare[lane] != 0.0 else normal[i, lane]
+
+
+@compiled
+def keep_fix(room: Room) -> None:
+    """Keep position and information of the fix, and its height above the stations' plane."""
+    vector, matrix, scalar = room.vector, room.matrix, room.scalar
+    d = vector.shape[1]
+    for lane in range(LANES):
+        scalar[HEIGHT, lane] = 0.0
+    for i in range(d):
+        for lane in range(LANES):
+            vector[FIX, i, lane] = vector[X, i, lane]
+            scalar[HEIGHT, lane] += (vector[X, i, lane] - vector[CENTRE, i, lane]) * vector[NORMAL, i, lane]
+        for j in range(i + 1):
+            for lane in range(LANES):
+                matrix[FIX_H, i, j, lane] = matrix[H, i, j, lane]
+
+
+@compiled
+def reflect(room: Room) -> None:
+    """Start the refinement of the mirror images of kept fixes; those that are not good have none."""
+    vector, scalar = room.vector, room.scalar
+    for i in range(vector.shape[1]):
+        for lane in range(LANES):
+            vector[X, i, lane] = vector[FIX, i, lane] - 2.0 * scalar[HEIGHT, lane] * vector[NORMAL, i, lane]
+    for lane in range(LANES):
+        scalar[DAMPING, lane], scalar[GROWTH, lane], scalar[STEPS, lane] = FIRST_DAMPING, FIRST_GROWTH, 0.0
+        scalar[ALIVE, lane] = scalar[GOOD, lane]
+
+
+@compiled
+def follow(model: Model, u: Array, room: Room, tolerance: float, fewest: int) -> None:
+    """Refine the positions of lanes that are alive, until fewer of them are left than are worth a block.
+
+    Parameters
+    ----------
+    model : Model
+        What all problems share.
+    u : array (q, W)
+        Whitened rows.
+    room : Room
+        Positions, damping, steps, and what `keep_fix` wrote in. Lanes that arrived somewhere stay good and are no
+        longer alive; those that are given up are not good.
+    tolerance : float
+        As of `optloc.compute.range_refine.refine`.
+    fewest : int
+        Lanes for which it goes on.
+    """
+    scalar, nearest = room.scalar, room.scalar[SHARE]
+    _evaluate(model, u, room, False)
+    _note_nearest(room, nearest, True)
+    while True:
+        propose(room.vector, room.matrix, scalar)
+        if watch(model, room, nearest) < fewest:
+            return
+        _evaluate(model, u, room, True)
+        going = decide(room.vector, room.matrix, scalar, tolerance)
+        _note_nearest(room, nearest, False)
+        if not going:
+            return
+
+
+@compiled
+def _evaluate(model: Model, u: Array, room: Room, trial: bool) -> None:
+    vector, matrix, scalar, shift = room.vector, room.matrix, room.scalar, 1 if trial else 0
+    # rows of what is tried stand behind those of what is kept
+    equations(
+        model.K,
+        u,
+        room.place,
+        room.r,
+        room.unit,
+        vector[X + shift],
+        vector[ROW],
+        scalar[SPARE],
+        scalar[LOOP],
+        matrix[H + shift],
+        vector[G + shift],
+        scalar[COST + shift],
+    )
+
+
+@compiled
+def _note_nearest(room: Room, nearest: Array, every: bool) -> None:
+    """Write the range to the nearest station, where the last step was kept."""
+    kept, least = room.scalar[SPARE], room.scalar[LOW]
+    for lane in range(LANES):
+        least[lane] = np.inf
+    for i in range(len(room.r)):
+        for lane in range(LANES):
+            least[lane] = min(least[lane], room.r[i, lane])
+    for lane in range(LANES):
+        nearest[lane] = least[lane] if every or kept[lane] != 0.0 else nearest[lane]
+
+
+@compiled
+def watch(model: Model, room: Room, nearest: Array) -> float:
+    """Give up refinements that lead to no rival, and return how many lanes are alive.
+
+    Two reasons end one. Within a ball of radius D about it nothing costs as little as a rival: over a step of length
+    D a range is off its linear prediction by 0 to ``D^2 / 2 r``, so that all residuals together are by no more than
+    ``norm(K) sqrt(s) D^2 / 2 r`` (half of it where a common error of all ranges is nothing), and the linear
+    prediction itself is nowhere better than its least. Or the refinement is back at the fix: within three standard
+    deviations of it, where the cost has risen as the curvature of the fix says.
+
+    Parameters
+    ----------
+    model : Model
+        What all problems share.
+    room : Room
+        Proposed steps, and what `keep_fix` wrote in; ALIVE and GOOD are written.
+    nearest : array (W,)
+        Ranges to the nearest stations, metres.
+    """
+    vector, matrix, scalar = room.vector, room.matrix, room.scalar
+    d, spare, trace = vector.shape[1], scalar[SPARE], scalar[LOW]
+    bow = model.norm * np.sqrt(len(room.r)) * (0.25 if model.level else 0.5)
+    for lane in range(LANES):
+        trace[lane], spare[lane] = 0.0, 0.0
+    for i in range(d):
+        for lane in range(LANES):
+            trace[lane] += matrix[H, i, i, lane]
+        for j in range(i + 1):
+            twice = 1.0 if i == j else 2.0
+            for lane in range(LANES):
+                first = vector[X, i, lane] - vector[FIX, i, lane]
+                second = vector[X, j, lane] - vector[FIX, j, lane]
+                spare[lane] += twice * matrix[FIX_H, i, j, lane] * first * second
+    alive = 0.0
+    for lane in range(LANES):
+        ball = _BALL * _BALL * scalar[HEIGHT, lane] * scalar[HEIGHT, lane]
+        # the gain is that of the damped step: within the ball the damping is worth no more than this
+        least = scalar[COST, lane] - scalar[GAIN, lane] - scalar[DAMPING, lane] * trace[lane] * ball
+        far = np.sqrt(max(least, 0.0)) >= np.sqrt(scalar[FIX_COST, lane] + LISTED) + bow * ball / nearest[lane]
+        near = spare[lane] < _NEAR and scalar[COST, lane] - scalar[FIX_COST, lane] > _RISEN * spare[lane]
+        up = far or near or scalar[STEPS, lane] >= _MOST
+        scalar[GOOD, lane] = 0.0 if up and scalar[ALIVE, lane] != 0.0 else scalar[GOOD, lane]
+        scalar[ALIVE, lane] = 0.0 if up else scalar[ALIVE, lane]
+        alive += scalar[ALIVE, lane]
+    return alive
+
+
+@compiled
+def confirm(model: Model, u: Array, room: Room) -> float:
+    """Leave good only the lanes that arrived at a rival, and return how many did.
+
+    Where a damped refinement ends is no minimum yet: the undamped step must be short there, too, and the curvature of
+    the cost, second derivatives of the ranges included, positive.
+    """
+    vector, matrix, scalar, spare = room.vector, room.matrix, room.scalar, room.scalar[SPARE]
+    d, found = vector.shape[1], 0.0
+    for lane in range(LANES):
+        cheap = scalar[COST, lane] <= scalar[FIX_COST, lane] + LISTED
+        scalar[GOOD, lane] = scalar[GOOD, lane] if cheap and scalar[ALIVE, lane] == 0.0 else 0.0
+        spare[lane] = 0.0
+        found += scalar[GOOD, lane]
+    if found == 0.0:
+        return 0.0
+    for i in range(d):
+        for j in range(d):
+            for lane in range(LANES):
+                apart = (vector[X, i, lane] - vector[FIX, i, lane]) * (vector[X, j, lane] - vector[FIX, j, lane])
+                spare[lane] += matrix[FIX_H, max(i, j), min(i, j), lane] * apart
+    for lane in range(LANES):
+        scalar[GOOD, lane] = scalar[GOOD, lane] if spare[lane] >= SAME else 0.0
+    _require_rest(vector, matrix, scalar)
+    _bend(model, u, room)
+    _require_positive(vector, matrix, scalar[GOOD], matrix[H_TRIAL])
+    found = 0.0
+    for lane in range(LANES):
+        found += scalar[GOOD, lane]
+    return found
+
+
+@compiled
+def _require_rest(vector: Array, matrix: Array, scalar: Array) -> None:
+    """Keep the lanes whose undamped step is short."""
+    d, move, length = vector.shape[1], vector[MOVE], scalar[SPARE]
+    _require_positive(vector, matrix, scalar[GOOD], matrix[H])
+    for i in range(d):
+        for lane in range(LANES):
+            move[i, lane] = vector[G, i, lane]
+    solve_plain(matrix[LOWER], vector[INVERSE], move)
+    for lane in range(LANES):
+        length[lane] = 0.0
+    for i in range(d):
+        for lane in range(LANES):
+            length[lane] += move[i, lane] * vector[G, i, lane]
+    for lane in range(LANES):
+        scalar[GOOD, lane] = scalar[GOOD, lane] if length[lane] < _ARRIVED else 0.0
+
+
+@compiled
+def _require_positive(vector: Array, matrix: Array, good: Array, curvature: Array) -> None:
+    """Keep the lanes whose curvature is positive definite; its factor is left in LOWER and INVERSE."""
+    d, diagonal, inverse = vector.shape[1], vector[DIAGONAL], vector[INVERSE]
+    for i in range(d):
+        for lane in range(LANES):
+            diagonal[i, lane] = curvature[i, i, lane]
+    factor_plain(curvature, diagonal, matrix[LOWER], inverse)
+    for i in range(d):
+        for lane in range(LANES):
+            good[lane] = good[lane] if 0.0 < inverse[i, lane] * diagonal[i, lane] < 1.0 / _WEAK else 0.0
+
+
+@compiled
+def _bend(model: Model, u: Array, room: Room) -> None:
+    """Write half the second derivatives of the cost to H_TRIAL: the information, less what bent fronts do to it."""
+    vector, matrix, scalar = room.vector, room.matrix, room.scalar
+    s, d = room.place.shape[:2]
+    left, pull = scalar[SPARE], scalar[HIGH]
+    out, residual = matrix[H_TRIAL], room.rows[:, 0]  # there are no more whitened rows than stations
+    ranges(room.place, vector[X], room.r, room.unit, left)
+    for k in range(len(model.K)):
+        for lane in range(LANES):
+            residual[k, lane] = u[k, lane]
+        for i in range(s):
+            part = model.K[k, i]
+            if part != 0.0:
+                for lane in range(LANES):
+                    residual[k, lane] -= part * room.r[i, lane]
+    for i in range(d):
+        for j in range(i + 1):
+            for lane in range(LANES):
+                out[i, j, lane] = matrix[H, i, j, lane]
+    for k in range(s):
+        for lane in range(LANES):
+            pull[lane] = 0.0
+        for m in range(len(model.K)):
+            part = model.K[m, k]
+            if part != 0.0:
+                for lane in range(LANES):
+                    pull[lane] += part * residual[m, lane]
+        for i in range(d):
+            for j in range(i + 1):
+                own = 1.0 if i == j else 0.0
+                for lane in range(LANES):
+                    across = own - room.unit[k, i, lane] * room.unit[k, j, lane]
+                    out[i, j, lane] -= pull[lane] * across / room.r[k, lane]
