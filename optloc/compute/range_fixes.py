@@ -239,7 +239,7 @@ def _examine(
     """
     s, scalar = len(room.place), room.scalar
     u, settled = room.value[s : s + len(model.K)], scalar[FIX_GOOD]
-    kappa, even, closer = room.vector[ROW, 0], room.vector[ROW, 1], 0
+    kappa, even, closer, turned = room.vector[ROW, 0], room.vector[ROW, 1], 0, False
     measure_shape(model, u, room, False, False, kappa)
     find_even(room.matrix, even)
     shape, rival, infinity, item = answer.kappa, answer.rival_cost, answer.infinity, room.item
@@ -249,8 +249,9 @@ def _examine(
         rival[i], infinity[i] = np.inf, np.inf
         look[i] = good and (kappa[lane] > STRAIGHT or even[lane] != 0.0)
         closer += 1 if look[i] else 0
+        turned = turned or even[lane] != 0.0
     if closer >= _WORTH or (closer and size < LANES):
-        _measure_closely(model, u, room, size, answer, look)
+        _measure_closely(model, u, room, size, answer, look, turned)
     measure_infinity(model, u, room)
     left = 0.0
     for lane in range(size):
@@ -268,21 +269,23 @@ def _examine(
 
 
 @compiled
-def _measure_closely(model: Model, u: Array, room: Room, size: int, answer: Answer, look: Array) -> None:
-    """Measure the shape of fixes along turned axes as well, and in inverse range where it is poor in metres."""
-    kappa, far, item, settled, shape = room.vector[ROW, 0], 0, room.item, answer.settled, answer.kappa
-    for inverse in range(2):
-        if inverse == 1 and far == 0:
-            return
-        measure_shape(model, u, room, inverse == 1, True, kappa)
+def _measure_closely(model: Model, u: Array, room: Room, size: int, answer: Answer, look: Array, turned: bool) -> None:
+    """Measure the shape in metres along turned axes as well, if asked, and in inverse range where it is poor there."""
+    kappa, item, settled, shape, far = room.vector[ROW, 0], room.item, answer.settled, answer.kappa, 0
+    if turned:
+        measure_shape(model, u, room, False, True, kappa)
+    for lane in range(size):
+        i = item[lane]
+        if settled[i]:
+            look[i] = False
+            shape[i, 0] = kappa[lane] if turned else shape[i, 0]
+            far += 1 if shape[i, 0] > STRAIGHT else 0
+    if far:
+        measure_shape(model, u, room, True, True, kappa)
         for lane in range(size):
             i = item[lane]
-            if not settled[i]:
-                continue
-            look[i] = False
-            if inverse == 0 or shape[i, 0] > STRAIGHT:
-                shape[i, inverse] = kappa[lane]
-            far += 1 if shape[i, 0] > STRAIGHT else 0
+            if settled[i] and shape[i, 0] > STRAIGHT:
+                shape[i, 1] = kappa[lane]
 
 
 @compiled
@@ -396,7 +399,7 @@ def _look_again(model: Model, z: Array, room: Room, size: int, answer: Answer, l
     for lane in range(LANES):
         scalar[ALIVE, lane] = 0.0
     _write_fixes(model, z, room, size, answer)
-    _measure_closely(model, u, room, size, answer, look)
+    _measure_closely(model, u, room, size, answer, look, True)
 
 
 @compiled

@@ -54,6 +54,9 @@ SAME = 1e-2
 # Share of the fix's height above the plane: the ball about the image in which a rival is looked for. Among 1 760 rivals
 # in flat networks (heights of 30, 100 and 300 m, range differences and ranges) none was lost with a fifth.
 _BALL = 0.2
+# Damping up to which the least of the linear prediction is one of all directions: along a short, damped step it says
+# too little of rivals farther off, some of which are behind a ridge.
+_FREE = 1e-5
 # Steps of a mirror image: half of the rivals in flat networks are reached in seven, nine of ten in fifteen, the last
 # in fifty.
 _MOST = 60
@@ -225,6 +228,7 @@ def watch(model: Model, room: Room, nearest: Array) -> float:
         least = scalar[COST, lane] - scalar[GAIN, lane] - scalar[DAMPING, lane] * trace[lane] * ball
         far = np.sqrt(max(least, 0.0)) >= np.sqrt(scalar[FIX_COST, lane] + LISTED) + bow * ball / nearest[lane]
         near = spare[lane] < _NEAR and scalar[COST, lane] - scalar[FIX_COST, lane] > _RISEN * spare[lane]
+        far = far and scalar[DAMPING, lane] <= _FREE
         up = far or near or scalar[STEPS, lane] >= _MOST
         scalar[GOOD, lane] = 0.0 if up and scalar[ALIVE, lane] != 0.0 else scalar[GOOD, lane]
         scalar[ALIVE, lane] = 0.0 if up else scalar[ALIVE, lane]

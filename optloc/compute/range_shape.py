@@ -86,7 +86,7 @@ def measure_shape(model: Model, u: Array, room: Room, inverse: bool, turned: boo
     if turned:
         _turn(model, u, room, inverse)
     for lane in range(LANES):
-        out[lane] = np.log(max(high[lane], 1.0 / low[lane]))
+        out[lane] = np.log(max(high[lane], 1.0 / max(low[lane], _NONE)))
 
 
 @compiled
@@ -131,7 +131,7 @@ def _turn(model: Model, u: Array, room: Room, inverse: bool) -> None:
                 _probe(model, u, room, inverse)
                 for lane in range(LANES):
                     # a quadratic rise stands for what is not asked
-                    rise = scalar[COST, lane] + share[lane]
+                    rise = scalar[COST, lane] + 1.0 / share[lane]
                     scalar[COST_TRIAL, lane] = scalar[COST_TRIAL, lane] if even[lane] != 0.0 else rise
                 _note(scalar, scalar[HIGH], scalar[LOW])
 
@@ -197,14 +197,14 @@ def _axes(matrix: Array, inverse: bool, spare: Array) -> None:
 
 @compiled
 def _probe(model: Model, u: Array, room: Room, inverse: bool) -> None:
-    """Find the cost a step MOVE away, and what a quadratic cost would rise by; a step past the horizon ends there."""
+    """Find the cost a step MOVE away, and one over the rise of a quadratic one; a step past the horizon ends there."""
     vector, scalar = room.vector, room.scalar
     d, move, trial, share, w = vector.shape[1], vector[MOVE], vector[TRIAL], scalar[SHARE], scalar[SPARE]
     if inverse:
         for lane in range(LANES):
             down = move[d - 1, lane]
             cut = (_HORIZON - 1.0) / down if 1.0 + down < _HORIZON else 1.0
-            share[lane] = _REACH * _REACH * cut * cut
+            share[lane] = 1.0 / (_REACH * _REACH * cut * cut)
             w[lane] = 1.0 / (1.0 + cut * down)
             for j in range(d - 1):
                 move[j, lane] *= cut
@@ -218,7 +218,7 @@ def _probe(model: Model, u: Array, room: Room, inverse: bool) -> None:
                 trial[i, lane] = vector[CENTRE, i, lane] + w[lane] * trial[i, lane]
     else:
         for lane in range(LANES):
-            share[lane] = _REACH * _REACH
+            share[lane] = 1.0 / (_REACH * _REACH)
         for i in range(d):
             for lane in range(LANES):
                 trial[i, lane] = vector[X, i, lane] + move[i, lane]
@@ -229,8 +229,9 @@ def _probe(model: Model, u: Array, room: Room, inverse: bool) -> None:
 def _note(scalar: Array, high: Array, low: Array) -> None:
     """Keep the greatest and the least rise of the cost, relative to that of a quadratic one."""
     for lane in range(LANES):
-        rise = (scalar[COST_TRIAL, lane] - scalar[COST, lane]) / scalar[SHARE, lane]
-        # what is no number is far from quadratic
-        rise = min(np.inf, rise)
+        rise = (scalar[COST_TRIAL, lane] - scalar[COST, lane]) * scalar[SHARE, lane]
+        # what is no number is far from quadratic, and comparisons with it fail
+        number, lower = rise < np.inf, rise < low[lane]
+        rise = rise if number else np.inf
         high[lane] = max(high[lane], rise)
-        low[lane] = min(low[lane], max(rise, _NONE))
+        low[lane] = rise if lower else low[lane]

@@ -320,8 +320,9 @@ def _pool(direct: Direct, answer: Answer, detail: str, seconds: float) -> Pool:
         np.broadcast_to(np.int32(direct.dof), count),
         (Stage("gtrs", "1 candidates at most", 0.0), Stage("lsr", detail, seconds)),
         refined=True,
-        curvature=Curvature(answer.covariance),
+        curvature=Curvature(answer.covariance, kappa=answer.kappa),
         plain=answer.settled & ~rivalled,
+        infinity=answer.infinity,
     )
 
 
