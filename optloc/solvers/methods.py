@@ -226,6 +226,8 @@ class Method:
     def runs(self, count: int) -> list[Solver]:
         """Return the stages for so many problems, in as few as do the same."""
         for words, short in SHORTCUTS.items():
+            if shortcut(self):
+                return [replace(short, alone=True)]
             if count >= short.least and self.words[: len(words)] == words:
                 return [short, *(SOLVERS[word].run for word in self.words[len(words) :])]
         return [SOLVERS[word].run for word in self.words]

@@ -25,7 +25,7 @@ from optloc.problem.problem import Problem
 from optloc.proof.pose import project_out, whiten_rows
 from optloc.solvers.policy import EQUAL_COST
 from optloc.solvers.pool import Curvature, Pool, in_parts
-from optloc.solvers.stages import gtrs, lsr
+from optloc.solvers.stages import Solver, gtrs, gtrs_lsr, lsr
 from optloc.solvers.starts.least_squares_ranges import Ranges, ranges
 
 if TYPE_CHECKING:
@@ -210,28 +210,35 @@ class Quick:
     ----------
     least : int
         Batches with fewer problems take the stages as they are.
+    alone : bool
+        Whether nothing follows: then the mirror image of the start is refined on the way of the stages, too. What
+        follows otherwise looks for other minima by itself.
     """
 
     least: int = 1
+    alone: bool = False
 
     def __call__(self, problem: Problem, pool: Pool | None) -> Pool:
         """Return the settled pools of a flat batch of problems."""
         count = problem.batch_shape[0]
         plan = direct(problem) if pool is None and count >= self.least else None
+        stages = gtrs_lsr if self.alone else _start_and_refine
         if plan is None:
             start = pool
-            return in_parts(
-                problem, lambda some, part: lsr(some, gtrs(some, None if start is None else take(start, part)))
-            )
+            return in_parts(problem, lambda some, part: stages(some, None if start is None else take(start, part)))
         z = problem.z if len(problem.rows) > 1 else problem.rows[0].z
         place = problem.stations.position.reshape(-1, *problem.stations.position.shape[-2:])
         z = z if len(z) == count else np.broadcast_to(z, (count, problem.count))
-        return settle_directly(plan, z, place, lambda items: by_stages(problem, items))
+        return settle_directly(plan, z, place, lambda items: by_stages(problem, items, stages))
 
 
-def by_stages(problem: Problem, items: Array) -> Pool:
-    """Return the pools of some problems of a flat batch by the stages "gtrs" and "lsr"."""
-    return in_parts(problem.take(items), lambda some, part: lsr(some, gtrs(some, None)))
+def _start_and_refine(problem: Problem, pool: Pool | None) -> Pool:
+    return lsr(problem, gtrs(problem, pool))
+
+
+def by_stages(problem: Problem, items: Array, stages: Solver = gtrs_lsr) -> Pool:
+    """Return the pools of some problems of a flat batch by stages, those of "gtrs+lsr" if not said otherwise."""
+    return in_parts(problem.take(items), lambda some, part: stages(some, None))
 
 
 def settle_directly(

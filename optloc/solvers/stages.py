@@ -13,7 +13,9 @@ from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
 from optloc.base.records import take
 from optloc.base.types import Array, Status
+from optloc.compute.sums import equations_at
 from optloc.linear.constraints import exact
+from optloc.linear.normal import decrement, step
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.solvers.formulations import FORMULATIONS
@@ -67,6 +69,45 @@ def start_with(word: str) -> Solver:
 
 
 gtrs, roots = start_with("gtrs"), start_with("roots")
+
+# Squared length of the undamped step, in standard deviations, below which a refinement has arrived: a hundredth of one.
+_ARRIVED = 1e-4
+
+
+def gtrs_lsr(problem: Problem, pool: Pool | None) -> Pool:
+    """Return what the method "gtrs+lsr" returns: the start and its mirror image, refined.
+
+    The image in the plane (or line) that fits the stations best is where flat networks have their second minimum; one
+    that ends where an undamped step would lead on is no minimum.
+    """
+    start = gtrs(problem, pool)
+    if not one_position(problem):
+        return lsr(problem, start)
+    slot, _ = problem.layout.find("position")
+    position = start.x[..., slot.start : slot.start + slot.size]
+    x = pack(np.concatenate([start.x, vectors(problem, mirror(problem, position))], axis=1))
+    both = replace(offer(problem, x, start, "", perf_counter()), stages=start.stages)
+    # where an image runs to infinity its cost is one of many there, and not the least: nobody has looked
+    return replace(_without_halted(problem, lsr(problem, both)), infinity=None)
+
+
+def _without_halted(problem: Problem, pool: Pool) -> Pool:
+    """Return a settled pool without the rivals at which an undamped step would lead on."""
+    item, slot = pool.occupied
+    item, slot = item[slot > 0], slot[slot > 0]
+    # constraints hold points that free steps would leave
+    if not len(item) or problem.constraints:
+        return pool
+    at, x = equations_at(problem.take(item), pool.x[item, slot]), np.array(pool.x)
+    with np.errstate(all="ignore"):
+        move, ok = step(at, np.zeros(len(item)))
+        halted = ~(ok & (decrement(at, move, problem.layout.n_shared) < _ARRIVED))
+    cost, code, lost = np.array(pool.cost), np.array(pool.code), (item[halted], slot[halted])
+    x[lost], cost[lost], code[lost] = np.nan, np.inf, Status.UNAVAILABLE
+    left = max(1, int(np.isfinite(cost).sum(1).max(initial=0)))
+    order = np.argsort(~np.isfinite(cost), axis=1, kind="stable")[:, :left]
+    cost, code, face = (np.take_along_axis(array, order, axis=1) for array in (cost, code, pool.face))
+    return replace(pool, x=np.take_along_axis(x, order[..., None], axis=1), cost=cost, code=code, face=face)
 
 
 def fix_by(problem: Problem, start: Callable[[Problem], Pool]) -> Fix:

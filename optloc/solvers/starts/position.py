@@ -54,10 +54,16 @@ def squared_range_starts(problem: Problem, pick: Pick) -> Array:
 
 
 def mirror(problem: Problem, position: Array) -> Array:
-    """Return points (N, ..., d) mirrored in the plane (or line) that fits the stations of each problem best."""
+    """Return points (N, ..., d) mirrored in the plane (or line) that fits the stations of each problem best.
+
+    Stations that stay count where a row is present of them, those that move as they are.
+    """
     flat = problem.stations.places
-    centre = flat.mean(-2, keepdims=True)
-    _, vectors = np.linalg.eigh(np.swapaxes(flat - centre, -1, -2) @ (flat - centre))
+    share = np.ones((1, flat.shape[-2], 1))
+    if problem.stations.position.shape[-3] == 1:
+        share = ((problem.weight > 0.0).astype(float) @ rows_of_stations(problem).T > 0.0).astype(float)[..., None]
+    centre = (share * flat).sum(-2, keepdims=True) / np.maximum(share.sum(-2, keepdims=True), 1.0)
+    _, vectors = np.linalg.eigh(np.swapaxes(flat - centre, -1, -2) @ (share * (flat - centre)))
     # eigenvalues ascend: the stations spread least along the first vector
     normal = vectors[..., :, 0]
     shape = (-1, *(1,) * (position.ndim - 2), position.shape[-1])
