@@ -37,7 +37,7 @@ def test_columns_are_what_they_say():
             left = drawn.problem.z[i] - (far[1:] - far[0])
             assert found[name][i] == pytest.approx(left @ weight @ left)
     assert (found["cost"] <= found["cost_truth"]).all()
-    assert set(found["status"]) == {"ok"}
+    assert set(found["status"]) == {"unproven"}  # of a method without a proof
     assert (found["seconds"] > 0.0).all()
     assert (found["iterations"] >= 1.0).all()
 
@@ -62,7 +62,7 @@ def test_a_failing_trial_costs_its_row(monkeypatch):
 
     monkeypatch.setattr(trial, "run", brittle)
     found = frame(made)
-    assert found["status"].tolist() == ["ok"] * 4 + [DIED] + ["ok"] * 5
+    assert found["status"].tolist() == ["unproven"] * 4 + [DIED] + ["unproven"] * 5
     assert found["reason"][4] == "FloatingPointError: no such luck"
     assert np.isnan(found["error"][4])
     assert found["truth_x"].equals(whole["truth_x"])
