@@ -39,14 +39,15 @@ def counted(name: str, count: int) -> list[int]:
     fix = solve(problem)
     slack = TIE * (1.0 + best.cost)
     endless = best.at_infinity
-    answered = fix.answered & ~fix.has(Status.UNBOUNDED)
+    answered = fix.answered
+    sure = answered & ~fix.has(Status.UNBOUNDED)
     reached = answered & (model.cost(fix.x, z) <= best.cost + slack)
     others = model.cost(fix.alternatives.x, z).min(1, initial=np.inf)
     listed = ~reached & fix.has(Status.AMBIGUOUS) & (others <= best.cost + slack)
-    endless &= ~reached & ~listed & ~answered
+    endless &= ~reached & ~listed & ~sure
     hidden = ~reached & ~listed & ~endless & (np.linalg.norm(best.x, axis=1) > HORIZON)
     rest = ~(reached | listed | endless | hidden)
-    parts = (reached, listed, rest & ~answered, rest & answered, endless, hidden, fix.has(Status.AMBIGUOUS))
+    parts = (reached, listed, rest & ~sure, rest & sure, endless, hidden, fix.has(Status.AMBIGUOUS))
     return [int(part.sum()) for part in parts]
 
 

@@ -119,8 +119,9 @@ def outcome(run: Trials, fix: Fix) -> Outcome:
     cost = run.model.cost(position(fix), run.z)
     others = run.model.cost(fix.alternatives.x[..., :d], run.z).min(1, initial=np.inf)
     slack = TIE * (1.0 + run.best.infimum)
+    answered = fix.answered
     # Where infinity explains the data as well, no place is claimed.
-    answered = fix.answered & ~fix.has(Status.UNBOUNDED)
+    sure = answered & ~fix.has(Status.UNBOUNDED)
     reached = answered & (cost <= run.best.cost + slack)
     listed = ~reached & fix.has(Status.AMBIGUOUS) & (others <= run.best.cost + slack)
     # An infimum at infinity is approached, never attained: a finite fix below it is the better point.
@@ -128,13 +129,13 @@ def outcome(run: Trials, fix: Fix) -> Outcome:
     reached, listed = reached & ~endless, listed & ~endless
     missed = ~(reached | listed | endless)
     # An ambiguous fix says that infinity rivals it.
-    claimed = endless & answered & ~fix.has(Status.AMBIGUOUS)
+    claimed = endless & sure & ~fix.has(Status.AMBIGUOUS)
     return Outcome(
         len(cost),
         reached,
         listed,
-        missed & ~answered,
-        missed & answered,
+        missed & ~sure,
+        missed & sure,
         answered & ~endless & (cost + slack < run.best.cost),
         endless & ~claimed,
         claimed,
