@@ -19,8 +19,8 @@ from optloc.problem.problem import Problem
 
 # Explanations of a misfit that are told where several do as well.
 _SHOWN = 3
-# Rows of a run that are looked at: tests of twenty stations take a second or two with as many.
-_ROWS = 20_000
+# Rows of a run that are looked at: what lasts shows in them, and tests of all channels take seconds with more.
+_ROWS = 2000
 
 
 def advise(problem: Problem, fix: Fix | None = None) -> Any:

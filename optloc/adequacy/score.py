@@ -230,11 +230,11 @@ def score(problem: Problem, x: Array, found: tuple[Candidate, ...]) -> list[tupl
     found : tuple of Candidate
         What is tested.
     """
-    larger = _with(problem, found)
+    larger, places = _with_families(problem, found)
     layout = larger.layout
     information, vector = _shared(larger, _embed(problem, larger, x))
-    own = [layout.find(bias.name)[0] for bias in larger.biases[len(problem.biases) :]]
-    inside = np.concatenate([np.arange(slot.start, slot.start + slot.size) for slot in own])
+    own = [slice(*(layout.find(name)[0].start + end for end in ends)) for name, ends in places]
+    inside = np.concatenate([np.arange(part.start, part.stop) for part in own])
     rest = np.setdiff1d(np.arange(layout.n_shared), inside)
     space = np.eye(layout.n_shared)[:, rest]
     if face := exact(problem):
@@ -245,8 +245,7 @@ def score(problem: Problem, x: Array, found: tuple[Candidate, ...]) -> list[tupl
         space[old] = along
     root = space @ _root(space.T @ information @ space)
     out = []
-    for slot in own:
-        part = slice(slot.start, slot.start + slot.size)
+    for part in own:
         coupling = root.T @ information[:, part]
         left = information[part, part] - coupling.T @ coupling
         pull = vector[part] - coupling.T @ (root.T @ vector)
@@ -254,7 +253,7 @@ def score(problem: Problem, x: Array, found: tuple[Candidate, ...]) -> list[tupl
         inverse = _root(left)
         inverse = inverse @ inverse.T if told.all() else np.zeros_like(left)
         value = inverse @ pull
-        out.append((float(pull @ value), value, slot.size))
+        out.append((float(pull @ value), value, part.stop - part.start))
     return out
 
 
@@ -273,6 +272,25 @@ def _root(matrix: Array) -> Array:
     values, vectors = np.linalg.eigh(matrix * scale[:, None] * scale)
     kept = values > _ROUNDING
     return np.asarray(scale[:, None] * vectors[:, kept] / np.sqrt(values[kept]))
+
+
+def _with_families(problem: Problem, found: tuple[Candidate, ...]) -> tuple[Problem, list[tuple[str, tuple[int, int]]]]:
+    """Return the problem with all candidates, those of a form as one bias, and the bias and entries of each.
+
+    A bias of many members costs no more than one of a single member.
+    """
+    more, places = [], [("", (0, 0))] * len(found)
+    for form in dict.fromkeys(one.bias.form for one in found):
+        own = [i for i, one in enumerate(found) if one.bias.form == form]
+        parts = [found[i].bias for i in own]
+        name, size = f"{form} that is tested", 3 if form == "rotation" and problem.dimension == 3 else 1
+        member = np.concatenate([np.full(len(part.row), j) for j, part in enumerate(parts)])
+        row, coefficient = (np.concatenate([getattr(part, key) for part in parts]) for key in ("row", "coefficient"))
+        more.append(replace(parts[0], name=name, members=tuple(map(str, own)), row=row, member=member))
+        more[-1] = replace(more[-1], coefficient=coefficient)
+        for j, i in enumerate(own):
+            places[i] = name, (size * j, size * (j + 1))
+    return replace(problem, biases=(*problem.biases, *more)), places
 
 
 def _with(problem: Problem, found: tuple[Candidate, ...]) -> Problem:
