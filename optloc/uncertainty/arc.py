@@ -15,7 +15,6 @@ from optloc.base.types import Array
 from optloc.problem.chart import CARTESIAN, basis, jacobian
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.uncertainty.proposal import student
 from optloc.uncertainty.surface import Surface
 
 # Corrections across the curve, in its standard deviations, below which the next step is longer and above which it is
@@ -283,3 +282,39 @@ class _Valley:
         share = (away @ chord) / max(chord @ chord, np.finfo(float).tiny)
         beside = np.linalg.pinv(there.across) @ (away - share * chord)
         return bool(0.0 < share <= 1.0 and np.sqrt((beside**2).sum()) < _HARD)
+
+
+# Points from which samples are drawn: a Student distribution, spread evenly.
+
+# Student's degrees of freedom: tails heavier than those of a Gaussian keep the weights of what lies there small.
+_DEGREES = 5.0
+
+
+def student(d: int, n: int, seed: int) -> tuple[Array, Array, Array]:
+    """Return evenly spread points of a Student distribution and one more number each.
+
+    Parameters
+    ----------
+    d, n : int
+        Dimensions and number of points.
+    seed : int
+        Decides the draw.
+
+    Returns
+    -------
+    spare : array (n,)
+        Numbers between 0 and 1, spread evenly together with the points.
+    points : array (n, d)
+        Of scale one.
+    log_density : array (n,)
+        Logarithm of the density there but for a constant.
+    """
+    from scipy.special import gammaincinv, ndtri
+    from scipy.stats import qmc
+
+    # Of any number, not only powers of two: the balance that is lost then is nothing beside the weights.
+    spaced = qmc.Sobol(d + 2, rng=np.random.default_rng(seed)).random_base2(int(np.ceil(np.log2(max(n, 2)))))[:n]
+    spaced = np.clip(spaced, np.finfo(float).eps, 1.0 - np.finfo(float).eps)
+    stretch = np.sqrt(_DEGREES / (2.0 * gammaincinv(0.5 * _DEGREES, spaced[:, 1])))
+    points = ndtri(spaced[:, 2:]) * stretch[:, None]
+    return spaced[:, 0], points, -0.5 * (_DEGREES + d) * np.log1p((points**2).sum(-1) / _DEGREES)

@@ -19,8 +19,8 @@ from optloc.uncertainty.surface import Surface
 # few samples each, and are worse. Arcs are longer than any slice: of a circle each is 15 degrees.
 _SLICES, _ARC_SLICES = 4, 24
 # Samples of a fix, and where the slices begin and end: beyond lies one in 500.
-_SAMPLES, _EDGES = 1024, (0.001, 0.999)
-# Fewest samples a dimension of a slice that has a covariance.
+_SAMPLES, _EDGES = 4096, (0.001, 0.999)
+# Fewest samples a dimension of a slice that stands alone.
 _FEWEST = 4
 # Gap in cost beyond which another minimum weighs nothing: 0.011 of the fix.
 _NEGLIGIBLE = 9.0
@@ -101,7 +101,7 @@ def _slices(surface: Surface, k: int, seed: int) -> Mixture:
         return Mixture(np.ones(1), chart.position[None], chart.covariance[None])
     if surface.kind == CURVED:
         arc = trace_from(surface)
-        drawn = along(arc, 2 * _SAMPLES, seed)
+        drawn = along(arc, _SAMPLES, seed)
         number, edges = arc.locate(drawn.position)[0], np.linspace(0.0, 1.0, k * _ARC_SLICES // _SLICES + 1)
     else:
         drawn = around(surface, _SAMPLES, seed)
@@ -117,11 +117,16 @@ def _quantiles(values: Array, weight: Array) -> list[float]:
 
 
 def _by_slice(drawn: Samples, slice_of: Array, k: int) -> Mixture:
-    """Return moments and weights of the samples in each of k slices; those with too few samples are left out."""
-    found = []
+    """Return moments and weights of the samples in k slices; one with too few samples is joined to its neighbour."""
+    fewest, groups = _FEWEST * drawn.position.shape[1], [np.zeros(len(slice_of), dtype=bool)]
     for i in range(k):
-        own = slice_of == i
-        if own.sum() >= _FEWEST * drawn.position.shape[1]:
-            found.append((drawn.weight[own].sum(), *moments(drawn.position[own], drawn.weight[own])))
+        if groups[-1].sum() >= fewest:
+            groups.append(slice_of == i)
+        else:
+            groups[-1] = groups[-1] | (slice_of == i)
+    if len(groups) > 1 and groups[-1].sum() < fewest:
+        last = groups.pop()
+        groups[-1] = groups[-1] | last
+    found = [(drawn.weight[own].sum(), *moments(drawn.position[own], drawn.weight[own])) for own in groups]
     weight, mean, covariance = (np.array(each) for each in zip(*found, strict=True))
     return Mixture(weight / weight.sum(), mean, covariance)

@@ -12,8 +12,7 @@ from optloc.base.types import Array
 from optloc.problem.chart import CURVED, INVERSE_RANGE
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.uncertainty.arc import Arc, trace_from
-from optloc.uncertainty.proposal import student
+from optloc.uncertainty.arc import Arc, student, trace_from
 from optloc.uncertainty.surface import Surface
 
 Belief = Literal["jeffreys", "flat"]
