@@ -331,8 +331,11 @@ def inverse(a: float, b: float, c: float, d: float, e: float, f: float, out: Arr
     """Write the inverse of [[a, b, c], [b, d, e], [c, e, f]] into out (3, 3); return False where it is singular."""
     u, v, t = d * f - e * e, c * e - b * f, b * e - c * d
     determinant = a * u + b * v + c * t
+    # What the determinant is the sum of, before anything cancels: of a matrix of rank one the cofactors are rounding
+    # themselves, and beside them nothing looks small. However rows and columns are scaled, the ratio is the same.
+    size = abs(a * d * f) + 2.0 * abs(b * c * e) + abs(a) * e * e + abs(d) * c * c + abs(f) * b * b
     # Cancelled to its last four digits: an inverse would be noise.
-    if not abs(determinant) > 1e-12 * (abs(a * u) + abs(b * v) + abs(c * t)):
+    if not abs(determinant) > 1e-12 * size:
         return False
     scale = 1.0 / determinant
     out[0, 0], out[1, 1], out[2, 2] = u * scale, (a * f - c * c) * scale, (a * d - b * b) * scale

@@ -221,6 +221,18 @@ def position(atlas: Atlas, x: Array) -> None:
         x[k] = atlas.middle[k] + atlas.radius * atlas.point[k] / atlas.scale[0]
 
 
+# Roundings of a coordinate of a piece around a minimum, three products and sums: of what is about 1 in size.
+_PLACED = 8.0 * 2.0**-52
+
+
+@compiled
+def widen_around(atlas: Atlas, i: int, half: Array) -> None:
+    """Widen a box of the piece around minimum i by how far rounding may have moved its centre."""
+    for k in range(atlas.dimension):
+        for m in range(atlas.dimension):
+            half[k] += _PLACED * abs(atlas.minima.back[i, k, m])
+
+
 @compiled
 def within(atlas: Atlas, half: Array, i: int, sides: Array) -> bool:
     """Return whether a box around the centre set lies inside the box ``|s_k| <= sides_k`` (3,) around minimum i."""
@@ -229,15 +241,16 @@ def within(atlas: Atlas, half: Array, i: int, sides: Array) -> bool:
     if minima.home[i] != atlas.place[0]:
         return False
     for k in range(d):
-        away = reach = 0.0
+        away = reach = blur = 0.0
         for m in range(d):
+            blur += _PLACED * abs(minima.back[i, k, m])
             away += minima.back[i, k, m] * (atlas.place[1 + m] - minima.start[i, m])
             slope = 0.0
             for c in range(d):
                 slope += minima.back[i, k, c] * atlas.linear[c, m]
             reach += abs(slope) * half[m]
         # Inwards by more than the rounding of the inverse axes: a box left out must be one that was looked at.
-        if abs(away) + reach > sides[k] * (1.0 - 1e-9):
+        if abs(away) + reach + blur > sides[k] * (1.0 - 1e-9):
             return False
     return True
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import isnan
+from math import isnan, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +10,8 @@ import numpy as np
 from optloc.base.threads import mapped
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, enabled, plain, ready
-from optloc.proof.chart import Cost, cost_of, empty_box, empty_groups, set_geometry
+from optloc.proof.box import bound_nodes, cost_at, rounding
+from optloc.proof.chart import Cost, Known, accuracy_floor, cost_of, empty_box, empty_groups, set_geometry
 from optloc.proof.everywhere import prove_everywhere
 from optloc.proof.near import BUDGET, OPEN, prove
 from optloc.proof.pose import Posed
@@ -33,8 +34,8 @@ class Asked(NamedTuple):
         Positions of the fixes.
     others : array (n, P, d)
         Other known minima, the finite ones first.
-    known : int array (n,)
-        How many of them count.
+    known, hidden : int array (n,)
+        How many of them are there, and how many of these, the last ones, do not count though they may cost less.
     kappa, eps : array (n,)
         Gap to prove, and how far below the cost of the fix still counts as equal.
     region : array (n, 2, d)
@@ -43,16 +44,20 @@ class Asked(NamedTuple):
         Corners of the regions to take where all positions cannot be bounded.
     budget : int array (n,)
         How many boxes each may take.
+    surface : array (n, e)
+        Values of the last e nodes on the surface to which the claim is limited.
     """
 
     x: Array
     others: Array
     known: Array
+    hidden: Array
     kappa: Array
     eps: Array
     region: Array
     fallback: Array
     budget: Array
+    surface: Array
 
     def take(self, index: Array | slice) -> Asked:
         """Return what is asked of some of the fixes."""
@@ -130,6 +135,17 @@ def _prove(pose: Posed, asked: Asked) -> Answered:
     return out
 
 
+def costs_at(pose: Posed, x: Array) -> tuple[Array, Array]:
+    """Return posed costs (n, P) at positions x (n, P, d), and what rounding may have made of their residuals (n, P)."""
+    out = np.zeros((2, *x.shape[:2]))
+    if len(x) > _FEW or ready(_loop):
+        _evaluate(Posed(*(_plain(array) for array in pose)), _plain(x), out)
+        return out[0], out[1]
+    with plain(), np.errstate(all="ignore"):  # as few proofs are: machine code takes longer to load
+        _evaluate(pose, x, out)
+    return out[0], out[1]
+
+
 def _plain(array: Array) -> Array:
     """Return an array in one form for all calls: machine code is made anew for read-only or strided arrays."""
     return np.require(array, requirements=["C", "W"])
@@ -142,6 +158,7 @@ def _loop(pose: Posed, asked: Asked, out: Answered) -> None:
     kinds, data, K, w = pose.kinds, pose.data, pose.K, pose.w
     fixes, others, known, kappas, tolerances = asked.x, asked.others, asked.known, asked.kappa, asked.eps
     regions, fallbacks, budgets = asked.region, asked.fallback, asked.budget
+    hidden, surfaces = asked.hidden, asked.surface
     verdicts, counts, bounds, wholes, points = out.verdict, out.boxes, out.bound, out.everywhere, out.found
     J = K.shape[2]
     A, weight, groups, box = np.empty((J, J)), np.empty(J), empty_groups(J), empty_box(K.shape[1], J)
@@ -155,17 +172,17 @@ def _loop(pose: Posed, asked: Asked, out: Answered) -> None:
             cost = _present(cost)
             own = empty_box(cost.K.shape[0], cost.K.shape[1])
         x, kappa, eps, found = fixes[i], kappas[i], tolerances[i], points[i]
-        minima, low, high = others[i, : known[i]], regions[i, 0], regions[i, 1]
+        beside, low, high = Known(others[i, : known[i]], hidden[i], surfaces[i]), regions[i, 0], regions[i, 1]
         boxes = 0
         wholes[i] = isnan(low[0])
         if wholes[i]:
-            verdict, boxes, bound = prove_everywhere(cost, own, x, minima, kappa, eps, budgets[i], found)
+            verdict, boxes, bound = prove_everywhere(cost, own, x, beside, kappa, eps, budgets[i], found)
             verdicts[i], counts[i], bounds[i] = verdict, boxes, bound
             if verdict != OPEN:
                 continue
             wholes[i] = False
             low, high = fallbacks[i, 0], fallbacks[i, 1]
-        verdict, more, bound = prove(cost, own, x, minima, kappa, eps, budgets[i], low, high, False, found)
+        verdict, more, bound = prove(cost, own, x, beside, kappa, eps, budgets[i], low, high, False, found)
         verdicts[i], counts[i], bounds[i] = verdict, boxes + more, bound
 
 
@@ -189,3 +206,26 @@ def _present(cost: Cost) -> Cost:
         for j in range(J):
             own[i, j] = K[rows[i], nodes[j]]
     return cost_of(cost.kinds[nodes[:J]], cost.data[nodes[:J]], own, values)
+
+
+@compiled
+def _evaluate(pose: Posed, x: Array, out: Array) -> None:
+    """Write costs, and lengths of the rounding of their residuals."""
+    J, q = pose.K.shape[2], pose.K.shape[1]
+    box, weight, axes, origin = empty_box(q, J), np.empty(J), np.eye(3), np.zeros(3)
+    for k in range(x.shape[2], 3):
+        axes[k, k] = 0.0
+    for i in range(len(x)):
+        K, data, w = pose.K[i if len(pose.K) > 1 else 0], pose.data[i if len(pose.data) > 1 else 0], pose.w[i]
+        for j in range(J):
+            weight[j] = 0.0
+            for row in range(q):
+                weight[j] += K[row, j] * K[row, j]
+            weight[j] = sqrt(weight[j])
+        for p in range(x.shape[1]):
+            for k in range(x.shape[2]):
+                origin[k] = x[i, p, k]
+            bound_nodes(pose.kinds, data, origin, axes, axes, box.half, box.line, box.nodes)
+            out[0, i, p] = cost_at(K, w, box.nodes)
+            floor = accuracy_floor(pose.kinds, data, weight, w, origin)
+            out[1, i, p] = rounding(K, weight, floor, box.nodes)

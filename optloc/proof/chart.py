@@ -10,7 +10,8 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, inlined, zero
 from optloc.compute.systems import invert, roughly_principal
-from optloc.proof.box import G0, G1, G2, ROW_WIDTH, SUMS, bound_nodes, convex, cost_at, curve_nodes, sum_up
+from optloc.proof.box import ROW_WIDTH, bound_nodes, cost_at, rounding
+from optloc.proof.curvature import G0, G1, G2, SUMS, convex, curve_nodes, sum_up
 from optloc.proof.nodes.dispatch import size_of
 from optloc.proof.nodes.node import CURVE_WIDTH, H00, H01, H02, H11, H12, H22, NODE_WIDTH, RANGE
 
@@ -18,11 +19,15 @@ from optloc.proof.nodes.node import CURVE_WIDTH, H00, H01, H02, H11, H12, H22, N
 # rows leaves of an entry of K'K that is zero.
 _APART = 1e-13
 # Share of its diagonal that a pivot of a group's rows must exceed, and how far ties may be from -1, 0 and 1: a group
-# whose covariance has lost more digits bounds nothing.
-_PIVOT, _TIED = 1e-9, 1e-9
+# whose covariance has lost more digits bounds nothing. Nor does one whose products may be off by more than `_BLURRED`,
+# half of the slack of an enclosure.
+_PIVOT, _TIED, _BLURRED = 1e-9, 1e-9, 5e-7
 # Search coordinates along which the information is less than this share of the best are not determined by the rows:
 # the square root, a ratio of standard deviations of three million, is beyond what doubles can tell.
 _DETERMINED = 1e-13
+# Roundings of a coordinate on its way from search coordinates to metres: three products, three sums, and the sizes of
+# what they are rounded beside.
+_PLACED = 8.0 * 2.0**-52
 # References of a group that needs none, and of one whose rows are too few.
 NONE, LOOSE = -1, -2
 
@@ -72,6 +77,24 @@ class Cost(NamedTuple):
     groups: Groups
 
 
+class Known(NamedTuple):
+    """What is known of a problem beside its fix.
+
+    Parameters
+    ----------
+    points : array (P, D)
+        Other minima, polished; boxes around them that hold no second one are set aside.
+    hidden : int
+        The last so many of them do not count, though they may cost less: nor does what is near them.
+    surface : array (e,)
+        Values that the last e nodes have on the surface to which the claim is limited: heights and planes.
+    """
+
+    points: Array
+    hidden: int
+    surface: Array
+
+
 class Chart(NamedTuple):
     """Search coordinates s with ``x = origin + sense s``: principal axes of the fix, one unit a standard deviation.
 
@@ -81,12 +104,18 @@ class Chart(NamedTuple):
         The fix.
     sense, back, gram : array (3, 3)
         T, its inverse, and T'T; rows and columns of zeros for the third coordinate in the plane.
+    slip : array (3,)
+        How far the rounding of coordinates of one metre moves a point, search coordinates.
+    floor : float
+        The sizes of what residuals are differences of, beside the nodes: measurements and coordinates.
     """
 
     origin: Array
     sense: Array
     back: Array
     gram: Array
+    slip: Array
+    floor: float
 
 
 class Box(NamedTuple):
@@ -207,6 +236,11 @@ def _ties(kinds: Array, A: Array, member: Array, first: int, size: int, count: i
             own[i, j] = A[member[first + i], member[first + j]]
     if size == 0 or not invert(own, size, _PIVOT):
         return False
+    condition = 0.0  # at least the largest over the least eigenvalue of the rows scaled to one length
+    for i in range(size):
+        condition += A[member[first + i], member[first + i]] * own[i, i]
+    if not (size + 2) * 2.0**-52 * size * condition <= _BLURRED:
+        return False
     for i in range(size, count):
         tie[member[first + i]] = 0.0
     for i in range(size):
@@ -248,8 +282,8 @@ def chart_at(cost: Cost, x: Array, box: Box) -> tuple[Chart, bool]:
     gradient is that along the search coordinates.
     """
     D = x.shape[0]
-    origin, numbers = np.zeros(3), np.zeros((3, 3, 3))
-    sense, back, gram = numbers[0], numbers[1], numbers[2]
+    vectors, numbers = np.zeros((2, 3)), np.zeros((3, 3, 3))
+    origin, slip, sense, back, gram = vectors[0], vectors[1], numbers[0], numbers[1], numbers[2]
     nodes, curves, sums, information = box.nodes, box.curves, box.sums, box.solve
     for k in range(D):
         origin[k] = x[k]
@@ -257,7 +291,7 @@ def chart_at(cost: Cost, x: Array, box: Box) -> tuple[Chart, bool]:
     box.half[:] = 0.0
     bound_nodes(cost.kinds, cost.data, origin, sense, gram, box.half, box.line, nodes)
     curves[:] = 0.0
-    sum_up(cost.K, cost.w, nodes, curves, sums)
+    sum_up(cost.K, cost.w, cost.weight, 0.0, nodes, curves, sums)
     information[0, 0], information[1, 1], information[2, 2] = sums[H00], sums[H11], sums[H22]
     information[0, 1] = information[1, 0] = sums[H01]
     information[0, 2] = information[2, 0] = sums[H02]
@@ -272,29 +306,40 @@ def chart_at(cost: Cost, x: Array, box: Box) -> tuple[Chart, bool]:
         root = sqrt(length) if length > 0.0 else 1.0
         for m in range(3):
             sense[m, k], back[k, m] = gram[m, k] / root, gram[m, k] * root
+            slip[k] += _PLACED * abs(back[k, m])
     for k in range(3):
         for m in range(3):
             gram[k, m] = sense[0, k] * sense[0, m] + sense[1, k] * sense[1, m] + sense[2, k] * sense[2, m]
     g0, g1, g2 = sums[G0], sums[G1], sums[G2]
     for k in range(3):
         sums[G0 + k] = sense[0, k] * g0 + sense[1, k] * g1 + sense[2, k] * g2
-    return Chart(origin, sense, back, gram), good
+    return Chart(
+        origin, sense, back, gram, slip, accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, origin)
+    ), good
 
 
 @compiled
-def accuracy_floor(cost: Cost, chart: Chart) -> float:
-    """Return the sizes of what residuals are differences of, beside the nodes: measurements and coordinates."""
+def accuracy_floor(kinds: Array, data: Array, weight: Array, w: Array, origin: Array) -> float:
+    """Return the sizes of what residuals are differences of, beside the nodes: measurements and coordinates.
+
+    Parameters
+    ----------
+    kinds, data, weight, w : arrays
+        As of `Cost`.
+    origin : array (3,)
+        A position, metres.
+    """
     total = 0.0
-    for i in range(cost.w.shape[0]):
-        total += cost.w[i] * cost.w[i]
+    for i in range(w.shape[0]):
+        total += w[i] * w[i]
     total = sqrt(total)
-    reach = abs(chart.origin[0]) + abs(chart.origin[1]) + abs(chart.origin[2])
-    for j in range(cost.kinds.shape[0]):
-        if cost.kinds[j] == RANGE:  # as its node says: ranges are asked often enough to be spared the call
-            size = reach + (abs(cost.data[j, 0]) + abs(cost.data[j, 1]) + abs(cost.data[j, 2]))
+    reach = abs(origin[0]) + abs(origin[1]) + abs(origin[2])
+    for j in range(kinds.shape[0]):
+        if kinds[j] == RANGE:  # as its node says: ranges are asked often enough to be spared the call
+            size = reach + (abs(data[j, 0]) + abs(data[j, 1]) + abs(data[j, 2]))
         else:
-            size = size_of(cost.kinds[j], cost.data[j], reach)
-        total += cost.weight[j] * size
+            size = size_of(kinds[j], data[j], reach)
+        total += weight[j] * size
     return total
 
 
@@ -304,6 +349,16 @@ def place(origin: Array, sense: Array, at: Array, centre: Array) -> None:
     s0, s1, s2 = at[0], at[1], at[2]
     for k in range(3):
         centre[k] = origin[k] + (sense[k, 0] * s0 + sense[k, 1] * s1 + sense[k, 2] * s2)
+
+
+@inlined
+def widen(chart: Chart, centre: Array, half: Array) -> None:
+    """Widen a box by how far rounding may have moved its centre, metres: all that is said of it holds where it is."""
+    size = abs(centre[0]) + abs(centre[1]) + abs(centre[2])
+    # What is added to the origin may be larger than the sum.
+    size += 2.0 * (abs(chart.origin[0]) + abs(chart.origin[1]) + abs(chart.origin[2]))
+    for k in range(3):
+        half[k] += chart.slip[k] * size
 
 
 @compiled
@@ -319,7 +374,8 @@ def curve_box(cost: Cost, chart: Chart, box: Box) -> None:
     """Fill the tables of second derivatives of a box whose nodes are bounded."""
     sense, gram, half, line, nodes, curves = chart.sense, chart.gram, box.half, box.line, box.nodes, box.curves
     curve_nodes(cost.kinds, cost.data, box.centre, sense, gram, half, line, box.solve, nodes, curves)
-    sum_up(cost.K, cost.w, nodes, curves, box.sums)
+    noise = rounding(cost.K, cost.weight, chart.floor, nodes)
+    sum_up(cost.K, cost.w, cost.weight, noise, nodes, curves, box.sums)
 
 
 @compiled

@@ -9,6 +9,7 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, inlined, zero
 from optloc.compute.systems import inverse, invert
+from optloc.proof.box import rounding
 from optloc.proof.chart import LOOSE, Box, Chart, Cost
 from optloc.proof.nodes.dispatch import ball_of, has_ray, ray_of
 from optloc.proof.nodes.node import FORCE, LINEAR, PHI, RANGE
@@ -55,6 +56,8 @@ SLACK = 1e-6
 # Share of the diagonal that a pivot of normal equations must exceed, how far a left inverse may then be from one, and
 # what a ball and its centre are widened by: a weak geometry has no enclosure rather than a wrong one.
 _PIVOT, _INVERSE, _WIDER = 1e-9, 1e-7, 1e-9
+# Unit in the last place of a double at 1.
+_ULP = 2.0**-52
 # Columns of a table of nodes: error at the fix, and how far from there the node may be; of its squared row, zero where
 # it has none: coefficients of the error (3), of the position and one more unknown (4), the same weighted (4), the left
 # inverse of all (4), and the weight in a sum of rows.
@@ -67,6 +70,7 @@ def around_squares(
     data: Array,
     A: Array,
     nodes: Array,
+    sense: Array,
     back: Array,
     rho: float,
     member: Array,
@@ -88,23 +92,33 @@ def around_squares(
     if count < 3 - int(plane) + int(ranges) or not _left_inverse(A, nodes, kinds, member, ties, ranges, plane):
         return
     near = nodes[reference, PHI] if reference >= 0 else 0.0
-    middle, spread = near, 0.0
-    if reference >= 0:
+    middle, spread, last, more = near, 0.0, 0.0, 1.0
+    if ranges:
         for j in member:
             ties[j, WEIGHT] = ties[j, LEFT + 3]
         own, beta, alpha, square = _sums(R, member, ties, near, 0.0)
-        alpha, beta, own = rho * alpha, rho * beta + rho * rho * square, near + own
-        if alpha >= 1.0:  # the errors can make up for any reference range
-            return
-        least, most = max(0.0, (own - beta) / (1.0 + alpha)), (own + beta) / (1.0 - alpha)
-        middle, spread = 0.5 * (least + most), 0.5 * (most - least) * (1.0 + SLACK)
+        alpha, beta = rho * alpha, rho * beta + rho * rho * square
+        last = abs(own) + beta  # how far the last unknown may be from its value at the fix
+        if reference >= 0:
+            if alpha >= 1.0:  # the errors can make up for any reference range
+                return
+            own, more = near + own, 1.0 / (1.0 - alpha)
+            least, most = max(0.0, (own - beta) / (1.0 + alpha)), (own + beta) * more
+            middle, spread = 0.5 * (least + most), 0.5 * (most - least) * (1.0 + SLACK)
+            last = max(abs(least - near), abs(most - near))
+    bound = np.empty((3, 4))  # centre and reach of each coordinate, what of it goes with the last unknown, and its side
     for k in range(3):
         for j in member:
             weight = back[k, 0] * ties[j, LEFT] + back[k, 1] * ties[j, LEFT + 1]
             ties[j, WEIGHT] = weight + back[k, 2] * ties[j, LEFT + 2]
         centre, linear, slope, square = _sums(R, member, ties, near, middle)
-        reach = (rho * (linear + spread * slope) + rho * rho * square) * (1.0 + SLACK)
-        lower[k], upper[k] = max(lower[k], centre - reach), min(upper[k], centre + reach)
+        reach = (rho * (linear + spread * slope) + rho * rho * square) * (1.0 + 0.5 * SLACK)
+        bound[k, 0], bound[k, 1], bound[k, 2], bound[k, 3] = centre, reach, rho * slope, abs(centre) + reach
+    if not _inverts_well(kinds, member, ties, sense, back, bound, last, more):
+        return
+    for k in range(3):
+        reach = bound[k, 1] * (1.0 + 0.5 * SLACK)
+        lower[k], upper[k] = max(lower[k], bound[k, 0] - reach), min(upper[k], bound[k, 0] + reach)
 
 
 @inlined
@@ -171,6 +185,63 @@ def _left_inverse(A: Array, nodes: Array, kinds: Array, member: Array, ties: Arr
 
 
 @inlined
+def _inverts_well(
+    kinds: Array,
+    member: Array,
+    ties: Array,
+    sense: Array,
+    back: Array,
+    bound: Array,
+    last: float,
+    more: float,
+) -> bool:
+    """Return whether what the left inverse lacks of one is nothing beside the widths of an enclosure.
+
+    With E = (left inverse) (rows) - 1 in search coordinates and the last unknown, differences y to the fix obey
+    ``|y_k| <= b_k + sum_m |E_km y_m|``, b_k the bounds without E. Where these terms are below a share of the widths at
+    y = b, no y is farther away than the widths and that share: it would be farther still by less than it is.
+
+    Parameters
+    ----------
+    kinds, member, ties : arrays
+        As of `around_squares`.
+    sense, back : array (3, 3)
+        Derivatives of the position with respect to the search coordinates, and the inverse.
+    bound : array (3, 4)
+        Of each coordinate: centre, reach, reach over that of the last unknown, and greatest size.
+    last, more : float
+        Greatest size of the last unknown, and how many times what is added to its bound it grows by.
+    """
+    row, left, off, size = np.empty(4), np.empty(4), np.zeros((4, 4)), np.zeros((4, 4))
+    for j in member:
+        if ties[j, ROW] == ties[j, ROW + 1] == ties[j, ROW + 2] == ties[j, ROW + 3] == 0.0:
+            continue
+        for k in range(3):
+            row[k] = ties[j, ROW] * sense[0, k] + ties[j, ROW + 1] * sense[1, k] + ties[j, ROW + 2] * sense[2, k]
+            left[k] = ties[j, LEFT] * back[k, 0] + ties[j, LEFT + 1] * back[k, 1] + ties[j, LEFT + 2] * back[k, 2]
+        row[3], left[3] = ties[j, ROW + 3], ties[j, LEFT + 3]
+        for k in range(4):
+            for m in range(4):
+                off[k, m] += left[k] * row[m]
+                size[k, m] += abs(left[k] * row[m])
+    wide, good = 0.0, True
+    for k in range(3, -1, -1):  # the last unknown first: it moves the others
+        extra = 0.0
+        for m in range(4):
+            most = bound[m, 3] if m < 3 else last
+            own = most > 0.0 and size[k, k] > 0.0 and size[m, m] > 0.0
+            lack = abs(off[k, m] - (k == m)) + (8 + member.shape[0]) * _ULP * size[k, m] if own else 0.0
+            extra += lack * most
+        if k == 3:
+            wide = extra * more
+            good = good and wide <= 0.25 * SLACK * last
+        else:
+            extra += bound[k, 2] * wide
+            good = good and extra <= 0.25 * SLACK * bound[k, 1]
+    return good
+
+
+@inlined
 def _sums(R: Array, member: Array, ties: Array, near: float, middle: float) -> tuple[float, float, float, float]:
     """Return what the errors make of a weighted sum of squared rows.
 
@@ -233,10 +304,13 @@ def around_rays(kinds: Array, data: Array, x: Array, back: Array, swing: Array, 
             if wide >= 0.0:
                 reach[count], far[count] = wide, away
                 count += 1
-    gamma = np.empty((3, max(count, 1)))
-    if not _weighted_inverse(rows, reach, far, count, back, gamma):
+    gamma, off = np.empty((3, max(count, 1))), np.empty((3, 3))
+    if not _weighted_inverse(rows, reach, far, count, back, gamma, off):
         return
     steep, most = 0.0, 0.0
+    for k in range(3):
+        for m in range(3):
+            steep += abs(off[k, m])
     for i in range(count):
         size = sqrt(gamma[0, i] ** 2 + gamma[1, i] ** 2 + gamma[2, i] ** 2) * reach[i]
         steep += size
@@ -247,6 +321,8 @@ def around_rays(kinds: Array, data: Array, x: Array, back: Array, swing: Array, 
     most /= 1.0 - steep
     for k in range(3):
         wide = 0.0
+        for m in range(3):  # what the left inverse lacks of one, times y
+            wide += (abs(back[k, 0]) * off[0, m] + abs(back[k, 1]) * off[1, m] + abs(back[k, 2]) * off[2, m]) * most
         for i in range(count):
             pull = abs(back[k, 0] * gamma[0, i] + back[k, 1] * gamma[1, i] + back[k, 2] * gamma[2, i])
             wide += pull * reach[i] * (far[i] + most)
@@ -255,8 +331,11 @@ def around_rays(kinds: Array, data: Array, x: Array, back: Array, swing: Array, 
 
 
 @compiled
-def _weighted_inverse(rows: Array, reach: Array, far: Array, count: int, back: Array, gamma: Array) -> bool:
-    """Write the left inverse of rows weighted by their widths; False where they do not determine a position."""
+def _weighted_inverse(rows: Array, reach: Array, far: Array, count: int, back: Array, gamma: Array, off: Array) -> bool:
+    """Write the left inverse of rows weighted by their widths; False where they do not determine a position.
+
+    How far it may be from one, entry by entry, goes into `off` (3, 3).
+    """
     solve, normal = np.empty((3, 3)), np.zeros((3, 3))
     for i in range(count):
         weight = 1.0 / (reach[i] * far[i]) ** 2 if reach[i] * far[i] > 0.0 else 0.0
@@ -275,18 +354,21 @@ def _weighted_inverse(rows: Array, reach: Array, far: Array, count: int, back: A
         weight = 1.0 / (reach[i] * far[i]) ** 2 if reach[i] * far[i] > 0.0 else 0.0
         for k in range(3):
             gamma[k, i] = weight * (solve[k, 0] * rows[i, 0] + solve[k, 1] * rows[i, 1] + solve[k, 2] * rows[i, 2])
-    return _inverts(gamma, rows, count, plane)
+    return _inverts(gamma, rows, count, plane, off)
 
 
 @compiled
-def _inverts(gamma: Array, rows: Array, count: int, plane: bool) -> bool:
-    """Return whether gamma times rows is the identity up to a small rounding."""
+def _inverts(gamma: Array, rows: Array, count: int, plane: bool, off: Array) -> bool:
+    """Write how far gamma times rows may be from one, entry by entry; return whether that is a small rounding."""
+    off[:] = 0.0
     for k in range(2 if plane else 3):
-        for m in range(3):
-            total = 0.0
+        for m in range(2 if plane else 3):
+            total = size = 0.0
             for i in range(count):
                 total += gamma[k, i] * rows[i, m]
-            if not abs(total - (k == m)) < _INVERSE:
+                size += abs(gamma[k, i] * rows[i, m])
+            off[k, m] = abs(total - (k == m)) + (2 + count) * _ULP * (1.0 + size)
+            if not off[k, m] < _INVERSE:
                 return False
     return True
 
@@ -317,7 +399,8 @@ def enclose(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper:
     """
     kinds, data, A, groups, nodes, curves = cost.kinds, cost.data, cost.A, cost.groups, box.nodes, box.curves
     x, sense, back = chart.origin, chart.sense, chart.back
-    rho, first, rays = rho * (1.0 + SLACK) + SLACK, 0, 0
+    # Longer by what rounding may have taken off the residuals.
+    rho, first, rays = rho * (1.0 + SLACK) + SLACK + rounding(cost.K, cost.weight, chart.floor, nodes), 0, 0
     order, R, ties = groups.order, groups.R, np.empty((kinds.shape[0], TIE_WIDTH))
     for k in range(3):
         plane = sense[0, k] == 0.0 and sense[1, k] == 0.0 and sense[2, k] == 0.0
@@ -342,7 +425,7 @@ def enclose(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper:
                 ties[j, SWING] = abs(error) + reach
                 rays += int(kinds[j] != RANGE and has_ray(kinds[j]))
                 around_node(kinds[j], data[j], middle - reach, middle + reach, x, back, lower, upper)
-        around_squares(kinds, data, A, nodes, back, rho, member, reference, own, groups.tie, ties, lower, upper)
+        around_squares(kinds, data, A, nodes, sense, back, rho, member, reference, own, groups.tie, ties, lower, upper)
     if rays:
         around_rays(kinds, data, x, back, ties[:, SWING].copy(), lower, upper)
     bounded = True

@@ -17,20 +17,16 @@ from optloc.proof.atlas import (
     home_of,
     position,
     set_centre,
+    widen_around,
     with_minima,
     within,
 )
 from optloc.proof.box import (
-    C00,
     CENTRE,
     DEPTH,
-    G0,
-    G1,
-    G2,
     HALF,
     J0,
     PIECE,
-    convex,
     cost_at,
     least_left,
     least_residual,
@@ -38,12 +34,23 @@ from optloc.proof.box import (
     pop,
     push_around,
     push_halves,
-    slopes_everywhere,
-    spread_of,
-    sum_up,
+    rounding,
 )
-from optloc.proof.chart import Box, Chart, Cost, chart_at, empty_box
-from optloc.proof.near import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, descend, prove
+from optloc.proof.chart import Box, Chart, Cost, Known, chart_at, empty_box
+from optloc.proof.curvature import C00, G0, G1, G2, NOISE0, convex, entry, slopes_everywhere, spread_of, sum_up
+from optloc.proof.near import (
+    BETTER,
+    BUDGET,
+    HIDDEN_REACH,
+    OPEN,
+    OTHER,
+    SINGULAR,
+    STATIONARY,
+    UNIQUE,
+    VALUE,
+    descend,
+    prove,
+)
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces, infinity_of, points_of
 from optloc.proof.nodes.node import ANY, DIFFERENCE, GROWS, H00, H11, H22, RANGE
 
@@ -88,13 +95,15 @@ def reaches_infinity(kinds: Array, K: Array) -> bool:
 
 
 @compiled
-def cube(kinds: Array, data: Array) -> tuple[Array, float]:
+def cube(kinds: Array, data: Array, x: Array) -> tuple[Array, float]:
     """Return centre (3,) and half-width of a cube that holds all stations well.
 
     Parameters
     ----------
     kinds, data : array (J,), (J, width)
         Nodes that have stations.
+    x : array (D,)
+        The fix: where all stations are in one place, its distance is the only length there is.
     """
     low, high = np.full(3, inf), np.full(3, -inf)
     for j in range(kinds.shape[0]):
@@ -104,7 +113,11 @@ def cube(kinds: Array, data: Array) -> tuple[Array, float]:
     reach = 0.0
     for k in range(3):
         reach = max(reach, 0.5 * (high[k] - low[k]))
-    return 0.5 * (low + high), max(_REACHES * reach, 1.0)
+    middle = 0.5 * (low + high)
+    if not reach > 0.0:
+        for k in range(x.shape[0]):
+            reach = max(reach, abs(x[k] - middle[k]))
+    return middle, _REACHES * reach if reach > 0.0 else 1.0
 
 
 @compiled
@@ -134,8 +147,8 @@ _GROWTH = 1.5
 
 
 @compiled
-def set_minimum(cost: Cost, box: Box, atlas: Atlas, i: int, x: Array, eps: float) -> bool:
-    """Write a minimum and its surroundings into an atlas; return False where it is none.
+def set_minimum(cost: Cost, box: Box, atlas: Atlas, i: int, x: Array, value: float, eps: float, limit: float) -> bool:
+    """Write a minimum and its surroundings into an atlas; return False where it is none, or costs too little.
 
     Parameters
     ----------
@@ -149,14 +162,20 @@ def set_minimum(cost: Cost, box: Box, atlas: Atlas, i: int, x: Array, eps: float
         Which.
     x : array (D,)
         Its position, polished.
+    value : float
+        What it must cost at least: its surroundings are not searched.
     eps : float
         How far the cost may fall below that of x in its convex box.
+    limit : float
+        How far, in metres, these may reach along any coordinate.
     """
     minima, d = atlas.minima, atlas.dimension
     minima.home[i] = home_of(atlas, x, minima.start[i])
     if not _set_axes(cost, box, atlas, i):
         return False
     _tables(cost, box, atlas, i, np.zeros(3))
+    if not cost_at(cost.K, cost.w, box.nodes) >= value:
+        return False
     sums = box.sums
     # On a box whose Hessian exceeds a margin the cost falls below that of its centre by slope^2 / margin at most.
     margin = (sums[G0] * sums[G0] + sums[G1] * sums[G1] + sums[G2] * sums[G2]) / eps
@@ -164,11 +183,32 @@ def set_minimum(cost: Cost, box: Box, atlas: Atlas, i: int, x: Array, eps: float
     for k in range(d):
         steep = abs(minima.axes[i, d - 1, k]) * d if minima.home[i] < 2 * d else 0.0
         hull[k] = min(_WIDEST, _SHARE * minima.start[i, d - 1] / steep if steep > 0.0 else _WIDEST)
+    if limit < inf:
+        _draw_in(atlas, i, hull, limit)
     if not _grow(cost, box, atlas, i, hull, margin):
         return False
     for k in range(d):
         minima.core[i, k] = min(max(_WIDER * minima.sides[i, k], _WIDE), hull[k])
     return True
+
+
+@compiled
+def _draw_in(atlas: Atlas, i: int, hull: Array, limit: float) -> None:
+    """Make half-widths (3,) around minimum i so small that no coordinate is farther than so many metres."""
+    minima, d = atlas.minima, atlas.dimension
+    beside, out, scale = 0.0, 0.0, 1.0  # how far p and v change, and v
+    for k in range(d):
+        reach = 0.0
+        for m in range(d):
+            reach += abs(minima.axes[i, k, m]) * hull[m]
+        if k == d - 1 and minima.home[i] < 2 * d:
+            out, scale = reach, minima.start[i, k]
+        else:
+            beside = max(beside, reach)
+    # |p/v - p'/v'| <= (|p - p'| + |v - v'|/v') / v, because |p'| <= 1.
+    share = limit * scale / (atlas.radius * (beside + out / scale) + limit * out)
+    for k in range(d):
+        hull[k] *= min(share, 1.0)
 
 
 @compiled
@@ -201,7 +241,8 @@ def _tables(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array) -> None:
     set_centre(atlas, 2 * atlas.dimension + 1 + i, box.at)
     bound_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes)
     curve_pieces(atlas, cost.kinds, cost.data, box.half, box.curves)
-    sum_up(cost.K, cost.w, box.nodes, box.curves, box.sums)
+    noise = rounding(cost.K, cost.weight, accuracy_floor_far(cost, atlas), box.nodes)
+    sum_up(cost.K, cost.w, cost.weight, noise, box.nodes, box.curves, box.sums)
 
 
 @compiled
@@ -307,6 +348,8 @@ def search_everywhere(
         pop(stack, size, box.at, box.half)
         piece = int(stack[size, PIECE])
         set_centre(atlas, piece, box.at)
+        if piece > 2 * atlas.dimension:
+            widen_around(atlas, piece - 2 * atlas.dimension - 1, box.half)
         if _known(atlas, box, piece):
             continue
         bound_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes)
@@ -320,7 +363,7 @@ def search_everywhere(
             return CHEAPER, boxes, 0.0
         touching = piece < 2 * atlas.dimension and box.at[last] <= box.half[last]
         # The test is dear, and fails in large boxes: only where the cost is low it can spare splits.
-        if here < _NEAR * (level + 1.0) and _leaves(cost, atlas, box, touching):
+        if here < _NEAR * (level + 1.0) and _leaves(cost, atlas, box, touching, floor):
             continue
         if here < level:
             lows += 1
@@ -414,14 +457,15 @@ def _steepness(box: Box, m: int) -> float:
 
 
 @compiled
-def _leaves(cost: Cost, atlas: Atlas, box: Box, touching: bool) -> bool:
+def _leaves(cost: Cost, atlas: Atlas, box: Box, touching: bool, floor: float) -> bool:
     """Return whether no infimum of the cost can lie in a box whose nodes are bounded.
 
     The gradient does not vanish, or the Hessian has a negative eigenvalue; and at infinity, an end of the box that is
     none of space, the cost falls inwards or changes along infinity.
     """
     curve_pieces(atlas, cost.kinds, cost.data, box.half, box.curves)
-    sum_up(cost.K, cost.w, box.nodes, box.curves, box.sums)
+    noise = rounding(cost.K, cost.weight, floor, box.nodes)
+    sum_up(cost.K, cost.w, cost.weight, noise, box.nodes, box.curves, box.sums)
     if not touching and slopes_everywhere(cost.A, box.half, box.nodes, box.curves, box.sums, box.solve):
         return True
     ball = spread_of(cost.A, box.half, box.nodes, box.curves, box.sums)
@@ -434,10 +478,10 @@ def _leaves(cost: Cost, atlas: Atlas, box: Box, touching: bool) -> bool:
     for k in range(atlas.dimension):
         change = ball
         for m in range(3):
-            entry = _entry(k, m)
-            change += (abs(sums[entry]) + sums[C00 + entry]) * h[m]
-        # As everywhere in search coordinates: slack for the rounding of sums, relative and of a standard deviation.
-        slope, change = sums[G0 + k], change * (1.0 + 1e-6) + 1e-9
+            at = entry(k, m)
+            change += (abs(sums[at]) + sums[C00 + at]) * h[m]
+        # Slack for the rounding of the sums, relative, and of the gradient itself.
+        slope, change = sums[G0 + k], change * (1.0 + 1e-6) + sums[NOISE0 + k]
         if -slope > change or (k < atlas.dimension - 1 and slope > change):
             return True
     return False
@@ -452,7 +496,7 @@ def _bends_down(box: Box, ball: float) -> bool:
     sums, hessian, vectors = box.sums, box.solve, np.empty((3, 3))
     for k in range(3):
         for m in range(3):
-            hessian[k, m] = sums[_entry(k, m)]
+            hessian[k, m] = sums[entry(k, m)]
     principal(hessian, vectors)
     column = 0
     for k in range(1, 3):
@@ -461,18 +505,11 @@ def _bends_down(box: Box, ball: float) -> bool:
     most = ball
     for k in range(3):
         for m in range(3):
-            entry = _entry(k, m)
+            at = entry(k, m)
             z = vectors[k, column] * vectors[m, column]
-            most += sums[entry] * z + sums[C00 + entry] * abs(z)
+            most += sums[at] * z + sums[C00 + at] * abs(z)
     size = abs(sums[H00]) + abs(sums[H11]) + abs(sums[H22])
     return bool(most < -1e-9 * size)  # by more than the rounding of the Hessian's entries
-
-
-@compiled
-def _entry(k: int, m: int) -> int:
-    """Return where entry (k, m) of a symmetric matrix stands among (00, 01, 02, 11, 12, 22)."""
-    first, second = min(k, m), max(k, m)
-    return second if first == 0 else first + second + 1
 
 
 @compiled
@@ -493,7 +530,7 @@ _CLOSE = 1e-3
 
 @inlined
 def prove_everywhere(
-    cost: Cost, box: Box, x: Array, others: Array, kappa: float, eps: float, budget: int, found: Array
+    cost: Cost, box: Box, x: Array, beside: Known, kappa: float, eps: float, budget: int, found: Array
 ) -> tuple[int, int, float]:
     """Prove that no position costs less than a fix, and that no other minimum has a gap below kappa.
 
@@ -503,7 +540,7 @@ def prove_everywhere(
 
     Parameters
     ----------
-    cost, box, x, others, kappa, eps, budget, found
+    cost, box, x, beside, kappa, eps, budget, found
         As of `optloc.proof.near.prove`.
 
     Returns
@@ -517,27 +554,30 @@ def prove_everywhere(
     """
     nowhere, open_end = np.full(x.shape[0], np.nan), reaches_infinity(cost.kinds, cost.K)
     first = min(budget, _SOON) if open_end else budget
-    verdict, boxes, bound = prove(cost, box, x, others, kappa, eps, first, nowhere, nowhere, False, found)
-    again = verdict in (OPEN, BUDGET, STATIONARY, SINGULAR) or (verdict == OTHER and _listed(x, others, found))
+    verdict, boxes, bound = prove(cost, box, x, beside, kappa, eps, first, nowhere, nowhere, False, found)
+    again = verdict in (OPEN, BUDGET, STATIONARY, SINGULAR) or (verdict == OTHER and _listed(x, beside.points, found))
     if not open_end or not again or boxes >= budget:
         return verdict, boxes, bound
-    verdict, more, bound = prove_atlas(cost, box, x, others, kappa, eps, budget - boxes, found)
+    verdict, more, bound = prove_atlas(cost, box, x, beside, kappa, eps, budget - boxes, found)
     return verdict, boxes + more, bound
 
 
 @compiled
 def prove_atlas(
-    cost: Cost, box: Box, x: Array, others: Array, kappa: float, eps: float, budget: int, found: Array
+    cost: Cost, box: Box, x: Array, beside: Known, kappa: float, eps: float, budget: int, found: Array
 ) -> tuple[int, int, float]:
     """Prove the same as `prove_everywhere` with the atlas alone, where `far.reaches_infinity` holds."""
     chart, _ = chart_at(cost, x, box)
     least = cost_at(cost.K, cost.w, box.nodes)
-    middle, radius = cube(cost.kinds, cost.data)
+    others = beside.points
+    middle, radius = cube(cost.kinds, cost.data, x)
     atlas = atlas_of(middle, radius, x.shape[0], 1 + (others.shape[0] if kappa > 0.0 else 0))
     known, place = zero(), np.empty(x.shape[0])
     for p in range(atlas.minima.home.shape[0]):
         place[:] = x if p == 0 else others[p - 1]
-        if set_minimum(cost, box, atlas, known, place, eps):
+        hidden = p > others.shape[0] - beside.hidden
+        least_here, limit = (-inf, HIDDEN_REACH) if hidden else (least - 0.5 * eps, inf)
+        if set_minimum(cost, box, atlas, known, place, least_here, 0.5 * eps, limit):
             known += 1
         elif p == 0:
             return STATIONARY, 0, -inf

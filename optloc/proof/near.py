@@ -13,14 +13,8 @@ from optloc.compute.systems import inverse, positive
 from optloc.proof.box import (
     DEPTH,
     DIRECTION,
-    G0,
-    G1,
-    G2,
     bound_nodes,
-    clip_to_stationary,
-    convex,
     cost_at,
-    curve_nodes,
     cut_out,
     is_empty,
     least_left,
@@ -32,12 +26,12 @@ from optloc.proof.box import (
     push_halves,
     rounding,
     shrink,
-    sum_up,
     uncut,
 )
-from optloc.proof.chart import Box, Chart, Cost, accuracy_floor, chart_at, curve_box, is_convex, place, value_at
+from optloc.proof.chart import Box, Chart, Cost, Known, chart_at, curve_box, is_convex, place, value_at, widen
+from optloc.proof.curvature import G0, G1, G2, clip_to_stationary, convex, curve_nodes, free_multiplier, sum_up
 from optloc.proof.enclosure import enclose
-from optloc.proof.nodes.node import FORCE, H00, H01, H02, H11, H12, H22, HIGH, LOW, RANGE, SLOPE0, SLOPE1, SLOPE2
+from optloc.proof.nodes.node import FORCE, H00, H01, H02, H11, H12, H22, HIGH, LOW, PHI, RANGE, SLOPE0, SLOPE1, SLOPE2
 
 # A few damped Newton steps in search coordinates: which minimum a low point belongs to.
 
@@ -140,15 +134,16 @@ class Aim(NamedTuple):
     whole : bool
         Whether a box is done as well where the gradient cannot vanish, because the search as a whole leaves no way out;
         otherwise only if its cost is at least `value`.
-    floor : float
-        See `optloc.proof.box.least_residual`.
+    surface : array (e,)
+        See `optloc.proof.chart.Known`. With one, a gap is proven on it alone: boxes are done where they do not touch it
+        or cost too much, and nowhere because the gradient cannot vanish, which on a surface it need not.
     """
 
     level: float
     value: float
     better: float
     whole: bool
-    floor: float
+    surface: Array
 
 
 @compiled
@@ -186,7 +181,8 @@ def branch(
     kinds, data, K, w, A = cost.kinds, cost.data, cost.K, cost.w, cost.A
     sense, gram, at, half, centre, line = chart.sense, chart.gram, box.at, box.half, box.centre, box.line
     nodes, rows, curves, sums, solve, cut = box.nodes, box.rows, box.curves, box.sums, box.solve, box.cut
-    weight, origin, unique = cost.weight, chart.origin, aim.level > aim.value
+    weight, origin, floor, unique = cost.weight, chart.origin, chart.floor, aim.level > aim.value
+    held = unique and aim.surface.shape[0] > 0
     rho = sqrt(max(aim.level, 0.0))
     boxes, low_points = 0, 0
     while size > 0:
@@ -196,25 +192,34 @@ def branch(
         pop(stack, size, at, half)
         boxes += 1
         place(origin, sense, at, centre)
+        widen(chart, centre, half)
         bound_nodes(kinds, data, centre, sense, gram, half, line, nodes)
         linearise_rows(K, w, nodes, rows)
-        low = least_residual(K, weight, aim.floor, half, nodes, rows)
+        low = least_residual(K, weight, floor, half, nodes, rows)
         # A length, where the level is a cost: below 1 the length is the larger, so it is squared.
         if low > 0.0 and low * low >= aim.level:
             continue
-        here = cost_at(K, w, nodes)
-        if here < aim.better:
+        here, noise = cost_at(K, w, nodes), rounding(K, weight, floor, nodes)
+        if held:
+            if _misses(aim.surface, weight, noise, half, nodes):
+                continue
+        elif here < aim.better:
             return CHEAPER, boxes, 0.0
         # What cannot hold a residual shorter than rho, and below what no minimum, is cut off from all sides.
         uncut(half, cut)
-        shrink(K, rho + rounding(K, weight, aim.floor, nodes), half[2] == 0.0, nodes, rows, cut, solve)
-        if unique or aim.whole:
-            sound = aim.whole or (low > 0.0 and low * low >= aim.value)
-            # In the convex box of a known minimum there is no second, but a lower point there may be.
+        shrink(K, weight, rho + noise, half, half[2] == 0.0, nodes, rows, cut, solve)
+        high = low > 0.0 and low * low >= aim.value
+        # In the convex box of a known minimum there is no second, but a lower point there may be.
+        if held:
+            # On a surface the other minima are no stationary points, so their boxes say nothing of the value.
+            if is_known(at, half, minima if high else minima[: int(aim.whole)], sides):
+                continue
+        elif unique or aim.whole:
+            sound = aim.whole or high
             if sound and is_known(at, half, minima, sides):
                 continue
             curve_nodes(kinds, data, centre, sense, gram, half, line, solve, nodes, curves)
-            sum_up(K, w, nodes, curves, sums)
+            sum_up(K, w, weight, noise, nodes, curves, sums)
             if sound:
                 clip_to_stationary(A, half, nodes, curves, sums, cut, solve)
             if here < aim.level and not is_empty(cut):
@@ -247,6 +252,20 @@ def _follow(cost: Cost, chart: Chart, box: Box, minima: Array, sides: Array, aim
         return ANOTHER
     box.at[:], box.half[:] = at, half
     return CLEAR
+
+
+@inlined
+def _misses(surface: Array, weight: Array, noise: float, half: Array, nodes: Array) -> bool:
+    """Return whether a box has no point where the last nodes have the values (e,) of a surface."""
+    first, apart = weight.shape[0] - surface.shape[0], False
+    for i in range(surface.shape[0]):
+        j = first + i
+        reach = abs(nodes[j, SLOPE0]) * half[0] + abs(nodes[j, SLOPE1]) * half[1] + abs(nodes[j, SLOPE2]) * half[2]
+        # The rounding of a residual, in units of the node.
+        reach += noise / weight[j]
+        off = surface[i] - nodes[j, PHI]
+        apart = apart or off < nodes[j, LOW] - reach or off > nodes[j, HIGH] + reach
+    return apart
 
 
 @compiled
@@ -311,13 +330,16 @@ _ENDLESS = 1e300
 _OUTWARDS = 1e-9
 # Other minima must be known to a hundredth of a standard deviation: margin of convexity over slope.
 _POLISHED = 100.0
+HIDDEN_REACH = 5e4
+"""How far around a minimum that does not count nothing else does, metres: such minima lie deep in the Earth."""
 
 
 @inlined
-def set_convex(cost: Cost, chart: Chart, box: Box, hull: Array, margin: float) -> bool:
+def set_convex(cost: Cost, chart: Chart, box: Box, hull: Array, margin: float, surface: int) -> bool:
     """Make a box around its centre as large as the cost is found convex on it; return False where it is on none.
 
-    Convex over the whole hull in most cases; else the hull is shrunk as a whole.
+    Convex over the whole hull in most cases; else the hull is shrunk as a whole. With a surface, it has one stationary
+    point on that at most (`optloc.proof.curvature.free_multiplier`).
 
     Parameters
     ----------
@@ -329,13 +351,19 @@ def set_convex(cost: Cost, chart: Chart, box: Box, hull: Array, margin: float) -
         Half-widths beyond which there is nothing to gain.
     margin : float
         By how much the Hessian of f/2 must exceed zero.
+    surface : int
+        How many nodes set the surface, the last ones.
     """
     size = 1.0
     for _ in range(_SHRINKS):
         for k in range(3):
             box.half[k] = size * hull[k]
         if is_convex(cost, chart, box, margin):
-            return True
+            if surface == 0:
+                return True
+            free_multiplier(cost.kinds, cost.A, box.half, box.nodes, box.curves, box.sums, surface)
+            if convex(cost.kinds, cost.A, box.half, box.nodes, box.curves, box.sums, margin):
+                return True
         size *= _SHARE
     return False
 
@@ -349,7 +377,7 @@ def prove(
     cost: Cost,
     box: Box,
     x: Array,
-    others: Array,
+    known: Known,
     kappa: float,
     eps: float,
     budget: int,
@@ -368,10 +396,10 @@ def prove(
         Tables to work with, see `optloc.proof.chart.empty_box`.
     x : array (D,)
         The fix, polished.
-    others : array (P, D)
-        Other minima that are known, polished; boxes around them where the cost is convex are set aside.
+    known : Known
+        Other minima that are known, and the surface to which the claim is limited.
     kappa : float
-        Gap to prove; 0 proves the value alone.
+        Gap to prove; 0 proves the value alone, and with a surface that of all space.
     eps : float
         How far below the cost of the fix still counts as equal, 1e-6 (1 + f) or so: covers rounding.
     budget : int
@@ -409,17 +437,18 @@ def prove(
     low, high = corners[0], corners[1]
     if not _start(cost, chart, box, sqrt(least + kappa), lower, upper, low, high):
         return OPEN, 0, -inf
-    minima, sides, known = _minima(cost, chart, box, others, low, high, margin)
-    if known == 0:
+    surface = known.surface if kappa > 0.0 else known.surface[:0]
+    minima, sides, count = _minima(cost, chart, box, known, surface.shape[0], low, high, margin, least - eps)
+    if count == 0:
         return STATIONARY, 0, -inf
     if kappa <= 0.0:  # the value alone: other minima are no excuse, their boxes must be bounded as all others
-        known = 1
+        count = 1
     # Halfway between: a point found to cost less does so by more than rounding, and no box is left that does by less.
     better, whole = least - 0.5 * eps, closed or isnan(lower[0])
-    aim = Aim(level, value=least - eps, better=better, whole=whole, floor=accuracy_floor(cost, chart))
+    aim = Aim(level, value=least - eps, better=better, whole=whole, surface=surface)
     stack = np.empty((_CAPACITY, DEPTH))
     size = push_around(stack, 0, low, high, sides[0], 0)
-    outcome, boxes, bound = branch(cost, chart, box, minima[:known], sides[:known], aim, budget, stack, size)
+    outcome, boxes, bound = branch(cost, chart, box, minima[:count], sides[:count], aim, budget, stack, size)
     if outcome == CLEAR:
         return UNIQUE if kappa > 0.0 else VALUE, boxes, least - eps
     if outcome == SPENT:
@@ -442,9 +471,14 @@ def _start(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper: 
                 middle += chart.back[k, m] * (0.5 * (lower[m] + upper[m]) - chart.origin[m])
                 reach += abs(chart.back[k, m]) * 0.5 * (upper[m] - lower[m])
             low[k], high[k] = middle - reach, middle + reach
-    widest = 0.0
+    widest, size = 0.0, 0.0
     for k in range(3):
+        for m in range(3):
+            size += abs(chart.sense[k, m]) * max(abs(low[m]), abs(high[m]))
+    for k in range(3):
+        # By a share, and by the rounding of search coordinates of points so far away.
         slack = _OUTWARDS * (1.0 + abs(low[k]) + abs(high[k])) if high[k] > low[k] else 0.0
+        slack += chart.slip[k] * size
         low[k], high[k] = low[k] - slack, high[k] + slack
         widest = max(widest, abs(low[k]), abs(high[k]))
     return widest < _ENDLESS
@@ -452,15 +486,26 @@ def _start(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper: 
 
 @inlined
 def _minima(
-    cost: Cost, chart: Chart, box: Box, others: Array, low: Array, high: Array, margin: float
+    cost: Cost,
+    chart: Chart,
+    box: Box,
+    known: Known,
+    surface: int,
+    low: Array,
+    high: Array,
+    margin: float,
+    value: float,
 ) -> tuple[Array, Array, int]:
     """Return the known minima (1 + P, 3) in search coordinates, half-widths of convex boxes around them, their number.
 
-    The fix comes first; the number is 0 where the cost is not convex around it. Points that are no minima are left out.
+    The fix comes first; the number is 0 where the cost is not convex around it. Points that are no minima are left out,
+    and those whose box holds a point below `value`, unless they are hidden.
     """
-    count = 0
-    minima, sides, hull = np.zeros((1 + others.shape[0], 3)), np.zeros((1 + others.shape[0], 3)), np.empty(3)
-    for p in range(1 + others.shape[0]):
+    others = known.points
+    count, size = 0, 1 + others.shape[0]
+    minima, sides, hull, shift = np.zeros((size, 3)), np.zeros((size, 3)), np.empty(3), np.zeros(3)
+    for p in range(size):
+        hidden = p >= size - known.hidden
         box.at[:] = 0.0
         if p > 0:
             for k in range(3):
@@ -470,13 +515,39 @@ def _minima(
             if not is_convex(cost, chart, box, 0.0):
                 continue
             sums = box.sums
-            # Where the Hessian exceeds a margin, the minimum is within slope / margin of any point.
+            # Where the Hessian exceeds a margin, the minimum is within slope / margin of any point, and the cost there
+            # is less by slope^2 / margin at most. On a surface the slope is none of the minimum's.
             margin = _POLISHED * sqrt(sums[G0] * sums[G0] + sums[G1] * sums[G1] + sums[G2] * sums[G2])
+            least = cost_at(cost.K, cost.w, box.nodes) - margin / (_POLISHED * _POLISHED)
+            margin = margin if surface == 0 else 0.0
+            if not hidden and surface == 0 and not least >= value:
+                continue
         for k in range(3):
             hull[k] = max(high[k] - box.at[k], box.at[k] - low[k], 0.0)
-        if set_convex(cost, chart, box, hull, margin):
-            minima[count], sides[count] = box.at, box.half
+        if hidden:
+            _draw_in(chart, hull)
+        if set_convex(cost, chart, box, hull, margin, surface):
+            # Where the box is, up to the rounding of its centre; that of the fix is the origin itself.
+            shift[:] = 0.0
+            if p > 0:
+                widen(chart, box.centre, shift)
+            for k in range(3):
+                minima[count, k], sides[count, k] = box.at[k], max(box.half[k] - shift[k], 0.0)
             count += 1
         elif p == 0:
             return minima, sides, 0
     return minima, sides, count
+
+
+@compiled
+def _draw_in(chart: Chart, hull: Array) -> None:
+    """Make half-widths (3,) so small that no coordinate in metres is farther than `HIDDEN_REACH`."""
+    share = 1.0
+    for k in range(3):
+        reach = 0.0
+        for m in range(3):
+            reach += abs(chart.sense[k, m]) * hull[m]
+        if reach * share > HIDDEN_REACH:
+            share = HIDDEN_REACH / reach
+    for k in range(3):
+        hull[k] *= share

@@ -501,9 +501,25 @@ def _beyond_stations(problem: Problem) -> Iterator[str]:
     same = np.eye(problem.dimension) * covariance[..., :1, :1]
     if not np.allclose(covariance, same, rtol=1e-9, atol=0.0):
         yield "the station errors differ from axis to axis"
+    if problem.stations.span == "run" and _move(problem):
+        yield "station errors last the whole run while stations move, and the proof takes one line to the target for each"
     bent = [rows.kind for rows in problem.rows if MODELS[rows.kind].ranges is None and MODELS[rows.kind].stations]
     if bent:
         yield f"station errors enter {bent[0]} rows in a way that depends on the place"
+
+
+def _move(problem: Problem) -> bool:
+    """Return whether a station that rows of several epochs name is at different places in them."""
+    place = problem.stations.position
+    if place.shape[-3] < 2:
+        return False
+    named = np.concatenate([(rows.a, rows.b)[k] for rows in problem.rows for k in range(MODELS[rows.kind].stations)])
+    when = np.concatenate([rows.epoch for rows in problem.rows for k in range(MODELS[rows.kind].stations)])
+    for station in np.unique(named):
+        seen = place[..., np.unique(when[named == station]), station, :]
+        if (seen != seen[..., :1, :]).any():
+            return True
+    return False
 
 
 def _beyond_constraints(problem: Problem) -> Iterator[str]:

@@ -4,10 +4,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from optloc.proof.chart import Known
 from optloc.proof.nodes.dispatch import NODES
 from optloc.proof.nodes.node import LINEAR, RANGE
 
 Array = np.ndarray
+
+
+def beside(points, d=3, hidden=0, surface=()):
+    """Return other minima (P, d), and the surface of a claim, as a proof wants them."""
+    return Known(np.array(points, dtype=float).reshape(-1, d), hidden, np.array(surface, dtype=float))
+
+
 NO_REGION = np.full(3, np.nan)
 # How many numbers any shipped node has at most.
 WIDTH = max(node.width for node in NODES)

@@ -6,8 +6,8 @@ from proof.costs import random_case
 from proof.test_ranges import bound_box, bounded, charted, drawn_box, ways
 
 from optloc.compute.jit import enabled
-from optloc.proof.box import convex, slopes_everywhere, spread_of
 from optloc.proof.chart import curve_box, is_convex
+from optloc.proof.curvature import C00, SUMS, convex, slopes_everywhere, spread_of
 from optloc.proof.near import set_convex
 from optloc.proof.nodes.node import CURVE_WIDTH, RANGE
 from optloc.proof.nodes.range import curve_ranges
@@ -100,7 +100,7 @@ def test_entries_of_the_hessian_change_less_than_bounded(d):
         x = chart.origin + (box.at + ways(rng, box.half, POINTS)) @ chart.sense.T
         T = chart.sense[:d, :d]
         H = T.T @ case.derivatives(x[:, :d])[1] @ T
-        centre, wide = square(box.sums[:6])[:d, :d], square(box.sums[9:15])[:d, :d]
+        centre, wide = square(box.sums[:6])[:d, :d], square(box.sums[C00:SUMS])[:d, :d]
         assert np.allclose(centre, T.T @ case.derivatives(box.centre[:d])[1] @ T, rtol=1e-6, atol=1e-9)
         assert (np.abs(H - centre) <= wide + ball + 1e-9).all()
         seen += 1
@@ -151,7 +151,7 @@ def test_a_convex_box_around_a_minimum_reaches_no_farther_than_convexity():
         if np.linalg.norm(x - truth) > 500.0:
             continue
         cost, chart, box = charted(case, x)
-        assert set_convex(cost, chart, box, np.full(3, 1e4), 0.0)
+        assert set_convex(cost, chart, box, np.full(3, 1e4), 0.0, 0)
         best = box.half.copy()
         assert is_convex(cost, chart, box, 0.0)
         x = chart.origin + ways(rng, best, 2000) @ chart.sense.T

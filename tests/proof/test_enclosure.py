@@ -6,8 +6,8 @@ from proof.costs import WIDTH, random_case
 from proof.test_ranges import charted
 
 from optloc.compute.jit import enabled
-from optloc.proof.box import sum_up
 from optloc.proof.chart import value_at
+from optloc.proof.curvature import sum_up
 from optloc.proof.enclosure import around_node, around_rays, enclose
 from optloc.proof.nodes.node import AZIMUTH, ELEVATION, RANGE, RATIO
 
@@ -19,7 +19,7 @@ def enclosed(case, x, rho):
     cost, chart, box = charted(case, x)
     value_at(cost, chart, box)
     box.curves[:] = 0.0
-    sum_up(cost.K, cost.w, box.nodes, box.curves, box.sums)
+    sum_up(cost.K, cost.w, cost.weight, 0.0, box.nodes, box.curves, box.sums)
     low, high = np.empty(3), np.empty(3)
     return chart, (low, high) if enclose(cost, chart, box, rho, low, high) else None
 

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from proof.costs import WIDTH
+from proof.costs import WIDTH, beside
 from scipy.optimize import least_squares
 
 from optloc.compute.jit import enabled
@@ -66,7 +66,7 @@ def proven(prover, kinds, data, K, w, x, others, kappa, budget=4000):
     others, boxes = list(others), 0
     for _ in range(6):
         found = np.full(len(x), np.nan)
-        rest = np.array(others).reshape(-1, len(x))
+        rest = beside(others, len(x))
         f = K @ np.linalg.norm(x - data[:, : len(x)], axis=1) - w if (kinds == RANGE).all() else np.zeros(1)
         cost, box = cost_of(kinds, data, K, w), empty_box(*K.shape)
         verdict, more, _ = prover(cost, box, x, rest, kappa, 1e-6 * (1.0 + f @ f), budget, found)
@@ -98,7 +98,7 @@ def test_in_the_plane_verdicts_are_those_of_brute_force():
             continue
         for cost, x in minima:
             found = np.full(2, np.nan)
-            args = (x, np.zeros((0, 2)), 0.0, 1e-6 * (1.0 + cost), 4000)
+            args = (x, beside([], 2), 0.0, 1e-6 * (1.0 + cost), 4000)
             verdict = prove_atlas(cost_of(kinds, data, K, w), empty_box(*K.shape), *args, found)[0]
             if verdict == BETTER:
                 assert ((K @ np.linalg.norm(found - S, axis=1) - w) ** 2).sum() < cost
@@ -161,7 +161,7 @@ def test_a_cost_that_falls_to_infinity_is_no_proof():
     kinds, data, K, w = differences(S, 1.0, np.array([0.0, 1e9]), rng)
     w = w + 0.5 * K @ np.array([-200.0, 0.0, -200.0, 0.0]) / 100.0
     x = least_squares(lambda p: K @ np.linalg.norm(p - S, axis=1) - w, [0.0, 1e5]).x
-    args = (x, np.zeros((0, 2)), 9.0, 1e-6, 4000, np.zeros(2))
+    args = (x, beside([], 2), 9.0, 1e-6, 4000, np.zeros(2))
     verdict = prove_atlas(cost_of(kinds, data, K, w), empty_box(*K.shape), *args)[0]
     assert verdict not in (UNIQUE, VALUE)
 
@@ -176,7 +176,7 @@ def test_costs_that_grow_without_end_are_not_for_the_atlas():
     data, K = np.concatenate([data, np.zeros((1, WIDTH))]), np.pad(K, ((0, 0), (0, 1)))
     cost, box = cost_of(np.append(kinds, LINEAR), data, K, np.zeros(2)), empty_box(*K.shape)
     x = np.array([3.0, 4.0, 5.0])
-    verdict = prove_everywhere(cost, box, x, np.zeros((0, 3)), 0.0, 1e-6, 10, np.zeros(3))[0]
+    verdict = prove_everywhere(cost, box, x, beside([]), 0.0, 1e-6, 10, np.zeros(3))[0]
     assert verdict not in (UNIQUE, VALUE)
 
 
@@ -185,9 +185,9 @@ def test_the_box_around_a_minimum_is_convex_in_every_sample():
     rng = np.random.default_rng(10)
     for problem, minima in flat_cell(8 if enabled() else 2, 11):
         _, data, K, w = problem
-        middle, radius = cube(*problem[:2])
+        middle, radius = cube(*problem[:2], minima[0][1])
         atlas, cost, box = atlas_of(middle, radius, 3, 1), cost_of(*problem), empty_box(*K.shape)
-        assert set_minimum(cost, box, atlas, 0, minima[0][1], 1e-6)
+        assert set_minimum(cost, box, atlas, 0, minima[0][1], 0.0, 1e-6, np.inf)
         for s in rng.uniform(-1.0, 1.0, (50, 3)) * atlas.minima.sides[0]:
             assert np.linalg.eigvalsh(hessian_at(atlas, data, K, w, s))[0] > -1e-3
 

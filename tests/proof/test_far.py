@@ -17,7 +17,7 @@ def scene(d, rng):
     """Return nodes of all kinds and an atlas with one known minimum of some cost outside the cube."""
     kinds = np.array([CODES[name] for name in NAMES[d]])
     data = np.stack([numbers("groa" if name == "range" else name, d, rng) for name in NAMES[d]])
-    middle, radius = cube(kinds, data)
+    middle, radius = cube(kinds, data, np.zeros(d))
     atlas = atlas_of(middle, radius, d, 1)
     minima = atlas.minima
     x = middle[:d] + radius * rng.normal(size=d) * 2.0

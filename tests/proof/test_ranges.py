@@ -6,7 +6,7 @@ from proof.costs import WIDTH, random_case
 
 from optloc.compute.jit import enabled
 from optloc.proof.box import bound_nodes, cut_out, least_residual, linearise_rows, shrink
-from optloc.proof.chart import accuracy_floor, chart_at, cost_of, empty_box, place
+from optloc.proof.chart import chart_at, cost_of, empty_box, place
 from optloc.proof.nodes.node import NODE_WIDTH, RANGE, greatest
 from optloc.proof.nodes.range import bound_ranges
 
@@ -114,7 +114,7 @@ def bound_box(cost, chart, box):
     place(chart.origin, chart.sense, box.at, box.centre)
     bound_nodes(*cost[:2], box.centre, chart.sense, chart.gram, box.half, box.line, box.nodes)
     linearise_rows(cost.K, cost.w, box.nodes, box.rows)
-    return least_residual(cost.K, cost.weight, accuracy_floor(cost, chart), box.half, box.nodes, box.rows)
+    return least_residual(cost.K, cost.weight, chart.floor, box.half, box.nodes, box.rows)
 
 
 def place_box(box, d, rng, most=4.0):
@@ -153,7 +153,7 @@ def test_a_clipped_box_loses_no_short_residual(d):
         length = np.sqrt(case.cost((chart.origin + (box.at + s) @ chart.sense.T)[:, :d]))
         rho = np.quantile(length, 0.2)
         box.cut[:3], box.cut[3:] = -box.half, box.half
-        shrink(cost.K, rho, d == 2, box.nodes, box.rows, box.cut, box.solve)
+        shrink(cost.K, cost.weight, rho, box.half, d == 2, box.nodes, box.rows, box.cut, box.solve)
         inside = s[length <= rho]
         assert (inside >= box.cut[:3]).all()
         assert (inside <= box.cut[3:]).all()

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from proof.costs import NO_REGION, combined, differences, random_case
+from proof.costs import NO_REGION, beside, combined, differences, random_case
 
 from optloc.compute.jit import enabled
 from optloc.proof.chart import cost_of, empty_box
@@ -17,7 +17,7 @@ def proof(case, x, kappa=0.0, others=(), region=None, budget=BUDGET_HERE, closed
     """Return verdict, boxes, bound and the point found."""
     d, found = case.d, np.full(case.d, np.nan)
     low, high = (NO_REGION[:d], NO_REGION[:d]) if region is None else (np.asarray(end, float) for end in region)
-    known = np.array(others, dtype=float).reshape(-1, d)
+    known = beside(others, d)
     eps = 1e-6 * (1.0 + case.cost(x))
     K = np.ascontiguousarray(case.K)
     cost, box = cost_of(case.kinds, case.data, K, case.w), empty_box(*K.shape)

@@ -50,11 +50,13 @@ def verdicts(problem, item, x, kappa: float, budget: int = 300):
         x,
         np.zeros((n, 0, d)),
         np.zeros(n, dtype=np.int64),
+        np.zeros(n, dtype=np.int64),
         np.full(n, kappa),
         EQUAL * (1.0 + cost),
         nowhere,
         reach,
         np.full(n, budget),
+        np.zeros((n, 0)),
     )
     return prove_all(pose.take(item), asked).verdict
 

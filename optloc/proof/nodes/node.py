@@ -54,8 +54,9 @@ GROWS, SCALED, DIFFERENCE = range(3)
 # Columns of a table of nodes over a box (J, NODE_WIDTH): value at the centre, gradient, enclosure of the remainder.
 PHI, SLOPE0, SLOPE1, SLOPE2, LOW, HIGH, NODE_WIDTH = range(7)
 # Columns of a table of second derivatives (J, CURVE_WIDTH): the Hessian's entries, bounds of the change of the gradient
-# and of the Hessian, and what the rows add to them: the force K'(K phi - w) on the node, and its pull K'J.
-H00, H01, H02, H11, H12, H22, TURN0, TURN1, TURN2, CHI, FORCE, PULL0, PULL1, PULL2, CURVE_WIDTH = range(15)
+# and of the Hessian, and what the rows add to them: the force K'(K phi - w) on the node, its pull K'J, and how far the
+# force may be from what it is computed to be.
+H00, H01, H02, H11, H12, H22, TURN0, TURN1, TURN2, CHI, FORCE, PULL0, PULL1, PULL2, BLUR, CURVE_WIDTH = range(16)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,19 +10,19 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.records import overwrite, present, take
-from optloc.base.types import Array, Band, Certificate
+from optloc.base.types import Array, Certificate
 from optloc.compute.jit import enabled
 from optloc.linear.constraints import TOLERANCE, exact, violation, violation_names
+from optloc.problem.chart import quantile
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.proof.batch import Answered, Asked, prove_all
 from optloc.proof.everywhere import UNBOUNDED
-from optloc.proof.near import BETTER, BUDGET, OTHER, UNIQUE, VALUE
-from optloc.proof.nodes.height import height_numbers
-from optloc.proof.nodes.linear import linear_numbers
-from optloc.proof.nodes.node import HEIGHT, LINEAR
-from optloc.proof.pose import Posed, pose_costs, stack_numbers, unsupported
+from optloc.proof.near import BETTER, BUDGET, HIDDEN_REACH, OTHER, UNIQUE, VALUE
+from optloc.proof.pose import Posed, pose_costs, unsupported
+from optloc.solvers.certify.agreement import agrees
+from optloc.solvers.certify.equalities import Held, hold_equalities
 from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP
@@ -46,6 +46,7 @@ HELD = "an inequality holds the fix, and the proof covers equalities only"
 REMOTE = "positions ever farther away explain the data about as well"
 TURNS = "angles may be a whole turn off with their biases at costs that matter"
 RESTLESS = "minima kept turning up"
+MISMATCHED = "the cost of the proof is not that of the fix"
 
 
 def unknown(reason: str) -> Certificate:
@@ -98,78 +99,9 @@ def column(certificates: list[Certificate]) -> Array:
     return out
 
 
-# Known heights and planes in a proof: an equality is worth a row whose residual is its multiplier.
-
-
-@dataclass(frozen=True, slots=True)
-class Held:
-    """Posed costs of a flat batch of N problems with their equalities as rows.
-
-    For a point with ``g(x) = H`` the cost is ``f(x) + ((g(x) - H) / s + l s)^2 - (l s)^2``: for the multiplier l of a
-    fix its gradient vanishes there in all directions, and a bound over all points is one over those that meet it.
-
-    Parameters
-    ----------
-    pose : Posed
-        Costs with the rows.
-    extra : array (N,)
-        By how much the posed cost of a fix exceeds its cost.
-    able : bool array (N,)
-        Where no other constraint holds the fix.
-    """
-
-    pose: Posed
-    extra: Array
-    able: Array
-
-
-def hold_equalities(problem: Problem, fix: Fix, pose: Posed) -> Held:
-    """Return posed costs with the equalities of a flat batch of problems as rows at the multipliers of their fixes.
-
-    References
-    ----------
-    M. J. D. Powell, "A method for nonlinear constraints in minimization problems" (1969); R. T. Rockafellar (1973): the
-    augmented Lagrangian.
-    """
-    face, size = exact(problem), len(fix.x)
-    active = [()] * size if fix.active is None else [tuple(found) for found in fix.active]
-    able = np.array([len(found) == len(face) for found in active])
-    if not face:
-        return Held(pose, np.zeros(size), able)
-    with np.errstate(invalid="ignore"):
-        spread = np.sqrt(np.trace(fix.covariance(), axis1=-2, axis2=-1) / max(problem.dimension - len(face), 1))
-    scale = np.where(np.isfinite(spread), np.maximum(spread, 1.0), 1.0)
-    extra = np.zeros(size)
-    for i, level in enumerate(face):
-        constraint = problem.constraints[level.constraint]
-        assert isinstance(constraint, Band)
-        shift = np.array([0.5 * found[i].multiplier if good else 0.0 for found, good in zip(active, able, strict=True)])
-        pose = _with_row(pose, *_node(problem, constraint), constraint.lower, scale, shift)
-        extra = extra + (shift * scale) ** 2
-    return Held(pose, extra, able)
-
-
-def _node(problem: Problem, constraint: Band) -> tuple[int, Array]:
-    """Return code and numbers (B, n) of the node that an equality sets."""
-    if constraint.kind == "height":
-        return HEIGHT, height_numbers(problem)
-    coefficients = constraint.coefficients
-    return LINEAR, linear_numbers(coefficients if coefficients.ndim == 2 else coefficients[None])
-
-
-def _with_row(pose: Posed, kind: int, numbers: Array, value: Array, scale: Array, shift: Array) -> Posed:
-    """Return costs with the row ``(node - value) / scale + shift * scale`` added."""
-    size, (q, nodes) = len(scale), pose.K.shape[-2:]
-    K = np.zeros((size, q + 1, nodes + 1))
-    K[:, :q, :nodes], K[:, q, nodes] = pose.K, 1.0 / scale
-    w = np.concatenate([pose.w, (np.broadcast_to(value, (size,)) / scale - shift * scale)[:, None]], axis=1)
-    kinds = np.append(pose.kinds, kind)
-    data = stack_numbers(kinds, [*(pose.data[:, j] for j in range(nodes)), numbers])
-    return pose._replace(kinds=kinds, data=data, K=K, w=w)
-
-
-# Gaps to other minima that are tried to prove, one after the other; the last is the value alone.
-_MARGINS = (LISTED_GAP, AMBIGUOUS_GAP, 0.0)
+# Gaps to other minima that are tried to prove, one after the other; the last is the value alone. Where positions ever
+# farther away cost too little for a gap, one more comes before the last: the cost of the 95 % region.
+_MARGINS, _LEVEL = (LISTED_GAP, AMBIGUOUS_GAP, 0.0), 0.95
 # Rounds of proof and repair: every margin may be lowered and the region tried, with a few minima found in between.
 _ROUNDS = 6
 # Boxes for the proof of a gap and of the value, with up to so many nodes. Plain Python takes a thousand times longer
@@ -180,8 +112,6 @@ _BUDGETS, _NODES, _SLOW_BUDGET, _AT_LEAST = (3000, 8000), 12, 2000, 5
 _EQUAL = 1e-6
 # Minima behind the Earth that are set aside at most: mirror images through it; whoever has more gets no proof.
 _HIDDEN = 4
-# How far around such a minimum everything must be hidden too, metres: its convex box is smaller.
-_DEEP = 5e4
 # Half-width of the region where all positions cannot be bounded: spreads of the stations, or distances of the fix, so
 # that it lies well inside either way.
 _SPREADS, _DISTANCES = 10.0, 2.0
@@ -210,15 +140,16 @@ class Work:
     fallback : array (N, 2, d)
         Corners of the regions that take their place where all positions cannot be bounded.
     margins : array (q,)
-        Gaps to prove, one after the other where proofs are not finished.
+        Gaps to prove, one after the other where proofs are not finished; the last but one only where infinity is near.
     level : int array (N,)
         Which of the margins is tried.
     pending : bool array (N,)
         What is not settled.
     effort : int
         By how much budgets and rounds are multiplied.
-    replaced, listed : int
-        How many fixes were replaced, and how often another minimum was added to the alternatives.
+    replaced, listed, mismatched : int
+        How many fixes were replaced, how often another minimum was added to the alternatives, and how many proofs were
+        about another cost than that of their fix.
     """
 
     problem: Problem
@@ -235,6 +166,7 @@ class Work:
     effort: int
     replaced: int = 0
     listed: int = 0
+    mismatched: int = 0
 
     @classmethod
     def begin(
@@ -252,7 +184,7 @@ class Work:
             np.full((size, 0, d), np.nan),
             np.array(np.broadcast_to(corners, (size, 2, d))),
             _around(problem, fix.position),
-            np.array([margin, *(m for m in _MARGINS if m < margin)]),
+            np.array(_gaps(margin, d)),
             np.zeros(size, dtype=np.int64),
             np.array(answered),
             effort,
@@ -265,25 +197,46 @@ class Work:
         counts = [f"{proofs.count(name)} {name}" for name in ("global", "region", "unknown") if name in proofs]
         more = [f"{self.replaced} fixes replaced by better ones"] if self.replaced else []
         more += [f"{self.listed} other minima found"] if self.listed else []
+        if self.mismatched:
+            more.append(f"{self.mismatched} posed cost{'s' if self.mismatched > 1 else ''} did not match")
         return ", ".join(counts + more)
+
+
+def _gaps(margin: float, dimension: int) -> list[float]:
+    """Return the gaps to prove, from the one asked for down to the value alone."""
+    below = [m for m in _MARGINS if m < margin]
+    near = min(quantile(_LEVEL, dimension), margin)
+    return [margin, *below[:-1], near, 0.0] if margin > 0.0 else [0.0]
 
 
 def settle(work: Work) -> Work:
     """Return the work with a certificate for every fix that was to be proven."""
+    asked = np.flatnonzero(work.pending)
     for _ in range(_ROUNDS * work.effort):
         items = np.flatnonzero(work.pending)
         if not len(items):
             break
         _round(work, items)
     _give_up(work, np.flatnonzero(work.pending), RESTLESS)
+    _compare(work, asked)
     return work
+
+
+def _compare(work: Work, items: Array) -> None:
+    """Take back what was proven of another cost than that of a fix."""
+    proven = items[[work.certificate[i].proof in ("global", "region") for i in items]]
+    if not len(proven):
+        return
+    off = proven[~agrees(work.problem.take(proven), work.fix[proven], work.pose.take(proven))]
+    _give_up(work, off, MISMATCHED)
+    work.mismatched += len(off)
 
 
 def _round(work: Work, items: Array) -> None:
     """Try to prove some fixes once, and settle or change what can be."""
     part = hold_equalities(work.problem.take(items), work.fix[items], work.pose.take(items))
     _give_up(work, items[~part.able], HELD)
-    asked = _asked(work, items, part.extra)
+    asked = _asked(work, items, part)
     # Below this level a wrapped residual may stand for another than the node's: no bound of one bounds the other.
     turning = part.able & (part.pose.level < work.fix.cost[items] + asked.kappa)
     _lower(work, items[turning], TURNS)
@@ -298,30 +251,33 @@ def _round(work: Work, items: Array) -> None:
     short = answer.verdict == BUDGET
     _lower(work, items[short], UNFINISHED)
     remote = answer.verdict == UNBOUNDED
-    _lower(work, items[remote], REMOTE)
+    _lower(work, items[remote], REMOTE, remote=True)
     found = np.isin(answer.verdict, (BETTER, OTHER))
     if found.any():
         _add(work, items[found], answer.found[found], answer.verdict[found] == BETTER)
     _give_up(work, items[~(done | short | remote | found)], UNSETTLED)
 
 
-def _asked(work: Work, items: Array, extra: Array) -> Asked:
-    kappa = work.margins[work.level[items]]
+def _asked(work: Work, items: Array, held: Held) -> Asked:
+    kappa = work.margins[work.level[items]] if held.single else np.zeros(len(items))
     fix, ignored = work.fix, work.ignored[items]
     gap = fix.alternatives.gap[items]
     with np.errstate(invalid="ignore"):
         listed = np.isfinite(gap) & (gap < np.maximum(kappa, AMBIGUOUS_GAP)[:, None])
     place = fix.layout.take(fix.alternatives.x[items], "position")
     others = pack(np.concatenate([np.where(listed[..., None], place, np.nan), ignored], axis=1))
+    seen = np.isfinite(ignored).all(-1).sum(1)
     return Asked(
         x=fix.position[items],
         others=np.where(np.isfinite(others), others, 0.0),
         known=np.isfinite(others).all(-1).sum(1),
+        hidden=seen,
         kappa=kappa,
-        eps=_EQUAL * (1.0 + fix.cost[items] + extra),
+        eps=_EQUAL * (1.0 + fix.cost[items] + held.extra),
         region=work.region[items],
         fallback=work.fallback[items],
         budget=_budgets(kappa, len(work.pose.kinds), work.effort),
+        surface=held.surface,
     )
 
 
@@ -334,14 +290,17 @@ def _budgets(kappa: Array, nodes: int, effort: int) -> Array:
     return np.asarray(np.where(kappa > 0.0, *_BUDGETS) / share).astype(np.int64)
 
 
-def _lower(work: Work, items: Array, why: str) -> None:
+def _lower(work: Work, items: Array, why: str, *, remote: bool = False) -> None:
     """Let proofs that failed try for a smaller margin, then for a region; give up where that was all."""
+    last = len(work.margins) - 1
     work.level[items] += 1
-    spent = items[work.level[items] >= len(work.margins)]
+    if not remote:
+        work.level[items] += work.level[items] == max(last - 1, 1)
+    spent = items[work.level[items] > last]
     everywhere = np.isnan(work.region[spent, 0, 0])
     regional = spent[everywhere]
     work.region[regional] = work.fallback[regional]
-    work.level[regional] = min(1, len(work.margins) - 1)
+    work.level[regional] = 1 if last > 2 else last
     _give_up(work, spent[~everywhere], why)
 
 
@@ -422,7 +381,7 @@ def _deep(problem: Problem, x: Array) -> Array:
     slot, _ = problem.layout.find("position")
     out = np.asarray(np.isfinite(x).all(-1))
     for axis in range(slot.start, slot.start + slot.size):
-        for side in (-_DEEP, _DEEP):
+        for side in (-HIDDEN_REACH, HIDDEN_REACH):
             beside = np.where(np.isfinite(x), x, 0.0)
             beside[:, axis] += side
             out &= is_hidden(problem, beside)

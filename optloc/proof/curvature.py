@@ -1,0 +1,326 @@
+"""Second derivatives of the cost over a box: where it is convex, and where its gradient cannot vanish."""
+
+from __future__ import annotations
+
+from math import inf, sqrt
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled, inlined
+from optloc.compute.systems import inverse, positive
+from optloc.proof.box import clip, digits, is_empty
+from optloc.proof.nodes.dispatch import curve_others, shape_of
+from optloc.proof.nodes.node import (
+    BLUR,
+    CHI,
+    CONVEX,
+    FLAT,
+    FORCE,
+    H00,
+    H01,
+    H02,
+    H11,
+    H12,
+    H22,
+    HIGH,
+    LOW,
+    PHI,
+    PULL0,
+    PULL1,
+    PULL2,
+    RANGE,
+    SLOPE0,
+    SLOPE1,
+    SLOPE2,
+    TURN0,
+    TURN1,
+    TURN2,
+)
+from optloc.proof.nodes.range import curve_ranges
+
+# Some units in the last place: what a sum of a few products is off by, relative to their sizes.
+_ROUNDING = 1e-15
+# A vector of sums (SUMS,): the Hessian of f/2 at the centre, entries H00 to H22 as of a node, its gradient; lengths of
+# the columns of the Jacobian, bounds of the rounding of these columns and of the gradient; and bounds of the change of
+# each entry of the Hessian.
+G0, G1, G2, LENGTH0, LENGTH1, LENGTH2, BLUR0, BLUR1, BLUR2, NOISE0, NOISE1, NOISE2 = range(6, 18)
+C00, C01, C02, C11, C12, C22, SUMS = range(18, 25)
+
+
+@inlined
+def curve_nodes(
+    kinds: Array,
+    data: Array,
+    centre: Array,
+    sense: Array,
+    gram: Array,
+    half: Array,
+    line: Array,
+    second: Array,
+    nodes: Array,
+    curves: Array,
+) -> None:
+    """Fill the table of second derivatives (J, CURVE_WIDTH) over a box.
+
+    Arguments are those of `bound_nodes`, which ran before, and working memory `second` (3, 3).
+    """
+    curve_ranges(kinds, gram, half, nodes, curves)
+    for j in range(kinds.shape[0]):
+        if kinds[j] != RANGE:  # ranges alone are the common case, and every array that is handed on costs
+            curve_others(kinds, data, centre, sense, half, line, second, nodes, curves)
+            break
+
+
+@compiled
+def sum_up(K: Array, w: Array, weight: Array, noise: float, nodes: Array, curves: Array, sums: Array) -> None:
+    """Fill forces and pulls of the table, and Hessian and gradient of f/2 at the centre of the box.
+
+    Parameters
+    ----------
+    K, w, weight : array (q, J), (q,), (J,)
+        Whitened rows, and the lengths of the columns of K.
+    noise : float
+        The rounding of a residual, see `rounding`.
+    nodes, curves : array (J, NODE_WIDTH), (J, CURVE_WIDTH)
+        Tables of the box.
+    sums : array (SUMS,)
+        Written.
+    """
+    sums[:] = 0.0
+    curves[:, FORCE:] = 0.0
+    longest = 0.0
+    for i in range(K.shape[0]):
+        residual, j0, j1, j2 = -w[i], 0.0, 0.0, 0.0
+        for j in range(K.shape[1]):
+            factor = K[i, j]
+            residual += factor * nodes[j, PHI]
+            j0 += factor * nodes[j, SLOPE0]
+            j1 += factor * nodes[j, SLOPE1]
+            j2 += factor * nodes[j, SLOPE2]
+        sums[H00] += j0 * j0
+        sums[H01] += j0 * j1
+        sums[H02] += j0 * j2
+        sums[H11] += j1 * j1
+        sums[H12] += j1 * j2
+        sums[H22] += j2 * j2
+        sums[G0] += j0 * residual
+        sums[G1] += j1 * residual
+        sums[G2] += j2 * residual
+        longest += residual * residual
+        for j in range(K.shape[1]):
+            factor = K[i, j]
+            curves[j, FORCE] += factor * residual
+            curves[j, PULL0] += factor * j0
+            curves[j, PULL1] += factor * j1
+            curves[j, PULL2] += factor * j2
+    longest, share = sqrt(longest), digits(K)
+    sums[LENGTH0], sums[LENGTH1], sums[LENGTH2] = sqrt(sums[H00]), sqrt(sums[H11]), sqrt(sums[H22])
+    for j in range(K.shape[1]):
+        curves[j, BLUR] = weight[j] * (noise + share * longest) + share * abs(curves[j, FORCE])
+        for k in range(3):
+            sums[BLUR0 + k] += share * weight[j] * abs(nodes[j, SLOPE0 + k])
+        for k in range(6):
+            sums[k] += curves[j, FORCE] * curves[j, k]
+    for k in range(3):
+        sums[NOISE0 + k] = sums[LENGTH0 + k] * noise + sums[BLUR0 + k] * (longest + noise)
+
+
+@inlined
+def force_change(A: Array, half: Array, nodes: Array, curves: Array, j: int) -> tuple[float, float]:
+    """Return how far component j of K'(K phi - w) can fall and rise over the box; A = K'K (J, J).
+
+    What rounding may have made of it at the centre counts as change.
+    """
+    spread = abs(curves[j, PULL0]) * half[0] + abs(curves[j, PULL1]) * half[1] + abs(curves[j, PULL2]) * half[2]
+    fall, rise = -spread - curves[j, BLUR], spread + curves[j, BLUR]
+    for m in range(A.shape[0]):
+        first, second = A[j, m] * nodes[m, LOW], A[j, m] * nodes[m, HIGH]
+        fall += min(first, second)
+        rise += max(first, second)
+    return fall, rise
+
+
+@compiled
+def convex(kinds: Array, A: Array, half: Array, nodes: Array, curves: Array, sums: Array, margin: float) -> bool:
+    """Return whether the Hessian of f/2 exceeds `margin` times the identity all over the box.
+
+    H = Phi'A Phi + sum_j g_j N_j. The first part changes by at least ``-(B'E + E'B)`` with B = A Phi and E the changes
+    of the gradients (a term ``dPhi'A dPhi`` is positive). A node whose Hessian is positive semidefinite counts with its
+    least force. What is bounded by entries only is taken off the diagonal, row by row (Gershgorin).
+
+    Parameters
+    ----------
+    kinds : array (J,)
+        Codes of the nodes.
+    A : array (J, J)
+        ``K'K``.
+    half, nodes, curves, sums : arrays
+        Of the box, filled by `bound_nodes`, `curve_nodes` and `sum_up`.
+    margin : float
+        In units of f/2 per squared search coordinate.
+    """
+    h0, h1, h2, h3, h4, h5 = sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], sums[H22]
+    away = margin
+    # The rounding of J'J, taken off as changes are.
+    length, blur = sums[LENGTH0] + sums[LENGTH1] + sums[LENGTH2], sums[BLUR0] + sums[BLUR1] + sums[BLUR2]
+    d0, d1 = sums[LENGTH0] * blur + sums[BLUR0] * length, sums[LENGTH1] * blur + sums[BLUR1] * length
+    d2 = sums[LENGTH2] * blur + sums[BLUR2] * length
+    for j in range(kinds.shape[0]):
+        b0, b1, b2 = abs(curves[j, PULL0]), abs(curves[j, PULL1]), abs(curves[j, PULL2])
+        e0, e1, e2 = curves[j, TURN0], curves[j, TURN1], curves[j, TURN2]
+        # Rows of |B|'E + E'|B|: Gershgorin takes them off the diagonal.
+        d0 += 2.0 * b0 * e0 + b0 * e1 + b1 * e0 + b0 * e2 + b2 * e0
+        d1 += 2.0 * b1 * e1 + b0 * e1 + b1 * e0 + b1 * e2 + b2 * e1
+        d2 += 2.0 * b2 * e2 + b0 * e2 + b2 * e0 + b1 * e2 + b2 * e1
+        shape = CONVEX if kinds[j] == RANGE else shape_of(kinds[j])  # the common case spares the call
+        if shape == FLAT:
+            continue
+        fall, rise = force_change(A, half, nodes, curves, j)
+        if shape == CONVEX:
+            # A force times a positive semidefinite Hessian is least where the force is: no absolute values are lost.
+            h0 += fall * curves[j, H00]
+            h1 += fall * curves[j, H01]
+            h2 += fall * curves[j, H02]
+            h3 += fall * curves[j, H11]
+            h4 += fall * curves[j, H12]
+            h5 += fall * curves[j, H22]
+            away += abs(curves[j, FORCE] + fall) * curves[j, CHI]
+        else:
+            most = max(-fall, rise)
+            n1, n2, n4 = abs(curves[j, H01]), abs(curves[j, H02]), abs(curves[j, H12])
+            d0 += most * (abs(curves[j, H00]) + n1 + n2)
+            d1 += most * (abs(curves[j, H11]) + n1 + n4)
+            d2 += most * (abs(curves[j, H22]) + n2 + n4)
+            away += (abs(curves[j, FORCE]) + most) * curves[j, CHI]
+    h0, h3 = h0 - d0 - away, h3 - d1 - away
+    # In the plane nothing depends on the third coordinate: any positive entry leaves the test to the others.
+    h5 = 1.0 if half[2] == 0.0 and sums[H22] == 0.0 else h5 - d2 - away
+    return positive(h0, h1, h2, h3, h4, h5)
+
+
+@compiled
+def spread_of(A: Array, half: Array, nodes: Array, curves: Array, sums: Array) -> float:
+    """Write bounds of the change of each entry of the Hessian into sums[C00:]; return one of the rest's norm."""
+    l0, l1, l2, u0, u1, u2 = sums[LENGTH0], sums[LENGTH1], sums[LENGTH2], sums[BLUR0], sums[BLUR1], sums[BLUR2]
+    # The rounding of J'J counts as change: twice, because only half of a change counts for the mean over a line.
+    sums[C00], sums[C01], sums[C02] = 4.0 * l0 * u0, 2.0 * (l0 * u1 + l1 * u0), 2.0 * (l0 * u2 + l2 * u0)
+    sums[C11], sums[C12], sums[C22] = 4.0 * l1 * u1, 2.0 * (l1 * u2 + l2 * u1), 4.0 * l2 * u2
+    ball = 0.0  # what is known of a change by its norm alone
+    for j in range(A.shape[0]):
+        fall, rise = force_change(A, half, nodes, curves, j)
+        most = max(-fall, rise) + curves[j, BLUR]
+        ball += (abs(curves[j, FORCE]) + most) * curves[j, CHI]
+        b0, b1, b2 = abs(curves[j, PULL0]), abs(curves[j, PULL1]), abs(curves[j, PULL2])
+        e0, e1, e2 = curves[j, TURN0], curves[j, TURN1], curves[j, TURN2]
+        f0, f1, f2 = 0.0, 0.0, 0.0
+        for m in range(A.shape[0]):
+            factor = abs(A[j, m])
+            f0 += factor * curves[m, TURN0]
+            f1 += factor * curves[m, TURN1]
+            f2 += factor * curves[m, TURN2]
+        sums[C00] += 2.0 * b0 * e0 + e0 * f0 + most * abs(curves[j, H00])
+        sums[C01] += b0 * e1 + b1 * e0 + e0 * f1 + most * abs(curves[j, H01])
+        sums[C02] += b0 * e2 + b2 * e0 + e0 * f2 + most * abs(curves[j, H02])
+        sums[C11] += 2.0 * b1 * e1 + e1 * f1 + most * abs(curves[j, H11])
+        sums[C12] += b1 * e2 + b2 * e1 + e1 * f2 + most * abs(curves[j, H12])
+        sums[C22] += 2.0 * b2 * e2 + e2 * f2 + most * abs(curves[j, H22])
+    return ball
+
+
+@compiled
+def clip_to_stationary(
+    A: Array, half: Array, nodes: Array, curves: Array, sums: Array, cut: Array, solve: Array
+) -> None:
+    """Clip a box to where the gradient of f may vanish.
+
+    Interval Newton: the gradient at c + s is ``g + H s``, H the mean of the Hessian between centre and s. Bounds of its
+    change over t times the box are at most t times those over the box (`optloc.proof.nodes.node`), so the mean changes
+    by half of them. With Y the inverse of the Hessian at the centre a zero obeys ``s = -Y g - (Y H - 1) s``.
+
+    Parameters
+    ----------
+    A, half, nodes, curves, sums : arrays
+        As of `convex`.
+    cut : array (6,)
+        Lower and upper ends of the box about its centre; clipped.
+    solve : array (3, 3)
+        Working memory.
+    """
+    ball = spread_of(A, half, nodes, curves, sums)
+    if not ball < inf:
+        return
+    # The share of the box that the mean reaches: half of the bounds of change, which grow with it at least linearly.
+    plane = half[2] == 0.0 and sums[H22] == 0.0
+    a, b, c, d, e, f = sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], 1.0 if plane else sums[H22]
+    if not inverse(a, b, c, d, e, f, solve):
+        return
+    h0, h1, h2 = half[0], half[1], half[2]
+    ball *= 0.5 * sqrt(h0 * h0 + h1 * h1 + h2 * h2)
+    w0 = 0.5 * (sums[C00] * h0 + sums[C01] * h1 + sums[C02] * h2)
+    w1 = 0.5 * (sums[C01] * h0 + sums[C11] * h1 + sums[C12] * h2)
+    w2 = 0.5 * (sums[C02] * h0 + sums[C12] * h1 + sums[C22] * h2)
+    for k in range(2 if plane else 3):
+        y0, y1, y2 = solve[k, 0], solve[k, 1], solve[k, 2]
+        step = y0 * sums[G0] + y1 * sums[G1] + y2 * sums[G2]
+        # What rounding leaves of Y H - 1 counts as change.
+        e0, e1, e2 = y0 * a + y1 * b + y2 * c, y0 * b + y1 * d + y2 * e, y0 * c + y1 * e + y2 * f
+        e0, e1, e2 = e0 - (k == 0), e1 - (k == 1), e2 - (k == 2)
+        reach = abs(e0) * h0 + abs(e1) * h1 + abs(e2) * h2 + abs(y0) * w0 + abs(y1) * w1 + abs(y2) * w2
+        reach += sqrt(y0 * y0 + y1 * y1 + y2 * y2) * ball
+        # The rounding of the gradient, and of the products with it, whatever is left of their sum.
+        reach += abs(y0) * sums[NOISE0] + abs(y1) * sums[NOISE1] + abs(y2) * sums[NOISE2]
+        g0, g1, g2 = abs(sums[G0]), abs(sums[G1]), abs(sums[G2])
+        reach += _ROUNDING * (abs(y0) * g0 + abs(y1) * g1 + abs(y2) * g2)
+        clip(cut, k, -step, reach + 1e-9)
+
+
+@compiled
+def slopes_everywhere(A: Array, half: Array, nodes: Array, curves: Array, sums: Array, solve: Array) -> bool:
+    """Return whether the gradient of f cannot vanish in the box; arguments as of `clip_to_stationary`."""
+    cut = np.empty(6)
+    for k in range(3):
+        cut[k], cut[3 + k] = -half[k], half[k]
+    clip_to_stationary(A, half, nodes, curves, sums, cut, solve)
+    return is_empty(cut)
+
+
+@compiled
+def entry(k: int, m: int) -> int:
+    """Return where entry (k, m) of a symmetric matrix stands among (00, 01, 02, 11, 12, 22)."""
+    first, second = min(k, m), max(k, m)
+    return second if first == 0 else first + second + 1
+
+
+@compiled
+def free_multiplier(kinds: Array, A: Array, half: Array, nodes: Array, curves: Array, sums: Array, count: int) -> None:
+    """Let the force on the nodes that set a surface be that of any stationary point on it: `convex` then allows for it.
+
+    Where the gradient of f along the surface vanishes, f less n times the node has no gradient at all, for a
+    multiplier n of that point alone. On a box where all these functions are convex, two such points x and y with n and
+    m would both be the least of their own: ``f(x) < f(y)`` and ``f(y) < f(x)``. A multiplier of a plane bends nothing;
+    that of a height is at most the gradient of f over that of the height, in any coordinate.
+
+    Parameters
+    ----------
+    kinds, A, half, nodes, curves, sums : arrays
+        As of `convex`; the last column of `curves` is raised.
+    count : int
+        How many nodes set the surface, the last ones.
+    """
+    for j in range(kinds.shape[0] - count, kinds.shape[0]):
+        if shape_of(kinds[j]) == FLAT:
+            continue
+        most = inf
+        # Beside another surface a height's multiplier is not bounded so simply: nothing is said.
+        if count == 1:
+            size = sqrt(half[0] * half[0] + half[1] * half[1] + half[2] * half[2])
+            ball = spread_of(A, half, nodes, curves, sums) * size
+            for k in range(3):
+                slope = abs(sums[G0 + k]) + sums[NOISE0 + k] + ball
+                for m in range(3):
+                    slope += (abs(sums[entry(k, m)]) + sums[C00 + entry(k, m)]) * half[m]
+                steep = abs(nodes[j, SLOPE0 + k]) - curves[j, TURN0 + k]
+                if steep > 0.0:
+                    most = min(most, slope / steep)
+        curves[j, BLUR] += most

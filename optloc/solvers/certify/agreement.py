@@ -1,0 +1,117 @@
+"""Whether the cost that a proof is about is that of the problem: both are taken at the fix and beside it."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.sums import equations_at
+from optloc.linear.constraints import exact
+from optloc.linear.normal import Normal, eliminated, step
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
+from optloc.proof.batch import costs_at
+from optloc.proof.pose import Posed
+from optloc.solvers.certify.equalities import hold_equalities
+
+# Places beside each fix, about a standard deviation away: two ways to write the same cost agree there to the rounding,
+# two different costs differ by a share of one.
+_BESIDE = 2
+# Relative difference of costs that is rounding, as for a proof, and how many lengths of a residual's own.
+_EQUAL, _ROUNDINGS = 1e-6, 8.0
+# Share of the largest eigenvalue of scaled information below which a combination of unknowns is open.
+_OPEN = 1e-12
+# Steps in which unknowns that enter the rows in no straight line (station errors) find their best values: each one
+# squares what is left, and what is left of the first is some metres over some kilometres.
+_STEPS = 6
+
+
+def agrees(problem: Problem, fix: Fix, pose: Posed) -> Array:
+    """Return of which of a flat batch of N problems the posed cost is their own (N,), at the fix and beside it.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems within the scope of the proof.
+    fix : Fix
+        Their fixes.
+    pose : Posed
+        Their costs over the position, equalities apart.
+    """
+    places = _places(fix)
+    own = _own_costs(problem, fix, places)
+    with np.errstate(all="ignore"):
+        posed, blur = costs_at(pose, places)
+        good = np.abs(posed - own) <= _tolerance(own, blur)
+        good[:, 0] &= np.abs(own[:, 0] - fix.cost) <= _tolerance(fix.cost, blur[:, 0])
+        if exact(problem):  # with the rows of equalities, which vanish at the fix
+            held = hold_equalities(problem, fix, pose)
+            whole, blur = costs_at(held.pose, places[:, :1])
+            off = np.abs(whole[:, 0] - held.extra - fix.cost)
+            good[:, 0] &= off <= _tolerance(fix.cost + held.extra, blur[:, 0])
+    return np.asarray(good.all(1))
+
+
+def _tolerance(cost: Array, blur: Array) -> Array:
+    """Return by how much costs may differ: a share, and what the rounding of residuals makes of their squares."""
+    return np.asarray(_EQUAL * (1.0 + cost) + _ROUNDINGS * blur * (np.sqrt(np.maximum(cost, 0.0)) + blur))
+
+
+def _places(fix: Fix) -> Array:
+    """Return the fixes and places about a standard deviation away, (N, 1 + P, d): the same ones in every run."""
+    position, covariance = fix.position, fix.covariance()
+    d = position.shape[-1]
+    with np.errstate(all="ignore"):
+        root, variance = np.zeros_like(covariance), np.where(np.isfinite(covariance), covariance, 0.0)
+        for k in range(d):  # by Cholesky's rule, less what is not determined
+            pivot = variance[:, k, k] - (root[:, k, :k] ** 2).sum(-1)
+            root[:, k, k] = np.sqrt(np.maximum(pivot, 0.0))
+            rest = variance[:, k + 1 :, k] - (root[:, k + 1 :, :k] @ root[:, k, :k, None])[..., 0]
+            root[:, k + 1 :, k] = np.where(pivot[:, None] > 0.0, rest / root[:, k, k, None], 0.0)
+    way = np.random.default_rng(1).standard_normal((_BESIDE, d))
+    beside = np.where(np.isfinite(root), root, 0.0)[:, None] @ way[..., None]
+    return np.concatenate([position[:, None], position[:, None] + beside[..., 0]], axis=1)
+
+
+def _own_costs(problem: Problem, fix: Fix, places: Array) -> Array:
+    """Return the costs (N, P) of the problems at positions (N, P, d), all other unknowns at their best values."""
+    count, several = places.shape[:2]
+    slot, _ = problem.layout.find("position")
+    part = problem.take(np.repeat(np.arange(count), several)) if count > 1 else problem
+    x = np.repeat(fix.x, several, axis=0)
+    x[:, slot.start : slot.start + slot.size] = places.reshape(-1, places.shape[-1])
+    with np.errstate(all="ignore"):
+        equations = equations_at(part, x)
+        if problem.stations.covariance is not None and problem.stations.span != "noise":
+            for _ in range(_STEPS):
+                move, ok = step(_without(equations, slot.start, slot.size), np.zeros(len(x)))
+                x = x + np.where(ok[:, None], _spread(move, slot.start, slot.size), 0.0)
+                equations = equations_at(part, x)
+        rest = eliminated(_without(equations, slot.start, slot.size))
+        cost = np.asarray(rest.cost)
+        if rest.shared.shape[-1]:
+            # Scaled, and by its pseudo-inverse: a combination that no row feels changes nothing.
+            size = np.sqrt(np.diagonal(rest.shared, axis1=-2, axis2=-1))
+            size = np.where(size > 0.0, size, 1.0)
+            turned = np.linalg.pinv(rest.shared / size[..., :, None] / size[..., None, :], _OPEN, hermitian=True)
+            vector = rest.shared_vector / size
+            cost = cost - ((turned @ vector[..., None])[..., 0] * vector).sum(-1)
+    return cost.reshape(count, several)
+
+
+def _without(equations: Normal, start: int, size: int) -> Normal:
+    """Return normal equations without the position: it is held."""
+    keep = np.delete(np.arange(equations.shared.shape[-1]), slice(start, start + size))
+    return Normal(
+        equations.shared[..., keep[:, None], keep],
+        equations.local,
+        equations.cross[..., keep, :],
+        equations.shared_vector[..., keep],
+        equations.local_vector,
+        equations.cost,
+    )
+
+
+def _spread(move: Array, start: int, size: int) -> Array:
+    """Return a step (N, n) of all unknowns but the position as one of all, which leaves the position where it is."""
+    return np.insert(move, np.full(size, start), 0.0, axis=-1)
