@@ -77,6 +77,10 @@ class Cost(NamedTuple):
     groups: Groups
 
 
+HIDDEN_REACH = 5e4
+"""How far around a minimum that does not count nothing else does, metres: such minima lie deep in the Earth."""
+
+
 class Known(NamedTuple):
     """What is known of a problem beside its fix.
 

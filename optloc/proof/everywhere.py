@@ -36,21 +36,9 @@ from optloc.proof.box import (
     push_halves,
     rounding,
 )
-from optloc.proof.chart import Box, Chart, Cost, Known, chart_at, empty_box
+from optloc.proof.chart import HIDDEN_REACH, Box, Chart, Cost, Known, chart_at, empty_box
 from optloc.proof.curvature import C00, G0, G1, G2, NOISE0, convex, entry, slopes_everywhere, spread_of, sum_up
-from optloc.proof.near import (
-    BETTER,
-    BUDGET,
-    HIDDEN_REACH,
-    OPEN,
-    OTHER,
-    SINGULAR,
-    STATIONARY,
-    UNIQUE,
-    VALUE,
-    descend,
-    prove,
-)
+from optloc.proof.near import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, descend, prove
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces, infinity_of, points_of
 from optloc.proof.nodes.node import ANY, DIFFERENCE, GROWS, H00, H11, H22, RANGE
 
@@ -302,7 +290,7 @@ _ALIKE = 0.1
 
 @compiled
 def search_everywhere(
-    cost: Cost, atlas: Atlas, chart: Chart, level: float, value: float, budget: int, found: Array
+    cost: Cost, atlas: Atlas, chart: Chart, level: float, value: float, whole: bool, budget: int, found: Array
 ) -> tuple[int, int, float]:
     """Search all positions but some boxes for minima that cost less than a level.
 
@@ -322,6 +310,8 @@ def search_everywhere(
         Cost to exceed.
     value : float
         Cost below which a point refutes the fix.
+    whole : bool
+        Whether a box is done as well where it has no minimum; otherwise only if it costs at least `value`.
     budget : int
         How many boxes may be looked at.
     found : array (D,)
@@ -363,7 +353,8 @@ def search_everywhere(
             return CHEAPER, boxes, 0.0
         touching = piece < 2 * atlas.dimension and box.at[last] <= box.half[last]
         # The test is dear, and fails in large boxes: only where the cost is low it can spare splits.
-        if here < _NEAR * (level + 1.0) and _leaves(cost, atlas, box, touching, floor):
+        sound = whole or (low > 0.0 and low * low >= value)
+        if sound and here < _NEAR * (level + 1.0) and _leaves(cost, atlas, box, touching, floor):
             continue
         if here < level:
             lows += 1
@@ -583,7 +574,7 @@ def prove_atlas(
             return STATIONARY, 0, -inf
     atlas = with_minima(middle, radius, x.shape[0], first_minima(atlas.minima, known))
     level = least + kappa if kappa > 0.0 else least - eps
-    outcome, boxes, bound = search_everywhere(cost, atlas, chart, level, least - eps, budget, found)
+    outcome, boxes, bound = search_everywhere(cost, atlas, chart, level, least - eps, beside.hidden == 0, budget, found)
     if outcome == CLEAR:
         return UNIQUE if kappa > 0.0 else VALUE, boxes, bound
     if outcome == CHEAPER:

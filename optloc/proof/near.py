@@ -28,7 +28,19 @@ from optloc.proof.box import (
     shrink,
     uncut,
 )
-from optloc.proof.chart import Box, Chart, Cost, Known, chart_at, curve_box, is_convex, place, value_at, widen
+from optloc.proof.chart import (
+    HIDDEN_REACH,
+    Box,
+    Chart,
+    Cost,
+    Known,
+    chart_at,
+    curve_box,
+    is_convex,
+    place,
+    value_at,
+    widen,
+)
 from optloc.proof.curvature import G0, G1, G2, clip_to_stationary, convex, curve_nodes, free_multiplier, sum_up
 from optloc.proof.enclosure import enclose
 from optloc.proof.nodes.node import FORCE, H00, H01, H02, H11, H12, H22, HIGH, LOW, PHI, RANGE, SLOPE0, SLOPE1, SLOPE2
@@ -134,6 +146,8 @@ class Aim(NamedTuple):
     whole : bool
         Whether a box is done as well where the gradient cannot vanish, because the search as a whole leaves no way out;
         otherwise only if its cost is at least `value`.
+    free : int
+        How many of the known minima, the fix first, are hidden or the fix: what their boxes hold does not count.
     surface : array (e,)
         See `optloc.proof.chart.Known`. With one, a gap is proven on it alone: boxes are done where they do not touch it
         or cost too much, and nowhere because the gradient cannot vanish, which on a surface it need not.
@@ -143,6 +157,7 @@ class Aim(NamedTuple):
     value: float
     better: float
     whole: bool
+    free: int
     surface: Array
 
 
@@ -184,6 +199,8 @@ def branch(
     weight, origin, floor, unique = cost.weight, chart.origin, chart.floor, aim.level > aim.value
     held = unique and aim.surface.shape[0] > 0
     rho = sqrt(max(aim.level, 0.0))
+    # The box of the fix holds nothing cheaper where no way leads out of the search.
+    first = 0 if aim.whole else 1
     boxes, low_points = 0, 0
     while size > 0:
         if boxes >= budget or size + 2 > stack.shape[0]:
@@ -200,32 +217,32 @@ def branch(
         if low > 0.0 and low * low >= aim.level:
             continue
         here, noise = cost_at(K, w, nodes), rounding(K, weight, floor, nodes)
-        if held:
-            if _misses(aim.surface, weight, noise, half, nodes):
-                continue
-        elif here < aim.better:
+        if held and _misses(aim.surface, weight, noise, half, nodes):
+            continue
+        if here < aim.better and not held:
             return CHEAPER, boxes, 0.0
         # What cannot hold a residual shorter than rho, and below what no minimum, is cut off from all sides.
         uncut(half, cut)
         shrink(K, weight, rho + noise, half, half[2] == 0.0, nodes, rows, cut, solve)
         high = low > 0.0 and low * low >= aim.value
-        # In the convex box of a known minimum there is no second, but a lower point there may be.
-        if held:
-            # On a surface the other minima are no stationary points, so their boxes say nothing of the value.
-            if is_known(at, half, minima if high else minima[: int(aim.whole)], sides):
-                continue
-        elif unique or aim.whole:
-            sound = aim.whole or high
-            if sound and is_known(at, half, minima, sides):
-                continue
-            curve_nodes(kinds, data, centre, sense, gram, half, line, solve, nodes, curves)
-            sum_up(K, w, weight, noise, nodes, curves, sums)
-            if sound:
+        sound = aim.whole or high
+        # In the convex box of a known minimum there is no second, but a lower point there may be: on a surface the
+        # others are no stationary points, and their boxes say nothing of the value.
+        if is_known(at, half, minima[first : aim.free], sides[first : aim.free]):
+            continue
+        if (unique or aim.whole) and (high if held else sound) and is_known(at, half, minima, sides):
+            continue
+        if held or unique or aim.whole:
+            if not held:
+                curve_nodes(kinds, data, centre, sense, gram, half, line, solve, nodes, curves)
+                sum_up(K, w, weight, noise, nodes, curves, sums)
+            if sound and not held:
                 clip_to_stationary(A, half, nodes, curves, sums, cut, solve)
             if here < aim.level and not is_empty(cut):
                 low_points += 1
                 # Early, then more and more seldom, and wherever a box holds one minimum at most.
-                if low_points & (low_points - 1) == 0 or convex(kinds, A, half, nodes, curves, sums, 0.0):
+                seldom = low_points & (low_points - 1) == 0
+                if seldom or (not held and convex(kinds, A, half, nodes, curves, sums, 0.0)):
                     outcome = _follow(cost, chart, box, minima, sides, aim)
                     if outcome != CLEAR:
                         return outcome, boxes, 0.0
@@ -246,7 +263,8 @@ def _follow(cost: Cost, chart: Chart, box: Box, minima: Array, sides: Array, aim
     """
     at, half = box.at.copy(), box.half.copy()
     least = descend(cost, chart, box)
-    if least < aim.better:
+    # Off the surface a lower cost refutes nothing.
+    if least < aim.better and aim.surface.shape[0] == 0:
         return CHEAPER
     if least < aim.level and not is_known(box.at, box.half, minima, sides):
         return ANOTHER
@@ -330,8 +348,6 @@ _ENDLESS = 1e300
 _OUTWARDS = 1e-9
 # Other minima must be known to a hundredth of a standard deviation: margin of convexity over slope.
 _POLISHED = 100.0
-HIDDEN_REACH = 5e4
-"""How far around a minimum that does not count nothing else does, metres: such minima lie deep in the Earth."""
 
 
 @inlined
@@ -438,14 +454,16 @@ def prove(
     if not _start(cost, chart, box, sqrt(least + kappa), lower, upper, low, high):
         return OPEN, 0, -inf
     surface = known.surface if kappa > 0.0 else known.surface[:0]
-    minima, sides, count = _minima(cost, chart, box, known, surface.shape[0], low, high, margin, least - eps)
+    minima, sides, count, free = _minima(cost, chart, box, known, surface.shape[0], low, high, margin, least - eps)
     if count == 0:
         return STATIONARY, 0, -inf
     if kappa <= 0.0:  # the value alone: other minima are no excuse, their boxes must be bounded as all others
-        count = 1
+        count = free
     # Halfway between: a point found to cost less does so by more than rounding, and no box is left that does by less.
     better, whole = least - 0.5 * eps, closed or isnan(lower[0])
-    aim = Aim(level, value=least - eps, better=better, whole=whole, surface=surface)
+    # From what is hidden a way leads out: where it becomes visible the cost may be least, and yet have a slope.
+    whole = whole and known.hidden == 0
+    aim = Aim(level, value=least - eps, better=better, whole=whole, free=free, surface=surface)
     stack = np.empty((_CAPACITY, DEPTH))
     size = push_around(stack, 0, low, high, sides[0], 0)
     outcome, boxes, bound = branch(cost, chart, box, minima[:count], sides[:count], aim, budget, stack, size)
@@ -495,17 +513,19 @@ def _minima(
     high: Array,
     margin: float,
     value: float,
-) -> tuple[Array, Array, int]:
-    """Return the known minima (1 + P, 3) in search coordinates, half-widths of convex boxes around them, their number.
+) -> tuple[Array, Array, int, int]:
+    """Return the known minima (1 + P, 3) in search coordinates, half-widths of convex boxes around them, two numbers.
 
-    The fix comes first; the number is 0 where the cost is not convex around it. Points that are no minima are left out,
-    and those whose box holds a point below `value`, unless they are hidden.
+    These are how many there are, 0 where the cost is not convex around the fix; and how many of them are the fix, which
+    comes first, or hidden. Points that are no minima are left out, and those whose box holds a point below `value`,
+    unless they are hidden.
     """
     others = known.points
-    count, size = 0, 1 + others.shape[0]
+    count, free, size = 0, 0, 1 + others.shape[0]
     minima, sides, hull, shift = np.zeros((size, 3)), np.zeros((size, 3)), np.empty(3), np.zeros(3)
-    for p in range(size):
-        hidden = p >= size - known.hidden
+    for i in range(size):
+        hidden = 0 < i <= known.hidden
+        p = size - i if hidden else (i - known.hidden if i > 0 else 0)
         box.at[:] = 0.0
         if p > 0:
             for k in range(3):
@@ -534,9 +554,10 @@ def _minima(
             for k in range(3):
                 minima[count, k], sides[count, k] = box.at[k], max(box.half[k] - shift[k], 0.0)
             count += 1
+            free += int(p == 0 or hidden)
         elif p == 0:
-            return minima, sides, 0
-    return minima, sides, count
+            return minima, sides, 0, 0
+    return minima, sides, count, free
 
 
 @compiled

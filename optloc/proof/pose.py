@@ -502,7 +502,7 @@ def _beyond_stations(problem: Problem) -> Iterator[str]:
     if not np.allclose(covariance, same, rtol=1e-9, atol=0.0):
         yield "the station errors differ from axis to axis"
     if problem.stations.span == "run" and _move(problem):
-        yield "station errors last the whole run while stations move, and the proof takes one line to the target for each"
+        yield "station errors last the whole run while stations move, and the proof takes one line of sight for each"
     bent = [rows.kind for rows in problem.rows if MODELS[rows.kind].ranges is None and MODELS[rows.kind].stations]
     if bent:
         yield f"station errors enter {bent[0]} rows in a way that depends on the place"

@@ -4,21 +4,27 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from proof.costs import WIDTH
+from proof.costs import WIDTH, beside
 from proof.sampling import bounded, numbers, rotation, value
 
 from optloc.compute.jit import enabled
+from optloc.compute.systems import inverse
+from optloc.proof.atlas import atlas_of, set_centre
 from optloc.proof.box import least_residual, linearise_rows, rounding, shrink, uncut
-from optloc.proof.chart import Chart, cost_of, curve_box, empty_box, value_at
-from optloc.proof.curvature import clip_to_stationary, slopes_everywhere
-from optloc.proof.nodes.node import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO
+from optloc.proof.chart import Chart, chart_at, cost_of, curve_box, empty_box, value_at
+from optloc.proof.curvature import clip_to_stationary, slopes_everywhere, sum_up
+from optloc.proof.enclosure import enclose
+from optloc.proof.everywhere import _leaves, accuracy_floor_far, cube, prove_everywhere
+from optloc.proof.near import UNIQUE, VALUE
+from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
+from optloc.proof.nodes.node import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO, SLOPE0
 
 CODES = {"range": RANGE, "linear": LINEAR, "azimuth": AZIMUTH, "elevation": ELEVATION, "groa": RATIO, "height": HEIGHT}
 NEAR = {2: ("range", "linear", "azimuth", "groa"), 3: tuple(CODES)}
 # What stays finite at infinity.
 FAR = {2: ("range", "azimuth", "groa"), 3: ("range", "azimuth", "elevation", "groa")}
 # Plain Python takes a thousand times longer for a box.
-BOXES = 2500 if enabled() else 25
+BOXES = 1500 if enabled() else 25
 
 
 @dataclass
@@ -201,6 +207,89 @@ def test_no_stationary_point_is_cut_off(d, seed):
     assert sum(check_stationary(rng, d) for _ in range(BOXES)) > BOXES // 50
 
 
+def check_leaves(rng, d):
+    """Check one box of an atlas: one that holds an infimum, finite or at infinity, never counts as left.
+
+    Returns whether a box beside it does, so that the test is seen to say something.
+    """
+    made = scene(rng, d, FAR, balanced=True)
+    middle, radius = cube(made.kinds, made.data, np.ones(d))
+    atlas, box = atlas_of(middle, radius, d, 0), empty_box(len(made.K), len(made.names))
+    piece, level = int(rng.integers(0, 2 * d + 1)), rng.integers(0, 14, size=d)
+    far = piece < 2 * d
+    box.half[:d] = 0.5**level
+    box.at[:d] = -1.0 + box.half[:d] * (2.0 * (rng.random(d) * 2.0**level).astype(int) + 1.0)
+    if far:  # the last coordinate is the scale, from infinity on
+        box.half[d - 1] *= 0.5
+        first = 0 if rng.random() < 0.5 else int(rng.random() * 2.0 ** level[d - 1])
+        box.at[d - 1] = box.half[d - 1] * (2.0 * first + 1.0)
+    at, half, touching = box.at.copy(), box.half.copy(), far and box.at[d - 1] <= box.half[d - 1]
+    u = at + some_point(rng, half)
+    if touching and rng.random() < 0.7:
+        u[d - 1] = 0.0
+    set_centre(atlas, piece, u)
+    bound_pieces(atlas, made.kinds, made.data, np.zeros(3), box.nodes)
+    values, slopes = box.nodes[:, 0].copy(), box.nodes[:, SLOPE0 : SLOPE0 + 3]
+    if not (np.isfinite(values).all() and np.isfinite(slopes).all()):
+        return False
+    J = made.K @ slopes
+    rest, ends = rng.normal(size=len(made.K)), touching and u[d - 1] == 0.0
+    span = np.linalg.svd(J[:, : d - 1] if ends else J, full_matrices=False)[0]
+    for _ in range(2):
+        rest = rest - span @ (span.T @ rest)
+    rest *= 10.0 ** rng.uniform(-6.0, 1.0)
+    if ends:  # the cost rises from infinity inwards
+        rest = rest if rest @ J[:, d - 1] >= 0.0 else -rest
+    made.w = made.K @ values - rest
+    cost = made.cost
+    floor = accuracy_floor_far(cost, atlas)
+    if not ends or d == 3:  # a minimum, not a saddle
+        curve_pieces(atlas, made.kinds, made.data, np.zeros(3), box.curves)
+        sum_up(cost.K, cost.w, cost.weight, 0.0, box.nodes, box.curves, box.sums)
+        keep = d - 1 if ends else d
+        H = box.sums[[[0, 1, 2], [1, 3, 4], [2, 4, 5]]][:keep, :keep]
+        if not np.linalg.eigvalsh(H)[0] > -1e-12 * np.abs(H).max():
+            return False
+    box.at[:], box.half[:] = at, half
+    set_centre(atlas, piece, box.at)
+    bound_pieces(atlas, made.kinds, made.data, box.half, box.nodes)
+    assert not _leaves(cost, atlas, box, touching, floor), (made.names, ends)
+    box.half[:] *= 0.25
+    set_centre(atlas, piece, box.at)
+    bound_pieces(atlas, made.kinds, made.data, box.half, box.nodes)
+    return bool((np.abs(u - at) > box.half).any() and _leaves(cost, atlas, box, False, floor))
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_no_box_with_an_infimum_counts_as_left(d, seed):
+    rng = np.random.default_rng([seed, d, 4])
+    assert sum(check_leaves(rng, d) for _ in range(BOXES)) > BOXES // 50
+
+
+def check_enclosure(rng, d):
+    """Check one enclosure: it holds a point, near or far, at the level of that point; return whether there is one."""
+    made = scene(rng, d, NEAR)
+    x = np.zeros(3)
+    x[:d] = rng.normal(size=d) * 10.0 ** rng.uniform(1.0, 4.5)
+    measured_at(rng, made, x + np.where(np.arange(3) < d, rng.normal(size=3) * 10.0 ** rng.uniform(-2.0, 3.0), 0.0))
+    y = x + np.where(np.arange(3) < d, rng.normal(size=3), 0.0) * 10.0 ** rng.uniform(-2.0, 5.5)
+    cost, box, low, high = made.cost, empty_box(*made.K.shape), np.empty(3), np.empty(3)
+    chart, good = chart_at(cost, x[:d], box)
+    rho = float(np.linalg.norm(made.residual(y)))
+    if not good or not enclose(cost, chart, box, rho, low, high):
+        return False
+    s = chart.back @ (y - chart.origin)
+    slack = chart.slip * np.abs([x, y]).sum() + 1e-9 * (1.0 + np.abs(s))
+    assert ((s >= low - slack) & (s <= high + slack)).all(), (made.names, s, low, high)
+    return True
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_every_point_is_enclosed_at_its_own_cost(d, seed):
+    rng = np.random.default_rng([seed, d, 5])
+    assert sum(check_enclosure(rng, d) for _ in range(BOXES)) > BOXES // 20
+
+
 @pytest.mark.full
 @pytest.mark.parametrize("d", [2, 3])
 def test_nothing_is_cut_off_in_full(d, seed):
@@ -208,3 +297,56 @@ def test_nothing_is_cut_off_in_full(d, seed):
     for _ in range(40 * BOXES):
         check_bounds(rng, d)
         check_stationary(rng, d)
+        check_leaves(rng, d)
+        check_enclosure(rng, d)
+
+
+# Six gain ratios whose least cost is 2.68: beside their second station all of them but one are flat.
+STATIONS = """
+    0x1.3f9fcd1c792b8p+10 -0x1.d661ed82031e7p+11 0x1.04f26005fe3ecp+8
+    -0x1.a3637f950670fp+10 0x1.130c2ae90084ap+11 -0x1.0f4a8fc661f09p+8
+    0x1.78ec9753b3fd7p+11 0x1.0a2c4042bc846p+12 -0x1.58032582879eap+10
+    -0x1.67d10fba36499p+10 0x1.c18ac8292a328p+11 -0x1.28819345c9ac2p+6
+    0x1.4f04f996fbf2cp+10 0x1.839179aafad07p+10 0x1.fbb49bf977457p+6
+    -0x1.ed0815d98b438p+11 0x1.511d31f5d3a49p+11 -0x1.d2657ae4bdd8ap+10
+"""
+RATIOS = """
+    0x1.64244ecd853dfp-1 0x1.4767c02d123cfp-1 0x1.90344aec912c3p-1 0x1.dd4c57df2ab90p-3 0x1.238716460df87p+0
+"""
+WRONG = "0x1.04d007edb8f40p+11 0x1.cac3563d12074p+10 0x1.26a46c72f443bp+10"
+BETTER_PLACE = (1711.77817131, 1242.16090502, -985.25639557)
+
+
+def numbers_of(text):
+    return np.array([float.fromhex(word) for word in text.split()])
+
+
+@pytest.mark.skipif(not enabled(), reason="plain Python takes a thousand times longer for a box")
+@pytest.mark.parametrize("budget", [300, 8000])
+def test_a_stationary_point_of_cost_1553_is_not_certified(budget):
+    S, z = numbers_of(STATIONS).reshape(6, 3), numbers_of(RATIOS)
+    data = np.zeros((5, WIDTH))
+    data[:, :3], data[:, 3:6], data[:, 15], data[:, 16] = S[1:], S[0], z, 1.0
+    K, x, found = 500.0 * np.eye(5), numbers_of(WRONG), np.zeros(3)
+    cost, box = cost_of(np.full(5, RATIO), data, K, 500.0 * z), empty_box(5, 5)
+    eps = 1e-6 * (1.0 + 1553.19)
+    verdict, _, bound = prove_everywhere(cost, box, x, beside([]), 0.0, eps, budget, found)
+    assert verdict not in (UNIQUE, VALUE)
+    r = np.linalg.norm(np.array(BETTER_PLACE) - S, axis=1)
+    assert bound <= (((r[1:] / r[0] - z) * 500.0) ** 2).sum() + 1e-6
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
+def test_a_matrix_of_rank_one_has_no_inverse(scale, seed):
+    rng, out = np.random.default_rng([seed, 6]), np.empty((3, 3))
+    for _ in range(200):
+        u = scale * rng.normal(size=3) * 10.0 ** rng.uniform(-4.0, 4.0, 3)
+        a = np.outer(u, u)
+        assert not inverse(a[0, 0], a[0, 1], a[0, 2], a[1, 1], a[1, 2], a[2, 2], out)
+
+
+def test_a_small_determinant_of_scales_alone_is_regular():
+    out, size = np.empty((3, 3)), np.array([1e-9, 1.0, 1e9])
+    a = np.array([[2.0, 1.0, 0.0], [1.0, 2.0, 1.0], [0.0, 1.0, 2.0]]) * size * size[:, None]
+    assert inverse(a[0, 0], a[0, 1], a[0, 2], a[1, 1], a[1, 2], a[2, 2], out)
+    np.testing.assert_allclose(out * size * size[:, None] @ (a / size / size[:, None]), np.eye(3), atol=1e-12)

@@ -18,8 +18,9 @@ from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.proof.batch import Answered, Asked, prove_all
+from optloc.proof.chart import HIDDEN_REACH
 from optloc.proof.everywhere import UNBOUNDED
-from optloc.proof.near import BETTER, BUDGET, HIDDEN_REACH, OTHER, UNIQUE, VALUE
+from optloc.proof.near import BETTER, BUDGET, OTHER, UNIQUE, VALUE
 from optloc.proof.pose import Posed, pose_costs, unsupported
 from optloc.solvers.certify.agreement import agrees
 from optloc.solvers.certify.equalities import Held, hold_equalities
