@@ -34,7 +34,7 @@ from optloc.proof.box import (
     rounding,
     uncut,
 )
-from optloc.proof.chart import Box, Chart, Cost, accuracy_floor, chart_at, place
+from optloc.proof.chart import Box, Chart, Cost, chart_at, place, widen
 from optloc.proof.enclosure import enclose
 from optloc.proof.everywhere import accuracy_floor_far, cube, set_minimum
 from optloc.proof.nodes.dispatch import bound_pieces
@@ -72,7 +72,7 @@ def cost_of_point(cost: Cost, box: Box, x: Array) -> float:
     for k in range(x.shape[0]):
         origin[k] = x[k]
     box.half[:] = 0.0
-    _bound_near(cost, Chart(origin, numbers[0], numbers[1], numbers[2]), box)
+    _bound_near(cost, Chart(origin, numbers[0], numbers[1], numbers[2], np.zeros(3), 0.0), box)
     return cost_at(cost.K, cost.w, box.nodes)
 
 
@@ -128,6 +128,7 @@ def cover_near(
     """
     own, good = chart_at(cost, x, box)
     chart.origin[:], chart.sense[:], chart.back[:], chart.gram[:] = own.origin, own.sense, own.back, own.gram
+    chart.slip[:] = own.slip
     corners = np.empty((2, 3))
     low, high = corners[0], corners[1]
     if not good or not enclose(cost, own, box, sqrt(level), low, high):
@@ -141,7 +142,7 @@ def cover_near(
     if not widest < _ENDLESS:
         return -1, 0, 0
     front[0, LEAST] = front[0, PIECE] = 0.0
-    floor = accuracy_floor(cost, chart)
+    floor = own.floor
     size, done, boxes = zero() + 1, zero(), zero()
     for _ in range(_GENERATIONS):
         following = zero()
@@ -172,6 +173,8 @@ def cover_near(
 def _look_near(cost: Cost, chart: Chart, box: Box, front: Array, i: int, level: float, floor: float) -> int:
     """Take a box of a list, clip it to what may lie in the region, and return what becomes of it."""
     pop(front, i, box.at, box.half)
+    place(chart.origin, chart.sense, box.at, box.centre)
+    widen(chart, box.centre, box.half)
     _bound_near(cost, chart, box)
     low = _least(cost, box, floor)
     fate = _ACROSS
@@ -339,12 +342,12 @@ def cover_everywhere(
     count, inside, boxes : int
         As of `cover_near`.
     """
-    middle, radius = cube(cost.kinds, cost.data)
+    middle, radius = cube(cost.kinds, cost.data, x)
     base[:] = middle
     d = x.shape[0]
     atlas = atlas_of(middle, radius, d, 1)
     # The surroundings of the fix along its own axes, where they can be found: a long thin region is cut along them.
-    known = set_minimum(cost, box, atlas, 0, x, 1e-6 * (1.0 + level))
+    known = set_minimum(cost, box, atlas, 0, x, 0.0, 1e-6 * (1.0 + level), inf)
     atlas = with_minima(middle, radius, d, first_minima(atlas.minima, int(known)))
     floor, size = accuracy_floor_far(cost, atlas), _pieces(lists[0], atlas)
     done, boxes = zero(), zero()

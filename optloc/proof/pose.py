@@ -216,8 +216,9 @@ def mark_alone(kinds: Array, data: Array, K: Array, w: Array) -> Array:
         return data
     information = np.swapaxes(K, -1, -2) @ K
     size = np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
-    others = np.abs(information - size[..., None] ** 2 * np.eye(len(kinds))).max(-1)
-    alone = others <= _ORTHOGONAL * size * size.max(-1, keepdims=True)
+    # Relative to both columns: beside a long one any tie of a short one would look like none.
+    across = size[..., :, None] * size[..., None, :]
+    alone = (np.abs(information) <= _ORTHOGONAL * across + across * np.eye(len(kinds)) * 2.0).all(-1)
     force = (np.swapaxes(K, -1, -2) @ w[..., None])[..., 0]
     centred = (np.abs(force) <= _ORTHOGONAL * size * np.linalg.norm(w, axis=-1, keepdims=True)).all(0)
     # Of a column that is orthogonal to all others, the least squares: the value that the rows say of the node.

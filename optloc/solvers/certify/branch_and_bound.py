@@ -56,7 +56,14 @@ def unknown(reason: str) -> Certificate:
 
 
 def state_claim(
-    cost: float, bound: float, margin: float, boxes: int, listed: int, region: tuple[Corner, Corner] | None
+    cost: float,
+    bound: float,
+    margin: float,
+    boxes: int,
+    listed: int,
+    region: tuple[Corner, Corner] | None,
+    *,
+    asked: bool = False,
 ) -> Certificate:
     """Return the certificate of a proven fix.
 
@@ -72,9 +79,11 @@ def state_claim(
         How many alternatives the claim leaves out, because they are listed.
     region : (lower, upper), optional
         Corners of the region of the claim; None: all positions.
+    asked : bool
+        Whether somebody asked for that region.
     """
     proof, sentence = "global" if region is None else "region", _sentence(margin, listed, region)
-    return Certificate(proof, sentence, METHOD, bound, cost - bound, margin > 0.0, margin, boxes, region)
+    return Certificate(proof, sentence, METHOD, bound, cost - bound, margin > 0.0, margin, boxes, region, asked)
 
 
 # A batch has few different claims but many fixes, and Python is slow to format numbers.
@@ -148,6 +157,8 @@ class Work:
         What is not settled.
     effort : int
         By how much budgets and rounds are multiplied.
+    limited : bool
+        Whether the claims are limited to a region that somebody asked for.
     replaced, listed, mismatched : int
         How many fixes were replaced, how often another minimum was added to the alternatives, and how many proofs were
         about another cost than that of their fix.
@@ -165,6 +176,7 @@ class Work:
     level: Array
     pending: Array
     effort: int
+    limited: bool
     replaced: int = 0
     listed: int = 0
     mismatched: int = 0
@@ -189,6 +201,7 @@ class Work:
             np.zeros(size, dtype=np.int64),
             np.array(answered),
             effort,
+            region is not None,
         )
 
     def summary(self) -> str:
@@ -321,7 +334,7 @@ def _claim(work: Work, items: Array, asked: Asked, answer: Answered, extra: Arra
         region[k] = tuple(low), tuple(high)
     numbers = (work.fix.cost[proven], bound, kappa, answer.boxes[done], listed.sum(1))
     given = zip(*(values.tolist() for values in numbers), region, strict=True)
-    work.certificate[proven] = column([state_claim(*each) for each in given])
+    work.certificate[proven] = column([state_claim(*each, asked=work.limited) for each in given])
     work.pending[proven] = False
 
 
