@@ -8,15 +8,17 @@ from cases import CASES, ENU, STATIONS, TARGET
 from proof.plain import node_values
 from scipy.optimize import least_squares
 
-from optloc import Motion, Stations, assemble, measured, simulate, solve
+from optloc import Motion, Stations, assemble, measured, solve
 from optloc.base.types import Band
 from optloc.compute.jit import enabled
 from optloc.linear.constraints import height
+from optloc.proof.everywhere import UNBOUNDED
+from optloc.proof.near import BUDGET
 from optloc.proof.pose import unsupported
 from optloc.solvers.certify import branch_and_bound
 
 machine_code = pytest.mark.skipif(not enabled(), reason="plain Python takes a thousand times longer for a box")
-TRIALS = 24
+TRIALS = 10
 
 
 # Equalities: other minima are those on the surface, which the free cost does not show.
@@ -44,17 +46,16 @@ def on_height(rng):
 
 
 def residuals(S, z, x, sigma):
-    """Return whitened residuals of arrivals with an unknown emission time."""
-    r = np.linalg.norm(x - S, axis=1) / sigma
-    return (r - r.mean()) - z
+    """Return whitened residuals of ranges."""
+    return np.linalg.norm(x - S, axis=1) / sigma - z
 
 
 def least_on(surface, S, z, sigma, rng):
     """Return the distinct minima (cost, position) that SciPy reaches on a surface."""
     place, found = surface, []
-    for start in rng.uniform(-1.0, 1.0, (40, 2)) * 10.0 ** rng.uniform(3.0, 4.7, (40, 1)):
+    for start in rng.uniform(-1.0, 1.0, (12, 2)) * 10.0 ** rng.uniform(3.0, 4.5, (12, 1)):
         done = least_squares(
-            lambda y: residuals(S, z, place(y[None])[0], sigma), start, x_scale=1e3, xtol=1e-14, ftol=1e-14, gtol=1e-14
+            lambda y: residuals(S, z, place(y[None])[0], sigma), start, method="lm", xtol=1e-12, ftol=1e-14, gtol=1e-12
         )
         bend = done.jac.T @ done.jac
         slope = np.sqrt(max(done.grad @ np.linalg.pinv(bend) @ done.grad, 0.0))
@@ -66,19 +67,17 @@ def least_on(surface, S, z, sigma, rng):
 
 def check_surface(kind, rng):
     """Compare one certificate on a surface with minima by other means; return whether it claims a gap."""
-    sigma = float(rng.choice([10.0, 100.0, 400.0]))
-    S = rng.uniform(-5e3, 5e3, (4, 3)) * [1.0, 1.0, 0.3]
+    sigma = float(rng.choice([0.1, 1.0, 5.0, 50.0]))
+    S = rng.uniform(-5e3, 5e3, (3, 3)) * [1.0, 0.2, 0.3]  # nearly in line: images compete
     constraint, place = kind(rng)
     truth = place(rng.uniform(-8e3, 8e3, (1, 2)))[0]
-    arrival = np.linalg.norm(truth - S, axis=1) + sigma * rng.standard_normal(4)
-    rows = measured("tdoa", arrival[1:] - arrival[0], a=[1, 2, 3], b=0, arrival_sigma=sigma)
-    problem = assemble(S, rows, frame=ENU, constraints=constraint)
+    r = np.linalg.norm(truth - S, axis=1) + sigma * rng.standard_normal(3)
+    problem = assemble(S, measured("range", r, a=[0, 1, 2], sigma=sigma), frame=ENU, constraints=constraint)
     fix = solve(problem)
     proof = fix.certificate.item()
     if not fix.answered or proof.proof not in ("global", "region"):
         return False
-    z = (arrival - arrival.mean()) / sigma
-    minima = least_on(place, S, z, sigma, rng)
+    minima = least_on(place, S, r / sigma, sigma, rng)
     cost, slack = float(fix.cost), 1e-5 * (1.0 + float(fix.cost))
     inside = np.ones(len(minima), dtype=bool)
     if proof.region is not None:
@@ -96,10 +95,9 @@ def check_surface(kind, rng):
 
 
 @machine_code
-@pytest.mark.parametrize("kind", [on_plane, on_height])
-def test_gaps_on_a_surface_hold_against_many_starts(kind, seed):
+def test_gaps_on_a_plane_hold_against_many_starts(seed):
     rng = np.random.default_rng([seed, 1])
-    assert sum(check_surface(kind, rng) for _ in range(TRIALS)) > TRIALS // 4
+    assert sum(check_surface(on_plane, rng) for _ in range(TRIALS)) >= TRIALS // 5
 
 
 @pytest.mark.full
@@ -107,32 +105,28 @@ def test_gaps_on_a_surface_hold_against_many_starts(kind, seed):
 @pytest.mark.parametrize("kind", [on_plane, on_height])
 def test_gaps_on_a_surface_hold_in_full(kind, seed):
     rng = np.random.default_rng([seed, 2])
-    assert sum(check_surface(kind, rng) for _ in range(20 * TRIALS)) > 5 * TRIALS
+    assert sum(check_surface(kind, rng) for _ in range(20 * TRIALS)) >= 2 * TRIALS
 
 
 # Infinity.
 
 
-@machine_code
-def test_where_infinity_is_near_the_gap_of_the_region_is_tried(seed):
-    """Far emitters in the plane: some gaps are 5.99, and no place far away costs less than that more."""
-    rng = np.random.default_rng([seed, 3])
-    S, n = rng.uniform(-5e3, 5e3, (5, 2)), 120
-    way = rng.uniform(-np.pi, np.pi, n)
-    truth = np.stack([np.cos(way), np.sin(way)], axis=1) * rng.uniform(40e3, 120e3, (n, 1))
-    arrival = np.linalg.norm(truth[:, None] - S, axis=-1) + 10.0 * rng.standard_normal((n, 5))
-    problem = assemble(S, measured("tdoa", arrival[:, 1:] - arrival[:, :1], a=[1, 2, 3, 4], b=0, arrival_sigma=10.0))
-    fix = solve(problem)
-    turn = np.linspace(-np.pi, np.pi, 20_000)
-    front = -np.stack([np.cos(turn), np.sin(turn)], axis=1) @ S.T / 10.0
-    front -= front.mean(1, keepdims=True)
-    z = (arrival - arrival.mean(1, keepdims=True)) / 10.0
-    infinity = ((front[None] - z[:, None]) ** 2).sum(-1).min(1)
-    margin, cost = np.array([proof.margin for proof in fix.certificate]), fix.cost
-    assert (infinity[margin > 0.0] > cost[margin > 0.0] + margin[margin > 0.0] - 0.01).all()
-    near = np.abs(margin - 5.991) < 0.01
-    assert near.any()
-    assert (infinity[near] < cost[near] + 9.1).all()
+@pytest.mark.parametrize(("why", "margin"), [(UNBOUNDED, 7.8147), (BUDGET, 0.0)])
+def test_where_infinity_is_near_the_gap_of_the_region_is_tried(why, margin, monkeypatch):
+    """Proofs of gaps from 9 on fail for a reason: only where it is infinity a gap between 9 and none is tried."""
+    problem, real, tried = CASES["tdoa-3d"].problem, branch_and_bound.prove_all, []
+
+    def failing(pose, asked):
+        tried.append(float(asked.kappa[0]))
+        answer = real(pose, asked)
+        return answer._replace(verdict=np.where(asked.kappa >= 9.0, why, answer.verdict))
+
+    monkeypatch.setattr(branch_and_bound, "prove_all", failing)
+    proof = branch_and_bound.certify(problem, solve(problem, "gtrs+lsr")).certificate.item()
+    assert (proof.proof, proof.unique) == ("global", margin > 0.0)
+    assert proof.margin == pytest.approx(margin, abs=1e-3)
+    assert tried[:2] == [25.0, 9.0]
+    assert tried[2:] == [proof.margin]
 
 
 # The cost of a proof is that of its fix.
@@ -166,9 +160,10 @@ def moving(span, move):
     """Return a problem of ranges to two places of each station, one error each."""
     a, d = np.tile(np.arange(4), 2), 3
     place = np.stack([STATIONS[d][:4], STATIONS[d][:4] + move])
-    own = Stations(place, covariance=np.broadcast_to(25.0 * np.eye(d), (4, d, d)), span=span)
-    rows = measured("range", a=a, epoch=np.repeat([0, 1], 4), sigma=1.0)
-    return simulate(assemble(own, rows, times=[0.0, 1.0], motions=(Motion(0),)), TARGET[d], 5)
+    own = Stations(place, tuple("ABCD"), covariance=np.broadcast_to(25.0 * np.eye(d), (4, d, d)), span=span)
+    z = np.linalg.norm(TARGET[d] - place, axis=-1).ravel() + np.random.default_rng(5).standard_normal(8)
+    rows = measured("range", z, a=a, epoch=np.repeat([0, 1], 4), sigma=1.0)
+    return assemble(own, rows, times=[0.0, 1.0], motions=(Motion(0),))
 
 
 def test_station_errors_of_a_run_are_refused_where_stations_move():

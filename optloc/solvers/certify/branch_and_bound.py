@@ -238,7 +238,9 @@ def settle(work: Work) -> Work:
 
 def _compare(work: Work, items: Array) -> None:
     """Take back what was proven of another cost than that of a fix."""
-    proven = items[[work.certificate[i].proof in ("global", "region") for i in items]]
+    # None where a fix was replaced by one that is no answer.
+    claims = [work.certificate[i] for i in items]
+    proven = items[np.array([c is not None and c.proof in ("global", "region") for c in claims], dtype=bool)]
     if not len(proven):
         return
     off = proven[~agrees(work.problem.take(proven), work.fix[proven], work.pose.take(proven))]
