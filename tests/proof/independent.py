@@ -85,6 +85,8 @@ class Trial:
                 max_nfev=300,
             )
             J = done.jac
+            if not (np.isfinite(J).all() and np.isfinite(done.fun).all()):  # on a station, or far out
+                return middle + scale * done.x, np.inf, np.inf
             step = np.linalg.lstsq(J, done.fun, rcond=None)[0]
         return middle + scale * done.x, 2.0 * done.cost, float(np.linalg.norm(J @ step))
 

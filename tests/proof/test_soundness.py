@@ -75,7 +75,7 @@ def stationary_points(trial: Trial, truth, rng, count: int):
         mixed = start + 0.3 * (truth - start) * rng.uniform()
         with np.errstate(all="ignore"):
             done = root(gradient, mixed / size, method="hybr", tol=1e-13)
-            if done.success:
+            if done.success and np.isfinite(trial.slope(size * done.x)).all():
                 step = np.linalg.lstsq(trial.slope(size * done.x), trial.residual(size * done.x), rcond=None)[0]
                 if np.linalg.norm(trial.slope(size * done.x) @ step) < 1e-4:
                     found.append(size * done.x)
