@@ -15,8 +15,8 @@ from optloc.proof.pose import Posed
 from optloc.solvers.certify.equalities import hold_equalities
 
 # Places beside each fix, about a standard deviation away: two ways to write the same cost agree there to the rounding,
-# two different costs differ by a share of one.
-_BESIDE = 2
+# two different costs differ by a share of one. A second place would cost half as much time again.
+_BESIDE = 1
 # Relative difference of costs that is rounding, as for a proof, and how many lengths of a residual's own.
 _EQUAL, _ROUNDINGS = 1e-6, 8.0
 # Share of the largest eigenvalue of scaled information below which a combination of unknowns is open.
