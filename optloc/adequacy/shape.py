@@ -230,7 +230,9 @@ _INFINITE = 1e7
 # of range differences is quadratic in the direction and has two minima at most.
 _DIRECTIONS = {2: 16, 3: 50}
 # Those of them that are refined, beside that of the fix; and steps, of which each squares a small error.
-_REFINED, _STEPS = 3, 12
+_REFINED, _STEPS = 2, 12
+# Share of a cost that no step promises any more at the end: what is compared with it is a gap of several.
+_STILL = 1e-4
 # Marquardt's damping to begin with, and what a step that succeeds makes of it.
 _DAMPING, _EASED = 1e-3, 0.1
 # Relative violation of a constraint (`optloc.linear.constraints.violation`) beyond rounding at such distances.
@@ -298,7 +300,11 @@ class _Sphere:
             turned = np.swapaxes(across, -1, -2)
             inner = turned @ information @ across
             grown = inner * (1.0 + damping[..., None, None] * np.eye(inner.shape[-1]))
-            move, _ = linalg.solve(grown, turned @ vector[..., None])
+            pull = turned @ vector[..., None]
+            move, _ = linalg.solve(grown, pull)
+            # what the step promises: where that is nothing for any start, all have arrived
+            if not ((move * pull).sum((-1, -2)) > _STILL * (1.0 + cost)).any():
+                break
             trial = self.direction(direction + (across @ move)[..., 0] / self.radius[:, None])
             new, more, other = self.look(trial)
             better = new < cost

@@ -125,7 +125,7 @@ def examine(problem: Problem, pool: Pool) -> Pool:
     # far away a velocity may grow with the range: no least cost is left to compute
     if pool.loss or not one_position(problem) or problem.motions[0].order:
         return pool
-    return replace(pool, infinity=_infinity(problem, pool, good & ~_is_settled(pool)))
+    return replace(pool, infinity=_infinity(problem, pool, good & _is_bent(pool)))
 
 
 def _has_position(problem: Problem) -> bool:
@@ -147,22 +147,25 @@ def _departure(problem: Problem, pool: Pool) -> Array:
     return out
 
 
-def _is_settled(pool: Pool) -> Array:
-    """Return where infinity need not be looked at, (N,): the fix is proven the only one, and is Gaussian in metres.
+def _is_bent(pool: Pool) -> Array:
+    """Return where infinity has to be looked at, (N,): where the fix is not Gaussian in metres.
 
-    Of 8 233 fixes that are Gaussian in metres none had infinity in its region; what is far is not Gaussian.
+    Of 8 233 fixes that are Gaussian in metres none had infinity in its region; and where another direction has it, no
+    proof of uniqueness comes to an end, so that the fix is not ok either way.
     """
     assert pool.curvature is not None
     assert pool.curvature.kappa is not None
-    return np.asarray(_is_unique(pool) & (pool.curvature.kappa[:, 0] <= BENT))
+    return np.asarray(~(pool.curvature.kappa[:, 0] <= BENT))
 
 
 def _infinity(problem: Problem, pool: Pool, wanted: Array) -> Array:
     """Return the least costs (N,) of infinity: those known from runs there, and where wanted all directions tried."""
     known = np.full(len(pool), np.nan) if pool.infinity is None else np.array(pool.infinity)
-    new = np.flatnonzero(wanted & np.isnan(known))
+    # one run there is none of the least; the compiled way has looked in all directions
+    looked = np.zeros(len(pool), dtype=bool) if pool.plain is None else pool.plain & ~np.isnan(known)
+    new = np.flatnonzero(wanted & ~looked)
     if len(new):
-        known[new] = cost_at_infinity(problem.take(new), pool.x[new, 0])
+        known[new] = np.fmin(known[new], cost_at_infinity(problem.take(new), pool.x[new, 0]))
     return known
 
 
