@@ -129,12 +129,12 @@ __all__ = [
 _UNCERTAINTY = {
     "Accuracy": "radii",
     "Arc": "arc",
-    "Mixture": "mixture",
+    "Mixture": "posterior",
     "Region": "region",
     "Samples": "posterior",
     "accuracy": "radii",
     "likelihood_region": "region",
-    "mixture": "mixture",
+    "mixture": "posterior",
     "samples": "posterior",
     "trace_arc": "arc",
 }

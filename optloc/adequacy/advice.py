@@ -9,8 +9,7 @@ import numpy as np
 
 from optloc.adequacy.geometry import Advice, advise_on_geometry
 from optloc.adequacy.misread import advise_on_values
-from optloc.adequacy.refit import fit_anywhere, one_place
-from optloc.adequacy.score import Explained, explain_misfit
+from optloc.adequacy.score import Explained, explain_misfit, fit_anywhere, one_place
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.problem.epochs import by_epoch, cut, separable, tied

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from optloc.adequacy.refit import descend, one_place
+from optloc.adequacy.score import descend, one_place
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array
 from optloc.linear.constraints import violation

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optloc.adequacy.geometry import Advice
-from optloc.adequacy.refit import descend, fit_anywhere, one_place
+from optloc.adequacy.score import descend, fit_anywhere, one_place
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Rows
 from optloc.base.units import SPEED_OF_LIGHT, UNITS

@@ -277,8 +277,8 @@ _SENTENCES: dict[Status, str] = {
     "contradict the constraints; check the stations' places and clocks, the noise levels and the bounds.",
     Status.MISFIT: "The residuals are larger than the stated noise allows, so position and covariance are refuted; see "
     "'optloc check', look for a wrong row with the method 'robust', or state the noise as it is.",
-    Status.UNPROVEN: "Refined, but nothing proves that no other position explains the data about as well; use the "
-    "method 'auto', or allow this status.",
+    Status.UNPROVEN: "Refined, but nothing proves that no other position explains the data about as well; the method "
+    "'auto' tries to, the certificate says what is missing, and whoever can do without allows this status.",
     Status.CURVED: "Right, but the covariance in metres does not cover: use the fix's chart, its interval, or "
     "optloc.likelihood_region.",
 }

@@ -13,9 +13,8 @@ from rich.table import Table
 from optloc.adequacy.geometry import Advice
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Bias
-from optloc.cli.causes import advice_for_vectors, advice_json, show_advice
 from optloc.cli.file_fixes import CHUNK
-from optloc.cli.fix import grouping_of
+from optloc.cli.fix import advice_for_vectors, advice_json, grouping_of, show_advice
 from optloc.cli.output import Columns, bar, dumps, records, say_all, with_sigma, write_picture, write_table, write_text
 from optloc.files import Loaded, read
 from optloc.linear.constraints import exact

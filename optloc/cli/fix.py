@@ -1,10 +1,10 @@
-"""What ``optloc fix`` does, and how fixes are shown to people."""
+"""`optloc fix`: fixes of a file as a table, with what speaks against them, what might be the cause and what helps."""
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -13,9 +13,10 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from optloc.adequacy.advice import advise, advise_at
+from optloc.adequacy.geometry import Advice
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import ANSWERED, Array, Status
-from optloc.cli.causes import advice_for_fixes, advice_json, show_advice
 from optloc.cli.file_fixes import (
     FileFixes,
     active_of,
@@ -32,6 +33,7 @@ from optloc.files import Loaded, read
 from optloc.files.schema import ConstraintTable
 from optloc.problem.chart import CARTESIAN, INVERSE_RANGE, NAMES
 from optloc.problem.fix import Fix, Suspect
+from optloc.problem.problem import Problem
 from optloc.quality.elements import GROUPINGS, By
 from optloc.quality.levels import NoiseLevels, with_estimated_noise
 
@@ -348,3 +350,38 @@ def _show_levels(levels: NoiseLevels, console: Console) -> None:
         table.add_row(name, sigma, *cells)
     console.print(table)
     say_all(console, levels.sentences)
+
+
+# What might be the cause, and what helps.
+
+
+def advice_for_fixes(found: FileFixes) -> tuple[Advice, ...]:
+    """Return the advice for all fixes of a file together; nothing where every one is ok."""
+    if all(bool((fix.code == Status.OK).all()) for fix in found.fixes):
+        return ()
+    problem = found.loaded.problem
+    if not found.fixes[0].shape:
+        return tuple(advise(problem, found.fixes[0]))
+    return advice_for_vectors(problem, np.concatenate([fix.x for fix in found.fixes]))
+
+
+def advice_for_vectors(problem: Problem, vectors: Array | None) -> tuple[Advice, ...]:
+    """Return the advice for a problem at the vectors (k, size) of its epochs, or without any."""
+    return advise_at(problem, np.full((1, problem.layout.size), np.nan) if vectors is None else vectors)
+
+
+def advice_json(found: tuple[Advice, ...]) -> list[dict[str, Any]]:
+    """Return advice as a JSON value."""
+    return [asdict(one) for one in found]
+
+
+def show_advice(found: tuple[Advice, ...], console: Console) -> None:
+    """Print what is seen and what helps, the lines of a problem file below it as they are to be copied."""
+    if not found:
+        return
+    say(console, "Advice")
+    for one in found:
+        say(console, f"  {one.seen[0].upper()}{one.seen[1:]}.")
+        say(console, f"  {one.advice[0].upper()}{one.advice[1:]}{':' if one.toml else '.'}")
+        for line in one.toml.splitlines():
+            say(console, f"      {line}")

@@ -13,10 +13,10 @@ from optloc.base.types import Array
 from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH
 from optloc.compute.gtrs import minimise
 from optloc.compute.jit import compiled
-from optloc.compute.range_infinity import measure_infinity, see_far
 from optloc.compute.range_mirror import LISTED, confirm, find_plane, follow, keep_fix, reflect
 from optloc.compute.range_refine import equations, ranges, refine
-from optloc.compute.range_room import (
+from optloc.compute.range_shape import STRAIGHT, find_even, measure_infinity, measure_shape, see_far
+from optloc.compute.range_start import (
     ALIVE,
     BEYOND,
     BLUR,
@@ -48,9 +48,11 @@ from optloc.compute.range_room import (
     Room,
     X,
     make_room,
+    read,
+    square,
+    stand,
+    weigh,
 )
-from optloc.compute.range_shape import STRAIGHT, find_even, measure_shape
-from optloc.compute.range_start import read, square, stand, weigh
 from optloc.compute.systems import LANES, factor_plain, solve_plain
 
 # Steps after which the problems of a block that still move wait for each other: fixes near their stations take two to

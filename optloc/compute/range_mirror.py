@@ -10,9 +10,8 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH
 from optloc.compute.jit import compiled
-from optloc.compute.principal import principal_axes
 from optloc.compute.range_refine import decide, equations, propose, ranges
-from optloc.compute.range_room import (
+from optloc.compute.range_start import (
     ALIVE,
     AXES,
     CENTRE,
@@ -44,7 +43,7 @@ from optloc.compute.range_room import (
     Room,
     X,
 )
-from optloc.compute.systems import LANES, factor_plain, solve_plain
+from optloc.compute.systems import LANES, factor_plain, principal_axes, solve_plain
 
 LISTED = 25.0
 """Cost above that of the fix up to which a rival counts (`optloc.solvers.policy.LISTED_GAP`)."""

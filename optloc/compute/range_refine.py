@@ -8,7 +8,7 @@ from optloc.base.linalg import PIVOT
 from optloc.base.types import Array
 from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge_lane
 from optloc.compute.jit import compiled
-from optloc.compute.range_room import (
+from optloc.compute.range_start import (
     ALIVE,
     BLUR,
     COST,
@@ -60,7 +60,7 @@ def refine(
     r, unit : array (s, W), (s, d, W)
         Scratch: ranges and unit vectors.
     vector, matrix, scalar : array (12, d, W), (6, d, d, W), (21, W)
-        Of `optloc.compute.range_room.Room`: positions in row X, cost of the loops, rounding error and which lanes are
+        Of `optloc.compute.range_start.Room`: positions in row X, cost of the loops, rounding error and which lanes are
         good in; positions, right-hand sides, information (lower half), costs, steps, which are alive and which good
         out.
     tolerance : float

@@ -199,8 +199,6 @@ def branch(
     weight, origin, floor, unique = cost.weight, chart.origin, chart.floor, aim.level > aim.value
     held = unique and aim.surface.shape[0] > 0
     rho = sqrt(max(aim.level, 0.0))
-    # The box of the fix holds nothing cheaper where no way leads out of the search.
-    first = 0 if aim.whole else 1
     boxes, low_points = 0, 0
     while size > 0:
         if boxes >= budget or size + 2 > stack.shape[0]:
@@ -226,11 +224,8 @@ def branch(
         shrink(K, weight, rho + noise, half, half[2] == 0.0, nodes, rows, cut, solve)
         high = low > 0.0 and low * low >= aim.value
         sound = aim.whole or high
-        # In the convex box of a known minimum there is no second, but a lower point there may be: on a surface the
-        # others are no stationary points, and their boxes say nothing of the value.
-        if is_known(at, half, minima[first : aim.free], sides[first : aim.free]):
-            continue
-        if (unique or aim.whole) and (high if held else sound) and is_known(at, half, minima, sides):
+        enough = (unique or aim.whole) and (high if held else sound)
+        if _is_done(at, half, minima, sides, aim, enough):
             continue
         if held or unique or aim.whole:
             if not held:
@@ -253,6 +248,20 @@ def branch(
         elif share > 0.0:
             size = push_halves(stack, size, side, at, half, low, 0, False)
     return CLEAR, boxes, inf
+
+
+@inlined
+def _is_done(at: Array, half: Array, minima: Array, sides: Array, aim: Aim, enough: bool) -> bool:
+    """Return whether a box lies where nothing is left to show.
+
+    In the convex box of a known minimum there is no second, but a lower point there may be: on a surface the others are
+    no stationary points, and their boxes say nothing of the value; `enough` says where any of them will do. The box of
+    the fix holds nothing cheaper where no way leads out of the search.
+    """
+    first = 0 if aim.whole else 1
+    if is_known(at, half, minima[first : aim.free], sides[first : aim.free]):
+        return True
+    return enough and is_known(at, half, minima, sides)
 
 
 @compiled

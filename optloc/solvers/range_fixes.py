@@ -29,7 +29,7 @@ from optloc.solvers.stages import Solver, gtrs, gtrs_lsr, lsr
 from optloc.solvers.starts.least_squares_ranges import Ranges, ranges
 
 if TYPE_CHECKING:
-    from optloc.compute.range_room import Answer
+    from optloc.compute.range_start import Answer
 
 # The linear maps from measurements to all that a fix from ranges needs, made once for a structure.
 
@@ -58,7 +58,7 @@ class Direct:
     station : int array (s,)
         Stations that take part.
     maps : tuple
-        Fields of `optloc.compute.range_room.Model`.
+        Fields of `optloc.compute.range_start.Model`.
     """
 
     layout: Layout
@@ -269,7 +269,7 @@ def settle_directly(
 def fix_directly(direct: Direct, z: Array, position: Array, threads: int | None = None) -> tuple[Answer, int]:
     """Return what the compiled call finds, and the most steps that a fix took; see `settle_directly`."""
     from optloc.compute.range_fixes import fixes
-    from optloc.compute.range_room import Answer, Model
+    from optloc.compute.range_start import Answer, Model
 
     model = Model(*direct.maps)  # type: ignore[arg-type]
     count, d, size = len(z), position.shape[-1], direct.layout.size

@@ -15,7 +15,7 @@ from optloc.base.types import Array
 from optloc.problem.chart import CARTESIAN, basis, jacobian
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.uncertainty.surface import Surface
+from optloc.uncertainty.region import Surface
 
 # Corrections across the curve, in its standard deviations, below which the next step is longer and above which it is
 # tried again; a step that changes the cost by more is tried again too: a circle takes 300 nodes, an arc 40.

@@ -24,7 +24,8 @@ def heard(constraints=()):
 def test_a_hidden_minimum_is_told_with_cost_and_place(bounds):
     fix = optloc.solve(heard(bounds), "gtrs+lsr")
     reason = str(fix.reason)
-    assert fix.status == Status.INFEASIBLE
+    # without a bound the mirror image in the plane of the satellites is left, out in space, and fits nothing
+    assert fix.status == (Status.INFEASIBLE if bounds else Status.MISFIT)
     assert "the only minimum, of cost 0." in reason
     assert "behind the Earth" in reason
     assert "1.00" in reason  # its latitude

@@ -8,7 +8,7 @@ import optloc
 from optloc import InvalidProblem, Stations, assemble, likelihood_region, measured
 from optloc.problem.chart import INVERSE_RANGE, jacobian, quantile
 from optloc.uncertainty.arc import trace_from
-from optloc.uncertainty.surface import Surface
+from optloc.uncertainty.region import Surface
 
 HELD = ("tdoa 2 5 30", "tdoa 2 5 300", "tdoa 3 6 0", "azel 4 300", "aoa 3 50 10", "plane 50 400", "line", "r2")
 

@@ -7,7 +7,7 @@ from uncertainty.scenes import fixed
 import optloc
 from optloc import InvalidProblem, assemble, measured, mixture, samples, trace_arc
 from optloc.problem.chart import CURVED, INVERSE_RANGE
-from optloc.uncertainty.surface import Surface
+from optloc.uncertainty.region import Surface
 
 
 def gaussian():

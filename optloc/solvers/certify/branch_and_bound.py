@@ -22,8 +22,7 @@ from optloc.proof.chart import HIDDEN_REACH
 from optloc.proof.everywhere import UNBOUNDED
 from optloc.proof.near import BETTER, BUDGET, OTHER, UNIQUE, VALUE
 from optloc.proof.pose import Posed, pose_costs, unsupported
-from optloc.solvers.certify.agreement import agrees
-from optloc.solvers.certify.equalities import Held, hold_equalities
+from optloc.solvers.certify.posed import Held, agrees, hold_equalities
 from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP
