@@ -70,7 +70,7 @@ def _by_machine_code(problem: Problem, x: Array, noise: tuple[Whitener, ...] | N
         return None
     from optloc.compute.equations import normal_at
 
-    sums = normal_at(found, x.reshape(count, -1), np.arange(count) % max(1, *problem.batch_shape, 1))
+    sums = normal_at(found, x.reshape(count, x.shape[-1]), np.arange(count) % max(1, *problem.batch_shape, 1))
     if x.ndim == 2:
         return sums
     return Normal(*(part.reshape((*shape, *part.shape[1:])) for part in sums.parts))
