@@ -164,7 +164,7 @@ def complete(problem: Problem, shared: Array) -> Array:
 def _fit_emission_times(problem: Problem, x: Array) -> Array:
     """Return vectors (N, q, size) with the emission times that fit their positions: the mean of what is left over."""
     size, q = x.shape[:2]
-    part, out = problem.take(np.repeat(np.arange(size), q)), x.reshape(size * q, -1).copy()
+    part, out = problem.take(np.repeat(np.arange(size), q)), x.reshape(size * q, x.shape[-1]).copy()
     usable = np.asarray(np.isfinite(out).all(-1))
     left = part.observed - predict(part, np.where(usable[:, None], out, 0.0))
     present, emissions = np.broadcast_to(part.weight > 0.0, left.shape), emission_columns(problem)
