@@ -9,7 +9,9 @@ from verdict.cases import CASES, GROUND
 from optloc import Status, solve
 from optloc.problem.chart import CARTESIAN, INVERSE_RANGE
 
-DEFAULT, FEW, FULL = 200, 100, 10_000
+DEFAULT, FEW, FULL = 200, 100, 5000
+# Arcs and mirror images keep a proof busy, and few of them are ok.
+SLOW = {"line": 300, "plane 5 100": 300, "plane 50 400": 1000}
 LEVELS = (0.95, 0.999)
 # What is promised of 2 000 fixes and more: the share of truths inside, least and greatest.
 BANDS = {0.95: (0.93, 0.97), 0.999: (0.995, 1.0)}
@@ -91,14 +93,14 @@ def test_clean_data_are_a_misfit_as_rarely_as_stated(seed):
 @pytest.fixture(scope="module")
 def book():
     header = ["case", "fixes", "ok", "in 95 %", "99.9 %", "Gaussian in inverse range", "in 95 %", "99.9 %", "refused"]
-    with ledger("coverage", header, list(CASES), f"seed 0, {FULL} trials a case, method auto") as made:
+    with ledger("coverage", header, list(CASES), f"seed 0, {FULL} trials a case, fewer of arcs, method auto") as made:
         yield made
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", CASES)
 def test_coverage_in_full(name, book):
-    fix, truth = solved(name, FULL, 0)
+    fix, truth = solved(name, SLOW.get(name, FULL), 0)
     cells = [len(fix)]
     for kind, where in groups(fix).items():
         shares = []

@@ -365,6 +365,8 @@ def _add(work: Work, items: Array, points: Array, better: Array) -> None:
 
 def _bar(work: Work, items: Array, points: Array, barred: Array) -> None:
     """Give up fixes beside which a point costs less that did not replace them, and say what forbids it."""
+    if not len(barred):
+        return
     part = work.problem.take(items[barred])
     x = vectors(part, points[barred, None])[:, 0]
     broken, hidden = violation(part, x) > TOLERANCE, is_hidden(part, x)
