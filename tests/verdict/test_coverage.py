@@ -135,6 +135,6 @@ def test_mirror_images_in_full(name, method, mirrors):
     others = [int((fix.code == status).sum()) for status in (Status.CURVED, Status.AMBIGUOUS)]
     mirrors.add(f"{name}, {method}", len(fix), share, *others, int(wrong.sum()), int(told.sum()))
     ok = int((fix.code == Status.OK).sum())
-    # one truth in ten thousand lies that far, and a rival by 9 and more is the right one in e^(-9/2) of its cases at most
+    # one truth in ten thousand lies that far; a rival by 9 and more is the right one in e^(-9/2) of its cases at most
     assert wrong.sum() <= binom.ppf(1 - 1e-3, ok, 1e-4)
     assert told.sum() <= binom.ppf(1 - 1e-4, ok, np.exp(-4.5))
