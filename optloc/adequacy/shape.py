@@ -82,6 +82,13 @@ def _without(equations: Normal, own: Array) -> Normal:
 
 # How far the cost is that of a Gaussian.
 
+BENT = 0.3
+"""Logarithm of the cost three sigma away over 9 beyond which no Gaussian covers.
+
+At 0.3 the 99.9 % ellipsoids hold 99.8 to 100 % of the truths; at 0.5 far fixes that look near by luck pass as well, and
+theirs hold 79 to 92 %.
+"""
+
 # Where it is looked at, standard deviations: 2 and 4 tell good covariances from bad ones as well.
 _AWAY = 3.0
 # The cost there is no less than this share of a Gaussian's: beyond, one is as bad as another.

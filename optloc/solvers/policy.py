@@ -17,13 +17,6 @@ REFUTED = 1e-4
 COVERED = 0.95
 """Level of the likelihood region that must not reach to infinity, with d degrees of freedom: what users ask for."""
 
-BENT = 0.3
-"""Logarithm of the cost three sigma away over 9 beyond which no Gaussian covers.
-
-At 0.3 the 99.9 % ellipsoids hold 99.8 to 100 % of the truths; at 0.5 far fixes that look near by luck pass as well, and
-theirs hold 79 to 92 %.
-"""
-
 FAR, FLAT = 1e4, 1e6
 """Spreads of the stations: from here on a fix must be a good one, and from there on every wave front is flat."""
 

@@ -7,7 +7,7 @@ from itertools import product
 
 import numpy as np
 
-from optloc.adequacy.shape import cost_at_infinity, departure, profile
+from optloc.adequacy.shape import BENT, cost_at_infinity, departure, profile
 from optloc.base.errors import InvalidProblem
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array
@@ -323,8 +323,6 @@ def _limit(surface: Surface, steps: Array) -> Array:
 
 # Evaluations of the cost at a time: their normal equations then take some megabytes.
 _PART = 2**13
-# Departure from a Gaussian beyond which none covers: that of the verdict `curved`, measured there.
-_BENT = 0.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -379,7 +377,7 @@ class Surface:
             centre = centre_and_spread(problem.stations.places)[0].reshape(-1, slot.size)[0]
         if kind is None:
             metres, inverse = departure(flat, x, cov[None], (), centre[None])[0]
-            kind = CARTESIAN if metres <= _BENT else INVERSE_RANGE if inverse <= _BENT else CURVED
+            kind = CARTESIAN if metres <= BENT else INVERSE_RANGE if inverse <= BENT else CURVED
         chart = Chart(np.asarray(kind, dtype=np.int8), x[0, part], cov[part, part], centre)
         return cls(flat, x, chart, float(profile(flat, x[None], x, _passes(flat))[0][0, 0]))
 

@@ -218,7 +218,8 @@ def test_the_stages_find_the_same_rivals():
 
 
 def test_thresholds_are_those_of_the_policy():
+    from optloc.adequacy.shape import BENT
     from optloc.compute.range_mirror import LISTED, SAME
     from optloc.compute.range_shape import STRAIGHT
 
-    assert (LISTED, SAME, STRAIGHT) == (policy.LISTED_GAP, policy.SAME_PLACE, policy.BENT)
+    assert (LISTED, SAME, STRAIGHT) == (policy.LISTED_GAP, policy.SAME_PLACE, BENT)

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.special import gammainccinv
 
-from optloc.adequacy.shape import cost_at_infinity, departure
+from optloc.adequacy.shape import BENT, cost_at_infinity, departure
 from optloc.base.linalg import centre_and_spread
 from optloc.base.records import present, take
 from optloc.base.types import Array, Certificate, Status
@@ -16,7 +16,7 @@ from optloc.linear.constraints import faces
 from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE, Chart, quantile
 from optloc.problem.fix import tail_probability
 from optloc.problem.problem import Problem
-from optloc.solvers.policy import AMBIGUOUS_GAP, BENT, COVERED, DOUBT, REFUTED
+from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED, DOUBT, REFUTED
 from optloc.solvers.pool import Curvature, Pool
 from optloc.solvers.starts.position import one_position, rows_of_stations
 
