@@ -99,7 +99,7 @@ def jacobian(y: Array, position: Array, centre: Array) -> Array:
 
 
 def log_volume(y: Array, position: Array, centre: Array) -> Array:
-    """Return log |det dx/dy| (...) at chart coordinates y (..., d): d log r - (d + 1) log w."""
+    """Return ``log |det dx/dy|`` (...) at chart coordinates y (..., d): ``d log r - (d + 1) log w``."""
     r, d = distance_and_direction(position, centre)[0], y.shape[-1]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.asarray(d * np.log(r) - (d + 1) * np.log(y[..., -1]))
@@ -201,7 +201,7 @@ class Chart:
         return to_position(np.asarray(y), self.position, self.centre)
 
     def log_volume(self, y: Array) -> Array:
-        """Return log |det dx/dy| (...) at chart coordinates (..., d)."""
+        """Return ``log |det dx/dy|`` (...) at chart coordinates (..., d)."""
         return log_volume(np.asarray(y), self.position, self.centre)
 
     def distance_squared(self, points: Array) -> Array:
