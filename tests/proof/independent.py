@@ -78,7 +78,8 @@ class Trial:
                 lambda y: self.residual(middle + scale * y),
                 (start - middle) / scale,
                 jac=lambda y: self.slope(middle + scale * y) * scale,
-                method="lm",
+                # Levenberg's method is not for fewer rows than unknowns
+                method="lm" if len(self.white) >= len(start) else "trf",
                 xtol=1e-15,
                 ftol=1e-15,
                 gtol=1e-15,
