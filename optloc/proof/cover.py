@@ -176,15 +176,18 @@ def _look_near(cost: Cost, chart: Chart, box: Box, front: Array, i: int, level: 
     place(chart.origin, chart.sense, box.at, box.centre)
     widen(chart, box.centre, box.half)
     _bound_near(cost, chart, box)
+    return _decide(cost, box, level, floor)
+
+
+@compiled
+def _decide(cost: Cost, box: Box, level: float, floor: float) -> int:
+    """Return what becomes of a box whose nodes are bounded; one across the edge of the region is clipped to it."""
     low = _least(cost, box, floor)
-    fate = _ACROSS
     if low > 0.0 and low * low > level:
-        fate = _OUT
-    elif _most_residual(cost, floor, box) <= sqrt(level):
-        fate = _IN
-    else:
-        fate = _clip(cost, box, sqrt(level) + _rounding(cost, box, floor))
-    return fate
+        return _OUT
+    if _most_residual(cost, floor, box) <= sqrt(level):
+        return _IN
+    return _clip(cost, box, sqrt(level) + _rounding(cost, box, floor))
 
 
 @compiled
@@ -407,19 +410,10 @@ def _look_far(cost: Cost, atlas: Atlas, box: Box, front: Array, i: int, level: f
     set_centre(atlas, piece, box.at)
     # What lies in the surroundings of the fix is covered there.
     around = piece <= 2 * atlas.dimension and atlas.minima.home.shape[0] > 0
-    fate = _ACROSS
     if around and within(atlas, box.half, 0, atlas.minima.core[0]):
-        fate = _OUT
-    else:
-        bound_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes)
-        low = _least(cost, box, floor)
-        if low > 0.0 and low * low > level:
-            fate = _OUT
-        elif _most_residual(cost, floor, box) <= sqrt(level):
-            fate = _IN
-        else:
-            fate = _clip(cost, box, sqrt(level) + _rounding(cost, box, floor))
-    return fate
+        return _OUT
+    bound_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes)
+    return _decide(cost, box, level, floor)
 
 
 @compiled
