@@ -135,8 +135,7 @@ def departure(problem: Problem, x: Array, covariance: Array, face: Face, centre:
     spread = covariance[:, part, part]
     precision, _ = linalg.inverse(spread)
     pull = covariance[:, :, part] @ (precision if not face else np.linalg.pinv(spread))  # of the others by the position
-    cost, _, _ = profile(problem, x[None], x)
-    look = _Look(problem, x, cost[0], pull, part, face)
+    look = _Look(problem, x, pull, part, face)
     out = np.full((len(x), 2), np.inf)
     position, axes = x[:, part], _axes(spread)
     with np.errstate(all="ignore"):
@@ -160,14 +159,13 @@ class _Look:
 
     problem: Problem
     x: Array
-    cost: Array
     pull: Array
     part: slice
     face: Face
 
     def take(self, items: Array) -> _Look:
         """Return some fixes."""
-        return _Look(self.problem.take(items), self.x[items], self.cost[items], self.pull[items], self.part, self.face)
+        return _Look(self.problem.take(items), self.x[items], self.pull[items], self.part, self.face)
 
     def departs(self, moved: Array, sigmas: Array) -> Array:
         """Return the largest departure (N,) over displacements (N, k, d) of so many standard deviations (N, k)."""
@@ -182,8 +180,9 @@ class _Look:
         x[..., :n] += shift
         if self.face:
             x = np.stack([restore(self.problem, self.face, one) for one in x])
-        cost, _, _ = profile(self.problem, x, self.x)
-        ratio = (cost - self.cost) / sigmas.T**2
+        # with the fix itself: of one fix a call costs as much as ten vectors of it
+        cost, _, _ = profile(self.problem, np.concatenate([self.x[None], x]), self.x)
+        ratio = (cost[1:] - cost[0]) / sigmas.T**2
         found = np.abs(np.log(np.maximum(ratio, _FLOOR)))
         # what has no width has no axis, and what cannot be evaluated is no Gaussian
         still = (moved == 0.0).all(-1).T

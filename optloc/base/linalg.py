@@ -306,6 +306,12 @@ def inverse_within(information: Array, space: Tangent) -> tuple[Array, Array]:
 # Points: their centre and spread, error ellipses and ellipsoids of covariances.
 
 
+def centre_of_points(points: Array, inside: Array) -> Array:
+    """Return the mean (..., d) of those points (..., s, d) that count, (..., s); the mean of none is the origin."""
+    total = np.einsum("...s,...sd->...d", inside.astype(float), points)
+    return np.asarray(total / np.maximum(inside.sum(-1), 1)[..., None])
+
+
 def centre_and_spread(points: Array, inside: Array | None = None) -> tuple[Array, Array]:
     """Return the mean (..., d) of points (..., s, d) and their greatest distance from it (...).
 
@@ -318,7 +324,7 @@ def centre_and_spread(points: Array, inside: Array | None = None) -> tuple[Array
     """
     if inside is None:
         inside = np.ones(points.shape[:-1], dtype=bool)
-    centre = (points * inside[..., None]).sum(-2) / np.maximum(inside.sum(-1), 1)[..., None]
+    centre = centre_of_points(points, inside)
     away = np.linalg.norm(points - centre[..., None, :], axis=-1)
     return centre, np.where(inside, away, 0.0).max(-1)
 

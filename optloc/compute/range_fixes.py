@@ -67,7 +67,7 @@ _WORTH = LANES // 2
 
 
 @compiled
-def fixes(model: Model, z: Array, station: Array, tolerance: float, most: int, answer: Answer) -> int:
+def fixes(model: Model, z: Array, station: Array, tolerance: float, most: int, given: bool, answer: Answer) -> int:
     """Fix N positions from ranges, each from measurements alone, and return the most steps that one took.
 
     Parameters
@@ -80,6 +80,9 @@ def fixes(model: Model, z: Array, station: Array, tolerance: float, most: int, a
         Stations, metres: those that take part, all of which have rows. Their mean is the centre of the chart.
     tolerance, most : float, int
         Tolerance and limit of `optloc.compute.range_refine.refine`.
+    given : bool
+        Whether starts stand in the answer's positions: those that the start here does not find, mostly because another
+        position fits the squared ranges as well. Every mirror image of them is refined.
     answer : Answer
         Written.
     """
@@ -91,7 +94,10 @@ def fixes(model: Model, z: Array, station: Array, tolerance: float, most: int, a
     for first in range(0, count, LANES):
         size = _take(room.item, None, first, count)
         _see(model, z, station, room, first == 0)
-        _begin(model, room)
+        if given:
+            _resume(answer.x, room)
+        else:
+            _begin(model, room)
         # what is no full block has nothing to wait for
         limit = min(_FEW, most) if size == LANES else most
         steps = max(steps, _refine(model, z, room, size, tolerance, limit, answer))
@@ -99,14 +105,14 @@ def fixes(model: Model, z: Array, station: Array, tolerance: float, most: int, a
             if room.scalar[ALIVE, lane] != 0.0 and most > limit:
                 late[waiting] = room.item[lane]
                 waiting += 1
-        images = _examine(model, z, room, size, tolerance, answer, look, hidden, images, course)
+        images = _examine(model, z, room, size, tolerance, given, answer, look, hidden, images, course)
     for first in range(0, waiting, LANES):
         size = _take(room.item, late, first, waiting)
         _see(model, z, station, room, False)
         _resume(answer.x, room)
         steps = max(steps, _FEW + _refine(model, z, room, size, tolerance, most - _FEW, answer))
-        images = _examine(model, z, room, size, tolerance, answer, look, hidden, images, course)
-    _pursue(model, z, station, room, tolerance, answer, look, hidden, images, course)
+        images = _examine(model, z, room, size, tolerance, given, answer, look, hidden, images, course)
+    _pursue(model, z, station, room, tolerance, given, answer, look, hidden, images, course)
     waiting = 0
     for i in range(count):
         late[waiting] = i
@@ -229,6 +235,7 @@ def _examine(
     room: Room,
     size: int,
     tolerance: float,
+    given: bool,
     answer: Answer,
     look: Array,
     hidden: Array,
@@ -266,7 +273,7 @@ def _examine(
         return images
     keep_fix(room)
     reflect(room)
-    follow(model, u, room, tolerance, _WORTH if size == LANES else 1)
+    follow(model, u, room, tolerance, _WORTH if size == LANES else 1, given)
     return _end_images(model, z, room, size, answer, look, hidden, images, course)
 
 
@@ -297,6 +304,7 @@ def _pursue(
     station: Array,
     room: Room,
     tolerance: float,
+    given: bool,
     answer: Answer,
     look: Array,
     hidden: Array,
@@ -321,7 +329,7 @@ def _pursue(
                 scalar[FIX_COST, lane], scalar[GOOD, lane], scalar[ALIVE, lane] = cost[i], 1.0, 1.0
                 scalar[DAMPING, lane], scalar[GROWTH, lane] = course[0, i], course[1, i]
                 scalar[STEPS, lane] = course[2, i]
-            follow(model, u, room, tolerance, _WORTH if size == LANES else 1)
+            follow(model, u, room, tolerance, _WORTH if size == LANES else 1, given)
             # those that wait on stand before the blocks that are still to come
             images = _end_images(model, z, room, size, answer, look, hidden, images, course)
 

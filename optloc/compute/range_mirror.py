@@ -123,7 +123,7 @@ def reflect(room: Room) -> None:
 
 
 @compiled
-def follow(model: Model, u: Array, room: Room, tolerance: float, fewest: int) -> None:
+def follow(model: Model, u: Array, room: Room, tolerance: float, fewest: int, every: bool) -> None:
     """Refine the positions of lanes that are alive, until fewer of them are left than are worth a block.
 
     Parameters
@@ -139,13 +139,15 @@ def follow(model: Model, u: Array, room: Room, tolerance: float, fewest: int) ->
         As of `optloc.compute.range_refine.refine`.
     fewest : int
         Lanes for which it goes on.
+    every : bool
+        As of `watch`.
     """
     scalar, nearest = room.scalar, room.scalar[SHARE]
     _evaluate(model, u, room, False)
     _note_nearest(room, nearest, True)
     while True:
         propose(room.vector, room.matrix, scalar)
-        if watch(model, room, nearest) < fewest:
+        if watch(model, room, nearest, every) < fewest:
             return
         _evaluate(model, u, room, True)
         going = decide(room.vector, room.matrix, scalar, tolerance)
@@ -188,7 +190,7 @@ def _note_nearest(room: Room, nearest: Array, every: bool) -> None:
 
 
 @compiled
-def watch(model: Model, room: Room, nearest: Array) -> float:
+def watch(model: Model, room: Room, nearest: Array, every: bool) -> float:
     """Give up refinements that lead to no rival, and return how many lanes are alive.
 
     Two reasons end one. Within a ball of radius D about it nothing costs as little as a rival: over a step of length
@@ -205,6 +207,8 @@ def watch(model: Model, room: Room, nearest: Array) -> float:
         Proposed steps, and what `keep_fix` wrote in; ALIVE and GOOD are written.
     nearest : array (W,)
         Ranges to the nearest stations, metres.
+    every : bool
+        Whether no image is given up for the first reason: rivals of a start that is one of two stand farther off.
     """
     vector, matrix, scalar = room.vector, room.matrix, room.scalar
     d, spare, trace = vector.shape[1], scalar[SPARE], scalar[LOW]
@@ -227,7 +231,7 @@ def watch(model: Model, room: Room, nearest: Array) -> float:
         least = scalar[COST, lane] - scalar[GAIN, lane] - scalar[DAMPING, lane] * trace[lane] * ball
         far = np.sqrt(max(least, 0.0)) >= np.sqrt(scalar[FIX_COST, lane] + LISTED) + bow * ball / nearest[lane]
         near = spare[lane] < _NEAR and scalar[COST, lane] - scalar[FIX_COST, lane] > _RISEN * spare[lane]
-        far = far and scalar[DAMPING, lane] <= _FREE
+        far = far and scalar[DAMPING, lane] <= _FREE and not every
         up = far or near or scalar[STEPS, lane] >= _MOST
         scalar[GOOD, lane] = 0.0 if up and scalar[ALIVE, lane] != 0.0 else scalar[GOOD, lane]
         scalar[ALIVE, lane] = 0.0 if up else scalar[ALIVE, lane]

@@ -14,7 +14,7 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
 from optloc.solvers.methods import Method, shortcut
-from optloc.solvers.range_fixes import Direct, by_stages, direct, settle_directly
+from optloc.solvers.range_fixes import Direct, direct, settle_directly
 from optloc.solvers.verdict.judge import verdict
 
 
@@ -76,7 +76,7 @@ class Prepared:
         if len(place) > 1:
             wide = np.broadcast_to(place.reshape(*self.shape, *place.shape[1:]), (*shape, *place.shape[1:]))
             place = wide.reshape(-1, *place.shape[1:])
-        pool = settle_directly(self.plan, flat, place, lambda items: by_stages(self._flat(values, shape), items))
+        pool = settle_directly(self.plan, flat, place, lambda items: self._flat(values, shape).take(items))
         fix = verdict(self._flat(values, shape), pool)
         return fix if len(shape) == 1 else fix.reshape(shape)
 

@@ -25,7 +25,7 @@ from optloc.problem.problem import Problem
 from optloc.proof.pose import project_out, whiten_rows
 from optloc.solvers.policy import EQUAL_COST
 from optloc.solvers.pool import Curvature, Pool, in_parts
-from optloc.solvers.stages import Solver, gtrs, gtrs_lsr, lsr
+from optloc.solvers.stages import gtrs, lsr, lsr_with_mirror
 from optloc.solvers.starts.least_squares_ranges import Ranges, ranges
 
 if TYPE_CHECKING:
@@ -222,27 +222,27 @@ class Quick:
         """Return the settled pools of a flat batch of problems."""
         count = problem.batch_shape[0]
         plan = direct(problem) if pool is None and count >= self.least else None
-        stages = gtrs_lsr if self.alone else _start_and_refine
+        refinement: Callable[[Problem, Pool], Pool] = lsr_with_mirror if self.alone else lsr
         if plan is None:
             start = pool
-            return in_parts(problem, lambda some, part: stages(some, None if start is None else take(start, part)))
+
+            def work(some: Problem, part: slice) -> Pool:
+                return refinement(some, gtrs(some, None if start is None else take(start, part)))
+
+            return in_parts(problem, work)
         z = problem.z if len(problem.rows) > 1 else problem.rows[0].z
         place = problem.stations.position.reshape(-1, *problem.stations.position.shape[-2:])
         z = z if len(z) == count else np.broadcast_to(z, (count, problem.count))
-        return settle_directly(plan, z, place, lambda items: by_stages(problem, items, stages))
-
-
-def _start_and_refine(problem: Problem, pool: Pool | None) -> Pool:
-    return lsr(problem, gtrs(problem, pool))
-
-
-def by_stages(problem: Problem, items: Array, stages: Solver = gtrs_lsr) -> Pool:
-    """Return the pools of some problems of a flat batch by stages, those of "gtrs+lsr" if not said otherwise."""
-    return in_parts(problem.take(items), lambda some, part: stages(some, None))
+        return settle_directly(plan, z, place, problem.take, refinement)
 
 
 def settle_directly(
-    direct: Direct, z: Array, position: Array, rest: Callable[[Array], Pool], threads: int | None = None
+    direct: Direct,
+    z: Array,
+    position: Array,
+    pose: Callable[[Array], Problem],
+    refinement: Callable[[Problem, Pool], Pool] = lsr_with_mirror,
+    threads: int | None = None,
 ) -> Pool:
     """Return the settled pools of measurements: directly where the answer is plain, else by other means.
 
@@ -254,27 +254,47 @@ def settle_directly(
         Measurements.
     position : array (N or 1, stations, d)
         Of all stations.
-    rest : callable
-        Maps the numbers of problems whose answer is not plain to their pools.
+    pose : callable
+        Maps the numbers of problems whose answer is not plain to the problems.
+    refinement : callable
+        What takes the starts of those that are not plain by any means.
     threads : int, optional
         At most so many; as many as `optloc.base.threads.thread_count` says if absent.
     """
     began = perf_counter()
     answer, steps = fix_directly(direct, z, position, threads)
-    pool = _pool(direct, answer, f"{len(z)} candidates, {steps} steps at most", perf_counter() - began)
     left = np.flatnonzero(~_is_final(direct, answer))
-    return pool.merge(left, rest(left)) if len(left) else pool
+    if not len(left):
+        return _pool(direct, answer, steps, began)
+    # most of what is left lacks nothing but a start: the eigenvalues of its pencil give one
+    some = pose(left)
+    start = in_parts(some, lambda part, _: gtrs(part, None))
+    place = position[left] if len(position) > 1 else position
+    more, again = fix_directly(direct, z[left], place, threads, start.x[:, 0])
+    for whole, part in zip(answer, more, strict=True):
+        whole[left] = part
+    pool = _pool(direct, answer, max(steps, again), began)
+    lost = np.flatnonzero(~_is_final(direct, more))
+    if not len(lost):
+        return pool
+    start = take(start, lost)
+    return pool.merge(left[lost], in_parts(some.take(lost), lambda part, own: refinement(part, take(start, own))))
 
 
-def fix_directly(direct: Direct, z: Array, position: Array, threads: int | None = None) -> tuple[Answer, int]:
-    """Return what the compiled call finds, and the most steps that a fix took; see `settle_directly`."""
+def fix_directly(
+    direct: Direct, z: Array, position: Array, threads: int | None = None, start: Array | None = None
+) -> tuple[Answer, int]:
+    """Return what the compiled call finds, and the most steps that a fix took; see `settle_directly`.
+
+    It finds starts by itself where none (N, size) are given.
+    """
     from optloc.compute.range_fixes import fixes
     from optloc.compute.range_start import Answer, Model
 
     model = Model(*direct.maps)  # type: ignore[arg-type]
     count, d, size = len(z), position.shape[-1], direct.layout.size
     answer = Answer(
-        np.empty((count, size)),
+        np.empty((count, size)) if start is None else np.array(start),
         np.empty((count, d, d)),
         np.empty(count),
         np.empty(count, dtype=np.bool_),
@@ -285,13 +305,14 @@ def fix_directly(direct: Direct, z: Array, position: Array, threads: int | None 
     )
     # Usually all stations take part, and their positions need no copy.
     everyone = len(direct.station) == position.shape[1]
+    given = start is not None
 
     def work(first: int) -> int:
         part = slice(first, min(first + _CHUNK, count))
         stations = position[part] if len(position) > 1 else position
         stations = _owned(stations if everyone else stations[:, direct.station])
         rows = _owned(z[part])
-        return int(fixes(model, rows, stations, _TOLERANCE, _LIMIT, Answer(*(array[part] for array in answer))))
+        return int(fixes(model, rows, stations, _TOLERANCE, _LIMIT, given, Answer(*(array[part] for array in answer))))
 
     return answer, max(mapped(work, range(0, count, _CHUNK), threads), default=0)
 
@@ -305,9 +326,10 @@ def _is_final(direct: Direct, answer: Answer) -> Array:
     return np.asarray(answer.settled & ~(apart <= EQUAL_COST * (1.0 + answer.cost)))
 
 
-def _pool(direct: Direct, answer: Answer, detail: str, seconds: float) -> Pool:
+def _pool(direct: Direct, answer: Answer, steps: int, began: float) -> Pool:
     """Return the pool of fixes that were found directly, with a second slot where some have a rival."""
-    count = len(answer.cost)
+    count, seconds = len(answer.cost), perf_counter() - began
+    detail = f"{count} candidates, {steps} steps at most"
     rivalled = np.isfinite(answer.rival_cost) & answer.settled
     x, cost = answer.x[:, None], answer.cost[:, None]
     code = np.broadcast_to(np.int8(Status.OK), (count, 1))

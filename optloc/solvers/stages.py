@@ -75,12 +75,16 @@ _ARRIVED = 1e-4
 
 
 def gtrs_lsr(problem: Problem, pool: Pool | None) -> Pool:
-    """Return what the method "gtrs+lsr" returns: the start and its mirror image, refined.
+    """Return what the method "gtrs+lsr" returns: the start and its mirror image, refined."""
+    return lsr_with_mirror(problem, gtrs(problem, pool))
+
+
+def lsr_with_mirror(problem: Problem, start: Pool) -> Pool:
+    """Return starts and their mirror images, refined.
 
     The image in the plane (or line) that fits the stations best is where flat networks have their second minimum; one
     that ends where an undamped step would lead on is no minimum.
     """
-    start = gtrs(problem, pool)
     if not one_position(problem):
         return lsr(problem, start)
     slot, _ = problem.layout.find("position")

@@ -11,7 +11,8 @@ from optloc.base.types import Array
 from optloc.compute.jit import enabled
 from optloc.problem.chart import basis
 from optloc.solvers import policy
-from optloc.solvers.range_fixes import by_stages, direct, fix_directly
+from optloc.solvers.range_fixes import direct, fix_directly
+from optloc.solvers.stages import gtrs_lsr
 from optloc.solvers.verdict.judge import verdict
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="there is no direct way without machine code")
@@ -209,7 +210,7 @@ def test_wrong_fixes_have_a_rival(kind, s, height, caught):
 def test_the_stages_find_the_same_rivals():
     made = flat("tdoa", 6, 100, 200)
     problem = made.problem
-    fix, other = solve(problem, "gtrs+lsr"), verdict(problem, by_stages(problem, np.arange(200)))
+    fix, other = solve(problem, "gtrs+lsr"), verdict(problem, gtrs_lsr(problem, None))
     apart = fix.code != other.code
     assert apart.sum() <= 2
     assert (fix.code == Status.AMBIGUOUS).sum() >= 1

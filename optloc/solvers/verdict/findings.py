@@ -9,7 +9,7 @@ import numpy as np
 from scipy.special import gammainccinv
 
 from optloc.adequacy.shape import BENT, cost_at_infinity, departure
-from optloc.base.linalg import centre_and_spread
+from optloc.base.linalg import centre_of_points
 from optloc.base.records import present, take
 from optloc.base.types import Array, Certificate, Status
 from optloc.linear.constraints import faces
@@ -174,7 +174,7 @@ def centre_of(problem: Problem) -> Array:
     places = problem.stations.places
     heard = (problem.weight > 0.0).astype(float) @ rows_of_stations(problem).T.astype(float) > 0.0
     # a station that moves counts wherever it is in the course of the run
-    return centre_and_spread(places, np.tile(heard, places.shape[-2] // problem.stations.count))[0]
+    return centre_of_points(places, np.tile(heard, places.shape[-2] // problem.stations.count))
 
 
 def chart_of(problem: Problem, x: Array, covariance: Array, curvature: Curvature) -> Chart | None:

@@ -302,11 +302,13 @@ def standing(pool: Pool, fix: Fix) -> Array:
 
 
 def _plain(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
-    """Return the fixes of settled pools as if all of them were finished and near."""
+    """Return the fixes of settled pools as if all of them were finished and near; without a status where none is."""
     count, cost, certificate = len(pool), pool.cost[:, 0], _claims(pool)
     with np.errstate(invalid="ignore"):
         gap = np.where(np.isfinite(pool.cost[:, 1:]), pool.cost[:, 1:] - cost[:, None], np.inf)
-    marks, reason = mark(problem, pool, gap), fill(count, "")
+    marks, reason, chart = np.zeros(count, dtype=np.int32), fill(count, ""), None
+    if pool.plain is not None:
+        marks, chart = mark(problem, pool, gap), chart_of(problem, pool.x[:, 0], curvature.covariance, curvature)
     code = first_status(marks)
     if pool.plain is not None:
         explain(problem, pool, code, gap, certificate, reason)
@@ -327,7 +329,7 @@ def _plain(problem: Problem, pool: Pool, curvature: Curvature) -> Fix:
         curvature.local,
         fill(count, ()) if pool.asked else None,
         marks,
-        chart_of(problem, pool.x[:, 0], curvature.covariance, curvature),
+        chart,
         np.full(count, np.nan) if pool.infinity is None else pool.infinity - cost,
     )
 
