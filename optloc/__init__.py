@@ -5,6 +5,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
+from optloc.adequacy.evidence import Reliability, reliability
 from optloc.base import frames, units
 from optloc.base.errors import InvalidProblem, NoSolution, OptlocError
 from optloc.base.frames import CARTESIAN, ECEF, Frame
@@ -78,6 +79,7 @@ __all__ = [
     "Prior",
     "Problem",
     "Region",
+    "Reliability",
     "Rows",
     "Running",
     "Samples",
@@ -111,6 +113,7 @@ __all__ = [
     "prepare",
     "reduce",
     "rejected",
+    "reliability",
     "samples",
     "separate",
     "simulate",

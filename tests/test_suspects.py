@@ -6,17 +6,18 @@ from importlib.resources import files
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
+from scipy.stats import binom, chi2
 from typer.testing import CliRunner
 from verdicts import alone
 
 import optloc
 from optloc import InvalidProblem, Motion, Prior, Status, assemble, measured, simulate, solve, with_bias
+from optloc.adequacy.evidence import errors, influence, log_tail, reliability, significance
+from optloc.adequacy.groups import groups_of
 from optloc.cli import app
+from optloc.problem.arrivals import as_arrivals, restore_order
+from optloc.solvers.policy import AMBIGUOUS_GAP
 from optloc.solvers.refine import refine
-from optloc.solvers.starts.arrivals import as_arrivals, restore_order
-from optloc.solvers.suspects.evidence import errors, influence, log_tail, significance
-from optloc.solvers.suspects.groups import groups_of
 
 RNG = np.random.default_rng(20251121)
 STATIONS = RNG.uniform(-0.5, 0.5, (8, 3)) * [10e3, 10e3, 6e3]
@@ -79,7 +80,7 @@ def test_arrivals_give_the_same_fix():
     flat = simulate(arrivals(), TARGET, 5, trials=4).flat()
     made = as_arrivals(flat)
     fix, other = solve(flat, "searched"), solve(made.problem, "searched")
-    np.testing.assert_allclose(restore_order(flat, made.problem, other.x), fix.x, atol=1e-3)
+    np.testing.assert_allclose(restore_order(flat.layout, made.problem.layout, other.x), fix.x, atol=1e-3)
     np.testing.assert_allclose(other.cov, fix.cov, rtol=1e-5)
     np.testing.assert_allclose(other.cost, fix.cost, rtol=1e-6)
     assert (other.dof == fix.dof).all()
@@ -168,7 +169,7 @@ def test_first_order_evidence_is_exact_for_linear_problems():
     """With a tiny cost surface (far stations, small errors) the drop of the cost equals the tested one."""
     flat = spoiled(problem(measured("range", a=EACH, sigma=0.01)), r3=0.1, r5=0.05).flat()
     fix = solve(flat, "searched")
-    groups = groups_of(flat, np.ones(8, dtype=bool))
+    groups = groups_of(flat, np.ones(8, dtype=bool), ("station", "row"))
     at = influence(flat, fix.x[0])
     weight = 1.0 - np.eye(8)
     without = solve(flat.take(np.zeros(8, dtype=int)).with_rows(weight=weight), "searched")
@@ -218,10 +219,40 @@ def test_too_little_redundancy_is_said():
     if unnoticed.answered:
         assert "would not be noticed" in str(unnoticed.reason)
     unnamed = solve(spoiled(arrivals(stations=5), s2=900.0), "robust")
-    assert unnamed.status is Status.AMBIGUOUS
-    assert len(unnamed.explanations[()]) > 1
-    assert ("station S2",) in names(unnamed)
+    assert unnamed.status is Status.CONTRADICTORY
+    assert not unnamed.explanations[()]
     assert "redundancy 1 does not tell" in str(unnamed.reason)
+
+
+def test_with_redundancy_one_a_bad_fit_is_not_ok():
+    """Between one in a hundred and one in ten thousand: an error may be there, and nobody could be named."""
+    rng = np.random.default_rng(1)
+    clean = simulate(arrivals(stations=5), TARGET, 1, trials=300)
+    late = clean.z + np.where(np.arange(4) == 2, rng.uniform(0.0, 900.0, (300, 1)), 0.0)
+    fix = solve(clean.with_rows(z=late), "robust")
+    unsure = (fix.p_value >= 1e-4) & (fix.p_value < 0.01)
+    assert unsure.sum() > 5
+    assert not (fix.code[unsure] == Status.OK).any()
+    assert fix.has(Status.UNPROVEN)[unsure].all()
+    assert (fix.code[fix.p_value < 1e-4] == Status.CONTRADICTORY).all()
+
+
+@pytest.mark.parametrize("kind", ["range", "range_sum"])
+def test_what_all_rows_have_in_common_is_no_liar(kind):
+    """All lengths are long alike: an offset explains them, nobody is left out, and nothing is ok."""
+    pairs = {"b": (EACH + 1) % 8} if kind == "range_sum" else {}
+    clean = simulate(problem(measured(kind, a=EACH, sigma=10.0, **pairs)), TARGET, 5, trials=40)
+    fix = solve(clean.with_rows(z=clean.z + 1000.0), "robust")
+    assert not (fix.code == Status.OK).any()
+    told = np.array([found[0].names == (f"common offset of {kind}",) for found in fix.explanations])
+    assert told.mean() > 0.8
+    error = fix.position - TARGET
+    squared = (error * np.linalg.solve(fix.covariance()[told][0], error.T).T).sum(-1)
+    assert (squared[told] < chi2.isf(1e-4, 3)).all()
+    suspect = fix.suspects[np.flatnonzero(told)[0]][0]
+    assert suspect.group == "offset"
+    assert suspect.error[0] == pytest.approx(1000.0, abs=5 * suspect.sigma[0])
+    assert "[[bias]]" in fix.reason[np.flatnonzero(told)[0]]
 
 
 @pytest.mark.parametrize("stations", [6, 7, 8])
@@ -288,6 +319,31 @@ def test_clean_fixes_are_left_alone():
     assert alone(plain)[clean].all()
     assert plain.explanations is None
     assert asked[0].suspects == ()
+
+
+def test_an_error_of_the_least_size_is_noticed_in_nineteen_cases_of_twenty():
+    """And it moves the fix of all data as far as is said: near the plane of a large network costs are quadratic."""
+    trials, bad, sigma = 600, 3, 0.1
+    clean = problem(measured("range", a=EACH, sigma=sigma))
+    told = reliability(clean, TARGET)
+    assert told.names[bad] == f"range of S{bad}"
+    made = simulate(clean, TARGET, 8, trials=trials)
+    late = made.with_rows(z=made.z + told.least[bad] * (EACH == bad))
+    whole = refine(late, np.tile(TARGET, (trials, 1)))
+    rest = refine(late.with_rows(weight=1.0 - (EACH == bad)), np.tile(TARGET, (trials, 1)))
+    price = groups_of(clean.flat(), np.ones(8, dtype=bool))[0].price
+    noticed = int((whole.cost - rest.cost > price - AMBIGUOUS_GAP).sum())
+    assert binom.ppf(1e-4, trials, 0.95) <= noticed <= binom.ppf(1 - 1e-4, trials, 0.95)
+    moved = np.linalg.norm((whole.x - TARGET).mean(0))
+    spread = np.sqrt(np.trace(optloc.crlb(clean, TARGET)) / trials)
+    assert moved == pytest.approx(told.shift[bad], abs=4.0 * spread)
+
+
+def test_what_nothing_checks_has_no_least_error():
+    told = reliability(arrivals(stations=4), TARGET)
+    assert np.isinf(told.least).all()
+    assert np.isinf(told.shift).all()
+    assert told.names[0] == "toa of S0"
 
 
 def run(epochs=40, bad=(), prior_off=0.0):

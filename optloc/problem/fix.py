@@ -54,7 +54,7 @@ class Active:
     multiplier: float
 
 
-GroupKind = Literal["station", "row", "prior"]
+GroupKind = Literal["station", "row", "prior", "offset"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +65,9 @@ class Suspect:
     ----------
     name : str
         In words, for instance "station S3" or "prior of position[2]".
-    group : "station", "row" or "prior"
-        What was left out: all rows of a station, one measurement, or a prior.
+    group : "station", "row", "prior" or "offset"
+        What was left out: all rows of a station, one measurement, or a prior; or the offset that all lengths of a kind
+        were given.
     rows : tuple of int
         Global numbers of the rows it takes part in; empty for a prior.
     error : array (q,)
@@ -97,7 +98,7 @@ class Explanation:
     Parameters
     ----------
     suspects : tuple of Suspect
-        What was left out.
+        What was left out; nobody, where all data agree as well as the rest does.
     x : array (size,)
         Parameter vector of the fix to the rest, in the order of the problem's layout.
     cost : float
@@ -106,6 +107,8 @@ class Explanation:
         Its degrees of freedom.
     p_value : float
         Its chi-square probability; NaN without redundancy.
+    score : float
+        The cost and a price for each suspect, 16 for one row: explanations weigh as exp(-score / 2).
     """
 
     suspects: tuple[Suspect, ...]
@@ -113,6 +116,7 @@ class Explanation:
     cost: float
     dof: int
     p_value: float
+    score: float = float("nan")
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -182,8 +186,8 @@ class Fix:
         Covariance of the states that targets have at each epoch of a run, in the order of the layout; NaN where an
         epoch leaves them open.
     explanations : object array (...), optional
-        Where the data contradict each other, a tuple of `Explanation`: all the ways of leaving out least, the most
-        plausible first, which is the one that was taken; an empty tuple elsewhere. None where nobody asked.
+        Where the data contradict each other, a tuple of `Explanation`: all that come within the gap of the best, which
+        is the first and was taken; an empty tuple elsewhere. None where nobody asked.
     marks : int array (...), optional
         All that applies to each fix, a bit for each `Status`; see `findings`.
     chart : Chart, optional

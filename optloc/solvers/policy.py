@@ -14,6 +14,10 @@ DOUBT = 1e-3
 REFUTED = 1e-4
 """Probability of the chi-square test below which the noise does not allow the residuals: so rarely good data fail."""
 
+NOTICED = 0.01
+"""Probability at which a search for suspects takes notice: of all groups of a long list together, and with redundancy
+one, where an error shows but nobody can be named."""
+
 COVERED = 0.95
 """Level of the likelihood region that must not reach to infinity, with d degrees of freedom: what users ask for."""
 

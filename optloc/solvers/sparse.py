@@ -15,11 +15,11 @@ from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array, Rows
 from optloc.linear.evaluate import differentiate
 from optloc.models import MODELS
+from optloc.problem.arrivals import as_arrivals
 from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
 from optloc.solvers.pool import Pool, begin, offer, pack
 from optloc.solvers.stages import fix_by, gtrs, lsr
-from optloc.solvers.starts.arrivals import as_arrivals
 from optloc.solvers.starts.position import hold_still, one_position, spread_of, vectors
 from optloc.solvers.starts.several_positions import from_pieces
 from optloc.solvers.starts.squared_range import Coordinates, lift_rows
@@ -253,7 +253,7 @@ def sparse(problem: Problem, pool: Pool | None) -> Pool:
 
 
 def spread_rows(wrong: Array, origin: Sequence[Array], count: int) -> Array:
-    """Return the rows (N, count) that wrong arrival times (N, m) were made from (`optloc.solvers.starts.arrivals`)."""
+    """Return the rows (N, count) that wrong arrival times (N, m) were made from (`optloc.problem.arrivals`)."""
     out = np.zeros((len(wrong), count), dtype=bool)
     for i, rows in enumerate(origin):
         out[:, rows] |= wrong[:, i, None]

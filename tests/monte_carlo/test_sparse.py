@@ -12,8 +12,8 @@ from scipy.stats import chi2
 from verdicts import alone
 
 from optloc import Problem, assemble, measured, solve
+from optloc.problem.arrivals import as_arrivals
 from optloc.solvers.sparse import sparse_errors
-from optloc.solvers.starts.arrivals import as_arrivals
 
 SIGMA, GROSS, LEVEL = 10.0, 50.0, 0.01
 # Stations, wrong ones, and how many wrong ones at most are searched for by trying all subsets.

@@ -12,6 +12,7 @@ import numpy as np
 from optloc.base.types import Array, Status
 from optloc.linear.constraints import Face, exact
 from optloc.linear.normal import Normal, degrees_of_freedom, marginal
+from optloc.problem.arrivals import Arrivals, as_arrivals, restore_order
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.problem import Problem
@@ -20,7 +21,6 @@ from optloc.solvers.policy import AMBIGUOUS_GAP, REJECTED
 from optloc.solvers.pool import Pool, pack
 from optloc.solvers.robust.reweighting import Doubt, residuals, reweight, robust_equations, weigh_by
 from optloc.solvers.robust.starts import flip_rows, robust_starts
-from optloc.solvers.starts.arrivals import Arrivals, as_arrivals, restore_order
 from optloc.solvers.verdict.judge import judge, standing
 from optloc.solvers.verdict.minima import settle
 
@@ -50,7 +50,7 @@ def by_arrivals(problem: Problem, start: Array | None, minimise: Minimise) -> Po
     assert found.curvature is not None
     return replace(
         found,
-        x=restore_order(problem, taken.problem, found.x),
+        x=restore_order(problem.layout, taken.problem.layout, found.x),
         dof=degrees_of_freedom(problem),
         weights=_weights(problem, taken, found),
         curvature=replace(found.curvature, local=None),

@@ -8,19 +8,20 @@ from time import perf_counter
 
 import numpy as np
 
+from optloc.adequacy.groups import KINDS, ROW_PRICE, Group, check_kinds, groups_of
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
+from optloc.problem.arrivals import as_arrivals
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix, GroupKind, Stage
 from optloc.problem.problem import Problem
 from optloc.solvers.outside import accept
+from optloc.solvers.policy import AMBIGUOUS_GAP
 from optloc.solvers.pool import Pool, begin, offer
 from optloc.solvers.stages import fix_by, lsr, search_widely
-from optloc.solvers.starts.arrivals import as_arrivals
 from optloc.solvers.starts.position import complete
-from optloc.solvers.suspects.groups import KINDS, Group, check_kinds, groups_of
 from optloc.solvers.suspects.report import Case, conclude_case
-from optloc.solvers.suspects.subsets import TEST, Finding, Rest, enumerable, explain, fix_rest, grow, prove_rest
+from optloc.solvers.suspects.subsets import Finding, Rest, enumerable, explain, fix_rest, grow
 from optloc.solvers.verdict.conclusion import Conclusion
 from optloc.solvers.verdict.judge import fill, judge, standing
 
@@ -34,11 +35,12 @@ _BEYOND = (Status.REJECTED, Status.TOO_FEW_ROWS, Status.INFEASIBLE, Status.UNAVA
 def suspects(problem: Problem, fix: Fix | None = None, *, by: str | Sequence[str] = KINDS) -> Fix:
     """Return fixes without the measurements that contradict the rest, and who they are.
 
-    A fix passes where its chi-square probability is 1 % or more: then nothing is left out, so that clean data are
-    accused in 1 % of all cases at most. Else every group, every two of them and so on are left out and the rest fixed
-    anew without a guess; all the smallest sets whose rest passes are its explanations. One explanation is taken;
-    several make the fix ambiguous; none makes it contradictory. Where the sets are too many, and in runs, groups are
-    left out one at a time.
+    Every group, every two of them and so on are left out and the rest fixed anew without a guess. A set explains the
+    data where its rest passes the chi-square test at 1e-4; its score is the cost of the rest and a price for each group
+    (16 for one row). All sets within 9 of the best score are listed, the empty one too. Where they place the target
+    elsewhere the fix is ambiguous; where none explains the data it is contradictory; an explanation that leaves out q
+    rows is `ok` only with redundancy q + 1 without them. A range or range sum may also have an offset that all rows of
+    its kind share. Where the sets are too many, and in runs, groups are left out one at a time.
 
     Parameters
     ----------
@@ -47,8 +49,8 @@ def suspects(problem: Problem, fix: Fix | None = None, *, by: str | Sequence[str
     fix : Fix, optional
         Of the same problem, by `solve`; None: it is solved first. Rows that a robust method rejected are suspected
         first.
-    by : "station", "row", "prior" or several of them
-        What may be wrong: all rows of a station, one measurement, a prior.
+    by : "station", "row", "prior", "offset" or several of them
+        What may be wrong: all rows of a station, one measurement, a prior, all lengths of a kind by one offset.
 
     Returns
     -------
@@ -84,7 +86,8 @@ def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS
     pool = replace(pool, asked=True)
     fix = judge(problem, pool)
     with np.errstate(invalid="ignore"):
-        noticed = ~fix.answered | (fix.p_value < TEST)
+        # of a lower cost the cheapest set has a score beyond the gap whatever it leaves
+        noticed = ~fix.answered | (fix.cost > ROW_PRICE - AMBIGUOUS_GAP)
     noticed |= problem.epochs > 1  # a few of many rows go unnoticed by the chi-square of all
     items = np.flatnonzero(noticed & (fix.dof > 0) & ~np.isin(fix.code, _BEYOND))
     conclusion = fill(len(pool), None)
@@ -118,22 +121,13 @@ def _conclude_pattern(
     else:
         findings = explain(work, groups, fix[items])
         # sets that were too many to be tried: group by group from the best that was found
-        for i in [i for i, own in enumerate(findings) if not own.rests and _more(groups, work, int(fix.dof[items[i]]))]:
-            more = _grow(work, groups, fix, i, items[i], rejected, findings[i].closest)
-            findings[i] = replace(more, p_value=findings[i].p_value | more.p_value, nearly=findings[i].nearly)
-    for i, found in enumerate(findings):
-        finding = found if found.rests else replace(found, rests=found.nearly)
-        if finding.rests:
-            best = prove_rest(work.take(np.array([i])), groups, finding.rests[0])
-            finding = replace(finding, rests=(best, *finding.rests[1:]))
+        untried = [not own.rests and own.tried < dof - 1 for own, dof in zip(findings, fix.dof[items], strict=True)]
+        for i in np.flatnonzero(untried).tolist():
+            more = _grow(work, groups, fix, i, int(items[i]), rejected, findings[i].closest)
+            findings[i] = replace(more, p_value=findings[i].p_value | more.p_value)
+    for i, finding in enumerate(findings):
         one = None if arrivals is None else replace(arrivals, problem=arrivals.problem.take(np.array([i])))
-        case = Case(part.take(np.array([i])), one, groups, fix[items[i]])
-        yield int(items[i]), conclude_case(case, finding)
-
-
-def _more(groups: Sequence[Group], problem: Problem, dof: int) -> bool:
-    """Return whether there are sets that the redundancy could name but that were too many to be tried."""
-    return not all(enumerable(groups, problem.count, size) for size in range(1, dof // 2 + 1))
+        yield int(items[i]), conclude_case(Case(part.take(np.array([i])), one, groups, fix[items[i]]), finding)
 
 
 def _grow(

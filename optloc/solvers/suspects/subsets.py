@@ -10,23 +10,18 @@ from time import perf_counter
 
 import numpy as np
 
+from optloc.adequacy.evidence import Influence, errors, influence, significance
+from optloc.adequacy.groups import ROW_PRICE, Group, leave_out, mark_rows
 from optloc.base.records import take
 from optloc.base.types import Array
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.solvers.certify.branch_and_bound import certified
 from optloc.solvers.outside import accept
+from optloc.solvers.policy import AMBIGUOUS_GAP, NOTICED, REFUTED
 from optloc.solvers.pool import Pool, begin, in_parts, offer, pack
 from optloc.solvers.stages import fix_by, gtrs, lsr, roots, search, widen
-from optloc.solvers.suspects.evidence import Influence, errors, influence, significance
-from optloc.solvers.suspects.groups import Group, leave_out, mark_rows
 from optloc.solvers.verdict.judge import judge, standing, verdict
-
-TEST = 0.01
-"""Probability of the chi-square test: a fit less likely than this is contradicted. Clean data are accused as often."""
-
-LAST = TEST**2
-"""What is left to be named where nothing passes the test: the right rest fails it once in a hundred, too."""
 
 # Rows times subsets of one problem up to which all subsets of a size are tried: seconds of fixes; and numbers of a
 # batch at a time, some ten megabytes an array.
@@ -34,6 +29,7 @@ _MOST, _CHUNK = 100_000, 1_000_000
 # Rests whose cost is at most so many times that of the test are solved in more ways, and in all of them. The cheapest
 # start may end at another minimum, and a wrong rest that costs a hundred times too much hardly has one that passes.
 _NEAR, _CLOSE = 100.0, 4.0
+_BLIND = "an error is there, but redundancy 1 does not tell where"
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,13 +39,16 @@ class Rest:
     Parameters
     ----------
     left : tuple of int
-        Numbers of the groups that were left out, ascending.
+        Numbers of the groups that were left out, ascending; () where all data count.
     fix : Fix
         Of one problem, without batch axes.
+    score : float
+        Its cost and the prices of what was left out: twice a negative logarithm of probability, up to a constant.
     """
 
     left: tuple[int, ...]
     fix: Fix
+    score: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,35 +58,36 @@ class Finding:
     Parameters
     ----------
     rests : tuple of Rest
-        What passes the test without the least number of groups, the most plausible first; empty where nothing does.
+        All whose score comes within the gap of the least, that one first; empty where nothing passes.
     p_value : dict of tuple of int to float
         Chi-square probability of the rest without each set of groups that was tried; NaN without redundancy.
     note : str
         What limited the search, in words.
-    nearly : tuple of Rest
-        Where nothing passes, what would pass a far weaker test: the right rest fails in 1 % of all cases, too.
     closest : Rest, optional
         The cheapest of the rests that were tried last.
+    tried : int
+        Size of the largest sets of which all were tried, or can be left untried because of their prices.
     """
 
     rests: tuple[Rest, ...]
     p_value: dict[tuple[int, ...], float]
     note: str = ""
-    nearly: tuple[Rest, ...] = ()
     closest: Rest | None = None
+    tried: int = 0
 
 
-def plausible(fix: Fix, size: int, test: float = TEST) -> Array:
-    """Return which rests (N,) do not contradict themselves.
+def rest_of(groups: Sequence[Group], left: tuple[int, ...], fix: Fix) -> Rest:
+    """Return what one problem is without some groups, with its score."""
+    return Rest(left, fix, float(fix.cost) + sum(groups[i].price for i in left))
 
-    A rest counts as evidence where at least as many rows agree in it as groups were left out: to name q errors takes a
-    redundancy of 2 q, as to correct them does in a code. A rest without redundancy cannot contradict itself; it counts
-    where one group is missing, because an error in it would be noticed but not named. Rests that fit at infinity only
-    count too; those with a position come first.
+
+def passes(fix: Fix) -> Array:
+    """Return which rests (N,) the noise allows; one without redundancy shows nothing.
+
+    Rests that fit at infinity only count too.
     """
     with np.errstate(invalid="ignore"):
-        tested = np.isfinite(fix.cost) & (fix.p_value >= test) & (fix.dof >= size)
-    return np.asarray(tested | ((fix.dof == 0) & (size == 1)))
+        return np.asarray(np.isfinite(fix.cost) & (fix.dof > 0) & (fix.p_value >= REFUTED))
 
 
 def enumerable(groups: Sequence[Group], rows: int, size: int) -> bool:
@@ -96,9 +96,10 @@ def enumerable(groups: Sequence[Group], rows: int, size: int) -> bool:
 
 
 def explain(problem: Problem, groups: Sequence[Group], whole: Fix) -> list[Finding]:
-    """Return what explains each problem of a flat batch: all the smallest sets of groups without which the rest passes.
+    """Return what explains each problem of a flat batch: all sets of groups within the gap of the best.
 
-    Sets of one, of two and so on, as many as the redundancy can name and as are few enough to be tried.
+    Sets of one, of two and so on are tried, as long as their prices alone do not exceed what has been found, the rest
+    has redundancy, and they are few enough.
 
     Parameters
     ----------
@@ -109,94 +110,109 @@ def explain(problem: Problem, groups: Sequence[Group], whole: Fix) -> list[Findi
     whole : Fix
         The fixes (N,) with nothing left out.
     """
-    found = [Finding((), {(): float(p)}) for p in whole.p_value]
-    open_ = np.arange(len(found))
-    # to name q errors takes a redundancy of 2 q, as to correct them does in a code
-    for size in range(1, max(1, int(whole.dof.max()) // 2) + 1):
-        if not len(open_) or not enumerable(groups, problem.count, size):
+    prices = np.cumsum(np.sort([group.price for group in groups]))
+    rests = [[rest_of(groups, (), whole[i])] if ok else [] for i, ok in enumerate(passes(whole))]
+    probability: list[dict[tuple[int, ...], float]] = [{(): float(p)} for p in whole.p_value]
+    closest: list[Rest | None] = [None] * len(rests)
+    tried = np.zeros(len(rests), dtype=np.int64)
+    for size in range(1, len(groups) + 1):
+        best = np.array([min((rest.score for rest in own), default=np.inf) for own in rests])
+        # no set of this size, and so no larger one, can come near
+        done = (prices[size - 1] > best + AMBIGUOUS_GAP) | (whole.dof <= size)
+        tried[done] = len(groups)
+        if done.all() or not enumerable(groups, problem.count, size):
             break
+        tried[~done] = size
         # as many problems at a time as fit the memory with all their sets
-        step = max(1, _CHUNK // (comb(len(groups), size) * problem.count + 1))
-        for first in range(0, len(open_), step):
-            items = open_[first : first + step]
-            for item, (rests, p_value, closest) in zip(
-                items, _try_sets(problem.take(items), groups, size), strict=True
-            ):
-                placed = [rest for rest in rests if rest.fix.answered or int(rest.fix.dof) == 0]
-                passing = [rest for rest in placed if plausible(rest.fix, size)]
-                # of the smallest size that has any
-                nearly = found[item].nearly or minimal(rests, groups)
-                found[item] = Finding(minimal(passing, groups), found[item].p_value | p_value, "", nearly, closest)
-        open_ = np.array([item for item in open_ if not found[item].rests], dtype=np.int64)
-    return found
+        items, step = np.flatnonzero(~done), max(1, _CHUNK // (comb(len(groups), size) * problem.count + 1))
+        for first in range(0, len(items), step):
+            own = items[first : first + step]
+            for item, (more, p_value, cheapest) in zip(own, _try_sets(problem.take(own), groups, size), strict=True):
+                rests[item] += more
+                probability[item] |= p_value
+                closest[item] = cheapest
+    notes = ["" if dof > 1 else _BLIND for dof in whole.dof]
+    parts = zip(rests, probability, notes, closest, tried, strict=True)
+    return [Finding(listed(own, groups), p, note, near, int(most)) for own, p, note, near, most in parts]
 
 
-def minimal(rests: Sequence[Rest], groups: Sequence[Group]) -> tuple[Rest, ...]:
-    """Return those rests that do not leave out more than another, the most plausible first."""
-    left = [frozenset(part for i in rest.left for part in _parts(groups[i])) for rest in rests]
-    kept = [
-        rest
-        for j, (rest, own) in enumerate(zip(rests, left, strict=True))
-        if not any(other < own or (other == own and i < j) for i, other in enumerate(left))
-    ]
-    return tuple(sorted(kept, key=_implausibility))
+def listed(rests: Sequence[Rest], groups: Sequence[Group]) -> tuple[Rest, ...]:
+    """Return the rests whose score comes within the gap of the least, the best first.
+
+    One that leaves out more than another is listed where the cost falls by more than the data may fall by chance: for
+    each row by the price of a row less the gap, as between leaving out one row and none.
+    """
+    if not rests:
+        return ()
+    order = sorted(rests, key=lambda rest: (rest.score, rest.left))
+    kept: list[tuple[frozenset[tuple[int, int]], Rest]] = []
+    for rest in order:
+        if rest.score > order[0].score + AMBIGUOUS_GAP:
+            break
+        own = _parts(groups, rest.left)
+        if not any(_adds_nothing(rest, len(own), other, len(parts)) for parts, other in kept if parts <= own):
+            kept.append((own, rest))
+    return tuple(rest for _, rest in kept)
 
 
-def _parts(group: Group) -> tuple[tuple[str, int], ...]:
-    return (("prior", group.prior),) if group.prior >= 0 else tuple(("row", i) for i in group.rows)
+def _adds_nothing(rest: Rest, size: int, other: Rest, fewer: int) -> bool:
+    return float(other.fix.cost - rest.fix.cost) <= (ROW_PRICE - AMBIGUOUS_GAP) * (size - fewer)
 
 
-def _implausibility(rest: Rest) -> tuple[bool, float, float]:
-    p = float(rest.fix.p_value)
-    return not bool(rest.fix.answered), -1.0 if np.isnan(p) else -p, float(rest.fix.cost)
+def _parts(groups: Sequence[Group], left: Sequence[int]) -> frozenset[tuple[int, int]]:
+    """Return what a set of groups leaves out, number by number: rows, and the components of groups without rows."""
+    rows = {(-1, row) for i in left for row in groups[i].rows}
+    return frozenset(rows | {(i, j) for i in left if not groups[i].rows for j in range(groups[i].size)})
 
 
 def _try_sets(
     problem: Problem, groups: Sequence[Group], size: int
 ) -> list[tuple[list[Rest], dict[tuple[int, ...], float], Rest | None]]:
-    """Return the rests of each problem that may pass, the probabilities of all, and the cheapest of all."""
+    """Return the rests of each problem that pass, the probabilities of all, and the cheapest of all."""
     sets = list(_subsets(groups, problem.count, size))
     count = problem.batch_shape[0]
     rests: list[list[Rest]] = [[] for _ in range(count)]
     probabilities: list[dict[tuple[int, ...], float]] = [{} for _ in range(count)]
     closest: list[Rest | None] = [None] * count
-    # priors are the same for a whole batch: sets that leave out the same ones are fixed together
-    for dropped in dict.fromkeys(priors for _, _, priors in sets):
-        own = [(left, rows) for left, rows, priors in sets if priors == dropped]
-        fix = _fix_rests(problem, np.stack([rows for _, rows in own]), dropped)
-        good, p_value = plausible(fix, size, LAST), fix.p_value
+    # priors and unknowns are the same for a whole batch: sets that change the same ones are fixed together
+    for others in dict.fromkeys(own for _, _, own in sets):
+        own = [(left, rows) for left, rows, its in sets if its == others]
+        fix = _fix_rests(problem, np.stack([rows for _, rows in own]), [groups[i] for i in sorted(others)])
+        good, p_value = passes(fix), fix.p_value
         cost = np.where(np.isfinite(fix.cost), fix.cost, np.inf).reshape(count, len(own))
         for item in range(count):
             for j, (left, _) in enumerate(own, start=item * len(own)):
                 probabilities[item][left] = float(p_value[j])
                 if good[j]:
-                    rests[item].append(Rest(left, fix[j]))
+                    rests[item].append(rest_of(groups, left, fix[j]))
             j, before = int(cost[item].argmin()), closest[item]
+            if any(groups[i].offset is not None for i in others):
+                continue  # what begins there leaves out more
             if np.isfinite(cost[item, j]) and (before is None or cost[item, j] < float(before.fix.cost)):
-                closest[item] = Rest(own[j][0], fix[item * len(own) + j])
+                closest[item] = rest_of(groups, own[j][0], fix[item * len(own) + j])
     return list(zip(rests, probabilities, closest, strict=True))
 
 
 def _subsets(groups: Sequence[Group], count: int, size: int) -> Iterator[tuple[tuple[int, ...], Array, frozenset[int]]]:
-    """Yield sets of groups, their rows and their priors; each of a set must add something to the others."""
+    """Yield sets of groups, their rows and those that have none; each of a set must add something to the others."""
     masks = [mark_rows([group], count) for group in groups]
     for left in combinations(range(len(groups)), size):
         rows = np.any([masks[i] for i in left], axis=0)
         idle = any(
-            groups[i].prior < 0 and not (masks[i] & ~np.any([masks[j] for j in left if j != i], axis=0)).any()
+            groups[i].rows and not (masks[i] & ~np.any([masks[j] for j in left if j != i], axis=0)).any()
             for i in left
             if size > 1
         )
         if not idle:
-            yield left, rows, frozenset(groups[i].prior for i in left if groups[i].prior >= 0)
+            yield left, rows, frozenset(i for i in left if not groups[i].rows)
 
 
-def _fix_rests(problem: Problem, left: Array, dropped: frozenset[int]) -> Fix:
+def _fix_rests(problem: Problem, left: Array, others: Sequence[Group]) -> Fix:
     """Return the fixes (N * C,) of N problems without each of C sets of rows (C, m), set after set of each problem."""
     count = problem.batch_shape[0]
     # item-major: the C sets of a problem lie together
     many = problem.take(np.repeat(np.arange(count), len(left)))
-    return in_parts(leave_out(many, np.tile(left, (count, 1)), dropped), lambda part, _: fix_rest(part))
+    return in_parts(leave_out(many, np.tile(left, (count, 1)), others), lambda part, _: fix_rest(part))
 
 
 def fix_rest(problem: Problem) -> Fix:
@@ -234,7 +250,7 @@ def _limit(dof: Array) -> Array:
     """Return the cost (N,) at which the test fails."""
     from scipy.special import gammainccinv
 
-    return np.asarray(2.0 * gammainccinv(np.maximum(dof, 1) / 2, TEST))
+    return np.asarray(2.0 * gammainccinv(np.maximum(dof, 1) / 2, REFUTED))
 
 
 # Many groups: the worst is left out and the rest fixed anew, until none stands out; then who fits again is taken back.
@@ -268,7 +284,7 @@ def grow(problem: Problem, groups: Sequence[Group], fix: Fix, rejected: Array, s
         Where to begin else: the best that was found without a few groups.
     """
     # Bonferroni: clean data are accused once in a hundred, whatever the number of groups
-    level = float(np.log(TEST / len(groups)))
+    level = float(np.log(NOTICED / len(groups)))
     left = [i for i, group in enumerate(groups) if len(group.rows) == 1 and rejected[group.rows[0]]]
     rest = fix_without(problem, groups, left, fix.x) if left else fix
     if start is not None and not left:
@@ -285,28 +301,30 @@ def grow(problem: Problem, groups: Sequence[Group], fix: Fix, rejected: Array, s
     left, rest = _take_back(problem, groups, left, rest, level)
     if not left or not rest.answered:
         return Finding((), {(): float(fix.p_value)}, "" if rest.answered else str(rest.reason))
-    found = minimal([Rest(tuple(sorted(left)), rest), *_rivals(problem, groups, left, rest, level)], groups)
-    return Finding(found, {(): float(fix.p_value)})
+    found = [rest_of(groups, tuple(sorted(left)), rest), *_rivals(problem, groups, left, rest, level)]
+    if passes(fix):
+        found.append(rest_of(groups, (), fix))
+    return Finding(listed(found, groups), {(): float(fix.p_value)})
 
 
 def fix_without(problem: Problem, groups: Sequence[Group], left: Sequence[int], x: Array) -> Fix:
     """Return the fix of one problem without some groups, refined from a vector (size,)."""
-    part = _leave_out(problem, groups, left)
+    part = leave_out_of(problem, groups, left)
     return fix_by(part, lambda one: begin(one, x[None]))[0]
 
 
 def prove_rest(problem: Problem, groups: Sequence[Group], rest: Rest) -> Rest:
     """Return what one problem is without some groups, after all that an `ok` promises has been looked at."""
-    part = _leave_out(problem, groups, rest.left)
     if not bool(rest.fix.answered):
         return rest
-    return Rest(rest.left, verdict(part, certified(part, accept(part, rest.fix.flat())))[0])
+    part = leave_out_of(problem, groups, rest.left)
+    return rest_of(groups, rest.left, verdict(part, certified(part, accept(part, rest.fix.flat())))[0])
 
 
-def _leave_out(problem: Problem, groups: Sequence[Group], left: Sequence[int]) -> Problem:
+def leave_out_of(problem: Problem, groups: Sequence[Group], left: Sequence[int]) -> Problem:
+    """Return one problem without some groups, and with their offsets."""
     chosen = [groups[i] for i in left]
-    dropped = frozenset(group.prior for group in chosen if group.prior >= 0)
-    return leave_out(problem, mark_rows(chosen, problem.count)[None], dropped)
+    return leave_out(problem, mark_rows(chosen, problem.count)[None], [one for one in chosen if not one.rows])
 
 
 def _worst(problem: Problem, groups: Sequence[Group], left: Sequence[int], rest: Fix, level: float) -> int | None:
@@ -329,7 +347,7 @@ def _worst(problem: Problem, groups: Sequence[Group], left: Sequence[int], rest:
 def _influence(problem: Problem, groups: Sequence[Group], left: Sequence[int], x: Array) -> Influence:
     dropped = frozenset(groups[i].prior for i in left if groups[i].prior >= 0)
     gone = mark_rows([groups[i] for i in left], problem.count)
-    return influence(leave_out(problem, gone[None], frozenset()), x, dropped)
+    return influence(leave_out(problem, gone[None]), x, dropped)
 
 
 def _present(group: Group, gone: Array) -> Group:
@@ -364,7 +382,7 @@ def _rivals(problem: Problem, groups: Sequence[Group], left: list[int], rest: Fi
         others = [j for j in left if j != i]
         fix = fix_without(problem, groups, others, rest.x)
         gone = mark_rows([groups[j] for j in others], problem.count)
-        open_ = [j for j, g in enumerate(groups) if j not in left and not _overlap(g, gone)]
+        open_ = [j for j, g in enumerate(groups) if j not in left and g.offset is None and not _overlap(g, gone)]
         if not np.isfinite(fix.x).all() or not open_:
             continue
         tail = significance(_influence(problem, groups, others, fix.x), [groups[j] for j in open_])
@@ -373,12 +391,8 @@ def _rivals(problem: Problem, groups: Sequence[Group], left: list[int], rest: Fi
             if key in found or tail[j] > level:
                 continue
             other = fix_without(problem, groups, key, fix.x)
-            # no less likely than the test wants, or than the first explanation is
-            agrees = bool(other.answered) and (
-                np.isnan(rest.p_value) or other.p_value >= min(TEST, float(rest.p_value))
-            )
-            if agrees and _worst(problem, groups, key, other, level) is None:
-                found[key] = Rest(key, other)
+            if bool(other.answered) and _worst(problem, groups, key, other, level) is None:
+                found[key] = rest_of(groups, key, other)
     return list(found.values())
 
 

@@ -22,11 +22,15 @@ class Conclusion:
     Parameters
     ----------
     explanations : tuple of Explanation
-        All ways of leaving out least, the most plausible first; empty where none passes.
+        All whose score comes near the best, that one first; empty where none passes.
     rest : Fix
         Of what the first explanation leaves, without batch axes; of all the data where there is none.
     alternatives : Alternatives
         Other positions, of the first explanation and of the others.
+    spent : int
+        Redundancy that the first explanation takes.
+    several : bool
+        Whether other explanations place the target elsewhere.
     tried : str
         Where there is no explanation: what came closest.
     """
@@ -34,34 +38,38 @@ class Conclusion:
     explanations: tuple[Explanation, ...]
     rest: Fix
     alternatives: Alternatives
+    spent: int = 0
+    several: bool = False
     tried: str = ""
 
 
 def conclude(problem: Problem, conclusion: Conclusion) -> Fix:
     """Return the fix, a flat batch of one, that a conclusion means for its problem.
 
-    One explanation is taken; several make the fix ambiguous, none makes it contradictory.
+    One explanation is taken; several that place the target elsewhere make the fix ambiguous, none makes it
+    contradictory. One that leaves little to check it, or that needs a common offset, is unproven.
     """
     rest, explanations = conclusion.rest, conclusion.explanations
     if not explanations:
         return _contradictory(conclusion).reshape((1,))
+    first = explanations[0]
     weights = np.array(np.broadcast_to(problem.weight, (1, problem.count))[0])
-    weights[[row for suspect in explanations[0].suspects for row in suspect.rows]] = 0.0
+    weights[[row for suspect in first.suspects for row in suspect.rows]] = 0.0
     # the rest stays as it was judged; several explanations are several positions
-    several = len(explanations) > 1
     marks = int(rest.marks) if rest.marks is not None else rest.status.mark
-    if several and rest.answered:
+    if conclusion.several and rest.answered:
         marks |= Status.AMBIGUOUS.mark
-    reason = _name_rivals(explanations) if several else _name_suspects(explanations[0], rest)
-    left_out = len(explanations[0].suspects)
-    if rest.answered and int(rest.dof) <= left_out:
-        # 2 k name k culprits, and one more notices that there is another
+    reason = _name_rivals(explanations) if conclusion.several else _name_suspects(explanations, rest)
+    if rest.answered and int(rest.dof) <= conclusion.spent:
+        # 2 q name the culprits of q rows, and one more notices that there is another
         marks |= Status.UNPROVEN.mark
         reason += f"; redundancy {int(rest.dof)} without them: another explanation would not be noticed"
+    if rest.answered and any(suspect.group == "offset" for suspect in first.suspects):
+        marks |= Status.UNPROVEN.mark
+        reason += '; a bias of all of them has to be stated in the problem, as [[bias]] with per = "kind"'
     return replace(
         rest,
-        x=explanations[0].x,
-        layout=problem.layout,
+        x=first.x,
         code=first_status(np.array(marks)),
         marks=np.array(marks, dtype=np.int32),
         reason=_object(reason),
@@ -96,22 +104,30 @@ def list_names(parts: Sequence[str]) -> str:
     return parts[0] if len(parts) == 1 else ", ".join(parts[:-1]) + " and " + parts[-1]
 
 
-def _name_suspects(explanation: Explanation, rest: Fix) -> str:
+def _name_suspects(explanations: Sequence[Explanation], rest: Fix) -> str:
+    explanation = explanations[0]
     parts = [f"{suspect.name}{_error(suspect)}" for suspect in explanation.suspects]
-    reason = f"left out: {list_names(parts)}; p = {_p(explanation.suspects[0].p_with)} with"
+    verb = "given" if all(suspect.group == "offset" for suspect in explanation.suspects) else "left out"
+    reason = f"{verb}: {list_names(parts)}; p = {_p(explanation.suspects[0].p_with)} with"
     reason += "" if len(parts) == 1 else " the first"
+    reason = f"{reason}, {_p(explanation.p_value)} without"
+    if len(explanations) > 1:
+        reason += f"; the same place follows from {_either(explanations[1:])}"
     own = str(rest.reason[()] or "")
-    return f"{reason}, {_p(explanation.p_value)} without" + (f"; {own}" if own else "")
+    return reason + (f"; {own}" if own else "")
 
 
 def _name_rivals(explanations: Sequence[Explanation]) -> str:
-    shown = [" and ".join(one.names) for one in explanations[:_SHOWN]]
-    more = f" or {len(explanations) - _SHOWN} others" if len(explanations) > _SHOWN else ""
     common = set(explanations[0].names).intersection(*(one.names for one in explanations[1:]))
     sure = f"; {list_names(sorted(common))} in all of them" if common else ""
-    blind = all(one.dof == 0 for one in explanations)
-    why = "an error is there, but redundancy 1 does not tell where" if blind else "several explanations pass"
-    return f"{why}: {' or '.join(shown)}{more}{sure}"
+    return f"several explanations pass: {_either(explanations)}{sure}"
+
+
+def _either(explanations: Sequence[Explanation]) -> str:
+    """Return explanations as a sentence has them: "A or B and C", by whom they leave out."""
+    shown = [" and ".join(one.names) or "nobody" for one in explanations[:_SHOWN]]
+    more = f" or {len(explanations) - _SHOWN} others" if len(explanations) > _SHOWN else ""
+    return " or ".join(shown) + more
 
 
 def _error(suspect: Suspect) -> str:

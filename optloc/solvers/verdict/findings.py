@@ -16,7 +16,7 @@ from optloc.linear.constraints import faces
 from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE, Chart, quantile
 from optloc.problem.fix import tail_probability
 from optloc.problem.problem import Problem
-from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED, DOUBT, REFUTED
+from optloc.solvers.policy import AMBIGUOUS_GAP, COVERED, DOUBT, NOTICED, REFUTED
 from optloc.solvers.pool import Curvature, Pool
 from optloc.solvers.starts.position import one_position, rows_of_stations
 
@@ -53,8 +53,9 @@ def mark(problem: Problem, pool: Pool, gap: Array) -> Array:
         # a proof makes up for the start that was not safe
         unsure = pool.searched & (marks & Status.UNPROVEN.mark != 0)
         marks[unsure] ^= Status.UNPROVEN.mark | Status.SEARCHED.mark
-    if pool.asked:  # without redundancy a search for suspects sees nothing
-        marks[(pool.dof <= 0) & (marks & Status.SEARCHED.mark == 0)] |= Status.UNPROVEN.mark
+    if pool.asked:  # without redundancy a search for suspects sees nothing, and with one it cannot tell who it is
+        blind = (pool.dof <= 0) | ((pool.dof == 1) & is_improbable(cost, pool.dof, NOTICED))
+        marks[blind & (marks & Status.SEARCHED.mark == 0)] |= Status.UNPROVEN.mark
     assert pool.curvature is not None
     if pool.curvature.kappa is not None:
         with np.errstate(invalid="ignore"):

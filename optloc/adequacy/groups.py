@@ -1,19 +1,26 @@
-"""What may be wrong together: all rows of a station, one measurement, a prior."""
+"""What may be wrong together: all rows of a station, one measurement, a prior, all lengths of a kind by one offset."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.types import Array
+from optloc.base.types import Array, Bias
 from optloc.models import MODELS
+from optloc.problem.bias import family
 from optloc.problem.fix import GroupKind
 from optloc.problem.problem import Problem
 
-KINDS: tuple[GroupKind, ...] = ("station", "row", "prior")
+KINDS: tuple[GroupKind, ...] = ("station", "row", "prior", "offset")
+
+_ONE, _EACH = 9.0, 7.0
+"""Twice the logarithms of what an error has against it: odds of a hundred to one that a group has none, and for each of
+its components that it is somewhere in a hundred sigma, not at zero (100 / sqrt(2 pi))."""
+ROW_PRICE = _ONE + _EACH
+"""Price of leaving out one row."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,18 +31,29 @@ class Group:
     ----------
     name : str
         In words.
-    kind : "station", "row" or "prior"
+    kind : "station", "row", "prior" or "offset"
         What it is.
     rows : tuple of int
-        Its rows that are present, as numbers of the problem's rows; empty for a prior.
+        Its rows that are present, as numbers of the problem's rows; empty for a prior and an offset.
     prior : int
-        Number of the prior; -1 for rows.
+        Number of the prior; -1 for others.
+    offset : Bias, optional
+        Unknown that all lengths of a kind get in common: nothing is left out then, but something more is unknown.
+    size : int
+        How many numbers it holds.
     """
 
     name: str
     kind: GroupKind
     rows: tuple[int, ...]
     prior: int = -1
+    offset: Bias | None = None
+    size: int = 1
+
+    @property
+    def price(self) -> float:
+        """Return by how much the cost has to fall for its error to be as likely as none, a few of them being wrong."""
+        return _ONE + _EACH * self.size
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,7 +97,7 @@ def groups_of(problem: Problem, present: Array, by: Sequence[GroupKind] = KINDS)
         Any batch.
     present : bool array (m,)
         Rows that are there.
-    by : sequence of "station", "row", "prior"
+    by : sequence of "station", "row", "prior", "offset"
         Which groups are wanted.
     """
     columns, found = _Columns.of(problem), dict[tuple[int, ...], Group]()
@@ -88,16 +106,34 @@ def groups_of(problem: Problem, present: Array, by: Sequence[GroupKind] = KINDS)
             rows = _numbers(present & ((columns.a == i) | (columns.b == i)))
             # setdefault: rows that two groups share by name are listed once, under the first
             if rows and len(rows) < present.sum():
-                found.setdefault(rows, Group(f"station {name}", "station", rows))
+                found.setdefault(rows, Group(f"station {name}", "station", rows, size=len(rows)))
     if "row" in by:
         for rows in [*((int(i),) for i in np.flatnonzero(present)), *_sightings(columns, present)]:
-            found.setdefault(rows, Group(_row_name(problem, columns, rows), "row", rows))
+            found.setdefault(rows, Group(_row_name(problem, columns, rows), "row", rows, size=len(rows)))
     groups = list(found.values())
     if "prior" in by:
         for j, prior in enumerate(problem.priors):
-            if problem.layout.find(prior.name)[1]:
-                groups.append(Group(f"prior of {prior.name}", "prior", (), j))
-    return tuple(groups)
+            slot, shared = problem.layout.find(prior.name)
+            if shared:
+                groups.append(Group(f"prior of {prior.name}", "prior", (), j, size=slot.size))
+    return (*groups, *(_offsets(problem, present) if "offset" in by else ()))
+
+
+def _offsets(problem: Problem, present: Array) -> Iterator[Group]:
+    """Yield the common offset of each kind of length that is known to be free of one: no emission time, no bias."""
+    for rows, start in zip(problem.rows, problem.starts, strict=True):
+        own, model = slice(start, start + rows.count), MODELS[rows.kind]
+        # differences have none, and what a bias touches has its own
+        alike = model.ranges is not None and sum(model.ranges) != 0 and not model.emission
+        touched = any(np.isin(bias.row, np.arange(start, start + rows.count)).any() for bias in problem.biases)
+        if alike and not touched and present[own].sum() > 1:
+            name = f"common offset of {rows.kind}"
+            yield Group(
+                name,
+                "offset",
+                (),
+                offset=family(problem.rows, problem.stations.names, name, per="kind", kind=rows.kind),
+            )
 
 
 def check_kinds(by: str | Sequence[str]) -> tuple[GroupKind, ...]:
@@ -111,11 +147,13 @@ def check_kinds(by: str | Sequence[str]) -> tuple[GroupKind, ...]:
     return tuple(kind for kind in KINDS if kind in wanted)
 
 
-def leave_out(problem: Problem, left: Array, dropped: frozenset[int]) -> Problem:
-    """Return a flat batch of problems without some rows (N, m) and without some priors."""
+def leave_out(problem: Problem, left: Array, others: Sequence[Group] = ()) -> Problem:
+    """Return a flat batch of problems without some rows (N, m), without the priors and with the offsets of groups."""
     weight = np.where(left, 0.0, np.broadcast_to(problem.weight, left.shape))
+    dropped = {group.prior for group in others}
     priors = tuple(prior for j, prior in enumerate(problem.priors) if j not in dropped)
-    return replace(problem, priors=priors).with_rows(weight=weight)
+    offsets = (group.offset for group in others if group.offset is not None)
+    return replace(problem, priors=priors, biases=(*problem.biases, *offsets)).with_rows(weight=weight)
 
 
 def mark_rows(groups: Sequence[Group], count: int) -> Array:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optloc.base.types import Array, Rows
+from optloc.problem.layout import Layout
 from optloc.problem.noise import Block, Noise, dense, group
 from optloc.problem.problem import Problem
 
@@ -170,13 +171,18 @@ def _keep_noise(noise: Noise, number: Array) -> Iterator[Block]:
             yield Block(number[block.row[kept]], own)
 
 
-def restore_order(problem: Problem, arrivals: Problem, x: Array) -> Array:
-    """Return vectors (..., size) of the problem with arrivals in the order of the problem they were made from."""
-    layout, other = problem.layout, arrivals.layout
+def restore_order(layout: Layout, other: Layout, x: Array) -> Array:
+    """Return vectors (..., size) in the order of a layout whose unknowns another layout has too, perhaps among more."""
     shared, local = other.split(x)
     columns = []
     for slot in layout.local:
         start = other.find(slot.name)[0].start
         columns.append(local[..., start : start + slot.size])
     flat = [np.concatenate(columns, axis=-1).reshape(*x.shape[:-1], -1)] if columns else []
-    return np.concatenate([shared, *flat], axis=-1)
+    return np.concatenate([shared[..., shared_places(layout, other)], *flat], axis=-1)
+
+
+def shared_places(layout: Layout, other: Layout) -> Array:
+    """Return where the shared unknowns of a layout stand in another that has them too, (n,)."""
+    starts = ((other.find(slot.name)[0].start, slot.size) for slot in layout.shared)
+    return np.concatenate([np.arange(0), *(np.arange(start, start + size) for start, size in starts)])
