@@ -10,39 +10,56 @@ from verdicts import alone
 from optloc import Fix, Problem, assemble, measured, solve
 from optloc.solvers.refine import refine
 
-BOX, SIGMA = np.array([10e3, 10e3, 6e3]), 10.0
+BOX, SIGMA, MILLIRADIANS = np.array([10e3, 10e3, 6e3]), 10.0, 3e-3
 
 
 @dataclass(frozen=True)
 class Spoilt:
-    """A batch of problems, the true vectors (N, size), and which arrivals are wrong (N, s)."""
+    """A batch of problems, true vectors (N, size), which arrivals are wrong (N, s), and by how many sigma (N, s)."""
 
     problem: Problem
     truth: np.ndarray
     wrong: np.ndarray
+    error: np.ndarray | None = None
 
 
 def spoilt(
-    kind: str, trials: int, stations: int, *, bad: int = 0, share: float = 0.0, size: float = 100.0, late=False, seed=1
+    kind: str,
+    trials: int,
+    stations: int,
+    *,
+    bad: int = 0,
+    share: float = 0.0,
+    size: float = 100.0,
+    late=False,
+    seed=1,
+    dimension: int = 3,
+    noise: float = 1.0,
 ) -> Spoilt:
-    """Return trials in which `bad` rows, or each with a probability, are off by `size` sigma, either way or late."""
+    """Return trials in which `bad` rows, or each with a probability, are off by `size` sigma, either way or late.
+
+    All errors besides are `noise` times as large as is stated; azimuths have 3 mrad.
+    """
     rng = np.random.default_rng([seed, stations, bad])
-    place = rng.uniform(-0.5, 0.5, (trials, 1, stations, 3)) * BOX
-    truth = rng.uniform(-0.5, 0.5, (trials, 3)) * BOX
-    distance = np.linalg.norm(truth[:, None] - place[:, 0], axis=-1)
+    place = rng.uniform(-0.5, 0.5, (trials, 1, stations, dimension)) * BOX[:dimension]
+    truth = rng.uniform(-0.5, 0.5, (trials, dimension)) * BOX[:dimension]
+    apart = truth[:, None] - place[:, 0]
+    exact = np.arctan2(apart[..., 1], apart[..., 0]) if kind == "azimuth" else np.linalg.norm(apart, axis=-1)
+    sigma = MILLIRADIANS if kind == "azimuth" else SIGMA
     wrong = np.argsort(rng.random((trials, stations)), axis=1) < bad
     wrong |= rng.random(wrong.shape) < share
     sign = 1.0 if late else rng.choice([-1.0, 1.0], wrong.shape)
-    z = distance + SIGMA * (rng.standard_normal(wrong.shape) + size * sign * wrong)
+    z = exact + sigma * (noise * rng.standard_normal(wrong.shape) + size * sign * wrong)
     every = np.arange(stations)
     if kind == "tdoa":
-        rows = measured("tdoa", z[:, 1:] - z[:, :1], a=every[1:], b=0, arrival_sigma=SIGMA)
+        rows = measured("tdoa", z[:, 1:] - z[:, :1], a=every[1:], b=0, arrival_sigma=sigma)
     elif kind == "toa":
-        rows = measured("toa", z + 5e3, a=every, sigma=SIGMA)
+        rows = measured("toa", z + 5e3, a=every, sigma=sigma)
         truth = np.column_stack([truth, np.full(trials, 5e3)])
     else:
-        rows = measured("range", z, a=every, sigma=SIGMA)
-    return Spoilt(assemble(place, rows), truth, wrong)
+        z = (z + np.pi) % (2 * np.pi) - np.pi if kind == "azimuth" else z
+        rows = measured(kind, z, a=every, sigma=sigma)
+    return Spoilt(assemble(place, rows), truth, wrong, size * sign * wrong)
 
 
 def worse_than_from_truth(case: Spoilt, method: str, fix: Fix) -> np.ndarray:

@@ -142,7 +142,7 @@ def counted(run: Trials, fix: Fix) -> Counts:
         count["named"] += not several and bool(found) and found[0] == true
         if fix.code[i] == Status.OK:
             count["ok"] += 1
-            count["wrong"] += not fix.covers(run.truth, 0.9999)[i]
+            count["wrong"] += not fix[i].covers(run.truth[i], 0.9999)
     return Counts(**{key: int(value) for key, value in count.items()})
 
 

@@ -42,7 +42,7 @@ HEADER = [
 @pytest.fixture(scope="module")
 def book():
     facts = f"{FULL} trials a case (seed 1 of `tests/robust_cases.py`), 10 m a row, emitter in the box of the stations"
-    with ledger("robust", HEADER, NAMES, facts) as made:
+    with ledger("losses", HEADER, NAMES, facts) as made:
         yield made
 
 
