@@ -339,6 +339,20 @@ def test_an_error_of_the_least_size_is_noticed_in_nineteen_cases_of_twenty():
     assert moved == pytest.approx(told.shift[bad], abs=4.0 * spread)
 
 
+@pytest.mark.parametrize("bad", [0, 3])
+def test_what_the_rest_of_a_robust_fix_shows_is_told_without_its_suspects(bad):
+    """Also without the common reference of all differences, which is one arrival."""
+    fix = solve(spoiled(arrivals(), **{f"s{bad}": 400.0}), "robust")
+    assert names(fix) == [(f"station S{bad}",)]
+    told = reliability(arrivals(), fix.x, fix.suspects)
+    others = [i for i in EACH if i != bad]
+    rest = assemble(STATIONS, measured("toa", a=others, sigma=10.0))
+    alone_ = reliability(rest, np.append(fix.x, 0.0))
+    assert told.names == alone_.names == tuple(f"toa of S{i}" for i in others)
+    np.testing.assert_allclose(told.least, alone_.least, rtol=1e-6)
+    np.testing.assert_allclose(told.shift, alone_.shift, rtol=1e-6)
+
+
 def test_what_nothing_checks_has_no_least_error():
     told = reliability(arrivals(stations=4), TARGET)
     assert np.isinf(told.least).all()
@@ -423,4 +437,9 @@ def test_the_command_line_names_suspects(tmp_path):
     assert suspect["name"] == "station Summit"
     assert suspect["error"][0] == pytest.approx(3000.0 * 0.299792458, abs=5 * suspect["sigma"][0])
     assert "station Summit" in table.read_text()
+    channels = [one["channel"] for one in written["fixes"][0]["unnoticed"]]
+    assert "toa of Mill" in channels
+    assert "toa of Summit" not in channels
+    assert "Errors that go unnoticed" in out
+    assert "Errors that go unnoticed" in command("crlb", file)
     assert "explanations" in json.loads(command("fix", file, "--json"))["fixes"][0]

@@ -20,6 +20,7 @@ from optloc.base.types import Array
 from optloc.compute.sums import equations_at
 from optloc.linear.normal import Linear, Normal, linearise, marginal, step
 from optloc.problem.arrivals import as_arrivals, shared_places
+from optloc.problem.fix import Suspect
 from optloc.problem.layout import Layout
 from optloc.problem.problem import Problem
 
@@ -271,7 +272,7 @@ class Reliability:
     shift: Array
 
 
-def reliability(problem: Problem, x: Array) -> Reliability:
+def reliability(problem: Problem, x: Array, suspects: Sequence[Suspect] = ()) -> Reliability:
     """Return the least error of each station that a search for suspects notices, and what an unseen one does.
 
     An error e of rows c shifts the cost by the noncentrality e^2 c'Q c; it is noticed where the cost falls without it
@@ -283,6 +284,8 @@ def reliability(problem: Problem, x: Array) -> Reliability:
         A single problem.
     x : array (size,)
         Where it is linearised: a fix, or a truth.
+    suspects : sequence of Suspect
+        What the fix left out, `fix.suspects`: of the rest then.
 
     Returns
     -------
@@ -298,6 +301,9 @@ def reliability(problem: Problem, x: Array) -> Reliability:
     flat = problem.flat()
     made = as_arrivals(flat)
     work = flat if made is None else made.problem
+    origin = tuple(np.arange(flat.count)[:, None]) if made is None else made.origin
+    for one in suspects:
+        work = work.with_rows(weight=np.where(_touched(work, origin, one), 0.0, work.weight))
     at = influence(work, _embed(flat.layout, work.layout, np.asarray(x, dtype=float)))
     channels = _channels(work)
     seen = np.array([at.block(rows).sum() for _, rows in channels])
@@ -307,6 +313,16 @@ def reliability(problem: Problem, x: Array) -> Reliability:
     places = [slot.start + i for slot in work.layout.shared if slot.name == "position" for i in range(slot.size)]
     pull = np.linalg.norm(moved[:, places], axis=-1)
     return Reliability(tuple(name for name, _ in channels), least, np.where(pull > 0.0, least * pull, 0.0))
+
+
+def _touched(work: Problem, origin: Sequence[Array], suspect: Suspect) -> Array:
+    """Return which rows (m,) of a problem, perhaps with arrivals for differences, a suspect is."""
+    if suspect.group == "station":
+        a, b = (np.concatenate([getattr(rows, end) for rows in work.rows]) for end in "ab")
+        number = work.stations.names.index(suspect.name.removeprefix("station "))
+        return np.asarray((a == number) | (b == number))
+    # a single arrival is its station; all others come from one row
+    return np.array([len(own) == 1 and int(own[0]) in suspect.rows for own in origin])
 
 
 def _embed(layout: Layout, other: Layout, x: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from optloc.adequacy.evidence import Reliability, reliability
 from optloc.base.errors import InvalidProblem
 from optloc.base.linalg import error_ellipse
 from optloc.base.types import Array
@@ -18,7 +20,9 @@ from optloc.cli.options import coordinates
 from optloc.cli.output import dumps, say, write_picture, write_text
 from optloc.files import Loaded, read
 from optloc.files.schema import Units
+from optloc.models import MODELS
 from optloc.problem.epochs import by_epoch, separable, tied
+from optloc.problem.fix import Suspect
 from optloc.problem.layout import Layout, Slot, state_names
 from optloc.problem.problem import Problem
 
@@ -29,6 +33,7 @@ _POINTS, _UNKNOWNS = 400, 100
 # Points along each side of a map: isolines are smooth, and the 9216 bounds take less than a second.
 _MAP_POINTS = 96
 _PICTURES = (".png", ".svg", ".pdf")
+_UNITS = {"length": "m", "speed": "m/s"}
 _RMS = {True: " (rms)", False: ""}
 
 
@@ -59,14 +64,17 @@ def run_crlb(
         for slot in problem.layout.shared
     ]
     over_time = courses(problem, truth)
+    told = reliability_of(problem, truth)
     if plot is not None:
         _draw(plot, loaded, over_time)
     if as_json:
         course = [] if over_time is None else _course_records(*over_time)
-        write_text(Path("-"), dumps({"file": loaded.source, "bounds": rows, "course": course}))
+        made = {"file": loaded.source, "bounds": rows, "reliability": reliability_json(told), "course": course}
+        write_text(Path("-"), dumps(made))
     elif not quiet:
         console = Console()
         console.print(_bound_table(loaded, rows))
+        show_reliability(told, console)
         if over_time is not None:
             console.print(_course_table(*over_time))
     return 0 if all(np.isfinite(row["sigma"]).all() for row in rows) and rows else 1
@@ -123,6 +131,82 @@ def _sigmas(row: dict[str, Any]) -> str:
     lines = [f"{entry}: {v:.4g} {row['unit']}".strip(": ") for entry, v in named]
     more = len(row["entries"]) - _MEMBERS
     return "\n".join([*lines, *([f"... and {more} more"] if more > 0 else [])])
+
+
+# What goes unnoticed.
+
+# Epochs of one run or batch that are looked at: the worst of them is told.
+_LOOKED_AT = 100
+
+
+def reliability_of(problem: Problem, x: Array, suspects: Sequence[Suspect] = ()) -> Reliability | None:
+    """Return the least errors of stations that a search for suspects notices, in the worst epoch that is looked at.
+
+    Parameters
+    ----------
+    problem : Problem
+        One problem, or epochs (...) that share nothing.
+    x : array (..., size)
+        Where they are linearised; those that are not finite are left out.
+    suspects : sequence of Suspect
+        What the fix of a single problem left out.
+
+    Returns
+    -------
+    Reliability or None
+        None where no epoch has a place.
+    """
+    flat = problem.flat()
+    places = np.broadcast_to(x, (*problem.batch_shape, flat.layout.size)).reshape(-1, flat.layout.size)
+    items = np.flatnonzero(np.isfinite(places).all(-1))
+    # evenly spaced: the geometry of a run changes slowly
+    items = items[np.unique(np.linspace(0, len(items) - 1, min(len(items), _LOOKED_AT)).astype(int))]
+    worst: dict[str, tuple[float, float]] = {}
+    for i in items:
+        told = reliability(flat.take(np.array([i])), places[i], suspects)
+        for name, least, shift in zip(told.names, told.least, told.shift, strict=True):
+            before = worst.get(name, (0.0, 0.0))
+            worst[name] = (max(before[0], float(least)), max(before[1], float(shift)))
+    if not worst:
+        return None
+    least, shift = np.array(list(worst.values())).T
+    return Reliability(tuple(worst), least, shift)
+
+
+def reliability_json(told: Reliability | None) -> list[dict[str, Any]]:
+    """Return the least errors that are noticed as records, in SI units and radians; infinite ones as null."""
+    if told is None:
+        return []
+    parts = zip(told.names, told.least, told.shift, strict=True)
+    return [{"channel": name, "least_noticed": least, "moves_position": shift} for name, least, shift in parts]
+
+
+def show_reliability(told: Reliability | None, console: Console) -> None:
+    """Print the least errors that are noticed, the largest displacement first."""
+    if told is None:
+        return
+    table = Table(title="Errors that go unnoticed", title_justify="left")
+    for name in ("of all rows", "up to", "moves the position, m"):
+        table.add_column(name, justify="left" if name == "of all rows" else "right")
+    order = np.argsort(-told.shift, kind="stable")
+    for i in order[:_MEMBERS]:
+        table.add_row(told.names[i], _size(told.names[i], told.least[i]), _length(told.shift[i]))
+    if len(order) > _MEMBERS:
+        table.add_row("...", "", f"{len(order) - _MEMBERS} more")
+    console.print(table)
+
+
+def _size(name: str, value: float) -> str:
+    if not np.isfinite(value):
+        return "any size"
+    quantity = MODELS[name.partition(" of ")[0]].quantity
+    if quantity == "angle":
+        return f"{np.degrees(value):.3g} deg"
+    return f"{value:.4g} {_UNITS.get(quantity, '')}".strip()
+
+
+def _length(value: float) -> str:
+    return f"{value:.4g}" if np.isfinite(value) else "anywhere"
 
 
 # Against time.

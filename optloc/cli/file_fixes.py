@@ -61,6 +61,11 @@ class FileFixes:
         return all(bool(np.isin(fix.code, [Status.OK, *allow]).all()) for fix in self.fixes)
 
     @property
+    def problem(self) -> Problem:
+        """Return what was solved: a batch of epochs where they share nothing, else the run."""
+        return by_epoch(self.loaded.problem) if separable(self.loaded.problem) else self.loaded.problem
+
+    @property
     def singles(self) -> Iterator[Fix]:
         """Yield the fixes one by one."""
         for fix in self.fixes:
@@ -257,7 +262,7 @@ def fixes_json(found: FileFixes) -> dict[str, Any]:
     from optloc.uncertainty.radii import accuracy
 
     frame, rows = found.loaded.problem.frame, records(found.columns)
-    per_fix = [_detail(fix, found) for fix in found.singles]
+    per_fix = [_detail(fix, found) | _unnoticed(fix, found, i) for i, fix in enumerate(found.singles)]
     # One row a fix wherever it has one target and one epoch; else what belongs to the fix stands with the run.
     single = len(rows) == len(per_fix)
     if len(rows) == 1 == len(per_fix):  # of one fix: the radii take milliseconds each
@@ -295,6 +300,17 @@ def _detail(fix: Fix, found: FileFixes) -> dict[str, Any]:
         "not_separable": [] if found.seen is None else list(found.seen.sentences),
         "of_each_epoch": {name: values for name, values in fix.bias.items() if not fix.layout.find(name)[1]},
     }
+
+
+def _unnoticed(fix: Fix, found: FileFixes, item: int) -> dict[str, Any]:
+    """Return which errors of the stations a search for suspects would not have noticed; nothing where nobody asked."""
+    if fix.explanations is None or not fix.answered:
+        return {}
+    from optloc.cli.crlb import reliability_json, reliability_of
+
+    problem = found.problem
+    one = problem.flat().take(np.array([item])) if problem.batch_shape else problem
+    return {"unnoticed": reliability_json(reliability_of(one, fix.x, fix.suspects))}
 
 
 def _chart_json(fix: Fix) -> dict[str, Any] | None:

@@ -143,6 +143,7 @@ def _show_one(found: FileFixes, fix: Fix, console: Console) -> None:
     console.print(table)
     _show_biases(found, fix, console)
     _show_suspects(fix, console)
+    _show_unnoticed(found, fix, console)
     _show_alternatives(fix, console)
 
 
@@ -251,6 +252,15 @@ def _show_suspects(fix: Fix, console: Console) -> None:
     if len(found) > _EXPLANATIONS:
         table.add_row("", f"and {len(found) - _EXPLANATIONS} more explanations", "", "", "")
     console.print(table)
+
+
+def _show_unnoticed(found: FileFixes, fix: Fix, console: Console) -> None:
+    """Print which errors a search for suspects would not have noticed; nothing where nobody asked."""
+    if fix.explanations is None or not fix.answered:
+        return
+    from optloc.cli.crlb import reliability_of, show_reliability
+
+    show_reliability(reliability_of(found.problem, fix.x, fix.suspects), console)
 
 
 def _error(suspect: Suspect) -> str:
