@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import Any
 
 from optloc.adequacy.evidence import Reliability, reliability
+from optloc.adequacy.level import CommonLevel
 from optloc.base import frames, units
 from optloc.base.errors import InvalidProblem, NoSolution, OptlocError
 from optloc.base.frames import CARTESIAN, ECEF, Frame
@@ -29,7 +30,7 @@ from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.noise import Noise
 from optloc.problem.problem import Problem
 from optloc.quality.health import Health, health
-from optloc.quality.levels import NoiseLevels, noise_levels, with_estimated_noise, with_noise_levels
+from optloc.quality.levels import NoiseLevels, common_level, noise_levels, with_estimated_noise, with_noise_levels
 from optloc.solvers import FORMULATIONS, METHODS, SOLVERS, Formulation, solve
 from optloc.solvers.certify.branch_and_bound import certify
 from optloc.solvers.prepared import Prepared, prepare
@@ -55,6 +56,7 @@ __all__ = [
     "Bias",
     "Certificate",
     "Chart",
+    "CommonLevel",
     "Course",
     "Emitters",
     "Explanation",
@@ -92,6 +94,7 @@ __all__ = [
     "assemble",
     "by_epoch",
     "certify",
+    "common_level",
     "constraints",
     "crlb",
     "crlb_course",

@@ -22,6 +22,7 @@ from optloc.cli.options import (
     Plot,
     ProblemPath,
     Quiet,
+    RescaleNoise,
     Verbose,
     allowed,
     constraints,
@@ -93,6 +94,7 @@ def fix(
     above_ground: AboveGround = False,
     box: Box = None,
     noise: NoiseFromData = None,
+    rescale: RescaleNoise = False,
     allow: Allow = None,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -105,7 +107,9 @@ def fix(
 
     more, passing = constraints(height, above_ground, box), allowed(allow)
     files = {"geojson_path": geojson, "plot": plot, "out": out, "html": html}
-    code = run_fix(file, method, more, as_json=as_json, **files, quiet=quiet, noise=noise, allow=passing)
+    code = run_fix(
+        file, method, more, as_json=as_json, **files, quiet=quiet, noise=noise, rescale=rescale, allow=passing
+    )
     raise typer.Exit(code)
 
 

@@ -10,18 +10,19 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from optloc.adequacy.elements import By, batch_of
 from optloc.adequacy.geometry import Advice
+from optloc.adequacy.level import CommonLevel, common_level_at
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Bias
 from optloc.cli.file_fixes import CHUNK
-from optloc.cli.fix import advice_for_vectors, advice_json, grouping_of, show_advice
+from optloc.cli.fix import advice_for_vectors, advice_json, grouping_of, level_json, show_advice, tell_level
 from optloc.cli.output import Columns, bar, dumps, records, say_all, with_sigma, write_picture, write_table, write_text
 from optloc.files import Loaded, read
 from optloc.linear.constraints import exact
 from optloc.models import MODELS
 from optloc.problem.epochs import separable
 from optloc.problem.problem import Problem
-from optloc.quality.elements import By, batch_of
 from optloc.quality.health import Health, health_of
 from optloc.solvers import Method
 
@@ -50,6 +51,7 @@ def run_check(file: Path, as_json: bool, asked: Asked | None = None, *, quiet: b
     told = _advice(loaded, checked)
     if as_json:
         more = {} if checked is None else {"health": _health_json(checked)}
+        more |= {} if checked is None or checked.level is None else {"noise_level": level_json(checked.level)}
         write_text(Path("-"), dumps(found | more | {"advice": advice_json(told)}))
     elif not quiet:
         table = Table(title=loaded.title, show_header=False, title_justify="left")
@@ -58,6 +60,7 @@ def run_check(file: Path, as_json: bool, asked: Asked | None = None, *, quiet: b
         Console().print(table)
         if checked is not None:
             _show_health(checked, Console())
+            say_all(Console(), () if checked.level is None else tell_level(checked.level))
         show_advice(told, Console())
     return 1 if found["epochs_with_too_few_rows"] or found["epochs_with_disconnected_pairs"] else 0
 
@@ -219,11 +222,12 @@ def _spread(position: Array) -> tuple[Array, Array]:
 
 @dataclass(frozen=True, slots=True)
 class Checked:
-    """Health of the stations of a file, or why there is none; the vectors (k, size) of its epochs, where solved."""
+    """Health of the stations of a file, or why there is none; of solved epochs vectors (k, size) and noise level."""
 
     health: Health | None
     why: str = ""
     vectors: Array | None = None
+    level: CommonLevel | None = None
 
 
 def _check_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
@@ -268,7 +272,8 @@ def _solve_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
         raise InvalidProblem("no epoch has a fix", loaded.source, "see `optloc fix` for the reasons")
     asked = any(each is not None for each in explained)
     health = health_of(batch, (kept, vectors[kept]), by, explained if asked else None)
-    return Checked(health, vectors=vectors if separable(loaded.problem) else None)
+    level = common_level_at(batch.take(kept), vectors[kept])
+    return Checked(health, vectors=vectors if separable(loaded.problem) else None, level=level)
 
 
 def _health_columns(health: Health) -> Columns:

@@ -14,7 +14,9 @@ from rich.table import Table
 from rich.text import Text
 
 from optloc.adequacy.advice import advise, advise_at
+from optloc.adequacy.elements import GROUPINGS, By, batch_of
 from optloc.adequacy.geometry import Advice
+from optloc.adequacy.level import CommonLevel, common_level_at
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import ANSWERED, Array, Status
 from optloc.cli.file_fixes import (
@@ -34,8 +36,7 @@ from optloc.files.schema import ConstraintTable
 from optloc.problem.chart import CARTESIAN, INVERSE_RANGE, NAMES
 from optloc.problem.fix import Fix, Suspect
 from optloc.problem.problem import Problem
-from optloc.quality.elements import GROUPINGS, By
-from optloc.quality.levels import NoiseLevels, with_estimated_noise
+from optloc.quality.levels import NoiseLevels, common_level, with_estimated_noise
 
 # What a screen holds of each list; the rest is counted, and --json and --out have all of it.
 _STATES, _EXPLANATIONS, _SUSPECTS, _BIASES, _FAILURES = 12, 8, 12, 40, 10
@@ -58,13 +59,19 @@ def run_fix(
     html: Path | None = None,
     quiet: bool = False,
     noise: str | None = None,
+    rescale: bool = False,
     allow: tuple[Status, ...] = (),
 ) -> int:
     """Fix a file under constraints of its own and more, write what was asked for, and return the exit code."""
     on_output = geojson_path is not None and str(geojson_path) == "-"
     if as_json and on_output:
         raise InvalidProblem("JSON and GeoJSON cannot both go to standard output", "--geojson", "name a file")
-    found = fix_file(_estimate_noise(read(file, more=more), noise), method, quiet or as_json)
+    loaded = _estimate_noise(read(file, more=more), noise)
+    rescaled = _common_level(loaded.problem) if rescale else None
+    if rescaled is not None:
+        loaded = replace(loaded, problem=rescaled.scale(loaded.problem))
+    found = fix_file(loaded, method, quiet or as_json)
+    level = rescaled or _level_of(found)
     levels = found.loaded.levels
     if out is not None:
         write_table(out, found.columns)
@@ -80,12 +87,15 @@ def run_fix(
     # many statuses are told by their own sentence; causes take a search, which only readers need
     told = advice_for_fixes(found) if as_json or not quiet else ()
     if as_json:
-        noise_found = {} if levels is None else {"noise": _levels_json(levels)}
+        noise_found: dict[str, Any] = {} if levels is None else {"noise": _levels_json(levels)}
+        noise_found |= {} if level is None else {"noise_level": level_json(level, rescaled is not None)}
         write_text(Path("-"), dumps(fixes_json(found) | {"advice": advice_json(told)} | noise_found))
     elif not quiet:
         console = Console(stderr=on_output)
         show(found, console)
         show_advice(told, console)
+        if level is not None:
+            say_all(console, tell_level(level, rescaled is not None))
         if levels is not None:
             _show_levels(levels, console)
     return 0 if found.passes(allow) else 1
@@ -322,8 +332,48 @@ def _estimate_noise(loaded: Loaded, by: str | None) -> Loaded:
     """Return a file's problem with its noise estimated for each station, pair or kind; unchanged where not asked."""
     if by is None:
         return loaded
-    problem, levels = with_estimated_noise(loaded.problem, grouping_of(by, "--noise-from-data"))
+    grouping, plus, more = by.partition("+")
+    if plus and more != "epoch":
+        raise InvalidProblem(f"unknown component {more!r}", "--noise-from-data", "write +epoch or nothing behind it")
+    group = grouping_of(grouping, "--noise-from-data")
+    problem, levels = with_estimated_noise(loaded.problem, group, common=bool(plus))
     return replace(loaded, problem=problem, levels=levels)
+
+
+# Fixes from which the level of the noise is asked for: of fewer one liar is as likely.
+_SEVERAL = 3
+
+
+def _common_level(problem: Problem) -> CommonLevel:
+    """Return whether the noise of a file is stated wrong; raise InvalidProblem where its epochs cannot tell."""
+    try:
+        return common_level(problem)
+    except InvalidProblem as error:
+        raise InvalidProblem(error.what, "--rescale-noise", "leave it out") from None
+
+
+def _level_of(found: FileFixes) -> CommonLevel | None:
+    """Return whether the fixes of a file accuse its noise; None of one fix, and where none is but ok."""
+    if not found.fixes[0].shape or sum(map(len, found.fixes)) < _SEVERAL:
+        return None
+    if all(bool((fix.code == Status.OK).all()) and fix.explanations is None for fix in found.fixes):
+        return None
+    batch = batch_of(found.loaded.problem)
+    return common_level_at(batch, np.concatenate([fix.x for fix in found.fixes]))
+
+
+def tell_level(level: CommonLevel, used: bool = False) -> tuple[str, ...]:
+    """Return what the fixes of a file say of the noise as stated, as sentences, and what helps."""
+    if level.suspect:
+        return (f"{level.sentence}: {'this is used' if used else '--rescale-noise uses it'}",)
+    if level.alone:
+        return (f"{level.sentence}: see `optloc check`, or --noise-from-data station",)
+    return ("the noise is used as stated: no common factor explains more",) if used else ()
+
+
+def level_json(level: CommonLevel, used: bool = False) -> dict[str, Any]:
+    """Return what is said of the noise as stated as one JSON value."""
+    return asdict(level) | {"used": used and level.suspect, "sentence": level.sentence}
 
 
 def grouping_of(by: str, where: str) -> By:
@@ -336,6 +386,7 @@ def grouping_of(by: str, where: str) -> By:
 def _levels_json(levels: NoiseLevels) -> dict[str, Any]:
     """Return noise levels as one JSON value, SI units."""
     columns: Columns = {"name": np.array(levels.names), "sigma": levels.sigma, "sigma_error": levels.sigma_error}
+    columns |= {"low": levels.low * levels.stated, "high": levels.high * levels.stated}
     columns |= {"stated": levels.stated, "redundancy": levels.redundancy, "count": levels.count, "gross": levels.gross}
     return {
         "by": levels.by,
@@ -351,13 +402,15 @@ def _show_levels(levels: NoiseLevels, console: Console) -> None:
     """Print noise levels as a table."""
     table = Table(title=f"Noise from data, by {levels.by}", title_justify="left")
     table.add_column(levels.by)
-    for name in ("sigma, SI", "stated", "redundancy", "errors", "gross"):
+    for name in ("sigma, SI", "95 %", "stated", "redundancy", "errors", "gross"):
         table.add_column(name, justify="right")
+    low, high = levels.low * levels.stated, levels.high * levels.stated
     for i, name in enumerate(levels.names):
-        told = np.isfinite(levels.error[i])
-        sigma = f"{levels.sigma[i]:.3g} ± {levels.sigma_error[i]:.2g}" if told else "not told"
+        # What is not told alone is used all the same: as stated, by a common factor, or none.
+        sigma = f"{levels.factor[i] * levels.stated[i]:.3g}" + ("" if np.isfinite(levels.error[i]) else ", not told")
+        within = f"{low[i]:.3g} to {high[i]:.3g}" if np.isfinite(high[i]) else "-"
         cells = (f"{levels.stated[i]:.3g}", f"{levels.redundancy[i]:.0%}", str(levels.count[i]), str(levels.gross[i]))
-        table.add_row(name, sigma, *cells)
+        table.add_row(name, sigma, within, *cells)
     console.print(table)
     say_all(console, levels.sentences)
 

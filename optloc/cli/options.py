@@ -177,7 +177,17 @@ Box = Annotated[
 ]
 NoiseFromData = Annotated[
     str | None,
-    typer.Option("--noise-from-data", metavar="station|pair|kind", help="Estimate the noise of each of these."),
+    typer.Option(
+        "--noise-from-data",
+        metavar="station|pair|kind",
+        help="Estimate the noise of each of these; with +epoch behind it also what their rows of an epoch share.",
+    ),
+]
+RescaleNoise = Annotated[
+    bool,
+    typer.Option(
+        "--rescale-noise", help="Use the common factor of the noise that all epochs show, if it is the suspect."
+    ),
 ]
 
 

@@ -8,14 +8,14 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
+from optloc.adequacy.elements import By, Elements, batch_of, elements, ends_of
+from optloc.adequacy.variance_components import Tested, snooped, tested
 from optloc.base.types import Array
 from optloc.base.units import SI_UNIT
 from optloc.models import MODELS
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.quality.elements import By, Elements, batch_of, elements, ends_of
 from optloc.quality.levels import NoiseLevels, levels_of, usable
-from optloc.quality.variance_components import Tested, snooped, tested
 
 # Where Huber's function turns, in sigmas: 95 % efficient for normal errors (Holland and Welsch 1977).
 _HUBER = 1.345

@@ -6,13 +6,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from optloc.adequacy.elements import (
+    By,
+    Elements,
+    batch_of,
+    common_effects,
+    common_name,
+    elements,
+    ends_of,
+    split,
+)
+from optloc.adequacy.level import CommonLevel, common_level_at
+from optloc.adequacy.variance_components import Fitted, Tested, fit, tested, total, visible, without
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
+from optloc.problem.epochs import tied
 from optloc.problem.fix import Fix
-from optloc.problem.noise import Block, Noise
+from optloc.problem.noise import Block, Noise, gathered, group, together
 from optloc.problem.problem import Problem
-from optloc.quality.elements import By, Elements, batch_of, elements, split
-from optloc.quality.variance_components import KEPT, Fitted, Tested, fit, tested, total, without
 
 # Turns of fixes and levels, and the change of all levels that ends them: 2 % is below the standard error that a
 # thousand errors leave (1 / sqrt(2 n)), and each turn fixes every epoch again.
@@ -30,13 +41,18 @@ class NoiseLevels:
     by : "station", "pair" or "kind"
         What makes a group.
     names : tuple of G str
-        Groups.
+        Groups; behind them, where asked for, what the rows of each have in common in an epoch.
     stated : array (G,)
-        Standard deviation that the problem states, root mean square, SI units.
+        Standard deviation that the problem states, root mean square, SI units; of what rows have in common, of which it
+        states nothing, that of the rows.
     factor : array (G,)
-        What the stated standard deviations are to be multiplied by; 1 where the data do not tell.
+        What the stated standard deviations are multiplied by; 1 where the data do not tell, 0 of what rows have in
+        common where the data do not show it.
     error : array (G,)
         Standard error of the factor; NaN where the data do not tell it for this group alone.
+    low, high : array (G,)
+        Interval of 95 % of the factor: from zero where the data do not tell the noise from none, NaN where they tell
+        nothing. The factor stays off zero all the same: it is the most likely one times a weight (see `noise_levels`).
     redundancy : array (G,)
         Share of each group's errors that shows in the residuals, from 0 to 1.
     count : int array (G,)
@@ -56,6 +72,8 @@ class NoiseLevels:
     stated: Array
     factor: Array
     error: Array
+    low: Array
+    high: Array
     redundancy: Array
     count: Array
     gross: Array
@@ -75,14 +93,17 @@ class NoiseLevels:
         return np.asarray(self.error * self.stated)
 
 
-def noise_levels(problem: Problem, by: By = "station", *, method: str = "auto", fix: Fix | None = None) -> NoiseLevels:
+def noise_levels(
+    problem: Problem, by: By = "station", *, common: bool = False, method: str = "auto", fix: Fix | None = None
+) -> NoiseLevels:
     """Return how large the errors of groups of rows are, from the residuals of many fixes.
 
     Restricted maximum likelihood of variance components: the covariance of the rows is a sum of the stated one's parts,
     each times an unknown factor, and the factors maximise the likelihood of what the residuals say that does not depend
-    on the fixes. Scoring steps on the logarithms are taken until they vanish; each is Rao's minimum norm quadratic
-    estimate at the factors before. Errors that the rest of their fix shows to be gross are left out one by one, and
-    the scale is that of the others.
+    on the fixes, times each factor of a variance: without that weight, which counts no more than two errors of a group,
+    a level of few errors is often zero. Scoring steps on the logarithms are taken until they vanish; each is Rao's
+    minimum norm quadratic estimate at the factors before. Errors that the rest of their fix shows to be gross are left
+    out one by one, and the scale is that of the others.
 
     Parameters
     ----------
@@ -91,6 +112,9 @@ def noise_levels(problem: Problem, by: By = "station", *, method: str = "auto", 
         Its noise may be wrong; its ratios within a group are kept.
     by : "station", "pair" or "kind"
         Whether each station has a level (the error of an arrival where rows combine arrivals), each pair or each kind.
+    common : bool
+        Whether the rows of a group have an error in common in every epoch besides: of an attitude, a place that is
+        taken as known, or refraction. It is told where a group has several rows in an epoch.
     method : str
         How to fix; see `solve`.
     fix : Fix, optional
@@ -112,6 +136,7 @@ def noise_levels(problem: Problem, by: By = "station", *, method: str = "auto", 
     C. R. Rao, "Estimation of variance and covariance components - MINQUE theory" (1971), section 4.
     D. A. Harville, "Maximum likelihood approaches to variance component estimation" (1977), section 5.
     K. R. Koch, "Maximum likelihood estimate of variance components" (1986), equation 4.
+    Y. Chung et al., "A nondegenerate penalized likelihood estimator for variance parameters" (2013), section 3.
     """
     from optloc.solvers import solve
 
@@ -119,18 +144,20 @@ def noise_levels(problem: Problem, by: By = "station", *, method: str = "auto", 
     if fix is None and batch.layout.size:
         fix = solve(batch, method)
     kept, x = usable(batch, fix)
-    made = elements(batch.take(kept), x, by)
-    return levels_of(made, by)
+    return levels_of(elements(batch.take(kept), x, by, common), by)
 
 
-def with_estimated_noise(problem: Problem, by: By = "kind", *, method: str = "auto") -> tuple[Problem, NoiseLevels]:
+def with_estimated_noise(
+    problem: Problem, by: By = "kind", *, common: bool = False, method: str = "auto"
+) -> tuple[Problem, NoiseLevels]:
     """Return the problem with its noise from the data, and the levels: fixes and levels are made until they agree.
 
     Parameters
     ----------
     problem : Problem
-        What its noise states is only where to begin; ratios within a group are kept.
-    by, method
+        Ratios of its noise within a group are kept; what it states else is only where to begin, but for groups that the
+        data do not tell: they stay as stated.
+    by, common, method
         As in `noise_levels`.
 
     Raises
@@ -138,20 +165,23 @@ def with_estimated_noise(problem: Problem, by: By = "kind", *, method: str = "au
     InvalidProblem
         As `noise_levels`, and where the data do not tell any level.
     """
+    from optloc.solvers import solve
+
+    batch, now = batch_of(problem), problem
     # Better weights move the fixes, and these the residuals: turns until nothing moves.
-    first = levels = noise_levels(problem, by, method=method)
-    factor = levels.factor
-    for _ in range(_ROUNDS):
-        problem = with_noise_levels(problem, levels)
-        levels = noise_levels(problem, by, method=method)
-        factor = factor * levels.factor
-        if np.abs(levels.factor - 1.0).max() < _CLOSE:
+    factor = np.ones(1)
+    for _ in range(1 + _ROUNDS):
+        kept, x = usable(batch, solve(batch_of(now), method) if batch.layout.size else None)
+        # Fixes with the noise as found, factors of the noise as stated: what is not told stays as stated, in any turn.
+        levels = levels_of(elements(batch.take(kept), x, by, common), by)
+        now = with_noise_levels(problem, levels)
+        if factor.shape == levels.factor.shape and np.abs(levels.factor - factor).max() <= _CLOSE * levels.factor.max():
             break
-    if levels.names != first.names or np.isnan(levels.error).all():
+        factor = levels.factor
+    if np.isnan(levels.error).all():
         advice = "state a sigma, or add rows, stations or epochs"
         raise InvalidProblem("the data do not tell the noise", "noise", advice)
-    whole = replace(levels, stated=first.stated, factor=factor, error=levels.error * factor, before=first.before)
-    return with_noise_levels(problem, levels), whole
+    return now, levels
 
 
 def with_noise_levels(problem: Problem, levels: NoiseLevels) -> Problem:
@@ -163,11 +193,19 @@ def with_noise_levels(problem: Problem, levels: NoiseLevels) -> Problem:
         The problem that the levels were estimated from, or another one of the same stations and kinds.
     levels : NoiseLevels
         Of `noise_levels`; groups that it does not have stay as they are.
+
+    Raises
+    ------
+    InvalidProblem
+        Where rows have an error in common in an epoch and others that last longer.
     """
     factor = dict(zip(levels.names, levels.factor.tolist(), strict=True))
     present = problem.weight > 0.0
-    blocks = [_scale(problem, block, levels.by, factor, present) for block in problem.noise.blocks]
-    return replace(problem, noise=Noise(tuple(blocks)))
+    noise = Noise(tuple(_scale(problem, block, levels.by, factor, present) for block in problem.noise.blocks))
+    sigma = dict(zip(levels.names, (levels.factor * levels.stated).tolist(), strict=True))
+    names = {*ends_of(problem, levels.by).name.ravel().tolist()} - {""}
+    common = {name: sigma[common_name(name)] for name in sorted(names) if sigma.get(common_name(name), 0.0) > 0.0}
+    return replace(problem, noise=_with_common(problem, noise, levels.by, common) if common else noise)
 
 
 def _scale(problem: Problem, block: Block, by: By, factor: dict[str, float], present: Array) -> Block:
@@ -178,6 +216,50 @@ def _scale(problem: Problem, block: Block, by: By, factor: dict[str, float], pre
     # Rows that are absent keep what was stated of them: nothing was learnt there.
     both = here[..., :, None] & here[..., None, :]
     return Block(block.row, np.where(both, scaled @ np.swapaxes(scaled, -1, -2), block.covariance))
+
+
+def _with_common(problem: Problem, noise: Noise, by: By, sigma: dict[str, float]) -> Noise:
+    """Return noise with an error of each of some groups that lasts an epoch, of these standard deviations."""
+    if tied(problem):
+        what = "errors of rows of several epochs are correlated"
+        raise InvalidProblem(what, "noise", "leave out what rows of an epoch have in common")
+    effect, _, _ = common_effects(problem, by, sigma)
+    blocks = []
+    for members in together(problem.epoch):
+        own = effect[members]
+        blocks.append(Block(members, gathered(noise, members) + own @ np.swapaxes(own, -1, -2)))
+    return group(blocks)
+
+
+def common_level(problem: Problem, *, method: str = "cauchy", fix: Fix | None = None) -> CommonLevel:
+    """Return whether many fixes accuse measurements, one station, or the noise as it is stated, and its factor.
+
+    Parameters
+    ----------
+    problem : Problem
+        As in `noise_levels`.
+    method : str
+        How to fix; see `solve`. One that a few liars do not move is best.
+    fix : Fix, optional
+        Fixes of `batch_of(problem)` made before.
+
+    Returns
+    -------
+    CommonLevel
+        `scale(problem)` is the problem with the noise that was found; that of data that fit it stays as stated.
+
+    Raises
+    ------
+    InvalidProblem
+        Where no epoch has a fix.
+    """
+    from optloc.solvers import solve
+
+    batch = batch_of(problem)
+    if fix is None and batch.layout.size:
+        fix = solve(batch, method)
+    kept, x = usable(batch, fix)
+    return common_level_at(batch.take(kept), x)
 
 
 def usable(batch: Problem, fix: Fix | None) -> tuple[Array, Array]:
@@ -200,45 +282,71 @@ def usable(batch: Problem, fix: Fix | None) -> tuple[Array, Array]:
 
 def levels_of(made: Elements, by: By) -> NoiseLevels:
     """Return the noise levels of linearised fixes; see `noise_levels`."""
-    # Groups that have errors, numbered from 0; -1, no group, comes first where it occurs.
-    used, inverse = np.unique(made.of_effect, return_inverse=True)
-    none = int(used[0] == -1)
-    group, used = inverse.reshape(made.of_effect.shape) - none, used[none:]
-    fitted = fit(made, group, len(used))
-    names = tuple(made.names[i] for i in used)
-    count, gross = total(group, len(used)), total(group, len(used), fitted.gross)
+    common = np.isin(np.array(made.names, dtype=object), [common_name(name) for name in made.names])
+    plain = fit(made, common, common)
+    # What rows have in common is stated nowhere: where the data do not show it, it is none.
+    shown = visible(made, plain, common)
+    found = fit(made, common & ~shown, common) if shown.any() else plain
+    while (shown & ~(found.low > 0.0)).any():
+        shown = shown & (found.low > 0.0)
+        found = fit(made, common & ~shown, common) if shown.any() else plain
+    return _report(made, by, found, common & ~shown)
+
+
+def _report(made: Elements, by: By, found: Fitted, none: Array) -> NoiseLevels:
+    """Return the levels of all groups that have errors; `none` (G,) are those that the data do not show."""
+    size = len(made.names)
+    count, gross = total(made.of_effect, size), total(made.of_effect, size, found.gross)
+    used = np.flatnonzero(count)
     # T_jj times the variance: what share of an error the residuals show.
-    redundancy = fitted.tests.size[:, : group.shape[1]] * fitted.variance[group]
-    factor = np.sqrt(fitted.variance)
+    share = found.tests.size[:, : found.gross.shape[1]] * np.nan_to_num(found.variance)[made.of_effect]
+    redundancy, factor = total(made.of_effect, size, share), np.sqrt(found.variance)
     # Gross errors of the fitted noise are left out of both ratios: else they would differ by these alone.
-    stated = without(tested(made, np.ones(())), fitted.gross)
+    own = np.append(none, False)[made.of_effect]
+    stated = without(tested(made, np.where(own, 0.0, 1.0)), found.gross)
+    low, high = (np.where(none, np.nan, np.sqrt(end)) for end in (found.low, found.high))
     return NoiseLevels(
         by,
-        names,
-        np.sqrt(total(group, len(used), made.sigma**2) / count),
-        factor,
-        factor * fitted.error,
-        total(group, len(used), redundancy) / np.maximum(count - gross, 1),
-        count.astype(np.int64),
-        gross.astype(np.int64),
+        tuple(made.names[i] for i in used),
+        np.sqrt(total(made.of_effect, size, made.sigma**2)[used] / count[used]),
+        factor[used],
+        (factor * found.error)[used],
+        low[used],
+        high[used],
+        (redundancy / np.maximum(count - gross, 1))[used],
+        count[used].astype(np.int64),
+        gross[used].astype(np.int64),
         _ratio(stated),
-        _ratio(fitted.tests),
+        _ratio(found.tests),
         int((stated.dof > 0).sum()),
-        _sentences(fitted, names),
+        _sentences(np.array(made.names, dtype=object), found, redundancy, none),
     )
 
 
 def _ratio(tests: Tested) -> float:
-    # Residuals were cut at three sigmas: their mean square is that much below one.
-    return float(tests.cost.sum() / KEPT / max(int(tests.dof.sum()), 1))
+    return float(tests.cost.sum() / max(int(tests.dof.sum()), 1))
 
 
-def _sentences(fitted: Fitted, names: tuple[str, ...]) -> tuple[str, ...]:
+# Redundancy of all errors of a group together below which its level is a guess: the sigma of two errors is known to a
+# factor of two, and its weight in a fix is nearly free.
+_SCARCE = 2.0
+
+
+def _sentences(names: Array, found: Fitted, redundancy: Array, none: Array) -> tuple[str, ...]:
     """Return what the data do not tell."""
-    open_ = [names[i] for i in np.flatnonzero(fitted.shared)]
-    if not open_:
-        return ()
-    who = ", ".join(open_[:_NAMED]) + (f" and {len(open_) - _NAMED} more" if len(open_) > _NAMED else "")
-    if fitted.stay:
-        return (f"the data do not tell the noise of {who}: it stays as stated",)
-    return (f"the data do not tell the noise of {who} apart: one factor for all of them",)
+    said = []
+    if found.shared.any():
+        what = "it stays as stated" if found.stay else "one factor for all of them"
+        apart = "" if found.stay else " apart"
+        said.append(f"the data do not tell the noise of {_list(names[found.shared])}{apart}: {what}")
+    if (open_ := ~found.shared & (found.low == 0.0)).any():
+        said.append(f"the data do not tell the noise of {_list(names[open_])} from none: what is used is a floor")
+    if (scarce := np.isfinite(found.low) & (redundancy < _SCARCE)).any():
+        said.append(f"the redundancy of {_list(names[scarce])} is below two: its level is hardly more than a guess")
+    if none.any():
+        said.append(f"the data do not show that rows have an error in common: {_list(names[none])}")
+    return tuple(said)
+
+
+def _list(names: Array) -> str:
+    return ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")

@@ -16,7 +16,7 @@ from optloc.linear.normal import prior_parts, weighed
 from optloc.models import MODELS
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.layout import emission_name
-from optloc.problem.noise import Block, gathered
+from optloc.problem.noise import Block, gathered, variances
 from optloc.problem.problem import Problem
 
 By = Literal["station", "pair", "kind"]
@@ -94,7 +94,7 @@ def batch_of(problem: Problem) -> Problem:
     return flat
 
 
-def elements(problem: Problem, x: Array, by: By) -> Elements:
+def elements(problem: Problem, x: Array, by: By, common: bool = False) -> Elements:
     """Return the elements of a flat batch of problems at parameter vectors.
 
     Parameters
@@ -105,22 +105,31 @@ def elements(problem: Problem, x: Array, by: By) -> Elements:
         Their fixes, finite.
     by : "station", "pair" or "kind"
         What makes a group.
+    common : bool
+        Whether the rows of a group have an error in common in every epoch besides: a group of its own, named as
+        `common_name` says, of which the noise states nothing; its sigma is that of `typical_sigma`.
     """
     ends = ends_of(problem, by)
     names = sorted({*ends.name.ravel().tolist()} - {""})
+    size = typical_sigma(problem, by) if common else {}
     parts = []
     for first in range(0, len(x), _PART):
         items = np.arange(first, min(first + _PART, len(x)))
-        parts.append(_part(problem.take(items), x[items], by))
+        parts.append(_part(problem.take(items), x[items], by, size))
     more = sorted({name for part in parts for name in part.names} - set(names))
     return _join((*names, *more), parts)
 
 
-def _part(problem: Problem, x: Array, by: By) -> Elements:
+def _part(problem: Problem, x: Array, by: By, common: dict[str, float]) -> Elements:
     count, rows = len(x), problem.count
     present = np.broadcast_to(problem.weight > 0.0, (count, rows))
     residual, jacobian = _linearise(problem, x)
     effect, error_names, sigma = _effects(problem, by, present)
+    if common:
+        more, more_names, size = common_effects(problem, by, common)
+        effect = np.concatenate([effect, np.broadcast_to(more, (count, *more.shape))], axis=-1)
+        sigma = np.concatenate([sigma, np.broadcast_to(size, (count, len(size)))], axis=-1)
+        error_names = np.concatenate([error_names, more_names])
     offset, offset_names = _offsets(problem, by)
     names = tuple(sorted({*error_names.tolist(), *offset_names.tolist()} - {""}))
     number = {name: i for i, name in enumerate(names)} | {"": -1}
@@ -209,6 +218,36 @@ def _offsets(problem: Problem, by: By) -> tuple[Array, Array]:
     ends = ends_of(problem, by)
     names = np.array(sorted({*ends.name.ravel().tolist()} - {""}), dtype=object)
     return ((ends.name[..., None] == names) * ends.sign[..., None]).sum(1), names
+
+
+def common_name(name: str) -> str:
+    """Return the name of the error that all rows of a group have in common in an epoch."""
+    return f"{name} common"
+
+
+def typical_sigma(problem: Problem, by: By) -> dict[str, float]:
+    """Return the stated standard deviation of the rows of each group, root mean square over all problems."""
+    variance = np.broadcast_to(variances(problem.noise, problem.count), (problem.batch_shape[0], problem.count))
+    weight, ends = np.broadcast_to(problem.weight > 0.0, variance.shape), ends_of(problem, by).name
+    found = {}
+    for name in sorted({*ends.ravel().tolist()} - {""}):
+        own = weight & (ends == name).any(1)
+        if own.any():
+            found[name] = float(np.sqrt(variance[own].mean()))
+    return found
+
+
+def common_effects(problem: Problem, by: By, size: dict[str, float]) -> tuple[Array, Array, Array]:
+    """Return the effects (m, c) of errors that the rows of a group have in common in an epoch, names and sizes (c,)."""
+    ends, epoch = ends_of(problem, by), problem.epoch
+    columns, names = [], []
+    for name, own in size.items():
+        sign = np.where(ends.name == name, ends.sign, 0.0).sum(1)
+        for k in np.unique(epoch[sign != 0.0]):
+            columns.append(np.where(epoch == k, sign, 0.0) * own)
+            names.append(name)
+    sizes = np.array([size[name] for name in names])
+    return np.stack(columns, axis=-1), np.array([common_name(name) for name in names], dtype=object), sizes
 
 
 def _ungrouped_noise(problem: Problem, x: Array) -> Array:
