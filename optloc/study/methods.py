@@ -94,7 +94,8 @@ def methods_of(table: MethodTable, number: int) -> Iterator[Method]:
     Raises
     ------
     InvalidProblem
-        For an unknown method, baseline or solver, naming the nearest, or a solver that is not installed.
+        For an unknown method, baseline or solver, naming the nearest, a solver that is not installed, or a setting that
+        a file must not make.
     """
     where = f"[[method]] {number}" if table.name is None else f"method {table.name!r}"
     if (table.method is None) == (table.baseline is None):
@@ -113,6 +114,7 @@ def methods_of(table: MethodTable, number: int) -> Iterator[Method]:
             raise InvalidProblem(f"unknown baseline {name!r}", where, nearest(name, list(BASELINES)))
         if solver is not None:
             backend_kind(solver, join(where, "solver"))
+            check_settings(solver, table.settings, join(where, "settings"))
         elif table.settings:
             raise InvalidProblem("settings belong to a solver", join(where, "settings"), "name it in 'solver'")
         yield Method(
@@ -194,6 +196,95 @@ def _solved(method: Method, drawn: Drawn) -> Fix:
     fix = solve(drawn.problem, method.method)
     # A batch of one has no axis of its own.
     return fix if fix.shape else fix.flat()
+
+
+# Settings of back ends. A study file comes from anybody: it may say how hard a solver tries, and nothing else. Options
+# that name files, libraries, compilers or callbacks are no settings here, and what is not in the table is out of reach.
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """A number, or a yes or no, that a study file may give to a back end.
+
+    Parameters
+    ----------
+    kind : type
+        bool, int or float.
+    least, most : float
+        Ends of what is taken; of no meaning for bool.
+    """
+
+    kind: type[bool | int | float]
+    least: float = 0.0
+    most: float = 1.0
+
+    def __str__(self) -> str:
+        """Return what is taken, in words."""
+        if self.kind is bool:
+            return "true or false"
+        return f"{'a whole number' if self.kind is int else 'a number'} from {self.least:g} to {self.most:g}"
+
+    def takes(self, value: object) -> bool:
+        """Return whether a value is of its kind and in its range; a whole number is a number too."""
+        if isinstance(value, bool) or self.kind is bool:
+            return isinstance(value, bool) and self.kind is bool
+        whole = isinstance(value, int) or (self.kind is float and isinstance(value, float))
+        return whole and self.least <= float(value) <= self.most  # type: ignore[arg-type]  # a number by now
+
+
+# Tolerances below the precision of numbers make every solve fail; a billion iterations, or a day, are no limit.
+_TOLERANCE, _COUNT, _SECONDS = Setting(float, 1e-16, 1.0), Setting(int, 1, 1e9), Setting(float, 1e-3, 86_400.0)
+_FACTOR, _SIZE, _SWITCH = Setting(float, 0.0, 1.0), Setting(float, 0.0, 1e12), Setting(bool)
+_SQP = {"max_iter": _COUNT, "min_iter": _COUNT, "tol_pr": _TOLERANCE, "tol_du": _TOLERANCE}
+SETTINGS: dict[str, dict[str, Setting]] = {
+    "CLARABEL": {
+        **dict.fromkeys(("tol_gap_abs", "tol_gap_rel", "tol_feas", "tol_infeas_abs", "tol_infeas_rel"), _TOLERANCE),
+        **dict.fromkeys(("reduced_tol_gap_abs", "reduced_tol_gap_rel", "reduced_tol_feas"), _TOLERANCE),
+        **dict.fromkeys(("static_regularization_constant", "static_regularization_proportional"), _FACTOR),
+        **dict.fromkeys(("dynamic_regularization_eps", "dynamic_regularization_delta", "max_step_fraction"), _FACTOR),
+        **dict.fromkeys(("static_regularization_enable", "dynamic_regularization_enable"), _SWITCH),
+        **dict.fromkeys(("equilibrate_enable", "iterative_refinement_enable"), _SWITCH),
+        **dict.fromkeys(("max_iter", "equilibrate_max_iter", "iterative_refinement_max_iter"), _COUNT),
+        "time_limit": _SECONDS,
+    },
+    "SCS": {
+        **dict.fromkeys(("eps", "eps_abs", "eps_rel", "eps_infeas"), _TOLERANCE),
+        **dict.fromkeys(("normalize", "adaptive_scale"), _SWITCH),
+        **dict.fromkeys(("scale", "rho_x"), _SIZE),
+        "alpha": Setting(float, 0.0, 2.0),
+        "max_iters": _COUNT,
+        "acceleration_lookback": Setting(int, -100, 100),
+        "acceleration_interval": _COUNT,
+        "time_limit_secs": _SECONDS,
+    },
+    "CVXOPT": {
+        **dict.fromkeys(("abstol", "reltol", "feastol"), _TOLERANCE),
+        "max_iters": _COUNT,
+        "refinement": Setting(int, 0, 100),
+    },
+    "QOCO": {**dict.fromkeys(("abstol", "reltol", "abstol_inacc", "reltol_inacc"), _TOLERANCE), "max_iters": _COUNT},
+    "ipopt": {
+        **dict.fromkeys(("tol", "acceptable_tol", "dual_inf_tol", "constr_viol_tol", "compl_inf_tol"), _TOLERANCE),
+        **dict.fromkeys(("max_iter", "acceptable_iter"), _COUNT),
+        **dict.fromkeys(("max_cpu_time", "max_wall_time"), _SECONDS),
+        **dict.fromkeys(("mu_init", "bound_push", "bound_frac", "bound_relax_factor"), _FACTOR),
+    },
+    "sqpmethod": {**_SQP, **dict.fromkeys(("beta", "c1", "min_step_size"), _FACTOR), "max_iter_ls": _COUNT},
+    "feasiblesqpmethod": {**_SQP, "max_inner_iter": _COUNT, "feas_tol": _TOLERANCE, "optim_tol": _TOLERANCE},
+    "sleqp": {"max_iter": _COUNT, "max_wall_time": _SECONDS},
+}
+"""What a study file may set, by back end; of those that are missing nothing."""
+
+
+def check_settings(solver: str, settings: dict[str, Any], where: str) -> None:
+    """Raise InvalidProblem for settings that a file must not make of a back end: unknown or out of range."""
+    known = SETTINGS.get(solver, {})
+    for name, value in settings.items():
+        if name not in known:
+            advice = f"a study may set {', '.join(sorted(known))}" if known else "a study sets nothing of this solver"
+            raise InvalidProblem(f"{name!r} is no setting of {solver} that a file may make", where, advice)
+        if not known[name].takes(value):
+            raise InvalidProblem(f"{name} is {value!r}", where, f"it takes {known[name]}")
 
 
 # Back ends that are installed here: conic solvers of cvxpy, nonlinear ones of CasADi, least squares.

@@ -2,12 +2,16 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from study.texts import QUICK, plan
 from typer.testing import CliRunner
 
+import optloc
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
+from optloc.solvers.methods import Choice, counting, using
+from optloc.study.methods import SETTINGS, backends, check_settings
 from optloc.study.plan import plan_of, shipped
 from optloc.study.trial import compute
 
@@ -20,6 +24,28 @@ BAD = {
     "solver": ('"gtrs+lsr"', '"sdp"\nsolver = "SCZ"', "unknown solver 'SCZ'; did you mean 'SCS'"),
     "licence": ('"gtrs+lsr"', '"gtrs+nlp"\nsolver = "snopt"', "the solver 'snopt' is not installed"),
     "settings": ('"gtrs+lsr"', '"gtrs+lsr"\nsettings = { eps = 1 }', "settings belong to a solver"),
+    **{
+        f"hostile {i}": ('"gtrs+lsr"', f'"{method}"\nsolver = "{solver}"\nsettings = {{ {hostile} }}', words)
+        for i, (method, solver, hostile, words) in enumerate(
+            [
+                ("gtrs+nlp", "sqpmethod", 'jit = true, compiler = "shell"', "'jit' is no setting of sqpmethod"),
+                ("gtrs+nlp", "sqpmethod", 'jit_options = { compiler = "true; cc" }', "'jit_options' is no setting"),
+                ("gtrs+nlp", "ipopt", 'output_file = "stray.txt"', "'output_file' is no setting of ipopt"),
+                ("gtrs+nlp", "ipopt", 'option_file_name = "stray.opt"', "'option_file_name' is no setting"),
+                ("gtrs+nlp", "ipopt", 'linear_solver = "ma27"', "'linear_solver' is no setting of ipopt"),
+                ("sdp", "SCS", 'write_data_filename = "stray"', "'write_data_filename' is no setting of SCS"),
+                ("sdp", "SCS", 'log_csv_filename = "stray.csv"', "a study may set acceleration_interval"),
+                ("sdp", "CLARABEL", 'direct_solve_method = "pardiso"', "'direct_solve_method' is no setting"),
+                ("sdp", "SCS", "max_iters = -1", "max_iters is -1"),
+                ("sdp", "SCS", "max_iters = 2.5", "it takes a whole number from 1 to 1e+09"),
+                ("sdp", "SCS", 'eps_abs = "1e-3"', "eps_abs is '1e-3'"),
+                ("sdp", "SCS", "eps_abs = nan", "eps_abs is nan"),
+                ("sdp", "SCS", "normalize = 1", "it takes true or false"),
+                ("sdp", "SCS", "eps_abs = true", "eps_abs is True"),
+                ("gtrs+nlp", "fatrop", "max_iter = 3", "a study sets nothing of this solver"),
+            ]
+        )
+    },
     "kind": ('["toa"]', '["taoa"]', "unknown kind 'taoa'; did you mean 'toa'"),
     "geometry": ("layout = { stations = 6 }", "", "a scenario has one geometry"),
     "problem": ("layout = { stations = 6 }", 'problem = "dema"', "unknown problem 'dema'; did you mean 'demo'"),
@@ -56,6 +82,24 @@ def test_bad_studies_are_one_sentence(name, tmp_path):
     result = RUN.invoke(app, ["study", "run", str(tmp_path / "s.toml"), "--out", str(tmp_path / "out")])
     assert words in sentence(result)
     assert not (tmp_path / "out").exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["s.toml"]
+
+
+@pytest.mark.parametrize("solver", [name for name, own in SETTINGS.items() if own and name in backends()])
+def test_every_setting_of_the_table_is_one_that_its_back_end_knows(solver):
+    """A library refuses a name that it does not know."""
+    backend = backends()[solver]
+    middle = {bool: True, int: 50, float: 1e-4}
+    given = {name: max(middle[one.kind], one.least) for name, one in SETTINGS[solver].items()}
+    given |= {name: 10.0 for name in given if "time" in name}
+    given.pop("eps", None)  # stands for eps_abs and eps_rel, and not beside them
+    check_settings(solver, given, "settings")
+    stations = np.random.default_rng(3).uniform(-5e3, 5e3, (6, 3))
+    template = optloc.assemble(stations, optloc.measured("range", a=np.arange(6), sigma=10.0))
+    problem = optloc.simulate(template, [1e3, 500.0, 200.0], 1)
+    with using(Choice(backend.kind, solver, given)), counting() as tally:
+        optloc.solve(problem, "socp" if backend.kind == "conic" else "gtrs+nlp")
+    assert solver in {name for name, _ in tally}
 
 
 @pytest.mark.parametrize(
