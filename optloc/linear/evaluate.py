@@ -419,7 +419,7 @@ _Terms = list[tuple[Array, Array, Any]]
 
 def _derive(problem: Problem, plan: Plan, x: Array) -> tuple[Any, _Terms]:
     """Return the values (..., m) of one block, biases included, and their derivatives."""
-    jet, m, fold = plan.model.h(*points(problem, plan, x, differentiate=True)), plan.block.count, _fold(problem)
+    jet, m, fold = plan.model.h(*points(problem, plan, x, differentiate=True)), plan.block.count, _fold(problem.layout)
     # A kind that nothing moves (known targets and stations) has a value without derivatives.
     if not isinstance(jet, Jet):
         jet = Jet(placed(np.asarray(jet), x), {})
@@ -436,9 +436,9 @@ def _derive(problem: Problem, plan: Plan, x: Array) -> tuple[Any, _Terms]:
     return value, terms
 
 
-def _fold(problem: Problem) -> Any:
+def _fold(layout: Layout) -> Any:
     """Return the map from columns of the full vector to columns of [shared, local of the row's epoch]."""
-    n, length = problem.layout.n_shared, problem.layout.n_local
+    n, length = layout.n_shared, layout.n_local
 
     def fold(column: Array) -> Array:
         return column if length == 0 else np.where(column < n, column, n + (column - n) % length)

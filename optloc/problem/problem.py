@@ -194,53 +194,47 @@ def _join(parts: list[Array]) -> Array:
     return joined
 
 
+# The numbers of each part of a problem, and their unbatched ranks. Index arrays are shared by the batch and are none.
+_NUMBERS: dict[type, dict[str, int]] = {
+    Stations: {"position": 3, "velocity": 3, "axes": 4, "covariance": 3},
+    Rows: {"z": 1, "weight": 1, "correction": 1},
+    Block: {"covariance": 3},
+    Motion: {"known": 3},
+    Prior: {"mean": 1, "covariance": 2},
+    Band: {"lower": 0, "upper": 0, "coefficients": 1},
+    Polygon: {},
+}
+
+
+def _numbers(part: Any) -> list[tuple[str, Array, int]]:
+    found = [(name, getattr(part, name), core) for name, core in _NUMBERS[type(part)].items()]
+    return [one for one in found if one[1] is not None]
+
+
 def _arrays(problem: Problem) -> list[tuple[Array, int]]:
-    found: list[tuple[Array, int]] = []
-
-    def note(array: Array, core: int) -> Array:
-        found.append((array, core))
-        return array
-
-    _map(problem, note)
-    return found
+    blocks = problem.noise.blocks
+    parts = (problem.stations, *problem.rows, *blocks, *problem.motions, *problem.priors, *problem.constraints)
+    return [(array, core) for part in parts for _, array, core in _numbers(part)]
 
 
 def _map(problem: Problem, change: Any) -> Problem:
     """Return the problem with every numeric array replaced; `change` gets the array and its unbatched rank."""
 
-    def maybe(array: Array | None, core: int) -> Array | None:
-        return None if array is None else change(array, core)
+    def changed(part: Any) -> Any:
+        numbers = {name: change(array, core) for name, array, core in _numbers(part)}
+        return replace(part, **numbers) if numbers else part
 
-    s = problem.stations
-    stations = replace(
-        s,
-        position=change(s.position, 3),
-        velocity=maybe(s.velocity, 3),
-        axes=maybe(s.axes, 4),
-        covariance=maybe(s.covariance, 3),
-    )
-    rows = tuple(
-        replace(r, z=change(r.z, 1), weight=change(r.weight, 1), correction=change(r.correction, 1))
-        for r in problem.rows
-    )
-    # Index arrays are shared by the batch and are not numbers: they stay as they are.
-    noise = Noise(tuple(Block(b.row, change(b.covariance, 3)) for b in problem.noise.blocks))
-    motions = tuple(replace(m, known=maybe(m.known, 3)) for m in problem.motions)
-    priors = tuple(replace(p, mean=change(p.mean, 1), covariance=change(p.covariance, 2)) for p in problem.priors)
-    constraints = tuple(
-        c
-        if isinstance(c, Polygon)
-        else replace(c, lower=change(c.lower, 0), upper=change(c.upper, 0), coefficients=change(c.coefficients, 1))
-        for c in problem.constraints
-    )
+    def each(parts: tuple[Any, ...]) -> tuple[Any, ...]:
+        return tuple(changed(part) for part in parts)
+
     return replace(
         problem,
-        stations=stations,
-        rows=rows,
-        noise=noise,
-        motions=motions,
-        priors=priors,
-        constraints=constraints,
+        stations=changed(problem.stations),
+        rows=each(problem.rows),
+        noise=Noise(each(problem.noise.blocks)),
+        motions=each(problem.motions),
+        priors=each(problem.priors),
+        constraints=each(problem.constraints),
     )
 
 

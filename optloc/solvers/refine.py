@@ -169,13 +169,15 @@ def _iterate(problem: Problem, start: Array, weights: _Weights, rules: Rules) ->
     with np.errstate(all="ignore"):
         start = restore(problem, rules.face, start) if rules.face else start
         state = _State.begin(problem, start, weights)
-        active, blur = np.arange(len(start)), _blur(problem, len(start))
+        active, part = np.arange(len(start)), _Part(problem, weights, _blur(problem, len(start)))
         for iteration in range(rules.limit):
             # The status until another is found: what still moves.
-            active = active[state.status[active] == Status.MAX_ITERATIONS]
-            if not len(active):
+            moving = np.flatnonzero(state.status[active] == Status.MAX_ITERATIONS)
+            if not len(moving):
                 break
-            part = _Part.of(problem, weights, blur, active)
+            # As long as all move, nothing is copied.
+            if len(moving) < len(active):
+                active, part = active[moving], part.take(moving)
             _advance(part, state, active, rules, iteration)
     return Refined(state.x, state.equations.cost, state.status, state.iterations, lambda: state.equations)
 
@@ -215,12 +217,9 @@ class _Part:
     weights: _Weights
     blur: Array
 
-    @classmethod
-    def of(cls, problem: Problem, weights: _Weights, blur: Array, active: Array) -> _Part:
-        # All still move: nothing is copied.
-        if len(active) == len(blur):
-            return cls(problem, weights, blur)
-        return cls(problem.take(active), weights.take(active), blur[active])
+    def take(self, items: Array) -> _Part:
+        """Return some of them."""
+        return _Part(self.problem.take(items), self.weights.take(items), self.blur[items])
 
 
 def _blur(problem: Problem, count: int) -> Array:
