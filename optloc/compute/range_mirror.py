@@ -61,7 +61,7 @@ _FREE = 1e-5
 _MOST = 60
 # Squared standard deviations about the fix in which a point belongs to it, if its cost has at least this share of the
 # rise that the fix's own curvature says: another minimum would be cheaper.
-_NEAR, _RISEN = 9.0, 0.5
+NEAR, RISEN = 9.0, 0.5
 # Squared length of the undamped step, in standard deviations, below which a refinement has arrived: a hundredth of one.
 _ARRIVED = 1e-4
 # Share of its diagonal that a pivot must keep: below it the curvature is rounding.
@@ -230,7 +230,7 @@ def watch(model: Model, room: Room, nearest: Array, every: bool) -> float:
         # the gain is that of the damped step: within the ball the damping is worth no more than this
         least = scalar[COST, lane] - scalar[GAIN, lane] - scalar[DAMPING, lane] * trace[lane] * ball
         far = np.sqrt(max(least, 0.0)) >= np.sqrt(scalar[FIX_COST, lane] + LISTED) + bow * ball / nearest[lane]
-        near = spare[lane] < _NEAR and scalar[COST, lane] - scalar[FIX_COST, lane] > _RISEN * spare[lane]
+        near = spare[lane] < NEAR and scalar[COST, lane] - scalar[FIX_COST, lane] > RISEN * spare[lane]
         far = far and scalar[DAMPING, lane] <= _FREE and not every
         up = far or near or scalar[STEPS, lane] >= _MOST
         scalar[GOOD, lane] = 0.0 if up and scalar[ALIVE, lane] != 0.0 else scalar[GOOD, lane]

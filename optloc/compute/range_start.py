@@ -14,8 +14,8 @@ from optloc.compute.systems import LANES
 # Least distance from a station that weighs a row, in units of the stations' spread: at the station itself a squared
 # range has no first-order error, and its weight would be infinite.
 _NEAR = 1e-3
-# Four roundings of a double lie between a measurement and its residual.
-_ROUNDING = 4.0 * 2.220446049250313e-16
+ROUNDING = 4.0 * 2.220446049250313e-16
+"""Share of a measurement that is rounding: four of a double lie between it and its residual."""
 
 
 @compiled
@@ -60,7 +60,7 @@ def read(
             blur[lane] += row[1, j] * out[j, lane] * out[j, lane]
             good[lane] = good[lane] if abs(out[j, lane]) < np.inf else 0.0
     for lane in range(LANES):
-        blur[lane] = _ROUNDING * np.sqrt(blur[lane])
+        blur[lane] = ROUNDING * np.sqrt(blur[lane])
     for j in range(m - 1, -1, -1):  # an anchor is the first of its rows: it goes last
         if anchor[j] >= 0:
             for lane in range(LANES):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from time import perf_counter
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,7 @@ from optloc.base.frames import Frame
 from optloc.base.records import take
 from optloc.base.threads import mapped
 from optloc.base.types import Array, Status
+from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge
 from optloc.compute.jit import enabled
 from optloc.linear.normal import degrees_of_freedom, depends_on_place, weighed
 from optloc.models import MODELS
@@ -221,10 +223,12 @@ class Quick:
     def __call__(self, problem: Problem, pool: Pool | None) -> Pool:
         """Return the settled pools of a flat batch of problems."""
         count = problem.batch_shape[0]
-        plan = direct(problem) if pool is None and count >= self.least else None
+        plan = direct(problem) if pool is None and (self.alone or count >= self.least) else None
         refinement: Callable[[Problem, Pool], Pool] = lsr_with_mirror if self.alone else lsr
-        if plan is None:
+        if plan is None or count < self.least:
             start = pool
+            if plan is not None:
+                refinement = partial(lsr_with_mirror, descend=partial(_descend, plan))
 
             def work(some: Problem, part: slice) -> Pool:
                 return refinement(some, gtrs(some, None if start is None else take(start, part)))
@@ -279,6 +283,53 @@ def settle_directly(
         return pool
     start = take(start, lost)
     return pool.merge(left[lost], in_parts(some.take(lost), lambda part, own: refinement(part, take(start, own))))
+
+
+def _descend(direct: Direct, problem: Problem, x: Array) -> Array:
+    """Return where the damped refinement of starts and images (N, 2 q, d) of few problems ends; NaN where it does not.
+
+    A third of the time of one that knows all kinds: an image takes ten steps, or fifty. Images that are back at the
+    minimum of their start are given up, as in `optloc.compute.range_mirror.watch`.
+    """
+    from optloc.compute.range_mirror import NEAR, RISEN
+    from optloc.compute.range_start import ROUNDING, Model
+
+    model, d, q = Model(*direct.maps), x.shape[-1], x.shape[1] // 2  # type: ignore[arg-type]
+    position = problem.stations.position
+    first, place = len(direct.station), position.reshape(-1, *position.shape[-2:])[:, None, direct.station]
+    z = np.where(model.row[1] > 0.0, problem.z - model.row[0], 0.0)
+    blur = ROUNDING * np.sqrt((model.row[1] * z * z).sum(-1))[:, None]
+    z = z - np.where(model.anchor >= 0, z[:, model.anchor], 0.0)
+    u = (z @ model.linear[first : first + len(model.K)].T)[:, None]
+
+    def equations(at: Array) -> tuple[Array, Array, Array]:
+        apart = at[..., None, :] - place
+        r = np.sqrt((apart * apart).sum(-1))
+        left, rows = u - r @ model.K.T, model.K @ (apart / r[..., None])
+        return (left * left).sum(-1), np.swapaxes(rows, -1, -2) @ rows, (left[..., None, :] @ rows)[..., 0, :]
+
+    with np.errstate(all="ignore"):
+        cost, matrix, right = equations(x)
+        alive, done = np.isfinite(cost), np.zeros(x.shape[:2], dtype=bool)
+        damping, growth = np.full(cost.shape, FIRST_DAMPING), np.full(cost.shape, FIRST_GROWTH)
+        for _ in range(_LIMIT):
+            if not alive.any():
+                break
+            move, solvable = linalg.solve(matrix * (1.0 + damping[..., None, None] * np.eye(d)), right[..., None])
+            after, steeper, pull = equations(x + move[..., 0])
+            gain = (move[..., 0] * right).sum(-1)
+            found = judge(cost, after, gain, solvable & alive, blur, damping, growth, _TOLERANCE, True)
+            better = found.better
+            x, cost = np.where(better[..., None], x + move[..., 0], x), np.where(better, after, cost)
+            matrix = np.where(better[..., None, None], steeper, matrix)
+            right, damping, growth = np.where(better[..., None], pull, right), found.damping, found.growth
+            done |= found.small
+            alive &= ~(found.small | found.stuck)
+            apart = x[:, q:] - x[:, :q]
+            squared = ((matrix[:, :q] @ apart[..., None])[..., 0] * apart).sum(-1)
+            back = (squared < NEAR) & (cost[:, q:] - cost[:, :q] > RISEN * squared)
+            alive[:, q:] &= ~(back & done[:, :q])
+    return np.where(done[..., None], x, np.nan)
 
 
 def fix_directly(

@@ -79,17 +79,33 @@ def gtrs_lsr(problem: Problem, pool: Pool | None) -> Pool:
     return lsr_with_mirror(problem, gtrs(problem, pool))
 
 
-def lsr_with_mirror(problem: Problem, start: Pool) -> Pool:
+def lsr_with_mirror(problem: Problem, start: Pool, descend: Callable[[Problem, Array], Array] | None = None) -> Pool:
     """Return starts and their mirror images, refined.
 
     The image in the plane (or line) that fits the stations best is where flat networks have their second minimum; one
     that ends where an undamped step would lead on is no minimum.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    start : Pool
+        Starts.
+    descend : callable, optional
+        Moves positions (N, 2 q, d), starts and then images, to the minima that refinement leads to, more quickly; NaN
+        where it leads to none, or an image to the minimum of its start.
     """
     if not one_position(problem):
         return lsr(problem, start)
     slot, _ = problem.layout.find("position")
     position = start.x[..., slot.start : slot.start + slot.size]
-    x = pack(np.concatenate([start.x, vectors(problem, mirror(problem, position))], axis=1))
+    image = mirror(problem, position)
+    x = np.concatenate([start.x, vectors(problem, image)], axis=1)
+    if descend is not None:
+        q, ahead = start.x.shape[1], vectors(problem, descend(problem, np.concatenate([position, image], axis=1)))
+        # starts that lead nowhere are the refinement's to judge
+        x = np.where(np.isnan(ahead) & (np.arange(2 * q) < q)[:, None], x, ahead)
+    x = pack(x)
     both = replace(offer(problem, x, start, "", perf_counter()), stages=start.stages)
     # where an image runs to infinity its cost is one of many there, and not the least: nobody has looked
     return replace(_without_halted(problem, lsr(problem, both)), infinity=None)

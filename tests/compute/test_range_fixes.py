@@ -11,8 +11,10 @@ from optloc.base.types import Array
 from optloc.compute.jit import enabled
 from optloc.problem.chart import basis
 from optloc.solvers import policy
-from optloc.solvers.range_fixes import direct, fix_directly
-from optloc.solvers.stages import gtrs_lsr
+from optloc.solvers.range_fixes import _descend, direct, fix_directly
+from optloc.solvers.refine import refine
+from optloc.solvers.stages import gtrs, gtrs_lsr
+from optloc.solvers.starts.position import mirror
 from optloc.solvers.verdict.judge import verdict
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="there is no direct way without machine code")
@@ -216,6 +218,32 @@ def test_the_stages_find_the_same_rivals():
     assert (fix.code == Status.AMBIGUOUS).sum() >= 1
     few = solve(problem.take(np.arange(10)), "gtrs+lsr")  # too few for the compiled call
     assert np.array_equal(few.code, other.code[:10])
+
+
+@pytest.mark.parametrize("kind", ["tdoa", "range"])
+def test_few_descend_to_where_the_refinement_of_all_kinds_ends(kind):
+    made = flat(kind, 6, 100, 40)
+    problem = made.problem
+    start = gtrs(problem, None).x[:, :1]
+    x = np.concatenate([start, mirror(problem, start)], axis=1)
+    found = _descend(direct(problem), problem, x)
+    first, second = (refine(problem, x[:, i], limit=100) for i in (0, 1))
+    ended = first.status == Status.OK
+    assert ended.mean() > 0.9
+    assert np.array_equal(np.isfinite(found[:, 0]).all(-1), ended)
+    # runs to infinity end where rounding says so
+    near = ended & (second.status == Status.OK) & (np.sqrt((second.x**2).sum(-1)) < 1e5)
+    led = np.isfinite(found[:, 1]).all(-1)
+    assert (near & led).sum() > 5
+    for i in np.flatnonzero(near):
+        A = made.information(i, first.x[i])
+        apart = found[i, 0] - first.x[i]
+        assert apart @ A @ apart < 1e-6
+        if led[i]:
+            assert made.cost(i, found[i, 1]) == pytest.approx(second.cost[i], rel=1e-9, abs=1e-6)
+        else:  # given up where it leads back to its start only
+            back = second.x[i] - first.x[i]
+            assert back @ A @ back < policy.SAME_PLACE
 
 
 def test_thresholds_are_those_of_the_policy():
