@@ -8,15 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from optloc.adequacy.elements import Elements, elements, kinds_of
+from optloc.adequacy.groups import ROW_PRICE
 from optloc.adequacy.variance_components import Tested, fit, tested, total
 from optloc.base.types import Array
 from optloc.problem.noise import Noise
 from optloc.problem.problem import Problem
 
-PRICE = 16.0
-"""Cost of leaving out one measurement, and of one factor more: about twice the logarithm of prior odds of 100:1 times a
-spread of 100 sigma over the root of 2 pi. It is the price of the suspects of one fix, and keeps clean data as stated: a
-factor gains as much once in 16 000 batches."""
+SEVERAL = 3
+"""Fixes from which the level of the noise is asked for: of fewer one liar each is as likely."""
 
 ACCUSED = 0.01
 """Chi-square probability below which a fix accuses somebody: that from which `robust` looks for suspects."""
@@ -82,6 +81,16 @@ class CommonLevel:
             return f"{accused}, and what is wrong is {self.alone}: {what}, or biased"
         return ""
 
+    @property
+    def refutes(self) -> bool:
+        """Return whether noise is stated too small: what is claimed of such fixes does not hold."""
+        return self.suspect and bool((self.factor > 1.0).any())
+
+    def sizes(self, problem: Problem) -> Array:
+        """Return the factors (m,) of the rows of a problem."""
+        factor = dict(zip(self.kinds, self.factor.tolist(), strict=True))
+        return np.array([factor.get(kind, 1.0) for kind in kinds_of(problem).tolist()])
+
     def scale(self, problem: Problem) -> Problem:
         """Return a problem of the same kinds with its noise times the factors.
 
@@ -90,8 +99,7 @@ class CommonLevel:
         problem : Problem
             Of any epochs; kinds that were not there stay as they are.
         """
-        factor = dict(zip(self.kinds, self.factor.tolist(), strict=True))
-        size = np.array([factor.get(kind, 1.0) for kind in kinds_of(problem).tolist()])
+        size = self.sizes(problem)
         blocks = [
             replace(b, covariance=b.covariance * size[b.row][:, :, None] * size[b.row][:, None, :])
             for b in problem.noise.blocks
@@ -104,7 +112,7 @@ def common_level_at(problem: Problem, x: Array) -> CommonLevel:
 
     Every fix may leave out measurements at a price each, under any of these: a few liars are no larger noise. Of a fix
     whose cost is c_k without k measurements and whose redundancy then is r_k, twice the negative logarithm of the
-    restricted likelihood with sigma times f is ``c_k / f^2 + r_k ln f^2`` and the price of k (see `PRICE`); the
+    restricted likelihood with sigma times f is ``c_k / f^2 + r_k ln f^2`` and the price of k (see `ROW_PRICE`); the
     measurements that are left out are those that stand out most, one after another, to first order at the fix. A
     factor of one station or kind changes c and r by the update of V for its errors. What is cheapest over all fixes,
     the price of its factor included, is what is told; the factors are those of `variance_components.fit`.
@@ -137,7 +145,7 @@ def common_level_at(problem: Problem, x: Array) -> CommonLevel:
     single += [*_alone(by_kind, tested(by_kind, np.ones(())), cost, dof)] if len(kinds) > 1 else []
     name, size, least = min(single, key=lambda one: one[2], default=("", np.nan, np.inf))
     gain = float(stated.sum() - min(common.min(), least))
-    if gain <= PRICE:
+    if gain <= ROW_PRICE:
         return none
     if least < common.min() and name not in kinds:
         return replace(none, alone=name, size=size, gain=gain)
@@ -176,7 +184,7 @@ def _path(tests: Tested) -> tuple[Array, Array]:
     while True:
         sigmas = np.abs(tests.sigmas[:, : tests.errors])
         worst = sigmas.argmax(1)
-        hit = (sigmas[np.arange(len(worst)), worst] > np.sqrt(PRICE)) & (tests.dof > 0)
+        hit = (sigmas[np.arange(len(worst)), worst] > np.sqrt(ROW_PRICE)) & (tests.dof > 0)
         if not hit.any():
             return np.stack(costs, axis=1), np.stack(dofs, axis=1)
         tests = tests.without(np.where(hit, worst, -1))
@@ -187,7 +195,7 @@ def _path(tests: Tested) -> tuple[Array, Array]:
 def _least(cost: Array, dof: Array, factor: float) -> Array:
     """Return the least of twice the negative log-likelihood of each fix (N,) with sigma times a factor."""
     left = np.arange(cost.shape[1])
-    return np.asarray((cost / factor**2 + dof * np.log(factor**2) + PRICE * left).min(1))
+    return np.asarray((cost / factor**2 + dof * np.log(factor**2) + ROW_PRICE * left).min(1))
 
 
 def _alone(made: Elements, tests: Tested, cost: Array, dof: Array) -> Iterator[tuple[str, float, float]]:
@@ -197,7 +205,7 @@ def _alone(made: Elements, tests: Tested, cost: Array, dof: Array) -> Iterator[t
     which t has the components y, the cost falls by (f^2 - 1) y^2 / (1 + (f^2 - 1) l), summed, and the determinants grow
     by 1 + (f^2 - 1) l (A. J. Woodbury 1950), also of a fix that leaves out another measurement instead.
     """
-    left = PRICE * np.arange(1, cost.shape[1])
+    left = ROW_PRICE * np.arange(1, cost.shape[1])
     instead = (cost[:, 1:] + left).min(1, initial=np.inf)
     for g in np.flatnonzero(total(made.of_effect, len(made.names))):
         own = made.of_effect == g

@@ -16,7 +16,7 @@ from rich.text import Text
 from optloc.adequacy.advice import advise, advise_at
 from optloc.adequacy.elements import GROUPINGS, By, batch_of
 from optloc.adequacy.geometry import Advice
-from optloc.adequacy.level import CommonLevel, common_level_at
+from optloc.adequacy.level import SEVERAL, CommonLevel, common_level_at
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import ANSWERED, Array, Status
 from optloc.cli.file_fixes import (
@@ -340,10 +340,6 @@ def _estimate_noise(loaded: Loaded, by: str | None) -> Loaded:
     return replace(loaded, problem=problem, levels=levels)
 
 
-# Fixes from which the level of the noise is asked for: of fewer one liar is as likely.
-_SEVERAL = 3
-
-
 def _common_level(problem: Problem) -> CommonLevel:
     """Return whether the noise of a file is stated wrong; raise InvalidProblem where its epochs cannot tell."""
     try:
@@ -354,7 +350,7 @@ def _common_level(problem: Problem) -> CommonLevel:
 
 def _level_of(found: FileFixes) -> CommonLevel | None:
     """Return whether the fixes of a file accuse its noise; None of one fix, and where none is but ok."""
-    if not found.fixes[0].shape or sum(map(len, found.fixes)) < _SEVERAL:
+    if not found.fixes[0].shape or sum(map(len, found.fixes)) < SEVERAL:
         return None
     if all(bool((fix.code == Status.OK).all()) and fix.explanations is None for fix in found.fixes):
         return None

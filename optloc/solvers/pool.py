@@ -99,6 +99,8 @@ class Pool:
         What lies behind the Earth, in words; "" where nothing does.
     asked : bool
         Whether contradictions were looked into.
+    refuted : str
+        Why the noise of all of them cannot be as stated, or "".
     conclusion : object array (N,), optional
         What explains the data where they contradict each other, an `optloc.solvers.verdict.conclusion.Conclusion`; or
         a `Fix` from outside that stands as it is.
@@ -122,6 +124,7 @@ class Pool:
     certificate: Annotated[Array, Axes(0, empty=None)] | None = None
     hidden: Annotated[Array, Axes(0, empty="")] | None = None
     asked: bool = False
+    refuted: str = ""
     conclusion: Annotated[Array, Axes(0, empty=None)] | None = None
 
     def __len__(self) -> int:

@@ -17,7 +17,7 @@ from optloc.problem.fix import Alternatives, Explanation, Fix, Suspect
 from optloc.problem.layout import Layout
 from optloc.problem.problem import Problem
 from optloc.solvers.policy import COVERED
-from optloc.solvers.suspects.subsets import Finding, Rest, leave_out_of, prove_rest
+from optloc.solvers.suspects.subsets import Finding, Rest, fix_without, leave_out_of, prove_rest, rest_of
 from optloc.solvers.verdict.conclusion import Conclusion, list_names
 
 
@@ -35,12 +35,15 @@ class Case:
         What may be wrong.
     whole : Fix
         The fix with nothing left out, without batch axes.
+    refuted : str
+        Why the noise cannot be as stated, or "".
     """
 
     problem: Problem
     arrivals: Arrivals | None
     groups: tuple[Group, ...]
     whole: Fix
+    refuted: str
 
     @property
     def work(self) -> Problem:
@@ -70,10 +73,13 @@ def conclude_case(case: Case, finding: Finding) -> Conclusion | None:
     elsewhere = [rest for rest in others if not _same_place(best.fix, rest.fix)]
     if not best.left and not elsewhere:
         return None
-    best = prove_rest(case.work if best.left else case.problem, case.groups, best)
+    work = case.work if best.left else case.problem
+    if case.refuted:  # it was found by other noise than is stated
+        best = rest_of(case.groups, best.left, fix_without(work, case.groups, best.left, best.fix.x))
+    best = prove_rest(work, case.groups, best)
     explanations = tuple(_explanation(case, rest, finding) for rest in (best, *others))
     spent, fix = int(case.whole.dof) - int(best.fix.dof), _in_layout(case, best.fix)
-    return Conclusion(explanations, fix, _alternatives(case, best, elsewhere), spent, several=bool(elsewhere))
+    return Conclusion(explanations, fix, _alternatives(case, best, elsewhere), spent, bool(elsewhere), case.refuted)
 
 
 def _same_place(best: Fix, other: Fix) -> bool:

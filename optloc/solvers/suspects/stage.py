@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from time import perf_counter
 
 import numpy as np
 
+from optloc.adequacy.elements import batch_of
 from optloc.adequacy.groups import KINDS, ROW_PRICE, Group, check_kinds, groups_of
+from optloc.adequacy.level import SEVERAL, CommonLevel, common_level_at
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
-from optloc.problem.arrivals import as_arrivals
+from optloc.problem.arrivals import as_arrivals, restore_order
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix, GroupKind, Stage
 from optloc.problem.problem import Problem
@@ -22,7 +24,6 @@ from optloc.solvers.stages import fix_by, lsr, search_widely
 from optloc.solvers.starts.position import complete
 from optloc.solvers.suspects.report import Case, conclude_case
 from optloc.solvers.suspects.subsets import Finding, Rest, enumerable, explain, fix_rest, grow
-from optloc.solvers.verdict.conclusion import Conclusion
 from optloc.solvers.verdict.judge import fill, judge, standing
 
 # A row that a loss gives less than half its weight is suspected first. More than `REJECTED` names: here it is a hint
@@ -83,19 +84,62 @@ def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS
     if not np.array_equal(pool.weights, present):
         # a robust fix has its minima elsewhere: the test is that of least squares with every row
         pool = lsr(problem, offer(problem, standing(pool, judge(problem, pool)), pool, "start", perf_counter()))
-    pool = replace(pool, asked=True)
-    fix = judge(problem, pool)
+    fix, before = judge(problem, pool), pool.stages
+    found, refuted = _explain(problem, fix, present, rejected, by), ""
+    level = _level(problem, fix)
+    if level is not None:
+        # whoever is accused then stands out from noise as large as it is
+        loud = level.scale(problem)
+        own = fix_by(loud, lambda one: begin(one, fix.x[:, None]))
+        other = replace(fix, x=own.x, cov=own.cov, cost=own.cost)
+        again = _explain(loud, other, present, rejected, by)
+        more = 2.0 * (present @ np.log(level.sizes(problem))) / np.maximum(present.sum(1), 1.0)
+        if _score(again, other, more) + ROW_PRICE < _score(found, fix, np.zeros(len(pool))):
+            found, refuted = again, level.sentence
+    pool = replace(pool, asked=True, refuted=refuted)
+    fix, conclusion = judge(problem, pool), fill(len(pool), None)
+    for items, groups, findings in found:
+        conclusion[items] = _conclude(problem.take(items), fix[items], groups, findings, refuted)
+    count = sum(len(items) for items, _, _ in found)
+    stage = Stage("suspects", f"{count} of {len(fix)} contradict themselves", perf_counter() - began)
+    return replace(pool, conclusion=conclusion, stages=(*before, stage))
+
+
+_Explained = list[tuple[Array, tuple[Group, ...], list[Finding]]]
+
+
+def _explain(problem: Problem, fix: Fix, present: Array, rejected: Array, by: Sequence[GroupKind]) -> _Explained:
+    """Return what explains those problems that show something: their numbers, what may be wrong, and what is."""
     with np.errstate(invalid="ignore"):
         # of a lower cost the cheapest set has a score beyond the gap whatever it leaves
         noticed = ~fix.answered | (fix.cost > ROW_PRICE - AMBIGUOUS_GAP)
     noticed |= problem.epochs > 1  # a few of many rows go unnoticed by the chi-square of all
     items = np.flatnonzero(noticed & (fix.dof > 0) & ~np.isin(fix.code, _BEYOND))
-    conclusion = fill(len(pool), None)
-    for own in _group_alike(present[items] > 0.0):
-        for item, found in _conclude_pattern(problem, fix, items[own], by, rejected):
-            conclusion[item] = found
-    stage = Stage("suspects", f"{len(items)} of {len(fix)} contradict themselves", perf_counter() - began)
-    return replace(pool, conclusion=conclusion, stages=(*pool.stages, stage))
+    alike = [items[own] for own in _group_alike(present[items] > 0.0)]
+    return [(own, *_explain_pattern(problem.take(own), fix[own], rejected[own], by)) for own in alike]
+
+
+def _score(found: _Explained, fix: Fix, more: Array) -> float:
+    """Return the least score of all problems together, with more (N,) for each redundancy: what larger noise costs.
+
+    It is twice the negative logarithm of the restricted likelihood, in which sigma times f counts r ln f^2.
+    """
+    good = np.isfinite(fix.cost) & (fix.dof > 0)
+    score, dof = np.where(good, fix.cost, 0.0), np.where(good, fix.dof, 0)
+    for items, _, findings in found:
+        for i, finding in zip(items, findings, strict=True):
+            if good[i] and np.isfinite(finding.least):
+                score[i], dof[i] = finding.least, finding.dof
+    return float((score + dof * more).sum())
+
+
+def _level(problem: Problem, fix: Fix) -> CommonLevel | None:
+    """Return by how much the fixes of a batch say that its noise is stated too small; None where they do not."""
+    if problem.epochs > 1 or len(fix.x) < SEVERAL:
+        return None
+    batch = batch_of(problem)
+    found = common_level_at(batch, restore_order(batch.layout, problem.layout, fix.x))
+    return found if found.refutes else None
 
 
 def _group_alike(present: Array) -> list[Array]:
@@ -106,40 +150,46 @@ def _group_alike(present: Array) -> list[Array]:
     return [np.flatnonzero(pattern.reshape(-1) == i) for i in range(int(pattern.max()) + 1)]
 
 
-def _conclude_pattern(
-    problem: Problem, fix: Fix, items: Array, by: Sequence[GroupKind], rejected: Array
-) -> Iterator[tuple[int, Conclusion | None]]:
-    """Yield what is concluded of problems in which the same rows are present."""
-    part = problem.take(items)
-    arrivals = as_arrivals(part)
-    work = part if arrivals is None else arrivals.problem
-    present = np.broadcast_to(work.weight, (len(items), work.count))[0] > 0.0
+def _explain_pattern(
+    problem: Problem, fix: Fix, rejected: Array, by: Sequence[GroupKind]
+) -> tuple[tuple[Group, ...], list[Finding]]:
+    """Return what may be wrong in problems (N,) in which the same rows are present, and what explains each."""
+    arrivals = as_arrivals(problem)
+    work = problem if arrivals is None else arrivals.problem
+    present = np.broadcast_to(work.weight, (len(fix.x), work.count))[0] > 0.0
     groups = groups_of(work, present, by)
     # few sets: all are tried, and nothing masks anything; runs and many groups: one at a time
     if problem.epochs > 1 or not enumerable(groups, work.count, 1):
-        findings = [_grow(work, groups, fix, i, item, rejected, None) for i, item in enumerate(items)]
-    else:
-        findings = explain(work, groups, fix[items])
-        # sets that were too many to be tried: group by group from the best that was found
-        untried = [not own.rests and own.tried < dof - 1 for own, dof in zip(findings, fix.dof[items], strict=True)]
-        for i in np.flatnonzero(untried).tolist():
-            more = _grow(work, groups, fix, i, int(items[i]), rejected, findings[i].closest)
-            findings[i] = replace(more, p_value=findings[i].p_value | more.p_value)
+        return groups, [_grow(work, groups, fix, i, rejected, None) for i in range(len(fix.x))]
+    findings = explain(work, groups, fix)
+    # sets that were too many to be tried: group by group from the best that was found
+    untried = [not own.rests and own.tried < dof - 1 for own, dof in zip(findings, fix.dof, strict=True)]
+    for i in np.flatnonzero(untried).tolist():
+        more = _grow(work, groups, fix, i, rejected, findings[i].closest)
+        findings[i] = replace(more, p_value=findings[i].p_value | more.p_value)
+    return groups, findings
+
+
+def _conclude(
+    problem: Problem, fix: Fix, groups: tuple[Group, ...], findings: Sequence[Finding], refuted: str
+) -> Array:
+    """Return what is concluded of problems (N,) in which the same rows are present, None where nothing is."""
+    arrivals, out = as_arrivals(problem), fill(len(findings), None)
     for i, finding in enumerate(findings):
-        one = None if arrivals is None else replace(arrivals, problem=arrivals.problem.take(np.array([i])))
-        yield int(items[i]), conclude_case(Case(part.take(np.array([i])), one, groups, fix[items[i]]), finding)
+        item = np.array([i])
+        one = None if arrivals is None else replace(arrivals, problem=arrivals.problem.take(item))
+        out[i] = conclude_case(Case(problem.take(item), one, groups, fix[i], refuted), finding)
+    return out
 
 
-def _grow(
-    problem: Problem, groups: Sequence[Group], fix: Fix, i: int, item: int, rejected: Array, start: Rest | None
-) -> Finding:
-    """Return what explains the i-th of some problems, that of the fix numbered `item`, found group by group."""
+def _grow(problem: Problem, groups: Sequence[Group], fix: Fix, i: int, rejected: Array, start: Rest | None) -> Finding:
+    """Return what explains the i-th of some problems, found group by group."""
     # the fix is of the problem as given; with arrivals for differences the layout has emission times besides
-    one, own = problem.take(np.array([i])), fix[item]
+    one, own = problem.take(np.array([i])), fix[i]
     if own.layout != one.layout or not np.isfinite(own.x).all():
         n = one.layout.n_shared
         known = np.isfinite(own.x[:n]).all()
         near = complete(one, own.x[None, None, :n]) if known else None
         own = (fix_rest(one) if near is None else fix_by(one, lambda _: begin(one, near)))[0]
-    mine = rejected[item] if one.count == rejected.shape[1] else np.zeros(one.count, dtype=bool)
+    mine = rejected[i] if one.count == rejected.shape[1] else np.zeros(one.count, dtype=bool)
     return grow(one, groups, own, mine, start)

@@ -67,6 +67,10 @@ class Finding:
         The cheapest of the rests that were tried last.
     tried : int
         Size of the largest sets of which all were tried, or can be left untried because of their prices.
+    least : float
+        Least score of all that was tried, whether it passes or not.
+    dof : int
+        Redundancy of what has it.
     """
 
     rests: tuple[Rest, ...]
@@ -74,6 +78,8 @@ class Finding:
     note: str = ""
     closest: Rest | None = None
     tried: int = 0
+    least: float = np.inf
+    dof: int = 0
 
 
 def rest_of(groups: Sequence[Group], left: tuple[int, ...], fix: Fix) -> Rest:
@@ -114,6 +120,7 @@ def explain(problem: Problem, groups: Sequence[Group], whole: Fix) -> list[Findi
     rests = [[rest_of(groups, (), whole[i])] if ok else [] for i, ok in enumerate(passes(whole))]
     probability: list[dict[tuple[int, ...], float]] = [{(): float(p)} for p in whole.p_value]
     closest: list[Rest | None] = [None] * len(rests)
+    least = [(float(c), int(r)) for c, r in zip(whole.cost, whole.dof, strict=True)]
     tried = np.zeros(len(rests), dtype=np.int64)
     for size in range(1, len(groups) + 1):
         best = np.array([min((rest.score for rest in own), default=np.inf) for own in rests])
@@ -127,13 +134,13 @@ def explain(problem: Problem, groups: Sequence[Group], whole: Fix) -> list[Findi
         items, step = np.flatnonzero(~done), max(1, _CHUNK // (comb(len(groups), size) * problem.count + 1))
         for first in range(0, len(items), step):
             own = items[first : first + step]
-            for item, (more, p_value, cheapest) in zip(own, _try_sets(problem.take(own), groups, size), strict=True):
-                rests[item] += more
-                probability[item] |= p_value
-                closest[item] = cheapest
+            for item, found in zip(own, _try_sets(problem.take(own), groups, size), strict=True):
+                rests[item] += found.rests
+                probability[item] |= found.p_value
+                closest[item], least[item] = found.closest, min(least[item], found.least)
     notes = ["" if dof > 1 else _BLIND for dof in whole.dof]
-    parts = zip(rests, probability, notes, closest, tried, strict=True)
-    return [Finding(listed(own, groups), p, note, near, int(most)) for own, p, note, near, most in parts]
+    parts = zip(rests, probability, notes, closest, tried, least, strict=True)
+    return [Finding(listed(own, groups), p, note, near, int(most), *low) for own, p, note, near, most, low in parts]
 
 
 def listed(rests: Sequence[Rest], groups: Sequence[Group]) -> tuple[Rest, ...]:
@@ -165,32 +172,41 @@ def _parts(groups: Sequence[Group], left: Sequence[int]) -> frozenset[tuple[int,
     return frozenset(rows | {(i, j) for i in left if not groups[i].rows for j in range(groups[i].size)})
 
 
-def _try_sets(
-    problem: Problem, groups: Sequence[Group], size: int
-) -> list[tuple[list[Rest], dict[tuple[int, ...], float], Rest | None]]:
-    """Return the rests of each problem that pass, the probabilities of all, and the cheapest of all."""
+@dataclass(slots=True)
+class _Tried:
+    """What the sets of one size say about one problem, collected."""
+
+    rests: list[Rest]
+    p_value: dict[tuple[int, ...], float]
+    closest: Rest | None = None
+    least: tuple[float, int] = (np.inf, 0)
+
+
+def _try_sets(problem: Problem, groups: Sequence[Group], size: int) -> list[_Tried]:
+    """Return the rests of each problem that pass, the probabilities of all, the cheapest and the least score of all."""
     sets = list(_subsets(groups, problem.count, size))
-    count = problem.batch_shape[0]
-    rests: list[list[Rest]] = [[] for _ in range(count)]
-    probabilities: list[dict[tuple[int, ...], float]] = [{} for _ in range(count)]
-    closest: list[Rest | None] = [None] * count
+    out = [_Tried([], {}) for _ in range(problem.batch_shape[0])]
     # priors and unknowns are the same for a whole batch: sets that change the same ones are fixed together
     for others in dict.fromkeys(own for _, _, own in sets):
         own = [(left, rows) for left, rows, its in sets if its == others]
         fix = _fix_rests(problem, np.stack([rows for _, rows in own]), [groups[i] for i in sorted(others)])
         good, p_value = passes(fix), fix.p_value
-        cost = np.where(np.isfinite(fix.cost), fix.cost, np.inf).reshape(count, len(own))
-        for item in range(count):
-            for j, (left, _) in enumerate(own, start=item * len(own)):
-                probabilities[item][left] = float(p_value[j])
+        cost = np.where(np.isfinite(fix.cost), fix.cost, np.inf).reshape(len(out), len(own))
+        score = cost + [sum(groups[i].price for i in left) for left, _ in own]
+        for item, found in enumerate(out):
+            first = item * len(own)
+            for j, (left, _) in enumerate(own, start=first):
+                found.p_value[left] = float(p_value[j])
                 if good[j]:
-                    rests[item].append(rest_of(groups, left, fix[j]))
-            j, before = int(cost[item].argmin()), closest[item]
-            if any(groups[i].offset is not None for i in others):
-                continue  # what begins there leaves out more
-            if np.isfinite(cost[item, j]) and (before is None or cost[item, j] < float(before.fix.cost)):
-                closest[item] = rest_of(groups, own[j][0], fix[item * len(own) + j])
-    return list(zip(rests, probabilities, closest, strict=True))
+                    found.rests.append(rest_of(groups, left, fix[j]))
+            j = int(score[item].argmin())
+            found.least = min(found.least, (float(score[item, j]), int(fix.dof[first + j])))
+            j = int(cost[item].argmin())
+            # what begins there leaves out more, and has no offset
+            nearer = found.closest is None or cost[item, j] < float(found.closest.fix.cost)
+            if np.isfinite(cost[item, j]) and nearer and all(groups[i].offset is None for i in others):
+                found.closest = rest_of(groups, own[j][0], fix[first + j])
+    return out
 
 
 def _subsets(groups: Sequence[Group], count: int, size: int) -> Iterator[tuple[tuple[int, ...], Array, frozenset[int]]]:

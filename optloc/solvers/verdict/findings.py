@@ -45,6 +45,8 @@ def mark(problem: Problem, pool: Pool, gap: Array) -> Array:
     marks = np.zeros(len(pool), dtype=np.int32)
     if not pool.loss:  # a loss bears gross errors: their cost refutes nothing
         marks[is_improbable(cost, pool.dof, REFUTED)] |= Status.MISFIT.mark
+    if pool.refuted:
+        marks |= Status.MISFIT.mark
     marks[is_open(problem, pool)] |= Status.UNBOUNDED.mark
     if gap.shape[1]:
         marks[gap.min(1) < AMBIGUOUS_GAP] |= Status.AMBIGUOUS.mark
@@ -231,8 +233,10 @@ def explain(problem: Problem, pool: Pool, code: Array, gap: Array, certificate: 
         reason[bulk] = NOT_TRIED
     else:
         reason[bulk] = [_unproven(claim) for claim in certificate[bulk]]
+    if pool.refuted:
+        reason[empty & (code == Status.MISFIT)] = pool.refuted
     cost = pool.cost[:, 0]
-    doubtful = empty & np.isin(code, (Status.OK, Status.MISFIT)) & is_improbable(cost, pool.dof, DOUBT)
+    doubtful = (reason == "") & np.isin(code, (Status.OK, Status.MISFIT)) & is_improbable(cost, pool.dof, DOUBT)
     for i in np.flatnonzero(doubtful):
         p_value = tail_probability(cost[i : i + 1], np.array(pool.dof[i : i + 1]))[0]
         reason[i] = f"the residuals are larger than the noise allows (p = {p_value:.1g})"
