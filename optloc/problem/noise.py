@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from optloc.base import arrays, linalg
 from optloc.base.types import Array
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)  # without slots: what follows from it is kept beside it
 class Block:
     """Equal-sized groups of rows that are correlated within a group only.
 
@@ -25,6 +26,11 @@ class Block:
 
     row: Array
     covariance: Array
+
+    @cached_property
+    def whitening(self) -> Array:
+        """Return whitening matrices (..., g or 1, r, r) of the covariance: a problem is evaluated many times."""
+        return linalg.whitening(self.covariance)
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,7 +173,9 @@ def _whitener(block: Block, weight: Array) -> Whitener:
     picked, xp = arrays.gather(weight, block.row), arrays.library(weight)
     # All rows as measured: the matrices of the covariance itself, shared by the batch where that is.
     if bool(xp.all(picked == 1.0)):
-        return Whitener(block.row, linalg.whitening(block.covariance))
+        # what other libraries trace belongs to one trace
+        own = arrays.foreign(block.covariance)
+        return Whitener(block.row, linalg.whitening(block.covariance) if own else block.whitening)
     present = picked > 0.0
     variance = xp.linalg.diagonal(block.covariance)
     extra = xp.where(present, (1.0 / xp.where(present, picked, 1.0) - 1.0) * variance, 0.0)

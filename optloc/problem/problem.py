@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from optloc.problem.layout import Layout, layout
 from optloc.problem.noise import Block, Noise
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)  # without slots: what is asked for at every step is kept beside it
 class Problem:
     """Everything an estimate depends on; leading axes of its arrays are a batch of independent problems.
 
@@ -73,7 +74,7 @@ class Problem:
         """Return the number of rows of all kinds."""
         return sum(block.count for block in self.rows)
 
-    @property
+    @cached_property
     def starts(self) -> tuple[int, ...]:
         """Return the global number of the first row of each kind."""
         counts = [block.count for block in self.rows]
@@ -86,7 +87,7 @@ class Problem:
         found = {int(t) for block in self.rows if MODELS[block.kind].emission for t in block.target}
         return tuple(sorted(found))
 
-    @property
+    @cached_property
     def layout(self) -> Layout:
         """Return the order of the unknowns."""
         # A bias has the unit of the rows that it touches, which the layout alone does not know.
@@ -122,12 +123,12 @@ class Problem:
         """Return the epoch of each row, (m,)."""
         return np.concatenate([block.epoch for block in self.rows])
 
-    @property
+    @cached_property
     def batch_shape(self) -> tuple[int, ...]:
         """Return the leading axes that all arrays share."""
         return np.broadcast_shapes(*(array.shape[: array.ndim - core] for array, core in _arrays(self)))
 
-    @property
+    @cached_property
     def structure(self) -> tuple[Any, ...]:
         """Return a hashable key of everything but the numbers; equal keys share compiled and indexed forms."""
         rows = tuple((r.kind, r.a.tobytes(), r.b.tobytes(), r.epoch.tobytes(), r.target.tobytes()) for r in self.rows)
@@ -165,6 +166,10 @@ class Problem:
 
     def take(self, index: Array) -> Problem:
         """Return the problems of a flat batch at an index or mask; structure stays."""
+        whole = np.arange(self.batch_shape[0])
+        numbers = whole[index]
+        if np.array_equal(numbers, whole):
+            return self
 
         def pick(array: Array, core: int) -> Array:
             # A batch axis of length one is shared like none at all.
@@ -173,8 +178,7 @@ class Problem:
         taken = _map(self, pick)
         # Where no array has the batch axis the measurements carry it: problems that are equal stay as many.
         if taken.batch_shape == (1,):
-            count = np.arange(self.batch_shape[0])[index].size
-            taken = _map_z(taken, lambda z: np.broadcast_to(z, (count, z.shape[-1])))
+            taken = _map_z(taken, lambda z: np.broadcast_to(z, (numbers.size, z.shape[-1])))
         return taken
 
     def with_rows(self, z: Array | None = None, weight: Array | None = None) -> Problem:
@@ -221,7 +225,8 @@ def _map(problem: Problem, change: Any) -> Problem:
     """Return the problem with every numeric array replaced; `change` gets the array and its unbatched rank."""
 
     def changed(part: Any) -> Any:
-        numbers = {name: change(array, core) for name, array, core in _numbers(part)}
+        found = [(name, array, change(array, core)) for name, array, core in _numbers(part)]
+        numbers = {name: new for name, old, new in found if new is not old}
         return replace(part, **numbers) if numbers else part
 
     def each(parts: tuple[Any, ...]) -> tuple[Any, ...]:
