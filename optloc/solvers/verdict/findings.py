@@ -121,14 +121,15 @@ def examine(problem: Problem, pool: Pool) -> Pool:
     if pool.conclusion is not None:
         good &= ~present(pool.conclusion)  # not all rows count there, and its fix was examined where it was made
     kappa = np.full((len(pool), 2), np.nan) if curvature.kappa is None else np.array(curvature.kappa)
-    new = np.flatnonzero(good & np.isnan(kappa[:, 0]))
+    unseen = np.isnan(kappa[:, 0])
+    new = np.flatnonzero(good & unseen)
     if len(new):
         kappa[new] = _departure(problem.take(new), take(pool, new))
     pool = replace(pool, curvature=replace(curvature, kappa=kappa))
     # far away a velocity may grow with the range: no least cost is left to compute
     if pool.loss or not one_position(problem) or problem.motions[0].order:
         return pool
-    return replace(pool, infinity=_infinity(problem, pool, good & _is_bent(pool)))
+    return replace(pool, infinity=_infinity(problem, pool, good & _is_bent(pool), unseen))
 
 
 def _has_position(problem: Problem) -> bool:
@@ -161,12 +162,11 @@ def _is_bent(pool: Pool) -> Array:
     return np.asarray(~(pool.curvature.kappa[:, 0] <= BENT))
 
 
-def _infinity(problem: Problem, pool: Pool, wanted: Array) -> Array:
+def _infinity(problem: Problem, pool: Pool, wanted: Array, unseen: Array) -> Array:
     """Return the least costs (N,) of infinity: those known from runs there, and where wanted all directions tried."""
     known = np.full(len(pool), np.nan) if pool.infinity is None else np.array(pool.infinity)
-    # one run there is none of the least; the compiled way has looked in all directions
-    looked = np.zeros(len(pool), dtype=bool) if pool.plain is None else pool.plain & ~np.isnan(known)
-    new = np.flatnonzero(wanted & ~looked)
+    # one run there is none of the least; who has seen the shape before has looked in all directions
+    new = np.flatnonzero(wanted & (unseen | np.isnan(known)))
     if len(new):
         known[new] = np.fmin(known[new], cost_at_infinity(problem.take(new), pool.x[new, 0]))
     return known
