@@ -221,8 +221,9 @@ def test_the_stages_find_the_same_rivals():
 
 
 @pytest.mark.parametrize("kind", ["tdoa", "range"])
-def test_few_descend_to_where_the_refinement_of_all_kinds_ends(kind):
-    made = flat(kind, 6, 100, 40)
+@pytest.mark.parametrize("rivalled", [True, False])
+def test_few_descend_to_where_the_refinement_of_all_kinds_ends(kind, rivalled):
+    made = flat(kind, 6, 100, 40) if rivalled else around(kind, 3, 6, (3.0, 3.7), 40)
     problem = made.problem
     start = gtrs(problem, None).x[:, :1]
     x = np.concatenate([start, mirror(problem, start)], axis=1)
@@ -234,7 +235,7 @@ def test_few_descend_to_where_the_refinement_of_all_kinds_ends(kind):
     # runs to infinity end where rounding says so
     near = ended & (second.status == Status.OK) & (np.sqrt((second.x**2).sum(-1)) < 1e5)
     led = np.isfinite(found[:, 1]).all(-1)
-    assert (near & led).sum() > 5
+    assert (near & (led == rivalled)).sum() > 5
     for i in np.flatnonzero(near):
         A = made.information(i, first.x[i])
         apart = found[i, 0] - first.x[i]
