@@ -179,11 +179,11 @@ def check(cell: Cell, trials: int) -> tuple[Counts, Spoilt, Fix]:
     left = np.array([sum(len(one.rows) > 0 for one in found) for found in fix.suspects])
     assert (fix.dof[(fix.code == Status.OK) & (left > 0)] >= left[(fix.code == Status.OK) & (left > 0)] + 1).all()
     if cell in WRONG:
-        assert made.wrong <= binom.isf(0.01, trials, WRONG[cell])
+        assert trials < MANY or made.wrong <= binom.isf(0.01, trials, WRONG[cell])
+        # all of these are errors that the geometry cannot see: their number is that which reliability expects
+        assert made.wrong <= poisson.isf(1e-4, unnoticed(case, cell))
     if cell in RIGHT:
         assert made.ok >= (binom.ppf(1e-4, trials, RIGHT[cell]) if trials < MANY else RIGHT[cell] * trials)
-        # and all of these are errors that the geometry cannot see: their number is that which reliability expects
-        assert made.wrong <= poisson.isf(1e-4, unnoticed(case, cell))
     if cell in TRIED:  # its share is known from a hundred trials alone
         assert made.wrong <= binom.isf(1e-3, trials, binom_upper(TRIED[cell], 100))
     return made, case, fix
