@@ -247,9 +247,9 @@ def errors(at: Influence, groups: Sequence[Group]) -> list[Error]:
 
 # Reliability: what the test does not see.
 
-# Standard deviations of an error that goes unnoticed in one case of twenty: a search for suspects notices what lowers
-# the cost by 7 (the price of a row, 16, less the gap of 9 up to which explanations are listed); 1.645 is for the noise.
-_NOTICEABLE = 7.0**0.5 + 1.645
+NOTICEABLE = 7.0**0.5 + 1.645
+"""Standard deviations of an error that goes unnoticed in one case of twenty: a search for suspects notices what
+lowers the cost by 7 (the price of a row, 16, less the gap of 9 of what is listed); 1.645 is for the noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -308,7 +308,7 @@ def reliability(problem: Problem, x: Array, suspects: Sequence[Suspect] = ()) ->
     channels = _channels(work)
     seen = np.array([at.block(rows).sum() for _, rows in channels])
     told = np.array([at.block(rows).sum() > _NOTHING * at.precision[rows][:, rows].sum() for _, rows in channels])
-    least = np.where(told, _NOTICEABLE / np.sqrt(np.where(told, seen, 1.0)), np.inf)
+    least = np.where(told, NOTICEABLE / np.sqrt(np.where(told, seen, 1.0)), np.inf)
     moved = np.stack([at.deviation @ at.shared[rows].sum(0) for _, rows in channels])
     places = [slot.start + i for slot in work.layout.shared if slot.name == "position" for i in range(slot.size)]
     pull = np.linalg.norm(moved[:, places], axis=-1)

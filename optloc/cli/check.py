@@ -289,6 +289,7 @@ def _health_columns(health: Health) -> Columns:
         "noise": health.noise,
         "noise_error": health.noise_error,
         "outliers": health.outliers,
+        "least_noticed": health.least_noticed,
         "suspect": health.suspect,
     }
 
@@ -316,13 +317,15 @@ def _show_health(checked: Checked, console: Console) -> None:
     scaled, suspected = np.isfinite(health.scale).any(), np.isfinite(health.suspect).any()
     table = Table(title=f"Health by {health.by}", title_justify="left")
     table.add_column(health.by)
-    wanted = ["fixes", "bias", *(["scale, ppm"] if scaled else []), "noise", "outliers"]
+    wanted = ["fixes", "bias", *(["scale, ppm"] if scaled else []), "noise", "outliers", "shows from"]
     for name in [*wanted, *(["suspect"] if suspected else [])]:
         table.add_column(name, justify="right")
+    seen = health.least_noticed
     for i in _order(health):
         cells = [str(health.count[i]), _told(health.bias[i], health.bias_error[i], health.units[i])]
         cells += [_told(1e6 * health.scale[i], 1e6 * health.scale_error[i], "")] if scaled else []
         cells += [_told(health.noise[i], health.noise_error[i], health.units[i]), f"{health.outliers[i]:.1%}"]
+        cells += [f"{seen[i]:.3g} {health.units[i]}".strip()]
         cells += [f"{health.suspect[i]:.1%}"] if suspected else []
         table.add_row(health.names[i], *cells)
     console.print(table)

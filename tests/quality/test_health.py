@@ -8,7 +8,7 @@ import pytest
 from quality.rings import FREE, RING, SIGMA, ranged
 from typer.testing import CliRunner
 
-from optloc import InvalidProblem, assemble, by_epoch, health, measured, predict, solve
+from optloc import InvalidProblem, assemble, by_epoch, health, measured, predict, reliability, solve, with_noise_levels
 from optloc.cli import app
 from optloc.files import read
 from optloc.plot import save
@@ -61,6 +61,17 @@ def test_shares_of_outliers_and_noise():
     assert abs(np.mean(shares) - 0.053) < 0.02
     # A few gross errors are too small to be seen as such and count as noise.
     assert (np.array(noise) ** 2).mean() < 3.0
+
+
+def test_the_least_error_that_shows_is_that_of_reliability():
+    """Of the same fixes, with the noise as it is found."""
+    problem = ranged(np.random.default_rng(5), 100, kind="range")
+    batch = by_epoch(problem)
+    fix = solve(batch)
+    found = health(problem, fix=fix)
+    levelled = with_noise_levels(batch, found.levels)
+    told = np.median([reliability(levelled.take(np.array([i])), fix.x[i]).least for i in range(100)], axis=0)
+    np.testing.assert_allclose(found.least_noticed, told, rtol=1e-3)
 
 
 def test_clean_measurements_are_rarely_outliers():
