@@ -320,9 +320,12 @@ ANSWERED = (
 
 def first_status(marks: Array) -> Array:
     """Return the statuses (...) of the marks (...) of all that applies; `ok` where nothing does."""
-    code = np.full(np.shape(marks), int(Status.OK), dtype=np.int8)
+    marks = np.asarray(marks)
+    code = np.full(marks.shape, int(Status.OK), dtype=np.int8)
+    anywhere = int(np.bitwise_or.reduce(marks, axis=None))  # few statuses occur in a batch
     for status in reversed(PRECEDENCE):
-        code[np.asarray(marks) & status.mark != 0] = int(status)
+        if anywhere & status.mark:
+            code[marks & status.mark != 0] = int(status)
     return code
 
 

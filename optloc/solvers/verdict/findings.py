@@ -236,7 +236,7 @@ def explain(problem: Problem, pool: Pool, code: Array, gap: Array, certificate: 
     if pool.refuted:
         reason[empty & (code == Status.MISFIT)] = pool.refuted
     cost = pool.cost[:, 0]
-    doubtful = (reason == "") & np.isin(code, (Status.OK, Status.MISFIT)) & is_improbable(cost, pool.dof, DOUBT)
+    doubtful = (reason == "") & ((code == Status.OK) | (code == Status.MISFIT)) & is_improbable(cost, pool.dof, DOUBT)
     for i in np.flatnonzero(doubtful):
         p_value = tail_probability(cost[i : i + 1], np.array(pool.dof[i : i + 1]))[0]
         reason[i] = f"the residuals are larger than the noise allows (p = {p_value:.1g})"
