@@ -8,8 +8,12 @@ import numpy as np
 from verdicts import alone
 
 from optloc import Fix, Problem, assemble, measured, solve
-from optloc.base.records import join
+from optloc.solvers.certify.branch_and_bound import certified
+from optloc.solvers.pool import in_parts
 from optloc.solvers.refine import refine
+from optloc.solvers.stages import search_widely
+from optloc.solvers.suspects.stage import suspect
+from optloc.solvers.verdict.judge import verdict
 
 BOX, SIGMA, MILLIRADIANS = np.array([10e3, 10e3, 6e3]), 10.0, 3e-3
 
@@ -63,10 +67,14 @@ def spoilt(
     return Spoilt(assemble(place, rows), truth, wrong, size * sign * wrong)
 
 
-def solve_apart(problem: Problem, method: str) -> Fix:
-    """Return the fixes of problems that do not know of each other: many with liars would make the noise the suspect."""
-    count = problem.batch_shape[0]
-    return join((solve(problem.take(np.arange(i, min(i + 2, count))), method) for i in range(0, count, 2)), count)
+def solve_apart(problem: Problem) -> Fix:
+    """Return what `robust` says of problems that have nothing to do with each other: liars in all are no noise."""
+
+    def work(part: Problem, _: slice) -> Fix:
+        pool = suspect(part, search_widely(part), together=False)
+        return verdict(part, certified(part, pool))
+
+    return in_parts(problem, work)
 
 
 def worse_than_from_truth(case: Spoilt, method: str, fix: Fix) -> np.ndarray:

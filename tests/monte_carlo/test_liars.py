@@ -174,7 +174,7 @@ def unnoticed(case: Spoilt, cell: Cell) -> float:
 def check(cell: Cell, trials: int) -> tuple[Counts, Spoilt, Fix]:
     """Return the counts of trials; nobody is named by an ok fix that has too little redundancy for it."""
     case = cell.drawn(trials)
-    fix = solve_apart(case.problem, "robust")
+    fix = solve_apart(case.problem)
     made = counted(case, fix)
     left = np.array([sum(len(one.rows) > 0 for one in found) for found in fix.suspects])
     assert (fix.dof[(fix.code == Status.OK) & (left > 0)] >= left[(fix.code == Status.OK) & (left > 0)] + 1).all()

@@ -150,7 +150,7 @@ def counted(run: Trials, fix: Fix) -> Counts:
 def check(name: str, count: int) -> Counts:
     s, bad, size = CASES[name]
     run = drawn(name, s, bad, size, count)
-    found = counted(run, solve_apart(run.problem, "robust"))
+    found = counted(run, solve_apart(run.problem))
     assert found.same >= 0.99 * count
     return found
 

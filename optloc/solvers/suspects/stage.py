@@ -33,7 +33,9 @@ _HALF = 0.5
 _BEYOND = (Status.REJECTED, Status.TOO_FEW_ROWS, Status.INFEASIBLE, Status.UNAVAILABLE, Status.DISCONNECTED)
 
 
-def suspects(problem: Problem, fix: Fix | None = None, *, by: str | Sequence[str] = KINDS) -> Fix:
+def suspects(
+    problem: Problem, fix: Fix | None = None, *, by: str | Sequence[str] = KINDS, together: bool = True
+) -> Fix:
     """Return fixes without the measurements that contradict the rest, and who they are.
 
     Every group, every two of them and so on are left out and the rest fixed anew without a guess. A set explains the
@@ -53,6 +55,10 @@ def suspects(problem: Problem, fix: Fix | None = None, *, by: str | Sequence[str
     by : "station", "row", "prior", "offset" or several of them
         What may be wrong: all rows of a station, one measurement, a prior, all lengths of a kind by one offset.
 
+    together : bool
+        Whether the noise of a batch, and of epochs, is stated for all of them, so that it is a suspect too where many
+        contradict themselves; False for problems that have nothing to do with each other.
+
     Returns
     -------
     Fix
@@ -69,10 +75,10 @@ def suspects(problem: Problem, fix: Fix | None = None, *, by: str | Sequence[str
     if fix is not None and fix.shape != shape:
         raise InvalidProblem(f"the fix has batch axes {fix.shape}, not {shape}", "fix", "give the fix of this problem")
     pool = search_widely(flat) if fix is None else accept(flat, fix.flat())
-    return judge(flat, suspect(flat, pool, kinds)).reshape(shape)
+    return judge(flat, suspect(flat, pool, kinds, together=together)).reshape(shape)
 
 
-def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS) -> Pool:
+def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS, *, together: bool = True) -> Pool:
     """Return the pool of a flat batch with what contradicts the rest left out: the stage behind `suspects`."""
     if pool is None:
         raise InvalidProblem(
@@ -86,7 +92,7 @@ def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS
         pool = lsr(problem, offer(problem, standing(pool, judge(problem, pool)), pool, "start", perf_counter()))
     fix, before = judge(problem, pool), pool.stages
     found, refuted = _explain(problem, fix, present, rejected, by), ""
-    level = _level(problem, fix)
+    level = _level(problem, fix) if together else None
     if level is not None:
         # whoever is accused then stands out from noise as large as it is
         loud = level.scale(problem)
