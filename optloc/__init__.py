@@ -6,7 +6,7 @@ from importlib import import_module
 from typing import Any
 
 from optloc.adequacy.evidence import Reliability, reliability
-from optloc.adequacy.level import CommonLevel
+from optloc.adequacy.level import CommonLevel, LateSignals
 from optloc.base import frames, units
 from optloc.base.errors import InvalidProblem, NoSolution, OptlocError
 from optloc.base.frames import CARTESIAN, ECEF, Frame
@@ -30,7 +30,14 @@ from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.noise import Noise
 from optloc.problem.problem import Problem
 from optloc.quality.health import Health, health
-from optloc.quality.levels import NoiseLevels, common_level, noise_levels, with_estimated_noise, with_noise_levels
+from optloc.quality.levels import (
+    NoiseLevels,
+    common_level,
+    late_signals,
+    noise_levels,
+    with_estimated_noise,
+    with_noise_levels,
+)
 from optloc.solvers import FORMULATIONS, METHODS, SOLVERS, Formulation, solve
 from optloc.solvers.certify.branch_and_bound import certify
 from optloc.solvers.prepared import Prepared, prepare
@@ -65,6 +72,7 @@ __all__ = [
     "Frame",
     "Health",
     "InvalidProblem",
+    "LateSignals",
     "Layout",
     "Linear",
     "Loss",
@@ -103,6 +111,7 @@ __all__ = [
     "from_table",
     "gauss_newton",
     "health",
+    "late_signals",
     "likelihood_region",
     "linearise",
     "load",

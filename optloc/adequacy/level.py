@@ -1,4 +1,4 @@
-"""Sigma before suspects: whether fixes accuse single measurements, one station, or the noise as it is stated."""
+"""What many accusations mean: a noise that is understated, one station that is wrong, late rows, or an offset."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ import numpy as np
 
 from optloc.adequacy.elements import Elements, elements, kinds_of
 from optloc.adequacy.groups import ROW_PRICE
-from optloc.adequacy.variance_components import Tested, fit, tested, total
+from optloc.adequacy.score import descend
+from optloc.adequacy.variance_components import Tested, fit, shown, snooped, tested, total, without
 from optloc.base.types import Array
+from optloc.problem.loss import LATE
 from optloc.problem.noise import Noise
 from optloc.problem.problem import Problem
 
@@ -192,6 +194,11 @@ def _path(tests: Tested) -> tuple[Array, Array]:
         dofs.append(tests.dof)
 
 
+def priced_cost(tests: Tested) -> Array:
+    """Return the least cost of each fix (N,) with any of its errors left out, at the price of each."""
+    return _least(*_path(tests), 1.0)
+
+
 def _least(cost: Array, dof: Array, factor: float) -> Array:
     """Return the least of twice the negative log-likelihood of each fix (N,) with sigma times a factor."""
     left = np.arange(cost.shape[1])
@@ -225,3 +232,202 @@ def _alone(made: Elements, tests: Tested, cost: Array, dof: Array) -> Iterator[t
         sums = (determinant + np.minimum(each, instead)).sum(-1)
         best = int(sums.argmin())
         yield made.names[g], float(np.sqrt(1.0 + more[best, 0, 0])), float(sums[best])
+
+
+# Late rows: how many of them there are, by how much, and which fixes stand on them.
+
+
+@dataclass(frozen=True, slots=True)
+class LateSignals:
+    """How many ranges and arrivals are late, as the residuals of many fixes show it.
+
+    Parameters
+    ----------
+    share, delay : float
+        Probability of a row to be late, and the mean delay of those in sigmas of the rows; zero where none are seen.
+    gain : float
+        Twice the logarithm of the likelihood over that of no late row.
+    count : int
+        Rows that the rest of their fix can check.
+    late : int array (N,)
+        Rows of each fix that are late rather than not.
+    carried : bool array (N,)
+        Fixes that stand on late rows: without these nothing checks them.
+    alike : str
+        Kind whose rows are all late by one amount, which then are not counted as late; empty for none.
+    offset, offset_error : float
+        That amount and its standard deviation, SI units.
+    left : float
+        Chi-square of all fixes without the late rows, and the price of these.
+    """
+
+    share: float
+    delay: float
+    gain: float
+    count: int
+    late: Array
+    carried: Array
+    alike: str = ""
+    offset: float = 0.0
+    offset_error: float = 0.0
+    left: float = 0.0
+
+    @property
+    def method(self) -> str:
+        """Return the method that fixes with such rows, for `solve`; "late" where none are seen."""
+        return f"late({self.share:.3g},{self.delay:.3g})" if self.share else "late"
+
+    @property
+    def sentence(self) -> str:
+        """Return what is found in one sentence without its full stop; empty where no row is late."""
+        if self.alike:
+            size = f"{self.offset:.4g} ± {self.offset_error:.2g} m"
+            return f"all {self.alike} rows are late alike, by {size}: that looks like a bias, an offset per kind"
+        if not self.share:
+            return ""
+        text = f"{100.0 * self.share:.2g} % of {self.count} rows are late, by {self.delay:.2g} sigma on average"
+        stand = int(self.carried.sum())
+        return text + (f"; {stand} of {len(self.late)} fixes stand on late rows" if stand else "")
+
+
+def late_signals_at(problem: Problem, kept: Array, x: Array) -> LateSignals:
+    """Return the late rows of fixes that were made before; see `late_signals`.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of N problems, of `batch_of`.
+    kept : int array (n,)
+        Those that have a fix.
+    x : array (n, size)
+        Their parameter vectors.
+    """
+    late, carried = np.zeros(problem.batch_shape[0], dtype=int), np.zeros(problem.batch_shape[0], dtype=bool)
+    able = [rows.kind for rows in problem.rows if rows.kind in LATE]
+    if not able:
+        return LateSignals(0.0, 0.0, 0.0, 0, late, carried)
+    part = problem.take(kept)
+    found = _late_rows(elements(part, x, "kind"), able)
+    if found.share:
+        kind, offset, error, left = min((_alike(part, x, one) for one in able), key=lambda one: one[3])
+        if offset > 0.0 and left < found.left:
+            found = replace(found, share=0.0, delay=0.0, alike=kind, offset=offset, offset_error=error)
+            return replace(found, late=late, carried=carried)
+    late[kept], carried[kept] = found.late, found.carried
+    return replace(found, late=late, carried=carried)
+
+
+# Turns of choosing late rows and of expectation and maximisation, and the change of both numbers that ends the latter.
+_CHOICES, _TURNS, _ENDED = 10, 500, 1e-6
+# Test, standard deviations, from which a row is taken for late to begin with.
+_STANDS_OUT = 3.0
+# Share of what gross errors of either side explain that late rows have to: 0.8 to 1 where a tenth or more are late by 5
+# sigma on average, 0.6 at the most where the noise is three or five times what is stated (50 fixes).
+_ONE_SIDED = 0.7
+
+
+def _late_rows(made: Elements, able: list[str]) -> LateSignals:
+    """Return the late rows of linearised fixes, their noise as stated."""
+    tests = tested(made, np.ones(()))
+    fit_for = np.isin(np.array([*made.names, ""], dtype=object)[made.of_effect], able)
+    share, delay, gain, late, seen = _mixture(tests, fit_for)
+    none = np.zeros(len(late), dtype=int)
+    # What leaving out late rows explains of what leaving out rows of either side does, at a price each: half of it
+    # where errors are tails, less where the noise is understated.
+    left = float((without(tests, late).cost + ROW_PRICE * late.sum(1)).sum())
+    explained = float(tests.cost.sum()) - left
+    if min(gain, explained) <= ROW_PRICE or explained < _ONE_SIDED * float((tests.cost - priced_cost(tests)).sum()):
+        return LateSignals(0.0, 0.0, max(gain, 0.0), seen, none, none > 0)
+    count = late.sum(1)
+    return LateSignals(share, delay, gain, seen, count, (count > 0) & (tests.dof - count <= 0), left=left)
+
+
+# Steps of an offset, each with fixes made anew, and the move in its sigma that ends them.
+_STEPS, _STILL = 8, 0.1
+
+
+def _alike(problem: Problem, x: Array, kind: str) -> tuple[str, float, float, float]:
+    """Return a kind, the offset that all its rows have in common, its standard deviation, and what is left to explain.
+
+    Gauss-Newton over all fixes together, each of which is refined in between: the rows are as late as they are, and a
+    fix may be far off for it.
+    """
+    own = np.concatenate([np.full(rows.count, rows.kind == kind) for rows in problem.rows])
+    offset, error = 0.0, np.inf
+    tests = None
+    for _ in range(_STEPS):
+        moved = problem.with_rows(z=problem.z - offset * own)
+        x, _ = descend(moved, x)
+        made = elements(moved, x, "kind")
+        tests = tested(made, np.ones(()))
+        here = made.of_offset == made.names.index(kind)
+        size = float(tests.size[:, tests.errors :][here].sum())
+        if size <= 0.0:  # a common delay is a time of emission
+            return kind, 0.0, np.inf, np.inf
+        step, error = float(tests.vector[:, tests.errors :][here].sum()) / size, size**-0.5
+        if abs(step) <= _STILL * error:
+            break
+        offset += step
+    return kind, offset, error, np.inf if tests is None else float(priced_cost(tests).sum()) + ROW_PRICE
+
+
+def _mixture(tests: Tested, able: Array) -> tuple[float, float, float, Array, int]:
+    """Return share, mean delay, gain, late rows (N, q) and the number of rows that are checked."""
+    found = snooped(tests, slice(0, tests.errors), _STANDS_OUT)
+    late = found.gross & able & (found.shift > 0.0)
+    share = delay = gain = 0.0
+    seen = able & np.isfinite(found.shift)
+    for _ in range(_CHOICES):
+        shift, sigma = _without_others(tests, late)
+        seen = able & np.isfinite(shift)
+        share, delay, gain, chance = _expect(shift[seen], sigma[seen], late[seen])
+        now = np.zeros(late.shape, dtype=bool)
+        now[seen] = chance > 0.5
+        # Rows that nothing checks once the others are left out stay what they were.
+        now |= late & ~seen
+        if (now == late).all():
+            break
+        late = now
+    return share, delay, gain, late, int(seen.sum())
+
+
+def _without_others(tests: Tested, late: Array) -> tuple[Array, Array]:
+    """Return the error (N, q) of each row, and its sigma, that the others show which are not late."""
+    items, q = np.arange(len(late)), tests.errors
+    shift, sigma = shown(without(tests, late), slice(0, q))
+    order = np.argsort(~late, axis=1, kind="stable")[:, : int(late.sum(1).max(initial=0))]
+    for column in order.T:
+        own = late[items, column]
+        others = late.copy()
+        others[items, column] = False
+        # of a late row all the other late ones are left out, not itself
+        one, error = shown(without(tests, others), slice(0, q))
+        shift[items[own], column[own]] = one[items[own], column[own]]
+        sigma[items[own], column[own]] = error[items[own], column[own]]
+    return shift, sigma
+
+
+def _expect(error: Array, sigma: Array, late: Array) -> tuple[float, float, float, Array]:
+    """Return share, mean delay and gain, and the chance of each row to be late: errors are normal, plus delays."""
+    from scipy.special import log_ndtr
+
+    share = float(np.clip(late.mean(), 0.5 / max(len(late), 1), 0.9)) if len(late) else 0.0
+    delay = float(np.mean(error[late])) if late.any() else 0.0
+    if not share or delay <= 0.0:
+        return 0.0, 0.0, 0.0, np.zeros(len(error))
+    prompt = -0.5 * (error / sigma) ** 2 - np.log(sigma) - 0.5 * np.log(2.0 * np.pi)
+    for _ in range(_TURNS):
+        # A delay given the error is normal about error - sigma^2 / delay, cut off at zero.
+        middle = error - sigma**2 / delay
+        tail = log_ndtr(middle / sigma)
+        density = np.log(share / delay) + 0.5 * (sigma / delay) ** 2 - error / delay + tail
+        both = np.logaddexp(np.log1p(-share) + prompt, density)
+        chance = np.exp(density - both)
+        mean = middle + sigma * np.exp(-0.5 * (middle / sigma) ** 2 - 0.5 * np.log(2.0 * np.pi) - tail)
+        new = float(np.clip(chance.mean(), 1e-12, 1.0 - 1e-6))
+        longer = float((chance * mean).sum() / max(chance.sum(), 1e-300))
+        done = abs(new - share) <= _ENDED * share and abs(longer - delay) <= _ENDED * delay
+        share, delay = new, max(longer, 1e-6)
+        if done:
+            break
+    return share, delay, float(2.0 * (both - prompt).sum()), chance

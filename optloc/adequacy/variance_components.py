@@ -453,13 +453,13 @@ def snooped(tests: Tested, columns: slice, cut: float) -> Snooped:
     none is beyond it: data snooping (Baarda 1968, section 4).
     """
     n, first = len(tests.vector), range(tests.vector.shape[1])[columns].start
-    shift, sigma = _shown(tests, columns)
+    shift, sigma = shown(tests, columns)
     gross = np.zeros(shift.shape, dtype=bool)
     while True:
         sigmas = np.abs(tests.sigmas[:, columns])
         worst = sigmas.argmax(1)
         hit = np.flatnonzero(sigmas[np.arange(n), worst] > cut)
-        now = _shown(tests, columns)
+        now = shown(tests, columns)
         shift, sigma = (np.where(gross, old, new) for old, new in zip((shift, sigma), now, strict=True))
         if not len(hit):
             return Snooped(gross, shift, sigma, tests)
@@ -470,7 +470,8 @@ def snooped(tests: Tested, columns: slice, cut: float) -> Snooped:
         tests = tests.without(column)
 
 
-def _shown(tests: Tested, columns: slice) -> tuple[Array, Array]:
+def shown(tests: Tested, columns: slice) -> tuple[Array, Array]:
+    """Return the size of an error along each column that the rest shows, and its standard deviation; NaN for none."""
     size, vector = tests.size[:, columns], tests.vector[:, columns]
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(size > 0.0, vector / size, np.nan), np.where(size > 0.0, size**-0.5, np.nan)

@@ -17,6 +17,7 @@ from optloc.cli.options import (
     Height,
     Html,
     Json,
+    LateFromData,
     Method,
     NoiseFromData,
     Plot,
@@ -95,6 +96,7 @@ def fix(
     box: Box = None,
     noise: NoiseFromData = None,
     rescale: RescaleNoise = False,
+    late: LateFromData = False,
     allow: Allow = None,
     quiet: Quiet = False,
     verbose: Verbose = False,
@@ -108,7 +110,16 @@ def fix(
     more, passing = constraints(height, above_ground, box), allowed(allow)
     files = {"geojson_path": geojson, "plot": plot, "out": out, "html": html}
     code = run_fix(
-        file, method, more, as_json=as_json, **files, quiet=quiet, noise=noise, rescale=rescale, allow=passing
+        file,
+        method,
+        more,
+        as_json=as_json,
+        **files,
+        quiet=quiet,
+        noise=noise,
+        rescale=rescale,
+        late=late,
+        allow=passing,
     )
     raise typer.Exit(code)
 

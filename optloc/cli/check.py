@@ -12,11 +12,11 @@ from rich.table import Table
 
 from optloc.adequacy.elements import By, batch_of
 from optloc.adequacy.geometry import Advice
-from optloc.adequacy.level import CommonLevel, common_level_at
+from optloc.adequacy.level import CommonLevel, LateSignals, common_level_at, late_signals_at
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Bias
 from optloc.cli.file_fixes import CHUNK
-from optloc.cli.fix import advice_for_vectors, advice_json, grouping_of, level_json, show_advice, tell_level
+from optloc.cli.fix import advice_for_vectors, advice_json, grouping_of, late_json, level_json, show_advice, tell_level
 from optloc.cli.output import Columns, bar, dumps, records, say_all, with_sigma, write_picture, write_table, write_text
 from optloc.files import Loaded, read
 from optloc.linear.constraints import exact
@@ -52,6 +52,7 @@ def run_check(file: Path, as_json: bool, asked: Asked | None = None, *, quiet: b
     if as_json:
         more = {} if checked is None else {"health": _health_json(checked)}
         more |= {} if checked is None or checked.level is None else {"noise_level": level_json(checked.level)}
+        more |= {} if checked is None or checked.late is None else {"late_signals": late_json(checked.late)}
         write_text(Path("-"), dumps(found | more | {"advice": advice_json(told)}))
     elif not quiet:
         table = Table(title=loaded.title, show_header=False, title_justify="left")
@@ -60,7 +61,7 @@ def run_check(file: Path, as_json: bool, asked: Asked | None = None, *, quiet: b
         Console().print(table)
         if checked is not None:
             _show_health(checked, Console())
-            say_all(Console(), () if checked.level is None else tell_level(checked.level))
+            say_all(Console(), tell_level(checked.level, late=checked.late))
         show_advice(told, Console())
     return 1 if found["epochs_with_too_few_rows"] or found["epochs_with_disconnected_pairs"] else 0
 
@@ -228,6 +229,7 @@ class Checked:
     why: str = ""
     vectors: Array | None = None
     level: CommonLevel | None = None
+    late: LateSignals | None = None
 
 
 def _check_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
@@ -273,7 +275,8 @@ def _solve_health(loaded: Loaded, method: str, by: By, quiet: bool) -> Checked:
     asked = any(each is not None for each in explained)
     health = health_of(batch, (kept, vectors[kept]), by, explained if asked else None)
     level = common_level_at(batch.take(kept), vectors[kept])
-    return Checked(health, vectors=vectors if separable(loaded.problem) else None, level=level)
+    late = late_signals_at(batch, kept, vectors[kept])
+    return Checked(health, vectors=vectors if separable(loaded.problem) else None, level=level, late=late)
 
 
 def _health_columns(health: Health) -> Columns:

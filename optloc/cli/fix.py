@@ -16,7 +16,7 @@ from rich.text import Text
 from optloc.adequacy.advice import advise, advise_at
 from optloc.adequacy.elements import GROUPINGS, By, batch_of
 from optloc.adequacy.geometry import Advice
-from optloc.adequacy.level import SEVERAL, CommonLevel, common_level_at
+from optloc.adequacy.level import SEVERAL, CommonLevel, LateSignals, common_level_at, late_signals_at
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import ANSWERED, Array, Status
 from optloc.cli.file_fixes import (
@@ -36,7 +36,12 @@ from optloc.files.schema import ConstraintTable
 from optloc.problem.chart import CARTESIAN, INVERSE_RANGE, NAMES
 from optloc.problem.fix import Fix, Suspect
 from optloc.problem.problem import Problem
-from optloc.quality.levels import NoiseLevels, common_level, with_estimated_noise
+from optloc.quality.levels import (
+    NoiseLevels,
+    common_level,
+    late_signals,
+    with_estimated_noise,
+)
 
 # What a screen holds of each list; the rest is counted, and --json and --out have all of it.
 _STATES, _EXPLANATIONS, _SUSPECTS, _BIASES, _FAILURES = 12, 8, 12, 40, 10
@@ -60,6 +65,7 @@ def run_fix(
     quiet: bool = False,
     noise: str | None = None,
     rescale: bool = False,
+    late: bool = False,
     allow: tuple[Status, ...] = (),
 ) -> int:
     """Fix a file under constraints of its own and more, write what was asked for, and return the exit code."""
@@ -70,8 +76,12 @@ def run_fix(
     rescaled = _common_level(loaded.problem) if rescale else None
     if rescaled is not None:
         loaded = replace(loaded, problem=rescaled.scale(loaded.problem))
-    found = fix_file(loaded, method, quiet or as_json)
+    signals = late_signals(loaded.problem) if late else None
+    found = fix_file(loaded, signals.method if signals is not None and signals.share else method, quiet or as_json)
+    if signals is not None and len(signals.late) == len(found.columns["x"]):
+        found.columns.update(late_rows=signals.late, on_late_rows=signals.carried)
     level = rescaled or _level_of(found)
+    signals = signals or _late_of(found)
     levels = found.loaded.levels
     if out is not None:
         write_table(out, found.columns)
@@ -89,13 +99,14 @@ def run_fix(
     if as_json:
         noise_found: dict[str, Any] = {} if levels is None else {"noise": _levels_json(levels)}
         noise_found |= {} if level is None else {"noise_level": level_json(level, rescaled is not None)}
+        noise_found |= {} if signals is None else {"late_signals": late_json(signals, late)}
         write_text(Path("-"), dumps(fixes_json(found) | {"advice": advice_json(told)} | noise_found))
     elif not quiet:
         console = Console(stderr=on_output)
         show(found, console)
         show_advice(told, console)
-        if level is not None:
-            say_all(console, tell_level(level, rescaled is not None))
+        if level is not None or signals is not None:
+            say_all(console, tell_level(level, rescaled is not None, signals, late))
         if levels is not None:
             _show_levels(levels, console)
     return 0 if found.passes(allow) else 1
@@ -358,13 +369,40 @@ def _level_of(found: FileFixes) -> CommonLevel | None:
     return common_level_at(batch, np.concatenate([fix.x for fix in found.fixes]))
 
 
-def tell_level(level: CommonLevel, used: bool = False) -> tuple[str, ...]:
-    """Return what the fixes of a file say of the noise as stated, as sentences, and what helps."""
-    if level.suspect:
-        return (f"{level.sentence}: {'this is used' if used else '--rescale-noise uses it'}",)
-    if level.alone:
-        return (f"{level.sentence}: see `optloc check`, or --noise-from-data station",)
-    return ("the noise is used as stated: no common factor explains more",) if used else ()
+def _late_of(found: FileFixes) -> LateSignals | None:
+    """Return whether rows of a file are late, by its fixes; None of one fix, and where none is but ok."""
+    if not found.fixes[0].shape or sum(map(len, found.fixes)) < SEVERAL:
+        return None
+    if all(bool((fix.code == Status.OK).all()) for fix in found.fixes):
+        return None
+    x, answered = (np.concatenate([getattr(fix, name) for fix in found.fixes]) for name in ("x", "answered"))
+    kept = answered & np.isfinite(x).all(-1)
+    return late_signals_at(batch_of(found.loaded.problem), np.flatnonzero(kept), x[kept]) if kept.any() else None
+
+
+def tell_level(
+    level: CommonLevel | None, used: bool = False, late: LateSignals | None = None, late_used: bool = False
+) -> tuple[str, ...]:
+    """Return what the fixes of a file say of the noise as stated and of late rows, as sentences, and what helps."""
+    said = []
+    if late is not None and late.sentence:
+        # Noise of a larger size explains late rows badly, and nothing well that they do not.
+        use = "this is used" if late_used else "--late-from-data fixes with that"
+        said.append(late.sentence if late.alike else f"{late.sentence}: {use}")
+    elif late_used:
+        said.append("no rows are seen to be late")
+    if level is not None and level.suspect and (used or not said):
+        said.append(f"{level.sentence}: {'this is used' if used else '--rescale-noise uses it'}")
+    elif level is not None and level.alone:
+        said.append(f"{level.sentence}: see `optloc check`, or --noise-from-data station")
+    elif used:
+        said.append("the noise is used as stated: no common factor explains more")
+    return tuple(said)
+
+
+def late_json(late: LateSignals, used: bool = False) -> dict[str, Any]:
+    """Return what is said of late rows as one JSON value."""
+    return asdict(late) | {"method": late.method, "used": used and late.share > 0.0, "sentence": late.sentence}
 
 
 def level_json(level: CommonLevel, used: bool = False) -> dict[str, Any]:

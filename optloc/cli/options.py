@@ -191,6 +191,15 @@ RescaleNoise = Annotated[
 ]
 
 
+LateFromData = Annotated[
+    bool,
+    typer.Option(
+        "--late-from-data",
+        help="Fix with the loss of the share of late rows, and their mean delay, that all epochs show.",
+    ),
+]
+
+
 def coordinates(
     text: str, where: str, advice: str = "write them as 1200,800,50", *, bounds: bool = False
 ) -> list[float]:

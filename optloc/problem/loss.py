@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
 
+from optloc.base.errors import InvalidProblem
 from optloc.base.registry import Table
 from optloc.base.types import Array
 
@@ -136,6 +138,99 @@ def _late_weight(u: Array, c: float) -> Array:
     return _cauchy_weight(np.maximum(u, 0.0), c)
 
 
+# Late rows as a share of all with delays that are exponential: a loss for every share and mean delay.
+
+LATE = frozenset(("range", "toa", "range_sum"))
+"""Kinds that a blocked path makes too long: they grow with every path they hold. A difference may be off either way."""
+
+# How a loss of late rows is spelled: the share of them, and the mean delay in sigma.
+_SPELLED = re.compile(r"late\((?P<share>[0-9.eE+-]+),(?P<delay>[0-9.eE+-]+)\)")
+# Where psi over u is its limit, and the step of the difference that is the limit: far above rounding of a logarithm.
+_ZERO, _STEP = 1e-6, 1e-3
+
+
+@lru_cache(maxsize=256)
+def late_loss(share: float, delay: float) -> Loss:
+    """Return the loss of rows of which a share is late, by delays that are exponential.
+
+    The residual of a row in its sigma is normal, plus a delay with the probability `share`: its density is
+    (1 - p) phi(u) + p g(u) with g that of an exponential and a normal variable together (Grushka 1972, equation 5), and
+    the loss is twice its negative logarithm above its mode, which is some hundredths of sigma above zero. What is
+    early costs its square.
+
+    Parameters
+    ----------
+    share : float
+        Probability of a row to be late, between 0 and 1.
+    delay : float
+        Mean delay of those, standard deviations.
+
+    Raises
+    ------
+    InvalidProblem
+        For a share that is none, or a delay that is not positive.
+    """
+    name = f"late({share:.4g},{delay:.4g})"
+    if not 0.0 < share < 1.0 or not 0.0 < delay < np.inf:
+        advice = "write the share of late rows and their mean delay in sigma, such as late(0.1,8)"
+        raise InvalidProblem(f"there is no loss {name}", "method", advice)
+    mode = _mode(share, delay)
+    least = _late_density(np.array(mode), share, delay)[0]
+    curvature = float(_late_density(np.array(mode + _STEP), share, delay)[1]) / _STEP
+
+    def cost(u: Array, _: float) -> Array:
+        here = _late_density(np.maximum(u, 0.0) + mode, share, delay)[0]
+        return np.where(u > 0.0, np.maximum(2.0 * (least - here), 0.0), u**2)
+
+    def importance(u: Array, _: float) -> Array:
+        psi = _late_density(np.maximum(u, 0.0) + mode, share, delay)[1]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            weight = np.where(u > _ZERO, psi / u, curvature)
+        return np.where(u > 0.0, np.clip(weight, 0.0, 1.0), 1.0)
+
+    summary = f"a share of {share:.2g} late by {delay:.2g} sigma on average"
+    # Where a row is as likely late as not the loss leaves the square; quadratures need no more of it.
+    grid = np.linspace(0.5, 8.0, 151)
+    kink = float(grid[int(np.argmin(np.abs(importance(grid, 0.0) - 0.5)))])
+    return Loss(name, kink, cost, importance, summary, one_sided=True)
+
+
+def _late_density(u: Array, share: float, delay: float) -> tuple[Array, Array]:
+    """Return the logarithm of the density of rows some of which are late, and the negative of its derivative."""
+    from scipy.special import log_ndtr
+
+    late = np.log(share / delay) + 0.5 / delay**2 - u / delay + log_ndtr(u - 1.0 / delay)
+    prompt = np.log1p(-share) - 0.5 * u**2 - _LOG_ROOT
+    density = np.logaddexp(late, prompt)
+    chance = np.exp(late - density)
+    # derivative of the logarithm of the normal distribution: its hazard
+    hazard = np.exp(-0.5 * (u - 1.0 / delay) ** 2 - _LOG_ROOT - log_ndtr(u - 1.0 / delay))
+    return density, (1.0 - chance) * u + chance * (1.0 / delay - hazard)
+
+
+_LOG_ROOT = 0.5 * float(np.log(2.0 * np.pi))
+
+
+def _mode(share: float, delay: float) -> float:
+    """Return where the density of rows some of which are late is largest, by bisection."""
+    low, high = 0.0, 1.0 + 2.0 * delay
+    for _ in range(60):  # down to rounding
+        middle = 0.5 * (low + high)
+        rising = float(_late_density(np.array(middle), share, delay)[1]) < 0.0
+        low, high = (middle, high) if rising else (low, middle)
+    return 0.5 * (low + high)
+
+
+class _Spelled(dict[str, Loss]):
+    """Losses that are made of what their name says."""
+
+    def __missing__(self, name: str) -> Loss:
+        found = _SPELLED.fullmatch(name.replace(" ", ""))
+        if found is None:
+            raise KeyError(name)
+        return late_loss(float(found["share"]), float(found["delay"]))
+
+
 # Each constant is where `efficiency` says 95 %, for the truncated loss 99 %.
 _OWN = (
     Loss("huber", 1.345, _huber, _huber_weight, "Huber's convex loss: gross errors pull no harder than 1.3 sigma"),
@@ -150,8 +245,11 @@ _OWN = (
         one_sided=True,
     ),
 )
-LOSSES: Table[Loss] = Table("optloc.losses", lambda value: isinstance(value, Loss), {loss.name: loss for loss in _OWN})
+LOSSES: Table[Loss] = Table(
+    "optloc.losses", lambda value: isinstance(value, Loss), {loss.name: loss for loss in _OWN}, _Spelled
+)
 """Losses by name, each a stage of a method: Huber 1964; Holland, Welsch 1977; Blake, Zisserman 1987; Cauchy one-sided.
 
-Add one with one entry, or from another package with an entry point of ``optloc.losses``.
+``LOSSES["late(0.1,8)"]`` is that of `late_loss`. Add one with one entry, or from another package with an entry point of
+``optloc.losses``.
 """

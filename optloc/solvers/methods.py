@@ -156,9 +156,17 @@ _STAGES: dict[str, Entry] = {
 }
 
 
+class _Derived(dict[str, Entry]):
+    """Stages of what other tables hold, also of losses that are made of what their name says."""
+
+    def __missing__(self, name: str) -> Entry:
+        loss = LOSSES[name]
+        return _start(Robust(loss), loss.summary)
+
+
 def _derive() -> Mapping[str, Entry]:
     """Return the stages that follow from other tables: of each loss, and of each start of a formulation."""
-    out = {name: _start(Robust(loss), loss.summary) for name, loss in LOSSES.items()}
+    out = _Derived({name: _start(Robust(loss), loss.summary) for name, loss in LOSSES.items()})
     for formulation in FORMULATIONS.values():
         for word in formulation.starts:
             out.setdefault(word, _start(stages.start_with(word), formulation.summary))

@@ -12,7 +12,7 @@ from optloc.linear.constraints import Face
 from optloc.linear.evaluate import predict
 from optloc.linear.normal import Normal, marginal, weighed, with_priors
 from optloc.models import MODELS, wrap
-from optloc.problem.loss import Loss
+from optloc.problem.loss import LATE, Loss
 from optloc.problem.noise import Noise, variances, whiten
 from optloc.problem.problem import Problem
 from optloc.solvers.refine import refine
@@ -20,9 +20,6 @@ from optloc.solvers.refine import refine
 # Rows of a correlated group are never quite absent while their weights are sought: their partners still foretell them.
 # At a millionth of its weight a row no longer counts in the sums, and one over it is far from overflow.
 _LEAST = 1e-6
-# A blocked path is longer: these kinds grow with every path they hold. A difference may be off to either side.
-_LATE = frozenset(("range", "toa", "range_sum"))
-
 # Gauss-Newton steps between two weighings, enough for least squares to settle from afar, and the change of a weight
 # that counts as none, well below what shows in a fix.
 _STEPS, _SETTLED = 12, 1e-4
@@ -89,7 +86,7 @@ class Doubt:
                 precision = (whitener.matrix**2).sum(-2)
                 known = present & full[..., None] & (precision > 0.0)
                 given[:, rows] = np.where(known, 1.0 / np.where(known, precision, 1.0), given[:, rows])
-        kinds = np.concatenate([np.full(rows.count, rows.kind in _LATE) for rows in problem.rows])
+        kinds = np.concatenate([np.full(rows.count, rows.kind in LATE) for rows in problem.rows])
         return cls(noise, base, own, given, kinds)
 
     def take(self, index: Array) -> Doubt:
