@@ -24,6 +24,8 @@ ACCUSED = 0.01
 
 # Factors of sigma that are tried: a grid of 5 % over what a wrong unit would not explain better.
 _FACTORS = np.exp(np.arange(-60, 100) * 0.05)
+# Share of late rows from which they are no exception: what all have in common may be an offset.
+_MINORITY = 0.5
 # Change of sigma that is worth a word: 20 % of it move no fix by a tenth of its sigma.
 _WORTH = 1.2
 # Eigenvalue of the tests of a group, as a share of the largest, below which it is rounding.
@@ -151,6 +153,9 @@ def common_level_at(problem: Problem, x: Array) -> CommonLevel:
         return none
     if least < common.min() and name not in kinds:
         return replace(none, alone=name, size=size, gain=gain)
+    # A minority of late rows widens what is left like a larger noise does: who is late is then said of each fix.
+    if 0.0 < _late_rows(by_kind, _able(batch)).share < _MINORITY:
+        return replace(none, gain=gain)
     return _rescaled(replace(none, gain=gain), by_kind)
 
 
@@ -303,7 +308,7 @@ def late_signals_at(problem: Problem, kept: Array, x: Array) -> LateSignals:
         Their parameter vectors.
     """
     late, carried = np.zeros(problem.batch_shape[0], dtype=int), np.zeros(problem.batch_shape[0], dtype=bool)
-    able = [rows.kind for rows in problem.rows if rows.kind in LATE]
+    able = _able(problem)
     if not able:
         return LateSignals(0.0, 0.0, 0.0, 0, late, carried)
     part = problem.take(kept)
@@ -324,6 +329,11 @@ _STANDS_OUT = 3.0
 # Share of what gross errors of either side explain that late rows have to: 0.8 to 1 where a tenth or more are late by 5
 # sigma on average, 0.6 at the most where the noise is three or five times what is stated (50 fixes).
 _ONE_SIDED = 0.7
+
+
+def _able(problem: Problem) -> list[str]:
+    """Return the kinds of a problem that may be late."""
+    return [rows.kind for rows in problem.rows if rows.kind in LATE]
 
 
 def _late_rows(made: Elements, able: list[str]) -> LateSignals:

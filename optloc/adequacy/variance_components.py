@@ -42,6 +42,8 @@ _LEAST = 1e-16
 # for a quarter of the stations that have half the noise of others (27 fixes by five ranges), and fixes that believe it
 # are hundreds of sigma off. With 1 the 95 % ellipses of fixes hold 89 % there, with 2 they hold 95 %, with 3 97 %.
 _PENALTY = 2.0
+# Most of what it takes of the information of a factor where all groups have the same: no variance is more than doubled.
+_SHARE = 0.5
 # Steps of the medians, which only bring the factors near; turns of gross errors and steps; scoring steps of a turn.
 _COARSE, _ROUNDS, _STEPS = 8, 5, 40
 # Moves that end them: of a coarse step in log-factors; of a scoring step and of a turn in standard errors.
@@ -132,7 +134,7 @@ def fit(made: Elements, left: Array, single: Array) -> Fitted:
         advice = "add rows, stations or known heights"
         raise InvalidProblem("no fix has more rows than unknowns: nothing shows the noise", "noise", advice)
     # One factor for all: where even that is not told, nothing is.
-    alike = _maximise(made, np.minimum(group, 0), np.zeros(1), none[:1])
+    alike = _maximise(made, np.minimum(group, 0), np.zeros(1), none[:1], np.zeros(1))
     begin = np.full(count, np.log(alike.variance[0]))
     shared = ~(_errors(alike.tests, group, np.exp(begin), none) < LOOSE) & ~single[used]
     # Groups that are not told by themselves become one, in the place of the first of them.
@@ -143,7 +145,10 @@ def fit(made: Elements, left: Array, single: Array) -> Fitted:
     alone = np.isin(kinds, np.flatnonzero(shared))
     if shared.sum() > 1:
         alone &= ~(_errors(alike.tests, own, np.exp(begin[: len(kinds)]), none[: len(kinds)]) < LOOSE)
-    found = _maximise(made, own, np.where(alone, 0.0, begin[: len(kinds)]), alone)
+    level = np.where(alone, 0.0, begin[: len(kinds)])
+    information, _ = _score(alike.tests, own, np.exp(begin[: len(kinds)]), alone)
+    penalty = np.minimum(_PENALTY, _SHARE * np.diagonal(information))
+    found = _maximise(made, own, level, alone, penalty)
     low, high = (np.where(alone, np.nan, end)[place] for end in _interval(found, own, alone))
 
     def spread(values: Array) -> Array:
@@ -201,8 +206,11 @@ def visible(made: Elements, found: Fitted, left: Array) -> Array:
     return np.asarray(told & (per_fix.sum(0) > _SEEN * np.sqrt(np.where(told, own, 1.0))))
 
 
-def _maximise(made: Elements, own: Array, level: Array, held: Array) -> _Found:
-    """Return the factors of classes of errors `own` (N, q), from log-factors (c,) on; some are held there."""
+def _maximise(made: Elements, own: Array, level: Array, held: Array, penalty: Array) -> _Found:
+    """Return the factors of classes of errors `own` (N, q), from log-factors (c,) on; some are held there.
+
+    The penalty (c,) is added to their scores.
+    """
     count, level = len(level), level.copy()
     # Medians first: they stand half of the errors being gross, the scores of the likelihood do not.
     for _ in range(_COARSE):
@@ -215,7 +223,7 @@ def _maximise(made: Elements, own: Array, level: Array, held: Array) -> _Found:
         # Gross errors are chosen once a turn, not at every step: else steps would jump as errors come and go.
         gross, tests = cleaned(made, np.exp(level)[own])
         for _ in range(_STEPS):
-            step, sure = _step(tests, own, np.exp(level), held)
+            step, sure = _step(tests, own, np.exp(level), held, penalty)
             last, level = level, np.maximum(level + step, np.log(_LEAST))
             tests = without(tested(made, np.exp(level)[own]), gross)
             if (np.abs(level - last) <= _CLOSE * sure).all():
@@ -238,14 +246,13 @@ def _coarse(tests: Tested, own: Array, variance: Array) -> Array:
     return np.clip(step, _DOWN, _UP)
 
 
-def _step(tests: Tested, own: Array, variance: Array, held: Array) -> tuple[Array, Array]:
+def _step(tests: Tested, own: Array, variance: Array, held: Array, penalty: Array) -> tuple[Array, Array]:
     """Return the scoring step of the log-factors (c,), at most one, along what the data see, and their sigmas."""
     information, per_fix = _score(tests, own, variance, held)
-    free = np.where(held, 0.0, _PENALTY)
     # The penalty has no curvature in the logarithm; its size damps steps where the data hardly see a factor.
-    inverse = _inverse(information + np.diag(free))
+    inverse = _inverse(information + np.diag(penalty))
     # A step of at most e: the quadratic model of the likelihood holds no further.
-    return np.clip(inverse @ (per_fix.sum(0) + free), -1.0, 1.0), np.sqrt(np.diagonal(inverse))
+    return np.clip(inverse @ (per_fix.sum(0) + penalty), -1.0, 1.0), np.sqrt(np.diagonal(inverse))
 
 
 def _score(tests: Tested, own: Array, variance: Array, held: Array) -> tuple[Array, Array]:

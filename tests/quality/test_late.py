@@ -10,7 +10,7 @@ from scipy.integrate import quad
 from scipy.stats import exponnorm, norm
 from typer.testing import CliRunner
 
-from optloc import LOSSES, InvalidProblem, assemble, late_signals, measured, solve
+from optloc import LOSSES, InvalidProblem, assemble, common_level, late_signals, measured, solve
 from optloc.adequacy.elements import batch_of
 from optloc.cli import app
 
@@ -133,3 +133,10 @@ def test_rows_late_alike_are_an_offset(tmp_path):
     found = late_signals(problem)
     assert found.alike == "range"
     assert found.offset == pytest.approx(100.0 * STATED, rel=0.2)
+
+
+def test_late_rows_are_no_noise():
+    for seed in range(4):
+        level = common_level(late(seed, 0.2, 10.0)[0], method="gtrs+lsr")
+        assert level.accused > 25
+        assert not level.suspect

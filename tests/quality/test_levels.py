@@ -50,13 +50,13 @@ def test_is_the_maximum_of_the_restricted_likelihood(monkeypatch):
     # Nothing is called gross here: the estimate is then that of the likelihood times the factors of all variances,
     # which scipy maximises from its definition.
     monkeypatch.setattr(rules, "CUT", np.inf)
-    problem = ranged(np.random.default_rng(3), 40, np.array([5.0, 10.0, 20.0, 10.0, 30.0, 10.0]))
+    problem = ranged(np.random.default_rng(3), 80, np.array([5.0, 10.0, 20.0, 10.0, 30.0, 10.0]))
     batch = by_epoch(problem)
     fix = solve(batch)
     found = noise_levels(problem, fix=fix)
     line = linearise(batch, fix.x)
     jacobian = np.concatenate([line.shared, line.local], axis=-1)
-    parts = [[np.diag(100.0 * (np.arange(6) == s)) for s in range(6)]] * 40
+    parts = [[np.diag(100.0 * (np.arange(6) == s)) for s in range(6)]] * 80
     plain = restricted(line.residual, jacobian, parts)
 
     def value(level):
@@ -257,3 +257,14 @@ def test_no_common_error_is_said_and_left_out():
     assert levels.factor[1] == 0.0
     assert "have an error in common: range common" in " ".join(levels.sentences)
     assert fixed.noise.blocks[0].row.shape[1] == 1
+
+
+def test_a_station_of_few_rows_has_a_level_that_is_bounded():
+    # S5 is heard in six epochs: what little shows of it may double its variance, not blow it up.
+    rng = np.random.default_rng(11)
+    problem = ranged(rng, 60, np.full(6, 10.0), kind="range")
+    weight = np.where((np.arange(problem.count) % 6 == 5) & (np.arange(problem.count) > 36), 0.0, 1.0)
+    levels = noise_levels(problem.with_rows(weight=weight))
+    assert levels.count[5] == 6
+    assert 0.2 < levels.factor[5] < 3.0
+    np.testing.assert_allclose(levels.factor[:5], 1.0, atol=0.4)
