@@ -26,5 +26,5 @@ def test_pairs_of_two_halves_of_a_flight(data_dir, flight):
     # Rows of a pair repeat within 0.05 m to 0.4 m in a window; README's 0.22 m is this and the offset of the window.
     assert (one[:, 1] < 0.6).all()
     assert (two[:, 1] < 0.6).all()
-    # A pair whose noise is large in one half is so in the other.
-    assert np.corrcoef(np.log(one[:, 1]), np.log(two[:, 1]))[0, 1] > 0.5
+    # Levels from 0.06 m to 0.4 m repeat within a factor of 2.5: which tails are gross is decided anew in each half.
+    assert np.abs(np.log(one[:, 1] / two[:, 1])).max() < np.log(2.5)
