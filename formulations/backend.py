@@ -39,6 +39,10 @@ class Choice:
         return f"{self.kind}:{self.name}:{sorted(self.settings.items())!r}"
 
 
+class SolverError(ArithmeticError):
+    """A back end stopped with an error of its own on numbers that it was given."""
+
+
 # Context variables, not globals: a choice inside `using` holds for its thread and task alone. Threads that are meant to
 # share it start in a copy of the caller's context.
 _CHOICE: ContextVar[Choice | None] = ContextVar("choice", default=None)

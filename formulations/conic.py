@@ -33,7 +33,7 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 
 from formulations.algebra import Array, Index
-from formulations.backend import choice_for, count
+from formulations.backend import SolverError, choice_for, count
 
 _Arguments = ParamSpec("_Arguments")
 _Built = TypeVar("_Built")
@@ -161,7 +161,11 @@ class Relaxation:
         reach: float | None,
     ) -> Answer:
         data.feed(values)
-        solution = _solver(data, settings).solve()
+        solver = _solver(data, settings)
+        try:
+            solution = solver.solve()
+        except Exception as trouble:  # whatever stops a solver that was built
+            raise SolverError(f"Clarabel failed: {trouble}") from trouble
         x, z, status = np.array(solution.x), np.array(solution.z), str(solution.status)
         if not (np.isfinite(x).all() and np.isfinite(z).all()):
             x, z = np.full(len(x), np.nan), np.full(len(z), np.nan)

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from formulations.algebra import Array
-from formulations.backend import Choice, count
+from formulations.backend import Choice, SolverError, count
 
 Function = Callable[[Any, Any], Any]
 Residual = Callable[[Any, Any, Any], Any]
@@ -209,8 +209,11 @@ class Program:
             "lbg": np.zeros(self._equal + self._more),
             "ubg": np.concatenate([np.zeros(self._equal), np.full(self._more, np.inf)]),
         }
-        with self._lock:
-            found, stats = self._solver(**given), self._solver.stats()
+        try:
+            with self._lock:
+                found, stats = self._solver(**given), self._solver.stats()
+        except RuntimeError as trouble:  # CasADi has no other kind
+            raise SolverError(f"{self._name} failed: {trouble}") from trouble
         iterations = int(stats.get("iter_count", 0))
         count(self._name, iterations)
         multipliers = _numbers(found["lam_g"])

@@ -14,7 +14,11 @@ import numpy as np
 
 from optloc.base.types import Status
 
-__all__ = ["InvalidProblem", "NoSolution", "OptlocError", "nearest"]
+__all__ = ["NUMERICAL", "InvalidProblem", "NoSolution", "OptlocError", "nearest"]
+
+# What arithmetic raises where numbers are at fault and not the program: those of numpy and scipy, of floating point and
+# of solvers (`formulations.backend.SolverError`). All else is a programming error, and surfaces.
+NUMERICAL: tuple[type[Exception], ...] = (np.linalg.LinAlgError, ArithmeticError)
 
 
 class OptlocError(Exception):

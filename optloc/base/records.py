@@ -79,7 +79,7 @@ def join(parts: Iterable[Record], count: int) -> Record:
     """Return records of flat batches one behind the other as one; what they have beside arrays is the first's.
 
     Each part is copied into place as it comes and may be forgotten: memory beyond the answers does not grow with the
-    batch. An array that all entries of all parts share stays one row.
+    batch. An array that all entries of all parts share stays one row; entries of a part that lacks one are empty.
 
     Parameters
     ----------
@@ -89,19 +89,41 @@ def join(parts: Iterable[Record], count: int) -> Record:
         Entries of all of them.
     """
     whole: dict[str, _Column] = {}
-    pieces: dict[str, list[Any]] = {}
+    pieces: dict[str, list[tuple[int, Any]]] = {}
     first, start = None, 0
     for part in parts:
         first, size = part if first is None else first, _count(part)
         for name, value, layout in _arrays(part):
             whole.setdefault(name, _Column(layout, count)).put(slice(start, start + size), value)
         for name, piece in _parts(part):
-            pieces.setdefault(name, []).append(piece)
+            pieces.setdefault(name, []).append((start, piece))
         start += size
     assert first is not None
     changed: dict[str, Any] = {name: column.array() for name, column in whole.items()}
-    changed |= {name: join(own, count) for name, own in pieces.items()}
+    changed |= {name: join(_without_gaps(own, count), count) for name, own in pieces.items()}
     return replace(first, **changed)  # type: ignore[type-var]
+
+
+def _without_gaps(pieces: list[tuple[int, Any]], count: int) -> Iterator[Any]:
+    """Yield records with where each begins, and empty ones for the entries between them, of so many."""
+    end = 0
+    for start, piece in [*pieces, (count, None)]:
+        if start > end:
+            yield _blank(pieces[0][1], start - end)
+        if piece is not None:
+            yield piece
+            end = start + _count(piece)
+
+
+def _blank(record: Record, count: int) -> Record:
+    """Return so many entries that nobody has filled, of records like another."""
+    changed: dict[str, Any] = {
+        name: _empty((count, *value.shape[1:]), layout, value.dtype)
+        for name, value, layout in _arrays(record)
+        if value is not None
+    }
+    changed |= {name: _blank(value, count) for name, value in _parts(record)}
+    return replace(record, **changed)  # type: ignore[type-var]
 
 
 class _Column:
@@ -111,9 +133,11 @@ class _Column:
         self.layout, self.count = layout, count
         self.parts: list[tuple[slice, Array]] = []  # slots differ in number, and shared rows wait for another
         self.whole: Array | None = None
+        self.lacking: list[slice] = []
 
     def put(self, place: slice, value: Array | None) -> None:
         if value is None:
+            self.lacking.append(place)
             return
         if self.whole is None and (self.layout.slots or self._shares(value)):
             self.parts.append((place, value))
@@ -129,7 +153,11 @@ class _Column:
                 return np.broadcast_to(value[:1], (self.count, *value.shape[1:]))
             width = max(own.shape[1] for _, own in self.parts) if self.layout.slots else 0
             self._allocate(value, (width, *value.shape[2:]) if self.layout.slots else value.shape[1:])
-        return self.whole
+        whole = self.whole
+        if whole is not None:
+            for place in self.lacking:
+                whole[place].fill(self.layout.empty)
+        return whole
 
     def _shares(self, value: Array) -> bool:
         """Return whether a part is one row for all, the same as of the parts before."""

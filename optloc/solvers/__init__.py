@@ -13,9 +13,9 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.methods import FORMULATIONS, METHODS, SOLVERS, Entry, Formulation, Method, shortcut
 from optloc.solvers.outside import given
-from optloc.solvers.pool import begin, in_parts
+from optloc.solvers.pool import PART, begin, in_parts, where
 from optloc.solvers.starts.position import vectors
-from optloc.solvers.verdict.judge import hide_open_epochs, verdict
+from optloc.solvers.verdict.judge import failed, hide_open_epochs, verdict
 
 __all__ = ["FORMULATIONS", "METHODS", "SOLVERS", "Entry", "Formulation", "Method", "given", "solve", "vectors"]
 
@@ -36,7 +36,8 @@ def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
     Returns
     -------
     Fix
-        With the problem's batch axes. Failure is a status, never an exception.
+        With the problem's batch axes. Failure is a status, never an exception: where a stage fails numerically for one
+        problem of a batch it is `numerical` with the cause, and the others are fixed.
 
     Raises
     ------
@@ -52,11 +53,13 @@ def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
     vector = None if start is None else _broadcast_start(problem, start).reshape(-1, problem.layout.size)
 
     def work(some: Problem, part: slice) -> Fix:
-        pool = None if vector is None else begin(some, vector[part])
-        return hide_open_epochs(verdict(some, run(some, pool)))
+        pool = run(some, None if vector is None else begin(some, vector[part]))
+        with where("the verdict"):
+            return hide_open_epochs(verdict(some, pool))
 
     # the shortcut divides its work itself, and shares it among threads
-    fix = work(flat, slice(None)) if shortcut(run) and vector is None else in_parts(flat, work)
+    most = flat.batch_shape[0] if shortcut(run) and vector is None else PART
+    fix = in_parts(flat, work, most, failed)
     return fix.reshape(shape) if shape != (len(fix),) else fix
 
 

@@ -22,7 +22,7 @@ from optloc.solvers.certify.branch_and_bound import certified, value_certified
 from optloc.solvers.formulations import FORMULATIONS, Formulation
 from optloc.solvers.outside import FixSolver, adapt
 from optloc.solvers.policy import LISTED_GAP
-from optloc.solvers.pool import Pool, offer, pack
+from optloc.solvers.pool import Pool, offer, pack, where
 from optloc.solvers.range_fixes import Quick
 from optloc.solvers.robust.stage import Robust
 from optloc.solvers.sparse import sparse
@@ -234,11 +234,12 @@ class Method:
     def runs(self, count: int) -> list[Solver]:
         """Return the stages for so many problems, in as few as do the same."""
         for words, short in SHORTCUTS.items():
+            name = "+".join(words)
             if shortcut(self):
-                return [replace(short, alone=True)]
+                return [_named(name, replace(short, alone=True))]
             if count >= short.least and self.words[: len(words)] == words:
-                return [short, *(SOLVERS[word].run for word in self.words[len(words) :])]
-        return [SOLVERS[word].run for word in self.words]
+                return [_named(name, short), *map(_stage, self.words[len(words) :])]
+        return [_stage(word) for word in self.words]
 
     def __call__(self, problem: Problem, pool: Pool | None = None) -> Pool:
         """Return the pool of a flat batch of problems.
@@ -255,9 +256,23 @@ class Method:
         return pool
 
 
+def _stage(word: str) -> Solver:
+    return _named(word, SOLVERS[word].run)
+
+
+def _named(name: str, solver: Solver) -> Solver:
+    """Return a stage whose numerical failures say where they happened."""
+
+    def stage(problem: Problem, pool: Pool | None) -> Pool:
+        with where(name):
+            return solver(problem, pool)
+
+    return stage
+
+
 def _run_through(method: Method, problem: Problem, given: Pool | None) -> Pool:
     # a shortcut takes no starts
-    first, *others = method.runs(problem.batch_shape[0]) if given is None else [SOLVERS[w].run for w in method.words]
+    first, *others = method.runs(problem.batch_shape[0]) if given is None else map(_stage, method.words)
     pool = first(problem, given)
     if given is not None and pool.curvature is None:
         # what is given competes with the starts that a stage makes

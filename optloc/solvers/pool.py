@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, TypeVar
 
 import numpy as np
 
+from optloc.base.errors import NUMERICAL
 from optloc.base.records import Axes, join, overwrite
 from optloc.base.types import Array, Status
 from optloc.linear.normal import degrees_of_freedom
@@ -194,8 +196,16 @@ def pack(points: Array) -> Array:
     return np.take_along_axis(points, order[..., None], axis=1)[:, :keep]
 
 
-def in_parts(problem: Problem, work: Callable[[Problem, slice], Answer], most: int = PART) -> Answer:
+def in_parts(
+    problem: Problem,
+    work: Callable[[Problem, slice], Answer],
+    most: int = PART,
+    failed: Callable[[Problem, str], Answer] | None = None,
+) -> Answer:
     """Return the answers for a flat batch of problems, at most so many at a time.
+
+    A part that fails numerically is halved until the problems are alone that cannot be worked on: of these the cause
+    is told, and the answers of all others are theirs.
 
     Parameters
     ----------
@@ -205,21 +215,76 @@ def in_parts(problem: Problem, work: Callable[[Problem, slice], Answer], most: i
         Maps some of the problems, and which they are, to their pool or fix.
     most : int
         Problems in one part.
+    failed : callable, optional
+        Maps problems and the cause to the answers of those that failed, and none to that of none; without it failures
+        are raised.
     """
     count = problem.batch_shape[0]
+    if failed is not None and not count:
+        return failed(problem, "")
     if count <= most:
-        return work(problem, slice(0, count))
-    stages: list[tuple[Stage, ...]] = []
+        found = list(_contained(problem, slice(0, count), work, failed))
+        return found[0] if len(found) == 1 else _joined(found, count)
 
-    def answers() -> Any:
+    def answers() -> Iterator[Answer]:
         for first in range(0, count, most):
             part = slice(first, min(first + most, count))
-            answer = work(problem.take(np.arange(part.start, part.stop)), part)
+            yield from _contained(problem.take(np.arange(part.start, part.stop)), part, work, failed)
+
+    return _joined(answers(), count)
+
+
+def _contained(
+    problem: Problem,
+    part: slice,
+    work: Callable[[Problem, slice], Answer],
+    failed: Callable[[Problem, str], Answer] | None,
+) -> Iterator[Answer]:
+    """Yield the answers of a part, or of its halves one after the other where it fails numerically."""
+    try:
+        answer = work(problem, part)
+    except NUMERICAL as error:
+        if failed is None:
+            raise
+        count = part.stop - part.start
+        if count == 1:
+            yield failed(problem, _cause(error))
+            return
+        half = count // 2
+        for first, last in ((0, half), (half, count)):
+            own = slice(part.start + first, part.start + last)
+            yield from _contained(problem.take(np.arange(first, last)), own, work, failed)
+    else:
+        yield answer
+
+
+@contextmanager
+def where(place: str) -> Iterator[None]:
+    """Note the place on a numerical failure that passes, unless an inner one has: its cause is told with it."""
+    try:
+        yield
+    except NUMERICAL as error:
+        if not getattr(error, "__notes__", ()):
+            error.add_note(place)
+        raise
+
+
+def _cause(error: Exception) -> str:
+    """Return what a numerical failure says, behind the place that `where` has noted."""
+    return ": ".join([*getattr(error, "__notes__", ()), str(error) or type(error).__name__])
+
+
+def _joined(answers: Iterable[Answer], count: int) -> Answer:
+    """Return answers of so many problems one behind the other as one."""
+    stages: list[tuple[Stage, ...]] = []
+
+    def told() -> Iterator[Answer]:
+        for answer in answers:
             # parts differ in them: one may need what others do not
             stages.append(answer.stages)
             yield answer
 
-    whole: Answer = join(answers(), count)
+    whole: Answer = join(told(), count)
     return replace(whole, stages=_sum_stages(stages))
 
 

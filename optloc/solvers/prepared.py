@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem
+from optloc.base.errors import NUMERICAL, InvalidProblem
 from optloc.base.types import Array
 from optloc.problem.epochs import separable
 from optloc.problem.fix import Fix
@@ -76,8 +76,12 @@ class Prepared:
         if len(place) > 1:
             wide = np.broadcast_to(place.reshape(*self.shape, *place.shape[1:]), (*shape, *place.shape[1:]))
             place = wide.reshape(-1, *place.shape[1:])
-        pool = settle_directly(self.plan, flat, place, lambda items: self._flat(values, shape).take(items))
-        fix = verdict(self._flat(values, shape), pool)
+        try:
+            pool = settle_directly(self.plan, flat, place, lambda items: self._flat(values, shape).take(items))
+            fix = verdict(self._flat(values, shape), pool)
+        except NUMERICAL:
+            # one of them fails: which one is told where all take the stages
+            return solve(self._flat(values, shape), self.method).reshape(shape)
         return fix if len(shape) == 1 else fix.reshape(shape)
 
     def _flat(self, z: Array, shape: tuple[int, ...]) -> Problem:

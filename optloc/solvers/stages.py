@@ -209,7 +209,7 @@ _SETTLED = (Status.REJECTED, Status.TOO_FEW_ROWS, Status.INFEASIBLE, Status.CONT
 
 def search(problem: Problem, pool: Pool | None) -> Pool:
     """Return a pool whose unanswered problems were searched from many places, and which says so of them."""
-    if pool is None:
+    if pool is None or pool.curvature is None:
         raise InvalidProblem("search fills the gaps of a fix", "method", "put it behind a refinement")
     if not one_position(problem):
         return pool

@@ -383,6 +383,27 @@ def _show_starts(problem: Problem, pool: Pool) -> Fix:
     )
 
 
+def failed(problem: Problem, cause: str) -> Fix:
+    """Return fixes (N,) without an answer, whose status is `numerical` and whose reason is the cause."""
+    count, size, n = problem.batch_shape[0], problem.layout.size, problem.layout.n_shared
+    code = np.full(count, int(Status.NUMERICAL), dtype=np.int8)
+    return Fix(
+        np.full((count, size), np.nan),
+        np.full((count, n, n), np.nan),
+        problem.layout,
+        problem.frame,
+        code,
+        fill(count, cause),
+        fill(count, UNKNOWN),
+        Alternatives(np.full((count, 0, size), np.nan), np.full((count, 0), np.inf)),
+        np.full(count, np.nan),
+        # nothing is computed here, since whatever is may fail again: without a cost no redundancy is of use
+        np.zeros(count, dtype=np.int32),
+        np.broadcast_to(problem.weight, (count, problem.count)),
+        marks=np.full(count, Status.NUMERICAL.mark, dtype=np.int32),
+    )
+
+
 def hide_open_epochs(fix: Fix) -> Fix:
     """Return the fixes of runs without the states of epochs that leave them open: NaN, and named in the reason."""
     if fix.local is None or not fix.answered.any():
