@@ -1,6 +1,8 @@
 """`optloc track`: tables, JSON and pictures; what goes wrong is a sentence or a status, and nothing is lost."""
 
 import json
+import subprocess
+import sys
 from importlib.resources import files as package_files
 
 import numpy as np
@@ -187,6 +189,43 @@ def test_rows_in_any_order_are_sorted(tmp_path):
     run(drive(tmp_path, table=lambda t: t.sample(frac=1.0, random_state=3)), "--out", tmp_path / "b.csv")
     one, two = pd.read_csv(tmp_path / "a.csv"), pd.read_csv(tmp_path / "b.csv")
     np.testing.assert_allclose(one["x"], two["x"], rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["t.csv", "t.parquet"])
+def test_rows_are_there_as_they_are_made(tmp_path, monkeypatch, name):
+    from optloc.track import UPDATES
+
+    seen, partial = [], tmp_path / f"{name}.partial"
+
+    def looking(scan, mean, cov):
+        seen.append(pd.read_csv(partial)["status"].tolist())
+        return UPDATES["ekf"](scan, mean, cov)
+
+    monkeypatch.setitem(UPDATES, "looking", looking)
+    run(drive(tmp_path), "--filter", "looking", "--out", tmp_path / name)
+    assert seen == [["starting", "started", *["ok"] * count] for count in range(10)]
+    assert not partial.exists()
+    table = pd.read_csv(tmp_path / name) if name == "t.csv" else pd.read_parquet(tmp_path / name)
+    assert table["status"].tolist() == ["starting", "started", *["ok"] * 10]
+
+
+def test_a_killed_run_leaves_its_rows(tmp_path):
+    """The process ends between two scans, without a word: what was tracked is a readable table."""
+    script = (
+        "import os, optloc.track as track\n"
+        "from optloc.cli import app\n"
+        "ekf, calls = track.UPDATES['ekf'], []\n"
+        "def dying(scan, mean, cov):\n"
+        "    calls.append(scan)\n"
+        "    os.kill(os.getpid(), 9) if len(calls) > 6 else None\n"
+        "    return ekf(scan, mean, cov)\n"
+        "track.UPDATES['dying'] = dying\n"
+        f"app(['track', {str(drive(tmp_path))!r}, '--filter', 'dying', '--out', {str(tmp_path / 't.csv')!r}])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, timeout=120)
+    assert done.returncode == -9, done.stderr
+    assert not (tmp_path / "t.csv").exists()
+    assert pd.read_csv(tmp_path / "t.csv.partial")["status"].tolist() == ["starting", "started"] + ["ok"] * 6
 
 
 def test_the_track_so_far_is_kept(tmp_path, monkeypatch):

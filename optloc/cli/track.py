@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from rich.text import Text
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.cli.options import coordinates
 from optloc.cli.output import (
+    LOG,
     Columns,
     bar,
     check_table_name,
@@ -29,6 +30,7 @@ from optloc.cli.output import (
     write_text,
 )
 from optloc.files import Loaded, read
+from optloc.files.writer import GrowingTable
 from optloc.problem.problem import Problem
 from optloc.track import Dynamics, State, current_statistical, polynomial, singer
 from optloc.track.run import Entry, Rules, tracked
@@ -125,6 +127,12 @@ class TargetTrack:
     labels: tuple[str, ...]
     entries: list[Entry]
 
+    @property
+    def last(self) -> TargetTrack:
+        """Return the track of the last scan alone."""
+        count = len(self.entries)
+        return replace(self, labels=self.labels[count - 1 : count], entries=self.entries[-1:])
+
 
 def run_track(
     file: Path,
@@ -138,7 +146,8 @@ def run_track(
 ) -> int:
     """Track the targets of a file, write what was asked for, and return the exit code.
 
-    Whatever goes wrong on the way, the track up to there is written first.
+    Whatever goes wrong on the way, the track up to there is written first; of a run that is killed the rows up to then
+    stand in a CSV file beside `out`, with ``.partial`` behind its name.
     """
     dynamics = dynamics_of(wanted)
     # Wrong words are refused before the file is read.
@@ -148,12 +157,15 @@ def run_track(
     ones = [TargetTrack(*parts, []) for parts in runs_of(loaded)]
     if wanted.start is not None and len(ones) > 1:
         raise InvalidProblem("one initial state does not fit several targets", "--start", "leave it out")
+    table = None if out is None else GrowingTable(out)
     try:
         with bar(loaded.title, sum(one.problem.epochs for one in ones), quiet or as_json) as advance:
             for one in ones:
                 start = _start(one.problem, dynamics, wanted)
                 for entry in tracked(one.problem, dynamics, update, start=start, rules=wanted.rules):
                     one.entries.append(entry)
+                    if table is not None:
+                        table.add(track_columns(one.last))
                     advance(1)
     # Interrupted or refused half way: what is known by then is written.
     finally:
@@ -161,7 +173,7 @@ def run_track(
             join_tables([track_columns(one) for one in ones if one.entries]) if any(o.entries for o in ones) else {}
         )
         if columns:
-            _write(loaded, ones, columns, out=out, as_json=as_json, plot=plot)
+            _write(loaded, ones, columns, table=table, as_json=as_json, plot=plot)
             if html is not None:
                 write_text(html, _map(loaded, ones))
     if not quiet and not as_json:
@@ -286,10 +298,20 @@ def _map(loaded: Loaded, ones: list[TargetTrack]) -> str:
 
 
 def _write(
-    loaded: Loaded, ones: list[TargetTrack], columns: Columns, *, out: Path | None, as_json: bool, plot: Path | None
+    loaded: Loaded,
+    ones: list[TargetTrack],
+    columns: Columns,
+    *,
+    table: GrowingTable | None,
+    as_json: bool,
+    plot: Path | None,
 ) -> None:
-    if out is not None:
-        write_table(out, columns)
+    if table is not None and table.path.suffix.lower() == ".csv":
+        table.finish()
+        LOG.info("wrote %s: %d rows", table.path, table.rows)
+    elif table is not None:
+        write_table(table.path, columns)
+        table.discard()
     if plot is not None:
         from optloc.plot.track import Drawn, plot_tracks
 

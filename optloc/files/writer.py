@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +30,47 @@ def write_csv(path: Path, columns: Mapping[str, Any]) -> None:
         csv.write_csv(table, path)
     except OSError as error:
         raise unwritable(path, error) from None
+
+
+class GrowingTable:
+    """A CSV file that grows row by row beside a table that is not finished: what a killed run had stays readable.
+
+    Parameters
+    ----------
+    path : Path
+        The table. Its rows stand in a file of this name with ``.partial`` behind it, each whole as soon as it is added.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.partial = path, path.with_name(f"{path.name}.partial")
+        self.rows = 0
+
+    def add(self, columns: Mapping[str, Any]) -> None:
+        """Add rows, the same columns each time; raise InvalidProblem where that fails."""
+        import pyarrow as pa
+        from pyarrow import csv
+
+        table = pa.table({name: pa.array(values, from_pandas=True) for name, values in columns.items()})
+        lines = BytesIO()
+        csv.write_csv(table, lines, csv.WriteOptions(include_header=not self.rows))
+        try:
+            # one write without a buffer: whenever the run is killed, whole lines are there
+            with self.partial.open("ab" if self.rows else "wb", buffering=0) as file:
+                file.write(lines.getvalue())
+        except OSError as error:
+            raise unwritable(self.partial, error) from None
+        self.rows += table.num_rows
+
+    def finish(self) -> None:
+        """Give the file the name of the table; raise InvalidProblem where that fails."""
+        try:
+            self.partial.replace(self.path)
+        except OSError as error:
+            raise unwritable(self.path, error) from None
+
+    def discard(self) -> None:
+        """Remove the file: the table stands in another form."""
+        self.partial.unlink(missing_ok=True)
 
 
 def unwritable(path: Path, error: OSError) -> InvalidProblem:

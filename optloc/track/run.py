@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -14,7 +15,7 @@ from optloc.base.types import Array, Status
 from optloc.problem.epochs import cut
 from optloc.problem.fix import Fix, tail_probability
 from optloc.problem.problem import Problem
-from optloc.track.associate import weights_within
+from optloc.track.associate import innovation, weights_within
 from optloc.track.dynamics import Dynamics
 from optloc.track.start import counts, first_fix, is_one_gaussian, state_of, with_height_rows
 from optloc.track.track import State, Track, check_state, check_trackable, collect, predicted, scan_at, take_scan
@@ -23,15 +24,25 @@ from optloc.track.updates import Update, Updated, filter_of
 # Rows of a start whose chi-square is less likely than this contradict each other: the next scan is tried. One good
 # start in ten thousand is passed over, which costs a scan; a wrong one costs the track.
 _PLAUSIBLE = 1e-4
-# First scans that are tried before a start that contradicts itself is taken: every try costs fixes, and a run that is
-# wrong for longer deserves a status more than a search.
-_SLIDES = 20
+# Scans that starts are tried from before one that contradicts itself is taken: every try costs a fix, and a run that is
+# wrong for longer deserves a status more than a search. The distance grows by half each time, and eleven tries reach
+# over forty scans: who is heard badly at first (a drone on the floor) has moved by then.
+_TRIES = 11
 # Scans of a stretch that is made longer until its state is clear: a longer one asks more of the model of motion, which
 # has no noise here, than of the rows.
 _CLEAR = 24
 # A given state whose first scan is less likely than this contradicts it: the run is refused, so this is nearly sure.
 _ABSURD = 1e-9
+# Scans of the window by which a track is judged, over those of `Rules.patience`.
+_WINDOW = 4
+# Mean squared innovation over the squared gate: a half where half of the rows are beyond the gate, as every place has
+# some by chance that agree; a quarter (5 sigma: two and a half times as large as stated) where no covariance covers.
+_LOST, _DOUBTFUL = 0.5, 0.25
+# Gate, standard deviations: of a good row one in two million is left out.
+_USUAL = 5.0
 Event = Literal["starting", "started", "restarted", ""]
+Fit = tuple[float, int]
+"""Sum of the squared innovations (or residuals) of rows in their standard deviations, and how many these are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +54,8 @@ class Rules:
     gate : float
         Rows further than this many standard deviations from the prediction are left out; infinite for none.
     patience : int
-        So many scans in succession of whose rows most were left out end a track.
+        So many scans in succession of whose rows most were left out end a track; so do four times as many of whose
+        rows half were, or whose innovations are as large on the whole as if half were.
     gap : float, optional
         Seconds without a valid row that end a track. Without it a gap ends a track where the predicted position has a
         standard deviation beyond the spread of the stations, and beyond the range of the target.
@@ -51,11 +63,16 @@ class Rules:
         Prior standard deviation of each coordinate of velocity (m/s) and acceleration (m/s^2), about zero, for starts.
     """
 
-    gate: float = 5.0
+    gate: float = _USUAL
     patience: int = 5
     gap: float | None = None
     speed: float | None = None
     rate: float | None = None
+
+    @property
+    def most(self) -> float:
+        """Return the squared innovation that a row counts as at most: that of the gate, or of the usual one."""
+        return float(min(self.gate, _USUAL) ** 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +87,8 @@ class Entry:
         State after the scan, its NIS and the rows used; NaN before the first start.
     code : Status
         Ok; too few rows where none was valid and the state was only predicted; rejected where most rows did not pass
-        the gate or are not finite; ambiguous where a start has alternatives; numerical where the update failed.
+        the gate or are not finite; misfit where the innovations of the last scans are much larger than stated;
+        ambiguous where a start has alternatives; numerical where the update failed.
     rejected : int
         Rows left out.
     event : "starting", "started", "restarted" or ""
@@ -161,15 +179,16 @@ class _Run:
     def entries(self, start: State | None) -> Iterator[Entry]:
         """Yield all entries."""
         # heard: the time of the last valid row. missed: scans in succession whose rows the gate mostly refused.
-        # fresh: whether a given state has yet to meet its first row.
+        # fresh: whether a given state has yet to meet its first row. recent: how the last scans fit.
         times, k, state, why = self.problem.times, 0, start, ""
         heard = float(times[0]) if start is None else start.time
-        missed, fresh = 0, start is not None
+        missed, fresh, recent = 0, start is not None, _Recent(self.rules)
         while k < len(times):
             if state is None:
                 start_here = begin(self.problem, k, self.dynamics, self.rules.speed, self.rules.rate)
                 yield from self._starting(start_here, k, why)
                 k, state, missed = start_here.last + 1, start_here.state, 0
+                recent.begin(start_here)
                 heard = float(times[start_here.last])
                 continue
             ahead = predicted(state, self.dynamics, float(times[k]), self.problem.dimension)
@@ -177,7 +196,7 @@ class _Run:
             if why:
                 state = None
                 continue
-            entry = self._updated(k, ahead)
+            entry, fit = self._updated(k, ahead)
             if fresh and entry.updated.count + entry.rejected > 0:
                 _check_agrees(entry)
                 fresh = False
@@ -186,10 +205,13 @@ class _Run:
             gated, used = entry.rejected - self._bad(k), int(entry.updated.count)
             missed = missed + 1 if gated > used else missed * int(used == 0)
             heard = float(times[k]) if entry.updated.count > 0 else heard
-            yield entry
+            recent.add(fit)
+            yield recent.judge(entry)
             state, k = State(entry.time, entry.updated.mean, entry.updated.cov), k + 1
             if missed >= self.rules.patience:
                 state, why = None, f"most rows of {missed} scans did not fit the prediction"
+            elif recent.lost:
+                state, why = None, recent.sentence
 
     def _starting(self, begun: Beginning, k: int, why: str) -> Iterator[Entry]:
         """Yield the scans of a start, of which the last one has the state."""
@@ -221,22 +243,75 @@ class _Run:
         limit = reach(self.problem, ahead.mean[:d])
         return f"the prediction was uncertain by {sigma:.3g} m after {silence:.6g} s" if sigma > limit else ""
 
-    def _updated(self, k: int, ahead: State) -> Entry:
-        """Return the update of a prediction by the rows of a scan that pass the gate."""
+    def _updated(self, k: int, ahead: State) -> tuple[Entry, Fit]:
+        """Return the update of a prediction by the rows of a scan that pass the gate, and how all of them fit it."""
         scan = scan_at(self.problem, k, self.dynamics.order)
         # Gate first, update then: an iterated update would be drawn by what it should not believe.
-        kept = weights_within(scan, ahead.mean, ahead.cov, self.rules.gate) if scan.rows else np.zeros(0)
-        lost = int(((scan.weight > 0.0) & (kept == 0.0)).sum()) if scan.rows else 0
-        used = scan.with_rows(weight=kept) if lost else scan
-        done, code = take_scan(used, ahead, self.rule)
+        off = innovation(scan, ahead.mean, ahead.cov).normalised[scan.weight > 0.0] if scan.rows else np.zeros(0)
+        lost = int((~(np.abs(off) <= self.rules.gate)).sum())
+        used = scan
+        if lost:
+            used = scan.with_rows(weight=weights_within(scan, ahead.mean, ahead.cov, self.rules.gate))
+        # How wild a row is says nothing of the others: none counts further than the gate, nor NaN less.
+        fit = float(np.nan_to_num(np.minimum(off**2, self.rules.most), nan=self.rules.most).sum()), len(off)
+        causes: list[str] = []
+        done, code = take_scan(used, ahead, self.rule, causes)
         status, rejected, reason = Status(int(code)), lost + self._bad(k), ""
         if status == Status.TOO_FEW_ROWS and not rejected:
             reason = "no valid row: the state was only predicted"
         elif rejected > int(done.count):
             status, reason = Status.REJECTED, f"{rejected} of {rejected + int(done.count)} rows were left out"
         elif status == Status.NUMERICAL:
-            reason = "the update failed: the state was only predicted"
-        return Entry(ahead.time, done, status, rejected, "", reason)
+            reason = "; ".join([*causes, "the update failed: the state was only predicted"])
+        return Entry(ahead.time, done, status, rejected, "", reason), fit
+
+
+class _Recent:
+    """How the rows of the last scans fit the prediction: their windowed NIS, no row further than the gate."""
+
+    def __init__(self, rules: Rules) -> None:
+        # As many scans as tell the loss of a track from a few wild rows in a row, where a scan has a single one: if one
+        # row in ten is wild, ten of twenty are in one window of a million.
+        self.scans: deque[Fit] = deque(maxlen=_WINDOW * rules.patience)
+        self.most, self.since = rules.most, 0
+
+    def begin(self, start: Beginning) -> None:
+        """Take the rows of a start; what did not fit before is forgotten where they agree, and else still counts."""
+        if start.code == Status.OK:
+            self.scans.clear()
+        self.add(start.fit)
+        self.since = 0
+
+    def add(self, fit: Fit) -> None:
+        """Take how the rows of one more scan fit."""
+        square, count = fit
+        if count > 0:
+            self.scans.append((min(square, self.most * count), count))
+            self.since += 1
+
+    @property
+    def share(self) -> float:
+        """Return the mean squared innovation as a share of the squared gate; 0 where the rows are too few to tell."""
+        rows = sum(count for _, count in self.scans)
+        assert self.scans.maxlen is not None
+        return sum(square for square, _ in self.scans) / (self.most * rows) if rows >= self.scans.maxlen else 0.0
+
+    @property
+    def lost(self) -> bool:
+        """Return whether a full window is as bad as if half of its rows were beyond the gate."""
+        return self.since >= len(self.scans) == self.scans.maxlen and self.share > _LOST
+
+    @property
+    def sentence(self) -> str:
+        """Return how large the innovations are."""
+        times = np.sqrt(self.share * self.most)
+        return f"the innovations of the last {len(self.scans)} scans are {times:.2g} times as large as stated"
+
+    def judge(self, entry: Entry) -> Entry:
+        """Return a scan with the status that those before it deserve, where its own is clean."""
+        if entry.code != Status.OK or self.share <= _DOUBTFUL:
+            return entry
+        return replace(entry, code=Status.MISFIT, reason=self.sentence)
 
 
 def _clean(problem: Problem) -> tuple[Problem, Array]:
@@ -293,6 +368,8 @@ class Beginning:
         Of the scans before: ok where a start follows.
     reason : str
         A sentence where the status is not ok.
+    fit : tuple of float and int
+        Chi-square of the rows of the start, and its degrees of freedom.
     """
 
     last: int
@@ -300,16 +377,32 @@ class Beginning:
     code: Status
     waiting: Status
     reason: str = ""
+    fit: Fit = (0.0, 0)
 
 
 @dataclass(frozen=True, slots=True)
 class _Stretch:
-    """Scans that determine a state: their fix, the last of them, the state there, and the p-value of their rows."""
+    """Scans that determine a state: their fix, the last of them, and the state there."""
 
     fix: Fix
     last: int
     state: State
-    p: float
+
+    @property
+    def p(self) -> float:
+        """Return the p-value of the rows; 1 without redundancy, where nothing contradicts."""
+        p = float(self.fix.p_value)
+        return 1.0 if np.isnan(p) else p
+
+    @property
+    def fit(self) -> Fit:
+        """Return the chi-square of the rows and its degrees of freedom."""
+        return float(self.fix.cost), int(self.fix.dof)
+
+    @property
+    def clean(self) -> bool:
+        """Return whether a filter may begin with it."""
+        return self.p >= _PLAUSIBLE and is_one_gaussian(self.fix)
 
 
 def begin(problem: Problem, first: int, dynamics: Dynamics, speed: float | None, rate: float | None) -> Beginning:
@@ -330,30 +423,46 @@ def begin(problem: Problem, first: int, dynamics: Dynamics, speed: float | None,
         Prior standard deviations, see `begun`.
     """
     doubtful: list[_Stretch] = []
-    verdict = Status.TOO_FEW_ROWS
+    verdict, last = Status.TOO_FEW_ROWS, first
     heard = _heard(problem, first)
-    for k in heard[:_SLIDES].tolist():
-        found, verdict = _stretch(problem, k, dynamics, speed, rate)
-        if found is None:
+    for i in _slides(len(heard)):
+        last = int(heard[i])
+        found, verdict = _stretch(problem, last, dynamics, speed, rate)
+        if found is not None and found.clean:
+            return Beginning(found.last, found.state, Status.OK, Status.OK, fit=found.fit)
+        if found is not None:
+            doubtful.append(found)
+        elif verdict != Status.CONTRADICTORY:
             break  # what all later scans leave open, fewer of them do too
-        if found.p >= _PLAUSIBLE and is_one_gaussian(found.fix):
-            return Beginning(found.last, found.state, Status.OK, Status.OK)
-        doubtful.append(found)
-        if found.p >= _PLAUSIBLE:
+        if found is not None and found.p >= _PLAUSIBLE:
             break
-    if not doubtful:
-        reason = f"the scans that are left do not determine a state: {verdict.label}"
-        return Beginning(problem.epochs - 1, None, verdict, verdict, reason)
-    # None is clean: the most plausible start, with a status that says what is wrong with it.
-    best = max(doubtful, key=lambda each: each.p)
-    if best.p < _PLAUSIBLE:
-        reason = f"the rows of the start contradict each other (p = {best.p:.2g})"
-        return Beginning(best.last, best.state, Status.REJECTED, Status.OK, reason)
+    if doubtful:
+        return _doubtful(min(doubtful, key=lambda each: each.fit[0] / max(each.fit[1], 1)))
+    if verdict == Status.CONTRADICTORY:  # of these scans; later ones may agree
+        return Beginning(last, None, Status.REJECTED, Status.REJECTED, "the rows of the scans contradict each other")
+    reason = f"the scans that are left do not determine a state: {verdict.label}"
+    return Beginning(problem.epochs - 1, None, verdict, verdict, reason)
+
+
+def _doubtful(best: _Stretch) -> Beginning:
+    """Return a start that is not clean, with a status that says what is wrong with it."""
     others = int(np.isfinite(best.fix.alternatives.gap).sum())
-    if not others:
-        return Beginning(best.last, best.state, Status.CURVED, Status.OK, "the covariance of the start does not cover")
-    reason = f"the start has {others} alternative{'s' if others > 1 else ''}"
-    return Beginning(best.last, best.state, Status.AMBIGUOUS, Status.OK, reason)
+    if best.p < _PLAUSIBLE:
+        code, reason = Status.REJECTED, f"the rows of the start contradict each other (p = {best.p:.2g})"
+    elif others:
+        code, reason = Status.AMBIGUOUS, f"the start has {others} alternative{'s' if others > 1 else ''}"
+    else:
+        code, reason = Status.CURVED, "the covariance of the start does not cover"
+    return Beginning(best.last, best.state, code, Status.OK, reason, best.fit)
+
+
+def _slides(count: int) -> Iterator[int]:
+    """Yield which of so many scans starts are tried from: the next few, then ever farther apart."""
+    i = 0
+    for _ in range(_TRIES):
+        if i < count:
+            yield i
+        i = max(i + 1, i * 3 // 2)
 
 
 def _stretch(
@@ -366,24 +475,27 @@ def _stretch(
             break
         fix = first_fix(run, dynamics, count, speed=speed, rate=rate)
         verdict = Status(int(fix.code))
-        if not bool(fix.answered):
+        # More scans do not mend rows that contradict each other; NaN without redundancy, where nothing does.
+        contradicted = bool(fix.p_value < _PLAUSIBLE)
+        state = state_of(run, fix, count) if bool(fix.answered) else None
+        if state is None or _is_vague(problem, state):
+            if contradicted:
+                return ambiguous, Status.CONTRADICTORY
             continue
-        state = state_of(run, fix, count)
-        d = problem.dimension
-        sigma = float(np.sqrt(np.linalg.eigvalsh(state.cov[:d, :d])[-1]))
-        # A state that is vaguer than the range of the target begins nothing; NaN is vague, too.
-        if not sigma <= reach(problem, state.mean[:d]):
-            continue
-        p = float(fix.p_value)
-        # Without redundancy there is no p-value, and nothing that contradicts.
-        found = _Stretch(fix, k + count - 1, state, 1.0 if np.isnan(p) else p)
-        # More scans do not mend rows that contradict each other.
-        if found.p < _PLAUSIBLE:
+        found = _Stretch(fix, k + count - 1, state)
+        if contradicted:
             return ambiguous or found, verdict
-        if is_one_gaussian(fix):
+        if found.clean:
             return found, verdict
         ambiguous = ambiguous or found
     return ambiguous, verdict
+
+
+def _is_vague(problem: Problem, state: State) -> bool:
+    """Return whether a state is vaguer than the range of the target, so that it begins nothing; NaN is vague, too."""
+    d = problem.dimension
+    sigma = float(np.sqrt(np.linalg.eigvalsh(state.cov[:d, :d])[-1]))
+    return not sigma <= reach(problem, state.mean[:d])
 
 
 def _heard(problem: Problem, first: int) -> Array:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem
+from optloc.base.errors import NUMERICAL, InvalidProblem
 from optloc.base.types import Array, Motion, Status
 from optloc.problem.epochs import cut
 from optloc.problem.fix import Fix
@@ -155,8 +156,20 @@ def predicted(state: State, dynamics: Dynamics, time: float, dimension: int) -> 
     return State(time, (F @ state.mean[..., None])[..., 0] + drive, 0.5 * (cov + np.swapaxes(cov, -1, -2)))
 
 
-def take_scan(scan: Problem, ahead: State, rule: Update) -> tuple[Updated, Array]:
-    """Return the update of a predicted state by a scan, and its status (...): bad scans leave the prediction."""
+def take_scan(scan: Problem, ahead: State, rule: Update, causes: list[str] | None = None) -> tuple[Updated, Array]:
+    """Return the update of a predicted state by a scan, and its status (...): bad scans leave the prediction.
+
+    Parameters
+    ----------
+    scan : Problem
+        One epoch.
+    ahead : State
+        At its time, (...).
+    rule : callable
+        The filter.
+    causes : list of str, optional
+        Takes a sentence of each state whose update fails numerically; they keep the prediction.
+    """
     shape = ahead.mean.shape[:-1]
     if not scan.rows or not scan.count:
         return _keep(ahead), np.full(shape, int(Status.TOO_FEW_ROWS), dtype=np.int8)
@@ -166,7 +179,7 @@ def take_scan(scan: Problem, ahead: State, rule: Update) -> tuple[Updated, Array
     usable = scan if not broken.any() else scan.with_rows(z=np.where(broken, 0.0, scan.z), weight=weight * ~broken)
     # A lost state is a status, not a warning: it is found out below.
     with np.errstate(all="ignore"):
-        done = rule(usable, ahead.mean, ahead.cov)
+        done = _contained(usable, ahead, rule, [] if causes is None else causes)
     lost = ~(np.isfinite(done.mean).all(-1) & np.isfinite(done.cov).all((-1, -2)))
     silent = done.count == 0
     # What is lost outweighs what is silent, and that outweighs rows that were not finite.
@@ -179,6 +192,32 @@ def take_scan(scan: Problem, ahead: State, rule: Update) -> tuple[Updated, Array
     return Updated(
         mean, cov, np.where(kept, np.nan, done.nis), np.where(kept, 0.0, done.loglikelihood), done.count
     ), code
+
+
+def _contained(scan: Problem, ahead: State, rule: Update, causes: list[str]) -> Updated:
+    """Return the update of states, NaN of those (and no others of a batch) for which it fails numerically."""
+    try:
+        return rule(scan, ahead.mean, ahead.cov)
+    except NUMERICAL as error:
+        n, shape = ahead.mean.shape[-1], np.broadcast_shapes(scan.batch_shape, ahead.mean.shape[:-1])
+        if math.prod(shape) == 1:
+            causes.append(str(error) or type(error).__name__)
+            mean, cov, none = (np.full((*shape, *([n] * core)), np.nan) for core in (1, 2, 0))
+            return Updated(mean, cov, none, none, np.zeros(shape))
+    mean = np.broadcast_to(ahead.mean, (*shape, n)).reshape(-1, n)
+    cov = np.broadcast_to(ahead.cov, (*shape, n, n)).reshape(-1, n, n)
+    size = math.prod(scan.batch_shape)
+    which, flat = np.broadcast_to(np.arange(size).reshape(scan.batch_shape), shape).ravel(), scan.flat()
+    each = [
+        _contained(flat.take(np.array([i])), State(ahead.time, *one), rule, causes)
+        for i, *one in zip(which, mean, cov, strict=True)
+    ]
+    return Updated(
+        *(
+            np.stack([np.asarray(getattr(one, field.name)) for one in each]).reshape(*shape, *([n] * core))
+            for field, core in zip(fields(Updated), (1, 2, 0, 0, 0), strict=True)
+        )
+    )
 
 
 def _keep(ahead: State) -> Updated:

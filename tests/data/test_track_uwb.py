@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cache
+from time import process_time
 
 import numpy as np
 import pandas as pd
@@ -50,7 +51,9 @@ def test_flights_are_tracked_without_a_guess(data_dir, flight):
     )
     assert found.labels.count("started") == 1, "one track, and no other"
     assert found.labels.index("started") <= 10
-    assert set(found.labels) <= {"starting", "started", "ok"}
+    # metal blocks a path of F04 for seconds: innovations are then more than twice as large as stated, and it says so
+    assert set(found.labels) <= {"starting", "started", "ok"} | ({"misfit"} if flight == "F04" else set())
+    assert found.labels.count("ok") > 0.8 * len(found.labels)
     assert found.rms <= LIMIT[flight]
     assert found.error.max() < 1.0, "never lost"
 
@@ -71,13 +74,22 @@ def test_the_table_of_the_documentation(data_dir):
     )
 
 
-def test_a_flight_from_the_floor_finds_itself_in_the_air(data_dir):
-    """On the floor multipath puts starts metres off; the track is ended by what contradicts it, and begun anew."""
-    problem, truth = uwb.course(data_dir / "util_uwb_tdoa", "F01", WINDOW, airborne=False, until=20.0)
-    entries = list(tracked(problem, polynomial(1, ACCELERATION), "ekf", rules=Rules(gate=GATE)))
-    position = collected(entries, 3).position
-    assert [entry.label for entry in entries].count("restarted") >= 1
-    later = (problem.times > 5.0) & (problem.times < 20.0)
-    error = np.linalg.norm(position - truth, axis=-1)[later]
-    report(f"UWB F01 from the floor: from second 5 on largest error {error.max():.2f} m")
-    assert error.max() < 1.0
+@pytest.mark.parametrize("flight", LIMIT)
+def test_flights_from_the_floor_find_themselves_in_the_air(data_dir, flight):
+    """On the floor multipath puts most rows metres off: no state there is right, but one is soon there in the air."""
+    problem, truth = uwb.course(data_dir / "util_uwb_tdoa", flight, WINDOW, airborne=False)
+    entries, seconds, began = [], None, process_time()
+    for entry in tracked(problem, polynomial(1, ACCELERATION), "ekf", rules=Rules(gate=GATE)):
+        entries.append(entry)
+        if seconds is None and np.isfinite(entry.updated.mean).all():
+            seconds = process_time() - began
+    error = np.linalg.norm(collected(entries, 3).position - truth, axis=-1)
+    air = np.flatnonzero(truth[:, 2] > 0.5)
+    report(
+        f"UWB {flight} from the floor: a state after {seconds:.2f} s of work; in the air {np.isnan(error[air]).sum()} "
+        f"scans without one, largest error {np.nanmax(error[air]):.2f} m"
+    )
+    assert seconds < 2.0
+    # never lost where the rows are good; up to two seconds are spent on a start that does not contradict itself
+    assert np.nanmax(error[air]) < 1.0
+    assert not np.isnan(error[air[20:]]).any()
