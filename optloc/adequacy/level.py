@@ -324,6 +324,8 @@ def late_signals_at(problem: Problem, kept: Array, x: Array) -> LateSignals:
 
 # Turns of choosing late rows and of expectation and maximisation, and the change of both numbers that ends the latter.
 _CHOICES, _TURNS, _ENDED = 10, 500, 1e-6
+# Mean delay, sigmas, below which it is none: it moves no fix by what anybody notices.
+_NO_DELAY = 0.1
 # Test, standard deviations, from which a row is taken for late to begin with.
 _STANDS_OUT = 3.0
 # Share of what gross errors of either side explain that late rows have to: 0.8 to 1 where a tenth or more are late by 5
@@ -437,7 +439,9 @@ def _expect(error: Array, sigma: Array, late: Array) -> tuple[float, float, floa
         new = float(np.clip(chance.mean(), 1e-12, 1.0 - 1e-6))
         longer = float((chance * mean).sum() / max(chance.sum(), 1e-300))
         done = abs(new - share) <= _ENDED * share and abs(longer - delay) <= _ENDED * delay
-        share, delay = new, max(longer, 1e-6)
+        if longer < _NO_DELAY:
+            return 0.0, 0.0, 0.0, np.zeros(len(error))
+        share, delay = new, longer
         if done:
             break
     return share, delay, float(2.0 * (both - prompt).sum()), chance
