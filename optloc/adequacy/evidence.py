@@ -215,16 +215,21 @@ def log_tail(statistic: Array, dof: Array) -> Array:
 
 def significance(at: Influence, groups: Sequence[Group]) -> Array:
     """Return the logarithms (G,) of the probabilities of the drop of the cost without each group."""
-    out, rows = np.zeros(len(groups)), [at.rows(group) for group in groups]
-    # groups of one size at a time: thousands of small eigenvalue problems as one batch
+    return log_tail(*drops(at, [at.rows(group) for group in groups]))
+
+
+def drops(at: Influence, rows: Sequence[Array]) -> tuple[Array, Array]:
+    """Return the drop of the cost without each of G sets of rows, to first order, and its degrees of freedom, (G,)."""
+    drop, dof = np.zeros(len(rows)), np.zeros(len(rows), dtype=np.int64)
+    # sets of one size at a time: thousands of small eigenvalue problems as one batch
     sizes = np.array([len(own) for own in rows])
     for size in np.unique(sizes):
         members = np.flatnonzero(sizes == size)
-        index = np.stack([rows[i] for i in members])
+        index = np.stack([rows[i] for i in members.tolist()])
         root = at.root(index)
-        drop = (np.swapaxes(root, -1, -2) @ at.pull[index][..., None])[..., 0]
-        out[members] = log_tail((drop**2).sum(-1), (root != 0.0).any(-2).sum(-1))
-    return out
+        drop[members] = ((np.swapaxes(root, -1, -2) @ at.pull[index][..., None])[..., 0] ** 2).sum(-1)
+        dof[members] = (root != 0.0).any(-2).sum(-1)
+    return drop, dof
 
 
 def errors(at: Influence, groups: Sequence[Group]) -> list[Error]:

@@ -19,12 +19,12 @@ from optloc.problem.fix import Fix, GroupKind, Stage
 from optloc.problem.problem import Problem
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP
-from optloc.solvers.pool import Pool, begin, offer
+from optloc.solvers.pool import Pool, begin, in_parts, offer
 from optloc.solvers.stages import fix_by, lsr, search_widely
 from optloc.solvers.starts.position import complete
 from optloc.solvers.suspects.report import Case, conclude_case
 from optloc.solvers.suspects.subsets import Finding, Rest, enumerable, explain, fix_rest, grow
-from optloc.solvers.verdict.judge import fill, judge, standing
+from optloc.solvers.verdict.judge import failed, fill, judge, standing
 
 # A row that a loss gives less than half its weight is suspected first. More than `REJECTED` names: here it is a hint
 # that is tested, and who fits is taken back.
@@ -74,8 +74,13 @@ def suspects(
     shape, flat = problem.batch_shape, problem.flat()
     if fix is not None and fix.shape != shape:
         raise InvalidProblem(f"the fix has batch axes {fix.shape}, not {shape}", "fix", "give the fix of this problem")
-    pool = search_widely(flat) if fix is None else accept(flat, fix.flat())
-    return judge(flat, suspect(flat, pool, kinds, together=together)).reshape(shape)
+    given = None if fix is None else fix.flat()
+
+    def work(part: Problem, own: slice) -> Fix:
+        pool = search_widely(part) if given is None else accept(part, given[own])
+        return judge(part, suspect(part, pool, kinds, together=together))
+
+    return in_parts(flat, work, failed=failed).reshape(shape)
 
 
 def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS, *, together: bool = True) -> Pool:

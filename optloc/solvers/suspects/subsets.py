@@ -10,10 +10,11 @@ from time import perf_counter
 
 import numpy as np
 
-from optloc.adequacy.evidence import Influence, errors, influence, significance
+from optloc.adequacy.evidence import Influence, drops, errors, influence, significance
 from optloc.adequacy.groups import ROW_PRICE, Group, leave_out, mark_rows
 from optloc.base.records import take
 from optloc.base.types import Array
+from optloc.problem.arrivals import restore_order
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.solvers.certify.branch_and_bound import certified
@@ -26,10 +27,16 @@ from optloc.solvers.verdict.judge import judge, standing, verdict
 # Rows times subsets of one problem up to which all subsets of a size are tried: seconds of fixes; and numbers of a
 # batch at a time, some ten megabytes an array.
 _MOST, _CHUNK = 100_000, 1_000_000
+# The same from which sets are looked at to first order before they are tried: fewer take less time than is saved.
+_FEW = 2_000
 # Rests whose cost is at most so many times that of the test are solved in more ways, and in all of them. The cheapest
 # start may end at another minimum, and a wrong rest that costs a hundred times too much hardly has one that passes.
 _NEAR, _CLOSE = 100.0, 4.0
 _BLIND = "an error is there, but redundancy 1 does not tell where"
+
+
+# A set of groups, the rows that it leaves out, and those of the groups that have no rows.
+_Set = tuple[tuple[int, ...], Array, frozenset[int]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,6 +129,13 @@ def explain(problem: Problem, groups: Sequence[Group], whole: Fix) -> list[Findi
     closest: list[Rest | None] = [None] * len(rests)
     least = [(float(c), int(r)) for c, r in zip(whole.cost, whole.dof, strict=True)]
     tried = np.zeros(len(rests), dtype=np.int64)
+
+    def collect(items: Array, sets: Sequence[_Set]) -> None:
+        for item, found in zip(items, _try_sets(problem.take(items), groups, sets), strict=True):
+            rests[item] += found.rests
+            probability[item] |= found.p_value
+            closest[item], least[item] = found.closest, min(least[item], found.least)
+
     for size in range(1, len(groups) + 1):
         best = np.array([min((rest.score for rest in own), default=np.inf) for own in rests])
         # no set of this size, and so no larger one, can come near
@@ -130,14 +144,19 @@ def explain(problem: Problem, groups: Sequence[Group], whole: Fix) -> list[Findi
         if done.all() or not enumerable(groups, problem.count, size):
             break
         tried[~done] = size
+        items, sets = np.flatnonzero(~done), list(_subsets(groups, problem.count, size))
+        if len(sets) * problem.count > _FEW:
+            # of many sets few matter where all data agree about as well: what their rest costs is known to first order
+            agree = [i for i in items if rests[i] and not rests[i][0].left]
+            for i in agree:
+                own = _promising(problem.take(np.array([i])), groups, sets, whole[i], best[i])
+                if own:
+                    collect(np.array([i]), own)
+            items = np.setdiff1d(items, agree)
         # as many problems at a time as fit the memory with all their sets
-        items, step = np.flatnonzero(~done), max(1, _CHUNK // (comb(len(groups), size) * problem.count + 1))
+        step = max(1, _CHUNK // (len(sets) * problem.count + 1))
         for first in range(0, len(items), step):
-            own = items[first : first + step]
-            for item, found in zip(own, _try_sets(problem.take(own), groups, size), strict=True):
-                rests[item] += found.rests
-                probability[item] |= found.p_value
-                closest[item], least[item] = found.closest, min(least[item], found.least)
+            collect(items[first : first + step], sets)
     notes = ["" if dof > 1 else _BLIND for dof in whole.dof]
     parts = zip(rests, probability, notes, closest, tried, least, strict=True)
     return [Finding(listed(own, groups), p, note, near, int(most), *low) for own, p, note, near, most, low in parts]
@@ -182,9 +201,22 @@ class _Tried:
     least: tuple[float, int] = (np.inf, 0)
 
 
-def _try_sets(problem: Problem, groups: Sequence[Group], size: int) -> list[_Tried]:
+def _promising(problem: Problem, groups: Sequence[Group], sets: Sequence[_Set], whole: Fix, best: float) -> list[_Set]:
+    """Return the sets without which one problem may come within the gap: the cost falls by half of that to first order.
+
+    Sets with an offset, a prior or a fix at infinity are all kept.
+    """
+    if not np.isfinite(whole.x).all():
+        return list(sets)
+    at = influence(problem, restore_order(problem.layout, whole.layout, whole.x))
+    drop, _ = drops(at, [np.flatnonzero(rows) for _, rows, _ in sets])
+    prices = np.array([sum(groups[i].price for i in left) for left, _, _ in sets])
+    wanted = float(whole.cost) + prices - best - AMBIGUOUS_GAP
+    return [one for one, d, w in zip(sets, drop, wanted, strict=True) if one[2] or 2.0 * d >= w]
+
+
+def _try_sets(problem: Problem, groups: Sequence[Group], sets: Sequence[_Set]) -> list[_Tried]:
     """Return the rests of each problem that pass, the probabilities of all, the cheapest and the least score of all."""
-    sets = list(_subsets(groups, problem.count, size))
     out = [_Tried([], {}) for _ in range(problem.batch_shape[0])]
     # priors and unknowns are the same for a whole batch: sets that change the same ones are fixed together
     for others in dict.fromkeys(own for _, _, own in sets):
@@ -209,7 +241,7 @@ def _try_sets(problem: Problem, groups: Sequence[Group], size: int) -> list[_Tri
     return out
 
 
-def _subsets(groups: Sequence[Group], count: int, size: int) -> Iterator[tuple[tuple[int, ...], Array, frozenset[int]]]:
+def _subsets(groups: Sequence[Group], count: int, size: int) -> Iterator[_Set]:
     """Yield sets of groups, their rows and those that have none; each of a set must add something to the others."""
     masks = [mark_rows([group], count) for group in groups]
     for left in combinations(range(len(groups)), size):
