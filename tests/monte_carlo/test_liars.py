@@ -184,7 +184,7 @@ def check(cell: Cell, trials: int) -> tuple[Counts, Spoilt, Fix]:
         # all of these are errors that the geometry cannot see: their number is that which reliability expects
         assert made.wrong <= poisson.isf(1e-4, unnoticed(case, cell))
     if cell in RIGHT:
-        assert made.ok >= (binom.ppf(1e-4, trials, RIGHT[cell]) if trials < MANY else RIGHT[cell] * trials)
+        assert made.ok >= binom.ppf(1e-4 if trials < MANY else 0.01, trials, RIGHT[cell])
     if cell in TRIED:  # its share is known from a hundred trials alone
         assert made.wrong <= binom.isf(1e-3, trials, binom_upper(TRIED[cell], 100))
     return made, case, fix
