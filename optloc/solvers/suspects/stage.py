@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from time import perf_counter
 
 import numpy as np
@@ -54,7 +55,6 @@ def suspects(
         first.
     by : "station", "row", "prior", "offset" or several of them
         What may be wrong: all rows of a station, one measurement, a prior, all lengths of a kind by one offset.
-
     together : bool
         Whether the noise of a batch, and of epochs, is stated for all of them, so that it is a suspect too where many
         contradict themselves; False for problems that have nothing to do with each other.
@@ -95,18 +95,9 @@ def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS
     if not np.array_equal(pool.weights, present):
         # a robust fix has its minima elsewhere: the test is that of least squares with every row
         pool = lsr(problem, offer(problem, standing(pool, judge(problem, pool)), pool, "start", perf_counter()))
-    fix, before = judge(problem, pool), pool.stages
-    found, refuted = _explain(problem, fix, present, rejected, by), ""
-    level = _level(problem, fix) if together else None
-    if level is not None:
-        # whoever is accused then stands out from noise as large as it is
-        loud = level.scale(problem)
-        own = fix_by(loud, lambda one: begin(one, fix.x[:, None]))
-        other = replace(fix, x=own.x, cov=own.cov, cost=own.cost)
-        again = _explain(loud, other, present, rejected, by)
-        more = 2.0 * (present @ np.log(level.sizes(problem))) / np.maximum(present.sum(1), 1.0)
-        if _score(again, other, more) + ROW_PRICE < _score(found, fix, np.zeros(len(pool))):
-            found, refuted = again, level.sentence
+    before = pool.stages
+    asked = partial(_explain, present=present, rejected=rejected, by=by)
+    found, refuted = _weigh(problem, judge(problem, pool), asked, together)
     pool = replace(pool, asked=True, refuted=refuted)
     fix, conclusion = judge(problem, pool), fill(len(pool), None)
     for items, groups, findings in found:
@@ -117,6 +108,25 @@ def suspect(problem: Problem, pool: Pool | None, by: Sequence[GroupKind] = KINDS
 
 
 _Explained = list[tuple[Array, tuple[Group, ...], list[Finding]]]
+
+
+def _weigh(
+    problem: Problem, fix: Fix, asked: Callable[[Problem, Fix], _Explained], together: bool
+) -> tuple[_Explained, str]:
+    """Return what explains problems by the noise as stated or, where that is likelier for all, by a larger one."""
+    found = asked(problem, fix)
+    level = _level(problem, fix) if together else None
+    if level is None:
+        return found, ""
+    # whoever is accused then stands out from noise as large as it is
+    loud = level.scale(problem)
+    own = fix_by(loud, lambda one: begin(one, fix.x[:, None]))
+    other = replace(fix, x=own.x, cov=own.cov, cost=own.cost)
+    again, present = asked(loud, other), np.broadcast_to(problem.weight, fix.weights.shape)
+    more = 2.0 * (present @ np.log(level.sizes(problem))) / np.maximum(present.sum(1), 1.0)
+    if _score(again, other, more) + ROW_PRICE < _score(found, fix, np.zeros(len(more))):
+        return again, level.sentence
+    return found, ""
 
 
 def _explain(problem: Problem, fix: Fix, present: Array, rejected: Array, by: Sequence[GroupKind]) -> _Explained:
