@@ -44,8 +44,8 @@ class Asked(NamedTuple):
         Corners of the regions to take where all positions cannot be bounded.
     budget : int array (n,)
         How many boxes each may take.
-    surface : array (n, e)
-        Values of the last e nodes on the surface to which the claim is limited.
+    planes, surface : array (n, e, 3), (n, 0) or (n, SURFACE_WIDTH)
+        Planes or a surface to which the claims are limited, see `optloc.proof.chart.Known`.
     """
 
     x: Array
@@ -57,6 +57,7 @@ class Asked(NamedTuple):
     region: Array
     fallback: Array
     budget: Array
+    planes: Array
     surface: Array
 
     def take(self, index: Array | slice) -> Asked:
@@ -158,7 +159,7 @@ def _loop(pose: Posed, asked: Asked, out: Answered) -> None:
     kinds, data, K, w = pose.kinds, pose.data, pose.K, pose.w
     fixes, others, known, kappas, tolerances = asked.x, asked.others, asked.known, asked.kappa, asked.eps
     regions, fallbacks, budgets = asked.region, asked.fallback, asked.budget
-    hidden, surfaces = asked.hidden, asked.surface
+    hidden, planes, surfaces = asked.hidden, asked.planes, asked.surface
     verdicts, counts, bounds, wholes, points = out.verdict, out.boxes, out.bound, out.everywhere, out.found
     J = K.shape[2]
     A, weight, groups, box = np.empty((J, J)), np.empty(J), empty_groups(J), empty_box(K.shape[1], J)
@@ -172,7 +173,11 @@ def _loop(pose: Posed, asked: Asked, out: Answered) -> None:
             cost = _present(cost)
             own = empty_box(cost.K.shape[0], cost.K.shape[1])
         x, kappa, eps, found = fixes[i], kappas[i], tolerances[i], points[i]
-        beside, low, high = Known(others[i, : known[i]], hidden[i], surfaces[i]), regions[i, 0], regions[i, 1]
+        beside, low, high = (
+            Known(others[i, : known[i]], hidden[i], planes[i], surfaces[i]),
+            regions[i, 0],
+            regions[i, 1],
+        )
         boxes = 0
         wholes[i] = isnan(low[0])
         if wholes[i]:

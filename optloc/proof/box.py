@@ -216,6 +216,8 @@ def shrink(
     a00, a01, a02, a11, a12, a22, b0, b1, b2 = normal_of(rows)
     if plane:  # nothing depends on the third coordinate: any pivot will do
         a22 = a22 + 1.0
+    if half[1] == 0.0:  # nor on the second
+        a11 = a11 + 1.0
     if not inverse(a00, a01, a02, a11, a12, a22, solve):
         return
     r0, r1, r2, size, longest = 0.0, 0.0, 0.0, rho, 0.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import sqrt
+from math import inf, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -10,10 +10,26 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, inlined, zero
 from optloc.compute.systems import invert, roughly_principal
+from optloc.models.primitives import WGS84_A
 from optloc.proof.box import ROW_WIDTH, bound_nodes, cost_at, rounding
 from optloc.proof.curvature import G0, G1, G2, SUMS, convex, curve_nodes, sum_up
 from optloc.proof.nodes.dispatch import size_of
-from optloc.proof.nodes.node import CURVE_WIDTH, H00, H01, H02, H11, H12, H22, NODE_WIDTH, RANGE
+from optloc.proof.nodes.level import LEAST_RADIUS
+from optloc.proof.nodes.node import ANY, CURVE_WIDTH, H00, H01, H02, H11, H12, H22, NODE_WIDTH, RANGE, inner, triple
+from optloc.proof.surface import (
+    FIRST,
+    GRAPH_WIDTH,
+    LEVEL,
+    MIDDLE,
+    SAG,
+    SECOND,
+    SLIP,
+    UP,
+    fold_bounds,
+    fold_curves,
+    lay,
+    unfold_slopes,
+)
 
 # Nodes whose rows are tied to each other by less than this share count as independent: what the rounding of whitened
 # rows leaves of an entry of K'K that is zero.
@@ -90,28 +106,37 @@ class Known(NamedTuple):
         Other minima, polished; boxes around them that hold no second one are set aside.
     hidden : int
         The last so many of them do not count, though they may cost less: nor does what is near them.
-    surface : array (e,)
-        Values that the last e nodes have on the surface to which the claim is limited: heights and planes.
+    planes : array (e, 3)
+        Normals of planes through the fix to which the claim is limited.
+    surface : array (0,) or (SURFACE_WIDTH,)
+        The surface of a height to which it is limited, see `optloc.proof.surface`; never together with planes.
     """
 
     points: Array
     hidden: int
+    planes: Array
     surface: Array
 
 
 class Chart(NamedTuple):
     """Search coordinates s with ``x = origin + sense s``: principal axes of the fix, one unit a standard deviation.
 
+    On planes there are fewer of them. On the surface of a height two: the third axis is upward, as
+    `optloc.proof.surface` says, and points are off the origin along it as far as the surface is.
+
     Parameters
     ----------
     origin : array (3,)
         The fix.
     sense, back, gram : array (3, 3)
-        T, its inverse, and T'T; rows and columns of zeros for the third coordinate in the plane.
+        T, its inverse, and T'T; columns of T, rows of the inverse and both of T'T are zero for coordinates that there
+        are not.
     slip : array (3,)
         How far the rounding of coordinates of one metre moves a point, search coordinates.
     floor : float
         The sizes of what residuals are differences of, beside the nodes: measurements and coordinates.
+    surface : array (0,) or (SURFACE_WIDTH,)
+        The surface of a height, with the axes of this piece.
     """
 
     origin: Array
@@ -120,6 +145,7 @@ class Chart(NamedTuple):
     gram: Array
     slip: Array
     floor: float
+    surface: Array
 
 
 class Box(NamedTuple):
@@ -139,6 +165,8 @@ class Box(NamedTuple):
         Working memory.
     cut : array (6,)
         Ends of the part of the box that is left, about its centre.
+    sense, gram, graph, lean : array (3, 3), (3, 3), (GRAPH_WIDTH,), (J,)
+        Of a box on a surface: its own T and T'T, the graph of the surface, and slopes along the upward axis.
     """
 
     at: Array
@@ -151,6 +179,10 @@ class Box(NamedTuple):
     sums: Array
     solve: Array
     cut: Array
+    sense: Array
+    gram: Array
+    graph: Array
+    lean: Array
 
 
 @compiled
@@ -275,6 +307,10 @@ def empty_box(q: int, J: int) -> Box:
         np.empty(SUMS),
         np.empty((3, 3)),
         np.empty(6),
+        np.empty((3, 3)),
+        np.empty((3, 3)),
+        np.empty(GRAPH_WIDTH),
+        np.empty(J),
     )
 
 
@@ -285,6 +321,12 @@ def chart_at(cost: Cost, x: Array, box: Box) -> tuple[Chart, bool]:
     The tables of the box are those of the fix afterwards: values of the nodes, forces (`CURVE_WIDTH`), and sums, whose
     gradient is that along the search coordinates.
     """
+    return chart_on(cost, x, box, np.empty((0, 3)), np.empty(0))
+
+
+@compiled
+def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> tuple[Chart, bool]:
+    """Return the search coordinates around a fix on planes or a surface (see `Known`), otherwise as `chart_at`."""
     D = x.shape[0]
     vectors, numbers = np.zeros((2, 3)), np.zeros((3, 3, 3))
     origin, slip, sense, back, gram = vectors[0], vectors[1], numbers[0], numbers[1], numbers[2]
@@ -301,25 +343,96 @@ def chart_at(cost: Cost, x: Array, box: Box) -> tuple[Chart, bool]:
     information[0, 2] = information[2, 0] = sums[H02]
     information[1, 2] = information[2, 1] = sums[H12]
     # `gram` holds the axes for the moment; it is written anew below.
-    roughly_principal(information, gram)
+    count = _set_tangents(D, planes, surface, gram)
+    _principal_along(information, gram, count)
     most = max(information[0, 0], information[1, 1], information[2, 2])
-    good = True
-    for k in range(D):
+    good, sense[:] = True, 0.0
+    for k in range(count):
         length = information[k, k]
         good = good and length > _DETERMINED * most
         root = sqrt(length) if length > 0.0 else 1.0
         for m in range(3):
             sense[m, k], back[k, m] = gram[m, k] / root, gram[m, k] * root
             slip[k] += _PLACED * abs(back[k, m])
-    for k in range(3):
+    own = surface.copy()
+    if surface.shape[0] > 0:  # axes of the piece, of unit length
         for m in range(3):
-            gram[k, m] = sense[0, k] * sense[0, m] + sense[1, k] * sense[1, m] + sense[2, k] * sense[2, m]
+            own[FIRST + m], own[SECOND + m] = gram[m, 0], gram[m, 1]
+            sense[m, 2] = back[2, m] = surface[UP + m]
     g0, g1, g2 = sums[G0], sums[G1], sums[G2]
     for k in range(3):
-        sums[G0 + k] = sense[0, k] * g0 + sense[1, k] * g1 + sense[2, k] * g2
-    return Chart(
-        origin, sense, back, gram, slip, accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, origin)
-    ), good
+        along = sense[0, k] * g0 + sense[1, k] * g1 + sense[2, k] * g2
+        sums[G0 + k] = along if k < count else 0.0
+        for m in range(3):
+            gram[k, m] = sense[0, k] * sense[0, m] + sense[1, k] * sense[1, m] + sense[2, k] * sense[2, m]
+    floor = accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, origin)
+    return Chart(origin, sense, back, gram, slip, floor, own), good
+
+
+# Length of the part of an axis of space across others that will do: of one of the three it is 0.57 at least.
+_ACROSS = 0.5
+
+
+@compiled
+def _set_tangents(D: int, planes: Array, surface: Array, axes: Array) -> int:
+    """Write orthonormal axes (3, 3): those along planes or a surface first, then those across; return how many."""
+    bent = int(surface.shape[0] > 0)
+    across = planes.shape[0] + bent + 3 - D
+    # From the last column on: the axis that a plane has not, the surface's, the planes', then whatever is left.
+    for number in range(3):
+        k = 2 - number
+        if number < 3 - D:
+            first = (0.0, 0.0, 1.0)
+        elif number < 3 - D + bent:
+            first = triple(surface, UP)
+        elif number < across:
+            first = triple(planes[number - bent - 3 + D], 0)
+        else:
+            first = (0.0, 0.0, 0.0)
+        if number < across:
+            _set_axis(axes, k, first)
+        else:
+            for turn in range(3):  # an axis of space, its own if that will do: without planes it is that one
+                m = (k + turn) % 3
+                start = (1.0 if m == 0 else 0.0, 1.0 if m == 1 else 0.0, 1.0 if m == 2 else 0.0)
+                if _set_axis(axes, k, start) > _ACROSS:
+                    break
+    return int(3 - across)
+
+
+@compiled
+def _set_axis(axes: Array, k: int, start: tuple[float, float, float]) -> float:
+    """Write the part of a vector across the axes behind k as axis k, of length one; return how long it was."""
+    length = 0.0
+    for m in range(3):
+        axes[m, k] = start[m]
+    for _ in range(2):  # twice is exact (Parlett)
+        for other in range(k + 1, 3):
+            along = axes[0, k] * axes[0, other] + axes[1, k] * axes[1, other] + axes[2, k] * axes[2, other]
+            for m in range(3):
+                axes[m, k] -= along * axes[m, other]
+    length = sqrt(axes[0, k] ** 2 + axes[1, k] ** 2 + axes[2, k] ** 2)
+    for m in range(3):
+        axes[m, k] /= length if length > 0.0 else 1.0
+    return length
+
+
+@compiled
+def _principal_along(information: Array, axes: Array, count: int) -> None:
+    """Turn the first `count` axes so that information (3, 3) is nearly diagonal along them; it is written so."""
+    own, turned, vectors = np.zeros((3, 3)), axes.copy(), np.zeros((3, 3))
+    for k in range(count):
+        for m in range(count):
+            for i in range(3):
+                for j in range(3):
+                    own[k, m] += axes[i, k] * information[i, j] * axes[j, m]
+    roughly_principal(own, vectors)
+    information[:] = own
+    for k in range(count):
+        for m in range(3):
+            axes[m, k] = 0.0
+            for i in range(count):
+                axes[m, k] += turned[m, i] * vectors[i, k]
 
 
 @compiled
@@ -366,26 +479,109 @@ def widen(chart: Chart, centre: Array, half: Array) -> None:
 
 
 @compiled
-def value_at(cost: Cost, chart: Chart, box: Box) -> float:
-    """Return f at the centre of a box; its first table is filled."""
+def is_bounded(cost: Cost, chart: Chart, box: Box) -> bool:
+    """Bound the nodes over a box; return False where it is so large that a surface is no graph over it."""
     place(chart.origin, chart.sense, box.at, box.centre)
-    bound_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, box.half, box.line, box.nodes)
-    return cost_at(cost.K, cost.w, box.nodes)
+    if chart.surface.shape[0] == 0:
+        bound_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, box.half, box.line, box.nodes)
+        return True
+    return lay_down(cost, chart, box)
+
+
+@compiled
+def lay_down(cost: Cost, chart: Chart, box: Box) -> bool:
+    """Bound the nodes over a box whose centre is in the plane of its chart along a surface, onto which it is moved."""
+    box.sense[:] = chart.sense
+    if not lay(chart.surface, box.centre, box.half, box.sense, box.gram, box.graph, box.solve):
+        box.half[2] = 0.0
+        return False
+    bound_nodes(cost.kinds, cost.data, box.centre, box.sense, box.gram, box.half, box.line, box.nodes)
+    fold_bounds(box.graph, box.lean, box.nodes)
+    box.half[2] = 0.0
+    return True
+
+
+@compiled
+def curve_along(cost: Cost, box: Box) -> None:
+    """Fill the table of second derivatives along a surface of a box that lies on it."""
+    unfold_slopes(box.lean, box.nodes)
+    box.half[2] = box.graph[SAG] + box.graph[SLIP]
+    sense, gram, half, line, nodes, curves = box.sense, box.gram, box.half, box.line, box.nodes, box.curves
+    curve_nodes(cost.kinds, cost.data, box.centre, sense, gram, half, line, box.solve, nodes, curves)
+    fold_curves(box.graph, box.lean, nodes, curves)
+    box.half[2] = 0.0
 
 
 @inlined
 def curve_box(cost: Cost, chart: Chart, box: Box) -> None:
     """Fill the tables of second derivatives of a box whose nodes are bounded."""
-    sense, gram, half, line, nodes, curves = chart.sense, chart.gram, box.half, box.line, box.nodes, box.curves
-    curve_nodes(cost.kinds, cost.data, box.centre, sense, gram, half, line, box.solve, nodes, curves)
+    half, line, nodes, curves = box.half, box.line, box.nodes, box.curves
+    if chart.surface.shape[0] == 0:
+        curve_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, half, line, box.solve, nodes, curves)
+    else:
+        curve_along(cost, box)
     noise = rounding(cost.K, cost.weight, chart.floor, nodes)
     sum_up(cost.K, cost.w, cost.weight, noise, nodes, curves, box.sums)
 
 
 @compiled
+def value_at(cost: Cost, chart: Chart, box: Box) -> float:
+    """Return f at the centre of a box, infinite where it is off a surface; its first table is filled."""
+    return cost_at(cost.K, cost.w, box.nodes) if is_bounded(cost, chart, box) else inf
+
+
+@compiled
+def shapes_of(cost: Cost, chart: Chart) -> Array:
+    """Return the codes of the nodes for tests of convexity: along a surface a range is not convex."""
+    return cost.kinds if chart.surface.shape[0] == 0 else np.full_like(cost.kinds, ANY)
+
+
+@compiled
 def is_convex(cost: Cost, chart: Chart, box: Box, margin: float) -> bool:
     """Return whether the Hessian of f/2 exceeds `margin` all over a box, whose tables are filled."""
-    place(chart.origin, chart.sense, box.at, box.centre)
-    bound_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, box.half, box.line, box.nodes)
+    if not is_bounded(cost, chart, box):
+        return False
     curve_box(cost, chart, box)
-    return convex(cost.kinds, cost.A, box.half, box.nodes, box.curves, box.sums, margin)
+    return convex(shapes_of(cost, chart), cost.A, box.half, box.nodes, box.curves, box.sums, margin)
+
+
+@compiled
+def turned(cost: Cost, chart: Chart, side: int) -> Chart:
+    """Return the search coordinates of another piece of a surface, one unit the Earth's least distance.
+
+    Parameters
+    ----------
+    cost, chart : Cost, Chart
+        The cost, and the search coordinates around the fix, side 0.
+    side : int
+        1: the piece opposite to the fix; 2 to 5: those beside it.
+    """
+    numbers, vectors, own = np.zeros((3, 3, 3)), np.zeros((2, 3)), chart.surface.copy()
+    origin, slip, sense, back = vectors[0], vectors[1], numbers[0], numbers[1]
+    sign, radius = -1.0 if side % 2 else 1.0, LEAST_RADIUS
+    for k, column in ((0, FIRST), (1, SECOND), (2, UP)):
+        source = FIRST + 3 * ((side // 2 + k) % 3)
+        for m in range(3):
+            own[column + m] = chart.surface[source + m] * (sign if k == 2 else 1.0)
+            sense[m, k], back[k, m] = own[column + m] * radius, own[column + m] / radius
+            slip[k] += _PLACED * abs(back[k, m])
+    for m in range(3):
+        sense[m, 2] = back[2, m] = own[UP + m]
+        origin[m] = own[MIDDLE + m] + radius * own[UP + m]
+    slip[2] = 0.0
+    floor = accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, origin)
+    return Chart(origin, sense, back, numbers[2], slip, floor, own)
+
+
+@compiled
+def reach_of_piece(chart: Chart, low: Array, high: Array) -> None:
+    """Clip corners (3,) of search coordinates by where the surface is of this piece, and take the third away."""
+    # A point that is farthest out along the third axis is at most so far aside: its squares sum to the distance's.
+    most = sqrt(0.5) * (WGS84_A + abs(chart.surface[LEVEL])) * (1.0 + 1e-9)
+    for k in range(2):
+        unit, away = triple(chart.surface, FIRST if k == 0 else SECOND), 0.0
+        size = inner(unit, (chart.sense[0, k], chart.sense[1, k], chart.sense[2, k]))
+        for m in range(3):
+            away += unit[m] * (chart.origin[m] - chart.surface[MIDDLE + m])
+        low[k], high[k] = max(low[k], (-most - away) / size), min(high[k], (most - away) / size)
+    low[2] = high[2] = 0.0

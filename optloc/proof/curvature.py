@@ -193,9 +193,9 @@ def convex(kinds: Array, A: Array, half: Array, nodes: Array, curves: Array, sum
             d1 += most * (abs(curves[j, H11]) + n1 + n4)
             d2 += most * (abs(curves[j, H22]) + n2 + n4)
             away += (abs(curves[j, FORCE]) + most) * curves[j, CHI]
-    h0, h3 = h0 - d0 - away, h3 - d1 - away
     # In the plane nothing depends on the third coordinate: any positive entry leaves the test to the others.
-    h5 = 1.0 if half[2] == 0.0 and sums[H22] == 0.0 else h5 - d2 - away
+    h3 = 1.0 if half[1] == 0.0 and sums[H11] == 0.0 else h3 - d1 - away
+    h0, h5 = h0 - d0 - away, 1.0 if half[2] == 0.0 and sums[H22] == 0.0 else h5 - d2 - away
     return positive(h0, h1, h2, h3, h4, h5)
 
 
@@ -253,6 +253,7 @@ def clip_to_stationary(
     # The share of the box that the mean reaches: half of the bounds of change, which grow with it at least linearly.
     plane = half[2] == 0.0 and sums[H22] == 0.0
     a, b, c, d, e, f = sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], 1.0 if plane else sums[H22]
+    d = 1.0 if half[1] == 0.0 and d == 0.0 else d
     if not inverse(a, b, c, d, e, f, solve):
         return
     h0, h1, h2 = half[0], half[1], half[2]
@@ -290,37 +291,3 @@ def entry(k: int, m: int) -> int:
     """Return where entry (k, m) of a symmetric matrix stands among (00, 01, 02, 11, 12, 22)."""
     first, second = min(k, m), max(k, m)
     return second if first == 0 else first + second + 1
-
-
-@compiled
-def free_multiplier(kinds: Array, A: Array, half: Array, nodes: Array, curves: Array, sums: Array, count: int) -> None:
-    """Let the force on the nodes that set a surface be that of any stationary point on it: `convex` then allows for it.
-
-    Where the gradient of f along the surface vanishes, f less n times the node has no gradient at all, for a
-    multiplier n of that point alone. On a box where all these functions are convex, two such points x and y with n and
-    m would both be the least of their own: ``f(x) < f(y)`` and ``f(y) < f(x)``. A multiplier of a plane bends nothing;
-    that of a height is at most the gradient of f over that of the height, in any coordinate.
-
-    Parameters
-    ----------
-    kinds, A, half, nodes, curves, sums : arrays
-        As of `convex`; the last column of `curves` is raised.
-    count : int
-        How many nodes set the surface, the last ones.
-    """
-    for j in range(kinds.shape[0] - count, kinds.shape[0]):
-        if shape_of(kinds[j]) == FLAT:
-            continue
-        most = inf
-        # Beside another surface a height's multiplier is not bounded so simply: nothing is said.
-        if count == 1:
-            size = sqrt(half[0] * half[0] + half[1] * half[1] + half[2] * half[2])
-            ball = spread_of(A, half, nodes, curves, sums) * size
-            for k in range(3):
-                slope = abs(sums[G0 + k]) + sums[NOISE0 + k] + ball
-                for m in range(3):
-                    slope += (abs(sums[entry(k, m)]) + sums[C00 + entry(k, m)]) * half[m]
-                steep = abs(nodes[j, SLOPE0 + k]) - curves[j, TURN0 + k]
-                if steep > 0.0:
-                    most = min(most, slope / steep)
-        curves[j, BLUR] += most

@@ -71,7 +71,6 @@ def around_squares(
     A: Array,
     nodes: Array,
     sense: Array,
-    back: Array,
     rho: float,
     member: Array,
     reference: int,
@@ -87,9 +86,10 @@ def around_squares(
     with ``phi_j = e_j (2 z_j + 2 n_j r_p + e_j)``; without a reference the second unknown is |x - s_p|^2 and n_j = 0.
     Differences to the fix bring the constants away. The last unknown is bounded first, because phi contains it.
     """
-    count, ranges = _rows(kinds, data, nodes, member, reference, tie, ties)
-    plane = lower[2] == upper[2] == 0.0
-    if count < 3 - int(plane) + int(ranges) or not _left_inverse(A, nodes, kinds, member, ties, ranges, plane):
+    count, ranges = _rows(kinds, data, nodes, sense, member, reference, tie, ties)
+    for k in range(3):
+        count += int(lower[k] == upper[k] == 0.0)  # a coordinate that there is not needs no row
+    if count < 3 + int(ranges) or not _left_inverse(A, member, ties, ranges, lower, upper):
         return
     near = nodes[reference, PHI] if reference >= 0 else 0.0
     middle, spread, last, more = near, 0.0, 0.0, 1.0
@@ -109,12 +109,11 @@ def around_squares(
     bound = np.empty((3, 4))  # centre and reach of each coordinate, what of it goes with the last unknown, and its side
     for k in range(3):
         for j in member:
-            weight = back[k, 0] * ties[j, LEFT] + back[k, 1] * ties[j, LEFT + 1]
-            ties[j, WEIGHT] = weight + back[k, 2] * ties[j, LEFT + 2]
+            ties[j, WEIGHT] = ties[j, LEFT + k]
         centre, linear, slope, square = _sums(R, member, ties, near, middle)
         reach = (rho * (linear + spread * slope) + rho * rho * square) * (1.0 + 0.5 * SLACK)
         bound[k, 0], bound[k, 1], bound[k, 2], bound[k, 3] = centre, reach, rho * slope, abs(centre) + reach
-    if not _inverts_well(kinds, member, ties, sense, back, bound, last, more):
+    if not _inverts_well(member, ties, bound, last, more):
         return
     for k in range(3):
         reach = bound[k, 1] * (1.0 + 0.5 * SLACK)
@@ -123,19 +122,19 @@ def around_squares(
 
 @inlined
 def _rows(
-    kinds: Array, data: Array, nodes: Array, member: Array, reference: int, tie: Array, ties: Array
+    kinds: Array, data: Array, nodes: Array, sense: Array, member: Array, reference: int, tie: Array, ties: Array
 ) -> tuple[int, bool]:
-    """Write the squared rows: their coefficients, and those of their errors.
+    """Write the squared rows: their coefficients in search coordinates, and those of their errors.
 
     An error e changes a row by ``e (first + second r_p + third e)``. Returned: how many rows there are, and whether any
     is a range.
     """
     origin, count, ranges = reference, 0, False
     for j in member:
-        ties[j, FIRST:] = 0.0
+        ties[j, FIRST:] = 0.0  # the row among them
         if kinds[j] == LINEAR:
             for k in range(3):
-                ties[j, ROW + k] = data[j, 3 + k]
+                ties[j, ROW + k] = data[j, 3] * sense[0, k] + data[j, 4] * sense[1, k] + data[j, 5] * sense[2, k]
             ties[j, FIRST], ties[j, WEIGHT] = -1.0, 1.0
         elif kinds[j] == RANGE and (reference < 0 or tie[j] != 0.0):
             origin = j if origin < 0 else origin
@@ -143,7 +142,8 @@ def _rows(
             if reference >= 0:
                 apart -= tie[j] * nodes[reference, PHI]
             for k in range(3):
-                ties[j, ROW + k] = 2.0 * (data[j, k] - data[origin, k])
+                for m in range(3):
+                    ties[j, ROW + k] += 2.0 * (data[j, m] - data[origin, m]) * sense[m, k]
             ties[j, ROW + 3] = 2.0 * apart * tie[j] if reference >= 0 else -1.0
             ties[j, FIRST], ties[j, SECOND], ties[j, THIRD] = 2.0 * apart, 2.0 * tie[j], 1.0
             # For the left inverse: what a squared row is worth beside its range.
@@ -156,7 +156,7 @@ def _rows(
 
 
 @inlined
-def _left_inverse(A: Array, nodes: Array, kinds: Array, member: Array, ties: Array, ranges: bool, plane: bool) -> bool:
+def _left_inverse(A: Array, member: Array, ties: Array, ranges: bool, lower: Array, upper: Array) -> bool:
     """Write the left inverse of the rows that is best for the errors at the fix; False where there is none."""
     normal = np.zeros((4, 4))
     for j in member:
@@ -171,8 +171,9 @@ def _left_inverse(A: Array, nodes: Array, kinds: Array, member: Array, ties: Arr
         for k in range(4):
             for m in range(k + 1):
                 normal[k, m] += ties[j, WEIGHTED + k] * ties[j, ROW + m]
-    if plane:
-        normal[2, 2] = 1.0
+    for k in range(3):
+        if lower[k] == upper[k] == 0.0:
+            normal[k, k] = 1.0
     if not ranges:
         normal[3, 3] = 1.0
     if not invert(normal, 4, _PIVOT):
@@ -185,16 +186,7 @@ def _left_inverse(A: Array, nodes: Array, kinds: Array, member: Array, ties: Arr
 
 
 @inlined
-def _inverts_well(
-    kinds: Array,
-    member: Array,
-    ties: Array,
-    sense: Array,
-    back: Array,
-    bound: Array,
-    last: float,
-    more: float,
-) -> bool:
+def _inverts_well(member: Array, ties: Array, bound: Array, last: float, more: float) -> bool:
     """Return whether what the left inverse lacks of one is nothing beside the widths of an enclosure.
 
     With E = (left inverse) (rows) - 1 in search coordinates and the last unknown, differences y to the fix obey
@@ -203,27 +195,21 @@ def _inverts_well(
 
     Parameters
     ----------
-    kinds, member, ties : arrays
+    member, ties : arrays
         As of `around_squares`.
-    sense, back : array (3, 3)
-        Derivatives of the position with respect to the search coordinates, and the inverse.
     bound : array (3, 4)
         Of each coordinate: centre, reach, reach over that of the last unknown, and greatest size.
     last, more : float
         Greatest size of the last unknown, and how many times what is added to its bound it grows by.
     """
-    row, left, off, size = np.empty(4), np.empty(4), np.zeros((4, 4)), np.zeros((4, 4))
+    off, size = np.zeros((4, 4)), np.zeros((4, 4))
     for j in member:
         if ties[j, ROW] == ties[j, ROW + 1] == ties[j, ROW + 2] == ties[j, ROW + 3] == 0.0:
             continue
-        for k in range(3):
-            row[k] = ties[j, ROW] * sense[0, k] + ties[j, ROW + 1] * sense[1, k] + ties[j, ROW + 2] * sense[2, k]
-            left[k] = ties[j, LEFT] * back[k, 0] + ties[j, LEFT + 1] * back[k, 1] + ties[j, LEFT + 2] * back[k, 2]
-        row[3], left[3] = ties[j, ROW + 3], ties[j, LEFT + 3]
         for k in range(4):
             for m in range(4):
-                off[k, m] += left[k] * row[m]
-                size[k, m] += abs(left[k] * row[m])
+                off[k, m] += ties[j, LEFT + k] * ties[j, ROW + m]
+                size[k, m] += abs(ties[j, LEFT + k] * ties[j, ROW + m])
     wide, good = 0.0, True
     for k in range(3, -1, -1):  # the last unknown first: it moves the others
         extra = 0.0
@@ -305,7 +291,14 @@ def around_rays(kinds: Array, data: Array, x: Array, back: Array, swing: Array, 
                 reach[count], far[count] = wide, away
                 count += 1
     gamma, off = np.empty((3, max(count, 1))), np.empty((3, 3))
-    if not _weighted_inverse(rows, reach, far, count, back, gamma, off):
+    # Along what the coordinates span: a position differs from the fix in no other way.
+    axes, turned = np.zeros((3, 3)), np.zeros((3, 3))
+    span = _span(back, axes, turned)
+    for i in range(count):
+        y0, y1, y2 = rows[i, 0], rows[i, 1], rows[i, 2]
+        for k in range(3):
+            rows[i, k] = y0 * axes[k, 0] + y1 * axes[k, 1] + y2 * axes[k, 2]
+    if not _weighted_inverse(rows, reach, far, count, span, gamma, off):
         return
     steep, most = 0.0, 0.0
     for k in range(3):
@@ -322,16 +315,43 @@ def around_rays(kinds: Array, data: Array, x: Array, back: Array, swing: Array, 
     for k in range(3):
         wide = 0.0
         for m in range(3):  # what the left inverse lacks of one, times y
-            wide += (abs(back[k, 0]) * off[0, m] + abs(back[k, 1]) * off[1, m] + abs(back[k, 2]) * off[2, m]) * most
+            for c in range(3):
+                wide += abs(turned[k, c]) * off[c, m] * most
         for i in range(count):
-            pull = abs(back[k, 0] * gamma[0, i] + back[k, 1] * gamma[1, i] + back[k, 2] * gamma[2, i])
+            pull = abs(turned[k, 0] * gamma[0, i] + turned[k, 1] * gamma[1, i] + turned[k, 2] * gamma[2, i])
             wide += pull * reach[i] * (far[i] + most)
         wide *= 1.0 + SLACK
         lower[k], upper[k] = max(lower[k], -wide), min(upper[k], wide)
 
 
 @compiled
-def _weighted_inverse(rows: Array, reach: Array, far: Array, count: int, back: Array, gamma: Array, off: Array) -> bool:
+def _span(back: Array, axes: Array, turned: Array) -> int:
+    """Write orthonormal axes (3, 3) of the rows of a matrix, and the matrix along them; return how many there are.
+
+    Rows of zeros are the last ones.
+    """
+    count = 0
+    for k in range(3):
+        length = 0.0
+        for m in range(3):
+            axes[k, m] = back[k, m]
+        for _ in range(2):  # twice is exact (Parlett)
+            for other in range(k):
+                along = axes[k, 0] * axes[other, 0] + axes[k, 1] * axes[other, 1] + axes[k, 2] * axes[other, 2]
+                for m in range(3):
+                    axes[k, m] -= along * axes[other, m]
+        length = sqrt(axes[k, 0] ** 2 + axes[k, 1] ** 2 + axes[k, 2] ** 2)
+        count += int(length > 0.0)
+        for m in range(3):
+            axes[k, m] /= length if length > 0.0 else 1.0
+    for k in range(3):
+        for c in range(3):
+            turned[k, c] = back[k, 0] * axes[c, 0] + back[k, 1] * axes[c, 1] + back[k, 2] * axes[c, 2]
+    return count
+
+
+@compiled
+def _weighted_inverse(rows: Array, reach: Array, far: Array, count: int, span: int, gamma: Array, off: Array) -> bool:
     """Write the left inverse of rows weighted by their widths; False where they do not determine a position.
 
     How far it may be from one, entry by entry, goes into `off` (3, 3).
@@ -342,10 +362,9 @@ def _weighted_inverse(rows: Array, reach: Array, far: Array, count: int, back: A
         for k in range(3):
             for m in range(3):
                 normal[k, m] += weight * rows[i, k] * rows[i, m]
-    plane = back[2, 0] == 0.0 and back[2, 1] == 0.0 and back[2, 2] == 0.0
-    if plane:
-        normal[2, 2] = 1.0
     size = normal[0, 0] + normal[1, 1]
+    for k in range(span, 3):
+        normal[k, k] = 1.0
     if not size > 0.0 or not inverse(
         normal[0, 0], normal[0, 1], normal[0, 2], normal[1, 1], normal[1, 2], normal[2, 2], solve
     ):
@@ -354,15 +373,15 @@ def _weighted_inverse(rows: Array, reach: Array, far: Array, count: int, back: A
         weight = 1.0 / (reach[i] * far[i]) ** 2 if reach[i] * far[i] > 0.0 else 0.0
         for k in range(3):
             gamma[k, i] = weight * (solve[k, 0] * rows[i, 0] + solve[k, 1] * rows[i, 1] + solve[k, 2] * rows[i, 2])
-    return _inverts(gamma, rows, count, plane, off)
+    return _inverts(gamma, rows, count, span, off)
 
 
 @compiled
-def _inverts(gamma: Array, rows: Array, count: int, plane: bool, off: Array) -> bool:
+def _inverts(gamma: Array, rows: Array, count: int, span: int, off: Array) -> bool:
     """Write how far gamma times rows may be from one, entry by entry; return whether that is a small rounding."""
     off[:] = 0.0
-    for k in range(2 if plane else 3):
-        for m in range(2 if plane else 3):
+    for k in range(span):
+        for m in range(span):
             total = size = 0.0
             for i in range(count):
                 total += gamma[k, i] * rows[i, m]
@@ -425,7 +444,7 @@ def enclose(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper:
                 ties[j, SWING] = abs(error) + reach
                 rays += int(kinds[j] != RANGE and has_ray(kinds[j]))
                 around_node(kinds[j], data[j], middle - reach, middle + reach, x, back, lower, upper)
-        around_squares(kinds, data, A, nodes, sense, back, rho, member, reference, own, groups.tie, ties, lower, upper)
+        around_squares(kinds, data, A, nodes, sense, rho, member, reference, own, groups.tie, ties, lower, upper)
     if rays:
         around_rays(kinds, data, x, back, ties[:, SWING].copy(), lower, upper)
     bounded = True

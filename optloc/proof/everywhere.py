@@ -38,7 +38,8 @@ from optloc.proof.box import (
 )
 from optloc.proof.chart import HIDDEN_REACH, Box, Chart, Cost, Known, chart_at, empty_box
 from optloc.proof.curvature import C00, G0, G1, G2, NOISE0, convex, entry, slopes_everywhere, spread_of, sum_up
-from optloc.proof.near import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, descend, prove
+from optloc.proof.descent import descend
+from optloc.proof.near import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces, infinity_of, points_of
 from optloc.proof.nodes.node import ANY, DIFFERENCE, GROWS, H00, H11, H22, RANGE
 
@@ -543,7 +544,8 @@ def prove_everywhere(
     bound : float
         A certified lower bound of f over all positions; -inf where there is none.
     """
-    nowhere, open_end = np.full(x.shape[0], np.nan), reaches_infinity(cost.kinds, cost.K)
+    nowhere, bound_to = np.full(x.shape[0], np.nan), beside.planes.shape[0] + beside.surface.shape[0] > 0
+    open_end = not bound_to and reaches_infinity(cost.kinds, cost.K)  # the atlas is of all space
     first = min(budget, _SOON) if open_end else budget
     verdict, boxes, bound = prove(cost, box, x, beside, kappa, eps, first, nowhere, nowhere, False, found)
     again = verdict in (OPEN, BUDGET, STATIONARY, SINGULAR) or (verdict == OTHER and _listed(x, beside.points, found))

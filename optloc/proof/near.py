@@ -8,8 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined
-from optloc.compute.systems import inverse, positive
+from optloc.compute.jit import compiled, inlined, zero
 from optloc.proof.box import (
     DEPTH,
     DIRECTION,
@@ -34,92 +33,29 @@ from optloc.proof.chart import (
     Chart,
     Cost,
     Known,
-    chart_at,
-    curve_box,
+    chart_on,
+    curve_along,
     is_convex,
+    lay_down,
     place,
-    value_at,
+    reach_of_piece,
+    shapes_of,
+    turned,
     widen,
 )
-from optloc.proof.curvature import G0, G1, G2, clip_to_stationary, convex, curve_nodes, free_multiplier, sum_up
-from optloc.proof.enclosure import enclose
-from optloc.proof.nodes.node import FORCE, H00, H01, H02, H11, H12, H22, HIGH, LOW, PHI, RANGE, SLOPE0, SLOPE1, SLOPE2
-
-# A few damped Newton steps in search coordinates: which minimum a low point belongs to.
-
-# Steps of a descent: damped Newton needs five to ten from a box near a minimum; beyond forty it creeps along a valley.
-_STEPS = 40
-# A step of so many standard deviations ends it: the next one, of Newton's, would be a millionth.
-_CLOSE = 1e-3
-# Damping at first, its factors after a step that was good and one that was not, and from where on it grows again. Steps
-# that are damped by more than the last are no Newton steps, and do not end a descent.
-_DAMPING, _LESS, _MORE, _LEAST, _FREE = 1e-6, 0.1, 10.0, 1e-4, 1e-3
-# Rounding of two costs of the same point, relative and absolute: a step may raise the cost by it.
-_SAME_COST = 1e-14
-
-
-@compiled
-def descend(cost: Cost, chart: Chart, box: Box) -> float:
-    """Move the centre of a box to a minimum of the cost; return the cost there, or infinity where none is reached.
-
-    The half-widths become zero, and the tables are those of the point. Newton's Hessian where it is positive definite,
-    that of Gauss and Newton elsewhere, damped after Levenberg and Marquardt.
-    """
-    box.half[:] = 0.0
-    start = box.at.copy()
-    cost_now, damping = value_at(cost, chart, box), _DAMPING
-    curve_box(cost, chart, box)
-    for _ in range(_STEPS):
-        length = _step(cost, box, damping)
-        if not length >= 0.0:
-            return float("inf")
-        start[:] = box.at
-        for k in range(3):
-            box.at[k] -= box.solve[0, k]
-        after = value_at(cost, chart, box)
-        if after <= cost_now * (1.0 + _SAME_COST) + _SAME_COST:
-            cost_now = after
-            curve_box(cost, chart, box)
-            if length < _CLOSE * _CLOSE and damping <= _FREE:
-                sums = box.sums
-                good = positive(
-                    sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], sums[H22] if sums[H22] != 0.0 else 1.0
-                )
-                return cost_now if good else float("inf")
-            damping *= _LESS
-        else:
-            box.at[:] = start
-            damping = max(_MORE * damping, _LEAST)
-    return float("inf")
-
-
-@compiled
-def _step(cost: Cost, box: Box, damping: float) -> float:
-    """Write the damped step into the first row of box.solve; return its squared length, NaN where there is none."""
-    sums, solve = box.sums, box.solve
-    h0, h1, h2, h3, h4, h5 = sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], sums[H22]
-    if h5 == 0.0:
-        h5 = 1.0
-    if not positive(h0, h1, h2, h3, h4, h5):
-        # Less the curvature of the nodes, Gauss and Newton's information is left, which always falls.
-        for j in range(box.curves.shape[0]):
-            force = box.curves[j, FORCE]
-            h0 -= force * box.curves[j, H00]
-            h1 -= force * box.curves[j, H01]
-            h2 -= force * box.curves[j, H02]
-            h3 -= force * box.curves[j, H11]
-            h4 -= force * box.curves[j, H12]
-            h5 -= force * box.curves[j, H22]
-    more = 1.0 + damping
-    if not inverse(h0 * more, h1, h2, h3 * more, h4, h5 * more, solve):
-        return float("nan")
-    g0, g1, g2 = sums[G0], sums[G1], sums[G2]
-    s0 = solve[0, 0] * g0 + solve[0, 1] * g1 + solve[0, 2] * g2
-    s1 = solve[1, 0] * g0 + solve[1, 1] * g1 + solve[1, 2] * g2
-    s2 = solve[2, 0] * g0 + solve[2, 1] * g1 + solve[2, 2] * g2
-    solve[0, 0], solve[0, 1], solve[0, 2] = s0, s1, s2
-    return float(s0 * s0 + s1 * s1 + s2 * s2)
-
+from optloc.proof.curvature import G0, G1, G2, clip_to_stationary, convex, curve_nodes, sum_up
+from optloc.proof.descent import descend
+from optloc.proof.enclosure import around_node, enclose
+from optloc.proof.nodes.node import (
+    HEIGHT,
+    HIGH,
+    LOW,
+    RANGE,
+    SLOPE0,
+    SLOPE1,
+    SLOPE2,
+)
+from optloc.proof.surface import DATA, LEVEL, MIDDLE, SIDES, is_beyond, is_one_side
 
 # Branch and bound over boxes of the near chart.
 
@@ -148,9 +84,6 @@ class Aim(NamedTuple):
         otherwise only if its cost is at least `value`.
     free : int
         How many of the known minima, the fix first, are hidden or the fix: what their boxes hold does not count.
-    surface : array (e,)
-        See `optloc.proof.chart.Known`. With one, a gap is proven on it alone: boxes are done where they do not touch it
-        or cost too much, and nowhere because the gradient cannot vanish, which on a surface it need not.
     """
 
     level: float
@@ -158,7 +91,6 @@ class Aim(NamedTuple):
     better: float
     whole: bool
     free: int
-    surface: Array
 
 
 @compiled
@@ -194,10 +126,11 @@ def branch(
     """
     # Arrays by names of their own: to hand a record on counts references to all it holds, at every box.
     kinds, data, K, w, A = cost.kinds, cost.data, cost.K, cost.w, cost.A
-    sense, gram, at, half, centre, line = chart.sense, chart.gram, box.at, box.half, box.centre, box.line
+    bent, shapes = chart.surface.shape[0] > 0, shapes_of(cost, chart)
+    gram = box.gram if bent else chart.gram  # a box on a surface has axes of its own
+    sense, at, half, centre, line = chart.sense, box.at, box.half, box.centre, box.line
     nodes, rows, curves, sums, solve, cut = box.nodes, box.rows, box.curves, box.sums, box.solve, box.cut
     weight, origin, floor, unique = cost.weight, chart.origin, chart.floor, aim.level > aim.value
-    held = unique and aim.surface.shape[0] > 0
     rho = sqrt(max(aim.level, 0.0))
     boxes, low_points = 0, 0
     while size > 0:
@@ -208,55 +141,62 @@ def branch(
         boxes += 1
         place(origin, sense, at, centre)
         widen(chart, centre, half)
-        bound_nodes(kinds, data, centre, sense, gram, half, line, nodes)
+        if bent:
+            left = _lay_or_halve(cost, chart, box, stack, size)
+            if left >= 0:
+                size = left
+                continue
+        else:
+            bound_nodes(kinds, data, centre, sense, gram, half, line, nodes)
         linearise_rows(K, w, nodes, rows)
         low = least_residual(K, weight, floor, half, nodes, rows)
         # A length, where the level is a cost: below 1 the length is the larger, so it is squared.
         if low > 0.0 and low * low >= aim.level:
             continue
         here, noise = cost_at(K, w, nodes), rounding(K, weight, floor, nodes)
-        if held and _misses(aim.surface, weight, noise, half, nodes):
-            continue
-        if here < aim.better and not held:
+        if here < aim.better:
             return CHEAPER, boxes, 0.0
         # What cannot hold a residual shorter than rho, and below what no minimum, is cut off from all sides.
         uncut(half, cut)
         shrink(K, weight, rho + noise, half, half[2] == 0.0, nodes, rows, cut, solve)
-        high = low > 0.0 and low * low >= aim.value
-        sound = aim.whole or high
-        enough = (unique or aim.whole) and (high if held else sound)
-        if _is_done(at, half, minima, sides, aim, enough):
+        sound = aim.whole or (low > 0.0 and low * low >= aim.value)
+        if _is_done(at, half, minima, sides, aim, (unique or aim.whole) and sound):
             continue
-        if held or unique or aim.whole:
-            if not held:
+        if unique or aim.whole:
+            if bent:
+                curve_along(cost, box)
+            else:
                 curve_nodes(kinds, data, centre, sense, gram, half, line, solve, nodes, curves)
-                sum_up(K, w, weight, noise, nodes, curves, sums)
-            if sound and not held:
+            sum_up(K, w, weight, noise, nodes, curves, sums)
+            if sound:
                 clip_to_stationary(A, half, nodes, curves, sums, cut, solve)
             if here < aim.level and not is_empty(cut):
                 low_points += 1
                 # Early, then more and more seldom, and wherever a box holds one minimum at most.
                 seldom = low_points & (low_points - 1) == 0
-                if seldom or (not held and convex(kinds, A, half, nodes, curves, sums, 0.0)):
+                if seldom or convex(shapes, A, half, nodes, curves, sums, 0.0):
                     outcome = _follow(cost, chart, box, minima, sides, aim)
                     if outcome != CLEAR:
                         return outcome, boxes, 0.0
         side = cut_side(kinds, K, gram, half, nodes, rows, here < aim.level)
-        share = cut_out(cut, at, half)
-        if 0.0 < share < _SHRUNK:
-            size = push(stack, size, at, half, low)
-        elif share > 0.0:
-            size = push_halves(stack, size, side, at, half, low, 0, False)
+        size = _push_rest(stack, size, cut_out(cut, at, half), side, at, half, low)
     return CLEAR, boxes, inf
+
+
+@inlined
+def _push_rest(stack: Array, size: int, share: float, side: int, at: Array, half: Array, low: float) -> int:
+    """Push what is left of a box, a share of it, whole or cut across a side; return the size of the stack."""
+    if 0.0 < share < _SHRUNK:
+        return push(stack, size, at, half, low)
+    return push_halves(stack, size, side, at, half, low, 0, False) if share > 0.0 else size
 
 
 @inlined
 def _is_done(at: Array, half: Array, minima: Array, sides: Array, aim: Aim, enough: bool) -> bool:
     """Return whether a box lies where nothing is left to show.
 
-    In the convex box of a known minimum there is no second, but a lower point there may be: on a surface the others are
-    no stationary points, and their boxes say nothing of the value; `enough` says where any of them will do. The box of
-    the fix holds nothing cheaper where no way leads out of the search.
+    In the convex box of a known minimum there is no second, but a lower point there may be: `enough` says where any of
+    them will do. The box of the fix holds nothing cheaper where no way leads out of the search.
     """
     first = 0 if aim.whole else 1
     if is_known(at, half, minima[first : aim.free], sides[first : aim.free]):
@@ -272,39 +212,12 @@ def _follow(cost: Cost, chart: Chart, box: Box, minima: Array, sides: Array, aim
     """
     at, half = box.at.copy(), box.half.copy()
     least = descend(cost, chart, box)
-    # Off the surface a lower cost refutes nothing.
-    if least < aim.better and aim.surface.shape[0] == 0:
+    if least < aim.better:
         return CHEAPER
     if least < aim.level and not is_known(box.at, box.half, minima, sides):
         return ANOTHER
     box.at[:], box.half[:] = at, half
     return CLEAR
-
-
-@inlined
-def _misses(surface: Array, weight: Array, noise: float, half: Array, nodes: Array) -> bool:
-    """Return whether a box has no point where the last nodes have the values (e,) of a surface."""
-    first, apart = weight.shape[0] - surface.shape[0], False
-    for i in range(surface.shape[0]):
-        j = first + i
-        reach = abs(nodes[j, SLOPE0]) * half[0] + abs(nodes[j, SLOPE1]) * half[1] + abs(nodes[j, SLOPE2]) * half[2]
-        # The rounding of a residual, in units of the node.
-        reach += noise / weight[j]
-        off = surface[i] - nodes[j, PHI]
-        apart = apart or off < nodes[j, LOW] - reach or off > nodes[j, HIGH] + reach
-    return apart
-
-
-@compiled
-def is_known(at: Array, half: Array, minima: Array, sides: Array) -> bool:
-    """Return whether a box lies inside the convex box (half-widths `sides`) of a known minimum."""
-    for p in range(minima.shape[0]):
-        inside = True
-        for k in range(3):
-            inside = inside and abs(at[k] - minima[p, k]) + half[k] <= sides[p, k]
-        if inside:
-            return True
-    return False
 
 
 @inlined
@@ -339,6 +252,22 @@ def cut_side(kinds: Array, K: Array, gram: Array, half: Array, nodes: Array, row
     return 0 if t0 == most else (1 if t1 == most else 2)
 
 
+@compiled
+def _lay_or_halve(cost: Cost, chart: Chart, box: Box, stack: Array, size: int) -> int:
+    """Lay a box on a surface, and bound its nodes; return -1, or the size of the stack where that is another box's.
+
+    A box of another piece of the surface is dropped, one over which it is no graph is halved across its longer side.
+    """
+    half, sense = box.half, chart.sense
+    if is_beyond(chart.surface, box.centre, sense, half):
+        return size
+    if lay_down(cost, chart, box):
+        return -1
+    first = (sense[0, 0] * sense[0, 0] + sense[1, 0] * sense[1, 0] + sense[2, 0] * sense[2, 0]) * half[0] * half[0]
+    second = (sense[0, 1] * sense[0, 1] + sense[1, 1] * sense[1, 1] + sense[2, 1] * sense[2, 1]) * half[1] * half[1]
+    return push_halves(stack, size, 0 if first >= second else 1, box.at, half, 0.0, 0, False)
+
+
 @inlined
 def _widest(half: Array) -> int:
     if half[0] >= half[1] and half[0] >= half[2]:
@@ -351,20 +280,15 @@ def _widest(half: Array) -> int:
 # What is left of a box that is not convex: a third of its volume. And how often it is made smaller: a hull of a billion
 # standard deviations comes down to half of one.
 _SHARE, _SHRINKS = 0.7, 60
-# Half-width from which on an enclosure is none: its products would overflow.
-_ENDLESS = 1e300
-# Corners of what is searched are moved out by this share, for the rounding of the enclosure.
-_OUTWARDS = 1e-9
 # Other minima must be known to a hundredth of a standard deviation: margin of convexity over slope.
 _POLISHED = 100.0
 
 
 @inlined
-def set_convex(cost: Cost, chart: Chart, box: Box, hull: Array, margin: float, surface: int) -> bool:
+def set_convex(cost: Cost, chart: Chart, box: Box, hull: Array, margin: float) -> bool:
     """Make a box around its centre as large as the cost is found convex on it; return False where it is on none.
 
-    Convex over the whole hull in most cases; else the hull is shrunk as a whole. With a surface, it has one stationary
-    point on that at most (`optloc.proof.curvature.free_multiplier`).
+    Convex over the whole hull in most cases; else the hull is shrunk as a whole.
 
     Parameters
     ----------
@@ -376,22 +300,122 @@ def set_convex(cost: Cost, chart: Chart, box: Box, hull: Array, margin: float, s
         Half-widths beyond which there is nothing to gain.
     margin : float
         By how much the Hessian of f/2 must exceed zero.
-    surface : int
-        How many nodes set the surface, the last ones.
     """
     size = 1.0
     for _ in range(_SHRINKS):
         for k in range(3):
             box.half[k] = size * hull[k]
         if is_convex(cost, chart, box, margin):
-            if surface == 0:
-                return True
-            free_multiplier(cost.kinds, cost.A, box.half, box.nodes, box.curves, box.sums, surface)
-            if convex(cost.kinds, cost.A, box.half, box.nodes, box.curves, box.sums, margin):
-                return True
+            return True
         size *= _SHARE
     return False
 
+
+@compiled
+def is_known(at: Array, half: Array, minima: Array, sides: Array) -> bool:
+    """Return whether a box lies inside the convex box (half-widths `sides`) of a known minimum."""
+    for p in range(minima.shape[0]):
+        inside = True
+        for k in range(3):
+            inside = inside and abs(at[k] - minima[p, k]) + half[k] <= sides[p, k]
+        if inside:
+            return True
+    return False
+
+
+@inlined
+def known_minima(
+    cost: Cost,
+    chart: Chart,
+    box: Box,
+    known: Known,
+    low: Array,
+    high: Array,
+    margin: float,
+    value: float,
+    own: bool,
+) -> tuple[Array, Array, int, int]:
+    """Return the known minima (1 + P, 3) in search coordinates, half-widths of convex boxes around them, two numbers.
+
+    These are how many there are, 0 where the cost is not convex around the fix; and how many of them are the fix, which
+    comes first, or hidden. Points that are no minima are left out, and those whose box holds a point below `value`,
+    unless they are hidden; without the fix (`own`), those of another piece of a surface.
+    """
+    others = known.points
+    count, free, size = 0, 0, 1 + others.shape[0]
+    minima, sides, hull, shift = np.zeros((size, 3)), np.zeros((size, 3)), np.empty(3), np.zeros(3)
+    for i in range(0 if own else 1, size):
+        hidden = 0 < i <= known.hidden
+        p = size - i if hidden else (i - known.hidden if i > 0 else 0)
+        box.at[:] = 0.0
+        if p > 0:
+            for k in range(3):
+                for m in range(others.shape[1]):
+                    box.at[k] += chart.back[k, m] * (others[p - 1, m] - chart.origin[m])
+            box.half[:] = 0.0
+            if chart.surface.shape[0] > 0:
+                box.at[2] = 0.0
+            if not is_convex(cost, chart, box, 0.0) or _is_elsewhere(chart, box, others[p - 1]):
+                continue
+            sums = box.sums
+            # Where the Hessian exceeds a margin, the minimum is within slope / margin of any point, and the cost there
+            # is less by slope^2 / margin at most.
+            margin = _POLISHED * sqrt(sums[G0] * sums[G0] + sums[G1] * sums[G1] + sums[G2] * sums[G2])
+            least = cost_at(cost.K, cost.w, box.nodes) - margin / (_POLISHED * _POLISHED)
+            if not hidden and not least >= value:
+                continue
+        for k in range(3):
+            hull[k] = max(high[k] - box.at[k], box.at[k] - low[k], 0.0)
+        if hidden:
+            _draw_in(chart, hull)
+        if set_convex(cost, chart, box, hull, margin):
+            # Where the box is, up to the rounding of its centre; that of the fix is the origin itself.
+            shift[:] = 0.0
+            if p > 0:
+                widen(chart, box.centre, shift)
+            for k in range(3):
+                minima[count, k], sides[count, k] = box.at[k], max(box.half[k] - shift[k], 0.0)
+            count += 1
+            free += int(p == 0 or hidden)
+        elif p == 0:
+            return minima, sides, 0, 0
+    return minima, sides, count, free
+
+
+# How far, metres, the point of a surface at the search coordinates of another may be from it: below an Earth's radius,
+# where its other side is, and above all rounding.
+_ASIDE = 1e5
+
+
+@inlined
+def _is_elsewhere(chart: Chart, box: Box, place_of: Array) -> bool:
+    """Return whether a point (D,) of a surface is not that at its own search coordinates, but behind it."""
+    apart = 0.0
+    for m in range(place_of.shape[0]):
+        apart = max(apart, abs(place_of[m] - box.centre[m]))
+    return bool(chart.surface.shape[0] > 0 and apart > _ASIDE)
+
+
+@compiled
+def _draw_in(chart: Chart, hull: Array) -> None:
+    """Make half-widths (3,) so small that no coordinate in metres is farther than `HIDDEN_REACH`."""
+    share = 1.0
+    for k in range(3):
+        reach = 0.0
+        for m in range(3):
+            reach += abs(chart.sense[k, m]) * hull[m]
+        if reach * share > HIDDEN_REACH:
+            share = HIDDEN_REACH / reach
+    for k in range(3):
+        hull[k] *= share
+
+
+# The proof.
+
+# Half-width from which on an enclosure is none: its products would overflow.
+_ENDLESS = 1e300
+# Corners of what is searched are moved out by this share, for the rounding of the enclosure.
+_OUTWARDS = 1e-9
 
 # Verdicts of a proof.
 UNIQUE, VALUE, BETTER, OTHER, BUDGET, OPEN, STATIONARY, SINGULAR = range(8)
@@ -422,9 +446,9 @@ def prove(
     x : array (D,)
         The fix, polished.
     known : Known
-        Other minima that are known, and the surface to which the claim is limited.
+        Other minima that are known, and planes or a surface to which the claim is limited.
     kappa : float
-        Gap to prove; 0 proves the value alone, and with a surface that of all space.
+        Gap to prove; 0 proves the value alone.
     eps : float
         How far below the cost of the fix still counts as equal, 1e-6 (1 + f) or so: covers rounding.
     budget : int
@@ -451,35 +475,47 @@ def prove(
         A certified lower bound of f over the region or over all positions; -inf where there is none.
     """
     # Standard deviations of the fix as units: boxes are then about as wide as the cost needs in every direction.
-    chart, good = chart_at(cost, x, box)
+    chart, good = chart_on(cost, x, box, known.planes, known.surface)
     if not good:
         return SINGULAR, 0, -inf
     least, sums = cost_at(cost.K, cost.w, box.nodes), box.sums
     # On a box whose Hessian exceeds a margin the cost falls below that of its centre by slope^2 / margin at most.
     margin = (sums[G0] * sums[G0] + sums[G1] * sums[G1] + sums[G2] * sums[G2]) / eps
-    level = least + kappa if kappa > 0.0 else least - eps
-    corners = np.empty((2, 3))
+    corners, bent = np.empty((2, 3)), chart.surface.shape[0] > 0
     low, high = corners[0], corners[1]
     if not _start(cost, chart, box, sqrt(least + kappa), lower, upper, low, high):
         return OPEN, 0, -inf
-    surface = known.surface if kappa > 0.0 else known.surface[:0]
-    minima, sides, count, free = _minima(cost, chart, box, known, surface.shape[0], low, high, margin, least - eps)
-    if count == 0:
-        return STATIONARY, 0, -inf
-    if kappa <= 0.0:  # the value alone: other minima are no excuse, their boxes must be bounded as all others
-        count = free
+    alone = not bent or is_one_side(chart.surface, chart.origin, chart.sense, low, high)
+    if not alone and not isnan(lower[0]):  # a region that reaches around the Earth
+        return OPEN, 0, -inf
     # Halfway between: a point found to cost less does so by more than rounding, and no box is left that does by less.
     better, whole = least - 0.5 * eps, closed or isnan(lower[0])
     # From what is hidden a way leads out: where it becomes visible the cost may be least, and yet have a slope.
     whole = whole and known.hidden == 0
-    aim = Aim(level, value=least - eps, better=better, whole=whole, free=free, surface=surface)
-    stack = np.empty((_CAPACITY, DEPTH))
-    size = push_around(stack, 0, low, high, sides[0], 0)
-    outcome, boxes, bound = branch(cost, chart, box, minima[:count], sides[:count], aim, budget, stack, size)
+    level = least + kappa if kappa > 0.0 else least - eps
+    outcome, boxes, bound, stack, around = CLEAR, zero(), inf, np.empty((_CAPACITY, DEPTH)), chart
+    for side in range(1 if alone else SIDES):
+        if side > 0:
+            chart = turned(cost, around, side)
+        if bent:
+            if side > 0:
+                low[:], high[:] = -inf, inf
+            reach_of_piece(chart, low, high)
+        minima, sides, count, free = known_minima(cost, chart, box, known, low, high, margin, least - eps, side == 0)
+        if side == 0 and count == 0:
+            return STATIONARY, 0, -inf
+        if kappa <= 0.0:  # the value alone: other minima are no excuse, their boxes must be bounded as all others
+            count = free
+        aim = Aim(level, value=least - eps, better=better, whole=whole, free=free)
+        size = push_around(stack, 0, low, high, sides[0], 0)
+        outcome, more, bound = branch(cost, chart, box, minima[:count], sides[:count], aim, budget - boxes, stack, size)
+        boxes += more
+        if outcome != CLEAR:
+            break
     if outcome == CLEAR:
         return UNIQUE if kappa > 0.0 else VALUE, boxes, least - eps
-    if outcome == SPENT:
-        return BUDGET, boxes, min(bound, least - eps)
+    if outcome == SPENT:  # of other sides nothing is known
+        return BUDGET, boxes, min(bound, least - eps) if alone else -inf
     for k in range(x.shape[0]):
         found[k] = box.centre[k]
     return BETTER if outcome == CHEAPER else OTHER, boxes, 0.0
@@ -489,7 +525,11 @@ def prove(
 def _start(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper: Array, low: Array, high: Array) -> bool:
     """Write the corners of the box to search: the region, or an enclosure of all that costs less than rho^2."""
     if isnan(lower[0]):
-        if not enclose(cost, chart, box, rho, low, high):
+        bounded = enclose(cost, chart, box, rho, low, high)
+        if chart.surface.shape[0] > 0:  # which is bounded itself
+            value = chart.surface[LEVEL]
+            around_node(HEIGHT, chart.surface[DATA:MIDDLE], value, value, chart.origin, chart.back, low, high)
+        elif not bounded:
             return False
     else:
         for k in range(3):
@@ -509,75 +549,3 @@ def _start(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper: 
         low[k], high[k] = low[k] - slack, high[k] + slack
         widest = max(widest, abs(low[k]), abs(high[k]))
     return widest < _ENDLESS
-
-
-@inlined
-def _minima(
-    cost: Cost,
-    chart: Chart,
-    box: Box,
-    known: Known,
-    surface: int,
-    low: Array,
-    high: Array,
-    margin: float,
-    value: float,
-) -> tuple[Array, Array, int, int]:
-    """Return the known minima (1 + P, 3) in search coordinates, half-widths of convex boxes around them, two numbers.
-
-    These are how many there are, 0 where the cost is not convex around the fix; and how many of them are the fix, which
-    comes first, or hidden. Points that are no minima are left out, and those whose box holds a point below `value`,
-    unless they are hidden.
-    """
-    others = known.points
-    count, free, size = 0, 0, 1 + others.shape[0]
-    minima, sides, hull, shift = np.zeros((size, 3)), np.zeros((size, 3)), np.empty(3), np.zeros(3)
-    for i in range(size):
-        hidden = 0 < i <= known.hidden
-        p = size - i if hidden else (i - known.hidden if i > 0 else 0)
-        box.at[:] = 0.0
-        if p > 0:
-            for k in range(3):
-                for m in range(others.shape[1]):
-                    box.at[k] += chart.back[k, m] * (others[p - 1, m] - chart.origin[m])
-            box.half[:] = 0.0
-            if not is_convex(cost, chart, box, 0.0):
-                continue
-            sums = box.sums
-            # Where the Hessian exceeds a margin, the minimum is within slope / margin of any point, and the cost there
-            # is less by slope^2 / margin at most. On a surface the slope is none of the minimum's.
-            margin = _POLISHED * sqrt(sums[G0] * sums[G0] + sums[G1] * sums[G1] + sums[G2] * sums[G2])
-            least = cost_at(cost.K, cost.w, box.nodes) - margin / (_POLISHED * _POLISHED)
-            margin = margin if surface == 0 else 0.0
-            if not hidden and surface == 0 and not least >= value:
-                continue
-        for k in range(3):
-            hull[k] = max(high[k] - box.at[k], box.at[k] - low[k], 0.0)
-        if hidden:
-            _draw_in(chart, hull)
-        if set_convex(cost, chart, box, hull, margin, surface):
-            # Where the box is, up to the rounding of its centre; that of the fix is the origin itself.
-            shift[:] = 0.0
-            if p > 0:
-                widen(chart, box.centre, shift)
-            for k in range(3):
-                minima[count, k], sides[count, k] = box.at[k], max(box.half[k] - shift[k], 0.0)
-            count += 1
-            free += int(p == 0 or hidden)
-        elif p == 0:
-            return minima, sides, 0, 0
-    return minima, sides, count, free
-
-
-@compiled
-def _draw_in(chart: Chart, hull: Array) -> None:
-    """Make half-widths (3,) so small that no coordinate in metres is farther than `HIDDEN_REACH`."""
-    share = 1.0
-    for k in range(3):
-        reach = 0.0
-        for m in range(3):
-            reach += abs(chart.sense[k, m]) * hull[m]
-        if reach * share > HIDDEN_REACH:
-            share = HIDDEN_REACH / reach
-    for k in range(3):
-        hull[k] *= share

@@ -17,7 +17,7 @@ from optloc.models import MODELS, Model
 from optloc.problem.noise import Whitener, variances, whiten
 from optloc.problem.problem import Problem
 from optloc.proof.nodes.dispatch import NODES, code_of, named, width
-from optloc.proof.nodes.linear import linear_numbers
+from optloc.proof.nodes.level import linear_numbers
 from optloc.proof.nodes.node import LINEAR, RANGE, Node, Row
 
 # From rows of measurements to nodes: which scalar functions the rows are sums of, and their numbers.
@@ -524,6 +524,11 @@ def _move(problem: Problem) -> bool:
 
 
 def _beyond_constraints(problem: Problem) -> Iterator[str]:
+    levels = [constraint for constraint in problem.constraints if is_exact(constraint)]
+    if len(levels) > 1 and any(isinstance(level, Band) and level.kind == "height" for level in levels):
+        yield "a height that is known together with another equality leaves a line, which the proof does not follow"
+    if len(levels) >= problem.dimension:
+        yield "the equalities leave no way to move"
     for constraint in problem.constraints:
         if is_exact(constraint) and isinstance(constraint, Band) and constraint.kind not in ("height", "plane"):
             yield f"the equality {constraint.name!r} is neither a height nor a plane"

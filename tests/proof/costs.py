@@ -11,9 +11,9 @@ from optloc.proof.nodes.node import LINEAR, RANGE
 Array = np.ndarray
 
 
-def beside(points, d=3, hidden=0, surface=()):
-    """Return other minima (P, d), and the surface of a claim, as a proof wants them."""
-    return Known(np.array(points, dtype=float).reshape(-1, d), hidden, np.array(surface, dtype=float))
+def beside(points, d=3, hidden=0):
+    """Return other minima (P, d) as a proof wants them."""
+    return Known(np.array(points, dtype=float).reshape(-1, d), hidden, np.zeros((0, 3)), np.zeros(0))
 
 
 NO_REGION = np.full(3, np.nan)

@@ -5,9 +5,8 @@ from proof.costs import WIDTH
 
 from optloc import MODELS
 from optloc.models import Point
-from optloc.proof.nodes.azimuth import bound_azimuth, curve_azimuth
-from optloc.proof.nodes.elevation import bound_elevation, curve_elevation
-from optloc.proof.nodes.height import bound_height, curve_height
+from optloc.proof.nodes.angles import bound_azimuth, bound_elevation, curve_azimuth, curve_elevation
+from optloc.proof.nodes.level import bound_height, curve_height
 from optloc.proof.nodes.ratio import bound_ratio, curve_ratio
 
 BOUND = {"azimuth": bound_azimuth, "elevation": bound_elevation, "groa": bound_ratio, "height": bound_height}

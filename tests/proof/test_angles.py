@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from proof.sampling import axes, bounded, changes, curved, differences, halves, numbers, remainders, samples, value
 
-from optloc.proof.nodes.azimuth import ALONE
+from optloc.proof.nodes.angles import ALONE
 
 KINDS = [("azimuth", 2), ("azimuth", 3), ("elevation", 3)]
 

@@ -151,7 +151,7 @@ def test_a_convex_box_around_a_minimum_reaches_no_farther_than_convexity():
         if np.linalg.norm(x - truth) > 500.0:
             continue
         cost, chart, box = charted(case, x)
-        assert set_convex(cost, chart, box, np.full(3, 1e4), 0.0, 0)
+        assert set_convex(cost, chart, box, np.full(3, 1e4), 0.0)
         best = box.half.copy()
         assert is_convex(cost, chart, box, 0.0)
         x = chart.origin + ways(rng, best, 2000) @ chart.sense.T

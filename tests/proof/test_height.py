@@ -5,7 +5,7 @@ import pytest
 from proof.sampling import bounded, changes, curved, differences, numbers, remainders, samples, value
 
 from optloc.models.primitives import WGS84_A, WGS84_F, geodetic_height
-from optloc.proof.nodes.height import LEAST_RADIUS, geodetic
+from optloc.proof.nodes.level import LEAST_RADIUS, geodetic
 
 B = WGS84_A * (1.0 - WGS84_F)
 

@@ -5,7 +5,7 @@ import pytest
 from proof.costs import WIDTH
 from proof.sampling import bounded, changes, curved, differences, numbers, remainders, samples, value
 
-from optloc.proof.nodes.azimuth import ALONE
+from optloc.proof.nodes.angles import ALONE
 from optloc.proof.nodes.node import AZIMUTH, RANGE, RATIO
 from optloc.proof.nodes.ratio import MEASURED
 from optloc.proof.pose import mark_alone

@@ -56,6 +56,7 @@ def verdicts(problem, item, x, kappa: float, budget: int = 300):
         nowhere,
         reach,
         np.full(n, budget),
+        np.zeros((n, 0, 3)),
         np.zeros((n, 0)),
     )
     return prove_all(pose.take(item), asked).verdict

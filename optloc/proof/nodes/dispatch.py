@@ -20,10 +20,8 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.compute.jit import compiled, inlined, renew, replace
 from optloc.proof.atlas import set_line
 from optloc.proof.nodes import node as columns
-from optloc.proof.nodes.azimuth import HORIZONTAL_ANGLE
-from optloc.proof.nodes.elevation import VERTICAL_ANGLE
-from optloc.proof.nodes.height import GEODETIC_HEIGHT
-from optloc.proof.nodes.linear import LINEAR_FORM
+from optloc.proof.nodes.angles import HORIZONTAL_ANGLE, VERTICAL_ANGLE
+from optloc.proof.nodes.level import GEODETIC_HEIGHT, LINEAR_FORM
 from optloc.proof.nodes.node import DIFFERENCE, FLAT, GROWS, MIXED, SCALED, Node, range_form, triple
 from optloc.proof.nodes.range import DISTANCE, bound_difference, curve_difference
 from optloc.proof.nodes.ratio import RATIO_OF_RANGES

@@ -22,7 +22,7 @@ from optloc.proof.chart import HIDDEN_REACH
 from optloc.proof.everywhere import UNBOUNDED
 from optloc.proof.near import BETTER, BUDGET, OTHER, UNIQUE, VALUE
 from optloc.proof.pose import Posed, pose_costs, unsupported
-from optloc.solvers.certify.posed import Held, agrees, hold_equalities
+from optloc.solvers.certify.posed import agrees, is_free, planes_of, surface_of
 from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP
@@ -116,6 +116,9 @@ _ROUNDS = 6
 # Boxes for the proof of a gap and of the value, with up to so many nodes. Plain Python takes a thousand times longer
 # for each: a budget of all.
 _BUDGETS, _NODES, _SLOW_BUDGET, _AT_LEAST = (3000, 8000), 12, 2000, 5
+# Times as many on the surface of a height: three range differences took 20 000 to 40 000 boxes all around the Earth, of
+# two coordinates and 2 us each.
+_AROUND = 15
 # Cost that counts as equal, relative: covers the rounding of two ways to compute it, and is nothing beside the gap of 9
 # at which a second minimum matters.
 _EQUAL = 1e-6
@@ -249,20 +252,20 @@ def _compare(work: Work, items: Array) -> None:
 
 def _round(work: Work, items: Array) -> None:
     """Try to prove some fixes once, and settle or change what can be."""
-    part = hold_equalities(work.problem.take(items), work.fix[items], work.pose.take(items))
-    _give_up(work, items[~part.able], HELD)
-    asked = _asked(work, items, part)
+    free = is_free(work.problem, work.fix[items])
+    _give_up(work, items[~free], HELD)
+    asked, pose = _asked(work, items), work.pose.take(items)
     # Below this level a wrapped residual may stand for another than the node's: no bound of one bounds the other.
-    turning = part.able & (part.pose.level < work.fix.cost[items] + asked.kappa)
+    turning = free & (pose.level < work.fix.cost[items] + asked.kappa)
     _lower(work, items[turning], TURNS)
-    good, pose, extra = np.flatnonzero(part.able & ~turning), part.pose, part.extra
+    good = np.flatnonzero(free & ~turning)
     if not len(good):
         return
     if len(good) < len(items):
-        items, asked, extra, pose = items[good], asked.take(good), extra[good], pose.take(good)
+        items, asked, pose = items[good], asked.take(good), pose.take(good)
     answer = prove_all(pose, asked)
     done = np.isin(answer.verdict, (UNIQUE, VALUE))
-    _claim(work, items, asked, answer, extra, np.flatnonzero(done))
+    _claim(work, items, asked, answer, np.flatnonzero(done))
     short = answer.verdict == BUDGET
     _lower(work, items[short], UNFINISHED)
     remote = answer.verdict == UNBOUNDED
@@ -273,9 +276,10 @@ def _round(work: Work, items: Array) -> None:
     _give_up(work, items[~(done | short | remote | found)], UNSETTLED)
 
 
-def _asked(work: Work, items: Array, held: Held) -> Asked:
-    kappa = work.margins[work.level[items]] if held.single else np.zeros(len(items))
+def _asked(work: Work, items: Array) -> Asked:
+    kappa, problem = work.margins[work.level[items]], work.problem.take(items)
     fix, ignored = work.fix, work.ignored[items]
+    surface = surface_of(problem, fix[items])
     gap = fix.alternatives.gap[items]
     with np.errstate(invalid="ignore"):
         listed = np.isfinite(gap) & (gap < np.maximum(kappa, AMBIGUOUS_GAP)[:, None])
@@ -288,11 +292,12 @@ def _asked(work: Work, items: Array, held: Held) -> Asked:
         known=np.isfinite(others).all(-1).sum(1),
         hidden=seen,
         kappa=kappa,
-        eps=_EQUAL * (1.0 + fix.cost[items] + held.extra),
+        eps=_EQUAL * (1.0 + fix.cost[items]),
         region=work.region[items],
         fallback=work.fallback[items],
-        budget=_budgets(kappa, len(work.pose.kinds), work.effort),
-        surface=held.surface,
+        budget=_budgets(kappa, len(work.pose.kinds), work.effort) * (_AROUND if surface.shape[1] else 1),
+        planes=planes_of(problem),
+        surface=surface,
     )
 
 
@@ -324,10 +329,10 @@ def _give_up(work: Work, items: Array, why: str) -> None:
     work.pending[items] = False
 
 
-def _claim(work: Work, items: Array, asked: Asked, answer: Answered, extra: Array, done: Array) -> None:
+def _claim(work: Work, items: Array, asked: Asked, answer: Answered, done: Array) -> None:
     """Write the certificates of those of some fixes that are proven."""
     proven, kappa = items[done], asked.kappa[done]
-    bound, listed = (answer.bound - extra)[done], work.fix.alternatives.gap[proven] < kappa[:, None]
+    bound, listed = answer.bound[done], work.fix.alternatives.gap[proven] < kappa[:, None]
     region: list[tuple[Corner, Corner] | None] = [None] * len(done)
     for k in np.flatnonzero(~answer.everywhere[done]).tolist():
         whole = np.isnan(asked.region[done[k], 0, 0])

@@ -1,8 +1,6 @@
-"""What a proof is posed of: the cost of a fix, its equalities as rows; checked against that of the problem itself."""
+"""What is posed beside a cost: the surfaces that hold a fix. And whether a posed cost is the problem's own."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,100 +8,55 @@ from optloc.base.types import Array, Band
 from optloc.compute.sums import equations_at
 from optloc.linear.constraints import exact
 from optloc.linear.normal import Normal, eliminated, step
+from optloc.models.primitives import geodetic_normal
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.proof.batch import costs_at
-from optloc.proof.nodes.height import height_numbers
-from optloc.proof.nodes.linear import linear_numbers
-from optloc.proof.nodes.node import HEIGHT, LINEAR
-from optloc.proof.pose import Posed, stack_numbers
-from optloc.solvers.starts.position import spread_of
+from optloc.proof.nodes.level import height_numbers
+from optloc.proof.pose import Posed
+from optloc.proof.surface import DATA, FIRST, LEVEL, MIDDLE, SURFACE_WIDTH, UP
 
-# Least width of the row of an equality, relative to the coordinates: a narrower one would measure their rounding.
-_NARROWEST = 1e-9
+# Equalities: planes and surfaces along which a proof looks.
 
 
-@dataclass(frozen=True, slots=True)
-class Held:
-    """Posed costs of a flat batch of N problems with their equalities as rows.
+def planes_of(problem: Problem) -> Array:
+    """Return unit normals (N, e, 3) of the planes to which the equalities of a flat batch hold its fixes."""
+    size, d = problem.batch_shape[0], problem.dimension
+    bands = [band for band in _equalities(problem) if band.kind == "plane"]
+    out = np.zeros((size, len(bands), 3))
+    for i, band in enumerate(bands):
+        out[:, i, :d] = band.coefficients / np.linalg.norm(band.coefficients, axis=-1, keepdims=True)
+    return out
 
-    For a point with ``g(x) = H`` the cost is ``f(x) + ((g(x) - H) / s + l s)^2 - (l s)^2``: for the multiplier l of a
-    fix its gradient vanishes there in all directions, and a bound over all points is one over those that meet it. That
-    of another point with a vanishing gradient along the surface has another multiplier, and no vanishing gradient here:
-    only bounds exclude it (`optloc.proof.near.prove`).
 
-    Parameters
-    ----------
-    pose : Posed
-        Costs with the rows.
-    extra : array (N,)
-        By how much the posed cost of a fix exceeds its cost.
-    able : bool array (N,)
-        Where no other constraint holds the fix.
-    surface : array (N, e)
-        The values H of the nodes of the rows, which come last.
-    single : bool
-        Whether a gap can be proven: on planes, and on one height alone.
+def surface_of(problem: Problem, fix: Fix) -> Array:
+    """Return the numbers (N, w) of the surfaces of the height to which an equality holds fixes; w is 0 without one.
+
+    See `optloc.proof.surface`; the upward axis is the normal at the fix.
     """
+    size = len(fix.x)
+    bands = [band for band in _equalities(problem) if band.kind == "height"]
+    if not bands:
+        return np.zeros((size, 0))
+    out = np.zeros((size, SURFACE_WIDTH))
+    out[:, LEVEL], out[:, DATA:MIDDLE] = bands[0].lower, height_numbers(problem)
+    turn = problem.frame.rotation_to_ecef()
+    out[:, MIDDLE:FIRST] = -problem.frame.origin_ecef() @ turn
+    place = problem.frame.to_ecef(np.where(np.isfinite(fix.position), fix.position, 0.0))
+    out[:, UP:] = np.stack(geodetic_normal((place[:, 0], place[:, 1], place[:, 2])), axis=-1) @ turn
+    return out
 
-    pose: Posed
-    extra: Array
-    able: Array
-    surface: Array
-    single: bool
 
-
-def hold_equalities(problem: Problem, fix: Fix, pose: Posed) -> Held:
-    """Return posed costs with the equalities of a flat batch of problems as rows at the multipliers of their fixes.
-
-    References
-    ----------
-    M. J. D. Powell, "A method for nonlinear constraints in minimization problems" (1969); R. T. Rockafellar (1973): the
-    augmented Lagrangian.
-    """
+def is_free(problem: Problem, fix: Fix) -> Array:
+    """Return which fixes of a flat batch no constraint holds but its equalities, (N,)."""
     face, size = exact(problem), len(fix.x)
     active = [()] * size if fix.active is None else [tuple(found) for found in fix.active]
-    able = np.array([len(found) == len(face) for found in active])
-    if not face:
-        return Held(pose, np.zeros(size), able, np.zeros((size, 0)), single=True)
-    scale, extra, values, bent = _scale(problem, fix, len(face)), np.zeros(size), [], 0
-    for i, level in enumerate(face):
-        constraint = problem.constraints[level.constraint]
-        assert isinstance(constraint, Band)
-        shift = np.array([0.5 * found[i].multiplier if good else 0.0 for found, good in zip(active, able, strict=True)])
-        pose = _with_row(pose, *_node(problem, constraint), constraint.lower, scale, shift)
-        extra = extra + (shift * scale) ** 2
-        values.append(np.broadcast_to(constraint.lower, (size,)))
-        bent += constraint.kind == "height"
-    return Held(pose, extra, able, np.stack(values, axis=1), single=not bent or len(face) == 1)
+    return np.array([len(found) == len(face) for found in active], dtype=bool)
 
 
-def _scale(problem: Problem, fix: Fix, count: int) -> Array:
-    """Return the widths (N,) of the rows: standard deviations of the fixes along the surface, metres."""
-    with np.errstate(invalid="ignore"):
-        spread = np.sqrt(np.trace(fix.covariance(), axis1=-2, axis2=-1) / max(problem.dimension - count, 1))
-        size = spread_of(problem)[1] + np.abs(problem.frame.origin_ecef() if problem.frame.geodetic else 0.0).max()
-        least = _NARROWEST * (size + np.abs(fix.position).max(-1))
-    return np.where(np.isfinite(spread) & (spread > 0.0), np.fmax(spread, least), np.where(least > 0.0, least, 1.0))
-
-
-def _node(problem: Problem, constraint: Band) -> tuple[int, Array]:
-    """Return code and numbers (B, n) of the node that an equality sets."""
-    if constraint.kind == "height":
-        return HEIGHT, height_numbers(problem)
-    coefficients = constraint.coefficients
-    return LINEAR, linear_numbers(coefficients if coefficients.ndim == 2 else coefficients[None])
-
-
-def _with_row(pose: Posed, kind: int, numbers: Array, value: Array, scale: Array, shift: Array) -> Posed:
-    """Return costs with the row ``(node - value) / scale + shift * scale`` added."""
-    size, (q, nodes) = len(scale), pose.K.shape[-2:]
-    K = np.zeros((size, q + 1, nodes + 1))
-    K[:, :q, :nodes], K[:, q, nodes] = pose.K, 1.0 / scale
-    w = np.concatenate([pose.w, (np.broadcast_to(value, (size,)) / scale - shift * scale)[:, None]], axis=1)
-    kinds = np.append(pose.kinds, kind)
-    data = stack_numbers(kinds, [*(pose.data[:, j] for j in range(nodes)), numbers])
-    return pose._replace(kinds=kinds, data=data, K=K, w=w)
+def _equalities(problem: Problem) -> list[Band]:
+    levels = [problem.constraints[level.constraint] for level in exact(problem)]
+    return [band for band in levels if isinstance(band, Band)]
 
 
 # Whether a posed cost is that of its fix.
@@ -138,11 +91,6 @@ def agrees(problem: Problem, fix: Fix, pose: Posed) -> Array:
         posed, blur = costs_at(pose, places)
         good = np.abs(posed - own) <= _tolerance(own, blur)
         good[:, 0] &= np.abs(own[:, 0] - fix.cost) <= _tolerance(fix.cost, blur[:, 0])
-        if exact(problem):  # with the rows of equalities, which vanish at the fix
-            held = hold_equalities(problem, fix, pose)
-            whole, blur = costs_at(held.pose, places[:, :1])
-            off = np.abs(whole[:, 0] - held.extra - fix.cost)
-            good[:, 0] &= off <= _tolerance(fix.cost + held.extra, blur[:, 0])
     return np.asarray(good.all(1))
 
 

@@ -1,8 +1,9 @@
-"""Geodetic height over a box: a distance to the ellipsoid, so it curves like the ranges to the centres of two balls.
+"""What levels and surfaces are of, over a box: linear forms of the position, and its geodetic height.
 
-An ellipsoid contains, at each of its points, the tangent ball of its least radius of curvature b^2/a, and lies in that
-of its greatest, a^2/b (Blaschke's rolling theorem). Above it the height is convex, its Hessian between 0 and
-1/(b^2/a + height) across the normal.
+Linear forms (coordinates, planes, priors) are exact. A height is a distance to the ellipsoid, so it curves like the
+ranges to the centres of two balls: an ellipsoid contains, at each of its points, the tangent ball of its least radius
+of curvature b^2/a, and lies in that of its greatest, a^2/b (Blaschke's rolling theorem). Above it the height is convex,
+its Hessian between 0 and 1/(b^2/a + height) across the normal.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from optloc.models.primitives import WGS84_A, WGS84_F
 from optloc.problem.problem import Problem
 from optloc.proof.nodes.node import (
     CONVEX,
+    FLAT,
     Node,
     Row,
     Triple,
@@ -32,14 +34,50 @@ from optloc.proof.nodes.node import (
     write,
 )
 
+# Linear forms.
+
+# Numbers: where the form n.(x - o) is zero, and its coefficients.
+ORIGIN, COEFFICIENTS, _NUMBERS = 0, 3, 6
+
+
+@compiled
+def bound_linear(data: Array, line: Array, sense: Array, half: Array, slope: Array) -> tuple[float, float, float]:
+    """Bound a linear form over a box (see `optloc.proof.nodes.node`), which has no remainder."""
+    n = triple(data, COEFFICIENTS)
+    write(pull(n, sense), slope)
+    return inner(n, triple(line, 0)), 0.0, 0.0
+
+
+@compiled
+def size_linear(data: Array, reach: float) -> float:
+    """Return the size of what a linear form is a difference of."""
+    size = reach + (abs(data[ORIGIN]) + abs(data[ORIGIN + 1]) + abs(data[ORIGIN + 2]))
+    return float(size * (abs(data[COEFFICIENTS]) + abs(data[COEFFICIENTS + 1]) + abs(data[COEFFICIENTS + 2])))
+
+
+def linear_numbers(coefficients: Array, origin: Array | None = None) -> Array:
+    """Return the numbers (B, n) of a linear node with coefficients (B, d), zero at an origin (B, d)."""
+    parts = {COEFFICIENTS: coefficients}
+    return lay_out(parts if origin is None else parts | {ORIGIN: origin})
+
+
+def _of_row(row: Row) -> Array:
+    """Return the numbers of a row: none is linear in the position; priors make these nodes themselves."""
+    raise NotImplementedError("a row of measurements does not say which linear form it is of")
+
+
+LINEAR_FORM = Node("linear", _NUMBERS, 1, _of_row, bound_linear, shape=FLAT, size=size_linear)
+
+# Geodetic heights.
+
 # Numbers: a point o of the frame, its ECEF position, and the rows of the rotation from frame to ECEF.
-POINT, ECEF, ROTATION, _WIDTH = 0, 3, 6, 15
+POINT, ECEF, ROTATION, HEIGHT_WIDTH = 0, 3, 6, 15
 
 _B = WGS84_A * (1.0 - WGS84_F)
 _E2 = WGS84_F * (2.0 - WGS84_F)
 LEAST_RADIUS = _B * _B / WGS84_A
 # What Bowring's latitude and rounding leave, metres; see `optloc.models.primitives.geodetic_height`.
-_EXACT = 1e-8
+EXACT = 1e-8
 # Deeper than this, where many normals meet, Bowring's latitude is no longer exact.
 _DEEP = -2e6
 
@@ -77,7 +115,7 @@ def _ecef(data: Array, line: Array) -> Triple:
 
 
 @compiled
-def _normal(data: Array, line: Array) -> tuple[float, Triple, Triple, Triple, float]:
+def normal_at(data: Array, line: Array) -> tuple[float, Triple, Triple, Triple, float]:
     """Return height, upward, eastward and northward unit vectors in the problem's frame, and sine of the latitude."""
     e, f, g = _ecef(data, line)
     height, p, sp, cp = geodetic(e, f, g)
@@ -93,7 +131,7 @@ def bound_height(data: Array, line: Array, sense: Array, half: Array, slope: Arr
 
     Deep in the Earth the model's formula is no exact height; there it lies between ``-|x| - a`` and ``|x| - b``.
     """
-    height, up, _, _, _ = _normal(data, line)
+    height, up, _, _, _ = normal_at(data, line)
     h = triple(half, 0)
     n = pull(up, sense)
     swing, aside = reach(n, h), across(sense, n, h)
@@ -104,7 +142,7 @@ def bound_height(data: Array, line: Array, sense: Array, half: Array, slope: Arr
         return height, -farthest - WGS84_A - height, farthest - _B - height
     write(n, slope)
     # Bowring's error falls with the height, but the rounding of coordinates grows with it.
-    slack = _EXACT * max(1.0, height / LEAST_RADIUS)
+    slack = EXACT * max(1.0, height / LEAST_RADIUS)
     return height, -slack, excess(LEAST_RADIUS + height - swing, aside) + slack
 
 
@@ -116,7 +154,7 @@ def curve_height(data: Array, line: Array, sense: Array, half: Array, curvature:
     prime vertical. Its derivative is at most 1.2 / (b^2/a + h)^2: ``3 p q^2`` with ``p^2 + q^2 = 1`` (1.155) for the
     turning normal and the stretching tangents, ``3/2 e^2 (1 + e^2)`` (0.01) for curvature that changes with latitude.
     """
-    height, up, east, north, sp = _normal(data, line)
+    height, up, east, north, sp = normal_at(data, line)
     h = triple(half, 0)
     n = pull(up, sense)
     swing, aside = reach(n, h), across(sense, n, h)
@@ -143,7 +181,7 @@ def curve_height(data: Array, line: Array, sense: Array, half: Array, curvature:
 
 
 @compiled
-def _ball(data: Array, least: float, most: float) -> tuple[float, float, float, float]:
+def earth_ball(data: Array, least: float, most: float) -> tuple[float, float, float, float]:
     """Return a ball around the Earth's centre: a height is at least the distance from there less the equator's."""
     origin = triple(data, ECEF)
     first, second, third = triple(data, ROTATION), triple(data, ROTATION + 3), triple(data, ROTATION + 6)
@@ -161,4 +199,4 @@ def _numbers(row: Row) -> Array:
     return height_numbers(row.problem)
 
 
-GEODETIC_HEIGHT = Node("height", _WIDTH, 1, _numbers, bound_height, curve_height, shape=CONVEX, ball=_ball)
+GEODETIC_HEIGHT = Node("height", HEIGHT_WIDTH, 1, _numbers, bound_height, curve_height, shape=CONVEX, ball=earth_ball)

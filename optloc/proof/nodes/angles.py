@@ -1,0 +1,402 @@
+"""Azimuths and elevations over a box: value, slope, remainder and curvature, and what several stations' enclose.
+
+The line of sight of an azimuth is the complex number z = X + iY of its horizontal part. With ``z = z_c (1 + w)``,
+``w = r + i t``, the angle changes by ``atan(t/(1+r))``, whose linear part is t. That of an elevation is rho + iZ, with
+rho the horizontal distance, a range of its own, whose argument changes as that of an azimuth does.
+"""
+
+from __future__ import annotations
+
+from math import atan, atan2, cos, hypot, inf, pi, sin, sqrt
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled
+from optloc.proof.nodes.node import (
+    AZIMUTH,
+    SCALED,
+    Node,
+    Row,
+    Triple,
+    blend,
+    excess,
+    inner,
+    lay_out,
+    length,
+    product,
+    pull,
+    reach,
+    row_reach,
+    still,
+    triple,
+    unbounded,
+    write,
+)
+
+# Azimuths.
+
+# Numbers: the station, its axes (rows), the measured angle from which the node counts, wrapped, and what is not 0 where
+# the row is the node's own.
+STATION, AXES, MEASURED, ALONE, _WIDTH = 0, 6, 15, 16, 17
+
+# Share of an angle's argument that its own rounding may be: some units in the last place.
+_ROUNDING = 1e-15
+
+
+@compiled
+def departure(back: float, ahead: float, aside: float) -> float:
+    """Return the greatest ``|atan(t/(1+r)) - t|`` over ``-back <= r <= ahead, |t| <= aside``; back must be below 1.
+
+    At t > 0 the difference falls with r. At r = -back it is greatest where ``t^2 = back (1 - back)``; at r = ahead it
+    falls with t.
+    """
+    best = min(aside, sqrt(back * (1.0 - back)))
+    above = atan(best / (1.0 - back)) - best
+    below = aside - atan(aside / (1.0 + ahead))
+    return max(above, below) + _ROUNDING * aside
+
+
+@compiled
+def remainder(back: float, ahead: float, aside: float, bilinear: tuple[float, float]) -> tuple[float, float]:
+    """Return an enclosure of ``atan(t/(1+r)) - t``.
+
+    Parameters
+    ----------
+    back, ahead, aside : float
+        ``-back <= r <= ahead, |t| <= aside``; back below 1.
+    bilinear : pair of float
+        An enclosure of ``-r t``, its leading term; what is beyond is at most ``|w|^3 / (3 (1 - |w|))``.
+    """
+    wide = departure(back, ahead, aside)
+    most = max(back, ahead)
+    size = sqrt(most * most + aside * aside)
+    if size >= 1.0:  # the series that the third order is cut from ends at the origin
+        return -wide, wide
+    third = size * size * size / (3.0 * (1.0 - size)) + _ROUNDING * aside
+    return max(-wide, bilinear[0] - third), min(wide, bilinear[1] + third)
+
+
+@compiled
+def arguments(left: float, right: float, down: float, up: float) -> tuple[float, float]:
+    """Return the angles of the vectors in a rectangle, radians; all angles where it touches the cut or the origin.
+
+    The rectangle is [left, right] along the first axis and [down, up] along the second.
+    """
+    if left <= 0.0 and down <= 0.0 <= up:
+        return -pi, pi
+    first, second = atan2(down, left), atan2(down, right)
+    third, fourth = atan2(up, left), atan2(up, right)
+    return min(first, second, third, fourth), max(first, second, third, fourth)
+
+
+@compiled
+def horizontal(data: Array, line: Array, sense: Array) -> tuple[float, float, Triple, Triple]:
+    """Return the line's components along the first two axes, turned by the measured angle, and their pulls."""
+    c, s = cos(data[MEASURED]), sin(data[MEASURED])
+    first, second = triple(data, AXES), triple(data, AXES + 3)
+    ahead, aside = blend(c, first, s, second), blend(c, second, -s, first)
+    away = triple(line, 0)
+    return inner(ahead, away), inner(aside, away), pull(ahead, sense), pull(aside, sense)
+
+
+@compiled
+def bound_azimuth(data: Array, line: Array, sense: Array, half: Array, slope: Array) -> tuple[float, float, float]:
+    """Bound an azimuth minus its measured value over a box (see `optloc.proof.nodes.node`), radians.
+
+    Where the box touches the half-plane behind the measured direction the angle jumps from pi to -pi. A row of its own
+    (number `ALONE`) is then given by its absolute value, which does not jump and costs the same.
+    """
+    x, y, along, beside = horizontal(data, line, sense)
+    h = triple(half, 0)
+    squared = x * x + y * y
+    value = atan2(y, x)
+    if squared > 0.0:
+        radial = blend(x / squared, along, y / squared, beside)
+        around = blend(x / squared, beside, -y / squared, along)
+        back, aside = reach(radial, h), reach(around, h)
+        # Neither the station's vertical nor the cut behind the measured direction is in the box.
+        if back < 1.0 and abs(value) + atan(aside / (1.0 - back)) < pi:
+            low, high = product(radial, around, h)
+            low, high = remainder(back, back, aside, (-high, -low))
+            write(around, slope)
+            return value, low, high
+    return _flat_azimuth(value, (x, reach(along, h)), (y, reach(beside, h)), data[ALONE] != 0.0, slope)
+
+
+@compiled
+def _flat_azimuth(
+    value: float, ahead: tuple[float, float], aside: tuple[float, float], alone: bool, slope: Array
+) -> tuple[float, float, float]:
+    """Enclose an azimuth by two numbers; each component is a centre and a half-width."""
+    slope[0] = slope[1] = slope[2] = 0.0
+    right, up, down = ahead[0] + ahead[1], aside[0] + aside[1], aside[0] - aside[1]
+    if alone and ahead[0] - ahead[1] <= 0.0 and down <= 0.0 <= up:
+        # The greatest sidestep at the farthest advance is the least angle off the measured direction.
+        least = atan2(max(up, -down), right) if right < 0.0 else 0.0
+        return abs(value), least - abs(value), pi - abs(value)
+    low, high = arguments(ahead[0] - ahead[1], right, down, up)
+    return value, low - value, high - value
+
+
+@compiled
+def curve_azimuth(data: Array, line: Array, sense: Array, half: Array, curvature: Array, turn: Array) -> float:
+    """Bound how an azimuth curves over a box (see `optloc.proof.nodes.node`).
+
+    With gamma = radial + i around, the gradient is ``Im(gamma/(1+w))`` and the Hessian ``-Im(gamma gamma'/(1+w)^2)``.
+    """
+    x, y, along, beside = horizontal(data, line, sense)
+    h = triple(half, 0)
+    squared = x * x + y * y
+    if squared == 0.0:
+        return unbounded(curvature, turn)
+    radial, around = blend(x / squared, along, y / squared, beside), blend(x / squared, beside, -y / squared, along)
+    for k in range(3):
+        for m in range(3):
+            curvature[k, m] = -(radial[k] * around[m] + around[k] * radial[m])
+    back, aside = reach(radial, h), reach(around, h)
+    if not (back < 1.0 and abs(atan2(y, x)) + atan(aside / (1.0 - back)) < pi):
+        turn[0] = turn[1] = turn[2] = inf
+        return inf
+    front = 1.0 - back
+    size = sqrt(back * back + aside * aside)
+    # How far the factors of gradient and Hessian can be from 1, for complex w of at most this size.
+    real, imaginary = size / front, aside / (front * front)  # of 1/(1+w) - 1
+    real2, imaginary2 = size * size / front, imaginary * size * (2.0 + size)  # of w^2/(1+w)
+    for k in range(3):
+        whole = abs(around[k]) * real + abs(radial[k]) * imaginary
+        second = abs(around[k]) * real2 + abs(radial[k]) * imaginary2
+        turn[k] = min(whole, row_reach(curvature, k, h) + second)
+    one, other = length(radial), length(around)
+    mixed = abs(inner(radial, around)) + one * other
+    return max(one, other) ** 2 * 2.0 * imaginary / front + mixed * real * (2.0 + real)
+
+
+@compiled
+def sight(data: Array, x: Array) -> Triple:
+    """Return the line from a station to a fix in the station's axes."""
+    line = (x[0] - data[0], x[1] - data[1], x[2] - data[2])
+    return inner(triple(data, AXES), line), inner(triple(data, AXES + 3), line), inner(triple(data, AXES + 6), line)
+
+
+@compiled
+def _ray(kinds: Array, data: Array, swing: Array, j: int, x: Array, row: Array) -> tuple[float, float]:
+    """Write the horizontal unit vector n across the sight: ``|n.(x' - x)| <= r sin(swing)`` at distance r."""
+    p, q, r = sight(data[j], x)
+    flat = hypot(p, q)
+    if not flat > 0.0:
+        return -1.0, 0.0
+    for k in range(3):
+        row[k] = (p * data[j, AXES + 3 + k] - q * data[j, AXES + k]) / flat
+    return sin(swing[j]), hypot(flat, r)
+
+
+def _numbers(row: Row) -> Array:
+    return lay_out({STATION: row.place(row.a), AXES: row.axes(row.a), MEASURED: row.measured[:, None]})
+
+
+def _mark(numbers: Array, alone: Array, centred: Array, measured: Array) -> None:
+    """Let an azimuth alone be folded: its cost is even, so where it jumps from pi to -pi its absolute value serves."""
+    numbers[..., ALONE] = alone & centred
+
+
+HORIZONTAL_ANGLE = Node(
+    "azimuth",
+    _WIDTH,
+    1,
+    _numbers,
+    bound_azimuth,
+    curve_azimuth,
+    infinity=SCALED,
+    ray=_ray,
+    counts_from_measured=True,
+    most=pi,
+    mark=_mark,
+)
+
+
+# Elevations.
+
+# Numbers: as of an azimuth, but that nothing is measured from anywhere: column 15 stays zero.
+_UPRIGHT_WIDTH = 16
+
+
+@compiled
+def _upright(data: Array, line: Array, sense: Array) -> tuple[float, float, Triple, Triple, Triple]:
+    """Return horizontal distance and rise of a line, and the pulls of outward, sideways and upward unit vectors."""
+    x, y, along, beside = horizontal(data, line, sense)
+    rho = sqrt(x * x + y * y)
+    # On the station's vertical any direction is outward; what is bounded there is not used.
+    ex, ey = (x / rho, y / rho) if rho > 0.0 else (1.0, 0.0)
+    up = triple(data, AXES + 6)
+    return rho, inner(up, triple(line, 0)), blend(ex, along, ey, beside), blend(ex, beside, -ey, along), pull(up, sense)
+
+
+@compiled
+def bound_elevation(data: Array, line: Array, sense: Array, half: Array, slope: Array) -> tuple[float, float, float]:
+    """Bound an elevation over a box (see `optloc.proof.nodes.node`), radians; it may hold the station's vertical."""
+    rho, rise, outward, sideways, upward = _upright(data, line, sense)
+    h = triple(half, 0)
+    value = atan2(rise, rho)
+    least = rho - reach(outward, h)
+    bulge = excess(least, reach(sideways, h))
+    low, high = -inf, inf
+    squared = rho * rho + rise * rise
+    radial, around = outward, upward
+    if squared > 0.0:
+        radial = blend(rho / squared, outward, rise / squared, upward)
+        around = blend(rho / squared, upward, -rise / squared, outward)
+        back, aside = reach(radial, h), reach(around, h)
+        if back < 1.0:
+            # rho = (linear part) + q, 0 <= q <= bulge, moves r by q rho/r^2 and t by -q rise/r^2.
+            ahead, shift = bulge * rho / squared, bulge * rise / squared
+            low, high = product(radial, around, h)
+            cross = abs(shift) * back + ahead * aside
+            bilinear = -high - cross + min(ahead * shift, 0.0), -low + cross + max(ahead * shift, 0.0)
+            low, high = remainder(back, back + ahead, aside + abs(shift), bilinear)
+            low, high = low - max(shift, 0.0), high - min(shift, 0.0)
+    # Where the line of sight turns by much, two numbers say more than a slope and its remainder.
+    bottom, top = _flat_elevation((rise, reach(upward, h)), max(least, 0.0), rho + reach(outward, h) + bulge)
+    if top - bottom < high - low:
+        slope[0] = slope[1] = slope[2] = 0.0
+        return value, bottom - value, top - value
+    write(around, slope)
+    return value, low, high
+
+
+@compiled
+def _flat_elevation(rise: tuple[float, float], near: float, far: float) -> tuple[float, float]:
+    """Enclose an elevation by two numbers: rise is a centre and a half-width, near and far horizontal distances."""
+    down, up = rise[0] - rise[1], rise[0] + rise[1]
+    return atan2(down, near if down < 0.0 else far), atan2(up, far if up < 0.0 else near)
+
+
+@compiled
+def curve_elevation(data: Array, line: Array, sense: Array, half: Array, curvature: Array, turn: Array) -> float:
+    """Bound how an elevation curves over a box (see `optloc.proof.nodes.node`).
+
+    In the unit vectors along the line (a), upwards across it (b) and sideways (c), all pulled and divided by the range,
+    the gradient is b and the Hessian ``-(a b' + b a') - tan(elevation) c c'``; the frame turns over the box.
+    """
+    bound_elevation(data, line, sense, half, turn)  # for its slope alone: `turn` is overwritten below
+    if still(turn):
+        return unbounded(curvature, turn)
+    rho, rise, outward, sideways, upward = _upright(data, line, sense)
+    h = triple(half, 0)
+    least, swing = rho - reach(outward, h), reach(sideways, h)
+    if not least > 0.0:
+        return unbounded(curvature, turn)
+    squared = rho * rho + rise * rise
+    r, tan = sqrt(squared), rise / rho
+    a, b = (
+        blend(rho / squared, outward, rise / squared, upward),
+        blend(rho / squared, upward, -rise / squared, outward),
+    )
+    c = blend(1.0 / r, sideways, 0.0, sideways)
+    for k in range(3):
+        for m in range(3):
+            curvature[k, m] = -(a[k] * b[m] + b[k] * a[m]) - tan * c[k] * c[m]
+    back, aside, bulge = reach(a, h), reach(b, h), excess(least, swing) / r
+    yaw = swing / least  # tangents of the frame's turns about the vertical, and up or down
+    pitch = (aside + bulge * abs(rise) / r) / (1.0 - back) if back < 1.0 else inf
+    if not (yaw < 1.0 and pitch < 1.0 and abs(tan) * pitch < 1.0):
+        turn[0] = turn[1] = turn[2] = inf
+        return inf
+    # First the range changes, then the frame turns up or down, then about the vertical.
+    near = 1.0 / (1.0 - back)
+    stretch = max(back * near, back + aside + bulge)
+    steeper = pitch * (1.0 + tan * tan) / (1.0 - abs(tan) * pitch)
+    sweep = blend(1.0 / r, outward, 0.0, outward)
+    swung = _swung(sweep, c, yaw, (0.0, 0.0, 0.0), near, 0.0)
+    da, db = _swung(a, b, pitch, swung, near, stretch), _swung(b, a, pitch, swung, near, stretch)
+    dc = _swung(c, sweep, yaw, (0.0, 0.0, 0.0), near, stretch)
+    return _frame_turn((a, b, c), (da, db, dc), (abs(tan), steeper), h, curvature, turn)
+
+
+@compiled
+def _swung(u: Triple, v: Triple, tangent: float, more: Triple, near: float, stretch: float) -> Triple:
+    """Return bounds of the change of u when it turns towards v and beyond by `more`, and the range changes.
+
+    By an angle whose tangent is at most `tangent`, ``u cos + v sin - u`` is at most ``tangent^2/2 |u| + tangent |v|``.
+    `near` and `stretch` bound r/r' and its difference from 1.
+    """
+    bent = 0.5 * tangent * tangent
+    return (
+        (bent * abs(u[0]) + tangent * abs(v[0])) * near + more[0] + stretch * abs(u[0]),
+        (bent * abs(u[1]) + tangent * abs(v[1])) * near + more[1] + stretch * abs(u[1]),
+        (bent * abs(u[2]) + tangent * abs(v[2])) * near + more[2] + stretch * abs(u[2]),
+    )
+
+
+@compiled
+def _frame_turn(
+    frame: tuple[Triple, Triple, Triple],
+    change: tuple[Triple, Triple, Triple],
+    steep: tuple[float, float],
+    h: Triple,
+    curvature: Array,
+    turn: Array,
+) -> float:
+    """Write the change of an elevation's gradient and return that of its Hessian, from the change of its frame.
+
+    `steep` is the tangent of the elevation and a bound of its change.
+    """
+    (a, b, c), (da, db, dc) = frame, change
+    tan = steep[0] + steep[1]
+    one, other, third = length(da), length(db), length(dc)
+    side = length(c)
+    across = 2.0 * (one * length(b) + other * length(a) + one * other)
+    chi = across + steep[1] * (side + third) ** 2 + steep[0] * third * (2.0 * side + third)
+    wide, high, flank = reach(a, h) + reach(da, h), reach(b, h) + reach(db, h), reach(c, h) + reach(dc, h)
+    for k in range(3):
+        along = (abs(a[k]) + da[k]) * high + (abs(b[k]) + db[k]) * wide
+        whole = along + tan * (abs(c[k]) + dc[k]) * flank
+        turn[k] = min(whole, row_reach(curvature, k, h) + chi * length(h))
+    return chi
+
+
+@compiled
+def _upright_ray(kinds: Array, data: Array, swing: Array, j: int, x: Array, row: Array) -> tuple[float, float]:
+    """Write the unit vector v across the sight and the horizontal: ``|v.(x' - x)| <= r (sin e + 1 - cos a)``.
+
+    At distance r, with e the swing of the elevation and a that of the azimuth beside it, below a quarter turn.
+    """
+    turn = _azimuth_beside(kinds, data, swing, j)
+    p, q, r = sight(data[j], x)
+    flat = hypot(p, q)
+    if not (turn < 0.5 * pi and flat > 0.0):
+        return -1.0, 0.0
+    whole = hypot(flat, r)
+    for k in range(3):
+        outward = (p * data[j, AXES + k] + q * data[j, AXES + 3 + k]) / flat
+        row[k] = (flat * data[j, AXES + 6 + k] - r * outward) / whole
+    return sin(swing[j]) + 1.0 - cos(turn), whole
+
+
+@compiled
+def _azimuth_beside(kinds: Array, data: Array, swing: Array, j: int) -> float:
+    """Return how far the azimuth may swing that the station of elevation j measures, pi if there is none."""
+    least = pi
+    for m in range(kinds.shape[0]):
+        if kinds[m] == AZIMUTH:
+            same = True
+            for k in range(AXES + 9):
+                same = same and data[m, k] == data[j, k]
+            if same:
+                least = min(least, swing[m])
+    return least
+
+
+def _upright_numbers(row: Row) -> Array:
+    return lay_out({STATION: row.place(row.a), AXES: row.axes(row.a)})
+
+
+VERTICAL_ANGLE = Node(
+    "elevation",
+    _UPRIGHT_WIDTH,
+    1,
+    _upright_numbers,
+    bound_elevation,
+    curve_elevation,
+    infinity=SCALED,
+    ray=_upright_ray,
+    most=0.5 * pi,
+)

@@ -1,0 +1,222 @@
+"""Surfaces of a known height as graphs: over a box along the surface, nodes are functions of two coordinates.
+
+Off the chart's plane the surface lies at ``x(s) = c + T s + n t(s)`` around a point c of it, T along the surface and n
+the chart's upward axis, t of no slope at c. Because the height is convex with a Hessian below 1/R, t is bounded with
+its derivatives, and a node that is bounded over the box of s and t is bounded, with its curvature, along the surface.
+
+A whole surface is six pieces: each point lies on that of the axis, of three through the Earth's centre and both ways,
+along which it is farthest out.
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled
+from optloc.models.primitives import WGS84_A
+from optloc.proof.nodes.level import EXACT, HEIGHT_WIDTH, LEAST_RADIUS, curve_height, normal_at
+from optloc.proof.nodes.node import (
+    CHI,
+    H00,
+    H01,
+    H02,
+    H11,
+    H12,
+    H22,
+    HIGH,
+    LOW,
+    SLOPE2,
+    TURN0,
+    TURN1,
+    TURN2,
+    inner,
+    triple,
+)
+
+# Numbers of a surface: its height, those of the node, the Earth's centre, and three orthonormal axes of a piece, the
+# last upward. One without numbers is no surface.
+LEVEL, DATA, MIDDLE, FIRST, SECOND, UP = 0, 1, 1 + HEIGHT_WIDTH, 4 + HEIGHT_WIDTH, 7 + HEIGHT_WIDTH, 10 + HEIGHT_WIDTH
+SURFACE_WIDTH, SIDES = 13 + HEIGHT_WIDTH, 6
+# Numbers of a graph over a box: how far it sags below its tangent plane at most, and how far off it the centre may be;
+# greatest slopes; the Hessian at the centre; its greatest size over the box, and its greatest change.
+SAG, SLIP, _STEEP0, _STEEP1, _BEND00, _BEND01, _BEND11, _BENT, _TURNED, GRAPH_WIDTH = range(10)
+# Newton's steps down to a surface, which double the digits of what is left, and their end: well above the rounding of
+# coordinates, far below what is measured.
+_STEPS, _CLOSE = 20, 1e-7
+# Cosine between the normal and the chart's axis below which a surface is no graph: a piece ends at 0.57. And the share
+# of the Earth's least radius that a box may leave of the radius of curvature: heights are exact so deep.
+_STEEP, _LEFT = 0.2, 0.7
+
+
+@compiled
+def is_beyond(surface: Array, centre: Array, sense: Array, half: Array) -> bool:
+    """Return whether all points of a surface over a box lie on other pieces, where they are farther out.
+
+    Parameters
+    ----------
+    surface : array (SURFACE_WIDTH,)
+        The surface, with the axes of the piece.
+    centre, sense, half : array (3,), (3, 3), (3,)
+        Of the box in the plane of the chart: only what is along it is read.
+    """
+    most, nearest, aside = WGS84_A + abs(surface[LEVEL]), 0.0, 0.0
+    for first in (FIRST, SECOND):
+        away = reach = 0.0
+        for m in range(3):
+            away += surface[first + m] * (centre[m] - surface[MIDDLE + m])
+        for k in range(2):
+            slope = 0.0
+            for m in range(3):
+                slope += surface[first + m] * sense[m, k]
+            reach += abs(slope) * half[k]
+        least = max(abs(away) - reach, 0.0) * (1.0 - 1e-9)
+        nearest, aside = max(nearest, least), aside + least * least
+    return bool(nearest * nearest > most * most - aside)
+
+
+@compiled
+def lay(surface: Array, centre: Array, half: Array, sense: Array, gram: Array, graph: Array, second: Array) -> bool:
+    """Move the centre of a box onto a surface, and the box into the tangent plane; False where it is too large.
+
+    Parameters
+    ----------
+    surface : array (SURFACE_WIDTH,)
+        The surface.
+    centre, half : array (3,)
+        Centre, metres; moved. Half-widths; the third is written: how far the surface is off the box.
+    sense, gram : array (3, 3)
+        T of the chart, whose third column is the upward axis; turned into the tangent plane. T'T is written.
+    graph : array (GRAPH_WIDTH,)
+        Written.
+    second : array (3, 3)
+        Working memory.
+    """
+    data, up, off, rise = surface[DATA:MIDDLE], triple(surface, UP), 0.0, 0.0
+    _, normal, _, _, _ = normal_at(data, centre)
+    for _ in range(_STEPS):
+        height, normal, _, _, _ = normal_at(data, centre)
+        rise, off = inner(normal, up), height - surface[LEVEL]
+        if not rise > _STEEP:
+            return False
+        if abs(off) <= _CLOSE:
+            break
+        for m in range(3):
+            centre[m] -= off / rise * up[m]
+    if not abs(off) <= _CLOSE:
+        return False
+    reach = size = 0.0
+    for k in range(2):
+        lean = -inner(normal, (sense[0, k], sense[1, k], sense[2, k])) / rise
+        square = 0.0
+        for m in range(3):
+            sense[m, k] += up[m] * lean
+            square += sense[m, k] * sense[m, k]
+        graph[_STEEP0 + k] = sqrt(square)  # the length of the column, for now
+        reach += sqrt(square) * half[k]
+        size += square
+    # With |w| <= reach + sag the height is at most (its slope).w + |w|^2 / 2R: what holds t between zero and the sag.
+    radius = LEAST_RADIUS + surface[LEVEL] - 2.0 * reach
+    if not radius > _LEFT * LEAST_RADIUS:
+        return False
+    bend = 1.0 / radius
+    share = 0.5 * bend / rise
+    if not 4.0 * share * reach < 1.0:
+        return False
+    sag = 2.0 * share * reach * reach / (1.0 - 2.0 * share * reach + sqrt(1.0 - 4.0 * share * reach))
+    least = rise - bend * (reach + sag)
+    if not (sag <= reach and least > 0.5 * _STEEP):
+        return False
+    _write_graph(data, centre, half, sense, gram, graph, second, (sag, rise, least, bend, size))
+    graph[SLIP] = (abs(off) + 4.0 * EXACT * max(1.0, surface[LEVEL] / LEAST_RADIUS)) / rise
+    half[2] = graph[SAG] + graph[SLIP]
+    return True
+
+
+@compiled
+def _write_graph(
+    data: Array,
+    centre: Array,
+    half: Array,
+    sense: Array,
+    gram: Array,
+    graph: Array,
+    second: Array,
+    found: tuple[float, float, float, float, float],
+) -> None:
+    """Write slopes and curvature of a surface over a box: what comes of deriving ``height(x(s)) = value``."""
+    sag, rise, least, bend, size = found
+    for k in range(3):
+        for m in range(3):
+            gram[k, m] = sense[0, k] * sense[0, m] + sense[1, k] * sense[1, m] + sense[2, k] * sense[2, m]
+    way = sag
+    for k in range(2):
+        way += graph[_STEEP0 + k] * half[k]
+    steep = 0.0
+    for k in range(2):
+        # The normal turns by no more than its bend times the way; along the tangents it has no part at the centre.
+        graph[_STEEP0 + k] *= bend * way / least
+        steep += graph[_STEEP0 + k] * graph[_STEEP0 + k]
+    half[2], graph[SAG] = sag, sag
+    curve_height(data, centre, sense, half, second, graph[_BEND00 : _BEND11 + 1])  # whose changes are bounded below
+    graph[_BEND00], graph[_BEND01], graph[_BEND11] = -second[0, 0] / rise, -second[0, 1] / rise, -second[1, 1] / rise
+    long, steep = sqrt(size), sqrt(steep)
+    wide = (long + steep) * (long + steep)
+    graph[_BENT] = bend * wide / least
+    # The Hessian of a height changes by 1.2 / R^2 a metre at most (`optloc.proof.nodes.level.curve_height`).
+    change = 1.2 * bend * bend * way * wide + bend * (2.0 * long + steep) * steep
+    graph[_TURNED] = change / least + bend * size * bend * way / (least * rise)
+
+
+@compiled
+def fold_bounds(graph: Array, lean: Array, nodes: Array) -> None:
+    """Make bounds over a box (s, t) those along the surface; `lean` (J,) keeps the slopes along the upward axis."""
+    sag, slip = graph[SAG] + graph[SLIP], graph[SLIP]
+    for j in range(nodes.shape[0]):
+        slope = nodes[j, SLOPE2]
+        nodes[j, LOW] += min(-slope * sag, slope * slip)
+        nodes[j, HIGH] += max(-slope * sag, slope * slip)
+        lean[j], nodes[j, SLOPE2] = slope, 0.0
+
+
+@compiled
+def unfold_slopes(lean: Array, nodes: Array) -> None:
+    """Give nodes back their slopes along the upward axis, of which their second derivatives are made."""
+    for j in range(nodes.shape[0]):
+        nodes[j, SLOPE2] = lean[j]
+
+
+@compiled
+def fold_curves(graph: Array, lean: Array, nodes: Array, curves: Array) -> None:
+    """Make second derivatives over a box (s, t) those along the surface, by the chain rule."""
+    steep = sqrt(graph[_STEEP0] * graph[_STEEP0] + graph[_STEEP1] * graph[_STEEP1])
+    for j in range(nodes.shape[0]):
+        slope, turn, chi = lean[j], curves[j, TURN2], curves[j, CHI]
+        mixed = sqrt(curves[j, H02] * curves[j, H02] + curves[j, H12] * curves[j, H12]) + chi
+        along = (abs(curves[j, H22]) + chi) * steep
+        curves[j, TURN0] += (abs(slope) + turn) * graph[_STEEP0]
+        curves[j, TURN1] += (abs(slope) + turn) * graph[_STEEP1]
+        curves[j, CHI] = chi + (2.0 * mixed + along) * steep + turn * graph[_BENT] + abs(slope) * graph[_TURNED]
+        curves[j, H00] += slope * graph[_BEND00]
+        curves[j, H01] += slope * graph[_BEND01]
+        curves[j, H11] += slope * graph[_BEND11]
+        curves[j, H02] = curves[j, H12] = curves[j, H22] = curves[j, TURN2] = nodes[j, SLOPE2] = 0.0
+
+
+@compiled
+def is_one_side(surface: Array, origin: Array, sense: Array, low: Array, high: Array) -> bool:
+    """Return whether all of a surface between corners (3,) of search coordinates belongs to their own piece."""
+    aside, below = 0.0, 0.0
+    for m in range(3):
+        below += surface[UP + m] * (origin[m] - surface[MIDDLE + m])
+    for first in (FIRST, SECOND):
+        away, reach = 0.0, 0.0
+        for m in range(3):
+            away += surface[first + m] * (origin[m] - surface[MIDDLE + m])
+        for k in range(2):
+            slope = 0.0
+            for m in range(3):
+                slope += surface[first + m] * sense[m, k]
+            reach += abs(slope) * max(abs(low[k]), abs(high[k]))
+        aside = max(aside, abs(away) + reach)
+    return bool(below + low[2] > aside * (1.0 + 1e-9))
