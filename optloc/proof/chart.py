@@ -343,10 +343,14 @@ def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> t
     information[0, 2] = information[2, 0] = sums[H02]
     information[1, 2] = information[2, 1] = sums[H12]
     # `gram` holds the axes for the moment; it is written anew below.
-    count = _set_tangents(D, planes, surface, gram)
-    _principal_along(information, gram, count)
+    if planes.shape[0] + surface.shape[0] == 0:
+        count = D
+        roughly_principal(information, gram)
+    else:
+        count = _set_tangents(D, planes, surface, gram)
+        _principal_along(information, gram, count)
     most = max(information[0, 0], information[1, 1], information[2, 2])
-    good, sense[:] = True, 0.0
+    good, sense[:] = count > 0, 0.0
     for k in range(count):
         length = information[k, k]
         good = good and length > _DETERMINED * most
@@ -371,12 +375,17 @@ def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> t
 
 # Length of the part of an axis of space across others that will do: of one of the three it is 0.57 at least.
 _ACROSS = 0.5
+# Sine of the angle between two planes below which their line has lost half of its digits.
+_PARALLEL = 1e-8
 
 
 @compiled
 def _set_tangents(D: int, planes: Array, surface: Array, axes: Array) -> int:
-    """Write orthonormal axes (3, 3): those along planes or a surface first, then those across; return how many."""
-    bent = int(surface.shape[0] > 0)
+    """Write orthonormal axes (3, 3): those along planes or a surface first, then those across; return how many.
+
+    None where planes are nearly parallel: what they leave is not known.
+    """
+    bent, apart = int(surface.shape[0] > 0), True
     across = planes.shape[0] + bent + 3 - D
     # From the last column on: the axis that a plane has not, the surface's, the planes', then whatever is left.
     for number in range(3):
@@ -390,14 +399,14 @@ def _set_tangents(D: int, planes: Array, surface: Array, axes: Array) -> int:
         else:
             first = (0.0, 0.0, 0.0)
         if number < across:
-            _set_axis(axes, k, first)
+            apart = _set_axis(axes, k, first) > _PARALLEL and apart
         else:
             for turn in range(3):  # an axis of space, its own if that will do: without planes it is that one
                 m = (k + turn) % 3
                 start = (1.0 if m == 0 else 0.0, 1.0 if m == 1 else 0.0, 1.0 if m == 2 else 0.0)
                 if _set_axis(axes, k, start) > _ACROSS:
                     break
-    return int(3 - across)
+    return int(3 - across) if apart else 0
 
 
 @compiled
@@ -478,7 +487,7 @@ def widen(chart: Chart, centre: Array, half: Array) -> None:
         half[k] += chart.slip[k] * size
 
 
-@compiled
+@inlined
 def is_bounded(cost: Cost, chart: Chart, box: Box) -> bool:
     """Bound the nodes over a box; return False where it is so large that a surface is no graph over it."""
     place(chart.origin, chart.sense, box.at, box.centre)
@@ -530,7 +539,7 @@ def value_at(cost: Cost, chart: Chart, box: Box) -> float:
     return cost_at(cost.K, cost.w, box.nodes) if is_bounded(cost, chart, box) else inf
 
 
-@compiled
+@inlined
 def shapes_of(cost: Cost, chart: Chart) -> Array:
     """Return the codes of the nodes for tests of convexity: along a surface a range is not convex."""
     return cost.kinds if chart.surface.shape[0] == 0 else np.full_like(cost.kinds, ANY)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import inf, isnan, sqrt
+from math import inf, isnan, nan, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -35,12 +35,14 @@ from optloc.proof.chart import (
     Known,
     chart_on,
     curve_along,
+    curve_box,
     is_convex,
     lay_down,
     place,
     reach_of_piece,
     shapes_of,
     turned,
+    value_at,
     widen,
 )
 from optloc.proof.curvature import G0, G1, G2, clip_to_stationary, convex, curve_nodes, sum_up
@@ -367,7 +369,7 @@ def known_minima(
         for k in range(3):
             hull[k] = max(high[k] - box.at[k], box.at[k] - low[k], 0.0)
         if hidden:
-            _draw_in(chart, hull)
+            _draw_in(box.sense if chart.surface.shape[0] > 0 else chart.sense, hull)
         if set_convex(cost, chart, box, hull, margin):
             # Where the box is, up to the rounding of its centre; that of the fix is the origin itself.
             shift[:] = 0.0
@@ -397,13 +399,13 @@ def _is_elsewhere(chart: Chart, box: Box, place_of: Array) -> bool:
 
 
 @compiled
-def _draw_in(chart: Chart, hull: Array) -> None:
+def _draw_in(sense: Array, hull: Array) -> None:
     """Make half-widths (3,) so small that no coordinate in metres is farther than `HIDDEN_REACH`."""
     share = 1.0
     for k in range(3):
         reach = 0.0
         for m in range(3):
-            reach += abs(chart.sense[k, m]) * hull[m]
+            reach += abs(sense[k, m]) * hull[m]
         if reach * share > HIDDEN_REACH:
             share = HIDDEN_REACH / reach
     for k in range(3):
@@ -478,16 +480,16 @@ def prove(
     chart, good = chart_on(cost, x, box, known.planes, known.surface)
     if not good:
         return SINGULAR, 0, -inf
-    least, sums = cost_at(cost.K, cost.w, box.nodes), box.sums
-    # On a box whose Hessian exceeds a margin the cost falls below that of its centre by slope^2 / margin at most.
-    margin = (sums[G0] * sums[G0] + sums[G1] * sums[G1] + sums[G2] * sums[G2]) / eps
-    corners, bent = np.empty((2, 3)), chart.surface.shape[0] > 0
+    least, corners, bent = cost_at(cost.K, cost.w, box.nodes), np.empty((2, 3)), chart.surface.shape[0] > 0
     low, high = corners[0], corners[1]
     if not _start(cost, chart, box, sqrt(least + kappa), lower, upper, low, high):
         return OPEN, 0, -inf
     alone = not bent or is_one_side(chart.surface, chart.origin, chart.sense, low, high)
     if not alone and not isnan(lower[0]):  # a region that reaches around the Earth
         return OPEN, 0, -inf
+    margin = _margin(cost, chart, box, least, eps)
+    if not margin >= 0.0:
+        return STATIONARY, 0, -inf
     # Halfway between: a point found to cost less does so by more than rounding, and no box is left that does by less.
     better, whole = least - 0.5 * eps, closed or isnan(lower[0])
     # From what is hidden a way leads out: where it becomes visible the cost may be least, and yet have a slope.
@@ -507,7 +509,8 @@ def prove(
         if kappa <= 0.0:  # the value alone: other minima are no excuse, their boxes must be bounded as all others
             count = free
         aim = Aim(level, value=least - eps, better=better, whole=whole, free=free)
-        size = push_around(stack, 0, low, high, sides[0], 0)
+        # Only the first side has a known minimum, the fix, at its origin.
+        size = push_around(stack, 0, low, high, sides[0] if side == 0 else np.zeros(3), 0)
         outcome, more, bound = branch(cost, chart, box, minima[:count], sides[:count], aim, budget - boxes, stack, size)
         boxes += more
         if outcome != CLEAR:
@@ -519,6 +522,22 @@ def prove(
     for k in range(x.shape[0]):
         found[k] = box.centre[k]
     return BETTER if outcome == CHEAPER else OTHER, boxes, 0.0
+
+
+@inlined
+def _margin(cost: Cost, chart: Chart, box: Box, least: float, eps: float) -> float:
+    """Return how convex the box of a fix must be for nothing in it to cost less by eps; NaN where none will do.
+
+    Where the Hessian exceeds a margin, the cost falls below that of the centre by slope^2 / margin at most.
+    """
+    sums, share = box.sums, 1.0
+    if chart.surface.shape[0] > 0:
+        # The fix is off its surface by a rounding, which must be none of its cost; there the slope is another, too.
+        box.at[:], box.half[:], share = 0.0, 0.0, 0.5
+        if not abs(value_at(cost, chart, box) - least) <= share * eps:
+            return nan
+        curve_box(cost, chart, box)
+    return float((sums[G0] * sums[G0] + sums[G1] * sums[G1] + sums[G2] * sums[G2]) / (share * eps))
 
 
 @inlined

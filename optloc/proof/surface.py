@@ -128,7 +128,8 @@ def lay(surface: Array, centre: Array, half: Array, sense: Array, gram: Array, g
     if not (sag <= reach and least > 0.5 * _STEEP):
         return False
     _write_graph(data, centre, half, sense, gram, graph, second, (sag, rise, least, bend, size))
-    graph[SLIP] = (abs(off) + 4.0 * EXACT * max(1.0, surface[LEVEL] / LEAST_RADIUS)) / rise
+    # Twice: the mean of slopes over a box counts half of what grows with the box, and this does not.
+    graph[SLIP] = 2.0 * (abs(off) + 4.0 * EXACT * max(1.0, surface[LEVEL] / LEAST_RADIUS)) / least
     half[2] = graph[SAG] + graph[SLIP]
     return True
 

@@ -22,7 +22,7 @@ from optloc.proof.chart import HIDDEN_REACH
 from optloc.proof.everywhere import UNBOUNDED
 from optloc.proof.near import BETTER, BUDGET, OTHER, UNIQUE, VALUE
 from optloc.proof.pose import Posed, pose_costs, unsupported
-from optloc.solvers.certify.posed import agrees, is_free, planes_of, surface_of
+from optloc.solvers.certify.posed import agrees, is_free, surfaces_of
 from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP
@@ -252,7 +252,7 @@ def _compare(work: Work, items: Array) -> None:
 
 def _round(work: Work, items: Array) -> None:
     """Try to prove some fixes once, and settle or change what can be."""
-    free = is_free(work.problem, work.fix[items])
+    free = is_free(work.problem, work.fix, items)
     _give_up(work, items[~free], HELD)
     asked, pose = _asked(work, items), work.pose.take(items)
     # Below this level a wrapped residual may stand for another than the node's: no bound of one bounds the other.
@@ -277,9 +277,8 @@ def _round(work: Work, items: Array) -> None:
 
 
 def _asked(work: Work, items: Array) -> Asked:
-    kappa, problem = work.margins[work.level[items]], work.problem.take(items)
-    fix, ignored = work.fix, work.ignored[items]
-    surface = surface_of(problem, fix[items])
+    kappa, fix, ignored = work.margins[work.level[items]], work.fix, work.ignored[items]
+    planes, surface = surfaces_of(work.problem, fix, items)
     gap = fix.alternatives.gap[items]
     with np.errstate(invalid="ignore"):
         listed = np.isfinite(gap) & (gap < np.maximum(kappa, AMBIGUOUS_GAP)[:, None])
@@ -296,7 +295,7 @@ def _asked(work: Work, items: Array) -> Asked:
         region=work.region[items],
         fallback=work.fallback[items],
         budget=_budgets(kappa, len(work.pose.kinds), work.effort) * (_AROUND if surface.shape[1] else 1),
-        planes=planes_of(problem),
+        planes=planes,
         surface=surface,
     )
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from optloc.base.types import Array, Band
 from optloc.compute.sums import equations_at
-from optloc.linear.constraints import exact
+from optloc.linear.constraints import exact, is_exact
 from optloc.linear.normal import Normal, eliminated, step
 from optloc.models.primitives import geodetic_normal
 from optloc.problem.fix import Fix
@@ -19,44 +19,56 @@ from optloc.proof.surface import DATA, FIRST, LEVEL, MIDDLE, SURFACE_WIDTH, UP
 # Equalities: planes and surfaces along which a proof looks.
 
 
-def planes_of(problem: Problem) -> Array:
-    """Return unit normals (N, e, 3) of the planes to which the equalities of a flat batch hold its fixes."""
-    size, d = problem.batch_shape[0], problem.dimension
-    bands = [band for band in _equalities(problem) if band.kind == "plane"]
-    out = np.zeros((size, len(bands), 3))
-    for i, band in enumerate(bands):
-        out[:, i, :d] = band.coefficients / np.linalg.norm(band.coefficients, axis=-1, keepdims=True)
+def surfaces_of(problem: Problem, fix: Fix, items: Array) -> tuple[Array, Array]:
+    """Return the planes and the surface to which equalities hold some fixes of a flat batch.
+
+    Parameters
+    ----------
+    problem, fix : Problem, Fix
+        N problems and their fixes.
+    items : int array (n,)
+        Which of them.
+
+    Returns
+    -------
+    planes : array (n, e, 3)
+        Unit normals of planes.
+    surface : array (n, w)
+        Numbers of the surface of a height (`optloc.proof.surface`), its upward axis the normal at the fix; w is 0
+        without one.
+    """
+    if not exact(problem):  # nothing of the problems need be looked at
+        return np.zeros((len(items), 0, 3)), np.zeros((len(items), 0))
+    bands = [band for band in problem.take(items).constraints if isinstance(band, Band) and is_exact(band)]
+    return _planes(problem, bands, len(items)), _surface(problem, bands, fix.position[items])
+
+
+def _planes(problem: Problem, bands: list[Band], size: int) -> Array:
+    normals = [band.coefficients for band in bands if band.kind == "plane"]
+    out = np.zeros((size, len(normals), 3))
+    for i, normal in enumerate(normals):
+        out[:, i, : problem.dimension] = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
     return out
 
 
-def surface_of(problem: Problem, fix: Fix) -> Array:
-    """Return the numbers (N, w) of the surfaces of the height to which an equality holds fixes; w is 0 without one.
-
-    See `optloc.proof.surface`; the upward axis is the normal at the fix.
-    """
-    size = len(fix.x)
-    bands = [band for band in _equalities(problem) if band.kind == "height"]
-    if not bands:
-        return np.zeros((size, 0))
-    out = np.zeros((size, SURFACE_WIDTH))
-    out[:, LEVEL], out[:, DATA:MIDDLE] = bands[0].lower, height_numbers(problem)
-    turn = problem.frame.rotation_to_ecef()
+def _surface(problem: Problem, bands: list[Band], position: Array) -> Array:
+    levels = [band.lower for band in bands if band.kind == "height"]
+    if not levels:
+        return np.zeros((len(position), 0))
+    out, turn = np.zeros((len(position), SURFACE_WIDTH)), problem.frame.rotation_to_ecef()
+    out[:, LEVEL], out[:, DATA:MIDDLE] = levels[0], height_numbers(problem)
     out[:, MIDDLE:FIRST] = -problem.frame.origin_ecef() @ turn
-    place = problem.frame.to_ecef(np.where(np.isfinite(fix.position), fix.position, 0.0))
+    place = problem.frame.to_ecef(np.where(np.isfinite(position), position, 0.0))
     out[:, UP:] = np.stack(geodetic_normal((place[:, 0], place[:, 1], place[:, 2])), axis=-1) @ turn
     return out
 
 
-def is_free(problem: Problem, fix: Fix) -> Array:
-    """Return which fixes of a flat batch no constraint holds but its equalities, (N,)."""
-    face, size = exact(problem), len(fix.x)
-    active = [()] * size if fix.active is None else [tuple(found) for found in fix.active]
-    return np.array([len(found) == len(face) for found in active], dtype=bool)
-
-
-def _equalities(problem: Problem) -> list[Band]:
-    levels = [problem.constraints[level.constraint] for level in exact(problem)]
-    return [band for band in levels if isinstance(band, Band)]
+def is_free(problem: Problem, fix: Fix, items: Array) -> Array:
+    """Return which of some fixes (n,) of a flat batch no constraint holds but its equalities, (n,)."""
+    face = exact(problem)
+    if fix.active is None:
+        return np.full(len(items), not face)
+    return np.array([len(found) == len(face) for found in fix.active[items]], dtype=bool)
 
 
 # Whether a posed cost is that of its fix.
