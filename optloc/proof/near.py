@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, inlined, zero
+from optloc.compute.jit import compiled, inlined
 from optloc.proof.box import (
     DEPTH,
     DIRECTION,
@@ -480,41 +480,34 @@ def prove(
     chart, good = chart_on(cost, x, box, known.planes, known.surface)
     if not good:
         return SINGULAR, 0, -inf
-    least, corners, bent = cost_at(cost.K, cost.w, box.nodes), np.empty((2, 3)), chart.surface.shape[0] > 0
+    least, sums, bent = cost_at(cost.K, cost.w, box.nodes), box.sums, chart.surface.shape[0] > 0
+    # On a box whose Hessian exceeds a margin the cost falls below that of its centre by slope^2 / margin at most.
+    margin = (sums[G0] * sums[G0] + sums[G1] * sums[G1] + sums[G2] * sums[G2]) / eps
+    corners, alone = np.empty((2, 3)), True
     low, high = corners[0], corners[1]
     if not _start(cost, chart, box, sqrt(least + kappa), lower, upper, low, high):
         return OPEN, 0, -inf
-    alone = not bent or is_one_side(chart.surface, chart.origin, chart.sense, low, high)
-    if not alone and not isnan(lower[0]):  # a region that reaches around the Earth
-        return OPEN, 0, -inf
-    margin = _margin(cost, chart, box, least, eps)
-    if not margin >= 0.0:
+    if bent:
+        alone = is_one_side(chart.surface, chart.origin, chart.sense, low, high)
+        if not alone and not isnan(lower[0]):  # a region that reaches around the Earth
+            return OPEN, 0, -inf
+        reach_of_piece(chart, low, high)
+        margin = _margin(cost, chart, box, least, eps)
+    minima, sides, count, free = known_minima(cost, chart, box, known, low, high, margin, least - eps, True)
+    if count == 0:
         return STATIONARY, 0, -inf
+    if kappa <= 0.0:  # the value alone: other minima are no excuse, their boxes must be bounded as all others
+        count = free
     # Halfway between: a point found to cost less does so by more than rounding, and no box is left that does by less.
     better, whole = least - 0.5 * eps, closed or isnan(lower[0])
     # From what is hidden a way leads out: where it becomes visible the cost may be least, and yet have a slope.
     whole = whole and known.hidden == 0
     level = least + kappa if kappa > 0.0 else least - eps
-    outcome, boxes, bound, stack, around = CLEAR, zero(), inf, np.empty((_CAPACITY, DEPTH)), chart
-    for side in range(1 if alone else SIDES):
-        if side > 0:
-            chart = turned(cost, around, side)
-        if bent:
-            if side > 0:
-                low[:], high[:] = -inf, inf
-            reach_of_piece(chart, low, high)
-        minima, sides, count, free = known_minima(cost, chart, box, known, low, high, margin, least - eps, side == 0)
-        if side == 0 and count == 0:
-            return STATIONARY, 0, -inf
-        if kappa <= 0.0:  # the value alone: other minima are no excuse, their boxes must be bounded as all others
-            count = free
-        aim = Aim(level, value=least - eps, better=better, whole=whole, free=free)
-        # Only the first side has a known minimum, the fix, at its origin.
-        size = push_around(stack, 0, low, high, sides[0] if side == 0 else np.zeros(3), 0)
-        outcome, more, bound = branch(cost, chart, box, minima[:count], sides[:count], aim, budget - boxes, stack, size)
-        boxes += more
-        if outcome != CLEAR:
-            break
+    aim, stack = Aim(level, value=least - eps, better=better, whole=whole, free=free), np.empty((_CAPACITY, DEPTH))
+    size = push_around(stack, 0, low, high, sides[0], 0)
+    outcome, boxes, bound = branch(cost, chart, box, minima[:count], sides[:count], aim, budget, stack, size)
+    if outcome == CLEAR and not alone:
+        outcome, boxes = _search_sides(cost, chart, box, known, aim, budget, boxes, stack)
     if outcome == CLEAR:
         return UNIQUE if kappa > 0.0 else VALUE, boxes, least - eps
     if outcome == SPENT:  # of other sides nothing is known
@@ -524,20 +517,43 @@ def prove(
     return BETTER if outcome == CHEAPER else OTHER, boxes, 0.0
 
 
-@inlined
+@compiled
 def _margin(cost: Cost, chart: Chart, box: Box, least: float, eps: float) -> float:
-    """Return how convex the box of a fix must be for nothing in it to cost less by eps; NaN where none will do.
+    """Return how convex the box of a fix must be for no place of a surface in it to cost less by eps.
 
-    Where the Hessian exceeds a margin, the cost falls below that of the centre by slope^2 / margin at most.
+    The fix is off its surface by a rounding. Half of eps is for what that costs, NaN where it is more; half for the
+    slope, which is another on the surface.
     """
-    sums, share = box.sums, 1.0
-    if chart.surface.shape[0] > 0:
-        # The fix is off its surface by a rounding, which must be none of its cost; there the slope is another, too.
-        box.at[:], box.half[:], share = 0.0, 0.0, 0.5
-        if not abs(value_at(cost, chart, box) - least) <= share * eps:
-            return nan
-        curve_box(cost, chart, box)
-    return float((sums[G0] * sums[G0] + sums[G1] * sums[G1] + sums[G2] * sums[G2]) / (share * eps))
+    sums = box.sums
+    box.at[:], box.half[:] = 0.0, 0.0
+    if not abs(value_at(cost, chart, box) - least) <= 0.5 * eps:
+        return nan
+    curve_box(cost, chart, box)
+    return float((sums[G0] * sums[G0] + sums[G1] * sums[G1]) / (0.5 * eps))
+
+
+@compiled
+def _search_sides(
+    cost: Cost, around: Chart, box: Box, known: Known, aim: Aim, budget: int, boxes: int, stack: Array
+) -> tuple[int, int]:
+    """Search all other pieces of a surface than that of the fix; return the outcome and the boxes with those before."""
+    corners, outcome = np.empty((2, 3)), CLEAR
+    for side in range(1, SIDES):
+        chart = turned(cost, around, side)
+        low, high = corners[0], corners[1]
+        low[:], high[:] = -inf, inf
+        reach_of_piece(chart, low, high)
+        minima, sides, count, free = known_minima(cost, chart, box, known, low, high, 0.0, aim.value, False)
+        if not aim.level > aim.value:
+            count = free
+        own = Aim(aim.level, aim.value, aim.better, aim.whole, free)
+        # No hole: the origin of a piece is no minimum.
+        size = push_around(stack, 0, low, high, np.zeros(3), 0)
+        outcome, more, _ = branch(cost, chart, box, minima[:count], sides[:count], own, budget - boxes, stack, size)
+        boxes += more
+        if outcome != CLEAR:
+            break
+    return outcome, boxes
 
 
 @inlined
