@@ -9,17 +9,15 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, inlined, zero
-from optloc.compute.systems import invert, roughly_principal
-from optloc.models.primitives import WGS84_A
+from optloc.compute.systems import inverse, invert, positive, roughly_principal
 from optloc.proof.box import ROW_WIDTH, bound_nodes, cost_at, rounding
 from optloc.proof.curvature import G0, G1, G2, SUMS, convex, curve_nodes, sum_up
 from optloc.proof.nodes.dispatch import size_of
 from optloc.proof.nodes.level import LEAST_RADIUS
-from optloc.proof.nodes.node import ANY, CURVE_WIDTH, H00, H01, H02, H11, H12, H22, NODE_WIDTH, RANGE, inner, triple
+from optloc.proof.nodes.node import ANY, CURVE_WIDTH, FORCE, H00, H01, H02, H11, H12, H22, NODE_WIDTH, RANGE
 from optloc.proof.surface import (
     FIRST,
     GRAPH_WIDTH,
-    LEVEL,
     MIDDLE,
     SAG,
     SECOND,
@@ -28,6 +26,8 @@ from optloc.proof.surface import (
     fold_bounds,
     fold_curves,
     lay,
+    principal_along,
+    set_tangents,
     unfold_slopes,
 )
 
@@ -347,8 +347,8 @@ def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> t
         count = D
         roughly_principal(information, gram)
     else:
-        count = _set_tangents(D, planes, surface, gram)
-        _principal_along(information, gram, count)
+        count = set_tangents(D, planes, surface, gram)
+        principal_along(information, gram, count)
     most = max(information[0, 0], information[1, 1], information[2, 2])
     good, sense[:] = count > 0, 0.0
     for k in range(count):
@@ -371,77 +371,6 @@ def chart_on(cost: Cost, x: Array, box: Box, planes: Array, surface: Array) -> t
             gram[k, m] = sense[0, k] * sense[0, m] + sense[1, k] * sense[1, m] + sense[2, k] * sense[2, m]
     floor = accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, origin)
     return Chart(origin, sense, back, gram, slip, floor, own), good
-
-
-# Length of the part of an axis of space across others that will do: of one of the three it is 0.57 at least.
-_ACROSS = 0.5
-# Sine of the angle between two planes below which their line has lost half of its digits.
-_PARALLEL = 1e-8
-
-
-@compiled
-def _set_tangents(D: int, planes: Array, surface: Array, axes: Array) -> int:
-    """Write orthonormal axes (3, 3): those along planes or a surface first, then those across; return how many.
-
-    None where planes are nearly parallel: what they leave is not known.
-    """
-    bent, apart = int(surface.shape[0] > 0), True
-    across = planes.shape[0] + bent + 3 - D
-    # From the last column on: the axis that a plane has not, the surface's, the planes', then whatever is left.
-    for number in range(3):
-        k = 2 - number
-        if number < 3 - D:
-            first = (0.0, 0.0, 1.0)
-        elif number < 3 - D + bent:
-            first = triple(surface, UP)
-        elif number < across:
-            first = triple(planes[number - bent - 3 + D], 0)
-        else:
-            first = (0.0, 0.0, 0.0)
-        if number < across:
-            apart = _set_axis(axes, k, first) > _PARALLEL and apart
-        else:
-            for turn in range(3):  # an axis of space, its own if that will do: without planes it is that one
-                m = (k + turn) % 3
-                start = (1.0 if m == 0 else 0.0, 1.0 if m == 1 else 0.0, 1.0 if m == 2 else 0.0)
-                if _set_axis(axes, k, start) > _ACROSS:
-                    break
-    return int(3 - across) if apart else 0
-
-
-@compiled
-def _set_axis(axes: Array, k: int, start: tuple[float, float, float]) -> float:
-    """Write the part of a vector across the axes behind k as axis k, of length one; return how long it was."""
-    length = 0.0
-    for m in range(3):
-        axes[m, k] = start[m]
-    for _ in range(2):  # twice is exact (Parlett)
-        for other in range(k + 1, 3):
-            along = axes[0, k] * axes[0, other] + axes[1, k] * axes[1, other] + axes[2, k] * axes[2, other]
-            for m in range(3):
-                axes[m, k] -= along * axes[m, other]
-    length = sqrt(axes[0, k] ** 2 + axes[1, k] ** 2 + axes[2, k] ** 2)
-    for m in range(3):
-        axes[m, k] /= length if length > 0.0 else 1.0
-    return length
-
-
-@compiled
-def _principal_along(information: Array, axes: Array, count: int) -> None:
-    """Turn the first `count` axes so that information (3, 3) is nearly diagonal along them; it is written so."""
-    own, turned, vectors = np.zeros((3, 3)), axes.copy(), np.zeros((3, 3))
-    for k in range(count):
-        for m in range(count):
-            for i in range(3):
-                for j in range(3):
-                    own[k, m] += axes[i, k] * information[i, j] * axes[j, m]
-    roughly_principal(own, vectors)
-    information[:] = own
-    for k in range(count):
-        for m in range(3):
-            axes[m, k] = 0.0
-            for i in range(count):
-                axes[m, k] += turned[m, i] * vectors[i, k]
 
 
 @compiled
@@ -582,15 +511,81 @@ def turned(cost: Cost, chart: Chart, side: int) -> Chart:
     return Chart(origin, sense, back, numbers[2], slip, floor, own)
 
 
+# Descents: which minimum a low point belongs to, by a few damped Newton steps.
+
+# Steps of a descent: damped Newton needs five to ten from a box near a minimum; beyond forty it creeps along a valley.
+_STEPS = 40
+# A step of so many standard deviations ends it: the next one, of Newton's, would be a millionth.
+_CLOSE = 1e-3
+# Damping at first, its factors after a step that was good and one that was not, and from where on it grows again. Steps
+# that are damped by more than the last are no Newton steps, and do not end a descent.
+_DAMPING, _LESS, _MORE, _LEAST, _FREE = 1e-6, 0.1, 10.0, 1e-4, 1e-3
+# Rounding of two costs of the same point, relative and absolute: a step may raise the cost by it.
+_SAME_COST = 1e-14
+
+
 @compiled
-def reach_of_piece(chart: Chart, low: Array, high: Array) -> None:
-    """Clip corners (3,) of search coordinates by where the surface is of this piece, and take the third away."""
-    # A point that is farthest out along the third axis is at most so far aside: its squares sum to the distance's.
-    most = sqrt(0.5) * (WGS84_A + abs(chart.surface[LEVEL])) * (1.0 + 1e-9)
-    for k in range(2):
-        unit, away = triple(chart.surface, FIRST if k == 0 else SECOND), 0.0
-        size = inner(unit, (chart.sense[0, k], chart.sense[1, k], chart.sense[2, k]))
-        for m in range(3):
-            away += unit[m] * (chart.origin[m] - chart.surface[MIDDLE + m])
-        low[k], high[k] = max(low[k], (-most - away) / size), min(high[k], (most - away) / size)
-    low[2] = high[2] = 0.0
+def descend(cost: Cost, chart: Chart, box: Box) -> float:
+    """Move the centre of a box to a minimum of the cost; return the cost there, or infinity where none is reached.
+
+    The half-widths become zero, and the tables are those of the point. Newton's Hessian where it is positive definite,
+    that of Gauss and Newton elsewhere, damped after Levenberg and Marquardt.
+    """
+    box.half[:] = 0.0
+    start = box.at.copy()
+    cost_now, damping = value_at(cost, chart, box), _DAMPING
+    curve_box(cost, chart, box)
+    for _ in range(_STEPS):
+        length = _step(cost, box, damping)
+        if not length >= 0.0:
+            return float("inf")
+        start[:] = box.at
+        for k in range(3):
+            box.at[k] -= box.solve[0, k]
+        after = value_at(cost, chart, box)
+        if after <= cost_now * (1.0 + _SAME_COST) + _SAME_COST:
+            cost_now = after
+            curve_box(cost, chart, box)
+            if length < _CLOSE * _CLOSE and damping <= _FREE:
+                sums = box.sums
+                good = positive(
+                    sums[H00],
+                    sums[H01],
+                    sums[H02],
+                    sums[H11] if sums[H11] != 0.0 else 1.0,
+                    sums[H12],
+                    sums[H22] if sums[H22] != 0.0 else 1.0,
+                )
+                return cost_now if good else float("inf")
+            damping *= _LESS
+        else:
+            box.at[:] = start
+            damping = max(_MORE * damping, _LEAST)
+    return float("inf")
+
+
+@compiled
+def _step(cost: Cost, box: Box, damping: float) -> float:
+    """Write the damped step into the first row of box.solve; return its squared length, NaN where there is none."""
+    sums, solve = box.sums, box.solve
+    h0, h1, h2, h3, h4, h5 = sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], sums[H22]
+    h3, h5 = h3 if h3 != 0.0 else 1.0, h5 if h5 != 0.0 else 1.0
+    if not positive(h0, h1, h2, h3, h4, h5):
+        # Less the curvature of the nodes, Gauss and Newton's information is left, which always falls.
+        for j in range(box.curves.shape[0]):
+            force = box.curves[j, FORCE]
+            h0 -= force * box.curves[j, H00]
+            h1 -= force * box.curves[j, H01]
+            h2 -= force * box.curves[j, H02]
+            h3 -= force * box.curves[j, H11]
+            h4 -= force * box.curves[j, H12]
+            h5 -= force * box.curves[j, H22]
+    more = 1.0 + damping
+    if not inverse(h0 * more, h1, h2, h3 * more, h4, h5 * more, solve):
+        return float("nan")
+    g0, g1, g2 = sums[G0], sums[G1], sums[G2]
+    s0 = solve[0, 0] * g0 + solve[0, 1] * g1 + solve[0, 2] * g2
+    s1 = solve[1, 0] * g0 + solve[1, 1] * g1 + solve[1, 2] * g2
+    s2 = solve[2, 0] * g0 + solve[2, 1] * g1 + solve[2, 2] * g2
+    solve[0, 0], solve[0, 1], solve[0, 2] = s0, s1, s2
+    return float(s0 * s0 + s1 * s1 + s2 * s2)

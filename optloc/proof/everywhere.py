@@ -36,9 +36,8 @@ from optloc.proof.box import (
     push_halves,
     rounding,
 )
-from optloc.proof.chart import HIDDEN_REACH, Box, Chart, Cost, Known, chart_at, empty_box
+from optloc.proof.chart import HIDDEN_REACH, Box, Chart, Cost, Known, chart_at, descend, empty_box
 from optloc.proof.curvature import C00, G0, G1, G2, NOISE0, convex, entry, slopes_everywhere, spread_of, sum_up
-from optloc.proof.descent import descend
 from optloc.proof.near import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces, infinity_of, points_of
 from optloc.proof.nodes.node import ANY, DIFFERENCE, GROWS, H00, H11, H22, RANGE

@@ -36,17 +36,16 @@ from optloc.proof.chart import (
     chart_on,
     curve_along,
     curve_box,
+    descend,
     is_convex,
     lay_down,
     place,
-    reach_of_piece,
     shapes_of,
     turned,
     value_at,
     widen,
 )
 from optloc.proof.curvature import G0, G1, G2, clip_to_stationary, convex, curve_nodes, sum_up
-from optloc.proof.descent import descend
 from optloc.proof.enclosure import around_node, enclose
 from optloc.proof.nodes.node import (
     HEIGHT,
@@ -57,7 +56,7 @@ from optloc.proof.nodes.node import (
     SLOPE1,
     SLOPE2,
 )
-from optloc.proof.surface import DATA, LEVEL, MIDDLE, SIDES, is_beyond, is_one_side
+from optloc.proof.surface import DATA, LEVEL, MIDDLE, SIDES, is_beyond, is_one_side, reach_of_piece
 
 # Branch and bound over boxes of the near chart.
 
@@ -491,7 +490,7 @@ def prove(
         alone = is_one_side(chart.surface, chart.origin, chart.sense, low, high)
         if not alone and not isnan(lower[0]):  # a region that reaches around the Earth
             return OPEN, 0, -inf
-        reach_of_piece(chart, low, high)
+        reach_of_piece(chart.surface, chart.origin, chart.sense, low, high)
         margin = _margin(cost, chart, box, least, eps)
     minima, sides, count, free = known_minima(cost, chart, box, known, low, high, margin, least - eps, True)
     if count == 0:
@@ -542,7 +541,7 @@ def _search_sides(
         chart = turned(cost, around, side)
         low, high = corners[0], corners[1]
         low[:], high[:] = -inf, inf
-        reach_of_piece(chart, low, high)
+        reach_of_piece(chart.surface, chart.origin, chart.sense, low, high)
         minima, sides, count, free = known_minima(cost, chart, box, known, low, high, 0.0, aim.value, False)
         if not aim.level > aim.value:
             count = free

@@ -12,8 +12,11 @@ from __future__ import annotations
 
 from math import sqrt
 
+import numpy as np
+
 from optloc.base.types import Array
 from optloc.compute.jit import compiled
+from optloc.compute.systems import roughly_principal
 from optloc.models.primitives import WGS84_A
 from optloc.proof.nodes.level import EXACT, HEIGHT_WIDTH, LEAST_RADIUS, curve_height, normal_at
 from optloc.proof.nodes.node import (
@@ -205,6 +208,20 @@ def fold_curves(graph: Array, lean: Array, nodes: Array, curves: Array) -> None:
 
 
 @compiled
+def reach_of_piece(surface: Array, origin: Array, sense: Array, low: Array, high: Array) -> None:
+    """Clip corners (3,) of search coordinates by where the surface is of this piece, and take the third away."""
+    # A point that is farthest out along the third axis is at most so far aside: its squares sum to the distance's.
+    most = sqrt(0.5) * (WGS84_A + abs(surface[LEVEL])) * (1.0 + 1e-9)
+    for k in range(2):
+        unit, away = triple(surface, FIRST if k == 0 else SECOND), 0.0
+        size = inner(unit, (sense[0, k], sense[1, k], sense[2, k]))
+        for m in range(3):
+            away += unit[m] * (origin[m] - surface[MIDDLE + m])
+        low[k], high[k] = max(low[k], (-most - away) / size), min(high[k], (most - away) / size)
+    low[2] = high[2] = 0.0
+
+
+@compiled
 def is_one_side(surface: Array, origin: Array, sense: Array, low: Array, high: Array) -> bool:
     """Return whether all of a surface between corners (3,) of search coordinates belongs to their own piece."""
     aside, below = 0.0, 0.0
@@ -221,3 +238,76 @@ def is_one_side(surface: Array, origin: Array, sense: Array, low: Array, high: A
             reach += abs(slope) * max(abs(low[k]), abs(high[k]))
         aside = max(aside, abs(away) + reach)
     return bool(below + low[2] > aside * (1.0 + 1e-9))
+
+
+# Axes of search coordinates along planes or a surface.
+
+# Length of the part of an axis of space across others that will do: of one of the three it is 0.57 at least.
+_ACROSS = 0.5
+# Sine of the angle between two planes below which their line has lost half of its digits.
+_PARALLEL = 1e-8
+
+
+@compiled
+def set_tangents(D: int, planes: Array, surface: Array, axes: Array) -> int:
+    """Write orthonormal axes (3, 3): those along planes or a surface first, then those across; return how many.
+
+    None where planes are nearly parallel: what they leave is not known.
+    """
+    bent, apart = int(surface.shape[0] > 0), True
+    across = planes.shape[0] + bent + 3 - D
+    # From the last column on: the axis that a plane has not, the surface's, the planes', then whatever is left.
+    for number in range(3):
+        k = 2 - number
+        if number < 3 - D:
+            first = (0.0, 0.0, 1.0)
+        elif number < 3 - D + bent:
+            first = triple(surface, UP)
+        elif number < across:
+            first = triple(planes[number - bent - 3 + D], 0)
+        else:
+            first = (0.0, 0.0, 0.0)
+        if number < across:
+            apart = _set_axis(axes, k, first) > _PARALLEL and apart
+        else:
+            for turn in range(3):  # an axis of space, its own if that will do: without planes it is that one
+                m = (k + turn) % 3
+                start = (1.0 if m == 0 else 0.0, 1.0 if m == 1 else 0.0, 1.0 if m == 2 else 0.0)
+                if _set_axis(axes, k, start) > _ACROSS:
+                    break
+    return int(3 - across) if apart else 0
+
+
+@compiled
+def _set_axis(axes: Array, k: int, start: tuple[float, float, float]) -> float:
+    """Write the part of a vector across the axes behind k as axis k, of length one; return how long it was."""
+    length = 0.0
+    for m in range(3):
+        axes[m, k] = start[m]
+    for _ in range(2):  # twice is exact (Parlett)
+        for other in range(k + 1, 3):
+            along = axes[0, k] * axes[0, other] + axes[1, k] * axes[1, other] + axes[2, k] * axes[2, other]
+            for m in range(3):
+                axes[m, k] -= along * axes[m, other]
+    length = sqrt(axes[0, k] ** 2 + axes[1, k] ** 2 + axes[2, k] ** 2)
+    for m in range(3):
+        axes[m, k] /= length if length > 0.0 else 1.0
+    return length
+
+
+@compiled
+def principal_along(information: Array, axes: Array, count: int) -> None:
+    """Turn the first `count` axes so that information (3, 3) is nearly diagonal along them; it is written so."""
+    own, turned, vectors = np.zeros((3, 3)), axes.copy(), np.zeros((3, 3))
+    for k in range(count):
+        for m in range(count):
+            for i in range(3):
+                for j in range(3):
+                    own[k, m] += axes[i, k] * information[i, j] * axes[j, m]
+    roughly_principal(own, vectors)
+    information[:] = own
+    for k in range(count):
+        for m in range(3):
+            axes[m, k] = 0.0
+            for i in range(count):
+                axes[m, k] += turned[m, i] * vectors[i, k]
