@@ -317,7 +317,9 @@ def reliability(problem: Problem, x: Array, suspects: Sequence[Suspect] = ()) ->
     moved = np.stack([at.deviation @ at.shared[rows].sum(0) for _, rows in channels])
     places = [slot.start + i for slot in work.layout.shared if slot.name == "position" for i in range(slot.size)]
     pull = np.linalg.norm(moved[:, places], axis=-1)
-    return Reliability(tuple(name for name, _ in channels), least, np.where(pull > 0.0, least * pull, 0.0))
+    # what moves nothing may be of any size
+    shift = np.where(pull > 0.0, least * np.where(pull > 0.0, pull, 1.0), 0.0)
+    return Reliability(tuple(name for name, _ in channels), least, shift)
 
 
 def _touched(work: Problem, origin: Sequence[Array], suspect: Suspect) -> Array:
