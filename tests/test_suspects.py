@@ -19,6 +19,7 @@ from optloc.cli import app
 from optloc.problem.arrivals import as_arrivals, restore_order
 from optloc.solvers.policy import AMBIGUOUS_GAP
 from optloc.solvers.refine import refine
+from optloc.solvers.suspects import subsets
 
 RNG = np.random.default_rng(20251121)
 STATIONS = RNG.uniform(-0.5, 0.5, (8, 3)) * [10e3, 10e3, 6e3]
@@ -254,6 +255,18 @@ def test_noise_that_is_understated_is_the_suspect_and_no_station_is(kind, noise)
         accused += sum(any(name.startswith("station") for name in found) for found in names_of)
     assert told == batches
     assert accused <= binom.isf(1e-3, trials * batches, 0.03)
+
+
+@pytest.mark.parametrize(("kind", "stations"), [("tdoa", 18), ("azimuth", 26)])
+def test_sets_that_are_left_untried_explain_nothing(kind, stations, monkeypatch):
+    """Many stations, of which two may be a little wrong: the same as where all sets of two are tried."""
+    case = spoilt(kind, 3, stations, share=0.06, size=5.0, seed=2, dimension=2 if kind == "azimuth" else 3)
+    quick = solve_apart(case.problem)
+    monkeypatch.setattr(subsets, "_FEW", 10**9)
+    every = solve_apart(case.problem)
+    np.testing.assert_array_equal(quick.code, every.code)
+    told = [[{one.names for one in found} for found in fix.explanations] for fix in (quick, every)]
+    assert told[0] == told[1]
 
 
 def test_a_few_liars_are_no_larger_noise():

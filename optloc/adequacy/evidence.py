@@ -309,7 +309,7 @@ def reliability(problem: Problem, x: Array, suspects: Sequence[Suspect] = ()) ->
     origin = tuple(np.arange(flat.count)[:, None]) if made is None else made.origin
     for one in suspects:
         work = work.with_rows(weight=np.where(_touched(work, origin, one), 0.0, work.weight))
-    at = influence(work, _embed(flat.layout, work.layout, np.asarray(x, dtype=float)))
+    at = influence(work, embed(flat.layout, work.layout, np.asarray(x, dtype=float)))
     channels = _channels(work)
     seen = np.array([at.block(rows).sum() for _, rows in channels])
     told = np.array([at.block(rows).sum() > _NOTHING * at.precision[rows][:, rows].sum() for _, rows in channels])
@@ -332,7 +332,7 @@ def _touched(work: Problem, origin: Sequence[Array], suspect: Suspect) -> Array:
     return np.array([len(own) == 1 and int(own[0]) in suspect.rows for own in origin])
 
 
-def _embed(layout: Layout, other: Layout, x: Array) -> Array:
+def embed(layout: Layout, other: Layout, x: Array) -> Array:
     """Return a vector (size,) in the order of a layout with more unknowns, which are zero: rows are linear in them."""
     out, (shared, local) = np.zeros(other.size), layout.split(x)
     out[shared_places(layout, other)] = shared

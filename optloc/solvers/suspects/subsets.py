@@ -10,11 +10,10 @@ from time import perf_counter
 
 import numpy as np
 
-from optloc.adequacy.evidence import Influence, drops, errors, influence, significance
+from optloc.adequacy.evidence import Influence, drops, embed, errors, influence, significance
 from optloc.adequacy.groups import ROW_PRICE, Group, leave_out, mark_rows
 from optloc.base.records import take
 from optloc.base.types import Array
-from optloc.problem.arrivals import restore_order
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.solvers.certify.branch_and_bound import certified
@@ -208,7 +207,8 @@ def _promising(problem: Problem, groups: Sequence[Group], sets: Sequence[_Set], 
     """
     if not np.isfinite(whole.x).all():
         return list(sets)
-    at = influence(problem, restore_order(problem.layout, whole.layout, whole.x))
+    # the fix is of the problem as given, which may have no emission time; rows are linear in it
+    at = influence(problem, embed(whole.layout, problem.layout, whole.x))
     drop, _ = drops(at, [np.flatnonzero(rows) for _, rows, _ in sets])
     prices = np.array([sum(groups[i].price for i in left) for left, _, _ in sets])
     wanted = float(whole.cost) + prices - best - AMBIGUOUS_GAP
