@@ -269,6 +269,23 @@ def test_sets_that_are_left_untried_explain_nothing(kind, stations, monkeypatch)
     assert told[0] == told[1]
 
 
+def test_two_kinds_of_lengths_may_both_have_an_offset():
+    """Then a set of two leaves out no row at all, among so many sets that they are looked at to first order."""
+
+    def rows(sigma):
+        sums = measured("range_sum", a=EACH, b=(EACH + 1) % 8, sigma=sigma)
+        return problem(measured("range", a=EACH, sigma=sigma), sums)
+
+    # errors half as large again as is stated: no rest is refuted, and none is so good that pairs need no look
+    loud = simulate(rows(15.0), TARGET, 6, trials=4).z
+    stated = simulate(rows(10.0), TARGET, 6, trials=4)
+    fix = solve_apart(stated.with_rows(z=loud))
+    assert fix.answered.all()
+    error = fix.position - TARGET
+    squared = (error * np.linalg.solve(fix.covariance(), error[..., None])[..., 0]).sum(-1)
+    assert (squared[fix.code == Status.OK] < chi2.isf(1e-4, 3)).all()
+
+
 def test_a_few_liars_are_no_larger_noise():
     """A tenth of the rows is wrong by a hundred sigma: stations are named, and the noise stays as it is."""
     case = spoilt("range", 60, 8, share=0.1, size=100.0, seed=4)

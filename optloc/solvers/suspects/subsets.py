@@ -209,10 +209,12 @@ def _promising(problem: Problem, groups: Sequence[Group], sets: Sequence[_Set], 
         return list(sets)
     # the fix is of the problem as given, which may have no emission time; rows are linear in it
     at = influence(problem, embed(whole.layout, problem.layout, whole.x))
-    drop, _ = drops(at, [np.flatnonzero(rows) for _, rows, _ in sets])
-    prices = np.array([sum(groups[i].price for i in left) for left, _, _ in sets])
+    plain = [one for one in sets if not one[2]]
+    drop, _ = drops(at, [np.flatnonzero(rows) for _, rows, _ in plain])
+    prices = np.array([sum(groups[i].price for i in left) for left, _, _ in plain])
     wanted = float(whole.cost) + prices - best - AMBIGUOUS_GAP
-    return [one for one, d, w in zip(sets, drop, wanted, strict=True) if one[2] or 2.0 * d >= w]
+    # two offsets leave out no row at all
+    return [one for one in sets if one[2]] + [plain[i] for i in np.flatnonzero(2.0 * drop >= wanted)]
 
 
 def _try_sets(problem: Problem, groups: Sequence[Group], sets: Sequence[_Set]) -> list[_Tried]:
