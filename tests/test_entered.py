@@ -28,8 +28,8 @@ finally:
     print(*sorted(entered))
 """
 # Five of them since an `ok` keeps its promise: the chart, the shape of the likelihood, the findings, and of the proof
-# its curvature and what it is posed of.
-MOST = 65
+# its curvature and what it is posed of; one since every file is read through the same door.
+MOST = 66
 
 
 def test_a_simple_fix_enters_few_modules():

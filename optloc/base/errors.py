@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -51,9 +52,19 @@ class InvalidProblem(OptlocError, ValueError):  # noqa: N818  (named for what th
 
     def __str__(self) -> str:
         """Return the sentence."""
-        place = f"{self.where}: " if self.where else ""
-        advice = f"; {self.advice.strip().rstrip('.')}" if self.advice else ""
-        return f"{place}{self.what.strip().rstrip('.')}{advice}."
+        place = f"{_shown(self.where)}: " if self.where else ""
+        advice = f"; {_shown(self.advice.strip().rstrip('.'), 4 * _SHOWN)}" if self.advice else ""
+        return f"{place}{_shown(self.what.strip().rstrip('.'))}{advice}."
+
+
+# Characters of a place and of what is wrong there, some three lines: a file may put a megabyte where a name belongs.
+# Advice may list what is known.
+_SHOWN = 300
+
+
+def _shown(text: str, most: int = _SHOWN) -> str:
+    """Return a text without what is in its middle, where it is long."""
+    return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 2 :]}"
 
 
 class NoSolution(OptlocError):  # noqa: N818  (a verdict about the problem)
@@ -87,8 +98,8 @@ class NoSolution(OptlocError):  # noqa: N818  (a verdict about the problem)
         return " ".join(refused or [verdict.sentence for verdict in verdicts])
 
 
-# So many names are still read.
-_FEW = 20
+# So many names are still read, and so many are looked through in the time of a keystroke.
+_FEW, _MANY = 20, 5000
 
 
 def nearest(word: str, known: Iterable[str]) -> str:
@@ -106,9 +117,11 @@ def nearest(word: str, known: Iterable[str]) -> str:
     str
         ``"did you mean 'km'? known are m, km"``.
     """
-    names = list(known)
+    names = list(islice(known, _MANY))
+    word = str(word)[:_SHOWN]
     folded = {name.lower(): name for name in names}
-    close = [repr(folded[name]) for name in get_close_matches(str(word).lower(), folded, n=2, cutoff=0.5)]
+    close = [repr(folded[name]) for name in get_close_matches(word.lower(), folded, n=2, cutoff=0.5)]
     hint = f"did you mean {' or '.join(close)}?" if close else ""
-    listed = "" if close and len(names) > _FEW else f"known are {', '.join(names)}"
+    more = f" and {len(names) - _FEW} more" if len(names) > 2 * _FEW else ""
+    listed = "" if close and len(names) > _FEW else f"known are {', '.join(names[:_FEW] if more else names)}{more}"
     return " ".join(part for part in (hint, listed) if part)

@@ -12,6 +12,7 @@ from optloc.cli.options import (
     AboveGround,
     Allow,
     Box,
+    Budget,
     Geodetic,
     Group,
     Height,
@@ -20,6 +21,7 @@ from optloc.cli.options import (
     LateFromData,
     Method,
     NoiseFromData,
+    Outside,
     Plot,
     ProblemPath,
     Quiet,
@@ -98,6 +100,8 @@ def fix(
     rescale: RescaleNoise = False,
     late: LateFromData = False,
     allow: Allow = None,
+    outside: Outside = False,
+    budget: Budget = None,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -167,6 +171,8 @@ def track(
     start_sigma: Annotated[
         str | None, typer.Option(metavar="P[,V[,A]]", help="Its standard deviations: position, velocity, acceleration.")
     ] = None,
+    outside: Outside = False,
+    budget: Budget = None,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -200,6 +206,8 @@ def separate(
         typer.Option("--region", metavar="LOW:HIGH", help="Where they are sought, metres: X,Y[,Z]:X,Y[,Z]."),
     ] = None,
     as_json: Json = False,
+    outside: Outside = False,
+    budget: Budget = None,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -225,6 +233,8 @@ def simulate(
     geodetic: Geodetic = False,
     seed: Annotated[int, typer.Option(help="Decides the draw.")] = 0,
     trials: Annotated[int, typer.Option(min=1, help="Independent draws; each becomes an epoch.")] = 1,
+    outside: Outside = False,
+    budget: Budget = None,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -265,6 +275,8 @@ def crlb(
     ] = None,
     dilution: Annotated[bool, typer.Option("--dilution", help="Map the geometric dilution of precision.")] = False,
     as_json: Json = False,
+    outside: Outside = False,
+    budget: Budget = None,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -297,6 +309,8 @@ def check(
     no_solve: Annotated[bool, typer.Option("--no-solve", help="Only read the file.")] = False,
     out: Annotated[Path | None, typer.Option(metavar="OUT", help="Write station health as .csv or .parquet.")] = None,
     plot: Annotated[Path | None, typer.Option("--plot", metavar="OUT.svg", help="Draw the residuals.")] = None,
+    outside: Outside = False,
+    budget: Budget = None,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -335,6 +349,8 @@ def plot(
     epoch: Annotated[
         str | None, typer.Option(metavar="LABEL", help="Epoch that is drawn, or case of a study; the first by default.")
     ] = None,
+    outside: Outside = False,
+    budget: Budget = None,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -428,6 +444,7 @@ def convert(
         str | None, typer.Option(metavar="cartesian|ecef", help="Frame of stations in x, y, z; cartesian by default.")
     ] = None,
     as_json: Json = False,
+    budget: Budget = None,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:

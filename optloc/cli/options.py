@@ -14,6 +14,7 @@ import typer
 from typer.core import TyperGroup
 
 from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.inputs import STANDARD_INPUT, access, budget_of, relax
 from optloc.base.types import Status
 from optloc.files.schema import ConstraintTable
 from optloc.problem.fix import status_named
@@ -47,7 +48,8 @@ class Group(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         """Run a command; malformed input and what the system refuses end in exit code 2, Ctrl-C in 130."""
         try:
-            return super().invoke(ctx)
+            with access(anew=True):
+                return super().invoke(ctx)
         except InvalidProblem as error:
             raise typer.Exit(_refuse(str(error))) from None
         except BrokenPipeError:
@@ -109,7 +111,7 @@ def shipped_problems() -> dict[str, Path]:
 def find_problem(path: Path) -> Path:
     """Return the path, or that of the shipped problem of this name where no such file is there."""
     # A bare word that is no file may be the name of a shipped problem; a path or a name with an ending never is.
-    if path.name != str(path) or path.suffix or path.exists():
+    if path == STANDARD_INPUT or path.name != str(path) or path.suffix or path.exists():
         return path
     known = shipped_problems()
     if str(path) in known:
@@ -121,7 +123,26 @@ def find_problem(path: Path) -> Path:
 ProblemPath = Annotated[
     Path,
     typer.Argument(
-        metavar="FILE", help="Problem file (TOML, format = 1), or the name of a shipped one.", callback=find_problem
+        metavar="FILE",
+        help="Problem file (TOML, format = 1), the name of a shipped one, or - for standard input.",
+        callback=find_problem,
+    ),
+]
+Outside = Annotated[
+    bool,
+    typer.Option(
+        "--outside",
+        callback=lambda wanted: relax(outside=wanted),
+        help="Let the file name files that are not beneath its own folder.",
+    ),
+]
+Budget = Annotated[
+    str | None,
+    typer.Option(
+        "--budget",
+        metavar="NAME=N,...",
+        callback=lambda text: text and relax(budget=budget_of(text, "--budget")),
+        help="Let files hold more: bytes, text (bytes of a document), rows, columns, cells, nesting.",
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON on standard output and nothing else.")]

@@ -15,7 +15,7 @@ from rich.console import Console
 from rich.table import Table
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.cli.options import STOPPED, Group, Json, Quiet, Verbose, complete, example
+from optloc.cli.options import STOPPED, Budget, Group, Json, Outside, Quiet, Verbose, complete, example
 
 # Heavy libraries are imported inside the commands, so that --help answers at once.
 
@@ -61,6 +61,8 @@ def run(
     ] = None,
     trials: Annotated[int | None, typer.Option(min=1, help="Trials, in the place of those of the file.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed, in the place of that of the file.")] = None,
+    outside: Outside = False,
+    budget: Budget = None,
     as_json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.inputs import read_bytes
 from optloc.base.types import Array
 from optloc.problem.problem import Problem
 
@@ -39,11 +41,7 @@ def check_files(folder: Path, sha256: Mapping[str, str]) -> None:
     """Raise InvalidProblem where a file is missing or has another SHA-256."""
     for name, expected in sha256.items():
         path = folder / name
-        try:
-            found = hashlib.sha256(path.read_bytes()).hexdigest()
-        except OSError as error:
-            advice = "put the whole data set there"
-            raise InvalidProblem(f"the file cannot be read ({error.strerror})", str(path), advice) from None
+        found = hashlib.sha256(read_bytes(path)).hexdigest()
         if found != expected:
             what = f"this is not the file that is meant: its SHA-256 begins {found[:12]}, not {expected[:12]}"
             raise InvalidProblem(what, str(path), "fetch it again, or read it nonetheless with verify=False")
@@ -54,10 +52,11 @@ def table(folder: Path, name: str) -> pd.DataFrame:
     import pandas as pd
 
     path = folder / f"{name}.csv"
+    data = read_bytes(path, lines=True)
     try:
-        return pd.read_csv(path)
-    except (OSError, ValueError) as error:
-        what = f"the table cannot be read ({getattr(error, 'strerror', None) or error})"
+        return pd.read_csv(io.BytesIO(data))
+    except ValueError as error:  # what pandas cannot parse is one
+        what = f"the table cannot be read ({str(error).partition(chr(10))[0]})"
         raise InvalidProblem(what, str(path), "put the whole data set there") from None
 
 

@@ -319,14 +319,15 @@ def _arrival(
         raise InvalidProblem("these rows do not combine arrival times", place, "give sigma or covariance")
     if not isinstance(given, Mapping):
         given = dict.fromkeys(c.stations, given)
-    unknown = [name for name in given if name not in c.stations]
+    numbers = {name: i for i, name in enumerate(c.stations)}
+    unknown = [name for name in given if name not in numbers]
     if unknown:
         raise InvalidProblem(f"there is no station {unknown[0]!r}", place, nearest(unknown[0], list(c.stations)))
     # A station that is not named measures exactly; rows without any noise are refused later.
     sigma = np.zeros(len(c.stations))
     for name, value in given.items():
         number, own = units.amount(value, unit, place)
-        sigma[c.stations.index(name)] = own.sigma_to_si(number)
+        sigma[numbers[name]] = own.sigma_to_si(number)
         if number <= 0.0:
             raise InvalidProblem("the standard deviation is not positive", place, "give a positive number")
     return sigma

@@ -11,10 +11,11 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
+from optloc.base.inputs import Budget, access
 from optloc.base.types import Array, Rows, Stations
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.files.measurements import ESTIMATE, Chunk, check_repeats, chunks_of, square, with_baseline
-from optloc.files.schema import ConstraintTable, ProblemFile, Units, join, read_document
+from optloc.files.schema import ConstraintTable, ProblemFile, Units, join, name_of, read_document
 from optloc.files.stations import over_epochs, survey
 from optloc.files.table import Epochs, Keys, Table, epochs_of, need_clock, table_of
 from optloc.files.unknowns import bias_of, constraints_of, known_of, motions_of, needs_clock, places_of, prior_of
@@ -89,20 +90,25 @@ class Draft:
     moving: bool
 
 
-def load(path: str | Path) -> Problem:
+def load(path: str | Path, *, outside: bool | None = None, budget: Budget | None = None) -> Problem:
     """Return the problem of a file.
 
     Parameters
     ----------
     path : str or Path
         A TOML file with ``format = 1``.
+    outside : bool, optional
+        Whether it may name files that are not beneath its own folder; it may not by default.
+    budget : Budget, optional
+        How much it and its tables may hold.
 
     Raises
     ------
     InvalidProblem
         One sentence that names the file, the row and the column or key, and says what to do.
     """
-    return read(path).problem
+    with access(outside=outside, budget=budget):
+        return read(path).problem
 
 
 def read(path: str | Path, *, values: bool = True, more: Mapping[str, ConstraintTable] | None = None) -> Loaded:
@@ -130,13 +136,13 @@ def read(path: str | Path, *, values: bool = True, more: Mapping[str, Constraint
 
 def draft(path: Path, *, values: bool, more: Mapping[str, ConstraintTable] | None = None) -> Draft:
     """Return the problem of a file together with its tables; arguments as `read`."""
-    file = read_document(path)
+    file, source = read_document(path), name_of(path)
     # Tables are read before anything is converted: a missing file is told before a wrong unit.
-    known = places_of(file, path.parent, path.name)
-    stations = table_of(file.stations, path.parent, join(path.name, "[stations]"))
-    places = [join(path.name, f"[[measurements]] {i + 1}") for i in range(len(file.measurements))]
+    known = places_of(file, path.parent, source)
+    stations = table_of(file.stations, path.parent, join(source, "[stations]"))
+    places = [join(source, f"[[measurements]] {i + 1}") for i in range(len(file.measurements))]
     tables = [table_of(m, path.parent, place) for m, place in zip(file.measurements, places, strict=True)]
-    return assemble(file, stations, tables, path.name, values=values, known=known, more=more)
+    return assemble(file, stations, tables, source, values=values, known=known, more=more)
 
 
 def assemble(

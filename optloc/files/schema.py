@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -11,6 +10,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.inputs import STANDARD_INPUT, read_text, toml_of
 from optloc.base.units import SI_UNIT, SPEED_OF_LIGHT, AzimuthConvention, Conversion, Quantity, conversion
 from optloc.models import MODELS, Model
 
@@ -156,7 +156,7 @@ class DataTable(_Table):
     """The rows themselves, one inline table each."""
     columns: dict[str, str] = Field(default_factory=dict)
     """What the file calls its columns: `{ a = "rx1", z = "tdoa_ns" }`."""
-    separator: str = Field(default=",", min_length=1, max_length=1)
+    separator: Literal[",", ";", "\t", "|", ":", " "] = ","
     """What separates the fields of a CSV file."""
 
 
@@ -328,13 +328,21 @@ def schema() -> dict[str, Any]:
 
 
 def read_document(path: Path) -> ProblemFile:
-    """Return the contents of a problem file; raise InvalidProblem where it is none."""
-    return validate(parse_toml(read_text(path), path.name), path.name)
+    """Return the contents of a problem file, or of standard input; raise InvalidProblem where it is none."""
+    source = name_of(path)
+    return validate(parse_toml(read_text(path), source), source)
+
+
+def name_of(path: Path) -> str:
+    """Return what to call a document."""
+    return "standard input" if path == STANDARD_INPUT else path.name
 
 
 def parse_toml(text: str, source: str) -> dict[str, Any]:
     """Return TOML of format 1 as data; `source` is the place to name."""
-    data = _toml(text, source)
+    if not text.strip():
+        raise InvalidProblem("the file is empty", source, "begin it with the line format = 1")
+    data = toml_of(text, source)
     # true equals 1 in Python.
     if data.get("format") != 1 or isinstance(data.get("format"), bool):
         given = f"format {data['format']!r} is unknown" if "format" in data else "the key 'format' is missing"
@@ -363,50 +371,6 @@ def conform(model: type[_Model], data: dict[str, Any], source: str) -> _Model:
         return model.model_validate(data)
     except ValidationError as error:
         raise _sentence(error, source, data, model) from None
-
-
-def read_text(path: Path) -> str:
-    """Return the text of a file; raise InvalidProblem where it is missing, a folder or not UTF-8."""
-    try:
-        # Editors of Windows begin files with a byte order mark.
-        return find_file(path).read_bytes().decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        line = error.object[: error.start].count(b"\n") + 1
-        raise InvalidProblem("the text is not UTF-8", join(path.name, f"line {line}"), "save it as UTF-8") from None
-
-
-def find_file(path: Path) -> Path:
-    """Return a path that is a readable file; raise InvalidProblem otherwise."""
-    if path.is_dir():
-        raise InvalidProblem("this is a folder, not a file", str(path), "name a file in it")
-    if not path.exists():
-        near = nearest(path.name, sorted(p.name for p in path.parent.iterdir())) if path.parent.is_dir() else ""
-        hint = (
-            near.partition("?")[0] + "?" if "?" in near else "check the name; it is taken relative to the problem file"
-        )
-        raise InvalidProblem("there is no such file", str(path), hint)
-    try:
-        # Opening it is the only sure test of permissions.
-        path.open("rb").close()
-    except OSError as error:
-        raise InvalidProblem(
-            f"the file cannot be opened ({error.strerror})", str(path), "check its permissions"
-        ) from None
-    return path
-
-
-def _toml(text: str, source: str) -> dict[str, Any]:
-    if not text.strip():
-        raise InvalidProblem("the file is empty", source, "begin it with the line format = 1")
-    try:
-        return tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
-        # tomllib has the place in its message only.
-        what, _, place = str(error).partition(" (at ")
-        line = place.rstrip(")").partition(",")[0] if place else None
-        raise InvalidProblem(
-            f"this is not TOML: {what[0].lower()}{what[1:]}", join(source, line), "see toml.io"
-        ) from None
 
 
 def _sentence(error: ValidationError, source: str, data: dict[str, Any], model: type[BaseModel]) -> InvalidProblem:

@@ -9,6 +9,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import CARTESIAN, ECEF, Frame, ecef_to_geodetic
+from optloc.base.inputs import at_most
 from optloc.base.types import Array, Stations
 from optloc.files.schema import FrameTable, StationsTable, Units, join
 from optloc.files.table import Epochs, Table
@@ -203,7 +204,6 @@ def over_epochs(found: Survey, section: StationsTable, epochs: Epochs, used: Seq
     used : sequence of int array (u, 2)
         Pairs (epoch, station) whose position is needed.
     """
-    s = len(found.names)
     if found.moving:
         position, velocity, axes = spread(found, section, epochs, np.concatenate(used))
     else:
@@ -212,8 +212,7 @@ def over_epochs(found: Survey, section: StationsTable, epochs: Epochs, used: Seq
         velocity, axes = (None if v is None else v[order][None] for v in (found.velocity, found.axes))
     covariance = None
     if found.sigma is not None:
-        first = np.array([np.flatnonzero(found.index == i)[0] for i in range(s)])
-        covariance = found.sigma[first, None, None] ** 2 * np.eye(found.position.shape[-1])
+        covariance = found.sigma[_first(found), None, None] ** 2 * np.eye(found.position.shape[-1])
     return Stations(position, found.names, velocity, axes, covariance, section.span)
 
 
@@ -233,7 +232,7 @@ def spread(
         epoch, station = used[int(np.flatnonzero(missing)[0])]
         what = f"{found.noun} {found.names[station]!r} has no position at epoch {epochs.labels[epoch]!r}"
         raise InvalidProblem(what, found.table.source, "add it, or leave out what it measured then")
-    first = np.array([np.flatnonzero(found.index == i)[0] for i in range(len(found.names))])
+    first = _first(found)
     # Wherever it is not needed a station stands where it was first seen: finite, and of no weight.
     low, high = np.where(low < 0, first, low), np.where(high < 0, first, high)
 
@@ -252,6 +251,11 @@ def spread(
     return between(found.position), velocity, None if found.axes is None else found.axes[low]
 
 
+def _first(found: Survey) -> Array:
+    """Return the first row (s,) of each station."""
+    return np.asarray(np.unique(found.index, return_index=True)[1])
+
+
 def _turning(found: Survey) -> bool:
     return any(found.table.has(key) for key in ("yaw_deg", "heading_deg", "qw"))
 
@@ -261,6 +265,7 @@ def _by_label(found: Survey, epochs: Epochs) -> tuple[Array, Array, Array]:
     known, place = np.unique(labels, return_inverse=True)
     at = np.searchsorted(known, np.array(epochs.labels)).clip(max=len(known) - 1)
     at = np.where(known[at] == np.array(epochs.labels), at, -1)
+    at_most("cells", max(len(known), epochs.count) * len(found.names), found.table.source)
     # Row of each label and station; the last line, -1, is that of labels that the table lacks.
     grid = np.full((len(known) + 1, len(found.names)), -1)
     grid[place, found.index] = np.arange(len(labels))
@@ -281,11 +286,12 @@ def _by_time(found: Survey, section: StationsTable, epochs: Epochs) -> tuple[Arr
         raise InvalidProblem(
             "the stations move in time, but the measurements are not dated", found.table.source, advice
         )
+    # Every station has a place at every epoch, used or not.
+    at_most("cells", k * len(found.names), found.table.source)
     low = np.full((k, len(found.names)), -1)
     high, share = low.copy(), np.zeros(low.shape)
-    for station in range(len(found.names)):
-        rows = np.flatnonzero(found.index == station)
-        rows = rows[np.argsort(times[rows], kind="stable")]
+    order = np.lexsort((times, found.index))
+    for station, rows in enumerate(np.split(order, np.cumsum(np.bincount(found.index))[:-1])):
         own = times[rows]
         again = np.flatnonzero(np.diff(own) == 0.0)
         if len(again):

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from csv import Error as CSVError
+from csv import reader as lines_of
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -10,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.inputs import at_most, decoded, has_controls, read_bytes, within
 from optloc.base.types import Array
-from optloc.files.schema import DataTable, find_file, join, read_text
+from optloc.files.schema import DataTable, join
 
 _PARQUET = (".parquet", ".pq")
 _FILES = (".csv", ".txt", ".tsv", *_PARQUET)
@@ -33,6 +38,8 @@ class Table:
         What the columns that are asked for are called here.
     first : int array (m,), optional
         Row of the source that each row was, where it is a part of a table.
+    others : mapping of str to str
+        Type of each column that is neither numbers, dates nor text.
     """
 
     source: str
@@ -40,11 +47,12 @@ class Table:
     count: int
     names: Mapping[str, str] = field(default_factory=dict)
     first: Array | None = None
+    others: Mapping[str, str] = field(default_factory=dict)
 
     def take(self, pick: Array) -> Table:
         """Return some of the rows."""
         columns = {name: column[pick] for name, column in self.columns.items()}
-        return Table(self.source, columns, len(pick), self.names, pick)
+        return Table(self.source, columns, len(pick), self.names, pick, self.others)
 
     def name(self, key: str) -> str:
         """Return what a column is called in this table."""
@@ -52,7 +60,7 @@ class Table:
 
     def has(self, key: str) -> bool:
         """Return whether there is such a column."""
-        return self.name(key) in self.columns
+        return self.name(key) in self.columns or self.name(key) in self.others
 
     def where(self, key: str, row: int | None = None) -> str:
         """Return the place of a cell (0-based row) or of a column."""
@@ -65,6 +73,9 @@ class Table:
     def raw(self, key: str) -> Array:
         """Return a column as it was read; raise InvalidProblem where there is none."""
         name = self.name(key)
+        if name in self.others:
+            what = f"it holds {self.others[name]}, which is neither numbers, dates nor text"
+            raise InvalidProblem(what, self.where(key), "write it as numbers or text")
         if name not in self.columns:
             what = f"there is no column {name!r}" + (f" (for {key})" if name != key else "")
             # Columns that already have a role are no suggestion.
@@ -82,7 +93,7 @@ class Table:
         if bad.any():
             row = int(np.flatnonzero(bad)[0])
             given = column[row]
-            what = "the cell is empty" if _empty(given) else f"{given} is not a finite number"
+            what = "the cell is empty" if _empty(given) else f"{given!s} is not a finite number"
             raise InvalidProblem(what, self.where(key, row), "give a number, or leave the row out")
         return values
 
@@ -91,17 +102,15 @@ class Table:
         column = self.raw(key)
         if column.dtype.kind in "iu":
             return column.astype(str).astype(object)
-        if column.dtype.kind == "f":
-            # Labels that a table has as floats: 3.0 is the station 3; 15 digits keep every whole number that a float
-            # can.
-            column = np.array([None if np.isnan(v) else f"{v:.15g}" for v in column], dtype=object)
-        elif column.dtype.kind == "M":
+        if column.dtype.kind == "M":
             column = np.datetime_as_string(column).astype(object)
         # Each different cell is spelled once: millions of rows have few names.
-        spelled = {cell: "" if _empty(cell) else str(cell).strip() for cell in set(column.tolist())}
+        spelled = {cell: _spelled(cell) for cell in set(column.tolist())}
         out = np.array(list(map(spelled.__getitem__, column.tolist())), dtype=object)
-        if "" in spelled.values():
-            raise InvalidProblem("the cell is empty", self.where(key, int(np.flatnonzero(out == "")[0])), "give a name")
+        wrong = next((text for text in spelled.values() if not text or has_controls(text)), None)
+        if wrong is not None:
+            what = f"{wrong!r} holds control characters" if wrong else "the cell is empty"
+            raise InvalidProblem(what, self.where(key, int(np.flatnonzero(out == wrong)[0])), "give a name")
         return out
 
     def times(self, key: str, factor: float) -> Array:
@@ -109,29 +118,56 @@ class Table:
         column = self.raw(key)
         # A date has two hyphens: 2024-05-01; a negative number has one.
         if column.dtype.kind == "O" and len(column) and isinstance(column[0], str) and column[0].count("-") >= 2:
-            try:
-                column = column.astype("datetime64[ns]")
-            except ValueError as error:
-                raise InvalidProblem(f"a date cannot be read ({error})", self.where(key), "use ISO 8601") from None
+            column = self._dates(key, column)
         if column.dtype.kind == "M":
+            late = np.isnat(column) | (np.abs(column.astype("datetime64[Y]").astype(np.int64)) > _YEARS)
+            if late.any():
+                place = self.where(key, int(np.flatnonzero(late)[0]))
+                raise InvalidProblem("the date is missing, or not in these centuries", place, "write it as 2024-05-01")
             return column.astype("datetime64[ns]").astype(np.int64) * 1e-9
         return self.numbers(key) * factor
 
-    def _parse(self, key: str, column: Array) -> Array:
-        # All at once where all are numbers; else cell by cell, to name the one that is not.
+    def _dates(self, key: str, column: Array) -> Array:
+        import pandas as pd
+
         try:
-            return column.astype(np.float64)
-        except (TypeError, ValueError):
-            pass
-        values = np.full(len(column), np.nan)
-        for row, cell in enumerate(column):
-            if _empty(cell):
-                continue
-            try:
-                values[row] = float(cell)
-            except (TypeError, ValueError):
-                raise InvalidProblem(f"{cell!r} is not a number", self.where(key, row), "give a number") from None
-        return values
+            # pandas knows time zones, which numpy does not; one that is not written is UTC.
+            return np.asarray(pd.to_datetime(column, format="ISO8601", utc=True).tz_localize(None).to_numpy())
+        except (ValueError, OverflowError, TypeError) as error:
+            what = str(error).partition(",")[0]
+            raise InvalidProblem(f"a date cannot be read ({what})", self.where(key), "use ISO 8601") from None
+
+    def _parse(self, key: str, column: Array) -> Array:
+        # Dates and truth values become numbers in numpy, and mean none.
+        if column.dtype.kind not in "OSU":
+            raise InvalidProblem(f"it holds {column.dtype}, not numbers", self.where(key), "give numbers")
+        cells = column.tolist()
+        # All at once where all are numbers; else cell by cell, to name the one that is not.
+        if all(isinstance(cell, str) and "_" not in cell for cell in cells):
+            with suppress(ValueError):
+                return column.astype(np.float64)
+        return np.array([np.nan if _empty(cell) else self._number(key, row, cell) for row, cell in enumerate(cells)])
+
+    def _number(self, key: str, row: int, cell: Any) -> float:
+        # Python reads 1_000 as a thousand, which in a table is a slip, and yes as one.
+        if not isinstance(cell, bool) and "_" not in str(cell):
+            with suppress(TypeError, ValueError, OverflowError):
+                return float(cell)
+        raise InvalidProblem(f"{cell!r} is not a number", self.where(key, row), "give a number")
+
+
+# Years from 1970 that fit into nanoseconds of 64 bits; numpy goes on with others, and means an earlier century.
+_YEARS = 290
+
+
+def _spelled(cell: object) -> str:
+    """Return a name as text, empty where the cell is."""
+    if _empty(cell):
+        return ""
+    # Names that a table has as floats: 3.0 is the station 3; of larger ones no float knows the last digit.
+    if isinstance(cell, float) and cell.is_integer() and abs(cell) < 2.0**53:
+        return str(int(cell))
+    return str(cell).strip()
 
 
 def _empty(cell: object) -> bool:
@@ -148,17 +184,12 @@ def table_of(section: DataTable, folder: Path, where: str) -> Table:
     if section.rows is not None:
         return of_rows(section.rows, where, section.columns)
     assert section.file is not None
-    path = folder / section.file
+    place = join(where, "key 'file'")
+    path = within(folder, section.file, place)
     suffix = path.suffix.lower()
     if suffix not in _FILES and not path.is_dir():
-        raise InvalidProblem(
-            f"{section.file!r} is of no known type", join(where, "key 'file'"), f"use {', '.join(_FILES)}"
-        )
-    found = (
-        parquet(find_file(path), section.columns)
-        if suffix in _PARQUET
-        else csv(path, section.separator, section.columns)
-    )
+        raise InvalidProblem(f"{section.file!r} is of no known type", place, f"use {', '.join(_FILES)}")
+    found = parquet(path, section.columns) if suffix in _PARQUET else csv(path, section.separator, section.columns)
     if not found.count:
         raise InvalidProblem("the table has no rows", found.source, "give at least one")
     return found
@@ -175,28 +206,25 @@ def of_rows(rows: Sequence[Mapping[str, Any]], where: str, names: Mapping[str, s
 def of_frame(frame: Any, where: str, names: Mapping[str, str]) -> Table:
     """Return the table of a pandas data frame, or of a mapping from names to columns."""
     columns = {str(name): np.asarray(frame[name]) for name in (frame.columns if hasattr(frame, "columns") else frame)}
-    sizes = {len(column) for column in columns.values()}
+    sizes = {len(column) if column.ndim == 1 else 0 for column in columns.values()}
     if len(sizes) != 1 or not sizes.copy().pop():
         raise InvalidProblem("the table has no rows, or columns of unequal length", where, "give at least one row")
     return Table(where, columns, sizes.pop(), names)
 
 
-def csv(path: Path, separator: str, names: Mapping[str, str]) -> Table:
-    """Return the table of a CSV file with a header, all cells as text."""
+def csv(path: Path, separator: str | None, names: Mapping[str, str]) -> Table:
+    """Return the table of a CSV file with a header, all cells as text; without a separator it is seen in the header."""
     import pyarrow as pa
     from pyarrow import csv as reader
 
-    text = read_text(path)
-    # The header is read by hand: its names may stand twice or be empty, and pyarrow would go on.
-    header = [name.strip().strip('"') for name in text.partition("\n")[0].strip().split(separator)]
-    if not any(header):
-        raise InvalidProblem("the file is empty or has no header", path.name, "begin it with the names of its columns")
-    twice = next((name for i, name in enumerate(header) if name in header[:i]), None)
-    if twice is not None:
-        raise InvalidProblem(f"column {twice!r} occurs twice", join(path.name, "header"), "rename one of them")
+    data = read_bytes(path, lines=True)
+    top = decoded(data.partition(b"\n")[0], path.name).strip()
+    # What separates is what the header has most of.
+    separator = max(",;\t", key=top.count) if separator is None else separator
+    header = _header(top, separator, path.name)
     try:
         read = reader.read_csv(
-            pa.BufferReader(text.encode()),
+            pa.BufferReader(data),
             read_options=reader.ReadOptions(column_names=header, skip_rows=1, use_threads=False),
             parse_options=reader.ParseOptions(delimiter=separator),
             # All cells as text: what a number is, is decided where the column is known, and told with its row.
@@ -205,33 +233,95 @@ def csv(path: Path, separator: str, names: Mapping[str, str]) -> Table:
             ),
         )
     except pa.ArrowInvalid as error:
-        # pyarrow counts from the first line after the header that it skipped.
-        what = str(error).partition("CSV parse error: ")[2] or str(error)
-        line, _, rest = what.splitlines()[0].rpartition(": Expected")
-        number = line.removeprefix("Row #")
-        place = join(path.name, f"row {int(number) - 1}" if number.isdigit() else None)
-        what = f"expected{rest}" if rest else what
-        raise InvalidProblem(f"this is no CSV table: {what}", place, "check its separators and quotes") from None
+        decoded(data, path.name)  # what is not UTF-8 is told with its line
+        raise _no_csv(str(error), path.name) from None
+    at_most("cells", read.num_rows * len(header), path.name)
     columns = {name: read.column(name).to_numpy(zero_copy_only=False).astype(object) for name in header}
     return Table(path.name, columns, read.num_rows, names)
 
 
+def _header(line: str, separator: str, source: str) -> list[str]:
+    """Return the names of the columns; pyarrow would go on where one is empty or stands twice."""
+    at_most("columns", line.count(separator) + 1, source)
+    try:
+        header = [name.strip() for name in next(lines_of([line], delimiter=separator, strict=True), [])]
+    except CSVError as error:
+        raise _no_csv(str(error), join(source, "header")) from None
+    if not any(header):
+        raise InvalidProblem("the file is empty or has no header", source, "begin it with the names of its columns")
+    twice, count = Counter(header).most_common(1)[0]
+    if count > 1:
+        raise InvalidProblem(f"column {twice!r} occurs twice", join(source, "header"), "rename one of them")
+    return header
+
+
+def _no_csv(complaint: str, source: str) -> InvalidProblem:
+    # pyarrow counts from the first line after the header that it skipped.
+    what = complaint.partition("CSV parse error: ")[2] or complaint
+    line, _, rest = what.splitlines()[0].rpartition(": Expected")
+    number = line.removeprefix("Row #")
+    place = join(source, f"row {int(number) - 1}" if number.isdigit() else None)
+    what = f"expected{rest}" if rest else what
+    return InvalidProblem(f"this is no CSV table: {what}", place, "check its separators and quotes")
+
+
 def parquet(path: Path, names: Mapping[str, str]) -> Table:
-    """Return the table of a Parquet file."""
+    """Return the table of a Parquet file; columns that are neither numbers, dates nor text are known by name only."""
     import pyarrow as pa
     from pyarrow import parquet as reader
 
+    data = pa.BufferReader(read_bytes(path))
     try:
-        read = reader.read_table(path)
-    except (pa.ArrowException, OSError):
-        raise InvalidProblem("the file is not Parquet", path.name, "write it again, or name a CSV file .csv") from None
-    columns = {name: read.column(name).to_numpy(zero_copy_only=False) for name in read.column_names}
-    return Table(path.name, columns, read.num_rows, names)
+        about = reader.ParquetFile(data)
+        schema = about.schema_arrow
+        # What it declares is held against the budget before anything is unpacked: 1 KiB may stand for terabytes.
+        _check_size(about.metadata, schema, path.name)
+        texts = [
+            entry.name for entry in schema if pa.types.is_string(entry.type) or pa.types.is_large_string(entry.type)
+        ]
+        fit = {entry.name: _fits(pa, entry.type) for entry in schema}
+        # Text stays in the dictionary that it is stored with: a long word that all rows share is there once.
+        read = reader.ParquetFile(data, read_dictionary=texts).read(columns=[name for name in fit if fit[name]])
+        columns = {name: _parquet_column(pa, read.column(name)) for name in read.column_names}
+    except (pa.ArrowException, OSError, UnicodeDecodeError, OverflowError) as error:
+        what = "a column of text is not UTF-8" if isinstance(error, UnicodeDecodeError) else "the file is not Parquet"
+        raise InvalidProblem(what, path.name, "write it again, or name a CSV file .csv") from None
+    others = {entry.name: str(entry.type) for entry in schema if not fit[entry.name]}
+    return Table(path.name, columns, read.num_rows if columns else about.metadata.num_rows, names, others=others)
+
+
+def _check_size(about: Any, schema: Any, source: str) -> None:
+    """Hold what a Parquet file says of itself against the budget."""
+    at_most("columns", len(schema), source)
+    at_most("rows", about.num_rows, source)
+    at_most("cells", about.num_rows * len(schema), source)
+    groups = [about.row_group(i) for i in range(about.num_row_groups)]
+    at_most("bytes", sum(max(group.total_byte_size, 0) for group in groups), source)
+    if sum(group.num_rows for group in groups) != about.num_rows:
+        raise InvalidProblem("its parts have other numbers of rows than it says", source, "write it again")
+    twice, count = Counter(schema.names).most_common(1)[0] if len(schema) else ("", 0)
+    if count > 1:
+        raise InvalidProblem(f"column {twice!r} occurs twice", source, "rename one of them")
+
+
+def _fits(pa: Any, kind: Any) -> bool:
+    """Return whether a column of a Parquet file can be one of a table: numbers, dates or text."""
+    kind = kind.value_type if pa.types.is_dictionary(kind) else kind
+    tests = "is_integer is_floating is_decimal is_timestamp is_date is_string is_large_string is_null"
+    return any(getattr(pa.types, test)(kind) for test in tests.split())
+
+
+def _parquet_column(pa: Any, column: Any) -> Array:
+    if not pa.types.is_dictionary(column.type):
+        return np.asarray(column.to_numpy(zero_copy_only=False))
+    column = column.unify_dictionaries().combine_chunks()  # each group of rows has a dictionary of its own
+    words = np.array([*column.dictionary.to_pylist(), None], dtype=object)
+    return np.asarray(words[column.indices.fill_null(len(words) - 1).to_numpy(zero_copy_only=False)])
 
 
 def _to_column(cells: list[Any]) -> Array:
-    # A column of numbers is an array of them; anything else stays as it was written.
-    if all(isinstance(cell, int | float) and not isinstance(cell, bool) for cell in cells):
+    # A column of numbers is an array of them, where floats keep all their digits; anything else stays as written.
+    if all(isinstance(cell, float) or (type(cell) is int and abs(cell) < 2**53) for cell in cells):
         return np.array(cells)
     column = np.empty(len(cells), dtype=object)
     column[:] = cells

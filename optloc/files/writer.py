@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
+from optloc.base.inputs import read_bytes
 from optloc.base.types import Array
 from optloc.files.reader import Draft, draft
 from optloc.files.table import Table
@@ -111,11 +112,11 @@ def write_measured(source: Path, out: Path, z: Array, note: str = "") -> list[Pa
     # What the author left out stays out, and takes the same defaults again.
     settings = made.file.model_dump(exclude_defaults=True)
     settings["title"] = " ".join(part for part in (made.loaded.title, f"({note})" if note else "") if part)
-    for section in (settings["stations"], settings.get("target", {}), *settings.get("targets", {}).values()):
-        if "file" in section:
-            # Tables that are not written again stay where they are: their paths are relative to the new file.
-            section["file"] = os.path.relpath(source.parent / section["file"], out.parent)
     written = [out]
+    kept = (settings["stations"], settings.get("target", {}), *settings.get("targets", {}).values())
+    for i, section in enumerate(kept):
+        if "file" in section:
+            written += _keep(section, source.parent, out, "stations" if i == 0 else f"target-{i}")
     for i, (section, table) in enumerate(zip(settings["measurements"], made.tables, strict=True)):
         path = out.with_name(f"{out.stem}-{i + 1}.csv")
         write_csv(path, _rows(made, table, z))
@@ -128,6 +129,22 @@ def write_measured(source: Path, out: Path, z: Array, note: str = "") -> list[Pa
     except OSError as error:
         raise unwritable(out, error) from None
     return written
+
+
+def _keep(section: dict[str, Any], folder: Path, out: Path, role: str) -> list[Path]:
+    """Let a section name a table that is not written again, and return the copy of it if one is needed."""
+    path = folder / section["file"]
+    section["file"] = os.path.relpath(path, out.parent)
+    if Path(os.path.realpath(path)).is_relative_to(os.path.realpath(out.parent)):
+        return []
+    # A problem file names nothing beyond its folder: what is elsewhere is copied beside it.
+    copy = out.with_name(f"{out.stem}-{role}{path.suffix}")
+    section["file"] = copy.name
+    try:
+        copy.write_bytes(read_bytes(path))
+    except OSError as error:
+        raise unwritable(copy, error) from None
+    return [copy]
 
 
 def _rows(made: Draft, table: Table, z: Array) -> dict[str, Any]:

@@ -8,21 +8,24 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from importlib.resources import as_file, files
 from importlib.resources.abc import Traversable
 from itertools import combinations, product
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.inputs import read_text, within
 from optloc.base.types import Array, Stations
 from optloc.base.units import SI_UNIT
 from optloc.files import read
-from optloc.files.schema import conform, join, kind_model, parse_toml, read_text
+from optloc.files.schema import conform, join, kind_model, parse_toml
 from optloc.models import MODELS
 from optloc.problem.build import assemble, measured
 from optloc.problem.epochs import separable
@@ -154,6 +157,10 @@ def shipped() -> dict[str, Traversable]:
     return dict(sorted(found.items()))
 
 
+# Cases whose problems are all held in memory, and part files of a folder: more are a slip, and take days to begin.
+_CASES, _PARTS = 10_000, 1_000_000
+
+
 def plan_of(file: Path, *, trials: int | None = None, seed: int | None = None) -> Plan:
     """Return the plan of a study file, or of a shipped study by its name.
 
@@ -194,13 +201,19 @@ def planned(text: str, source: str, folder: Path, *, trials: int | None = None, 
     except InvalidProblem as error:
         where = ", ".join(part for part in (source, error.where) if part)
         raise InvalidProblem(error.what, where, error.advice) from None
+    parts = len(cases) * len(methods)
+    if parts <= _PARTS:
+        parts = sum(-(-case.trials // Cell(case, method).stretch) for case in cases for method in methods)
+    if parts > _PARTS:
+        advice = "ask for fewer trials or cases, or let tasks be larger: chunk in [[method]]"
+        raise InvalidProblem(f"the study has {parts} parts, {_PARTS} at most", source, advice)
     _distinct([method.name for method in methods], source, "method")
     _distinct([table.name for table in study.scenario], source, "scenario")
     return Plan(study, text, tuple(Cell(case, method) for case in cases for method in methods), str(folder.resolve()))
 
 
 def _distinct(names: list[str], source: str, what: str) -> None:
-    twice = sorted({name for name in names if names.count(name) > 1})
+    twice = sorted(name for name, count in Counter(names).items() if count > 1)
     if twice:
         raise InvalidProblem(f"there are two {what}s {twice[0]!r}", source, f"give each {what} a name of its own")
 
@@ -243,6 +256,9 @@ def _sweep(table: ScenarioTable) -> Iterator[tuple[dict[str, Any], ScenarioTable
         if not values or name in ("name", "sweep", "noise", "trials"):
             what = "has no values" if not values else "cannot be swept"
             raise InvalidProblem(f"{name!r} {what}", join(where, "sweep"), "give a list; noise has levels of its own")
+    if (count := prod(map(len, table.sweep.values()))) > _CASES:
+        what = f"its lists make {count} cases, {_CASES} at most"
+        raise InvalidProblem(what, join(where, "sweep"), "sweep fewer values, or write several studies")
     for chosen in product(*table.sweep.values()):
         swept = dict(zip(table.sweep, chosen, strict=True))
         # Swept values are put into what the file says and read again, so that they are checked like written ones.
@@ -266,7 +282,7 @@ def _template(table: ScenarioTable, folder: Path, where: str, seed: int) -> Prob
     assert table.problem is not None
     shipped = files("optloc") / "scenarios"
     names = sorted(entry.name.removesuffix(".toml") for entry in shipped.iterdir() if entry.name.endswith(".toml"))
-    path = folder / table.problem
+    path = within(folder, table.problem, join(where, "problem"))
     if path.suffix == "" and not path.exists():
         if table.problem not in names:
             advice = nearest(table.problem, names) + ", or the path of a problem file"

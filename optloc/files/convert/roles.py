@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -13,9 +12,9 @@ from typing import Any
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.inputs import json_of, read_text
 from optloc.base.types import Array
 from optloc.base.units import UNITS
-from optloc.files.schema import find_file, read_text
 from optloc.files.table import Table, csv, parquet
 
 # Role: names that suggest it, the likeliest first; without case, unit and what is no letter.
@@ -112,15 +111,11 @@ class Roles:
 def read_table(path: Path) -> Table:
     """Return a CSV or Parquet table; what separates the fields of a CSV file is seen from its header."""
     if path.suffix.lower() in (".parquet", ".pq"):
-        return parquet(find_file(path), {})
+        return parquet(path, {})
     if path.suffix.lower() not in (".csv", ".tsv", ".txt") and path.is_file():
         known = "use .csv, .tsv, .txt or .parquet, and .geojson for stations"
         raise InvalidProblem(f"files of type {path.suffix or path.name!r} are unknown", str(path), known)
-    with find_file(path).open("rb") as stream:
-        header = stream.readline()
-    # What separates is what the header has most of.
-    separator = max(b",;\t", key=header.count)
-    found = csv(path, chr(separator), {})
+    found = csv(path, None, {})
     if not found.count:
         raise InvalidProblem("the table has no rows", found.source, "give at least one")
     return found
@@ -182,11 +177,7 @@ def _of_table(path: Path, told: Mapping[str, str], frame: str) -> Places:
 
 def _of_geojson(path: Path) -> Places:
     """Return the points of a GeoJSON feature collection (RFC 7946: longitude, latitude, height above WGS 84)."""
-    try:
-        data = json.loads(read_text(path))
-    except json.JSONDecodeError as error:
-        what = f"this is not JSON: {error.msg.lower()}"
-        raise InvalidProblem(what, f"{path.name}, line {error.lineno}", "write it again") from None
+    data = json_of(read_text(path), path.name)
     features = data.get("features") if isinstance(data, dict) else None
     if not isinstance(features, list):
         raise InvalidProblem("there is no list of features", path.name, "give a GeoJSON FeatureCollection of points")
