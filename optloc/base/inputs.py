@@ -253,7 +253,7 @@ def _open(path: Path) -> int:
     except (FileNotFoundError, NotADirectoryError):
         raise InvalidProblem("there is no such file", str(path), _like(path)) from None
     except OSError as error:
-        if path.is_dir():
+        if os.path.isdir(path):  # noqa: PTH112  # it does not raise for a name that is too long
             raise InvalidProblem("this is a folder, not a file", str(path), "name a file in it") from None
         what = f"the file cannot be opened ({error.strerror})"
         raise InvalidProblem(what, str(path), "check its permissions and links") from None

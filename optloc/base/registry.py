@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import importlib.util
+import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import Any, TypeVar, cast
+
+from optloc.base.errors import InvalidProblem
 
 T = TypeVar("T")
 
@@ -93,3 +98,57 @@ class Table(MutableMapping[str, T]):
         package = "an unnamed package" if entry.dist is None else f"the package {entry.dist.name!r}"
         what = f"{package} adds nothing to {self._group} as {entry.name!r}: {why}"
         warnings.warn(what, RuntimeWarning, stacklevel=2)
+
+
+# Plugins that somebody names on a command line: with entry points the only ways in which foreign code comes in.
+
+_PLUGINS: list[str] = []
+
+
+def plugins() -> tuple[str, ...]:
+    """Return the plugins that were loaded by name: what another process needs to know the same."""
+    return tuple(_PLUGINS)
+
+
+def load_plugin(name: str) -> None:
+    """Run a Python file or module that adds to the tables, such as ``optloc.MODELS["mine"] = ...``, once.
+
+    Parameters
+    ----------
+    name : str
+        Path of a file that ends in .py, or name of an installed module. It may do whatever Python can: it must come
+        from the user, never from a file that is read.
+
+    Raises
+    ------
+    InvalidProblem
+        Where there is none, or it fails; with what it says.
+    """
+    path = Path(name)
+    known = str(path.resolve()) if path.suffix == ".py" else name
+    if known in _PLUGINS:
+        return
+    try:
+        if path.suffix == ".py":
+            _run_file(path.resolve())
+        else:
+            importlib.import_module(name)
+    except Exception as error:
+        what = f"the plugin cannot be loaded ({type(error).__name__}: {error})"
+        raise InvalidProblem(what, name, "give a file that ends in .py, or the name of an installed module") from error
+    _PLUGINS.append(known)
+
+
+def _run_file(path: Path) -> None:
+    # By its path: two plugins may have one file name, and neither hides a module of that name.
+    key = f"optloc plugin {path}"
+    found = importlib.util.spec_from_file_location(key, path)
+    assert found is not None
+    assert found.loader is not None
+    module = importlib.util.module_from_spec(found)
+    sys.modules[key] = module  # what it defines can then be pickled by name
+    try:
+        found.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[key]
+        raise

@@ -71,8 +71,15 @@ def _options(
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
+    plugin: Annotated[
+        list[str] | None,
+        typer.Option(metavar="MODULE", help="Run a Python file or module first that adds kinds, losses, solvers."),
+    ] = None,
 ) -> None:
-    pass
+    from optloc.base.registry import load_plugin
+
+    for name in plugin or ():
+        load_plugin(name)
 
 
 @app.command(

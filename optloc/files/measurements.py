@@ -11,7 +11,7 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
 from optloc.base.units import Conversion
 from optloc.files.schema import MeasurementsTable, Units, join, kind_model
-from optloc.files.table import Epochs, Table
+from optloc.files.table import Epochs, Table, distinct
 from optloc.models import Model
 
 ESTIMATE = "estimate"
@@ -120,12 +120,12 @@ def chunks_of(
     if not table.has("kind"):
         raise InvalidProblem("the key 'kind' is missing", where, 'write kind = "tdoa", or give the rows a column kind')
     labels = table.labels("kind")
-    kinds, first = np.unique(labels.astype(str), return_index=True)
+    kinds, first, index = distinct(labels)
     made = []
     # Kinds in the order of their first rows, so that a covariance across kinds keeps the order of the file.
-    for kind, row in zip(kinds[np.argsort(first)].tolist(), np.sort(first).tolist(), strict=True):
-        kind_model(kind, table.where("kind", row))
-        made.append(chunk(kind, np.flatnonzero(labels == kind)))
+    for i in np.argsort(first).tolist():
+        kind_model(kinds[i], table.where("kind", int(first[i])))
+        made.append(chunk(kinds[i], np.flatnonzero(index == i)))
     return made
 
 
@@ -230,7 +230,7 @@ def _stations(c: Context, key: str, needed: bool) -> Array:
     numbers = {name: i for i, name in enumerate(c.stations)}
     unknown = set(labels.tolist()) - numbers.keys()
     if unknown:
-        row = int(np.flatnonzero(np.isin(labels.astype(str), list(unknown)))[0])
+        row = next(i for i, label in enumerate(labels.tolist()) if label in unknown)
         place = c.table.where(key, row) if c.table.has(key) else join(c.where, f"key {key!r}")
         raise InvalidProblem(f"there is no station {labels[row]!r}", place, nearest(labels[row], list(c.stations)))
     return np.array(list(map(numbers.__getitem__, labels.tolist())), dtype=np.int64)

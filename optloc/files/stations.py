@@ -12,7 +12,7 @@ from optloc.base.frames import CARTESIAN, ECEF, Frame, ecef_to_geodetic
 from optloc.base.inputs import at_most
 from optloc.base.types import Array, Stations
 from optloc.files.schema import FrameTable, StationsTable, Units, join
-from optloc.files.table import Epochs, Table
+from optloc.files.table import Epochs, Table, distinct
 
 _XYZ, _GEODETIC, _RATES = ("x", "y", "z"), ("lat_deg", "lon_deg", "height"), ("vx", "vy", "vz")
 _QUATERNION = ("qw", "qx", "qy", "qz")
@@ -64,10 +64,10 @@ class Survey:
 def survey(section: StationsTable, table: Table, frame_table: FrameTable, where: str) -> tuple[Survey, Frame]:
     """Return the stations of a table and the frame of the problem."""
     labels = table.labels("name")
-    found, first, index = np.unique(labels.astype(str), return_index=True, return_inverse=True)
+    found, first, index = distinct(labels)
     order = np.argsort(first)
-    names = tuple(found[order].tolist())
-    # Stations in the order of appearance, as messages and results list them; np.unique sorts by name.
+    names = tuple(found[i] for i in order.tolist())
+    # Stations in the order of appearance, as messages and results list them.
     index = np.argsort(order)[index]
     if len(names) < table.count and not (table.has("time") or table.has("epoch")):
         row = int(np.setdiff1d(np.arange(table.count), first)[0])
@@ -261,10 +261,10 @@ def _turning(found: Survey) -> bool:
 
 
 def _by_label(found: Survey, epochs: Epochs) -> tuple[Array, Array, Array]:
-    labels = found.table.labels("epoch").astype(str)
-    known, place = np.unique(labels, return_inverse=True)
-    at = np.searchsorted(known, np.array(epochs.labels)).clip(max=len(known) - 1)
-    at = np.where(known[at] == np.array(epochs.labels), at, -1)
+    labels = found.table.labels("epoch")
+    known, _, place = distinct(labels)
+    number = {label: i for i, label in enumerate(known)}
+    at = np.array([number.get(label, -1) for label in epochs.labels])
     at_most("cells", max(len(known), epochs.count) * len(found.names), found.table.source)
     # Row of each label and station; the last line, -1, is that of labels that the table lacks.
     grid = np.full((len(known) + 1, len(found.names)), -1)

@@ -110,7 +110,7 @@ class Table:
         wrong = next((text for text in spelled.values() if not text or has_controls(text)), None)
         if wrong is not None:
             what = f"{wrong!r} holds control characters" if wrong else "the cell is empty"
-            raise InvalidProblem(what, self.where(key, int(np.flatnonzero(out == wrong)[0])), "give a name")
+            raise InvalidProblem(what, self.where(key, out.tolist().index(wrong)), "give a name")
         return out
 
     def times(self, key: str, factor: float) -> Array:
@@ -158,6 +158,23 @@ class Table:
 
 # Years from 1970 that fit into nanoseconds of 64 bits; numpy goes on with others, and means an earlier century.
 _YEARS = 290
+
+
+def distinct(labels: Array) -> tuple[list[str], Array, Array]:
+    """Return what `np.unique` does of text: the names in order, the first row (n,) and the number (m,) of each.
+
+    Parameters
+    ----------
+    labels : object array (m,)
+        Text. As an array of fixed width a single long name would make it as large as all rows times its length.
+    """
+    rows = labels.tolist()
+    names = sorted(dict.fromkeys(rows))
+    number = {name: i for i, name in enumerate(names)}
+    index = np.array(list(map(number.__getitem__, rows)), dtype=np.int64)
+    first = np.full(len(names), len(rows))
+    np.minimum.at(first, index, np.arange(len(rows)))
+    return names, first, index
 
 
 def _spelled(cell: object) -> str:
@@ -420,14 +437,14 @@ def epochs_of(keys: Keys, count: int, window: float | None, free: bool | None, s
     _check_instants(keys, labels, index, source)
     if keys.target is None:
         return Epochs(index, np.zeros(count, dtype=np.int64), labels, times, ("target",))
-    names, target = np.unique(keys.target.astype(str), return_inverse=True)
+    names, _, target = distinct(keys.target)
     # Rows of a moving target or of one epoch stay together: its targets share the epoch.
     if len(names) == 1 or not (len(labels) > 1 if free is None else free):
-        return Epochs(index, target, labels, times, tuple(names.tolist()))
+        return Epochs(index, target, labels, times, tuple(names))
     # Targets that are free share nothing between epochs or with each other: each pair is an epoch of its own.
     pairs, index = np.unique(index * len(names) + target, return_inverse=True)
     epoch, owner = pairs // len(names), pairs % len(names)
-    owners = tuple(names[owner].tolist())
+    owners = tuple(names[i] for i in owner.tolist())
     chosen = tuple(np.array(labels, dtype=object)[epoch].tolist())
     return Epochs(index, np.zeros(count, dtype=np.int64), chosen, times[epoch], owners, own=True)
 
@@ -437,17 +454,17 @@ def _group(keys: Keys, count: int, window: float | None) -> tuple[Array, tuple[s
     if keys.label is None and keys.time is None:
         return np.zeros(count, dtype=np.int64), ("0",), np.full(1, np.nan)
     if keys.label is not None:
-        values, first, index = np.unique(keys.label.astype(str), return_index=True, return_inverse=True)
+        values, first, index = distinct(keys.label)
         # Labels that are numbers go by size (2 before 10), others as they appear; times, where given, outweigh both.
         rank = _numbers(values)
         order = np.argsort(first if rank is None else rank, kind="stable")
-        labels = values.astype(object)
+        labels = np.array(values, dtype=object)
     else:
         assert keys.time is not None
         assert keys.written is not None
         bins = keys.time if window is None else np.floor((keys.time - keys.time.min()) / window + _ROUNDING)
         _, first, index = np.unique(bins, return_index=True, return_inverse=True)
-        order, labels = np.arange(len(first)), keys.written[first].astype(str).astype(object)
+        order, labels = np.arange(len(first)), keys.written[first]
     times = np.full(len(first), np.nan)
     if keys.time is not None:
         # Differences from the first row: equal times stay exactly themselves.
@@ -478,9 +495,9 @@ def _check_instants(keys: Keys, labels: Sequence[str], index: Array, source: str
         raise InvalidProblem(f"{what}, and epoch {labels[two]!r} lies between them", source, advice)
 
 
-def _numbers(values: Array) -> Array | None:
+def _numbers(values: Sequence[str]) -> Array | None:
     try:
-        return values.astype(np.float64)
+        return np.array([float(value) for value in values])
     except ValueError:
         return None
 
