@@ -206,10 +206,10 @@ def test_simulate_keeps_units_kinds_and_geodesy(tmp_path):
     assert 5.0 < bearing[0] < 25.0
     assert (
         "several trials"
-        in run("simulate", DEMOS / "run.toml", "--truth", "1,2", "--trials", 2, "--out", out, code=2).stderr
+        in run("simulate", DEMOS / "run.toml", "--truth", "1,2", "--trials", 2, "--out", out, "--force", code=2).stderr
     )
-    assert "no list" in run("simulate", path, "--truth", "1;2", "--out", out, code=2).stderr
-    assert "dimensions" in run("simulate", path, "--truth", "1,2", "--out", out, code=2).stderr
+    assert "no list" in run("simulate", path, "--truth", "1;2", "--out", out, "--force", code=2).stderr
+    assert "dimensions" in run("simulate", path, "--truth", "1,2", "--out", out, "--force", code=2).stderr
 
 
 def test_simulate_knows_that_a_spread_in_decibels_goes_with_the_ratio(tmp_path):

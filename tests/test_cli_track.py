@@ -108,7 +108,7 @@ def test_a_gap_begins_another_track(tmp_path):
     status = pd.read_csv(tmp_path / "t.csv")["status"].tolist()
     assert status == ["starting", "started", *["ok"] * 6, "starting", "restarted", *["ok"] * 6]
     assert "no valid row for 13 s" in shown.stdout
-    run(path, "--noise", 0.1, "--out", tmp_path / "t.csv")
+    run(path, "--noise", 0.1, "--out", tmp_path / "t.csv", "--force")
     assert "restarted" not in pd.read_csv(tmp_path / "t.csv")["status"].tolist()
 
 

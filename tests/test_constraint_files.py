@@ -226,7 +226,7 @@ def test_an_infeasible_epoch_is_exit_code_1_and_leaves_the_others_alone(tmp_path
     ):  # 1 and 12 sigma before the second place
         inside = ranging(table, PLANE) + f'[[constraints]]\nkind = "box"\nmax = [{most}, 9000]\n'
         # an inequality that holds a fix is more than the proof covers
-        run("fix", write(tmp_path, inside), "--allow", "unproven", "--out", out, code=code)
+        run("fix", write(tmp_path, inside), "--allow", "unproven", "--out", out, "--force", code=code)
         found = pd.read_csv(out, keep_default_na=False)
         assert found["active"].tolist() == ["", "x upper"]
         assert found["status"].tolist() == ["ok", status]

@@ -220,9 +220,9 @@ def test_the_command_says_what_comes_next(tmp_path):
     told = RUN.invoke(app, arguments)
     assert told.exit_code == 0, told.output
     assert f"10 rows of 2 epochs at 5 stations. Next: optloc check {out}." in told.stdout
-    found = json.loads(RUN.invoke(app, [*arguments, "--json"]).stdout)
+    found = json.loads(RUN.invoke(app, [*arguments, "--json", "--force"]).stdout)
     assert (found["rows"], found["epochs"], len(found["files"])) == (10, 2, 3)
-    bad = RUN.invoke(app, [*arguments, "--column", "station"])
+    bad = RUN.invoke(app, [*arguments, "--column", "station", "--force"])
     assert (bad.exit_code, bad.stderr.count("\n")) == (2, 1)
     for verb in ("check", "fix"):
         assert RUN.invoke(app, [verb, str(out)]).exit_code == 0

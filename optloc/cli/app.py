@@ -13,6 +13,7 @@ from optloc.cli.options import (
     Allow,
     Box,
     Budget,
+    Force,
     Geodetic,
     Group,
     Height,
@@ -32,6 +33,7 @@ from optloc.cli.options import (
     example,
     find_problem,
     name_in,
+    run_process,
 )
 from optloc.cli.study import study
 
@@ -52,7 +54,7 @@ app = typer.Typer(
 
 def main() -> None:
     """Run the command line."""
-    app()
+    run_process(app)
 
 
 def _print_version(wanted: bool) -> None:
@@ -109,6 +111,7 @@ def fix(
     allow: Allow = None,
     outside: Outside = False,
     budget: Budget = None,
+    force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -180,6 +183,7 @@ def track(
     ] = None,
     outside: Outside = False,
     budget: Budget = None,
+    force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -242,6 +246,7 @@ def simulate(
     trials: Annotated[int, typer.Option(min=1, help="Independent draws; each becomes an epoch.")] = 1,
     outside: Outside = False,
     budget: Budget = None,
+    force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -284,6 +289,7 @@ def crlb(
     as_json: Json = False,
     outside: Outside = False,
     budget: Budget = None,
+    force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -318,6 +324,7 @@ def check(
     plot: Annotated[Path | None, typer.Option("--plot", metavar="OUT.svg", help="Draw the residuals.")] = None,
     outside: Outside = False,
     budget: Budget = None,
+    force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -358,6 +365,7 @@ def plot(
     ] = None,
     outside: Outside = False,
     budget: Budget = None,
+    force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -382,6 +390,7 @@ def demo(
         Path | None, typer.Option(metavar="OUT.png", help="Where to draw the fix; optloc-demo.png by default.")
     ] = None,
     as_json: Json = False,
+    force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -400,14 +409,14 @@ def new(
     out: Annotated[
         Path | None, typer.Option(metavar="OUT.toml", help="File to write; standard output by default.")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Write over a file that exists.")] = False,
+    force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
     """Write a problem file with comments that can be fixed as it is, to begin with."""
     from optloc.cli.starters import run_new
 
-    raise typer.Exit(run_new(kind, out, force=force, quiet=quiet))
+    raise typer.Exit(run_new(kind, out, quiet=quiet))
 
 
 @app.command(
@@ -452,6 +461,7 @@ def convert(
     ] = None,
     as_json: Json = False,
     budget: Budget = None,
+    force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -475,6 +485,7 @@ def reproduce(
         Path | None, typer.Option(metavar="DIR", help="Where tables and pictures go; optloc-NAME by default.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Decides all draws.")] = 1,
+    force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:

@@ -14,10 +14,23 @@ from optloc.adequacy.elements import By, batch_of
 from optloc.adequacy.geometry import Advice
 from optloc.adequacy.level import CommonLevel, LateSignals, common_level_at, late_signals_at
 from optloc.base.errors import InvalidProblem
+from optloc.base.outputs import together
 from optloc.base.types import Array, Bias
 from optloc.cli.file_fixes import CHUNK
 from optloc.cli.fix import advice_for_vectors, advice_json, grouping_of, late_json, level_json, show_advice, tell_level
-from optloc.cli.output import Columns, bar, dumps, records, say_all, with_sigma, write_picture, write_table, write_text
+from optloc.cli.output import (
+    Columns,
+    Screen,
+    bar,
+    claim_outputs,
+    dumps,
+    records,
+    say_all,
+    with_sigma,
+    write_picture,
+    write_table,
+    write_text,
+)
 from optloc.files import Loaded, read
 from optloc.linear.constraints import exact
 from optloc.models import MODELS
@@ -46,6 +59,7 @@ def run_check(file: Path, as_json: bool, asked: Asked | None = None, *, quiet: b
     asked = asked or Asked()
     # A file without measured values can be checked, too, before the campaign.
     loaded = read(file, values=False)
+    claim_outputs(table=asked.out, picture=asked.plot, inputs=[file])
     found = summary(loaded)
     checked = _health(loaded, asked, quiet or as_json)
     told = _advice(loaded, checked)
@@ -58,11 +72,11 @@ def run_check(file: Path, as_json: bool, asked: Asked | None = None, *, quiet: b
         table = Table(title=loaded.title, show_header=False, title_justify="left")
         for name, value in found.items():
             table.add_row(name.replace("_", " "), _spell(value))
-        Console().print(table)
+        Screen().print(table)
         if checked is not None:
-            _show_health(checked, Console())
-            say_all(Console(), tell_level(checked.level, late=checked.late))
-        show_advice(told, Console())
+            _show_health(checked, Screen())
+            say_all(Screen(), tell_level(checked.level, late=checked.late))
+        show_advice(told, Screen())
     return 1 if found["epochs_with_too_few_rows"] or found["epochs_with_disconnected_pairs"] else 0
 
 
@@ -78,12 +92,11 @@ def _health(loaded: Loaded, asked: Asked, quiet: bool) -> Checked | None:
     Method.parse(method)  # a misspelt method is refused before the work
     checked = _check_health(loaded, method, by, quiet)
     # A table or picture that was asked for and cannot be made is an error, where a summary would say why.
-    if asked.out is not None:
-        if checked.health is None:
-            raise InvalidProblem(checked.why, "--out", "leave it out")
-        write_table(asked.out, _health_columns(checked.health))
-    if asked.plot is not None:
-        _draw_health(checked, loaded.title, asked.plot)
+    for path, option in ((asked.out, "--out"), (asked.plot, "--plot")):
+        if path is not None and checked.health is None:
+            raise InvalidProblem(checked.why, option, "leave it out")
+    if checked.health is not None:
+        _write_health(checked.health, loaded.title, asked)
     return checked
 
 
@@ -351,10 +364,12 @@ def _told(value: float, error: float, unit: str) -> str:
     return with_sigma(float(value), float(error), unit).strip()
 
 
-def _draw_health(checked: Checked, title: str, path: Path) -> None:
-    """Draw health to a picture file; raise InvalidProblem where there is none or that fails."""
-    from optloc.plot.residuals import plot_health
+def _write_health(health: Health, title: str, asked: Asked) -> None:
+    """Write the table and the picture of health that were asked for: both, or none."""
+    with together():
+        if asked.out is not None:
+            write_table(asked.out, _health_columns(health))
+        if asked.plot is not None:
+            from optloc.plot.residuals import plot_health
 
-    if checked.health is None:
-        raise InvalidProblem(checked.why, "--plot", "leave it out")
-    write_picture(plot_health(checked.health, title=title), path)
+            write_picture(plot_health(health, title=title), asked.plot)

@@ -17,7 +17,7 @@ from optloc.base.types import Array
 from optloc.bounds.bound_map import BoundMap, bound_map, extent, plan_of
 from optloc.bounds.crlb import Course, crlb_course
 from optloc.cli.options import coordinates
-from optloc.cli.output import dumps, say, write_picture, write_text
+from optloc.cli.output import PICTURES, Screen, claim_outputs, dumps, say, write_picture, write_text
 from optloc.files import Loaded, read
 from optloc.files.schema import Units
 from optloc.models import MODELS
@@ -32,7 +32,6 @@ _LINES, _BOUNDS, _MEMBERS = 10, 30, 16
 _POINTS, _UNKNOWNS = 400, 100
 # Points along each side of a map: isolines are smooth, and the 9216 bounds take less than a second.
 _MAP_POINTS = 96
-_PICTURES = (".png", ".svg", ".pdf")
 _UNITS = {"length": "m", "speed": "m/s"}
 _RMS = {True: " (rms)", False: ""}
 
@@ -51,6 +50,7 @@ def run_crlb(
     from optloc.bounds.crlb import crlb
 
     loaded = read(file, values=False)
+    claim_outputs(picture=plot, inputs=[file])
     problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
     # Biases alone, of known targets, need no place: their bound does not depend on a guess.
     truth = _solve(file) if at is None and _sought(problem) else vector(problem, at, velocity, geodetic)
@@ -72,7 +72,7 @@ def run_crlb(
         made = {"file": loaded.source, "bounds": rows, "reliability": reliability_json(told), "course": course}
         write_text(Path("-"), dumps(made))
     elif not quiet:
-        console = Console()
+        console = Screen()
         console.print(_bound_table(loaded, rows))
         show_reliability(told, console)
         if over_time is not None:
@@ -291,10 +291,11 @@ def run_map(
     dilution: bool,
 ) -> int:
     """Write the map of the bound of a file, of the first epoch where each has a position of its own."""
-    if out.suffix.lower() not in (*_PICTURES, ".html", ".geojson"):
+    if out.suffix.lower() not in (*PICTURES, ".html", ".geojson"):
         advice = "use .png, .svg, .pdf, .geojson or .html"
         raise InvalidProblem(f"maps of type {out.suffix or out.name!r} are unknown", str(out), advice)
     loaded = read(file, values=False)
+    claim_outputs(out, inputs=[file])
     problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
     # One map: epochs apart are mapped as the first of them is.
     problem = problem.flat().take(np.zeros(1, dtype=int)) if problem.batch_shape else problem
@@ -354,7 +355,7 @@ def _write_map(found: BoundMap, out: Path, title: str, *, dilution: bool) -> Non
     from optloc.plot.bound_map import map_geojson, plot_bound_map
 
     ending = out.suffix.lower()
-    if ending in _PICTURES:
+    if ending in PICTURES:
         write_picture(plot_bound_map(found, title, dilution=dilution), out)
         return
     if dilution:
@@ -380,6 +381,7 @@ def run_simulate(
     from optloc.linear.evaluate import predict
     from optloc.linear.simulate import simulate
 
+    claim_outputs(out, inputs=[file])
     problem = read(file, values=False).problem
     x = vector(problem, truth, velocity, geodetic)
     # A spread in decibels depends on the values: the noise is that of the true ones.
@@ -388,7 +390,7 @@ def run_simulate(
         drawn = simulate(read(exact).problem, x, seed, trials)
     z = np.concatenate([rows.z for rows in drawn.rows], axis=-1)
     written = write_measured(file, out, z, note=f"drawn at {truth} with seed {seed}")
-    say(Console(quiet=quiet), f"{trials} trial(s) of {z.shape[-1]} rows are in {', '.join(str(p) for p in written)}.")
+    say(Screen(quiet=quiet), f"{trials} trial(s) of {z.shape[-1]} rows are in {', '.join(str(p) for p in written)}.")
     return 0
 
 

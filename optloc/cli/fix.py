@@ -18,6 +18,7 @@ from optloc.adequacy.elements import GROUPINGS, By, batch_of
 from optloc.adequacy.geometry import Advice
 from optloc.adequacy.level import SEVERAL, CommonLevel, LateSignals, common_level_at, late_signals_at
 from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.outputs import together
 from optloc.base.types import ANSWERED, Array, Status
 from optloc.cli.file_fixes import (
     FileFixes,
@@ -30,7 +31,19 @@ from optloc.cli.file_fixes import (
     geojson,
     level_covariance,
 )
-from optloc.cli.output import Columns, dumps, records, say, say_all, with_sigma, write_picture, write_table, write_text
+from optloc.cli.output import (
+    Columns,
+    Screen,
+    claim_outputs,
+    dumps,
+    records,
+    say,
+    say_all,
+    with_sigma,
+    write_picture,
+    write_table,
+    write_text,
+)
 from optloc.files import Loaded, read
 from optloc.files.schema import ConstraintTable
 from optloc.problem.chart import CARTESIAN, INVERSE_RANGE, NAMES
@@ -72,7 +85,9 @@ def run_fix(
     on_output = geojson_path is not None and str(geojson_path) == "-"
     if as_json and on_output:
         raise InvalidProblem("JSON and GeoJSON cannot both go to standard output", "--geojson", "name a file")
-    loaded = _estimate_noise(read(file, more=more), noise)
+    loaded = read(file, more=more)
+    claim_outputs(geojson_path, html, table=out, picture=plot, inputs=[file])
+    loaded = _estimate_noise(loaded, noise)
     rescaled = _common_level(loaded.problem) if rescale else None
     if rescaled is not None:
         loaded = replace(loaded, problem=rescaled.scale(loaded.problem))
@@ -83,17 +98,7 @@ def run_fix(
     level = rescaled or _level_of(found)
     signals = signals or _late_of(found)
     levels = found.loaded.levels
-    if out is not None:
-        write_table(out, found.columns)
-    if geojson_path is not None:
-        write_text(geojson_path, dumps(geojson(found)))
-    if plot is not None:
-        draw(found, plot)
-    if html is not None:
-        from optloc.report import fix_page
-
-        labels = [str(label) for label in found.columns["epoch"]]
-        write_text(html, fix_page(found.loaded.problem, found.fixes, found.loaded.title, labels))
+    _write(found, out, geojson_path, plot, html)
     # many statuses are told by their own sentence; causes take a search, which only readers need
     told = advice_for_fixes(found) if as_json or not quiet else ()
     if as_json:
@@ -102,7 +107,7 @@ def run_fix(
         noise_found |= {} if signals is None else {"late_signals": late_json(signals, late)}
         write_text(Path("-"), dumps(fixes_json(found) | {"advice": advice_json(told)} | noise_found))
     elif not quiet:
-        console = Console(stderr=on_output)
+        console = Screen(stderr=on_output)
         show(found, console)
         show_advice(told, console)
         if level is not None or signals is not None:
@@ -110,6 +115,22 @@ def run_fix(
         if levels is not None:
             _show_levels(levels, console)
     return 0 if found.passes(allow) else 1
+
+
+def _write(found: FileFixes, out: Path | None, geojson_path: Path | None, plot: Path | None, html: Path | None) -> None:
+    """Write the files that were asked for: all of them, or none."""
+    with together():
+        if out is not None:
+            write_table(out, found.columns)
+        if geojson_path is not None:
+            write_text(geojson_path, dumps(geojson(found)))
+        if plot is not None:
+            draw(found, plot)
+        if html is not None:
+            from optloc.report import fix_page
+
+            labels = [str(label) for label in found.columns["epoch"]]
+            write_text(html, fix_page(found.loaded.problem, found.fixes, found.loaded.title, labels))
 
 
 def draw(found: FileFixes, path: Path) -> None:

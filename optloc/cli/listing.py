@@ -11,10 +11,11 @@ import typer
 from rich.console import Console
 from rich.padding import Padding
 from rich.table import Table
+from rich.text import Text
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.units import UNITS
-from optloc.cli.output import dumps
+from optloc.cli.output import Screen, dumps
 from optloc.models import MODELS
 
 Rows = list[dict[str, str]]
@@ -31,7 +32,7 @@ def run_list(what: str, as_json: bool) -> int:
     if as_json:
         typer.echo(dumps(rows))
         return 0
-    _print(rows, Console())
+    _print(rows, Screen())
     return 0
 
 
@@ -41,7 +42,7 @@ def _print(rows: Rows, console: Console) -> None:
     title, *names = dict.fromkeys(name for row in rows for name in row)
     if sum(max(len(row.get(name, "")) for row in rows) for name in names) > _WRAPS * console.width:
         for row in rows:
-            console.print(f"[bold]{row[title]}[/bold]: {row['summary']}", highlight=False)
+            console.print(Text.assemble((row[title], "bold"), f": {row['summary']}"), highlight=False)
             for name in names[:-1]:
                 console.print(Padding(f"{name}: {row.get(name, '')}", (0, 0, 0, 4)), highlight=False)
         return

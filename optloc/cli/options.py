@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import logging
+import os
+import signal
 import sys
 from collections.abc import Callable
+from contextvars import copy_context
 from importlib.resources import files
+from io import TextIOWrapper
 from math import isfinite, isnan, nan
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,6 +19,7 @@ from typer.core import TyperGroup
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.inputs import STANDARD_INPUT, access, budget_of, relax
+from optloc.base.outputs import remove_unnamed, replace_files, visible
 from optloc.base.types import Status
 from optloc.files.schema import ConstraintTable
 from optloc.problem.fix import status_named
@@ -22,10 +27,88 @@ from optloc.problem.fix import status_named
 BAD_INPUT = 2
 """Exit code of whatever is wrong with the arguments or a file: what shells and typer use for wrong usage."""
 
-STOPPED = 130
-"""Exit code after Ctrl-C: 128 and the number of SIGINT, as shells count."""
+STOPPED, READER_GONE = 130, 141
+"""Exit codes after Ctrl-C, and where the reader of a pipe has gone: 128 and the signal's number, as shells count."""
 
 EXIT_CODES = "Exit codes: 0 everything is ok or allowed, 1 some status is not ok, 2 bad input, 130 stopped by Ctrl-C."
+
+
+def run_process(command: Callable[[], Any]) -> None:
+    """Run a command as the whole of a process, and end it: quietly wherever Ctrl-C or the end of a pipe finds it."""
+    code: Any = 0
+    ignored = signal.getsignal(signal.SIGINT) in (signal.SIG_IGN, None)  # as under nohup
+    try:
+        _prepare()
+        if not ignored:
+            signal.signal(signal.SIGINT, _interrupt)
+        command()
+    except SystemExit as end:
+        code = end.code
+    except KeyboardInterrupt:
+        code = STOPPED
+    except Exception:
+        # Some libraries make another exception of Ctrl-C.
+        if signal.getsignal(signal.SIGINT) is not end_at_once:
+            raise
+        code = STOPPED
+    finally:
+        if not ignored:
+            signal.signal(signal.SIGINT, end_at_once)
+    sys.exit(_flush(code))
+
+
+def _interrupt(*_: Any) -> None:
+    """Let the command end in its own way; a second Ctrl-C does not wait for it."""
+    signal.signal(signal.SIGINT, end_at_once)
+    raise KeyboardInterrupt
+
+
+def end_at_once(*_: Any) -> None:
+    """End the process without a word, and without what is half written."""
+    remove_unnamed()
+    os._exit(STOPPED)
+
+
+def _unraisable(found: Any) -> None:
+    """End where Ctrl-C was pressed while an object was cleared away, which Python would print and go on."""
+    if isinstance(found.exc_value, KeyboardInterrupt):
+        end_at_once()
+    sys.__unraisablehook__(found)
+
+
+# Columns of text between which tables can be read, whatever the environment says of the terminal.
+_NARROWEST, _WIDEST = 20, 1000
+
+
+def _prepare() -> None:
+    """Make standard streams and the width of the terminal such that nothing that is printed can fail."""
+    while (number := os.open(os.devnull, os.O_RDWR)) < 3:
+        pass  # a stream that is closed: the next file that is opened must not become it
+    os.close(number)
+    sys.stdout = sys.stdout or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115, PTH123  (until the end)
+    sys.stderr = sys.stderr or open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115, PTH123  (until the end)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):
+            stream.reconfigure(errors="replace")  # what its encoding lacks, such as ±, becomes a question mark
+    for name in ("COLUMNS", "LINES"):
+        said = os.environ.get(name)
+        if said is not None:
+            wide = said.isascii() and said.isdigit() and len(said) < 10
+            os.environ[name] = str(min(max(int(said), _NARROWEST), _WIDEST)) if wide else "80"
+    sys.unraisablehook = _unraisable
+
+
+def _flush(code: Any) -> Any:
+    """Write what is still to be printed, and return the exit code."""
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        # Python would try again, and complain.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+        if isinstance(error, BrokenPipeError):
+            return READER_GONE
+        return _refuse(f"standard output cannot be written ({error.strerror or error}).")
+    return code
 
 
 class Group(TyperGroup):
@@ -35,7 +118,8 @@ class Group(TyperGroup):
         """Run the command that the arguments name; what is wrong with them is one line."""
         standalone = kwargs.pop("standalone_mode", True)
         try:
-            code = super().main(*args, **{**kwargs, "standalone_mode": False})
+            # What a command decides, such as --force, ends with it: a process may run several.
+            code = copy_context().run(super().main, *args, **{**kwargs, "standalone_mode": False})
         except Exception as error:
             # Usage errors. Their classes have another home in each release of typer, but all can be spelled.
             if not standalone or not hasattr(error, "format_message"):
@@ -53,7 +137,7 @@ class Group(TyperGroup):
         except InvalidProblem as error:
             raise typer.Exit(_refuse(str(error))) from None
         except BrokenPipeError:
-            raise  # the reader of a pipe has gone: click ends quietly
+            raise typer.Exit(READER_GONE) from None
         except OSError as error:
             raise typer.Exit(_refuse(f"{error.filename or 'optloc'}: {error.strerror or error}.")) from None
         except KeyboardInterrupt:
@@ -70,7 +154,7 @@ class Group(TyperGroup):
 
 def _refuse(sentence: str) -> int:
     """Print one line on standard error, and return the exit code of bad input."""
-    typer.echo(" ".join(sentence.split()), err=True)
+    typer.echo(visible(" ".join(sentence.split())), err=True)
     return BAD_INPUT
 
 
@@ -155,6 +239,9 @@ Allow = Annotated[
     typer.Option(
         "--allow", metavar="STATUS,...", help="Statuses that pass beside ok (exit code 0), such as curved,unproven."
     ),
+]
+Force = Annotated[
+    bool, typer.Option("--force", callback=replace_files, help="Write over files that exist; never over what is read.")
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
 Verbose = Annotated[

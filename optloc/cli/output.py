@@ -12,11 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
+from rich.text import Text
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
+from optloc.base.outputs import claim, is_stream, visible, written
 from optloc.base.types import Array
-from optloc.files.writer import unwritable, write_csv
+from optloc.files.writer import write_csv
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,8 +28,26 @@ LOG = logging.getLogger("optloc.write")
 Columns = dict[str, Array]
 """A long table: columns (rows,) by name, in SI units and degrees, NaN where there is no number."""
 
+PICTURES = (".png", ".svg", ".pdf")
+"""Types of pictures that commands write."""
+
 # What a coordinate that an equality holds may have as its sigma, as a share of it: rounding.
 _HELD = 1e-12
+
+
+class Screen(Console):
+    """The terminal, or whatever standard output is: names of strangers are printed letter by letter and do nothing."""
+
+    def __init__(self, *, stderr: bool = False, quiet: bool = False) -> None:
+        super().__init__(stderr=stderr, quiet=quiet, markup=False, emoji=False)
+
+    def render_str(self, text: str, **style: Any) -> Text:
+        """Return text as it is shown: what would steer the terminal is spelled."""
+        return super().render_str(visible(text), **style)
+
+    def on_broken_pipe(self) -> None:
+        """Let the command end: the reader of a pipe has gone."""
+        raise BrokenPipeError
 
 
 def say(console: Console, line: str) -> None:
@@ -111,46 +131,59 @@ def write_text(path: Path, text: str) -> None:
     if str(path) == "-":
         sys.stdout.write(text + "\n")
         return
-    try:
-        path.write_text(text + "\n", encoding="utf-8")
-    except OSError as error:
-        raise unwritable(path, error) from None
+    with written(path) as file:
+        file.write_text(text + "\n", encoding="utf-8")
     LOG.info("wrote %s", path)
 
 
 def write_table(path: Path, columns: Columns) -> None:
     """Write a long table as CSV or Parquet, by the ending of its name; NaN is an empty cell."""
-    check_table_name(path)
-    if path.suffix.lower() == ".csv":
-        write_csv(path, columns)
+    if is_csv(path):
+        write_csv(path, columns, for_people=True)
     else:
         import pyarrow as pa
         from pyarrow import parquet
 
         # from_pandas: NaN is a missing value.
         table = pa.table({name: pa.array(values, from_pandas=True) for name, values in columns.items()})
-        try:
-            parquet.write_table(table, path)
-        except OSError as error:
-            raise unwritable(path, error) from None
+        with written(path) as file:
+            parquet.write_table(table, file)
     LOG.info("wrote %s: %d rows", path, len(next(iter(columns.values()))))
 
 
-def check_table_name(path: Path) -> None:
-    """Refuse names of tables whose ending says no type that can be written."""
-    if path.suffix.lower() not in {".csv", ".parquet", ".pq"}:
-        what = f"results of type {path.suffix or path.name!r} are unknown"
-        raise InvalidProblem(what, str(path), "use .csv or .parquet")
+def is_csv(path: Path) -> bool:
+    """Return whether a table goes to CSV; what has no ending, such as a pipe, gets that too."""
+    return path.suffix.lower() == ".csv" or is_stream(path)
+
+
+def claim_outputs(
+    *others: Path | None, table: Path | None = None, picture: Path | None = None, inputs: Sequence[Path] = ()
+) -> None:
+    """Refuse outputs of a command that cannot or must not be written, before the work.
+
+    Parameters
+    ----------
+    *others : Path, optional
+        Files of text.
+    table, picture : Path, optional
+        Files whose endings say their types.
+    inputs : sequence of Path
+        What the command reads, beside what was read already.
+    """
+    if table is not None and not is_csv(table) and table.suffix.lower() not in {".parquet", ".pq"}:
+        what = f"results of type {table.suffix or table.name!r} are unknown"
+        raise InvalidProblem(what, str(table), "use .csv or .parquet")
+    if picture is not None and picture.suffix.lower() not in PICTURES and not is_stream(picture):
+        what = f"pictures of type {picture.suffix or picture.name!r} are unknown"
+        raise InvalidProblem(what, str(picture), f"use {', '.join(PICTURES[:-1])} or {PICTURES[-1]}")
+    claim(table, picture, *others, inputs=inputs)
 
 
 def write_picture(figure: Figure, path: Path) -> None:
     """Write a picture; raise InvalidProblem where that fails."""
     from optloc.plot import save
 
-    try:
-        save(figure, path)
-    except (OSError, ValueError) as error:
-        raise InvalidProblem(f"the picture cannot be written ({error})", str(path), "use .png, .svg or .pdf") from None
+    save(figure, path)
     LOG.info("wrote %s", path)
 
 
@@ -160,7 +193,7 @@ def bar(title: str, total: int, quiet: bool) -> Iterator[Callable[[int], None]]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     # Results may be piped from standard output; one step is too short for a bar.
-    console = Console(stderr=True)
+    console = Screen(stderr=True)
     shown = console.is_terminal and not quiet and total > 1
     parts = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*parts, console=console, disable=not shown, transient=True) as progress:

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from rich.console import Console
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.cli.output import say, write_picture
+from optloc.cli.output import Screen, claim_outputs, say, write_picture
 from optloc.files import Loaded, read
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix
@@ -47,8 +46,9 @@ def run_plot(what: str, asked: Asked, quiet: bool) -> int:
     """Draw a picture, and return the exit code."""
     if what not in PICTURES:
         raise InvalidProblem(f"there is no picture {what!r}", "plot", nearest(what, list(PICTURES)))
+    claim_outputs(picture=asked.out, inputs=[asked.file])
     PICTURES[what](asked)
-    say(Console(quiet=quiet), f"The picture is in {asked.out}.")
+    say(Screen(quiet=quiet), f"The picture is in {asked.out}.")
     return 0
 
 

@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 from rich.table import Table
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Status
 from optloc.cli.crlb import vector
-from optloc.cli.output import dumps, write_text
+from optloc.cli.output import Screen, dumps, write_text
 from optloc.files import Loaded, read
 from optloc.problem.problem import Problem
 from optloc.several import Emitters, evenly, separate
@@ -106,7 +105,7 @@ def _show(loaded: Loaded, label: str, found: Emitters) -> None:
     for cells in _rows(found):
         table.add_row(*cells)
     table.caption = f"{found.status.label}: {found.reason}; cost {found.cost:.1f}, at least {found.bound:.1f}"
-    Console().print(table)
+    Screen().print(table)
 
 
 def _rows(found: Emitters) -> Iterator[tuple[str, ...]]:

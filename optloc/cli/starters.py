@@ -17,7 +17,7 @@ from optloc.base.units import SI_UNIT, UNITS
 from optloc.cli.file_fixes import FileFixes, fix_file, fixes_json
 from optloc.cli.fix import draw, show
 from optloc.cli.options import shipped_problems
-from optloc.cli.output import dumps, say, say_all, write_text
+from optloc.cli.output import Screen, claim_outputs, dumps, say, say_all, write_text
 from optloc.files import read
 from optloc.files.convert import Converted, convert
 from optloc.models import MODELS, Model
@@ -75,13 +75,14 @@ def run_demo(name: str | None, plot: Path | None, *, as_json: bool, quiet: bool)
     known = shipped_problems()
     if name is not None and name not in known:
         raise InvalidProblem(f"there is no demo {name!r}", "demo", nearest(name, list(known)))
+    claim_outputs(picture=plot)
     if name is None and not as_json:
         return _walk(plot, quiet)
     found = _fix(name or "demo", quiet or as_json)
     if as_json:
         write_text(Path("-"), dumps(fixes_json(found)))
     elif not quiet:
-        show(found, Console())
+        show(found, Screen())
     if plot is not None or not as_json:
         _draw(found, plot, quiet or as_json)
     return 0 if _shows(found, name or "demo") else 1
@@ -89,7 +90,7 @@ def run_demo(name: str | None, plot: Path | None, *, as_json: bool, quiet: bool)
 
 def _walk(plot: Path | None, quiet: bool) -> int:
     """Fix three shipped problems and say what is seen; the exit code is 0 where each shows what it should."""
-    console = Console(quiet=quiet)
+    console = Screen(quiet=quiet)
     code = 0
     for i, (text, name) in enumerate(_STEPS):
         _explain(text, console)
@@ -118,14 +119,20 @@ def _explain(text: str, console: Console) -> None:
 
 
 def _draw(found: FileFixes, plot: Path | None, quiet: bool) -> None:
-    """Draw a fix; where no picture was asked for and none can be drawn, say so and go on."""
+    """Draw a fix; where no picture was asked for and none can be drawn, or one is there, say so and go on."""
     from importlib.util import find_spec
 
-    console = Console(quiet=quiet)
+    console = Screen(quiet=quiet)
     # Without a request a missing library is no error: the numbers are there.
     if plot is None and find_spec("matplotlib") is None:
         say(console, "There is no picture, as matplotlib is not installed: pip install 'optloc[plot]'.")
         return
+    if plot is None:
+        try:
+            claim_outputs(picture=PICTURE)
+        except InvalidProblem as refused:
+            say(console, f"There is no new picture. {refused}")
+            return
     draw(found, plot or PICTURE)
     say(console, f"The picture is in {plot or PICTURE}.")
 
@@ -156,7 +163,7 @@ def starters() -> dict[str, Starter]:
     return found
 
 
-def run_new(kind: str, out: Path | None, *, force: bool, quiet: bool) -> int:
+def run_new(kind: str, out: Path | None, *, quiet: bool) -> int:
     """Write a starter, to standard output where no file is named, and return the exit code."""
     known = starters()
     if kind not in known:
@@ -166,10 +173,8 @@ def run_new(kind: str, out: Path | None, *, force: bool, quiet: bool) -> int:
         return 0
     if out.suffix.lower() != ".toml":
         raise InvalidProblem("a problem file ends in .toml", str(out), f"write --out {out.with_suffix('.toml')}")
-    if out.exists() and not force:
-        raise InvalidProblem("there is such a file already", str(out), "choose another name, or add --force")
     write_text(out, known[kind].text.rstrip("\n"))
-    say(Console(quiet=quiet), f"{out} can be changed and fixed: optloc check {out}, then optloc fix {out}.")
+    say(Screen(quiet=quiet), f"{out} can be changed and fixed: optloc check {out}, then optloc fix {out}.")
     return 0
 
 
@@ -250,7 +255,7 @@ def run_convert(file: Path, out: Path, column: list[str], *, as_json: bool, quie
     if as_json:
         write_text(Path("-"), dumps(_conversion_json(found)))
     elif not quiet:
-        _show_conversion(found, Console(), out)
+        _show_conversion(found, Screen(), out)
     return 0
 
 

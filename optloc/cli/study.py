@@ -15,7 +15,9 @@ from rich.console import Console
 from rich.table import Table
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.cli.options import STOPPED, Budget, Group, Json, Outside, Quiet, Verbose, complete, example
+from optloc.base.outputs import claim, make_folder
+from optloc.cli.options import STOPPED, Budget, Force, Group, Json, Outside, Quiet, Verbose, complete, example
+from optloc.cli.output import Screen
 
 # Heavy libraries are imported inside the commands, so that --help answers at once.
 
@@ -86,7 +88,7 @@ def run(
     if as_json:
         _print_json(_record(found))
     elif not quiet:
-        _show(found, Console())
+        _show(found, Screen())
         _say(f"The table is in {folder}; optloc study report {folder} makes the report.")
 
 
@@ -99,7 +101,7 @@ def status(folder: Folder, as_json: Json = False, quiet: Quiet = False, verbose:
     if as_json:
         _print_json(_record(found))
     elif not quiet:
-        _show(found, Console())
+        _show(found, Screen())
     raise typer.Exit(0 if found.complete else 1)
 
 
@@ -109,6 +111,7 @@ def report(
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Where the report goes; report in the study's folder by default.")
     ] = None,
+    force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
@@ -118,7 +121,7 @@ def report(
     """
     from optloc.report import write_report
 
-    console = Console(stderr=True)
+    console = Screen(stderr=True)
     shown = console.is_terminal and not quiet
     with console.status("report") if shown else nullcontext() as status:
         files = write_report(folder, out, (lambda text: status.update(f"report: {text}")) if status else None)
@@ -143,7 +146,7 @@ def compare(
     if as_json:
         _print_json([asdict(difference) for difference in found])
     elif not quiet:
-        _show_comparison(found, one, two, Console())
+        _show_comparison(found, one, two, Screen())
     raise typer.Exit(int(any(abs(difference.z) > _DIFFERS for difference in found)))
 
 
@@ -164,7 +167,7 @@ def _print_json(value: Any) -> None:
 def _say(line: str) -> None:
     from optloc.cli.output import say
 
-    say(Console(), line)
+    say(Screen(), line)
 
 
 def _record(found: Any) -> dict[str, Any]:
@@ -192,7 +195,7 @@ def _bar(title: str, total: int, quiet: bool) -> Iterator[Any]:
     """Yield a function that moves a bar with the counts of statuses; it is drawn on terminals only."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    console = Console(stderr=True)
+    console = Screen(stderr=True)
     counts: Counter[str] = Counter()
     parts = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     shown = console.is_terminal and not quiet
@@ -255,16 +258,14 @@ def run_reproduce(name: str, size: str, out: Path | None, seed: int, quiet: bool
     if size not in get_args(Size):
         raise InvalidProblem(f"there is no size {size!r}", "--size", nearest(size, get_args(Size)))
     folder = Path(f"optloc-{name}") if out is None else out
-    try:  # before the work, so that a place that cannot be written is known at once
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        what = f"the folder cannot be made ({error.strerror or error})"
-        raise InvalidProblem(what, str(folder), "choose another place") from None
+    # before the work, so that a place that cannot be written is known at once
+    make_folder(folder)
+    claim(folder / "README.md")
     plan = planned(name, cast(Size, size), seed)
     with bar(name, plan.work, quiet) as advance:
         report = plan.run(lambda: advance(1))
     written = write(report, folder)
-    console = Console(quiet=quiet)
+    console = Screen(quiet=quiet)
     for found in report.tables:
         table = Table(title=found.title, title_justify="left", caption=found.note, caption_justify="left")
         for i, heading in enumerate(found.header):

@@ -13,15 +13,18 @@ from rich.table import Table
 from rich.text import Text
 
 from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.outputs import is_stream
 from optloc.cli.options import coordinates
 from optloc.cli.output import (
     LOG,
     Columns,
+    Screen,
     bar,
-    check_table_name,
+    claim_outputs,
     covariance_columns,
     dumps,
     geodetic_columns,
+    is_csv,
     join_tables,
     records,
     say,
@@ -152,12 +155,12 @@ def run_track(
     dynamics = dynamics_of(wanted)
     # Wrong words are refused before the file is read.
     update = filter_of(wanted.filter) if wanted.loss is None else reweighted(wanted.filter, wanted.loss)
-    _check_places(out, plot, html)
     loaded = read(file)
+    claim_outputs(html, table=out, picture=plot, inputs=[file])
     ones = [TargetTrack(*parts, []) for parts in runs_of(loaded)]
     if wanted.start is not None and len(ones) > 1:
         raise InvalidProblem("one initial state does not fit several targets", "--start", "leave it out")
-    table = None if out is None else GrowingTable(out)
+    table = GrowingTable(out) if out is not None and not is_stream(out) else None
     try:
         with bar(loaded.title, sum(one.problem.epochs for one in ones), quiet or as_json) as advance:
             for one in ones:
@@ -173,11 +176,11 @@ def run_track(
             join_tables([track_columns(one) for one in ones if one.entries]) if any(o.entries for o in ones) else {}
         )
         if columns:
-            _write(loaded, ones, columns, table=table, as_json=as_json, plot=plot)
-            if html is not None:
-                write_text(html, _map(loaded, ones))
+            _write(loaded, ones, columns, (out, plot, html), table)
+            if as_json:
+                write_text(Path("-"), dumps({"file": loaded.source, "title": loaded.title, "scans": records(columns)}))
     if not quiet and not as_json:
-        _show(loaded, columns, Console())
+        _show(loaded, columns, Screen())
     return 0 if set(columns["status"].tolist()) <= _CLEAN else 1
 
 
@@ -187,15 +190,6 @@ def dynamics_of(wanted: Wanted) -> Dynamics:
         raise InvalidProblem(f"unknown model {wanted.model!r}", "--model", nearest(wanted.model, list(MOTIONS)))
     motion = MOTIONS[wanted.model]
     return motion.make(motion.noise if wanted.noise is None else wanted.noise, wanted.memory)
-
-
-def _check_places(out: Path | None, plot: Path | None, html: Path | None) -> None:
-    """Refuse places that cannot be written before there is a track to lose."""
-    if out is not None:
-        check_table_name(out)
-    for path in (out, plot, html):
-        if path is not None and not path.parent.is_dir():
-            raise InvalidProblem("the file cannot be written (no such folder)", str(path), "choose another place")
 
 
 def rules(gate: float, gap: float | None) -> Rules:
@@ -301,24 +295,25 @@ def _write(
     loaded: Loaded,
     ones: list[TargetTrack],
     columns: Columns,
-    *,
+    places: tuple[Path | None, Path | None, Path | None],
     table: GrowingTable | None,
-    as_json: bool,
-    plot: Path | None,
 ) -> None:
-    if table is not None and table.path.suffix.lower() == ".csv":
-        table.finish()
+    """Write table, picture and page, as far as they were asked for; rows that stand in a file already get its name."""
+    out, plot, html = places
+    if table is not None and is_csv(table.path):
+        table.file.finish()
         LOG.info("wrote %s: %d rows", table.path, table.rows)
-    elif table is not None:
-        write_table(table.path, columns)
-        table.discard()
+    elif out is not None:
+        write_table(out, columns)
+        if table is not None:
+            table.file.discard()
     if plot is not None:
         from optloc.plot.track import Drawn, plot_tracks
 
         drawn = [Drawn(one.name, one.problem, tuple(one.entries)) for one in ones if one.entries]
         write_picture(plot_tracks(drawn, title=loaded.title), plot)
-    if as_json:
-        write_text(Path("-"), dumps({"file": loaded.source, "title": loaded.title, "scans": records(columns)}))
+    if html is not None:
+        write_text(html, _map(loaded, ones))
 
 
 def _show(loaded: Loaded, columns: Columns, console: Console) -> None:

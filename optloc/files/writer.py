@@ -13,6 +13,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.inputs import read_bytes
+from optloc.base.outputs import Growing, claim, together, written
 from optloc.base.types import Array
 from optloc.files.reader import Draft, draft
 from optloc.files.table import Table
@@ -21,62 +22,79 @@ from optloc.files.table import Table
 _COLUMNS = ("kind", "epoch", "time", "target", "a", "b", "z", "sigma", "weight", "correction")
 
 
-def write_csv(path: Path, columns: Mapping[str, Any]) -> None:
-    """Write columns as CSV, NaN as an empty cell; raise InvalidProblem where that fails."""
-    import pyarrow as pa
-    from pyarrow import csv
-
-    table = pa.table({name: pa.array(values, from_pandas=True) for name, values in columns.items()})
-    try:
-        csv.write_csv(table, path)
-    except OSError as error:
-        raise unwritable(path, error) from None
+# What makes a spreadsheet take a cell of text for a formula: OWASP, "CSV injection".
+_FORMULA = tuple("=+-@\t\r\n")
 
 
-class GrowingTable:
-    """A CSV file that grows row by row beside a table that is not finished: what a killed run had stays readable.
+def write_csv(path: Path, columns: Mapping[str, Any], *, for_people: bool = False) -> None:
+    """Write columns as CSV, NaN as an empty cell.
 
     Parameters
     ----------
     path : Path
-        The table. Its rows stand in a file of this name with ``.partial`` behind it, each whole as soon as it is added.
+        The file.
+    columns : mapping of str to array
+        By name.
+    for_people : bool
+        Whether people will open it in a spreadsheet: then text that would be a formula there is made harmless. What
+        optloc reads again is written as it is.
+
+    Raises
+    ------
+    InvalidProblem
+        Where it cannot be written.
+    """
+    from pyarrow import csv
+
+    with written(path) as file:
+        csv.write_csv(_table(columns, for_people), file)
+
+
+def _table(columns: Mapping[str, Any], for_people: bool) -> Any:
+    import pyarrow as pa
+
+    cells = {name: harmless_column(values) for name, values in columns.items()} if for_people else columns
+    return pa.table({name: pa.array(values, from_pandas=True) for name, values in cells.items()})
+
+
+def harmless(text: str) -> str:
+    """Return text of a cell with an apostrophe before it where a spreadsheet would compute it; numbers stay."""
+    if not text.startswith(_FORMULA):
+        return text
+    try:
+        float(text)
+    except ValueError:
+        return f"'{text}"
+    return text
+
+
+def harmless_column(values: Any) -> Any:
+    """Return a column of which the texts are harmless."""
+    if isinstance(values, np.ndarray) and values.dtype.kind != "O":
+        return values
+    return [harmless(value) if isinstance(value, str) else value for value in values]
+
+
+class GrowingTable:
+    """A CSV file for people that grows row by row: each row is whole as soon as it is added.
+
+    Parameters
+    ----------
+    path : Path
+        The table; see `optloc.base.outputs.Growing`.
     """
 
     def __init__(self, path: Path) -> None:
-        self.path, self.partial = path, path.with_name(f"{path.name}.partial")
-        self.rows = 0
+        self.path, self.file, self.rows = path, Growing(path), 0
 
     def add(self, columns: Mapping[str, Any]) -> None:
         """Add rows, the same columns each time; raise InvalidProblem where that fails."""
-        import pyarrow as pa
         from pyarrow import csv
 
-        table = pa.table({name: pa.array(values, from_pandas=True) for name, values in columns.items()})
-        lines = BytesIO()
+        table, lines = _table(columns, for_people=True), BytesIO()
         csv.write_csv(table, lines, csv.WriteOptions(include_header=not self.rows))
-        try:
-            # one write without a buffer: whenever the run is killed, whole lines are there
-            with self.partial.open("ab" if self.rows else "wb", buffering=0) as file:
-                file.write(lines.getvalue())
-        except OSError as error:
-            raise unwritable(self.partial, error) from None
+        self.file.append(lines.getvalue())
         self.rows += table.num_rows
-
-    def finish(self) -> None:
-        """Give the file the name of the table; raise InvalidProblem where that fails."""
-        try:
-            self.partial.replace(self.path)
-        except OSError as error:
-            raise unwritable(self.path, error) from None
-
-    def discard(self) -> None:
-        """Remove the file: the table stands in another form."""
-        self.partial.unlink(missing_ok=True)
-
-
-def unwritable(path: Path, error: OSError) -> InvalidProblem:
-    """Return what is said of a file that cannot be written."""
-    return InvalidProblem(f"the file cannot be written ({error.strerror or error})", str(path), "choose another place")
 
 
 def write_measured(source: Path, out: Path, z: Array, note: str = "") -> list[Path]:
@@ -112,39 +130,38 @@ def write_measured(source: Path, out: Path, z: Array, note: str = "") -> list[Pa
     # What the author left out stays out, and takes the same defaults again.
     settings = made.file.model_dump(exclude_defaults=True)
     settings["title"] = " ".join(part for part in (made.loaded.title, f"({note})" if note else "") if part)
-    written = [out]
     kept = (settings["stations"], settings.get("target", {}), *settings.get("targets", {}).values())
+    copies: dict[Path, Path] = {}
     for i, section in enumerate(kept):
         if "file" in section:
-            written += _keep(section, source.parent, out, "stations" if i == 0 else f"target-{i}")
-    for i, (section, table) in enumerate(zip(settings["measurements"], made.tables, strict=True)):
-        path = out.with_name(f"{out.stem}-{i + 1}.csv")
-        write_csv(path, _rows(made, table, z))
-        for key in ("rows", "columns", "separator"):
-            section.pop(key, None)
-        section["file"] = path.name
-        written.append(path)
-    try:
-        out.write_text("format = 1\n" + _toml({k: v for k, v in settings.items() if k != "format"}), encoding="utf-8")
-    except OSError as error:
-        raise unwritable(out, error) from None
-    return written
+            copies |= _keep(section, source.parent, out, "stations" if i == 0 else f"target-{i}")
+    tables = [out.with_name(f"{out.stem}-{i + 1}.csv") for i in range(len(made.tables))]
+    claim(out, *copies, *tables, inputs=[source])
+    with together():
+        for path, original in copies.items():
+            with written(path) as file:
+                file.write_bytes(read_bytes(original))
+        for path, section, table in zip(tables, settings["measurements"], made.tables, strict=True):
+            write_csv(path, _rows(made, table, z))
+            for key in ("rows", "columns", "separator"):
+                section.pop(key, None)
+            section["file"] = path.name
+        text = "format = 1\n" + _toml({k: v for k, v in settings.items() if k != "format"})
+        with written(out) as file:
+            file.write_text(text, encoding="utf-8")
+    return [out, *copies, *tables]
 
 
-def _keep(section: dict[str, Any], folder: Path, out: Path, role: str) -> list[Path]:
-    """Let a section name a table that is not written again, and return the copy of it if one is needed."""
+def _keep(section: dict[str, Any], folder: Path, out: Path, role: str) -> dict[Path, Path]:
+    """Let a section name a table that is not written again; return the name of a copy and its original, if needed."""
     path = folder / section["file"]
     section["file"] = os.path.relpath(path, out.parent)
     if Path(os.path.realpath(path)).is_relative_to(os.path.realpath(out.parent)):
-        return []
+        return {}
     # A problem file names nothing beyond its folder: what is elsewhere is copied beside it.
     copy = out.with_name(f"{out.stem}-{role}{path.suffix}")
     section["file"] = copy.name
-    try:
-        copy.write_bytes(read_bytes(path))
-    except OSError as error:
-        raise unwritable(copy, error) from None
-    return [copy]
+    return {copy: path}
 
 
 def _rows(made: Draft, table: Table, z: Array) -> dict[str, Any]:

@@ -27,6 +27,7 @@ from textwrap import fill
 from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
 from optloc.base.errors import InvalidProblem
+from optloc.base.outputs import make_folder, together, written
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -350,21 +351,19 @@ def write(report: Report, folder: Path) -> list[Path]:
     Raises
     ------
     InvalidProblem
-        Where the folder cannot be written.
+        Where a file cannot be written; then none is.
     """
     page = folder / "README.md"
     tables = [(folder / f"{table.name}.csv", table) for table in report.tables]
     pictures = [(folder / f"{picture.name}.png", picture) for picture in report.pictures]
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        page.write_text(report.markdown(), encoding="utf-8")
+    make_folder(folder)
+    with together():
+        with written(page) as file:
+            file.write_text(report.markdown(), encoding="utf-8")
         for path, table in tables:
-            with path.open("w", encoding="utf-8", newline="") as file:
-                csv.writer(file, lineterminator="\n").writerows([table.header, *table.rows])
+            with written(path) as file, file.open("w", encoding="utf-8", newline="") as lines:
+                csv.writer(lines, lineterminator="\n").writerows([table.header, *table.rows])
         for path, picture in pictures:
-            picture.figure.savefig(path, dpi=120)
-    except OSError as error:
-        raise InvalidProblem(
-            f"the folder cannot be written ({error.strerror or error})", str(folder), "choose another place"
-        ) from None
+            with written(path) as file:
+                picture.figure.savefig(file, dpi=120)
     return [page, *(path for path, _ in tables), *(path for path, _ in pictures)]

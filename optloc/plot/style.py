@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from io import BytesIO
 from math import factorial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem
+from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
 from optloc.base.linalg import error_ellipse
+from optloc.base.outputs import written
 from optloc.base.types import Array, Band, Polygon, Status
 from optloc.plot.outlines import Pieces, pieces_of, rings
 from optloc.problem.chart import CARTESIAN
@@ -90,8 +92,22 @@ def finish(figure: Figure, title: str, panels: Sequence[Axes] = (), ncols: int =
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a picture; the ending of the name decides the type."""
-    figure.savefig(path, dpi=120)
+    """Write a picture; the ending of the name decides the type, without one it is PNG.
+
+    Raises
+    ------
+    InvalidProblem
+        Where that type is unknown, or the file cannot be written.
+    """
+    known = sorted(figure.canvas.get_supported_filetypes())
+    ending = path.suffix.lower().removeprefix(".") or "png"
+    if ending not in known:
+        raise InvalidProblem(f"pictures of type {path.suffix!r} are unknown", str(path), nearest(ending, known))
+    # Drawn before it is written: an error of the disk inside a library has many names.
+    drawn = BytesIO()
+    figure.savefig(drawn, dpi=120, format=ending)
+    with written(path) as file:
+        file.write_bytes(drawn.getvalue())
 
 
 def unit_of(points: Array) -> tuple[str, float]:

@@ -11,8 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
+from optloc.base.outputs import claim, make_folder, together, written
 from optloc.base.types import Array
 from optloc.bounds.bound_map import BoundMap, bound_map, extent, plan_of
+from optloc.files.writer import harmless_column
 from optloc.papers.report import Picture
 from optloc.plot.bound_map import plot_bound_map
 from optloc.plot.style import figure_class
@@ -25,7 +27,7 @@ from optloc.report.sheets import Sheet, latex, sheets
 from optloc.study import summary
 from optloc.study.baselines import BASELINES
 from optloc.study.draws import Case, draw
-from optloc.study.folder import Manifest, read_frame, read_manifest, unwritable
+from optloc.study.folder import Manifest, read_frame, read_manifest
 from optloc.study.plan import Plan, planned
 from optloc.study.summary import case_label, noise_text
 
@@ -179,10 +181,13 @@ def write_report(folder: Path, out: Path | None = None, tell: Tell | None = None
     """
     figure_class()
     place = folder / "report" if out is None else out
+    target = place / "report.html"
     say = tell or (lambda _: None)
     say("reading")
     found = _found(folder)
-    try:
+    make_folder(place)
+    claim(target)
+    with together():
         files = [_table_file(place, sheet, ending) for sheet in found.sheets.values() for ending in ("csv", "tex")]
         parts = [Part("ranking", "Ranking", tables=[found.sheets["ranking"]])]
         for section in _SECTIONS:
@@ -198,10 +203,8 @@ def write_report(folder: Path, out: Path | None = None, tell: Tell | None = None
             files += more
         source = found.manifest.text
         parts.append(Part("made", "How it was made", tables=[found.sheets["machine"]], source=source))
-        target = place / "report.html"
-        target.write_text(_page(found, parts), encoding="utf-8")
-    except OSError as error:
-        raise unwritable(place, error) from None
+        with written(target) as file:
+            file.write_text(_page(found, parts), encoding="utf-8")
     return [target, *files]
 
 
@@ -256,19 +259,23 @@ def _figure_files(place: Path, picture: Picture, *, legend: bool) -> list[Path]:
         width, height = figure.get_size_inches()
         figure.set_size_inches(width, height + _LEGEND_LINE * -(-len(labels) // columns))
     paths = [place / "figures" / f"{picture.name}.{ending}" for ending in ("png", "svg")]
-    paths[0].parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(paths[0], dpi=_DPI)
-    paths[1].write_text(svg_text(figure), encoding="utf-8")
+    make_folder(paths[0].parent)
+    with written(paths[0]) as file:
+        figure.savefig(file, dpi=_DPI)
+    with written(paths[1]) as file:
+        file.write_text(svg_text(figure), encoding="utf-8")
     return paths
 
 
 def _table_file(place: Path, sheet: Sheet, ending: str) -> Path:
     path = place / "tables" / f"{sheet.shown.name}.{ending}"
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if ending == "csv":
-        sheet.frame.to_csv(path, index=False, lineterminator="\n")
-    else:
-        path.write_text(latex(sheet.shown, sheet.words), encoding="utf-8")
+    make_folder(path.parent)
+    with written(path) as file:
+        if ending == "csv":
+            frame = sheet.frame.assign(**{str(name): harmless_column(cells) for name, cells in sheet.frame.items()})
+            frame.to_csv(file, index=False, lineterminator="\n")
+        else:
+            file.write_text(latex(sheet.shown, sheet.words), encoding="utf-8")
     return path
 
 

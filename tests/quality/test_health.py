@@ -143,7 +143,7 @@ def test_check_tells_health_as_table_json_files_and_picture(tmp_path):
     table = pd.read_csv(out)
     assert list(table["name"]) == list(stations)
     assert picture.read_text().startswith("<?xml")
-    assert "no-solve" in run("check", path, "--no-solve", "--out", out, code=2).stderr
+    assert "no-solve" in run("check", path, "--no-solve", "--out", out, "--force", code=2).stderr
     assert "did you mean" in run("check", path, "--by", "stations", code=2).stderr
 
 

@@ -252,7 +252,7 @@ def test_bad_places_are_sentences(site, tmp_path):
     with pytest.raises(InvalidProblem, match="nothing of the study is finished yet"):
         write_report(empty)
     (tmp_path / "file").write_text("")
-    with pytest.raises(InvalidProblem, match="cannot be written"):
+    with pytest.raises(InvalidProblem, match="cannot be made"):
         write_report(site, tmp_path / "file")
     found = RUN.invoke(app, ["study", "report", str(tmp_path / "none")])
     assert found.exit_code == 2

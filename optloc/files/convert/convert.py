@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.outputs import claim, together, written
 from optloc.base.types import Array
 from optloc.base.units import UNITS
 from optloc.files.convert.roles import GEOJSON, GUESSES, Places, Roles, places_of, read_table, stem, unit_of
 from optloc.files.reader import Loaded, read
 from optloc.files.schema import Units
-from optloc.files.writer import unwritable, write_csv
+from optloc.files.writer import write_csv
 
 INPUTS = ("arrivals", "pseudoranges", "stations")
 
@@ -97,6 +98,7 @@ def convert(
         raise InvalidProblem(f"there is no frame {frame!r}", "--frame", nearest(str(frame), ("cartesian", "ecef")))
     if what is not None and what not in INPUTS:
         raise InvalidProblem(f"there is no input {what!r}", "--as", nearest(what, INPUTS))
+    claim(out, *_tables(out), inputs=[source, *([stations] if stations else [])])
     if what == "stations" or source.suffix.lower() in GEOJSON:
         return _write_stations(source, out, told, frame)
     if out.suffix.lower() != ".toml":
@@ -140,11 +142,14 @@ def _write_stations(source: Path, out: Path, told: Mapping[str, str], frame: str
     return Converted((out,), None, (found.note,) if found.note else ())
 
 
+def _tables(out: Path) -> tuple[Path, ...]:
+    """Return the names of the tables beside a problem file; stations alone have none."""
+    names = ("stations", "rows") if out.suffix.lower() == ".toml" else ()
+    return tuple(out.with_name(f"{out.stem}-{name}.csv") for name in names)
+
+
 def _write(source: Path, out: Path, found: Measured, place: Places, sigma: str) -> Converted:
-    tables = {out.with_name(f"{out.stem}-stations.csv"): place.columns}
-    tables[out.with_name(f"{out.stem}-rows.csv")] = found.columns
-    for path, columns in tables.items():
-        write_csv(path, columns)
+    tables = dict(zip(_tables(out), (place.columns, found.columns), strict=True))
     one, two = (json.dumps(path.name) for path in tables)
     text = f"""# Made from {source.name} by optloc convert.
 format = 1
@@ -163,10 +168,11 @@ file = {two}
 unit = "{found.unit}"
 sigma = {json.dumps(sigma)}
 """
-    try:
-        out.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise unwritable(out, error) from None
+    with together():
+        for path, columns in tables.items():
+            write_csv(path, columns)
+        with written(out) as file:
+            file.write_text(text, encoding="utf-8")
     notes = (*found.notes, *((place.note,) if place.note else ()))
     return Converted((out, *tables), read(out), notes)
 
