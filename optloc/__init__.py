@@ -5,14 +5,15 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from importlib import import_module
-from typing import Any
 
 # The libraries of the command line take half a second to load: Ctrl-C ends it then as it does later, quietly.
 _NAME = os.path.basename("".join(sys.argv[:1]))  # noqa: PTH119  (pathlib takes its time, too)
 _RUNS = _NAME in {"optloc", "optloc.exe", "optloc-script.py"} or (_NAME == "-m" and "optloc.cli" in sys.orig_argv)
 if _RUNS and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, lambda *_: os._exit(130))
+
+from importlib import import_module
+from typing import Any
 
 from optloc.adequacy.evidence import Reliability, reliability
 from optloc.adequacy.level import CommonLevel, LateSignals

@@ -6,6 +6,7 @@ import logging
 import os
 import signal
 import sys
+import warnings
 from collections.abc import Callable
 from contextvars import copy_context
 from importlib.resources import files
@@ -96,6 +97,8 @@ def _prepare() -> None:
             wide = said.isascii() and said.isdigit() and len(said) < 10
             os.environ[name] = str(min(max(int(said), _NARROWEST), _WIDEST)) if wide else "80"
     sys.unraisablehook = _unraisable
+    # A picture shows a box where its font has no such sign, and no one can do anything about it.
+    warnings.filterwarnings("ignore", message=r"Glyph .* missing from font")
 
 
 def _flush(code: Any) -> Any:

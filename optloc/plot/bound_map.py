@@ -10,7 +10,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.bounds.bound_map import BoundMap
-from optloc.plot.style import BLACK, GREY, apart, figure_class
+from optloc.plot.style import BLACK, GREY, apart, figure_class, literal
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -77,7 +77,7 @@ def plot_bound_map(found: BoundMap, title: str = "", *, dilution: bool = False) 
     bar = figure.colorbar(drawn, ax=axes, label=name, ticks=steps, format=lambda value, _: f"{value:g}", pad=0.02)
     bar.ax.minorticks_off()
     if title:
-        axes.set_title(title, fontsize=11)
+        axes.set_title(literal(title), fontsize=11)
     apart(figure)
     return figure
 
@@ -89,7 +89,7 @@ def _mark_stations(axes: Axes, stations: Array, names: Sequence[str], x: Array, 
     inside = (np.abs(stations - [x.mean(), y.mean()]) <= [np.ptp(x) / 2, np.ptp(y) / 2]).all(-1)
     for place, text in zip(stations[inside], np.array(names)[inside], strict=True):
         if len(names) <= _NAMED:
-            note = axes.annotate(str(text), place, (4, 5), textcoords="offset points", fontsize=8, zorder=5)
+            note = axes.annotate(literal(str(text)), place, (4, 5), textcoords="offset points", fontsize=8, zorder=5)
             note.set_bbox({"facecolor": "white", "edgecolor": GREY, "alpha": 0.75, "pad": 1, "linewidth": 0.4})
 
 

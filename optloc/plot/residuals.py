@@ -13,7 +13,7 @@ from optloc.base.units import SI_UNIT
 from optloc.linear.evaluate import differentiate
 from optloc.linear.normal import weighed
 from optloc.models import MODELS
-from optloc.plot.style import BLACK, BLUE, GREY, ORANGE, SKY, figure_class, finish, grid
+from optloc.plot.style import BLACK, BLUE, GREY, ORANGE, SKY, figure_class, finish, grid, literal
 from optloc.problem.fix import Fix
 from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
@@ -142,7 +142,7 @@ def _panel(panel: Axes, kind: str, sets: Sets) -> None:
                     own[chosen], np.full(chosen.sum(), place), color=colour, marker=mark, zorder=4, label=name
                 )
     panel.axvline(0.0, color=BLACK, linewidth=0.8, zorder=1)
-    panel.set_yticks(range(len(sets)), list(sets))
+    panel.set_yticks(range(len(sets)), [literal(name) for name in sets])
     panel.set_ylim(len(sets) - 0.4, -0.6)
     panel.set_xlabel(f"measured less modelled ({unit})" if unit != "1" else "measured less modelled")
     panel.set_title(kind, fontsize=10)
@@ -205,7 +205,7 @@ def _health_panel(panel: Axes, health: Health, unit: str, groups: Array) -> None
     panel.errorbar(factor * health.bias[groups], place, xerr=error, label="bias ± 2 standard errors", **style)
     _limit(panel, np.abs([low, high]).max(0), factor * health.bias[groups], shown)
     panel.axvline(0.0, color=BLACK, linewidth=0.8, zorder=0)
-    panel.set_yticks(place, [health.names[g] for g in groups])
+    panel.set_yticks(place, [literal(health.names[g]) for g in groups])
     panel.set_xlabel(f"measured less predicted by the others ({shown})" if shown != "1" else "measured less predicted")
     panel.set_ylim(-0.7, len(groups) - 0.3)
     panel.grid(axis="x", color=GREY, alpha=0.3, linewidth=0.6)

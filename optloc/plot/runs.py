@@ -22,6 +22,7 @@ from optloc.plot.style import (
     figure_class,
     finish,
     grid,
+    literal,
     panels_for,
 )
 from optloc.problem.layout import Slot
@@ -93,7 +94,7 @@ def plot_accuracy(
     axes.plot(noise, bound, color=BLACK, linewidth=4.0, alpha=0.3, label="Cramer-Rao bound", zorder=2)
     for i, (name, values) in enumerate(errors.items()):
         colour, mark = _LOOKS[i % len(_LOOKS)]
-        axes.plot(noise, values, color=colour, marker=mark, markersize=5, linewidth=1.3, label=name, zorder=3)
+        axes.plot(noise, values, color=colour, marker=mark, markersize=5, linewidth=1.3, label=literal(name), zorder=3)
     axes.set_xscale("log")
     axes.set_yscale("log")
     axes.set_xlabel(f"standard deviation of a row ({unit})" if unit else "factor on the noise")
@@ -101,7 +102,7 @@ def plot_accuracy(
     axes.legend(frameon=False, fontsize=9)
     grid(axes)
     if title:
-        axes.set_title(title, fontsize=11)
+        axes.set_title(literal(title), fontsize=11)
     return figure
 
 
@@ -143,7 +144,9 @@ def _course_panel(panel: Axes, course: Course, known: Course | None, slot: Slot)
         entries, sigma = ("root mean square",), course.total(slot.name)[:, None] / np.sqrt(slot.size)
     for entry, values, colour in zip(entries, sigma.T, _COURSE_COLOURS * 2, strict=False):
         label = f"{word} {entry}".strip() if slot.members else f"along {entry}"
-        panel.plot(course.times, values, color=colour, linewidth=1.8 if slot.members else 1.0, label=label, zorder=3)
+        panel.plot(
+            course.times, values, color=colour, linewidth=1.8 if slot.members else 1.0, label=literal(label), zorder=3
+        )
     if not slot.members:
         panel.plot(course.times, course.total(slot.name), color=BLUE, linewidth=3.5, label=f"in {_SPACE[slot.size]}")
         if known is not None:
@@ -152,7 +155,7 @@ def _course_panel(panel: Axes, course: Course, known: Course | None, slot: Slot)
     panel.set_yscale("log")
     panel.set_xlabel("time (s)")
     panel.set_ylabel(f"bound of the standard deviation ({unit})")
-    panel.set_title(slot.name)
+    panel.set_title(literal(slot.name))
     panel.grid(which="both", color=GREY, alpha=0.3, linewidth=0.6)
     panel.legend(frameon=False, fontsize=8)
 
@@ -201,7 +204,7 @@ def _bias_panel(panel: Axes, found: Growing, slot: Slot, truth: Array | None) ->
     for i, entry in enumerate(slot.entries[:_MOST]):
         colour, band = _BIAS_COLOURS[i % len(_BIAS_COLOURS)], _95 * sigma[:, i]
         style: dict[str, Any] = {"color": colour, "linewidth": 1.5, "linestyle": _DASHES[i % len(_DASHES)]}
-        panel.plot(found.times, values[:, i], label=str(entry), zorder=3, **style)
+        panel.plot(found.times, values[:, i], label=literal(str(entry)), zorder=3, **style)
         panel.fill_between(
             found.times, values[:, i] - band, values[:, i] + band, color=colour, alpha=0.18, linewidth=0.0
         )
@@ -209,7 +212,7 @@ def _bias_panel(panel: Axes, found: Growing, slot: Slot, truth: Array | None) ->
             panel.axhline(np.ravel(truth)[i], color=BLACK, linewidth=1.0, linestyle=":", zorder=2)
     _window(panel, values[:, :_MOST], sigma[:, :_MOST])
     hidden = len(slot.entries) - _MOST
-    panel.set_title(slot.name + (f" (first {_MOST} of {len(slot.entries)})" if hidden > 0 else ""))
+    panel.set_title(literal(slot.name) + (f" (first {_MOST} of {len(slot.entries)})" if hidden > 0 else ""))
     panel.set_xlabel("time (s)")
     panel.set_ylabel(f"estimate and 95 % ({slot.unit})" if slot.unit else "estimate and 95 %")
     panel.legend(frameon=False, fontsize=8, ncols=2)

@@ -14,7 +14,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
 from optloc.base.linalg import error_ellipse
-from optloc.base.outputs import written
+from optloc.base.outputs import visible, written
 from optloc.base.types import Array, Band, Polygon, Status
 from optloc.plot.outlines import Pieces, pieces_of, rings
 from optloc.problem.chart import CARTESIAN
@@ -87,7 +87,7 @@ def finish(figure: Figure, title: str, panels: Sequence[Axes] = (), ncols: int =
     if shown:
         figure.legend(shown.values(), shown, loc="outside lower center", ncols=ncols, frameon=False, **style)
     if title:
-        figure.suptitle(title)
+        figure.suptitle(literal(title))
     return figure
 
 
@@ -108,6 +108,17 @@ def save(figure: Figure, path: Path) -> None:
     figure.savefig(drawn, dpi=120, format=ending)
     with written(path) as file:
         file.write_bytes(drawn.getvalue())
+
+
+# Letters of a title or a name that a picture has room for.
+_LETTERS = 120
+
+
+def literal(text: str) -> str:
+    """Return a text of strangers as matplotlib shows it letter by letter: dollars begin no formula, `_` hides nothing."""
+    text = visible(" ".join(text.split()))
+    text = text if len(text) <= _LETTERS else f"{text[: _LETTERS - 1]}…"
+    return (" " if text.startswith("_") else "") + text.replace("$", r"\$")
 
 
 def unit_of(points: Array) -> tuple[str, float]:
@@ -443,7 +454,7 @@ def note(panel: Axes, text: str, x: float, y: float, colour: str = BLACK) -> Non
     from matplotlib.patheffects import withStroke
 
     style: dict[str, Any] = {"fontsize": 8, "color": colour, "zorder": 6, "annotation_clip": True}
-    made = panel.annotate(text, (x, y), xytext=(5, 5), textcoords="offset points", **style)
+    made = panel.annotate(literal(text), (x, y), xytext=(5, 5), textcoords="offset points", **style)
     # A white rim: readable over lines and colours.
     made.set_path_effects([withStroke(linewidth=2.0, foreground="white")])
 

@@ -10,7 +10,21 @@ import numpy as np
 
 from optloc.base.frames import Frame
 from optloc.base.types import Array
-from optloc.plot.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, YELLOW, figure_class, finish, ring, unit_of
+from optloc.plot.style import (
+    BLACK,
+    BLUE,
+    GREEN,
+    GREY,
+    ORANGE,
+    PURPLE,
+    SKY,
+    YELLOW,
+    figure_class,
+    finish,
+    literal,
+    ring,
+    unit_of,
+)
 from optloc.problem.problem import Problem
 from optloc.track.run import Entry
 
@@ -143,7 +157,9 @@ def _plan(panel: Axes, lines: Sequence[_Line], stations: Array, axes: Sequence[s
         )
     for i, (line, colour) in enumerate(_colour(lines)):
         path = line.position[:, :2] / size
-        panel.plot(*path.T, color=colour, linewidth=1.5, zorder=4, label=line.name if len(lines) > 1 else "track")
+        panel.plot(
+            *path.T, color=colour, linewidth=1.5, zorder=4, label=literal(line.name) if len(lines) > 1 else "track"
+        )
         marks: dict[str, Any] = {"marker": "o", "s": 45, "color": colour, "edgecolors": BLACK, "zorder": 6}
         panel.scatter(path[line.starts, 0], path[line.starts, 1], label=None if i else "start, from a fix", **marks)
         if line.bad.any():

@@ -13,7 +13,7 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.papers.report import Picture
-from optloc.plot.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, YELLOW, figure_class
+from optloc.plot.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, YELLOW, figure_class, literal
 from optloc.study.summary import accuracy_rows, distribution, instances, noise_text, performance_profile, wilson
 
 if TYPE_CHECKING:
@@ -95,11 +95,6 @@ def panel(title: str, size: tuple[float, float] = _SIZE) -> tuple[Figure, Axes]:
     if title:
         axes.set_title(literal(title), fontsize=10)
     return figure, axes
-
-
-def literal(text: str) -> str:
-    """Return a text of a study file as matplotlib shows it letter by letter: its dollars begin no formula."""
-    return text.replace("$", r"\$")
 
 
 def success(table: pd.DataFrame, looks: Looks) -> Iterator[Picture]:

@@ -19,7 +19,7 @@ from optloc.papers.report import Picture
 from optloc.plot.bound_map import plot_bound_map
 from optloc.plot.style import figure_class
 from optloc.report import figures as drawn
-from optloc.report.figures import Drawing, Mark, inline, literal, marks, svg_text
+from optloc.report.figures import Drawing, Mark, inline, marks, svg_text
 from optloc.report.map import Canvas
 from optloc.report.map_pages import map_element
 from optloc.report.page import Part, write_page
@@ -290,7 +290,7 @@ def _maps(place: Path, found: _Found) -> tuple[Part, list[Path]]:
     files = []
     for i, one in enumerate(found.places):
         name = f"map-{i + 1}"
-        picture = Picture(name, f"Bound: {one.title}", plot_bound_map(one.found, literal(one.title)))
+        picture = Picture(name, f"Bound: {one.title}", plot_bound_map(one.found, one.title))
         trials = (one.truths, one.off)
         maps.append(map_element(one.found, name, one.title, trials) if one.found.geodetic else inline(picture))
         files += _figure_files(place, picture, legend=False)
