@@ -115,7 +115,7 @@ _LETTERS = 120
 
 
 def literal(text: str) -> str:
-    """Return a text of strangers as matplotlib shows it letter by letter: dollars begin no formula, `_` hides nothing."""
+    """Return a text as matplotlib shows it letter by letter: dollars begin no formula, and `_` hides nothing."""
     text = visible(" ".join(text.split()))
     text = text if len(text) <= _LETTERS else f"{text[: _LETTERS - 1]}…"
     return (" " if text.startswith("_") else "") + text.replace("$", r"\$")
