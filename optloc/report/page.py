@@ -1,4 +1,4 @@
-"""A page: one HTML file that needs nothing else, from the templates of this package.
+"""A page: one HTML file that needs nothing else, from the templates of this package; pages with a map that moves.
 
 Python prepares values and templates write HTML: every text is escaped where it is written, but for what `asset` reads
 and the SVG of figures.
@@ -6,14 +6,40 @@ and the SVG of figures.
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
-from typing import TYPE_CHECKING
+from io import BytesIO
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array
+from optloc.bounds.bound_map import BoundMap
+from optloc.plot.bound_map import COLOURS, isolines, levels
+from optloc.plot.style import BLACK, BLUE, ORANGE
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
 from optloc.report.figures import Drawing, Mark
-from optloc.report.map import Canvas
+from optloc.report.map import (
+    Canvas,
+    Curve,
+    Drawn,
+    Image,
+    Label,
+    Plane,
+    Spots,
+    dot,
+    fixed_spots,
+    lines_of_position,
+    map_canvas,
+    other_spots,
+    path,
+    station_spots,
+)
 from optloc.report.sheets import Sheet
 
 if TYPE_CHECKING:
@@ -108,3 +134,254 @@ def _environment() -> Environment:
 def _asset(name: str) -> str:
     """Return a style sheet or a script, whose braces must not be read as those of a template."""
     return (files("optloc.report") / "templates" / name).read_text(encoding="utf-8")
+
+
+# Pages with a map that moves: fixes or tracks with ellipses and lines of position; a bound, as reports show it.
+
+# Ellipses of more fixes are left out: a thicket that nobody reads, and 70 corners each.
+_ELLIPSES = 200
+# Decimals of the units of the drawing: an ellipse of centimetres on a map of 1000 km is still round.
+_DIGITS = 5
+# Degrees; a map of a single place is so wide at least, some metres.
+_LEAST = 1e-5
+# Share of the map on each side that stays free of marks, so that names of stations have room.
+_RIM = 0.22
+# The shorter side of a map over the longer, at least.
+_SLIMMEST = 0.6
+# Pixels of a dot: of a station and its white middle, of a mark, and of a mark where there are more than `_FEW`.
+_STATION, _MIDDLE, _MARK, _SMALL = 11, 7, 11, 5
+_FEW = 12
+
+
+def fix_page(problem: Problem, fixes: Fix | Sequence[Fix], title: str, labels: Sequence[str] = ()) -> str:
+    """Return an HTML page with an interactive map of fixes; it needs no server and no network.
+
+    Parameters
+    ----------
+    problem : Problem
+        On Earth; gives the stations.
+    fixes : Fix or sequence of Fix
+        Single fixes or batches.
+    title : str
+        Title of the page.
+    labels : sequence of str
+        Names of the fixes, for instance their epochs.
+
+    Raises
+    ------
+    InvalidProblem
+        Where the frame is not on Earth, nothing has a place, or matplotlib is missing.
+    """
+    _on_earth(problem.frame.geodetic)
+    several = [fixes] if isinstance(fixes, Fix) else list(fixes)
+    found, others = fixed_spots(problem, several, labels), other_spots(problem, several)
+    single = several[0] if len(several) == 1 and several[0].code.size == 1 else None
+    return _page(problem, found, others, title, "fix", single)
+
+
+def track_page(problem: Problem, tracks: Spots, title: str) -> str:
+    """Return the same of the scans of tracks."""
+    _on_earth(problem.frame.geodetic)
+    return _page(problem, tracks, Spots(np.zeros((0, 2)), (), np.zeros(0, dtype=bool), ()), title, "track", None)
+
+
+def map_page(found: BoundMap, title: str) -> str:
+    """Return an HTML page with the interactive map of a bound; it needs no network.
+
+    Raises
+    ------
+    InvalidProblem
+        Where the frame is not on Earth, or matplotlib is missing.
+    """
+    _on_earth(found.geodetic)
+    text = "Root of the trace of the Cramer-Rao bound of the position, in metres. Shores: Natural Earth."
+    part = Part("map", "Bound of the position error", text, maps=[map_element(found, "map-1", title)])
+    return write_page(title, [part])
+
+
+def _on_earth(geodetic: bool) -> None:
+    if not geodetic:
+        advice = "write a picture (.png, .svg, .pdf), or give a frame of the Earth"
+        raise InvalidProblem("an interactive map needs positions on Earth", "map", advice)
+
+
+def _page(problem: Problem, found: Spots, others: Spots, title: str, what: str, single: Fix | None) -> str:
+    stations = station_spots(problem)
+    limits = _limits([stations.place, found.place, others.place])
+    plane, middle = Plane(*limits), (limits[0] + limits[1]) / 2.0
+    lines = [] if single is None else lines_of_position(problem, single, limits)
+    few = len(found.place) <= _FEW
+    layers: dict[str, Sequence[Drawn]] = {
+        **({"lines of position": _curves(lines, plane)} if lines else {}),
+        "stations": _stations(stations, plane, middle),
+        **({"alternatives": _dots(others, plane, middle, _MARK)} if len(others.place) else {}),
+        what: [*_ellipses(found, plane, middle), *_dots(found, plane, middle, _MARK if few else _SMALL)],
+    }
+    # The part that deserves a button is three ellipses wide; a map that is not wider needs none.
+    data: dict[str, object] = {}
+    if focus := _focus(found, plane, middle):
+        # One can zoom until the part fills a tenth of the width, at least as far as on maps without one.
+        data = {"focus": focus, "nearest": max(200.0, 10.0 * 2.0 * float(plane.half[0]) / focus[2])}
+    text = f"Stations (white), {what} (blue; orange where the status is not ok) with what holds 95 %. Point at a mark."
+    canvas = map_canvas(plane, "map-1", title, layers, data, text)
+    note = "Drag to move, wheel or pinch to zoom. Shores: Natural Earth."
+    return write_page(title, [Part("map", "Map", maps=[canvas], note=note)])
+
+
+def _limits(places: Sequence[Array]) -> tuple[float, float, float, float]:
+    """Return west, east, south, north that hold all places with a rim; of two ways around the Earth the shorter."""
+    points = np.concatenate(places)
+    points = points[np.isfinite(points).all(-1)]
+    if not len(points):
+        raise InvalidProblem("nothing has a place on the map", "map", "see `optloc fix` for the reasons")
+    # Everything within half a turn of the first place.
+    points = _turn(points, points[0, 0])
+    low, high = points.min(0), points.max(0)
+    squeeze = np.array([np.cos(np.radians((low + high)[1] / 2.0)), 1.0])
+    half = (0.5 + _RIM) * np.maximum(
+        (high - low) * squeeze, _SLIMMEST * float(((high - low) * squeeze).max() or _LEAST)
+    )
+    (west, south), (east, north) = (low + high) / 2.0 - half / squeeze, (low + high) / 2.0 + half / squeeze
+    return float(west), float(east), float(max(south, -90.0)), float(min(north, 90.0))
+
+
+def _turn(place: Array, middle: float) -> Array:
+    """Return longitude and latitude (n, 2) with longitudes within half a turn of the middle of the map."""
+    out = np.array(place, dtype=float)
+    out[:, 0] = (out[:, 0] - middle + 180.0) % 360.0 - 180.0 + middle
+    return out
+
+
+def _focus(found: Spots, plane: Plane, middle: float) -> list[float] | None:
+    """Return middle and width, in units of the drawing, of what holds a single ellipse, where that is small."""
+    rings = [ring for ring in found.rings if len(ring)]
+    if len(found.place) != 1 or not rings:
+        return None
+    ring = plane(_turn(rings[0], middle))
+    (x, y), width = ring.mean(0), 3.0 * float(np.ptp(ring, axis=0).max())
+    return [float(x), float(y), width] if width < plane.half[0] else None
+
+
+def _curves(lines: Sequence[tuple[str, Array]], plane: Plane) -> list[Drawn]:
+    return [Curve("line thin", path([plane(line)], close=False, digits=3), tell=name) for name, line in lines]
+
+
+def _stations(stations: Spots, plane: Plane, middle: float) -> list[Drawn]:
+    places = plane(_turn(stations.place, middle))
+    marks = [_station(name, x, y, f"station {name}") for name, (x, y) in zip(stations.text, places, strict=True)]
+    return [one for mark, seen in zip(marks, np.isfinite(places[:, 0]), strict=True) if seen for one in mark]
+
+
+def _station(name: str, x: float, y: float, tell: str) -> tuple[Drawn, ...]:
+    return dot(x, y, BLACK, _STATION), dot(x, y, "#ffffff", _MIDDLE, tell), Label("name", x, y, name)
+
+
+def _ellipses(found: Spots, plane: Plane, middle: float) -> list[Drawn]:
+    rings = [plane(_turn(ring, middle)) for ring in (*found.rings, *found.more) if len(ring)]
+    if not rings or len(found.rings) > _ELLIPSES:
+        return []
+    return [Curve("ring", path(rings, close=True, digits=_DIGITS), BLUE)]
+
+
+def _dots(found: Spots, plane: Plane, middle: float, size: float) -> list[Drawn]:
+    return [
+        dot(x, y, BLUE if ok else ORANGE, size, told)
+        for (x, y), ok, told in zip(plane(_turn(found.place, middle)), found.clean, found.text, strict=True)
+        if np.isfinite(x)
+    ]
+
+
+# The map of a bound: coastlines, bound, stations and trials.
+
+# Dots of trials: enough to show where they are, few enough that the bound below is seen and the page moves smoothly.
+_DOTS = 400
+_RIGHT, _WRONG = 3, 5  # pixels: those that were answered wrong must be seen among many that were not
+
+
+def map_element(found: BoundMap, name: str, title: str, trials: tuple[Array, Array] | None = None) -> Canvas:
+    """Return the map of a bound.
+
+    Parameters
+    ----------
+    found : BoundMap
+        The bound over a grid of longitude and latitude.
+    name : str
+        Identity of the element.
+    title : str
+        What it shows.
+    trials : (places, off), optional
+        Longitude and latitude (n, 2) of true places, and which of them (n,) were not answered right.
+    """
+    plane = Plane(found.x[0], found.x[-1], found.y[0], found.y[-1])
+    layers: dict[str, Sequence[Drawn]] = {
+        "bound": [_image(found, plane), *_lines(found, plane)],
+        **({} if trials is None else {"trials": _trials(plane, *trials)}),
+        "stations": _map_stations(found, plane),
+    }
+    return map_canvas(plane, name, title, layers, _data(found), _help(found))
+
+
+def _help(found: BoundMap) -> str:
+    steps = levels(found.sigma)
+    low, high = _metres(steps[0]), _metres(steps[-1])
+    return f"Bound from {low} (light) to {high} (dark), {found.height:.0f} m above the ellipsoid. Point at a place."
+
+
+def _metres(level: float) -> str:
+    return f"{level:g} m" if level < 1e3 else f"{level / 1e3:g} km"
+
+
+def _image(found: BoundMap, plane: Plane) -> Image:
+    from matplotlib import colormaps
+    from matplotlib.colors import LogNorm
+    from matplotlib.image import imsave
+
+    steps = levels(found.sigma)
+    # A bound that is the same everywhere still has two ends of a scale.
+    norm = LogNorm(steps[0], max(steps[-1], 2.0 * steps[0]), clip=True)
+    rgba = colormaps[COLOURS](norm(np.ma.masked_invalid(found.sigma)))
+    # Where there is no bound nothing is drawn.
+    rgba[~np.isfinite(found.sigma)] = 0.0
+    file = BytesIO()
+    imsave(file, np.ascontiguousarray(rgba[::-1]), format="png")
+    # A pixel stands around its point, so the picture reaches half a step beyond the grid.
+    dx, dy = ((v[1] - v[0]) / 2.0 for v in (found.x, found.y))
+    x, y = plane(np.array([found.x[0] - dx, found.y[-1] + dy]))
+    right, low = plane(np.array([found.x[-1] + dx, found.y[0] - dy]))
+    return Image(x, y, right - x, low - y, f"data:image/png;base64,{b64encode(file.getvalue()).decode()}")
+
+
+def _lines(found: BoundMap, plane: Plane) -> list[Drawn]:
+    parts: list[Drawn] = []
+    for level, lines in isolines(found):
+        drawn = [plane(line) for line in lines]
+        if not drawn:
+            continue
+        # One label a level, in the middle of its longest line.
+        longest = max(drawn, key=len)
+        x, y = longest[len(longest) // 2]
+        parts += [Curve("line", path(drawn, close=False)), Label("level", x, y, _metres(level))]
+    return parts
+
+
+def _map_stations(found: BoundMap, plane: Plane) -> list[Drawn]:
+    places = zip(found.names, plane(found.stations), strict=True)
+    return [one for name, (x, y) in places for one in _station(name, x, y, name)]
+
+
+def _trials(plane: Plane, places: Array, off: Array) -> list[Drawn]:
+    kept = np.unique(np.linspace(0, len(places) - 1, min(_DOTS, len(places))).astype(int))
+    order = kept[np.argsort(off[kept], kind="stable")]  # those that were wrong on top
+    return [
+        dot(x, y, ORANGE if bad else BLUE, _WRONG if bad else _RIGHT)
+        for (x, y), bad in zip(plane(places[order]), off[order], strict=True)
+    ]
+
+
+def _data(found: BoundMap) -> dict[str, Any]:
+    """Return what the script of the page needs to tell the bound at a place."""
+    return {
+        "x": [float(found.x[0]), float(found.x[-1]), len(found.x)],
+        "y": [float(found.y[0]), float(found.y[-1]), len(found.y)],
+        "values": [float(f"{v:.3g}") if np.isfinite(v) else None for v in found.sigma.ravel()],
+    }

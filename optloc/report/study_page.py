@@ -21,8 +21,7 @@ from optloc.plot.style import figure_class
 from optloc.report import figures as drawn
 from optloc.report.figures import Drawing, Mark, inline, marks, svg_text
 from optloc.report.map import Canvas
-from optloc.report.map_pages import map_element
-from optloc.report.page import Part, write_page
+from optloc.report.page import Part, map_element, write_page
 from optloc.report.sheets import Sheet, latex, sheets
 from optloc.study import summary
 from optloc.study.baselines import BASELINES
