@@ -98,7 +98,7 @@ def test_any_encoding_and_any_width(encoding, tmp_path):
         f"{{ a = {json.dumps(n, ensure_ascii=False)}, z = {z} }}" for n, z in zip(names, (500, 640, 720), strict=True)
     ]
     text = (
-        f'format = 1\ntitle = "\u00b1 [red] [/nothing] \\u001b[2J"\n[stations]\nrows = [{", ".join(stations)}]\n'
+        f'format = 1\ntitle = "\u00b1 [red] [/nothing]"\n[stations]\nrows = [{", ".join(stations)}]\n'
         f'[[measurements]]\nkind = "range"\nsigma = 1\nrows = [{", ".join(rows)}]\n'
     )
     (tmp_path / "a.toml").write_text(text, encoding="utf-8")

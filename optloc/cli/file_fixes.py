@@ -15,7 +15,16 @@ from optloc.base.types import Array, Status
 from optloc.bounds.observability import Observability, observability
 from optloc.cli.output import Columns, bar, covariance_columns, geodetic_columns, join_tables, records
 from optloc.files import Loaded
-from optloc.plot.outlines import Pieces, pieces_of, polygons
+from optloc.plot.outlines import (
+    Pieces,
+    earth_line,
+    earth_points,
+    feature,
+    pieces_of,
+    point_geometry,
+    polygon_geometry,
+    polygons,
+)
 from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Active, Explanation, Fix
@@ -332,16 +341,14 @@ def geojson(found: FileFixes) -> dict[str, Any]:
 
     An ellipse where it covers, else the outline of the region; a curved fix without one has none.
     """
-    from optloc.plot.bound_map import feature
-
     problem = found.loaded.problem
     if not problem.frame.geodetic:
         what = "GeoJSON needs positions on Earth, but the frame is cartesian"
         raise InvalidProblem(what, found.loaded.source, 'give a [frame] of kind "geodetic", "ecef" or "enu"')
     place = problem.stations.position.reshape(-1, problem.stations.count, problem.dimension)[0]
     features = [
-        feature("Point", point, {"role": "station", "name": name})
-        for name, point in zip(problem.stations.names, _degrees(problem, place), strict=True)
+        feature(point_geometry(point), {"role": "station", "name": name})
+        for name, point in zip(problem.stations.names, earth_points(problem.frame, place), strict=True)
     ]
     outlines = _outlines(found)
     skipped = {"x", "y", "z", "lat_deg", "lon_deg", "height"}
@@ -349,12 +356,13 @@ def geojson(found: FileFixes) -> dict[str, Any]:
         if row["lat_deg"] is None:
             continue
         about = {name: value for name, value in row.items() if name not in skipped and not name.startswith("cov_")}
-        features.append(feature("Point", [row["lon_deg"], row["lat_deg"], row["height"]], {"role": "fix", **about}))
+        point = np.array([row["lon_deg"], row["lat_deg"], row["height"]])
+        features.append(feature(point_geometry(point), {"role": "fix", **about}))
         about = {"epoch": row["epoch"], "target": row["target"]}
         if pieces := outlines.get(number, ()):
-            features.append(feature("MultiPolygon", _polygons(problem, row, pieces), {"role": "region95", **about}))
+            features.append(feature(_region(problem, row, pieces), {"role": "region95", **about}))
         elif row["cov_ee"] is not None and number not in outlines:
-            features.append(feature("Polygon", [_ring(problem, row)], {"role": "ellipse95", **about}))
+            features.append(feature(_ellipse(problem, row), {"role": "ellipse95", **about}))
     return {"type": "FeatureCollection", "features": features}
 
 
@@ -369,27 +377,21 @@ def _outlines(found: FileFixes) -> dict[int, Pieces]:
     return {int(i): pieces[i] for i in np.flatnonzero(np.concatenate(kinds) != CARTESIAN)}
 
 
-def _polygons(problem: Problem, row: dict[str, Any], pieces: Pieces) -> list[list[list[list[float]]]]:
-    """Return the plan of a region of convex parts as the coordinates of a multi-polygon."""
+def _region(problem: Problem, row: dict[str, Any], pieces: Pieces) -> dict[str, Any]:
+    """Return the plan of a region of convex parts as a geometry."""
     centre = np.array([row[axis] for axis in "xyz"[: problem.dimension]])
     axes = problem.frame.enu_axes(centre)[:2]
     plan = polygons([(piece - centre) @ axes.T for piece in pieces])
-    return [[_degrees(problem, centre + line @ axes) for line in polygon] for polygon in plan]
+    return polygon_geometry([[earth_line(problem.frame, centre + line @ axes) for line in each] for each in plan])
 
 
-def _degrees(problem: Problem, position: Array) -> list[list[float]]:
-    """Return positions as RFC 7946 orders them: longitude, latitude, height."""
-    lat, lon, height = problem.frame.to_geodetic(position)
-    return np.stack([np.degrees(lon), np.degrees(lat), height], axis=-1).tolist()  # type: ignore[no-any-return]
-
-
-def _ring(problem: Problem, row: dict[str, Any]) -> list[list[float]]:
-    """Return the closed ring, counter-clockwise, of the horizontal 95 % ellipse of a row."""
+def _ellipse(problem: Problem, row: dict[str, Any]) -> dict[str, Any]:
+    """Return the horizontal 95 % ellipse of a row as a geometry, counter-clockwise."""
     covariance = np.array([[row["cov_ee"], row["cov_en"]], [row["cov_en"], row["cov_nn"]]])
     semi_axes, directions = error_ellipse(covariance)
     # Eigenvectors may be left-handed: the sign of the turn makes up for it.
-    angle = np.linspace(0.0, 2.0 * np.pi, _CORNERS, endpoint=False) * np.sign(np.linalg.det(directions))
+    angle = np.linspace(0.0, 2.0 * np.pi, _CORNERS + 1) * np.sign(np.linalg.det(directions))
     plane = (np.stack([np.cos(angle), np.sin(angle)], axis=-1) * semi_axes) @ directions.T
+    plane[-1] = plane[0]
     centre = np.array([row[axis] for axis in "xyz"[: problem.dimension]])
-    ring = _degrees(problem, centre + plane @ problem.frame.enu_axes(centre)[:2])
-    return [*ring, ring[0]]
+    return polygon_geometry([[earth_line(problem.frame, centre + plane @ problem.frame.enu_axes(centre)[:2])]])

@@ -10,6 +10,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.bounds.bound_map import BoundMap
+from optloc.plot.outlines import feature, line_geometry, point_geometry
 from optloc.plot.style import BLACK, GREY, apart, figure_class, literal
 
 if TYPE_CHECKING:
@@ -26,6 +27,8 @@ _BETWEEN = {1.0: (1.2, 1.5), 2.0: (3.0,), 5.0: (7.0,)}
 _LEVELS = 9
 # Stations that are named.
 _NAMED = 12
+# Decimals of a degree of isolines: a tenth of a metre.
+_DIGITS = 6
 # Side of a map from which it is in kilometres, metres.
 _FAR = 5e3
 
@@ -154,30 +157,11 @@ def map_geojson(found: BoundMap) -> dict[str, Any]:
         advice = 'give a [frame] of kind "geodetic", "ecef" or "enu"'
         raise InvalidProblem("GeoJSON needs positions on Earth, but the frame is cartesian", "map", advice)
     features = [
-        feature("Point", _wrapped(place[None])[0], {"role": "station", "name": name})
+        feature(point_geometry(place, _DIGITS), {"role": "station", "name": name})
         for name, place in zip(found.names, found.stations, strict=True)
     ]
     for level, lines in isolines(found):
         if lines:
             about = {"role": "bound", "sigma_m": level, "height": found.height}
-            features.append(feature("MultiLineString", [piece for line in lines for piece in _pieces(line)], about))
+            features.append(feature(line_geometry(lines, _DIGITS), about))
     return {"type": "FeatureCollection", "features": features}
-
-
-def _pieces(line: Array) -> list[list[list[float]]]:
-    """Return a line cut where it crosses the date line, as the standard asks."""
-    # Maps across the date line have longitudes beyond 180 degrees; files do not.
-    turn = np.floor((line[:, 0] + 180.0) / 360.0)
-    cuts = np.flatnonzero(np.diff(turn)) + 1
-    return [_wrapped(part) for part in np.split(line, cuts) if len(part) > 1]
-
-
-def _wrapped(line: Array) -> list[list[float]]:
-    lon = (line[:, 0] + 180.0) % 360.0 - 180.0
-    # Six decimals of a degree are a tenth of a metre.
-    return np.round(np.stack([lon, line[:, 1]], axis=-1), 6).tolist()  # type: ignore[no-any-return]
-
-
-def feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> dict[str, Any]:
-    """Return a feature of GeoJSON."""
-    return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": properties}

@@ -1,13 +1,18 @@
-"""What covers where an ellipse does not, as lines of a picture: an egg for a far fix, a banana or a ring as it is."""
+"""What covers where an ellipse does not, as lines of a picture: an egg for a far fix, a banana or a ring as it is.
+
+And such lines on the Earth as GeoJSON has them: cut at the antimeridian, closed around the poles.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
+from optloc.base.frames import Frame
 from optloc.base.types import Array
 from optloc.problem.chart import CURVED, INVERSE_RANGE, Chart, quantile
 from optloc.problem.epochs import by_epoch, separable
@@ -171,3 +176,161 @@ def hull(points: Array) -> Array:
     except QhullError:
         return points
     return np.asarray(points[np.append(around, around[0])])
+
+
+# On the Earth, as GeoJSON: RFC 7946, sections 3.1.6 and 3.1.9.
+
+# Decimals of a degree: a tenth of a millimetre, so that the ellipse of a fix of centimetres is round; of metres.
+_DIGITS, _MILLIMETRES = 9, 3
+# Longitudes of neighbours on a line differ by this many degrees at most, as lines of a map are straight in degrees.
+_STEP = 5.0
+# Halvings by which that is sought, enough for a line that passes a pole at a thousandth of its length.
+_HALVINGS = 10
+# How far inside the antimeridian a point on it is taken to be, degrees: it is on one side, and crossings are crossings.
+_INSIDE = 1e-9
+# The edge of the map counter-clockwise from its lower right corner: its length, degrees, and how far the corners are.
+_AROUND = 1080.0
+_EDGES = {180.0: (180.0, 90.0), 540.0: (-180.0, 90.0), 720.0: (-180.0, -90.0), 0.0: (180.0, -90.0)}
+
+
+def feature(geometry: dict[str, Any], properties: dict[str, Any]) -> dict[str, Any]:
+    """Return a feature of GeoJSON."""
+    return {"type": "Feature", "geometry": geometry, "properties": properties}
+
+
+def point_geometry(place: Array, digits: int = _DIGITS) -> dict[str, Any]:
+    """Return a point (2 or 3,) of longitude, latitude (degrees) and height (metres)."""
+    return {"type": "Point", "coordinates": _rounded(_wrapped(place[None]), digits)[0]}
+
+
+def line_geometry(lines: Sequence[Array], digits: int = _DIGITS) -> dict[str, Any]:
+    """Return lines (n, 2 or 3) of longitude, latitude (degrees) and height (metres), cut at the antimeridian."""
+    parts = [_rounded(part, digits) for line in lines for part in _parts(_wrapped(line))]
+    return {"type": "MultiLineString", "coordinates": [part for part in parts if len(part) > 1]}
+
+
+def polygon_geometry(polygons: Sequence[Sequence[Array]], digits: int = _DIGITS) -> dict[str, Any]:
+    """Return polygons on the Earth, cut at the antimeridian, and closed along the edge of the map around a pole.
+
+    Parameters
+    ----------
+    polygons : sequence of sequence of array (n, 2 or 3)
+        Closed lines of longitude, latitude (degrees) and height (metres), the outer one counter-clockwise as seen from
+        above, then those around holes, clockwise: what is on the left of a line is inside.
+    digits : int
+        Decimals of a degree.
+    """
+    found = [piece for polygon in polygons for piece in _cut([_wrapped(line) for line in polygon])]
+    rounded = [[ring for line in piece if len(ring := _rounded(line, digits)) > 3] for piece in found]
+    kept = [piece for piece in rounded if piece]
+    if len(kept) == 1:
+        return {"type": "Polygon", "coordinates": kept[0]}
+    return {"type": "MultiPolygon", "coordinates": kept}
+
+
+def earth_line(frame: Frame, line: Array) -> Array:
+    """Return a line (n, d) in metres as longitude, latitude (degrees) and height (metres) (m, 3), finer near a pole."""
+    place = earth_points(frame, line)
+    for _ in range(_HALVINGS):
+        wide = np.abs((np.diff(place[:, 0]) + 180.0) % 360.0 - 180.0) > _STEP
+        if not wide.any():
+            break
+        at = np.flatnonzero(wide) + 1
+        line = np.insert(line, at, 0.5 * (line[at - 1] + line[at]), axis=0)
+        place = earth_points(frame, line)
+    return place
+
+
+def earth_points(frame: Frame, position: Array) -> Array:
+    """Return positions (n, d) in metres as longitude, latitude (degrees) and height (metres) (n, 3)."""
+    lat, lon, height = frame.to_geodetic(position)
+    return np.stack([np.degrees(lon), np.degrees(lat), height], axis=-1)
+
+
+def _wrapped(place: Array) -> Array:
+    """Return places with longitudes within ±180 degrees."""
+    out = np.array(place, dtype=float)
+    out[:, 0] = np.clip((out[:, 0] + 180.0) % 360.0 - 180.0, -180.0 + _INSIDE, 180.0 - _INSIDE)
+    return out
+
+
+def _rounded(line: Array, digits: int) -> list[list[float]]:
+    """Return a line as JSON has it, without neighbours that are one place."""
+    out = np.round(line, digits)
+    out[:, 2:] = np.round(line[:, 2:], _MILLIMETRES)
+    kept = np.append(True, (np.diff(out[:, :2], axis=0) != 0.0).any(-1))
+    return out[kept].tolist()  # type: ignore[no-any-return]
+
+
+def _parts(line: Array) -> list[Array]:
+    """Return a line cut where it crosses the antimeridian; each part begins and ends on it where it was cut."""
+    parts, part = [], [line[0]]
+    for one, two in pairwise(line):
+        if abs(two[0] - one[0]) > 180.0:  # the shorter way
+            side = float(np.copysign(180.0, one[0]))
+            before, after = side - one[0], two[0] + side
+            middle = one + before / (before + after) * (two - one)
+            middle[0] = side
+            parts.append(np.stack([*part, middle]))
+            middle = middle.copy()
+            middle[0] = -side
+            part = [middle]
+        part.append(two)
+    return [*parts, np.stack(part)]
+
+
+def _cut(rings: Sequence[Array]) -> list[list[Array]]:
+    """Return one polygon as polygons within the map: parts of its lines, joined along the edge of the map.
+
+    The interior is on the left of every line: from the end of a part it goes on along the edge, counter-clockwise, to
+    the next beginning; around a pole that way leads over the corners.
+    """
+    whole: list[Array] = []
+    parts: list[Array] = []
+    for ring in rings:
+        closed = ring if (ring[0] == ring[-1]).all() else np.concatenate([ring, ring[:1]])
+        found = _parts(closed)
+        if len(found) == 1:
+            whole.append(closed)
+        else:  # where the line begins it is not cut
+            parts += [np.concatenate([found[-1], found[0][1:]]), *found[1:-1]]
+    if not parts:
+        return [whole]
+    outers = [[line] for line in _joined(parts)]
+    for hole in whole:
+        next((piece for piece in outers if _inside(hole[0], piece[0])), outers[0]).append(hole)
+    return outers
+
+
+def _joined(parts: list[Array]) -> list[Array]:
+    """Return parts of lines that begin and end on the edge of the map as closed lines along it."""
+    begins = [_along(part[0]) for part in parts]
+    left, found = set(range(len(parts))), []
+    while left:
+        first = here = min(left)
+        line: list[Array] = []
+        while here != first or not line:
+            left.discard(here)
+            line.append(parts[here])
+            end = _along(parts[here][-1])
+            here = min({*left, first}, key=lambda i: (begins[i] - end) % _AROUND)
+            way = (begins[here] - end) % _AROUND
+            for corner, place in sorted(_EDGES.items(), key=lambda each: (each[0] - end) % _AROUND):
+                if (corner - end) % _AROUND < way:
+                    line.append(np.array([[*place, *line[-1][-1, 2:]]]))
+        found.append(np.concatenate([*line, line[0][:1]]))
+    return found
+
+
+def _along(place: Array) -> float:
+    """Return how far along the edge of the map a place on its left or right side is."""
+    return float(90.0 + place[1] if place[0] > 0.0 else 630.0 - place[1])
+
+
+def _inside(place: Array, ring: Array) -> bool:
+    """Return whether a place is inside a closed line, by the crossings of a ray to the east."""
+    (x0, y0), (x1, y1) = ring[:-1, :2].T, ring[1:, :2].T
+    crosses = (y0 > place[1]) != (y1 > place[1])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x = x0 + (place[1] - y0) / (y1 - y0) * (x1 - x0)
+    return bool((crosses & (x > place[0])).sum() % 2)
