@@ -242,7 +242,7 @@ def simulate(
         str | None, typer.Option(metavar="X,Y[,Z]", help="True velocity of a moving target, m/s.")
     ] = None,
     geodetic: Geodetic = False,
-    seed: Annotated[int, typer.Option(help="Decides the draw.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Decides the draw.")] = 0,
     trials: Annotated[int, typer.Option(min=1, help="Independent draws; each becomes an epoch.")] = 1,
     outside: Outside = False,
     budget: Budget = None,

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from optloc.adequacy.evidence import Reliability, reliability
 from optloc.base.errors import InvalidProblem
+from optloc.base.inputs import at_most
 from optloc.base.linalg import error_ellipse
 from optloc.base.types import Array
 from optloc.bounds.bound_map import BoundMap, bound_map, extent, plan_of
@@ -383,6 +384,7 @@ def run_simulate(
 
     claim_outputs(out, inputs=[file])
     problem = read(file, values=False).problem
+    at_most("rows", trials * problem.count, "--trials")  # what is written can be read
     x = vector(problem, truth, velocity, geodetic)
     # A spread in decibels depends on the values: the noise is that of the true ones.
     with TemporaryDirectory() as folder:

@@ -141,6 +141,8 @@ class Group(TyperGroup):
             raise typer.Exit(_refuse(str(error))) from None
         except BrokenPipeError:
             raise typer.Exit(READER_GONE) from None
+        except MemoryError:
+            raise typer.Exit(_refuse("There is not enough memory for this; ask for less at once.")) from None
         except OSError as error:
             raise typer.Exit(_refuse(f"{error.filename or 'optloc'}: {error.strerror or error}.")) from None
         except KeyboardInterrupt:

@@ -17,6 +17,9 @@ from optloc.files import Loaded, read
 from optloc.problem.problem import Problem
 from optloc.several import Emitters, evenly, separate
 
+# Digits of a number of rows: no file holds more.
+_DIGITS = 12
+
 
 def run_separate(
     file: Path,
@@ -32,7 +35,7 @@ def run_separate(
     loaded = read(file)
     problem = loaded.problem
     clutter = evenly(problem, detection, false)
-    found = separate(problem, clutter, count=_count(emitters), region=_region(problem, region))
+    found = separate(problem, clutter, count=_count(emitters, problem.count), region=_region(problem, region))
     # Epochs without rows have no answer, and no label.
     labels = [loaded.epochs[k] for k in np.unique(problem.epoch)]
     if as_json:
@@ -44,11 +47,13 @@ def run_separate(
     return 0 if all(one.status == Status.OK for one in found) else 1
 
 
-def _count(text: str) -> int | None:
+def _count(text: str, rows: int) -> int | None:
+    """Return a number of emitters, each of which has a row at least; None where the data are to tell it."""
     if text == "auto":
         return None
-    if not text.isdigit():
-        raise InvalidProblem(f"{text!r} is no number of emitters", "--emitters", "give a whole number, or auto")
+    if not (text.isascii() and text.isdigit() and len(text) < _DIGITS and int(text) <= rows):
+        what = f"{text!r} is no number of emitters that {rows} rows can be of"
+        raise InvalidProblem(what, "--emitters", "give a whole number, or auto")
     return int(text)
 
 

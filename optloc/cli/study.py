@@ -24,6 +24,9 @@ from optloc.cli.output import Screen
 # Difference of two shares of answers, in its standard deviations, that is called one: 3 in 1000 by chance.
 _DIFFERS = 3.0
 
+# Processes that are believed to be meant; each takes 200 MB or so.
+_MOST_JOBS = 1024
+
 study = typer.Typer(
     cls=Group,
     no_args_is_help=True,
@@ -59,7 +62,7 @@ def run(
         str | None, typer.Option(metavar="ADDRESS", help="Cluster that exists, such as tcp://host:8786; implies dask.")
     ] = None,
     jobs: Annotated[
-        int | None, typer.Option("--jobs", "-j", min=1, help="Processes; all processors by default.")
+        int | None, typer.Option("--jobs", "-j", min=1, max=_MOST_JOBS, help="Processes; all processors by default.")
     ] = None,
     trials: Annotated[int | None, typer.Option(min=1, help="Trials, in the place of those of the file.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed, in the place of that of the file.")] = None,
