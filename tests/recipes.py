@@ -8,10 +8,18 @@ from pathlib import Path
 import pytest
 
 from optloc import FORMULATIONS, LOSSES, MODELS, SOLVERS
+from optloc.study.baselines import BASELINES
 from optloc.track import UPDATES
 
 PAGE = Path(__file__).parents[1] / "docs" / "contributing.md"
-TABLES = {"models": MODELS, "formulations": FORMULATIONS, "losses": LOSSES, "solvers": SOLVERS, "trackers": UPDATES}
+TABLES = {
+    "models": MODELS,
+    "formulations": FORMULATIONS,
+    "losses": LOSSES,
+    "solvers": SOLVERS,
+    "trackers": UPDATES,
+    "baselines": BASELINES,
+}
 _BLOCK = re.compile(r"^```\{code-block\} \w+\n:caption: (\S+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 

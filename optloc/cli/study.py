@@ -56,7 +56,7 @@ def run(
         Path | None, typer.Option(metavar="DIR", help="Output folder; NAME-study by default. Goes on where it stopped.")
     ] = None,
     executor: Annotated[
-        str, typer.Option("--executor", "-x", metavar="NAME", help="in-process, processes, dask or ray.")
+        str, typer.Option("--executor", "-x", metavar="NAME", help="processes, dask or ray.")
     ] = "processes",
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Cluster that exists, such as tcp://host:8786; implies dask.")
@@ -64,6 +64,9 @@ def run(
     jobs: Annotated[
         int | None, typer.Option("--jobs", "-j", min=1, max=_MOST_JOBS, help="Processes; all processors by default.")
     ] = None,
+    limit: Annotated[
+        float, typer.Option("--task-limit", metavar="SECONDS", help="Time that a task may take: methods may hang.")
+    ] = 600.0,
     trials: Annotated[int | None, typer.Option(min=1, help="Trials, in the place of those of the file.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed, in the place of that of the file.")] = None,
     outside: Outside = False,
@@ -78,12 +81,12 @@ def run(
     from optloc.study.plan import plan_of
 
     # A scheduler can only be meant for dask.
-    by = chosen("dask" if scheduler is not None and executor == "processes" else executor, jobs, scheduler)
+    by = chosen("dask" if scheduler is not None and executor == "processes" else executor, jobs, scheduler, limit)
     plan = plan_of(file, trials=trials, seed=seed)
     folder = Path(f"{plan.study.name}-study".replace(" ", "-").replace("/", "-")) if out is None else out
     try:
         with _bar(plan.study.name, plan.rows, quiet or as_json) as tell:
-            found = run_plan(plan, folder, by, tell)
+            found = run_plan(plan, folder, by, tell, lambda line: typer.echo(line, err=True))
     # Not an error: parts are written as they are finished.
     except KeyboardInterrupt:
         typer.echo(f"Stopped. What is finished is in {folder}; the same command goes on from there.", err=True)
@@ -189,7 +192,10 @@ def _record(found: Any) -> dict[str, Any]:
         "rows": found.rows,
         "rows_planned": m.rows,
         "statuses": found.counts,
-        "methods": [{"method": k, "status": s, "rows": n} for (k, s), n in found.methods.items()],
+        "methods": [
+            {"method": k, "status": s, "rows": n, "reason": found.failures.get((k, s), "")}
+            for (k, s), n in found.methods.items()
+        ],
     }
 
 
@@ -230,6 +236,9 @@ def _show(found: Any, console: Console) -> None:
     for method in dict.fromkeys(method for method, _ in found.methods):
         table.add_row(method, *(str(found.methods.get((method, name), 0)) for name in statuses))
     console.print(table)
+    for (method, name), reason in found.failures.items():
+        line = f"{method}: {name} in {found.methods[method, name]} trials, such as: {reason}"
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
 def _show_comparison(found: list[Any], one: Path, two: Path, console: Console) -> None:

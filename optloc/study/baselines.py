@@ -13,6 +13,7 @@ import numpy as np
 
 from formulations.backend import count
 from optloc.base.linalg import centre_and_spread
+from optloc.base.registry import Table
 from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array, Status
 from optloc.compute.sums import equations_at
@@ -299,7 +300,7 @@ def _original(steps: Callable[[Problem, Array], Array]) -> Callable[[Drawn, Arra
     return lambda drawn, start: claim(drawn.problem, start, steps(drawn.problem, start))
 
 
-BASELINES: dict[str, Baseline] = {
+_OWN = {
     "truth": Baseline(
         _truth, "damped least squares from the truth: the best that any start can lead to", guess=False, reference=True
     ),
@@ -325,4 +326,6 @@ BASELINES: dict[str, Baseline] = {
         slow=True,
     ),
 }
+
+BASELINES: Table[Baseline] = Table("optloc.baselines", lambda value: isinstance(value, Baseline), _OWN)
 """Baselines by name."""

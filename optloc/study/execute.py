@@ -1,23 +1,42 @@
-"""Run a study into its folder: here, in local processes, on a Dask cluster or on Ray, through one joblib seam."""
+"""Run a study into its folder: methods in processes apart, on this machine, a Dask cluster or Ray, through joblib.
+
+Whoever executes, a method runs in a process of its own that is watched over (`Apart`): it has a limit of time and of
+memory, what it answers is checked there, and it ends with the process that began it, however that ends.
+"""
 
 from __future__ import annotations
 
 import logging
 import os
+import pickle
+import signal
+import subprocess
+import sys
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
-from contextlib import AbstractContextManager, ExitStack, closing, contextmanager
+from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import cache
 from itertools import islice
 from pathlib import Path
-from typing import Any, Self
+from queue import Empty, SimpleQueue
+from threading import Lock, Thread
+from typing import IO, Any, NoReturn
+from warnings import warn
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.study.folder import Progress, begin, finished_chunks, known_data, locked, note_data, progress, store
-from optloc.study.plan import Chunk, Plan, workers
-from optloc.study.trial import Part, compute, dead_part, join_parts
+from optloc.study.folder import Progress, begin, finished_parts, known_data, locked, note_data, progress, store
+from optloc.study.plan import Chunk, Plan, memory_of, workers
+from optloc.study.trial import DIED, LATE, Lost, Part, compute, join_parts, part_of_lost
 
 CONNECT = 10.0
 """Seconds to wait for a scheduler: one on the same network answers in less than one; people wait for no more."""
+
+TASK_LIMIT = 600.0
+"""Seconds that a task may take where nobody says otherwise: it should take seconds, of the shipped studies the longest
+takes half of one, and compiling everything on a machine that has not yet done so takes a minute."""
+# A week: no wait on any system can be so long that numbers overflow.
+_LONGEST = 604_800.0
 
 Tell = Callable[[int, dict[str, int]], None]
 """Called with the number of new rows and their statuses after each part."""
@@ -35,23 +54,30 @@ class Executor:
         Processes; all processors by default. A cluster that exists decides itself.
     address : str, optional
         Of a Dask scheduler ("tcp://host:8786") or a Ray cluster; by default a local one is begun.
+    limit : float
+        Seconds that a task may take.
     """
 
     name: str = "processes"
     jobs: int | None = None
     address: str | None = None
+    limit: float = TASK_LIMIT
 
 
-def executor(name: str, jobs: int | None = None, address: str | None = None) -> Executor:
-    """Return an executor; raise InvalidProblem for an unknown one, or an address that it does not take."""
+def executor(name: str, jobs: int | None = None, address: str | None = None, limit: float = TASK_LIMIT) -> Executor:
+    """Return an executor; raise InvalidProblem for an unknown one, or an address or a limit that cannot be."""
     if name not in EXECUTORS:
         raise InvalidProblem(f"unknown executor {name!r}", "--executor", nearest(name, list(EXECUTORS)))
     if address is not None and not EXECUTORS[name].scheduler:
         raise InvalidProblem(f"{name} has no scheduler", "--scheduler", "add --executor dask")
-    return Executor(name, jobs, address)
+    if not 0.0 < limit <= _LONGEST:
+        raise InvalidProblem(f"a task cannot take {limit:g} s", "--task-limit", f"give seconds, {_LONGEST:g} at most")
+    return Executor(name, jobs, address, limit)
 
 
-def run_plan(plan: Plan, folder: Path, by: Executor, tell: Tell | None = None) -> Progress:
+def run_plan(
+    plan: Plan, folder: Path, by: Executor, tell: Tell | None = None, say: Callable[[str], None] = warn
+) -> Progress:
     """Compute what is missing of a study, and return how far it is.
 
     Parameters
@@ -64,16 +90,18 @@ def run_plan(plan: Plan, folder: Path, by: Executor, tell: Tell | None = None) -
         Who computes.
     tell : callable, optional
         Hears of every part, and first of those that were there.
+    say : callable
+        Hears sentences about parts that were damaged and are made again.
 
     Raises
     ------
     InvalidProblem
         Where the folder belongs to another study, holds other data or cannot be written; finished parts are kept.
     """
-    manifest = begin(plan, folder)
-    # From here to the end nobody else writes: what is counted as finished stays so.
     with locked(folder):
-        done = finished_chunks(folder, manifest)
+        # From here to the end nobody else writes: what is counted as finished stays so.
+        manifest = begin(plan, folder)
+        done = finished_parts(folder, manifest, say)
         known = known_data(plan, folder, done)
         if tell is not None and done:
             had = progress(folder)
@@ -85,14 +113,14 @@ def run_plan(plan: Plan, folder: Path, by: Executor, tell: Tell | None = None) -
                 store(folder, part)
                 if tell is not None:
                     tell(sum(part.counts.values()), part.counts)
-    return progress(folder)
+        return progress(folder)
 
 
 def compute_all(chunks: Iterable[Chunk], by: Executor) -> Generator[Part]:
     """Yield the parts of chunks as they are finished.
 
-    A chunk whose worker died is computed again in a process of its own. If that dies too, halves are tried down to
-    the single trial that is to blame, which then has the status `died`.
+    A chunk whose process died is computed again in another. If that dies too, or where a chunk is over its time, halves
+    are tried down to the single trial that is to blame, which then has the status `died` or `timeout`.
 
     Parameters
     ----------
@@ -104,90 +132,344 @@ def compute_all(chunks: Iterable[Chunk], by: Executor) -> Generator[Part]:
     Raises
     ------
     InvalidProblem
-        Where the executor is not installed or its scheduler cannot be reached.
+        Where the executor is not installed, its scheduler cannot be reached, or no process can be begun.
     """
-    left = {chunk.key: chunk for chunk in chunks}
-    if not left:
+    work = _Work(chunks, by.limit)
+    if not work.left:
         return
     with ExitStack() as stack:
         begun = stack.enter_context(EXECUTORS[by.name].begin(by))
-        alone = stack.enter_context(_Alone())
-        while left:
-            out: dict[str, Chunk] = {}
+        here = stack.enter_context(closing(Pool(1)))
+        while work.left:
             try:
-                for part in _parallel(_note(list(left.values()), out), begun):
-                    out.pop(part.key, None)
-                    del left[part.key]
-                    yield part
+                for found in _parallel(work.hand_out(), begun):
+                    yield from work.take(found)
             except begun.deaths:
-                # Which of those handed out was to blame is not told: each is tried apart, where nothing else can die.
-                for key in out:
-                    yield alone.part(left.pop(key))
+                # A cluster lost a worker again and again: what it had is computed here, and the others there.
+                for chunk, limit in work.handed_out():
+                    yield from work.take(here.compute(chunk, limit))
 
 
-def task(chunk: Chunk) -> Part:
-    """Compute a chunk in a worker, which is one of several on its machine: on one thread."""
-    # Workers times threads would be more than the processors, and slower than either.
-    os.environ.setdefault("OPTLOC_THREADS", "1")
-    return compute(chunk)
-
-
-def _note(chunks: list[Chunk], out: dict[str, Chunk]) -> Iterator[Chunk]:
-    """Yield chunks, and note which have been handed out."""
-    for chunk in chunks:
-        out[chunk.key] = chunk
-        yield chunk
-
-
-def _parallel(chunks: Iterator[Chunk], begun: Begun) -> Iterator[Part]:
+def _parallel(tasks: Iterator[tuple[Chunk, float]], begun: Begun) -> Iterator[Part | Lost]:
     from joblib import Parallel, delayed, parallel_config
 
-    work = task if begun.apart else compute
     with parallel_config(**begun.options):
         if begun.streams:
             # One chunk a task, two for each worker in hand: none waits for its next, and few are lost when a run stops.
             run = Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs")
-            yield from run(delayed(work)(chunk) for chunk in chunks)
+            yield from run(delayed(begun.work)(*task) for task in tasks)
             return
-        while some := list(islice(chunks, 2 * begun.options["n_jobs"])):
-            yield from Parallel(batch_size=1)(delayed(work)(chunk) for chunk in some)
+        while some := list(islice(tasks, 2 * begun.options["n_jobs"])):
+            yield from Parallel(batch_size=1)(delayed(begun.work)(*task) for task in some)
 
 
-class _Alone:
-    """One process apart, begun when it is needed and again when it has died."""
+# What is left of the chunks of a run, and what becomes of those that came to grief.
+
+# A cell may cost four limits of time beyond its work, and a death a sixteenth of one: enough to find the one trial of
+# ten thousand at which a method hangs (3.1 limits), or four at which it dies; one that always does is left soon.
+_PATIENCE, _DEATH = 4.0, 1 / 16
+# A part of a chunk has its share of the limit, but not less than an eighth, and time for what is built once.
+_SHARE, _BUILD = 1 / 8, 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    """Some trials of a chunk of the plan; `again` where its process has died once."""
+
+    chunk: Chunk
+    whole: Chunk
+    again: bool = False
+
+
+class _Work:
+    """The tasks that are left and out, the parts of chunks that were halved, and what each cell has cost."""
+
+    def __init__(self, chunks: Iterable[Chunk], limit: float) -> None:
+        self.left = deque(_Task(chunk, chunk) for chunk in chunks)
+        self._limit = limit
+        self._out: dict[str, _Task] = {}
+        self._parts: dict[str, list[Part]] = {}
+        self._cost: dict[str, float] = {}
+
+    def hand_out(self) -> Iterator[tuple[Chunk, float]]:
+        """Yield chunks with the seconds that they may take: none where their cell has cost too much."""
+        while self.left:
+            task = self.left.popleft()
+            self._out[task.chunk.key] = task
+            yield task.chunk, 0.0 if self._spent(task) else self._seconds(task)
+
+    def handed_out(self) -> list[tuple[Chunk, float]]:
+        """Return what is out."""
+        return [(task.chunk, self._seconds(task)) for task in self._out.values()]
+
+    def take(self, found: Part | Lost) -> Iterator[Part]:
+        """Yield the part of a chunk of the plan where it is complete with what was found."""
+        task = self._out.pop(found.key)
+        part = self._judge(task, found) if isinstance(found, Lost) else found
+        if part is None:
+            return
+        parts = self._parts.setdefault(task.whole.key, [])
+        parts.append(part)
+        if sum(len(some.table) for some in parts) == task.whole.count:
+            del self._parts[task.whole.key]
+            # Names of parts are in the order of their trials.
+            yield part if len(parts) == 1 else join_parts(task.whole, sorted(parts, key=lambda some: some.key))
+
+    def _judge(self, task: _Task, lost: Lost) -> Part | None:
+        """Return the part of a task that was lost, or None and have it tried again, whole or in halves."""
+        chunk, cell = task.chunk, task.chunk.cell.key
+        price = self._seconds(task) / self._limit if lost.status == LATE else _DEATH
+        self._cost[cell] = self._cost.get(cell, 0.0) + price
+        if self._spent(task):
+            reason = f"given up: the method cost this scenario too many processes; the last one: {lost.reason}"
+            return part_of_lost(chunk, replace(lost, reason=reason))
+        if lost.status == DIED and not task.again:
+            # Perhaps the machine was short of memory, or somebody killed it: halves would be solved in other batches.
+            self.left.append(replace(task, again=True))
+        elif chunk.count == 1:
+            return part_of_lost(chunk, lost)
+        else:
+            half = chunk.count // 2
+            for first, count in ((chunk.first, half), (chunk.first + half, chunk.count - half)):
+                self.left.append(_Task(replace(chunk, first=first, count=count), task.whole, again=True))
+        return None
+
+    def _spent(self, task: _Task) -> bool:
+        return self._cost.get(task.chunk.cell.key, 0.0) >= _PATIENCE
+
+    def _seconds(self, task: _Task) -> float:
+        share = max(task.chunk.count / task.whole.count, _SHARE)
+        return min(self._limit, max(share * self._limit, _BUILD))
+
+
+# A process apart. It is begun without multiprocessing, which would run the caller's script again, and which lets the
+# workers of a cluster begin none.
+
+# Seconds: to begin, which takes half of one, and more where many share a processor; without a task, after which it ends,
+# as nobody tells a cluster that a study is over; between the end of its pipe and its own, which says how it ended.
+_START, _IDLE, _MOMENT = 120.0, 60.0, 0.2
+# Workers times threads would be more than the processors, and each thread of BLAS reserves memory.
+_ONE = ("OPTLOC", "OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "VECLIB_MAXIMUM", "NUMEXPR_NUM", "NUMBA_NUM")
+# Frames are pickled bytes in a pickle: the outer one can be read while nothing of optloc is imported.
+_BEGIN = (
+    "import pickle, sys; sys.path[:], memory = pickle.loads(pickle.load(sys.stdin.buffer)); "
+    "from optloc.study.execute import serve; serve(memory)"
+)
+
+
+class Apart:
+    """A process apart that computes chunks, one at a time; what it begins ends with it."""
 
     def __init__(self) -> None:
-        self._pool: Any = None
+        # -P: nothing is imported from the current folder, unless this process does that, too. A session of its own:
+        # Ctrl-C is for this process, which ends it.
+        self._process = subprocess.Popen(  # noqa: S603  (this interpreter, and a text of this file)
+            [sys.executable, "-P", "-c", _BEGIN],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=os.environ | {f"{name}_THREADS": "1" for name in _ONE},
+            start_new_session=True,
+        )
+        self._ended = Lock()
 
-    def __enter__(self) -> Self:
-        return self
+    def lives(self) -> bool:
+        """Return whether it can be asked."""
+        return self._process.poll() is None
 
-    def __exit__(self, *_: object) -> None:
-        self._close()
+    def ask(self, message: object, seconds: float) -> Any:
+        """Return the answer to a message; raise TimeoutError after so many seconds, EOFError where the process ends."""
+        answer: SimpleQueue[bytes | None] = SimpleQueue()
 
-    def _close(self) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, kill_workers=True)
-            self._pool = None
+        def exchange() -> None:
+            # In a thread: pipes have no time limit on every system.
+            assert self._process.stdin is not None
+            assert self._process.stdout is not None
+            try:
+                _send(self._process.stdin, message)
+                answer.put(pickle.load(self._process.stdout))  # noqa: S301  (of a process of our own)
+            except Exception:  # noqa: BLE001  (whatever a process that ends leaves in its pipe)
+                answer.put(None)
 
-    def part(self, chunk: Chunk) -> Part:
-        """Return the part of a chunk; trials that take the process down have the status `died`."""
-        from joblib.externals.loky.process_executor import BrokenProcessPool, ProcessPoolExecutor
-
-        if self._pool is None:
-            # Local even where a cluster computes: another worker of it is not put at risk.
-            self._pool = ProcessPoolExecutor(max_workers=1)
+        thread = Thread(target=exchange, daemon=True)
+        thread.start()
         try:
-            found: Part = self._pool.submit(task, chunk).result()
-        except BrokenProcessPool:
-            self._close()
-            if chunk.count == 1:
-                return dead_part(chunk, "the process that solved it died, and died again")
-            # Every round costs one process; of 10 000 trials the one to blame is found in 14.
-            half = chunk.count // 2
-            halves = (replace(chunk, count=half), replace(chunk, first=chunk.first + half, count=chunk.count - half))
-            return join_parts(chunk, [self.part(some) for some in halves])
-        return found
+            found = answer.get(timeout=seconds)
+        except Empty:
+            self.end()
+            raise TimeoutError from None
+        if found is None:
+            raise EOFError(self.end(_MOMENT))
+        return pickle.loads(found)  # noqa: S301
+
+    def end(self, seconds: float = 0.0) -> str:
+        """End the process, after some seconds, with all that it began, whatever it does, and return how it ended."""
+        with self._ended:
+            with suppress(subprocess.TimeoutExpired):
+                self._process.wait(seconds)
+            if hasattr(os, "killpg"):
+                # Its group lives on where it has ended and what it began has not.
+                with suppress(ProcessLookupError, PermissionError):
+                    os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.kill()
+            code = self._process.wait()
+        how = f"exit code {code}" if code >= 0 else f"signal {-code} ({signal.strsignal(-code)})"
+        return f"its process ended with {how}"
+
+
+def _send(file: IO[bytes], message: object) -> None:
+    pickle.dump(pickle.dumps(message), file)
+    file.flush()
+
+
+class Pool:
+    """Processes apart: begun when they are needed, and others where they died.
+
+    Parameters
+    ----------
+    count : int
+        How many share the machine.
+    """
+
+    def __init__(self, count: int) -> None:
+        self._memory, self._lock, self._closed = memory_of(count), Lock(), False
+        self._all: set[Apart] = set()
+        self._idle: list[Apart] = []
+
+    def compute(self, chunk: Chunk, seconds: float) -> Part | Lost:
+        """Return the part of a chunk, computed in a process apart, or what came of it in so many seconds.
+
+        Raises
+        ------
+        InvalidProblem
+            Where the method cannot be run at all, or no process can be begun.
+        """
+        if not seconds:
+            return Lost(chunk.key, LATE, "not tried")
+        apart = self._take()
+        try:
+            found = apart.ask(chunk, seconds)
+        except TimeoutError:
+            return Lost(chunk.key, LATE, f"it took more than {seconds:g} s")
+        except EOFError as error:
+            return Lost(chunk.key, DIED, str(error))
+        finally:
+            self._give(apart)
+        if isinstance(found, InvalidProblem):
+            raise found
+        return found  # type: ignore[no-any-return]  (what `serve` sends)
+
+    def close(self) -> None:
+        """End all processes."""
+        with self._lock:
+            self._closed, left = True, list(self._all)
+        for apart in left:
+            apart.end()
+
+    def _take(self) -> Apart:
+        """Return a process that waits, or another."""
+        while True:
+            with self._lock:
+                if not self._idle:
+                    break
+                apart = self._idle.pop()
+            if apart.lives():
+                return apart
+            self._all.discard(apart)
+        for again in (True, False):
+            try:
+                return self._begin()
+            except (EOFError, TimeoutError) as error:
+                # Once somebody may have killed it; twice, nothing can be computed here.
+                if not again:
+                    advice = "what it said stands above; check the installation, and the memory that is left"
+                    raise InvalidProblem(f"no process can be begun ({error})", sys.executable, advice) from None
+        raise AssertionError
+
+    def _begin(self) -> Apart:
+        apart = Apart()
+        with self._lock:
+            self._all.add(apart)
+            closed = self._closed
+        if closed:
+            apart.end()
+        apart.ask(([str(place) for place in sys.path], self._memory), _START)
+        return apart
+
+    def _give(self, apart: Apart) -> None:
+        with self._lock:
+            (self._idle.append if apart.lives() else self._all.discard)(apart)
+
+
+# What runs in the process apart.
+
+
+def serve(memory: int | None) -> NoReturn:
+    """Compute the chunks that come in at standard input, one by one, and answer at standard output, until it closes."""
+    _restrain(memory)
+    tasks, answers, line = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb"), SimpleQueue[bytes]()
+    # A method may read and print what it likes.
+    nowhere = os.open(os.devnull, os.O_RDWR)
+    for number in range(3):
+        os.dup2(nowhere, number)
+    Thread(target=_listen, args=(tasks, line), daemon=True).start()
+    found: object = None
+    try:
+        while True:
+            _die_with(tasks, on=False)
+            _send(answers, found)
+            chunk = pickle.loads(line.get(timeout=_IDLE))  # noqa: S301
+            try:
+                found = compute(chunk)
+            except InvalidProblem as error:
+                found = error
+            except Exception as error:  # noqa: BLE001  (a chunk that fails costs itself)
+                found = Lost(chunk.key, DIED, f"{type(error).__name__}: {error}")
+    finally:
+        _end()
+
+
+def _listen(tasks: IO[bytes], line: SimpleQueue[bytes]) -> None:
+    """Pass on what comes in; where nothing can come any more, who sent it has ended, and so does this process."""
+    try:
+        while True:
+            message = pickle.load(tasks)  # noqa: S301
+            _die_with(tasks, on=True)
+            line.put(message)
+    finally:
+        _end()
+
+
+def _die_with(tasks: IO[bytes], *, on: bool) -> None:
+    """Have the system kill this group of processes, or not, when the other end of a pipe is closed or written to."""
+    # A thread that waits for that does the same on every system, but not while machine code holds the interpreter.
+    with suppress(ImportError, AttributeError, OSError):
+        import fcntl
+
+        fcntl.fcntl(tasks, fcntl.F_SETOWN, -os.getpgrp())
+        fcntl.fcntl(tasks, fcntl.F_SETSIG, signal.SIGKILL)
+        flags = fcntl.fcntl(tasks, fcntl.F_GETFL)
+        fcntl.fcntl(tasks, fcntl.F_SETFL, flags | os.O_ASYNC if on else flags & ~os.O_ASYNC)
+
+
+def _end() -> NoReturn:
+    """End this process and its group, whatever threads it has."""
+    if hasattr(os, "killpg"):
+        os.killpg(os.getpgrp(), signal.SIGKILL)
+    os._exit(1)
+
+
+def _restrain(memory: int | None) -> None:
+    """Limit the memory of this process, have it leave no core, and be the first to go where memory is short."""
+    with suppress(ImportError, OSError, ValueError):
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        if memory is not None:
+            most = resource.getrlimit(resource.RLIMIT_AS)[1]
+            limit = memory if most == resource.RLIM_INFINITY else min(memory, most)
+            resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+    with suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
 
 
 # The executors: how each begins, and which exceptions say that a worker died.
@@ -201,36 +483,36 @@ class Begun:
     ----------
     options : dict
         Of joblib.
+    work : callable
+        ``(chunk, seconds) -> Part or Lost``: what its workers do.
     deaths : tuple of exception types
         Those that say that a worker died.
-    apart : bool
-        Whether chunks are computed in workers.
     streams : bool
         Whether it gives each part when it is finished; otherwise it takes lists, a few chunks a processor at a time.
     """
 
     options: dict[str, Any]
+    work: Callable[[Chunk, float], Part | Lost]
     deaths: tuple[type[BaseException], ...] = ()
-    apart: bool = True
     streams: bool = True
 
 
-@contextmanager
-def _here(by: Executor) -> Iterator[Begun]:
-    yield Begun({"backend": "sequential", "n_jobs": 1}, apart=False)
+@cache
+def _pool() -> Pool:
+    return Pool(workers())
+
+
+def task(chunk: Chunk, seconds: float) -> Part | Lost:
+    """Compute a chunk beside a worker of a cluster."""
+    return _pool().compute(chunk, seconds)
 
 
 @contextmanager
 def _processes(by: Executor) -> Iterator[Begun]:
-    from joblib.externals.loky import get_reusable_executor
-    from joblib.externals.loky.process_executor import BrokenProcessPool
-
-    try:
-        options = {"backend": "loky", "n_jobs": by.jobs or workers(), "inner_max_num_threads": 1}
-        yield Begun(options, (BrokenProcessPool,))
-    finally:
-        # Loky keeps its workers for the next call; a study is the last, and Ctrl-C must not leave them behind.
-        get_reusable_executor().shutdown(wait=True, kill_workers=True)
+    jobs = by.jobs or workers()
+    # Its workers are threads: each waits for a process apart.
+    with closing(Pool(jobs)) as pool:
+        yield Begun({"backend": "threading", "n_jobs": jobs}, pool.compute)
 
 
 @contextmanager
@@ -256,7 +538,7 @@ def _dask(by: Executor) -> Iterator[Begun]:
             raise InvalidProblem(
                 "the scheduler has no workers", by.address or "dask", "start one: dask worker ADDRESS --nthreads 1"
             )
-        yield Begun({"backend": "dask", "client": client, "n_jobs": -1}, (KilledWorker,))
+        yield Begun({"backend": "dask", "client": client, "n_jobs": -1}, task, (KilledWorker,))
 
 
 @contextmanager
@@ -280,7 +562,7 @@ def _ray(by: Executor) -> Iterator[Begun]:
         register_ray()
         jobs = int(ray.cluster_resources().get("CPU", 1))
         deaths = (ray.exceptions.RayActorError, ray.exceptions.WorkerCrashedError)
-        yield Begun({"backend": "ray", "n_jobs": jobs}, deaths, streams=False)
+        yield Begun({"backend": "ray", "n_jobs": jobs}, task, deaths, streams=False)
     finally:
         ray.shutdown()
 
@@ -311,8 +593,7 @@ class Entry:
 
 
 EXECUTORS: dict[str, Entry] = {
-    "in-process": Entry(_here, "one after the other, without a process of their own"),
-    "processes": Entry(_processes, "processes of this machine (loky); the default"),
+    "processes": Entry(_processes, "processes of this machine; the default"),
     "dask": Entry(_dask, "a Dask cluster that exists (--scheduler), or a local one", scheduler=True),
     "ray": Entry(_ray, "a Ray cluster that exists (--scheduler), or a local one", scheduler=True),
 }

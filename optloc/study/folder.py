@@ -1,11 +1,12 @@
-"""The output folder of a study: a manifest and part files that appear whole or not at all."""
+"""The output folder of a study: a manifest and part files that appear whole or not at all, named by what they hold."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -18,7 +19,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.study.draws import draw
 from optloc.study.methods import version_of
 from optloc.study.plan import Plan
-from optloc.study.trial import COLUMNS, GAP, Part, arrow_schema, machine, versions
+from optloc.study.trial import COLUMNS, FAILED, GAP, Part, arrow_schema, machine, versions
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -26,7 +27,8 @@ if TYPE_CHECKING:
 
 # Another format is refused; other columns or another version of optloc are too, whatever the format.
 MANIFEST = "manifest.json"
-FORMAT = 1
+FORMAT = 2
+_LOCK = ".lock"
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +118,7 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def begin(plan: Plan, folder: Path) -> Manifest:
-    """Return the manifest of a folder for a plan, written where there is none.
+    """Return the manifest of a folder for a plan, written where there is none; call it while the folder is `locked`.
 
     Raises
     ------
@@ -132,17 +134,17 @@ def begin(plan: Plan, folder: Path) -> Manifest:
         if (found.version, found.columns) != (wanted.version, wanted.columns):
             what = f"the folder was written by optloc {found.version}, and this is {wanted.version}"
             raise InvalidProblem(what, str(folder), "choose another folder with --out")
-        _clean(folder)
-        return found
-    if folder.is_dir() and any(folder.iterdir()):
-        raise InvalidProblem("the folder is not empty, and holds no study", str(folder), "choose another with --out")
+    else:
+        found = wanted
     try:
-        (folder / "parts").mkdir(parents=True, exist_ok=True)
-        data = {"format": FORMAT, **{name: getattr(wanted, name) for name in Manifest.__slots__}}
-        _replaced(folder / MANIFEST, lambda path: path.write_text(json.dumps(data, indent=1), encoding="utf-8"))
+        (folder / "parts").mkdir(exist_ok=True)
+        _clean(folder)
+        if found is wanted:
+            data = {"format": FORMAT, **{name: getattr(wanted, name) for name in Manifest.__slots__}}
+            _replaced(folder / MANIFEST, lambda path: path.write_text(json.dumps(data, indent=1), encoding="utf-8"))
     except OSError as error:
         raise unwritable(folder, error) from None
-    return wanted
+    return found
 
 
 def unwritable(path: Path, error: OSError) -> InvalidProblem:
@@ -166,44 +168,80 @@ def _replaced(path: Path, write: Any) -> None:
 
 def _clean(folder: Path) -> None:
     """Remove what a run that was killed left half written."""
-    for scratch in (folder / "parts").glob(".*"):
+    for scratch in [*folder.glob(f".{MANIFEST}.*"), *(folder / "parts").glob(".*")]:
         scratch.unlink(missing_ok=True)
 
 
 def store(folder: Path, part: Part) -> None:
     """Write a part; raise InvalidProblem where that fails."""
+    import pyarrow as pa
     from pyarrow import parquet
 
-    path = folder / "parts" / f"{part.key}.parquet"
+    sink = pa.BufferOutputStream()
+    parquet.write_table(part.table, sink, compression="zstd")
+    content = sink.getvalue().to_pybytes()
     try:
-        _replaced(path, lambda scratch: parquet.write_table(part.table, scratch, compression="zstd"))
+        _replaced(folder / "parts" / f"{part.key}.{_digest(content)}.parquet", lambda path: path.write_bytes(content))
     except OSError as error:
-        raise unwritable(path, error) from None
+        raise unwritable(folder, error) from None
 
 
-def part_files(folder: Path) -> list[Path]:
-    """Return the part files of a study that are there, in the order of their names."""
+def _digest(content: bytes) -> str:
+    """Return 16 hexadecimal digits of a file's content: a name tells damage, and needs no second file to do so."""
+    return hashlib.blake2b(content, digest_size=8).hexdigest()
+
+
+def part_files(folder: Path) -> dict[str, Path]:
+    """Return the part files of a study that are there by their chunks, in the order of their names."""
     known = read_manifest(folder).chunks
-    return [path for path in sorted((folder / "parts").glob("*.parquet")) if path.stem in known]
+    found = {path.name.partition(".")[0]: path for path in sorted((folder / "parts").glob("[!.]*.parquet"))}
+    return {key: path for key, path in found.items() if key in known}
 
 
-def finished_chunks(folder: Path, manifest: Manifest) -> set[str]:
-    """Return the keys of the chunks whose parts are whole; one that was damaged is removed."""
-    from pyarrow import ArrowException, parquet
+def read_part(path: Path, columns: Sequence[str] | None = None) -> Any:
+    """Return the Arrow table of a part file; raise InvalidProblem where it is not what was written."""
+    import pyarrow as pa
+    from pyarrow import parquet
 
-    done = set()
-    for path in (folder / "parts").glob("*.parquet"):
-        if path.stem not in manifest.chunks:
-            continue
+    try:
+        content = path.read_bytes()
+        if path.name.split(".")[1:-1] == [_digest(content)]:
+            return parquet.read_table(pa.BufferReader(content), columns=columns)
+    except (OSError, pa.ArrowException):
+        pass
+    raise InvalidProblem("the part is damaged", str(path), "run the study again, and it is made again")
+
+
+def finished_parts(folder: Path, manifest: Manifest, say: Callable[[str], None]) -> dict[str, Path]:
+    """Return the part files of finished chunks.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the study.
+    manifest : Manifest
+        Of the folder.
+    say : callable
+        Hears a sentence about every part that was damaged; it is removed.
+
+    Raises
+    ------
+    InvalidProblem
+        Where a damaged part cannot be removed.
+    """
+    done = part_files(folder)
+    for key, path in list(done.items()):
         try:
-            # The end of a Parquet file holds its size: a file cut short has none, and no row need be read.
-            rows = parquet.read_metadata(path).num_rows
-        except (ArrowException, OSError):
-            rows = -1
-        if rows == manifest.chunks[path.stem]:
-            done.add(path.stem)
-        else:
-            path.unlink(missing_ok=True)
+            whole = read_part(path, ["status"]).num_rows == manifest.chunks[key]
+        except InvalidProblem:
+            whole = False
+        if not whole:
+            del done[key]
+            say(f"{path}: the part is damaged, and is made again")
+            try:
+                path.unlink(missing_ok=True)
+            except OSError as error:
+                raise unwritable(path, error) from None
     return done
 
 
@@ -232,20 +270,18 @@ def note_data(known: dict[str, str], table: Any, folder: Path) -> None:
             raise InvalidProblem(what, str(folder), advice)
 
 
-def known_data(plan: Plan, folder: Path, done: set[str]) -> dict[str, str]:
-    """Return the digests of the blocks of finished chunks by their seeds.
+def known_data(plan: Plan, folder: Path, done: dict[str, Path]) -> dict[str, str]:
+    """Return the digests of the blocks of finished chunks, whose part files are given, by their seeds.
 
     Raises
     ------
     InvalidProblem
         Where they contradict each other, or what is drawn here for the first finished trial of a case.
     """
-    from pyarrow import parquet
-
     known: dict[str, str] = {}
     first = {chunk.cell.case.key: chunk for chunk in reversed(list(plan.chunks)) if chunk.key in done}
-    for key in sorted(done):
-        note_data(known, parquet.read_table(folder / "parts" / f"{key}.parquet", columns=["seed", "data"]), folder)
+    for path in done.values():
+        note_data(known, read_part(path, ["seed", "data"]), folder)
     for chunk in first.values():
         drawn = draw(chunk.cell.case, chunk.first, 1)
         if known.get(drawn.seed[0]) != drawn.digest[0]:
@@ -257,19 +293,31 @@ def known_data(plan: Plan, folder: Path, done: set[str]) -> dict[str, str]:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Hold a folder, so that two runs do not write to it; the lock goes with the process, however it ends."""
+    """Make and hold a folder, so that two runs do not write to it; the lock goes with the process, however it ends.
+
+    Raises
+    ------
+    InvalidProblem
+        Where another run holds it, it cannot be written, or it holds something else than a study.
+    """
     try:
-        import fcntl
-    except ImportError:  # there is none on this system
-        yield
-        return
-    # The manifest is there before any part and is never written again: what could be locked better?
-    with (folder / MANIFEST).open("rb") as file:
+        # A folder of somebody else is left as it is.
+        if folder.is_dir() and not {MANIFEST, _LOCK} & (names := {path.name for path in folder.iterdir()}) and names:
+            advice = "choose another with --out"
+            raise InvalidProblem("the folder is not empty, and holds no study", str(folder), advice)
+        folder.mkdir(parents=True, exist_ok=True)
+        # Opened for writing: file systems of a network lock nothing else.
+        file = (folder / _LOCK).open("ab")
+    except OSError as error:
+        raise unwritable(folder, error) from None
+    with file:
         try:
+            import fcntl
+
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             raise InvalidProblem("another run writes to this folder", str(folder), "wait until it ends") from None
-        except OSError:  # a file system without locks
+        except (ImportError, OSError):  # a system or a file system without locks
             pass
         yield
 
@@ -293,6 +341,8 @@ class Progress:
         How many of them have which status.
     methods : dict of (str, str) to int
         How many rows of which method have which status.
+    failures : dict of (str, str) to str
+        Why a trial of a method has a status that only those without a fix have.
     """
 
     manifest: Manifest
@@ -301,6 +351,7 @@ class Progress:
     rows: int
     counts: dict[str, int]
     methods: dict[tuple[str, str], int]
+    failures: dict[tuple[str, str], str]
 
     @property
     def complete(self) -> bool:
@@ -310,20 +361,25 @@ class Progress:
 
 def progress(folder: Path) -> Progress:
     """Return how far the study of a folder is; raise InvalidProblem where it holds none."""
-    from pyarrow import parquet
+    import pyarrow.compute as pc
 
     manifest = read_manifest(folder)
     files = part_files(folder)
     methods: Counter[tuple[str, str]] = Counter()
-    for path in files:
-        # Two columns of fifty, so that looking does not slow down a run of millions of rows.
-        table = parquet.read_table(path, columns=["method", "status"])
-        found = table.group_by(["method", "status"]).aggregate([([], "count_all")]).to_pylist()
-        methods.update({(str(row["method"]), str(row["status"])): int(row["count_all"]) for row in found})
+    failures: dict[tuple[str, str], str] = {}
+    for path in files.values():
+        # Three columns of fifty, so that looking does not slow down a run of millions of rows.
+        table = read_part(path, ["method", "status", "reason"])
+        for row in table.group_by(["method", "status"]).aggregate([([], "count_all")]).to_pylist():
+            method, status = str(row["method"]), str(row["status"])
+            methods[method, status] += int(row["count_all"])
+            if status in FAILED and (method, status) not in failures:
+                own = pc.and_(pc.equal(table["method"], method), pc.equal(table["status"], status))
+                failures[method, status] = str(table["reason"].filter(own)[0])
     counts: Counter[str] = Counter()
     for (_, status), count in methods.items():
         counts[status] += count
-    return Progress(manifest, len(files), len(manifest.chunks), counts.total(), dict(counts), dict(methods))
+    return Progress(manifest, len(files), len(manifest.chunks), counts.total(), dict(counts), dict(methods), failures)
 
 
 # Read the parts of a study as one table; the columns are described in `optloc.study.trial`.
@@ -344,17 +400,16 @@ def read_arrow(folder: Path, columns: Sequence[str] | None = None) -> Any:
     Raises
     ------
     InvalidProblem
-        Where the folder holds no study.
+        Where the folder holds no study, or a part is damaged.
     """
     import pyarrow as pa
     import pyarrow.compute as pc
-    from pyarrow import parquet
 
     schema = arrow_schema()
     wanted = [c.name for c in COLUMNS] if columns is None else [c.name for c in COLUMNS if c.name in set(columns)]
     # What sorts must be read, though it may not be wanted.
     read = list(dict.fromkeys([*wanted, *SORTED]))
-    parts = [parquet.read_table(path, columns=read) for path in part_files(folder)]
+    parts = [read_part(path, read) for path in part_files(folder).values()]
     empty = pa.schema([schema.field(name) for name in read]).empty_table()
     table = pa.concat_tables([empty, *(part.cast(empty.schema) for part in parts)]).unify_dictionaries()
     # Texts sort by themselves, not by their numbers in the dictionary, which depend on the order of parts.

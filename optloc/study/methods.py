@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.types import Array, Certificate, Status
 from optloc.files.schema import Units, join
 from optloc.problem.fix import Fix
 from optloc.study.baselines import BASELINES, start_of
@@ -156,11 +157,18 @@ class Run:
         Time of the call.
     iterations : float
         Iterations of all its solvers and refinements; NaN where nothing was counted.
+    used : bool
+        Whether the back end that was asked for has solved anything; True where none was asked for.
     """
 
     fix: Fix
     seconds: float
     iterations: float
+    used: bool
+
+
+class Nonsense(Exception):  # noqa: N818  (a word for what it is, as all of them)
+    """What a method returned is no answer to its trials."""
 
 
 def run(method: Method, drawn: Drawn) -> Run:
@@ -168,8 +176,8 @@ def run(method: Method, drawn: Drawn) -> Run:
 
     Raises
     ------
-    InvalidProblem
-        Where the method solved nothing with the back end that was asked for.
+    Nonsense
+        Where what the method returned is no fix of these trials.
     """
     from optloc.solvers.methods import Choice, counting, using
 
@@ -180,14 +188,20 @@ def run(method: Method, drawn: Drawn) -> Run:
         began = perf_counter()
         fix = _solved(method, drawn)
         seconds = perf_counter() - began
+    _check(fix, drawn)
+    used = choice is None or choice.name in {name for name, _ in tally}
+    return Run(fix, seconds, float(sum(n for _, n in tally)) if tally else np.nan, used)
+
+
+def require_program(method: Method, found: Run) -> None:
+    """Raise InvalidProblem where the back end that was asked for has solved nothing."""
     # A method that never asks the back end would be measured under its name.
-    if choice is not None and choice.name not in {name for name, _ in tally}:
-        what = f"{method.method or method.baseline} has no program that {choice.name} solves"
+    if not found.used:
+        what = f"{method.method or method.baseline} has no program that {method.solver} solves"
         raise InvalidProblem(what, f"method {method.name!r}", "leave the solver out, or use a stage such as sdp or nlp")
-    return Run(fix, seconds, float(sum(n for _, n in tally)) if tally else np.nan)
 
 
-def _solved(method: Method, drawn: Drawn) -> Fix:
+def _solved(method: Method, drawn: Drawn) -> Any:
     if method.baseline is not None:
         return BASELINES[method.baseline].run(drawn, start_of(method.start, method.width, drawn))
     from optloc.solvers import solve
@@ -196,6 +210,61 @@ def _solved(method: Method, drawn: Drawn) -> Fix:
     fix = solve(drawn.problem, method.method)
     # A batch of one has no axis of its own.
     return fix if fix.shape else fix.flat()
+
+
+# Share of the variances by which rounding may make a covariance unsymmetric or negative: half of the digits.
+_ROUNDING = 1e-8
+
+
+def _check(fix: Any, drawn: Drawn) -> None:
+    """Raise Nonsense where something is no fix of trials: its type, its shapes and kinds of numbers, its answers."""
+    if not isinstance(fix, Fix):
+        raise Nonsense(f"it returned {type(fix).__name__} in the place of a fix")
+    n, size = drawn.truth.shape
+    shared, others = drawn.problem.layout.n_shared, np.shape(fix.alternatives.gap)[-1:]
+    wanted: dict[str, tuple[Any, tuple[int, ...], str]] = {
+        "x": (fix.x, (n, size), "f"),
+        "cov": (fix.cov, (n, shared, shared), "f"),
+        "code": (fix.code, (n,), "iu"),
+        "cost": (fix.cost, (n,), "f"),
+        "dof": (fix.dof, (n,), "iu"),
+        "weights": (fix.weights, (n, drawn.problem.count), "f"),
+        "reason": (fix.reason, (n,), "OU"),
+        "certificate": (fix.certificate, (n,), "O"),
+        "alternatives.x": (fix.alternatives.x, (n, *others, size), "f"),
+        "alternatives.gap": (fix.alternatives.gap, (n, *others), "f"),
+    }
+    for name, (value, shape, kinds) in wanted.items():
+        if not isinstance(value, np.ndarray) or value.shape != shape or value.dtype.kind not in kinds:
+            what = f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
+            raise Nonsense(f"its {name} is {what}, and not an array {shape} of kind {kinds!r}")
+    if not all(isinstance(one, Certificate) for one in fix.certificate):
+        raise Nonsense("its certificates are none")
+    if not all(0 <= code < len(Status) for code in fix.code):
+        raise Nonsense("its status is unknown")
+    kept = fix.answered
+    _check_answers(fix.x[kept, :shared], fix.cov[kept], fix.code[kept])
+
+
+def _check_answers(x: Array, cov: Array, code: Array) -> None:
+    """Raise Nonsense where answers (n, p) are not finite, or their covariances (n, p, p) are none."""
+    # A run to infinity has no place.
+    x, cov = (value[code != Status.UNBOUNDED] for value in (x, cov))
+    if not np.isfinite(x).all():
+        raise Nonsense("its status has an answer, and its estimate is not finite")
+    if not np.isfinite(cov).all():
+        raise Nonsense("its status has an answer, and its covariance is not finite")
+    variance = np.diagonal(cov, axis1=-2, axis2=-1)
+    if (variance < 0.0).any():
+        raise Nonsense("its covariance has negative variances")
+    # In units of each deviation, so that metres and radians count alike; what is known has none.
+    scale = np.sqrt(variance)
+    scale = np.where(scale > 0.0, scale, 1.0)
+    relative = cov / scale[:, :, None] / scale[:, None, :]
+    if (np.abs(relative - np.swapaxes(relative, -1, -2)) > _ROUNDING).any():
+        raise Nonsense("its covariance is not symmetric")
+    if len(cov) and np.linalg.eigvalsh(relative).min() < -_ROUNDING:
+        raise Nonsense("its covariance is not positive semidefinite")
 
 
 # Settings of back ends. A study file comes from anybody: it may say how hard a solver tries, and nothing else. Options

@@ -376,3 +376,15 @@ def workers() -> int:
     """Return how many processes this machine can run at a time."""
     # Processors that this process may use: containers and schedulers leave it fewer than the machine has.
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+# What methods may take of the memory of a machine, if all processes do so; and bytes that each may use at least:
+# libraries alone reserve 2e9.
+_MEMORY, _LEAST_MEMORY = 0.8, 4 << 30
+
+
+def memory_of(count: int) -> int | None:
+    """Return the bytes that each of so many processes of this machine may use; None where that is not known."""
+    if not hasattr(os, "sysconf"):
+        return None
+    return max(_LEAST_MEMORY, int(_MEMORY * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / count))

@@ -16,7 +16,6 @@ from typing import Any, Literal
 import numpy as np
 
 from optloc.base import linalg
-from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
 from optloc.bounds.crlb import crlb
 from optloc.compute.sums import equations_at
@@ -25,7 +24,7 @@ from optloc.linear.normal import covariance, eliminated
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.study.draws import Case, Drawn, draw
-from optloc.study.methods import run, version_of
+from optloc.study.methods import Nonsense, require_program, run, version_of
 from optloc.study.plan import Cell, Chunk
 
 # The long table of a study, one row for each trial of each method: columns, units and meaning in one place.
@@ -76,7 +75,13 @@ COLUMNS: tuple[Column, ...] = (
     Column("epochs", "int", "", "Number of epochs of a trial."),
     Column("trial", "int", "", "Number of the trial, from 0."),
     Column("seed", "category", "", "Seed of the trial's block of data: study seed, data cell and block number."),
-    Column("status", "category", "", "Label of the status, for instance ok; 'died' where the process died twice."),
+    Column(
+        "status",
+        "category",
+        "",
+        "Label of the status, for instance ok; without a fix: 'died' of an error or with its process, 'timeout' over "
+        "the time limit of tasks, 'invalid' for an answer that is none.",
+    ),
     Column("answered", "bool", "", "Whether the status has a position with a covariance, whatever stands against it."),
     Column("reason", "category", "", "Sentence that belongs to the status."),
     Column("located", "bool", "", "Whether there is a finite position at all, refined or not."),
@@ -131,8 +136,8 @@ COLUMNS: tuple[Column, ...] = (
 GAP = Column("gap", "float", "1", "Cost less the lowest cost that any method of the study found for the same data.")
 """Added when all parts are read: it needs all methods."""
 
-DIED = "died"
-"""Status of a trial that took its process down twice."""
+FAILED = DIED, LATE, INVALID = "died", "timeout", "invalid"
+"""Statuses of a trial that has no fix: an error or the end of its process, its time limit, an answer that is none."""
 
 VALUES: tuple[str, ...] = tuple(column.name for column in COLUMNS if column.value)
 """Columns that are equal bit for bit on one machine, whatever the executor."""
@@ -176,8 +181,30 @@ class Part:
     counts: dict[str, int]
 
 
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """What came of a chunk that gave no part.
+
+    Parameters
+    ----------
+    key : str
+        Of the chunk.
+    status : str
+        `DIED` or `LATE`.
+    reason : str
+        How it ended.
+    """
+
+    key: str
+    status: str
+    reason: str
+
+
 Values = dict[str, Any]
 """Columns of some trials: arrays (n,), or one value for all."""
+
+# Characters of a reason: it stands in every row, and a library may put a matrix into its complaint.
+_WORDS = 200
 
 # Cells of which this process has solved a trial: what is compiled or canonicalised once is not timed with the others.
 _warm: set[tuple[str, str]] = set()
@@ -191,7 +218,8 @@ def compute(chunk: Chunk) -> Part:
     Raises
     ------
     InvalidProblem
-        Where the method cannot be run at all. Any other error of a trial becomes the status of its row.
+        Where the method solves nothing with the back end that was asked for. Whatever a method raises becomes the
+        status of a row.
     """
     from threadpoolctl import threadpool_limits
 
@@ -219,11 +247,10 @@ def _warm_up(cell: Cell, drawn: Drawn) -> float:
         return 0.0
     began = perf_counter()
     try:
-        run(cell.method, drawn.part(0, 1))
-    except InvalidProblem:
-        raise
-    except Exception:  # noqa: BLE001  (it comes again with its row)
+        found = run(cell.method, drawn.part(0, 1))
+    except (Exception, SystemExit):  # noqa: BLE001  (it comes again with its row)
         return 0.0
+    require_program(cell.method, found)
     # Only where it went well: a failure may come before what is slow.
     _warm.add(key)
     return perf_counter() - began
@@ -233,11 +260,12 @@ def _solve_in_halves(cell: Cell, known: Known, first: int, count: int) -> list[t
     """Return the values of some trials; where the call fails, halves are tried until the one trial is found."""
     try:
         return [(count, _solve(cell, known.part(first, count)))]
-    except InvalidProblem:
-        raise
-    except Exception as error:  # noqa: BLE001  (a failing trial costs a row, never the study)
-        if count == 1:
-            return [(1, _failure(f"{type(error).__name__}: {error}".splitlines()[0]))]
+    except Nonsense as error:
+        status, reason = INVALID, str(error)
+    except (Exception, SystemExit) as error:  # noqa: BLE001  (a failing trial costs a row, never the study)
+        status, reason = DIED, f"{type(error).__name__}: {error}".splitlines()[0]
+    if count == 1:
+        return [(1, _failure(status, reason))]
     half = count // 2
     return [*_solve_in_halves(cell, known, first, half), *_solve_in_halves(cell, known, first + half, count - half)]
 
@@ -249,17 +277,17 @@ def _solve(cell: Cell, known: Known) -> Values:
     return values | {"seconds": found.seconds / count, "iterations": found.iterations / count, "batch": count}
 
 
-def _failure(reason: str) -> Values:
+def _failure(status: str, reason: str) -> Values:
     """Return the values of a trial that failed."""
     values: Values = {column.name: np.nan for column in COLUMNS if column.kind == "float"}
-    values |= {"status": DIED, "reason": reason, "answered": False, "located": False}
+    values |= {"status": status, "reason": reason[:_WORDS], "answered": False, "located": False}
     values |= dict.fromkeys(("dof", "alternatives", "rejected"), 0)
     return values | {"proof": "unknown", "certificate": "", "batch": 1}
 
 
-def dead_part(chunk: Chunk, reason: str) -> Part:
-    """Return the part of a chunk whose trials all have the status `died`."""
-    found = {name: _spread(value, chunk.count) for name, value in _failure(reason).items()}
+def part_of_lost(chunk: Chunk, lost: Lost) -> Part:
+    """Return the part of a chunk whose trials all have the status of what came of it."""
+    found = {name: _spread(value, chunk.count) for name, value in _failure(lost.status, lost.reason).items()}
     return _part(chunk, known_of(draw(chunk.cell.case, chunk.first, chunk.count)), found, 0.0)
 
 

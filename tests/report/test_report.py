@@ -56,7 +56,7 @@ def site(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report") / "site"
     file = folder.with_suffix(".toml")
     file.write_text(TEXT, encoding="utf-8")
-    run_plan(plan_of(file), folder, executor("in-process"))
+    run_plan(plan_of(file), folder, executor("processes", 1))
     return folder
 
 
@@ -69,7 +69,7 @@ def made(site):
 def shipped(tmp_path_factory):
     """The report of a shipped study, with few trials."""
     folder = tmp_path_factory.mktemp("report") / "divergence"
-    run_plan(plan_of(folder.relative_to(folder.parent), trials=4), folder, executor("in-process"))
+    run_plan(plan_of(folder.relative_to(folder.parent), trials=4), folder, executor("processes", 1))
     return write_report(folder)
 
 

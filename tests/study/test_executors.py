@@ -8,16 +8,13 @@ import sys
 import time
 from contextlib import ExitStack, contextmanager
 
-import cloudpickle
-import numpy as np
 import pytest
-from study.texts import QUICK, SMALL, assert_identical, plan
+from study.texts import QUICK, assert_identical, plan, run_here
 
 from optloc.base.errors import InvalidProblem
 from optloc.study import execute
 from optloc.study.execute import EXECUTORS, executor, run_plan
-from optloc.study.folder import progress, read_frame
-from optloc.study.trial import compute
+from optloc.study.folder import progress
 
 LONG = QUICK.replace("trials = 60", "trials = 600")
 
@@ -25,8 +22,7 @@ LONG = QUICK.replace("trials = 60", "trials = 600")
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
     folder = tmp_path_factory.mktemp("study") / "plain"
-    assert run_plan(plan(), folder, executor("in-process")).complete
-    return folder
+    return run_here(plan(), folder)
 
 
 @contextmanager
@@ -95,7 +91,7 @@ def test_a_killed_worker_and_a_killed_run_lose_nothing(cluster, tmp_path):
     address, another, workers = cluster
     (tmp_path / "long.toml").write_text(LONG)
     whole = tmp_path / "whole"
-    assert run_plan(plan(LONG), whole, executor("in-process")).complete
+    run_here(plan(LONG), whole)
     out = tmp_path / "out"
     command = ["-m", "optloc.cli", "study", "run", str(tmp_path / "long.toml"), "--out", str(out)]
 
@@ -119,64 +115,12 @@ def test_a_killed_worker_and_a_killed_run_lose_nothing(cluster, tmp_path):
     assert_identical(whole, out)
 
 
-def test_a_killed_run_of_local_processes_goes_on(tmp_path, undisturbed):
-    (tmp_path / "small.toml").write_text(SMALL)
-    out = tmp_path / "out"
-    command = ["-m", "optloc.cli", "study", "run", str(tmp_path / "small.toml"), "--out", str(out), "--jobs", "2"]
-    with process(*command, stdout=subprocess.DEVNULL, start_new_session=True) as run:
-        until(lambda: list(out.glob("parts/*.parquet")))
-        os.killpg(run.pid, signal.SIGKILL)
-        run.wait()
-    assert run_plan(plan(), out, executor("in-process")).complete
-    assert_identical(undisturbed, out)
-
-
-def test_ctrl_c_stops_with_a_sentence_and_keeps_what_is_finished(tmp_path):
-    (tmp_path / "long.toml").write_text(LONG)
-    out = tmp_path / "out"
-    command = ["-m", "optloc.cli", "study", "run", str(tmp_path / "long.toml"), "--out", str(out), "--jobs", "2"]
-    with process(*command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run:
-        until(lambda: list(out.glob("parts/*.parquet")))
-        run.send_signal(signal.SIGINT)
-        _, complaint = run.communicate(timeout=60)
-    assert run.returncode == 130
-    assert "goes on from there" in complaint
-    assert "Traceback" not in complaint
-    assert progress(out).done > 0
-
-
-def test_a_trial_that_kills_its_process_costs_one_row(tmp_path, monkeypatch):
-    made, undisturbed = plan(QUICK), tmp_path / "plain"
-    run_plan(made, undisturbed, executor("in-process"))
-    key = made.cells[0].key
-
-    def lethal(chunk):
-        if chunk.cell.key == key and chunk.first <= 13 < chunk.first + chunk.count:
-            os.kill(os.getpid(), signal.SIGKILL)
-        return compute(chunk)
-
-    cloudpickle.register_pickle_by_value(sys.modules[__name__])
-    monkeypatch.setattr(execute, "task", lethal)
-    try:
-        found = run_plan(made, tmp_path / "out", executor("processes", 2))
-    finally:
-        cloudpickle.unregister_pickle_by_value(sys.modules[__name__])
-    assert found.complete
-    assert found.counts["died"] == 1
-    table, whole = (read_frame(folder) for folder in (tmp_path / "out", undisturbed))
-    lost = table["status"] == "died"
-    assert (table["key"][lost].item(), table["trial"][lost].item()) == (key, 13)
-    for name in ("seed", "trial", "truth_x", "crlb", "cost_truth", "chunk"):
-        assert (table[name].astype(object) == whole[name].astype(object)).all(), name
-    assert np.allclose(table["error"][~lost], whole["error"][~lost])
-
-
 def test_unknown_executors_and_schedulers_that_are_not_there():
     with pytest.raises(InvalidProblem, match="did you mean 'dask'"):
         executor("desk")
     with pytest.raises(InvalidProblem, match="has no scheduler"):
         executor("processes", None, "tcp://127.0.0.1:1")
-    assert set(EXECUTORS) == {"in-process", "processes", "dask", "ray"}
+    assert set(EXECUTORS) == {"processes", "dask", "ray"}
 
 
 def test_an_unreachable_scheduler_is_one_sentence_and_nothing_is_lost(tmp_path, monkeypatch):

@@ -108,7 +108,9 @@ def test_every_setting_of_the_table_is_one_that_its_back_end_knows(solver):
         (["run", "divergense"], "did you mean 'divergence'"),
         (["run", "nowhere.toml"], "no such file"),
         (["run", "groa", "--executor", "procesess"], "did you mean 'processes'"),
-        (["run", "groa", "--executor", "in-process", "--scheduler", "tcp://h:1"], "has no scheduler"),
+        (["run", "groa", "--executor", "in-process"], "unknown executor 'in-process'"),
+        (["run", "groa", "--task-limit", "0"], "a task cannot take 0 s"),
+        (["run", "groa", "--task-limit", "nan"], "a task cannot take nan s"),
         (["status", "."], "holds no study"),
         (["compare", ".", "."], "holds no study"),
     ],
@@ -121,7 +123,7 @@ def test_bad_commands_are_one_sentence(arguments, words, tmp_path, monkeypatch):
 def test_run_status_and_compare(tmp_path):
     (tmp_path / "s.toml").write_text(QUICK)
     out = str(tmp_path / "out")
-    made = RUN.invoke(app, ["study", "run", str(tmp_path / "s.toml"), "--out", out, "-x", "in-process"])
+    made = RUN.invoke(app, ["study", "run", str(tmp_path / "s.toml"), "--out", out, "-j", "1"])
     assert made.exit_code == 0, made.output
     assert "complete, 180 of 180 rows" in made.stdout
     state = RUN.invoke(app, ["study", "status", out, "--json"])
@@ -138,7 +140,7 @@ def test_lists_show_what_studies_are_made_of():
     for what, words in {
         "solvers": ("CLARABEL", "ipopt", "sqpmethod", "scipy", "lsr", "version"),
         "baselines": ("taylor", "lifted-sdp"),
-        "executors": ("dask", "in-process"),
+        "executors": ("dask", "processes"),
         "studies": tuple(STUDIES),
         "methods": ("auto",),
     }.items():

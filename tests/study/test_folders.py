@@ -11,23 +11,33 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
-from study.texts import QUICK, assert_identical, plan, values
+from study.texts import QUICK, assert_identical, plan, run_here, values
 
 from optloc.base.errors import InvalidProblem
-from optloc.study import draws
+from optloc.study import draws, execute
 from optloc.study import folder as parts
 from optloc.study.execute import executor, run_plan
-from optloc.study.folder import progress, read_arrow, read_frame, swept
+from optloc.study.folder import (
+    finished_parts,
+    part_files,
+    progress,
+    read_arrow,
+    read_frame,
+    read_manifest,
+    read_part,
+    store,
+    swept,
+)
 from optloc.study.summary import compared
+from optloc.study.trial import Part, compute
 
-HERE = executor("in-process")
+HERE = executor("processes", 1)
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
     folder = tmp_path_factory.mktemp("study") / "whole"
-    assert run_plan(plan(QUICK), folder, HERE).complete
-    return folder
+    return run_here(plan(QUICK), folder)
 
 
 def test_a_full_disk_is_a_sentence_and_the_same_command_goes_on(whole, tmp_path, monkeypatch):
@@ -49,13 +59,46 @@ def test_a_full_disk_is_a_sentence_and_the_same_command_goes_on(whole, tmp_path,
     assert_identical(whole, out)
 
 
-def test_a_damaged_part_is_computed_again(whole, tmp_path):
-    out = tmp_path / "out"
-    run_plan(plan(QUICK), out, HERE)
-    victim = sorted((out / "parts").glob("*.parquet"))[1]
-    victim.write_bytes(victim.read_bytes()[:100])
+def damage(path, how):
+    content = path.read_bytes()
+    table = read_part(path)
+    path.unlink()
+    if how == "cut":
+        path.write_bytes(content[:-100])
+    elif how == "a bit":
+        path.write_bytes(content[:700] + bytes([content[700] ^ 4]) + content[701:])
+    elif how == "empty":
+        path.touch()
+    elif how == "other columns":
+        parquet.write_table(table.drop_columns(["seed"]), path)
+    elif how == "no name":
+        path.with_name(f"{path.name.partition('.')[0]}.parquet").write_bytes(content)
+    elif how == "few rows":
+        store(path.parent.parent, Part(path.name.partition(".")[0], table.slice(1), {}))
+
+
+def test_damaged_parts_are_named_and_computed_again(whole, tmp_path):
+    out, told = tmp_path / "out", []
+    shutil.copytree(whole, out)
+    before = part_files(out)
+    ways = ("cut", "a bit", "empty", "other columns", "no name", "few rows")
+    for i, (key, path) in enumerate(list(before.items())[1 : 1 + len(ways)]):
+        how = ways[i]
+        damage(path, how)
+        if how != "few rows":  # a file like any other
+            with pytest.raises(InvalidProblem, match=rf"{key}.*the part is damaged"):
+                progress(out)
+        said = []
+        assert len(finished_parts(out, read_manifest(out), said.append)) == len(before) - 1 - i, how
+        assert len(said) == 1
+        assert key in said[0]
+        told += said
     (out / "parts" / ".left.1").write_bytes(b"half")
-    assert run_plan(plan(QUICK), out, HERE).complete
+    victim = next(iter(part_files(out).values()))
+    victim.write_bytes(victim.read_bytes()[:100])
+    with pytest.warns(UserWarning, match=f"{victim.name}: the part is damaged, and is made again"):
+        assert run_plan(plan(QUICK), out, HERE).complete
+    assert len(told) == len(ways)
     assert not (out / "parts" / ".left.1").exists()
     assert_identical(whole, out)
 
@@ -71,9 +114,9 @@ def test_remarks_are_not_another_study(whole):
     assert run_plan(plan("# a remark\n" + QUICK), whole, HERE).complete
 
 
-def test_the_folder_of_another_version_is_refused(tmp_path):
+def test_the_folder_of_another_version_is_refused(whole, tmp_path):
     out = tmp_path / "out"
-    run_plan(plan(QUICK), out, HERE)
+    shutil.copytree(whole, out)
     manifest = json.loads((out / "manifest.json").read_text())
     (out / "manifest.json").write_text(json.dumps({**manifest, "version": "0.0.1"}))
     with pytest.raises(InvalidProblem, match=r"written by optloc 0\.0\.1"):
@@ -112,7 +155,7 @@ def test_two_runs_do_not_write_to_one_folder(whole):
 
 def test_the_gap_is_to_the_best_method_of_the_same_trial(tmp_path):
     text = QUICK.replace('method = "gtrs+lsr"', 'method = ["gtrs+lsr", "gtrs"]')
-    run_plan(plan(text), tmp_path / "out", HERE)
+    run_here(plan(text), tmp_path / "out")
     frame = read_frame(tmp_path / "out")
     best = frame.groupby(["data", "trial"], observed=True)["cost"].transform("min")
     assert (frame["gap"] == frame["cost"] - best).all()
@@ -125,7 +168,7 @@ def test_the_gap_is_to_the_best_method_of_the_same_trial(tmp_path):
 def test_swept_values_become_columns(tmp_path):
     text = QUICK.replace("[[method]]", '[[method]]\nname = "m"').replace("trials = 60", "trials = 10")
     text = text.replace('noise = ["3 m"]', 'noise = ["3 m"]\nsweep = { "layout.stations" = [5, 7] }')
-    run_plan(plan(text), tmp_path / "out", HERE)
+    run_here(plan(text), tmp_path / "out")
     frame = swept(read_frame(tmp_path / "out"))
     arrivals = frame[frame["scenario"] == "arrivals"]
     assert (arrivals["layout.stations"] == arrivals["stations"]).all()
@@ -137,11 +180,11 @@ def test_studies_are_compared_cell_by_cell(whole, tmp_path):
     same = compared(whole, whole)
     assert len(same) == 3
     assert all(d.identical and d.same_data for d in same)
-    run_plan(plan(QUICK, seed=6), tmp_path / "other", HERE)
+    run_here(plan(QUICK, seed=6), tmp_path / "other")
     other = compared(whole, tmp_path / "other")
     assert not any(d.identical or d.same_data for d in other)
     assert all(d.two.rmse < 3.0 * d.two.bound for d in other)
-    run_plan(plan(QUICK.replace('"arrivals"', '"a"').replace('"differences"', '"d"')), tmp_path / "names", HERE)
+    run_here(plan(QUICK.replace('"arrivals"', '"a"').replace('"differences"', '"d"')), tmp_path / "names")
     with pytest.raises(InvalidProblem, match="no cell in common"):
         compared(whole, tmp_path / "names")
 
@@ -154,7 +197,7 @@ def elsewhere(monkeypatch):
 
 
 def test_the_same_seed_is_not_the_same_data(whole, tmp_path, elsewhere):
-    run_plan(plan(QUICK), tmp_path / "other", HERE)
+    run_here(plan(QUICK), tmp_path / "other")
     other = compared(whole, tmp_path / "other")
     assert not any(d.identical or d.same_data for d in other)
     seeds = [set(values(folder)["seed"]) for folder in (whole, tmp_path / "other")]
@@ -175,27 +218,31 @@ def test_parts_that_contradict_each_other_are_refused(whole, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(whole, out)
     part = sorted((out / "parts").glob("*.parquet"))[1]
-    table = parquet.read_table(part)
+    table = read_part(part)
     column = table.schema.get_field_index("data")
     other = pa.array(["0123456789abcdef"] * len(table)).dictionary_encode()
-    parquet.write_table(table.set_column(column, table.schema.field(column), other), part)
+    part.unlink()
+    key = part.name.partition(".")[0]
+    store(out, Part(key, table.set_column(column, table.schema.field(column), other), {}))
     with pytest.raises(InvalidProblem, match="hold different data for the same trials"):
         run_plan(plan(QUICK), out, HERE)
 
 
-def test_a_part_with_other_data_is_not_stored(whole, tmp_path, monkeypatch):
+def test_a_part_with_other_data_is_not_stored(tmp_path, monkeypatch):
     """Two methods, of which the second is computed where the same seed draws other data."""
-    text = QUICK.replace('method = "gtrs+lsr"', 'method = ["gtrs+lsr", "gtrs"]')
-    here, calls = draws.simulate, []
+    made = plan(QUICK.replace('method = "gtrs+lsr"', 'method = ["gtrs+lsr", "gtrs"]'))
+    here = draws.simulate
 
-    def strays(*given):
-        calls.append(given)
-        made = here(*given)
-        return made if len(calls) == 1 else made.with_rows(z=np.nextafter(made.z, 1e9))
+    def strays(chunks, by):
+        for i, chunk in enumerate(chunks):
+            with monkeypatch.context() as patch:
+                if i:
+                    patch.setattr(draws, "simulate", lambda *a: (d := here(*a)).with_rows(z=np.nextafter(d.z, 1e9)))
+                yield compute(chunk)
 
-    monkeypatch.setattr(draws, "simulate", strays)
+    monkeypatch.setattr(execute, "compute_all", strays)
     with pytest.raises(InvalidProblem, match="hold different data for the same trials"):
-        run_plan(plan(text), tmp_path / "out", HERE)
+        run_plan(made, tmp_path / "out", HERE)
     assert progress(tmp_path / "out").done >= 1
 
 
