@@ -146,8 +146,8 @@ def compute_all(chunks: Iterable[Chunk], by: Executor) -> Generator[Part]:
                     yield from work.take(found)
             except begun.deaths:
                 # A cluster lost a worker again and again: what it had is computed here, and the others there.
-                for chunk, limit in work.handed_out():
-                    yield from work.take(here.compute(chunk, limit))
+                for task in list(work.out.values()):
+                    yield from work.take(here.compute(task.chunk, by.limit))
 
 
 def _parallel(tasks: Iterator[tuple[Chunk, float]], begun: Begun) -> Iterator[Part | Lost]:
@@ -169,7 +169,7 @@ def _parallel(tasks: Iterator[tuple[Chunk, float]], begun: Begun) -> Iterator[Pa
 # ten thousand at which a method hangs (3.1 limits), or four at which it dies; one that always does is left soon.
 _PATIENCE, _DEATH = 4.0, 1 / 16
 # A part of a chunk has its share of the limit, but not less than an eighth, and time for what is built once.
-_SHARE, _BUILD = 1 / 8, 10.0
+_LEAST, _BUILD = 1 / 8, 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,24 +187,21 @@ class _Work:
     def __init__(self, chunks: Iterable[Chunk], limit: float) -> None:
         self.left = deque(_Task(chunk, chunk) for chunk in chunks)
         self._limit = limit
-        self._out: dict[str, _Task] = {}
+        self.out: dict[str, _Task] = {}
         self._parts: dict[str, list[Part]] = {}
         self._cost: dict[str, float] = {}
+        self._given_up: dict[str, Lost] = {}
 
     def hand_out(self) -> Iterator[tuple[Chunk, float]]:
         """Yield chunks with the seconds that they may take: none where their cell has cost too much."""
         while self.left:
             task = self.left.popleft()
-            self._out[task.chunk.key] = task
-            yield task.chunk, 0.0 if self._spent(task) else self._seconds(task)
-
-    def handed_out(self) -> list[tuple[Chunk, float]]:
-        """Return what is out."""
-        return [(task.chunk, self._seconds(task)) for task in self._out.values()]
+            self.out[task.chunk.key] = task
+            yield task.chunk, self._seconds(task)
 
     def take(self, found: Part | Lost) -> Iterator[Part]:
         """Yield the part of a chunk of the plan where it is complete with what was found."""
-        task = self._out.pop(found.key)
+        task = self.out.pop(found.key)
         part = self._judge(task, found) if isinstance(found, Lost) else found
         if part is None:
             return
@@ -218,11 +215,13 @@ class _Work:
     def _judge(self, task: _Task, lost: Lost) -> Part | None:
         """Return the part of a task that was lost, or None and have it tried again, whole or in halves."""
         chunk, cell = task.chunk, task.chunk.cell.key
-        price = self._seconds(task) / self._limit if lost.status == LATE else _DEATH
-        self._cost[cell] = self._cost.get(cell, 0.0) + price
-        if self._spent(task):
-            reason = f"given up: the method cost this scenario too many processes; the last one: {lost.reason}"
-            return part_of_lost(chunk, replace(lost, reason=reason))
+        if cell not in self._given_up:
+            self._cost[cell] = self._cost.get(cell, 0.0) + (_share(task) if lost.status == LATE else _DEATH)
+            if self._cost[cell] >= _PATIENCE:
+                reason = f"given up, since too much of it was lost in this scenario; the last time {lost.reason}"
+                self._given_up[cell] = replace(lost, reason=reason)
+        if cell in self._given_up:
+            return part_of_lost(chunk, self._given_up[cell])
         if lost.status == DIED and not task.again:
             # Perhaps the machine was short of memory, or somebody killed it: halves would be solved in other batches.
             self.left.append(replace(task, again=True))
@@ -234,25 +233,26 @@ class _Work:
                 self.left.append(_Task(replace(chunk, first=first, count=count), task.whole, again=True))
         return None
 
-    def _spent(self, task: _Task) -> bool:
-        return self._cost.get(task.chunk.cell.key, 0.0) >= _PATIENCE
-
     def _seconds(self, task: _Task) -> float:
-        share = max(task.chunk.count / task.whole.count, _SHARE)
-        return min(self._limit, max(share * self._limit, _BUILD))
+        if task.chunk.cell.key in self._given_up:
+            return 0.0
+        return min(self._limit, max(_share(task) * self._limit, _BUILD))
+
+
+def _share(task: _Task) -> float:
+    return max(task.chunk.count / task.whole.count, _LEAST)
 
 
 # A process apart. It is begun without multiprocessing, which would run the caller's script again, and which lets the
 # workers of a cluster begin none.
 
-# Seconds: to begin, which takes half of one, and more where many share a processor; without a task, after which it ends,
-# as nobody tells a cluster that a study is over; between the end of its pipe and its own, which says how it ended.
+# Seconds: to begin, half of one where a processor is free; without a task, after which it ends, as nobody tells a
+# cluster that a study is over; between the end of its pipe and its own, which says how it ended.
 _START, _IDLE, _MOMENT = 120.0, 60.0, 0.2
 # Workers times threads would be more than the processors, and each thread of BLAS reserves memory.
 _ONE = ("OPTLOC", "OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "VECLIB_MAXIMUM", "NUMEXPR_NUM", "NUMBA_NUM")
-# Frames are pickled bytes in a pickle: the outer one can be read while nothing of optloc is imported.
 _BEGIN = (
-    "import pickle, sys; sys.path[:], memory = pickle.loads(pickle.load(sys.stdin.buffer)); "
+    "import pickle, sys; sys.path[:], memory = pickle.load(sys.stdin.buffer); "
     "from optloc.study.execute import serve; serve(memory)"
 )
 
@@ -278,7 +278,7 @@ class Apart:
 
     def ask(self, message: object, seconds: float) -> Any:
         """Return the answer to a message; raise TimeoutError after so many seconds, EOFError where the process ends."""
-        answer: SimpleQueue[bytes | None] = SimpleQueue()
+        answer: SimpleQueue[Any] = SimpleQueue()
 
         def exchange() -> None:
             # In a thread: pipes have no time limit on every system.
@@ -290,8 +290,7 @@ class Apart:
             except Exception:  # noqa: BLE001  (whatever a process that ends leaves in its pipe)
                 answer.put(None)
 
-        thread = Thread(target=exchange, daemon=True)
-        thread.start()
+        Thread(target=exchange, daemon=True).start()
         try:
             found = answer.get(timeout=seconds)
         except Empty:
@@ -299,17 +298,16 @@ class Apart:
             raise TimeoutError from None
         if found is None:
             raise EOFError(self.end(_MOMENT))
-        return pickle.loads(found)  # noqa: S301
+        return found
 
     def end(self, seconds: float = 0.0) -> str:
         """End the process, after some seconds, with all that it began, whatever it does, and return how it ended."""
         with self._ended:
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(seconds)
-            if hasattr(os, "killpg"):
-                # Its group lives on where it has ended and what it began has not.
-                with suppress(ProcessLookupError, PermissionError):
-                    os.killpg(self._process.pid, signal.SIGKILL)
+            # Its group lives on where it has ended and what it began has not; there are none on some systems.
+            with suppress(AttributeError, ProcessLookupError, PermissionError):
+                os.killpg(self._process.pid, signal.SIGKILL)
             self._process.kill()
             code = self._process.wait()
         how = f"exit code {code}" if code >= 0 else f"signal {-code} ({signal.strsignal(-code)})"
@@ -317,7 +315,7 @@ class Apart:
 
 
 def _send(file: IO[bytes], message: object) -> None:
-    pickle.dump(pickle.dumps(message), file)
+    pickle.dump(message, file)
     file.flush()
 
 
@@ -347,16 +345,22 @@ class Pool:
             return Lost(chunk.key, LATE, "not tried")
         apart = self._take()
         try:
-            found = apart.ask(chunk, seconds)
+            # Pickled twice: who listens need not import what belongs to the chunk.
+            found = apart.ask(pickle.dumps(chunk), seconds)
+            if isinstance(found, InvalidProblem):
+                raise found
+            if isinstance(found, Part) and (found.key, len(found.table)) == (chunk.key, chunk.count):
+                return found
+            # A process without memory, or one that answers something else, is of no use to others.
+            apart.end()
+            return found if isinstance(found, Lost) else Lost(chunk.key, DIED, "its process answered something else")
         except TimeoutError:
             return Lost(chunk.key, LATE, f"it took more than {seconds:g} s")
         except EOFError as error:
             return Lost(chunk.key, DIED, str(error))
         finally:
-            self._give(apart)
-        if isinstance(found, InvalidProblem):
-            raise found
-        return found  # type: ignore[no-any-return]  (what `serve` sends)
+            with self._lock:
+                (self._idle.append if apart.lives() else self._all.discard)(apart)
 
     def close(self) -> None:
         """End all processes."""
@@ -367,14 +371,11 @@ class Pool:
 
     def _take(self) -> Apart:
         """Return a process that waits, or another."""
-        while True:
-            with self._lock:
-                if not self._idle:
-                    break
-                apart = self._idle.pop()
-            if apart.lives():
-                return apart
-            self._all.discard(apart)
+        with self._lock:
+            while self._idle:
+                if (apart := self._idle.pop()).lives():
+                    return apart
+                self._all.discard(apart)
         for again in (True, False):
             try:
                 return self._begin()
@@ -395,10 +396,6 @@ class Pool:
         apart.ask(([str(place) for place in sys.path], self._memory), _START)
         return apart
 
-    def _give(self, apart: Apart) -> None:
-        with self._lock:
-            (self._idle.append if apart.lives() else self._all.discard)(apart)
-
 
 # What runs in the process apart.
 
@@ -412,9 +409,12 @@ def serve(memory: int | None) -> NoReturn:
     for number in range(3):
         os.dup2(nowhere, number)
     Thread(target=_listen, args=(tasks, line), daemon=True).start()
-    found: object = None
+    found: object = True
+    own = os.getpid()
     try:
         while True:
+            if os.getpid() != own:  # a method forked, and its copy has arrived here, too
+                os._exit(0)
             _die_with(tasks, on=False)
             _send(answers, found)
             chunk = pickle.loads(line.get(timeout=_IDLE))  # noqa: S301
@@ -422,7 +422,7 @@ def serve(memory: int | None) -> NoReturn:
                 found = compute(chunk)
             except InvalidProblem as error:
                 found = error
-            except Exception as error:  # noqa: BLE001  (a chunk that fails costs itself)
+            except Exception as error:  # noqa: BLE001  (short of memory, most of all)
                 found = Lost(chunk.key, DIED, f"{type(error).__name__}: {error}")
     finally:
         _end()
@@ -465,9 +465,7 @@ def _restrain(memory: int | None) -> None:
 
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         if memory is not None:
-            most = resource.getrlimit(resource.RLIMIT_AS)[1]
-            limit = memory if most == resource.RLIM_INFINITY else min(memory, most)
-            resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
+            resource.setrlimit(resource.RLIMIT_AS, (memory, resource.getrlimit(resource.RLIMIT_AS)[1]))
     with suppress(OSError):
         Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
 
@@ -502,7 +500,7 @@ def _pool() -> Pool:
     return Pool(workers())
 
 
-def task(chunk: Chunk, seconds: float) -> Part | Lost:
+def beside(chunk: Chunk, seconds: float) -> Part | Lost:
     """Compute a chunk beside a worker of a cluster."""
     return _pool().compute(chunk, seconds)
 
@@ -538,7 +536,7 @@ def _dask(by: Executor) -> Iterator[Begun]:
             raise InvalidProblem(
                 "the scheduler has no workers", by.address or "dask", "start one: dask worker ADDRESS --nthreads 1"
             )
-        yield Begun({"backend": "dask", "client": client, "n_jobs": -1}, task, (KilledWorker,))
+        yield Begun({"backend": "dask", "client": client, "n_jobs": -1}, beside, (KilledWorker,))
 
 
 @contextmanager
@@ -562,7 +560,7 @@ def _ray(by: Executor) -> Iterator[Begun]:
         register_ray()
         jobs = int(ray.cluster_resources().get("CPU", 1))
         deaths = (ray.exceptions.RayActorError, ray.exceptions.WorkerCrashedError)
-        yield Begun({"backend": "ray", "n_jobs": jobs}, task, deaths, streams=False)
+        yield Begun({"backend": "ray", "n_jobs": jobs}, beside, deaths, streams=False)
     finally:
         ray.shutdown()
 

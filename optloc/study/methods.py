@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.types import Array, Certificate, Status
+from optloc.base.types import ANSWERED, Array, Certificate, Status
 from optloc.files.schema import Units, join
 from optloc.problem.fix import Fix
 from optloc.study.baselines import BASELINES, start_of
@@ -184,7 +184,8 @@ def run(method: Method, drawn: Drawn) -> Run:
     choice = None
     if method.solver:
         choice = Choice(backend_kind(method.solver, "solver"), method.solver, method.settings)
-    with using(choice), counting() as tally:
+    # What a method does about rounding and division is its own affair, and ends with it.
+    with using(choice), counting() as tally, np.errstate():
         began = perf_counter()
         fix = _solved(method, drawn)
         seconds = perf_counter() - began
@@ -242,14 +243,13 @@ def _check(fix: Any, drawn: Drawn) -> None:
         raise Nonsense("its certificates are none")
     if not all(0 <= code < len(Status) for code in fix.code):
         raise Nonsense("its status is unknown")
-    kept = fix.answered
-    _check_answers(fix.x[kept, :shared], fix.cov[kept], fix.code[kept])
-
-
-def _check_answers(x: Array, cov: Array, code: Array) -> None:
-    """Raise Nonsense where answers (n, p) are not finite, or their covariances (n, p, p) are none."""
     # A run to infinity has no place.
-    x, cov = (value[code != Status.UNBOUNDED] for value in (x, cov))
+    kept = np.isin(fix.code, [status for status in ANSWERED if status is not Status.UNBOUNDED])
+    _check_answers(fix.x[kept, :shared], fix.cov[kept])
+
+
+def _check_answers(x: Array, cov: Array) -> None:
+    """Raise Nonsense where answers (n, p) are not finite, or their covariances (n, p, p) are none."""
     if not np.isfinite(x).all():
         raise Nonsense("its status has an answer, and its estimate is not finite")
     if not np.isfinite(cov).all():

@@ -13,7 +13,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.study.folder import read_frame
-from optloc.study.trial import DIED, VALUES
+from optloc.study.trial import FAILED, VALUES
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -155,7 +155,7 @@ def _cell(part: pd.DataFrame) -> dict[str, Any]:
         "trials": len(part),
         **{name: int(part[name].sum()) for name in ("answered", "right", "wrong", "false")},
         "proven": int((part["proof"] == PROVEN).sum()),
-        "died": int((part["status"] == DIED).sum()),
+        "died": int(part["status"].isin(FAILED).sum()),
         "rmse": float(np.sqrt(np.mean(error**2))) if len(error) else np.nan,
         "bound": float(np.sqrt(np.mean(bound[good] ** 2))) if good.any() else np.nan,
         "ratio": ratio,

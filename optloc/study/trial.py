@@ -218,8 +218,9 @@ def compute(chunk: Chunk) -> Part:
     Raises
     ------
     InvalidProblem
-        Where the method solves nothing with the back end that was asked for. Whatever a method raises becomes the
-        status of a row.
+        Where the method solves nothing with the back end that was asked for.
+    MemoryError
+        Where there is not enough. Whatever else a method raises becomes the status of a row.
     """
     from threadpoolctl import threadpool_limits
 
@@ -260,6 +261,9 @@ def _solve_in_halves(cell: Cell, known: Known, first: int, count: int) -> list[t
     """Return the values of some trials; where the call fails, halves are tried until the one trial is found."""
     try:
         return [(count, _solve(cell, known.part(first, count)))]
+    except MemoryError:
+        # Perhaps of one that was here before: another process decides.
+        raise
     except Nonsense as error:
         status, reason = INVALID, str(error)
     except (Exception, SystemExit) as error:  # noqa: BLE001  (a failing trial costs a row, never the study)

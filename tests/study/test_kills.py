@@ -81,27 +81,30 @@ def wait(run, condition, seconds=60.0):
         time.sleep(0.01)
 
 
-def killed(folder, count, options, seed):
-    """Kill runs of a folder until there were so many; return the kills, and those after the first part was stored."""
-    dice, kills, late, first = random.Random(seed), 0, 0, 0.0
-    for i in range(count):
+def killed(folder, count, options, seed, first=None):
+    """Kill runs of a folder until there were so many, at any moment from their beginning to some parts later.
+
+    Return the kills, those after the first part, and the time to the first part: without it, the first kill is later.
+    """
+    dice, kills, late = random.Random(seed), 0, 0
+    while kills < count:
         began = time.monotonic()
         with running(folder, *options) as run:
-            if i == 0:
+            if first is None:
                 wait(run, lambda: parts(folder) > 0)
                 first = time.monotonic() - began
                 moment = time.monotonic() + dice.uniform(0.0, 0.5)
-            else:  # any moment from its beginning to some parts later
-                moment = began + dice.uniform(0.0, 1.3 * first)
+            else:
+                moment = began + dice.uniform(0.0, 1.4 * first)
             wait(run, lambda moment=moment: time.monotonic() > moment)
             if run.poll() is not None:
-                return kills, late  # it was complete
+                break  # it was complete
             before = parts(folder)
             run.send_signal(signal.SIGKILL)
             run.wait()
             assert not orphans(folder)
             kills, late = kills + 1, late + (before > 0)
-    return kills, late
+    return kills, late, first
 
 
 def finish(folder, *options):
@@ -114,7 +117,7 @@ def finish(folder, *options):
 @pytest.mark.parametrize("jobs", ["1", "2"])
 def test_a_killed_run_goes_on_to_the_same_table(jobs, whole, tmp_path):
     out = tmp_path / "out"
-    kills, late = killed(out, 2, ["-j", jobs], seed=int(jobs))
+    kills, late, _ = killed(out, 2, ["-j", jobs], seed=int(jobs))
     assert 1 <= late <= kills
     finish(out, "-j", jobs)
     assert_identical(whole, out)
@@ -126,9 +129,10 @@ def test_fifty_kills_change_nothing(options, whole, tmp_path):
     if "dask" in options:
         pytest.importorskip("distributed")
     kills = late = rounds = 0
+    first = None
     while kills < 50 or late < 20:
         out = tmp_path / f"out{rounds}"
-        more, after = killed(out, min(10, max(1, 50 - kills)), options, seed=rounds)
+        more, after, first = killed(out, 5, options, rounds, first)
         kills, late, rounds = kills + more, late + after, rounds + 1
         finish(out, *options)
         assert_identical(whole, out)

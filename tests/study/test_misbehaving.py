@@ -17,6 +17,7 @@ from optloc.study.execute import executor, run_plan
 from optloc.study.folder import read_frame
 from optloc.study.trial import DIED, FAILED, INVALID, LATE
 
+FULL = pytest.mark.full
 HEAD = """
 import ctypes, os, signal, subprocess, sys, threading, time
 from dataclasses import replace
@@ -50,6 +51,7 @@ ROGUES = {
     "few": (INVALID, "its x is", "return replace(f, x=f.x[:0])"),
     "kind": (INVALID, "complex128", "return replace(f, x=f.x + 1j)"),
     "status": (INVALID, "status is unknown", "return replace(f, code=f.code + 99)"),
+    "garbage": (DIED, "", "[os.write(i, b'x' * 99) for i in range(3, 30) if os.path.exists(f'/dev/fd/{i}')]"),
     "memory": (DIED, "MemoryError", "np.ones((1 << 40) // 8)"),
     "small-memory": (DIED, "MemoryError", "b = [bytearray(1 << 26) for _ in range(1 << 14)]"),
 }
@@ -95,13 +97,39 @@ def package(tmp_path_factory):
                 HOW[os.environ["BAD_WAY"]]()
             return good(drawn, start)
 
+        def fork_(drawn, start):
+            os.fork()
+            return good(drawn, start)
+
+        def hoard_(drawn, start):
+            try:
+                while True:
+                    KEPT.append(bytearray(1 << 20))
+            finally:
+                KEPT.pop()
+
+        KEPT = []
+        fork_entry, hoard_entry = baseline(fork_), baseline(hoard_)
         HOW = {"die": lambda: os.kill(os.getpid(), signal.SIGKILL), "hang": lambda: time.sleep(1e6)}
         once_entry = baseline(once_)
     """)
-    entries = {name: f"rogues:{name.replace('-', '_')}_entry" for name in [*ROGUES, *HANGING, "once"]}
+    entries = {name: f"rogues:{name.replace('-', '_')}_entry" for name in [*ROGUES, *HANGING, "once", "fork", "hoard"]}
     write_package(folder, {"rogues.py": text}, "rogues", {"optloc.baselines": entries})
     with installed(folder):
         yield folder
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="there is none on this system")
+def test_a_method_that_forks_answers_once(tmp_path):
+    assert run_plan(plan(study(["fork"])), tmp_path / "out", executor("processes", 1)).counts == {"unproven": 6}
+
+
+@FULL
+def test_a_method_that_keeps_memory_harms_no_other(tmp_path, monkeypatch):
+    monkeypatch.setattr(execute, "memory_of", lambda count: 3 << 30)
+    found = run_plan(plan(study(["hoard"])), tmp_path / "out", executor("processes", 1))
+    assert found.methods["gtrs+lsr", "unproven"] == 3
+    assert found.methods["hoard", DIED] == 3
 
 
 def check(folder, names):
@@ -116,9 +144,6 @@ def check(folder, names):
         assert np.isfinite(own["truth_x"]).all()
 
 
-FULL = pytest.mark.full
-
-
 @pytest.mark.parametrize(
     ("jobs", "some"),
     [
@@ -129,7 +154,7 @@ FULL = pytest.mark.full
 def test_methods_that_misbehave_are_named_and_the_study_goes_on(jobs, some, tmp_path, monkeypatch):
     # Little more than libraries reserve: what is asked for beyond is never touched.
     monkeypatch.setattr(execute, "memory_of", lambda count: 3 << 30)
-    deadly = {"exit", "exit-well", "segfault", "kill", "interrupt"}
+    deadly = {"exit", "exit-well", "segfault", "kill", "interrupt", "garbage", "small-memory"}
     names = [name for name in ROGUES if (name in deadly) == (some == "processes")]
     found = run_plan(plan(study(names)), tmp_path / "out", executor("processes", jobs))
     assert found.complete
@@ -145,7 +170,7 @@ def test_methods_that_end_or_hold_up_their_process_are_named(jobs, tmp_path):
     check(tmp_path / "out", names)
 
 
-@pytest.mark.full
+@FULL
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_all_that_hang_are_given_up_after_a_few_limits(jobs, tmp_path):
     names, limit = list(HANGING), 2.0
@@ -159,13 +184,13 @@ def test_all_that_hang_are_given_up_after_a_few_limits(jobs, tmp_path):
     assert any(reason.startswith("given up") for reason in read_frame(tmp_path / "out")["reason"].astype(str))
 
 
-@pytest.mark.parametrize("way", ["die", pytest.param("hang", marks=pytest.mark.full)])
+@pytest.mark.parametrize("way", ["die", pytest.param("hang", marks=FULL)])
 def test_of_many_trials_one_is_to_blame(way, tmp_path, monkeypatch):
-    made = plan(study(["once"], 40).replace("chunk = 2", "chunk = 20"))
+    made = plan(study(["once"], 10).replace("chunk = 2", "chunk = 8"))
     monkeypatch.setenv("BAD_WAY", way)
     monkeypatch.setenv("BAD_TRIAL", "0.0")
     whole = read_frame(run_here(made, tmp_path / "whole"))
-    bad = (whole["method"] == "once") & (whole["trial"] == 13)
+    bad = (whole["method"] == "once") & (whole["trial"] == 5)
     monkeypatch.setenv("BAD_TRIAL", repr(float(whole["truth_x"][bad].item())))
     found = run_plan(made, tmp_path / "out", executor("processes", 2, limit=3.0))
     assert found.complete
