@@ -16,17 +16,18 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from itertools import islice
+from multiprocessing import resource_tracker
 from pathlib import Path
 from queue import Empty, SimpleQueue
 from threading import Lock, Thread
 from typing import IO, Any, NoReturn
-from warnings import warn
+from warnings import catch_warnings, filterwarnings, warn
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.study.folder import Progress, begin, finished_parts, known_data, locked, note_data, progress, store
-from optloc.study.plan import Chunk, Plan, memory_of, workers
+from optloc.study.plan import Chunk, Plan, memory_of, restrain, workers
 from optloc.study.trial import DIED, LATE, Lost, Part, compute, join_parts, part_of_lost
 
 CONNECT = 10.0
@@ -153,7 +154,9 @@ def compute_all(chunks: Iterable[Chunk], by: Executor) -> Generator[Part]:
 def _parallel(tasks: Iterator[tuple[Chunk, float]], begun: Begun) -> Iterator[Part | Lost]:
     from joblib import Parallel, delayed, parallel_config
 
-    with parallel_config(**begun.options):
+    with parallel_config(**begun.options), catch_warnings():
+        # What was computed when a run was stopped is computed again: nobody needs to hear of that.
+        filterwarnings("ignore", "[0-9]+ tasks", UserWarning)
         if begun.streams:
             # One chunk a task, two for each worker in hand: none waits for its next, and few are lost when a run stops.
             run = Parallel(return_as="generator_unordered", batch_size=1, pre_dispatch="2*n_jobs")
@@ -251,10 +254,7 @@ def _share(task: _Task) -> float:
 _START, _IDLE, _MOMENT = 120.0, 60.0, 0.2
 # Workers times threads would be more than the processors, and each thread of BLAS reserves memory.
 _ONE = ("OPTLOC", "OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "VECLIB_MAXIMUM", "NUMEXPR_NUM", "NUMBA_NUM")
-_BEGIN = (
-    "import pickle, sys; sys.path[:], memory = pickle.load(sys.stdin.buffer); "
-    "from optloc.study.execute import serve; serve(memory)"
-)
+_BEGIN = "import pickle, sys; sys.path[:], run = pickle.load(sys.stdin.buffer); pickle.loads(run)()"
 
 
 class Apart:
@@ -369,22 +369,21 @@ class Pool:
         for apart in left:
             apart.end()
 
-    def _take(self) -> Apart:
+    def _take(self, *, again: bool = True) -> Apart:
         """Return a process that waits, or another."""
         with self._lock:
             while self._idle:
                 if (apart := self._idle.pop()).lives():
                     return apart
                 self._all.discard(apart)
-        for again in (True, False):
-            try:
-                return self._begin()
-            except (EOFError, TimeoutError) as error:
-                # Once somebody may have killed it; twice, nothing can be computed here.
-                if not again:
-                    advice = "what it said stands above; check the installation, and the memory that is left"
-                    raise InvalidProblem(f"no process can be begun ({error})", sys.executable, advice) from None
-        raise AssertionError
+        try:
+            return self._begin()
+        except (EOFError, TimeoutError) as error:
+            # Once somebody may have killed it; twice, nothing can be computed here.
+            if again:
+                return self._take(again=False)
+            advice = "what it said stands above; check the installation, and the memory that is left"
+            raise InvalidProblem(f"no process can be begun ({error})", sys.executable, advice) from None
 
     def _begin(self) -> Apart:
         apart = Apart()
@@ -393,7 +392,8 @@ class Pool:
             closed = self._closed
         if closed:
             apart.end()
-        apart.ask(([str(place) for place in sys.path], self._memory), _START)
+        # What runs there is found when the path is that of this process.
+        apart.ask(([str(place) for place in sys.path], pickle.dumps(partial(serve, self._memory))), _START)
         return apart
 
 
@@ -402,15 +402,14 @@ class Pool:
 
 def serve(memory: int | None) -> NoReturn:
     """Compute the chunks that come in at standard input, one by one, and answer at standard output, until it closes."""
-    _restrain(memory)
+    restrain(memory)
     tasks, answers, line = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb"), SimpleQueue[bytes]()
     # A method may read and print what it likes.
-    nowhere = os.open(os.devnull, os.O_RDWR)
+    nowhere, own = os.open(os.devnull, os.O_RDWR), os.getpid()
     for number in range(3):
         os.dup2(nowhere, number)
     Thread(target=_listen, args=(tasks, line), daemon=True).start()
     found: object = True
-    own = os.getpid()
     try:
         while True:
             if os.getpid() != own:  # a method forked, and its copy has arrived here, too
@@ -456,18 +455,6 @@ def _end() -> NoReturn:
     if hasattr(os, "killpg"):
         os.killpg(os.getpgrp(), signal.SIGKILL)
     os._exit(1)
-
-
-def _restrain(memory: int | None) -> None:
-    """Limit the memory of this process, have it leave no core, and be the first to go where memory is short."""
-    with suppress(ImportError, OSError, ValueError):
-        import resource
-
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        if memory is not None:
-            resource.setrlimit(resource.RLIMIT_AS, (memory, resource.getrlimit(resource.RLIMIT_AS)[1]))
-    with suppress(OSError):
-        Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
 
 
 # The executors: how each begins, and which exceptions say that a worker died.
@@ -524,7 +511,8 @@ def _dask(by: Executor) -> Iterator[Begun]:
             if by.address is None:
                 # No page of statistics, and no warnings of workers that are lost on purpose when it ends.
                 own = {"threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.CRITICAL}
-                cluster = LocalCluster(n_workers=by.jobs or workers(), **own)
+                with _deaf():
+                    cluster = LocalCluster(n_workers=by.jobs or workers(), **own)
                 client = Client(stack.enter_context(cluster), timeout=CONNECT)
             else:
                 client = Client(by.address, timeout=CONNECT)
@@ -537,6 +525,20 @@ def _dask(by: Executor) -> Iterator[Begun]:
                 "the scheduler has no workers", by.address or "dask", "start one: dask worker ADDRESS --nthreads 1"
             )
         yield Begun({"backend": "dask", "client": client, "n_jobs": -1}, beside, (KilledWorker,))
+
+
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """Have processes that are begun meanwhile, and what they begin, not hear Ctrl-C, which waits for this one."""
+    if not hasattr(signal, "pthread_sigmask"):  # on a system where each is told apart
+        yield
+        return
+    resource_tracker.ensure_running()  # it would unblock what is blocked here
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager

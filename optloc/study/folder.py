@@ -137,7 +137,7 @@ def begin(plan: Plan, folder: Path) -> Manifest:
     else:
         found = wanted
     try:
-        (folder / "parts").mkdir(exist_ok=True)
+        (folder / "parts").mkdir(parents=True, exist_ok=True)
         _clean(folder)
         if found is wanted:
             data = {"format": FORMAT, **{name: getattr(wanted, name) for name in Manifest.__slots__}}

@@ -10,6 +10,7 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.resources import as_file, files
 from importlib.resources.abc import Traversable
@@ -372,6 +373,9 @@ def _scale(noise: Noise, factor: Array) -> Noise:
     return Noise(tuple(blocks))
 
 
+# What this machine has, and what a process may take of it.
+
+
 def workers() -> int:
     """Return how many processes this machine can run at a time."""
     # Processors that this process may use: containers and schedulers leave it fewer than the machine has.
@@ -388,3 +392,15 @@ def memory_of(count: int) -> int | None:
     if not hasattr(os, "sysconf"):
         return None
     return max(_LEAST_MEMORY, int(_MEMORY * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / count))
+
+
+def restrain(memory: int | None) -> None:
+    """Limit the memory of this process, have it leave no core, and be the first to go where memory is short."""
+    with suppress(ImportError, OSError, ValueError):
+        import resource
+
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        if memory is not None:
+            resource.setrlimit(resource.RLIMIT_AS, (memory, resource.getrlimit(resource.RLIMIT_AS)[1]))
+    with suppress(OSError):
+        Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")
