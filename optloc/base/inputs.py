@@ -18,10 +18,12 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field, fields, replace
 from itertools import islice
+from math import inf
 from pathlib import Path
 from typing import Any
 
 from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.units import LARGEST
 
 __all__ = [
     "Access",
@@ -362,7 +364,7 @@ def has_controls(text: str) -> bool:
 
 
 def _check_data(data: Any, source: str) -> None:
-    """Refuse data that are nested too deep, or whose words hold control characters."""
+    """Refuse data that are nested too deep, whose words hold control characters or whose numbers are too large."""
     level, depth = [data], 0
     while level:
         at_most("nesting", depth, source)
@@ -374,4 +376,7 @@ def _check_data(data: Any, source: str) -> None:
                 inner += outer
             elif isinstance(outer, str) and has_controls(outer):
                 raise InvalidProblem(f"{outer[:_WORD]!r} holds control characters", source, "leave them out")
+            elif isinstance(outer, int | float) and LARGEST < abs(outer) < inf:
+                given = f"{outer:.10g}" if isinstance(outer, float) else f"{str(outer)[:_WORD]}..."
+                raise InvalidProblem(f"the number {given} is beyond {LARGEST:g}", source, "use another unit")
         level, depth = inner, depth + 1

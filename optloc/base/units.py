@@ -29,6 +29,7 @@ from numpy.typing import ArrayLike, NDArray
 from optloc.base.errors import InvalidProblem, nearest
 
 __all__ = [
+    "LARGEST",
     "SI_UNIT",
     "SPEED_OF_LIGHT",
     "UNITS",
@@ -48,6 +49,10 @@ AzimuthConvention = Literal["east-counterclockwise", "north-clockwise"]
 
 SPEED_OF_LIGHT: Final = 299_792_458.0
 """Speed of light in vacuum in m/s (exact, SI)."""
+
+LARGEST: Final = 1e30
+"""What no number is beyond that a file or a problem holds, in any unit: the visible universe is 1e27 m wide, and a
+tenth power is still no overflow. As spread, no number is below its inverse."""
 
 # Apart, because a length may be given as a time too: it is multiplied by the speed of propagation.
 _TIME: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "ps": 1e-12}
@@ -122,7 +127,11 @@ class Conversion:
         Angles are not wrapped: 350 deg stays above pi.
         """
         u = np.asarray(values, dtype=np.float64)
-        return np.exp(self.factor * u) if self.logarithmic else self.offset + self.factor * u
+        if self.logarithmic:
+            # What is too large becomes infinite, and is refused where its row is known.
+            with np.errstate(over="ignore"):
+                return np.exp(self.factor * u)
+        return self.offset + self.factor * u
 
     def from_si(self, values: ArrayLike) -> NDArray[np.float64]:
         """Convert SI values of any shape to the file's unit."""

@@ -182,7 +182,8 @@ def _of_target(loaded: Loaded, fix: Fix, first: int | None, target: int, names: 
 
 def level_covariance(columns: Columns, i: int) -> Array:
     """Return the covariance (d, d) of one row in level axes: east, north and up where there is a ground."""
-    axes = "enu" if "cov_ee" in columns else "xyz"[: 3 if "z" in columns else 2]
+    axes = "enu" if "cov_ee" in columns else "xyz"
+    axes = axes[: 3 if f"cov_{2 * axes[2]}" in columns else 2]
     pairs = [[f"cov_{min(a, b, key=axes.index)}{max(a, b, key=axes.index)}" for b in axes] for a in axes]
     return np.array([[float(columns[name][i]) for name in row] for row in pairs])
 

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from contextvars import copy_context
 from importlib.resources import files
 from io import TextIOWrapper
-from math import isfinite, isnan, nan
+from math import isnan, nan
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,6 +22,7 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.inputs import STANDARD_INPUT, access, budget_of, relax
 from optloc.base.outputs import remove_unnamed, replace_files, visible
 from optloc.base.types import Status
+from optloc.base.units import LARGEST
 from optloc.files.schema import ConstraintTable
 from optloc.problem.fix import status_named
 
@@ -328,7 +329,7 @@ def coordinates(
     except ValueError:
         values = [nan]
     # inf is a bound that is none; NaN would pass every comparison.
-    if any(map(isnan, values)) or not (bounds or all(map(isfinite, values))):
+    if any(map(isnan, values)) or not (bounds or all(abs(v) <= LARGEST for v in values)):
         raise InvalidProblem(f"{text!r} is no list of numbers", where, advice)
     return values
 

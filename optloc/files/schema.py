@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.inputs import STANDARD_INPUT, read_text, toml_of
-from optloc.base.units import SI_UNIT, SPEED_OF_LIGHT, AzimuthConvention, Conversion, Quantity, conversion
+from optloc.base.units import LARGEST, SI_UNIT, SPEED_OF_LIGHT, AzimuthConvention, Conversion, Quantity, conversion
 from optloc.models import MODELS, Model
 
 # Words that a file may get wrong, and amounts such as "30 ns".
@@ -84,9 +84,10 @@ class Units:
         except ValueError:
             number = math.nan
         # The example repeats the number that was written, so that it can be copied.
-        example = f'"{text if math.isfinite(number) else 1.5} {SI_UNIT[self.quantity]}"'
-        if not math.isfinite(number):
-            raise InvalidProblem(f"{value!r} is no amount", where, f"write a number and a unit, such as {example}")
+        example = f'"{text if abs(number) <= LARGEST else 1.5} {SI_UNIT[self.quantity]}"'
+        if not abs(number) <= LARGEST:
+            what = f"{value!r} is beyond {LARGEST:g}" if math.isfinite(number) else f"{value!r} is no amount"
+            raise InvalidProblem(what, where, f"write a number and a unit, such as {example}")
         if unit.strip():
             return number, self.conversion(unit.strip(), where)
         if default is None:

@@ -16,10 +16,13 @@ import numpy as np
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.inputs import at_most, decoded, has_controls, read_bytes, within
 from optloc.base.types import Array
+from optloc.base.units import LARGEST
 from optloc.files.schema import DataTable, join
 
 _PARQUET = (".parquet", ".pq")
 _FILES = (".csv", ".txt", ".tsv", *_PARQUET)
+# What is repeated of a cell that is refused.
+_WORD = 40
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,11 +92,12 @@ class Table:
         """Return a column as finite numbers (m,); an empty cell is NaN where `optional`, else refused."""
         column = self.raw(key)
         values = column.astype(np.float64) if column.dtype.kind in "iuf" else self._parse(key, column)
-        bad = np.isinf(values) if optional else ~np.isfinite(values)
+        bad = (np.abs(values) > LARGEST) if optional else ~(np.abs(values) <= LARGEST)
         if bad.any():
             row = int(np.flatnonzero(bad)[0])
             given = column[row]
-            what = "the cell is empty" if _empty(given) else f"{given!s} is not a finite number"
+            why = f"beyond {LARGEST:g}" if np.isfinite(values[row]) else "not a finite number"
+            what = "the cell is empty" if _empty(given) else f"{str(given)[:_WORD]} is {why}"
             raise InvalidProblem(what, self.where(key, row), "give a number, or leave the row out")
         return values
 
@@ -105,8 +109,10 @@ class Table:
         if column.dtype.kind == "M":
             column = np.datetime_as_string(column).astype(object)
         # Each different cell is spelled once: millions of rows have few names.
-        spelled = {cell: _spelled(cell) for cell in set(column.tolist())}
-        out = np.array(list(map(spelled.__getitem__, column.tolist())), dtype=object)
+        # The list is made once: a cell that is no number equals nothing but itself.
+        cells = column.tolist()
+        spelled = {cell: _spelled(cell) for cell in set(cells)}
+        out = np.array(list(map(spelled.__getitem__, cells)), dtype=object)
         wrong = next((text for text in spelled.values() if not text or has_controls(text)), None)
         if wrong is not None:
             what = f"{wrong!r} holds control characters" if wrong else "the cell is empty"
@@ -274,11 +280,11 @@ def _header(line: str, separator: str, source: str) -> list[str]:
 
 def _no_csv(complaint: str, source: str) -> InvalidProblem:
     # pyarrow counts from the first line after the header that it skipped.
-    what = complaint.partition("CSV parse error: ")[2] or complaint
-    line, _, rest = what.splitlines()[0].rpartition(": Expected")
+    what = (complaint.partition("CSV parse error: ")[2] or complaint).splitlines()[0]
+    line, found, rest = what.rpartition(": Expected")
     number = line.removeprefix("Row #")
     place = join(source, f"row {int(number) - 1}" if number.isdigit() else None)
-    what = f"expected{rest}" if rest else what
+    what = f"expected{rest}" if found else what
     return InvalidProblem(f"this is no CSV table: {what}", place, "check its separators and quotes")
 
 

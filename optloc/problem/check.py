@@ -11,6 +11,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
 from optloc.base.types import Array, Band, Bias, Motion, Polygon, Prior, Rows, Stations
+from optloc.base.units import LARGEST
 from optloc.models import MODELS
 from optloc.models.surfaces import SURFACES
 from optloc.problem.epochs import separable, tied, untied
@@ -69,12 +70,19 @@ def _cut_noise(problem: Problem) -> Problem:
     return problem
 
 
+def _beyond(values: Any) -> tuple[Any, str]:
+    """Return which values are no numbers, or too large for their squares to be any, and what to call the first."""
+    values = np.asarray(values)
+    bad = ~(np.abs(values) <= LARGEST)
+    return bad, "not finite" if not np.isfinite(values[bad]).all() else f"beyond {LARGEST:g}"
+
+
 def _check_stations(problem: Problem) -> None:
     stations: Stations = problem.stations
-    bad = ~np.isfinite(stations.position).all(-1)
+    bad, why = _beyond(stations.position)
     if bad.any():
-        name = stations.names[int(np.argwhere(bad)[0][-1])]
-        raise InvalidProblem(f"the position of station {name!r} is not finite", "stations", "give metres")
+        name = stations.names[int(np.argwhere(bad.any(-1))[0][-1])]
+        raise InvalidProblem(f"the position of station {name!r} is {why}", "stations", "give metres")
     if len(stations.names) != stations.count:
         raise InvalidProblem(
             f"{stations.count} stations have {len(stations.names)} names", "stations", "give one name each"
@@ -112,10 +120,10 @@ def _check_moving(problem: Problem) -> None:
         if array.shape[-core] not in (1, problem.epochs):
             counts = f"{array.shape[-core]} epochs of station {name} for {problem.epochs} epochs of measurements"
             raise InvalidProblem(counts, "stations", "give one, or one for each epoch")
-        bad = ~np.isfinite(array).all(tuple(range(-core + 2, 0)))
+        bad, why = _beyond(array)
         if bad.any():
-            label = s.names[int(np.argwhere(bad)[0][-1])]
-            raise InvalidProblem(f"the {name} of station {label!r} is not finite", "stations", "give SI units")
+            label = s.names[int(np.argwhere(bad.any(tuple(range(-core + 2, 0))))[0][-1])]
+            raise InvalidProblem(f"the {name} of station {label!r} is {why}", "stations", "give SI units")
     if s.axes is not None:
         # A microradian: single precision and angles with seven digits pass, degrees in the place of radians do not.
         skew = np.abs(s.axes @ np.swapaxes(s.axes, -1, -2) - np.eye(d)).max((-1, -2)) > 1e-6
@@ -160,14 +168,14 @@ def _check_rows(problem: Problem, rows: Rows) -> None:
         row = int(np.flatnonzero(rows.a == rows.b)[0])
         raise InvalidProblem(f"{rows.kind} row {row} names one station twice", "a, b", "name two stations")
     # NaN passes: it stands for a measurement that is simulated later, or that rejects its own fix alone.
-    infinite = np.argwhere(np.isinf(rows.z))
-    if len(infinite):
-        row = infinite[0][-1]
-        raise InvalidProblem(f"{rows.kind} row {row} is infinite", "z", "remove the row or give it weight zero")
-    if not np.isfinite(rows.correction).all():
-        raise InvalidProblem(
-            f"{rows.kind} has a correction that is not finite", "correction", "give 0 where none is known"
-        )
+    large = np.argwhere(np.abs(rows.z) > LARGEST)
+    if len(large):
+        why = "infinite" if np.isinf(rows.z[tuple(large[0])]) else f"beyond {LARGEST:g}"
+        what = f"{rows.kind} row {large[0][-1]} is {why}"
+        raise InvalidProblem(what, "z", "remove the row or give it weight zero")
+    bad, why = _beyond(rows.correction)
+    if bad.any():
+        raise InvalidProblem(f"{rows.kind} has a correction that is {why}", "correction", "give 0 where none is known")
     if not ((rows.weight >= 0.0) & (rows.weight <= 1.0)).all():
         raise InvalidProblem(f"{rows.kind} has a weight outside 0 to 1", "weight", "use 0 for absent, 1 for present")
 
@@ -190,6 +198,9 @@ def _check_covariance(covariance: Array, what: str, names: tuple[str, ...] | Non
     fail(~np.isfinite(covariance).all((-1, -2)), "not finite")
     diagonal = np.diagonal(covariance, axis1=-2, axis2=-1)
     fail((diagonal <= 0.0).any(-1), "not positive on its diagonal")
+    # As standard deviations: their inverses square the residuals.
+    fail((diagonal > LARGEST**2).any(-1), f"of deviations beyond {LARGEST:g}")
+    fail((diagonal < LARGEST**-2).any(-1), f"of deviations below {1.0 / LARGEST:g}")
     if covariance.shape[-1] == 1:
         return
     # As correlations, so that one tolerance fits metres, radians and ratios.
@@ -203,7 +214,7 @@ def _check_covariance(covariance: Array, what: str, names: tuple[str, ...] | Non
 
 def _check_times(problem: Problem) -> None:
     times = problem.times
-    if times.ndim != 1 or not np.isfinite(times).all():
+    if times.ndim != 1 or _beyond(times)[0].any():
         raise InvalidProblem("times are not a list of finite seconds", "times", "give one number per epoch")
     if (np.diff(times) <= 0.0).any():
         place = int(np.flatnonzero(np.diff(times) <= 0.0)[0]) + 1
@@ -251,7 +262,7 @@ def _check_motion(problem: Problem, motion: Motion, number: int) -> None:
         raise InvalidProblem(f"a motion of order {motion.order}", where, "use order 0, 1 or 2")
     if motion.span not in ("run", "epoch"):
         raise InvalidProblem(f"unknown span {motion.span!r}", where, "use 'run' or 'epoch'")
-    if motion.reference is not None and not np.isfinite(motion.reference):
+    if motion.reference is not None and _beyond(motion.reference)[0]:
         raise InvalidProblem(f"the reference time is {motion.reference}", where, "give finite seconds")
     if motion.known is None:
         return
@@ -263,8 +274,9 @@ def _check_motion(problem: Problem, motion: Motion, number: int) -> None:
     if shape[-3] not in (1, problem.epochs):
         counts = f"{problem.epochs} epoch{'s' if problem.epochs > 1 else ''}"
         raise InvalidProblem(f"known states for {shape[-3]} epochs, not {counts}", where, "give one, or one an epoch")
-    if not np.isfinite(motion.known).all():
-        raise InvalidProblem("a known state is not finite", where, "give metres and metres per second")
+    bad, why = _beyond(motion.known)
+    if bad.any():
+        raise InvalidProblem(f"a known state is {why}", where, "give metres and metres per second")
     if shape[-3] > 1 and shape[-2] == 1:
         for rows in problem.rows:
             if MODELS[rows.kind].velocity and (rows.target == number).any():
@@ -283,8 +295,9 @@ def _check_bias(problem: Problem, bias: Bias, where: str) -> None:
         bad = (index < 0) | (index >= limit)
         if bad.any():
             raise InvalidProblem(f"there is no {name} {index[bad][0]}", where, f"use 0 to {limit - 1}")
-    if not np.isfinite(bias.coefficient).all():
-        raise InvalidProblem("a coefficient is not finite", where, "give numbers such as 1 and -1")
+    bad, why = _beyond(bias.coefficient)
+    if bad.any():
+        raise InvalidProblem(f"a coefficient is {why}", where, "give numbers such as 1 and -1")
     if bias.form == "rotation":
         _check_rotation(problem, bias, where)
     turns = (1 if problem.dimension == 2 else 3) if bias.form == "rotation" else 1
@@ -296,7 +309,8 @@ def _check_bias(problem: Problem, bias: Bias, where: str) -> None:
             raise InvalidProblem(
                 f"{name} has {np.size(values)} entries, not {wanted}", where, "give one for each unknown"
             )
-    if not ((np.asarray(bias.sigma) > 0.0) & np.isfinite(bias.sigma)).all() or not np.isfinite(bias.mean).all():
+    sigma = np.asarray(bias.sigma)
+    if not ((sigma >= 1.0 / LARGEST) & (sigma <= LARGEST)).all() or _beyond(bias.mean)[0].any():
         raise InvalidProblem("sigma is not positive or mean is not finite", where, "give true numbers, or no sigma")
 
 
@@ -319,8 +333,9 @@ def _check_prior(problem: Problem, prior: Prior) -> None:
             where,
             f"give {slot.size} entries",
         )
-    if not np.isfinite(prior.mean).all():
-        raise InvalidProblem("the mean is not finite", where, "give SI units, or no prior")
+    bad, why = _beyond(prior.mean)
+    if bad.any():
+        raise InvalidProblem(f"the mean is {why}", where, "give SI units, or no prior")
 
 
 # What cannot be demanded: malformed or contradictory constraints are refused with a sentence that names them.
@@ -387,9 +402,10 @@ def check_polygon(vertices: Array, where: str) -> None:
     if vertices.ndim != 2 or vertices.shape[-1] != 2 or len(vertices) < 3:
         count = "no pairs" if vertices.ndim != 2 or vertices.shape[-1] != 2 else f"only {len(vertices)} corners"
         raise InvalidProblem(f"the polygon has {count}", where, "give three corners or more, two coordinates each")
-    if not np.isfinite(vertices).all():
-        corner = int(np.flatnonzero(~np.isfinite(vertices).all(-1))[0])
-        raise InvalidProblem(f"corner {corner + 1} is not finite", where, "give two numbers")
+    bad, why = _beyond(vertices)
+    if bad.any():
+        corner = int(np.flatnonzero(bad.any(-1))[0])
+        raise InvalidProblem(f"corner {corner + 1} is {why}", where, "give two numbers")
     # Centred: corners in metres from a far origin would lose the digits that areas need.
     v = vertices - vertices.mean(0)
     size = np.abs(v).max()
@@ -449,10 +465,11 @@ def _check_band(problem: Problem, band: Band, where: str) -> None:
     given = np.shape(band.coefficients)[-1:]
     if given != (size,):
         raise InvalidProblem(f"coefficients of shape {np.shape(band.coefficients)}", where, f"give {size} numbers")
-    if not np.isfinite(band.coefficients).all():
-        raise InvalidProblem("a coefficient is not finite", where, "give numbers")
+    bad, why = _beyond(band.coefficients)
+    if np.any(bad):
+        raise InvalidProblem(f"a coefficient is {why}", where, "give numbers")
     for name, bound, absent in (("lower", band.lower, -np.inf), ("upper", band.upper, np.inf)):
-        bad = np.isnan(bound) | (np.isinf(bound) & (bound != absent))
+        bad = _beyond(bound)[0] & (np.asarray(bound) != absent)
         if np.any(bad):
             raise InvalidProblem(
                 f"the {name} bound is {np.asarray(bound)[bad][0]:g}", where, f"give a number, or {absent:g} for none"

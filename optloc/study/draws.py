@@ -391,8 +391,24 @@ def check_truth(truth: TruthTable, frame: Frame, dimension: int, where: str) -> 
     if (truth.at_deg is not None or truth.kind == "area") and not (frame.geodetic and dimension == 3):
         advice = "give a frame of the Earth, or metres"
         raise InvalidProblem("latitude and longitude need a frame on Earth in three dimensions", where, advice)
+    _check_spans(truth, where)
     # Amounts that cannot be read complain here, before anything is computed; stations anywhere will do.
     place_targets(truth, frame, np.ones((1, 2, dimension)), where, np.random.default_rng(0))
+
+
+def _check_spans(truth: TruthTable, where: str) -> None:
+    """Refuse what is drawn between a least and a greatest value that are the other way round, or not on the sphere."""
+    degrees = {"elevation_deg": 90.0, "lat_deg": 90.0, "lon_deg": 360.0}
+    for key, limit in {"distance": np.inf, **degrees}.items():
+        given = getattr(truth, key)
+        if given is None:
+            continue
+        place = join(where, key)
+        low, high = metres(given, place) if key == "distance" else given
+        if low > high:
+            raise InvalidProblem(f"the least value {low:g} is above the greatest, {high:g}", place, "exchange them")
+        if max(-low, high) > limit:
+            raise InvalidProblem(f"{low:g} to {high:g} is beyond {limit:g} degrees", place, "give degrees")
 
 
 def _velocities(truth: TruthTable, dimension: int, where: str, rng: Rng, count: int) -> Array:

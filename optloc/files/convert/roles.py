@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
+from math import isfinite, nan
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.inputs import json_of, read_text
 from optloc.base.types import Array
-from optloc.base.units import UNITS
+from optloc.base.units import LARGEST, UNITS
 from optloc.files.table import Table, csv, parquet
 
 # Role: names that suggest it, the likeliest first; without case, unit and what is no letter.
@@ -101,8 +102,8 @@ class Roles:
                 number = Decimal(str(cell).strip()) if cell is not None else Decimal("nan")
             except InvalidOperation:
                 number = Decimal("nan")
-            if not number.is_finite():
-                what = "the cell is empty" if cell in (None, "") else f"{cell!r} is not a finite number"
+            if not (number.is_finite() and abs(number) <= LARGEST):
+                what = "the cell is empty" if cell in (None, "") else f"{str(cell)[:80]!r} is not a finite number"
                 raise InvalidProblem(what, self.table.where(name, row), "give a number, or leave the row out")
             out.append(number)
         return out
@@ -204,15 +205,24 @@ def _kind(feature: Mapping[str, Any]) -> Any:
 def _point(feature: Mapping[str, Any], where: str) -> tuple[str, float, float, float | None]:
     """Return name, longitude, latitude and height of a point."""
     about = feature.get("properties") or {}
-    name = next((about[key] for key in _NAMES if about.get(key) not in (None, "")), feature.get("id"))
+    if not isinstance(about, dict):
+        raise InvalidProblem("the properties are no table", where, 'write "properties": {"name": "..."}')
+    # A list or a table is no name, and true is no number.
+    words = [about.get(key) for key in _NAMES] + [feature.get("id")]
+    name = next((str(word).strip() for word in words if type(word) in (str, int, float) and str(word).strip()), None)
     if name is None:
         raise InvalidProblem("the point has no name", where, 'give it a property "name"')
     place = feature["geometry"].get("coordinates")
-    number = isinstance(place, list) and all(isinstance(v, int | float) and np.isfinite(v) for v in place)
+    number = isinstance(place, list) and all(type(v) in (int, float) and isfinite(v) for v in place)
     if not number or len(place) not in (2, 3) or abs(place[1]) > 90.0:
-        raise InvalidProblem(f"{place} is no point", where, "write [longitude, latitude, height]")
+        raise InvalidProblem(f"{str(place)[:80]} is no point", where, "write [longitude, latitude, height]")
     height = place[2] if len(place) == 3 else next((about[key] for key in _HEIGHTS if key in about), None)
+    if height is None:
+        return name, float(place[0]), float(place[1]), None
     try:
-        return str(name), float(place[0]), float(place[1]), None if height is None else float(height)
+        metres = float(height)
     except (TypeError, ValueError):
-        raise InvalidProblem(f"the height {height!r} is not a number", where, "give metres") from None
+        metres = nan
+    if not abs(metres) <= LARGEST:
+        raise InvalidProblem(f"the height {str(height)[:80]!r} is not a number", where, "give metres") from None
+    return name, float(place[0]), float(place[1]), metres
