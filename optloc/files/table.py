@@ -97,7 +97,7 @@ class Table:
             row = int(np.flatnonzero(bad)[0])
             given = column[row]
             why = f"beyond {LARGEST:g}" if np.isfinite(values[row]) else "not a finite number"
-            what = "the cell is empty" if _empty(given) else f"{str(given)[:_WORD]} is {why}"
+            what = "the cell is empty" if is_empty(given) else f"{str(given)[:_WORD]} is {why}"
             raise InvalidProblem(what, self.where(key, row), "give a number, or leave the row out")
         return values
 
@@ -152,7 +152,7 @@ class Table:
         if all(isinstance(cell, str) and "_" not in cell for cell in cells):
             with suppress(ValueError):
                 return column.astype(np.float64)
-        return np.array([np.nan if _empty(cell) else self._number(key, row, cell) for row, cell in enumerate(cells)])
+        return np.array([np.nan if is_empty(cell) else self._number(key, row, cell) for row, cell in enumerate(cells)])
 
     def _number(self, key: str, row: int, cell: Any) -> float:
         # Python reads 1_000 as a thousand, which in a table is a slip, and yes as one.
@@ -185,7 +185,7 @@ def distinct(labels: Array) -> tuple[list[str], Array, Array]:
 
 def _spelled(cell: object) -> str:
     """Return a name as text, empty where the cell is."""
-    if _empty(cell):
+    if is_empty(cell):
         return ""
     # Names that a table has as floats: 3.0 is the station 3; of larger ones no float knows the last digit.
     if isinstance(cell, float) and cell.is_integer() and abs(cell) < 2.0**53:
@@ -193,7 +193,8 @@ def _spelled(cell: object) -> str:
     return str(cell).strip()
 
 
-def _empty(cell: object) -> bool:
+def is_empty(cell: object) -> bool:
+    """Return whether a cell holds nothing."""
     return cell is None or cell == "" or (isinstance(cell, float) and np.isnan(cell)) or str(cell).isspace()
 
 

@@ -16,7 +16,7 @@ from optloc.base.inputs import read_bytes
 from optloc.base.outputs import Growing, claim, together, written
 from optloc.base.types import Array
 from optloc.files.reader import Draft, draft
-from optloc.files.table import Table
+from optloc.files.table import Table, is_empty
 
 # Columns of measurements that are written again; the others are of no meaning to optloc.
 _COLUMNS = ("kind", "epoch", "time", "target", "a", "b", "z", "sigma", "weight", "correction")
@@ -54,7 +54,15 @@ def _table(columns: Mapping[str, Any], for_people: bool) -> Any:
     import pyarrow as pa
 
     cells = {name: harmless_column(values) for name, values in columns.items()} if for_people else columns
-    return pa.table({name: pa.array(values, from_pandas=True) for name, values in cells.items()})
+
+    def column(values: Any) -> Any:
+        try:
+            return pa.array(values, from_pandas=True)
+        except (pa.ArrowException, OverflowError):
+            # Numbers and words in one column, or numbers of many digits, go back as they came.
+            return pa.array([None if is_empty(value) else str(value) for value in values])
+
+    return pa.table({name: column(values) for name, values in cells.items()})
 
 
 def harmless(text: str) -> str:

@@ -1,0 +1,109 @@
+"""What mutated files have found: arguments, files, the words of the one sentence; None where there is an answer."""
+
+from fuzz.originals import to_parquet
+
+STATIONS = """[stations]
+rows = [
+  { name = "A", x = 0.0, y = 0.0 },
+  { name = "B", x = 4000.0, y = 300.0 },
+  { name = "C", x = 200.0, y = 5000.0 },
+  { name = "D", x = 4100.0, y = 4700.0 },
+]
+"""
+RANGES = """[[measurements]]
+kind = "range"
+sigma = 3.0
+rows = [{ a = "A", z = 2800.0 }, { a = "B", z = 2700.0 }, { a = "C", z = 3500.0 }, { a = "D", z = 3400.0 }]
+"""
+GAINS = """[[measurements]]
+kind = "groa"
+unit = "dB"
+sigma = 0.1
+b = "D"
+rows = [{ a = "A", z = 1.0 }, { a = "B", z = 1e9 }, { a = "C", z = 2.0 }]
+"""
+GOOD = f"format = 1\n{STATIONS}{RANGES}"
+STUDY = """format = 1
+name = "s"
+trials = 2
+[[scenario]]
+name = "one"
+layout = { stations = 5 }
+truth = { kind = "shell", distance = ["20 km", "10 km"] }
+noise = ["1 m"]
+[[method]]
+method = "gtrs+lsr"
+"""
+POINT = (
+    '{"features": [{"type": "Feature", "id": 1, "properties": %s, "geometry": {"type": "Point", "coordinates": %s}}]}'
+)
+ENU = '[frame]\nkind = "enu"\norigin = { lat_deg = 47.8, lon_deg = 11.2 }\n'
+
+
+def problem(old="", new="", text=GOOD):
+    """Return a good problem file with one thing changed."""
+    assert old in text
+    return {"p.toml": text.replace(old, new, 1)}
+
+
+def study(old, new):
+    """Return a study file with one thing changed."""
+    assert old in STUDY
+    return {"s.toml": STUDY.replace(old, new, 1)}
+
+
+def table(name, content):
+    """Return a problem file whose rows are in a table."""
+    return {
+        "p.toml": f'format = 1\n{STATIONS}[[measurements]]\nkind = "range"\nsigma = 1.0\nfile = "{name}"\n',
+        name: content,
+    }
+
+
+FIX, CHECK, SIMULATE = ["fix", "p.toml", "--json"], ["check", "p.toml"], ["simulate", "p.toml", "--truth", "1,2"]
+RUN = ["study", "run", "s.toml", "--out", "out", "-x", "in-process", "-q"]
+SITES = ["convert", "s.geojson", "--out", "s.csv"]
+FOUND = {
+    "station at 1e300 m": (FIX, problem("4100.0", "1e300"), ["p.toml", "1e+300", "beyond 1e+30"]),
+    "range of 1e31 km": (FIX, problem("2800.0", "1e308"), ["p.toml", "1e+308", "beyond 1e+30"]),
+    "large in another unit": (
+        FIX,
+        problem('"range"\n', '"range"\nunit = "km"\n', GOOD.replace("2800.0", "1e29")),
+        ["p.toml", "row 0", "beyond 1e+30"],
+    ),
+    "number of 400 digits": (FIX, problem("2800.0", "9" * 400), ["p.toml", "beyond 1e+30", "99999..."]),
+    "amount of 1e308": (FIX, problem("sigma = 3.0", 'sigma = "1e308 km"'), ["'sigma'", "beyond 1e+30"]),
+    "sigma of 1e-50": (FIX, problem("sigma = 3.0", "sigma = 1e-50"), ["p.toml", "deviations below 1e-30"]),
+    "decibels of 1e9": (FIX, {"p.toml": f"format = 1\n{STATIONS}{GAINS}"}, ["p.toml", "row 1", "infinite"]),
+    "cell of 1e308": (
+        FIX,
+        table("r.csv", "a,z\nA,1.0\nB,1e308\n"),
+        ["r.csv, row 2, column 'z'", "1e308 is beyond 1e+30"],
+    ),
+    "names that are no numbers": (
+        FIX,
+        table("r.parquet", to_parquet(b"a,z\n1.5,1.0\n,2.0\n")),
+        ["r.parquet, row 2, column 'a'", "empty"],
+    ),
+    "header with a break": (
+        FIX,
+        table("r.csv", 'a,"z\rx,y\n'),
+        ["r.csv, header", "this is no CSV table: "],
+    ),
+    "the plane beside a place on Earth": (FIX, problem("[stations]", f"{ENU}[stations]"), None),
+    "numbers and words in one column": (
+        [*SIMULATE, "--out", "s.toml"],
+        {"p.toml": GOOD.replace("{ a", "{ time = 0.0, a").replace("0.0, a", '"0.0", a', 1)},
+        None,
+    ),
+    "properties that are a list": (SITES, {"s.geojson": POINT % ("[1]", "[11.0, 47.0]")}, ["feature 1", "properties"]),
+    "a name that is a table": (SITES, {"s.geojson": (POINT % ('{"name": {}}', "[1, 2]")).replace('"id": 1, ', "")},
+                               ["feature 1", "no name"]),
+    "a longitude of 400 digits": (SITES, {"s.geojson": POINT % ("{}", f"[{'9' * 400}, 47.0]")}, ["beyond 1e+30"]),
+    "distances the other way round": (RUN, {"s.toml": STUDY}, ["scenario 'one'", "distance", "20000", "exchange them"]),
+    "elevations beyond the zenith": (
+        RUN,
+        study('"20 km", "10 km"]', '"1 km", "2 km"], elevation_deg = [80.0, 100.0]'),
+        ["elevation_deg", "90 degrees"],
+    ),
+}  # fmt: skip
