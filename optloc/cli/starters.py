@@ -172,7 +172,7 @@ def run_new(kind: str, out: Path | None, *, quiet: bool) -> int:
         write_text(Path("-"), known[kind].text.rstrip("\n"))
         return 0
     if out.suffix.lower() != ".toml":
-        raise InvalidProblem("a problem file ends in .toml", str(out), f"write --out {out.with_suffix('.toml')}")
+        raise InvalidProblem("a problem file ends in .toml", str(out), "let the name behind --out end in it")
     write_text(out, known[kind].text.rstrip("\n"))
     say(Screen(quiet=quiet), f"{out} can be changed and fixed: optloc check {out}, then optloc fix {out}.")
     return 0

@@ -102,7 +102,7 @@ def convert(
     if what == "stations" or source.suffix.lower() in GEOJSON:
         return _write_stations(source, out, told, frame)
     if out.suffix.lower() != ".toml":
-        raise InvalidProblem("the problem file must end in .toml", str(out), f"write --out {out.with_suffix('.toml')}")
+        raise InvalidProblem("the problem file must end in .toml", str(out), "let the name behind --out end in it")
     roles = Roles(read_table(source), told)
     seen = what or _recognise(roles)
     if seen == "stations":
@@ -136,7 +136,7 @@ def _recognise(roles: Roles) -> str:
 def _write_stations(source: Path, out: Path, told: Mapping[str, str], frame: str | None) -> Converted:
     if out.suffix.lower() != ".csv":
         what = "stations alone are no problem: they become a CSV table"
-        raise InvalidProblem(what, str(out), f"write --out {out.with_suffix('.csv')}, or convert the measurements")
+        raise InvalidProblem(what, str(out), "let the name behind --out end in .csv, or convert the measurements")
     found = places_of(source, told, frame)
     write_csv(out, found.columns)
     return Converted((out,), None, (found.note,) if found.note else ())
