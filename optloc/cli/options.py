@@ -13,6 +13,7 @@ from importlib.resources import files
 from io import TextIOWrapper
 from math import isnan, nan
 from pathlib import Path
+from threading import Timer
 from typing import Annotated, Any
 
 import typer
@@ -59,9 +60,16 @@ def run_process(command: Callable[[], Any]) -> None:
     sys.exit(_flush(code))
 
 
+# Seconds that a command is given to end after Ctrl-C: a library may swallow it, or a compiler go on for a minute.
+_PATIENCE = 8.0
+
+
 def _interrupt(*_: Any) -> None:
-    """Let the command end in its own way; a second Ctrl-C does not wait for it."""
+    """Let the command end in its own way, if it does so soon; a second Ctrl-C does not wait for it."""
     signal.signal(signal.SIGINT, end_at_once)
+    watch = Timer(_PATIENCE, end_at_once)
+    watch.daemon = True
+    watch.start()
     raise KeyboardInterrupt
 
 
