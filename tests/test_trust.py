@@ -46,6 +46,8 @@ NEEDED = {
     "scenario": STUDY["scenario"][0],
     "method": STUDY["method"][0],
 }
+# What a key takes the place of.
+INSTEAD = {"file": "rows", "problem": "layout", "baseline": "method"}
 # Things that must not happen while a file is read and solved: new processes, the network, libraries, deletions.
 FORBIDDEN = (
     "os.system os.exec os.fork os.forkpty os.spawn os.posix_spawn subprocess.Popen socket.connect socket.getaddrinfo "
@@ -148,6 +150,7 @@ def put(base, path, value):
         at = inner[0] if kind == "list" else inner
         if name == "targets":
             at = at.setdefault("target", {})
+    at.pop(INSTEAD.get(path[-1]), None)
     at[path[-1]] = value
     return out
 
