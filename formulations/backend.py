@@ -5,6 +5,7 @@ Both are context variables: threads and tasks may each have a choice of their ow
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -41,6 +42,18 @@ class Choice:
 
 class SolverError(ArithmeticError):
     """A back end stopped with an error of its own on numbers that it was given."""
+
+
+def hold_in_forks(lock: Any) -> None:
+    """Let nobody else hold a lock, or all locks behind it, while the process forks: in the child nobody would open it.
+
+    Parameters
+    ----------
+    lock : object
+        It has ``acquire`` and ``release``. Of several the one that was named last is taken first.
+    """
+    if hasattr(os, "register_at_fork"):  # not where processes do not fork
+        os.register_at_fork(before=lock.acquire, after_in_parent=lock.release, after_in_child=lock.release)
 
 
 # Context variables, not globals: a choice inside `using` holds for its thread and task alone. Threads that are meant to

@@ -33,7 +33,7 @@ from typing import Any, ParamSpec, TypeVar
 import numpy as np
 
 from formulations.algebra import Array, Index
-from formulations.backend import SolverError, choice_for, count
+from formulations.backend import SolverError, choice_for, count, hold_in_forks
 
 _Arguments = ParamSpec("_Arguments")
 _Built = TypeVar("_Built")
@@ -41,6 +41,7 @@ _Built = TypeVar("_Built")
 # cvxpy counts its variables in a global that is read and written in two steps, and keeps the values of parameters in
 # the problem: two threads in it could number two variables alike, or solve each other's data.
 _CVXPY = threading.RLock()
+hold_in_forks(_CVXPY)
 
 # More sizes of one problem than a study mixes. Building takes 10 ms to 0.5 s, and what is built less than 2 MB (the
 # moments of seven ranges, eight directions), 20 MB for the registration of eight windows of a moving target.
@@ -235,6 +236,7 @@ def keep(build: Callable[_Arguments, _Built]) -> Callable[_Arguments, _Built]:
 
     # A hit waits for builds of the same function only; without this lock two threads would build the same twice.
     cached, lock = lru_cache(_KEPT)(alone), threading.Lock()
+    hold_in_forks(lock)
 
     @wraps(build)
     def once(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Built:

@@ -22,12 +22,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from weakref import WeakSet
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from formulations.algebra import Array
-from formulations.backend import Choice, SolverError, count
+from formulations.backend import Choice, SolverError, count, hold_in_forks
 
 Function = Callable[[Any, Any], Any]
 Residual = Callable[[Any, Any, Any], Any]
@@ -155,7 +156,8 @@ class Program:
         self._solver = solver if faster is None else faster
         # CasADi releases the interpreter lock while it solves, and the solver has one memory, which threads at once
         # corrupt, and one report, of its last solve
-        self._lock = threading.Lock()
+        self.lock = threading.Lock()
+        _LOCKS.programs.add(self)
 
     def solve(
         self,
@@ -210,7 +212,7 @@ class Program:
             "ubg": np.concatenate([np.zeros(self._equal), np.full(self._more, np.inf)]),
         }
         try:
-            with self._lock:
+            with self.lock:
                 found, stats = self._solver(**given), self._solver.stats()
         except RuntimeError as trouble:  # CasADi has no other kind
             raise SolverError(f"{self._name} failed: {trouble}") from trouble
@@ -227,6 +229,27 @@ class Program:
             success=bool(stats["success"]),
             iterations=iterations,
         )
+
+
+class _Locks:
+    """The locks of all programs as one; who forks waits until their solves have ended."""
+
+    def __init__(self) -> None:
+        self.programs: WeakSet[Program] = WeakSet()
+        self.held: list[threading.Lock] = []
+
+    def acquire(self) -> None:
+        self.held = [program.lock for program in self.programs]
+        for lock in self.held:
+            lock.acquire()
+
+    def release(self) -> None:
+        for lock in self.held:
+            lock.release()
+
+
+_LOCKS = _Locks()
+hold_in_forks(_LOCKS)
 
 
 def _options(choice: Choice | None, settings: Mapping[str, Any]) -> dict[str, Any]:

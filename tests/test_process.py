@@ -16,9 +16,10 @@ from joblib import Parallel, delayed
 
 import optloc
 from optloc import assemble, measured, solve
+from optloc.base.cache import Cache
 
 # How many fixes of how many structures are let go by before memory is looked at, in full and by default.
-FULL, QUICK = (20_000, 200, 2000), (240, 20, 120)
+FULL, QUICK = (20_000, 200, 2000), (150, 15, 75)
 GROWTH = 1.05
 SIGMA = {"azimuth": 1e-3, "groa": 1e-3}
 H = {
@@ -85,6 +86,36 @@ def told(number):
 def child(number, pipe):
     pipe.send(told(number))
     pipe.close()
+
+
+def busy(cache, started, until):
+    """Make a value of a cache for as long as it takes somebody else to fork."""
+
+    def make():
+        started.set()
+        until.wait(60)
+        return 1
+
+    cache.find("slow", make)
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="this system cannot fork")
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*fork:DeprecationWarning")
+def test_a_child_makes_what_a_thread_of_its_parent_was_making():
+    cache, started, until = Cache(4), threading.Event(), threading.Event()
+    cache.find("made", lambda: 2)
+    thread = threading.Thread(target=busy, args=(cache, started, until))
+    thread.start()
+    assert started.wait(60)
+    mine, theirs = multiprocessing.get_context("fork").Pipe(duplex=False)
+    ask = lambda: theirs.send((cache.find("slow", lambda: 3), cache.find("made", lambda: 4)))  # noqa: E731
+    process = multiprocessing.get_context("fork").Process(target=ask)
+    process.start()
+    assert mine.poll(60), "the child waits for a thread that it has not"
+    assert mine.recv() == (3, 2)
+    until.set()
+    thread.join()
+    process.join(60)
 
 
 @pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="this system cannot fork")

@@ -15,6 +15,8 @@ from dataclasses import dataclass, field
 from threading import Lock
 from typing import Generic, TypeVar, cast
 
+from optloc.base.threads import held_by_forks
+
 Value = TypeVar("Value")
 
 # None is a value (there are no tables for some structures), so a place that waits for its value holds this.
@@ -36,6 +38,8 @@ class Cache(Generic[Value]):
     A value is made once, whichever thread asks first: others wait for it, while values of other keys can be had and
     made. A call that raises leaves nothing behind. To make a value may take other caches, never the same key of this.
 
+    A cache lives as long as the process: it is one of a module, not of an object.
+
     Parameters
     ----------
     most : int
@@ -50,6 +54,11 @@ class Cache(Generic[Value]):
         self._most, self._weigh = most, weigh
         self._lock, self._total = Lock(), 0
         self._places: dict[Hashable, _Place] = {}  # in the order of their last use
+        held_by_forks(self._lock, self._begin_child)
+
+    def _begin_child(self) -> None:
+        # The threads that make these values do not live in a forked child; who needs one makes it.
+        self._places = {key: place for key, place in self._places.items() if place.value is not _NOTHING}
 
     def __len__(self) -> int:
         return len(self._places)

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextvars import copy_context
+from threading import Lock as LockType
 from time import perf_counter
 from typing import TypeVar
 
@@ -38,6 +39,26 @@ def thread_count() -> int:
     if not given.isdecimal() or int(given) < 1:
         raise InvalidProblem(f"{given!r} is no number of threads", _VARIABLE, "give a whole number of at least 1")
     return int(given)
+
+
+def held_by_forks(lock: LockType, begin: Callable[[], None] = lambda: None) -> LockType:
+    """Return a lock that nobody else holds while the process forks, so that the child finds it open.
+
+    Parameters
+    ----------
+    lock : threading.Lock
+        A lock that lives as long as the process.
+    begin : callable
+        What is done first in the child.
+    """
+
+    def child() -> None:
+        lock.release()
+        begin()
+
+    if hasattr(os, "register_at_fork"):  # not where processes do not fork
+        os.register_at_fork(before=lock.acquire, after_in_parent=lock.release, after_in_child=child)
+    return lock
 
 
 def mapped(

@@ -10,11 +10,13 @@ from threading import Lock
 from types import FunctionType
 from typing import Any, TypeVar, cast
 
+from optloc.base.threads import held_by_forks
+
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 # A context variable: one thread may run plainly while others run machine code.
 _PLAIN = ContextVar("plain", default=False)
-_LOCK = Lock()
+_LOCK = held_by_forks(Lock())
 
 
 @cache
