@@ -53,6 +53,24 @@ def costs() -> str:
     return "\n".join([*head, *lines])
 
 
+def budgets() -> str:
+    """Return how much a file may hold as a table."""
+    from dataclasses import asdict
+
+    from optloc import Budget
+
+    what = {
+        "bytes": "bytes of a table: as it is stored, and as Parquet declares itself unpacked",
+        "text": "bytes of a document: TOML, JSON, GeoJSON",
+        "rows": "rows of a table",
+        "columns": "columns of a table",
+        "cells": "cells of a table; places of moving stations, one for each epoch",
+        "nesting": "tables and lists within each other in a document",
+    }
+    lines = [f"| `{name}` | {what[name]} | {most} |" for name, most in asdict(Budget()).items()]
+    return "\n".join(["| name | what | at most |", "|---|---|---|", *lines])
+
+
 def words() -> str:
     """Return the words that a method is made of as a table."""
     from optloc import SOLVERS
@@ -174,4 +192,5 @@ GENERATED: dict[str, Callable[..., str]] = {
     "words": words,
     "commands": commands,
     "layers": layers,
+    "budgets": budgets,
 }

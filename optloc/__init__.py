@@ -20,6 +20,7 @@ from optloc.adequacy.level import CommonLevel, LateSignals
 from optloc.base import frames, units
 from optloc.base.errors import InvalidProblem, NoSolution, OptlocError
 from optloc.base.frames import CARTESIAN, ECEF, Frame
+from optloc.base.inputs import Budget
 from optloc.base.types import Bias, Certificate, Motion, Prior, Rows, Stations, Status
 from optloc.bounds.crlb import Course, crlb, crlb_course
 from optloc.bounds.observability import Observability, observability
@@ -71,6 +72,7 @@ __all__ = [
     "Alternatives",
     "Arc",
     "Bias",
+    "Budget",
     "Certificate",
     "Chart",
     "CommonLevel",

@@ -31,6 +31,9 @@ HARD = [
     "AOA in the plane, 3 stations, 10 mrad",
     "bistatic, two illuminators, 10 m, 5 mrad",
 ]
+# Metres beyond which a difference of two ranges as floats is noise of 0.1 mm and more: at 1e68 m, where a search once
+# ended, it is zero, and with it a cost that is none.
+FAR = 1e12
 # Plain Python takes a thousand times longer for a box.
 SHARE = 1.0 if enabled() else 0.05
 
@@ -80,7 +83,7 @@ def stationary_points(trial: Trial, truth, rng, count: int):
                 step = np.linalg.lstsq(trial.slope(size * done.x), trial.residual(size * done.x), rcond=None)[0]
                 if np.linalg.norm(trial.slope(size * done.x) @ step) < 1e-4:
                     found.append(size * done.x)
-    return np.array(found)
+    return np.array([x for x in found if np.linalg.norm(x) < FAR])
 
 
 def wrong_points(problem, truth, count: int, rng):
