@@ -254,7 +254,8 @@ def _share(task: _Task) -> float:
 _START, _IDLE, _MOMENT = 120.0, 60.0, 0.2
 # Workers times threads would be more than the processors, and each thread of BLAS reserves memory.
 _ONE = ("OPTLOC", "OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "VECLIB_MAXIMUM", "NUMEXPR_NUM", "NUMBA_NUM")
-_BEGIN = "import pickle, sys; sys.path[:], run = pickle.load(sys.stdin.buffer); pickle.loads(run)()"
+_BEGIN = "import pickle, sys; f = sys.stdin.buffer; f.peek() or sys.exit(); "
+_BEGIN += "sys.path[:], run = pickle.load(f); pickle.loads(run)()"
 
 
 class Apart:
@@ -386,12 +387,10 @@ class Pool:
             raise InvalidProblem(f"no process can be begun ({error})", sys.executable, advice) from None
 
     def _begin(self) -> Apart:
-        apart = Apart()
         with self._lock:
-            self._all.add(apart)
-            closed = self._closed
-        if closed:
-            apart.end()
+            if self._closed:
+                raise InvalidProblem("the run was stopped", "study", "the same command goes on")
+            self._all.add(apart := Apart())
         # What runs there is found when the path is that of this process.
         apart.ask(([str(place) for place in sys.path], pickle.dumps(partial(serve, self._memory))), _START)
         return apart
@@ -508,16 +507,14 @@ def _dask(by: Executor) -> Iterator[Begun]:
         raise InvalidProblem("Dask is not installed", "--executor", "pip install 'optloc[dask]'") from None
     with ExitStack() as stack:
         try:
-            if by.address is None:
-                # No page of statistics, and no warnings of workers that are lost on purpose when it ends.
-                own = {"threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.CRITICAL}
-                with _deaf():
-                    cluster = LocalCluster(n_workers=by.jobs or workers(), **own)
-                client = Client(stack.enter_context(cluster), timeout=CONNECT)
-            else:
-                client = Client(by.address, timeout=CONNECT)
-            stack.enter_context(client)
-            count = sum(client.ncores().values())
+            with _deaf():
+                place: Any = by.address
+                if place is None:
+                    # No page of statistics, and no warnings of workers that are lost on purpose when it ends.
+                    own = {"threads_per_worker": 1, "dashboard_address": None, "silence_logs": logging.CRITICAL}
+                    place = stack.enter_context(LocalCluster(n_workers=by.jobs or workers(), **own))
+                client = stack.enter_context(Client(place, timeout=CONNECT))
+                count = sum(client.ncores().values())
         except (OSError, TimeoutError, ValueError) as error:
             raise _unreachable(by, error) from None
         if not count:

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from io import BufferedIOBase, BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -180,15 +181,16 @@ def store(folder: Path, part: Part) -> None:
     sink = pa.BufferOutputStream()
     parquet.write_table(part.table, sink, compression="zstd")
     content = sink.getvalue().to_pybytes()
+    name = f"{part.key}.{_digest(BytesIO(content))}.parquet"
     try:
-        _replaced(folder / "parts" / f"{part.key}.{_digest(content)}.parquet", lambda path: path.write_bytes(content))
+        _replaced(folder / "parts" / name, lambda path: path.write_bytes(content))
     except OSError as error:
         raise unwritable(folder, error) from None
 
 
-def _digest(content: bytes) -> str:
+def _digest(file: BufferedIOBase) -> str:
     """Return 16 hexadecimal digits of a file's content: a name tells damage, and needs no second file to do so."""
-    return hashlib.blake2b(content, digest_size=8).hexdigest()
+    return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=8)).hexdigest()
 
 
 def part_files(folder: Path) -> dict[str, Path]:
@@ -200,14 +202,15 @@ def part_files(folder: Path) -> dict[str, Path]:
 
 def read_part(path: Path, columns: Sequence[str] | None = None) -> Any:
     """Return the Arrow table of a part file; raise InvalidProblem where it is not what was written."""
-    import pyarrow as pa
-    from pyarrow import parquet
+    from pyarrow import ArrowException, parquet
 
     try:
-        content = path.read_bytes()
-        if path.name.split(".")[1:-1] == [_digest(content)]:
-            return parquet.read_table(pa.BufferReader(content), columns=columns)
-    except (OSError, pa.ArrowException):
+        with path.open("rb") as file:
+            found = _digest(file)
+        if path.name.split(".")[1:-1] == [found]:
+            # Not from bytes of Python: threads of Arrow that free such while the interpreter ends abort the process.
+            return parquet.read_table(path, columns=columns, partitioning=None)
+    except (OSError, ArrowException):
         pass
     raise InvalidProblem("the part is damaged", str(path), "run the study again, and it is made again")
 
@@ -262,7 +265,12 @@ def note_data(known: dict[str, str], table: Any, folder: Path) -> None:
     InvalidProblem
         Where a block has other data than are known of it: methods would be compared on different measurements.
     """
-    found = table.select(["seed", "data"]).group_by(["seed", "data"]).aggregate([([], "count_all")]).to_pylist()
+    found = (
+        table.select(["seed", "data"])
+        .group_by(["seed", "data"], use_threads=False)
+        .aggregate([([], "count_all")])
+        .to_pylist()
+    )
     for row in found:
         if known.setdefault(row["seed"], row["data"]) != row["data"]:
             what = f"parts of the study hold different data for the same trials (those of the seed {row['seed']})"
@@ -370,7 +378,7 @@ def progress(folder: Path) -> Progress:
     for path in files.values():
         # Three columns of fifty, so that looking does not slow down a run of millions of rows.
         table = read_part(path, ["method", "status", "reason"])
-        for row in table.group_by(["method", "status"]).aggregate([([], "count_all")]).to_pylist():
+        for row in table.group_by(["method", "status"], use_threads=False).aggregate([([], "count_all")]).to_pylist():
             method, status = str(row["method"]), str(row["status"])
             methods[method, status] += int(row["count_all"])
             if status in FAILED and (method, status) not in failures:
