@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from io import BufferedIOBase, BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
+from optloc.base.inputs import json_of, read_bytes
+from optloc.base.outputs import written
 from optloc.study.draws import draw
 from optloc.study.methods import version_of
 from optloc.study.plan import Plan
@@ -102,19 +102,22 @@ def manifest_of(plan: Plan) -> Manifest:
 
 def read_manifest(folder: Path) -> Manifest:
     """Return the manifest of an output folder; raise InvalidProblem where it is none."""
+    from pydantic import TypeAdapter, ValidationError
+
     path = folder / MANIFEST
-    try:
-        data = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
+    if not path.exists():
         what = "the folder holds no study" if folder.is_dir() else "there is no such folder"
-        raise InvalidProblem(what, str(folder), "name the folder that 'optloc study run' wrote") from None
-    except (OSError, ValueError) as error:
+        raise InvalidProblem(what, str(folder), "name the folder that 'optloc study run' wrote")
+    try:
+        # Not as a document, whose budget is smaller: a study may have a million chunks.
+        data = json_of(read_bytes(path).decode(), str(path))
+    except (InvalidProblem, ValueError) as error:
         raise InvalidProblem(f"the manifest cannot be read ({error})", str(path), "run the study again") from None
     if not isinstance(data, dict) or data.pop("format", None) != FORMAT:
         raise InvalidProblem("the manifest is of another format", str(path), "write to another folder")
     try:
-        return Manifest(**{**data, "columns": tuple(data["columns"])})
-    except (KeyError, TypeError):
+        return TypeAdapter(Manifest).validate_python(data)
+    except ValidationError:
         raise InvalidProblem("the manifest is incomplete", str(path), "write to another folder") from None
 
 
@@ -140,36 +143,33 @@ def begin(plan: Plan, folder: Path) -> Manifest:
     try:
         (folder / "parts").mkdir(parents=True, exist_ok=True)
         _clean(folder)
-        if found is wanted:
-            data = {"format": FORMAT, **{name: getattr(wanted, name) for name in Manifest.__slots__}}
-            _replaced(folder / MANIFEST, lambda path: path.write_text(json.dumps(data, indent=1), encoding="utf-8"))
     except OSError as error:
-        raise unwritable(folder, error) from None
+        raise _unwritable(folder, error) from None
+    if found is wanted:
+        data = {"format": FORMAT, **{name: getattr(wanted, name) for name in Manifest.__slots__}}
+        _write(folder / MANIFEST, json.dumps(data, indent=1).encode())
     return found
 
 
-def unwritable(path: Path, error: OSError) -> InvalidProblem:
-    """Return the sentence for a place that cannot be written."""
-    advice = "make room or choose another place; what is finished is kept, and the same command goes on from there"
-    return InvalidProblem(f"the place cannot be written ({error.strerror or error})", str(path), advice)
+_KEPT = "make room or choose another place; what is finished is kept, and the same command goes on from there"
 
 
-def _replaced(path: Path, write: Any) -> None:
-    """Write a file under another name and move it to its place, whole or not at all."""
-    # The dot hides it from what lists parts, the process number keeps two writers apart.
-    scratch = path.with_name(f".{path.name}.{os.getpid()}")
+def _unwritable(path: Path, error: OSError) -> InvalidProblem:
+    return InvalidProblem(f"the place cannot be written ({error.strerror or error})", str(path), _KEPT)
+
+
+def _write(path: Path, content: bytes) -> None:
+    """Write a file, whole or not at all; raise InvalidProblem where that fails."""
     try:
-        write(scratch)
-        # On one file system this is one step: a reader sees the old file, the new one or none.
-        os.replace(scratch, path)  # noqa: PTH105  (the same, and easier to replace in tests)
-    except BaseException:
-        scratch.unlink(missing_ok=True)
-        raise
+        with written(path) as place:
+            place.write_bytes(content)
+    except InvalidProblem as error:
+        raise InvalidProblem(error.what, error.where, _KEPT) from None
 
 
 def _clean(folder: Path) -> None:
     """Remove what a run that was killed left half written."""
-    for scratch in [*folder.glob(f".{MANIFEST}.*"), *(folder / "parts").glob(".*")]:
+    for scratch in [*folder.glob(".optloc-*"), *(folder / "parts").glob(".*")]:
         scratch.unlink(missing_ok=True)
 
 
@@ -181,16 +181,12 @@ def store(folder: Path, part: Part) -> None:
     sink = pa.BufferOutputStream()
     parquet.write_table(part.table, sink, compression="zstd")
     content = sink.getvalue().to_pybytes()
-    name = f"{part.key}.{_digest(BytesIO(content))}.parquet"
-    try:
-        _replaced(folder / "parts" / name, lambda path: path.write_bytes(content))
-    except OSError as error:
-        raise unwritable(folder, error) from None
+    _write(folder / "parts" / f"{part.key}.{_digest(content)}.parquet", content)
 
 
-def _digest(file: BufferedIOBase) -> str:
+def _digest(content: bytes) -> str:
     """Return 16 hexadecimal digits of a file's content: a name tells damage, and needs no second file to do so."""
-    return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=8)).hexdigest()
+    return hashlib.blake2b(content, digest_size=8).hexdigest()
 
 
 def part_files(folder: Path) -> dict[str, Path]:
@@ -205,12 +201,10 @@ def read_part(path: Path, columns: Sequence[str] | None = None) -> Any:
     from pyarrow import ArrowException, parquet
 
     try:
-        with path.open("rb") as file:
-            found = _digest(file)
-        if path.name.split(".")[1:-1] == [found]:
+        if path.name.split(".")[1:-1] == [_digest(read_bytes(path))]:
             # Not from bytes of Python: threads of Arrow that free such while the interpreter ends abort the process.
             return parquet.read_table(path, columns=columns, partitioning=None)
-    except (OSError, ArrowException):
+    except (InvalidProblem, OSError, ArrowException):
         pass
     raise InvalidProblem("the part is damaged", str(path), "run the study again, and it is made again")
 
@@ -244,7 +238,7 @@ def finished_parts(folder: Path, manifest: Manifest, say: Callable[[str], None])
             try:
                 path.unlink(missing_ok=True)
             except OSError as error:
-                raise unwritable(path, error) from None
+                raise _unwritable(path, error) from None
     return done
 
 
@@ -317,7 +311,7 @@ def locked(folder: Path) -> Iterator[None]:
         # Opened for writing: file systems of a network lock nothing else.
         file = (folder / _LOCK).open("ab")
     except OSError as error:
-        raise unwritable(folder, error) from None
+        raise _unwritable(folder, error) from None
     with file:
         try:
             import fcntl

@@ -15,7 +15,6 @@ from study.texts import QUICK, assert_identical, plan, run_here, values
 
 from optloc.base.errors import InvalidProblem
 from optloc.study import draws, execute
-from optloc.study import folder as parts
 from optloc.study.execute import executor, run_plan
 from optloc.study.folder import (
     finished_parts,
@@ -49,7 +48,7 @@ def test_a_full_disk_is_a_sentence_and_the_same_command_goes_on(whole, tmp_path,
         moved.append(target)
         return move(source, target)
 
-    monkeypatch.setattr(parts.os, "replace", full)
+    monkeypatch.setattr(os, "replace", full)
     with pytest.raises(InvalidProblem, match=r"No space left on device.*goes on from there"):
         run_plan(plan(QUICK), out, HERE)
     monkeypatch.undo()
@@ -136,6 +135,10 @@ def test_folders_that_hold_no_study(tmp_path):
     (tmp_path / "manifest.json").write_text("{")
     with pytest.raises(InvalidProblem, match="cannot be read"):
         progress(tmp_path)
+    for odd in ('{"format": 2}', '{"format": 1}', "[]", '{"format": 2, "name": 3, "chunks": 5}'):
+        (tmp_path / "manifest.json").write_text(odd)
+        with pytest.raises(InvalidProblem, match=r"is incomplete|another format"):
+            progress(tmp_path)
 
 
 def test_two_runs_do_not_write_to_one_folder(whole):
