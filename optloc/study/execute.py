@@ -183,6 +183,10 @@ class _Task:
     whole: Chunk
     again: bool = False
 
+    @property
+    def share(self) -> float:
+        return max(self.chunk.count / self.whole.count, _LEAST)
+
 
 class _Work:
     """The tasks that are left and out, the parts of chunks that were halved, and what each cell has cost."""
@@ -219,7 +223,7 @@ class _Work:
         """Return the part of a task that was lost, or None and have it tried again, whole or in halves."""
         chunk, cell = task.chunk, task.chunk.cell.key
         if cell not in self._given_up:
-            self._cost[cell] = self._cost.get(cell, 0.0) + (_share(task) if lost.status == LATE else _DEATH)
+            self._cost[cell] = self._cost.get(cell, 0.0) + (task.share if lost.status == LATE else _DEATH)
             if self._cost[cell] >= _PATIENCE:
                 reason = f"given up, since too much of it was lost in this scenario; the last time {lost.reason}"
                 self._given_up[cell] = replace(lost, reason=reason)
@@ -239,11 +243,7 @@ class _Work:
     def _seconds(self, task: _Task) -> float:
         if task.chunk.cell.key in self._given_up:
             return 0.0
-        return min(self._limit, max(_share(task) * self._limit, _BUILD))
-
-
-def _share(task: _Task) -> float:
-    return max(task.chunk.count / task.whole.count, _LEAST)
+        return min(self._limit, max(task.share * self._limit, _BUILD))
 
 
 # A process apart. It is begun without multiprocessing, which would run the caller's script again, and which lets the
@@ -271,7 +271,7 @@ class Apart:
             env=os.environ | {f"{name}_THREADS": "1" for name in _ONE},
             start_new_session=True,
         )
-        self._ended = Lock()
+        self._ended, self._pipes = Lock(), Lock()
 
     def lives(self) -> bool:
         """Return whether it can be asked."""
@@ -285,11 +285,11 @@ class Apart:
             # In a thread: pipes have no time limit on every system.
             assert self._process.stdin is not None
             assert self._process.stdout is not None
-            try:
+            found = None
+            with self._pipes, suppress(Exception):  # whatever a process that ends leaves in its pipe
                 _send(self._process.stdin, message)
-                answer.put(pickle.load(self._process.stdout))  # noqa: S301  (of a process of our own)
-            except Exception:  # noqa: BLE001  (whatever a process that ends leaves in its pipe)
-                answer.put(None)
+                found = pickle.load(self._process.stdout)  # noqa: S301  (of a process of our own)
+            answer.put(found)
 
         Thread(target=exchange, daemon=True).start()
         try:
@@ -306,11 +306,15 @@ class Apart:
         with self._ended:
             with suppress(subprocess.TimeoutExpired):
                 self._process.wait(seconds)
-            # Its group lives on where it has ended and what it began has not; there are none on some systems.
+            # Its group lives on where what it began has not ended; some systems have none.
             with suppress(AttributeError, ProcessLookupError, PermissionError):
                 os.killpg(self._process.pid, signal.SIGKILL)
             self._process.kill()
             code = self._process.wait()
+        # A copy of it that left its group may hold the other ends.
+        if self._pipes.acquire(timeout=_MOMENT):
+            with suppress(OSError), self._process:
+                self._pipes.release()
         how = f"exit code {code}" if code >= 0 else f"signal {-code} ({signal.strsignal(-code)})"
         return f"its process ended with {how}"
 
@@ -402,17 +406,17 @@ class Pool:
 def serve(memory: int | None) -> NoReturn:
     """Compute the chunks that come in at standard input, one by one, and answer at standard output, until it closes."""
     restrain(memory)
-    tasks, answers, line = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb"), SimpleQueue[bytes]()
-    # A method may read and print what it likes.
-    nowhere, own = os.open(os.devnull, os.O_RDWR), os.getpid()
+    # A method may read and print what it likes. First, lest a pipe's copy takes the place of closed standard error.
+    nowhere, own, line = os.open(os.devnull, os.O_RDWR), os.getpid(), SimpleQueue[bytes]()
+    tasks, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     for number in range(3):
         os.dup2(nowhere, number)
     Thread(target=_listen, args=(tasks, line), daemon=True).start()
     found: object = True
     try:
         while True:
-            if os.getpid() != own:  # a method forked, and its copy has arrived here, too
-                os._exit(0)
+            if os.getpid() != own:
+                os._exit(0)  # a method forked, and its copy has arrived here, too
             _die_with(tasks, on=False)
             _send(answers, found)
             chunk = pickle.loads(line.get(timeout=_IDLE))  # noqa: S301
@@ -518,9 +522,8 @@ def _dask(by: Executor) -> Iterator[Begun]:
         except (OSError, TimeoutError, ValueError) as error:
             raise _unreachable(by, error) from None
         if not count:
-            raise InvalidProblem(
-                "the scheduler has no workers", by.address or "dask", "start one: dask worker ADDRESS --nthreads 1"
-            )
+            advice = "start one: dask worker ADDRESS --nthreads 1"
+            raise InvalidProblem("the scheduler has no workers", by.address or "dask", advice)
         yield Begun({"backend": "dask", "client": client, "n_jobs": -1}, beside, (KilledWorker,))
 
 
