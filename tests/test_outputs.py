@@ -3,10 +3,12 @@
 import json
 import os
 import re
+import shutil
 import stat
 import subprocess
 import sys
 import threading
+from importlib.resources import files
 from pathlib import Path
 
 import pandas as pd
@@ -146,6 +148,20 @@ def test_places_that_are_none(place):
     (place / "fresh.csv").symlink_to(place / "made.csv")
     run("fix", "demo", "--out", "fresh.csv")
     assert (place / "made.csv").exists()
+
+
+@STREAMS
+def test_names_that_are_no_unicode(place):
+    for name in ("site\udcff.toml", "toa\udcff.csv"):
+        (place / name).write_bytes((place / name.replace("\udcff", "")).read_bytes())
+    shutil.copy(files("optloc") / "scenarios" / "demo.toml", place / "demo\udcff.toml")
+    run("fix", "demo\udcff.toml", "--html", "o.html", "--plot", "o.svg", "--geojson", "o.geojson", "--out", "o.csv")
+    run(*"convert toa\udcff.csv --stations rx.csv --sigma 1ns --out c.toml".split())
+    assert read(place / "c.toml").problem.count == 3
+    (place / "toa.csv").rename(place / "\U0001f4e1.csv")
+    run(*"convert \U0001f4e1.csv --stations rx.csv --sigma 1ns --out \U0001f4e1.toml".split())
+    run(*"simulate site\udcff.toml --truth 1,2,3 --out s.toml".split())
+    assert "not Unicode" in run(*"simulate demo --truth 1,2,3 --out s\udcff.toml".split(), code=2).stderr
 
 
 @STREAMS

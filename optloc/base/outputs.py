@@ -92,6 +92,8 @@ def _place(path: Path, inputs: Iterable[Path] = ()) -> Path:
     """Return where a file is to be written: a link is followed, and stays; raise InvalidProblem where it must not."""
     try:
         place = Path(os.path.realpath(path))
+        if place.name != place.name.encode(errors="replace").decode():
+            raise InvalidProblem("the name is not Unicode", str(path), "choose another name")
         if place.is_dir():
             raise InvalidProblem("it is a folder", str(path), "name a file")
         if not place.parent.is_dir():
@@ -159,6 +161,12 @@ def written(path: Path) -> Iterator[Path]:
     except BaseException:
         _remove(temporary)
         raise
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file in UTF-8, as `written` does; what is no Unicode, of a file's name, becomes a question mark."""
+    with written(path) as file:
+        file.write_text(text, encoding="utf-8", errors="replace")
 
 
 @contextmanager

@@ -14,6 +14,7 @@ import numpy as np
 from rich.console import Console
 from rich.text import Text
 
+from optloc.base import outputs
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
 from optloc.base.outputs import claim, is_stream, visible, written
@@ -131,8 +132,7 @@ def write_text(path: Path, text: str) -> None:
     if str(path) == "-":
         sys.stdout.write(text + "\n")
         return
-    with written(path) as file:
-        file.write_text(text + "\n", encoding="utf-8")
+    outputs.write_text(path, text + "\n")
     LOG.info("wrote %s", path)
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.inputs import read_bytes
-from optloc.base.outputs import Growing, claim, together, written
+from optloc.base.outputs import Growing, claim, together, write_text, written
 from optloc.base.types import Array
 from optloc.files.reader import Draft, draft
 from optloc.files.table import Table, is_empty
@@ -155,8 +155,7 @@ def write_measured(source: Path, out: Path, z: Array, note: str = "") -> list[Pa
                 section.pop(key, None)
             section["file"] = path.name
         text = "format = 1\n" + _toml({k: v for k, v in settings.items() if k != "format"})
-        with written(out) as file:
-            file.write_text(text, encoding="utf-8")
+        write_text(out, text)
     return [out, *copies, *tables]
 
 

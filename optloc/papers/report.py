@@ -27,7 +27,7 @@ from textwrap import fill
 from typing import TYPE_CHECKING, Generic, Literal, TypeVar
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.outputs import make_folder, together, written
+from optloc.base.outputs import make_folder, together, write_text, written
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -358,8 +358,7 @@ def write(report: Report, folder: Path) -> list[Path]:
     pictures = [(folder / f"{picture.name}.png", picture) for picture in report.pictures]
     make_folder(folder)
     with together():
-        with written(page) as file:
-            file.write_text(report.markdown(), encoding="utf-8")
+        write_text(page, report.markdown())
         for path, table in tables:
             with written(path) as file, file.open("w", encoding="utf-8", newline="") as lines:
                 csv.writer(lines, lineterminator="\n").writerows([table.header, *table.rows])

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.outputs import claim, make_folder, together, written
+from optloc.base.outputs import claim, make_folder, together, write_text, written
 from optloc.base.types import Array
 from optloc.bounds.bound_map import BoundMap, bound_map, extent, plan_of
 from optloc.files.writer import harmless_column
@@ -202,8 +202,7 @@ def write_report(folder: Path, out: Path | None = None, tell: Tell | None = None
             files += more
         source = found.manifest.text
         parts.append(Part("made", "How it was made", tables=[found.sheets["machine"]], source=source))
-        with written(target) as file:
-            file.write_text(_page(found, parts), encoding="utf-8")
+        write_text(target, _page(found, parts))
     return [target, *files]
 
 
@@ -261,20 +260,19 @@ def _figure_files(place: Path, picture: Picture, *, legend: bool) -> list[Path]:
     make_folder(paths[0].parent)
     with written(paths[0]) as file:
         figure.savefig(file, dpi=_DPI)
-    with written(paths[1]) as file:
-        file.write_text(svg_text(figure), encoding="utf-8")
+    write_text(paths[1], svg_text(figure))
     return paths
 
 
 def _table_file(place: Path, sheet: Sheet, ending: str) -> Path:
     path = place / "tables" / f"{sheet.shown.name}.{ending}"
     make_folder(path.parent)
+    if ending != "csv":
+        write_text(path, latex(sheet.shown, sheet.words))
+        return path
+    frame = sheet.frame.assign(**{str(name): harmless_column(cells) for name, cells in sheet.frame.items()})
     with written(path) as file:
-        if ending == "csv":
-            frame = sheet.frame.assign(**{str(name): harmless_column(cells) for name, cells in sheet.frame.items()})
-            frame.to_csv(file, index=False, lineterminator="\n")
-        else:
-            file.write_text(latex(sheet.shown, sheet.words), encoding="utf-8")
+        frame.to_csv(file, index=False, lineterminator="\n")
     return path
 
 

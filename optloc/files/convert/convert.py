@@ -6,13 +6,14 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from decimal import Decimal
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
-from optloc.base.outputs import claim, together, written
+from optloc.base.outputs import claim, together, write_text
 from optloc.base.types import Array
 from optloc.base.units import UNITS
 from optloc.files.convert.roles import GEOJSON, GUESSES, Places, Roles, places_of, read_table, stem, unit_of
@@ -150,10 +151,12 @@ def _tables(out: Path) -> tuple[Path, ...]:
 
 def _write(source: Path, out: Path, found: Measured, place: Places, sigma: str) -> Converted:
     tables = dict(zip(_tables(out), (place.columns, found.columns), strict=True))
-    one, two = (json.dumps(path.name) for path in tables)
+    # JSON spells strings as TOML does, but for signs beyond 16 bits, which stay as they are.
+    quoted = partial(json.dumps, ensure_ascii=False)
+    one, two = (quoted(path.name) for path in tables)
     text = f"""# Made from {source.name} by optloc convert.
 format = 1
-title = {json.dumps(source.stem)}
+title = {quoted(source.stem)}
 
 [frame]
 kind = "{place.frame}"
@@ -166,13 +169,12 @@ unit = "{place.unit}"
 kind = "toa"                         # {found.comment}
 file = {two}
 unit = "{found.unit}"
-sigma = {json.dumps(sigma)}
+sigma = {quoted(sigma)}
 """
     with together():
         for path, columns in tables.items():
             write_csv(path, columns)
-        with written(out) as file:
-            file.write_text(text, encoding="utf-8")
+        write_text(out, text)
     notes = (*found.notes, *((place.note,) if place.note else ()))
     return Converted((out, *tables), read(out), notes)
 
