@@ -156,10 +156,13 @@ def test_names_that_are_no_unicode(place):
         (place / name).write_bytes((place / name.replace("\udcff", "")).read_bytes())
     shutil.copy(files("optloc") / "scenarios" / "demo.toml", place / "demo\udcff.toml")
     run("fix", "demo\udcff.toml", "--html", "o.html", "--plot", "o.svg", "--geojson", "o.geojson", "--out", "o.csv")
-    run(*"convert toa\udcff.csv --stations rx.csv --sigma 1ns --out c.toml".split())
+    run(*"convert toa\udcff.csv --stations rx.csv --sigma soon --out c.toml".split(), code=2)
+    assert not (place / "c.toml").exists()
+    assert not (place / "c-rows.csv").exists()
+    run(*"convert toa\udcff.csv --stations rx.csv --out c.toml --sigma".split(), "1 ns")
     assert read(place / "c.toml").problem.count == 3
     (place / "toa.csv").rename(place / "\U0001f4e1.csv")
-    run(*"convert \U0001f4e1.csv --stations rx.csv --sigma 1ns --out \U0001f4e1.toml".split())
+    run(*"convert \U0001f4e1.csv --stations rx.csv --out \U0001f4e1.toml --sigma".split(), "1 ns")
     run(*"simulate site\udcff.toml --truth 1,2,3 --out s.toml".split())
     assert "not Unicode" in run(*"simulate demo --truth 1,2,3 --out s\udcff.toml".split(), code=2).stderr
 

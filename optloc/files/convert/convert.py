@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -154,7 +155,7 @@ def _write(source: Path, out: Path, found: Measured, place: Places, sigma: str) 
     # JSON spells strings as TOML does, but for signs beyond 16 bits, which stay as they are.
     quoted = partial(json.dumps, ensure_ascii=False)
     one, two = (quoted(path.name) for path in tables)
-    text = f"""# Made from {source.name} by optloc convert.
+    text = f"""# Made from {quoted(source.name)} by optloc convert.
 format = 1
 title = {quoted(source.stem)}
 
@@ -171,12 +172,21 @@ file = {two}
 unit = "{found.unit}"
 sigma = {quoted(sigma)}
 """
+    # Read before it is there: what cannot be read is not written.
+    with TemporaryDirectory() as folder:
+        _lay(text, tables, Path(folder) / out.name)
+        loaded = read(Path(folder) / out.name)
+    _lay(text, tables, out)
+    notes = (*found.notes, *((place.note,) if place.note else ()))
+    return Converted((out, *tables), loaded, notes)
+
+
+def _lay(text: str, tables: Mapping[Path, Mapping[str, Any]], out: Path) -> None:
+    """Write a problem file with its tables beside it."""
     with together():
         for path, columns in tables.items():
-            write_csv(path, columns)
+            write_csv(out.with_name(path.name), columns)
         write_text(out, text)
-    notes = (*found.notes, *((place.note,) if place.note else ()))
-    return Converted((out, *tables), read(out), notes)
 
 
 # A table of arrival times: which station heard which message when.
