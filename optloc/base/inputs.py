@@ -64,6 +64,8 @@ class Budget:
         Of a table.
     nesting : int
         Tables and lists within each other in a document.
+    unknowns : int
+        That all epochs of a problem file share: places of targets, biases, offsets of stations.
     """
 
     bytes: int = 1 << 28
@@ -72,6 +74,7 @@ class Budget:
     columns: int = 1000
     cells: int = 40_000_000
     nesting: int = 32
+    unknowns: int = 300
 
 
 @dataclass(frozen=True, slots=True)

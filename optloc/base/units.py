@@ -214,7 +214,7 @@ def conversion(
         # Amplitude falls with the range, so that 20 decibels are a factor of ten in range.
         return Conversion(math.log(10) / 20, logarithmic=True)
     if unit == "Hz":
-        if carrier is None or not (math.isfinite(carrier) and carrier > 0):
+        if carrier is None or not 1.0 / LARGEST <= carrier <= LARGEST:
             given = "is missing" if carrier is None else f"must be positive, not {carrier:g} Hz"
             raise InvalidProblem(
                 f"the carrier frequency {given}",
@@ -274,5 +274,5 @@ def _check_options(unit: str, quantity: str, propagation_speed: float, conventio
     if convention not in get_args(AzimuthConvention):
         advice = nearest(convention, list(get_args(AzimuthConvention)))
         raise InvalidProblem(f"unknown azimuth convention {convention!r}", where, advice)
-    if not (math.isfinite(propagation_speed) and propagation_speed > 0):
+    if not 1.0 / LARGEST <= propagation_speed <= LARGEST:
         raise InvalidProblem(f"the propagation speed must be positive, not {propagation_speed:g} m/s", where)

@@ -240,7 +240,7 @@ Budget = Annotated[
         "--budget",
         metavar="NAME=N,...",
         callback=lambda text: text and relax(budget=budget_of(text, "--budget")),
-        help="Let files hold more: bytes, text (bytes of a document), rows, columns, cells, nesting.",
+        help="Let files hold more: bytes, text (bytes of a document), rows, columns, cells, nesting, unknowns.",
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON on standard output and nothing else.")]

@@ -11,7 +11,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
-from optloc.base.inputs import Budget, access
+from optloc.base.inputs import Budget, access, at_most
 from optloc.base.types import Array, Rows, Stations
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.files.measurements import ESTIMATE, Chunk, check_repeats, chunks_of, square, with_baseline
@@ -222,6 +222,7 @@ def _problem(
     demands = {join(source, f"[[constraints]] {i + 1}"): table for i, table in enumerate(file.constraints)}
     constraints = constraints_of({**demands, **more}, stations, frame, motions, epochs.targets, speed)
     made = Problem(stations, rows, noise, times, motions, biases, priors, frame, constraints)
+    at_most("unknowns", made.layout.n_shared, source)
     return _check(made, source)
 
 

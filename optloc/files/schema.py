@@ -297,6 +297,10 @@ class WindowTable(_Table):
     """Length of an epoch, such as "0.1 s"; by default rows of exactly equal time belong together."""
 
 
+# Biases, priors and constraints that a person writes down; each is a unit of work in every step of every fix.
+_MANY = 100
+
+
 class ProblemFile(_Table):
     """A problem file, format 1."""
 
@@ -313,9 +317,9 @@ class ProblemFile(_Table):
     target: TargetTable = TargetTable()
     targets: dict[str, TargetTable] = Field(default_factory=dict)
     """Motions of single targets by name."""
-    biases: list[BiasTable] = Field(default_factory=list)
-    priors: list[PriorTable] = Field(default_factory=list)
-    constraints: list[ConstraintTable] = Field(default_factory=list)
+    biases: list[BiasTable] = Field(default_factory=list, max_length=_MANY)
+    priors: list[PriorTable] = Field(default_factory=list, max_length=_MANY)
+    constraints: list[ConstraintTable] = Field(default_factory=list, max_length=_MANY)
     covariance: list[list[float]] | None = None
     """Covariance of the rows of one epoch across all kinds, in the order of the file, in their units."""
 

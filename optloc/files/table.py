@@ -136,11 +136,16 @@ class Table:
     def _dates(self, key: str, column: Array) -> Array:
         import pandas as pd
 
+        # What is no text is no date: pandas would take a number for nanoseconds.
+        other = next((row for row, cell in enumerate(column) if not isinstance(cell, str | None)), None)
+        if other is not None:
+            what = f"{column[other]!r} is no date, but others are"
+            raise InvalidProblem(what, self.where(key, other), "use ISO 8601 everywhere, or numbers")
         try:
             # pandas knows time zones, which numpy does not; one that is not written is UTC.
             return np.asarray(pd.to_datetime(column, format="ISO8601", utc=True).tz_localize(None).to_numpy())
         except (ValueError, OverflowError, TypeError) as error:
-            what = str(error).partition(",")[0]
+            what = str(error).partition(",")[0].partition(". You")[0]
             raise InvalidProblem(f"a date cannot be read ({what})", self.where(key), "use ISO 8601") from None
 
     def _parse(self, key: str, column: Array) -> Array:

@@ -338,6 +338,9 @@ def _check_prior(problem: Problem, prior: Prior) -> None:
         raise InvalidProblem(f"the mean is {why}", where, "give SI units, or no prior")
 
 
+# Corners of a polygon: each edge is held against each other one, and is a piece of the region.
+_CORNERS = 1000
+
 # What cannot be demanded: malformed or contradictory constraints are refused with a sentence that names them.
 
 # Lengths relative to the polygon's size, and areas to its square, below which corners and edges count as meeting: four
@@ -402,6 +405,9 @@ def check_polygon(vertices: Array, where: str) -> None:
     if vertices.ndim != 2 or vertices.shape[-1] != 2 or len(vertices) < 3:
         count = "no pairs" if vertices.ndim != 2 or vertices.shape[-1] != 2 else f"only {len(vertices)} corners"
         raise InvalidProblem(f"the polygon has {count}", where, "give three corners or more, two coordinates each")
+    if len(vertices) > _CORNERS:
+        what = f"the polygon has {len(vertices)} corners, {_CORNERS} at most"
+        raise InvalidProblem(what, where, "leave out those that change little")
     bad, why = _beyond(vertices)
     if bad.any():
         corner = int(np.flatnonzero(bad.any(-1))[0])

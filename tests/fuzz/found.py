@@ -34,6 +34,16 @@ noise = ["1 m"]
 [[method]]
 method = "gtrs+lsr"
 """
+POLYGON = (
+    '[[constraints]]\nkind = "polygon"\ncorners = [' + ", ".join(f"[{i}.0, {i * i}.0]" for i in range(2000)) + "]\n"
+)
+PRIOR = '[[priors]]\nname = "position"\nmean = [1.0, 2.0]\nsigma = "1 m"\n'
+ROW = '{{ a = "{}", target = "{}", z = 3000.0 }}'
+TARGETS = f"""[[measurements]]
+kind = "range"
+sigma = 1.0
+rows = [{", ".join(ROW.format("ABCD"[i % 4], i // 4) for i in range(8000))}]
+"""
 POINT = (
     '{"features": [{"type": "Feature", "id": 1, "properties": %s, "geometry": {"type": "Point", "coordinates": %s}}]}'
 )
@@ -61,7 +71,7 @@ def table(name, content):
 
 
 FIX, CHECK, SIMULATE = ["fix", "p.toml", "--json"], ["check", "p.toml"], ["simulate", "p.toml", "--truth", "1,2"]
-RUN = ["study", "run", "s.toml", "--out", "out", "-x", "in-process", "-q"]
+RUN = ["study", "run", "s.toml", "--out", "out", "-j", "1", "-q"]
 SITES = ["convert", "s.geojson", "--out", "s.csv"]
 FOUND = {
     "station at 1e300 m": (FIX, problem("4100.0", "1e300"), ["p.toml", "1e+300", "beyond 1e+30"]),
@@ -95,6 +105,24 @@ FOUND = {
         [*SIMULATE, "--out", "s.toml"],
         {"p.toml": GOOD.replace("{ a", "{ time = 0.0, a").replace("0.0, a", '"0.0", a', 1)},
         None,
+    ),
+    "a billion decimals": (
+        ["convert", "toa.csv", "--stations", "rx.csv", "--sigma", "1 ns", "--out", "t.toml"],
+        {"toa.csv": "message,station,toa_ns\n1,A,1e-999999999\n1,B,2\n", "rx.csv": "name,x,y\nA,0,0\nB,1,0\n"},
+        ["toa.csv, row 1, column 'toa_ns'", "1e-999999999"],
+    ),
+    "a polygon of 2000 corners": (FIX, problem(text=f"{GOOD}{POLYGON}"), ["2000 corners", "1000 at most"]),
+    "200 priors": (FIX, problem(text=GOOD + 200 * PRIOR), ["priors", "100"]),
+    "2000 targets at once": (FIX, problem(text=f"format = 1\n{STATIONS}{TARGETS}"), ["4000 unknowns, 300 at most"]),
+    "a date among numbers": (
+        FIX,
+        {"p.toml": GOOD.replace("{ a", "{ time = 3.0, a").replace("3.0, a", '"2024-05-01", a', 1)},
+        ["row 2, column 'time'", "3.0 is no date"],
+    ),
+    "a carrier of 1e-310 Hz": (
+        FIX,
+        problem('"groa"\nunit = "dB"', '"fdoa"\nunit = "Hz"\ncarrier_hz = 1e-310', f"format = 1\n{STATIONS}{GAINS}"),
+        ["carrier", "positive"],
     ),
     "properties that are a list": (SITES, {"s.geojson": POINT % ("[1]", "[11.0, 47.0]")}, ["feature 1", "properties"]),
     "a name that is a table": (SITES, {"s.geojson": (POINT % ('{"name": {}}', "[1, 2]")).replace('"id": 1, ', "")},

@@ -35,6 +35,8 @@ GUESSES = {
     "height": "height h alt altitude elevation ellipsoidalheight",
 }
 GEOJSON = (".geojson", ".json")
+# Decimals of an instant: no clock tells more than 20, and a float written in full has some fifty.
+_DIGITS = 60
 # Properties of a GeoJSON point that may be its name or its height, the likeliest first.
 _NAMES = ("name", "station", "title", "callsign", "id", "receiver", "sensor")
 _HEIGHTS = ("height", "height_m", "altitude", "alt", "elevation", "ele", "h_m", "h")
@@ -102,7 +104,8 @@ class Roles:
                 number = Decimal(str(cell).strip()) if cell is not None else Decimal("nan")
             except InvalidOperation:
                 number = Decimal("nan")
-            if not (number.is_finite() and abs(number) <= LARGEST):
+            # Written out, 1e-999999999 has a billion digits.
+            if not (number.is_finite() and abs(number) <= LARGEST and -int(number.as_tuple().exponent) <= _DIGITS):
                 what = "the cell is empty" if cell in (None, "") else f"{str(cell)[:80]!r} is not a finite number"
                 raise InvalidProblem(what, self.table.where(name, row), "give a number, or leave the row out")
             out.append(number)
