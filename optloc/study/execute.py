@@ -138,9 +138,7 @@ def compute_all(chunks: Iterable[Chunk], by: Executor) -> Generator[Part]:
     work = _Work(chunks, by.limit)
     if not work.left:
         return
-    with ExitStack() as stack:
-        begun = stack.enter_context(EXECUTORS[by.name].begin(by))
-        here = stack.enter_context(closing(Pool(1)))
+    with EXECUTORS[by.name].begin(by) as begun, closing(Pool(1)) as here:
         while work.left:
             try:
                 for found in _parallel(work.hand_out(), begun):
@@ -246,16 +244,29 @@ class _Work:
         return min(self._limit, max(task.share * self._limit, _BUILD))
 
 
-# A process apart. It is begun without multiprocessing, which would run the caller's script again, and which lets the
-# workers of a cluster begin none.
+# A process apart, without multiprocessing: that would run the caller's script again, and lets no daemon begin any.
 
 # Seconds: to begin, half of one where a processor is free; without a task, after which it ends, as nobody tells a
 # cluster that a study is over; between the end of its pipe and its own, which says how it ended.
 _START, _IDLE, _MOMENT = 120.0, 60.0, 0.2
 # Workers times threads would be more than the processors, and each thread of BLAS reserves memory.
 _ONE = ("OPTLOC", "OMP_NUM", "OPENBLAS_NUM", "MKL_NUM", "BLIS_NUM", "VECLIB_MAXIMUM", "NUMEXPR_NUM", "NUMBA_NUM")
-_BEGIN = "import pickle, sys; f = sys.stdin.buffer; f.peek() or sys.exit(); "
-_BEGIN += "sys.path[:], run = pickle.load(f); pickle.loads(run)()"
+# From its beginning the system kills its group where the other end of its pipe is closed, or written to. A thread that
+# waits for that does so everywhere, but not while machine code holds the interpreter.
+_BEGIN = """
+import contextlib, os, pickle, select, signal, sys
+def die_with(file, on):
+    with contextlib.suppress(ImportError, AttributeError, OSError):
+        import fcntl
+        fcntl.fcntl(file, fcntl.F_SETOWN, -os.getpgrp())
+        fcntl.fcntl(file, fcntl.F_SETSIG, signal.SIGKILL)
+        fcntl.fcntl(file, fcntl.F_SETFL, os.O_ASYNC if on else 0)
+        if on and select.select([file], [], [], 0)[0]:
+            os.killpg(os.getpgrp(), signal.SIGKILL)
+sys.path[:], run = pickle.load(sys.stdin.buffer) if sys.stdin.buffer.peek() else sys.exit()
+die_with(0, True)
+pickle.loads(run)(die_with)
+"""
 
 
 class Apart:
@@ -403,7 +414,7 @@ class Pool:
 # What runs in the process apart.
 
 
-def serve(memory: int | None) -> NoReturn:
+def serve(memory: int | None, die_with: Callable[[IO[bytes], bool], None]) -> NoReturn:
     """Compute the chunks that come in at standard input, one by one, and answer at standard output, until it closes."""
     restrain(memory)
     # A method may read and print what it likes. First, lest a pipe's copy takes the place of closed standard error.
@@ -411,13 +422,13 @@ def serve(memory: int | None) -> NoReturn:
     tasks, answers = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
     for number in range(3):
         os.dup2(nowhere, number)
-    Thread(target=_listen, args=(tasks, line), daemon=True).start()
+    Thread(target=_listen, args=(tasks, line, die_with), daemon=True).start()
     found: object = True
     try:
         while True:
             if os.getpid() != own:
                 os._exit(0)  # a method forked, and its copy has arrived here, too
-            _die_with(tasks, on=False)
+            die_with(tasks, False)
             _send(answers, found)
             chunk = pickle.loads(line.get(timeout=_IDLE))  # noqa: S301
             try:
@@ -430,27 +441,15 @@ def serve(memory: int | None) -> NoReturn:
         _end()
 
 
-def _listen(tasks: IO[bytes], line: SimpleQueue[bytes]) -> None:
+def _listen(tasks: IO[bytes], line: SimpleQueue[bytes], die_with: Callable[[IO[bytes], bool], None]) -> None:
     """Pass on what comes in; where nothing can come any more, who sent it has ended, and so does this process."""
     try:
         while True:
             message = pickle.load(tasks)  # noqa: S301
-            _die_with(tasks, on=True)
+            die_with(tasks, True)
             line.put(message)
     finally:
         _end()
-
-
-def _die_with(tasks: IO[bytes], *, on: bool) -> None:
-    """Have the system kill this group of processes, or not, when the other end of a pipe is closed or written to."""
-    # A thread that waits for that does the same on every system, but not while machine code holds the interpreter.
-    with suppress(ImportError, AttributeError, OSError):
-        import fcntl
-
-        fcntl.fcntl(tasks, fcntl.F_SETOWN, -os.getpgrp())
-        fcntl.fcntl(tasks, fcntl.F_SETSIG, signal.SIGKILL)
-        flags = fcntl.fcntl(tasks, fcntl.F_GETFL)
-        fcntl.fcntl(tasks, fcntl.F_SETFL, flags | os.O_ASYNC if on else flags & ~os.O_ASYNC)
 
 
 def _end() -> NoReturn:
