@@ -206,6 +206,8 @@ def runs_of(loaded: Loaded) -> Iterator[tuple[str, Problem, tuple[str, ...]]]:
     if problem.priors:
         what = f"the file has a prior of {problem.priors[0].name!r}, which a track does not take"
         raise InvalidProblem(what, source, "leave it out, and give --start and --start-sigma")
+    if all(motion.known is not None for motion in problem.motions):
+        raise InvalidProblem("the motion of every target is known", source, "leave the places of one out")
     if problem.epochs > 1 and not np.isfinite(loaded.times).all():
         raise InvalidProblem("a track needs the time of each epoch", source, "give the measurements a column 'time'")
     # Targets free at each epoch have epochs of their own; others share them, told apart by their rows.

@@ -38,6 +38,7 @@ POLYGON = (
     '[[constraints]]\nkind = "polygon"\ncorners = [' + ", ".join(f"[{i}.0, {i * i}.0]" for i in range(2000)) + "]\n"
 )
 PRIOR = '[[priors]]\nname = "position"\nmean = [1.0, 2.0]\nsigma = "1 m"\n'
+KNOWN = "[target]\nrows = [{ x = 1.0, y = 2.0 }]\n"
 ROW = '{{ a = "{}", target = "{}", z = 3000.0 }}'
 TARGETS = f"""[[measurements]]
 kind = "range"
@@ -114,6 +115,8 @@ FOUND = {
     "a polygon of 2000 corners": (FIX, problem(text=f"{GOOD}{POLYGON}"), ["2000 corners", "1000 at most"]),
     "200 priors": (FIX, problem(text=GOOD + 200 * PRIOR), ["priors", "100"]),
     "2000 targets at once": (FIX, problem(text=f"format = 1\n{STATIONS}{TARGETS}"), ["4000 unknowns, 300 at most"]),
+    "a bound of nothing": (["crlb", "p.toml"], problem(text=f"{GOOD}{KNOWN}"), ["nothing is unknown"]),
+    "a track of what is known": (["track", "p.toml"], problem(text=f"{GOOD}{KNOWN}"), ["every target is known"]),
     "a date among numbers": (
         FIX,
         {"p.toml": GOOD.replace("{ a", "{ time = 3.0, a").replace("3.0, a", '"2024-05-01", a', 1)},
