@@ -51,8 +51,6 @@ def crlb(problem: Problem, truth: Array) -> Array:
     J. D. Gorman and A. O. Hero, "Lower bounds for parametric estimation with constraints" (1990), theorem 1.
     """
     x, held = np.asarray(truth, dtype=float), exact(problem)
-    if problem.layout.size == 0:
-        raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
     equations = equations_at(problem, x)
     if not held:
         return covariance(equations)[0]

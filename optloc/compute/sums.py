@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.compute.jit import enabled
 from optloc.compute.pack import pack
@@ -43,6 +44,8 @@ def equations_at(
 
 def summed(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = None, *, at: Array | None = None) -> Normal:
     """Return the normal equations of the measurements alone; arguments as of `equations_at`."""
+    if x.shape[-1] == 0:
+        raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
     quick = _by_machine_code(problem, x, noise) if at is None else None
     if quick is not None:
         return quick

@@ -52,7 +52,7 @@ class Units:
 
     def name(self, unit: str | None) -> str:
         """Return a unit; None is the SI unit."""
-        return unit or SI_UNIT[self.quantity]
+        return SI_UNIT[self.quantity] if unit is None else unit
 
     def conversion(self, unit: str | None, where: str) -> Conversion:
         """Return how a unit becomes SI; None is the SI unit."""

@@ -208,7 +208,7 @@ def prior_of(table: PriorTable, dimension: int, source: str) -> Prior:
             "there is no such unknown", where, f"{nearest(base, list(_STATES))}; those of biases stand with the bias"
         )
     quantity, default = _STATES[base]
-    units, unit = Units(quantity), table.unit or default
+    units, unit = Units(quantity), default if table.unit is None else table.unit
     size = 1 if base == "emission" else dimension
     if len(table.mean) != size:
         raise InvalidProblem(f"the mean has {len(table.mean)} coordinates, not {size}", where, "give one each")
