@@ -85,6 +85,9 @@ class Prepared:
         return fix if len(shape) == 1 else fix.reshape(shape)
 
     def _flat(self, z: Array, shape: tuple[int, ...]) -> Problem:
+        # A problem without batch axes takes those of its measurements: there is nothing to make flat.
+        if not self.shape:
+            return self.problem.with_rows(z=np.broadcast_to(z, (*shape, z.shape[-1])).reshape(-1, z.shape[-1]))
         return self.problem.with_rows(z=np.broadcast_to(z, (*shape, z.shape[-1]))).flat()
 
     def _batch(self, z: Array) -> tuple[int, ...]:
