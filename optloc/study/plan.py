@@ -10,7 +10,6 @@ import json
 import os
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib.resources import as_file, files
 from importlib.resources.abc import Traversable
@@ -373,34 +372,7 @@ def _scale(noise: Noise, factor: Array) -> Noise:
     return Noise(tuple(blocks))
 
 
-# What this machine has, and what a process may take of it.
-
-
 def workers() -> int:
     """Return how many processes this machine can run at a time."""
     # Processors that this process may use: containers and schedulers leave it fewer than the machine has.
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-# What methods may take of the memory of a machine, if all processes do so; and bytes that each may use at least:
-# libraries alone reserve 2e9.
-_MEMORY, _LEAST_MEMORY = 0.8, 4 << 30
-
-
-def memory_of(count: int) -> int | None:
-    """Return the bytes that each of so many processes of this machine may use; None where that is not known."""
-    if not hasattr(os, "sysconf"):
-        return None
-    return max(_LEAST_MEMORY, int(_MEMORY * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / count))
-
-
-def restrain(memory: int | None) -> None:
-    """Limit the memory of this process, have it leave no core, and be the first to go where memory is short."""
-    with suppress(ImportError, OSError, ValueError):
-        import resource
-
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-        if memory is not None:
-            resource.setrlimit(resource.RLIMIT_AS, (memory, resource.getrlimit(resource.RLIMIT_AS)[1]))
-    with suppress(OSError):
-        Path("/proc/self/oom_score_adj").write_text("1000", encoding="ascii")

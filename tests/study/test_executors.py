@@ -1,6 +1,7 @@
 """One study on several executors, with workers and runs that are killed: the same table, bit for bit."""
 
 import importlib.util
+import json
 import os
 import signal
 import subprocess
@@ -130,3 +131,36 @@ def test_an_unreachable_scheduler_is_one_sentence_and_nothing_is_lost(tmp_path, 
     with pytest.raises(InvalidProblem, match=r"tcp://127\.0\.0\.1:1: the scheduler cannot be reached"):
         run_plan(plan(), out, executor("dask", None, "tcp://127.0.0.1:1"))
     assert progress(out).done == 0
+
+
+PLUGIN = """
+from optloc.study.baselines import BASELINES, Baseline
+
+def same(drawn, start):
+    return BASELINES["truth"].run(drawn, start)
+
+BASELINES["mine"] = Baseline(same, "what is known", guess=False)
+"""
+
+
+def test_a_plugin_of_the_command_line_is_known_to_the_processes_of_a_study(tmp_path):
+    (tmp_path / "mine.py").write_text(PLUGIN)
+    (tmp_path / "study.toml").write_text(QUICK + '\n[[method]]\nbaseline = "mine"\n')
+    ask = [
+        sys.executable,
+        "-m",
+        "optloc.cli",
+        "--plugin",
+        "mine.py",
+        "study",
+        "run",
+        "study.toml",
+        "--out",
+        "out",
+        "-j",
+        "1",
+    ]
+    made = subprocess.run([*ask, "--json"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert made.returncode == 0, made.stderr
+    found = {(one["method"], one["status"]) for one in json.loads(made.stdout)["methods"]}
+    assert ("mine", "unproven") in found  # an answer, and one that nobody has proven

@@ -12,7 +12,7 @@ from recipes import installed, write_package
 from study.texts import assert_identical, plan, run_here
 
 from optloc.base.errors import InvalidProblem
-from optloc.study import execute
+from optloc.study import apart
 from optloc.study.execute import executor, run_plan
 from optloc.study.folder import read_frame
 from optloc.study.trial import DIED, FAILED, INVALID, LATE
@@ -126,7 +126,7 @@ def test_a_method_that_forks_answers_once(tmp_path):
 
 @FULL
 def test_a_method_that_keeps_memory_harms_no_other(tmp_path, monkeypatch):
-    monkeypatch.setattr(execute, "memory_of", lambda count: 3 << 30)
+    monkeypatch.setattr(apart, "memory_of", lambda count: 3 << 30)
     found = run_plan(plan(study(["hoard"])), tmp_path / "out", executor("processes", 1))
     assert found.methods["gtrs+lsr", "unproven"] == 3
     assert found.methods["hoard", DIED] == 3
@@ -153,7 +153,7 @@ def check(folder, names):
 )
 def test_methods_that_misbehave_are_named_and_the_study_goes_on(jobs, some, tmp_path, monkeypatch):
     # Little more than libraries reserve: what is asked for beyond is never touched.
-    monkeypatch.setattr(execute, "memory_of", lambda count: 3 << 30)
+    monkeypatch.setattr(apart, "memory_of", lambda count: 3 << 30)
     deadly = {"exit", "exit-well", "segfault", "kill", "interrupt", "garbage", "small-memory"}
     names = [name for name in ROGUES if (name in deadly) == (some == "processes")]
     found = run_plan(plan(study(names)), tmp_path / "out", executor("processes", jobs))
@@ -204,7 +204,7 @@ def test_of_many_trials_one_is_to_blame(way, tmp_path, monkeypatch):
 
 
 def test_a_process_that_cannot_begin_is_a_sentence_and_stores_nothing(tmp_path, monkeypatch):
-    monkeypatch.setattr(execute, "_BEGIN", "import sys; sys.exit(7)")
+    monkeypatch.setattr(apart, "_BEGIN", "import sys; sys.exit(7)")
     with pytest.raises(InvalidProblem, match=r"no process can be begun \(its process ended with exit code 7\)"):
         run_plan(plan(), tmp_path / "out", executor("processes", 1))
     assert not list((tmp_path / "out" / "parts").iterdir())
