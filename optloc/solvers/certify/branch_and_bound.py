@@ -26,11 +26,11 @@ from optloc.solvers.certify.posed import agrees, is_free, surfaces_of
 from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP
-from optloc.solvers.pool import Pool, offer, pack
+from optloc.solvers.pool import Pool, in_parts, offer, pack, where
 from optloc.solvers.refine import refine
 from optloc.solvers.stages import lsr
 from optloc.solvers.starts.position import spread_of, vectors
-from optloc.solvers.verdict.judge import fill, judge, standing, verdict
+from optloc.solvers.verdict.judge import failed, fill, judge, standing, verdict
 
 # What a proof lets a certificate say, in sentences.
 
@@ -456,7 +456,7 @@ def certify(
     -------
     Fix
         Like `fix`. Fixes without an answer stay as they are; what cannot be proven has the certificate "unknown" with
-        the reason.
+        the reason, and one whose proof fails numerically the status `numerical`.
 
     Raises
     ------
@@ -473,8 +473,13 @@ def certify(
     if not 0.0 <= margin < np.inf:
         raise InvalidProblem(f"the margin is {margin}", "margin", "give 0 or a positive number")
     corners = None if region is None else _corners(problem, region)
-    pool = certified(flat, accept(flat, fix.reshape((flat.batch_shape[0],))), corners, margin, _EFFORT)
-    return verdict(flat, pool).reshape(shape)
+    given = fix.reshape((flat.batch_shape[0],))
+
+    def work(some: Problem, part: slice) -> Fix:
+        with where("certify"):
+            return verdict(some, certified(some, accept(some, given[part]), corners, margin, _EFFORT))
+
+    return in_parts(flat, work, failed=failed).reshape(shape)
 
 
 def value_certified(problem: Problem, pool: Pool | None) -> Pool:
