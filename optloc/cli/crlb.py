@@ -53,6 +53,8 @@ def run_crlb(
     loaded = read(file, values=False)
     claim_outputs(picture=plot, inputs=[file])
     problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
+    if not problem.layout.n_shared:
+        raise InvalidProblem("nothing is unknown but what each epoch has of its own", loaded.source, "give a bias")
     # Biases alone, of known targets, need no place: their bound does not depend on a guess.
     truth = _solve(file) if at is None and _sought(problem) else vector(problem, at, velocity, geodetic)
     bound = np.asarray(crlb(problem, truth))

@@ -121,7 +121,8 @@ def _simple(problem: Problem) -> bool:
     return (
         not (problem.constraints or problem.biases or problem.priors)
         and len(problem.motions) == 1
-        and (motion.order, motion.span, motion.known) == (0, "run", None)
+        and (motion.order, motion.span) == (0, "run")
+        and motion.known is None
         and all(MODELS[r.kind].ranges is not None and bool((r.target == 0).all()) for r in problem.rows)
         and stations.position.shape[-3] == 1
         and (stations.covariance is None or (stations.span == "noise" and stations.covariance.ndim == 3))

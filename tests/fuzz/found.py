@@ -115,6 +115,16 @@ FOUND = {
     "a polygon of 2000 corners": (FIX, problem(text=f"{GOOD}{POLYGON}"), ["2000 corners", "1000 at most"]),
     "200 priors": (FIX, problem(text=GOOD + 200 * PRIOR), ["priors", "100"]),
     "2000 targets at once": (FIX, problem(text=f"format = 1\n{STATIONS}{TARGETS}"), ["4000 unknowns, 300 at most"]),
+    "offsets of stations about a known target": (
+        FIX,
+        problem("[stations]", '[stations]\nsigma = "1 m"', f"{GOOD}{KNOWN}"),
+        None,
+    ),
+    "a bound of emission times alone": (
+        ["crlb", "p.toml"],
+        problem('"range"', '"toa"', f"{GOOD}{KNOWN}"),
+        ["p.toml", "nothing is unknown but"],
+    ),
     "an empty unit": (FIX, problem("sigma", 'unit = ""\nsigma'), ["unknown unit ''"]),
     "a bound of nothing": (["crlb", "p.toml"], problem(text=f"{GOOD}{KNOWN}"), ["nothing is unknown"]),
     "a track of what is known": (["track", "p.toml"], problem(text=f"{GOOD}{KNOWN}"), ["every target is known"]),
