@@ -66,6 +66,7 @@ def budgets() -> str:
         "columns": "columns of a table",
         "cells": "cells of a table; places of moving stations, one for each epoch",
         "nesting": "tables and lists within each other in a document",
+        "unknowns": "unknowns of a problem that its epochs share",
     }
     lines = [f"| `{name}` | {what[name]} | {most} |" for name, most in asdict(Budget()).items()]
     return "\n".join(["| name | what | at most |", "|---|---|---|", *lines])
