@@ -77,10 +77,13 @@ def test_many_fixes_of_many_structures_leave_nothing_behind(counts):
     assert (files, threads) == (0, 0)
 
 
-def told(number):
+def said(fix):
     """Return what a fix says, to the last bit."""
-    fix = solve(posed(number, 0))
     return fix.status.label, fix.x.tobytes(), fix.cov.tobytes()
+
+
+def told(number):
+    return said(solve(posed(number, 0)))
 
 
 def child(number, pipe):
@@ -133,7 +136,7 @@ def test_threads_forks_and_workers_give_one_answer():
             process = fork.Process(target=child, args=(number, theirs))
             process.start()
             ends.append((mine, process))
-        workers = Parallel(n_jobs=2)(delayed(told)(number) for number in numbers)
+        workers = [said(fix) for fix in Parallel(n_jobs=2)(delayed(solve)(posed(number, 0)) for number in numbers)]
         assert list(threads) == expected
     assert workers == expected
     for (mine, process), answer in zip(ends, expected, strict=True):

@@ -41,7 +41,14 @@ COMMANDS = (
 def start(command, place, **options):
     arguments = [sys.executable, "-c", SCRIPT, *command.split()]
     return subprocess.Popen(
-        arguments, cwd=place, stdout=subprocess.PIPE, stderr=subprocess.PIPE, process_group=0, **options
+        arguments,
+        cwd=place,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        process_group=0,
+        # Tests that run in the background do not hear Ctrl-C, nor would what they begin.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509  (no threads here)
+        **options,
     )
 
 

@@ -270,7 +270,9 @@ def test_reproduce_writes_tables_and_pictures(report, tmp_path, monkeypatch):
     assert "Table 3: initial error" in result.stdout
     assert len((folder / "table-2.csv").read_text(encoding="utf-8").splitlines()) == 1 + 16
     assert (folder / "figure-1.png").read_bytes().startswith(b"\x89PNG")
-    assert RUN.invoke(app, ["reproduce", "registration", "--out", str(folder), "--quiet"]).output == ""
+    again = ["reproduce", "registration", "--out", str(folder), "--quiet"]
+    assert RUN.invoke(app, again).exit_code == 2
+    assert RUN.invoke(app, [*again, "--force"]).output == ""
 
 
 def test_draws_depend_on_seed_and_key_alone():

@@ -106,8 +106,8 @@ def test_geojson_has_the_region_of_a_far_fix():
     assert far.fixes[0].chart.name != "cartesian"
     found = geojson(far)["features"][-1]
     assert found["properties"]["role"] == "region95"
-    assert found["geometry"]["type"] == "MultiPolygon"
-    ring = np.array(found["geometry"]["coordinates"][0][0])
+    assert found["geometry"]["type"] == "Polygon"
+    ring = np.array(found["geometry"]["coordinates"][0])
     assert (ring[0] == ring[-1]).all()
     assert area(ring[:, :2]) > 0
     lon, lat = np.degrees(problem.frame.to_geodetic(far.fixes[0].position.reshape(1, 3))[1::-1]).ravel()
