@@ -37,6 +37,15 @@ method = "gtrs+lsr"
 POLYGON = (
     '[[constraints]]\nkind = "polygon"\ncorners = [' + ", ".join(f"[{i}.0, {i * i}.0]" for i in range(2000)) + "]\n"
 )
+HEIGHT = """format = 1
+frame = { kind = "ecef" }
+[stations]
+rows = [{ name = "A", x = 4177e3, y = 855e3, z = 4728e3 }]
+[[measurements]]
+kind = "height"
+sigma = 5.0
+rows = [{ z = 900.0 }]
+"""
 PRIOR = '[[priors]]\nname = "position"\nmean = [1.0, 2.0]\nsigma = "1 m"\n'
 KNOWN = "[target]\nrows = [{ x = 1.0, y = 2.0 }]\n"
 ROW = '{{ a = "{}", target = "{}", z = 3000.0 }}'
@@ -143,6 +152,7 @@ FOUND = {
                                ["feature 1", "no name"]),
     "a longitude of 400 digits": (SITES, {"s.geojson": POINT % ("{}", f"[{'9' * 400}, 47.0]")}, ["beyond 1e+30"]),
     "distances the other way round": (RUN, {"s.toml": STUDY}, ["scenario 'one'", "distance", "20000", "exchange them"]),
+    "a height and nothing else": (["fix", "p.toml", "-q", "-m", "gtrs+lsr"], {"p.toml": HEIGHT}, None),
     "elevations beyond the zenith": (
         RUN,
         study('"20 km", "10 km"]', '"1 km", "2 km"], elevation_deg = [80.0, 100.0]'),

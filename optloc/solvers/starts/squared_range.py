@@ -195,6 +195,7 @@ def _station_nodes(problem: Problem, found: Ranges | None) -> tuple[Array, Array
     )
     if found is None:
         used = sorted({int(s) for rows in problem.rows for s in (*rows.a, *rows.b) if s >= 0})
+        used = used or list(range(problem.stations.count))  # heights alone name none, and are no start
         nodes = position[:, 0, used]
         return nodes, np.ones(nodes.shape[:2], dtype=bool)
     return position[:, found.epoch, found.station], found.inside
