@@ -261,15 +261,15 @@ def _points(rows: Array, right: Array, quadric: Quadric, find: Finder) -> tuple[
             left = apply(b, points) - h[:, None]
             y[part], valid[part], cost[part] = points.transpose(2, 1, 0), found.T, (left * left).sum(axis=0).T
             usable[part] = ~bad
-    # the apex, in the last slot of the cone, is no sign that the multiplier was found
-    roots = slots - 1 if quadric.shape == "cone" and slots > 1 else slots
-    lost = np.flatnonzero(usable & ~valid[:, :roots].any(axis=1))
-    if lost.size:
-        points, met = _line_points(rows[lost], right[lost], quadric.square, quadric.linear)
-        few = min(roots, 2)
-        y[lost, :few], valid[lost, :few] = points[:, :few], met[:, :few]
-        left = np.einsum("Nqn,Nkn->Nkq", rows[lost], points[:, :few]) - right[lost, None]
-        cost[lost, :few] = (left * left).sum(axis=-1)
+        # the apex, in the last slot of the cone, is no sign that the multiplier was found
+        roots = slots - 1 if quadric.shape == "cone" and slots > 1 else slots
+        lost = np.flatnonzero(usable & ~valid[:, :roots].any(axis=1))
+        if lost.size:
+            points, met = _line_points(rows[lost], right[lost], quadric.square, quadric.linear)
+            few = min(roots, 2)
+            y[lost, :few], valid[lost, :few] = points[:, :few], met[:, :few]
+            left = np.einsum("Nqn,Nkn->Nkq", rows[lost], points[:, :few]) - right[lost, None]
+            cost[lost, :few] = (left * left).sum(axis=-1)
     y[~valid], cost[~valid] = np.nan, np.inf
     return y, cost, valid
 

@@ -421,7 +421,7 @@ def _without_others(tests: Tested, late: Array) -> tuple[Array, Array]:
 
 def _expect(error: Array, sigma: Array, late: Array) -> tuple[float, float, float, Array]:
     """Return share, mean delay and gain, and the chance of each row to be late: errors are normal, plus delays."""
-    from scipy.special import log_ndtr
+    from scipy.special import erfcx, log_ndtr
 
     share = float(np.clip(late.mean(), 0.5 / max(len(late), 1), 0.9)) if len(late) else 0.0
     delay = float(np.mean(error[late])) if late.any() else 0.0
@@ -435,7 +435,8 @@ def _expect(error: Array, sigma: Array, late: Array) -> tuple[float, float, floa
         density = np.log(share / delay) + 0.5 * (sigma / delay) ** 2 - error / delay + tail
         both = np.logaddexp(np.log1p(-share) + prompt, density)
         chance = np.exp(density - both)
-        mean = middle + sigma * np.exp(-0.5 * (middle / sigma) ** 2 - 0.5 * np.log(2.0 * np.pi) - tail)
+        # its mean: the density over the distribution of a normal variable, as erfcx has it without cancellation
+        mean = middle + sigma * np.sqrt(2.0 / np.pi) / erfcx(-middle / (np.sqrt(2.0) * sigma))
         new = float(np.clip(chance.mean(), 1e-12, 1.0 - 1e-6))
         longer = float((chance * mean).sum() / max(chance.sum(), 1e-300))
         done = abs(new - share) <= _ENDED * share and abs(longer - delay) <= _ENDED * delay

@@ -9,7 +9,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
-from optloc.base.units import Conversion
+from optloc.base.units import LARGEST, Conversion
 from optloc.files.schema import MeasurementsTable, Units, join, kind_model
 from optloc.files.table import Epochs, Table, distinct
 from optloc.models import Model
@@ -217,7 +217,11 @@ def _values(c: Context, unit: Conversion, weight: Array) -> Array:
         c.table.numbers("z")
         raise AssertionError
     # An absent row may have any value, or none: zero keeps sums finite.
-    return np.where(weight > 0.0, unit.to_si(raw), 0.0)
+    z = np.where(weight > 0.0, unit.to_si(raw), 0.0)
+    large = np.flatnonzero(np.abs(z) > LARGEST)  # decibels that a file may well hold are ratios that none has
+    if len(large):
+        raise InvalidProblem(f"the value is beyond {LARGEST:g}", c.table.where("z", int(large[0])), "correct it")
+    return z
 
 
 def _stations(c: Context, key: str, needed: bool) -> Array:
@@ -304,10 +308,11 @@ def spread_of(
 
 
 def _positive(c: Context, sigma: Array, *, column: bool) -> Array:
-    bad = np.flatnonzero(sigma <= 0.0)
+    bad = np.flatnonzero(~((sigma > 0.0) & (sigma <= LARGEST)))
     if len(bad):
         place = c.table.where("sigma", int(bad[0])) if column else join(c.where, "key 'sigma'")
-        raise InvalidProblem("the standard deviation is not positive", place, "give a positive number")
+        why = f"beyond {LARGEST:g}" if sigma[bad[0]] > 0.0 else "not positive"
+        raise InvalidProblem(f"the standard deviation is {why}", place, "give a positive number")
     return sigma
 
 

@@ -102,7 +102,8 @@ def of_fixes(own, problem, told):
         return f"same: its fix is not judged: {', '.join(lacks) or 'many epochs'}"
     for epoch, said in enumerate(told["fixes"]):
         fix = optloc.solve(posed(own, epoch))
-        if fix.status.label != said["status"]:
+        # Which refusal it is may hang on the last digit; what is claimed may not.
+        if fix.status.label != said["status"] and "ok" in (fix.status.label, said["status"]):
             return f"mismatch: epoch {epoch} is {said['status']}, of the plain numbers {fix.status.label}"
         # An answer that must not be used may be any of several, as rounding has it.
         if fix.status != optloc.Status.OK:
