@@ -94,7 +94,7 @@ FOUND = {
     "number of 400 digits": (FIX, problem("2800.0", "9" * 400), ["p.toml", "beyond 1e+30", "99999..."]),
     "amount of 1e308": (FIX, problem("sigma = 3.0", 'sigma = "1e308 km"'), ["'sigma'", "beyond 1e+30"]),
     "sigma of 1e-50": (FIX, problem("sigma = 3.0", "sigma = 1e-50"), ["p.toml", "deviations below 1e-30"]),
-    "decibels of 1e9": (FIX, {"p.toml": f"format = 1\n{STATIONS}{GAINS}"}, ["p.toml", "row 2, column 'z'", "beyond 1e+30"]),
+    "decibels of 1e9": (FIX, {"p.toml": f"format = 1\n{STATIONS}{GAINS}"}, ["row 2, column 'z'", "beyond 1e+30"]),
     "cell of 1e308": (
         FIX,
         table("r.csv", "a,z\nA,1.0\nB,1e308\n"),
