@@ -103,6 +103,8 @@ def methods_of(table: MethodTable, number: int) -> Iterator[Method]:
         raise InvalidProblem("a method is one thing", where, "give either method or baseline")
     solvers: list[str | None] = [*_list(table.solver)] or [None]
     names = _list(table.method) or _list(table.baseline)
+    if not names:
+        raise InvalidProblem("its list of methods is empty", where, "name one, or leave the table out")
     for name, solver in product(names, solvers):
         if table.method is not None:
             from optloc.solvers import Method as Pipeline

@@ -20,6 +20,7 @@ STUDIES = sorted(shipped())
 BAD = {
     "method": ('"gtrs+lsr"', '"gtsr+lsr"', "unknown method 'gtsr'; did you mean 'gtrs'"),
     "baseline": ('method = "gtrs+lsr"', 'baseline = "tailor"', "unknown baseline 'tailor'; did you mean 'taylor'"),
+    "no method": ('"gtrs+lsr"', "[]", "its list of methods is empty"),
     "two methods": ('"gtrs+lsr"', '"gtrs+lsr"\nbaseline = "taylor"', "give either method or baseline"),
     "solver": ('"gtrs+lsr"', '"sdp"\nsolver = "SCZ"', "unknown solver 'SCZ'; did you mean 'SCS'"),
     "licence": ('"gtrs+lsr"', '"gtrs+nlp"\nsolver = "snopt"', "the solver 'snopt' is not installed"),
