@@ -65,6 +65,8 @@ def test_a_map_across_the_date_line_is_in_one_piece():
         problem, np.zeros(problem.layout.size), np.linspace(west, east, 9), np.linspace(south, north, 9), 9e3
     )
     assert np.isfinite(found.sigma).all()
+    # Every station is on the map, whose longitudes go beyond 180 degrees.
+    assert ((west < found.stations[:, 0]) & (found.stations[:, 0] < east)).all()
     for feature in map_geojson(found)["features"]:
         if feature["geometry"]["type"] == "MultiLineString":
             for line in feature["geometry"]["coordinates"]:

@@ -108,6 +108,9 @@ def bound_map(
     plan, shape = np.sqrt(variance[:, :2].sum(-1)), east.shape
     up = np.sqrt(variance[:, 2]) if problem.dimension == 3 else np.full(len(places), np.nan)
     stations = problem.stations.position.reshape(-1, problem.stations.count, problem.dimension)[0]
+    marks = plan_of(problem.frame, stations, earth)[:, :2]
+    if earth:  # a map across the date line has longitudes beyond 180 degrees, and its stations have, too
+        marks[:, 0] = (marks[:, 0] - np.mean(x) + 180.0) % 360.0 - 180.0 + np.mean(x)
     return BoundMap(
         np.asarray(x, dtype=float),
         np.asarray(y, dtype=float),
@@ -116,7 +119,7 @@ def bound_map(
         plan.reshape(shape),
         up.reshape(shape),
         _deviation(problem),
-        plan_of(problem.frame, stations, earth)[:, :2],
+        marks,
         problem.stations.names,
         earth,
     )

@@ -80,7 +80,7 @@ def plot_bound_map(found: BoundMap, title: str = "", *, dilution: bool = False) 
     bar = figure.colorbar(drawn, ax=axes, label=name, ticks=steps, format=lambda value, _: f"{value:g}", pad=0.02)
     bar.ax.minorticks_off()
     if title:
-        axes.set_title(literal(title), fontsize=11)
+        axes.set_title(literal(title), fontsize=11, wrap=True)
     apart(figure)
     return figure
 

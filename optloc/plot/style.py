@@ -87,7 +87,7 @@ def finish(figure: Figure, title: str, panels: Sequence[Axes] = (), ncols: int =
     if shown:
         figure.legend(shown.values(), shown, loc="outside lower center", ncols=ncols, frameon=False, **style)
     if title:
-        figure.suptitle(literal(title))
+        figure.suptitle(literal(title), wrap=True)
     return figure
 
 
