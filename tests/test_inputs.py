@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import time
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ import optloc
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.inputs import Budget, access, budget_of, files_read, json_of, read_bytes, toml_of
 from optloc.cli import app
+from optloc.files import table as tables
 from optloc.files.reader import read
 from optloc.study.plan import plan_of
 
@@ -135,6 +137,7 @@ def test_a_refusal_takes_neither_time_nor_memory(tmp_path, case):
 COMMAND = """
 import sys
 from optloc.cli import app
+from optloc.files import table as tables
 try:
     app()
 finally:
@@ -326,3 +329,20 @@ def test_a_plugin_that_fails_is_named(tmp_path, text, words):
     assert found.exit_code == 2
     assert words in found.stderr
     assert found.stderr.count("\n") == 1
+
+
+def test_a_damaged_byte_of_a_parquet_table_is_a_table_or_a_sentence(tmp_path):
+    """Every byte in turn, its last bit or its second: it is read with another value, or refused."""
+    path = tmp_path / "t.parquet"
+    words = pa.array(["A", "B", "A", "C", "B"])
+    parquet.write_table(pa.table({"a": words, "z": [1.0, 2.0, 3.0, 4.0, 5.0]}), path)
+    whole, refused = path.read_bytes(), 0
+    for place, flip in product(range(len(whole)), (1, 64)):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ flip]) + whole[place + 1 :])
+        try:
+            table = tables.parquet(path, {})
+        except InvalidProblem:
+            refused += 1
+        else:
+            assert {len(column) for column in table.columns.values()} <= {table.count}
+    assert refused > 100

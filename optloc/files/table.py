@@ -311,6 +311,8 @@ def parquet(path: Path, names: Mapping[str, str]) -> Table:
         fit = {entry.name: _fits(pa, entry.type) for entry in schema}
         # Text stays in the dictionary that it is stored with: a long word that all rows share is there once.
         read = reader.ParquetFile(data, read_dictionary=texts).read(columns=[name for name in fit if fit[name]])
+        # A damaged page may name words that its dictionary has not.
+        read.validate(full=True)
         columns = {name: _parquet_column(pa, read.column(name)) for name in read.column_names}
     except (pa.ArrowException, OSError, UnicodeDecodeError, OverflowError) as error:
         what = "a column of text is not UTF-8" if isinstance(error, UnicodeDecodeError) else "the file is not Parquet"

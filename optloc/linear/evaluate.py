@@ -368,6 +368,11 @@ def to_ecef(problem: Problem, position: tuple[Any, ...]) -> tuple[Any, ...]:
 # Values and derivatives of all rows: those of a kind together, then what biases do to them.
 
 
+# At a station an angle, a ratio or a rate has no value: NaN says so, and what asked judges it.
+_undefined = np.errstate(divide="ignore", invalid="ignore")
+
+
+@_undefined
 def predict(problem: Problem, x: Array) -> Array:
     """Return the modelled measurements h(x), (..., m), of a problem at vectors x (..., size)."""
     values, x, xp = [], fitting(problem, x), library(x)
@@ -378,6 +383,7 @@ def predict(problem: Problem, x: Array) -> Array:
     return _joined(values)
 
 
+@_undefined
 def differentiate(problem: Problem, x: Array) -> tuple[Array, Array]:
     """Return residuals and derivatives of a problem at a point.
 

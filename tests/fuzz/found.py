@@ -1,6 +1,6 @@
 """What mutated files have found: arguments, files, the words of the one sentence; None where there is an answer."""
 
-from fuzz.originals import to_parquet
+from fuzz.originals import problems, to_parquet
 
 STATIONS = """[stations]
 rows = [
@@ -157,5 +157,10 @@ FOUND = {
         RUN,
         study('"20 km", "10 km"]', '"1 km", "2 km"], elevation_deg = [80.0, 100.0]'),
         ["elevation_deg", "90 degrees"],
+    ),
+    "an arrival a million times too late among frequencies": (
+        ["fix", "fdoa.toml", "-m", "robust", "--json"],
+        {"fdoa.toml": problems()["fdoa.toml"]["fdoa.toml"].replace(b"9779.0", b"9779000000.0")},
+        None,
     ),
 }  # fmt: skip

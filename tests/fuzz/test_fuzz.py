@@ -9,6 +9,7 @@ import os
 import random
 import subprocess
 import sys
+import warnings
 from functools import cache
 from hashlib import blake2b
 from pathlib import Path
@@ -64,7 +65,10 @@ def test_what_was_found_once_is_one_sentence(name, tmp_path, monkeypatch):
     for path, text in files.items():
         (tmp_path / path).write_bytes(text if isinstance(text, bytes) else text.encode())
     monkeypatch.chdir(tmp_path)
-    result = CliRunner().invoke(app, arguments)
+    with warnings.catch_warnings(record=True) as warned:
+        warnings.simplefilter("always", RuntimeWarning)
+        result = CliRunner().invoke(app, arguments)
+    assert not [str(one.message) for one in warned if one.category is RuntimeWarning]
     if words is None:
         assert result.exit_code in (0, 1), result.output
         return
