@@ -139,6 +139,7 @@ __all__ = [
     "rejected",
     "reliability",
     "samples",
+    "satellites",
     "separate",
     "simulate",
     "solve",
@@ -174,6 +175,10 @@ def __getattr__(name: str) -> Any:
         from optloc import files  # pandas is loaded when a file or a table is read
 
         return getattr(files, name)
+    if name == "satellites":
+        from optloc.files.orbits import satellites  # orbits are of an extra
+
+        return satellites
     if name in ("Emitters", "separate"):
         from optloc import several  # scipy.optimize is loaded when emitters are told apart
 

@@ -426,11 +426,16 @@ def new(
         "optloc convert log.csv --column time=when --stations rx.csv --sigma '6 m' --out b.toml",
         "optloc convert gnss.csv --column pseudorange=C1C --sigma '3 m' --out gnss.toml",
         "optloc convert sites.geojson --out stations.csv",
+        "optloc convert iridium.tle --times passes.csv --out satellites.csv",
     ),
 )
 def convert(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="Arrival times or pseudoranges (CSV, Parquet), or GeoJSON stations.")
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            help="Arrival times or pseudoranges (CSV, Parquet), GeoJSON stations, or orbits (elements, OMM, SP3).",
+        ),
     ],
     out: Annotated[
         Path, typer.Option(metavar="OUT.toml", help="Problem file to write; its tables go to CSV files beside it.")
@@ -459,16 +464,20 @@ def convert(
     frame: Annotated[
         str | None, typer.Option(metavar="cartesian|ecef", help="Frame of stations in x, y, z; cartesian by default.")
     ] = None,
+    times: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Table of measurements whose times (UTC) orbits are wanted at."),
+    ] = None,
     as_json: Json = False,
     budget: Budget = None,
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Read a table of arrival times or pseudoranges, or GeoJSON stations, into a problem file."""
+    """Read a table of arrival times or pseudoranges, GeoJSON stations or orbits into a problem file."""
     from optloc.cli.starters import run_convert
 
-    options = {"stations": stations, "sigma": sigma, "unit": unit, "what": as_, "frame": frame}
+    options = {"stations": stations, "sigma": sigma, "unit": unit, "what": as_, "frame": frame, "times": times}
     raise typer.Exit(run_convert(file, out, column or [], as_json=as_json, quiet=quiet, **options))
 
 

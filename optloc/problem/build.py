@@ -218,18 +218,40 @@ def assemble(
     return checked(replace(made, noise=noise))
 
 
-def station_array(position: Any, names: Sequence[str] | None = None) -> Stations:
-    """Return stations at positions (s, d), or (..., k, s, d) where they move or differ from problem to problem."""
+def station_array(
+    position: Any, names: Sequence[str] | None = None, *, velocity: Any = None, axes: Any = None
+) -> Stations:
+    """Return stations.
+
+    Parameters
+    ----------
+    position : array (s, d), or (..., k, s, d)
+        Metres; with an axis of epochs where they move or differ from problem to problem.
+    names : sequence of s str, optional
+        Unique names; S0, S1, ... by default.
+    velocity : array (s, d), or (..., k, s, d), optional
+        Metres per second; range rates need it of stations that move.
+    axes : array (s, d, d), or (..., k, s, d, d), optional
+        Rows are the unit vectors of each station's own axes; the frame's axes by default.
+
+    Raises
+    ------
+    InvalidProblem
+        Where positions are no such array, or numbers are none.
+    """
     array = np.asarray(numbers(position, "stations"))
     if array.ndim < 2 or array.shape[-1] not in (2, 3):
         raise InvalidProblem(
             f"stations have shape {array.shape}", where="stations", advice="give an array (stations, 2 or 3) in metres"
         )
-    # Stations that stay have an epoch axis of length one.
-    if array.ndim == 2:
-        array = array[None]
     labels = tuple(names) if names is not None else tuple(f"S{i}" for i in range(array.shape[-2]))
-    return Stations(array, labels)
+    rates, own = (None if v is None else np.asarray(numbers(v, "stations")) for v in (velocity, axes))
+    # Stations that stay have an epoch axis of length one.
+    return Stations(_dated(array, 2), labels, _dated(rates, 2), _dated(own, 3))
+
+
+def _dated(array: Any, rank: int) -> Any:
+    return array[None] if array is not None and array.ndim == rank else array
 
 
 def _number(measurements: Sequence[Measured]) -> list[tuple[Measured, int]]:

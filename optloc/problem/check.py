@@ -145,6 +145,14 @@ def _check_rows(problem: Problem, rows: Rows) -> None:
     if model.axes and problem.frame.kind == "ecef" and problem.stations.axes is None:
         advice = "give the stations axes, for instance frame.enu_axes(positions)"
         raise InvalidProblem(f"{rows.kind} rows in ECEF need the stations' own axes", rows.kind, advice)
+    if model.velocity and model.stations and problem.stations.velocity is None:
+        # At rest is what stations without velocities are taken for; those that are seen to move are not.
+        place = problem.stations.position
+        moved = np.argwhere((place != place[..., :1, :, :]).any(-1))
+        if len(moved):
+            what = f"station {problem.stations.names[int(moved[0][-1])]!r} moves, but has no velocity for {rows.kind}"
+            advice = "give velocities (vx, vy, vz in a file): differences of positions are too coarse for rates"
+            raise InvalidProblem(what, "stations", advice)
     if model.ecef and not problem.frame.geodetic:
         raise InvalidProblem(f"{rows.kind} needs a geodetic frame", "frame", "use frame ecef or enu with an origin")
     if model.ecef and problem.dimension != 3:

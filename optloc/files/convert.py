@@ -1,4 +1,4 @@
-"""Common inputs as a problem file with CSV tables beside it: arrival times, pseudoranges, stations."""
+"""Common inputs as a problem file with CSV tables beside it: arrival times, pseudoranges, stations, satellites."""
 
 from __future__ import annotations
 
@@ -14,18 +14,24 @@ from typing import Any
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.frames import ECEF
+from optloc.base.inputs import at_most
 from optloc.base.outputs import claim, together, write_text
 from optloc.base.types import Array
 from optloc.base.units import UNITS
-from optloc.files.convert.roles import GEOJSON, GUESSES, Places, Roles, places_of, read_table, stem, unit_of
+from optloc.files.orbits import read_orbits
 from optloc.files.reader import Loaded, read
+from optloc.files.roles import GEOJSON, GUESSES, Places, Roles, places_of, read_table, stem, unit_of
 from optloc.files.schema import Units
+from optloc.files.table import distinct
 from optloc.files.writer import write_csv
 
 INPUTS = ("arrivals", "pseudoranges", "stations")
 
 # Nothing is nearer to the centre of the Earth than its poles but what has another unit, metres.
 _SURFACE = 6.4e6
+# What files of orbits are called; where times are given, any file is one.
+_ORBITS = (".tle", ".2le", ".3le", ".sp3", ".omm")
 # Arrivals that place a target in the plane; of fewer the user is told.
 _FEW = 3
 
@@ -59,17 +65,19 @@ def convert(
     columns: Mapping[str, str] | None = None,
     unit: str | None = None,
     frame: str | None = None,
+    times: Path | None = None,
 ) -> Converted:
     """Write a table as a problem file.
 
     Parameters
     ----------
     source : Path
-        Arrival times or pseudoranges as CSV or Parquet; or stations, as such a table or as GeoJSON.
+        Arrival times or pseudoranges as CSV or Parquet; or stations, as such a table or as GeoJSON; or orbits of
+        satellites, as two-line elements, OMM (JSON, CSV) or SP3.
     out : Path
         Problem file to write, .toml; its tables go to CSV files beside it. Of stations alone: the CSV file.
     stations : Path, optional
-        Where the stations of arrival times are: CSV, Parquet or GeoJSON.
+        Where the stations of arrival times are: CSV, Parquet or GeoJSON. Beside orbits: stations that stay.
     sigma : str, optional
         Standard deviation of each row with its unit, such as "20 ns"; "estimate" finds it from many epochs.
     what : "arrivals", "pseudoranges" or "stations", optional
@@ -81,6 +89,9 @@ def convert(
         Unit of the values; by default what the column's name ends in, else s of times and m of pseudoranges.
     frame : "cartesian" or "ecef", optional
         Frame of stations in x, y, z; cartesian by default.
+    times : Path, optional
+        Table of the measurements, whose times (dates, or seconds since 1970; UTC) satellites are wanted at, and whose
+        column of satellites, where it has one, says which.
 
     Returns
     -------
@@ -100,7 +111,9 @@ def convert(
         raise InvalidProblem(f"there is no frame {frame!r}", "--frame", nearest(str(frame), ("cartesian", "ecef")))
     if what is not None and what not in INPUTS:
         raise InvalidProblem(f"there is no input {what!r}", "--as", nearest(what, INPUTS))
-    claim(out, *_tables(out), inputs=[source, *([stations] if stations else [])])
+    claim(out, *_tables(out), inputs=[source, *(path for path in (stations, times) if path)])
+    if times is not None or source.suffix.lower() in _ORBITS:
+        return _write_satellites(source, out, told, times, stations)
     if what == "stations" or source.suffix.lower() in GEOJSON:
         return _write_stations(source, out, told, frame)
     if out.suffix.lower() != ".toml":
@@ -142,6 +155,53 @@ def _write_stations(source: Path, out: Path, told: Mapping[str, str], frame: str
     found = places_of(source, told, frame)
     write_csv(out, found.columns)
     return Converted((out,), None, (found.note,) if found.note else ())
+
+
+def _write_satellites(
+    source: Path, out: Path, told: Mapping[str, str], times: Path | None, stations: Path | None
+) -> Converted:
+    """Write where satellites are at the times of measurements, and with which velocity, as a table of stations."""
+    if times is None:
+        advice = "name the table of the measurements with --times: its times, and its satellites if it has them"
+        raise InvalidProblem("nothing is known of when the satellites are wanted", "--times", advice)
+    if out.suffix.lower() != ".csv":
+        what = "satellites are stations that move: they become a CSV table"
+        raise InvalidProblem(what, str(out), "let the name behind --out end in .csv")
+    orbits, roles = read_orbits(source), Roles(read_table(times), told)
+    written, seconds = roles.table.raw(roles.column("time")), roles.table.times(roles.column("time"), 1.0)
+    whose = roles.labels("satellite") if roles.find("satellite") is not None else None
+    wanted = distinct(whose)[0] if whose is not None else list(orbits.courses)
+    at_most("cells", 7 * len(wanted) * len(seconds), roles.table.source)
+    parts: list[tuple[Array, ...]] = []
+    for name in wanted:
+        rows = np.arange(len(seconds)) if whose is None else np.flatnonzero(whose == name)
+        rows = rows[np.unique(seconds[rows], return_index=True)[1]]
+        parts.append((np.full(len(rows), name, dtype=object), rows, *orbits.at(name, seconds[rows])))
+    rows = np.unique(seconds, return_index=True)[1]
+    for name, place in _resting(stations, told).items():
+        still = np.zeros((len(rows), 3))
+        parts.append((np.full(len(rows), name, dtype=object), rows, place + still, still))
+    names, rows, position, velocity = (np.concatenate(part) for part in zip(*parts, strict=True))
+    columns = {"name": names, "time": written[rows]} | dict(zip("xyz", position.T, strict=True))
+    write_csv(out, columns | dict(zip(("vx", "vy", "vz"), velocity.T, strict=True)))
+    return Converted((out,), None, ('positions are along ECEF: write kind = "ecef" in [frame]',))
+
+
+def _resting(path: Path | None, told: Mapping[str, str]) -> dict[str, np.ndarray]:
+    """Return where stations on the ground are in ECEF, by name."""
+    if path is None:
+        return {}
+    own = {role: name for role, name in told.items() if role in ("name", "x", "y", "z", "lat", "lon", "height")}
+    place = places_of(path, own, "ecef")
+    held, scale = place.columns, UNITS["length"][place.unit]
+    if place.frame == "geodetic":
+        lat, lon = np.radians(held["lat_deg"]), np.radians(held["lon_deg"])
+        found = ECEF.from_geodetic(lat, lon, scale * held["height"], where=path.name, first_row=1)
+    elif "z" in held:
+        found = scale * np.stack([held[axis] for axis in "xyz"], axis=-1)
+    else:
+        raise InvalidProblem("stations beside satellites have x, y and z", path.name, "or latitude and longitude")
+    return dict(zip(place.names, found, strict=True))
 
 
 def _tables(out: Path) -> tuple[Path, ...]:

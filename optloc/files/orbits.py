@@ -1,0 +1,427 @@
+"""Satellites as stations: places and velocities in ECEF at given times, from orbital elements or from SP3 files.
+
+Two-line elements, and mean elements as OMM in JSON or CSV, are followed by SGP4 and turned from its frame of date
+(TEME) to the Earth's by the library skyfield, the rate of that turn included: velocities are those that a station on
+the ground sees. SP3 files hold places in the Earth's frame, which are interpolated; their velocities are derivatives.
+
+Sources: D. A. Vallado, P. Crawford, R. Hujsak, T. S. Kelso, "Revisiting Spacetrack Report #3", AIAA 2006-6753;
+S. Hilla, "The Extended Standard Product 3 Orbit Format (SP3-d)" (2016).
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import cache, partial
+from itertools import pairwise
+from math import isfinite
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.inputs import Budget, access, at_most, has_controls, json_of, read_text
+from optloc.base.types import Array, Stations
+from optloc.files.table import csv, of_frame
+
+# Days from its epoch at which an element set still says where a low satellite is: some 2 km a day are usual, and an
+# error of 60 km along the track is no longer a model of the pass.
+_OLDEST = 30.0
+_DAY = 86400.0
+_EPOCH_1970 = 2440587.5  # Julian date of 1970-01-01
+# Times that are turned at once: the theory of the Earth's axis takes 11 kB for each.
+_AT_ONCE = 4096
+# Neighbours of a time that an SP3 file is interpolated by, and how far the answer by fewer may be from theirs: between
+# positions of GNSS satellites 15 minutes apart both agree within 0.1 m, even next to the ends.
+_POINTS, _FEWER, _APART = 10, 8, 1.0
+# Unequal steps that are no rounding of times: a position is missing.
+_UNEVEN = 1e-3
+# Seconds that the clocks of SP3 files are ahead of atomic time (TAI); None is UTC.
+_CLOCKS = {"GPS": -19.0, "GAL": -19.0, "QZS": -19.0, "IRN": -19.0, "BDT": -33.0, "TAI": 0.0, "UTC": None, "GLO": None}
+_KILOMETRE = 1e3
+
+# Position (k, 3) and velocity (k, 3) at seconds (k,) since 1970 UTC.
+_Course = Callable[[Array], tuple[Array, Array]]
+
+
+@dataclass(frozen=True, slots=True)
+class Orbits:
+    """The satellites of a file.
+
+    Parameters
+    ----------
+    source : str
+        Name of the file.
+    courses : mapping of str to callable
+        Position and velocity of each satellite at times.
+    aliases : mapping of str to str
+        Name of the satellite of each catalogue number.
+    """
+
+    source: str
+    courses: Mapping[str, _Course]
+    aliases: Mapping[str, str]
+
+    def at(self, name: str, seconds: Array) -> tuple[Array, Array]:
+        """Return position (k, 3) and velocity (k, 3) in ECEF of a satellite, metres and metres per second.
+
+        Parameters
+        ----------
+        name : str
+            Its name, or its catalogue number.
+        seconds : array (k,)
+            Since 1970, UTC.
+
+        Raises
+        ------
+        InvalidProblem
+            For an unknown name, a time at which the orbit is not known, and elements that are none.
+        """
+        course = self.courses.get(self.aliases.get(name, name))
+        if course is None:
+            raise InvalidProblem(f"there is no satellite {name!r}", self.source, nearest(name, [*self.courses]))
+        return course(seconds)
+
+
+def satellites(
+    path: str | Path, times: Any, names: Sequence[str] | None = None, *, budget: Budget | None = None
+) -> Stations:
+    """Return satellites as stations with position and velocity in ECEF.
+
+    Parameters
+    ----------
+    path : str or Path
+        Two-line elements, OMM as JSON or CSV, or SP3.
+    times : array (k,)
+        Dates (datetime64, or text in ISO 8601), or seconds since 1970; UTC.
+    names : sequence of s str, optional
+        Names, or catalogue numbers; all of the file by default.
+    budget : Budget, optional
+        How much the file may hold.
+
+    Returns
+    -------
+    Stations
+        Position and velocity (k, s, 3), metres and metres per second.
+
+    Raises
+    ------
+    InvalidProblem
+        Naming the file and the line, or the satellite.
+    """
+    with access(budget=budget):
+        orbits = read_orbits(Path(path))
+        seconds = of_frame({"time": np.ravel(times)}, "times", {}).times("time", 1.0)
+        chosen = tuple(orbits.courses if names is None else names)
+        at_most("cells", 6 * len(chosen) * len(seconds), "times")
+        places = [orbits.at(name, seconds) for name in chosen]
+    position, velocity = (np.stack(parts, axis=1) for parts in zip(*places, strict=True))
+    return Stations(position, chosen, velocity)
+
+
+def read_orbits(path: Path) -> Orbits:
+    """Return the satellites of a file; what it is, is seen in it."""
+    text = read_text(path)
+    start = text.lstrip()[:1]
+    if start == "<":
+        raise InvalidProblem("elements in XML are not read", path.name, "save them as JSON, CSV or two-line elements")
+    if start == "#":
+        return _sp3(text, path.name)
+    if start in ("{", "["):
+        return _of_elements(_json_sets(text, path.name), path.name)
+    if "MEAN_MOTION" in text.partition("\n")[0]:
+        return _of_elements(_csv_sets(path), path.name)
+    return _of_elements(_line_sets(text, path.name), path.name)
+
+
+# Elements: several sets of one satellite are of different days.
+
+
+@dataclass(frozen=True, slots=True)
+class _Set:
+    """Elements as they are written: two lines, or the fields of an OMM."""
+
+    name: str
+    number: str
+    where: str
+    made: Callable[[], Any]
+
+    def satellite(self) -> Any:
+        """Return the satellite of the library; raise InvalidProblem where the elements are none."""
+        with _telling(self.where):
+            found = self.made()
+        if found.model.error:
+            raise _no_elements(self.where)
+        return found
+
+
+def _no_elements(where: str) -> InvalidProblem:
+    return InvalidProblem("these are no elements of an orbit", where, "fetch them again, unchanged")
+
+
+@contextmanager
+def _telling(where: str) -> Iterator[None]:
+    """Tell what the library complains of as one sentence."""
+    try:
+        yield
+    except InvalidProblem:
+        raise
+    except KeyError as error:
+        raise InvalidProblem(f"the element {error.args[0]} is missing", where, "fetch them again, unchanged") from None
+    except (ValueError, TypeError, AttributeError, OverflowError, ZeroDivisionError):
+        raise _no_elements(where) from None
+
+
+def _of_elements(sets: Sequence[_Set], source: str) -> Orbits:
+    if not sets:
+        what = "the file holds no orbits"
+        raise InvalidProblem(what, source, "give two-line elements, OMM as JSON or CSV, or SP3")
+    by_number: dict[str, list[_Set]] = {}
+    for found in sets:
+        if has_controls(found.name):
+            raise InvalidProblem(f"the name {found.name!r} holds control characters", found.where, "give another")
+        by_number.setdefault(found.number, []).append(found)
+    held = {number: own[-1].name or number for number, own in by_number.items()}
+    # Pieces of one launch share names such as OBJECT A: these have their numbers.
+    shared = {name for name, count in Counter(held.values()).items() if count > 1}
+    names = {number: number if name in shared else name for number, name in held.items()}
+    return Orbits(source, {names[number]: partial(_follow, own) for number, own in by_number.items()}, names)
+
+
+def _follow(sets: Sequence[_Set], seconds: Array) -> tuple[Array, Array]:
+    """Return position and velocity by the set whose day is nearest to each time."""
+    found = [one.satellite() for one in sets]
+    epochs = np.array([sat.model.jdsatepoch + sat.model.jdsatepochF for sat in found])
+    age = np.abs(seconds[:, None] / _DAY + _EPOCH_1970 - epochs)
+    pick = age.argmin(axis=1)
+    old = np.flatnonzero(age.min(axis=1) > _OLDEST)
+    if len(old):
+        days = age[old[0], pick[old[0]]]
+        what = f"the elements of {sets[0].name or sets[0].number!r} are {days:.0f} days from {_date(seconds[old[0]])}"
+        advice = "fetch those of that day; times are dates, or seconds since 1970, UTC"
+        raise InvalidProblem(what, sets[pick[old[0]]].where, advice)
+    position, velocity = np.empty((len(seconds), 3)), np.empty((len(seconds), 3))
+    for i in np.unique(pick).tolist():
+        mine = np.flatnonzero(pick == i)
+        for part in np.split(mine, range(_AT_ONCE, len(mine), _AT_ONCE)):
+            position[part], velocity[part] = _propagate(found[i], seconds[part], sets[i].where)
+    return position, velocity
+
+
+def _propagate(satellite: Any, seconds: Array, where: str) -> tuple[Array, Array]:
+    from skyfield.framelib import itrs
+
+    found = satellite.at(_instants(seconds))
+    place, rate = found.frame_xyz_and_velocity(itrs)
+    position, velocity = place.m.T, rate.km_per_s.T * _KILOMETRE
+    bad = np.flatnonzero(~np.isfinite(position).all(axis=1))
+    if len(bad):
+        why = str((found.message or {})[bad[0]]) if found.message is not None else "it has no position"
+        what = f"the orbit cannot be followed to {_date(seconds[bad[0]])} ({why})"
+        raise InvalidProblem(what, where, "the satellite may have come down: leave it out")
+    return position, velocity
+
+
+def _date(seconds: float) -> str:
+    return str(np.datetime64(int(seconds), "s")) + " UTC"
+
+
+@cache
+def _library() -> Any:
+    """Return the library's clock."""
+    try:
+        from skyfield.api import load
+    except ImportError:
+        what, advice = "orbits need the library skyfield", "pip install 'optloc[satellites]'"
+        raise InvalidProblem(what, "satellites", advice) from None
+    # Leap seconds and the Earth's rotation come with the library: nothing is fetched.
+    return load.timescale(builtin=True)
+
+
+def _instants(seconds: Array) -> Any:
+    day = np.floor(seconds / _DAY)
+    return _library().utc(1970, 1, 1 + day.astype(np.int64), 0, 0, seconds - day * _DAY)
+
+
+def _line_sets(text: str, source: str) -> list[_Set]:
+    """Return two-line elements, each with the name on the line before it where there is one."""
+    lines = [(i, line.rstrip()) for i, line in enumerate(text.splitlines(), 1) if line.strip()]
+    sets, name = [], ""
+    following = iter([*pairwise(lines), (lines[-1], (0, ""))] if lines else [])
+    for (i, line), (_, after) in following:
+        where = f"{source}, line {i}"
+        if not line.startswith("1 "):
+            if line.startswith("2 "):
+                raise InvalidProblem("a second line of elements has no first one", where, "give both, unchanged")
+            # What is no name and no element shows what the file is not, before anything is looked for in it.
+            name = re.sub("^0 ", "", line).strip()
+            continue
+        if not after.startswith("2 "):
+            raise InvalidProblem("a first line of elements has no second one", where, "give both, unchanged")
+        sets.append(_Set(name, line[2:7].strip(), where, partial(_from_lines, name, line, after)))
+        name = ""
+        next(following)
+    return sets
+
+
+def _from_lines(name: str, one: str, two: str) -> Any:
+    _library()
+    from sgp4.earth_gravity import wgs72
+    from sgp4.io import twoline2rv, verify_checksum
+    from skyfield.api import EarthSatellite
+
+    # The fast reader takes anything for elements: the slow one looks at every column first.
+    verify_checksum(one, two)
+    twoline2rv(one, two, wgs72)
+    return EarthSatellite(one, two, name or None, _library())
+
+
+def _json_sets(text: str, source: str) -> list[_Set]:
+    data = json_of(text, source)
+    messages = data if isinstance(data, list) else [data]
+    at_most("rows", len(messages), source)
+    for i, fields in enumerate(messages, 1):
+        if not isinstance(fields, dict):
+            what = "this is no orbit mean-elements message"
+            raise InvalidProblem(what, f"{source}, message {i}", "give a list of objects with EPOCH, MEAN_MOTION ...")
+    return [_of_fields(fields, f"{source}, message {i}") for i, fields in enumerate(messages, 1)]
+
+
+def _csv_sets(path: Path) -> list[_Set]:
+    table = csv(path, None, {})
+    rows = zip(*(table.columns[name] for name in table.columns), strict=True)
+    found = (dict(zip(table.columns, row, strict=True)) for row in rows)
+    return [_of_fields(fields, table.at(i)) for i, fields in enumerate(found)]
+
+
+# What the theory takes elements for; a message may say that its own are others.
+_MEANT = {"REF_FRAME": "TEME", "TIME_SYSTEM": "UTC", "MEAN_ELEMENT_THEORY": "SGP4", "CENTER_NAME": "EARTH"}
+
+
+def _of_fields(fields: Mapping[str, Any], where: str) -> _Set:
+    for key, meant in _MEANT.items():
+        if fields.get(key) not in (None, "", meant):
+            what = f"{key} is {str(fields[key])[:40]!r}"
+            raise InvalidProblem(what, where, f"elements are read where it is {meant}")
+    number = str(fields.get("NORAD_CAT_ID") or "").strip()
+    name = str(fields.get("OBJECT_NAME") or "").strip()
+    if not (number or name):
+        raise InvalidProblem("the element NORAD_CAT_ID is missing", where, "fetch them again, unchanged")
+    return _Set(name, number or name, where, partial(_from_fields, fields))
+
+
+def _from_fields(fields: Mapping[str, Any]) -> Any:
+    load = _library()
+    from skyfield.api import EarthSatellite
+
+    epoch = str(fields["EPOCH"]).removesuffix("Z")
+    return EarthSatellite.from_omm(load, {**fields, "EPOCH": epoch if "." in epoch else f"{epoch}.0"})
+
+
+# SP3: places at equal steps, interpolated.
+
+
+def _sp3(text: str, source: str) -> Orbits:
+    """Return the satellites of an SP3 file, versions a to d."""
+    clock, time = "GPS", 0.0
+    times: dict[str, list[float]] = {}
+    places: dict[str, list[list[float]]] = {}
+    for i, line in enumerate(text.splitlines(), 1):
+        where = f"{source}, line {i}"
+        if i == 1 and line[1:2] not in tuple("abcd"):
+            raise InvalidProblem("this is no SP3 file of version a to d", where, "see the first two characters")
+        if line.startswith("%c") and clock == "GPS" and line[9:12].strip("c "):
+            clock = line[9:12]
+        elif line.startswith("* "):
+            time = _calendar(line, where)
+        elif line.startswith("P") and line[4:].strip():
+            place = [_number(line[4 + 14 * k : 18 + 14 * k], where) for k in range(3)]
+            if any(place):  # zeros stand for a place that is not known
+                name = line[1:4].strip()
+                times.setdefault(name, []).append(time)
+                places.setdefault(name, []).append(place)
+        elif line.startswith("EOF"):
+            break
+    if clock not in _CLOCKS:
+        raise InvalidProblem(f"the clock {clock!r} is unknown", source, f"known are {', '.join(_CLOCKS)}")
+    if not places:
+        raise InvalidProblem("the file holds no places", source, "give a file with lines that begin with P")
+    courses = {}
+    for name, seconds in times.items():
+        if has_controls(name) or (np.diff(seconds) <= 0.0).any():
+            raise InvalidProblem(f"the times of satellite {name!r} do not increase", source, "fetch it again")
+        nodes = np.array(seconds), _KILOMETRE * np.array(places[name])
+        courses[name] = partial(_between, *nodes, _CLOCKS[clock], name, source)
+    return Orbits(source, courses, {})
+
+
+def _number(text: str, where: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = float("nan")
+    # A place of 1e9 km is beyond any orbit round the Earth.
+    if not (isfinite(value) and abs(value) < 1e9 and "_" not in text):
+        raise InvalidProblem(f"{text.strip()[:40]!r} is not a number", where, "fetch the file again")
+    return value
+
+
+def _calendar(line: str, where: str) -> float:
+    """Return the reading of the file's clock as seconds since 1970."""
+    parts = line[1:].split()
+    try:
+        year, month, day, hour, minute = (int(part) for part in parts[:5])
+        date = np.datetime64(f"{year:04d}-{month:02d}-{day:02d}T{hour:02d}:{minute:02d}", "s")
+    except ValueError:
+        raise InvalidProblem("this is no date", where, "fetch the file again") from None
+    return float(date.astype(np.int64)) + _number(parts[5] if len(parts) > 5 else "", where)
+
+
+def _between(
+    nodes: Array, places: Array, ahead: float | None, name: str, source: str, seconds: Array
+) -> tuple[Array, Array]:
+    """Return position and velocity between the places (n, 3) at the file's readings (n,)."""
+    at = seconds + (0.0 if ahead is None else ahead + _leap(seconds))
+    where = f"{source}, satellite {name}"
+    if len(nodes) < _POINTS:
+        raise InvalidProblem(f"there are {len(nodes)} places", where, f"interpolation needs {_POINTS}")
+    outside = np.flatnonzero((at < nodes[0]) | (at > nodes[-1]))
+    if len(outside):
+        what = f"{_date(seconds[outside[0]])} is before its first or after its last place"
+        raise InvalidProblem(what, where, "use the file of that day; times are dates, or seconds since 1970, UTC")
+    position, velocity = _polynomial(nodes, places, at, _POINTS, where)
+    off = np.linalg.norm(position - _polynomial(nodes, places, at, _FEWER, where)[0], axis=1).max(initial=0.0)
+    if off > _APART:
+        step = float(np.diff(nodes).min())
+        what = f"its places are {step:g} s apart, and between them it is known to {off:.2g} m only"
+        raise InvalidProblem(what, where, "use a file with smaller steps")
+    return position, velocity
+
+
+def _polynomial(nodes: Array, places: Array, at: Array, count: int, where: str) -> tuple[Array, Array]:
+    """Return values and derivatives of polynomials through the `count` neighbours of each time."""
+    from scipy.interpolate import KroghInterpolator
+
+    start = (np.searchsorted(nodes, at) - count // 2).clip(0, len(nodes) - count)
+    position, velocity = np.empty((len(at), 3)), np.empty((len(at), 3))
+    for first in np.unique(start).tolist():
+        mine, own = start == first, nodes[first : first + count]
+        steps = np.diff(own)
+        if np.ptp(steps) > _UNEVEN * steps.min():
+            raise InvalidProblem(f"places are missing around {_date(at[mine][0])}", where, "use another file")
+        # Counted in steps from the first: powers of seconds would lose digits.
+        step = float(steps.mean())
+        through = KroghInterpolator((own - own[0]) / step, places[first : first + count])
+        position[mine], velocity[mine] = through.derivatives((at[mine] - own[0]) / step, 2)
+        velocity[mine] /= step
+    return position, velocity
+
+
+def _leap(seconds: Array) -> Array:
+    """Return the whole seconds that atomic time is ahead of UTC."""
+    ahead = np.concatenate([_instants(part).tai for part in np.split(seconds, range(_AT_ONCE, len(seconds), _AT_ONCE))])
+    return np.asarray(np.round((ahead - (seconds / _DAY + _EPOCH_1970)) * _DAY))
