@@ -120,6 +120,12 @@ def _fdoa(d: int) -> Problem:
     return assemble(stations(d, velocity=rate), measured("fdoa", a=a, b=b, sigma=0.05), motions=(known,))
 
 
+def _range_rate(d: int) -> Problem:
+    count = len(STATIONS[d])
+    rate = np.random.default_rng(3).normal(0.0, 150.0, (1, count, d))
+    return assemble(stations(d, velocity=rate), measured("range_rate", a=np.arange(count), sigma=0.05))
+
+
 # How to pose each kind alone (a height with the ranges it needs): a kind without a line here has no case.
 BUILD: dict[str, Callable[[int], Problem]] = {
     "tdoa": _tdoa,
@@ -131,6 +137,7 @@ BUILD: dict[str, Callable[[int], Problem]] = {
     "azimuth": _angle("azimuth"),
     "elevation": _angle("elevation"),
     "height": _height,
+    "range_rate": _range_rate,
     "fdoa": _fdoa,
 }
 
@@ -231,7 +238,7 @@ def _case(name: str, build: Callable[[int], Problem], d: int) -> Case:
     truth = truth_of(problem)
     kinds = {rows.kind for rows in problem.rows}
     seed = [d, *(ord(letter) for letter in name)]
-    start = kinds not in ({"fdoa"}, {"elevation"})  # neither lifts to rows without ranges of their own
+    start = kinds not in ({"range_rate"}, {"fdoa"}, {"elevation"})  # none lifts to rows without ranges of their own
     return Case(name, simulate(problem, truth, np.random.SeedSequence(seed)), truth, start)
 
 
@@ -273,6 +280,8 @@ def plain_h(kind: str, p, v, sa, va, sb, vb, axes, frame=None):
             return pymap3d.ecef2geodetic(*p)[2]
         lat, lon, height = frame.origin
         return pymap3d.enu2geodetic(*p, np.degrees(lat), np.degrees(lon), height)[2]
+    if kind == "range_rate":
+        return (p - sa) @ (v - va) / ra
     if kind == "fdoa":
         return (p - sa) @ (v - va) / ra - (p - sb) @ (v - vb) / rb
     raise LookupError(kind)
@@ -456,10 +465,10 @@ def quick(problem: Problem) -> Callable[[np.ndarray], np.ndarray]:
                 out.append(one if two is None else two(r[a], r[b]))
             elif rows.kind == "height":
                 out.append([plain_h("height", x[:d], None, None, None, None, None, None, problem.frame)])
-            elif rows.kind == "fdoa":
+            elif rows.kind in ("range_rate", "fdoa"):
                 v = x[d : 2 * d] if order else np.zeros(d)
                 slope = (line * (v - rate)).sum(1) / r
-                out.append(slope[a] - slope[b])
+                out.append(slope[a] - slope[b] if rows.kind == "fdoa" else slope[a])
             elif rows.kind in ("azimuth", "elevation"):
                 own = line[a] if s.axes is None else np.einsum("mij,mj->mi", s.axes[0][a], line[a])
                 out.append(np.arctan2(own[:, 1], own[:, 0]) if rows.kind == "azimuth" else np.arcsin(own[:, 2] / r[a]))

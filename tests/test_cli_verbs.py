@@ -272,7 +272,7 @@ def test_entries_show_what_they_say_in_words():
 def test_names_are_completed():
     environment = {"_OPTLOC_COMPLETE": "complete_bash", "COMP_WORDS": "optloc new rang", "COMP_CWORD": "2"}
     result = RUN.invoke(app, [], prog_name="optloc", env=environment)
-    assert result.stdout.split() == ["range", "range_sum"]
+    assert result.stdout.split() == ["range", "range_rate", "range_sum"]
 
 
 def test_a_process_ends_with_the_code_and_one_line():

@@ -139,7 +139,7 @@ def test_the_bound_in_the_course_of_the_run(tmp_path):
     assert (tmp_path / "b.png").read_bytes().startswith(b"\x89PNG")
     text = run("crlb", DEMO, "--at", AT).stdout
     assert "biases known" in text
-    assert f"R5: {by_name['clock']['sigma'][3]:.4g} m" in text
+    assert f"R5: {by_name['clock']['sigma'][3] / (299792458.0 * 1e-9):.4g} ns" in text
     (fix,) = json.loads(run("fix", DEMO, *ALLOW, "--json").stdout)["fixes"]
     assert fix["sigma_z"] == pytest.approx(by_name["position"]["sigma"][2], rel=0.02)
 

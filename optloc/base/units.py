@@ -8,8 +8,9 @@ second. Three conversions are more than a factor:
 * A gain ratio in ``dB`` is a ratio of ranges. Amplitude falls with ``1 / r``, so the level at
   station b above the level at station a, ``20 log10(A_b / A_a)``, is ``20 log10(r_a / r_b)``. Decibels of
   power, ``10 log10(P_b / P_a)``, are the same number. A quantity that is itself a level stays in decibels.
-* A frequency difference in ``Hz`` is a range-rate difference: a receding emitter lowers the received
-  frequency, ``f = f_c (1 - r' / c)``, so ``r_a' - r_b' = -(c / f_c) (f_a - f_b)``.
+* A frequency in ``Hz``, less its carrier, is a range rate: a receding emitter lowers the received
+  frequency, ``f = f_c (1 - r' / c)``, so ``r_a' = -(c / f_c) (f_a - f_c)``, and a difference of two frequencies is
+  ``r_a' - r_b' = -(c / f_c) (f_a - f_b)``.
 
 Sources: BIPM, The International System of Units, 9th edition (2019), sections 2.3.1 and 4, for c, the
 nautical mile, the knot, degrees and the decibel; the international foot of 1959 for foot, yard and mile.
@@ -219,7 +220,7 @@ def conversion(
             raise InvalidProblem(
                 f"the carrier frequency {given}",
                 where,
-                "a frequency difference in Hz is a speed only beside its carrier",
+                "a frequency in Hz is a speed only beside its carrier",
             )
         # Negative: a receding emitter is heard at a lower frequency.
         return Conversion(-propagation_speed / carrier)

@@ -15,7 +15,7 @@ from optloc.adequacy.geometry import Advice
 from optloc.adequacy.level import CommonLevel, LateSignals, common_level_at, late_signals_at
 from optloc.base.errors import InvalidProblem
 from optloc.base.outputs import together
-from optloc.base.types import Array, Bias
+from optloc.base.types import Array, Bias, Stations
 from optloc.cli.file_fixes import CHUNK
 from optloc.cli.fix import advice_for_vectors, advice_json, grouping_of, late_json, level_json, show_advice, tell_level
 from optloc.cli.output import (
@@ -130,15 +130,15 @@ def summary(loaded: Loaded) -> dict[str, Any]:
     alone = separable(problem)
     redundancy = _redundancy(problem, alone)
     parts = _components(problem)
-    flattest, widest = _spread(problem.stations.position)
-    # Of stations that move, the epoch at which they are nearest to a line or plane.
+    flattest, widest = _spread(_together(problem, alone))
+    # Of epochs that are fixed one by one, that at which stations are nearest to a line or plane.
     worst = int(np.argmin(flattest / widest))
     return {
         "file": loaded.source,
         "frame": problem.frame.kind,
         "dimension": problem.dimension,
         "stations": problem.stations.count,
-        "moving_stations": _count_moving(problem.stations.position),
+        "moving_stations": _count_moving(problem.stations),
         "station_errors": _errors(problem),
         "epochs": problem.epochs,
         "duration_s": float(np.ptp(loaded.times)),
@@ -146,7 +146,7 @@ def summary(loaded: Loaded) -> dict[str, Any]:
         "rows": {block.kind: block.count for block in problem.rows},
         "absent_rows": int((problem.weight == 0.0).sum()),
         "constraints": [constraint.name for constraint in problem.constraints],
-        "biases": {bias.name: _bias(problem, bias) for bias in problem.biases},
+        "biases": {bias.name: _bias(loaded, bias) for bias in problem.biases},
         "unknowns": problem.layout.size // problem.epochs if alone else problem.layout.size,
         "redundancy": {"least": int(redundancy.min()), "median": float(np.median(redundancy))},
         "epochs_with_too_few_rows": int((redundancy < 0).sum()),
@@ -156,9 +156,10 @@ def summary(loaded: Loaded) -> dict[str, Any]:
     }
 
 
-def _count_moving(position: Array) -> int:
-    """Return how many stations (k, s, d) are not at one place in all epochs."""
-    return int((np.ptp(position, axis=0).max(-1) > 0.0).sum())
+def _count_moving(stations: Stations) -> int:
+    """Return how many stations have a velocity, or are not at one place in all epochs."""
+    moving = np.ptp(stations.position, axis=0).max(-1) > 0.0
+    return int((moving if stations.velocity is None else moving | stations.velocity.any((0, -1))).sum())
 
 
 def _errors(problem: Problem) -> str:
@@ -171,17 +172,18 @@ def _errors(problem: Problem) -> str:
     return f"{sizes} m, {'noise of each epoch' if span == 'noise' else f'unknown for each {span}'}"
 
 
-def _bias(problem: Problem, bias: Bias) -> str:
+def _bias(loaded: Loaded, bias: Bias) -> str:
     """Return form, members and prior of a bias in words."""
-    slot, _ = problem.layout.find(bias.name)
+    slot, _ = loaded.problem.layout.find(bias.name)
+    unit, size = loaded.bias_unit(bias.name, slot.unit)
     names = ", ".join(bias.members[:_MEMBERS]) + (
         f" and {len(bias.members) - _MEMBERS} more" if len(bias.members) > _MEMBERS else ""
     )
     if bias.sigma is None:
         return f"{bias.form} of {names}, unknown"
-    low, high = np.min(bias.sigma), np.max(bias.sigma)
+    low, high = np.min(bias.sigma) / abs(size), np.max(bias.sigma) / abs(size)
     prior = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
-    return f"{bias.form} of {names}, prior {prior} {slot.unit}"
+    return f"{bias.form} of {names}, prior {prior} {unit}"
 
 
 def _redundancy(problem: Problem, alone: bool) -> Array:
@@ -219,6 +221,12 @@ def _components(problem: Problem) -> Array:
     touched = np.unique(edges)
     pairs = np.unique(np.stack([touched // s, label[touched]]), axis=1)
     return np.bincount(pairs[0], minlength=k)
+
+
+def _together(problem: Problem, alone: bool) -> Array:
+    """Return the places (k, s, d) that a fix is seen from: those of an epoch, or (1, k s, d) of a whole run."""
+    position = problem.stations.position
+    return position if alone else position.reshape(1, -1, position.shape[-1])
 
 
 def _spread(position: Array) -> tuple[Array, Array]:

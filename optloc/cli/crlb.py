@@ -79,7 +79,7 @@ def run_crlb(
         console.print(_bound_table(loaded, rows))
         show_reliability(told, console)
         if over_time is not None:
-            console.print(_course_table(*over_time))
+            console.print(_course_table(*over_time, loaded))
     return 0 if all(np.isfinite(row["sigma"]).all() for row in rows) and rows else 1
 
 
@@ -120,18 +120,19 @@ def _bound_table(loaded: Loaded, rows: list[dict[str, Any]]) -> Table:
         table.add_column(name)
     for row in rows[:_BOUNDS]:
         ellipse = ", ".join(f"{v:.4g}" for v in row.get("ellipse95", ()))
-        table.add_row(row["epoch"], row["unknown"], _sigmas(row), ellipse)
+        table.add_row(row["epoch"], row["unknown"], _sigmas(row, loaded), ellipse)
     if len(rows) > _BOUNDS:
         table.add_row("...", "", f"{len(rows) - _BOUNDS} more", "--json prints all")
     return table
 
 
-def _sigmas(row: dict[str, Any]) -> str:
-    """Return standard deviations in a line, those of members one below the other."""
+def _sigmas(row: dict[str, Any], loaded: Loaded) -> str:
+    """Return standard deviations in a line, those of members one below the other in the unit of the file."""
     if set(row["entries"]) <= set("xyz"):
         return f"{', '.join(f'{v:.4g}' for v in row['sigma'])} {row['unit']}"
-    named = zip(row["entries"][:_MEMBERS], row["sigma"], strict=False)
-    lines = [f"{entry}: {v:.4g} {row['unit']}".strip(": ") for entry, v in named]
+    unit, size = loaded.bias_unit(row["unknown"], row["unit"])
+    named = zip(row["entries"][:_MEMBERS], row["sigma"] / abs(size), strict=False)
+    lines = [f"{entry}: {v:.4g} {unit}".strip(": ") for entry, v in named]
     more = len(row["entries"]) - _MEMBERS
     return "\n".join([*lines, *([f"... and {more} more"] if more > 0 else [])])
 
@@ -260,19 +261,19 @@ def _shown(layout: Layout) -> tuple[str, ...]:
     return (*states[:4], *biases[:4])
 
 
-def _course_table(course: Course, known: Course | None) -> Table:
+def _course_table(course: Course, known: Course | None, loaded: Loaded) -> Table:
     """Return the bound at a few times, as root sum of squares over coordinates and root mean square over members."""
     table = Table(title="Bound after the first epochs", title_justify="left")
     for name in ("epochs", "time, s"):
         table.add_column(name, justify="right")
-    columns: list[tuple[Course, Slot]] = []
+    values: list[Array] = []
     for slot in (course.layout.find(name)[0] for name in _shown(course.layout)):
-        table.add_column(f"{slot.name}{_RMS[bool(slot.members)]}, {slot.unit}".rstrip(", "), justify="right")
-        columns.append((course, slot))
+        unit, size = loaded.bias_unit(slot.name, slot.unit)
+        table.add_column(f"{slot.name}{_RMS[bool(slot.members)]}, {unit}".rstrip(", "), justify="right")
+        values.append(course.total(slot.name) / (abs(size) * np.sqrt(slot.size if slot.members else 1)))
         if known is not None and not slot.members:
             table.add_column("biases known", justify="right")
-            columns.append((known, slot))
-    values = [which.total(slot.name) / np.sqrt(slot.size if slot.members else 1) for which, slot in columns]
+            values.append(known.total(slot.name))
     for i in _few(course):
         numbers = [f"{value[i]:.4g}" if np.isfinite(value[i]) else "-" for value in values]
         table.add_row(str(course.counts[i]), f"{course.times[i]:g}", *numbers)

@@ -267,9 +267,9 @@ def _show_biases(found: FileFixes, fix: Fix, console: Console) -> None:
             table.add_column(name, justify="right" if name == "from data" else "left")
         for row in rows[:_BIASES]:
             share = f"{100.0 * row['from_data']:.3g} %" if np.isfinite(row["from_data"]) else "-"
-            table.add_row(
-                row["name"], row["member"], with_sigma(row["value"], row["sigma"], row["unit"]).strip(), share
-            )
+            unit, size = found.loaded.bias_unit(row["name"], row["unit"])
+            told = with_sigma(row["value"] / size, row["sigma"] / abs(size), unit)
+            table.add_row(row["name"], row["member"], told.strip(), share)
         if len(rows) > _BIASES:
             table.add_row("...", f"{len(rows) - _BIASES} more", "--json prints all", "")
         console.print(table)

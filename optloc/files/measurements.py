@@ -39,6 +39,10 @@ class Chunk:
         As in `optloc.base.types.Rows`; NaN where a value is to be simulated.
     unit : Conversion
         Of z.
+    units : Units
+        What z measures, and what its unit depends on.
+    written_unit : str
+        The unit of z as the file has it.
     slope : array (m,)
         SI units in one unit of the file, with sign.
     baseline : array (m,)
@@ -65,6 +69,8 @@ class Chunk:
     weight: Array
     correction: Array
     unit: Conversion
+    units: Units
+    written_unit: str
     slope: Array
     baseline: Array
     sigma: Array | None
@@ -135,7 +141,8 @@ def _chunk(c: Context, kind: str) -> Chunk:
     convention = section.azimuth if kind == "azimuth" else "east-counterclockwise"
     units = Units(model.quantity, c.speed, section.carrier_hz, convention)  # type: ignore[arg-type]
     _check_options(c, kind, model)
-    unit = units.conversion(_unit(section, kind, c.where), join(c.where, "key 'unit'"))
+    name = _unit(section, kind, c.where)
+    unit = units.conversion(name, join(c.where, "key 'unit'"))
     weight = _numbers(c, "weight", 1.0 if section.weight is None else section.weight)
     _check_weight(c, weight)
     z = _values(c, unit, weight)
@@ -148,7 +155,7 @@ def _chunk(c: Context, kind: str) -> Chunk:
     sigma, arrival, covariance = spread_of(c, model, units, unit, z)
     seconds = Units("time").conversion(section.time_unit, join(c.where, "key 'time_unit'")).factor
     return Chunk(
-        kind, np.arange(table.count), z, a, b, weight, _correction(c, units, unit), unit,
+        kind, np.arange(table.count), z, a, b, weight, _correction(c, units, unit), unit, units, units.name(name),
         np.broadcast_to(unit.slope(z), z.shape), np.zeros(c.table.count),
         sigma, arrival, covariance,
         table.labels("epoch") if table.has("epoch") else None,
@@ -320,8 +327,8 @@ def _arrival(
     c: Context, model: Model, units: Units, unit: Conversion, given: float | str | Mapping[str, float | str]
 ) -> Array:
     place = join(c.where, "key 'arrival_sigma'")
-    if model.ranges is None:
-        raise InvalidProblem("these rows do not combine arrival times", place, "give sigma or covariance")
+    if model.signs is None:
+        raise InvalidProblem("these rows do not add up what single stations measure", place, "give sigma or covariance")
     if not isinstance(given, Mapping):
         given = dict.fromkeys(c.stations, given)
     numbers = {name: i for i, name in enumerate(c.stations)}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
 from optloc.base.inputs import Budget, access, at_most
-from optloc.base.types import Array, Rows, Stations
+from optloc.base.types import Array, Bias, Rows, Stations
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.files.measurements import ESTIMATE, Chunk, check_repeats, chunks_of, square, with_baseline
 from optloc.files.schema import ConstraintTable, ProblemFile, Units, join, name_of, read_document, validate
@@ -51,6 +51,8 @@ class Loaded:
         Whether every epoch belongs to one target.
     levels : NoiseLevels, optional
         What the data say of the noise, where it is left to them.
+    bias_units : mapping of str to (str, float)
+        Unit of the file that people read each bias in, and its SI size with sign; those read in SI are left out.
     """
 
     problem: Problem
@@ -61,6 +63,11 @@ class Loaded:
     targets: tuple[str, ...]
     own_epochs: bool = False
     levels: NoiseLevels | None = None
+    bias_units: Mapping[str, tuple[str, float]] = field(default_factory=dict)
+
+    def bias_unit(self, name: str, unit: str) -> tuple[str, float]:
+        """Return the unit that people read an unknown in and its SI size: the file's, or what its slot says."""
+        return self.bias_units.get(name, (unit, 1.0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,11 +201,15 @@ def assemble(
     chunks = [_add_baseline(chunk, i, stations) for chunk, i in zip(chunks, index, strict=True)]
     rows, numbers = _rows(chunks, index, target)
     noise = _noise(file, chunks, numbers, index, target, source)
-    problem = _problem(file, epochs, stations, rows, noise, frame, source, known or {}, more or {})
+    written = [(number, chunk.units, chunk.written_unit) for number, chunk in zip(numbers, chunks, strict=True)]
+    biases = [bias_of(b, rows, stations.names, stations.dimension, written, source) for b in file.biases]
+    units = {bias.name: unit for bias, unit in biases if unit[0]}
+    own = tuple(bias for bias, _ in biases)
+    problem = _problem(file, epochs, stations, rows, noise, own, frame, source, known or {}, more or {})
     # Noise that is left to the data needs fixes, so the whole problem: it comes last.
     problem, levels = with_noise(file, problem, source)
     title = file.title or source
-    loaded = Loaded(problem, source, title, epochs.labels, epochs.times, epochs.targets, epochs.own, levels)
+    loaded = Loaded(problem, source, title, epochs.labels, epochs.times, epochs.targets, epochs.own, levels, units)
     return Draft(loaded, file, tuple(tables), tuple(chunks), tuple(numbers), found.moving or _follows(problem))
 
 
@@ -208,6 +219,7 @@ def _problem(
     stations: Stations,
     rows: tuple[Rows, ...],
     noise: Noise,
+    biases: tuple[Bias, ...],
     frame: Frame,
     source: str,
     known: Mapping[str | None, Table],
@@ -218,7 +230,6 @@ def _problem(
     # Times matter to what moves or drifts; other files may leave them out, or date epochs alike.
     why = needs_clock(motions, file.biases)
     times = epochs.clock if why is None else need_clock(epochs, why, source)
-    biases = tuple(bias_of(b, rows, stations.names, stations.dimension, speed, source) for b in file.biases)
     priors = tuple(prior_of(p, stations.dimension, source) for p in file.priors)
     demands = {join(source, f"[[constraints]] {i + 1}"): table for i, table in enumerate(file.constraints)}
     constraints = constraints_of({**demands, **more}, stations, frame, motions, epochs.targets, speed)
@@ -337,8 +348,8 @@ def noise_of(
 
 
 def _arrivals(chunk: Chunk, members: Array) -> Array:
-    """Return the covariance (g, r, r) of groups of rows (g, r) that combine independent arrivals."""
-    signs = MODELS[chunk.kind].ranges
+    """Return the covariance (g, r, r) of groups of rows (g, r) that combine what stations measure independently."""
+    signs = MODELS[chunk.kind].signs
     assert signs is not None
     assert chunk.arrival is not None
     ends = [(index[members], sign) for index, sign in zip((chunk.a, chunk.b), signs, strict=True)]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +11,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
 from optloc.base.types import Array, Band, Bias, Motion, Polygon, Prior, Rows, Stations
-from optloc.base.units import SPEED_OF_LIGHT, Quantity
+from optloc.base.units import SPEED_OF_LIGHT, Conversion, Quantity
 from optloc.files.schema import (
     Amount,
     BiasTable,
@@ -28,7 +28,6 @@ from optloc.files.schema import (
 from optloc.files.stations import spread, survey
 from optloc.files.table import Epochs, Table, table_of
 from optloc.linear.constraints import box, height, polygon, speed, visible
-from optloc.models import MODELS
 from optloc.problem.bias import family
 from optloc.problem.check import check_polygon, like
 
@@ -144,9 +143,37 @@ def _settle_frame(wanted: FrameTable, frame: Frame, dimension: int) -> FrameTabl
 
 
 def bias_of(
-    table: BiasTable, rows: Sequence[Rows], stations: Sequence[str], dimension: int, speed: float, source: str
-) -> Bias:
-    """Return a family of biases over the rows of a problem."""
+    table: BiasTable,
+    rows: Sequence[Rows],
+    stations: Sequence[str],
+    dimension: int,
+    written: Sequence[tuple[Array, Units, str]],
+    source: str,
+) -> tuple[Bias, tuple[str, float]]:
+    """Return a family of biases over the rows of a problem, and the unit that people read it in with its SI size.
+
+    Parameters
+    ----------
+    table : BiasTable
+        What the file says.
+    rows : sequence of Rows
+        All rows.
+    stations : sequence of str
+        Their names.
+    dimension : int
+        Of positions.
+    written : sequence of (int array (m,), Units, str)
+        Global numbers of rows, what their values measure and the unit that they are written in.
+    source : str
+        Place to name.
+
+    Returns
+    -------
+    Bias
+        The family.
+    (str, float)
+        Unit of the touched rows where they have one, per second for a drift; else empty.
+    """
     where = join(source, f"[[biases]] {table.name!r}")
     bias = family(
         rows,
@@ -158,24 +185,35 @@ def bias_of(
         members=table.members,
         where=where,
     )
-    ends = np.cumsum([block.count for block in rows])
-    # All rows of a bias are of one kind: that of the first tells the quantity.
-    block = rows[int(np.searchsorted(ends, bias.row[0], side="right"))]
-    quantity: Quantity = MODELS[block.kind].quantity  # type: ignore[assignment]  # the table holds known quantities only
+    # Which way an angle is counted does not matter to an error of it.
+    spelled = {
+        (replace(units, convention="east-counterclockwise"), name)
+        for numbers, units, name in written
+        if np.isin(bias.row, numbers).any()
+    }
     # A rotation in space has three angles, in the plane one.
     turns = (3,) if table.form == "rotation" and dimension == 3 else ()
-    mean, sigma = _prior(table, quantity, speed, (len(bias.members), *turns), where)
-    return replace(bias, mean=mean, sigma=sigma)
+    mean, sigma = _prior(table, [units for units, _ in spelled], (len(bias.members), *turns), where)
+    return replace(bias, mean=mean, sigma=sigma), _unit_to_read(table.form, spelled, where)
 
 
-def _prior(
-    table: BiasTable, quantity: Quantity, speed: float, shape: tuple[int, ...], where: str
-) -> tuple[Array, Array | None]:
+def _unit_to_read(form: str, spelled: Iterable[tuple[Units, str]], where: str) -> tuple[str, float]:
+    """Return the unit of an offset or drift of rows that are written in one unit, and its SI size; else empty."""
+    sizes = {(name, units.conversion(name, where)) for units, name in spelled}
+    (name, size), *more = sizes
+    if more or form not in ("offset", "drift") or size.logarithmic or size.factor == 1.0:
+        return "", 1.0
+    return f"{name}/s" if form == "drift" else name, size.factor
+
+
+def _prior(table: BiasTable, rows: Sequence[Units], shape: tuple[int, ...], where: str) -> tuple[Array, Array | None]:
     # A scale is a number whatever the rows measure, a rotation an angle.
     own: dict[str, Quantity] = {"scale": "plain", "rotation": "angle"}
-    units = Units(own.get(table.form, quantity), speed)
+    # All rows of a bias are of one quantity; carriers may differ from table to table.
+    carriers = {units.carrier for units in rows}
+    units = replace(rows[0], quantity=own.get(table.form, rows[0].quantity))
 
-    def si(value: float | str, key: str) -> float:
+    def si(value: float | str, key: str) -> tuple[float, Conversion]:
         place, text = join(where, f"key {key!r}"), value
         bare = "1" if units.quantity in {"plain", "ratio"} and table.form != "drift" else None
         # A drift has the unit of its rows per second, or per second squared of a drift of a rate.
@@ -186,17 +224,21 @@ def _prior(
                 example = f'"{number} {units.name(None)}/s"'
                 raise InvalidProblem(f"{value!r} is no drift", place, f"write its unit, such as {example}")
             text = f"{number} {amount}"
-        return units.plain(text, bare, place)
+        if len(carriers) > 1 and str(text).endswith("Hz"):
+            raise InvalidProblem("its rows have several carriers", place, "give it in m/s")
+        return units.amount(text, None if bare is None else units.conversion(bare, place), place)
 
-    mean = np.full(shape, 0.0 if table.mean is None else si(table.mean, "mean"))
+    centre, unit = (0.0, Conversion(1.0)) if table.mean is None else si(table.mean, "mean")
+    mean = np.full(shape, float(unit.to_si(centre)))
     if table.sigma is None:
         return mean, None
-    sigma = si(table.sigma, "sigma")
-    if sigma <= 0.0:
+    size, unit = si(table.sigma, "sigma")
+    if size <= 0.0:
         raise InvalidProblem(
             "the standard deviation is not positive", join(where, "key 'sigma'"), "leave it out if unknown"
         )
-    return mean, np.full(shape, sigma)
+    # A frequency grows where a rate falls: the size is what a standard deviation has.
+    return mean, np.full(shape, abs(float(unit.to_si(size))))
 
 
 def prior_of(table: PriorTable, dimension: int, source: str) -> Prior:

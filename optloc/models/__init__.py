@@ -81,6 +81,9 @@ class Model:
         One line for listings.
     ranges : (ra, rb), optional
         Set where ``h = ra r_a + rb r_b`` exactly.
+    signs : (sa, sb), optional
+        Set where ``h = sa q_a + sb q_b`` of something that each station measures by itself: rows that share a station
+        share its error (`arrival_sigma`). That of ranges is `ranges`.
     nodes : tuple of (factor, node)
         What a proof takes h for where it is no sum of ranges: ``h = sum of factor phi``, each phi a node
         (`optloc.proof.nodes.node.Node`) or the name of one that optloc has. Empty: nothing is proven of such rows.
@@ -106,6 +109,7 @@ class Model:
     stations: int
     summary: str
     ranges: tuple[int, int] | None = None
+    signs: tuple[int, int] | None = None
     nodes: tuple[tuple[float, Any], ...] = ()
     lifted: Callable[[Any, Point, Point], LiftedRow] | None = None
     period: float | None = None
@@ -120,6 +124,8 @@ class Model:
             raise InvalidProblem(f"unknown quantity {self.quantity!r}", "quantity", nearest(self.quantity, list(UNITS)))
         if self.stations not in (0, 1, 2):
             raise InvalidProblem(f"a row names 0, 1 or 2 stations, not {self.stations}", "stations")
+        if self.signs is None:
+            object.__setattr__(self, "signs", self.ranges)
 
 
 def _azimuth(t: Point, a: Point, b: Point) -> Any:
@@ -167,7 +173,7 @@ def rss_difference(exponent: float = 2.0) -> Model:
         return LiftedRow(None, 1.0, -1.0 * ratio, 0.0, lambda t, a, b: ratio / decibels * distance(t, b))
 
     summary = f"difference of received signal strengths, {10.0 * exponent:g} log10(r_b / r_a)"
-    return Model(h, "level", 2, summary, lifted=lifted)
+    return Model(h, "level", 2, summary, signs=(1, -1), lifted=lifted)
 
 
 def _basis(a: Point) -> tuple[Components, ...]:
@@ -262,11 +268,20 @@ _KINDS: dict[str, Model] = {
         ecef=True,
         dimensions=(3,),
     ),
+    "range_rate": Model(
+        lambda t, a, b: range_rate(t, a),
+        "speed",
+        1,
+        "Doppler shift as range rate, r'_a",
+        signs=(1, 0),
+        velocity=True,
+    ),
     "fdoa": Model(
         lambda t, a, b: range_rate(t, a) - range_rate(t, b),
         "speed",
         2,
         "frequency difference of arrival as range-rate difference, r'_a - r'_b",
+        signs=(1, -1),
         velocity=True,
     ),
     "rss_difference": rss_difference(),

@@ -226,8 +226,8 @@ def _signs(kind: str, form: Form) -> tuple[int, int]:
     model = MODELS[kind]
     if form == "rotation" or model.stations == 1:
         return (1, 0)
-    # Of two stations in a kind that is no sum of ranges, a difference is meant: gains, rates, levels.
-    return model.ranges or (1, -1)
+    # Of two stations in a kind that is no sum, a difference is meant: gains.
+    return model.signs or (1, -1)
 
 
 def _each(values: Any, shape: tuple[int, ...], where: str, what: str) -> Array:

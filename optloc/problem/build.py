@@ -29,8 +29,8 @@ class Measured:
     variance : array (..., m), optional
         Independent variance of each row.
     arrival : array (..., s) or (), optional
-        Variance of each station's arrival; rows that share a station and an epoch are then correlated. It adds to
-        `variance`.
+        Variance of what each station measures by itself; rows that share a station and an epoch are then correlated.
+        It adds to `variance`.
     covariance : array (..., m, m), optional
         Full covariance of these rows.
     """
@@ -68,8 +68,8 @@ def measured(
     sigma : float or array (..., m), optional
         Standard deviation of each row; rows are then independent.
     arrival_sigma : float or array (..., s), optional
-        Standard deviation of each station's arrival (metres); rows get the covariance D diag(sigma^2) D'. With
-        `sigma` as well, the two add.
+        Standard deviation of what each station measures by itself, in the unit of z: its arrival time (times c), its
+        range rate; rows get the covariance D diag(sigma^2) D'. With `sigma` as well, the two add.
     covariance : array (..., m, m), optional
         Full covariance of these rows, in the place of both.
     epoch, target : int array (m,) or int
@@ -278,11 +278,10 @@ def _noise(m: Measured, start: int, stations: int) -> list[noises.Block]:
 
 def _arrival_blocks(m: Measured, start: int, variance: Array) -> list[noises.Block]:
     """Return one block for each epoch and target: its rows combine the same arrivals, and have noise of their own."""
-    rows, signs = m.rows, MODELS[m.rows.kind].ranges
+    rows, signs = m.rows, MODELS[m.rows.kind].signs
     if signs is None:
-        raise InvalidProblem(
-            f"{rows.kind} does not combine arrival times", where="arrival_sigma", advice="give sigma or covariance"
-        )
+        what = f"{rows.kind} does not add up what single stations measure"
+        raise InvalidProblem(what, "arrival_sigma", "give sigma or covariance")
     blocks = []
     # Each epoch and target has arrivals of its own; a key for each pair of them, -1 (no target) included.
     for members in noises.together(rows.epoch * (rows.target.max(initial=0) + 2) + rows.target):

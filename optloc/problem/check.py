@@ -48,6 +48,7 @@ def checked(problem: Problem) -> Problem:
     _check_times(problem)
     _check_moving(problem)
     check_unknowns(problem)
+    _check_rates(problem)
     try:
         problem.batch_shape  # noqa: B018  (raises where leading axes disagree)
     except ValueError:
@@ -229,6 +230,15 @@ def _check_times(problem: Problem) -> None:
         raise InvalidProblem(f"epoch {place} is not later than the one before", "times", "sort the epochs")
     if any(rows.epoch.max(initial=0) >= len(times) for rows in problem.rows):
         raise InvalidProblem(f"there are only {len(times)} times", "times", "give one for each epoch")
+
+
+def _check_rates(problem: Problem) -> None:
+    """Refuse range rates between points that nobody says move: all of them are zero, wherever the target is."""
+    still = problem.stations.velocity is None and all(motion.order == 0 for motion in problem.motions)
+    kind = next((rows.kind for rows in problem.rows if MODELS[rows.kind].velocity), None)
+    if still and kind is not None:
+        what = f"{kind} of a target that stays needs stations that move, and none has a velocity"
+        raise InvalidProblem(what, "stations", "give velocities, columns vx, vy and vz of a file")
 
 
 # What cannot be unknown: malformed motions, biases and priors are refused with a sentence that names them.

@@ -33,7 +33,8 @@ WORDS = (
     "estimate",
     "position", "position[0]", "emission", "all", "target", "known", "free", "static", "constant_velocity", "drift",
     "scale", "rotation", "pair", "kind", "ecef", "enu", "geodetic", "cartesian", "north-clockwise", "b-farther", "run",
-    "tdoa", "toa", "range", "range_sum", "groa", "azimuth", "elevation", "height", "fdoa", "rss_difference", "auto",
+    "tdoa", "toa", "range", "range_sum", "groa", "azimuth", "elevation", "height", "range_rate", "fdoa",
+    "rss_difference", "auto",
     "estimate ", "1 ns", "10 m", "-3 m", "0 m", "1e308 km", "1e-320 ps", "nan m", "5 parsec", "3 dB", "2 deg", "1 Hz",
 )  # fmt: skip
 UNITS = (

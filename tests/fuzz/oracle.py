@@ -54,6 +54,13 @@ def differences(own, problem):
         for station, at in enumerate(here):
             if at is not None and not close(at, place[epoch, station], np.abs(at).max() + 1e7):
                 return f"station {own.names[station]} at epoch {epoch}: {at} and {place[epoch, station]}"
+    moves = problem.stations.velocity
+    if (own.velocity is None) != (moves is None):
+        return f"velocities {own.velocity} and {moves}"
+    for epoch, here in enumerate(own.velocity or []):
+        for station, rate in enumerate(here):
+            if rate is not None and not close(rate, moves[epoch, station], np.abs(rate).max()):
+                return f"velocity of {own.names[station]} at epoch {epoch}: {rate} and {moves[epoch, station]}"
     found = of_problem(problem)
     if len(found) != len(own.rows) or problem.epochs != own.count:
         return f"{len(own.rows)} rows in {own.count} epochs and {len(found)} in {problem.epochs}"
@@ -120,7 +127,10 @@ def posed(own, epoch):
     here = own.place[epoch if len(own.place) > 1 else 0]
     known = next(at for at in here if at is not None)
     place = np.array([[known if at is None else at for at in here]])
-    velocity = None if own.velocity is None else np.array(own.velocity)
+    velocity = None
+    if own.velocity is not None:
+        moves = own.velocity[epoch if len(own.velocity) > 1 else 0]
+        velocity = np.array([[[0.0] * place.shape[-1] if rate is None else rate for rate in moves]])
     kind, origin = own.frame
     frame = optloc.CARTESIAN if kind == "cartesian" else optloc.ECEF
     if kind == "enu":

@@ -17,8 +17,9 @@ SPEED = {"m/s": 1.0, "km/s": 1e3, "km/h": 1 / 3.6, "ft/s": 0.3048, "mph": 0.4470
 LEVEL = {"dB": 1.0, "Np": 20 / math.log(10)}
 CLOCK = TIME | {"min": 60.0, "h": 3600.0}
 LENGTHS = {"tdoa": 2, "range": 1, "toa": 1, "range_sum": 2, "height": 0}
-STATIONS = LENGTHS | {"azimuth": 1, "elevation": 1, "groa": 2, "fdoa": 2, "rss_difference": 2}
+STATIONS = LENGTHS | {"azimuth": 1, "elevation": 1, "groa": 2, "range_rate": 1, "fdoa": 2, "rss_difference": 2}
 SIGNS = {"tdoa": (1, -1), "range": (1, 0), "toa": (1, 0), "range_sum": (1, 1)}
+SIGNS |= {"range_rate": (1, 0), "fdoa": (1, -1), "rss_difference": (1, -1)}
 
 
 class Uncovered(Exception):  # noqa: N818  (no error: what this reading lacks)
@@ -175,7 +176,7 @@ def scale(kind, unit, section, speed):
         if unit == "dB":
             return lambda v: 10 ** (v / 20), lambda z: z * math.log(10) / 20
         factor = {"1": 1.0}[unit or "1"]
-    elif kind == "fdoa":
+    elif kind in ("range_rate", "fdoa"):
         factor = -speed / section["carrier_hz"] if unit == "Hz" else SPEED[unit or "m/s"]
     else:
         factor = LEVEL[unit or "dB"]
@@ -336,18 +337,24 @@ def stations(data, rows, used, epochs, count, times):
     if not any("time" in row or "epoch" in row for row in rows):
         assert len(index) == len(set(index)), "station twice"
         return names, [place], None if velocity is None else [velocity], sigma, system
-    if velocity is not None or any("epoch" in row for row in rows):
-        raise Uncovered("stations by epoch, or with velocities")
+    if any("epoch" in row for row in rows):
+        raise Uncovered("stations by epoch")
     factor = CLOCK[section.get("time_unit", "s")]
     if any(isinstance(row["time"], str) and row["time"].count("-") >= 2 for row in rows):
         raise Uncovered("dates")
     first = [index.index(s) for s in range(len(names))]
-    courses = [
-        sorted((number(row, "time") * factor, *at) for row, at, i in zip(rows, place, index, strict=True) if i == s)
-        for s in range(len(names))
-    ]
-    spread_out = [[between(course, time) for course in courses] for time in times]
-    return names, spread_out, None, sigma and [sigma[i] for i in first], system
+
+    def over_epochs(values):
+        courses = [
+            sorted(
+                (number(row, "time") * factor, *at) for row, at, i in zip(rows, values, index, strict=True) if i == s
+            )
+            for s in range(len(names))
+        ]
+        return [[between(course, time) for course in courses] for time in times]
+
+    moves = None if velocity is None else over_epochs(velocity)
+    return names, over_epochs(place), moves, sigma and [sigma[i] for i in first], system
 
 
 def between(course, time):
