@@ -8,8 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from optloc.base.frames import Frame
 from optloc.base.linalg import error_ellipse
-from optloc.base.types import Array
+from optloc.base.types import Array, Rows
+from optloc.models import MODELS, Point
 from optloc.plot import style
 from optloc.plot.outlines import rings
 from optloc.plot.style import (
@@ -19,11 +21,14 @@ from optloc.plot.style import (
     GREY,
     ORANGE,
     PLAN,
+    PURPLE,
     Scene,
     View,
     apart,
     figure_class,
     finish,
+    local_frame,
+    placed_points,
     scene_of,
     unit_of,
     xy,
@@ -41,13 +46,18 @@ _CLOSE = 0.3
 # Panel around the fixes: so many semi-axes of the largest ellipse, and of the distance that holds 95 % of the fixes.
 # The last is the share of the stations' spread where both are zero, as of a fix that constraints hold.
 _SEMI_AXES, _SPREAD, _HELD = 1.6, 1.1, 0.1
+# Range rates of a run that have curves, evenly among them; points along a side of the grid on which these are sought;
+# and the side in widths of what is shown, for a panel may be wider or taller than that.
+_CURVES, _GRID, _WIDE = 9, 161, 2.0
+# Metres from the picture's origin at which the Earth's surface stands almost upright in its plan, and steps to it.
+_STEEP, _STEPS = 5.5e6, 12
 
 
 def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") -> Figure:
     """Return a picture of fixes.
 
     A plan of everything and a plan of the surroundings of the fix; in three dimensions a view of the height between
-    them. One scale on both axes of each.
+    them. One scale on both axes of each. Of a single fix from range rates, the plans show isodoppler curves.
 
     Parameters
     ----------
@@ -63,23 +73,29 @@ def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") ->
     matplotlib.figure.Figure
         To be written with `optloc.plot.save`.
     """
-    scene = scene_of(problem, [fixes] if isinstance(fixes, Fix) else fixes, outlined=True)
+    every = [fixes] if isinstance(fixes, Fix) else fixes
+    scene = scene_of(problem, every, outlined=True)
     spatial = scene.stations.shape[-1] == 3
     count = 1 + spatial + (near := _nearby(scene))
     figure = figure_class()(figsize=(0.4 + 5.0 * count, 5.2), layout="constrained")
     # Overview, height in space, and the surroundings where the overview shows no more than a dot.
     panels = figure.subplots(1, count, squeeze=False)[0]
-    _overview(panels[0], scene, PLAN)
+    sizes = [_overview(panels[0], scene, PLAN)]
     if spatial:
         _overview(panels[1], scene, (0, 2))
     if near:
-        _close(panels[-1], scene)
+        sizes.append(_close(panels[-1], scene))
+    if len(every) == 1 and every[0].code.size == 1 and np.isfinite(scene.fixes).all():
+        centres = (np.zeros(2), scene.fixes[0, :2])
+        for panel, size, centre in zip((panels[0], panels[-1]), sizes, centres, strict=False):
+            _isodopplers(panel, problem, every[0], centre, size)
     finish(figure, title, panels[:1])
     apart(figure)
     return figure
 
 
-def _overview(panel: Axes, scene: Scene, view: View) -> None:
+def _overview(panel: Axes, scene: Scene, view: View) -> float:
+    """Draw everything, and return the size of the unit."""
     lines = (*scene.tracks, *scene.paths, *scene.other_paths, *scene.known)
     everything = np.concatenate([scene.stations, scene.fixes, scene.alternatives, *lines])
     unit, size = unit_of(everything[:, view])
@@ -91,6 +107,7 @@ def _overview(panel: Axes, scene: Scene, view: View) -> None:
     style.points(panel, scene, view, size)
     style.name_axes(panel, scene, view, unit)
     panel.set_title("plan" if view == PLAN else "height")
+    return size
 
 
 def _edges(panel: Axes, scene: Scene, size: float) -> None:
@@ -125,14 +142,14 @@ def _nearby(scene: Scene) -> bool:
     return reach < _CLOSE * float(np.ptp(scene.stations[:, :2]))
 
 
-def _close(panel: Axes, scene: Scene) -> None:
-    """Draw the surroundings of the fixes: what is beyond their ellipses, or their own spread."""
+def _close(panel: Axes, scene: Scene) -> float:
+    """Draw the surroundings of the fixes, their ellipses or their own spread, and return the size of the unit."""
     known: Array = np.asarray(np.isfinite(scene.fixes).all(-1))
     view = PLAN
     if not known.any():
         panel.set_axis_off()
         panel.text(0.5, 0.5, "no fix", ha="center", va="center", transform=panel.transAxes)
-        return
+        return 1.0
     # Medians: one wild fix of many must not move the panel.
     centre = np.median(scene.fixes[known][:, view], axis=0)
     extent = _reach(scene, known, centre)
@@ -148,6 +165,7 @@ def _close(panel: Axes, scene: Scene) -> None:
     panel.set_xlim(-extent / size, extent / size)
     panel.set_ylim(-extent / size, extent / size)
     panel.set_title(f"around {scene.axes[0]} {centre[0]:.1f} m, {scene.axes[1]} {centre[1]:.1f} m")
+    return size
 
 
 def _shift(scene: Scene, centre: Array) -> Scene:
@@ -168,3 +186,112 @@ def _reach(scene: Scene, known: Array, centre: Array) -> float:
     away = np.abs(scene.fixes[known][:, :2] - centre).max(-1)
     reach = _SEMI_AXES * float(largest) + _SPREAD * float(np.quantile(away, 0.95))
     return reach if reach > 0.0 else _HELD * float(np.ptp(scene.stations[:, :2]) or 1.0)
+
+
+# Isodoppler curves: where the target would be by one range rate alone.
+
+
+def _isodopplers(panel: Axes, problem: Problem, fix: Fix, centre: Array, size: float) -> None:
+    """Draw the curves of equal range rate through the fix in a plan whose origin is a centre, metres."""
+    from matplotlib.collections import LineCollection
+
+    (west, east), (south, north) = panel.get_xlim(), panel.get_ylim()
+    middle, half = np.array([west + east, south + north]) / 2.0, _WIDE * max(east - west, north - south) / 2.0
+    corners = size * np.stack([middle - half, middle + half]) + centre
+    x, y = (np.linspace(low, high, _GRID) for low, high in corners.T)
+    places = _at_height(problem, fix, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+    lines = [(line - centre) / size for _, line in isodopplers(problem, fix, x, y, places)]
+    if lines:
+        # The limits of a plan are those of what is known, not of curves.
+        look: dict[str, Any] = {"colors": PURPLE, "linewidths": 1.0, "zorder": 1}
+        panel.add_collection(LineCollection(lines, label="equal Doppler through the fix", **look), autolim=False)
+
+
+def isodopplers(problem: Problem, fix: Fix, x: Array, y: Array, places: Array) -> list[tuple[str, Array]]:
+    """Return curves on which a range rate, or a difference of two, is what it is at the fix.
+
+    Parameters
+    ----------
+    problem : Problem
+        With one target.
+    fix : Fix
+        Its fix.
+    x, y : array (n,), (m,)
+        Grid of a plan or a map.
+    places : array (m n, d)
+        Its points in the problem's frame, metres; NaN where there is none.
+
+    Returns
+    -------
+    list of (str, array (p, 2))
+        Names of rows, nine at most, and lines in x and y; none where the target moves in the course of a run, or
+        there is no fix.
+    """
+    from contourpy import contour_generator
+
+    flat, answer = problem.flat(), fix.flat()
+    rates = [rows for rows in flat.rows if MODELS[rows.kind].velocity]
+    moving = [motion for motion in flat.motions if motion.known is None]
+    alone = len(moving) == 1 == len(flat.motions) and flat.batch_shape == (1,)
+    if not (rates and alone and np.isfinite(answer.x).all() and (moving[0].order == 0 or flat.epochs == 1)):
+        return []
+    # The fix is the last point: what it has is the level of its curve.
+    places = np.concatenate([places, answer.position.reshape(1, -1)])
+    velocity = answer.velocity.reshape(-1) if moving[0].order else np.zeros(flat.dimension)
+    found = []
+    for rows, row in _spread(rates):
+        value = _rate(flat, rows, row, places, velocity)
+        excess = np.ma.masked_invalid((value[:-1] - value[-1]).reshape(len(y), len(x)))
+        ends = " – ".join(flat.stations.names[k] for k in (rows.a[row], rows.b[row]) if k >= 0)
+        made = contour_generator(x, y, excess).lines(0.0)
+        found += [(f"{rows.kind} {ends}, as at the fix", np.asarray(line)) for line in made]
+    return found
+
+
+def _spread(rates: Sequence[Rows]) -> list[tuple[Rows, int]]:
+    """Return rows that count, evenly chosen where they are many."""
+    every = [(rows, i) for rows in rates for i in np.flatnonzero(rows.weight.reshape(-1, rows.count)[0] > 0.0).tolist()]
+    return [every[i] for i in np.unique(np.linspace(0, len(every) - 1, min(_CURVES, len(every))).astype(int)).tolist()]
+
+
+def _rate(problem: Problem, rows: Rows, row: int, places: Array, velocity: Array) -> Array:
+    """Return what a row would measure of a target at places (n, d)."""
+
+    def at(array: Array | None, index: int) -> tuple[float, ...]:
+        if array is None:
+            return (0.0,) * problem.dimension
+        epoch = rows.epoch[row] if array.shape[-3] > 1 else 0
+        return tuple(array.reshape(-1, *array.shape[-3:])[0, epoch, index].tolist())
+
+    stations = problem.stations
+    a, b = (Point(at(stations.position, i[row]), at(stations.velocity, i[row])) for i in (rows.a, rows.b))
+    target = Point(tuple(places.T), tuple(velocity))
+    with np.errstate(all="ignore"):
+        return np.asarray(MODELS[rows.kind].h(target, a, b))
+
+
+def _at_height(problem: Problem, fix: Fix, plan: Array) -> Array:
+    """Return points (n, d) of the problem's frame above a plan (n, 2), as high as the fix; NaN beyond the horizon."""
+    fixed = fix.position.reshape(1, -1)
+    if problem.dimension == 2:
+        return plan
+    frame = local_frame(problem) or problem.frame
+    if not frame.geodetic:
+        return np.column_stack([plan, np.full(len(plan), fixed[0, 2])])
+    height = float(problem.frame.to_geodetic(fixed)[2][0])
+    return placed_points(problem, np.column_stack([plan, _up(frame, plan, height)]))[0]
+
+
+def _up(frame: Frame, plan: Array, height: float) -> Array:
+    """Return the third coordinate (n,) of points above a plan whose height above the ellipsoid is given."""
+    across = np.linalg.norm(plan, axis=1)
+    near = across < _STEEP
+    centre = np.linalg.norm(frame.origin_ecef())
+    up = np.full(len(plan), np.nan)
+    up[near] = np.sqrt(centre**2 - across[near] ** 2) - centre
+    for _ in range(_STEPS):
+        at = np.column_stack([plan[near], up[near]])
+        # How much higher a point is for each metre along the picture's third axis, on a sphere.
+        gain = (up[near] + centre) / np.hypot(across[near], up[near] + centre)
+        up[near] -= (frame.to_geodetic(at)[2] - height) / gain
+    return up

@@ -14,6 +14,7 @@ from optloc.base.linalg import error_ellipse
 from optloc.base.types import Array, Status
 from optloc.linear.evaluate import differentiate
 from optloc.models import MODELS
+from optloc.plot.fixes import isodopplers
 from optloc.plot.outlines import Pieces
 from optloc.plot.outlines import rings as around
 from optloc.plot.style import figure_class, outlines_of, states_of
@@ -366,13 +367,14 @@ def station_spots(problem: Problem) -> Spots:
 def lines_of_position(problem: Problem, fix: Fix, limits: tuple[float, float, float, float]) -> list[tuple[str, Array]]:
     """Return where a target would be by each row alone, at the height of the fix: name, and line (n, 2) in degrees.
 
-    Hyperbolas of time differences, circles of ranges, rays of bearings; other unknowns are as the fix has them.
+    Hyperbolas of time differences, circles of ranges, rays of bearings; other unknowns are as the fix has them. Of many
+    rows only range rates have lines, some of them, through the fix.
     """
     figure_class()  # one sentence where matplotlib, which brings contourpy, is missing
     from contourpy import contour_generator
 
     flat, x = problem.flat(), fix.flat().x[0]
-    if flat.batch_shape != (1,) or flat.count > _LINES or not np.isfinite(x).all():
+    if flat.batch_shape != (1,) or not np.isfinite(x).all():
         return []
     slot, shared = flat.layout.find("position") if _has_position(flat) else (None, False)
     if slot is None or not shared:
@@ -381,9 +383,11 @@ def lines_of_position(problem: Problem, fix: Fix, limits: tuple[float, float, fl
     own = x[slot.start : slot.start + slot.size]
     height = float(problem.frame.to_geodetic(own)[2])
     east, north = (np.radians(v.ravel()) for v in np.meshgrid(lon, lat))
-    vectors = np.tile(x, (east.size, 1))
     # Longitudes back between half a turn west and east: the grid goes on beyond the date line.
     place = problem.frame.from_geodetic(north, (east + np.pi) % (2.0 * np.pi) - np.pi, np.full(east.size, height))
+    if flat.count > _LINES:
+        return isodopplers(problem, fix, lon, lat, place[:, : slot.size])
+    vectors = np.tile(x, (east.size, 1))
     vectors[:, slot.start : slot.start + slot.size] = place[:, : slot.size]
     with np.errstate(all="ignore"):
         residual = differentiate(flat, vectors)[0]
