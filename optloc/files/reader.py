@@ -19,7 +19,16 @@ from optloc.files.measurements import ESTIMATE, Chunk, check_repeats, chunks_of,
 from optloc.files.schema import ConstraintTable, ProblemFile, Units, join, name_of, read_document, validate
 from optloc.files.stations import over_epochs, survey
 from optloc.files.table import Epochs, Keys, Table, epochs_of, need_clock, of_frame, table_of
-from optloc.files.unknowns import bias_of, constraints_of, known_of, motions_of, needs_clock, places_of, prior_of
+from optloc.files.unknowns import (
+    FREE,
+    bias_of,
+    constraints_of,
+    known_of,
+    motions_of,
+    needs_clock,
+    places_of,
+    prior_of,
+)
 from optloc.models import MODELS
 from optloc.problem.check import checked
 from optloc.problem.noise import Block, Noise, arrivals, group, together
@@ -256,7 +265,7 @@ def _epochs(file: ProblemFile, chunks: Sequence[Chunk], source: str) -> Epochs:
         raise InvalidProblem(what, place, "leave the key out, or correct the columns")
     # A stated motion decides whether targets are free at each epoch; none leaves it to the number of epochs.
     motion = {table.moves for table in (file.target, *file.targets.values())} - {None}
-    free = None if not motion else motion == {"free"}
+    free = None if not motion else motion <= FREE
     keys = Keys(columns["label"], columns["time"], columns["written"], columns["target"])
     return epochs_of(keys, sum(len(chunk.z) for chunk in chunks), window, free, source)
 
@@ -461,7 +470,7 @@ def from_table(
         What the table calls its columns: ``{"z": "tdoa_ns"}``.
     sigma : float or str, optional
         Standard deviation of every row, in `unit` or as text with its own: ``"30 ns"``.
-    motion : "static", "free", "constant_velocity" or "constant_acceleration", optional
+    motion : "static", "free", "free_velocity", "constant_velocity" or "constant_acceleration", optional
         How the target moves; static with one epoch, free with several by default.
     frame : str or mapping
         ``"cartesian"``, ``"ecef"``, ``"geodetic"``, or the table ``[frame]`` of a problem file.

@@ -214,8 +214,11 @@ class MeasurementsTable(DataTable):
 class TargetTable(DataTable):
     """How targets move; the rows of a known one. Columns: x, y, z or lat_deg, lon_deg, height; time or epoch."""
 
-    motion: Literal["static", "free", "constant_velocity", "constant_acceleration", "known"] | None = None
-    """Default: known with rows or a file, else static with one epoch, else a free position at every epoch."""
+    motion: Literal["static", "free", "free_velocity", "constant_velocity", "constant_acceleration", "known"] | None = (
+        None
+    )
+    """Default: known with rows or a file, else static with one epoch, else a free position at every epoch, where the
+    target is at rest; free_velocity has a velocity of each epoch, too."""
     reference: float | None = None
     """Time at which the state of a moving target is answered, seconds; the first epoch by default."""
     unit: str = "m"

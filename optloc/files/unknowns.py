@@ -32,7 +32,10 @@ from optloc.problem.bias import family
 from optloc.problem.check import check_polygon, like
 
 # Derivatives of the position that a motion estimates.
-_ORDERS = {"static": 0, "free": 0, "constant_velocity": 1, "constant_acceleration": 2}
+_ORDERS = {"static": 0, "free": 0, "free_velocity": 1, "constant_velocity": 1, "constant_acceleration": 2}
+FREE = {"free", "free_velocity"}
+"""Motions whose state is one of each epoch."""
+
 # What an unknown measures, and the unit of its bare numbers; units know no acceleration, so that is SI only.
 _STATES: dict[str, tuple[Quantity, str]] = {
     "position": ("length", "m"),
@@ -70,12 +73,12 @@ def _motion(table: TargetTable, count: int, known: Array | None) -> Motion:
     if known is not None:
         return Motion(known.shape[-2] - 1, "epoch" if count > 1 else "run", known)
     motion = table.motion or ("static" if count == 1 else "free")
-    return Motion(_ORDERS[motion], "epoch" if motion == "free" and count > 1 else "run", reference=table.reference)
+    return Motion(_ORDERS[motion], "epoch" if motion in FREE and count > 1 else "run", reference=table.reference)
 
 
 def needs_clock(motions: Sequence[Motion], biases: Sequence[BiasTable]) -> str | None:
     """Return why the times of the epochs matter, or None."""
-    if any(motion.order > 0 and motion.known is None for motion in motions):
+    if any(motion.order > 0 and motion.span == "run" and motion.known is None for motion in motions):
         return "a moving target"
     return "a drift" if any(bias.form == "drift" for bias in biases) else None
 

@@ -238,7 +238,8 @@ def _check_rates(problem: Problem) -> None:
     kind = next((rows.kind for rows in problem.rows if MODELS[rows.kind].velocity), None)
     if still and kind is not None:
         what = f"{kind} of a target that stays needs stations that move, and none has a velocity"
-        raise InvalidProblem(what, "stations", "give velocities, columns vx, vy and vz of a file")
+        advice = "give velocities (vx, vy, vz in a file), or say how the target moves"
+        raise InvalidProblem(what, "stations", advice)
 
 
 # What cannot be unknown: malformed motions, biases and priors are refused with a sentence that names them.
