@@ -395,6 +395,7 @@ def kitchen_sink(d: int, span: str = "epoch", seed: int = 5) -> Problem:
     known = np.stack([np.stack([TARGET[d] + 500.0 * i, RATE[d]]) for i in range(k)])
     motions = (Motion(1), Motion(2, reference=11.0), Motion(1, known=known))
     kinds = ["tdoa", "groa", "range", "toa", "range_sum", "azimuth", "fdoa"] + (["elevation"] if d == 3 else [])
+    kinds.append("range_rate")
     parts, sizes = [], {}
     for kind in kinds:
         a = rng.integers(0, count, 11)
