@@ -9,6 +9,8 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 DOCS = Path(__file__).parent
 PLACE = re.compile(r"^<!-- generated: (\w+)(?: (.+?))? -->$", re.MULTILINE)
 
@@ -185,6 +187,147 @@ def _marked(text: str) -> str:
     return re.sub(r"(?<![`\w-])(--[a-z][a-z-]*)", r"`\1`", text)
 
 
+# What moves Doppler rows of a pass, and what of it is modelled: sizes from a pass that is typical.
+
+# m/s; rad/s; m3/s2 (WGS 84); Hz, the L band of Iridium; TECU and metres at the zenith: a day at middle latitudes.
+_C, _TURN, _GM, _CARRIER, _TECU, _AIR = 299792458.0, 7.2921151467e-5, 3.986004418e14, 1.6e9, 30.0, 2.4
+
+
+class Pass:
+    """Four minutes of a satellite 780 km high that comes up to 45 degrees over an emitter: two bodies."""
+
+    def __init__(self) -> None:
+        from optloc.base.frames import ECEF
+
+        self.times = np.arange(-120.0, 121.0, 5.0)
+        self.emitter = ECEF.from_geodetic(np.radians(47.8), np.radians(11.2), 600.0)
+        below = ECEF.from_geodetic(np.radians(47.8), np.radians(20.0), 0.0)
+        self.axes = ECEF.enu_axes(self.emitter)
+        self.radius = 6378e3 + 780e3
+        self.up, self.ahead = below / np.linalg.norm(below), ECEF.enu_axes(below)[1]
+        self.speed = float(np.sqrt(_GM / self.radius))
+
+    def satellite(self, times: Any) -> Any:
+        """Return where it is in axes that do not turn, those of the Earth at time zero."""
+        angle = np.asarray(times)[..., None] * self.speed / self.radius
+        return self.radius * (np.cos(angle) * self.up + np.sin(angle) * self.ahead)
+
+    def ground(self, times: Any) -> Any:
+        """Return where the emitter is in these axes."""
+        return turned(np.broadcast_to(self.emitter, (*np.shape(times), 3)), _TURN * np.asarray(times))
+
+    def range(self, times: Any, shift: float = 0.0) -> Any:
+        """Return what optloc computes: the distance at one instant, the satellite `shift` seconds ahead."""
+        place = turned(self.satellite(times + shift), -_TURN * (times + shift))
+        return np.linalg.norm(place - self.emitter, axis=-1)
+
+    def light(self, times: Any, *, up: bool) -> Any:
+        """Return the way of the light that arrives at times, from the ground to the satellite or down."""
+        way = np.zeros_like(times)
+        for _ in range(5):  # each step is 1e5 times closer
+            then = times - way / _C
+            ends = (self.satellite(times), self.ground(then)) if up else (self.satellite(then), self.ground(times))
+            way = np.linalg.norm(ends[0] - ends[1], axis=-1)
+        return way
+
+    def sine(self, times: Any) -> Any:
+        """Return the sine of the satellite's elevation."""
+        line = self.satellite(times) - self.ground(times)
+        return np.einsum("ni,ni->n", line, turned(np.broadcast_to(self.axes[2], line.shape), _TURN * times)) / (
+            np.linalg.norm(line, axis=-1)
+        )
+
+    def rate(self, excess: Callable[[Any], Any]) -> Any:
+        """Return the rate of what a path is longer by."""
+        return (excess(self.times + 0.5) - excess(self.times - 0.5)) / 1.0
+
+    def moves(self, rate: Any, *, known: bool) -> float:
+        """Return by how much an error of the rates moves a fix at known height, metres; the frequency known or not."""
+
+        def model(place: Any) -> Any:
+            away = turned(self.satellite(self.times), -_TURN * self.times)
+            step = turned(self.satellite(self.times + 0.5), -_TURN * (self.times + 0.5))
+            back = turned(self.satellite(self.times - 0.5), -_TURN * (self.times - 0.5))
+            line = away - place
+            return np.einsum("ni,ni->n", line, step - back) / np.linalg.norm(line, axis=-1)
+
+        slopes = [(model(self.emitter + 50.0 * axis) - model(self.emitter - 50.0 * axis)) / 100.0 for axis in self.axes]
+        design = np.column_stack([*slopes[:2], *([] if known else [np.ones(len(self.times))])])
+        return float(np.linalg.norm(np.linalg.lstsq(design, rate)[0][:2]))
+
+
+def turned(place: Any, angle: Any) -> Any:
+    """Return places (n, 3) turned about the third axis."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([c * place[..., 0] - s * place[..., 1], s * place[..., 0] + c * place[..., 1], place[..., 2]], -1)
+
+
+def effects() -> dict[str, tuple[str, Any, Any]]:
+    """Return what moves the rows of a pass: what optloc does about it, error of the range and of its rate (n,)."""
+    scene = Pass()
+    t, speed = scene.times, scene.speed
+    late = float(scene.range(np.zeros(1))[0] / _C)
+    thin = 40.3e16 * _TECU / _CARRIER**2
+
+    def rotated(angle: float, axis: int) -> Callable[[Any], Any]:
+        def excess(times: Any) -> Any:
+            place = turned(scene.satellite(times), -_TURN * times)
+            around = np.roll(turned(np.roll(place, 2 - axis, axis=-1), angle), axis - 2, axis=-1)
+            return np.linalg.norm(around - scene.emitter, axis=-1) - np.linalg.norm(place - scene.emitter, axis=-1)
+
+        return excess
+
+    def layer(times: Any) -> Any:
+        across = np.sqrt(1.0 - scene.sine(times) ** 2)
+        return -thin / np.sqrt(1.0 - (6371.0 / (6371.0 + 350.0) * across) ** 2)
+
+    table: dict[str, tuple[str, Callable[[Any], Any]]] = {
+        "light time, from the ground up (Sagnac)": ("left", lambda t: scene.light(t, up=True) - scene.range(t)),
+        "light time, from the satellite down": ("left", lambda t: scene.light(t, up=False) - scene.range(t)),
+        "the same, times put earlier by the light time of mid-pass": (
+            "what is left of it",
+            lambda t: scene.light(t, up=False) - scene.range(t, -late),
+        ),
+        "UT1 - UTC of 0.1 s": ("modelled (skyfield)", rotated(0.1 * _TURN, 2)),
+        "polar motion of 0.3 seconds of arc": ("left", rotated(float(np.radians(0.3 / 3600.0)), 0)),
+        "place of the satellite along its track, 1 km": (
+            "left",
+            lambda t: scene.range(t, 1e3 / speed) - scene.range(t),
+        ),
+        "ionosphere, 30 TECU": ("left", layer),
+        "troposphere, 2.4 m at the zenith": ("left", lambda t: _AIR / scene.sine(t)),
+    }
+    found = {name: (what, excess(t), scene.rate(excess)) for name, (what, excess) in table.items()}
+    place = turned(scene.satellite(t), -_TURN * t)
+    line = place - scene.emitter
+    carried = _TURN * np.einsum("ni,ni->n", line, np.stack([-place[:, 1], place[:, 0], 0.0 * t], -1))
+    turn = ("modelled: velocities in ECEF hold it", np.full(len(t), np.nan), carried / np.linalg.norm(line, axis=-1))
+    # Speed makes the satellite's clock slow, height makes it fast.
+    clock = (speed**2 / 2.0 + _GM / scene.radius - _GM / np.linalg.norm(scene.emitter)) / _C
+    constant = ("goes into the unknown frequency", np.full(len(t), np.nan), np.full(len(t), clock))
+    return {"Earth's rotation in the velocities": turn} | found | {"v²/2c² and gravity (clocks)": constant}
+
+
+def doppler() -> str:
+    """Return the effects as a table: their sizes, and what a fix is moved by."""
+    scene, head = (
+        Pass(),
+        "| effect | range, m | rate, m/s | at 1.6 GHz, Hz | moves the fix by, m | frequency known, m | in optloc |",
+    )
+    lines = [head, "|---|---|---|---|---|---|---|"]
+    for name, (what, length, rate) in effects().items():
+        most = float(np.abs(rate).max())
+        reach = "" if np.isnan(length).all() else _brief(float(np.abs(length).max()))
+        found = (most, _CARRIER / _C * most, scene.moves(rate, known=False), scene.moves(rate, known=True))
+        lines.append(f"| {name} | {reach} | {' | '.join(map(_brief, found))} | {what} |")
+    return "\n".join(lines)
+
+
+def _brief(size: float) -> str:
+    """Return two digits of a size; less than a tenth of a millimetre is nothing."""
+    return "0" if size < 1e-4 else f"{float(f'{size:.2g}'):g}"
+
+
 GENERATED: dict[str, Callable[..., str]] = {
     "rows": rows,
     "formulation": formulation,
@@ -194,4 +337,5 @@ GENERATED: dict[str, Callable[..., str]] = {
     "commands": commands,
     "layers": layers,
     "budgets": budgets,
+    "doppler": doppler,
 }

@@ -3,10 +3,12 @@
 import json
 import random
 import re
+from importlib.util import module_from_spec, spec_from_file_location
 
 import numpy as np
 import pandas as pd
 import pytest
+from doc_pages import DOCS
 from typer.testing import CliRunner
 
 import optloc
@@ -332,3 +334,34 @@ def test_without_the_library_the_extra_is_named(tle, monkeypatch):
     with pytest.raises(InvalidProblem, match=r"need the library skyfield; pip install 'optloc\[satellites\]'"):
         satellites(tle, seconds(0.0))
     orbits._library.cache_clear()
+
+
+# What the page says is left of physics.
+
+
+def test_the_effects_of_the_page_have_the_sizes_of_their_formulas():
+    spec = spec_from_file_location("generated", DOCS / "generated.py")
+    generated = module_from_spec(spec)
+    spec.loader.exec_module(generated)
+    scene, effects = generated.Pass(), generated.effects()
+    t, c, speed = scene.times, 299792458.0, np.sqrt(3.986004418e14 / 7158e3)
+    place = generated.turned(scene.satellite(t), -ROTATION * t)
+    # Sagnac: what the turning Earth carries the emitter while the signal is on its way
+    twice = place[:, 1] * scene.emitter[0] - place[:, 0] * scene.emitter[1]
+    up = effects["light time, from the ground up (Sagnac)"]
+    np.testing.assert_allclose(up[1], ROTATION / c * twice, rtol=1e-3)
+    # down: r r' / c, a rate of v^2 / c at all times on a straight course, and Sagnac's with the other sign
+    down = effects["light time, from the satellite down"]
+    half = scene.range(t + 0.5) ** 2 - scene.range(t - 0.5) ** 2
+    np.testing.assert_allclose(down[1], -half / 2.0 / c - up[1], atol=2e-3)
+    assert np.ptp(down[2]) < 0.1 * np.abs(down[2]).max()
+    clock = effects["v²/2c² and gravity (clocks)"][2]
+    assert (0.0 < clock).all()
+    assert (clock < speed**2 / 2.0 / c).all()
+    assert scene.moves(clock, known=False) < 1e-6
+    # along the track the fix goes with the satellite, by as much less as the ground is lower
+    along = effects["place of the satellite along its track, 1 km"]
+    assert abs(scene.moves(along[2], known=False) - 1e3 * 6367.0 / 7158.0) < 20.0
+    table = generated.doppler().splitlines()
+    assert len(table) == 2 + len(effects)
+    assert {line.count("|") for line in table} == {8}
