@@ -1,6 +1,7 @@
 """The plug-in for Stone Soup: models against finite differences, the initiator, the feeder, YAML, whole trackers."""
 
 import datetime as dt
+from functools import partial
 from importlib.metadata import entry_points
 from io import StringIO
 
@@ -15,6 +16,7 @@ from stonesoup.deleter.time import UpdateTimeStepsDeleter
 from stonesoup.hypothesiser.distance import DistanceHypothesiser
 from stonesoup.initiator.simple import SimpleMeasurementInitiator, SinglePointInitiator
 from stonesoup.measures import Mahalanobis
+from stonesoup.models.measurement.nonlinear import CartesianToBearingRangeRate
 from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
 from stonesoup.predictor.kalman import ExtendedKalmanPredictor, UnscentedKalmanPredictor
 from stonesoup.serialise import YAML
@@ -26,7 +28,17 @@ from stonesoup.updater.kalman import ExtendedKalmanUpdater, IteratedKalmanUpdate
 
 from optloc import InvalidProblem, measured
 from optloc.plugins import stonesoup as plugin
-from optloc.plugins.stonesoup import AOATDOA, GROA, TDOA, FixInitiator, PairFeeder, arrival_covariance
+from optloc.plugins.stonesoup import (
+    AOATDOA,
+    FDOA,
+    GROA,
+    TDOA,
+    TDOAFDOA,
+    FixInitiator,
+    PairFeeder,
+    RangeRate,
+    arrival_covariance,
+)
 
 PLACE, RATE = [0, 2, 4], [1, 3, 5]
 STATIONS = np.array(
@@ -57,14 +69,32 @@ def aoatdoa():
     )
 
 
+def rates(kind, **more):
+    """Return a model of range rates of the stations in motion."""
+    shape = {"ndim_state": 6, "mapping": PLACE, "stations": STATIONS, "velocities": moving(1) - STATIONS} | more
+    if kind is RangeRate:
+        return RangeRate(noise_covar=0.01 * np.eye(6), receivers=np.arange(6), **shape)
+    size, shared = 0.1, arrival_covariance(PAIRS, 1.0, len(STATIONS))
+    noise = np.kron(np.diag([SIGMA**2, size**2]), shared) if kind is TDOAFDOA else size**2 * shared
+    return kind(noise_covar=noise, pairs=PAIRS, **shape)
+
+
 MODELS = {"TDOA": tdoa, "GROA": groa, "AOATDOA": aoatdoa}
+RATES = {"RangeRate": RangeRate, "FDOA": FDOA, "TDOAFDOA": TDOAFDOA}
+MODELS |= {name: partial(rates, kind) for name, kind in RATES.items()}
 TRUTH = np.array([4000.0, 80, 6500, -60, 1800, 5])[:, None]
 
 
-def expected(name, p):
-    """Return the measurement from the definitions, written again."""
-    line = p - STATIONS
+def expected(name, state):
+    """Return the measurement of a state (6,) from the definitions, written again."""
+    line = state[PLACE] - STATIONS
     r = np.sqrt((line**2).sum(1))
+    rate = (line * (state[RATE] - moving(1) + STATIONS)).sum(1) / r
+    if name == "RangeRate":
+        return rate
+    if name in RATES:
+        pairs = [r[a] - r[b] for a, b in PAIRS] if name == "TDOAFDOA" else []
+        return [*pairs, *(rate[a] - rate[b] for a, b in PAIRS)]
     if name == "TDOA":
         return [r[a] - r[b] for a, b in PAIRS]
     if name == "GROA":
@@ -78,32 +108,67 @@ def expected(name, p):
 def test_functions_derivatives_and_batches(name):
     model = MODELS[name]()
     value = np.asarray(model.function(State(TRUTH)), dtype=float)[:, 0]
-    np.testing.assert_allclose(value, expected(name, TRUTH[PLACE, 0]), rtol=1e-12)
+    np.testing.assert_allclose(value, expected(name, TRUTH[:, 0]), rtol=1e-12)
     numeric = np.zeros((model.ndim_meas, 6))
     for i in range(6):
         step = np.zeros((6, 1))
         step[i] = 0.1
-        ends = [np.array(expected(name, (TRUTH + sign * step)[PLACE, 0])) for sign in (1, -1)]
+        ends = [np.array(expected(name, (TRUTH + sign * step)[:, 0])) for sign in (1, -1)]
         numeric[:, i] = (ends[0] - ends[1]) / 0.2
     np.testing.assert_allclose(model.jacobian(State(TRUTH)), numeric, rtol=1e-5, atol=1e-9)
     many = StateVectors(np.hstack([TRUTH, TRUTH + 1.0]))
     both = np.asarray(model.function(State(many)), dtype=float)
     np.testing.assert_allclose(both[:, 0], value)
-    np.testing.assert_allclose(both[:, 1], expected(name, TRUTH[PLACE, 0] + 1.0))
+    np.testing.assert_allclose(both[:, 1], expected(name, TRUTH[:, 0] + 1.0))
 
 
 @pytest.mark.parametrize("name", MODELS)
 def test_inverse_noise_and_density(name):
     model = MODELS[name]()
     exact = Detection(model.function(State(TRUTH)), timestamp=ZERO, measurement_model=model)
-    back = model.inverse_function(exact)
-    np.testing.assert_allclose(np.asarray(back, dtype=float)[PLACE, 0], TRUTH[PLACE, 0], atol=1e-3)
-    np.testing.assert_array_equal(np.asarray(back, dtype=float)[RATE, 0], 0.0)
+    if name not in ("RangeRate", "FDOA"):  # rates alone do not show position and velocity at one instant
+        back = np.asarray(model.inverse_function(exact), dtype=float)
+        np.testing.assert_allclose(back[PLACE, 0], TRUTH[PLACE, 0], atol=1e-3)
+        np.testing.assert_allclose(back[RATE, 0], TRUTH[RATE, 0] if name == "TDOAFDOA" else 0.0, atol=1e-3)
     drawn = np.asarray(model.rvs(20_000, random_state=np.random.RandomState(0)), dtype=float)
     size = np.sqrt(np.outer(*[np.diag(model.covar())] * 2))
     np.testing.assert_allclose(np.cov(drawn) / size, np.asarray(model.covar(), dtype=float) / size, atol=0.05)
     at_peak = model.logpdf(exact, State(TRUTH))
     assert at_peak == pytest.approx(-0.5 * np.linalg.slogdet(2 * np.pi * np.asarray(model.covar(), dtype=float))[1])
+
+
+def test_range_rates_are_those_of_the_host():
+    """Stone Soup's own model of bearing, range and range rate, for each station with its velocity."""
+    rate, velocities = rates(RangeRate), moving(1) - STATIONS
+    ours, slope = np.asarray(rate.function(State(TRUTH)), dtype=float), rate.jacobian(State(TRUTH))
+    for i, (place, velocity) in enumerate(zip(STATIONS, velocities, strict=True)):
+        host = CartesianToBearingRangeRate(
+            ndim_state=6,
+            mapping=PLACE,
+            velocity_mapping=RATE,
+            noise_covar=np.eye(3),
+            translation_offset=place[:, None],
+            velocity=velocity[:, None],
+        )
+        assert float(host.function(State(TRUTH))[2, 0]) == pytest.approx(ours[i, 0], rel=1e-12)
+        theirs = np.asarray(host.jacobian(State(TRUTH)), dtype=float)[2]
+        np.testing.assert_allclose(slope[i], theirs, rtol=1e-4, atol=1e-6)  # theirs by differences
+
+
+def test_rates_begin_a_track_with_its_velocity():
+    """One scan of time and frequency differences is a state; another order of the state is only that."""
+    order = {"mapping": [0, 1, 2], "velocity_mapping": [3, 4, 5]}
+    swap = [0, 2, 4, 1, 3, 5]
+    for shape, state in (({}, TRUTH), (order, TRUTH[swap])):
+        model = rates(TDOAFDOA, **shape)
+        found = Detection(model.function(State(state)), timestamp=ZERO, measurement_model=model)
+        track = FixInitiator().initiate({found}, ZERO).pop()
+        np.testing.assert_allclose(np.asarray(track.state_vector, dtype=float), state, atol=1e-3)
+        assert np.sqrt(np.diag(np.asarray(track.covar, dtype=float))[swap[1] if not shape else 3]) < 5.0
+    with pytest.raises(InvalidProblem, match="name the places of the velocity"):
+        rates(FDOA, ndim_state=4, mapping=[1, 2, 3])
+    with pytest.raises(InvalidProblem, match="give one for each station"):
+        rates(FDOA, velocities=np.zeros((2, 3)))
 
 
 def test_angles_wrap():
@@ -277,7 +342,7 @@ def test_a_prior_of_the_speed_lets_one_scan_do():
 
 def test_detections_of_other_models_are_refused():
     other = Detection(np.zeros((1, 1)), timestamp=ZERO)
-    with pytest.raises(InvalidProblem, match="TDOA, GROA or AOATDOA"):
+    with pytest.raises(InvalidProblem, match="a model of this plug-in, such as TDOA"):
         FixInitiator().initiate({other}, ZERO)
 
 

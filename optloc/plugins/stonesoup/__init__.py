@@ -9,14 +9,29 @@ from __future__ import annotations
 from typing import Any
 
 from optloc.plugins.stonesoup.initiator import FixInitiator
-from optloc.plugins.stonesoup.models import AOATDOA, GROA, TDOA, PairFeeder, StationMeasurement, arrival_covariance
+from optloc.plugins.stonesoup.models import (
+    AOATDOA,
+    FDOA,
+    GROA,
+    TDOA,
+    TDOAFDOA,
+    PairFeeder,
+    RangeRate,
+    RateMeasurement,
+    StationMeasurement,
+    arrival_covariance,
+)
 
 __all__ = [
     "AOATDOA",
+    "FDOA",
     "GROA",
     "TDOA",
+    "TDOAFDOA",
     "FixInitiator",
     "PairFeeder",
+    "RangeRate",
+    "RateMeasurement",
     "StationMeasurement",
     "arrival_covariance",
     "register_yaml",
@@ -31,7 +46,7 @@ def register_yaml(yaml: Any) -> None:
     yaml : ruamel.yaml.YAML
         Given by Stone Soup, which finds this function by the entry point ``stonesoup.serialise.yaml``.
     """
-    classes = {cls.__name__: cls for cls in (TDOA, GROA, AOATDOA, FixInitiator, PairFeeder)}
+    classes = {cls.__name__: cls for cls in (TDOA, GROA, AOATDOA, RangeRate, FDOA, TDOAFDOA, FixInitiator, PairFeeder)}
 
     # Stone Soup writes the module of a class into its tag; the class alone is read, so files outlive moves.
     def construct(constructor: Any, suffix: str, node: Any) -> Any:

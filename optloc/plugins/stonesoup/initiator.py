@@ -95,7 +95,7 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         """Return the most likely chain that a detection continues, which is then taken, or a new one."""
         if not isinstance(detection.measurement_model, StationMeasurement):
             what = f"a detection has the measurement model {type(detection.measurement_model).__name__}"
-            raise InvalidProblem(what, "initiator", "use TDOA, GROA or AOATDOA of this plug-in")
+            raise InvalidProblem(what, "initiator", "use a model of this plug-in, such as TDOA")
         tried = [
             (self._chain((*chain.detections, detection)), chain)
             for chain in self._chains
@@ -120,10 +120,12 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         times = np.array([(detection.timestamp - last).total_seconds() for detection in detections])
         d = len(models[0].mapping)
         priors = [Prior("velocity", np.zeros(d), self.speed**2 * np.eye(d))] if self.order and self.speed else []
+        rates = [model.rates for model in models]
         problem = problem_of(
             np.stack([model.stations for model in models]),
             [model.rows for model in models],
             [model.covar() for model in models],
+            velocity=None if any(rate is None for rate in rates) else np.stack(rates),
             times=times,
             motions=(Motion(self.order, reference=0.0),),
             priors=priors,
@@ -159,7 +161,8 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
     def _rates(self, model: StationMeasurement) -> Sequence[int]:
         if not self.order:
             return []
-        return [i + 1 for i in model.mapping] if self.velocity_mapping is None else list(self.velocity_mapping)
+        own = getattr(model, "velocity_mapping", None) if self.velocity_mapping is None else self.velocity_mapping
+        return [i + 1 for i in model.mapping] if own is None else list(own)
 
 
 def _alike(one: Any, two: Any) -> bool:

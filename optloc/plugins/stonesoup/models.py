@@ -23,10 +23,10 @@ from stonesoup.types.array import StateVector, StateVectors
 from stonesoup.types.detection import Detection
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array, Status
+from optloc.base.types import Array, Motion, Status
 from optloc.linear.evaluate import predict
 from optloc.linear.normal import linearise
-from optloc.problem.build import assemble, measured
+from optloc.problem.build import assemble, measured, station_array
 from optloc.problem.noise import Block, arrivals, group
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
@@ -40,14 +40,14 @@ Row = tuple[str, int, int]
 
 
 def arrival_covariance(pairs: Any, sigma: Any, stations: int) -> Array:
-    """Return the covariance (m, m) of differences of arrivals, in square metres: rows that share a station correlate.
+    """Return the covariance (m, m) of differences of what stations measure: rows that share a station correlate.
 
     Parameters
     ----------
     pairs : int array (m, 2)
         Stations a and b of each row.
     sigma : float or array (s,)
-        Standard deviation of each station's arrival, metres.
+        Standard deviation of each station's arrival, metres; of its range rate, m/s.
     stations : int
         Number of stations s.
     """
@@ -60,7 +60,7 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
     """What stations at given positions measure of a target; base of the models below.
 
     Moving stations: give each detection a model of its own. Azimuths go from +x towards +y, elevations up from the
-    plane, ranges and their differences are in metres.
+    plane, ranges and their differences are in metres, range rates and theirs in metres per second.
 
     Raises
     ------
@@ -92,28 +92,43 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
         """Return the number of rows."""
         return len(self.rows)
 
+    @property
+    def places(self) -> list[int]:
+        """Return the places in the state of what the measurement depends on: the position."""
+        return list(self.mapping)
+
+    @property
+    def rates(self) -> Array | None:
+        """Return the velocities (s, d) of the stations, metres per second, where they matter."""
+        return None
+
     @clearable_cached_property("stations", "noise_covar")  # type: ignore[untyped-decorator]
     def problem(self) -> Problem:
         """Return the optloc problem of one measurement: an unknown position, values of zero."""
-        return problem_of(self.stations[None], [self.rows], [np.asarray(self.noise_covar, dtype=float)])
+        return self._posed(Motion())
+
+    def _posed(self, motion: Motion) -> Problem:
+        rates = None if self.rates is None else self.rates[None]
+        covariance = np.asarray(self.noise_covar, dtype=float)
+        return problem_of(self.stations[None], [self.rows], [covariance], velocity=rates, motions=(motion,))
 
     def function(self, state: Any, noise: Any = False, **kwargs: Any) -> Any:
         """Return the measurement (m, 1) of a state, or (m, N) of N of them, with noise if wanted."""
-        position = np.asarray(state.state_vector, dtype=float)[list(self.mapping)].T  # (N, d)
-        values = self._ordered(predict(self.problem, position).T)
+        vector = np.asarray(state.state_vector, dtype=float)[self.places].T  # (N, d or 2 d)
+        values = self._ordered(predict(self.problem, vector).T)
         if isinstance(noise, bool) or noise is None:
             noise = self.rvs(num_samples=values.shape[1], **kwargs) if noise else 0
         return self._typed(values) + noise
 
     def jacobian(self, state: Any, **kwargs: Any) -> Array:
         """Return the derivative (m, n) of the measurement with respect to the state."""
-        position = np.asarray(state.state_vector, dtype=float)[list(self.mapping), 0]
+        vector = np.asarray(state.state_vector, dtype=float)[self.places, 0]
         out = np.zeros((self.ndim_meas, self.ndim_state))
-        out[:, list(self.mapping)] = self._ordered(linearise(self.problem, position).shared)
+        out[:, self.places] = self._ordered(linearise(self.problem, vector).shared)
         return out
 
     def inverse_function(self, detection: Any, **kwargs: Any) -> Any:
-        """Return the state (n, 1) with the position that fits a detection best, found without a guess; else zeros.
+        """Return the state (n, 1) of which `places` fit a detection best, found without a guess; zeros elsewhere.
 
         Raises
         ------
@@ -124,7 +139,7 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
         if not bool(fix.answered) or bool(fix.has(*_NOT_ONE_PLACE)):
             raise NotImplementedError(Status(int(fix.code)).sentence)
         out = np.zeros((self.ndim_state, 1))
-        out[list(self.mapping), 0] = fix.position
+        out[self.places, 0] = fix.x
         return out.view(StateVector)
 
     def rvs(self, num_samples: int = 1, **kwargs: Any) -> Any:
@@ -198,6 +213,82 @@ class AOATDOA(StationMeasurement):
         return [*seen, *(("tdoa", int(a), int(b)) for a, b in np.atleast_2d(self.pairs))]
 
 
+class RateMeasurement(StationMeasurement, ABC):
+    """What depends on the velocity of the target as well; base of the models below.
+
+    Raises
+    ------
+    InvalidProblem
+        Where velocities do not fit the stations, or the state has no place for the target's.
+    """
+
+    velocities: np.ndarray | None = Property(
+        default=None, doc="Velocities (s, d) of the stations, m/s; by default they are at rest."
+    )
+    velocity_mapping: Sequence[int] | None = Property(
+        default=None, doc="Places of the velocity in the state; by default those after the position's."
+    )
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.velocities = None if self.velocities is None else np.asarray(self.velocities, dtype=float)
+        if self.velocities is not None and self.velocities.shape != self.stations.shape:
+            what = f"velocities have shape {self.velocities.shape}, stations {self.stations.shape}"
+            raise InvalidProblem(what, "velocities", "give one for each station")
+        if len(self.places) != 2 * len(self.mapping) or max(self.places) >= self.ndim_state:
+            what = f"the velocity is at {self.places[len(self.mapping) :]} of a state of {self.ndim_state}"
+            raise InvalidProblem(what, "velocity_mapping", "name the places of the velocity")
+
+    @property
+    def places(self) -> list[int]:
+        """Return the places in the state of the position, then of the velocity."""
+        own = self.velocity_mapping
+        return [*self.mapping, *([i + 1 for i in self.mapping] if own is None else own)]
+
+    @property
+    def rates(self) -> Array | None:
+        """Return the velocities (s, d) of the stations."""
+        return np.zeros_like(self.stations) if self.velocities is None else self.velocities
+
+    @clearable_cached_property("stations", "noise_covar", "velocities")  # type: ignore[untyped-decorator]
+    def problem(self) -> Problem:
+        """Return the optloc problem of one measurement: an unknown position and velocity, values of zero."""
+        return self._posed(Motion(1))
+
+
+class RangeRate(RateMeasurement):
+    """Range rates of single stations, m/s: a Doppler shift f is the rate -c f / carrier."""
+
+    receivers: np.ndarray = Property(doc="Station (m,) of each row.")
+
+    @property
+    def rows(self) -> Sequence[Row]:
+        """Return kind and station of each row."""
+        return [("range_rate", int(a), -1) for a in np.atleast_1d(self.receivers)]
+
+
+class FDOA(RateMeasurement):
+    """Range-rate differences of pairs of stations, m/s."""
+
+    pairs: np.ndarray = Property(doc="Stations a and b (m, 2) of each row.")
+
+    @property
+    def rows(self) -> Sequence[Row]:
+        """Return kind and stations of each row."""
+        return [("fdoa", int(a), int(b)) for a, b in np.atleast_2d(self.pairs)]
+
+
+class TDOAFDOA(RateMeasurement):
+    """Range differences of pairs of stations, metres, then range-rate differences of the same pairs, m/s."""
+
+    pairs: np.ndarray = Property(doc="Stations a and b (m, 2) of each range difference and each rate difference.")
+
+    @property
+    def rows(self) -> Sequence[Row]:
+        """Return kind and stations of each row."""
+        return [(kind, int(a), int(b)) for kind in ("tdoa", "fdoa") for a, b in np.atleast_2d(self.pairs)]
+
+
 def values_of(detection: Any) -> Array:
     """Return the values (m,) of a detection."""
     return np.asarray(detection.state_vector, dtype=float)[:, 0]
@@ -214,7 +305,14 @@ def rows_by_kind(scans: Sequence[Sequence[Row]]) -> tuple[dict[str, list[tuple[i
     return found, np.concatenate([np.array(part) for part in places.values()])
 
 
-def problem_of(stations: Array, scans: Sequence[Sequence[Row]], covariances: Sequence[Array], **more: Any) -> Problem:
+def problem_of(
+    stations: Array,
+    scans: Sequence[Sequence[Row]],
+    covariances: Sequence[Array],
+    *,
+    velocity: Array | None = None,
+    **more: Any,
+) -> Problem:
     """Return the problem of some scans, with values of zero.
 
     Parameters
@@ -225,6 +323,8 @@ def problem_of(stations: Array, scans: Sequence[Sequence[Row]], covariances: Seq
         Rows.
     covariances : sequence of k arrays (m, m)
         Of the rows of each scan.
+    velocity : array (k, s, d), optional
+        Of the stations at each scan.
     **more
         Further arguments of `optloc.assemble`.
     """
@@ -240,7 +340,7 @@ def problem_of(stations: Array, scans: Sequence[Sequence[Row]], covariances: Seq
         for first, last, covariance in zip(ends[:-1], ends[1:], covariances, strict=True)
     ]
     still = stations[:1] if np.array_equal(stations, np.broadcast_to(stations[:1], stations.shape)) else stations
-    return replace(assemble(still, *parts, **more), noise=group(blocks))
+    return replace(assemble(station_array(still, velocity=velocity), *parts, **more), noise=group(blocks))
 
 
 class PairFeeder(DetectionFeeder):  # type: ignore[misc]  # untyped base
