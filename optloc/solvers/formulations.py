@@ -14,8 +14,14 @@ from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.certify.relaxations import Reference, reference_bound
 from optloc.solvers.starts.angles import Bearings, bearings, by_directions, instrumental, least_worst
-from optloc.solvers.starts.heights import height_starts
-from optloc.solvers.starts.position import one_position, over_ground, registrable, squared_range_starts
+from optloc.solvers.starts.doppler import doppler_starts, dopplered
+from optloc.solvers.starts.position import (
+    height_starts,
+    one_position,
+    over_ground,
+    registrable,
+    squared_range_starts,
+)
 from optloc.solvers.starts.registration import closed_form, relax_run, run_starts
 from optloc.solvers.starts.squared_range import every, hull, minimum, shor
 
@@ -198,6 +204,15 @@ _PROGRAMS: dict[str, Formulation] = {
         "Shor 1987",
         serves=registrable,
         starts={"sdp": _start_relaxed_run},
+    ),
+    "doppler_sdp": Formulation(
+        "place, ranges, unknown rates and their products lifted; weighted by the ranges of the pass before",
+        "range_rate, fdoa of a source at rest, with tdoa, range, range_sum and a known height",
+        "never tight: a start, seldom the only minimum; many rows are joined to normal points",
+        "0.01 s four stations, 1 s eight epochs of a pair",
+        "Song et al. 2025; Wang, Li, Ansari 2013",
+        serves=dopplered,
+        starts={"sdp": doppler_starts},
     ),
     "lifted": Formulation(
         "order-1 lift [1, x, r]: a baseline for studies, never a default",

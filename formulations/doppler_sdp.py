@@ -1,0 +1,573 @@
+r"""Doppler shifts of a source at rest, its ranges and the products with unknown rates lifted: **a start, never tight**.
+
+A node is a station at one epoch: place :math:`s_i`, velocity :math:`v_i`. Range and range rate of a source at `x` are
+
+.. math:: r_i = |x - s_i|, \qquad r_i\, q_i = -(x - s_i) \cdot v_i,
+
+and the rows say :math:`z_m = q_a - q_b + A_m \cdot b + n_m` (without `b` where one station hears its Doppler shift) or
+:math:`z_l = R_l \cdot r + A_l \cdot b + n_l` with unknowns `b`, an offset of the emitter's frequency for instance. A
+row of rates times :math:`r_a` has no quotient left:
+
+.. math:: \varepsilon_m = r_a n_m = z_m r_a + (x - s_a) \cdot v_a + q_b r_a - A_m \cdot b\, r_a .
+
+With the unknown rates :math:`\beta = (b, q_b)` and the products :math:`w_{ji} = \beta_j r_i` that occur, all of this is
+linear in :math:`y = (1, x, \beta, r, w)`, and the weighted cost, rows of rates divided by ranges :math:`\rho_a` that
+are known from the pass before,
+
+.. math:: \min_x \; |W \,\mathrm{diag}(1/\rho)\, L\, y|^2,
+
+is linear in :math:`Y = y y^\top`. It is relaxed to :math:`Y \succeq 0` with what holds for every source:
+
+- ties: :math:`Y_{r_i r_i} = |x - s_i|^2`, :math:`Y_{\beta_j r_i} = w_{ji}`, and
+  :math:`Y_{q_b r_b} = -(x - s_b) \cdot v_b` of a rate's own range;
+- products taken in two orders: :math:`w_{ji} r_n = w_{jn} r_i` and :math:`w_{ji} \beta_l = w_{li} \beta_j`, where the
+  product of a rate with its own range is the linear form above;
+- Cauchy and Schwarz, :math:`r_i r_n \ge |(x - s_i) \cdot (x - s_n)|` (that is the triangle inequality),
+  :math:`q_b^2 \le |v_b|^2`, and :math:`|x - s_i| \le r_i`;
+- where the height is known, :math:`(x - c)^\top E (x - c) = 1`, else :math:`|x|^2 \le` `reach`:sup:`2`; both are linear
+  in `Y`, and the ellipsoid is a surface of constant height only nearly (`formulations.range_height.ellipsoid`).
+
+What it is worth: the value is a lower bound of that weighted cost for the last :math:`\rho`, not of the likelihood's
+(both agree at a point whose ranges are :math:`\rho`). It is not tight: where the first row of `Y` says a place, the
+rest says how far around it the relaxation cannot choose. A frequency offset leaves two places, one on each side of a
+satellite's track, of which `Y` is the mean: then its first moment lies between them, and the points
+
+.. math:: \bar x, \quad \bar x \pm \sqrt{\lambda_k}\, e_k, \qquad Y_{xx} - \bar x \bar x^\top = \sum_k \lambda_k e_k
+   e_k^\top
+
+hold both (a mean of two points has one eigenvalue, and they are at plus and minus its root). They are starts for a
+local method and say nothing of uniqueness; differences of rates alone, of one pair, are where they miss most.
+
+Many rows are too many: `normal_points` joins those that follow each other in time.
+
+Sources: B. Song, W. Wen, Q. Zhang, B. Xu and L.-T. Hsu, "Certifiably optimal Doppler positioning using opportunistic
+LEO satellites", arXiv:2509.17198 (2025) (place, ranges, clock drift and its products with the ranges lifted, and
+weights from the ranges of the pass before: the programme for one station a row, without the products in two orders and
+the inequalities); G. Wang, Y. Li and N. Ansari, "A semidefinite relaxation method for source localization using TDOA
+and FDOA measurements", IEEE Trans. Veh. Technol. 62 (2013), p. 853 (range and rate of the reference as unknowns that
+are lifted with the source); H. D. Sherali and W. P. Adams, "A reformulation-linearization technique", Kluwer 1999
+(products in two orders).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from formulations.algebra import Array, Index, Mask
+from formulations.conic import Answer, Relaxation, keep, rank_ratio, tight
+from formulations.range_height import Ellipsoid
+
+SIZE = 36
+"""Length of y beyond which rows should be joined: the time of the programme grows with its fourth power, and is half a
+second here."""
+
+_PASSES = 2  # the second has the ranges that the first found; a third changed no start of 40
+_LIMIT = 10.0  # of unknowns that are not rates, in speeds of the fastest node: far beyond what a fit leaves of them
+_NEAREST = 1e-3  # of the unit of length: a weight at a station itself would be infinite
+_BEND = 2  # degree of the polynomial of a normal point: rates of a pass bend, over a block they hardly do more
+
+
+@dataclass(frozen=True, slots=True)
+class Shape:
+    """What the programme is built for.
+
+    Parameters
+    ----------
+    dimension, nodes, unknowns : int
+        Of space, numbers of nodes and of linear unknowns b.
+    second : tuple of int
+        Nodes whose range rate is an unknown: those subtracted in a row.
+    product : tuple of (int, int)
+        Unknown j of beta and node i of each product w.
+    surface : bool
+        Whether the source lies on an ellipsoid; else within a reach.
+    """
+
+    dimension: int
+    nodes: int
+    unknowns: int
+    second: tuple[int, ...]
+    product: tuple[tuple[int, int], ...]
+    surface: bool
+
+    @property
+    def places(self) -> tuple[int, int, int, int]:
+        """Return where beta, r and w begin in y, and how long y is."""
+        beta = 1 + self.dimension
+        r = beta + self.unknowns + len(self.second)
+        return beta, r, r + self.nodes, r + self.nodes + len(self.product)
+
+    @property
+    def rate_of(self) -> dict[int, int]:
+        """Return the node whose range rate each unknown of beta is, by the unknown."""
+        return {self.unknowns + i: node for i, node in enumerate(self.second)}
+
+    def swaps(self) -> Index:
+        """Return the products that may be taken in two orders.
+
+        Returns
+        -------
+        int array, shape (q, 4)
+            ``f, u, g, v``: f times entry u of y is g times entry v. Both f and g are entries of y, products w; but a
+            negative f stands for the range times the range rate of node ``-1 - f``.
+        """
+        beta, r, w, _ = self.places
+        form = {(j, node): -1 - node for j, node in self.rate_of.items()}
+        form |= {pair: w + k for k, pair in enumerate(self.product)}
+        found = []
+        for (one, f), (other, g) in combinations(form.items(), 2):
+            if one[0] == other[0]:
+                found.append((f, r + other[1], g, r + one[1]))
+            elif one[1] == other[1]:
+                found.append((f, beta + other[0], g, beta + one[0]))
+        # a rate has one node, and a node one rate: of two forms one at most is negative, and it comes first in `form`
+        return np.array(found, dtype=np.int64).reshape(-1, 4)
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """The rows in units of their own size, see the module's text.
+
+    Parameters
+    ----------
+    shape : Shape
+        What is multiplied with what.
+    place, speed : Array, shape (M, d)
+        Nodes.
+    rows : Array, shape (m, n)
+        L: every row as a form in y.
+    pivot : int array, shape (m,)
+        Node whose range the error of a row is multiplied with; -1 for none.
+    whiten : Array, shape (m, m)
+        W.
+    surface : Ellipsoid or None
+        In these units.
+    origin : Array, shape (d,)
+        Where they begin.
+    length, rate : float
+        Units of length and speed.
+    unit, mean : Array, shape (p,)
+        Units of b, and what they count from.
+    """
+
+    shape: Shape
+    place: Array
+    speed: Array
+    rows: Array
+    pivot: Array
+    whiten: Array
+    surface: Ellipsoid | None
+    origin: Array
+    length: float
+    rate: float
+    unit: Array
+    mean: Array
+
+    @classmethod
+    def of(
+        cls,
+        place: Array,
+        speed: Array,
+        z: Array,
+        whiten: Array,
+        ranges: Array,
+        rates: Array,
+        design: Array,
+        surface: Ellipsoid | None,
+    ) -> Scene:
+        """Scale, and choose what is lifted; arguments as in `doppler`."""
+        origin = place.mean(axis=0) if surface is None else surface.centre
+        # of an ellipsoid its mean radius, else the farthest node
+        length = (
+            float(np.sqrt(((place - origin) ** 2).sum(axis=1).max()))
+            if surface is None
+            else float(np.trace(surface.shape) / len(origin)) ** -0.5
+        )
+        length = length or 1.0
+        rate = float(np.sqrt((speed**2).sum(axis=1).max())) or 1.0
+        of_rate = np.asarray(rates.any(axis=1))
+        size = np.where(of_rate, rate, length)
+        first, second, sign = _ends(rates, speed)
+        scaled = design / size[:, None]
+        unit = 1.0 / np.maximum(np.abs(scaled).max(axis=0, initial=0.0), np.finfo(float).tiny)
+        scaled = scaled * unit
+        # without what a fit by the unknowns alone explains they are numbers of order one
+        left = z / size
+        mean = np.linalg.lstsq(scaled, left, rcond=None)[0] if scaled.size else np.zeros(design.shape[1])
+        left = left - scaled @ mean
+        shape = _shape(place.shape, first, second, scaled, of_rate, surface is not None)
+        place, speed = (place - origin) / length, speed / rate
+        left, scaled = np.where(of_rate, sign, 1.0) * left, np.where(of_rate, sign, 1.0)[:, None] * scaled
+        rows = _forms(shape, place, speed, left, ranges, first, second, scaled)
+        whiten = whiten * (size * np.where(of_rate, sign, 1.0))
+        own = None if surface is None else Ellipsoid(surface.shape * length**2, np.zeros(len(origin)))
+        return cls(shape, place, speed, rows, first, whiten, own, origin, length, rate, unit, unit * mean)
+
+    def parameters(self, far: Array, reach: float) -> tuple[dict[str, Array], float]:
+        """Parameters of the programme for the ranges of the pass before, and the unit of its cost."""
+        form = self.whiten @ (self.rows / far[:, None])
+        gram = form.T @ form
+        size = float(np.abs(gram).max()) or 1.0
+        speed, place, shape = self.speed, self.place, self.shape
+        swap = shape.swaps()
+        slow = np.sqrt((speed**2).sum(axis=1))
+        own = (place * speed).sum(axis=1)
+        values = {
+            "gram": gram / size,
+            "station": place,
+            "square": (place**2).sum(axis=1),
+        }
+        limit = np.concatenate([np.full(shape.unknowns, _LIMIT), slow[list(shape.second)]])
+        if len(limit):
+            values["limit"] = limit**2
+        if shape.second:
+            values |= {"rate": speed[list(shape.second)], "level": own[list(shape.second)]}
+        mixed = -1 - swap[swap[:, 0] < 0, 0]
+        if len(mixed):
+            values |= {"turned rate": speed[mixed], "turned level": own[mixed]}
+        if shape.nodes > 1:
+            u, v = np.triu_indices(shape.nodes, 1)
+            values |= {"middle": place[u] + place[v], "inner": (place[u] * place[v]).sum(axis=1)}
+        values |= {"reach": np.array(reach**2)} if self.surface is None else {"form": self.surface.shape}
+        return values, size
+
+    def longest(self, reach: float) -> float:
+        """Length of Y that no source within the reach exceeds."""
+        far = reach if self.surface is None else float(np.linalg.eigvalsh(self.surface.shape)[0]) ** -0.5
+        r = far + np.sqrt((self.place**2).sum(axis=1))
+        slow = np.sqrt((self.speed**2).sum(axis=1))
+        beta = np.concatenate([np.full(self.shape.unknowns, _LIMIT), slow[list(self.shape.second)]])
+        w = np.array([beta[j] * r[i] for j, i in self.shape.product])
+        return float(1.0 + far**2 + (r**2).sum() + (beta**2).sum() + (w**2).sum())
+
+
+@dataclass(frozen=True, slots=True)
+class Started:
+    """A start from the relaxation.
+
+    Parameters
+    ----------
+    point : Array, shape (1 + 2 d, d)
+        What the first row of Y says, then the points around it, the farthest first; NaN where the solver gave none.
+    unknown : Array, shape (p,)
+        What it says of b.
+    far : Array, shape (m,)
+        Ranges that the errors of rows of rates are divided by in the weighted cost; one for other rows.
+    value, bound : float
+        Optimum, and a lower bound of the weighted cost within the reach, recomputed from the dual.
+    rank_ratio : float
+        Second over first eigenvalue of the lift.
+    answer : Answer
+        The solver's report.
+    """
+
+    point: Array
+    unknown: Array
+    far: Array
+    value: float
+    bound: float
+    rank_ratio: float
+    answer: Answer | None
+
+
+def doppler(
+    place: ArrayLike,
+    speed: ArrayLike,
+    z: ArrayLike,
+    whiten: ArrayLike,
+    *,
+    ranges: ArrayLike,
+    rates: ArrayLike,
+    design: ArrayLike | None = None,
+    surface: Ellipsoid | None = None,
+    reach: float = 10.0,
+    backend: str = "CLARABEL",
+) -> Started:
+    """Start a source at rest from Doppler shifts, and range differences beside them.
+
+    Parameters
+    ----------
+    place, speed : array_like, shape (M, d)
+        Nodes, stations at an epoch each: positions and velocities.
+    z : array_like, shape (m,)
+        Measured values: range rates and differences of range rates, ranges and their differences or sums.
+    whiten : array_like, shape (m, m)
+        W, the whitening matrix of their errors.
+    ranges, rates : array_like, shape (m, M)
+        What each row adds up of the nodes' ranges and range rates: a row of rates has one node with plus or minus one,
+        or two of opposite signs, and no ranges.
+    design : array_like, shape (m, p), optional
+        A: what each linear unknown adds to the rows.
+    surface : Ellipsoid, optional
+        Where the source lies.
+    reach : float
+        Without a surface: how far from the nodes' centre it may be, in distances of the farthest node.
+    backend : str
+        Conic solver; only ``"CLARABEL"`` gives bounds.
+
+    Returns
+    -------
+    Started
+        Points and bound; see the module's text for what they are worth. NaN where the data or the answer are.
+
+    Raises
+    ------
+    ValueError
+        For a row of rates of another form.
+
+    Notes
+    -----
+    Song et al. (2025); Wang, Li and Ansari (2013). Built once for each shape in each process.
+    """
+    S, V, values, W, R, Q = (np.asarray(part, dtype=np.float64) for part in (place, speed, z, whiten, ranges, rates))
+    A = np.zeros((len(values), 0)) if design is None else np.asarray(design, dtype=np.float64)
+    if not all(np.isfinite(part).all() for part in (S, V, values, W, A)):
+        return _nothing(S.shape[1], A.shape, None)
+    scene = Scene.of(S, V, values, W, R, Q, A, surface)
+    relaxation, far = _relaxation(scene.shape, backend), np.ones(len(values))
+    for _ in range(_PASSES):
+        given, size = scene.parameters(far, reach)
+        answer = relaxation.solve(given, reach=scene.longest(reach))
+        lift = answer.values["lift"]
+        if not np.isfinite(lift).all():
+            return _nothing(S.shape[1], A.shape, answer)
+        weighted, point = far, lift[0, 1 : 1 + S.shape[1]]
+        apart = np.sqrt(((point - scene.place) ** 2).sum(axis=1))
+        far = np.where(scene.pivot < 0, 1.0, np.maximum(apart[scene.pivot], _NEAREST))
+    return _read_off(scene, weighted, size, answer)
+
+
+def _read_off(scene: Scene, far: Array, size: float, answer: Answer) -> Started:
+    lift, d = answer.values["lift"], scene.shape.dimension
+    point, beta = lift[0, 1 : 1 + d], scene.shape.places[0]
+    spread, axes = np.linalg.eigh(lift[1 : 1 + d, 1 : 1 + d] - np.outer(point, point))
+    step = (np.sqrt(np.maximum(spread, 0.0)) * axes).T[::-1]
+    points = point + np.concatenate([np.zeros((1, d)), np.stack([step, -step], axis=1).reshape(-1, d)])
+    if scene.surface is not None:
+        # a mean of places on a surface lies below it: they are brought back along the line to its centre
+        points = points / np.sqrt(np.einsum("ij,jk,ik->i", points, scene.surface.shape, points))[:, None]
+    unknown = scene.mean + scene.unit * lift[0, beta : beta + scene.shape.unknowns]
+    return Started(
+        scene.origin + scene.length * points,
+        unknown,
+        np.where(scene.pivot < 0, 1.0, scene.length * far),
+        answer.primal * size,
+        max(answer.bound * size, 0.0),  # a sum of squares is not negative
+        rank_ratio(lift),
+        answer,
+    )
+
+
+def _nothing(dimension: int, design: tuple[int, ...], answer: Answer | None) -> Started:
+    rows, unknowns = design
+    point, none = np.full((1 + 2 * dimension, dimension), np.nan), np.full(unknowns, np.nan)
+    return Started(point, none, np.full(rows, np.nan), np.nan, -np.inf, np.nan, answer)
+
+
+def _ends(rates: Array, speed: Array) -> tuple[Array, Array, Array]:
+    """Return the node whose range multiplies a row, the node whose rate is an unknown, -1 for none, and the sign."""
+    if (np.abs(rates).sum(axis=1) > 2.0).any() or (np.abs(rates.sum(axis=1)) > 1.0).any():
+        raise ValueError("a row of rates is one rate, or the difference of two")
+    # a rate that is zero by itself needs no unknown, and one that many rows share is better one unknown than many
+    moving = (speed != 0.0).any(axis=1)
+    often = np.where(moving, 1.0 + np.abs(rates).sum(axis=0), 0.0)
+    held = np.where(rates != 0.0, often, np.inf)
+    first = np.where(rates.any(axis=1), held.argmin(axis=1), -1)
+    rest = np.where(np.arange(rates.shape[1]) == first[:, None], 0.0, np.abs(rates) * often)
+    second = np.where(rest.any(axis=1), rest.argmax(axis=1), -1)
+    # of a moving and a resting station the moving one is multiplied
+    still = (first >= 0) & (second >= 0) & ~moving[first]
+    first, second = np.where(still, second, first), np.where(still, -1, second)
+    return first, second, np.where(first < 0, 1.0, rates[np.arange(len(rates)), first])
+
+
+def _shape(nodes: tuple[int, ...], first: Array, second: Array, design: Array, rate: Mask, surface: bool) -> Shape:
+    known = design.shape[1]
+    others = tuple(int(node) for node in np.unique(second[second >= 0]))
+    of = {node: known + i for i, node in enumerate(others)}
+    product: dict[tuple[int, int], None] = {}  # a dictionary keeps the order, and each pair once
+    for a, b, row in zip(first[rate], second[rate], design[rate], strict=True):
+        product |= {(int(j), int(a)): None for j in np.flatnonzero(row)}
+        product |= {(of[int(b)], int(a)): None} if b >= 0 else {}
+    return Shape(nodes[1], nodes[0], known, others, tuple(product), surface)
+
+
+def _forms(
+    shape: Shape, place: Array, speed: Array, z: Array, ranges: Array, first: Array, second: Array, design: Array
+) -> Array:
+    """Rows as forms in y: what is measured, less what they say."""
+    beta, r, w, size = shape.places
+    at = {pair: w + k for k, pair in enumerate(shape.product)}
+    of = {node: j for j, node in shape.rate_of.items()}
+    rows = np.zeros((len(z), size))
+    for m, (a, b) in enumerate(zip(first, second, strict=True)):
+        if a < 0:
+            rows[m, 0], rows[m, beta : beta + shape.unknowns], rows[m, r:w] = z[m], -design[m], -ranges[m]
+            continue
+        rows[m, 0], rows[m, 1:beta], rows[m, r + a] = -place[a] @ speed[a], speed[a], z[m]
+        for j in np.flatnonzero(design[m]):
+            rows[m, at[int(j), int(a)]] = -design[m, j]
+        if b >= 0:
+            rows[m, at[of[int(b)], int(a)]] = 1.0
+    return rows
+
+
+def lifted_size(dimension: int, ranges: Array, rates: Array, design: Array) -> int:
+    """Length of y for rows whose nodes all move.
+
+    Parameters
+    ----------
+    dimension : int
+        Of space.
+    ranges, rates : Array, shape (m, M)
+        What rows add up.
+    design : Array, shape (m, p)
+        What linear unknowns add.
+
+    Returns
+    -------
+    int
+        The programme takes seconds beyond `SIZE`.
+    """
+    first, second, _ = _ends(rates, np.ones((rates.shape[1], 1)))
+    rate = np.asarray(rates.any(axis=1))
+    return _shape((rates.shape[1], dimension), first, second, design, rate, False).places[-1]
+
+
+def doppler_problem(shape: Shape) -> Any:
+    """Build the relaxation as a cvxpy problem.
+
+    Parameters
+    ----------
+    shape : Shape
+        What is lifted.
+
+    Returns
+    -------
+    cvxpy.Problem
+        Variable ``lift`` of shape (n, n), ordered (1, x, beta, r, w); parameters as `Scene.parameters` gives them.
+
+    Notes
+    -----
+    Song et al. (2025), with the further rules of the module's text.
+    """
+    import cvxpy as cp
+
+    d, count = shape.dimension, shape.nodes
+    beta, r, w, size = shape.places
+    lift = cp.Variable((size, size), symmetric=True, name="lift")
+    gram = cp.Parameter((size, size), name="gram")
+    station, square = cp.Parameter((count, d), name="station"), cp.Parameter(count, name="square")
+    x, inside, far = lift[0, 1:beta], lift[1:beta, 1:beta], lift[0, r:w]
+    rules = [
+        lift >> 0,
+        lift[0, 0] == 1,
+        cp.diag(lift)[r:w] == cp.trace(inside) - 2 * station @ x + square,
+        far >= 0,
+        *(cp.norm(x - station[i]) <= far[i] for i in range(count)),
+    ]
+    if shape.surface:
+        form = cp.Parameter((d, d), name="form")
+        rules.append(cp.sum(cp.multiply(form, inside)) == 1)
+    else:
+        rules.append(cp.trace(inside) <= cp.Parameter(name="reach"))
+    if count > 1:
+        u, v = np.triu_indices(count, 1)
+        middle, inner = cp.Parameter((len(u), d), name="middle"), cp.Parameter(len(u), name="inner")
+        dot = cp.trace(inside) - middle @ x + inner
+        rules += [lift[r + u, r + v] >= dot, lift[r + u, r + v] >= -dot]
+    if r > beta:
+        rules.append(cp.diag(lift)[beta:r] <= cp.Parameter(r - beta, name="limit"))
+    return cp.Problem(cp.Minimize(cp.sum(cp.multiply(gram, lift))), [*rules, *_products(shape, lift)])
+
+
+def _products(shape: Shape, lift: Any) -> list[Any]:
+    """Rules of the products: what they are, and that their order does not matter."""
+    import cvxpy as cp
+
+    d, (beta, r, w, _) = shape.dimension, shape.places
+    rules = []
+    if shape.product:
+        j, i = np.array(shape.product).T
+        rules.append(lift[beta + j, r + i] == lift[0, w:])
+    if shape.second:
+        own, node = beta + shape.unknowns + np.arange(len(shape.second)), np.array(shape.second)
+        rate, level = cp.Parameter((len(node), d), name="rate"), cp.Parameter(len(node), name="level")
+        rules.append(lift[own, r + node] == level - rate @ lift[0, 1:beta])
+    swap = shape.swaps()
+    plain, mixed = swap[swap[:, 0] >= 0], swap[swap[:, 0] < 0]
+    if len(plain):
+        rules.append(lift[plain[:, 0], plain[:, 1]] == lift[plain[:, 2], plain[:, 3]])
+    if len(mixed):
+        rate, level = cp.Parameter((len(mixed), d), name="turned rate"), cp.Parameter(len(mixed), name="turned level")
+        along = cp.sum(cp.multiply(rate, lift[mixed[:, 1]][:, 1:beta]), axis=1)
+        rules.append(cp.multiply(level, lift[0, mixed[:, 1]]) - along == lift[mixed[:, 2], mixed[:, 3]])
+    return rules
+
+
+@keep
+def _relaxation(shape: Shape, backend: str) -> Relaxation:
+    # a decade below Clarabel's own: the errors of precise rows are 1e-5 of their rates
+    return Relaxation(doppler_problem(shape), backend=backend, settings=tight(backend, 1e-9))
+
+
+def blocks(time: ArrayLike, length: int) -> list[Index]:
+    """Cut rows in the order of time into blocks of nearly equal numbers.
+
+    Parameters
+    ----------
+    time : array_like, shape (m,)
+        When each row was measured.
+    length : int
+        Rows of a block at most, one or more.
+
+    Returns
+    -------
+    list of int arrays
+        The rows of each block.
+    """
+    order = np.argsort(np.asarray(time, dtype=np.float64), kind="stable")
+    return np.array_split(order, -(-len(order) // length)) if len(order) else []
+
+
+def normal_points(time: ArrayLike, z: ArrayLike, sigma: ArrayLike, cut: Sequence[Index]) -> tuple[Index, Array, Array]:
+    """Join rows of the same instruments that follow each other in time.
+
+    A parabola through each block by least squares (a line or a mean through too few different times) says the value at
+    the time of its middle row.
+
+    Parameters
+    ----------
+    time, z, sigma : array_like, shape (m,)
+        When, what, and standard deviations of independent errors.
+    cut : sequence of q int arrays
+        The rows of each block, see `blocks`.
+
+    Returns
+    -------
+    row : int array, shape (q,)
+        The middle row of each block.
+    z, sigma : Array, shape (q,)
+        What stands in its place.
+
+    Notes
+    -----
+    The normal points of satellite laser ranging: A. T. Sinclair, "Data screening and normal point formation" (1997).
+    """
+    t, values, spread = (np.asarray(part, dtype=np.float64) for part in (time, z, sigma))
+    row = np.array([block[len(block) // 2] for block in cut], dtype=np.int64)
+    out, error = np.zeros(len(row)), np.zeros(len(row))
+    for k, (block, middle) in enumerate(zip(cut, row, strict=True)):
+        since = t[block] - t[middle]
+        # two rows more than coefficients: a polynomial through all rows averages nothing
+        degree = min(_BEND, len(np.unique(since)) - 1, max(len(block) - 3, 0))
+        power = (since / (np.abs(since).max() or 1.0))[:, None] ** np.arange(degree + 1)
+        left = np.linalg.pinv(power / spread[block, None])[0] / spread[block]
+        out[k], error[k] = left @ values[block], np.sqrt(((left * spread[block]) ** 2).sum())
+    return row, out, error

@@ -1,0 +1,200 @@
+"""Starts from Doppler shifts: rows made few enough for the relaxation, with range rows and a known height beside."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from formulations.doppler_sdp import SIZE, blocks, doppler, lifted_size, normal_points
+from formulations.range_height import Ellipsoid, ellipsoid
+from optloc.base.linalg import whitening
+from optloc.base.threads import WORTH, mapped
+from optloc.base.types import Array, Rows
+from optloc.linear.evaluate import plans
+from optloc.models import MODELS
+from optloc.models.primitives import WGS84_A, WGS84_F
+from optloc.problem.noise import dense, variances
+from optloc.problem.problem import Problem
+from optloc.solvers.starts.position import known_height, one_position, vectors
+
+# What rows of range rates add up, at their first and second station; kinds that others add may have any h.
+_RATES = {"range_rate": (1, 0), "fdoa": (1, -1)}
+_AXES = WGS84_A * np.array([1.0, 1.0, 1.0 - WGS84_F])
+
+
+def dopplered(problem: Problem) -> bool:
+    """Return whether a single source at rest is sought, and rows tell its range rates."""
+    if len(problem.motions) != 1 or problem.stations.velocity is None:
+        return False
+    motion, told = problem.motions[0], any(rows.kind in _RATES for rows in problem.rows)
+    return told and motion.known is None and motion.order == 0 and (motion.span == "run" or problem.epochs == 1)
+
+
+def doppler_starts(problem: Problem) -> Array:
+    """Return candidates of a flat batch of sources at rest from their Doppler shifts, one by one.
+
+    Rows of range rates and of sums of ranges are used, those of other kinds are the refinement's. Where they are too
+    many, those of the same stations are joined to normal points, or taken at even steps.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems, see `dopplered`.
+
+    Returns
+    -------
+    array (N, q, d) or (N, q, size)
+        Metres; positions where a single one is sought, else full vectors. NaN where there is none.
+    """
+    size, d = problem.batch_shape[0], problem.dimension
+    position = np.full((size, 1 + 2 * d, d), np.nan)
+    height = known_height(problem) if problem.frame.geodetic and d == 3 else None
+    every = _gather(problem)
+
+    def start(i: int) -> None:
+        surface = None if height is None or not np.isfinite(height[i]) else ellipsoid(_AXES, height[i])
+        position[i] = _start(problem, i, every, surface)
+
+    if len(every.row):
+        mapped(start, range(size), least=WORTH)
+    return position if one_position(problem) else vectors(problem, position)
+
+
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """The rows that the relaxation takes, of all problems of a batch: numbers (m,) or (N, m) of each.
+
+    Parameters
+    ----------
+    row : int array (m,)
+        Number in the problem.
+    epoch, a, b : int array (m,)
+        When, and at which stations; b is -1 where there is none.
+    group : int array (m,)
+        Equal for rows of one kind at the same stations.
+    rates, ranges : array (m, 2)
+        What it adds up of both stations' range rates and ranges.
+    design : array (m, n)
+        What the shared unknowns add.
+    """
+
+    row: Array
+    epoch: Array
+    a: Array
+    b: Array
+    group: Array
+    rates: Array
+    ranges: Array
+    design: Array
+
+    def take(self, index: Array) -> _Told:
+        """Return some of the rows."""
+        return _Told(*(getattr(self, name)[index] for name in self.__dataclass_fields__))
+
+
+def _gather(problem: Problem) -> _Told:
+    shared, parts = problem.layout.n_shared, list(_parts(problem))
+    row, epoch, a, b, kind, rates, ranges = (np.concatenate(values) for values in zip(*parts, strict=True))
+    design = np.zeros((problem.count, shared))
+    for plan, start in zip(plans(problem), problem.starts, strict=True):
+        mine = plan.adds.column < shared
+        np.add.at(design, (start + plan.adds.row[mine], plan.adds.column[mine]), plan.adds.coefficient[mine])
+    _, group = np.unique(np.stack([kind, a, b]), axis=1, return_inverse=True)
+    return _Told(row, epoch, a, b, group.reshape(-1), rates, ranges, design[row])
+
+
+def _parts(problem: Problem) -> Iterator[tuple[Array, ...]]:
+    """Yield number, epoch, stations, kind and coefficients of the rows that the relaxation takes."""
+    for i, (rows, start) in enumerate(zip(problem.rows, problem.starts, strict=True)):
+        rates, ranges = _RATES.get(rows.kind, (0, 0)), _ranges(rows)
+        count = rows.count if rates != (0, 0) or ranges != (0, 0) else 0
+        one = np.ones((count, 1))
+        cut = slice(0, count)
+        other = rows.b[cut] if MODELS[rows.kind].stations > 1 else np.full(count, -1)
+        which = np.full(count, i)
+        yield start + np.arange(count), rows.epoch[cut], rows.a[cut], other, which, one * rates, one * ranges
+
+
+def _ranges(rows: Rows) -> tuple[int, int]:
+    # an unknown emission time is one of an epoch each: those rows are left to the refinement
+    model = MODELS[rows.kind]
+    return (0, 0) if model.ranges is None or model.emission else model.ranges
+
+
+def _start(problem: Problem, i: int, every: _Told, surface: Ellipsoid | None) -> Array:
+    """Return the points (1 + 2 d, d) of one problem."""
+    one = problem.take(np.array([i]))
+    z, weight = one.observed[0, every.row], np.broadcast_to(one.weight, (1, one.count))[0, every.row]
+    present = (weight > 0.0) & np.isfinite(z)
+    told, z, weight = every.take(present), z[present], weight[present]
+    nowhere = np.full((1 + 2 * problem.dimension, problem.dimension), np.nan)
+    if not told.rates.any():
+        return nowhere
+    pick, values, sigma = _few(one, told, z, weight)
+    chosen = told.take(pick)
+    nodes, ranges, rates = _nodes(one, chosen)
+    if sigma is None:
+        scale = np.sqrt(weight)
+        covariance = dense(one.noise, chosen.row).reshape(-1, len(pick), len(pick))[0] / (scale[:, None] * scale)
+        white = whitening(covariance[None])[0]
+    else:
+        white = np.diag(1.0 / sigma)
+    place, speed = _moving(one, nodes, surface is not None)
+    used = np.flatnonzero(chosen.design.any(axis=0))
+    design = chosen.design[:, used]
+    found = doppler(place, speed, values, white, ranges=ranges, rates=rates, design=design, surface=surface).point
+    return found if surface is None else problem.frame.from_ecef(found)
+
+
+def _few(problem: Problem, told: _Told, z: Array, weight: Array) -> tuple[Array, Array, Array | None]:
+    """Return the rows that are used, their values, and standard deviations where they stand for several."""
+    if _size(problem, told) <= SIZE:
+        return np.arange(len(z)), z, None
+    time = problem.times[told.epoch]
+    parts = [np.flatnonzero(told.group == group) for group in np.unique(told.group)]
+    # the shortest blocks that are few enough; a row adds an entry of its own at least
+    for length in range(max(2, len(z) // SIZE), 1 + max(2, *map(len, parts))):
+        cut = [part[block] for part in parts for block in blocks(time[part], length)]
+        pick = np.array([block[len(block) // 2] for block in cut])
+        if _size(problem, told.take(pick)) <= SIZE:
+            break
+    # stations that are too many as they are: every other block, every third, ...
+    steps = (step for step in range(1, len(cut)) if _size(problem, told.take(pick[::step])) <= SIZE)
+    sigma = np.sqrt(variances(problem.noise, problem.count)[..., told.row].reshape(-1, len(z))[0] / weight)
+    return normal_points(time, z, sigma, cut[:: next(steps, len(cut))])
+
+
+def _size(problem: Problem, told: _Told) -> int:
+    _, ranges, rates = _nodes(problem, told)
+    return lifted_size(problem.dimension, ranges, rates, told.design[:, told.design.any(axis=0)])
+
+
+def _nodes(problem: Problem, told: _Told) -> tuple[Array, Array, Array]:
+    """Return the nodes (M, 2) of rows, epoch and station each, and what rows add up of their ranges and rates."""
+    stations = problem.stations
+    assert stations.velocity is not None
+    stays = stations.position.shape[-3] == 1 and stations.velocity.shape[-3] == 1
+    epoch = np.zeros_like(told.epoch) if stays else told.epoch
+    ends = np.stack([np.stack([epoch, station], axis=1) for station in (told.a, told.b)], axis=1)
+    known = ends[..., 1] >= 0
+    nodes, at = np.unique(ends[known], axis=0, return_inverse=True)
+    row, side = np.nonzero(known)
+    out = np.zeros((2, len(told.row), len(nodes)))
+    np.add.at(out[0], (row, at.reshape(-1)), told.ranges[row, side])
+    np.add.at(out[1], (row, at.reshape(-1)), told.rates[row, side])
+    return nodes, out[0], out[1]
+
+
+def _moving(problem: Problem, nodes: Array, geocentric: bool) -> tuple[Array, Array]:
+    """Return places and velocities (M, d) of nodes."""
+    stations = problem.stations
+    assert stations.velocity is not None
+    place, speed = (
+        np.broadcast_to(values, (1, *values.shape[-3:]))[0][np.minimum(nodes[:, 0], values.shape[-3] - 1), nodes[:, 1]]
+        for values in (stations.position, stations.velocity)
+    )
+    if not geocentric:
+        return place, speed
+    return problem.frame.to_ecef(place), speed @ problem.frame.rotation_to_ecef().T
