@@ -280,6 +280,71 @@ def test_the_bound_of_a_pass_is_what_draws_scatter_by():
     assert fix.cost.mean() == pytest.approx(10.0, abs=3.0 * np.sqrt(20.0 / 200))
 
 
+def rounds(sigma=0.05, targets=1):
+    """Return a minute of range rates of five receivers that fly, of one or more emitters, and its times."""
+    t = np.linspace(0.0, 60.0, 13)
+    path = PLACE + t[:, None, None] * RATE
+    a, epoch = np.tile(np.arange(5), 13 * targets), np.tile(np.repeat(np.arange(13), 5), targets)
+    rows = measured("range_rate", a=a, epoch=epoch, target=np.repeat(np.arange(targets), 65), sigma=sigma)
+    fleet = optloc.station_array(path, "ABCDE", velocity=np.broadcast_to(RATE, path.shape))
+    return assemble(fleet, rows, times=t, motions=(Motion(),) * targets)
+
+
+def test_an_offset_of_every_receiver_is_the_mean_of_its_residuals_projected_out():
+    truth = np.concatenate([TARGET, [3.0, -8.0, 15.0, -1.0, 4.0]])
+    drawn = simulate(with_bias(rounds(), "oscillator"), truth, 8)
+    fix = solve(drawn, start=np.append(TARGET + 200.0, np.zeros(5)))
+    place = drawn.stations.position
+
+    def residual(x):
+        line = x - place
+        off = drawn.z.reshape(13, 5) + (line * RATE).sum(-1) / np.linalg.norm(line, axis=-1)
+        return ((off - off.mean(0)) / 0.05).ravel()
+
+    found = least_squares(residual, TARGET + 200.0, x_scale=100.0, xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    assert np.allclose(fix.position, found.x, atol=1e-3)
+    assert fix.cost == pytest.approx(2.0 * found.cost, rel=1e-9)
+    J = found.jac
+    assert np.allclose(fix.cov[:2, :2], np.linalg.inv(J.T @ J), rtol=1e-4)
+    assert np.abs((fix.bias["oscillator"] - truth[2:]) / fix.sigma("oscillator")).max() < 4.0
+
+
+def test_every_emitter_has_its_own_frequency(tmp_path):
+    other = np.array([-3e3, 2e3])
+    problem = with_bias(rounds(targets=2), "frequency", per="target")
+    assert problem.biases[0].members == ("0", "1")
+    truth = np.concatenate([TARGET, other, [200.0, -150.0]])
+    drawn = simulate(problem, truth, 9)
+    fix = solve(drawn, start=truth + np.array([200.0, -300.0, 100.0, 200.0, 0.0, 0.0]))
+    # each by itself, all its rows with one unknown
+    for i, place in enumerate((TARGET, other)):
+        own = with_bias(rounds(), "frequency", per="kind").with_rows(z=drawn.z[65 * i : 65 * i + 65])
+        alone = solve(own, start=np.append(place, 0.0))
+        assert np.allclose(fix.take(f"position[{i}]"), alone.position, atol=1e-3)
+        assert fix.bias["frequency"][i] == pytest.approx(alone.bias["frequency"][0], abs=1e-5)
+        assert fix.sigma("frequency")[i] == pytest.approx(alone.sigma("frequency")[0], rel=1e-5)
+    one = with_bias(rounds(targets=2), "frequency", per="target", members=["1"])
+    assert set(one.biases[0].row.tolist()) == set(range(65, 130))
+    with pytest.raises(InvalidProblem, match="there is no target '2'"):
+        with_bias(rounds(targets=2), "frequency", per="target", members=["2"])
+    with pytest.raises(InvalidProblem, match="targets have no groups"):
+        with_bias(rounds(targets=2), "frequency", per="target", members={"both": ["0", "1"]})
+
+    lines = PASS.partition("rows = [\n  { time = 0.0, z")
+    rows = "".join(
+        f'  {{ time = {t}.0, z = 1.0, target = "{name}" }},\n' for t in (0, 15, 30) for name in ("red", "blue")
+    )
+    text = (lines[0] + "rows = [\n" + rows + "]\n" + PASS[PASS.index("\n[[biases]]") :]).replace(
+        'per = "kind"', 'per = "target"'
+    )
+    path = tmp_path / "two.toml"
+    path.write_text(text)
+    assert read(path).problem.biases[0].members == ("blue", "red")
+    path.write_text(text.replace('motion = "static"', 'motion = "free"'))
+    with pytest.raises(InvalidProblem, match="free targets are fixed apart, and so are their errors"):
+        read(path)
+
+
 def test_receivers_whose_oscillators_are_off_and_drift_are_told_apart():
     """Offsets and drifts of four receivers against the first, over a minute of frequency differences."""
     k, t = 13, np.linspace(0.0, 60.0, 13)

@@ -211,7 +211,7 @@ def assemble(
     rows, numbers = _rows(chunks, index, target)
     noise = _noise(file, chunks, numbers, index, target, source)
     written = [(number, chunk.units, chunk.written_unit) for number, chunk in zip(numbers, chunks, strict=True)]
-    biases = [bias_of(b, rows, stations.names, stations.dimension, written, source) for b in file.biases]
+    biases = [bias_of(b, rows, stations.names, epochs, stations.dimension, written, source) for b in file.biases]
     units = {bias.name: unit for bias, unit in biases if unit[0]}
     own = tuple(bias for bias, _ in biases)
     problem = _problem(file, epochs, stations, rows, noise, own, frame, source, known or {}, more or {})

@@ -267,13 +267,13 @@ class BiasTable(_Table):
     """Its name."""
     form: Literal["offset", "scale", "drift", "rotation"] = "offset"
     """Added; times the measured quantity; times the seconds of the run; or a turn of the station's axes."""
-    per: Literal["station", "pair", "kind"] = "station"
-    """Who has one of his own: each station (with the sign of its arrival), each pair of stations, or the kind."""
+    per: Literal["station", "pair", "kind", "target"] = "station"
+    """Who has one of his own: each station (with the sign of its arrival), pair of stations, or target; or the kind."""
     kind: str | None = None
     """Kind of the rows that are touched; needed where the file has several."""
     members: list[str] | dict[str, list[str]] | None = None
     """Stations that have one; all that measure by default. Leave out the reference of a difference. Or groups of
-    stations that share one: `{ GPS = ["G01", "G07"] }`. Of pairs: names such as "A-B"."""
+    stations that share one: `{ GPS = ["G01", "G07"] }`. Of pairs: names such as "A-B"; of targets: theirs."""
     mean: Amount | None = None
     """Prior mean."""
     sigma: Amount | None = None

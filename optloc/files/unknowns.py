@@ -149,6 +149,7 @@ def bias_of(
     table: BiasTable,
     rows: Sequence[Rows],
     stations: Sequence[str],
+    epochs: Epochs,
     dimension: int,
     written: Sequence[tuple[Array, Units, str]],
     source: str,
@@ -163,6 +164,8 @@ def bias_of(
         All rows.
     stations : sequence of str
         Their names.
+    epochs : Epochs
+        Names of the targets.
     dimension : int
         Of positions.
     written : sequence of (int array (m,), Units, str)
@@ -178,6 +181,9 @@ def bias_of(
         Unit of the touched rows where they have one, per second for a drift; else empty.
     """
     where = join(source, f"[[biases]] {table.name!r}")
+    if table.per == "target" and epochs.own:
+        what = "free targets are fixed apart, and so are their errors"
+        raise InvalidProblem(what, where, "give the targets a motion, or write one file for each")
     bias = family(
         rows,
         stations,
@@ -186,6 +192,7 @@ def bias_of(
         form=table.form,
         kind=table.kind,
         members=table.members,
+        targets=epochs.targets,
         where=where,
     )
     # Which way an angle is counted does not matter to an error of it.

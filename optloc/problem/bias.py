@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from optloc.problem.check import check_unknowns
 from optloc.problem.problem import Problem
 
 Form = Literal["offset", "scale", "drift", "rotation"]
-Per = Literal["station", "pair", "kind"]
+Per = Literal["station", "pair", "kind", "target"]
 Members = Sequence[str] | Mapping[str, Sequence[str]] | None
 _Touch = tuple[Array, Array, Array]
 # Slots of the layout that are not biases: a bias of such a name would hide one.
@@ -43,17 +43,18 @@ def with_bias(
         A problem; its earlier biases stay.
     name : str
         Name of the family, for instance "clock".
-    per : "station", "pair" or "kind"
-        Who has an error of its own: a station, entering with the sign of its arrival; a pair of stations; or all rows
-        of a kind together.
+    per : "station", "pair", "kind" or "target"
+        Who has an error of its own: a station, entering with the sign of its arrival; a pair of stations; all rows of
+        a kind together; or all rows of a target, such as the frequency of an emitter.
     form : "offset", "scale", "drift" or "rotation"
         Added to the measurement; times the measured quantity; times the seconds since the first epoch; or a turn of
         the station's axes.
     kind : str, optional
         Kind of the rows that are touched; all by default, for a rotation all that are measured in axes of stations.
     members : sequence of str, or mapping of str to sequence of str, optional
-        Stations (or pairs, "A-B") that have one, all that measure by default; or groups of stations that share one, by
-        the name of the group. Of differences alone, leave out the reference: what all stations share has no effect.
+        Stations (or pairs, "A-B", or targets, "0") that have one, all that measure by default; or groups of stations
+        that share one, by the name of the group. Of differences alone, leave out the reference: what all stations
+        share has no effect.
     mean : float or array (q,) or (q, 3)
         Prior mean of each member in the unit of the measurements, 1 for a scale, unit per second for a drift, radians
         for a rotation (three angles in space).
@@ -85,6 +86,7 @@ def family(
     form: Form = "offset",
     kind: str | None = None,
     members: Members = None,
+    targets: Sequence[str] | None = None,
     where: str | None = None,
 ) -> Bias:
     """Return a bias without prior over the rows of a problem; arguments as `with_bias`.
@@ -95,6 +97,8 @@ def family(
         All rows of the problem.
     stations : sequence of str
         Names of the stations.
+    targets : sequence of str, optional
+        Names of the targets; their numbers by default.
     where : str, optional
         Place that complaints name; the bias by default.
     """
@@ -103,7 +107,7 @@ def family(
         advice = f"other unknowns are called {', '.join(_TAKEN)}"
         raise InvalidProblem(f"the name {name!r} is taken" if name else "the name is empty", where, advice)
     for value, known, what in (
-        (per, ("station", "pair", "kind"), "per"),
+        (per, get_args(Per), "per"),
         (form, ("offset", "scale", "drift", "rotation"), "form"),
     ):
         if value not in known:
@@ -116,6 +120,8 @@ def family(
         names, touches = tuple(block.kind for block, _ in touched), _by_kind(touched)
     elif per == "pair":
         names, touches = _by_pair(touched, stations, members, where)
+    elif per == "target":
+        names, touches = _by_target(touched, targets, members, where)
     else:
         names, touches = _by_station(touched, form, stations, members, where)
     row, member, coefficient = (np.concatenate(parts) for parts in zip(*touches, strict=True))
@@ -175,6 +181,23 @@ def _by_pair(
         _touch(start + np.arange(block.count), place[np.searchsorted(found, code)], 1.0)
         for (block, start), code in zip(touched, codes, strict=True)
     ]
+
+
+def _by_target(
+    touched: list[tuple[Rows, int]], targets: Sequence[str] | None, members: Members, where: str
+) -> tuple[tuple[str, ...], list[_Touch]]:
+    found = np.unique(np.concatenate([block.target for block, _ in touched]))
+    present = {int(i): str(i) if targets is None else targets[i] for i in found if i >= 0}
+    if isinstance(members, Mapping) or not present:
+        what = "no row says whose it is" if not present else "targets have no groups"
+        raise InvalidProblem(what, f"{where}, members", "name the targets")
+    known = tuple(present.values())
+    names = known if members is None else _check_names(members, known, "target", where)
+    # rows without a target have none of these errors: index -1 is the last
+    place = np.full(max(present, default=0) + 2, -1)
+    for i, label in present.items():
+        place[i] = names.index(label) if label in names else -1
+    return names, [_touch(start + np.arange(block.count), place[block.target], 1.0) for block, start in touched]
 
 
 def _by_station(

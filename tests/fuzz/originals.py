@@ -25,6 +25,8 @@ biases = [
   { name = "drift", form = "drift", members = ["East", "B"], sigma = "1 m/s" },
   { name = "turn", form = "rotation", kind = "azimuth", sigma = "1 deg" },
   { name = "cable", per = "pair" },
+  { name = "frequency", per = "target", kind = "range_rate", mean = "100 Hz", sigma = "5000 Hz" },
+  { name = "oscillator", per = "kind", form = "drift", kind = "range_rate", sigma = "0.5 Hz/s" },
   { name = "system", members = { one = ["North", "B"], two = ["East", "C"] }, mean = "10 m", sigma = "200 m" },
 ]
 priors = [
@@ -69,6 +71,7 @@ rows = [
   { kind = "range", a = "North", z = 3000.0, sigma = 3.0, weight = 1.0, correction = 1.0, target = "t1", epoch = 1 },
   { kind = "azimuth", a = "East", z = 0.5, sigma = 0.1, weight = 0, target = "t2", epoch = 2 },
   { kind = "toa", a = "East", z = 2e3, time = 1.5 },
+  { kind = "range_rate", a = "East", z = 20.0, time = 2.5 },
 ]
 [[measurements]]
 kind = "tdoa"
