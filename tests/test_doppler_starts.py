@@ -6,7 +6,6 @@ import pytest
 from optloc import ECEF, Bias, Frame, Motion, Stations, assemble, measured, simulate, solve
 from optloc.base.frames import geodetic_to_ecef
 from optloc.linear.constraints import height
-from optloc.solvers.starts import doppler
 from optloc.solvers.starts.doppler import doppler_starts, dopplered
 
 EARTH_RATE = 7.292115e-5  # rad/s
@@ -75,14 +74,8 @@ def test_one_pair_over_its_epochs():
     assert fix.cost <= best.cost * (1 + 1e-6) + 1e-6
 
 
-@pytest.fixture
-def quick(monkeypatch):
-    """Let fewer rows be too many: the way they are joined is what is looked at."""
-    monkeypatch.setattr(doppler, "SIZE", 21)
-
-
 @pytest.mark.parametrize("rows", [8, 120])
-def test_a_pass_with_an_offset_has_both_sides(rows, quick):
+def test_a_pass_with_an_offset_has_both_sides(rows):
     posed, truth = satellite(rows)
     problem = seen(posed, truth)
     fix, best = solve(problem, "sdp+lsr"), solve(problem, "lsr", start=truth)
@@ -95,7 +88,7 @@ def test_a_pass_with_an_offset_has_both_sides(rows, quick):
     assert len(sides) == 2
 
 
-def test_rows_beside_and_stations_by_the_dozen(quick):
+def test_rows_beside_and_stations_by_the_dozen():
     rng = np.random.default_rng(4)
     place, speed = rng.uniform(-10e3, 10e3, (60, 2)), rng.normal(0, 120, (60, 2))
     stations = Stations(place[None], tuple(map(str, range(60))), velocity=speed[None])

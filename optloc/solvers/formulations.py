@@ -209,7 +209,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "place, ranges, unknown rates and their products lifted; weighted by the ranges of the pass before",
         "range_rate, fdoa of a source at rest, with tdoa, range, range_sum and a known height",
         "never tight: a start, seldom the only minimum; many rows are joined to normal points",
-        "0.01 s four stations, 1 s eight epochs of a pair",
+        "10 ms four stations, 0.1 s a pass of a satellite",
         "Song et al. 2025; Wang, Li, Ansari 2013",
         serves=dopplered,
         starts={"sdp": doppler_starts},

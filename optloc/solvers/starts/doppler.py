@@ -29,7 +29,7 @@ def dopplered(problem: Problem) -> bool:
     if len(problem.motions) != 1 or problem.stations.velocity is None:
         return False
     motion, told = problem.motions[0], any(rows.kind in _RATES for rows in problem.rows)
-    return told and motion.known is None and motion.order == 0 and (motion.span == "run" or problem.epochs == 1)
+    return told and motion.known is None and motion.order == 0 and motion.span == "run"
 
 
 def doppler_starts(problem: Problem) -> Array:
