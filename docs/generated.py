@@ -291,7 +291,7 @@ def effects() -> dict[str, tuple[str, Any, Any]]:
         "UT1 - UTC of 0.1 s": ("modelled (skyfield)", rotated(0.1 * _TURN, 2)),
         "polar motion of 0.3 seconds of arc": ("left", rotated(float(np.radians(0.3 / 3600.0)), 0)),
         "place of the satellite along its track, 1 km": (
-            "left",
+            "a bias of the form `time`, or left",
             lambda t: scene.range(t, 1e3 / speed) - scene.range(t),
         ),
         "ionosphere, 30 TECU": ("left", layer),

@@ -128,10 +128,12 @@ class Bias:
         Sparse design: which global rows are touched, and by which member.
     coefficient : float array (n,)
         Sign or size of each touch, for instance +1 for station a and -1 for station b.
-    form : "offset", "scale", "drift" or "rotation"
+    form : "offset", "scale", "drift", "rotation" or "time"
         Added to the measurement; times the measured quantity; times seconds since the first target's reference time
         (by default the first epoch); or a turn of
-        the station's axes (one angle in the plane, a rotation vector in space; a member is then a station's mount).
+        the station's axes (one angle in the plane, a rotation vector in space; a member is then a station's mount); or
+        the seconds by which a station is further along its course (coefficient 1 where it is the row's first, -1 where
+        it is the second).
     mean : float array (q,) or (q, c)
         Prior mean, in the unit of the form.
     sigma : float array like `mean`, optional
@@ -143,7 +145,7 @@ class Bias:
     row: Array
     member: Array
     coefficient: Array
-    form: Literal["offset", "scale", "drift", "rotation"] = "offset"
+    form: Literal["offset", "scale", "drift", "rotation", "time"] = "offset"
     # One zero stands for all members; an array of its own for each bias, for arrays can be written into.
     mean: Array = field(default_factory=lambda: np.zeros(1))
     sigma: Array | None = None

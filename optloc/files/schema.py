@@ -265,12 +265,13 @@ class BiasTable(_Table):
 
     name: str = Field(min_length=1)
     """Its name."""
-    form: Literal["offset", "scale", "drift", "rotation"] = "offset"
-    """Added; times the measured quantity; times the seconds of the run; or a turn of the station's axes."""
+    form: Literal["offset", "scale", "drift", "rotation", "time"] = "offset"
+    """Added; times the measured quantity; times the seconds of the run; a turn of the station's axes; or the seconds by
+    which the station is further along its course."""
     per: Literal["station", "pair", "kind", "target"] = "station"
     """Who has one of his own: each station (with the sign of its arrival), pair of stations, or target; or the kind."""
     kind: str | None = None
-    """Kind of the rows that are touched; needed where the file has several."""
+    """Kind of the rows that are touched; needed where the file has several quantities, but not for a time."""
     members: list[str] | dict[str, list[str]] | None = None
     """Stations that have one; all that measure by default. Leave out the reference of a difference. Or groups of
     stations that share one: `{ GPS = ["G01", "G07"] }`. Of pairs: names such as "A-B"; of targets: theirs."""

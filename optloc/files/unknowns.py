@@ -218,7 +218,7 @@ def _unit_to_read(form: str, spelled: Iterable[tuple[Units, str]], where: str) -
 
 def _prior(table: BiasTable, rows: Sequence[Units], shape: tuple[int, ...], where: str) -> tuple[Array, Array | None]:
     # A scale is a number whatever the rows measure, a rotation an angle.
-    own: dict[str, Quantity] = {"scale": "plain", "rotation": "angle"}
+    own: dict[str, Quantity] = {"scale": "plain", "rotation": "angle", "time": "time"}
     # All rows of a bias are of one quantity; carriers may differ from table to table.
     carriers = {units.carrier for units in rows}
     units = replace(rows[0], quantity=own.get(table.form, rows[0].quantity))

@@ -14,6 +14,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Rows
 from optloc.models import MODELS, Model, Point
 from optloc.models.primitives import Jet, rotate, wrap
+from optloc.problem.bias import course
 from optloc.problem.layout import Layout, emission_name, state_names
 from optloc.problem.problem import Problem
 
@@ -146,7 +147,7 @@ def _plan(problem: Problem, block: Rows, start: int) -> Plan:
         where = f"{block.kind} row {int(np.argmax(block.target < 0))}"
         raise InvalidProblem("the row names no target", where, "give the index of its target")
     feeds = [*_motion_feeds(problem, block, model), *_station_feeds(problem, block, model)]
-    feeds += _turn_feeds(problem, block, start)
+    feeds += [*_turn_feeds(problem, block, start), *_course_feeds(problem, block, model, start)]
     return Plan(block, model, tuple(feeds), _terms(problem, block, start, ("scale",)), _adds(problem, block, start))
 
 
@@ -235,6 +236,25 @@ def _turn_feeds(problem: Problem, block: Rows, start: int) -> list[Feed]:
             for c in range(turns):
                 picked = column[np.arange(len(rows)), bias.member[touch] * turns + c]
                 feeds.append(Feed(TURN + c, picked, bias.coefficient[touch], rows))
+    return feeds
+
+
+def _course_feeds(problem: Problem, block: Rows, model: Model, start: int) -> list[Feed]:
+    """Return what seconds along a course add to places and rates of stations, to first order."""
+    feeds: list[Feed] = []
+    for bias in problem.biases:
+        if bias.form != "time":
+            continue
+        rates = course(problem)
+        inside = (bias.row >= start) & (bias.row < start + block.count)
+        for side, station, place, rate in ((1.0, block.a, A, RATE_A), (-1.0, block.b, B, RATE_B)):
+            touch = np.flatnonzero(inside & (bias.coefficient == side))
+            rows = bias.row[touch] - start
+            column = columns(problem.layout, bias.name, rows)[np.arange(len(rows)), bias.member[touch]]
+            epoch = block.epoch[rows] if len(rates[0]) > 1 else np.zeros_like(rows)
+            for seed, grows in ((place, rates[0]), (rate, rates[1]))[: 1 + model.velocity if len(rows) else 0]:
+                picked = grows[epoch, station[rows]]
+                feeds += [Feed(seed + c, column, picked[:, c], rows) for c in range(problem.dimension)]
     return feeds
 
 

@@ -11,12 +11,12 @@ import numpy as np
 from optloc.base.arrays import numbers
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array, Bias, Rows
-from optloc.models import MODELS
+from optloc.models import MODELS, Model
 from optloc.models.primitives import rotate
 from optloc.problem.check import check_unknowns
 from optloc.problem.problem import Problem
 
-Form = Literal["offset", "scale", "drift", "rotation"]
+Form = Literal["offset", "scale", "drift", "rotation", "time"]
 Per = Literal["station", "pair", "kind", "target"]
 Members = Sequence[str] | Mapping[str, Sequence[str]] | None
 _Touch = tuple[Array, Array, Array]
@@ -46,18 +46,19 @@ def with_bias(
     per : "station", "pair", "kind" or "target"
         Who has an error of its own: a station, entering with the sign of its arrival; a pair of stations; all rows of
         a kind together; or all rows of a target, such as the frequency of an emitter.
-    form : "offset", "scale", "drift" or "rotation"
-        Added to the measurement; times the measured quantity; times the seconds since the first epoch; or a turn of
-        the station's axes.
+    form : "offset", "scale", "drift", "rotation" or "time"
+        Added to the measurement; times the measured quantity; times the seconds since the first epoch; a turn of the
+        station's axes; or the seconds by which the station is further along its course than its positions say.
     kind : str, optional
-        Kind of the rows that are touched; all by default, for a rotation all that are measured in axes of stations.
+        Kind of the rows that are touched; all by default, for a rotation all that are measured in axes of stations, for
+        a time all that have stations.
     members : sequence of str, or mapping of str to sequence of str, optional
         Stations (or pairs, "A-B", or targets, "0") that have one, all that measure by default; or groups of stations
         that share one, by the name of the group. Of differences alone, leave out the reference: what all stations
         share has no effect.
     mean : float or array (q,) or (q, 3)
         Prior mean of each member in the unit of the measurements, 1 for a scale, unit per second for a drift, radians
-        for a rotation (three angles in space).
+        for a rotation (three angles in space), seconds for a time.
     sigma : float or array like `mean`, optional
         Prior standard deviation; None: unknown.
 
@@ -108,12 +109,14 @@ def family(
         raise InvalidProblem(f"the name {name!r} is taken" if name else "the name is empty", where, advice)
     for value, known, what in (
         (per, get_args(Per), "per"),
-        (form, ("offset", "scale", "drift", "rotation"), "form"),
+        (form, get_args(Form), "form"),
     ):
         if value not in known:
             raise InvalidProblem(f"unknown {what} {value!r}", where, nearest(str(value), known))
     # Who has an error decides how members are named, and with which sign a row feels it.
     touched = _select_rows(rows, form, kind, where)
+    if form == "time" and per != "station":
+        raise InvalidProblem("a time along a course is one of a station", where, "use per = 'station', or groups")
     if per == "kind":
         if members is not None:
             raise InvalidProblem("a kind has no members", where, "leave members out, or use per = 'station'")
@@ -141,16 +144,21 @@ def _select_rows(rows: Sequence[Rows], form: Form, kind: str | None, where: str)
     chosen = [
         (block, start)
         for block, start in zip(rows, starts, strict=False)
-        if kind == block.kind or (kind is None and (form != "rotation" or MODELS[block.kind].axes))
+        if kind == block.kind or (kind is None and _may_touch(MODELS[block.kind], form))
     ]
     if not chosen:
-        raise InvalidProblem("no rows depend on the axes of stations", where, "leave the bias out")
+        of = "axes of stations" if form == "rotation" else "stations"
+        raise InvalidProblem(f"no rows depend on the {of}", where, "leave the bias out")
     if form == "rotation" and not MODELS[chosen[0][0].kind].axes:
         raise InvalidProblem(f"{kind} has no axes that could be turned", where, "use the form offset")
     # One number cannot be metres for one row and radians for another.
-    if len({MODELS[block.kind].quantity for block, _ in chosen}) > 1:
+    if form != "time" and len({MODELS[block.kind].quantity for block, _ in chosen}) > 1:
         raise InvalidProblem("the rows measure different quantities", where, "name the kind that it touches")
     return chosen
+
+
+def _may_touch(model: Model, form: Form) -> bool:
+    return model.axes if form == "rotation" else model.stations > 0 if form == "time" else True
 
 
 def _touch(row: Array, member: Array, sign: float) -> _Touch:
@@ -249,6 +257,9 @@ def _signs(kind: str, form: Form) -> tuple[int, int]:
     model = MODELS[kind]
     if form == "rotation" or model.stations == 1:
         return (1, 0)
+    # Which of the two stations is further along its course.
+    if form == "time":
+        return (1, -1)
     # Of two stations in a kind that is no sum, a difference is meant: gains.
     return model.signs or (1, -1)
 
@@ -282,13 +293,13 @@ def with_known_bias(problem: Problem, name: str, values: Any) -> Problem:
     name : str
         Name of the family.
     values : array (q,) or (q, 3), or mapping of str to number
-        Value of each member in the order of the family, in its unit (radians for a rotation), or by the name of the
-        member; members that a mapping lacks have none.
+        Value of each member in the order of the family, in its unit (radians for a rotation, seconds for a time), or by
+        the name of the member; members that a mapping lacks have none.
 
     Returns
     -------
     Problem
-        Without the family: its rows are corrected, or the axes of its stations turned.
+        Without the family: its rows are corrected, the axes of its stations turned, or these moved along.
 
     Raises
     ------
@@ -301,7 +312,8 @@ def with_known_bias(problem: Problem, name: str, values: Any) -> Problem:
     bias = problem.biases[names.index(name)]
     known = _order(bias, values, (3,) if bias.form == "rotation" and problem.dimension == 3 else ())
     rest = replace(problem, biases=tuple(b for b in problem.biases if b is not bias))
-    return _turn(rest, bias, known) if bias.form == "rotation" else _correct(rest, bias, known)
+    change = {"rotation": _turn, "time": _move}.get(bias.form, _correct)
+    return change(rest, bias, known)
 
 
 def _order(bias: Bias, values: Any, inner: tuple[int, ...]) -> Array:
@@ -348,3 +360,53 @@ def _turn(problem: Problem, bias: Bias, known: Array) -> Problem:
     return replace(
         problem, stations=replace(stations, axes=np.stack([np.stack(row, axis=-1) for row in rows], axis=-2))
     )
+
+
+def _move(problem: Problem, bias: Bias, known: Array) -> Problem:
+    """Return the problem with stations further along their courses."""
+    stations, seconds = problem.stations, np.zeros((problem.stations.count, 1))
+    for index, side in (("a", 1.0), ("b", -1.0)):
+        here = bias.coefficient == side
+        moved = np.concatenate([getattr(block, index) for block in problem.rows])[bias.row[here]]
+        seconds[moved, 0] = known[bias.member[here]]
+    velocity, acceleration = course(problem)
+    moved = replace(
+        stations, position=stations.position + seconds * velocity, velocity=velocity + seconds * acceleration
+    )
+    return replace(problem, stations=moved)
+
+
+# Stations that are further along their courses than is said.
+
+# Of the Earth (WGS 84): m^3/s^2, rad/s, m; and metres above it from which what moves falls freely.
+_GM, _TURN, _RADIUS, _SKY = 3.986004418e14, 7.292115e-5, 6378137.0, 1e5
+
+
+def course(problem: Problem) -> tuple[Array, Array]:
+    """Return velocity and acceleration (k or 1, s, d) of the stations.
+
+    What is above the air falls freely around the turning Earth, its flattening left out (0.02 of 8 m/s^2 in a low
+    orbit); all else keeps its velocity for the second or so that a station may be further along.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its stations have velocities, the same in all problems of a batch.
+
+    References
+    ----------
+    O. Montenbruck and E. Gill, "Satellite Orbits" (2000), eq. 3.1 and section 5.1, in axes that turn.
+    """
+    assert problem.stations.velocity is not None
+    position, velocity = (
+        array.reshape(-1, *array.shape[-3:])[0] for array in (problem.stations.position, problem.stations.velocity)
+    )
+    position, velocity = np.broadcast_arrays(position, velocity)
+    if problem.frame.kind == "cartesian" or problem.dimension == 2:
+        return velocity, np.zeros_like(velocity)
+    turn = problem.frame.rotation_to_ecef()
+    place, speed, axis = problem.frame.to_ecef(position), velocity @ turn.T, np.array([0.0, 0.0, _TURN])
+    away = np.linalg.norm(place, axis=-1, keepdims=True)
+    pull = -_GM * place / np.maximum(away, _RADIUS) ** 3
+    fall = pull - 2.0 * np.cross(axis, speed) - np.cross(axis, np.cross(axis, place))
+    return velocity, np.where(away > _RADIUS + _SKY, fall @ turn, 0.0)

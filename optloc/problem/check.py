@@ -245,7 +245,7 @@ def _check_rates(problem: Problem) -> None:
 # What cannot be unknown: malformed motions, biases and priors are refused with a sentence that names them.
 
 # As in `optloc.base.types.Bias`, which types alone do not enforce.
-_FORMS = ("offset", "scale", "drift", "rotation")
+_FORMS = ("offset", "scale", "drift", "rotation", "time")
 
 
 def check_unknowns(problem: Problem) -> None:
@@ -319,6 +319,8 @@ def _check_bias(problem: Problem, bias: Bias, where: str) -> None:
         raise InvalidProblem(f"a coefficient is {why}", where, "give numbers such as 1 and -1")
     if bias.form == "rotation":
         _check_rotation(problem, bias, where)
+    if bias.form == "time":
+        _check_course(problem, bias, where)
     turns = (1 if problem.dimension == 2 else 3) if bias.form == "rotation" else 1
     if bias.sigma is None:
         return
@@ -341,6 +343,28 @@ def _check_rotation(problem: Problem, bias: Bias, where: str) -> None:
             raise InvalidProblem(
                 f"a rotation does not change {rows.kind} row {bias.row[inside][0] - start}", where, advice
             )
+
+
+def _check_course(problem: Problem, bias: Bias, where: str) -> None:
+    """Refuse a time along a course that stations do not have."""
+    velocity = problem.stations.velocity
+    if velocity is None:
+        raise InvalidProblem("a time along a course needs velocities of the stations", where, "give vx, vy and vz")
+    if np.prod(velocity.shape[:-3]) * np.prod(problem.stations.position.shape[:-3]) > 1:
+        raise InvalidProblem("the stations differ from problem to problem", where, "solve them one by one")
+    if not np.isin(bias.coefficient, (1.0, -1.0)).all():
+        advice = "give 1 where it moves the row's first station, and -1 where its second"
+        raise InvalidProblem("a coefficient is neither 1 nor -1", where, advice)
+    ends = (np.concatenate([getattr(rows, name) for rows in problem.rows])[bias.row] for name in ("a", "b"))
+    station = np.where(bias.coefficient > 0.0, *ends)
+    if len(np.unique(np.stack([bias.row, station]), axis=1).T) < len(bias.row) or (station < 0).any():
+        raise InvalidProblem("a row has no such station, or has it twice", where, "let each row touch a station once")
+    epoch = problem.epoch[bias.row] if velocity.shape[-3] > 1 else np.zeros_like(bias.row)
+    moves = velocity.reshape(-1, *velocity.shape[-2:])[epoch, station].any(-1)
+    still = np.setdiff1d(np.arange(len(bias.members)), bias.member[moves])
+    if len(still):
+        what = f"{bias.members[still[0]]} stays where it is: it has no time along its course"
+        raise InvalidProblem(what, f"{where}, members", "name those that move")
 
 
 def _check_prior(problem: Problem, prior: Prior) -> None:

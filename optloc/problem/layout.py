@@ -11,7 +11,7 @@ from optloc.base.types import Array, Bias, Motion, Stations
 
 # Units are those of reports: inside all is SI.
 _STATE = (("position", "m"), ("velocity", "m/s"), ("acceleration", "m/s^2"))
-_OWN_UNIT = {"scale": "1", "rotation": "rad"}
+_OWN_UNIT = {"scale": "1", "rotation": "rad", "time": "s"}
 # A drift is per second; of a speed that is an acceleration.
 _RATE = {"m/s": "m/s^2"}
 _Part = tuple[str, int, str, tuple[str, ...]]

@@ -139,7 +139,11 @@ class Problem:
             for b in self.biases
         )
         # Numbers are left out: positions, measurements, weights, covariances change from solve to solve.
-        stations = (self.stations.count, self.dimension, self.stations.covariance is None, self.stations.span)
+        s = self.stations
+        stations: tuple[Any, ...] = (s.count, self.dimension, s.covariance is None, s.span)
+        # But for courses that a station may be further along: how fast it goes is a factor of an unknown.
+        if any(b.form == "time" for b in self.biases) and s.velocity is not None:
+            stations += (s.position.tobytes(), s.velocity.tobytes())
         # Polygons enter nothing that is kept by structure but programs, whose keys hold the bands of their edges.
         constraints = tuple((c.kind, c.target) for c in self.constraints if isinstance(c, Band))
         return (rows, blocks, motions, biases, stations, self.times.tobytes(), self.frame, constraints)

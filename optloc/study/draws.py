@@ -453,7 +453,7 @@ def _amount(case: Case, bias: Bias, value: Amount, where: str) -> float:
         text = value.strip()
         sign = -1.0 if text.startswith("-") else 1.0
         return sign * sigma_of(kind, text.lstrip("-"), where)
-    quantity = "angle" if bias.form == "rotation" else "plain"
+    quantity = {"rotation": "angle", "time": "time"}.get(bias.form, "plain")
     return Units(quantity).plain(value, None, where)  # type: ignore[arg-type]
 
 
