@@ -16,7 +16,8 @@ are known from the pass before,
 
 .. math:: \min_x \; |W \,\mathrm{diag}(1/\rho)\, L\, y|^2,
 
-is linear in :math:`Y = y y^\top`. It is relaxed to :math:`Y \succeq 0` with what holds for every source:
+is linear in :math:`Y = y y^\top`. It is relaxed to :math:`Y \succeq 0` with what holds for every
+source, the last two within their bounds:
 
 - ties: :math:`Y_{r_i r_i} = |x - s_i|^2`, :math:`Y_{\beta_j r_i} = w_{ji}`, and
   :math:`Y_{q_b r_b} = -(x - s_b) \cdot v_b` of a rate's own range;
@@ -24,8 +25,9 @@ is linear in :math:`Y = y y^\top`. It is relaxed to :math:`Y \succeq 0` with wha
   product of a rate with its own range is the linear form above;
 - Cauchy and Schwarz, :math:`r_i r_n \ge |(x - s_i) \cdot (x - s_n)|` (that is the triangle inequality),
   :math:`q_b^2 \le |v_b|^2`, and :math:`|x - s_i| \le r_i`;
-- where the height is known, :math:`(x - c)^\top E (x - c) = 1`, else :math:`|x|^2 \le` `reach`:sup:`2`; both are linear
-  in `Y`, and the ellipsoid is a surface of constant height only nearly (`formulations.range_height.ellipsoid`).
+- where the height is known, :math:`(x - c)^\top E (x - c) = 1`, else :math:`|x| \le` `reach`; squared both are linear
+  in `Y`, and the ellipsoid is a surface of constant height only nearly (`formulations.range_height.ellipsoid`);
+- so that `Y` stays bounded, `b` within ten speeds of the fastest node of what a fit of the rows by `b` alone says.
 
 What it is worth: the value is a lower bound of that weighted cost for the last :math:`\rho`, not of the likelihood's
 (both agree at a point whose ranges are :math:`\rho`). It is not tight: where the first row of `Y` says a place, the
