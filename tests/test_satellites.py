@@ -191,7 +191,7 @@ ONE, TWO = LEO.splitlines()[1:]
 BROKEN = {
     "nothing": ("", "the file holds no orbits"),
     "words": ("these are\nno elements\n", "the file holds no orbits"),
-    "check digit": (LEO.replace("100.0000", "101.0000"), r"b\.tle, line 2: these are no elements of an orbit"),
+    "check digit": (LEO.replace("100.0000", "101.0000"), r"b\.tle, line 2: the check digit at the end of a line"),
     "letters": (f"A\n{ONE}\n{line(TWO.replace('86.3900', 'xx.3900'))}", r"b\.tle, line 2: these are no elements"),
     "cut": (f"A\n{ONE[:40]}\n{TWO}", r"b\.tle, line 2: these are no elements"),
     "two satellites": (f"A\n{ONE}\n{GNSS.splitlines()[2]}", r"b\.tle, line 2: these are no elements"),
@@ -199,7 +199,7 @@ BROKEN = {
     "the first is missing": (f"A\n{TWO}\n", r"b\.tle, line 2: a second line of elements has no first one"),
     "no motion": (elements(motion=0.0), r"b\.tle, line 2: these are no elements|cannot be followed"),
     "in the ground": (elements(motion=18.5), r"b\.tle, line 2: .*(no elements|cannot be followed)"),
-    "other years": (LEO.replace("04097", "05097").replace(ONE[-1:] + "\n2", "3\n2"), "no elements|364 days from 2004"),
+    "other years": (elements(epoch="05097.00000000"), "are 36[456] days from 2004-04-06"),
     "bell": (LEO.replace("LEO 1", "LE\x07"), "control characters"),
     "xml": ("<?xml version='1.0'?><ndm/>", "elements in XML are not read; save them as JSON"),
     "half a json": ('{"OBJECT_NAME": "A"', "line 1: this is not JSON"),
@@ -220,6 +220,7 @@ BROKEN = {
         "line 3: 'a lot' is not a number",
     ),
     "sp3 without a date": ("#d\n*  2004 13 6 0 0 0.0\n", "line 2: this is no date"),
+    "sp3 at minute -5": ("#d\n*  2004 4 6 0 -5 0.0\n", "line 2: this is no date"),
     "sp3 with few": ("#d\n*  2004 4 6 0 0 0.0\nPG01" + 3 * "  12345.000000" + "\n", "there are 1 places"),
     "sp3 backwards": (2 * ("#d\n*  2004 4 6 0 0 0.0\nPG01" + 3 * "  12345.000000" + "\n"), "do not increase"),
 }

@@ -15,6 +15,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import cache, partial
 from itertools import pairwise
 from math import isfinite
@@ -262,20 +263,24 @@ def _line_sets(text: str, source: str) -> list[_Set]:
             continue
         if not after.startswith("2 "):
             raise InvalidProblem("a first line of elements has no second one", where, "give both, unchanged")
-        sets.append(_Set(name, line[2:7].strip(), where, partial(_from_lines, name, line, after)))
+        sets.append(_Set(name, line[2:7].strip(), where, partial(_from_lines, name, line, after, where)))
         name = ""
         next(following)
     return sets
 
 
-def _from_lines(name: str, one: str, two: str) -> Any:
+def _from_lines(name: str, one: str, two: str, where: str) -> Any:
     _library()
     from sgp4.earth_gravity import wgs72
     from sgp4.io import twoline2rv, verify_checksum
     from skyfield.api import EarthSatellite
 
     # The fast reader takes anything for elements: the slow one looks at every column first.
-    verify_checksum(one, two)
+    try:
+        verify_checksum(one, two)
+    except ValueError:
+        what = "the check digit at the end of a line does not fit it"
+        raise InvalidProblem(what, where, "fetch them again, unchanged") from None
     twoline2rv(one, two, wgs72)
     return EarthSatellite(one, two, name or None, _library())
 
@@ -374,11 +379,10 @@ def _calendar(line: str, where: str) -> float:
     """Return the reading of the file's clock as seconds since 1970."""
     parts = line[1:].split()
     try:
-        year, month, day, hour, minute = (int(part) for part in parts[:5])
-        date = np.datetime64(f"{year:04d}-{month:02d}-{day:02d}T{hour:02d}:{minute:02d}", "s")
-    except ValueError:
+        date = datetime(*(int(part) for part in parts[:5]), tzinfo=UTC)  # type: ignore[misc,arg-type]  # five of them
+    except (ValueError, TypeError):
         raise InvalidProblem("this is no date", where, "fetch the file again") from None
-    return float(date.astype(np.int64)) + _number(parts[5] if len(parts) > 5 else "", where)
+    return date.timestamp() + _number(parts[5] if len(parts) > 5 else "", where)
 
 
 def _between(

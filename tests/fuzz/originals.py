@@ -5,6 +5,7 @@ import json
 import tomllib
 from functools import cache
 from importlib.resources import files
+from math import cos, sin
 
 import pyarrow as pa
 from fuzz.mutations import toml_text
@@ -133,6 +134,25 @@ PSEUDORANGES = "time,satellite,pseudorange,x,y,z\n" + "".join(
         ("G30", 21483155.7, 25610e3, -1400e3, 6660e3),
     )
 )
+ELEMENTS = """LEO 1
+1 90001U 97020B   26097.00000000  .00000000  00000-0  00000-0 0  9992
+2 90001  86.3900 196.0000 0002000  90.0000 270.0000 14.34216000 10006
+LEO 2
+1 90002U 97020C   26097.00000000  .00000000  00000-0  00000-0 0  9993
+2 90002  63.4000  64.0000 0002000  90.0000 342.0000 14.34216000 10008
+"""
+MEAN_ELEMENTS = {
+    "OBJECT_NAME": "LEO 1", "OBJECT_ID": "1997-020B", "EPOCH": "2026-04-07T00:00:00.000000", "MEAN_MOTION": 14.34216,
+    "ECCENTRICITY": 0.0002, "INCLINATION": 86.39, "RA_OF_ASC_NODE": 196.0, "ARG_OF_PERICENTER": 90.0,
+    "MEAN_ANOMALY": 270.0, "EPHEMERIS_TYPE": 0, "CLASSIFICATION_TYPE": "U", "NORAD_CAT_ID": 90001,
+    "ELEMENT_SET_NO": 999, "REV_AT_EPOCH": 1000, "BSTAR": 0, "MEAN_MOTION_DOT": 0, "MEAN_MOTION_DDOT": 0,
+}  # fmt: skip
+PLACES = "#dP2026  4  7  0  0  0.00000000      12\n%c M  cc GPS ccc cccc cccc cccc cccc ccccc ccccc ccccc\n" + "".join(
+    f"*  2026  4  7  0 {k:2d}  0.00000000\n"
+    f"PL01{7158.0 * cos(0.0625 * k):14.6f}{0.0:14.6f}{7158.0 * sin(0.0625 * k):14.6f}{999999.999999:14.6f}\n"
+    for k in range(20)
+)
+PASS = "time,satellite,z\n" + "".join(f"2026-04-07T00:{k}:30Z,{{}},{20.0 * k}\n" for k in range(11, 16))
 
 
 def geojson():
@@ -149,6 +169,11 @@ def geojson():
     del points[1]["geometry"]["coordinates"][2]
     road = {"type": "Feature", "properties": {}, "geometry": {"type": "LineString", "coordinates": [[0, 0], [1, 1]]}}
     return json.dumps({"type": "FeatureCollection", "features": [*points, road]}, indent=1)
+
+
+def csv_of(fields):
+    """Return one row as a CSV table."""
+    return ",".join(fields) + "\n" + ",".join(map(str, fields.values())) + "\n"
 
 
 def to_parquet(data):
@@ -207,7 +232,17 @@ def conversions():
     heard, sites = {"toa.csv": ARRIVALS.encode()}, {"sites.geojson": geojson().encode()}
     packed, gnss = {"toa.parquet": to_parquet(ARRIVALS.encode())}, {"gnss.csv": PSEUDORANGES.encode()}
     spread = ["--sigma", "20 ns", *to]
+    leo, told = {"pass.csv": PASS.format(*5 * ["LEO 1"]).encode()}, ["--times", "pass.csv", "--out", "s.csv"]
+    omm = csv_of(MEAN_ELEMENTS).encode()
     return {
+        "elements": ({"leo.tle": ELEMENTS.encode()} | leo, told, ("s.csv",)),
+        "mean elements": ({"leo.csv": omm} | leo, told, ("s.csv",)),
+        "mean elements, json": ({"leo.json": json.dumps([MEAN_ELEMENTS]).encode()} | leo, told, ("s.csv",)),
+        "places": (
+            {"leo.sp3": PLACES.encode(), "l01.csv": PASS.format(*5 * ["L01"]).encode()} | sites,
+            ["--times", "l01.csv", "--stations", "sites.geojson", "--out", "s.csv"],
+            ("s.csv",),
+        ),
         "arrivals, geojson": (heard | sites, ["--stations", "sites.geojson", *spread], site),
         "arrivals, table": (heard | {"rx.csv": GRID.encode()}, ["--stations", "rx.csv", *spread], site),
         "arrivals, parquet": (packed | {"rx.csv": SITES.encode()}, ["--stations", "rx.csv", *spread], site),
