@@ -139,7 +139,8 @@ def _nearby(scene: Scene) -> bool:
     if not known.any():
         return True
     reach = _reach(scene, known, np.median(scene.fixes[known][:, :2], axis=0))
-    return reach < _CLOSE * float(np.ptp(scene.stations[:, :2]))
+    # A single station that moves is as wide as its track.
+    return reach < _CLOSE * float(np.ptp(np.concatenate([scene.stations, *scene.tracks])[:, :2]))
 
 
 def _close(panel: Axes, scene: Scene) -> float:

@@ -297,7 +297,7 @@ def scene_of(problem: Problem, fixes: Sequence[Fix], *, outlined: bool = False) 
         tracks=_tracks(problem),
         paths=paths,
         other_paths=other,
-        known=tuple(_thin(place) for place in known),
+        known=tuple(thinned(place) for place in known),
         outlines=outlines,
         local=_is_local(fixes, outlines, len(position)),
     )
@@ -351,11 +351,11 @@ def _tracks(problem: Problem) -> tuple[Array, ...]:
     position = problem.stations.position
     if position.ndim > 3:
         return ()
-    tracks = (_thin(track) for track in np.swapaxes(position, 0, 1))
+    tracks = (thinned(track) for track in np.swapaxes(position, 0, 1))
     return tuple(track for track in tracks if np.ptp(track, axis=0).max() > 0.0)
 
 
-def _thin(track: Array) -> Array:
+def thinned(track: Array) -> Array:
     """Return a track (k, d) with no more points than a picture needs, the first and the last among them."""
     return np.asarray(track[np.unique(np.linspace(0, len(track) - 1, _PATH).astype(int))])
 
@@ -372,7 +372,7 @@ def _paths(problem: Problem, fixes: Sequence[Fix]) -> tuple[tuple[Array, ...], t
             continue
         for i, motion in enumerate(problem.motions):
             if motion.known is None and (motion.order or motion.span == "epoch"):
-                paths[number > 0].append(_thin(_path(problem, fixes[0], i, x)))
+                paths[number > 0].append(thinned(_path(problem, fixes[0], i, x)))
     return tuple(paths[0]), tuple(paths[1])
 
 

@@ -17,7 +17,7 @@ from optloc.models import MODELS
 from optloc.plot.fixes import isodopplers
 from optloc.plot.outlines import Pieces
 from optloc.plot.outlines import rings as around
-from optloc.plot.style import figure_class, outlines_of, states_of
+from optloc.plot.style import figure_class, outlines_of, states_of, thinned
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 
@@ -362,6 +362,22 @@ def station_spots(problem: Problem) -> Spots:
     place[problem.frame.to_geodetic(position)[2] > _SKY] = np.nan
     nothing = tuple(np.zeros((0, 2)) for _ in position)
     return Spots(place, nothing, np.ones(len(position), dtype=bool), problem.stations.names)
+
+
+def ground_tracks(problem: Problem) -> list[tuple[str, Array]]:
+    """Return the lines (n, 2) in degrees below stations in the sky that range rates are measured from, by name.
+
+    Their longitudes go on beyond the date line.
+    """
+    heard = [index for rows in problem.rows if MODELS[rows.kind].velocity for index in (rows.a, rows.b)]
+    found = []
+    for station in np.unique(np.concatenate([*heard, [-1]]))[1:].tolist():
+        track = problem.stations.position.reshape(-1, *problem.stations.position.shape[-3:])[0, :, station]
+        lat, lon, height = problem.frame.to_geodetic(thinned(track))
+        if height.min() > _SKY:
+            line = np.degrees(np.stack([np.unwrap(lon), lat], axis=-1))
+            found.append((f"below {problem.stations.names[station]}", line))
+    return found
 
 
 def lines_of_position(problem: Problem, fix: Fix, limits: tuple[float, float, float, float]) -> list[tuple[str, Array]]:

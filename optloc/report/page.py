@@ -34,6 +34,7 @@ from optloc.report.map import (
     Spots,
     dot,
     fixed_spots,
+    ground_tracks,
     lines_of_position,
     map_canvas,
     other_spots,
@@ -206,13 +207,14 @@ def _on_earth(geodetic: bool) -> None:
 
 
 def _page(problem: Problem, found: Spots, others: Spots, title: str, what: str, single: Fix | None) -> str:
-    stations = station_spots(problem)
-    limits = _limits([stations.place, found.place, others.place])
+    stations, tracks = station_spots(problem), ground_tracks(problem)
+    limits = _limits([stations.place, found.place, others.place, *(line for _, line in tracks)])
     plane, middle = Plane(*limits), (limits[0] + limits[1]) / 2.0
     lines = [] if single is None else lines_of_position(problem, single, limits)
     few = len(found.place) <= _FEW
     layers: dict[str, Sequence[Drawn]] = {
         **({"lines of position": _curves(lines, plane)} if lines else {}),
+        **({"ground tracks": _curves(_around(tracks, middle), plane, "line")} if tracks else {}),
         "stations": _stations(stations, plane, middle),
         **({"alternatives": _dots(others, plane, middle, _MARK)} if len(others.place) else {}),
         what: [*_ellipses(found, plane, middle), *_dots(found, plane, middle, _MARK if few else _SMALL)],
@@ -262,8 +264,13 @@ def _focus(found: Spots, plane: Plane, middle: float) -> list[float] | None:
     return [float(x), float(y), width] if width < plane.half[0] else None
 
 
-def _curves(lines: Sequence[tuple[str, Array]], plane: Plane) -> list[Drawn]:
-    return [Curve("line thin", path([plane(line)], close=False, digits=3), tell=name) for name, line in lines]
+def _around(lines: Sequence[tuple[str, Array]], middle: float) -> list[tuple[str, Array]]:
+    """Return lines each in one piece, on the turn of longitudes that is nearest to the middle of the map."""
+    return [(name, line - [360.0 * np.round((line[:, 0].mean() - middle) / 360.0), 0.0]) for name, line in lines]
+
+
+def _curves(lines: Sequence[tuple[str, Array]], plane: Plane, kind: str = "line thin") -> list[Drawn]:
+    return [Curve(kind, path([plane(line)], close=False, digits=3), tell=name) for name, line in lines]
 
 
 def _stations(stations: Spots, plane: Plane, middle: float) -> list[Drawn]:

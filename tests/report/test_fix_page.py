@@ -11,7 +11,7 @@ import optloc
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
 from optloc.report import fix_page
-from optloc.report.map import fixed_spots, lines_of_position
+from optloc.report.map import fixed_spots, ground_tracks, lines_of_position
 
 RUN = CliRunner()
 DEMO = package_files("optloc") / "scenarios" / "demo.toml"
@@ -61,6 +61,25 @@ def test_lines_of_position_meet_their_rows(demo):
         row = [f"tdoa {problem.stations.names[a]} – Lake" for a in problem.rows[0].a].index(name)
         x = problem.frame.from_geodetic(*np.radians(line.T[::-1]), np.full(len(line), fix.geodetic[2]))
         assert np.abs(optloc.predict(problem, x)[:, row] - problem.z[row]).max() < 30.0
+
+
+def test_a_pass_has_its_ground_track_on_the_map():
+    problem = optloc.load(DEMO.parent.parent / "starters" / "range_rate.toml")
+    near = problem.frame.from_geodetic(np.radians(47.0), np.radians(10.0), 650.0)
+    fix = optloc.solve(problem, start=np.append(near, 0.0))
+    ((name, line),) = ground_tracks(problem)
+    lat, lon, _ = problem.frame.to_geodetic(problem.stations.position[[0, -1], 0])
+    assert name == "below SAT"
+    np.testing.assert_allclose(line[[0, -1]], np.degrees(np.stack([lon, lat], axis=-1)))
+    page = fix_page(problem, fix, "pass")
+    assert "below SAT" in page
+    assert page.count("range_rate SAT") >= 13
+    # turned to the date line its track stays in one piece
+    over = np.array([[np.cos(turn), np.sin(turn), 0.0] for turn in np.radians([178.0, 181.0, 184.0])]) * 7e6
+    stations = optloc.station_array(over[:, None], ("high",), velocity=np.ones((3, 1, 3)))
+    rows = optloc.measured("range_rate", np.zeros(3), a=[0, 0, 0], epoch=[0, 1, 2], sigma=1.0)
+    ((_, line),) = ground_tracks(optloc.assemble(stations, rows, times=[0.0, 1.0, 2.0], frame=optloc.ECEF))
+    np.testing.assert_allclose(line, [[178.0, 0.0], [181.0, 0.0], [184.0, 0.0]], atol=1e-9)
 
 
 def test_a_plane_frame_is_refused():

@@ -1,0 +1,20 @@
+"""
+A pass of a satellite
+=====================
+
+Frequencies of one emitter in one pass: each row alone would leave the target anywhere on its isodoppler curve. The
+curves cross at the fix, and once more at the mirror place on the other side of the track.
+"""
+
+from importlib.resources import files
+
+import numpy as np
+
+import optloc
+from optloc.plot import plot_fixes
+
+problem = optloc.load(files("optloc") / "starters" / "range_rate.toml")
+near = optloc.ECEF.from_geodetic(np.radians(47.0), np.radians(10.0), 650.0)
+fix = optloc.solve(problem, start=np.append(near, 0.0))
+figure = plot_fixes(problem, fix, "One pass, thirteen frequencies")
+print(np.degrees(fix.geodetic[:2]).round(4))
