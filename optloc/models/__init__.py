@@ -86,7 +86,8 @@ class Model:
         share its error (`arrival_sigma`). That of ranges is `ranges`.
     nodes : tuple of (factor, node)
         What a proof takes h for where it is no sum of ranges: ``h = sum of factor phi``, each phi a node
-        (`optloc.proof.nodes.node.Node`) or the name of one that optloc has. Empty: nothing is proven of such rows.
+        (`optloc.proof.nodes.node.Node`) or the name of one that optloc has; with `signs`, that of q. Empty: nothing is
+        proven of such rows.
     lifted : callable of (m, a, b), optional
         The `LiftedRow` of a measured value m, where there is one that is not a sum of ranges.
     period : float, optional
@@ -274,6 +275,7 @@ _KINDS: dict[str, Model] = {
         1,
         "Doppler shift as range rate, r'_a",
         signs=(1, 0),
+        nodes=((1.0, "range_rate"),),
         velocity=True,
     ),
     "fdoa": Model(
@@ -282,6 +284,7 @@ _KINDS: dict[str, Model] = {
         2,
         "frequency difference of arrival as range-rate difference, r'_a - r'_b",
         signs=(1, -1),
+        nodes=((1.0, "range_rate"),),
         velocity=True,
     ),
     "rss_difference": rss_difference(),

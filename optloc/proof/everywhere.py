@@ -39,7 +39,7 @@ from optloc.proof.box import (
 from optloc.proof.chart import HIDDEN_REACH, Box, Chart, Cost, Known, chart_at, descend, empty_box
 from optloc.proof.curvature import C00, G0, G1, G2, NOISE0, convex, entry, slopes_everywhere, spread_of, sum_up
 from optloc.proof.near import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove
-from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces, infinity_of, points_of
+from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces, infinity_of, points_of, size_of
 from optloc.proof.nodes.node import ANY, DIFFERENCE, GROWS, H00, H11, H22, RANGE
 
 # The cost over the pieces of an atlas: all nodes over a box, out to infinity, and the surroundings of known minima.
@@ -118,7 +118,8 @@ def accuracy_floor_far(cost: Cost, atlas: Atlas) -> float:
     # Lines are p - v a with |p| at most sqrt(3) and |a| below 1: their lengths, and sums of two, are below 4 reaches.
     size = 4.0 * atlas.radius + abs(atlas.middle[0]) + abs(atlas.middle[1]) + abs(atlas.middle[2])
     for j in range(cost.kinds.shape[0]):
-        total += cost.weight[j] * (size if infinity_of(cost.kinds[j]) == DIFFERENCE else 4.0)
+        own = size if infinity_of(cost.kinds[j]) == DIFFERENCE else 4.0 * size_of(cost.kinds[j], cost.data[j], 1.0)
+        total += cost.weight[j] * own
     return total
 
 

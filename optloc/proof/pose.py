@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +18,7 @@ from optloc.problem.noise import Whitener, variances, whiten
 from optloc.problem.problem import Problem
 from optloc.proof.nodes.dispatch import NODES, code_of, named, width
 from optloc.proof.nodes.level import linear_numbers
-from optloc.proof.nodes.node import LINEAR, RANGE, Node, Row
+from optloc.proof.nodes.node import LINEAR, Node, Row
 
 # From rows of measurements to nodes: which scalar functions the rows are sums of, and their numbers.
 
@@ -41,9 +41,9 @@ class Columns:
     row, column, coefficient : list
         Sparse design: row of the problem, node, factor.
     station, epoch : list of int
-        Of each node that is a range; -1 for the others.
-    ranges : dict
-        The node of the range of a station at an epoch, which rows share.
+        Of each node that is of a station alone; -1 for the others.
+    shared : dict
+        The nodes that rows share, by code, station and epoch: ranges and range rates.
     """
 
     problem: Problem
@@ -54,7 +54,7 @@ class Columns:
     coefficient: list[float] = field(default_factory=list)
     station: list[int] = field(default_factory=list)
     epoch: list[int] = field(default_factory=list)
-    ranges: dict[tuple[int, int], int] = field(default_factory=dict)
+    shared: dict[tuple[int, int, int], int] = field(default_factory=dict)
 
     def add(self, kind: int, data: Array, station: int = -1, epoch: int = -1) -> int:
         """Add a node and return its number."""
@@ -106,29 +106,37 @@ def columns_of(problem: Problem, observed: Array) -> Columns:
         model = MODELS[rows.kind]
         for i in range(rows.count):
             row = Row(problem, int(rows.a[i]), int(rows.b[i]), int(rows.epoch[i]), observed[:, start + i])
-            if model.ranges is None:
-                for factor, node in model.nodes:
-                    made.touch(start + i, _own(made, row, node), factor)
-                continue
-            for sign, station in zip(model.ranges, (row.a, row.b), strict=True):
-                if sign:
-                    made.touch(start + i, _range(made, row, station), float(sign))
+            for factor, node, station in _terms(model, row):
+                made.touch(start + i, _number_of(made, replace(row, a=station), node), factor)
     return made
 
 
-def _own(made: Columns, row: Row, node: str | Node) -> int:
-    """Return the number of a node of one row, which is added unless it is a range that other rows have as well."""
-    if code_of(node) == RANGE:
-        return _range(made, row, row.a)
-    return made.add(code_of(node), named(node).numbers(row))
+def _terms(model: Model, row: Row) -> Iterator[tuple[float, str | Node, int]]:
+    """Yield what a row is a sum of: factors, nodes, and of which station."""
+    nodes = ((1.0, "range"),) if model.ranges is not None else model.nodes
+    # What each station measures by itself enters with its sign; other nodes are of the row as a whole.
+    for sign, station in zip(model.signs or (1,), (row.a, row.b), strict=False):
+        if sign:
+            yield from ((sign * factor, node, station) for factor, node in nodes)
 
 
-def _range(made: Columns, row: Row, station: int) -> int:
-    """Return the number of the node that is the range to a station at the epoch of a row."""
-    epoch = row.epoch if made.problem.stations.position.shape[-3] > 1 else 0
-    if (station, epoch) not in made.ranges:
-        made.ranges[station, epoch] = made.add(RANGE, row.place(station), station, epoch)
-    return made.ranges[station, epoch]
+def _number_of(made: Columns, row: Row, node: str | Node) -> int:
+    """Return the number of a node of one row, which is added unless it is of its station alone, as others are."""
+    code, own = code_of(node), named(node)
+    if not own.of_station:
+        return made.add(code, own.numbers(row))
+    epoch = row.epoch if _epochs(made.problem) > 1 else 0
+    key = (code, row.a, epoch)
+    if key not in made.shared:
+        made.shared[key] = made.add(code, own.numbers(row), row.a, epoch)
+    return made.shared[key]
+
+
+def _epochs(problem: Problem) -> int:
+    """Return at how many epochs stations have a place, or a velocity, of their own."""
+    stations = problem.stations
+    given = [array for array in (stations.position, stations.velocity) if array is not None]
+    return max(int(array.shape[-3]) for array in given)
 
 
 def add_linear(made: Columns, rows: Array, origin: Array | None = None) -> list[int]:
@@ -458,30 +466,28 @@ def _reasons(problem: Problem) -> Iterator[str]:
 def _beyond_rows(problem: Problem) -> Iterator[str]:
     for rows in problem.rows:
         model = MODELS[rows.kind]
-        if model.velocity:
-            yield f"{rows.kind} rows depend on velocities, which the proof does not bound"
-        elif model.ranges is None and not model.nodes:
-            yield f"{rows.kind} rows are neither sums of ranges nor a kind whose bounds are known"
+        if model.ranges is None and not model.nodes:
+            yield f"{rows.kind} rows are neither sums of ranges or rates nor a kind whose bounds are known"
     most = MOST_NODES if enabled() else MOST_NODES_PLAIN
     if problem.count > most and _nodes(problem) > most:
         without = "" if enabled() else " without machine code"
-        yield f"there are {_nodes(problem)} different ranges and angles, and the proof takes {most}{without}"
+        yield f"there are {_nodes(problem)} different ranges, rates and angles, and the proof takes {most}{without}"
     if problem.layout.size - problem.dimension > MOST_UNKNOWNS:
         yield f"there are {problem.layout.size} unknowns, and the proof takes {MOST_UNKNOWNS}"
 
 
 def _nodes(problem: Problem) -> int:
-    """Return how many different ranges, angles, ratios and heights the rows are made of."""
-    moving, own = problem.stations.position.shape[-3] > 1, 0
-    found: set[tuple[int, int]] = set()
+    """Return how many different ranges, rates, angles, ratios and heights the rows are made of."""
+    moving, own = _epochs(problem) > 1, 0
+    found: set[tuple[bool, int, int]] = set()
     for rows in problem.rows:
         model = MODELS[rows.kind]
-        if model.ranges is None:
+        if model.signs is None:
             own += rows.count * len(model.nodes)
             continue
         when = rows.epoch if moving else np.zeros_like(rows.epoch)
         for index in (rows.a, rows.b)[: model.stations]:
-            found.update(zip(index.tolist(), when.tolist(), strict=True))
+            found.update((model.ranges is None, *key) for key in zip(index.tolist(), when.tolist(), strict=True))
     return own + len(found)
 
 

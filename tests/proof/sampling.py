@@ -4,13 +4,15 @@ import numpy as np
 from proof.costs import WIDTH
 
 from optloc import MODELS
-from optloc.models import Point
+from optloc.models import Point, range_rate
 from optloc.proof.nodes.angles import bound_azimuth, bound_elevation, curve_azimuth, curve_elevation
 from optloc.proof.nodes.level import bound_height, curve_height
+from optloc.proof.nodes.rate import VELOCITY, bound_rate, curve_rate
 from optloc.proof.nodes.ratio import bound_ratio, curve_ratio
 
 BOUND = {"azimuth": bound_azimuth, "elevation": bound_elevation, "groa": bound_ratio, "height": bound_height}
 CURVE = {"azimuth": curve_azimuth, "elevation": curve_elevation, "groa": curve_ratio, "height": curve_height}
+BOUND["range_rate"], CURVE["range_rate"] = bound_rate, curve_rate
 RADIUS = 6.37e6
 
 
@@ -33,6 +35,8 @@ def numbers(kind, d, rng):
         data[15] = rng.uniform(-np.pi, np.pi)
     if kind == "groa":
         data[3 : 3 + d] = rng.normal(size=d) * 1e3
+    if kind == "range_rate":  # any speed, up to a satellite's
+        data[VELOCITY : VELOCITY + d] = rng.normal(size=d) * 10 ** rng.uniform(0.0, 4.0)
     return data
 
 
@@ -45,6 +49,9 @@ def value(kind, d, data, x):
     """Return the node at positions (..., 3) by the package's h; azimuths from their measured value, wrapped."""
     parts = tuple(x[..., i] for i in range(d))
     a = Point(tuple(data[:d]), None, tuple(tuple(data[6 + 3 * i : 6 + 3 * i + d]) for i in range(d)))
+    if kind == "range_rate":
+        still, moving = (0.0,) * d, tuple(-data[VELOCITY : VELOCITY + d])
+        return range_rate(Point(parts, still), Point(tuple(data[:d]), moving))
     if kind == "height":
         ecef = data[3:6] + x @ data[6:15].reshape(3, 3).T
         return MODELS[kind].h(Point(parts, ecef=tuple(ecef[..., i] for i in range(3))), a, a)

@@ -24,10 +24,11 @@ from optloc.proof.nodes.angles import HORIZONTAL_ANGLE, VERTICAL_ANGLE
 from optloc.proof.nodes.level import GEODETIC_HEIGHT, LINEAR_FORM
 from optloc.proof.nodes.node import DIFFERENCE, FLAT, GROWS, MIXED, SCALED, Node, range_form, triple
 from optloc.proof.nodes.range import DISTANCE, bound_difference, curve_difference
+from optloc.proof.nodes.rate import RATE_OF_RANGE
 from optloc.proof.nodes.ratio import RATIO_OF_RANGES
 
 # In the order of their codes (`optloc.proof.nodes.node`); those from outside follow as they are met.
-_SHIPPED = (DISTANCE, LINEAR_FORM, HORIZONTAL_ANGLE, VERTICAL_ANGLE, RATIO_OF_RANGES, GEODETIC_HEIGHT)
+_SHIPPED = (DISTANCE, LINEAR_FORM, HORIZONTAL_ANGLE, VERTICAL_ANGLE, RATIO_OF_RANGES, GEODETIC_HEIGHT, RATE_OF_RANGE)
 NODES: list[Node] = list(_SHIPPED)
 _CODES = {node: code for code, node in enumerate(NODES)}
 _NAMES = {node.name: node for node in NODES}

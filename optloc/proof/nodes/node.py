@@ -41,7 +41,7 @@ from optloc.problem.problem import Problem
 
 # Codes of the shipped nodes, by which machine code knows them; nodes from outside are counted on. ANY stands for a node
 # of which nothing is known but its tables.
-RANGE, LINEAR, AZIMUTH, ELEVATION, RATIO, HEIGHT = range(6)
+RANGE, LINEAR, AZIMUTH, ELEVATION, RATIO, HEIGHT, RATE = range(7)
 ANY = -1
 
 # How a node curves: not at all, with a Hessian that is nowhere negative (a bound of its force from below is enough
@@ -83,6 +83,13 @@ class Row:
         """Return the position (B, d) of a station; B is N, or 1 where all problems share it."""
         position = self.problem.stations.position
         picked = position[..., self.epoch if position.shape[-3] > 1 else 0, station, :]
+        return picked if picked.ndim == 2 else picked[None]
+
+    def velocity(self, station: int) -> Array:
+        """Return the velocity (B, d) of a station."""
+        velocity = self.problem.stations.velocity
+        assert velocity is not None  # a problem of kinds with velocities has them
+        picked = velocity[..., self.epoch if velocity.shape[-3] > 1 else 0, station, :]
         return picked if picked.ndim == 2 else picked[None]
 
     def axes(self, station: int) -> Array:
@@ -139,6 +146,8 @@ class Node:
         ``(kinds, data, swing, j, x, row) -> (width, far)``: of node j, which is within `swing` (J,) of its value at a
         fix x. Writes a unit vector into row (3,): points at distance r off the station are within ``r width`` of the
         fix along it, and the fix itself is `far`. A negative width where nothing is known. None: it never is.
+    of_station : bool
+        Whether it is of a station at an epoch alone, so that all rows which name it share the node.
     counts_from_measured : bool
         Whether the node is its quantity less the measured value.
     most : float
@@ -162,6 +171,7 @@ class Node:
     size: Kernel | None = None
     ball: Kernel | None = None
     ray: Kernel | None = None
+    of_station: bool = False
     counts_from_measured: bool = False
     most: float = inf
     mark: Callable[[Array, Array, Array, Array], None] | None = None

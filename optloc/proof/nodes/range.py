@@ -219,4 +219,4 @@ def _numbers(row: Row) -> Array:
     return row.place(row.a)
 
 
-DISTANCE = Node("range", 3, 1, _numbers, shape=CONVEX, infinity=DIFFERENCE, size=_size, ball=_ball)
+DISTANCE = Node("range", 3, 1, _numbers, shape=CONVEX, infinity=DIFFERENCE, size=_size, ball=_ball, of_station=True)

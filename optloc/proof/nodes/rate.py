@@ -1,0 +1,103 @@
+"""Range rates of a target that stays, over a box: the component along the line of sight of the station's velocity.
+
+A rate is ``n.w / |n|`` with n the line from the station and w its velocity reversed: a quotient of a linear form and a
+range, of the direction of the line alone, so it stays finite and smooth at infinity.
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled
+from optloc.proof.nodes.node import (
+    SCALED,
+    Node,
+    Row,
+    across,
+    blend,
+    inner,
+    lay_out,
+    length,
+    pull,
+    range_bend,
+    range_form,
+    reach,
+    still,
+    triple,
+    unbounded,
+    write,
+)
+from optloc.proof.nodes.ratio import quotient, quotient_bend
+
+# Numbers: the station, and its velocity reversed.
+STATION, VELOCITY, RATE_WIDTH = 0, 3, 6
+
+
+@compiled
+def bound_rate(data: Array, line: Array, sense: Array, half: Array, slope: Array) -> tuple[float, float, float]:
+    """Bound a range rate over a box (see `optloc.proof.nodes.node`): a quotient, or what its directions allow."""
+    h, n, w = triple(half, 0), triple(line, 0), triple(data, VELOCITY)
+    r, u, least, most, far = range_form(line, sense, h)
+    phi = inner(w, n) / r if r > 0.0 else 0.0
+    low, high = _cone(phi, length(w), least, across(sense, u, h))
+    if least > 0.0:
+        g = blend(1.0 / r, pull(w, sense), -phi / r, u)
+        less, more = quotient(phi, g, u, most, (0.0, 0.0), (least, far), h)
+        # Else two numbers for the whole box say more than a slope and its remainder.
+        if more - less <= high - low:
+            write(g, slope)
+            return phi, less, more
+    slope[0] = slope[1] = slope[2] = 0.0
+    return phi, low - phi, high - phi
+
+
+@compiled
+def _cone(phi: float, speed: float, least: float, aside: float) -> tuple[float, float]:
+    """Return the least and greatest rate over all directions that a box holds.
+
+    They lie in a cone around that to its centre: along it lines are at least `least`, across it at most `aside`.
+    """
+    if not (least > 0.0 and speed > 0.0):
+        return -speed, speed
+    size = sqrt(least * least + aside * aside)
+    cosine, sine, along = least / size, aside / size, phi / speed
+    beside = sqrt(max(0.0, 1.0 - along * along))
+    # Where the cone holds the velocity itself the rate is the speed.
+    high = 1.0 if along >= cosine else along * cosine + beside * sine
+    low = -1.0 if along <= -cosine else along * cosine - beside * sine
+    return speed * low, speed * high
+
+
+@compiled
+def curve_rate(data: Array, line: Array, sense: Array, half: Array, curvature: Array, turn: Array) -> float:
+    """Bound how a range rate curves over a box (see `optloc.proof.nodes.node`)."""
+    h, n, w = triple(half, 0), triple(line, 0), triple(data, VELOCITY)
+    bound_rate(data, line, sense, half, turn)
+    r, u, least, most, _ = range_form(line, sense, h)
+    if still(turn) or not least > 0.0:
+        return unbounded(curvature, turn)
+    second, phi = np.empty((3, 3)), inner(w, n) / r
+    ds, chi, norm = range_bend(sense, h, r, u, least, most, second)
+    curvature[:] = 0.0  # of the linear form
+    g = blend(1.0 / r, pull(w, sense), -phi / r, u)
+    changes = ((0.0, 0.0, 0.0), ds, 0.0, chi, norm, reach(u, h) + most)
+    return quotient_bend(g, u, (phi, r, least), changes, h, curvature, second, turn)
+
+
+@compiled
+def _size(data: Array, reach: float) -> float:
+    """Return the size of what a rate is a sum of: the speed."""
+    return float(abs(data[VELOCITY]) + abs(data[VELOCITY + 1]) + abs(data[VELOCITY + 2]))
+
+
+def _numbers(row: Row) -> Array:
+    # The target stays: what it would add is the station's velocity reversed.
+    return lay_out({STATION: row.place(row.a), VELOCITY: -row.velocity(row.a)})
+
+
+RATE_OF_RANGE = Node(
+    "range_rate", RATE_WIDTH, 1, _numbers, bound_rate, curve_rate, infinity=SCALED, size=_size, of_station=True
+)
