@@ -20,7 +20,7 @@ from optloc.proof.pose import Posed
 # what is left of a batch by stretches, of which each should get several (`_PARTS` in all).
 _STRETCH, _PARTS = (16, 512), 32
 # So few proofs over so few nodes are begun in plain Python, with so many boxes in all: about half a second.
-_FEW, _SMALL, _FIRST_BOXES = 16, 24, 400
+FEW, SMALL, FIRST_BOXES = 16, 24, 400
 # Fewest boxes that each of them gets: most proofs inside a network end with the first.
 _AT_LEAST = 5
 
@@ -99,11 +99,11 @@ def prove_all(pose: Posed, asked: Asked) -> Answered:
     A few proofs are begun in plain Python: most need few boxes, and machine code takes longer to load.
     """
     n = len(asked.x)
-    if n > _FEW or len(pose.kinds) > _SMALL or ready(_loop):
+    if n > FEW or len(pose.kinds) > SMALL or ready(_loop):
         return _prove(pose, asked)
     # A budget for each that ends soon; who needs more begins anew in machine code.
     with plain():
-        out = _prove(pose, asked._replace(budget=np.minimum(asked.budget, max(_AT_LEAST, _FIRST_BOXES // max(n, 1)))))
+        out = _prove(pose, asked._replace(budget=np.minimum(asked.budget, max(_AT_LEAST, FIRST_BOXES // max(n, 1)))))
     short = np.flatnonzero((out.verdict == BUDGET) & (out.boxes < asked.budget))
     if len(short) and enabled():
         for array, more in zip(out, _prove(pose.take(short), asked.take(short)), strict=True):
@@ -120,7 +120,7 @@ def _prove(pose: Posed, asked: Asked) -> Answered:
         everywhere=np.zeros(n, dtype=np.bool_),
         found=np.full((n, d), np.nan),
     )
-    pose, asked = Posed(*(_plain(array) for array in pose)), Asked(*(_plain(array) for array in asked))
+    pose, asked = Posed(*(plainly(array) for array in pose)), Asked(*(plainly(array) for array in asked))
     length = max(_STRETCH[0], min(_STRETCH[1], n // _PARTS))
 
     def stretch(first: int) -> None:
@@ -139,15 +139,15 @@ def _prove(pose: Posed, asked: Asked) -> Answered:
 def costs_at(pose: Posed, x: Array) -> tuple[Array, Array]:
     """Return posed costs (n, P) at positions x (n, P, d), and what rounding may have made of their residuals (n, P)."""
     out = np.zeros((2, *x.shape[:2]))
-    if len(x) > _FEW or ready(_loop):
-        _evaluate(Posed(*(_plain(array) for array in pose)), _plain(x), out)
+    if len(x) > FEW or ready(_loop):
+        _evaluate(Posed(*(plainly(array) for array in pose)), plainly(x), out)
         return out[0], out[1]
     with plain(), np.errstate(all="ignore"):  # as few proofs are: machine code takes longer to load
         _evaluate(pose, x, out)
     return out[0], out[1]
 
 
-def _plain(array: Array) -> Array:
+def plainly(array: Array) -> Array:
     """Return an array in one form for all calls: machine code is made anew for read-only or strided arrays."""
     return np.require(array, requirements=["C", "W"])
 
@@ -170,7 +170,7 @@ def _loop(pose: Posed, asked: Asked, out: Answered) -> None:
         cost, own = Cost(kinds, data[i if len(data) > 1 else 0], rows, w[i], A, weight, groups), box
         # Rows that are absent in this problem alone: the tables of the batch are too wide for it.
         if (weight == 0.0).any():
-            cost = _present(cost)
+            cost = present_in(cost)
             own = empty_box(cost.K.shape[0], cost.K.shape[1])
         x, kappa, eps, found = fixes[i], kappas[i], tolerances[i], points[i]
         beside, low, high = (
@@ -192,7 +192,7 @@ def _loop(pose: Posed, asked: Asked, out: Answered) -> None:
 
 
 @compiled
-def _present(cost: Cost) -> Cost:
+def present_in(cost: Cost) -> Cost:
     """Return a cost without nodes that no row has: time goes with the square of the nodes."""
     K, w = cost.K, cost.w
     nodes, rows = np.empty(K.shape[1], dtype=np.int64), np.empty(K.shape[0], dtype=np.int64)

@@ -104,6 +104,7 @@ def least_residual(K: Array, weight: Array, floor: float, half: Array, nodes: Ar
     """
     # Whatever v is, the bound holds; how good it is depends on v alone.
     _nearest(half, rows)
+    _absorb(K, weight, nodes, rows)
     length, reach, t0, t1, t2 = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(K.shape[0]):
         v = rows[i, DIRECTION]
@@ -181,6 +182,23 @@ def _nearest(half: Array, rows: Array) -> None:
         s2 = within(-(b2 + a02 * s0 + a12 * s1) * d2, half[2])
     for i in range(rows.shape[0]):
         rows[i, DIRECTION] = rows[i, MIDDLE] + rows[i, J0] * s0 + rows[i, J1] * s1 + rows[i, J2] * s2
+
+
+@compiled
+def _absorb(K: Array, weight: Array, nodes: Array, rows: Array) -> None:
+    """Take off the direction v what nodes that are only enclosed may explain, as around a station of theirs."""
+    for _ in range(_SWEEPS):
+        for j in range(K.shape[1]):
+            radius = 0.5 * (nodes[j, HIGH] - nodes[j, LOW])
+            still = nodes[j, SLOPE0] == 0.0 and nodes[j, SLOPE1] == 0.0 and nodes[j, SLOPE2] == 0.0
+            if not (still and 0.0 < radius < inf and weight[j] > 0.0):
+                continue
+            pull = 0.0
+            for i in range(K.shape[0]):
+                pull += K[i, j] * rows[i, DIRECTION]
+            move = within(-pull / (weight[j] * weight[j]), radius)
+            for i in range(K.shape[0]):
+                rows[i, DIRECTION] += move * K[i, j]
 
 
 # Parts of a box that may be left out: where residuals are too long.

@@ -330,7 +330,7 @@ def search_everywhere(
     """
     box, near = empty_box(cost.K.shape[0], cost.K.shape[1]), empty_box(cost.K.shape[0], cost.K.shape[1])
     stack, last = np.zeros((_CAPACITY, DEPTH)), atlas.dimension - 1
-    size, boxes, lows, floor = _pieces(stack, atlas), 0, 0, accuracy_floor_far(cost, atlas)
+    size, boxes, lows, floor = push_pieces(stack, atlas), 0, 0, accuracy_floor_far(cost, atlas)
     while size > 0:
         if boxes >= budget or size + 2 > _CAPACITY:
             return SPENT, boxes, least_left(stack, size)
@@ -341,7 +341,7 @@ def search_everywhere(
         set_centre(atlas, piece, box.at)
         if piece > 2 * atlas.dimension:
             widen_around(atlas, piece - 2 * atlas.dimension - 1, box.half)
-        if _known(atlas, box, piece):
+        if is_left(atlas, box, piece):
             continue
         bound_pieces(atlas, cost.kinds, cost.data, box.half, box.nodes)
         linearise_rows(cost.K, cost.w, box.nodes, box.rows)
@@ -355,7 +355,7 @@ def search_everywhere(
         touching = piece < 2 * atlas.dimension and box.at[last] <= box.half[last]
         # The test is dear, and fails in large boxes: only where the cost is low it can spare splits.
         sound = whole or (low > 0.0 and low * low >= value)
-        if sound and here < _NEAR * (level + 1.0) and _leaves(cost, atlas, box, touching, floor):
+        if sound and here < _NEAR * (level + 1.0) and leaves(cost, atlas, box, touching, floor):
             continue
         if here < level:
             lows += 1
@@ -365,13 +365,13 @@ def search_everywhere(
         if touching and max(box.half[0], box.half[1], box.half[2]) < _TINY and _at_infinity(cost, atlas, box) < level:
             return INFINITE, boxes, 0.0
         # Exact but around the fix, where centres and half-widths are no sums of powers of two.
-        exact, side = piece <= 2 * atlas.dimension, _side(box, atlas.dimension)
+        exact, side = piece <= 2 * atlas.dimension, steepest_side(box, atlas.dimension)
         size = push_halves(stack, size, side, box.at, box.half, low, piece, exact)
     return CLEAR, boxes, value
 
 
 @compiled
-def _known(atlas: Atlas, box: Box, piece: int) -> bool:
+def is_left(atlas: Atlas, box: Box, piece: int) -> bool:
     """Return whether a box lies in the convex box of a known minimum, or in one that is searched along its axes."""
     known, d = False, atlas.dimension
     for i in range(atlas.minima.home.shape[0]):
@@ -408,7 +408,7 @@ def _another(cost: Cost, atlas: Atlas, chart: Chart, near: Box, level: float, fo
 
 
 @compiled
-def _pieces(stack: Array, atlas: Atlas) -> int:
+def push_pieces(stack: Array, atlas: Atlas) -> int:
     """Push all faces of the cube, its inside, and on top of them the surroundings of known minima, the fix last."""
     d = atlas.dimension
     size = 2 * d + 1
@@ -425,7 +425,7 @@ def _pieces(stack: Array, atlas: Atlas) -> int:
 
 
 @compiled
-def _side(box: Box, dimension: int) -> int:
+def steepest_side(box: Box, dimension: int) -> int:
     """Return the side along which the residual changes most; a part of that change counts for all sides alike.
 
     Nodes that are only enclosed have no slope, and bend where they do.
@@ -449,7 +449,7 @@ def _steepness(box: Box, m: int) -> float:
 
 
 @compiled
-def _leaves(cost: Cost, atlas: Atlas, box: Box, touching: bool, floor: float) -> bool:
+def leaves(cost: Cost, atlas: Atlas, box: Box, touching: bool, floor: float) -> bool:
     """Return whether no infimum of the cost can lie in a box whose nodes are bounded.
 
     The gradient does not vanish, or the Hessian has a negative eigenvalue; and at infinity, an end of the box that is

@@ -143,7 +143,7 @@ def branch(
         place(origin, sense, at, centre)
         widen(chart, centre, half)
         if bent:
-            left = _lay_or_halve(cost, chart, box, stack, size)
+            left = lay_or_halve(cost, chart, box, stack, size)
             if left >= 0:
                 size = left
                 continue
@@ -254,7 +254,7 @@ def cut_side(kinds: Array, K: Array, gram: Array, half: Array, nodes: Array, row
 
 
 @compiled
-def _lay_or_halve(cost: Cost, chart: Chart, box: Box, stack: Array, size: int) -> int:
+def lay_or_halve(cost: Cost, chart: Chart, box: Box, stack: Array, size: int) -> int:
     """Lay a box on a surface, and bound its nodes; return -1, or the size of the stack where that is another box's.
 
     A box of another piece of the surface is dropped, one over which it is no graph is halved across its longer side.
@@ -484,7 +484,7 @@ def prove(
     margin = (sums[G0] * sums[G0] + sums[G1] * sums[G1] + sums[G2] * sums[G2]) / eps
     corners, alone = np.empty((2, 3)), True
     low, high = corners[0], corners[1]
-    if not _start(cost, chart, box, sqrt(least + kappa), lower, upper, low, high):
+    if not region_of(cost, chart, box, sqrt(least + kappa), lower, upper, low, high):
         return OPEN, 0, -inf
     if bent:
         alone = is_one_side(chart.surface, chart.origin, chart.sense, low, high)
@@ -556,7 +556,9 @@ def _search_sides(
 
 
 @inlined
-def _start(cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper: Array, low: Array, high: Array) -> bool:
+def region_of(
+    cost: Cost, chart: Chart, box: Box, rho: float, lower: Array, upper: Array, low: Array, high: Array
+) -> bool:
     """Write the corners of the box to search: the region, or an enclosure of all that costs less than rho^2."""
     if isnan(lower[0]):
         bounded = enclose(cost, chart, box, rho, low, high)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
@@ -18,11 +19,13 @@ from optloc.linear.constraints import exact
 from optloc.linear.normal import decrement, step
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
+from optloc.proof.pose import unsupported
 from optloc.solvers.formulations import FORMULATIONS
 from optloc.solvers.inequalities import bound_pool, least_finished
 from optloc.solvers.policy import DOUBT
 from optloc.solvers.pool import Pool, offer, pack
 from optloc.solvers.refine import refine
+from optloc.solvers.starts.best_first import best_first_starts
 from optloc.solvers.starts.position import (
     along_the_valley,
     hold_still,
@@ -208,11 +211,23 @@ _SETTLED = (Status.REJECTED, Status.TOO_FEW_ROWS, Status.INFEASIBLE, Status.CONT
 
 
 def search(problem: Problem, pool: Pool | None) -> Pool:
-    """Return a pool whose unanswered problems were searched from many places, and which says so of them."""
+    """Return a pool whose unanswered problems were searched: box by box where a proof bounds their cost, or by places.
+
+    Only of those that were searched from places does the pool say so.
+    """
     if pool is None or pool.curvature is None:
         raise InvalidProblem("search fills the gaps of a fix", "method", "put it behind a refinement")
-    if not one_position(problem):
-        return pool
+    if not unsupported(problem):
+        pool = _answer(problem, pool, best_first_starts, lambda why: {})
+    if one_position(problem):
+        pool = _answer(problem, pool, _search_starts, _searched)
+    return pool
+
+
+def _answer(
+    problem: Problem, pool: Pool, starts: Callable[[Problem], Array], says: Callable[[Array], dict[str, Any]]
+) -> Pool:
+    """Return a pool whose unanswered problems begin anew, and keep what they had where that answers nothing either."""
     fix = judge(problem, pool)
     lost = ~fix.answered & ~np.isin(fix.code, _SETTLED)
     # unlinked groups have fewer equations than the count says: without redundancy any place would fit
@@ -222,12 +237,17 @@ def search(problem: Problem, pool: Pool | None) -> Pool:
         return pool
     began = perf_counter()
     part = problem.take(items)
-    found = lsr(part, _place(part, _search_starts(part), take(pool, items), "search", began))
+    found = lsr(part, _place(part, starts(part), take(pool, items), "search", began))
     good = np.flatnonzero(judge(part, found).answered)
-    remark = np.array([_searched_sentence(why) for why in fix.reason[items]], dtype=object)
-    found = replace(found, searched=np.ones(len(items), dtype=bool), remark=remark)
+    found = replace(found, **says(fix.reason[items]))
     stage = Stage("search", f"{len(good)} of {len(items)} found", perf_counter() - began)
     return pool.merge(items[good], take(found, good), stage)
+
+
+def _searched(why: Array) -> dict[str, Any]:
+    """Return what a pool says of problems that were searched from places, after what was wrong before."""
+    remark = np.array([_searched_sentence(each) for each in why], dtype=object)
+    return {"searched": np.ones(len(why), dtype=bool), "remark": remark}
 
 
 def _search_starts(problem: Problem) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pymap3d
 
-from optloc.proof.nodes.node import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO
+from optloc.proof.nodes.node import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATE, RATIO
 from optloc.proof.pose import pose_costs
 
 
@@ -19,6 +19,8 @@ def node_values(problem, kinds, data, x):
             out.append(np.linalg.norm(line, axis=-1))
         elif kind == RATIO:
             out.append(np.linalg.norm(line, axis=-1) / np.linalg.norm(x - p[:, 3 : 3 + d], axis=-1))
+        elif kind == RATE:
+            out.append((line * p[:, 3 : 3 + d]).sum(-1) / np.linalg.norm(line, axis=-1))
         elif kind == LINEAR:
             out.append((line * p[:, 3 : 3 + d]).sum(-1))
         elif kind in (AZIMUTH, ELEVATION):

@@ -278,7 +278,7 @@ def _round(work: Work, items: Array) -> None:
 
 def _asked(work: Work, items: Array) -> Asked:
     kappa, fix, ignored = work.margins[work.level[items]], work.fix, work.ignored[items]
-    planes, surface = surfaces_of(work.problem, fix, items)
+    planes, surface = surfaces_of(work.problem.take(items), fix.position[items])
     gap = fix.alternatives.gap[items]
     with np.errstate(invalid="ignore"):
         listed = np.isfinite(gap) & (gap < np.maximum(kappa, AMBIGUOUS_GAP)[:, None])

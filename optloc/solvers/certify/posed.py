@@ -19,28 +19,28 @@ from optloc.proof.surface import DATA, FIRST, LEVEL, MIDDLE, SURFACE_WIDTH, UP
 # Equalities: planes and surfaces along which a proof looks.
 
 
-def surfaces_of(problem: Problem, fix: Fix, items: Array) -> tuple[Array, Array]:
-    """Return the planes and the surface to which equalities hold some fixes of a flat batch.
+def surfaces_of(problem: Problem, position: Array) -> tuple[Array, Array]:
+    """Return the planes and the surface to which equalities hold the fixes of a flat batch.
 
     Parameters
     ----------
-    problem, fix : Problem, Fix
-        N problems and their fixes.
-    items : int array (n,)
-        Which of them.
+    problem : Problem
+        N problems.
+    position : array (N, d)
+        Places on these planes or beside the surface.
 
     Returns
     -------
-    planes : array (n, e, 3)
+    planes : array (N, e, 3)
         Unit normals of planes.
-    surface : array (n, w)
-        Numbers of the surface of a height (`optloc.proof.surface`), its upward axis the normal at the fix; w is 0
+    surface : array (N, w)
+        Numbers of the surface of a height (`optloc.proof.surface`), its upward axis the normal at the place; w is 0
         without one.
     """
     if not exact(problem):  # nothing of the problems need be looked at
-        return np.zeros((len(items), 0, 3)), np.zeros((len(items), 0))
-    bands = [band for band in problem.take(items).constraints if isinstance(band, Band) and is_exact(band)]
-    return _planes(problem, bands, len(items)), _surface(problem, bands, fix.position[items])
+        return np.zeros((len(position), 0, 3)), np.zeros((len(position), 0))
+    bands = [band for band in problem.constraints if isinstance(band, Band) and is_exact(band)]
+    return _planes(problem, bands, len(position)), _surface(problem, bands, position)
 
 
 def _planes(problem: Problem, bands: list[Band], size: int) -> Array:

@@ -1,0 +1,53 @@
+"""Starts from nothing for every mixture that the proof can bound: minima that a best-first search of boxes meets."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from optloc.base.types import Array, Band
+from optloc.compute.jit import enabled
+from optloc.linear.constraints import is_exact
+from optloc.problem.problem import Problem
+from optloc.proof.best_first import Places, find_minima
+from optloc.proof.pose import pose_costs
+from optloc.solvers.certify.posed import surfaces_of
+from optloc.solvers.policy import LISTED_GAP
+from optloc.solvers.starts.position import spread_of
+
+# Boxes for each problem, with machine code and without: one takes some microseconds, or a thousand times that. Mixtures
+# of frequencies, times and angles take 100 to 1 500.
+_BUDGET, _SLOW_BUDGET = 4000, 400
+# Minima that are kept: a pass of a satellite has two, exact solutions of three frequencies in space up to a handful.
+_MOST = 12
+# Spreads of the stations around their centre that are searched where nothing bounds the cheap positions: as a proof of
+# a region takes.
+_SPREADS = 10.0
+
+
+def best_first_starts(problem: Problem) -> Array:
+    """Return the minima (N, q, d) that a best-first search of a flat batch meets, by their cost; NaN behind the last.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems within the scope of the proof (`optloc.proof.pose.unsupported`).
+    """
+    size, d = problem.batch_shape[0], problem.dimension
+    centre, spread = spread_of(problem)
+    region = centre[:, None] + _SPREADS * spread[:, None, None] * np.array([[-1.0], [1.0]])
+    x = _on_planes(problem, np.broadcast_to(centre, (size, d)))
+    planes, surface = surfaces_of(problem, x)
+    places = Places(x, np.broadcast_to(region, (size, 2, d)), planes, surface)
+    points, _ = find_minima(pose_costs(problem), places, LISTED_GAP, _BUDGET if enabled() else _SLOW_BUDGET, _MOST)
+    return points
+
+
+def _on_planes(problem: Problem, x: Array) -> Array:
+    """Return places (N, d) moved onto the planes that hold the target."""
+    for band in problem.constraints:
+        if isinstance(band, Band) and is_exact(band) and band.kind == "plane":
+            # One after the other: those that are not at right angles leave what the proof's own axes do not feel.
+            normal = band.coefficients
+            off = np.asarray(band.lower) - (x * normal).sum(-1)
+            x = x + (off / (normal**2).sum(-1))[..., None] * normal
+    return x
