@@ -14,7 +14,7 @@ from optloc.proof.box import least_residual, linearise_rows, rounding, shrink, u
 from optloc.proof.chart import Chart, chart_at, cost_of, curve_box, empty_box, value_at
 from optloc.proof.curvature import clip_to_stationary, slopes_everywhere, sum_up
 from optloc.proof.enclosure import enclose
-from optloc.proof.everywhere import _leaves, accuracy_floor_far, cube, prove_everywhere
+from optloc.proof.everywhere import accuracy_floor_far, cube, leaves, prove_everywhere
 from optloc.proof.near import UNIQUE, VALUE
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
 from optloc.proof.nodes.node import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO, SLOPE0
@@ -253,11 +253,11 @@ def check_leaves(rng, d):
     box.at[:], box.half[:] = at, half
     set_centre(atlas, piece, box.at)
     bound_pieces(atlas, made.kinds, made.data, box.half, box.nodes)
-    assert not _leaves(cost, atlas, box, touching, floor), (made.names, ends)
+    assert not leaves(cost, atlas, box, touching, floor), (made.names, ends)
     box.half[:] *= 0.25
     set_centre(atlas, piece, box.at)
     bound_pieces(atlas, made.kinds, made.data, box.half, box.nodes)
-    return bool((np.abs(u - at) > box.half).any() and _leaves(cost, atlas, box, False, floor))
+    return bool((np.abs(u - at) > box.half).any() and leaves(cost, atlas, box, False, floor))
 
 
 @pytest.mark.parametrize("d", [2, 3])
