@@ -229,12 +229,14 @@ def test_a_constraint_that_does_not_bind_is_no_obstacle_and_one_that_binds_is_na
     assert "inequality" in proof.reason
 
 
-def test_a_searched_fix_becomes_ok_when_it_is_proven():
+def test_what_no_closed_form_starts_is_searched_box_by_box_and_ok_when_it_is_proven():
     problem = CASES["elevation-3d"].problem
+    assert not solve(problem, "gtrs+lsr").answered
     searched, fix = solve(problem, "searched"), solve(problem)
-    assert searched.status == Status.SEARCHED
+    assert searched.status == Status.UNPROVEN
+    assert searched.cost == pytest.approx(fix.cost.item())
     proof = fix.certificate.item()
-    assert fix.status == (Status.OK if proof.proof == "global" and proof.unique else Status.SEARCHED)
+    assert fix.status == (Status.OK if proof.proof == "global" and proof.unique else Status.UNPROVEN)
 
 
 def test_epochs_that_share_nothing_are_certified_one_by_one():
