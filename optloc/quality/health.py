@@ -255,6 +255,8 @@ def _sentences(offsets: Offsets, names: tuple[str, ...], used: Array) -> tuple[s
         share = np.abs(direction[used]) > _PART * np.abs(direction).max()
         who = [names[g] for g in used[share]]
         listed = ", ".join(who[:6]) + (f" and {len(who) - 6} more" if len(who) > 6 else "")
+        if not who:  # of groups that no row is used of, it says nothing of the others
+            continue
         if len(who) == 1:
             said.append(f"the data do not show a bias of {listed}")
         elif np.ptp(direction[used][share]) < _PART * np.abs(direction).max():
