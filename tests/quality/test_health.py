@@ -1,6 +1,7 @@
 """Station health: known biases, noise and outliers are found within their errors, and what is not seen is said."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
@@ -13,6 +14,7 @@ from optloc.cli import app
 from optloc.files import read
 from optloc.plot import save
 from optloc.plot.residuals import plot_health
+from optloc.quality.health import _sentences
 
 RUN = CliRunner()
 BIAS = np.array([0.0, 0.0, 60.0, 0.0, -15.0, 0.0, 0.0, 200.0])
@@ -198,3 +200,8 @@ def test_no_epoch_fixed_is_said():
     problem = ranged(np.random.default_rng(2), 5)
     with pytest.raises(InvalidProblem, match="no epoch has a fix"):
         health(problem.with_rows(weight=np.zeros(problem.count)))
+
+
+def test_combinations_of_offsets_that_no_row_is_used_of_say_nothing():
+    unseen = SimpleNamespace(open=[np.array([0.0, 0.0, 1.0]), np.array([1.0, 1e-9, 0.0])])
+    assert _sentences(unseen, ("A", "B", "C"), np.array([0, 1])) == ("the data do not show a bias of A",)
