@@ -140,7 +140,9 @@ _STAGES: dict[str, Entry] = {
     ),
     "widen": _refinement(stages.widen, "more candidates beside a fix: mirror image, sub-arrays", batched=True),
     "search": _refinement(
-        stages.search, "a seeded search from many places for problems still without an answer", batched=True
+        stages.search,
+        "a search for problems still without an answer: by boxes where a proof bounds them, or from many places",
+        batched=True,
     ),
     "lsr": _refinement(stages.lsr, "damped Taylor least squares (Gauss-Newton) from every candidate", batched=True),
     "nlp": _refinement(_nlp, "the maximum-likelihood cost by IPOPT from every candidate"),
