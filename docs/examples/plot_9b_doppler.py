@@ -14,7 +14,6 @@ import optloc
 from optloc.plot import plot_fixes
 
 problem = optloc.load(files("optloc") / "starters" / "range_rate.toml")
-near = optloc.ECEF.from_geodetic(np.radians(47.0), np.radians(10.0), 650.0)
-fix = optloc.solve(problem, start=np.append(near, 0.0))
+fix = optloc.solve(problem)
 figure = plot_fixes(problem, fix, "One pass, thirteen frequencies")
 print(np.degrees(fix.geodetic[:2]).round(4))
