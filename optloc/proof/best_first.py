@@ -13,8 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from optloc.base.threads import mapped
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, enabled, plain, ready
+from optloc.compute.jit import compiled, enabled, plain, ready, zero
 from optloc.proof.atlas import atlas_of, first_minima, position, set_centre, widen_around, with_minima
 from optloc.proof.batch import FEW, FIRST_BOXES, SMALL, plainly, present_in
 from optloc.proof.box import (
@@ -160,7 +161,7 @@ def _search_everywhere(cost: Cost, box: Box, near: Box, x: Array, aim: Aim, budg
     minima, at = atlas_of(middle, radius, d, most).minima, np.empty(d)
     atlas, known = with_minima(middle, radius, d, first_minima(minima, 0)), 0
     stack = np.zeros((2 * budget + 4 * (d + 1) + 6 * most, DEPTH))
-    size, boxes, lows, count, cheapest = push_pieces(stack, atlas), 0, 0, 0, inf
+    size, boxes, lows, count, cheapest = push_pieces(stack, atlas), 0, 0, zero(), inf
     queue = [(0.0, i) for i in range(size)]
     floor = accuracy_floor_far(cost, atlas)
     while len(queue) > 0 and boxes < budget:
@@ -287,7 +288,7 @@ def _around(cost: Cost, chart: Chart, near: Box, aim: Aim, corners: Array, count
 def _search_sides(cost: Cost, box: Box, near: Box, x: Array, aim: Aim, budget: int) -> tuple[int, int]:
     """Look for minima all around the surface of a height."""
     around, _ = chart_on(cost, x, box, aim.planes, aim.surface)
-    corners, count, boxes = np.empty((2, 3)), 0, 0
+    corners, count, boxes = np.empty((2, 3)), zero(), zero()
     for look in (_LOOK, budget):
         for side in range(SIDES):
             chart = turned(cost, around, side)
@@ -307,18 +308,7 @@ def _search_region(cost: Cost, box: Box, near: Box, x: Array, aim: Aim, region: 
     level = cost_at(cost.K, cost.w, box.nodes) + aim.gap
     if not region_of(cost, chart, box, sqrt(level), nowhere, nowhere, corners[0], corners[1]):
         region_of(cost, chart, box, sqrt(level), region[0], region[1], corners[0], corners[1])
-    return _search_chart(cost, chart, box, near, aim, corners, budget, 0)
-
-
-@compiled
-def _search(cost: Cost, x: Array, aim: Aim, region: Array, budget: int) -> tuple[int, int]:
-    """Look for minima wherever they may be; return how many were met, and the boxes that it took."""
-    box, near = empty_box(cost.K.shape[0], cost.K.shape[1]), empty_box(cost.K.shape[0], cost.K.shape[1])
-    if aim.surface.shape[0] > 0:
-        return _search_sides(cost, box, near, x, aim, budget)
-    if aim.planes.shape[0] == 0 and reaches_infinity(cost.kinds, cost.K):
-        return _search_everywhere(cost, box, near, x, aim, budget)
-    return _search_region(cost, box, near, x, aim, region, budget)
+    return _search_chart(cost, chart, box, near, aim, corners, budget, zero())
 
 
 class Places(NamedTuple):
@@ -338,6 +328,10 @@ class Places(NamedTuple):
     region: Array
     planes: Array
     surface: Array
+
+    def take(self, i: int) -> Places:
+        """Return the place of one of the costs, without the first axis."""
+        return Places(*(array[i] for array in self))
 
 
 def find_minima(pose: Posed, places: Places, gap: float, budget: int, most: int) -> tuple[Array, Array]:
@@ -366,32 +360,42 @@ def find_minima(pose: Posed, places: Places, gap: float, budget: int, most: int)
     n, d = places.x.shape
     points, boxes = np.full((n, most, d), np.nan), np.zeros(n, dtype=np.int64)
     pose, places = Posed(*map(plainly, pose)), Places(*map(plainly, places))
-    if n <= FEW and len(pose.kinds) <= SMALL and not ready(_loop):
+
+    def search(i: int, budget: int) -> None:
+        with np.errstate(all="ignore"):  # plain Python would warn of what has no bound
+            points[i], boxes[i] = _search(pose.take(slice(i, i + 1)), places.take(i), gap, budget, most)
+
+    asked = list(range(n))
+    if n <= FEW and len(pose.kinds) <= SMALL and not ready(present_in):
         # As few proofs are: most need few boxes, and machine code takes longer to load.
         first = min(budget, FIRST_BOXES // n)
-        with plain(), np.errstate(all="ignore"):
-            _loop(pose, places, gap, first, points, boxes)
-        if first == budget or not enabled() or (boxes < first).all():
-            return points, boxes
-        points[:] = np.nan
-    with np.errstate(all="ignore"):
-        _loop(pose, places, gap, budget, points, boxes)
+        with plain():
+            for i in asked:
+                search(i, first)
+        asked = np.flatnonzero(boxes == first).tolist() if first < budget and enabled() else []
+    if enabled():
+        mapped(lambda i: search(i, budget), asked)
+    else:  # plain Python holds the interpreter: threads would wait for each other
+        for i in asked:
+            search(i, budget)
     return points, boxes
 
 
-@compiled
-def _loop(pose: Posed, places: Places, gap: float, budget: int, points: Array, boxes: Array) -> None:
-    """Write the minima of each cost, and how many boxes were looked at."""
-    for i in range(len(places.x)):
-        data, K = pose.data[i if len(pose.data) > 1 else 0], pose.K[i if len(pose.K) > 1 else 0]
-        cost = present_in(cost_of(pose.kinds, data, K, pose.w[i]))
-        most, d = points.shape[1], places.x.shape[1]
-        _, radius = cube(cost.kinds, cost.data, places.x[i])
-        found, costs = np.zeros((most, d)), np.full(most, inf)
-        aim = Aim(places.planes[i], places.surface[i], gap, _AWAY * radius, found, costs)
-        count, boxes[i] = _search(cost, places.x[i], aim, places.region[i], budget)
-        best, slot = _least(aim, count), 0
-        for p in np.argsort(costs):
-            if costs[p] < best + gap:
-                points[i, slot] = found[p]
-                slot += 1
+def _search(pose: Posed, place: Places, gap: float, budget: int, most: int) -> tuple[Array, int]:
+    """Return the minima (most, d) of one posed cost, and the boxes that it took; places without their first axis."""
+    cost = present_in(cost_of(pose.kinds, pose.data[0], pose.K[0], pose.w[0]))
+    _, radius = cube(cost.kinds, cost.data, place.x)
+    found, costs = np.zeros((most, len(place.x))), np.full(most, inf)
+    aim = Aim(place.planes, place.surface, gap, _AWAY * radius, found, costs)
+    box, near = empty_box(*cost.K.shape), empty_box(*cost.K.shape)
+    if len(place.surface):
+        _, boxes = _search_sides(cost, box, near, place.x, aim, budget)
+    elif not len(place.planes) and reaches_infinity(cost.kinds, cost.K):
+        _, boxes = _search_everywhere(cost, box, near, place.x, aim, budget)
+    else:
+        _, boxes = _search_region(cost, box, near, place.x, aim, place.region, budget)
+    order = np.argsort(costs)
+    points = np.full(found.shape, np.nan)
+    good = order[costs[order] < costs.min() + gap]
+    points[: len(good)] = found[good]
+    return points, boxes
