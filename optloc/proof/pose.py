@@ -495,7 +495,8 @@ def _beyond_biases(problem: Problem) -> Iterator[str]:
     angular = np.concatenate([np.full(rows.count, MODELS[rows.kind].period is not None) for rows in problem.rows])
     for bias in problem.biases:
         if bias.form not in ("offset", "drift"):
-            yield f"the {bias.form} {bias.name!r} multiplies what it touches, and the proof takes what is added"
+            does = "moves stations" if bias.form == "time" else "multiplies what it touches"
+            yield f"the {bias.form} {bias.name!r} {does}, and the proof takes what is added"
         elif bias.sigma is None and angular[bias.row].any():
             yield f"the bias {bias.name!r} of angles has no prior, and may be whole turns"
 

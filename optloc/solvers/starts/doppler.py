@@ -19,8 +19,6 @@ from optloc.problem.noise import dense, variances
 from optloc.problem.problem import Problem
 from optloc.solvers.starts.position import known_height, one_position, vectors
 
-# What rows of range rates add up, at their first and second station; kinds that others add may have any h.
-_RATES = {"range_rate": (1, 0), "fdoa": (1, -1)}
 _AXES = WGS84_A * np.array([1.0, 1.0, 1.0 - WGS84_F])
 
 
@@ -28,7 +26,7 @@ def dopplered(problem: Problem) -> bool:
     """Return whether a single source at rest is sought, and rows tell its range rates."""
     if len(problem.motions) != 1 or problem.stations.velocity is None:
         return False
-    motion, told = problem.motions[0], any(rows.kind in _RATES for rows in problem.rows)
+    motion, told = problem.motions[0], any(_rates(rows) != (0, 0) for rows in problem.rows)
     return told and motion.known is None and motion.order == 0 and motion.span == "run"
 
 
@@ -108,13 +106,19 @@ def _gather(problem: Problem) -> _Told:
 def _parts(problem: Problem) -> Iterator[tuple[Array, ...]]:
     """Yield number, epoch, stations, kind and coefficients of the rows that the relaxation takes."""
     for i, (rows, start) in enumerate(zip(problem.rows, problem.starts, strict=True)):
-        rates, ranges = _RATES.get(rows.kind, (0, 0)), _ranges(rows)
+        rates, ranges = _rates(rows), _ranges(rows)
         count = rows.count if rates != (0, 0) or ranges != (0, 0) else 0
         one = np.ones((count, 1))
         cut = slice(0, count)
         other = rows.b[cut] if MODELS[rows.kind].stations > 1 else np.full(count, -1)
         which = np.full(count, i)
         yield start + np.arange(count), rows.epoch[cut], rows.a[cut], other, which, one * rates, one * ranges
+
+
+def _rates(rows: Rows) -> tuple[int, int]:
+    """Return what rows add up of the range rates of their first and second station."""
+    model = MODELS[rows.kind]
+    return model.signs if model.signs is not None and model.nodes == ((1.0, "range_rate"),) else (0, 0)
 
 
 def _ranges(rows: Rows) -> tuple[int, int]:
