@@ -70,6 +70,7 @@ def _print_version(wanted: bool) -> None:
 
 @app.callback()
 def _options(
+    context: typer.Context,
     version: Annotated[
         bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
     ] = False,
@@ -78,8 +79,12 @@ def _options(
         typer.Option(metavar="MODULE", help="Run a Python file or module first that adds kinds, losses, solvers."),
     ] = None,
 ) -> None:
+    import numpy as np
+
     from optloc.base.registry import load_plugin
 
+    # What has no value is judged, and its status says so; a warning of NumPy beside it would tell nobody anything.
+    context.with_resource(np.errstate(all="ignore"))
     for name in plugin or ():
         load_plugin(name)
 

@@ -163,4 +163,9 @@ FOUND = {
         {"fdoa.toml": problems()["fdoa.toml"]["fdoa.toml"].replace(b"9779.0", b"9779000000.0")},
         None,
     ),
+    "a difference of seven thousand decibels": (
+        ["fix", "l.toml", "--json"],
+        {"l.toml": problems()["rss_difference.toml"]["rss_difference.toml"].replace(b"z = -4.19", b"z = -7027.9")},
+        None,
+    ),
 }  # fmt: skip
