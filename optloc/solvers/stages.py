@@ -218,9 +218,9 @@ def search(problem: Problem, pool: Pool | None) -> Pool:
     if pool is None or pool.curvature is None:
         raise InvalidProblem("search fills the gaps of a fix", "method", "put it behind a refinement")
     if not unsupported(problem):
-        pool = _answer(problem, pool, best_first_starts, lambda why: {})
+        pool = _answer(problem, pool, lambda part: _with_offsets(part, best_first_starts(part)), lambda why: {})
     if one_position(problem):
-        pool = _answer(problem, pool, _search_starts, _searched)
+        pool = _answer(problem, pool, lambda part: vectors(part, pack(_search_starts(part))), _searched)
     return pool
 
 
@@ -237,11 +237,29 @@ def _answer(
         return pool
     began = perf_counter()
     part = problem.take(items)
-    found = lsr(part, _place(part, starts(part), take(pool, items), "search", began))
+    found = lsr(part, offer(part, starts(part), take(pool, items), "search", began))
     good = np.flatnonzero(judge(part, found).answered)
     found = replace(found, **says(fix.reason[items]))
     stage = Stage("search", f"{len(good)} of {len(items)} found", perf_counter() - began)
     return pool.merge(items[good], take(found, good), stage)
+
+
+def _with_offsets(problem: Problem, position: Array) -> Array:
+    """Return vectors (N, q, size) of positions (N, q, d), the other shared unknowns as fit them.
+
+    They are linear where a proof bounds the cost. Beside the minimum of a weak pair a refinement from other offsets
+    creeps along a valley and stops short.
+    """
+    x = vectors(problem, pack(position))
+    slot, _ = problem.layout.find("position")
+    others = np.delete(np.arange(problem.layout.n_shared), np.s_[slot.start : slot.start + slot.size])
+    item, place = np.nonzero(np.isfinite(x).all(-1))
+    if len(others) and len(item):
+        at = equations_at(problem.take(item), x[item, place])
+        # a combination of offsets that no row feels stays as it is
+        solved = np.linalg.pinv(at.shared[:, others[:, None], others], hermitian=True)
+        x[item[:, None], place[:, None], others] += (solved @ at.shared_vector[:, others, None])[..., 0]
+    return x
 
 
 def _searched(why: Array) -> dict[str, Any]:

@@ -71,6 +71,15 @@ def test_descents_follow_the_sphere_of_a_sharp_range():
     assert fix.alternatives.gap[0, 0] == pytest.approx(0.1376, abs=1e-3)
 
 
+@pytest.mark.skipif(not enabled(), reason="budgets of boxes are smaller in plain Python")
+def test_offsets_begin_where_the_position_has_them():
+    """From an offset of zero the refinement crept along a valley, and what the search had found was lost."""
+    scenes = scenes_of("moving pair, unknown offset", 10, 0, 1002)
+    fix = solve(scenes.problem.take([2]))
+    assert fix.answered.all()
+    assert fix.cost[0] == pytest.approx(7.944797, abs=1e-5)
+
+
 @pytest.mark.full
 @pytest.mark.parametrize("name", FAMILIES)
 def test_no_claim_of_a_doppler_fix_is_wrong_in_full(name, seed, record_property):
