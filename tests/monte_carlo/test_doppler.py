@@ -142,12 +142,19 @@ def next_to_truth(trial: Trial) -> np.ndarray:
 
 
 def mirrored(trial: Trial) -> np.ndarray:
-    """Return the minimum on the other side of the track, as it is over the turning Earth amid the pass."""
-    k = len(trial.a) // 2
+    """Return the minimum on the other side of the track, as it is over the turning Earth amid the pass.
+
+    Of a weak pass the image may lie in the valley of the truth's own: places further aside are tried, too.
+    """
+    k, here = len(trial.a) // 2, next_to_truth(trial)
     normal = np.cross(trial.a[k], trial.v[k])
     normal /= np.linalg.norm(normal)
-    image = trial.truth - 2.0 * (trial.truth @ normal) * normal
-    return trial.descended(np.array(ECEF.to_geodetic(image)[:2]))[0]
+    for share in (2.0, 3.0, 4.0):
+        image = here - share * (here @ normal) * normal
+        there = trial.descended(np.array(ECEF.to_geodetic(image)[:2]))[0]
+        if not is_at(trial, there[None], here)[0]:
+            break
+    return there
 
 
 def is_at(trial: Trial, known: np.ndarray, x: np.ndarray) -> np.ndarray:
