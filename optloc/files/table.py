@@ -315,7 +315,8 @@ def parquet(path: Path, names: Mapping[str, str]) -> Table:
         read.validate(full=True)
         columns = {name: _parquet_column(pa, read.column(name)) for name in read.column_names}
     except (pa.ArrowException, OSError, UnicodeDecodeError, OverflowError) as error:
-        what = "a column of text is not UTF-8" if isinstance(error, UnicodeDecodeError) else "the file is not Parquet"
+        text = isinstance(error, UnicodeDecodeError) or "UTF8" in str(error)
+        what = "a column of text is not UTF-8" if text else "the file is not Parquet"
         raise InvalidProblem(what, path.name, "write it again, or name a CSV file .csv") from None
     others = {entry.name: str(entry.type) for entry in schema if not fit[entry.name]}
     return Table(path.name, columns, read.num_rows if columns else about.metadata.num_rows, names, others=others)

@@ -5,7 +5,7 @@ import pytest
 from uncertainty.scenes import CASES, fixed
 
 import optloc
-from optloc import InvalidProblem, Stations, assemble, likelihood_region, measured
+from optloc import InvalidProblem, assemble, likelihood_region, measured
 from optloc.problem.chart import INVERSE_RANGE, jacobian, quantile
 from optloc.uncertainty.arc import trace_from
 from optloc.uncertainty.region import Surface
@@ -151,12 +151,14 @@ def test_other_unknowns_take_their_best():
 
 def test_what_the_proof_does_not_bound_has_rays_and_a_reason():
     place = np.array([[0.0, 0.0], [9e3, 0.0], [0.0, 9e3], [9e3, 8e3]])
-    stations = Stations(place[None], tuple("ABCD"), velocity=np.full((1, 4, 2), 50.0))
-    rows = measured("tdoa", a=[1, 2, 3], b=0, arrival_sigma=5.0), measured("fdoa", a=[1, 2, 3], b=0, sigma=0.1)
-    problem = optloc.simulate(assemble(stations, *rows), [3e3, 4e3], 1)
+    rows = (
+        measured("tdoa", a=[1, 2, 3], b=0, arrival_sigma=5.0),
+        measured("rss_difference", a=[1, 2, 3], b=0, sigma=0.1),
+    )
+    problem = optloc.simulate(assemble(place, *rows), [3e3, 4e3], 1)
     region = likelihood_region(problem, optloc.solve(problem))
     assert region.cells is region.box is region.cone is None
-    assert "velocities" in region.reason
+    assert "rss_difference rows are neither sums" in region.reason
     assert region.covers(region.points * 0.999999 + 0.000001 * region.surface.position).all()
 
 
