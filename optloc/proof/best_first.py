@@ -51,7 +51,7 @@ from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.pose import Posed
 from optloc.proof.surface import SIDES, reach_of_piece
 
-# Standard deviations within which two minima are one, squared: descents end a thousandth of one from their minimum.
+# Standard deviations within which two minima are one: descents end a thousandth of one from their minimum.
 _SAME = 0.1
 # Rounds of a descent, each in the axes of where the one before ended. Two where a minimum is near; along the sphere of
 # a sharp range, a thousand times as long as it is thick, up to fifteen.
