@@ -7,7 +7,7 @@ import pytest
 
 from optloc import InvalidProblem, Motion, Prior, Stations, assemble, crlb, measured, with_bias
 from optloc.base.frames import Frame
-from optloc.bounds.crlb import crlb_course
+from optloc.bounds.crlb import _inverse, crlb_course
 from optloc.bounds.observability import observability
 from optloc.linear.constraints import height
 from optloc.linear.normal import linearise, prior_parts
@@ -204,3 +204,10 @@ def test_epochs_tied_by_noise_have_no_course():
     )
     with pytest.raises(InvalidProblem, match="correlates the epochs"):
         crlb_course(tied, np.array([1e3, 1e3]))
+
+
+def test_information_beyond_all_numbers_is_as_good_as_none():
+    information = np.array([np.full((2, 2), np.inf), [[4.0, 0.0], [0.0, 1.0]]])
+    found = _inverse(information, np.array([[np.inf, np.inf], [4.0, 1.0]]), np.eye(2))
+    assert np.isnan(found[0]).all()
+    assert found[1] == pytest.approx(np.diag([0.25, 1.0]))

@@ -191,8 +191,10 @@ def _inverse(information: Array, size: Array, basis: Array) -> Array:
     inner, size = basis.T @ information @ basis, size @ basis**2
     inverse, _ = linalg.inverse(inner)
     scale = 1.0 / np.sqrt(np.where(size > 0.0, size, 1.0))
-    weakest = np.linalg.eigvalsh(inner * scale[..., :, None] * scale[..., None, :]).min(-1, initial=1.0)
-    return np.where((weakest > OPEN)[..., None, None], basis @ inverse @ basis.T, np.nan)
+    scaled = inner * scale[..., :, None] * scale[..., None, :]
+    finite = np.asarray(np.isfinite(scaled).all((-1, -2)))  # beyond all numbers is as good as open
+    weakest = np.linalg.eigvalsh(np.where(finite[..., None, None], scaled, 0.0)).min(-1, initial=1.0)
+    return np.where((finite & (weakest > OPEN))[..., None, None], basis @ inverse @ basis.T, np.nan)
 
 
 def with_local_priors(problem: Problem, equations: Normal) -> Normal:
