@@ -366,7 +366,7 @@ def find_minima(pose: Posed, places: Places, gap: float, budget: int, most: int)
     points : array (n, most, d)
         The minima by their cost, NaN behind the last.
     boxes : int array (n,)
-        Boxes looked at; where they are fewer than the budget, no other minimum within the gap is left.
+        Boxes looked at; where they are fewer than the budget, none was left that bounds did not drop.
     """
     n, d = places.x.shape
     points, boxes = np.full((n, most, d), np.nan), np.zeros(n, dtype=np.int64)
