@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final, Literal
 
 import numpy as np
@@ -73,13 +74,11 @@ class Frame:
         ndarray, shape (3, 3)
             Its columns are this frame's axes in ECEF.
         """
-        place = self._place()
-        return np.eye(3) if place is None else _axes_in_ecef(np.asarray(place[0]), np.asarray(place[1])).T
+        return _turn_at(self._place())
 
     def origin_ecef(self) -> Array:
         """Return the origin o of ``p_ecef = R p + o`` in metres, shape (3,)."""
-        place = self._place()
-        return np.zeros(3) if place is None else geodetic_to_ecef(*place)
+        return _start_at(self._place())
 
     def to_ecef(self, position: ArrayLike) -> Array:
         """Convert positions of this frame to ECEF.
@@ -253,6 +252,25 @@ def check_geodetic(
 
 def _row(where: str, row: np.intp, column: Array, first_row: int) -> str:
     return where if column.size == 1 else f"{where}, row {row + first_row}"
+
+
+# Of a frame both are always the same, and constraints ask at every step.
+
+
+@lru_cache(maxsize=64)
+def _turn_at(place: tuple[float, float, float] | None) -> Array:
+    return _fixed(np.eye(3) if place is None else _axes_in_ecef(np.asarray(place[0]), np.asarray(place[1])).T)
+
+
+@lru_cache(maxsize=64)
+def _start_at(place: tuple[float, float, float] | None) -> Array:
+    return _fixed(np.zeros(3) if place is None else geodetic_to_ecef(*place))
+
+
+def _fixed(array: Array) -> Array:
+    """Return an array that nobody can write to, because others read it."""
+    array.flags.writeable = False
+    return array
 
 
 def _axes_in_ecef(lat: Array, lon: Array) -> Array:

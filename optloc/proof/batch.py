@@ -9,7 +9,7 @@ import numpy as np
 
 from optloc.base.threads import mapped
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, enabled, plain, ready
+from optloc.compute.jit import FEW, compiled, enabled, plain, ready, usable
 from optloc.proof.box import bound_nodes, cost_at, rounding
 from optloc.proof.chart import Cost, Known, accuracy_floor, cost_of, empty_box, empty_groups, set_geometry
 from optloc.proof.everywhere import prove_everywhere
@@ -19,8 +19,9 @@ from optloc.proof.pose import Posed
 # Fixes that one call of machine code proves, fewest and most: a call costs as much as a fix or two, and threads share
 # what is left of a batch by stretches, of which each should get several (`_PARTS` in all).
 _STRETCH, _PARTS = (16, 512), 32
-# So few proofs over so few nodes are begun in plain Python, with so many boxes in all: about half a second.
-FEW, SMALL, FIRST_BOXES = 16, 24, 400
+# Few proofs over so few nodes are begun in plain Python, with so many boxes in all: about half a second. Where there is
+# no machine code that could go on, they get so many more: about three seconds.
+SMALL, FIRST_BOXES, PLAIN_BOXES = 24, 400, 2000
 # Fewest boxes that each of them gets: most proofs inside a network end with the first.
 _AT_LEAST = 5
 
@@ -41,7 +42,7 @@ class Asked(NamedTuple):
     region : array (n, 2, d)
         Corners of the regions; NaN for all positions.
     fallback : array (n, 2, d)
-        Corners of the regions to take where all positions cannot be bounded.
+        Corners of the regions to take where all positions cannot be bounded; NaN for none.
     budget : int array (n,)
         How many boxes each may take.
     planes, surface : array (n, e, 3), (n, 0) or (n, SURFACE_WIDTH)
@@ -99,27 +100,56 @@ def prove_all(pose: Posed, asked: Asked) -> Answered:
     A few proofs are begun in plain Python: most need few boxes, and machine code takes longer to load.
     """
     n = len(asked.x)
-    if n > FEW or len(pose.kinds) > SMALL or ready(_loop):
+    if ready(_loop) or ((n > FEW or len(pose.kinds) > SMALL) and usable(_loop, n)):
         return _prove(pose, asked)
-    # A budget for each that ends soon; who needs more begins anew in machine code.
-    with plain():
-        out = _prove(pose, asked._replace(budget=np.minimum(asked.budget, max(_AT_LEAST, FIRST_BOXES // max(n, 1)))))
+    parts = []
+    for first in range(0, n, FEW):
+        # Where machine code is made meanwhile, it goes on with the rest.
+        last = n if first > 0 and usable(_loop, n) else min(first + FEW, n)
+        some = slice(first, last)
+        parts.append((_prove if last - first > FEW else _prove_few)(pose.take(some), asked.take(some)))
+        if last == n:
+            break
+    return parts[0] if len(parts) == 1 else Answered(*map(np.concatenate, zip(*parts, strict=True)))
+
+
+def _prove_few(pose: Posed, asked: Asked) -> Answered:
+    """Return the outcome of a few proofs, begun in plain Python; who needs more begins anew in machine code."""
+    n = len(asked.x)
+    out = _prove_plainly(pose, asked, FIRST_BOXES // max(n, 1))
     short = np.flatnonzero((out.verdict == BUDGET) & (out.boxes < asked.budget))
     if len(short) and enabled():
-        for array, more in zip(out, _prove(pose.take(short), asked.take(short)), strict=True):
-            array[short] = more
+        pose, asked = pose.take(short), asked.take(short)
+        more = _prove(pose, asked) if usable(_loop, n) else _prove_plainly(pose, asked, PLAIN_BOXES // len(short))
+        for array, found in zip(out, more, strict=True):
+            array[short] = found
     return out
 
 
-def _prove(pose: Posed, asked: Asked) -> Answered:
-    n, d = asked.x.shape
-    out = Answered(
+def _prove_plainly(pose: Posed, asked: Asked, boxes: int) -> Answered:
+    with plain():
+        return _prove(pose, asked._replace(budget=np.minimum(asked.budget, max(_AT_LEAST, boxes))))
+
+
+def lacks_code(count: int) -> bool:
+    """Return whether proofs of so many fixes ended early because there is no machine code of them yet."""
+    return enabled() and not usable(_loop, count)
+
+
+def empty_answer(n: int, d: int) -> Answered:
+    """Return what n proofs in d dimensions write into."""
+    return Answered(
         verdict=np.zeros(n, dtype=np.int64),
         boxes=np.zeros(n, dtype=np.int64),
         bound=np.zeros(n),
         everywhere=np.zeros(n, dtype=np.bool_),
         found=np.full((n, d), np.nan),
     )
+
+
+def _prove(pose: Posed, asked: Asked) -> Answered:
+    n, d = asked.x.shape
+    out = empty_answer(n, d)
     pose, asked = Posed(*(plainly(array) for array in pose)), Asked(*(plainly(array) for array in asked))
     length = max(_STRETCH[0], min(_STRETCH[1], n // _PARTS))
 
@@ -136,10 +166,23 @@ def _prove(pose: Posed, asked: Asked) -> Answered:
     return out
 
 
+def prove_here(pose: Posed, asked: Asked, out: Answered) -> None:
+    """Write what becomes of proofs to arrays, by machine code in the calling thread; see `prove_all`.
+
+    All arrays are writable and in C order: nothing is looked at, copied or shared out.
+    """
+    _loop(pose, asked, out)
+
+
+def loaded() -> bool:
+    """Return whether the machine code of proofs has been used in this process."""
+    return ready(_loop)
+
+
 def costs_at(pose: Posed, x: Array) -> tuple[Array, Array]:
     """Return posed costs (n, P) at positions x (n, P, d), and what rounding may have made of their residuals (n, P)."""
     out = np.zeros((2, *x.shape[:2]))
-    if len(x) > FEW or ready(_loop):
+    if ready(_evaluate) or (len(x) > FEW and usable(_evaluate, len(x))):
         _evaluate(Posed(*(plainly(array) for array in pose)), plainly(x), out)
         return out[0], out[1]
     with plain(), np.errstate(all="ignore"):  # as few proofs are: machine code takes longer to load
@@ -183,7 +226,7 @@ def _loop(pose: Posed, asked: Asked, out: Answered) -> None:
         if wholes[i]:
             verdict, boxes, bound = prove_everywhere(cost, own, x, beside, kappa, eps, budgets[i], found)
             verdicts[i], counts[i], bounds[i] = verdict, boxes, bound
-            if verdict != OPEN:
+            if verdict != OPEN or isnan(fallbacks[i, 0, 0]):
                 continue
             wholes[i] = False
             low, high = fallbacks[i, 0], fallbacks[i, 1]

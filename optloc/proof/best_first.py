@@ -15,9 +15,9 @@ import numpy as np
 
 from optloc.base.threads import mapped
 from optloc.base.types import Array
-from optloc.compute.jit import compiled, enabled, plain, ready, zero
+from optloc.compute.jit import FEW, compiled, enabled, plain, ready, usable, zero
 from optloc.proof.atlas import atlas_of, first_minima, position, set_centre, widen_around, with_minima
-from optloc.proof.batch import FEW, FIRST_BOXES, SMALL, plainly, present_in
+from optloc.proof.batch import FIRST_BOXES, PLAIN_BOXES, SMALL, plainly, present_in
 from optloc.proof.box import (
     DEPTH,
     PIECE,
@@ -384,11 +384,14 @@ def find_minima(pose: Posed, places: Places, gap: float, budget: int, most: int)
             for i in asked:
                 search(i, first)
         asked = np.flatnonzero(boxes == first).tolist() if first < budget and enabled() else []
-    if enabled():
+    if enabled() and all(usable(kernel, n) for kernel in (_search_everywhere, _search_sides, _search_region)):
         mapped(lambda i: search(i, budget), asked)
-    else:  # plain Python holds the interpreter: threads would wait for each other
+        return points, boxes
+    # Plain Python holds the interpreter: threads would wait for each other.
+    most = min(budget, max(FIRST_BOXES, PLAIN_BOXES // max(len(asked), 1))) if enabled() else budget
+    with plain():
         for i in asked:
-            search(i, budget)
+            search(i, most)
     return points, boxes
 
 

@@ -8,8 +8,8 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, inlined
-from optloc.compute.systems import inverse, positive
-from optloc.proof.box import clip, digits, is_empty
+from optloc.compute.systems import inverse, positive, principal
+from optloc.proof.box import clip, digits, is_empty, uncut
 from optloc.proof.nodes.dispatch import curve_others, shape_of
 from optloc.proof.nodes.node import (
     BLUR,
@@ -247,7 +247,12 @@ def clip_to_stationary(
     solve : array (3, 3)
         Working memory.
     """
-    ball = spread_of(A, half, nodes, curves, sums)
+    clip_newton(half, sums, spread_of(A, half, nodes, curves, sums), cut, solve)
+
+
+@inlined
+def clip_newton(half: Array, sums: Array, ball: float, cut: Array, solve: Array) -> None:
+    """Clip a box to where the gradient of f may vanish; `ball` and sums[C00:] bound the change of the Hessian."""
     if not ball < inf:
         return
     # The share of the box that the mean reaches: half of the bounds of change, which grow with it at least linearly.
@@ -277,13 +282,65 @@ def clip_to_stationary(
 
 
 @compiled
-def slopes_everywhere(A: Array, half: Array, nodes: Array, curves: Array, sums: Array, solve: Array) -> bool:
-    """Return whether the gradient of f cannot vanish in the box; arguments as of `clip_to_stationary`."""
-    cut = np.empty(6)
+def has_no_infimum(dimension: int, touching: bool, half: Array, sums: Array, ball: float, solve: Array) -> bool:
+    """Return whether no infimum of the cost can lie in a box of an atlas.
+
+    The gradient does not vanish, or the Hessian has a negative eigenvalue; and at infinity, an end of the box that is
+    none of space (`touching`), the cost falls inwards or changes along infinity.
+
+    Parameters
+    ----------
+    dimension : int
+        2 or 3.
+    touching : bool
+        Whether infinity is a side of the box.
+    half, sums : array (3,), (SUMS,)
+        The box, and its sums with bounds of the Hessian's change.
+    ball : float
+        A bound of the norm of the rest of that change.
+    solve : array (3, 3)
+        Working memory.
+    """
+    if not ball < inf:
+        return False
+    if not touching:
+        cut = np.empty(6)
+        uncut(half, cut)
+        clip_newton(half, sums, ball, cut, solve)
+        return is_empty(cut) or _bends_down(sums, ball, solve)
+    ball *= sqrt(half[0] * half[0] + half[1] * half[1] + half[2] * half[2])
+    for k in range(dimension):
+        change = ball
+        for m in range(3):
+            at = entry(k, m)
+            change += (abs(sums[at]) + sums[C00 + at]) * half[m]
+        # Slack for the rounding of the sums, relative, and of the gradient itself.
+        slope, change = sums[G0 + k], change * (1.0 + 1e-6) + sums[NOISE0 + k]
+        if -slope > change or (k < dimension - 1 and slope > change):
+            return True
+    return False
+
+
+@compiled
+def _bends_down(sums: Array, ball: float, hessian: Array) -> bool:
+    """Return whether the cost curves downwards along one direction all over a box, as around a saddle."""
+    vectors = np.empty((3, 3))
     for k in range(3):
-        cut[k], cut[3 + k] = -half[k], half[k]
-    clip_to_stationary(A, half, nodes, curves, sums, cut, solve)
-    return is_empty(cut)
+        for m in range(3):
+            hessian[k, m] = sums[entry(k, m)]
+    principal(hessian, vectors)
+    column = 0
+    for k in range(1, 3):
+        if hessian[k, k] < hessian[column, column]:
+            column = k
+    most = ball
+    for k in range(3):
+        for m in range(3):
+            at = entry(k, m)
+            z = vectors[k, column] * vectors[m, column]
+            most += sums[at] * z + sums[C00 + at] * abs(z)
+    size = abs(sums[H00]) + abs(sums[H11]) + abs(sums[H22])
+    return bool(most < -1e-9 * size)  # by more than the rounding of the Hessian's entries
 
 
 @compiled

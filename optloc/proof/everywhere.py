@@ -37,10 +37,10 @@ from optloc.proof.box import (
     rounding,
 )
 from optloc.proof.chart import HIDDEN_REACH, Box, Chart, Cost, Known, chart_at, descend, empty_box
-from optloc.proof.curvature import C00, G0, G1, G2, NOISE0, convex, entry, slopes_everywhere, spread_of, sum_up
+from optloc.proof.curvature import G0, G1, G2, convex, has_no_infimum, spread_of, sum_up
 from optloc.proof.near import BETTER, BUDGET, OPEN, OTHER, SINGULAR, STATIONARY, UNIQUE, VALUE, prove
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces, infinity_of, points_of, size_of
-from optloc.proof.nodes.node import ANY, DIFFERENCE, GROWS, H00, H11, H22, RANGE
+from optloc.proof.nodes.node import ANY, DIFFERENCE, GROWS, RANGE
 
 # The cost over the pieces of an atlas: all nodes over a box, out to infinity, and the surroundings of known minima.
 #
@@ -160,7 +160,7 @@ def set_minimum(cost: Cost, box: Box, atlas: Atlas, i: int, x: Array, value: flo
     """
     minima, d = atlas.minima, atlas.dimension
     minima.home[i] = home_of(atlas, x, minima.start[i])
-    if not _set_axes(cost, box, atlas, i):
+    if not set_axes(cost, box, atlas, i):
         return False
     _tables(cost, box, atlas, i, np.zeros(3))
     if not cost_at(cost.K, cost.w, box.nodes) >= value:
@@ -169,16 +169,23 @@ def set_minimum(cost: Cost, box: Box, atlas: Atlas, i: int, x: Array, value: flo
     # On a box whose Hessian exceeds a margin the cost falls below that of its centre by slope^2 / margin at most.
     margin = (sums[G0] * sums[G0] + sums[G1] * sums[G1] + sums[G2] * sums[G2]) / eps
     hull = np.zeros(3)
-    for k in range(d):
-        steep = abs(minima.axes[i, d - 1, k]) * d if minima.home[i] < 2 * d else 0.0
-        hull[k] = min(_WIDEST, _SHARE * minima.start[i, d - 1] / steep if steep > 0.0 else _WIDEST)
-    if limit < inf:
-        _draw_in(atlas, i, hull, limit)
+    set_hull(atlas, i, hull, limit)
     if not _grow(cost, box, atlas, i, hull, margin):
         return False
     for k in range(d):
         minima.core[i, k] = min(max(_WIDER * minima.sides[i, k], _WIDE), hull[k])
     return True
+
+
+@compiled
+def set_hull(atlas: Atlas, i: int, hull: Array, limit: float) -> None:
+    """Write half-widths (3,) around minimum i beyond which no convex box is looked for, within a limit in metres."""
+    minima, d = atlas.minima, atlas.dimension
+    for k in range(d):
+        steep = abs(minima.axes[i, d - 1, k]) * d if minima.home[i] < 2 * d else 0.0
+        hull[k] = min(_WIDEST, _SHARE * minima.start[i, d - 1] / steep if steep > 0.0 else _WIDEST)
+    if limit < inf:
+        _draw_in(atlas, i, hull, limit)
 
 
 @compiled
@@ -201,7 +208,7 @@ def _draw_in(atlas: Atlas, i: int, hull: Array, limit: float) -> None:
 
 
 @compiled
-def _set_axes(cost: Cost, box: Box, atlas: Atlas, i: int) -> bool:
+def set_axes(cost: Cost, box: Box, atlas: Atlas, i: int) -> bool:
     """Write the principal axes of minimum i in the coordinates of its home; return False where there are none."""
     minima, d = atlas.minima, atlas.dimension
     minima.axes[i], minima.back[i] = np.eye(3), np.eye(3)
@@ -385,7 +392,7 @@ def is_left(atlas: Atlas, box: Box, piece: int) -> bool:
 @compiled
 def _another(cost: Cost, atlas: Atlas, chart: Chart, near: Box, level: float, found: Array) -> bool:
     """Return whether the centre of a box descends to a minimum below the level that is not known, and write it."""
-    d, minima, u = atlas.dimension, atlas.minima, np.zeros(3)
+    d = atlas.dimension
     position(atlas, found)
     for k in range(3):
         near.at[k] = 0.0
@@ -393,18 +400,27 @@ def _another(cost: Cost, atlas: Atlas, chart: Chart, near: Box, level: float, fo
             near.at[k] += chart.back[k, m] * (found[m] - chart.origin[m])
     if not descend(cost, chart, near) < level:
         return False
+    if is_listed(atlas, near.centre):
+        return False
+    for m in range(d):
+        found[m] = near.centre[m]
+    return True
+
+
+@compiled
+def is_listed(atlas: Atlas, x: Array) -> bool:
+    """Return whether a position x (D,) lies in the convex box of a known minimum, or next to it."""
+    d, minima, u = atlas.dimension, atlas.minima, np.zeros(3)
     for i in range(minima.home.shape[0]):
-        inside = coordinates_on(atlas, minima.home[i], near.centre, u)
+        inside = coordinates_on(atlas, minima.home[i], x, u)
         for k in range(d):
             away = 0.0
             for m in range(d):
                 away += minima.back[i, k, m] * (u[m] - minima.start[i, m])
             inside = inside and abs(away) <= max(minima.sides[i, k], _SAME)
         if inside:
-            return False
-    for m in range(d):
-        found[m] = near.centre[m]
-    return True
+            return True
+    return False
 
 
 @compiled
@@ -450,58 +466,12 @@ def _steepness(box: Box, m: int) -> float:
 
 @compiled
 def leaves(cost: Cost, atlas: Atlas, box: Box, touching: bool, floor: float) -> bool:
-    """Return whether no infimum of the cost can lie in a box whose nodes are bounded.
-
-    The gradient does not vanish, or the Hessian has a negative eigenvalue; and at infinity, an end of the box that is
-    none of space, the cost falls inwards or changes along infinity.
-    """
+    """Return whether no infimum of the cost can lie in a box whose nodes are bounded; `touching`: infinity is there."""
     curve_pieces(atlas, cost.kinds, cost.data, box.half, box.curves)
     noise = rounding(cost.K, cost.weight, floor, box.nodes)
     sum_up(cost.K, cost.w, cost.weight, noise, box.nodes, box.curves, box.sums)
-    if not touching and slopes_everywhere(cost.A, box.half, box.nodes, box.curves, box.sums, box.solve):
-        return True
     ball = spread_of(cost.A, box.half, box.nodes, box.curves, box.sums)
-    if not ball < inf:
-        return False
-    if not touching:
-        return _bends_down(box, ball)
-    sums, h = box.sums, box.half
-    ball *= sqrt(h[0] * h[0] + h[1] * h[1] + h[2] * h[2])
-    for k in range(atlas.dimension):
-        change = ball
-        for m in range(3):
-            at = entry(k, m)
-            change += (abs(sums[at]) + sums[C00 + at]) * h[m]
-        # Slack for the rounding of the sums, relative, and of the gradient itself.
-        slope, change = sums[G0 + k], change * (1.0 + 1e-6) + sums[NOISE0 + k]
-        if -slope > change or (k < atlas.dimension - 1 and slope > change):
-            return True
-    return False
-
-
-@compiled
-def _bends_down(box: Box, ball: float) -> bool:
-    """Return whether the cost curves downwards along one direction all over a box, as around a saddle.
-
-    `optloc.proof.box.spread_of` has filled ``box.sums[C00:]`` and returned `ball`, bounds of the Hessian's change.
-    """
-    sums, hessian, vectors = box.sums, box.solve, np.empty((3, 3))
-    for k in range(3):
-        for m in range(3):
-            hessian[k, m] = sums[entry(k, m)]
-    principal(hessian, vectors)
-    column = 0
-    for k in range(1, 3):
-        if hessian[k, k] < hessian[column, column]:
-            column = k
-    most = ball
-    for k in range(3):
-        for m in range(3):
-            at = entry(k, m)
-            z = vectors[k, column] * vectors[m, column]
-            most += sums[at] * z + sums[C00 + at] * abs(z)
-    size = abs(sums[H00]) + abs(sums[H11]) + abs(sums[H22])
-    return bool(most < -1e-9 * size)  # by more than the rounding of the Hessian's entries
+    return has_no_infimum(atlas.dimension, touching, box.half, box.sums, ball, box.solve)
 
 
 @compiled

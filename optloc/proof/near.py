@@ -356,7 +356,7 @@ def known_minima(
             box.half[:] = 0.0
             if chart.surface.shape[0] > 0:
                 box.at[2] = 0.0
-            if not is_convex(cost, chart, box, 0.0) or _is_elsewhere(chart, box, others[p - 1]):
+            if not is_convex(cost, chart, box, 0.0) or is_elsewhere(chart, box, others[p - 1]):
                 continue
             sums = box.sums
             # Where the Hessian exceeds a margin, the minimum is within slope / margin of any point, and the cost there
@@ -368,7 +368,7 @@ def known_minima(
         for k in range(3):
             hull[k] = max(high[k] - box.at[k], box.at[k] - low[k], 0.0)
         if hidden:
-            _draw_in(box.sense if chart.surface.shape[0] > 0 else chart.sense, hull)
+            draw_in(box.sense if chart.surface.shape[0] > 0 else chart.sense, hull)
         if set_convex(cost, chart, box, hull, margin):
             # Where the box is, up to the rounding of its centre; that of the fix is the origin itself.
             shift[:] = 0.0
@@ -389,7 +389,7 @@ _ASIDE = 1e5
 
 
 @inlined
-def _is_elsewhere(chart: Chart, box: Box, place_of: Array) -> bool:
+def is_elsewhere(chart: Chart, box: Box, place_of: Array) -> bool:
     """Return whether a point (D,) of a surface is not that at its own search coordinates, but behind it."""
     apart = 0.0
     for m in range(place_of.shape[0]):
@@ -398,7 +398,7 @@ def _is_elsewhere(chart: Chart, box: Box, place_of: Array) -> bool:
 
 
 @compiled
-def _draw_in(sense: Array, hull: Array) -> None:
+def draw_in(sense: Array, hull: Array) -> None:
     """Make half-widths (3,) so small that no coordinate in metres is farther than `HIDDEN_REACH`."""
     share = 1.0
     for k in range(3):

@@ -8,9 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from optloc.base.types import Array, Band
-from optloc.compute.jit import enabled
-from optloc.linear.constraints import is_exact
+from optloc.base.types import Array
 from optloc.linear.evaluate import columns, plans
 from optloc.linear.normal import prior_parts, weighed
 from optloc.models import MODELS, Model
@@ -125,14 +123,14 @@ def _number_of(made: Columns, row: Row, node: str | Node) -> int:
     code, own = code_of(node), named(node)
     if not own.of_station:
         return made.add(code, own.numbers(row))
-    epoch = row.epoch if _epochs(made.problem) > 1 else 0
+    epoch = row.epoch if own_epochs(made.problem) > 1 else 0
     key = (code, row.a, epoch)
     if key not in made.shared:
         made.shared[key] = made.add(code, own.numbers(row), row.a, epoch)
     return made.shared[key]
 
 
-def _epochs(problem: Problem) -> int:
+def own_epochs(problem: Problem) -> int:
     """Return at how many epochs stations have a place, or a velocity, of their own."""
     stations = problem.stations
     given = [array for array in (stations.position, stations.velocity) if array is not None]
@@ -161,19 +159,24 @@ def roots(precision: Array) -> Array:
 
 
 def project_out(unknowns: Array, values: Array) -> Array:
-    """Return values (..., q, p) less their projection onto the span of unknowns (..., q, n).
-
-    Columns of unknowns are scaled to one length first; what then is shorter than 1e-12 counts as dependent.
-    """
+    """Return values (..., q, p) less their projection onto the span of unknowns (..., q, n)."""
     if not unknowns.shape[-1]:
         return values
-    length = np.sqrt((unknowns**2).sum(-2, keepdims=True))
-    u, s, _ = np.linalg.svd(unknowns / np.where(length > 0.0, length, 1.0), full_matrices=False)
-    # The rounding of a column that is a sum of others is some thousandth of that; what is dependent changes nothing.
-    basis = u * (s > 1e-12 * np.maximum(s[..., :1], 1e-300))[..., None, :]
+    basis = span_of(unknowns)
     # Twice: what rounding leaves of the first projection is as large as the values, and they may be large.
     once = values - basis @ (np.swapaxes(basis, -1, -2) @ values)
     return np.asarray(once - basis @ (np.swapaxes(basis, -1, -2) @ once))
+
+
+def span_of(unknowns: Array) -> Array:
+    """Return orthonormal columns (..., q, n) of the span of unknowns (..., q, n); zeros where some are dependent.
+
+    Columns are scaled to one length first; what then is shorter than 1e-12 counts as dependent.
+    """
+    length = np.sqrt((unknowns**2).sum(-2, keepdims=True))
+    u, s, _ = np.linalg.svd(unknowns / np.where(length > 0.0, length, 1.0), full_matrices=False)
+    # The rounding of a column that is a sum of others is some thousandth of that; what is dependent changes nothing.
+    return np.asarray(u * (s > 1e-12 * np.maximum(s[..., :1], 1e-300))[..., None, :])
 
 
 def compress(K: Array, w: Array) -> tuple[Array, Array]:
@@ -190,12 +193,16 @@ def compress(K: Array, w: Array) -> tuple[Array, Array]:
     if q <= nodes + 1:
         return K, w
     basis, upper = np.linalg.qr(K)
-    inside = (np.swapaxes(basis, -1, -2) @ w[..., None])[..., 0]
-    rest = w - (basis @ inside[..., None])[..., 0]
-    last = np.sqrt((rest**2).sum(-1, keepdims=True))
     # What no position can fit stands in a row of its own, so that the cost keeps its value.
     upper = np.concatenate([upper, np.zeros((*upper.shape[:-2], 1, nodes))], axis=-2)
-    return upper, np.concatenate([inside, last], axis=-1)
+    return upper, _fold(basis, w)
+
+
+def _fold(basis: Array, w: Array) -> Array:
+    """Return measurements (N, q) along orthonormal columns (B, q, J), and the length of what is across: (N, J + 1)."""
+    inside = (np.swapaxes(basis, -1, -2) @ w[..., None])[..., 0]
+    rest = w - (basis @ inside[..., None])[..., 0]
+    return np.concatenate([inside, np.sqrt((rest**2).sum(-1, keepdims=True))], axis=-1)
 
 
 def mark_alone(kinds: Array, data: Array, K: Array, w: Array) -> Array:
@@ -268,6 +275,11 @@ class Posed(NamedTuple):
     w: Array
     level: Array
 
+    @property
+    def dense(self) -> float:
+        """Return with how many nodes the time of a box grows as their square."""
+        return float(len(self.kinds))
+
     def take(self, items: Array | slice) -> Posed:
         """Return the posed costs of some of the problems."""
 
@@ -287,28 +299,82 @@ def pose_costs(problem: Problem) -> Posed:
     Parameters
     ----------
     problem : Problem
-        N problems within the scope of the proof, see `optloc.proof.pose.unsupported`.
+        N problems within the scope of the proof, see `optloc.proof.scope.unsupported`.
     """
+    kinds, numbers, K, w, level = _rows_of(problem)
+    K, w = compress(K, w)
+    return Posed(kinds, data=mark_alone(kinds, numbers, K, w), K=K, w=w, level=level)
+
+
+def _rows_of(problem: Problem) -> tuple[Array, Array, Array, Array, Array]:
+    """Return kinds and numbers of the nodes, all rows over them with their measurements (N, q), and levels (N,)."""
     problem = weighed(problem)
-    others = _Others.of(problem)
+    others = Others.of(problem)
     known = problem.observed - (others.touch @ others.mean[..., None])[..., 0]
     # Absent rows have weight zero, and any finite value will do.
     usable = (problem.weight > 0.0) & np.isfinite(known)
     known = np.where(usable, known, 0.0)
     made = columns_of(problem, known)
     others = others.with_stations(problem, made)
-    value = np.where(_of_rows(problem, _counts_from_measured), 0.0, known)
+    value = np.where(counts_from_measured(problem), 0.0, known)
     K, w = _projected(problem, made, others, value)
-    K, w = _with_position_prior(problem, made, K, w)
-    K, w = compress(K, w)
-    size, level = problem.batch_shape[0], _turned(problem, others, known)
+    K, w = _with_rows_of(position_prior(problem, made), K, w)
+    size, level = problem.batch_shape[0], turned_level(problem, others, known)
     w, level = np.broadcast_to(w, (size, w.shape[-1])), np.broadcast_to(level, (size,))
-    kinds = np.array(made.kinds)
-    return Posed(kinds, data=mark_alone(kinds, made.numbers, K, w), K=K, w=w, level=level)
+    return np.array(made.kinds), made.numbers, K, w, level
+
+
+class Affine(NamedTuple):
+    """The costs of all problems that differ in their measurements z alone: of ``base + slope z``, see `Posed`.
+
+    Parameters
+    ----------
+    kinds, data, K : int array (J,), array (1, J, width), array (1, q, J)
+        As of `Posed`.
+    base, slope : array (p,), (p, m)
+        Whitened measurements of z = 0, and what they gain with each measurement.
+    basis : array (p, J), optional
+        Orthonormal columns to which they are folded (`compress`); None where they are not.
+    """
+
+    kinds: Array
+    data: Array
+    K: Array
+    base: Array
+    slope: Array
+    basis: Array | None
+
+    def write(self, z: Array, w: Array) -> None:
+        """Write the whitened measurements (q,) of measurements (m,)."""
+        if self.basis is None:
+            np.dot(self.slope, z, out=w)
+            w += self.base
+        else:
+            w[:] = _fold(self.basis, self.slope @ z + self.base)
+
+
+def pose_affinely(problem: Problem) -> Affine | None:
+    """Return how the cost of a problem depends on its measurements, or None where not in a straight line.
+
+    Parameters
+    ----------
+    problem : Problem
+        Without batch axes, and within the scope of the proof; its measurements are not looked at.
+    """
+    # an affine map is known by its images of zero and of the unit vectors
+    probes = np.concatenate([np.zeros((1, problem.count)), np.eye(problem.count)])
+    kinds, data, K, w, level = _rows_of(problem.with_rows(z=probes))
+    marked = any(NODES[int(kind)].mark is not None for kind in kinds)
+    counted = counts_from_measured(problem).any()
+    if marked or counted or np.isfinite(level).any() or len(K) > 1 or len(data) > 1:
+        return None
+    base, slope = w[0].copy(), np.ascontiguousarray((w[1:] - w[0]).T)
+    basis = None if K.shape[1] <= K.shape[2] + 1 else np.linalg.qr(K[0])[0]
+    return Affine(kinds, data, compress(K, w)[0], base, slope, basis)
 
 
 @dataclass(frozen=True, slots=True)
-class _Others:
+class Others:
     """Unknowns beside the position: how rows contain them (m, n), their precision (B, n, n) and mean (B, n)."""
 
     touch: Array
@@ -316,7 +382,8 @@ class _Others:
     mean: Array
 
     @classmethod
-    def of(cls, problem: Problem) -> _Others:
+    def of(cls, problem: Problem) -> Others:
+        """Return the unknowns of a problem beside the position, those of stations apart."""
         size = problem.layout.size
         touch = np.zeros((problem.count, size))
         for plan, start in zip(plans(problem), problem.starts, strict=True):
@@ -334,7 +401,7 @@ class _Others:
                 mean[:, own] = centre
         return cls(touch, precision, mean)
 
-    def with_stations(self, problem: Problem, made: Columns) -> _Others:
+    def with_stations(self, problem: Problem, made: Columns) -> Others:
         """Return the unknowns with station errors along the line to the target as their first coordinates."""
         if problem.stations.covariance is None:
             return self
@@ -344,7 +411,7 @@ class _Others:
             own = columns(problem.layout, "stations", epoch[row : row + 1])[0]
             # Isotropic, so any axis stands for the line to the target: the first of the station's d.
             touch[row, own[made.station[node] * d]] += coefficient
-        return _Others(touch, self.precision, self.mean)
+        return Others(touch, self.precision, self.mean)
 
 
 def _of_rows(problem: Problem, of_model: Callable[[Model], Any]) -> Array:
@@ -352,11 +419,12 @@ def _of_rows(problem: Problem, of_model: Callable[[Model], Any]) -> Array:
     return np.concatenate([np.full(rows.count, of_model(MODELS[rows.kind])) for rows in problem.rows])
 
 
-def _counts_from_measured(model: Model) -> bool:
-    return any(named(node).counts_from_measured for _, node in model.nodes)
+def counts_from_measured(problem: Problem) -> Array:
+    """Return which rows (m,) are of nodes that are less their measured value."""
+    return _of_rows(problem, lambda model: any(named(node).counts_from_measured for _, node in model.nodes))
 
 
-def _projected(problem: Problem, made: Columns, others: _Others, value: Array) -> tuple[Array, Array]:
+def _projected(problem: Problem, made: Columns, others: Others, value: Array) -> tuple[Array, Array]:
     """Return whitened rows (B, q, J) over the nodes and measurements (N, q), free of the other unknowns."""
     noise, J = whiten(problem.noise, problem.weight), len(made.kinds)
     used = others.touch.any(0) | others.precision.any((0, 1))
@@ -380,21 +448,28 @@ def _projected(problem: Problem, made: Columns, others: _Others, value: Array) -
     return geometry[..., :J], np.ascontiguousarray(seen[0].T) if shared else seen[..., 0]
 
 
-def _with_position_prior(problem: Problem, made: Columns, K: Array, w: Array) -> tuple[Array, Array]:
-    """Return the rows with those of a Gaussian prior on the position; its nodes are added."""
+def position_prior(problem: Problem, made: Columns) -> list[int]:
+    """Add the nodes of a Gaussian prior on the position, one for each of its rows, and return their numbers."""
+    out: list[int] = []
     for name, mean, precision in prior_parts(problem):
         if name == "position":
             whole = precision if precision.ndim == 3 else precision[None]
-            nodes = add_linear(made, roots(whole), mean if mean.ndim == 2 else mean[None])
-            own = np.zeros((len(K), len(nodes), len(made.kinds)))
-            own[:, np.arange(len(nodes)), nodes] = 1.0
-            wider = np.zeros((*K.shape[:2], len(nodes)))
-            K = np.concatenate([np.concatenate([K, wider], axis=2), own], axis=1)
-            w = np.concatenate([w, np.zeros((len(w), len(nodes)))], axis=1)
-    return K, w
+            out += add_linear(made, roots(whole), mean if mean.ndim == 2 else mean[None])
+    return out
 
 
-def _turned(problem: Problem, others: _Others, known: Array) -> Array:
+def _with_rows_of(nodes: list[int], K: Array, w: Array) -> tuple[Array, Array]:
+    """Return the rows with one of its own, with a measured zero, for each of the last nodes."""
+    if not nodes:
+        return K, w
+    own = np.zeros((len(K), len(nodes), K.shape[2] + len(nodes)))
+    own[:, np.arange(len(nodes)), nodes] = 1.0
+    wider = np.zeros((*K.shape[:2], len(nodes)))
+    K = np.concatenate([np.concatenate([K, wider], axis=2), own], axis=1)
+    return K, np.concatenate([w, np.zeros((len(w), len(nodes)))], axis=1)
+
+
+def turned_level(problem: Problem, others: Others, known: Array) -> Array:
     """Return the cost (N,) from which on the sum of an angle and its bias may be off by a turn.
 
     Residuals are wrapped with their bias, nodes without it; a row can differ only where noise and bias together are
@@ -411,7 +486,7 @@ def _turned(problem: Problem, others: _Others, known: Array) -> Array:
     if biased.any():
         covariance = np.linalg.pinv(others.precision, hermitian=True)
         variance = variance + np.einsum("rn,bnm,rm->br", touch, covariance, touch)
-    counted = _of_rows(problem, _counts_from_measured)[rows]
+    counted = counts_from_measured(problem)[rows]
     most, turn = _of_rows(problem, _most)[rows], period[rows]
     # From the measured value to the farthest that the node can be: beyond half a turn the residual is the shorter way.
     size = np.where(counted, 0.0, np.abs(known[:, rows]))
@@ -423,119 +498,3 @@ def _turned(problem: Problem, others: _Others, known: Array) -> Array:
 def _most(model: Model) -> float:
     """Return how large the node of a kind with a period can be."""
     return sum(abs(factor) * named(node).most for factor, node in model.nodes)
-
-
-# What the proof covers: one static position, rows made of ranges, angles, ratios and heights.
-
-# Different ranges, angles and ratios, and unknowns beside the position, of a problem whose proof is worth the time. It
-# goes with the square of the nodes, and plain Python takes a thousand times longer.
-MOST_NODES, MOST_NODES_PLAIN, MOST_UNKNOWNS = 128, 24, 128
-
-
-def unsupported(problem: Problem) -> str:
-    """Return why a problem is beyond the proof, in a sentence that names what, or nothing where it is within.
-
-    Parameters
-    ----------
-    problem : Problem
-        Flat batch of problems.
-    """
-    return next(_reasons(problem), "")
-
-
-def _reasons(problem: Problem) -> Iterator[str]:
-    if len(problem.motions) != 1:
-        yield f"there are {len(problem.motions)} targets, and the proof is for one"
-        return
-    motion = problem.motions[0]
-    if motion.known is not None or not any(slot.name == "position" for slot in problem.layout.shared):
-        yield "no position is common to all rows"
-    if motion.order > 0:
-        yield "the target moves, and the proof is for one that stays"
-    yield from _beyond_rows(problem)
-    yield from _beyond_biases(problem)
-    yield from _beyond_stations(problem)
-    yield from _beyond_constraints(problem)
-    known = {"position", "stations", *(bias.name for bias in problem.biases)}
-    # What `optloc.proof.pose` does not write as rows would be left out of the cost without a word.
-    for name, _, _ in prior_parts(problem):
-        if name not in known:
-            yield f"the prior on {name} is not covered"
-
-
-def _beyond_rows(problem: Problem) -> Iterator[str]:
-    for rows in problem.rows:
-        model = MODELS[rows.kind]
-        if model.ranges is None and not model.nodes:
-            yield f"{rows.kind} rows are neither sums of ranges or rates nor a kind whose bounds are known"
-    most = MOST_NODES if enabled() else MOST_NODES_PLAIN
-    if problem.count > most and _nodes(problem) > most:
-        without = "" if enabled() else " without machine code"
-        yield f"there are {_nodes(problem)} different ranges, rates and angles, and the proof takes {most}{without}"
-    if problem.layout.size - problem.dimension > MOST_UNKNOWNS:
-        yield f"there are {problem.layout.size} unknowns, and the proof takes {MOST_UNKNOWNS}"
-
-
-def _nodes(problem: Problem) -> int:
-    """Return how many different ranges, rates, angles, ratios and heights the rows are made of."""
-    moving, own = _epochs(problem) > 1, 0
-    found: set[tuple[bool, int, int]] = set()
-    for rows in problem.rows:
-        model = MODELS[rows.kind]
-        if model.signs is None:
-            own += rows.count * len(model.nodes)
-            continue
-        when = rows.epoch if moving else np.zeros_like(rows.epoch)
-        for index in (rows.a, rows.b)[: model.stations]:
-            found.update((model.ranges is None, *key) for key in zip(index.tolist(), when.tolist(), strict=True))
-    return own + len(found)
-
-
-def _beyond_biases(problem: Problem) -> Iterator[str]:
-    angular = np.concatenate([np.full(rows.count, MODELS[rows.kind].period is not None) for rows in problem.rows])
-    for bias in problem.biases:
-        if bias.form not in ("offset", "drift"):
-            does = "moves stations" if bias.form == "time" else "multiplies what it touches"
-            yield f"the {bias.form} {bias.name!r} {does}, and the proof takes what is added"
-        elif bias.sigma is None and angular[bias.row].any():
-            yield f"the bias {bias.name!r} of angles has no prior, and may be whole turns"
-
-
-def _beyond_stations(problem: Problem) -> Iterator[str]:
-    covariance = problem.stations.covariance
-    if covariance is None:
-        return
-    # A sphere is what makes the nearest place to the surveyed one lie on the line to the target.
-    same = np.eye(problem.dimension) * covariance[..., :1, :1]
-    if not np.allclose(covariance, same, rtol=1e-9, atol=0.0):
-        yield "the station errors differ from axis to axis"
-    if problem.stations.span == "run" and _move(problem):
-        yield "station errors last the whole run while stations move, and the proof takes one line of sight for each"
-    bent = [rows.kind for rows in problem.rows if MODELS[rows.kind].ranges is None and MODELS[rows.kind].stations]
-    if bent:
-        yield f"station errors enter {bent[0]} rows in a way that depends on the place"
-
-
-def _move(problem: Problem) -> bool:
-    """Return whether a station that rows of several epochs name is at different places in them."""
-    place = problem.stations.position
-    if place.shape[-3] < 2:
-        return False
-    named = np.concatenate([(rows.a, rows.b)[k] for rows in problem.rows for k in range(MODELS[rows.kind].stations)])
-    when = np.concatenate([rows.epoch for rows in problem.rows for k in range(MODELS[rows.kind].stations)])
-    for station in np.unique(named):
-        seen = place[..., np.unique(when[named == station]), station, :]
-        if (seen != seen[..., :1, :]).any():
-            return True
-    return False
-
-
-def _beyond_constraints(problem: Problem) -> Iterator[str]:
-    levels = [constraint for constraint in problem.constraints if is_exact(constraint)]
-    if len(levels) > 1 and any(isinstance(level, Band) and level.kind == "height" for level in levels):
-        yield "a height that is known together with another equality leaves a line, which the proof does not follow"
-    if len(levels) >= problem.dimension:
-        yield "the equalities leave no way to move"
-    for constraint in problem.constraints:
-        if is_exact(constraint) and isinstance(constraint, Band) and constraint.kind not in ("height", "plane"):
-            yield f"the equality {constraint.name!r} is neither a height nor a plane"

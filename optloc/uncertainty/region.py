@@ -22,7 +22,8 @@ from optloc.proof.chart import Chart as Axes
 from optloc.proof.chart import Cost, cost_of, empty_box
 from optloc.proof.cover import cost_of_point, cover_everywhere, cover_near, room
 from optloc.proof.everywhere import reaches_infinity
-from optloc.proof.pose import pose_costs, unsupported
+from optloc.proof.pose import pose_costs
+from optloc.proof.scope import crowded, unsupported
 
 # Boxes of a cover at most, by dimension: the hull of an ellipse is then 2 % wider than the ellipse, that of an
 # ellipsoid 10 %, after some 20 and 100 ms. Plain Python takes a thousand times longer for each.
@@ -208,7 +209,7 @@ def likelihood_region(problem: Problem, fix: Fix, level: float = 0.95, *, boxes:
 
 def _cover(surface: Surface, threshold: float, boxes: int | None) -> tuple[Cells | None, bool, str]:
     """Return cells that hold the region, whether they found it open, or why there are none."""
-    why = unsupported(surface.problem)
+    why = unsupported(surface.problem) or crowded(surface.problem)
     if why:
         return None, False, why
     pose = pose_costs(surface.problem)

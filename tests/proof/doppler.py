@@ -72,6 +72,9 @@ class Scenes:
     truth: Array  # (N, d)
     z: Array  # (N, m)
     offset: bool = False
+    # Stations whose clocks are off by an unknown offset, and, with times, by a drift.
+    clocks: Sequence[int] = ()
+    times: Array | None = None
     height: float | None = None
     frame: Frame = field(default_factory=lambda: Frame("cartesian"))
 
@@ -79,10 +82,15 @@ class Scenes:
     def problem(self) -> Problem:
         ends = np.cumsum([len(part.a) for part in self.parts])[:-1]
         told = [part.told(z) for part, z in zip(self.parts, np.split(self.z, ends, axis=1), strict=True)]
-        names = tuple("ABCDEFGH"[: self.place.shape[2]])
+        names = tuple("ABCDEFGHI"[: self.place.shape[2]])
         limits = () if self.height is None else height(exactly=self.height)
         stations = Stations(self.place, names, velocity=self.velocity)
-        made = assemble(stations, *told, frame=self.frame, constraints=limits)
+        made = assemble(stations, *told, frame=self.frame, constraints=limits, times=self.times)
+        late = [names[s] for s in self.clocks]
+        if late:
+            made = with_bias(made, "clock", members=late)
+        if late and self.times is not None:
+            made = with_bias(made, "drift", form="drift", members=late)
         return with_bias(made, "frequency", per="kind") if self.offset else made
 
 
@@ -100,8 +108,12 @@ class Trial:
         self.b, self.w = place[epoch, b], speed[epoch, b]
         self.z, self.truth = scenes.z[item], scenes.truth[item]
         self.white = np.linalg.inv(np.linalg.cholesky(_blocks([part.covariance for part in scenes.parts])))
-        if scenes.offset:
-            q, _ = np.linalg.qr(self.white.sum(1, keepdims=True))
+        late = [(a == s) * 1.0 - (b == s) for s in scenes.clocks]
+        if scenes.times is not None:
+            late += [column * scenes.times[epoch] for column in late]
+        late += [np.ones(len(a))] * scenes.offset
+        if late:
+            q, _ = np.linalg.qr(self.white @ np.stack(late, axis=1))
             self.white = self.white - q @ (q.T @ self.white)
         self.middle = place.reshape(-1, self.d).mean(0)
         self.size = np.linalg.norm(place - self.middle, axis=-1).max()
@@ -313,6 +325,22 @@ def passes(rng: Rng, n: int) -> Scenes:
     return drawn([rate], place, velocity, truth, rng, offset=True, height=level, frame=ECEF)
 
 
+def constellation(rng: Rng, n: int, rows: int = 400, count: int = 9) -> Scenes:
+    """Passes of several satellites one after the other over ten minutes, to 1 Hz; height known, frequency not."""
+    level, seconds = float(rng.uniform(0.0, 2000.0)), np.linspace(0.0, 600.0, rows)
+    truth, heard = sites(rng, n, level), np.arange(rows) * count // rows
+    place, velocity = np.zeros((2, n, rows, count, 3))
+    for i, x in enumerate(truth):
+        for s in range(count):
+            own = heard == s
+            track = orbits(rng, x, seconds[own], np.radians(8.0))
+            for array, values in zip((place, velocity), track, strict=True):
+                array[i, :, s] = values[0]  # wherever it is while it is not heard
+                array[i, own, s] = values
+    rate = Part("range_rate", heard, HERTZ, epoch=range(rows))
+    return drawn([rate], place, velocity, truth, rng, offset=True, height=level, frame=ECEF)
+
+
 def satellites(rng: Rng, n: int) -> Scenes:
     """Time and frequency differences of three low satellites to an emitter on the ground: 100 ns and 1 Hz at 8 GHz."""
     truth = sites(rng, n, 0.0)
@@ -323,6 +351,20 @@ def satellites(rng: Rng, n: int) -> Scenes:
         Part("fdoa", [1, 2], C / 8e9, [0, 0], by_arrival=True),
     ]
     return drawn(parts, place, velocity, truth, rng, height=0.0, frame=ECEF)
+
+
+def registration(rng: Rng, n: int, d: int, epochs: int, drift: bool) -> Scenes:
+    """Time differences of four to six aircraft with clocks of their own, to an emitter near or far: ten minutes."""
+    s, times = int(rng.integers(4, 7)), np.linspace(0.0, 600.0, epochs)
+    place, velocity = moving(rng, n, s, d)
+    place = place + velocity * times[:, None, None]
+    a = np.tile(np.arange(1, s), epochs)
+    epoch = np.repeat(np.arange(epochs), s - 1)
+    tdoa = Part("tdoa", a, 3.0, np.zeros(len(a), dtype=int), epoch, by_arrival=True)
+    way = rng.standard_normal((n, d)) * np.array([1.0, 1.0, 0.1])[:d]
+    truth = way / np.linalg.norm(way, axis=-1, keepdims=True) * 10.0 ** rng.uniform(4.0, 5.5, (n, 1))
+    more = {"clocks": range(1, s), "times": times if drift else None}
+    return drawn([tdoa], place, np.broadcast_to(velocity, place.shape), truth, rng, **more)
 
 
 # Accuracies that mixtures are drawn from: sharp, and so coarse that minima lie all over the place.
@@ -368,6 +410,11 @@ FAMILIES: dict[str, Callable[[Rng, int], Scenes]] = {
     "bearing of 0.06 rad + TDOA + FDOA": lambda rng, n: hybrid(rng, n, 0.06),
     "three satellites, TDOA + FDOA": satellites,
     "one pass of a satellite": passes,
+    "passes of nine satellites": constellation,
+    "registration of 20 epochs in the plane": lambda rng, n: registration(rng, n, 2, 20, drift=False),
+    "registration of 40 epochs in space": lambda rng, n: registration(rng, n, 3, 40, drift=False),
+    "registration of 100 epochs in space": lambda rng, n: registration(rng, n, 3, 100, drift=False),
+    "registration of 60 epochs with drifts": lambda rng, n: registration(rng, n, 3, 60, drift=True),
     "mixtures in the plane": lambda rng, n: mixture(rng, n, 2),
     "mixtures in space": lambda rng, n: mixture(rng, n, 3),
 }

@@ -15,7 +15,7 @@ from optloc.linear.constraints import height
 from optloc.models.primitives import WGS84_A, WGS84_F
 from optloc.proof.everywhere import UNBOUNDED
 from optloc.proof.near import BUDGET
-from optloc.proof.pose import unsupported
+from optloc.proof.scope import unsupported
 from optloc.solvers.certify import branch_and_bound
 
 machine_code = pytest.mark.skipif(not enabled(), reason="plain Python takes a thousand times longer for a box")
@@ -168,14 +168,14 @@ def test_gaps_on_a_surface_hold_in_full(surface, seed):
 @pytest.mark.parametrize(("why", "margin"), [(UNBOUNDED, 7.8147), (BUDGET, 0.0)])
 def test_where_infinity_is_near_the_gap_of_the_region_is_tried(why, margin, monkeypatch):
     """Proofs of gaps from 9 on fail for a reason: only where it is infinity a gap between 9 and none is tried."""
-    problem, real, tried = CASES["tdoa-3d"].problem, branch_and_bound.prove_all, []
+    problem, real, tried = CASES["tdoa-3d"].problem, branch_and_bound.prove, []
 
     def failing(pose, asked):
         tried.append(float(asked.kappa[0]))
         answer = real(pose, asked)
         return answer._replace(verdict=np.where(asked.kappa >= 9.0, why, answer.verdict))
 
-    monkeypatch.setattr(branch_and_bound, "prove_all", failing)
+    monkeypatch.setattr(branch_and_bound, "prove", failing)
     proof = branch_and_bound.certify(problem, solve(problem, "gtrs+lsr")).certificate.item()
     assert (proof.proof, proof.unique) == ("global", margin > 0.0)
     assert proof.margin == pytest.approx(margin, abs=1e-3)
@@ -191,7 +191,7 @@ def test_where_infinity_is_near_the_gap_of_the_region_is_tried(why, margin, monk
 def test_costs_beside_the_fix_are_compared_too(name, monkeypatch):
     """Rows that are turned about the fix leave its cost and its slope as they are, but nothing else."""
     problem = CASES[name].problem
-    fix, real = solve(problem, "gtrs+lsr"), branch_and_bound.pose_costs
+    fix, real = solve(problem, "gtrs+lsr"), branch_and_bound.pose
 
     def steeper(given):
         pose = real(given)
@@ -200,7 +200,7 @@ def test_costs_beside_the_fix_are_compared_too(name, monkeypatch):
         return pose._replace(K=1.001 * pose.K, w=1.001 * (pose.w + rest) - rest)
 
     assert branch_and_bound.certify(problem, fix).certificate.item().reason != branch_and_bound.MISMATCHED
-    monkeypatch.setattr(branch_and_bound, "pose_costs", steeper)
+    monkeypatch.setattr(branch_and_bound, "pose", steeper)
     turned = branch_and_bound.certify(problem, fix)
     assert turned.certificate.item().proof == "unknown"
     assert turned.certificate.item().reason == branch_and_bound.MISMATCHED

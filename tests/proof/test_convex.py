@@ -6,8 +6,9 @@ from proof.costs import random_case
 from proof.test_ranges import bound_box, bounded, charted, drawn_box, ways
 
 from optloc.compute.jit import enabled
+from optloc.proof.box import is_empty, uncut
 from optloc.proof.chart import curve_box, is_convex
-from optloc.proof.curvature import C00, SUMS, convex, slopes_everywhere, spread_of
+from optloc.proof.curvature import C00, SUMS, clip_to_stationary, convex, spread_of
 from optloc.proof.near import set_convex
 from optloc.proof.nodes.node import CURVE_WIDTH, RANGE
 from optloc.proof.nodes.range import curve_ranges
@@ -134,7 +135,9 @@ def test_no_box_around_a_stationary_point_is_excluded(d):
                 box.at[:d] = at + box.half[:d] * (rng.uniform(-1.0, 1.0, d) if inside else 5.0)
                 bound_box(cost, chart, box)
                 curve_box(cost, chart, box)
-                none = slopes_everywhere(cost.A, box.half, box.nodes, box.curves, box.sums, box.solve)
+                uncut(box.half, box.cut)
+                clip_to_stationary(cost.A, box.half, box.nodes, box.curves, box.sums, box.cut, box.solve)
+                none = is_empty(box.cut)
                 assert not (inside and none)
                 around += inside
                 excluded += none

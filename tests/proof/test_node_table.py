@@ -93,7 +93,12 @@ def minima(stations, z, tdoa, truth, rng):
     return np.array([2.0 * least_squares(residual, start, x_scale=1e3, xtol=1e-14).cost for start in starts])
 
 
-MACHINE = pytest.mark.skipif(not enabled(), reason="plain Python takes a thousand times longer for a box")
+# A node from outside has the whole proof compiled anew, which takes minutes: every run has the plain form of it, and in
+# machine code what the node is asked.
+MACHINE = [
+    pytest.mark.full,
+    pytest.mark.skipif(not enabled(), reason="plain Python takes a thousand times longer for a box"),
+]
 
 
 @pytest.mark.parametrize(
@@ -121,7 +126,8 @@ def test_a_kind_from_outside_gets_certificates_that_hold(package, d, machine):
     assert unique >= TRIALS // 2
 
 
-@MACHINE
+@pytest.mark.full
+@pytest.mark.skipif(not enabled(), reason="plain Python takes a thousand times longer for a box")
 def test_it_mixes_with_kinds_that_optloc_has(package):
     rng = np.random.default_rng(7)
     stations, truth, z = drawn(rng, 3)
@@ -132,6 +138,52 @@ def test_it_mixes_with_kinds_that_optloc_has(package):
     for i, (proof, _, bound, *_) in enumerate(certificates):
         if proof == "global":
             assert bound <= minima(stations[i], z[i], tdoa[i], truth[i], rng).min() + 1e-6 * (1.0 + cost[i])
+
+
+# Bounds and second derivatives of the node over boxes, in machine code and in plain Python, with a range beside it.
+CHOICES = """
+import numpy as np
+import squared_range
+from optloc.compute.jit import plain
+from optloc.proof.chart import empty_box
+from optloc.proof.curvature import curve_nodes
+from optloc.proof.box import bound_nodes
+from optloc.proof.nodes.dispatch import code_of, width
+
+kinds = np.array([0, code_of(squared_range.SQUARED)])
+rng = np.random.default_rng(5)
+
+def asked(data, centre, sense, half):
+    box = empty_box(2, 2)
+    box.nodes[:] = box.curves[:] = 0.0
+    bound_nodes(kinds, data, centre, sense, sense.T @ sense, half, box.line, box.nodes)
+    second = np.zeros((3, 3))
+    curve_nodes(kinds, data, centre, sense, sense.T @ sense, half, box.line, second, box.nodes, box.curves)
+    return np.concatenate([box.nodes.ravel(), box.curves.ravel()])
+
+for _ in range(50):
+    data = np.zeros((2, width(kinds)))
+    data[:, :3] = rng.uniform(-5e3, 5e3, (2, 3))
+    box = rng.uniform(-8e3, 8e3, 3), 100.0 * rng.standard_normal((3, 3)), rng.uniform(0.1, 5.0, 3)
+    ours = asked(data, *box)
+    with plain():
+        theirs = asked(data, *box)
+    assert np.allclose(ours, theirs, rtol=1e-9, atol=1e-9), (ours, theirs)
+    assert np.isfinite(ours).sum() > 20 and ours.any()
+"""
+
+
+@pytest.mark.skipif(not enabled(), reason="without numba there is no machine code")
+def test_machine_code_asks_the_same_of_a_node_from_outside():
+    path = os.pathsep.join([str(HERE), *sys.path])
+    done = subprocess.run(
+        [sys.executable, "-c", CHOICES],
+        env=os.environ | {"PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("d", [2, 3])

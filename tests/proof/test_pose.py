@@ -10,7 +10,8 @@ from proof.plain import cost_of
 from optloc import Motion, Prior, Stations, assemble, measured, simulate, with_bias
 from optloc.base.types import Bias
 from optloc.compute.sums import equations_at
-from optloc.proof.pose import pose_costs, unsupported
+from optloc.proof.pose import pose_costs
+from optloc.proof.scope import unsupported
 
 PLACES = 12
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from time import perf_counter
+from typing import Any
 
 import numpy as np
 
@@ -17,12 +18,12 @@ from optloc.problem.chart import quantile
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
-from optloc.proof.batch import Answered, Asked, prove_all
+from optloc.proof.batch import Answered, Asked
 from optloc.proof.chart import HIDDEN_REACH
 from optloc.proof.everywhere import UNBOUNDED
 from optloc.proof.near import BETTER, BUDGET, OTHER, UNIQUE, VALUE
-from optloc.proof.pose import Posed, pose_costs, unsupported
-from optloc.solvers.certify.posed import agrees, is_free, surfaces_of
+from optloc.proof.scope import unsupported
+from optloc.solvers.certify.posed import Costs, agrees, is_free, lacks, pose, prove, surfaces_of
 from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP
@@ -39,6 +40,7 @@ Corner = tuple[float, ...]
 METHOD = "branch and bound"
 # Reasons for which nothing is proven.
 UNFINISHED = "the proof was not finished within its budget of boxes"
+LACKS_CODE = "; machine code, which takes minutes to make once, would go on: run `optloc compile`"
 UNSETTLED = "the rows do not make the fix a strict minimum that stands out from its neighbourhood"
 BARRED = "a position that costs less is not admitted: {}"
 LOST = "a position that costs less was met, and no minimum next to it was kept"
@@ -122,6 +124,13 @@ _AROUND = 15
 # Cost that counts as equal, relative: covers the rounding of two ways to compute it, and is nothing beside the gap of 9
 # at which a second minimum matters.
 _EQUAL = 1e-6
+
+
+def equal_cost(cost: Any) -> Any:
+    """Return how far below a cost, or each of many, another counts as equal."""
+    return _EQUAL * (1.0 + cost)
+
+
 # Minima behind the Earth that are set aside at most: mirror images through it; whoever has more gets no proof.
 _HIDDEN = 4
 # Half-width of the region where all positions cannot be bounded: spreads of the stations, or distances of the fix, so
@@ -143,7 +152,7 @@ class Work:
         The verdict of the pool.
     certificate : object array (N,)
         What is claimed of each; None where nothing was tried.
-    pose : Posed
+    pose : Posed or Runs
         Their costs over the position, equalities apart.
     ignored : array (N, h, d)
         Minima that the Earth hides; NaN in empty slots.
@@ -170,7 +179,7 @@ class Work:
     pool: Pool
     fix: Fix
     certificate: Array
-    pose: Posed
+    pose: Costs
     ignored: Array
     region: Array
     fallback: Array
@@ -195,7 +204,7 @@ class Work:
             pool,
             fix,
             fill(size, None) if pool.certificate is None else np.array(pool.certificate),
-            pose_costs(problem),
+            pose(problem),
             np.full((size, 0, d), np.nan),
             np.array(np.broadcast_to(corners, (size, 2, d))),
             _around(problem, fix.position),
@@ -254,20 +263,20 @@ def _round(work: Work, items: Array) -> None:
     """Try to prove some fixes once, and settle or change what can be."""
     free = is_free(work.problem, work.fix, items)
     _give_up(work, items[~free], HELD)
-    asked, pose = _asked(work, items), work.pose.take(items)
+    asked, costs = _asked(work, items), work.pose.take(items)
     # Below this level a wrapped residual may stand for another than the node's: no bound of one bounds the other.
-    turning = free & (pose.level < work.fix.cost[items] + asked.kappa)
+    turning = free & (costs.level < work.fix.cost[items] + asked.kappa)
     _lower(work, items[turning], TURNS)
     good = np.flatnonzero(free & ~turning)
     if not len(good):
         return
     if len(good) < len(items):
-        items, asked, pose = items[good], asked.take(good), pose.take(good)
-    answer = prove_all(pose, asked)
+        items, asked, costs = items[good], asked.take(good), costs.take(good)
+    answer = prove(costs, asked)
     done = np.isin(answer.verdict, (UNIQUE, VALUE))
     _claim(work, items, asked, answer, np.flatnonzero(done))
     short = answer.verdict == BUDGET
-    _lower(work, items[short], UNFINISHED)
+    _lower(work, items[short], _unfinished(work.pose, len(items)))
     remote = answer.verdict == UNBOUNDED
     _lower(work, items[remote], REMOTE, remote=True)
     found = np.isin(answer.verdict, (BETTER, OTHER))
@@ -291,22 +300,26 @@ def _asked(work: Work, items: Array) -> Asked:
         known=np.isfinite(others).all(-1).sum(1),
         hidden=seen,
         kappa=kappa,
-        eps=_EQUAL * (1.0 + fix.cost[items]),
+        eps=equal_cost(fix.cost[items]),
         region=work.region[items],
         fallback=work.fallback[items],
-        budget=_budgets(kappa, len(work.pose.kinds), work.effort) * (_AROUND if surface.shape[1] else 1),
+        budget=budgets(kappa, work.pose.dense, work.effort) * (_AROUND if surface.shape[1] else 1),
         planes=planes,
         surface=surface,
     )
 
 
-def _budgets(kappa: Array, nodes: int, effort: int) -> Array:
-    """Return the boxes (n,) that proofs may take: a box takes time with the square of the nodes."""
+def budgets(kappa: Array, nodes: float, effort: int) -> Array:
+    """Return the boxes (n,) that proofs may take: one takes time with the square of the nodes of dense rows."""
     if not enabled():
         return np.full(len(kappa), max(_AT_LEAST, _SLOW_BUDGET // len(kappa)))
     # The same time whatever the number of nodes, not the same number of boxes.
     share = max(1.0, (nodes / _NODES) ** 2) / effort
     return np.asarray(np.where(kappa > 0.0, *_BUDGETS) / share).astype(np.int64)
+
+
+def _unfinished(costs: Costs, count: int) -> str:
+    return UNFINISHED + (LACKS_CODE if lacks(costs, count) else "")
 
 
 def _lower(work: Work, items: Array, why: str, *, remote: bool = False) -> None:
@@ -351,7 +364,7 @@ def _add(work: Work, items: Array, points: Array, better: Array) -> None:
     pool = _keep_evidence(lsr(part, offer(part, x, before, "certify", began)), before)
     new = judge(part, pool)
     with np.errstate(invalid="ignore"):
-        lower = new.cost < own.cost - _EQUAL * (1.0 + own.cost)
+        lower = new.cost < own.cost - equal_cost(own.cost)
         more = np.isfinite(new.alternatives.gap).sum(1) > np.isfinite(own.alternatives.gap).sum(1)
     changed = lower | more | ~new.answered
     work.replaced += int(lower.sum())
@@ -364,7 +377,7 @@ def _add(work: Work, items: Array, points: Array, better: Array) -> None:
     stuck = np.flatnonzero(~changed)
     stuck = stuck[~_ignore(work, items[stuck], points[stuck])]
     _bar(work, items, points, stuck[better[stuck]])
-    _lower(work, items[stuck[~better[stuck]]], UNFINISHED)
+    _lower(work, items[stuck[~better[stuck]]], _unfinished(work.pose, len(items)))
 
 
 def _bar(work: Work, items: Array, points: Array, barred: Array) -> None:
@@ -505,14 +518,17 @@ def certified(
     if why or not answered.any():
         certificate = fill(len(pool), None) if pool.certificate is None else np.array(pool.certificate)
         certificate[answered] = unknown(why)
-        return replace(pool, certificate=certificate, stages=(*pool.stages, _stage(why or "nothing to prove", began)))
+        return replace(
+            pool, certificate=certificate, stages=(*pool.stages, certify_stage(why or "nothing to prove", began))
+        )
 
     work = settle(Work.begin(problem, pool, fix, answered, region, margin, effort))
-    stages = (*pool.stages, _stage(work.summary(), began))
+    stages = (*pool.stages, certify_stage(work.summary(), began))
     return replace(work.pool, certificate=work.certificate, stages=stages)
 
 
-def _stage(detail: str, began: float) -> Stage:
+def certify_stage(detail: str, began: float) -> Stage:
+    """Return the stage "certify" that began at a time of `time.perf_counter`, with what it did."""
     return Stage("certify", detail, perf_counter() - began)
 
 

@@ -1,4 +1,4 @@
-"""What is posed beside a cost: the surfaces that hold a fix. And whether a posed cost is the problem's own."""
+"""Costs as posed for a proof, short or long, with the surfaces that hold a fix; and whether they are its own."""
 
 from __future__ import annotations
 
@@ -11,10 +11,33 @@ from optloc.linear.normal import Normal, eliminated, step
 from optloc.models.primitives import geodetic_normal
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.proof.batch import costs_at
+from optloc.proof.batch import Answered, Asked, costs_at, lacks_code, prove_all
 from optloc.proof.nodes.level import height_numbers
-from optloc.proof.pose import Posed
+from optloc.proof.pose import Posed, pose_costs
+from optloc.proof.runs.posed import Runs, pose_runs
+from optloc.proof.runs.prove import costs_of_runs, prove_runs, runs_lack_code
+from optloc.proof.scope import is_run
 from optloc.proof.surface import DATA, FIRST, LEVEL, MIDDLE, SURFACE_WIDTH, UP
+
+# Costs over the position: with dense rows, or sparse ones where there are many.
+
+Costs = Posed | Runs
+
+
+def pose(problem: Problem) -> Costs:
+    """Return the costs of a flat batch of problems over the position."""
+    return pose_runs(problem) if is_run(problem) else pose_costs(problem)
+
+
+def prove(costs: Costs, asked: Asked) -> Answered:
+    """Return the outcome of the proofs of n fixes of n posed problems."""
+    return prove_runs(costs, asked) if isinstance(costs, Runs) else prove_all(costs, asked)
+
+
+def lacks(costs: Costs, count: int) -> bool:
+    """Return whether proofs of so many fixes ended early because there is no machine code of them yet."""
+    return runs_lack_code(count) if isinstance(costs, Runs) else lacks_code(count)
+
 
 # Equalities: planes and surfaces along which a proof looks.
 
@@ -85,7 +108,7 @@ _OPEN = 1e-12
 _STEPS = 6
 
 
-def agrees(problem: Problem, fix: Fix, pose: Posed) -> Array:
+def agrees(problem: Problem, fix: Fix, costs: Costs) -> Array:
     """Return of which of a flat batch of N problems the posed cost is their own (N,), at the fix and beside it.
 
     Parameters
@@ -94,13 +117,13 @@ def agrees(problem: Problem, fix: Fix, pose: Posed) -> Array:
         N problems within the scope of the proof.
     fix : Fix
         Their fixes.
-    pose : Posed
+    costs : Posed or Runs
         Their costs over the position, equalities apart.
     """
     places = _places(fix)
     own = _own_costs(problem, fix, places)
     with np.errstate(all="ignore"):
-        posed, blur = costs_at(pose, places)
+        posed, blur = costs_of_runs(costs, places) if isinstance(costs, Runs) else costs_at(costs, places)
         good = np.abs(posed - own) <= _tolerance(own, blur)
         good[:, 0] &= np.abs(own[:, 0] - fix.cost) <= _tolerance(fix.cost, blur[:, 0])
     return np.asarray(good.all(1))

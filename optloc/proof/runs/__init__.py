@@ -1,0 +1,1 @@
+"""The proof of runs: rows by the hundred of a target that stays."""

@@ -1,0 +1,190 @@
+"""From long problems to runs: sparse rows over the nodes, and the dense rows of few epochs, which cost nowhere more."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.linear.normal import weighed
+from optloc.problem.noise import whiten
+from optloc.problem.problem import Problem
+from optloc.proof.batch import plainly
+from optloc.proof.chart import (
+    Cost,
+    cost_of,
+    empty_groups,
+)
+from optloc.proof.pose import (
+    Columns,
+    Others,
+    Posed,
+    columns_of,
+    counts_from_measured,
+    position_prior,
+    project_out,
+    roots,
+    span_of,
+    turned_level,
+)
+from optloc.proof.runs.rows import (
+    Rows,
+)
+
+# From a problem to its rows, and to those of few epochs.
+
+# Nodes of the first look. Runs of five stations at 200 and 600 epochs: with a tenth of them a box cost as much as the
+# looks at all rows that it spared, with three times as many no fewer were needed.
+_LOOK = 60
+
+
+# Nodes of dense rows whose budget of boxes is whole, and of a run from which on it is not: 500 nodes take 50 us a box.
+_DENSE, _LONG = 12, 500
+
+
+class Run(NamedTuple):
+    """A cost of many rows.
+
+    Parameters
+    ----------
+    cost : Cost
+        Its nodes, weights and measurements; the rows are left out.
+    rows : Rows
+        All rows.
+    look : Cost
+        The cost of few of them, which is nowhere larger.
+    """
+
+    cost: Cost
+    rows: Rows
+    look: Cost
+
+
+@dataclass(frozen=True, slots=True)
+class Runs:
+    """The posed costs of a flat batch of long problems, as `optloc.proof.pose.Posed` holds those of short ones.
+
+    Parameters
+    ----------
+    runs : tuple of Run
+        One for each problem.
+    level : array (N,)
+        Cost from which on angles may be off by a turn that the rows do not see.
+    """
+
+    runs: tuple[Run, ...]
+    level: Array
+
+    @property
+    def dense(self) -> float:
+        """Return with how many nodes of dense rows a box would be as dear, as far as it may take boxes from a budget.
+
+        Long runs take fewer boxes than short ones, so only the root of what a box takes longer counts.
+        """
+        return float(_DENSE * max(1.0, len(self.runs[0].cost.kinds) / _LONG) ** 0.25)
+
+    def take(self, items: Array | slice) -> Runs:
+        """Return the posed costs of some of the problems."""
+        numbers = np.arange(len(self.runs))[items]
+        return Runs(tuple(self.runs[i] for i in numbers), self.level[items])
+
+
+def pose_runs(problem: Problem) -> Runs:
+    """Return the costs of a flat batch of N long problems over the position, see `optloc.proof.pose.pose_costs`."""
+    problem = weighed(problem)
+    posed = [_pose(problem.take(np.array([i]))) for i in range(problem.batch_shape[0])]
+    return Runs(tuple(run for run, _ in posed), np.array([level for _, level in posed]))
+
+
+def pose_few(problem: Problem) -> Posed:
+    """Return the cost of few rows of one long problem, a batch of one."""
+    run, level = _pose(weighed(problem))
+    look = run.look
+    return Posed(look.kinds, look.data[None], look.K[None], look.w[None], np.array([level]))
+
+
+def _pose(problem: Problem) -> tuple[Run, float]:
+    """Return one problem of a batch of one as a run, and its level of turns."""
+    others = Others.of(problem)
+    known = problem.observed - (others.touch @ others.mean[..., None])[..., 0]
+    usable = (problem.weight > 0.0) & np.isfinite(known)
+    known = np.where(usable, known, 0.0)
+    made = columns_of(problem, known)
+    others = others.with_stations(problem, made)
+    priors = position_prior(problem, made)
+    kinds, data = np.array(made.kinds), made.numbers[0]
+    value = np.where(counts_from_measured(problem), 0.0, known)[0]
+    whole = _System.of(problem, usable[0], made, others, value, priors)
+    few = _System.of(problem, usable[0] & _few(problem, len(kinds)), made, others, value, priors)
+    used = np.bincount(few.nodes.indices, minlength=len(kinds)) > 0
+    dense = project_out(few.unknowns, np.column_stack([few.nodes[:, used].toarray(), few.measured]))
+    present = (dense != 0.0).any(1)
+    look = cost_of(kinds[used], plainly(data[used]), plainly(dense[present, :-1]), plainly(dense[present, -1]))
+    rows = whole.rows()
+    none = np.empty((0, len(kinds)))
+    cost = Cost(kinds, plainly(data), none, rows.w, np.empty((0, 0)), rows.weight, empty_groups(0))
+    return Run(cost, rows, look), float(turned_level(problem, others, known)[0])
+
+
+def _few(problem: Problem, nodes: int) -> Array:
+    """Return which rows (m,) the first look takes: those of epochs evenly apart, or every so many."""
+    epochs = np.unique(problem.epoch)
+    key = np.searchsorted(epochs, problem.epoch) if len(epochs) >= _LOOK // 3 else np.arange(problem.count)
+    apart = max(1, round(nodes / _LOOK))
+    return np.asarray(key % apart == apart // 2)
+
+
+@dataclass(frozen=True, slots=True)
+class _System:
+    """Whitened rows over nodes (sparse) and over other unknowns, with the rows of their priors, and measurements."""
+
+    nodes: Any
+    unknowns: Array
+    measured: Array
+
+    @classmethod
+    def of(
+        cls, problem: Problem, present: Array, made: Columns, others: Others, value: Array, priors: list[int]
+    ) -> _System:
+        from scipy import sparse  # with the first long run: problems of one epoch need none
+
+        size, white = len(made.kinds), _whitening(problem, present)
+        design = sparse.csr_array((made.coefficient, (made.row, made.column)), shape=(problem.count, size))
+        precision = others.precision[0]
+        used = others.touch.any(0) | precision.any(0)
+        root = roots(precision[used][:, used])
+        prior = sparse.csr_array((np.ones(len(priors)), (np.arange(len(priors)), priors)), shape=(len(priors), size))
+        none = sparse.csr_array((len(root), size))
+        return cls(
+            sparse.csr_array(sparse.vstack([white @ design, prior, none])),
+            np.concatenate([white @ others.touch[:, used], np.zeros((len(priors), len(root))), root]),
+            np.concatenate([white @ value, np.zeros(len(priors) + len(root))]),
+        )
+
+    def rows(self) -> Rows:
+        """Return them for machine code."""
+        basis = span_of(self.unknowns) if self.unknowns.shape[1] else self.unknowns
+        kept = basis.any(0)
+        start, column = (np.asarray(index, dtype=np.int64) for index in (self.nodes.indptr, self.nodes.indices))
+        weight = np.sqrt(np.asarray(self.nodes.multiply(self.nodes).sum(0)))
+        arrays = (self.nodes.data, self.measured, basis[:, kept].T, weight)
+        return Rows(start, column, *map(plainly, arrays))
+
+
+def _whitening(problem: Problem, present: Array) -> Any:
+    """Return the sparse matrix (q, m) that whitens the rows, zero for those that are absent."""
+    from scipy import sparse
+
+    blocks = []
+    for whitener in whiten(problem.noise, np.where(present, problem.weight[0], 0.0)):
+        g, r = whitener.row.shape
+        matrix = whitener.matrix[0] if whitener.matrix.ndim == 4 else whitener.matrix
+        line = np.broadcast_to(np.arange(g * r).reshape(g, r, 1), (g, r, r))
+        column = np.broadcast_to(whitener.row[:, None, :], (g, r, r))
+        entries = (np.broadcast_to(matrix, (g, r, r)).ravel(), (line.ravel(), column.ravel()))
+        blocks.append(sparse.csr_array(entries, shape=(g * r, problem.count)))
+    out = sparse.csr_array(sparse.vstack(blocks))
+    out.eliminate_zeros()
+    return out

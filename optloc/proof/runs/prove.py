@@ -1,0 +1,370 @@
+"""The proof of a run: no position costs less than a fix, and no other minimum is within a gap."""
+
+from __future__ import annotations
+
+from math import inf, isnan, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from optloc.base.threads import mapped
+from optloc.base.types import Array
+from optloc.compute.jit import compiled, enabled, usable, zero
+from optloc.proof.atlas import Atlas, atlas_of, first_minima, home_of, set_centre, with_minima
+from optloc.proof.batch import Answered, Asked, plainly
+from optloc.proof.box import (
+    DEPTH,
+    bound_nodes,
+    push_around,
+)
+from optloc.proof.chart import (
+    HIDDEN_REACH,
+    Chart,
+    Known,
+    accuracy_floor,
+    chart_on,
+    turned,
+    widen,
+)
+from optloc.proof.curvature import G0, G1, G2, entry
+from optloc.proof.everywhere import (
+    CHEAPER,
+    CLEAR,
+    INFINITE,
+    SPENT,
+    UNBOUNDED,
+    cube,
+    push_pieces,
+    set_axes,
+    set_hull,
+)
+from optloc.proof.near import (
+    BETTER,
+    BUDGET,
+    OPEN,
+    OTHER,
+    SINGULAR,
+    STATIONARY,
+    UNIQUE,
+    VALUE,
+    Aim,
+    draw_in,
+    is_elsewhere,
+    region_of,
+)
+from optloc.proof.nodes.dispatch import infinity_of
+from optloc.proof.nodes.node import DIFFERENCE, GROWS
+from optloc.proof.runs.posed import Run, Runs
+from optloc.proof.runs.rows import (
+    blur_of,
+    is_balanced,
+    is_convex_by,
+    residual_at,
+)
+from optloc.proof.runs.search import (
+    CAPACITY,
+    Space,
+    Tables,
+    cost_at_coordinates,
+    floor_of,
+    search_run,
+    sum_at,
+    tables_of,
+)
+from optloc.proof.surface import SIDES, is_one_side, reach_of_piece
+
+# Boxes around known minima on which the cost is convex.
+
+# Sides are tried smaller by this factor, so often: from the first, standard deviations, to a millionth of it.
+_WIDEST, _SMALLER, _TRIALS = 100.0, 0.8, 62
+# The box searched along the axes of a minimum, in convex boxes and standard deviations at least: beyond it the cost of
+# a run is high enough for boxes along the axes of space.
+_WIDER, _WIDE = 3.0, 40.0
+
+
+@compiled
+def _convex_sides(
+    run: Run, space: Space, tables: Tables, at: Array, piece: int, hull: Array, margin: float, sides: Array
+) -> bool:
+    """Write half-widths (3,), none beyond the hull, of a box around a place on which the cost is convex."""
+    box, share, floor = tables.box, _WIDEST, floor_of(space, run.cost)
+    for _ in range(_TRIALS):
+        box.at[:] = at
+        for k in range(3):
+            box.half[k] = sides[k] = min(share, hull[k])
+        if space.far:
+            set_centre(space.atlas, piece, at)
+        _, ball = sum_at(run, space, tables, floor)
+        if is_convex_by(box.half, box.sums, ball, margin):
+            return True
+        share *= _SMALLER
+    return False
+
+
+@compiled
+def _set_far(run: Run, space: Space, tables: Tables, i: int, x: Array, value: float, eps: float, limit: float) -> bool:
+    """Write a minimum and its surroundings into an atlas; see `optloc.proof.everywhere.set_minimum`."""
+    atlas, box, d, hull = space.atlas, tables.box, space.atlas.dimension, np.zeros(3)
+    minima, piece = atlas.minima, 2 * d + 1 + i
+    minima.home[i] = home_of(atlas, x, minima.start[i])
+    if not set_axes(run.look, tables.small, atlas, i):
+        return False
+    if not cost_at_coordinates(run, space, tables, piece, hull) >= value:
+        return False
+    for k in range(d):  # the axes of few rows, in units of all
+        own = box.sums[entry(k, k)]
+        if not own > 0.0:
+            return False
+        for m in range(d):
+            minima.axes[i, m, k] /= sqrt(own)
+            minima.back[i, k, m] *= sqrt(own)
+    cost_at_coordinates(run, space, tables, piece, hull)
+    margin = (box.sums[G0] ** 2 + box.sums[G1] ** 2 + box.sums[G2] ** 2) / eps
+    set_hull(atlas, i, hull, limit)
+    if not _convex_sides(run, space, tables, np.zeros(3), piece, hull, margin, minima.sides[i]):
+        return False
+    for k in range(d):
+        minima.core[i, k] = min(max(_WIDER * minima.sides[i, k], _WIDE), hull[k])
+    return True
+
+
+@compiled
+def _set_near(
+    run: Run, space: Space, tables: Tables, i: int, x: Array, corners: Array, value: float, eps: float, hidden: bool
+) -> bool:
+    """Write a minimum in search coordinates, and the sides of a convex box around it."""
+    chart, box, hull, shift, at = space.chart, tables.box, np.zeros(3), np.zeros(3), space.minima[i]
+    for k in range(3):
+        at[k] = 0.0
+        for m in range(x.shape[0]):
+            at[k] += chart.back[k, m] * (x[m] - chart.origin[m])
+        hull[k] = max(corners[1, k] - at[k], at[k] - corners[0, k], 0.0)
+    if chart.surface.shape[0] > 0:
+        at[2] = 0.0
+    if not cost_at_coordinates(run, space, tables, 0, at) >= value:
+        return False
+    margin = (box.sums[G0] ** 2 + box.sums[G1] ** 2 + box.sums[G2] ** 2) / eps
+    if is_elsewhere(chart, box, x):
+        return False
+    if hidden:
+        draw_in(box.sense if chart.surface.shape[0] > 0 else chart.sense, hull)
+    if not _convex_sides(run, space, tables, at, 0, hull, margin, space.sides[i]):
+        return False
+    # Where the box is, up to the rounding of its centre.
+    widen(chart, box.centre, shift)
+    for k in range(3):
+        space.sides[i, k] = max(space.sides[i, k] - shift[k], 0.0)
+    return True
+
+
+# The proof.
+
+
+@compiled
+def _reaches_infinity(run: Run) -> bool:
+    """Return whether the cost stays finite at infinity, so that the atlas holds; see `reaches_infinity`."""
+    kinds, rows = run.cost.kinds, run.rows
+    ones, out = np.zeros(kinds.shape[0]), np.zeros(rows.w.shape[0])
+    for j in range(kinds.shape[0]):
+        if infinity_of(kinds[j]) == GROWS:
+            return False
+        ones[j] = 1.0 if infinity_of(kinds[j]) == DIFFERENCE else 0.0
+    return is_balanced(rows, ones, out)
+
+
+@compiled
+def cost_of_place(run: Run, x: Array, tables: Tables) -> float:
+    """Return the cost at a position x (D,)."""
+    cost, box, axes = run.cost, tables.box, np.zeros((3, 3))
+    box.half[:], box.centre[:] = 0.0, 0.0
+    for k in range(x.shape[0]):
+        axes[k, k], box.centre[k] = 1.0, x[k]
+    bound_nodes(cost.kinds, cost.data, box.centre, axes, axes, box.half, box.line, box.nodes)
+    return residual_at(run.rows, box.nodes, tables.sheet)
+
+
+class Task(NamedTuple):
+    """What is to be proven of one fix.
+
+    Parameters
+    ----------
+    x : array (D,)
+        The fix.
+    beside : Known
+        What else is known.
+    aim : Aim
+        What is to be shown of every box.
+    eps : float
+        How far below the cost of the fix still counts as equal.
+    budget : int
+        How many boxes may be looked at.
+    found : array (D,)
+        Written: a better or other point.
+    """
+
+    x: Array
+    beside: Known
+    aim: Aim
+    eps: float
+    budget: int
+    found: Array
+
+
+@compiled
+def prove_run(
+    run: Run, x: Array, beside: Known, kappa: float, eps: float, budget: int, lower: Array, upper: Array, found: Array
+) -> tuple[int, int, float]:
+    """Prove of a run what `optloc.proof.near.prove` proves of a cost; arguments and result as there.
+
+    Over all space where the cost stays finite at infinity; else within a region, around a surface, or within what
+    encloses the level of the cost of few rows.
+    """
+    tables, D = tables_of(run), x.shape[0]
+    chart, good = chart_on(run.look, x, tables.small, beside.planes, beside.surface)
+    least = cost_of_place(run, x, tables)
+    level = least + kappa if kappa > 0.0 else least - eps
+    aim = Aim(level, least - eps, least - 0.5 * eps, beside.hidden == 0 and isnan(lower[0]), 0)
+    task = Task(x, beside, aim, eps, budget, found)
+    bound_to = beside.planes.shape[0] + beside.surface.shape[0] > 0 or not isnan(lower[0])
+    middle, radius = cube(run.cost.kinds, run.cost.data, x)
+    if not bound_to and _reaches_infinity(run):
+        return _prove_far(run, task, atlas_of(middle, radius, D, 1 + beside.points.shape[0]), chart, tables)
+    if not good:
+        return SINGULAR, 0, -inf
+    return _prove_near(run, task, atlas_of(middle, radius, D, 0), chart, tables, lower, upper)
+
+
+@compiled
+def _prove_far(run: Run, task: Task, atlas: Atlas, chart: Chart, tables: Tables) -> tuple[int, int, float]:
+    """Prove over all space."""
+    none, known, place, aim = np.empty((0, 3)), zero(), np.empty(task.x.shape[0]), task.aim
+    space, stack, others = Space(True, atlas, chart, none, none), np.zeros((CAPACITY, DEPTH)), task.beside.points
+    for p in range(1 + others.shape[0]):
+        place[:] = task.x if p == 0 else others[p - 1]
+        hidden = p > others.shape[0] - task.beside.hidden
+        if p > 0 and not (hidden or aim.level > aim.value):
+            continue
+        least, limit = (-inf, HIDDEN_REACH) if hidden else (aim.better, inf)
+        if _set_far(run, space, tables, known, place, least, 0.5 * task.eps, limit):
+            known += 1
+        elif p == 0:
+            return STATIONARY, 0, -inf
+    own = with_minima(atlas.middle, atlas.radius, task.x.shape[0], first_minima(atlas.minima, known))
+    size, space = push_pieces(stack, own), Space(True, own, chart, none, none)
+    outcome, boxes, bound = search_run(run, space, tables, stack, size, aim, task.budget, task.found)
+    return _verdict(outcome, aim), boxes, min(bound, aim.value)
+
+
+@compiled
+def _verdict(outcome: int, aim: Aim) -> int:
+    """Return the verdict of a proof by the outcome of its search."""
+    if outcome == CLEAR:
+        return UNIQUE if aim.level > aim.value else VALUE
+    if outcome == SPENT:
+        return BUDGET
+    if outcome == INFINITE:
+        return UNBOUNDED
+    return BETTER if outcome == CHEAPER else OTHER
+
+
+@compiled
+def _prove_near(
+    run: Run, task: Task, atlas: Atlas, around: Chart, tables: Tables, lower: Array, upper: Array
+) -> tuple[int, int, float]:
+    """Prove in search coordinates around a fix: a region, what few rows enclose, or all pieces of a surface."""
+    corners, bent, aim = np.empty((2, 3)), around.surface.shape[0] > 0, task.aim
+    stack, total, bound = np.zeros((CAPACITY, DEPTH)), 0, aim.value
+    rho = sqrt(max(aim.level, aim.value + task.eps))
+    if not region_of(run.look, around, tables.small, rho, lower, upper, corners[0], corners[1]):
+        return OPEN, 0, -inf
+    alone = not bent or is_one_side(around.surface, around.origin, around.sense, corners[0], corners[1])
+    if not alone and not isnan(lower[0]):  # a region that reaches around the Earth
+        return OPEN, 0, -inf
+    for side in range(1 if alone else SIDES):
+        chart = around if side == 0 else turned(run.look, around, side)
+        if side > 0:
+            corners[0], corners[1] = -inf, inf
+        if bent:
+            reach_of_piece(chart.surface, chart.origin, chart.sense, corners[0], corners[1])
+        space = _beside(run, task, atlas, chart, tables, corners, side == 0)
+        if side == 0 and space.minima.shape[0] == 0:
+            return STATIONARY, 0, -inf
+        hole = space.sides[0] if side == 0 else np.zeros(3)
+        size = push_around(stack, 0, corners[0], corners[1], hole, 0)
+        outcome, boxes, low = search_run(run, space, tables, stack, size, aim, task.budget - total, task.found)
+        total += boxes
+        bound = min(bound, low)
+        if outcome != CLEAR:
+            return _verdict(outcome, aim), total, bound if alone else -inf
+    return UNIQUE if aim.level > aim.value else VALUE, total, bound
+
+
+@compiled
+def _beside(run: Run, task: Task, atlas: Atlas, chart: Chart, tables: Tables, corners: Array, own: bool) -> Space:
+    """Return search coordinates with their known minima, that of the fix (`own`) first; none where it is none."""
+    others, known, place = task.beside.points, zero(), np.empty(task.x.shape[0])
+    room = np.zeros((2, 1 + others.shape[0], 3))
+    space = Space(False, atlas, chart, room[0], room[1])
+    for p in range(0 if own else 1, 1 + others.shape[0]):
+        place[:] = task.x if p == 0 else others[p - 1]
+        hidden = p > others.shape[0] - task.beside.hidden
+        if p > 0 and not (hidden or task.aim.level > task.aim.value):
+            continue
+        least = -inf if hidden else task.aim.better
+        if _set_near(run, space, tables, known, place, corners, least, 0.5 * task.eps, hidden):
+            known += 1
+        elif p == 0:
+            break
+    return Space(False, atlas, chart, room[0, :known], room[1, :known])
+
+
+def prove_runs(posed: Runs, asked: Asked) -> Answered:
+    """Return the outcome of the proofs of n fixes of n long problems, see `optloc.proof.batch.prove_all`.
+
+    Plain Python would take a second for ten boxes: without machine code none is looked at.
+    """
+    n, d = asked.x.shape
+    verdict, boxes, bound, whole = np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros(n), np.ones(n, np.bool_)
+    found, asked = np.full((n, d), np.nan), Asked(*(plainly(array) for array in asked))
+
+    def prove(i: int) -> None:
+        others = asked.others[i, : asked.known[i]]
+        beside = Known(others, int(asked.hidden[i]), asked.planes[i], asked.surface[i])
+        for corners in (asked.region[i], asked.fallback[i]):
+            verdict[i], boxes[i], bound[i] = prove_run(
+                posed.runs[i],
+                asked.x[i],
+                beside,
+                asked.kappa[i],
+                asked.eps[i],
+                int(asked.budget[i]),
+                corners[0],
+                corners[1],
+                found[i],
+            )
+            whole[i] = np.isnan(corners[0, 0])
+            if verdict[i] != OPEN or not whole[i]:
+                break
+
+    if usable(prove_run, n):
+        mapped(prove, range(n))
+    else:
+        verdict[:], bound[:] = BUDGET, -inf
+    return Answered(verdict, boxes, bound, whole, found)
+
+
+def runs_lack_code(count: int) -> bool:
+    """Return whether proofs of so many long problems were left because there is no machine code of them yet."""
+    return enabled() and not usable(prove_run, count)
+
+
+def costs_of_runs(posed: Runs, x: Array) -> tuple[Array, Array]:
+    """Return posed costs (n, P) at positions x (n, P, d) and the rounding of their residuals, see `costs_at`."""
+    out = np.zeros((2, *x.shape[:2]))
+    for i, run in enumerate(posed.runs):
+        tables = tables_of(run)
+        for p, place in enumerate(plainly(x[i])):
+            out[0, i, p] = cost_of_place(run, place, tables)
+            floor = accuracy_floor(run.cost.kinds, run.cost.data, run.cost.weight, run.cost.w, tables.box.centre)
+            out[1, i, p] = blur_of(run.rows, floor, tables.box.nodes)
+    return out[0], out[1]

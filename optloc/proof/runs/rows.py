@@ -1,0 +1,384 @@
+"""Rows by the hundred: bounds of a cost over a box in a time that is linear in the rows.
+
+The rows of a long run touch few nodes each, and share a few unknowns that enter them linearly: offsets, drifts. With
+``e = S phi - w`` (S sparse, whitened) and Q the directions that these unknowns reach, the cost is ``f = |P e|^2``,
+``P = 1 - Q Q'``. The dense rows P S are never made: every unit vector v with ``Q'v = 0`` has ``|P e| >= v.e``, and what
+v.e is over a box takes one pass over the entries of S. Second derivatives are summed over all nodes before a bound is
+taken: in a long run they cancel.
+"""
+
+from __future__ import annotations
+
+from math import inf, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled
+from optloc.compute.systems import positive
+from optloc.proof.curvature import (
+    BLUR0,
+    C00,
+    C01,
+    C02,
+    C11,
+    C12,
+    C22,
+    G0,
+    LENGTH0,
+    NOISE0,
+    entry,
+)
+from optloc.proof.nodes.node import (
+    CHI,
+    H00,
+    H01,
+    H02,
+    H11,
+    H12,
+    H22,
+    HIGH,
+    LOW,
+    PHI,
+    SLOPE0,
+    SLOPE1,
+    SLOPE2,
+)
+
+# Unit in the last place of a double at 1.
+_ULP = 2.0**-52
+
+
+class Rows(NamedTuple):
+    """Whitened rows ``e = S phi - w`` and what other unknowns reach.
+
+    Parameters
+    ----------
+    start : int array (q + 1,)
+        Where the entries of each row begin, and the end.
+    column, factor : int array (n,), array (n,)
+        The node of each entry of S, and the entry.
+    w : array (q,)
+        Whitened measurements.
+    basis : array (p, q)
+        Orthonormal: what the other unknowns can change.
+    weight : array (J,)
+        Lengths of the columns of S.
+    """
+
+    start: Array
+    column: Array
+    factor: Array
+    w: Array
+    basis: Array
+    weight: Array
+
+
+class Sheet(NamedTuple):
+    """Working memory for rows over one box.
+
+    Parameters
+    ----------
+    residual : array (q,)
+        P e at the centre.
+    force : array (J,)
+        ``S'P e``.
+    lines, pulls : array (3, q), (3, J)
+        Columns of the Jacobian ``P S Phi``, and of ``S'P S Phi``.
+    reach, length : array (J,), (q,)
+        A number for each node, and what the rows make of it.
+    """
+
+    residual: Array
+    force: Array
+    lines: Array
+    pulls: Array
+    reach: Array
+    length: Array
+
+
+@compiled
+def sheet_of(rows: Rows) -> Sheet:
+    """Return working memory for rows."""
+    q, J = rows.w.shape[0], rows.weight.shape[0]
+    return Sheet(np.empty(q), np.empty(J), np.empty((3, q)), np.empty((3, J)), np.empty(J), np.empty(q))
+
+
+@compiled
+def _multiply(rows: Rows, values: Array, out: Array) -> None:
+    """Write ``S values``."""
+    for i in range(out.shape[0]):
+        total = 0.0
+        for n in range(rows.start[i], rows.start[i + 1]):
+            total += rows.factor[n] * values[rows.column[n]]
+        out[i] = total
+
+
+@compiled
+def _pull_back(rows: Rows, values: Array, out: Array) -> None:
+    """Write ``S'values``."""
+    out[:] = 0.0
+    for i in range(values.shape[0]):
+        value = values[i]
+        for n in range(rows.start[i], rows.start[i + 1]):
+            out[rows.column[n]] += rows.factor[n] * value
+
+
+@compiled
+def _project(rows: Rows, values: Array) -> None:
+    """Take off values (q,) what other unknowns can change."""
+    for _ in range(2):  # twice is exact (Parlett)
+        for k in range(rows.basis.shape[0]):
+            along, own = 0.0, rows.basis[k]
+            for i in range(values.shape[0]):
+                along += own[i] * values[i]
+            for i in range(values.shape[0]):
+                values[i] -= along * own[i]
+
+
+@compiled
+def _largest(rows: Rows, values: Array, out: Array) -> float:
+    """Return the greatest length of ``S y`` over all y with ``|y_j| <= values_j``."""
+    total = 0.0
+    for i in range(out.shape[0]):
+        most = 0.0
+        for n in range(rows.start[i], rows.start[i + 1]):
+            most += abs(rows.factor[n]) * values[rows.column[n]]
+        total += most * most
+    return sqrt(total)
+
+
+@compiled
+def blur_of(rows: Rows, floor: float, nodes: Array) -> float:
+    """Return a bound of the rounding errors of a residual (its length).
+
+    Parameters
+    ----------
+    rows : Rows
+        The rows.
+    floor : float
+        What limits the accuracy beside the nodes: lengths of w and of coordinates times their weights.
+    nodes : array (J, NODE_WIDTH)
+        Table of the box.
+    """
+    size = floor
+    for j in range(nodes.shape[0]):
+        size += rows.weight[j] * (abs(nodes[j, PHI]) + abs(nodes[j, LOW]) + abs(nodes[j, HIGH]))
+    return _digits(rows) * size
+
+
+@compiled
+def _digits(rows: Rows) -> float:
+    """Return the relative rounding error of sums over nodes and rows: one a term, and 32 within a node."""
+    return float((32 + rows.w.shape[0] + rows.weight.shape[0]) * _ULP)
+
+
+@compiled
+def residual_at(rows: Rows, nodes: Array, sheet: Sheet) -> float:
+    """Write the residual at the centre of a box whose nodes are bounded, and its forces; return the cost there."""
+    e, total = sheet.residual, 0.0
+    for i in range(e.shape[0]):
+        value = -rows.w[i]
+        for n in range(rows.start[i], rows.start[i + 1]):
+            value += rows.factor[n] * nodes[rows.column[n], PHI]
+        e[i] = value
+    _project(rows, e)
+    for i in range(e.shape[0]):
+        total += e[i] * e[i]
+    _pull_back(rows, e, sheet.force)
+    return total
+
+
+# How much a projection may leave of what lies in the span: as of whitened rows, but for their number.
+_BALANCED = 1e-11
+
+
+@compiled
+def is_balanced(rows: Rows, ones: Array, out: Array) -> bool:
+    """Return whether equal changes of some nodes (J,) change no row but by what the other unknowns explain."""
+    size = _largest(rows, ones, out)
+    _multiply(rows, ones, out)
+    _project(rows, out)
+    left = 0.0
+    for i in range(out.shape[0]):
+        left += out[i] * out[i]
+    return bool(sqrt(left) <= _BALANCED * size)
+
+
+@compiled
+def least_length(
+    half: Array, nodes: Array, curves: Array, lean: Array, slip: float, sheet: Sheet, cost: float, curved: bool
+) -> float:
+    """Return a lower bound of ``|P e|`` over a box, rounding apart; negative where it says nothing.
+
+    Parameters
+    ----------
+    half : array (3,)
+        Half-widths.
+    nodes, curves : array (J, NODE_WIDTH), (J, CURVE_WIDTH)
+        Tables of the box.
+    lean, slip : array (J,), float
+        Slopes of nodes across a surface, and how far off it the centre may be; 0 elsewhere.
+    sheet : Sheet
+        As `residual_at` has left it.
+    cost : float
+        What that returned.
+    curved : bool
+        Whether second derivatives are there. A node counts with them, or with the enclosure of its remainder: where a
+        third-order remainder is the smaller.
+    """
+    n = sqrt(cost)
+    if not n > 0.0:
+        return -1.0
+    h0, h1, h2 = half[0], half[1], half[2]
+    # A Hessian that changes by chi over the box, evenly along every ray: a sixth of it is left of the third order.
+    third = (h0 * h0 + h1 * h1 + h2 * h2) / 6.0
+    g0 = g1 = g2 = m00 = m01 = m02 = m11 = m12 = m22 = rest = 0.0
+    for j in range(nodes.shape[0]):
+        force = sheet.force[j]
+        s0, s1, s2 = nodes[j, SLOPE0], nodes[j, SLOPE1], nodes[j, SLOPE2]
+        g0 += force * s0
+        g1 += force * s1
+        g2 += force * s2
+        enclosed = min(force * nodes[j, LOW], force * nodes[j, HIGH])
+        if curved and (s0 != 0.0 or s1 != 0.0 or s2 != 0.0):  # no slope may stand for one that was not used
+            # Twice: slopes and Hessians of a place off the surface are others, too, by much less.
+            left = -abs(force) * (curves[j, CHI] * third + 2.0 * abs(lean[j]) * slip)
+            if left > enclosed:
+                rest += left
+                m00 += force * curves[j, H00]
+                m01 += force * curves[j, H01]
+                m02 += force * curves[j, H02]
+                m11 += force * curves[j, H11]
+                m12 += force * curves[j, H12]
+                m22 += force * curves[j, H22]
+                continue
+        rest += enclosed
+    rest += 0.5 * (min(m00, 0.0) * h0 * h0 + min(m11, 0.0) * h1 * h1 + min(m22, 0.0) * h2 * h2)
+    rest -= abs(m01) * h0 * h1 + abs(m02) * h0 * h2 + abs(m12) * h1 * h2
+    return float(n + (rest - abs(g0) * h0 - abs(g1) * h1 - abs(g2) * h2) / n)
+
+
+# Second derivatives of f/2 over a box: H = J'J + sum_j g_j N_j, with N_j the Hessian of node j and g_j its force.
+
+
+@compiled
+def sum_up_rows(rows: Rows, half: Array, nodes: Array, curves: Array, noise: float, sheet: Sheet, sums: Array) -> float:
+    """Fill sums (SUMS,) of a box and bounds of the Hessian's change in sums[C00:]; return one of the rest's norm.
+
+    Along s the Jacobian changes by ``P S (N s + r)``, ``|r| <= chi |s| / 2``, and forces by ``S'P S (Phi s + q)`` with
+    q the remainders. What is linear in s is summed over the nodes, entry by entry, before its bound is taken.
+
+    Parameters
+    ----------
+    rows : Rows
+        The rows.
+    half, nodes, curves : arrays
+        The box and its tables.
+    noise : float
+        The rounding of a residual.
+    sheet : Sheet
+        As `residual_at` has left it; filled.
+    sums : array (SUMS,)
+        Written.
+    """
+    sums[:] = 0.0
+    residual, lines, pulls, q = sheet.residual, sheet.lines, sheet.pulls, rows.w.shape[0]
+    longest, share = 0.0, _digits(rows)
+    for i in range(q):
+        longest += residual[i] * residual[i]
+    longest = sqrt(longest)
+    for k in range(3):
+        _multiply(rows, nodes[:, SLOPE0 + k], lines[k])
+        _project(rows, lines[k])
+        _pull_back(rows, lines[k], pulls[k])
+    for k in range(3):
+        for m in range(k, 3):
+            total = 0.0
+            for i in range(q):
+                total += lines[k, i] * lines[m, i]
+            sums[entry(k, m)] = total
+        total = 0.0
+        for i in range(q):
+            total += lines[k, i] * residual[i]
+        sums[G0 + k], sums[LENGTH0 + k] = total, sqrt(sums[entry(k, k)])
+    for j in range(nodes.shape[0]):
+        for k in range(6):
+            sums[k] += sheet.force[j] * curves[j, k]
+        for k in range(3):
+            sums[BLUR0 + k] += share * rows.weight[j] * abs(nodes[j, SLOPE0 + k])
+    for k in range(3):
+        sums[NOISE0 + k] = sums[LENGTH0 + k] * noise + sums[BLUR0 + k] * (longest + noise)
+    _turn_entries(half, curves, pulls, sums)
+    return _rest(rows, half, nodes, curves, noise + share * longest, sheet, sums)
+
+
+@compiled
+def _turn_entries(half: Array, curves: Array, pulls: Array, sums: Array) -> None:
+    """Write what is linear in s of the Hessian's change: the third derivatives but for the nodes' own."""
+    third = np.zeros((3, 6))  # entry (l, m) along k: sum_j pull_jk N_jlm
+    for j in range(curves.shape[0]):
+        for k in range(3):
+            for at in range(6):
+                third[k, at] += pulls[k, j] * curves[j, at]
+    for a in range(3):
+        for b in range(a, 3):
+            change = 0.0
+            for k in range(3):
+                turn = third[k, entry(a, b)] + third[a, entry(k, b)] + third[b, entry(k, a)]
+                change += half[k] * abs(turn)
+            # The rounding of J'J counts as change, twice: for the mean over a line half of a change counts.
+            blur = sums[LENGTH0 + a] * sums[BLUR0 + b] + sums[LENGTH0 + b] * sums[BLUR0 + a]
+            sums[C00 + entry(a, b)] = change + 2.0 * blur
+
+
+@compiled
+def _rest(rows: Rows, half: Array, nodes: Array, curves: Array, blur: float, sheet: Sheet, sums: Array) -> float:
+    """Return a bound of the norm of what else changes in the Hessian; arguments as of `sum_up_rows`."""
+    h0, h1, h2, reach = half[0], half[1], half[2], sheet.reach
+    size = sqrt(h0 * h0 + h1 * h1 + h2 * h2)
+    own = cross = ball = 0.0
+    for j in range(nodes.shape[0]):
+        chi = curves[j, CHI]
+        p0, p1, p2 = abs(sheet.pulls[0, j]), abs(sheet.pulls[1, j]), abs(sheet.pulls[2, j])
+        # Of its own Hessian with its force, and with what that changes to first order; of its gradient's second order.
+        ball += (abs(sheet.force[j]) + p0 * h0 + p1 * h1 + p2 * h2) * chi
+        cross += sqrt(p0 * p0 + p1 * p1 + p2 * p2) * chi * size
+        bend = _norm(curves, j)
+        own += rows.weight[j] * blur * bend
+        reach[j] = max(-nodes[j, LOW], nodes[j, HIGH])
+    if not ball < inf:
+        return inf
+    remainder = _largest(rows, reach, sheet.length)
+    for j in range(nodes.shape[0]):
+        reach[j] = _norm(curves, j)
+    bent = _largest(rows, reach, sheet.length)
+    for j in range(nodes.shape[0]):
+        reach[j] = curves[j, CHI]
+    wide = _largest(rows, reach, sheet.length)
+    # Changes of forces of second order, with Hessians and with their changes; and the square of the Jacobian's.
+    jump = bent * size + 0.5 * wide * size
+    return float(ball + cross + 2.0 * own + remainder * (bent + wide) + jump * jump)
+
+
+@compiled
+def _norm(curves: Array, j: int) -> float:
+    """Return the Frobenius norm of a node's Hessian."""
+    a, b, c = curves[j, H00], curves[j, H11], curves[j, H22]
+    d, e, f = curves[j, H01], curves[j, H02], curves[j, H12]
+    return sqrt(a * a + b * b + c * c + 2.0 * (d * d + e * e + f * f))
+
+
+@compiled
+def is_convex_by(half: Array, sums: Array, ball: float, margin: float) -> bool:
+    """Return whether the Hessian of f/2 exceeds `margin` all over a box, by its sums and bounds of their change."""
+    if not ball < inf:
+        return False
+    d0 = sums[C00] + sums[C01] + sums[C02] + ball + margin
+    d1 = sums[C01] + sums[C11] + sums[C12] + ball + margin
+    d2 = sums[C02] + sums[C12] + sums[C22] + ball + margin
+    # In the plane, and along a surface, nothing depends on the third coordinate.
+    second = 1.0 if half[1] == 0.0 and sums[H11] == 0.0 else sums[H11] - d1
+    third = 1.0 if half[2] == 0.0 and sums[H22] == 0.0 else sums[H22] - d2
+    return bool(positive(sums[H00] - d0, sums[H01], sums[H02], second, sums[H12], third))

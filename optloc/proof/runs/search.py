@@ -1,0 +1,383 @@
+"""The search of a run: boxes of all space, along a surface or of a region.
+
+Each box is looked at with the rows of few epochs first, which cost never more than all of them do, and with all rows
+only where those of few say nothing.
+"""
+
+from __future__ import annotations
+
+from math import inf, nan
+from typing import NamedTuple
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled
+from optloc.compute.systems import inverse, positive
+from optloc.proof.atlas import Atlas, position, set_centre, widen_around
+from optloc.proof.box import (
+    PIECE,
+    cost_at,
+    least_left,
+    least_residual,
+    linearise_rows,
+    pop,
+    push_halves,
+)
+from optloc.proof.chart import (
+    Box,
+    Chart,
+    Cost,
+    accuracy_floor,
+    curve_along,
+    empty_box,
+    is_bounded,
+    place,
+    widen,
+)
+from optloc.proof.curvature import G0, G1, G2, curve_nodes, has_no_infimum
+from optloc.proof.everywhere import (
+    ANOTHER,
+    CHEAPER,
+    CLEAR,
+    INFINITE,
+    SPENT,
+    accuracy_floor_far,
+    is_left,
+    is_listed,
+    steepest_side,
+)
+from optloc.proof.near import (
+    Aim,
+    is_known,
+    lay_or_halve,
+)
+from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
+from optloc.proof.nodes.node import H00, H01, H02, H11, H12, H22
+from optloc.proof.runs.posed import Run
+from optloc.proof.runs.rows import (
+    Sheet,
+    blur_of,
+    least_length,
+    residual_at,
+    sheet_of,
+    sum_up_rows,
+)
+from optloc.proof.surface import SLIP
+
+# Where a search takes place, and boxes in it.
+
+
+class Space(NamedTuple):
+    """Where a run is searched: an atlas of all positions, or search coordinates around a fix.
+
+    Parameters
+    ----------
+    far : bool
+        Whether it is the atlas.
+    atlas : Atlas
+        The pieces, with known minima.
+    chart : Chart
+        The search coordinates, along planes or on a piece of a surface.
+    minima, sides : array (P, 3)
+        Known minima in these, and half-widths of boxes around them on which the cost is convex.
+    """
+
+    far: bool
+    atlas: Atlas
+    chart: Chart
+    minima: Array
+    sides: Array
+
+
+class Tables(NamedTuple):
+    """Working memory: a box for few nodes and one for all, and a sheet for all rows."""
+
+    small: Box
+    box: Box
+    sheet: Sheet
+
+
+@compiled
+def tables_of(run: Run) -> Tables:
+    """Return tables for a run."""
+    box = empty_box(0, run.cost.kinds.shape[0])
+    box.lean[:], box.graph[:] = 0.0, 0.0  # which only a surface writes
+    return Tables(empty_box(run.look.K.shape[0], run.look.K.shape[1]), box, sheet_of(run.rows))
+
+
+@compiled
+def floor_of(space: Space, cost: Cost) -> float:
+    """Return the sizes of what residuals are differences of, beside the nodes."""
+    if space.far:
+        return accuracy_floor_far(cost, space.atlas)
+    return accuracy_floor(cost.kinds, cost.data, cost.weight, cost.w, space.chart.origin)
+
+
+@compiled
+def set_nodes(space: Space, cost: Cost, box: Box) -> bool:
+    """Bound the nodes of a cost over a box whose centre is set; return False where a surface is no graph over it."""
+    if space.far:
+        bound_pieces(space.atlas, cost.kinds, cost.data, box.half, box.nodes)
+        return True
+    return is_bounded(cost, space.chart, box)
+
+
+@compiled
+def set_curves(space: Space, cost: Cost, box: Box) -> None:
+    """Bound second derivatives of the nodes over a box whose nodes are bounded."""
+    chart = space.chart
+    if space.far:
+        curve_pieces(space.atlas, cost.kinds, cost.data, box.half, box.curves)
+    elif chart.surface.shape[0] > 0:
+        curve_along(cost, box)
+    else:
+        half, line, nodes, curves = box.half, box.line, box.nodes, box.curves
+        curve_nodes(cost.kinds, cost.data, box.centre, chart.sense, chart.gram, half, line, box.solve, nodes, curves)
+
+
+@compiled
+def sum_at(run: Run, space: Space, tables: Tables, floor: float) -> tuple[float, float]:
+    """Return the cost at the centre of a box that is set, and the norm of the rest of its Hessian's change.
+
+    The sums of the box are filled. Both are infinite where nothing is bounded.
+    """
+    box, sheet = tables.box, tables.sheet
+    if not set_nodes(space, run.cost, box):
+        return inf, inf
+    set_curves(space, run.cost, box)
+    here = residual_at(run.rows, box.nodes, sheet)
+    noise = blur_of(run.rows, floor, box.nodes)
+    return here, sum_up_rows(run.rows, box.half, box.nodes, box.curves, noise, sheet, box.sums)
+
+
+@compiled
+def place_of(space: Space, box: Box, x: Array) -> None:
+    """Write the position x (D,) of the centre of a box that is set."""
+    if space.far:
+        position(space.atlas, x)
+    else:
+        for k in range(x.shape[0]):
+            x[k] = box.centre[k]
+
+
+# The search.
+
+# Boxes are looked at with all rows where few of them cost less than so many levels at the centre: elsewhere halves are
+# dropped by few as well.
+_WORTH = 4.0
+# The test for stationary points is made where the cost at the centre is within so many levels, as in
+# `optloc.proof.everywhere`; and boxes at infinity are not split below a size.
+_NEAR, _TINY = 100.0, 1e-5
+# Boxes on the stack: pieces, slabs around known minima, and one for each halving of the deepest.
+CAPACITY = 4096
+# Looks at few rows for each at all rows, at most: they take a twentieth of the time.
+_LOOKS = 10
+
+
+@compiled
+def search_run(
+    run: Run, space: Space, tables: Tables, stack: Array, size: int, aim: Aim, budget: int, found: Array
+) -> tuple[int, int, float]:
+    """Search boxes for minima of a run that cost less than a level.
+
+    Parameters
+    ----------
+    run : Run
+        The cost.
+    space : Space
+        Where the boxes are.
+    tables : Tables
+        Working memory.
+    stack, size : array (capacity, DEPTH), int
+        The boxes.
+    aim : Aim
+        What is to be shown of each.
+    budget : int
+        How many boxes may be looked at with all rows, and `_LOOKS` times as many with few.
+    found : array (D,)
+        Written: the point of the outcomes CHEAPER and ANOTHER.
+
+    Returns
+    -------
+    outcome, boxes, bound
+        As of `optloc.proof.everywhere.search_everywhere`.
+    """
+    look, small, d, boxes, looks, lows = run.look, tables.small, found.shape[0], 0, 0, 0
+    floors = floor_of(space, look), floor_of(space, run.cost)
+    while size > 0:
+        if boxes >= budget or looks >= _LOOKS * budget or size + 2 > stack.shape[0]:
+            return SPENT, looks, least_left(stack, size)
+        size -= 1
+        looks += 1
+        pop(stack, size, small.at, small.half)
+        piece = int(stack[size, PIECE])
+        left = _set_small(run, space, tables, piece, stack, size)
+        if left >= 0:
+            size = left
+            continue
+        linearise_rows(look.K, look.w, small.nodes, small.rows)
+        low = least_residual(look.K, look.weight, floors[0], small.half, small.nodes, small.rows)
+        if low > 0.0 and low * low >= aim.level:
+            continue
+        side = steepest_side(small, d)
+        if cost_at(look.K, look.w, small.nodes) < _WORTH * (aim.level + 1.0):
+            boxes += 1
+            tables.box.at[:], tables.box.half[:] = small.at, small.half
+            touching = space.far and piece < 2 * d and small.at[d - 1] <= small.half[d - 1]
+            here, more = _bound(run, space, tables, floors[1], aim.level)
+            low = max(low, more)
+            if here < aim.better:
+                place_of(space, tables.box, found)
+                return CHEAPER, looks, 0.0
+            if _is_done(run, space, tables, aim, here, low, touching, floors[1]):
+                continue
+            lows += int(here < aim.level)
+            # At the first, second, fourth ... low centre: found early, and seldom looked for in vain.
+            if here < aim.level and lows & (lows - 1) == 0:
+                if _descends(run, space, tables, aim.level, found):
+                    return ANOTHER, looks, 0.0
+                _set_place(space, small, piece)
+            if touching and _is_flat_out(run, space, tables, aim.level):
+                return INFINITE, looks, 0.0
+        size = push_halves(stack, size, side, small.at, small.half, low, piece, space.far and piece <= 2 * d)
+    return CLEAR, looks, aim.value
+
+
+@compiled
+def _set_small(run: Run, space: Space, tables: Tables, piece: int, stack: Array, size: int) -> int:
+    """Bound the nodes of few rows over a box; return -1, or where there is nothing to bound the size of the stack."""
+    small, bent = tables.small, space.chart.surface.shape[0] > 0
+    _set_place(space, small, piece)
+    if space.far:
+        if piece > 2 * space.atlas.dimension:
+            widen_around(space.atlas, piece - 2 * space.atlas.dimension - 1, small.half)
+        if is_left(space.atlas, small, piece):
+            return size
+    else:
+        widen(space.chart, small.centre, small.half)
+        if is_known(small.at, small.half, space.minima, space.sides):
+            return size
+        if bent:
+            return lay_or_halve(run.look, space.chart, small, stack, size)
+    set_nodes(space, run.look, small)
+    return -1
+
+
+@compiled
+def _set_place(space: Space, box: Box, piece: int) -> None:
+    """Set the centre of a box."""
+    if space.far:
+        set_centre(space.atlas, piece, box.at)
+    else:
+        place(space.chart.origin, space.chart.sense, box.at, box.centre)
+
+
+@compiled
+def _is_done(
+    run: Run, space: Space, tables: Tables, aim: Aim, here: float, low: float, touching: bool, floor: float
+) -> bool:
+    """Return whether a box that has a cost at its centre and a bound need not be split."""
+    if low > 0.0 and low * low >= aim.level:
+        return True
+    if not (aim.whole or (low > 0.0 and low * low >= aim.value)) or not here < _NEAR * (aim.level + 1.0):
+        return False
+    box, d = tables.box, space.atlas.dimension if space.far else 3
+    _, ball = sum_at(run, space, tables, floor)
+    return has_no_infimum(d, touching, box.half, box.sums, ball, box.solve)
+
+
+@compiled
+def _is_flat_out(run: Run, space: Space, tables: Tables, level: float) -> bool:
+    """Return whether a small box at infinity costs less than a level there."""
+    half, box = tables.small.half, tables.box
+    if not max(half[0], half[1], half[2]) < _TINY:
+        return False
+    space.atlas.scale[0] = 0.0
+    bound_pieces(space.atlas, run.cost.kinds, run.cost.data, half, box.nodes)
+    return residual_at(run.rows, box.nodes, tables.sheet) < level
+
+
+@compiled
+def _bound(run: Run, space: Space, tables: Tables, floor: float, level: float) -> tuple[float, float]:
+    """Return the cost at the centre of a box and a lower bound of the residual over it, negative where none is."""
+    box, sheet, rows = tables.box, tables.sheet, run.rows
+    if not set_nodes(space, run.cost, box):
+        return inf, -1.0
+    here = residual_at(rows, box.nodes, sheet)
+    if here < level:  # no bound will do
+        return here, -1.0
+    noise, slip = blur_of(rows, floor, box.nodes), box.graph[SLIP]
+    low = least_length(box.half, box.nodes, box.curves, box.lean, slip, sheet, here, False) - noise
+    if low > 0.0 and low * low >= level:
+        return here, low
+    set_curves(space, run.cost, box)
+    return here, max(low, least_length(box.half, box.nodes, box.curves, box.lean, slip, sheet, here, True) - noise)
+
+
+# Descents.
+
+# Steps, and the length of one in standard deviations that ends it.
+_STEPS, _CLOSE = 40, 1e-3
+# How far outside its piece of an atlas a descent may go: beyond it others descend.
+_ASIDE = 1.5
+
+
+@compiled
+def _descends(run: Run, space: Space, tables: Tables, level: float, found: Array) -> bool:
+    """Return whether the centre of a box descends to a minimum below the level that is not known, and write it."""
+    box, d, home = tables.box, found.shape[0], 0
+    u, before, face = box.at.copy(), np.zeros(3), False
+    if space.far:
+        home = int(space.atlas.place[0])
+        face = home < 2 * d
+        for k in range(d):
+            u[k] = space.atlas.place[1 + k]
+    now, damping = cost_at_coordinates(run, space, tables, home, u), 1e-3
+    for _ in range(_STEPS):
+        length = _step(box, damping)
+        if not length >= 0.0:
+            return False
+        before[:] = u
+        inside = True
+        for k in range(3):
+            u[k] -= box.solve[0, k]
+            inside = inside and (not space.far or abs(u[k]) <= _ASIDE)
+        inside = inside and not (face and not u[d - 1] > 0.0)
+        after = cost_at_coordinates(run, space, tables, home, u) if inside else inf
+        if after <= now:
+            now, damping = after, 0.1 * damping
+            if length < _CLOSE * _CLOSE:
+                place_of(space, box, found)
+                known = is_listed(space.atlas, found) if space.far else is_known(u, box.half, space.minima, space.sides)
+                return now < level and not known
+        else:
+            u[:], damping = before, max(10.0 * damping, 1e-4)
+            cost_at_coordinates(run, space, tables, home, u)
+    return False
+
+
+@compiled
+def cost_at_coordinates(run: Run, space: Space, tables: Tables, home: int, u: Array) -> float:
+    """Return the cost at coordinates of a piece, with its derivatives in the sums of the box."""
+    tables.box.at[:], tables.box.half[:] = u, 0.0
+    if space.far:
+        set_centre(space.atlas, home, u)
+    return sum_at(run, space, tables, 0.0)[0]
+
+
+@compiled
+def _step(box: Box, damping: float) -> float:
+    """Write a damped Newton step into box.solve[0]; return its squared length, NaN where there is none."""
+    sums, solve, more = box.sums, box.solve, 1.0 + damping
+    h3, h5 = sums[H11] if sums[H11] != 0.0 else 1.0, sums[H22] if sums[H22] != 0.0 else 1.0
+    if not positive(sums[H00], sums[H01], sums[H02], h3, sums[H12], h5):
+        return nan
+    if not inverse(sums[H00] * more, sums[H01], sums[H02], h3 * more, sums[H12], h5 * more, solve):
+        return nan
+    g0, g1, g2 = sums[G0], sums[G1], sums[G2]
+    s0 = solve[0, 0] * g0 + solve[0, 1] * g1 + solve[0, 2] * g2
+    s1 = solve[1, 0] * g0 + solve[1, 1] * g1 + solve[1, 2] * g2
+    s2 = solve[2, 0] * g0 + solve[2, 1] * g1 + solve[2, 2] * g2
+    solve[0, 0], solve[0, 1], solve[0, 2] = s0, s1, s2
+    return float(s0 * g0 + s1 * g1 + s2 * g2)

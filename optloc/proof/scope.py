@@ -1,0 +1,144 @@
+"""What the proof covers: one static position and rows of ranges, rates, angles, ratios, heights; and what is a run."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from optloc.base.types import Band
+from optloc.compute.jit import enabled
+from optloc.linear.constraints import is_exact
+from optloc.linear.normal import prior_parts
+from optloc.models import MODELS
+from optloc.problem.problem import Problem
+from optloc.proof.pose import own_epochs
+
+# Different ranges, angles and ratios, and unknowns beside the position, of a problem whose proof is worth the time: a
+# box of ten thousand nodes takes a millisecond, and plain Python takes a thousand times longer.
+MOST_NODES, MOST_NODES_PLAIN, MOST_UNKNOWNS = 10_000, 24, 128
+# Nodes beyond which a proof is that of a run, whose time goes with the nodes, not with their square: of stations that
+# move (of 25 nodes of five epochs no box was looked at within the budget of dense rows; up to here plain Python begins
+# where there is no machine code), and of those that stay, whose batches share their rows.
+SHORT, MOST_DENSE = 24, 128
+
+
+def unsupported(problem: Problem) -> str:
+    """Return why a problem is beyond the proof, in a sentence that names what, or nothing where it is within.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of problems.
+    """
+    return next(_reasons(problem), "")
+
+
+def _reasons(problem: Problem) -> Iterator[str]:
+    if len(problem.motions) != 1:
+        yield f"there are {len(problem.motions)} targets, and the proof is for one"
+        return
+    motion = problem.motions[0]
+    if motion.known is not None or not any(slot.name == "position" for slot in problem.layout.shared):
+        yield "no position is common to all rows"
+    if motion.order > 0:
+        yield "the target moves, and the proof is for one that stays"
+    yield from _beyond_rows(problem)
+    yield from _beyond_biases(problem)
+    yield from _beyond_stations(problem)
+    yield from _beyond_constraints(problem)
+    known = {"position", "stations", *(bias.name for bias in problem.biases)}
+    # What `optloc.proof.pose` does not write as rows would be left out of the cost without a word.
+    for name, _, _ in prior_parts(problem):
+        if name not in known:
+            yield f"the prior on {name} is not covered"
+
+
+def _beyond_rows(problem: Problem) -> Iterator[str]:
+    for rows in problem.rows:
+        model = MODELS[rows.kind]
+        if model.ranges is None and not model.nodes:
+            yield f"{rows.kind} rows are neither sums of ranges or rates nor a kind whose bounds are known"
+    most = MOST_NODES if enabled() else MOST_NODES_PLAIN
+    if problem.count > most and _nodes(problem) > most:
+        without = "" if enabled() else " without machine code"
+        yield f"there are {_nodes(problem)} different ranges, rates and angles, and the proof takes {most}{without}"
+    if problem.layout.size - problem.dimension > MOST_UNKNOWNS:
+        yield f"there are {problem.layout.size} unknowns, and the proof takes {MOST_UNKNOWNS}"
+
+
+def is_run(problem: Problem) -> bool:
+    """Return whether a proof is that of a run (`optloc.proof.runs`): its rows have too many nodes for dense ones."""
+    most = SHORT if own_epochs(problem) > 1 else MOST_DENSE
+    return 2 * problem.count > most and _nodes(problem) > most
+
+
+def crowded(problem: Problem) -> str:
+    """Return why a problem is beyond what works with dense rows, in a sentence, or nothing where it is within."""
+    number = _nodes(problem)
+    return "" if number <= MOST_DENSE else f"there are {number} different ranges, rates and angles, over {MOST_DENSE}"
+
+
+def _nodes(problem: Problem) -> int:
+    """Return how many different ranges, rates, angles, ratios and heights the rows are made of."""
+    moving, own = own_epochs(problem) > 1, 0
+    found: set[tuple[bool, int, int]] = set()
+    for rows in problem.rows:
+        model = MODELS[rows.kind]
+        if model.signs is None:
+            own += rows.count * len(model.nodes)
+            continue
+        when = rows.epoch if moving else np.zeros_like(rows.epoch)
+        for index in (rows.a, rows.b)[: model.stations]:
+            found.update((model.ranges is None, *key) for key in zip(index.tolist(), when.tolist(), strict=True))
+    return own + len(found)
+
+
+def _beyond_biases(problem: Problem) -> Iterator[str]:
+    angular = np.concatenate([np.full(rows.count, MODELS[rows.kind].period is not None) for rows in problem.rows])
+    for bias in problem.biases:
+        if bias.form not in ("offset", "drift"):
+            does = "moves stations" if bias.form == "time" else "multiplies what it touches"
+            yield f"the {bias.form} {bias.name!r} {does}, and the proof takes what is added"
+        elif bias.sigma is None and angular[bias.row].any():
+            yield f"the bias {bias.name!r} of angles has no prior, and may be whole turns"
+
+
+def _beyond_stations(problem: Problem) -> Iterator[str]:
+    covariance = problem.stations.covariance
+    if covariance is None:
+        return
+    # A sphere is what makes the nearest place to the surveyed one lie on the line to the target.
+    same = np.eye(problem.dimension) * covariance[..., :1, :1]
+    if not np.allclose(covariance, same, rtol=1e-9, atol=0.0):
+        yield "the station errors differ from axis to axis"
+    if problem.stations.span == "run" and _move(problem):
+        yield "station errors last the whole run while stations move, and the proof takes one line of sight for each"
+    bent = [rows.kind for rows in problem.rows if MODELS[rows.kind].ranges is None and MODELS[rows.kind].stations]
+    if bent:
+        yield f"station errors enter {bent[0]} rows in a way that depends on the place"
+
+
+def _move(problem: Problem) -> bool:
+    """Return whether a station that rows of several epochs name is at different places in them."""
+    place = problem.stations.position
+    if place.shape[-3] < 2:
+        return False
+    named = np.concatenate([(rows.a, rows.b)[k] for rows in problem.rows for k in range(MODELS[rows.kind].stations)])
+    when = np.concatenate([rows.epoch for rows in problem.rows for k in range(MODELS[rows.kind].stations)])
+    for station in np.unique(named):
+        seen = place[..., np.unique(when[named == station]), station, :]
+        if (seen != seen[..., :1, :]).any():
+            return True
+    return False
+
+
+def _beyond_constraints(problem: Problem) -> Iterator[str]:
+    levels = [constraint for constraint in problem.constraints if is_exact(constraint)]
+    if len(levels) > 1 and any(isinstance(level, Band) and level.kind == "height" for level in levels):
+        yield "a height that is known together with another equality leaves a line, which the proof does not follow"
+    if len(levels) >= problem.dimension:
+        yield "the equalities leave no way to move"
+    for constraint in problem.constraints:
+        if is_exact(constraint) and isinstance(constraint, Band) and constraint.kind not in ("height", "plane"):
+            yield f"the equality {constraint.name!r} is neither a height nor a plane"
