@@ -16,14 +16,14 @@ from optloc.base.types import Array, Certificate, Status
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.loss import LOSSES
 from optloc.problem.problem import Problem
-from optloc.proof.pose import unsupported
+from optloc.proof.scope import unsupported
 from optloc.solvers import stages
 from optloc.solvers.certify.branch_and_bound import certified, value_certified
 from optloc.solvers.formulations import FORMULATIONS, Formulation
 from optloc.solvers.outside import FixSolver, adapt
 from optloc.solvers.policy import LISTED_GAP
 from optloc.solvers.pool import Pool, offer, pack, where
-from optloc.solvers.range_fixes import Quick
+from optloc.solvers.range_fixes import Quick, worth
 from optloc.solvers.robust.stage import Robust
 from optloc.solvers.sparse import sparse
 from optloc.solvers.stages import Solver
@@ -177,11 +177,8 @@ def _derive() -> Mapping[str, Entry]:
 
 SOLVERS: Table[Entry] = Table("optloc.solvers", lambda value: isinstance(value, Entry), _STAGES, _derive)
 
-# Problems from which on the compiled shortcut is used: machine code takes time to load, more than the stages take for
-# fewer.
-WORTH = 16
 # Beginnings of methods for which there is a stage that does the same in one.
-SHORTCUTS: Mapping[tuple[str, ...], Quick] = {("gtrs", "lsr"): Quick(WORTH)}
+SHORTCUTS: Mapping[tuple[str, ...], Quick] = {("gtrs", "lsr"): Quick()}
 
 # What stands behind "|" is for the problems of which not everything is proven by then.
 METHODS = {
@@ -239,7 +236,7 @@ class Method:
             name = "+".join(words)
             if shortcut(self):
                 return [_named(name, replace(short, alone=True))]
-            if count >= short.least and self.words[: len(words)] == words:
+            if count >= worth(count) and self.words[: len(words)] == words:
                 return [_named(name, short), *map(_stage, self.words[len(words) :])]
         return [_stage(word) for word in self.words]
 

@@ -19,13 +19,14 @@ from optloc.linear.constraints import exact
 from optloc.linear.normal import decrement, step
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
-from optloc.proof.pose import unsupported
+from optloc.proof.scope import unsupported
 from optloc.solvers.formulations import FORMULATIONS
 from optloc.solvers.inequalities import bound_pool, least_finished
 from optloc.solvers.policy import DOUBT
 from optloc.solvers.pool import Pool, offer, pack
 from optloc.solvers.refine import refine
 from optloc.solvers.starts.best_first import best_first_starts
+from optloc.solvers.starts.moving import moves_at_once, moving_starts
 from optloc.solvers.starts.position import (
     along_the_valley,
     hold_still,
@@ -219,6 +220,8 @@ def search(problem: Problem, pool: Pool | None) -> Pool:
         raise InvalidProblem("search fills the gaps of a fix", "method", "put it behind a refinement")
     if not unsupported(problem):
         pool = _answer(problem, pool, lambda part: _with_offsets(part, best_first_starts(part)), lambda why: {})
+    elif moves_at_once(problem):
+        pool = _answer(problem, pool, lambda part: _with_offsets(part, moving_starts(part)), lambda why: {})
     if one_position(problem):
         pool = _answer(problem, pool, lambda part: vectors(part, pack(_search_starts(part))), _searched)
     return pool

@@ -15,14 +15,17 @@ from optloc.solvers.policy import LISTED_GAP
 
 SLACK, SAME = 1e-5, 1e-2
 PASSES = "one pass of a satellite"
+NINE = "passes of nine satellites"
 SATELLITES = "three satellites, TDOA + FDOA"
 # Fixes of a call; of mixtures each call has other kinds and stations.
 BATCH = 10
 FULL = dict.fromkeys(FAMILIES, 200)
-FULL |= {name: 2000 for name in FAMILIES if "bearing" in name} | {name: 250 for name in FAMILIES if "mixtures" in name}
-FULL |= {PASSES: 2000, SATELLITES: 2000}
+FULL |= {name: 700 for name in FAMILIES if "bearing" in name} | {name: 250 for name in FAMILIES if "mixtures" in name}
+FULL |= {PASSES: 2000, SATELLITES: 2000, NINE: 100}
 # Descents from random places, beside the truth and the best dozen of a grid.
 STARTS = 4
+# Descents of each long run from random places alone.
+_ANYWHERE = 10
 METHODS = ("gtrs+lsr", "roots+lsr", "searched", "proven")
 HEADER = [
     "rows",
@@ -206,6 +209,20 @@ def _against_bound(besides: Counter, scenes: Scenes, fix: Fix, best: np.ndarray)
             besides["covered"] += bool(squared < chi2.ppf(0.95, 2))
 
 
+def _from_anywhere(besides: Counter, scenes: Scenes, fix: Fix, best: np.ndarray) -> None:
+    """Count the descents from random places on Earth that end at the best place."""
+    rng = np.random.default_rng(int(1e6 * scenes.truth[0, 0]) % 2**32)
+    for i in range(len(scenes.truth)):
+        trial = Trial(scenes, i)
+        for start in trial.anywhere(rng, _ANYWHERE):
+            besides["descents"] += 1
+            besides["arrived"] += bool(trial.descended(start)[1] < best[i] + SLACK * (1.0 + best[i]))
+
+
+def _said_of_descents(besides: Counter) -> str:
+    return f"{besides['arrived']} of {besides['descents']} descents from random places end at the best one"
+
+
 def _said_of_sides(besides: Counter) -> str:
     n = max(besides["judged"], 1)
     stated, exact = (f"{besides[key] / n:.4f}" for key in ("stated", "exact"))
@@ -224,8 +241,13 @@ def _said_of_methods(besides: Counter) -> str:
 
 
 HYBRIDS = [name for name in FAMILIES if "bearing" in name]
-BESIDES = {PASSES: _sides, SATELLITES: _against_bound, **dict.fromkeys(HYBRIDS, _by_any_method)}
-SAID = {PASSES: _said_of_sides, SATELLITES: _said_of_bound, **dict.fromkeys(HYBRIDS, _said_of_methods)}
+BESIDES = {PASSES: _sides, NINE: _from_anywhere, SATELLITES: _against_bound, **dict.fromkeys(HYBRIDS, _by_any_method)}
+SAID = {
+    PASSES: _said_of_sides,
+    NINE: _said_of_descents,
+    SATELLITES: _said_of_bound,
+    **dict.fromkeys(HYBRIDS, _said_of_methods),
+}
 
 
 def judge(made: Counted) -> None:

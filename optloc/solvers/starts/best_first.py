@@ -10,6 +10,8 @@ from optloc.linear.constraints import is_exact
 from optloc.problem.problem import Problem
 from optloc.proof.best_first import Places, find_minima
 from optloc.proof.pose import pose_costs
+from optloc.proof.runs.posed import pose_few
+from optloc.proof.scope import is_run
 from optloc.solvers.certify.posed import surfaces_of
 from optloc.solvers.policy import LISTED_GAP
 from optloc.solvers.starts.position import spread_of
@@ -17,6 +19,8 @@ from optloc.solvers.starts.position import spread_of
 # Boxes for each problem, with machine code and without: one takes some microseconds, or a thousand times that. Mixtures
 # of frequencies, times and angles take 100 to 1 500.
 _BUDGET, _SLOW_BUDGET = 4000, 400
+# Boxes for the few rows of a run: its best minimum is met within a hundred, and all others are the proof's to find.
+_RUN_BUDGET = 500
 # Minima that are kept: a pass of a satellite has two, exact solutions of three frequencies in space up to a handful.
 _MOST = 12
 # Spreads of the stations around their centre that are searched where nothing bounds the cheap positions: as a proof of
@@ -30,7 +34,7 @@ def best_first_starts(problem: Problem) -> Array:
     Parameters
     ----------
     problem : Problem
-        N problems within the scope of the proof (`optloc.proof.pose.unsupported`).
+        N problems within the scope of the proof (`optloc.proof.scope.unsupported`).
     """
     size, d = problem.batch_shape[0], problem.dimension
     centre, spread = spread_of(problem)
@@ -38,8 +42,18 @@ def best_first_starts(problem: Problem) -> Array:
     x = _on_planes(problem, np.broadcast_to(centre, (size, d)))
     planes, surface = surfaces_of(problem, x)
     places = Places(x, np.broadcast_to(region, (size, 2, d)), planes, surface)
-    points, _ = find_minima(pose_costs(problem), places, LISTED_GAP, _BUDGET if enabled() else _SLOW_BUDGET, _MOST)
-    return points
+    budget = _BUDGET if enabled() else _SLOW_BUDGET
+    if not is_run(problem):
+        return find_minima(pose_costs(problem), places, LISTED_GAP, budget, _MOST)[0]
+    # Few rows of a run are enough to begin with: the rest decides between their minima.
+    looks = [pose_few(problem.take(np.array([i]))) for i in range(size)]
+    each = [find_minima(look, _place(places, i), LISTED_GAP, _RUN_BUDGET, _MOST)[0] for i, look in enumerate(looks)]
+    return np.concatenate(each)
+
+
+def _place(places: Places, i: int) -> Places:
+    """Return the places of one problem as a batch."""
+    return Places(*(array[i : i + 1] for array in places))
 
 
 def _on_planes(problem: Problem, x: Array) -> Array:

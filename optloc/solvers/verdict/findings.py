@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from scipy.special import gammainccinv
@@ -21,6 +22,13 @@ from optloc.solvers.pool import Curvature, Pool
 from optloc.solvers.starts.position import one_position, rows_of_stations
 
 NOT_TRIED = "no proof was tried"
+BENT_SENTENCE = {
+    INVERSE_RANGE: "Gaussian in inverse range, not in metres",
+    CURVED: "Gaussian neither in metres nor in inverse range",
+}
+"""What is said of a fix that is `curved`, by the kind of its chart."""
+_MISFIT, _UNBOUNDED, _AMBIGUOUS = Status.MISFIT.mark, Status.UNBOUNDED.mark, Status.AMBIGUOUS.mark
+_UNPROVEN, _CURVED = Status.UNPROVEN.mark, Status.CURVED.mark
 _ALIKE = 1e-3  # gaps below this are told as "fits as well": a reader gains nothing from more zeros
 # Gaps to infinity below this come from rounding: the fix itself is as far away as counts.
 _NONE = 1e-6
@@ -41,16 +49,19 @@ def mark(problem: Problem, pool: Pool, gap: Array) -> Array:
     gap : array (N, r)
         Costs of the other minima less that of the best; infinite where there is none.
     """
-    cost = pool.cost[:, 0]
-    marks = np.zeros(len(pool), dtype=np.int32)
-    if not pool.loss:  # a loss bears gross errors: their cost refutes nothing
-        marks[is_improbable(cost, pool.dof, REFUTED)] |= Status.MISFIT.mark
+    cost, kappa = pool.cost[:, 0], None if pool.curvature is None else pool.curvature.kappa
+    with np.errstate(invalid="ignore"):
+        marks: Array = marks_of(
+            # a loss bears gross errors: their cost refutes nothing
+            np.zeros(len(pool), dtype=bool) if pool.loss else is_improbable(cost, pool.dof, REFUTED),
+            np.nan if pool.infinity is None else pool.infinity - cost,
+            quantile(COVERED, problem.dimension),
+            gap.min(1, initial=np.inf),
+            np.nan if kappa is None else kappa[:, 0],
+            _is_unique(pool),
+        ).astype(np.int32)
     if pool.refuted:
         marks |= Status.MISFIT.mark
-    marks[is_open(problem, pool)] |= Status.UNBOUNDED.mark
-    if gap.shape[1]:
-        marks[gap.min(1) < AMBIGUOUS_GAP] |= Status.AMBIGUOUS.mark
-    marks |= np.where(_is_unique(pool), 0, Status.UNPROVEN.mark).astype(np.int32)
     if pool.searched is not None:
         # a proof makes up for the start that was not safe
         unsure = pool.searched & (marks & Status.UNPROVEN.mark != 0)
@@ -58,36 +69,50 @@ def mark(problem: Problem, pool: Pool, gap: Array) -> Array:
     if pool.asked:  # without redundancy a search for suspects sees nothing, and with one it cannot tell who it is
         blind = (pool.dof <= 0) | ((pool.dof == 1) & is_improbable(cost, pool.dof, NOTICED))
         marks[blind & (marks & Status.SEARCHED.mark == 0)] |= Status.UNPROVEN.mark
-    assert pool.curvature is not None
-    if pool.curvature.kappa is not None:
-        with np.errstate(invalid="ignore"):
-            marks[pool.curvature.kappa[:, 0] > BENT] |= Status.CURVED.mark
     return marks
+
+
+def marks_of(improbable: Any, infinity: Any, region: float, gap: Any, kappa: Any, unique: Any) -> Any:
+    """Return the marks of what numbers say against one finished answer, or against many (N,); NaN says nothing.
+
+    Parameters
+    ----------
+    improbable : bool
+        Whether noise so rarely makes such a cost that the model is refuted.
+    infinity, region : float
+        Least cost at infinity less that of the answer, and by how much costs in the likelihood region exceed it.
+    gap : float
+        Cost of the cheapest other minimum less that of the answer.
+    kappa : float
+        Departure from a Gaussian in metres, see `optloc.solvers.pool.Curvature`.
+    unique : bool
+        As of `is_proof_of_one`.
+    """
+    # operators alone, so that numbers and arrays take the same rules
+    return (
+        (improbable * _MISFIT)
+        | ((infinity <= region) * _UNBOUNDED)
+        | ((gap < AMBIGUOUS_GAP) * _AMBIGUOUS)
+        | ((unique ^ True) * _UNPROVEN)
+        | ((kappa > BENT) * _CURVED)
+    )
 
 
 def is_improbable(cost: Array, dof: Array, probability: float) -> Array:
     """Return where costs (N,) are so large that noise makes them with less than a probability, (N,)."""
     # often one number for all, as a view without strides
     if dof.strides == (0,):
-        level = int(dof[0]) if len(dof) else 0
-        return np.asarray(cost > _limit(level, probability)) if level > 0 else np.zeros(len(cost), dtype=bool)
+        return np.asarray(cost > largest(int(dof[0]) if len(dof) else 0, probability))
     out = np.zeros(len(cost), dtype=bool)
     for level in np.unique(dof[dof > 0]):
-        out |= (dof == level) & (cost > _limit(int(level), probability))
+        out |= (dof == level) & (cost > largest(int(level), probability))
     return out
 
 
 @lru_cache(maxsize=512)
-def _limit(dof: int, probability: float) -> float:
-    return float(2.0 * gammainccinv(dof / 2, probability))
-
-
-def is_open(problem: Problem, pool: Pool) -> Array:
-    """Return where infinity lies inside the likelihood region, as far as it was looked at, (N,)."""
-    if pool.infinity is None:
-        return np.zeros(len(pool), dtype=bool)
-    with np.errstate(invalid="ignore"):
-        return np.asarray(pool.infinity <= pool.cost[:, 0] + quantile(COVERED, problem.dimension))
+def largest(dof: int, probability: float) -> float:
+    """Return the cost that noise exceeds with a probability; infinite without redundancy, which tells nothing."""
+    return float(2.0 * gammainccinv(dof / 2, probability)) if dof > 0 else np.inf
 
 
 def _is_unique(pool: Pool) -> Array:
@@ -97,10 +122,18 @@ def _is_unique(pool: Pool) -> Array:
         return out
     between = np.zeros(len(pool)) if pool.infinity is None else pool.infinity - pool.cost[:, 0]
     for i, claim in enumerate(pool.certificate):
-        if isinstance(claim, Certificate) and claim.unique and (claim.proof == "global" or claim.asked):
-            # where infinity comes before the gap, up to there: what lies beyond is infinity's
-            out[i] = claim.margin >= AMBIGUOUS_GAP or 0.0 < between[i] < AMBIGUOUS_GAP
+        out[i] = isinstance(claim, Certificate) and is_proof_of_one(claim, between[i])
     return out
+
+
+def is_proof_of_one(claim: Certificate, infinity: float) -> bool:
+    """Return whether a certificate says that no other minimum than those listed costs less than the gap more.
+
+    Where infinity, which costs so much more, comes before the gap, up to there: what lies beyond is infinity's.
+    """
+    if not (claim.unique and (claim.proof == "global" or claim.asked)):
+        return False
+    return claim.margin >= AMBIGUOUS_GAP or 0.0 < infinity < AMBIGUOUS_GAP
 
 
 def examine(problem: Problem, pool: Pool) -> Pool:
@@ -201,11 +234,20 @@ def chart_of(problem: Problem, x: Array, covariance: Array, curvature: Curvature
     kind = np.full(len(x), CURVED, dtype=np.int8)
     if curvature.kappa is not None:
         with np.errstate(invalid="ignore"):
-            kind[curvature.kappa[:, 1] <= BENT] = INVERSE_RANGE
-            kind[curvature.kappa[:, 0] <= BENT] = CARTESIAN
+            kind = chart_kind(curvature.kappa[:, 0], curvature.kappa[:, 1]).astype(np.int8)
     centre = centre_of(problem)
     centre = np.broadcast_to(centre, (len(x), centre.shape[-1]))
     return Chart(kind, x[:, part], covariance[:, part, part], centre)
+
+
+def chart_kind(metres: Any, inverse: Any) -> Any:
+    """Return the kind of chart of one fix, or of many (N,), from the two numbers of `Curvature.kappa`.
+
+    The first of the kinds whose number is small: NaN is not.
+    """
+    assert (CARTESIAN, INVERSE_RANGE, CURVED) == (0, 1, 2)  # so each number that is not small counts as one kind more
+    bent = (metres <= BENT) ^ True
+    return bent * 1 + (bent & ((inverse <= BENT) ^ True)) * 1
 
 
 # What applies, in sentences.
@@ -246,12 +288,13 @@ def explain(problem: Problem, pool: Pool, code: Array, gap: Array, certificate: 
         assert pool.infinity is not None
         more = float(pool.infinity[i] - cost[i])
         reason[i] = f"infinity costs {f'only {more:.2g}' if more > _NONE else 'no'} more"
-    if (code == Status.CURVED).any():
+    curved = empty & (code == Status.CURVED)
+    if curved.any():
         assert pool.curvature is not None
         assert pool.curvature.kappa is not None
-        inverse = pool.curvature.kappa[:, 1] <= BENT
-        reason[empty & (code == Status.CURVED) & inverse] = "Gaussian in inverse range, not in metres"
-        reason[empty & (code == Status.CURVED) & ~inverse] = "Gaussian neither in metres nor in inverse range"
+        kind = chart_kind(pool.curvature.kappa[:, 0], pool.curvature.kappa[:, 1])
+        for each in (INVERSE_RANGE, CURVED):
+            reason[curved & (kind == each)] = BENT_SENTENCE[each]
     if pool.searched is not None and pool.remark is not None:
         told = pool.searched & (code == Status.SEARCHED)
         reason[told] = pool.remark[told]

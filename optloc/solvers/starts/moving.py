@@ -1,0 +1,156 @@
+"""Starts of a target whose velocity is unknown, from range rates of one epoch: boxes of all space in best-first order.
+
+Given the position, rates are linear in the velocity, which is taken off at the centre of each box. Over the box the
+lines of sight turn, by so much that a velocity of known size changes no residual by more than a bound says; boxes are
+looked at in the order of the bounds that are left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from heapq import heapify, heappop, heappush
+from math import sqrt
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import plain
+from optloc.linear.constraints import exact
+from optloc.problem.problem import Problem
+from optloc.proof.atlas import Atlas, atlas_of, position, set_centre
+from optloc.proof.everywhere import cube, reaches_infinity
+from optloc.proof.nodes.dispatch import bound_pieces
+from optloc.proof.nodes.node import HIGH, LOW, NODE_WIDTH, PHI, RATE, SLOPE0
+from optloc.proof.pose import Posed, pose_costs
+from optloc.proof.scope import is_run, unsupported
+
+# Boxes for each problem; centres that are kept, the cheapest of them.
+_BUDGET, _MOST = 600, 24
+# Metres per second that a target is taken to move at most: above what flies in the air. It orders boxes, and no more: a
+# faster one is found by those that are cheap all the same.
+_SPEED = 700.0
+# Remainder of a direction that is turned: see `optloc.proof.nodes.rate`, and Legendre's polynomials, n = 2.
+_TURN = 2.0 / sqrt(3.0)
+# Centres nearer to each other than this share of their distance from the stations are one start.
+_APART = 0.1
+
+
+def moves_at_once(problem: Problem) -> bool:
+    """Return whether all that needs a start is the position of one target of unknown velocity, at one epoch."""
+    if len(problem.motions) != 1 or problem.motions[0].order != 1 or problem.motions[0].known is not None:
+        return False
+    if problem.epochs > 1 or exact(problem) or not any(slot.name == "velocity" for slot in problem.layout.shared):
+        return False
+    return not unsupported(held(problem)) and not is_run(held(problem))
+
+
+def held(problem: Problem) -> Problem:
+    """Return the problem of a target that stays: priors on its velocity have nothing to say then."""
+    motions = tuple(replace(motion, order=0) for motion in problem.motions)
+    priors = tuple(prior for prior in problem.priors if prior.name != "velocity")
+    return replace(problem, motions=motions, priors=priors)
+
+
+def moving_starts(problem: Problem) -> Array:
+    """Return the cheapest positions (N, q, d) that a best-first search of a flat batch meets; NaN behind the last.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems of which `moves_at_once` holds.
+    """
+    posed, d = pose_costs(held(problem)), problem.dimension
+    out = np.full((problem.batch_shape[0], _MOST, d), np.nan)
+    for i in range(len(out)):
+        found = _search(posed.take(slice(i, i + 1)), d)
+        out[i, : len(found)] = found
+    return out
+
+
+def _search(posed: Posed, d: int) -> Array:
+    """Return the cheapest centres (q, d) of boxes that are far apart."""
+    kinds, data, K, w = posed.kinds, posed.data[0], posed.K[0], posed.w[0]
+    with plain():
+        if not reaches_infinity(kinds, K):
+            return np.empty((0, d))
+        middle, radius = cube(kinds, data, np.zeros(d))
+        atlas = atlas_of(middle, radius, d, 0)
+        rows, nodes, centre = _Rows(K, w, data, kinds == RATE), np.zeros((len(kinds), NODE_WIDTH)), np.empty(d)
+        queue = [(0.0, piece, *_whole(piece, d)) for piece in range(2 * d + 1)]
+        heapify(queue)
+        met: list[tuple[float, tuple[float, ...]]] = []
+        for _ in range(_BUDGET):
+            _, piece, at, half = heappop(queue)
+            set_centre(atlas, piece, np.array(at))
+            bound_pieces(atlas, kinds, data, np.array(half), nodes)
+            cost, low, side = rows.bound(atlas, nodes, np.array(half), d)
+            if atlas.scale[0] > 0.0:
+                position(atlas, centre)
+                met.append((cost, tuple(centre)))
+            for sign in (-0.5, 0.5):
+                moved = tuple(a + sign * half[k] * (k == side) for k, a in enumerate(at))
+                heappush(queue, (low, piece, moved, tuple(h * (0.5 if k == side else 1.0) for k, h in enumerate(half))))
+    return _apart(met, middle[:d])
+
+
+def _whole(piece: int, d: int) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return centre and half-widths of a whole piece of an atlas."""
+    at, half = [0.0] * 3, [1.0] * d + [0.0] * (3 - d)
+    if piece < 2 * d:
+        at[d - 1] = half[d - 1] = 0.5
+    return tuple(at), tuple(half)
+
+
+def _apart(met: list[tuple[float, tuple[float, ...]]], middle: Array) -> Array:
+    """Return the cheapest of the places that were met, each apart from those before."""
+    out: list[Array] = []
+    for _, place in sorted(met):
+        x = np.array(place)
+        away = _APART * np.linalg.norm(x - middle)
+        if all(np.linalg.norm(x - other) > away for other in out):
+            out.append(x)
+        if len(out) == _MOST:
+            break
+    return np.array(out).reshape(-1, len(middle))
+
+
+class _Rows:
+    """Whitened rows, and what they say over a box of an atlas when the velocity is the best one for its centre."""
+
+    def __init__(self, K: Array, w: Array, data: Array, rates: Array) -> None:
+        self.K, self.w, self.rates, self.stations = K, w, rates, data[rates, :3]
+
+    def bound(self, atlas: Atlas, nodes: Array, half: Array, d: int) -> tuple[float, float, int]:
+        """Return the cost at the centre, a bound of the residual over the box, and the side to halve."""
+        lines, slants = self._lines(atlas, d)
+        length = np.linalg.norm(lines, axis=1)
+        sight = lines / np.where(length > 0.0, length, 1.0)[:, None]
+        basis, _ = np.linalg.qr(self.K[:, self.rates] @ sight)
+        residual = self.K @ nodes[:, PHI] - self.w
+        residual = residual - basis @ (basis.T @ residual)
+        size = float(np.linalg.norm(residual))
+        steep = np.linalg.norm(self.K @ nodes[:, SLOPE0 : SLOPE0 + 3], axis=0) * half + 1e-9 * half
+        if not size > 0.0:
+            return 0.0, 0.0, int(np.argmax(steep))
+        pull = residual @ self.K / size
+        low = size - np.abs(pull @ nodes[:, SLOPE0 : SLOPE0 + 3]) @ half
+        low += np.minimum(pull * nodes[:, LOW], pull * nodes[:, HIGH]).sum()
+        low -= _SPEED * self._turned(pull[self.rates], sight, slants, length, half)
+        return size * size, max(low, 0.0), int(np.argmax(steep))
+
+    def _lines(self, atlas: Atlas, d: int) -> tuple[Array, Array]:
+        """Return scaled lines (n, d) to the stations of the rates, and their derivatives (n, d, 3)."""
+        a = ((self.stations - atlas.middle) / atlas.radius)[:, :d]
+        slants = atlas.slant[:d] - a[:, :, None] * atlas.scale[1:4]
+        return atlas.point[:d] - atlas.scale[0] * a, slants
+
+    def _turned(self, pull: Array, sight: Array, slants: Array, length: Array, half: Array) -> float:
+        """Return how much of a residual one metre per second can change over the box, as lines of sight turn."""
+        reach = np.sqrt(((np.abs(slants) @ half) ** 2).sum(-1))
+        share = np.where(length > 0.0, reach / np.where(length > 0.0, length, 1.0), np.inf)
+        near = share < 1.0  # elsewhere a station may be in the box, and its line point anywhere
+        k = np.where(near, share, 0.0)
+        slope = slants - sight[:, :, None] * np.einsum("ni,nik->nk", sight, slants)[:, None]
+        first = np.einsum("n,nik->ik", np.where(near, pull / np.where(near, length, 1.0), 0.0), slope)
+        rest = np.where(near, _TURN * (-np.log1p(-k) - k), 2.0)
+        return float(np.sqrt(((np.abs(first) @ half) ** 2).sum()) + np.abs(pull) @ rest)
