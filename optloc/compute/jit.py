@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from functools import cache, update_wrapper
+from functools import cache, partial, update_wrapper
 from threading import Lock
 from types import FunctionType
 from typing import Any, TypeVar, cast
 
+from optloc.base.errors import InvalidProblem
 from optloc.base.threads import held_by_forks
+from optloc.compute.kept import begin_child, folder, is_kept, kept, locked
+from optloc.compute.progress import Reporter
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -28,7 +32,10 @@ def _numba() -> Any:
     # numba reads the variable NUMBA_DISABLE_JIT; its kernels would then be plain functions, without its rules of
     # division.
     settings: Any = numba.config
-    return None if settings.DISABLE_JIT else numba
+    if settings.DISABLE_JIT:
+        return None
+    _listen(_report)
+    return numba
 
 
 def enabled() -> bool:
@@ -46,8 +53,8 @@ def plain() -> Iterator[None]:
         _PLAIN.reset(token)
 
 
-# Machine code on disk is found by file and name of a function, and holds that of what it calls. Where a kernel that
-# others call is replaced, the callers get names of their own.
+# Machine code on disk is found by the name of a function, and holds that of what it calls (`optloc.compute.kept`).
+# Where a kernel that others call is replaced, the callers get names of their own.
 _KERNELS: list[_Kernel] = []
 _MARKS: list[tuple[Callable[[str], bool], str]] = []
 
@@ -73,6 +80,11 @@ class _Kernel:
         _KERNELS.append(self)
 
     @property
+    def name(self) -> str:
+        """The whole name of the function."""
+        return name_of(self.function)
+
+    @property
     def machine(self) -> Any:
         """The compiled form; without an entry for C, which nobody calls, it is made a fifth faster."""
         made = self._machine  # by a name of its own: another thread may renew the kernel meanwhile
@@ -80,8 +92,11 @@ class _Kernel:
             with _LOCK:  # one form for all threads: numba compiles, and looks up types, for each form anew
                 made = self._machine
                 if made is None:
-                    options = {"cache": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-                    made = self._machine = _numba().njit(**options, inline=self.inline)(self.function)
+                    options = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+                    made = _numba().njit(**options, inline=self.inline)(self.function)
+                    # What numba's own option `cache` sets; where nothing can be written, machine code is not kept.
+                    made._cache = kept(self.function) or made._cache  # noqa: SLF001
+                    self._machine = made
         return made
 
     def renew(self) -> None:
@@ -98,13 +113,133 @@ class _Kernel:
     def __call__(self, *args: Any) -> Any:
         if not enabled():
             return self.function(*args)
-        self.ready = True
+        if not self.ready:
+            self._prepare(args)
         return self.machine(*args)
+
+    def _prepare(self, args: tuple[Any, ...]) -> None:
+        """Load or compile the form for arguments of these types, while other processes wait for it."""
+        REPORTER.begin()
+        try:
+            with locked(self.name):
+                machine = self.machine
+                machine.compile(tuple(machine.typeof_pyval(value) for value in args))
+        finally:
+            REPORTER.end()
+        self.ready = True
+
+
+@contextmanager
+def compiling(tell: Callable[[str, bool], None]) -> Iterator[None]:
+    """Have the name of each kernel told when its compilation begins (False) and ends (True), in whichever thread."""
+    stop = _listen(tell)
+    try:
+        yield
+    finally:
+        stop()
+
+
+def _listen(tell: Callable[[str, bool], None]) -> Callable[[], None]:
+    from numba.core import event
+
+    events: Any = event  # without types
+
+    class Told(events.Listener):  # type: ignore[misc]
+        def on_start(self, found: Any) -> None:
+            tell(name_of(found.data["dispatcher"].py_func), False)
+
+        def on_end(self, found: Any) -> None:
+            tell(name_of(found.data["dispatcher"].py_func), True)
+
+    listener = Told()
+    events.register("numba:compile", listener)
+    return partial(events.unregister, "numba:compile", listener)
+
+
+# What this process has compiled, by whole names, and what says so while it goes on.
+_DONE: set[str] = set()
+
+
+def _text() -> str:
+    loaded = {kernel.name for kernel in _KERNELS if kernel.inline == "never"}
+    return f"making machine code: {len(_DONE)} of about {len(loaded | _DONE)} functions, once; kept in {folder()}"
+
+
+REPORTER = Reporter(_text)
+
+
+def _report(name: str, done: bool) -> None:
+    if done:
+        _DONE.add(name)
+        REPORTER.end()
+    else:
+        REPORTER.begin()
+
+
+def name_of(function: Callable[..., Any]) -> str:
+    """Return the whole name of a function."""
+    return f"{function.__module__}.{function.__qualname__}"
+
+
+def names_in(package: str) -> list[str]:
+    """Return the whole names of all kernels of a package that are compiled by themselves, as far as it is loaded."""
+    names = [kernel.name for kernel in _KERNELS if kernel.inline == "never"]
+    return [name for name in names if name.startswith(f"{package}.")]
+
+
+# So many problems are few: plain Python answers them before machine code could be made.
+FEW = 16
+# What is done where there is no machine code yet: wait for it, have a process in the background make it, or neither.
+_VARIABLE, _WAYS = "OPTLOC_COMPILE", ("wait", "child", "never")
+
+
+def way() -> str:
+    """Return what OPTLOC_COMPILE says of machine code that has to be made first: wait, child, never, or nothing."""
+    given = os.environ.get(_VARIABLE, "").strip()
+    if given and given not in _WAYS:
+        raise InvalidProblem(f"{given!r} is no way to come by machine code", _VARIABLE, f"one of {', '.join(_WAYS)}")
+    return given
+
+
+def usable(kernel: Callable[..., Any], count: int) -> bool:
+    """Return whether machine code is the way for a number of problems: it is at hand, or they may wait for it.
+
+    Raises
+    ------
+    InvalidProblem
+        If OPTLOC_COMPILE is neither wait, child nor never.
+    """
+    assert isinstance(kernel, _Kernel)
+    if not enabled():
+        return False
+    if ready(kernel) or is_kept(kernel.name):
+        return True
+    chosen = way()
+    if chosen == "child" and count > FEW:
+        begin_child()
+    return chosen == "wait" or (not chosen and count > FEW)
 
 
 def ready(kernel: Callable[..., Any]) -> bool:
     """Return whether machine code of a kernel has been used in this process: the next call need not load it."""
     return bool(getattr(kernel, "ready", False))
+
+
+def insist_on(kernel: Callable[..., Any]) -> None:
+    """Let a kernel count as at hand, so that its next use compiles it where there is no machine code on disk."""
+    assert isinstance(kernel, _Kernel)
+    kernel.ready = True
+
+
+def at_hand(kernel: Callable[..., Any]) -> bool:
+    """Return whether machine code of a kernel was used in this process, or was on disk when that was first asked."""
+    assert isinstance(kernel, _Kernel)
+    return enabled() and (kernel.ready or _was_kept(kernel.function))
+
+
+@cache  # to look into the folder takes longer than what it is asked for
+def _was_kept(function: Callable[..., Any]) -> bool:
+    return is_kept(f"{function.__module__}.{function.__qualname__}")
 
 
 def replace(kernel: Callable[..., Any], function: Callable[..., Any]) -> None:
@@ -146,3 +281,39 @@ def inlined(function: _Function) -> _Function:
 def zero() -> int:
     """Return 0 as the start of a count: numba would compile what is handed a constant once more for a variable."""
     return int(0.0)  # not 0, which it takes for a constant again
+
+
+def with_constants(kernel: _Function, mark: str, **constants: Any) -> _Function:
+    """Return a kernel with other values of module constants, in it and in all kernels that it calls.
+
+    Machine code knows constants when it is made, so others take machine code of their own; the source is one.
+
+    Parameters
+    ----------
+    kernel : callable
+        As `compiled` returns it.
+    mark : str
+        Tells the names of its machine code from those of the kernels as they are.
+    constants : object
+        New values by name; kernels that use none of them, nor call one that does, stay as they are.
+    """
+    made: dict[_Kernel, _Kernel] = {}
+
+    def copy(one: _Kernel) -> _Kernel:
+        if one in made:
+            return made[one]
+        old, changed = one.function, dict[str, Any]()
+        assert isinstance(old, FunctionType)
+        for name in set(old.__code__.co_names) & old.__globals__.keys():
+            value = old.__globals__[name]
+            new = copy(value) if isinstance(value, _Kernel) else constants.get(name, value)
+            changed |= {} if new is value else {name: new}
+        made[one] = one
+        if changed:
+            own = FunctionType(old.__code__, {**old.__globals__, **changed}, old.__name__, old.__defaults__)
+            own.__qualname__, own.__doc__ = f"{old.__qualname__}_{mark}", old.__doc__
+            made[one] = _Kernel(own, one.inline)
+        return made[one]
+
+    assert isinstance(kernel, _Kernel)
+    return cast(_Function, copy(kernel))

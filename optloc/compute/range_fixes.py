@@ -12,7 +12,7 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH
 from optloc.compute.gtrs import minimise
-from optloc.compute.jit import compiled
+from optloc.compute.jit import compiled, with_constants
 from optloc.compute.range_mirror import LISTED, confirm, find_plane, follow, keep_fix, reflect
 from optloc.compute.range_refine import equations, ranges, refine
 from optloc.compute.range_shape import STRAIGHT, find_even, measure_infinity, measure_shape, see_far
@@ -519,3 +519,8 @@ def _invert(vector: Array, matrix: Array, scalar: Array) -> None:
         for i in range(j, d):
             for lane in range(LANES):
                 matrix[H_TRIAL, i, j, lane] = move[i, lane]
+
+
+# A block works out all of its lanes, whatever stands in them: one problem takes 55 us in 64 lanes, 30 in 8, 25 in 4.
+few_fixes = with_constants(fixes, "four", LANES=4, _WORTH=2)
+"""The same as `fixes` in blocks of four: for so few problems that most of the 64 lanes would be empty."""

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from math import prod
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
-from optloc.compute.jit import enabled
+from optloc.compute.jit import enabled, usable
 from optloc.compute.pack import pack
 from optloc.linear.normal import Normal, depends_on_place, linearise, normal, whitener_at, with_priors
 from optloc.problem.epochs import windows
@@ -80,5 +81,11 @@ def _by_machine_code(problem: Problem, x: Array, noise: tuple[Whitener, ...] | N
 
 
 def serves(problem: Problem, starts: int) -> bool:
-    """Return whether machine code is at hand and pays for a number of vectors of a problem."""
-    return problem.count <= _LONGEST and starts * problem.count >= _WORTH and enabled()
+    """Return whether machine code is at hand, or may be waited for, and pays for a number of vectors of a problem."""
+    if problem.count > _LONGEST or starts * problem.count < _WORTH or not enabled():
+        return False
+    from optloc.compute.equations import normal_block
+    from optloc.compute.refine import refine_block, refine_runs
+
+    count = prod(problem.batch_shape)
+    return all(usable(kernel, count) for kernel in (normal_block, refine_block, refine_runs))

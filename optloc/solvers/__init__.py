@@ -44,7 +44,11 @@ def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
     InvalidProblem
         For an unknown method, or where nothing is unknown.
     """
-    run = Method.parse(method)
+    return solve_in_stages(problem, Method.parse(method), start)
+
+
+def solve_in_stages(problem: Problem, run: Method, start: Any = None) -> Fix:
+    """Return what `solve` returns, by the stages of a method: a batch is what they are made for."""
     if problem.layout.size == 0:
         raise InvalidProblem("nothing is unknown: the motion of every target is known", "motions", "give a bias")
     if separable(problem):
@@ -59,7 +63,8 @@ def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
 
     # the shortcut divides its work itself, and shares it among threads
     most = flat.batch_shape[0] if shortcut(run) and vector is None else PART
-    fix = in_parts(flat, work, most, failed)
+    with np.errstate(all="ignore"):  # what overflows is judged: a status says so, once
+        fix = in_parts(flat, work, most, failed)
     return fix.reshape(shape) if shape != (len(fix),) else fix
 
 

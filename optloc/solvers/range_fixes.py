@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from functools import partial
 from time import perf_counter
@@ -17,7 +17,7 @@ from optloc.base.records import take
 from optloc.base.threads import mapped
 from optloc.base.types import Array, Status
 from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge
-from optloc.compute.jit import enabled
+from optloc.compute.jit import enabled, ready, usable
 from optloc.linear.normal import degrees_of_freedom, depends_on_place, weighed
 from optloc.models import MODELS
 from optloc.problem.fix import Stage
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 # The linear maps from measurements to all that a fix from ranges needs, made once for a structure.
 
 # Rows, and epochs with emission times, up to which dense maps pay: their cost grows with the square.
-_MOST = 64
+MOST = 64
 # Share of the largest weight below which a combination of rows is rounding: four digits above it.
 _NOTHING = 1e-12
 # Share of a combination of ranges that their common part may have left by rounding: differences have none of it.
@@ -89,12 +89,16 @@ def direct(problem: Problem) -> Direct | None:
     """
     if not (_simple(problem) and enabled()):
         return None
+    return _KEPT.find(key_of(problem), lambda: _direct(problem))
+
+
+def key_of(problem: Problem) -> tuple[Hashable, ...]:
+    """Return a key of all that the maps of a problem without batch axes of its own are made of."""
     # Not structure, yet what the maps are made of: they are part of the key by their bytes.
     numbers = [array for r in problem.rows for array in (r.weight, r.correction)]
     numbers += [block.covariance for block in problem.noise.blocks]
     numbers += [] if problem.stations.covariance is None else [problem.stations.covariance]
-    key = (problem.structure, *(array.tobytes() for array in numbers))
-    return _KEPT.find(key, lambda: _direct(problem))
+    return (problem.structure, *(array.tobytes() for array in numbers))
 
 
 def _direct(problem: Problem) -> Direct | None:
@@ -127,8 +131,8 @@ def _simple(problem: Problem) -> bool:
         and stations.position.shape[-3] == 1
         and (stations.covariance is None or (stations.span == "noise" and stations.covariance.ndim == 3))
         and not depends_on_place(problem)
-        and 0 < problem.count <= _MOST
-        and problem.epochs <= _MOST
+        and 0 < problem.count <= MOST
+        and problem.epochs <= MOST
         and all(array.ndim == 1 for array in shared)
         and all(block.covariance.ndim == 3 for block in problem.noise.blocks)
     )
@@ -202,31 +206,62 @@ def _design(one: Problem, station: Array) -> tuple[Array, Array, Array, Array]:
 # 16 000 no difference was measured.
 _CHUNK = 4096
 # Of the refinement of the method "lsr".
-_TOLERANCE, _LIMIT = 1e-7, 100
+TOLERANCE, LIMIT = 1e-7, 100
+
+
+# Problems from which on machine code is worth its loading, which takes more time than the stages take for fewer.
+_WORTH = 16
+# Problems up to which narrow blocks are quicker: one of four lanes takes 25 us, two 45, four as long as one of 64.
+_FEW = 8
+
+
+def worth(count: int) -> int:
+    """Return from how many problems on the direct way is taken: whatever was loaded before, for equal answers."""
+    from optloc.compute.range_fixes import fixes
+
+    return _WORTH if usable(fixes, count) else count + 1
+
+
+def kernel_for(count: int, *, often: bool = False) -> Callable[..., int]:
+    """Return the machine code for so many problems: narrow blocks for few, unless only the wide ones are loaded.
+
+    Parameters
+    ----------
+    count : int
+        Problems of one call.
+    often : bool
+        Whether such a call comes again and again, and is worth loading what serves it best.
+    """
+    from optloc.compute.range_fixes import few_fixes, fixes
+
+    narrow = count <= _FEW and (ready(few_fixes) or ((often or not ready(fixes)) and usable(few_fixes, count)))
+    return few_fixes if narrow else fixes
+
+
+def at_hand(count: int) -> bool:
+    """Return whether so many problems may take the direct way: its machine code is there, or they may wait for it."""
+    return usable(kernel_for(count, often=True), count)
 
 
 @dataclass(frozen=True, slots=True)
 class Quick:
-    """The stages "gtrs" and "lsr" as one, which takes the direct way where there is one.
+    """The stages "gtrs" and "lsr" as one, which takes the direct way where there is one, and where it is worth it.
 
     Parameters
     ----------
-    least : int
-        Batches with fewer problems take the stages as they are.
     alone : bool
         Whether nothing follows: then the mirror image of the start is refined on the way of the stages, too. What
         follows otherwise looks for other minima by itself.
     """
 
-    least: int = 1
     alone: bool = False
 
     def __call__(self, problem: Problem, pool: Pool | None) -> Pool:
         """Return the settled pools of a flat batch of problems."""
-        count = problem.batch_shape[0]
-        plan = direct(problem) if pool is None and (self.alone or count >= self.least) else None
+        count, least = problem.batch_shape[0], worth(problem.batch_shape[0])
+        plan = direct(problem) if pool is None and (self.alone or count >= least) else None
         refinement: Callable[[Problem, Pool], Pool] = lsr_with_mirror if self.alone else lsr
-        if plan is None or count < self.least:
+        if plan is None or count < least:
             start = pool
             if plan is not None:
                 refinement = partial(lsr_with_mirror, descend=partial(_descend, plan))
@@ -313,13 +348,13 @@ def _descend(direct: Direct, problem: Problem, x: Array) -> Array:
         cost, matrix, right = equations(x)
         alive, done = np.isfinite(cost), np.zeros(x.shape[:2], dtype=bool)
         damping, growth = np.full(cost.shape, FIRST_DAMPING), np.full(cost.shape, FIRST_GROWTH)
-        for _ in range(_LIMIT):
+        for _ in range(LIMIT):
             if not alive.any():
                 break
             move, solvable = linalg.solve(matrix * (1.0 + damping[..., None, None] * np.eye(d)), right[..., None])
             after, steeper, pull = equations(x + move[..., 0])
             gain = (move[..., 0] * right).sum(-1)
-            found = judge(cost, after, gain, solvable & alive, blur, damping, growth, _TOLERANCE, True)
+            found = judge(cost, after, gain, solvable & alive, blur, damping, growth, TOLERANCE, True)
             better = found.better
             x, cost = np.where(better[..., None], x + move[..., 0], x), np.where(better, after, cost)
             matrix = np.where(better[..., None, None], steeper, matrix)
@@ -340,9 +375,9 @@ def fix_directly(
 
     It finds starts by itself where none (N, size) are given.
     """
-    from optloc.compute.range_fixes import fixes
     from optloc.compute.range_start import Answer, Model
 
+    kernel = kernel_for(len(z))
     model = Model(*direct.maps)  # type: ignore[arg-type]
     count, d, size = len(z), position.shape[-1], direct.layout.size
     answer = Answer(
@@ -364,7 +399,7 @@ def fix_directly(
         stations = position[part] if len(position) > 1 else position
         stations = _owned(stations if everyone else stations[:, direct.station])
         rows = _owned(z[part])
-        return int(fixes(model, rows, stations, _TOLERANCE, _LIMIT, given, Answer(*(array[part] for array in answer))))
+        return int(kernel(model, rows, stations, TOLERANCE, LIMIT, given, Answer(*(array[part] for array in answer))))
 
     return answer, max(mapped(work, range(0, count, _CHUNK), threads), default=0)
 
@@ -381,7 +416,6 @@ def _is_final(direct: Direct, answer: Answer) -> Array:
 def _pool(direct: Direct, answer: Answer, steps: int, began: float) -> Pool:
     """Return the pool of fixes that were found directly, with a second slot where some have a rival."""
     count, seconds = len(answer.cost), perf_counter() - began
-    detail = f"{count} candidates, {steps} steps at most"
     rivalled = np.isfinite(answer.rival_cost) & answer.settled
     x, cost = answer.x[:, None], answer.cost[:, None]
     code = np.broadcast_to(np.int8(Status.OK), (count, 1))
@@ -399,12 +433,18 @@ def _pool(direct: Direct, answer: Answer, steps: int, began: float) -> Pool:
         np.broadcast_to(0, cost.shape),
         np.broadcast_to(direct.weight, (count, len(direct.weight))),
         np.broadcast_to(np.int32(direct.dof), count),
-        (Stage("gtrs", "1 candidates at most", 0.0), Stage("lsr", detail, seconds)),
+        direct_stages(count, steps, seconds),
         refined=True,
         curvature=Curvature(answer.covariance, kappa=answer.kappa),
         plain=answer.settled & ~rivalled,
         infinity=answer.infinity,
     )
+
+
+def direct_stages(count: int, steps: int, seconds: float) -> tuple[Stage, ...]:
+    """Return the stages that so many fixes went through at once, and the most steps that one took."""
+    detail = f"{count} candidates, {steps} steps at most"
+    return Stage("gtrs", "1 candidates at most", 0.0), Stage("lsr", detail, seconds)
 
 
 def _owned(values: Array) -> Array:

@@ -313,7 +313,7 @@ def innovation(scan: Problem, mean: Array, cov: Array) -> Innovation:
     Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation" (2001), eq.
     5.2.3-9.
     """
-    linear = linearise(scan, mean)
+    linear = linearise(scan, mean, ())  # nothing is whitened here
     H = linear.shared
     # Station errors are part of the noise, and grow with the place of the target.
     R = noises.dense(weighed(scan, mean).noise, np.arange(scan.count))

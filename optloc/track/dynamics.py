@@ -67,11 +67,7 @@ def polynomial(order: int, noise: float = 0.0) -> Dynamics:
         raise InvalidProblem(f"process noise of {noise}", "noise", "give a standard deviation of at least 0")
 
     def step(dt: float, mean: Array, d: int) -> tuple[Array, Array, Array]:
-        powers = np.array([dt**j / factorial(j) for j in range(order + 2)])
-        F = sum(powers[j] * np.eye(order + 1, k=j) for j in range(order + 1))
-        # The next derivative is constant between scans: one number enters position, velocity, ... by dt^j / j!.
-        drive = noise * powers[order + 1 : 0 : -1]
-        return *_blocked(np.asarray(F), np.outer(drive, drive), d), np.zeros(mean.shape)
+        return *_polynomial(order, noise, dt, d), np.zeros(mean.shape)
 
     return Dynamics(("static", "constant velocity", "constant acceleration")[order], order, step)
 
@@ -141,6 +137,19 @@ def current_statistical(time_constant: float, limit: float, floor: float = 0.0) 
 
 
 # Scans at equal distances have one step; a run of any others has some dozens that recur.
+@lru_cache(maxsize=256)
+def _polynomial(order: int, noise: float, dt: float, d: int) -> tuple[Array, Array]:
+    """Return F and Q of a polynomial, which nobody can write into."""
+    powers = np.array([dt**j / factorial(j) for j in range(order + 2)])
+    F = sum(powers[j] * np.eye(order + 1, k=j) for j in range(order + 1))
+    # The next derivative is constant between scans: one number enters position, velocity, ... by dt^j / j!.
+    drive = noise * powers[order + 1 : 0 : -1]
+    both = _blocked(np.asarray(F), np.outer(drive, drive), d)
+    for array in both:
+        array.setflags(write=False)
+    return both
+
+
 @lru_cache(maxsize=256)
 def correlated(alpha: float, dt: float) -> tuple[Array, Array, Array]:
     """Return F (3, 3), Q (3, 3) for unit variance and U (3,) of an exponentially correlated acceleration of one axis.

@@ -173,18 +173,22 @@ def take_scan(scan: Problem, ahead: State, rule: Update, causes: list[str] | Non
     shape = ahead.mean.shape[:-1]
     if not scan.rows or not scan.count:
         return _keep(ahead), np.full(shape, int(Status.TOO_FEW_ROWS), dtype=np.int8)
-    # One scan may serve many targets, and one target many runs: weights take the axes of both.
-    weight = np.broadcast_to(scan.weight, np.broadcast_shapes((*shape, scan.count), scan.z.shape))
-    broken = ~np.isfinite(scan.z) & (weight > 0.0)
-    usable = scan if not broken.any() else scan.with_rows(z=np.where(broken, 0.0, scan.z), weight=weight * ~broken)
+    usable, broken = scan, np.zeros((), dtype=bool)
+    if not np.isfinite(scan.z).all():
+        # One scan may serve many targets, and one target many runs: weights take the axes of both.
+        weight = np.broadcast_to(scan.weight, np.broadcast_shapes((*shape, scan.count), scan.z.shape))
+        bad = ~np.isfinite(scan.z) & (weight > 0.0)
+        usable, broken = scan.with_rows(z=np.where(bad, 0.0, scan.z), weight=weight * ~bad), np.asarray(bad.any(-1))
     # A lost state is a status, not a warning: it is found out below.
     with np.errstate(all="ignore"):
         done = _contained(usable, ahead, rule, [] if causes is None else causes)
+    if not broken.any() and np.isfinite(done.cov).all() and np.isfinite(done.mean).all() and np.all(done.count > 0):
+        return done, np.zeros(done.mean.shape[:-1], dtype=np.int8)
     lost = ~(np.isfinite(done.mean).all(-1) & np.isfinite(done.cov).all((-1, -2)))
     silent = done.count == 0
     # What is lost outweighs what is silent, and that outweighs rows that were not finite.
     code = np.where(lost, Status.NUMERICAL, np.where(silent, Status.TOO_FEW_ROWS, Status.OK))
-    code = np.where(broken.any(-1) & ~lost, Status.REJECTED, code).astype(np.int8)
+    code = np.where(broken & ~lost, Status.REJECTED, code).astype(np.int8)
     # Without a row, or with a wrong one, the prediction is the best there is.
     kept = lost | silent
     mean = np.where(kept[..., None], ahead.mean, done.mean)

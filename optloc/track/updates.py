@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 
 import numpy as np
 
 from optloc.base import linalg
+from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.registry import Table
 from optloc.base.types import Array
+from optloc.compute.filter import Absorbed, absorb
+from optloc.compute.jit import at_hand
+from optloc.compute.pack import Packed, observed, pack
 from optloc.linear.evaluate import differentiate
-from optloc.linear.normal import linearise
+from optloc.linear.normal import depends_on_place, linearise, whitener_at
 from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.noise import Whitener
 from optloc.problem.problem import Problem
@@ -68,6 +72,9 @@ def ekf(scan: Problem, mean: Array, cov: Array) -> Updated:
     ----------
     A. H. Jazwinski, "Stochastic Processes and Filtering Theory" (1970), theorem 8.1.
     """
+    quick = _by_machine_code(scan, mean, cov, 1, 0.0)
+    if quick is not None:
+        return quick
     white = whitened(scan, mean)
     gain = _gain(white.H, cov)
     moved = mean + (gain @ white.residual[..., None])[..., 0]
@@ -85,6 +92,9 @@ def iekf(scan: Problem, mean: Array, cov: Array, *, limit: int = 20, tolerance: 
     B. M. Bell, F. W. Cathey, "The iterated Kalman filter update as a Gauss-Newton method", IEEE Trans. Autom. Control
     38 (1993).
     """
+    quick = _by_machine_code(scan, mean, cov, limit, tolerance)
+    if quick is not None:
+        return quick
     first = whitened(scan, mean)
     # The prior is one more whitened row block: the cost that steps may not raise is that of rows and prior together.
     prior = linalg.whitening(cov)
@@ -206,6 +216,70 @@ def reweighted(update: Update | str, loss: Loss | str) -> Update:
     return robust
 
 
+# One state and one scan by machine code: all but the measurements is kept for scans of the same rows.
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    """What scans share that differ in time and measurements alone."""
+
+    packed: Packed
+    count: Array
+    logdet: Array
+
+
+# A network has a few sets of rows that hear a target together; each takes some kilobytes.
+_KEPT = Cache["_Kept | None"](256)
+
+
+def _by_machine_code(scan: Problem, mean: Array, cov: Array, limit: int, tolerance: float) -> Updated | None:
+    """Return the update of one state by one scan, or None where it takes numpy: others, or no machine code at hand."""
+    if mean.ndim != 1 or type(mean) is not np.ndarray or not at_hand(absorb) or not _is_plain(scan):
+        return None
+    kept = _KEPT.find(_key_of(scan), lambda: _prepared(scan))
+    if kept is None or kept.packed.tables.shared != len(mean):
+        return None
+    numbers = kept.packed.numbers._replace(observed=observed(scan))
+    out = Absorbed(np.empty(len(mean)), np.empty((len(mean), len(mean))), np.empty(2))
+    x, P = (np.require(array, float, ["C", "W"]) for array in (mean, cov))
+    if absorb(kept.packed._replace(numbers=numbers), x, P, limit, tolerance, out) < 0:
+        return None
+    nis, logdet = out.said
+    return Updated(out.mean, out.cov, nis, -0.5 * (nis + logdet + kept.logdet), kept.count)
+
+
+def _is_plain(scan: Problem) -> bool:
+    """Return whether the state of one target at the time of the scan is all that is unknown."""
+    motion = scan.motions[0]
+    return (
+        not scan.batch_shape
+        and len(scan.times) == len(scan.motions) == 1
+        and motion.known is None
+        and motion.reference == scan.times[0]
+        and not (scan.biases or scan.priors or scan.constraints)
+        and (scan.stations.covariance is None or scan.stations.span == "noise")
+    )
+
+
+def _key_of(scan: Problem) -> tuple[Hashable, ...]:
+    """Return a key of all that a scan is made of but its time and its measurements."""
+    s = scan.stations
+    arrays = [s.position, s.velocity, s.axes, s.covariance, *(b.covariance for b in scan.noise.blocks)]
+    arrays += [array for b in scan.noise.blocks for array in (b.row,)]
+    arrays += [array for r in scan.rows for array in (r.a, r.b, r.target, r.weight, r.correction)]
+    sizes = tuple((r.kind, r.count) for r in scan.rows), tuple(b.row.shape for b in scan.noise.blocks)
+    numbers = tuple(None if array is None else array.tobytes() for array in arrays)
+    return (sizes, numbers, s.count, scan.dimension, scan.frame, scan.motions[0].order)
+
+
+def _prepared(scan: Problem) -> _Kept | None:
+    if scan.emitting or depends_on_place(scan):
+        return None
+    noise = whitener_at(scan, np.zeros(scan.layout.size))
+    packed = pack(scan, noise)
+    return None if packed is None or packed.tables.local else _Kept(packed, *_size_of(noise, ()))
+
+
 # Rows of a scan, whitened, and what all filters make of them.
 
 
@@ -236,8 +310,14 @@ def whitened(scan: Problem, x: Array, noise: tuple[Whitener, ...] | None = None)
     linear = linearise(scan, x, noise)
     both = np.concatenate([linear.shared, linear.residual[..., None]], axis=-1)
     white = np.concatenate([w.apply(both) for w in linear.noise], axis=-2)
-    count, logdet = np.zeros(white.shape[:-2]), np.zeros(white.shape[:-2])
-    for w in linear.noise:
+    count, logdet = _size_of(linear.noise, white.shape[:-2])
+    return White(white[..., -1], white[..., :-1], count, logdet)
+
+
+def _size_of(noise: tuple[Whitener, ...], shape: tuple[int, ...]) -> tuple[Array, Array]:
+    """Return the number of rows that are present, and the logarithm of the determinant of 2 pi R, each (...)."""
+    count, logdet = np.zeros(shape), np.zeros(shape)
+    for w in noise:
         # A whitener is triangular: the product of its pivots is one over the root of |R|; absent rows have none.
         pivots = np.diagonal(w.matrix, axis1=-2, axis2=-1)
         present = pivots > 0.0
@@ -245,7 +325,7 @@ def whitened(scan: Problem, x: Array, noise: tuple[Whitener, ...] | None = None)
         share = len(w.row) if w.matrix.shape[-3] == 1 else 1
         count = count + share * present.sum((-1, -2))
         logdet = logdet - 2.0 * share * np.log(np.where(present, pivots, 1.0)).sum((-1, -2))
-    return White(white[..., -1], white[..., :-1], count, logdet + count * np.log(2.0 * np.pi))
+    return count, logdet + count * np.log(2.0 * np.pi)
 
 
 def joseph(H: Array, gain: Array, cov: Array) -> Array:

@@ -1,0 +1,281 @@
+"""What ``optloc compile`` does: make the machine code of all kernels at once, or say what there is.
+
+Few kernels are called from Python, each with arrays of one type, so a handful of small problems has everything compiled
+that others will ask for; processes of their own do so side by side.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from threading import Lock
+from typing import Any
+
+import numpy as np
+import typer
+from rich.table import Table
+
+from optloc.base.frames import Frame
+from optloc.base.types import Array, Stations
+from optloc.cli.output import Screen, dumps, meter
+from optloc.compute.filter import absorb
+from optloc.compute.jit import REPORTER, compiling, enabled, insist_on, names_in
+from optloc.compute.kept import alone, folder, is_kept
+from optloc.linear.constraints import height
+from optloc.linear.simulate import simulate
+from optloc.problem.build import assemble, measured
+from optloc.problem.problem import Problem
+from optloc.solvers import solve
+from optloc.solvers.certify.branch_and_bound import certify
+from optloc.solvers.prepared import prepare
+from optloc.solvers.starts.best_first import best_first_starts
+from optloc.track.updates import ekf
+from optloc.uncertainty.region import likelihood_region
+
+_STATIONS = 1e3 * np.array([[0.0, 0, 0], [10, 0, 1], [0, 10, 2], [-9, 1, 0.5], [1, -8, 3], [6, 7, 0]])
+_TARGET = np.array([2e3, 3e3, 4e3])
+# More problems than plain Python answers, and than the stages of numpy sum the equations of.
+_FEW, _MANY = 40, 500
+
+
+def _posed(kind: str, stations: Stations | Array = _STATIONS, **more: Any) -> Problem:
+    rows = {"b": np.zeros(5, dtype=int)} if kind in ("tdoa", "fdoa") else {}
+    return assemble(stations, measured(kind, a=np.arange(1, 6), sigma=1.0, **rows), **more)
+
+
+def _drawn(kind: str, count: int, stations: Stations | Array = _STATIONS, **more: Any) -> Problem:
+    problem = _posed(kind, stations, **more)
+    place = np.append(_TARGET, np.zeros(problem.layout.size - 3)) if problem.layout.size > 3 else _TARGET
+    return simulate(problem, place, 1, count).flat()
+
+
+def _fix_ranges() -> None:
+    problem = _drawn("tdoa", _FEW)
+    solve(problem, "gtrs+lsr")
+    prepare(_posed("tdoa"), "gtrs+lsr")(problem.z[0])
+
+
+def _filter() -> None:
+    insist_on(absorb)
+    scan = simulate(assemble(_STATIONS, measured("range", a=np.arange(6), sigma=1.0)), _TARGET, 1)
+    ekf(scan, _TARGET, np.eye(3))
+
+
+def _refine() -> None:
+    solve(_drawn("elevation", _MANY), "lsr", start=np.tile(_TARGET, (_MANY, 1)))
+    # a run whose emission times are unknowns of its two epochs
+    rows = measured("toa", a=np.tile(np.arange(6), 2), epoch=np.repeat([0, 1], 6), sigma=1.0)
+    run = assemble(_STATIONS, rows)
+    truth = np.append(_TARGET, np.zeros(run.layout.size - 3))
+    solve(simulate(run, truth, 1, _MANY).flat(), "lsr", start=np.tile(truth, (_MANY, 1)))
+
+
+def _prove() -> None:
+    problem = _drawn("tdoa", _FEW)
+    certify(problem, solve(problem, "gtrs+lsr"))
+
+
+def _prove_runs() -> None:
+    speed = np.random.default_rng(1).normal(0.0, 100.0, _STATIONS.shape)  # any
+    place = _STATIONS + 10.0 * np.arange(4)[:, None, None] * speed
+    rows = measured("tdoa", a=np.tile(np.arange(1, 6), 4), b=0, epoch=np.repeat(np.arange(4), 5), sigma=1.0)
+    problem = simulate(assemble(Stations(place, tuple("ABCDEF")), rows), _TARGET, 1, _FEW).flat()
+    certify(problem, solve(problem, "gtrs+lsr"))
+
+
+def _search() -> None:
+    velocity = np.broadcast_to([50.0, -30.0, 0.0], _STATIONS.shape)
+    moving = Stations(_STATIONS[None], tuple("ABCDEF"), velocity=velocity[None])
+    # Through all space, all around the Earth at a height, and where an enclosure bounds the cheap positions.
+    best_first_starts(_drawn("fdoa", _FEW, moving))
+    frame = Frame.enu(lat_deg=47.0, lon_deg=8.0, height=400.0)
+    best_first_starts(_drawn("tdoa", _FEW, frame=frame, constraints=height(exactly=4400.0)))
+    best_first_starts(_drawn("range", _FEW))
+
+
+def _cover() -> None:
+    # of a fix inside, and of one so far outside that infinity is as likely
+    for times in (1.0, 1000.0):
+        problem = simulate(_posed("tdoa"), times * _TARGET, 1)
+        likelihood_region(problem, solve(problem))
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """What one process compiles: how that is had, and the kernels that Python calls."""
+
+    summary: str
+    package: str
+    works: tuple[Callable[[], None], ...]
+    entries: tuple[str, ...]
+
+    def missing(self) -> list[str]:
+        """Return the kernels of which there is no machine code on disk."""
+        return [name for name in self.entries if not is_kept(name)]
+
+
+# The longest first: there are as many processes as processors, at most two, and memory is a gigabyte each. Those that
+# share what they call do not begin side by side.
+PARTS: Mapping[str, Part] = {
+    "proofs": Part(
+        "proofs of fixes", "optloc.proof", (_prove,), ("optloc.proof.batch._loop", "optloc.proof.batch._evaluate")
+    ),
+    "fixes": Part(
+        "fixes, refinements and filters",
+        "optloc.compute",
+        (_fix_ranges, _refine, _filter),
+        (
+            "optloc.compute.filter.absorb",
+            "optloc.compute.range_fixes.fixes",
+            "optloc.compute.range_fixes.fixes_four",
+            "optloc.compute.refine.refine_block",
+            "optloc.compute.refine.refine_runs",
+            "optloc.compute.equations.normal_block",
+        ),
+    ),
+    "runs": Part(
+        "proofs of runs",
+        "optloc.proof",
+        (_prove_runs,),
+        tuple(f"optloc.proof.runs.{name}" for name in ("search.tables_of", "prove.prove_run", "prove.cost_of_place")),
+    ),
+    "searches": Part(
+        "searches for starts",
+        "optloc.proof",
+        (_search,),
+        tuple(f"optloc.proof.best_first._search_{where}" for where in ("everywhere", "sides", "region")),
+    ),
+    "regions": Part(
+        "cells of regions",
+        "optloc.proof",
+        (_cover,),
+        tuple(f"optloc.proof.cover.cover_{w}" for w in ("near", "everywhere")),
+    ),
+}
+
+
+def missing() -> list[str]:
+    """Return the kernels that Python calls of which there is no machine code on disk."""
+    return [name for part in PARTS.values() for name in part.missing()]
+
+
+def make(tell: Callable[[int, int], None] = lambda done, total: None) -> list[str]:
+    """Compile what is not on disk yet, in two processes.
+
+    Parameters
+    ----------
+    tell : callable
+        Told how many functions are compiled, and about how many there are.
+
+    Returns
+    -------
+    list of str
+        The kernels that Python calls of which there is no machine code even now; empty if all went well.
+    """
+    names = [name for name, part in PARTS.items() if part.missing()]
+    known, done, lock = {}, set(), Lock()
+
+    def follow(name: str) -> None:
+        for line in _started(name):
+            word, _, rest = line.partition(" ")
+            with lock:
+                if word == "all":
+                    known[name] = set(rest.split())
+                else:
+                    done.add(rest)
+                tell(len(done), len(set().union(*known.values(), done)))
+
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(follow, names))
+    return missing()
+
+
+def _started(name: str) -> Iterator[str]:
+    """Begin a process that compiles a part, and yield the lines that it writes; it ends with this process."""
+    path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])])
+    # -P: nothing is imported from the current folder.
+    command = [sys.executable, "-P", "-m", "optloc.cli.compile", name]
+    environment = os.environ | {"PYTHONPATH": path, "OPTLOC_COMPILE": "wait"}
+    with subprocess.Popen(  # noqa: S603  (this interpreter, and this module)
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, env=environment
+    ) as process:
+        try:
+            assert process.stdout is not None
+            yield from (line.strip() for line in process.stdout)
+        finally:
+            process.kill()
+
+
+def _compile(part: Part) -> None:
+    """Compile a part in this process, and write what is done to standard output."""
+    for entry in (entry for each in PARTS.values() for entry in each.entries):
+        import_module(entry.rpartition(".")[0])  # all kernels are known then
+    print("all", *names_in(part.package), flush=True)  # noqa: T201
+
+    def tell(name: str, done: bool) -> None:
+        if done:
+            try:
+                print("made", name, flush=True)  # noqa: T201
+            except BrokenPipeError:  # the process that began this one has ended
+                os._exit(1)
+
+    REPORTER.muted = True  # the process that began this one tells
+    with compiling(tell):
+        for work in part.works:
+            work()
+
+
+def run_compile(check: bool, as_json: bool, *, quiet: bool = False) -> int:
+    """Compile what is not on disk, and print what is; the exit code is 1 where something is missing at the end."""
+    place = folder() if enabled() else None
+    if place is not None and not check:
+        with meter("making machine code", quiet) as tell:
+            make(tell)
+    found = {name: len(part.missing()) for name, part in PARTS.items()} if place is not None else {}
+    if as_json:
+        parts = {name: not missing for name, missing in found.items()}
+        typer.echo(dumps({"folder": None if place is None else str(place), "parts": parts}))
+    else:
+        _print(found, None if place is None else str(place))
+    return int(place is None or any(found.values()))
+
+
+def _print(found: dict[str, int], place: str | None) -> None:
+    screen = Screen()
+    if place is None:
+        reason = "no folder can be written" if enabled() else "numba is not installed, or switched off"
+        screen.print(f"no machine code can be kept: {reason}", highlight=False)
+        return
+    table = Table()
+    for title in ("machine code of", "on disk"):
+        table.add_column(title)
+    for name, missing in found.items():
+        table.add_row(PARTS[name].summary, "no" if missing else "yes")
+    screen.print(table)
+    screen.print(f"kept in {place}", highlight=False, soft_wrap=True)
+    if any(found.values()):
+        screen.print(
+            "`optloc compile` makes what is missing; until then few problems take plain Python", highlight=False
+        )
+
+
+def _make_alone() -> None:
+    """Make all behind whatever else the computer does, unless another process is at it."""
+    with alone() as only:
+        if only:
+            if hasattr(os, "nice"):
+                os.nice(10)  # what answers in plain Python meanwhile goes first
+            make()
+
+
+if __name__ == "__main__":
+    if sys.argv[1:]:
+        _compile(PARTS[sys.argv[1]])
+    else:
+        _make_alone()

@@ -1,0 +1,246 @@
+"""Machine code on disk: kept under a digest of all the sources that it may hold.
+
+numba renews what it keeps of a function when the file of that function changes, but machine code holds that of all
+functions it calls, wherever they stand: after an edit or an upgrade of one of those, stale code of the caller would go
+on answering. So the folder of machine code is named by a digest of all sources of kernels, of the versions of what
+compiles them, and of the processor that they are compiled for.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from functools import cache, partial
+from hashlib import sha256
+from importlib.metadata import version
+from pathlib import Path
+from tempfile import TemporaryFile
+from typing import IO, Any, cast
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+# All files and folders of optloc that kernels stand in, or take constants from: constants are part of machine code.
+SOURCES = ("compute", "proof", "base/linalg.py", "linear/normal.py", "models/primitives.py")
+# Folders of machine code of other sources that are left, the last used ones: branches of one checkout and versions that
+# share a folder by NUMBA_CACHE_DIR take turns. One is some 40 MB.
+_LEFT = 4
+_PREFIX = "optloc-"
+_LOG = logging.getLogger("optloc")
+
+
+def _digest_of(files: list[Path], root: Path) -> str:
+    made = sha256()
+    for file in sorted(files):
+        text = file.read_bytes()
+        made.update(f"{file.relative_to(root).as_posix()} {len(text)}\n".encode())
+        made.update(text)
+    return made.hexdigest()
+
+
+@cache
+def sources_digest() -> str:
+    """Return the digest of all sources of kernels that optloc ships."""
+    found = [_PACKAGE / name for name in SOURCES]
+    return _digest_of([file for path in found for file in ([path] if path.is_file() else path.rglob("*.py"))], _PACKAGE)
+
+
+@cache
+def folder_name() -> str:
+    """Return what machine code of these sources is kept under that the installed numba makes for this processor."""
+    made = sha256("\n".join([sources_digest(), version("numba"), version("llvmlite"), *processor()]).encode())
+    return _PREFIX + made.hexdigest()[:16]
+
+
+def processor() -> tuple[str, str, str]:
+    """Return triple, name and features of the processor that numba compiles for."""
+    from llvmlite import binding
+    from numba.core import codegen, config
+
+    llvm, made, settings = cast("tuple[Any, Any, Any]", (binding, codegen, config))  # without types
+    name, features = settings.CPU_NAME, settings.CPU_FEATURES
+    return (
+        llvm.get_process_triple(),
+        llvm.get_host_cpu_name() if name is None else name,
+        made.get_host_cpu_features() if features is None else features,
+    )
+
+
+@cache
+def folder() -> Path | None:
+    """Return the folder that machine code is kept in, None where nothing can be written.
+
+    It lies in the folder that NUMBA_CACHE_DIR names, else beside the package, else in the user's folder of caches.
+    """
+    from numba.core import config
+    from numba.misc import appdirs
+
+    settings: Any = config  # without types
+    users: Any = appdirs
+    for root in (settings.CACHE_DIR, _PACKAGE / "__pycache__", users.user_cache_dir("optloc", appauthor=False)):
+        if not root:
+            continue
+        place = Path(root) / folder_name()
+        try:
+            place.mkdir(parents=True, exist_ok=True)
+            TemporaryFile(dir=place).close()
+            os.utime(place)  # used now
+            _clear(place)
+        except OSError:
+            continue
+        return place
+    return None
+
+
+def _clear(place: Path) -> None:
+    """Remove machine code of other sources but that used last; a process that still uses it makes its own anew."""
+    others = [path for path in place.parent.glob(f"{_PREFIX}*") if path != place and path.is_dir()]
+    for path in sorted(others, key=_used, reverse=True)[_LEFT:]:
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def _used(path: Path) -> float:
+    try:
+        return path.stat().st_mtime
+    except OSError:  # removed by another process meanwhile
+        return 0.0
+
+
+class _Place:
+    """Where the machine code of a function is kept, as numba asks for it (a cache locator)."""
+
+    def __init__(self, function: Callable[..., Any], place: Path) -> None:
+        file = Path(function.__code__.co_filename).resolve()
+        self._py_file = str(file)
+        self._path = str(place)
+        line = str(function.__code__.co_firstlineno)
+        if _PACKAGE in file.parents:
+            self._name, self._stamp = line, ""
+        else:  # a node from outside, whose kernels may call those of files beside it
+            self._name = f"{line}-{sha256(str(file).encode()).hexdigest()[:8]}"
+            self._stamp = _digest_of(list(file.parent.glob("*.py")), file.parent)
+
+    def ensure_cache_path(self) -> None:
+        Path(self._path).mkdir(parents=True, exist_ok=True)
+
+    def get_cache_path(self) -> str:
+        return self._path
+
+    def get_source_stamp(self) -> str:
+        return self._stamp
+
+    def get_disambiguator(self) -> str:
+        return self._name
+
+
+@cache
+def _cache_type() -> Any:
+    """Return numba's cache of a function, told where it lies and by which name; damaged entries are as good as none."""
+    from numba.core import caching
+
+    numba: Any = caching  # half typed
+
+    class Impl(numba.CompileResultCacheImpl):  # type: ignore[misc]
+        def __init__(self, place: _Place, function: Callable[..., Any]) -> None:
+            self._locator, self._lineno = place, function.__code__.co_firstlineno
+            # By the whole name of the module: all lie in one folder.
+            name = f"{function.__module__}.{function.__qualname__}"
+            self._filename_base = self.get_filename_base(name, getattr(sys, "abiflags", ""))
+
+    class Kept(numba.FunctionCache):  # type: ignore[misc]
+        def __init__(self, function: Callable[..., Any], place: Path) -> None:
+            self._impl_class = partial(Impl, _Place(function, place))
+            super().__init__(function)
+            self._name = f"{function.__module__}.{function.__qualname__}"
+
+        def load_overload(self, sig: Any, target_context: Any) -> Any:
+            try:
+                return super().load_overload(sig, target_context)
+            except Exception as error:  # noqa: BLE001  # whatever a damaged pickle raises
+                _LOG.warning("machine code of %s on disk cannot be read (%r); it is made anew", self._name, error)
+                return None
+
+        def save_overload(self, sig: Any, data: Any) -> None:
+            try:
+                super().save_overload(sig, data)
+            except OSError as error:  # a full disk: the code serves this process
+                _LOG.warning("machine code of %s cannot be kept on disk: %s", self._name, error)
+
+    return Kept
+
+
+def kept(function: Callable[..., Any]) -> Any:
+    """Return a cache for the machine code of a function, as a dispatcher of numba holds one; None without a folder."""
+    place = folder()
+    return None if place is None else _cache_type()(function, place)
+
+
+def is_kept(name: str) -> bool:
+    """Return whether there is machine code on disk of a function, by its whole name."""
+    place = folder()
+    return place is not None and any(place.glob(f"{name}-*.py{sys.version_info[0]}{sys.version_info[1]}*.nbi"))
+
+
+@cache
+def begin_child() -> None:
+    """Begin a process in the background that makes all machine code, if none does so already; it may outlive this one.
+
+    Its absence is no failure: what it would have made is made later, or never, and answers come in plain Python.
+    """
+    path = os.pathsep.join([str(_PACKAGE.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
+    quiet = subprocess.DEVNULL
+    try:
+        subprocess.Popen(
+            [sys.executable, "-P", "-m", "optloc.cli.compile"],
+            stdin=quiet,
+            stdout=quiet,
+            stderr=quiet,
+            env=os.environ | {"PYTHONPATH": path},
+            start_new_session=True,
+        )
+    except OSError as error:
+        _LOG.warning("no process can be begun that would make machine code: %s", error)
+
+
+def _holds(file: IO[bytes], *, wait: bool) -> bool:
+    """Return whether a file could be locked, until it is closed; True on systems and file systems without locks."""
+    try:
+        import fcntl
+
+        fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except BlockingIOError:
+        return False
+    except (ImportError, OSError):
+        pass
+    return True
+
+
+@contextmanager
+def alone() -> Iterator[bool]:
+    """Tell whether no other process makes all machine code, and be the one that does."""
+    place = folder()
+    if place is None:
+        yield False
+        return
+    with (place / "all.lock").open("ab") as file:
+        yield _holds(file, wait=False)
+
+
+@contextmanager
+def locked(name: str) -> Iterator[None]:
+    """Hold the machine code of a function while it is made: a process that waits for it loads it afterwards."""
+    place = folder()
+    if place is None or is_kept(name):
+        yield
+        return
+    with ExitStack() as stack:
+        try:
+            file = stack.enter_context((place / f"{name}.lock").open("ab"))
+        except OSError:  # the folder was removed: it is made once more
+            yield
+            return
+        _holds(file, wait=True)
+        yield

@@ -1,0 +1,358 @@
+"""Few fixes at once: from new measurements of a kept problem to the verdict, through machine code and past all batches.
+
+What does not depend on the measurements is kept: the linear maps of the fix, the nodes of the proof and the map to its
+right side, the columns of the verdict. What is not plain (a rival, a doubtful cost, a proof that is not done at once)
+takes the long way, which knows what to say of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from math import prod
+from threading import local
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from optloc.base.types import Array, Certificate, Status, first_status
+from optloc.problem.chart import Chart, quantile
+from optloc.problem.epochs import separable
+from optloc.problem.fix import Alternatives, Fix, Stage
+from optloc.problem.problem import Problem
+from optloc.proof.batch import Answered, Asked, empty_answer, lacks_code, prove_here
+from optloc.proof.near import UNIQUE
+from optloc.proof.pose import Affine, Posed, pose_affinely
+from optloc.proof.scope import is_run, unsupported
+from optloc.solvers.certify.branch_and_bound import budgets, certify_stage, equal_cost, state_claim
+from optloc.solvers.certify.posed import agrees
+from optloc.solvers.methods import Method
+from optloc.solvers.policy import COVERED, DOUBT, LISTED_GAP, REFUTED
+from optloc.solvers.range_fixes import (
+    LIMIT,
+    TOLERANCE,
+    Direct,
+    at_hand,
+    direct,
+    direct_stages,
+    kernel_for,
+)
+from optloc.solvers.verdict.findings import (
+    BENT_SENTENCE,
+    NOT_TRIED,
+    centre_of,
+    chart_kind,
+    is_proof_of_one,
+    largest,
+    marks_of,
+)
+from optloc.solvers.verdict.judge import LOCAL
+
+# Beginnings of methods that go the short way, and whether they prove.
+_WORDS = {("gtrs", "lsr"): False, ("gtrs", "lsr", "certify"): True}
+
+
+# What is said of a fix by its status, and of a curved one by the kind of its chart; whatever else there may be to say
+# takes numbers, and the long way.
+_SENTENCES: dict[tuple[Status, int | None], str] = {
+    (Status.OK, None): "",
+    (Status.UNPROVEN, None): NOT_TRIED,
+    **{(Status.CURVED, kind): sentence for kind, sentence in BENT_SENTENCE.items()},
+}
+# By how much of what counts as equal (`equal_cost`) the bound of a proof may be off the cost: it is one below.
+_APART = 3.0
+
+
+# Problems that go the short way together at most: from there on a batch is as quick.
+MANY = 64
+
+
+@dataclass(slots=True)
+class _Room:
+    """What a thread writes into while it works on n problems, and what all their fixes share.
+
+    Parameters
+    ----------
+    z : array (n, m)
+        Measurements.
+    found : tuple of array
+        Fields of `optloc.compute.range_start.Answer`, without position and covariance.
+    pose : Posed
+        With the whitened measurements; empty without a proof.
+    asked, answered : Asked, Answered
+        Of the proofs.
+    centre : array (..., d)
+        Of the charts.
+    kept : dict
+        Fields of a fix that are the same for all measurements; nobody can write into them.
+    checked : bool
+        Whether the posed cost of a fix was compared with its own.
+    """
+
+    z: Array
+    found: tuple[Array, ...]
+    pose: Posed
+    asked: Asked
+    answered: Answered
+    centre: Array
+    kept: dict[str, Any]
+    checked: bool = False
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Single:
+    """A problem without batch axes that waits for measurements; see `single`.
+
+    Parameters
+    ----------
+    problem : Problem
+        What it was made of; its own measurements do not matter.
+    plan : Direct
+        What fixes it.
+    model : Model
+        The maps of the plan, as machine code takes them.
+    station : array (1, s, d)
+        Stations that take part, metres.
+    map : Affine, optional
+        Of the costs of the proof; None for methods without one.
+    absent : bool array (m,), optional
+        Rows of weight zero, which may hold anything; None where all count.
+    centre : array (d,)
+        Middle of the stations.
+    doubt, refuted, region : float
+        Costs that call for another look and that refute the model, and by how much those of the likelihood region
+        exceed the least.
+    often : bool
+        Whether it is worth loading machine code for.
+    own : threading.local
+        What each thread writes into.
+    """
+
+    problem: Problem
+    plan: Direct
+    model: Any
+    station: Array
+    map: Affine | None
+    absent: Array | None
+    centre: Array
+    doubt: float
+    refuted: float
+    region: float
+    often: bool
+    own: local = field(default_factory=local)
+
+    def __call__(self, z: Array) -> Fix | None:
+        """Return the fix of measurements (m,), or fixes (n,) of a few (n, m).
+
+        None where only the long way knows what to say of one of them.
+        """
+        from optloc.compute.range_start import Answer
+
+        began, shape = perf_counter(), z.shape[:-1]
+        if not at_hand(n := prod(shape)) or (self.map is not None and lacks_code(n)):
+            return None
+        room = self._room(shape)
+        room.z[:] = z
+        if self.absent is not None:
+            room.z[:, self.absent] = 0.0
+        d = self.station.shape[-1]
+        x, covariance = np.empty((n, self.plan.layout.size)), np.empty((n, d, d))
+        answer = Answer(x, covariance, *room.found)
+        kernel = kernel_for(n, often=self.often)
+        steps = kernel(self.model, room.z, self.station, TOLERANCE, LIMIT, False, answer)
+        costs = answer.cost.tolist()
+        for cost, settled, rival in zip(costs, answer.settled.tolist(), answer.rival_cost.tolist(), strict=True):
+            if not settled or rival < np.inf or not cost <= self.doubt:
+                return None
+        fixed = perf_counter()
+        stages = direct_stages(n, steps, fixed - began)
+        claims: list[Certificate] | None = [LOCAL] * n
+        if self.map is not None:
+            claims = self._prove(self.map, x[:, :d], costs, room)
+            stages = (*stages, certify_stage(f"{n} global", fixed))
+        fix = None if claims is None else self._judge(shape, answer, costs, claims, stages, room)
+        if fix is not None and not room.checked:
+            room.checked = self._agrees(fix, room)
+            return fix if room.checked else None
+        return fix
+
+    def _prove(self, posed: Affine, position: Array, costs: list[float], room: _Room) -> list[Certificate] | None:
+        """Return what is proven of all positions, or None where that is not all there is to prove."""
+        asked, answered = room.asked, room.answered
+        for i, cost in enumerate(costs):
+            posed.write(room.z[i], room.pose.w[i])
+            asked.eps[i] = equal_cost(cost)
+        asked.x[:] = position
+        prove_here(room.pose, asked, answered)
+        out = []
+        told = zip(costs, *(array.tolist() for array in answered[:4]), strict=True)
+        for cost, verdict, boxes, bound, everywhere in told:
+            # a bound that is not that of this cost is one of another: the long way finds out which is wrong
+            if verdict != UNIQUE or not everywhere or not abs(cost - bound) <= _APART * equal_cost(cost):
+                return None
+            out.append(state_claim(cost, bound, LISTED_GAP, boxes, 0, None))
+        return out
+
+    def _agrees(self, fix: Fix, room: _Room) -> bool:
+        """Return whether the posed costs are the problem's own, at the first fixes of a thread and beside them."""
+        many = self.problem.with_rows(z=room.z.copy())
+        return self.map is None or bool(agrees(many, fix.flat(), room.pose).all())
+
+    def _judge(
+        self,
+        shape: tuple[int, ...],
+        answer: Any,
+        costs: list[float],
+        claims: list[Certificate],
+        stages: tuple[Stage, ...],
+        room: _Room,
+    ) -> Fix | None:
+        """Return the fixes with their verdicts, or None where more stands against one than words without numbers."""
+        code, marks, kinds, reason, infinity = [], [], [], [], []
+        for i, (cost, bent, least) in enumerate(
+            zip(costs, answer.kappa.tolist(), answer.infinity.tolist(), strict=True)
+        ):
+            unique = is_proof_of_one(claims[i], least - cost)
+            marks.append(marks_of(cost > self.refuted, least - cost, self.region, np.inf, bent[0], unique))
+            code.append(_status(marks[i]))
+            kinds.append(chart_kind(*bent))
+            infinity.append(least - cost)
+            sentence = _SENTENCES.get((code[i], kinds[i] if code[i] == Status.CURVED else None))
+            if sentence is None:
+                return None
+            reason.append(sentence)
+        x, covariance = (answer.x, answer.covariance) if shape else (answer.x[0], answer.covariance[0])
+        return Fix(
+            x,
+            covariance,
+            code=_numbers(code, shape, np.int8),
+            reason=_objects(reason, shape),
+            certificate=_objects(claims, shape),
+            cost=_numbers(costs, shape),
+            stages=stages,
+            active=_objects(_NOTHING[: len(costs)], shape),
+            marks=_numbers(marks, shape, np.int32),
+            chart=Chart(_numbers(kinds, shape, np.int8), x[..., : covariance.shape[-1]], covariance, room.centre),
+            infinity=_numbers(infinity, shape),
+            **room.kept,
+        )
+
+    def _room(self, shape: tuple[int, ...]) -> _Room:
+        """Return the arrays of this thread for so many problems."""
+        rooms: dict[tuple[int, ...], _Room] | None = getattr(self.own, "rooms", None)
+        if rooms is None:
+            rooms = self.own.rooms = {}
+        if shape not in rooms:
+            rooms[shape] = self._make_room(shape)
+        return rooms[shape]
+
+    def _make_room(self, shape: tuple[int, ...]) -> _Room:
+        n, size, d, m = max(1, *shape, 1), self.plan.layout.size, self.station.shape[-1], self.problem.count
+        found = (
+            np.empty(n),
+            np.empty(n, dtype=np.bool_),
+            np.empty((n, size)),
+            np.empty(n),
+            np.empty((n, 2)),
+            np.empty(n),
+        )
+        posed = self.map
+        none = np.empty(0, dtype=np.int64), np.empty((1, 0, 0)), np.empty((1, 0, 0))
+        kinds, data, K = none if posed is None else (posed.kinds, posed.data, posed.K)
+        gap, nowhere = np.full(n, LISTED_GAP), np.full((n, 2, d), np.nan)
+        asked = Asked(
+            x=np.empty((n, d)),
+            others=np.empty((n, 0, d)),
+            known=np.zeros(n, dtype=np.int64),
+            hidden=np.zeros(n, dtype=np.int64),
+            kappa=gap,
+            eps=np.empty(n),
+            region=nowhere,
+            # where all positions cannot be bounded the long way says what can
+            fallback=nowhere,
+            budget=budgets(gap, len(kinds), 1),
+            planes=np.empty((n, 0, 3)),
+            surface=np.empty((n, 0)),
+        )
+        pose = Posed(kinds, data, K, np.empty((n, K.shape[1])), np.full(n, np.inf))
+        centre = np.broadcast_to(self.centre, (*shape, d))
+        kept = {
+            "layout": self.plan.layout,
+            "frame": self.plan.frame,
+            "alternatives": Alternatives(np.empty((*shape, 0, size)), np.empty((*shape, 0))),
+            # views that nobody can write into
+            "dof": np.broadcast_to(np.int32(self.plan.dof), shape),
+            "weights": np.broadcast_to(self.plan.weight, (*shape, m)),
+        }
+        return _Room(np.empty((n, m)), found, pose, asked, empty_answer(n, d), centre, kept)
+
+
+@lru_cache(maxsize=64)
+def _status(marks: int) -> Status:
+    return Status(int(first_status(np.array(marks))))
+
+
+_NOTHING = [()] * MANY  # constraints that hold fixes: none
+
+
+def _objects(values: Sequence[object], shape: tuple[int, ...]) -> Array:
+    out = np.empty(len(values), dtype=object)
+    for i, value in enumerate(values):
+        out[i] = value
+    return out.reshape(shape)
+
+
+def _numbers(values: Sequence[float], shape: tuple[int, ...], kind: Any = float) -> Array:
+    return np.array(values if shape else values[0], dtype=kind)
+
+
+def single(problem: Problem, method: Method, *, often: bool = True) -> Single | None:
+    """Return what fixes measurements of one problem the short way, or None where there is none.
+
+    There is one where problems differ in measurements alone and have a direct way, for methods that begin with it, and
+    where a proof depends on the measurements in a straight line.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its own measurements do not matter.
+    method : Method
+        What its fixes are to be the same as.
+    often : bool
+        As of `Single`.
+    """
+    from optloc.compute.range_start import Model
+
+    proves = _WORDS.get(method.words)
+    if proves is None or (method.then is not None and not proves) or separable(problem):
+        return None
+    if problem.frame.geodetic:  # what the Earth hides is judged by the stages
+        return None
+    bare = problem.with_rows(z=np.zeros(problem.count))
+    plan = None if bare.batch_shape else direct(bare)
+    if plan is None or (proves and (unsupported(bare) or is_run(bare))):
+        return None
+    posed = pose_affinely(bare) if proves else None
+    if proves and posed is None:
+        return None
+    weight, d = bare.weight, problem.dimension
+    return Single(
+        bare,
+        plan,
+        Model(*plan.maps),  # type: ignore[arg-type]
+        np.require(bare.stations.position[:, plan.station], dtype=float, requirements=["C", "W"]),
+        posed,
+        weight == 0.0 if (weight == 0.0).any() else None,
+        centre_of(bare).reshape(d),
+        largest(plan.dof, DOUBT),
+        largest(plan.dof, REFUTED),
+        quantile(COVERED, d),
+        often,
+    )
+
+
+def is_few(shape: tuple[int, ...]) -> bool:
+    """Return whether problems with some batch axes may go the short way: one axis at most, and a short one."""
+    return len(shape) < 2 and 0 < max(shape, default=1) <= MANY

@@ -1,0 +1,162 @@
+"""One fix at once: prepared, of a known and of a new structure, and a tracker's update; ratios to SciPy in one run."""
+
+import gc
+import os
+from functools import cache
+from itertools import permutations
+from time import thread_time
+
+import numpy as np
+import pytest
+from benchmarks.scenes import Scene
+from benchmarks.with_general import scipy_from_the_truth
+from monte_carlo.tables import write
+
+from optloc import Motion, assemble, measured, prepare, solve
+from optloc.compute.jit import enabled
+from optloc.compute.range_fixes import few_fixes
+from optloc.compute.range_start import Answer
+from optloc.proof.batch import prove_here
+from optloc.solvers.range_fixes import LIMIT, TOLERANCE
+from optloc.track import State, polynomial, predicted
+from optloc.track.track import scan_at, take_scan
+from optloc.track.updates import filter_of
+
+pytestmark = pytest.mark.skipif(not enabled(), reason="times of machine code")
+SIGMA, COUNT, WARM = 5.0, 400, 20
+STATIONS = 1e3 * np.array([[0, 0, 0], [8, 0, 0.2], [0, 8, -0.15], [-7, 1, 0.4], [1, -8, 0.1], [5, 5, 0.9]])
+FIRST = np.zeros(5, dtype=int)
+PLACES = ("inside", "10 to 30 km")
+
+
+@cache
+def scene(place):
+    """Differences to the first of six stations of emitters inside the network or outside."""
+    rng = np.random.default_rng(PLACES.index(place))
+    turn, height = rng.uniform(0.0, 2.0 * np.pi, COUNT), rng.uniform(500.0, 6e3, COUNT)
+    r = rng.uniform(0.0, 5e3, COUNT) if place == PLACES[0] else rng.uniform(1e4, 3e4, COUNT)
+    truth = np.stack([r * np.cos(turn), r * np.sin(turn), height], axis=1)
+    arrival = np.linalg.norm(truth[:, None] - STATIONS, axis=-1)
+    arrival += SIGMA * rng.standard_normal(arrival.shape)
+    z = arrival[:, 1:] - arrival[:, :1]
+    return Scene(np.broadcast_to(STATIONS, (COUNT, 6, 3)), z, truth, SIGMA**2 * (np.eye(5) + 1.0))
+
+
+def posed(z, order=(1, 2, 3, 4, 5)):
+    return assemble(STATIONS, measured("tdoa", z, a=np.array(order), b=FIRST, arrival_sigma=SIGMA))
+
+
+def timed(work, count=COUNT, warm=WARM):
+    """Return median and 99th percentile, microseconds of processor time, of calls with the numbers of measurements."""
+    for i in range(warm):
+        work(i)
+    times = np.empty(count - warm)
+    gc.collect()
+    gc.disable()
+    try:
+        for i in range(warm, count):
+            began = thread_time()
+            work(i)
+            times[i - warm] = thread_time() - began
+    finally:
+        gc.enable()
+    return 1e6 * np.median(times), 1e6 * np.percentile(times, 99)
+
+
+def general(place):
+    """SciPy from the truth, of one problem at a time."""
+    whole = scene(place)
+    parts = [
+        Scene(whole.stations[i : i + 1], whole.z[i : i + 1], whole.truth[i : i + 1], whole.covariance)
+        for i in range(COUNT)
+    ]
+    made = [scipy_from_the_truth(part) for part in parts]
+    return timed(lambda i: made[i]())
+
+
+def kernels(place):
+    """The machine code of fix and proof alone, on arrays that are ready."""
+    ready, z = prepare(posed(scene(place).z[0]), "auto"), scene(place).z
+    ready(z[0])
+    short = ready.short
+    room = short._room(())
+    x, covariance = np.empty((1, 3)), np.empty((1, 3, 3))
+    answer = Answer(x, covariance, *room.found)
+
+    def work(i):
+        room.z[0] = z[i]
+        few_fixes(short.model, room.z, short.station, TOLERANCE, LIMIT, False, answer)
+        short.map.write(z[i], room.pose.w[0])
+        room.asked.x[0] = x[0]
+        prove_here(room.pose, room.asked, room.answered)
+
+    return timed(work)
+
+
+def prepared(method, place):
+    ready, z = prepare(posed(scene(place).z[0]), method), scene(place).z
+    return timed(lambda i: ready(z[i]))
+
+
+def new():
+    """Structures that nobody has seen: the stations in another order each time."""
+    orders = list(permutations(range(1, 6)))[1:101]
+    made = [posed(z[np.array(order) - 1], order) for z, order in zip(scene(PLACES[0]).z, orders, strict=False)]
+    return timed(lambda i: solve(made[i]), len(made), 0)
+
+
+def assembled():
+    z = scene(PLACES[0]).z
+    return timed(lambda i: posed(z[i]))
+
+
+def update(name):
+    """The update of a predicted state by a scan of five differences."""
+    truth, rng = scene(PLACES[0]).truth[0], np.random.default_rng(1)
+    times = np.arange(COUNT, dtype=float)
+    way = truth + times[:, None] * np.array([5.0, 3.0, 0.0])
+    arrival = np.linalg.norm(way[:, None] - STATIONS, axis=-1) + SIGMA * rng.standard_normal((COUNT, 6))
+    z, a, b = (arrival[:, 1:] - arrival[:, :1]).ravel(), np.tile(np.arange(1, 6), COUNT), np.tile(FIRST, COUNT)
+    rows = measured("tdoa", z, a=a, b=b, epoch=np.repeat(np.arange(COUNT), 5), arrival_sigma=SIGMA)
+    run = assemble(STATIONS, rows, times=times, motions=(Motion(0, span="epoch"),))
+    scans, rule, dynamics = [scan_at(run, k, 1) for k in range(COUNT)], filter_of(name), polynomial(1, 0.1)
+    state = [State(-1.0, np.r_[way[0] - [5.0, 3.0, 0.0], 5.0, 3.0, 0.0], np.diag([1e4] * 3 + [25.0] * 3))]
+
+    def work(i):
+        ahead = predicted(state[-1], dynamics, float(times[i]), 3)
+        done, _ = take_scan(scans[i], ahead, rule)
+        state.append(State(float(times[i]), done.mean, done.cov))
+
+    return timed(work)
+
+
+def figures():
+    """Return name, median and 99th percentile, and the place whose SciPy each is compared with."""
+    for place in PLACES:
+        yield f"{place}: SciPy `least_squares` from the truth", *general(place), place
+        yield f"{place}: machine code of fix and proof alone", *kernels(place), place
+        for method in ("auto", "gtrs+lsr"):
+            yield f"{place}: prepared, {method}", *prepared(method, place), place
+    yield "`solve`, auto", *new(), PLACES[0]
+    yield "`assemble`", *assembled(), PLACES[0]
+    for name in ("ekf", "iekf"):
+        yield f"prediction and update of a tracker, {name}", *update(name), PLACES[0]
+
+
+@pytest.mark.parametrize(("place", "proven"), zip(PLACES, (0.7, 1.5), strict=True))
+def test_one_fix_takes_as_long_as_scipy_from_the_truth(place, proven):
+    """Less than that inside the stations; far from them the proof looks at some dozens of boxes, of 3 us each."""
+    theirs = general(place)[0]
+    assert prepared("gtrs+lsr", place)[0] < 0.5 * theirs
+    assert prepared("auto", place)[0] < proven * theirs
+
+
+@pytest.mark.full
+def test_write_the_table():
+    rows, theirs = [], {}
+    for name, median, late, place in figures():
+        theirs.setdefault(place, median)
+        rows.append([name, f"{median:.0f}", f"{late:.0f}", f"{median / theirs[place]:.2f}"])
+    facts = f"five TDOA of six stations, {SIGMA:g} m an arrival; processor time of one core of {os.cpu_count()}"
+    header = ["one fix at once", "median, us", "99 of 100, us", "SciPy from the truth"]
+    assert write("latency", header, rows, facts).is_file()
