@@ -13,6 +13,9 @@ DATA_DEFAULT = ROOT.parent / "shared" / "data"
 hypothesis.settings.register_profile("optloc", derandomize=True, deadline=None)
 hypothesis.settings.load_profile("optloc")
 
+# Machine code is waited for, in this process and in those that tests begin: answers must not depend on what is on disk.
+os.environ.setdefault("OPTLOC_COMPILE", "wait")
+
 # Seeds of a test in full: data that nobody had seen broke a proof once, where ten seeds had been one.
 FULL_SEEDS = 10
 
@@ -22,6 +25,21 @@ def pytest_addoption(parser):
     group = parser.getgroup("optloc")
     group.addoption("--seed", type=int, default=0, help="first seed of the drawn scenes (0: those of every run)")
     group.addoption("--seeds", type=int, help=f"how many seeds, one after the other (1; {FULL_SEEDS} of full tests)")
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_sessionstart(session):
+    """Have machine code made before several processes begin that would need it at once; one makes what it needs."""
+    option = session.config.option
+    if hasattr(session.config, "workerinput") or not getattr(option, "numprocesses", None) or option.collectonly:
+        return
+    from optloc.cli.compile import make, missing
+    from optloc.cli.output import meter
+    from optloc.compute.jit import enabled
+
+    if enabled() and missing():
+        with meter("making machine code", quiet=False) as tell:
+            make(tell)
 
 
 def pytest_generate_tests(metafunc):

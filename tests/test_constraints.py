@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from often import few
 from scipy.optimize import minimize
 from verdicts import alone
 
@@ -76,7 +77,7 @@ def above(x):
 
 
 @pytest.mark.parametrize("exact", [True, False])
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", few(range(6), 2))
 def test_heights(seed, exact):
     rng = np.random.default_rng(seed)
     truth = np.array([*rng.uniform(500.0, 4500.0, 2), rng.uniform(100.0, 2e3)])

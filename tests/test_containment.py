@@ -1,6 +1,7 @@
 """A numerical failure of one problem is its status: in every method linear algebra is made to fail, once and again."""
 
 import sys
+import warnings
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
@@ -225,3 +226,12 @@ def test_prepared_fixes_are_contained_too(monkeypatch):
     monkeypatch.setattr("optloc.solvers.prepared.settle_directly", fail)
     fix = ready(many.z)
     np.testing.assert_allclose(fix.x, solve(many, "gtrs+lsr").x, atol=1e-3)
+
+
+def test_values_that_overflow_are_judged_without_a_warning():
+    """Four thousand decibels are a ratio that has no square in a double."""
+    z = [1.66, -4190.0, 8.13, 0.09]
+    rows = assemble(STATIONS, measured("rss_difference", z, a=[1, 2, 3, 4], b=0, sigma=0.1))
+    with warnings.catch_warnings(action="error"):
+        fix = solve(rows)
+    assert fix.status != Status.OK

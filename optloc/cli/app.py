@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from optloc.cli.live import EXAMPLES, SERVED, live, serve
 from optloc.cli.options import (
     EXIT_CODES,
     AboveGround,
@@ -538,6 +539,19 @@ def list_(
     raise typer.Exit(run_list(what, as_json))
 
 
+@app.command("compile", rich_help_panel=MORE, epilog=example("optloc compile", "optloc compile --check"))
+def compile_(
+    check: Annotated[bool, typer.Option("--check", help="Compile nothing: only say what there is.")] = False,
+    as_json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Make the machine code of all kernels for this computer at once, which takes minutes and is kept on disk."""
+    from optloc.cli.compile import run_compile
+
+    raise typer.Exit(run_compile(check, as_json, quiet=quiet))
+
+
 @app.command(rich_help_panel=MORE, epilog=example("optloc schema > optloc.schema.json"))
 def schema(verbose: Verbose = False) -> None:
     """Print the JSON schema of problem files, from which editors complete and check them."""
@@ -546,6 +560,9 @@ def schema(verbose: Verbose = False) -> None:
 
     typer.echo(dumps(of_files()))
 
+
+app.command(rich_help_panel=ANSWERS, epilog=EXAMPLES)(live)
+app.command(rich_help_panel=ANSWERS, epilog=SERVED)(serve)
 
 # Last, so that help lists it behind the other commands of its panel.
 app.add_typer(study, name="study", rich_help_panel=MORE)

@@ -19,6 +19,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
 from optloc.base.outputs import claim, is_stream, visible, written
 from optloc.base.types import Array
+from optloc.compute.progress import Reporter
 from optloc.files.writer import write_csv
 
 if TYPE_CHECKING:
@@ -199,3 +200,26 @@ def bar(title: str, total: int, quiet: bool) -> Iterator[Callable[[int], None]]:
     with Progress(*parts, console=console, disable=not shown, transient=True) as progress:
         task = progress.add_task(title, total=total)
         yield lambda n: progress.update(task, advance=n)
+
+
+@contextmanager
+def meter(title: str, quiet: bool) -> Iterator[Callable[[int, int], None]]:
+    """Yield a function that is told how much of how much is done: a bar on terminals, elsewhere a line now and then."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    console, known = Screen(stderr=True), [0, 0]
+    lines = Reporter(lambda: f"{title}: {known[0]} of about {known[1]}")
+    lines.muted = quiet or console.is_terminal
+    parts = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*parts, console=console, disable=quiet or not console.is_terminal, transient=True) as progress:
+        task = progress.add_task(title, total=None)
+
+        def tell(done: int, total: int) -> None:
+            known[:] = done, total
+            progress.update(task, completed=done, total=total)
+
+        lines.begin()
+        try:
+            yield tell
+        finally:
+            lines.end()

@@ -38,7 +38,8 @@ Five aircraft time an emitter some 360 km away for ten minutes, 200 times, each 
 four of these clocks are unknown: a fix that believed them would be more than a kilometre off. They are estimated
 together with the position, and `from data` says how much of each estimate is measurement, not assumption.
 
-The line `certificate` says `unknown`: so many rows are more than a proof takes, and what is not proven is not claimed.
+The line `certificate` says that nothing else explains the 800 differences as well: no place on Earth or in space, with
+whatever clocks. Where it says `unknown`, there is no machine code yet: `optloc compile` makes it, once, in minutes.
 """
 _PROOF = """
 # 3. A proof
@@ -58,7 +59,8 @@ _END = """
 """
 _STEPS = ((_FIX, "demo"), (_REGISTRATION, "registration"), (_PROOF, "ambiguous"))
 PICTURE = Path("optloc-demo.png")
-# What a shipped problem is there to show beside an `ok` fix: two places that fit, a run of which nothing is proven.
+# What a shipped problem is there to show beside an `ok` fix: two places that fit, and a run whose proof takes machine
+# code, which a fresh machine has none of.
 _SHOWN = {"ambiguous": (Status.AMBIGUOUS,), "registration": (Status.UNPROVEN,)}
 
 

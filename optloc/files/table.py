@@ -364,6 +364,8 @@ def _to_column(cells: list[Any]) -> Array:
 
 # Share of a window by which a time may be short of the next one: times such as 0.3 are not multiples of 0.1 in binary.
 _ROUNDING = 1e-9
+# Windows beyond this number have no number of their own in a double.
+_COUNTED = 2.0**53
 
 
 @dataclass(frozen=True, slots=True)
@@ -446,8 +448,11 @@ def epochs_of(keys: Keys, count: int, window: float | None, free: bool | None, s
     Raises
     ------
     InvalidProblem
-        Where the times of an epoch have a whole other epoch between them.
+        Where the times of an epoch have a whole other epoch between them, or windows are too short to be counted.
     """
+    if window is not None and keys.time is not None and np.ptp(keys.time) > _COUNTED * window:
+        what = f"windows of {window:g} s are too short to be counted over {np.ptp(keys.time):g} s"
+        raise InvalidProblem(what, join(source, "[epochs]", "key 'window'"), "give a longer one")
     index, labels, times = _group(keys, count, window)
     _check_instants(keys, labels, index, source)
     if keys.target is None:

@@ -126,7 +126,9 @@ class Problem:
     @cached_property
     def batch_shape(self) -> tuple[int, ...]:
         """Return the leading axes that all arrays share."""
-        return np.broadcast_shapes(*(array.shape[: array.ndim - core] for array, core in _arrays(self)))
+        # few shapes are different: numpy, which takes longer than all the rest, is asked where more than one is left
+        found = {array.shape[: array.ndim - core] for array, core in _arrays(self)} - {()}
+        return np.broadcast_shapes(*found) if len(found) > 1 else next(iter(found), ())
 
     @cached_property
     def structure(self) -> tuple[Any, ...]:
@@ -196,6 +198,8 @@ class Problem:
 
 
 def _join(parts: list[Array]) -> Array:
+    if len(parts) == 1 and isinstance(parts[0], np.ndarray):
+        return parts[0].copy()  # a tenth of the time of a concatenation, and as new
     xp = library(parts[0])
     shape = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
     joined: Array = xp.concat([xp.broadcast_to(part, (*shape, part.shape[-1])) for part in parts], axis=-1)

@@ -94,7 +94,13 @@ class Part:
 
 
 def write_page(
-    title: str, parts: Sequence[Part], *, opening: Sequence[str] = (), facts: str = "", methods: Iterable[Mark] = ()
+    title: str,
+    parts: Sequence[Part],
+    *,
+    opening: Sequence[str] = (),
+    facts: str = "",
+    methods: Iterable[Mark] = (),
+    live: bool = False,
 ) -> str:
     """Return a page.
 
@@ -110,9 +116,11 @@ def write_page(
         The same in small print.
     methods : iterable of Mark
         Looks of methods for a legend that stays in view.
+    live : bool
+        Whether the map asks its server for fixes, once a second.
     """
     page = _environment().get_template("page.html")
-    return page.render(title=title, parts=parts, opening=opening, facts=facts, methods=list(methods))
+    return page.render(title=title, parts=parts, opening=opening, facts=facts, methods=list(methods), live=live)
 
 
 @cache
@@ -184,6 +192,32 @@ def track_page(problem: Problem, tracks: Spots, title: str) -> str:
     """Return the same of the scans of tracks."""
     _on_earth(problem.frame.geodetic)
     return _page(problem, tracks, Spots(np.zeros((0, 2)), (), np.zeros(0, dtype=bool), ()), title, "track", None)
+
+
+def live_page(problem: Problem, title: str) -> str:
+    """Return an HTML page with a map of stations, on which the fixes of the server that it comes from appear.
+
+    Parameters
+    ----------
+    problem : Problem
+        On Earth; gives the stations.
+    title : str
+        Title of the page.
+
+    Raises
+    ------
+    InvalidProblem
+        Where the frame is not on Earth, or matplotlib is missing.
+    """
+    _on_earth(problem.frame.geodetic)
+    stations = station_spots(problem)
+    limits = _limits([stations.place])
+    plane, middle = Plane(*limits), (limits[0] + limits[1]) / 2.0
+    layers: dict[str, Sequence[Drawn]] = {"stations": _stations(stations, plane, middle), "fixes": ()}
+    text = "Stations (white) and the latest fixes (blue; orange where the status is not ok). Point at a mark."
+    canvas = map_canvas(plane, "map-1", title, layers, {}, text)
+    note = "Drag to move, wheel or pinch to zoom. Shores: Natural Earth."
+    return write_page(title, [Part("map", "Map", maps=[canvas], note=note)], live=True)
 
 
 def map_page(found: BoundMap, title: str) -> str:

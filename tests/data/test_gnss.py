@@ -42,10 +42,12 @@ def test_all_satellites_by_arrival_with_system_offsets(session, case, offset):
 
 
 @pytest.mark.parametrize(
-    "case", [CASES[0], *(pytest.param(case, marks=pytest.mark.full) for case in CASES[1:])], ids="-".join
+    ("case", "draws"),
+    [(CASES[0], 800), *(pytest.param(case, 1500, marks=pytest.mark.full) for case in CASES)],
+    ids=lambda given: "-".join(given) if isinstance(given, tuple) else str(given),
 )
-def test_three_satellites_and_the_height(session, case):
-    data = session.draws(1500, seed=3)
+def test_three_satellites_and_the_height(session, case, draws):
+    data = session.draws(draws, seed=3)
     fix, reference = solve(data.by_difference()), truths.gnss_draws(data)
     name = f"GNSS {case}, three satellites"
     right = np.linalg.norm(fix.position - reference.position, axis=-1) < 1.0

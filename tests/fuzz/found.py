@@ -15,6 +15,7 @@ kind = "range"
 sigma = 3.0
 rows = [{ a = "A", z = 2800.0 }, { a = "B", z = 2700.0 }, { a = "C", z = 3500.0 }, { a = "D", z = 3400.0 }]
 """
+TIMED = RANGES.replace("{ a", "{ time = 0.0, a", 2).replace("{ a", "{ time = 9.0, a")
 GAINS = """[[measurements]]
 kind = "groa"
 unit = "dB"
@@ -162,6 +163,11 @@ FOUND = {
         ["fix", "fdoa.toml", "-m", "robust", "--json"],
         {"fdoa.toml": problems()["fdoa.toml"]["fdoa.toml"].replace(b"9779.0", b"9779000000.0")},
         None,
+    ),
+    "windows of the least double": (
+        ["check", "p.toml"],
+        problem(text=f"format = 1\n[epochs]\nwindow = '5e-324 s'\n{STATIONS}{TIMED}"),
+        ["key 'window'", "too short to be counted"],
     ),
     "a difference of seven thousand decibels": (
         ["fix", "l.toml", "--json"],

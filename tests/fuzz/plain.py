@@ -285,6 +285,8 @@ def grouped(data, rows):
     elif window is not None:
         size, unit = window.split()
         width = float(size) * CLOCK[unit]
+        if max(times) - min(times) > 2.0**53 * width:
+            raise ValueError("windows that cannot be counted")
         key = [math.floor((time - min(times)) / width + 1e-9) for time in times]
         known = sorted(set(key))
     else:

@@ -1,0 +1,265 @@
+"""What a stream answers: records of fixes and proofs, and the same as GeoJSON and as aircraft of readsb."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from time import time
+from typing import Any
+
+import numpy as np
+
+from optloc.base.types import Array, Status
+from optloc.live.events import Event
+from optloc.problem.fix import Fix
+
+Record = dict[str, Any]
+
+# Shared by all threads: it keeps nothing of what it writes.
+_JSON = json.JSONEncoder(allow_nan=False, separators=(",", ":"))
+_LABELS = {int(status): status.label for status in Status}
+_FEET = 0.3048
+# Seconds after which a target is no longer on the list: what maps of aircraft take.
+_GONE = 60.0
+
+
+def fix_records(fix: Fix, events: Sequence[Event], phase: str | None) -> list[Record]:
+    """Return what is answered of each event of a batch (n,).
+
+    Parameters
+    ----------
+    fix : Fix
+        Their fixes.
+    events : sequence of n Event
+        Whose they are.
+    phase : str, optional
+        Which answer of several it is.
+
+    Returns
+    -------
+    list of dict
+        Metres in the frame of the site, degrees; None where there is no number.
+    """
+    position, covariance = fix.position, fix.covariance()
+    known = np.asarray(np.isfinite(position).all(-1))
+    spread = np.asarray(known & np.isfinite(covariance).all((-1, -2)))
+    columns: dict[str, list[Any]] = {} if phase is None else {"phase": [phase] * len(events)}
+    columns |= {
+        "status": [_LABELS[code] for code in fix.code.tolist()],
+        "position": _known(position, known),
+        "cov": _known(covariance, spread),
+        "cost": _known(fix.cost, np.isfinite(fix.cost)),
+        "dof": fix.dof.tolist(),
+    }
+    if fix.frame.geodetic:
+        lat, lon, height = fix.frame.to_geodetic(np.where(known[:, None], position, 0.0))
+        for name, values in (("lat_deg", np.degrees(lat)), ("lon_deg", np.degrees(lon)), ("height", height)):
+            columns[name] = _known(values, known)
+    names, others = ("event", *columns), _alternatives(fix)
+    made = [
+        dict(zip(names, row, strict=True))
+        for row in zip((event.name for event in events), *columns.values(), strict=True)
+    ]
+    for i, (record, event) in enumerate(zip(made, events, strict=True)):
+        record["alternatives"] = others.get(i, [])
+        if fix.reason[i]:
+            record["reason"] = fix.reason[i]
+        _mark(record, event)
+    return made
+
+
+def unsolved(event: Event, **why: str) -> Record:
+    """Return what is answered of an event that makes no problem; `why` is its status, or an error."""
+    record = {"event": event.name, "phase": "fix", **why, "position": None}
+    _mark(record, event)
+    return record
+
+
+def _known(values: Array, known: Array) -> list[Any]:
+    given: list[Any] = values.tolist()
+    return (
+        given if known.all() else [value if good else None for value, good in zip(given, known.tolist(), strict=True)]
+    )
+
+
+def _alternatives(fix: Fix) -> dict[int, list[Record]]:
+    """Return the other positions of those events of a batch that have some."""
+    gap = fix.alternatives.gap
+    if not gap.shape[-1]:
+        return {}
+    place, out = fix.layout.take(fix.alternatives.x, "position"), {}
+    for i in np.flatnonzero(np.isfinite(gap).any(-1)).tolist():
+        shown = np.isfinite(gap[i])
+        pairs = zip(place[i][shown].tolist(), gap[i][shown].tolist(), strict=True)
+        out[i] = [{"position": x, "gap": g} for x, g in pairs]
+    return out
+
+
+def _mark(record: Record, event: Event) -> None:
+    """Add what is not as usual about an event."""
+    if event.closed != "whole":
+        record["closed"] = event.closed
+    if event.revision > 1:
+        record["revision"] = event.revision
+    if event.conflict:
+        record["conflict"] = True
+    if event.target:
+        record["target"] = event.target
+
+
+def proof_records(fix: Fix, events: Sequence[Event], before: Sequence[Record | None]) -> list[Record]:
+    """Return what the second phase says of each event: the proof alone, or a better fix with it.
+
+    Parameters
+    ----------
+    fix : Fix
+        Fixes (n,) of the whole method.
+    events : sequence of n Event
+        Whose they are.
+    before : sequence of n dict or None
+        What the first phase said; None where nothing was said, so that all is.
+    """
+    records = fix_records(fix, events, None)
+    out = []
+    for new, old, certificate in zip(records, before, fix.certificate.tolist(), strict=True):
+        proof: Record = {"proof": getattr(certificate, "proof", "unknown")}
+        proof |= {"margin": getattr(certificate, "margin", 0.0), "boxes": getattr(certificate, "boxes", 0)}
+        if proof["proof"] == "unknown" and getattr(certificate, "reason", ""):
+            proof["why"] = certificate.reason
+        if old is None:
+            out.append(new | proof)
+        elif _same(new, old):
+            changed = {key: new[key] for key in ("alternatives", "revision", "reason", "target") if new.get(key)}
+            out.append({"event": new["event"], "phase": "proof", "status": new["status"], **proof, **changed})
+        else:
+            head = {"event": new.pop("event"), "phase": "proof"}
+            out.append(head | new | proof | {"revised": True})
+    return out
+
+
+# Costs and coordinates that differ by less are rounding, as shares: the whole method refines to eleven digits.
+_ROUNDING = 1e-9
+
+
+def _same(new: Record, old: Record) -> bool:
+    """Return whether the whole method has left the fix of the first phase as it was."""
+    if new["position"] is None or old["position"] is None:
+        return bool(new["position"] == old["position"])
+    size = 1.0 + max(map(abs, old["position"]))
+    apart = max(abs(a - b) for a, b in zip(new["position"], old["position"], strict=True))
+    return bool(apart <= _ROUNDING * size and (new["cov"] is None) == (old["cov"] is None))
+
+
+def unproven(event: Event, why: str, before: Record | None) -> Record:
+    """Return what is said of an event whose proof was not finished: "deadline" or "skipped: load"."""
+    proof = {"proof": "unknown", "margin": 0.0, "boxes": 0, "why": why}
+    proof |= {"target": event.target} if event.target else {}
+    if before is not None:
+        return {"event": event.name, "phase": "proof", "status": before["status"], **proof}
+    return {"event": event.name, **proof}
+
+
+def join(first: Record | None, then: Record) -> Record:
+    """Return the answers of both phases of an event as one."""
+    left_out = ("phase", "reason")  # why the first one was not sure is told no longer
+    kept = {} if first is None else {key: value for key, value in first.items() if key not in left_out}
+    return kept | {key: value for key, value in then.items() if key != "phase"}
+
+
+def to_line(record: Record) -> bytes:
+    """Return a record as one line of strict JSON; what is not finite is null."""
+    try:
+        return _JSON.encode(record).encode() + b"\n"
+    except ValueError:
+        return _JSON.encode(_finite(record)).encode() + b"\n"
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(inner) for key, inner in value.items()}
+    if isinstance(value, list):
+        return [_finite(inner) for inner in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+# Other formats.
+
+
+def to_feature(record: Record) -> Record:
+    """Return a record as a GeoJSON feature (RFC 7946); its geometry is null where it has no place on Earth."""
+    place = None
+    if record.get("lat_deg") is not None:
+        place = {"type": "Point", "coordinates": [record["lon_deg"], record["lat_deg"], record["height"]]}
+    left_out = ("lat_deg", "lon_deg", "height", "position", "cov")
+    about = {key: value for key, value in record.items() if key not in left_out}
+    return {"type": "Feature", "geometry": place, "properties": about}
+
+
+def to_aircraft(record: Record, seen: float = 0.0) -> Record:
+    """Return a fix on Earth as an entry of readsb's ``aircraft.json``: heights in feet, the target as `hex`."""
+    return {
+        "hex": record.get("target") or record["event"],
+        "type": "mlat",
+        "lat": round(record["lat_deg"], 6),
+        "lon": round(record["lon_deg"], 6),
+        "alt_geom": round(record["height"] / _FEET),
+        "mlat": ["lat", "lon", "alt_geom"],
+        "tisb": [],
+        "messages": 1,
+        "seen": round(seen, 1),
+        "seen_pos": round(seen, 1),
+        "status": record["status"],
+    }
+
+
+FORMATS: Mapping[str, Callable[[Record], bytes | None]] = {
+    "ndjson": to_line,
+    "geojson": lambda record: to_line(to_feature(record)),
+    "aircraft": lambda record: to_line(to_aircraft(record)) if record.get("lat_deg") is not None else None,
+}
+"""What lines of the output are: records, GeoJSON features, or aircraft where there is a place on Earth."""
+
+
+class Latest:
+    """The latest fix of each target, or event where it names none: what maps ask for.
+
+    Parameters
+    ----------
+    most : int
+        Targets that are kept.
+    """
+
+    def __init__(self, most: int = 1024) -> None:
+        self._most, self._total = most, 0
+        self._held: dict[str, tuple[float, Record]] = {}
+
+    def __call__(self, record: Record) -> None:
+        """Keep a record, if it has a place or says more of one that is kept."""
+        if "event" not in record or "note" in record:
+            return
+        name = record.get("target") or record["event"]
+        old = self._held.get(name)
+        if old is not None and old[1]["event"] == record["event"]:
+            self._held[name] = (old[0], join(old[1], record))
+            return
+        if record.get("position") is None:
+            return
+        # One call of a built-in each: whoever reads in another thread sees the old or the new.
+        self._held.pop(name, None)
+        self._held[name] = (time(), join(None, record))
+        self._total += 1
+        if len(self._held) > self._most:
+            self._held.pop(next(iter(self._held)), None)
+
+    def _present(self) -> list[tuple[float, Record]]:
+        now = time()
+        return [(now - when, record) for when, record in list(self._held.values()) if now - when < _GONE]
+
+    def features(self) -> Record:
+        """Return them as a GeoJSON feature collection."""
+        return {"type": "FeatureCollection", "features": [to_feature(record) for _, record in self._present()]}
+
+    def aircraft(self) -> Record:
+        """Return them as readsb's ``aircraft.json``."""
+        found = [to_aircraft(record, age) for age, record in self._present() if record.get("lat_deg") is not None]
+        return {"now": round(time(), 1), "messages": self._total, "aircraft": found}

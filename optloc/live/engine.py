@@ -1,0 +1,306 @@
+"""Fixes at once and proofs under a deadline: micro-batches of events, solved by problems that are prepared."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from math import inf
+from threading import Condition, Thread
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array, Status
+from optloc.live.answers import Record, fix_records, proof_records, unproven, unsolved
+from optloc.live.events import Event
+from optloc.live.metrics import Metrics
+from optloc.live.site import Ready, Row, Site
+
+LOG = logging.getLogger("optloc.live")
+
+BATCH = 64
+"""Events that are solved at once, at most: alone while few come, all that wait under load."""
+
+PENDING = 256
+"""Proofs that may wait; what comes beyond is answered without one, or waits, as the stream wants it."""
+
+PHASES = ("two", "one", "fix")
+"""Answers of an event: a fix at once and its proof later, both in one when the proof is there, or no proof at all."""
+
+Emit = Callable[[Event, Record, bool], None]
+"""Takes an event, what is answered, and whether that is its last answer."""
+
+
+class Group(NamedTuple):
+    """Events of a batch that have the same rows: one prepared problem, and their measurements (n, m)."""
+
+    ready: Ready
+    events: list[Event]
+    z: Array
+
+
+@dataclass(slots=True, eq=False)
+class Pending:
+    """A proof that is still to be made.
+
+    Parameters
+    ----------
+    event : Event
+        Whose.
+    ready : Ready
+        Its problem.
+    z : array (m,)
+        Its measurements.
+    before : dict or None
+        What the first phase has answered.
+    until : float
+        When it is no longer waited for, by the clock of the stream.
+    done : bool
+        Whether the event has its last answer.
+    """
+
+    event: Event
+    ready: Ready
+    z: Array
+    before: Record | None
+    until: float
+    done: bool = False
+
+
+class Engine:
+    """Solves events: the first phase in the thread that calls, the second in one of its own.
+
+    Parameters
+    ----------
+    site : Site
+        Whose events.
+    metrics : Metrics
+        Where is counted.
+    emit : callable
+        Takes the answers, from both threads.
+    clock : callable
+        Seconds that never go back.
+    phases : "two", "one" or "fix"
+        As `PHASES`.
+    deadline : float
+        Seconds after its event closed at which a proof is given up; infinity for none.
+    shed : bool
+        Whether events are answered without a proof where too many wait; the stream waits for them otherwise.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        metrics: Metrics,
+        emit: Emit,
+        clock: Callable[[], float],
+        *,
+        phases: str = "two",
+        deadline: float = inf,
+        shed: bool = True,
+    ) -> None:
+        self.site, self._metrics, self._emit, self._clock = site, metrics, emit, clock
+        self._phases, self._deadline, self._shed = phases, deadline, shed
+        self._waiting: deque[Pending] = deque()
+        # those that wait and those that are being proven, in the order of their deadlines
+        self._open: deque[Pending] = deque()
+        self._changed, self._ends = Condition(), False
+        self._thread = Thread(target=self._prove, name="optloc proofs", daemon=True)
+        metrics.gauges["proofs"] = lambda: len(self._waiting)
+        if phases != "fix":
+            self._thread.start()
+
+    @property
+    def next_due(self) -> float:
+        """Return when the next proof is to be given up; infinity where none is open."""
+        with self._changed:
+            return self._open[0].until if self._open else inf
+
+    def settle(self, events: Iterable[Event]) -> None:
+        """Answer events that have closed, and let their proofs be made."""
+        for group in self._groups(events):
+            if self._phases == "one":
+                self._offer([Pending(e, group.ready, z, None, e.stamp + self._deadline) for e, z in _pairs(group)])
+                continue
+            last = self._phases == "fix"
+            records = self._fixed(group, "fix")
+            self._metrics.took("fix", [self._clock() - event.stamp for event in group.events])
+            for event, record in zip(group.events, records, strict=True):
+                self._answer(event, record, last or "error" in record)
+            if not last:
+                found = zip(_pairs(group), records, strict=True)
+                items = [
+                    Pending(e, group.ready, z, record, e.stamp + self._deadline)
+                    for (e, z), record in found
+                    if "error" not in record
+                ]
+                self._offer(items)
+
+    def expire(self) -> None:
+        """Answer the events whose proofs have passed their deadlines."""
+        now, late = self._clock(), []
+        with self._changed:
+            while self._open and (self._open[0].done or self._open[0].until <= now):
+                item = self._open.popleft()
+                if not item.done:
+                    item.done = True
+                    late.append(item)
+        self._give_up(late, "deadline")
+
+    def stop(self) -> None:
+        """Finish the proofs that wait, within their deadlines, and end."""
+        with self._changed:
+            self._ends = True
+            self._changed.notify_all()
+        while self._thread.is_alive():
+            self._thread.join(min(max(self.next_due - self._clock(), 1e-3), 0.1))
+            self.expire()
+            with self._changed:
+                if all(item.done for item in self._open):
+                    return  # what is still being proven is given up already
+
+    # Batches.
+
+    def _groups(self, events: Iterable[Event]) -> list[Group]:
+        """Return events by their rows; those whose rows make no problem are answered at once."""
+        found: dict[tuple[tuple[int, ...], tuple[Row, ...]], list[Event]] = {}
+        everything = tuple(range(len(self.site.rows)))
+        names: dict[tuple[Any, ...], tuple[Row, ...]] = {everything: self.site.rows}
+        for event in events:
+            keys = tuple(event.rows)
+            if event.sigmas or keys not in names:
+                keys = tuple(sorted(keys, key=_order))
+                rows = tuple(self.site.row(key)._replace(sigma=event.sigmas.get(key)) for key in keys)
+                event.rows = {key: event.rows[key] for key in keys}
+                if not event.sigmas:
+                    names[keys] = rows
+            else:
+                rows = names[keys]
+            found.setdefault((tuple(sorted(event.times)), rows), []).append(event)
+        return [group for key, some in found.items() for group in self._group(key, some)]
+
+    def _group(self, key: tuple[tuple[int, ...], tuple[Row, ...]], events: list[Event]) -> list[Group]:
+        heard, rows = key
+        now = self._clock()
+        self._metrics.hear((self.site.stations[i] for i in heard), now)
+        self._metrics.hear((name for row in rows for name in (row.a, row.b) if name), now)
+        try:
+            ready = self.site.ready(heard, rows)
+        except InvalidProblem as error:
+            for event in events:
+                self._fail(event, str(error))
+            return []
+        if ready is None:
+            for event in events:
+                self._answer(event, unsolved(event, status=Status.TOO_FEW_ROWS.label), last=True)
+            return []
+        # differences of integers: a float of seconds since 1970 would resolve no more than 70 m
+        arrivals = np.array([_since_first(event, heard) for event in events], dtype=float).reshape(len(events), -1)
+        values = np.array([list(event.rows.values()) for event in events], dtype=float).reshape(len(events), -1)
+        return [Group(ready, events, ready.si(arrivals, values))]
+
+    def _fixed(self, group: Group, phase: str | None) -> list[Record]:
+        """Return the answers of the first phase."""
+        try:
+            return fix_records(group.ready.fast(group.z), group.events, phase)
+        except Exception as error:  # noqa: BLE001  # a stream goes on, whatever one event brings to light
+            return self._failed(group, error)
+
+    def _failed(self, group: Group, error: Exception) -> list[Record]:
+        if not isinstance(error, InvalidProblem):
+            LOG.error("events from %s on failed", group.events[0].name, exc_info=error)
+        why = str(error) if isinstance(error, InvalidProblem) else f"{type(error).__name__}: {error}"
+        self._metrics.add("unsolvable", len(group.events))
+        return [unsolved(event, error=why) for event in group.events]
+
+    def _fail(self, event: Event, why: str) -> None:
+        self._metrics.add("unsolvable")
+        self._answer(event, unsolved(event, error=why), last=True)
+
+    def _answer(self, event: Event, record: Record, last: bool) -> None:
+        if last:
+            self._metrics.concluded(record.get("status", "error"), record.get("proof"))
+        self._emit(event, record, last)
+
+    # Proofs, in a thread of their own.
+
+    def _offer(self, items: Sequence[Pending]) -> None:
+        left: Sequence[Pending] = ()
+        with self._changed:
+            if self._shed:
+                room = max(PENDING - len(self._waiting), 0)
+                items, left = items[:room], items[room:]
+            else:
+                self._changed.wait_for(lambda: len(self._waiting) < PENDING)
+            self._waiting.extend(items)
+            self._open.extend(items)
+            self._changed.notify_all()
+        self._give_up(left, "skipped: load")
+
+    def _give_up(self, items: Sequence[Pending], why: str) -> None:
+        for group in _grouped([item for item in items if item.before is None]):
+            for event, record in zip(group.events, self._fixed(group, None), strict=True):
+                self._answer(event, record if "error" in record else record | unproven(event, why, None), last=True)
+        for item in items:
+            if item.before is not None:
+                self._answer(item.event, unproven(item.event, why, item.before), last=True)
+
+    def _prove(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._waiting or self._ends)
+                if not self._waiting:
+                    return
+                taken = [self._waiting.popleft() for _ in range(min(len(self._waiting), BATCH))]
+                self._changed.notify_all()
+            for group in _grouped([item for item in taken if not item.done]):
+                self._conclude(group, {item.event.name: item for item in taken})
+
+    def _conclude(self, group: Group, items: dict[str, Pending]) -> None:
+        """Prove the fixes of some events, and answer those that are still waited for."""
+        whose = [items[event.name] for event in group.events]
+        try:
+            fix = group.ready.full(group.z)
+            records = proof_records(fix, group.events, [item.before for item in whose])
+        except Exception as error:  # noqa: BLE001  # as in the first phase
+            records = self._failed(group, error)
+        kept = []
+        with self._changed:
+            for item, record in zip(whose, records, strict=True):
+                if not item.done:
+                    item.done = True
+                    kept.append((item.event, record))
+            while self._open and self._open[0].done:
+                self._open.popleft()
+        self._metrics.took("proof", [self._clock() - event.stamp for event, _ in kept])
+        for event, record in kept:
+            self._answer(event, record, last=True)
+
+
+def _order(key: int | Row) -> tuple[int, tuple[str, ...]]:
+    """Return the place of a row among those of an event: as in the template, what is not listed behind."""
+    return (key, ()) if isinstance(key, int) else (1 << 30, key[2:5])
+
+
+def _since_first(event: Event, heard: Sequence[int]) -> list[int]:
+    times = event.times
+    first = min(times.values(), default=0)
+    return [times[i] - first for i in heard]
+
+
+def _pairs(group: Group) -> list[tuple[Event, Array]]:
+    return list(zip(group.events, group.z, strict=True))
+
+
+def _grouped(items: Sequence[Pending]) -> list[Group]:
+    """Return proofs by their problems."""
+    found: dict[int, list[Pending]] = {}
+    for item in items:
+        found.setdefault(id(item.ready), []).append(item)
+    return [
+        Group(some[0].ready, [item.event for item in some], np.stack([item.z for item in some]))
+        for some in found.values()
+    ]

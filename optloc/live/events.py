@@ -1,0 +1,500 @@
+"""From lines to events: what a line may say, when an event closes, and what becomes of rows that come late or twice."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
+from zlib import crc32
+
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.inputs import has_controls
+from optloc.base.units import LARGEST
+from optloc.live.metrics import Metrics
+from optloc.live.site import Row, Site
+
+# One line.
+
+LINE = 1 << 16
+"""Bytes that a line may have: more than a thousand rows."""
+
+COMMANDS = ("flush", "health")
+# Characters of an id or a name, and rows of an event: far more than any network has.
+_NAME, _ROWS = 256, 4096
+_KEYS = {
+    *("command", "event", "z", "rows", "arrivals", "station", "kind", "a", "b", "sigma", "more", "target", "received"),
+    *("time", "time_ns", "time_ps"),
+}
+_ROW_KEYS = {"kind", "a", "b", "z", "sigma"}
+# Digits behind the point of a picosecond, by the key that a time stands under.
+_DIGITS = {"time": 12, "time_ns": 3, "time_ps": 0}
+_DECIMAL = re.compile(r"([+-]?)(\d{1,25})(?:\.(\d{1,40}))?")
+# Picoseconds of thirty thousand years: no clock of any epoch shows more.
+_LATEST = 10**24
+
+Key = int | Row
+"""A row of an event: its number in the template, or what the template does not list."""
+
+
+def _refuse(word: str) -> Any:
+    raise ValueError(f"{word} is no number")
+
+
+# What JSON has no word for is refused by the reader of numbers itself.
+_JSON = json.JSONDecoder(parse_constant=_refuse)
+
+
+class Message(NamedTuple):
+    """What a line says.
+
+    Parameters
+    ----------
+    event : str
+        Whose rows these are; empty for a command.
+    rows : dict of Key to float
+        Values in the units of the site.
+    times : dict of int to int
+        Arrivals at stations, picoseconds.
+    whole : bool
+        Whether the event ends with this line.
+    sigmas : dict of Key to float, optional
+        Standard deviations that the rows bring along.
+    target : str
+        Name of the target, handed on.
+    command : str
+        What is to be done instead.
+    """
+
+    event: str
+    rows: dict[Key, float]
+    times: dict[int, int]
+    whole: bool
+    sigmas: dict[Key, float] | None = None
+    target: str = ""
+    command: str = ""
+
+
+def parse(line: bytes, site: Site) -> Message:
+    """Return what a line says.
+
+    Parameters
+    ----------
+    line : bytes
+        One JSON object.
+    site : Site
+        What rows and stations it may name.
+
+    Raises
+    ------
+    InvalidProblem
+        Where it says nothing of the kind; the sentence names the key.
+    """
+    if len(line) > LINE:
+        raise InvalidProblem(f"the line has {len(line)} bytes, {LINE} at most", None, "send fewer rows a line")
+    try:
+        found = _JSON.decode(line.decode())
+    except RecursionError:
+        raise InvalidProblem("the line is nested too deep", None, "send one flat object a line") from None
+    except ValueError as error:
+        what = "it is not UTF-8" if isinstance(error, UnicodeDecodeError) else str(error).partition(":")[0].lower()
+        raise InvalidProblem(f"this is not JSON: {what}", None, "send one object a line") from None
+    if type(found) is not dict:
+        raise InvalidProblem("this is no JSON object", None, 'send {"event": "1", "z": [...]}')
+    z = found.get("z")
+    if len(found) == 2 and type(z) is list:
+        return Message(_event(found), _values(z, site), {}, whole=True)  # what comes ten thousand times a second
+    station, time = found.get("station"), found.get("time_ns")
+    if len(found) == 3 and type(time) is int and abs(time) < _LATEST // 1000 and type(station) is str:
+        number = site.number.get(station, -1)  # what comes even more often
+        if number >= 0 and site.arriving:
+            return Message(_event(found), {}, {number: 1000 * time}, whole=False)
+    return _general(found, site)
+
+
+def _general(found: dict[str, Any], site: Site) -> Message:
+    unknown = found.keys() - _KEYS
+    if unknown:
+        name = min(unknown)
+        raise InvalidProblem(f"unknown key {name[:40]!r}", None, nearest(name, sorted(_KEYS)))
+    if "command" in found:
+        command = found["command"]
+        if command not in COMMANDS:
+            raise InvalidProblem(
+                f"unknown command {str(command)[:40]!r}", "command", f"known are {', '.join(COMMANDS)}"
+            )
+        return Message("", {}, {}, whole=False, command=command)
+    event = _event(found)
+    target = _text(found["target"], "target") if "target" in found else ""
+    ways: list[str] = [key for key in ("rows", "arrivals", "station", "kind") if key in found]
+    ways += ["z"] if "z" in found and "kind" not in found else []
+    if len(ways) != 1 and ways != ["rows", "arrivals"]:
+        what = f"the line has {' and '.join(ways)}" if ways else "the line has no rows"
+        raise InvalidProblem(what, None, "give one of z, rows, arrivals, station, kind")
+    rows, sigmas, times = dict[Key, float](), dict[Key, float](), dict[int, int]()
+    if "rows" in ways:
+        for entry in _list(found["rows"], "rows"):
+            _row(_object(entry, _ROW_KEYS, "rows"), site, rows, sigmas)
+    if "arrivals" in ways:
+        for entry in _list(found["arrivals"], "arrivals"):
+            _arrival(_object(entry, {"station", *_DIGITS}, "arrivals"), site, times)
+    if "z" in ways:
+        rows = _values(_list(found["z"], "z"), site)
+    elif "station" in ways:
+        _arrival(found, site, times)
+    elif "kind" in ways:
+        _row(found, site, rows, sigmas)
+    more = found.get("more", ways[0] in ("station", "kind"))
+    if type(more) is not bool:
+        raise InvalidProblem("it is neither true nor false", "more", "say true where more rows are to come")
+    return Message(event, rows, times, not more, sigmas or None, target)
+
+
+def _event(found: Mapping[str, Any]) -> str:
+    if "event" not in found:
+        raise InvalidProblem("the line has no event", None, 'give every line an id: "event": "1"')
+    name = found["event"]
+    return str(name) if type(name) is int and abs(name) < _LATEST else _text(name, "event")
+
+
+def _text(given: Any, key: str) -> str:
+    if type(given) is not str or not given or len(given) > _NAME or has_controls(given):
+        raise InvalidProblem(f"{str(given)[:40]!r} is no name", key, f"give 1 to {_NAME} printable characters")
+    return given
+
+
+def _list(given: Any, key: str) -> list[Any]:
+    if type(given) is not list or not 0 < len(given) <= _ROWS:
+        raise InvalidProblem(f"it is no list of 1 to {_ROWS} entries", key, "give a list")
+    return given
+
+
+def _object(given: Any, keys: set[str], where: str) -> dict[str, Any]:
+    if type(given) is not dict:
+        raise InvalidProblem("an entry is no object", where, f"give objects of {', '.join(sorted(keys))}")
+    unknown = given.keys() - keys
+    if unknown:
+        name = min(unknown)
+        raise InvalidProblem(f"unknown key {name[:40]!r}", where, nearest(name, sorted(keys)))
+    return given
+
+
+def _number(given: Any, where: str) -> float:
+    # true is a whole number in Python, and one of 400 digits is no float
+    if type(given) is float or (type(given) is int and abs(given) <= LARGEST):
+        value = float(given)
+        if abs(value) <= LARGEST:
+            return value
+    raise InvalidProblem(f"{str(given)[:40]} is no number up to {LARGEST:g}", where, "give a number")
+
+
+def _values(given: list[Any], site: Site) -> dict[Key, float]:
+    if len(given) != len(site.rows):
+        what = f"there are {len(given)} values, and the site has {len(site.rows)} rows"
+        raise InvalidProblem(what, "z", "give them in the order of the file, null for what is missing")
+    return {i: _number(value, "z") for i, value in enumerate(given) if value is not None}
+
+
+def _row(found: Mapping[str, Any], site: Site, rows: dict[Key, float], sigmas: dict[Key, float]) -> None:
+    if "z" not in found:
+        raise InvalidProblem("a row has no value", "z", "give a number")
+    words = [found.get(key, "") for key in ("kind", "a", "b")]
+    if any(type(word) is not str for word in words):
+        raise InvalidProblem("kind, a and b are names", "rows", "put them in quotes")
+    key = site.find(words[0], words[1], words[2])
+    value = _number(found["z"], "z")
+    if rows.setdefault(key, value) != value:
+        raise InvalidProblem("the line has a row twice", "rows", "send it once")
+    if "sigma" in found:
+        sigma = _number(found["sigma"], "sigma")
+        if sigma <= 0.0:
+            raise InvalidProblem(f"the standard deviation {sigma:g} is not positive", "sigma", "give a positive number")
+        sigmas[key] = sigma
+
+
+def _arrival(found: Mapping[str, Any], site: Site, times: dict[int, int]) -> None:
+    station = found.get("station")
+    if not site.arriving:
+        what = "the site has neither toa nor tdoa rows, so that it cannot take arrivals"
+        raise InvalidProblem(what, "station", "send values: kind, a, b, z")
+    if type(station) is not str or station not in site.number:
+        raise InvalidProblem(
+            f"there is no station {str(station)[:40]!r}", "station", nearest(str(station), site.number)
+        )
+    given = [key for key in _DIGITS if key in found]
+    if len(given) != 1:
+        raise InvalidProblem("an arrival needs one time", "station", "give time_ns, time_ps or time")
+    value, number = picoseconds(found[given[0]], given[0]), site.number[station]
+    if times.setdefault(number, value) != value:
+        raise InvalidProblem(f"station {station!r} has two arrivals", "arrivals", "send one")
+
+
+def picoseconds(given: Any, key: str) -> int:
+    """Return a time as picoseconds: a whole number, or a decimal number in quotes, of the unit that its key says.
+
+    Parameters
+    ----------
+    given : int or str
+        The time; digits below a picosecond (0.3 mm) are cut.
+    key : "time", "time_ns" or "time_ps"
+        Seconds, nanoseconds or picoseconds.
+
+    Raises
+    ------
+    InvalidProblem
+        For all else; a float of seconds since 1970 resolves 70 m.
+    """
+    digits = _DIGITS[key]
+    if type(given) is int and abs(given) < _LATEST:
+        value: int = given * 10**digits
+    elif type(given) is str and (match := _DECIMAL.fullmatch(given)):
+        sign, whole, part = match.groups()
+        value = int(whole) * 10**digits + int(((part or "") + "0" * digits)[:digits] or "0")
+        value = -value if sign == "-" else value
+    else:
+        advice = "send a whole number as time_ns or time_ps, or a decimal number in quotes"
+        raise InvalidProblem(f"{str(given)[:40]} is no exact time", key, advice)
+    if abs(value) >= _LATEST:
+        raise InvalidProblem(f"the time {str(given)[:40]} is beyond all clocks", key, "check its unit")
+    return value
+
+
+# Events: open until they are whole, then answered, then remembered.
+
+MOST_OPEN = 4096
+"""Events that may be open at a time; the oldest closes before another opens."""
+
+REMEMBERED = 65_536
+"""Closed events whose rows are still known: at a thousand events a second, a minute."""
+
+
+class Reply(Protocol):
+    """Who gets the answers of an event besides the output."""
+
+    def expect(self) -> None:
+        """Note that there will be answers."""
+
+    def answer(self, record: dict[str, Any], last: bool) -> None:
+        """Take one."""
+
+
+@dataclass(slots=True)
+class Event:
+    """Rows that belong together.
+
+    Parameters
+    ----------
+    name : str
+        Its id.
+    rows, times, sigmas, target
+        As of `Message`.
+    first : float
+        When its first row was read, by the time that events wait.
+    stamp : float
+        When it could be answered, by the clock: its last row was read, or its time was over.
+    closed : str
+        Why it closed: "whole", "wait", "flush" or "early".
+    revision : int
+        1, and one more for each answer that late rows have changed.
+    conflict : bool
+        Whether a row came with two values.
+    reply : Reply, optional
+        Who waits for its answers.
+    """
+
+    name: str
+    rows: dict[Key, float]
+    times: dict[int, int]
+    first: float
+    stamp: float
+    sigmas: dict[Key, float] = field(default_factory=dict)
+    target: str = ""
+    closed: str = ""
+    revision: int = 1
+    conflict: bool = False
+    reply: Reply | None = None
+
+
+@dataclass(slots=True)
+class Events:
+    """Open and closed events of one stream, for one thread.
+
+    Parameters
+    ----------
+    site : Site
+        What an event consists of.
+    metrics : Metrics
+        Where is counted.
+    note : callable
+        Gets a record of every row that came late or with another value after its event was answered.
+    wait : float
+        Seconds after its first row at which an event closes.
+    revise : bool
+        Whether late rows make a new answer.
+    part : (int, int)
+        Which of how many processes this is: others answer events whose ids fall to them.
+    most : int
+        Events that may be open.
+    """
+
+    site: Site
+    metrics: Metrics
+    note: Callable[[dict[str, Any]], None]
+    wait: float = 0.05
+    revise: bool = False
+    part: tuple[int, int] = (0, 1)
+    most: int = MOST_OPEN
+    open: dict[str, Event] = field(default_factory=dict)
+    # None: known from a checkpoint by its id alone
+    closed: dict[str, Event | None] = field(default_factory=dict)
+    ready: deque[Event] = field(default_factory=deque)
+    # names of the closed ones in their order: a dictionary whose oldest entries have gone is slow to find its first
+    _order: deque[str] = field(default_factory=deque)
+
+    def take(self, message: Message, now: float, when: float, reply: Reply | None = None) -> None:
+        """Put what a line says to its event, which may close.
+
+        Parameters
+        ----------
+        message : Message
+            What the line says.
+        now, when : float
+            When it was read, by the clock, and by the time that events wait.
+        reply : Reply, optional
+            Gets the answers if nobody else waits for them.
+        """
+        counts = self.metrics.counts
+        size = len(message.rows) + len(message.times)
+        counts["rows"] += size
+        if self.part[1] > 1 and share_of(message.event, self.part[1]) != self.part[0]:
+            counts["elsewhere"] += size
+            return
+        event = self.open.get(message.event)
+        if event is None:
+            if message.event in self.closed:
+                self._after(message, now)
+                return
+            event = Event(message.event, message.rows, message.times, when, now, message.sigmas or {}, message.target)
+            self._wait_for(event, reply)
+            if message.whole:
+                self._close(event, "whole", now)
+                return
+            self.open[message.event] = event
+            if len(self.open) > self.most:
+                counts["early"] += 1
+                oldest = next(iter(self.open))
+                self._close(self.open.pop(oldest), "early", now)
+        else:
+            self._join(event, message)
+            self._wait_for(event, reply)
+        if message.whole or self._is_whole(event):
+            self.open.pop(event.name, None)
+            self._close(event, "whole", now)
+
+    def due(self, when: float, now: float) -> None:
+        """Close what has waited long enough; times as of `take`."""
+        while self.open:
+            event = next(iter(self.open.values()))
+            if when < event.first + self.wait:
+                return
+            del self.open[event.name]
+            self.metrics.counts["incomplete"] += 1
+            self._close(event, "wait", now)
+
+    @property
+    def next_due(self) -> float:
+        """Return when the next event closes by time; infinity where none is open."""
+        return next(iter(self.open.values())).first + self.wait if self.open else float("inf")
+
+    def flush(self, now: float) -> None:
+        """Close all events."""
+        for event in self.open.values():
+            self._close(event, "flush", now)
+        self.open.clear()
+
+    def closing(self) -> Iterator[Event]:
+        """Yield the events that have closed since, and forget them."""
+        while self.ready:
+            yield self.ready.popleft()
+
+    def _join(self, event: Event, message: Message) -> None:
+        """Put rows to an event; the first value of a row stays."""
+        counts = self.metrics.counts
+        known: list[tuple[dict[Any, Any], dict[Any, Any]]] = [
+            (event.rows, message.rows),
+            (event.times, message.times),
+        ]
+        for held, new in known:
+            for key, value in new.items():
+                if key not in held:
+                    held[key] = value
+                elif held[key] == value:
+                    counts["repeated"] += 1
+                else:
+                    counts["conflicts"] += 1
+                    event.conflict = True
+        if message.sigmas:
+            event.sigmas = {**message.sigmas, **event.sigmas}
+        event.target = event.target or message.target
+
+    def _is_whole(self, event: Event) -> bool:
+        """Return whether all rows and stations of the site are there."""
+        site = self.site
+        if event.times:
+            if len(event.times) < len(site.hearing):
+                return False
+            return all(i in event.rows for i in site.others)
+        return len(event.rows) >= len(site.rows) and all(i in event.rows for i in range(len(site.rows)))
+
+    def _wait_for(self, event: Event, reply: Reply | None) -> None:
+        if reply is not None and event.reply is None:
+            event.reply = reply
+            reply.expect()
+
+    def _close(self, event: Event, why: str, now: float) -> None:
+        event.closed, event.stamp = why, now
+        self.metrics.counts["events"] += 1
+        self.remember(event.name, event)
+        self.ready.append(event)
+
+    def remember(self, name: str, event: Event | None) -> None:
+        """Note that an event is answered, and forget the oldest one where there are too many."""
+        self.closed[name] = event
+        self._order.append(name)
+        if len(self._order) > REMEMBERED:
+            self.closed.pop(self._order.popleft(), None)
+
+    def _after(self, message: Message, now: float) -> None:
+        """Tell what came after its event was answered."""
+        event, counts = self.closed[message.event], self.metrics.counts
+        if event is None:
+            counts["repeated"] += len(message.rows) + len(message.times)
+            return
+        site = self.site
+        late = [site.name_of(key) for key in message.rows if key not in event.rows]
+        late += [site.stations[i] for i in message.times if i not in event.times]
+        other = [site.name_of(key) for key, value in message.rows.items() if event.rows.get(key, value) != value]
+        other += [site.stations[i] for i, value in message.times.items() if event.times.get(i, value) != value]
+        counts["conflicts"] += len(other)
+        counts["repeated"] += len(message.rows) + len(message.times) - len(late) - len(other)
+        counts["late"] += len(late)
+        if other:
+            self.note({"event": event.name, "note": "conflict", "rows": other})
+        if late and not self.revise:
+            self.note({"event": event.name, "note": "late", "rows": late})
+        if late and self.revise:
+            again = Event(
+                event.name, {**message.rows, **event.rows}, {**message.times, **event.times}, now, now,
+                {**(message.sigmas or {}), **event.sigmas}, event.target or message.target,
+                "late", event.revision + 1, event.conflict or bool(other),
+            )  # fmt: skip
+            counts["revisions"] += 1
+            self.closed[event.name] = again
+            self.ready.append(again)
+
+
+def share_of(event: str, count: int) -> int:
+    """Return which of `count` processes answers an event: the same in every process and on every machine."""
+    return crc32(event.encode("utf-8", "surrogatepass")) % count

@@ -1,0 +1,255 @@
+"""A stream over HTTP: events in requests and over a websocket, health, metrics, the latest fixes, a map of them."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+from collections.abc import Callable
+from contextlib import suppress
+from threading import Thread
+from typing import Any
+from urllib.parse import urlsplit
+
+from optloc.base.errors import InvalidProblem
+from optloc.live.answers import Record, to_line
+from optloc.live.events import LINE
+from optloc.live.queues import WAITING, Ticket
+from optloc.live.site import Site
+from optloc.live.stream import Stream
+
+HOST, PORT = "127.0.0.1", 8200
+"""Where requests are taken unless somebody says otherwise: on this machine alone."""
+
+# Bytes of a request: a thousand events of a large network.
+_BODY = 1 << 20
+# Seconds after which a request is answered without its fix: its events wait for rows of others.
+_PATIENCE = 30.0
+# Requests and websockets at a time, and records that wait for a websocket.
+_CONNECTIONS, _QUEUE = 256, 1024
+# What a browser on this machine may call it: another name in a request is a page of a stranger that had its own name
+# point here.
+_NAMES = ("localhost", "127.0.0.1", "::1", "[::1]")
+
+
+def serve(stream: Stream, host: str = HOST, port: int = PORT) -> tuple[int, Callable[[], None]]:
+    """Take requests in a thread of their own.
+
+    Parameters
+    ----------
+    stream : Stream
+        Who answers.
+    host : str
+        Name or address of the interface; other machines reach it unless it is this machine's own.
+    port : int
+        0 takes one that is free.
+
+    Returns
+    -------
+    port : int
+        Where it listens.
+    stop : callable
+        Ends it.
+
+    Raises
+    ------
+    InvalidProblem
+        Where nobody can listen there, or a library is missing.
+    """
+    try:
+        import starlette  # noqa: F401  # what the application needs
+        import uvicorn
+    except ImportError:
+        raise InvalidProblem(
+            "requests need uvicorn and starlette", "--http", "pip install 'optloc[live-http]'"
+        ) from None
+    try:
+        found = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+    except (OSError, OverflowError) as error:
+        what = f"nobody can listen at {host}:{port} ({getattr(error, 'strerror', None) or error})"
+        raise InvalidProblem(what, "--http", "choose another port") from None
+    config = uvicorn.Config(
+        application(stream, local=host in _NAMES),
+        log_level="warning",
+        access_log=False,
+        lifespan="off",
+        ws_max_size=LINE,
+        limit_concurrency=_CONNECTIONS,
+        timeout_graceful_shutdown=2,
+        proxy_headers=False,
+        server_header=False,
+    )
+    server = uvicorn.Server(config)
+    thread = Thread(target=lambda: server.run(sockets=[found]), name="optloc requests", daemon=True)
+    thread.start()
+
+    def stop() -> None:
+        server.should_exit = True
+        thread.join(5.0)
+
+    return int(found.getsockname()[1]), stop
+
+
+def application(stream: Stream, *, local: bool = True) -> Any:
+    """Return the ASGI application of a stream.
+
+    Parameters
+    ----------
+    stream : Stream
+        Who answers.
+    local : bool
+        Whether requests must name this machine.
+    """
+    from starlette.applications import Starlette
+    from starlette.middleware import Middleware
+    from starlette.middleware.trustedhost import TrustedHostMiddleware
+    from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
+    from starlette.routing import Route, WebSocketRoute
+
+    async def fix(request: Any) -> Any:
+        if not _is_own(request):
+            return PlainTextResponse("a page of another site asks\n", 403)
+        body = await _body(request)
+        if body is None:
+            return PlainTextResponse(f"the request has more than {_BODY} bytes\n", 413)
+        single = request.headers.get("content-type", "").partition(";")[0].strip() == "application/json"
+        lines = [body.replace(b"\n", b" ")] if single else [each for each in body.split(b"\n") if each.strip()]
+        if not 0 < len(lines) <= WAITING:
+            return PlainTextResponse(f"send 1 to {WAITING} lines\n", 400)
+        records = await _answered(stream, lines)
+        if isinstance(records, int):
+            said = {429: "too much waits", 503: "the stream ends", 504: "no answer yet: it will be in the stream"}
+            return PlainTextResponse(said[records] + "\n", records, {"Retry-After": "1"})
+        if single:
+            return Response(to_line(records[0]), 400 if "error" in records[0] else 200, media_type="application/json")
+        return Response(b"".join(map(to_line, records)), media_type="application/x-ndjson")
+
+    async def health(_: Any) -> Any:
+        return JSONResponse(stream.health())
+
+    async def metrics(_: Any) -> Any:
+        text = stream.metrics.text(stream.clock())
+        return Response(text, headers={"Content-Type": "text/plain; version=0.0.4; charset=utf-8"})
+
+    async def fixes(_: Any) -> Any:
+        return JSONResponse(stream.latest.features(), media_type="application/geo+json")
+
+    async def aircraft(_: Any) -> Any:
+        return JSONResponse(stream.latest.aircraft())
+
+    async def page(_: Any) -> Any:
+        try:
+            return HTMLResponse(await asyncio.to_thread(page_of, stream.site))
+        except InvalidProblem as error:
+            return PlainTextResponse(f"{error}\n", 404)
+
+    async def listen(socket: Any) -> None:
+        await _listen(stream, socket)
+
+    routes = [
+        Route("/", page),
+        Route("/fix", fix, methods=["POST"]),
+        Route("/health", health),
+        Route("/metrics", metrics),
+        Route("/fixes.geojson", fixes),
+        Route("/data/aircraft.json", aircraft),
+        WebSocketRoute("/ws", listen),
+    ]
+    names = ["localhost", "127.0.0.1", "::1", "[::1]"] if local else ["*"]
+    return Starlette(routes=routes, middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=names)])
+
+
+def page_of(site: Site) -> str:
+    """Return the page of a site's map; raise InvalidProblem where it has no place on Earth."""
+    from optloc.report import live_page
+
+    ready = site.ready((), site.rows)
+    assert ready is not None  # a site has rows
+    return live_page(ready.fast.problem, site.title)
+
+
+def _is_own(request: Any) -> bool:
+    """Return whether a request comes from a program, or from a page of this server."""
+    origin = request.headers.get("origin")
+    return origin is None or urlsplit(origin).netloc == request.headers.get("host")
+
+
+async def _body(request: Any) -> bytes | None:
+    """Return what a request holds; None where that is too much."""
+    parts, size = [], 0
+    async for part in request.stream():
+        size += len(part)
+        if size > _BODY:
+            return None
+        parts.append(part)
+    return b"".join(parts)
+
+
+async def _answered(stream: Stream, lines: list[bytes]) -> list[Record] | int:
+    """Return the answers to lines, or the code of why there are none."""
+    loop = asyncio.get_running_loop()
+    future: asyncio.Future[list[Record]] = loop.create_future()
+
+    def finish(records: list[Record]) -> None:
+        if not future.done():
+            future.set_result(records)
+
+    def done(records: list[Record]) -> None:
+        with suppress(RuntimeError):  # the server has ended
+            loop.call_soon_threadsafe(finish, records)
+
+    ticket = Ticket(len(lines), done)
+    if not stream.inbox.offer(stream.lines(lines, "request", 1, ticket)):
+        if stream.inbox.closed:
+            return 503
+        stream.metrics.add("refused")
+        return 429
+    try:
+        records = await asyncio.wait_for(future, _PATIENCE)
+    except TimeoutError:
+        return 504
+    return records or [{"accepted": len(lines)}]
+
+
+async def _listen(stream: Stream, socket: Any) -> None:
+    """Send all records to a websocket, and take lines from it."""
+    from starlette.websockets import WebSocketDisconnect
+
+    if not _is_own(socket):
+        await socket.close(1008, "a page of another site asks")
+        return
+    await socket.accept()
+    loop, queue = asyncio.get_running_loop(), asyncio.Queue[Record | None](_QUEUE)
+
+    def keep(record: Record | None) -> None:
+        with suppress(asyncio.QueueFull):
+            queue.put_nowait(record)
+            return
+        while not queue.empty():  # who reads too slowly is told so, and begins anew
+            queue.get_nowait()
+        queue.put_nowait(None)
+
+    def hear(record: Record) -> None:
+        with suppress(RuntimeError):  # the server has ended
+            loop.call_soon_threadsafe(keep, record)
+
+    async def send() -> None:
+        while (record := await queue.get()) is not None:
+            await socket.send_text(to_line(record).decode())
+        await socket.close(1013, "read faster")
+
+    stream.listeners = (*stream.listeners, hear)
+    sending = asyncio.create_task(send())
+    number = 0
+    try:
+        while True:
+            text = await socket.receive_text()
+            number += 1
+            if not stream.inbox.offer(stream.lines([text.encode()], "websocket", number)):
+                stream.metrics.add("refused")
+                await socket.send_text(json.dumps({"error": "too much waits; send it again", "line": number}))
+    except (WebSocketDisconnect, RuntimeError, KeyError):
+        pass  # it has gone, or sends what is no text
+    finally:
+        stream.listeners = tuple(each for each in stream.listeners if each is not hear)
+        sending.cancel()

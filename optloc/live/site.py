@@ -1,0 +1,397 @@
+"""The site of a stream: what its file says of every event, and problems that are prepared for the rows that are there.
+
+A site is an ordinary problem file. Its rows are the template of an event: their kinds, stations and noise count, their
+values do not. An event is solved as the file would be that holds its rows alone, by the same reader.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from optloc.base.cache import Cache
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.frames import Frame
+from optloc.base.types import Array
+from optloc.base.units import SPEED_OF_LIGHT, Conversion
+from optloc.files.reader import Draft, assemble
+from optloc.files.schema import ProblemFile, join, name_of, read_document
+from optloc.files.table import Table, table_of
+from optloc.files.unknowns import FREE, places_of
+from optloc.models import MODELS
+from optloc.solvers.prepared import Prepared, prepare
+
+FAST = "gtrs+lsr"
+"""The method of the first phase: no proof, some ten microseconds a fix where rows are sums of ranges."""
+
+# Prepared problems that are kept, each some 100 kB: a network of ten has more sets of receivers, but few of them often.
+_KEPT = 64
+# Settings that a row may bring along in a table of the site, beside its stations.
+_OWN = ("sigma", "weight", "correction")
+
+
+class Row(NamedTuple):
+    """A row as an event names it.
+
+    Parameters
+    ----------
+    section : int
+        Table ``[[measurements]]`` whose settings it has.
+    at : int
+        Row of that table, -1 where it is not listed there.
+    kind : str
+        Its kind.
+    a, b : str
+        Its stations; empty where it has none.
+    sigma : float or None
+        Standard deviation that the event states, in the unit of the file.
+    """
+
+    section: int
+    at: int
+    kind: str
+    a: str = ""
+    b: str = ""
+    sigma: float | None = None
+
+    @property
+    def name(self) -> str:
+        """Return what people call it: kind and stations."""
+        return " ".join(part for part in (self.kind, "-".join(filter(None, (self.a, self.b)))) if part)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ready:
+    """A problem of one set of rows, prepared.
+
+    Parameters
+    ----------
+    fast, full : Prepared
+        For the first phase, and for the method of the stream.
+    count : int
+        Rows of the problem; those without a value have no weight.
+    row, first, second : int array (l,)
+        Rows that arrivals make, and which two arrivals each compares; `second` is -1 for a time of arrival.
+    stated : tuple of (int array, int array, Conversion, array)
+        Of each kind of the rows that come as values: their columns, rows of the problem, unit, and what is added.
+    scale : float
+        Metres in a picosecond.
+    """
+
+    fast: Prepared
+    full: Prepared
+    count: int
+    row: Array
+    first: Array
+    second: Array
+    stated: tuple[tuple[Array, Array, Conversion, Array], ...]
+    scale: float
+
+    def si(self, arrivals: Array, values: Array) -> Array:
+        """Return the measurements (n, m) of the problem.
+
+        Parameters
+        ----------
+        arrivals : array (n, h)
+            Picoseconds since the first arrival of the event.
+        values : array (n, v)
+            Values of the other rows in their units.
+        """
+        z = np.zeros((len(values), self.count))
+        less = np.where(self.second >= 0, arrivals[:, self.second], 0.0) if len(self.row) else 0.0
+        z[:, self.row] = self.scale * (arrivals[:, self.first] - less)
+        for column, row, unit, more in self.stated:
+            z[:, row] = unit.to_si(values[:, column]) + more
+        return z
+
+
+# Keyed by the site itself, too: one that is read anew has problems of its own.
+_READY = Cache["Ready | None"](_KEPT)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Site:
+    """What the file of a stream says.
+
+    Parameters
+    ----------
+    source : str
+        Its name.
+    title : str
+        What it says it is.
+    method : str
+        How events are solved; see `optloc.solve`.
+    file : ProblemFile
+        Its settings.
+    station_table : Table
+        Its stations as they were read.
+    tables : tuple of Table
+        Rows of each ``[[measurements]]``.
+    places : mapping of str to Table
+        Of known targets.
+    rows : tuple of Row
+        The template of an event, in the order of the file.
+    stations : tuple of str
+        Names of the stations.
+    position : array (s, d)
+        Their positions, metres in the frame.
+    frame : Frame
+        Of positions.
+    speed : float
+        Of the signals, metres per second.
+    arriving, others : tuple of int
+        Rows of the template that arrivals make, those of the first table of times of arrival or of their differences;
+        and all others.
+    hearing : tuple of int
+        Stations whose arrivals the template knows.
+    index : dict of (kind, a, b) to int
+        Number of each row of the template.
+    number : dict of str to int
+        Number of each station.
+    """
+
+    source: str
+    title: str
+    method: str
+    file: ProblemFile
+    station_table: Table
+    tables: tuple[Table, ...]
+    places: dict[str | None, Table]
+    rows: tuple[Row, ...]
+    stations: tuple[str, ...]
+    position: Array
+    frame: Frame
+    speed: float
+    arriving: tuple[int, ...]
+    others: tuple[int, ...]
+    hearing: tuple[int, ...]
+    index: dict[tuple[str, str, str], int]
+    number: dict[str, int]
+
+    def find(self, kind: str, a: str, b: str) -> int | Row:
+        """Return the row that an event names by kind and stations: its number in the template, or what is not listed.
+
+        Raises
+        ------
+        InvalidProblem
+            For a kind that the site has not, or a station that it does not know.
+        """
+        known = self.index.get((kind, a, b))
+        if known is not None:
+            return known
+        alike = [row for row in self.rows if row.kind == kind]
+        if not alike:
+            kinds = list(dict.fromkeys(row.kind for row in self.rows))
+            raise InvalidProblem(f"the site has no rows of the kind {kind[:40]!r}", "kind", nearest(kind, kinds))
+        count = MODELS[kind].stations
+        for key, name, needed in (("a", a, count > 0), ("b", b, count > 1)):
+            if bool(name) != needed:
+                what = "the station is missing" if needed else "there is a station too many"
+                raise InvalidProblem(what, key, f"{kind} rows name {count} of them")
+            if needed and name not in self.number:
+                raise InvalidProblem(f"there is no station {name[:40]!r}", key, nearest(name, self.stations))
+        if a == b and count > 1:
+            raise InvalidProblem(f"{kind} names station {a!r} twice", "b", "name two stations")
+        return Row(alike[0].section, -1, kind, a, b)
+
+    def row(self, key: int | Row) -> Row:
+        """Return a row by what an event calls it."""
+        return self.rows[key] if isinstance(key, int) else key
+
+    def name_of(self, key: int | Row) -> str:
+        """Return what people call a row."""
+        return self.row(key).name
+
+    def ready(self, heard: tuple[int, ...], rows: tuple[Row, ...]) -> Ready | None:
+        """Return the problem of some arrivals and rows, prepared; None where they make no row.
+
+        Parameters
+        ----------
+        heard : tuple of int
+            Stations that have an arrival, ascending.
+        rows : tuple of Row
+            Rows that come as values.
+
+        Raises
+        ------
+        InvalidProblem
+            Where the file does not say enough of one of them, such as its noise.
+        """
+        return _READY.find((self, heard, rows), lambda: self._prepare(heard, rows))
+
+    def between(self, heard: tuple[int, ...]) -> tuple[Row, ...]:
+        """Return the rows that arrivals at some stations make.
+
+        Those of the template whose stations are there; where they do not link all of them, a difference to the first
+        takes in each group that is left.
+        """
+        if not heard:
+            return ()
+        names = [self.stations[i] for i in heard]
+        kept = [self.rows[i] for i in self.arriving if {self.rows[i].a, self.rows[i].b} - {""} <= set(names)]
+        section, kind = self.rows[self.arriving[0]].section, self.rows[self.arriving[0]].kind
+        if kind == "toa":
+            listed = {row.a for row in kept}
+            return (*kept, *(Row(section, -1, kind, name) for name in names if name not in listed))
+        group = {name: name for name in names}
+        for row in kept:
+            group = {name: group[row.b] if g == group[row.a] else g for name, g in group.items()}
+        for name in names[1:]:
+            if group[name] != group[names[0]]:
+                kept.append(Row(section, -1, kind, name, names[0]))
+                group = {other: group[names[0]] if g == group[name] else g for other, g in group.items()}
+        return tuple(kept)
+
+    def _prepare(self, heard: tuple[int, ...], rows: tuple[Row, ...]) -> Ready | None:
+        timed = self.between(heard)
+        if not (timed or rows):
+            return None
+        draft, order = self._draft((*timed, *rows))
+        problem = draft.loaded.problem
+        bare = problem.with_rows(z=np.zeros(problem.count))
+        place, stated, links = {station: i for i, station in enumerate(heard)}, [], []
+        for chunk, number in zip(draft.chunks, draft.numbers, strict=True):
+            section = next(i for i, table in enumerate(draft.tables) if table is chunk.table)
+            column = np.array([order[section][row] for row in chunk.row.tolist()])
+            made = np.flatnonzero((column >= 0) & (column < len(timed))).tolist()
+            links += [(number[i], place[int(chunk.a[i])], place.get(int(chunk.b[i]), -1)) for i in made]
+            # rows that are there for a covariance alone keep any value: their weight is zero
+            given = column >= len(timed)
+            added = np.where(chunk.weight > 0.0, chunk.baseline, 0.0)[given]
+            stated.append((column[given] - len(timed), number[given], chunk.unit, added))
+        row, first, second = np.array(links, dtype=np.int64).reshape(-1, 3).T
+        fast = prepare(bare, FAST)
+        full = fast if self.method == FAST else prepare(bare, self.method)
+        return Ready(fast, full, problem.count, row, first, second, tuple(stated), self.speed * 1e-12)
+
+    def _draft(self, rows: tuple[Row, ...]) -> tuple[Draft, list[list[int]]]:
+        """Return the problem of some rows, and which of them each row of its tables is, -1 for none."""
+        sections, tables, order = [], [], []
+        for i, (section, table) in enumerate(zip(self.file.measurements, self.tables, strict=True)):
+            of_all = section.covariance is not None or self.file.covariance is not None
+            listed = {row.at: k for k, row in enumerate(rows) if row.section == i and row.at >= 0}
+            others = [k for k, row in enumerate(rows) if row.section == i and row.at < 0]
+            if of_all and others:
+                what = f"the covariance of the site does not know {rows[others[0]].name}"
+                raise InvalidProblem(what, self.source, "send rows of the site only")
+            # one matrix for all rows of an epoch: what is absent keeps its place, with weight 0
+            own = [row for row in self.rows if row.section == i] if of_all else []
+            chosen = own or [*(rows[k] for k in sorted(listed.values())), *(rows[k] for k in others)]
+            if not chosen:
+                continue
+            place = [listed.get(row.at, -1) for row in own] or [*sorted(listed.values()), *others]
+            sections.append(section)
+            tables.append(_table(table, section.kind is None, chosen, [k >= 0 for k in place]))
+            order.append(place)
+        file = self.file.model_copy(update={"measurements": sections})
+        draft = assemble(file, self.station_table, tables, self.source, values=False, known=self.places)
+        return draft, order
+
+
+def _table(table: Table, kinds: bool, rows: Sequence[Row], present: Sequence[bool]) -> Table:
+    """Return the rows of an event as a table like that of the site."""
+    columns: dict[str, Array] = {}
+    if kinds:
+        columns["kind"] = np.array([row.kind for row in rows], dtype=object)
+    for key in ("a", "b"):
+        if any(getattr(row, key) for row in rows):
+            columns[key] = np.array([getattr(row, key) or None for row in rows], dtype=object)
+    for key in _OWN:
+        given = table.numbers(key) if table.has(key) else None
+        stated = key == "sigma" and any(row.sigma is not None for row in rows)
+        if given is None and not stated and (key != "weight" or all(present)):
+            continue
+        columns[key] = np.array([_own(given, key, row, table.source) for row in rows])
+    if not all(present):
+        columns["weight"] = np.where(present, columns["weight"], 0.0)
+    return Table(table.source, columns, len(rows))
+
+
+def _own(given: Array | None, key: str, row: Row, source: str) -> float:
+    """Return the standard deviation, weight or correction of a row."""
+    if key == "sigma" and row.sigma is not None:
+        return row.sigma
+    if given is not None and row.at >= 0:
+        return float(given[row.at])
+    if key == "sigma":
+        raise InvalidProblem(f"nothing is said of the noise of {row.name}", source, "send its sigma")
+    return 1.0 if key == "weight" else 0.0
+
+
+def read_site(path: Path, method: str = "auto") -> Site:
+    """Return the site of a problem file.
+
+    Parameters
+    ----------
+    path : Path
+        The file; its rows are the template of an event, values need not be there.
+    method : str
+        How events are solved.
+
+    Raises
+    ------
+    InvalidProblem
+        Where the file is none, or says what a stream of single events cannot have: stations or targets that move,
+        noise to be estimated, decibels.
+    """
+    file, source = read_document(path), name_of(path)
+    station_table = table_of(file.stations, path.parent, join(source, "[stations]"))
+    places = places_of(file, path.parent, source)
+    tables = [
+        table_of(section, path.parent, join(source, f"[[measurements]] {i + 1}"))
+        for i, section in enumerate(file.measurements)
+    ]
+    draft = assemble(file, station_table, tables, source, values=False, known=places)
+    _check(draft, source)
+    rows = _template(draft, source)
+    problem = draft.loaded.problem
+    timed = next((row for row in rows if row.kind in ("toa", "tdoa")), None)
+    arriving = tuple(i for i, row in enumerate(rows) if timed and row[:3:2] == timed[:3:2])
+    number = {name: i for i, name in enumerate(problem.stations.names)}
+    hearing = {number[end] for i in arriving for end in (rows[i].a, rows[i].b) if end}
+    site = Site(
+        source, draft.loaded.title, method, file, station_table, tuple(tables), places, rows, problem.stations.names,
+        problem.stations.position[0], problem.frame, file.propagation_speed or SPEED_OF_LIGHT, arriving,
+        tuple(i for i in range(len(rows)) if i not in arriving), tuple(sorted(hearing)),
+        {row[2:5]: i for i, row in enumerate(rows)}, number,
+    )  # fmt: skip
+    # what one event cannot be fixed by, such as a bias without a prior, is the verdict's; what cannot be read is told
+    site.ready((), rows)
+    return site
+
+
+def _check(draft: Draft, source: str) -> None:
+    """Refuse what single events cannot have."""
+    if draft.moving or len(draft.loaded.problem.stations.position) > 1:
+        raise InvalidProblem("the stations move", join(source, "[stations]"), "a stream needs stations that stay")
+    motion = {table.moves for table in (draft.file.target, *draft.file.targets.values())} - {None, "static"}
+    if motion - FREE:
+        what = f"the motion {min(map(str, motion - FREE))} needs several epochs"
+        raise InvalidProblem(what, join(source, "[target]"), "leave it out: events are fixed one by one")
+    for chunk in draft.chunks:
+        if chunk.unit.logarithmic:
+            where = join(chunk.table.source, "key 'unit'")
+            raise InvalidProblem("a stream takes no decibels of ratios", where, "send ratios, in the unit '1'")
+
+
+def _template(draft: Draft, source: str) -> tuple[Row, ...]:
+    """Return what different rows there are, in the order of the file."""
+    found: dict[tuple[int, str, str, str], Row] = {}
+    for i, (section, table) in enumerate(zip(draft.file.measurements, draft.tables, strict=True)):
+        kinds = [section.kind] * table.count if section.kind is not None else table.labels("kind").tolist()
+        ends = [
+            table.labels(key).tolist() if table.has(key) else [getattr(section, key) or ""] * table.count
+            for key in ("a", "b")
+        ]
+        for at, (kind, a, b) in enumerate(zip(kinds, *ends, strict=True)):
+            count = MODELS[kind].stations
+            key = (i, kind, a if count > 0 else "", b if count > 1 else "")
+            if key in found and draft.loaded.problem.epochs == 1:
+                what = f"{found[key].name} stands twice"
+                raise InvalidProblem(what, join(source, f"[[measurements]] {i + 1}"), "a stream tells rows by these")
+            found.setdefault(key, Row(i, at, *key[1:]))
+    return tuple(found.values())

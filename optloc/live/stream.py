@@ -1,0 +1,487 @@
+"""A stream: lines from anywhere through one bounded queue, one thread that answers, one that writes; checkpoints."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from threading import Event, Thread
+from time import monotonic
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.inputs import access, json_of, read_text
+from optloc.base.outputs import Growing, write_text
+from optloc.compute.jit import enabled
+from optloc.linear.simulate import simulate
+from optloc.live import events as of_events
+from optloc.live.answers import FORMATS, Latest, Record, to_line
+from optloc.live.engine import BATCH, Engine
+from optloc.live.events import LINE, Events, parse
+from optloc.live.metrics import Metrics
+from optloc.live.queues import Inbox, Line, Outbox, Ticket
+from optloc.live.site import Site, read_site
+
+LOG = logging.getLogger("optloc.live")
+
+# Lines that are looked at before the clock is: a timer is late by what they take, some milliseconds.
+_LINES = 256
+# Seconds after which it is looked again whether a reader has read what is there for it.
+_PAUSE = 1e-3
+# Share of the time that does not count for events while lines wait to be read: rows of an event that were written one
+# after the other are near each other however slowly they are read, and events without all rows still close.
+_STILL = 0.98
+# Bytes of a recording that are gathered before they are written.
+_GATHERED = 1 << 16
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """How a stream answers.
+
+    Parameters
+    ----------
+    wait : float
+        Seconds after its first row at which an event closes.
+    revise : bool
+        Whether late rows make a new answer.
+    phases : "two", "one" or "fix"
+        As `optloc.live.engine.PHASES`.
+    deadline : float
+        Seconds after which a proof is given up.
+    shed : bool
+        Whether proofs are skipped under load; rows wait otherwise.
+    part : (int, int)
+        Which of how many processes this is.
+    format : str
+        A key of `optloc.live.answers.FORMATS`.
+    state : Path, optional
+        Checkpoint, read at the start where it is there.
+    record : Path, optional
+        Where the lines go that are read, with the seconds at which they were.
+    every : float
+        Seconds between checkpoints.
+    health : float
+        Seconds between lines of health.
+    """
+
+    wait: float = 0.05
+    revise: bool = False
+    phases: str = "two"
+    deadline: float = 1.0
+    shed: bool = True
+    part: tuple[int, int] = (0, 1)
+    format: str = "ndjson"
+    state: Path | None = None
+    record: Path | None = None
+    every: float = 5.0
+    health: float = 10.0
+
+
+class Stream:
+    """Reads lines, answers events, writes answers, until it is closed.
+
+    Parameters
+    ----------
+    site : Site
+        What events consist of.
+    settings : Settings
+        How they are answered.
+    write : callable
+        Writes bytes to the output.
+    say : callable
+        Writes a line for people, such as health.
+    clock : callable
+        Seconds that never go back.
+    again : Path, optional
+        The file of the site, where it may be read anew.
+    replayed : bool
+        Whether its lines say themselves when they were read: events then close by that, whatever the speed.
+    """
+
+    def __init__(
+        self,
+        site: Site,
+        settings: Settings,
+        write: Callable[[bytes], None],
+        say: Callable[[str], None] = lambda line: None,
+        clock: Callable[[], float] = monotonic,
+        again: Path | None = None,
+        *,
+        replayed: bool = False,
+    ) -> None:
+        self.site, self._settings, self._say, self.clock, self._again = site, settings, say, clock, again
+        self._replayed = replayed
+        self.metrics, self.latest, self.inbox = Metrics(), Latest(), Inbox()
+        # replaced, never changed: threads go through it
+        self.listeners: tuple[Callable[[Record], None], ...] = ()
+        # of a source that is a file: seconds that count for nothing, and whether it has more to read
+        self.held = 0.0
+        self.pending: Callable[[], bool] = bool
+        self._outbox = Outbox(write, self.inbox.close)
+        self._format = FORMATS[settings.format]
+        self._engine = self._new_engine(site)
+        self._events = Events(site, self.metrics, self._emit, settings.wait, settings.revise, settings.part)
+        self._unwritten: dict[str, of_events.Event] = {}
+        self._record = None if settings.record is None else Growing(settings.record)
+        self._recorded = bytearray()
+        self._reload = False
+        self._next_state, self._next_health = clock() + settings.every, clock() + settings.health
+        self.metrics.gauges |= {
+            "input": lambda: len(self.inbox),
+            "output": lambda: len(self._outbox),
+            "open": lambda: len(self._events.open),
+        }
+        self.ended = Event()
+        self.error: Exception | None = None
+        if settings.state is not None and settings.state.exists():
+            restore(settings.state, self._events, self._time())
+        warm_up(site, settings.phases)
+        Thread(target=self._run, name="optloc stream", daemon=True).start()
+
+    def _new_engine(self, site: Site) -> Engine:
+        s = self._settings
+        return Engine(site, self.metrics, self._answer, self.clock, phases=s.phases, deadline=s.deadline, shed=s.shed)
+
+    # What others ask for.
+
+    def lines(self, data: Sequence[bytes], source: str, first: int = 1, ticket: Ticket | None = None) -> list[Line]:
+        """Return what was read just now as lines, numbered from `first`."""
+        now, when = self.clock(), self._time()
+        return [Line(each, first + i, source, now, when, ticket) for i, each in enumerate(data)]
+
+    def _time(self) -> float:
+        return self.clock() - self.held
+
+    def close(self) -> None:
+        """Read no more lines, answer those that are there, and end."""
+        self.inbox.close()
+
+    def reload(self) -> None:
+        """Read the file of the site anew, if it can be read; open events are answered by the old one."""
+        self._reload = True
+        self.inbox.wake()
+
+    @property
+    def failed(self) -> bool:
+        """Whether the reader of the output has gone."""
+        return self._outbox.failed
+
+    def health(self) -> Record:
+        """Return what is counted."""
+        about = {"site": self.site.title, "machine_code": enabled(), "phases": self._settings.phases}
+        return self.metrics.health(self.clock(), about)
+
+    # The thread that answers.
+
+    def _run(self) -> None:
+        try:
+            self._loop()
+        except Exception as error:  # noqa: BLE001  # raised where the stream is waited for
+            self.error = error
+        finally:
+            self.inbox.close()
+            self._outbox.close()
+            self.ended.set()
+
+    def _loop(self) -> None:
+        while not self._outbox.failed:
+            due = min(self._engine.next_due, self._next_state, self._next_health) - self.clock()
+            if not self._replayed:
+                due = min(due, self._events.next_due - self._time())
+            pending = self.pending()
+            lines = self.inbox.take(_LINES, max(due, _PAUSE) if pending else due)
+            if lines is None:
+                break
+            for line in lines:
+                if line.when >= self._events.next_due:
+                    self._events.due(line.when, self.clock())
+                self._read(line)
+                if len(self._events.ready) >= BATCH:
+                    self._settle()
+            # while lines wait it is as late as the last one says: what belongs to an event may be among them
+            if not (self._replayed or pending or len(self.inbox)):
+                self._events.due(self._time(), self.clock())
+            self._tend()
+        if not self._outbox.failed:
+            self._finish()
+
+    def _tend(self) -> None:
+        """Do what is due by time."""
+        now = self.clock()
+        self._settle()
+        self._engine.expire()
+        if self._reload:
+            self._reload = False
+            self._renew()
+        if now >= self._next_health:
+            self._next_health = now + self._settings.health
+            self._say(json.dumps({"health": self.health()}))
+            self._write_record()
+        if now >= self._next_state:
+            self._next_state = now + self._settings.every
+            self._checkpoint()
+
+    def _finish(self) -> None:
+        """Answer all that is there, and keep the last state."""
+        self._events.flush(self.clock())
+        self._settle()
+        self._engine.stop()
+        self._outbox.close()
+        self._checkpoint()
+        self._write_record(last=True)
+
+    def _read(self, line: Line) -> None:
+        counts, ticket = self.metrics.counts, line.ticket
+        data = line.data.strip()
+        refused = None
+        if data:
+            counts["lines"] += 1
+            try:
+                message = parse(data, self.site)
+                self._keep(data, line.stamp)
+                if message.command:
+                    refused = self._obey(message.command)
+                else:
+                    self._events.take(message, line.stamp, line.when, ticket)
+            except Exception as error:  # a stream goes on, whatever one line brings to light
+                if not isinstance(error, InvalidProblem):
+                    LOG.exception("line %d of %s failed", line.number, line.source)
+                counts["malformed"] += 1
+                refused = {"error": str(error), "line": line.number, "source": line.source}
+                if ticket is None:
+                    self._emit(refused)
+        if ticket is not None:
+            ticket.handled(refused)
+
+    def _obey(self, command: str) -> Record:
+        if command == "flush":
+            self._events.flush(self.clock())
+            return {"flushed": True}
+        record = {"health": self.health()}
+        self._emit(record)
+        return record
+
+    def _settle(self) -> None:
+        closed = list(self._events.closing())
+        for event in closed:
+            self._unwritten[event.name] = event
+        for first in range(0, len(closed), BATCH):
+            self._engine.settle(closed[first : first + BATCH])
+
+    # Answers, from all threads.
+
+    def _answer(self, event: of_events.Event, record: Record, last: bool) -> None:
+        self._tell(record)
+        self._outbox.put(self._format(record) or b"", event.name if last else None)
+        if event.reply is not None:
+            event.reply.answer(record, last)
+            if last:
+                event.reply = None  # it is remembered for long, and who asked has gone
+
+    def _emit(self, record: Record) -> None:
+        """Write a record that is no answer: a note, an error, health."""
+        self._tell(record)
+        if self._settings.format != "aircraft":
+            self._outbox.put(self._format(record) or b"")
+        else:
+            self._say(json.dumps(record))
+
+    def _tell(self, record: Record) -> None:
+        self.latest(record)
+        for listener in self.listeners:
+            listener(record)
+
+    # Files.
+
+    def _renew(self) -> None:
+        """Take the file of the site as it is now, once the events of the old one are answered."""
+        if self._again is None:
+            return
+        try:
+            with access(anew=True):
+                site = read_site(self._again, self.site.method)
+            warm_up(site, self._settings.phases)
+        except InvalidProblem as error:
+            self._say(f"The site stays as it was: {error}")
+            return
+        self._events.flush(self.clock())
+        self._settle()
+        self._engine.stop()
+        self.site = self._events.site = site
+        self._engine = self._new_engine(site)
+        self._events.closed = dict.fromkeys(self._events.closed)  # their rows were others
+        self._say(f"The site is {site.title!r} now, with {len(site.rows)} rows of {len(site.stations)} stations.")
+
+    def _checkpoint(self) -> None:
+        for _ in range(len(self._outbox.written)):
+            self._unwritten.pop(self._outbox.written.popleft(), None)
+        if self._settings.state is not None:
+            try:
+                write_text(self._settings.state, to_line(state_of(self._events, self._unwritten)).decode())
+            except InvalidProblem as error:
+                self._say(f"There is no checkpoint: {error}")  # a full disk ends no stream
+
+    def _keep(self, data: bytes, stamp: float) -> None:
+        """Record a line with the seconds at which it was read; it holds one JSON object."""
+        if self._record is not None:
+            self._recorded += b'{"received":%.6f,' % stamp + data[1:] + b"\n"
+            if len(self._recorded) > _GATHERED:
+                self._write_record()
+
+    def _write_record(self, *, last: bool = False) -> None:
+        if self._record is None:
+            return
+        if self._recorded:
+            self._record.append(bytes(self._recorded))
+            self._recorded.clear()
+        if last:
+            self._record.finish()
+
+
+def warm_up(site: Site, phases: str) -> None:
+    """Solve a made-up event, so that the first real one finds machine code loaded.
+
+    Parameters
+    ----------
+    site : Site
+        Whose template is taken.
+    phases : "two", "one" or "fix"
+        Which answers will be wanted.
+    """
+    ready = site.ready((), site.rows)
+    assert ready is not None  # a site has rows
+    problem = ready.fast.problem
+    x = np.zeros(problem.layout.size)
+    slot, _ = problem.layout.find("position")
+    # beside the middle, where no two stations are alike
+    x[slot.start : slot.start + slot.size] = site.position.mean(0) + 0.1 * np.ptp(site.position, axis=0)
+    with np.errstate(all="ignore"):
+        z = simulate(problem, x, 0, BATCH).z
+    for count in (1, BATCH):
+        ready.fast(z[:count])
+        if phases != "fix":
+            ready.full(z[:count])
+
+
+# Checkpoints: open events, and the ids of those that were answered.
+
+
+def state_of(events: Events, unwritten: dict[str, of_events.Event]) -> Record:
+    """Return what a stream must know to go on where it was.
+
+    Parameters
+    ----------
+    events : Events
+        Of the stream.
+    unwritten : dict of str to Event
+        Closed events whose answers may not have been written: they count as open.
+    """
+    site = events.site
+
+    def spelled(event: of_events.Event) -> Record:
+        rows = [[*site.row(key)[2:5], value, event.sigmas.get(key)] for key, value in event.rows.items()]
+        times = [[site.stations[i], str(value)] for i, value in event.times.items()]
+        about = {"target": event.target, "revision": event.revision, "conflict": event.conflict}
+        return {"event": event.name, "rows": rows, "times": times, **about}
+
+    return {
+        "format": "optloc live 1",
+        "site": site.source,
+        "open": [spelled(event) for event in (*unwritten.values(), *events.open.values())],
+        "closed": [name for name in events.closed if name not in unwritten],
+        "counts": dict(events.metrics.counts),
+    }
+
+
+def restore(path: Path, events: Events, now: float) -> None:
+    """Take over what a checkpoint holds.
+
+    Parameters
+    ----------
+    path : Path
+        The checkpoint.
+    events : Events
+        A stream's, before its first line.
+    now : float
+        By the clock of the stream.
+
+    Raises
+    ------
+    InvalidProblem
+        Where it is none, or names what the site has not.
+    """
+    site = events.site
+    with access(anew=True):  # it is written again, which a file that was read must not be
+        found = json_of(read_text(path), path.name)
+    if not isinstance(found, dict) or found.get("format") != "optloc live 1":
+        raise InvalidProblem("this is no checkpoint of a stream", str(path), "name another file, or remove it")
+    try:
+        for name in found["closed"]:
+            events.remember(str(name), None)
+        for each in found["open"]:
+            rows, sigmas = {}, {}
+            for kind, a, b, value, sigma in each["rows"]:
+                key = site.find(kind, a, b)
+                rows[key] = float(value)
+                if sigma is not None:
+                    sigmas[key] = float(sigma)
+            times = {site.number[station]: int(value) for station, value in each["times"]}
+            event = of_events.Event(str(each["event"]), rows, times, now, now, sigmas, str(each["target"]))
+            event.revision, event.conflict = int(each["revision"]), bool(each["conflict"])
+            events.open[event.name] = event
+        events.metrics.counts.update({name: int(n) for name, n in found["counts"].items()})
+    except (KeyError, TypeError, ValueError) as error:
+        if isinstance(error, InvalidProblem):
+            raise InvalidProblem(error.what, str(path), "it belongs to another site; name another file") from None
+        raise InvalidProblem("this checkpoint is damaged", str(path), "remove it") from None
+
+
+# Sources that are files: standard input, and recordings.
+
+
+def read_lines(
+    read: Callable[[int], bytes],
+    stream: Stream,
+    source: str,
+    adapter: Callable[[bytes], bytes] | None = None,
+    pending: Callable[[], bool] = bool,
+) -> None:
+    """Read lines until the end and hand them to a stream; what it has no room for is not read.
+
+    Parameters
+    ----------
+    read : callable
+        Returns at most so many bytes, as soon as some are there; none at the end.
+    stream : Stream
+        Who gets them.
+    source : str
+        What its complaints call them.
+    adapter : callable, optional
+        Turns what comes into lines of a stream.
+    pending : callable
+        Whether something is there to be read: the time between two reads then hardly counts for events that wait.
+    """
+    rest, number, last = b"", 0, stream.clock()
+    stream.pending = pending
+    while True:
+        waited = pending()
+        if not (piece := read(LINE)):
+            break
+        now = stream.clock()
+        stream.held += _STILL * (now - last) if waited else 0.0
+        last = now
+        *whole, rest = (rest + piece).split(b"\n")
+        if len(rest) > 2 * LINE:
+            rest = rest[: LINE + 1]  # of a line that is refused its beginning is enough, however long it becomes
+        lines = whole if adapter is None else [adapter(data) for data in whole]
+        stream.inbox.put(stream.lines(lines, source, number + 1))
+        number += len(whole)
+        if stream.inbox.closed:
+            return
+    stream.pending = bool
+    if rest:
+        stream.inbox.put(stream.lines([rest if adapter is None else adapter(rest)], source, number + 1))
