@@ -15,6 +15,8 @@ hypothesis.settings.load_profile("optloc")
 
 # Machine code is waited for, in this process and in those that tests begin: answers must not depend on what is on disk.
 os.environ.setdefault("OPTLOC_COMPILE", "wait")
+# What tests begin is the optloc that they test, not a checkout in the current folder, which has no machine code.
+os.environ["PYTHONSAFEPATH"] = "1"
 
 # Seeds of a test in full: data that nobody had seen broke a proof once, where ten seeds had been one.
 FULL_SEEDS = 10

@@ -255,7 +255,7 @@ def _is_plain(scan: Problem) -> bool:
         not scan.batch_shape
         and len(scan.times) == len(scan.motions) == 1
         and motion.known is None
-        and motion.reference == scan.times[0]
+        and motion.reference in (None, scan.times[0])
         and not (scan.biases or scan.priors or scan.constraints)
         and (scan.stations.covariance is None or scan.stations.span == "noise")
     )
