@@ -32,7 +32,8 @@ def test_no_fix_that_is_alone_misses_a_better_minimum_near_the_truth(kind, biase
     state = [2e3, 3e3, 1.5e3, *([60.0, 40.0, 2.0] if moves else [])]
     truth = np.concatenate([state, np.linspace(-3.0, 3.0, 4) * SIGMA[kind] if biased else []])
     drawn = optloc.simulate(problem, truth=np.tile(truth, (TRIALS, 1)), seed=2)
-    fix, near = solve(drawn), solve(drawn, "lsr", start=truth)
+    # Without the proof, which takes seconds a run and has tests of its own.
+    fix, near = solve(drawn, "searched"), solve(drawn, "lsr", start=truth)
     missed = fix.cost > near.cost + 1e-3
     assert not (missed & alone(fix)).any()
     assert missed.sum() <= 1  # with ten unknowns of weak rows, one in some hundred, and then ambiguous

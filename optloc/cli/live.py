@@ -13,7 +13,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from math import inf
 from pathlib import Path
-from threading import Thread, current_thread, main_thread
+from threading import Event, Thread, current_thread, main_thread
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -247,10 +247,11 @@ def run_live(file: Path, asked: Asked) -> int:
     with _threads(), ExitStack() as stops:
         stream = Stream(site, settings, write, say, again=file, replayed=recording is not None)
         stops.callback(stream.close)  # where a source cannot be opened
+        interrupted = stops.enter_context(_obeying(stream))  # before anything is read
         places = _open(asked, stream, adapter, stops)
         say(f"ready: {site.title!r}, {len(site.rows)} rows of {len(site.stations)} stations{places}")
         _read(asked, stream, adapter, recording)
-        code = wait(stream)
+        code = wait(stream, interrupted)
     say(json.dumps({"health": stream.health()}))
     return code
 
@@ -318,25 +319,29 @@ def told(site: Site) -> Iterator[str]:
     )
 
 
-def wait(stream: Stream) -> int:
-    """Return the exit code of a stream when it has ended; signals end it, or let it read its site anew."""
-    stopped = False
+def wait(stream: Stream, interrupted: Event) -> int:
+    """Return the exit code of a stream when it has ended."""
+    # with a timeout: on Windows a wait without one hears no signals
+    while not stream.ended.wait(1.0):
+        pass
+    if stream.error is not None:
+        raise stream.error
+    return STOPPED if interrupted.is_set() else READER_GONE if stream.failed else 0
+
+
+@contextmanager
+def _obeying(stream: Stream) -> Iterator[Event]:
+    """Let signals end a stream, or have it read its site anew; what is yielded is set by Ctrl-C."""
+    interrupted = Event()
 
     def stop(number: int, _: Any) -> None:
-        nonlocal stopped
-        stopped = number == signal.SIGINT
+        if number == signal.SIGINT:
+            interrupted.set()
         signal.signal(signal.SIGINT, signal.default_int_handler)  # a second Ctrl-C does not wait
         stream.close()
 
-    wanted: dict[str, Callable[[int, Any], None]] = {"SIGTERM": stop, "SIGINT": stop}
-    wanted["SIGHUP"] = lambda *_: stream.reload()
-    with _signals(wanted):
-        # with a timeout: on Windows a wait without one hears no signals
-        while not stream.ended.wait(1.0):
-            pass
-    if stream.error is not None:
-        raise stream.error
-    return STOPPED if stopped else READER_GONE if stream.failed else 0
+    with _signals({"SIGTERM": stop, "SIGINT": stop, "SIGHUP": lambda *_: stream.reload()}):
+        yield interrupted
 
 
 @contextmanager
