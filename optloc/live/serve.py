@@ -155,7 +155,7 @@ def application(stream: Stream, *, local: bool = True) -> Any:
         Route("/data/aircraft.json", aircraft),
         WebSocketRoute("/ws", listen),
     ]
-    names = ["localhost", "127.0.0.1", "::1", "[::1]"] if local else ["*"]
+    names = list(_NAMES) if local else ["*"]
     return Starlette(routes=routes, middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=names)])
 
 
