@@ -194,15 +194,18 @@ def volume(trial: Trial, x: np.ndarray, least: float) -> float:
 
 
 def _against_bound(besides: Counter, scenes: Scenes, fix: Fix, best: np.ndarray) -> None:
-    """Sum up squared errors along the ground and what the bound allows; count `ok` ellipses that hold the truth."""
+    """Sum up squared errors along the ground, each over what its bound allows; count `ok` ellipses that hold the truth.
+
+    Over its own bound: of sums over all, five scenes of two thousand would be a quarter.
+    """
     bound, spread = crlb(scenes.problem, scenes.truth), fix.covariance()
     for i, truth in enumerate(scenes.truth):
         axes = ECEF.enu_axes(truth)[:2]
         error = axes @ (fix.position[i] - truth)
         if not fix.answered[i]:
             continue
-        besides["squared"] += error @ error
-        besides["bound"] += np.trace(axes @ bound[i] @ axes.T)
+        besides["judged"] += 1
+        besides["squared"] += error @ error / np.trace(axes @ bound[i] @ axes.T)
         if fix.code[i] == Status.OK:
             besides["sure"] += 1
             squared = error @ np.linalg.solve(axes @ spread[i] @ axes.T, error)
@@ -232,7 +235,7 @@ def _said_of_sides(besides: Counter) -> str:
 
 
 def _said_of_bound(besides: Counter) -> str:
-    ratio, held = np.sqrt(besides["squared"] / besides["bound"]), besides["covered"] / max(besides["sure"], 1)
+    ratio, held = np.sqrt(besides["squared"] / besides["judged"]), besides["covered"] / max(besides["sure"], 1)
     return f"RMSE {ratio:.3f} of the bound; the 95 % ellipses of `ok` hold {100.0 * held:.1f} % of truths"
 
 
@@ -263,8 +266,8 @@ def judge(made: Counted) -> None:
         assert abs(besides["stated"] - besides["exact"]) < 0.01 * besides["judged"]
     if name == SATELLITES:
         n = besides["sure"]
-        # Of n errors in the plane the mean square is known to 1 / sqrt(n), and a share of 95 % to 0.22 / sqrt(n).
-        assert abs(besides["squared"] / besides["bound"] - 1.0) < 0.1 + 3.0 / np.sqrt(n)
+        # Of n errors, most along one axis, the mean square is known to sqrt(2 / n), a share of 95 % to 0.22 / sqrt(n).
+        assert abs(besides["squared"] / besides["judged"] - 1.0) < 0.1 + 4.3 / np.sqrt(n)
         assert abs(besides["covered"] / n - 0.95) < 0.02 + 0.65 / np.sqrt(n)
 
 
