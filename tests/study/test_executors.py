@@ -17,7 +17,8 @@ from optloc.study import execute
 from optloc.study.execute import EXECUTORS, executor, run_plan
 from optloc.study.folder import progress
 
-LONG = QUICK.replace("trials = 60", "trials = 600")
+# Thirty parts or so: enough that a worker, and then the run, is killed between them.
+LONG = QUICK.replace("trials = 60", "trials = 200")
 
 
 @pytest.fixture(scope="module")
