@@ -59,7 +59,7 @@ def test_the_answer_is_a_minimum_of_the_loss(name):
 @pytest.mark.parametrize("kind", ["toa", "tdoa", "range"])
 @pytest.mark.parametrize("name", REDESCENDING)
 def test_the_truth_leads_to_nothing_better(kind, name):
-    case = spoilt(kind, 60, 8, bad=2, size=30.0)
+    case = spoilt(kind, 30, 8, bad=2, size=30.0)
     if kind == "tdoa":
         case = replace(case, truth=case.truth[:, :3])
     worse = worse_than_from_truth(case, name, solve(case.problem, name))
@@ -68,7 +68,7 @@ def test_the_truth_leads_to_nothing_better(kind, name):
 
 @pytest.mark.parametrize("name", REDESCENDING)
 def test_gross_errors_are_named_and_do_no_harm(name):
-    case = spoilt("toa", 100, 10, bad=1, size=1000.0)
+    case = spoilt("toa", 40, 10, bad=1, size=1000.0)
     fix = solve(case.problem, name)
     claimed = alone(fix)
     assert claimed.mean() >= 0.95
@@ -99,13 +99,13 @@ def test_sigma_means_what_it_says_with_one_row_in_ten_wrong(name):
 
 def test_range_differences_are_doubted_as_arrivals():
     # Of the first station's arrival all differences are made: all seven are wrong, and one arrival is.
-    arrivals, differences = (spoilt(kind, 20, 8, bad=1, seed=6) for kind in ("toa", "tdoa"))
+    arrivals, differences = (spoilt(kind, 8, 8, bad=1, seed=6) for kind in ("toa", "tdoa"))
     for name in ("cauchy", "late"):
         one, two = solve(arrivals.problem, name), solve(differences.problem, name)
         np.testing.assert_allclose(one.position, two.position, atol=1e-2)
         np.testing.assert_allclose(one.cost, two.cost, rtol=1e-4)
-    assert two.weights.shape == (20, 7)
-    assert two.x.shape == (20, 3)
+    assert two.weights.shape == (8, 7)
+    assert two.x.shape == (8, 3)
 
 
 def test_late_arrivals_are_doubted_and_early_ones_believed():
@@ -141,7 +141,7 @@ def test_partners_tell_which_of_correlated_rows_is_wrong():
     pair = np.array([[1.0, 0.99], [0.99, 1.0]])
     problem = assemble(stations, measured("range", a=a, sigma=1.0))
     problem = replace(problem, noise=Noise((Block(np.arange(12).reshape(6, 2), pair[None]),)))
-    problem = simulate(problem, np.tile(truth, (100, 1)), 11)
+    problem = simulate(problem, np.tile(truth, (40, 1)), 11)
     z = problem.z.copy()
     z[:, 4] += 2.0
     fix = solve(problem.with_rows(z=z), "truncated")
