@@ -59,7 +59,7 @@ def test_the_answer_is_a_minimum_of_the_loss(name):
 @pytest.mark.parametrize("kind", ["toa", "tdoa", "range"])
 @pytest.mark.parametrize("name", REDESCENDING)
 def test_the_truth_leads_to_nothing_better(kind, name):
-    case = spoilt(kind, 60, 8, bad=2, size=30.0)
+    case = spoilt(kind, 30, 8, bad=2, size=30.0)
     if kind == "tdoa":
         case = replace(case, truth=case.truth[:, :3])
     worse = worse_than_from_truth(case, name, solve(case.problem, name))
@@ -68,7 +68,7 @@ def test_the_truth_leads_to_nothing_better(kind, name):
 
 @pytest.mark.parametrize("name", REDESCENDING)
 def test_gross_errors_are_named_and_do_no_harm(name):
-    case = spoilt("toa", 100, 10, bad=1, size=1000.0)
+    case = spoilt("toa", 40, 10, bad=1, size=1000.0)
     fix = solve(case.problem, name)
     claimed = alone(fix)
     assert claimed.mean() >= 0.95
@@ -80,7 +80,7 @@ def test_gross_errors_are_named_and_do_no_harm(name):
 
 @pytest.mark.parametrize("name", LOSSES)
 def test_clean_data_lose_next_to_nothing(name):
-    case = spoilt("toa", 150, 9)
+    case = spoilt("toa", 80, 9)
     fix = solve(case.problem, name)
     assert not (fix.code == Status.OK).any()  # of a loss nothing is proven
     assert alone(fix).mean() >= 0.97
@@ -99,17 +99,17 @@ def test_sigma_means_what_it_says_with_one_row_in_ten_wrong(name):
 
 def test_range_differences_are_doubted_as_arrivals():
     # Of the first station's arrival all differences are made: all seven are wrong, and one arrival is.
-    arrivals, differences = (spoilt(kind, 20, 8, bad=1, seed=6) for kind in ("toa", "tdoa"))
+    arrivals, differences = (spoilt(kind, 8, 8, bad=1, seed=6) for kind in ("toa", "tdoa"))
     for name in ("cauchy", "late"):
         one, two = solve(arrivals.problem, name), solve(differences.problem, name)
         np.testing.assert_allclose(one.position, two.position, atol=1e-2)
         np.testing.assert_allclose(one.cost, two.cost, rtol=1e-4)
-    assert two.weights.shape == (20, 7)
-    assert two.x.shape == (20, 3)
+    assert two.weights.shape == (8, 7)
+    assert two.x.shape == (8, 3)
 
 
 def test_late_arrivals_are_doubted_and_early_ones_believed():
-    case = spoilt("range", 100, 8, bad=2, size=50.0, late=True)
+    case = spoilt("range", 50, 8, bad=2, size=50.0, late=True)
     fix = solve(case.problem, "late")
     claimed = alone(fix)
     assert claimed.mean() > 0.9
@@ -141,7 +141,7 @@ def test_partners_tell_which_of_correlated_rows_is_wrong():
     pair = np.array([[1.0, 0.99], [0.99, 1.0]])
     problem = assemble(stations, measured("range", a=a, sigma=1.0))
     problem = replace(problem, noise=Noise((Block(np.arange(12).reshape(6, 2), pair[None]),)))
-    problem = simulate(problem, np.tile(truth, (100, 1)), 11)
+    problem = simulate(problem, np.tile(truth, (40, 1)), 11)
     z = problem.z.copy()
     z[:, 4] += 2.0
     fix = solve(problem.with_rows(z=z), "truncated")
@@ -193,8 +193,8 @@ def test_absent_rows_stay_absent_and_broken_ones_are_said():
 
 
 def test_rows_that_are_all_wrong_get_no_clean_answer():
-    case = spoilt("toa", 30, 7)
-    z = case.problem.z + 1e4 * np.random.default_rng(13).standard_normal((30, 7))
+    case = spoilt("toa", 12, 7)
+    z = case.problem.z + 1e4 * np.random.default_rng(13).standard_normal((12, 7))
     fix = solve(case.problem.with_rows(z=z), "cauchy")
     assert not (fix.code == Status.OK).any()
     assert (~alone(fix) | (fix.p_value < 1e-3)).all()

@@ -239,11 +239,13 @@ def test_with_redundancy_one_a_bad_fit_is_not_ok():
     assert (fix.code[fix.p_value < 1e-4] == Status.CONTRADICTORY).all()
 
 
-@pytest.mark.parametrize("noise", [2.0, 3.0])
+@pytest.mark.parametrize(
+    ("noise", "batches"), [(2.0, 1), (3.0, 1), *(pytest.param(n, 4, marks=pytest.mark.full) for n in (2.0, 3.0))]
+)
 @pytest.mark.parametrize("kind", ["toa", "range", "azimuth"])
-def test_noise_that_is_understated_is_the_suspect_and_no_station_is(kind, noise):
+def test_noise_that_is_understated_is_the_suspect_and_no_station_is(kind, noise, batches):
     """Fifty fixes at a time: the level is named, nobody is accused more often than on clean data, and nothing is ok."""
-    trials, batches = 50, 4
+    trials = 50
     told = accused = 0
     for seed in range(batches):
         case = spoilt(kind, trials, 8, seed=seed, noise=noise, dimension=2 if kind == "azimuth" else 3)
@@ -257,7 +259,9 @@ def test_noise_that_is_understated_is_the_suspect_and_no_station_is(kind, noise)
     assert accused <= binom.isf(1e-3, trials * batches, 0.03)
 
 
-@pytest.mark.parametrize(("kind", "stations"), [("tdoa", 18), ("azimuth", 26)])
+@pytest.mark.parametrize(
+    ("kind", "stations"), [("tdoa", 18), ("azimuth", 20), pytest.param("azimuth", 26, marks=pytest.mark.full)]
+)
 def test_sets_that_are_left_untried_explain_nothing(kind, stations, monkeypatch):
     """Many stations, of which two may be a little wrong: the same as where all sets of two are tried."""
     case = spoilt(kind, 3, stations, share=0.06, size=5.0, seed=2, dimension=2 if kind == "azimuth" else 3)
@@ -277,8 +281,8 @@ def test_two_kinds_of_lengths_may_both_have_an_offset():
         return problem(measured("range", a=EACH, sigma=sigma), sums)
 
     # errors half as large again as is stated: no rest is refuted, and none is so good that pairs need no look
-    loud = simulate(rows(15.0), TARGET, 6, trials=4).z
-    stated = simulate(rows(10.0), TARGET, 6, trials=4)
+    loud = simulate(rows(15.0), TARGET, 6, trials=2).z
+    stated = simulate(rows(10.0), TARGET, 6, trials=2)
     fix = solve_apart(stated.with_rows(z=loud))
     assert fix.answered.all()
     error = fix.position - TARGET

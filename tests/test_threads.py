@@ -219,7 +219,7 @@ def solved_in_threads(problems: list[Problem], methods: tuple[str, ...], solves:
 
 
 def test_threads_solve_different_problems_as_one_thread_does():
-    solved_in_threads([varied(i) for i in range(120)], ("gtrs+lsr", "auto"), 500)
+    solved_in_threads([varied(i) for i in range(42)], ("gtrs+lsr", "auto"), 170)  # three of each kind and dimension
 
 
 @pytest.mark.full
@@ -229,13 +229,13 @@ def test_threads_solve_many_different_problems_as_one_thread_does():
 
 @pytest.mark.parametrize("methods", [("gtrs+nlp+lsr",), ("sdp+lsr", "socp+lsr"), ("sparse+lsr",)])
 def test_threads_share_the_programs_of_back_ends(methods):
-    """Forty problems of four structures: a program of IPOPT or Clarabel serves several threads at a time."""
+    """Twenty problems of four structures: a program of IPOPT or Clarabel serves several threads at a time."""
     problems = [
         simulate(varied(i), np.resize([1e3, -2e3, 500.0], varied(i).layout.size), k)
         for i in (0, 1, 2, 3)
-        for k in range(10)
+        for k in range(5)
     ]
-    solved_in_threads([p.take(np.arange(1)) if p.batch_shape else p for p in problems], methods, 80)
+    solved_in_threads([p.take(np.arange(1)) if p.batch_shape else p for p in problems], methods, 40)
 
 
 def test_a_nonlinear_program_serves_several_threads_at_a_time():

@@ -40,13 +40,17 @@ def test_five_stations_and_the_height(folder, given, refraction):
     assert not _silent(fix, reference).any()
 
 
-def test_three_stations_and_the_height(folder):
+# A proof takes ten times as long as a fix.
+@pytest.mark.parametrize(
+    ("messages", "method"), [(15, "searched"), (3, "auto"), pytest.param(15, "auto", marks=pytest.mark.full)]
+)
+def test_three_stations_and_the_height(folder, messages, method):
     whole = adsb.heard(folder, refraction=True).unbiased()
-    chosen = np.sort(np.random.default_rng(10).choice(len(whole.truth), 15, replace=False))
+    chosen = np.sort(np.random.default_rng(10).choice(len(whole.truth), messages, replace=False))
     data = whole.take(chosen).triplets()
     # Stations 147 and 632 are 22 m apart: three with both of them are two, and say nothing that can be judged.
     data = data.take(np.flatnonzero(truths.adsb_width(data) > 50.0))
-    fix, reference = solve(data.problem("exactly")), truths.adsb(data, "exactly")
+    fix, reference = solve(data.problem("exactly"), method), truths.adsb(data, "exactly")
     name = "ADS-B, three stations and height"
     theirs, best = truths.adsb_horizontal(data, reference.position), listed(fix, partial(truths.adsb_horizontal, data))
     law(name, fix, best, theirs, reference, answered=0.97)

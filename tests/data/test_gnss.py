@@ -41,14 +41,15 @@ def test_all_satellites_by_arrival_with_system_offsets(session, case, offset):
         assert (*found, up.mean()) == pytest.approx(ALL[case], abs=0.15)
 
 
+# A proof takes twenty times as long as a fix, and finds no other places: those of forty draws are looked at below.
 @pytest.mark.parametrize(
-    ("case", "draws"),
-    [(CASES[0], 800), *(pytest.param(case, 1500, marks=pytest.mark.full) for case in CASES)],
+    ("case", "draws", "method"),
+    [(CASES[0], 800, "searched"), *(pytest.param(case, 1500, "auto", marks=pytest.mark.full) for case in CASES)],
     ids=lambda given: "-".join(given) if isinstance(given, tuple) else str(given),
 )
-def test_three_satellites_and_the_height(session, case, draws):
+def test_three_satellites_and_the_height(session, case, draws, method):
     data = session.draws(draws, seed=3)
-    fix, reference = solve(data.by_difference()), truths.gnss_draws(data)
+    fix, reference = solve(data.by_difference(), method), truths.gnss_draws(data)
     name = f"GNSS {case}, three satellites"
     right = np.linalg.norm(fix.position - reference.position, axis=-1) < 1.0
     near = listed(fix, lambda x: np.linalg.norm(x - reference.position, axis=-1)) < 1.0
@@ -77,17 +78,19 @@ def test_three_satellites_and_the_height(session, case, draws):
 
 
 def test_the_elevation_mask_leaves_fewer_answers(data_dir):
-    data = gnss.load(data_dir / "gnss_static", "K078", "prc_l1_m").draws(100, seed=3)
+    data = gnss.load(data_dir / "gnss_static", "K078", "prc_l1_m").draws(40, seed=3)
     reference, free, masked = (
         truths.gnss_draws(data),
         solve(data.by_difference()),
         solve(data.by_difference(masked=True)),
     )
-    report(f"GNSS, 100 draws: {statuses(free)}; with the mask of 10 deg known: {statuses(masked)}")
+    report(f"GNSS, 40 draws: {statuses(free)}; with the mask of 10 deg known: {statuses(masked)}")
     assert masked.answered.all()
     assert masked.has(Status.AMBIGUOUS).sum() < free.has(Status.AMBIGUOUS).sum()
     near = listed(masked, lambda x: np.linalg.norm(x - reference.position, axis=-1)) < 1.0
     assert near.all()
+    right = np.linalg.norm(free.position - reference.position, axis=-1) < 1.0
+    assert not (alone(free) & ~right).any()
     # Draw 4 has a second answer 103 deg away, which one of its satellites would not have reached.
     assert free.has(Status.AMBIGUOUS)[4]
     assert alone(masked)[4]

@@ -10,20 +10,25 @@ import time
 from contextlib import ExitStack, contextmanager
 
 import pytest
-from study.texts import QUICK, assert_identical, plan, run_here
+from study.texts import QUICK, SMALL, assert_identical, plan, run_here
 
 from optloc.base.errors import InvalidProblem
 from optloc.study import execute
 from optloc.study.execute import EXECUTORS, executor, run_plan
 from optloc.study.folder import progress
 
-LONG = QUICK.replace("trials = 60", "trials = 600")
+# Thirty parts or so: enough that a worker, and then the run, is killed between them.
+LONG = QUICK.replace("trials = 60", "trials = 200")
 
 
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("study") / "plain"
-    return run_here(plan(), folder)
+# Two methods in parts of two sizes; without the relaxation processes need less time to begin.
+TWO = SMALL.replace("socp+lsr", "roots+lsr")
+
+
+@pytest.fixture(scope="module", params=[TWO, pytest.param(SMALL, marks=pytest.mark.full)], ids=["quick", "relaxed"])
+def undisturbed(request, tmp_path_factory):
+    """Return a study's text and the folder where it was computed in this process."""
+    return request.param, run_here(plan(request.param), tmp_path_factory.mktemp("study") / "plain")
 
 
 @contextmanager
@@ -76,16 +81,18 @@ def cluster(tmp_path_factory):
 
 
 def test_local_processes_and_a_cluster_give_the_same_table(undisturbed, cluster, tmp_path):
-    assert run_plan(plan(), tmp_path / "processes", executor("processes", 2)).complete
-    assert_identical(undisturbed, tmp_path / "processes")
-    assert run_plan(plan(), tmp_path / "dask", executor("dask", None, cluster[0])).complete
-    assert_identical(undisturbed, tmp_path / "dask")
+    text, expected = undisturbed
+    assert run_plan(plan(text), tmp_path / "processes", executor("processes", 2)).complete
+    assert_identical(expected, tmp_path / "processes")
+    assert run_plan(plan(text), tmp_path / "dask", executor("dask", None, cluster[0])).complete
+    assert_identical(expected, tmp_path / "dask")
 
 
 @pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="Ray is not installed")
 def test_ray_gives_the_same_table(undisturbed, tmp_path):
-    assert run_plan(plan(), tmp_path / "ray", executor("ray", 2)).complete
-    assert_identical(undisturbed, tmp_path / "ray")
+    text, expected = undisturbed
+    assert run_plan(plan(text), tmp_path / "ray", executor("ray", 2)).complete
+    assert_identical(expected, tmp_path / "ray")
 
 
 def test_a_killed_worker_and_a_killed_run_lose_nothing(cluster, tmp_path):
