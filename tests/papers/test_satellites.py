@@ -1,12 +1,10 @@
 """The paper `satellites`: its numbers, the bounds beside them, and the page."""
 
-from functools import partial
-
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from optloc import ECEF, crlb, predict, solve
+from optloc import ECEF, crlb, predict
 from optloc.cli import app
 from optloc.papers import satellites
 from optloc.papers.report import Study
@@ -69,13 +67,6 @@ def test_a_fix_is_worth_less_and_less_away_from_the_satellites():
     assert far(np.radians([25.0]))[0] == pytest.approx(30e3, rel=0.1)
 
 
-@pytest.fixture
-def unproven(monkeypatch):
-    """Filters begin with places and covariances: proofs of hundreds of fixes would be most of the time."""
-    monkeypatch.setattr(satellites, "solve", partial(solve, method="searched"))
-
-
-@pytest.mark.usefixtures("unproven")
 def test_filters_from_fixes_meet_the_bound():
     found, bound = run_fixed(60, 60, sequence(1))
     assert bound[[0, 9, 49]] == pytest.approx([522.1, 310.5, 156.3], abs=0.05)
@@ -84,7 +75,6 @@ def test_filters_from_fixes_meet_the_bound():
         assert found[name].claimed[0] == pytest.approx(bound, rel=0.02)
 
 
-@pytest.mark.usefixtures("unproven")
 def test_far_starts_order_the_filters():
     found, bound = run_wild(100e3, 60, 60, sequence(2))
     last = {name: run.error[:, -1] for name, run in found.items()}
@@ -97,7 +87,6 @@ def test_far_starts_order_the_filters():
     assert bound[-1] < 200.0
 
 
-@pytest.mark.usefixtures("unproven")
 def test_what_a_wrong_height_does():
     found = run_heights(60, 40, sequence(3))
     careless, honest = (found[f"constant error of 500 m, {how}"] for how in ("taken for white", "as a state"))

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from conftest import FULL_SEEDS
 from monte_carlo.tables import write
-from scipy.stats import binom
 from verdict.scenes import draw
 from verdict.search import Judgement, judge
 
 import optloc
 from optloc import LOSSES, Status, solve
 
-SCENES, FEW = 60, 4
+SCENES, FEW = 100, 6
 IN_FULL = {"auto": 1000}  # scenes a seed, of ten; 100 of every other method
 # Others than `auto`; those of a loss can never be `ok`, and only that is looked at.
 METHODS = ("gtrs+lsr", "roots+lsr", "searched", "proven", "robust", "roots+lsr+widen+lsr+value", *LOSSES)
@@ -91,7 +90,7 @@ def test_no_answer_is_wrong_though_it_is_ok(seed):
     assert tally.count["ok"] > SCENES // 3
     assert tally.beyond["ok"] <= 1
     # of so few no more than gross failure shows; the full run has the bands
-    assert tally.covered["ok 0.95"] >= binom.ppf(1e-3, tally.known["ok"], 0.95)
+    assert tally.covered["ok 0.95"] > 0.85 * tally.known["ok"]
 
 
 @pytest.mark.parametrize("method", METHODS)
