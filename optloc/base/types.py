@@ -354,7 +354,7 @@ class Certificate:
     margin : float
         Cost beyond that of the fix below which no other minimum is left; 0 where uniqueness is not proven.
     boxes : int
-        How many boxes a proof by branch and bound looked at.
+        How many boxes a proof by branch and bound looked at; where it was not finished, in all attempts.
     region : tuple of (lower, upper), optional
         Corners of the region of the claim, each d coordinates in the problem's frame, metres.
     asked : bool

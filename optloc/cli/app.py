@@ -539,14 +539,25 @@ def list_(
     raise typer.Exit(run_list(what, as_json))
 
 
-@app.command("compile", rich_help_panel=MORE, epilog=example("optloc compile", "optloc compile --check"))
+@app.command(
+    "compile",
+    rich_help_panel=MORE,
+    epilog=example("optloc compile", "optloc compile --check", "optloc compile --wheel dist"),
+)
 def compile_(
     check: Annotated[bool, typer.Option("--check", help="Compile nothing: only say what there is.")] = False,
+    wheel: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Pack it as a wheel for computers of this platform.")
+    ] = None,
     as_json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
     """Make the machine code of all kernels for this computer at once, which takes minutes and is kept on disk."""
+    if wheel is not None:
+        from optloc.cli.wheel import run_wheel
+
+        raise typer.Exit(run_wheel(wheel, quiet=quiet))
     from optloc.cli.compile import run_compile
 
     raise typer.Exit(run_compile(check, as_json, quiet=quiet))

@@ -26,7 +26,7 @@ from optloc.base.types import Array, Stations
 from optloc.cli.output import Screen, dumps, meter
 from optloc.compute.filter import absorb
 from optloc.compute.jit import REPORTER, compiling, enabled, insist_on, names_in, plain
-from optloc.compute.kept import alone, folder, is_kept
+from optloc.compute.kept import alone, is_kept, kept_in
 from optloc.linear.constraints import height
 from optloc.linear.simulate import simulate
 from optloc.problem.build import assemble, measured
@@ -206,14 +206,18 @@ def make(tell: Callable[[int, int], None] = lambda done, total: None) -> list[st
     return missing()
 
 
+def environment(**more: str) -> dict[str, str]:
+    """Return the variables of a process that is to import this very optloc, and more of them."""
+    path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])])
+    return os.environ | {"PYTHONPATH": path, **more}
+
+
 def _started(name: str) -> Iterator[str]:
     """Begin a process that compiles a part, and yield the lines that it writes; it ends with this process."""
-    path = os.pathsep.join([str(Path(__file__).resolve().parents[2]), *filter(None, [os.environ.get("PYTHONPATH")])])
     # -P: nothing is imported from the current folder.
     command = [sys.executable, "-P", "-m", "optloc.cli.compile", name]
-    environment = os.environ | {"PYTHONPATH": path, "OPTLOC_COMPILE": "wait"}
     with subprocess.Popen(  # noqa: S603  (this interpreter, and this module)
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, env=environment
+        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True, env=environment(OPTLOC_COMPILE="wait")
     ) as process:
         try:
             assert process.stdout is not None
@@ -243,7 +247,7 @@ def _compile(part: Part) -> None:
 
 def run_compile(check: bool, as_json: bool, *, quiet: bool = False) -> int:
     """Compile what is not on disk, and print what is; the exit code is 1 where something is missing at the end."""
-    place = folder() if enabled() else None
+    place = kept_in() if enabled() else None
     if place is not None and not check:
         with meter("making machine code", quiet) as tell:
             make(tell)

@@ -3,7 +3,8 @@
 numba renews what it keeps of a function when the file of that function changes, but machine code holds that of all
 functions it calls, wherever they stand: after an edit or an upgrade of one of those, stale code of the caller would go
 on answering. So the folder of machine code is named by a digest of all sources of kernels, of the versions of what
-compiles them, and of the processor that they are compiled for.
+compiles them, and of the processor that they are compiled for. What was installed for it (`optloc.compute.manifest`) is
+read first.
 """
 
 from __future__ import annotations
@@ -17,56 +18,16 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from functools import cache, partial
 from hashlib import sha256
-from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import IO, Any, cast
+from typing import IO, Any
 
-_PACKAGE = Path(__file__).resolve().parents[1]
-# All files and folders of optloc that kernels stand in, or take constants from: constants are part of machine code.
-SOURCES = ("compute", "proof", "base/linalg.py", "linear/normal.py", "models/primitives.py")
+from optloc.compute.manifest import PACKAGE, PREFIX, digest_of, installed, of_this_process
+
 # Folders of machine code of other sources that are left, the last used ones: branches of one checkout and versions that
 # share a folder by NUMBA_CACHE_DIR take turns. One is some 40 MB.
 _LEFT = 4
-_PREFIX = "optloc-"
 _LOG = logging.getLogger("optloc")
-
-
-def _digest_of(files: list[Path], root: Path) -> str:
-    made = sha256()
-    for file in sorted(files):
-        text = file.read_bytes()
-        made.update(f"{file.relative_to(root).as_posix()} {len(text)}\n".encode())
-        made.update(text)
-    return made.hexdigest()
-
-
-@cache
-def sources_digest() -> str:
-    """Return the digest of all sources of kernels that optloc ships."""
-    found = [_PACKAGE / name for name in SOURCES]
-    return _digest_of([file for path in found for file in ([path] if path.is_file() else path.rglob("*.py"))], _PACKAGE)
-
-
-@cache
-def folder_name() -> str:
-    """Return what machine code of these sources is kept under that the installed numba makes for this processor."""
-    made = sha256("\n".join([sources_digest(), version("numba"), version("llvmlite"), *processor()]).encode())
-    return _PREFIX + made.hexdigest()[:16]
-
-
-def processor() -> tuple[str, str, str]:
-    """Return triple, name and features of the processor that numba compiles for."""
-    from llvmlite import binding
-    from numba.core import codegen, config
-
-    llvm, made, settings = cast("tuple[Any, Any, Any]", (binding, codegen, config))  # without types
-    name, features = settings.CPU_NAME, settings.CPU_FEATURES
-    return (
-        llvm.get_process_triple(),
-        llvm.get_host_cpu_name() if name is None else name,
-        made.get_host_cpu_features() if features is None else features,
-    )
 
 
 @cache
@@ -80,10 +41,10 @@ def folder() -> Path | None:
 
     settings: Any = config  # without types
     users: Any = appdirs
-    for root in (settings.CACHE_DIR, _PACKAGE / "__pycache__", users.user_cache_dir("optloc", appauthor=False)):
+    for root in (settings.CACHE_DIR, PACKAGE / "__pycache__", users.user_cache_dir("optloc", appauthor=False)):
         if not root:
             continue
-        place = Path(root) / folder_name()
+        place = Path(root) / of_this_process().name
         try:
             place.mkdir(parents=True, exist_ok=True)
             TemporaryFile(dir=place).close()
@@ -97,7 +58,7 @@ def folder() -> Path | None:
 
 def _clear(place: Path) -> None:
     """Remove machine code of other sources but that used last; a process that still uses it makes its own anew."""
-    others = [path for path in place.parent.glob(f"{_PREFIX}*") if path != place and path.is_dir()]
+    others = [path for path in place.parent.glob(f"{PREFIX}*") if path != place and path.is_dir()]
     for path in sorted(others, key=_used, reverse=True)[_LEFT:]:
         shutil.rmtree(path, ignore_errors=True)
 
@@ -117,11 +78,11 @@ class _Place:
         self._py_file = str(file)
         self._path = str(place)
         line = str(function.__code__.co_firstlineno)
-        if _PACKAGE in file.parents:
+        if PACKAGE in file.parents:
             self._name, self._stamp = line, ""
         else:  # a node from outside, whose kernels may call those of files beside it
             self._name = f"{line}-{sha256(str(file).encode()).hexdigest()[:8]}"
-            self._stamp = _digest_of(list(file.parent.glob("*.py")), file.parent)
+            self._stamp = digest_of(list(file.parent.glob("*.py")), file.parent)
 
     def ensure_cache_path(self) -> None:
         Path(self._path).mkdir(parents=True, exist_ok=True)
@@ -152,16 +113,30 @@ def _cache_type() -> Any:
 
     class Kept(numba.FunctionCache):  # type: ignore[misc]
         def __init__(self, function: Callable[..., Any], place: Path) -> None:
-            self._impl_class = partial(Impl, _Place(function, place))
+            locator = _Place(function, place)
+            self._impl_class = partial(Impl, locator)
             super().__init__(function)
             self._name = f"{function.__module__}.{function.__qualname__}"
+            # what stands outside of optloc was not installed with it
+            self._installed = None if locator.get_source_stamp() else installed()
 
         def load_overload(self, sig: Any, target_context: Any) -> Any:
             try:
-                return super().load_overload(sig, target_context)
+                found = self._from_installed(sig, target_context)
+                return super().load_overload(sig, target_context) if found is None else found
             except Exception as error:  # noqa: BLE001  # whatever a damaged pickle raises
                 _LOG.warning("machine code of %s on disk cannot be read (%r); it is made anew", self._name, error)
                 return None
+
+        def _from_installed(self, sig: Any, target_context: Any) -> Any:
+            if self._installed is None:
+                return None
+            place, made = self._installed
+            target_context.refresh()
+            sig, _, code = self._index_key(sig, target_context.codegen())
+            file = numba.IndexDataCacheFile(str(place), self._impl.filename_base, "")
+            data = file.load((sig, (made.triple, made.processor, made.features), code))
+            return None if data is None else self._impl.rebuild(target_context, data)
 
         def save_overload(self, sig: Any, data: Any) -> None:
             try:
@@ -174,14 +149,24 @@ def _cache_type() -> Any:
 
 def kept(function: Callable[..., Any]) -> Any:
     """Return a cache for the machine code of a function, as a dispatcher of numba holds one; None without a folder."""
-    place = folder()
+    place = kept_in()
     return None if place is None else _cache_type()(function, place)
+
+
+def kept_in() -> Path | None:
+    """Return the folder that machine code is kept in, or was installed in where nothing can be written."""
+    return folder() or _installed_folder()
 
 
 def is_kept(name: str) -> bool:
     """Return whether there is machine code on disk of a function, by its whole name."""
-    place = folder()
-    return place is not None and any(place.glob(f"{name}-*.py{sys.version_info[0]}{sys.version_info[1]}*.nbi"))
+    wanted = f"{name}-*.py{sys.version_info[0]}{sys.version_info[1]}*.nbi"
+    return any(place is not None and any(place.glob(wanted)) for place in (_installed_folder(), folder()))
+
+
+def _installed_folder() -> Path | None:
+    found = installed()
+    return None if found is None else found[0]
 
 
 @cache
@@ -190,7 +175,7 @@ def begin_child() -> None:
 
     Its absence is no failure: what it would have made is made later, or never, and answers come in plain Python.
     """
-    path = os.pathsep.join([str(_PACKAGE.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
+    path = os.pathsep.join([str(PACKAGE.parent), *filter(None, [os.environ.get("PYTHONPATH")])])
     quiet = subprocess.DEVNULL
     try:
         subprocess.Popen(

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from optloc.compute import kept
+from optloc.compute import kept, manifest
 from optloc.compute.jit import _KERNELS, enabled
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="without numba there is no machine code")
@@ -54,7 +54,7 @@ def asked(folder: Path, **environment: str) -> tuple[int, int, Path]:
 def test_an_edited_callee_renews_its_callers_and_damage_is_made_good(tmp_path):
     (tmp_path / "caller.py").write_text(CALLER)
     cache = str(tmp_path / "cache")
-    place = Path(cache, kept.folder_name())
+    place = Path(cache, manifest.of_this_process().name)
     for step, damaged, compiled in ((1, False, 2), (1, False, 0), (1, True, 1), (2, False, 2)):
         (tmp_path / "callee.py").write_text(CALLEE.format(step=step))
         for file in place.glob("caller.answer-*.nbc") if damaged else ():
@@ -63,15 +63,15 @@ def test_an_edited_callee_renews_its_callers_and_damage_is_made_good(tmp_path):
 
 
 def test_every_source_counts(tmp_path, monkeypatch):
-    for name in kept.SOURCES:
-        source, copy = kept._PACKAGE / name, tmp_path / name
+    for name in manifest.SOURCES:
+        source, copy = manifest.PACKAGE / name, tmp_path / name
         for file in [source] if source.is_file() else source.rglob("*.py"):
             target = copy if source.is_file() else copy / file.relative_to(source)
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(file.read_bytes())
-    monkeypatch.setattr(kept, "_PACKAGE", tmp_path)
-    made = kept.sources_digest.__wrapped__
-    seen = {kept.sources_digest(), made()}
+    monkeypatch.setattr(manifest, "PACKAGE", tmp_path)
+    made = manifest.sources_digest.__wrapped__
+    seen = {manifest.sources_digest(), made()}
     assert len(seen) == 1  # the same sources at another place
     for file in sorted(tmp_path.rglob("*.py")):
         file.write_bytes(file.read_bytes() + b"#")
@@ -90,7 +90,7 @@ def test_what_kernels_name_stands_in_the_sources():
     """A constant from elsewhere would be part of machine code that does not change with it."""
     for module in ("compute.refine", "compute.range_fixes", "proof.best_first", "proof.batch"):
         importlib.import_module(f"optloc.{module}")
-    inside = tuple("optloc." + name.replace("/", ".").removesuffix(".py") for name in kept.SOURCES)
+    inside = tuple("optloc." + name.replace("/", ".").removesuffix(".py") for name in manifest.SOURCES)
     libraries = ("math", "numpy", "heapq", "typing")
     origins = {}
     for kernel in _KERNELS:

@@ -51,9 +51,9 @@ RESTLESS = "minima kept turning up"
 MISMATCHED = "the cost of the proof is not that of the fix"
 
 
-def unknown(reason: str) -> Certificate:
-    """Return the certificate of a fix of which nothing is proven, with the reason."""
-    return Certificate("unknown", reason, METHOD)
+def unknown(reason: str, boxes: int = 0) -> Certificate:
+    """Return the certificate of a fix of which nothing is proven, with the reason and the boxes that were looked at."""
+    return Certificate("unknown", reason, METHOD, boxes=boxes)
 
 
 def state_claim(
@@ -170,6 +170,8 @@ class Work:
         By how much budgets and rounds are multiplied.
     limited : bool
         Whether the claims are limited to a region that somebody asked for.
+    spent : int array (N,)
+        Boxes of all proofs that were tried.
     replaced, listed, mismatched : int
         How many fixes were replaced, how often another minimum was added to the alternatives, and how many proofs were
         about another cost than that of their fix.
@@ -188,6 +190,7 @@ class Work:
     pending: Array
     effort: int
     limited: bool
+    spent: Array
     replaced: int = 0
     listed: int = 0
     mismatched: int = 0
@@ -213,6 +216,7 @@ class Work:
             np.array(answered),
             effort,
             region is not None,
+            np.zeros(size, dtype=np.int64),
         )
 
     def summary(self) -> str:
@@ -273,6 +277,7 @@ def _round(work: Work, items: Array) -> None:
     if len(good) < len(items):
         items, asked, costs = items[good], asked.take(good), costs.take(good)
     answer = prove(costs, asked)
+    work.spent[items] += answer.boxes
     done = np.isin(answer.verdict, (UNIQUE, VALUE))
     _claim(work, items, asked, answer, np.flatnonzero(done))
     short = answer.verdict == BUDGET
@@ -337,7 +342,7 @@ def _lower(work: Work, items: Array, why: str, *, remote: bool = False) -> None:
 
 
 def _give_up(work: Work, items: Array, why: str) -> None:
-    work.certificate[items] = unknown(why)
+    work.certificate[items] = column([unknown(why, boxes) for boxes in work.spent[items].tolist()])
     work.pending[items] = False
 
 
