@@ -33,7 +33,7 @@ def test_fixes_reach_the_published_accuracy(data_dir, number, kinds):
     whole = mrclam.load(data_dir / "mrclam_aoa2d", number)
     assert len(whole.truth) == {1: 690, 2: 2306, 5: 2708}[number]
     # Ranges to landmarks in one camera view nearly mirror in their line: dear to settle, and often truly ambiguous.
-    # The others: 700 epochs or more tell the quantiles of the README to well within what is asked below.
+    # By bearings: some hundreds of epochs tell the quantiles of the README to well within what is asked below.
     thinned = {1: 2, 2: 8, 5: 32}[number] if kinds == RANGE else 1 if (number, kinds) == (1, AOA) else 3
     data = whole.every(thinned)
     fix, reference = solve(data.problem(kinds)), truths.mrclam(data, kinds)
