@@ -29,8 +29,9 @@ finally:
 """
 # Five of them since an `ok` keeps its promise: the chart, the shape of the likelihood, the findings, and of the proof
 # its curvature and what it is posed of; two since every file is read through one door and written through another;
-# three since machine code has a folder that is looked into, and what a proof covers is a file of its own.
-MOST = 70
+# four since machine code has a folder that is looked into and a manifest of what it is made for, and what a proof
+# covers is a file of its own.
+MOST = 71
 
 
 def test_a_simple_fix_enters_few_modules():
