@@ -27,6 +27,7 @@ from optloc.cli.output import Screen, dumps, meter
 from optloc.compute.filter import absorb
 from optloc.compute.jit import REPORTER, compiling, enabled, insist_on, names_in, plain
 from optloc.compute.kept import alone, is_kept, kept_in
+from optloc.compute.manifest import installed
 from optloc.linear.constraints import height
 from optloc.linear.simulate import simulate
 from optloc.problem.build import assemble, measured
@@ -272,7 +273,9 @@ def _print(found: dict[str, int], place: str | None) -> None:
     for name, missing in found.items():
         table.add_row(PARTS[name].summary, "no" if missing else "yes")
     screen.print(table)
-    screen.print(f"kept in {place}", highlight=False, soft_wrap=True)
+    shipped = installed()
+    before = "" if shipped is None else f"installed in {shipped[0]}; what is missing is "
+    screen.print(f"{before}kept in {place}", highlight=False, soft_wrap=True)
     if any(found.values()):
         screen.print(
             "`optloc compile` makes what is missing; until then few problems take plain Python", highlight=False
