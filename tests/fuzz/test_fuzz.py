@@ -10,8 +10,6 @@ import random
 import subprocess
 import sys
 import warnings
-from functools import cache
-from hashlib import blake2b
 from pathlib import Path
 
 import pytest
@@ -19,6 +17,7 @@ from fuzz import mutations, plain
 from fuzz.cases import case_of
 from fuzz.found import FOUND
 from fuzz.harness import outcome
+from monte_carlo.tables import code_digest
 from typer.testing import CliRunner
 
 import optloc
@@ -107,11 +106,9 @@ def parts(config, seed, part):
     return known, lambda found: config.cache.set(key, {"code": digest(), "found": found})
 
 
-@cache
 def digest():
     """Return what tells this state of the package and of the cases from others."""
-    files = sorted([*Path(optloc.__file__).parent.rglob("*.py"), *HERE.glob("*.py")])
-    return blake2b(b"".join(path.read_bytes() for path in files), digest_size=12).hexdigest()
+    return code_digest(*HERE.glob("*.py"))
 
 
 @pytest.mark.full

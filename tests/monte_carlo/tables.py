@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import cache
+from hashlib import blake2b
 from pathlib import Path
 
+import optloc
 from optloc import __version__
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "measured"
@@ -15,21 +19,42 @@ FOLDER = Path(__file__).resolve().parents[2] / "docs" / "measured"
 START = "<!-- table -->"
 
 
+@cache
+def code_digest(*more: Path) -> str:
+    """Return what tells this state of the package, and of more files, from others."""
+    files = sorted([*Path(optloc.__file__).parent.rglob("*.py"), *more])
+    return blake2b(b"".join(path.read_bytes() for path in files), digest_size=12).hexdigest()
+
+
 @dataclass
 class Ledger:
-    """Rows of one table by the name of their case."""
+    """Rows of one table by the name of their case, kept on disk as they are made where it has a file."""
 
     header: Sequence[str]
     rows: dict[str, Sequence[str]] = field(default_factory=dict)
+    file: Path | None = None
 
     def add(self, name: str, *cells: object) -> None:
         self.rows[name] = [str(cell) for cell in cells]
+        if self.file is not None:
+            # others may make other rows of the table meanwhile
+            rows = (json.loads(self.file.read_text()) if self.file.exists() else {}) | {name: self.rows[name]}
+            self.file.parent.mkdir(parents=True, exist_ok=True)
+            self.file.write_text(json.dumps(rows))
+            self.rows |= rows
 
 
 @contextmanager
-def ledger(file: str, header: Sequence[str], names: Sequence[str], facts: str) -> Iterator[Ledger]:
-    """Yield a ledger; write it to docs/measured/`file`.md if every name has a row in the end."""
-    book = Ledger(header)
+def ledger(
+    file: str, header: Sequence[str], names: Sequence[str], facts: str, *, kept: Path | None = None
+) -> Iterator[Ledger]:
+    """Yield a ledger; write it to docs/measured/`file`.md if every name has a row in the end.
+
+    With a folder where rows are kept, a run that was stopped goes on: the ledger has those of the same code.
+    """
+    place = None if kept is None else kept / f"{file}-{code_digest()}.json"
+    rows = json.loads(place.read_text()) if place is not None and place.exists() else {}
+    book = Ledger(header, rows, place)
     yield book
     if all(name in book.rows for name in names):
         write(file, header, [[name, *book.rows[name]] for name in names], facts)
