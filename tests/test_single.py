@@ -10,7 +10,7 @@ import pytest
 from optloc import Motion, Status, assemble, measured, prepare, simulate, solve
 from optloc.compute.jit import enabled
 from optloc.solvers.methods import Method
-from optloc.solvers.single import single
+from optloc.solvers.single import at_once, single
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="there is no short way without machine code")
 SIGMA, FULL = 5.0, pytest.mark.full
@@ -213,6 +213,27 @@ def test_problems_of_one_structure_are_told_apart_by_what_they_are_made_of():
         one, noise=replace(one.noise, blocks=tuple(replace(b, covariance=4.0 * b.covariance) for b in one.noise.blocks))
     )
     moved = replace(one, stations=replace(one.stations, position=one.stations.position + 10.0))
-    fix = prepare(one)(z)
-    assert np.allclose(prepare(loud)(z).cov, 4.0 * fix.cov, rtol=1e-6)
-    assert np.allclose(prepare(moved)(z).x, fix.x + 10.0, atol=1e-5)
+    for fixed in (lambda some: prepare(some)(z), solve):
+        fix = fixed(one)
+        assert np.allclose(fixed(loud).cov, 4.0 * fix.cov, rtol=1e-6)
+        assert np.allclose(fixed(moved).x, fix.x + 10.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("method", ["auto", "gtrs+lsr"])
+def test_solve_takes_the_short_way(method, monkeypatch):
+    """To the last bit as a prepared problem, whatever was solved before."""
+    problem, z = network(6), drawn(6, "inside", 20)
+    ready = prepare(problem, method)
+    monkeypatch.setattr("optloc.solvers.solve_in_stages", None)
+    for one in (z[0], z[1], z[0], z[:3], z[0]):
+        fix, same = solve(problem.with_rows(z=one), method), ready.short(one)
+        assert (fix.shape, fix.x.tobytes(), fix.cov.tobytes()) == (same.shape, same.x.tobytes(), same.cov.tobytes())
+
+
+def test_problems_that_differ_in_more_than_measurements_take_the_stages():
+    problem, z = network(6), drawn(6, "inside", 2)
+    weight = np.array([[1.0] * 6, [0.25] * 6])
+    moved = replace(problem.stations, position=problem.stations.position + np.array([[[[0.0]]], [[[10.0]]]]))
+    for batch in (problem.with_rows(z=z, weight=weight), replace(problem.with_rows(z=z[0]), stations=moved)):
+        assert at_once(batch, Method.parse("auto")) is None
+        assert [one.x.tobytes() for one in solve(batch)] != [solve(problem.with_rows(z=z[0])).x.tobytes()] * 2

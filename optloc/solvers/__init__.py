@@ -14,6 +14,7 @@ from optloc.problem.problem import Problem
 from optloc.solvers.methods import FORMULATIONS, METHODS, SOLVERS, Entry, Formulation, Method, shortcut
 from optloc.solvers.outside import given
 from optloc.solvers.pool import PART, begin, in_parts, where
+from optloc.solvers.single import at_once
 from optloc.solvers.starts.position import vectors
 from optloc.solvers.verdict.judge import failed, hide_open_epochs, verdict
 
@@ -44,7 +45,9 @@ def solve(problem: Problem, method: str = "auto", *, start: Any = None) -> Fix:
     InvalidProblem
         For an unknown method, or where nothing is unknown.
     """
-    return solve_in_stages(problem, Method.parse(method), start)
+    run = Method.parse(method)
+    fix = at_once(problem, run) if start is None else None
+    return solve_in_stages(problem, run, start) if fix is None else fix
 
 
 def solve_in_stages(problem: Problem, run: Method, start: Any = None) -> Fix:

@@ -87,7 +87,7 @@ def direct(problem: Problem) -> Direct | None:
     problem : Problem
         Batch of problems; their measurements are not looked at.
     """
-    if not (_simple(problem) and enabled()):
+    if not (is_direct(problem) and enabled()):
         return None
     return _KEPT.find(key_of(problem), lambda: _direct(problem))
 
@@ -118,7 +118,7 @@ def _direct(problem: Problem) -> Direct | None:
     return Direct(problem.layout, problem.frame, one.weight, dof, found.station[heard], maps)
 
 
-def _simple(problem: Problem) -> bool:
+def is_direct(problem: Problem) -> bool:
     """Return whether the structure, and what the batch shares, are such that linear maps exist and pay."""
     stations, motion = problem.stations, problem.motions[0]
     shared = [r.weight for r in problem.rows] + [r.correction for r in problem.rows]
@@ -209,17 +209,8 @@ _CHUNK = 4096
 TOLERANCE, LIMIT = 1e-7, 100
 
 
-# Problems from which on machine code is worth its loading, which takes more time than the stages take for fewer.
-_WORTH = 16
 # Problems up to which narrow blocks are quicker: one of four lanes takes 25 us, two 45, four as long as one of 64.
 _FEW = 8
-
-
-def worth(count: int) -> int:
-    """Return from how many problems on the direct way is taken: whatever was loaded before, for equal answers."""
-    from optloc.compute.range_fixes import fixes
-
-    return _WORTH if usable(fixes, count) else count + 1
 
 
 def kernel_for(count: int, *, often: bool = False) -> Callable[..., int]:
@@ -245,7 +236,7 @@ def at_hand(count: int) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class Quick:
-    """The stages "gtrs" and "lsr" as one, which takes the direct way where there is one, and where it is worth it.
+    """The stages "gtrs" and "lsr" as one, which takes the direct way where there is one, and its machine code.
 
     Parameters
     ----------
@@ -258,10 +249,11 @@ class Quick:
 
     def __call__(self, problem: Problem, pool: Pool | None) -> Pool:
         """Return the settled pools of a flat batch of problems."""
-        count, least = problem.batch_shape[0], worth(problem.batch_shape[0])
-        plan = direct(problem) if pool is None and (self.alone or count >= least) else None
+        count = problem.batch_shape[0]
+        quick = at_hand(count)
+        plan = direct(problem) if pool is None and (self.alone or quick) else None
         refinement: Callable[[Problem, Pool], Pool] = lsr_with_mirror if self.alone else lsr
-        if plan is None or count < least:
+        if plan is None or not quick:
             start = pool
             if plan is not None:
                 refinement = partial(lsr_with_mirror, descend=partial(_descend, plan))
