@@ -80,10 +80,16 @@ def _options(
         typer.Option(metavar="MODULE", help="Run a Python file or module first that adds kinds, losses, solvers."),
     ] = None,
 ) -> None:
+    import os
+    import sys
+
     import numpy as np
 
     from optloc.base.registry import load_plugin
 
+    # Who looks on sees answers at once. Elsewhere, and in studies, nothing is left running that nobody asked for.
+    if sys.stderr is not None and sys.stderr.isatty() and context.invoked_subcommand != "study":
+        os.environ.setdefault("OPTLOC_COMPILE", "child")
     # What has no value is judged, and its status says so; a warning of NumPy beside it would tell nobody anything.
     context.with_resource(np.errstate(all="ignore"))
     for name in plugin or ():

@@ -186,6 +186,7 @@ def begin_child() -> None:
             env=os.environ | {"PYTHONPATH": path},
             start_new_session=True,
         )
+        _LOG.warning("machine code is made in the background, once and in some minutes; plain Python answers meanwhile")
     except OSError as error:
         _LOG.warning("no process can be begun that would make machine code: %s", error)
 

@@ -91,3 +91,40 @@ def test_entries_are_kernels_that_there_are():
             module, _, _ = name.rpartition(".")
             import_module(module)
             assert name in names_in("optloc")
+
+
+ASKS = """
+import os, sys
+from optloc.cli.app import app
+try:
+    app(sys.argv[1:])
+except SystemExit:
+    pass
+print(os.environ.get("OPTLOC_COMPILE"))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no such terminals")
+@pytest.mark.parametrize(
+    ("command", "looked_at", "way"),
+    [("list kinds", True, "child"), ("list kinds", False, None), ("study list", True, None)],
+)
+def test_who_looks_on_does_not_wait(command, looked_at, way):
+    """At a terminal a process in the background makes machine code; a script, or a study, waits for it."""
+    import pty
+
+    everything = {name: value for name, value in os.environ.items() if name != "OPTLOC_COMPILE"}
+    kept, terminal = pty.openpty()
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", ASKS, *command.split()],
+            stdout=subprocess.PIPE,
+            stderr=terminal if looked_at else subprocess.DEVNULL,
+            env=everything,
+            text=True,
+            check=True,
+        )
+    finally:
+        os.close(kept)
+        os.close(terminal)
+    assert done.stdout.split()[-1] == str(way)
