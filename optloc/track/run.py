@@ -363,8 +363,9 @@ class Follower:
         self._dynamics, self._rule, self._rules = dynamics, filter_of(update), rules or Rules()
         self._course: _Course | None = None
         self._waiting: list[Problem] = []
-        # how many scans the start needs, and the time of the last one
-        self._needed, self._last = 1, -np.inf
+        self._needed = 1  # scans, for the next try of a start
+        self.last = -np.inf
+        """Time of the last scan, seconds."""
 
     @property
     def lost(self) -> str:
@@ -388,12 +389,12 @@ class Follower:
         if scan.batch_shape or scan.epochs != 1:
             raise InvalidProblem("this is not a single scan", "track", "give one epoch after the other")
         time = float(scan.times[0])
-        if not time > self._last:
-            what = f"the scan at {time:.10g} s follows one at {self._last:.10g} s"
+        if not time > self.last:
+            what = f"the scan at {time:.10g} s follows one at {self.last:.10g} s"
             raise InvalidProblem(what, "times", "give scans in the order of time, and one for each time")
         run = [*self._waiting, scan]
         if len(run) < self._needed:
-            self._waiting, self._last = run, time
+            self._waiting, self.last = run, time
             return []
         cleaned, broken = _clean(reduce(joined, run))
         stretch = _Run(with_height_rows(cleaned), broken, self._dynamics, self._rule, self._rules)
@@ -405,7 +406,7 @@ class Follower:
                 done.append(entry)  # noqa: PERF402  # those before a start that is left open stay
         except Undecided as undecided:
             self._needed = undecided.scans - len(done)
-        self._course, self._waiting, self._last = course, run[len(done) :], time
+        self._course, self._waiting, self.last = course, run[len(done) :], time
         return done
 
 
