@@ -137,6 +137,8 @@ class Metrics:
             "# TYPE optloc_latency_seconds gauge",
         ]
         for phase in PHASES:
+            if not self._answers[phase]:
+                continue
             for word, value in zip(("0.5", "0.99"), self.percentiles(phase), strict=True):
                 lines.append(f'optloc_latency_seconds{{phase="{phase}",quantile="{word}"}} {value:.6g}')
         lines += [
