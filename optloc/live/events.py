@@ -177,7 +177,7 @@ def _when(found: Mapping[str, Any], ways: list[str]) -> int | None:
         raise InvalidProblem(f"the line has {' and '.join(given)}", given[0], "give one of them")
     value = found[given[0]]
     if type(value) is float:  # of a track a quarter of a microsecond is enough, of an arrival it is not
-        return round(_number(value, given[0]) * 10 ** _DIGITS[given[0]])
+        return round(_number(value, given[0]) * 10.0 ** _DIGITS[given[0]])
     return picoseconds(value, given[0])
 
 
