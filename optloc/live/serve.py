@@ -106,6 +106,46 @@ def application(stream: Stream, *, local: bool = True) -> Any:
     from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
     from starlette.routing import Route, WebSocketRoute
 
+    async def health(_: Any) -> Any:
+        return JSONResponse(stream.health())
+
+    async def metrics(_: Any) -> Any:
+        text = stream.metrics.text(stream.clock())
+        return Response(text, headers={"Content-Type": "text/plain; version=0.0.4; charset=utf-8"})
+
+    async def fixes(_: Any) -> Any:
+        return JSONResponse(stream.latest.features(), media_type="application/geo+json")
+
+    async def aircraft(_: Any) -> Any:
+        return JSONResponse(stream.latest.aircraft())
+
+    async def page(_: Any) -> Any:
+        try:
+            return HTMLResponse(await asyncio.to_thread(page_of, stream.site))
+        except InvalidProblem as error:
+            return PlainTextResponse(f"{error}\n", 404)
+
+    async def listen(socket: Any) -> None:
+        await _listen(stream, socket)
+
+    routes = [
+        Route("/", page),
+        *_questions(stream),
+        Route("/health", health),
+        Route("/metrics", metrics),
+        Route("/fixes.geojson", fixes),
+        Route("/data/aircraft.json", aircraft),
+        WebSocketRoute("/ws", listen),
+    ]
+    names = list(_NAMES) if local else ["*"]
+    return Starlette(routes=routes, middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=names)])
+
+
+def _questions(stream: Stream) -> list[Any]:
+    """Return the routes that take lines and tell tracks."""
+    from starlette.responses import JSONResponse, Response
+    from starlette.routing import Route
+
     def refused(code: int, why: str, **headers: str) -> Any:
         return JSONResponse({"error": why}, code, headers)
 
@@ -142,41 +182,11 @@ def application(stream: Stream, *, local: bool = True) -> Any:
         found = next((each for each in stream.tracks.records() if each["target"] == name), None)
         return refused(404, f"there is no track of {name[:40]!r}") if found is None else JSONResponse(found)
 
-    async def health(_: Any) -> Any:
-        return JSONResponse(stream.health())
-
-    async def metrics(_: Any) -> Any:
-        text = stream.metrics.text(stream.clock())
-        return Response(text, headers={"Content-Type": "text/plain; version=0.0.4; charset=utf-8"})
-
-    async def fixes(_: Any) -> Any:
-        return JSONResponse(stream.latest.features(), media_type="application/geo+json")
-
-    async def aircraft(_: Any) -> Any:
-        return JSONResponse(stream.latest.aircraft())
-
-    async def page(_: Any) -> Any:
-        try:
-            return HTMLResponse(await asyncio.to_thread(page_of, stream.site))
-        except InvalidProblem as error:
-            return PlainTextResponse(f"{error}\n", 404)
-
-    async def listen(socket: Any) -> None:
-        await _listen(stream, socket)
-
-    routes = [
-        Route("/", page),
+    return [
         Route("/fix", fix, methods=["POST"]),
         Route("/track", track, methods=["GET", "POST"]),
         Route("/track/{name:path}", one),
-        Route("/health", health),
-        Route("/metrics", metrics),
-        Route("/fixes.geojson", fixes),
-        Route("/data/aircraft.json", aircraft),
-        WebSocketRoute("/ws", listen),
     ]
-    names = list(_NAMES) if local else ["*"]
-    return Starlette(routes=routes, middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=names)])
 
 
 def page_of(site: Site) -> str:
