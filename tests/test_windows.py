@@ -13,6 +13,7 @@ from optloc.compute.sums import equations_at
 from optloc.linear.normal import linearise, normal, with_priors
 from optloc.problem import epochs as stretches
 from optloc.problem.epochs import cut, joined, windows
+from optloc.problem.noise import variances
 
 
 def shuffled(problem):
@@ -73,6 +74,21 @@ def test_cut_and_joined_runs_are_the_run(name, at):
     scale = np.abs(one.shared).max()
     np.testing.assert_allclose(two.shared, one.shared, rtol=1e-9, atol=1e-12 * scale)
     np.testing.assert_allclose(two.cost, one.cost, rtol=1e-12)
+
+
+def test_runs_join_whose_kinds_differ():
+    places = [[0.0, 0.0], [900.0, 0.0], [0.0, 900.0]]
+
+    def at(time, *given):
+        rows = [optloc.measured(kind, z, a=range(len(z)), sigma=s) for kind, z, s in given]
+        return replace(optloc.assemble(places, *rows), times=np.array([time]))
+
+    made = joined(at(0.0, ("range", [1.0, 2.0], 3.0)), at(1.0, ("azimuth", [0.1], 0.2), ("range", [4.0], 5.0)))
+    assert [(rows.kind, rows.z.tolist(), rows.epoch.tolist()) for rows in made.rows] == [
+        ("range", [1.0, 2.0, 4.0], [0, 0, 1]),
+        ("azimuth", [0.1], [1]),
+    ]
+    np.testing.assert_allclose(np.sqrt(variances(made.noise, made.count)), [3.0, 3.0, 5.0, 0.2])
 
 
 def test_a_cut_keeps_the_time_of_states_and_drifts():

@@ -85,6 +85,12 @@ Adapt = Annotated[
     str | None, typer.Option("--adapter", metavar="chirpstack|mode-s", help="Lines are in the format of others.")
 ]
 
+Model = Annotated[str, typer.Option("--model", metavar="NAME", help="Of tracks: as of [bold]optloc track[/bold].")]
+Filter = Annotated[str, typer.Option("--filter", metavar="NAME", help="Of tracks, likewise.")]
+Noise = Annotated[float | None, typer.Option("--noise", metavar="SD", help="Of tracks, likewise.")]
+Gap = Annotated[float | None, typer.Option("--gap", metavar="SECONDS", help="Of tracks, likewise.")]
+Track = Annotated[bool, typer.Option("--track", help="Answer the states of targets' tracks in the place of fixes.")]
+
 EXAMPLES = example(
     "feed | optloc live site.toml > fixes.ndjson",
     "optloc live site.toml --check",
@@ -112,6 +118,11 @@ def live(
     mqtt: Mqtt = None,
     zmq: Zmq = None,
     adapter: Adapt = None,
+    track: Track = False,
+    model: Model = "cv",
+    filter_: Filter = "iekf",
+    noise: Noise = None,
+    gap: Gap = None,
     check: Annotated[bool, typer.Option("--check", help="Say what the stream would take, and end.")] = False,
     outside: Outside = False,
     budget: Budget = None,
@@ -126,6 +137,7 @@ def live(
     if check:
         raise typer.Exit(run_check(file, method))
     settings = _settings(wait, late, phases, deadline, part, form) | {"state": state, "record": record}
+    settings |= _tracking(model, filter_, noise, gap, track=track)
     settings["every"] = seconds_of(every, "--every")
     speed = inf if speed is None else speed
     asked = Asked(settings, method, replay, speed, shed, quiet, http, mqtt, zmq, adapter, stdin=not (mqtt or zmq))
@@ -155,17 +167,23 @@ def serve(
     mqtt: Mqtt = None,
     zmq: Zmq = None,
     adapter: Adapt = None,
+    track: Track = False,
+    model: Model = "cv",
+    filter_: Filter = "iekf",
+    noise: Noise = None,
+    gap: Gap = None,
     outside: Outside = False,
     budget: Budget = None,
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Fix events that come by HTTP: /fix, /ws, /health, /metrics, a map at /, the latest fixes as GeoJSON and aircraft.
+    """Fix events that come by HTTP: /fix, /track, /ws, /health, /metrics, a map at /, fixes as GeoJSON and aircraft.
 
     Nothing is read from standard input, and nothing written to standard output.
     """
     settings = _settings(wait, late, "two", deadline, part, "ndjson") | {"state": state, "record": record}
+    settings |= _tracking(model, filter_, noise, gap, track=track)
     settings["every"] = seconds_of(every, "--every")
     asked = Asked(settings, method, None, inf, True, quiet, http, mqtt, zmq, adapter, stdin=False, stdout=False)
     raise typer.Exit(run_live(file, asked))
@@ -184,6 +202,19 @@ def _settings(wait: str, late: str, phases: str, deadline: str | None, part: str
         "part": part_of(part),
         "format": one_of(form, tuple(FORMATS), "--format"),
     }
+
+
+def _tracking(model: str, name: str, noise: float | None, gap: float | None, *, track: bool) -> dict[str, Any]:
+    """Return how tracks are made, as arguments of `optloc.live.stream.Settings`."""
+    if (model, name, noise, gap) == ("cv", "iekf", None, None):
+        return {"track": track}
+    from optloc.cli.track import Wanted, dynamics_of, rules
+    from optloc.live.tracks import Following
+    from optloc.track.run import Rules
+    from optloc.track.updates import filter_of
+
+    dynamics = dynamics_of(Wanted(model, noise=noise))
+    return {"track": track, "following": Following(dynamics, filter_of(name), rules(Rules().gate, gap))}
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,6 +278,8 @@ def run_live(file: Path, asked: Asked) -> int:
     with _threads(), ExitStack() as stops:
         stream = Stream(site, settings, write, say, again=file, replayed=recording is not None)
         stops.callback(stream.close)  # where a source cannot be opened
+        if settings.track and stream.untracked:
+            raise InvalidProblem(stream.untracked, "--track", "leave it out")
         interrupted = stops.enter_context(_obeying(stream))  # before anything is read
         places = _open(asked, stream, adapter, stops)
         say(f"ready: {site.title!r}, {len(site.rows)} rows of {len(site.stations)} stations{places}")

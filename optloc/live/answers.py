@@ -12,6 +12,8 @@ import numpy as np
 from optloc.base.types import Array, Status
 from optloc.live.events import Event
 from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
+from optloc.track.run import Entry
 
 Record = dict[str, Any]
 
@@ -19,6 +21,10 @@ Record = dict[str, Any]
 _JSON = json.JSONEncoder(allow_nan=False, separators=(",", ":"))
 _LABELS = {int(status): status.label for status in Status}
 _FEET = 0.3048
+
+UNNAMED = "target"
+"""What the target of events that name none is called in tracks, as in files."""
+
 # Seconds after which a target is no longer on the list: what maps of aircraft take.
 _GONE = 60.0
 
@@ -68,9 +74,9 @@ def fix_records(fix: Fix, events: Sequence[Event], phase: str | None) -> list[Re
     return made
 
 
-def unsolved(event: Event, **why: str) -> Record:
-    """Return what is answered of an event that makes no problem; `why` is its status, or an error."""
-    record = {"event": event.name, "phase": "fix", **why, "position": None}
+def unsolved(event: Event, phase: str = "fix", **why: Any) -> Record:
+    """Return what is answered of an event that has no place; `why` is its status, or an error."""
+    record = {"event": event.name, "phase": phase, **why, "position": None}
     _mark(record, event)
     return record
 
@@ -148,6 +154,42 @@ def _same(new: Record, old: Record) -> bool:
     size = 1.0 + max(map(abs, old["position"]))
     apart = max(abs(a - b) for a, b in zip(new["position"], old["position"], strict=True))
     return bool(apart <= _ROUNDING * size and (new["cov"] is None) == (old["cov"] is None))
+
+
+def track_record(event: Event, time: float, entry: Entry, problem: Problem) -> Record:
+    """Return what is answered of an event of a track.
+
+    Parameters
+    ----------
+    event : Event
+        Whose.
+    time : float
+        Seconds, as the event says.
+    entry : Entry
+        What became of it.
+    problem : Problem
+        Gives dimension and frame.
+
+    Returns
+    -------
+    dict
+        Metres and seconds in the frame of the site; `cov` is that of position, velocity and acceleration.
+    """
+    d, mean = problem.dimension, entry.updated.mean
+    known = bool(np.isfinite(mean).all())
+    record: Record = {"event": event.name, "phase": "track", "target": UNNAMED, "time": time, "status": entry.label}
+    for i, name in enumerate(("position", "velocity", "acceleration")[: len(mean) // d]):
+        record[name] = mean[i * d : (i + 1) * d].tolist() if known else None
+    record["cov"] = entry.updated.cov.tolist() if known else None
+    if problem.frame.geodetic and known:
+        lat, lon, height = problem.frame.to_geodetic(mean[:d])
+        record |= {"lat_deg": float(np.degrees(lat)), "lon_deg": float(np.degrees(lon)), "height": float(height)}
+    nis = float(entry.updated.nis)
+    record |= {"nis": nis if np.isfinite(nis) else None, "rows": int(entry.updated.count), "rejected": entry.rejected}
+    if entry.reason:
+        record["reason"] = entry.reason
+    _mark(record, event)
+    return record
 
 
 def unproven(event: Event, why: str, before: Record | None) -> Record:

@@ -18,6 +18,7 @@ from optloc.live.answers import Record, fix_records, proof_records, unproven, un
 from optloc.live.events import Event
 from optloc.live.metrics import Metrics
 from optloc.live.site import Ready, Row, Site
+from optloc.live.tracks import Following, Scan, Tracks
 
 LOG = logging.getLogger("optloc.live")
 
@@ -89,6 +90,8 @@ class Engine:
         Seconds after its event closed at which a proof is given up; infinity for none.
     shed : bool
         Whether events are answered without a proof where too many wait; the stream waits for them otherwise.
+    following : Following, optional
+        How tracks are made of the events that are to be answered by them.
     """
 
     def __init__(
@@ -101,6 +104,7 @@ class Engine:
         phases: str = "two",
         deadline: float = inf,
         shed: bool = True,
+        following: Following | None = None,
     ) -> None:
         self.site, self._metrics, self._emit, self._clock = site, metrics, emit, clock
         self._phases, self._deadline, self._shed = phases, deadline, shed
@@ -109,6 +113,9 @@ class Engine:
         self._open: deque[Pending] = deque()
         self._changed, self._ends = Condition(), False
         self._thread = Thread(target=self._prove, name="optloc proofs", daemon=True)
+        ready = site.ready((), site.rows)
+        assert ready is not None  # a site has rows
+        self.tracks = Tracks(ready.fast.problem, following or Following(), metrics, self._followed, clock)
         metrics.gauges["proofs"] = lambda: len(self._waiting)
         if phases != "fix":
             self._thread.start()
@@ -120,8 +127,16 @@ class Engine:
             return self._open[0].until if self._open else inf
 
     def settle(self, events: Iterable[Event]) -> None:
-        """Answer events that have closed, and let their proofs be made."""
-        for group in self._groups(events):
+        """Answer events that have closed, and let their proofs be made; or hand them to their tracks."""
+        closed = list(events)
+        followed = [event for event in closed if event.track]
+        if followed:
+            scans = [Scan(e, group.ready.fast.problem, z) for group in self._groups(followed) for e, z in _pairs(group)]
+            # groups are by rows, tracks go by time
+            place = {id(event): i for i, event in enumerate(followed)}
+            self.tracks.take(sorted(scans, key=lambda scan: place[id(scan.event)]))
+            closed = [event for event in closed if not event.track]
+        for group in self._groups(closed):
             if self._phases == "one":
                 self._offer([Pending(e, group.ready, z, None, e.stamp + self._deadline) for e, z in _pairs(group)])
                 continue
@@ -151,7 +166,8 @@ class Engine:
         self._give_up(late, "deadline")
 
     def stop(self) -> None:
-        """Finish the proofs that wait, within their deadlines, and end."""
+        """Finish the tracks that wait, and the proofs within their deadlines, and end."""
+        self.tracks.stop()
         with self._changed:
             self._ends = True
             self._changed.notify_all()
@@ -218,12 +234,15 @@ class Engine:
 
     def _fail(self, event: Event, why: str) -> None:
         self._metrics.add("unsolvable")
-        self._answer(event, unsolved(event, error=why), last=True)
+        self._answer(event, unsolved(event, phase="track" if event.track else "fix", error=why), last=True)
 
     def _answer(self, event: Event, record: Record, last: bool) -> None:
         if last:
             self._metrics.concluded(record.get("status", "error"), record.get("proof"))
         self._emit(event, record, last)
+
+    def _followed(self, event: Event, record: Record) -> None:
+        self._emit(event, record, True)
 
     # Proofs, in a thread of their own.
 

@@ -66,6 +66,8 @@ class Message(NamedTuple):
         Name of the target, handed on.
     command : str
         What is to be done instead.
+    when : int, optional
+        Time of the event, picoseconds; its first arrival counts where it says none.
     """
 
     event: str
@@ -75,6 +77,7 @@ class Message(NamedTuple):
     sigmas: dict[Key, float] | None = None
     target: str = ""
     command: str = ""
+    when: int | None = None
 
 
 def parse(line: bytes, site: Site) -> Message:
@@ -149,7 +152,7 @@ def _general(found: dict[str, Any], site: Site) -> Message:
     more = found.get("more", ways[0] in ("station", "kind"))
     if type(more) is not bool:
         raise InvalidProblem("it is neither true nor false", "more", "say true where more rows are to come")
-    return Message(event, rows, times, not more, sigmas or None, target)
+    return Message(event, rows, times, not more, sigmas or None, target, when=_when(found, ways))
 
 
 def _event(found: Mapping[str, Any]) -> str:
@@ -163,6 +166,19 @@ def _text(given: Any, key: str) -> str:
     if type(given) is not str or not given or len(given) > _NAME or has_controls(given):
         raise InvalidProblem(f"{str(given)[:40]!r} is no name", key, f"give 1 to {_NAME} printable characters")
     return given
+
+
+def _when(found: Mapping[str, Any], ways: list[str]) -> int | None:
+    """Return the time of an event in picoseconds, None where the line says none or it is that of its arrival."""
+    given = [key for key in _DIGITS if key in found]
+    if ways == ["station"] or not given:
+        return None
+    if len(given) > 1:
+        raise InvalidProblem(f"the line has {' and '.join(given)}", given[0], "give one of them")
+    value = found[given[0]]
+    if type(value) is float:  # of a track a quarter of a microsecond is enough, of an arrival it is not
+        return round(_number(value, given[0]) * 10.0 ** _DIGITS[given[0]])
+    return picoseconds(value, given[0])
 
 
 def _list(given: Any, key: str) -> list[Any]:
@@ -300,6 +316,10 @@ class Event:
         1, and one more for each answer that late rows have changed.
     conflict : bool
         Whether a row came with two values.
+    when : int, optional
+        As of `Message`.
+    track : bool
+        Whether it is answered by the state of its track, in the place of a fix.
     reply : Reply, optional
         Who waits for its answers.
     """
@@ -315,6 +335,8 @@ class Event:
     revision: int = 1
     conflict: bool = False
     reply: Reply | None = None
+    when: int | None = None
+    track: bool = False
 
 
 @dataclass(slots=True)
@@ -353,7 +375,9 @@ class Events:
     # names of the closed ones in their order: a dictionary whose oldest entries have gone is slow to find its first
     _order: deque[str] = field(default_factory=deque)
 
-    def take(self, message: Message, now: float, when: float, reply: Reply | None = None) -> None:
+    def take(
+        self, message: Message, now: float, when: float, reply: Reply | None = None, *, track: bool = False
+    ) -> None:
         """Put what a line says to its event, which may close.
 
         Parameters
@@ -364,6 +388,8 @@ class Events:
             When it was read, by the clock, and by the time that events wait.
         reply : Reply, optional
             Gets the answers if nobody else waits for them.
+        track : bool
+            Whether the event, if it is a new one, is answered by its track.
         """
         counts = self.metrics.counts
         size = len(message.rows) + len(message.times)
@@ -377,6 +403,7 @@ class Events:
                 self._after(message, now)
                 return
             event = Event(message.event, message.rows, message.times, when, now, message.sigmas or {}, message.target)
+            event.when, event.track = message.when, track
             self._wait_for(event, reply)
             if message.whole:
                 self._close(event, "whole", now)
@@ -438,6 +465,7 @@ class Events:
         if message.sigmas:
             event.sigmas = {**message.sigmas, **event.sigmas}
         event.target = event.target or message.target
+        event.when = message.when if event.when is None else event.when
 
     def _is_whole(self, event: Event) -> bool:
         """Return whether all rows and stations of the site are there."""
@@ -488,7 +516,7 @@ class Events:
             again = Event(
                 event.name, {**message.rows, **event.rows}, {**message.times, **event.times}, now, now,
                 {**(message.sigmas or {}), **event.sigmas}, event.target or message.target,
-                "late", event.revision + 1, event.conflict or bool(other),
+                "late", event.revision + 1, event.conflict or bool(other), None, event.when, event.track,
             )  # fmt: skip
             counts["revisions"] += 1
             self.closed[event.name] = again

@@ -14,6 +14,9 @@ from optloc.base.types import Array
 # Latencies that are kept, of each phase: percentiles of the last seconds under load, of the last minute at 64 a second.
 _LATENCIES = 4096
 
+PHASES = ("fix", "proof", "track")
+"""Answers whose latency is told."""
+
 COUNTS = {
     "lines": "lines read",
     "rows": "rows and arrivals read",
@@ -29,6 +32,9 @@ COUNTS = {
     "dropped": "messages of a broker that were dropped because the input was full",
     "refused": "requests that were refused because the input was full",
     "unsolvable": "events whose rows make no problem",
+    "tracked": "events that were taken into a track",
+    "unordered": "events that came after a later one of their track, and were refused",
+    "forgotten": "tracks that were forgotten: silent for too long, too many, or failed",
 }
 """What is counted, and what it means."""
 
@@ -41,7 +47,8 @@ class Metrics:
         self.counts: Counter[str] = Counter(dict.fromkeys(COUNTS, 0))
         self.statuses: Counter[str] = Counter()
         self.proofs: Counter[str] = Counter()
-        self._latency = {phase: np.zeros(_LATENCIES) for phase in ("fix", "proof")}
+        self.tracks: Counter[str] = Counter()
+        self._latency = {phase: np.zeros(_LATENCIES) for phase in PHASES}
         self._answers: Counter[str] = Counter()
         self.heard: dict[str, float] = {}
         self.gauges: dict[str, Callable[[], int]] = {}
@@ -52,7 +59,7 @@ class Metrics:
             self.counts[name] += count
 
     def took(self, phase: str, seconds: Sequence[float]) -> None:
-        """Keep how long answers of a phase, "fix" or "proof", took from the last row of their events, seconds."""
+        """Keep how long answers of a phase, one of `PHASES`, took from the last row of their events, seconds."""
         taken = np.asarray(seconds, dtype=float)
         with self._lock:
             place = (self._answers[phase] + np.arange(len(taken))) % _LATENCIES
@@ -65,6 +72,11 @@ class Metrics:
             self.statuses[status] += 1
             if proof is not None:
                 self.proofs[proof] += 1
+
+    def followed(self, status: str) -> None:
+        """Count an event of a track by its status."""
+        with self._lock:
+            self.tracks[status] += 1
 
     def hear(self, stations: Iterable[str], now: float) -> None:
         """Note when stations were heard last, by the clock of the stream."""
@@ -94,9 +106,10 @@ class Metrics:
                 **self.counts,
                 "statuses": dict(self.statuses),
                 "proofs": dict(self.proofs),
+                "tracks": dict(self.tracks),
             }
         out["queues"] = {name: depth() for name, depth in self.gauges.items()}
-        for phase in ("fix", "proof"):
+        for phase in PHASES:
             p50, p99 = self.percentiles(phase)
             out[f"{phase}_latency_ms"] = None if np.isnan(p50) else {"p50": _ms(p50), "p99": _ms(p99)}
         out["seconds_since_row"] = {name: round(now - when, 3) for name, when in sorted(self.heard.items())}
@@ -112,8 +125,9 @@ class Metrics:
         for name, key, meaning in (
             ("fixes_total", "statuses", "fixes by status"),
             ("proofs_total", "proofs", "proofs by outcome"),
+            ("tracks_total", "tracks", "events of tracks by status"),
         ):
-            label = "status" if key == "statuses" else "proof"
+            label = "proof" if key == "proofs" else "status"
             lines += [f"# HELP optloc_{name} {meaning}", f"# TYPE optloc_{name} counter"]
             lines += [f'optloc_{name}{{{label}="{_label(word)}"}} {n}' for word, n in sorted(found[key].items())]
         lines += ["# HELP optloc_queue_depth what waits", "# TYPE optloc_queue_depth gauge"]
@@ -122,7 +136,9 @@ class Metrics:
             "# HELP optloc_latency_seconds from the last row to the answer",
             "# TYPE optloc_latency_seconds gauge",
         ]
-        for phase in ("fix", "proof"):
+        for phase in PHASES:
+            if not self._answers[phase]:
+                continue
             for word, value in zip(("0.5", "0.99"), self.percentiles(phase), strict=True):
                 lines.append(f'optloc_latency_seconds{{phase="{phase}",quantile="{word}"}} {value:.6g}')
         lines += [

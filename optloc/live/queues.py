@@ -75,6 +75,8 @@ class Line(NamedTuple):
         The same by the time that events wait, see `optloc.live.stream.read_lines`.
     ticket : Ticket, optional
         Who waits for what it brings.
+    track : bool, optional
+        Whether its event is answered by its track; None: as the stream does it.
     """
 
     data: bytes
@@ -83,6 +85,7 @@ class Line(NamedTuple):
     stamp: float
     when: float
     ticket: Ticket | None = None
+    track: bool | None = None
 
 
 class Inbox:

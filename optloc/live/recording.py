@@ -74,7 +74,8 @@ def _epochs(made: Draft) -> Iterator[Recorded]:
     for i in np.argsort(loaded.times, kind="stable").tolist():
         name = f"{loaded.epochs[i]} {loaded.targets[i]}" if loaded.own_epochs else loaded.epochs[i]
         line = {"event": name, "rows": rows[i]} | ({"target": loaded.targets[i]} if loaded.own_epochs else {})
-        yield Recorded(float(loaded.times[i]), json.dumps(line).encode())
+        when = float(loaded.times[i])
+        yield Recorded(when, json.dumps(line | ({"time": when} if np.isfinite(when) else {})).encode())
 
 
 def _turned(kind: str) -> bool:

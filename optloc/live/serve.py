@@ -106,24 +106,6 @@ def application(stream: Stream, *, local: bool = True) -> Any:
     from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
     from starlette.routing import Route, WebSocketRoute
 
-    async def fix(request: Any) -> Any:
-        if not _is_own(request):
-            return PlainTextResponse("a page of another site asks\n", 403)
-        body = await _body(request)
-        if body is None:
-            return PlainTextResponse(f"the request has more than {_BODY} bytes\n", 413)
-        single = request.headers.get("content-type", "").partition(";")[0].strip() == "application/json"
-        lines = [body.replace(b"\n", b" ")] if single else [each for each in body.split(b"\n") if each.strip()]
-        if not 0 < len(lines) <= WAITING:
-            return PlainTextResponse(f"send 1 to {WAITING} lines\n", 400)
-        records = await _answered(stream, lines)
-        if isinstance(records, int):
-            said = {429: "too much waits", 503: "the stream ends", 504: "no answer yet: it will be in the stream"}
-            return PlainTextResponse(said[records] + "\n", records, {"Retry-After": "1"})
-        if single:
-            return Response(to_line(records[0]), 400 if "error" in records[0] else 200, media_type="application/json")
-        return Response(b"".join(map(to_line, records)), media_type="application/x-ndjson")
-
     async def health(_: Any) -> Any:
         return JSONResponse(stream.health())
 
@@ -148,7 +130,7 @@ def application(stream: Stream, *, local: bool = True) -> Any:
 
     routes = [
         Route("/", page),
-        Route("/fix", fix, methods=["POST"]),
+        *_questions(stream),
         Route("/health", health),
         Route("/metrics", metrics),
         Route("/fixes.geojson", fixes),
@@ -157,6 +139,54 @@ def application(stream: Stream, *, local: bool = True) -> Any:
     ]
     names = list(_NAMES) if local else ["*"]
     return Starlette(routes=routes, middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=names)])
+
+
+def _questions(stream: Stream) -> list[Any]:
+    """Return the routes that take lines and tell tracks."""
+    from starlette.responses import JSONResponse, Response
+    from starlette.routing import Route
+
+    def refused(code: int, why: str, **headers: str) -> Any:
+        return JSONResponse({"error": why}, code, headers)
+
+    async def answer(request: Any, *, track: bool) -> Any:
+        if not _is_own(request):
+            return refused(403, "a page of another site asks")
+        body = await _body(request)
+        if body is None:
+            return refused(413, f"the request has more than {_BODY} bytes")
+        single = request.headers.get("content-type", "").partition(";")[0].strip() == "application/json"
+        lines = [body.replace(b"\n", b" ")] if single else [each for each in body.split(b"\n") if each.strip()]
+        if not 0 < len(lines) <= WAITING:
+            return refused(400, f"send 1 to {WAITING} lines")
+        records = await _answered(stream, lines, track=track)
+        if isinstance(records, int):
+            said = {429: "too much waits", 503: "the stream ends", 504: "no answer yet: it will be in the stream"}
+            return refused(records, said[records], **{"Retry-After": "1"})
+        if single:
+            return Response(to_line(records[0]), 400 if "error" in records[0] else 200, media_type="application/json")
+        return Response(b"".join(map(to_line, records)), media_type="application/x-ndjson")
+
+    async def fix(request: Any) -> Any:
+        return await answer(request, track=False)
+
+    async def track(request: Any) -> Any:
+        if stream.untracked:
+            return refused(400, stream.untracked)
+        if request.method == "POST":
+            return await answer(request, track=True)
+        return JSONResponse({"tracks": stream.tracks.records()})
+
+    async def one(request: Any) -> Any:
+        name = request.path_params["name"]
+        found = next((each for each in stream.tracks.records() if each["target"] == name), None)
+        return refused(404, f"there is no track of {name[:40]!r}") if found is None else JSONResponse(found)
+
+    return [
+        Route("/fix", fix, methods=["POST"]),
+        Route("/track", track, methods=["GET", "POST"]),
+        Route("/track/{name:path}", one),
+    ]
 
 
 def page_of(site: Site) -> str:
@@ -185,7 +215,7 @@ async def _body(request: Any) -> bytes | None:
     return b"".join(parts)
 
 
-async def _answered(stream: Stream, lines: list[bytes]) -> list[Record] | int:
+async def _answered(stream: Stream, lines: list[bytes], *, track: bool) -> list[Record] | int:
     """Return the answers to lines, or the code of why there are none."""
     loop = asyncio.get_running_loop()
     future: asyncio.Future[list[Record]] = loop.create_future()
@@ -199,7 +229,7 @@ async def _answered(stream: Stream, lines: list[bytes]) -> list[Record] | int:
             loop.call_soon_threadsafe(finish, records)
 
     ticket = Ticket(len(lines), done)
-    if not stream.inbox.offer(stream.lines(lines, "request", 1, ticket)):
+    if not stream.inbox.offer(stream.lines(lines, "request", 1, ticket, track=track)):
         if stream.inbox.closed:
             return 503
         stream.metrics.add("refused")

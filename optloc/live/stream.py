@@ -24,6 +24,7 @@ from optloc.live.events import LINE, Events, parse
 from optloc.live.metrics import Metrics
 from optloc.live.queues import Inbox, Line, Outbox, Ticket
 from optloc.live.site import Site, read_site
+from optloc.live.tracks import Following, Tracks
 
 LOG = logging.getLogger("optloc.live")
 
@@ -66,6 +67,10 @@ class Settings:
         Seconds between checkpoints.
     health : float
         Seconds between lines of health.
+    track : bool
+        Whether events are answered by the states of their tracks, in the place of fixes.
+    following : Following, optional
+        How tracks are made.
     """
 
     wait: float = 0.05
@@ -79,6 +84,8 @@ class Settings:
     record: Path | None = None
     every: float = 5.0
     health: float = 10.0
+    track: bool = False
+    following: Following | None = None
 
 
 class Stream:
@@ -144,14 +151,43 @@ class Stream:
 
     def _new_engine(self, site: Site) -> Engine:
         s = self._settings
-        return Engine(site, self.metrics, self._answer, self.clock, phases=s.phases, deadline=s.deadline, shed=s.shed)
+        return Engine(
+            site,
+            self.metrics,
+            self._answer,
+            self.clock,
+            phases=s.phases,
+            deadline=s.deadline,
+            shed=s.shed,
+            following=s.following,
+        )
 
     # What others ask for.
 
-    def lines(self, data: Sequence[bytes], source: str, first: int = 1, ticket: Ticket | None = None) -> list[Line]:
-        """Return what was read just now as lines, numbered from `first`."""
+    def lines(
+        self,
+        data: Sequence[bytes],
+        source: str,
+        first: int = 1,
+        ticket: Ticket | None = None,
+        *,
+        track: bool | None = None,
+    ) -> list[Line]:
+        """Return what was read just now as lines, numbered from `first`; `track` as of `Line`."""
         now, when = self.clock(), self._time()
-        return [Line(each, first + i, source, now, when, ticket) for i, each in enumerate(data)]
+        return [Line(each, first + i, source, now, when, ticket, track) for i, each in enumerate(data)]
+
+    @property
+    def tracks(self) -> Tracks:
+        """Return the tracks of the events that are answered by them."""
+        return self._engine.tracks
+
+    @property
+    def untracked(self) -> str:
+        """Return why events of this stream make no tracks; empty where they do."""
+        if self._settings.part[1] > 1:
+            return "this process answers a part of the events, and a track needs all those of its target"
+        return self.tracks.why
 
     def _time(self) -> float:
         return self.clock() - self.held
@@ -246,7 +282,8 @@ class Stream:
                 if message.command:
                     refused = self._obey(message.command)
                 else:
-                    self._events.take(message, line.stamp, line.when, ticket)
+                    track = self._settings.track if line.track is None else line.track
+                    self._events.take(message, line.stamp, line.when, ticket, track=track)
             except Exception as error:  # a stream goes on, whatever one line brings to light
                 if not isinstance(error, InvalidProblem):
                     LOG.exception("line %d of %s failed", line.number, line.source)
@@ -386,6 +423,7 @@ def state_of(events: Events, unwritten: dict[str, of_events.Event]) -> Record:
         rows = [[*site.row(key)[2:5], value, event.sigmas.get(key)] for key, value in event.rows.items()]
         times = [[site.stations[i], str(value)] for i, value in event.times.items()]
         about = {"target": event.target, "revision": event.revision, "conflict": event.conflict}
+        about |= {"when": None if event.when is None else str(event.when), "track": event.track}
         return {"event": event.name, "rows": rows, "times": times, **about}
 
     return {
@@ -432,6 +470,9 @@ def restore(path: Path, events: Events, now: float) -> None:
             times = {site.number[station]: int(value) for station, value in each["times"]}
             event = of_events.Event(str(each["event"]), rows, times, now, now, sigmas, str(each["target"]))
             event.revision, event.conflict = int(each["revision"]), bool(each["conflict"])
+            # a checkpoint of before there were tracks has neither
+            event.when = None if each.get("when") is None else int(each["when"])
+            event.track = bool(each.get("track"))
             events.open[event.name] = event
         events.metrics.counts.update({name: int(n) for name, n in found["counts"].items()})
     except (KeyError, TypeError, ValueError) as error:

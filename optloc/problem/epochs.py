@@ -362,7 +362,7 @@ def joined(problem: Problem, more: Problem) -> Problem:
     Parameters
     ----------
     problem, more : Problem
-        The same stations, targets, biases, priors and kinds in the same order; all times of `more` are later.
+        The same stations, targets, biases and priors; all times of `more` are later. Each may have kinds of its own.
 
     Returns
     -------
@@ -376,14 +376,22 @@ def joined(problem: Problem, more: Problem) -> Problem:
     """
     _check_alike(problem, more)
     k = problem.epochs
-    rows = tuple(
-        _append(one, replace(two, epoch=two.epoch + k)) for one, two in zip(problem.rows, more.rows, strict=True)
-    )
+    ours, others = _named(problem.rows), _named(more.rows)
+    names = list(dict.fromkeys((*ours, *others)))
+    none = [_none_of(kind) for kind, _ in names]
+    first = [ours.get(name, block) for name, block in zip(names, none, strict=True)]
+    second = [others.get(name, block) for name, block in zip(names, none, strict=True)]
+    rows = tuple(_append(one, replace(two, epoch=two.epoch + k)) for one, two in zip(first, second, strict=True))
     # Where the rows of either run come to stand: kinds stay together, the second run behind the first.
-    counts = [(one.count, two.count) for one, two in zip(problem.rows, more.rows, strict=True)]
-    starts = np.cumsum([0, *(a + b for a, b in counts)])[:-1]
-    mine = np.concatenate([start + np.arange(a) for start, (a, _) in zip(starts, counts, strict=True)])
-    theirs = np.concatenate([start + a + np.arange(b) for start, (a, b) in zip(starts, counts, strict=True)])
+    counts = [(one.count, two.count) for one, two in zip(first, second, strict=True)]
+    starts = dict(zip(names, np.cumsum([0, *(a + b for a, b in counts)]).tolist(), strict=False))
+    mine = np.concatenate([starts[name] + np.arange(block.count) for name, block in ours.items()])
+    theirs = np.concatenate(
+        [
+            starts[name] + (ours[name].count if name in ours else 0) + np.arange(block.count)
+            for name, block in others.items()
+        ]
+    )
     blocks = [Block(mine[block.row], block.covariance) for block in problem.noise.blocks]
     blocks += [Block(theirs[block.row], block.covariance) for block in more.noise.blocks]
     biases = tuple(
@@ -404,6 +412,18 @@ def joined(problem: Problem, more: Problem) -> Problem:
         motions=_motions(problem, more),
         biases=biases,
     )
+
+
+def _named(rows: tuple[Rows, ...]) -> dict[tuple[str, int], Rows]:
+    """Return the blocks of a run by their kinds, and which of several blocks of a kind they are."""
+    kinds = [block.kind for block in rows]
+    return {(kind, kinds[:i].count(kind)): block for i, (kind, block) in enumerate(zip(kinds, rows, strict=True))}
+
+
+def _none_of(kind: str) -> Rows:
+    """Return no rows of a kind, which one of two runs has not."""
+    none, numbers = np.zeros(0), np.zeros(0, dtype=np.int64)
+    return Rows(kind, none, numbers, numbers, numbers, numbers, none, none)
 
 
 def _append(one: Rows, two: Rows) -> Rows:
@@ -455,7 +475,6 @@ def _check_alike(problem: Problem, more: Problem) -> None:
     one, two = problem, more
     for what, same in (
         ("stations", one.stations.names == two.stations.names and one.stations.span == two.stations.span),
-        ("kinds", [rows.kind for rows in one.rows] == [rows.kind for rows in two.rows]),
         (
             "targets",
             [(m.order, m.span, m.known is None) for m in one.motions]

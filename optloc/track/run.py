@@ -5,32 +5,22 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import Literal
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array, Status
-from optloc.problem.epochs import cut
-from optloc.problem.fix import Fix, tail_probability
+from optloc.problem.epochs import joined
+from optloc.problem.fix import tail_probability
 from optloc.problem.problem import Problem
 from optloc.track.associate import innovation, weights_within
 from optloc.track.dynamics import Dynamics
-from optloc.track.start import counts, first_fix, is_one_gaussian, state_of, with_height_rows
+from optloc.track.start import Beginning, Fit, Undecided, begin, reach, with_height_rows
 from optloc.track.track import State, Track, check_state, check_trackable, collect, predicted, scan_at, take_scan
 from optloc.track.updates import Update, Updated, filter_of
 
-# Rows of a start whose chi-square is less likely than this contradict each other: the next scan is tried. One good
-# start in ten thousand is passed over, which costs a scan; a wrong one costs the track.
-_PLAUSIBLE = 1e-4
-# Scans that starts are tried from before one that contradicts itself is taken: every try costs a fix, and a run that is
-# wrong for longer deserves a status more than a search. The distance grows by half each time, and eleven tries reach
-# over forty scans: who is heard badly at first (a drone on the floor) has moved by then.
-_TRIES = 11
-# Scans of a stretch that is made longer until its state is clear: a longer one asks more of the model of motion, which
-# has no noise here, than of the rows.
-_CLEAR = 24
 # A given state whose first scan is less likely than this contradicts it: the run is refused, so this is nearly sure.
 _ABSURD = 1e-9
 # Scans of the window by which a track is judged, over those of `Rules.patience`.
@@ -41,8 +31,6 @@ _LOST, _DOUBTFUL = 0.5, 0.25
 # Gate, standard deviations: of a good row one in two million is left out.
 _USUAL = 5.0
 Event = Literal["starting", "started", "restarted", ""]
-Fit = tuple[float, int]
-"""Sum of the squared innovations (or residuals) of rows in their standard deviations, and how many these are."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +137,10 @@ def tracked(
         _check_start(start, problem, dynamics)
     cleaned, broken = _clean(problem)
     # The checks above are made at the call, not at the first scan.
-    return _Run(with_height_rows(cleaned), broken, dynamics, rule, rules or Rules()).entries(start)
+    rules = rules or Rules()
+    course = _Course(start, float(problem.times[0]) if start is None else start.time, _Recent(rules))
+    course.fresh = start is not None
+    return _Run(with_height_rows(cleaned), broken, dynamics, rule, rules).entries(course)
 
 
 def collected(entries: Sequence[Entry], dimension: int) -> Track:
@@ -168,7 +159,7 @@ def collected(entries: Sequence[Entry], dimension: int) -> Track:
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """One run with its rules; `broken` says which of its rows (m,) are not finite."""
+    """One run, or a stretch of it, with its rules; `broken` says which of its rows (m,) are not finite."""
 
     problem: Problem
     broken: Array
@@ -176,42 +167,30 @@ class _Run:
     rule: Update
     rules: Rules
 
-    def entries(self, start: State | None) -> Iterator[Entry]:
-        """Yield all entries."""
-        # heard: the time of the last valid row. missed: scans in succession whose rows the gate mostly refused.
-        # fresh: whether a given state has yet to meet its first row. recent: how the last scans fit.
-        times, k, state, why = self.problem.times, 0, start, ""
-        heard = float(times[0]) if start is None else start.time
-        missed, fresh, recent = 0, start is not None, _Recent(self.rules)
+    def entries(self, course: _Course, *, ends: bool = True) -> Iterator[Entry]:
+        """Yield all entries, one for each scan, from where a track stands; `ends` as of `begin`."""
+        times, k = self.problem.times, 0
         while k < len(times):
-            if state is None:
-                start_here = begin(self.problem, k, self.dynamics, self.rules.speed, self.rules.rate)
-                yield from self._starting(start_here, k, why)
-                k, state, missed = start_here.last + 1, start_here.state, 0
-                recent.begin(start_here)
-                heard = float(times[start_here.last])
+            if course.state is None:
+                start_here = begin(self.problem, k, self.dynamics, self.rules.speed, self.rules.rate, ends=ends)
+                yield from self._starting(start_here, k, course.why)
+                k, course.state, course.missed = start_here.last + 1, start_here.state, 0
+                course.recent.begin(start_here)
+                course.heard = float(times[start_here.last])
                 continue
-            ahead = predicted(state, self.dynamics, float(times[k]), self.problem.dimension)
-            why = self._unbridged(ahead, times[k] - heard)
-            if why:
-                state = None
+            ahead = predicted(course.state, self.dynamics, float(times[k]), self.problem.dimension)
+            course.why = self._unbridged(ahead, times[k] - course.heard)
+            if course.why:
+                course.state = None
                 continue
             entry, fit = self._updated(k, ahead)
-            if fresh and entry.updated.count + entry.rejected > 0:
+            if course.fresh and entry.updated.count + entry.rejected > 0:
                 _check_agrees(entry)
-                fresh = False
-            # Rows that are not finite say nothing of the state: only those that the gate refused end a track. A scan
-            # without rows leaves the count as it was.
-            gated, used = entry.rejected - self._bad(k), int(entry.updated.count)
-            missed = missed + 1 if gated > used else missed * int(used == 0)
-            heard = float(times[k]) if entry.updated.count > 0 else heard
-            recent.add(fit)
-            yield recent.judge(entry)
-            state, k = State(entry.time, entry.updated.mean, entry.updated.cov), k + 1
-            if missed >= self.rules.patience:
-                state, why = None, f"most rows of {missed} scans did not fit the prediction"
-            elif recent.lost:
-                state, why = None, recent.sentence
+                course.fresh = False
+            course.take(entry, fit, entry.rejected - self._bad(k))
+            k += 1
+            yield course.recent.judge(entry)
+            course.judge()
 
     def _starting(self, begun: Beginning, k: int, why: str) -> Iterator[Entry]:
         """Yield the scans of a start, of which the last one has the state."""
@@ -273,7 +252,7 @@ class _Recent:
         # As many scans as tell the loss of a track from a few wild rows in a row, where a scan has a single one: if one
         # row in ten is wild, ten of twenty are in one window of a million.
         self.scans: deque[Fit] = deque(maxlen=_WINDOW * rules.patience)
-        self.most, self.since = rules.most, 0
+        self.rules, self.most, self.since = rules, rules.most, 0
 
     def begin(self, start: Beginning) -> None:
         """Take the rows of a start; what did not fit before is forgotten where they agree, and else still counts."""
@@ -314,6 +293,123 @@ class _Recent:
         return replace(entry, code=Status.MISFIT, reason=self.sentence)
 
 
+@dataclass(slots=True)
+class _Course:
+    """Where a track stands between two scans.
+
+    Parameters
+    ----------
+    state : State or None
+        None before a start.
+    heard : float
+        Time of the last valid row.
+    recent : _Recent
+        How the last scans fit.
+    why : str
+        Why the state before was given up.
+    missed : int
+        Scans in succession whose rows the gate mostly refused.
+    fresh : bool
+        Whether a given state has yet to meet its first row.
+    """
+
+    state: State | None
+    heard: float
+    recent: _Recent
+    why: str = ""
+    missed: int = 0
+    fresh: bool = False
+
+    def take(self, entry: Entry, fit: Fit, gated: int) -> None:
+        """Go on by a scan of whose rows the gate refused so many."""
+        # Rows that are not finite say nothing of the state: only those that the gate refused end a track. A scan
+        # without rows leaves the count as it was.
+        used = int(entry.updated.count)
+        self.missed = self.missed + 1 if gated > used else self.missed * int(used == 0)
+        self.heard = entry.time if used else self.heard
+        self.recent.add(fit)
+        self.state = State(entry.time, entry.updated.mean, entry.updated.cov)
+
+    def judge(self) -> None:
+        """Give the state up where it is lost."""
+        if self.missed >= self.recent.rules.patience:
+            self.state, self.why = None, f"most rows of {self.missed} scans did not fit the prediction"
+        elif self.recent.lost:
+            self.state, self.why = None, self.recent.sentence
+
+
+# Scans that wait for a start, at most: a stretch of 63 is the tenth that is tried, and what so many leave open is not
+# a matter of the next few.
+_WAITING = 64
+
+
+class Follower:
+    """A track that goes on as scans come: what it says of them is what `tracked` says of the whole run.
+
+    Only a start that many scans leave open is told earlier than there: it is given up after 64 of them, as at the end
+    of a run.
+
+    Parameters
+    ----------
+    dynamics : Dynamics
+        Model of motion.
+    update : callable or str
+        A filter, or its name in `UPDATES`.
+    rules : Rules, optional
+        When rows are left out and tracks begin anew.
+    """
+
+    def __init__(self, dynamics: Dynamics, update: Update | str = "iekf", rules: Rules | None = None) -> None:
+        self._dynamics, self._rule, self._rules = dynamics, filter_of(update), rules or Rules()
+        self._course: _Course | None = None
+        self._waiting: list[Problem] = []
+        self._needed = 1  # scans, for the next try of a start
+        self.last = -np.inf
+        """Time of the last scan, seconds."""
+
+    @property
+    def lost(self) -> str:
+        """Return why the last state was given up while there is no new one; empty where there is one, or never was."""
+        return self._course.why if self._course is not None and self._course.state is None else ""
+
+    def take(self, scan: Problem) -> list[Entry]:
+        """Return what became of the scans up to this one that were left open; nothing where a start needs more.
+
+        Parameters
+        ----------
+        scan : Problem
+            One epoch of the run, later than those before; the same stations and target.
+
+        Raises
+        ------
+        InvalidProblem
+            Where it is not later, or not one target's; the track stays as it was.
+        """
+        check_trackable(scan)
+        if scan.batch_shape or scan.epochs != 1:
+            raise InvalidProblem("this is not a single scan", "track", "give one epoch after the other")
+        time = float(scan.times[0])
+        if not time > self.last:
+            what = f"the scan at {time:.10g} s follows one at {self.last:.10g} s"
+            raise InvalidProblem(what, "times", "give scans in the order of time, and one for each time")
+        run = [*self._waiting, scan]
+        if len(run) < self._needed:
+            self._waiting, self.last = run, time
+            return []
+        cleaned, broken = _clean(reduce(joined, run))
+        stretch = _Run(with_height_rows(cleaned), broken, self._dynamics, self._rule, self._rules)
+        course = self._course or _Course(None, float(run[0].times[0]), _Recent(self._rules))
+        done: list[Entry] = []
+        self._needed = 1
+        try:
+            for entry in stretch.entries(course, ends=len(run) >= _WAITING):
+                done.append(entry)  # noqa: PERF402  # those before a start that is left open stay
+        except Undecided as undecided:
+            self._needed = undecided.scans - len(done)
+        self._course, self._waiting, self.last = course, run[len(done) :], time
+        return done
+
+
 def _clean(problem: Problem) -> tuple[Problem, Array]:
     """Return the run with weight zero for rows that are not finite, and which of the present ones these are (m,)."""
     broken = ~np.isfinite(problem.z) & (problem.weight > 0.0)
@@ -347,164 +443,3 @@ def _check_agrees(entry: Entry) -> None:
         what = f"the initial state contradicts the first scan, at {entry.time:.10g} s"
         advice = "correct it, make its standard deviation larger, or leave it out: a start needs no guess"
         raise InvalidProblem(what, "start", advice)
-
-
-# Where a track begins: the first scans that determine a state and do not contradict each other.
-
-
-@dataclass(frozen=True, slots=True)
-class Beginning:
-    """A start, or why there is none.
-
-    Parameters
-    ----------
-    last : int
-        Last scan that was used, or given up.
-    state : State or None
-        At that scan.
-    code : Status
-        Ok; ambiguous where the state has alternatives; rejected where the rows contradict each other.
-    waiting : Status
-        Of the scans before: ok where a start follows.
-    reason : str
-        A sentence where the status is not ok.
-    fit : tuple of float and int
-        Chi-square of the rows of the start, and its degrees of freedom.
-    """
-
-    last: int
-    state: State | None
-    code: Status
-    waiting: Status
-    reason: str = ""
-    fit: Fit = (0.0, 0)
-
-
-@dataclass(frozen=True, slots=True)
-class _Stretch:
-    """Scans that determine a state: their fix, the last of them, and the state there."""
-
-    fix: Fix
-    last: int
-    state: State
-
-    @property
-    def p(self) -> float:
-        """Return the p-value of the rows; 1 without redundancy, where nothing contradicts."""
-        p = float(self.fix.p_value)
-        return 1.0 if np.isnan(p) else p
-
-    @property
-    def fit(self) -> Fit:
-        """Return the chi-square of the rows and its degrees of freedom."""
-        return float(self.fix.cost), int(self.fix.dof)
-
-    @property
-    def clean(self) -> bool:
-        """Return whether a filter may begin with it."""
-        return self.p >= _PLAUSIBLE and is_one_gaussian(self.fix)
-
-
-def begin(problem: Problem, first: int, dynamics: Dynamics, speed: float | None, rate: float | None) -> Beginning:
-    """Return a start from the scan `first` on, without a guess.
-
-    The fewest scans that determine the state are solved as one problem. Where their rows contradict each other the
-    stretch begins one scan later, where several states explain them it is made longer.
-
-    Parameters
-    ----------
-    problem : Problem
-        A single run of one target.
-    first : int
-        First scan that may be used.
-    dynamics : Dynamics
-        Gives the order of the state.
-    speed, rate : float, optional
-        Prior standard deviations, see `begun`.
-    """
-    doubtful: list[_Stretch] = []
-    verdict, last = Status.TOO_FEW_ROWS, first
-    heard = _heard(problem, first)
-    for i in _slides(len(heard)):
-        last = int(heard[i])
-        found, verdict = _stretch(problem, last, dynamics, speed, rate)
-        if found is not None and found.clean:
-            return Beginning(found.last, found.state, Status.OK, Status.OK, fit=found.fit)
-        if found is not None:
-            doubtful.append(found)
-        elif verdict != Status.CONTRADICTORY:
-            break  # what all later scans leave open, fewer of them do too
-        if found is not None and found.p >= _PLAUSIBLE:
-            break
-    if doubtful:
-        return _doubtful(min(doubtful, key=lambda each: each.fit[0] / max(each.fit[1], 1)))
-    if verdict == Status.CONTRADICTORY:  # of these scans; later ones may agree
-        return Beginning(last, None, Status.REJECTED, Status.REJECTED, "the rows of the scans contradict each other")
-    reason = f"the scans that are left do not determine a state: {verdict.label}"
-    return Beginning(problem.epochs - 1, None, verdict, verdict, reason)
-
-
-def _doubtful(best: _Stretch) -> Beginning:
-    """Return a start that is not clean, with a status that says what is wrong with it."""
-    others = int(np.isfinite(best.fix.alternatives.gap).sum())
-    if best.p < _PLAUSIBLE:
-        code, reason = Status.REJECTED, f"the rows of the start contradict each other (p = {best.p:.2g})"
-    elif others:
-        code, reason = Status.AMBIGUOUS, f"the start has {others} alternative{'s' if others > 1 else ''}"
-    else:
-        code, reason = Status.CURVED, "the covariance of the start does not cover"
-    return Beginning(best.last, best.state, code, Status.OK, reason, best.fit)
-
-
-def _slides(count: int) -> Iterator[int]:
-    """Yield which of so many scans starts are tried from: the next few, then ever farther apart."""
-    i = 0
-    for _ in range(_TRIES):
-        if i < count:
-            yield i
-        i = max(i + 1, i * 3 // 2)
-
-
-def _stretch(
-    problem: Problem, k: int, dynamics: Dynamics, speed: float | None, rate: float | None
-) -> tuple[_Stretch | None, Status]:
-    """Return the first clear start from scan k on, else the first one that is answered, and the last verdict."""
-    run, ambiguous, verdict = cut(problem, k, problem.epochs), None, Status.TOO_FEW_ROWS
-    for count in counts(run.epochs, dynamics.order, speed, rate):
-        if ambiguous is not None and count > _CLEAR:
-            break
-        fix = first_fix(run, dynamics, count, speed=speed, rate=rate)
-        verdict = Status(int(fix.code))
-        # More scans do not mend rows that contradict each other; NaN without redundancy, where nothing does.
-        contradicted = bool(fix.p_value < _PLAUSIBLE)
-        state = state_of(run, fix, count) if bool(fix.answered) else None
-        if state is None or _is_vague(problem, state):
-            if contradicted:
-                return ambiguous, Status.CONTRADICTORY
-            continue
-        found = _Stretch(fix, k + count - 1, state)
-        if contradicted:
-            return ambiguous or found, verdict
-        if found.clean:
-            return found, verdict
-        ambiguous = ambiguous or found
-    return ambiguous, verdict
-
-
-def _is_vague(problem: Problem, state: State) -> bool:
-    """Return whether a state is vaguer than the range of the target, so that it begins nothing; NaN is vague, too."""
-    d = problem.dimension
-    sigma = float(np.sqrt(np.linalg.eigvalsh(state.cov[:d, :d])[-1]))
-    return not sigma <= reach(problem, state.mean[:d])
-
-
-def _heard(problem: Problem, first: int) -> Array:
-    """Return the scans from `first` on that have a valid row."""
-    scans = np.unique(problem.epoch[problem.weight > 0.0])
-    return np.asarray(scans[scans >= first])
-
-
-def reach(problem: Problem, position: Array) -> float:
-    """Return the spread of the stations, or the range of a position (d,) from their centre if that is more, metres."""
-    centre, spread = centre_and_spread(problem.stations.places.reshape(-1, problem.dimension))
-    return max(float(spread), float(np.linalg.norm(position - centre)))

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, NoSolution
-from optloc.base.types import Band, Motion, Prior, Rows, Status
+from optloc.base.linalg import centre_and_spread
+from optloc.base.types import Array, Band, Motion, Prior, Rows, Status
 from optloc.problem.epochs import cut
 from optloc.problem.fix import Fix
 from optloc.problem.noise import Block, Noise
@@ -18,6 +20,19 @@ from optloc.track.track import State, check_trackable
 
 # Metres: below every other error; of ECEF coordinates a millimetre has too few digits to converge on.
 _EXACT = 1e-2
+# Rows of a start whose chi-square is less likely than this contradict each other: the next scan is tried. One good
+# start in ten thousand is passed over, which costs a scan; a wrong one costs the track.
+_PLAUSIBLE = 1e-4
+# Scans that starts are tried from before one that contradicts itself is taken: every try costs a fix, and a run that is
+# wrong for longer deserves a status more than a search. The distance grows by half each time, and eleven tries reach
+# over forty scans: who is heard badly at first (a drone on the floor) has moved by then.
+_TRIES = 11
+# Scans of a stretch that is made longer until its state is clear: a longer one asks more of the model of motion, which
+# has no noise here, than of the rows.
+_CLEAR = 24
+
+Fit = tuple[float, int]
+"""Sum of the squared innovations (or residuals) of rows in their standard deviations, and how many these are."""
 
 
 def begun(
@@ -177,3 +192,187 @@ def with_height_rows(problem: Problem) -> Problem:
     block = Block(problem.count + np.arange(m)[:, None], np.full((1, 1, 1), _EXACT**2))
     kept = tuple(c for c in problem.constraints if not any(c is e for e in exact))
     return replace(problem, rows=(*problem.rows, rows), noise=Noise((*problem.noise.blocks, block)), constraints=kept)
+
+
+# Where a track begins: the first scans that determine a state and do not contradict each other.
+
+
+@dataclass(frozen=True, slots=True)
+class Beginning:
+    """A start, or why there is none.
+
+    Parameters
+    ----------
+    last : int
+        Last scan that was used, or given up.
+    state : State or None
+        At that scan.
+    code : Status
+        Ok; ambiguous where the state has alternatives; rejected where the rows contradict each other.
+    waiting : Status
+        Of the scans before: ok where a start follows.
+    reason : str
+        A sentence where the status is not ok.
+    fit : tuple of float and int
+        Chi-square of the rows of the start, and its degrees of freedom.
+    """
+
+    last: int
+    state: State | None
+    code: Status
+    waiting: Status
+    reason: str = ""
+    fit: Fit = (0.0, 0)
+
+
+class Undecided(Exception):  # noqa: N818  # no failure: more scans are to come
+    """A start that needs more scans than have come: so many of the run."""
+
+    def __init__(self, scans: int) -> None:
+        super().__init__(scans)
+        self.scans = scans
+
+
+@dataclass(frozen=True, slots=True)
+class _Stretch:
+    """Scans that determine a state: their fix, the last of them, and the state there."""
+
+    fix: Fix
+    last: int
+    state: State
+
+    @property
+    def p(self) -> float:
+        """Return the p-value of the rows; 1 without redundancy, where nothing contradicts."""
+        p = float(self.fix.p_value)
+        return 1.0 if np.isnan(p) else p
+
+    @property
+    def fit(self) -> Fit:
+        """Return the chi-square of the rows and its degrees of freedom."""
+        return float(self.fix.cost), int(self.fix.dof)
+
+    @property
+    def clean(self) -> bool:
+        """Return whether a filter may begin with it."""
+        return self.p >= _PLAUSIBLE and is_one_gaussian(self.fix)
+
+
+def begin(
+    problem: Problem,
+    first: int,
+    dynamics: Dynamics,
+    speed: float | None,
+    rate: float | None,
+    *,
+    ends: bool = True,
+) -> Beginning:
+    """Return a start from the scan `first` on, without a guess.
+
+    The fewest scans that determine the state are solved as one problem. Where their rows contradict each other the
+    stretch begins one scan later, where several states explain them it is made longer.
+
+    Parameters
+    ----------
+    problem : Problem
+        A single run of one target.
+    first : int
+        First scan that may be used.
+    dynamics : Dynamics
+        Gives the order of the state.
+    speed, rate : float, optional
+        Prior standard deviations, see `begun`.
+    ends : bool
+        Whether these are all scans. Otherwise what a start asks of scans that are still to come is `Undecided`.
+    """
+    doubtful: list[_Stretch] = []
+    verdict, last = Status.TOO_FEW_ROWS, first
+    heard = _heard(problem, first)
+    for i in _slides(len(heard) if ends else np.inf):
+        if i >= len(heard):
+            raise Undecided(problem.epochs + 1)
+        last = int(heard[i])
+        found, verdict = _stretch(problem, last, dynamics, speed, rate, ends)
+        if found is not None and found.clean:
+            return Beginning(found.last, found.state, Status.OK, Status.OK, fit=found.fit)
+        if found is not None:
+            doubtful.append(found)
+        elif verdict != Status.CONTRADICTORY:
+            break  # what all later scans leave open, fewer of them do too
+        if found is not None and found.p >= _PLAUSIBLE:
+            break
+    if doubtful:
+        return _doubtful(min(doubtful, key=lambda each: each.fit[0] / max(each.fit[1], 1)))
+    if verdict == Status.CONTRADICTORY:  # of these scans; later ones may agree
+        return Beginning(last, None, Status.REJECTED, Status.REJECTED, "the rows of the scans contradict each other")
+    reason = f"the scans that are left do not determine a state: {verdict.label}"
+    return Beginning(problem.epochs - 1, None, verdict, verdict, reason)
+
+
+def _doubtful(best: _Stretch) -> Beginning:
+    """Return a start that is not clean, with a status that says what is wrong with it."""
+    others = int(np.isfinite(best.fix.alternatives.gap).sum())
+    if best.p < _PLAUSIBLE:
+        code, reason = Status.REJECTED, f"the rows of the start contradict each other (p = {best.p:.2g})"
+    elif others:
+        code, reason = Status.AMBIGUOUS, f"the start has {others} alternative{'s' if others > 1 else ''}"
+    else:
+        code, reason = Status.CURVED, "the covariance of the start does not cover"
+    return Beginning(best.last, best.state, code, Status.OK, reason, best.fit)
+
+
+def _slides(count: float) -> Iterator[int]:
+    """Yield which of so many scans starts are tried from: the next few, then ever farther apart."""
+    i = 0
+    for _ in range(_TRIES):
+        if i < count:
+            yield i
+        i = max(i + 1, i * 3 // 2)
+
+
+def _stretch(
+    problem: Problem, k: int, dynamics: Dynamics, speed: float | None, rate: float | None, ends: bool
+) -> tuple[_Stretch | None, Status]:
+    """Return the first clear start from scan k on, else the first one that is answered, and the last verdict."""
+    run, ambiguous, verdict = cut(problem, k, problem.epochs), None, Status.TOO_FEW_ROWS
+    # Of a run that goes on, the numbers up to the next one after what is there.
+    for count in counts(run.epochs if ends else 2 * run.epochs + 2, dynamics.order, speed, rate):
+        if ambiguous is not None and count > _CLEAR:
+            break
+        if count > run.epochs:
+            raise Undecided(k + count)
+        fix = first_fix(run, dynamics, count, speed=speed, rate=rate)
+        verdict = Status(int(fix.code))
+        # More scans do not mend rows that contradict each other; NaN without redundancy, where nothing does.
+        contradicted = bool(fix.p_value < _PLAUSIBLE)
+        state = state_of(run, fix, count) if bool(fix.answered) else None
+        if state is None or _is_vague(problem, state):
+            if contradicted:
+                return ambiguous, Status.CONTRADICTORY
+            continue
+        found = _Stretch(fix, k + count - 1, state)
+        if contradicted:
+            return ambiguous or found, verdict
+        if found.clean:
+            return found, verdict
+        ambiguous = ambiguous or found
+    return ambiguous, verdict
+
+
+def _is_vague(problem: Problem, state: State) -> bool:
+    """Return whether a state is vaguer than the range of the target, so that it begins nothing; NaN is vague, too."""
+    d = problem.dimension
+    sigma = float(np.sqrt(np.linalg.eigvalsh(state.cov[:d, :d])[-1]))
+    return not sigma <= reach(problem, state.mean[:d])
+
+
+def _heard(problem: Problem, first: int) -> Array:
+    """Return the scans from `first` on that have a valid row."""
+    scans = np.unique(problem.epoch[problem.weight > 0.0])
+    return np.asarray(scans[scans >= first])
+
+
+def reach(problem: Problem, position: Array) -> float:
+    """Return the spread of the stations, or the range of a position (d,) from their centre if that is more, metres."""
+    centre, spread = centre_and_spread(problem.stations.places.reshape(-1, problem.dimension))
+    return max(float(spread), float(np.linalg.norm(position - centre)))

@@ -5,6 +5,7 @@ import json
 import time
 from urllib.parse import urlsplit
 
+import numpy as np
 import pytest
 from live.lines import SITE, Answers, arrivals, differences, line, site_in, solved
 from report.browser import Browser, executable
@@ -15,8 +16,12 @@ connect = pytest.importorskip("websockets.sync.client").connect
 ConnectionClosed = pytest.importorskip("websockets.exceptions").ConnectionClosed
 
 from optloc.base.errors import InvalidProblem  # noqa: E402  (after the libraries that may be missing)
+from optloc.cli.track import runs_of  # noqa: E402
+from optloc.files import read  # noqa: E402
 from optloc.live.serve import serve  # noqa: E402
 from optloc.live.stream import Settings, Stream  # noqa: E402
+from optloc.live.tracks import Following  # noqa: E402
+from optloc.track import polynomial, tracked  # noqa: E402
 
 ON_EARTH = SITE.replace("[stations]", '[frame]\nkind = "enu"\norigin = { lat_deg = 47.5, lon_deg = 8.0 }\n\n[stations]')
 
@@ -110,6 +115,88 @@ def test_health_metrics_and_the_latest_fixes(site, served):
     planes = json.loads(ask(port, "GET", "/data/aircraft.json")[2])["aircraft"]
     (own,) = [plane for plane in planes if plane["hex"] == "4b1234"]
     assert own["lat"] == pytest.approx(47.5, abs=0.1)
+
+
+def flight(site, count=20, seed=3):
+    """Return times and rows of something that flies through the site."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(float(count))
+    x = np.array([500.0, 800.0, 700.0]) + t[:, None] * np.array([60.0, 40.0, 5.0])
+    path = np.linalg.norm(x[:, None] - site.position, axis=-1) + 5.0 * rng.standard_normal((count, len(site.stations)))
+    ends = [(site.number[row.a], site.number[row.b]) for row in site.rows]
+    return t, np.array([path[:, a] - path[:, b] for a, b in ends]).T
+
+
+def test_a_track_is_that_of_the_command(site, served, tmp_path):
+    _, port = served
+    t, z = flight(site)
+    z[12] += 500.0  # and one scan that no gate lets pass
+    rows = ",\n".join(
+        f'{{ a = "{row.a}", time = {time}, z = {value!r} }}'
+        for time, values in zip(t.tolist(), z.tolist(), strict=True)
+        for row, value in zip(site.rows, values, strict=True)
+    )
+    (tmp_path / "flight.toml").write_text(ON_EARTH.split("rows = [{ a")[0] + f"rows = [{rows}]\n")
+    problem = next(runs_of(read(tmp_path / "flight.toml")))[1]
+    entries = list(tracked(problem, polynomial(1, 1.0)))
+    lines = [line(event=f"flies {i}", z=v, time=t[i], target="ab/1") for i, v in enumerate(z.tolist())]
+    # other targets between its events, and the same event again
+    lines[5:5] = [line(event="else", z=z[0].tolist(), time=2.0, target="other"), lines[4]]
+    code, _, said = ask(port, "POST", "/track", b"\n".join(lines))
+    records = {r["event"]: r for r in map(json.loads, said.splitlines())}
+    assert (code, len(records), records["else"]["status"]) == (200, 21, "starting")
+    own = [records[f"flies {i}"] for i in range(20)]
+    assert [r["status"] for r in own] == [entry.label for entry in entries]
+    assert own[12]["rejected"] == entries[12].rejected > 0
+    for record, entry in zip(own[1:], entries[1:], strict=True):
+        d = entry.updated.mean
+        np.testing.assert_allclose(record["position"] + record["velocity"], d, rtol=1e-7)
+        np.testing.assert_allclose(record["cov"], entry.updated.cov, rtol=1e-6, atol=1e-9)
+        nis = float(entry.updated.nis)
+        assert record["nis"] is None if np.isnan(nis) else record["nis"] == pytest.approx(nis, rel=1e-6)
+    listed = json.loads(ask(port, "GET", "/track")[2])["tracks"]
+    assert {r["target"] for r in listed} >= {"ab/1", "other"}
+    one = json.loads(ask(port, "GET", "/track/ab/1")[2])
+    assert (one["event"], one["position"]) == ("flies 19", own[19]["position"])
+    values = ask(port, "GET", "/metrics")[2]
+    assert 'optloc_tracks_total{status="started"} 1' in values
+
+
+def test_what_no_track_can_take_is_refused_and_counted(site, served):
+    stream, port = served
+    z = flight(site, 3)[1].tolist()
+    before = dict(stream.metrics.counts)
+
+    def post(**found):
+        code, _, said = ask(port, "POST", "/track", line(**found), Content_Type="application/json")
+        return code, json.loads(said)
+
+    assert post(event="t1", z=z[0], time=5, target="late")[1]["status"] == "starting"
+    code, said = post(event="t2", z=z[1], time="5", target="late")
+    assert (code, "in the order of their times" in said["error"]) == (400, True)
+    code, said = post(event="t3", z=z[1], target="late")
+    assert (code, "needs the time" in said["error"]) == (400, True)
+    assert post(event="t4", z=z[1], time=True)[0] == 400
+    assert post(event="t5", z=z[1], time=1, time_ns=1)[0] == 400
+    after = stream.metrics.counts
+    assert [after[k] - before[k] for k in ("tracked", "unordered", "unsolvable", "malformed")] == [1, 1, 1, 2]
+    code, _, said = ask(port, "GET", "/track/nobody")
+    assert (code, json.loads(said)["error"]) == (404, "there is no track of 'nobody'")
+
+
+def test_tracks_are_bounded_in_number_and_age(site):
+    z, now, out = flight(site, 1)[1].tolist(), [0.0], Answers()
+    settings = Settings(track=True, following=Following(most=3, age=10.0))
+    stream = Stream(site, settings, out, clock=lambda: now[0])
+    for i in range(5):
+        stream.inbox.put(stream.lines([line(event=str(i), z=z[0], time=i, target=str(i))], "test"))
+    stream.close()
+    assert stream.ended.wait(10.0)
+    assert [r["target"] for r in stream.tracks.records()] == ["4", "3", "2"]
+    assert stream.metrics.counts["forgotten"] == 2
+    now[0] = 11.0
+    assert stream.tracks.records() == []
+    assert stream.metrics.counts["forgotten"] == 5
 
 
 def test_the_map_needs_no_network(served):
