@@ -7,8 +7,9 @@ from scipy.optimize import least_squares
 
 from optloc.compute.jit import enabled
 from optloc.proof.atlas import atlas_of
+from optloc.proof.box import cube, reaches_infinity
 from optloc.proof.chart import cost_of, empty_box
-from optloc.proof.everywhere import UNBOUNDED, cube, prove_atlas, prove_everywhere, reaches_infinity, set_minimum
+from optloc.proof.everywhere import UNBOUNDED, prove_atlas, prove_everywhere, set_minimum
 from optloc.proof.near import BETTER, OTHER, UNIQUE, VALUE, prove
 from optloc.proof.nodes.node import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO
 

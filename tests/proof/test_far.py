@@ -5,7 +5,7 @@ import pytest
 from proof.sampling import numbers, value
 
 from optloc.proof.atlas import atlas_of, home_of, position, set_centre, within
-from optloc.proof.everywhere import cube
+from optloc.proof.box import cube
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
 from optloc.proof.nodes.node import AZIMUTH, ELEVATION, RANGE, RATIO
 
