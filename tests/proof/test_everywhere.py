@@ -155,6 +155,41 @@ def test_flat_networks_in_full(kappa, least):
     assert everywhere >= max(enclosure, least)
 
 
+def wrong_claims(count, seed):
+    """Offer the atlas mirrors of flat networks for fixes, and fixes without their mirrors; return claims and offers."""
+    claims = offers = 0
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        S = rng.uniform(-5e3, 5e3, (5, 3)) * [1.0, 1.0, 0.01]
+        x = np.array([*rng.uniform(-1e4, 1e4, 2), rng.uniform(3e3, 11e3)])
+        kinds, data, K, w = differences(S, 7.0, x, rng)
+        found = minima_of(S, K, w, [x, x * [1.0, 1.0, -1.0]])
+        if len(found) < 2:
+            continue
+        (least, best), (more, mirror) = found[:2]
+        cost, box = cost_of(kinds, data, K, w), empty_box(*K.shape)
+        asked = [(mirror, 0.0), (mirror, 25.0)] if more > least + 1e-3 * (1.0 + least) else []
+        asked += [(best, 25.0)] if more < least + 24.0 else []
+        for place, kappa in asked:
+            args = (place, beside([], 3), kappa, 1e-6 * (1.0 + more), 3000, np.zeros(3))
+            claims += prove_atlas(cost, box, *args)[0] in (UNIQUE, VALUE)
+            offers += 1
+    return claims, offers
+
+
+def test_no_mirror_of_a_flat_network_is_proven(seed):
+    claims, offers = wrong_claims(60 if enabled() else 2, 30 + seed)
+    assert claims == 0
+    assert offers > (60 if enabled() else 0)
+
+
+@pytest.mark.full
+def test_no_mirror_of_a_flat_network_is_proven_in_full(seed):
+    claims, offers = wrong_claims(800, 60 + seed)
+    assert claims == 0
+    assert offers > 800
+
+
 def test_a_cost_that_falls_to_infinity_is_no_proof():
     """Wave fronts that bend away from their source: the cost falls towards infinity, whatever point is offered."""
     S = np.array([[-1e3, 0.0], [0.0, 200.0], [1e3, 0.0], [0.0, -200.0]])
