@@ -255,6 +255,55 @@ def within(atlas: Atlas, half: Array, i: int, sides: Array) -> bool:
     return True
 
 
+# What a few sums and products round, relative to their sizes, and a thousand times that.
+_BEYOND = 1e-12
+
+
+@compiled
+def clip_to_corners(atlas: Atlas, origin: Array, back: Array, corners: Array, half: Array, cut: Array) -> None:
+    """Clip a box around the centre set to what lies between corners in search coordinates around a fix.
+
+    With b a row of `back` a position x has the coordinate ``b.(x - origin)``, and v times it is linear in the
+    coordinates of the piece: ``b.(R p + (m - origin) v)``. So is v times an end, with which it is compared: v >= 0.
+
+    Parameters
+    ----------
+    atlas : Atlas
+        The centre is set.
+    origin, back : array (3,), (3, 3)
+        The fix, and the derivative of the search coordinates with respect to the position.
+    corners : array (2, 3)
+        Least and greatest search coordinates.
+    half, cut : array (3,), (6,)
+        Half-widths of the box, and ends of what is left of it, clipped.
+    """
+    scale, slope, size = atlas.scale, np.empty(4), np.empty(4)  # of v times a coordinate: at the centre, then along u
+    for k in range(3):
+        for side in range(2):
+            sign, end = (-1.0, corners[0, k]) if side == 0 else (1.0, corners[1, k])
+            for c in range(4):
+                slope[c], size[c] = -sign * end * scale[c], abs(end * scale[c])
+                for m in range(atlas.dimension):
+                    p = atlas.radius * (atlas.point[m] if c == 0 else atlas.slant[m, c - 1])
+                    slope[c] += sign * back[k, m] * (p + (atlas.middle[m] - origin[m]) * scale[c])
+                    size[c] += abs(back[k, m]) * (abs(p) + (abs(atlas.middle[m]) + abs(origin[m])) * abs(scale[c]))
+            # slope.(1, u) <= 0 is asked of u: from the lowest corner of the box there is so much room.
+            room = _BEYOND * size[0] - slope[0]
+            for c in range(3):
+                room += (abs(slope[1 + c]) + _BEYOND * size[1 + c]) * half[c]
+            if room < 0.0:
+                cut[0], cut[3] = 1.0, -1.0
+                return
+            for c in range(3):
+                steep = abs(slope[1 + c])
+                if steep > 0.0 and room < 2.0 * steep * half[c]:
+                    most = room / steep - half[c] + _BEYOND * half[c]
+                    if slope[1 + c] > 0.0:
+                        cut[3 + c] = min(cut[3 + c], most)
+                    else:
+                        cut[c] = max(cut[c], -most)
+
+
 @compiled
 def set_line(atlas: Atlas, data: Array, first: int, away: Array, sense: Array) -> None:
     """Write the scaled line p - v a to the station at data[first:first + 3], and its derivative."""

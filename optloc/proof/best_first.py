@@ -23,12 +23,14 @@ from optloc.proof.box import (
     PIECE,
     bound_nodes,
     cost_at,
+    cube,
     cut_out,
     least_residual,
     linearise_rows,
     pop,
     push_around,
     push_halves,
+    reaches_infinity,
     rounding,
     shrink,
     uncut,
@@ -38,11 +40,9 @@ from optloc.proof.chart import place as set_place
 from optloc.proof.curvature import clip_to_stationary
 from optloc.proof.everywhere import (
     accuracy_floor_far,
-    cube,
     is_left,
     leaves,
     push_pieces,
-    reaches_infinity,
     set_minimum,
     steepest_side,
 )

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from math import inf, sqrt
 
+import numpy as np
+
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, inlined
 from optloc.compute.systems import inverse
-from optloc.proof.nodes.dispatch import bound_others
+from optloc.proof.nodes.dispatch import bound_others, infinity_of, points_of
 from optloc.proof.nodes.node import (
+    DIFFERENCE,
+    GROWS,
     HIGH,
     LOW,
     PHI,
+    RANGE,
     SLOPE0,
     SLOPE1,
     SLOPE2,
@@ -383,3 +388,66 @@ def least_left(stack: Array, size: int) -> float:
         low = stack[i, LEAST]
         least = min(least, low * low if low > 0.0 else 0.0)  # NaN, too, says nothing
     return least
+
+
+# Space as boxes: whether it may be taken to infinity, and the cube in its middle.
+
+# How little the coefficients of ranges in a row may sum to, relative to their sizes: zero but for whitening's rounding.
+_BALANCED = 1e-12
+# Half-width of the cube, reaches of the stations: with a margin, so that no station touches a face, where lines to it
+# would vanish.
+_REACHES = 1.25
+
+
+@compiled
+def reaches_infinity(kinds: Array, K: Array) -> bool:
+    """Return whether a cost stays finite at infinity, so that the chart holds.
+
+    Linear forms, heights, and ranges that no other balances grow without end.
+
+    Parameters
+    ----------
+    kinds : int array (J,)
+        Codes of the nodes.
+    K : array (q, J)
+        Whitened rows.
+    """
+    for j in range(kinds.shape[0]):
+        # Here and below ranges, the common case, spare the call: what they do at infinity is known.
+        if kinds[j] != RANGE and infinity_of(kinds[j]) == GROWS:
+            return False
+    for i in range(K.shape[0]):
+        total = size = 0.0
+        for j in range(kinds.shape[0]):
+            if kinds[j] == RANGE or infinity_of(kinds[j]) == DIFFERENCE:
+                total += K[i, j]
+                size += abs(K[i, j])
+        if abs(total) > _BALANCED * size:
+            return False
+    return True
+
+
+@compiled
+def cube(kinds: Array, data: Array, x: Array) -> tuple[Array, float]:
+    """Return centre (3,) and half-width of a cube that holds all stations well.
+
+    Parameters
+    ----------
+    kinds, data : array (J,), (J, width)
+        Nodes that have stations.
+    x : array (D,)
+        The fix: where all stations are in one place, its distance is the only length there is.
+    """
+    low, high = np.full(3, inf), np.full(3, -inf)
+    for j in range(kinds.shape[0]):
+        for first in range(0, 3 * points_of(kinds[j]), 3):
+            for k in range(3):
+                low[k], high[k] = min(low[k], data[j, first + k]), max(high[k], data[j, first + k])
+    reach = 0.0
+    for k in range(3):
+        reach = max(reach, 0.5 * (high[k] - low[k]))
+    middle = 0.5 * (low + high)
+    if not reach > 0.0:
+        for k in range(x.shape[0]):
+            reach = max(reach, abs(x[k] - middle[k]))
+    return middle, _REACHES * reach if reach > 0.0 else 1.0

@@ -26,6 +26,7 @@ from optloc.proof.box import (
     bound_nodes,
     clip,
     cost_at,
+    cube,
     cut_out,
     least_residual,
     linearise_rows,
@@ -36,7 +37,7 @@ from optloc.proof.box import (
 )
 from optloc.proof.chart import Box, Chart, Cost, chart_at, place, widen
 from optloc.proof.enclosure import enclose
-from optloc.proof.everywhere import accuracy_floor_far, cube, set_minimum
+from optloc.proof.everywhere import accuracy_floor_far, set_minimum
 from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.nodes.node import HIGH, LOW
 
@@ -319,7 +320,7 @@ def _side_far(cost: Cost, atlas: Atlas, box: Box, piece: int) -> int:
     return side
 
 
-# All space to infinity, where the cost stays finite there (`optloc.proof.everywhere.reaches_infinity`).
+# All space to infinity, where the cost stays finite there (`optloc.proof.box.reaches_infinity`).
 
 
 @compiled

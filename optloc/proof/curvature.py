@@ -9,7 +9,7 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.compute.jit import compiled, inlined
 from optloc.compute.systems import inverse, positive, principal
-from optloc.proof.box import clip, digits, is_empty, uncut
+from optloc.proof.box import clip, digits, is_empty
 from optloc.proof.nodes.dispatch import curve_others, shape_of
 from optloc.proof.nodes.node import (
     BLUR,
@@ -282,7 +282,9 @@ def clip_newton(half: Array, sums: Array, ball: float, cut: Array, solve: Array)
 
 
 @compiled
-def has_no_infimum(dimension: int, touching: bool, half: Array, sums: Array, ball: float, solve: Array) -> bool:
+def has_no_infimum(
+    dimension: int, touching: bool, half: Array, sums: Array, ball: float, cut: Array, solve: Array
+) -> bool:
     """Return whether no infimum of the cost can lie in a box of an atlas.
 
     The gradient does not vanish, or the Hessian has a negative eigenvalue; and at infinity, an end of the box that is
@@ -298,14 +300,14 @@ def has_no_infimum(dimension: int, touching: bool, half: Array, sums: Array, bal
         The box, and its sums with bounds of the Hessian's change.
     ball : float
         A bound of the norm of the rest of that change.
+    cut : array (6,)
+        Ends of the part of the box that is asked about; clipped, but for a box that reaches infinity.
     solve : array (3, 3)
         Working memory.
     """
     if not ball < inf:
         return False
     if not touching:
-        cut = np.empty(6)
-        uncut(half, cut)
         clip_newton(half, sums, ball, cut, solve)
         return is_empty(cut) or _bends_down(sums, ball, solve)
     ball *= sqrt(half[0] * half[0] + half[1] * half[1] + half[2] * half[2])

@@ -18,10 +18,10 @@ from optloc.linear.normal import covariance
 from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE, Chart, quantile
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
+from optloc.proof.box import reaches_infinity
 from optloc.proof.chart import Chart as Axes
 from optloc.proof.chart import Cost, cost_of, empty_box
 from optloc.proof.cover import cost_of_point, cover_everywhere, cover_near, room
-from optloc.proof.everywhere import reaches_infinity
 from optloc.proof.pose import pose_costs
 from optloc.proof.scope import crowded, unsupported
 

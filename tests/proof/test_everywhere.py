@@ -7,8 +7,9 @@ from scipy.optimize import least_squares
 
 from optloc.compute.jit import enabled
 from optloc.proof.atlas import atlas_of
+from optloc.proof.box import cube, reaches_infinity
 from optloc.proof.chart import cost_of, empty_box
-from optloc.proof.everywhere import UNBOUNDED, cube, prove_atlas, prove_everywhere, reaches_infinity, set_minimum
+from optloc.proof.everywhere import UNBOUNDED, prove_atlas, prove_everywhere, set_minimum
 from optloc.proof.near import BETTER, OTHER, UNIQUE, VALUE, prove
 from optloc.proof.nodes.node import AZIMUTH, ELEVATION, HEIGHT, LINEAR, RANGE, RATIO
 
@@ -152,6 +153,41 @@ def test_flat_networks_are_proven_where_enclosures_fail(kappa, least):
 def test_flat_networks_in_full(kappa, least):
     enclosure, everywhere = shares(flat_cell(300, 7), kappa)
     assert everywhere >= max(enclosure, least)
+
+
+def wrong_claims(count, seed):
+    """Offer the atlas mirrors of flat networks for fixes, and fixes without their mirrors; return claims and offers."""
+    claims = offers = 0
+    rng = np.random.default_rng(seed)
+    for _ in range(count):
+        S = rng.uniform(-5e3, 5e3, (5, 3)) * [1.0, 1.0, 0.01]
+        x = np.array([*rng.uniform(-1e4, 1e4, 2), rng.uniform(3e3, 11e3)])
+        kinds, data, K, w = differences(S, 7.0, x, rng)
+        found = minima_of(S, K, w, [x, x * [1.0, 1.0, -1.0]])
+        if len(found) < 2:
+            continue
+        (least, best), (more, mirror) = found[:2]
+        cost, box = cost_of(kinds, data, K, w), empty_box(*K.shape)
+        asked = [(mirror, 0.0), (mirror, 25.0)] if more > least + 1e-3 * (1.0 + least) else []
+        asked += [(best, 25.0)] if more < least + 24.0 else []
+        for place, kappa in asked:
+            args = (place, beside([], 3), kappa, 1e-6 * (1.0 + more), 3000, np.zeros(3))
+            claims += prove_atlas(cost, box, *args)[0] in (UNIQUE, VALUE)
+            offers += 1
+    return claims, offers
+
+
+def test_no_mirror_of_a_flat_network_is_proven(seed):
+    claims, offers = wrong_claims(60 if enabled() else 2, 30 + seed)
+    assert claims == 0
+    assert offers > (60 if enabled() else 0)
+
+
+@pytest.mark.full
+def test_no_mirror_of_a_flat_network_is_proven_in_full(seed):
+    claims, offers = wrong_claims(300, 60 + seed)
+    assert claims == 0
+    assert offers > 300
 
 
 def test_a_cost_that_falls_to_infinity_is_no_proof():

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from proof.sampling import numbers, value
 
-from optloc.proof.atlas import atlas_of, home_of, position, set_centre, within
-from optloc.proof.everywhere import cube
+from optloc.proof.atlas import atlas_of, clip_to_corners, home_of, position, set_centre, within
+from optloc.proof.box import cube
 from optloc.proof.nodes.dispatch import bound_pieces, curve_pieces
 from optloc.proof.nodes.node import AZIMUTH, ELEVATION, RANGE, RATIO
 
@@ -154,3 +154,34 @@ def test_a_box_within_another_has_all_its_points_there(d):
         elif (np.abs(s) > sides).any():
             continue
     assert inside > 10
+
+
+@pytest.mark.parametrize("d", [2, 3])
+def test_no_position_between_the_corners_is_cut_off(d):
+    """On faces and inside, near the corners and far off: what is left of a box holds all that lies between them."""
+    rng, parts, lost = np.random.default_rng(5), 0, 0
+    for _ in range(300):
+        atlas = atlas_of(rng.standard_normal(3) * (np.arange(3) < d), float(rng.uniform(0.5, 2.0)), d, 0)
+        piece, half = int(rng.integers(2 * d + 1)), np.zeros(3)
+        half[:d] = rng.uniform(0.01, 0.5, d)
+        at = np.zeros(3)
+        at[:d] = rng.uniform(-0.5, 0.5, d)
+        if piece < 2 * d:
+            at[d - 1] = half[d - 1] * rng.choice([1.0, 2.0])  # infinity is its end, or near
+        back, origin, corners = np.zeros((3, 3)), np.zeros(3), np.zeros((2, 3))
+        back[:d, :d], origin[:d] = rng.standard_normal((d, d)), rng.standard_normal(d)
+        corners[:, :d] = np.sort(rng.standard_normal((2, d)) * 10.0 ** rng.uniform(-1.0, 2.0), axis=0)
+        cut = np.concatenate([-half, half])
+        set_centre(atlas, piece, at)
+        clip_to_corners(atlas, origin, back, corners, half, cut)
+        parts += int((cut[:3] > -half).any() or (cut[3:] < half).any())
+        for u in rng.uniform(-1.0, 1.0, (100, 3)) * half:
+            x = np.zeros(d)
+            set_centre(atlas, piece, at + u)
+            if atlas.scale[0] > 0.0:
+                position(atlas, x)
+                s = back[:, :d] @ (x - origin[:d])
+                inside = (corners[0] <= s).all() and (s <= corners[1]).all()
+                lost += int(inside and ((u < cut[:3]).any() or (u > cut[3:]).any()))
+    assert parts > 100
+    assert lost == 0

@@ -11,9 +11,9 @@ from optloc import Frame, Stations, assemble, measured, with_bias
 from optloc.compute.jit import enabled
 from optloc.proof.atlas import atlas_of, set_centre
 from optloc.proof.batch import costs_at
+from optloc.proof.box import cube
 from optloc.proof.chart import chart_on
 from optloc.proof.curvature import C00, entry
-from optloc.proof.everywhere import cube
 from optloc.proof.pose import pose_costs
 from optloc.proof.runs.posed import pose_runs
 from optloc.proof.runs.prove import costs_of_runs

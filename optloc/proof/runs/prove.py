@@ -15,6 +15,7 @@ from optloc.proof.batch import Answered, Asked, plainly
 from optloc.proof.box import (
     DEPTH,
     bound_nodes,
+    cube,
     push_around,
 )
 from optloc.proof.chart import (
@@ -33,7 +34,6 @@ from optloc.proof.everywhere import (
     INFINITE,
     SPENT,
     UNBOUNDED,
-    cube,
     push_pieces,
     set_axes,
     set_hull,

@@ -23,6 +23,7 @@ from optloc.proof.box import (
     linearise_rows,
     pop,
     push_halves,
+    uncut,
 )
 from optloc.proof.chart import (
     Box,
@@ -284,7 +285,8 @@ def _is_done(
         return False
     box, d = tables.box, space.atlas.dimension if space.far else 3
     _, ball = sum_at(run, space, tables, floor)
-    return has_no_infimum(d, touching, box.half, box.sums, ball, box.solve)
+    uncut(box.half, box.cut)
+    return has_no_infimum(d, touching, box.half, box.sums, ball, box.cut, box.solve)
 
 
 @compiled

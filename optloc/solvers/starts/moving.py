@@ -18,7 +18,7 @@ from optloc.compute.jit import plain
 from optloc.linear.constraints import exact
 from optloc.problem.problem import Problem
 from optloc.proof.atlas import Atlas, atlas_of, position, set_centre
-from optloc.proof.everywhere import cube, reaches_infinity
+from optloc.proof.box import cube, reaches_infinity
 from optloc.proof.nodes.dispatch import bound_pieces
 from optloc.proof.nodes.node import HIGH, LOW, NODE_WIDTH, PHI, RATE, SLOPE0
 from optloc.proof.pose import Posed, pose_costs
