@@ -24,8 +24,8 @@ from optloc.proof.nodes.node import HIGH, LOW, NODE_WIDTH, PHI, RATE, SLOPE0
 from optloc.proof.pose import Posed, pose_costs
 from optloc.proof.scope import is_run, unsupported
 
-# Boxes for each problem, by its dimension; centres that are kept, the cheapest of them. In space 600 boxes missed the best
-# place of 10 emitters of 100, and 2 400 none.
+# Boxes for each problem, by its dimension; centres that are kept, the cheapest of them. In space 600 boxes missed the
+# best place of 10 emitters of 100, and 2 400 none.
 _BUDGET, _MOST = {2: 900, 3: 2400}, 24
 # Metres per second that a target is taken to move at most: above what flies in the air. It orders boxes, and no more: a
 # faster one is found by those that are cheap all the same.
