@@ -11,7 +11,10 @@ import time
 
 import pytest
 from data.windows import report
-from live.lines import arrivals, differences, line, site_in
+from live.lines import Answers, arrivals, differences, line, site_in, slowed
+
+from optloc.cli.live import _threads
+from optloc.live.stream import Settings, Stream
 
 EVENTS = 20_000
 
@@ -92,3 +95,21 @@ def test_latency_at_two_hundred_events_a_second(feed):
         health = json.loads(process.stderr.read().splitlines()[-1])["health"]
     report(f"ms: fixes {health['fix_latency_ms']}, proofs {health['proof_latency_ms']}")
     assert health["fix_latency_ms"]["p99"] <= 20.0
+
+
+@pytest.mark.parametrize("busy", [False, True])
+def test_latency_beside_proofs_of_40_milliseconds(tmp_path, busy):
+    site = site_in(tmp_path)
+    rows = differences(site, arrivals(site, 2000))
+    with _threads():  # as the command has them
+        stream = Stream(slowed(site, busy), Settings(), Answers())
+        began = time.perf_counter()
+        for i, z in enumerate(rows.tolist()):
+            time.sleep(max(began + i / 200.0 - time.perf_counter(), 0.0))
+            stream.inbox.put(stream.lines([line(event=str(i), z=z)], "test"))
+        stream.close()
+        assert stream.ended.wait(60.0)
+    found = stream.health()
+    report(f"proofs {'hold' if busy else 'release'} the lock: fixes {found['fix_latency_ms']} ms")
+    assert sum(found["statuses"].values()) >= len(rows)
+    assert found["fix_latency_ms"]["p99"] <= 20.0

@@ -1,6 +1,8 @@
 """What the tests of streams share: a site, events drawn on it as lines, and a stream that answers them."""
 
 import json
+import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -99,3 +101,32 @@ def solved(site, z, method="auto") -> tuple[Problem, object]:
     ready = site.ready((), site.rows)
     problem = ready.full.problem.with_rows(z=np.asarray(z))
     return problem, solve(problem, method)
+
+
+class Slow:
+    """A prepared problem whose every fix takes 40 ms, as the hardest proofs do.
+
+    It holds the interpreter lock where it is busy, as plain Python does; machine code does not.
+    """
+
+    def __init__(self, prepared, busy):
+        self.prepared, self.busy = prepared, busy
+
+    def __call__(self, z):
+        until = time.perf_counter() + 0.04 * len(np.atleast_2d(z))
+        while self.busy and time.perf_counter() < until:
+            pass
+        time.sleep(max(until - time.perf_counter(), 0.0))
+        return self.prepared(z)
+
+
+def slowed(site, busy=False):
+    """Return a site all of whose proofs are slow."""
+    ready = site.ready((), site.rows)
+    other = replace(ready, full=Slow(ready.full, busy))
+
+    class Other(type(site)):
+        def ready(self, heard, rows):
+            return other
+
+    return Other(*(getattr(site, name) for name in site.__dataclass_fields__))

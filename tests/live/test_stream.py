@@ -6,11 +6,10 @@ import subprocess
 import sys
 import threading
 import time
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from live.lines import EPOCH, SITE, Answers, answers, arrivals, differences, line, site_in, solved
+from live.lines import EPOCH, SITE, Answers, answers, arrivals, differences, line, site_in, slowed, solved
 from typer.testing import CliRunner
 
 from optloc.cli import app
@@ -436,29 +435,6 @@ def test_the_time_of_day_may_jump(fast, monkeypatch):
 # 5. Hard proofs beside the first phase.
 
 
-class Slow:
-    """A prepared problem whose every fix takes 40 ms, as the hardest proofs do, without the interpreter lock."""
-
-    def __init__(self, prepared):
-        self.prepared = prepared
-
-    def __call__(self, z):
-        time.sleep(0.04 * len(np.atleast_2d(z)))
-        return self.prepared(z)
-
-
-def slowed(site):
-    """Return a site all of whose proofs are slow."""
-    ready = site.ready((), site.rows)
-    other = replace(ready, full=Slow(ready.full))
-
-    class Other(type(site)):
-        def ready(self, heard, rows):
-            return other
-
-    return Other(*(getattr(site, name) for name in site.__dataclass_fields__))
-
-
 def test_hard_proofs_do_not_hold_up_fixes(site):
     slow, out = slowed(site), Answers()
     _, lines = whole(site, 100)
@@ -642,6 +618,8 @@ def test_a_reader_that_goes_ends_it(tmp_path):
         (["--phases", "three"], "--phases: 'three' is unknown"),
         (["--partition", "3/2"], "--partition: '3/2' is no part"),
         (["--format", "xml"], "--format: 'xml' is unknown"),
+        (["--track", "--partition", "1/2"], "--track: this process answers a part of the events"),
+        (["--track", "--model", "fast"], "--model: unknown model 'fast'"),
         (["--replay", "none.ndjson"], "there is no such file"),
         (["--replay", "none.ndjson", "--speed", "0"], "--speed: the speed is 0"),
         (["--late", "never"], "--late: 'never' is unknown"),
@@ -653,6 +631,15 @@ def test_options_that_cannot_be_are_one_sentence(tmp_path, words, said):
     assert result.exit_code == 2
     assert said in result.output
     assert len(result.output.splitlines()) == 1
+
+
+def test_a_site_whose_events_make_no_tracks_says_why(tmp_path):
+    arrives = SITE.replace('"tdoa"', '"toa"').replace("arrival_sigma", "sigma").replace('b = "A"\n', "")
+    site_in(tmp_path, arrives)
+    result = CliRunner().invoke(app, ["live", str(tmp_path / "site.toml"), "--track"])
+    assert (result.exit_code, len(result.output.splitlines())) == (2, 1)
+    assert "--track: " in result.output
+    assert "emission times are unknown" in result.output
 
 
 def test_two_processes_share_the_events_of_a_feed(tmp_path):
