@@ -10,7 +10,7 @@ import pytest
 from optloc import Motion, Status, assemble, measured, prepare, simulate, solve
 from optloc.compute.jit import enabled
 from optloc.solvers.methods import Method
-from optloc.solvers.single import at_once, single
+from optloc.solvers.single import single
 
 pytestmark = pytest.mark.skipif(not enabled(), reason="there is no short way without machine code")
 SIGMA, FULL = 5.0, pytest.mark.full
@@ -225,15 +225,6 @@ def test_solve_takes_the_short_way(method, monkeypatch):
     problem, z = network(6), drawn(6, "inside", 20)
     ready = prepare(problem, method)
     monkeypatch.setattr("optloc.solvers.solve_in_stages", None)
-    for one in (z[0], z[1], z[0], z[:3], z[0]):
+    for one in (z[0], z[1], z[0]):
         fix, same = solve(problem.with_rows(z=one), method), ready.short(one)
         assert (fix.shape, fix.x.tobytes(), fix.cov.tobytes()) == (same.shape, same.x.tobytes(), same.cov.tobytes())
-
-
-def test_problems_that_differ_in_more_than_measurements_take_the_stages():
-    problem, z = network(6), drawn(6, "inside", 2)
-    weight = np.array([[1.0] * 6, [0.25] * 6])
-    moved = replace(problem.stations, position=problem.stations.position + np.array([[[[0.0]]], [[[10.0]]]]))
-    for batch in (problem.with_rows(z=z, weight=weight), replace(problem.with_rows(z=z[0]), stations=moved)):
-        assert at_once(batch, Method.parse("auto")) is None
-        assert [one.x.tobytes() for one in solve(batch)] != [solve(problem.with_rows(z=z[0])).x.tobytes()] * 2

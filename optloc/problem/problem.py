@@ -229,12 +229,6 @@ def _arrays(problem: Problem) -> list[tuple[Array, int]]:
     return [(array, core) for part in parts for _, array, core in _numbers(part)]
 
 
-def differs_in_z(problem: Problem) -> bool:
-    """Return whether the problems of a batch differ in measurements alone."""
-    own = [rows.z for rows in problem.rows]
-    return all(array.ndim == core or any(array is z for z in own) for array, core in _arrays(problem))
-
-
 def _map(problem: Problem, change: Any) -> Problem:
     """Return the problem with every numeric array replaced; `change` gets the array and its unbatched rank."""
 

@@ -22,7 +22,7 @@ from optloc.base.types import Array, Certificate, Status, first_status
 from optloc.problem.chart import Chart, quantile
 from optloc.problem.epochs import separable
 from optloc.problem.fix import Alternatives, Fix, Stage
-from optloc.problem.problem import Problem, differs_in_z
+from optloc.problem.problem import Problem
 from optloc.proof.batch import Answered, Asked, empty_answer, lacks_code, prove_here
 from optloc.proof.near import UNIQUE
 from optloc.proof.pose import Affine, Posed, pose_affinely
@@ -365,11 +365,11 @@ _KEPT = Cache["Single | None"](64)
 
 
 def at_once(problem: Problem, method: Method) -> Fix | None:
-    """Return the fix of one problem, or of a few that differ in measurements alone, past all batches.
+    """Return the fix of a problem without batch axes, past all batches; None where only the stages know what to say.
 
-    None where only the stages know what to say. What does not depend on the measurements is kept for the next.
+    What does not depend on the measurements is kept for the next problem of the same structure.
     """
-    if not (is_few(problem.batch_shape) and is_direct(problem) and differs_in_z(problem)):
+    if problem.batch_shape or not is_direct(problem):
         return None
     place = problem.stations.position.tobytes()
     ready = _KEPT.find((method, place, *key_of(problem)), lambda: single(problem, method))

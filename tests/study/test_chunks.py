@@ -5,7 +5,6 @@ import pytest
 from study.texts import plan
 
 import optloc
-from optloc.compute.jit import enabled
 from optloc.study import trial
 from optloc.study.draws import draw
 from optloc.study.methods import run
@@ -40,8 +39,7 @@ def test_columns_are_what_they_say():
     assert (found["cost"] <= found["cost_truth"]).all()
     assert set(found["status"]) == {"unproven"}  # of a method without a proof
     assert (found["seconds"] > 0.0).all()
-    # machine code of fixes from ranges counts none
-    assert found["iterations"].isna().all() if enabled() else (found["iterations"] >= 1.0).all()
+    assert (found["iterations"] >= 1.0).all()
 
 
 def test_costs_of_unrefined_starts_are_those_of_the_likelihood():
