@@ -171,6 +171,16 @@ def test_a_batch_is_its_problems_one_by_one(name):
         agree(alone, fix.x[i][: fix.layout.n_shared], fix.cov[i], fix.cost[i], rtol=1e-9)
 
 
+def test_as_many_problems_as_rows_may_have_stations_of_their_own():
+    """One set of measurements for all: it is not taken for one measurement of each."""
+    rng, n = np.random.default_rng(6), 16
+    places, shift = rng.uniform(-1e3, 1e3, (n, 3)), rng.uniform(-1e4, 1e4, (n, 1, 1, 3))
+    problem = assemble(places, measured("range", a=range(n), sigma=1.0))
+    problem = simulate(problem, np.array([2e3, -1e3, 4e3]), 3)
+    fix = solve(replace(problem, stations=replace(problem.stations, position=places + shift)))
+    assert np.allclose(fix.x, solve(problem).x + shift[:, 0, 0], atol=1e-5)
+
+
 @pytest.mark.parametrize("name", FLAT)
 def test_a_batch_may_have_stations_of_its_own(name):
     """Every problem of the batch is another turn of the scene: all fixes turn back to one."""

@@ -273,7 +273,7 @@ class Quick:
             return in_parts(problem, work)
         z = problem.z if len(problem.rows) > 1 else problem.rows[0].z
         place = problem.stations.position.reshape(-1, *problem.stations.position.shape[-2:])
-        z = z if len(z) == count else np.broadcast_to(z, (count, problem.count))
+        z = z if z.ndim == 2 and len(z) == count else np.broadcast_to(z, (count, problem.count))
         return settle_directly(plan, z, place, problem.take, refinement)
 
 
