@@ -25,6 +25,7 @@ from optloc.problem.layout import Layout
 from optloc.problem.noise import variances, whiten
 from optloc.problem.problem import Problem
 from optloc.proof.pose import project_out, whiten_rows
+from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.policy import EQUAL_COST
 from optloc.solvers.pool import Curvature, Pool, in_parts
 from optloc.solvers.stages import gtrs, lsr, lsr_with_mirror
@@ -304,7 +305,7 @@ def settle_directly(
     """
     began = perf_counter()
     answer, steps = fix_directly(direct, z, position, threads)
-    left = np.flatnonzero(~_is_final(direct, answer))
+    left = np.flatnonzero(~_is_final(direct, answer, pose))
     if not len(left):
         return _pool(direct, answer, steps, began)
     # most of what is left lacks nothing but a start: the eigenvalues of its pencil give one
@@ -315,7 +316,7 @@ def settle_directly(
     for whole, part in zip(answer, more, strict=True):
         whole[left] = part
     pool = _pool(direct, answer, max(steps, again), began)
-    lost = np.flatnonzero(~_is_final(direct, more))
+    lost = np.flatnonzero(~_is_final(direct, more, some.take))
     if not len(lost):
         return pool
     start = take(start, lost)
@@ -405,13 +406,19 @@ def fix_directly(
     return answer, max(mapped(work, range(0, count, _CHUNK), threads), default=0)
 
 
-def _is_final(direct: Direct, answer: Answer) -> Array:
-    """Return which fixes (N,) need no other means: settled ones that are not one of a pair that costs the same."""
+def _is_final(direct: Direct, answer: Answer, pose: Callable[[Array], Problem]) -> Array:
+    """Return which fixes (N,) need no other means: settled ones that are not one of a pair that costs the same.
+
+    On Earth those which it hides from a station are not final either: what lies before it competes, and is told.
+    """
     if not direct.frame.geodetic:
         return answer.settled
     # of minima on Earth that cost the same the one that is seen better is the answer: the verdict has the rule
     apart = np.abs(answer.rival_cost - answer.cost)
-    return np.asarray(answer.settled & ~(apart <= EQUAL_COST * (1.0 + answer.cost)))
+    out = answer.settled & ~(apart <= EQUAL_COST * (1.0 + answer.cost))
+    items = np.flatnonzero(out)
+    out[items] = ~is_hidden(pose(items), answer.x[items])
+    return np.asarray(out)
 
 
 def _pool(direct: Direct, answer: Answer, steps: int, began: float) -> Pool:

@@ -40,6 +40,17 @@ def test_a_misfit_before_the_horizon_tells_what_lies_behind_it():
     assert fix.certificate.item().reason == BARRED.format("the Earth hides it from a satellite")
 
 
+@pytest.mark.parametrize("method", ["auto", "gtrs+lsr"])
+def test_the_earth_hides_from_a_batch_what_it_hides_from_one(method):
+    """Machine code of many fixes knows nothing of the Earth: what it finds behind it is no answer."""
+    one = heard()
+    many = one.with_rows(z=np.tile(one.z, (20, 1)))
+    alone = optloc.solve(one, method)
+    for fix in (optloc.solve(many, method), optloc.prepare(one, method)(many.z)):
+        assert (fix.code == alone.code).all()
+        assert all("behind the Earth" in reason for reason in fix.reason)
+
+
 def test_without_earth_and_constraint_nothing_is_said_to_forbid():
     assert "constraint" not in LOST
     assert "Earth" not in LOST
