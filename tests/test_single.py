@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from optloc import Motion, Status, assemble, measured, prepare, simulate, solve
+from optloc import ECEF, Frame, Motion, Status, assemble, measured, prepare, simulate, solve
 from optloc.compute.jit import enabled
 from optloc.solvers.methods import Method
 from optloc.solvers.single import single
@@ -102,6 +102,31 @@ def test_single_fixes_equal_a_batch(count, rows, place, method):
     assert short >= (0.9 if rows > 4 else 0.5) * clean.sum()
     # a batch puts its stragglers off, and begins anew from where they are: a few differ in the last bits
     assert same >= 0.95 * short
+
+
+@pytest.mark.parametrize("method", ["auto", "gtrs+lsr"])
+def test_a_site_on_earth_takes_the_short_way(method):
+    problem = replace(network(6), frame=Frame.enu(48.2, 11.6, 500.0))
+    z = np.concatenate([drawn(6, "inside", 12), drawn(6, "outside", 12)])
+    batch, ready = solve(problem.with_rows(z=z), method), prepare(problem, method)
+    short = [ready.short(one) for one in z]
+    assert sum(fix is not None for fix in short) >= 20
+    for i, fix in enumerate(short):
+        if fix is not None:
+            check_same(fix, batch[i])
+
+
+def test_what_the_earth_hides_does_not_take_the_short_way():
+    """Ranges from satellites meet behind the Earth as well as before it."""
+    up = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [-0.5, 0.4, 0.77], [0.1, -0.7, 0.71], [0.3, 0.6, 0.74]])
+    place = 2.6e7 * up / np.linalg.norm(up, axis=1, keepdims=True)
+    behind = np.array([2e4, -3e4, -6.35e6])
+    problem = assemble(place, measured("range", a=np.arange(5), sigma=SIGMA), frame=ECEF)
+    ready = prepare(problem, "gtrs+lsr")
+    z = np.linalg.norm(place - behind, axis=1)
+    assert ready.short(z) is None
+    assert ready(z).status != Status.OK
+    assert ready.short(np.linalg.norm(place + behind, axis=1)) is not None
 
 
 @pytest.mark.parametrize(

@@ -442,4 +442,4 @@ def _directions(d: int) -> Array:
 
 def one_place(problem: Problem) -> bool:
     """Return whether the unknowns of a problem are one position of one epoch and what goes with it."""
-    return problem.epochs == 1 and any(slot.name == "position" for slot in problem.layout.shared)
+    return problem.epochs == 1 and problem.layout.shares("position")

@@ -96,7 +96,7 @@ def single(problem: Problem, fix: Fix) -> tuple[Problem, Fix]:
     """Return a problem and its fix as flat batches of one; refuse what has no answer or not one position."""
     flat, answer = problem.flat(), fix.flat()
     sought = sum(motion.known is None for motion in problem.motions)
-    if len(answer) != 1 or sought != 1 or not any(slot.name == "position" for slot in flat.layout.shared):
+    if len(answer) != 1 or sought != 1 or not flat.layout.shares("position"):
         what = f"{len(answer)} fixes of {sought} targets are more than one position"
         raise InvalidProblem(what, "plot", "draw one epoch, or a run of one target")
     if not np.isfinite(answer.x).all():

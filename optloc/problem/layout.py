@@ -87,6 +87,10 @@ class Layout:
         known = ", ".join(slot.name for slot in (*self.shared, *self.local))
         raise InvalidProblem(f"no unknown is called {name!r}", advice=f"this problem has {known}")
 
+    def shares(self, name: str) -> bool:
+        """Return whether there is a shared unknown of this name."""
+        return any(slot.name == name for slot in self.shared)
+
     def split(self, x: Array) -> tuple[Array, Array]:
         """Return the shared part (..., n) and the local part (..., k, l) of vectors (..., size)."""
         n = self.n_shared

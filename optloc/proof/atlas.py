@@ -19,8 +19,8 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
-from optloc.proof.nodes.node import Triple, blend, inner, pull, triple
+from optloc.compute.jit import compiled, inlined
+from optloc.proof.nodes.node import Triple, blend, inner, reach, triple, write
 
 
 class Minima(NamedTuple):
@@ -65,7 +65,7 @@ class Atlas(NamedTuple):
         The home of the piece (itself but around minima), then coordinates there of the centre, and their derivative.
     away, away_b, sense, sense_b : arrays
         Scaled lines to a node's stations, and their derivatives.
-    bend, second : array (3, 3)
+    bend : array (3, 3)
         Second derivatives.
     """
 
@@ -83,7 +83,6 @@ class Atlas(NamedTuple):
     sense: Array
     sense_b: Array
     bend: Array
-    second: Array
 
 
 @compiled
@@ -104,7 +103,7 @@ def atlas_of(middle: Array, radius: float, dimension: int, count: int) -> Atlas:
 def with_minima(middle: Array, radius: float, dimension: int, minima: Minima) -> Atlas:
     """Return the pieces around a cube and around known minima."""
     # One array for all vectors and one for all matrices: an atlas is made for every fix.
-    vectors, matrices = np.zeros((3, 3)), np.zeros((6, 3, 3))
+    vectors, matrices = np.zeros((3, 3)), np.zeros((5, 3, 3))
     return Atlas(
         middle,
         radius,
@@ -120,7 +119,6 @@ def with_minima(middle: Array, radius: float, dimension: int, minima: Minima) ->
         matrices[2],
         matrices[3],
         matrices[4],
-        matrices[5],
     )
 
 
@@ -151,37 +149,37 @@ def set_centre(atlas: Atlas, piece: int, at: Array) -> None:
         Centre in the coordinates of the piece.
     """
     d, place, linear = atlas.dimension, atlas.place, atlas.linear
-    linear[:] = 0.0
     around = piece - 2 * d - 1
-    # All below is in the coordinates of the home; around a minimum these turn with its axes.
+    # All below is in the coordinates of the home; around a minimum these turn with its axes. Entry by entry: slices of
+    # arrays cost more than all else here.
     place[0] = piece if around < 0 else atlas.minima.home[around]
+    for k in range(3):
+        for m in range(3):
+            linear[k, m] = 1.0 if around < 0 and k == m and k < d else 0.0
     for k in range(d):
-        if around < 0:
-            place[1 + k], linear[k, k] = at[k], 1.0
-            continue
-        place[1 + k] = atlas.minima.start[around, k]
-        for m in range(d):
-            linear[k, m] = atlas.minima.axes[around, k, m]
-            place[1 + k] += linear[k, m] * at[m]
+        place[1 + k] = at[k] if around < 0 else atlas.minima.start[around, k]
+        if around >= 0:
+            for m in range(d):
+                linear[k, m] = atlas.minima.axes[around, k, m]
+                place[1 + k] += linear[k, m] * at[m]
     _set_home(atlas, int(place[0]))
 
 
 @compiled
 def _set_home(atlas: Atlas, home: int) -> None:
-    d, place, linear, scale = atlas.dimension, atlas.place, atlas.linear, atlas.scale
-    # Inside the cube v is 1 and does not change; on a face it is the last coordinate.
-    scale[:] = 0.0
-    scale[0] = 1.0
+    d, place, linear, scale, slant = atlas.dimension, atlas.place, atlas.linear, atlas.scale, atlas.slant
     column = 0
     for k in range(d):
-        atlas.slant[k] = 0.0
-        if k == home // 2:
-            atlas.point[k] = 1.0 if home % 2 else -1.0
-        else:
-            atlas.point[k], atlas.slant[k] = place[1 + column], linear[column]
-            column += 1
-    if home < 2 * d:
-        scale[0], scale[1:4] = place[d], linear[d - 1]
+        level = k == home // 2  # the coordinate that is level all over a face
+        atlas.point[k] = (1.0 if home % 2 else -1.0) if level else place[1 + column]
+        for m in range(3):
+            slant[k, m] = 0.0 if level else linear[column, m]
+        column += 0 if level else 1
+    # Inside the cube v is 1 and does not change; on a face it is the last coordinate.
+    face = home < 2 * d
+    scale[0] = place[d] if face else 1.0
+    for m in range(3):
+        scale[1 + m] = linear[d - 1, m] if face else 0.0
 
 
 @compiled
@@ -255,6 +253,40 @@ def within(atlas: Atlas, half: Array, i: int, sides: Array) -> bool:
     return True
 
 
+class Frame(NamedTuple):
+    """Where a box lies, in numbers alone: machine code counts references to every array that it hands on.
+
+    Parameters
+    ----------
+    middle : triple
+        Centre of the cube, metres.
+    radius : float
+        Half its side.
+    space : bool
+        Whether there are three dimensions.
+    point, slant : triple, three triples
+        p at the centre of the box, and the rows of its derivative.
+    scale, rise : float, triple
+        v there, and its derivative.
+    """
+
+    middle: Triple
+    radius: float
+    space: bool
+    point: Triple
+    slant: tuple[Triple, Triple, Triple]
+    scale: float
+    rise: Triple
+
+
+@inlined
+def frame_of(atlas: Atlas) -> Frame:
+    """Return where the centre that `set_centre` has set lies."""
+    slant = (triple(atlas.slant[0], 0), triple(atlas.slant[1], 0), triple(atlas.slant[2], 0))
+    point, rise = triple(atlas.point, 0), triple(atlas.scale, 1)
+    return Frame(triple(atlas.middle, 0), atlas.radius, atlas.dimension == 3, point, slant, atlas.scale[0], rise)
+
+
 # What a few sums and products round, relative to their sizes, and a thousand times that.
 _BEYOND = 1e-12
 
@@ -277,51 +309,64 @@ def clip_to_corners(atlas: Atlas, origin: Array, back: Array, corners: Array, ha
     half, cut : array (3,), (6,)
         Half-widths of the box, and ends of what is left of it, clipped.
     """
-    scale, slope, size = atlas.scale, np.empty(4), np.empty(4)  # of v times a coordinate: at the centre, then along u
+    frame, h = frame_of(atlas), triple(half, 0)
+    s0, s1, s2 = frame.slant
+    m0, m1, m2 = frame.middle
+    apart, most = (m0 - origin[0], m1 - origin[1], m2 - origin[2]), abs(frame.scale) + reach(frame.rise, h)
     for k in range(3):
+        b = triple(back[k], 0)
+        # v times the coordinate: at the centre, its derivative, and what both round relative to.
+        away = inner(b, apart)
+        middle = frame.radius * inner(b, frame.point) + away * frame.scale
+        slant = blend(1.0, blend(b[0], s0, b[1], s1), b[2], s2)
+        steep, blur = blend(frame.radius, slant, away, frame.rise), 0.0
+        for m in range(3):
+            size = frame.radius * (abs(frame.point[m]) + reach(frame.slant[m], h))
+            blur += abs(b[m]) * (size + (abs(frame.middle[m]) + abs(origin[m])) * most)
         for side in range(2):
             sign, end = (-1.0, corners[0, k]) if side == 0 else (1.0, corners[1, k])
-            for c in range(4):
-                slope[c], size[c] = -sign * end * scale[c], abs(end * scale[c])
-                for m in range(atlas.dimension):
-                    p = atlas.radius * (atlas.point[m] if c == 0 else atlas.slant[m, c - 1])
-                    slope[c] += sign * back[k, m] * (p + (atlas.middle[m] - origin[m]) * scale[c])
-                    size[c] += abs(back[k, m]) * (abs(p) + (abs(atlas.middle[m]) + abs(origin[m])) * abs(scale[c]))
-            # slope.(1, u) <= 0 is asked of u: from the lowest corner of the box there is so much room.
-            room = _BEYOND * size[0] - slope[0]
-            for c in range(3):
-                room += (abs(slope[1 + c]) + _BEYOND * size[1 + c]) * half[c]
+            slope = blend(sign, steep, -sign * end, frame.rise)
+            # How far the coordinate is beyond the end, times v, must not be positive: from the lowest corner of the box
+            # there is so much room.
+            room = reach(slope, h) - sign * (middle - end * frame.scale) + _BEYOND * (blur + abs(end) * most)
             if room < 0.0:
                 cut[0], cut[3] = 1.0, -1.0
                 return
             for c in range(3):
-                steep = abs(slope[1 + c])
-                if steep > 0.0 and room < 2.0 * steep * half[c]:
-                    most = room / steep - half[c] + _BEYOND * half[c]
-                    if slope[1 + c] > 0.0:
-                        cut[3 + c] = min(cut[3 + c], most)
+                size = abs(slope[c])
+                if size > 0.0 and room < 2.0 * size * half[c]:
+                    far = room / size - half[c] + _BEYOND * half[c]
+                    if slope[c] > 0.0:
+                        cut[3 + c] = min(cut[3 + c], far)
                     else:
-                        cut[c] = max(cut[c], -most)
+                        cut[c] = max(cut[c], -far)
 
 
-@compiled
-def set_line(atlas: Atlas, data: Array, first: int, away: Array, sense: Array) -> None:
+@inlined
+def _station(frame: Frame, data: Array, first: int) -> Triple:
+    """Return the station a at data[first:first + 3] in the units of the cube."""
+    m0, m1, m2 = frame.middle
+    radius = frame.radius
+    third = (data[first + 2] - m2) / radius if frame.space else 0.0
+    return (data[first] - m0) / radius, (data[first + 1] - m1) / radius, third
+
+
+@inlined
+def set_line(frame: Frame, data: Array, first: int, away: Array, sense: Array) -> None:
     """Write the scaled line p - v a to the station at data[first:first + 3], and its derivative."""
-    for k in range(atlas.dimension):
-        a = (data[first + k] - atlas.middle[k]) / atlas.radius
-        away[k] = atlas.point[k] - atlas.scale[0] * a
-        for m in range(3):
-            sense[k, m] = atlas.slant[k, m] - a * atlas.scale[1 + m]
+    a0, a1, a2 = _station(frame, data, first)
+    write(blend(1.0, frame.point, -frame.scale, (a0, a1, a2)), away)
+    s0, s1, s2 = frame.slant
+    sense[0, 0], sense[0, 1], sense[0, 2] = blend(1.0, s0, -a0, frame.rise)
+    sense[1, 0], sense[1, 1], sense[1, 2] = blend(1.0, s1, -a1, frame.rise)
+    sense[2, 0], sense[2, 1], sense[2, 2] = blend(1.0, s2, -a2, frame.rise)
 
 
-@compiled
-def scaled_station(atlas: Atlas, data: Array) -> tuple[float, float, Triple]:
+@inlined
+def scaled_station(frame: Frame, data: Array) -> tuple[float, float, Triple]:
     """Return ``|a|`` of a station a, and ``N = -2 a.p + v |a|^2`` with its gradient, a constant."""
-    a = (
-        (data[0] - atlas.middle[0]) / atlas.radius,
-        (data[1] - atlas.middle[1]) / atlas.radius,
-        (data[2] - atlas.middle[2]) / atlas.radius if atlas.dimension == 3 else 0.0,
-    )
+    a = _station(frame, data, 0)
     squared = inner(a, a)
-    n = blend(-2.0, pull(a, atlas.slant), squared, triple(atlas.scale, 1))
-    return sqrt(squared), atlas.scale[0] * squared - 2.0 * inner(a, triple(atlas.point, 0)), n
+    s0, s1, s2 = frame.slant
+    n = blend(1.0, blend(a[0], s0, a[1], s1), a[2], s2)
+    return sqrt(squared), frame.scale * squared - 2.0 * inner(a, frame.point), blend(-2.0, n, squared, frame.rise)

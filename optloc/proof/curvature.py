@@ -326,6 +326,8 @@ def has_no_infimum(
 @compiled
 def _bends_down(sums: Array, ball: float, hessian: Array) -> bool:
     """Return whether the cost curves downwards along one direction all over a box, as around a saddle."""
+    if positive(sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], sums[H22]):  # nowhere, at the centre
+        return False
     vectors = np.empty((3, 3))
     for k in range(3):
         for m in range(3):

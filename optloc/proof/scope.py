@@ -39,7 +39,7 @@ def _reasons(problem: Problem) -> Iterator[str]:
         yield f"there are {len(problem.motions)} targets, and the proof is for one"
         return
     motion = problem.motions[0]
-    if motion.known is not None or not any(slot.name == "position" for slot in problem.layout.shared):
+    if motion.known is not None or not problem.layout.shares("position"):
         yield "no position is common to all rows"
     if motion.order > 0:
         yield "the target moves, and the proof is for one that stays"

@@ -392,7 +392,7 @@ def lines_of_position(problem: Problem, fix: Fix, limits: tuple[float, float, fl
     flat, x = problem.flat(), fix.flat().x[0]
     if flat.batch_shape != (1,) or not np.isfinite(x).all():
         return []
-    slot, shared = flat.layout.find("position") if _has_position(flat) else (None, False)
+    slot, shared = flat.layout.find("position") if flat.layout.shares("position") else (None, False)
     if slot is None or not shared:
         return []
     lon, lat = _beyond(*limits[:2]), np.clip(_beyond(*limits[2:]), -_POLE, _POLE)
@@ -424,7 +424,3 @@ def _beyond(low: float, high: float) -> Array:
     """Return a grid that goes beyond the limits of a map, whose window may be wider or taller."""
     rim = _RIM * (high - low)
     return np.linspace(low - rim, high + rim, _GRID)
-
-
-def _has_position(problem: Problem) -> bool:
-    return any(slot.name == "position" for slot in problem.layout.shared)

@@ -6,13 +6,13 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import Annotated, TypeVar
+from typing import Annotated, NamedTuple, TypeVar
 
 import numpy as np
 
 from optloc.base.errors import NUMERICAL
 from optloc.base.records import Axes, join, overwrite
-from optloc.base.types import Array, Status
+from optloc.base.types import Array, Certificate, Status
 from optloc.linear.normal import degrees_of_freedom
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
@@ -53,6 +53,24 @@ class Curvature:
     active: Annotated[Array, Axes(0, empty=())] | None = None
     local: Annotated[Array, Axes(3)] | None = None
     kappa: Annotated[Array, Axes(1)] | None = None
+
+
+class Claim(NamedTuple):
+    """What was tried to prove of a fix, and of what it was tried.
+
+    Parameters
+    ----------
+    cost : float
+        Of the fix.
+    listed : int
+        How many other minima were known.
+    certificate : Certificate
+        What came of it.
+    """
+
+    cost: float
+    listed: int
+    certificate: Certificate
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,6 +115,8 @@ class Pool:
         What a stage has to say beside the status.
     certificate : object array (N,), optional
         `Certificate` of what is proven of the best candidates, None where nobody has tried.
+    claims : object array (N,), optional
+        What a branch before has tried to prove, a `Claim`: it stands where nothing new was found. None elsewhere.
     hidden : object array (N,), optional
         What lies behind the Earth, in words; "" where nothing does.
     asked : bool
@@ -124,6 +144,7 @@ class Pool:
     searched: Annotated[Array, Axes(0, empty=False)] | None = None
     remark: Annotated[Array, Axes(0, empty="")] | None = None
     certificate: Annotated[Array, Axes(0, empty=None)] | None = None
+    claims: Annotated[Array, Axes(0, empty=None)] | None = None
     hidden: Annotated[Array, Axes(0, empty="")] | None = None
     asked: bool = False
     refuted: str = ""

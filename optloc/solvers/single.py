@@ -29,6 +29,7 @@ from optloc.proof.pose import Affine, Posed, pose_affinely
 from optloc.proof.scope import is_run, unsupported
 from optloc.solvers.certify.branch_and_bound import budgets, certify_stage, equal_cost, state_claim
 from optloc.solvers.certify.posed import agrees
+from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.methods import Method
 from optloc.solvers.policy import COVERED, DOUBT, LISTED_GAP, REFUTED
 from optloc.solvers.range_fixes import (
@@ -92,6 +93,8 @@ class _Room:
         Of the charts.
     kept : dict
         Fields of a fix that are the same for all measurements; nobody can write into them.
+    many : Problem, optional
+        n times the problem, on Earth: of what it hides no measurement matters.
     checked : bool
         Whether the posed cost of a fix was compared with its own.
     """
@@ -103,6 +106,7 @@ class _Room:
     answered: Answered
     centre: Array
     kept: dict[str, Any]
+    many: Problem | None
     checked: bool = False
 
 
@@ -171,6 +175,8 @@ class Single:
         for cost, settled, rival in zip(costs, answer.settled.tolist(), answer.rival_cost.tolist(), strict=True):
             if not settled or rival < np.inf or not cost <= self.doubt:
                 return None
+        if room.many is not None and is_hidden(room.many, x).any():  # the stages say what lies behind the Earth
+            return None
         fixed = perf_counter()
         stages = direct_stages(n, steps, fixed - began)
         claims: list[Certificate] | None = [LOCAL] * n
@@ -293,7 +299,8 @@ class Single:
             "dof": np.broadcast_to(np.int32(self.plan.dof), shape),
             "weights": np.broadcast_to(self.plan.weight, (*shape, m)),
         }
-        return _Room(np.empty((n, m)), found, pose, asked, empty_answer(n, d), centre, kept)
+        many = self.problem.with_rows(z=np.zeros((n, m))) if self.problem.frame.geodetic else None
+        return _Room(np.empty((n, m)), found, pose, asked, empty_answer(n, d), centre, kept, many)
 
 
 @lru_cache(maxsize=64)
@@ -334,8 +341,6 @@ def single(problem: Problem, method: Method, *, often: bool = True) -> Single | 
 
     proves = _WORDS.get(method.words)
     if proves is None or (method.then is not None and not proves) or separable(problem):
-        return None
-    if problem.frame.geodetic:  # what the Earth hides is judged by the stages
         return None
     bare = problem.with_rows(z=np.zeros(problem.count))
     plan = None if bare.batch_shape else direct(bare)

@@ -440,7 +440,7 @@ def _check(problem: Problem, fix: Fix) -> None:
     if fix.shape != () or int(np.prod(problem.batch_shape)) != 1:
         raise InvalidProblem("a region or samples are those of one fix, and these are several", "fix", advice)
     motion = problem.motions[0]
-    shared = any(slot.name == "position" for slot in problem.layout.shared)
+    shared = problem.layout.shares("position")
     if len(problem.motions) > 1 or motion.order > 0 or motion.known is not None or not shared:
         raise InvalidProblem("a region or samples are those of one position that stays", "problem")
     if exact(problem):

@@ -242,7 +242,7 @@ def check_leaves(rng, d):
     cost = made.cost
     floor = accuracy_floor_far(cost, atlas)
     if not ends or d == 3:  # a minimum, not a saddle
-        curve_pieces(atlas, made.kinds, made.data, np.zeros(3), box.curves)
+        curve_pieces(atlas, made.kinds, made.data, np.zeros(3), box.nodes, box.curves)
         sum_up(cost.K, cost.w, cost.weight, 0.0, box.nodes, box.curves, box.sums)
         keep = d - 1 if ends else d
         H = box.sums[[[0, 1, 2], [1, 3, 4], [2, 4, 5]]][:keep, :keep]

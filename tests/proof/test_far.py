@@ -99,12 +99,13 @@ def test_gradients_and_hessians_change_no_more_than_bounded(d):
         at, half = some_box(d, piece, rng)
         nodes, curves, there, bent = (np.zeros((len(kinds), size)) for size in (6, 14, 6, 14))
         set_centre(atlas, piece, at)
-        curve_pieces(atlas, kinds, data, half, curves)
+        bound_pieces(atlas, kinds, data, half, nodes)
+        curve_pieces(atlas, kinds, data, half, nodes, curves)
         bound_pieces(atlas, kinds, data, np.zeros(3), nodes)
         for _ in range(20):
             set_centre(atlas, piece, at + rng.uniform(-1.0, 1.0, 3) * half)
             bound_pieces(atlas, kinds, data, np.zeros(3), there)
-            curve_pieces(atlas, kinds, data, np.zeros(3), bent)
+            curve_pieces(atlas, kinds, data, np.zeros(3), there, bent)
             for j in np.flatnonzero(curves[:, 9] < np.inf):
                 counted += 1
                 change = np.abs(np.linalg.eigvalsh(full(bent[j] - curves[j]))).max()

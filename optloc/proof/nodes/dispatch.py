@@ -18,12 +18,12 @@ from typing import Any
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.compute.jit import compiled, inlined, renew, replace
-from optloc.proof.atlas import set_line
+from optloc.proof.atlas import frame_of, set_line
 from optloc.proof.nodes import node as columns
 from optloc.proof.nodes.angles import HORIZONTAL_ANGLE, VERTICAL_ANGLE
 from optloc.proof.nodes.level import GEODETIC_HEIGHT, LINEAR_FORM
 from optloc.proof.nodes.node import DIFFERENCE, FLAT, GROWS, MIXED, SCALED, Node, range_form, triple
-from optloc.proof.nodes.range import DISTANCE, bound_difference, curve_difference
+from optloc.proof.nodes.range import DISTANCE, bound_difference, curve_centre, curve_difference
 from optloc.proof.nodes.rate import RATE_OF_RANGE
 from optloc.proof.nodes.ratio import RATIO_OF_RANGES
 
@@ -117,26 +117,38 @@ def curve_others(kinds, data, centre, sense, half, line, second, nodes, curves):
     "bound_pieces": """
 def bound_pieces(atlas, kinds, data, half, nodes):
     away, away_b, sense, sense_b = atlas.away, atlas.away_b, atlas.sense, atlas.sense_b
-    centre = range_form(atlas.point, atlas.slant, triple(half, 0))
+    frame, h = frame_of(atlas), triple(half, 0)
+    centre = range_form(atlas.point, atlas.slant, h)
     for j in range(kinds.shape[0]):
-        kind, own, slope = kinds[j], data[j], nodes[j, SLOPE0 : SLOPE2 + 1]
+        kind, own = kinds[j], data[j]
         if kind == RANGE:
-            value, low, high = bound_difference(atlas, own, centre, half, slope)
-        else:
-            set_line(atlas, own, 0, away, sense)
+            value, low, high, g = bound_difference(frame, own, centre, h, away, sense)
+            nodes[j, SLOPE0], nodes[j, SLOPE1], nodes[j, SLOPE2] = g
+            nodes[j, PHI], nodes[j, LOW], nodes[j, HIGH] = value, low, high
+            continue
+        slope = nodes[j, SLOPE0 : SLOPE2 + 1]
+        set_line(frame, own, 0, away, sense)
 {cases}
         nodes[j, PHI], nodes[j, LOW], nodes[j, HIGH] = value, low, high
 """,
     "curve_pieces": """
-def curve_pieces(atlas, kinds, data, half, curves):
+def curve_pieces(atlas, kinds, data, half, nodes, curves):
     away, away_b, sense, sense_b, bend = atlas.away, atlas.away_b, atlas.sense, atlas.sense_b, atlas.bend
-    centre = range_form(atlas.point, atlas.slant, triple(half, 0))
+    frame, h = frame_of(atlas), triple(half, 0)
+    centre = range_form(atlas.point, atlas.slant, h)
+    bent = curve_centre(atlas.slant, centre, h)
     for j in range(kinds.shape[0]):
-        kind, own, turn = kinds[j], data[j], curves[j, TURN0 : TURN2 + 1]
+        kind, own = kinds[j], data[j]
         if kind == RANGE:
-            chi = curve_difference(atlas, own, centre, half, turn)
-        else:
-            set_line(atlas, own, 0, away, sense)
+            flat = nodes[j, SLOPE0] == 0.0 and nodes[j, SLOPE1] == 0.0 and nodes[j, SLOPE2] == 0.0
+            second, turns, chi = curve_difference(frame, own, centre, bent, h, flat, away, sense)
+            curves[j, H00], curves[j, H01], curves[j, H02] = second[0], second[1], second[2]
+            curves[j, H11], curves[j, H12], curves[j, H22] = second[3], second[4], second[5]
+            curves[j, TURN0], curves[j, TURN1], curves[j, TURN2] = turns
+            curves[j, CHI] = chi
+            continue
+        turn = curves[j, TURN0 : TURN2 + 1]
+        set_line(frame, own, 0, away, sense)
 {cases}
         curves[j, CHI] = chi
         column = 0
@@ -162,7 +174,7 @@ def _far_case(node: Node, code: int, call: str) -> list[str]:
         return []
     if node.points == 1:
         return [call.format(code, "away, sense")]
-    return ["set_line(atlas, own, 3, away_b, sense_b)", call.format(code, "away, sense, away_b, sense_b")]
+    return ["set_line(frame, own, 3, away_b, sense_b)", call.format(code, "away, sense, away_b, sense_b")]
 
 
 def _cases(name: str, nodes: list[Node]) -> Iterator[str]:
@@ -172,7 +184,7 @@ def _cases(name: str, nodes: list[Node]) -> Iterator[str]:
         call = "value, low, high = bound_{}(own, {}, half, slope)"
     else:
         call = f"chi = curve_{{}}(own, {{}}, half, {'second' if near else 'bend'}, turn)"
-    indent, word = " " * (8 if near else 12), "if"
+    indent, word = " " * 8, "if"
     for code, node in enumerate(nodes):
         if node.infinity == DIFFERENCE:
             continue
@@ -195,8 +207,11 @@ def text_of(name: str, nodes: list[Node]) -> str:
 
 _KERNELS = ("bound", "curve", "size", "ball", "ray")
 # What the loops name beside the functions of the nodes.
-_NAMED = (range_form, triple, set_line, bound_difference, curve_difference)
-_COLUMNS = ("RANGE", "PHI", "SLOPE0", "SLOPE1", "SLOPE2", "LOW", "HIGH", "TURN0", "TURN2", "CHI", "FORCE")
+_NAMED = (range_form, triple, frame_of, set_line, bound_difference, curve_centre, curve_difference)
+_COLUMNS = (
+    *("RANGE", "PHI", "SLOPE0", "SLOPE1", "SLOPE2", "LOW", "HIGH"),
+    *("H00", "H01", "H02", "H11", "H12", "H22", "TURN0", "TURN1", "TURN2", "CHI", "FORCE"),
+)
 
 
 def _kernels(node: Node) -> Iterator[tuple[str, Any]]:

@@ -36,7 +36,7 @@ from typing import Any
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
+from optloc.compute.jit import compiled, inlined
 from optloc.problem.problem import Problem
 
 # Codes of the shipped nodes, by which machine code knows them; nodes from outside are counted on. ANY stands for a node
@@ -183,6 +183,8 @@ class Node:
 # A box is ``|s_k| <= h_k``; a linear form u.s is the triple of its coefficients.
 
 Triple = tuple[float, float, float]
+# A symmetric matrix: entries 00, 01, 02, 11, 12, 22. Numbers, not an array: machine code keeps them in registers.
+Symmetric = tuple[float, float, float, float, float, float]
 # A range over a box, see `range_form`.
 RangeForm = tuple[float, Triple, float, float, float]
 
@@ -277,7 +279,7 @@ def scaled(low: float, high: float, least: float, most: float) -> tuple[float, f
     return low / (least if low < 0.0 else most), high / (least if high > 0.0 else most)
 
 
-@compiled
+@inlined
 def excess(along: float, across: float) -> float:
     """Return a bound of ``hypot(a, b) - a`` for all a >= along and |b| <= across: it falls with a."""
     whole = sqrt(along * along + across * across)
@@ -285,7 +287,7 @@ def excess(along: float, across: float) -> float:
     return across * across / (whole + along) if along > 0.0 else whole - along
 
 
-@compiled
+@inlined
 def greatest(a: float, b: float, c: float, d: float, e: float, f: float) -> float:
     """Return the maximum of s'[[a, b, c], [b, d, e], [c, e, f]]s, positive semidefinite, over |s_k| <= 1.
 
@@ -300,7 +302,7 @@ def greatest(a: float, b: float, c: float, d: float, e: float, f: float) -> floa
     return max(0.0, a + d + f + 2.0 * mixed)
 
 
-@compiled
+@inlined
 def across(sense: Array, u: Triple, h: Triple) -> float:
     """Return a bound over a box of the length of ``sense s`` without its part along a unit vector.
 
@@ -313,18 +315,13 @@ def across(sense: Array, u: Triple, h: Triple) -> float:
     h : triple
         Half-widths.
     """
-    form = greatest(
-        _gram(sense, u, 0, 0) * h[0] * h[0],
-        _gram(sense, u, 0, 1) * h[0] * h[1],
-        _gram(sense, u, 0, 2) * h[0] * h[2],
-        _gram(sense, u, 1, 1) * h[1] * h[1],
-        _gram(sense, u, 1, 2) * h[1] * h[2],
-        _gram(sense, u, 2, 2) * h[2] * h[2],
-    )
+    g = _gram(sense, u)
+    h0, h1, h2 = h
+    form = greatest(g[0] * h0 * h0, g[1] * h0 * h1, g[2] * h0 * h2, g[3] * h1 * h1, g[4] * h1 * h2, g[5] * h2 * h2)
     return sqrt(form)
 
 
-@compiled
+@inlined
 def range_form(line: Array, sense: Array, h: Triple) -> RangeForm:
     """Return a range over a box: its value r, slope u, the least r + u.s, a bound of the remainder, and the greatest.
 
@@ -341,9 +338,9 @@ def range_form(line: Array, sense: Array, h: Triple) -> RangeForm:
 
 @compiled
 def range_bend(
-    sense: Array, h: Triple, r: float, u: Triple, least: float, remainder: float, hessian: Array
-) -> tuple[Triple, float, float]:
-    """Write the Hessian of a range; return bounds of the change of its gradient (a triple) and Hessian, and its norm.
+    sense: Array, h: Triple, r: float, u: Triple, least: float, remainder: float
+) -> tuple[Symmetric, Triple, float, float]:
+    """Return the Hessian of a range; bounds of the change of its gradient (a triple) and Hessian, and its norm.
 
     Parameters
     ----------
@@ -353,31 +350,69 @@ def range_bend(
         Half-widths.
     r, u, least, remainder
         What `range_form` returns; `least` must be positive.
-    hessian : array (3, 3)
-        Written: ``sense' P sense / r``.
+
+    Returns
+    -------
+    hessian : symmetric
+        ``sense' P sense / r``.
+    turn, change, norm
+        As above.
     """
-    trace = 0.0
-    for k in range(3):
-        for m in range(k + 1):
-            gram = _gram(sense, u, k, m)
-            hessian[k, m] = hessian[m, k] = gram / r
-            if k == m:
-                trace += gram / r
+    g = _gram(sense, u)
+    hessian = (g[0] / r, g[1] / r, g[2] / r, g[3] / r, g[4] / r, g[5] / r)
+    trace = hessian[0] + hessian[3] + hessian[5]
     if not least > 0.0:
-        return (inf, inf, inf), inf, trace
-    back = r / least
+        return hessian, (inf, inf, inf), inf, trace
+    back, (w0, w1, w2) = r / least, reaches(hessian, h)
     turn = (
-        row_reach(hessian, 0, h) * back + remainder * abs(u[0]) / least,
-        row_reach(hessian, 1, h) * back + remainder * abs(u[1]) / least,
-        row_reach(hessian, 2, h) * back + remainder * abs(u[2]) / least,
+        w0 * back + remainder * abs(u[0]) / least,
+        w1 * back + remainder * abs(u[1]) / least,
+        w2 * back + remainder * abs(u[2]) / least,
     )
     eta = length(turn)
     change = eta * (2.0 * length(u) + eta) / least + trace * (reach(u, h) + remainder) / least
-    return turn, change, trace
+    return hessian, turn, change, trace
 
 
 @compiled
-def _gram(sense: Array, u: Triple, k: int, m: int) -> float:
-    entry = sense[0, k] * sense[0, m] + sense[1, k] * sense[1, m] + sense[2, k] * sense[2, m] - u[k] * u[m]
-    # A squared length: rounding may not make it negative.
-    return float(max(entry, 0.0)) if k == m else float(entry)
+def reaches(matrix: Symmetric, h: Triple) -> Triple:
+    """Return the greatest values over a box of the entries of ``matrix s``, see `row_reach`."""
+    m00, m01, m02, m11, m12, m22 = matrix
+    b, c, e = abs(m01), abs(m02), abs(m12)
+    return (
+        abs(m00) * h[0] + b * h[1] + c * h[2],
+        b * h[0] + abs(m11) * h[1] + e * h[2],
+        c * h[0] + e * h[1] + abs(m22) * h[2],
+    )
+
+
+@compiled
+def add(a: Symmetric, b: Symmetric) -> Symmetric:
+    """Return the sum of two symmetric matrices."""
+    return a[0] + b[0], a[1] + b[1], a[2] + b[2], a[3] + b[3], a[4] + b[4], a[5] + b[5]
+
+
+@compiled
+def write_symmetric(matrix: Symmetric, out: Array) -> None:
+    """Write a symmetric matrix into an array (3, 3)."""
+    out[0, 0], out[1, 1], out[2, 2] = matrix[0], matrix[3], matrix[5]
+    out[0, 1] = out[1, 0] = matrix[1]
+    out[0, 2] = out[2, 0] = matrix[2]
+    out[1, 2] = out[2, 1] = matrix[4]
+
+
+@inlined
+def _gram(sense: Array, u: Triple) -> Symmetric:
+    """Return ``sense'sense - u u'``, of which rounding may not make a squared length negative."""
+    a, b, c = sense[0, 0], sense[0, 1], sense[0, 2]
+    d, e, f = sense[1, 0], sense[1, 1], sense[1, 2]
+    p, q, r = sense[2, 0], sense[2, 1], sense[2, 2]
+    u0, u1, u2 = u
+    return (
+        max(a * a + d * d + p * p - u0 * u0, 0.0),
+        a * b + d * e + p * q - u0 * u1,
+        a * c + d * f + p * r - u0 * u2,
+        max(b * b + e * e + q * q - u1 * u1, 0.0),
+        b * c + e * f + q * r - u1 * u2,
+        max(c * c + f * f + r * r - u2 * u2, 0.0),
+    )

@@ -8,8 +8,8 @@ from __future__ import annotations
 from math import inf, sqrt
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
-from optloc.proof.atlas import Atlas, scaled_station, set_line
+from optloc.compute.jit import compiled, inlined
+from optloc.proof.atlas import Frame, scaled_station, set_line
 from optloc.proof.nodes.node import (
     CHI,
     CONVEX,
@@ -33,17 +33,19 @@ from optloc.proof.nodes.node import (
     Node,
     RangeForm,
     Row,
+    Symmetric,
+    Triple,
+    add,
     blend,
     greatest,
     range_bend,
     range_form,
     reach,
-    still,
-    triple,
-    unbounded,
-    write,
 )
 from optloc.proof.nodes.ratio import quotient, quotient_bend
+
+# How a range curves over a box, see `range_bend`.
+RangeBend = tuple[Symmetric, Triple, float, float]
 
 
 @compiled
@@ -146,19 +148,31 @@ def curve_ranges(kinds: Array, gram: Array, half: Array, nodes: Array, curves: A
 # stays finite and smooth at infinity.
 
 
-@compiled
+@inlined
 def bound_difference(
-    atlas: Atlas, data: Array, centre: RangeForm, half: Array, slope: Array
-) -> tuple[float, float, float]:
-    """Bound a range less the distance to the centre over a box, metres; as the functions of `optloc.proof.nodes.node`.
+    frame: Frame, data: Array, centre: RangeForm, h: Triple, away: Array, sense: Array
+) -> tuple[float, float, float, Triple]:
+    """Return a range less the distance to the centre over a box, metres: value, ends of the remainder, and slope.
 
     A quotient N/S with N linear, as ratios are (`optloc.proof.nodes.ratio.bound_ratio`), and at most ``R |a|`` in size.
-    `centre` is what `optloc.proof.nodes.node.range_form` says of p.
+
+    Parameters
+    ----------
+    frame : Frame
+        Where the box lies.
+    data : array (width,)
+        The node.
+    centre : tuple
+        What `optloc.proof.nodes.node.range_form` says of p.
+    h : triple
+        Half-widths.
+    away, sense : array (3,), (3, 3)
+        Working memory.
     """
-    h, radius = triple(half, 0), atlas.radius
-    set_line(atlas, data, 0, atlas.away, atlas.sense)
-    a, rise, n = scaled_station(atlas, data)
-    r, u, least, q, far = range_form(atlas.away, atlas.sense, h)
+    radius = frame.radius
+    set_line(frame, data, 0, away, sense)
+    a, rise, n = scaled_station(frame, data)
+    r, u, least, q, far = range_form(away, sense, h)
     r0, u0, least0, q0, far0 = centre
     size, u, most = r + r0, blend(1.0, u, 1.0, u0), q + q0
     phi, least = rise / size if size > 0.0 else 0.0, max(least, 0.0) + max(least0, 0.0)
@@ -167,41 +181,55 @@ def bound_difference(
         low, high = quotient(phi, g, u, most, (0.0, 0.0), (least, far + far0), h)
         # By the triangle inequality the difference of the two distances is within |a| of zero.
         if high - low <= 2.0 * a:
-            write(blend(radius, g, 0.0, g), slope)
-            return radius * phi, radius * low, radius * high
-    slope[0] = slope[1] = slope[2] = 0.0
-    return radius * phi, radius * (-a - phi), radius * (a - phi)
+            return radius * phi, radius * low, radius * high, blend(radius, g, 0.0, g)
+    return radius * phi, radius * (-a - phi), radius * (a - phi), (0.0, 0.0, 0.0)
 
 
-@compiled
-def curve_difference(atlas: Atlas, data: Array, centre: RangeForm, half: Array, turn: Array) -> float:
-    """Bound how a range less the distance to the centre curves over a box; the Hessian goes into ``atlas.bend``."""
-    h, bend, second = triple(half, 0), atlas.bend, atlas.second
-    bound_difference(atlas, data, centre, half, turn)
-    a, rise, n = scaled_station(atlas, data)
-    if a == 0.0:
-        bend[:] = 0.0
-        return 0.0
-    r, u, least, q, _ = range_form(atlas.away, atlas.sense, h)
+@inlined
+def curve_centre(slant: Array, centre: RangeForm, h: Triple) -> RangeBend:
+    """Return how the distance to the centre of the cube curves over a box, for `curve_difference`."""
+    r, u, least, q, _ = centre
+    if not least > 0.0:
+        return (0.0, 0.0, 0.0, 0.0, 0.0, 0.0), (inf, inf, inf), inf, inf
+    return range_bend(slant, h, r, u, least, q)
+
+
+@inlined
+def curve_difference(
+    frame: Frame, data: Array, centre: RangeForm, bent: RangeBend, h: Triple, flat: bool, away: Array, sense: Array
+) -> tuple[Symmetric, Triple, float]:
+    """Return how a range less the distance to the centre curves over a box: Hessian, and bounds of what changes.
+
+    Parameters
+    ----------
+    frame, data, centre, h, away, sense
+        As of `bound_difference`.
+    bent : tuple
+        What `curve_centre` says of p.
+    flat : bool
+        Whether that found no slope.
+    """
+    radius = frame.radius
+    set_line(frame, data, 0, away, sense)
+    a, rise, n = scaled_station(frame, data)
+    still, own = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    if a == 0.0:  # the node is zero
+        return own, still, 0.0
+    r, u, least, q, _ = range_form(away, sense, h)
     r0, u0, least0, q0, _ = centre
-    if still(turn) or not (least > 0.0 and least0 > 0.0):
-        return unbounded(bend, turn)
-    ds, chi, norm = range_bend(atlas.sense, h, r, u, least, q, second)
-    ds0, chi0, norm0 = range_bend(atlas.slant, h, r0, u0, least0, q0, bend)
-    for k in range(3):
-        for m in range(3):
-            second[k, m] += bend[k, m]
-            bend[k, m] = 0.0
+    if flat or not (least > 0.0 and least0 > 0.0):
+        return own, (inf, inf, inf), inf
+    second, ds, change, norm = range_bend(sense, h, r, u, least, q)
+    second0, ds0, change0, norm0 = bent
     size, u = r + r0, blend(1.0, u, 1.0, u0)
     phi = rise / size
     g = blend(1.0 / size, n, -phi / size, u)
-    changes = ((0.0, 0.0, 0.0), blend(1.0, ds, 1.0, ds0), 0.0, chi + chi0, norm + norm0, reach(u, h) + q + q0)
-    change = quotient_bend(g, u, (phi, size, least + least0), changes, h, bend, second, turn)
-    for k in range(3):
-        turn[k] *= atlas.radius
-        for m in range(3):
-            bend[k, m] *= atlas.radius
-    return atlas.radius * change
+    # N is linear.
+    changes = (still, blend(1.0, ds, 1.0, ds0), 0.0, change + change0, norm + norm0, reach(u, h) + q + q0)
+    own, turn, chi = quotient_bend(g, u, (phi, size, least + least0), changes, h, own, add(second, second0))
+    h00, h01, h02, h11, h12, h22 = own
+    own = (radius * h00, radius * h01, radius * h02, radius * h11, radius * h12, radius * h22)
+    return own, blend(radius, turn, 0.0, turn), radius * chi
 
 
 @compiled

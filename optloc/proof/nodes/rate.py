@@ -8,8 +8,6 @@ from __future__ import annotations
 
 from math import sqrt
 
-import numpy as np
-
 from optloc.base.types import Array
 from optloc.compute.jit import compiled
 from optloc.proof.nodes.node import (
@@ -29,6 +27,7 @@ from optloc.proof.nodes.node import (
     triple,
     unbounded,
     write,
+    write_symmetric,
 )
 from optloc.proof.nodes.ratio import quotient, quotient_bend
 
@@ -79,12 +78,15 @@ def curve_rate(data: Array, line: Array, sense: Array, half: Array, curvature: A
     r, u, least, most, _ = range_form(line, sense, h)
     if still(turn) or not least > 0.0:
         return unbounded(curvature, turn)
-    second, phi = np.empty((3, 3)), inner(w, n) / r
-    ds, chi, norm = range_bend(sense, h, r, u, least, most, second)
-    curvature[:] = 0.0  # of the linear form
+    phi = inner(w, n) / r
+    second, ds, chi, norm = range_bend(sense, h, r, u, least, most)
     g = blend(1.0 / r, pull(w, sense), -phi / r, u)
     changes = ((0.0, 0.0, 0.0), ds, 0.0, chi, norm, reach(u, h) + most)
-    return quotient_bend(g, u, (phi, r, least), changes, h, curvature, second, turn)
+    flat = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # a linear form does not bend
+    own, wander, chi = quotient_bend(g, u, (phi, r, least), changes, h, flat, second)
+    write_symmetric(own, curvature)
+    write(wander, turn)
+    return chi
 
 
 @compiled

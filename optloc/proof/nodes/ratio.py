@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from math import inf, sqrt
 
-import numpy as np
-
 from optloc.base.types import Array
 from optloc.compute.jit import compiled
 from optloc.proof.nodes.node import (
     SCALED,
     Node,
     Row,
+    Symmetric,
     Triple,
+    add,
     blend,
     lay_out,
     length,
@@ -21,12 +21,13 @@ from optloc.proof.nodes.node import (
     range_bend,
     range_form,
     reach,
-    row_reach,
+    reaches,
     scaled,
     still,
     triple,
     unbounded,
     write,
+    write_symmetric,
 )
 
 # Numbers: stations a and b, the measured value, and what is not 0 where the row is the node's own.
@@ -137,39 +138,43 @@ def curve_ratio(
     rb, ub, least_b, qb, _ = range_form(line_b, sense_b, h)
     if still(turn) or not (least_a > 0.0 and least_b > 0.0):
         return unbounded(curvature, turn)
-    bend, whole = np.empty((3, 3)), np.empty((3, 3))
-    da, chi_a, norm_a = range_bend(sense, h, ra, ua, least_a, qa, whole)
-    db, chi_b, norm_b = range_bend(sense_b, h, rb, ub, least_b, qb, bend)
+    own, da, chi_a, norm_a = range_bend(sense, h, ra, ua, least_a, qa)
+    bend, db, chi_b, norm_b = range_bend(sense_b, h, rb, ub, least_b, qb)
     n, _ = _squares(line, sense, line_b, sense_b, h)
-    dn = _square_bend(sense, sense_b, h, curvature)
-    for k in range(3):
-        for m in range(3):
-            whole[k, m] += bend[k, m]
+    second = _square_bend(sense, sense_b)
     size, u, delta = ra + rb, blend(1.0, ua, 1.0, ub), ra - rb
     g = blend(1.0 / size, n, -delta / size, u)
-    changes = (dn, blend(1.0, da, 1.0, db), 0.0, chi_a + chi_b, norm_a + norm_b, reach(u, h) + qa + qb)
-    chi = quotient_bend(g, u, (delta, size, least_a + least_b), changes, h, curvature, whole, turn)
+    changes = (reaches(second, h), blend(1.0, da, 1.0, db), 0.0, chi_a + chi_b, norm_a + norm_b, reach(u, h) + qa + qb)
+    centre = (delta, size, least_a + least_b)
+    second, wander, chi = quotient_bend(g, u, centre, changes, h, second, add(own, bend))
     # What became of the difference is the numerator of the second step.
-    wander = triple(turn, 0)
     g = blend(1.0 / rb, g, -delta / (rb * rb), ub)
     changes = (wander, db, chi, chi_b, norm_b, reach(ub, h) + qb)
-    return quotient_bend(g, ub, (delta / rb, rb, least_b), changes, h, curvature, bend, turn)
+    second, wander, chi = quotient_bend(g, ub, (delta / rb, rb, least_b), changes, h, second, bend)
+    write_symmetric(second, curvature)
+    write(wander, turn)
+    return chi
 
 
 @compiled
-def _square_bend(sense: Array, sense_b: Array, h: Triple, curvature: Array) -> Triple:
-    """Write the Hessian of ``|line|^2 - |line_b|^2``, a constant; return how much the gradient changes over a box."""
-    for k in range(3):
-        for m in range(3):
-            entry = 0.0
-            for i in range(3):
-                entry += sense[i, k] * sense[i, m] - sense_b[i, k] * sense_b[i, m]
-            curvature[k, m] = 2.0 * entry
+def _square_bend(sense: Array, sense_b: Array) -> Symmetric:
+    """Return the Hessian of ``|line|^2 - |line_b|^2``, a constant."""
     return (
-        row_reach(curvature, 0, h),
-        row_reach(curvature, 1, h),
-        row_reach(curvature, 2, h),
+        _square_entry(sense, sense_b, 0, 0),
+        _square_entry(sense, sense_b, 0, 1),
+        _square_entry(sense, sense_b, 0, 2),
+        _square_entry(sense, sense_b, 1, 1),
+        _square_entry(sense, sense_b, 1, 2),
+        _square_entry(sense, sense_b, 2, 2),
     )
+
+
+@compiled
+def _square_entry(sense: Array, sense_b: Array, k: int, m: int) -> float:
+    entry = 0.0
+    for i in range(3):
+        entry += sense[i, k] * sense[i, m] - sense_b[i, k] * sense_b[i, m]
+    return 2.0 * entry
 
 
 @compiled
@@ -179,11 +184,10 @@ def quotient_bend(
     centre: tuple[float, float, float],
     changes: tuple[Triple, Triple, float, float, float, float],
     h: Triple,
-    curvature: Array,
-    bend: Array,
-    turn: Array,
-) -> float:
-    """Bound how a quotient phi = N/S curves, from how N and S do; return the change of its Hessian.
+    curvature: Symmetric,
+    bend: Symmetric,
+) -> tuple[Symmetric, Triple, float]:
+    """Return the Hessian of a quotient phi = N/S, and bounds of the change of its gradient and of that Hessian.
 
     Parameters
     ----------
@@ -196,33 +200,35 @@ def quotient_bend(
         the centre, and the change of S.
     h : triple
         Half-widths.
-    curvature : array (3, 3)
-        The Hessian of N; overwritten by that of phi.
-    bend : array (3, 3)
-        The Hessian of S.
-    turn : array (3,)
-        Written: bounds of the change of the gradient of phi.
+    curvature, bend : symmetric
+        The Hessians of N and of S.
     """
     phi, size, least = centre
     dn, ds, chi_n, chi_s, norm_s, widen = changes
-    for k in range(3):
-        for m in range(3):
-            curvature[k, m] = (curvature[k, m] - g[k] * u[m] - u[k] * g[m] - phi * bend[k, m]) / size
+    c00, c01, c02, c11, c12, c22 = curvature
+    b00, b01, b02, b11, b12, b22 = bend
+    g0, g1, g2 = g
+    u0, u1, u2 = u
+    own = (
+        (c00 - 2.0 * g0 * u0 - phi * b00) / size,
+        (c01 - g0 * u1 - u0 * g1 - phi * b01) / size,
+        (c02 - g0 * u2 - u0 * g2 - phi * b02) / size,
+        (c11 - 2.0 * g1 * u1 - phi * b11) / size,
+        (c12 - g1 * u2 - u1 * g2 - phi * b12) / size,
+        (c22 - 2.0 * g2 * u2 - phi * b22) / size,
+    )
     # phi' r' = N', so the change of phi is (N' - N - phi (S' - S)) / S': its own slope, and what that changes by.
     rise = reach(g, h) * size / least + (reach(dn, h) + abs(phi) * reach(ds, h)) / least
-    norm = 0.0
-    for k in range(3):
-        for m in range(3):
-            norm += curvature[k, m] * curvature[k, m]
-        change = dn[k] + abs(phi) * ds[k] + rise * (abs(u[k]) + ds[k]) + widen * abs(g[k])
-        turn[k] = change / least
-    wander = (turn[0], turn[1], turn[2])
-    dg, du = length(wander), length(ds)
+    norm = own[0] * own[0] + own[3] * own[3] + own[5] * own[5]
+    norm += 2.0 * (own[1] * own[1] + own[2] * own[2] + own[4] * own[4])
+    t0 = (dn[0] + abs(phi) * ds[0] + rise * (abs(u0) + ds[0]) + widen * abs(g0)) / least
+    t1 = (dn[1] + abs(phi) * ds[1] + rise * (abs(u1) + ds[1]) + widen * abs(g1)) / least
+    t2 = (dn[2] + abs(phi) * ds[2] + rise * (abs(u2) + ds[2]) + widen * abs(g2)) / least
+    dg, du = length((t0, t1, t2)), length(ds)
     mixed = 2.0 * (dg * length(u) + length(g) * du + dg * du)
     chi = (chi_n + mixed + abs(phi) * chi_s + rise * (norm_s + chi_s) + widen * sqrt(norm)) / least
-    for k in range(3):
-        turn[k] = min(turn[k], row_reach(curvature, k, h) + chi * length(h))
-    return chi
+    (w0, w1, w2), far = reaches(own, h), chi * length(h)
+    return own, (min(t0, w0 + far), min(t1, w1 + far), min(t2, w2 + far)), chi
 
 
 @compiled

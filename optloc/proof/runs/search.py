@@ -129,7 +129,7 @@ def set_curves(space: Space, cost: Cost, box: Box) -> None:
     """Bound second derivatives of the nodes over a box whose nodes are bounded."""
     chart = space.chart
     if space.far:
-        curve_pieces(space.atlas, cost.kinds, cost.data, box.half, box.curves)
+        curve_pieces(space.atlas, cost.kinds, cost.data, box.half, box.nodes, box.curves)
     elif chart.surface.shape[0] > 0:
         curve_along(cost, box)
     else:

@@ -27,7 +27,7 @@ from optloc.solvers.certify.posed import Costs, agrees, is_free, lacks, pose, pr
 from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP
-from optloc.solvers.pool import Pool, in_parts, offer, pack, where
+from optloc.solvers.pool import Claim, Pool, in_parts, offer, pack, where
 from optloc.solvers.refine import refine
 from optloc.solvers.stages import lsr
 from optloc.solvers.starts.position import spread_of, vectors
@@ -527,9 +527,44 @@ def certified(
             pool, certificate=certificate, stages=(*pool.stages, certify_stage(why or "nothing to prove", began))
         )
 
-    work = settle(Work.begin(problem, pool, fix, answered, region, margin, effort))
+    stands = _stands(pool.claims, fix)
+    work = Work.begin(problem, pool, fix, answered & ~stands, region, margin, effort)
+    for i in np.flatnonzero(answered & stands).tolist():
+        assert pool.claims is not None
+        work.certificate[i] = pool.claims[i].certificate
+    work = settle(work)
     stages = (*pool.stages, certify_stage(work.summary(), began))
     return replace(work.pool, certificate=work.certificate, stages=stages)
+
+
+def claimed(pool: Pool, fix: Fix, items: Array) -> Array | None:
+    """Return what was tried to prove of some of the fixes (N,) of a pool, for `Pool.claims`; None where nothing was."""
+    if pool.certificate is None:
+        return None
+    out, listed = fill(len(items), None), _count_listed(fix)
+    for k, i in enumerate(items.tolist()):
+        if pool.certificate[i] is not None:
+            out[k] = Claim(float(fix.cost[i]), int(listed[i]), pool.certificate[i])
+    return out
+
+
+def _count_listed(fix: Fix) -> Array:
+    return np.asarray(np.isfinite(fix.alternatives.gap).sum(1))
+
+
+def _stands(claims: Array | None, fix: Fix) -> Array:
+    """Return which claims are about the same minima as fixes (N,): what was shown, or not, of these holds still.
+
+    The minima that were known compete in what is found later. As many of them, and a least one that costs the same, are
+    therefore the same.
+    """
+    out = np.zeros(len(fix.x), dtype=bool)
+    if claims is None:
+        return out
+    listed, equal = _count_listed(fix), equal_cost(fix.cost)
+    for i, claim in enumerate(claims):
+        out[i] = claim is not None and claim.listed == listed[i] and abs(fix.cost[i] - claim.cost) <= equal[i]
+    return out
 
 
 def certify_stage(detail: str, began: float) -> Stage:

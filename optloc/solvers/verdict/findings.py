@@ -147,7 +147,7 @@ def examine(problem: Problem, pool: Pool) -> Pool:
         What was measured before is kept.
     """
     curvature = pool.curvature
-    if curvature is None or not _has_position(problem):
+    if curvature is None or not problem.layout.shares("position"):
         return pool
     good = (pool.code[:, 0] == Status.OK) & np.isfinite(pool.x[:, 0]).all(-1)
     good &= np.isfinite(curvature.covariance).all((-1, -2))
@@ -163,10 +163,6 @@ def examine(problem: Problem, pool: Pool) -> Pool:
     if pool.loss or not one_position(problem) or problem.motions[0].order:
         return pool
     return replace(pool, infinity=_infinity(problem, pool, good & _is_bent(pool), unseen))
-
-
-def _has_position(problem: Problem) -> bool:
-    return any(slot.name == "position" for slot in problem.layout.shared)
 
 
 def _departure(problem: Problem, pool: Pool) -> Array:
@@ -227,7 +223,7 @@ def chart_of(problem: Problem, x: Array, covariance: Array, curvature: Curvature
     curvature : Curvature
         Examined; what was not is taken for curved.
     """
-    if not _has_position(problem):
+    if not problem.layout.shares("position"):
         return None
     slot, _ = problem.layout.find("position")
     part = slice(slot.start, slot.start + slot.size)

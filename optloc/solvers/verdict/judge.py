@@ -201,7 +201,7 @@ def _name_hidden(hidden: Array, items: Array, reason: Array) -> None:
 
 def _position(problem: Problem, pool: Pool) -> Array:
     """Return the position (N, d) of the only target, or the centre of the stations where there is no such thing."""
-    if any(slot.name == "position" for slot in problem.layout.shared):
+    if problem.layout.shares("position"):
         return problem.layout.take(np.where(np.isfinite(pool.cost[:, :1]), pool.x[:, 0], np.nan), "position")
     return np.broadcast_to(spread_of(problem)[0], (len(pool), problem.dimension))
 

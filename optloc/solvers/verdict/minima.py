@@ -169,7 +169,7 @@ def settle(problem: Problem, pool: Pool, stage: Stage, equations: Equations = eq
 def _without_runs_to_infinity(problem: Problem, pool: Pool) -> tuple[Pool, Array]:
     """Return the pool without runs to infinity where a finite minimum rivals them, and their least cost, (N,)."""
     none = np.full(len(pool), np.nan)
-    if not any(slot.name == "position" for slot in problem.layout.shared):
+    if not problem.layout.shares("position"):
         return pool, none
     distance = distance_of(problem, problem.layout.take(pool.x, "position"))
     with np.errstate(invalid="ignore"):
@@ -197,18 +197,36 @@ def _sort(pool: Pool) -> Pool:
 
 
 def _choose(problem: Problem, pool: Pool) -> Array:
-    """Return the slot to answer with: the cheapest, or of finished ones that cost the same that with the best sight."""
+    """Return the slot to answer with: the cheapest, or of finished ones that cost the same the likelier by their place.
+
+    Which of these is the cheapest is a matter of rounding, and another processor's is another.
+    """
     finished, least = pool.code == Status.OK, pool.cost[:, :1]
     with np.errstate(invalid="ignore"):
         near = finished & (pool.cost <= least + EQUAL_COST * (1.0 + np.abs(least)))
     best = np.where(near.any(1), near.argmax(1), 0)
     tied, slot = np.nonzero(near & (near.sum(1) > 1)[:, None])
-    if len(tied) and problem.frame.geodetic:
-        sight = np.full(pool.cost.shape, -np.inf)
-        # sines of elevations, equal to the last digits for mirror images: rounded, so that the cheaper of them wins
-        sight[tied, slot] = np.round(lowest_sight(problem.take(tied), pool.x[tied, slot]), 6)
-        best[tied] = sight[tied].argmax(1)
+    if len(tied) and problem.layout.shares("position"):
+        first, second = np.full((2, *pool.cost.shape), -np.inf)
+        first[tied, slot], second[tied, slot] = _likelier(problem.take(tied), pool.x[tied, slot])
+        second[first < first.max(1)[:, None]] = -np.inf
+        best[tied] = second[tied].argmax(1)
     return best
+
+
+def _likelier(problem: Problem, x: Array) -> tuple[Array, Array]:
+    """Return by what vectors (N, size) that cost the same are told apart, the larger the better, and then by what.
+
+    On Earth by how well all stations see them, elsewhere by how near to the stations they are; mirror images, equal in
+    both, by their last coordinate: the upper one. What is equal but for rounding must be equal here.
+    """
+    place = problem.layout.take(x, "position")
+    if problem.frame.geodetic:
+        first = lowest_sight(problem, x)  # sines of elevations
+    else:
+        with np.errstate(divide="ignore"):
+            first = -np.log(distance_of(problem, place))
+    return np.round(first, 6), place[:, -1]
 
 
 def _rivals(problem: Problem, pool: Pool, x: Array, cost: Array, curvature: Curvature) -> Array:
