@@ -106,7 +106,7 @@ def test_single_fixes_equal_a_batch(count, rows, place, method):
 
 @pytest.mark.parametrize("method", ["auto", "gtrs+lsr"])
 def test_a_site_on_earth_takes_the_short_way(method):
-    problem = replace(network(6), frame=Frame.enu(48.2, 11.6, 500.0))
+    problem = replace(network(6), frame=Frame.enu(lat_deg=48.2, lon_deg=11.6, height=500.0))
     z = np.concatenate([drawn(6, "inside", 12), drawn(6, "outside", 12)])
     batch, ready = solve(problem.with_rows(z=z), method), prepare(problem, method)
     short = [ready.short(one) for one in z]
