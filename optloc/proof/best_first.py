@@ -33,6 +33,7 @@ from optloc.proof.box import (
     reaches_infinity,
     rounding,
     shrink,
+    steepest_side,
     uncut,
 )
 from optloc.proof.chart import Box, Chart, Cost, Known, chart_on, cost_of, curve_box, descend, empty_box, turned, widen
@@ -44,7 +45,6 @@ from optloc.proof.everywhere import (
     leaves,
     push_pieces,
     set_minimum,
-    steepest_side,
 )
 from optloc.proof.near import cut_side, is_known, known_minima, lay_or_halve, region_of
 from optloc.proof.nodes.dispatch import bound_pieces
@@ -196,7 +196,7 @@ def _search_everywhere(cost: Cost, box: Box, near: Box, x: Array, aim: Aim, budg
         if touching and max(box.half[0], box.half[1], box.half[2]) < _TINY:
             continue
         position(atlas, at)
-        exact, side = piece <= 2 * d, steepest_side(box, d)
+        exact, side = piece <= 2 * d, steepest_side(box.half, box.rows, d)
         if level < inf and here < _NEAR * (level + 1.0) and leaves(cost, atlas, box, touching, floor):
             continue
         lows, promising = lows + int(here < level), here < _HALF * cheapest

@@ -311,6 +311,35 @@ def is_empty(cut: Array) -> bool:
     return bool(cut[0] > cut[3] or cut[1] > cut[4] or cut[2] > cut[5])
 
 
+# Share of the steepest side's change that counts for all sides alike: nodes that are only enclosed have no slope. Over
+# 8 fixes by range differences no share took 10 % more boxes.
+_ALIKE = 0.1
+
+
+@compiled
+def steepest_side(half: Array, rows: Array, dimension: int) -> int:
+    """Return the side along which the residual changes most; a part of that change counts for all sides alike.
+
+    Nodes that are only enclosed have no slope, and bend where they do.
+    """
+    steepest, best, k = 0.0, -1.0, 0
+    for m in range(dimension):
+        steepest = max(steepest, _steepness(rows, m))
+    for m in range(dimension):
+        change = (_steepness(rows, m) + _ALIKE * steepest + 1e-300) * half[m]  # all flat: the widest side
+        if change > best:
+            best, k = change, m
+    return k
+
+
+@compiled
+def _steepness(rows: Array, m: int) -> float:
+    total = 0.0
+    for i in range(rows.shape[0]):
+        total += rows[i, J0 + m] * rows[i, J0 + m]
+    return sqrt(total)
+
+
 # The boxes still to be looked at: a stack, so that the deepest comes first and few are kept.
 
 # Columns of the stack (capacity, DEPTH): centre, half-widths, the bound of the box that it came from, and the piece of

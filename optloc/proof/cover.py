@@ -33,6 +33,7 @@ from optloc.proof.box import (
     pop,
     push_halves,
     rounding,
+    steepest_side,
     uncut,
 )
 from optloc.proof.chart import Box, Chart, Cost, chart_at, place, widen
@@ -43,8 +44,6 @@ from optloc.proof.nodes.node import HIGH, LOW
 
 # Share of a box below which what is left of it is looked at again before it is cut, as in `optloc.proof.near`.
 _SHRUNK = 0.5
-# Share of the steepest side's change that counts for all sides alike, as in `optloc.proof.everywhere`.
-_ALIKE = 0.1
 # Share of its bend that halving a side must leave a box at most, to be preferred to what its slopes say: nodes that are
 # only enclosed bend as much in half the box.
 _STRAIGHTER = 0.8
@@ -253,21 +252,6 @@ def _keep(boxes: Array, count: int, box: Box, piece: int) -> int:
 
 
 @compiled
-def _side(box: Box, dimension: int) -> int:
-    """Return the side along which the residual changes most; a part of that change counts for all sides alike."""
-    steep = np.zeros(3)
-    for m in range(dimension):
-        for i in range(box.rows.shape[0]):
-            steep[m] += box.rows[i, J0 + m] ** 2
-        steep[m] = sqrt(steep[m])
-    alike, best, side = _ALIKE * max(steep[0], steep[1], steep[2]) + 1e-300, -1.0, zero()
-    for m in range(dimension):
-        if (steep[m] + alike) * box.half[m] > best:
-            best, side = (steep[m] + alike) * box.half[m], m
-    return side
-
-
-@compiled
 def _bends(cost: Cost, box: Box) -> float:
     """Return how much of the residual over a box is not linear: half the widths of the remainders, weighted."""
     total = 0.0
@@ -292,7 +276,7 @@ def _is_bent(cost: Cost, box: Box, dimension: int) -> bool:
 @compiled
 def _side_near(cost: Cost, chart: Chart, box: Box, dimension: int) -> int:
     """Return the side to halve: where the rows bend most of all, the one whose halving straightens them most."""
-    side = _side(box, dimension)
+    side = steepest_side(box.half, box.rows, dimension)
     if _is_bent(cost, box, dimension):
         least = _STRAIGHTER * _bends(cost, box)
         for k in range(dimension):
@@ -307,7 +291,7 @@ def _side_near(cost: Cost, chart: Chart, box: Box, dimension: int) -> int:
 @compiled
 def _side_far(cost: Cost, atlas: Atlas, box: Box, piece: int) -> int:
     """Return the side to halve in a piece of an atlas, see `_side_near`."""
-    side = _side(box, atlas.dimension)
+    side = steepest_side(box.half, box.rows, atlas.dimension)
     if _is_bent(cost, box, atlas.dimension):
         least = _STRAIGHTER * _bends(cost, box)
         set_centre(atlas, piece, box.at)

@@ -42,6 +42,7 @@ from optloc.proof.box import (
     reaches_infinity,
     rounding,
     shrink,
+    steepest_side,
     uncut,
 )
 from optloc.proof.chart import HIDDEN_REACH, Box, Chart, Cost, Known, chart_at, descend, empty_box
@@ -251,9 +252,6 @@ _SAME = 1e-3
 # large, or its bound will do when it is halved. Over 8 fixes by range differences one level took four times as many
 # boxes; a test everywhere took a quarter more time for the same.
 _NEAR = 100.0
-# Share of the steepest side's change that counts for all sides alike: nodes that are only enclosed have no slope. Over
-# the same fixes no share took 10 % more boxes.
-_ALIKE = 0.1
 _SHRUNK = 0.5  # share of a box below which what is left is looked at before it is halved, as in `optloc.proof.near`
 _BEYOND = 1e-12  # what a sum of two rounds, and a thousand times that
 
@@ -345,7 +343,7 @@ def search_everywhere(
                 return ANOTHER, boxes, 0.0
         if touching and max(box.half[0], box.half[1], box.half[2]) < _TINY and _at_infinity(cost, atlas, box) < level:
             return INFINITE, boxes, 0.0
-        size = _push_rest(stack, size, box, steepest_side(box, atlas.dimension), low, piece)
+        size = _push_rest(stack, size, box, steepest_side(box.half, box.rows, atlas.dimension), low, piece)
     return CLEAR, boxes, value
 
 
@@ -456,30 +454,6 @@ def push_pieces(stack: Array, atlas: Atlas) -> int:
         core = atlas.minima.core[i]
         size = push_around(stack, size, -core, core, atlas.minima.sides[i], 2 * d + 1 + i)
     return size
-
-
-@compiled
-def steepest_side(box: Box, dimension: int) -> int:
-    """Return the side along which the residual changes most; a part of that change counts for all sides alike.
-
-    Nodes that are only enclosed have no slope, and bend where they do.
-    """
-    steepest, best, k = 0.0, -1.0, 0
-    for m in range(dimension):
-        steepest = max(steepest, _steepness(box, m))
-    for m in range(dimension):
-        change = (_steepness(box, m) + _ALIKE * steepest + 1e-300) * box.half[m]  # all flat: the widest side
-        if change > best:
-            best, k = change, m
-    return k
-
-
-@compiled
-def _steepness(box: Box, m: int) -> float:
-    total = 0.0
-    for i in range(box.rows.shape[0]):
-        total += box.rows[i, J0 + m] * box.rows[i, J0 + m]
-    return sqrt(total)
 
 
 @compiled

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 AMBIGUOUS_GAP = 9.0
 """Cost by which another minimum must exceed the best: at three sigma of one number the data tell them apart."""
 
@@ -24,9 +26,6 @@ COVERED = 0.95
 FAR, FLAT = 1e4, 1e6
 """Spreads of the stations: from here on a fix must be a good one, and from there on every wave front is flat."""
 
-EQUAL_COST = 1e-6
-"""Relative difference of costs that rounding and the refinement's tolerance leave: such minima cost the same."""
-
 SAME_PLACE = 1e-2
 """Squared distance in standard deviations below which two minima are one: a tenth of a sigma tells nobody anything."""
 
@@ -35,3 +34,12 @@ WEAK = 1e-12
 
 REJECTED = 0.25
 """Share of its weight below which a row that a loss doubts is called rejected: four sigma of the Cauchy loss."""
+
+# Relative difference of costs that rounding, the refinement's tolerance and two ways to compute them leave: nothing
+# beside the gap of 9 at which a second minimum matters.
+_EQUAL = 1e-6
+
+
+def equal_cost(cost: Any) -> Any:
+    """Return how far from a cost, or from each of many, another counts as equal."""
+    return _EQUAL * (1.0 + cost)

@@ -18,6 +18,7 @@ from optloc.base.threads import mapped
 from optloc.base.types import Array, Status
 from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge
 from optloc.compute.jit import enabled, ready, usable
+from optloc.compute.sums import equations_at
 from optloc.linear.normal import degrees_of_freedom, depends_on_place, weighed
 from optloc.models import MODELS
 from optloc.problem.fix import Stage
@@ -26,10 +27,11 @@ from optloc.problem.noise import variances, whiten
 from optloc.problem.problem import Problem
 from optloc.proof.pose import project_out, whiten_rows
 from optloc.solvers.inequalities import is_hidden
-from optloc.solvers.policy import EQUAL_COST
+from optloc.solvers.policy import equal_cost
 from optloc.solvers.pool import Curvature, Pool, in_parts
 from optloc.solvers.stages import gtrs, lsr, lsr_with_mirror
 from optloc.solvers.starts.least_squares_ranges import Ranges, ranges
+from optloc.solvers.verdict.minima import likelihood_of, measure_curvature
 
 if TYPE_CHECKING:
     from optloc.compute.range_start import Answer
@@ -307,7 +309,7 @@ def settle_directly(
     answer, steps = fix_directly(direct, z, position, threads)
     left = np.flatnonzero(~_is_final(direct, answer, pose))
     if not len(left):
-        return _pool(direct, answer, steps, began)
+        return _pool(direct, _preferred(answer, pose), steps, began)
     # most of what is left lacks nothing but a start: the eigenvalues of its pencil give one
     some = pose(left)
     start = in_parts(some, lambda part, _: gtrs(part, None))
@@ -315,7 +317,7 @@ def settle_directly(
     more, again = fix_directly(direct, z[left], place, threads, start.x[:, 0])
     for whole, part in zip(answer, more, strict=True):
         whole[left] = part
-    pool = _pool(direct, answer, max(steps, again), began)
+    pool = _pool(direct, _preferred(answer, pose), max(steps, again), began)
     lost = np.flatnonzero(~_is_final(direct, more, some.take))
     if not len(lost):
         return pool
@@ -407,18 +409,38 @@ def fix_directly(
 
 
 def _is_final(direct: Direct, answer: Answer, pose: Callable[[Array], Problem]) -> Array:
-    """Return which fixes (N,) need no other means: settled ones that are not one of a pair that costs the same.
+    """Return which fixes (N,) need no other means: settled ones.
 
-    On Earth those which it hides from a station are not final either: what lies before it competes, and is told.
+    On Earth those which it hides from a station are not final: what lies before it competes, and is told.
     """
     if not direct.frame.geodetic:
         return answer.settled
-    # of minima on Earth that cost the same the one that is seen better is the answer: the verdict has the rule
-    apart = np.abs(answer.rival_cost - answer.cost)
-    out = answer.settled & ~(apart <= EQUAL_COST * (1.0 + answer.cost))
-    items = np.flatnonzero(out)
+    out, items = np.array(answer.settled), np.flatnonzero(answer.settled)
     out[items] = ~is_hidden(pose(items), answer.x[items])
-    return np.asarray(out)
+    return out
+
+
+def _preferred(answer: Answer, pose: Callable[[Array], Problem]) -> Answer:
+    """Return the answer with the likelier by its place of two minima that cost the same, as the verdict has it."""
+    tied = np.flatnonzero(answer.settled & (np.abs(answer.rival_cost - answer.cost) <= equal_cost(answer.cost)))
+    if not len(tied):
+        return answer
+    some = pose(tied)
+    (first, second), (other, another) = likelihood_of(some, answer.x[tied]), likelihood_of(some, answer.rival[tied])
+    changed = (other > first) | ((other == first) & (another > second))
+    items, some = tied[changed], some.take(np.flatnonzero(changed))
+    if not len(items):
+        return answer
+    x, rival, cost, rival_cost, covariance, kappa = (
+        np.array(values)
+        for values in (answer.x, answer.rival, answer.cost, answer.rival_cost, answer.covariance, answer.kappa)
+    )
+    x[items], rival[items] = rival[items], x[items]
+    cost[items], rival_cost[items] = rival_cost[items], cost[items]
+    at = x[items]
+    covariance[items] = measure_curvature(some, equations_at(some, at), at, np.zeros(len(at), dtype=int)).covariance
+    kappa[items] = np.nan  # the verdict looks at its shape
+    return answer._replace(x=x, rival=rival, cost=cost, rival_cost=rival_cost, covariance=covariance, kappa=kappa)
 
 
 def _pool(direct: Direct, answer: Answer, steps: int, began: float) -> Pool:

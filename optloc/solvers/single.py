@@ -27,11 +27,11 @@ from optloc.proof.batch import Answered, Asked, empty_answer, lacks_code, prove_
 from optloc.proof.near import UNIQUE
 from optloc.proof.pose import Affine, Posed, pose_affinely
 from optloc.proof.scope import is_run, unsupported
-from optloc.solvers.certify.branch_and_bound import budgets, certify_stage, equal_cost, state_claim
+from optloc.solvers.certify.branch_and_bound import budgets, certify_stage, state_claim
 from optloc.solvers.certify.posed import agrees
 from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.methods import Method
-from optloc.solvers.policy import COVERED, DOUBT, LISTED_GAP, REFUTED
+from optloc.solvers.policy import COVERED, DOUBT, LISTED_GAP, REFUTED, equal_cost
 from optloc.solvers.range_fixes import (
     LIMIT,
     TOLERANCE,

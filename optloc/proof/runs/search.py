@@ -23,6 +23,7 @@ from optloc.proof.box import (
     linearise_rows,
     pop,
     push_halves,
+    steepest_side,
     uncut,
 )
 from optloc.proof.chart import (
@@ -46,7 +47,6 @@ from optloc.proof.everywhere import (
     accuracy_floor_far,
     is_left,
     is_listed,
-    steepest_side,
 )
 from optloc.proof.near import (
     Aim,
@@ -221,7 +221,7 @@ def search_run(
         low = least_residual(look.K, look.weight, floors[0], small.half, small.nodes, small.rows)
         if low > 0.0 and low * low >= aim.level:
             continue
-        side = steepest_side(small, d)
+        side = steepest_side(small.half, small.rows, d)
         if cost_at(look.K, look.w, small.nodes) < _WORTH * (aim.level + 1.0):
             boxes += 1
             tables.box.at[:], tables.box.half[:] = small.at, small.half

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
@@ -26,7 +25,7 @@ from optloc.proof.scope import unsupported
 from optloc.solvers.certify.posed import Costs, agrees, is_free, lacks, pose, prove, surfaces_of
 from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.outside import accept
-from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP
+from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, equal_cost
 from optloc.solvers.pool import Claim, Pool, in_parts, offer, pack, where
 from optloc.solvers.refine import refine
 from optloc.solvers.stages import lsr
@@ -121,16 +120,6 @@ _BUDGETS, _NODES, _SLOW_BUDGET, _AT_LEAST = (3000, 8000), 12, 2000, 5
 # Times as many on the surface of a height: three range differences took 20 000 to 40 000 boxes all around the Earth, of
 # two coordinates and 2 us each.
 _AROUND = 15
-# Cost that counts as equal, relative: covers the rounding of two ways to compute it, and is nothing beside the gap of 9
-# at which a second minimum matters.
-_EQUAL = 1e-6
-
-
-def equal_cost(cost: Any) -> Any:
-    """Return how far below a cost, or each of many, another counts as equal."""
-    return _EQUAL * (1.0 + cost)
-
-
 # Minima behind the Earth that are set aside at most: mirror images through it; whoever has more gets no proof.
 _HIDDEN = 4
 # Half-width of the region where all positions cannot be bounded: spreads of the stations, or distances of the fix, so

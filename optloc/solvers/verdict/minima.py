@@ -16,7 +16,7 @@ from optloc.problem.fix import Active, Stage
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
 from optloc.solvers.inequalities import lowest_sight
-from optloc.solvers.policy import AMBIGUOUS_GAP, EQUAL_COST, FAR, FLAT, LISTED_GAP, SAME_PLACE
+from optloc.solvers.policy import AMBIGUOUS_GAP, FAR, FLAT, LISTED_GAP, SAME_PLACE, equal_cost
 from optloc.solvers.pool import Curvature, Pool
 from optloc.solvers.starts.position import distance_of
 
@@ -203,19 +203,19 @@ def _choose(problem: Problem, pool: Pool) -> Array:
     """
     finished, least = pool.code == Status.OK, pool.cost[:, :1]
     with np.errstate(invalid="ignore"):
-        near = finished & (pool.cost <= least + EQUAL_COST * (1.0 + np.abs(least)))
+        near = finished & (pool.cost <= least + equal_cost(np.abs(least)))
     best = np.where(near.any(1), near.argmax(1), 0)
     tied, slot = np.nonzero(near & (near.sum(1) > 1)[:, None])
     if len(tied) and problem.layout.shares("position"):
         first, second = np.full((2, *pool.cost.shape), -np.inf)
-        first[tied, slot], second[tied, slot] = _likelier(problem.take(tied), pool.x[tied, slot])
+        first[tied, slot], second[tied, slot] = likelihood_of(problem.take(tied), pool.x[tied, slot])
         second[first < first.max(1)[:, None]] = -np.inf
         best[tied] = second[tied].argmax(1)
     return best
 
 
-def _likelier(problem: Problem, x: Array) -> tuple[Array, Array]:
-    """Return by what vectors (N, size) that cost the same are told apart, the larger the better, and then by what.
+def likelihood_of(problem: Problem, x: Array) -> tuple[Array, Array]:
+    """Return two numbers each, (N,), by which vectors (N, size) of one cost are told apart: the larger is likelier.
 
     On Earth by how well all stations see them, elsewhere by how near to the stations they are; mirror images, equal in
     both, by their last coordinate: the upper one. What is equal but for rounding must be equal here.
