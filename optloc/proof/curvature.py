@@ -326,7 +326,10 @@ def has_no_infimum(
 @compiled
 def _bends_down(sums: Array, ball: float, hessian: Array) -> bool:
     """Return whether the cost curves downwards along one direction all over a box, as around a saddle."""
-    if positive(sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], sums[H22]):  # nowhere, at the centre
+    # No eigenvalue is less than an entry of the diagonal less those beside it (Gershgorin): the common case.
+    a, b, c = abs(sums[H01]), abs(sums[H02]), abs(sums[H12])
+    least = min(sums[H00] - a - b, sums[H11] - a - c, sums[H22] - b - c)
+    if least + ball >= 0.0 or positive(sums[H00], sums[H01], sums[H02], sums[H11], sums[H12], sums[H22]):
         return False
     vectors = np.empty((3, 3))
     for k in range(3):

@@ -83,8 +83,9 @@ _WIDER, _WIDE = 3.0, 3.0
 # The same for a proof: a valley of a flat network is narrow, oblique to the faces, and longer than its curvature at the
 # minimum says. Over 300 fixes of five stations on flat ground 12 took a sixth fewer boxes than 3, and 8 half of that.
 _VALLEY = 12.0
-# Factor by which convex boxes are tried larger: the last one that is convex is at least two thirds of the largest.
-_GROWTH = 1.5
+# Half-widths of the first convex box that is tried, standard deviations, and by what cubes and sides are tried larger:
+# most cubes end at four. A side is at least two thirds of the largest.
+_FIRST, _DOUBLED, _GROWTH = 2.0, 2.0, 1.5
 
 
 @compiled
@@ -191,7 +192,7 @@ def set_axes(cost: Cost, box: Box, atlas: Atlas, i: int) -> bool:
     return True
 
 
-@compiled
+@inlined
 def _tables(cost: Cost, box: Box, atlas: Atlas, i: int, half: Array) -> None:
     """Fill the tables of a box with half-widths (3,) around minimum i."""
     box.at[:], box.half[:] = 0.0, half
@@ -215,17 +216,16 @@ def _grow(cost: Cost, box: Box, atlas: Atlas, i: int, hull: Array, margin: float
 
     A cube that shrinks or doubles, then its sides one by one, none beyond the hull (3,).
     """
-    sides = atlas.minima.sides[i]
-    if not _convex(cost, box, atlas, i, np.zeros(3), margin):
-        return False
-    trial, size = np.minimum(hull, 1.0), 1.0
+    sides, size = atlas.minima.sides[i], _FIRST
+    trial = np.minimum(hull, size)
     while not _convex(cost, box, atlas, i, trial, margin):
+        # Where it is not even at the centre, or on a millionth of a standard deviation, no box holds the minimum.
+        if (size == _FIRST and not _convex(cost, box, atlas, i, np.zeros(3), margin)) or size < 1e-6:
+            return False
         size *= 0.5
         trial = np.minimum(hull, size)
-        if size < 1e-6:  # a millionth of a standard deviation: no box that could hold the rounding of the minimum
-            return False
-    while size < _WIDEST and _convex(cost, box, atlas, i, np.minimum(hull, _GROWTH * size), margin):
-        size *= _GROWTH
+    while size < _WIDEST and _convex(cost, box, atlas, i, np.minimum(hull, _DOUBLED * size), margin):
+        size *= _DOUBLED
     sides[:] = np.minimum(hull, size)
     for k in range(atlas.dimension):
         trial = sides.copy()
