@@ -241,7 +241,8 @@ def _problem(
     times = epochs.clock if why is None else need_clock(epochs, why, source)
     priors = tuple(prior_of(p, stations.dimension, source) for p in file.priors)
     demands = {join(source, f"[[constraints]] {i + 1}"): table for i, table in enumerate(file.constraints)}
-    constraints = constraints_of({**demands, **more}, stations, frame, motions, epochs.targets, speed)
+    demands |= more
+    constraints, motions = constraints_of(demands, stations, frame, motions, epochs.targets, times, speed)
     made = Problem(stations, rows, noise, times, motions, biases, priors, frame, constraints)
     at_most("unknowns", made.layout.n_shared, source)
     return _check(made, source)

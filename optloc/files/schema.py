@@ -242,8 +242,13 @@ class ConstraintTable(_Table):
     """What is bounded; each kind has its own keys."""
     target: str | None = None
     """Name of the target; all by default."""
-    exactly: Amount | None = None
-    """Known height above the WGS 84 ellipsoid."""
+    exactly: Amount | list[Bound] | None = None
+    """Known height above the WGS 84 ellipsoid; or one number for each epoch, as reported."""
+    within: Amount | None = None
+    """Half the width of a band about `exactly`."""
+    along: bool | None = None
+    """Whether the height of a target that moves is held at every epoch (default), on a course that follows the
+    Earth, or at the reference time alone."""
     min: Amount | list[Bound] | None = None
     """Least height or speed; least coordinates of a box in the frame, -inf for none."""
     max: Amount | list[Bound] | None = None

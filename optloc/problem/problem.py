@@ -135,7 +135,7 @@ class Problem:
         """Return a hashable key of everything but the numbers; equal keys share compiled and indexed forms."""
         rows = tuple((r.kind, r.a.tobytes(), r.b.tobytes(), r.epoch.tobytes(), r.target.tobytes()) for r in self.rows)
         blocks = tuple((b.row.shape, b.row.tobytes()) for b in self.noise.blocks)
-        motions = tuple((m.order, m.span, m.known is None, m.reference) for m in self.motions)
+        motions = tuple((m.order, m.span, m.known is None, m.reference, m.over, m.rise is None) for m in self.motions)
         biases = tuple(
             (b.name, b.members, b.form, b.row.tobytes(), b.member.tobytes(), b.coefficient.tobytes())
             for b in self.biases
@@ -147,7 +147,7 @@ class Problem:
         if any(b.form == "time" for b in self.biases) and s.velocity is not None:
             stations += (s.position.tobytes(), s.velocity.tobytes())
         # Polygons enter nothing that is kept by structure but programs, whose keys hold the bands of their edges.
-        constraints = tuple((c.kind, c.target) for c in self.constraints if isinstance(c, Band))
+        constraints = tuple((c.kind, c.target, c.along) for c in self.constraints if isinstance(c, Band))
         return (rows, blocks, motions, biases, stations, self.times.tobytes(), self.frame, constraints)
 
     def flat(self) -> Problem:
@@ -211,7 +211,7 @@ _NUMBERS: dict[type, dict[str, int]] = {
     Stations: {"position": 3, "velocity": 3, "axes": 4, "covariance": 3},
     Rows: {"z": 1, "weight": 1, "correction": 1},
     Block: {"covariance": 3},
-    Motion: {"known": 3},
+    Motion: {"known": 3, "rise": 2},
     Prior: {"mean": 1, "covariance": 2},
     Band: {"lower": 0, "upper": 0, "coefficients": 1},
     Polygon: {},
