@@ -154,6 +154,8 @@ BAD = {
     "no reference": (lambda: Signal([1.0, 1.0], BAND, TIME, 2), "no station 2"),
     "angles": (lambda: assemble(STATIONS, measured("azimuth", a=[0], signal=Signal(np.ones(4), BAND, TIME))),
                "neither a time difference nor a gain ratio"),
+    "ranges": (lambda: assemble(STATIONS, measured("range", a=[1], signal=Signal(np.ones(4), BAND, TIME))),
+               "neither a time difference nor a gain ratio"),
     "too few": (lambda: assemble(STATIONS, measured("tdoa", a=[1], b=0, signal=Signal(np.ones(3), BAND, TIME))),
                 "3 signal-to-noise ratios for 4 stations"),
     "silent": (lambda: assemble(STATIONS, measured("tdoa", a=[1], b=0, signal=Signal([1, np.nan, 1, 1], BAND, TIME))),

@@ -122,12 +122,7 @@ def measured(
         array = np.asarray(np.nan) if values is None else values
         return np.array(np.broadcast_to(array, (*array.shape[:-1], count)))
 
-    # Exactly one of: a covariance; a signal; standard deviations, of rows, of arrivals, or of both.
-    if sum((covariance is not None, signal is not None, sigma is not None or arrival_sigma is not None)) != 1:
-        advice = "give covariance, or signal, or sigma, or arrival_sigma, or the last two together"
-        raise InvalidProblem(f"the noise of {kind} must be given once", where=kind, advice=advice)
-    if signal is not None and not isinstance(signal, Signal):
-        raise InvalidProblem(f"it is a {type(signal).__name__}", "signal", "give an optloc.Signal")
+    _check_noise(kind, covariance, signal, sigma is not None or arrival_sigma is not None)
     rows = Rows(
         kind,
         row(z),
@@ -145,6 +140,15 @@ def measured(
         covariance,
         signal,
     )
+
+
+def _check_noise(kind: str, covariance: Any, signal: Any, deviations: bool) -> None:
+    """Refuse all but one of: a covariance; a signal; standard deviations, of rows, of arrivals, or of both."""
+    if sum((covariance is not None, signal is not None, deviations)) != 1:
+        advice = "give covariance, or signal, or sigma, or arrival_sigma, or the last two together"
+        raise InvalidProblem(f"the noise of {kind} must be given once", where=kind, advice=advice)
+    if signal is not None and not isinstance(signal, Signal):
+        raise InvalidProblem(f"it is a {type(signal).__name__}", "signal", "give an optloc.Signal")
 
 
 def _count(kind: str, given: Sequence[Array | None], covariance: Array | None) -> int:

@@ -115,7 +115,7 @@ class Signal:
         Parameters
         ----------
         kind : str
-            A kind that adds up arrivals, such as "tdoa", or "groa".
+            "tdoa", "toa" or "groa".
         a, b : int array (g, r)
             Stations of each row.
 
@@ -131,7 +131,8 @@ class Signal:
         """
         model = MODELS[kind]
         ratio = kind == "groa"
-        if not ratio and model.ranges is None:
+        # what is common to all stations, the emission, must drop out of the rows
+        if not ratio and not model.emission and model.ranges != (1, -1):
             raise InvalidProblem(f"{kind} is neither a time difference nor a gain ratio", "signal", "give sigma")
         own = self._levels if ratio else np.diag(self.arrival_sigma**2)
         signs = _RATIO if model.ranges is None else model.ranges
