@@ -195,7 +195,8 @@ def decisive(problem: Problem, constraint: Band | Polygon) -> list[int | None]:
     if not isinstance(constraint, Band) or not holds_along(problem, constraint):
         return [None]
     count = problem.motions[constraint.target].order + 1
-    return [int(k) for k in np.unique(np.linspace(0, problem.epochs - 1, count).round())]
+    chosen = np.unique(np.linspace(0, problem.epochs - 1, count).round().astype(int))
+    return [int(k) for k in np.argsort(problem.times, kind="stable")[chosen]]
 
 
 def holds_along(problem: Problem, band: Band) -> bool:
