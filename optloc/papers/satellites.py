@@ -364,10 +364,12 @@ def table_relative(panels: Mapping[str, tuple[Mapping[str, Run], Array]]) -> Tab
     longest = max(len(bound) for _, bound in panels.values())
     steps = [step for step in _STEPS if step <= longest]
     lines = []
-    for title, (runs, _) in panels.items():
+    for title, (runs, bound) in panels.items():
         for name, run in runs.items():
-            at = [100.0 * run.relative[s - 1] if s <= len(run.relative) else None for s in steps]
-            lines.append((title, NAMES[name], *(ABSENT if v is None else f"{v:.4f} %" for v in at)))
+            # a filter that is begun by fixes has no state before the second
+            at = [s - 1 - len(bound) + len(run.relative) for s in steps]
+            shown = (f"{100.0 * run.relative[i]:.4f} %" if 0 <= i < len(run.relative) else ABSENT for i in at)
+            lines.append((title, NAMES[name], *shown))
     return tabulate("relative", ("start", "filter", *(f"step {step}" for step in steps)), lines)
 
 
