@@ -135,7 +135,7 @@ class Problem:
         """Return a hashable key of everything but the numbers; equal keys share compiled and indexed forms."""
         rows = tuple((r.kind, r.a.tobytes(), r.b.tobytes(), r.epoch.tobytes(), r.target.tobytes()) for r in self.rows)
         blocks = tuple((b.row.shape, b.row.tobytes()) for b in self.noise.blocks)
-        motions = tuple((m.order, m.span, m.known is None, m.reference, m.over, m.rise is None) for m in self.motions)
+        motions = tuple((m.order, m.span, m.known is None, m.reference, *_course(m)) for m in self.motions)
         biases = tuple(
             (b.name, b.members, b.form, b.row.tobytes(), b.member.tobytes(), b.coefficient.tobytes())
             for b in self.biases
@@ -147,7 +147,8 @@ class Problem:
         if any(b.form == "time" for b in self.biases) and s.velocity is not None:
             stations += (s.position.tobytes(), s.velocity.tobytes())
         # Polygons enter nothing that is kept by structure but programs, whose keys hold the bands of their edges.
-        constraints = tuple((c.kind, c.target, c.along) for c in self.constraints if isinstance(c, Band))
+        bands = [c for c in self.constraints if isinstance(c, Band)]
+        constraints = tuple((c.kind, c.target, *_along(c, self.motions[c.target])) for c in bands)
         return (rows, blocks, motions, biases, stations, self.times.tobytes(), self.frame, constraints)
 
     def flat(self) -> Problem:
@@ -195,6 +196,17 @@ class Problem:
         for block, values, importance in zip(self.rows, zs, weights, strict=True):
             rows.append(replace(block, z=values, weight=importance))
         return replace(self, rows=tuple(rows))
+
+
+# Entries of a structure that few problems have, and none that draws of stored studies are keyed by.
+
+
+def _course(motion: Motion) -> tuple[Any, ...]:
+    return () if motion.over == "space" and motion.rise is None else (motion.over, motion.rise is None)
+
+
+def _along(band: Band, motion: Motion) -> tuple[str, ...]:
+    return ("along",) if band.along and motion.order and motion.span == "run" else ()
 
 
 def _join(parts: list[Array]) -> Array:
