@@ -140,10 +140,12 @@ class Program:
         weight = ca.SX.sym("W", m, 1 if diagonal else m)
         mean, information = ca.SX.sym("mean", n), ca.SX.sym("M", n, n)
         misfit = z - _column(h(x, given), m) if h is not None else _column(residual(x, given, z), m)  # type: ignore[misc]
-        white = weight * misfit if diagonal else weight @ misfit
-        cost = ca.sumsqr(white) + ca.bilin(information, x - mean, x - mean)
         c = _column(equalities(x, given)) if equalities else ca.SX(0, 1)
         d = _column(inequalities(x, given)) if inequalities else ca.SX(0, 1)
+        # what rows share is computed once: of courses that follow the Earth derivatives then are a seventh as long
+        misfit, c, d = ca.cse([misfit, c, d])
+        white = weight * misfit if diagonal else weight @ misfit
+        cost = ca.sumsqr(white) + ca.bilin(information, x - mean, x - mean)
         self._equal, self._more = c.shape[0], d.shape[0]
         # everything that changes from solve to solve is one parameter vector: the program is built and compiled once
         data = ca.vertcat(given, z, ca.vec(weight), mean, ca.vec(information))

@@ -13,7 +13,16 @@ ranges,
 .. math:: r_1^2 = |p_k - s_1|^2, \qquad (z_i - f_i)^2 + 2 r_1 (z_i - f_i) = |p_k - s_i|^2 - |p_k - s_1|^2 .
 
 The lift :math:`Y = y y^\top` is relaxed to :math:`Y \succeq 0` and solved with the price :math:`\eta \,
-\operatorname{mean}_k |p_k|^2`, read off the lift. Small unknowns are lifted in small units: the leftovers, not the
+\operatorname{mean}_k |p_k|^2`, read off the lift.
+
+It is never formed. With the biases in the lift the cost is a sum over the windows, and so are the definitions: of `Y`
+only the blocks of :math:`u_k = (1, p, v, \delta, r_1(k), f_i(k))` are asked for, which share those of :math:`(1, p, v,
+\delta)` and nothing else. Blocks that are semidefinite one by one and agree in what they share are those of a
+semidefinite matrix, for the graph of such a pattern is chordal; and the best moments of the biases give :math:`f^\top M
+f` back. So `K` blocks of a dozen rows are the same relaxation as the lift of all windows, whose time grows with the
+sixth power of them.
+
+Small unknowns are lifted in small units: the leftovers, not the
 ranges :math:`r_i`, whose squares would hide them from an interior-point method.
 
 Both the price and the prior are needed. A misfit `m` of the second equality can be absorbed in the moments alone,
@@ -27,10 +36,12 @@ gives starts, not bounds.
 The best price depends on the unknown distance: too high, and it draws the target in; too low, and the slack throws it
 out. So a ladder of prices is solved, and the answers are ranked by the cost of the data at their targets.
 
-Sources: N. Z. Shor, "Quadratic optimization problems", Sov. J. Comput. Syst. Sci. 25 (1987) (the lift); K. W. K. Lui,
-W.-K. Ma, H. C. So and F. K. W. Chan, "Semi-definite programming algorithms for sensor network node localization with
-uncertainties in anchor positions and/or propagation speed", IEEE Trans. Signal Process. 57 (2009) (nuisance parameters
-in the lift); the leftovers, the price and its reason are this project's.
+Sources: R. Grone, C. R. Johnson, E. M. Sa and H. Wolkowicz, "Positive definite completions of partial Hermitian
+matrices", Linear Algebra Appl. 58 (1984), theorem 7 (the blocks); N. Z. Shor, "Quadratic optimization problems", Sov.
+J. Comput. Syst. Sci. 25 (1987) (the lift); K. W. K. Lui, W.-K. Ma, H. C. So and F. K. W. Chan, "Semi-definite
+programming algorithms for sensor network node localization with uncertainties in anchor positions and/or propagation
+speed", IEEE Trans. Signal Process. 57 (2009) (nuisance parameters in the lift); the leftovers, the price and its
+reason are this project's.
 """
 
 from __future__ import annotations
@@ -69,7 +80,7 @@ class Started:
     slack : float
         Mean over the windows of the lifted ``|p_k|^2`` less its value at the target, length squared.
     rank_ratio : float
-        Second over first eigenvalue of the lift in its own units; near zero would mean tight.
+        Second over first eigenvalue in its own units, of the block in which it is largest; near zero would mean tight.
     answer : Answer
         The solver's report.
     """
@@ -141,12 +152,12 @@ def registration(
         return ()
     # the price of the mean of |p_k|^2 over the windows
     K, S, d = run.station.shape
-    relaxation, data = _relaxation(K, S, d, run.power.shape[1] - 1, backend), _parameters(run)
+    relaxation, data = _relaxation(K, S, d, run.power.shape[1] - 1, len(run.prior), backend), _parameters(run)
     weight = np.kron(run.power.T @ run.power / K, np.eye(d))
     found = []
     for price in prices:
         answer = relaxation.solve({**data, "price": price * weight}, bound=False)
-        if np.isfinite(answer.values["lift"]).all():
+        if all(np.isfinite(value).all() for value in answer.values.values()):
             found.append(_read_off(run, weight, price, answer))
     return tuple(sorted(found, key=lambda one: one.cost))
 
@@ -226,19 +237,11 @@ class Windows:
         """Whether all numbers are finite and the times, where they count, differ."""
         return all(np.isfinite(part).all() for part in (self.station, self.z, self.gram, self.power))
 
-    def form(self) -> Array:
-        """Return M of the cost f'Mf of leftovers f (K (S - 1),): the rows' information less what biases explain."""
-        K, C, _ = self.gram.shape
-        along = (self.gram @ self.design).reshape(K * C, -1)
-        blocks = np.zeros((K, C, K, C))
-        blocks[np.arange(K), :, np.arange(K)] = self.gram
-        return np.asarray(blocks.reshape(K * C, K * C) - along @ np.linalg.solve(self._total(), along.T))
-
     def cost(self, target: Array) -> tuple[float, Array]:
         """Return the cost at a scaled target (n,), and the shifts (b,) of the biases from their means that fit best."""
         away = np.linalg.norm((self.power @ target.reshape(-1, len(self.origin)))[:, None] - self.station, axis=-1)
         left = (self.z - away[:, 1:] + away[:, :1]) / self.unit
-        shift = np.linalg.solve(self._total(), self.design.T @ np.einsum("kij,kj->i", self.gram, left))
+        shift = np.linalg.solve(self.total, self.design.T @ np.einsum("kij,kj->i", self.gram, left))
         rest = left - self.design @ shift
         return float(np.einsum("ki,kij,kj", rest, self.gram, rest) + self.prior @ shift**2), shift
 
@@ -251,11 +254,13 @@ class Windows:
         found[0] += self.origin
         return np.asarray(found)
 
-    def _total(self) -> Array:
+    @property
+    def total(self) -> Array:
+        """Return the information of the biases (b, b) in the fine unit, prior included."""
         return np.asarray(self.design.T @ self.gram.sum(axis=0) @ self.design + np.diag(self.prior))
 
 
-def registration_problem(windows: int, stations: int, dimension: int, order: int) -> Any:
+def registration_problem(windows: int, stations: int, dimension: int, order: int, biases: int) -> Any:
     """Build the relaxation as a cvxpy problem.
 
     Parameters
@@ -264,50 +269,56 @@ def registration_problem(windows: int, stations: int, dimension: int, order: int
         K, S and d.
     order : int
         Zero for a fixed target, one for a uniformly moving one.
+    biases : int
+        b.
 
     Returns
     -------
     cvxpy.Problem
-        Variable ``lift`` of size 1 + n + K + K (S - 1), n = d (order + 1), in the order of `y`. Parameters ``form``,
-        the matrix M, ``price`` (n, n), ``moment`` (K, order + 1, order + 1) flattened to (K, ...), whose entries
-        weigh the inner products of p and v in ``|p_k|^2``; of ``r_1^2 = |p_k|^2 + near'(1, p, v)`` the rows ``near``
-        (K, n + 1); of ``unit f^2 - 2 r_1 f + level'(1, p, v) + ahead r_1 - turn f = 0`` the rows ``level``
-        (K (S - 1), n + 1), ``ahead`` and ``turn`` (K (S - 1),), and the scalar ``unit``.
+        Variables ``shared`` of size 1 + n + b, n = d (order + 1), the lift of (1, p, v, delta), and for each window k
+        ``across k`` (1 + n + b, S) and ``own k`` (S, S), those of it with (r_1, f), and of (r_1, f). Parameters
+        ``gram k`` and ``tie k``, the inverse covariance G of the rows and G E, ``bias`` (b, b), the sum of E'G E and
+        the prior, ``price`` (n, n), ``moment`` (K, order + 1, order + 1) flattened to (K, ...), whose entries weigh
+        the inner products of p and v in ``|p_k|^2``; of ``r_1^2 = |p_k|^2 + near'(1, p, v)`` the rows ``near`` (K, n
+        + 1); of ``unit f^2 - 2 r_1 f + level'(1, p, v) + ahead r_1 - turn f = 0`` the rows ``level`` (K (S - 1), n +
+        1), ``ahead`` and ``turn`` (K (S - 1),), and the scalar ``unit``.
 
     Notes
     -----
-    Shor (1987).
+    Shor (1987); Grone et al. (1984).
     """
     import cvxpy as cp
 
-    n, count = dimension * (order + 1), windows * (stations - 1)
-    first, last = 1 + n, 1 + n + windows
-    lift = cp.Variable((last + count, last + count), symmetric=True, name="lift")
-    form, price = cp.Parameter((count, count), name="form"), cp.Parameter((n, n), name="price")
+    n, rows = dimension * (order + 1), stations - 1
+    first, size = 1 + n, 1 + n + biases
+    shared = cp.Variable((size, size), symmetric=True, name="shared")
+    price, bias = cp.Parameter((n, n), name="price"), cp.Parameter((biases, biases), name="bias")
     moment = cp.Parameter((windows, (order + 1) ** 2), name="moment")
-    near, level = cp.Parameter((windows, n + 1), name="near"), cp.Parameter((count, n + 1), name="level")
-    ahead, turn = cp.Parameter(count, name="ahead"), cp.Parameter(count, name="turn")
+    near, level = cp.Parameter((windows, n + 1), name="near"), cp.Parameter((windows * rows, n + 1), name="level")
+    ahead, turn = cp.Parameter(windows * rows, name="ahead"), cp.Parameter(windows * rows, name="turn")
     unit = cp.Parameter(name="unit")
-    head, square = lift[0, :first], cp.diag(lift)
     parts = [slice(1 + i * dimension, 1 + (i + 1) * dimension) for i in range(order + 1)]
-    inner = cp.hstack([cp.trace(lift[a, b]) for a in parts for b in parts])
-    # which r_1 belongs to each leftover: their product in the lift
-    owner = np.repeat(np.arange(first, last), stations - 1)
-    cross = lift[owner, np.arange(last, last + count)]
-    rules = [
-        lift >> 0,
-        lift[0, 0] == 1,
-        square[first:last] == moment @ inner + near @ head,
-        unit * square[last:] - 2 * cross + level @ head + cp.multiply(ahead, lift[0, owner])
-        == cp.multiply(turn, lift[0, last:]),
-    ]
-    cost = cp.sum(cp.multiply(form, lift[last:, last:])) + cp.sum(cp.multiply(price, lift[1:first, 1:first]))
+    head, inner = shared[0, :first], cp.hstack([cp.trace(shared[a, b]) for a in parts for b in parts])
+    cost = cp.sum(cp.multiply(price, shared[1:first, 1:first])) + cp.sum(cp.multiply(bias, shared[first:, first:]))
+    rules = [shared[0, 0] == 1]
+    for k in range(windows):
+        across = cp.Variable((size, stations), name=f"across {k}")
+        own = cp.Variable((stations, stations), symmetric=True, name=f"own {k}")
+        gram, tie = cp.Parameter((rows, rows), name=f"gram {k}"), cp.Parameter((rows, biases), name=f"tie {k}")
+        part = slice(k * rows, (k + 1) * rows)
+        rules += [
+            cp.bmat([[shared, across], [across.T, own]]) >> 0,
+            own[0, 0] == moment[k] @ inner + near[k] @ head,
+            unit * cp.diag(own)[1:] - 2 * own[0, 1:] + level[part] @ head + ahead[part] * across[0, 0]
+            == cp.multiply(turn[part], across[0, 1:]),
+        ]
+        cost += cp.sum(cp.multiply(gram, own[1:, 1:])) - 2 * cp.sum(cp.multiply(tie, across[first:, 1:].T))
     return cp.Problem(cp.Minimize(cost), rules)
 
 
 @keep
-def _relaxation(windows: int, stations: int, dimension: int, order: int, backend: str) -> Relaxation:
-    return Relaxation(registration_problem(windows, stations, dimension, order), backend=backend)
+def _relaxation(windows: int, stations: int, dimension: int, order: int, biases: int, backend: str) -> Relaxation:
+    return Relaxation(registration_problem(windows, stations, dimension, order, biases), backend=backend)
 
 
 def _parameters(run: Windows) -> dict[str, Array]:
@@ -319,8 +330,10 @@ def _parameters(run: Windows) -> dict[str, Array]:
     lever = np.einsum("ko,kid->kiod", power, other - first[:, None]).reshape(K, S - 1, -1)
     level = np.concatenate([(run.z**2 - size[:, 1:] + size[:, :1])[..., None], 2 * lever], axis=-1)
     slope = np.einsum("ko,kd->kod", power, first).reshape(K, -1)
-    return {
-        "form": run.form(),
+    tie = run.gram @ run.design
+    blocks = {f"gram {k}": run.gram[k] for k in range(K)} | {f"tie {k}": tie[k] for k in range(K)}
+    return blocks | {
+        "bias": run.total,
         "moment": np.einsum("ka,kb->kab", power, power).reshape(K, -1),
         "near": np.concatenate([size[:, :1], -2 * slope], axis=1),
         "level": level.reshape(K * (S - 1), -1) / run.unit,
@@ -331,12 +344,11 @@ def _parameters(run: Windows) -> dict[str, Array]:
 
 
 def _read_off(run: Windows, weight: Array, price: float, answer: Answer) -> Started:
-    lift = answer.values["lift"]
-    inside = slice(1, 1 + len(weight))
-    target = lift[0, inside]
+    shared, inside = answer.values["shared"], slice(1, 1 + len(weight))
+    target = shared[0, inside]
     cost, shift = run.cost(target)
     # what the lift says |p|^2 is: more than the square of what it says p is, by the slack
-    square = float((weight * lift[inside, inside]).sum())
+    square = float((weight * shared[inside, inside]).sum())
     return Started(
         run.place(target),
         run.mean + run.unit * run.scale * shift,
@@ -344,6 +356,11 @@ def _read_off(run: Windows, weight: Array, price: float, answer: Answer) -> Star
         price,
         answer.primal - price * square,
         run.scale**2 * (square - float(target @ weight @ target)),
-        rank_ratio(lift),
+        max(rank_ratio(_block(answer, k)) for k in range(len(run.station))),
         answer,
     )
+
+
+def _block(answer: Answer, window: int) -> Array:
+    across = answer.values[f"across {window}"]
+    return np.block([[answer.values["shared"], across], [across.T, answer.values[f"own {window}"]]])

@@ -40,6 +40,7 @@ from optloc.problem.layout import Layout
 from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.noise import Noise
 from optloc.problem.problem import Problem
+from optloc.problem.signal import Signal
 from optloc.quality.health import Health, health
 from optloc.quality.levels import (
     NoiseLevels,
@@ -105,6 +106,7 @@ __all__ = [
     "Rows",
     "Running",
     "Samples",
+    "Signal",
     "Stage",
     "Stations",
     "Status",

@@ -5,6 +5,7 @@ import pytest
 from cases import STATIONS, TARGET
 
 from optloc import assemble, measured, simulate, solve
+from optloc.papers.registration import SPATIAL, Setting
 
 
 @pytest.mark.parametrize("count", [1, 3])
@@ -18,3 +19,14 @@ def test_each_problem_has_its_own_stations(count):
     sigma = np.sqrt(np.diagonal(expected.cov, axis1=-2, axis2=-1))
     assert found.answered.all()
     assert (np.abs(found.position - expected.position) <= 1e-4 * sigma).all()
+
+
+def test_a_long_run_ends_refined_on_all_its_epochs():
+    """IPOPT sees block averages of it, whose minimum is another: least squares ends at that of all rows."""
+    setting = Setting(SPATIAL, 2, 1, 0)
+    drawn = setting.draw(150)
+    found, expected = solve(drawn, "roots+nlp"), solve(drawn, "roots+lsr")
+    assert found.answered.all()
+    sigma = np.sqrt(np.diagonal(expected.cov, axis1=-2, axis2=-1))
+    assert (np.abs(found.x - expected.x) <= 1e-4 * sigma).all()
+    assert [stage.name for stage in found.stages] == ["roots", "nlp", "lsr"]

@@ -84,6 +84,16 @@ def test_three_satellites_with_noise_end_where_newton_from_the_truth_does():
     assert nearest(fix[met], expected[met]).max() < 1e-3
 
 
+def test_the_relaxation_that_knows_the_height_is_the_answer_of_sdp_alone():
+    x, up = visible(20)
+    template = assemble(
+        SATELLITES, measured("tdoa", a=[0, 0], b=[1, 2], sigma=15.0), frame=ECEF, constraints=[height(exactly=up)]
+    )
+    drawn = simulate(template, x, seed=14)
+    alone, refined = solve(drawn, "sdp").position, solve(drawn, "sdp+lsr").position
+    assert np.median(np.linalg.norm(alone - refined, axis=1)) < 1.0
+
+
 @pytest.mark.parametrize("order", [0, 1])
 def test_one_receiver_and_one_illuminator_reach_the_minimum_beside_the_truth(order):
     epochs = np.arange(30)

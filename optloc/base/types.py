@@ -106,12 +106,20 @@ class Motion:
         The target's true state at each epoch (calibration); it is then not estimated.
     reference : float, optional
         Time at which the state of a run holds, seconds; None: the first epoch.
+    over : "space" or "ground"
+        The course of a run is a polynomial in space, or it follows the Earth: along a great circle with that way, at
+        a height that is a polynomial of that order (`optloc.models.course`).
+    rise : array (..., k, 2), optional
+        Height at each epoch beyond that polynomial, metres, and its rate, metres per second: the known shape of a
+        height that was reported. Zero at the reference time.
     """
 
     order: int = 0
     span: Literal["run", "epoch"] = "run"
     known: Array | None = None
     reference: float | None = None
+    over: Literal["space", "ground"] = "space"
+    rise: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,7 +174,9 @@ class Band:
     name : str
         How reports call it.
     target : int
-        Which target; the constraint holds for its state at the reference time.
+        Which target.
+    along : bool
+        Whether it holds at every epoch of a run, less the known `rise` of a height, or at the reference time alone.
     """
 
     kind: str
@@ -175,6 +185,7 @@ class Band:
     coefficients: Array
     name: str
     target: int = 0
+    along: bool = False
 
 
 @dataclass(frozen=True, slots=True)

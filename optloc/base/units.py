@@ -42,7 +42,7 @@ __all__ = [
     "to_si",
 ]
 
-Quantity = Literal["length", "angle", "ratio", "level", "speed", "time", "plain"]
+Quantity = Literal["length", "angle", "ratio", "level", "speed", "time", "frequency", "power", "plain"]
 """What a number measures; it decides which units make sense."""
 
 AzimuthConvention = Literal["east-counterclockwise", "north-clockwise"]
@@ -94,11 +94,13 @@ UNITS: Final[Mapping[Quantity, Mapping[str, float]]] = MappingProxyType(
             "Hz": 1.0,
         },
         "time": {**_TIME, "min": 60.0, "h": 3600.0},
+        "frequency": {"Hz": 1.0, "kHz": 1e3, "MHz": 1e6, "GHz": 1e9},
+        "power": {"1": 1.0, "dB": 1.0},
         "plain": {"1": 1.0},
     }
 )
 """Known units of each quantity and their size in SI; times that stand for lengths are in seconds,
-``Hz`` in 1/s and ``dB`` of a ratio is logarithmic (see the module's text)."""
+``Hz`` in 1/s and ``dB`` of a ratio, or of a ratio of powers, is logarithmic (see the module's text)."""
 
 SI_UNIT: Final[Mapping[Quantity, str]] = MappingProxyType({q: next(iter(table)) for q, table in UNITS.items()})
 """The unit of each quantity in memory; levels are in decibels, which SI accepts."""
@@ -185,7 +187,7 @@ def conversion(
     ----------
     unit : str
         One of ``UNITS[quantity]``.
-    quantity : {"length", "angle", "ratio", "level", "speed", "time", "plain"}
+    quantity : {"length", "angle", "ratio", "level", "speed", "time", "frequency", "power", "plain"}
         What the numbers measure.
     propagation_speed : float
         Speed in m/s that turns propagation times into lengths and frequencies into speeds.
@@ -214,7 +216,9 @@ def conversion(
     if unit == "dB" and quantity == "ratio":
         # Amplitude falls with the range, so that 20 decibels are a factor of ten in range.
         return Conversion(math.log(10) / 20, logarithmic=True)
-    if unit == "Hz":
+    if unit == "dB" and quantity == "power":
+        return Conversion(math.log(10) / 10, logarithmic=True)
+    if unit == "Hz" and quantity == "speed":
         if carrier is None or not 1.0 / LARGEST <= carrier <= LARGEST:
             given = "is missing" if carrier is None else f"must be positive, not {carrier:g} Hz"
             raise InvalidProblem(

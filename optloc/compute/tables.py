@@ -243,7 +243,7 @@ class Sources:
     Parameters
     ----------
     arrays : tuple of (array, core rank)
-        Station positions, rates, axes, known targets.
+        Station positions, rates, axes, known targets, known shapes of heights.
     start : tuple of int
         Number of the first entry of each, counted over one problem.
     """
@@ -256,6 +256,7 @@ class Sources:
         """Return the data arrays of a flat batch of problems."""
         s = problem.stations
         found = [(s.position, 3), (s.velocity, 3), (s.axes, 4), *((m.known, 3) for m in problem.motions)]
+        found += [(m.rise, 2) for m in problem.motions]
         arrays = tuple((array, core) for array, core in found if array is not None)
         sizes = [int(np.prod(array.shape[array.ndim - core :])) for array, core in arrays]
         return cls(arrays, tuple(int(n) for n in np.cumsum([1, *sizes[:-1]])))
@@ -278,6 +279,7 @@ class Sources:
         s = problem.stations
         stations = replace(s, position=next(places), velocity=place(s.velocity), axes=place(s.axes))
         motions = tuple(replace(m, known=place(m.known)) for m in problem.motions)
+        motions = tuple(replace(m, rise=place(m.rise)) for m in motions)
         return replace(problem, stations=stations, motions=motions)
 
     def lookup(self) -> Array:

@@ -13,6 +13,7 @@ from optloc.base.units import LARGEST, Conversion
 from optloc.files.schema import MeasurementsTable, Units, join, kind_model
 from optloc.files.table import Epochs, Table, distinct
 from optloc.models import Model
+from optloc.problem.signal import Signal
 
 ESTIMATE = "estimate"
 """Word in the place of a standard deviation that is to be found from the data."""
@@ -53,6 +54,8 @@ class Chunk:
         Standard deviation of each station's arrival.
     covariance : array (r, r), optional
         Covariance of the rows of one epoch, in the file's unit squared.
+    signal : Signal, optional
+        What their noise follows from.
     label, time, written, target : array (m,), optional
         Columns epoch, time (seconds; as written) and target.
     excess : bool
@@ -76,6 +79,7 @@ class Chunk:
     sigma: Array | None
     arrival: Array | None
     covariance: Array | None
+    signal: Signal | None
     label: Array | None
     time: Array | None
     written: Array | None
@@ -157,7 +161,7 @@ def _chunk(c: Context, kind: str) -> Chunk:
     return Chunk(
         kind, np.arange(table.count), z, a, b, weight, _correction(c, units, unit), unit, units, units.name(name),
         np.broadcast_to(unit.slope(z), z.shape), np.zeros(c.table.count),
-        sigma, arrival, covariance,
+        sigma, arrival, covariance, signal_of(c),
         table.labels("epoch") if table.has("epoch") else None,
         table.times("time", seconds) if table.has("time") else None,
         table.labels("time") if table.has("time") else None,
@@ -297,9 +301,10 @@ def spread_of(
     """
     section = c.section
     column = c.table.has("sigma")
-    given = [column or section.sigma is not None, section.arrival_sigma is not None, section.covariance is not None]
-    if sum(given) > 1:
-        raise InvalidProblem("the noise is given more than once", c.where, "give sigma, arrival_sigma or covariance")
+    forms = (section.arrival_sigma, section.covariance, section.snr)
+    if sum((column or section.sigma is not None, *(form is not None for form in forms))) > 1:
+        advice = "give sigma, arrival_sigma, covariance or snr"
+        raise InvalidProblem("the noise is given more than once", c.where, advice)
     if column:
         return _positive(c, unit.sigma_to_si(c.table.numbers("sigma"), z), column=True), None, None
     if section.sigma == ESTIMATE:
@@ -312,6 +317,28 @@ def spread_of(
     # A matrix stays in the file's unit until the slope of each row is known.
     covariance = None if section.covariance is None else square(section.covariance, join(c.where, "key 'covariance'"))
     return None, None, covariance
+
+
+def signal_of(c: Context) -> Signal | None:
+    """Return the signal from which the noise of rows follows, or None where the table names none."""
+    section, parts = c.section, ("snr", "bandwidth", "duration")
+    lacking = [name for name in parts if getattr(section, name) is None]
+    if section.snr is None or section.bandwidth is None or section.duration is None:
+        if len(lacking) < len(parts):
+            raise InvalidProblem(f"the noise of a signal needs {' and '.join(lacking)}", c.where, "give all three")
+        return None
+    given = section.snr if isinstance(section.snr, Mapping) else dict.fromkeys(c.stations, section.snr)
+    place, snr = join(c.where, "key 'snr'"), np.full(len(c.stations), np.nan)
+    for name, value in given.items():
+        if name not in c.stations:
+            raise InvalidProblem(f"there is no station {name!r}", place, nearest(name, list(c.stations)))
+        snr[c.stations.index(name)] = Units("power").plain(value, "1", place)
+    bandwidth = Units("frequency").plain(section.bandwidth, "Hz", join(c.where, "key 'bandwidth'"))
+    duration = Units("time").plain(section.duration, "s", join(c.where, "key 'duration'"))
+    try:
+        return Signal(snr, bandwidth, duration, speed=c.speed)
+    except InvalidProblem as error:
+        raise InvalidProblem(error.what, join(c.where, f"key {error.where!r}"), error.advice) from None
 
 
 def _positive(c: Context, sigma: Array, *, column: bool) -> Array:
@@ -416,7 +443,7 @@ def check_repeats(
 def _table(chunk: Chunk, index: Array, target: Array, number: int) -> Array:
     """Return the number of the chunk, what makes rows equal, and the place in the chunk, as columns (9, present)."""
     # With noise of arrivals a second row of the same stations has the same noise, whatever its value: a copy, too.
-    own = chunk.arrival is None
+    own = chunk.arrival is None and chunk.signal is None
     time = np.zeros(len(index)) if chunk.time is None or not own else chunk.time
     value = chunk.z if own else np.zeros(len(index))
     same = (chunk.a, chunk.b, index, target, np.full(len(index), own), value, time)
@@ -434,6 +461,6 @@ def _repeated(
     row = f"row {other.row[j] + 1}" + ("" if other.table is chunk.table else f" of {other.table.source}")
     what = " ".join(f"{chunk.kind} {names} of epoch {epoch!r} is already in {row}".split())
     advice = "leave one of them out, or give each an epoch of its own"
-    if chunk.arrival is not None:
-        what += ", and by arrival_sigma both have the same noise"
+    if chunk.arrival is not None or chunk.signal is not None:
+        what += f", and by {'snr' if chunk.arrival is None else 'arrival_sigma'} both have the same noise"
     return InvalidProblem(what, chunk.table.where("z", int(chunk.row[i])), advice)

@@ -33,6 +33,7 @@ from optloc.models import MODELS
 from optloc.problem.check import checked
 from optloc.problem.noise import Block, Noise, arrivals, group, together
 from optloc.problem.problem import Problem
+from optloc.problem.signal import Signal
 from optloc.quality.levels import NoiseLevels, with_estimated_noise
 
 LOG = logging.getLogger("optloc.read")
@@ -241,7 +242,8 @@ def _problem(
     times = epochs.clock if why is None else need_clock(epochs, why, source)
     priors = tuple(prior_of(p, stations.dimension, source) for p in file.priors)
     demands = {join(source, f"[[constraints]] {i + 1}"): table for i, table in enumerate(file.constraints)}
-    constraints = constraints_of({**demands, **more}, stations, frame, motions, epochs.targets, speed)
+    demands |= more
+    constraints, motions = constraints_of(demands, stations, frame, motions, epochs.targets, times, speed)
     made = Problem(stations, rows, noise, times, motions, biases, priors, frame, constraints)
     at_most("unknowns", made.layout.n_shared, source)
     return _check(made, source)
@@ -321,7 +323,7 @@ def _noise(
     if file.covariance is None:
         return noise_of(chunks, numbers, index, target)
     place = join(source, "key 'covariance'")
-    if any(c.sigma is not None or c.arrival is not None or c.covariance is not None for c in chunks):
+    if any(part is not None for c in chunks for part in (c.sigma, c.arrival, c.covariance, c.signal)):
         raise InvalidProblem("the noise is given more than once", place, "leave out that of the single measurements")
     matrix = square(file.covariance, place)
     slope = np.concatenate([chunk.slope for chunk in chunks])
@@ -348,10 +350,13 @@ def noise_of(
             # Arrivals are common to the rows of one epoch and one target: another pulse has other errors.
             members = together(epoch * (target.max(initial=0) + 1) + target)
             blocks += [Block(number[m], _arrivals(chunk, m)) for m in members]
+        elif chunk.signal is not None:
+            members = together(epoch * (target.max(initial=0) + 1) + target)
+            blocks += [Block(number[m], _by_signal(chunk, chunk.signal, m)) for m in members]
         elif chunk.covariance is not None:
             blocks.append(_per_epoch_block(chunk, number, epoch, chunk.covariance))
         else:
-            advice = "give sigma, arrival_sigma or covariance, or rows with a column sigma"
+            advice = "give sigma, arrival_sigma, covariance or snr, or rows with a column sigma"
             raise InvalidProblem("the measurements have no noise", chunk.table.source, advice)
     return group(blocks)
 
@@ -368,6 +373,13 @@ def _arrivals(chunk: Chunk, members: Array) -> Array:
         place = join(chunk.table.source, f"row {chunk.row[members[row[0], column[0]]] + 1}")
         raise InvalidProblem("no station of this row has an arrival_sigma", place, "name its stations there")
     return covariance
+
+
+def _by_signal(chunk: Chunk, signal: Signal, members: Array) -> Array:
+    try:
+        return signal.covariance(chunk.kind, chunk.a[members], chunk.b[members])
+    except InvalidProblem as error:
+        raise InvalidProblem(error.what, join(chunk.table.source, f"key {error.where!r}"), error.advice) from None
 
 
 def _per_epoch_block(chunk: Chunk, number: Array, epoch: Array, matrix: Array) -> Block:

@@ -203,6 +203,13 @@ class MeasurementsTable(DataTable):
     """Standard deviation of the arrival at each station; rows of an epoch that share a station are then correlated."""
     covariance: list[list[float]] | None = None
     """Covariance of the rows of one epoch in their order, unit squared."""
+    snr: Amount | dict[str, Amount] | None = None
+    """Signal-to-noise ratio of power within the band, one or of each station, "10 dB" or a ratio: with `bandwidth` and
+    `duration` the noise of time differences and gain ratios follows."""
+    bandwidth: Amount | None = None
+    """Hertz, from zero up; of a signal about a carrier half its bandwidth, with twice the duration."""
+    duration: Amount | None = None
+    """Seconds that are integrated for one measurement."""
     correction: Amount | None = None
     """Known amount by which every row exceeds the model."""
     weight: float | None = Field(default=None, ge=0.0, le=1.0)
@@ -242,8 +249,13 @@ class ConstraintTable(_Table):
     """What is bounded; each kind has its own keys."""
     target: str | None = None
     """Name of the target; all by default."""
-    exactly: Amount | None = None
-    """Known height above the WGS 84 ellipsoid."""
+    exactly: Amount | list[Bound] | None = None
+    """Known height above the WGS 84 ellipsoid; or one number for each epoch, as reported."""
+    within: Amount | None = None
+    """Half the width of a band about `exactly`."""
+    along: bool | None = None
+    """Whether the height of a target that moves is held at every epoch (default), on a course that follows the
+    Earth, or at the reference time alone."""
     min: Amount | list[Bound] | None = None
     """Least height or speed; least coordinates of a box in the frame, -inf for none."""
     max: Amount | list[Bound] | None = None

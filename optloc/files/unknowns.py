@@ -27,7 +27,7 @@ from optloc.files.schema import (
 )
 from optloc.files.stations import spread, survey
 from optloc.files.table import Epochs, Table, table_of
-from optloc.linear.constraints import box, height, polygon, speed, visible
+from optloc.linear.constraints import box, height, polygon, reported, speed, visible
 from optloc.problem.bias import family
 from optloc.problem.check import check_polygon, like
 
@@ -46,8 +46,8 @@ _STATES: dict[str, tuple[Quantity, str]] = {
 # Keys of each kind of constraint beside "kind" and "target".
 _KEYS = {
     "box": ("min", "max", "unit"),
-    "height": ("exactly", "min", "max", "unit"),
-    "above-ground": (),
+    "height": ("exactly", "within", "min", "max", "unit", "along"),
+    "above-ground": ("along",),
     "polygon": ("corners", "corners_deg", "unit"),
     "visible": ("stations", "elevation"),
     "speed": ("min", "max", "unit"),
@@ -280,9 +280,13 @@ def constraints_of(
     frame: Frame,
     motions: Sequence[Motion],
     names: Sequence[str],
+    times: Array,
     speed: float = SPEED_OF_LIGHT,
-) -> tuple[Constraint, ...]:
-    """Return the constraints of tables; those on one quantity of one target become one.
+) -> tuple[tuple[Constraint, ...], tuple[Motion, ...]]:
+    """Return the constraints of tables, and the motions that can meet them.
+
+    Those on one quantity of one target become one. Where heights are held along courses, all targets that move follow
+    the Earth.
 
     Parameters
     ----------
@@ -296,18 +300,77 @@ def constraints_of(
         Of each target; a constraint without a target holds for all that are estimated.
     names : sequence of str
         Names of the targets.
+    times : array (k,)
+        Seconds of the epochs.
     speed : float
         Propagation speed, metres per second.
     """
     found: list[Constraint] = []
+    motions = list(motions)
     for where, table in tables.items():
         _check_keys(table, where)
         # A constraint without a target is one for each that is estimated, named after it.
         for target in _targets(table, motions, names, where):
             suffix = f" of {names[target]}" if len(motions) > 1 else ""
-            made = _make(table, stations, frame, where, speed)
+            if table.kind in ("height", "above-ground"):
+                motions[target], made = _level(table, motions[target], times, where, speed)
+            else:
+                made = _make(table, stations, frame, where, speed)
             found += [replace(c, target=target, name=c.name + suffix) for c in made]
-    return tuple(_merge(found))
+    if any(motion.over == "ground" for motion in motions):
+        motions = [replace(m, over="ground") if _moves(m) else m for m in motions]
+    return tuple(_merge(found)), tuple(motions)
+
+
+def _moves(motion: Motion) -> bool:
+    return motion.order > 0 and motion.span == "run" and motion.known is None
+
+
+def _level(
+    table: ConstraintTable, motion: Motion, times: Array, where: str, c: float
+) -> tuple[Motion, Sequence[Constraint]]:
+    """Return the constraint on a height, and the motion that can keep it."""
+    if table.kind == "above-ground":
+        low, high = 0.0, np.inf
+    elif table.exactly is not None and (table.min is not None or table.max is not None):
+        raise InvalidProblem("a height is either exact or in a band", where, "give exactly, or min and max")
+    elif table.exactly is None:
+        if table.within is not None:
+            raise InvalidProblem("'within' has nothing to be about", where, "give exactly, or min and max alone")
+        low, high = _bounds(table, "length", where, c)
+    else:
+        within = _amount(table, "within", "length", where, c) or 0.0
+        if within < 0.0:
+            raise InvalidProblem("the band has a negative width", join(where, "key 'within'"), "give its half width")
+        if isinstance(table.exactly, list):
+            return _reported(table, motion, times, within, where, c)
+        level = _amount(table, "exactly", "length", where, c)
+        assert level is not None
+        low, high = level - within, level + within
+    # bounds of a height that may curve are held at one time: between the ends of a course they need not hold
+    along = table.along if table.along is not None else motion.order < 2 or low == high
+    over = replace(motion, over="ground") if along and _moves(motion) else motion
+    return over, height(low, high, along=along)
+
+
+def _reported(
+    table: ConstraintTable, motion: Motion, times: Array, within: float, where: str, c: float
+) -> tuple[Motion, Sequence[Constraint]]:
+    """Return motion and constraint of a height that is given for each epoch."""
+    assert isinstance(table.exactly, list)
+    place = join(where, "key 'exactly'")
+    if motion.span == "run" and not motion.order:
+        raise InvalidProblem("a target that stays has one height", place, 'give one, such as "500 m"')
+    if table.along is False:
+        raise InvalidProblem("heights of all epochs hold along the course", where, "leave out along = false")
+    if len(table.exactly) != len(times):
+        what = f"{len(table.exactly)} heights for {len(times)} epochs"
+        raise InvalidProblem(what, place, "give one for each epoch, in the order of time")
+    levels = Units("length", c).conversion(table.unit, place).factor * np.array(table.exactly, dtype=float)
+    if motion.span == "epoch":
+        rise = np.stack([levels - levels[0], np.zeros_like(levels)], axis=-1)
+        return replace(motion, rise=rise), height(levels[0] - within, levels[0] + within)
+    return reported(levels, times, within=within, order=motion.order, reference=motion.reference)
 
 
 def _check_keys(table: ConstraintTable, where: str) -> None:
@@ -316,7 +379,7 @@ def _check_keys(table: ConstraintTable, where: str) -> None:
     if foreign:
         advice = nearest(foreign[0], known) if known else "leave it out"
         raise InvalidProblem(f"{table.kind} has no key {foreign[0]!r}", where, advice)
-    needed = [key for key in known if key not in {"unit", "stations", "elevation"}]
+    needed = [key for key in known if key not in {"unit", "stations", "elevation", "within", "along"}]
     if needed and not any(getattr(table, key) is not None for key in needed):
         raise InvalidProblem(f"{table.kind} bounds nothing", where, f"give {' or '.join(needed)}")
 
@@ -342,12 +405,6 @@ def _make(table: ConstraintTable, stations: Stations, frame: Frame, where: str, 
     if table.kind == "box":
         low, high = (_corner(table, key, stations.dimension, where, c) for key in ("min", "max"))
         return box(low.tolist(), high.tolist())
-    if table.kind == "height":
-        if table.exactly is not None and (table.min is not None or table.max is not None):
-            raise InvalidProblem("a height is either exact or in a band", where, "give exactly, or min and max")
-        return height(*_bounds(table, "length", where, c), exactly=_amount(table, "exactly", "length", where, c))
-    if table.kind == "above-ground":
-        return height(0.0)
     if table.kind == "speed":
         least, most = _bounds(table, "speed", where, c)
         return speed(most, lower=least)

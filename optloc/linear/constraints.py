@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -10,8 +11,8 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.linalg import Tangent, tangent
-from optloc.base.types import Array, Band, Polygon
-from optloc.linear.evaluate import to_ecef
+from optloc.base.types import Array, Band, Motion, Polygon
+from optloc.linear.courses import course_at, elapsed, to_ecef
 from optloc.models.primitives import Jet, Point
 from optloc.models.surfaces import SURFACES
 from optloc.problem.layout import state_names
@@ -41,8 +42,13 @@ def box(lower: Sequence[float], upper: Sequence[float], *, target: int = 0) -> t
     )
 
 
-def height(lower: float = -np.inf, upper: float = np.inf, *, exactly: Any = None, target: int = 0) -> tuple[Band, ...]:
+def height(
+    lower: float = -np.inf, upper: float = np.inf, *, exactly: Any = None, target: int = 0, along: bool = True
+) -> tuple[Band, ...]:
     """Return the constraint on a target's height above the WGS 84 ellipsoid, metres: a band, or one exact value.
+
+    A straight course leaves a height above the curved Earth: a target that moves needs ``Motion(order,
+    over="ground")``, see also `reported`.
 
     Parameters
     ----------
@@ -52,9 +58,62 @@ def height(lower: float = -np.inf, upper: float = np.inf, *, exactly: Any = None
         Known height, in the place of a band.
     target : int
         Which target.
+    along : bool
+        Whether it holds at every epoch, or at the reference time alone.
     """
     low, high = (lower, upper) if exactly is None else (exactly, exactly)
-    return (Band("height", _number(low), _number(high), np.zeros(0), "height", target),)
+    return (Band("height", _number(low), _number(high), np.zeros(0), "height", target, along),)
+
+
+def reported(
+    heights: Any, times: Any, *, within: float = 0.0, order: int = 1, reference: float | None = None, target: int = 0
+) -> tuple[Motion, tuple[Band, ...]]:
+    """Return motion and constraint of a target whose height is known at every epoch, as aircraft report theirs.
+
+    The way over ground has the given order; the height is that of the report, to which a constant and a rate may be
+    added where it is known within a band only.
+
+    Parameters
+    ----------
+    heights : array (..., k)
+        Above the WGS 84 ellipsoid at each epoch, metres.
+    times : array (k,)
+        Seconds of the epochs, ascending.
+    within : float
+        Half the width of the band, metres; zero: exact.
+    order : 1 or 2
+        Of the motion.
+    reference : float, optional
+        Time at which the state holds, seconds; the first epoch by default.
+    target : int
+        Which target.
+
+    Returns
+    -------
+    Motion
+        Over ground, with the shape of the height.
+    tuple of Band
+        The height at the reference time, and so at every epoch.
+
+    Raises
+    ------
+    InvalidProblem
+        Where heights and times do not belong together.
+    """
+    heights, times = np.asarray(heights, dtype=float), np.asarray(times, dtype=float)
+    if times.ndim != 1 or heights.shape[-1:] != times.shape or not (np.diff(times) > 0.0).all():
+        what = f"heights of shape {heights.shape} for times of shape {times.shape}"
+        raise InvalidProblem(what, "reported heights", "give one height for each epoch, and ascending times")
+    # straight between the epochs, where the reference time is none of them
+    last = len(times) - 1
+    place = float(np.interp(times[0] if reference is None else reference, times, np.arange(last + 1.0)))
+    before = min(int(place), last)
+    share = place - before
+    level = heights[..., before] * (1.0 - share) + heights[..., min(before + 1, last)] * share
+    rate = np.gradient(heights, times, axis=-1) if last else np.zeros_like(heights)
+    rise = np.stack([heights - level[..., None], rate], axis=-1)
+    motion = Motion(order, reference=reference, over="ground", rise=rise)
+    return motion, height(level - within, level + within, target=target)
 
 
 def visible(points: Any, *, elevation: float = 0.0, target: int = 0) -> tuple[Band, ...]:
@@ -105,35 +164,78 @@ class Level:
         Number of the constraint.
     side : "equal", "lower", "upper", or int
         Which bound; of a polygon, which edge.
+    epoch : int, optional
+        Where along a course; None: at the reference time.
     """
 
     constraint: int
     side: str | int
+    epoch: int | None = None
 
 
 Face = tuple[Level, ...]
 
 
 def exact(problem: Problem) -> Face:
-    """Return the equalities of a problem."""
-    return tuple(Level(i, "equal") for i, c in enumerate(problem.constraints) if is_exact(c))
+    """Return the equalities of a problem; one along a course holds everywhere if it does at the epochs named."""
+    return tuple(
+        Level(i, "equal", epoch)
+        for i, c in enumerate(problem.constraints)
+        if is_exact(c)
+        for epoch in decisive(problem, c)
+    )
+
+
+def decisive(problem: Problem, constraint: Band | Polygon) -> list[int | None]:
+    """Return the epochs at which a constraint along a course decides about all of them; None is the reference time.
+
+    What is bounded is a polynomial of time of the motion's order: it is constant if it is at one epoch more than that,
+    and a straight one lies between bounds if its ends do.
+    """
+    if not isinstance(constraint, Band) or not holds_along(problem, constraint):
+        return [None]
+    count = problem.motions[constraint.target].order + 1
+    chosen = np.unique(np.linspace(0, problem.epochs - 1, count).round().astype(int))
+    return [int(k) for k in np.argsort(problem.times, kind="stable")[chosen]]
+
+
+def holds_along(problem: Problem, band: Band) -> bool:
+    """Return whether a band bounds a course: that of a target whose state of the run moves."""
+    motion = problem.motions[band.target]
+    return band.along and motion.span == "run" and motion.order > 0
 
 
 def faces(problem: Problem) -> list[Face]:
     """Return every set of constraints that can hold with equality together; the equalities alone come first."""
     found = [exact(problem)]
     for i, constraint in enumerate(problem.constraints):
-        sides = [] if is_exact(constraint) else list(_sides(i, constraint))
+        sides = [] if is_exact(constraint) else _meetings(list(_sides(i, constraint)), decisive(problem, constraint))
         # More sides than dimensions meet in no point; speeds bound other unknowns, and do not count.
         wider = [(*face, *side) for face in found for side in sides]
-        found += [face for face in wider if sum(_kind(problem, v) != "speed" for v in face) <= problem.dimension]
+        found += [face for face in wider if _most_at_once(problem, face) <= problem.dimension]
     return sorted(found, key=len)
+
+
+def _meetings(sides: list[Face], epochs: list[int | None]) -> list[Face]:
+    """Return the sides of a constraint at each of some epochs, and those of several epochs together."""
+    found: list[Face] = [()]
+    for epoch in epochs:
+        here = [tuple(replace(level, epoch=epoch) for level in side) for side in sides]
+        found += [(*face, *side) for face in found for side in here]
+    return found[1:]
+
+
+def _most_at_once(problem: Problem, face: Face) -> int:
+    """Return how many levels of positions a face has at the epoch with most of them."""
+    count = Counter(level.epoch for level in face if _kind(problem, level) != "speed")
+    return max(count.values(), default=0)
 
 
 def face_names(problem: Problem, face: Face) -> tuple[str, ...]:
     """Return what each level of a face is called, for instance "height upper"."""
     return tuple(
         f"{problem.constraints[level.constraint].name} {'edge ' if isinstance(level.side, int) else ''}{level.side}"
+        + ("" if level.epoch is None else f" at {problem.times[level.epoch]:g} s")
         for level in face
     )
 
@@ -172,7 +274,7 @@ def levels(problem: Problem, face: Face, x: Array) -> tuple[Array, Array]:
     gradients = np.zeros((len(x), len(face), problem.layout.n_shared))
     for i, level in enumerate(face):
         band = _band(problem.constraints[level.constraint], level.side)
-        jet, columns = _quantity(problem, band, x)
+        jet, columns = _quantity(problem, band, x, level.epoch)
         values[:, i] = jet.value - (band.upper if level.side == "upper" else band.lower)
         for seed, partial in jet.partials.items():
             gradients[:, i, columns[seed]] = partial
@@ -255,14 +357,21 @@ def violation(problem: Problem, x: Array) -> Array:
             worst = np.maximum(worst, _outside(c, _plan(problem, c.target, x)))
             continue
         with np.errstate(all="ignore"):  # the speed of a target at rest has no derivative, and none is needed here
-            value = _quantity(problem, c, x)[0].value
-        for bound, sign in ((c.lower, 1.0), (c.upper, -1.0)):
-            with np.errstate(invalid="ignore"):
-                short = np.where(np.isfinite(bound), sign * (bound - value), -np.inf)
-            # Metres of an altitude and sines of an elevation by one measure: relative to the bound, absolute near
-            # zero.
-            size = 1.0 + np.where(np.isfinite(bound), np.abs(bound), 0.0)
-            worst = np.maximum(worst, short / size)
+            values = [_quantity(problem, c, x, epoch)[0].value for epoch in decisive(problem, c)]
+        for value in values:
+            worst = np.maximum(worst, _short(c, value))
+    return worst
+
+
+def _short(band: Band, value: Array) -> Array:
+    """Return by how much values (N,) break a band, relative to its size (N,); negative where they do not."""
+    worst = np.full(len(value), -np.inf)
+    for bound, sign in ((band.lower, 1.0), (band.upper, -1.0)):
+        with np.errstate(invalid="ignore"):
+            short = np.where(np.isfinite(bound), sign * (bound - value), -np.inf)
+        # Metres of an altitude and sines of an elevation by one measure: relative to the bound, absolute near zero.
+        size = 1.0 + np.where(np.isfinite(bound), np.abs(bound), 0.0)
+        worst = np.maximum(worst, short / size)
     return worst
 
 
@@ -271,27 +380,47 @@ def violation_names(problem: Problem) -> str:
     return ", ".join(dict.fromkeys(c.name for c in problem.constraints))
 
 
-def _quantity(problem: Problem, band: Band, x: Array) -> tuple[Jet, dict[int, int]]:
-    """Return the bounded quantity with its derivatives, and the column of x behind each seed."""
-    surface, d, c = SURFACES[band.kind], problem.dimension, band.coefficients
-    names = state_names(band.target, len(problem.motions), 2)
-    slot, shared = problem.layout.find(names[0])
-    if not shared:
-        raise InvalidProblem(
-            "a constraint needs a target whose state lasts the run", "constraints", "solve epoch by epoch"
-        )
-    columns = {i: slot.start + i for i in range(d)}
-    position: tuple[Any, ...] = tuple(Jet(x[:, slot.start + i], {i: np.ones(1)}) for i in range(d))
-    velocity: tuple[Any, ...] | None = None
-    if surface.velocity:
-        start = problem.layout.find(names[1])[0].start
-        columns |= {d + i: start + i for i in range(d)}
-        velocity = tuple(Jet(x[:, start + i], {d + i: np.ones(1)}) for i in range(d))
+def _quantity(problem: Problem, band: Band, x: Array, epoch: int | None = None) -> tuple[Jet, dict[int, int]]:
+    """Return the bounded quantity at an epoch with its derivatives, and the column of x behind each seed."""
+    d, columns, states = problem.dimension, dict[int, int](), []
+    for j, name in enumerate(state_names(band.target, len(problem.motions), problem.motions[band.target].order)):
+        slot, shared = problem.layout.find(name)
+        if not shared:
+            raise InvalidProblem(
+                "a constraint needs a target whose state lasts the run", "constraints", "solve epoch by epoch"
+            )
+        columns |= {d * j + i: slot.start + i for i in range(d)}
+        states.append(tuple(Jet(x[:, slot.start + i], {d * j + i: np.ones(1)}) for i in range(d)))
+    c = band.coefficients
+    value = bounded(problem, band, states, tuple(c[..., i] for i in range(c.shape[-1])), epoch)
+    return value, columns
+
+
+def bounded(
+    problem: Problem, band: Band, states: Sequence[Any], coefficients: tuple[Any, ...], epoch: int | None
+) -> Any:
+    """Return the quantity that a band bounds, less the known rise of a height.
+
+    Parameters
+    ----------
+    problem : Problem
+        Says how the target moves.
+    band : Band
+        The constraint.
+    states : sequence of tuples of d numbers
+        Position, velocity and acceleration, as many as the target has: jets or symbols.
+    coefficients : tuple of c numbers
+        Those of the band.
+    epoch : int, optional
+        Where along the course; None: at the reference time.
+    """
+    surface = SURFACES[band.kind]
+    since = 0.0 if epoch is None else float(elapsed(problem, band.target)[epoch])
+    position = states[0] if epoch is None else course_at(problem, band.target, list(states), since)
     ecef = to_ecef(problem, position) if surface.ecef else None
     # An edge of a polygon is a plane with two coefficients: it bounds the plan of a target in space.
-    used = position[: c.shape[-1]] if band.kind == "plane" else position
-    value = surface.g(Point(used, velocity, None, ecef), tuple(c[..., i] for i in range(c.shape[-1])))
-    return value, columns
+    used = position[: len(coefficients)] if band.kind == "plane" else position
+    return surface.g(Point(used, states[1] if surface.velocity else None, None, ecef), coefficients)
 
 
 def _plan(problem: Problem, target: int, x: Array) -> Array:

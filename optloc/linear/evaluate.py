@@ -12,6 +12,7 @@ from optloc.base.arrays import Portable, foreign, gather, library, placed
 from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Rows
+from optloc.linear.courses import carried, elapsed, over_ground, to_ecef
 from optloc.models import MODELS, Model, Point
 from optloc.models.primitives import Jet, rotate, wrap
 from optloc.problem.bias import course
@@ -20,9 +21,10 @@ from optloc.problem.problem import Problem
 
 # Which unknown moves which input of which row: the indices of a problem, made once for each structure.
 
-# Inputs of a measurement function: target, its rate, both stations, their rates, axes and the turn of the axes.
+# Inputs of a measurement function: target, its rate, both stations, their rates, axes and the turn of the axes; of a
+# course over ground where it began, and the shape of its height with its rate.
 # Sixteen apart: the largest input, a set of axes, has nine components.
-TARGET, TARGET_RATE, A, B, RATE_A, RATE_B, AXES_A, AXES_B, TURN = (16 * i for i in range(9))
+TARGET, TARGET_RATE, A, B, RATE_A, RATE_B, AXES_A, AXES_B, TURN, START, RISE = (16 * i for i in range(11))
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,25 +190,17 @@ def _motion_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
             continue
         rows = slice(None) if np.all(block.target == i) else np.flatnonzero(block.target == i)
         epoch = block.epoch[rows]
-        since = elapsed(problem, i)[epoch]
+        since, ground = elapsed(problem, i)[epoch], over_ground(problem)
         for j, name in enumerate(state_names(i, count, motion.order)):
             column = columns(problem.layout, name, epoch)
             for c in range(problem.dimension):
                 # Taylor's polynomial of the course; its derivative feeds the rate.
                 feeds.append(Feed(TARGET + c, column[:, c], since**j / factorial(j), rows))
+                if ground and not j:
+                    feeds.append(Feed(START + c, column[:, c], 1.0, rows))
                 if model.velocity and j:
                     feeds.append(Feed(TARGET_RATE + c, column[:, c], since ** (j - 1) / factorial(j - 1), rows))
     return feeds
-
-
-def elapsed(problem: Problem, target: int) -> Array:
-    """Return the seconds (k,) since a target's state holds; zero where each epoch has its own state."""
-    motion = problem.motions[target]
-    if motion.span == "epoch":
-        return np.zeros(problem.epochs)
-    # The first epoch by default, so that adding later epochs does not move what a state means.
-    reference = problem.times[0] if motion.reference is None else motion.reference
-    return np.asarray(problem.times - reference)
 
 
 def _station_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
@@ -322,9 +316,10 @@ def join(problem: Problem, model: Model, inputs: dict[int, Any]) -> tuple[Point,
             own = rotate(own or identity, tuple(inputs[TURN + c] for c in range(1 if d == 2 else 3)))
         return Point(vector(place), vector(rate) if model.velocity else None, own)
 
-    place = vector(TARGET)
-    ecef = to_ecef(problem, place) if model.ecef else None
-    target = Point(place, vector(TARGET_RATE) if model.velocity else None, None, ecef)
+    place, rate = vector(TARGET), vector(TARGET_RATE) if model.velocity else None
+    if START in inputs:
+        place, rate = carried(problem, vector(START), place, rate, (inputs.get(RISE, 0.0), inputs.get(RISE + 1, 0.0)))
+    target = Point(place, rate, None, to_ecef(problem, place) if model.ecef else None)
     # A kind without stations gets the target in their place, which its h does not look at.
     a = station(A, RATE_A, AXES_A) if model.stations else target
     return target, a, station(B, RATE_B, AXES_B) if model.stations > 1 else a
@@ -342,6 +337,10 @@ def given(problem: Problem, plan: Plan) -> dict[int, Any]:
             inputs |= _at_rows(stations.axes, 2, block, index, axes)
     for i, motion in enumerate(problem.motions):
         rows = np.flatnonzero(block.target == i)
+        if motion.rise is not None and motion.over == "ground" and len(rows):
+            for c in range(2 if model.velocity else 1):
+                shape = placed(1.0 * (block.target == i), motion.rise) * gather(motion.rise[..., c], block.epoch)
+                inputs[RISE + c] = inputs.get(RISE + c, 0.0) + shape
         if motion.known is None or not len(rows):
             continue
         epoch = block.epoch if motion.known.shape[-3] > 1 else np.zeros_like(block.epoch)
@@ -350,7 +349,8 @@ def given(problem: Problem, plan: Plan) -> dict[int, Any]:
         for seed, order in ((TARGET, 0), (TARGET_RATE, 1)):
             for c in range(problem.dimension if order < motion.known.shape[-2] else 0):
                 values = mine * gather(motion.known[..., order, c], epoch)
-                inputs[seed + c] = inputs.get(seed + c, 0.0) + values
+                for place in (seed, START) if over_ground(problem) and not order else (seed,):
+                    inputs[place + c] = inputs.get(place + c, 0.0) + values
     return inputs
 
 
@@ -371,18 +371,6 @@ def _feed(value: Any, feed: Feed, x: Array, count: int) -> Any:
     part = gather(x, column)
     # Most unknowns enter as they are; a product with ones would cost as much as the rest.
     return value + (part if np.all(gain == 1.0) else part * placed(gain, x))
-
-
-def to_ecef(problem: Problem, position: tuple[Any, ...]) -> tuple[Any, ...]:
-    """Return a position of the problem's frame as ECEF components of the same type."""
-    # Spelled out with numbers as factors: components may be jets or symbols, which know no matrices.
-    turn, origin = problem.frame.rotation_to_ecef(), problem.frame.origin_ecef()
-    if problem.frame.kind == "ecef":
-        return position
-    return tuple(
-        sum((float(turn[i, c]) * position[c] for c in range(1, 3)), float(turn[i, 0]) * position[0]) + float(origin[i])
-        for i in range(3)
-    )
 
 
 # Values and derivatives of all rows: those of a kind together, then what biases do to them.

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from optloc.base.types import Array, Band
-from optloc.linear.constraints import conjunction
-from optloc.linear.evaluate import Terms, given, join, plans, to_ecef
-from optloc.models.primitives import Point, wrap
+from optloc.base.types import Array
+from optloc.linear.constraints import bounded, conjunction, decisive
+from optloc.linear.evaluate import Terms, given, join, plans
+from optloc.models.primitives import wrap
 from optloc.models.surfaces import SURFACES
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
@@ -94,26 +94,20 @@ def constrained(problem: Problem, x: Any, p: Any, length: Any) -> tuple[list[Any
         lower, upper = p[used + count], p[used + count + 1]
         used += count + 2
         unit = length if surface.unit == "m" else 1.0
-        value = surface.g(_target(problem, band, x), c)
-        # Which side exists is part of the structure; where it lies is a parameter.
-        if np.all(band.lower == band.upper):
-            equal.append((value - lower) / unit)
-            continue
-        if np.isfinite(band.lower).all():
-            more.append((value - lower) / unit)
-        if np.isfinite(band.upper).all():
-            more.append((upper - value) / unit)
+        for epoch in decisive(problem, band):
+            value = bounded(problem, band, _states(problem, band.target, x), c, epoch)
+            # Which side exists is part of the structure; where it lies is a parameter.
+            if np.all(band.lower == band.upper):
+                equal.append((value - lower) / unit)
+                continue
+            if np.isfinite(band.lower).all():
+                more.append((value - lower) / unit)
+            if np.isfinite(band.upper).all():
+                more.append((upper - value) / unit)
     return equal, more
 
 
-def _target(problem: Problem, band: Band, x: Any) -> Point:
-    names, d = state_names(band.target, len(problem.motions), 2), problem.dimension
-    surface = SURFACES[band.kind]
-    start = problem.layout.find(names[0])[0].start
-    position = tuple(x[start + i] for i in range(d))
-    velocity = None
-    if surface.velocity:
-        start = problem.layout.find(names[1])[0].start
-        velocity = tuple(x[start + i] for i in range(d))
-    ecef = to_ecef(problem, position) if surface.ecef else None
-    return Point(position[: band.coefficients.shape[-1]] if band.kind == "plane" else position, velocity, None, ecef)
+def _states(problem: Problem, target: int, x: Any) -> list[tuple[Any, ...]]:
+    names = state_names(target, len(problem.motions), problem.motions[target].order)
+    starts = [problem.layout.find(name)[0].start for name in names]
+    return [tuple(x[start + i] for i in range(problem.dimension)) for start in starts]

@@ -13,12 +13,12 @@ from typing import Literal
 
 import numpy as np
 
-from optloc.base import linalg
 from optloc.base.types import Array, Motion, Stations
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.bounds.crlb import crlb, crlb_course
 from optloc.linear.evaluate import predict
 from optloc.linear.simulate import simulate
+from optloc.papers.registration_recursion import FIRST, joint_recursion, recursion
 from optloc.problem.bias import with_bias
 from optloc.problem.build import assemble, measured
 from optloc.problem.fix import Fix
@@ -192,95 +192,6 @@ def truth(scenario: Scenario, problem: Problem) -> Array:
     return np.concatenate([np.asarray(values[slot.name], dtype=float) for slot in problem.layout.shared])
 
 
-# The algorithm of the paper as printed: two undamped steps over all past data at every new epoch.
-#
-# It starts from a given place at the fortieth epoch and never looks for another minimum: a baseline.
-
-FIRST = 40
-"""Epochs that are collected before the first estimate, as printed."""
-
-_BLOCK = 8  # trials whose arrays, 5 stations by 700 epochs by 3 coordinates, fit a cache of 1 MB together
-
-
-def recursion(scenario: Scenario, z: Array, start: Array, *, first: int = FIRST, iterations: int = 2) -> Array:
-    """Return the estimates of the paper's recursion after every epoch.
-
-    Parameters
-    ----------
-    scenario : Scenario
-        Stations.
-    z : array (trials, k, s - 1)
-        Range differences against the first station, metres.
-    start : array (trials, n)
-        Position, or position and velocity at time zero, from which the first estimate is made.
-    first : int
-        Epochs of the first estimate.
-    iterations : int
-        Steps at each epoch.
-
-    Returns
-    -------
-    array (trials, k - first + 1, n + s - 1)
-        State and biases after `first`, `first + 1` ... epochs; NaN from where the steps ran away.
-    """
-    trials, epochs = z.shape[:2]
-    out = np.empty((trials, epochs - first + 1, start.shape[-1] + z.shape[-1]))
-    arrivals = np.zeros((trials, z.shape[-1] + 1, epochs))
-    arrivals[:, 1:] = z.swapaxes(1, 2)
-    track, times = np.ascontiguousarray(scenario.track(epochs).T), scenario.times(epochs)
-    with np.errstate(all="ignore"):  # what runs away overflows, and stays lost
-        for low in range(0, trials, _BLOCK):
-            part = slice(low, low + _BLOCK)
-            state = start[part]
-            for k in range(first, epochs + 1):
-                for _ in range(iterations):
-                    move, bias = step(state, arrivals[part, :, :k], track[..., :k], times[:k])
-                    state = state + move
-                out[part, k - first] = np.concatenate([state, bias], axis=-1)
-    return out
-
-
-def step(state: Array, arrivals: Array, track: Array, times: Array) -> tuple[Array, Array]:
-    """Return one Gauss-Newton step (trials, n) of the state and the biases (trials, s - 1) that go with it.
-
-    The sums of eq. 11 and 12 over the epochs. The inverse of R, proportional to I + 11', takes the mean of each epoch
-    out of the arrivals, and eliminating the unknown biases takes the mean of the run out of each channel: what is left
-    are outer products.
-
-    Parameters
-    ----------
-    state : array (trials, n)
-        Position, or position and velocity at time zero.
-    arrivals : array (trials, s, k)
-        Range differences against the first station, whose own are zero.
-    track : array (3, s, k)
-        Stations.
-    times : array (k,)
-        Seconds.
-    """
-    trials, n = state.shape
-    target = state[:, :3, None, None]
-    if n > 3:
-        target = target + state[:, 3:, None, None] * times
-    slope = target - track
-    distance = np.sqrt(np.einsum("tcsk,tcsk->tsk", slope, slope))
-    slope /= distance[:, None]  # unit vectors (trials, 3, s, k)
-    misfit = arrivals - distance  # (trials, s, k)
-    # First the mean of each epoch over the stations, then that of each channel over the epochs, in the sums below.
-    misfit -= misfit.mean(1, keepdims=True)
-    slope -= slope.mean(2, keepdims=True)
-    if n > 3:
-        slope = np.concatenate([slope, slope * times], axis=1)
-    rows, mean, left = slope.reshape(trials, n, -1), slope.mean(3), misfit.mean(2)
-    information = rows @ rows.swapaxes(1, 2) - len(times) * (mean @ mean.swapaxes(1, 2))
-    vector = rows @ misfit.reshape(trials, -1, 1) - len(times) * (mean @ left[..., None])
-    solved, ok = linalg.solve(information, vector)
-    # A singular system has no step: NaN, and lost, instead of one that a solver makes up.
-    move = np.where(ok[:, None], solved[..., 0], np.nan)
-    left = left - (move[:, None] @ mean)[:, 0]
-    return move, left[:, 1:] - left[:, :1]
-
-
 FAR = 10.0
 """An estimate further from the truth than this many bounds is lost: no noise moves it there."""
 
@@ -432,9 +343,14 @@ def wander(
     width : float
         Width of the starts in one-shot standard deviations.
     """
-    scene = setting.scenario
-    z = drawn.rows[0].z.reshape(setting.trials, drawn.epochs, -1)
-    estimates = recursion(scene, z[:, : max(epochs)], setting.starts(width), first=first)
+    scene, last = setting.scenario, max(epochs)
+    z, *gains = (rows.z.reshape(setting.trials, drawn.epochs, -1)[:, :last] for rows in drawn.rows)
+    track, times, start = scene.track(last), scene.times(last), setting.starts(width)
+    if setting.gain_sigma is None:
+        estimates = recursion(track, times, z, start, first=first)
+    else:
+        sigma = (scene.sigma if setting.sigma is None else setting.sigma, setting.gain_sigma, setting.station_sigma)
+        estimates = joint_recursion(track, z, gains[0], start, sigma, first=first)
     exact = truth(scene, drawn)[: estimates.shape[-1]]
     return tuple(score(estimates[:, k - first], exact, bound) for k, bound in zip(epochs, bounds, strict=True))
 

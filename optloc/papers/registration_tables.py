@@ -12,7 +12,6 @@ import numpy as np
 from optloc.base.types import Array, Status
 from optloc.bounds.crlb import crlb
 from optloc.papers.registration import (
-    FIRST,
     MOVING,
     NANOSECOND,
     PRINTED,
@@ -30,6 +29,7 @@ from optloc.papers.registration import (
     truth,
     wander,
 )
+from optloc.papers.registration_recursion import FIRST
 from optloc.papers.report import (
     ABSENT,
     Ink,
@@ -117,8 +117,8 @@ class History:
         Numbers of epochs.
     bounds : array (t, n, n)
         Cramer-Rao bound at each.
-    plain : tuple of Score, or None
-        The paper's recursion on the range differences.
+    plain : tuple of Score
+        The paper's recursion on the same data.
     found : tuple of Score
         The fix without a guess.
     ambiguous : tuple of float
@@ -130,15 +130,13 @@ class History:
     setting: Setting
     epochs: tuple[int, ...]
     bounds: Array
-    plain: tuple[Score, ...] | None
+    plain: tuple[Score, ...]
     found: tuple[Score, ...]
     ambiguous: tuple[float, ...]
     silent: tuple[float, ...]
 
 
-def run_history(
-    setting: Setting, epochs: Sequence[int], tick: Tick, *, plain: bool = True, first: int = FIRST
-) -> History:
+def run_history(setting: Setting, epochs: Sequence[int], tick: Tick, *, first: int = FIRST) -> History:
     """Return the scores of both routes on the same data.
 
     Parameters
@@ -149,8 +147,6 @@ def run_history(
         Numbers of epochs to look at.
     tick : callable
         Called after each of them, and after the recursion.
-    plain : bool
-        Whether the recursion runs as well.
     first : int
         Epochs of its first estimate.
     """
@@ -158,10 +154,8 @@ def run_history(
     drawn = setting.draw(max(epochs))
     bounds = setting.bounds(epochs)
     exact = truth(setting.scenario, drawn)
-    wandered = None
-    if plain:
-        wandered = wander(setting, drawn, epochs, bounds, first=first)
-        tick()
+    wandered = wander(setting, drawn, epochs, bounds, first=first)
+    tick()
     found, ambiguous, silent = [], [], []
     for k, bound in zip(epochs, bounds, strict=True):
         fix = solve(setting.first(drawn, k), _METHOD)
@@ -235,7 +229,7 @@ def table_biases(name: str, history: History, rows: Mapping[int, Sequence[float]
     lines = []
     for second, values in rows.items():
         at, n = history.epochs.index(second), len(exact) - len(values)
-        plain, found = None if history.plain is None else history.plain[at], history.found[at]
+        plain, found = history.plain[at], history.found[at]
         spread = np.sqrt(np.diagonal(history.bounds[at]))[n:]
         columns = (
             _mean(plain, n, exact),
@@ -253,9 +247,9 @@ def table_biases(name: str, history: History, rows: Mapping[int, Sequence[float]
     return tabulate(name, header, lines)
 
 
-def _mean(score: Score | None, n: int, exact: Array) -> Array:
+def _mean(score: Score, n: int, exact: Array) -> Array:
     """Return the accuracy of the mean over all trials that are not lost; empty where there are none."""
-    if score is None or score.lost.all():
+    if score.lost.all():
         return np.zeros(0)
     error = score.error[~score.lost, n:].mean(0)
     return accuracy(error, exact[n : n + len(error)])
@@ -282,12 +276,11 @@ def table_errors(name: str, histories: Mapping[str, History], printed: Mapping[s
     lines = []
     for environment, history in histories.items():
         for at, second in enumerate(history.epochs):
-            plain, found = None if history.plain is None else history.plain[at], history.found[at]
+            plain, found = history.plain[at], history.found[at]
             named = f"{printed[environment]:.0f}" if second == 600 else ""
-            error, lost = (ABSENT, ABSENT) if plain is None else (metres(plain.rmse), percent(plain.share))
-            lengths = (error, metres(found.rmse), metres(rms(history.bounds[at])))
-            shares = (found.share, history.silent[at], history.ambiguous[at])
-            lines.append((environment, str(second), named, *lengths, lost, *map(percent, shares)))
+            lengths = (plain.rmse, found.rmse, rms(history.bounds[at]))
+            shares = (plain.share, found.share, history.silent[at], history.ambiguous[at])
+            lines.append((environment, str(second), named, *map(metres, lengths), *map(percent, shares)))
     header = (
         "environment", "second", "printed", "recursion", "optloc", "bound",
         "recursion lost", "optloc lost", "lost unnoticed", "ambiguous",
@@ -375,9 +368,8 @@ def _panel(ax: Axes, history: History, printed: float, since: int) -> None:
     bounds = [rms(bound) for bound in history.setting.bounds(curve)]
     ax.plot(step * curve, bounds, color=Ink.BLACK, label="Cramér-Rao bound")
     times = step * np.array(epochs)
-    if history.plain is not None:
-        plain = [history.plain[i].rmse for i in keep]
-        ax.plot(times, plain, "o", color=Ink.RED, mfc="none", ms=9, label="recursion of the paper")
+    plain = [history.plain[i].rmse for i in keep]
+    ax.plot(times, plain, "o", color=Ink.RED, mfc="none", ms=9, label="recursion of the paper")
     ax.plot(times, [history.found[i].rmse for i in keep], "x", color=Ink.BLUE, ms=7, mew=2, label="optloc, no guess")
     ax.plot([600.0], [printed], "D", color=Ink.GREEN, ms=6, label="printed at 600 s")
     if not since:
@@ -508,7 +500,7 @@ _SIZES: dict[Size, Sample] = {
 
 
 def _work(sample: Sample) -> int:
-    histories = 4 * len(sample.fixed) + len(sample.moving) + 3
+    histories = 4 * len(sample.fixed) + len(sample.moving) + 5
     return histories + len(INITIAL) + 2 * len(NOISE) + 1
 
 
@@ -519,9 +511,7 @@ def _run(sample: Sample, seed: int, tick: Tick) -> Report:
     }
     moving = {"1 m": run_history(Setting(MOVING, sample.trials, seed, 2), sample.moving, tick, first=_MOVING_FIRST)}
     joint = {
-        name: run_history(
-            Setting(PRINTED, sample.trials, seed, key, None, size, _GAIN), sample.fixed, tick, plain=False
-        )
+        name: run_history(Setting(PRINTED, sample.trials, seed, key, None, size, _GAIN), sample.fixed, tick)
         for key, (name, size) in enumerate((("5 m", 5.0), ("1 m", 1.0)), 3)
     }
     starts = _starts(Setting(PRINTED, sample.many, seed, 5), sample.last, tick)

@@ -156,6 +156,10 @@ SPEED = 50.0
 """Standard deviation of each coordinate of the velocity in starts that are far off, m/s: the ship makes 28."""
 
 
+# What errors are relative to in the paper, metres.
+_DISTANCE = 100e3
+
+
 @dataclass(frozen=True, slots=True)
 class Run:
     """Position errors of the trials of one filter.
@@ -178,6 +182,11 @@ class Run:
     def rms(self) -> Array:
         """Return root mean square errors (steps,), metres."""
         return np.asarray(np.sqrt((self.error**2).mean(0)))
+
+    @property
+    def relative(self) -> Array:
+        """Return the mean error over the distance that the paper divides by (steps,)."""
+        return np.asarray(self.error.mean(0) / _DISTANCE)
 
 
 def root_trace(cov: Array) -> Array:
@@ -342,12 +351,26 @@ def table_fixed(found: Mapping[str, Run], bound: Array) -> Table:
     lines = []
     for name, run in found.items():
         apart = np.linalg.norm(run.position - plain, axis=-1)[:, _SETTLED:].max()
-        share = f"{run.error.mean(0)[-1] / 1e3:.4f} %"  # of the 100 km of the paper: a per mille is 100 m
+        share = f"{100.0 * run.relative[-1]:.4f} %"
         lines.append((NAMES[name], *(metres(run.rms[step - 1]) for step in steps), share, f"{apart:.2f}"))
     lines.append(("posterior bound", *(metres(bound[step - 1]) for step in steps), ABSENT, ABSENT))
     last = f"mean error at {len(bound)}, of 100 km"
     header = ("filter", *(f"step {step}, m" for step in steps), last, "most from EKF after step 10, m")
     return tabulate("fixed", header, lines)
+
+
+def table_relative(panels: Mapping[str, tuple[Mapping[str, Run], Array]]) -> Table:
+    """Return what the paper's figure shows, in its unit: mean errors over 100 km, by start and filter."""
+    longest = max(len(bound) for _, bound in panels.values())
+    steps = [step for step in _STEPS if step <= longest]
+    lines = []
+    for title, (runs, bound) in panels.items():
+        for name, run in runs.items():
+            # a filter that is begun by fixes has no state before the second
+            at = [s - 1 - len(bound) + len(run.relative) for s in steps]
+            shown = (f"{100.0 * run.relative[i]:.4f} %" if 0 <= i < len(run.relative) else ABSENT for i in at)
+            lines.append((title, NAMES[name], *shown))
+    return tabulate("relative", ("start", "filter", *(f"step {step}" for step in steps)), lines)
 
 
 def table_starts(found: Mapping[float, tuple[Mapping[str, Run], Array]]) -> Table:
@@ -433,17 +456,20 @@ def figure_filters(panels: Mapping[str, tuple[Mapping[str, Run], Array]]) -> Fig
     panels : mapping of str to (mapping of str to Run, array (steps,))
         Filters and bound by title.
     """
-    figure = canvas(0.6 + 6.0 * len(panels), 4.8)
-    axes = figure.subplots(1, len(panels), squeeze=False)[0]
-    for ax, (title, (runs, bound)) in zip(axes, panels.items(), strict=True):
+    figure = canvas(0.6 + 6.0 * len(panels), 8.8)
+    rows = figure.subplots(2, len(panels), squeeze=False)
+    for above, below, (title, (runs, bound)) in zip(*rows, panels.items(), strict=True):
         for name, (colour, dash, width) in _STYLE.items():
             if name in runs:
                 run = runs[name]
                 steps = np.arange(len(bound) - len(run.rms) + 1, len(bound) + 1)
-                ax.plot(steps, run.rms, dash, color=colour, lw=width, label=NAMES[name])
-        ax.plot(np.arange(1, len(bound) + 1), bound, color=Ink.BLACK, lw=0.9, label="posterior bound")
-        ax.set_title(title)
-        _against_steps(ax)
+                above.plot(steps, run.rms, dash, color=colour, lw=width, label=NAMES[name])
+                below.plot(steps, 100.0 * run.relative, dash, color=colour, lw=width, label=NAMES[name])
+        above.plot(np.arange(1, len(bound) + 1), bound, color=Ink.BLACK, lw=0.9, label="posterior bound")
+        above.set_title(title)
+        _against_steps(above)
+        scale(below)
+        label(below, "step, one a second", "mean error, per cent of 100 km")
     explain(figure)
     return figure
 
@@ -524,6 +550,7 @@ def _run(sample: Sample, seed: int, tick: Tick) -> Report:
     panels = {"from the first two fixes": begun, "start wrong by 100 km": starts[_PANEL]}
     tables = (
         table_fixed(*begun),
+        table_relative(panels),
         table_starts(starts),
         table_pairs(starts),
         table_heights(known),

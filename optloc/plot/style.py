@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from io import BytesIO
-from math import factorial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -16,6 +15,7 @@ from optloc.base.frames import Frame
 from optloc.base.linalg import error_ellipse
 from optloc.base.outputs import visible, written
 from optloc.base.types import Array, Band, Polygon, Status
+from optloc.linear.courses import course_at, elapsed
 from optloc.plot.outlines import Pieces, pieces_of, rings
 from optloc.problem.chart import CARTESIAN
 from optloc.problem.fix import Fix
@@ -381,9 +381,9 @@ def _path(problem: Problem, fix: Fix, target: int, x: Array) -> Array:
     states = [fix.layout.take(x, name) for name in state_names(target, len(problem.motions), motion.order)]
     if motion.span == "epoch":
         return states[0]
-    # A polynomial about the reference: position, velocity, acceleration by the powers of time over factorials.
-    since = problem.times - (problem.times[0] if motion.reference is None else motion.reference)
-    return np.asarray(sum(since[:, None] ** i / factorial(i) * state for i, state in enumerate(states)))
+    parts = [tuple(state[..., i] for i in range(state.shape[-1])) for state in states]
+    rise = 0.0 if motion.rise is None else motion.rise[..., 0]
+    return np.stack(course_at(problem, target, parts, elapsed(problem, target), rise), axis=-1)
 
 
 def _regions(problem: Problem, reach: Array) -> tuple[Array, ...]:

@@ -16,6 +16,7 @@ from optloc.models import MODELS
 from optloc.problem import noise as noises
 from optloc.problem.check import checked
 from optloc.problem.problem import Problem
+from optloc.problem.signal import Signal
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,12 +34,15 @@ class Measured:
         It adds to `variance`.
     covariance : array (..., m, m), optional
         Full covariance of these rows.
+    signal : Signal, optional
+        What their noise follows from.
     """
 
     rows: Rows
     variance: Array | None = None
     arrival: Array | None = None
     covariance: Array | None = None
+    signal: Signal | None = None
 
 
 def measured(
@@ -50,6 +54,7 @@ def measured(
     sigma: Any = None,
     arrival_sigma: Any = None,
     covariance: Any = None,
+    signal: Any = None,
     epoch: Any = 0,
     target: Any = 0,
     weight: Any = 1.0,
@@ -72,6 +77,9 @@ def measured(
         range rate; rows get the covariance D diag(sigma^2) D'. With `sigma` as well, the two add.
     covariance : array (..., m, m), optional
         Full covariance of these rows, in the place of both.
+    signal : Signal, optional
+        Signal-to-noise ratios, bandwidth and duration from which the noise of time differences and gain ratios
+        follows, in the place of all three.
     epoch, target : int array (m,) or int
         Epoch and target of each row.
     weight : float or array (..., m)
@@ -114,10 +122,7 @@ def measured(
         array = np.asarray(np.nan) if values is None else values
         return np.array(np.broadcast_to(array, (*array.shape[:-1], count)))
 
-    # Exactly one of: a covariance; standard deviations, of rows, of arrivals, or of both.
-    if (covariance is None) == (sigma is None and arrival_sigma is None):
-        advice = "give covariance, or sigma, or arrival_sigma, or the last two together"
-        raise InvalidProblem(f"the noise of {kind} must be given once", where=kind, advice=advice)
+    _check_noise(kind, covariance, signal, sigma is not None or arrival_sigma is not None)
     rows = Rows(
         kind,
         row(z),
@@ -133,7 +138,17 @@ def measured(
         None if sigma is None else row(sigma) ** 2,
         None if arrival_sigma is None else arrival_sigma**2,
         covariance,
+        signal,
     )
+
+
+def _check_noise(kind: str, covariance: Any, signal: Any, deviations: bool) -> None:
+    """Refuse all but one of: a covariance; a signal; standard deviations, of rows, of arrivals, or of both."""
+    if sum((covariance is not None, signal is not None, deviations)) != 1:
+        advice = "give covariance, or signal, or sigma, or arrival_sigma, or the last two together"
+        raise InvalidProblem(f"the noise of {kind} must be given once", where=kind, advice=advice)
+    if signal is not None and not isinstance(signal, Signal):
+        raise InvalidProblem(f"it is a {type(signal).__name__}", "signal", "give an optloc.Signal")
 
 
 def _count(kind: str, given: Sequence[Array | None], covariance: Array | None) -> int:
@@ -265,6 +280,8 @@ def _noise(m: Measured, start: int, stations: int) -> list[noises.Block]:
         return [noises.Block(rows[:, None], m.variance[..., None, None])]
     if m.covariance is not None:
         return [noises.Block(rows[None], m.covariance[..., None, :, :])]
+    if m.signal is not None:
+        return _signal_blocks(m, start, stations, m.signal)
     assert m.arrival is not None
     variance = m.arrival if m.arrival.ndim else np.full(stations, float(m.arrival))
     if variance.shape[-1] != stations:
@@ -274,6 +291,15 @@ def _noise(m: Measured, start: int, stations: int) -> list[noises.Block]:
             "give one for each station",
         )
     return _arrival_blocks(m, start, variance)
+
+
+def _signal_blocks(m: Measured, start: int, stations: int, signal: Signal) -> list[noises.Block]:
+    if len(signal.snr) != stations:
+        what = f"there are {len(signal.snr)} signal-to-noise ratios for {stations} stations"
+        raise InvalidProblem(what, "signal", "give one for each station, NaN for those that take no part")
+    rows = m.rows
+    groups = noises.together(rows.epoch * (rows.target.max(initial=0) + 2) + rows.target)
+    return [noises.Block(start + g, signal.covariance(rows.kind, rows.a[g], rows.b[g])) for g in groups]
 
 
 def _arrival_blocks(m: Measured, start: int, variance: Array) -> list[noises.Block]:

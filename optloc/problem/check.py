@@ -283,6 +283,7 @@ def _check_motion(problem: Problem, motion: Motion, number: int) -> None:
         raise InvalidProblem(f"unknown span {motion.span!r}", where, "use 'run' or 'epoch'")
     if motion.reference is not None and _beyond(motion.reference)[0]:
         raise InvalidProblem(f"the reference time is {motion.reference}", where, "give finite seconds")
+    _check_course_over(problem, motion, where)
     if motion.known is None:
         return
     shape = motion.known.shape
@@ -300,6 +301,32 @@ def _check_motion(problem: Problem, motion: Motion, number: int) -> None:
         for rows in problem.rows:
             if MODELS[rows.kind].velocity and (rows.target == number).any():
                 raise InvalidProblem(f"{rows.kind} needs the velocity of this known target", where, "give it as well")
+
+
+def _check_course_over(problem: Problem, motion: Motion, where: str) -> None:
+    if motion.over not in ("space", "ground"):
+        raise InvalidProblem(f"a course over {motion.over!r}", where, "use 'space' or 'ground'")
+    moving = [m for m in problem.motions if m.known is None and m.order > 0]
+    if motion.over == "ground":
+        if not problem.frame.geodetic or problem.dimension != 3:
+            advice = "use frame ecef or enu with 3-D stations"
+            raise InvalidProblem("a course over ground needs a geodetic frame", where, advice)
+        if motion.span != "run" or motion.known is not None:
+            raise InvalidProblem("only a state of the run has a course over ground", where, "leave out over='ground'")
+        if any(m.over != "ground" for m in moving):
+            advice = "give over='ground' to all targets that move"
+            raise InvalidProblem("some targets move over ground and some in space", where, advice)
+    if motion.rise is None:
+        return
+    if motion.known is not None or (motion.span == "run" and (motion.over != "ground" or not motion.order)):
+        advice = "give it with over='ground' and order 1 or 2, or to a free target"
+        raise InvalidProblem("a known shape of its height does not fit this motion", where, advice)
+    if motion.rise.shape[-2:] != (problem.epochs, 2):
+        what = f"a rise of shape {motion.rise.shape} for {problem.epochs} epochs"
+        raise InvalidProblem(what, where, "give height and rate at each epoch, see optloc.constraints.reported")
+    bad, why = _beyond(motion.rise)
+    if bad.any():
+        raise InvalidProblem(f"a rise is {why}", where, "give metres and metres per second")
 
 
 def _check_bias(problem: Problem, bias: Bias, where: str) -> None:
@@ -418,10 +445,11 @@ def check_constraints(problem: Problem) -> None:
 
 def like(constraints: Sequence[Band | Polygon]) -> list[list[Band]]:
     """Return the bands on one quantity of one target together, in the order of their first."""
-    groups: dict[tuple[str, int, bytes], list[Band]] = {}
+    groups: dict[tuple[str, int, bool, bytes], list[Band]] = {}
     for c in constraints:
         if isinstance(c, Band):
-            groups.setdefault((c.kind, c.target, np.asarray(c.coefficients, dtype=float).tobytes()), []).append(c)
+            key = (c.kind, c.target, c.along, np.asarray(c.coefficients, dtype=float).tobytes())
+            groups.setdefault(key, []).append(c)
     return list(groups.values())
 
 
@@ -510,6 +538,9 @@ def _check_band(problem: Problem, band: Band, where: str) -> None:
         raise InvalidProblem(f"{band.kind} needs three dimensions", where, "use 3-D stations")
     if surface.velocity and problem.motions[band.target].order == 0:
         raise InvalidProblem(f"{band.kind} needs a target that moves", where, "give it a velocity, or leave this out")
+    motion = problem.motions[band.target]
+    if band.along and motion.span == "run" and motion.order > 0:
+        _check_along(motion, band, where)
     size = problem.dimension if surface.coefficients < 0 else surface.coefficients
     given = np.shape(band.coefficients)[-1:]
     if given != (size,):
@@ -523,6 +554,17 @@ def _check_band(problem: Problem, band: Band, where: str) -> None:
             raise InvalidProblem(
                 f"the {name} bound is {np.asarray(bound)[bad][0]:g}", where, f"give a number, or {absent:g} for none"
             )
+
+
+def _check_along(motion: Motion, band: Band, where: str) -> None:
+    other = "or let it hold at the reference time with along=False"
+    if (band.kind, motion.over) not in (("height", "ground"), ("plane", "space")):
+        what, advice = f"{band.kind} is not held along a course over {motion.over}", f"use the other course, {other}"
+        if band.kind == "height":
+            what, advice = "a straight course keeps no height above the Earth", f"let it move over='ground', {other}"
+        raise InvalidProblem(what, where, advice)
+    if motion.order > 1 and not np.all(band.lower == band.upper):
+        raise InvalidProblem("bounds along a course of constant acceleration", where, f"give one exact value, {other}")
 
 
 def _check_agreement(bands: Sequence[Band]) -> None:

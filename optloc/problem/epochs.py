@@ -79,7 +79,8 @@ def by_epoch(problem: Problem) -> Problem:
             Rows(old.kind, spread(old.z), a, b, np.zeros_like(a), target, spread(old.weight), spread(old.correction))
         )
     motions = tuple(
-        replace(m, span="run", known=None if m.known is None else _split(m.known, 3)) for m in problem.motions
+        replace(m, span="run", known=None if m.known is None else _split(m.known, 3), rise=None)
+        for m in problem.motions
     )
     s = problem.stations
     stations = replace(
@@ -90,7 +91,7 @@ def by_epoch(problem: Problem) -> Problem:
         covariance=None if s.covariance is None else _same(s.covariance, 3),
     )
     priors = tuple(replace(p, mean=_same(p.mean, 1), covariance=_same(p.covariance, 2)) for p in problem.priors)
-    constraints = tuple(_spread(c) for c in problem.constraints)
+    constraints = tuple(_spread(c, problem.motions[c.target].rise) for c in problem.constraints)
     noise = _noise(problem, where, int(starts[-1]))
     return replace(
         problem,
@@ -104,10 +105,12 @@ def by_epoch(problem: Problem) -> Problem:
     )
 
 
-def _spread(c: Band | Polygon) -> Band | Polygon:
+def _spread(c: Band | Polygon, rise: Array | None) -> Band | Polygon:
     if isinstance(c, Polygon):
         return c
-    return replace(c, lower=_same(c.lower, 0), upper=_same(c.upper, 0), coefficients=_same(c.coefficients, 1))
+    more = 0.0 if rise is None or not c.along else rise[..., 0]
+    lower, upper = (_same(bound, 0) + more for bound in (c.lower, c.upper))
+    return replace(c, lower=lower, upper=upper, coefficients=_same(c.coefficients, 1))
 
 
 def untied(problem: Problem) -> Problem:
@@ -322,7 +325,10 @@ def cut(problem: Problem, first: int, last: int) -> Problem:
     # Station numbers, times and unknowns of the run stay; only what counts epochs begins anew.
     position = own(s.position, 3)
     assert position is not None
-    motions = tuple(replace(m, known=own(m.known, 3), reference=_reference(problem, m)) for m in problem.motions)
+    motions = tuple(
+        replace(m, known=own(m.known, 3), reference=_reference(problem, m), rise=own(m.rise, 2))
+        for m in problem.motions
+    )
     return replace(
         part,
         stations=replace(s, position=position, velocity=own(s.velocity, 3), axes=own(s.axes, 4)),
@@ -456,7 +462,10 @@ def _motions(problem: Problem, more: Problem) -> tuple[Motion, ...]:
         known = one.known
         if known is not None and two.known is not None:
             known = _course(known, problem.epochs, two.known, more.epochs, 3)
-        joint.append(replace(one, known=known, reference=_reference(problem, one)))
+        rise = one.rise
+        if rise is not None and two.rise is not None:
+            rise = _course(rise, problem.epochs, two.rise, more.epochs, 2)
+        joint.append(replace(one, known=known, reference=_reference(problem, one), rise=rise))
     return tuple(joint)
 
 
@@ -477,8 +486,8 @@ def _check_alike(problem: Problem, more: Problem) -> None:
         ("stations", one.stations.names == two.stations.names and one.stations.span == two.stations.span),
         (
             "targets",
-            [(m.order, m.span, m.known is None) for m in one.motions]
-            == [(m.order, m.span, m.known is None) for m in two.motions],
+            [(m.order, m.span, m.known is None, m.over, m.rise is None) for m in one.motions]
+            == [(m.order, m.span, m.known is None, m.over, m.rise is None) for m in two.motions],
         ),
         (
             "biases",

@@ -135,7 +135,7 @@ class Problem:
         """Return a hashable key of everything but the numbers; equal keys share compiled and indexed forms."""
         rows = tuple((r.kind, r.a.tobytes(), r.b.tobytes(), r.epoch.tobytes(), r.target.tobytes()) for r in self.rows)
         blocks = tuple((b.row.shape, b.row.tobytes()) for b in self.noise.blocks)
-        motions = tuple((m.order, m.span, m.known is None, m.reference) for m in self.motions)
+        motions = tuple((m.order, m.span, m.known is None, m.reference, *_course(m)) for m in self.motions)
         biases = tuple(
             (b.name, b.members, b.form, b.row.tobytes(), b.member.tobytes(), b.coefficient.tobytes())
             for b in self.biases
@@ -147,7 +147,8 @@ class Problem:
         if any(b.form == "time" for b in self.biases) and s.velocity is not None:
             stations += (s.position.tobytes(), s.velocity.tobytes())
         # Polygons enter nothing that is kept by structure but programs, whose keys hold the bands of their edges.
-        constraints = tuple((c.kind, c.target) for c in self.constraints if isinstance(c, Band))
+        bands = [c for c in self.constraints if isinstance(c, Band)]
+        constraints = tuple((c.kind, c.target, *_along(c, self.motions[c.target])) for c in bands)
         return (rows, blocks, motions, biases, stations, self.times.tobytes(), self.frame, constraints)
 
     def flat(self) -> Problem:
@@ -197,6 +198,17 @@ class Problem:
         return replace(self, rows=tuple(rows))
 
 
+# Entries of a structure that few problems have, and none that draws of stored studies are keyed by.
+
+
+def _course(motion: Motion) -> tuple[Any, ...]:
+    return () if motion.over == "space" and motion.rise is None else (motion.over, motion.rise is None)
+
+
+def _along(band: Band, motion: Motion) -> tuple[str, ...]:
+    return ("along",) if band.along and motion.order and motion.span == "run" else ()
+
+
 def _join(parts: list[Array]) -> Array:
     if len(parts) == 1 and isinstance(parts[0], np.ndarray):
         return parts[0].copy()  # a tenth of the time of a concatenation, and as new
@@ -211,7 +223,7 @@ _NUMBERS: dict[type, dict[str, int]] = {
     Stations: {"position": 3, "velocity": 3, "axes": 4, "covariance": 3},
     Rows: {"z": 1, "weight": 1, "correction": 1},
     Block: {"covariance": 3},
-    Motion: {"known": 3},
+    Motion: {"known": 3, "rise": 2},
     Prior: {"mean": 1, "covariance": 2},
     Band: {"lower": 0, "upper": 0, "coefficients": 1},
     Polygon: {},

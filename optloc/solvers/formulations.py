@@ -200,7 +200,7 @@ _PROGRAMS: dict[str, Formulation] = {
         "the same lifted with its reference ranges; price on the trace, prior on the biases",
         "tdoa, toa of moving stations",
         "never tight: a start",
-        "1 s",
+        "0.5 s",
         "Shor 1987",
         serves=registrable,
         starts={"sdp": _start_relaxed_run},

@@ -23,6 +23,7 @@ from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
 from optloc.solvers.inequalities import without_broken
 from optloc.solvers.pool import Pool, begin, offer
+from optloc.solvers.stages import lsr
 from optloc.solvers.starts.block_averages import average_blocks
 from optloc.solvers.starts.position import complete, registrable, spread_of
 from optloc.solvers.starts.registration import BLOCKS, group_alike
@@ -46,14 +47,14 @@ def nlp(problem: Problem, pool: Pool | None) -> Pool:
     Returns
     -------
     Pool
-        Settled; of a long run, the answers for its block averages, to be refined by `lsr`.
+        Settled; of a long run, the answers for its block averages, refined on all epochs by least squares.
     """
     if pool is None:
         raise InvalidProblem("nlp improves a start", "method", "give start= or a method such as 'gtrs+nlp'")
     began = perf_counter()
-    # a program of thousands of rows is slow to build and to solve; `lsr` behind it has all epochs
+    # a program of thousands of rows is slow to build and to solve; least squares behind it has all epochs
     if registrable(problem) and problem.epochs >= 2 * BLOCKS:
-        return offer(problem, _of_blocks(problem, pool.x), pool, "nlp", began)
+        return lsr(problem, offer(problem, _of_blocks(problem, pool.x), pool, "nlp", began))
     # IPOPT sees one covariance: station errors of an epoch are noise to it
     problem = weighed(problem)
     x, shape = pool.x.copy(), pool.x.shape[:2]

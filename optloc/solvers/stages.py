@@ -57,6 +57,8 @@ def start_with(word: str) -> Solver:
     def start(problem: Problem, pool: Pool | None) -> Pool:
         began = perf_counter()
         serving = [form for form in FORMULATIONS.values() if word in form.starts and form.serves(problem)]
+        # what serves fewer problems knows more of this one: where nothing refines the starts, its answer is the fix
+        serving.sort(key=lambda form: form.serves is one_position)
         if one_position(problem):
             alone = hold_still(problem)
             # an empty slot, so that rows which no formulation starts give a pool without candidates

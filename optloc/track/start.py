@@ -187,7 +187,8 @@ def with_height_rows(problem: Problem) -> Problem:
         raise InvalidProblem(f"the constraint {other.name!r} is an equality", "track", advice)
     heard = np.unique(problem.epoch[problem.weight > 0.0])
     m, none = len(heard), np.full(len(heard), -1)
-    z = np.broadcast_to(exact[0].lower, (m,))
+    rise = problem.motions[0].rise
+    z = np.broadcast_to(exact[0].lower, (m,)) if rise is None else exact[0].lower[..., None] + rise[..., heard, 0]
     rows = Rows("height", z, none, none, heard, np.zeros_like(heard), np.ones(m), np.zeros(m))
     block = Block(problem.count + np.arange(m)[:, None], np.full((1, 1, 1), _EXACT**2))
     kept = tuple(c for c in problem.constraints if not any(c is e for e in exact))

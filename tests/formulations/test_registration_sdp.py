@@ -1,9 +1,14 @@
 """The semidefinite start of registration: exact equalities, starts in the right basin, the need of price and prior."""
 
 from dataclasses import dataclass
+from time import perf_counter
 
+import cvxpy as cp
 import numpy as np
 import pytest
+from monte_carlo.tables import write
+from scipy.linalg import block_diag
+from scipy.optimize import minimize
 
 from formulations.registration_sdp import PRICES, Windows, _parameters, registration, registration_problem
 
@@ -100,14 +105,59 @@ def other_geometry(rng, dimension=3):
 
 
 def lifted(data, target, bias):
-    """The vector y of the module's text at a target, in the units of the data."""
+    """The unknowns (1, p, v), r_1 (K,) and f (K, S - 1) at a target, in the units of the data."""
     scaled = np.concatenate([target[:1] - data.origin, target[1:]])
     if len(scaled) == 2:
         scaled = np.stack([scaled[0] + data.clock[0] * scaled[1], scaled[1] * data.clock[1]])
     scaled = scaled / data.scale
     r = np.linalg.norm((data.power @ scaled)[:, None] - data.station, axis=-1)
     f = (data.z - r[:, 1:] + r[:, :1]) / data.unit
-    return np.concatenate([[1.0], scaled.ravel(), r[:, 0], f.ravel()])
+    return np.append(1.0, scaled), r[:, 0], f
+
+
+def in_one_piece(data, price):
+    """The relaxation as the module states it: one lift of all windows, the biases eliminated beforehand."""
+    K, S, _ = data.station.shape
+    n, count = data.power.shape[1] * data.station.shape[2], K * (S - 1)
+    given = _parameters(data)
+    along = (data.gram @ data.design).reshape(count, -1)
+    form = block_diag(*data.gram) - along @ np.linalg.solve(data.total, along.T)
+    lift = cp.Variable((1 + n + K + count, 1 + n + K + count), symmetric=True)
+    first, last = 1 + n, 1 + n + K
+    owner = np.repeat(np.arange(first, last), S - 1)
+    inner = cp.hstack([cp.trace(lift[a, b]) for a in parts(data) for b in parts(data)])
+    rules = [
+        lift >> 0,
+        lift[0, 0] == 1,
+        cp.diag(lift)[first:last] == given["moment"] @ inner + given["near"] @ lift[0, :first],
+        data.unit * cp.diag(lift)[last:] - 2 * lift[owner, np.arange(last, last + count)]
+        + given["level"] @ lift[0, :first] + cp.multiply(given["ahead"], lift[0, owner])
+        == cp.multiply(given["turn"], lift[0, last:]),
+    ]  # fmt: skip
+    cost = cp.sum(cp.multiply(form, lift[last:, last:])) + cp.sum(cp.multiply(price, lift[1:first, 1:first]))
+    problem = cp.Problem(cp.Minimize(cost), rules)
+    problem.solve(solver=cp.CLARABEL)
+    return problem.value, lift.value[0, 1:first]
+
+
+def parts(data):
+    d = data.station.shape[2]
+    return [slice(1 + i * d, 1 + (i + 1) * d) for i in range(data.power.shape[1])]
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_blocks_of_windows_are_the_whole_lift(moving):
+    """Against the lift of all windows, written apart and solved by cvxpy alone."""
+    target = np.array([[200e3, 300e3, 5e3], [-100.0, 0.0, 0.0]])[: 1 + moving]
+    one = run(np.random.default_rng(3), 3.0, target=target)
+    station, z, whiten, time = one.windows(4)
+    data = Windows.of(station, z, whiten, one.sigma, None, 0.0, time if moving else None)
+    for price in (10.0, 0.3):
+        (found,) = one.start(4, prices=(price,))
+        weight = np.kron(data.power.T @ data.power / 4, np.eye(3))
+        value, place = in_one_piece(data, price * weight)
+        assert found.answer.primal == pytest.approx(value, rel=1e-5)
+        assert np.linalg.norm((found.target - data.place(place))[0]) < 0.01 * np.linalg.norm(target[0])
 
 
 @pytest.mark.parametrize(("dimension", "moving", "clocks"), [(3, False, False), (3, True, True), (2, False, True)])
@@ -121,13 +171,18 @@ def test_any_target_is_a_rank_one_point_at_its_own_cost(dimension, moving, clock
     one = run(rng, 3.0, bias=bias, design=design, **scene)
     station, z, whiten, time = one.windows(4)
     data = Windows.of(station, z, whiten, one.sigma, design, 10.0, time if moving else None)
-    problem = registration_problem(4, 5, dimension, int(moving))
+    problem = registration_problem(4, 5, dimension, int(moving), len(bias))
     target = one.truth + 0.1 * one.truth * rng.normal(size=one.truth.shape)
-    y = lifted(data, target, bias)
+    y, near, left_over = lifted(data, target, bias)
     weight = np.kron(data.power.T @ data.power / 4, np.eye(dimension))
     for parameter in problem.parameters():
         parameter.value = {**_parameters(data), "price": 0.7 * weight}[parameter.name()]
-    problem.variables()[0].value = np.outer(y, y)
+    cost, shift = data.cost(y[1:])
+    shared = np.append(y, shift)
+    for variable in problem.variables():
+        name, _, k = variable.name().partition(" ")
+        own = np.append(near[int(k)], left_over[int(k)]) if k else shared
+        variable.value = np.outer(shared if name == "across" else own, own)
     for rule in problem.constraints:
         assert np.max(rule.violation()) < 1e-7
     # the cost of target and bias, the biases eliminated by brute force
@@ -137,12 +192,11 @@ def test_any_target_is_a_rank_one_point_at_its_own_cost(dimension, moving, clock
     A = np.concatenate([np.tile(whiten @ design, (4, 1)), np.diag(1 / one.sigma)])
     b = np.concatenate([(left @ whiten.T).ravel(), 10.0 / one.sigma])
     found = np.linalg.lstsq(A, b, rcond=None)[0]
-    cost, shift = data.cost(y[1 : 1 + target.size])
     assert cost == pytest.approx(np.sum((b - A @ found) ** 2), rel=1e-8)
     np.testing.assert_allclose(10.0 + shift * data.unit * data.scale, found, rtol=1e-7)
     far = np.mean(np.sum((point - data.origin) ** 2, axis=-1)) / data.scale**2
     assert problem.objective.value == pytest.approx(cost + 0.7 * far, rel=1e-8)
-    np.testing.assert_allclose(data.place(y[1 : 1 + target.size]), target, rtol=1e-9)
+    np.testing.assert_allclose(data.place(y[1:]), target, rtol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -276,3 +330,44 @@ def test_what_cannot_be_started():
     for sigma in (np.inf, 0.0, np.nan):
         with pytest.raises(ValueError, match="prior standard deviation"):
             registration(station, z, whiten, np.full(4, sigma))
+
+
+def least(data, price, start):
+    """Return the least cost with the price on the squared distance next to a scaled target: what is relaxed."""
+    weight = np.kron(data.power.T @ data.power / len(data.station), np.eye(data.station.shape[2]))
+    unit = np.abs(start).max()
+
+    def cost(u):
+        return data.cost(unit * u)[0] + price * unit**2 * u @ weight @ u
+
+    return minimize(cost, start / unit, method="Nelder-Mead", options={"xatol": 1e-9, "fatol": 1e-9, "maxiter": 2000})
+
+
+@pytest.mark.full
+def test_how_far_from_tight():
+    """Writes docs/measured/relaxation_of_runs.md: bound over least cost, and what both leave of the data's cost."""
+    lines, trials, windows = [], 12, 6
+    for noise in (3.0, 12.0):
+        runs = [run(np.random.default_rng(seed), noise) for seed in range(trials)]
+        for price in (30.0, 3.0, 0.3, 0.03):
+            shares, misfits, ratios, errors, seconds = [], [], [], [], []
+            for one in runs:
+                station, z, whiten, _ = one.windows(windows)
+                data = Windows.of(station, z, whiten, one.sigma, None, 0.0, None)
+                began = perf_counter()
+                (found,) = one.start(windows, prices=(price,))
+                seconds.append(perf_counter() - began)
+                starts = [((x - data.origin) / data.scale).ravel() for x in (one.truth, found.target)]
+                best = min(least(data, price, start).fun for start in starts)
+                shares.append(found.answer.primal / best)
+                misfits.append(found.misfit / min(least(data, 0.0, start).fun for start in starts))
+                ratios.append(found.rank_ratio)
+                errors.append(np.linalg.norm(found.target - one.truth))
+            assert np.max(shares) < 1.0  # a relaxation
+            middle = [f"{np.median(part):.2g}" for part in (shares, misfits, ratios)]
+            milliseconds = f"{1e3 * np.median(seconds):.0f}"
+            lines.append((f"{noise:g} m, price {price:g}", *middle, f"{np.median(errors):.0f}", milliseconds))
+    header = (
+        "case", "bound / least cost", "misfit / least misfit", "second / first eigenvalue", "start error, m", "ms",
+    )  # fmt: skip
+    write("relaxation_of_runs", header, lines, f"seeds 0 to {trials - 1}, medians of {trials} runs of 600 epochs")

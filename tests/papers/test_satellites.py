@@ -124,7 +124,7 @@ def report():
 
 def test_a_reproduction_has_every_table_and_figure(report):
     rows = {table.name: table.rows for table in report.tables}
-    assert list(rows) == ["fixed", "starts", "pairs", "heights", "moving", "one-shot"]
+    assert list(rows) == ["fixed", "relative", "starts", "pairs", "heights", "moving", "one-shot"]
     assert [picture.name for picture in report.pictures] == ["filters", "heights"]
     assert [row[0] for row in rows["fixed"]] == ["EKF", "IEKF", "MGEKF", "MVEKF", "posterior bound"]
     assert rows["fixed"][-1][1:3] == ("522.1", "310.5")

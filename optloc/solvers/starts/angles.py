@@ -12,7 +12,7 @@ from formulations.bistatic import course, triad
 from optloc.base.linalg import centre_and_spread
 from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array, Rows
-from optloc.linear.evaluate import elapsed
+from optloc.linear.courses import elapsed
 from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
 from optloc.solvers.starts.position import spread_of

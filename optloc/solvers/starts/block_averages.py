@@ -80,7 +80,10 @@ def _blocks(problem: Problem, length: int, longest: float) -> Problem:
         rows=rows,
         noise=_noise(problem, means, np.concatenate([block.epoch for block in rows])),
         times=middle,
-        motions=tuple(replace(m, reference=_reference(problem, m.reference)) for m in problem.motions),
+        motions=tuple(
+            replace(m, reference=_reference(problem, m.reference), rise=_at(problem.times, m.rise, middle))
+            for m in problem.motions
+        ),
         biases=tuple(_bias(bias, np.concatenate([mean.first for mean in means])) for bias in problem.biases),
     )
 
@@ -122,6 +125,15 @@ def _with_station_noise(problem: Problem) -> Problem:
 
 def _reference(problem: Problem, reference: float | None) -> float:
     return float(problem.times[0]) if reference is None else reference
+
+
+def _at(times: Array, rise: Array | None, middle: Array) -> Array | None:
+    """Return the known shape of a height (..., b, 2) at the middles, straight between the epochs."""
+    if rise is None:
+        return None
+    after = np.clip(np.searchsorted(times, middle), 1, len(times) - 1)
+    share = ((middle - times[after - 1]) / (times[after] - times[after - 1]))[:, None]
+    return np.asarray(rise[..., after - 1, :] * (1.0 - share) + rise[..., after, :] * share)
 
 
 def _means(rows: Rows, when: _Blocks, present: Array, start: int, taken: int) -> _Mean:

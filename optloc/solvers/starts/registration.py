@@ -12,7 +12,8 @@ from formulations.registration import Course, candidates
 from optloc.base import linalg
 from optloc.base.types import Array, Status
 from optloc.compute.sums import equations_at
-from optloc.linear.evaluate import elapsed, plans
+from optloc.linear.courses import elapsed
+from optloc.linear.evaluate import plans
 from optloc.linear.normal import covariance, degrees_of_freedom, prior_parts
 from optloc.problem.epochs import by_epoch, untied
 from optloc.problem.problem import Problem

@@ -9,9 +9,9 @@ from math import factorial
 import numpy as np
 
 from optloc.base import linalg
-from optloc.base.types import Array, Motion, Rows, Stations
+from optloc.base.types import Array, Band, Motion, Polygon, Rows, Stations
 from optloc.linear.constraints import is_exact, needs_velocity
-from optloc.linear.evaluate import elapsed
+from optloc.linear.courses import elapsed
 from optloc.models import MODELS
 from optloc.problem.epochs import by_epoch, untied
 from optloc.problem.fix import Fix
@@ -63,13 +63,17 @@ def _isolate(problem: Problem, target: int) -> Problem:
     problem = without_biases(problem)
     problem = _take_rows(problem, target) if len(problem.motions) > 1 else problem
     motion = problem.motions[target]
-    # What bounds a moving target holds at its reference time only, but a known height is as good a start elsewhere.
+    # What bounds a target at its reference time alone may not hold at others, but a known height is a good start.
     constraints = tuple(
         replace(c, target=0)
         for c in problem.constraints
-        if c.target == target and (motion.order == 0 or (is_exact(c) and not needs_velocity(c)))
+        if c.target == target and (motion.order == 0 or ((is_exact(c) or _along(c)) and not needs_velocity(c)))
     )
     return replace(problem, motions=(motion,), constraints=constraints)
+
+
+def _along(constraint: Band | Polygon) -> bool:
+    return isinstance(constraint, Band) and constraint.along
 
 
 def _take_rows(problem: Problem, target: int) -> Problem:
@@ -122,7 +126,7 @@ def _state(problem: Problem, fixed: Callable[[Problem], Fix]) -> Array:
     if seen is not None and np.isfinite(seen).all():
         return seen[:, None]
     # else epoch by epoch, and a polynomial through the fixes: rough where epochs are weak, but a start
-    free = by_epoch(untied(replace(problem, motions=(Motion(span="epoch"),))))
+    free = by_epoch(untied(replace(problem, motions=(Motion(span="epoch", rise=motion.rise),))))
     fix = fixed(free.flat()).reshape((size, problem.epochs))
     if motion.span == "epoch":
         state = np.zeros((size, problem.epochs, motion.order + 1, problem.dimension))

@@ -1,0 +1,104 @@
+"""Where targets are along their courses, in the frame of a problem: polynomials in space, or ways over ground."""
+
+from __future__ import annotations
+
+from math import factorial
+from typing import Any
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.models.course import carry
+from optloc.models.primitives import Components, Jet
+from optloc.problem.problem import Problem
+
+
+def over_ground(problem: Problem) -> bool:
+    """Return whether the courses of a problem follow the Earth: those of all targets that move, or none."""
+    return any(motion.over == "ground" for motion in problem.motions)
+
+
+def elapsed(problem: Problem, target: int) -> Array:
+    """Return the seconds (k,) since a target's state holds; zero where each epoch has its own state."""
+    motion = problem.motions[target]
+    if motion.span == "epoch":
+        return np.zeros(problem.epochs)
+    # The first epoch by default, so that adding later epochs does not move what a state means.
+    reference = problem.times[0] if motion.reference is None else motion.reference
+    return np.asarray(problem.times - reference)
+
+
+def to_ecef(problem: Problem, position: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return a position of the problem's frame as ECEF components of the same type."""
+    # Spelled out with numbers as factors: components may be jets or symbols, which know no matrices.
+    turn, origin = problem.frame.rotation_to_ecef(), problem.frame.origin_ecef()
+    if problem.frame.kind == "ecef":
+        return position
+    return tuple(
+        sum((float(turn[i, c]) * position[c] for c in range(1, 3)), float(turn[i, 0]) * position[0]) + float(origin[i])
+        for i in range(3)
+    )
+
+
+def carried(
+    problem: Problem,
+    start: Components,
+    straight: Components,
+    rate: Components | None = None,
+    rise: tuple[Any, Any] = (0.0, 0.0),
+) -> tuple[Components, Components | None]:
+    """Return place and rate on a course over ground, in the problem's frame.
+
+    Parameters
+    ----------
+    problem : Problem
+        In a geodetic frame.
+    start : tuple of 3 numbers
+        Place at the reference time, metres.
+    straight : tuple of 3 numbers
+        Where the same state leads in space.
+    rate : tuple of 3 numbers, optional
+        Its rate there, metres per second.
+    rise : pair of numbers
+        Height beyond its polynomial, metres, and its rate.
+    """
+    if rate is None:
+        return _from_ecef(problem, carry(to_ecef(problem, start), to_ecef(problem, straight), rise[0])), None
+    # the derivative along time is one more of the same kind: all numbers are jets of it, constants too
+    begun = tuple(Jet(p, {}) for p in start)
+    led = tuple(Jet(p, {0: v}) for p, v in zip(straight, rate, strict=True))
+    place = carry(to_ecef(problem, begun), to_ecef(problem, led), Jet(rise[0], {0: rise[1]}))
+    found = _from_ecef(problem, place)
+    return tuple(jet.value for jet in found), tuple(jet.partials[0] for jet in found)
+
+
+def course_at(problem: Problem, target: int, states: list[Components], since: Any, rise: Any = 0.0) -> Components:
+    """Return where a target is some seconds after its reference time.
+
+    Parameters
+    ----------
+    problem : Problem
+        Says how the target moves.
+    target : int
+        Which.
+    states : list of tuples of d numbers
+        Position, velocity and acceleration, as many as it has: arrays, jets or symbols.
+    since : float or array
+        Seconds.
+    rise : float or array
+        Height beyond its polynomial, metres; by default what is known of that is left out.
+    """
+    place = states[0]
+    for j, state in enumerate(states[1:], 1):
+        place = tuple(p + since**j / factorial(j) * v for p, v in zip(place, state, strict=True))
+    return (
+        carried(problem, states[0], place, rise=(rise, 0.0))[0] if problem.motions[target].over == "ground" else place
+    )
+
+
+def _from_ecef(problem: Problem, ecef: Components) -> Components:
+    turn, origin = problem.frame.rotation_to_ecef(), problem.frame.origin_ecef()
+    if problem.frame.kind == "ecef":
+        return ecef
+    off = tuple(e - float(o) for e, o in zip(ecef, origin, strict=True))
+    return tuple(sum((float(turn[i, c]) * off[i] for i in (1, 2)), float(turn[0, c]) * off[0]) for c in range(3))

@@ -1,0 +1,213 @@
+"""The algorithm of the paper `registration` as printed: two undamped steps over all past data at every new epoch.
+
+It starts from a given place at the fortieth epoch and never looks for another minimum: a baseline.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from optloc.base import linalg
+from optloc.base.types import Array
+
+FIRST = 40
+"""Epochs that are collected before the first estimate, as printed."""
+
+_BLOCK = 8  # trials whose arrays, 5 stations by 700 epochs by 3 coordinates, fit a cache of 1 MB together
+
+
+def recursion(track: Array, times: Array, z: Array, start: Array, *, first: int = FIRST, iterations: int = 2) -> Array:
+    """Return the estimates of the paper's recursion after every epoch.
+
+    Parameters
+    ----------
+    track : array (k, s, 3)
+        Stations, metres.
+    times : array (k,)
+        Seconds.
+    z : array (trials, k, s - 1)
+        Range differences against the first station, metres.
+    start : array (trials, n)
+        Position, or position and velocity at time zero, from which the first estimate is made.
+    first : int
+        Epochs of the first estimate.
+    iterations : int
+        Steps at each epoch.
+
+    Returns
+    -------
+    array (trials, k - first + 1, n + s - 1)
+        State and biases after `first`, `first + 1` ... epochs; NaN from where the steps ran away.
+    """
+    trials, epochs = z.shape[:2]
+    out = np.empty((trials, epochs - first + 1, start.shape[-1] + z.shape[-1]))
+    arrivals = np.zeros((trials, z.shape[-1] + 1, epochs))
+    arrivals[:, 1:] = z.swapaxes(1, 2)
+    track = np.ascontiguousarray(track.T)
+    with np.errstate(all="ignore"):  # what runs away overflows, and stays lost
+        for low in range(0, trials, _BLOCK):
+            part = slice(low, low + _BLOCK)
+            state = start[part]
+            for k in range(first, epochs + 1):
+                for _ in range(iterations):
+                    move, bias = step(state, arrivals[part, :, :k], track[..., :k], times[:k])
+                    state = state + move
+                out[part, k - first] = np.concatenate([state, bias], axis=-1)
+    return out
+
+
+def step(state: Array, arrivals: Array, track: Array, times: Array) -> tuple[Array, Array]:
+    """Return one Gauss-Newton step (trials, n) of the state and the biases (trials, s - 1) that go with it.
+
+    The sums of eq. 11 and 12 over the epochs. The inverse of R, proportional to I + 11', takes the mean of each epoch
+    out of the arrivals, and eliminating the unknown biases takes the mean of the run out of each channel: what is left
+    are outer products.
+
+    Parameters
+    ----------
+    state : array (trials, n)
+        Position, or position and velocity at time zero.
+    arrivals : array (trials, s, k)
+        Range differences against the first station, whose own are zero.
+    track : array (3, s, k)
+        Stations.
+    times : array (k,)
+        Seconds.
+    """
+    trials, n = state.shape
+    target = state[:, :3, None, None]
+    if n > 3:
+        target = target + state[:, 3:, None, None] * times
+    slope = target - track
+    distance = np.sqrt(np.einsum("tcsk,tcsk->tsk", slope, slope))
+    slope /= distance[:, None]  # unit vectors (trials, 3, s, k)
+    misfit = arrivals - distance  # (trials, s, k)
+    # First the mean of each epoch over the stations, then that of each channel over the epochs, in the sums below.
+    misfit -= misfit.mean(1, keepdims=True)
+    slope -= slope.mean(2, keepdims=True)
+    if n > 3:
+        slope = np.concatenate([slope, slope * times], axis=1)
+    rows, mean, left = slope.reshape(trials, n, -1), slope.mean(3), misfit.mean(2)
+    information = rows @ rows.swapaxes(1, 2) - len(times) * (mean @ mean.swapaxes(1, 2))
+    vector = rows @ misfit.reshape(trials, -1, 1) - len(times) * (mean @ left[..., None])
+    solved, ok = linalg.solve(information, vector)
+    # A singular system has no step: NaN, and lost, instead of one that a solver makes up.
+    move = np.where(ok[:, None], solved[..., 0], np.nan)
+    left = left - (move[:, None] @ mean)[:, 0]
+    return move, left[:, 1:] - left[:, :1]
+
+
+# The same with gain ratios beside the range differences (section 3.2), whose weights depend on the place.
+
+
+def joint_recursion(
+    track: Array,
+    z: Array,
+    gains: Array,
+    start: Array,
+    sigma: tuple[float, float, float],
+    *,
+    first: int = FIRST,
+    iterations: int = 2,
+) -> Array:
+    """Return the estimates of the paper's joint recursion for a fixed target after every epoch.
+
+    An epoch is weighed where the target is thought to be when it arrives, and its weight stays; its residuals and
+    derivatives are those of the present estimate.
+
+    Parameters
+    ----------
+    track : array (k, s, 3)
+        Stations, metres.
+    z, gains : array (trials, k, s - 1)
+        Range differences against the first station, metres, and gain ratios.
+    start : array (trials, 3)
+        Position from which the first estimate is made, metres.
+    sigma : (float, float, float)
+        Standard deviations: of an arrival and of a coordinate of a station, metres, with that of a gain between them.
+    first : int
+        Epochs of the first estimate.
+    iterations : int
+        Steps at each epoch.
+
+    Returns
+    -------
+    array (trials, k - first + 1, 3 + 2 (s - 1))
+        Position and biases of both kinds after `first`, `first + 1` ... epochs; NaN from where the steps ran away.
+    """
+    trials, epochs = z.shape[:2]
+    measured = np.concatenate([z, gains], axis=-1)
+    out = np.empty((trials, epochs - first + 1, start.shape[-1] + measured.shape[-1]))
+    with np.errstate(all="ignore"):  # what runs away overflows, and stays lost
+        for low in range(0, trials, _BLOCK):
+            part = slice(low, low + _BLOCK)
+            state, weights = start[part], joint_weights(start[part], track[:first], sigma)
+            weight = np.empty((len(state), epochs, *weights.shape[-2:]))
+            weight[:, :first], total = weights, weights.sum(1)
+            for k in range(first, epochs + 1):
+                if k > first:
+                    weight[:, k - 1] = joint_weights(state, track[k - 1 : k], sigma)[:, 0]
+                    total += weight[:, k - 1]
+                for _ in range(iterations):
+                    move, bias = joint_step(state, measured[part, :k], track[:k], weight[:, :k], total)
+                    state = state + move
+                out[part, k - first] = np.concatenate([state, bias], axis=-1)
+    return out
+
+
+def joint_weights(state: Array, track: Array, sigma: tuple[float, float, float]) -> Array:
+    """Return the inverse covariances (trials, k, 2 m, 2 m) of differences and ratios, m of each, at positions.
+
+    R of eq. 40: noise of one kind is sigma^2 (I + 11'), and the errors of the stations tie both kinds by
+    G_i . G_j' = size^2 (1 + delta) of the lines of sight, here with r_1 and the ratios of the ranges.
+    """
+    arrival, gain, size = sigma
+    distance = np.linalg.norm(state[:, None, None] - track, axis=-1)
+    first, ratio = distance[..., :1, None], distance[..., 1:, None] / distance[..., :1, None]
+    count = ratio.shape[-2]
+    shape, one = np.eye(count) + 1.0, np.ones_like(ratio)
+    both = size**2 * (one @ ratio.swapaxes(-1, -2) + np.eye(count)) / first
+    own = size**2 * (ratio @ ratio.swapaxes(-1, -2) + np.eye(count)) / first**2
+    upper = np.concatenate([np.broadcast_to((arrival**2 + size**2) * shape, own.shape), both], axis=-1)
+    lower = np.concatenate([both.swapaxes(-1, -2), own + gain**2 * shape], axis=-1)
+    return linalg.inverse(np.concatenate([upper, lower], axis=-2))[0]
+
+
+def joint_step(state: Array, measured: Array, track: Array, weight: Array, total: Array) -> tuple[Array, Array]:
+    """Return one Gauss-Newton step (trials, 3) of the position and the biases (trials, 2 m) that go with it.
+
+    The sums of eq. 11 and 12 with the matrices of eq. 39, the constant biases eliminated.
+
+    Parameters
+    ----------
+    state : array (trials, 3)
+        Positions.
+    measured : array (trials, k, 2 m)
+        Range differences, then gain ratios.
+    track : array (k, s, 3)
+        Stations.
+    weight : array (trials, k, 2 m, 2 m)
+        Inverse covariances.
+    total : array (trials, 2 m, 2 m)
+        Their sum.
+    """
+    line = state[:, None, None] - track
+    distance = np.linalg.norm(line, axis=-1, keepdims=True)
+    sight = line / distance
+    ratio = distance[..., 1:, :] / distance[..., :1, :]
+    slope = np.concatenate(
+        [sight[..., 1:, :] - sight[..., :1, :], (sight[..., 1:, :] - ratio * sight[..., :1, :]) / distance[..., :1, :]],
+        axis=-2,
+    )
+    value = np.concatenate([distance[..., 1:, 0] - distance[..., :1, 0], ratio[..., 0]], axis=-1)
+    both = np.concatenate([slope, (measured - value)[..., None]], axis=-1)  # (trials, k, 2 m, 4)
+    white = weight @ both
+    trials, wide = len(state), both.shape[-1]
+    sums = both.reshape(trials, -1, wide).swapaxes(1, 2) @ white.reshape(trials, -1, wide)
+    shared = white.sum(1)
+    away, fine = linalg.solve(total, shared)
+    left = sums - shared.swapaxes(1, 2) @ away
+    solved, ok = linalg.solve(left[:, :-1, :-1], left[:, :-1, -1:])
+    # A singular system has no step: NaN, and lost, instead of one that a solver makes up.
+    move = np.where((ok & fine)[:, None], solved[..., 0], np.nan)
+    return move, away[..., -1] - (away[..., :-1] @ move[..., None])[..., 0]
