@@ -29,9 +29,11 @@ from optloc.linear.evaluate import predict
 from optloc.linear.gauss_newton import gauss_newton
 from optloc.linear.normal import Linear, Normal, linearise, normal
 from optloc.linear.simulate import simulate
+from optloc.linear.walks import wander
 from optloc.models import MODELS, Model
 from optloc.problem import epochs, noise
 from optloc.problem.bias import with_bias, with_known_bias
+from optloc.problem.clocks import clock_densities
 from optloc.problem.build import assemble, measured, station_array
 from optloc.problem.chart import Chart
 from optloc.problem.epochs import by_epoch
@@ -114,6 +116,7 @@ __all__ = [
     "assemble",
     "by_epoch",
     "certify",
+    "clock_densities",
     "common_level",
     "constraints",
     "crlb",
@@ -147,6 +150,7 @@ __all__ = [
     "suspects",
     "trace_arc",
     "units",
+    "wander",
     "with_bias",
     "with_estimated_noise",
     "with_known_bias",

@@ -13,6 +13,7 @@ from optloc.base.types import Array
 from optloc.compute.sums import equations_at
 from optloc.linear.constraints import exact, levels, tangent_at
 from optloc.linear.normal import Linear, Normal, covariance, linearise, marginal, normal, prior_parts
+from optloc.linear.walks import walks
 from optloc.problem.epochs import tied, windows
 from optloc.problem.layout import Layout
 from optloc.problem.problem import Problem
@@ -115,7 +116,7 @@ def crlb_course(
     Raises
     ------
     InvalidProblem
-        Where noise ties the epochs together, a count is out of range, or a name is unknown.
+        Where noise or a walk ties the epochs together, a count is out of range, or a name is unknown.
 
     References
     ----------
@@ -125,6 +126,9 @@ def crlb_course(
     if tied(problem):
         advice = "ask for the bound of the whole run"
         raise InvalidProblem("noise correlates the epochs, so that what they say does not add up", "noise", advice)
+    if walks(problem):
+        what = f"the walk {walks(problem)[0].name!r} ties the epochs, so that what they say does not add up"
+        raise InvalidProblem(what, "biases", "ask for the bound of the whole run")
     chosen = np.arange(1, k + 1) if counts is None else np.asarray(counts, dtype=np.int64)
     if chosen.ndim != 1 or not len(chosen) or chosen.min() < 1 or chosen.max() > k:
         raise InvalidProblem(f"the counts are not among 1 to {k}", "counts", "give numbers of epochs")

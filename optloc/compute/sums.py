@@ -12,6 +12,7 @@ from optloc.base.types import Array
 from optloc.compute.jit import enabled, usable
 from optloc.compute.pack import pack
 from optloc.linear.normal import Normal, depends_on_place, linearise, normal, whitener_at, with_priors
+from optloc.linear.walks import walks
 from optloc.problem.epochs import windows
 from optloc.problem.noise import Whitener
 from optloc.problem.problem import Problem
@@ -82,7 +83,7 @@ def _by_machine_code(problem: Problem, x: Array, noise: tuple[Whitener, ...] | N
 
 def serves(problem: Problem, starts: int) -> bool:
     """Return whether machine code is at hand, or may be waited for, and pays for a number of vectors of a problem."""
-    if problem.count > _LONGEST or starts * problem.count < _WORTH or not enabled():
+    if problem.count > _LONGEST or starts * problem.count < _WORTH or not enabled() or walks(problem):
         return False
     from optloc.compute.equations import normal_block
     from optloc.compute.refine import refine_block, refine_runs

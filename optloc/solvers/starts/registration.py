@@ -10,10 +10,11 @@ import numpy as np
 
 from formulations.registration import Course, candidates
 from optloc.base import linalg
-from optloc.base.types import Array, Status
+from optloc.base.types import Array, Bias, Status
 from optloc.compute.sums import equations_at
 from optloc.linear.evaluate import elapsed, plans
 from optloc.linear.normal import covariance, degrees_of_freedom, prior_parts
+from optloc.linear.walks import places, state_of, walks
 from optloc.problem.epochs import by_epoch, untied
 from optloc.problem.problem import Problem
 from optloc.solvers.policy import DOUBT
@@ -83,7 +84,7 @@ def _start_group(problem: Problem, begin: Callable[[Problem], Array | None]) -> 
     """Return starting vectors (N, C, size) of runs that have the same rows."""
     # every candidate is refined on the averages, where a step costs next to nothing; few are on all epochs
     blocks = average_blocks(problem, BLOCKS)
-    x = begin(blocks)
+    x = _begin(blocks, begin)
     x = _around(blocks, _ANYWHERE) if x is None else x
     pool = _minima(blocks, x)
     # stations in a plane see the mirror image nearly as well: it is always tried
@@ -95,6 +96,42 @@ def _start_group(problem: Problem, begin: Callable[[Problem], Array | None]) -> 
         wider = _minima(part, np.concatenate([_around(part, _RADII), _valley(part, pool[0][doubtful, 0])], axis=1))
         pool = _merge(pool, _scatter(wider, doubtful, len(x)))
     return complete(problem, _best(blocks, *pool)[..., : problem.layout.n_shared])
+
+
+def _begin(blocks: Problem, begin: Callable[[Problem], Array | None]) -> Array | None:
+    """Return starting vectors of blocks; those whose biases walk begin as if these were offsets that drift."""
+    steady = _without_walks(blocks)
+    x = begin(steady)
+    if x is None or steady is blocks:
+        return x
+    layout, out = blocks.layout, np.zeros((*x.shape[:2], blocks.layout.size))
+    for slot in layout.shared:
+        out[..., slot.start : slot.start + slot.size] = steady.layout.take(x, slot.name)
+    local = out[..., layout.n_shared :].reshape(*x.shape[:2], layout.epochs, layout.n_local)
+    since = (blocks.times - blocks.origin)[:, None]
+    for bias in walks(blocks):
+        value, *rate = (steady.layout.take(x, name)[:, :, None] for name in state_of(bias))
+        place = places(layout, bias)
+        local[..., place[:, 0]] = value + (rate[0] * since if rate else 0.0)
+        if rate:
+            local[..., place[:, 1]] = rate[0]
+    out[..., layout.n_shared :] = local.reshape(*x.shape[:2], -1)
+    out[np.isnan(x).any(-1)] = np.nan
+    return out
+
+
+def _without_walks(problem: Problem) -> Problem:
+    """Return a problem whose walks are offsets, and drifts besides where they have rates; itself without walks."""
+    biases: list[Bias] = []
+    for bias in problem.biases:
+        if bias.form != "walk":
+            biases.append(bias)
+            continue
+        forms = zip(state_of(bias), ("offset", "drift"), strict=False)
+        for name, form in forms:
+            known = {} if form == "offset" else {"sigma": None, "mean": np.zeros(1)}
+            biases.append(replace(bias, name=name, form=form, density=None, **known))
+    return replace(problem, biases=tuple(biases)) if walks(problem) else problem
 
 
 def _minima(blocks: Problem, x: Array) -> tuple[Array, Array]:
