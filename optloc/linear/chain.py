@@ -1,6 +1,7 @@
 """Symmetric systems of blocks in a chain: epochs that are tied to the next one, solved in time linear in their number.
 
-Every other block is eliminated at once and the rest is a chain again, half as long: cyclic reduction, which for
+Regular ones are banded matrices, which LAPACK factors. For blocks of an inverse, and where a block leaves something
+open, every other block is eliminated at once and the rest is a chain again, half as long: cyclic reduction, which for
 positive definite matrices is Cholesky's method in another order. B. L. Buzbee, G. H. Golub, C. W. Nielson, "On direct
 methods for solving Poisson's equations", SIAM J. Numer. Anal. 7 (1970) 627-656.
 """
@@ -39,8 +40,41 @@ def solve(block: Array, link: Array, right: Array) -> tuple[Array, Array]:
     ok : bool array (...)
         False where the chain as a whole is singular.
     """
-    found, _, ok = _reduce(block, link, right, np.abs(block).max((-1, -2, -3)), inverse=False)
-    return found, ok
+    shape = np.broadcast_shapes(block.shape[:-3], right.shape[:-3])
+    out, ok = np.empty((*shape, *right.shape[-3:])), np.ones(shape, dtype=bool)
+    each = [np.broadcast_to(part, (*shape, *part.shape[-3:])) for part in (block, link, right)]
+    for i in np.ndindex(shape):
+        one, two, three = (part[i] for part in each)
+        found = _banded(one, two, three)
+        if found is None:
+            found, _, ok[i] = _reduce(one, two, three, np.abs(one).max(), inverse=False)
+        out[i] = found
+    return out, ok
+
+
+def _banded(block: Array, link: Array, right: Array) -> Array | None:
+    """Return the solution (k, l, p) of one chain by a banded factor; None where it is not safely regular."""
+    from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
+
+    k, length = block.shape[:2]
+    # LAPACK's lower band: the entry of row i + d and column i stands in line d, column i
+    band = np.zeros((2 * length, k, length))
+    for d in range(length):
+        band[d, :, : length - d] = np.diagonal(block, -d, 1, 2)
+        band[length + d, :-1, : length - d] = np.diagonal(link.mT, -d, 1, 2)
+        if d:
+            band[length - d, :-1, d:] = np.diagonal(link.mT, d, 1, 2)
+    band = band.reshape(2 * length, -1)
+    if not np.isfinite(band).all() or not (band[0] > 0.0).all():
+        return None
+    try:
+        factor = cholesky_banded(band, lower=True, check_finite=False)
+    except LinAlgError:
+        return None
+    if (factor[0] ** 2 <= _OPEN * band[0]).any():
+        return None
+    flat = right.reshape(k * length, -1)
+    return np.asarray(cho_solve_banded((factor, True), flat, check_finite=False)).reshape(right.shape)
 
 
 def inverse_blocks(block: Array, link: Array) -> tuple[Array, Array]:

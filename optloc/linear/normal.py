@@ -309,23 +309,27 @@ def marginal(equations: Normal) -> tuple[Array, Array, Array]:
     Schur complement epoch by epoch. Of several epochs one may leave some of its own unknowns open: what it says about
     the shared ones counts all the same. `ok` (...) is False where the only epoch does so.
     """
+    return _eliminate(equations)[:3]
+
+
+def _eliminate(equations: Normal) -> tuple[Array, Array, Array, Array]:
+    """Return what `marginal` does, and the solutions (..., k, l, n + 1) of the local systems: coupling, then vector."""
     xp = library(equations.cost)
-    if equations.local.shape[-1] == 0:
-        return equations.shared, equations.shared_vector, xp.ones_like(equations.cost, dtype=xp.bool)
-    # Coupling and vector are solved for at once.
     right = xp.concat([equations.cross.mT, equations.local_vector[..., None]], axis=-1)
+    if equations.local.shape[-1] == 0:
+        return equations.shared, equations.shared_vector, xp.ones_like(equations.cost, dtype=xp.bool), right
+    # Coupling and vector are solved for at once.
     solved, ok = _solve_local(equations, right)
     lost = xp.sum(equations.cross @ solved, axis=-3)
-    return equations.shared - lost[..., :-1], equations.shared_vector - lost[..., -1], ok
+    return equations.shared - lost[..., :-1], equations.shared_vector - lost[..., -1], ok, solved
 
 
 def eliminated(equations: Normal) -> Normal:
     """Return the information about the shared unknowns alone: local ones take the values that fit best."""
-    information, vector, _ = marginal(equations)
+    information, vector, _, held = _eliminate(equations)
     cost = equations.cost
     if equations.local.shape[-1]:
-        rest, _ = _solve_local(equations, equations.local_vector[..., None])
-        cost = cost - (rest[..., 0] * equations.local_vector).sum((-1, -2))
+        cost = cost - (held[..., -1] * equations.local_vector).sum((-1, -2))
     none = np.zeros((*cost.shape, 1, 0))
     return Normal(information, none[..., None], np.zeros((*cost.shape, 1, vector.shape[-1], 0)), vector, none, cost)
 
@@ -397,7 +401,7 @@ def step(equations: Normal, damping: Array, space: Tangent | None = None) -> tup
         Tangent space of equalities that the step keeps to first order.
     """
     damped = _damp(equations, damping)
-    information, vector, ok = marginal(damped)
+    information, vector, ok, held = _eliminate(damped)
     if space is not None:
         shared, good = linalg.solve_within(information, vector, space)
         ok = ok & good
@@ -408,12 +412,10 @@ def step(equations: Normal, damping: Array, space: Tangent | None = None) -> tup
         shared = vector
     if damped.local.shape[-1] == 0:
         return shared, ok
-    # Back substitution: given the shared step, each epoch solves for its own.
-    rest = damped.local_vector - (damped.cross.mT @ shared[..., None, :, None])[..., 0]
-    local, good = _solve_local(damped, rest[..., None])
-    xp = library(local)
-    flat = xp.reshape(local[..., 0], (*local.shape[:-3], -1))
-    return xp.concat([shared, flat], axis=-1), ok & good
+    # Back substitution: what an epoch does by itself, less what the shared step takes from it.
+    local, xp = held[..., -1] - (held[..., :-1] @ shared[..., None, :, None])[..., 0], library(held)
+    flat = xp.reshape(local, (*local.shape[:-2], -1))
+    return xp.concat([shared, flat], axis=-1), ok
 
 
 def _damp(equations: Normal, damping: Array) -> Normal:
