@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -235,24 +236,20 @@ class Normal:
 
     def __add__(self, other: Normal) -> Normal:
         """Return the sum of the information of disjoint epochs: shared parts add, local parts are joined."""
-        # Without local unknowns nothing is joined: blocks of length zero stay as they are.
-        if self.local.shape[-1] == 0 == other.local.shape[-1]:
-            return Normal(
-                self.shared + other.shared,
-                self.local,
-                self.cross,
-                self.shared_vector + other.shared_vector,
-                self.local_vector,
-                self.cost + other.cost,
-            )
-        return Normal(
-            self.shared + other.shared,
-            np.concatenate([self.local, other.local], axis=-3),
-            np.concatenate([self.cross, other.cross], axis=-3),
-            self.shared_vector + other.shared_vector,
-            np.concatenate([self.local_vector, other.local_vector], axis=-2),
-            self.cost + other.cost,
-        )
+        return total([self, other])
+
+
+def total(parts: Sequence[Normal]) -> Normal:
+    """Return the sum of the information of disjoint stretches of epochs, before priors: local parts are joined once."""
+    first = parts[0]
+    if len(parts) == 1:
+        return first
+    shared, vector, cost = (sum(getattr(p, name) for p in parts) for name in ("shared", "shared_vector", "cost"))
+    # Without local unknowns nothing is joined: blocks of length zero stay as they are.
+    if first.local.shape[-1] == 0:
+        return Normal(shared, first.local, first.cross, vector, first.local_vector, cost)
+    local, cross = (np.concatenate([getattr(p, name) for p in parts], axis=-3) for name in ("local", "cross"))
+    return Normal(shared, local, cross, vector, np.concatenate([p.local_vector for p in parts], axis=-2), cost)
 
 
 def normal(linear: Linear, epochs: int) -> Normal:
