@@ -24,10 +24,14 @@ def spline_members(bias: Bias) -> tuple[str, ...]:
     The times are the averages of the knots under each piece (Greville's abscissae), where a coefficient is about the
     value of the spline.
     """
+    return tuple(f"{member} at {time:.6g} s" for member in bias.members for time in greville(bias))
+
+
+def greville(bias: Bias) -> Array:
+    """Return the times (c,) that the coefficients of each member of a spline say most of, seconds."""
     assert bias.knots is not None
     full = _padded(bias.knots)
-    when = [full[i + 1 : i + 1 + DEGREE].mean() for i in range(coefficients(bias.knots))]
-    return tuple(f"{member} at {time:.6g} s" for member in bias.members for time in when)
+    return np.array([full[i + 1 : i + 1 + DEGREE].mean() for i in range(coefficients(bias.knots))])
 
 
 def coefficients(knots: Array) -> int:
