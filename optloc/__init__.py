@@ -33,9 +33,9 @@ from optloc.linear.walks import wander
 from optloc.models import MODELS, Model
 from optloc.problem import epochs, noise
 from optloc.problem.bias import with_bias, with_known_bias
-from optloc.problem.clocks import clock_densities
 from optloc.problem.build import assemble, measured, station_array
 from optloc.problem.chart import Chart
+from optloc.problem.clocks import clock_densities
 from optloc.problem.epochs import by_epoch
 from optloc.problem.fix import Alternatives, Explanation, Fix, Stage, Suspect
 from optloc.problem.layout import Layout

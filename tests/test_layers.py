@@ -124,7 +124,8 @@ def test_no_loose_module():
 
 
 # A file is a concept that a stranger can hold in mind; these are the limits of the contributing guide.
-MODULES, LINES, BODY, RECURRING = 280, 600, 60, 20
+# 283: walks of clocks brought what they are, what they say as information, and how tied epochs are solved.
+MODULES, LINES, BODY, RECURRING = 283, 600, 60, 20
 
 
 def test_files_and_functions_are_of_a_size_to_be_read():

@@ -198,7 +198,7 @@ def _redundancy(problem: Problem, alone: bool) -> Array:
     known = len(exact(problem)) + sum(len(np.ravel(bias.sigma)) for bias in problem.biases if bias.sigma is not None)
     known += sum(prior.mean.shape[-1] for prior in problem.priors)
     # the steps of a walk are known to be small: a row for each
-    known += sum((problem.epochs - 1) * np.size(bias.density) for bias in problem.biases if bias.form == "walk")
+    known += (problem.epochs - 1) * sum(bias.density.size for bias in problem.biases if bias.density is not None)
     if problem.stations.covariance is not None and problem.stations.span != "noise":
         # Surveyed positions count as measured: each unknown offset comes with a prior of its own.
         times = 1 if alone or problem.stations.span == "run" else problem.epochs

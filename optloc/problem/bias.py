@@ -108,7 +108,9 @@ def changing(
     for name, value in (("density", density), ("rate_density", rate_density), ("knots", knots)):
         if value is not None and name not in needed:
             what = f"the form {bias.form} has no {name}"
-            raise InvalidProblem(what, where, f"leave it out, or use the form {'spline' if name == 'knots' else 'walk'}")
+            raise InvalidProblem(
+                what, where, f"leave it out, or use the form {'spline' if name == 'knots' else 'walk'}"
+            )
     if bias.form == "walk":
         return replace(bias, density=density_of(density, rate_density, len(bias.members), where))
     return replace(bias, knots=knots_over(times, knots, where)) if bias.form == "spline" else bias

@@ -343,7 +343,9 @@ def _check_changing(problem: Problem, bias: Bias, where: str) -> None:
             advice = f"give an array ({len(bias.members)}, 1), or with rates ({len(bias.members)}, 2)"
             raise InvalidProblem("a walk has no spectral densities", where, advice)
         if not (np.isfinite(density) & (density >= 0.0)).all() or not (density[:, -1:] > 0.0).all():
-            raise InvalidProblem("a spectral density is not positive", where, "an error that stays has the form 'offset'")
+            raise InvalidProblem(
+                "a spectral density is not positive", where, "an error that stays has the form 'offset'"
+            )
         if problem.epochs == 1:
             raise InvalidProblem("a walk needs several epochs", where, "use the form offset")
     if bias.form == "spline":

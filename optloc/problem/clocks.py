@@ -197,12 +197,13 @@ def clock_densities(tau: Any, deviation: Any, speed: float = SPEED_OF_LIGHT) -> 
     References
     ----------
     D. W. Allan, "Time and frequency (time-domain) characterization, estimation, and prediction of precision clocks and
-    oscillators", IEEE Trans. UFFC 34 (1987); L. Galleani, "A tutorial on the two-state model of the atomic clock noise",
-    Metrologia 45 (2008) S175, eq. 36.
+    oscillators", IEEE Trans. UFFC 34 (1987); L. Galleani, "A tutorial on the two-state model of the atomic clock
+    noise", Metrologia 45 (2008) S175.
     """
     from scipy.optimize import nnls
 
-    times, sizes = (np.atleast_1d(numbers(v, name)) for v, name in ((tau, "tau"), (deviation, "deviation")))
+    given = ((tau, "tau"), (deviation, "deviation"))
+    times, sizes = (np.atleast_1d(np.asarray(numbers(value, name))) for value, name in given)
     if times.shape != sizes.shape or times.ndim != 1:
         what = f"{times.size} averaging times for {sizes.size} Allan deviations"
         raise InvalidProblem(what, "deviation", "give one deviation for each time")

@@ -17,8 +17,8 @@ from optloc.base.types import Array, Status
 from optloc.compute.sums import equations_at
 from optloc.linear.constraints import conjunction, face_of, faces, tangent_at
 from optloc.linear.normal import decrement, prior_parts, step, weighed
-from optloc.linear.walks import chain_at, places, walks
 from optloc.linear.symbolic import bounds, constrained, parameters, residual
+from optloc.linear.walks import chain_at, places, walks
 from optloc.problem.fix import Stage
 from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
