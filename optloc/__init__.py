@@ -122,6 +122,7 @@ __all__ = [
     "crlb",
     "crlb_course",
     "epochs",
+    "explained",
     "frames",
     "from_table",
     "gauss_newton",
@@ -187,7 +188,7 @@ def __getattr__(name: str) -> Any:
         from optloc import several  # scipy.optimize is loaded when emitters are told apart
 
         return getattr(several, name)
-    if name in ("Advice", "advise"):
+    if name in ("Advice", "advise", "explained"):
         from optloc.adequacy import advice  # only who has something to mend needs it
 
         return getattr(advice, name)

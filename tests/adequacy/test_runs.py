@@ -1,0 +1,129 @@
+"""What is wrong with one station of a run is named in the reason of its fix, and clean runs are not accused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import optloc
+from optloc import Status
+from optloc.adequacy.advice import explained, misfit_of
+from optloc.adequacy.score import FALSE_ALARM, Candidate, explain_misfit
+from optloc.files import load
+from optloc.problem.epochs import cut, thinned
+from tests.monte_carlo.tables import write
+
+SHIPPED = Path(optloc.__file__).parent / "scenarios" / "registration.toml"
+TRUTH = np.array([200e3, 300e3, 0.0, *(0.299792458 * np.array([100.0, -133.0, 167.0, -100.0]))])
+RUNS = 12
+
+
+@pytest.fixture(scope="module")
+def shipped():
+    return load(SHIPPED)
+
+
+def spoilt(problem, seed, change):
+    """Return a drawn run whose rows of R2 were changed: `change` maps seconds since the first epoch to metres."""
+    drawn = optloc.simulate(problem, TRUTH, seed)
+    of_r2 = problem.rows[0].a == problem.stations.names.index("R2")
+    return drawn.with_rows(z=drawn.z + of_r2 * change(problem.times - problem.times[0])[problem.epoch])
+
+
+def counted(problem, first, runs):
+    """Return how many of so many runs with a drift of R2 say so, and how many clean ones are accused."""
+    named = accused = 0
+    for seed in range(first, first + runs):
+        fix = optloc.solve(spoilt(problem, seed, lambda t: 0.1 * t), "searched")
+        named += fix.status is Status.MISFIT and "drift of R2" in fix.reason[()]
+        clean = optloc.simulate(problem, TRUTH, 10_000 + seed)
+        fix = optloc.solve(clean, "searched")
+        accused += bool(fix.has(Status.MISFIT)) or explained(clean, fix) is not None
+    return named, accused
+
+
+def test_a_drift_of_a_clock_is_named_and_clean_runs_are_not_accused(shipped):
+    named, accused = counted(shipped, 0, RUNS)
+    assert named == RUNS
+    assert accused == 0
+
+
+@pytest.mark.full
+def test_a_drift_is_named_in_500_runs(shipped):
+    named, accused = counted(shipped, 20_000, 500)
+    header = ("200 epochs of 5 aircraft, 10 ns an arrival", "of 500 runs")
+    rows = (("drift of 0.1 m/s: `misfit`, and R2 named with its drift", str(named)), ("clean: accused", str(accused)))
+    write("adequacy", header, rows, "seeds 20000 to 20499")
+    assert named >= 475
+    assert accused <= 5
+
+
+WRONG = {
+    "step": (lambda t: 40.0 * (t >= 300.0), "step of R2 from t = "),
+    "burst": (lambda t: 60.0 * ((t > 230.0) & (t < 270.0)), "burst of R2 from t = "),
+}
+
+
+@pytest.mark.parametrize("form", WRONG)
+def test_what_begins_or_ends_in_a_run_is_named(shipped, form):
+    change, words = WRONG[form]
+    problem = spoilt(shipped, 7, change)
+    fix = optloc.solve(problem, "searched")
+    assert fix.status is Status.MISFIT
+    assert words in fix.reason[()], fix.reason[()]
+
+
+def test_the_fix_with_what_is_named_is_right(shipped):
+    problem = spoilt(shipped, 3, lambda t: 0.1 * t)
+    fix = optloc.solve(problem, "searched")
+    larger = explained(problem, fix)
+    assert larger.biases[-1].name == "drift of R2"
+    other = optloc.solve(larger, "searched")
+    assert other.p_value > FALSE_ALARM
+    error = other.position - TRUTH[:3]
+    assert error @ np.linalg.inv(other.covariance()) @ error < 20.0
+    assert np.linalg.norm(fix.position - TRUTH[:3]) > 10.0 * np.linalg.norm(error)
+    assert abs(other.take("drift of R2")[0] - 0.1) < 4.0 * other.sigma("drift of R2")[0]
+
+
+def test_a_long_run_is_looked_at_all_over(shipped):
+    # four times as many rows as are tested, and nothing wrong but in its last tenth
+    few = shipped.times
+    problem = optloc.assemble(
+        np.concatenate([shipped.stations.position[:, :5]] * 4)[:, :, :],
+        optloc.measured(
+            "tdoa",
+            a=np.tile([1, 2, 3, 4], 4 * len(few)),
+            b=0,
+            epoch=np.repeat(np.arange(4 * len(few)), 4),
+            sigma=4.0,
+        ),
+        times=np.arange(4.0 * len(few)),
+    )
+    drawn = optloc.simulate(problem, TRUTH[:3], 5)
+    late = problem.epoch >= 720
+    wrong = drawn.with_rows(z=drawn.z + 40.0 * late * (problem.rows[0].a == 2))
+    fix = optloc.solve(wrong, "searched")
+    told = misfit_of(wrong.flat(), fix.x)
+    assert told.startswith("a step of S2 from t = "), told
+
+
+def test_epochs_here_and_there_are_a_run_of_their_own(shipped):
+    drawn = optloc.simulate(shipped, TRUTH, 2)
+    ahead = cut(drawn, 3, 9)
+    same = thinned(drawn, np.arange(3, 9))
+    np.testing.assert_array_equal(optloc.predict(same, TRUTH), optloc.predict(ahead, TRUTH))
+    np.testing.assert_array_equal(same.z, ahead.z)
+    every = thinned(drawn, np.arange(0, 200, 10))
+    np.testing.assert_array_equal(every.times, drawn.times[::10])
+    x = optloc.solve(drawn, "searched").x
+    whole = optloc.predict(drawn, x).reshape(200, -1)
+    np.testing.assert_allclose(optloc.predict(every, x), whole[::10].ravel())
+
+
+def test_an_error_has_the_name_that_is_shown(shipped):
+    problem = spoilt(shipped, 1, lambda t: 0.1 * t).flat()
+    best = explain_misfit(problem, optloc.solve(problem, "searched").x)[0].candidate
+    assert (best.form, best.name) == ("drift", "drift of R2")
+    burst = Candidate(best.bias, "station", "tdoa", 3.0, 9.0)
+    assert burst.name == "burst of R2 from t = 3 s to 9 s"
