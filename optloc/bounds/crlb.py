@@ -100,8 +100,8 @@ def crlb_course(
     """Return the Cramer-Rao bound after the first 1, 2, ... epochs of a run.
 
     What every epoch says of the shared unknowns, its own unknowns eliminated, adds up; the prior counts once. Time is
-    proportional to the number of epochs, and memory beyond the answer does not depend on it; with biases that walk it is
-    proportional to the sum of the counts.
+    proportional to the number of epochs, and memory beyond the answer does not depend on it; with biases that walk time
+    is proportional to the sum of the counts.
 
     Parameters
     ----------
