@@ -175,7 +175,7 @@ def _nees(error, covariance):
 
 @pytest.mark.parametrize("order", [1, 2])
 def test_clocks_and_positions_are_as_certain_as_is_said(order):
-    for name, (value, low, high) in nees(order, 100, 40 + order).items():
+    for name, (value, low, high) in nees(order, 50, 40 + order).items():
         assert low < value < high, (name, value)
 
 

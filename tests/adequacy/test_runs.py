@@ -1,21 +1,25 @@
 """What is wrong with one station of a run is named in the reason of its fix, and clean runs are not accused."""
 
+import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import optloc
 from optloc import Status
 from optloc.adequacy.advice import explained, misfit_of
 from optloc.adequacy.score import FALSE_ALARM, Candidate, explain_misfit
+from optloc.cli import app
 from optloc.files import load
 from optloc.problem.epochs import cut, thinned
 from tests.monte_carlo.tables import write
 
 SHIPPED = Path(optloc.__file__).parent / "scenarios" / "registration.toml"
 TRUTH = np.array([200e3, 300e3, 0.0, *(0.299792458 * np.array([100.0, -133.0, 167.0, -100.0]))])
-RUNS = 12
+RUNS = 6
 
 
 @pytest.fixture(scope="module")
@@ -127,3 +131,25 @@ def test_an_error_has_the_name_that_is_shown(shipped):
     assert (best.form, best.name) == ("drift", "drift of R2")
     burst = Candidate(best.bias, "station", "tdoa", 3.0, 9.0)
     assert burst.name == "burst of R2 from t = 3 s to 9 s"
+
+
+def test_the_command_line_fixes_again_on_request_and_never_by_itself(tmp_path):
+    spoil = re.compile(r'(time = ([\d.]+), a = "C", z = )([-\d.]+)')
+    text = (SHIPPED.parents[1] / "starters" / "registration.toml").read_text(encoding="utf-8")
+    file = tmp_path / "site.toml"
+    file.write_text(spoil.sub(lambda m: f"{m[1]}{float(m[3]) + 2.0 * float(m[2]):.1f}", text))
+    plain = CliRunner().invoke(app, ["fix", str(file)])
+    assert "drift of station C" in " ".join(plain.output.split())
+    assert "as it was" not in plain.output
+    shown = CliRunner().invoke(app, ["fix", str(file), "--explain"])
+    assert "With the drift of C" in shown.output
+    assert "the fix above is without it" in " ".join(shown.output.split())
+    told = json.loads(CliRunner().invoke(app, ["fix", str(file), "--explain", "--json"]).output)
+    assert told["fixes"][0]["status"] == "misfit"
+    assert told["explained"]["name"] == "drift of C"
+    assert told["explained"]["fixes"][0]["p_value"] > FALSE_ALARM
+    change = told["explained"]["fixes"][0]["y"] - told["fixes"][0]["y"]
+    assert told["explained"]["change"][0]["change_y"] == pytest.approx(change)
+    clean = tmp_path / "clean.toml"
+    clean.write_text(text)
+    assert "No single error explains" in CliRunner().invoke(app, ["fix", str(clean), "--explain"]).output
