@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 
 import optloc
 from optloc import Status
-from optloc.adequacy.advice import explained, misfit_of
+from optloc.adequacy.advice import advise_at, explained, misfit_of
 from optloc.adequacy.score import FALSE_ALARM, Candidate, explain_misfit
 from optloc.cli import app
 from optloc.files import load
@@ -19,7 +19,8 @@ from tests.monte_carlo.tables import write
 
 SHIPPED = Path(optloc.__file__).parent / "scenarios" / "registration.toml"
 TRUTH = np.array([200e3, 300e3, 0.0, *(0.299792458 * np.array([100.0, -133.0, 167.0, -100.0]))])
-RUNS = 6
+RUNS = 12
+FORMS = ("offset", "scale", "drift", "rotation", "step", "burst")
 
 
 @pytest.fixture(scope="module")
@@ -34,16 +35,18 @@ def spoilt(problem, seed, change):
     return drawn.with_rows(z=drawn.z + of_r2 * change(problem.times - problem.times[0])[problem.epoch])
 
 
-def counted(problem, first, runs):
+def counted(problem, seed, runs):
     """Return how many of so many runs with a drift of R2 say so, and how many clean ones are accused."""
-    named = accused = 0
-    for seed in range(first, first + runs):
-        fix = optloc.solve(spoilt(problem, seed, lambda t: 0.1 * t), "searched")
-        named += fix.status is Status.MISFIT and "drift of R2" in fix.reason[()]
-        clean = optloc.simulate(problem, TRUTH, 10_000 + seed)
-        fix = optloc.solve(clean, "searched")
-        accused += bool(fix.has(Status.MISFIT)) or explained(clean, fix) is not None
-    return named, accused
+    clean = optloc.simulate(problem, TRUTH, seed, trials=runs)
+    of_r2 = problem.rows[0].a == problem.stations.names.index("R2")
+    wrong = clean.with_rows(z=clean.z + of_r2 * 0.1 * (problem.times - problem.times[0])[problem.epoch])
+    # what is told of few misfits in their reasons is asked for here: batches of many leave it out
+    fix, right = optloc.solve(wrong, "searched"), optloc.solve(clean, "searched")
+    told = [misfit_of(wrong.take(np.array([i])), fix.x[i]) for i in range(runs)]
+    named = sum(bool(m) and "drift of R2" in t for m, t in zip(fix.has(Status.MISFIT), told, strict=True))
+    accused = [advise_at(clean.take(np.array([i])), right.x[i]) for i in range(runs)]
+    causes = sum(any(one.cause in FORMS for one in each) for each in accused)
+    return named, int(np.sum(right.has(Status.MISFIT))) + causes
 
 
 def test_a_drift_of_a_clock_is_named_and_clean_runs_are_not_accused(shipped):
@@ -54,10 +57,10 @@ def test_a_drift_of_a_clock_is_named_and_clean_runs_are_not_accused(shipped):
 
 @pytest.mark.full
 def test_a_drift_is_named_in_500_runs(shipped):
-    named, accused = counted(shipped, 20_000, 500)
+    named, accused = counted(shipped, 20, 500)
     header = ("200 epochs of 5 aircraft, 10 ns an arrival", "of 500 runs")
     rows = (("drift of 0.1 m/s: `misfit`, and R2 named with its drift", str(named)), ("clean: accused", str(accused)))
-    write("adequacy", header, rows, "seeds 20000 to 20499")
+    write("adequacy", header, rows, "seed 20")
     assert named >= 475
     assert accused <= 5
 
