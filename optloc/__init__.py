@@ -29,11 +29,13 @@ from optloc.linear.evaluate import predict
 from optloc.linear.gauss_newton import gauss_newton
 from optloc.linear.normal import Linear, Normal, linearise, normal
 from optloc.linear.simulate import simulate
+from optloc.linear.walks import wander
 from optloc.models import MODELS, Model
 from optloc.problem import epochs, noise
 from optloc.problem.bias import with_bias, with_known_bias
 from optloc.problem.build import assemble, measured, station_array
 from optloc.problem.chart import Chart
+from optloc.problem.clocks import clock_densities
 from optloc.problem.epochs import by_epoch
 from optloc.problem.fix import Alternatives, Explanation, Fix, Stage, Suspect
 from optloc.problem.layout import Layout
@@ -116,11 +118,13 @@ __all__ = [
     "assemble",
     "by_epoch",
     "certify",
+    "clock_densities",
     "common_level",
     "constraints",
     "crlb",
     "crlb_course",
     "epochs",
+    "explained",
     "frames",
     "from_table",
     "gauss_newton",
@@ -149,6 +153,7 @@ __all__ = [
     "suspects",
     "trace_arc",
     "units",
+    "wander",
     "with_bias",
     "with_estimated_noise",
     "with_known_bias",
@@ -185,7 +190,7 @@ def __getattr__(name: str) -> Any:
         from optloc import several  # scipy.optimize is loaded when emitters are told apart
 
         return getattr(several, name)
-    if name in ("Advice", "advise"):
+    if name in ("Advice", "advise", "explained"):
         from optloc.adequacy import advice  # only who has something to mend needs it
 
         return getattr(advice, name)

@@ -9,10 +9,11 @@ import numpy as np
 
 from optloc.adequacy.geometry import Advice, advise_on_geometry
 from optloc.adequacy.misread import advise_on_values
-from optloc.adequacy.score import Explained, explain_misfit, fit_anywhere, one_place
+from optloc.adequacy.score import Candidate, Explained, explain_misfit, fit_anywhere, one_place
 from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array
-from optloc.problem.epochs import by_epoch, cut, separable, tied
+from optloc.base.types import Array, Bias
+from optloc.problem.bias import family
+from optloc.problem.epochs import by_epoch, separable, thinned, tied
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 
@@ -83,6 +84,79 @@ def advise_at(problem: Problem, x: Array) -> tuple[Advice, ...]:
     return (*values, *errors, *found)
 
 
+def explained(problem: Problem, fix: Fix) -> Problem | None:
+    """Return a problem with the systematic error among its unknowns that would explain most of the misfit of its fix.
+
+    Nothing of it is done by itself: solve the larger problem and compare. An error that is there in truth is estimated
+    with what else is unknown; where there is none, a test names one in a thousand runs.
+
+    Parameters
+    ----------
+    problem : Problem
+        One problem or run.
+    fix : Fix
+        Its fix, or those (k,) of a run whose epochs share nothing.
+
+    Returns
+    -------
+    Problem or None
+        The error is its last bias, whose name tells what and whose it is, such as "drift of R2". None where no single
+        error explains the misfit.
+
+    Raises
+    ------
+    InvalidProblem
+        Where the fix is not one of this problem, or a batch is given.
+
+    References
+    ----------
+    C. R. Rao, Math. Proc. Cambridge Philos. Soc. 44 (1948): the score test; see `optloc.adequacy.score.explain_misfit`.
+    """
+    return explained_at(problem, fix.x)
+
+
+def explained_at(problem: Problem, x: Array) -> Problem | None:
+    """Return what `explained` does, for vectors as `advise_at` takes them."""
+    if problem.batch_shape:
+        raise InvalidProblem("there are several problems", "explained", "take them one by one")
+    part, x = _shortened(*_without_unknown(problem.flat(), _joined(problem, np.asarray(x))))
+    told = explain_misfit(part, x)
+    if not told:
+        return None
+    return replace(problem, biases=(*problem.biases, _whole(problem, told[0].candidate)))
+
+
+def misfit_of(problem: Problem, x: Array) -> str:
+    """Return what would explain most of the misfit of a run at a vector (size,), in words; empty where nothing does.
+
+    Parameters
+    ----------
+    problem : Problem
+        Flat batch of one run.
+    x : array (size,)
+        Its fix.
+    """
+    part, x = _shortened(*_without_unknown(problem, x[None]))
+    told = explain_misfit(part, x)
+    if not told:
+        return "no error of a single station explains the misfit"
+    (value, unit), one = _size(part, told[0]), told[0]
+    article = "an" if one.candidate.form == "offset" else "a"
+    return f"{article} {one.candidate.name}, {value} {unit}, would explain it (p = {one.p_after:.2g})"
+
+
+def _whole(problem: Problem, one: Candidate) -> Bias:
+    """Return the bias of a candidate over all rows of a run, of which it was found in some."""
+    members = (one.bias.members[0],) if one.per == "station" else None
+    rows, names, kind = problem.rows, problem.stations.names, one.kind or None
+    bias = family(rows, names, one.name, per=one.per, form=one.bias.form, kind=kind, members=members)
+    if not np.isfinite(one.since):
+        return bias
+    when = problem.times[problem.epoch[bias.row]]
+    inside = (when >= one.since) & ~(when >= one.until)
+    return replace(bias, row=bias.row[inside], member=bias.member[inside], coefficient=bias.coefficient[inside])
+
+
 def _joined(problem: Problem, x: Array) -> Array:
     """Return the parameter vector (1, size) of a problem, of its epochs together where they are fixed one by one."""
     layout = problem.layout
@@ -96,12 +170,18 @@ def _joined(problem: Problem, x: Array) -> Array:
 
 
 def _shortened(problem: Problem, x: Array) -> tuple[Problem, Array]:
-    """Return the first epochs of a long run: what lasts shows in them, and tests of all channels take time."""
+    """Return epochs of a long run, evenly over all of it: what lasts shows in them, and tests take time.
+
+    Errors grow with the run: its first epochs alone would not show a slow drift, nor what begins late.
+    """
     if problem.count <= _ROWS or problem.epochs == 1 or tied(problem):
         return problem, x
-    last = max(2, int(problem.epochs * _ROWS / problem.count))
+    kept = max(2, int(problem.epochs * _ROWS / problem.count))
+    chosen = np.unique(np.linspace(0, problem.epochs - 1, kept).round().astype(int))
+    chosen = chosen[np.isin(chosen, problem.epoch)]
     n, length = problem.layout.n_shared, problem.layout.n_local
-    return cut(problem, 0, last), x[:, : n + last * length]
+    own = x[:, n:].reshape(len(x), problem.epochs, length)[:, chosen]
+    return thinned(problem, chosen), np.concatenate([x[:, :n], own.reshape(len(x), -1)], axis=1)
 
 
 def _without_unknown(problem: Problem, x: Array) -> tuple[Problem, Array]:
@@ -122,6 +202,15 @@ def _without_unknown(problem: Problem, x: Array) -> tuple[Problem, Array]:
 
 # What a score test has found, in words.
 
+_NAMED = {
+    "offset": "an offset",
+    "scale": "a scale error",
+    "drift": "a drift",
+    "rotation": "a turn of its axes",
+    "step": "a step",
+    "burst": "a burst of errors",
+}
+
 
 def _tell(problem: Problem, one: Explained) -> Advice:
     bias, who = one.candidate.bias, one.candidate
@@ -129,14 +218,15 @@ def _tell(problem: Problem, one: Explained) -> Advice:
     station = bias.members[0]
     whose = f"station {station}" if who.per == "station" else f"all {station} rows"
     rows = f" in its {who.kind} rows" if who.per == "station" and who.kind and len(problem.rows) > 1 else ""
-    kind = "step" if np.isfinite(who.since) else bias.form
-    named = {"offset": "an offset", "scale": "a scale error", "drift": "a drift", "rotation": "a turn of its axes"}
-    what = named.get(kind, "a step")
-    when = f" from t = {who.since:.6g} s on" if kind == "step" else ""
+    kind, what = who.form, _NAMED[who.form]
+    when = f" from t = {who.since:.6g} s " if np.isfinite(who.since) else ""
+    when += {"step": "on", "burst": f"to {who.until:.6g} s"}.get(kind, "")
     seen = f"{what} of {whose}{rows} of {value} {unit}{when} would explain the misfit: p = {one.p_after:.2g}"
     seen += f" with it, {one.p_before:.2g} without"
     if kind == "step":
         return Advice("step", seen, "cut the run there, or give the rows from then on another station name")
+    if kind == "burst":
+        return Advice("burst", seen, "leave these rows out, or fix with the method 'robust'")
     return Advice(kind, seen, "look at that channel; model it until then", _lines(problem, one))
 
 

@@ -16,9 +16,11 @@ import numpy as np
 
 from optloc.adequacy.groups import Group
 from optloc.base import linalg
+from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.compute.sums import equations_at
 from optloc.linear.normal import Linear, Normal, linearise, marginal, step
+from optloc.linear.walks import walks
 from optloc.problem.arrivals import as_arrivals, shared_places
 from optloc.problem.fix import Suspect
 from optloc.problem.layout import Layout
@@ -123,9 +125,17 @@ def influence(problem: Problem, x: Array, dropped: frozenset[int] = frozenset())
         Where it is linearised; it need not be a minimum.
     dropped : frozenset of int
         Priors to do without.
+
+    Raises
+    ------
+    InvalidProblem
+        Where a bias walks: rows of one epoch then say something of the next.
     """
     from scipy.sparse import block_diag
 
+    if walks(problem):
+        what = f"the walk {walks(problem)[0].name!r} ties each epoch to the next, and errors are weighed epoch by epoch"
+        raise InvalidProblem(what, "biases", "fix with a loss such as 'huber', or let the bias be a spline")
     layout = problem.layout
     numbers = [j for j, p in enumerate(problem.priors) if j not in dropped and layout.find(p.name)[1]]
     problem = replace(problem, priors=tuple(p for j, p in enumerate(problem.priors) if j not in dropped))

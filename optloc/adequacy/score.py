@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -33,11 +34,15 @@ _RIVAL = 9.0
 _SAME = 2.0
 # The simplest first.
 _FORMS: tuple[Form, ...] = ("offset", "scale", "drift", "rotation")
+_ORDER = (*_FORMS, "step", "burst")
+# What a scale of arrival times has against it beside a drift: a clock that is fast is a drift, and seconds are as long
+# for all, so the odds are a hundred to one. Where a run looks alike in both, noise alone decides between them.
+_STRETCHED_TIME = 9.0
 # Share of its information that is left of a candidate once the other unknowns follow it, below which it is rounding.
 _OPEN = 1e-9
 # Relative size of an eigenvalue of scaled information that is rounding.
 _ROUNDING = 1e-12
-# Epochs of a run from which steps are looked for, and how many times of a step are tried.
+# Epochs of a run from which steps and bursts are looked for, and how many times of them are tried.
 _STEP_EPOCHS, _STEP_TIMES = 6, 12
 
 
@@ -53,14 +58,29 @@ class Candidate:
         Whether it belongs to one station or to all rows of a kind.
     kind : str
         Kind of the rows; empty where several are touched.
-    since : float
-        Time from which it lasts, seconds; NaN: all the time.
+    since, until : float
+        Times from which it lasts, and at which it is over, seconds; NaN: all the time, to the end.
     """
 
     bias: Bias
     per: Per
     kind: str
     since: float = float("nan")
+    until: float = float("nan")
+
+    @property
+    def form(self) -> str:
+        """Return the form of the bias, or "step" or "burst" of an offset that does not last all the time."""
+        if not np.isfinite(self.since):
+            return self.bias.form
+        return "burst" if np.isfinite(self.until) else "step"
+
+    @property
+    def name(self) -> str:
+        """Return it in words, for instance "drift of R2"."""
+        whose = self.bias.members[0] if self.per == "station" else f"all {self.bias.members[0]} rows"
+        when = f" from t = {self.since:.6g} s" if np.isfinite(self.since) else ""
+        return f"{self.form} of {whose}{when}" + (f" to {self.until:.6g} s" if np.isfinite(self.until) else "")
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,11 +135,16 @@ def explain_misfit(problem: Problem, x: Array) -> tuple[Explained, ...]:
         return ()
     x, cost = descend(problem, x)
     before = float(tail_probability(cost, np.array([dof]))[0])
-    level = 1.0 - FALSE_ALARM / len(found)
+    # and as many again as are tried about the ends of the best step and the best burst
+    more = 3 * (2 * _around(problem) + 1) if any(one.form == "step" for one in found) else 0
+    level = 1.0 - FALSE_ALARM / (len(found) + more)
     # a statistic is the square of a projection of the residual: none is larger than the cost
     if cost[0] <= quantile(level, 1):
         return ()
     scores = score(problem, x, found)
+    sharp = tuple(_sharpened(problem, x, found, np.array([one for one, _, _ in scores])))
+    if sharp:
+        found, scores = (*found, *sharp), [*scores, *score(problem, x, sharp)]
     limit = np.array([quantile(level, max(1, size)) for _, _, size in scores])
     values = np.array([one for one, _, _ in scores])
     order = np.argsort(-np.where(values > limit, values - limit, -np.inf), kind="stable")[:_FITTED]
@@ -137,14 +162,32 @@ def explain_misfit(problem: Problem, x: Array) -> tuple[Explained, ...]:
 def _distinct(told: list[Explained]) -> tuple[Explained, ...]:
     """Return explanations that cost about as little as the best, those first; of equal ones the simplest."""
     # one row has an offset, a scale and a drift alike, and so have rows of one place
-    simple = sorted(told, key=lambda one: (np.isfinite(one.candidate.since), _FORMS.index(one.candidate.bias.form)))
+    simple = sorted(told, key=lambda one: (_is_stretched(one), _ORDER.index(one.candidate.form), one.cost))
     kept: list[Explained] = []
     for one in simple:
         same = [other for other in kept if other.candidate.bias.members == one.candidate.bias.members]
-        if not any(abs(other.cost - one.cost) < _SAME for other in same):
+        if not any(_stands_for(other, one) for other in same):
             kept.append(one)
     kept.sort(key=lambda one: one.cost)
     return tuple(one for one in kept if one.cost <= kept[0].cost + _RIVAL)
+
+
+def _stands_for(other: Explained, one: Explained) -> bool:
+    """Return whether an explanation makes another one of the same station not worth telling."""
+    if _is_stretched(one) and not _is_stretched(other):
+        return other.cost - one.cost < _STRETCHED_TIME
+    return abs(other.cost - one.cost) < _SAME
+
+
+def _is_stretched(one: Explained) -> bool:
+    """Return whether an explanation is a scale of times."""
+    return one.candidate.bias.form == "scale" and one.candidate.kind != "" and _is_of_arrivals(one.candidate.kind)
+
+
+def _is_of_arrivals(kind: str) -> bool:
+    """Return whether rows of a kind are times that clocks of their stations tell: differences, or since an emission."""
+    model = MODELS[kind]
+    return model.quantity == "length" and (model.emission or model.stations == 2)
 
 
 def candidates(problem: Problem) -> tuple[Candidate, ...]:
@@ -197,19 +240,68 @@ def _turns(problem: Problem, present: Array) -> Iterator[Candidate]:
 
 
 def _steps(problem: Problem, found: list[Candidate]) -> Iterator[Candidate]:
-    """Yield offsets of stations that begin in the middle of a run."""
+    """Yield offsets of stations that begin in the middle of a run, and those that end there too."""
     k = problem.epochs
     if k < _STEP_EPOCHS or not np.isfinite(problem.times).all():
         return
-    epoch = problem.epoch
-    for first in np.unique(np.linspace(1, k - 1, min(k - 1, _STEP_TIMES)).round().astype(int)):
-        for one in found:
-            if one.bias.form == "offset" and one.per == "station":
-                later = epoch[one.bias.row] >= first
-                if later.any() and not later.all():
-                    touched = (one.bias.row[later], one.bias.member[later], one.bias.coefficient[later])
-                    bias = replace(one.bias, row=touched[0], member=touched[1], coefficient=touched[2])
-                    yield replace(one, bias=bias, since=float(problem.times[first]))
+    cuts = np.unique(np.linspace(1, k - 1, min(k - 1, _STEP_TIMES)).round().astype(int)).tolist()
+    # a burst before the first cut is a step there, and after the last one too
+    spans = [*((first, k) for first in cuts), *pairwise(cuts)]
+    stations = [one for one in found if one.bias.form == "offset" and one.per == "station"]
+    for first, last in spans:
+        yield from (made for one in stations for made in _lasting(problem, one, first, last))
+
+
+def _lasting(problem: Problem, one: Candidate, first: int, last: int) -> Iterator[Candidate]:
+    """Yield an offset of the epochs first <= k < last alone, where that is not nothing and not all."""
+    when = problem.epoch[one.bias.row]
+    inside = (when >= first) & (when < last)
+    if inside.any() and not inside.all():
+        until = float(problem.times[last]) if last < problem.epochs else float("nan")
+        yield replace(one, bias=_of_rows(one.bias, inside), since=float(problem.times[first]), until=until)
+
+
+def _sharpened(problem: Problem, x: Array, found: Sequence[Candidate], values: Array) -> list[Candidate]:
+    """Return the best step and the best burst with their ends at the epochs that the test likes best.
+
+    Between the times that are tried at first an error of many sigma leaves a misfit that hides what it is.
+    """
+    out, around = [], _around(problem)
+    for form in ("step", "burst"):
+        own = [i for i, one in enumerate(found) if one.form == form]
+        if not own:
+            continue
+        best = found[max(own, key=lambda i: values[i])]
+        # the same channel, all the time
+        whole = next(
+            one
+            for one in found
+            if one.form == "offset" and (one.kind, one.bias.members) == (best.kind, best.bias.members)
+        )
+        for end in range(1 if form == "step" else 2):
+            ends = _ends(problem, best)
+            near = np.clip(ends[end] + np.arange(-around, around + 1), 1 if end == 0 else ends[0] + 1, problem.epochs)
+            spans = [(k, ends[1]) if end == 0 else (ends[0], k) for k in np.unique(near).tolist()]
+            tried = tuple(made for span in spans if span[0] < span[1] for made in _lasting(problem, whole, *span))
+            best = tried[int(np.argmax([value for value, _, _ in score(problem, x, tried)]))]
+        out.append(best)
+    return out
+
+
+def _around(problem: Problem) -> int:
+    """Return how many epochs lie between the times that are tried at first."""
+    return -(-problem.epochs // _STEP_TIMES)
+
+
+def _ends(problem: Problem, one: Candidate) -> tuple[int, int]:
+    """Return the first epoch of what does not last all the time, and the one after its last."""
+    last = int(np.searchsorted(problem.times, one.until)) if np.isfinite(one.until) else problem.epochs
+    return int(np.searchsorted(problem.times, one.since)), last
+
+
+def _of_rows(bias: Bias, inside: Array) -> Bias:
+    """Return a bias that touches only some of its rows."""
+    return replace(bias, row=bias.row[inside], member=bias.member[inside], coefficient=bias.coefficient[inside])
 
 
 # The tests themselves.

@@ -77,6 +77,7 @@ def _without(equations: Normal, own: Array) -> Normal:
         equations.shared_vector[..., own],
         equations.local_vector,
         equations.cost,
+        equations.link,
     )
 
 

@@ -136,16 +136,22 @@ class Bias:
         Sparse design: which global rows are touched, and by which member.
     coefficient : float array (n,)
         Sign or size of each touch, for instance +1 for station a and -1 for station b.
-    form : "offset", "scale", "drift", "rotation" or "time"
+    form : "offset", "scale", "drift", "rotation", "time", "walk" or "spline"
         Added to the measurement; times the measured quantity; times seconds since the first target's reference time
         (by default the first epoch); or a turn of
         the station's axes (one angle in the plane, a rotation vector in space; a member is then a station's mount); or
         the seconds by which a station is further along its course (coefficient 1 where it is the row's first, -1 where
-        it is the second).
+        it is the second); or added, another value at each epoch: a random walk, or a smooth function of time.
     mean : float array (q,) or (q, c)
-        Prior mean, in the unit of the form.
+        Prior mean, in the unit of the form; of a walk that of its value at the first epoch, of a spline that of each of
+        its coefficients, which have the unit of the rows.
     sigma : float array like `mean`, optional
         Prior standard deviation; None: unknown.
+    density : float array (q, 1 or 2), optional
+        Of a walk: spectral density of the white noise that it is the sum of, unit of the rows squared per second; and
+        of that which its rate is the sum of, per second cubed (`optloc.problem.clocks.process`).
+    knots : float array (p,), optional
+        Of a spline: times between which it is a cubic polynomial, seconds.
     """
 
     name: str
@@ -153,10 +159,12 @@ class Bias:
     row: Array
     member: Array
     coefficient: Array
-    form: Literal["offset", "scale", "drift", "rotation", "time"] = "offset"
+    form: Literal["offset", "scale", "drift", "rotation", "time", "walk", "spline"] = "offset"
     # One zero stands for all members; an array of its own for each bias, for arrays can be written into.
     mean: Array = field(default_factory=lambda: np.zeros(1))
     sigma: Array | None = None
+    density: Array | None = None
+    knots: Array | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,10 +10,11 @@ import numpy as np
 from optloc.base import linalg
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
-from optloc.compute.sums import equations_at
+from optloc.compute.sums import equations_at, summed
 from optloc.linear.constraints import exact, levels, tangent_at
-from optloc.linear.normal import Linear, Normal, covariance, linearise, marginal, normal, prior_parts
-from optloc.problem.epochs import tied, windows
+from optloc.linear.normal import Linear, Normal, covariance, linearise, marginal, normal, prior_parts, with_priors
+from optloc.linear.walks import walks
+from optloc.problem.epochs import cut, tied, windows
 from optloc.problem.layout import Layout
 from optloc.problem.problem import Problem
 
@@ -99,7 +100,8 @@ def crlb_course(
     """Return the Cramer-Rao bound after the first 1, 2, ... epochs of a run.
 
     What every epoch says of the shared unknowns, its own unknowns eliminated, adds up; the prior counts once. Time is
-    proportional to the number of epochs, and memory beyond the answer does not depend on it.
+    proportional to the number of epochs, and memory beyond the answer does not depend on it; with biases that walk time
+    is proportional to the sum of the counts.
 
     Parameters
     ----------
@@ -128,7 +130,8 @@ def crlb_course(
     chosen = np.arange(1, k + 1) if counts is None else np.asarray(counts, dtype=np.int64)
     if chosen.ndim != 1 or not len(chosen) or chosen.min() < 1 or chosen.max() > k:
         raise InvalidProblem(f"the counts are not among 1 to {k}", "counts", "give numbers of epochs")
-    total, size = _totals(problem, x, chosen)
+    # walks tie each epoch to the next: what the first ones say is asked of them alone
+    total, size = (_totals_of_walks if walks(problem) else _totals)(problem, x, chosen)
     prior = shared_priors(problem)
     bound = _inverse(total + prior, size + np.diagonal(prior), free_directions(problem, x, known))
     return Course(chosen, problem.times[chosen - 1], bound, layout)
@@ -160,6 +163,17 @@ def _totals(problem: Problem, x: Array, counts: Array) -> tuple[Array, Array]:
         inside = np.flatnonzero((counts > first) & (counts <= first + len(each)))
         total[inside], size[inside] = sums[counts[inside] - first - 1], sizes[counts[inside] - first - 1]
         so_far, size_so_far = sums[-1], sizes[-1]
+    return total, size
+
+
+def _totals_of_walks(problem: Problem, x: Array, counts: Array) -> tuple[Array, Array]:
+    """Return what `_totals` does where epochs do not add up: time grows with each count asked for."""
+    n, length = problem.layout.n_shared, problem.layout.n_local
+    total, size = np.zeros((len(counts), n, n)), np.zeros((len(counts), n))
+    for i, count in enumerate(counts.tolist()):
+        part, own = cut(problem, 0, count), x[: n + count * length]
+        equations = with_priors(part, own, summed(part, own), shared=False)
+        total[i], size[i] = marginal(equations)[0], np.diagonal(equations.shared)
     return total, size
 
 

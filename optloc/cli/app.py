@@ -14,6 +14,7 @@ from optloc.cli.options import (
     Allow,
     Box,
     Budget,
+    Explain,
     Force,
     Geodetic,
     Group,
@@ -120,6 +121,7 @@ def fix(
     noise: NoiseFromData = None,
     rescale: RescaleNoise = False,
     late: LateFromData = False,
+    explain: Explain = False,
     allow: Allow = None,
     outside: Outside = False,
     budget: Budget = None,
@@ -145,6 +147,7 @@ def fix(
         noise=noise,
         rescale=rescale,
         late=late,
+        explain=explain,
         allow=passing,
     )
     raise typer.Exit(code)

@@ -179,6 +179,11 @@ def _bias(loaded: Loaded, bias: Bias) -> str:
     names = ", ".join(bias.members[:_MEMBERS]) + (
         f" and {len(bias.members) - _MEMBERS} more" if len(bias.members) > _MEMBERS else ""
     )
+    if bias.density is not None:
+        # a person knows how far a clock has gone after a second, or an hour
+        ends = np.sqrt([bias.density[:, 0].min(), bias.density[:, 0].max()])
+        gone = " to ".join(dict.fromkeys(f"{v:.3g}" for v in ends))
+        names += f", {gone} {slot.unit} after a second" + (", rates walk too" if bias.density.shape[1] > 1 else "")
     if bias.sigma is None:
         return f"{bias.form} of {names}, unknown"
     low, high = np.min(bias.sigma) / abs(size), np.max(bias.sigma) / abs(size)
@@ -192,6 +197,8 @@ def _redundancy(problem: Problem, alone: bool) -> Array:
     layout = problem.layout
     known = len(exact(problem)) + sum(len(np.ravel(bias.sigma)) for bias in problem.biases if bias.sigma is not None)
     known += sum(prior.mean.shape[-1] for prior in problem.priors)
+    # the steps of a walk are known to be small: a row for each
+    known += (problem.epochs - 1) * sum(bias.density.size for bias in problem.biases if bias.density is not None)
     if problem.stations.covariance is not None and problem.stations.span != "noise":
         # Surveyed positions count as measured: each unknown offset comes with a prior of its own.
         times = 1 if alone or problem.stations.span == "run" else problem.epochs

@@ -428,6 +428,6 @@ def vector(problem: Problem, position: str | None, velocity: str | None, geodeti
             (shared if is_shared else local)[..., slot.start : slot.start + slot.size] = value
     for bias in problem.biases:
         if bias.sigma is not None:
-            slot, _ = layout.find(bias.name)
-            shared[slot.start : slot.start + slot.size] = np.ravel(bias.mean)
+            slot, is_shared = layout.find(bias.name)
+            (shared if is_shared else local)[..., slot.start : slot.start + slot.size] = np.ravel(bias.mean)
     return np.concatenate([shared, local.ravel()])

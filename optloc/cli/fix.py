@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from optloc.adequacy.advice import advise, advise_at
+from optloc.adequacy.advice import advise, advise_at, explained_at
 from optloc.adequacy.elements import GROUPINGS, By, batch_of
 from optloc.adequacy.geometry import Advice
 from optloc.adequacy.level import SEVERAL, CommonLevel, LateSignals, common_level_at, late_signals_at
@@ -79,6 +79,7 @@ def run_fix(
     noise: str | None = None,
     rescale: bool = False,
     late: bool = False,
+    explain: bool = False,
     allow: tuple[Status, ...] = (),
 ) -> int:
     """Fix a file under constraints of its own and more, write what was asked for, and return the exit code."""
@@ -101,15 +102,19 @@ def run_fix(
     _write(found, out, geojson_path, plot, html)
     # many statuses are told by their own sentence; causes take a search, which only readers need
     told = advice_for_fixes(found) if as_json or not quiet else ()
+    other = _explain(found, method) if explain and (as_json or not quiet) else None
     if as_json:
         noise_found: dict[str, Any] = {} if levels is None else {"noise": _levels_json(levels)}
         noise_found |= {} if level is None else {"noise_level": level_json(level, rescaled is not None)}
+        noise_found |= {"explained": explained_json(found, other)} if explain else {}
         noise_found |= {} if signals is None else {"late_signals": late_json(signals, late)}
         write_text(Path("-"), dumps(fixes_json(found) | {"advice": advice_json(told)} | noise_found))
     elif not quiet:
         console = Screen(stderr=on_output)
         show(found, console)
         show_advice(told, console)
+        if explain:
+            _show_explained(found, other, console)
         if level is not None or signals is not None:
             say_all(console, tell_level(level, rescaled is not None, signals, late))
         if levels is not None:
@@ -503,3 +508,55 @@ def show_advice(found: tuple[Advice, ...], console: Console) -> None:
         say(console, f"  {one.advice[0].upper()}{one.advice[1:]}{':' if one.toml else '.'}")
         for line in one.toml.splitlines():
             say(console, f"      {line}")
+
+
+# The fix with what would explain most of its misfit, on request.
+
+
+def _explain(found: FileFixes, method: str) -> FileFixes | None:
+    """Return the fixes of a file with the error among its unknowns that explains most, or None where none does."""
+    x = np.concatenate([np.atleast_2d(fix.x) for fix in found.fixes])
+    larger = explained_at(found.loaded.problem, x if found.fixes[0].shape else x[0])
+    return None if larger is None else fix_file(replace(found.loaded, problem=larger), method, True)
+
+
+def explained_json(found: FileFixes, other: FileFixes | None) -> dict[str, Any] | None:
+    """Return what is explained, and the fixes with it, as one JSON value; None where nothing is."""
+    if other is None:
+        return None
+    moved = {f"change_{axis}": other.columns[axis] - found.columns[axis] for axis in _axes(found)}
+    return {"name": other.loaded.problem.biases[-1].name, "change": records(moved)} | fixes_json(other)
+
+
+def _show_explained(found: FileFixes, other: FileFixes | None, console: Console) -> None:
+    """Print a fix before and after what would explain most of its misfit became unknown."""
+    if other is None:
+        say(console, "No single error explains what does not fit.")
+        return
+    bias, fix = other.loaded.problem.biases[-1], other.fixes[0]
+    table = Table(title=f"With the {bias.name}", title_justify="left")
+    for name in ("", "as it was", "with it", "change"):
+        table.add_column(name, justify="left" if not name else "right")
+    table.add_row("status", Status(int(found.fixes[0].flat().code[0])).label, Status(int(fix.code)).label, "")
+    before = "-" if found.fixes[0].shape else _p(float(found.fixes[0].p_value))
+    table.add_row("p", before, _p(float(fix.p_value)), "")
+    rows = min(len(found.columns["x"]), _STATES)
+    for i in range(rows):
+        whose = _whose(found.columns, i) if len(found.columns["x"]) > 1 else ""
+        for axis in _axes(found):
+            one, two = (each.columns[axis][i] for each in (found, other))
+            sigmas = [each.columns[f"sigma_{axis}"][i] for each in (found, other)]
+            told = [with_sigma(value, sigma, "m") for value, sigma in zip((one, two), sigmas, strict=True)]
+            table.add_row(f"{axis}{whose}", *told, f"{two - one:+.4g} m")
+    console.print(table)
+    if rows < len(found.columns["x"]):
+        say(console, f"{len(found.columns['x']) - rows} more positions changed: --json has all of them.")
+    if np.isfinite(fix.x).all():
+        slot, _ = fix.layout.find(bias.name)
+        values = zip(fix.take(bias.name), fix.sigma(bias.name), strict=True)
+        sizes = ", ".join(with_sigma(float(value), float(sigma), slot.unit) for value, sigma in values)
+        say(console, f"The {bias.name} is {sizes}; the fix above is without it.")
+
+
+def _axes(found: FileFixes) -> list[str]:
+    return [axis for axis in "xyz" if axis in found.columns]

@@ -322,6 +322,12 @@ LateFromData = Annotated[
 ]
 
 
+Explain = Annotated[
+    bool,
+    typer.Option("--explain", help="Fix again with the error that explains most of a misfit, and show the change."),
+]
+
+
 def coordinates(
     text: str, where: str, advice: str = "write them as 1200,800,50", *, bounds: bool = False
 ) -> list[float]:

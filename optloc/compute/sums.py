@@ -11,7 +11,8 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array
 from optloc.compute.jit import enabled, usable
 from optloc.compute.pack import pack
-from optloc.linear.normal import Normal, depends_on_place, linearise, normal, whitener_at, with_priors
+from optloc.linear.normal import Normal, depends_on_place, linearise, normal, total, whitener_at, with_priors
+from optloc.linear.walks import walks
 from optloc.problem.epochs import windows
 from optloc.problem.noise import Whitener
 from optloc.problem.problem import Problem
@@ -50,16 +51,14 @@ def summed(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None = None
     quick = _by_machine_code(problem, x, noise) if at is None else None
     if quick is not None:
         return quick
-    total = None
+    parts = []
     for first, last, part in windows(problem, x.size // x.shape[-1]):
         own = noise if last - first == problem.epochs else None
         if own is None and at is not None:
             own = whitener_at(part, at)
         linear = linearise(part, x, own)
-        sums = normal(replace(linear, epoch=linear.epoch - first), last - first)
-        total = sums if total is None else total + sums
-    assert total is not None
-    return total
+        parts.append(normal(replace(linear, epoch=linear.epoch - first), last - first))
+    return total(parts)
 
 
 def _by_machine_code(problem: Problem, x: Array, noise: tuple[Whitener, ...] | None) -> Normal | None:
@@ -82,7 +81,7 @@ def _by_machine_code(problem: Problem, x: Array, noise: tuple[Whitener, ...] | N
 
 def serves(problem: Problem, starts: int) -> bool:
     """Return whether machine code is at hand, or may be waited for, and pays for a number of vectors of a problem."""
-    if problem.count > _LONGEST or starts * problem.count < _WORTH or not enabled():
+    if problem.count > _LONGEST or starts * problem.count < _WORTH or not enabled() or walks(problem):
         return False
     from optloc.compute.equations import normal_block
     from optloc.compute.refine import refine_block, refine_runs

@@ -272,14 +272,19 @@ class ConstraintTable(_Table):
     """Least elevation of these stations, degrees; 0 by default."""
 
 
+# Biases, priors and constraints that a person writes down; each is a unit of work in every step of every fix.
+_MANY = 100
+
+
 class BiasTable(_Table):
     """A family of unknown systematic errors."""
 
     name: str = Field(min_length=1)
     """Its name."""
-    form: Literal["offset", "scale", "drift", "rotation", "time"] = "offset"
-    """Added; times the measured quantity; times the seconds of the run; a turn of the station's axes; or the seconds by
-    which the station is further along its course."""
+    form: Literal["offset", "scale", "drift", "rotation", "time", "walk", "spline"] = "offset"
+    """Added; times the measured quantity; times the seconds of the run; a turn of the station's axes; the seconds by
+    which the station is further along its course; or added, and another at each epoch: a random walk, as of a clock, or
+    a smooth function of time."""
     per: Literal["station", "pair", "kind", "target"] = "station"
     """Who has one of his own: each station (with the sign of its arrival), pair of stations, or target; or the kind."""
     kind: str | None = None
@@ -290,7 +295,17 @@ class BiasTable(_Table):
     mean: Amount | None = None
     """Prior mean."""
     sigma: Amount | None = None
-    """Prior standard deviation with its unit, such as "200 m"; without it the bias is unknown."""
+    """Prior standard deviation with its unit, such as "200 m"; without it the bias is unknown. Of a walk that of its
+    value at the first epoch."""
+    density: str | None = None
+    """Of a walk: spectral density of the white noise that it is the sum of, such as "0.04 m^2/s" or "4 ns^2/s"."""
+    rate_density: str | None = None
+    """Of a walk whose rate walks too: the density of that, such as "1e-6 m^2/s^3"."""
+    allan: list[list[float]] | None = Field(default=None, max_length=_MANY)
+    """Of a walk of times or lengths, in place of densities: Allan deviations of the clock, each with its averaging time
+    in seconds, such as [[1.0, 1e-9], [100.0, 2e-10]]."""
+    knots: int | list[float] | None = None
+    """Of a spline: the times in seconds between which it is a cubic polynomial, or how many evenly spaced ones."""
 
 
 class PriorTable(_Table):
@@ -311,10 +326,6 @@ class WindowTable(_Table):
 
     window: str | None = None
     """Length of an epoch, such as "0.1 s"; by default rows of exactly equal time belong together."""
-
-
-# Biases, priors and constraints that a person writes down; each is a unit of work in every step of every fix.
-_MANY = 100
 
 
 class ProblemFile(_Table):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,8 +29,9 @@ from optloc.files.schema import (
 from optloc.files.stations import spread, survey
 from optloc.files.table import Epochs, Table, table_of
 from optloc.linear.constraints import box, height, polygon, reported, speed, visible
-from optloc.problem.bias import family
+from optloc.problem.bias import changing, family, prior_shape
 from optloc.problem.check import check_polygon, like
+from optloc.problem.clocks import clock_densities
 
 # Derivatives of the position that a motion estimates.
 _ORDERS = {"static": 0, "free": 0, "free_velocity": 1, "constant_velocity": 1, "constant_acceleration": 2}
@@ -80,7 +82,7 @@ def needs_clock(motions: Sequence[Motion], biases: Sequence[BiasTable]) -> str |
     """Return why the times of the epochs matter, or None."""
     if any(motion.order > 0 and motion.span == "run" and motion.known is None for motion in motions):
         return "a moving target"
-    return "a drift" if any(bias.form == "drift" for bias in biases) else None
+    return next((f"a {bias.form}" for bias in biases if bias.form in ("drift", "walk", "spline")), None)
 
 
 # Targets whose positions are given, for calibration: their tables are read like those of stations.
@@ -201,17 +203,51 @@ def bias_of(
         for numbers, units, name in written
         if np.isin(bias.row, numbers).any()
     }
-    # A rotation in space has three angles, in the plane one.
-    turns = (3,) if table.form == "rotation" and dimension == 3 else ()
-    mean, sigma = _prior(table, [units for units, _ in spelled], (len(bias.members), *turns), where)
+    # epochs without times are refused where the problem is made
+    bias = changing(bias, epochs.clock, where, **_change(table, [units for units, _ in spelled], where))
+    mean, sigma = _prior(table, [units for units, _ in spelled], prior_shape(bias, dimension), where)
     return replace(bias, mean=mean, sigma=sigma), _unit_to_read(table.form, spelled, where)
+
+
+def _change(table: BiasTable, rows: Sequence[Units], where: str) -> dict[str, Any]:
+    """Return what a table says of how its bias changes in time, SI units."""
+    found: dict[str, Any] = {}
+    for key, power in (("density", 1), ("rate_density", 3)):
+        text = getattr(table, key)
+        if text is not None:
+            found[key] = _density(text, power, rows[0], join(where, f"key {key!r}"))
+    if table.knots is not None:
+        found["knots"] = table.knots
+    if table.allan is None:
+        return found
+    place = join(where, "key 'allan'")
+    if found:
+        raise InvalidProblem("Allan deviations stand in place of densities", place, "give one of them")
+    if rows[0].quantity != "length":
+        raise InvalidProblem("Allan deviations are of clocks, whose rows are times or lengths", place, "give a density")
+    if any(len(pair) != 2 for pair in table.allan):
+        raise InvalidProblem("an entry is not two numbers", place, "give [averaging time in s, Allan deviation] each")
+    tau, deviation = np.array(table.allan).reshape(-1, 2).T
+    white, wander = clock_densities(tau, deviation, rows[0].speed)
+    return {"density": white, **({"rate_density": wander} if wander > 0.0 else {})}
+
+
+def _density(text: str, power: int, units: Units, where: str) -> float:
+    """Return a spectral density such as "4 ns^2/s" in SI units; `power` is that of the seconds."""
+    end = "^2/s" if power == 1 else f"^2/s^{power}"
+    number, _, unit = text.strip().partition(" ")
+    if not unit.endswith(end):
+        example = f'"{number} {units.name(None)}{end}"'
+        raise InvalidProblem(f"{text!r} is no density", where, f"write its unit, such as {example}")
+    value, size = units.amount(f"{number} {unit.removesuffix(end)}", None, where)
+    return float(value) * size.factor**2
 
 
 def _unit_to_read(form: str, spelled: Iterable[tuple[Units, str]], where: str) -> tuple[str, float]:
     """Return the unit of an offset or drift of rows that are written in one unit, and its SI size; else empty."""
     sizes = {(name, units.conversion(name, where)) for units, name in spelled}
     (name, size), *more = sizes
-    if more or form not in ("offset", "drift") or size.logarithmic or size.factor == 1.0:
+    if more or form not in ("offset", "drift", "walk", "spline") or size.logarithmic or size.factor == 1.0:
         return "", 1.0
     return f"{name}/s" if form == "drift" else name, size.factor
 

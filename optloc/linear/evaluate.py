@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import factorial
 from typing import Any
 
@@ -16,6 +16,7 @@ from optloc.linear.courses import carried, elapsed, over_ground, to_ecef
 from optloc.models import MODELS, Model, Point
 from optloc.models.primitives import Jet, rotate, wrap
 from optloc.problem.bias import course
+from optloc.problem.clocks import effects
 from optloc.problem.layout import Layout, emission_name, state_names
 from optloc.problem.problem import Problem
 
@@ -154,7 +155,7 @@ def _plan(problem: Problem, block: Rows, start: int) -> Plan:
 
 
 def _adds(problem: Problem, block: Rows, start: int) -> Terms:
-    parts = [_terms(problem, block, start, ("offset", "drift"))]
+    parts = [_terms(problem, block, start, ("offset", "drift", "spline", "walk"))]
     for target in problem.emitting if MODELS[block.kind].emission else ():
         rows = np.flatnonzero(block.target == target)
         column = columns(problem.layout, emission_name(target, len(problem.motions)), block.epoch[rows])
@@ -168,12 +169,11 @@ def _terms(problem: Problem, block: Rows, start: int, forms: tuple[str, ...]) ->
         if bias.form not in forms:
             continue
         inside = (bias.row >= start) & (bias.row < start + block.count)
-        rows, member, coefficient = bias.row[inside] - start, bias.member[inside], bias.coefficient[inside]
-        if bias.form == "drift":
-            # A drift is an offset that grows: here is where seconds enter, nowhere else.
-            coefficient = coefficient * (problem.times - problem.origin)[block.epoch[rows]]
-        column = columns(problem.layout, bias.name, rows)[np.arange(len(rows)), member]
-        parts.append(Terms(rows, column, coefficient))
+        rows, epoch = bias.row[inside] - start, block.epoch[bias.row[inside] - start]
+        own = replace(bias, member=bias.member[inside], coefficient=bias.coefficient[inside])
+        entry, factor = effects(own, problem.times, problem.origin, epoch)
+        column = np.take_along_axis(columns(problem.layout, bias.name, epoch), entry, axis=1)
+        parts.append(Terms(np.repeat(rows, entry.shape[1]), column.ravel(), factor.ravel()))
     return _append(parts)
 
 

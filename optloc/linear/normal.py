@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,8 +12,10 @@ from optloc.base import linalg
 from optloc.base.arrays import as_number, eye, gather, library, placed
 from optloc.base.linalg import Tangent
 from optloc.base.types import Array, Rows
+from optloc.linear import chain
 from optloc.linear.constraints import exact
 from optloc.linear.evaluate import differentiate
+from optloc.linear.walks import chain_at, free_of, walk_names, walks
 from optloc.models import MODELS
 from optloc.problem.epochs import windows
 from optloc.problem.noise import Block, Noise, Whitener, arrivals, gathered, together, whiten
@@ -213,6 +216,8 @@ class Normal:
         Right-hand side of the local unknowns.
     cost : array (...)
         Weighted sum of squared residuals, without a factor 1/2.
+    link : array (..., k - 1, l, l), optional
+        Coupling of the local unknowns of each epoch with those of the next: of walks, which priors bring.
     """
 
     shared: Array
@@ -221,32 +226,30 @@ class Normal:
     shared_vector: Array
     local_vector: Array
     cost: Array
+    link: Array | None = None
 
     @property
     def parts(self) -> tuple[Array, ...]:
         """Return its arrays, in their order."""
-        return self.shared, self.local, self.cross, self.shared_vector, self.local_vector, self.cost
+        own = (self.shared, self.local, self.cross, self.shared_vector, self.local_vector, self.cost)
+        return own if self.link is None else (*own, self.link)
 
     def __add__(self, other: Normal) -> Normal:
         """Return the sum of the information of disjoint epochs: shared parts add, local parts are joined."""
-        # Without local unknowns nothing is joined: blocks of length zero stay as they are.
-        if self.local.shape[-1] == 0 == other.local.shape[-1]:
-            return Normal(
-                self.shared + other.shared,
-                self.local,
-                self.cross,
-                self.shared_vector + other.shared_vector,
-                self.local_vector,
-                self.cost + other.cost,
-            )
-        return Normal(
-            self.shared + other.shared,
-            np.concatenate([self.local, other.local], axis=-3),
-            np.concatenate([self.cross, other.cross], axis=-3),
-            self.shared_vector + other.shared_vector,
-            np.concatenate([self.local_vector, other.local_vector], axis=-2),
-            self.cost + other.cost,
-        )
+        return total([self, other])
+
+
+def total(parts: Sequence[Normal]) -> Normal:
+    """Return the sum of the information of disjoint stretches of epochs, before priors: local parts are joined once."""
+    first = parts[0]
+    if len(parts) == 1:
+        return first
+    shared, vector, cost = (sum(getattr(p, name) for p in parts) for name in ("shared", "shared_vector", "cost"))
+    # Without local unknowns nothing is joined: blocks of length zero stay as they are.
+    if first.local.shape[-1] == 0:
+        return Normal(shared, first.local, first.cross, vector, first.local_vector, cost)
+    local, cross = (np.concatenate([getattr(p, name) for p in parts], axis=-3) for name in ("local", "cross"))
+    return Normal(shared, local, cross, vector, np.concatenate([p.local_vector for p in parts], axis=-2), cost)
 
 
 def normal(linear: Linear, epochs: int) -> Normal:
@@ -303,30 +306,36 @@ def marginal(equations: Normal) -> tuple[Array, Array, Array]:
     Schur complement epoch by epoch. Of several epochs one may leave some of its own unknowns open: what it says about
     the shared ones counts all the same. `ok` (...) is False where the only epoch does so.
     """
+    return _eliminate(equations)[:3]
+
+
+def _eliminate(equations: Normal) -> tuple[Array, Array, Array, Array]:
+    """Return what `marginal` does, and the solutions (..., k, l, n + 1) of the local systems: coupling, then vector."""
     xp = library(equations.cost)
-    if equations.local.shape[-1] == 0:
-        return equations.shared, equations.shared_vector, xp.ones_like(equations.cost, dtype=xp.bool)
-    # Coupling and vector are solved for at once.
     right = xp.concat([equations.cross.mT, equations.local_vector[..., None]], axis=-1)
-    solved, ok = _solve_local(equations.local, right)
+    if equations.local.shape[-1] == 0:
+        return equations.shared, equations.shared_vector, xp.ones_like(equations.cost, dtype=xp.bool), right
+    # Coupling and vector are solved for at once.
+    solved, ok = _solve_local(equations, right)
     lost = xp.sum(equations.cross @ solved, axis=-3)
-    return equations.shared - lost[..., :-1], equations.shared_vector - lost[..., -1], ok
+    return equations.shared - lost[..., :-1], equations.shared_vector - lost[..., -1], ok, solved
 
 
 def eliminated(equations: Normal) -> Normal:
     """Return the information about the shared unknowns alone: local ones take the values that fit best."""
-    information, vector, _ = marginal(equations)
+    information, vector, _, held = _eliminate(equations)
     cost = equations.cost
     if equations.local.shape[-1]:
-        rest, _ = _solve_local(equations.local, equations.local_vector[..., None])
-        cost = cost - (rest[..., 0] * equations.local_vector).sum((-1, -2))
+        cost = cost - (held[..., -1] * equations.local_vector).sum((-1, -2))
     none = np.zeros((*cost.shape, 1, 0))
     return Normal(information, none[..., None], np.zeros((*cost.shape, 1, vector.shape[-1], 0)), vector, none, cost)
 
 
-def _solve_local(local: Array, right: Array) -> tuple[Array, Array]:
+def _solve_local(equations: Normal, right: Array) -> tuple[Array, Array]:
     """Return solutions (..., k, l, p) of the local systems, of least norm where they are singular, and ok (...)."""
-    xp = library(local)
+    local, xp = equations.local, library(equations.local)
+    if equations.link is not None:
+        return chain.solve(_hold_untouched(local), equations.link, right)
     # A single epoch that leaves its own unknowns open leaves the fix open: that is for the caller to see.
     if local.shape[-3] == 1:
         solved, good = linalg.solve(_hold_untouched(local), right)
@@ -362,8 +371,15 @@ def local_covariance(equations: Normal, shared: Array, size: int) -> Array:
     size : int
         How many of the local unknowns are wanted.
     """
-    inverse, good = linalg.inverse(equations.local, OPEN)
-    gain = inverse @ np.swapaxes(equations.cross, -1, -2)
+    if equations.link is None:
+        inverse, good = linalg.inverse(equations.local, OPEN)
+        gain = inverse @ np.swapaxes(equations.cross, -1, -2)
+    else:
+        held = _hold_untouched(equations.local)
+        inverse, whole = chain.inverse_blocks(held, equations.link)
+        gain, _ = chain.solve(held, equations.link, equations.cross.mT)
+        # of states of their own, an epoch may leave some open all the same
+        good = whole[..., None] & linalg.solve(held, np.zeros((*held.shape[:-1], 0)), OPEN)[1]
     # Own errors, and those that come from the shared unknowns.
     full = inverse + gain @ shared[..., None, :, :] @ np.swapaxes(gain, -1, -2)
     return np.where(good[..., None, None], full, np.nan)[..., :size, :size]
@@ -382,7 +398,7 @@ def step(equations: Normal, damping: Array, space: Tangent | None = None) -> tup
         Tangent space of equalities that the step keeps to first order.
     """
     damped = _damp(equations, damping)
-    information, vector, ok = marginal(damped)
+    information, vector, ok, held = _eliminate(damped)
     if space is not None:
         shared, good = linalg.solve_within(information, vector, space)
         ok = ok & good
@@ -393,12 +409,10 @@ def step(equations: Normal, damping: Array, space: Tangent | None = None) -> tup
         shared = vector
     if damped.local.shape[-1] == 0:
         return shared, ok
-    # Back substitution: given the shared step, each epoch solves for its own.
-    rest = damped.local_vector - (damped.cross.mT @ shared[..., None, :, None])[..., 0]
-    local, good = _solve_local(damped.local, rest[..., None])
-    xp = library(local)
-    flat = xp.reshape(local[..., 0], (*local.shape[:-3], -1))
-    return xp.concat([shared, flat], axis=-1), ok & good
+    # Back substitution: what an epoch does by itself, less what the shared step takes from it.
+    local, xp = held[..., -1] - (held[..., :-1] @ shared[..., None, :, None])[..., 0], library(held)
+    flat = xp.reshape(local, (*local.shape[:-2], -1))
+    return xp.concat([shared, flat], axis=-1), ok
 
 
 def _damp(equations: Normal, damping: Array) -> Normal:
@@ -407,14 +421,12 @@ def _damp(equations: Normal, damping: Array) -> Normal:
         grown: Array = matrix * (1.0 + factor[..., None, None] * eye(matrix.shape[-1], matrix))
         return grown
 
-    return Normal(
-        grow(equations.shared, damping),
-        grow(equations.local, damping[..., None]),
-        equations.cross,
-        equations.shared_vector,
-        equations.local_vector,
-        equations.cost,
-    )
+    local = grow(equations.local, damping[..., None])
+    if equations.link is not None:
+        # Walks enter linearly, and the precision of their steps beside that of the rows would hold them where they are.
+        walking = np.diagonal(equations.link, axis1=-2, axis2=-1).any(tuple(range(equations.link.ndim - 2)))
+        local = np.where(walking, equations.local, local)
+    return replace(equations, shared=grow(equations.shared, damping), local=local)
 
 
 def covariance(equations: Normal, space: Tangent | None = None) -> tuple[Array, Array]:
@@ -454,6 +466,8 @@ def with_priors(problem: Problem, x: Array, equations: Normal, *, shared: bool =
     """
     layout = problem.layout
     parts = [part for part in prior_parts(problem) if (shared if layout.find(part[0])[1] else local)]
+    if local and walks(problem):
+        equations = _with_walks(problem, x, equations)
     if not parts:
         return equations
     (at_shared, at_local), xp = layout.split(x), library(x)
@@ -477,11 +491,24 @@ def with_priors(problem: Problem, x: Array, equations: Normal, *, shared: bool =
                 local_vector + (pick @ pull[..., None])[..., 0],
             )
             cost = cost + xp.sum(penalty, axis=-1)
-    return Normal(matrix, blocks, equations.cross, vector, local_vector, cost)
+    return Normal(matrix, blocks, equations.cross, vector, local_vector, cost, equations.link)
+
+
+def _with_walks(problem: Problem, x: Array, equations: Normal) -> Normal:
+    """Return normal equations with what the walks say of neighbouring epochs."""
+    walked = chain_at(problem, x)
+    link = np.broadcast_to(walked.link, (*equations.cost.shape, *walked.link.shape))
+    return replace(
+        equations,
+        local=equations.local + walked.block,
+        local_vector=equations.local_vector + walked.vector,
+        cost=equations.cost + walked.cost,
+        link=link,
+    )
 
 
 def prior_parts(problem: Problem) -> list[tuple[str, Array, Array]]:
-    """Return (name, mean, precision) of every prior; local ones have an epoch axis of length one."""
+    """Return (name, mean, precision) of every prior but those of walks; local ones have an epoch axis of length one."""
     parts, layout = [], problem.layout
     for prior in problem.priors:
         precision, _ = linalg.inverse(prior.covariance)
@@ -489,7 +516,8 @@ def prior_parts(problem: Problem) -> list[tuple[str, Array, Array]]:
         mean = prior.mean if is_shared else prior.mean[..., None, :]
         parts.append((prior.name, mean, precision if is_shared else precision[..., None, :, :]))
     for bias in problem.biases:
-        if bias.sigma is not None:
+        # what is known of walks ties epochs: `chain_at`
+        if bias.sigma is not None and bias.form != "walk":
             sigma = np.ravel(bias.sigma)
             # Members of a bias are independent of each other a priori.
             parts.append((bias.name, np.broadcast_to(np.ravel(bias.mean), sigma.shape), np.diag(sigma**-2.0)))
@@ -527,11 +555,13 @@ def degrees_of_freedom(problem: Problem) -> Array:
     known = (
         {prior.name for prior in problem.priors}
         | {b.name for b in problem.biases if b.sigma is not None}
-        | {"stations"}
+        | {"stations", *walk_names(problem)}
     )
     layout = problem.layout
     unknowns: Any = sum(slot.size for slot in layout.shared if slot.name not in known)
     unknowns = unknowns + heard * sum(slot.size for slot in layout.local if slot.name not in known)
+    # steps of walks are rows and unknowns alike: what is left is how they begin
+    unknowns = unknowns + free_of(problem)
     return np.broadcast_to(rank - unknowns + len(exact(problem)), problem.batch_shape).astype(np.int32)
 
 

@@ -14,9 +14,10 @@ from optloc.base.types import Array, Bias, Rows
 from optloc.models import MODELS, Model
 from optloc.models.primitives import rotate
 from optloc.problem.check import check_unknowns
+from optloc.problem.clocks import coefficients, density_of, effects, knots_over
 from optloc.problem.problem import Problem
 
-Form = Literal["offset", "scale", "drift", "rotation", "time"]
+Form = Literal["offset", "scale", "drift", "rotation", "time", "walk", "spline"]
 Per = Literal["station", "pair", "kind", "target"]
 Members = Sequence[str] | Mapping[str, Sequence[str]] | None
 _Touch = tuple[Array, Array, Array]
@@ -34,6 +35,9 @@ def with_bias(
     members: Members = None,
     mean: Any = 0.0,
     sigma: Any = None,
+    density: Any = None,
+    rate_density: Any = None,
+    knots: Any = None,
 ) -> Problem:
     """Return the problem with one more family of unknown systematic errors.
 
@@ -46,9 +50,10 @@ def with_bias(
     per : "station", "pair", "kind" or "target"
         Who has an error of its own: a station, entering with the sign of its arrival; a pair of stations; all rows of
         a kind together; or all rows of a target, such as the frequency of an emitter.
-    form : "offset", "scale", "drift", "rotation" or "time"
+    form : "offset", "scale", "drift", "rotation", "time", "walk" or "spline"
         Added to the measurement; times the measured quantity; times the seconds since the first epoch; a turn of the
-        station's axes; or the seconds by which the station is further along its course than its positions say.
+        station's axes; the seconds by which the station is further along its course than its positions say; or added,
+        and another at each epoch: a random walk, as of a clock, or a smooth function of time.
     kind : str, optional
         Kind of the rows that are touched; all by default, for a rotation all that are measured in axes of stations, for
         a time all that have stations.
@@ -60,7 +65,15 @@ def with_bias(
         Prior mean of each member in the unit of the measurements, 1 for a scale, unit per second for a drift, radians
         for a rotation (three angles in space), seconds for a time.
     sigma : float or array like `mean`, optional
-        Prior standard deviation; None: unknown.
+        Prior standard deviation; None: unknown. Of a walk they are those of its value at the first epoch.
+    density : float or array (q,), optional
+        Of a walk: spectral density of the white noise that it is the sum of, square of the unit of the rows per second:
+        after t seconds it has gone ``sqrt(density * t)``.
+    rate_density : float or array (q,), optional
+        Of a walk with a rate: density of the noise which that is the sum of, per second cubed. Clocks have both:
+        `optloc.clock_densities` makes them of Allan deviations.
+    knots : int or array (p,), optional
+        Of a spline: times in seconds between which it is a cubic polynomial, or how many evenly spaced ones.
 
     Raises
     ------
@@ -70,12 +83,37 @@ def with_bias(
     """
     where = f"bias {name!r}"
     bias = family(problem.rows, problem.stations.names, name, per=per, form=form, kind=kind, members=members)
-    shape = (len(bias.members), *((3,) if form == "rotation" and problem.dimension == 3 else ()))
+    bias = changing(bias, problem.times, where, density=density, rate_density=rate_density, knots=knots)
+    shape = prior_shape(bias, problem.dimension)
     centre = _each(0.0 if mean is None else mean, shape, where, "mean")
     spread = None if sigma is None else _each(sigma, shape, where, "sigma")
     made = replace(problem, biases=(*problem.biases, replace(bias, mean=centre, sigma=spread)))
     check_unknowns(made)
     return made
+
+
+def prior_shape(bias: Bias, dimension: int) -> tuple[int, ...]:
+    """Return the shape of the prior mean of a bias: one value a member, or one for each of its angles or knots."""
+    if bias.form == "spline":
+        assert bias.knots is not None
+        return (len(bias.members), coefficients(bias.knots))
+    return (len(bias.members), *((3,) if bias.form == "rotation" and dimension == 3 else ()))
+
+
+def changing(
+    bias: Bias, times: Array, where: str, *, density: Any = None, rate_density: Any = None, knots: Any = None
+) -> Bias:
+    """Return a bias with what its form needs to change in time; refuse what it does not need."""
+    needed = {"walk": ("density", "rate_density"), "spline": ("knots",)}.get(bias.form, ())
+    for name, value in (("density", density), ("rate_density", rate_density), ("knots", knots)):
+        if value is not None and name not in needed:
+            what = f"the form {bias.form} has no {name}"
+            raise InvalidProblem(
+                what, where, f"leave it out, or use the form {'spline' if name == 'knots' else 'walk'}"
+            )
+    if bias.form == "walk":
+        return replace(bias, density=density_of(density, rate_density, len(bias.members), where))
+    return replace(bias, knots=knots_over(times, knots, where)) if bias.form == "spline" else bias
 
 
 def family(
@@ -310,21 +348,31 @@ def with_known_bias(problem: Problem, name: str, values: Any) -> Problem:
     if name not in names:
         raise InvalidProblem(f"there is no bias {name!r}", "name", nearest(name, names) if names else "there are none")
     bias = problem.biases[names.index(name)]
-    known = _order(bias, values, (3,) if bias.form == "rotation" and problem.dimension == 3 else ())
+    known = _order(bias, values, _shape_of(problem, bias))
     rest = replace(problem, biases=tuple(b for b in problem.biases if b is not bias))
     change = {"rotation": _turn, "time": _move}.get(bias.form, _correct)
     return change(rest, bias, known)
 
 
-def _order(bias: Bias, values: Any, inner: tuple[int, ...]) -> Array:
-    """Return values (q,) or (q, 3) in the order of the members."""
+def _shape_of(problem: Problem, bias: Bias) -> tuple[int, ...]:
+    """Return the shape of the values of a bias: members, and what each has several of; of a walk epochs, members."""
+    if bias.form == "walk":
+        return (problem.epochs, len(bias.members))
+    several = problem.layout.find(bias.name)[0].size // len(bias.members)
+    return (len(bias.members), *((several,) if several > 1 else ()))
+
+
+def _order(bias: Bias, values: Any, shape: tuple[int, ...]) -> Array:
+    """Return values of a shape in the order of the members."""
     where = f"values of {bias.name!r}"
+    if isinstance(values, Mapping) and bias.form == "walk":
+        raise InvalidProblem("a walk has values at every epoch", where, f"give an array of shape {shape}")
     if isinstance(values, Mapping):
         strange = [member for member in values if member not in bias.members]
         if strange:
             raise InvalidProblem(f"{strange[0]!r} is no member", where, nearest(str(strange[0]), list(bias.members)))
-        values = [values.get(member, np.zeros(inner)) for member in bias.members]
-    array, shape = np.asarray(numbers(values, where)), (len(bias.members), *inner)
+        values = [values.get(member, np.zeros(shape[1:])) for member in bias.members]
+    array = np.asarray(numbers(values, where))
     if array.size != np.prod(shape):
         raise InvalidProblem(f"there are {array.size} values", where, f"give an array of shape {shape}")
     if not np.isfinite(array).all():
@@ -334,9 +382,10 @@ def _order(bias: Bias, values: Any, inner: tuple[int, ...]) -> Array:
 
 def _correct(problem: Problem, bias: Bias, known: Array) -> Problem:
     """Return the problem with offsets, drifts or scales in the known corrections of its rows."""
-    amount = np.zeros(problem.count)
-    since = (problem.times - problem.origin)[problem.epoch[bias.row]] if bias.form == "drift" else 1.0
-    np.add.at(amount, bias.row, bias.coefficient * since * known[bias.member])
+    amount, epoch = np.zeros(problem.count), problem.epoch[bias.row]
+    entry, factor = effects(bias, problem.times, problem.origin, epoch)
+    values = known[epoch[:, None], entry] if bias.form == "walk" else known.ravel()[entry]
+    np.add.at(amount, bias.row, (factor * values).sum(1))
     rows = []
     for block, start in zip(problem.rows, problem.starts, strict=True):
         # What the measurement exceeds the model by; for a scale it depends on the measurement: z = h (1 + s).

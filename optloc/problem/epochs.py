@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -249,17 +249,22 @@ def window(problem: Problem, first: int, last: int) -> Problem:
     first, last : int
         Stretch of epochs.
     """
-    kept = [_inside(block.epoch, first, last) for block in problem.rows]
-    rows = tuple(_rows(block, inside) for block, inside in zip(problem.rows, kept, strict=True))
+    return _with_rows_of(problem, lambda epoch: _inside(epoch, first, last))
+
+
+def _with_rows_of(problem: Problem, inside: Callable[[Array], slice | Array]) -> Problem:
+    """Return the problem with the rows of some epochs only; `inside` maps epochs (n,) to the entries that are kept."""
+    kept = [inside(block.epoch) for block in problem.rows]
+    rows = tuple(_rows(block, own) for block, own in zip(problem.rows, kept, strict=True))
     number = _Numbers.of(problem, kept, [block.count for block in rows])
     blocks = []
     for block in problem.noise.blocks:
-        groups = _inside(number.epoch(problem, block.row[:, 0]), first, last)
+        groups = inside(number.epoch(problem, block.row[:, 0]))
         # Blocks hold groups of one epoch, so that the epoch of the first row is that of all.
         covariance = block.covariance if block.covariance.shape[-3] == 1 else block.covariance[..., groups, :, :]
         if len(block.row[groups]):
             blocks.append(Block(number.new(block.row[groups]), covariance))
-    biases = tuple(_touches(problem, bias, number, first, last) for bias in problem.biases)
+    biases = tuple(_touches(problem, bias, number, inside) for bias in problem.biases)
     return replace(problem, rows=rows, noise=Noise(tuple(blocks)), biases=biases)
 
 
@@ -315,13 +320,24 @@ def cut(problem: Problem, first: int, last: int) -> Problem:
     part = window(problem, first, last)
     if part.count == 0:
         raise InvalidProblem(f"epochs {first} to {last} hold no rows", "cut", "take a longer stretch")
+    return _begun_anew(problem, part, slice(first, last))
+
+
+def thinned(problem: Problem, epochs: Array) -> Problem:
+    """Return some epochs (n,) of a run as a run of its own; arguments otherwise as of `cut`."""
+    part = _with_rows_of(problem, lambda epoch: np.flatnonzero(np.isin(epoch, epochs)))
+    return _begun_anew(problem, part, epochs)
+
+
+def _begun_anew(problem: Problem, part: Problem, when: slice | Array) -> Problem:
+    """Return the rows of some epochs of a run, increasing, as those of a run that has no others."""
 
     def own(values: Array | None, core: int) -> Array | None:
         if values is None or values.shape[-core] == 1:
             return values
-        return np.moveaxis(np.moveaxis(values, -core, 0)[first:last], 0, -core)
+        return np.moveaxis(np.moveaxis(values, -core, 0)[when], 0, -core)
 
-    s = problem.stations
+    s, number = problem.stations, np.arange(problem.epochs)[when]
     # Station numbers, times and unknowns of the run stay; only what counts epochs begins anew.
     position = own(s.position, 3)
     assert position is not None
@@ -332,8 +348,8 @@ def cut(problem: Problem, first: int, last: int) -> Problem:
     return replace(
         part,
         stations=replace(s, position=position, velocity=own(s.velocity, 3), axes=own(s.axes, 4)),
-        rows=tuple(replace(rows, epoch=rows.epoch - first) for rows in part.rows),
-        times=problem.times[first:last],
+        rows=tuple(replace(rows, epoch=np.searchsorted(number, rows.epoch)) for rows in part.rows),
+        times=problem.times[when],
         motions=motions,
     )
 
@@ -354,8 +370,8 @@ def _rows(block: Rows, kept: slice | Array) -> Rows:
     return Rows(block.kind, *(getattr(block, name)[..., kept] for name in _ROW_ARRAYS))
 
 
-def _touches(problem: Problem, bias: Bias, number: _Numbers, first: int, last: int) -> Bias:
-    kept = _inside(number.epoch(problem, bias.row), first, last)
+def _touches(problem: Problem, bias: Bias, number: _Numbers, inside: Callable[[Array], slice | Array]) -> Bias:
+    kept = inside(number.epoch(problem, bias.row))
     return replace(bias, row=number.new(bias.row[kept]), member=bias.member[kept], coefficient=bias.coefficient[kept])
 
 

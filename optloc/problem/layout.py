@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from optloc.base.arrays import library
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Bias, Motion, Stations
+from optloc.problem.clocks import rate_name, spline_members
 
 # Units are those of reports: inside all is SI.
 _STATE = (("position", "m"), ("velocity", "m/s"), ("acceleration", "m/s^2"))
@@ -155,8 +156,12 @@ def layout(
     # Angles of a rotation: one in the plane, a vector in space.
     turns = 1 if stations.dimension == 2 else 3
     for bias, unit in zip(biases, bias_units or [""] * len(biases), strict=True):
-        size = len(bias.members) * (turns if bias.form == "rotation" else 1)
-        shared.append((bias.name, size, _bias_unit(bias.form, unit), bias.members))
+        if bias.form == "walk":
+            local.extend(_walk(bias, unit))
+            continue
+        members = spline_members(bias) if bias.form == "spline" else bias.members
+        size = len(members) * (turns if bias.form == "rotation" else 1)
+        shared.append((bias.name, size, _bias_unit(bias.form, unit), members))
     # Emission times last one epoch by their nature; station errors where their span says so.
     local.extend((emission_name(i, len(motions)), 1, "m", ()) for i in emitting)
     if stations.covariance is not None and stations.span != "noise":
@@ -165,11 +170,20 @@ def layout(
     return Layout(_slots(shared), _slots(local), epochs)
 
 
+def _walk(bias: Bias, unit: str) -> list[_Part]:
+    """Return the parts of a walk at each epoch: its values, and its rates where it has some."""
+    assert bias.density is not None
+    parts = [(bias.name, len(bias.members), unit, bias.members)]
+    if bias.density.shape[1] == 2:
+        parts.append((rate_name(bias.name), len(bias.members), _bias_unit("drift", unit), bias.members))
+    return parts
+
+
 def _bias_unit(form: str, unit: str) -> str:
     """Return the unit of a bias on rows of a unit: "1" is that of ratios."""
     if form in _OWN_UNIT:
         return _OWN_UNIT[form]
-    return unit if form == "offset" else _RATE.get(unit, f"{unit}/s" if unit else "")
+    return _RATE.get(unit, f"{unit}/s" if unit else "") if form == "drift" else unit
 
 
 def _slots(parts: list[_Part]) -> tuple[Slot, ...]:

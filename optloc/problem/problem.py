@@ -137,7 +137,7 @@ class Problem:
         blocks = tuple((b.row.shape, b.row.tobytes()) for b in self.noise.blocks)
         motions = tuple((m.order, m.span, m.known is None, m.reference, *_course(m)) for m in self.motions)
         biases = tuple(
-            (b.name, b.members, b.form, b.row.tobytes(), b.member.tobytes(), b.coefficient.tobytes())
+            (b.name, b.members, b.form, b.row.tobytes(), b.member.tobytes(), b.coefficient.tobytes(), *_shape(b))
             for b in self.biases
         )
         # Numbers are left out: positions, measurements, weights, covariances change from solve to solve.
@@ -207,6 +207,13 @@ def _course(motion: Motion) -> tuple[Any, ...]:
 
 def _along(band: Band, motion: Motion) -> tuple[str, ...]:
     return ("along",) if band.along and motion.order and motion.span == "run" else ()
+
+
+def _shape(bias: Bias) -> tuple[Any, ...]:
+    """Return what of a walk or a spline decides about columns: how many states it has, and its knots."""
+    if bias.density is None and bias.knots is None:
+        return ()
+    return () if bias.density is None else bias.density.shape, None if bias.knots is None else bias.knots.tobytes()
 
 
 def _join(parts: list[Array]) -> Array:

@@ -388,10 +388,10 @@ def find_minima(pose: Posed, places: Places, gap: float, budget: int, most: int)
         mapped(lambda i: search(i, budget), asked)
         return points, boxes
     # Plain Python holds the interpreter: threads would wait for each other.
-    most = min(budget, max(FIRST_BOXES, PLAIN_BOXES // max(len(asked), 1))) if enabled() else budget
+    few = min(budget, max(FIRST_BOXES, PLAIN_BOXES // max(len(asked), 1))) if enabled() else budget
     with plain():
         for i in asked:
-            search(i, most)
+            search(i, few)
     return points, boxes
 
 

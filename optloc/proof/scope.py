@@ -97,7 +97,9 @@ def _nodes(problem: Problem) -> int:
 def _beyond_biases(problem: Problem) -> Iterator[str]:
     angular = np.concatenate([np.full(rows.count, MODELS[rows.kind].period is not None) for rows in problem.rows])
     for bias in problem.biases:
-        if bias.form not in ("offset", "drift"):
+        if bias.form == "walk":
+            yield f"the walk {bias.name!r} is another unknown at each epoch, and the proof takes those of the run"
+        elif bias.form not in ("offset", "drift", "spline"):
             does = "moves stations" if bias.form == "time" else "multiplies what it touches"
             yield f"the {bias.form} {bias.name!r} {does}, and the proof takes what is added"
         elif bias.sigma is None and angular[bias.row].any():

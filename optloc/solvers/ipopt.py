@@ -18,6 +18,7 @@ from optloc.compute.sums import equations_at
 from optloc.linear.constraints import conjunction, face_of, faces, tangent_at
 from optloc.linear.normal import decrement, prior_parts, step, weighed
 from optloc.linear.symbolic import bounds, constrained, parameters, residual
+from optloc.linear.walks import chain_at, places, walks
 from optloc.problem.fix import Stage
 from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
@@ -213,6 +214,22 @@ def _whitening(problem: Problem) -> Array:
     return matrix
 
 
+def _add_walks(problem: Problem, mean: Array, information: Array) -> None:
+    """Add what walks say to prior means and information: their steps are zero, of which none moves the mean."""
+    layout = problem.layout
+    walked = chain_at(problem, np.zeros((1, layout.size)))
+    starts = layout.n_shared + layout.n_local * np.arange(layout.epochs)
+    own = starts[:, None] + np.arange(layout.n_local)
+    information[own[:, :, None], own[:, None, :]] += walked.block
+    information[own[:-1, :, None], own[1:, None, :]] += walked.link
+    information[own[1:, :, None], own[:-1, None, :]] += walked.link.mT
+    for bias in walks(problem):
+        # a walk from its prior mean that takes no steps costs nothing
+        if bias.sigma is not None:
+            place = starts[:, None] + places(layout, bias)[:, 0]
+            mean[place] = np.ravel(bias.mean)
+
+
 def _prior(problem: Problem, unit: Array, centre: Array) -> tuple[Array, Array]:
     layout = problem.layout
     mean, information = np.zeros(layout.size), np.zeros((layout.size, layout.size))
@@ -223,4 +240,6 @@ def _prior(problem: Problem, unit: Array, centre: Array) -> tuple[Array, Array]:
             part = slice(start, start + slot.size)
             mean[part] = value.reshape(-1, value.shape[-1])[0]
             information[part, part] = precision.reshape(-1, slot.size, slot.size)[0]
+    if walks(problem):
+        _add_walks(problem, mean, information)
     return (mean - centre) / unit, information * unit[:, None] * unit[None, :]

@@ -270,17 +270,16 @@ def _keep(state: _State, active: Array, better: Array, x: Array, after: Normal) 
         return
     to = active[better]
     state.x[to] = x[better]
-    for name in Normal.__slots__:
-        getattr(state.equations, name)[to] = getattr(after, name)[better]
+    for mine, new in zip(state.equations.parts, after.parts, strict=True):
+        mine[to] = new[better]
 
 
 def _own(equations: Normal) -> Normal:
-    arrays = (getattr(equations, name) for name in Normal.__slots__)
-    return Normal(*(array if array.flags.writeable else np.array(array) for array in arrays))
+    return Normal(*(array if array.flags.writeable else np.array(array) for array in equations.parts))
 
 
 def _at(equations: Normal, index: Array) -> Normal:
-    return Normal(*(getattr(equations, name)[index] for name in Normal.__slots__))
+    return Normal(*(part[index] for part in equations.parts))
 
 
 # By machine code: which problems it serves, and with which weights.
@@ -365,7 +364,7 @@ def _join(parts: list[Refined]) -> Refined:
 
     def make() -> Normal:
         made = [part.equations for part in parts]
-        return Normal(*(np.concatenate([getattr(one, name) for one in made]) for name in Normal.__slots__))
+        return Normal(*(np.concatenate(same) for same in zip(*(one.parts for one in made), strict=True)))
 
     x, cost, status, iterations = (
         np.concatenate([getattr(part, name) for part in parts]) for name in ("x", "cost", "status", "iterations")

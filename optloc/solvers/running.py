@@ -12,6 +12,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
 from optloc.compute.sums import summed
 from optloc.linear.normal import Normal, covariance, eliminated, with_priors
+from optloc.linear.walks import walks
 from optloc.problem.epochs import cut, joined, tied, window
 from optloc.problem.fix import Fix
 from optloc.problem.layout import Layout
@@ -76,10 +77,13 @@ class Running:
         Raises
         ------
         InvalidProblem
-            Where targets have states of their own at each epoch, or the fix has no answer.
+            Where targets have states of their own at each epoch, a bias walks, or the fix has no answer.
         """
         if any(motion.span == "epoch" and motion.known is None for motion in problem.motions):
             raise InvalidProblem("targets that are free at each epoch share nothing", "begin", "solve their epochs")
+        if walks(problem):
+            what = f"the walk {walks(problem)[0].name!r} ties each epoch to the next, so that they do not add up"
+            raise InvalidProblem(what, "begin", "solve the whole run")
         if not np.isfinite(fix.x).all():
             raise InvalidProblem("the fix has no answer to begin from", "fix", "wait for more epochs; see fix.status")
         flat = problem.flat()

@@ -19,6 +19,7 @@ from optloc.base.frames import Frame
 from optloc.base.types import Array, Bias
 from optloc.files.schema import Units, join
 from optloc.linear.simulate import simulate
+from optloc.linear.walks import walks, wander
 from optloc.problem.bias import with_bias
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
@@ -176,8 +177,8 @@ def _block(case: Case, number: int, size: int) -> tuple[Array, Array, Array, Arr
     """Return stations, truth, wild places, measurements and numbers of stations that are off, of one block."""
     # A seed sequence mixes words of 32 bits.
     key = [int(case.key[:8], 16), int(case.key[8:], 16)]
-    # Three streams: what is placed, what is measured and where guesses begin do not shift one another.
-    geometry, noise, guess = np.random.SeedSequence([case.seed, *key], spawn_key=(number,)).spawn(3)
+    # Streams: what is placed, what is measured, where guesses begin and how clocks walk do not shift one another.
+    geometry, noise, guess, steps = np.random.SeedSequence([case.seed, *key], spawn_key=(number,)).spawn(4)
     rng, problem, table = np.random.default_rng(geometry), case.template, case.table
     stations = np.broadcast_to(problem.stations.position.mean(0), (size, *problem.stations.position.shape[-2:]))
     if table.layout is not None:
@@ -195,9 +196,9 @@ def _block(case: Case, number: int, size: int) -> tuple[Array, Array, Array, Arr
     values |= errors
     off = [errors[flaw.name] != 0.0 for flaw in flaws if flaw.share is not None]
     bad = np.any(off, axis=0).sum(-1) if off else np.zeros(size, dtype=int)
-    z = np.broadcast_to(simulate(real, _vector(real, values, size), noise).z, (size, problem.count))
+    z = np.broadcast_to(simulate(real, _vector(real, values, size, steps), noise).z, (size, problem.count))
     wild = np.random.default_rng(guess).uniform(-0.5, 0.5, (size, problem.dimension))
-    return stations, _vector(problem, values, size), wild, z, bad
+    return stations, _vector(problem, values, size, steps), wild, z, bad
 
 
 def _at(problem: Problem, stations: Array) -> Problem:
@@ -205,14 +206,17 @@ def _at(problem: Problem, stations: Array) -> Problem:
     return replace(problem, stations=replace(problem.stations, position=stations[:, None]))
 
 
-def _vector(problem: Problem, values: dict[str, Array], size: int) -> Array:
-    """Return parameter vectors (size, n) with named values; what has none is zero, unknowns of single epochs too."""
+def _vector(problem: Problem, values: dict[str, Array], size: int, steps: np.random.SeedSequence) -> Array:
+    """Return parameter vectors (size, n) with named values; what has none is zero, unknowns of single epochs too.
+
+    Walks begin at their values and go on by steps that are drawn.
+    """
     layout = problem.layout
     vectors = np.zeros((size, layout.size))
-    for slot in layout.shared:
+    for base, slot in (*((0, slot) for slot in layout.shared), *((layout.n_shared, slot) for slot in layout.local)):
         if slot.name in values:
-            vectors[:, slot.start : slot.start + slot.size] = values[slot.name]
-    return vectors
+            vectors[:, base + slot.start : base + slot.start + slot.size] = values[slot.name]
+    return wander(problem, vectors, steps) if walks(problem) else vectors
 
 
 def _length(problem: Problem, name: str) -> int:
@@ -447,7 +451,7 @@ def _amount(case: Case, bias: Bias, value: Amount, where: str) -> float:
     """Return a value of a bias in SI units: an offset has the unit of its rows, a boresight is an angle."""
     if isinstance(value, int | float):
         return float(value)
-    if bias.form == "offset":
+    if bias.form in ("offset", "walk", "spline"):
         starts = np.array(case.template.starts)
         kind = case.template.rows[int(np.searchsorted(starts, bias.row[0], side="right")) - 1].kind
         text = value.strip()

@@ -84,10 +84,11 @@ def followed_with_constants(problem: Problem, start: State, dynamics: Dynamics, 
 
 def _check(problem: Problem) -> None:
     check_trackable(replace(problem, biases=()))
-    # A drift times the seconds of the run is no constant of one scan: its model would need the time.
-    drifting = next((bias.name for bias in problem.biases if bias.form == "drift"), None)
-    if drifting is not None:
-        raise InvalidProblem(f"the bias {drifting!r} drifts", "track", "learn it first, then `with_known_bias`")
+    # What changes with the seconds of the run is no constant of one scan: its model would need the time.
+    changing = next((bias for bias in problem.biases if bias.form in ("drift", "walk", "spline")), None)
+    if changing is not None:
+        what = f"the {changing.form} {changing.name!r} changes in time"
+        raise InvalidProblem(what, "track", "learn it first, then `with_known_bias`")
 
 
 def _with_constants(dynamics: Dynamics, constants: int) -> Dynamics:

@@ -186,6 +186,7 @@ def _without(equations: Normal, start: int, size: int) -> Normal:
         equations.shared_vector[..., keep],
         equations.local_vector,
         equations.cost,
+        equations.link,
     )
 
 

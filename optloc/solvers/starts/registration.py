@@ -10,11 +10,13 @@ import numpy as np
 
 from formulations.registration import Course, candidates
 from optloc.base import linalg
-from optloc.base.types import Array, Status
+from optloc.base.types import Array, Bias, Status
 from optloc.compute.sums import equations_at
 from optloc.linear.courses import elapsed
 from optloc.linear.evaluate import plans
 from optloc.linear.normal import covariance, degrees_of_freedom, prior_parts
+from optloc.linear.walks import places, state_of, walks
+from optloc.problem.clocks import greville, rate_name
 from optloc.problem.epochs import by_epoch, untied
 from optloc.problem.problem import Problem
 from optloc.solvers.policy import DOUBT
@@ -83,8 +85,9 @@ def group_alike(problem: Problem) -> list[Array]:
 def _start_group(problem: Problem, begin: Callable[[Problem], Array | None]) -> Array:
     """Return starting vectors (N, C, size) of runs that have the same rows."""
     # every candidate is refined on the averages, where a step costs next to nothing; few are on all epochs
-    blocks = average_blocks(problem, BLOCKS)
-    x = begin(blocks)
+    straight = _straighten(problem, "spline")
+    blocks = average_blocks(straight, BLOCKS)
+    x = _begin(blocks, begin)
     x = _around(blocks, _ANYWHERE) if x is None else x
     pool = _minima(blocks, x)
     # stations in a plane see the mirror image nearly as well: it is always tried
@@ -95,7 +98,59 @@ def _start_group(problem: Problem, begin: Callable[[Problem], Array | None]) -> 
         part = blocks.take(doubtful)
         wider = _minima(part, np.concatenate([_around(part, _RADII), _valley(part, pool[0][doubtful, 0])], axis=1))
         pool = _merge(pool, _scatter(wider, doubtful, len(x)))
-    return complete(problem, _best(blocks, *pool)[..., : problem.layout.n_shared])
+    x = complete(straight, _best(blocks, *pool)[..., : straight.layout.n_shared])
+    return x if straight is problem else _bend(problem, straight, x)
+
+
+def _begin(blocks: Problem, begin: Callable[[Problem], Array | None]) -> Array | None:
+    """Return starting vectors of blocks; those whose biases walk begin as if these were offsets that drift."""
+    steady = _straighten(blocks, "walk")
+    x = begin(steady)
+    return x if x is None or steady is blocks else _bend(blocks, steady, x)
+
+
+def _straighten(problem: Problem, form: str) -> Problem:
+    """Return a problem whose walks or splines are offsets, and drifts besides: a few dozen blocks tell no more of them.
+
+    Walks without rates are offsets alone; a problem without any is returned as it is.
+    """
+    biases: list[Bias] = []
+    for bias in problem.biases:
+        straight = replace(bias, form="offset", density=None, knots=None, sigma=None, mean=np.zeros(1))
+        if bias.form != form:
+            biases.append(bias)
+        elif form == "spline":
+            biases += [straight, replace(straight, name=rate_name(bias.name), form="drift")]
+        else:
+            known = replace(straight, sigma=bias.sigma, mean=bias.mean)
+            biases += [known, *(replace(straight, name=name, form="drift") for name in state_of(bias)[1:])]
+    return replace(problem, biases=tuple(biases)) if any(b.form == form for b in problem.biases) else problem
+
+
+def _bend(problem: Problem, straight: Problem, x: Array) -> Array:
+    """Return vectors (N, C, size) of a problem from those of the same with straight biases; NaN stay NaN."""
+    layout, out = problem.layout, np.zeros((*x.shape[:2], problem.layout.size))
+    changed = {bias.name: bias for bias in problem.biases if bias.form in ("walk", "spline")}
+    for slot in layout.shared:
+        part, bias = slice(slot.start, slot.start + slot.size), changed.get(slot.name)
+        own = straight.layout.take(x, slot.name)
+        if bias is not None and own.shape[-1] != slot.size:
+            # a coefficient is the value of a straight line at its time
+            own = own[..., None] + straight.layout.take(x, rate_name(slot.name))[..., None] * (
+                greville(bias) - problem.origin
+            )
+        out[..., part] = own.reshape(*x.shape[:2], -1)
+    local = out[..., layout.n_shared :].reshape(*x.shape[:2], layout.epochs, layout.n_local)
+    since = (problem.times - problem.origin)[:, None]
+    for bias in walks(problem):
+        value, *rate = (straight.layout.take(x, name)[:, :, None] for name in state_of(bias))
+        place = places(layout, bias)
+        local[..., place[:, 0]] = value + (rate[0] * since if rate else 0.0)
+        for each in rate:
+            local[..., place[:, 1]] = each
+    out[..., layout.n_shared :] = local.reshape(*x.shape[:2], -1)
+    out[np.isnan(x).any(-1)] = np.nan
+    return out
 
 
 def _minima(blocks: Problem, x: Array) -> tuple[Array, Array]:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtrc
 
+from optloc.adequacy.advice import misfit_of
 from optloc.base.records import overwrite, present, take
 from optloc.base.types import Array, Certificate, Status, first_status
 from optloc.bounds.observability import open_sentences
@@ -251,6 +252,7 @@ def _weigh_redundancy(pool: Pool, finished: Array, reason: Array) -> None:
 
 
 _EPOCHS_SHOWN = 8  # epochs that a sentence names
+_EXPLAINED = 4  # misfits of a batch whose causes are looked for: each takes as long as many fixes
 
 
 def verdict(problem: Problem, pool: Pool) -> Fix:
@@ -263,7 +265,19 @@ def verdict(problem: Problem, pool: Pool) -> Fix:
     pool : Pool
         Their candidates.
     """
-    return judge(problem, examine(problem, pool))
+    return _name_misfits(problem, judge(problem, examine(problem, pool)))
+
+
+def _name_misfits(problem: Problem, fix: Fix) -> Fix:
+    """Return the fixes of runs with what would explain their misfits among the reasons, where they are few."""
+    items = np.flatnonzero(fix.code == Status.MISFIT)
+    if problem.epochs == 1 or not 0 < len(items) <= _EXPLAINED:
+        return fix
+    reason = fix.reason.copy()
+    for i in items:
+        told = misfit_of(problem.take(np.array([i])), fix.x[i])
+        reason[i] = f"{reason[i]}; {told}" if reason[i] else told
+    return replace(fix, reason=reason)
 
 
 def judge(problem: Problem, pool: Pool) -> Fix:

@@ -12,6 +12,7 @@ from optloc.base.types import Array, Status
 from optloc.compute.sums import equations_at
 from optloc.linear.constraints import Face, face_names, faces, levels, tangent_at
 from optloc.linear.normal import Normal, local_covariance, marginal
+from optloc.linear.walks import walk_names
 from optloc.problem.fix import Active, Stage
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
@@ -53,8 +54,10 @@ def measure_curvature(problem: Problem, equations: Normal, x: Array, face: Array
 
 
 def _local_covariance(problem: Problem, equations: Normal, shared: Array) -> Array | None:
-    """Return the covariance of the states that targets have at each epoch of a run, or None where there are none."""
+    """Return the covariance of the states that targets and walks have at each epoch, or None where there are none."""
     names = {name for i, m in enumerate(problem.motions) for name in state_names(i, len(problem.motions), m.order)}
+    names |= set(walk_names(problem))
+    # they stand first
     size = sum(slot.size for slot in problem.layout.local if slot.name in names)
     with np.errstate(all="ignore"):
         return local_covariance(equations, shared, size) if size else None

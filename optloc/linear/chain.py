@@ -1,0 +1,157 @@
+"""Symmetric systems of blocks in a chain: epochs that are tied to the next one, solved in time linear in their number.
+
+Regular ones are banded matrices, which LAPACK factors. For blocks of an inverse, and where a block leaves something
+open, every other block is eliminated at once and the rest is a chain again, half as long: cyclic reduction, which for
+positive definite matrices is Cholesky's method in another order. B. L. Buzbee, G. H. Golub, C. W. Nielson, "On direct
+methods for solving Poisson's equations", SIAM J. Numer. Anal. 7 (1970) 627-656.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from optloc.base import linalg
+from optloc.base.types import Array
+
+# Share of its information below which a block leaves a combination open: that of `optloc.linear.normal`.
+_OPEN = 1e-12
+# Share of the largest block below which what is left for the last block is rounding: sums of k blocks lose k eps.
+_ROUNDING = 1e-13
+
+
+def solve(block: Array, link: Array, right: Array) -> tuple[Array, Array]:
+    """Return the solutions of a chain, and whether it is regular.
+
+    Parameters
+    ----------
+    block : array (..., k, l, l)
+        On the diagonal; positive semidefinite as a whole.
+    link : array (..., k - 1, l, l)
+        Rows of a block, columns of the next.
+    right : array (..., k, l, p)
+        Right-hand sides. Of what a block by itself leaves open the solution is that of least norm.
+
+    Returns
+    -------
+    solved : array (..., k, l, p)
+        Solutions.
+    ok : bool array (...)
+        False where the chain as a whole is singular.
+    """
+    shape = np.broadcast_shapes(block.shape[:-3], right.shape[:-3])
+    out, ok = np.empty((*shape, *right.shape[-3:])), np.ones(shape, dtype=bool)
+    each = [np.broadcast_to(part, (*shape, *part.shape[-3:])) for part in (block, link, right)]
+    for i in np.ndindex(shape):
+        one, two, three = (part[i] for part in each)
+        found = _banded(one, two, three)
+        if found is None:
+            found, _, ok[i] = _reduce(one, two, three, np.abs(one).max(), inverse=False)
+        out[i] = found
+    return out, ok
+
+
+def _banded(block: Array, link: Array, right: Array) -> Array | None:
+    """Return the solution (k, l, p) of one chain by a banded factor; None where it is not safely regular."""
+    from scipy.linalg import LinAlgError, cho_solve_banded, cholesky_banded
+
+    k, length = block.shape[:2]
+    # LAPACK's lower band: the entry of row i + d and column i stands in line d, column i
+    band = np.zeros((2 * length, k, length))
+    for d in range(length):
+        band[d, :, : length - d] = np.diagonal(block, -d, 1, 2)
+        band[length + d, :-1, : length - d] = np.diagonal(link.mT, -d, 1, 2)
+        if d:
+            band[length - d, :-1, d:] = np.diagonal(link.mT, d, 1, 2)
+    band = band.reshape(2 * length, -1)
+    if not np.isfinite(band).all() or not (band[0] > 0.0).all():
+        return None
+    try:
+        factor = cholesky_banded(band, lower=True, check_finite=False)
+    except LinAlgError:
+        return None
+    if (factor[0] ** 2 <= _OPEN * band[0]).any():
+        return None
+    flat = right.reshape(k * length, -1)
+    return np.asarray(cho_solve_banded((factor, True), flat, check_finite=False)).reshape(right.shape)
+
+
+def inverse_blocks(block: Array, link: Array) -> tuple[Array, Array]:
+    """Return the blocks (..., k, l, l) on the diagonal of the inverse of a chain, and whether it is regular."""
+    none = np.zeros((*block.shape[:-1], 0))
+    _, (inner, _), ok = _reduce(block, link, none, np.abs(block).max((-1, -2, -3)), inverse=True)
+    return inner, ok
+
+
+class _Parts(NamedTuple):
+    """Blocks of an inverse on its diagonal, and beside it: those of each block with the next."""
+
+    inner: Array
+    beside: Array
+
+
+def _reduce(block: Array, link: Array, right: Array, size: Array, inverse: bool) -> tuple[Array, _Parts, Array]:
+    """Return solutions, parts of the inverse (empty where they are not wanted), and whether the chain is regular."""
+    k, length = block.shape[-3:-1]
+    eye = np.broadcast_to(np.eye(length) if inverse else np.zeros((length, 0)), (*block.shape[:-1], length * inverse))
+    if k == 1:
+        both, good = linalg.solve(block, np.concatenate([right, eye], axis=-1), _OPEN)
+        left = np.diagonal(block, axis1=-2, axis2=-1).min((-1, -2))
+        ok = good.all(-1) & (left > _ROUNDING * size)
+        inner = np.where(ok[..., None, None, None], both[..., right.shape[-1] :], np.nan)
+        return both[..., : right.shape[-1]], _Parts(inner, link), ok
+    # an odd block knows those before and after it; the last one of an even number has none after it
+    after = np.zeros((*block.shape[:-3], k // 2, length, length))
+    after[..., : (k - 1) // 2, :, :] = link[..., 1::2, :, :]
+    before = link[..., ::2, :, :].mT
+    sides = np.concatenate([before, after, right[..., 1::2, :, :], eye[..., 1::2, :, :]], axis=-1)
+    solved = _regular(block[..., 1::2, :, :], sides)
+    back, on, own, self_ = np.split(solved, np.cumsum([length, length, right.shape[-1]]), axis=-1)
+    # what is left of the even blocks
+    rest, vector = block[..., ::2, :, :].copy(), right[..., ::2, :, :].copy()
+    m = k // 2
+    rest[..., :m, :, :] -= before.mT @ back
+    vector[..., :m, :, :] -= before.mT @ own
+    follow = (k - 1) // 2
+    rest[..., 1:, :, :] -= (after.mT @ on)[..., :follow, :, :]
+    vector[..., 1:, :, :] -= (after.mT @ own)[..., :follow, :, :]
+    between = -(before.mT @ on)[..., :follow, :, :]
+    even, parts, ok = _reduce(rest, between, vector, size, inverse)
+    out = np.empty((*block.shape[:-3], k, length, right.shape[-1]))
+    out[..., ::2, :, :] = even
+    behind = _behind(even, m)
+    out[..., 1::2, :, :] = own - back @ even[..., :m, :, :] - on @ behind
+    return out, _inner(parts, back, on, self_, k) if inverse else parts, ok
+
+
+def _behind(even: Array, count: int) -> Array:
+    """Return what stands at the even blocks after the odd ones; zero where there is none."""
+    out = np.zeros((*even.shape[:-3], count, *even.shape[-2:]))
+    out[..., : even.shape[-3] - 1, :, :] = even[..., 1:, :, :]
+    return out
+
+
+def _inner(parts: _Parts, back: Array, on: Array, own: Array, k: int) -> _Parts:
+    """Return the parts of the inverse from those of the even blocks: x_odd = own - back x_before - on x_after."""
+    m, first = k // 2, parts.inner[..., : k // 2, :, :]
+    second, across = _behind(parts.inner, m), np.zeros_like(back)
+    across[..., : parts.beside.shape[-3], :, :] = parts.beside
+    with_before = -(back @ first + on @ across.mT)
+    with_after = -(back @ across + on @ second)
+    inner = np.empty((*back.shape[:-3], k, *back.shape[-2:]))
+    inner[..., ::2, :, :] = parts.inner
+    inner[..., 1::2, :, :] = own - with_before @ back.mT - with_after @ on.mT
+    beside = np.empty((*back.shape[:-3], k - 1, *back.shape[-2:]))
+    beside[..., ::2, :, :] = with_before.mT
+    beside[..., 1::2, :, :] = with_after[..., : (k - 1) // 2, :, :]
+    return _Parts(inner, beside)
+
+
+def _regular(block: Array, right: Array) -> Array:
+    """Return solutions of blocks by themselves, of least norm where they are singular."""
+    solved, good = linalg.solve(block, right, _OPEN)
+    if not good.all():
+        root, _ = linalg.root(block[~good])
+        solved[~good] = root @ (root.mT @ right[~good])
+    return solved

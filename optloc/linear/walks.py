@@ -1,0 +1,136 @@
+"""What walks of biases say of the unknowns of neighbouring epochs, as information."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from optloc.base import linalg
+from optloc.base.types import Array, Bias
+from optloc.problem.clocks import process, rate_name
+from optloc.problem.layout import Layout
+from optloc.problem.problem import Problem
+
+
+def walks(problem: Problem) -> tuple[Bias, ...]:
+    """Return the biases of a problem that walk from epoch to epoch."""
+    return tuple(bias for bias in problem.biases if bias.form == "walk")
+
+
+def walk_names(problem: Problem) -> tuple[str, ...]:
+    """Return the names of the unknowns of epochs that walk: values, and rates."""
+    return tuple(name for bias in walks(problem) for name in state_of(bias))
+
+
+def state_of(bias: Bias) -> tuple[str, ...]:
+    """Return the names of the values of a walk, and of its rates where it has some."""
+    assert bias.density is not None
+    return (bias.name, rate_name(bias.name))[: bias.density.shape[1]]
+
+
+def free_of(problem: Problem) -> int:
+    """Return how many unknowns of all walks nothing is known of beforehand: what begins them, not their steps."""
+    return sum(len(b.members) * len(state_of(b)) - (0 if b.sigma is None else np.size(b.sigma)) for b in walks(problem))
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """Information about the unknowns of k epochs that ties each epoch to the next.
+
+    Parameters
+    ----------
+    block : array (k, l, l)
+        About the unknowns of an epoch.
+    link : array (k - 1, l, l)
+        Rows of an epoch, columns of the next.
+    vector : array (..., k, l)
+        Right-hand side at given vectors.
+    cost : array (...)
+        What the steps cost there.
+    """
+
+    block: Array
+    link: Array
+    vector: Array
+    cost: Array
+
+
+def chain_at(problem: Problem, x: Array) -> Chain:
+    """Return what the walks of a problem say at vectors x (..., size).
+
+    Of the steps ``e = x_{j+1} - F x_j`` with precision W the information is ``F'WF``, ``-F'W`` and ``W``, and the
+    right-hand side ``F'We`` and ``-We``.
+    """
+    layout, k = problem.layout, problem.epochs
+    local = layout.split(x)[1]
+    block, link = np.zeros((k, layout.n_local, layout.n_local)), np.zeros((k - 1, layout.n_local, layout.n_local))
+    vector, cost = np.zeros(local.shape), np.zeros(x.shape[:-1])
+    for bias, place, F, W in _steps(problem):
+        state = local[..., place]  # (..., k, q, o)
+        error = state[..., 1:, :, :] - (F[:, None] @ state[..., :-1, :, :, None])[..., 0]
+        pull = (W @ error[..., None])[..., 0]
+        across = F.mT[:, None] @ W
+        one, two = place[:, :, None], place[:, None, :]
+        block[:-1, one, two] += across @ F[:, None]
+        block[1:, one, two] += W
+        link[:, one, two] -= across
+        vector[..., :-1, place] += (F.mT[:, None] @ pull[..., None])[..., 0]
+        vector[..., 1:, place] -= pull
+        cost = cost + (error * pull).sum((-1, -2, -3))
+        if bias.sigma is not None:
+            first, precision = place[:, 0], np.ravel(bias.sigma) ** -2.0
+            off = np.ravel(bias.mean) - local[..., 0, first]
+            block[0, first, first] += precision
+            vector[..., 0, first] += precision * off
+            cost = cost + (precision * off**2).sum(-1)
+    return Chain(block, link, vector, cost)
+
+
+def _steps(problem: Problem) -> Iterator[tuple[Bias, Array, Array, Array]]:
+    """Yield each walk, the local columns (q, o) of its states, its transitions and the precisions of its steps."""
+    for bias in walks(problem):
+        F, Q = process(bias, problem.times)
+        yield bias, places(problem.layout, bias), F, linalg.inverse(Q, 0.0)[0]
+
+
+def places(layout: Layout, bias: Bias) -> Array:
+    """Return the local columns (q, o) of the states of a walk."""
+    starts = [layout.find(name)[0].start for name in state_of(bias)]
+    return np.stack([start + np.arange(len(bias.members)) for start in starts], axis=1)
+
+
+def wander(problem: Problem, truth: Array, seed: int | np.random.SeedSequence, trials: int | None = None) -> Array:
+    """Return true parameter vectors whose walks are drawn: they begin where the given ones do.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its walks say how they go.
+    truth : array (..., size)
+        True parameter vectors in the order of ``problem.layout``; of walks the first epoch counts.
+    seed : int or SeedSequence
+        Decides the draw.
+    trials : int, optional
+        Number of independent draws; they become the first axis.
+
+    Returns
+    -------
+    array (trials, ..., size) or (..., size)
+        For `optloc.simulate`, which draws the noise of the rows.
+    """
+    rng, truth = np.random.default_rng(seed), np.asarray(truth, dtype=float)
+    shape = truth.shape if trials is None else (trials, *truth.shape)
+    out = np.array(np.broadcast_to(truth, shape))
+    local = out[..., problem.layout.n_shared :].reshape(*shape[:-1], problem.epochs, problem.layout.n_local)
+    for bias in walks(problem):
+        (F, Q), place = process(bias, problem.times), places(problem.layout, bias)
+        # not by eigenvectors, as `optloc.linear.simulate.samples` says
+        root = linalg.factor_semidefinite(Q)
+        noise = (root @ rng.standard_normal((*shape[:-1], *Q.shape[:-1], 1)))[..., 0]
+        for j in range(problem.epochs - 1):
+            before = local[..., j, :][..., place]
+            local[..., j + 1, place] = (F[j] @ before[..., None])[..., 0] + noise[..., j, :, :]
+    out[..., problem.layout.n_shared :] = local.reshape(*shape[:-1], -1)
+    return out

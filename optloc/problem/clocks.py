@@ -1,0 +1,240 @@
+"""Errors that change during a run: walks by their spectral densities or Allan deviations, splines by their knots."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from optloc.base.arrays import numbers
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array, Bias
+from optloc.base.units import SPEED_OF_LIGHT
+
+DEGREE = 3
+"""Of the polynomials between knots: cubic ones are smooth, and four of them meet at any time."""
+
+
+# Splines: an error that is a smooth function of time.
+
+
+def spline_members(bias: Bias) -> tuple[str, ...]:
+    """Return what the coefficients of a spline are called: a member, and the time that its coefficient says most of.
+
+    The times are the averages of the knots under each piece (Greville's abscissae), where a coefficient is about the
+    value of the spline.
+    """
+    return tuple(f"{member} at {time:.6g} s" for member in bias.members for time in greville(bias))
+
+
+def greville(bias: Bias) -> Array:
+    """Return the times (c,) that the coefficients of each member of a spline say most of, seconds."""
+    assert bias.knots is not None
+    full = _padded(bias.knots)
+    return np.array([full[i + 1 : i + 1 + DEGREE].mean() for i in range(coefficients(bias.knots))])
+
+
+def coefficients(knots: Array) -> int:
+    """Return how many coefficients a spline over knots (p,) has."""
+    return len(knots) + DEGREE - 1
+
+
+def pieces(knots: Array, times: Array) -> tuple[Array, Array]:
+    """Return which coefficients (n, 4) of a spline count at times (n,), and how much (n, 4).
+
+    Parameters
+    ----------
+    knots : array (p,)
+        Increasing times, seconds; the first and the last are counted four times, so that the spline ends there.
+    times : array (n,)
+        Within the knots.
+
+    References
+    ----------
+    C. de Boor, "A Practical Guide to Splines" (1978), chapters IX and X.
+    """
+    from scipy.interpolate import BSpline
+
+    design = BSpline.design_matrix(times, _padded(knots), DEGREE)
+    return design.indices.reshape(len(times), -1), design.data.reshape(len(times), -1)
+
+
+def _padded(knots: Array) -> Array:
+    return np.concatenate([np.full(DEGREE, knots[0]), knots, np.full(DEGREE, knots[-1])])
+
+
+def knots_over(times: Array, knots: Any, where: str) -> Array:
+    """Return knots (p,) of a spline over a run: those given, or so many evenly spaced ones.
+
+    Raises
+    ------
+    InvalidProblem
+        Where they are not two or more increasing numbers, or the run reaches beyond them.
+    """
+    place = f"{where}, knots"
+    if knots is None:
+        raise InvalidProblem("a spline needs knots", place, "give their times in seconds, or how many there are")
+    array = np.asarray(numbers(knots, place))
+    if array.ndim == 0 and (array < 2 or array != round(float(array))):
+        raise InvalidProblem(f"{knots} knots", place, "give two or more: the first and the last time are knots")
+    if array.ndim == 0:
+        return np.linspace(times[0], times[-1], int(array))
+    if array.ndim != 1 or len(array) < 2 or not (np.diff(array) > 0.0).all():
+        raise InvalidProblem("the knots are not two or more increasing times", place, "sort them")
+    if times[0] < array[0] or times[-1] > array[-1]:
+        what = f"the run lasts from {times[0]:.6g} to {times[-1]:.6g} s, and the knots do not"
+        raise InvalidProblem(what, place, "let the first and the last knot enclose it")
+    return array
+
+
+# Walks: an error that is the sum of independent steps, or whose rate is.
+
+
+def rate_name(name: str) -> str:
+    """Return what the rates of a walk are called, where it has some."""
+    return f"{name} rate"
+
+
+def process(bias: Bias, times: Array) -> tuple[Array, Array]:
+    """Return how a walk goes from one epoch to the next, and the covariance of what it does besides.
+
+    White noise of a spectral density q1 that is added to the rate of the error, and white noise of a density q2 that
+    is added to the rate of its rate: over a time t they add ``q1 t + q2 t^3 / 3`` to the variance of the error and
+    ``q2 t`` to that of its rate, with the covariance ``q2 t^2 / 2``.
+
+    Parameters
+    ----------
+    bias : Bias
+        A walk of q members, of order o = 1, the error alone, or 2, with its rate.
+    times : array (k,)
+        Seconds of the epochs.
+
+    Returns
+    -------
+    transition : array (k - 1, o, o)
+        State of an epoch to that of the next.
+    covariance : array (k - 1, q, o, o)
+        Of the steps.
+
+    References
+    ----------
+    A. J. van Dierendonck, J. B. McGraw, R. G. Brown, "Relationship between Allan variances and Kalman filter
+    parameters", Proc. 16th PTTI (1984), eq. 16; R. G. Brown, P. Y. C. Hwang, "Introduction to Random Signals and
+    Applied Kalman Filtering" (1997), eq. 10.3.
+    """
+    assert bias.density is not None
+    step, order = np.diff(times), bias.density.shape[1]
+    transition = np.broadcast_to(np.eye(order), (len(step), order, order)).copy()
+    white, t = bias.density[:, 0], step[:, None]
+    covariance = np.zeros((len(step), len(white), order, order))
+    covariance[..., 0, 0] = white * t
+    if order == 2:
+        transition[:, 0, 1], wander = step, bias.density[:, 1]
+        covariance[..., 0, 0] += wander * t**3 / 3.0
+        covariance[..., 0, 1] = covariance[..., 1, 0] = wander * t**2 / 2.0
+        covariance[..., 1, 1] = wander * t
+    return transition, covariance
+
+
+def density_of(density: Any, rate_density: Any, members: int, where: str) -> Array:
+    """Return the spectral densities (q, 1 or 2) of a walk, one line for each member.
+
+    Parameters
+    ----------
+    density, rate_density : float or array (q,), optional
+        Of the noise that the error is the sum of, unit squared per second, and of that which its rate is the sum of,
+        unit squared per second cubed; None: none.
+    members : int
+        Their number q.
+    where : str
+        Place to name.
+    """
+    if density is None and rate_density is None:
+        advice = "give density, rate_density or both, for instance by optloc.clock_densities"
+        raise InvalidProblem("a walk needs a spectral density", where, advice)
+    columns = []
+    for values, name in ((density, "density"), (rate_density, "rate_density")):
+        if values is None and name == "rate_density":
+            continue
+        array = np.asarray(numbers(0.0 if values is None else values, f"{where}, {name}"))
+        if array.shape not in {(), (members,)}:
+            raise InvalidProblem(f"{name} has shape {array.shape}", where, f"give one, or one for each of {members}")
+        # of two noises one may be nothing; a walk without any is an offset
+        low = 0.0 if name == "density" and rate_density is not None else np.finfo(float).tiny
+        if not (np.isfinite(array) & (array >= low)).all():
+            raise InvalidProblem(f"{name} is not positive", where, "an error that stays has the form 'offset'")
+        columns.append(np.broadcast_to(array, (members,)))
+    return np.stack(columns, axis=1)
+
+
+def clock_densities(tau: Any, deviation: Any, speed: float = SPEED_OF_LIGHT) -> tuple[float, float]:
+    """Return the spectral densities of a clock from its Allan deviations, for errors in metres.
+
+    White noise of the frequency and a random walk of it give the Allan variance ``h1 / tau + h2 tau / 3``; h1 and h2
+    are the least-squares values that are not negative, each deviation counted by its own size.
+
+    Parameters
+    ----------
+    tau : float or array (n,)
+        Averaging times, seconds.
+    deviation : float or array (n,)
+        Allan deviations of the relative frequency; of a single one the frequency noise is taken to be white.
+    speed : float
+        Metres that a second stands for.
+
+    Returns
+    -------
+    density : float
+        ``speed^2 h1``, square metres per second: for `optloc.with_bias` of the form "walk".
+    rate_density : float
+        ``speed^2 h2``, square metres per second cubed.
+
+    Raises
+    ------
+    InvalidProblem
+        Where they are not positive numbers, one deviation for each time.
+
+    References
+    ----------
+    D. W. Allan, "Time and frequency (time-domain) characterization, estimation, and prediction of precision clocks and
+    oscillators", IEEE Trans. UFFC 34 (1987); L. Galleani, "A tutorial on the two-state model of the atomic clock
+    noise", Metrologia 45 (2008) S175.
+    """
+    from scipy.optimize import nnls
+
+    given = ((tau, "tau"), (deviation, "deviation"))
+    times, sizes = (np.atleast_1d(np.asarray(numbers(value, name))) for value, name in given)
+    if times.shape != sizes.shape or times.ndim != 1:
+        what = f"{times.size} averaging times for {sizes.size} Allan deviations"
+        raise InvalidProblem(what, "deviation", "give one deviation for each time")
+    if not (np.isfinite(times * sizes) & (times > 0.0) & (sizes > 0.0)).all():
+        raise InvalidProblem("a time or a deviation is not positive", "deviation", "give such as 1.0 s and 1e-9")
+    design = np.stack([1.0 / times, times / 3.0], axis=1)[:, : min(2, len(times))]
+    # relative to each: what a deviation of 1e-12 says is not lost beside one of 1e-9
+    found, _ = nnls(design / sizes[:, None] ** 2, np.ones(len(sizes)))
+    white, wander = (*found.tolist(), 0.0)[:2]
+    return speed**2 * white, speed**2 * wander
+
+
+def effects(bias: Bias, times: Array, origin: float, epoch: Array) -> tuple[Array, Array]:
+    """Return which of its entries each touch of a bias adds to its row, and with which factor, each (n, c).
+
+    Parameters
+    ----------
+    bias : Bias
+        What is added: an offset, a drift, a spline or a walk. Scales have the same entries, of which times the value is
+        added.
+    times : array (k,)
+        Seconds of the epochs.
+    origin : float
+        Time from which drifts count.
+    epoch : int array (n,)
+        Epoch of the row of each touch.
+    """
+    if bias.form == "spline":
+        assert bias.knots is not None
+        entry, factor = pieces(bias.knots, times)
+        return bias.member[:, None] * coefficients(bias.knots) + entry[epoch], bias.coefficient[:, None] * factor[epoch]
+    # A drift is an offset that grows: here is where seconds enter, nowhere else.
+    since = (times - origin)[epoch] if bias.form == "drift" else 1.0
+    return bias.member[:, None], (bias.coefficient * since)[:, None]
