@@ -135,8 +135,10 @@ def explain_misfit(problem: Problem, x: Array) -> tuple[Explained, ...]:
         return ()
     x, cost = descend(problem, x)
     before = float(tail_probability(cost, np.array([dof]))[0])
-    # and as many again as are tried about the ends of the best step and the best burst
-    more = 3 * (2 * _around(problem) + 1) if any(one.form == "step" for one in found) else 0
+    # a search for the ends of steps and bursts picks the best of all that it could have reached: those of every channel
+    # that begin at any epoch, and end at any of so many
+    channels = sum(one.form == "offset" and one.per == "station" for one in found)
+    more = channels * problem.epochs * (2 * _around(problem) + 2) if any(o.form == "step" for o in found) else 0
     level = 1.0 - FALSE_ALARM / (len(found) + more)
     # a statistic is the square of a projection of the residual: none is larger than the cost
     if cost[0] <= quantile(level, 1):
