@@ -14,6 +14,7 @@ from optloc.base.types import Array, Band, Bias, Motion, Polygon, Prior, Rows, S
 from optloc.base.units import LARGEST
 from optloc.models import MODELS
 from optloc.models.surfaces import SURFACES
+from optloc.problem.clocks import check_changing
 from optloc.problem.epochs import separable, tied, untied
 from optloc.problem.noise import Noise
 from optloc.problem.problem import Problem
@@ -348,7 +349,7 @@ def _check_bias(problem: Problem, bias: Bias, where: str) -> None:
         _check_rotation(problem, bias, where)
     if bias.form == "time":
         _check_course(problem, bias, where)
-    _check_changing(problem, bias, where)
+    check_changing(bias, problem.times, where)
     if bias.sigma is None:
         return
     wanted = problem.layout.find(bias.name)[0].size
@@ -360,28 +361,6 @@ def _check_bias(problem: Problem, bias: Bias, where: str) -> None:
     sigma = np.asarray(bias.sigma)
     if not ((sigma >= 1.0 / LARGEST) & (sigma <= LARGEST)).all() or _beyond(bias.mean)[0].any():
         raise InvalidProblem("sigma is not positive or mean is not finite", where, "give true numbers, or no sigma")
-
-
-def _check_changing(problem: Problem, bias: Bias, where: str) -> None:
-    """Refuse walks without densities and splines without knots, and what runs of one epoch cannot tell."""
-    if bias.form == "walk":
-        density = bias.density
-        if density is None or density.shape not in {(len(bias.members), 1), (len(bias.members), 2)}:
-            advice = f"give an array ({len(bias.members)}, 1), or with rates ({len(bias.members)}, 2)"
-            raise InvalidProblem("a walk has no spectral densities", where, advice)
-        if not (np.isfinite(density) & (density >= 0.0)).all() or not (density[:, -1:] > 0.0).all():
-            raise InvalidProblem(
-                "a spectral density is not positive", where, "an error that stays has the form 'offset'"
-            )
-        if problem.epochs == 1:
-            raise InvalidProblem("a walk needs several epochs", where, "use the form offset")
-    if bias.form == "spline":
-        knots, times = bias.knots, problem.times
-        if knots is None or knots.ndim != 1 or len(knots) < 2 or not (np.diff(knots) > 0.0).all():
-            raise InvalidProblem("a spline has no increasing knots", where, "give two times or more")
-        if times[0] < knots[0] or times[-1] > knots[-1]:
-            what = f"the run lasts from {times[0]:.6g} to {times[-1]:.6g} s, and the knots do not"
-            raise InvalidProblem(what, f"{where}, knots", "let the first and the last knot enclose it")
 
 
 def _check_rotation(problem: Problem, bias: Bias, where: str) -> None:

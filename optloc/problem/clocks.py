@@ -238,3 +238,25 @@ def effects(bias: Bias, times: Array, origin: float, epoch: Array) -> tuple[Arra
     # A drift is an offset that grows: here is where seconds enter, nowhere else.
     since = (times - origin)[epoch] if bias.form == "drift" else 1.0
     return bias.member[:, None], (bias.coefficient * since)[:, None]
+
+
+def check_changing(bias: Bias, times: Array, where: str) -> None:
+    """Refuse walks without densities and splines without knots, and what runs (times (k,)) of one epoch cannot tell."""
+    if bias.form == "walk":
+        density = bias.density
+        if density is None or density.shape not in {(len(bias.members), 1), (len(bias.members), 2)}:
+            advice = f"give an array ({len(bias.members)}, 1), or with rates ({len(bias.members)}, 2)"
+            raise InvalidProblem("a walk has no spectral densities", where, advice)
+        if not (np.isfinite(density) & (density >= 0.0)).all() or not (density[:, -1:] > 0.0).all():
+            raise InvalidProblem(
+                "a spectral density is not positive", where, "an error that stays has the form 'offset'"
+            )
+        if len(times) == 1:
+            raise InvalidProblem("a walk needs several epochs", where, "use the form offset")
+    if bias.form == "spline":
+        knots = bias.knots
+        if knots is None or knots.ndim != 1 or len(knots) < 2 or not (np.diff(knots) > 0.0).all():
+            raise InvalidProblem("a spline has no increasing knots", where, "give two times or more")
+        if times[0] < knots[0] or times[-1] > knots[-1]:
+            what = f"the run lasts from {times[0]:.6g} to {times[-1]:.6g} s, and the knots do not"
+            raise InvalidProblem(what, f"{where}, knots", "let the first and the last knot enclose it")
