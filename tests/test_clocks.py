@@ -359,3 +359,36 @@ def test_a_file_says_how_clocks_walk(tmp_path):
 def test_a_file_that_says_it_wrongly_is_refused(tmp_path, lines, words):
     with pytest.raises(InvalidProblem, match=words):
         site(tmp_path, lines)
+
+
+def test_an_aircraft_that_reports_lets_unsynchronised_receivers_fix_others():
+    """Six receivers on the ground with walking clocks; one aircraft's places are known, another's course is not."""
+    stations = 1e3 * np.array(
+        [[0, 0, 0.1], [40, 5, 0.3], [12, 38, 0.6], [-35, 22, 0.2], [-28, -30, 0.4], [25, -33, 0.8]]
+    )
+    times, trials = 4.0 * np.arange(30), 40
+    reported = np.array([-30e3, 10e3, 10.2e3]) + times[:, None] * np.array([210.0, -60.0, 0.0])
+    rows = optloc.measured(
+        "tdoa",
+        a=np.tile([1, 2, 3, 4, 5], 60),
+        b=0,
+        epoch=np.repeat(np.arange(30), 10),
+        target=np.tile(np.repeat([0, 1], 5), 30),
+        arrival_sigma=15.0,
+    )
+    motions = (optloc.Motion(order=1), optloc.Motion(known=reported[:, None]))
+    plain = optloc.assemble(stations, rows, times=times, motions=motions)
+    model = with_bias(plain, "clock", form="walk", members=plain.stations.names[1:], density=81.0)
+    begin = np.zeros((30, 5))
+    begin[0] = [350.0, -820.0, 130.0, 610.0, -240.0]
+    silent = np.array([18e3, 24e3, 7.6e3, -150.0, -110.0, 0.0])
+    data = optloc.simulate(model, optloc.wander(model, np.concatenate([silent, begin.ravel()]), 3, trials), 4)
+    fix = optloc.solve(data)
+    assert (fix.code == optloc.Status.UNPROVEN).sum() >= trials - 1  # one in a thousand may be told a misfit
+    error = fix.x[:, :6] - silent
+    from scipy.stats import chi2
+
+    low, high = chi2.ppf([0.005, 0.995], 6 * trials) / (6 * trials)
+    assert low < np.mean(_nees(error, fix.cov[:, :6, :6])[0]) / 6.0 < high
+    still = optloc.solve(with_bias(plain.with_rows(z=data.z[:4]), "clock", members=plain.stations.names[1:]))
+    assert (still.code == optloc.Status.MISFIT).all()
