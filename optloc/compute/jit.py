@@ -21,6 +21,8 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 # A context variable: one thread may run plainly while others run machine code.
 _PLAIN = ContextVar("plain", default=False)
 _LOCK = held_by_forks(Lock())
+# While a thread loads or makes machine code it has numba's own lock, which a child of a fork would wait for in vain.
+_LOADING = held_by_forks(Lock())
 
 
 @cache
@@ -121,7 +123,7 @@ class _Kernel:
         """Load or compile the form for arguments of these types, while other processes wait for it."""
         REPORTER.begin()
         try:
-            with locked(self.name):
+            with locked(self.name), _LOADING:
                 machine = self.machine
                 machine.compile(tuple(machine.typeof_pyval(value) for value in args))
         finally:

@@ -6,7 +6,7 @@ from study.texts import QUICK, plan
 
 from optloc.base.types import Status
 from optloc.papers.registration import PRINTED, Setting
-from optloc.papers.registration import recursion as printed
+from optloc.papers.registration_recursion import recursion as printed
 from optloc.solvers.pool import begin
 from optloc.solvers.stages import lsr
 from optloc.solvers.verdict.judge import judge
@@ -18,7 +18,7 @@ from optloc.study.trial import compute
 def test_the_recursion_is_that_of_the_paper():
     setting = Setting(PRINTED, 3, 1, 1)
     run, start = setting.draw(120), setting.starts(1.0)
-    wanted = printed(PRINTED, run.z.reshape(3, 120, 4), start)[:, -1]
+    wanted = printed(PRINTED.track(120), PRINTED.times(120), run.z.reshape(3, 120, 4), start)[:, -1]
     found = recursion(run, np.concatenate([start, np.zeros((3, 4))], axis=1))
     assert np.abs(found - wanted).max() < 1e-6
 
