@@ -79,18 +79,18 @@ def test_the_table_of_the_documentation(data_dir):
 def test_flights_from_the_floor_find_themselves_in_the_air(data_dir, flight):
     """On the floor multipath puts most rows metres off: no state there is right, but one is soon there in the air."""
     problem, truth = uwb.course(data_dir / "util_uwb_tdoa", flight, WINDOW, airborne=False)
-    entries, seconds, began = [], None, process_time()
+    entries, scans, began = [], None, process_time()
     for entry in tracked(problem, polynomial(1, ACCELERATION), "ekf", rules=Rules(gate=GATE)):
         entries.append(entry)
-        if seconds is None and np.isfinite(entry.updated.mean).all():
-            seconds = process_time() - began
+        if scans is None and np.isfinite(entry.updated.mean).all():
+            scans, seconds = len(entries), process_time() - began
     error = np.linalg.norm(collected(entries, 3).position - truth, axis=-1)
     air = np.flatnonzero(truth[:, 2] > 0.5)
     report(
-        f"UWB {flight} from the floor: a state after {seconds:.2f} s of work; in the air {np.isnan(error[air]).sum()} "
+        f"UWB {flight} from the floor: a state after {scans} scans and {seconds:.2f} s of work; in the air {np.isnan(error[air]).sum()} "
         f"scans without one, largest error {np.nanmax(error[air]):.2f} m"
     )
-    assert seconds < 2.0
+    assert scans <= 60  # each try takes bounded work: 2 s in all on a quiet core; without a bound 575 scans took 70 s
     # never lost where the rows are good; up to two seconds are spent on a start that does not contradict itself
     assert np.nanmax(error[air]) < 1.0
     assert not np.isnan(error[air[20:]]).any()
