@@ -87,8 +87,8 @@ def test_flights_from_the_floor_find_themselves_in_the_air(data_dir, flight):
     error = np.linalg.norm(collected(entries, 3).position - truth, axis=-1)
     air = np.flatnonzero(truth[:, 2] > 0.5)
     report(
-        f"UWB {flight} from the floor: a state after {scans} scans and {seconds:.2f} s of work; in the air {np.isnan(error[air]).sum()} "
-        f"scans without one, largest error {np.nanmax(error[air]):.2f} m"
+        f"UWB {flight} from the floor: a state after {scans} scans and {seconds:.2f} s of work; in the air "
+        f"{np.isnan(error[air]).sum()} scans without one, largest error {np.nanmax(error[air]):.2f} m"
     )
     assert scans <= 60  # each try takes bounded work: 2 s in all on a quiet core; without a bound 575 scans took 70 s
     # never lost where the rows are good; up to two seconds are spent on a start that does not contradict itself
