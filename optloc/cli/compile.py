@@ -22,7 +22,7 @@ import typer
 from rich.table import Table
 
 from optloc.base.frames import Frame
-from optloc.base.types import Array, Stations
+from optloc.base.types import Array, Motion, Stations
 from optloc.cli.output import Screen, dumps, meter
 from optloc.compute.filter import absorb
 from optloc.compute.jit import REPORTER, compiling, enabled, insist_on, names_in, plain
@@ -98,6 +98,9 @@ def _prove_runs() -> None:
     rows = measured("tdoa", a=np.tile(np.arange(1, 6), epochs), b=0, epoch=np.repeat(np.arange(epochs), 5), sigma=1.0)
     problem = simulate(assemble(Stations(place, tuple("ABCDEF")), rows), _TARGET, 1, _FEW).flat()
     certify(problem, _plainly_solved(problem))
+    moving = assemble(_STATIONS[:, :2], rows, times=np.arange(float(epochs)), motions=(Motion(1),))
+    problem = simulate(moving, [*_TARGET[:2], 30.0, -10.0], 1).flat()
+    certify(problem, _plainly_solved(problem))
 
 
 def _search() -> None:
@@ -154,7 +157,10 @@ PARTS: Mapping[str, Part] = {
         "proofs of runs",
         "optloc.proof",
         (_prove_runs,),
-        tuple(f"optloc.proof.runs.{name}" for name in ("search.tables_of", "prove.prove_run", "prove.cost_of_place")),
+        (
+            *(f"optloc.proof.runs.{name}" for name in ("search.tables_of", "prove.prove_run", "prove.cost_of_place")),
+            *(f"optloc.proof.runs.courses.{name}" for name in ("cost_of_state", "hessian_of_state", "prove_course")),
+        ),
     ),
     "searches": Part(
         "searches for starts",

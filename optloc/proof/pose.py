@@ -131,8 +131,10 @@ def _number_of(made: Columns, row: Row, node: str | Node) -> int:
 
 
 def own_epochs(problem: Problem) -> int:
-    """Return at how many epochs stations have a place, or a velocity, of their own."""
+    """Return at how many epochs stations, or the target, have a place or a velocity of their own."""
     stations = problem.stations
+    if problem.motions[0].order > 0:
+        return problem.epochs
     given = [array for array in (stations.position, stations.velocity) if array is not None]
     return max(int(array.shape[-3]) for array in given)
 
@@ -226,22 +228,36 @@ def mark_alone(kinds: Array, data: Array, K: Array, w: Array) -> Array:
     array (B or N, J, width)
         N where marks differ from problem to problem.
     """
-    marked = [j for j, kind in enumerate(kinds) if NODES[kind].mark is not None]
-    if not marked:
+    if not any(NODES[kind].mark for kind in kinds):
         return data
     information = np.swapaxes(K, -1, -2) @ K
     size = np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
     # Relative to both columns: beside a long one any tie of a short one would look like none.
     across = size[..., :, None] * size[..., None, :]
     alone = (np.abs(information) <= _ORTHOGONAL * across + across * np.eye(len(kinds)) * 2.0).all(-1)
-    force = (np.swapaxes(K, -1, -2) @ w[..., None])[..., 0]
+    return mark_nodes(kinds, data, alone, size, (np.swapaxes(K, -1, -2) @ w[..., None])[..., 0], w)
+
+
+def mark_nodes(kinds: Array, data: Array, alone: Array, size: Array, force: Array, w: Array) -> Array:
+    """Return the numbers of nodes with a mark on those that are alone in their rows, see `mark_alone`.
+
+    Parameters
+    ----------
+    kinds, data, w : arrays
+        As there.
+    alone, size : array (B, J)
+        Whether no other node, and no other unknown, is in a node's rows; lengths of the columns K.
+    force : array (N, J)
+        ``K'w``.
+    """
     centred = (np.abs(force) <= _ORTHOGONAL * size * np.linalg.norm(w, axis=-1, keepdims=True)).all(0)
     # Of a column that is orthogonal to all others, the least squares: the value that the rows say of the node.
     with np.errstate(invalid="ignore", divide="ignore"):
         measured = np.where(size > 0.0, force / size**2, 0.0)
-    differs = any(NODES[kinds[j]].differs for j in marked)
+    marked = {int(kind) for kind in kinds if NODES[kind].mark is not None}
+    differs = any(NODES[kind].differs for kind in marked)
     out = np.array(np.broadcast_to(data, (len(w), *data.shape[1:])) if differs else data)
-    for kind in {int(kinds[j]) for j in marked}:
+    for kind in marked:
         own, mark = kinds == kind, NODES[kind].mark
         assert mark is not None
         numbers = out[:, own]
@@ -375,7 +391,7 @@ def pose_affinely(problem: Problem) -> Affine | None:
 
 @dataclass(frozen=True, slots=True)
 class Others:
-    """Unknowns beside the position: how rows contain them (m, n), their precision (B, n, n) and mean (B, n)."""
+    """Unknowns beside the target's state: how rows contain them (m, n), their precision (B, n, n) and mean (B, n)."""
 
     touch: Array
     precision: Array
@@ -383,12 +399,12 @@ class Others:
 
     @classmethod
     def of(cls, problem: Problem) -> Others:
-        """Return the unknowns of a problem beside the position, those of stations apart."""
+        """Return the unknowns of a problem beside the target's state, those of stations apart."""
         size = problem.layout.size
         touch = np.zeros((problem.count, size))
         for plan, start in zip(plans(problem), problem.starts, strict=True):
             np.add.at(touch, (start + plan.adds.row, plan.adds.column), plan.adds.coefficient)
-        parts = [part for part in prior_parts(problem) if part[0] != "position"]
+        parts = [part for part in prior_parts(problem) if part[0] not in ("position", "velocity")]
         wide = max(
             (len(array) for _, m, p in parts for array, core in ((m, 1), (p, 2)) if array.ndim > core), default=1
         )

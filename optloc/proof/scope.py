@@ -1,4 +1,4 @@
-"""What the proof covers: one static position and rows of ranges, rates, angles, ratios, heights; and what is a run."""
+"""What the proof covers: one target, the kinds of rows, biases and constraints; and what is a run."""
 
 from __future__ import annotations
 
@@ -42,16 +42,30 @@ def _reasons(problem: Problem) -> Iterator[str]:
     if motion.known is not None or not problem.layout.shares("position"):
         yield "no position is common to all rows"
     if motion.order > 0:
-        yield "the target moves, and the proof is for one that stays"
+        yield from _beyond_courses(problem)
     yield from _beyond_rows(problem)
     yield from _beyond_biases(problem)
     yield from _beyond_stations(problem)
     yield from _beyond_constraints(problem)
-    known = {"position", "stations", *(bias.name for bias in problem.biases)}
+    known = {"position", "velocity", "stations", *(bias.name for bias in problem.biases)}
     # What `optloc.proof.pose` does not write as rows would be left out of the cost without a word.
     for name, _, _ in prior_parts(problem):
         if name not in known:
             yield f"the prior on {name} is not covered"
+
+
+def _beyond_courses(problem: Problem) -> Iterator[str]:
+    """Yield what of a target that moves is beyond the proof: its node at an epoch is one of the place it has then."""
+    motion = problem.motions[0]
+    if motion.order > 1:
+        yield "the target accelerates, and the proof is for one that stays or moves uniformly"
+    if problem.epochs < 2:
+        yield "the target moves, and the proof of that needs several epochs"
+    if problem.dimension > 2:
+        yield "the target moves in space, and the proof is for one that stays or moves in the plane"
+    for rows in problem.rows:
+        if MODELS[rows.kind].velocity:
+            yield f"the target moves, and {rows.kind} rows depend on how fast"
 
 
 def _beyond_rows(problem: Problem) -> Iterator[str]:

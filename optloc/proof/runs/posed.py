@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.linear.normal import weighed
+from optloc.linear.normal import prior_parts, weighed
 from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
 from optloc.proof.batch import plainly
@@ -21,17 +21,18 @@ from optloc.proof.pose import (
     Columns,
     Others,
     Posed,
+    add_linear,
     columns_of,
     counts_from_measured,
+    mark_nodes,
     position_prior,
     project_out,
     roots,
     span_of,
     turned_level,
 )
-from optloc.proof.runs.rows import (
-    Rows,
-)
+from optloc.proof.runs.courses import Course
+from optloc.proof.runs.rows import Rows
 
 # From a problem to its rows, and to those of few epochs.
 
@@ -114,10 +115,12 @@ def _pose(problem: Problem) -> tuple[Run, float]:
     made = columns_of(problem, known)
     others = others.with_stations(problem, made)
     priors = position_prior(problem, made)
-    kinds, data = np.array(made.kinds), made.numbers[0]
+    kinds = np.array(made.kinds)
     value = np.where(counts_from_measured(problem), 0.0, known)[0]
-    whole = _System.of(problem, usable[0], made, others, value, priors)
-    few = _System.of(problem, usable[0] & _few(problem, len(kinds)), made, others, value, priors)
+    prior = _rows_at(priors, len(kinds))
+    whole = _System.of(problem, usable[0], made, others, value, prior)
+    data = whole.marked(kinds, made.numbers[:1])
+    few = _System.of(problem, usable[0] & _few(problem, len(kinds)), made, others, value, prior)
     used = np.bincount(few.nodes.indices, minlength=len(kinds)) > 0
     dense = project_out(few.unknowns, np.column_stack([few.nodes[:, used].toarray(), few.measured]))
     present = (dense != 0.0).any(1)
@@ -126,6 +129,103 @@ def _pose(problem: Problem) -> tuple[Run, float]:
     none = np.empty((0, len(kinds)))
     cost = Cost(kinds, plainly(data), none, rows.w, np.empty((0, 0)), rows.weight, empty_groups(0))
     return Run(cost, rows, look), float(turned_level(problem, others, known)[0])
+
+
+# From a problem whose target moves: its nodes are of the places at their epochs.
+
+
+@dataclass(frozen=True, slots=True)
+class Courses:
+    """The posed costs of a flat batch of problems of a moving target, as `Runs` holds those of one that stays.
+
+    Parameters
+    ----------
+    courses : tuple of (Course, Course)
+        All rows of each problem, and those of few epochs, which cost nowhere more.
+    level : array (N,)
+        As of `Runs`.
+    """
+
+    courses: tuple[tuple[Course, Course], ...]
+    level: Array
+
+    @property
+    def dense(self) -> float:
+        """Return with how many nodes of dense rows a box would be as dear, as far as it takes boxes from a budget."""
+        return float(_DENSE)
+
+    def take(self, items: Array | slice) -> Courses:
+        """Return the posed costs of some of the problems."""
+        numbers = np.arange(len(self.courses))[items]
+        return Courses(tuple(self.courses[i] for i in numbers), self.level[items])
+
+
+def pose_courses(problem: Problem) -> Courses:
+    """Return the costs of a flat batch of N problems over position and velocity, all else at its best values."""
+    problem = weighed(problem)
+    posed = [_pose_course(problem.take(np.array([i]))) for i in range(problem.batch_shape[0])]
+    return Courses(tuple(courses for courses, _ in posed), np.array([level for _, level in posed]))
+
+
+def _pose_course(problem: Problem) -> tuple[tuple[Course, Course], float]:
+    """Return one problem of a batch of one as courses of all rows and of few, and its level of turns."""
+    others = Others.of(problem)
+    known = problem.observed - (others.touch @ others.mean[..., None])[..., 0]
+    usable = (problem.weight > 0.0) & np.isfinite(known)
+    known = np.where(usable, known, 0.0)
+    made = columns_of(problem, known)
+    others = others.with_stations(problem, made)
+    since = problem.times - problem.origin
+    when = np.zeros(len(made.kinds))
+    when[made.column] = since[problem.epoch[made.row]]  # rows that share a node are of one epoch
+    value = np.where(counts_from_measured(problem), 0.0, known)[0]
+    prior, times = _state_prior(problem, made, max(float(np.ptp(since)), 1.0))
+    when = np.concatenate([when, times])
+    parts = [usable[0], usable[0] & _few(problem, len(when))]
+    courses = [_course(_System.of(problem, part, made, others, value, prior), made, when) for part in parts]
+    return (courses[0], courses[1]), float(turned_level(problem, others, known)[0])
+
+
+def _state_prior(problem: Problem, made: Columns, span: float) -> tuple[Any, list[float]]:
+    """Add the nodes of priors on position and velocity; return their rows over all nodes, and when nodes are, seconds.
+
+    A velocity is the difference of two places, a span of time apart, over that.
+    """
+    from scipy import sparse
+
+    rows: list[tuple[int, int, float]] = []
+    times: list[float] = []
+    count = 0
+    for name, mean, precision in prior_parts(problem):
+        if name not in ("position", "velocity"):
+            continue
+        root, centre = roots(precision.reshape(problem.dimension, -1)), mean.reshape(1, -1)
+        ends = [(1.0, 0.0, centre)] if name == "position" else [(1.0, span, span * centre), (-1.0, 0.0, 0.0 * centre)]
+        for factor, time, origin in ends:
+            nodes = add_linear(made, root[None], origin)
+            scale = factor if name == "position" else factor / span
+            rows += [(count + i, node, scale) for i, node in enumerate(nodes)]
+            times += [time] * len(nodes)
+        count += problem.dimension
+    line, node, factor = (np.array(column) for column in zip(*rows, strict=True)) if rows else (np.zeros(0, int),) * 3
+    return sparse.csr_array((factor, (line, node)), shape=(count, len(made.kinds))), times
+
+
+def _sparse(matrix: Any) -> Any:
+    from scipy import sparse
+
+    return sparse.csr_array(matrix)
+
+
+def _course(system: _System, made: Columns, when: Array) -> Course:
+    """Return whitened rows as a course over the nodes that they touch, epoch by epoch."""
+    used = np.flatnonzero(np.bincount(system.nodes.indices, minlength=len(when)))
+    order = used[np.argsort(when[used], kind="stable")]
+    since, first = np.unique(when[order], return_index=True)
+    own = replace(system, nodes=_sparse(system.nodes[:, order]))
+    kinds = np.array(made.kinds)[order]
+    data = own.marked(kinds, made.numbers[:1, order])
+    return Course(kinds, data, np.append(first, len(order)), since, own.rows())
 
 
 def _few(problem: Problem, nodes: int) -> Array:
@@ -146,7 +246,7 @@ class _System:
 
     @classmethod
     def of(
-        cls, problem: Problem, present: Array, made: Columns, others: Others, value: Array, priors: list[int]
+        cls, problem: Problem, present: Array, made: Columns, others: Others, value: Array, prior: Any
     ) -> _System:
         from scipy import sparse  # with the first long run: problems of one epoch need none
 
@@ -155,13 +255,21 @@ class _System:
         precision = others.precision[0]
         used = others.touch.any(0) | precision.any(0)
         root = roots(precision[used][:, used])
-        prior = sparse.csr_array((np.ones(len(priors)), (np.arange(len(priors)), priors)), shape=(len(priors), size))
         none = sparse.csr_array((len(root), size))
         return cls(
             sparse.csr_array(sparse.vstack([white @ design, prior, none])),
-            np.concatenate([white @ others.touch[:, used], np.zeros((len(priors), len(root))), root]),
-            np.concatenate([white @ value, np.zeros(len(priors) + len(root))]),
+            np.concatenate([white @ others.touch[:, used], np.zeros((prior.shape[0], len(root))), root]),
+            np.concatenate([white @ value, np.zeros(prior.shape[0] + len(root))]),
         )
+
+    def marked(self, kinds: Array, data: Array) -> Array:
+        """Return the numbers (J, width) of its nodes, with a mark on those that are alone in their rows."""
+        shared = (np.diff(self.nodes.indptr) > 1) | self.unknowns.any(1)
+        touched = self.nodes != 0.0
+        size = np.sqrt(np.asarray(self.nodes.multiply(self.nodes).sum(0)))
+        force = np.asarray(self.nodes.T @ self.measured)
+        alone = np.asarray(touched.T @ shared.astype(float)) == 0.0
+        return plainly(mark_nodes(kinds, data, alone[None], size[None], force[None], self.measured[None])[0])
 
     def rows(self) -> Rows:
         """Return them for machine code."""
@@ -171,6 +279,13 @@ class _System:
         weight = np.sqrt(np.asarray(self.nodes.multiply(self.nodes).sum(0)))
         arrays = (self.nodes.data, self.measured, basis[:, kept].T, weight)
         return Rows(start, column, *map(plainly, arrays))
+
+
+def _rows_at(nodes: list[int], size: int) -> Any:
+    """Return rows (n, size), sparse, of one each of some nodes."""
+    from scipy import sparse
+
+    return sparse.csr_array((np.ones(len(nodes)), (np.arange(len(nodes)), nodes)), shape=(len(nodes), size))
 
 
 def _whitening(problem: Problem, present: Array) -> Any:

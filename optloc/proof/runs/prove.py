@@ -54,7 +54,8 @@ from optloc.proof.near import (
 )
 from optloc.proof.nodes.dispatch import infinity_of
 from optloc.proof.nodes.node import DIFFERENCE, GROWS
-from optloc.proof.runs.posed import Run, Runs
+from optloc.proof.runs.courses import axes_of, cost_of_state, hessian_of_state, prove_course
+from optloc.proof.runs.posed import Courses, Run, Runs
 from optloc.proof.runs.rows import (
     blur_of,
     is_balanced,
@@ -353,9 +354,9 @@ def prove_runs(posed: Runs, asked: Asked) -> Answered:
     return Answered(verdict, boxes, bound, whole, found)
 
 
-def runs_lack_code(count: int) -> bool:
+def runs_lack_code(posed: Runs | Courses, count: int) -> bool:
     """Return whether proofs of so many long problems were left because there is no machine code of them yet."""
-    return enabled() and not usable(prove_run, count)
+    return enabled() and not usable(prove_run if isinstance(posed, Runs) else prove_course, count)
 
 
 def costs_of_runs(posed: Runs, x: Array) -> tuple[Array, Array]:
@@ -367,4 +368,41 @@ def costs_of_runs(posed: Runs, x: Array) -> tuple[Array, Array]:
             out[0, i, p] = cost_of_place(run, place, tables)
             floor = accuracy_floor(run.cost.kinds, run.cost.data, run.cost.weight, run.cost.w, tables.box.centre)
             out[1, i, p] = blur_of(run.rows, floor, tables.box.nodes)
+    return out[0], out[1]
+
+
+# Targets that move.
+
+
+def prove_courses(posed: Courses, asked: Asked) -> Answered:
+    """Return the outcome of the proofs of n fixes of n problems of a moving target; x holds velocities as well.
+
+    Without machine code none is looked at, as of `prove_runs`.
+    """
+    n, size = asked.x.shape
+    verdict, boxes, bound = np.full(n, BUDGET), np.zeros(n, np.int64), np.full(n, -inf)
+    found = np.full((n, size), np.nan)
+
+    def prove(i: int) -> None:
+        (whole, few), state = posed.courses[i], plainly(asked.x[i])
+        axes = axes_of(hessian_of_state(whole, state), state, plainly(asked.region[i]))
+        if axes is None:
+            verdict[i] = STATIONARY
+            return
+        others, budget = plainly(asked.others[i, : asked.known[i]]), int(asked.budget[i])
+        verdict[i], boxes[i], bound[i] = prove_course(
+            whole, few, axes, others, asked.kappa[i], asked.eps[i], budget, found[i]
+        )
+
+    if usable(prove_course, n):
+        mapped(prove, range(n))
+    return Answered(verdict, boxes, bound, np.zeros(n, np.bool_), found)
+
+
+def costs_of_courses(posed: Courses, states: Array) -> tuple[Array, Array]:
+    """Return posed costs (n, P) of states (n, P, 2 d) and the rounding of their residuals, see `costs_at`."""
+    out = np.zeros((2, *states.shape[:2]))
+    for i, (whole, _) in enumerate(posed.courses):
+        for p, state in enumerate(plainly(states[i])):
+            out[:, i, p] = cost_of_state(whole, state)
     return out[0], out[1]

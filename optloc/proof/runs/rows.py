@@ -106,7 +106,7 @@ def sheet_of(rows: Rows) -> Sheet:
 
 
 @compiled
-def _multiply(rows: Rows, values: Array, out: Array) -> None:
+def multiply(rows: Rows, values: Array, out: Array) -> None:
     """Write ``S values``."""
     for i in range(out.shape[0]):
         total = 0.0
@@ -116,7 +116,7 @@ def _multiply(rows: Rows, values: Array, out: Array) -> None:
 
 
 @compiled
-def _pull_back(rows: Rows, values: Array, out: Array) -> None:
+def pull_back(rows: Rows, values: Array, out: Array) -> None:
     """Write ``S'values``."""
     out[:] = 0.0
     for i in range(values.shape[0]):
@@ -126,7 +126,7 @@ def _pull_back(rows: Rows, values: Array, out: Array) -> None:
 
 
 @compiled
-def _project(rows: Rows, values: Array) -> None:
+def project(rows: Rows, values: Array) -> None:
     """Take off values (q,) what other unknowns can change."""
     for _ in range(2):  # twice is exact (Parlett)
         for k in range(rows.basis.shape[0]):
@@ -138,7 +138,7 @@ def _project(rows: Rows, values: Array) -> None:
 
 
 @compiled
-def _largest(rows: Rows, values: Array, out: Array) -> float:
+def greatest_length(rows: Rows, values: Array, out: Array) -> float:
     """Return the greatest length of ``S y`` over all y with ``|y_j| <= values_j``."""
     total = 0.0
     for i in range(out.shape[0]):
@@ -165,11 +165,11 @@ def blur_of(rows: Rows, floor: float, nodes: Array) -> float:
     size = floor
     for j in range(nodes.shape[0]):
         size += rows.weight[j] * (abs(nodes[j, PHI]) + abs(nodes[j, LOW]) + abs(nodes[j, HIGH]))
-    return _digits(rows) * size
+    return digits_of(rows) * size
 
 
 @compiled
-def _digits(rows: Rows) -> float:
+def digits_of(rows: Rows) -> float:
     """Return the relative rounding error of sums over nodes and rows: one a term, and 32 within a node."""
     return float((32 + rows.w.shape[0] + rows.weight.shape[0]) * _ULP)
 
@@ -183,10 +183,10 @@ def residual_at(rows: Rows, nodes: Array, sheet: Sheet) -> float:
         for n in range(rows.start[i], rows.start[i + 1]):
             value += rows.factor[n] * nodes[rows.column[n], PHI]
         e[i] = value
-    _project(rows, e)
+    project(rows, e)
     for i in range(e.shape[0]):
         total += e[i] * e[i]
-    _pull_back(rows, e, sheet.force)
+    pull_back(rows, e, sheet.force)
     return total
 
 
@@ -197,9 +197,9 @@ _BALANCED = 1e-11
 @compiled
 def is_balanced(rows: Rows, ones: Array, out: Array) -> bool:
     """Return whether equal changes of some nodes (J,) change no row but by what the other unknowns explain."""
-    size = _largest(rows, ones, out)
-    _multiply(rows, ones, out)
-    _project(rows, out)
+    size = greatest_length(rows, ones, out)
+    multiply(rows, ones, out)
+    project(rows, out)
     left = 0.0
     for i in range(out.shape[0]):
         left += out[i] * out[i]
@@ -285,14 +285,14 @@ def sum_up_rows(rows: Rows, half: Array, nodes: Array, curves: Array, noise: flo
     """
     sums[:] = 0.0
     residual, lines, pulls, q = sheet.residual, sheet.lines, sheet.pulls, rows.w.shape[0]
-    longest, share = 0.0, _digits(rows)
+    longest, share = 0.0, digits_of(rows)
     for i in range(q):
         longest += residual[i] * residual[i]
     longest = sqrt(longest)
     for k in range(3):
-        _multiply(rows, nodes[:, SLOPE0 + k], lines[k])
-        _project(rows, lines[k])
-        _pull_back(rows, lines[k], pulls[k])
+        multiply(rows, nodes[:, SLOPE0 + k], lines[k])
+        project(rows, lines[k])
+        pull_back(rows, lines[k], pulls[k])
     for k in range(3):
         for m in range(k, 3):
             total = 0.0
@@ -345,25 +345,25 @@ def _rest(rows: Rows, half: Array, nodes: Array, curves: Array, blur: float, she
         # Of its own Hessian with its force, and with what that changes to first order; of its gradient's second order.
         ball += (abs(sheet.force[j]) + p0 * h0 + p1 * h1 + p2 * h2) * chi
         cross += sqrt(p0 * p0 + p1 * p1 + p2 * p2) * chi * size
-        bend = _norm(curves, j)
+        bend = norm_of(curves, j)
         own += rows.weight[j] * blur * bend
         reach[j] = max(-nodes[j, LOW], nodes[j, HIGH])
     if not ball < inf:
         return inf
-    remainder = _largest(rows, reach, sheet.length)
+    remainder = greatest_length(rows, reach, sheet.length)
     for j in range(nodes.shape[0]):
-        reach[j] = _norm(curves, j)
-    bent = _largest(rows, reach, sheet.length)
+        reach[j] = norm_of(curves, j)
+    bent = greatest_length(rows, reach, sheet.length)
     for j in range(nodes.shape[0]):
         reach[j] = curves[j, CHI]
-    wide = _largest(rows, reach, sheet.length)
+    wide = greatest_length(rows, reach, sheet.length)
     # Changes of forces of second order, with Hessians and with their changes; and the square of the Jacobian's.
     jump = bent * size + 0.5 * wide * size
     return float(ball + cross + 2.0 * own + remainder * (bent + wide) + jump * jump)
 
 
 @compiled
-def _norm(curves: Array, j: int) -> float:
+def norm_of(curves: Array, j: int) -> float:
     """Return the Frobenius norm of a node's Hessian."""
     a, b, c = curves[j, H00], curves[j, H11], curves[j, H22]
     d, e, f = curves[j, H01], curves[j, H02], curves[j, H12]

@@ -22,14 +22,25 @@ from optloc.proof.chart import HIDDEN_REACH
 from optloc.proof.everywhere import UNBOUNDED
 from optloc.proof.near import BETTER, BUDGET, OTHER, UNIQUE, VALUE
 from optloc.proof.scope import unsupported
-from optloc.solvers.certify.posed import Costs, agrees, is_free, lacks, pose, prove, surfaces_of
+from optloc.solvers.certify.posed import (
+    Costs,
+    agrees,
+    around,
+    is_free,
+    lacks,
+    pose,
+    prove,
+    regions_of,
+    state_columns,
+    surfaces_of,
+)
 from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, equal_cost
 from optloc.solvers.pool import Claim, Pool, in_parts, offer, pack, where
 from optloc.solvers.refine import refine
 from optloc.solvers.stages import lsr
-from optloc.solvers.starts.position import spread_of, vectors
+from optloc.solvers.starts.position import vectors
 from optloc.solvers.verdict.judge import failed, fill, judge, standing, verdict
 
 # What a proof lets a certificate say, in sentences.
@@ -86,16 +97,27 @@ def state_claim(
     return Certificate(proof, sentence, METHOD, bound, cost - bound, margin > 0.0, margin, boxes, region, asked)
 
 
+# Coordinates of space.
+_SPACE = 3
+
+
 # A batch has few different claims but many fixes, and Python is slow to format numbers.
 @lru_cache(maxsize=256)
 def _sentence(margin: float, listed: int, region: tuple[Corner, Corner] | None) -> str:
-    where = "no position" if region is None else f"no position from {_text(region[0])} to {_text(region[1])} m"
+    where = "no position" if region is None else _where(*region)
     beside = "" if not listed else " but that listed" if listed == 1 else f" but the {listed} listed"
     if margin > 0.0:
         rest = f"no other minimum{beside} has a cost within {margin:g} of it"
     else:
         rest = "other minima were searched for, not excluded"
     return f"{where} costs less; {rest}"
+
+
+def _where(lower: Corner, upper: Corner) -> str:
+    """Return a region in words: of positions, or of positions and velocities where there are more than coordinates."""
+    d = len(lower) // 2 if len(lower) > _SPACE else len(lower)
+    words = f"no position from {_text(lower[:d])} to {_text(upper[:d])} m"
+    return words if d == len(lower) else f"{words} at a velocity from {_text(lower[d:])} to {_text(upper[d:])} m/s"
 
 
 def _text(corner: Corner) -> str:
@@ -122,9 +144,6 @@ _BUDGETS, _NODES, _SLOW_BUDGET, _AT_LEAST = (3000, 8000), 12, 2000, 5
 _AROUND = 15
 # Minima behind the Earth that are set aside at most: mirror images through it; whoever has more gets no proof.
 _HIDDEN = 4
-# Half-width of the region where all positions cannot be bounded: spreads of the stations, or distances of the fix, so
-# that it lies well inside either way.
-_SPREADS, _DISTANCES = 10.0, 2.0
 
 
 @dataclass(slots=True)
@@ -189,8 +208,9 @@ class Work:
         cls, problem: Problem, pool: Pool, fix: Fix, answered: Array, region: Array | None, margin: float, effort: int
     ) -> Work:
         """Return the work before the first round."""
-        size, d = len(fix.x), problem.dimension
-        corners = np.full((2, d), np.nan) if region is None else region
+        size, state = len(fix.x), fix.x[:, state_columns(problem)]
+        d = state.shape[-1]
+        corners, limited = regions_of(problem, state, region)
         return cls(
             problem,
             pool,
@@ -198,13 +218,13 @@ class Work:
             fill(size, None) if pool.certificate is None else np.array(pool.certificate),
             pose(problem),
             np.full((size, 0, d), np.nan),
-            np.array(np.broadcast_to(corners, (size, 2, d))),
-            _around(problem, fix.position),
+            corners,
+            around(problem, state),
             np.array(_gaps(margin, d)),
             np.zeros(size, dtype=np.int64),
             np.array(answered),
             effort,
-            region is not None,
+            limited,
             np.zeros(size, dtype=np.int64),
         )
 
@@ -281,15 +301,16 @@ def _round(work: Work, items: Array) -> None:
 
 def _asked(work: Work, items: Array) -> Asked:
     kappa, fix, ignored = work.margins[work.level[items]], work.fix, work.ignored[items]
+    own = state_columns(work.problem)
     planes, surface = surfaces_of(work.problem.take(items), fix.position[items])
     gap = fix.alternatives.gap[items]
     with np.errstate(invalid="ignore"):
         listed = np.isfinite(gap) & (gap < np.maximum(kappa, AMBIGUOUS_GAP)[:, None])
-    place = fix.layout.take(fix.alternatives.x[items], "position")
+    place = fix.alternatives.x[items][..., own]
     others = pack(np.concatenate([np.where(listed[..., None], place, np.nan), ignored], axis=1))
     seen = np.isfinite(ignored).all(-1).sum(1)
     return Asked(
-        x=fix.position[items],
+        x=fix.x[items, own],
         others=np.where(np.isfinite(others), others, 0.0),
         known=np.isfinite(others).all(-1).sum(1),
         hidden=seen,
@@ -390,7 +411,7 @@ def _bar(work: Work, items: Array, points: Array, barred: Array) -> None:
 def _ignore(work: Work, items: Array, points: Array) -> Array:
     """Note the minima next to points (n, d) that the Earth hides, and return which are new (n,)."""
     problem = work.problem
-    if not problem.frame.geodetic or not len(items) or work.ignored.shape[1] >= _HIDDEN:
+    if not problem.frame.geodetic or problem.motions[0].order or not len(items) or work.ignored.shape[1] >= _HIDDEN:
         return np.zeros(len(items), dtype=bool)
     part = problem.take(items)
     done = refine(part, vectors(part, points[:, None])[:, 0], face=exact(problem))
@@ -424,15 +445,6 @@ def _keep_evidence(pool: Pool, before: Pool) -> Pool:
     return replace(pool, infinity=infinity, searched=before.searched, remark=before.remark, asked=before.asked)
 
 
-def _around(problem: Problem, position: Array) -> Array:
-    """Return the corners (N, 2, d) of cubes around the stations that hold the fixes (N, d) well inside."""
-    centre, spread = spread_of(problem)
-    with np.errstate(invalid="ignore"):
-        away = np.abs(position - centre).max(-1)
-    half = np.maximum(_SPREADS * spread, _DISTANCES * np.where(np.isfinite(away), away, 0.0))
-    return np.stack([centre - half[:, None], centre + half[:, None]], axis=1)
-
-
 # Who asks for a proof gives it more time than a method that goes on without one.
 _EFFORT = 4
 
@@ -454,7 +466,9 @@ def certify(
         Their fixes, refined.
     region : (lower, upper), optional
         Corners (d,) of the box to which the claim may be limited, in the problem's frame, metres; None: all positions,
-        or where that cannot be bounded a box around the stations that the certificate names.
+        or where that cannot be bounded a box around the stations that the certificate names. Of a target that moves
+        (2 d,), velocities in metres per second after the coordinates; None: what its constraints admit, see
+        `optloc.solvers.certify.posed.regions_of`.
     margin : float
         Gap between the cost of the fix and that of any other minimum that is tried to prove first; where the proof is
         not finished, 9, the gap of `ambiguous`, and the value alone follow. 0 asks for the value alone: quicker.
@@ -562,10 +576,13 @@ def certify_stage(detail: str, began: float) -> Stage:
 
 
 def _corners(problem: Problem, region: tuple[Array, Array]) -> Array:
-    """Return the corners (2, d) of a region that is a box."""
+    """Return the corners (2, d) of a region that is a box, (2, 2 d) where it says velocities as well."""
     corners = np.array([np.asarray(corner, dtype=float) for corner in region])
-    if corners.shape != (2, problem.dimension) or not np.isfinite(corners).all() or (corners[0] >= corners[1]).any():
+    sizes = {problem.dimension, problem.dimension * (problem.motions[0].order + 1)}
+    if corners.shape[:1] != (2,) or corners.ndim != 2 or corners.shape[1] not in sizes or not np.isfinite(corners).all() or (corners[0] >= corners[1]).any():
         raise InvalidProblem(
-            "the region is no box", "region", f"give (lower, upper) with {problem.dimension} finite coordinates each"
+            "the region is no box",
+            "region",
+            f"give (lower, upper) with {' or '.join(map(str, sorted(sizes)))} finite coordinates each",
         )
     return corners

@@ -1,4 +1,4 @@
-"""Costs as posed for a proof, short or long, with the surfaces that hold a fix; and whether they are its own."""
+"""What a proof is posed of: costs, short or long, surfaces that hold a fix, regions; and whether a cost is the fix's own."""
 
 from __future__ import annotations
 
@@ -14,29 +14,48 @@ from optloc.problem.problem import Problem
 from optloc.proof.batch import Answered, Asked, costs_at, lacks_code, prove_all
 from optloc.proof.nodes.level import height_numbers
 from optloc.proof.pose import Posed, pose_costs
-from optloc.proof.runs.posed import Runs, pose_runs
-from optloc.proof.runs.prove import costs_of_runs, prove_runs, runs_lack_code
+from optloc.proof.runs.posed import Courses, Runs, pose_courses, pose_runs
+from optloc.proof.runs.prove import costs_of_courses, costs_of_runs, prove_courses, prove_runs, runs_lack_code
 from optloc.proof.scope import is_run
 from optloc.proof.surface import DATA, FIRST, LEVEL, MIDDLE, SURFACE_WIDTH, UP
+from optloc.solvers.starts.position import spread_of
 
-# Costs over the position: with dense rows, or sparse ones where there are many.
+# Costs over the target's state: its position, with dense rows or sparse ones where there are many, or where it moves
+# its position and velocity.
 
-Costs = Posed | Runs
+Costs = Posed | Runs | Courses
 
 
 def pose(problem: Problem) -> Costs:
-    """Return the costs of a flat batch of problems over the position."""
+    """Return the costs of a flat batch of problems over the target's state."""
+    if problem.motions[0].order > 0:
+        return pose_courses(problem)
     return pose_runs(problem) if is_run(problem) else pose_costs(problem)
 
 
 def prove(costs: Costs, asked: Asked) -> Answered:
     """Return the outcome of the proofs of n fixes of n posed problems."""
+    if isinstance(costs, Courses):
+        return prove_courses(costs, asked)
     return prove_runs(costs, asked) if isinstance(costs, Runs) else prove_all(costs, asked)
 
 
 def lacks(costs: Costs, count: int) -> bool:
     """Return whether proofs of so many fixes ended early because there is no machine code of them yet."""
-    return runs_lack_code(count) if isinstance(costs, Runs) else lacks_code(count)
+    return lacks_code(count) if isinstance(costs, Posed) else runs_lack_code(costs, count)
+
+
+def costs_of(costs: Costs, states: Array) -> tuple[Array, Array]:
+    """Return posed costs (N, P) of states (N, P, n) and the rounding of their residuals."""
+    if isinstance(costs, Courses):
+        return costs_of_courses(costs, states)
+    return costs_of_runs(costs, states) if isinstance(costs, Runs) else costs_at(costs, states)
+
+
+def state_columns(problem: Problem) -> slice:
+    """Return where in parameter vectors the state stands that a proof is about."""
+    slot, _ = problem.layout.find("position")
+    return slice(slot.start, slot.start + problem.dimension * (problem.motions[0].order + 1))
 
 
 # Equalities: planes and surfaces along which a proof looks.
@@ -94,6 +113,75 @@ def is_free(problem: Problem, fix: Fix, items: Array) -> Array:
     return np.array([len(found) == len(face) for found in fix.active[items]], dtype=bool)
 
 
+# Regions of claims.
+
+# Half-width of the region where all positions cannot be bounded: spreads of the stations, or distances of the fix, so
+# that it lies well inside either way; and of the velocities, metres per second: above what flies in the air.
+_SPREADS, _DISTANCES, _FAST = 10.0, 2.0, 700.0
+
+
+def regions_of(problem: Problem, state: Array, region: Array | None) -> tuple[Array, bool]:
+    """Return corners (N, 2, n) of the regions of claims about states (N, n), and whether somebody asked for them.
+
+    A target that stays is looked for everywhere, if no region is given: NaN. One that moves could be anywhere at any
+    speed, so a claim about it is for a region. Where box and speed are constraints nothing else is admitted, and that
+    is what is asked for; else it is what `around` says.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    state : array (N, n)
+        Positions, and velocities where the target moves.
+    region : array (2, d) or (2, n), optional
+        Corners that are asked for.
+    """
+    size, n = state.shape
+    out = np.full((size, 2, n), np.nan) if n == problem.dimension else around(problem, state)
+    asked = region is not None
+    if region is not None:
+        out[..., : region.shape[-1]] = region
+    if n > problem.dimension and (region is None or region.shape[-1] < n):
+        limits = _admitted(problem, n)
+        known = np.isfinite(limits).all(0)
+        known[: 0 if region is None else region.shape[-1]] = False
+        out[..., known] = limits[:, known]
+        asked = bool(known[0 if region is None else region.shape[-1] :].all())
+    return out, asked
+
+
+def _admitted(problem: Problem, n: int) -> Array:
+    """Return the least and greatest state (2, n) that constraints on coordinates and speed admit; NaN for none."""
+    d = problem.dimension
+    out = np.stack([np.full(n, -np.inf), np.full(n, np.inf)])
+    for band in problem.constraints:
+        if not isinstance(band, Band) or band.lower.ndim or band.upper.ndim:
+            continue
+        axis = np.flatnonzero(band.coefficients)
+        if band.kind == "plane" and len(axis) == 1:
+            factor = float(np.ravel(band.coefficients)[axis[0]])
+            low, high = sorted((float(band.lower) / factor, float(band.upper) / factor))
+            out[0, axis[0]], out[1, axis[0]] = max(out[0, axis[0]], low), min(out[1, axis[0]], high)
+        elif band.kind == "speed":
+            out[0, d:], out[1, d:] = -float(band.upper), float(band.upper)
+    return out
+
+
+def around(problem: Problem, state: Array) -> Array:
+    """Return the corners (N, 2, n) of boxes that hold states (N, n) well inside.
+
+    Positions lie in cubes around the stations, velocities of targets that move in cubes around none.
+    """
+    (centre, spread), d = spread_of(problem), problem.dimension
+    with np.errstate(invalid="ignore"):
+        away = np.nan_to_num(np.abs(state[:, :d] - centre).max(-1), nan=0.0)
+        speed = np.nan_to_num(np.abs(state[:, d:]).max(-1, initial=0.0), nan=0.0)
+    half = np.repeat(np.maximum(_SPREADS * spread, _DISTANCES * away)[:, None], d, axis=1)
+    fast = np.repeat(np.maximum(_FAST, _DISTANCES * speed)[:, None], state.shape[-1] - d, axis=1)
+    middle, reach = np.concatenate([centre, np.zeros_like(fast)], axis=1), np.concatenate([half, fast], axis=1)
+    return np.stack([middle - reach, middle + reach], axis=1)
+
+
 # Whether a posed cost is that of its fix.
 
 # Places beside each fix, about a standard deviation away: two ways to write the same cost agree there to the rounding,
@@ -120,10 +208,10 @@ def agrees(problem: Problem, fix: Fix, costs: Costs) -> Array:
     costs : Posed or Runs
         Their costs over the position, equalities apart.
     """
-    places = _places(fix)
+    places = _places(problem, fix)
     own = _own_costs(problem, fix, places)
     with np.errstate(all="ignore"):
-        posed, blur = costs_of_runs(costs, places) if isinstance(costs, Runs) else costs_at(costs, places)
+        posed, blur = costs_of(costs, places)
         good = np.abs(posed - own) <= _tolerance(own, blur)
         good[:, 0] &= np.abs(own[:, 0] - fix.cost) <= _tolerance(fix.cost, blur[:, 0])
     return np.asarray(good.all(1))
@@ -134,9 +222,10 @@ def _tolerance(cost: Array, blur: Array) -> Array:
     return np.asarray(_EQUAL * (1.0 + cost) + _ROUNDINGS * blur * (np.sqrt(np.maximum(cost, 0.0)) + blur))
 
 
-def _places(fix: Fix) -> Array:
-    """Return the fixes and places about a standard deviation away, (N, 1 + P, d): the same ones in every run."""
-    position, covariance = fix.position, fix.covariance()
+def _places(problem: Problem, fix: Fix) -> Array:
+    """Return the fixes and states about a standard deviation away, (N, 1 + P, n): the same ones in every run."""
+    own = state_columns(problem)
+    position, covariance = fix.x[..., own], fix.cov[..., own, own]
     d = position.shape[-1]
     with np.errstate(all="ignore"):
         root, variance = np.zeros_like(covariance), np.where(np.isfinite(covariance), covariance, 0.0)
@@ -151,20 +240,21 @@ def _places(fix: Fix) -> Array:
 
 
 def _own_costs(problem: Problem, fix: Fix, places: Array) -> Array:
-    """Return the costs (N, P) of the problems at positions (N, P, d), all other unknowns at their best values."""
+    """Return the costs (N, P) of the problems at states (N, P, n), all other unknowns at their best values."""
     count, several = places.shape[:2]
-    slot, _ = problem.layout.find("position")
+    own = state_columns(problem)
+    start, size = own.start, own.stop - own.start
     part = problem.take(np.repeat(np.arange(count), several)) if count > 1 else problem
     x = np.repeat(fix.x, several, axis=0)
-    x[:, slot.start : slot.start + slot.size] = places.reshape(-1, places.shape[-1])
+    x[:, own] = places.reshape(-1, size)
     with np.errstate(all="ignore"):
         equations = equations_at(part, x)
         if problem.stations.covariance is not None and problem.stations.span != "noise":
             for _ in range(_STEPS):
-                move, ok = step(_without(equations, slot.start, slot.size), np.zeros(len(x)))
-                x = x + np.where(ok[:, None], _spread(move, slot.start, slot.size), 0.0)
+                move, ok = step(_without(equations, start, size), np.zeros(len(x)))
+                x = x + np.where(ok[:, None], _spread(move, start, size), 0.0)
                 equations = equations_at(part, x)
-        rest = eliminated(_without(equations, slot.start, slot.size))
+        rest = eliminated(_without(equations, start, size))
         cost = np.asarray(rest.cost)
         if rest.shared.shape[-1]:
             # Scaled, and by its pseudo-inverse: a combination that no row feels changes nothing.
@@ -177,7 +267,7 @@ def _own_costs(problem: Problem, fix: Fix, places: Array) -> Array:
 
 
 def _without(equations: Normal, start: int, size: int) -> Normal:
-    """Return normal equations without the position: it is held."""
+    """Return normal equations without the target's state: it is held."""
     keep = np.delete(np.arange(equations.shared.shape[-1]), slice(start, start + size))
     return Normal(
         equations.shared[..., keep[:, None], keep],
@@ -191,5 +281,5 @@ def _without(equations: Normal, start: int, size: int) -> Normal:
 
 
 def _spread(move: Array, start: int, size: int) -> Array:
-    """Return a step (N, n) of all unknowns but the position as one of all, which leaves the position where it is."""
+    """Return a step (N, n) of all unknowns but the state as one of all, which leaves the state as it is."""
     return np.insert(move, np.full(size, start), 0.0, axis=-1)

@@ -138,8 +138,8 @@ def vectors(problem: Problem, position: Array | None) -> Array:
     ----------
     problem : Problem
         Flat batch of N problems.
-    position : array (N, q, d), optional
-        Of the only target; None: vectors (N, size) without any state.
+    position : array (N, q, d or more), optional
+        Of the only target, with what of its state follows; None: vectors (N, size) without any state.
     """
     layout = problem.layout
     x = np.zeros(((problem.batch_shape[0],) if position is None else position.shape[:-1]) + (layout.size,))
@@ -152,7 +152,7 @@ def vectors(problem: Problem, position: Array | None) -> Array:
             x[..., slot.start : slot.start + slot.size] = each
     if position is not None:
         slot, _ = layout.find("position")
-        x[..., slot.start : slot.start + slot.size] = position
+        x[..., slot.start : slot.start + position.shape[-1]] = position
         x = _fit_emission_times(problem, x) if problem.emitting else x
     return x
 
