@@ -324,7 +324,9 @@ def sum_up(course: Course, table: Table, noise: float) -> tuple[float, float]:
     for m in range(n):
         for other in range(m):
             table.hessian[other, m] = table.hessian[m, other]
-        for other in range(n):  # the rounding of J'J counts as change, twice: for the mean over a line half of it counts
+        for other in range(
+            n
+        ):  # the rounding of J'J counts as change, twice: for the mean over a line half of it counts
             table.change[m, other] += 4.0 * sqrt(widest) * blur
     ball = _rest(course, table, noise + digits_of(rows) * longest)
     return ball, sqrt(widest) * noise + blur * (longest + noise)
@@ -672,7 +674,11 @@ def _descends(search: Search, level: float, found: Array) -> bool:
             now, damping = after, 0.1 * damping
             if length < _CLOSE * _CLOSE:
                 table.half[:] = 0.0
-                return now < level and _is_inside(search.axes, table.at, found) and not _is_known(search, table.at, table.half)
+                return (
+                    now < level
+                    and _is_inside(search.axes, table.at, found)
+                    and not _is_known(search, table.at, table.half)
+                )
         else:
             table.at[:], damping = before, max(10.0 * damping, 1e-4)
             _linearise(search, table)

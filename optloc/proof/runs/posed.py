@@ -245,9 +245,7 @@ class _System:
     measured: Array
 
     @classmethod
-    def of(
-        cls, problem: Problem, present: Array, made: Columns, others: Others, value: Array, prior: Any
-    ) -> _System:
+    def of(cls, problem: Problem, present: Array, made: Columns, others: Others, value: Array, prior: Any) -> _System:
         from scipy import sparse  # with the first long run: problems of one epoch need none
 
         size, white = len(made.kinds), _whitening(problem, present)
@@ -293,7 +291,7 @@ def _whitening(problem: Problem, present: Array) -> Any:
     from scipy import sparse
 
     blocks = []
-    for whitener in whiten(problem.noise, np.where(present, problem.weight[0], 0.0)):
+    for whitener in whiten(problem.noise, np.where(present, problem.weight.reshape(-1), 0.0)):
         g, r = whitener.row.shape
         matrix = whitener.matrix[0] if whitener.matrix.ndim == 4 else whitener.matrix
         line = np.broadcast_to(np.arange(g * r).reshape(g, r, 1), (g, r, r))

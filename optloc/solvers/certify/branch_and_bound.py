@@ -579,7 +579,13 @@ def _corners(problem: Problem, region: tuple[Array, Array]) -> Array:
     """Return the corners (2, d) of a region that is a box, (2, 2 d) where it says velocities as well."""
     corners = np.array([np.asarray(corner, dtype=float) for corner in region])
     sizes = {problem.dimension, problem.dimension * (problem.motions[0].order + 1)}
-    if corners.shape[:1] != (2,) or corners.ndim != 2 or corners.shape[1] not in sizes or not np.isfinite(corners).all() or (corners[0] >= corners[1]).any():
+    if (
+        corners.shape[:1] != (2,)
+        or corners.ndim != 2
+        or corners.shape[1] not in sizes
+        or not np.isfinite(corners).all()
+        or (corners[0] >= corners[1]).any()
+    ):
         raise InvalidProblem(
             "the region is no box",
             "region",
