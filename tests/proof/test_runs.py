@@ -115,6 +115,15 @@ def test_a_run_costs_what_its_dense_rows_cost():
         assert (blur < 1e-6 * (1.0 + np.sqrt(own))).all()
 
 
+def test_rows_have_weights_of_their_own():
+    rng = np.random.default_rng(SEED + 2)
+    problem = mixture(rng, ("tdoa",), 3, prior=True)
+    weight = rng.uniform(0.2, 1.0, problem.count) * (np.arange(problem.count) > 0)  # the first row is absent
+    problem = problem.with_rows(weight=weight).flat()
+    x = rng.uniform(-3e4, 3e4, (1, 1, 3))
+    assert np.isclose(costs_of_runs(pose_runs(problem), x)[0], costs_at(pose_costs(problem), x)[0], rtol=1e-9).all()
+
+
 def test_few_rows_cost_nowhere_more_than_all():
     rng = np.random.default_rng(SEED + 1)
     for problem, x in runs_of(rng):

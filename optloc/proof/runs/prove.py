@@ -54,7 +54,8 @@ from optloc.proof.near import (
 )
 from optloc.proof.nodes.dispatch import infinity_of
 from optloc.proof.nodes.node import DIFFERENCE, GROWS
-from optloc.proof.runs.courses import axes_of, cost_of_state, hessian_of_state, prove_course
+from optloc.proof.runs.course_search import prove_course
+from optloc.proof.runs.courses import axes_of, cost_of_state, hessian_of_state
 from optloc.proof.runs.posed import Courses, Run, Runs
 from optloc.proof.runs.rows import (
     blur_of,

@@ -578,17 +578,11 @@ def certify_stage(detail: str, began: float) -> Stage:
 def _corners(problem: Problem, region: tuple[Array, Array]) -> Array:
     """Return the corners (2, d) of a region that is a box, (2, 2 d) where it says velocities as well."""
     corners = np.array([np.asarray(corner, dtype=float) for corner in region])
-    sizes = {problem.dimension, problem.dimension * (problem.motions[0].order + 1)}
-    if (
-        corners.shape[:1] != (2,)
-        or corners.ndim != 2
-        or corners.shape[1] not in sizes
-        or not np.isfinite(corners).all()
-        or (corners[0] >= corners[1]).any()
-    ):
+    sizes = sorted({problem.dimension, problem.dimension * (problem.motions[0].order + 1)})
+    shaped = corners.ndim == 2 and len(corners) == 2 and corners.shape[1] in sizes
+    if not shaped or not np.isfinite(corners).all() or (corners[0] >= corners[1]).any():
+        count = " or ".join(map(str, sizes))
         raise InvalidProblem(
-            "the region is no box",
-            "region",
-            f"give (lower, upper) with {' or '.join(map(str, sorted(sizes)))} finite coordinates each",
+            "the region is no box", "region", f"give (lower, upper) with {count} finite coordinates each"
         )
     return corners

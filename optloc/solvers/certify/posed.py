@@ -1,4 +1,4 @@
-"""What a proof is posed of: costs, short or long, surfaces that hold a fix, regions; and whether a cost is the fix's own."""
+"""What a proof is posed of: costs, surfaces that hold a fix, regions; and whether a cost is the fix's own."""
 
 from __future__ import annotations
 

@@ -1,0 +1,389 @@
+"""The search for a target in uniform motion through boxes of positions and velocities, and its proof in a region."""
+
+from __future__ import annotations
+
+from math import inf, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled
+from optloc.compute.systems import invert
+from optloc.proof.everywhere import ANOTHER, CHEAPER, CLEAR, SPENT
+from optloc.proof.near import BETTER, BUDGET, OTHER, STATIONARY, UNIQUE, VALUE, Aim
+from optloc.proof.runs.courses import (
+    SHIFT,
+    WIDER,
+    Axes,
+    Course,
+    Table,
+    floor_of,
+    has_no_minimum,
+    is_convex,
+    least_length,
+    set_bends,
+    set_box,
+    set_lines,
+    sum_up,
+    table_of,
+)
+from optloc.proof.runs.rows import blur_of, residual_at
+
+# The search.
+
+# As of `optloc.proof.runs.search`: where boxes are looked at with all rows, and where minima are excluded by
+# derivatives, in levels; boxes on the stack; and looks at few rows for each at all rows.
+_WORTH, _NEAR, _CAPACITY, _LOOKS = 4.0, 100.0, 4096, 10
+# Share of the steepest side's change that counts for all sides alike.
+_ALIKE = 0.1
+
+
+class Search(NamedTuple):
+    """Where is looked, and what is known there.
+
+    Parameters
+    ----------
+    whole, few : Course
+        All rows, and those of few epochs, which cost nowhere more.
+    axes : Axes
+        The coordinates.
+    table, small : Table
+        Working memory for all rows, and for few.
+    floors : tuple of 2 float
+        Sizes of what residuals of all and of few rows are differences of, beside the nodes.
+    minima, sides : array (P, n)
+        Known minima, and half-widths of boxes around them on which the cost is convex.
+    """
+
+    whole: Course
+    few: Course
+    axes: Axes
+    table: Table
+    small: Table
+    floors: tuple[float, float]
+    minima: Array
+    sides: Array
+
+
+@compiled
+def search_courses(search: Search, stack: Array, size: int, aim: Aim, budget: int, found: Array) -> tuple[int, int]:
+    """Search boxes for minima that cost less than a level; return the outcome and how many boxes were looked at.
+
+    Parameters
+    ----------
+    search : Search
+        Where.
+    stack, size : array (capacity, 2 n), int
+        The boxes: centres, half-widths.
+    aim : Aim
+        What is to be shown of each.
+    budget : int
+        How many boxes may be looked at with all rows, and `_LOOKS` times as many with few.
+    found : array (n,)
+        Written: the state of the outcomes CHEAPER and ANOTHER.
+
+    Returns
+    -------
+    outcome, boxes
+        CLEAR, CHEAPER (a state costs less than `aim.better`), ANOTHER (a minimum below the level is not known), SPENT.
+    """
+    axes, table, small, n = search.axes, search.table, search.small, found.shape[0]
+    boxes, looks, lows = 0, 0, 0
+    while size > 0:
+        if boxes >= budget or looks >= _LOOKS * budget or size + 2 > stack.shape[0]:
+            return SPENT, looks
+        size -= 1
+        looks += 1
+        small.at[:], small.half[:] = stack[size, :n], stack[size, n:]
+        where = _where(axes, small.at, small.half)
+        if where < 0 or _is_known(search, small.at, small.half):
+            continue
+        here, low = _look(search.few, axes, small, search.floors[1], aim.level)
+        if low > 0.0 and low * low >= aim.level:
+            continue
+        if here < _WORTH * (aim.level + 1.0):
+            boxes += 1
+            table.at[:], table.half[:] = small.at, small.half
+            here, low = _look(search.whole, axes, table, search.floors[0], aim.level)
+            if low > 0.0 and low * low >= aim.level:
+                continue
+            inside = _is_inside(axes, table.at, found)
+            if inside and here < aim.better:
+                return CHEAPER, looks
+            # in the inside of a region costs are least where the gradient vanishes; its edge has to cost the level
+            if where > 0 and here < _NEAR * (aim.level + 1.0):
+                ball, noise = _curve(search, table)
+                if has_no_minimum(table, ball, noise):
+                    continue
+            lows += int(inside and here < aim.level)
+            # at the first, second, fourth ... low centre: found early, and seldom looked for in vain
+            if inside and here < aim.level and lows & (lows - 1) == 0 and _descends(search, aim.level, found):
+                return ANOTHER, looks
+        size = _push_halves(stack, size, small, _steepest(small))
+    return CLEAR, looks
+
+
+@compiled
+def _look(course: Course, axes: Axes, table: Table, floor: float, level: float) -> tuple[float, float]:
+    """Return the cost at the centre of a box that is set and a lower bound of the residual over it."""
+    set_box(course, axes, table, True)
+    here = residual_at(course.rows, table.nodes, table.sheet)
+    noise = blur_of(course.rows, floor, table.nodes)
+    set_lines(course, table)
+    if here < level:  # no bound will do
+        return here, -1.0
+    low = least_length(course, table, here, False) - noise
+    if low > 0.0 and low * low >= level:
+        return here, low
+    set_bends(course, table)
+    return here, max(low, least_length(course, table, here, True) - noise)
+
+
+@compiled
+def _curve(search: Search, table: Table) -> tuple[float, float]:
+    """Fill the sums of a box that was looked at with all rows, see `sum_up`."""
+    noise = blur_of(search.whole.rows, search.floors[0], table.nodes)
+    set_bends(search.whole, table)
+    return sum_up(search.whole, table, noise)
+
+
+@compiled
+def _where(axes: Axes, at: Array, half: Array) -> int:
+    """Return -1 where no state of a box is in the region, 1 where all are in its inside, else 0."""
+    inside = 1
+    for i in range(at.shape[0]):
+        middle, reach = axes.origin[i], 0.0
+        for m in range(at.shape[0]):
+            middle += axes.turn[i, m] * at[m]
+            reach += abs(axes.turn[i, m]) * half[m] * (1.0 + 1e-9)
+        if middle - reach > axes.corners[1, i] or middle + reach < axes.corners[0, i]:
+            return -1
+        if middle - reach <= axes.corners[0, i] or middle + reach >= axes.corners[1, i]:
+            inside = 0
+    return inside
+
+
+@compiled
+def _is_inside(axes: Axes, at: Array, state: Array) -> bool:
+    """Write the state of search coordinates; return whether it is in the region."""
+    inside = True
+    for i in range(at.shape[0]):
+        state[i] = axes.origin[i]
+        for m in range(at.shape[0]):
+            state[i] += axes.turn[i, m] * at[m]
+        inside = inside and axes.corners[0, i] <= state[i] <= axes.corners[1, i]
+    return inside
+
+
+@compiled
+def _is_known(search: Search, at: Array, half: Array) -> bool:
+    """Return whether a box lies where the cost is convex around a known minimum."""
+    for p in range(search.minima.shape[0]):
+        inside = True
+        for m in range(at.shape[0]):
+            inside = inside and abs(at[m] - search.minima[p, m]) + half[m] <= search.sides[p, m]
+        if inside:
+            return True
+    return False
+
+
+@compiled
+def _steepest(table: Table) -> int:
+    """Return the side of a box that was looked at along which the residual changes most."""
+    best, steepest, side, n = -1.0, 0.0, 0, table.at.shape[0]
+    for m in range(n):
+        table.move[m] = 0.0
+        for value in table.lines[m]:
+            table.move[m] += value * value
+        table.move[m] = sqrt(table.move[m])
+        steepest = max(steepest, table.move[m] / table.half[m])
+    for m in range(n):
+        change = table.move[m] + (_ALIKE * steepest + 1e-300) * table.half[m]
+        if change > best:
+            best, side = change, m
+    return side
+
+
+@compiled
+def _push_halves(stack: Array, size: int, table: Table, side: int) -> int:
+    """Push the halves of a box; return the size of the stack."""
+    n = table.at.shape[0]
+    for sign in (-0.5, 0.5):
+        stack[size, :n], stack[size, n:] = table.at, table.half
+        stack[size, side] += sign * table.half[side]
+        stack[size, n + side] *= 0.5
+        stack[size, n + side] += WIDER * stack[size, n + side] + SHIFT * (abs(table.at[side]) + table.half[side])
+        size += 1
+    return size
+
+
+# Descents.
+
+# Steps, and the length of one in standard deviations that ends it.
+_STEPS, _CLOSE = 40, 1e-3
+
+
+@compiled
+def _descends(search: Search, level: float, found: Array) -> bool:
+    """Return whether the centre of a box descends to a minimum below the level that is not known, and write it."""
+    table = search.table
+    before, damping = table.at.copy(), 1e-3
+    now = _linearise(search, table)
+    for _ in range(_STEPS):
+        before[:] = table.at
+        length = _step(table, damping)
+        if not length >= 0.0:
+            return False
+        table.at[:] -= table.move
+        after = _linearise(search, table)
+        if after <= now:
+            now, damping = after, 0.1 * damping
+            if length < _CLOSE * _CLOSE:
+                table.half[:] = 0.0
+                return (
+                    now < level
+                    and _is_inside(search.axes, table.at, found)
+                    and not _is_known(search, table.at, table.half)
+                )
+        else:
+            table.at[:], damping = before, max(10.0 * damping, 1e-4)
+            _linearise(search, table)
+    return False
+
+
+@compiled
+def _linearise(search: Search, table: Table) -> float:
+    """Return the cost at coordinates that are set, with residual, Jacobian and slope in lengths of 1."""
+    table.half[:] = 0.0
+    set_box(search.whole, search.axes, table, False)
+    cost = residual_at(search.whole.rows, table.nodes, table.sheet)
+    set_lines(search.whole, table)
+    return cost
+
+
+@compiled
+def _step(table: Table, damping: float) -> float:
+    """Write a damped Gauss-Newton step; return its squared length in units of what is left, NaN where there is none."""
+    n, matrix, lines = table.at.shape[0], table.solve, table.lines
+    for m in range(n):
+        table.slope[m] = 0.0
+        for i in range(lines.shape[1]):
+            table.slope[m] += lines[m, i] * table.sheet.residual[i]
+        for other in range(n):
+            matrix[m, other] = 0.0
+            for i in range(lines.shape[1]):
+                matrix[m, other] += lines[m, i] * lines[other, i]
+    for m in range(n):
+        matrix[m, m] *= 1.0 + damping
+    if not invert(matrix, n, 1e-14):
+        return -1.0
+    length = 0.0
+    for m in range(n):
+        table.move[m] = 0.0
+        for other in range(n):
+            table.move[m] += matrix[m, other] * table.slope[other]
+        length += table.move[m] * table.slope[m]
+    return length
+
+
+# Known minima.
+
+# Sides are tried smaller by this factor, so often: from the first, standard deviations, to a millionth of it.
+_WIDEST, _SMALLER, _TRIALS = 100.0, 0.8, 62
+
+
+@compiled
+def set_minimum(search: Search, p: int, state: Array, least: float, eps: float) -> bool:
+    """Write a minimum and the sides of a convex box around it; return False where it is none, or costs less than that.
+
+    Within the box no cost is more than eps below that of the minimum.
+    """
+    axes, table, n = search.axes, search.table, state.shape[0]
+    for m in range(n):
+        search.minima[p, m] = 0.0
+        for i in range(n):
+            search.minima[p, m] += axes.back[m, i] * (state[i] - axes.origin[i])
+    table.at[:] = search.minima[p]
+    if not _linearise(search, table) >= least:
+        return False
+    margin = 0.0
+    for m in range(n):
+        slope = 0.0
+        for i in range(table.lines.shape[1]):
+            slope += table.lines[m, i] * table.sheet.residual[i]
+        margin += slope * slope / eps
+    share = _WIDEST
+    for _ in range(_TRIALS):
+        table.half[:] = share
+        set_box(search.whole, axes, table, True)
+        residual_at(search.whole.rows, table.nodes, table.sheet)
+        set_lines(search.whole, table)
+        ball, _ = _curve(search, table)
+        if is_convex(table, ball, margin):
+            search.sides[p] = share
+            return True
+        share *= _SMALLER
+    return False
+
+
+# The proof.
+
+
+@compiled
+def prove_course(
+    whole: Course, few: Course, axes: Axes, others: Array, kappa: float, eps: float, budget: int, found: Array
+) -> tuple[int, int, float]:
+    """Prove of a course what `optloc.proof.near.prove` proves of a cost, within a region.
+
+    Parameters
+    ----------
+    whole, few : Course
+        All rows, and those of few epochs.
+    axes : Axes
+        Of the fix, with the region.
+    others : array (P, n)
+        Other known minima.
+    kappa, eps : float
+        Gap to prove, and how far below the cost of the fix still counts as equal.
+    budget : int
+        How many boxes may be looked at.
+    found : array (n,)
+        Written: a better or other state.
+
+    Returns
+    -------
+    verdict, boxes, bound
+        As there.
+    """
+    x, n = axes.origin, axes.origin.shape[0]
+    table, small, room = table_of(whole, n), table_of(few, n), np.zeros((2, 1 + others.shape[0], n))
+    floors = floor_of(whole, x), floor_of(few, x)
+    search = Search(whole, few, axes, table, small, floors, room[0], room[1])
+    least = _linearise(search, table)
+    level = least + kappa if kappa > 0.0 else least - eps
+    aim = Aim(level, least - eps, least - 0.5 * eps, False, 0)
+    if not set_minimum(search, 0, x, aim.better, 0.5 * eps):
+        return STATIONARY, 0, -inf
+    known = 1
+    for p in range(others.shape[0] if kappa > 0.0 else 0):
+        known += int(set_minimum(search, known, others[p], aim.better, 0.5 * eps))
+    search = Search(whole, few, axes, table, small, floors, room[0, :known], room[1, :known])
+    stack = np.zeros((_CAPACITY, 2 * n))
+    _set_first(axes, stack[0, :n], stack[0, n:])
+    outcome, boxes = search_courses(search, stack, 1, aim, budget, found)
+    if outcome == CLEAR:
+        return (UNIQUE if kappa > 0.0 else VALUE), boxes, aim.value
+    if outcome == SPENT:
+        return BUDGET, boxes, -inf
+    return (BETTER if outcome == CHEAPER else OTHER), boxes, -inf
+
+
+@compiled
+def _set_first(axes: Axes, at: Array, half: Array) -> None:
+    """Write the box that holds a region."""
+    for m in range(at.shape[0]):
+        for i in range(at.shape[0]):
+            low, high = axes.corners[0, i], axes.corners[1, i]
+            at[m] += axes.back[m, i] * (0.5 * (low + high) - axes.origin[i])
+            half[m] += abs(axes.back[m, i]) * 0.5 * (high - low) * (1.0 + 1e-9)
