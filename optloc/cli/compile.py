@@ -99,7 +99,7 @@ def _prove_runs() -> None:
     problem = simulate(assemble(Stations(place, tuple("ABCDEF")), rows), _TARGET, 1, _FEW).flat()
     certify(problem, _plainly_solved(problem))
     moving = assemble(_STATIONS[:, :2], rows, times=np.arange(float(epochs)), motions=(Motion(1),))
-    problem = simulate(moving, [*_TARGET[:2], 30.0, -10.0], 1).flat()
+    problem = simulate(moving, np.append(_TARGET[:2], [30.0, -10.0]), 1).flat()
     certify(problem, _plainly_solved(problem))
 
 

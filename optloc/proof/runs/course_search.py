@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from optloc.base.types import Array
-from optloc.compute.jit import compiled
+from optloc.compute.jit import compiled, zero
 from optloc.compute.systems import invert
 from optloc.proof.everywhere import ANOTHER, CHEAPER, CLEAR, SPENT
 from optloc.proof.near import BETTER, BUDGET, OTHER, STATIONARY, UNIQUE, VALUE, Aim
@@ -22,6 +22,7 @@ from optloc.proof.runs.courses import (
     has_no_minimum,
     is_convex,
     least_length,
+    put,
     set_bends,
     set_box,
     set_lines,
@@ -95,7 +96,7 @@ def search_courses(search: Search, stack: Array, size: int, aim: Aim, budget: in
             return SPENT, looks
         size -= 1
         looks += 1
-        small.at[:], small.half[:] = stack[size, :n], stack[size, n:]
+        put(small, stack[size, :n], stack[size, n:])
         where = _where(axes, small.at, small.half)
         if where < 0 or _is_known(search, small.at, small.half):
             continue
@@ -104,7 +105,7 @@ def search_courses(search: Search, stack: Array, size: int, aim: Aim, budget: in
             continue
         if here < _WORTH * (aim.level + 1.0):
             boxes += 1
-            table.at[:], table.half[:] = small.at, small.half
+            put(table, small.at, small.half)
             here, low = _look(search.whole, axes, table, search.floors[0], aim.level)
             if low > 0.0 and low * low >= aim.level:
                 continue
@@ -127,7 +128,7 @@ def search_courses(search: Search, stack: Array, size: int, aim: Aim, budget: in
 @compiled
 def _look(course: Course, axes: Axes, table: Table, floor: float, level: float) -> tuple[float, float]:
     """Return the cost at the centre of a box that is set and a lower bound of the residual over it."""
-    set_box(course, axes, table, True)
+    set_box(course, axes, table)
     here = residual_at(course.rows, table.nodes, table.sheet)
     noise = blur_of(course.rows, floor, table.nodes)
     set_lines(course, table)
@@ -210,7 +211,8 @@ def _push_halves(stack: Array, size: int, table: Table, side: int) -> int:
     """Push the halves of a box; return the size of the stack."""
     n = table.at.shape[0]
     for sign in (-0.5, 0.5):
-        stack[size, :n], stack[size, n:] = table.at, table.half
+        for m in range(n):
+            stack[size, m], stack[size, n + m] = table.at[m], table.half[m]
         stack[size, side] += sign * table.half[side]
         stack[size, n + side] *= 0.5
         stack[size, n + side] += WIDER * stack[size, n + side] + SHIFT * (abs(table.at[side]) + table.half[side])
@@ -231,11 +233,12 @@ def _descends(search: Search, level: float, found: Array) -> bool:
     before, damping = table.at.copy(), 1e-3
     now = _linearise(search, table)
     for _ in range(_STEPS):
-        before[:] = table.at
         length = _step(table, damping)
         if not length >= 0.0:
             return False
-        table.at[:] -= table.move
+        for m in range(before.shape[0]):
+            before[m] = table.at[m]
+            table.at[m] -= table.move[m]
         after = _linearise(search, table)
         if after <= now:
             now, damping = after, 0.1 * damping
@@ -247,7 +250,8 @@ def _descends(search: Search, level: float, found: Array) -> bool:
                     and not _is_known(search, table.at, table.half)
                 )
         else:
-            table.at[:], damping = before, max(10.0 * damping, 1e-4)
+            put(table, before, before)
+            damping = max(10.0 * damping, 1e-4)
             _linearise(search, table)
     return False
 
@@ -255,8 +259,9 @@ def _descends(search: Search, level: float, found: Array) -> bool:
 @compiled
 def _linearise(search: Search, table: Table) -> float:
     """Return the cost at coordinates that are set, with residual, Jacobian and slope in lengths of 1."""
-    table.half[:] = 0.0
-    set_box(search.whole, search.axes, table, False)
+    for m in range(table.at.shape[0]):
+        table.half[m], table.unit[m] = 0.0, 1.0
+    set_box(search.whole, search.axes, table)
     cost = residual_at(search.whole.rows, table.nodes, table.sheet)
     set_lines(search.whole, table)
     return cost
@@ -304,7 +309,7 @@ def set_minimum(search: Search, p: int, state: Array, least: float, eps: float) 
         search.minima[p, m] = 0.0
         for i in range(n):
             search.minima[p, m] += axes.back[m, i] * (state[i] - axes.origin[i])
-    table.at[:] = search.minima[p]
+    put(table, search.minima[p], search.minima[p])
     if not _linearise(search, table) >= least:
         return False
     margin = 0.0
@@ -315,13 +320,15 @@ def set_minimum(search: Search, p: int, state: Array, least: float, eps: float) 
         margin += slope * slope / eps
     share = _WIDEST
     for _ in range(_TRIALS):
-        table.half[:] = share
-        set_box(search.whole, axes, table, True)
+        for m in range(n):
+            table.half[m] = table.unit[m] = share
+        set_box(search.whole, axes, table)
         residual_at(search.whole.rows, table.nodes, table.sheet)
         set_lines(search.whole, table)
         ball, _ = _curve(search, table)
         if is_convex(table, ball, margin):
-            search.sides[p] = share
+            for m in range(n):
+                search.sides[p, m] = share
             return True
         share *= _SMALLER
     return False
@@ -363,11 +370,13 @@ def prove_course(
     least = _linearise(search, table)
     level = least + kappa if kappa > 0.0 else least - eps
     aim = Aim(level, least - eps, least - 0.5 * eps, False, 0)
-    if not set_minimum(search, 0, x, aim.better, 0.5 * eps):
-        return STATIONARY, 0, -inf
-    known = 1
-    for p in range(others.shape[0] if kappa > 0.0 else 0):
-        known += int(set_minimum(search, known, others[p], aim.better, 0.5 * eps))
+    known, place = zero(), x.copy()
+    for p in range(1 + (others.shape[0] if kappa > 0.0 else 0)):
+        for m in range(n if p > 0 else 0):
+            place[m] = others[p - 1, m]
+        known += int(set_minimum(search, known, place, aim.better, 0.5 * eps))
+        if known == 0:
+            return STATIONARY, 0, -inf
     search = Search(whole, few, axes, table, small, floors, room[0, :known], room[1, :known])
     stack = np.zeros((_CAPACITY, 2 * n))
     _set_first(axes, stack[0, :n], stack[0, n:])

@@ -155,14 +155,19 @@ def table_of(course: Course, n: int) -> Table:
 
 
 @compiled
-def set_box(course: Course, axes: Axes, table: Table, scaled: bool) -> None:
-    """Bound all nodes over a box that is set, and take derivatives in its half-widths (`scaled`) or in lengths of 1."""
+def put(table: Table, at: Array, half: Array) -> None:
+    """Set a box, whose derivatives are taken in its half-widths."""
+    for m in range(at.shape[0]):
+        table.at[m], table.half[m], table.unit[m] = at[m], half[m], half[m]
+
+
+@compiled
+def set_box(course: Course, axes: Axes, table: Table) -> None:
+    """Bound all nodes over a box that is set, and write the levers of its unit."""
     n, d, at, half = table.at.shape[0], table.at.shape[0] // 2, table.at, table.half
     plan, line = np.zeros((3, 3)), np.zeros(6)
     for i in range(d):
         plan[i, i] = 1.0
-    for m in range(n):
-        table.unit[m] = half[m] if scaled else 1.0
     for k in range(course.since.shape[0]):
         time, place, reach = course.since[k], table.places[k, 0], table.places[k, 1]
         for i in range(d):
@@ -274,8 +279,10 @@ def least_length(course: Course, table: Table, cost: float, curved: bool) -> flo
     if not cost > 0.0:
         return -1.0
     s, v = table.move, sheet.length
-    s[:] = 0.0
-    v[:] = sheet.residual
+    for m in range(n):
+        s[m] = 0.0
+    for i in range(v.shape[0]):
+        v[i] = sheet.residual[i]
     for _ in range(_SWEEPS):
         for m in range(n):
             pull = own = 0.0
@@ -468,7 +475,8 @@ def has_no_minimum(table: Table, ball: float, noise: float) -> bool:
 def cost_of_state(course: Course, state: Array) -> tuple[float, float]:
     """Return the cost of a state (n,), and the rounding of its residual."""
     table = table_of(course, state.shape[0])
-    set_box(course, _own_axes(state), table, False)
+    table.unit[:] = 1.0
+    set_box(course, _own_axes(state), table)
     cost = residual_at(course.rows, table.nodes, table.sheet)
     return cost, blur_of(course.rows, floor_of(course, state), table.nodes)
 
@@ -477,7 +485,8 @@ def cost_of_state(course: Course, state: Array) -> tuple[float, float]:
 def hessian_of_state(course: Course, state: Array) -> Array:
     """Return the Hessian (n, n) of f/2 at a state (n,)."""
     table = table_of(course, state.shape[0])
-    set_box(course, _own_axes(state), table, False)
+    table.unit[:] = 1.0
+    set_box(course, _own_axes(state), table)
     residual_at(course.rows, table.nodes, table.sheet)
     set_lines(course, table)
     set_bends(course, table)

@@ -193,22 +193,23 @@ def _state_prior(problem: Problem, made: Columns, span: float) -> tuple[Any, lis
     """
     from scipy import sparse
 
-    rows: list[tuple[int, int, float]] = []
+    row: list[int] = []
+    node: list[int] = []
+    factor: list[float] = []
     times: list[float] = []
     count = 0
     for name, mean, precision in prior_parts(problem):
         if name not in ("position", "velocity"):
             continue
         root, centre = roots(precision.reshape(problem.dimension, -1)), mean.reshape(1, -1)
-        ends = [(1.0, 0.0, centre)] if name == "position" else [(1.0, span, span * centre), (-1.0, 0.0, 0.0 * centre)]
-        for factor, time, origin in ends:
-            nodes = add_linear(made, root[None], origin)
-            scale = factor if name == "position" else factor / span
-            rows += [(count + i, node, scale) for i, node in enumerate(nodes)]
-            times += [time] * len(nodes)
+        for time, share in ((0.0, 1.0),) if name == "position" else ((span, 1.0 / span), (0.0, -1.0 / span)):
+            node += add_linear(made, root[None], centre if name == "position" else time * centre)
+            row += range(count, count + problem.dimension)
+            factor += [share] * problem.dimension
+            times += [time] * problem.dimension
         count += problem.dimension
-    line, node, factor = (np.array(column) for column in zip(*rows, strict=True)) if rows else (np.zeros(0, int),) * 3
-    return sparse.csr_array((factor, (line, node)), shape=(count, len(made.kinds))), times
+    entries = (np.array(factor), (np.array(row, dtype=int), np.array(node, dtype=int)))
+    return sparse.csr_array(entries, shape=(count, len(made.kinds))), times
 
 
 def _sparse(matrix: Any) -> Any:

@@ -138,16 +138,15 @@ def regions_of(problem: Problem, state: Array, region: Array | None) -> tuple[Ar
     """
     size, n = state.shape
     out = np.full((size, 2, n), np.nan) if n == problem.dimension else around(problem, state)
-    asked = region is not None
+    given = 0 if region is None else region.shape[-1]
     if region is not None:
-        out[..., : region.shape[-1]] = region
-    if n > problem.dimension and (region is None or region.shape[-1] < n):
-        limits = _admitted(problem, n)
-        known = np.isfinite(limits).all(0)
-        known[: 0 if region is None else region.shape[-1]] = False
-        out[..., known] = limits[:, known]
-        asked = bool(known[0 if region is None else region.shape[-1] :].all())
-    return out, asked
+        out[..., :given] = region
+    if n == problem.dimension:
+        return out, given > 0
+    limits = _admitted(problem, n)[:, given:]
+    known = given + np.flatnonzero(np.isfinite(limits).all(0))
+    out[..., known] = limits[:, known - given]
+    return out, given + len(known) == n
 
 
 def _admitted(problem: Problem, n: int) -> Array:
@@ -178,7 +177,8 @@ def around(problem: Problem, state: Array) -> Array:
         speed = np.nan_to_num(np.abs(state[:, d:]).max(-1, initial=0.0), nan=0.0)
     half = np.repeat(np.maximum(_SPREADS * spread, _DISTANCES * away)[:, None], d, axis=1)
     fast = np.repeat(np.maximum(_FAST, _DISTANCES * speed)[:, None], state.shape[-1] - d, axis=1)
-    middle, reach = np.concatenate([centre, np.zeros_like(fast)], axis=1), np.concatenate([half, fast], axis=1)
+    middle = np.concatenate([np.broadcast_to(centre, half.shape), np.zeros_like(fast)], axis=1)
+    reach = np.concatenate([half, fast], axis=1)
     return np.stack([middle - reach, middle + reach], axis=1)
 
 
