@@ -353,9 +353,9 @@ def satellites(rng: Rng, n: int) -> Scenes:
     return drawn(parts, place, velocity, truth, rng, height=0.0, frame=ECEF)
 
 
-def registration(rng: Rng, n: int, d: int, epochs: int, drift: bool) -> Scenes:
+def registration(rng: Rng, n: int, d: int, epochs: int, drift: bool, span: float = 600.0) -> Scenes:
     """Time differences of four to six aircraft with clocks of their own, to an emitter near or far: ten minutes."""
-    s, times = int(rng.integers(4, 7)), np.linspace(0.0, 600.0, epochs)
+    s, times = int(rng.integers(4, 7)), np.linspace(0.0, span, epochs)
     place, velocity = moving(rng, n, s, d)
     place = place + velocity * times[:, None, None]
     a = np.tile(np.arange(1, s), epochs)
