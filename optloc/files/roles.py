@@ -5,10 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
 from math import isfinite, nan
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -16,7 +15,9 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.inputs import json_of, read_text
 from optloc.base.types import Array
 from optloc.base.units import LARGEST, UNITS
-from optloc.files.table import Table, csv, parquet
+from optloc.files.foreign import read_table, records
+from optloc.files.table import Table
+from optloc.models import MODELS
 
 WORDS = {
     "name": "name station receiver rx sensor anchor beacon id site callsign node stationid receiverid sensorid",
@@ -28,35 +29,62 @@ WORDS = {
     "z": "z value measured measurement",
 }
 """Other words for the columns of problem files that nothing works without, the likeliest first; without case, unit and
-what is no letter. What is measured may be called by its kind as well (`optloc.models.Model.aliases`), see `in_our_words`.
-Columns that may be left out have their names alone: what a table has besides must not change what it says."""
+what is no letter. What is measured may be called by its kind as well (`optloc.models.Model.aliases`), see
+`in_our_words`. Columns that may be left out have their names alone: what a table has besides must not change what it
+says."""
 
-# Role: names that suggest it, the likeliest first; spelled like `WORDS`.
+# Role: names that suggest it, the likeliest first; spelled like `WORDS`. A kind is a role, too, with its aliases.
 GUESSES = {
-    "message": "message msg messageid msgid pulse frame epoch event burst id",
-    "station": "station receiver rx sensor anchor node site stationid receiverid sensorid",
-    "time": "toa arrival timeofarrival arrivaltime rxtime time timestamp t",
+    "message": "message msg messageid msgid pulse frame epoch event eventid burst shot seq id",
+    "station": f"station receiver rx sensor anchor node site stationid receiverid sensorid beacon {WORDS['a']}",
+    "reference": f"{WORDS['b']} refstation anchorb",
+    "time": "toa arrival timeofarrival arrivaltime rxtime time timestamp utc datetime date t",
     "epoch": "epoch time tgps gpstime tow t timestamp",
+    "target": "target tag mobile transmitter emitter icao hex mac device track",
+    "sigma": "sigma std stddev stdev sd uncertainty",
+    "phase": "phase phasehint phasetype",
+    "p": "p tp ptime ppick parrival",
+    "s": "s ts stime spick sarrival",
+    "sp": "sp sminusp spdifference stmp tstp",
     "satellite": "satellite sat prn sv svid satid",
     "pseudorange": "pseudorange pr prange rho c1c prm",
-    "name": WORDS["name"],
+    "name": f"{WORDS['name']} user",
     "x": "x satx xecef ecefx xsat",
     "y": "y saty yecef ecefy ysat",
     "z": "z satz zecef ecefz zsat",
     "lat": WORDS["lat_deg"],
     "lon": WORDS["lon_deg"],
-    "height": WORDS["height"],
+    "height": f"{WORDS['height']} elev",
+    "depth": "depth",
 }
+# Short words for what a table measures, which would be too many ways to spell the kinds of a problem file.
+_SHORT = {
+    "range": "ranges dist r d",
+    "tdoa": "tdoas timedifference rdiff",
+    "azimuth": "az bearings brg lob lineofbearing",
+    "elevation": "el elev",
+}
+PLACE = ("name", "x", "y", "z", "lat", "lon", "height", "depth")
+"""Roles of columns that say where stations are."""
 GEOJSON = (".geojson", ".json")
-# Decimals of an instant: no clock tells more than 20, and a float written in full has some fifty.
-_DIGITS = 60
 # Properties of a GeoJSON point that may be its name or its height, the likeliest first.
 _NAMES = ("name", "station", "title", "callsign", "id", "receiver", "sensor")
 _HEIGHTS = ("height", "height_m", "altitude", "alt", "elevation", "ele", "h_m", "h")
 _FLAT = "no heights are given: all stations are taken to be at height 0"
+# Units as people spell them in headers.
+_SPELLED = {
+    **dict.fromkeys(("meter", "meters", "metre", "metres"), "m"),
+    **dict.fromkeys(("feet", "foot"), "ft"),
+    **dict.fromkeys(("sec", "secs", "second", "seconds"), "s"),
+    **dict.fromkeys(("msec", "millis", "milliseconds"), "ms"),
+    **dict.fromkeys(("µs", "μs", "usec", "micros", "microseconds"), "us"),
+    **dict.fromkeys(("nsec", "nanos", "nanoseconds"), "ns"),
+    **dict.fromkeys(("°", "degree", "degrees"), "deg"),
+    **dict.fromkeys(("radian", "radians"), "rad"),
+}
 # Longest first: of toa_ns the unit is ns, not s.
-_UNITS = sorted({*UNITS["length"], *UNITS["angle"]}, key=len, reverse=True)
-_SUFFIX = re.compile(rf"[_ \[(]+({'|'.join(_UNITS)})[\])]?$", re.IGNORECASE)
+_UNITS = sorted({*UNITS["length"], *UNITS["angle"], *UNITS["speed"], "dB", *_SPELLED}, key=len, reverse=True)
+_SUFFIX = re.compile(rf"\s*[_ \[(/]\s*({'|'.join(map(re.escape, _UNITS))})[\])]?$", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +113,7 @@ class Roles:
             return self.told[role]
         # Reversed, so that of two columns with one stem the first one counts.
         stems = {stem(name): name for name in reversed(columns)}
-        return next((stems[guess] for guess in GUESSES[role].split() if guess in stems), None)
+        return next((stems[guess] for guess in guesses(role) if guess in stems), None)
 
     def column(self, role: str) -> str:
         """Return the column of a role; raise InvalidProblem where there is none."""
@@ -99,54 +127,40 @@ class Roles:
     def labels(self, role: str) -> Array:
         """Return text (m,), that of several columns with "-" between it."""
         parts = [self.table.labels(part) for part in self.column(role).split("+")]
+        if len(parts) == 1:
+            return parts[0]
         return np.array(["-".join(row) for row in zip(*parts, strict=True)], dtype=object)
 
     def numbers(self, role: str) -> Array:
         """Return finite numbers (m,)."""
         return self.table.numbers(self.column(role))
 
-    def exact(self, role: str) -> list[Decimal]:
-        """Return numbers with all their digits: an instant of today in seconds has more than a float keeps."""
-        name = self.column(role)
-        column = self.table.raw(name)
-        if column.dtype.kind == "M":
-            return [Decimal(int(cell)).scaleb(-9) for cell in column.astype("datetime64[ns]").astype(np.int64)]
-        out = []
-        for row, cell in enumerate(column.tolist()):
-            try:
-                number = Decimal(str(cell).strip()) if cell is not None else Decimal("nan")
-            except InvalidOperation:
-                number = Decimal("nan")
-            # Written out, 1e-999999999 has a billion digits.
-            if not (number.is_finite() and abs(number) <= LARGEST and -int(number.as_tuple().exponent) <= _DIGITS):
-                what = "the cell is empty" if cell in (None, "") else f"{str(cell)[:80]!r} is not a finite number"
-                raise InvalidProblem(what, self.table.where(name, row), "give a number, or leave the row out")
-            out.append(number)
-        return out
 
-
-def read_table(path: Path) -> Table:
-    """Return a CSV or Parquet table; what separates the fields of a CSV file is seen from its header."""
-    if path.suffix.lower() in (".parquet", ".pq"):
-        return parquet(path, {})
-    if path.suffix.lower() not in (".csv", ".tsv", ".txt") and path.is_file():
-        known = "use .csv, .tsv, .txt or .parquet, and .geojson for stations"
-        raise InvalidProblem(f"files of type {path.suffix or path.name!r} are unknown", str(path), known)
-    found = csv(path, None, {})
-    if not found.count:
-        raise InvalidProblem("the table has no rows", found.source, "give at least one")
-    return found
+def guesses(role: str) -> list[str]:
+    """Return the names that suggest a role: of a kind that and its other words."""
+    if role in GUESSES:
+        return GUESSES[role].split()
+    words = (role, *MODELS[role].aliases) if role in MODELS else (role,)
+    return [*map(stem, words), *_SHORT.get(role, "").split()]
 
 
 def stem(column: str) -> str:
     """Return a column's name without case, unit and signs: "TOA_ns" is "toa"."""
-    return re.sub(r"[^a-z0-9]", "", _SUFFIX.sub("", column.strip()).lower())
+    return re.sub(r"[^a-z0-9]", "", bare(column).lower())
 
 
 def unit_of(column: str, known: Iterable[str]) -> str | None:
     """Return the unit that a column's name ends in, None where it is none of those known."""
     found = _SUFFIX.search(column.strip())
-    return None if found is None else {unit.lower(): unit for unit in known}.get(found.group(1).lower())
+    if found is None:
+        return None
+    spelled = found.group(1).lower()
+    return {unit.lower(): unit for unit in known}.get(_SPELLED.get(spelled, spelled).lower())
+
+
+def bare(column: str) -> str:
+    """Return a column's name without its unit."""
+    return _SUFFIX.sub("", column.strip())
 
 
 # Stations from a table or from GeoJSON points.
@@ -169,42 +183,68 @@ class Places:
 
 def places_of(path: Path, told: Mapping[str, str], frame: str | None) -> Places:
     """Return the stations of a file; `frame` is that of x, y, z."""
-    return _of_geojson(path) if path.suffix.lower() in GEOJSON else _of_table(path, told, frame or "cartesian")
+    if path.suffix.lower() == ".geojson":
+        return _of_geojson(json_of(read_text(path), path.name), path.name)
+    if path.suffix.lower() == ".json":
+        data = json_of(read_text(path), path.name)
+        if isinstance(data, list) or (isinstance(data, dict) and "features" in data):
+            return _of_geojson(data, path.name)
+        return placed(Roles(records(data, path.name), told), frame)
+    return placed(Roles(read_table(path), told), frame)
 
 
-def _of_table(path: Path, told: Mapping[str, str], frame: str) -> Places:
-    roles = Roles(read_table(path), told)
-    names = roles.labels("name")
+def placed(roles: Roles, frame: str | None, names: Array | None = None) -> Places:
+    """Return the stations of a table; `names` (s,) are theirs where no column has them, `frame` is that of x, y, z."""
+    names = roles.labels("name") if names is None else names
     lat, x = roles.find("lat"), roles.find("x")
     if lat is None and x is None:
         columns = ", ".join(roles.table.columns)
         advice = f"name them with --column lat=NAME or --column x=NAME; the columns are {columns}"
         raise InvalidProblem("no columns look like latitude and longitude, or x and y", roles.table.source, advice)
     if lat is not None:
-        height = roles.find("height")
-        unit = "m" if height is None else unit_of(height, UNITS["length"]) or "m"
-        degrees = {"lat_deg": roles.numbers("lat"), "lon_deg": roles.numbers("lon")}
-        degrees["height"] = np.zeros(len(names)) if height is None else roles.numbers("height")
-        return Places({"name": names} | degrees, "geodetic", unit, "" if height else _FLAT)
-    axes = [axis for axis in "xyz" if roles.find(axis) is not None]
+        degrees = {f"{axis}_deg": scaled(roles, axis, "angle", "deg") for axis in ("lat", "lon")}
+        height, unit = _upwards(roles, "height")
+        degrees["height"] = np.zeros(len(names)) if height is None else height
+        return Places({"name": names} | degrees, "geodetic", unit, _FLAT if height is None else "")
+    up, unit = _upwards(roles, "z")
     assert x is not None
     unit = unit_of(x, UNITS["length"]) or "m"
-    return Places({"name": names} | {axis: roles.numbers(axis) for axis in axes}, frame, unit)
+    axes = {axis: scaled(roles, axis, "length", unit) for axis in "xy"}
+    if up is not None:
+        axes["z"] = _upwards(roles, "z", unit)[0]
+    # What calls itself so is along the axes of the Earth, and its fixes have latitudes.
+    return Places({"name": names} | axes, frame or ("ecef" if "ecef" in stem(x) else "cartesian"), unit)
 
 
-def _of_geojson(path: Path) -> Places:
+def scaled(roles: Roles, role: str, quantity: Literal["length", "angle"], unit: str) -> Array:
+    """Return the numbers of a role in a unit; a column whose name has none is in it."""
+    own = unit_of(roles.column(role), UNITS[quantity]) or unit
+    values = roles.numbers(role)
+    return values if own == unit else values * UNITS[quantity][own] / UNITS[quantity][unit]
+
+
+def _upwards(roles: Roles, role: Literal["height", "z"], unit: str | None = None) -> tuple[Any, str]:
+    """Return heights, None where there are none, and their unit; depths are heights that grow downwards."""
+    found = next((one for one in (role, "depth") if roles.find(one) is not None), None)
+    if found is None:
+        return None, unit or "m"
+    unit = unit or unit_of(roles.column(found), UNITS["length"]) or "m"
+    values = scaled(roles, found, "length", unit)
+    return (-values if found == "depth" else values), unit
+
+
+def _of_geojson(data: Any, source: str) -> Places:
     """Return the points of a GeoJSON feature collection (RFC 7946: longitude, latitude, height above WGS 84)."""
-    data = json_of(read_text(path), path.name)
     features = data.get("features") if isinstance(data, dict) else None
     if not isinstance(features, list):
-        raise InvalidProblem("there is no list of features", path.name, "give a GeoJSON FeatureCollection of points")
+        raise InvalidProblem("there is no list of features", source, "give a GeoJSON FeatureCollection of points")
     points = [
-        _point(feature, f"{path.name}, feature {i + 1}")
+        _point(feature, f"{source}, feature {i + 1}")
         for i, feature in enumerate(features)
         if isinstance(feature, dict) and _kind(feature) == "Point"
     ]
     if not points:
-        raise InvalidProblem("there is no point among the features", path.name, "give each station as a Point")
+        raise InvalidProblem("there is no point among the features", source, "give each station as a Point")
     names, lon, lat, height = (list(column) for column in zip(*points, strict=True))
     columns = {"name": np.array(names, dtype=object), "lat_deg": np.array(lat), "lon_deg": np.array(lon)}
     known = [h is not None for h in height]
