@@ -109,6 +109,7 @@ def _kinds() -> Rows:
     return [
         {
             "kind": name,
+            "also called": ", ".join(model.aliases),
             "stations": str(model.stations),
             "dimensions": " ".join(str(d) for d in model.dimensions),
             "units": " ".join(UNITS[model.quantity]),  # type: ignore[index]  # models hold known quantities only

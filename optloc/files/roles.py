@@ -1,4 +1,4 @@
-"""Which column of a foreign table plays which role: as it is told, or as its name suggests."""
+"""Which column of a table plays which role: as it is told, or as its name suggests; and other words for our own."""
 
 from __future__ import annotations
 
@@ -18,7 +18,20 @@ from optloc.base.types import Array
 from optloc.base.units import LARGEST, UNITS
 from optloc.files.table import Table, csv, parquet
 
-# Role: names that suggest it, the likeliest first; without case, unit and what is no letter.
+WORDS = {
+    "name": "name station receiver rx sensor anchor beacon id site callsign node stationid receiverid sensorid",
+    "lat_deg": "lat latitude",
+    "lon_deg": "lon long lng longitude",
+    "height": "height h alt altitude elevation ellipsoidalheight",
+    "a": "a station receiver rx sensor anchor node site stationa receivera station1 receiver1 rx1",
+    "b": "b reference ref stationb receiverb station2 receiver2 rx2",
+    "z": "z value measured measurement",
+}
+"""Other words for the columns of problem files that nothing works without, the likeliest first; without case, unit and
+what is no letter. What is measured may be called by its kind as well (`optloc.models.Model.aliases`), see `in_our_words`.
+Columns that may be left out have their names alone: what a table has besides must not change what it says."""
+
+# Role: names that suggest it, the likeliest first; spelled like `WORDS`.
 GUESSES = {
     "message": "message msg messageid msgid pulse frame epoch event burst id",
     "station": "station receiver rx sensor anchor node site stationid receiverid sensorid",
@@ -26,13 +39,13 @@ GUESSES = {
     "epoch": "epoch time tgps gpstime tow t timestamp",
     "satellite": "satellite sat prn sv svid satid",
     "pseudorange": "pseudorange pr prange rho c1c prm",
-    "name": "name station receiver sensor anchor beacon id site callsign",
+    "name": WORDS["name"],
     "x": "x satx xecef ecefx xsat",
     "y": "y saty yecef ecefy ysat",
     "z": "z satz zecef ecefz zsat",
-    "lat": "lat latitude",
-    "lon": "lon long lng longitude",
-    "height": "height h alt altitude elevation ellipsoidalheight",
+    "lat": WORDS["lat_deg"],
+    "lon": WORDS["lon_deg"],
+    "height": WORDS["height"],
 }
 GEOJSON = (".geojson", ".json")
 # Decimals of an instant: no clock tells more than 20, and a float written in full has some fifty.

@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.inputs import STANDARD_INPUT, read_text, toml_of
 from optloc.base.units import LARGEST, SI_UNIT, SPEED_OF_LIGHT, AzimuthConvention, Conversion, Quantity, conversion
-from optloc.models import MODELS, Model
+from optloc.models import MODELS, Model, kind_named
 
 # Words that a file may get wrong, and amounts such as "30 ns".
 
@@ -23,10 +23,8 @@ def join(*places: str | None) -> str:
 
 
 def kind_model(kind: str, where: str) -> Model:
-    """Return the model of a kind; raise InvalidProblem for an unknown one, naming the nearest."""
-    if kind not in MODELS:
-        raise InvalidProblem(f"unknown kind {kind!r}", where, nearest(kind, sorted(MODELS)))
-    return MODELS[kind]
+    """Return the model of a kind, by its name or an alias; raise InvalidProblem for an unknown one."""
+    return MODELS[kind_named(kind, where)]
 
 
 @dataclass(frozen=True, slots=True)
