@@ -37,7 +37,7 @@ from optloc.problem.build import assemble, measured, station_array
 from optloc.problem.chart import Chart
 from optloc.problem.clocks import clock_densities
 from optloc.problem.epochs import by_epoch
-from optloc.problem.fix import Alternatives, Explanation, Fix, Stage, Suspect
+from optloc.problem.fix import Alternatives, Explanation, Fix, Stage, Suspect, told_by
 from optloc.problem.layout import Layout
 from optloc.problem.loss import LOSSES, Loss
 from optloc.problem.noise import Noise
@@ -197,6 +197,9 @@ def __getattr__(name: str) -> Any:
     if name == "datasets":
         return import_module("optloc.datasets")
     raise AttributeError(f"module 'optloc' has no attribute {name!r}")
+
+
+told_by(lambda: import_module("optloc.report.fixes"))
 
 
 def _from_table(*args: Any, **options: Any) -> Problem:

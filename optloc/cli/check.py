@@ -19,14 +19,11 @@ from optloc.base.types import Array, Bias, Stations
 from optloc.cli.file_fixes import CHUNK
 from optloc.cli.fix import advice_for_vectors, advice_json, grouping_of, late_json, level_json, show_advice, tell_level
 from optloc.cli.output import (
-    Columns,
     Screen,
     bar,
     claim_outputs,
     dumps,
-    records,
     say_all,
-    with_sigma,
     write_picture,
     write_table,
     write_text,
@@ -37,6 +34,7 @@ from optloc.models import MODELS
 from optloc.problem.epochs import separable
 from optloc.problem.problem import Problem
 from optloc.quality.health import Health, health_of
+from optloc.report.fixes import Columns, records, with_sigma
 from optloc.solvers import Method
 
 # Members of a bias that are named; the others are counted.

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from math import isfinite, nan
 from pathlib import Path
 from typing import Any, Literal
@@ -16,8 +16,9 @@ from optloc.base.inputs import json_of, read_text
 from optloc.base.types import Array
 from optloc.base.units import LARGEST, UNITS
 from optloc.files.foreign import read_table, records
+from optloc.files.schema import MeasurementsTable, ProblemFile, join
 from optloc.files.table import Table
-from optloc.models import MODELS
+from optloc.models import BEARING, MODELS, kind_named
 
 WORDS = {
     "name": "name station receiver rx sensor anchor beacon id site callsign node stationid receiverid sensorid",
@@ -29,9 +30,8 @@ WORDS = {
     "z": "z value measured measurement",
 }
 """Other words for the columns of problem files that nothing works without, the likeliest first; without case, unit and
-what is no letter. What is measured may be called by its kind as well (`optloc.models.Model.aliases`), see
-`in_our_words`. Columns that may be left out have their names alone: what a table has besides must not change what it
-says."""
+what is no letter. What is measured may be called by its kind as well (`optloc.models.Model.aliases`).
+Columns that may be left out have their names alone: what a table has besides must not change what it says."""
 
 # Role: names that suggest it, the likeliest first; spelled like `WORDS`. A kind is a role, too, with its aliases.
 GUESSES = {
@@ -161,6 +161,149 @@ def unit_of(column: str, known: Iterable[str]) -> str | None:
 def bare(column: str) -> str:
     """Return a column's name without its unit."""
     return _SUFFIX.sub("", column.strip())
+
+
+# Other words for kinds and columns of problem files, and what is left to the format.
+
+
+def in_our_words(
+    file: ProblemFile, stations: Table, tables: Sequence[Table], source: str
+) -> tuple[ProblemFile, Table, list[Table]]:
+    """Return a problem file and its tables with kinds and columns by our names, and with nothing left to the format.
+
+    Parameters
+    ----------
+    file : ProblemFile
+        Settings.
+    stations : Table
+        Rows of the stations.
+    tables : sequence of Table
+        Rows of each ``[[measurements]]``.
+    source : str
+        Name to call the settings.
+    """
+    stations = worded(stations, file.stations.unit)
+    frame = file.frame
+    if "kind" not in frame.model_fields_set and (stations.has("lat_deg") or stations.has("lon_deg")):
+        frame = frame.model_copy(update={"kind": "enu" if frame.origin or frame.dimension == 2 else "geodetic"})
+    compass = file.format > 1 and frame.kind != "cartesian"
+    places = [join(source, f"[[measurements]] {i + 1}") for i in range(len(tables))]
+    read = [
+        _rows_in_our_words(section, table, place, compass)
+        for section, table, place in zip(file.measurements, tables, places, strict=True)
+    ]
+    biases = [
+        b.model_copy(update={"kind": kind_named(b.kind, f"bias {b.name!r}")}) if b.kind else b for b in file.biases
+    ]
+    file = file.model_copy(update={"frame": frame, "measurements": [one for one, _ in read], "biases": biases})
+    return file, stations, [table for _, table in read]
+
+
+def worded(table: Table, unit: str) -> Table:
+    """Return a table of stations with its columns by our names; heights become those of the table's unit."""
+    found = {key: name for key in ("name", "lat_deg", "lon_deg", "height") if (name := _column(table, WORDS[key]))}
+    found = {key: name for key, name in found.items() if not table.has(key) and key not in table.names}
+    # Latitudes in radians are none that could be read: the column stays unknown.
+    named = {key: name for key, name in found.items() if not key.endswith("_deg") or _said(name) in (None, "deg")}
+    columns, own = dict(table.columns), unit_of(named.get("height", ""), UNITS["length"])
+    if own is not None and own != unit and unit in UNITS["length"]:
+        columns["height"] = table.numbers(named.pop("height")) * (UNITS["length"][own] / UNITS["length"][unit])
+    return replace(table, columns=columns, names={**table.names, **named})
+
+
+def _rows_in_our_words(
+    section: MeasurementsTable, table: Table, where: str, compass: bool
+) -> tuple[MeasurementsTable, Table]:
+    """Return measurements by our names, with the convention of azimuths; `compass` is that of the format."""
+    words = [section.kind] if section.kind else sorted(set(table.labels("kind"))) if table.has("kind") else []
+    places = {word: _place_of(word, section, table, where) for word in words}
+    kinds = {word: kind_named(word, places[word]) for word in words}
+    bearing = {word for word, kind in kinds.items() if kind == "azimuth" and word.strip().lower() == BEARING}
+    changes: dict[str, Any] = {}
+    if section.azimuth is None and "azimuth" in kinds.values():
+        if 0 < len(bearing) < list(kinds.values()).count("azimuth"):
+            what = "some azimuths are called bearings, and others are not"
+            raise InvalidProblem(
+                what, where, 'say what all are: azimuth = "north-clockwise", or "east-counterclockwise"'
+            )
+        changes["azimuth"] = "north-clockwise" if bearing or compass else "east-counterclockwise"
+    if section.kind is None:
+        # A column without other words stays as it is: millions of rows are not spelled again.
+        if any(word != kind for word, kind in kinds.items()):
+            spelled = np.array([kinds[word] for word in table.labels("kind").tolist()], dtype=object)
+            table = replace(table, columns={**table.columns, table.name("kind"): spelled})
+        return _units_by_kind(section.model_copy(update=changes)), _ends(section, table)
+    changes["kind"] = kinds[section.kind]
+    table, unit = _value(_ends(section, table), kinds[section.kind], where)
+    if unit is not None and isinstance(section.unit, str) and section.unit != unit:
+        what = f"the column {table.name('z')!r} is called after another unit than {section.unit!r}"
+        raise InvalidProblem(what, join(where, "key 'unit'"), "leave the key out, or rename the column")
+    if section.unit is None and (unit or bearing):
+        changes["unit"] = unit or "deg"
+    return _units_by_kind(section.model_copy(update=changes)), table
+
+
+def _units_by_kind(section: MeasurementsTable) -> MeasurementsTable:
+    if not isinstance(section.unit, dict):
+        return section
+    return section.model_copy(update={"unit": {kind_named(kind): unit for kind, unit in section.unit.items()}})
+
+
+def _place_of(word: str, section: MeasurementsTable, table: Table, where: str) -> str:
+    """Return the place of the word for a kind: the key, or the first row."""
+    if section.kind is not None:
+        return join(where, "key 'kind'")
+    return table.where("kind", table.labels("kind").tolist().index(word))
+
+
+def _ends(section: MeasurementsTable, table: Table) -> Table:
+    """Return a table whose columns of stations have our names, where the section does not name the station."""
+    found = {key: _column(table, WORDS[key]) for key in "ab" if getattr(section, key) is None and not table.has(key)}
+    return replace(table, names={**{key: name for key, name in found.items() if name}, **table.names})
+
+
+def _value(table: Table, kind: str, where: str) -> tuple[Table, str | None]:
+    """Return a table whose measured values are called z, and the unit that its name ends in, if it was another name."""
+    if table.has("z") or "z" in table.names:
+        return table, None
+    model = MODELS[kind]
+    name = _column(table, " ".join([WORDS["z"], *(stem(word) for word in (kind, *model.aliases))]))
+    if name is None or (_said(name) is not None and unit_of(name, UNITS[model.quantity]) is None):  # type: ignore[index]
+        return table, None
+    return replace(table, names={**table.names, "z": name}), unit_of(name, UNITS[model.quantity])  # type: ignore[index]
+
+
+def _column(table: Table, words: str) -> str | None:
+    """Return the column that is called by one of some words and has no role yet, None where there is none."""
+    taken = set(table.names.values())
+    stems = {stem(name): name for name in reversed([*table.columns]) if name not in taken}
+    return next((stems[word] for word in words.split() if word in stems), None)
+
+
+def _said(name: str) -> str | None:
+    """Return the unit of any quantity that a column's name ends in."""
+    return unit_of(name, _UNITS)
+
+
+_OTHER = {"north-clockwise": "east-counterclockwise", "east-counterclockwise": "north-clockwise"}
+_COUNTED = {"north-clockwise": "a compass: from north, clockwise", "east-counterclockwise": "from east, anticlockwise"}
+
+
+def azimuths_of(written: ProblemFile, read: ProblemFile) -> str:
+    """Return from where azimuths are counted and how a file says otherwise; empty where it has no azimuths.
+
+    Parameters
+    ----------
+    written, read : ProblemFile
+        The settings as they are written, and as `in_our_words` returns them.
+    """
+    said = {}
+    for before, after in zip(written.measurements, read.measurements, strict=True):
+        if after.azimuth is not None:
+            assumed = before.azimuth is None and str(before.kind).lower() != BEARING
+            why = " (no convention is named)" if assumed else ""
+            said[f'{_COUNTED[after.azimuth]}{why}; else write azimuth = "{_OTHER[after.azimuth]}"'] = None
+    return "; ".join(said)
 
 
 # Stations from a table or from GeoJSON points.

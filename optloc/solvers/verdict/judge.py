@@ -371,7 +371,7 @@ def _apply_rules(problem: Problem, pool: Pool, fix: Fix) -> Fix:
         code=first_status(ruling.marks),
         marks=ruling.marks,
         reason=ruling.reason,
-        certificate=ruling.certificate,
+        claims=ruling.certificate,
         cost=np.where(np.isfinite(fix.cost), fix.cost, np.nan),
         chart=chart_of(problem, x, covariance, pool.curvature),
     )
