@@ -19,6 +19,7 @@ from optloc.adequacy.level import SEVERAL, CommonLevel, LateSignals, common_leve
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.outputs import together
 from optloc.base.types import ANSWERED, Array, Status
+from optloc.cli.convert import read_table_problem
 from optloc.cli.file_fixes import (
     FileFixes,
     fix_file,
@@ -36,6 +37,7 @@ from optloc.cli.output import (
     write_text,
 )
 from optloc.files import Loaded, read
+from optloc.files.readings import Told
 from optloc.files.schema import ConstraintTable
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
@@ -83,12 +85,16 @@ def run_fix(
     late: bool = False,
     explain: bool = False,
     allow: tuple[Status, ...] = (),
+    told: Told | None = None,
 ) -> int:
-    """Fix a file under constraints of its own and more, write what was asked for, and return the exit code."""
+    """Fix a file, or a table with what is told of it, under more constraints; write and print; return the exit code."""
     on_output = geojson_path is not None and str(geojson_path) == "-"
     if as_json and on_output:
         raise InvalidProblem("JSON and GeoJSON cannot both go to standard output", "--geojson", "name a file")
-    loaded = read(file, more=more)
+    if told is None:
+        loaded = read(file, more=more)
+    else:
+        loaded = read_table_problem(file, told, more, quiet=quiet or as_json, on_error=on_output)
     claim_outputs(geojson_path, html, table=out, picture=plot, inputs=[file])
     loaded = _estimate_noise(loaded, noise)
     rescaled = _common_level(loaded.problem) if rescale else None

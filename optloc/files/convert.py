@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import Decimal
 from functools import partial
@@ -122,14 +122,22 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Converted:
-    """What was written, the problem that it is (None of stations alone), and what had to be assumed."""
+    """What was written, the problem that it is (None of stations alone), what was assumed, and what it is."""
 
     written: tuple[Path, ...]
     loaded: Loaded | None
     notes: tuple[str, ...] = ()
+    about: tuple[tuple[str, str], ...] = ()
 
 
-def convert(source: Path, out: Path, told: Told | None = None, **options: Any) -> Converted:
+def convert(
+    source: Path,
+    out: Path,
+    told: Told | None = None,
+    *,
+    tell: Callable[[Plan], object] = lambda _: None,
+    **options: Any,
+) -> Converted:
     """Write a table as a problem file.
 
     Parameters
@@ -141,6 +149,8 @@ def convert(source: Path, out: Path, told: Told | None = None, **options: Any) -
         Problem file to write, .toml; its tables go to CSV files beside it. Of stations alone: the CSV file.
     told : Told, optional
         What the table does not say itself.
+    tell : callable, optional
+        Is given the plan of a table of readings before it is written.
     **options
         The same, one by one: the fields of `Told`.
 
@@ -164,10 +174,11 @@ def convert(source: Path, out: Path, told: Told | None = None, **options: Any) -
     if out.suffix.lower() != ".toml":
         raise InvalidProblem("the problem file must end in .toml", str(out), "let the name behind --out end in it")
     plan = understood(source, told)
+    tell(plan)
     claim(*plan.tables(out), inputs=[source, *(path for path in (told.stations,) if path)])
     # Read before it is there: what cannot be read is not written.
     loaded = plan.read()
-    return Converted(plan.write(out), loaded, plan.notes)
+    return Converted(plan.write(out), loaded, plan.notes, plan.about)
 
 
 def _check_told(told: Told) -> None:
@@ -255,9 +266,7 @@ def _plan(roles: Roles, told: Told, place: Places, source: Path, found: Sequence
     if any(one.form.value == "sp" for one in found):
         speed = _sp_speed(told)
         lines = (f"propagation_speed = {speed!r}",)
-        notes.append(
-            f"S minus P times {speed:.6g} m/s, vp vs / (vp - vs), is a range: straight rays, one speed"
-        )
+        notes.append(f"S minus P times {speed:.6g} m/s, vp vs / (vp - vs), is a range: straight rays, one speed")
     after: tuple[str, ...] = ()
     if told.window is not None and "epoch" not in epochs:
         if "time" not in epochs:

@@ -266,12 +266,12 @@ def unit_for(column: str, form: Form, told: Told, held: Sequence[Decimal | None]
     """Return the unit of a column and a remark; raise InvalidProblem where neither its name nor --unit says it."""
     known = UNITS[form.quantity]  # type: ignore[index]  # models hold known quantities only
     own = unit_of(column, known)
+    if told.unit is not None and told.unit in known:
+        return told.unit, ""
+    if told.unit is not None and (own is None or not any(told.unit in table for table in UNITS.values())):
+        raise InvalidProblem(f"{told.unit!r} is no unit of {form.text}", "--unit", nearest(told.unit, list(known)))
     if own is not None:
         return own, ""
-    if told.unit is not None:
-        if told.unit not in known:
-            raise InvalidProblem(f"{told.unit!r} is no unit of {form.text}", "--unit", nearest(told.unit, list(known)))
-        return told.unit, ""
     if form.quantity == "angle" and any(value is not None and abs(value) > _TURN for value in held):
         return "deg", f"{column!r} is in degrees: some of its values are beyond a turn in radians"
     some = {"length": "ns, or --unit m", "angle": "deg, or --unit rad", "speed": "m/s"}.get(form.quantity, "1")

@@ -208,7 +208,8 @@ def _settled(found: Readings, roles: Roles, told: Told, place: Places, empty: in
         for i, name in enumerate([] if end is None else end.tolist()):
             if name not in known:
                 where = told.stations.name if told.stations is not None else table.source
-                spot = table.where(found.cells[i], int(found.row[i]))
+                column = roles.find("station") if len(set(found.cells)) == 1 else None
+                spot = table.where(column or found.cells[i], int(found.row[i]))
                 raise InvalidProblem(f"there is no station {name!r} in {where}", spot, nearest(name, place.names))
     if found.b is not None:
         same = next((i for i, (a, b) in enumerate(zip(found.a, found.b, strict=True)) if a == b), None)
