@@ -75,6 +75,8 @@ class Plan:
         Further lines of the problem file, before its tables.
     after : tuple of str
         The same, behind them.
+    height : str
+        What the constraint on the height says, where there is one.
     """
 
     source: Path
@@ -84,12 +86,14 @@ class Plan:
     notes: tuple[str, ...] = ()
     lines: tuple[str, ...] = ()
     after: tuple[str, ...] = ()
+    height: str = ""
 
     def read(self, more: Mapping[str, ConstraintTable] | None = None) -> Loaded:
         """Return the problem, with more constraints; nothing is left on the disk."""
         with TemporaryDirectory() as folder:
             place = Path(folder) / f"{self.source.stem}.toml"
-            self.write(place)
+            # A height that is told takes the place of one that was assumed.
+            (replace(self, height="") if "--height" in (more or {}) else self).write(place)
             return read(place, more=more)
 
     def write(self, out: Path) -> tuple[Path, ...]:
@@ -117,7 +121,8 @@ class Plan:
             lines += ["", "[[measurements]]", f'kind = "{section.kind}"                         # {section.text}']
             lines += [f"file = {quoted(name)}", f'unit = "{section.unit}"', *section.lines]
             lines += [f"sigma = {quoted(section.sigma)}"] if section.sigma is not None else []
-        return "\n".join([*lines, *self.after]) + "\n"
+        lines += [*self.after, *(["", "[[constraints]]", 'kind = "height"', self.height] if self.height else [])]
+        return "\n".join(lines) + "\n"
 
 
 @dataclass(frozen=True, slots=True)
@@ -273,8 +278,28 @@ def _plan(roles: Roles, told: Told, place: Places, source: Path, found: Sequence
             advice = "name the column of times with --column time=NAME, and its unit at the end of its name"
             raise InvalidProblem("a window needs a column of times", "--window", advice)
         after = ("", "[epochs]", f"window = {json.dumps(told.window)}")
-    notes += _few(sections, told)
-    return Plan(source, sections, place, tuple(_about(roles, told, place, found, epochs)), tuple(notes), lines, after)
+    height, note = _height(found, place)
+    notes += [*_few(sections, told), *([note] if note else [])]
+    return Plan(
+        source, sections, place, tuple(_about(roles, told, place, found, epochs)), tuple(notes), lines, after, height
+    )
+
+
+def _height(found: Sequence[Readings], place: Places) -> tuple[str, str]:
+    """Return what is known of the height of a target on Earth without a reading, as a line of a file, and a remark."""
+    if place.frame != "geodetic":
+        return "", ""
+    heights, unit = place.columns["height"], place.unit
+    if all(one.form.kind == "azimuth" for one in found):
+        mean = round(float(heights.mean()), 3)
+        remark = (
+            f"bearings tell no height: it is taken to be {mean:g} {unit}, the stations' mean, or what --height says"
+        )
+        return f'exactly = "{mean!r} {unit}"', remark
+    if any(one.form.value == "sp" for one in found):
+        top = float(heights.max())
+        return f'max = "{top!r} {unit}"', f"the earthquake is taken to be below the highest station, {top:g} {unit}"
+    return "", ""
 
 
 def _sigmas(told: Told, found: Sequence[Readings]) -> list[str | None]:
@@ -369,8 +394,10 @@ def _about(
         cells = list(dict.fromkeys(one.cells))
         shown = ", ".join(cells[:_NAMED]) + (f" and {len(cells) - _NAMED} more columns" if len(cells) > _NAMED else "")
         unit = f" in {one.unit}" if one.unit != "1" else ""
-        out.append((one.form.kind, f"{len(one.values)} readings{unit} from {shown}: {one.form.text}"))
-        out += [("azimuth", f"{one.azimuth}")] if one.azimuth is not None else []
+        text = {COMPASS: "bearings of a compass", CARTESIAN: "angles from the x axis"}.get(
+            str(one.azimuth), one.form.text
+        )
+        out.append((one.form.kind, f"{len(one.values)} readings{unit} from {shown}: {text}"))
         if one.b is not None and one.form.kind != "range_sum":
             out.append(
                 ("sign", f"positive where the {'first' if one.positive == 'a-farther' else 'second'} is farther")
