@@ -19,7 +19,6 @@ from optloc.adequacy.level import SEVERAL, CommonLevel, LateSignals, common_leve
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.outputs import together
 from optloc.base.types import ANSWERED, Array, Status
-from optloc.cli.convert import read_table_problem
 from optloc.cli.file_fixes import (
     FileFixes,
     fix_file,
@@ -36,6 +35,7 @@ from optloc.cli.output import (
     write_table,
     write_text,
 )
+from optloc.cli.tables import read_table_problem
 from optloc.files import Loaded, read
 from optloc.files.readings import Told
 from optloc.files.schema import ConstraintTable
