@@ -7,6 +7,28 @@ from typing import Annotated
 
 import typer
 
+from optloc.cli.from_table import EXAMPLES as CONVERSIONS
+from optloc.cli.from_table import (
+    As,
+    Average,
+    Axes,
+    Azimuth,
+    Column,
+    Missing,
+    Positive,
+    PSpeed,
+    Reference,
+    Sigma,
+    SSpeed,
+    Stations,
+    Still,
+    Unit,
+    Window,
+    Zone,
+    columns_of,
+    convert,
+    table_told,
+)
 from optloc.cli.live import EXAMPLES, SERVED, live, serve
 from optloc.cli.options import (
     EXIT_CODES,
@@ -38,28 +60,6 @@ from optloc.cli.options import (
     run_process,
 )
 from optloc.cli.study import study
-from optloc.cli.tables import EXAMPLES as CONVERSIONS
-from optloc.cli.tables import (
-    As,
-    Average,
-    Axes,
-    Azimuth,
-    Column,
-    Missing,
-    Positive,
-    PSpeed,
-    Reference,
-    Sigma,
-    SSpeed,
-    Stations,
-    Still,
-    Unit,
-    Window,
-    Zone,
-    columns_of,
-    convert,
-    table_told,
-)
 
 # Heavy libraries are imported inside the commands, so that --help answers at once.
 

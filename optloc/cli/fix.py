@@ -25,6 +25,7 @@ from optloc.cli.file_fixes import (
     fixes_json,
     geojson,
 )
+from optloc.cli.from_table import read_table_problem
 from optloc.cli.output import (
     Screen,
     claim_outputs,
@@ -35,7 +36,6 @@ from optloc.cli.output import (
     write_table,
     write_text,
 )
-from optloc.cli.tables import read_table_problem
 from optloc.files import Loaded, read
 from optloc.files.readings import Told
 from optloc.files.schema import ConstraintTable

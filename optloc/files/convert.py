@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -39,6 +40,8 @@ _SURFACE = 6.4e6
 _ORBITS = (".tle", ".2le", ".3le", ".sp3", ".omm")
 # Arrivals that place a target in the plane; of fewer the user is told.
 _FEW = 3
+# Letters of the name of a file that is not kept.
+_LETTERS = 40
 # Names of columns that are repeated of a list.
 _NAMED = 4
 
@@ -91,7 +94,8 @@ class Plan:
     def read(self, more: Mapping[str, ConstraintTable] | None = None) -> Loaded:
         """Return the problem, with more constraints; nothing is left on the disk."""
         with TemporaryDirectory() as folder:
-            place = Path(folder) / f"{self.source.stem}.toml"
+            # As the table is called, as far as every system writes such a name.
+            place = Path(folder) / f"{re.sub(r'[^A-Za-z0-9_-]', '_', self.source.stem)[:_LETTERS]}.toml"
             # A height that is told takes the place of one that was assumed.
             (replace(self, height="") if "--height" in (more or {}) else self).write(place)
             return read(place, more=more)
