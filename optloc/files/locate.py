@@ -185,7 +185,7 @@ def _pose(
         own = _per_word(unit, word, given, "unit") or found.unit or _WORDS[word].unit
         step = conversion(own, units.quantity, propagation_speed=speed, where=f"unit of {word}")
         spread = _spread(_per_word(sigma, word, given, "sigma"), word, units, own)
-        rows.append(_rows(word, found, spread, step, places))
+        rows.append(_rows(word, found, spread, step, places, speed))
     at = _heights(height, places, given)
     return assemble(places.stations, *rows, frame=places.frame, constraints=at)
 
@@ -409,14 +409,15 @@ def _numbers(word: str, values: Any) -> Array:
     return array
 
 
-def _rows(word: str, found: _Readings, sigma: float, unit: Conversion, places: _Receivers) -> Measured:
+def _rows(word: str, found: _Readings, sigma: float, unit: Conversion, places: _Receivers, speed: float) -> Measured:
     """Return readings in SI units as rows."""
     kind = _WORDS[word].kind
     a, b = np.array(found.keys, dtype=np.int64).T
     values = found.values
     if word == "toa":
+        # Dates become seconds, whatever the unit of sigma is.
+        unit = conversion("s", "length", propagation_speed=speed) if values.dtype.kind == "M" else unit
         values = _since_first(values, sigma, unit)
-        unit = Conversion(1.0) if found.values.dtype.kind == "M" else unit
     z = np.asarray(unit.to_si(values), dtype=float)
     heard = np.isfinite(z)
     if np.isinf(z).any():
@@ -434,13 +435,12 @@ def _rows(word: str, found: _Readings, sigma: float, unit: Conversion, places: _
 
 
 def _since_first(times: Array, sigma: float, unit: Conversion) -> Array:
-    """Return times counted from the first arrival, in their unit (dates in metres), before any digit is lost."""
+    """Return times counted from the first arrival, in their unit (dates in seconds), before any digit is lost."""
     if times.dtype.kind == "M":
         known = ~np.isnat(times)
         counted = times.astype("datetime64[ns]").astype(np.int64)
         first = np.where(known, counted, np.iinfo(np.int64).max).min(-1, keepdims=True)
-        speed = unit.factor  # of bare numbers, seconds
-        return np.where(known, (counted - first) * 1e-9 * speed, np.nan)
+        return np.where(known, (counted - first) * 1e-9, np.nan)
     if times.dtype.kind in "iu":
         return np.asarray((times - times.min(-1, keepdims=True)).astype(float))
     coarse = np.spacing(np.nanmax(np.abs(times))) * unit.factor if np.isfinite(times).any() else 0.0
