@@ -133,6 +133,7 @@ __all__ = [
     "likelihood_region",
     "linearise",
     "load",
+    "locate",
     "measured",
     "mixture",
     "noise",
@@ -182,6 +183,10 @@ def __getattr__(name: str) -> Any:
         from optloc import files  # pandas is loaded when a file or a table is read
 
         return getattr(files, name)
+    if name == "locate":
+        from optloc.files.locate import locate  # tables are read by the same libraries
+
+        return locate
     if name == "satellites":
         from optloc.files.orbits import satellites  # orbits are of an extra
 

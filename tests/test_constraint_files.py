@@ -230,7 +230,7 @@ def test_an_infeasible_epoch_is_exit_code_1_and_leaves_the_others_alone(tmp_path
         found = pd.read_csv(out, keep_default_na=False)
         assert found["active"].tolist() == ["", "x upper"]
         assert found["status"].tolist() == ["ok", status]
-        assert ("data contradict x upper" in found["reason"][1]) == (code == 1)
+        assert ("the constraint x upper disagree" in found["reason"][1]) == (code == 1)
         np.testing.assert_allclose(found["x"].astype(float), [1500.0, most], atol=1e-3)
 
 

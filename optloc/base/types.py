@@ -283,7 +283,8 @@ _SENTENCES: dict[Status, str] = {
     "station or a known height that tells them apart.",
     Status.SEARCHED: "No safe start is known for this mixture of rows: this is the best of a seeded search, and "
     "nothing proves that no other position explains the data as well.",
-    Status.MAX_ITERATIONS: "The refinement used all its iterations; raise the limit or look at the geometry.",
+    Status.MAX_ITERATIONS: "The iterations ended before they converged; check the units, the signs and the "
+    "places of the stations with 'optloc check'.",
     Status.STALLED: "The refinement could not lower the cost any more although its gradient is not zero.",
     Status.SINGULAR_GEOMETRY: "The rows leave a direction of the answer undetermined; add a station off it.",
     Status.TOO_FEW_ROWS: "There are fewer measurements than unknowns; add rows or fix an unknown.",

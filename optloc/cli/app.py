@@ -281,7 +281,7 @@ def separate(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Tell several emitters apart whose rows do not say whose they are; a channel is a kind at its stations."""
+    """Find several emitters when no row says which emitter it came from; a channel is one kind at its stations."""
     from optloc.cli.separate import run_separate
 
     raise typer.Exit(run_separate(file, detection, false, emitters, region, as_json=as_json, quiet=quiet))

@@ -17,8 +17,8 @@ from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix
 from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
-from optloc.report import fixes as told
-from optloc.report.fixes import Columns, fix_detail, join_tables, level_covariance, records
+from optloc.report import columns as told
+from optloc.report.columns import Columns, fix_detail, join_tables, level_covariance, records
 
 LOG = logging.getLogger("optloc.problem.fix")
 
@@ -188,6 +188,6 @@ def _unnoticed(fix: Fix, found: FileFixes, item: int) -> dict[str, Any]:
 
 
 def geojson(found: FileFixes) -> dict[str, Any]:
-    """Return stations, fixes and what holds 95 % as a GeoJSON feature collection, see `optloc.report.fixes.geojson`."""
+    """Return stations, fixes and what holds 95 % as GeoJSON, see `optloc.report.columns.geojson`."""
     problem = found.loaded.problem
     return told.geojson(found.columns, problem.frame, found.fixes, problem, found.loaded.source)

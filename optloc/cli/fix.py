@@ -47,16 +47,15 @@ from optloc.quality.levels import (
     late_signals,
     with_estimated_noise,
 )
+from optloc.report.columns import Columns, records
 from optloc.report.fixes import (
     SHOWN,
-    Columns,
     Sheet,
     alternative_sheet,
     as_p,
     bias_sheet,
     count_sheet,
     fix_sheet,
-    records,
     suspect_sheet,
     whose,
     with_sigma,

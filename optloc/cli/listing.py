@@ -40,7 +40,11 @@ def _print(rows: Rows, console: Console) -> None:
     """Print entries as a table, or one below the other where they are too long for one."""
     # Entries of one table may have different fields: all of them, in the order in which they first occur.
     title, *names = dict.fromkeys(name for row in rows for name in row)
-    if sum(max(len(row.get(name, "")) for row in rows) for name in names) > _WRAPS * console.width:
+    widths = [max(len(row.get(name, "")) for row in rows) for name in names]
+    words = [max((len(word) for row in rows for word in row.get(name, "").split()), default=0) for name in names]
+    # Three signs between two columns: where a word would be cut, a table does not fit either.
+    least = max(len(row[title]) for row in rows) + sum(words) + 3 * len(names) + 4
+    if sum(widths) > _WRAPS * console.width or least > console.width:
         for row in rows:
             console.print(Text.assemble((row[title], "bold"), f": {row['summary']}"), highlight=False)
             for name in names[:-1]:

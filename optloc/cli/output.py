@@ -18,7 +18,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.outputs import claim, is_stream, visible, written
 from optloc.compute.progress import Reporter
 from optloc.files.writer import write_csv
-from optloc.report.fixes import Columns, plain
+from optloc.report.columns import Columns, plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -30,7 +30,7 @@ from optloc.cli.output import (
 from optloc.files import Loaded, read
 from optloc.files.writer import GrowingTable
 from optloc.problem.problem import Problem
-from optloc.report.fixes import Columns, covariance_columns, geodetic_columns, join_tables, records
+from optloc.report.columns import Columns, covariance_columns, geodetic_columns, join_tables, records
 from optloc.track import Dynamics, State, current_statistical, polynomial, singer
 from optloc.track.run import Entry, Rules, tracked
 from optloc.track.several_targets import alone

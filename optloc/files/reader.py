@@ -15,7 +15,7 @@ from optloc.base.frames import Frame
 from optloc.base.inputs import Budget, access, at_most
 from optloc.base.types import Array, Bias, Rows, Stations
 from optloc.files.measurements import ESTIMATE, Chunk, check_repeats, chunks_of, square, with_baseline
-from optloc.files.roles import azimuths_of, in_our_words
+from optloc.files.roles import ASSUMED, azimuths_of, in_our_words
 from optloc.files.schema import ConstraintTable, ProblemFile, Units, join, name_of, read_document, speed_of, validate
 from optloc.files.stations import over_epochs, survey
 from optloc.files.table import Epochs, Keys, Table, epochs_of, need_clock, of_frame, table_of
@@ -151,6 +151,8 @@ def read(path: str | Path, *, values: bool = True, more: Mapping[str, Constraint
     """
     loaded = draft(Path(path), values=values, more=more or {}).loaded
     p = loaded.problem
+    if ASSUMED in loaded.azimuths:
+        LOG.warning("%s: azimuths are counted by %s", loaded.source, loaded.azimuths)
     LOG.info("read %s: %d rows, %d epochs, %d stations", loaded.source, p.count, p.epochs, p.stations.count)
     return loaded
 
@@ -195,9 +197,9 @@ def assemble(
     more : mapping of str to ConstraintTable, optional
         As `read`.
     """
-    written = file
+    stated = file
     file, station_table, tables = in_our_words(file, station_table, tables, source)
-    azimuths = azimuths_of(written, file)
+    azimuths = azimuths_of(stated, file)
     speed = speed_of(file, source)
     found, frame = survey(file.stations, station_table, file.frame, source)
     chunks = []

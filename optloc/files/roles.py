@@ -285,8 +285,13 @@ def _said(name: str) -> str | None:
     return unit_of(name, _UNITS)
 
 
+ASSUMED = " (no convention is named)"
+"""What is said beside azimuths of format 1 that might be meant otherwise."""
 _OTHER = {"north-clockwise": "east-counterclockwise", "east-counterclockwise": "north-clockwise"}
-_COUNTED = {"north-clockwise": "a compass: from north, clockwise", "east-counterclockwise": "from east, anticlockwise"}
+_COUNTED = {
+    "north-clockwise": "the compass, clockwise from north (+y)",
+    "east-counterclockwise": "the axes, anticlockwise from east (+x)",
+}
 
 
 def azimuths_of(written: ProblemFile, read: ProblemFile) -> str:
@@ -297,11 +302,11 @@ def azimuths_of(written: ProblemFile, read: ProblemFile) -> str:
     written, read : ProblemFile
         The settings as they are written, and as `in_our_words` returns them.
     """
-    said = {}
+    said: dict[str, None] = {}
     for before, after in zip(written.measurements, read.measurements, strict=True):
         if after.azimuth is not None:
             assumed = before.azimuth is None and str(before.kind).lower() != BEARING
-            why = " (no convention is named)" if assumed else ""
+            why = ASSUMED if assumed and written.format == 1 else ""
             said[f'{_COUNTED[after.azimuth]}{why}; else write azimuth = "{_OTHER[after.azimuth]}"'] = None
     return "; ".join(said)
 

@@ -335,9 +335,14 @@ def kind_named(word: str, where: str | None = "kind") -> str:
     raise InvalidProblem(f"unknown kind {word!r}", where, _likely_kind(folded, words))
 
 
+# Words of the field for quantities that no kind is: differences of angles and of phases, round trips, received power.
+_FOREIGN = {"adoa", "pdoa", "poa", "rtt", "rss", "rssi", "csi", "snr"}
+
+
 def _likely_kind(word: str, words: dict[str, str]) -> str:
-    # Spelled alike is not meant alike: only slips of the pen are guessed, the kinds are listed else.
-    close = get_close_matches(word, words, n=1, cutoff=0.8)
+    # Spelled alike is not meant alike: slips of the pen are guessed, one letter of four and not the first.
+    alike = [known for known in words if known[:1] == word[:1]]
+    close = [] if word in _FOREIGN else get_close_matches(word, alike, n=1, cutoff=0.75)
     known = f"known are {', '.join(sorted(MODELS))}; 'optloc list kinds' has their other names"
     return f"did you mean {close[0]!r}? {known}" if close else known
 

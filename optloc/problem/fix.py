@@ -280,6 +280,12 @@ class Fix:
         """Return latitude, longitude (radians) and ellipsoidal height (metres) of the position."""
         return self.frame.to_geodetic(self.position)
 
+    @property
+    def latlon(self) -> Array:
+        """Return latitude and longitude (degrees) and ellipsoidal height (metres) of the position, (..., 3)."""
+        lat, lon, height = self.geodetic
+        return np.stack([np.degrees(lat), np.degrees(lon), height], axis=-1)
+
     def ellipse(self, probability: float = 0.95) -> tuple[Array, Array]:
         """Return the error ellipse or ellipsoid of the position.
 
