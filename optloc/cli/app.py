@@ -3,31 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from optloc.cli.from_table import EXAMPLES as CONVERSIONS
 from optloc.cli.from_table import (
-    As,
-    Average,
-    Axes,
-    Azimuth,
-    Column,
-    Missing,
-    Positive,
-    PSpeed,
-    Reference,
-    Sigma,
-    SSpeed,
-    Stations,
-    Still,
-    Unit,
-    Window,
-    Zone,
-    columns_of,
     convert,
     table_told,
+    takes_table,
 )
 from optloc.cli.live import EXAMPLES, SERVED, live, serve
 from optloc.cli.options import (
@@ -130,6 +114,7 @@ def _options(
         "optloc fix toa.csv --stations sites.csv --sigma '20 ns'",
     ),
 )
+@takes_table
 def fix(
     file: ProblemPath,
     method: Method = "auto",
@@ -146,37 +131,18 @@ def fix(
     late: LateFromData = False,
     explain: Explain = False,
     allow: Allow = None,
-    stations: Stations = None,
-    sigma: Sigma = None,
-    column: Column = None,
-    unit: Unit = None,
-    as_: As = None,
-    frame: Axes = None,
-    missing: Missing = None,
-    average: Average = False,
-    azimuth: Azimuth = None,
-    positive: Positive = None,
-    reference: Reference = None,
-    vp: PSpeed = None,
-    vs: SSpeed = None,
-    window: Window = None,
-    still: Still = False,
-    zone: Zone = None,
     outside: Outside = False,
     budget: Budget = None,
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
+    given: Any = None,
 ) -> None:
     """Fix the target of a problem file, or of a table of readings, at every epoch if there are several.
 
     Options such as --height add to the constraints of the file. A table needs --stations and --sigma.
     """
     from optloc.cli.fix import run_fix
-
-    given = {"stations": stations, "sigma": sigma, "columns": columns_of(column), "unit": unit, "what": as_}
-    given |= {"frame": frame, "missing": missing, "average": average, "azimuth": azimuth, "positive": positive}
-    given |= {"reference": reference, "vp": vp, "vs": vs, "window": window, "still": still, "zone": zone}
 
     more, passing = constraints(height, above_ground, box), allowed(allow)
     files = {"geojson_path": geojson, "plot": plot, "out": out, "html": html}

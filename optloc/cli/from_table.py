@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import wraps
+from inspect import Parameter, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -35,52 +37,78 @@ def _option(metavar: str, text: str, *flags: str) -> Any:
     return typer.Option(*flags, metavar=metavar, help=text, rich_help_panel=PANEL)
 
 
-Stations = Annotated[
-    Path | None, _option("FILE", "Where the stations are: GeoJSON, CSV, Parquet or JSON.", "--stations")
-]
-Sigma = Annotated[
-    str | None,
-    _option("AMOUNT", "Error of each row: '20 ns', '6 m', 'range=6 m,azimuth=2 deg', or estimate.", "--sigma"),
-]
-Column = Annotated[
-    list[str] | None,
-    _option(
-        "ROLE=NAME",
-        "Column of a role that its name does not tell: message, station, time, target, reference, sigma, or a kind; "
-        "epoch, satellite, pseudorange, x, y, z; name, lat, lon, height, depth; p, s, phase. Once for each; "
-        "message=set+msg joins two.",
-        "--column",
-    ),
-]
-Unit = Annotated[str | None, _option("UNIT", "Of the values, where the column's name does not end in it.", "--unit")]
-As = Annotated[
-    str | None,
-    _option("WHAT", "arrivals, sp, pseudoranges, stations or a kind such as range, where columns do not tell.", "--as"),
-]
-Axes = Annotated[
-    str | None, _option("cartesian|ecef", "Frame of stations in x, y, z; cartesian by default.", "--frame")
-]
-Missing = Annotated[
-    str | None,
-    _option("N,...", "Numbers that mean: no reading, such as 0,-1,9999; none: all are readings.", "--missing"),
-]
-Average = Annotated[
-    bool, typer.Option("--average", help="Take the mean of several readings of the same.", rich_help_panel=PANEL)
-]
-Azimuth = Annotated[
-    str | None, _option("CONVENTION", "Of bearings: north-clockwise or east-counterclockwise.", "--azimuth")
-]
-Positive = Annotated[str | None, _option("a-farther|b-farther", "Where differences are positive.", "--positive")]
-Reference = Annotated[str | None, _option("STATION", "The other station of all differences.", "--reference")]
-PSpeed = Annotated[str | None, _option("SPEED", "Of P waves, such as '6 km/s'.", "--vp")]
-SSpeed = Annotated[str | None, _option("SPEED", "Of S waves, such as '3.5 km/s'.", "--vs")]
-Window = Annotated[str | None, _option("TIME", "Readings within it belong together, such as '0.1 s'.", "--window")]
-Still = Annotated[
-    bool, typer.Option("--still", help="The target stays: all readings belong together.", rich_help_panel=PANEL)
-]
-Zone = Annotated[str | None, _option("NAME", "Time zone of dates without one: UTC, Europe/Rome.", "--zone")]
+def _flag(text: str, flag: str) -> Any:
+    return typer.Option(flag, help=text, rich_help_panel=PANEL)
 
 
+_TEXT = str | None
+# Field of `optloc.files.readings.Told`: its option. One table, from which all commands that take tables have them.
+_OPTIONS: dict[str, Any] = {
+    "stations": Annotated[
+        Path | None, _option("FILE", "Where the stations are: GeoJSON, CSV, Parquet or JSON.", "--stations")
+    ],
+    "sigma": Annotated[
+        _TEXT,
+        _option("AMOUNT", "Error of each row: '20 ns', '6 m', 'range=6 m,azimuth=2 deg', or estimate.", "--sigma"),
+    ],
+    "columns": Annotated[
+        list[str] | None,
+        _option(
+            "ROLE=NAME",
+            "Column of a role that its name does not tell: message, station, time, target, reference, sigma, or a "
+            "kind; epoch, satellite, pseudorange, x, y, z; name, lat, lon, height, depth; p, s, phase. Once for each; "
+            "message=set+msg joins two.",
+            "--column",
+        ),
+    ],
+    "unit": Annotated[_TEXT, _option("UNIT", "Of the values, where the column's name does not end in it.", "--unit")],
+    "what": Annotated[
+        _TEXT,
+        _option("WHAT", "arrivals, sp, pseudoranges, stations or a kind such as range; as columns tell.", "--as"),
+    ],
+    "frame": Annotated[
+        _TEXT, _option("cartesian|ecef", "Frame of stations in x, y, z; cartesian by default.", "--frame")
+    ],
+    "missing": Annotated[
+        _TEXT,
+        _option("N,...", "Numbers that stand for no reading, such as 0,-1,9999, or none.", "--missing"),
+    ],
+    "average": Annotated[bool, _flag("Take the mean of several readings of the same.", "--average")],
+    "azimuth": Annotated[
+        _TEXT, _option("CONVENTION", "Of bearings: north-clockwise or east-counterclockwise.", "--azimuth")
+    ],
+    "positive": Annotated[_TEXT, _option("a-farther|b-farther", "Where differences are positive.", "--positive")],
+    "reference": Annotated[_TEXT, _option("STATION", "The other station of all differences.", "--reference")],
+    "vp": Annotated[_TEXT, _option("SPEED", "Of P waves, such as '6 km/s'.", "--vp")],
+    "vs": Annotated[_TEXT, _option("SPEED", "Of S waves, such as '3.5 km/s'.", "--vs")],
+    "window": Annotated[_TEXT, _option("TIME", "Readings within it belong together, such as '0.1 s'.", "--window")],
+    "still": Annotated[bool, _flag("The target stays: all readings belong together.", "--still")],
+    "zone": Annotated[_TEXT, _option("NAME", "Time zone of dates without one: UTC, Europe/Rome.", "--zone")],
+}
+
+
+def takes_table(command: Callable[..., None]) -> Callable[..., None]:
+    """Return a command with the options of tables; it is given them as one mapping, `given`."""
+    own = signature(command, eval_str=True)
+
+    @wraps(command)
+    def taking(**values: Any) -> None:
+        given = {name: values.pop(name) for name in _OPTIONS}
+        command(**values, given=given | {"columns": columns_of(given["columns"])})
+
+    kept = [entry for entry in own.parameters.values() if entry.name != "given"]
+    more = [
+        Parameter(
+            name, Parameter.KEYWORD_ONLY, default=False if name in ("average", "still") else None, annotation=kind
+        )
+        for name, kind in _OPTIONS.items()
+    ]
+    taking.__signature__ = own.replace(parameters=[*kept, *more])  # type: ignore[attr-defined]  # what typer reads
+    taking.__annotations__ = {entry.name: entry.annotation for entry in (*kept, *more)}
+    return taking
+
+
+@takes_table
 def convert(
     file: Annotated[
         Path,
@@ -93,22 +121,6 @@ def convert(
         Path | None,
         typer.Option(metavar="OUT.toml", help="Problem file to write, with CSV files beside it; without: only look."),
     ] = None,
-    stations: Stations = None,
-    sigma: Sigma = None,
-    column: Column = None,
-    unit: Unit = None,
-    as_: As = None,
-    frame: Axes = None,
-    missing: Missing = None,
-    average: Average = False,
-    azimuth: Azimuth = None,
-    positive: Positive = None,
-    reference: Reference = None,
-    vp: PSpeed = None,
-    vs: SSpeed = None,
-    window: Window = None,
-    still: Still = False,
-    zone: Zone = None,
     times: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Table of measurements whose times (UTC) orbits are wanted at."),
@@ -118,12 +130,10 @@ def convert(
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
+    given: Any = None,
 ) -> None:
     """Make a problem file of a table of readings, of stations or of orbits, and say what it was taken for."""
-    given = {"stations": stations, "sigma": sigma, "columns": columns_of(column), "unit": unit, "what": as_}
-    given |= {"frame": frame, "missing": missing, "average": average, "azimuth": azimuth, "positive": positive}
-    given |= {"reference": reference, "vp": vp, "vs": vs, "window": window, "still": still, "zone": zone}
-    raise typer.Exit(_run(file, out, given | {"times": times}, as_json, quiet))
+    raise typer.Exit(_run(file, out, {**given, "times": times}, as_json, quiet))
 
 
 def columns_of(pairs: Sequence[str] | None) -> dict[str, str]:
