@@ -35,7 +35,7 @@ from optloc.report.map import (
     dot,
     fixed_spots,
     ground_tracks,
-    lines_of_position,
+    lines_on_map,
     map_canvas,
     other_spots,
     path,
@@ -244,7 +244,7 @@ def _page(problem: Problem, found: Spots, others: Spots, title: str, what: str, 
     stations, tracks = station_spots(problem), ground_tracks(problem)
     limits = _limits([stations.place, found.place, others.place, *(line for _, line in tracks)])
     plane, middle = Plane(*limits), (limits[0] + limits[1]) / 2.0
-    lines = [] if single is None else lines_of_position(problem, single, limits)
+    lines = [] if single is None else lines_on_map(problem, single, limits)
     few = len(found.place) <= _FEW
     layers: dict[str, Sequence[Drawn]] = {
         **({"lines of position": _curves(lines, plane)} if lines else {}),

@@ -11,7 +11,7 @@ import optloc
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
 from optloc.report import fix_page
-from optloc.report.map import fixed_spots, ground_tracks, lines_of_position
+from optloc.report.map import fixed_spots, ground_tracks, lines_on_map
 
 RUN = CliRunner()
 DEMO = package_files("optloc") / "scenarios" / "demo.toml"
@@ -55,7 +55,7 @@ def test_the_ring_is_the_ellipse(demo):
 def test_lines_of_position_meet_their_rows(demo):
     problem, fix = demo
     lon, lat = np.degrees(fix.geodetic[1]), np.degrees(fix.geodetic[0])
-    lines = lines_of_position(problem, fix, (lon - 0.1, lon + 0.1, lat - 0.07, lat + 0.07))
+    lines = lines_on_map(problem, fix, (lon - 0.1, lon + 0.1, lat - 0.07, lat + 0.07))
     assert {name for name, _ in lines} == {f"tdoa {n} – Lake" for n in ("Chapel", "Quarry", "Summit", "Mill", "Tower")}
     for name, line in lines:
         row = [f"tdoa {problem.stations.names[a]} – Lake" for a in problem.rows[0].a].index(name)
