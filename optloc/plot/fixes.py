@@ -104,8 +104,14 @@ def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") ->
     if len(every) == 1 and every[0].code.size == 1 and np.isfinite(scene.fixes).all():
         centres = (np.zeros(2), scene.fixes[0, :2])
         for panel, size, centre in zip((panels[0], panels[-1]), sizes, centres, strict=False):
-            _position_lines(panel, problem, every[0], centre, size)
+            if _position_lines(panel, problem, every[0], centre, size) and spatial and panel is panels[0]:
+                panel.set_title("plan, lines at the height of the fix")
     finish(figure, title, panels[:1])
+    # The limits of a plan are settled once the figure was laid out.
+    figure.draw_without_rendering()
+    for panel in panels[:: len(panels) - 1] if near else panels[:1]:
+        if panel.axison:
+            style.scale_bar(panel, panel.get_xlabel().rpartition("(")[2].rstrip(")"))
     apart(figure)
     return figure
 
@@ -216,16 +222,22 @@ class PositionLine(NamedTuple):
     line: Array
 
 
-def _position_lines(panel: Axes, problem: Problem, fix: Fix, centre: Array, size: float) -> None:
-    """Draw where each row alone would put the target, in a plan whose origin is a centre, metres."""
-    from matplotlib.collections import LineCollection
-
+def _position_lines(panel: Axes, problem: Problem, fix: Fix, centre: Array, size: float) -> bool:
+    """Draw where each row alone would put the target, in a plan whose origin is a centre; return whether there are."""
     (west, east), (south, north) = panel.get_xlim(), panel.get_ylim()
     middle, half = np.array([west + east, south + north]) / 2.0, _WIDE * max(east - west, north - south) / 2.0
     corners = size * np.stack([middle - half, middle + half]) + centre
     x, y = (np.linspace(low, high, _GRID) for low, high in corners.T)
     places = _at_height(problem, fix, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
     found = lines_of_position(problem, fix, x, y, places)
+    draw_lines(panel, found, centre, size)
+    return bool(found)
+
+
+def draw_lines(panel: Axes, found: Sequence[PositionLine], centre: Array, size: float) -> None:
+    """Draw lines of position in a plan whose origin is a centre, metres, and whose unit has a size."""
+    from matplotlib.collections import LineCollection
+
     for kind, colour in zip(dict.fromkeys(one.kind for one in found), cycle((PURPLE, SKY, GREEN, YELLOW))):
         lines = [(one.line - centre) / size for one in found if one.kind == kind]
         label = _SHAPES.get(kind, f"where one {kind} alone would put it")

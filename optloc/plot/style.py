@@ -133,6 +133,31 @@ def grid(panel: Axes) -> None:
     panel.set_axisbelow(True)
 
 
+# Parts of a panel that a scale bar takes: a length that reads well, and the corner in which fewest marks are.
+_BAR, _CORNER = 0.25, 0.3
+
+
+def scale_bar(panel: Axes, unit: str) -> None:
+    """Draw the bar of a length in a corner of a plan whose limits are settled."""
+    from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
+
+    (west, east), (south, north) = panel.get_xlim(), panel.get_ylim()
+    most = _BAR * (east - west)
+    power = 10.0 ** np.floor(np.log10(most))
+    length = power * next(n for n in (5.0, 2.0, 1.0) if n * power <= most)
+    marks = panel.transData.inverted().transform(_marks(panel))
+    share = (marks - [west, south]) / [east - west, north - south]
+    counts = {
+        name: int(((np.abs(share[:, 0] - x) < 1.3 * _CORNER) & (share[:, 1] < _CORNER)).sum())
+        for name, x in (("lower right", 1.0), ("lower left", 0.0))
+    }
+    corner = min(counts, key=lambda name: counts[name])
+    style: dict[str, Any] = {"pad": 0.3, "borderpad": 0.4, "sep": 3, "size_vertical": 0.004 * (north - south)}
+    bar = AnchoredSizeBar(panel.transData, length, f"{length:g} {unit}", corner, frameon=True, **style)
+    bar.patch.set(edgecolor="none", alpha=0.8)
+    panel.add_artist(bar)
+
+
 # Notes that keep apart.
 
 
