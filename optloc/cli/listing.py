@@ -48,8 +48,8 @@ def _print(rows: Rows, console: Console) -> None:
     if sum(widths) > _WRAPS * console.width or least > console.width:
         for row in rows:
             console.print(Text.assemble((row[title], "bold"), f": {row['summary']}"), highlight=False)
-            for name in (each for each in names if each != "summary"):
-                console.print(Padding(f"{name}: {row.get(name, '')}", (0, 0, 0, 4)), highlight=False)
+            for name in (each for each in names if each != "summary" and row.get(each)):
+                console.print(Padding(f"{name}: {row[name]}", (0, 0, 0, 4)), highlight=False)
         return
     table = Table()
     table.add_column(title, no_wrap=True)
