@@ -322,3 +322,28 @@ def test_sound_is_as_tables_have_it():
     assert optloc.units.sound_in_water(20.0, salinity=0.0) == pytest.approx(1482.3, abs=1.0)
     with pytest.raises(InvalidProblem, match="outside"):
         optloc.units.sound_in_water(90.0)
+
+
+def test_a_speed_that_is_not_known_is_estimated(tmp_path):
+    ways = {name: float(np.linalg.norm(TAG - at)) for name, at in {**ANCHORS, "E": (4.0, 9.0)}.items()}
+    stations = ", ".join(f'{{name = "{n}", x = {x}, y = {y}}}' for n, (x, y) in {**ANCHORS, "E": (4.0, 9.0)}.items())
+    rows = ", ".join(f'{{a = "{n}", tof_ms = {1e3 * way / 340.0}}}' for n, way in ways.items())
+    path = tmp_path / "sound.toml"
+    path.write_text(f"""format = 2
+propagation_speed = {{ medium = "air", celsius = 20.0 }}
+[stations]
+rows = [{stations}]
+[[measurements]]
+kind = "tof"
+sigma = "0.01 ms"
+rows = [{rows}]
+[[biases]]
+name = "speed"
+form = "scale"
+per = "kind"
+kind = "tof"
+sigma = "0.05 1"
+""")
+    fix = optloc.solve(optloc.load(path))
+    assert fix.position == pytest.approx(TAG, abs=1e-3)
+    assert fix.bias["speed"] == pytest.approx([optloc.units.sound_in_air(20.0) / 340.0 - 1.0], rel=0.02)

@@ -120,7 +120,9 @@ def nearest(word: str, known: Iterable[str]) -> str:
     names = list(islice(known, _MANY))
     word = str(word)[:_SHOWN]
     folded = {name.lower(): name for name in names}
-    close = [repr(folded[name]) for name in get_close_matches(word.lower(), folded, n=2, cutoff=0.5)]
+    # Of one letter nobody knows what it was meant to be, and half of the letters alike is chance.
+    alike = get_close_matches(word.lower(), folded, n=2, cutoff=0.6) if len(word) > 1 else []
+    close = [repr(folded[name]) for name in alike]
     hint = f"did you mean {' or '.join(close)}?" if close else ""
     more = f" and {len(names) - _FEW} more" if len(names) > 2 * _FEW else ""
     listed = "" if close and len(names) > _FEW else f"known are {', '.join(names[:_FEW] if more else names)}{more}"

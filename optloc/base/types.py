@@ -259,6 +259,14 @@ class Status(IntEnum):
     UNPROVEN = 15
     CURVED = 16
 
+    def __str__(self) -> str:
+        """Return the label: what `print` shows."""
+        return self.label
+
+    def __format__(self, spec: str) -> str:
+        """Return the label, or the number where a format asks for one."""
+        return format(int(self), spec) if spec else self.label
+
     @property
     def sentence(self) -> str:
         """Return what happened and what to do about it."""

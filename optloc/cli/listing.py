@@ -41,19 +41,20 @@ def _print(rows: Rows, console: Console) -> None:
     # Entries of one table may have different fields: all of them, in the order in which they first occur.
     title, *names = dict.fromkeys(name for row in rows for name in row)
     widths = [max(len(row.get(name, "")) for row in rows) for name in names]
-    words = [max((len(word) for row in rows for word in row.get(name, "").split()), default=0) for name in names]
-    # Three signs between two columns: where a word would be cut, a table does not fit either.
-    least = max(len(row[title]) for row in rows) + sum(words) + 3 * len(names) + 4
+    # Where a word would be cut, a table does not fit either: three signs stand between two columns.
+    texts = {name: " ".join([name, *(row.get(name, "") for row in rows)]) for name in names}
+    words = {name: max(map(len, text.split())) for name, text in texts.items()}
+    least = max(len(row[title]) for row in rows) + sum(words.values()) + 3 * len(names) + 4
     if sum(widths) > _WRAPS * console.width or least > console.width:
         for row in rows:
             console.print(Text.assemble((row[title], "bold"), f": {row['summary']}"), highlight=False)
-            for name in names[:-1]:
-                console.print(Padding(f"{name}: {row.get(name, '')}", (0, 0, 0, 4)), highlight=False)
+            for name in (each for each in names if each != "summary" and row.get(each)):
+                console.print(Padding(f"{name}: {row[name]}", (0, 0, 0, 4)), highlight=False)
         return
     table = Table()
     table.add_column(title, no_wrap=True)
     for name in names:
-        table.add_column(name)
+        table.add_column(name, overflow="fold")
     for row in rows:
         table.add_row(row[title], *(row.get(name, "") for name in names))
     console.print(table)

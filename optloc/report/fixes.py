@@ -39,7 +39,7 @@ from optloc.report.columns import (
 _HELD = 1e-12
 _EARTH = 6.4e6
 # A length below this share of another one is rounding: a height that is held has one.
-_NOTHING = 1e-8
+_NOTHING = 1e-6
 # What a screen holds of each list; the rest is counted, and tables and JSON have all of it.
 SHOWN, _EXPLANATIONS, _SUSPECTS, _BIASES = 12, 8, 12, 40
 # p-value below which a misfit is pointed out: one right fix in a thousand.

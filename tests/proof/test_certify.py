@@ -112,7 +112,7 @@ def test_a_mirror_image_is_a_second_minimum_not_a_worse_one():
     np.testing.assert_allclose(fix.alternatives.x[0], fix.x * [1.0, 1.0, -1.0], atol=1e-3)
     proof = fix.certificate
     assert (proof.proof, proof.unique) == ("global", True)
-    assert "every other local minimum, except the 1 listed," in proof.reason
+    assert "every other local minimum, except the one listed," in proof.reason
 
 
 @machine_code

@@ -90,7 +90,7 @@ def state_claim(
 @lru_cache(maxsize=256)
 def _sentence(margin: float, listed: int, region: tuple[Corner, Corner] | None) -> str:
     where = "no position" if region is None else f"no position from {_text(region[0])} to {_text(region[1])} m"
-    beside = "" if not listed else f", except the {listed} listed,"
+    beside = "" if not listed else f", except the {'one' if listed == 1 else listed} listed,"
     if margin > 0.0:
         rest = f"every other local minimum{beside} costs at least {margin:g} more"
     else:
