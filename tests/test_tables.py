@@ -84,7 +84,7 @@ def test_five_hundred_aircraft_messages_from_a_wide_table(tmp_path):
     asked = run(*words, code=2)
     assert "do not tell what they hold; say it with --as arrivals" in asked.stderr
     told = run(*words, "--as", "arrivals", "--out", out, "--allow", "curved,ambiguous,unproven")
-    assert "10 cells are empty: no readings" in told.stdout
+    assert "10 cells without a number: no reading" in told.stdout
     assert "not used  squawk" in told.stdout
     import pandas as pd
 
@@ -265,11 +265,11 @@ def test_dates_and_numbers_of_an_instant_are_the_same_arrivals(tmp_path):
 def test_a_number_that_may_mean_nothing_is_asked_for(mark, good, tmp_path):
     rows = "".join(f"{k},{good + 0.1 * k},{mark if k == 2 else 4.0 + 0.1 * k},{5.0 + 0.01 * k}\n" for k in range(4))
     text = "epoch,dist_A1_m,dist_A2_m,dist_A3_m\n" + rows
-    with pytest.raises(InvalidProblem, match=rf"row 3, .*'dist_A2_m': {mark} occurs once: .* --missing {mark} if"):
+    with pytest.raises(InvalidProblem, match=rf"row 3, .*'dist_A2_m': {mark} occurs once, .* --missing {mark}, or"):
         plan(tmp_path, text)
     found = plan(tmp_path, text, missing=mark)
     assert found.read().problem.count == 11
-    assert f"1 cells hold {mark}: no readings" in found.notes
+    assert f"1 cell with {mark}: no reading" in found.notes
     assert plan(tmp_path, text, missing="none").read().problem.count == 12
 
 
@@ -286,7 +286,7 @@ def test_words_for_nothing_are_no_readings(word, tmp_path):
     text = f"epoch,dist_A1_m,dist_A2_m\n1,3.2,{word}\n2,3.3,4.4\n"
     found = plan(tmp_path, text)
     assert found.read().problem.count == 3
-    assert "1 cells are empty: no readings" in found.notes
+    assert "1 cell without a number: no reading" in found.notes
 
 
 def test_repeats_are_refused_with_their_count_or_averaged(tmp_path):

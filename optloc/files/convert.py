@@ -414,7 +414,8 @@ def _about(
         by = next((f"column {named[role]}" for role in roles_ if role in named), "row")
         out.append(("epochs", f"{len(set(epochs['epoch'].tolist()) - {''})} by {by}"))
     elif "time" in epochs:
-        out.append(("epochs", f"by column {named['time']}" + (f", {told.window} each" if told.window else "")))
+        each = f"{told.window} each" if told.window else f"{len(np.unique(epochs['time']))}"
+        out.append(("epochs", f"{each} by column {named['time']}"))
     if "target" in epochs:
         out.append(("targets", f"{len(set(epochs['target'].tolist()))} by column {named['target']}"))
     where = told.stations.name if told.stations is not None else "the table itself"

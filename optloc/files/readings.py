@@ -328,16 +328,20 @@ def without_gaps(found: Readings, epoch: Sequence[Any], told: Told, table: Table
             count = found.values.count(doubtful)
             where = next(i for i, value in enumerate(found.values) if value == doubtful)
             times = f"{count} times, first here" if count > 1 else "once"
-            advice = f"say --missing {doubtful} if it means that there is none, else --missing none"
-            what = f"{doubtful} occurs {times}: a reading, or none?"
+            advice = f"say --missing {doubtful}, or --missing none if it is a reading"
+            what = f"{doubtful} occurs {times}, and may be a reading or mean that there is none"
             raise InvalidProblem(what, table.where(found.cells[where], int(found.row[where])), advice)
     keep = [i for i, value in enumerate(found.values) if value not in marks]
     if not keep:
         raise InvalidProblem("no cell holds a reading", table.source, "look at --missing and the columns")
     gone = len(found.values) - len(keep)
-    notes = [f"{gone} cells hold {told.missing}: no readings"] if gone else []
-    notes += [f"{empty} cells are empty: no readings"] if empty else []
+    notes = [f"{_cells(gone)} with {told.missing}: no reading"] if gone else []
+    notes += [f"{_cells(empty)} without a number: no reading"] if empty else []
     return replace(found.take(keep) if gone else found, notes=(*found.notes, *notes))
+
+
+def _cells(count: int) -> str:
+    return "1 cell" if count == 1 else f"{count} cells"
 
 
 def _doubtful(found: Readings, epoch: Sequence[Any]) -> Decimal | None:
