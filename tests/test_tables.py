@@ -471,3 +471,22 @@ def test_without_out_a_table_is_only_looked_at(tmp_path):
     assert "3 readings in ns from toa_ns: arrival times" in told.stdout
     assert "Nothing is written" in told.stdout
     assert {path.name for path in tmp_path.iterdir()} == {"t.csv", "rx.csv"}
+
+
+def test_digits_that_are_lost_are_told(tmp_path):
+    told = {"stations": rx(tmp_path), "sigma": "1 ns"}
+    with pytest.raises(InvalidProblem, match=r"row 1, column 'toa_ns': the arrival 1.79E\+18 has lost its digits"):
+        plan(tmp_path, "msg,rx,toa_ns\n1,Lake,1.79E+18\n1,Mill,1.79E+18\n", **told)
+    seconds = "1790000000.250000123456"
+    rows = f'[{{"rx": "Lake", "toa_s": {seconds}}}, {{"rx": "Mill", "toa_s": 1790000000.25}}]'
+    found = plan(tmp_path, rows, "t.json", **told).sections[0]
+    assert [float(z) for z in found.columns["z"]] == [1.23456e-7, 0.0]
+    import pandas as pd
+
+    pd.DataFrame({"rx": ["Lake", "Mill"], "toa_s": [1790000000.25, 1790000000.5]}).to_parquet(tmp_path / "t.parquet")
+    assert "rounded to 71.5 m" in understood(tmp_path / "t.parquet", Told(**told)).notes[0]
+
+
+def test_a_column_like_those_of_receivers_that_names_none_is_told(tmp_path):
+    found = plan(tmp_path, "t_s,A1_m,A2_m,A9_m,note\n1,3,4,5,x\n", what="range")
+    assert "'A9_m' may hold readings, but name no station of anchors.csv" in found.notes

@@ -158,7 +158,7 @@ def fix(
         late=late,
         explain=explain,
         allow=passing,
-        told=table_told(file, given),
+        table=table_told(file, given),
     )
     raise typer.Exit(code)
 

@@ -84,16 +84,16 @@ def run_fix(
     late: bool = False,
     explain: bool = False,
     allow: tuple[Status, ...] = (),
-    told: Told | None = None,
+    table: Told | None = None,
 ) -> int:
     """Fix a file, or a table with what is told of it, under more constraints; write and print; return the exit code."""
     on_output = geojson_path is not None and str(geojson_path) == "-"
     if as_json and on_output:
         raise InvalidProblem("JSON and GeoJSON cannot both go to standard output", "--geojson", "name a file")
-    if told is None:
+    if table is None:
         loaded = read(file, more=more)
     else:
-        loaded = read_table_problem(file, told, more, quiet=quiet or as_json, on_error=on_output)
+        loaded = read_table_problem(file, table, more, quiet=quiet or as_json, on_error=on_output)
     claim_outputs(geojson_path, html, table=out, picture=plot, inputs=[file])
     loaded = _estimate_noise(loaded, noise)
     rescaled = _common_level(loaded.problem) if rescale else None

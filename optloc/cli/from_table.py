@@ -161,7 +161,7 @@ def _run(file: Path, out: Path | None, given: Mapping[str, Any], as_json: bool, 
         plan.read()
         say_next(console, f"Nothing is written: --out names the problem file, and optloc fix {file} fixes it as it is.")
         if as_json:
-            write_text(Path("-"), dumps({"understood": [list(pair) for pair in plan.about], "notes": list(plan.notes)}))
+            write_text(Path("-"), dumps({"understood": _pairs(plan.about), "notes": list(plan.notes)}))
         return 0
     found = written(file, out, told, tell=lambda plan: _tell(plan, console))
     if as_json:
@@ -196,12 +196,16 @@ def _tell(plan: Plan, console: Console) -> None:
     say_all(console, plan.notes)
 
 
+def _pairs(about: Sequence[tuple[str, str]]) -> list[list[str]]:
+    return [list(pair) for pair in about]
+
+
 def _json(found: Converted) -> dict[str, Any]:
-    about = {"files": [str(path) for path in found.written], "notes": list(found.notes)}
+    about: dict[str, Any] = {"files": [str(path) for path in found.written], "notes": list(found.notes)}
     if found.loaded is None:
         return about
     problem = found.loaded.problem
-    about |= {"understood": [list(pair) for pair in found.about]}
+    about["understood"] = _pairs(found.about)
     return about | {"stations": problem.stations.count, "epochs": problem.epochs, "rows": problem.count}
 
 

@@ -282,10 +282,24 @@ def _plan(roles: Roles, told: Told, place: Places, source: Path, found: Sequence
             advice = "name the column of times with --column time=NAME, and its unit at the end of its name"
             raise InvalidProblem("a window needs a column of times", "--window", advice)
         after = ("", "[epochs]", f"window = {json.dumps(told.window)}")
+    notes += _left_out(roles, told, found)
     height, note = _height(found, place)
     notes += [*_few(sections, told), *([note] if note else [])]
     return Plan(
         source, sections, place, tuple(_about(roles, told, place, found, epochs)), tuple(notes), lines, after, height
+    )
+
+
+def _left_out(roles: Roles, told: Told, found: Sequence[Readings]) -> list[str]:
+    """Return a remark on columns that are in the unit of those of receivers, but name none."""
+    used = {cell for one in found for cell in one.cells}
+    if told.stations is None or len(used) <= len(found):
+        return []
+    units = {unit_of(name, UNITS["length"]) for name in used} - {None}
+    like = [name for name in roles.table.columns if name not in used and unit_of(name, UNITS["length"]) in units]
+    like = [name for name in like if name not in {roles.find(role) for role in ("time", "message", "sigma")}]
+    return (
+        [f"{', '.join(map(repr, like))} may hold readings, but name no station of {told.stations.name}"] if like else []
     )
 
 
@@ -406,8 +420,9 @@ def _about(
             out.append(
                 ("sign", f"positive where the {'first' if one.positive == 'a-farther' else 'second'} is farther")
             )
-    wanted = ("station", "reference", "message", "time", "target", "sigma", "phase", "p", "s", "sp")
+    wanted: tuple[str, ...] = ("station", "reference", "message", "time", "target", "sigma", "phase", "p", "s", "sp")
     wanted += PLACE if told.stations is None else ()
+    wanted = tuple(role for role in wanted if role != "sigma" or any(one.sigma is not None for one in found))
     named = {role: column for role in wanted if (column := roles.find(role))}
     if "epoch" in epochs:
         roles_ = ("message", "time") if told.window is None else ("time",)

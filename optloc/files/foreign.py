@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from decimal import Decimal
 from math import sqrt
 from pathlib import Path
 from typing import Any
@@ -100,8 +101,8 @@ def _json(path: Path) -> Table:
     # Lines that are documents each are a log; a document of one line may be either.
     several = len(lines) > 1 and all(line.lstrip().startswith("{") and line.rstrip().endswith("}") for line in lines)
     if not several:
-        return records(json_of(text, path.name), path.name)
-    return records([json_of(line, f"{path.name}, line {i + 1}") for i, line in enumerate(lines)], path.name)
+        return records(json_of(text, path.name, Decimal), path.name)
+    return records([json_of(line, f"{path.name}, line {i + 1}", Decimal) for i, line in enumerate(lines)], path.name)
 
 
 def records(data: Any, source: str) -> Table:
@@ -130,6 +131,8 @@ def _flat(row: Mapping[str, Any]) -> dict[str, Any]:
     for key, value in row.items():
         if isinstance(value, Mapping):
             out |= {f"{key}_{inner}": cell for inner, cell in _flat(value).items()}
+        elif isinstance(value, Decimal):
+            out[str(key)] = str(value)
         elif isinstance(value, str | int | float | None) and not isinstance(value, bool):
             out[str(key)] = value
     return out
@@ -143,9 +146,10 @@ def _clusters(data: Sequence[Mapping[str, Any]], source: str) -> Iterator[dict[s
         if not isinstance(cluster, list):
             raise InvalidProblem("there is no cluster of receptions, which other rows have", place, "leave it out")
         for cells in cluster:
-            numbers = isinstance(cells, list) and all(type(cell) in (int, float) for cell in cells)
+            numbers = isinstance(cells, list) and all(type(cell) in (int, float, Decimal) for cell in cells)
             if not numbers or len(cells) < len(_CLUSTER) - 1:
                 raise InvalidProblem(f"{str(cells)[:80]} is no reception", place, "write [x, y, z, microseconds]")
-            reception = dict(zip(_CLUSTER, [*cells[:4], *(sqrt(max(cell, 0.0)) for cell in cells[4:5])], strict=False))
-            name = "/".join(f"{cell:.0f}" for cell in cells[:3])
+            reals = [float(cell) for cell in cells]
+            reception = dict(zip(_CLUSTER, [*reals[:4], *(sqrt(max(cell, 0.0)) for cell in reals[4:5])], strict=False))
+            name = "/".join(f"{cell:.0f}" for cell in reals[:3])
             yield {"message": i + 1, "icao": str(row.get("icao", "")) or None, "station": name} | reception

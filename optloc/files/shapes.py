@@ -11,7 +11,7 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
-from optloc.base.units import UNITS
+from optloc.base.units import SPEED_OF_LIGHT, UNITS
 from optloc.files.cells import instants, is_dated, moments, numbers
 from optloc.files.readings import (
     CARTESIAN,
@@ -28,6 +28,7 @@ from optloc.files.readings import (
 )
 from optloc.files.roles import Places, Roles, placed, stem, unit_of
 from optloc.files.schema import Units
+from optloc.files.table import Table
 from optloc.models import BEARING
 
 # Names of columns that are repeated of a list.
@@ -216,6 +217,7 @@ def _settled(found: Readings, roles: Roles, told: Told, place: Places, empty: in
         if same is not None:
             spot = table.at(int(found.row[same]))
             raise InvalidProblem(f"{found.form.kind} names station {found.a[same]!r} twice", spot, "name two stations")
+    found = _with_digits(found, table)
     keys = _keys(found, roles, told)
     found = without_gaps(found, [keys[row] for row in found.row.tolist()], told, table, empty)
     if not told.still:
@@ -227,6 +229,28 @@ def _settled(found: Readings, roles: Roles, told: Told, place: Places, empty: in
         raise InvalidProblem(what, table.source, advice)
     found = replace(found, positive=told.positive or positive or "a-farther")
     return _oriented(found, told, place, table.source) if found.form.kind == "azimuth" else found
+
+
+# Digits of an instant in seconds or nanoseconds of today, and metres of rounding that a fix would not show.
+_INSTANT, _ROUNDED = 9, 1.0
+
+
+def _with_digits(found: Readings, table: Table) -> Readings:
+    """Return arrivals that have all their digits; raise InvalidProblem where a spreadsheet took them."""
+    if found.form.kind != "toa":
+        return found
+    for i, value in enumerate(found.values):
+        if int(value.as_tuple().exponent) > 0 and len(value.as_tuple().digits) <= _INSTANT <= value.adjusted():
+            spot = table.where(found.cells[i], int(found.row[i]))
+            advice = "write it with all digits; a spreadsheet must take the column for text"
+            raise InvalidProblem(f"the arrival {value:E} has lost its digits", spot, advice)
+    floats = any(table.raw(cell).dtype.kind == "f" for cell in set(found.cells))
+    factor = UNITS["length"][found.unit] * (SPEED_OF_LIGHT if found.unit in UNITS["time"] else 1.0)
+    step = float(np.spacing(max(abs(float(value)) for value in found.values))) * factor
+    if not floats or step < _ROUNDED:
+        return found
+    note = f"arrivals are floating-point numbers, at this size rounded to {step:.3g} m: text or integers keep more"
+    return replace(found, notes=(*found.notes, note))
 
 
 def _oriented(found: Readings, told: Told, place: Places, source: str) -> Readings:
