@@ -33,11 +33,15 @@ WORDS = {
 what is no letter. What is measured may be called by its kind as well (`optloc.models.Model.aliases`).
 Columns that may be left out have their names alone: what a table has besides must not change what it says."""
 
+_A, _B = (
+    " ".join(f"{word}{end}" for word in ("anchor", "sensor", "node", "rx", "site") for end in ends)
+    for ends in ("a1", "b2")
+)
 # Role: names that suggest it, the likeliest first; spelled like `WORDS`. A kind is a role, too, with its aliases.
 GUESSES = {
     "message": "message msg messageid msgid pulse frame epoch event eventid burst shot seq id",
-    "station": f"station receiver rx sensor anchor node site stationid receiverid sensorid beacon {WORDS['a']}",
-    "reference": f"{WORDS['b']} refstation anchorb",
+    "station": f"station receiver rx sensor anchor node site stationid receiverid sensorid beacon {WORDS['a']} {_A}",
+    "reference": f"{WORDS['b']} refstation {_B}",
     "time": "toa arrival timeofarrival arrivaltime rxtime time timestamp utc datetime date t",
     "epoch": "epoch time tgps gpstime tow t timestamp",
     "target": "target tag mobile transmitter emitter icao hex mac device track",
