@@ -146,6 +146,14 @@ def test_a_file_of_bearings_says_how_they_are_counted(tmp_path, caplog, version,
         assert metres(optloc.solve(loaded.problem)) < 0.1
 
 
+def test_a_bearing_is_never_taken_for_radians_from_the_x_axis():
+    with pytest.raises(InvalidProblem, match="locate"):
+        optloc.measured("bearing", [0.5], a=0, sigma=0.1)
+    table = {"station": ["P", "Q"], "bearing": [45.0, 315.0]}
+    problem = optloc.from_table(table, {"P": (0, 0), "Q": (100, 0)}, kind="bearing", sigma=1.0)
+    assert optloc.solve(problem).position == pytest.approx([50.0, 50.0])
+
+
 # Ranges of a tag, ultra-wide band.
 
 
