@@ -94,6 +94,19 @@ def test_seconds_are_the_unit_where_none_is_said_and_a_wrong_one_is_seen():
         locate(latlon=SDRS, toa={name: 1.7e9 + value for name, value in seconds.items()}, sigma=5e-9)
 
 
+def test_what_was_not_heard_is_left_out():
+    time = delays()
+    since = {name: np.datetime64(int(1.7e18) + round(value), "ns") for name, value in time.items()}
+    fix = locate(latlon=SDRS, toa={**since, "West": None}, sigma="5 ns")
+    assert int(fix.dof) == 0
+    assert metres(fix) < 20.0
+    against = np.array([[time[name] - time["Nord"] for name in SDRS]] * 2)
+    against[1, 2] = np.nan
+    both = locate(latlon=SDRS, tdoa=against, unit="ns", sigma=7.0)
+    assert both.dof.tolist() == [1, 0]
+    assert metres(both[0]) < 10.0
+
+
 # Three compass bearings.
 
 
@@ -226,6 +239,8 @@ WRONG = {
     ),
     "unit": ({"stations": ANCHORS, "ranges": [1, 2, 3, 4], "sigma": 1.0, "unit": "deg"}, "unit of ranges"),
     "latitude": ({"latlon": {"A": (95, 1), "B": (1, 2)}, "toa": [0, 0], "sigma": 1e-9}, "95 deg"),
+    "only the reference": ({"stations": ANCHORS, "tdoa": {"A": 0.0}, "sigma": 1.0}, "the other stations"),
+    "x and y for degrees": ({"latlon": {"x": [0.0, 1.0], "y": [0.0, 1.0]}, "toa": [0, 0], "sigma": 1.0}, "lat and lon"),
     "words": ({"stations": ANCHORS, "ranges": {"A": "near"}, "sigma": 1.0}, "not numbers"),
     "height": ({"stations": ANCHORS, "ranges": [1, 2, 3, 4], "sigma": 1.0, "height": 2.0}, "plane"),
 }
