@@ -179,7 +179,7 @@ def test_options_add_to_the_file(tmp_path):
     assert table["active"][0] == "height equal; x upper"
     assert float(table["multipliers"][0].split("; ")[1]) == pytest.approx(fix["active"][1]["multiplier"], rel=1e-5)
     text = run("fix", path, "--height", "4000 ft", code=1).stdout
-    assert "held by height equal" in text
+    assert "height held as given" in text
     assert "nan" not in text
     assert "1490 m (held)" in run("fix", path, "--box", "0,0,0:1490,3000,inf", code=1).stdout
 

@@ -94,6 +94,19 @@ def test_seconds_are_the_unit_where_none_is_said_and_a_wrong_one_is_seen():
         locate(latlon=SDRS, toa={name: 1.7e9 + value for name, value in seconds.items()}, sigma=5e-9)
 
 
+def test_what_was_not_heard_is_left_out():
+    time = delays()
+    since = {name: np.datetime64(int(1.7e18) + round(value), "ns") for name, value in time.items()}
+    fix = locate(latlon=SDRS, toa={**since, "West": None}, sigma="5 ns")
+    assert int(fix.dof) == 0
+    assert metres(fix) < 20.0
+    against = np.array([[time[name] - time["Nord"] for name in SDRS]] * 2)
+    against[1, 2] = np.nan
+    both = locate(latlon=SDRS, tdoa=against, unit="ns", sigma=7.0)
+    assert both.dof.tolist() == [1, 0]
+    assert metres(both[0]) < 10.0
+
+
 # Three compass bearings.
 
 
@@ -144,6 +157,14 @@ def test_a_file_of_bearings_says_how_they_are_counted(tmp_path, caplog, version,
     assert ("no convention is named" in caplog.text) == (not compass)
     if compass:
         assert metres(optloc.solve(loaded.problem)) < 0.1
+
+
+def test_a_bearing_is_never_taken_for_radians_from_the_x_axis():
+    with pytest.raises(InvalidProblem, match="locate"):
+        optloc.measured("bearing", [0.5], a=0, sigma=0.1)
+    table = {"station": ["P", "Q"], "bearing": [45.0, 315.0]}
+    problem = optloc.from_table(table, {"P": (0, 0), "Q": (100, 0)}, kind="bearing", sigma=1.0)
+    assert optloc.solve(problem).position == pytest.approx([50.0, 50.0])
 
 
 # Ranges of a tag, ultra-wide band.
@@ -218,6 +239,8 @@ WRONG = {
     ),
     "unit": ({"stations": ANCHORS, "ranges": [1, 2, 3, 4], "sigma": 1.0, "unit": "deg"}, "unit of ranges"),
     "latitude": ({"latlon": {"A": (95, 1), "B": (1, 2)}, "toa": [0, 0], "sigma": 1e-9}, "95 deg"),
+    "only the reference": ({"stations": ANCHORS, "tdoa": {"A": 0.0}, "sigma": 1.0}, "the other stations"),
+    "x and y for degrees": ({"latlon": {"x": [0.0, 1.0], "y": [0.0, 1.0]}, "toa": [0, 0], "sigma": 1.0}, "lat and lon"),
     "words": ({"stations": ANCHORS, "ranges": {"A": "near"}, "sigma": 1.0}, "not numbers"),
     "height": ({"stations": ANCHORS, "ranges": [1, 2, 3, 4], "sigma": 1.0, "height": 2.0}, "plane"),
 }

@@ -79,7 +79,7 @@ def check_same(one, other):
     assert (one.chart.kind, one.active[()]) == (other.chart.kind, other.active[()])
     assert np.allclose(one.chart.centre, other.chart.centre, rtol=1e-12)
     assert [stage.name for stage in one.stages] == [stage.name for stage in other.stages]
-    for name in ("x", "cov", "code", "reason", "certificate", "cost", "dof", "weights", "marks", "infinity"):
+    for name in ("x", "cov", "code", "reason", "claims", "cost", "dof", "weights", "marks", "infinity"):
         assert getattr(one, name).dtype == getattr(other, name).dtype
         assert getattr(one, name).shape == getattr(other, name).shape
 

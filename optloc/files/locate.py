@@ -204,8 +204,12 @@ def _receivers(stations: Any, latlon: Any, frame: str) -> _Receivers:
     where, axes = ("stations", "xyz") if latlon is None else ("latlon", ("lat_deg", "lon_deg", "height"))
     table = worded(_station_table(stations if latlon is None else latlon, where, axes), "m")
     globe = table.has("lat_deg") or table.has("lon_deg")
+    if latlon is not None and not globe:
+        raise InvalidProblem("there are no latitudes", "latlon", "call the columns lat and lon, or use stations=")
     kind = "enu" if globe else frame
     found, own = survey(StationsTable(), table, FrameTable(kind=cast("Any", kind)), where)
+    if len(found.position) > len(found.names):
+        raise InvalidProblem("a station has several places", where, "give one for each, or use optloc.from_table")
     order = np.argsort(found.index)
     axes_of = None if found.axes is None else found.axes[order]
     made = station_array(found.position[order], found.names, axes=axes_of)
@@ -317,6 +321,8 @@ def _readings(word: str, given: Any, names: Sequence[str], reference: str | None
         columns = [_numbers(word, value) for value in given.values()]
         if len({np.shape(column) for column in columns}) > 1:
             raise InvalidProblem("some stations have more values than others", word, "give each as many, NaN for none")
+        if any(column.dtype.kind == "M" for column in columns):
+            columns = [column if column.dtype.kind == "M" else _no_dates(word, column) for column in columns]
         found = _Readings(np.stack(columns, axis=-1) if columns else np.zeros(0), list(given))
     else:
         values, keys = _numbers(word, given), list(names)
@@ -330,6 +336,8 @@ def _readings(word: str, given: Any, names: Sequence[str], reference: str | None
         raise InvalidProblem("there are no values", word, "give name: value")
     ends = [_ends(word, key, names, first) for key in found.keys]
     kept = [i for i, (a, b) in enumerate(ends) if a != b]  # the reference against itself says nothing
+    if not kept:
+        raise InvalidProblem("there is nothing but the reference", word, "give the other stations")
     return _Readings(found.values[..., kept], [ends[i] for i in kept], found.unit)
 
 
@@ -375,7 +383,7 @@ def _of_table(word: str, frame: Any, names: Sequence[str]) -> _Readings:
     if word == "tdoa" and chosen["b"] is not None:
         ends = list(zip(ends, (str(name) for name in frame[chosen["b"]]), strict=True))  # type: ignore[arg-type]
     labels = [None] * len(ends) if epochs is None else frame[epochs].tolist()
-    keys, rows = list(dict.fromkeys(ends)), list(dict.fromkeys(labels))
+    keys, rows = ({one: i for i, one in enumerate(dict.fromkeys(each))} for each in (ends, labels))
     values = _numbers(word, frame[chosen["z"]].to_numpy())
     grid = np.full(
         (len(rows), len(keys)),
@@ -386,14 +394,21 @@ def _of_table(word: str, frame: Any, names: Sequence[str]) -> _Readings:
     # Whole numbers are counted from the least, so that nanoseconds of today keep their digits as floats.
     values = values - values.min() if values.dtype.kind in "iu" else values
     for value, key, label in zip(values, ends, labels, strict=True):
-        place = (rows.index(label), keys.index(key))
+        place = (rows[label], keys[key])
         if place in seen:
             what = f"{key} has two values" + ("" if label is None else f" at {label}")
             raise InvalidProblem(what, word, "leave one of them out, or give a column epoch")
         seen.add(place)
         grid[place] = value
     named = unit_of(str(chosen["z"]), ("s", "ms", "us", "ns", "ps", "m", "km", "cm", "mm", "ft", "deg", "rad"))
-    return _Readings(grid if epochs is not None else grid[0], keys, named)
+    return _Readings(grid if epochs is not None else grid[0], list(keys), named)
+
+
+def _no_dates(word: str, values: Array) -> Array:
+    """Return missing dates in the place of missing numbers; numbers beside dates are refused."""
+    if not np.isnan(values).all():
+        raise InvalidProblem("some instants are dates, and others are numbers", word, "give all as one or the other")
+    return np.full(values.shape, np.datetime64("NaT", "ns"))
 
 
 def _numbers(word: str, values: Any) -> Array:

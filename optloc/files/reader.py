@@ -151,8 +151,6 @@ def read(path: str | Path, *, values: bool = True, more: Mapping[str, Constraint
     """
     loaded = draft(Path(path), values=values, more=more or {}).loaded
     p = loaded.problem
-    if ASSUMED in loaded.azimuths:
-        LOG.warning("%s: azimuths are counted by %s", loaded.source, loaded.azimuths)
     LOG.info("read %s: %d rows, %d epochs, %d stations", loaded.source, p.count, p.epochs, p.stations.count)
     return loaded
 
@@ -200,6 +198,8 @@ def assemble(
     stated = file
     file, station_table, tables = in_our_words(file, station_table, tables, source)
     azimuths = azimuths_of(stated, file)
+    if ASSUMED in azimuths:
+        LOG.warning("%s: azimuths are counted by %s", source, azimuths)
     speed = speed_of(file, source)
     found, frame = survey(file.stations, station_table, file.frame, source)
     chunks = []
