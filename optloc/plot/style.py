@@ -324,7 +324,7 @@ def scene_of(problem: Problem, fixes: Sequence[Fix], *, outlined: bool = False) 
         other_paths=other,
         known=tuple(thinned(place) for place in known),
         outlines=outlines,
-        local=_is_local(fixes, outlines, len(position)),
+        local=is_local(fixes, outlines, len(position)),
     )
     return _local(problem, scene) if problem.frame.kind == "ecef" else scene
 
@@ -336,7 +336,7 @@ def outlines_of(problem: Problem, fixes: Sequence[Fix], count: int) -> tuple[Pie
     return tuple(pieces for fix in fixes for pieces in pieces_of(problem, fix))
 
 
-def _is_local(fixes: Sequence[Fix], outlines: Sequence[Pieces], count: int) -> Array | None:
+def is_local(fixes: Sequence[Fix], outlines: Sequence[Pieces], count: int) -> Array | None:
     """Return where an ellipse does not cover and there is no outline (n,); None unless fixes are one position each."""
     if count != sum(fix.code.size for fix in fixes):
         return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from typing import Any, ClassVar
@@ -16,7 +16,7 @@ from optloc.models import MODELS
 from optloc.plot.fixes import lines_of_position
 from optloc.plot.outlines import Pieces
 from optloc.plot.outlines import rings as around
-from optloc.plot.style import figure_class, outlines_of, states_of, thinned
+from optloc.plot.style import figure_class, is_local, outlines_of, states_of, thinned
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 
@@ -256,6 +256,8 @@ class Spots:
         What is told of each.
     more : tuple of array (r, 2)
         Outlines of the other parts of regions, degrees.
+    local : bool array (n,), optional
+        Where the ring is an ellipse that does not cover, and what does is not known.
     """
 
     place: Array
@@ -263,6 +265,7 @@ class Spots:
     clean: Array
     text: tuple[str, ...]
     more: tuple[Array, ...] = ()
+    local: Array | None = None
 
 
 def spots(
@@ -328,7 +331,9 @@ def fixed_spots(problem: Problem, fixes: Sequence[Fix], labels: Sequence[str]) -
     told = status if len(status) == len(position) else ["" if ok else "status not ok" for ok in clean]
     sigma = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
     sentences = [sentence(*each) for each in zip(named, told, degrees(problem, position), sigma, strict=True)]
-    return spots(problem, position, covariance, clean, sentences, outlines_of(problem, fixes, len(position)))
+    outlines = outlines_of(problem, fixes, len(position))
+    found = spots(problem, position, covariance, clean, sentences, outlines)
+    return replace(found, local=is_local(fixes, outlines, len(position)))
 
 
 def sentence(name: str, status: str, place: Array, sigma: float) -> str:

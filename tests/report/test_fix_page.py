@@ -134,3 +134,17 @@ _POINT = """(() => { const dot = document.querySelector('[data-layer=fix] .dot')
   document.querySelector('.map svg').dispatchEvent(
     new PointerEvent('pointermove', { clientX: b.x + b.width / 2, clientY: b.y + b.height / 2, bubbles: true }));
   return document.querySelector('.map output').textContent; })()"""
+
+
+def test_an_ellipse_that_does_not_cover_is_dotted_on_the_map():
+    lat, lon = np.radians([47.812, 47.751, 47.79]), np.radians([11.183, 11.148, 11.31])
+    stations = optloc.station_array(optloc.ECEF.from_geodetic(lat, lon, np.array([612.0, 640.0, 842.0])), "ABC")
+    rows = optloc.measured("range", np.array([9000.0, 12300.0, 1500.0]), a=[0, 1, 2], sigma=800.0)
+    problem = optloc.assemble(
+        stations, rows, frame=optloc.ECEF, constraints=(optloc.constraints.height(exactly=700.0),)
+    )
+    fix = optloc.solve(problem)
+    assert fixed_spots(problem, [fix], []).local.all()
+    page = fix_page(problem, fix, "far from an ellipse")
+    assert "dotted: an ellipse that does not" in page
+    assert 'class="ring local"' in page
