@@ -324,7 +324,7 @@ def _ellipses(found: Spots, plane: Plane, middle: float) -> list[Drawn]:
         return []
     local = np.zeros(len(found.rings), dtype=bool) if found.local is None else found.local
     covers = [ring for ring, bare in zip(found.rings, local, strict=True) if not bare]
-    drawn = []
+    drawn: list[Drawn] = []
     for kind, rings in (
         ("ring", [*covers, *found.more]),
         # What does not hold 95 % must not look as if it did.
