@@ -13,52 +13,68 @@ if _RUNS and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
     signal.signal(signal.SIGINT, lambda *_: os._exit(130))
 
 from importlib import import_module
-from typing import Any
+from importlib.util import find_spec
+from typing import TYPE_CHECKING, Any
 
-from optloc.adequacy.evidence import Reliability, reliability
-from optloc.adequacy.level import CommonLevel, LateSignals
-from optloc.base import frames, units
-from optloc.base.errors import InvalidProblem, NoSolution, OptlocError
-from optloc.base.frames import CARTESIAN, ECEF, Frame
-from optloc.base.inputs import Budget
-from optloc.base.types import Bias, Certificate, Motion, Prior, Rows, Stations, Status
-from optloc.bounds.crlb import Course, crlb, crlb_course
-from optloc.bounds.observability import Observability, observability
-from optloc.linear import constraints
-from optloc.linear.evaluate import predict
-from optloc.linear.gauss_newton import gauss_newton
-from optloc.linear.normal import Linear, Normal, linearise, normal
-from optloc.linear.simulate import simulate
-from optloc.linear.walks import wander
-from optloc.models import MODELS, Model
-from optloc.problem import epochs, noise
-from optloc.problem.bias import with_bias, with_known_bias
-from optloc.problem.build import assemble, measured, station_array
-from optloc.problem.chart import Chart
-from optloc.problem.clocks import clock_densities
-from optloc.problem.epochs import by_epoch
-from optloc.problem.fix import Alternatives, Explanation, Fix, Stage, Suspect
-from optloc.problem.layout import Layout
-from optloc.problem.loss import LOSSES, Loss
-from optloc.problem.noise import Noise
+from optloc.problem.fix import told_by
 from optloc.problem.problem import Problem
-from optloc.problem.signal import Signal
-from optloc.quality.health import Health, health
-from optloc.quality.levels import (
-    NoiseLevels,
-    common_level,
-    late_signals,
-    noise_levels,
-    with_estimated_noise,
-    with_noise_levels,
-)
-from optloc.solvers import FORMULATIONS, METHODS, SOLVERS, Formulation, solve
-from optloc.solvers.certify.branch_and_bound import certify
-from optloc.solvers.prepared import Prepared, prepare
-from optloc.solvers.robust.stage import rejected
-from optloc.solvers.running import Running
-from optloc.solvers.starts.least_squares_ranges import reduce
-from optloc.solvers.suspects.stage import suspects
+
+# Everything else loads when its name is first used: solvers, proofs and tables take half a second together.
+if TYPE_CHECKING:
+    from optloc.adequacy.advice import advise, explained
+    from optloc.adequacy.evidence import Reliability, reliability
+    from optloc.adequacy.geometry import Advice
+    from optloc.adequacy.level import CommonLevel, LateSignals
+    from optloc.base import frames, units
+    from optloc.base.errors import InvalidProblem, NoSolution, OptlocError
+    from optloc.base.frames import CARTESIAN, ECEF, Frame
+    from optloc.base.inputs import Budget
+    from optloc.base.types import Bias, Certificate, Motion, Prior, Rows, Stations, Status
+    from optloc.bounds.crlb import Course, crlb, crlb_course
+    from optloc.bounds.observability import Observability, observability
+    from optloc.files import from_table, load
+    from optloc.files.locate import locate
+    from optloc.files.orbits import satellites
+    from optloc.linear import constraints
+    from optloc.linear.evaluate import predict
+    from optloc.linear.gauss_newton import gauss_newton
+    from optloc.linear.normal import Linear, Normal, linearise, normal
+    from optloc.linear.simulate import simulate
+    from optloc.linear.walks import wander
+    from optloc.models import MODELS, Model
+    from optloc.problem import epochs, noise
+    from optloc.problem.bias import with_bias, with_known_bias
+    from optloc.problem.build import assemble, measured, station_array
+    from optloc.problem.chart import Chart
+    from optloc.problem.clocks import clock_densities
+    from optloc.problem.epochs import by_epoch
+    from optloc.problem.fix import Alternatives, Explanation, Fix, Stage, Suspect
+    from optloc.problem.layout import Layout
+    from optloc.problem.loss import LOSSES, Loss
+    from optloc.problem.noise import Noise
+    from optloc.problem.problem import Problem
+    from optloc.problem.signal import Signal
+    from optloc.quality.health import Health, health
+    from optloc.quality.levels import (
+        NoiseLevels,
+        common_level,
+        late_signals,
+        noise_levels,
+        with_estimated_noise,
+        with_noise_levels,
+    )
+    from optloc.several import Emitters, separate
+    from optloc.solvers import FORMULATIONS, METHODS, SOLVERS, Formulation, solve
+    from optloc.solvers.certify.branch_and_bound import certify
+    from optloc.solvers.prepared import Prepared, prepare
+    from optloc.solvers.robust.stage import rejected
+    from optloc.solvers.running import Running
+    from optloc.solvers.starts.least_squares_ranges import reduce
+    from optloc.solvers.suspects.stage import suspects
+    from optloc.uncertainty.arc import Arc, trace_arc
+    from optloc.uncertainty.posterior import Mixture, Samples, mixture, samples
+    from optloc.uncertainty.radii import Accuracy, accuracy
+    from optloc.uncertainty.region import Region, likelihood_region
 
 __version__ = "0.1.0"
 
@@ -133,6 +149,7 @@ __all__ = [
     "likelihood_region",
     "linearise",
     "load",
+    "locate",
     "measured",
     "mixture",
     "noise",
@@ -161,42 +178,81 @@ __all__ = [
 ]
 
 
-_UNCERTAINTY = {
-    "Accuracy": "radii",
-    "Arc": "arc",
-    "Mixture": "posterior",
-    "Region": "region",
-    "Samples": "posterior",
-    "accuracy": "radii",
-    "likelihood_region": "region",
-    "mixture": "posterior",
-    "samples": "posterior",
-    "trace_arc": "arc",
+# Where each public name lives; the imports above say the same to whoever checks types, a test holds both equal.
+_HOMES = {
+    "adequacy.advice": "advise explained",
+    "adequacy.evidence": "Reliability reliability",
+    "adequacy.geometry": "Advice",
+    "adequacy.level": "CommonLevel LateSignals",
+    "base.errors": "InvalidProblem NoSolution OptlocError",
+    "base.frames": "CARTESIAN ECEF Frame",
+    "base.inputs": "Budget",
+    "base.types": "Bias Certificate Motion Prior Rows Stations Status",
+    "bounds.crlb": "Course crlb crlb_course",
+    "bounds.observability": "Observability observability",
+    "files": "from_table load",
+    "files.locate": "locate",
+    "files.orbits": "satellites",
+    "linear.evaluate": "predict",
+    "linear.gauss_newton": "gauss_newton",
+    "linear.normal": "Linear Normal linearise normal",
+    "linear.simulate": "simulate",
+    "linear.walks": "wander",
+    "models": "MODELS Model",
+    "problem.bias": "with_bias with_known_bias",
+    "problem.build": "assemble measured station_array",
+    "problem.chart": "Chart",
+    "problem.clocks": "clock_densities",
+    "problem.epochs": "by_epoch",
+    "problem.fix": "Alternatives Explanation Fix Stage Suspect",
+    "problem.layout": "Layout",
+    "problem.loss": "LOSSES Loss",
+    "problem.noise": "Noise",
+    "problem.problem": "Problem",
+    "problem.signal": "Signal",
+    "quality.health": "Health health",
+    "quality.levels": "NoiseLevels common_level late_signals noise_levels with_estimated_noise with_noise_levels",
+    "several": "Emitters separate",
+    "solvers": "FORMULATIONS METHODS SOLVERS Formulation solve",
+    "solvers.certify.branch_and_bound": "certify",
+    "solvers.prepared": "Prepared prepare",
+    "solvers.robust.stage": "rejected",
+    "solvers.running": "Running",
+    "solvers.starts.least_squares_ranges": "reduce",
+    "solvers.suspects.stage": "suspects",
+    "uncertainty.arc": "Arc trace_arc",
+    "uncertainty.posterior": "Mixture Samples mixture samples",
+    "uncertainty.radii": "Accuracy accuracy",
+    "uncertainty.region": "Region likelihood_region",
 }
+_MODULES = {
+    "constraints": "optloc.linear.constraints",
+    "epochs": "optloc.problem.epochs",
+    "frames": "optloc.base.frames",
+    "noise": "optloc.problem.noise",
+    "units": "optloc.base.units",
+}
+_PLACE = {name: f"optloc.{place}" for place, names in _HOMES.items() for name in names.split()}
 
 
 def __getattr__(name: str) -> Any:
-    if name in _UNCERTAINTY:
-        return getattr(import_module(f"optloc.uncertainty.{_UNCERTAINTY[name]}"), name)
-    if name in ("load", "from_table"):
-        from optloc import files  # pandas is loaded when a file or a table is read
+    if name in _PLACE:
+        found = getattr(import_module(_PLACE[name]), name)
+    elif name in _MODULES:
+        found = import_module(_MODULES[name])
+    elif not name.startswith("_") and find_spec(f"optloc.{name}") is not None:
+        return import_module(f"optloc.{name}")  # a folder, such as `optloc.track`, is its own attribute from then on
+    else:
+        raise AttributeError(f"module 'optloc' has no attribute {name!r}")
+    globals()[name] = found
+    return found
 
-        return getattr(files, name)
-    if name == "satellites":
-        from optloc.files.orbits import satellites  # orbits are of an extra
 
-        return satellites
-    if name in ("Emitters", "separate"):
-        from optloc import several  # scipy.optimize is loaded when emitters are told apart
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
 
-        return getattr(several, name)
-    if name in ("Advice", "advise", "explained"):
-        from optloc.adequacy import advice  # only who has something to mend needs it
 
-        return getattr(advice, name)
-    if name == "datasets":
-        return import_module("optloc.datasets")
-    raise AttributeError(f"module 'optloc' has no attribute {name!r}")
+told_by(lambda: import_module("optloc.report.fixes"))
 
 
 def _from_table(*args: Any, **options: Any) -> Problem:

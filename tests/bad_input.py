@@ -84,7 +84,7 @@ BAD = {
     "empty file": ("", ["empty"]),
     "broken": ("format = 1\nstations = = 3\n", ["line 2", "TOML"]),
     "no format": ("title = 'x'\n", ["format = 1"]),
-    "unknown format": ("format = 2\n", ["format 2"]),
+    "unknown format": ("format = 3\n", ["format 3"]),
     "unknown key": (tdoa(extra="sigma = 1.0\nwieght = 1.0\n"), ["]] 1", "'wieght'", "did you mean 'weight'"]),
     "unknown table": (tdoa() + "[statoins]\n", ["'statoins'", "did you mean 'stations'"]),
     "missing key": ("format = 1\n[stations]\nrows = []\n", ["'measurements' is missing"]),

@@ -179,7 +179,7 @@ def test_options_add_to_the_file(tmp_path):
     assert table["active"][0] == "height equal; x upper"
     assert float(table["multipliers"][0].split("; ")[1]) == pytest.approx(fix["active"][1]["multiplier"], rel=1e-5)
     text = run("fix", path, "--height", "4000 ft", code=1).stdout
-    assert "held by height equal" in text
+    assert "height held as given" in text
     assert "nan" not in text
     assert "1490 m (held)" in run("fix", path, "--box", "0,0,0:1490,3000,inf", code=1).stdout
 
@@ -230,7 +230,7 @@ def test_an_infeasible_epoch_is_exit_code_1_and_leaves_the_others_alone(tmp_path
         found = pd.read_csv(out, keep_default_na=False)
         assert found["active"].tolist() == ["", "x upper"]
         assert found["status"].tolist() == ["ok", status]
-        assert ("data contradict x upper" in found["reason"][1]) == (code == 1)
+        assert ("the constraint x upper disagree" in found["reason"][1]) == (code == 1)
         np.testing.assert_allclose(found["x"].astype(float), [1500.0, most], atol=1e-3)
 
 

@@ -1,7 +1,9 @@
 """`import optloc` is quick: heavy libraries load where they are used."""
 
+import ast
 import subprocess
 import sys
+from pathlib import Path
 
 HEAVY = "cvxpy casadi numba pandas matplotlib scipy.stats pymap3d pydantic typer".split()
 
@@ -10,3 +12,21 @@ def test_import_loads_no_heavy_library():
     code = f"import optloc, sys; print(*sorted(set({HEAVY}) & set(sys.modules)))"
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert loaded == []
+
+
+def test_import_loads_no_solver():
+    code = "import optloc, sys; print(*(name for name in sys.modules if name.startswith(('optloc.solvers', 'scipy'))))"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split() == []
+
+
+def test_what_loads_late_is_what_types_are_checked_by():
+    """Names stand in two lists, one for type checkers and one for use: they say the same."""
+    import optloc
+
+    tree = ast.parse(Path(optloc.__file__).read_text(encoding="utf-8"))
+    block = next(node for node in tree.body if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING")
+    told = {f"{node.module}.{name.name}" for node in block.body for name in node.names}
+    places = {f"{place}.{name}" for name, place in optloc._PLACE.items()} | set(optloc._MODULES.values())
+    assert told == places
+    assert set(optloc._PLACE) | set(optloc._MODULES) == set(optloc.__all__)
+    assert all(getattr(optloc, name) is not None for name in optloc.__all__)

@@ -182,7 +182,7 @@ def run(words, place):
 def place(tmp_path):
     folder = tmp_path / "in"
     folder.mkdir()
-    (folder / "toa.csv").write_text("message,station,time\n1,a,0\n1,b,1e-6\n1,c,2e-6\n")
+    (folder / "toa.csv").write_text("message,station,time_s\n1,a,0\n1,b,1e-6\n1,c,2e-6\n")
     (folder / "rx.csv").write_text("name,x,y\na,0,0\nb,1000,0\nc,0,1000\n")
     (folder / "site.toml").write_text("mine")
     ring = {n: 5e3 * np.array([np.cos(i), np.sin(i)]) for i, n in enumerate("ABCDE")}

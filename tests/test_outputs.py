@@ -40,7 +40,7 @@ def run(*arguments, code=0):
 def place(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "site.toml").write_text(tdoa(), encoding="utf-8")
-    (tmp_path / "toa.csv").write_text("message,station,time\n1,a,0\n1,b,1e-6\n1,c,2e-6\n")
+    (tmp_path / "toa.csv").write_text("message,station,time_s\n1,a,0\n1,b,1e-6\n1,c,2e-6\n")
     (tmp_path / "rx.csv").write_text("name,x,y\na,0,0\nb,1000,0\nc,0,1000\n")
     return tmp_path
 

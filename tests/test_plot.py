@@ -11,7 +11,7 @@ from optloc.base.linalg import error_ellipse
 from optloc.cli.file_fixes import fix_file
 from optloc.files import from_table, read
 from optloc.plot import plot_fixes, save
-from optloc.plot.fixes import isodopplers
+from optloc.plot.fixes import isodopplers, lines_of_position
 from optloc.plot.style import scene_of
 from optloc.solvers import solve
 
@@ -143,3 +143,55 @@ def test_other_fixes_have_no_isodopplers():
     grid = (np.arange(3.0), np.arange(3.0), np.zeros((9, 2)))
     demo = read(DEMOS / "ambiguous.toml").problem
     assert not isodopplers(demo, solve(demo), *grid)
+
+
+def measured_in_the_plane(kind, absent=()):
+    """Return a problem in the plane whose rows are off by some sigmas, and its fix."""
+    stations = optloc.station_array(np.array([[0.0, 0.0], [900.0, 100.0], [700.0, 800.0], [-100.0, 600.0]]), "ABCD")
+    a, b = np.arange(4), np.array([1, 2, 3, 0])
+    pair = {"b": b} if optloc.MODELS[kind].stations > 1 else {}
+    weight = {"weight": np.where(np.isin(a, absent), 0.0, 1.0)}
+    sigma = 0.01 if kind in {"azimuth", "groa"} else 10.0
+    empty = optloc.assemble(stations, optloc.measured(kind, None, a=a, **pair, sigma=sigma, **weight))
+    truth = np.append([300.0, 420.0], [50.0] * (empty.layout.size - 2))
+    z = optloc.predict(empty, truth) + sigma * np.array([1.0, -0.5, 0.3, 0.8])
+    problem = optloc.assemble(stations, optloc.measured(kind, z, a=a, **pair, sigma=sigma, **weight))
+    return problem, solve(problem)
+
+
+@pytest.mark.parametrize("kind", ["tdoa", "toa", "range", "range_sum", "azimuth", "groa"])
+def test_lines_of_position_are_where_a_row_is_what_was_measured(kind):
+    problem, fix = measured_in_the_plane(kind, absent=(3,))
+    x, y = np.linspace(-300.0, 1200.0, 301), np.linspace(-300.0, 1200.0, 301)
+    grid = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+    lines = lines_of_position(problem, fix, x, y, grid)
+    names = {one.name for one in lines}
+    pairs = {"tdoa", "range_sum", "groa"}
+    first = int(np.argmin(problem.z[:3]))
+    heard = {f"{n} – {'ABC'[first]}" for i, n in enumerate("ABC") if i != first}
+    assert names == ({"A – B", "B – C", "C – D"} if kind in pairs else heard if kind == "toa" else {"A", "B", "C"})
+    for one in lines:
+        row = "ABC".index(one.name[0])
+        vectors = np.concatenate([one.line, np.tile(np.asarray(fix.x)[2:], (len(one.line), 1))], axis=-1)
+        off = optloc.predict(problem, vectors) - problem.z
+        off = off[:, row] - (off[:, first] if kind == "toa" else 0.0)
+        # bearings are steep beside their stations, where the grid is coarse for them
+        far = np.linalg.norm(one.line - problem.stations.position[0, row], axis=-1) > 100.0
+        assert np.abs(off[far]).max() < {"azimuth": 2e-3, "groa": 2e-2}.get(kind, 0.5)
+
+
+def test_a_picture_has_lines_a_scale_and_the_same_limits():
+    problem, fix = measured_in_the_plane("range")
+    figure = plot_fixes(problem, fix)
+    plan = figure.axes[0]
+    (lines,) = [c for c in plan.collections if c.get_label() == "circle of a range"]
+    assert len(lines.get_segments()) >= 4
+    assert np.ptp(plan.get_xlim()) < 2500.0
+    (bar,) = [one for one in plan.artists if type(one).__name__ == "AnchoredSizeBar"]
+    assert bar.txt_label.get_text() in {"200 m", "500 m"}
+
+
+def test_a_run_has_no_lines():
+    moving = read(DEMOS / "run.toml").problem
+    grid = (np.arange(3.0), np.arange(3.0), np.zeros((9, moving.dimension)))
+    assert not lines_of_position(moving, solve(moving), *grid)

@@ -199,7 +199,7 @@ def test_the_stage_keeps_what_is_proven_and_proves_the_rest():
     certificate = np.array(fix.certificate)
     certificate[0] = replace(certificate[0], proof="global", method="another proof")
     certificate[1] = replace(certificate[1], proof="unknown", method="none")
-    found = bounded(problem, replace(fix, certificate=certificate))
+    found = bounded(problem, replace(fix, claims=certificate))
     assert found.certificate[0].method == "another proof"
     assert (found.certificate[1].proof, found.certificate[1].method) == ("global", "moment relaxation")
     assert found.certificate[1].gap < 1e-3

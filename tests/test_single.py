@@ -59,7 +59,7 @@ def check_same(one, other):
     """Compare single fixes with those of a batch: what they say, and all numbers to what rounding leaves."""
     assert one.shape == ()
     assert (one.code, one.marks, one.reason[()]) == (other.code, other.marks, other.reason[()])
-    mine, theirs = one.certificate[()], other.certificate[()]
+    mine, theirs = one.certificate, other.certificate
     assert (mine.proof, mine.reason, mine.boxes, mine.margin) == (
         theirs.proof,
         theirs.reason,
@@ -79,7 +79,7 @@ def check_same(one, other):
     assert (one.chart.kind, one.active[()]) == (other.chart.kind, other.active[()])
     assert np.allclose(one.chart.centre, other.chart.centre, rtol=1e-12)
     assert [stage.name for stage in one.stages] == [stage.name for stage in other.stages]
-    for name in ("x", "cov", "code", "reason", "certificate", "cost", "dof", "weights", "marks", "infinity"):
+    for name in ("x", "cov", "code", "reason", "claims", "cost", "dof", "weights", "marks", "infinity"):
         assert getattr(one, name).dtype == getattr(other, name).dtype
         assert getattr(one, name).shape == getattr(other, name).shape
 
@@ -228,7 +228,7 @@ def test_threads_do_not_share_what_they_write_into():
     with ThreadPoolExecutor(4) as pool:
         for fix, other in zip(pool.map(ready, np.tile(z, (4, 1))), alone * 4, strict=True):
             assert np.array_equal(fix.x, other.x)
-            assert fix.certificate[()].boxes == other.certificate[()].boxes
+            assert fix.certificate.boxes == other.certificate.boxes
 
 
 def test_problems_of_one_structure_are_told_apart_by_what_they_are_made_of():

@@ -120,8 +120,18 @@ def nearest(word: str, known: Iterable[str]) -> str:
     names = list(islice(known, _MANY))
     word = str(word)[:_SHOWN]
     folded = {name.lower(): name for name in names}
-    close = [repr(folded[name]) for name in get_close_matches(word.lower(), folded, n=2, cutoff=0.5)]
+    close = [repr(folded[name]) for name in _alike(word.lower(), folded)]
     hint = f"did you mean {' or '.join(close)}?" if close else ""
     more = f" and {len(names) - _FEW} more" if len(names) > 2 * _FEW else ""
     listed = "" if close and len(names) > _FEW else f"known are {', '.join(names[:_FEW] if more else names)}{more}"
     return " ".join(part for part in (hint, listed) if part)
+
+
+def _alike(word: str, known: Iterable[str]) -> list[str]:
+    """Return up to two names that a word was perhaps meant to be; none for a single letter, which may be anything."""
+    names = list(known)
+    begun = [name for name in names if len(word) > 2 and name.startswith(word)][:2]
+    # Half of the letters alike is chance, but for names of one length, such as R5 and R6.
+    same = [name for name in names if len(name) == len(word)]
+    found = get_close_matches(word, names, n=2, cutoff=0.6) or begun or get_close_matches(word, same, n=2, cutoff=0.5)
+    return found if len(word) > 1 else []

@@ -337,10 +337,13 @@ def toml_of(text: str, source: str) -> dict[str, Any]:
     return data
 
 
-def json_of(text: str, source: str) -> Any:
-    """Return JSON as data; raise InvalidProblem where it is none, naming the line; arguments as `toml_of`."""
+def json_of(text: str, source: str, parse_float: Callable[[str], Any] | None = None) -> Any:
+    """Return JSON as data; raise InvalidProblem where it is none, naming the line; arguments as `toml_of`.
+
+    `parse_float` makes something else of a number with a decimal point, such as one that keeps all its digits.
+    """
     try:
-        data = json.loads(text)
+        data = json.loads(text, parse_float=parse_float)
     except json.JSONDecodeError as error:
         what = f"this is not JSON: {error.msg.lower()}"
         raise InvalidProblem(what, f"{source}, line {error.lineno}", "write it again") from None

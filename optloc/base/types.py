@@ -259,6 +259,14 @@ class Status(IntEnum):
     UNPROVEN = 15
     CURVED = 16
 
+    def __str__(self) -> str:
+        """Return the label: what `print` shows."""
+        return self.label
+
+    def __format__(self, spec: str) -> str:
+        """Return the label, or the number where a format asks for one."""
+        return format(int(self), spec) if spec else self.label
+
     @property
     def sentence(self) -> str:
         """Return what happened and what to do about it."""
@@ -283,7 +291,8 @@ _SENTENCES: dict[Status, str] = {
     "station or a known height that tells them apart.",
     Status.SEARCHED: "No safe start is known for this mixture of rows: this is the best of a seeded search, and "
     "nothing proves that no other position explains the data as well.",
-    Status.MAX_ITERATIONS: "The refinement used all its iterations; raise the limit or look at the geometry.",
+    Status.MAX_ITERATIONS: "The iterations ended before they converged; check the units, the signs and the "
+    "places of the stations with 'optloc check'.",
     Status.STALLED: "The refinement could not lower the cost any more although its gradient is not zero.",
     Status.SINGULAR_GEOMETRY: "The rows leave a direction of the answer undetermined; add a station off it.",
     Status.TOO_FEW_ROWS: "There are fewer measurements than unknowns; add rows or fix an unknown.",

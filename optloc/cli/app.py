@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
+from optloc.cli.from_table import EXAMPLES as CONVERSIONS
+from optloc.cli.from_table import (
+    convert,
+    table_told,
+    takes_table,
+)
 from optloc.cli.live import EXAMPLES, SERVED, live, serve
 from optloc.cli.options import (
     EXIT_CODES,
@@ -105,8 +111,10 @@ def _options(
         "optloc fix site.toml --html map.html",
         "optloc fix site.toml --json | jq .fixes",
         "optloc fix site.toml --height '1640 ft'",
+        "optloc fix toa.csv --stations sites.csv --sigma '20 ns'",
     ),
 )
+@takes_table
 def fix(
     file: ProblemPath,
     method: Method = "auto",
@@ -128,10 +136,11 @@ def fix(
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
+    given: Any = None,
 ) -> None:
-    """Fix the target of a problem file, at every epoch if there are several.
+    """Fix the target of a problem file, or of a table of readings, at every epoch if there are several.
 
-    Options such as --height add to the constraints of the file.
+    Options such as --height add to the constraints of the file. A table needs --stations and --sigma.
     """
     from optloc.cli.fix import run_fix
 
@@ -149,6 +158,7 @@ def fix(
         late=late,
         explain=explain,
         allow=passing,
+        table=table_told(file, given),
     )
     raise typer.Exit(code)
 
@@ -237,7 +247,7 @@ def separate(
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Tell several emitters apart whose rows do not say whose they are; a channel is a kind at its stations."""
+    """Find several emitters when no row says which emitter it came from; a channel is one kind at its stations."""
     from optloc.cli.separate import run_separate
 
     raise typer.Exit(run_separate(file, detection, false, emitters, region, as_json=as_json, quiet=quiet))
@@ -434,66 +444,7 @@ def new(
     raise typer.Exit(run_new(kind, out, quiet=quiet))
 
 
-@app.command(
-    rich_help_panel=FIRST,
-    epilog=example(
-        "optloc convert toa.csv --stations sites.geojson --sigma '20 ns' --out a.toml",
-        "optloc convert log.csv --column time=when --stations rx.csv --sigma '6 m' --out b.toml",
-        "optloc convert gnss.csv --column pseudorange=C1C --sigma '3 m' --out gnss.toml",
-        "optloc convert sites.geojson --out stations.csv",
-        "optloc convert iridium.tle --times passes.csv --out satellites.csv",
-    ),
-)
-def convert(
-    file: Annotated[
-        Path,
-        typer.Argument(
-            metavar="FILE",
-            help="Arrival times or pseudoranges (CSV, Parquet), GeoJSON stations, or orbits (elements, OMM, SP3).",
-        ),
-    ],
-    out: Annotated[
-        Path, typer.Option(metavar="OUT.toml", help="Problem file to write; its tables go to CSV files beside it.")
-    ],
-    stations: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Where the stations are: GeoJSON, CSV or Parquet.")
-    ] = None,
-    sigma: Annotated[
-        str | None, typer.Option(metavar="AMOUNT", help="Error of each row: '20 ns', '6 m', or estimate.")
-    ] = None,
-    column: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="ROLE=NAME",
-            help="Column of a role that its name does not tell: message, station, time; epoch, satellite, x, y, z, "
-            "pseudorange; name, lat, lon, height. Give it once for each; message=set+msg joins two columns.",
-        ),
-    ] = None,
-    unit: Annotated[
-        str | None, typer.Option(metavar="UNIT", help="Of the values; by default what the column's name ends in.")
-    ] = None,
-    as_: Annotated[
-        str | None,
-        typer.Option("--as", metavar="WHAT", help="arrivals, pseudoranges or stations, where columns do not tell."),
-    ] = None,
-    frame: Annotated[
-        str | None, typer.Option(metavar="cartesian|ecef", help="Frame of stations in x, y, z; cartesian by default.")
-    ] = None,
-    times: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Table of measurements whose times (UTC) orbits are wanted at."),
-    ] = None,
-    as_json: Json = False,
-    budget: Budget = None,
-    force: Force = False,
-    quiet: Quiet = False,
-    verbose: Verbose = False,
-) -> None:
-    """Read a table of arrival times or pseudoranges, GeoJSON stations or orbits into a problem file."""
-    from optloc.cli.starters import run_convert
-
-    options = {"stations": stations, "sigma": sigma, "unit": unit, "what": as_, "frame": frame, "times": times}
-    raise typer.Exit(run_convert(file, out, column or [], as_json=as_json, quiet=quiet, **options))
+app.command(rich_help_panel=FIRST, epilog=example(*CONVERSIONS))(convert)
 
 
 @app.command(

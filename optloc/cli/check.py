@@ -19,14 +19,11 @@ from optloc.base.types import Array, Bias, Stations
 from optloc.cli.file_fixes import CHUNK
 from optloc.cli.fix import advice_for_vectors, advice_json, grouping_of, late_json, level_json, show_advice, tell_level
 from optloc.cli.output import (
-    Columns,
     Screen,
     bar,
     claim_outputs,
     dumps,
-    records,
     say_all,
-    with_sigma,
     write_picture,
     write_table,
     write_text,
@@ -37,6 +34,8 @@ from optloc.models import MODELS
 from optloc.problem.epochs import separable
 from optloc.problem.problem import Problem
 from optloc.quality.health import Health, health_of
+from optloc.report.columns import Columns, records
+from optloc.report.fixes import with_sigma
 from optloc.solvers import Method
 
 # Members of a bias that are named; the others are counted.
@@ -153,6 +152,7 @@ def summary(loaded: Loaded) -> dict[str, Any]:
         "groups_of_connected_stations": {"most": int(parts.max(initial=0))},
         "epochs_with_disconnected_pairs": int((parts > 1).sum()),
         "geometry": f"stations spread {flattest[worst]:.4g} m (root mean square) across, {widest[worst]:.4g} m along",
+        **({"azimuths": loaded.azimuths} if loaded.azimuths else {}),
     }
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -22,32 +21,25 @@ from optloc.base.outputs import together
 from optloc.base.types import ANSWERED, Array, Status
 from optloc.cli.file_fixes import (
     FileFixes,
-    active_of,
-    alternative_position,
-    bias_records,
-    explanations_of,
     fix_file,
     fixes_json,
     geojson,
-    level_covariance,
 )
+from optloc.cli.from_table import read_table_problem
 from optloc.cli.output import (
-    Columns,
     Screen,
     claim_outputs,
     dumps,
-    records,
     say,
     say_all,
-    with_sigma,
     write_picture,
     write_table,
     write_text,
 )
 from optloc.files import Loaded, read
+from optloc.files.readings import Told
 from optloc.files.schema import ConstraintTable
-from optloc.problem.chart import CARTESIAN, INVERSE_RANGE, NAMES
-from optloc.problem.fix import Fix, Suspect
+from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.quality.levels import (
     NoiseLevels,
@@ -55,13 +47,24 @@ from optloc.quality.levels import (
     late_signals,
     with_estimated_noise,
 )
+from optloc.report.columns import Columns, records
+from optloc.report.fixes import (
+    SHOWN,
+    Sheet,
+    alternative_sheet,
+    as_p,
+    bias_sheet,
+    count_sheet,
+    fix_sheet,
+    suspect_sheet,
+    whose,
+    with_sigma,
+)
 
 # What a screen holds of each list; the rest is counted, and --json and --out have all of it.
-_STATES, _EXPLANATIONS, _SUSPECTS, _BIASES, _FAILURES = 12, 8, 12, 40, 10
-# p-value below which a misfit is pointed out: one right fix in a thousand.
-_UNLIKELY = 1e-3
-# A cost gap below this is printed as 0: the two places explain the data equally well.
-_NO_GAP = 1e-3
+_STATES, _FAILURES = SHOWN, 10
+# Columns of text; those of numbers stand on the right.
+_TEXTS = {"name", "member", "estimate", "suspect"}
 _GOOD, _CARE, _BAD = "green", "yellow", "red"
 
 
@@ -81,12 +84,16 @@ def run_fix(
     late: bool = False,
     explain: bool = False,
     allow: tuple[Status, ...] = (),
+    table: Told | None = None,
 ) -> int:
-    """Fix a file under constraints of its own and more, write what was asked for, and return the exit code."""
+    """Fix a file, or a table with what is told of it, under more constraints; write and print; return the exit code."""
     on_output = geojson_path is not None and str(geojson_path) == "-"
     if as_json and on_output:
         raise InvalidProblem("JSON and GeoJSON cannot both go to standard output", "--geojson", "name a file")
-    loaded = read(file, more=more)
+    if table is None:
+        loaded = read(file, more=more)
+    else:
+        loaded = read_table_problem(file, table, more, quiet=quiet or as_json, on_error=on_output)
     claim_outputs(geojson_path, html, table=out, picture=plot, inputs=[file])
     loaded = _estimate_noise(loaded, noise)
     rescaled = _common_level(loaded.problem) if rescale else None
@@ -157,148 +164,34 @@ def show(found: FileFixes, console: Console) -> None:
 
 
 def _show_one(found: FileFixes, fix: Fix, console: Console) -> None:
-    verdict = Status(int(fix.code))
-    table = Table(title=found.loaded.title, show_header=False, title_justify="left", min_width=60)
-    table.add_row("status", Text(verdict.label, style=f"bold {_colour(verdict)}"))
-    reason = str(fix.reason[()] or "")
-    table.add_row("", verdict.sentence)
-    if reason:
-        table.add_row("reason", reason)
-    others = [one.label for one in fix.findings if one is not verdict]
-    if others:
-        table.add_row("besides", ", ".join(others))
-    # A run may have a state of each epoch: those that fit on a screen.
-    rows = len(found.columns["x"])
-    for i in range(min(rows, _STATES)):
-        _add_state(table, found.columns, i, _whose(found.columns, i) if rows > 1 else "")
-    if rows > _STATES:
-        table.add_row("...", f"{rows - _STATES} more; --out writes all of them")
-    # Errors of single epochs, such as clocks, are too many to list: their size is told.
-    for name, values in fix.bias.items():
-        slot, shared = fix.layout.find(name)
-        if not shared:
-            spread = np.sqrt(np.mean(values**2))
-            table.add_row(name, f"{values.size} values, root mean square {spread:.4g} {slot.unit}".strip())
-    for active in active_of(fix):
-        table.add_row(f"held by {active.name}", f"multiplier {active.multiplier:.4g} (cost per SI unit)")
-    _add_extents(table, found, fix)
-    table.add_row("chi-square", _chi_square(fix))
-    certificate: Any = fix.certificate[()]
-    if hasattr(certificate, "proof"):
-        table.add_row("certificate", f"{certificate.proof}: {certificate.reason}")
-    table.add_row("stages", " → ".join(stage.name for stage in fix.stages) or "none")
+    sheet = fix_sheet(fix, found.columns, found.loaded.title)
+    rows = [*sheet.rows, *([("azimuths", found.loaded.azimuths)] if found.loaded.azimuths else [])]
+    table = Table(title=sheet.title, show_header=False, title_justify="left", min_width=60)
+    table.add_row("status", Text(rows[0][1], style=f"bold {_colour(Status(int(fix.code)))}"))
+    for row in rows[1:]:
+        table.add_row(*row)
     console.print(table)
-    _show_biases(found, fix, console)
-    _show_suspects(fix, console)
+    _show_sheet(bias_sheet(fix, found.seen, found.loaded.bias_unit), console)
+    say_all(console, () if found.seen is None else found.seen.sentences)
+    _show_sheet(suspect_sheet(fix), console)
     _show_unnoticed(found, fix, console)
-    _show_alternatives(fix, console)
+    _show_sheet(alternative_sheet(fix), console)
+
+
+def _show_sheet(sheet: Sheet | None, console: Console) -> None:
+    """Print a sheet with names of columns; nothing where there is none."""
+    if sheet is None:
+        return
+    table = Table(title=sheet.title, title_justify="left")
+    for name in sheet.head:
+        table.add_column(name, justify="left" if name in _TEXTS else "right")
+    for row in sheet.rows:
+        table.add_row(*row)
+    console.print(table)
 
 
 def _colour(verdict: Status) -> str:
     return _GOOD if verdict is Status.OK else _CARE if verdict in ANSWERED else _BAD
-
-
-def _add_extents(table: Table, found: FileFixes, fix: Fix) -> None:
-    """Add what covers where the ellipsoid in metres does not."""
-    if fix.chart is None or not fix.answered or fix.chart.kind == CARTESIAN:
-        return
-    if fix.chart.kind != INVERSE_RANGE:
-        table.add_row("95 % region", "curved: the numbers behind ± do not cover; optloc.likelihood_region does")
-        return
-    low, high = (float(end) for end in fix.interval("range"))
-    far = f"to {high:.4g} m" if np.isfinite(high) else "or more, to infinity"
-    table.add_row("95 % range", f"{low:.4g} m {far}, from the middle of the stations")
-    if not found.loaded.problem.frame.geodetic:
-        low, high = (float(np.degrees(end)) for end in fix.interval("bearing"))
-        table.add_row("95 % bearing", f"{low:.4g} to {high:.4g} deg from the first axis towards the second")
-
-
-def _whose(columns: Columns, i: int) -> str:
-    """Return whose state a row is where there are several."""
-    several = len(set(columns["target"].tolist())) > 1
-    epoch = f" at {columns['epoch'][i]}" if columns["epoch"][i] != "run" else ""
-    return (f" of {columns['target'][i]}" if several else "") + epoch
-
-
-def _add_state(table: Table, columns: Columns, i: int, whose: str) -> None:
-    if not np.isfinite(columns["x"][i]):
-        return
-    axes = [axis for axis in "xyz" if axis in columns]
-    for axis in axes:
-        table.add_row(f"{axis}{whose}", with_sigma(columns[axis][i], columns[f"sigma_{axis}"][i], "m"))
-    if "lat_deg" in columns:
-        table.add_row(f"latitude{whose}", f"{columns['lat_deg'][i]:.7f} deg")
-        table.add_row(f"longitude{whose}", f"{columns['lon_deg'][i]:.7f} deg")
-        table.add_row(f"height{whose}", f"{columns['height'][i]:.2f} m")
-        local = [columns[f"cov_{axis}{axis}"][i] for axis in "enu" if f"cov_{axis}{axis}" in columns]
-        table.add_row("sigma east, north, up", ", ".join(f"{v:.3g}" for v in np.sqrt(np.maximum(local, 0.0))) + " m")
-    for letter, word, unit in (("v", "velocity", "m/s"), ("a", "acceleration", "m/s²")):
-        for axis in (axis for axis in axes if f"{letter}{axis}" in columns):
-            value, sigma = (columns[f"{prefix}{letter}{axis}"][i] for prefix in ("", "sigma_"))
-            table.add_row(f"{word} {axis}{whose}", with_sigma(value, sigma, unit))
-    semi = [columns[f"ellipse95_{j + 1}"][i] for j in range(len(axes))]
-    if np.isfinite(semi).all() and columns["chart"][i] in {"", NAMES[CARTESIAN]}:
-        name = "95 % ellipse" if len(axes) == 2 else "95 % ellipsoid"
-        table.add_row(name, " x ".join(f"{v:.3g}" for v in semi) + " m (semi-axes)")
-        if len(columns["x"]) == 1:
-            _add_accuracy(table, level_covariance(columns, i))
-
-
-def _add_accuracy(table: Table, covariance: Array) -> None:
-    """Add the radii that data sheets give."""
-    from optloc.uncertainty.radii import accuracy
-
-    radii = accuracy(covariance)
-    table.add_row("CEP50, CEP95", f"{radii.cep50:.3g}, {radii.cep95:.3g} m (circles)")
-    if len(covariance) == 3:
-        table.add_row("SEP50, SEP95", f"{radii.sep50:.3g}, {radii.sep95:.3g} m (spheres)")
-        table.add_row("vertical 95 %", f"± {radii.vertical95:.3g} m")
-
-
-def _chi_square(fix: Fix) -> str:
-    if int(fix.dof) <= 0 or not np.isfinite(fix.cost):
-        return "no redundancy: nothing to test"
-    p = float(fix.p_value)
-    warning = "; the residuals are larger than the stated noise" if p < _UNLIKELY else ""
-    return f"{float(fix.cost):.4g} with {int(fix.dof)} degrees of freedom, p = {p:.3g}{warning}"
-
-
-def _show_biases(found: FileFixes, fix: Fix, console: Console) -> None:
-    """Print the biases of a fix, and what cannot be told apart; nothing where there is none."""
-    rows = bias_records(fix, found.seen) if np.isfinite(fix.x).all() else []
-    if rows:
-        table = Table(title="Biases", title_justify="left")
-        for name in ("name", "member", "estimate", "from data"):
-            table.add_column(name, justify="right" if name == "from data" else "left")
-        for row in rows[:_BIASES]:
-            share = f"{100.0 * row['from_data']:.3g} %" if np.isfinite(row["from_data"]) else "-"
-            unit, size = found.loaded.bias_unit(row["name"], row["unit"])
-            told = with_sigma(row["value"] / size, row["sigma"] / abs(size), unit)
-            table.add_row(row["name"], row["member"], told.strip(), share)
-        if len(rows) > _BIASES:
-            table.add_row("...", f"{len(rows) - _BIASES} more", "--json prints all", "")
-        console.print(table)
-    say_all(console, () if found.seen is None else found.seen.sentences)
-
-
-def _show_suspects(fix: Fix, console: Console) -> None:
-    """Print what explains the data of a single fix that contradict each other; nothing where they agree."""
-    found = explanations_of(fix)
-    if not found:
-        return
-    title = "Left out" if len(found) == 1 else f"{len(found)} explanations: the first was taken"
-    table = Table(title=title, title_justify="left")
-    for name in ("#", "suspect", "error", "p with", "p without"):
-        table.add_column(name, justify="left" if name == "suspect" else "right")
-    for i, explanation in enumerate(found[:_EXPLANATIONS]):
-        for j, suspect in enumerate(explanation.suspects[:_SUSPECTS]):
-            label = str(i + 1) if j == 0 else ""
-            table.add_row(label, suspect.name, _error(suspect), _p(suspect.p_with), _p(suspect.p_without))
-        if len(explanation.suspects) > _SUSPECTS:
-            table.add_row("", f"and {len(explanation.suspects) - _SUSPECTS} more", "", "", "")
-    if len(found) > _EXPLANATIONS:
-        table.add_row("", f"and {len(found) - _EXPLANATIONS} more explanations", "", "", "")
-    console.print(table)
 
 
 def _show_unnoticed(found: FileFixes, fix: Fix, console: Console) -> None:
@@ -310,56 +203,22 @@ def _show_unnoticed(found: FileFixes, fix: Fix, console: Console) -> None:
     show_reliability(reliability_of(found.problem, fix.x, fix.suspects), console)
 
 
-def _error(suspect: Suspect) -> str:
-    """Return the errors of a suspect, each with its standard deviation."""
-    pairs = [f"{e:+.3g} ± {s:.2g}" for e, s in zip(suspect.error, suspect.sigma, strict=True) if np.isfinite(s)]
-    return ", ".join(pairs[:3]) + (" ..." if len(pairs) > 3 else "") if pairs else "not told"
-
-
-def _p(value: float) -> str:
-    return "-" if np.isnan(value) else f"{value:.2g}"
-
-
-def _show_alternatives(fix: Fix, console: Console) -> None:
-    found = np.isfinite(fix.alternatives.gap)
-    if not found.any():
-        return
-    table = Table(title="Alternatives", title_justify="left")
-    for name in ("#", "position, m", "cost gap", "probability"):
-        table.add_column(name, justify="right")
-    others = (fix.alternatives.x[found], fix.alternatives.gap[found], fix.alternatives.doubt[found])
-    for i, (x, gap, doubt) in enumerate(zip(*others, strict=True)):
-        # Two positions of a pair of targets at the most.
-        point = ", ".join(f"{v:.1f}" for v in np.ravel(alternative_position(fix, x))[:6])
-        table.add_row(str(i + 1), point, f"{gap:.4g}" if gap >= _NO_GAP else "0", f"{doubt:.2g}")
-    console.print(table)
-
-
 def _show_many(found: FileFixes, console: Console) -> None:
     columns = found.columns
-    table = Table(title=f"{found.loaded.title}: {len(columns['x'])} fixes", title_justify="left")
-    table.add_column("status")
-    for name in ("fixes", "median sigma, m", "95 % of sigmas, m", "median p"):
-        table.add_column(name, justify="right")
-    # One number for the error of a position: the root of the trace of its covariance.
-    sigma = np.sqrt(sum(columns[f"sigma_{axis}"] ** 2 for axis in "xyz" if axis in columns))
-    for label, count in Counter(columns["status"].tolist()).most_common():
-        inside = columns["status"] == label
-        # Half of the fixes are better than the median, all but the worst twentieth better than the other.
-        shares = ((sigma, 0.5), (sigma, 0.95), (columns["p_value"], 0.5))
-        cells = [_quantile(values[inside], share) for values, share in shares]
-        table.add_row(Text(label, style=_colour(Status[label.upper().replace(" ", "_")])), str(count), *cells)
+    sheet = count_sheet(columns, f"{found.loaded.title}: ")
+    table = Table(title=sheet.title, title_justify="left")
+    for name in sheet.head:
+        table.add_column(name, justify="left" if name == "status" else "right")
+    for label, *cells in sheet.rows:
+        table.add_row(Text(label, style=_colour(Status[label.upper().replace(" ", "_")])), *cells)
     console.print(table)
     bad = np.flatnonzero(columns["status"] != Status.OK.label)
     for i in bad[:_FAILURES]:
         say(console, f"epoch {columns['epoch'][i]}: {columns['status'][i]}: {columns['reason'][i]}")
     if len(bad) > _FAILURES:
         say(console, f"... and {len(bad) - _FAILURES} more; --out writes all of them")
-
-
-def _quantile(values: Array, share: float) -> str:
-    finite = values[np.isfinite(values)]
-    return f"{np.quantile(finite, share):.3g}" if len(finite) else "-"
+    if found.loaded.azimuths:
+        say(console, f"Azimuths: {found.loaded.azimuths}.")
 
 
 # Noise from data.
@@ -538,16 +397,16 @@ def _show_explained(found: FileFixes, other: FileFixes | None, console: Console)
     for name in ("", "as it was", "with it", "change"):
         table.add_column(name, justify="left" if not name else "right")
     table.add_row("status", Status(int(found.fixes[0].flat().code[0])).label, Status(int(fix.code)).label, "")
-    before = "-" if found.fixes[0].shape else _p(float(found.fixes[0].p_value))
-    table.add_row("p", before, _p(float(fix.p_value)), "")
+    before = "-" if found.fixes[0].shape else as_p(float(found.fixes[0].p_value))
+    table.add_row("p", before, as_p(float(fix.p_value)), "")
     rows = min(len(found.columns["x"]), _STATES)
     for i in range(rows):
-        whose = _whose(found.columns, i) if len(found.columns["x"]) > 1 else ""
+        owner = whose(found.columns, i) if len(found.columns["x"]) > 1 else ""
         for axis in _axes(found):
             one, two = (each.columns[axis][i] for each in (found, other))
             sigmas = [each.columns[f"sigma_{axis}"][i] for each in (found, other)]
             told = [with_sigma(value, sigma, "m") for value, sigma in zip((one, two), sigmas, strict=True)]
-            table.add_row(f"{axis}{whose}", *told, f"{two - one:+.4g} m")
+            table.add_row(f"{axis}{owner}", *told, f"{two - one:+.4g} m")
     console.print(table)
     if rows < len(found.columns["x"]):
         say(console, f"{len(found.columns['x']) - rows} more positions changed: --json has all of them.")

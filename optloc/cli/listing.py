@@ -40,16 +40,21 @@ def _print(rows: Rows, console: Console) -> None:
     """Print entries as a table, or one below the other where they are too long for one."""
     # Entries of one table may have different fields: all of them, in the order in which they first occur.
     title, *names = dict.fromkeys(name for row in rows for name in row)
-    if sum(max(len(row.get(name, "")) for row in rows) for name in names) > _WRAPS * console.width:
+    widths = [max(len(row.get(name, "")) for row in rows) for name in names]
+    # Where a word would be cut, a table does not fit either: three signs stand between two columns.
+    texts = {name: " ".join([name, *(row.get(name, "") for row in rows)]) for name in names}
+    words = {name: max(map(len, text.split())) for name, text in texts.items()}
+    least = max(len(row[title]) for row in rows) + sum(words.values()) + 3 * len(names) + 4
+    if sum(widths) > _WRAPS * console.width or least > console.width:
         for row in rows:
             console.print(Text.assemble((row[title], "bold"), f": {row['summary']}"), highlight=False)
-            for name in names[:-1]:
-                console.print(Padding(f"{name}: {row.get(name, '')}", (0, 0, 0, 4)), highlight=False)
+            for name in (each for each in names if each != "summary" and row.get(each)):
+                console.print(Padding(f"{name}: {row[name]}", (0, 0, 0, 4)), highlight=False)
         return
     table = Table()
     table.add_column(title, no_wrap=True)
     for name in names:
-        table.add_column(name)
+        table.add_column(name, overflow="fold")
     for row in rows:
         table.add_row(row[title], *(row.get(name, "") for name in names))
     console.print(table)
@@ -109,6 +114,7 @@ def _kinds() -> Rows:
     return [
         {
             "kind": name,
+            "also called": ", ".join(model.aliases),
             "stations": str(model.stations),
             "dimensions": " ".join(str(d) for d in model.dimensions),
             "units": " ".join(UNITS[model.quantity]),  # type: ignore[index]  # models hold known quantities only

@@ -10,31 +10,23 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from rich.console import Console
 from rich.text import Text
 
 from optloc.base import outputs
 from optloc.base.errors import InvalidProblem
-from optloc.base.frames import Frame
 from optloc.base.outputs import claim, is_stream, visible, written
-from optloc.base.types import Array
 from optloc.compute.progress import Reporter
 from optloc.files.writer import write_csv
+from optloc.report.columns import Columns, plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 LOG = logging.getLogger("optloc.write")
 
-Columns = dict[str, Array]
-"""A long table: columns (rows,) by name, in SI units and degrees, NaN where there is no number."""
-
 PICTURES = (".png", ".svg", ".pdf")
 """Types of pictures that commands write."""
-
-# What a coordinate that an equality holds may have as its sigma, as a share of it: rounding.
-_HELD = 1e-12
 
 
 class Screen(Console):
@@ -63,69 +55,10 @@ def say_all(console: Console, sentences: Sequence[str]) -> None:
         say(console, f"{text[0].upper()}{text[1:]}.")
 
 
-def with_sigma(value: float, sigma: float, unit: str) -> str:
-    """Return a number with its standard deviation, rounded to it; a constraint may leave it none."""
-    unit = unit if unit != "1" else ""
-    if sigma <= _HELD * (1.0 + abs(value)):
-        return f"{value:.10g} {unit} (held)"
-    if not np.isfinite(sigma):
-        return f"{value:.6g} {unit}"
-    # Two digits of the standard deviation, none behind the point of one above 10.
-    digits = int(max(0, 1 - np.floor(np.log10(sigma))))
-    return f"{value:.{digits}f} ± {sigma:.{digits}f} {unit}"
-
-
-def plain(value: Any) -> Any:
-    """Return a value as JSON knows it: arrays as lists, what is not finite as null."""
-    if isinstance(value, dict):
-        return {key: plain(inner) for key, inner in value.items()}
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, list | tuple):
-        return [plain(inner) for inner in value]
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
 def dumps(value: Any) -> str:
     """Return strict JSON."""
     # NaN and infinity are no JSON: they were made null, and a leftover is a mistake.
     return json.dumps(plain(value), allow_nan=False, indent=2)
-
-
-def records(columns: Columns) -> list[dict[str, Any]]:
-    """Return a table as one record for each row, ready for JSON."""
-    lists = {name: plain(values) for name, values in columns.items()}
-    return [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)]
-
-
-def join_tables(parts: Sequence[Columns]) -> Columns:
-    """Return tables below each other; a column that one lacks is NaN there."""
-    names = dict.fromkeys(name for part in parts for name in part)
-    sizes = [len(next(iter(part.values()))) for part in parts]
-    return {
-        name: np.concatenate([part.get(name, np.full(size, np.nan)) for part, size in zip(parts, sizes, strict=True)])
-        for name in names
-    }
-
-
-def covariance_columns(covariance: Array, axes: str) -> Columns:
-    """Return the upper triangles of covariances (n, d, d) along named axes."""
-    d = covariance.shape[-1]
-    return {f"cov_{axes[i]}{axes[j]}": covariance[:, i, j] for i in range(d) for j in range(i, d)}
-
-
-def geodetic_columns(frame: Frame, position: Array, covariance: Array) -> Columns:
-    """Return latitude and longitude (degrees), height (metres) and covariance along east, north, up."""
-    if not frame.geodetic:
-        return {}
-    with np.errstate(invalid="ignore"):  # epochs without a fix are NaN
-        lat, lon, height = frame.to_geodetic(position)
-        axes = frame.enu_axes(position)
-    local = axes @ covariance @ np.swapaxes(axes, -1, -2)
-    degrees = {"lat_deg": np.degrees(lat), "lon_deg": np.degrees(lon), "height": height}
-    return degrees | covariance_columns(local, "enu")
 
 
 def write_text(path: Path, text: str) -> None:

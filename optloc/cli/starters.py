@@ -1,4 +1,4 @@
-"""What ``optloc demo``, ``new`` and ``convert`` do: a first problem file, shipped, written or made of tables."""
+"""What ``optloc demo`` and ``new`` do: a first problem file, shipped or written."""
 
 from __future__ import annotations
 
@@ -17,9 +17,8 @@ from optloc.base.units import SI_UNIT, UNITS
 from optloc.cli.file_fixes import FileFixes, fix_file, fixes_json
 from optloc.cli.fix import draw, show
 from optloc.cli.options import shipped_problems
-from optloc.cli.output import Screen, claim_outputs, dumps, say, say_all, write_text
+from optloc.cli.output import Screen, claim_outputs, dumps, say, write_text
 from optloc.files import read
-from optloc.files.convert import Converted, convert
 from optloc.models import MODELS, Model
 
 _FIX = """
@@ -55,7 +54,7 @@ _END = """
 - `optloc new tdoa --out site.toml` writes a problem file with comments, to be filled with your own numbers;
   `optloc list starters` shows what else there is.
 - `optloc check site.toml`, then `optloc fix site.toml --plot fix.png`.
-- `optloc convert` reads tables of arrival times, pseudoranges and GeoJSON stations.
+- `optloc convert` reads tables of readings, pseudoranges and GeoJSON stations, long or wide.
 """
 _STEPS = ((_FIX, "demo"), (_REGISTRATION, "registration"), (_PROOF, "ambiguous"))
 PICTURE = Path("optloc-demo.png")
@@ -240,40 +239,3 @@ def _measurements(block: Rows, sigma: float, names: list[str]) -> list[str]:
         ends = [f'{end} = "{names[index[i]]}"' for end, index in (("a", block.a), ("b", block.b))][: model.stations]
         lines.append("  { " + ", ".join([*ends, f"z = {z:.6g}"]) + " },")
     return [*lines, "]"]
-
-
-# Tables of others.
-
-
-def run_convert(file: Path, out: Path, column: list[str], *, as_json: bool, quiet: bool, **options: Any) -> int:
-    """Convert a file, say what was made of it, and return the exit code."""
-    columns = {}
-    for pair in column:
-        role, sign, name = pair.partition("=")
-        if not (role and sign and name):
-            raise InvalidProblem(f"{pair!r} names no column", "--column", "write ROLE=NAME, such as station=receiver")
-        columns[role] = name
-    found = convert(file, out, columns=columns, **options)
-    if as_json:
-        write_text(Path("-"), dumps(_conversion_json(found)))
-    elif not quiet:
-        _show_conversion(found, Screen(), out)
-    return 0
-
-
-def _conversion_json(found: Converted) -> dict[str, Any]:
-    about = {"files": [str(path) for path in found.written], "notes": list(found.notes)}
-    if found.loaded is None:
-        return about
-    problem = found.loaded.problem
-    return about | {"stations": problem.stations.count, "epochs": problem.epochs, "rows": problem.count}
-
-
-def _show_conversion(found: Converted, console: Console, out: Path) -> None:
-    say_all(console, found.notes)
-    if found.loaded is None:
-        say(console, f'{out} is a table of stations: name it in a problem file, [stations] file = "{out.name}".')
-        return
-    problem = found.loaded.problem
-    held = f"{problem.count} rows of {problem.epochs} epochs at {problem.stations.count} stations"
-    say(console, f"{', '.join(str(path) for path in found.written)}: {held}. Next: optloc check {out}.")

@@ -17,16 +17,11 @@ from optloc.base.outputs import is_stream
 from optloc.cli.options import coordinates
 from optloc.cli.output import (
     LOG,
-    Columns,
     Screen,
     bar,
     claim_outputs,
-    covariance_columns,
     dumps,
-    geodetic_columns,
     is_csv,
-    join_tables,
-    records,
     say,
     write_picture,
     write_table,
@@ -35,6 +30,7 @@ from optloc.cli.output import (
 from optloc.files import Loaded, read
 from optloc.files.writer import GrowingTable
 from optloc.problem.problem import Problem
+from optloc.report.columns import Columns, covariance_columns, geodetic_columns, join_tables, records
 from optloc.track import Dynamics, State, current_statistical, polynomial, singer
 from optloc.track.run import Entry, Rules, tracked
 from optloc.track.several_targets import alone

@@ -1,10 +1,12 @@
-"""Common inputs as a problem file with CSV tables beside it: arrival times, pseudoranges, stations, satellites."""
+"""Common tables as a problem file with CSV tables beside it: readings of receivers, pseudoranges, stations, orbits."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import re
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from decimal import Decimal
 from functools import partial
 from pathlib import Path
@@ -19,14 +21,18 @@ from optloc.base.inputs import at_most
 from optloc.base.outputs import claim, together, write_text
 from optloc.base.types import Array
 from optloc.base.units import UNITS
+from optloc.files.foreign import read_table
 from optloc.files.orbits import read_orbits
 from optloc.files.reader import Loaded, read
-from optloc.files.roles import GEOJSON, GUESSES, Places, Roles, places_of, read_table, stem, unit_of
-from optloc.files.schema import Units
+from optloc.files.readings import CARTESIAN, COMPASS, Named, Readings, Told, named_columns, sort_named, sorts_of
+from optloc.files.roles import GUESSES, PLACE, Places, Roles, places_of, scaled, stem, unit_of
+from optloc.files.schema import ConstraintTable, Units
+from optloc.files.shapes import epochs_of, inline, long, wide
 from optloc.files.table import distinct
 from optloc.files.writer import write_csv
+from optloc.models import MODELS, kind_named
 
-INPUTS = ("arrivals", "pseudoranges", "stations")
+INPUTS = ("arrivals", "sp", "pseudoranges", "stations")
 
 # Nothing is nearer to the centre of the Earth than its poles but what has another unit, metres.
 _SURFACE = 6.4e6
@@ -34,64 +40,128 @@ _SURFACE = 6.4e6
 _ORBITS = (".tle", ".2le", ".3le", ".sp3", ".omm")
 # Arrivals that place a target in the plane; of fewer the user is told.
 _FEW = 3
+# Letters of the name of a file that is not kept.
+_LETTERS = 40
+# Names of columns that are repeated of a list.
+_NAMED = 4
 
 
 @dataclass(frozen=True, slots=True)
-class Measured:
-    """The columns (m,) of a measurements table, their unit, what they are, and what had to be assumed."""
+class Section:
+    """One table of measurements: its kind, columns (m,), unit, noise, what it is, and further lines of the file."""
 
+    kind: str
     columns: Mapping[str, Any]
     unit: str
-    comment: str
+    sigma: str | None
+    text: str
+    lines: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What a table is understood to be, before anything is written.
+
+    Parameters
+    ----------
+    source : Path
+        The table.
+    sections : tuple of Section
+        The measurements.
+    places : Places
+        The stations.
+    about : tuple of (str, str)
+        What was understood: a word, and what it is.
+    notes : tuple of str
+        What was assumed or left out.
+    lines : tuple of str
+        Further lines of the problem file, before its tables.
+    after : tuple of str
+        The same, behind them.
+    height : str
+        What the constraint on the height says, where there is one.
+    """
+
+    source: Path
+    sections: tuple[Section, ...]
+    places: Places
+    about: tuple[tuple[str, str], ...]
     notes: tuple[str, ...] = ()
+    lines: tuple[str, ...] = ()
+    after: tuple[str, ...] = ()
+    height: str = ""
+
+    def read(self, more: Mapping[str, ConstraintTable] | None = None) -> Loaded:
+        """Return the problem, with more constraints; nothing is left on the disk."""
+        with TemporaryDirectory() as folder:
+            # As the table is called, as far as every system writes such a name.
+            place = Path(folder) / f"{re.sub(r'[^A-Za-z0-9_-]', '_', self.source.stem)[:_LETTERS]}.toml"
+            # A height that is told takes the place of one that was assumed.
+            (replace(self, height="") if "--height" in (more or {}) else self).write(place)
+            return read(place, more=more)
+
+    def write(self, out: Path) -> tuple[Path, ...]:
+        """Write a problem file with its tables beside it, and return their paths."""
+        tables = self.tables(out)
+        with together():
+            for path, columns in zip(tables, (self.places.columns, *(s.columns for s in self.sections)), strict=True):
+                write_csv(path, columns)
+            write_text(out, self._text([path.name for path in tables]))
+        return (out, *tables)
+
+    def tables(self, out: Path) -> tuple[Path, ...]:
+        """Return the names of the tables beside a problem file: stations, then the rows of each kind."""
+        many = len(self.sections) > 1
+        names = ("stations", *(section.kind if many else "rows" for section in self.sections))
+        return tuple(out.with_name(f"{out.stem}-{name}.csv") for name in names)
+
+    def _text(self, names: Sequence[str]) -> str:
+        # JSON spells strings as TOML does, but for signs beyond 16 bits, which stay as they are.
+        quoted = partial(json.dumps, ensure_ascii=False)
+        lines = [f"# Made from {quoted(self.source.name)} by optloc convert.", "format = 1"]
+        lines += [f"title = {quoted(self.source.stem)}", *self.lines, "", "[frame]", f'kind = "{self.places.frame}"']
+        lines += ["", "[stations]", f"file = {quoted(names[0])}", f'unit = "{self.places.unit}"']
+        for section, name in zip(self.sections, names[1:], strict=True):
+            lines += ["", "[[measurements]]", f'kind = "{section.kind}"                         # {section.text}']
+            lines += [f"file = {quoted(name)}", f'unit = "{section.unit}"', *section.lines]
+            lines += [f"sigma = {quoted(section.sigma)}"] if section.sigma is not None else []
+        lines += [*self.after, *(["", "[[constraints]]", 'kind = "height"', self.height] if self.height else [])]
+        return "\n".join(lines) + "\n"
 
 
 @dataclass(frozen=True, slots=True)
 class Converted:
-    """What was written, the problem that it is (None of stations alone), and what had to be assumed."""
+    """What was written, the problem that it is (None of stations alone), what was assumed, and what it is."""
 
     written: tuple[Path, ...]
     loaded: Loaded | None
     notes: tuple[str, ...] = ()
+    about: tuple[tuple[str, str], ...] = ()
 
 
 def convert(
     source: Path,
     out: Path,
+    told: Told | None = None,
     *,
-    stations: Path | None = None,
-    sigma: str | None = None,
-    what: str | None = None,
-    columns: Mapping[str, str] | None = None,
-    unit: str | None = None,
-    frame: str | None = None,
-    times: Path | None = None,
+    tell: Callable[[Plan], object] = lambda _: None,
+    **options: Any,
 ) -> Converted:
     """Write a table as a problem file.
 
     Parameters
     ----------
     source : Path
-        Arrival times or pseudoranges as CSV or Parquet; or stations, as such a table or as GeoJSON; or orbits of
-        satellites, as two-line elements, OMM (JSON, CSV) or SP3.
+        Readings of receivers or pseudoranges as CSV, Parquet or JSON; or stations, as such a table or as GeoJSON; or
+        orbits of satellites, as two-line elements, OMM (JSON, CSV) or SP3.
     out : Path
         Problem file to write, .toml; its tables go to CSV files beside it. Of stations alone: the CSV file.
-    stations : Path, optional
-        Where the stations of arrival times are: CSV, Parquet or GeoJSON. Beside orbits: stations that stay.
-    sigma : str, optional
-        Standard deviation of each row with its unit, such as "20 ns"; "estimate" finds it from many epochs.
-    what : "arrivals", "pseudoranges" or "stations", optional
-        What `source` holds; by default what its columns suggest.
-    columns : mapping of str to str, optional
-        Column of each role that is not found by its name: "message", "station", "time", "epoch", "satellite",
-        "pseudorange", "name", "x", "y", "z", "lat", "lon", "height". "set+msg" puts two columns together.
-    unit : str, optional
-        Unit of the values; by default what the column's name ends in, else s of times and m of pseudoranges.
-    frame : "cartesian" or "ecef", optional
-        Frame of stations in x, y, z; cartesian by default.
-    times : Path, optional
-        Table of the measurements, whose times (dates, or seconds since 1970; UTC) satellites are wanted at, and whose
-        column of satellites, where it has one, says which.
+    told : Told, optional
+        What the table does not say itself.
+    tell : callable, optional
+        Is given the plan of a table of readings before it is written.
+    **options
+        The same, one by one: the fields of `Told`.
 
     Returns
     -------
@@ -103,49 +173,313 @@ def convert(
     InvalidProblem
         Naming the file, the row and the column.
     """
-    told = dict(columns or {})
-    for role in told:
-        if role not in GUESSES:
-            raise InvalidProblem(f"there is no role {role!r}", "--column", nearest(role, GUESSES))
-    if frame not in (None, "cartesian", "ecef"):
-        raise InvalidProblem(f"there is no frame {frame!r}", "--frame", nearest(str(frame), ("cartesian", "ecef")))
-    if what is not None and what not in INPUTS:
-        raise InvalidProblem(f"there is no input {what!r}", "--as", nearest(what, INPUTS))
-    claim(out, *_tables(out), inputs=[source, *(path for path in (stations, times) if path)])
-    if times is not None or source.suffix.lower() in _ORBITS:
-        return _write_satellites(source, out, told, times, stations)
-    if what == "stations" or source.suffix.lower() in GEOJSON:
-        return _write_stations(source, out, told, frame)
+    told = replace(told or Told(), **options)
+    _check_told(told)
+    claim(out, inputs=[source, *(path for path in (told.stations, told.times) if path)])
+    if told.times is not None or source.suffix.lower() in _ORBITS:
+        return _write_satellites(source, out, told.columns, told.times, told.stations)
+    if told.what == "stations" or source.suffix.lower() == ".geojson":
+        return _write_stations(source, out, told.columns, told.frame)
     if out.suffix.lower() != ".toml":
         raise InvalidProblem("the problem file must end in .toml", str(out), "let the name behind --out end in it")
-    roles = Roles(read_table(source), told)
-    seen = what or _recognise(roles)
-    if seen == "stations":
-        return _write_stations(source, out, told, frame)
-    if sigma is None:
-        advice = "say it with --sigma '20 ns' (or metres); --sigma estimate finds it from many epochs"
-        raise InvalidProblem("nothing is known of how accurate the rows are", "--sigma", advice)
-    if seen == "arrivals":
-        if stations is None:
+    plan = understood(source, told)
+    tell(plan)
+    claim(*plan.tables(out), inputs=[source, *(path for path in (told.stations,) if path)])
+    # Read before it is there: what cannot be read is not written.
+    loaded = plan.read()
+    return Converted(plan.write(out), loaded, plan.notes, plan.about)
+
+
+def _check_told(told: Told) -> None:
+    """Refuse roles, frames and conventions that there are none of."""
+    for role in told.columns:
+        if role not in GUESSES and role not in MODELS:
+            raise InvalidProblem(f"there is no role {role!r}", "--column", nearest(role, GUESSES))
+    choices = {"frame": ("cartesian", "ecef"), "azimuth": (COMPASS, CARTESIAN), "positive": ("a-farther", "b-farther")}
+    for name, known in choices.items():
+        given = getattr(told, name)
+        if given not in (None, *known):
+            raise InvalidProblem(f"there is no {name} {given!r}", f"--{name}", nearest(str(given), known))
+    if told.what is not None and told.what not in INPUTS:
+        _sort(told.what)
+
+
+def _sort(word: str) -> str:
+    """Return the sort of reading that --as names."""
+    if word in ("arrivals", "sp"):
+        return word
+    try:
+        kind = kind_named(word, "--as")
+    except InvalidProblem:
+        raise InvalidProblem(f"there is no input {word!r}", "--as", nearest(word, [*INPUTS, *MODELS])) from None
+    if not MODELS[kind].stations:
+        raise InvalidProblem(f"{kind} has no stations", "--as", "write it in the problem file")
+    return "arrivals" if kind == "toa" else kind
+
+
+def understood(source: Path, told: Told) -> Plan:
+    """Return what a table of readings or pseudoranges is, with what it does not say itself.
+
+    Raises
+    ------
+    InvalidProblem
+        For what is wrong, and for what may mean two things: naming the option that says which.
+    """
+    _check_told(told)
+    roles = Roles(read_table(source), told.columns)
+    satellites = roles.find("pseudorange") is not None and roles.find("satellite") is not None
+    if told.what == "pseudoranges" or (told.what is None and satellites):
+        return _pseudoranges(source, roles, told)
+    told = told if told.what is None else replace(told, what=_sort(told.what))
+    if told.stations is not None:
+        place = places_of(told.stations, {k: name for k, name in told.columns.items() if k in PLACE}, told.frame)
+        columns = [one for one in named_columns(list(roles.table.columns), place.names) if _may_be(one, told)]
+        if len(columns) > 1 and "station" not in told.columns:
+            return _plan(roles, told, place, source, wide(roles, told, columns, place))
+    sorts, heard = sorts_of(roles, told), None
+    if not sorts:
+        raise _unknown(roles, told)
+    if told.stations is None:
+        if roles.find("lat") is None and roles.find("x") is None:
             advice = "name a table or GeoJSON file with --stations"
             raise InvalidProblem("nothing is known of where the stations are", "--stations", advice)
-        own = {role: name for role, name in told.items() if role in ("name", "x", "y", "z", "lat", "lon", "height")}
-        place = places_of(stations, own, frame)
-        found = arrivals(roles, place.names, stations.name, unit)
-    else:
-        found, place = pseudoranges(roles, unit)
-    return _write(source, out, found, place, sigma)
+        place, heard = inline(roles, told)
+    return _plan(roles, told, place, source, [long(roles, sort_named(name), told, place, heard) for name in sorts])
 
 
-def _recognise(roles: Roles) -> str:
-    """Return what a table holds by its columns; raise InvalidProblem where they do not tell."""
-    if roles.find("pseudorange") is not None and roles.find("satellite") is not None:
-        return "pseudoranges"
-    if roles.find("station") is not None and roles.find("time") is not None:
-        return "arrivals"
-    what = f"the columns {', '.join(roles.table.columns)} do not tell what this is"
-    advice = f"say it with --as {', --as '.join(INPUTS)}, and name columns with --column ROLE=NAME"
-    raise InvalidProblem(what, roles.table.source, advice)
+def _unknown(roles: Roles, told: Told) -> InvalidProblem:
+    """Return what is said of a table whose columns do not tell what it is."""
+    columns = list(roles.table.columns)
+    what = f"the columns {', '.join(columns)} do not tell what this is"
+    advice = f"say it with --as {', --as '.join(INPUTS)} or a kind, and name columns with --column ROLE=NAME"
+    if told.stations is None:
+        advice += "; columns named by receivers need --stations"
+    return InvalidProblem(what, roles.table.source, advice)
+
+
+def _may_be(one: Named, told: Told) -> bool:
+    """Return whether a column that names stations holds what is asked for."""
+    return told.what is None or one.form in (None, told.what)
+
+
+# From readings to the tables of a problem file.
+
+
+def _plan(roles: Roles, told: Told, place: Places, source: Path, found: Sequence[Readings]) -> Plan:
+    """Return what readings become."""
+    epochs = epochs_of(roles, told, found)
+    sections = tuple(_section(one, epochs, sigma) for one, sigma in zip(found, _sigmas(told, found), strict=True))
+    notes = [*roles.table.notes, *([place.note] if place.note else [])]
+    notes += dict.fromkeys(note for one in found for note in one.notes)
+    lines: tuple[str, ...] = ()
+    if any(one.form.value == "sp" for one in found):
+        speed = _sp_speed(told)
+        lines = (f"propagation_speed = {speed!r}",)
+        notes.append(f"S minus P times {speed:.6g} m/s, vp vs / (vp - vs), is a range: straight rays, one speed")
+    after: tuple[str, ...] = ()
+    if told.window is not None and "epoch" not in epochs:
+        if "time" not in epochs:
+            advice = "name the column of times with --column time=NAME, and its unit at the end of its name"
+            raise InvalidProblem("a window needs a column of times", "--window", advice)
+        after = ("", "[epochs]", f"window = {json.dumps(told.window)}")
+    notes += _left_out(roles, told, found)
+    height, note = _height(found, place)
+    notes += [*_few(sections, told), *([note] if note else [])]
+    return Plan(
+        source, sections, place, tuple(_about(roles, told, place, found, epochs)), tuple(notes), lines, after, height
+    )
+
+
+def _left_out(roles: Roles, told: Told, found: Sequence[Readings]) -> list[str]:
+    """Return a remark on columns that are in the unit of those of receivers, but name none."""
+    used = {cell for one in found for cell in one.cells}
+    if told.stations is None or len(used) <= len(found):
+        return []
+    units = {unit_of(name, UNITS["length"]) for name in used} - {None}
+    like = [name for name in roles.table.columns if name not in used and unit_of(name, UNITS["length"]) in units]
+    like = [name for name in like if name not in {roles.find(role) for role in ("time", "message", "sigma")}]
+    return (
+        [f"{', '.join(map(repr, like))} may hold readings, but name no station of {told.stations.name}"] if like else []
+    )
+
+
+def _height(found: Sequence[Readings], place: Places) -> tuple[str, str]:
+    """Return what is known of the height of a target on Earth without a reading, as a line of a file, and a remark."""
+    if place.frame != "geodetic":
+        return "", ""
+    heights, unit = place.columns["height"], place.unit
+    if all(one.form.kind == "azimuth" for one in found):
+        mean = round(float(heights.mean()), 3)
+        remark = (
+            f"bearings tell no height: it is taken to be {mean:g} {unit}, the stations' mean, or what --height says"
+        )
+        return f'exactly = "{mean!r} {unit}"', remark
+    if any(one.form.value == "sp" for one in found):
+        top = float(heights.max())
+        return f'max = "{top!r} {unit}"', f"the earthquake is taken to be below the highest station, {top:g} {unit}"
+    return "", ""
+
+
+def _sigmas(told: Told, found: Sequence[Readings]) -> list[str | None]:
+    """Return the standard deviation of each sort as it is written, None where the table has its own."""
+    if told.sigma is None and all(one.sigma is not None for one in found):
+        return [None] * len(found)
+    if told.sigma is None:
+        raise _no_sigma("20 ns")
+    if "=" not in told.sigma:
+        if len({one.form.quantity for one in found}) > 1:
+            advice = "write --sigma '" + ",".join(f"{one.form.kind}=1 {one.unit}" for one in found) + "'"
+            raise InvalidProblem("the readings are of several kinds, and each needs its own", "--sigma", advice)
+        return [told.sigma] * len(found)
+    parts = [part.partition("=") for part in told.sigma.split(",")]
+    given = {kind_named(word.strip(), "--sigma"): amount.strip() for word, _, amount in parts}
+    lacking = next((one.form.kind for one in found if one.form.kind not in given), None)
+    if lacking is not None:
+        raise InvalidProblem(f"nothing is said of {lacking}", "--sigma", f"add {lacking}=AMOUNT behind a comma")
+    return [given[one.form.kind] for one in found]
+
+
+def _no_sigma(example: str) -> InvalidProblem:
+    advice = f"say it with --sigma '{example}' (or metres); --sigma estimate finds it from many epochs"
+    return InvalidProblem("nothing is known of how accurate the rows are", "--sigma", advice)
+
+
+def _sp_speed(told: Told) -> float:
+    """Return the speed that turns S minus P into a range, metres per second."""
+    if told.vp is None or told.vs is None:
+        advice = "say both, such as --vp '6 km/s' --vs '3.5 km/s'"
+        raise InvalidProblem("the speeds of the P and S waves are not known", "--vp", advice)
+    vp, vs = (Units("speed").plain(given, None, where) for given, where in ((told.vp, "--vp"), (told.vs, "--vs")))
+    if not 0.0 < vs < vp:
+        raise InvalidProblem(f"P waves of {vp:g} m/s are not faster than S waves of {vs:g} m/s", "--vs", "correct it")
+    return vp * vs / (vp - vs)
+
+
+def _section(found: Readings, epochs: Mapping[str, Array], sigma: str | None) -> Section:
+    columns: dict[str, Any] = {name: column[found.row] for name, column in epochs.items()}
+    values, text = found.values, found.form.text
+    if found.form.kind == "toa":
+        values, text = _from_first(found, columns), "arrivals, counted from the first of each message"
+    columns |= {"a": found.a} | ({} if found.b is None else {"b": found.b}) | {"z": [f"{value:f}" for value in values]}
+    if found.sigma is not None and sigma is None:
+        columns["sigma"] = found.sigma
+    lines = [f'azimuth = "{found.azimuth}"'] if found.azimuth is not None else []
+    lines += [f'positive = "{found.positive}"'] if found.positive != "a-farther" else []
+    return Section(found.form.kind, columns, found.unit, sigma, text, tuple(lines))
+
+
+def _from_first(found: Readings, columns: dict[str, Any]) -> list[Decimal]:
+    """Return arrivals counted from the first of their message, whose time becomes a column where there is none.
+
+    Seconds of today in nanoseconds have 19 digits, a float 16: differences are taken before anything is rounded.
+    """
+    keys = [columns[name].tolist() for name in ("epoch", "time", "target") if name in columns]
+    labels: list[Any] = list(zip(*keys, strict=True)) if keys else [()] * len(found.values)
+    first: dict[Any, Decimal] = {}
+    for label, value in zip(labels, found.values, strict=True):
+        first[label] = min(value, first.get(label, value))
+    # Arrivals that are counted from their first already say nothing of when that was.
+    dated = found.unit in UNITS["time"] and len(set(first.values())) == len(first)
+    if dated and "time" not in columns:
+        factor = Decimal(repr(UNITS["time"][found.unit]))
+        columns["time"] = np.array([float(first[label] * factor) for label in labels])
+    return [value - first[label] for label, value in zip(labels, found.values, strict=True)]
+
+
+def _few(sections: Sequence[Section], told: Told) -> list[str]:
+    """Return what is to be said of epochs with few readings."""
+    counts: Counter[Any] = Counter()
+    for section in sections:
+        keys = [section.columns[name] for name in ("epoch", "target") if name in section.columns]
+        keys = keys or [section.columns[name] for name in ("time",) if name in section.columns]
+        counts.update(zip(*(column.tolist() for column in keys), strict=True))
+    few = sum(count < _FEW for count in counts.values())
+    if sections[0].kind == "toa" and few:
+        return [f"{few} of {len(counts)} messages were heard by fewer than three stations"]
+    if len(counts) > 1 and max(counts.values()) == 1 and told.window is None:
+        advice = "--still puts them together if the target stays, --window '0.1 s' those of 0.1 s"
+        return [f"each of the {len(counts)} instants has one reading: {advice}"]
+    return []
+
+
+def _about(
+    roles: Roles, told: Told, place: Places, found: Sequence[Readings], epochs: Mapping[str, Array]
+) -> list[tuple[str, str]]:
+    """Return what was understood, for a reader to check."""
+    out: list[tuple[str, str]] = []
+    used = {cell for one in found for cell in one.cells}
+    for one in found:
+        cells = list(dict.fromkeys(one.cells))
+        shown = ", ".join(cells[:_NAMED]) + (f" and {len(cells) - _NAMED} more columns" if len(cells) > _NAMED else "")
+        unit = f" in {one.unit}" if one.unit != "1" else ""
+        text = {COMPASS: "bearings of a compass", CARTESIAN: "angles from the x axis"}.get(
+            str(one.azimuth), one.form.text
+        )
+        out.append((one.form.kind, f"{len(one.values)} readings{unit} from {shown}: {text}"))
+        if one.b is not None and one.form.kind != "range_sum":
+            out.append(
+                ("sign", f"positive where the {'first' if one.positive == 'a-farther' else 'second'} is farther")
+            )
+    wanted: tuple[str, ...] = ("station", "reference", "message", "time", "target", "sigma", "phase", "p", "s", "sp")
+    wanted += PLACE if told.stations is None else ()
+    wanted = tuple(role for role in wanted if role != "sigma" or any(one.sigma is not None for one in found))
+    named = {role: column for role in wanted if (column := roles.find(role))}
+    if "epoch" in epochs:
+        roles_ = ("message", "time") if told.window is None else ("time",)
+        by = next((f"column {named[role]}" for role in roles_ if role in named), "row")
+        out.append(("epochs", f"{len(set(epochs['epoch'].tolist()) - {''})} by {by}"))
+    elif "time" in epochs:
+        each = f"{told.window} each" if told.window else f"{len(np.unique(epochs['time']))}"
+        out.append(("epochs", f"{each} by column {named['time']}"))
+    if "target" in epochs:
+        out.append(("targets", f"{len(set(epochs['target'].tolist()))} by column {named['target']}"))
+    where = told.stations.name if told.stations is not None else "the table itself"
+    by = "latitude and longitude" if place.frame == "geodetic" else f"x and y, {place.frame}, in {place.unit}"
+    out.append(("stations", f"{len(set(place.names))} of {where}, by {by}"))
+    used |= {part for column in named.values() for part in column.split("+")}
+    rest = [name for name in roles.table.columns if name not in used]
+    return [*out, ("not used", ", ".join(rest))] if rest else out
+
+
+# A table of pseudoranges: which satellite was received when, from where, and how far it seemed.
+
+
+def _pseudoranges(source: Path, roles: Roles, told: Told) -> Plan:
+    """Return pseudoranges as arrivals with a clock of each epoch, and the satellites as stations that move, in ECEF."""
+    if told.sigma is None:
+        raise _no_sigma("2 m")
+    epoch, satellite, z = roles.labels("epoch"), roles.labels("satellite"), roles.numbers("pseudorange")
+    unit = told.unit or unit_of(roles.column("pseudorange"), UNITS["length"]) or "m"
+    Units("length").conversion(unit, "--unit")
+    length = unit_of(roles.column("x"), UNITS["length"]) or "m"
+    place = np.stack([scaled(roles, axis, "length", length) for axis in "xyz"], axis=-1)
+    _check_far(roles, place * UNITS["length"][length])
+    _check_once(roles, epoch, satellite)
+    columns = {"epoch": epoch, "a": satellite, "z": z}
+    named = roles.column("epoch")
+    if stem(named) != "epoch" and "+" not in named:
+        columns["time"] = roles.numbers("epoch")
+    satellites = {"name": satellite, "epoch": epoch} | dict(zip("xyz", place.T, strict=True))
+    section = Section("toa", columns, unit, told.sigma, "the range and the receiver's clock")
+    about = (
+        ("pseudoranges", f"{len(z)} readings in {unit} from {roles.column('pseudorange')}, with a clock of each epoch"),
+        ("epochs", f"{len(set(epoch.tolist()))} by column {named}"),
+        ("satellites", f"{len(set(satellite.tolist()))} at x, y, z in {length}, along ECEF"),
+    )
+    return Plan(source, (section,), Places(satellites, "ecef", length), about)
+
+
+def _check_once(roles: Roles, epoch: Array, satellite: Array) -> None:
+    """Refuse a satellite that an epoch has twice."""
+    seen: dict[tuple[str, str], int] = {}
+    for row, key in enumerate(zip(epoch.tolist(), satellite.tolist(), strict=True)):
+        if key in seen:
+            what = f"satellite {key[1]!r} occurs again at epoch {key[0]!r}, first in row {seen[key] + 1}"
+            raise InvalidProblem(what, roles.table.at(row), "leave one of them out")
+        seen[key] = row
+
+
+# Stations alone, and satellites.
 
 
 def _write_stations(source: Path, out: Path, told: Mapping[str, str], frame: str | None) -> Converted:
@@ -202,126 +536,6 @@ def _resting(path: Path | None, told: Mapping[str, str]) -> dict[str, np.ndarray
     else:
         raise InvalidProblem("stations beside satellites have x, y and z", path.name, "or latitude and longitude")
     return dict(zip(place.names, found, strict=True))
-
-
-def _tables(out: Path) -> tuple[Path, ...]:
-    """Return the names of the tables beside a problem file; stations alone have none."""
-    names = ("stations", "rows") if out.suffix.lower() == ".toml" else ()
-    return tuple(out.with_name(f"{out.stem}-{name}.csv") for name in names)
-
-
-def _write(source: Path, out: Path, found: Measured, place: Places, sigma: str) -> Converted:
-    tables = dict(zip(_tables(out), (place.columns, found.columns), strict=True))
-    # JSON spells strings as TOML does, but for signs beyond 16 bits, which stay as they are.
-    quoted = partial(json.dumps, ensure_ascii=False)
-    one, two = (quoted(path.name) for path in tables)
-    text = f"""# Made from {quoted(source.name)} by optloc convert.
-format = 1
-title = {quoted(source.stem)}
-
-[frame]
-kind = "{place.frame}"
-
-[stations]
-file = {one}
-unit = "{place.unit}"
-
-[[measurements]]
-kind = "toa"                         # {found.comment}
-file = {two}
-unit = "{found.unit}"
-sigma = {quoted(sigma)}
-"""
-    # Read before it is there: what cannot be read is not written.
-    with TemporaryDirectory() as folder:
-        _lay(text, tables, Path(folder) / out.name)
-        loaded = read(Path(folder) / out.name)
-    _lay(text, tables, out)
-    notes = (*found.notes, *((place.note,) if place.note else ()))
-    return Converted((out, *tables), loaded, notes)
-
-
-def _lay(text: str, tables: Mapping[Path, Mapping[str, Any]], out: Path) -> None:
-    """Write a problem file with its tables beside it."""
-    with together():
-        for path, columns in tables.items():
-            write_csv(out.with_name(path.name), columns)
-        write_text(out, text)
-
-
-# A table of arrival times: which station heard which message when.
-
-
-def arrivals(roles: Roles, stations: Sequence[str], where: str, unit: str | None) -> Measured:
-    """Return arrivals, each counted from the first of its message so that no digit is lost.
-
-    Parameters
-    ----------
-    roles : Roles
-        The table: message, station, time.
-    stations : sequence of str
-        Names of the known stations.
-    where : str
-        Where these are known from.
-    unit : str, optional
-        Of the times; by default what the column's name ends in, else seconds.
-    """
-    message, heard, times = roles.labels("message"), roles.labels("station"), roles.exact("time")
-    named = roles.column("time")
-    stated = unit or unit_of(named, UNITS["time"])
-    unit = stated or "s"
-    factor = Decimal(repr(float(Units("time").conversion(unit, "--unit").factor)))
-    known = set(stations)
-    for row, name in enumerate(heard.tolist()):
-        if name not in known:
-            place = roles.table.where(roles.column("station"), row)
-            raise InvalidProblem(f"there is no station {name!r} in {where}", place, nearest(name, stations))
-    advice = "leave one of them out, or put columns together: --column message=ONE+TWO"
-    _check_once(roles, message, heard, "station {1!r} hears message {0!r} again, first in row {2}", advice)
-    # Seconds of today in nanoseconds have 19 digits, a float 16: differences are taken before anything is rounded.
-    first: dict[str, Decimal] = {}
-    for label, time in zip(message.tolist(), times, strict=True):
-        first[label] = min(time, first.get(label, time))
-    columns = {
-        "epoch": message,
-        "time": [float(first[label] * factor) for label in message.tolist()],
-        "a": heard,
-        "z": [f"{time - first[label]:f}" for label, time in zip(message.tolist(), times, strict=True)],
-    }
-    lone = np.unique(message, return_counts=True)[1]
-    few = int((lone < _FEW).sum())
-    assumed = () if stated else (f"the column {named!r} is taken to be in seconds; --unit says another",)
-    notes = (f"{few} of {len(lone)} messages were heard by fewer than three stations",) if few else ()
-    return Measured(columns, unit, "arrivals, counted from the first of each message", (*assumed, *notes))
-
-
-def _check_once(roles: Roles, group: Array, member: Array, what: str, advice: str) -> None:
-    """Refuse a member that a group has twice; {0}, {1} and {2} of `what` are both names and the first row."""
-    seen: dict[tuple[str, str], int] = {}
-    for row, key in enumerate(zip(group.tolist(), member.tolist(), strict=True)):
-        if key in seen:
-            raise InvalidProblem(what.format(*key, seen[key] + 1), roles.table.at(row), advice)
-        seen[key] = row
-
-
-# A table of pseudoranges: which satellite was received when, from where, and how far it seemed.
-
-
-def pseudoranges(roles: Roles, unit: str | None) -> tuple[Measured, Places]:
-    """Return pseudoranges as arrivals with a clock of each epoch, and the satellites as stations that move, in ECEF."""
-    epoch, satellite, z = roles.labels("epoch"), roles.labels("satellite"), roles.numbers("pseudorange")
-    unit = unit or unit_of(roles.column("pseudorange"), UNITS["length"]) or "m"
-    Units("length").conversion(unit, "--unit")
-    length = unit_of(roles.column("x"), UNITS["length"]) or "m"
-    place = np.stack([roles.numbers(axis) for axis in "xyz"], axis=-1)
-    _check_far(roles, place * UNITS["length"][length])
-    advice = "leave one of them out"
-    _check_once(roles, epoch, satellite, "satellite {1!r} occurs again at epoch {0!r}, first in row {2}", advice)
-    columns = {"epoch": epoch, "a": satellite, "z": z}
-    if stem(roles.column("epoch")) != "epoch" and "+" not in roles.column("epoch"):
-        columns["time"] = roles.numbers("epoch")
-    satellites = {"name": satellite, "epoch": epoch} | dict(zip("xyz", place.T, strict=True))
-    return Measured(columns, unit, "the range and the receiver's clock"), Places(satellites, "ecef", length)
 
 
 def _check_far(roles: Roles, place: np.ndarray) -> None:

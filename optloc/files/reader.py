@@ -14,9 +14,9 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
 from optloc.base.inputs import Budget, access, at_most
 from optloc.base.types import Array, Bias, Rows, Stations
-from optloc.base.units import SPEED_OF_LIGHT
 from optloc.files.measurements import ESTIMATE, Chunk, check_repeats, chunks_of, square, with_baseline
-from optloc.files.schema import ConstraintTable, ProblemFile, Units, join, name_of, read_document, validate
+from optloc.files.roles import ASSUMED, azimuths_of, in_our_words
+from optloc.files.schema import ConstraintTable, ProblemFile, Units, join, name_of, read_document, speed_of, validate
 from optloc.files.stations import over_epochs, survey
 from optloc.files.table import Epochs, Keys, Table, epochs_of, need_clock, of_frame, table_of
 from optloc.files.unknowns import (
@@ -63,6 +63,8 @@ class Loaded:
         What the data say of the noise, where it is left to them.
     bias_units : mapping of str to (str, float)
         Unit of the file that people read each bias in, and its SI size with sign; those read in SI are left out.
+    azimuths : str
+        From where azimuths are counted, and how the file would say otherwise; empty where there are none.
     """
 
     problem: Problem
@@ -74,6 +76,7 @@ class Loaded:
     own_epochs: bool = False
     levels: NoiseLevels | None = None
     bias_units: Mapping[str, tuple[str, float]] = field(default_factory=dict)
+    azimuths: str = ""
 
     def bias_unit(self, name: str, unit: str) -> tuple[str, float]:
         """Return the unit that people read an unknown in and its SI size: the file's, or what its slot says."""
@@ -114,7 +117,7 @@ def load(path: str | Path, *, outside: bool | None = None, budget: Budget | None
     Parameters
     ----------
     path : str or Path
-        A TOML file with ``format = 1``.
+        A TOML file with ``format = 1`` or 2.
     outside : bool, optional
         Whether it may name files that are not beneath its own folder; it may not by default.
     budget : Budget, optional
@@ -135,7 +138,7 @@ def read(path: str | Path, *, values: bool = True, more: Mapping[str, Constraint
     Parameters
     ----------
     path : str or Path
-        A TOML file with ``format = 1``.
+        A TOML file with ``format = 1`` or 2.
     values : bool
         Whether measured values are needed; False for simulations and bounds.
     more : mapping of str to ConstraintTable, optional
@@ -192,7 +195,12 @@ def assemble(
     more : mapping of str to ConstraintTable, optional
         As `read`.
     """
-    speed = file.propagation_speed or SPEED_OF_LIGHT
+    stated = file
+    file, station_table, tables = in_our_words(file, station_table, tables, source)
+    azimuths = azimuths_of(stated, file)
+    if ASSUMED in azimuths:
+        LOG.warning("%s: azimuths are counted by %s", source, azimuths)
+    speed = speed_of(file, source)
     found, frame = survey(file.stations, station_table, file.frame, source)
     chunks = []
     for i, (section, table) in enumerate(zip(file.measurements, tables, strict=True)):
@@ -219,7 +227,8 @@ def assemble(
     # Noise that is left to the data needs fixes, so the whole problem: it comes last.
     problem, levels = with_noise(file, problem, source)
     title = file.title or source
-    loaded = Loaded(problem, source, title, epochs.labels, epochs.times, epochs.targets, epochs.own, levels, units)
+    named = (epochs.labels, epochs.times, epochs.targets, epochs.own)
+    loaded = Loaded(problem, source, title, *named, levels, units, azimuths)
     return Draft(loaded, file, tuple(tables), tuple(chunks), tuple(numbers), found.moving or _follows(problem))
 
 
@@ -235,7 +244,7 @@ def _problem(
     known: Mapping[str | None, Table],
     more: Mapping[str, ConstraintTable],
 ) -> Problem:
-    speed = file.propagation_speed or SPEED_OF_LIGHT
+    speed = speed_of(file, source)
     motions = motions_of(file, epochs, known_of(file, known, epochs, frame, stations.dimension), source)
     # Times matter to what moves or drifts; other files may leave them out, or date epochs alike.
     why = needs_clock(motions, file.biases)

@@ -1,14 +1,13 @@
-"""Which column of a foreign table plays which role: as it is told, or as its name suggests."""
+"""Which column of a table plays which role: as it is told, or as its name suggests; and other words for our own."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from math import isfinite, nan
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -16,34 +15,80 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.inputs import json_of, read_text
 from optloc.base.types import Array
 from optloc.base.units import LARGEST, UNITS
-from optloc.files.table import Table, csv, parquet
+from optloc.files.foreign import read_table, records
+from optloc.files.schema import MeasurementsTable, ProblemFile, join
+from optloc.files.table import Table
+from optloc.models import BEARING, MODELS, kind_named
 
-# Role: names that suggest it, the likeliest first; without case, unit and what is no letter.
+WORDS = {
+    "name": "name station receiver rx sensor anchor beacon id site callsign node stationid receiverid sensorid",
+    "lat_deg": "lat latitude",
+    "lon_deg": "lon long lng longitude",
+    "height": "height h alt altitude elevation ellipsoidalheight",
+    "a": "a station receiver rx sensor anchor node site stationa receivera station1 receiver1 rx1",
+    "b": "b reference ref stationb receiverb station2 receiver2 rx2",
+    "z": "z value measured measurement",
+}
+"""Other words for the columns of problem files that nothing works without, the likeliest first; without case, unit and
+what is no letter. What is measured may be called by its kind as well (`optloc.models.Model.aliases`).
+Columns that may be left out have their names alone: what a table has besides must not change what it says."""
+
+_A, _B = (
+    " ".join(f"{word}{end}" for word in ("anchor", "sensor", "node", "rx", "site") for end in ends)
+    for ends in ("a1", "b2")
+)
+# Role: names that suggest it, the likeliest first; spelled like `WORDS`. A kind is a role, too, with its aliases.
 GUESSES = {
-    "message": "message msg messageid msgid pulse frame epoch event burst id",
-    "station": "station receiver rx sensor anchor node site stationid receiverid sensorid",
-    "time": "toa arrival timeofarrival arrivaltime rxtime time timestamp t",
+    "message": "message msg messageid msgid pulse frame epoch event eventid burst shot seq id",
+    "station": f"station receiver rx sensor anchor node site stationid receiverid sensorid beacon {WORDS['a']} {_A}",
+    "reference": f"{WORDS['b']} refstation {_B}",
+    "time": "toa arrival timeofarrival arrivaltime rxtime time timestamp utc datetime date t",
     "epoch": "epoch time tgps gpstime tow t timestamp",
+    "target": "target tag mobile transmitter emitter icao hex mac device track",
+    "sigma": "sigma std stddev stdev sd uncertainty",
+    "phase": "phase phasehint phasetype",
+    "p": "p tp ptime ppick parrival",
+    "s": "s ts stime spick sarrival",
+    "sp": "sp sminusp spdifference stmp tstp",
     "satellite": "satellite sat prn sv svid satid",
     "pseudorange": "pseudorange pr prange rho c1c prm",
-    "name": "name station receiver sensor anchor beacon id site callsign",
+    "name": f"{WORDS['name']} user",
     "x": "x satx xecef ecefx xsat",
     "y": "y saty yecef ecefy ysat",
     "z": "z satz zecef ecefz zsat",
-    "lat": "lat latitude",
-    "lon": "lon long lng longitude",
-    "height": "height h alt altitude elevation ellipsoidalheight",
+    "lat": WORDS["lat_deg"],
+    "lon": WORDS["lon_deg"],
+    "height": f"{WORDS['height']} elev",
+    "depth": "depth",
 }
+# Short words for what a table measures, which would be too many ways to spell the kinds of a problem file.
+_SHORT = {
+    "range": "ranges dist r d",
+    "tdoa": "tdoas timedifference rdiff",
+    "azimuth": "az bearings brg lob lineofbearing",
+    "elevation": "el elev",
+}
+PLACE = ("name", "x", "y", "z", "lat", "lon", "height", "depth")
+"""Roles of columns that say where stations are."""
 GEOJSON = (".geojson", ".json")
-# Decimals of an instant: no clock tells more than 20, and a float written in full has some fifty.
-_DIGITS = 60
 # Properties of a GeoJSON point that may be its name or its height, the likeliest first.
 _NAMES = ("name", "station", "title", "callsign", "id", "receiver", "sensor")
 _HEIGHTS = ("height", "height_m", "altitude", "alt", "elevation", "ele", "h_m", "h")
 _FLAT = "no heights are given: all stations are taken to be at height 0"
+# Units as people spell them in headers.
+_SPELLED = {
+    **dict.fromkeys(("meter", "meters", "metre", "metres"), "m"),
+    **dict.fromkeys(("feet", "foot"), "ft"),
+    **dict.fromkeys(("sec", "secs", "second", "seconds"), "s"),
+    **dict.fromkeys(("msec", "millis", "milliseconds"), "ms"),
+    **dict.fromkeys(("µs", "μs", "usec", "micros", "microseconds"), "us"),
+    **dict.fromkeys(("nsec", "nanos", "nanoseconds"), "ns"),
+    **dict.fromkeys(("°", "degree", "degrees"), "deg"),
+    **dict.fromkeys(("radian", "radians"), "rad"),
+}
 # Longest first: of toa_ns the unit is ns, not s.
-_UNITS = sorted({*UNITS["length"], *UNITS["angle"]}, key=len, reverse=True)
-_SUFFIX = re.compile(rf"[_ \[(]+({'|'.join(_UNITS)})[\])]?$", re.IGNORECASE)
+_UNITS = sorted({*UNITS["length"], *UNITS["angle"], *UNITS["speed"], "dB", *_SPELLED}, key=len, reverse=True)
+_SUFFIX = re.compile(rf"\s*[_ \[(/]\s*({'|'.join(map(re.escape, _UNITS))})[\])]?$", re.IGNORECASE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +117,7 @@ class Roles:
             return self.told[role]
         # Reversed, so that of two columns with one stem the first one counts.
         stems = {stem(name): name for name in reversed(columns)}
-        return next((stems[guess] for guess in GUESSES[role].split() if guess in stems), None)
+        return next((stems[guess] for guess in guesses(role) if guess in stems), None)
 
     def column(self, role: str) -> str:
         """Return the column of a role; raise InvalidProblem where there is none."""
@@ -86,54 +131,188 @@ class Roles:
     def labels(self, role: str) -> Array:
         """Return text (m,), that of several columns with "-" between it."""
         parts = [self.table.labels(part) for part in self.column(role).split("+")]
+        if len(parts) == 1:
+            return parts[0]
         return np.array(["-".join(row) for row in zip(*parts, strict=True)], dtype=object)
 
     def numbers(self, role: str) -> Array:
         """Return finite numbers (m,)."""
         return self.table.numbers(self.column(role))
 
-    def exact(self, role: str) -> list[Decimal]:
-        """Return numbers with all their digits: an instant of today in seconds has more than a float keeps."""
-        name = self.column(role)
-        column = self.table.raw(name)
-        if column.dtype.kind == "M":
-            return [Decimal(int(cell)).scaleb(-9) for cell in column.astype("datetime64[ns]").astype(np.int64)]
-        out = []
-        for row, cell in enumerate(column.tolist()):
-            try:
-                number = Decimal(str(cell).strip()) if cell is not None else Decimal("nan")
-            except InvalidOperation:
-                number = Decimal("nan")
-            # Written out, 1e-999999999 has a billion digits.
-            if not (number.is_finite() and abs(number) <= LARGEST and -int(number.as_tuple().exponent) <= _DIGITS):
-                what = "the cell is empty" if cell in (None, "") else f"{str(cell)[:80]!r} is not a finite number"
-                raise InvalidProblem(what, self.table.where(name, row), "give a number, or leave the row out")
-            out.append(number)
-        return out
 
-
-def read_table(path: Path) -> Table:
-    """Return a CSV or Parquet table; what separates the fields of a CSV file is seen from its header."""
-    if path.suffix.lower() in (".parquet", ".pq"):
-        return parquet(path, {})
-    if path.suffix.lower() not in (".csv", ".tsv", ".txt") and path.is_file():
-        known = "use .csv, .tsv, .txt or .parquet, and .geojson for stations"
-        raise InvalidProblem(f"files of type {path.suffix or path.name!r} are unknown", str(path), known)
-    found = csv(path, None, {})
-    if not found.count:
-        raise InvalidProblem("the table has no rows", found.source, "give at least one")
-    return found
+def guesses(role: str) -> list[str]:
+    """Return the names that suggest a role: of a kind that and its other words."""
+    if role in GUESSES:
+        return GUESSES[role].split()
+    words = (role, *MODELS[role].aliases) if role in MODELS else (role,)
+    return [*map(stem, words), *_SHORT.get(role, "").split()]
 
 
 def stem(column: str) -> str:
     """Return a column's name without case, unit and signs: "TOA_ns" is "toa"."""
-    return re.sub(r"[^a-z0-9]", "", _SUFFIX.sub("", column.strip()).lower())
+    return re.sub(r"[^a-z0-9]", "", bare(column).lower())
 
 
 def unit_of(column: str, known: Iterable[str]) -> str | None:
     """Return the unit that a column's name ends in, None where it is none of those known."""
     found = _SUFFIX.search(column.strip())
-    return None if found is None else {unit.lower(): unit for unit in known}.get(found.group(1).lower())
+    if found is None:
+        return None
+    spelled = found.group(1).lower()
+    return {unit.lower(): unit for unit in known}.get(_SPELLED.get(spelled, spelled).lower())
+
+
+def bare(column: str) -> str:
+    """Return a column's name without its unit."""
+    return _SUFFIX.sub("", column.strip())
+
+
+# Other words for kinds and columns of problem files, and what is left to the format.
+
+
+def in_our_words(
+    file: ProblemFile, stations: Table, tables: Sequence[Table], source: str
+) -> tuple[ProblemFile, Table, list[Table]]:
+    """Return a problem file and its tables with kinds and columns by our names, and with nothing left to the format.
+
+    Parameters
+    ----------
+    file : ProblemFile
+        Settings.
+    stations : Table
+        Rows of the stations.
+    tables : sequence of Table
+        Rows of each ``[[measurements]]``.
+    source : str
+        Name to call the settings.
+    """
+    stations = worded(stations, file.stations.unit)
+    frame = file.frame
+    if "kind" not in frame.model_fields_set and (stations.has("lat_deg") or stations.has("lon_deg")):
+        frame = frame.model_copy(update={"kind": "enu" if frame.origin or frame.dimension == 2 else "geodetic"})
+    compass = file.format > 1 and frame.kind != "cartesian"
+    places = [join(source, f"[[measurements]] {i + 1}") for i in range(len(tables))]
+    read = [
+        _rows_in_our_words(section, table, place, compass)
+        for section, table, place in zip(file.measurements, tables, places, strict=True)
+    ]
+    biases = [
+        b.model_copy(update={"kind": kind_named(b.kind, f"bias {b.name!r}")}) if b.kind else b for b in file.biases
+    ]
+    file = file.model_copy(update={"frame": frame, "measurements": [one for one, _ in read], "biases": biases})
+    return file, stations, [table for _, table in read]
+
+
+def worded(table: Table, unit: str) -> Table:
+    """Return a table of stations with its columns by our names; heights become those of the table's unit."""
+    found = {key: name for key in ("name", "lat_deg", "lon_deg", "height") if (name := _column(table, WORDS[key]))}
+    found = {key: name for key, name in found.items() if not table.has(key) and key not in table.names}
+    # Latitudes in radians are none that could be read: the column stays unknown.
+    named = {key: name for key, name in found.items() if not key.endswith("_deg") or _said(name) in (None, "deg")}
+    columns, own = dict(table.columns), unit_of(named.get("height", ""), UNITS["length"])
+    if own is not None and own != unit and unit in UNITS["length"]:
+        columns["height"] = table.numbers(named.pop("height")) * (UNITS["length"][own] / UNITS["length"][unit])
+    return replace(table, columns=columns, names={**table.names, **named})
+
+
+def _rows_in_our_words(
+    section: MeasurementsTable, table: Table, where: str, compass: bool
+) -> tuple[MeasurementsTable, Table]:
+    """Return measurements by our names, with the convention of azimuths; `compass` is that of the format."""
+    words = [section.kind] if section.kind else sorted(set(table.labels("kind"))) if table.has("kind") else []
+    places = {word: _place_of(word, section, table, where) for word in words}
+    kinds = {word: kind_named(word, places[word]) for word in words}
+    bearing = {word for word, kind in kinds.items() if kind == "azimuth" and word.strip().lower() == BEARING}
+    changes: dict[str, Any] = {}
+    if section.azimuth is None and "azimuth" in kinds.values():
+        if 0 < len(bearing) < list(kinds.values()).count("azimuth"):
+            what = "some azimuths are called bearings, and others are not"
+            raise InvalidProblem(
+                what, where, 'say what all are: azimuth = "north-clockwise", or "east-counterclockwise"'
+            )
+        changes["azimuth"] = "north-clockwise" if bearing or compass else "east-counterclockwise"
+    if section.kind is None:
+        # A column without other words stays as it is: millions of rows are not spelled again.
+        if any(word != kind for word, kind in kinds.items()):
+            spelled = np.array([kinds[word] for word in table.labels("kind").tolist()], dtype=object)
+            table = replace(table, columns={**table.columns, table.name("kind"): spelled})
+        return _units_by_kind(section.model_copy(update=changes)), _ends(section, table)
+    changes["kind"] = kinds[section.kind]
+    table, unit = _value(_ends(section, table), kinds[section.kind], where)
+    if unit is not None and isinstance(section.unit, str) and section.unit != unit:
+        what = f"the column {table.name('z')!r} is called after another unit than {section.unit!r}"
+        raise InvalidProblem(what, join(where, "key 'unit'"), "leave the key out, or rename the column")
+    if section.unit is None and (unit or bearing):
+        changes["unit"] = unit or "deg"
+    return _units_by_kind(section.model_copy(update=changes)), table
+
+
+def _units_by_kind(section: MeasurementsTable) -> MeasurementsTable:
+    if not isinstance(section.unit, dict):
+        return section
+    return section.model_copy(update={"unit": {kind_named(kind): unit for kind, unit in section.unit.items()}})
+
+
+def _place_of(word: str, section: MeasurementsTable, table: Table, where: str) -> str:
+    """Return the place of the word for a kind: the key, or the first row."""
+    if section.kind is not None:
+        return join(where, "key 'kind'")
+    return table.where("kind", table.labels("kind").tolist().index(word))
+
+
+def _ends(section: MeasurementsTable, table: Table) -> Table:
+    """Return a table whose columns of stations have our names, where the section does not name the station."""
+    found = {key: _column(table, WORDS[key]) for key in "ab" if getattr(section, key) is None and not table.has(key)}
+    return replace(table, names={**{key: name for key, name in found.items() if name}, **table.names})
+
+
+def _value(table: Table, kind: str, where: str) -> tuple[Table, str | None]:
+    """Return a table whose measured values are called z, and the unit that its name ends in, if it was another name."""
+    if table.has("z") or "z" in table.names:
+        return table, None
+    model = MODELS[kind]
+    name = _column(table, " ".join([WORDS["z"], *(stem(word) for word in (kind, *model.aliases))]))
+    if name is None or (_said(name) is not None and unit_of(name, UNITS[model.quantity]) is None):  # type: ignore[index]
+        return table, None
+    return replace(table, names={**table.names, "z": name}), unit_of(name, UNITS[model.quantity])  # type: ignore[index]
+
+
+def _column(table: Table, words: str) -> str | None:
+    """Return the column that is called by one of some words and has no role yet, None where there is none."""
+    taken = set(table.names.values())
+    stems = {stem(name): name for name in reversed([*table.columns]) if name not in taken}
+    return next((stems[word] for word in words.split() if word in stems), None)
+
+
+def _said(name: str) -> str | None:
+    """Return the unit of any quantity that a column's name ends in."""
+    return unit_of(name, _UNITS)
+
+
+ASSUMED = " (no convention is named)"
+"""What is said beside azimuths of format 1 that might be meant otherwise."""
+_OTHER = {"north-clockwise": "east-counterclockwise", "east-counterclockwise": "north-clockwise"}
+_COUNTED = {
+    "north-clockwise": "the compass, clockwise from north (+y)",
+    "east-counterclockwise": "the axes, anticlockwise from east (+x)",
+}
+
+
+def azimuths_of(written: ProblemFile, read: ProblemFile) -> str:
+    """Return from where azimuths are counted and how a file says otherwise; empty where it has no azimuths.
+
+    Parameters
+    ----------
+    written, read : ProblemFile
+        The settings as they are written, and as `in_our_words` returns them.
+    """
+    said: dict[str, None] = {}
+    for before, after in zip(written.measurements, read.measurements, strict=True):
+        if after.azimuth is not None:
+            assumed = before.azimuth is None and str(before.kind).lower() != BEARING
+            why = ASSUMED if assumed and written.format == 1 else ""
+            said[f'{_COUNTED[after.azimuth]}{why}; else write azimuth = "{_OTHER[after.azimuth]}"'] = None
+    return "; ".join(said)
 
 
 # Stations from a table or from GeoJSON points.
@@ -156,42 +335,68 @@ class Places:
 
 def places_of(path: Path, told: Mapping[str, str], frame: str | None) -> Places:
     """Return the stations of a file; `frame` is that of x, y, z."""
-    return _of_geojson(path) if path.suffix.lower() in GEOJSON else _of_table(path, told, frame or "cartesian")
+    if path.suffix.lower() == ".geojson":
+        return _of_geojson(json_of(read_text(path), path.name), path.name)
+    if path.suffix.lower() == ".json":
+        data = json_of(read_text(path), path.name)
+        if isinstance(data, list) or (isinstance(data, dict) and "features" in data):
+            return _of_geojson(data, path.name)
+        return placed(Roles(records(data, path.name), told), frame)
+    return placed(Roles(read_table(path), told), frame)
 
 
-def _of_table(path: Path, told: Mapping[str, str], frame: str) -> Places:
-    roles = Roles(read_table(path), told)
-    names = roles.labels("name")
+def placed(roles: Roles, frame: str | None, names: Array | None = None) -> Places:
+    """Return the stations of a table; `names` (s,) are theirs where no column has them, `frame` is that of x, y, z."""
+    names = roles.labels("name") if names is None else names
     lat, x = roles.find("lat"), roles.find("x")
     if lat is None and x is None:
         columns = ", ".join(roles.table.columns)
         advice = f"name them with --column lat=NAME or --column x=NAME; the columns are {columns}"
         raise InvalidProblem("no columns look like latitude and longitude, or x and y", roles.table.source, advice)
     if lat is not None:
-        height = roles.find("height")
-        unit = "m" if height is None else unit_of(height, UNITS["length"]) or "m"
-        degrees = {"lat_deg": roles.numbers("lat"), "lon_deg": roles.numbers("lon")}
-        degrees["height"] = np.zeros(len(names)) if height is None else roles.numbers("height")
-        return Places({"name": names} | degrees, "geodetic", unit, "" if height else _FLAT)
-    axes = [axis for axis in "xyz" if roles.find(axis) is not None]
+        degrees = {f"{axis}_deg": scaled(roles, axis, "angle", "deg") for axis in ("lat", "lon")}
+        height, unit = _upwards(roles, "height")
+        degrees["height"] = np.zeros(len(names)) if height is None else height
+        return Places({"name": names} | degrees, "geodetic", unit, _FLAT if height is None else "")
+    up, unit = _upwards(roles, "z")
     assert x is not None
     unit = unit_of(x, UNITS["length"]) or "m"
-    return Places({"name": names} | {axis: roles.numbers(axis) for axis in axes}, frame, unit)
+    axes = {axis: scaled(roles, axis, "length", unit) for axis in "xy"}
+    if up is not None:
+        axes["z"] = _upwards(roles, "z", unit)[0]
+    # What calls itself so is along the axes of the Earth, and its fixes have latitudes.
+    return Places({"name": names} | axes, frame or ("ecef" if "ecef" in stem(x) else "cartesian"), unit)
 
 
-def _of_geojson(path: Path) -> Places:
+def scaled(roles: Roles, role: str, quantity: Literal["length", "angle"], unit: str) -> Array:
+    """Return the numbers of a role in a unit; a column whose name has none is in it."""
+    own = unit_of(roles.column(role), UNITS[quantity]) or unit
+    values = roles.numbers(role)
+    return values if own == unit else values * UNITS[quantity][own] / UNITS[quantity][unit]
+
+
+def _upwards(roles: Roles, role: Literal["height", "z"], unit: str | None = None) -> tuple[Any, str]:
+    """Return heights, None where there are none, and their unit; depths are heights that grow downwards."""
+    found = next((one for one in (role, "depth") if roles.find(one) is not None), None)
+    if found is None:
+        return None, unit or "m"
+    unit = unit or unit_of(roles.column(found), UNITS["length"]) or "m"
+    values = scaled(roles, found, "length", unit)
+    return (-values if found == "depth" else values), unit
+
+
+def _of_geojson(data: Any, source: str) -> Places:
     """Return the points of a GeoJSON feature collection (RFC 7946: longitude, latitude, height above WGS 84)."""
-    data = json_of(read_text(path), path.name)
     features = data.get("features") if isinstance(data, dict) else None
     if not isinstance(features, list):
-        raise InvalidProblem("there is no list of features", path.name, "give a GeoJSON FeatureCollection of points")
+        raise InvalidProblem("there is no list of features", source, "give a GeoJSON FeatureCollection of points")
     points = [
-        _point(feature, f"{path.name}, feature {i + 1}")
+        _point(feature, f"{source}, feature {i + 1}")
         for i, feature in enumerate(features)
         if isinstance(feature, dict) and _kind(feature) == "Point"
     ]
     if not points:
-        raise InvalidProblem("there is no point among the features", path.name, "give each station as a Point")
+        raise InvalidProblem("there is no point among the features", source, "give each station as a Point")
     names, lon, lat, height = (list(column) for column in zip(*points, strict=True))
     columns = {"name": np.array(names, dtype=object), "lat_deg": np.array(lat), "lon_deg": np.array(lon)}
     known = [h is not None for h in height]

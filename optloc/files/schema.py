@@ -11,8 +11,18 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.inputs import STANDARD_INPUT, read_text, toml_of
-from optloc.base.units import LARGEST, SI_UNIT, SPEED_OF_LIGHT, AzimuthConvention, Conversion, Quantity, conversion
-from optloc.models import MODELS, Model
+from optloc.base.units import (
+    LARGEST,
+    SI_UNIT,
+    SPEED_OF_LIGHT,
+    AzimuthConvention,
+    Conversion,
+    Quantity,
+    conversion,
+    sound_in_air,
+    sound_in_water,
+)
+from optloc.models import MODELS, Model, kind_named
 
 # Words that a file may get wrong, and amounts such as "30 ns".
 
@@ -23,10 +33,8 @@ def join(*places: str | None) -> str:
 
 
 def kind_model(kind: str, where: str) -> Model:
-    """Return the model of a kind; raise InvalidProblem for an unknown one, naming the nearest."""
-    if kind not in MODELS:
-        raise InvalidProblem(f"unknown kind {kind!r}", where, nearest(kind, sorted(MODELS)))
-    return MODELS[kind]
+    """Return the model of a kind, by its name or an alias; raise InvalidProblem for an unknown one."""
+    return MODELS[kind_named(kind, where)]
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,10 +186,14 @@ class StationsTable(DataTable):
     """Whether a position error is an unknown of each epoch, one of the whole run, or noise drawn anew at each epoch."""
 
 
+def _kind_words() -> list[str]:
+    return [*sorted(MODELS), *sorted(alias for model in MODELS.values() for alias in model.aliases)]
+
+
 class MeasurementsTable(DataTable):
     """Measurements of one kind. Columns: a, b, z; optional ones are listed in the manual."""
 
-    kind: str | None = Field(default=None, json_schema_extra=lambda schema: schema.update(enum=[*sorted(MODELS), None]))
+    kind: str | None = Field(default=None, json_schema_extra=lambda schema: schema.update(enum=[*_kind_words(), None]))
     """Measurement kind; None where the rows have a column `kind`."""
     unit: str | dict[str, str] | None = None
     """Unit of z, or one unit for each kind; SI by default."""
@@ -189,8 +201,9 @@ class MeasurementsTable(DataTable):
     """First station of all rows, where there is no column a."""
     b: str | None = None
     """Second station of all rows, where there is no column b."""
-    azimuth: AzimuthConvention = "east-counterclockwise"
-    """Where azimuth zero is and which way it grows."""
+    azimuth: AzimuthConvention | None = None
+    """Where azimuth zero is and which way it grows. Default: a compass (north-clockwise) for the kind `bearing`, and in
+    format 2 wherever there is an Earth; else east-counterclockwise."""
     positive: Literal["a-farther", "b-farther"] = "a-farther"
     """Sign of differences (and sense of ratios): a against b, or b against a."""
     excess: bool = False
@@ -321,6 +334,19 @@ class PriorTable(_Table):
     """Unit of both; metres, metres per second, metres per second squared by default."""
 
 
+class SoundTable(_Table):
+    """The medium through which sound comes."""
+
+    medium: Literal["air", "fresh water", "sea water"]
+    """What it is."""
+    celsius: float
+    """Its temperature."""
+    salinity: float | None = None
+    """Grams of salt in a kilogram of water; 0 in fresh water and 35 in sea water by default."""
+    depth: float = 0.0
+    """Metres below the surface."""
+
+
 class WindowTable(_Table):
     """How rows are put together to epochs by their times."""
 
@@ -329,14 +355,14 @@ class WindowTable(_Table):
 
 
 class ProblemFile(_Table):
-    """A problem file, format 1."""
+    """A problem file."""
 
-    format: Literal[1]
-    """Version of the format."""
+    format: Literal[1, 2]
+    """Version of the format: in 2, azimuths on Earth are compass bearings where nothing else is said."""
     title: str | None = None
     """What it is."""
-    propagation_speed: float | None = Field(default=None, gt=0.0)
-    """Metres per second; light in vacuum by default."""
+    propagation_speed: Annotated[float, Field(gt=0.0)] | str | SoundTable | None = None
+    """Metres per second, or text with a unit; or of sound: { medium = "air", celsius = 20.0 }. Light by default."""
     frame: FrameTable = FrameTable()
     stations: StationsTable
     measurements: list[MeasurementsTable] = Field(min_length=1)
@@ -351,6 +377,22 @@ class ProblemFile(_Table):
     """Covariance of the rows of one epoch across all kinds, in the order of the file, in their units."""
 
 
+def speed_of(file: ProblemFile, source: str) -> float:
+    """Return the propagation speed of a problem file, metres per second; light where it names none."""
+    given, place = file.propagation_speed, join(source, "key 'propagation_speed'")
+    if isinstance(given, SoundTable):
+        water = given.medium != "air"
+        if not water and (given.salinity is not None or given.depth):
+            raise InvalidProblem("air has no salinity and no depth", place, "leave them out")
+        usual = 35.0 if given.medium == "sea water" else 0.0
+        salinity = usual if given.salinity is None else given.salinity
+        return sound_in_water(given.celsius, salinity, given.depth) if water else sound_in_air(given.celsius)
+    speed = SPEED_OF_LIGHT if given is None else Units("speed").plain(given, "m/s", place)
+    if not speed > 0.0:
+        raise InvalidProblem(f"the speed {given} is not positive", place, 'write it as 340.0 or "340 m/s"')
+    return speed
+
+
 def schema() -> dict[str, Any]:
     """Return the JSON schema (draft 2020-12) of a problem file."""
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **ProblemFile.model_json_schema()}
@@ -362,7 +404,7 @@ def schema() -> dict[str, Any]:
 def read_document(path: Path) -> ProblemFile:
     """Return the contents of a problem file, or of standard input; raise InvalidProblem where it is none."""
     source = name_of(path)
-    return validate(parse_toml(read_text(path), source), source)
+    return validate(parse_toml(read_text(path), source, formats=(1, 2)), source)
 
 
 def name_of(path: Path) -> str:
@@ -370,13 +412,13 @@ def name_of(path: Path) -> str:
     return "standard input" if path == STANDARD_INPUT else path.name
 
 
-def parse_toml(text: str, source: str) -> dict[str, Any]:
-    """Return TOML of format 1 as data; `source` is the place to name."""
+def parse_toml(text: str, source: str, formats: tuple[int, ...] = (1,)) -> dict[str, Any]:
+    """Return TOML of one of some formats as data; `source` is the place to name."""
     if not text.strip():
         raise InvalidProblem("the file is empty", source, "begin it with the line format = 1")
     data = toml_of(text, source)
     # true equals 1 in Python.
-    if data.get("format") != 1 or isinstance(data.get("format"), bool):
+    if data.get("format") not in formats or isinstance(data.get("format"), bool):
         given = f"format {data['format']!r} is unknown" if "format" in data else "the key 'format' is missing"
         raise InvalidProblem(given, source, "begin the file with the line format = 1")
     return data

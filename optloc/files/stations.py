@@ -11,6 +11,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.frames import CARTESIAN, ECEF, Frame, ecef_to_geodetic
 from optloc.base.inputs import at_most
 from optloc.base.types import Array, Stations
+from optloc.files.roles import worded
 from optloc.files.schema import FrameTable, StationsTable, Units, join
 from optloc.files.table import Epochs, Table, distinct
 
@@ -63,6 +64,7 @@ class Survey:
 
 def survey(section: StationsTable, table: Table, frame_table: FrameTable, where: str) -> tuple[Survey, Frame]:
     """Return the stations of a table and the frame of the problem."""
+    table = worded(table, section.unit)
     labels = table.labels("name")
     found, first, index = distinct(labels)
     order = np.argsort(first)

@@ -43,6 +43,8 @@ class Table:
         Row of the source that each row was, where it is a part of a table.
     others : mapping of str to str
         Type of each column that is neither numbers, dates nor text.
+    notes : tuple of str
+        What was done to make a table of the file.
     """
 
     source: str
@@ -51,6 +53,7 @@ class Table:
     names: Mapping[str, str] = field(default_factory=dict)
     first: Array | None = None
     others: Mapping[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     def take(self, pick: Array) -> Table:
         """Return some of the rows."""

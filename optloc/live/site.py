@@ -17,9 +17,9 @@ from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.frames import Frame
 from optloc.base.types import Array
-from optloc.base.units import SPEED_OF_LIGHT, Conversion
+from optloc.base.units import Conversion
 from optloc.files.reader import Draft, assemble
-from optloc.files.schema import ProblemFile, join, name_of, read_document
+from optloc.files.schema import ProblemFile, join, name_of, read_document, speed_of
 from optloc.files.table import Table, table_of
 from optloc.files.unknowns import FREE, places_of
 from optloc.models import MODELS
@@ -354,8 +354,8 @@ def read_site(path: Path, method: str = "auto") -> Site:
     number = {name: i for i, name in enumerate(problem.stations.names)}
     hearing = {number[end] for i in arriving for end in (rows[i].a, rows[i].b) if end}
     site = Site(
-        source, draft.loaded.title, method, file, station_table, tuple(tables), places, rows, problem.stations.names,
-        problem.stations.position[0], problem.frame, file.propagation_speed or SPEED_OF_LIGHT, arriving,
+        source, draft.loaded.title, method, draft.file, station_table, draft.tables, places, rows,
+        problem.stations.names, problem.stations.position[0], problem.frame, speed_of(file, source), arriving,
         tuple(i for i in range(len(rows)) if i not in arriving), tuple(sorted(hearing)),
         {row[2:5]: i for i, row in enumerate(rows)}, number,
     )  # fmt: skip

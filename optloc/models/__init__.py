@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from difflib import get_close_matches
 from math import log, tau
 from typing import Any
 
@@ -27,11 +28,13 @@ from optloc.models.primitives import (
 )
 
 __all__ = [
+    "BEARING",
     "MODELS",
     "LiftedRow",
     "Model",
     "Point",
     "distance",
+    "kind_named",
     "lifted_row",
     "local",
     "namespace",
@@ -98,6 +101,8 @@ class Model:
         What the points must carry beyond their position.
     dimensions : tuple of int
         Dimensions in which the kind makes sense.
+    aliases : tuple of str
+        Other words for the kind, which are read wherever its name is; see `kind_named`.
 
     Raises
     ------
@@ -119,6 +124,7 @@ class Model:
     axes: bool = False
     ecef: bool = False
     dimensions: tuple[int, ...] = (2, 3)
+    aliases: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.quantity not in UNITS:
@@ -174,7 +180,7 @@ def rss_difference(exponent: float = 2.0) -> Model:
         return LiftedRow(None, 1.0, -1.0 * ratio, 0.0, lambda t, a, b: ratio / decibels * distance(t, b))
 
     summary = f"difference of received signal strengths, {10.0 * exponent:g} log10(r_b / r_a)"
-    return Model(h, "level", 2, summary, signs=(1, -1), lifted=lifted)
+    return Model(h, "level", 2, summary, signs=(1, -1), lifted=lifted, aliases=("rssd", "drss"))
 
 
 def _basis(a: Point) -> tuple[Components, ...]:
@@ -206,6 +212,9 @@ def _lifted_elevation(m: Any, a: Point, b: Point) -> LiftedRow:
     )
 
 
+BEARING = "bearing"
+"""The word for an azimuth that is a compass bearing wherever nothing else is said: degrees from north, clockwise."""
+
 # Signs and units are those of files after conversion: metres, radians; a is the first station named.
 _KINDS: dict[str, Model] = {
     "tdoa": Model(
@@ -214,6 +223,7 @@ _KINDS: dict[str, Model] = {
         2,
         "time difference of arrival times c, r_a - r_b",
         ranges=(1, -1),
+        aliases=("time_difference", "range_difference", "rdoa", "dtoa"),
     ),
     "groa": Model(
         lambda t, a, b: distance(t, a) / distance(t, b),
@@ -222,8 +232,17 @@ _KINDS: dict[str, Model] = {
         "gain ratio of arrival, r_a / r_b",
         nodes=((1.0, "ratio"),),
         lifted=lambda m, a, b: LiftedRow(None, 1.0, -1.0 * m, 0.0, lambda t, a, b: -1.0 * distance(t, b)),
+        aliases=("gain_ratio",),
     ),
-    "range": Model(lambda t, a, b: distance(t, a), "length", 1, "range r_a", ranges=(1, 0)),
+    "range": Model(
+        lambda t, a, b: distance(t, a),
+        "length",
+        1,
+        "range r_a",
+        ranges=(1, 0),
+        # no "rtt": a round trip is two ranges
+        aliases=("distance", "twr", "tof", "slant_range", "dme"),
+    ),
     "toa": Model(
         lambda t, a, b: distance(t, a),
         "length",
@@ -231,6 +250,7 @@ _KINDS: dict[str, Model] = {
         "time of arrival times c, r_a plus the epoch's unknown emission time",
         ranges=(1, 0),
         emission=True,
+        aliases=("pseudorange", "arrival", "arrival_time", "time_of_arrival"),
     ),
     "range_sum": Model(
         lambda t, a, b: distance(t, a) + distance(t, b),
@@ -238,6 +258,7 @@ _KINDS: dict[str, Model] = {
         2,
         "bistatic range, r_a + r_b",
         ranges=(1, 1),
+        aliases=("bistatic_range", "tsoa"),
     ),
     "azimuth": Model(
         _azimuth,
@@ -248,6 +269,7 @@ _KINDS: dict[str, Model] = {
         lifted=_lifted_azimuth,
         period=tau,
         axes=True,
+        aliases=("aoa", "doa", BEARING),
     ),
     "elevation": Model(
         _elevation,
@@ -259,6 +281,7 @@ _KINDS: dict[str, Model] = {
         period=tau,
         axes=True,
         dimensions=(3,),
+        aliases=("elevation_angle",),
     ),
     "height": Model(
         _height,
@@ -268,6 +291,7 @@ _KINDS: dict[str, Model] = {
         nodes=((1.0, "height"),),
         ecef=True,
         dimensions=(3,),
+        aliases=("altitude",),
     ),
     "range_rate": Model(
         lambda t, a, b: range_rate(t, a),
@@ -277,6 +301,7 @@ _KINDS: dict[str, Model] = {
         signs=(1, 0),
         nodes=((1.0, "range_rate"),),
         velocity=True,
+        aliases=("doppler", "radial_velocity"),
     ),
     "fdoa": Model(
         lambda t, a, b: range_rate(t, a) - range_rate(t, b),
@@ -286,10 +311,40 @@ _KINDS: dict[str, Model] = {
         signs=(1, -1),
         nodes=((1.0, "range_rate"),),
         velocity=True,
+        aliases=("frequency_difference",),
     ),
     "rss_difference": rss_difference(),
 }
 MODELS: Table[Model] = Table("optloc.models", lambda value: isinstance(value, Model), _KINDS)
+
+
+def kind_named(word: str, where: str | None = "kind") -> str:
+    """Return the kind of measurement that a word stands for: its name, or one of its aliases, in any case.
+
+    Raises
+    ------
+    InvalidProblem
+        For a word that is none, with the kinds whose names or aliases are spelled alike.
+    """
+    if word in MODELS:
+        return word
+    folded = str(word).strip().lower().replace("-", "_").replace(" ", "_")
+    words = {alias: name for name, model in MODELS.items() for alias in (name, *model.aliases)}
+    if folded in words:
+        return words[folded]
+    raise InvalidProblem(f"unknown kind {word!r}", where, _likely_kind(folded, words))
+
+
+# Words of the field for quantities that no kind is: differences of angles and of phases, round trips, received power.
+_FOREIGN = {"adoa", "pdoa", "poa", "rtt", "rss", "rssi", "csi", "snr"}
+
+
+def _likely_kind(word: str, words: dict[str, str]) -> str:
+    # Spelled alike is not meant alike: slips of the pen are guessed, one letter of four and not the first.
+    alike = [known for known in words if known[:1] == word[:1]]
+    close = [] if word in _FOREIGN else get_close_matches(word, alike, n=1, cutoff=0.75)
+    known = f"known are {', '.join(sorted(MODELS))}; 'optloc list kinds' has their other names"
+    return f"did you mean {close[0]!r}? {known}" if close else known
 
 
 def lifted_row(model: Model, m: Any, a: Point, b: Point) -> LiftedRow | None:

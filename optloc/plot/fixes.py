@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from itertools import cycle
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from optloc.base.frames import Frame
 from optloc.base.linalg import error_ellipse
 from optloc.base.types import Array, Rows
+from optloc.linear.evaluate import differentiate
 from optloc.models import MODELS, Point
 from optloc.plot import style
 from optloc.plot.outlines import rings
@@ -22,6 +24,8 @@ from optloc.plot.style import (
     ORANGE,
     PLAN,
     PURPLE,
+    SKY,
+    YELLOW,
     Scene,
     View,
     apart,
@@ -49,6 +53,17 @@ _SEMI_AXES, _SPREAD, _HELD = 1.6, 1.1, 0.1
 # Range rates of a run that have curves, evenly among them; points along a side of the grid on which these are sought;
 # and the side in widths of what is shown, for a panel may be wider or taller than that.
 _CURVES, _GRID, _WIDE = 9, 161, 2.0
+# Rows that have lines of position: more cannot be told apart.
+_LINES = 24
+# What the lines of kinds are called.
+_SHAPES = {
+    "tdoa": "hyperbola of a time difference",
+    "toa": "hyperbola of two arrivals",
+    "range": "circle of a range",
+    "range_sum": "ellipse of a bistatic range",
+    "azimuth": "ray of a bearing",
+    "isodoppler": "equal Doppler through the fix",
+}
 # Metres from the picture's origin at which the Earth's surface stands almost upright in its plan, and steps to it.
 _STEEP, _STEPS = 5.5e6, 12
 
@@ -57,7 +72,8 @@ def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") ->
     """Return a picture of fixes.
 
     A plan of everything and a plan of the surroundings of the fix; in three dimensions a view of the height between
-    them. One scale on both axes of each. Of a single fix from range rates, the plans show isodoppler curves.
+    them. One scale on both axes of each. Of a single fix the plans show on which line each row alone would put the
+    target, at the height of the fix: hyperbolas, circles, rays; of many range rates isodoppler curves.
 
     Parameters
     ----------
@@ -88,8 +104,14 @@ def plot_fixes(problem: Problem, fixes: Fix | Sequence[Fix], title: str = "") ->
     if len(every) == 1 and every[0].code.size == 1 and np.isfinite(scene.fixes).all():
         centres = (np.zeros(2), scene.fixes[0, :2])
         for panel, size, centre in zip((panels[0], panels[-1]), sizes, centres, strict=False):
-            _isodopplers(panel, problem, every[0], centre, size)
+            if _position_lines(panel, problem, every[0], centre, size) and spatial and panel is panels[0]:
+                panel.set_title("plan, lines at the height of the fix")
     finish(figure, title, panels[:1])
+    # The limits of a plan are settled once the figure was laid out.
+    figure.draw_without_rendering()
+    for panel in panels[:: len(panels) - 1] if near else panels[:1]:
+        if panel.axison:
+            style.scale_bar(panel, panel.get_xlabel().rpartition("(")[2].rstrip(")"))
     apart(figure)
     return figure
 
@@ -189,23 +211,97 @@ def _reach(scene: Scene, known: Array, centre: Array) -> float:
     return reach if reach > 0.0 else _HELD * float(np.ptp(scene.stations[:, :2]) or 1.0)
 
 
-# Isodoppler curves: where the target would be by one range rate alone.
+# Lines of position: where the target would be by one row alone.
 
 
-def _isodopplers(panel: Axes, problem: Problem, fix: Fix, centre: Array, size: float) -> None:
-    """Draw the curves of equal range rate through the fix in a plan whose origin is a centre, metres."""
-    from matplotlib.collections import LineCollection
+class PositionLine(NamedTuple):
+    """A line (p, 2) in x and y on which one row of a kind, of stations by name, would put the target."""
 
+    kind: str
+    name: str
+    line: Array
+
+
+def _position_lines(panel: Axes, problem: Problem, fix: Fix, centre: Array, size: float) -> bool:
+    """Draw where each row alone would put the target, in a plan whose origin is a centre; return whether there are."""
     (west, east), (south, north) = panel.get_xlim(), panel.get_ylim()
     middle, half = np.array([west + east, south + north]) / 2.0, _WIDE * max(east - west, north - south) / 2.0
     corners = size * np.stack([middle - half, middle + half]) + centre
     x, y = (np.linspace(low, high, _GRID) for low, high in corners.T)
     places = _at_height(problem, fix, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
-    lines = [(line - centre) / size for _, line in isodopplers(problem, fix, x, y, places)]
-    if lines:
+    found = lines_of_position(problem, fix, x, y, places)
+    draw_lines(panel, found, centre, size)
+    return bool(found)
+
+
+def draw_lines(panel: Axes, found: Sequence[PositionLine], centre: Array, size: float) -> None:
+    """Draw lines of position in a plan whose origin is a centre, metres, and whose unit has a size."""
+    from matplotlib.collections import LineCollection
+
+    for kind, colour in zip(dict.fromkeys(one.kind for one in found), cycle((PURPLE, SKY, GREEN, YELLOW))):
+        lines = [(one.line - centre) / size for one in found if one.kind == kind]
+        label = _SHAPES.get(kind, f"where one {kind} alone would put it")
         # The limits of a plan are those of what is known, not of curves.
-        look: dict[str, Any] = {"colors": PURPLE, "linewidths": 1.0, "zorder": 1}
-        panel.add_collection(LineCollection(lines, label="equal Doppler through the fix", **look), autolim=False)
+        look: dict[str, Any] = {"colors": colour, "linewidths": 1.0, "alpha": 0.8, "zorder": 1}
+        panel.add_collection(LineCollection(lines, label=label, **look), autolim=False)
+
+
+def lines_of_position(problem: Problem, fix: Fix, x: Array, y: Array, places: Array) -> list[PositionLine]:
+    """Return where a target would be by each row alone, other unknowns as the fix has them.
+
+    Hyperbolas of time differences, and of arrivals against the first of them; circles of ranges, rays of bearings. Of
+    many rows only range rates have lines, some of them, through the fix.
+
+    Parameters
+    ----------
+    problem : Problem
+        With one target.
+    fix : Fix
+        Its fix.
+    x, y : array (n,), (m,)
+        Grid of a plan or a map.
+    places : array (m n, d)
+        Its points in the problem's frame, metres; NaN where there is none.
+    """
+    flat, answer = problem.flat(), fix.flat()
+    moving = [motion for motion in flat.motions if motion.known is None]
+    alone = len(moving) == 1 == len(flat.motions) and flat.batch_shape == (1,)
+    if not alone or not np.isfinite(answer.x).all() or not flat.layout.shares("position"):
+        return []
+    if flat.count > _LINES or (moving[0].order > 0 and flat.epochs > 1):
+        return [PositionLine("isodoppler", name, line) for name, line in isodopplers(problem, fix, x, y, places)]
+    slot, _ = flat.layout.find("position")
+    vectors = np.tile(answer.x[0], (len(places), 1))
+    vectors[:, slot.start : slot.start + slot.size] = places[:, : slot.size]
+    with np.errstate(all="ignore"):
+        residual = differentiate(flat, vectors)[0]
+    found: list[PositionLine] = []
+    for rows, start in zip(flat.rows, flat.starts, strict=True):
+        found += _lines_of(flat, rows, residual[:, start : start + rows.count], x, y)
+    return found
+
+
+def _lines_of(problem: Problem, rows: Rows, residual: Array, x: Array, y: Array) -> list[PositionLine]:
+    """Return the lines of rows of one kind, where their residuals (n, m) on a grid are zero."""
+    from contourpy import contour_generator
+
+    model, names, present = MODELS[rows.kind], problem.stations.names, rows.weight.reshape(-1, rows.count)[0] > 0.0
+    found = []
+    for i in np.flatnonzero(present).tolist():
+        values, ends = residual[:, i], [names[k] for k in (rows.a[i], rows.b[i]) if k >= 0]
+        if model.emission:
+            # When the signal was sent nobody measured: what was is how much later another station heard it.
+            same = np.flatnonzero(present & (rows.epoch == rows.epoch[i]))
+            first = same[np.argmin(rows.z.reshape(-1, rows.count)[0, same])]
+            if first == i:
+                continue
+            values, ends = values - residual[:, first], [*ends, names[rows.a[first]]]
+        if model.period is not None:
+            # Behind a station a bearing jumps by a turn: a change of sign there is no line.
+            values = np.where(np.abs(values) < 0.25 * model.period, values, np.nan)
+        made = contour_generator(x, y, np.ma.masked_invalid(values.reshape(len(y), len(x)))).lines(0.0)
+        found += [PositionLine(rows.kind, " – ".join(ends), np.asarray(line)) for line in made]
+    return found
 
 
 def isodopplers(problem: Problem, fix: Fix, x: Array, y: Array, places: Array) -> list[tuple[str, Array]]:

@@ -10,6 +10,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
 from optloc.plot import style
 from optloc.plot.bound_map import levels
+from optloc.plot.fixes import draw_lines, lines_of_position
 from optloc.plot.style import (
     BLACK,
     BLUE,
@@ -201,6 +202,8 @@ def plot_convergence(
 ) -> Figure:
     """Return a map of starts, coloured by where plain and damped iterations from there end, beside the fix.
 
+    The fix is drawn with its lines of position, and what is around it.
+
     Starts lie in the horizontal plane of the fix: the plain iteration is told the height.
 
     Parameters
@@ -241,14 +244,38 @@ def plot_convergence(
         found = basins(flat, answer, places.reshape(starts, starts, -1), method)
         _ends(panel, found, x / size, y / size)
         share = f"{100.0 * found.share(End.REACHED):.1f} % of {starts**2} starts"
-        panel.set_title(f"{_NAMES[method]}\n{share} reach the best fit")
-    panels[2].set_title(f"optloc, without a start\n{verdict(answer)}")
+        panel.set_title(f"{_NAMES[method]}:\n{share} reach the best fit")
+    panels[2].set_title(f"optloc needs no start:\n{verdict(answer)}")
+    draw_lines(panels[2], lines_of_position(flat, answer, x, y, places), np.zeros(2), size)
     for panel in panels:
         _marks(panel, scene, size, corners / size, unit, last=panel is panels[2])
     _legend(figure, panels[2])
-    finish(figure, title)
+    finish(figure, f"{title}: from which starts is the best fit found?" if title else "")
+    _inset(panels[2], scene)
     apart(figure)
     return figure
+
+
+def _inset(panel: Axes, scene: Scene) -> None:
+    """Draw the surroundings of the fix in a corner: in the plan of all starts its ellipse is a dot."""
+    centre, covariance = scene.fixes[0], scene.covariances[0]
+    half = _AROUND * float(np.sqrt(np.diagonal(covariance)[:2].max()))
+    if not (np.isfinite(half) and half > 0.0):
+        return
+    unit, size = unit_of(np.array([[half, half]]))
+    near = panel.inset_axes((0.64, 0.03, 0.33, 0.33))
+    moved = scene.moved(lambda place: place - np.pad(centre[:2], (0, len(centre) - 2)))
+    style.ellipses(near, moved, PLAN, size)
+    near.scatter(0.0, 0.0, s=30, color=BLUE, zorder=4)
+    near.set(
+        xlim=(-half / size, half / size),
+        ylim=(-1.3 * half / size, 0.7 * half / size),
+        xticks=[],
+        yticks=[],
+        aspect="equal",
+    )
+    near.set_title("around the fix", fontsize=8, pad=3)
+    style.scale_bar(near, unit)
 
 
 def verdict(fix: Fix) -> str:

@@ -133,6 +133,31 @@ def grid(panel: Axes) -> None:
     panel.set_axisbelow(True)
 
 
+# Parts of a panel that a scale bar takes: a length that reads well, and the corner in which fewest marks are.
+_BAR, _CORNER = 0.25, 0.3
+
+
+def scale_bar(panel: Axes, unit: str) -> None:
+    """Draw the bar of a length in a corner of a plan whose limits are settled."""
+    from mpl_toolkits.axes_grid1.anchored_artists import AnchoredSizeBar
+
+    (west, east), (south, north) = panel.get_xlim(), panel.get_ylim()
+    most = _BAR * (east - west)
+    power = 10.0 ** np.floor(np.log10(most))
+    length = power * next(n for n in (5.0, 2.0, 1.0) if n * power <= most)
+    marks = panel.transData.inverted().transform(_marks(panel))
+    share = (marks - [west, south]) / [east - west, north - south]
+    counts = {
+        name: int(((np.abs(share[:, 0] - x) < 1.3 * _CORNER) & (share[:, 1] < _CORNER)).sum())
+        for name, x in (("lower right", 1.0), ("lower left", 0.0))
+    }
+    corner = min(counts, key=lambda name: counts[name])
+    style: dict[str, Any] = {"pad": 0.3, "borderpad": 0.4, "sep": 3, "size_vertical": 0.004 * (north - south)}
+    bar = AnchoredSizeBar(panel.transData, length, f"{length:g} {unit}", corner, frameon=True, **style)
+    bar.patch.set(edgecolor="none", alpha=0.8)
+    panel.add_artist(bar)
+
+
 # Notes that keep apart.
 
 
@@ -299,7 +324,7 @@ def scene_of(problem: Problem, fixes: Sequence[Fix], *, outlined: bool = False) 
         other_paths=other,
         known=tuple(thinned(place) for place in known),
         outlines=outlines,
-        local=_is_local(fixes, outlines, len(position)),
+        local=is_local(fixes, outlines, len(position)),
     )
     return _local(problem, scene) if problem.frame.kind == "ecef" else scene
 
@@ -311,7 +336,7 @@ def outlines_of(problem: Problem, fixes: Sequence[Fix], count: int) -> tuple[Pie
     return tuple(pieces for fix in fixes for pieces in pieces_of(problem, fix))
 
 
-def _is_local(fixes: Sequence[Fix], outlines: Sequence[Pieces], count: int) -> Array | None:
+def is_local(fixes: Sequence[Fix], outlines: Sequence[Pieces], count: int) -> Array | None:
     """Return where an ellipse does not cover and there is no outline (n,); None unless fixes are one position each."""
     if count != sum(fix.code.size for fix in fixes):
         return None

@@ -12,7 +12,7 @@ from optloc.base.arrays import numbers, positive, whole
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import CARTESIAN, Frame
 from optloc.base.types import Array, Bias, Motion, Prior, Rows, Stations
-from optloc.models import MODELS
+from optloc.models import BEARING, MODELS, kind_named
 from optloc.problem import noise as noises
 from optloc.problem.check import checked
 from optloc.problem.problem import Problem
@@ -65,7 +65,7 @@ def measured(
     Parameters
     ----------
     kind : str
-        A key of `optloc.MODELS`, for instance "tdoa".
+        A key of `optloc.MODELS`, for instance "tdoa", or one of its aliases.
     z : array (..., m), optional
         Measured values: metres, metres per second, radians or ratios; None to be simulated.
     a, b : int array (m,) or int
@@ -97,9 +97,11 @@ def measured(
     InvalidProblem
         For an unknown kind, missing stations or a noise given not exactly once.
     """
-    model = MODELS.get(kind)
-    if model is None:
-        raise InvalidProblem(f"unknown kind {kind!r}", where="kind", advice=f"use one of {', '.join(sorted(MODELS))}")
+    if str(kind).strip().lower() == BEARING:
+        advice = "use optloc.locate(bearings=...), or 'azimuth' in radians from the first axis towards the second"
+        raise InvalidProblem("a bearing is degrees from north, and measurements in memory are not", "kind", advice)
+    kind = kind_named(kind)
+    model = MODELS[kind]
     # Everything becomes arrays first, so that what follows speaks of shapes and never of types.
     z, sigma, arrival_sigma = (
         numbers(z, "z"),

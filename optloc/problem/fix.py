@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
@@ -150,7 +150,7 @@ class Alternatives:
         return np.asarray(expit(-0.5 * self.gap))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Fix:
     """Estimates of a batch of problems; a single problem has no leading axes.
 
@@ -168,8 +168,8 @@ class Fix:
         `Status` numbers.
     reason : object array (...)
         Sentence that belongs to the status: the direction, the groups, the count.
-    certificate : object array (...)
-        `Certificate` of each fix.
+    claims : object array (...)
+        `Certificate` of each fix; see `certificate`.
     alternatives : Alternatives
         Other minima.
     cost : array (...)
@@ -202,7 +202,7 @@ class Fix:
     frame: Frame
     code: Annotated[Array, Axes(0)]
     reason: Annotated[Array, Axes(0, empty="")]
-    certificate: Annotated[Array, Axes(0)]
+    claims: Annotated[Array, Axes(0)]
     alternatives: Alternatives
     cost: Annotated[Array, Axes(0)]
     dof: Annotated[Array, Axes(0)]
@@ -224,6 +224,11 @@ class Fix:
     def status(self) -> Any:
         """Return the `Status` of a single fix, or the int array (...) of a batch (compare with `Status` members)."""
         return Status(int(self.code)) if self.shape == () else self.code
+
+    @property
+    def certificate(self) -> Any:
+        """Return the `Certificate` of a single fix, or the object array (...) of them of a batch."""
+        return self.claims[()]
 
     @property
     def position(self) -> Array:
@@ -275,6 +280,12 @@ class Fix:
         """Return latitude, longitude (radians) and ellipsoidal height (metres) of the position."""
         return self.frame.to_geodetic(self.position)
 
+    @property
+    def latlon(self) -> Array:
+        """Return latitude and longitude (degrees) and ellipsoidal height (metres) of the position, (..., 3)."""
+        lat, lon, height = self.geodetic
+        return np.stack([np.degrees(lat), np.degrees(lon), height], axis=-1)
+
     def ellipse(self, probability: float = 0.95) -> tuple[Array, Array]:
         """Return the error ellipse or ellipsoid of the position.
 
@@ -298,6 +309,50 @@ class Fix:
         scale = np.sqrt(2.0 * gammaincinv(cov.shape[-1] / 2, probability))
         axes = scale * np.sqrt(np.maximum(values, 0.0))
         return np.where(known[..., None], axes, np.nan), np.where(known[..., None, None], vectors, np.nan)
+
+    def __repr__(self) -> str:
+        """Return what the command line shows of a fix; of a batch how many have which status."""
+        return str(_TELLER[0]().text_of(self)) if _TELLER else object.__repr__(self)
+
+    def _repr_html_(self) -> str:
+        """Return the same as HTML, for notebooks."""
+        return str(_TELLER[0]().html_of(self)) if _TELLER else ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the fix as plain numbers, texts and lists, ready for JSON.
+
+        Returns
+        -------
+        dict
+            Status, position, sigma, covariance, alternatives, certificate and more by name, as ``optloc fix --json``
+            has them: metres and degrees, None where there is no number. Of a batch ``{"fixes": [...]}``.
+        """
+        return dict(_TELLER[0]().dict_of(self))
+
+    def to_dataframe(self) -> Any:
+        """Return a pandas data frame with one row for each fix (and target, and epoch), as ``optloc fix --out`` writes.
+
+        Raises
+        ------
+        InvalidProblem
+            Where pandas is not installed.
+        """
+        return _TELLER[0]().frame_of(self)
+
+    def to_geojson(self, problem: Any = None) -> dict[str, Any]:
+        """Return positions and what holds 95 % as a GeoJSON feature collection (RFC 7946).
+
+        Parameters
+        ----------
+        problem : Problem, optional
+            What was solved: its stations are features, too, and so is a curved region.
+
+        Raises
+        ------
+        InvalidProblem
+            For positions that are not on Earth.
+        """
+        return dict(_TELLER[0]().geojson_of(self, problem))
 
     def gaussian(self) -> tuple[Array, Array]:
         """Return mean (..., n) and covariance (..., n, n) of the shared unknowns: an initial state for a tracker."""
@@ -416,6 +471,15 @@ class Fix:
     def __len__(self) -> int:
         """Return the length of the first batch axis."""
         return int(self.x.shape[0])
+
+
+# Words, tables and maps are made on a higher floor: `optloc` says by whom, once.
+_TELLER: list[Callable[[], Any]] = []
+
+
+def told_by(teller: Callable[[], Any]) -> None:
+    """Say which module, loaded when it is needed, tells fixes in words and tables: `optloc.report.fixes`."""
+    _TELLER[:] = [teller]
 
 
 def status_named(label: str) -> Status:

@@ -1,6 +1,19 @@
-"""Pages that need no network: the report of a study with its files for papers, maps of bounds, of fixes and tracks."""
+"""Pages that need no network, and what a fix says: reports of studies, maps of bounds, fixes and tracks, words."""
 
-from optloc.report.page import fix_page, live_page, map_page, track_page
-from optloc.report.study_page import Tell, write_report
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from optloc.report.page import fix_page, live_page, map_page, track_page
+    from optloc.report.study_page import Tell, write_report
 
 __all__ = ["Tell", "fix_page", "live_page", "map_page", "track_page", "write_report"]
+
+
+def __getattr__(name: str) -> Any:
+    # Pages bring templates and drawings with them; words of a fix need neither.
+    from importlib import import_module
+
+    for place in ("page", "study_page"):
+        if name in __all__ and hasattr(module := import_module(f"optloc.report.{place}"), name):
+            return getattr(module, name)
+    raise AttributeError(f"module 'optloc.report' has no attribute {name!r}")

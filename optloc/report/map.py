@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from importlib.resources import files
 from typing import Any, ClassVar
@@ -12,12 +12,11 @@ import numpy as np
 
 from optloc.base.linalg import error_ellipse
 from optloc.base.types import Array, Status
-from optloc.linear.evaluate import differentiate
 from optloc.models import MODELS
-from optloc.plot.fixes import isodopplers
+from optloc.plot.fixes import lines_of_position
 from optloc.plot.outlines import Pieces
 from optloc.plot.outlines import rings as around
-from optloc.plot.style import figure_class, outlines_of, states_of, thinned
+from optloc.plot.style import figure_class, is_local, outlines_of, states_of, thinned
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 
@@ -233,8 +232,6 @@ def dot(x: float, y: float, colour: str, size: float, title: str = "") -> Curve:
 _RING = 73
 # Metres above the ellipsoid where space begins by convention: satellites have no place on a map.
 _SKY = 100e3
-# Rows that have lines of position: more cannot be told apart.
-_LINES = 24
 # Points along an axis on which lines of position are sought: 112 steps across the map, and beyond each of its sides as
 # much as `_RIM` says in widths, for windows that are wider or taller; 80 000 points are evaluated in one batch.
 _GRID, _RIM = 281, 0.75
@@ -259,6 +256,8 @@ class Spots:
         What is told of each.
     more : tuple of array (r, 2)
         Outlines of the other parts of regions, degrees.
+    local : bool array (n,), optional
+        Where the ring is an ellipse that does not cover, and what does is not known.
     """
 
     place: Array
@@ -266,6 +265,7 @@ class Spots:
     clean: Array
     text: tuple[str, ...]
     more: tuple[Array, ...] = ()
+    local: Array | None = None
 
 
 def spots(
@@ -331,7 +331,9 @@ def fixed_spots(problem: Problem, fixes: Sequence[Fix], labels: Sequence[str]) -
     told = status if len(status) == len(position) else ["" if ok else "status not ok" for ok in clean]
     sigma = np.sqrt(np.trace(covariance, axis1=-2, axis2=-1))
     sentences = [sentence(*each) for each in zip(named, told, degrees(problem, position), sigma, strict=True)]
-    return spots(problem, position, covariance, clean, sentences, outlines_of(problem, fixes, len(position)))
+    outlines = outlines_of(problem, fixes, len(position))
+    found = spots(problem, position, covariance, clean, sentences, outlines)
+    return replace(found, local=is_local(fixes, outlines, len(position)))
 
 
 def sentence(name: str, status: str, place: Array, sigma: float) -> str:
@@ -380,44 +382,19 @@ def ground_tracks(problem: Problem) -> list[tuple[str, Array]]:
     return found
 
 
-def lines_of_position(problem: Problem, fix: Fix, limits: tuple[float, float, float, float]) -> list[tuple[str, Array]]:
-    """Return where a target would be by each row alone, at the height of the fix: name, and line (n, 2) in degrees.
-
-    Hyperbolas of time differences, circles of ranges, rays of bearings; other unknowns are as the fix has them. Of many
-    rows only range rates have lines, some of them, through the fix.
-    """
+def lines_on_map(problem: Problem, fix: Fix, limits: tuple[float, float, float, float]) -> list[tuple[str, Array]]:
+    """Return the lines of position of a single fix, at its height: kind and stations, and line (n, 2) in degrees."""
     figure_class()  # one sentence where matplotlib, which brings contourpy, is missing
-    from contourpy import contour_generator
-
-    flat, x = problem.flat(), fix.flat().x[0]
-    if flat.batch_shape != (1,) or not np.isfinite(x).all():
-        return []
-    slot, shared = flat.layout.find("position") if flat.layout.shares("position") else (None, False)
-    if slot is None or not shared:
+    flat = fix.flat()
+    if len(flat) != 1 or not np.isfinite(flat.x).all() or not flat.layout.shares("position"):
         return []
     lon, lat = _beyond(*limits[:2]), np.clip(_beyond(*limits[2:]), -_POLE, _POLE)
-    own = x[slot.start : slot.start + slot.size]
-    height = float(problem.frame.to_geodetic(own)[2])
+    height = float(problem.frame.to_geodetic(flat.take("position")[0])[2])
     east, north = (np.radians(v.ravel()) for v in np.meshgrid(lon, lat))
     # Longitudes back between half a turn west and east: the grid goes on beyond the date line.
     place = problem.frame.from_geodetic(north, (east + np.pi) % (2.0 * np.pi) - np.pi, np.full(east.size, height))
-    if flat.count > _LINES:
-        return isodopplers(problem, fix, lon, lat, place[:, : slot.size])
-    vectors = np.tile(x, (east.size, 1))
-    vectors[:, slot.start : slot.start + slot.size] = place[:, : slot.size]
-    with np.errstate(all="ignore"):
-        residual = differentiate(flat, vectors)[0]
-    found: list[tuple[str, Array]] = []
-    for rows, start in zip(flat.rows, flat.starts, strict=True):
-        for i in range(rows.count):
-            values = residual[:, start + i].reshape(_GRID, _GRID)
-            if MODELS[rows.kind].period is not None:
-                # Behind a station a bearing jumps by a turn: a change of sign there is no line.
-                values = np.where(np.abs(values) < 0.5 * np.pi, values, np.nan)
-            ends = [flat.stations.names[k] for k in (rows.a[i], rows.b[i]) if k >= 0]
-            made = contour_generator(lon, lat, np.ma.masked_invalid(values)).lines(0.0)
-            found += [(f"{rows.kind} {' – '.join(ends)}", np.asarray(line)) for line in made]
-    return found
+    found = lines_of_position(problem, fix, lon, lat, place[:, : problem.dimension])
+    return [(one.name if one.kind == "isodoppler" else f"{one.kind} {one.name}", one.line) for one in found]
 
 
 def _beyond(low: float, high: float) -> Array:

@@ -35,7 +35,7 @@ from optloc.report.map import (
     dot,
     fixed_spots,
     ground_tracks,
-    lines_of_position,
+    lines_on_map,
     map_canvas,
     other_spots,
     path,
@@ -244,7 +244,7 @@ def _page(problem: Problem, found: Spots, others: Spots, title: str, what: str, 
     stations, tracks = station_spots(problem), ground_tracks(problem)
     limits = _limits([stations.place, found.place, others.place, *(line for _, line in tracks)])
     plane, middle = Plane(*limits), (limits[0] + limits[1]) / 2.0
-    lines = [] if single is None else lines_of_position(problem, single, limits)
+    lines = [] if single is None else lines_on_map(problem, single, limits)
     few = len(found.place) <= _FEW
     layers: dict[str, Sequence[Drawn]] = {
         **({"lines of position": _curves(lines, plane)} if lines else {}),
@@ -259,6 +259,8 @@ def _page(problem: Problem, found: Spots, others: Spots, title: str, what: str, 
         # One can zoom until the part fills a tenth of the width, at least as far as on maps without one.
         data = {"focus": focus, "nearest": max(200.0, 10.0 * 2.0 * float(plane.half[0]) / focus[2])}
     text = f"Stations (white), {what} (blue; orange where the status is not ok) with what holds 95 %. Point at a mark."
+    if found.local is not None and found.local.any():
+        text = text.replace("holds 95 %.", "holds 95 % (dotted: an ellipse that does not).")
     canvas = map_canvas(plane, "map-1", title, layers, data, text)
     note = "Drag to move, wheel or pinch to zoom. Shores: Natural Earth."
     return write_page(title, [Part("map", "Map", maps=[canvas], note=note)])
@@ -318,10 +320,20 @@ def _station(name: str, x: float, y: float, tell: str) -> tuple[Drawn, ...]:
 
 
 def _ellipses(found: Spots, plane: Plane, middle: float) -> list[Drawn]:
-    rings = [plane(_turn(ring, middle)) for ring in (*found.rings, *found.more) if len(ring)]
-    if not rings or len(found.rings) > _ELLIPSES:
+    if len(found.rings) > _ELLIPSES:
         return []
-    return [Curve("ring", path(rings, close=True, digits=_DIGITS), BLUE)]
+    local = np.zeros(len(found.rings), dtype=bool) if found.local is None else found.local
+    covers = [ring for ring, bare in zip(found.rings, local, strict=True) if not bare]
+    drawn: list[Drawn] = []
+    for kind, rings in (
+        ("ring", [*covers, *found.more]),
+        # What does not hold 95 % must not look as if it did.
+        ("ring local", [ring for ring, bare in zip(found.rings, local, strict=True) if bare]),
+    ):
+        lines = [plane(_turn(ring, middle)) for ring in rings if len(ring)]
+        tell = "local ellipse: it does not cover" if kind == "ring local" else ""
+        drawn += [Curve(kind, path(lines, close=True, digits=_DIGITS), BLUE, tell=tell)] if lines else []
+    return drawn
 
 
 def _dots(found: Spots, plane: Plane, middle: float, size: float) -> list[Drawn]:

@@ -154,7 +154,9 @@ _STAGES: dict[str, Entry] = {
     "suspects": _refinement(
         suspect, "leaves out the stations, rows and priors that contradict the rest, and names them"
     ),
-    "taylor": _refinement(stages.taylor, "plain undamped Taylor iteration; a baseline, it diverges", batched=True),
+    "taylor": _refinement(
+        stages.taylor, "plain Taylor iteration without damping: a baseline that often diverges", batched=True
+    ),
 }
 
 

@@ -240,7 +240,7 @@ class Single:
             covariance,
             code=_numbers(code, shape, np.int8),
             reason=_objects(reason, shape),
-            certificate=_objects(claims, shape),
+            claims=_objects(claims, shape),
             cost=_numbers(costs, shape),
             stages=stages,
             active=_objects(_NOTHING[: len(costs)], shape),

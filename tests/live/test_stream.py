@@ -564,7 +564,7 @@ def test_a_site_is_read_anew_if_it_can_be(tmp_path):
         return said[-1]
 
     stream.inbox.put(stream.lines([line(event="1", station="A", time_ns=1)], "test"))
-    assert again("format = 2").startswith("The site stays as it was: site.toml: format 2 is unknown")
+    assert again("format = 3").startswith("The site stays as it was: site.toml: format 3 is unknown")
     assert stream.site is site
     assert again(SITE.replace("Six receivers", "Others").replace(', { a = "F" }', "")).startswith(
         "The site is 'Others'"

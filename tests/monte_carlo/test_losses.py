@@ -28,7 +28,7 @@ CASES = {
 NAMES = [f"{case}, {loss}" for case in CASES for loss in LOSSES]
 HEADER = [
     "case, loss",
-    "truth finds better",
+    "cheaper from the truth",
     "one place",
     "of these beyond 5 sigma",
     "bad rows rejected",
@@ -47,7 +47,7 @@ def book():
 
 
 def counted(name: str, loss: str, trials: int) -> tuple[int, int, int, tuple[object, ...]]:
-    """Return trials in which the truth finds better, with one place, with one beyond 5 sigma, and the other cells."""
+    """Return trials cheaper from the truth, with one place, with one beyond 5 sigma, and the other cells."""
     kind, stations, bad, size, late = CASES[name]
     case = spoilt(kind, trials, stations, bad=bad, size=size, late=late)
     fix, best = solve(case.problem, loss), solve(case.problem, loss, start=case.truth)

@@ -125,7 +125,7 @@ def check_surface(surface, rng):
     kind, S, z, sigma, rows = drawn_on(surface, place, rng)
     problem = assemble(S, rows, frame=ENU, constraints=constraint)
     fix = solve(problem)
-    proof = fix.certificate.item()
+    proof = fix.certificate
     if not fix.answered or proof.proof not in ("global", "region"):
         return False
     minima = least_on(place, kind, S, z, sigma, rng, REACH[surface])
@@ -176,7 +176,7 @@ def test_where_infinity_is_near_the_gap_of_the_region_is_tried(why, margin, monk
         return answer._replace(verdict=np.where(asked.kappa >= 9.0, why, answer.verdict))
 
     monkeypatch.setattr(branch_and_bound, "prove", failing)
-    proof = branch_and_bound.certify(problem, solve(problem, "gtrs+lsr")).certificate.item()
+    proof = branch_and_bound.certify(problem, solve(problem, "gtrs+lsr")).certificate
     assert (proof.proof, proof.unique) == ("global", margin > 0.0)
     assert proof.margin == pytest.approx(margin, abs=1e-3)
     assert tried[:2] == [25.0, 9.0]
@@ -199,11 +199,11 @@ def test_costs_beside_the_fix_are_compared_too(name, monkeypatch):
         rest = (pose.K @ phi[..., None])[..., 0] - pose.w
         return pose._replace(K=1.001 * pose.K, w=1.001 * (pose.w + rest) - rest)
 
-    assert branch_and_bound.certify(problem, fix).certificate.item().reason != branch_and_bound.MISMATCHED
+    assert branch_and_bound.certify(problem, fix).certificate.reason != branch_and_bound.MISMATCHED
     monkeypatch.setattr(branch_and_bound, "pose", steeper)
     turned = branch_and_bound.certify(problem, fix)
-    assert turned.certificate.item().proof == "unknown"
-    assert turned.certificate.item().reason == branch_and_bound.MISMATCHED
+    assert turned.certificate.proof == "unknown"
+    assert turned.certificate.reason == branch_and_bound.MISMATCHED
     assert turned.stages[-1].detail.endswith("1 posed cost did not match")
 
 
@@ -223,8 +223,8 @@ def moving(span, move):
 def test_station_errors_of_a_run_are_refused_where_stations_move():
     assert "while stations move" in unsupported(moving("run", 500.0).flat())
     fix = solve(moving("run", 500.0))
-    assert fix.certificate.item().proof == "unknown"
-    assert "while stations move" in fix.certificate.item().reason
+    assert fix.certificate.proof == "unknown"
+    assert "while stations move" in fix.certificate.reason
     for span, move in (("run", 0.0), ("epoch", 500.0)):
         assert unsupported(moving(span, move).flat()) == ""
 
@@ -233,7 +233,7 @@ def test_station_errors_of_a_run_are_refused_where_stations_move():
 @pytest.mark.parametrize(("span", "move"), [("run", 0.0), ("epoch", 500.0)])
 def test_station_errors_that_are_posed_agree_with_the_problem(span, move):
     problem = moving(span, move)
-    proof = solve(problem).certificate.item()
+    proof = solve(problem).certificate
     assert proof.reason != branch_and_bound.MISMATCHED
     assert proof.proof == "global"
 

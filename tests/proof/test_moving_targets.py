@@ -210,7 +210,7 @@ def attacked(seed: int, count: int, starts: int) -> tuple[int, int]:
         if not fix.answered:
             continue
         total += 1
-        claim = fix.certificate[()]
+        claim = fix.certificate
         if claim.proof != "region":
             continue
         proven += claim.unique
@@ -245,7 +245,7 @@ def test_clocks_and_what_is_known_of_the_state_count(seed):
         problem = simulate(made, truth=np.concatenate([truth, np.zeros(made.layout.size - 4)]), seed=number)
         fix = solve(problem)
         # a claim is made only where the posed cost is that of the fix
-        claims.append(fix.certificate[()].proof == "region" if fix.answered else None)
+        claims.append(fix.certificate.proof == "region" if fix.answered else None)
     assert claims.count(True) >= 4
 
 
@@ -255,7 +255,7 @@ def test_a_mirror_image_is_listed():
     made = assemble(line, rows, times=10.0 * np.arange(8), motions=(Motion(1),), constraints=limits())
     fix = solve(simulate(made, truth=[2e3, 9e3, 30.0, 20.0], seed=4))
     assert fix.status == Status.AMBIGUOUS
-    assert fix.certificate[()].unique
+    assert fix.certificate.unique
     other = fix.alternatives.x[0][:4]
     assert np.allclose(other * [1.0, -1.0, 1.0, -1.0], fix.x[:4], atol=[1.0, 1.0, 0.1, 0.1])
 
@@ -266,11 +266,11 @@ def test_what_is_admitted_is_what_is_claimed():
     problem = simulate(made, truth=truth, seed=1)
     fix = solve(problem)
     assert fix.status == Status.UNPROVEN  # it might be faster, or farther away
-    assert "at a velocity from (-700, -700) to (700, 700) m/s" in fix.certificate[()].reason
+    assert "at a velocity from (-700, -700) to (700, 700) m/s" in fix.certificate.reason
     corners = [-1e5, -1e5, -90.0, -300.0], [1e5, 1e5, 200.0, 300.0]
     asked = certify(problem, fix, corners)
-    assert asked.certificate[()].asked
-    assert asked.certificate[()].region == tuple(map(tuple, corners))
+    assert asked.certificate.asked
+    assert asked.certificate.region == tuple(map(tuple, corners))
     assert asked.status == Status.OK
 
 

@@ -11,7 +11,7 @@ import optloc
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
 from optloc.report import fix_page
-from optloc.report.map import fixed_spots, ground_tracks, lines_of_position
+from optloc.report.map import fixed_spots, ground_tracks, lines_on_map
 
 RUN = CliRunner()
 DEMO = package_files("optloc") / "scenarios" / "demo.toml"
@@ -55,7 +55,7 @@ def test_the_ring_is_the_ellipse(demo):
 def test_lines_of_position_meet_their_rows(demo):
     problem, fix = demo
     lon, lat = np.degrees(fix.geodetic[1]), np.degrees(fix.geodetic[0])
-    lines = lines_of_position(problem, fix, (lon - 0.1, lon + 0.1, lat - 0.07, lat + 0.07))
+    lines = lines_on_map(problem, fix, (lon - 0.1, lon + 0.1, lat - 0.07, lat + 0.07))
     assert {name for name, _ in lines} == {f"tdoa {n} – Lake" for n in ("Chapel", "Quarry", "Summit", "Mill", "Tower")}
     for name, line in lines:
         row = [f"tdoa {problem.stations.names[a]} – Lake" for a in problem.rows[0].a].index(name)
@@ -134,3 +134,17 @@ _POINT = """(() => { const dot = document.querySelector('[data-layer=fix] .dot')
   document.querySelector('.map svg').dispatchEvent(
     new PointerEvent('pointermove', { clientX: b.x + b.width / 2, clientY: b.y + b.height / 2, bubbles: true }));
   return document.querySelector('.map output').textContent; })()"""
+
+
+def test_an_ellipse_that_does_not_cover_is_dotted_on_the_map():
+    lat, lon = np.radians([47.812, 47.751, 47.79]), np.radians([11.183, 11.148, 11.31])
+    stations = optloc.station_array(optloc.ECEF.from_geodetic(lat, lon, np.array([612.0, 640.0, 842.0])), "ABC")
+    rows = optloc.measured("range", np.array([9000.0, 12300.0, 1500.0]), a=[0, 1, 2], sigma=800.0)
+    problem = optloc.assemble(
+        stations, rows, frame=optloc.ECEF, constraints=(optloc.constraints.height(exactly=700.0),)
+    )
+    fix = optloc.solve(problem)
+    assert fixed_spots(problem, [fix], []).local.all()
+    page = fix_page(problem, fix, "far from an ellipse")
+    assert "dotted: an ellipse that does not" in page
+    assert 'class="ring local"' in page

@@ -9,10 +9,21 @@ for (const map of document.querySelectorAll(".map")) {
     const { width, height } = svg.getBoundingClientRect();
     return Math.max(view[2] / Math.max(width, 1), view[3] / Math.max(height, 1));
   };
+  const bar = map.querySelector(".scale");
+  // The longest of 1, 2, 5, 10 ... metres that is no longer than 120 pixels; a degree of latitude has 111.2 km.
+  const measure = () => {
+    const metres = unit() * 111195 / Math.abs(data.scale[1]), most = 120 * metres;
+    const power = 10 ** Math.floor(Math.log10(most)), length = power * [5, 2, 1].find(n => n * power <= most);
+    bar.style.width = `${length / metres}px`;
+    bar.textContent = length >= 1000 ? `${length / 1000} km` : length >= 1 ? `${length} m` : `${+(length * 100).toFixed(2)} cm`;
+    // Shores are off by kilometres: of a city they say little, and look it.
+    svg.classList.toggle("near", metres < 20);
+  };
   const show = () => {
     svg.setAttribute("viewBox", view.join(" "));
     svg.style.setProperty("--unit", unit());
     svg.classList.toggle("far", view[2] > 1.7 * whole[2]);
+    measure();
   };
   const place = event => {
     const box = svg.getBoundingClientRect(), u = unit();

@@ -105,9 +105,9 @@ _SPACE = 3
 @lru_cache(maxsize=256)
 def _sentence(margin: float, listed: int, region: tuple[Corner, Corner] | None) -> str:
     where = "no position" if region is None else _where(*region)
-    beside = "" if not listed else " but that listed" if listed == 1 else f" but the {listed} listed"
+    beside = "" if not listed else f", except the {'one' if listed == 1 else listed} listed,"
     if margin > 0.0:
-        rest = f"no other minimum{beside} has a cost within {margin:g} of it"
+        rest = f"every other local minimum{beside} costs at least {margin:g} more"
     else:
         rest = "other minima were searched for, not excluded"
     return f"{where} costs less; {rest}"

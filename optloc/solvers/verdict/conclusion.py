@@ -97,7 +97,7 @@ def _contradictory(conclusion: Conclusion) -> Fix:
         code=np.array(int(Status.CONTRADICTORY), dtype=np.int8),
         marks=np.array(Status.CONTRADICTORY.mark, dtype=np.int32),
         reason=_object(reason),
-        certificate=_object(_UNKNOWN),
+        claims=_object(_UNKNOWN),
         local=None if whole.local is None else np.full_like(whole.local, np.nan),
         explanations=_object(()),
     )

@@ -91,7 +91,7 @@ def rule(problem: Problem, pool: Pool, gap: Array) -> Ruling:
     for i in np.flatnonzero(few):
         reason[i] = _lacking(-int(pool.dof[i]))
     for i in np.flatnonzero(answered & np.isin(code, _UNFINISHED)):
-        reason[i] = f"the refinement stopped {distance[i]:.3g} spreads of the stations away"
+        reason[i] = f"the last step ended at {distance[i]:.3g} times the size of the station array from its middle"
     for i in np.flatnonzero(weak):
         reason[i] = _open(problem, _information(curvature)[i])
     _explain_missing(problem, pool, np.flatnonzero(missing), code, reason)
@@ -237,7 +237,9 @@ def _hold_against_constraints(pool: Pool, cost: Array, finished: Array, marks: A
     for i in np.flatnonzero((held > 0) & finished & np.isfinite(free) & noise & dear):
         names = " and ".join(active.name for active in pool.curvature.active[i])
         marks[i] |= Status.CONTRADICTORY.mark
-        reason[i] = f"the data contradict {names}: the cost is {cost[i]:.3g}, and {free[i]:.3g} without"
+        reason[i] = (
+            f"the data and the constraint {names} disagree: cost {cost[i]:.3g} with it, {free[i]:.3g} without it"
+        )
 
 
 def _weigh_redundancy(pool: Pool, finished: Array, reason: Array) -> None:
@@ -371,7 +373,7 @@ def _apply_rules(problem: Problem, pool: Pool, fix: Fix) -> Fix:
         code=first_status(ruling.marks),
         marks=ruling.marks,
         reason=ruling.reason,
-        certificate=ruling.certificate,
+        claims=ruling.certificate,
         cost=np.where(np.isfinite(fix.cost), fix.cost, np.nan),
         chart=chart_of(problem, x, covariance, pool.curvature),
     )

@@ -1,0 +1,416 @@
+"""Readings of a foreign table: of which sort they are, in which unit, without gaps and repeats."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from decimal import Decimal, InvalidOperation
+from math import atan2, cos, degrees, radians, sin
+from pathlib import Path
+from typing import Any
+
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.types import Array
+from optloc.base.units import UNITS
+from optloc.files.cells import NOTHING
+from optloc.files.roles import Roles, bare, guesses, unit_of
+from optloc.files.table import Table
+from optloc.models import MODELS
+
+
+@dataclass(frozen=True, slots=True)
+class Form:
+    """A sort of reading that tables hold.
+
+    Parameters
+    ----------
+    kind : str
+        Measurement kind that it becomes.
+    value : str
+        Role of its column.
+    text : str
+        What readings are.
+    """
+
+    kind: str
+    value: str
+    text: str
+
+    @property
+    def stations(self) -> int:
+        """Return how many stations a reading has."""
+        return MODELS[self.kind].stations
+
+    @property
+    def quantity(self) -> str:
+        """Return what its values measure."""
+        return MODELS[self.kind].quantity
+
+
+_OWN = {
+    "arrivals": Form("toa", "time", "arrival times"),
+    "sp": Form("range", "sp", "times from P to S of an earthquake, as ranges"),
+}
+
+
+def sort_named(name: str) -> Form:
+    """Return a sort of reading by its name: "arrivals", "sp" or a kind with stations."""
+    return _OWN[name] if name in _OWN else Form(name, name, MODELS[name].summary)
+
+
+# Sorts that a column's name alone tells, the likeliest first; the others are told.
+_SEEN = ("tdoa", "range", "range_sum", "azimuth", "elevation", "range_rate", "fdoa", "groa")
+# What programs write in place of a reading that there is none of.
+_MARKS = tuple(map(Decimal, (0, -1, *(sign * (10**n - 1) for n in (2, 3, 4, 5, 6, 9) for sign in (1, -1)))))
+# Radians of a turn: what is beyond is in degrees.
+_TURN = Decimal("6.2832")
+COMPASS, CARTESIAN = "north-clockwise", "east-counterclockwise"
+
+
+@dataclass(frozen=True, slots=True)
+class Told:
+    """What is said of a table that it does not say itself; each is an option of the command line.
+
+    Parameters
+    ----------
+    stations : Path, optional
+        Where the stations are: CSV, Parquet, JSON or GeoJSON. Beside orbits: stations that stay.
+    sigma : str, optional
+        Standard deviation of each reading with its unit, such as "20 ns"; "estimate" finds it from many epochs; of
+        several kinds "range=10 cm,azimuth=2 deg".
+    what : str, optional
+        What the table holds: "arrivals", "pseudoranges", "stations", "sp" or a measurement kind; by default what its
+        columns suggest.
+    columns : mapping of str to str
+        Column of each role that is not found by its name; "set+msg" puts two columns together.
+    unit : str, optional
+        Unit of the values, where the column's name does not end in it.
+    frame : "cartesian" or "ecef", optional
+        Frame of stations in x, y, z; cartesian by default.
+    times : Path, optional
+        Table of the measurements, whose times satellites are wanted at.
+    missing : str, optional
+        Numbers that stand for no reading, such as "0,-1,9999"; "none": every number is a reading.
+    average : bool
+        Whether several readings of the same become their mean; by default they are refused.
+    azimuth : str, optional
+        Convention of azimuths, as in a problem file.
+    positive : str, optional
+        Sign of differences, as in a problem file.
+    reference : str, optional
+        Station against which differences of a single station each are.
+    vp, vs : str, optional
+        Speeds of the P and S waves, such as "6 km/s".
+    window : str, optional
+        Length of time in which readings belong together, such as "0.1 s".
+    still : bool
+        Whether the target stays, so that all readings belong together.
+    zone : str, optional
+        Time zone of dates that name none, such as "UTC" or "Europe/Rome".
+    """
+
+    stations: Path | None = None
+    sigma: str | None = None
+    what: str | None = None
+    columns: Mapping[str, str] = field(default_factory=dict)
+    unit: str | None = None
+    frame: str | None = None
+    times: Path | None = None
+    missing: str | None = None
+    average: bool = False
+    azimuth: str | None = None
+    positive: str | None = None
+    reference: str | None = None
+    vp: str | None = None
+    vs: str | None = None
+    window: str | None = None
+    still: bool = False
+    zone: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Readings:
+    """Readings of one sort.
+
+    Parameters
+    ----------
+    form : Form
+        The sort.
+    unit : str
+        Of the values.
+    values : list of m Decimal
+        With all their digits.
+    row : int array (m,)
+        Row of the table that each is from.
+    cells : list of m str
+        Column that each is from.
+    a, b : object array (m,)
+        Names of the stations; b of pairs only.
+    positive : str
+        Sign of differences.
+    azimuth : str, optional
+        Convention of azimuths.
+    sigma : array (m,), optional
+        Standard deviations in the same unit.
+    notes : tuple of str
+        What was assumed, and what was left out.
+    """
+
+    form: Form
+    unit: str
+    values: list[Decimal]
+    row: Array
+    cells: list[str]
+    a: Array
+    b: Array | None = None
+    positive: str = "a-farther"
+    azimuth: str | None = None
+    sigma: Array | None = None
+    notes: tuple[str, ...] = ()
+
+    def take(self, pick: Sequence[int]) -> Readings:
+        """Return some of the readings."""
+        return replace(
+            self,
+            values=[self.values[i] for i in pick],
+            row=self.row[list(pick)],
+            cells=[self.cells[i] for i in pick],
+            a=self.a[list(pick)],
+            b=None if self.b is None else self.b[list(pick)],
+            sigma=None if self.sigma is None else self.sigma[list(pick)],
+        )
+
+
+# Which column holds readings of which stations.
+
+
+@dataclass(frozen=True, slots=True)
+class Named:
+    """A column that names stations: a sort of reading, where its name says one, and the stations."""
+
+    column: str
+    form: str | None
+    ends: tuple[str, ...]
+    minus: bool
+
+
+def tokens(text: str) -> tuple[str, ...]:
+    """Return the words and numbers of a name, without case."""
+    return tuple(re.findall(r"[^\W\d_]+|\d+", text.lower()))
+
+
+def named_columns(columns: Sequence[str], stations: Sequence[str]) -> list[Named]:
+    """Return the columns of a wide table: those whose names hold one station or two, and nothing that is unknown."""
+    known = sorted({tokens(name): name for name in stations if tokens(name)}.items(), key=lambda item: -len(item[0]))
+    exact = {name.strip(): name for name in stations}
+    found = []
+    for column in columns:
+        text = bare(column)
+        ends, rest = ([exact[text]], []) if text in exact else _stations_in(tokens(text), known)
+        form = _form_of("".join(word for word in rest if word not in _ENDS))
+        if ends and len(ends) <= 2 and form is not None:
+            between = re.search(r"[-\u2212\u2013]|minus", text) is not None
+            found.append(Named(column, form or None, tuple(ends), len(ends) == 2 and between))
+    return found
+
+
+# Words of headers that say of a name that it is a station's.
+_ENDS = frozenset("receiver rx sensor anchor node site station beacon minus at to from".split())
+
+
+def _stations_in(words: tuple[str, ...], known: Sequence[tuple[tuple[str, ...], str]]) -> tuple[list[str], list[str]]:
+    """Return the stations whose names are among words, in their order, and the words that are left."""
+    ends, rest, at = [], [], 0
+    while at < len(words):
+        hit = next(((key, name) for key, name in known if words[at : at + len(key)] == key), None)
+        if hit is None:
+            rest.append(words[at])
+            at += 1
+        else:
+            ends.append(hit[1])
+            at += len(hit[0])
+    return ends, rest
+
+
+def _form_of(word: str) -> str | None:
+    """Return the sort of reading that a word names, "" where there is none, and None for one that is unknown."""
+    if not word:
+        return ""
+    return next((name for name in (*_OWN, *_SEEN) if word in guesses(sort_named(name).value)), None)
+
+
+def sorts_of(roles: Roles, told: Told) -> list[str]:
+    """Return the sorts of readings of a table with one reading a row; none where its columns do not tell."""
+    if told.what is not None:
+        return [told.what]
+    if all(roles.find(role) for role in ("station", "time", "phase")) or roles.find("sp"):
+        return ["sp"]
+    if roles.find("p") and roles.find("s") and roles.find("station"):
+        return ["sp"]
+    fitting = [name for name in _SEEN if (column := roles.find(name)) and _fits(column, name)]
+    return fitting or (["arrivals"] if roles.find("station") and roles.find("time") else [])
+
+
+def _fits(column: str, name: str) -> bool:
+    """Return whether the unit in a column's name, if there is one, is one of a sort: an elevation may be a height."""
+    given = column.strip() != bare(column)
+    return not given or unit_of(column, UNITS[MODELS[name].quantity]) is not None  # type: ignore[index]
+
+
+# Units, gaps, repeats.
+
+
+def unit_for(column: str, form: Form, told: Told, held: Sequence[Decimal | None], where: str) -> tuple[str, str]:
+    """Return the unit of a column and a remark; raise InvalidProblem where neither its name nor --unit says it."""
+    known = UNITS[form.quantity]  # type: ignore[index]  # models hold known quantities only
+    own = unit_of(column, known)
+    if told.unit is not None and told.unit in known:
+        return told.unit, ""
+    if told.unit is not None and (own is None or not any(told.unit in table for table in UNITS.values())):
+        raise InvalidProblem(f"{told.unit!r} is no unit of {form.text}", "--unit", nearest(told.unit, list(known)))
+    if own is not None:
+        return own, ""
+    if form.quantity == "angle" and any(value is not None and abs(value) > _TURN for value in held):
+        return "deg", f"{column!r} is in degrees: some of its values are beyond a turn in radians"
+    some = {"length": "ns, or --unit m", "angle": "deg, or --unit rad", "speed": "m/s"}.get(form.quantity, "1")
+    raise InvalidProblem(f"the unit of the column {column!r} is not known", where, f"say it with --unit {some}")
+
+
+def in_unit(value: Decimal, unit: str, wanted: str, form: Form) -> Decimal:
+    """Return a value in another unit of its quantity, with all its digits."""
+    known = UNITS[form.quantity]  # type: ignore[index]  # models hold known quantities only
+    times = {unit, wanted} <= set(UNITS["time"])
+    if unit == wanted:
+        return value
+    if form.quantity == "length" and not times and {unit, wanted} & set(UNITS["time"]):
+        advice = "give the columns one unit, or convert them one by one"
+        raise InvalidProblem(f"some columns are in {unit}, others in {wanted}", "units", advice)
+    return value * Decimal(repr(known[unit])) / Decimal(repr(known[wanted]))
+
+
+def marks_of(told: Told) -> frozenset[Decimal] | None:
+    """Return the numbers that stand for no reading; None where nothing is said of them."""
+    if told.missing is None:
+        return None
+    if told.missing.strip().lower() == "none":
+        return frozenset()
+    try:
+        words = [word.strip() for word in told.missing.split(",")]
+        return frozenset(Decimal(word) for word in words if word.lower() not in NOTHING)
+    except InvalidOperation:
+        advice = "write numbers such as --missing 0,-1,9999, or --missing none"
+        raise InvalidProblem(f"{told.missing!r} is no list of numbers", "--missing", advice) from None
+
+
+def without_gaps(found: Readings, epoch: Sequence[Any], told: Told, table: Table, empty: int) -> Readings:
+    """Return readings without those that a number marks as missing; one that may be such a mark is asked for.
+
+    Parameters
+    ----------
+    found : Readings
+        All numbers.
+    epoch : sequence of m
+        Epoch of each.
+    told : Told
+        What is known of such numbers.
+    table : Table
+        Where they are from.
+    empty : int
+        Cells that hold nothing, to be told.
+    """
+    marks = marks_of(told)
+    if marks is None:
+        marks = frozenset()
+        doubtful = _doubtful(found, epoch)
+        if doubtful is not None:
+            count = found.values.count(doubtful)
+            where = next(i for i, value in enumerate(found.values) if value == doubtful)
+            times = f"{count} times, first here" if count > 1 else "once"
+            advice = f"say --missing {doubtful}, or --missing none if it is a reading"
+            what = f"{doubtful} occurs {times}, and may be a reading or mean that there is none"
+            raise InvalidProblem(what, table.where(found.cells[where], int(found.row[where])), advice)
+    keep = [i for i, value in enumerate(found.values) if value not in marks]
+    if not keep:
+        raise InvalidProblem("no cell holds a reading", table.source, "look at --missing and the columns")
+    gone = len(found.values) - len(keep)
+    notes = [f"{_cells(gone)} with {told.missing}: no reading"] if gone else []
+    notes += [f"{_cells(empty)} without a number: no reading"] if empty else []
+    return replace(found.take(keep) if gone else found, notes=(*found.notes, *notes))
+
+
+def _cells(count: int) -> str:
+    return "1 cell" if count == 1 else f"{count} cells"
+
+
+def _doubtful(found: Readings, epoch: Sequence[Any]) -> Decimal | None:
+    """Return a number that may mark what is missing, None where there is none.
+
+    Such a number is doubted where it is beyond all others or as frequent as none of them.
+    """
+    counts = Counter(found.values)
+    for mark in _MARKS:
+        if mark not in counts or len(counts) == 1:
+            continue
+        if mark == 0 and found.form.kind == "toa" and _begins(found, epoch):
+            continue
+        others = [value for value in counts if value != mark]
+        beyond = mark < min(others) or mark > max(others)
+        if beyond or (counts[mark] > 1 and counts[mark] > max(counts[value] for value in others)):
+            return mark
+    return None
+
+
+def _begins(found: Readings, epoch: Sequence[Any]) -> bool:
+    """Return whether each epoch has one zero and nothing below: then arrivals are counted from the first."""
+    zeros = Counter(label for label, value in zip(epoch, found.values, strict=True) if value == 0)
+    return min(found.values) >= 0 and set(zeros) == set(epoch) and max(zeros.values()) == 1
+
+
+def without_repeats(found: Readings, epoch: Sequence[Any], told: Told, table: Table) -> Readings:
+    """Return readings of which none repeats another: their means where that is asked for, else they are refused.
+
+    Parameters
+    ----------
+    found : Readings
+        All of them.
+    epoch : sequence of m
+        Epoch and target of each.
+    told : Told
+        Whether means are wanted.
+    table : Table
+        Where they are from.
+    """
+    groups: dict[tuple[Any, ...], list[int]] = {}
+    b = [None] * len(found.values) if found.b is None else found.b.tolist()
+    for i, key in enumerate(zip(epoch, found.a.tolist(), b, strict=True)):
+        groups.setdefault(key, []).append(i)
+    again = [members for members in groups.values() if len(members) > 1]
+    if not again:
+        return found
+    extra = sum(map(len, again)) - len(again)
+    if not told.average:
+        first, second = min(again, key=lambda members: members[1])[:2]
+        ends = " and ".join(repr(str(end)) for end in (found.a[second], b[second]) if end is not None)
+        label = epoch[second][0]
+        what = f"station {ends} has a second reading of message {label!r}, first in row {found.row[first] + 1}"
+        if extra > 1:
+            what += f"; {extra} such repeats in all"
+        advice = "say --average for their means, or tell messages apart: --column message=ONE+TWO"
+        raise InvalidProblem(what, table.at(int(found.row[second])), advice)
+    values = list(found.values)
+    for members in again:
+        values[members[0]] = _mean([found.values[i] for i in members], found)
+    kept = replace(found, values=values).take([members[0] for members in groups.values()])
+    note = f"{extra} repeated readings were averaged with the first of their message; sigma stays that of one"
+    return replace(kept, notes=(*found.notes, note))
+
+
+def _mean(values: Sequence[Decimal], found: Readings) -> Decimal:
+    if found.form.quantity != "angle":
+        return sum(values, Decimal(0)) / len(values)
+    # Of 359 and 1 degrees the mean is 0: directions are added, not numbers.
+    turn = [float(value) if found.unit == "rad" else radians(float(value)) for value in values]
+    mean = atan2(sum(map(sin, turn)), sum(map(cos, turn)))
+    return Decimal(repr(mean if found.unit == "rad" else degrees(mean) % 360.0))

@@ -1,0 +1,313 @@
+"""The two shapes of a table of readings: long, one a row, and wide, a column for each receiver."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from decimal import Decimal
+from typing import Any
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.types import Array
+from optloc.base.units import SPEED_OF_LIGHT, UNITS
+from optloc.files.cells import instants, is_dated, moments, numbers
+from optloc.files.readings import (
+    CARTESIAN,
+    COMPASS,
+    Form,
+    Named,
+    Readings,
+    Told,
+    in_unit,
+    sort_named,
+    unit_for,
+    without_gaps,
+    without_repeats,
+)
+from optloc.files.roles import Places, Roles, placed, stem, unit_of
+from optloc.files.schema import Units
+from optloc.files.table import Table
+from optloc.models import BEARING
+
+# Names of columns that are repeated of a list.
+_SHOWN = 4
+
+
+# A column for each receiver, or for each pair.
+
+
+def wide(roles: Roles, told: Told, columns: Sequence[Named], place: Places) -> list[Readings]:
+    """Return the readings of a table that has a column for each receiver, one set for each sort."""
+    sorts: dict[str, list[Named]] = {}
+    for one in columns:
+        name = one.form or told.what or ("tdoa" if one.minus else None)
+        if name is None:
+            shown = ", ".join(repr(each.column) for each in columns[:_SHOWN])
+            advice = "say it with --as arrivals, --as range, --as tdoa or another kind"
+            raise InvalidProblem(f"columns such as {shown} do not tell what they hold", roles.table.source, advice)
+        sorts.setdefault(name, []).append(one)
+    return [_wide_sort(roles, sort_named(name), told, chosen, place) for name, chosen in sorts.items()]
+
+
+def _wide_sort(roles: Roles, form: Form, told: Told, columns: Sequence[Named], place: Places) -> Readings:
+    table = roles.table
+    values: list[Decimal] = []
+    rows, cells, ends, notes = [], [], [], []
+    first, empty, dated = "", 0, False
+    for one in columns:
+        dated = form.quantity == "length" and is_dated(table, one.column)
+        held = instants(table, one.column, told.zone) if dated else numbers(table, one.column)
+        unit, note = ("s", "") if dated else unit_for(one.column, form, told, held, table.source)
+        first = first or unit
+        notes += [note] if note else []
+        pick = [row for row, value in enumerate(held) if value is not None]
+        empty += len(held) - len(pick)
+        values += [in_unit(value, unit, first, form) for value in held if value is not None]
+        rows += pick
+        cells += [one.column] * len(pick)
+        ends += [_ends(one, form, told, table.source)] * len(pick)
+    if not values:
+        raise InvalidProblem("no cell holds a reading", table.source, "look at the columns of the receivers")
+    pairs = form.stations > 1
+    minus = all(one.minus or len(one.ends) == 1 for one in columns)
+    found = Readings(form, first, values, np.array(rows), cells, np.array([a for a, _ in ends], dtype=object))
+    found = replace(found, b=np.array([b for _, b in ends], dtype=object) if pairs else None, notes=tuple(notes))
+    return _settled(found, roles, told, place, empty, "a-farther" if minus else None)
+
+
+def _ends(one: Named, form: Form, told: Told, source: str) -> tuple[str, str | None]:
+    """Return the stations of a column of a wide table."""
+    if form.stations == 1 and len(one.ends) == 1:
+        return one.ends[0], None
+    if form.stations == 2 and len(one.ends) == 2:
+        return one.ends
+    if form.stations == 2 and told.reference is not None:
+        return one.ends[0], told.reference
+    if form.stations == 2:
+        advice = "say the other with --reference STATION"
+        raise InvalidProblem(f"{form.kind} needs two stations, {one.column!r} names one", source, advice)
+    raise InvalidProblem(f"{form.kind} has one station, {one.column!r} names two", source, "say what it is with --as")
+
+
+# One reading a row.
+
+
+def inline(roles: Roles, told: Told) -> tuple[Places, Array]:
+    """Return the stations of a table that says in each row where its station was, and the name of each row's."""
+    count = roles.table.count
+    role = next((role for role in ("station", "name") if roles.find(role)), None)
+    names = np.array([str(i + 1) for i in range(count)], dtype=object) if role is None else roles.labels(role)
+    every = placed(roles, told.frame, names)
+    spots: dict[tuple[Any, ...], str] = {}
+    seen: dict[str, int] = {}
+    heard, first = [], []
+    for row, key in enumerate(zip(*(column.tolist() for column in every.columns.values()), strict=True)):
+        if key not in spots:
+            # A station that is elsewhere in another row is another one: where it was matters, not what it is called.
+            seen[key[0]] = seen.get(key[0], 0) + 1
+            spots[key] = key[0] if seen[key[0]] == 1 else f"{key[0]} ({seen[key[0]]})"
+            first.append(row)
+        heard.append(spots[key])
+    columns = {key: column[first] for key, column in every.columns.items()}
+    columns["name"] = np.array([heard[row] for row in first], dtype=object)
+    return replace(every, columns=columns), np.array(heard, dtype=object)
+
+
+def long(roles: Roles, form: Form, told: Told, place: Places, heard: Array | None) -> Readings:
+    """Return the readings of a table that has one a row; `heard` are stations that are known without a column."""
+    table = roles.table
+    if form.value == "sp" and roles.find("sp") is None:
+        return _picks(roles, told, place)
+    column = roles.column(form.value)
+    dated = form.quantity == "length" and is_dated(table, column)
+    held = instants(table, column, told.zone) if dated else numbers(table, column)
+    unit, note = ("s", "") if dated else unit_for(column, form, told, held, table.source)
+    pick = np.array([row for row, value in enumerate(held) if value is not None], dtype=np.int64)
+    if not len(pick):
+        raise InvalidProblem("no cell holds a reading", table.where(column), "look at the column")
+    a = roles.labels("station") if heard is None else heard
+    positive, b = ("a-farther", None) if form.stations == 1 else _others(roles, told)
+    found = Readings(form, unit, [value for value in held if value is not None], pick, [column] * len(pick), a[pick])
+    found = replace(found, b=None if b is None else b[pick], notes=(note,) if note else ())
+    if roles.find("sigma") is not None and told.sigma is None:
+        found = replace(found, sigma=_own_sigma(roles, form, unit)[pick])
+    return _settled(found, roles, told, place, table.count - len(pick), positive)
+
+
+def _others(roles: Roles, told: Told) -> tuple[str | None, Array]:
+    """Return the sign of differences, where it is known, and the second station of each row."""
+    column = roles.find("reference")
+    if told.reference is not None:
+        return "a-farther", np.full(roles.table.count, told.reference, dtype=object)
+    if column is None:
+        advice = "say it with --reference STATION, or name its column with --column reference=NAME"
+        raise InvalidProblem("no column looks like the second station", roles.table.source, advice)
+    against = stem(column) in ("reference", "ref", "refstation", "b")
+    return ("a-farther" if against else None), roles.labels("reference")
+
+
+def _own_sigma(roles: Roles, form: Form, unit: str) -> Array:
+    """Return the standard deviations of a table in the unit of its values."""
+    known = UNITS[form.quantity]  # type: ignore[index]  # models hold known quantities only
+    own = unit_of(roles.column("sigma"), known) or unit
+    return roles.numbers("sigma") * known[own] / known[unit]
+
+
+def _picks(roles: Roles, told: Told, place: Places) -> Readings:
+    """Return S minus P of a table with a column for each, or with a column of phases."""
+    table, zone = roles.table, told.zone
+
+    def times(role: str) -> list[Decimal | None]:
+        column = roles.column(role)
+        if is_dated(table, column):
+            return instants(table, column, zone)
+        held = numbers(table, column)
+        unit, _ = unit_for(column, sort_named("sp"), told, held, table.source)
+        return [None if value is None else in_unit(value, unit, "s", sort_named("sp")) for value in held]
+
+    station = roles.labels("station")
+    if roles.find("p") and roles.find("s"):
+        pairs = [(row, p, s) for row, (p, s) in enumerate(zip(times("p"), times("s"), strict=True))]
+    else:
+        phases, held = [phase[:1].upper() for phase in roles.labels("phase").tolist()], times("time")
+        event = roles.labels("message").tolist() if roles.find("message") else [""] * table.count
+        first: dict[tuple[str, str, str], int] = {}
+        for row, key in enumerate(zip(event, station.tolist(), phases, strict=True)):
+            if key in first:
+                what = f"station {key[1]!r} has a second {key[2]} pick, first in row {first[key] + 1}"
+                advice = "leave one out, or name the events with --column message=NAME"
+                raise InvalidProblem(what, table.at(row), advice)
+            first[key] = row
+        pairs = [
+            (row, held[row], held[first[label, name, "S"]])
+            for (label, name, phase), row in first.items()
+            if phase == "P" and (label, name, "S") in first
+        ]
+    both = [(row, s - p) for row, p, s in pairs if p is not None and s is not None]
+    early = next((row for row, value in both if value <= 0), None)
+    if early is not None:
+        raise InvalidProblem("the S wave is not behind the P wave", table.at(early), "correct the picks")
+    if not both:
+        raise InvalidProblem("no station has both P and S", table.source, "name their columns with --column p=, s=")
+    rows = np.array([row for row, _ in both])
+    column = roles.find("s") or roles.column("time")
+    found = Readings(sort_named("sp"), "s", [value for _, value in both], rows, [column] * len(rows), station[rows])
+    lone = len({*station.tolist()}) - len({*found.a.tolist()})
+    found = replace(found, notes=(f"{lone} stations without both P and S are left out",) if lone else ())
+    return _settled(found, roles, told, place, 0, "a-farther")
+
+
+# What all have in common: stations that are known, no gaps, no repeats, a sign and a convention.
+
+
+def _settled(found: Readings, roles: Roles, told: Told, place: Places, empty: int, positive: str | None) -> Readings:
+    """Return readings whose stations are known, of which none is missing or repeated, with sign and convention."""
+    table, known = roles.table, set(place.names)
+    for end in (found.a, found.b):
+        for i, name in enumerate([] if end is None else end.tolist()):
+            if name not in known:
+                where = told.stations.name if told.stations is not None else table.source
+                column = roles.find("station") if len(set(found.cells)) == 1 else None
+                spot = table.where(column or found.cells[i], int(found.row[i]))
+                raise InvalidProblem(f"there is no station {name!r} in {where}", spot, nearest(name, place.names))
+    if found.b is not None:
+        same = next((i for i, (a, b) in enumerate(zip(found.a, found.b, strict=True)) if a == b), None)
+        if same is not None:
+            spot = table.at(int(found.row[same]))
+            raise InvalidProblem(f"{found.form.kind} names station {found.a[same]!r} twice", spot, "name two stations")
+    found = _with_digits(found, table)
+    keys = _keys(found, roles, told)
+    found = without_gaps(found, [keys[row] for row in found.row.tolist()], told, table, empty)
+    if not told.still:
+        found = without_repeats(found, [keys[row] for row in found.row.tolist()], told, table)
+    signed = found.form.stations > 1 and found.form.kind != "range_sum"
+    if signed and told.positive is None and positive is None:
+        advice = "say --positive a-farther if the first is farther then, or --positive b-farther"
+        what = "a difference of two stations may be positive where the first is farther, or the second"
+        raise InvalidProblem(what, table.source, advice)
+    found = replace(found, positive=told.positive or positive or "a-farther")
+    return _oriented(found, told, place, table.source) if found.form.kind == "azimuth" else found
+
+
+# Digits of an instant in seconds or nanoseconds of today, and metres of rounding that a fix would not show.
+_INSTANT, _ROUNDED = 9, 1.0
+
+
+def _with_digits(found: Readings, table: Table) -> Readings:
+    """Return arrivals that have all their digits; raise InvalidProblem where a spreadsheet took them."""
+    if found.form.kind != "toa":
+        return found
+    for i, value in enumerate(found.values):
+        if int(value.as_tuple().exponent) > 0 and len(value.as_tuple().digits) <= _INSTANT <= value.adjusted():
+            spot = table.where(found.cells[i], int(found.row[i]))
+            advice = "write it with all digits; a spreadsheet must take the column for text"
+            raise InvalidProblem(f"the arrival {value:E} has lost its digits", spot, advice)
+    floats = any(table.raw(cell).dtype.kind == "f" for cell in set(found.cells))
+    factor = UNITS["length"][found.unit] * (SPEED_OF_LIGHT if found.unit in UNITS["time"] else 1.0)
+    step = float(np.spacing(max(abs(float(value)) for value in found.values))) * factor
+    if not floats or step < _ROUNDED:
+        return found
+    note = f"arrivals are floating-point numbers, at this size rounded to {step:.3g} m: text or integers keep more"
+    return replace(found, notes=(*found.notes, note))
+
+
+def _oriented(found: Readings, told: Told, place: Places, source: str) -> Readings:
+    """Return azimuths with their convention: as told, as their name says, or, on Earth, that of a compass."""
+    named = any(word in stem(found.cells[0]) for word in (BEARING, "brg", "compass", "heading"))
+    if told.azimuth is not None or named:
+        return replace(found, azimuth=told.azimuth or COMPASS)
+    if place.frame == "cartesian":
+        advice = f"say --azimuth {COMPASS} of a compass, or --azimuth {CARTESIAN} from the x axis"
+        raise InvalidProblem("an azimuth may begin at north or at the x axis", source, advice)
+    note = f"azimuths are taken as those of a compass; --azimuth {CARTESIAN} says another"
+    return replace(found, azimuth=COMPASS, notes=(*found.notes, note))
+
+
+def _keys(found: Readings, roles: Roles, told: Told) -> list[tuple[str, ...]]:
+    """Return what tells the rows (n,) of a table apart beside their stations: message and target, or time."""
+    epochs = epochs_of(roles, told, [found])
+    columns = [column.tolist() for key in ("epoch", "time", "target") if (column := epochs.get(key)) is not None]
+    return [tuple(map(str, row)) for row in zip(*columns, strict=True)] if columns else [("",)] * roles.table.count
+
+
+def epochs_of(roles: Roles, told: Told, found: Sequence[Readings]) -> dict[str, Array]:
+    """Return the columns epoch, time and target (n,) of the rows of a table, those that there are."""
+    table, taken = roles.table, {cell for one in found for cell in one.cells}
+    out: dict[str, Array] = {}
+    long = len(taken) == len(found)
+    if found[0].form.value == "sp":
+        taken |= {column for role in ("p", "s", "phase", "time") if (column := roles.find(role))}
+    if long and (station := roles.find("station")):
+        taken.add(station)
+    target = roles.find("target")
+    if target is not None and target not in taken:
+        out["target"] = roles.labels("target")
+        taken.add(target)
+    if told.still:
+        return out
+    if told.window is not None and found[0].form.value == "time" and long:
+        return out | {"epoch": _clusters(found[0], told.window, table.count)}
+    message, when = (None if (name := roles.find(role)) in taken else name for role in ("message", "time"))
+    if message is not None and told.window is None:
+        out["epoch"] = roles.labels("message")
+    time = None if when is None else moments(roles, when, told.zone)
+    if time is not None:
+        out["time"] = time
+    elif when is not None and message is None:
+        out["epoch"] = roles.labels("time")
+    if not long and not out.keys() & {"epoch", "time"}:
+        out["epoch"] = np.array([str(row + 1) for row in range(table.count)], dtype=object)
+    return out
+
+
+def _clusters(found: Readings, window: str, count: int) -> Array:
+    """Return the message (n,) of each row of arrivals: of the same are those less than a window apart."""
+    factor = Decimal(repr(Units("time").plain(window, None, "--window"))) / Decimal(repr(UNITS["length"][found.unit]))
+    out, label, last = np.full(count, "", dtype=object), 0, None
+    for i in sorted(range(len(found.values)), key=lambda i: found.values[i]):
+        label += last is None or found.values[i] - last > factor
+        last = found.values[i]
+        out[found.row[i]] = str(label)
+    return out

@@ -1,0 +1,376 @@
+"""Fixes as columns of a long table, as JSON and as GeoJSON: what files of results hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.frames import Frame
+from optloc.base.linalg import error_ellipse
+from optloc.base.types import Array, Status
+from optloc.bounds.observability import Observability
+from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE
+from optloc.problem.fix import Active, Explanation, Fix
+from optloc.problem.problem import Problem
+
+Columns = dict[str, Array]
+"""A long table: columns (rows,) by name, in SI units and degrees, NaN where there is no number."""
+
+_RATES = {"velocity": "v", "acceleration": "a"}
+_STATES = ("position", *_RATES)
+# Corners of an ellipse on a map, one for every 5 degrees: no edge is seen at any zoom that shows the whole.
+_CORNERS = 72
+
+# Numbers and tables.
+
+
+def plain(value: Any) -> Any:
+    """Return a value as JSON knows it: arrays as lists, what is not finite as null."""
+    if isinstance(value, dict):
+        return {key: plain(inner) for key, inner in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, list | tuple):
+        return [plain(inner) for inner in value]
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def records(columns: Columns) -> list[dict[str, Any]]:
+    """Return a table as one record for each row, ready for JSON."""
+    lists = {name: plain(values) for name, values in columns.items()}
+    return [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)]
+
+
+def join_tables(parts: Sequence[Columns]) -> Columns:
+    """Return tables below each other; a column that one lacks is NaN there."""
+    names = dict.fromkeys(name for part in parts for name in part)
+    sizes = [len(next(iter(part.values()))) for part in parts]
+    return {
+        name: np.concatenate([part.get(name, np.full(size, np.nan)) for part, size in zip(parts, sizes, strict=True)])
+        for name in names
+    }
+
+
+def covariance_columns(covariance: Array, axes: str) -> Columns:
+    """Return the upper triangles of covariances (n, d, d) along named axes."""
+    d = covariance.shape[-1]
+    return {f"cov_{axes[i]}{axes[j]}": covariance[:, i, j] for i in range(d) for j in range(i, d)}
+
+
+def geodetic_columns(frame: Frame, position: Array, covariance: Array) -> Columns:
+    """Return latitude and longitude (degrees), height (metres) and covariance along east, north, up."""
+    if not frame.geodetic:
+        return {}
+    with np.errstate(invalid="ignore"):  # epochs without a fix are NaN
+        lat, lon, height = frame.to_geodetic(position)
+        axes = frame.enu_axes(position)
+    local = axes @ covariance @ np.swapaxes(axes, -1, -2)
+    degrees = {"lat_deg": np.degrees(lat), "lon_deg": np.degrees(lon), "height": height}
+    return degrees | covariance_columns(local, "enu")
+
+
+# The long table: one row for each target and epoch.
+
+Labels = Callable[[int, bool], Columns]
+
+
+def fix_columns(
+    fix: Fix,
+    *,
+    targets: Sequence[tuple[int, tuple[str, ...]]] | None = None,
+    labels: Labels | None = None,
+    dimension: int = 3,
+    constrained: bool | None = None,
+) -> Columns:
+    """Return the table of fixes.
+
+    Parameters
+    ----------
+    fix : Fix
+        One fix, or a batch (n,) of them.
+    targets : sequence of (int, tuple of str), optional
+        Number of each target and the names of its position, velocity and acceleration; by default those of the layout.
+    labels : callable of (int, bool), optional
+        Returns the columns that say which row is which, of a target, and whether it has a position at each epoch.
+    dimension : int
+        Of positions, where none is estimated.
+    constrained : bool, optional
+        Whether there are constraints that may hold it; by default whether any does.
+
+    Returns
+    -------
+    dict of str to array (rows,)
+        Metres, seconds and degrees; NaN where there is no number.
+    """
+    flat = fix if len(fix.shape) == 1 else fix.flat()
+    if targets is None:
+        targets = list(enumerate(_states_of(fix))) or [(0, ("position",))]
+    if labels is None:
+        labels = _numbered(flat, len(targets))
+    words = _told_in_words(
+        flat, any(map(len, fix.active.ravel())) if constrained is None and fix.active is not None else bool(constrained)
+    )
+    return join_tables([_of_target(flat, names, i, labels, dimension, words) for i, names in targets])
+
+
+def _states_of(fix: Fix) -> list[tuple[str, ...]]:
+    """Return the names of position, velocity and acceleration of each target that is estimated."""
+    names = [slot.name for slot in (*fix.layout.shared, *fix.layout.local)]
+    numbers = [name.removeprefix("position") for name in names if name.partition("[")[0] == "position"]
+    return [tuple(f"{word}{number}" for word in _STATES if f"{word}{number}" in names) for number in numbers]
+
+
+def _numbered(fix: Fix, targets: int) -> Labels:
+    """Return labels of fixes that nobody has named: their numbers in the batch, of epochs and of targets."""
+    n, k = len(fix), fix.layout.epochs
+
+    def labels(target: int, spread: bool) -> Columns:
+        rows = n * k if spread else n
+        number = {"number": np.arange(rows) // (k if spread else 1)} if n > 1 else {}
+        epoch = {"epoch": np.tile(np.arange(k), n)} if spread else {}
+        return number | epoch | ({"target": np.full(rows, target)} if targets > 1 else {})
+
+    return labels
+
+
+def _of_target(
+    fix: Fix, names: Sequence[str], target: int, labels: Labels, dimension: int, words: Mapping[str, Sequence[str]]
+) -> Columns:
+    """Return the rows of one target: `names` are those of its position, velocity and acceleration."""
+    estimated = names[0] in {slot.name for slot in (*fix.layout.shared, *fix.layout.local)}
+    position = fix.take(names[0]) if estimated else np.full((len(fix), dimension), np.nan)
+    n, d = len(fix), position.shape[-1]
+    # A position of each epoch of a run has an axis of epochs (1, k, d), and a covariance where that was asked for.
+    spread = position.ndim == 3
+    count = position.shape[1] if spread else 1
+    told = estimated and (not spread or fix.local is not None)
+    columns = dict(labels(target, spread))
+    position = position.reshape(n * count, d)
+    covariance = fix.covariance(names[0]).reshape(n * count, d, d) if told else np.full((n * count, d, d), np.nan)
+    sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+    columns |= _repeat(count, status=[Status(int(code)).label for code in fix.code], reason=list(fix.reason))
+    columns |= {axis: position[:, i] for i, axis in enumerate("xyz"[:d])}
+    columns |= {f"sigma_{axis}": sigma[:, i] for i, axis in enumerate("xyz"[:d])}
+    columns |= covariance_columns(covariance, "xyz")
+    for name in names[1:] if estimated else ():
+        letter = _RATES[name.partition("[")[0]]
+        own = fix.sigma(name).reshape(n * count, d) if told else np.full((n * count, d), np.nan)
+        for values, prefix in ((fix.take(name).reshape(n * count, d), letter), (own, f"sigma_{letter}")):
+            columns |= {f"{prefix}{axis}": v for axis, v in zip("xyz", values.T, strict=False)}
+    columns |= geodetic_columns(fix.frame, position, covariance)
+    semi_axes, _ = error_ellipse(covariance)
+    # Longest axis first.
+    columns |= {f"ellipse95_{i + 1}": semi_axes[:, d - 1 - i] for i in range(d)}
+    for name, numbers in {"cost": fix.cost, "dof": fix.dof, "p_value": np.asarray(fix.p_value)}.items():
+        columns[name] = np.repeat(numbers, count)
+    columns["alternatives"] = np.repeat(np.isfinite(fix.alternatives.gap).sum(-1), count)
+    return columns | _repeat(count, **words)
+
+
+def level_covariance(columns: Columns, i: int) -> Array:
+    """Return the covariance (d, d) of one row in level axes: east, north and up where there is a ground."""
+    axes = "enu" if "cov_ee" in columns else "xyz"
+    axes = axes[: 3 if f"cov_{2 * axes[2]}" in columns else 2]
+    pairs = [[f"cov_{min(a, b, key=axes.index)}{max(a, b, key=axes.index)}" for b in axes] for a in axes]
+    return np.array([[float(columns[name][i]) for name in row] for row in pairs])
+
+
+def _repeat(count: int, **texts: Sequence[str]) -> Columns:
+    """Return texts of each fix (n,) as columns, each so often as the fix has rows."""
+    return {name: np.repeat(np.array(list(values), dtype=object), count) for name, values in texts.items()}
+
+
+def _told_in_words(fix: Fix, constrained: bool) -> dict[str, list[str]]:
+    """Return the proof of each fix, the constraints that hold it, and its suspects: "A; B" together, "A | B" either."""
+    texts = {"proof": [getattr(c, "proof", "unknown") for c in fix.claims]}
+    texts["findings"] = ["; ".join(one.label for one in each) for each in fix.findings]
+    texts["chart"] = [""] * len(fix) if fix.chart is None else list(fix.chart.name)
+    if constrained:
+        held = [()] * len(fix) if fix.active is None else fix.active
+        texts["active"] = ["; ".join(active.name for active in each) for each in held]
+        texts["multipliers"] = ["; ".join(f"{active.multiplier:.6g}" for active in each) for each in held]
+    if fix.explanations is not None:
+        texts["suspects"] = [" | ".join("; ".join(e.names) for e in each) for each in fix.explanations]
+    return texts
+
+
+# What a single fix has besides its numbers.
+
+
+def explanations_of(fix: Fix) -> tuple[Explanation, ...]:
+    """Return what explains the data of a single fix."""
+    return () if fix.explanations is None else tuple(fix.explanations[()])
+
+
+def active_of(fix: Fix) -> tuple[Active, ...]:
+    """Return the constraints that hold a single fix with equality."""
+    return () if fix.active is None else tuple(fix.active[()])
+
+
+def alternative_position(fix: Fix, x: Array) -> Array:
+    """Return the positions of all targets of a parameter vector, metres."""
+    # Two targets are called position[0] and position[1].
+    names = [slot.name for slot in (*fix.layout.shared, *fix.layout.local) if slot.name.partition("[")[0] == "position"]
+    parts = [fix.layout.take(x, name) for name in names]
+    return parts[0] if len(parts) == 1 else np.stack(parts)
+
+
+def bias_records(fix: Fix, seen: Observability | None) -> list[dict[str, Any]]:
+    """Return one record for each bias of a single fix: name, member, value, sigma, unit, from_data.
+
+    Parameters
+    ----------
+    fix : Fix
+        A single fix.
+    seen : Observability, optional
+        What its data show.
+    """
+    found = []
+    for slot in fix.layout.shared:
+        if not slot.members:
+            continue
+        values, sigmas = fix.take(slot.name), fix.sigma(slot.name)
+        shares = np.full(slot.size, np.nan) if seen is None else seen.from_data[slot.start : slot.start + slot.size]
+        for member, value, sigma, share in zip(slot.entries, values, sigmas, shares, strict=True):
+            record = {"name": slot.name, "member": member, "value": float(value), "sigma": float(sigma)}
+            found.append(record | {"unit": slot.unit, "from_data": float(share)})
+    return found
+
+
+def fix_detail(fix: Fix, seen: Observability | None = None, *, reweighted: bool = False) -> dict[str, Any]:
+    """Return what a single fix has besides the columns of its table, for JSON.
+
+    Parameters
+    ----------
+    fix : Fix
+        A single fix.
+    seen : Observability, optional
+        What its data show of its biases.
+    reweighted : bool
+        Whether rows have other weights than they came with.
+    """
+    others = fix.alternatives
+    shown = np.isfinite(others.gap)
+    return {
+        "sentence": Status(int(fix.code)).sentence,
+        "findings": [one.label for one in fix.findings],
+        "gap_to_infinity": None if fix.infinity is None else fix.infinity,
+        "chart": _chart_json(fix),
+        "alternatives": [
+            {"gap": gap, "probability": doubt, "position": alternative_position(fix, x)}
+            for x, gap, doubt in zip(others.x[shown], others.gap[shown], others.doubt[shown], strict=True)
+        ],
+        "explanations": [asdict(explanation) for explanation in explanations_of(fix)],
+        "weights": fix.weights if reweighted else None,
+        "active": [{"name": a.name, "multiplier": a.multiplier} for a in active_of(fix)],
+        "certificate": asdict(fix.certificate),
+        "biases": bias_records(fix, seen),
+        "not_separable": [] if seen is None else list(seen.sentences),
+        "of_each_epoch": {name: values for name, values in fix.bias.items() if not fix.layout.find(name)[1]},
+    }
+
+
+def _chart_json(fix: Fix) -> dict[str, Any] | None:
+    """Return in which coordinates a single fix is Gaussian, and its Gaussian there."""
+    chart = fix.chart
+    if chart is None or not bool(fix.answered):
+        return None
+    told: dict[str, Any] = {"name": str(chart.name), "centre": chart.centre}
+    if chart.kind == INVERSE_RANGE:
+        told |= {"distance": chart.distance, "direction": chart.direction, "basis": chart.basis}
+        told |= {"mean": chart.mean, "covariance": chart.spread}
+    if chart.kind != CURVED:
+        told["range95"] = fix.interval("range")
+    return told
+
+
+# As GeoJSON.
+
+
+def geojson(
+    columns: Columns, frame: Frame, fixes: Sequence[Fix], problem: Problem | None = None, source: str | None = None
+) -> dict[str, Any]:
+    """Return stations, fixes and what holds 95 % as a GeoJSON feature collection (RFC 7946).
+
+    An ellipse where it covers, else the outline of the region; a curved fix without one has none.
+
+    Parameters
+    ----------
+    columns : dict of str to array
+        The table of the fixes.
+    frame : Frame
+        Of their positions.
+    fixes : sequence of Fix
+        In the order of the table.
+    problem : Problem, optional
+        Whose stations are told, and by which curved regions are known.
+    source : str, optional
+        Place to name.
+    """
+    from optloc.plot.outlines import earth_points, feature, point_geometry
+
+    if not frame.geodetic:
+        what = "GeoJSON needs positions on Earth, but the frame is cartesian"
+        raise InvalidProblem(what, source, 'give a [frame] of kind "geodetic", "ecef" or "enu"')
+    features = []
+    if problem is not None:
+        place = problem.stations.position.reshape(-1, problem.stations.count, problem.dimension)[0]
+        named = zip(problem.stations.names, earth_points(frame, place), strict=True)
+        features = [feature(point_geometry(point), {"role": "station", "name": name}) for name, point in named]
+    outlines = {} if problem is None else _outlines(columns, fixes, problem)
+    skipped = {"x", "y", "z", "lat_deg", "lon_deg", "height"}
+    for number, row in enumerate(records(columns)):
+        if row["lat_deg"] is None:
+            continue
+        about = {name: value for name, value in row.items() if name not in skipped and not name.startswith("cov_")}
+        point = np.array([row["lon_deg"], row["lat_deg"], row["height"]])
+        features.append(feature(point_geometry(point), {"role": "fix", **about}))
+        about = {name: row[name] for name in ("number", "epoch", "target") if name in row}
+        if pieces := outlines.get(number, ()):
+            features.append(feature(_region(frame, row, pieces), {"role": "region95", **about}))
+        elif row["cov_ee"] is not None and number not in outlines:
+            features.append(feature(_ellipse(frame, row), {"role": "ellipse95", **about}))
+    return {"type": "FeatureCollection", "features": features}
+
+
+def _outlines(columns: Columns, fixes: Sequence[Fix], problem: Problem) -> dict[int, tuple[Array, ...]]:
+    """Return the convex parts of the regions of rows whose ellipses do not cover; empty where they are not known."""
+    from optloc.plot.outlines import pieces_of
+
+    charts = [fix.chart for fix in fixes]
+    kinds = [np.ravel(chart.kind) for chart in charts if chart is not None]
+    # Fixes of one position each: a row is a fix.
+    if len(kinds) != len(charts) or sum(map(len, kinds)) != len(columns["x"]):
+        return {}
+    pieces = [part for fix in fixes for part in pieces_of(problem, fix)]
+    return {int(i): pieces[i] for i in np.flatnonzero(np.concatenate(kinds) != CARTESIAN)}
+
+
+def _region(frame: Frame, row: dict[str, Any], pieces: tuple[Array, ...]) -> dict[str, Any]:
+    """Return the plan of a region of convex parts as a geometry."""
+    from optloc.plot.outlines import earth_line, polygon_geometry, polygons
+
+    centre = np.array([row[axis] for axis in "xyz" if axis in row])
+    axes = frame.enu_axes(centre)[:2]
+    plan = polygons([(piece - centre) @ axes.T for piece in pieces])
+    return polygon_geometry([[earth_line(frame, centre + line @ axes) for line in each] for each in plan])
+
+
+def _ellipse(frame: Frame, row: dict[str, Any]) -> dict[str, Any]:
+    """Return the horizontal 95 % ellipse of a row as a geometry, counter-clockwise."""
+    from optloc.plot.outlines import earth_line, polygon_geometry
+
+    covariance = np.array([[row["cov_ee"], row["cov_en"]], [row["cov_en"], row["cov_nn"]]])
+    semi_axes, directions = error_ellipse(covariance)
+    # Eigenvectors may be left-handed: the sign of the turn makes up for it.
+    angle = np.linspace(0.0, 2.0 * np.pi, _CORNERS + 1) * np.sign(np.linalg.det(directions))
+    plane = (np.stack([np.cos(angle), np.sin(angle)], axis=-1) * semi_axes) @ directions.T
+    plane[-1] = plane[0]
+    centre = np.array([row[axis] for axis in "xyz" if axis in row])
+    return polygon_geometry([[earth_line(frame, centre + plane @ frame.enu_axes(centre)[:2])]])

@@ -1,0 +1,72 @@
+"""What the tool says: every sentence is short enough to be read once, whoever's names stand in it."""
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+from optloc.base.types import Status
+
+ROOT = Path(__file__).resolve().parents[1] / "optloc"
+# Characters of a sentence without the names, numbers and lists that are put into it.
+MOST = 200
+# Whose arguments are read by people: errors (three parts, one sentence), advice (two sentences), lines on the screen.
+JOINED, APART = {"InvalidProblem"}, {"Advice", "say"}
+
+
+def text(node: ast.AST | None, known: dict[str, list[ast.expr]], depth: int = 0) -> str:
+    """Return the longest text that an expression is known to be; what is put into it is left out."""
+    if isinstance(node, ast.Constant):
+        return node.value if isinstance(node.value, str) else ""
+    if isinstance(node, ast.JoinedStr):
+        return "".join(text(part, known, depth) for part in node.values)
+    if isinstance(node, ast.FormattedValue):
+        return text(node.value, known, depth) if isinstance(node.value, ast.IfExp | ast.Name) else ""
+    if isinstance(node, ast.BinOp) and isinstance(node.op, ast.Add):
+        return text(node.left, known, depth) + text(node.right, known, depth)
+    if isinstance(node, ast.IfExp):
+        return max(text(node.body, known, depth), text(node.orelse, known, depth), key=len)
+    if isinstance(node, ast.Name) and depth < 3:
+        return max((text(one, known, depth + 1) for one in known.get(node.id, [])), key=len, default="")
+    return ""
+
+
+def sentences(path: Path) -> Iterator[tuple[int, str]]:
+    """Yield line and text of all that a module says."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for scope in ast.walk(tree):
+        if not isinstance(scope, ast.FunctionDef | ast.AsyncFunctionDef):
+            continue
+        known: dict[str, list[ast.expr]] = {}
+        for node in ast.walk(scope):
+            if isinstance(node, ast.Assign):
+                for target in node.targets:
+                    pairs = [(target, node.value)]
+                    if isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
+                        pairs = list(zip(target.elts, node.value.elts, strict=False))
+                    for one, value in pairs:
+                        if isinstance(one, ast.Name):
+                            known.setdefault(one.id, []).append(value)
+                        elif isinstance(one, ast.Subscript) and getattr(one.value, "id", "") == "reason":
+                            yield node.lineno, text(value, known)
+        for node in ast.walk(scope):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+                parts = [text(part, known) for part in (*node.args, *(word.value for word in node.keywords))]
+                if node.func.id in JOINED:
+                    yield node.lineno, "; ".join(part for part in parts if part)
+                elif node.func.id in APART:
+                    yield from ((node.lineno, part) for part in parts if "\n" not in part)
+
+
+def all_sentences() -> list[tuple[str, str]]:
+    paths = sorted(ROOT.rglob("*.py"))
+    return [(f"{path.relative_to(ROOT)}:{line}", said) for path in paths for line, said in sentences(path) if said]
+
+
+def test_every_sentence_is_short():
+    found = all_sentences()
+    assert len(found) > 500  # the collection finds what it is for
+    assert [place for place, said in found if len(said) >= MOST] == []
+
+
+def test_every_status_is_short():
+    assert [status.label for status in Status if len(status.sentence) >= MOST] == []
