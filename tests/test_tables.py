@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from optloc import InvalidProblem, solve
+from optloc import InvalidProblem, locate, solve
 from optloc.base.frames import ECEF
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.cli import app
@@ -490,3 +490,17 @@ def test_digits_that_are_lost_are_told(tmp_path):
 def test_a_column_like_those_of_receivers_that_names_none_is_told(tmp_path):
     found = plan(tmp_path, "t_s,A1_m,A2_m,A9_m,note\n1,3,4,5,x\n", what="range")
     assert "'A9_m' may hold readings, but name no station of anchors.csv" in found.notes
+
+
+def test_differences_share_the_errors_of_their_stations_as_in_one_call(tmp_path):
+    far = ranges()
+    pairs = [("A1", "A2"), ("A1", "A3"), ("A2", "A3"), ("A1", "A4"), ("B-1", "A4"), ("A1", "B-1")]
+    values = {pair: far[pair[0]] - far[pair[1]] for pair in pairs}
+    text = "station,reference,tdoa [m]\n" + "".join(f"{a},{b},{value:.6f}\n" for (a, b), value in values.items())
+    read = solve(plan(tmp_path, text, positive="a-farther").read().problem)
+    told = locate(ANCHORS, tdoa=values, unit="m", sigma=0.1)
+    assert np.allclose(read.position, told.position, atol=1e-4)
+    assert np.allclose(read.cov, told.cov, rtol=1e-3)
+    # pairs that close loops say what the others do, and no more
+    tree = locate(ANCHORS, tdoa={pair: values[pair] for pair in pairs if pair[0] == "A1"}, unit="m", sigma=0.1)
+    assert np.allclose(told.cov, tree.cov, rtol=1e-3)

@@ -22,6 +22,7 @@ from optloc.base.outputs import claim, together, write_text
 from optloc.base.types import Array
 from optloc.base.units import UNITS
 from optloc.files.foreign import read_table
+from optloc.files.measurements import ESTIMATE
 from optloc.files.orbits import read_orbits
 from optloc.files.reader import Loaded, read
 from optloc.files.readings import CARTESIAN, COMPASS, Named, Readings, Told, named_columns, sort_named, sorts_of
@@ -365,7 +366,20 @@ def _section(found: Readings, epochs: Mapping[str, Array], sigma: str | None) ->
         columns["sigma"] = found.sigma
     lines = [f'azimuth = "{found.azimuth}"'] if found.azimuth is not None else []
     lines += [f'positive = "{found.positive}"'] if found.positive != "a-farther" else []
+    if found.b is not None and sigma not in (None, ESTIMATE) and MODELS[found.form.kind].signs == (1, -1):
+        # as `optloc.locate` takes it: differences share the errors of their stations, each half of the variance
+        lines += [f'arrival_sigma = "{_share(str(sigma), found.unit)}"    # of one station, sigma / sqrt(2)']
+        sigma = None
     return Section(found.form.kind, columns, found.unit, sigma, text, tuple(lines))
+
+
+def _share(sigma: str, unit: str) -> str:
+    """Return the part of one station in the standard deviation of a difference, an amount as text."""
+    number, own = re.fullmatch(r"\s*([-+.\deE]*)\s*(.*?)\s*", sigma, re.DOTALL).groups()  # type: ignore[union-attr]
+    try:
+        return f"{float(number) / np.sqrt(2.0):.9g} {own or unit}"
+    except ValueError:  # what reads the file says what is wrong with it
+        return sigma
 
 
 def _from_first(found: Readings, columns: dict[str, Any]) -> list[Decimal]:

@@ -442,10 +442,9 @@ def _rows(word: str, found: _Readings, sigma: float, unit: Conversion, places: _
     if word in ("toa", "tdoa"):
         _check_far(word, z, sigma, places)
     own = {"weight": heard.astype(float), "a": a, "b": None if word != "tdoa" else b}
-    # Differences to one station share its error: half of the variance of each is that of either arrival. Where pairs
-    # close loops, each was measured by itself.
-    shared = word == "tdoa" and _is_forest(a, b)
-    noise = {"arrival_sigma": sigma / np.sqrt(2.0)} if shared else {"sigma": sigma}
+    # Differences to one station share its error: half of the variance of each is that of either arrival. Of pairs that
+    # close loops this claims the least: what follows from the others says nothing more.
+    noise = {"arrival_sigma": sigma / np.sqrt(2.0)} if word == "tdoa" else {"sigma": sigma}
     return measured(kind, np.where(heard, z, 0.0), **own, **noise)
 
 
@@ -475,13 +474,3 @@ def _check_far(word: str, z: Array, sigma: float, places: _Receivers) -> None:
     if most > _TOO_FAR * max(places.extent, sigma):
         what = f"the arrivals are {most / 1e3:.3g} km apart, and the stations {places.extent / 1e3:.3g} km"
         raise InvalidProblem(what, word, "say the unit of the times, such as unit='ns', or correct them")
-
-
-def _is_forest(a: Array, b: Array) -> bool:
-    """Return whether no pair of stations follows from the others."""
-    group = {int(i): int(i) for i in (*a, *b)}
-    for one, other in zip(a.tolist(), b.tolist(), strict=True):
-        if group[one] == group[other]:
-            return False
-        group = {name: group[one] if own == group[other] else own for name, own in group.items()}
-    return True
