@@ -12,7 +12,6 @@ import typer
 
 from optloc.base.errors import InvalidProblem
 from optloc.cli.options import Budget, Force, Json, Quiet, Verbose
-from optloc.files.schema import ConstraintTable
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -20,6 +19,7 @@ if TYPE_CHECKING:
     from optloc.files.convert import Converted, Plan
     from optloc.files.reader import Loaded
     from optloc.files.readings import Told
+    from optloc.files.schema import ConstraintTable
 
 _TABLES = (".csv", ".tsv", ".txt", ".log", ".json", ".jsonl", ".ndjson", ".parquet", ".pq")
 PANEL = "A table"

@@ -14,7 +14,7 @@ from io import TextIOWrapper
 from math import isnan, nan
 from pathlib import Path
 from threading import Timer
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperGroup
@@ -24,8 +24,10 @@ from optloc.base.inputs import STANDARD_INPUT, access, budget_of, relax
 from optloc.base.outputs import remove_unnamed, replace_files, visible
 from optloc.base.types import Status
 from optloc.base.units import LARGEST
-from optloc.files.schema import ConstraintTable
 from optloc.problem.fix import status_named
+
+if TYPE_CHECKING:
+    from optloc.files.schema import ConstraintTable
 
 BAD_INPUT = 2
 """Exit code of whatever is wrong with the arguments or a file: what shells and typer use for wrong usage."""
@@ -365,6 +367,8 @@ def constraints(height: str | None, above_ground: bool, box: str | None) -> dict
     box : str, optional
         Least and greatest coordinates, metres: ``0,0,-inf:5000,5000,inf``.
     """
+    from optloc.files.schema import ConstraintTable  # the help needs no schema
+
     found = {}
     if height is not None:
         found["--height"] = ConstraintTable(kind="height", exactly=height)

@@ -17,7 +17,6 @@ from optloc.base import outputs
 from optloc.base.errors import InvalidProblem
 from optloc.base.outputs import claim, is_stream, visible, written
 from optloc.compute.progress import Reporter
-from optloc.files.writer import write_csv
 from optloc.report.columns import Columns, plain
 
 if TYPE_CHECKING:
@@ -73,6 +72,8 @@ def write_text(path: Path, text: str) -> None:
 def write_table(path: Path, columns: Columns) -> None:
     """Write a long table as CSV or Parquet, by the ending of its name; NaN is an empty cell."""
     if is_csv(path):
+        from optloc.files.writer import write_csv  # with the schema, which not every command needs
+
         write_csv(path, columns, for_people=True)
     else:
         import pyarrow as pa

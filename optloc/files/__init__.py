@@ -1,6 +1,18 @@
 """Problem files: stations and measurements in TOML, CSV and Parquet, in the units of their writers."""
 
-from optloc.files.reader import Loaded, from_table, load, read
-from optloc.files.schema import schema
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from optloc.files.reader import Loaded, from_table, load, read
+    from optloc.files.schema import schema
 
 __all__ = ["Loaded", "from_table", "load", "read", "schema"]
+
+
+def __getattr__(name: str) -> Any:
+    # The schema takes a quarter of a second: who only writes a table, or shows the help, does not wait for it.
+    from importlib import import_module
+
+    if name in __all__:
+        return getattr(import_module(f"optloc.files.{'schema' if name == 'schema' else 'reader'}"), name)
+    raise AttributeError(f"module 'optloc.files' has no attribute {name!r}")
