@@ -30,3 +30,10 @@ def test_what_loads_late_is_what_types_are_checked_by():
     assert told == places
     assert set(optloc._PLACE) | set(optloc._MODULES) == set(optloc.__all__)
     assert all(getattr(optloc, name) is not None for name in optloc.__all__)
+
+
+def test_the_help_waits_for_no_schema():
+    heavy = {"pydantic", "optloc.files.schema", "matplotlib", "pandas"}
+    code = f"import optloc.cli.app, sys; print(*sorted({heavy} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""

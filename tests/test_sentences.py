@@ -70,3 +70,21 @@ def test_every_sentence_is_short():
 
 def test_every_status_is_short():
     assert [status.label for status in Status if len(status.sentence) >= MOST] == []
+
+
+def test_every_error_names_a_place_and_a_step():
+    """Lines of a stream have no names: who reads them says which line it was, and the key that is wrong."""
+    lacking, count = [], 0
+    for path in sorted(ROOT.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if not isinstance(node, ast.Call) or getattr(node.func, "id", "") != "InvalidProblem":
+                continue
+            count += 1
+            told = {word.arg: word.value for word in node.keywords}
+            told |= dict(zip(("what", "where", "advice"), node.args, strict=False))
+            needed = ("advice",) if path.parent.name == "live" else ("where", "advice")
+            parts = [told.get(part, ast.Constant(None)) for part in needed]
+            if any(isinstance(part, ast.Constant) and not part.value for part in parts):
+                lacking.append(f"{path.relative_to(ROOT)}:{node.lineno}")
+    assert count > 500
+    assert lacking == []

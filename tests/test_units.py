@@ -82,7 +82,7 @@ WRONG = [
     (("m", "lenght"), {}, "unknown quantity 'lenght'; did you mean 'length'"),
     (("Hz", "speed"), {}, "carrier frequency is missing"),
     (("Hz", "speed"), {"carrier": -1.0}, "carrier frequency must be positive"),
-    (("ns", "length"), {"propagation_speed": math.nan}, "propagation speed must be positive"),
+    (("ns", "length"), {"propagation_speed": math.nan}, "propagation speed is nan"),
     (("deg", "angle"), {"convention": "north"}, "did you mean 'north-clockwise'"),
 ]
 

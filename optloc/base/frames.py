@@ -247,7 +247,7 @@ def check_geodetic(
     bad = np.flatnonzero(~np.isfinite(metres))
     if bad.size:
         what = f"the height {metres[bad[0]]:g} is not a finite number"
-        raise InvalidProblem(what, _row(where, bad[0], metres, first_row))
+        raise InvalidProblem(what, _row(where, bad[0], metres, first_row), "give every place a height in metres")
 
 
 def _row(where: str, row: np.intp, column: Array, first_row: int) -> str:
@@ -286,7 +286,6 @@ def _vectors(position: ArrayLike, lengths: tuple[int, ...]) -> Array:
     p = np.asarray(position, dtype=np.float64)
     if p.ndim == 0 or p.shape[-1] not in lengths:
         allowed = " or ".join(str(n) for n in lengths)
-        raise InvalidProblem(
-            f"a position needs {allowed} coordinates on its last axis, got shape {p.shape}", "position"
-        )
+        what = f"positions of shape {p.shape} have no last axis of {allowed} coordinates"
+        raise InvalidProblem(what, "position", "give x, y or x, y, z of each in its last axis")
     return p

@@ -164,7 +164,8 @@ class Conversion:
         if values_si is None:
             raise InvalidProblem(
                 "an error in dB has no fixed size as a ratio",
-                advice="give the measured values with it, or state the error in unit '1'",
+                "sigma",
+                "give the measured values with it, or state the error in unit '1'",
             )
         return self.factor * np.asarray(values_si, dtype=np.float64)
 
@@ -334,4 +335,5 @@ def _check_options(unit: str, quantity: str, propagation_speed: float, conventio
         advice = nearest(convention, list(get_args(AzimuthConvention)))
         raise InvalidProblem(f"unknown azimuth convention {convention!r}", where, advice)
     if not 1.0 / LARGEST <= propagation_speed <= LARGEST:
-        raise InvalidProblem(f"the propagation speed must be positive, not {propagation_speed:g} m/s", where)
+        what = f"the propagation speed is {propagation_speed:g} m/s"
+        raise InvalidProblem(what, where, "give a positive number of metres per second")

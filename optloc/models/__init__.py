@@ -130,7 +130,7 @@ class Model:
         if self.quantity not in UNITS:
             raise InvalidProblem(f"unknown quantity {self.quantity!r}", "quantity", nearest(self.quantity, list(UNITS)))
         if self.stations not in (0, 1, 2):
-            raise InvalidProblem(f"a row names 0, 1 or 2 stations, not {self.stations}", "stations")
+            raise InvalidProblem(f"a row cannot name {self.stations} stations", "stations", "give 0, 1 or 2")
         if self.signs is None:
             object.__setattr__(self, "signs", self.ranges)
 

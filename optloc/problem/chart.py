@@ -274,7 +274,7 @@ class Chart:
             raise InvalidProblem(f"there is no interval of {extent!r}", "extent", nearest(str(extent), _EXTENTS))
         self._demand(f"interval of the {extent}")
         if extent in {"elevation", "height"} and self.position.shape[-1] != 3:
-            raise InvalidProblem(f"a fix in the plane has no {extent}", "extent")
+            raise InvalidProblem(f"a fix in the plane has no {extent}", "extent", "ask for range or bearing")
         return _EXTENTS[extent](self, float(np.sqrt(quantile(level, 1))))
 
     def _demand(self, what: str) -> None:

@@ -86,7 +86,7 @@ class Layout:
                 if slot.name == name:
                     return slot, is_shared
         known = ", ".join(slot.name for slot in (*self.shared, *self.local))
-        raise InvalidProblem(f"no unknown is called {name!r}", advice=f"this problem has {known}")
+        raise InvalidProblem(f"no unknown is called {name!r}", "name", f"this problem has {known}")
 
     def shares(self, name: str) -> bool:
         """Return whether there is a shared unknown of this name."""

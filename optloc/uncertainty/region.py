@@ -442,7 +442,8 @@ def _check(problem: Problem, fix: Fix) -> None:
     motion = problem.motions[0]
     shared = problem.layout.shares("position")
     if len(problem.motions) > 1 or motion.order > 0 or motion.known is not None or not shared:
-        raise InvalidProblem("a region or samples are those of one position that stays", "problem")
+        what = "a region or samples are those of one position that stays"
+        raise InvalidProblem(what, "problem", "use fix.ellipse() or fix.gaussian() of other problems")
     if exact(problem):
         raise InvalidProblem(
             "the position is held by an equality, such as a known height, along which regions are not drawn",
