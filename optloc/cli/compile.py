@@ -159,8 +159,8 @@ PARTS: Mapping[str, Part] = {
         (_prove_runs,),
         (
             *(f"optloc.proof.runs.{name}" for name in ("search.tables_of", "prove.prove_run", "prove.cost_of_place")),
-            *(f"optloc.proof.runs.courses.{name}" for name in ("cost_of_state", "hessian_of_state")),
-            "optloc.proof.runs.course_search.prove_course",
+            *(f"optloc.proof.runs.states.{name}" for name in ("cost_of_state", "hessian_of_state")),
+            "optloc.proof.runs.state_search.prove_course",
         ),
     ),
     "searches": Part(

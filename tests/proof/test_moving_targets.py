@@ -10,7 +10,9 @@ from scipy.optimize import least_squares
 
 from optloc import Motion, Prior, Status, assemble, certify, constraints, measured, simulate, solve, with_bias
 from optloc.compute.jit import enabled
-from optloc.proof.runs.courses import (
+from optloc.proof.runs.posed import pose_courses
+from optloc.proof.runs.rows import blur_of, residual_at
+from optloc.proof.runs.states import (
     Axes,
     cost_of_state,
     has_no_minimum,
@@ -24,8 +26,6 @@ from optloc.proof.runs.courses import (
     sum_up,
     table_of,
 )
-from optloc.proof.runs.posed import pose_courses
-from optloc.proof.runs.rows import blur_of, residual_at
 from optloc.proof.scope import unsupported
 from optloc.solvers.certify.posed import state_columns
 
@@ -238,7 +238,7 @@ def test_claims_hold_against_other_searches_in_full(seed):
 
 def test_clocks_and_what_is_known_of_the_state_count(seed):
     claims = []
-    for number in range(6):
+    for number in range(4):
         rng = np.random.default_rng([6, seed, number])
         made, truth = drawn(rng, KINDS[number % 2], constraints=limits())
         made = spoiled(rng, made)
@@ -246,7 +246,7 @@ def test_clocks_and_what_is_known_of_the_state_count(seed):
         fix = solve(problem)
         # a claim is made only where the posed cost is that of the fix
         claims.append(fix.certificate.proof == "region" if fix.answered else None)
-    assert claims.count(True) >= 4
+    assert claims.count(True) >= 3
 
 
 def test_a_mirror_image_is_listed():
@@ -266,7 +266,10 @@ def test_what_is_admitted_is_what_is_claimed():
     problem = simulate(made, truth=truth, seed=1)
     fix = solve(problem)
     assert fix.status == Status.UNPROVEN  # it might be faster, or farther away
-    assert "at a velocity from (-700, -700) to (700, 700) m/s" in fix.certificate.reason
+    assert "state a box and a greatest speed" in fix.certificate.reason
+    around = certify(problem, fix)
+    assert "at a velocity from (-700, -700) to (700, 700) m/s" in around.certificate.reason
+    assert around.status == Status.UNPROVEN
     corners = [-1e5, -1e5, -90.0, -300.0], [1e5, 1e5, 200.0, 300.0]
     asked = certify(problem, fix, corners)
     assert asked.certificate.asked

@@ -31,8 +31,8 @@ from optloc.proof.pose import (
     span_of,
     turned_level,
 )
-from optloc.proof.runs.courses import Course
 from optloc.proof.runs.rows import Rows
+from optloc.proof.runs.states import Course
 
 # From a problem to its rows, and to those of few epochs.
 

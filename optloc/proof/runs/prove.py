@@ -54,8 +54,6 @@ from optloc.proof.near import (
 )
 from optloc.proof.nodes.dispatch import infinity_of
 from optloc.proof.nodes.node import DIFFERENCE, GROWS
-from optloc.proof.runs.course_search import prove_course
-from optloc.proof.runs.courses import axes_of, cost_of_state, hessian_of_state
 from optloc.proof.runs.posed import Courses, Run, Runs
 from optloc.proof.runs.rows import (
     blur_of,
@@ -73,6 +71,8 @@ from optloc.proof.runs.search import (
     sum_at,
     tables_of,
 )
+from optloc.proof.runs.state_search import prove_course
+from optloc.proof.runs.states import axes_of, cost_of_state, hessian_of_state
 from optloc.proof.surface import SIDES, is_one_side, reach_of_piece
 
 # Boxes around known minima on which the cost is convex.

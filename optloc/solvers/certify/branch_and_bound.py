@@ -33,6 +33,7 @@ from optloc.solvers.certify.posed import (
     regions_of,
     state_columns,
     surfaces_of,
+    unlimited,
 )
 from optloc.solvers.inequalities import is_hidden
 from optloc.solvers.outside import accept
@@ -523,6 +524,8 @@ def certified(
     if pool.conclusion is not None:
         answered &= ~present(pool.conclusion)  # the rows are not all there
     why = unsupported(problem)
+    if not why and region is None and effort == 1:  # who calls `certify` wants what can be had
+        why = unlimited(problem)
     if why or not answered.any():
         certificate = fill(len(pool), None) if pool.certificate is None else np.array(pool.certificate)
         certificate[answered] = unknown(why)

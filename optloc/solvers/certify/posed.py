@@ -125,7 +125,7 @@ def regions_of(problem: Problem, state: Array, region: Array | None) -> tuple[Ar
 
     A target that stays is looked for everywhere, if no region is given: NaN. One that moves could be anywhere at any
     speed, so a claim about it is for a region. Where box and speed are constraints nothing else is admitted, and that
-    is what is asked for; else it is what `around` says.
+    is what is asked for; else it is what `around` says, see `unlimited`.
 
     Parameters
     ----------
@@ -147,6 +147,14 @@ def regions_of(problem: Problem, state: Array, region: Array | None) -> tuple[Ar
     known = given + np.flatnonzero(np.isfinite(limits).all(0))
     out[..., known] = limits[:, known - given]
     return out, given + len(known) == n
+
+
+def unlimited(problem: Problem) -> str:
+    """Return why a proof of a moving target is worth nothing unless somebody asks for a region, or nothing."""
+    n = problem.dimension * (problem.motions[0].order + 1)
+    if n == problem.dimension or np.isfinite(_admitted(problem, n)).all():
+        return ""
+    return "the target could be anywhere at any speed; state a box and a greatest speed as constraints"
 
 
 def _admitted(problem: Problem, n: int) -> Array:

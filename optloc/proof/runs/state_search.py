@@ -1,4 +1,4 @@
-"""The search for a target in uniform motion through boxes of positions and velocities, and its proof in a region."""
+"""The search through boxes of positions and velocities for a target in uniform motion, and its proof in a region."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from optloc.compute.jit import compiled, zero
 from optloc.compute.systems import invert
 from optloc.proof.everywhere import ANOTHER, CHEAPER, CLEAR, SPENT
 from optloc.proof.near import BETTER, BUDGET, OTHER, STATIONARY, UNIQUE, VALUE, Aim
-from optloc.proof.runs.courses import (
+from optloc.proof.runs.rows import blur_of, residual_at
+from optloc.proof.runs.states import (
     SHIFT,
     WIDER,
     Axes,
@@ -29,7 +30,6 @@ from optloc.proof.runs.courses import (
     sum_up,
     table_of,
 )
-from optloc.proof.runs.rows import blur_of, residual_at
 
 # The search.
 
