@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import ECEF, Frame
 from optloc.base.units import SPEED_OF_LIGHT
-from optloc.files import from_table, load, read, schema
+from optloc.files import from_table, load, read
+from optloc.files.schema import schema
 from optloc.problem.noise import dense
 
 

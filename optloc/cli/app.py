@@ -527,7 +527,7 @@ def compile_(
 def schema(verbose: Verbose = False) -> None:
     """Print the JSON schema of problem files, from which editors complete and check them."""
     from optloc.cli.output import dumps
-    from optloc.files import schema as of_files
+    from optloc.files.schema import schema as of_files
 
     typer.echo(dumps(of_files()))
 

@@ -4,9 +4,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from optloc.files.reader import Loaded, from_table, load, read
-    from optloc.files.schema import schema
 
-__all__ = ["Loaded", "from_table", "load", "read", "schema"]
+__all__ = ["Loaded", "from_table", "load", "read"]
 
 
 def __getattr__(name: str) -> Any:
@@ -14,5 +13,5 @@ def __getattr__(name: str) -> Any:
     from importlib import import_module
 
     if name in __all__:
-        return getattr(import_module(f"optloc.files.{'schema' if name == 'schema' else 'reader'}"), name)
+        return getattr(import_module("optloc.files.reader"), name)
     raise AttributeError(f"module 'optloc.files' has no attribute {name!r}")
