@@ -116,7 +116,7 @@ WRONG = [
     (CARTESIAN.rotation_to_ecef, "no place on Earth; use the frame 'ecef'"),
     (CARTESIAN.origin_ecef, "no place on Earth"),
     (lambda: CARTESIAN.to_geodetic(np.zeros(3)), "no place on Earth"),
-    (lambda: ECEF.to_ecef(np.zeros(2)), r"got shape \(2,\)"),
+    (lambda: ECEF.to_ecef(np.zeros(2)), r"of shape \(2,\)"),
     (
         lambda: ECEF.from_geodetic([0, 2.0], [0, 0], [0, 0], where="s.csv", first_row=2),
         "s.csv, row 3: the latitude 114",
