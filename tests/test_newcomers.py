@@ -243,6 +243,13 @@ WRONG = {
     "x and y for degrees": ({"latlon": {"x": [0.0, 1.0], "y": [0.0, 1.0]}, "toa": [0, 0], "sigma": 1.0}, "lat and lon"),
     "words": ({"stations": ANCHORS, "ranges": {"A": "near"}, "sigma": 1.0}, "not numbers"),
     "height": ({"stations": ANCHORS, "ranges": [1, 2, 3, 4], "sigma": 1.0, "height": 2.0}, "plane"),
+    "a height that is none": ({"stations": ANCHORS, "ranges": [1, 2, 3, 4], "sigma": 1.0, "height": {}}, "no height"),
+    "a speed that is none": ({"stations": ANCHORS, "ranges": [1, 2, 3, 4], "sigma": 1.0, "speed": "fast"}, "speed"),
+    "a unit that is none": (
+        {"stations": ANCHORS, "ranges": [1, 2, 3, 4], "sigma": 1.0, "unit": [1]},
+        "list is no name",
+    ),
+    "a method that is none": ({"stations": ANCHORS, "ranges": [1, 2, 3, 4], "sigma": 1.0, "method": {}}, "dict is no"),
 }
 
 

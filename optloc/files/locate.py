@@ -160,9 +160,17 @@ def locate(
     given = {word: values for word, values in arguments.items() if values is not None}
     if not given:
         raise InvalidProblem("there are no measurements", "locate", f"give one of {', '.join(arguments)}")
-    if not 0.0 < float(speed) < np.inf:
-        raise InvalidProblem(f"the speed {speed} is not positive", "speed", "give metres per second")
+    for name, text in (("reference", reference), ("frame", frame), ("method", method), *_texts(unit)):
+        if text is not None and not isinstance(text, str):
+            raise InvalidProblem(f"{type(text).__name__} is no name", name, "give text, such as 'ns' for a unit")
+    if isinstance(speed, bool) or not isinstance(speed, float | int | np.number) or not 0.0 < speed < np.inf:
+        raise InvalidProblem("the speed is no positive number", "speed", "give metres per second")
     return solve(_pose(stations, latlon, given, sigma, unit, reference, height, frame, float(speed)), method=method)
+
+
+def _texts(unit: Any) -> list[tuple[str, Any]]:
+    """Return what must be text in an argument that may have one for each kind."""
+    return [("unit", each) for each in (unit.values() if isinstance(unit, Mapping) else (unit,))]
 
 
 def _pose(
@@ -261,7 +269,8 @@ def _heights(height: Any, places: _Receivers, given: Mapping[str, Any]) -> tuple
     except (TypeError, ValueError):
         low = high = np.nan
     if not low <= high:
-        raise InvalidProblem(f"{height!r} is no height", "height", "give metres, or the least and the greatest")
+        what = f"{height!r} is no height" if isinstance(height, str) else "this is no height"
+        raise InvalidProblem(what, "height", "give metres, or the least and the greatest")
     if places.frame.geodetic:
         return constraints.height(low, high)
     if d == 2:
