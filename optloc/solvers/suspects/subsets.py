@@ -181,6 +181,8 @@ def listed(rests: Sequence[Rest], groups: Sequence[Group]) -> tuple[Rest, ...]:
 
 
 def _adds_nothing(rest: Rest, size: int, other: Rest, fewer: int) -> bool:
+    if size == fewer:  # the same under other names: their costs differ by rounding
+        return True
     return float(other.fix.cost - rest.fix.cost) <= (ROW_PRICE - AMBIGUOUS_GAP) * (size - fewer)
 
 
