@@ -163,9 +163,13 @@ def locate(
     for name, text in (("reference", reference), ("frame", frame), ("method", method), *_texts(unit)):
         if text is not None and not isinstance(text, str):
             raise InvalidProblem(f"{type(text).__name__} is no name", name, "give text, such as 'ns' for a unit")
-    if isinstance(speed, bool) or not isinstance(speed, float | int | np.number) or not 0.0 < speed < np.inf:
+    return solve(_pose(stations, latlon, given, sigma, unit, reference, height, frame, _speed(speed)), method=method)
+
+
+def _speed(given: Any) -> float:
+    if isinstance(given, bool) or not isinstance(given, float | int | np.number) or not 0.0 < given < np.inf:
         raise InvalidProblem("the speed is no positive number", "speed", "give metres per second")
-    return solve(_pose(stations, latlon, given, sigma, unit, reference, height, frame, float(speed)), method=method)
+    return float(given)
 
 
 def _texts(unit: Any) -> list[tuple[str, Any]]:
