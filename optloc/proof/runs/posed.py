@@ -106,14 +106,19 @@ def pose_few(problem: Problem) -> Posed:
     return Posed(look.kinds, look.data[None], look.K[None], look.w[None], np.array([level]))
 
 
-def _pose(problem: Problem) -> tuple[Run, float]:
-    """Return one problem of a batch of one as a run, and its level of turns."""
+def _read(problem: Problem) -> tuple[Others, Array, Array, Columns]:
+    """Return the other unknowns, measurements without what is known to be added, which are there, and the nodes."""
     others = Others.of(problem)
     known = problem.observed - (others.touch @ others.mean[..., None])[..., 0]
     usable = (problem.weight > 0.0) & np.isfinite(known)
     known = np.where(usable, known, 0.0)
     made = columns_of(problem, known)
-    others = others.with_stations(problem, made)
+    return others.with_stations(problem, made), known, usable, made
+
+
+def _pose(problem: Problem) -> tuple[Run, float]:
+    """Return one problem of a batch of one as a run, and its level of turns."""
+    others, known, usable, made = _read(problem)
     priors = position_prior(problem, made)
     kinds = np.array(made.kinds)
     value = np.where(counts_from_measured(problem), 0.0, known)[0]
@@ -169,12 +174,7 @@ def pose_courses(problem: Problem) -> Courses:
 
 def _pose_course(problem: Problem) -> tuple[tuple[Course, Course], float]:
     """Return one problem of a batch of one as courses of all rows and of few, and its level of turns."""
-    others = Others.of(problem)
-    known = problem.observed - (others.touch @ others.mean[..., None])[..., 0]
-    usable = (problem.weight > 0.0) & np.isfinite(known)
-    known = np.where(usable, known, 0.0)
-    made = columns_of(problem, known)
-    others = others.with_stations(problem, made)
+    others, known, usable, made = _read(problem)
     since = problem.times - problem.origin
     when = np.zeros(len(made.kinds))
     when[made.column] = since[problem.epoch[made.row]]  # rows that share a node are of one epoch
@@ -212,18 +212,12 @@ def _state_prior(problem: Problem, made: Columns, span: float) -> tuple[Any, lis
     return sparse.csr_array(entries, shape=(count, len(made.kinds))), times
 
 
-def _sparse(matrix: Any) -> Any:
-    from scipy import sparse
-
-    return sparse.csr_array(matrix)
-
-
 def _course(system: _System, made: Columns, when: Array) -> Course:
     """Return whitened rows as a course over the nodes that they touch, epoch by epoch."""
     used = np.flatnonzero(np.bincount(system.nodes.indices, minlength=len(when)))
     order = used[np.argsort(when[used], kind="stable")]
     since, first = np.unique(when[order], return_index=True)
-    own = replace(system, nodes=_sparse(system.nodes[:, order]))
+    own = replace(system, nodes=system.nodes[:, order])
     kinds = np.array(made.kinds)[order]
     data = own.marked(kinds, made.numbers[:1, order])
     return Course(kinds, data, np.append(first, len(order)), since, own.rows())
