@@ -42,6 +42,9 @@ if TYPE_CHECKING:
     from optloc.linear.simulate import simulate
     from optloc.linear.walks import wander
     from optloc.models import MODELS, Model
+    from optloc.models.medium import Atmosphere, Layers
+    from optloc.placement.chosen import Placement, place
+    from optloc.placement.sites import Plan
     from optloc.problem import epochs, noise
     from optloc.problem.bias import with_bias, with_known_bias
     from optloc.problem.build import assemble, measured, station_array
@@ -65,7 +68,7 @@ if TYPE_CHECKING:
     )
     from optloc.several import Emitters, separate
     from optloc.solvers import FORMULATIONS, METHODS, SOLVERS, Formulation, solve
-    from optloc.solvers.certify.branch_and_bound import certify
+    from optloc.solvers.certify.admitted import certify
     from optloc.solvers.prepared import Prepared, prepare
     from optloc.solvers.robust.stage import rejected
     from optloc.solvers.running import Running
@@ -90,6 +93,7 @@ __all__ = [
     "Advice",
     "Alternatives",
     "Arc",
+    "Atmosphere",
     "Bias",
     "Budget",
     "Certificate",
@@ -104,6 +108,7 @@ __all__ = [
     "Health",
     "InvalidProblem",
     "LateSignals",
+    "Layers",
     "Layout",
     "Linear",
     "Loss",
@@ -116,6 +121,8 @@ __all__ = [
     "Normal",
     "Observability",
     "OptlocError",
+    "Placement",
+    "Plan",
     "Prepared",
     "Prior",
     "Problem",
@@ -156,6 +163,7 @@ __all__ = [
     "noise_levels",
     "normal",
     "observability",
+    "place",
     "predict",
     "prepare",
     "reduce",
@@ -199,6 +207,9 @@ _HOMES = {
     "linear.simulate": "simulate",
     "linear.walks": "wander",
     "models": "MODELS Model",
+    "models.medium": "Atmosphere Layers",
+    "placement.chosen": "Placement place",
+    "placement.sites": "Plan",
     "problem.bias": "with_bias with_known_bias",
     "problem.build": "assemble measured station_array",
     "problem.chart": "Chart",
@@ -214,7 +225,7 @@ _HOMES = {
     "quality.levels": "NoiseLevels common_level late_signals noise_levels with_estimated_noise with_noise_levels",
     "several": "Emitters separate",
     "solvers": "FORMULATIONS METHODS SOLVERS Formulation solve",
-    "solvers.certify.branch_and_bound": "certify",
+    "solvers.certify.admitted": "certify",
     "solvers.prepared": "Prepared prepare",
     "solvers.robust.stage": "rejected",
     "solvers.running": "Running",

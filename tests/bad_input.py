@@ -83,7 +83,7 @@ BAD = {
     "latitude": (GEODETIC.format(frame='kind = "ecef"').replace("47.1", "97.1"), ["row 2", "latitude 97.1"]),
     "empty file": ("", ["empty"]),
     "broken": ("format = 1\nstations = = 3\n", ["line 2", "TOML"]),
-    "no format": ("title = 'x'\n", ["format = 1"]),
+    "no format": ("title = 'x'\n", ["format = 2"]),
     "unknown format": ("format = 3\n", ["format 3"]),
     "unknown key": (tdoa(extra="sigma = 1.0\nwieght = 1.0\n"), ["]] 1", "'wieght'", "did you mean 'weight'"]),
     "unknown table": (tdoa() + "[statoins]\n", ["'statoins'", "did you mean 'stations'"]),

@@ -8,7 +8,7 @@ import numpy as np
 from verdicts import alone
 
 from optloc import Fix, Problem, assemble, measured, solve
-from optloc.solvers.certify.branch_and_bound import certified
+from optloc.solvers.certify.admitted import certified
 from optloc.solvers.pool import in_parts
 from optloc.solvers.refine import refine
 from optloc.solvers.stages import search_widely

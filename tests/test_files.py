@@ -16,6 +16,7 @@ from optloc.base.frames import ECEF, Frame
 from optloc.base.units import SPEED_OF_LIGHT
 from optloc.files import from_table, load, read
 from optloc.files.schema import schema
+from optloc.files.writer import write_measured
 from optloc.problem.noise import dense
 
 
@@ -275,3 +276,17 @@ def test_a_mistake_is_one_sentence_with_its_place(name, tmp_path):
     message = str(caught.value)
     assert "\n" not in message
     assert all(word in message for word in words), message
+
+
+def test_a_simulation_keeps_the_format_and_so_the_bearings_of_its_file(tmp_path):
+    path = tmp_path / "site.toml"
+    rows = "".join(f'{{a = "{n}", z = {z}}},' for n, z in (("P", 45.0), ("Q", 315.0)))
+    path.write_text(
+        'format = 2\n[stations]\nrows = [{name = "P", lat = 48.0, lon = 11.0, alt = 0.0},'
+        '{name = "Q", lat = 48.0, lon = 11.1, alt = 0.0}]\n[[measurements]]\nkind = "azimuth"\nunit = "deg"\n'
+        f'sigma = 1.0\nrows = [{rows}]\n[[constraints]]\nkind = "height"\nexactly = "0 m"\n'
+    )
+    problem = load(path)
+    write_measured(path, tmp_path / "again.toml", problem.z[None])
+    assert "format = 2" in (tmp_path / "again.toml").read_text()
+    assert load(tmp_path / "again.toml").z == pytest.approx(problem.z)

@@ -1,6 +1,7 @@
 """The same seed draws the same data, bit for bit, whatever the BLAS and the width of the processor's registers."""
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -72,7 +73,8 @@ note("BLAS", matrix @ matrix, np.linalg.eigh(matrix + matrix.mT)[1])
 note("numpy", np.sin(matrix), np.arctan2(matrix, 0.5), np.log(np.abs(matrix)))
 """
 # Kernels of processors of 2013, 2011 and 2015; then one of 2008 with a numpy and a C library that use nothing younger.
-# Where a processor lacks what is asked for, or is of another architecture, the libraries keep what they have.
+# A processor of another architecture keeps what it has; one that lacks what a kernel asks for (that of 2015 wants wider
+# registers than many younger ones have) ends in an illegal instruction, and there is nothing to compare.
 SETTINGS = (
     {"OPENBLAS_CORETYPE": "Haswell"},
     {"OPENBLAS_CORETYPE": "Sandybridge"},
@@ -97,8 +99,11 @@ def test_data_do_not_depend_on_the_blas_nor_on_the_registers():
     found = []
     for run in runs:
         out, error = run.communicate(timeout=120)
+        if run.returncode == -signal.SIGILL:
+            continue
         assert run.returncode == 0, error
         found.append(dict(line.rsplit(" ", 1) for line in out.splitlines()))
+    assert len(found) > 1
     first = found[0]
     assert len(first) > 40
     for other in found[1:]:

@@ -37,6 +37,10 @@ def test_every_kind_has_a_starter_that_uses_it():
         assert kind in used
 
 
+def test_what_is_written_is_of_the_newest_format():
+    assert {tomllib.loads(starter.text)["format"] for starter in STARTERS.values()} == {2}
+
+
 @pytest.mark.parametrize("name", STARTERS)
 def test_it_is_fixed_as_it_is(name, tmp_path):
     path = tmp_path / "site.toml"

@@ -15,7 +15,7 @@ import optloc
 from optloc.base.errors import InvalidProblem
 from optloc.files.reader import read
 from optloc.files.schema import ProblemFile
-from optloc.files.writer import _toml
+from optloc.files.writer import toml_text
 from optloc.solvers import solve
 from optloc.study.document import StudyFile
 from optloc.study.methods import SETTINGS
@@ -174,7 +174,7 @@ def warm(tmp_path_factory):
     folder = tmp_path_factory.mktemp("warm")
     for kind, base in (("problem", PROBLEM), ("study", STUDY)):
         path = folder / f"{kind}.toml"
-        path.write_text(_toml(base))
+        path.write_text(toml_text(base))
         used(kind, path)
 
 
@@ -195,7 +195,7 @@ def test_text_of_a_file_is_data(tmp_path, watch, case):
     for text in hostile(folder):
         for value in values(annotation, text):
             path = folder / "file.toml"
-            path.write_text(_toml(put(base, key, value)), encoding="utf-8")
+            path.write_text(toml_text(put(base, key, value)), encoding="utf-8")
             with watch.look() as seen, suppress(InvalidProblem):
                 used(kind, path)
             wrong = [one for one in seen if not harmless(one, folder)]

@@ -84,7 +84,7 @@ def batch_of(problem: Problem) -> Problem:
         Where more rows than can be handled share unknowns.
     """
     stations = problem.stations
-    if stations.covariance is not None and stations.span == "epoch":
+    if stations.estimated and stations.span == "epoch":
         # An offset of each epoch that nothing else shares is noise of that epoch, and needs no unknown.
         problem = replace(problem, stations=replace(stations, span="noise"))
     flat = (by_epoch(problem) if separable(problem) else problem).flat()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from optloc.base import linalg
 from optloc.base.linalg import centre_and_spread
 from optloc.base.types import Array
 from optloc.compute.sums import equations_at
-from optloc.linear.constraints import Face, exact, restore, tangent_at, violation
+from optloc.linear.constraints import Face, exact, levels, restore, tangent_at, violation
 from optloc.linear.normal import Normal, decrement, depends_on_place, marginal, step
 from optloc.problem.chart import INVERSE_RANGE, Chart, basis
 from optloc.problem.problem import Problem
@@ -44,18 +44,24 @@ def profile(problem: Problem, x: Array, at: Array, passes: int = 1) -> tuple[Arr
     """
     slot, _ = problem.layout.find("position")
     part, n = slice(slot.start, slot.start + slot.size), problem.layout.n_shared
-    own = np.r_[0 : slot.start, slot.start + slot.size : n]
+    own = others = np.r_[0 : slot.start, slot.start + slot.size : n]
     weighed = np.broadcast_to(at, x.shape) if depends_on_place(problem) else None
     alone = problem.layout.size == slot.size
     for left in range(passes - 1, -1, -1):
         equations = equations_at(problem, x, at=weighed)
         if alone:
             return equations.cost, equations.shared, equations.shared_vector
+        turn = _kept(problem, x, part, others)
+        if turn is not None:
+            equations, part = _turned(equations, turn), slice(0, slot.size)
+            own = np.arange(slot.size, turn.shape[-1])
         rest = _without(equations, own)
         move, _ = step(rest, np.zeros(rest.cost.shape))
         if left:
-            x = np.array(x)
-            x[..., own] += move[..., : len(own)]
+            x, shared = np.array(x), move[..., : len(own)]
+            if turn is not None:
+                shared = (turn[..., others[:, None], own] @ shared[..., None])[..., 0]
+            x[..., others] += shared
             x[..., n:] += move[..., len(own) :]
     information, vector, _ = marginal(equations)
     cost = equations.cost - decrement(rest, move, len(own))
@@ -66,6 +72,38 @@ def profile(problem: Problem, x: Array, at: Array, passes: int = 1) -> tuple[Arr
     solved, _ = linalg.solve(information[..., own[:, None], own], right)
     lost = coupling @ solved
     return cost, information[..., part, part] - lost[..., :-1], vector[..., part] - lost[..., -1]
+
+
+def _kept(problem: Problem, x: Array, part: slice, own: Array) -> Array | None:
+    """Return the directions (q, N, n, m) that equalities leave: those of the position, then of the other unknowns.
+
+    None where no equality is about other unknowns: a height that is kept along a course is about the velocity as well.
+    """
+    face = exact(problem)
+    if not face or not len(own):
+        return None
+    gradients = np.stack([levels(problem, face, one)[1] for one in x])[..., own]
+    if not gradients.any():
+        return None
+    _, sizes, axes = np.linalg.svd(np.where(np.isfinite(gradients), gradients, 0.0))
+    rank = int((sizes > _DEPENDENT * sizes.max(-1, keepdims=True)).sum(-1).max())
+    turn = np.zeros((*gradients.shape[:2], problem.layout.n_shared, part.stop - part.start + len(own) - rank))
+    for k, column in enumerate(range(part.start, part.stop)):
+        turn[..., column, k] = 1.0
+    turn[..., own, part.stop - part.start :] = np.swapaxes(axes[..., rank:, :], -1, -2)
+    return turn
+
+
+# Share of the largest gradient below which an equality says nothing that another one does not.
+_DEPENDENT = 1e-9
+
+
+def _turned(equations: Normal, turn: Array) -> Normal:
+    """Return the normal equations of other shared unknowns: ``turn`` (..., n, m) times those are the old ones."""
+    back = np.swapaxes(turn, -1, -2)
+    vector = (back @ equations.shared_vector[..., None])[..., 0]
+    shared, cross = back @ equations.shared @ turn, back[..., None, :, :] @ equations.cross
+    return replace(equations, shared=shared, cross=cross, shared_vector=vector)
 
 
 def _without(equations: Normal, own: Array) -> Normal:

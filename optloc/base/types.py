@@ -28,8 +28,11 @@ class Stations:
     covariance : array (..., s, d, d), optional
         Covariance of the position errors, square metres; None: surveyed exactly.
     span : "epoch", "run" or "noise"
-        A position error is an unknown of each epoch, or one that lasts the whole run; or it is drawn anew at each
-        epoch and not estimated: it enlarges the noise of the rows that the station takes part in.
+        An error of position or velocity is an unknown of each epoch, or one that lasts the whole run; or it is drawn
+        anew at each epoch and not estimated: it enlarges the noise of the rows that the station takes part in.
+    velocity_covariance : array (..., s, d, d), optional
+        Covariance of the velocity errors, square metres per second squared, independent of those of the positions;
+        None: known exactly. They enter the kinds that depend on velocities: range rates and their differences.
     """
 
     position: Array
@@ -38,6 +41,23 @@ class Stations:
     axes: Array | None = None
     covariance: Array | None = None
     span: Literal["epoch", "run", "noise"] = "epoch"
+    velocity_covariance: Array | None = None
+
+    @property
+    def errors(self) -> tuple[tuple[str, str, Array], ...]:
+        """Return name, SI unit and covariance (..., s, d, d) of the errors there are, in the order of their slots."""
+        both = (("stations", "m", self.covariance), ("station velocities", "m/s", self.velocity_covariance))
+        return tuple((name, unit, covariance) for name, unit, covariance in both if covariance is not None)
+
+    @property
+    def estimated(self) -> bool:
+        """Return whether errors of positions or velocities are unknowns."""
+        return self.span != "noise" and bool(self.errors)
+
+    @property
+    def weighed(self) -> bool:
+        """Return whether errors of positions or velocities are noise of each epoch."""
+        return self.span == "noise" and bool(self.errors)
 
     @property
     def dimension(self) -> int:

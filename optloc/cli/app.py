@@ -18,9 +18,14 @@ from optloc.cli.options import (
     EXIT_CODES,
     AboveGround,
     Allow,
+    AmbiguityDraws,
     Box,
     Budget,
+    Choose,
+    Costs,
+    Criterion,
     Explain,
+    FailOne,
     Force,
     Geodetic,
     Group,
@@ -31,6 +36,8 @@ from optloc.cli.options import (
     Method,
     NoiseFromData,
     Outside,
+    PlacementMap,
+    PlaceOfInterest,
     Plot,
     ProblemPath,
     Quiet,
@@ -169,8 +176,10 @@ def fix(
         "optloc track flight.toml --out track.csv --plot track.png",
         "optloc track flight.toml --model csm --noise 30 --filter ekf",
         "optloc track flight.toml --json | jq '.scans[-1]'",
+        "optloc track messages.csv --stations sites.csv --sigma '20 ns'",
     ),
 )
+@takes_table
 def track(
     file: ProblemPath,
     model: Annotated[str, name_in("motions", "How the target moves, such as cv or csm", "--model")] = "cv",
@@ -211,12 +220,18 @@ def track(
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
+    given: Any = None,
 ) -> None:
-    """Track the targets of a problem file through its scans, from fixes of its first ones, without a guess."""
+    """Track the targets of a problem file, or of a table, through its scans, from fixes of its first ones.
+
+    It needs no guess. A table needs --stations and --sigma.
+    """
     from optloc.cli.track import Wanted, rules, run_track
 
     wanted = Wanted(model, filter_, noise, memory, rules(gate, gap), start, start_sigma, loss)
-    raise typer.Exit(run_track(file, wanted, out=out, as_json=as_json, plot=plot, html=html, quiet=quiet))
+    files = {"out": out, "plot": plot, "html": html}
+    told = table_told(file, given)
+    raise typer.Exit(run_track(file, wanted, **files, as_json=as_json, quiet=quiet, table=told))
 
 
 @app.command(
@@ -335,8 +350,52 @@ def crlb(
 
 @app.command(
     rich_help_panel=ANSWERS,
-    epilog=example("optloc check site.toml", "optloc check flight.toml --plot health.svg --out health.csv"),
+    epilog=example(
+        "optloc place sites.toml",
+        "optloc place sites.toml -k 6 --worst --fail-one --plot map.png --out chosen.toml",
+        "optloc place site.toml -k 4 --at 1200,800,50",
+    ),
 )
+def place(
+    file: ProblemPath,
+    choose: Choose = None,
+    budget_: Costs = None,
+    criterion: Criterion = None,
+    worst: Annotated[bool | None, typer.Option("--worst/--mean", help="The worst place counts, or the mean.")] = None,
+    fail_one: FailOne = None,
+    gap: Annotated[float | None, typer.Option(metavar="SHARE", help="Stop when the bound is as close.")] = None,
+    time: Annotated[float | None, typer.Option(metavar="SECONDS", help="Stop after so long.")] = None,
+    at: PlaceOfInterest = None,
+    rows: Annotated[bool, typer.Option("--rows", help="Choose single measurements, not stations.")] = False,
+    draws: AmbiguityDraws = 20,
+    out: Annotated[Path | None, typer.Option(metavar="OUT.toml", help="Write the chosen stations.")] = None,
+    plot: PlacementMap = None,
+    as_json: Json = False,
+    outside: Outside = False,
+    budget: Budget = None,
+    force: Force = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Choose where stations go: which of many sites give the best fixes, with a bound of what any choice can reach.
+
+    FILE is a plan (choice, candidates, targets), or a problem file, of whose stations some are chosen for one target.
+    """
+    from optloc.cli.place import Wanted, run_place
+
+    wanted = Wanted(choose, budget_, criterion, worst, fail_one, gap, time, at, rows, draws)
+    raise typer.Exit(run_place(file, wanted, plot=plot, out=out, as_json=as_json, quiet=quiet))
+
+
+@app.command(
+    rich_help_panel=ANSWERS,
+    epilog=example(
+        "optloc check site.toml",
+        "optloc check flight.toml --plot health.svg --out health.csv",
+        "optloc check toa.csv --stations sites.csv --sigma '20 ns'",
+    ),
+)
+@takes_table
 def check(
     file: ProblemPath,
     as_json: Json = False,
@@ -352,14 +411,16 @@ def check(
     force: Force = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
+    given: Any = None,
 ) -> None:
-    """Say what a file holds (rows, redundancy, geometry) and, of many epochs, how healthy its stations are.
+    """Say what a file or a table holds (rows, redundancy, geometry) and, of many epochs, how healthy its stations are.
 
     Each epoch is fixed, and each station compared with what the others say: bias, scale, noise, outliers.
     """
     from optloc.cli.check import Asked, run_check
 
-    raise typer.Exit(run_check(file, as_json, Asked(not no_solve, method, by, out, plot), quiet=quiet))
+    asked = Asked(not no_solve, method, by, out, plot)
+    raise typer.Exit(run_check(file, as_json, asked, quiet=quiet, table=table_told(file, given)))
 
 
 @app.command(

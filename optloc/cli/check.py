@@ -18,6 +18,7 @@ from optloc.base.outputs import together
 from optloc.base.types import Array, Bias, Stations
 from optloc.cli.file_fixes import CHUNK
 from optloc.cli.fix import advice_for_vectors, advice_json, grouping_of, late_json, level_json, show_advice, tell_level
+from optloc.cli.from_table import read_problem
 from optloc.cli.output import (
     Screen,
     bar,
@@ -28,7 +29,8 @@ from optloc.cli.output import (
     write_table,
     write_text,
 )
-from optloc.files import Loaded, read
+from optloc.files import Loaded
+from optloc.files.readings import Told
 from optloc.linear.constraints import exact
 from optloc.models import MODELS
 from optloc.problem.epochs import separable
@@ -53,11 +55,13 @@ class Asked:
     plot: Path | None = None
 
 
-def run_check(file: Path, as_json: bool, asked: Asked | None = None, *, quiet: bool = False) -> int:
+def run_check(
+    file: Path, as_json: bool, asked: Asked | None = None, *, quiet: bool = False, table: Told | None = None
+) -> int:
     """Print a summary of a file and its health; the exit code is 1 where some epoch cannot be fixed."""
     asked = asked or Asked()
     # A file without measured values can be checked, too, before the campaign.
-    loaded = read(file, values=False)
+    loaded = read_problem(file, table, values=False, quiet=quiet or as_json)
     claim_outputs(table=asked.out, picture=asked.plot, inputs=[file])
     found = summary(loaded)
     checked = _health(loaded, asked, quiet or as_json)
@@ -68,10 +72,10 @@ def run_check(file: Path, as_json: bool, asked: Asked | None = None, *, quiet: b
         more |= {} if checked is None or checked.late is None else {"late_signals": late_json(checked.late)}
         write_text(Path("-"), dumps(found | more | {"advice": advice_json(told)}))
     elif not quiet:
-        table = Table(title=loaded.title, show_header=False, title_justify="left")
+        sheet = Table(title=loaded.title, show_header=False, title_justify="left")
         for name, value in found.items():
-            table.add_row(name.replace("_", " "), _spell(value))
-        Screen().print(table)
+            sheet.add_row(name.replace("_", " "), _spell(value))
+        Screen().print(sheet)
         if checked is not None:
             _show_health(checked, Screen())
             say_all(Screen(), tell_level(checked.level, late=checked.late))
@@ -139,6 +143,7 @@ def summary(loaded: Loaded) -> dict[str, Any]:
         "stations": problem.stations.count,
         "moving_stations": _count_moving(problem.stations),
         "station_errors": _errors(problem),
+        **({} if problem.medium is None else {"medium": problem.medium.words}),
         "epochs": problem.epochs,
         "duration_s": float(np.ptp(loaded.times)),
         "targets": len(set(loaded.targets)),
@@ -163,13 +168,14 @@ def _count_moving(stations: Stations) -> int:
 
 
 def _errors(problem: Problem) -> str:
-    """Return the size of the errors of station positions, and how long they last."""
-    covariance, span = problem.stations.covariance, problem.stations.span
-    if covariance is None:
-        return "none"
-    sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-    sizes = f"{sigma.min():.4g}" if np.ptp(sigma) == 0.0 else f"{sigma.min():.4g} to {sigma.max():.4g}"
-    return f"{sizes} m, {'noise of each epoch' if span == 'noise' else f'unknown for each {span}'}"
+    """Return the size of the errors of station positions and velocities, and how long they last."""
+    sizes, span = [], problem.stations.span
+    for _, unit, covariance in problem.stations.errors:
+        sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+        low, high = sigma.min(), sigma.max()
+        sizes.append(f"{low:.4g} {unit}" if low == high else f"{low:.4g} to {high:.4g} {unit}")
+    lasts = "noise of each epoch" if span == "noise" else f"unknown for each {span}"
+    return f"{' and '.join(sizes)}, {lasts}" if sizes else "none"
 
 
 def _bias(loaded: Loaded, bias: Bias) -> str:
@@ -199,10 +205,10 @@ def _redundancy(problem: Problem, alone: bool) -> Array:
     known += sum(prior.mean.shape[-1] for prior in problem.priors)
     # the steps of a walk are known to be small: a row for each
     known += (problem.epochs - 1) * sum(bias.density.size for bias in problem.biases if bias.density is not None)
-    if problem.stations.covariance is not None and problem.stations.span != "noise":
-        # Surveyed positions count as measured: each unknown offset comes with a prior of its own.
+    if problem.stations.estimated:
+        # What is surveyed counts as measured: each unknown offset comes with a prior of its own.
         times = 1 if alone or problem.stations.span == "run" else problem.epochs
-        known += problem.stations.count * problem.dimension * times
+        known += len(problem.stations.errors) * problem.stations.count * problem.dimension * times
     if alone:
         return np.asarray(present + known - layout.size // problem.epochs)
     return np.array([present.sum() + known - layout.size])

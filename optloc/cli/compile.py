@@ -30,12 +30,13 @@ from optloc.compute.kept import alone, is_kept, kept_in
 from optloc.compute.manifest import installed
 from optloc.linear.constraints import height
 from optloc.linear.simulate import simulate
+from optloc.placement import Plan, place
 from optloc.problem.build import assemble, measured
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.proof.scope import SHORT
 from optloc.solvers import solve
-from optloc.solvers.certify.branch_and_bound import certify
+from optloc.solvers.certify.admitted import certify
 from optloc.solvers.prepared import prepare
 from optloc.solvers.starts.best_first import best_first_starts
 from optloc.track.updates import ekf
@@ -120,6 +121,11 @@ def _cover() -> None:
         likelihood_region(problem, _plainly_solved(problem))
 
 
+def _place() -> None:
+    # the criteria differ by numbers, not by types
+    place(Plan(_posed("toa"), _TARGET[None], choose=4, gap=0.5))
+
+
 @dataclass(frozen=True, slots=True)
 class Part:
     """What one process compiles: how that is had, and the kernels that Python calls."""
@@ -159,7 +165,8 @@ PARTS: Mapping[str, Part] = {
         (_prove_runs,),
         (
             *(f"optloc.proof.runs.{name}" for name in ("search.tables_of", "prove.prove_run", "prove.cost_of_place")),
-            *(f"optloc.proof.runs.states.{name}" for name in ("cost_of_state", "hessian_of_state")),
+            "optloc.proof.runs.states.cost_of_state",
+            "optloc.proof.runs.state_bounds.hessian_of_state",
             "optloc.proof.runs.state_search.prove_course",
         ),
     ),
@@ -168,6 +175,12 @@ PARTS: Mapping[str, Part] = {
         "optloc.proof",
         (_search,),
         tuple(f"optloc.proof.best_first._search_{where}" for where in ("everywhere", "sides", "region")),
+    ),
+    "placements": Part(
+        "placements of stations",
+        "optloc.placement",
+        (_place,),
+        tuple(f"optloc.placement.branching.{name}" for name in ("propagate", "expand", "score", "settle")),
     ),
     "regions": Part(
         "cells of regions",

@@ -25,7 +25,7 @@ from optloc.cli.file_fixes import (
     fixes_json,
     geojson,
 )
-from optloc.cli.from_table import read_table_problem
+from optloc.cli.from_table import read_problem
 from optloc.cli.output import (
     Screen,
     claim_outputs,
@@ -36,7 +36,7 @@ from optloc.cli.output import (
     write_table,
     write_text,
 )
-from optloc.files import Loaded, read
+from optloc.files import Loaded
 from optloc.files.readings import Told
 from optloc.files.schema import ConstraintTable
 from optloc.problem.fix import Fix
@@ -90,10 +90,7 @@ def run_fix(
     on_output = geojson_path is not None and str(geojson_path) == "-"
     if as_json and on_output:
         raise InvalidProblem("JSON and GeoJSON cannot both go to standard output", "--geojson", "name a file")
-    if table is None:
-        loaded = read(file, more=more)
-    else:
-        loaded = read_table_problem(file, table, more, quiet=quiet or as_json, on_error=on_output)
+    loaded = read_problem(file, table, more, quiet=quiet or as_json, on_error=on_output)
     claim_outputs(geojson_path, html, table=out, picture=plot, inputs=[file])
     loaded = _estimate_noise(loaded, noise)
     rescaled = _common_level(loaded.problem) if rescale else None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import wraps
 from inspect import Parameter, signature
@@ -21,13 +22,16 @@ if TYPE_CHECKING:
     from optloc.files.readings import Told
     from optloc.files.schema import ConstraintTable
 
-_TABLES = (".csv", ".tsv", ".txt", ".log", ".json", ".jsonl", ".ndjson", ".parquet", ".pq")
+_TABLES = (".csv", ".tsv", ".txt", ".log", ".json", ".jsonl", ".ndjson", ".parquet", ".pq", ".rnx", ".obs")
+# RINEX observations of a year, such as site1230.21o.
+_YEAR = re.compile(r"\.\d\do")
 PANEL = "A table"
 EXAMPLES = (
     "optloc convert toa.csv --stations sites.geojson --sigma '20 ns' --out a.toml",
     "optloc convert messages.csv --stations rx.csv --as arrivals --unit ns --sigma '50 ns'",
     "optloc convert picks.csv --stations net.csv --vp '6 km/s' --vs '3.5 km/s' --sigma '0.1 s' --out b.toml",
     "optloc convert gnss.csv --column pseudorange=C1C --sigma '3 m' --out gnss.toml",
+    "optloc convert site.21o --navigation site.21n --sigma '1 m' --out gnss.toml",
     "optloc convert sites.geojson --out stations.csv",
     "optloc convert iridium.tle --times passes.csv --out satellites.csv",
 )
@@ -84,6 +88,11 @@ _OPTIONS: dict[str, Any] = {
     "window": Annotated[_TEXT, _option("TIME", "Readings within it belong together, such as '0.1 s'.", "--window")],
     "still": Annotated[bool, _flag("The target stays: all readings belong together.", "--still")],
     "zone": Annotated[_TEXT, _option("NAME", "Time zone of dates without one: UTC, Europe/Rome.", "--zone")],
+    "navigation": Annotated[
+        Path | None, _option("FILE", "RINEX navigation beside RINEX observations or Android's log.", "--navigation")
+    ],
+    "system": Annotated[_TEXT, _option("G|E|J", "Satellites that are taken; GPS by default.", "--system")],
+    "mask": Annotated[_TEXT, _option("ANGLE", "Lowest elevation of satellites; 10 deg by default.", "--mask")],
 }
 
 
@@ -114,7 +123,8 @@ def convert(
         Path,
         typer.Argument(
             metavar="FILE",
-            help="Readings or pseudoranges (CSV, Parquet, JSON), GeoJSON stations, or orbits (elements, OMM, SP3).",
+            help="Readings or pseudoranges (CSV, Parquet, JSON, RINEX, Android), GeoJSON stations, or orbits "
+            "(elements, OMM, SP3).",
         ),
     ],
     out: Annotated[
@@ -216,7 +226,7 @@ def table_told(file: Path, given: Mapping[str, Any]) -> Told | None:
     """Return what is said of a table, None of a problem file; raise InvalidProblem where something is said of that."""
     from optloc.files.readings import Told
 
-    if file.suffix.lower() in _TABLES:
+    if file.suffix.lower() in _TABLES or _YEAR.fullmatch(file.suffix.lower()):
         return Told(**given)
     said = [name for name, value in given.items() if value]
     if said:
@@ -226,13 +236,37 @@ def table_told(file: Path, given: Mapping[str, Any]) -> Told | None:
     return None
 
 
-def read_table_problem(
-    file: Path, told: Told, more: Mapping[str, ConstraintTable], *, quiet: bool, on_error: bool
+def read_problem(
+    file: Path,
+    told: Told | None,
+    more: Mapping[str, ConstraintTable] | None = None,
+    *,
+    values: bool = True,
+    quiet: bool = False,
+    on_error: bool = False,
 ) -> Loaded:
-    """Return the problem of a table with more constraints, and say what it is understood to be."""
+    """Return a problem file with more constraints, or a table with what is told of it, and say how that is understood.
+
+    Parameters
+    ----------
+    file : Path
+        Problem file, or table.
+    told : Told, optional
+        What is said of a table; None of a problem file.
+    more : mapping, optional
+        Further constraints.
+    values : bool
+        Whether a problem file needs measured values.
+    quiet, on_error : bool
+        Whether nothing is said of a table, and whether it is said on standard error.
+    """
+    from optloc.files import read
+
+    if told is None:
+        return read(file, values=values, more=more)
     from optloc.cli.output import Screen
     from optloc.files.convert import understood
 
     plan = understood(file, told)
     _tell(plan, Screen(quiet=quiet, stderr=on_error))
-    return plan.read(more)
+    return plan.read(more or {})

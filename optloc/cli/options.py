@@ -224,7 +224,7 @@ ProblemPath = Annotated[
     Path,
     typer.Argument(
         metavar="FILE",
-        help="Problem file (TOML, format = 1), the name of a shipped one, or - for standard input.",
+        help="Problem file (TOML, format = 2), the name of a shipped one, or - for standard input.",
         callback=find_problem,
     ),
 ]
@@ -381,3 +381,26 @@ def constraints(height: str | None, above_ground: bool, box: str | None) -> dict
         low, high = (coordinates(corner, "--box", advice, bounds=True) for corner in box.split(":", 1))
         found["--box"] = ConstraintTable(kind="box", min=low, max=high)
     return found
+
+
+# Of where to put stations.
+
+Choose = Annotated[
+    int | None, typer.Option("--choose", "-k", min=1, help="Candidates to take, beyond the stations kept.")
+]
+Costs = Annotated[float | None, typer.Option("--cost", min=0.0, metavar="SUM", help="What they may cost together.")]
+Criterion = Annotated[
+    str | None,
+    typer.Option(metavar="rms|volume|axis", help="Mean-square error, volume or longest axis of the ellipsoid."),
+]
+FailOne = Annotated[bool | None, typer.Option("--fail-one/--no-fail", help="The worst loss of any one station counts.")]
+PlaceOfInterest = Annotated[
+    str | None,
+    typer.Option(metavar="X,Y[,Z]", help="The one place of interest; of a problem file, by default its fix."),
+]
+AmbiguityDraws = Annotated[
+    int, typer.Option(min=0, help="Simulated fixes at each place that check for ambiguity; 0 for none.")
+]
+PlacementMap = Annotated[
+    Path | None, typer.Option("--plot", metavar="OUT.png", help="Draw the bound before and after.")
+]

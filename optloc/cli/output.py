@@ -157,3 +157,26 @@ def meter(title: str, quiet: bool) -> Iterator[Callable[[int, int], None]]:
             yield tell
         finally:
             lines.end()
+
+
+@contextmanager
+def line(quiet: bool) -> Iterator[Callable[[str], None]]:
+    """Yield a function that is told how far something is, in words: a line on terminals, elsewhere one now and then."""
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    console, known = Screen(stderr=True), [""]
+    lines = Reporter(lambda: known[0])
+    lines.muted = quiet or console.is_terminal
+    parts = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    with Progress(*parts, console=console, disable=quiet or not console.is_terminal, transient=True) as progress:
+        task = progress.add_task("", total=None)
+
+        def tell(text: str) -> None:
+            known[0] = text
+            progress.update(task, description=text)
+
+        lines.begin()
+        try:
+            yield tell
+        finally:
+            lines.end()

@@ -213,7 +213,7 @@ def _compose(kind: str, model: Model) -> str:
     lines = [
         f"# {kind}: {model.summary}.",
         f"# truth: {', '.join(f'{v:g}' for v in _TRUTH[:d])}",
-        "format = 1",
+        "format = 2",
         f'title = "Rows of {kind} beside ranges"',
         "",
         "[stations]",

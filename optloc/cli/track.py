@@ -14,6 +14,7 @@ from rich.text import Text
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.outputs import is_stream
+from optloc.cli.from_table import read_problem
 from optloc.cli.options import coordinates
 from optloc.cli.output import (
     LOG,
@@ -27,7 +28,8 @@ from optloc.cli.output import (
     write_table,
     write_text,
 )
-from optloc.files import Loaded, read
+from optloc.files import Loaded
+from optloc.files.readings import Told
 from optloc.files.writer import GrowingTable
 from optloc.problem.problem import Problem
 from optloc.report.columns import Columns, covariance_columns, geodetic_columns, join_tables, records
@@ -142,8 +144,9 @@ def run_track(
     plot: Path | None = None,
     html: Path | None = None,
     quiet: bool = False,
+    table: Told | None = None,
 ) -> int:
-    """Track the targets of a file, write what was asked for, and return the exit code.
+    """Track the targets of a file or a table, write what was asked for, and return the exit code.
 
     Whatever goes wrong on the way, the track up to there is written first; of a run that is killed the rows up to then
     stand in a CSV file beside `out`, with ``.partial`` behind its name.
@@ -151,20 +154,20 @@ def run_track(
     dynamics = dynamics_of(wanted)
     # Wrong words are refused before the file is read.
     update = filter_of(wanted.filter) if wanted.loss is None else reweighted(wanted.filter, wanted.loss)
-    loaded = read(file)
+    loaded = read_problem(file, table, quiet=quiet or as_json)
     claim_outputs(html, table=out, picture=plot, inputs=[file])
     ones = [TargetTrack(*parts, []) for parts in runs_of(loaded)]
     if wanted.start is not None and len(ones) > 1:
         raise InvalidProblem("one initial state does not fit several targets", "--start", "leave it out")
-    table = GrowingTable(out) if out is not None and not is_stream(out) else None
+    growing = GrowingTable(out) if out is not None and not is_stream(out) else None
     try:
         with bar(loaded.title, sum(one.problem.epochs for one in ones), quiet or as_json) as advance:
             for one in ones:
                 start = _start(one.problem, dynamics, wanted)
                 for entry in tracked(one.problem, dynamics, update, start=start, rules=wanted.rules):
                     one.entries.append(entry)
-                    if table is not None:
-                        table.add(track_columns(one.last))
+                    if growing is not None:
+                        growing.add(track_columns(one.last))
                     advance(1)
     # Interrupted or refused half way: what is known by then is written.
     finally:
@@ -172,7 +175,7 @@ def run_track(
             join_tables([track_columns(one) for one in ones if one.entries]) if any(o.entries for o in ones) else {}
         )
         if columns:
-            _write(loaded, ones, columns, (out, plot, html), table)
+            _write(loaded, ones, columns, (out, plot, html), growing)
             if as_json:
                 write_text(Path("-"), dumps({"file": loaded.source, "title": loaded.title, "scans": records(columns)}))
     if not quiet and not as_json:

@@ -15,7 +15,14 @@ PACKAGE = Path(__file__).resolve().parents[1]
 """The folder of optloc."""
 
 # All files and folders of optloc that kernels stand in, or take constants from: constants are part of machine code.
-SOURCES = ("compute", "proof", "base/linalg.py", "linear/normal.py", "models/primitives.py")
+SOURCES = (
+    "compute",
+    "proof",
+    "base/linalg.py",
+    "linear/normal.py",
+    "models/primitives.py",
+    *(f"placement/{name}.py" for name in ("criteria", "relaxation", "branching")),
+)
 
 PREFIX = "optloc-"
 """How the names of folders of machine code begin."""

@@ -371,8 +371,9 @@ def trace(problem: Problem, plan: Plan, given: frozenset[int], moved: frozenset[
         Inputs that unknowns move: those that derivatives are wanted of.
     """
     model = plan.model
-    frame = problem.frame if model.ecef else None
-    key = (model, given, moved, problem.dimension, frame)
+    medium = problem.medium if model.straight else None
+    frame = problem.frame if model.ecef or medium is not None else None
+    key = (model, given, moved, problem.dimension, frame, medium)
     return _TRACED.find(key, lambda: _trace(problem, model, given, moved))
 
 

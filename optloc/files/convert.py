@@ -24,6 +24,7 @@ from optloc.base.units import UNITS
 from optloc.files.foreign import read_table
 from optloc.files.measurements import ESTIMATE
 from optloc.files.orbits import read_orbits
+from optloc.files.pseudoranges import is_gnss, received
 from optloc.files.reader import Loaded, read
 from optloc.files.readings import CARTESIAN, COMPASS, Named, Readings, Told, named_columns, sort_named, sorts_of
 from optloc.files.roles import GUESSES, PLACE, Places, Roles, places_of, scaled, stem, unit_of
@@ -99,7 +100,7 @@ class Plan:
             place = Path(folder) / f"{re.sub(r'[^A-Za-z0-9_-]', '_', self.source.stem)[:_LETTERS]}.toml"
             # A height that is told takes the place of one that was assumed.
             (replace(self, height="") if "--height" in (more or {}) else self).write(place)
-            return read(place, more=more)
+            return replace(read(place, more=more), source=self.source.name)
 
     def write(self, out: Path) -> tuple[Path, ...]:
         """Write a problem file with its tables beside it, and return their paths."""
@@ -119,7 +120,7 @@ class Plan:
     def _text(self, names: Sequence[str]) -> str:
         # JSON spells strings as TOML does, but for signs beyond 16 bits, which stay as they are.
         quoted = partial(json.dumps, ensure_ascii=False)
-        lines = [f"# Made from {quoted(self.source.name)} by optloc convert.", "format = 1"]
+        lines = [f"# Made from {quoted(self.source.name)} by optloc convert.", "format = 2"]
         lines += [f"title = {quoted(self.source.stem)}", *self.lines, "", "[frame]", f'kind = "{self.places.frame}"']
         lines += ["", "[stations]", f"file = {quoted(names[0])}", f'unit = "{self.places.unit}"']
         for section, name in zip(self.sections, names[1:], strict=True):
@@ -153,7 +154,8 @@ def convert(
     Parameters
     ----------
     source : Path
-        Readings of receivers or pseudoranges as CSV, Parquet or JSON; or stations, as such a table or as GeoJSON; or
+        Readings of receivers or pseudoranges as CSV, Parquet or JSON, pseudoranges as RINEX or as a log of Android, the
+        navigation file beside it; or stations, as such a table or as GeoJSON; or
         orbits of satellites, as two-line elements, OMM (JSON, CSV) or SP3.
     out : Path
         Problem file to write, .toml; its tables go to CSV files beside it. Of stations alone: the CSV file.
@@ -227,6 +229,8 @@ def understood(source: Path, told: Told) -> Plan:
         For what is wrong, and for what may mean two things: naming the option that says which.
     """
     _check_told(told)
+    if is_gnss(source):
+        return _gnss(source, told)
     roles = Roles(read_table(source), told.columns)
     satellites = roles.find("pseudorange") is not None and roles.find("satellite") is not None
     if told.what == "pseudoranges" or (told.what is None and satellites):
@@ -481,6 +485,16 @@ def _pseudoranges(source: Path, roles: Roles, told: Told) -> Plan:
         ("satellites", f"{len(set(satellite.tolist()))} at x, y, z in {length}, along ECEF"),
     )
     return Plan(source, (section,), Places(satellites, "ecef", length), about)
+
+
+def _gnss(source: Path, told: Told) -> Plan:
+    """Return what a receiver of navigation satellites has seen as arrivals, like a table of pseudoranges."""
+    found = received(source, told.navigation, told.sigma, system=told.system, mask=told.mask)
+    columns = {"epoch": found.epoch, "time": found.time, "a": found.satellite, "z": np.round(found.z, 4)}
+    columns["sigma"] = np.round(found.sigma, 3)
+    places = {"name": found.satellite, "epoch": found.epoch} | dict(zip("xyz", np.round(found.place, 4).T, strict=True))
+    section = Section("toa", columns, "m", None, "the range and the receiver's clock")
+    return Plan(source, (section,), Places(places, "ecef", "m"), found.about, found.notes)
 
 
 def _check_once(roles: Roles, epoch: Array, satellite: Array) -> None:

@@ -1,4 +1,4 @@
-"""Files of other programs as tables: CSV and Parquet, JSON of mlat-server, logs of KrakenSDR and of Android."""
+"""Files of other programs as tables: CSV and Parquet, JSON of mlat-server, logs of KrakenSDR."""
 
 from __future__ import annotations
 
@@ -72,23 +72,7 @@ def _kraken(text: str, source: str) -> Table:
     return replace(of_rows(rows, source, {}), notes=(note,))
 
 
-def _android(text: str, source: str) -> Table:
-    """Refuse the raw log of an Android phone: it does not say where the satellites are."""
-    advice = "convert a table with satellite, its x, y, z and the corrected pseudorange of each row"
-    raise InvalidProblem("a GnssLogger log has times of signals, but no places of satellites", source, advice)
-
-
-def _rinex(text: str, source: str) -> Table:
-    """Refuse RINEX: observations become pseudoranges only beside orbits and clocks, which optloc does not read."""
-    advice = "make a table of pseudoranges and satellite places of it, with gnss_lib_py or RTKLIB for instance"
-    raise InvalidProblem("this is RINEX, which is not read", source, advice)
-
-
-_LOGS: tuple[tuple[re.Pattern[bytes], Callable[[str, str], Table]], ...] = (
-    (_KRAKEN, _kraken),
-    (re.compile(rb"#\s*\r?\n#\s*Header|# ?Raw,|# ?Version:.*Platform"), _android),
-    (re.compile(rb" *\d\.\d\d +.{0,40}RINEX VERSION"), _rinex),
-)
+_LOGS: tuple[tuple[re.Pattern[bytes], Callable[[str, str], Table]], ...] = ((_KRAKEN, _kraken),)
 """How each log begins, and what reads it."""
 
 

@@ -21,6 +21,7 @@ from optloc.files.stations import survey
 from optloc.files.table import Table, of_frame
 from optloc.linear import constraints
 from optloc.models import MODELS
+from optloc.models.medium import Medium
 from optloc.problem.build import Measured, assemble, measured, station_array
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
@@ -92,7 +93,7 @@ def locate(
     reference: str | None = None,
     height: Any = None,
     frame: str = "cartesian",
-    speed: float = SPEED_OF_LIGHT,
+    speed: float | Medium = SPEED_OF_LIGHT,
     method: str = "auto",
 ) -> Fix:
     """Return where something is from what receivers measured of it, in one call.
@@ -132,8 +133,9 @@ def locate(
         Known height of the target: metres above the WGS 84 ellipsoid, or along z where there is no Earth.
     frame : "cartesian" or "ecef"
         What x, y, z of stations mean.
-    speed : float
-        Propagation speed, m/s: light, or `optloc.units.sound_in_air` and `sound_in_water`.
+    speed : float, Layers or Atmosphere
+        Propagation speed, m/s: light, or `optloc.units.sound_in_air` and `sound_in_water`; or `optloc.Layers` and
+        `optloc.Atmosphere`, through which rays bend.
     method : str
         As of `optloc.solve`.
 
@@ -166,9 +168,12 @@ def locate(
     return solve(_pose(stations, latlon, given, sigma, unit, reference, height, frame, _speed(speed)), method=method)
 
 
-def _speed(given: Any) -> float:
+def _speed(given: Any) -> float | Medium:
+    if isinstance(given, Medium):
+        return given
     if isinstance(given, bool) or not isinstance(given, float | int | np.number) or not 0.0 < given < np.inf:
-        raise InvalidProblem("the speed is no positive number", "speed", "give metres per second")
+        advice = "give metres per second, optloc.Layers or optloc.Atmosphere"
+        raise InvalidProblem("the speed is no positive number", "speed", advice)
     return float(given)
 
 
@@ -186,9 +191,10 @@ def _pose(
     reference: str | None,
     height: Any,
     frame: str,
-    speed: float,
+    through: float | Medium,
 ) -> Problem:
     """Return the problem of the arguments of `locate`."""
+    medium, speed = (through, through.unit_speed) if isinstance(through, Medium) else (None, through)
     places = _receivers(stations, latlon, frame)
     rows = []
     for word, values in given.items():
@@ -199,7 +205,7 @@ def _pose(
         spread = _spread(_per_word(sigma, word, given, "sigma"), word, units, own)
         rows.append(_rows(word, found, spread, step, places, speed))
     at = _heights(height, places, given)
-    return assemble(places.stations, *rows, frame=places.frame, constraints=at)
+    return assemble(places.stations, *rows, frame=places.frame, constraints=at, medium=medium)
 
 
 # Where the receivers are.

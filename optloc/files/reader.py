@@ -16,7 +16,17 @@ from optloc.base.inputs import Budget, access, at_most
 from optloc.base.types import Array, Bias, Rows, Stations
 from optloc.files.measurements import ESTIMATE, Chunk, check_repeats, chunks_of, square, with_baseline
 from optloc.files.roles import ASSUMED, azimuths_of, in_our_words
-from optloc.files.schema import ConstraintTable, ProblemFile, Units, join, name_of, read_document, speed_of, validate
+from optloc.files.schema import (
+    ConstraintTable,
+    ProblemFile,
+    Units,
+    join,
+    medium_in,
+    name_of,
+    read_document,
+    speed_of,
+    validate,
+)
 from optloc.files.stations import over_epochs, survey
 from optloc.files.table import Epochs, Keys, Table, epochs_of, need_clock, of_frame, table_of
 from optloc.files.unknowns import (
@@ -30,6 +40,7 @@ from optloc.files.unknowns import (
     prior_of,
 )
 from optloc.models import MODELS
+from optloc.models.medium import Medium
 from optloc.problem.check import checked
 from optloc.problem.noise import Block, Noise, arrivals, group, together
 from optloc.problem.problem import Problem
@@ -255,7 +266,7 @@ def _problem(
     constraints, motions = constraints_of(demands, stations, frame, motions, epochs.targets, times, speed)
     made = Problem(stations, rows, noise, times, motions, biases, priors, frame, constraints)
     at_most("unknowns", made.layout.n_shared, source)
-    return _check(made, source)
+    return _check(made, source, medium_in(file, source))
 
 
 def _epochs(file: ProblemFile, chunks: Sequence[Chunk], source: str) -> Epochs:
@@ -442,9 +453,9 @@ def with_noise(file: ProblemFile, problem: Problem, source: str) -> tuple[Proble
         raise InvalidProblem(error.what, place, error.advice) from None
 
 
-def _check(problem: Problem, source: str) -> Problem:
+def _check(problem: Problem, source: str, medium: Medium | None = None) -> Problem:
     try:
-        return checked(problem)
+        return checked(problem if medium is None else problem.in_medium(medium))
     # A complaint of the problem gets the name of the file in front.
     except InvalidProblem as error:
         raise InvalidProblem(error.what, join(source, error.where), error.advice) from None
@@ -524,7 +535,7 @@ def from_table(
     measured = {"kind": kind, "unit": dict(unit) if isinstance(unit, Mapping) else unit, "sigma": sigma, **options}
     # The arguments as a problem file: one reader serves both, and complaints name "arguments".
     settings = {
-        "format": 1,
+        "format": 1,  # of arguments: azimuths are counted as they always were
         "propagation_speed": propagation_speed,
         "frame": place,
         "stations": dict(station_options or {}),

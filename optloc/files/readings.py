@@ -109,6 +109,12 @@ class Told:
         Whether the target stays, so that all readings belong together.
     zone : str, optional
         Time zone of dates that name none, such as "UTC" or "Europe/Rome".
+    navigation : Path, optional
+        RINEX navigation file beside RINEX observations or a log of Android.
+    system : str, optional
+        Letter of the system whose satellites are taken: "G", "E" or "J"; GPS.
+    mask : str, optional
+        Elevation below which satellites are left out, such as "15 deg"; 10 degrees.
     """
 
     stations: Path | None = None
@@ -128,6 +134,9 @@ class Told:
     window: str | None = None
     still: bool = False
     zone: str | None = None
+    navigation: Path | None = None
+    system: str | None = None
+    mask: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,6 +23,7 @@ from optloc.base.units import (
     sound_in_water,
 )
 from optloc.models import MODELS, Model, kind_named
+from optloc.models.medium import Atmosphere, Layers, Medium
 
 # Words that a file may get wrong, and amounts such as "30 ns".
 
@@ -175,15 +176,18 @@ class StationsTable(DataTable):
     unit: str = "m"
     """Unit of x, y, z, height and sigma."""
     speed_unit: str = "m/s"
-    """Unit of vx, vy, vz."""
+    """Unit of vx, vy, vz and velocity_sigma."""
     time_unit: str = "s"
     """Unit of the time column of moving stations."""
     axes: Literal["frame", "enu"] | None = None
     """Axes that angles refer to: the frame's, or east, north, up at each station (default on Earth)."""
     sigma: Amount | None = None
     """Standard deviation of each coordinate of the positions; None: surveyed exactly."""
+    velocity_sigma: Amount | None = None
+    """Standard deviation of each coordinate of the velocities; None: known exactly."""
     span: Literal["epoch", "run", "noise"] = "epoch"
-    """Whether a position error is an unknown of each epoch, one of the whole run, or noise drawn anew at each epoch."""
+    """Whether an error of position or velocity is an unknown of each epoch, one of the whole run, or noise drawn anew
+    at each epoch."""
 
 
 def _kind_words() -> list[str]:
@@ -285,6 +289,8 @@ class ConstraintTable(_Table):
     """Least elevation of these stations, degrees; 0 by default."""
 
 
+# Depths of a table of speeds: each is a unit of work in every ray, and a profile of the sea has a few dozen.
+_LAYERS = 1000
 # Biases, priors and constraints that a person writes down; each is a unit of work in every step of every fix.
 _MANY = 100
 
@@ -347,6 +353,36 @@ class SoundTable(_Table):
     """Metres below the surface."""
 
 
+class MediumTable(_Table):
+    """What the waves come through where their speed is not one number: each row is then measured along its rays."""
+
+    kind: Literal["layers", "atmosphere"]
+    """Speeds over depth below a level surface; or air as radio waves meet it."""
+    depths: list[float] | None = Field(default=None, max_length=_LAYERS)
+    """Of layers: depths that grow; of the points between which speeds are straight lines, or of tops of layers."""
+    speeds: list[float] | None = Field(default=None, max_length=_LAYERS)
+    """Of layers: the speed at each depth."""
+    between: Literal["linear", "constant"] = "linear"
+    """Of layers: what holds between the depths."""
+    surface: Amount = 0.0
+    """Of layers: third coordinate of depth zero."""
+    unit: str = "m"
+    """Unit of depths and surface."""
+    speed_unit: str = "m/s"
+    """Unit of speeds."""
+    refractivity: float | None = None
+    """Of an atmosphere: (n - 1) 1e6 at height zero; 315 by default."""
+    scale_height: float | None = None
+    """Of an atmosphere: metres over which it falls to 1 / e; 7350 by default."""
+
+
+# Keys of each kind of medium.
+_MEDIA = {
+    "layers": ("depths", "speeds", "between", "surface", "unit", "speed_unit"),
+    "atmosphere": ("refractivity", "scale_height"),
+}
+
+
 class WindowTable(_Table):
     """How rows are put together to epochs by their times."""
 
@@ -362,7 +398,10 @@ class ProblemFile(_Table):
     title: str | None = None
     """What it is."""
     propagation_speed: Annotated[float, Field(gt=0.0)] | str | SoundTable | None = None
-    """Metres per second, or text with a unit; or of sound: { medium = "air", celsius = 20.0 }. Light by default."""
+    """Metres per second, or text with a unit; or of sound: { medium = "air", celsius = 20.0 }. Light by default.
+    Beside layers: the speed by which ranges in metres were made of times."""
+    medium: MediumTable | None = None
+    """Layers or air, where the speed is not one number."""
     frame: FrameTable = FrameTable()
     stations: StationsTable
     measurements: list[MeasurementsTable] = Field(min_length=1)
@@ -377,8 +416,51 @@ class ProblemFile(_Table):
     """Covariance of the rows of one epoch across all kinds, in the order of the file, in their units."""
 
 
+def medium_in(file: ProblemFile, source: str) -> Medium | None:
+    """Return what the waves of a problem file come through, None where their speed is one number."""
+    return None if file.medium is None else _medium(file.medium, _stated_speed(file, source), source)
+
+
 def speed_of(file: ProblemFile, source: str) -> float:
-    """Return the propagation speed of a problem file, metres per second; light where it names none."""
+    """Return the speed by which times are lengths, metres per second: light where a problem file names none."""
+    medium, stated = medium_in(file, source), _stated_speed(file, source)
+    if medium is not None:
+        return medium.unit_speed
+    return SPEED_OF_LIGHT if stated is None else stated
+
+
+def _medium(table: MediumTable, reference: float | None, source: str) -> Medium:
+    """Return the medium that a table states; `reference` is the propagation speed beside it, if there is one."""
+    place = join(source, "[medium]")
+    own = _MEDIA[table.kind]
+    given = {key for key in table.model_fields_set - {"kind"} if getattr(table, key) is not None}
+    wrong, lacking = sorted(given - set(own)), [key for key in ("depths", "speeds") if key in own and key not in given]
+    if wrong:
+        raise InvalidProblem(f"the kind {table.kind!r} has no {wrong[0]!r}", place, f"its keys are {', '.join(own)}")
+    if lacking:
+        raise InvalidProblem(f"the kind {table.kind!r} needs {lacking[0]}", place, "give a list of numbers")
+    if table.kind == "atmosphere" and reference is not None:
+        what = "an atmosphere has its own speed, that of light over the refractive index"
+        raise InvalidProblem(what, place, "leave propagation_speed out")
+    length, speed = (
+        Units(quantity).conversion(unit, place).to_si  # type: ignore[arg-type]
+        for quantity, unit in (("length", table.unit), ("speed", table.speed_unit))
+    )
+    try:
+        if table.kind == "atmosphere":
+            return Atmosphere(**{key: getattr(table, key) for key in given})
+        surface = Units("length").plain(table.surface, table.unit, place)
+        depth, speeds = (
+            tuple(float(to_si(v)) for v in values or ())
+            for to_si, values in ((length, table.depths), (speed, table.speeds))
+        )
+        return Layers(depth, speeds, table.between, surface, reference)
+    except InvalidProblem as error:
+        raise InvalidProblem(error.what, place, error.advice) from None
+
+
+def _stated_speed(file: ProblemFile, source: str) -> float | None:
+    """Return the propagation speed that a file states, metres per second."""
     given, place = file.propagation_speed, join(source, "key 'propagation_speed'")
     if isinstance(given, SoundTable):
         water = given.medium != "air"
@@ -387,7 +469,9 @@ def speed_of(file: ProblemFile, source: str) -> float:
         usual = 35.0 if given.medium == "sea water" else 0.0
         salinity = usual if given.salinity is None else given.salinity
         return sound_in_water(given.celsius, salinity, given.depth) if water else sound_in_air(given.celsius)
-    speed = SPEED_OF_LIGHT if given is None else Units("speed").plain(given, "m/s", place)
+    if given is None:
+        return None
+    speed = Units("speed").plain(given, "m/s", place)
     if not speed > 0.0:
         raise InvalidProblem(f"the speed {given} is not positive", place, 'write it as 340.0 or "340 m/s"')
     return speed
@@ -415,12 +499,12 @@ def name_of(path: Path) -> str:
 def parse_toml(text: str, source: str, formats: tuple[int, ...] = (1,)) -> dict[str, Any]:
     """Return TOML of one of some formats as data; `source` is the place to name."""
     if not text.strip():
-        raise InvalidProblem("the file is empty", source, "begin it with the line format = 1")
+        raise InvalidProblem("the file is empty", source, f"begin it with the line format = {max(formats)}")
     data = toml_of(text, source)
     # true equals 1 in Python.
     if data.get("format") not in formats or isinstance(data.get("format"), bool):
         given = f"format {data['format']!r} is unknown" if "format" in data else "the key 'format' is missing"
-        raise InvalidProblem(given, source, "begin the file with the line format = 1")
+        raise InvalidProblem(given, source, f"begin the file with the line format = {max(formats)}")
     return data
 
 

@@ -39,8 +39,8 @@ class Survey:
         Metres per second.
     axes : array (n, d, d), optional
         Unit vectors in rows.
-    sigma : array (n,), optional
-        Standard deviation of each coordinate, metres.
+    sigma, velocity_sigma : array (n,), optional
+        Standard deviation of each coordinate, metres, and of the velocities, metres per second.
     table : Table
         The rows.
     noun : str
@@ -53,6 +53,7 @@ class Survey:
     velocity: Array | None
     axes: Array | None
     sigma: Array | None
+    velocity_sigma: Array | None
     table: Table
     noun: str = "station"
 
@@ -86,7 +87,8 @@ def survey(section: StationsTable, table: Table, frame_table: FrameTable, where:
         if frame.geodetic and frame_table.kind == "geodetic":
             velocity = np.einsum("nij,ni->nj", frame.enu_axes(position), velocity)
     axes = _axes(section, table, frame, position)
-    return Survey(names, index, position, velocity, axes, _sigma(section, table, where), table), frame
+    sigma, of_rates = (_sigma(section, table, where, key) for key in ("sigma", "velocity_sigma"))
+    return Survey(names, index, position, velocity, axes, sigma, of_rates, table), frame
 
 
 def _positions(table: Table, wanted: FrameTable, factor: float, where: str) -> tuple[Array, Frame]:
@@ -174,21 +176,22 @@ def _turn(table: Table, d: int) -> Array | None:
     return np.asarray(Rotation.from_quat(parts[:, [1, 2, 3, 0]]).as_matrix())
 
 
-def _sigma(section: StationsTable, table: Table, where: str) -> Array | None:
-    units = Units("length")
-    if table.has("sigma"):
-        sigma = units.conversion(section.unit, where).sigma_to_si(table.numbers("sigma"))
-    elif section.sigma is not None:
-        number, unit = units.amount(
-            section.sigma, units.conversion(section.unit, where), join(where, "[stations]", "key 'sigma'")
-        )
+def _sigma(section: StationsTable, table: Table, where: str, key: str) -> Array | None:
+    """Return the standard deviations (n,) of positions or velocities, by the column or the key of that name."""
+    stated, place = getattr(section, key), join(where, "[stations]", f"key {key!r}")
+    units, own = (Units("length"), section.unit) if key == "sigma" else (Units("speed"), section.speed_unit)
+    unit = units.conversion(own, where)
+    if table.has(key):
+        sigma = unit.sigma_to_si(table.numbers(key))
+    elif stated is not None:
+        number, unit = units.amount(stated, unit, place)
         sigma = np.full(table.count, float(unit.sigma_to_si(number)))
     else:
         return None
     bad = np.flatnonzero(sigma <= 0.0)
     if len(bad):
-        place = table.where("sigma", int(bad[0])) if table.has("sigma") else join(where, "[stations]", "key 'sigma'")
-        raise InvalidProblem("a standard deviation is not positive", place, "leave sigma out for surveyed stations")
+        place = table.where(key, int(bad[0])) if table.has(key) else place
+        raise InvalidProblem("a standard deviation is not positive", place, f"leave {key} out where nothing errs")
     return sigma
 
 
@@ -212,10 +215,12 @@ def over_epochs(found: Survey, section: StationsTable, epochs: Epochs, used: Seq
         order = np.argsort(found.index)
         position = found.position[order][None]
         velocity, axes = (None if v is None else v[order][None] for v in (found.velocity, found.axes))
-    covariance = None
-    if found.sigma is not None:
-        covariance = found.sigma[_first(found), None, None] ** 2 * np.eye(found.position.shape[-1])
-    return Stations(position, found.names, velocity, axes, covariance, section.span)
+    identity = np.eye(found.position.shape[-1])
+    covariance, of_rates = (
+        None if sigma is None else sigma[_first(found), None, None] ** 2 * identity
+        for sigma in (found.sigma, found.velocity_sigma)
+    )
+    return Stations(position, found.names, velocity, axes, covariance, section.span, of_rates)
 
 
 # Stations that move: their rows are matched to epochs by label, or interpolated in time.

@@ -111,7 +111,7 @@ def known_of(
         key = name if name in file.targets else None
         if key in places:
             section = file.target if key is None else file.targets[key]
-            wanted = _settle_frame(file.frame, frame, dimension)
+            wanted = settle_frame(file.frame, frame, dimension)
             states[name] = _states(
                 section, places[key], name, epochs, np.unique(epochs.index[epochs.target == i]), wanted
             )
@@ -134,7 +134,7 @@ def _states(section: TargetTable, table: Table, name: str, epochs: Epochs, heard
     return position if velocity is None else np.concatenate([position, velocity], axis=-2)
 
 
-def _settle_frame(wanted: FrameTable, frame: Frame, dimension: int) -> FrameTable:
+def settle_frame(wanted: FrameTable, frame: Frame, dimension: int) -> FrameTable:
     """Return the frame table with the origin and the dimension that the stations decided."""
     # The frame as the stations settled it: a target must not choose an origin of its own.
     origin = None

@@ -154,7 +154,7 @@ def write_measured(source: Path, out: Path, z: Array, note: str = "") -> list[Pa
             for key in ("rows", "columns", "separator"):
                 section.pop(key, None)
             section["file"] = path.name
-        text = "format = 1\n" + _toml({k: v for k, v in settings.items() if k != "format"})
+        text = f"format = {made.file.format}\n" + toml_text({k: v for k, v in settings.items() if k != "format"})
         write_text(out, text)
     return [out, *copies, *tables]
 
@@ -186,16 +186,16 @@ def _rows(made: Draft, table: Table, z: Array) -> dict[str, Any]:
     return columns | {"z": values.ravel()}
 
 
-def _toml(settings: dict[str, Any], path: tuple[str, ...] = ()) -> str:
+def toml_text(settings: dict[str, Any], path: tuple[str, ...] = ()) -> str:
     """Return TOML: numbers and lists first, then tables."""
     plain, tables = [], []
     for key, value in settings.items():
         name = (*path, key)
         # Tables of the first level get a header; deeper ones are written inline, which TOML allows everywhere.
         if isinstance(value, dict) and len(path) < 1:
-            tables.append(f"\n[{'.'.join(map(_key, name))}]\n" + _toml(value, name))
+            tables.append(f"\n[{'.'.join(map(_key, name))}]\n" + toml_text(value, name))
         elif isinstance(value, list) and value and isinstance(value[0], dict) and not path:
-            tables += [f"\n[[{_key(key)}]]\n" + _toml(item, name) for item in value]
+            tables += [f"\n[[{_key(key)}]]\n" + toml_text(item, name) for item in value]
         elif value is not None:
             plain.append(f"{_key(key)} = {_value(value)}\n")
     return "".join([*plain, *tables])

@@ -12,7 +12,7 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.linalg import Tangent, tangent
 from optloc.base.types import Array, Band, Motion, Polygon
-from optloc.linear.courses import course_at, elapsed, to_ecef
+from optloc.linear.courses import course_at, elapsed, height_at, to_ecef
 from optloc.models.primitives import Jet, Point
 from optloc.models.surfaces import SURFACES
 from optloc.problem.layout import state_names
@@ -231,6 +231,69 @@ def _most_at_once(problem: Problem, face: Face) -> int:
     return max(count.values(), default=0)
 
 
+def on_face(problem: Problem, face: Face) -> Problem:
+    """Return the problem whose only constraints are equalities: the levels of a face, at the reference time."""
+    bands = []
+    for level in face:
+        band = _band(problem.constraints[level.constraint], level.side)
+        value = band.upper if level.side == "upper" else band.lower
+        bands.append(replace(band, lower=value, upper=value, coefficients=_padded(problem, band)))
+    return replace(problem, constraints=tuple(bands))
+
+
+def _padded(problem: Problem, band: Band) -> Array:
+    """Return the coefficients of a band, of a plane as many as dimensions: an edge of a polygon is one of the plan."""
+    lacking = problem.dimension - band.coefficients.shape[-1] if band.kind == "plane" else 0
+    return np.concatenate([band.coefficients, np.zeros((*band.coefficients.shape[:-1], lacking))], axis=-1)
+
+
+def is_corner(problem: Problem, face: Face) -> bool:
+    """Return whether a face is one point: as many planes as dimensions."""
+    return len(face) == problem.dimension and all(_kind(problem, level) == "plane" for level in face)
+
+
+def is_held(problem: Problem, face: Face, x: Array, descent: Array) -> Array:
+    """Return at which minima along a face (N, size) a cost falls out of what is admitted, (N,): inwards it grows.
+
+    Parameters
+    ----------
+    problem : Problem
+        N problems.
+    face : Face
+        What holds with equality.
+    x : array (N, size)
+        Vectors on it.
+    descent : array (N, n)
+        Minus the gradient to the shared unknowns: a sum of outward normals, none of them less than zero times.
+    """
+    gradients = levels(problem, face, x)[1]
+    share = (np.linalg.pinv(np.swapaxes(gradients, -1, -2)) @ descent[..., None])[..., 0]
+    out = np.ones(len(x), dtype=bool)
+    for i, level in enumerate(face):
+        constraint = problem.constraints[level.constraint]
+        if isinstance(constraint, Polygon):
+            out &= share[:, i] * _turn(constraint.vertices) >= 0.0
+            # where a polygon is not convex, its corner is admitted on both sides: costs fall along one of them
+            here = [other.side for other in face if other.constraint == level.constraint]
+            out &= len(here) < 2 or _turn(constraint.vertices) * _turn(_corner(constraint, here)) > 0.0
+        elif not is_exact(constraint):
+            out &= share[:, i] * (1.0 if level.side == "upper" else -1.0) >= 0.0
+    return out
+
+
+def _corner(region: Polygon, edges: list[str | int]) -> Array:
+    """Return the corner (3, 2) between two edges of a polygon, the first before the other."""
+    first, count = edges[0], len(region.vertices)
+    assert isinstance(first, int)
+    return region.vertices[[first, (first + 1) % count, (first + 2) % count]]
+
+
+def _turn(vertices: Array) -> float:
+    """Return 1 where corners (v, 2) go counter-clockwise around what they enclose, -1 where they go clockwise."""
+    (x, y), (u, v) = vertices.T, np.roll(vertices, -1, axis=0).T
+    return float(np.sign((x * v - u * y).sum()))
+
+
 def face_names(problem: Problem, face: Face) -> tuple[str, ...]:
     """Return what each level of a face is called, for instance "height upper"."""
     return tuple(
@@ -416,6 +479,8 @@ def bounded(
     """
     surface = SURFACES[band.kind]
     since = 0.0 if epoch is None else float(elapsed(problem, band.target)[epoch])
+    if epoch is not None and band.kind == "height":
+        return height_at(problem, list(states), since)
     position = states[0] if epoch is None else course_at(problem, band.target, list(states), since)
     ecef = to_ecef(problem, position) if surface.ecef else None
     # An edge of a polygon is a plane with two coefficients: it bounds the plan of a target in space.

@@ -9,7 +9,7 @@ import numpy as np
 
 from optloc.base.types import Array
 from optloc.models.course import carry
-from optloc.models.primitives import Components, Jet
+from optloc.models.primitives import Components, Jet, dot, geodetic_height, geodetic_normal, subtract
 from optloc.problem.problem import Problem
 
 
@@ -37,6 +37,16 @@ def to_ecef(problem: Problem, position: tuple[Any, ...]) -> tuple[Any, ...]:
     return tuple(
         sum((float(turn[i, c]) * position[c] for c in range(1, 3)), float(turn[i, 0]) * position[0]) + float(origin[i])
         for i in range(3)
+    )
+
+
+def turned_back(problem: Problem, vector: tuple[Any, ...]) -> tuple[Any, ...]:
+    """Return a vector of ECEF components in the axes of the problem's frame."""
+    turn = problem.frame.rotation_to_ecef()
+    if problem.frame.kind == "ecef":
+        return vector
+    return tuple(
+        sum((float(turn[i, c]) * vector[i] for i in range(1, 3)), float(turn[0, c]) * vector[0]) for c in range(3)
     )
 
 
@@ -88,12 +98,28 @@ def course_at(problem: Problem, target: int, states: list[Components], since: An
     rise : float or array
         Height beyond its polynomial, metres; by default what is known of that is left out.
     """
-    place = states[0]
-    for j, state in enumerate(states[1:], 1):
-        place = tuple(p + since**j / factorial(j) * v for p, v in zip(place, state, strict=True))
+    place = _straight(states, since)
     return (
         carried(problem, states[0], place, rise=(rise, 0.0))[0] if problem.motions[target].over == "ground" else place
     )
+
+
+def height_at(problem: Problem, states: list[Components], since: float) -> Any:
+    """Return the height of a course over ground some seconds after its reference time, less its rise, metres.
+
+    It is what `optloc.models.course.carry` keeps to: the height of the start, and the upward part of the straight way.
+    """
+    start = to_ecef(problem, states[0])
+    ahead = to_ecef(problem, _straight(states, since))
+    return geodetic_height(start) + dot(subtract(ahead, start), geodetic_normal(start))
+
+
+def _straight(states: list[Components], since: Any) -> Components:
+    """Return where states lead in space."""
+    place = states[0]
+    for j, state in enumerate(states[1:], 1):
+        place = tuple(p + since**j / factorial(j) * v for p, v in zip(place, state, strict=True))
+    return place
 
 
 def _from_ecef(problem: Problem, ecef: Components) -> Components:

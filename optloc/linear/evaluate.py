@@ -12,9 +12,10 @@ from optloc.base.arrays import Portable, foreign, gather, library, placed
 from optloc.base.cache import Cache
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Rows
-from optloc.linear.courses import carried, elapsed, over_ground, to_ecef
+from optloc.linear.courses import carried, elapsed, over_ground, to_ecef, turned_back
 from optloc.models import MODELS, Model, Point
-from optloc.models.primitives import Jet, rotate, wrap
+from optloc.models.medium import Atmosphere
+from optloc.models.primitives import Jet, geodetic_normal, rotate, wrap
 from optloc.problem.bias import course
 from optloc.problem.clocks import effects
 from optloc.problem.layout import Layout, emission_name, state_names
@@ -205,14 +206,17 @@ def _motion_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
 
 def _station_feeds(problem: Problem, block: Rows, model: Model) -> list[Feed]:
     # Errors that are noise are no unknowns: `optloc.linear.normal` puts them into the covariance of rows.
-    if problem.stations.covariance is None or problem.stations.span == "noise":
-        return []
     d, feeds = problem.dimension, []
-    column = columns(problem.layout, "stations", block.epoch)
-    for seed, station in ((A, block.a), (B, block.b))[: model.stations]:
-        for c in range(d):
-            picked = column[np.arange(block.count), station * d + c]
-            feeds.append(Feed(seed + c, picked, 1.0, slice(None)))
+    for name, _, _ in problem.stations.errors if problem.stations.estimated else ():
+        rates = name == "station velocities"
+        if rates and not model.velocity:
+            continue
+        column = columns(problem.layout, name, block.epoch)
+        places = ((RATE_A, block.a), (RATE_B, block.b)) if rates else ((A, block.a), (B, block.b))
+        for seed, station in places[: model.stations]:
+            for c in range(d):
+                picked = column[np.arange(block.count), station * d + c]
+                feeds.append(Feed(seed + c, picked, 1.0, slice(None)))
     return feeds
 
 
@@ -314,12 +318,19 @@ def join(problem: Problem, model: Model, inputs: dict[int, Any]) -> tuple[Point,
         if TURN in inputs:
             identity = tuple(tuple(float(i == j) for j in range(d)) for i in range(d))
             own = rotate(own or identity, tuple(inputs[TURN + c] for c in range(1 if d == 2 else 3)))
-        return Point(vector(place), vector(rate) if model.velocity else None, own)
+        return seen(vector(place), vector(rate) if model.velocity else None, own)
+
+    def seen(place: tuple[Any, ...], rate: tuple[Any, ...] | None, axes: Any = None) -> Point:
+        medium = problem.medium if model.straight else None
+        if not isinstance(medium, Atmosphere):
+            return Point(place, rate, axes, to_ecef(problem, place) if model.ecef else None, medium=medium)
+        ecef = to_ecef(problem, place)
+        return Point(place, rate, axes, ecef, turned_back(problem, geodetic_normal(ecef)), medium)
 
     place, rate = vector(TARGET), vector(TARGET_RATE) if model.velocity else None
     if START in inputs:
         place, rate = carried(problem, vector(START), place, rate, (inputs.get(RISE, 0.0), inputs.get(RISE + 1, 0.0)))
-    target = Point(place, rate, None, to_ecef(problem, place) if model.ecef else None)
+    target = seen(place, rate)
     # A kind without stations gets the target in their place, which its h does not look at.
     a = station(A, RATE_A, AXES_A) if model.stations else target
     return target, a, station(B, RATE_B, AXES_B) if model.stations > 1 else a

@@ -44,32 +44,36 @@ def weighed(problem: Problem, x: Array | None = None) -> Problem:
     Problem
         Without station errors; the same problem where their span is not "noise".
     """
-    covariance = problem.stations.covariance
-    if covariance is None or problem.stations.span != "noise":
+    stations = problem.stations
+    if not stations.weighed:
         return problem
     groups = _groups(problem)
     if x is None or not depends_on_place(problem):
+        # Ranges depend on positions alone.
+        nothing = np.zeros((stations.count, problem.dimension, problem.dimension))
+        covariance = nothing if stations.covariance is None else stations.covariance
         more = [_alike(problem, members, covariance) for members in groups]
     else:
-        # G is the Jacobian to station offsets as if they were unknowns; they stand last among the local ones.
+        # G is the Jacobian to station errors as if they were unknowns; they stand last among the local ones.
         named, x = with_offsets(problem, x, np.zeros(()))
         _, jacobian = differentiate(named, x)
-        last = covariance.shape[-3] * problem.dimension
-        more = [_propagate(jacobian[..., members, -last:], covariance) for members in groups]
+        parts = np.split(jacobian[..., -offsets_of(problem) :], len(stations.errors), axis=-1)
+        more = [_propagate_all(parts, members, problem) for members in groups]
     blocks = [
         Block(members, gathered(problem.noise, members) + extra) for members, extra in zip(groups, more, strict=True)
     ]
-    return replace(problem, stations=replace(problem.stations, covariance=None), noise=Noise(tuple(blocks)))
+    exact_ones = replace(stations, covariance=None, velocity_covariance=None)
+    return replace(problem, stations=exact_ones, noise=Noise(tuple(blocks)))
 
 
 def depends_on_place(problem: Problem) -> bool:
     """Return whether what station errors of span "noise" add to the noise depends on where the target is."""
-    covariance = problem.stations.covariance
-    if covariance is None or problem.stations.span != "noise":
+    if not problem.stations.weighed:
         return False
     # Isotropic errors of ranges project to the same variance along every line of sight.
-    same = np.eye(problem.dimension) * covariance[..., :1, :1]
-    return not np.array_equal(covariance, same) or any(MODELS[rows.kind].ranges is None for rows in problem.rows)
+    own = [c for name, _, c in problem.stations.errors if name == "stations"]
+    same = all(np.array_equal(c, np.eye(problem.dimension) * c[..., :1, :1]) for c in own)
+    return not same or any(MODELS[rows.kind].ranges is None for rows in problem.rows)
 
 
 def whitener_at(problem: Problem, x: Array) -> tuple[Whitener, ...]:
@@ -86,17 +90,22 @@ def with_offsets(problem: Problem, x: Array, offsets: Array) -> tuple[Problem, A
         k epochs, s stations, d dimensions.
     x : array (..., size)
         Parameter vectors of the problem.
-    offsets : array (..., k, s * d) or ()
-        Errors of the station positions, metres.
+    offsets : array (..., k, `offsets_of`) or ()
+        Errors of the stations in the order of their slots: positions, metres; velocities, metres per second.
     """
     named = replace(problem, stations=replace(problem.stations, span="epoch"))
     shared, local = problem.layout.split(x)
-    size = problem.stations.count * problem.dimension
+    size = offsets_of(problem)
     batch = np.broadcast_shapes(x.shape[:-1], offsets.shape[:-2])
     more = np.broadcast_to(offsets, (*batch, problem.epochs, size))
     local = np.concatenate([np.broadcast_to(local, (*batch, *local.shape[-2:])), more], axis=-1)
     shared = np.broadcast_to(shared, (*batch, shared.shape[-1]))
     return named, np.concatenate([shared, local.reshape(*batch, -1)], axis=-1)
+
+
+def offsets_of(problem: Problem) -> int:
+    """Return how many errors the stations have at an epoch, those of positions and of velocities together."""
+    return len(problem.stations.errors) * problem.stations.count * problem.dimension
 
 
 def _groups(problem: Problem) -> list[Array]:
@@ -121,6 +130,13 @@ def _alike(problem: Problem, members: Array, covariance: Array) -> Array:
 
 def _signs(rows: Rows) -> tuple[int, int]:
     return MODELS[rows.kind].ranges or (0, 0)
+
+
+def _propagate_all(parts: Sequence[Array], members: Array, problem: Problem) -> Array:
+    """Return what station errors of all sorts add to groups of rows (g, r), of Jacobians (..., m, s * d) to each."""
+    errors = problem.stations.errors
+    added = [_propagate(part[..., members, :], c) for part, (_, _, c) in zip(parts, errors, strict=True)]
+    return np.asarray(sum(added[1:], added[0]))
 
 
 def _propagate(sensitivity: Array, covariance: Array) -> Array:
@@ -399,6 +415,9 @@ def step(equations: Normal, damping: Array, space: Tangent | None = None) -> tup
     """
     damped = _damp(equations, damping)
     information, vector, ok, held = _eliminate(damped)
+    if equations.link is not None:
+        # Beside walks, which follow whatever is shared, little of what rows say of it is left: that is what is scaled.
+        information = _grow(information, damping)
     if space is not None:
         shared, good = linalg.solve_within(information, vector, space)
         ok = ok & good
@@ -416,17 +435,18 @@ def step(equations: Normal, damping: Array, space: Tangent | None = None) -> tup
 
 
 def _damp(equations: Normal, damping: Array) -> Normal:
-    def grow(matrix: Array, factor: Array) -> Array:
-        # Diagonal times (1 + damping), all else times one: Marquardt's scaling knows no units.
-        grown: Array = matrix * (1.0 + factor[..., None, None] * eye(matrix.shape[-1], matrix))
-        return grown
+    local = _grow(equations.local, damping[..., None])
+    if equations.link is None:
+        return replace(equations, shared=_grow(equations.shared, damping), local=local)
+    # Walks enter linearly, and the precision of their steps beside that of the rows would hold them where they are.
+    walking = np.diagonal(equations.link, axis1=-2, axis2=-1).any(tuple(range(equations.link.ndim - 2)))
+    return replace(equations, local=np.where(walking, equations.local, local))
 
-    local = grow(equations.local, damping[..., None])
-    if equations.link is not None:
-        # Walks enter linearly, and the precision of their steps beside that of the rows would hold them where they are.
-        walking = np.diagonal(equations.link, axis1=-2, axis2=-1).any(tuple(range(equations.link.ndim - 2)))
-        local = np.where(walking, equations.local, local)
-    return replace(equations, shared=grow(equations.shared, damping), local=local)
+
+def _grow(matrix: Array, factor: Array) -> Array:
+    """Return a matrix with its diagonal times (1 + factor): Marquardt's scaling knows no units."""
+    grown: Array = matrix * (1.0 + factor[..., None, None] * eye(matrix.shape[-1], matrix))
+    return grown
 
 
 def covariance(equations: Normal, space: Tangent | None = None) -> tuple[Array, Array]:
@@ -522,11 +542,11 @@ def prior_parts(problem: Problem) -> list[tuple[str, Array, Array]]:
             # Members of a bias are independent of each other a priori.
             parts.append((bias.name, np.broadcast_to(np.ravel(bias.mean), sigma.shape), np.diag(sigma**-2.0)))
     stations = problem.stations
-    if stations.covariance is not None and stations.span != "noise":
-        precision = _block_diagonal(linalg.inverse(stations.covariance)[0])
+    for name, _, covariance in stations.errors if stations.estimated else ():
+        precision = _block_diagonal(linalg.inverse(covariance)[0])
         if stations.span == "epoch":
             precision = precision[..., None, :, :]
-        parts.append(("stations", np.zeros(precision.shape[-1]), precision))
+        parts.append((name, np.zeros(precision.shape[-1]), precision))
     return parts
 
 
@@ -555,7 +575,8 @@ def degrees_of_freedom(problem: Problem) -> Array:
     known = (
         {prior.name for prior in problem.priors}
         | {b.name for b in problem.biases if b.sigma is not None}
-        | {"stations", *walk_names(problem)}
+        | {name for name, _, _ in problem.stations.errors}
+        | {*walk_names(problem)}
     )
     layout = problem.layout
     unknowns: Any = sum(slot.size for slot in layout.shared if slot.name not in known)

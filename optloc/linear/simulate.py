@@ -20,7 +20,7 @@ def simulate(problem: Problem, truth: Array, seed: int | np.random.SeedSequence,
     Parameters
     ----------
     problem : Problem
-        Stations, rows and noise; its measurements are ignored. Position errors of span "noise" are drawn as well.
+        Stations, rows and noise; its measurements are ignored. Station errors of span "noise" are drawn as well.
     truth : array (..., size)
         True parameter vectors in the order of ``problem.layout``; leading axes must fit the problem's.
     seed : int or SeedSequence
@@ -56,10 +56,14 @@ def _displace(
 ) -> tuple[Problem, Array]:
     """Return the problem with the stations where they really are, as far as their errors are noise, and its truth."""
     stations = problem.stations
-    if stations.covariance is None or stations.span != "noise":
+    if not stations.weighed:
         return problem, truth
-    errors = samples(stations.covariance[..., None, :, :, :], (*shape, problem.epochs, stations.count), rng)
-    return with_offsets(problem, truth, errors.reshape(*shape, problem.epochs, -1))
+    drawn = [
+        samples(covariance[..., None, :, :, :], (*shape, problem.epochs, stations.count), rng)
+        for _, _, covariance in stations.errors
+    ]
+    errors = [each.reshape(*shape, problem.epochs, -1) for each in drawn]
+    return with_offsets(problem, truth, np.concatenate(errors, axis=-1))
 
 
 def samples(covariance: Array, shape: tuple[int, ...], rng: np.random.Generator) -> Array:

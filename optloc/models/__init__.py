@@ -7,14 +7,16 @@ another package an entry point of the group ``optloc.models``.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
+from functools import lru_cache
 from math import log, tau
 from typing import Any
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.registry import Table
 from optloc.base.units import UNITS
+from optloc.models.medium import arrival, path, path_rate
 from optloc.models.primitives import (
     Components,
     Point,
@@ -95,6 +97,11 @@ class Model:
         The `LiftedRow` of a measured value m, where there is one that is not a sum of ranges.
     period : float, optional
         Period of an angle, radians; the residual is wrapped.
+    ray : callable of (t, a, b), optional
+        The measurement along the rays of a medium, which the points carry (`optloc.models.medium`); None where it is
+        not known what rays that bend do to it. ``MODELS["ray_" + kind]`` is the kind that is measured so.
+    straight : str, optional
+        Of a kind along rays: the name of the kind that it is where waves come straight. Starts take that one.
     emission : bool
         True where an unknown emission time (times c, metres) of the epoch is added.
     velocity, axes, ecef : bool
@@ -119,6 +126,8 @@ class Model:
     nodes: tuple[tuple[float, Any], ...] = ()
     lifted: Callable[[Any, Point, Point], LiftedRow] | None = None
     period: float | None = None
+    ray: Callable[[Point, Point, Point], Any] | None = None
+    straight: str | None = None
     emission: bool = False
     velocity: bool = False
     axes: bool = False
@@ -135,13 +144,11 @@ class Model:
             object.__setattr__(self, "signs", self.ranges)
 
 
-def _azimuth(t: Point, a: Point, b: Point) -> Any:
-    line = local(t, a)
+def _azimuth(line: Components) -> Any:
     return namespace(line[1]).atan2(line[1], line[0])
 
 
-def _elevation(t: Point, a: Point, b: Point) -> Any:
-    line = local(t, a)
+def _elevation(line: Components) -> Any:
     # By both legs: the arcsine of a ratio loses its digits overhead.
     xp = namespace(line[2])
     return xp.atan2(line[2], xp.hypot(line[0], line[1]))
@@ -215,6 +222,9 @@ def _lifted_elevation(m: Any, a: Point, b: Point) -> LiftedRow:
 BEARING = "bearing"
 """The word for an azimuth that is a compass bearing wherever nothing else is said: degrees from north, clockwise."""
 
+RAY = "ray_"
+"""What the name of a kind begins with that is measured along the rays of a medium."""
+
 # Signs and units are those of files after conversion: metres, radians; a is the first station named.
 _KINDS: dict[str, Model] = {
     "tdoa": Model(
@@ -223,6 +233,7 @@ _KINDS: dict[str, Model] = {
         2,
         "time difference of arrival times c, r_a - r_b",
         ranges=(1, -1),
+        ray=lambda t, a, b: path(t, a) - path(t, b),
         aliases=("time_difference", "range_difference", "rdoa", "dtoa"),
     ),
     "groa": Model(
@@ -240,6 +251,7 @@ _KINDS: dict[str, Model] = {
         1,
         "range r_a",
         ranges=(1, 0),
+        ray=lambda t, a, b: path(t, a),
         # no "rtt": a round trip is two ranges
         aliases=("distance", "twr", "tof", "slant_range", "dme"),
     ),
@@ -250,6 +262,7 @@ _KINDS: dict[str, Model] = {
         "time of arrival times c, r_a plus the epoch's unknown emission time",
         ranges=(1, 0),
         emission=True,
+        ray=lambda t, a, b: path(t, a),
         aliases=("pseudorange", "arrival", "arrival_time", "time_of_arrival"),
     ),
     "range_sum": Model(
@@ -258,10 +271,11 @@ _KINDS: dict[str, Model] = {
         2,
         "bistatic range, r_a + r_b",
         ranges=(1, 1),
+        ray=lambda t, a, b: path(t, a) + path(t, b),
         aliases=("bistatic_range", "tsoa"),
     ),
     "azimuth": Model(
-        _azimuth,
+        lambda t, a, b: _azimuth(local(t, a)),
         "angle",
         1,
         "azimuth from the station's first axis towards its second",
@@ -269,10 +283,11 @@ _KINDS: dict[str, Model] = {
         lifted=_lifted_azimuth,
         period=tau,
         axes=True,
+        ray=lambda t, a, b: _azimuth(arrival(t, a)),
         aliases=("aoa", "doa", BEARING),
     ),
     "elevation": Model(
-        _elevation,
+        lambda t, a, b: _elevation(local(t, a)),
         "angle",
         1,
         "elevation above the plane of the station's first two axes",
@@ -281,6 +296,7 @@ _KINDS: dict[str, Model] = {
         period=tau,
         axes=True,
         dimensions=(3,),
+        ray=lambda t, a, b: _elevation(arrival(t, a)),
         aliases=("elevation_angle",),
     ),
     "height": Model(
@@ -301,6 +317,7 @@ _KINDS: dict[str, Model] = {
         signs=(1, 0),
         nodes=((1.0, "range_rate"),),
         velocity=True,
+        ray=lambda t, a, b: path_rate(t, a),
         aliases=("doppler", "radial_velocity"),
     ),
     "fdoa": Model(
@@ -311,11 +328,45 @@ _KINDS: dict[str, Model] = {
         signs=(1, -1),
         nodes=((1.0, "range_rate"),),
         velocity=True,
+        ray=lambda t, a, b: path_rate(t, a) - path_rate(t, b),
         aliases=("frequency_difference",),
     ),
     "rss_difference": rss_difference(),
 }
-MODELS: Table[Model] = Table("optloc.models", lambda value: isinstance(value, Model), _KINDS)
+
+
+class _AlongRays(dict[str, Model]):
+    """Kinds along rays, which are made of what their names say and listed nowhere."""
+
+    def __missing__(self, name: str) -> Model:
+        if not name.startswith(RAY):
+            raise KeyError(name)
+        return _along_rays(name)
+
+
+@lru_cache(maxsize=64)
+def _along_rays(name: str) -> Model:
+    kind = name.removeprefix(RAY)
+    model = MODELS[kind]
+    if model.ray is None:
+        raise KeyError(name)
+    # Nothing is linear there, and nothing proven.
+    return replace(
+        model,
+        h=model.ray,
+        summary=f"{model.summary}, along the rays of a medium",
+        ranges=None,
+        signs=model.signs,
+        nodes=(),
+        lifted=None,
+        ray=None,
+        straight=kind,
+        dimensions=(3,),
+        aliases=(),
+    )
+
+
+MODELS: Table[Model] = Table("optloc.models", lambda value: isinstance(value, Model), _KINDS, _AlongRays)
 
 
 def kind_named(word: str, where: str | None = "kind") -> str:
@@ -345,6 +396,24 @@ def _likely_kind(word: str, words: dict[str, str]) -> str:
     close = [] if word in _FOREIGN else get_close_matches(word, alike, n=1, cutoff=0.75)
     known = f"known are {', '.join(sorted(MODELS))}; 'optloc list kinds' has their other names"
     return f"did you mean {close[0]!r}? {known}" if close else known
+
+
+def bent(kind: str) -> str:
+    """Return the kind that a kind is along the rays of a medium; the same where it does not depend on waves.
+
+    Raises
+    ------
+    InvalidProblem
+        For kinds of which it is not known what rays that bend do to them.
+    """
+    model = MODELS[kind]
+    if model.straight is not None or not model.stations:
+        return kind
+    if model.ray is None:
+        known = ", ".join(name for name, other in _KINDS.items() if other.ray is not None)
+        what = f"what bent rays do to {kind} rows is not known"
+        raise InvalidProblem(what, kind, f"leave them out, or the medium; known are {known}")
+    return RAY + kind
 
 
 def lifted_row(model: Model, m: Any, a: Point, b: Point) -> LiftedRow | None:

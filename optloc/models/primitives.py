@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -54,12 +55,18 @@ class Point:
         Unit vectors of the local frame, expressed in the problem's frame.
     ecef : tuple of 3 numbers, optional
         The same position, Earth-centred Earth-fixed, metres.
+    up : tuple of 3 numbers, optional
+        Unit normal of the ellipsoid there, in the problem's frame.
+    medium : Layers or Air, optional
+        What the waves come through (`optloc.models.medium`).
     """
 
     position: Components
     velocity: Components | None = None
     axes: tuple[Components, ...] | None = None
     ecef: Components | None = None
+    up: Components | None = None
+    medium: Any = None
 
 
 def dot(u: Components, v: Components) -> Any:
@@ -96,7 +103,11 @@ def range_rate(t: Point, a: Point) -> Any:
 
 def local(t: Point, a: Point) -> Components:
     """Return the line of sight from station to target in the station's own axes, metres."""
-    line = subtract(t.position, a.position)
+    return within(subtract(t.position, a.position), a)
+
+
+def within(line: Components, a: Point) -> Components:
+    """Return a vector of the problem's frame in the station's own axes."""
     return line if a.axes is None else tuple(dot(axis, line) for axis in a.axes)
 
 
@@ -281,6 +292,23 @@ def atan2(u: Any, v: Any) -> Jet:
     (p, du), (q, dv) = _parts(u), _parts(v)
     squared = p * p + q * q
     return Jet(namespace(p).atan2(p, q), _sum(_scale(du, q / squared), _scale(dv, -p / squared)))
+
+
+def differential(value: Any, parts: Sequence[tuple[Any, Any]]) -> Any:
+    """Return a value that was found by other means than arithmetic, with its derivatives by the chain rule.
+
+    Parameters
+    ----------
+    value : array
+        The value.
+    parts : sequence of (number or Jet, array)
+        What it depends on, and its derivative to each.
+    """
+    total: dict[int, Any] = {}
+    for part, slope in parts:
+        if isinstance(part, Jet):
+            total = _sum(total, _scale(part.partials, slope))
+    return Jet(value, total) if total else value
 
 
 def _parts(other: Any) -> tuple[Any, dict[int, Any]]:

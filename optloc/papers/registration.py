@@ -435,7 +435,7 @@ _ARRIVAL, _STATION = 10.0, 1.0
 _PROBLEM = """\
 # Five aircraft time an emitter 360 km away for ten minutes, each by a clock of its own. The emitter stands at 200 km,
 # 300 km, 0; the clocks of R2 to R5 are 100, -133, 167 and -100 ns late against that of R1.
-format = 1
+format = 2
 title = "Five aircraft, one emitter, four clock errors"
 
 [stations]

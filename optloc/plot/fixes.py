@@ -13,7 +13,8 @@ from optloc.base.frames import Frame
 from optloc.base.linalg import error_ellipse
 from optloc.base.types import Array, Rows
 from optloc.linear.evaluate import differentiate
-from optloc.models import MODELS, Point
+from optloc.models import MODELS, RAY, Point
+from optloc.models.layers import Layers
 from optloc.plot import style
 from optloc.plot.outlines import rings
 from optloc.plot.style import (
@@ -227,7 +228,9 @@ def _position_lines(panel: Axes, problem: Problem, fix: Fix, centre: Array, size
     (west, east), (south, north) = panel.get_xlim(), panel.get_ylim()
     middle, half = np.array([west + east, south + north]) / 2.0, _WIDE * max(east - west, north - south) / 2.0
     corners = size * np.stack([middle - half, middle + half]) + centre
-    x, y = (np.linspace(low, high, _GRID) for low, high in corners.T)
+    # Rays through layers take a thousand times longer than straight lines.
+    side = _GRID if not isinstance(problem.medium, Layers) else _GRID // 3
+    x, y = (np.linspace(low, high, side) for low, high in corners.T)
     places = _at_height(problem, fix, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
     found = lines_of_position(problem, fix, x, y, places)
     draw_lines(panel, found, centre, size)
@@ -240,7 +243,7 @@ def draw_lines(panel: Axes, found: Sequence[PositionLine], centre: Array, size: 
 
     for kind, colour in zip(dict.fromkeys(one.kind for one in found), cycle((PURPLE, SKY, GREEN, YELLOW))):
         lines = [(one.line - centre) / size for one in found if one.kind == kind]
-        label = _SHAPES.get(kind, f"where one {kind} alone would put it")
+        label = _SHAPES.get(kind, f"where one {kind.removeprefix(RAY)} alone would put it")
         # The limits of a plan are those of what is known, not of curves.
         look: dict[str, Any] = {"colors": colour, "linewidths": 1.0, "alpha": 0.8, "zorder": 1}
         panel.add_collection(LineCollection(lines, label=label, **look), autolim=False)
@@ -364,7 +367,8 @@ def _rate(problem: Problem, rows: Rows, row: int, places: Array, velocity: Array
     a, b = (Point(at(stations.position, i[row]), at(stations.velocity, i[row])) for i in (rows.a, rows.b))
     target = Point(tuple(places.T), tuple(velocity))
     with np.errstate(all="ignore"):
-        return np.asarray(MODELS[rows.kind].h(target, a, b))
+        # Of rays that bend the picture takes straight ones: the curve goes through the fix either way.
+        return np.asarray(MODELS[MODELS[rows.kind].straight or rows.kind].h(target, a, b))
 
 
 def _at_height(problem: Problem, fix: Fix, plan: Array) -> Array:

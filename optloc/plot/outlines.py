@@ -14,17 +14,20 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
 from optloc.base.types import Array
-from optloc.problem.chart import CURVED, INVERSE_RANGE, Chart, quantile
+from optloc.linear.constraints import exact
+from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE, Chart, quantile
 from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
-from optloc.uncertainty.region import directions, likelihood_region
+from optloc.uncertainty.region import cells_along, directions, likelihood_region
 
 # Cells of a region that is drawn, by dimension: finer than a picture shows. And regions that are drawn as they are:
 # each takes a tenth of a second.
 _CELLS, _MOST = {2: 400, 3: 3000}, 12
 # Where a region that goes on to infinity is cut off in a picture: so many times the distance of the fix.
 _FAR = 3.0
+# Half the width of a region that is a line, of its length: it is seen, and not taken for an area.
+_WIDTH = 2e-3
 # Points around an outline in the plane, and on a spiral around one in space: 4 degrees apart.
 _POINTS, _SPIRAL = 181, 3000
 # Points of the grid on which many cells are joined, and steps up to which a cell is all of the rectangle around it.
@@ -57,8 +60,13 @@ def pieces_of(problem: Problem, fix: Fix, level: float = 0.95) -> list[Pieces]:
     kinds = np.where(np.isfinite(flat.cov).all((-1, -2)), flat.chart.kind, -1)
     own = _one_each(problem, len(flat))
     found: list[Pieces] = []
+    held = bool(exact(problem))
     for i, kind in enumerate(kinds):
-        if kind == INVERSE_RANGE:
+        if held and kind in (CURVED, INVERSE_RANGE) and own is not None and (kinds > CARTESIAN).sum() <= _MOST:
+            found.append(_on_surface(own.take(np.array([i])), flat[i], level))
+        elif held:
+            found.append(())
+        elif kind == INVERSE_RANGE:
             found.append((far_hull(_item(flat.chart, i), level),))
         elif kind == CURVED and own is not None and (kinds == CURVED).sum() <= _MOST:
             found.append(_cells(own.take(np.array([i])), flat[i], level))
@@ -99,6 +107,19 @@ def far_hull(chart: Chart, level: float) -> Array:
     # What would be farther is pulled back along its chord to the fix.
     share = np.where(away[:, -1] < 0.0, np.minimum(1.0, (1.0 - 1.0 / _FAR) / np.maximum(-away[:, -1], 1e-300)), 1.0)
     return chart.to_position(chart.mean + share[:, None] * away)
+
+
+def _on_surface(problem: Problem, fix: Fix, level: float) -> Pieces:
+    """Return the cells of the region of a fix that an equality holds: a part of a surface, or of a line."""
+    assert fix.chart is not None
+    cells = cells_along(problem, fix, level, _FAR * float(fix.chart.distance))
+    if len(cells) and cells.shape[1] == 2:  # of a line, which has no width: in a picture it has
+        along = (cells[:, 1] - cells[:, 0])[:, :2]
+        length = np.maximum(np.sqrt((along**2).sum(-1, keepdims=True)), np.finfo(float).tiny)
+        aside = np.zeros_like(cells[:, :1])
+        aside[:, 0, :2] = _WIDTH * np.ptp(cells, axis=(0, 1)).max() * along[:, ::-1] / length * [-1.0, 1.0]
+        cells = np.concatenate([cells - aside, cells + aside], axis=1)
+    return tuple(cells)
 
 
 def _cells(problem: Problem, fix: Fix, level: float) -> Pieces:

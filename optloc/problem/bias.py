@@ -22,7 +22,7 @@ Per = Literal["station", "pair", "kind", "target"]
 Members = Sequence[str] | Mapping[str, Sequence[str]] | None
 _Touch = tuple[Array, Array, Array]
 # Slots of the layout that are not biases: a bias of such a name would hide one.
-_TAKEN = ("position", "velocity", "acceleration", "emission", "stations")
+_TAKEN = ("position", "velocity", "acceleration", "emission", "stations", "station velocities")
 
 
 def with_bias(

@@ -13,6 +13,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.frames import CARTESIAN, Frame
 from optloc.base.types import Array, Bias, Motion, Prior, Rows, Stations
 from optloc.models import BEARING, MODELS, kind_named
+from optloc.models.medium import Medium
 from optloc.problem import noise as noises
 from optloc.problem.check import checked
 from optloc.problem.problem import Problem
@@ -177,6 +178,7 @@ def assemble(
     frame: Frame = CARTESIAN,
     covariance: Any = None,
     constraints: Sequence[Any] = (),
+    medium: Medium | None = None,
 ) -> Problem:
     """Return a problem, or a batch of problems where arrays have leading axes.
 
@@ -200,6 +202,8 @@ def assemble(
         Covariance of all rows together, across kinds; replaces what the measurements say.
     constraints : sequence of Band, Polygon or tuples of them
         What the answer must meet, see `optloc.linear.constraints`.
+    medium : Layers or Atmosphere, optional
+        What the waves come through where their speed is not one number: rows are then measured along its rays.
 
     Raises
     ------
@@ -232,7 +236,8 @@ def assemble(
                 f"the joint covariance has shape {full.shape}", "covariance", f"give one of {made.count} x {made.count}"
             )
         noise = noises.Noise((noises.Block(np.arange(made.count)[None], full[..., None, :, :]),))
-    return checked(replace(made, noise=noise))
+    made = replace(made, noise=noise)
+    return checked(made if medium is None else made.in_medium(medium))
 
 
 def station_array(

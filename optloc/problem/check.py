@@ -17,7 +17,7 @@ from optloc.models.surfaces import SURFACES
 from optloc.problem.clocks import check_changing
 from optloc.problem.epochs import separable, tied, untied
 from optloc.problem.noise import Noise
-from optloc.problem.problem import Problem
+from optloc.problem.problem import Problem, check_medium
 
 
 def checked(problem: Problem) -> Problem:
@@ -48,6 +48,7 @@ def checked(problem: Problem) -> Problem:
     _check_noise(problem.noise, problem.count)
     _check_times(problem)
     _check_moving(problem)
+    check_medium(problem)
     check_unknowns(problem)
     _check_rates(problem)
     try:
@@ -94,15 +95,15 @@ def _check_stations(problem: Problem) -> None:
         raise InvalidProblem(f"station name {twice[0]!r} is used twice", "stations", "rename one of them")
     if problem.frame.kind == "ecef" and stations.dimension != 3:
         raise InvalidProblem("stations in ECEF need three coordinates", "stations", "give x, y and z")
-    if stations.covariance is not None:
-        shape = (stations.count, stations.dimension, stations.dimension)
-        if stations.covariance.shape[-3:] != shape:
-            raise InvalidProblem(
-                f"the covariance of their errors has shape {stations.covariance.shape}", "stations", f"give {shape}"
-            )
-        _check_covariance(stations.covariance, "position error of station", stations.names)
+    shape = (stations.count, stations.dimension, stations.dimension)
+    for name, _, covariance in stations.errors:
+        if covariance.shape[-3:] != shape:
+            what = f"the covariance of the errors of {name} has shape {covariance.shape}"
+            raise InvalidProblem(what, "stations", f"give {shape}")
+        of = "velocity" if name == "station velocities" else "position"
+        _check_covariance(covariance, f"{of} error of station", stations.names)
     if stations.span not in ("epoch", "run", "noise"):
-        what = f"unknown span {stations.span!r} of position errors"
+        what = f"unknown span {stations.span!r} of station errors"
         raise InvalidProblem(what, "stations", "use 'epoch', 'run' or 'noise'")
 
 
@@ -155,6 +156,9 @@ def _check_rows(problem: Problem, rows: Rows) -> None:
             what = f"station {problem.stations.names[int(moved[0][-1])]!r} moves, but has no velocity for {rows.kind}"
             advice = "give velocities (vx, vy, vz in a file): differences of positions are too coarse for rates"
             raise InvalidProblem(what, "stations", advice)
+    if model.straight is not None and problem.medium is None:
+        what = f"{rows.kind} rows need what their waves come through"
+        raise InvalidProblem(what, rows.kind, f"state a medium, or use the kind {model.straight}")
     if model.ecef and not problem.frame.geodetic:
         raise InvalidProblem(f"{rows.kind} needs a geodetic frame", "frame", "use frame ecef or enu with an origin")
     if model.ecef and problem.dimension != 3:

@@ -17,7 +17,7 @@ from optloc.problem.problem import Problem
 
 def separable(problem: Problem) -> bool:
     """Return whether no unknown is shared between the epochs of a problem."""
-    run_long_errors = problem.stations.covariance is not None and problem.stations.span == "run"
+    run_long_errors = problem.stations.estimated and problem.stations.span == "run"
     # A target that is known for the run ties nothing, and counts as free only where its span says so.
     free = all(motion.span == "epoch" for motion in problem.motions)
     return problem.epochs > 1 and free and not problem.biases and not run_long_errors and not tied(problem)
@@ -89,6 +89,7 @@ def by_epoch(problem: Problem) -> Problem:
         velocity=None if s.velocity is None else _split(s.velocity, 3),
         axes=None if s.axes is None else _split(s.axes, 4),
         covariance=None if s.covariance is None else _same(s.covariance, 3),
+        velocity_covariance=None if s.velocity_covariance is None else _same(s.velocity_covariance, 3),
     )
     priors = tuple(replace(p, mean=_same(p.mean, 1), covariance=_same(p.covariance, 2)) for p in problem.priors)
     constraints = tuple(_spread(c, problem.motions[c.target].rise) for c in problem.constraints)
@@ -510,6 +511,7 @@ def _check_alike(problem: Problem, more: Problem) -> None:
             [(b.name, b.members, b.form) for b in one.biases] == [(b.name, b.members, b.form) for b in two.biases],
         ),
         ("frames", one.frame == two.frame),
+        ("media", one.medium == two.medium),
     ):
         if not same:
             raise InvalidProblem(f"the {what} of the two runs differ", "update", "give the same ones in the same order")

@@ -133,7 +133,7 @@ def layout(
     Parameters
     ----------
     stations : Stations
-        Gives the dimension, and station offsets where positions are uncertain.
+        Gives the dimension, and station offsets where positions or velocities are uncertain.
     motions : sequence of Motion
         One for each target.
     biases : sequence of Bias
@@ -164,9 +164,10 @@ def layout(
         shared.append((bias.name, size, _bias_unit(bias.form, unit), members))
     # Emission times last one epoch by their nature; station errors where their span says so.
     local.extend((emission_name(i, len(motions)), 1, "m", ()) for i in emitting)
-    if stations.covariance is not None and stations.span != "noise":
+    if stations.estimated:
         room = shared if stations.span == "run" else local
-        room.append(("stations", stations.count * stations.dimension, "m", stations.names))
+        size = stations.count * stations.dimension
+        room.extend((name, size, unit, stations.names) for name, unit, _ in stations.errors)
     return Layout(_slots(shared), _slots(local), epochs)
 
 

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 
 from optloc.base.arrays import library, placed
+from optloc.base.errors import InvalidProblem
 from optloc.base.frames import CARTESIAN, Frame
 from optloc.base.types import Array, Band, Bias, Motion, Polygon, Prior, Rows, Stations
 from optloc.base.units import SI_UNIT
-from optloc.models import MODELS
+from optloc.models import MODELS, bent
+from optloc.models.medium import Atmosphere, Medium
 from optloc.problem.layout import Layout, layout
 from optloc.problem.noise import Block, Noise
 
@@ -41,6 +43,8 @@ class Problem:
         What the coordinates mean.
     constraints : tuple of Band or Polygon
         What the answer must meet.
+    medium : Layers or Atmosphere, optional
+        What the waves of rows of kinds that follow rays come through; see `in_medium`.
     """
 
     stations: Stations
@@ -52,6 +56,7 @@ class Problem:
     priors: tuple[Prior, ...] = ()
     frame: Frame = CARTESIAN
     constraints: tuple[Band | Polygon, ...] = ()
+    medium: Medium | None = None
 
     @property
     def dimension(self) -> int:
@@ -143,13 +148,42 @@ class Problem:
         # Numbers are left out: positions, measurements, weights, covariances change from solve to solve.
         s = self.stations
         stations: tuple[Any, ...] = (s.count, self.dimension, s.covariance is None, s.span)
+        stations += () if s.velocity_covariance is None else ("velocity errors",)
         # But for courses that a station may be further along: how fast it goes is a factor of an unknown.
         if any(b.form == "time" for b in self.biases) and s.velocity is not None:
             stations += (s.position.tobytes(), s.velocity.tobytes())
         # Polygons enter nothing that is kept by structure but programs, whose keys hold the bands of their edges.
         bands = [c for c in self.constraints if isinstance(c, Band)]
         constraints = tuple((c.kind, c.target, *_along(c, self.motions[c.target])) for c in bands)
-        return (rows, blocks, motions, biases, stations, self.times.tobytes(), self.frame, constraints)
+        medium = () if self.medium is None else (self.medium,)
+        return (rows, blocks, motions, biases, stations, self.times.tobytes(), self.frame, constraints, *medium)
+
+    def in_medium(self, medium: Medium) -> Problem:
+        """Return the problem with its rows measured along the rays of a medium; the places of all else stay.
+
+        Raises
+        ------
+        InvalidProblem
+            For kinds of which it is not known what rays that bend do to them, a frame that does not fit the medium, and
+            stations outside it.
+        """
+        made = replace(self, rows=tuple(replace(r, kind=bent(r.kind)) for r in self.rows), medium=medium)
+        check_medium(made)
+        return made
+
+    def straightened(self) -> Problem:
+        """Return the problem as if waves came straight, at one speed: what starts make of it."""
+        if self.medium is None:
+            return self
+        rows = []
+        for block in self.rows:
+            model = MODELS[block.kind]
+            factor = self.medium.straight if model.quantity in ("length", "speed") else 1.0
+            straight = replace(
+                block, kind=model.straight or block.kind, z=factor * block.z, correction=factor * block.correction
+            )
+            rows.append(block if model.straight is None else straight)
+        return replace(self, rows=tuple(rows), medium=None)
 
     def flat(self) -> Problem:
         """Return the same problems with exactly one batch axis."""
@@ -198,6 +232,30 @@ class Problem:
         return replace(self, rows=tuple(rows))
 
 
+def check_medium(problem: Problem) -> None:
+    """Refuse media that the frame does not fit, and stations outside them."""
+    medium, frame = problem.medium, problem.frame.kind
+    if medium is None:
+        return
+    if problem.dimension != 3:
+        raise InvalidProblem("rays bend in three dimensions, and the stations have two", "medium", "give z or height")
+    if isinstance(medium, Atmosphere):
+        if not problem.frame.geodetic:
+            advice = "use the frame geodetic, ecef or enu with an origin"
+            raise InvalidProblem("an atmosphere needs a frame on Earth", "frame", advice)
+        return
+    if frame == "ecef":
+        advice = 'use the frame "enu" with an origin, or "cartesian"'
+        raise InvalidProblem("layers need a frame whose third axis is up", "frame", advice)
+    (low, high), height = medium.reach, problem.stations.position[..., 2]
+    bad = np.argwhere((height < low) | (height > high))
+    if len(bad):
+        name, at = problem.stations.names[int(bad[0][-1])], height[tuple(bad[0])]
+        ends = f"{medium.surface - high:g} to {medium.surface - low:g} m"
+        what = f"station {name!r} is at depth {medium.surface - at:g} m, and the speeds are for {ends}"
+        raise InvalidProblem(what, "stations", "widen the table of speeds, or check the sign of z")
+
+
 # Entries of a structure that few problems have, and none that draws of stored studies are keyed by.
 
 
@@ -227,7 +285,7 @@ def _join(parts: list[Array]) -> Array:
 
 # The numbers of each part of a problem, and their unbatched ranks. Index arrays are shared by the batch and are none.
 _NUMBERS: dict[type, dict[str, int]] = {
-    Stations: {"position": 3, "velocity": 3, "axes": 4, "covariance": 3},
+    Stations: {"position": 3, "velocity": 3, "axes": 4, "covariance": 3, "velocity_covariance": 3},
     Rows: {"z": 1, "weight": 1, "correction": 1},
     Block: {"covariance": 3},
     Motion: {"known": 3, "rise": 2},

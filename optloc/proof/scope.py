@@ -8,7 +8,7 @@ import numpy as np
 
 from optloc.base.types import Band
 from optloc.compute.jit import enabled
-from optloc.linear.constraints import is_exact
+from optloc.linear.constraints import holds_along, is_exact
 from optloc.linear.normal import prior_parts
 from optloc.models import MODELS
 from optloc.problem.problem import Problem
@@ -47,7 +47,8 @@ def _reasons(problem: Problem) -> Iterator[str]:
     yield from _beyond_biases(problem)
     yield from _beyond_stations(problem)
     yield from _beyond_constraints(problem)
-    known = {"position", "velocity", "stations", *(bias.name for bias in problem.biases)}
+    known = {"position", "velocity", *(bias.name for bias in problem.biases)}
+    known |= {name for name, _, _ in problem.stations.errors}
     # What `optloc.proof.pose` does not write as rows would be left out of the cost without a word.
     for name, _, _ in prior_parts(problem):
         if name not in known:
@@ -61,17 +62,31 @@ def _beyond_courses(problem: Problem) -> Iterator[str]:
         yield "the target accelerates, and the proof is for one that stays or moves uniformly"
     if problem.epochs < 2:
         yield "the target moves, and the proof of that needs several epochs"
-    if problem.dimension > 2:
-        yield "the target moves in space, and the proof is for one that stays or moves in the plane"
+    if problem.dimension > 2 and held_height(problem) is None:
+        yield "the target moves in space, and the proof is for the plane and for heights that are kept over ground"
+    if problem.dimension > 2 and any(name == "velocity" for name, _, _ in prior_parts(problem)):
+        yield "the prior on velocity is not covered where the target moves over ground"
     for rows in problem.rows:
         if MODELS[rows.kind].velocity:
             yield f"the target moves, and {rows.kind} rows depend on how fast"
 
 
+def held_height(problem: Problem) -> Band | None:
+    """Return the height that a target which moves over ground keeps, or nothing."""
+    for band in problem.constraints:
+        if not isinstance(band, Band) or band.kind != "height" or not is_exact(band):
+            continue
+        if holds_along(problem, band) and problem.motions[band.target].over == "ground":
+            return band
+    return None
+
+
 def _beyond_rows(problem: Problem) -> Iterator[str]:
     for rows in problem.rows:
         model = MODELS[rows.kind]
-        if model.ranges is None and not model.nodes:
+        if model.straight is not None:
+            yield f"{model.straight} rows follow rays that bend, and the proof takes straight ones"
+        elif model.ranges is None and not model.nodes:
             yield f"{rows.kind} rows are neither sums of ranges or rates nor a kind whose bounds are known"
     most = MOST_NODES if enabled() else MOST_NODES_PLAIN
     if problem.count > most and _nodes(problem) > most:
@@ -122,6 +137,10 @@ def _beyond_biases(problem: Problem) -> Iterator[str]:
 
 def _beyond_stations(problem: Problem) -> Iterator[str]:
     covariance = problem.stations.covariance
+    if problem.stations.velocity_covariance is not None:
+        rates = [rows.kind for rows in problem.rows if MODELS[rows.kind].velocity]
+        if rates:
+            yield f"errors of the stations' velocities enter {rates[0]} rows in a way that depends on the place"
     if covariance is None:
         return
     # A sphere is what makes the nearest place to the surveyed one lie on the line to the target.

@@ -177,7 +177,7 @@ def _check(problem: Problem) -> None:
         ("biases", problem.biases),
         ("priors", problem.priors),
         ("constraints", problem.constraints),
-        ("stations", problem.stations.covariance is not None),
+        ("stations", bool(problem.stations.errors)),
     ):
         if given:
             advice = "leave them out: here positions are all that is unknown, and a region is given beside the problem"

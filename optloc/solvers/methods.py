@@ -18,7 +18,8 @@ from optloc.problem.loss import LOSSES
 from optloc.problem.problem import Problem
 from optloc.proof.scope import is_run, unsupported
 from optloc.solvers import stages
-from optloc.solvers.certify.branch_and_bound import certified, claimed, value_certified
+from optloc.solvers.certify.admitted import certified, value_certified
+from optloc.solvers.certify.branch_and_bound import claimed
 from optloc.solvers.formulations import FORMULATIONS, Formulation
 from optloc.solvers.outside import FixSolver, adapt
 from optloc.solvers.policy import LISTED_GAP

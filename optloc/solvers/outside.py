@@ -76,7 +76,11 @@ def accept(problem: Problem, fix: Fix) -> Pool:
     listed = np.where(np.isfinite(fix.alternatives.gap), int(Status.OK), int(Status.UNAVAILABLE))
     known = np.asarray(np.isfinite(fix.cov).all((-1, -2)))
     # a fix keeps its covariance alone: what is weak is not known of it, and not needed, as its verdict stands
-    information, regular = linalg.inverse(np.where(known[:, None, None], fix.cov, np.eye(fix.cov.shape[-1])))
+    covariance = np.where(known[:, None, None], fix.cov, np.eye(fix.cov.shape[-1]))
+    information, regular = linalg.inverse(covariance)
+    if fix.active is not None:  # what constraints hold has no variance: that is no sign of rows that leave it open
+        held = np.flatnonzero(_lengths(fix.active) > 0)
+        information[held], regular[held] = np.linalg.pinv(covariance[held], _HELD, hermitian=True), True
     marks = np.zeros(len(fix.code), dtype=int) if fix.marks is None else fix.marks
     searched = (fix.code == Status.SEARCHED) | (marks & Status.SEARCHED.mark != 0)
     verbatim = ~fix.answered if fix.explanations is None else ~fix.answered | (_lengths(fix.explanations) > 0)
@@ -98,6 +102,10 @@ def accept(problem: Problem, fix: Fix) -> Pool:
         asked=fix.explanations is not None,
         conclusion=_verbatim(fix, verbatim),
     )
+
+
+# Share of the largest variance below which one is the rounding of none.
+_HELD = 1e-12
 
 
 def _lengths(explanations: Array) -> Array:

@@ -14,6 +14,7 @@ from optloc.base.errors import NUMERICAL
 from optloc.base.records import Axes, join, overwrite
 from optloc.base.types import Array, Certificate, Status
 from optloc.linear.normal import degrees_of_freedom
+from optloc.models.layers import Layers
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 
@@ -187,7 +188,7 @@ def offer(problem: Problem, x: Array, before: Pool | None, name: str, began: flo
     began : float
         When it began, by `time.perf_counter`.
     """
-    shape = x.shape[:2]
+    shape, x = x.shape[:2], _within_layers(problem, x)
     stage = Stage(name, f"{x.shape[1]} candidates at most", perf_counter() - began)
     return Pool(
         x,
@@ -198,6 +199,21 @@ def offer(problem: Problem, x: Array, before: Pool | None, name: str, began: flo
         degrees_of_freedom(problem) if before is None else before.dof,
         (*(before.stages if before else ()), stage),
     )
+
+
+def _within_layers(problem: Problem, x: Array) -> Array:
+    """Return starts (N, q, size) whose positions have a speed: those beyond the layers are mirrored into them."""
+    if not isinstance(problem.medium, Layers):
+        return x
+    x, layout, (low, high) = x.copy(), problem.layout, problem.medium.reach
+    for slots, base, runs in ((layout.shared, 0, 1), (layout.local, layout.n_shared, layout.epochs)):
+        for slot in slots:
+            if slot.name.partition("[")[0] == "position":
+                # the third coordinate is up
+                up = base + slot.start + 2 + layout.n_local * np.arange(runs)
+                nearest = np.clip(x[..., up], low, high)
+                x[..., up] = np.clip(2.0 * nearest - x[..., up], low, high)
+    return x
 
 
 def begin(problem: Problem, start: Array) -> Pool:

@@ -100,7 +100,7 @@ def key_of(problem: Problem) -> tuple[Hashable, ...]:
     # Not structure, yet what the maps are made of: they are part of the key by their bytes.
     numbers = [array for r in problem.rows for array in (r.weight, r.correction)]
     numbers += [block.covariance for block in problem.noise.blocks]
-    numbers += [] if problem.stations.covariance is None else [problem.stations.covariance]
+    numbers += [covariance for _, _, covariance in problem.stations.errors]
     return (problem.structure, *(array.tobytes() for array in numbers))
 
 
@@ -132,7 +132,8 @@ def is_direct(problem: Problem) -> bool:
         and motion.known is None
         and all(MODELS[r.kind].ranges is not None and bool((r.target == 0).all()) for r in problem.rows)
         and stations.position.shape[-3] == 1
-        and (stations.covariance is None or (stations.span == "noise" and stations.covariance.ndim == 3))
+        and not stations.estimated
+        and all(covariance.ndim == 3 for _, _, covariance in stations.errors)
         and not depends_on_place(problem)
         and 0 < problem.count <= MOST
         and problem.epochs <= MOST

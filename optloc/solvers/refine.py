@@ -14,7 +14,7 @@ from optloc.compute.damping import FIRST_DAMPING, FIRST_GROWTH, judge
 from optloc.compute.pack import coarseness, pack
 from optloc.compute.sums import equations_at, serves
 from optloc.linear.constraints import Face, restore, tangent_at
-from optloc.linear.normal import Normal, decrement, depends_on_place, step, weighed, whitener_at
+from optloc.linear.normal import Normal, decrement, depends_on_place, offsets_of, step, weighed, whitener_at
 from optloc.problem.epochs import whole, windows
 from optloc.problem.noise import Whitener, variances, whiten
 from optloc.problem.problem import Problem
@@ -316,7 +316,7 @@ def by_machine_code(
     own = np.arange(len(start)) if item is None else np.asarray(item, dtype=np.int64)
     if not depends_on_place(problem):
         return _at_once(problem, start, own, whiten(weighed(problem).noise, problem.weight), rules, otherwise)
-    width = problem.layout.n_shared + problem.stations.count * problem.dimension
+    width = problem.layout.n_shared + offsets_of(problem)
     # Each problem has weights of its own: made in parts, so that their derivatives stay in memory.
     parts = np.array_split(np.arange(len(start)), 1 + len(start) * problem.count * width // _WEIGHED)
 

@@ -56,6 +56,8 @@ def start_with(word: str) -> Solver:
 
     def start(problem: Problem, pool: Pool | None) -> Pool:
         began = perf_counter()
+        # rays are the refinement's: what starts a fix knows straight lines
+        whole, problem = problem, problem.straightened()
         serving = [form for form in FORMULATIONS.values() if word in form.starts and form.serves(problem)]
         # what serves fewer problems knows more of this one: where nothing refines the starts, its answer is the fix
         serving.sort(key=lambda form: form.serves is one_position)
@@ -64,12 +66,12 @@ def start_with(word: str) -> Solver:
             # an empty slot, so that rows which no formulation starts give a pool without candidates
             nowhere = np.full((problem.batch_shape[0], 1, problem.dimension), np.nan)
             position = np.concatenate([*(form.starts[word](alone) for form in serving), nowhere], axis=1)
-            return _place(problem, position, pool, word, began)
+            return _place(whole, position, pool, word, began)
         if serving:
             x = np.concatenate([form.starts[word](problem) for form in serving], axis=1)
         else:
             x = from_pieces(problem, lambda piece: fix_by(piece, lambda one: start(one, None)))
-        return offer(problem, x, pool, word, began)
+        return offer(whole, x, pool, word, began)
 
     return start
 
@@ -152,7 +154,7 @@ def widen(problem: Problem, pool: Pool | None) -> Pool:
         return _beside(problem, pool, fix, around, began) if np.isfinite(around).any() else pool
     if not one_position(problem):
         return pool
-    fix, alone = judge(problem, pool), hold_still(problem)
+    fix, alone = judge(problem, pool), hold_still(problem.straightened())
     seen = problem.layout.take(standing(pool, fix), "position")
     parts = [mirror(alone, fix.position[:, None])]
     # the mirror image is one start and always tried; the others are many: where the verdict is not clean

@@ -74,6 +74,7 @@ class Case:
         for array in (
             problem.stations.position,
             problem.stations.covariance,
+            problem.stations.velocity_covariance,
             problem.weight,
             *(rows.correction for rows in problem.rows),
             *(block.covariance for block in problem.noise.blocks),

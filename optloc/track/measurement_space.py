@@ -87,8 +87,8 @@ def _check_lines(problem: Problem, order: int, window: int | None) -> None:
         )
     if problem.constraints or problem.priors:
         raise InvalidProblem("there are constraints or priors", "lines", "leave them out, or use a filter")
-    if problem.stations.covariance is not None:
-        raise InvalidProblem("station positions have errors", "lines", "use a filter")
+    if problem.stations.errors:
+        raise InvalidProblem("station positions or velocities have errors", "lines", "use a filter")
     if problem.epochs <= order or (window is not None and window <= order):
         raise InvalidProblem(
             f"too few epochs for a polynomial of order {order}", "lines", "give more, or a wider window"

@@ -257,14 +257,15 @@ def _is_plain(scan: Problem) -> bool:
         and motion.known is None
         and motion.reference in (None, scan.times[0])
         and not (scan.biases or scan.priors or scan.constraints)
-        and (scan.stations.covariance is None or scan.stations.span == "noise")
+        and not scan.stations.estimated
     )
 
 
 def _key_of(scan: Problem) -> tuple[Hashable, ...]:
     """Return a key of all that a scan is made of but its time and its measurements."""
     s = scan.stations
-    arrays = [s.position, s.velocity, s.axes, s.covariance, *(b.covariance for b in scan.noise.blocks)]
+    arrays = [s.position, s.velocity, s.axes, s.covariance, s.velocity_covariance]
+    arrays += [b.covariance for b in scan.noise.blocks]
     arrays += [array for b in scan.noise.blocks for array in (b.row,)]
     arrays += [array for r in scan.rows for array in (r.a, r.b, r.target, r.weight, r.correction)]
     sizes = tuple((r.kind, r.count) for r in scan.rows), tuple(b.row.shape for b in scan.noise.blocks)

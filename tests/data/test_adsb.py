@@ -9,7 +9,7 @@ from data.reference import law, listed
 from data.windows import quantiles, report
 from verdicts import alone
 
-from optloc import Status, solve
+from optloc import Atmosphere, Status, solve
 from optloc.datasets import adsb
 
 pytestmark = pytest.mark.data
@@ -79,3 +79,19 @@ def _silent(fix, reference):
     information = np.linalg.pinv(fix.covariance()[good], rcond=1e-12, hermitian=True)
     off[good] = np.sqrt(np.einsum("ki,kij,kj->k", apart[good], information, apart[good]))
     return off > 3.0
+
+
+def test_refraction_without_the_truth(folder):
+    # The paths through air are those of the unknown place: nothing of the truth but the height is used.
+    data, air = adsb.heard(folder).take(np.arange(0, 763, 8)), Atmosphere(1e6 * adsb.REFRACTIVITY, adsb.SCALE_HEIGHT)
+    corrected = adsb.heard(folder, refraction=True).take(np.arange(0, 763, 8))
+    problems = (data.problem("exactly"), corrected.problem("exactly"), data.problem("exactly").in_medium(air))
+    vacuum, known, own = (solve(problem, "gtrs+lsr").position for problem in problems)
+    medians = [quantiles(truths.adsb_horizontal(data, place))[0] for place in (vacuum, known, own)]
+    report(
+        f"ADS-B, five stations: {medians[0]} m in vacuum, {medians[1]} m with the air on the true path, {medians[2]} m"
+    )
+    assert medians[2] == pytest.approx(medians[1], rel=0.03)
+    assert medians[2] < medians[0]
+    # The line dips below the straight course between both heights that the dataset's formula follows.
+    assert np.median(np.linalg.norm(own - known, axis=1)) < 3.0

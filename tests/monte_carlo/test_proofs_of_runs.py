@@ -1,6 +1,7 @@
 """Runs of random fleets and of targets that move: how often they are proven, and whether anything refutes a proof."""
 
 from collections import Counter
+from contextlib import ExitStack
 from dataclasses import replace
 from time import process_time
 
@@ -10,9 +11,11 @@ from monte_carlo.tables import ledger
 from proof.doppler import registration
 from proof.test_moving_targets import drawn as moving_target
 from proof.test_moving_targets import limits
+from proof.test_targets_over_ground import drawn as over_ground
 
 from optloc import Problem, Status, simulate, solve
 from optloc.compute.jit import enabled
+from optloc.linear.constraints import exact, restore
 from optloc.solvers.certify.posed import state_columns
 from optloc.solvers.refine import refine
 from optloc.solvers.starts.position import vectors
@@ -26,19 +29,25 @@ MOVING = {"ranges": ("range",), "bearings": ("azimuth",), "range differences": (
 RUNS = {f"{epochs} epochs, {clocks}": (epochs, clocks, 600.0) for epochs in EPOCHS for clocks in CLOCKS}
 RUNS |= {f"25 epochs in a minute, {clocks}": (25, clocks, 60.0) for clocks in CLOCKS[:2]}
 COURSES = {f"a target that moves, {words}": kinds for words, kinds in MOVING.items()}
-# 20 cells of 112 runs are two thousand and some; and of each kind of row of a moving target.
-FULL, FULL_MOVING = 112, 200
+GROUND = {f"at a known height, {words}": kinds for words, kinds in MOVING.items()}
+# 20 cells of 112 runs are two thousand and some; of each kind of row of a moving target; of those over ground, whose
+# refinements take a second.
+FULL, FULL_MOVING, FULL_GROUND = 112, 200, 60
 HEADER = ["runs", "fixes", "proven", "unique", "`ok`", "others", "refuted", "boxes, median", "boxes, 99 %", "ms a fix"]
 
 
+TABLES = {"proofs_of_runs": [*RUNS, *COURSES], "proofs_over_ground": [*GROUND]}
+COURSES |= GROUND
+
+
 @pytest.fixture(scope="module")
-def book(pytestconfig):
-    facts, kept = (
-        f"seed {SEED}, method auto, {STARTS} refinements against each",
-        pytestconfig.cache.mkdir("optloc-tables"),
-    )
-    with ledger("proofs_of_runs", HEADER, [*RUNS, *COURSES], facts, kept=kept) as made:
-        yield made
+def books(pytestconfig):
+    facts = f"seed {SEED}, method auto, {STARTS} refinements against each"
+    kept = pytestconfig.cache.mkdir("optloc-tables")
+    with ExitStack() as stack:
+        yield {
+            file: stack.enter_context(ledger(file, HEADER, names, facts, kept=kept)) for file, names in TABLES.items()
+        }
 
 
 def fleets(epochs: int, clocks: str, span: float, number: int) -> tuple[Problem, Array]:
@@ -52,9 +61,13 @@ def fleets(epochs: int, clocks: str, span: float, number: int) -> tuple[Problem,
     return problem, scenes.truth
 
 
-def course(kinds: tuple[str, ...], number: int) -> tuple[Problem, Array]:
-    """Return a target that moves in the plane, within limits that are stated, and its state (1, 4)."""
+def course(name: str, number: int) -> tuple[Problem, Array]:
+    """Return a target that moves in the plane or over ground, within limits that are stated, and its state."""
+    kinds = COURSES[name]
     rng = np.random.default_rng([SEED, len(kinds[0]), number])
+    if name in GROUND:
+        made, truth = over_ground(rng, kinds)
+        return simulate(made, truth=truth, seed=number).flat(), truth[None, :6]
     made, truth = moving_target(rng, kinds, out=rng.choice([1.0, 2.0]), constraints=limits())
     return simulate(made, truth=truth, seed=number).flat(), truth[None, :4]
 
@@ -73,11 +86,14 @@ def refuted(problem: Problem, fix, truth: Array, rng: np.random.Generator) -> in
         if claim is None or claim.proof not in ("global", "region"):
             continue
         part = problem.take(np.full(starts.shape[1], i))
-        done = refine(part, vectors(part, starts[i][:, None])[:, 0])
+        x = vectors(part, starts[i][:, None])[:, 0]
+        face = exact(problem)
+        done = refine(part, restore(part, face, x) if face else x, face=face)
         place, gap = done.x[:, own], done.cost - fix.cost[i]
         inside = np.isfinite(done.cost) & (done.status == Status.OK)
         if claim.region is not None:
-            inside &= ((place >= claim.region[0]) & (place <= claim.region[1])).all(-1)
+            limited = place if len(claim.region[0]) == size else place[:, [0, 1, 3, 4]]
+            inside &= ((limited >= claim.region[0]) & (limited <= claim.region[1])).all(-1)
         known = np.concatenate([fix.x[i : i + 1, own], fix.alternatives.x[i][:, own]])
         spread = np.sqrt(np.diag(fix.cov[i][own, own]))
         with np.errstate(invalid="ignore"):
@@ -123,7 +139,7 @@ def told(name: str, trials: int) -> Told:
     """Return what became of some runs of a row of the table."""
     out = Told()
     for number in range(trials // BATCH if name in RUNS else trials):
-        problem, truth = fleets(*RUNS[name], number) if name in RUNS else course(COURSES[name], number)
+        problem, truth = fleets(*RUNS[name], number) if name in RUNS else course(name, number)
         out.add(problem, truth, np.random.default_rng([1, number]))
     return out
 
@@ -136,16 +152,17 @@ def judge(name: str, made: Told) -> None:
 
 
 @pytest.mark.skipif(not enabled(), reason="runs are proven by machine code")
-@pytest.mark.parametrize("name", ["25 epochs, offsets", "a target that moves, ranges"])
+@pytest.mark.parametrize("name", ["25 epochs, offsets", "a target that moves, ranges", "at a known height, ranges"])
 def test_runs_are_proven_and_nothing_refutes_them(name):
-    judge(name, told(name, 2 * BATCH))
+    judge(name, told(name, 2 if name in GROUND else 2 * BATCH))
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", [*RUNS, *COURSES])
-def test_proofs_of_runs_in_full(name, book):
+def test_proofs_of_runs_in_full(name, books):
+    book = books["proofs_over_ground" if name in GROUND else "proofs_of_runs"]
     if name in book.rows:  # of the same code, by a run that was stopped
         return
-    made = told(name, FULL if name in RUNS else FULL_MOVING)
+    made = told(name, FULL if name in RUNS else FULL_GROUND if name in GROUND else FULL_MOVING)
     judge(name, made)
     book.add(name, *made.cells)

@@ -12,20 +12,15 @@ from optloc import Motion, Prior, Status, assemble, certify, constraints, measur
 from optloc.compute.jit import enabled
 from optloc.proof.runs.posed import pose_courses
 from optloc.proof.runs.rows import blur_of, residual_at
-from optloc.proof.runs.states import (
-    Axes,
-    cost_of_state,
+from optloc.proof.runs.state_bounds import (
     has_no_minimum,
     hessian_of_state,
     is_convex,
     least_length,
-    put,
-    set_bends,
-    set_box,
     set_lines,
     sum_up,
-    table_of,
 )
+from optloc.proof.runs.states import Axes, cost_of_state, put, set_bends, set_box, table_of
 from optloc.proof.scope import unsupported
 from optloc.solvers.certify.posed import state_columns
 
@@ -84,7 +79,7 @@ def boxes(rng: np.random.Generator, count: int):
         origin = truth[:4] + off * np.array([1.0, 1.0, 0.01, 0.01]) * rng.normal(size=4)
         turn = np.diag([1.0, 1.0, 0.01, 0.01]) @ rng.normal(size=(4, 4))
         axes = Axes(origin, np.ascontiguousarray(turn), np.linalg.inv(turn), np.zeros((2, 4)))
-        table = table_of(course, 4)
+        table = table_of(course)
         put(table, np.zeros(4), 10.0 ** rng.uniform(-1.0, 4.0) * rng.uniform(0.1, 1.0, 4))
         set_box(course, axes, table)
         yield course, axes, table
@@ -103,7 +98,7 @@ def test_no_point_costs_less_than_its_box(seed):
         noise = blur_of(course.rows, 1.0, table.nodes)
         set_lines(course, table)
         low = least_length(course, table, here, False)
-        set_bends(course, table)
+        set_bends(course, axes, table)
         low = max(low, least_length(course, table, here, True)) - noise
         cost = min(cost_of_state(course, state)[0] for state in inside(rng, axes, table, 100))
         assert low <= np.sqrt(cost) * (1.0 + 1e-9) + 1e-9
@@ -116,7 +111,7 @@ def test_no_state_of_a_box_has_a_hessian_beyond_its_bounds(seed):
     for course, axes, table in boxes(rng, 140):
         residual_at(course.rows, table.nodes, table.sheet)
         set_lines(course, table)
-        set_bends(course, table)
+        set_bends(course, axes, table)
         ball, noise = sum_up(course, table, blur_of(course.rows, 1.0, table.nodes))
         states, good = inside(rng, axes, table, 20), is_convex(table, ball, 0.0)
         convex += good

@@ -123,3 +123,61 @@ def test_a_map_has_the_region_of_a_far_fix():
     assert len(made.rings) == 1
     lat, lon = np.degrees(frame.to_geodetic(fix.position)[:2])
     assert inside((lon, lat), [made.rings[0]])
+
+
+def held_at_a_height(seed):
+    """Return a problem of differences whose target is at a known height, far from the stations, and its fix."""
+    frame = optloc.Frame.enu(lat_deg=47.8, lon_deg=11.2, height=600.0)
+    stations = np.array([[0.0, 0.0, 0.0], [9e3, 400.0, 30.0], [4e3, 7e3, 50.0], [-6e3, 5e3, 10.0]])
+    rows = optloc.measured("tdoa", a=np.arange(1, 4), b=np.zeros(3, dtype=int), arrival_sigma=60.0)
+    template = optloc.assemble(stations, rows, frame=frame, constraints=optloc.constraints.height(exactly=1600.0))
+    lat, lon, _ = frame.to_geodetic(np.array([25e3, -30e3, 0.0]))
+    truth = frame.from_geodetic(lat, lon, 1600.0)
+    problem = optloc.simulate(template, truth, seed)
+    return problem, truth, optloc.solve(problem)
+
+
+def test_a_region_along_a_known_height_is_what_costs_as_little_there():
+    for seed in (1, 2, 4):
+        problem, _, fix = held_at_a_height(seed)
+        assert fix.chart.name == "curved"
+        (pieces,) = pieces_of(problem, fix)
+        cells = np.array(pieces)
+        assert problem.frame.to_geodetic(cells)[2] == pytest.approx(1600.0, abs=1e-6)
+        plan = polygons([piece[:, :2] for piece in pieces])
+        # points of the surface around, by a cost of their own
+        rng, z, place = np.random.default_rng(seed), problem.z, problem.stations.position.reshape(-1, 3)
+        low, high = cells[..., :2].min((0, 1)), cells[..., :2].max((0, 1))
+        points = np.c_[rng.uniform(low, high, (2000, 2)), np.zeros(2000)]
+        for _ in range(5):
+            points[:, 2] += 1600.0 - problem.frame.to_geodetic(points)[2]
+        way = np.linalg.norm(points[:, None] - place, axis=-1)
+        off = way[:, 1:] - way[:, :1] - z
+        inverse = np.linalg.inv(60.0**2 * (np.eye(3) + 1.0))
+        excess = np.einsum("ni,ij,nj->n", off, inverse, off) - float(fix.cost)
+        held = np.array([any(inside(point[:2], polygon) for polygon in plan) for point in points])
+        assert (excess < quantile(0.95, 2)).sum() > 5
+        assert held[excess < 0.9 * quantile(0.95, 2)].mean() > 0.98
+        assert not held[excess > 4.0 * quantile(0.95, 2)].mean() > 0.02
+        labels = plot_fixes(problem, fix).axes[0].get_legend_handles_labels()[1]
+        assert "95 % region" in labels
+        assert fixed_spots(problem, [fix], []).rings[0].shape[0] > 4
+
+
+def test_a_region_along_a_plane_or_a_line_is_drawn():
+    stations, drawn = np.array([[0.0, 0.0, 0.0], [1e3, 0.0, 0.0], [0.0, 1e3, 0.0]]), []
+    for across in (np.inf, 700.0):
+        high = np.array([np.inf, across, 300.0])
+        held = optloc.constraints.box(np.where(np.isfinite(high), high, -np.inf), high)
+        rows = optloc.measured("azimuth", a=np.arange(3), sigma=0.1)
+        template = optloc.assemble(stations, rows, constraints=held)
+        for seed in range(8):
+            problem = optloc.simulate(template, [9e3, 700.0, 300.0], seed)
+            fix = optloc.solve(problem)
+            if fix.answered and fix.chart.name != "cartesian":
+                (pieces,) = pieces_of(problem, fix)
+                assert np.array(pieces)[..., 2] == pytest.approx(300.0)
+                plot_fixes(problem, fix)
+                drawn.append(across)
+                break
+    assert drawn == [np.inf, 700.0]

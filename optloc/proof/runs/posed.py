@@ -17,6 +17,7 @@ from optloc.proof.chart import (
     cost_of,
     empty_groups,
 )
+from optloc.proof.nodes.level import height_numbers
 from optloc.proof.pose import (
     Columns,
     Others,
@@ -31,8 +32,10 @@ from optloc.proof.pose import (
     span_of,
     turned_level,
 )
+from optloc.proof.runs.ground import STRAIGHT, Ground
 from optloc.proof.runs.rows import Rows
 from optloc.proof.runs.states import Course
+from optloc.proof.scope import held_height
 
 # From a problem to its rows, and to those of few epochs.
 
@@ -179,11 +182,21 @@ def _pose_course(problem: Problem) -> tuple[tuple[Course, Course], float]:
     when = np.zeros(len(made.kinds))
     when[made.column] = since[problem.epoch[made.row]]  # rows that share a node are of one epoch
     value = np.where(counts_from_measured(problem), 0.0, known)[0]
+    rise = np.zeros(len(made.kinds))
+    rise[made.column] = _rise(problem)[problem.epoch[made.row]]
     prior, times = _state_prior(problem, made, max(float(np.ptp(since)), 1.0))
-    when = np.concatenate([when, times])
+    # a prior is of the state itself, wherever heights are reported to be at that time
+    when = np.stack([np.concatenate([when, times]), np.concatenate([rise, np.zeros(len(times))])], axis=1)
     parts = [usable[0], usable[0] & _few(problem, len(when))]
-    courses = [_course(_System.of(problem, part, made, others, value, prior), made, when) for part in parts]
+    systems = [_System.of(problem, part, made, others, value, prior) for part in parts]
+    courses = [_course(problem, system, made, when) for system in systems]
     return (courses[0], courses[1]), float(turned_level(problem, others, known)[0])
+
+
+def _rise(problem: Problem) -> Array:
+    """Return what heights of a course are above that of its state, (k,), metres."""
+    rise = problem.motions[0].rise
+    return np.zeros(problem.epochs) if rise is None else np.reshape(rise[..., 0], (-1, problem.epochs))[0]
 
 
 def _state_prior(problem: Problem, made: Columns, span: float) -> tuple[Any, list[float]]:
@@ -212,15 +225,26 @@ def _state_prior(problem: Problem, made: Columns, span: float) -> tuple[Any, lis
     return sparse.csr_array(entries, shape=(count, len(made.kinds))), times
 
 
-def _course(system: _System, made: Columns, when: Array) -> Course:
-    """Return whitened rows as a course over the nodes that they touch, epoch by epoch."""
+def _course(problem: Problem, system: _System, made: Columns, when: Array) -> Course:
+    """Return whitened rows as a course over the nodes that they touch, by time and height (J, 2) of these."""
     used = np.flatnonzero(np.bincount(system.nodes.indices, minlength=len(when)))
-    order = used[np.argsort(when[used], kind="stable")]
-    since, first = np.unique(when[order], return_index=True)
+    order = used[np.lexsort((when[used, 1], when[used, 0]))]
+    epochs, first = np.unique(when[order], axis=0, return_index=True)
     own = replace(system, nodes=system.nodes[:, order])
     kinds = np.array(made.kinds)[order]
     data = own.marked(kinds, made.numbers[:1, order])
-    return Course(kinds, data, np.append(first, len(order)), since, own.rows())
+    since, rise = (plainly(column) for column in epochs.T)
+    ground = _ground(problem, since, rise)
+    return Course(kinds, data, np.append(first, len(order)), since, own.rows(), ground)
+
+
+def _ground(problem: Problem, since: Array, rise: Array) -> Ground:
+    """Return what a course is carried over; its axes are those of the frame until a place is known."""
+    level = held_height(problem)
+    if level is None:
+        return STRAIGHT
+    value = float(np.ravel(level.lower)[0])
+    return Ground(plainly(height_numbers(problem)[0]), np.eye(3), value, rise, float(np.abs(since).max(initial=0.0)))
 
 
 def _few(problem: Problem, nodes: int) -> Array:

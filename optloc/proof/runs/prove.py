@@ -54,6 +54,7 @@ from optloc.proof.near import (
 )
 from optloc.proof.nodes.dispatch import infinity_of
 from optloc.proof.nodes.node import DIFFERENCE, GROWS
+from optloc.proof.runs.ground import Ground, axes_at, corners_on, over_ground, state_off, state_on
 from optloc.proof.runs.posed import Courses, Run, Runs
 from optloc.proof.runs.rows import (
     blur_of,
@@ -71,8 +72,9 @@ from optloc.proof.runs.search import (
     sum_at,
     tables_of,
 )
+from optloc.proof.runs.state_bounds import axes_of, hessian_of_state
 from optloc.proof.runs.state_search import prove_course
-from optloc.proof.runs.states import axes_of, cost_of_state, hessian_of_state
+from optloc.proof.runs.states import STATE, Course, cost_of_state
 from optloc.proof.surface import SIDES, is_one_side, reach_of_piece
 
 # Boxes around known minima on which the cost is convex.
@@ -385,19 +387,32 @@ def prove_courses(posed: Courses, asked: Asked) -> Answered:
     found = np.full((n, size), np.nan)
 
     def prove(i: int) -> None:
-        (whole, few), state = posed.courses[i], plainly(asked.x[i])
-        axes = axes_of(hessian_of_state(whole, state), state, plainly(asked.region[i]))
+        (whole, few), ground = _on_surface(posed.courses[i], asked.x[i])
+        state, others, corners = asked.x[i], asked.others[i, : asked.known[i]], asked.region[i]
+        if over_ground(ground):
+            state, others, corners = state_on(ground, state), state_on(ground, others), corners_on(ground, corners)
+        state, another = plainly(state), np.full(STATE, np.nan)
+        axes = axes_of(hessian_of_state(whole, state), state, plainly(corners))
         if axes is None:
             verdict[i] = STATIONARY
             return
-        others, budget = plainly(asked.others[i, : asked.known[i]]), int(asked.budget[i])
         verdict[i], boxes[i], bound[i] = prove_course(
-            whole, few, axes, others, asked.kappa[i], asked.eps[i], budget, found[i]
+            whole, few, axes, plainly(others), asked.kappa[i], asked.eps[i], int(asked.budget[i]), another
         )
+        found[i] = state_off(ground, another) if over_ground(ground) else another
 
     if usable(prove_course, n):
         mapped(prove, range(n))
     return Answered(verdict, boxes, bound, np.zeros(n, np.bool_), found)
+
+
+def _on_surface(courses: tuple[Course, Course], state: Array) -> tuple[tuple[Course, Course], Ground]:
+    """Return courses with the axes along which states are counted around one, and what they are carried over."""
+    if not over_ground(courses[0].ground):
+        return courses, courses[0].ground
+    axes = axes_at(courses[0].ground.data, state[:3])
+    whole, few = (course._replace(ground=course.ground._replace(axes=axes)) for course in courses)
+    return (whole, few), whole.ground
 
 
 def costs_of_courses(posed: Courses, states: Array) -> tuple[Array, Array]:

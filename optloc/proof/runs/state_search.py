@@ -13,6 +13,7 @@ from optloc.compute.systems import invert
 from optloc.proof.everywhere import ANOTHER, CHEAPER, CLEAR, SPENT
 from optloc.proof.near import BETTER, BUDGET, OTHER, STATIONARY, UNIQUE, VALUE, Aim
 from optloc.proof.runs.rows import blur_of, residual_at
+from optloc.proof.runs.state_bounds import has_no_minimum, is_convex, least_length, set_lines, sum_up
 from optloc.proof.runs.states import (
     SHIFT,
     WIDER,
@@ -20,14 +21,9 @@ from optloc.proof.runs.states import (
     Course,
     Table,
     floor_of,
-    has_no_minimum,
-    is_convex,
-    least_length,
     put,
     set_bends,
     set_box,
-    set_lines,
-    sum_up,
     table_of,
 )
 
@@ -137,7 +133,7 @@ def _look(course: Course, axes: Axes, table: Table, floor: float, level: float) 
     low = least_length(course, table, here, False) - noise
     if low > 0.0 and low * low >= level:
         return here, low
-    set_bends(course, table)
+    set_bends(course, axes, table)
     return here, max(low, least_length(course, table, here, True) - noise)
 
 
@@ -145,7 +141,7 @@ def _look(course: Course, axes: Axes, table: Table, floor: float, level: float) 
 def _curve(search: Search, table: Table) -> tuple[float, float]:
     """Fill the sums of a box that was looked at with all rows, see `sum_up`."""
     noise = blur_of(search.whole.rows, search.floors[0], table.nodes)
-    set_bends(search.whole, table)
+    set_bends(search.whole, search.axes, table)
     return sum_up(search.whole, table, noise)
 
 
@@ -325,8 +321,9 @@ def set_minimum(search: Search, p: int, state: Array, least: float, eps: float) 
         set_box(search.whole, axes, table)
         residual_at(search.whole.rows, table.nodes, table.sheet)
         set_lines(search.whole, table)
-        ball, _ = _curve(search, table)
-        if is_convex(table, ball, margin):
+        ball, noise = _curve(search, table)
+        blur = noise / share  # of the slope, which the margin is made of
+        if is_convex(table, ball, margin + n * blur * (blur + 2.0 * sqrt(eps * margin)) / eps):
             for m in range(n):
                 search.sides[p, m] = share
             return True
@@ -364,7 +361,7 @@ def prove_course(
         As there.
     """
     x, n = axes.origin, axes.origin.shape[0]
-    table, small, room = table_of(whole, n), table_of(few, n), np.zeros((2, 1 + others.shape[0], n))
+    table, small, room = table_of(whole), table_of(few), np.zeros((2, 1 + others.shape[0], n))
     floors = floor_of(whole, x), floor_of(few, x)
     search = Search(whole, few, axes, table, small, floors, room[0], room[1])
     least = _linearise(search, table)

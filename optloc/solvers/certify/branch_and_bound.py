@@ -14,7 +14,6 @@ from optloc.base.types import Array, Certificate
 from optloc.compute.jit import enabled
 from optloc.linear.constraints import TOLERANCE, exact, violation, violation_names
 from optloc.problem.chart import quantile
-from optloc.problem.epochs import by_epoch, separable
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
 from optloc.proof.batch import Answered, Asked
@@ -36,13 +35,12 @@ from optloc.solvers.certify.posed import (
     unlimited,
 )
 from optloc.solvers.inequalities import is_hidden
-from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, equal_cost
-from optloc.solvers.pool import Claim, Pool, in_parts, offer, pack, where
+from optloc.solvers.pool import Claim, Pool, offer, pack
 from optloc.solvers.refine import refine
 from optloc.solvers.stages import lsr
 from optloc.solvers.starts.position import vectors
-from optloc.solvers.verdict.judge import failed, fill, judge, standing, verdict
+from optloc.solvers.verdict.judge import fill, judge, standing
 
 # What a proof lets a certificate say, in sentences.
 
@@ -364,7 +362,8 @@ def _claim(work: Work, items: Array, asked: Asked, answer: Answered, done: Array
     region: list[tuple[Corner, Corner] | None] = [None] * len(done)
     for k in np.flatnonzero(~answer.everywhere[done]).tolist():
         whole = np.isnan(asked.region[done[k], 0, 0])
-        low, high = (asked.fallback if whole else asked.region)[done[k]].tolist()
+        corners = (asked.fallback if whole else asked.region)[done[k]]
+        low, high = corners[:, np.isfinite(corners).all(0)].tolist()  # what a known height says is not limited
         region[k] = tuple(low), tuple(high)
     numbers = (work.fix.cost[proven], bound, kappa, answer.boxes[done], listed.sum(1))
     given = zip(*(values.tolist() for values in numbers), region, strict=True)
@@ -377,7 +376,7 @@ def _add(work: Work, items: Array, points: Array, better: Array) -> None:
     began = perf_counter()
     part, own, before = work.problem.take(items), work.fix[items], take(work.pool, items)
     x = pack(np.concatenate([standing(before, own), vectors(part, points[:, None])], axis=1))
-    pool = _keep_evidence(lsr(part, offer(part, x, before, "certify", began)), before)
+    pool = keep_evidence(lsr(part, offer(part, x, before, "certify", began)), before)
     new = judge(part, pool)
     with np.errstate(invalid="ignore"):
         lower = new.cost < own.cost - equal_cost(own.cost)
@@ -438,7 +437,7 @@ def _deep(problem: Problem, x: Array) -> Array:
     return out
 
 
-def _keep_evidence(pool: Pool, before: Pool) -> Pool:
+def keep_evidence(pool: Pool, before: Pool) -> Pool:
     """Return a pool with what was known of its problems before one more candidate was refined."""
     infinity = pool.infinity if before.infinity is None else before.infinity
     if pool.infinity is not None and before.infinity is not None:
@@ -446,83 +445,29 @@ def _keep_evidence(pool: Pool, before: Pool) -> Pool:
     return replace(pool, infinity=infinity, searched=before.searched, remark=before.remark, asked=before.asked)
 
 
-# Who asks for a proof gives it more time than a method that goes on without one.
-_EFFORT = 4
-
-
-def certify(
-    problem: Problem, fix: Fix, region: tuple[Array, Array] | None = None, *, margin: float = LISTED_GAP
-) -> Fix:
-    """Return a fix with a certificate of what is proven about it, and with every better or other minimum met.
-
-    The proof encloses all positions that could cost less, shows that the cost is convex around the fix, and splits
-    the rest into boxes until a lower bound excludes each. A better position replaces the fix, which is then proven
-    again; other minima with a cost within 25 are listed as alternatives.
+def certified_freely(
+    problem: Problem, pool: Pool | None, region: Array | None = None, margin: float = LISTED_GAP, effort: int = 1
+) -> Pool:
+    """Return the pools of a flat batch with certificates of claims about all positions, admitted or not.
 
     Parameters
     ----------
     problem : Problem
-        Batch (...) of problems.
-    fix : Fix
-        Their fixes, refined.
-    region : (lower, upper), optional
-        Corners (d,) of the box to which the claim may be limited, in the problem's frame, metres; None: all positions,
-        or where that cannot be bounded a box around the stations that the certificate names. Of a target that moves
-        (2 d,), velocities in metres per second after the coordinates; None: what its constraints admit, see
-        `optloc.solvers.certify.posed.regions_of`.
+        N problems.
+    pool : Pool
+        Refined.
+    region : array (2, d), optional
+        As of `optloc.solvers.certify.admitted.certify`.
     margin : float
-        Gap between the cost of the fix and that of any other minimum that is tried to prove first; where the proof is
-        not finished, 9, the gap of `ambiguous`, and the value alone follow. 0 asks for the value alone: quicker.
-
-    Returns
-    -------
-    Fix
-        Like `fix`. Fixes without an answer stay as they are; what cannot be proven has the certificate "unknown" with
-        the reason, and one whose proof fails numerically the status `numerical`.
-
-    Raises
-    ------
-    InvalidProblem
-        For a fix of another shape, corners that do not bound a box, or a negative margin.
-    """
-    if separable(problem):
-        problem = by_epoch(problem)
-    shape, flat = problem.batch_shape, problem.flat()
-    if fix.shape != shape:
-        raise InvalidProblem(
-            f"a fix of shape {fix.shape} for problems of shape {shape}", "fix", "give the fix of this problem"
-        )
-    if not 0.0 <= margin < np.inf:
-        raise InvalidProblem(f"the margin is {margin}", "margin", "give 0 or a positive number")
-    corners = None if region is None else _corners(problem, region)
-    given = fix.reshape((flat.batch_shape[0],))
-
-    def work(some: Problem, part: slice) -> Fix:
-        with where("certify"):
-            return verdict(some, certified(some, accept(some, given[part]), corners, margin, _EFFORT))
-
-    return in_parts(flat, work, failed=failed).reshape(shape)
-
-
-def value_certified(problem: Problem, pool: Pool | None) -> Pool:
-    """Return the pools of a flat batch of problems with a proof that nothing costs less: the stage "value"."""
-    return certified(problem, pool, margin=0.0)
-
-
-def certified(
-    problem: Problem, pool: Pool | None, region: Array | None = None, margin: float = LISTED_GAP, effort: int = 1
-) -> Pool:
-    """Return the pools of a flat batch with certificates: the stage "certify"; region (2, d) as of `certify`.
-
-    `effort` multiplies the boxes that a proof may take.
+        Gap to prove.
+    effort : int
+        Multiplies the boxes that a proof may take.
     """
     if pool is None:
         raise InvalidProblem("certify examines a fix", "method", "put it behind a refinement")
     began = perf_counter()
     fix = judge(problem, pool)
-    answered = fix.answered & np.isfinite(fix.cost)
-    if pool.conclusion is not None:
-        answered &= ~present(pool.conclusion)  # the rows are not all there
+    answered, proven_before = to_prove(pool, fix)
     why = unsupported(problem)
     if not why and region is None and effort == 1:  # who calls `certify` wants what can be had
         why = unlimited(problem)
@@ -533,9 +478,8 @@ def certified(
             pool, certificate=certificate, stages=(*pool.stages, certify_stage(why or "nothing to prove", began))
         )
 
-    stands = _stands(pool.claims, fix)
-    work = Work.begin(problem, pool, fix, answered & ~stands, region, margin, effort)
-    for i in np.flatnonzero(answered & stands).tolist():
+    work = Work.begin(problem, pool, fix, answered & ~proven_before, region, margin, effort)
+    for i in np.flatnonzero(proven_before).tolist():
         assert pool.claims is not None
         work.certificate[i] = pool.claims[i].certificate
     work = settle(work)
@@ -558,6 +502,14 @@ def _count_listed(fix: Fix) -> Array:
     return np.asarray(np.isfinite(fix.alternatives.gap).sum(1))
 
 
+def to_prove(pool: Pool, fix: Fix) -> tuple[Array, Array]:
+    """Return which fixes (N,) there is something to prove of, and of which of these a claim of before holds still."""
+    answered = fix.answered & np.isfinite(fix.cost)
+    if pool.conclusion is not None:
+        answered &= ~present(pool.conclusion)  # the rows are not all there
+    return answered, answered & _stands(pool.claims, fix)
+
+
 def _stands(claims: Array | None, fix: Fix) -> Array:
     """Return which claims are about the same minima as fixes (N,): what was shown, or not, of these holds still.
 
@@ -576,16 +528,3 @@ def _stands(claims: Array | None, fix: Fix) -> Array:
 def certify_stage(detail: str, began: float) -> Stage:
     """Return the stage "certify" that began at a time of `time.perf_counter`, with what it did."""
     return Stage("certify", detail, perf_counter() - began)
-
-
-def _corners(problem: Problem, region: tuple[Array, Array]) -> Array:
-    """Return the corners (2, d) of a region that is a box, (2, 2 d) where it says velocities as well."""
-    corners = np.array([np.asarray(corner, dtype=float) for corner in region])
-    sizes = sorted({problem.dimension, problem.dimension * (problem.motions[0].order + 1)})
-    shaped = corners.ndim == 2 and len(corners) == 2 and corners.shape[1] in sizes
-    if not shaped or not np.isfinite(corners).all() or (corners[0] >= corners[1]).any():
-        count = " or ".join(map(str, sizes))
-        raise InvalidProblem(
-            "the region is no box", "region", f"give (lower, upper) with {count} finite coordinates each"
-        )
-    return corners

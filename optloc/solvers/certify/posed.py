@@ -16,7 +16,7 @@ from optloc.proof.nodes.level import height_numbers
 from optloc.proof.pose import Posed, pose_costs
 from optloc.proof.runs.posed import Courses, Runs, pose_courses, pose_runs
 from optloc.proof.runs.prove import costs_of_courses, costs_of_runs, prove_courses, prove_runs, runs_lack_code
-from optloc.proof.scope import is_run
+from optloc.proof.scope import held_height, is_run
 from optloc.proof.surface import DATA, FIRST, LEVEL, MIDDLE, SURFACE_WIDTH, UP
 from optloc.solvers.starts.position import spread_of
 
@@ -143,21 +143,28 @@ def regions_of(problem: Problem, state: Array, region: Array | None) -> tuple[Ar
         out[..., :given] = region
     if n == problem.dimension:
         return out, given > 0
-    limits = _admitted(problem, n)[:, given:]
-    known = given + np.flatnonzero(np.isfinite(limits).all(0))
-    out[..., known] = limits[:, known - given]
-    return out, given + len(known) == n
+    limits = admitted(problem, n)
+    known = np.flatnonzero(np.isfinite(limits).all(0) & (np.arange(n) >= given))
+    out[..., known] = limits[:, known]
+    free = _across(problem)
+    out[..., free] = [[-np.inf], [np.inf]]
+    return out, set(range(n)) <= {*range(given), *known.tolist(), *free}
 
 
 def unlimited(problem: Problem) -> str:
     """Return why a proof of a moving target is worth nothing unless somebody asks for a region, or nothing."""
     n = problem.dimension * (problem.motions[0].order + 1)
-    if n == problem.dimension or np.isfinite(_admitted(problem, n)).all():
+    if n == problem.dimension or np.isfinite(np.delete(admitted(problem, n), _across(problem), axis=1)).all():
         return ""
     return "the target could be anywhere at any speed; state a box and a greatest speed as constraints"
 
 
-def _admitted(problem: Problem, n: int) -> Array:
+def _across(problem: Problem) -> list[int]:
+    """Return which numbers of the state a height that is kept says by itself: what is upward in a local frame."""
+    return [2, 5] if held_height(problem) is not None and problem.frame.kind != "ecef" else []
+
+
+def admitted(problem: Problem, n: int) -> Array:
     """Return the least and greatest state (2, n) that constraints on coordinates and speed admit; NaN for none."""
     d = problem.dimension
     out = np.stack([np.full(n, -np.inf), np.full(n, np.inf)])
@@ -257,7 +264,7 @@ def _own_costs(problem: Problem, fix: Fix, places: Array) -> Array:
     x[:, own] = places.reshape(-1, size)
     with np.errstate(all="ignore"):
         equations = equations_at(part, x)
-        if problem.stations.covariance is not None and problem.stations.span != "noise":
+        if problem.stations.estimated:
             for _ in range(_STEPS):
                 move, ok = step(_without(equations, start, size), np.zeros(len(x)))
                 x = x + np.where(ok[:, None], _spread(move, start, size), 0.0)

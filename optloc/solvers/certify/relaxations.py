@@ -120,7 +120,7 @@ def _beyond(problem: Problem) -> str:
         return "the relaxation is for one position that stays"
     if problem.biases or problem.priors:
         return "the relaxation knows no biases and no priors"
-    if problem.stations.covariance is not None:
+    if problem.stations.errors:
         return "the relaxation takes the stations for exact"
     return "the relaxation knows no constraints" if problem.constraints else ""
 

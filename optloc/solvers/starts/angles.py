@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from optloc.base.types import Array, Rows
 from optloc.linear.courses import elapsed
 from optloc.problem.noise import variances
 from optloc.problem.problem import Problem
-from optloc.solvers.starts.position import spread_of
+from optloc.solvers.starts.position import known_height, spread_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,14 +120,16 @@ def courses(problem: Problem) -> Courses | None:
     seen = bearings(problem)
     if seen is None:
         return None
+    seen = _in_plan(problem, seen)
+    flat = seen.station.shape[-1] < problem.dimension
     block = next(rows for rows in problem.rows if rows.kind == "azimuth")
     found = sight_courses(
         seen.angle[..., 0],
         seen.station,
         elapsed(problem, 0)[block.epoch],
         seen.weight[..., 0],
-        elevation=seen.angle[..., 1],
-        elevation_weight=seen.weight[..., 1],
+        elevation=None if flat else seen.angle[..., 1],
+        elevation_weight=None if flat else seen.weight[..., 1],
         axes=seen.axes,
         order=problem.motions[0].order,
     )
@@ -150,7 +152,30 @@ def course_states(problem: Problem) -> Array | None:
         return None
     # coefficients of 1, t, t^2 as place, velocity and acceleration: x = p + v t + a t^2 / 2
     unit = np.array([1.0, 1.0, 2.0])[: found.plain.shape[1], None]
-    return np.where(found.ahead[:, None, None], unit * found.instrumental, np.nan)
+    states = np.where(found.ahead[:, None, None], unit * found.instrumental, np.nan)
+    return states if states.shape[-1] == problem.dimension else _at_height(problem, states)
+
+
+def _in_plan(problem: Problem, seen: Bearings) -> Bearings:
+    """Return azimuths alone as those of a plan where a height is known: they say nothing of it themselves."""
+    local = problem.frame.kind == "enu" and problem.dimension == _SPACE
+    if not local or (seen.weight[..., 1] > 0.0).any() or known_height(problem) is None:
+        return seen
+    return replace(seen, station=seen.station[..., :2], axes=None, centre=seen.centre[..., :2])
+
+
+# Coordinates of space.
+_SPACE = 3
+
+
+def _at_height(problem: Problem, plan: Array) -> Array:
+    """Return states (N, q, 3) of those of a plan: at the known height where the Earth does not bend away yet."""
+    level = known_height(problem)
+    assert level is not None
+    assert problem.frame.origin is not None
+    states = np.concatenate([plan, np.zeros((*plan.shape[:2], 1))], axis=-1)
+    states[:, 0, 2] = level - problem.frame.origin[2]
+    return states
 
 
 def by_directions(seen: Bearings) -> Array:

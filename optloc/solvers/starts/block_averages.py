@@ -118,7 +118,7 @@ class _Mean:
 def _with_station_noise(problem: Problem) -> Problem:
     """Return the problem with its station errors of each epoch in the noise."""
     stations = problem.stations
-    if stations.covariance is None or stations.span == "run":
+    if not stations.errors or stations.span == "run":
         return problem
     return weighed(replace(problem, stations=replace(stations, span="noise")))
 

@@ -16,7 +16,7 @@ from optloc.base.records import take
 from optloc.base.types import Array
 from optloc.problem.fix import Fix, Stage
 from optloc.problem.problem import Problem
-from optloc.solvers.certify.branch_and_bound import certified
+from optloc.solvers.certify.admitted import certified
 from optloc.solvers.outside import accept
 from optloc.solvers.policy import AMBIGUOUS_GAP, NOTICED, REFUTED
 from optloc.solvers.pool import Pool, begin, in_parts, offer, pack

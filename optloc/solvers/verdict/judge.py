@@ -13,6 +13,7 @@ from optloc.base.types import Array, Certificate, Status, first_status
 from optloc.bounds.observability import open_sentences
 from optloc.linear.constraints import violation_names
 from optloc.models import MODELS
+from optloc.models.layers import Layers
 from optloc.problem.fix import Alternatives, Fix
 from optloc.problem.problem import Problem
 from optloc.solvers.policy import DOUBT, FAR, FLAT, REJECTED, WEAK
@@ -173,6 +174,9 @@ def _explain_missing(problem: Problem, pool: Pool, items: Array, code: Array, re
             reason[i] = "no row links " + " with ".join(
                 "{" + ", ".join(names[s] for s in sorted(set(group))) + "}" for group in groups
             )
+        elif isinstance(problem.medium, Layers):
+            code[i] = Status.INFEASIBLE
+            reason[i] = "no place was found within the layers that direct rays lead from to all stations of the rows"
         elif not any(MODELS[rows.kind].ranges or MODELS[rows.kind].lifted for rows in problem.rows):
             code[i] = Status.UNAVAILABLE
             reason[i] = "no closed form starts from " + " and ".join(rows.kind for rows in problem.rows)

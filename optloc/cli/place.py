@@ -1,0 +1,276 @@
+"""What ``optloc place`` does: which sites to take, how far from the best that is, what each loss costs, and maps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.outputs import is_stream
+from optloc.base.types import Array
+from optloc.bounds.bound_map import bound_map, extent, plan_of
+from optloc.cli.crlb import vector
+from optloc.cli.output import Screen, claim_outputs, dumps, line, say, write_picture, write_text
+from optloc.files import read
+from optloc.placement import Placement, Plan, place
+from optloc.placement.chosen import PRIOR
+from optloc.placement.plan_file import Planned, criterion_name, is_plan, read_plan, write_chosen
+from optloc.placement.refinement import refined
+from optloc.problem.epochs import by_epoch, separable
+
+# Points along each side of a map, and lines of a table of places or stations: what a picture and a screen hold.
+_MAP_POINTS, _LINES = 80, 20
+
+
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What the command line says in the place of the file, None where it says nothing.
+
+    Parameters
+    ----------
+    choose, budget, criterion, worst, fail_one, gap, seconds
+        As of a plan.
+    at : str, optional
+        The one place of interest.
+    rows : bool
+        Single rows are chosen.
+    draws : int
+        Simulated fixes at each place.
+    """
+
+    choose: int | None = None
+    budget: float | None = None
+    criterion: str | None = None
+    worst: bool | None = None
+    fail_one: bool | None = None
+    gap: float | None = None
+    seconds: float | None = None
+    at: str | None = None
+    rows: bool = False
+    draws: int = 0
+
+
+def run_place(
+    file: Path, wanted: Wanted, *, plot: Path | None, out: Path | None, as_json: bool = False, quiet: bool = False
+) -> int:
+    """Choose sites, print and write what was chosen, and return the exit code: 1 where the gap did not close."""
+    claim_outputs(out, picture=plot, inputs=[file])
+    planned = read_plan(file) if is_plan(file) else _of_problem(file, wanted)
+    plan = _with(planned.plan, wanted)
+    with line(quiet or as_json) as tell:
+
+        def told(bound: float, value: float, nodes: int) -> None:
+            tell(f"best {value:.5g}, no set below {bound:.5g}, {nodes} nodes")
+
+        tell("searching")
+        found = place(plan, draws=wanted.draws, tell=told)
+        if planned.regions:
+            tell("refining")
+            found = refined(plan, found, planned.regions, planned.ground)
+    if out is not None:
+        if not planned.settings or plan.by == "row":
+            raise InvalidProblem("only a plan with candidates is written", str(out), "leave --out out")
+        write_chosen(planned, (*found.chosen, *found.kept), out, file)
+    if plot is not None:
+        write_picture(_picture(plan, found), plot)
+    if as_json:
+        write_text(Path("-"), dumps(_record(planned, plan, found)))
+    elif not quiet:
+        _show(planned, plan, found)
+        if out is not None and not is_stream(out):
+            say(Screen(), f"The chosen stations are in {out}: try optloc crlb {out} --map map.png.")
+    return 0 if found.closed and (found.draws is None or found.draws.clean) else 1
+
+
+def _of_problem(file: Path, wanted: Wanted) -> Planned:
+    """Return the plan of an ordinary problem file: which of its stations, for a target at a place or the fix."""
+    loaded = read(file, values=False)
+    problem = by_epoch(loaded.problem) if separable(loaded.problem) else loaded.problem
+    problem = problem.flat().take(np.zeros(1, dtype=int)) if problem.batch_shape else problem
+    if wanted.choose is None:
+        what = "the file has no table [choice], and nothing says how many stations to take"
+        raise InvalidProblem(what, loaded.source, "give -k, such as -k 4")
+    if wanted.at is not None:
+        places = vector(problem, wanted.at, None, False)[None, : problem.dimension]
+    else:
+        from optloc.solvers import solve
+
+        places = solve(read(file).problem).position.reshape(-1, problem.dimension)[:1]
+        if not np.isfinite(places).all():
+            raise InvalidProblem("the file has no fix to choose stations for", loaded.source, "give a place with --at")
+    return Planned(Plan(problem, places, choose=wanted.choose), loaded.source, loaded.title, {})
+
+
+def _with(plan: Plan, wanted: Wanted) -> Plan:
+    """Return a plan with what the command line says."""
+    given: dict[str, Any] = {
+        key: value
+        for key in ("choose", "budget", "worst", "fail_one", "gap", "seconds")
+        if (value := getattr(wanted, key)) is not None
+    }
+    if wanted.criterion is not None:
+        given["criterion"] = criterion_name(wanted.criterion)
+    if wanted.choose is not None and wanted.budget is None:
+        given |= {"budget": None, "cost": None}
+    if wanted.at is not None:
+        place_ = vector(plan.problem, wanted.at, None, False)[None, : plan.problem.dimension]
+        given |= {"places": place_, "names": ("here",), "weights": None, "sight": None}
+    if wanted.rows:
+        given["by"] = "row"
+    return replace(plan, **given)
+
+
+def _names_of(plan: Plan) -> tuple[str, ...]:
+    count = len(np.atleast_2d(plan.places))
+    return plan.names or tuple(f"P{i + 1}" for i in range(count))
+
+
+def _record(planned: Planned, plan: Plan, found: Placement) -> dict[str, Any]:
+    drawn = found.draws
+    return {
+        "file": planned.source,
+        "chosen": found.chosen,
+        "kept": found.kept,
+        "criterion": found.criterion,
+        "value": found.value,
+        "bound": found.bound,
+        "gap": found.gap,
+        "closed": found.closed,
+        "reason": found.reason,
+        "places": [
+            {
+                "name": name,
+                "sigma": sigma,
+                "before": before,
+                "one_failed": failed,
+                "share_of_prior": share,
+                "spare": spare,
+            }
+            for name, sigma, before, failed, share, spare in zip(
+                _names_of(plan),
+                found.per_place,
+                found.before,
+                found.failed,
+                found.share_of_prior,
+                found.redundancy,
+                strict=True,
+            )
+        ],
+        "before": found.before_sites,
+        "losses": [
+            {"name": s.name, "value": s.value, "replacement": s.replacement, "replaced": s.replaced}
+            for s in found.swaps
+        ],
+        "next": [{"name": name, "value": value} for name, value in found.following],
+        "alternatives": [{"chosen": names, "value": value} for names, value in found.alternatives],
+        "draws": None
+        if drawn is None
+        else {
+            "count": drawn.count,
+            "ambiguous": drawn.ambiguous,
+            "rms_over_bound": drawn.ratio,
+            "coverage": drawn.coverage,
+            "clean": drawn.clean,
+        },
+        "banned": found.banned,
+        "refined": None if found.refined is None else {"position": found.refined, "value": found.refined_value},
+        "nodes": found.nodes,
+    }
+
+
+def _show(planned: Planned, plan: Plan, found: Placement) -> None:
+    console = Screen()
+    sure = "" if found.closed else " (open)"
+    say(console, f"{planned.title}: take {', '.join(found.chosen) or 'nothing'}.")
+    words = {"rms": "mean bound", "volume": "mean axis of the ellipsoid", "axis": "longest axis of the ellipsoid"}
+    least = f"{words[found.criterion]} {found.sigma:.4g} m, no choice below {np.sqrt(max(found.bound, 0.0)):.4g} m"
+    say(console, f"{least[0].upper()}{least[1:]}{sure}: {found.reason}.")
+    console.print(_places_table(plan, found))
+    console.print(_losses_table(found))
+    for text in _remarks(plan, found):
+        say(console, text)
+
+
+def _places_table(plan: Plan, found: Placement) -> Table:
+    before = "kept stations" if set(found.before_sites) == set(found.kept) else "random set"
+    table = Table(title="Bound of the position error, m", title_justify="left")
+    for heading in ("place", f"before ({before})", "after", "one failed", "spare rows"):
+        table.add_column(heading, justify="left" if heading == "place" else "right")
+    order = np.argsort(-found.per_place, kind="stable")[:_LINES]
+    names = _names_of(plan)
+    for i in order:
+        values = (found.before[i], found.per_place[i], found.failed[i])
+        table.add_row(names[i], *(f"{v:.4g}" for v in values), str(found.redundancy[i]))
+    if len(names) > _LINES:
+        table.add_row("...", "", f"{len(names) - _LINES} better", "", "")
+    return table
+
+
+def _losses_table(found: Placement) -> Table:
+    table = Table(title="What the loss of a station costs, m", title_justify="left")
+    for heading in ("station", "without it", "best in its place", "then"):
+        table.add_column(heading, justify="left" if heading in ("station", "best in its place") else "right")
+    for swap in found.swaps[:_LINES]:
+        then = f"{np.sqrt(swap.replaced):.4g}" if swap.replacement else ""
+        table.add_row(swap.name, f"{np.sqrt(swap.value):.4g}", swap.replacement or "-", then)
+    return table
+
+
+def _remarks(plan: Plan, found: Placement) -> list[str]:
+    names, out = _names_of(plan), []
+    weak = [names[i] for i in np.flatnonzero(found.share_of_prior > PRIOR)]
+    if weak:
+        out.append(f"No fix of its own, the prior holds it: {', '.join(weak)}.")
+    bare = [names[i] for i in np.flatnonzero(found.redundancy <= 0)]
+    if bare:
+        out.append(f"No spare row, a wrong one would not be noticed: {', '.join(bare)}.")
+    if found.following:
+        name, value = found.following[0]
+        out.append(f"The best station to add next is {name}: {np.sqrt(value):.4g} m.")
+    if found.draws is not None:
+        share = 100 * found.draws.ambiguous.mean()
+        worst = names[int(found.draws.ambiguous.argmax())]
+        text = f"{share:.2g} % of simulated fixes are ambiguous, most at {worst}"
+        out.append(text + ("." if found.draws.clean else "; add a height, a constraint or a station off the plane."))
+        coverage = np.nanmean(found.draws.coverage) if np.isfinite(found.draws.coverage).any() else np.nan
+        out.append(f"Of the others {100 * coverage:.3g} % are in their 95 % ellipse.")
+    if found.banned:
+        out.append(f"Better sets were given up, their fixes are ambiguous: {'; '.join(map(', '.join, found.banned))}.")
+    if found.refined is not None:
+        spots = "; ".join(", ".join(f"{v:.1f}" for v in row) for row in found.refined)
+        out.append(f"Refined to {np.sqrt(found.refined_value):.4g} m, a local optimum, at {spots}.")
+    return out
+
+
+def _picture(plan: Plan, found: Placement) -> Any:
+    from optloc.plot.placement_map import plot_placement
+
+    problem, names = plan.problem, np.array(plan.problem.stations.names)
+    if plan.by == "row":
+        raise InvalidProblem("rows that are chosen have no map", "--plot", "choose stations")
+    single = problem.flat().take(np.zeros(1, dtype=int)) if problem.batch_shape else problem
+    places = np.atleast_2d(np.asarray(plan.places, dtype=float))[:, : problem.dimension]
+    truth = np.zeros(problem.layout.size)
+    truth[: problem.dimension] = places[0]
+    earth = problem.frame.geodetic and problem.dimension == 3
+    flat = plan_of(problem.frame, places, earth)
+    height = float(np.median(flat[:, 2])) if problem.dimension == 3 else 0.0
+    x0, x1, y0, y1 = extent(problem, places, widen=0.08)
+    grid = np.linspace(x0, x1, _MAP_POINTS), np.linspace(y0, y1, _MAP_POINTS)
+    end = np.concatenate([rows.a for rows in problem.rows])
+    maps, taken = [], []
+    for sites in (found.before_sites, (*found.chosen, *found.kept)):
+        mask = np.isin(names, sites)
+        own = single.with_rows(weight=single.weight * mask[end])
+        maps.append(bound_map(own, truth, *grid, height))
+        taken.append(mask)
+    weights = np.ones(len(places)) if plan.weights is None else np.asarray(plan.weights)
+    course: Array = found.course.copy()
+    course[:, 1:] = np.sqrt(np.maximum(course[:, 1:], 0.0))
+    kept = set(found.before_sites) == set(found.kept)
+    titles = ("before: kept stations" if kept else "before: a random set", f"after: {found.sigma:.3g} m")
+    return plot_placement(maps, taken, flat[:, :2], weights, course, titles)

@@ -1,0 +1,341 @@
+"""The search for a set of sites: starts that are exchanged, and a branch and bound that says how good any set can be.
+
+Best first; a node is bounded by its relaxation (`optloc.placement.relaxation`), started from its parent's weights. What
+the reduced costs forbid is fixed at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from heapq import heappop, heappush
+from time import monotonic
+
+import numpy as np
+from scipy.optimize import Bounds, LinearConstraint, milp
+
+from formulations.placement import Criterion, Design
+from optloc.base.types import Array
+from optloc.placement.branching import FREE, IN, expand, propagate, score, settle
+
+# Random sets that are exchanged beside the rounded relaxation, and steps of a relaxation: at the root, and of a node.
+_STARTS, _ROOT_STEPS, _STEPS = 5, 60, 40
+# A value that is better than another by less is the same, relatively: rounding of sums over places.
+_SAME = 1e-12
+# Weight above which a site is as good as taken: to cut there decides little. With weights nearest one half the
+# hardest of 100 searches had half as many nodes more.
+_TAKEN = 0.9
+# Rounding of a rule whose largest entry is one.
+_ROOM = 1e-9
+# Seconds between two points of the course of bound and value.
+_EVERY = 0.05
+_KINDS: dict[Criterion, int] = {"A": 0, "D": 1, "E": 2}
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What is searched.
+
+    Parameters
+    ----------
+    design : Design
+        Rows, priors and weights of the places.
+    criterion : "A", "D" or "E"
+        As in `formulations.placement`.
+    worst, fail : bool
+        Whether the worst place, and the worst failure of a site, count.
+    rules, limits : array (R, n), (R,)
+        rules @ w <= limits; the first has no negative entry.
+    state : int array (n,)
+        -1 for free sites, 0 and 1 for those that are left out and taken.
+    """
+
+    design: Design
+    criterion: Criterion
+    worst: bool
+    fail: bool
+    rules: Array
+    limits: Array
+    state: Array
+
+    @property
+    def kind(self) -> int:
+        """Return the criterion's number in machine code."""
+        return _KINDS[self.criterion]
+
+    def score(self, sets: Array) -> Array:
+        """Return the criterion (B,) of sets (B, n)."""
+        design, chosen = self.design, np.ascontiguousarray(sets, dtype=np.int64)
+        return np.asarray(
+            score(
+                np.ascontiguousarray(design.rows),
+                design.prior,
+                design.weight,
+                design.dimension,
+                self.kind,
+                int(self.worst),
+                int(self.fail),
+                chosen,
+            )
+        )
+
+    def fits(self, sets: Array) -> Array:
+        """Return whether sets (B, n) meet the rules."""
+        room = self.limits + _ROOM * np.maximum(1.0, np.abs(self.limits))
+        return np.asarray((sets @ self.rules.T <= room).all(-1))
+
+    def scale(self, value: float) -> float:
+        """Return a criterion as a variance, square metres: that of a determinant is its geometric mean."""
+        return float(np.exp(value / self.design.dimension)) if self.criterion == "D" else value
+
+    def enough(self, value: float, gap: float) -> float:
+        """Return the bound at which a value is known to be the best but for a share of it."""
+        if self.criterion == "D":
+            return value + self.design.dimension * float(np.log1p(-gap))
+        return value * (1.0 - gap)
+
+
+@dataclass(frozen=True, slots=True)
+class Searched:
+    """What a search found.
+
+    Parameters
+    ----------
+    best : tuple of (float, array (n,))
+        Values and sets, the best first; none where the rules allow no set.
+    bound : float
+        No set that meets the rules has a lower value.
+    closed : bool
+        Whether bound and value are as close as was asked.
+    root : float
+        Bound before anything was branched.
+    nodes : int
+        Relaxations that were solved.
+    course : array (q, 3)
+        Seconds, bound and value.
+    """
+
+    best: tuple[tuple[float, Array], ...]
+    bound: float
+    closed: bool
+    root: float
+    nodes: int
+    course: Array
+
+
+@dataclass(slots=True)
+class _Open:
+    """The state of a search: sets that were seen, open nodes, how far it is."""
+
+    task: Task
+    gap: float
+    keep: int
+    seen: dict[bytes, tuple[float, Array]]
+    heap: list[tuple[float, int, Array, Array]]
+    nodes: int = 0
+    count: int = 0
+
+    @property
+    def value(self) -> float:
+        return min((value for value, _ in self.seen.values()), default=np.inf)
+
+    def add(self, value: float, chosen: Array) -> None:
+        self.seen[chosen.astype(np.int8).tobytes()] = (value, chosen)
+        if len(self.seen) > 4 * self.keep:  # the worst of many go
+            best = sorted(self.seen.items(), key=lambda item: item[1][0])[: self.keep]
+            self.seen = dict(best)
+
+    def push(self, bound: float, state: Array, w: Array) -> None:
+        self.count += 1  # a counter breaks ties: arrays have no order
+        heappush(self.heap, (bound, self.count, state, w))
+
+    @property
+    def enough(self) -> float:
+        return self.task.enough(self.value, self.gap) if self.seen else np.inf
+
+    @property
+    def bound(self) -> float:
+        return min(self.heap[0][0] if self.heap else np.inf, self.enough)
+
+
+def search(
+    task: Task,
+    *,
+    gap: float = 0.01,
+    seconds: float = 60.0,
+    keep: int = 5,
+    seed: int = 0,
+    tell: Callable[[float, float, int], None] = lambda bound, value, nodes: None,
+) -> Searched:
+    """Return the best set that was found and the bound of all.
+
+    Parameters
+    ----------
+    task : Task
+        What is searched.
+    gap : float
+        Share of the value at which it stops.
+    seconds : float
+        After which it stops.
+    keep : int
+        Sets that are told.
+    seed : int
+        Of the random starts.
+    tell : callable of (bound, value, nodes)
+        Told now and then how far it is.
+    """
+    _load()
+    begun = monotonic()
+    rows = np.ascontiguousarray(task.design.rows)  # one type of array: machine code is made for each
+    task = replace(task, design=replace(task.design, rows=rows))
+    made, state = _Open(task, gap, max(1, keep), {}, []), np.array(task.state, dtype=np.int64)
+    if not propagate(task.rules, task.limits, state):
+        return Searched((), np.inf, True, np.inf, 0, np.zeros((0, 3)))
+    root, w = -np.inf, np.where(state == IN, 1.0, 0.0)
+    if (state == FREE).any():
+        w[state == FREE] = 0.5
+        root, w, _ = _relax(made, state, w, np.nan, _ROOT_STEPS)
+        made.push(root, state, w)
+    for value, chosen in _starts(task, state, w, seed):
+        made.add(value, chosen)
+    if not made.seen:
+        return Searched((), np.inf, True, np.inf, made.nodes, np.zeros((0, 3)))
+    course = [(monotonic() - begun, made.bound, made.value)]
+    while made.heap and made.heap[0][0] < made.enough and monotonic() - begun < seconds:
+        _branch(made, *made.heap[0][:1], *heappop(made.heap)[2:])
+        if monotonic() - begun > course[-1][0] + _EVERY:
+            course.append((monotonic() - begun, made.bound, made.value))
+            tell(made.bound, made.value, made.nodes)
+    closed = not made.heap or made.heap[0][0] >= made.enough
+    course.append((monotonic() - begun, made.bound, made.value))
+    best = sorted(made.seen.values(), key=lambda pair: pair[0])[: made.keep]
+    return Searched(tuple(best), made.bound, closed, root, made.nodes, np.array(course))
+
+
+def _load() -> None:
+    """Have machine code at hand before the time counts: where it is made first, that takes a minute."""
+    prior, none = np.ones((1, 1, 1)), np.zeros(0)
+    one = Task(
+        Design(np.ones((1, 1, 1, 2)), prior, np.ones(1), 1), "A", False, False, np.ones((1, 2)), np.ones(1), none
+    )
+    state = np.full(2, FREE, dtype=np.int64)
+    propagate(one.rules, one.limits, state)
+    _relax(_Open(one, 0.5, 1, {}, []), state, np.full(2, 0.5), np.nan, 1)
+    settle(0.0, np.zeros(2), 1.0, state)
+    one.score(np.eye(2))
+
+
+def _relax(made: _Open, state: Array, w: Array, enough: float, steps: int) -> tuple[float, Array, Array]:
+    """Return bound, weights (n,) and costs (n,) of the relaxation of a node."""
+    task, x, cost = made.task, w.copy(), np.empty(len(w))
+    design = task.design
+    bound, _, _ = expand(
+        design.rows,
+        design.prior,
+        design.weight,
+        design.dimension,
+        task.rules,
+        task.limits,
+        task.kind,
+        int(task.worst),
+        int(task.fail),
+        state,
+        x,
+        enough,
+        steps,
+        cost,
+    )
+    made.nodes += 1
+    return float(bound), x, cost
+
+
+def _branch(made: _Open, bound: float, state: Array, w: Array) -> None:
+    """Open both children of a node, cut at the free site of the largest weight that is not all but taken."""
+    free = np.flatnonzero(state == FREE)
+    j = free[np.where(w[free] > _TAKEN, -1.0, w[free]).argmax()]
+    for one in (1, 0):
+        child, x = state.copy(), w.copy()
+        child[j] = x[j] = one
+        _open(made, bound, child, x)
+
+
+def _open(made: _Open, bound: float, state: Array, w: Array) -> None:
+    """Bound a node, and put it among the open ones if it may hold a better set; a node without a choice is one set."""
+    task = made.task
+    while propagate(task.rules, task.limits, state):
+        if not (state == FREE).any():
+            if task.fits(state[None])[0]:
+                made.add(float(task.score(state[None])[0]), state)
+            return
+        low, w, cost = _relax(made, state, w, made.enough, _STEPS)
+        bound = max(bound, low)
+        if bound >= made.enough:
+            return
+        fixed = settle(low, cost, made.enough, state)
+        if not fixed or (state == FREE).sum() > 0.8 * ((state == FREE).sum() + fixed):
+            if fixed and not propagate(task.rules, task.limits, state):
+                return
+            if (state == FREE).any():
+                made.push(bound, state, w)
+                return
+
+
+def _starts(task: Task, state: Array, w: Array, seed: int) -> Iterator[tuple[float, Array]]:
+    """Yield sets that no exchange of two sites improves, from the rounded relaxation and random ones, with values."""
+    rng = np.random.default_rng(seed)
+    for priority in (w, *rng.random((_STARTS, len(w)))):
+        chosen = _rounded(task, state, priority)
+        if chosen is None:
+            return
+        yield exchanged(task, chosen)
+
+
+def _rounded(task: Task, state: Array, priority: Array) -> Array | None:
+    """Return a set (n,) of sites of large priority that meets the rules and has no room for another; None for none."""
+    chosen = (state == IN).astype(np.int64)
+    for j in np.argsort(-priority, kind="stable"):
+        if state[j] == FREE:
+            chosen[j] = 1
+            chosen[j] = int((task.rules @ chosen <= task.limits + _ROOM)[(task.rules >= 0.0).all(1)].all())
+    if task.fits(chosen[None])[0]:
+        return np.asarray(chosen)
+    # rules that ask for sites may be met by others only: a programme of integers finds out
+    lower, upper = (state == IN).astype(float), (state != 0).astype(float)
+    rules = LinearConstraint(task.rules, -np.inf, task.limits)
+    found = milp(
+        -priority - _ROOM,
+        integrality=np.ones(len(state), dtype=np.int64),
+        bounds=Bounds(lower, upper),
+        constraints=rules,
+    )
+    return None if found.x is None else np.asarray(np.round(found.x).astype(np.int64))
+
+
+def random_sets(task: Task, count: int, seed: int) -> Iterator[Array]:
+    """Yield random sets (n,) that meet the rules and leave no room for another site."""
+    rng = np.random.default_rng(seed)
+    for priority in rng.random((count, len(task.state))):
+        chosen = _rounded(task, task.state, priority)
+        if chosen is not None:
+            yield chosen
+
+
+def exchanged(task: Task, chosen: Array) -> tuple[float, Array]:
+    """Return value and set (n,) after the best exchanges of two sites, or additions, until none improves it."""
+    fixed = task.state != FREE
+    value = float(task.score(chosen[None])[0])
+    while True:
+        out, into = np.flatnonzero((chosen == 1) & ~fixed), np.flatnonzero((chosen == 0) & ~fixed)
+        tries = np.repeat(chosen[None], (len(out) + 1) * len(into), axis=0)
+        number = np.arange(len(tries))
+        swapped = number[: len(out) * len(into)]
+        tries[swapped, np.repeat(out, len(into))] = 0
+        tries[number, np.tile(into, len(out) + 1)] = 1
+        tries = tries[task.fits(tries)]
+        if not len(tries):
+            return value, chosen
+        values = task.score(tries)
+        best = int(values.argmin())
+        if not values[best] < value - _SAME * max(1.0, abs(value)):
+            return value, chosen
+        value, chosen = float(values[best]), tries[best]

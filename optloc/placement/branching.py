@@ -1,0 +1,219 @@
+"""Nodes of the search for a set of sites, as machine code: what rules leave open, scenarios, scores of whole sets."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled
+from optloc.placement.criteria import gather, invert, measure
+from optloc.placement.relaxation import relax
+
+FREE, OUT, IN = -1, 0, 1
+"""States of a site."""
+
+# Rounding of sums of costs, as a share of a limit: a budget that is met exactly is met.
+_EXACT = 1e-9
+# How far inside 0 <= w <= 1 a node begins.
+_INSIDE = 0.02
+
+
+@compiled
+def propagate(rules: Array, limits: Array, state: Array) -> bool:
+    """Fix in `state` what rules leave no choice of; return whether a set is left at all.
+
+    Where all that is free may be taken it is: no criterion gets worse by another site.
+    """
+    count, n = rules.shape
+    changed = True
+    while changed:
+        changed, all_fit = False, True
+        for i in range(count):
+            least, most = 0.0, 0.0
+            for j in range(n):
+                if state[j] == IN:
+                    least += rules[i, j]
+                    most += rules[i, j]
+                elif state[j] == FREE:
+                    least += min(0.0, rules[i, j])
+                    most += rules[i, j]
+            limit = limits[i] + _EXACT * max(1.0, abs(limits[i]))
+            if least > limit:
+                return False
+            all_fit = all_fit and most <= limit
+            for j in range(n):
+                if state[j] == FREE and least + abs(rules[i, j]) > limit:
+                    state[j] = OUT if rules[i, j] > 0.0 else IN
+                    changed = True
+        if all_fit and not changed:
+            for j in range(n):
+                if state[j] == FREE:
+                    state[j] = IN
+    return True
+
+
+@compiled
+def score(rows: Array, prior: Array, weight: Array, d: int, kind: int, worst: int, fail: int, chosen: Array) -> Array:
+    """Return the criterion (B,) of sets of sites (B, n), infinite where the information is singular.
+
+    Parameters
+    ----------
+    rows : array (P, r, m, n)
+        Whitened rows of each site at each place.
+    prior : array (P, m, m)
+        Information without any site.
+    weight : array (P,)
+        Of the places.
+    d, kind, worst
+        As in `optloc.placement.relaxation.evaluate`.
+    fail : int
+        Whether the worst loss of one site counts.
+    chosen : int array (B, n)
+        1 for sites that are taken.
+    """
+    places, r, m, n = rows.shape
+    out = np.empty(chosen.shape[0])
+    matrix, lower = np.empty((m, m)), np.empty((m, m))
+    inverse, turn, basis, shares = np.empty((m, m)), np.empty((d, d)), np.empty((d, d)), np.empty(d)
+    members = np.empty(n, dtype=np.int64)
+    for b in range(chosen.shape[0]):
+        size = 0
+        for j in range(n):
+            if chosen[b, j] == IN:
+                members[size] = j
+                size += 1
+        out[b] = -np.inf
+        for lost in range(size if fail and size else 1):
+            total = -np.inf if worst else 0.0
+            for p in range(places):
+                for i in range(m):
+                    for k in range(m):
+                        matrix[i, k] = prior[p, i, k]
+                for one in range(size):
+                    if fail and one == lost:
+                        continue
+                    for q in range(r):
+                        for i in range(m):
+                            x = rows[p, q, i, members[one]]
+                            for k in range(m):
+                                matrix[i, k] += x * rows[p, q, k, members[one]]
+                ok = invert(matrix, inverse, lower)
+                if not np.isfinite(ok):
+                    total = np.inf
+                    break
+                top, _, _ = measure(kind, inverse[:d, :d].copy(), turn, basis, shares)
+                total = max(total, top) if worst else total + weight[p] * top
+            out[b] = max(out[b], total)
+    return out
+
+
+@compiled
+def number_left(rule: Array, limit: float, state: Array) -> int:
+    """Return how many free sites a rule leaves room for at the most."""
+    left, sizes, count = limit, np.empty(rule.shape[0]), 0
+    for j in range(rule.shape[0]):
+        if state[j] == IN:
+            left -= rule[j]
+        elif state[j] == FREE:
+            sizes[count] = rule[j]
+            count += 1
+    number = 0
+    for size in np.sort(sizes[:count]):
+        left -= size
+        if left < -_EXACT * max(1.0, abs(limit)):
+            break
+        number += 1
+    return number
+
+
+@compiled
+def expand(
+    rows: Array,
+    prior: Array,
+    weight: Array,
+    d: int,
+    rules: Array,
+    limits: Array,
+    kind: int,
+    worst: int,
+    fail: int,
+    state: Array,
+    w: Array,
+    enough: float,
+    most: int,
+    cost: Array,
+) -> tuple[float, float, int]:
+    """Return bound, criterion and steps of the relaxed choice of a node with at least one free site.
+
+    That one of the sites fails is bounded without knowing which are taken: the mean over those that are still to be
+    taken, c at the most, is by Jensen's inequality no less than the criterion of all at the weight (1 - 1 / c) v.
+    Those that are taken for sure fail one by one.
+
+    Parameters
+    ----------
+    rows, prior, weight, d, kind, worst, fail
+        As in `score`.
+    rules, limits : array (R, n), (R,)
+        rules @ w <= limits; the first has no negative entry.
+    state : int array (n,)
+        FREE, OUT or IN.
+    w, cost : array (n,)
+        As in `relax`, of all sites.
+    enough, most
+        As in `relax`.
+    """
+    places, r, m, n = rows.shape
+    free, taken = np.flatnonzero(state == FREE), np.flatnonzero(state == IN)
+    count, sure = len(free), len(taken)
+    inner = np.empty((places, r, m, count))
+    for p in range(places):
+        for q in range(r):
+            for a in range(m):
+                for j in range(count):
+                    inner[p, q, a, j] = rows[p, q, a, free[j]]
+    scenarios = sure + 1 if fail else 1
+    bases, off, scale = np.empty((scenarios, places, m, m)), np.full(scenarios, -1), np.ones(scenarios)
+    ones, scaled = np.ones(1), np.empty((r, m, 1))
+    for p in range(places):
+        total = prior[p].copy()
+        for own in taken:
+            gather(rows[p, :, :, own : own + 1].copy(), total, ones, -1, 1.0, scaled, bases[0, p])
+            total[:, :] = bases[0, p]
+        bases[0, p] = total
+        for s in range(1, scenarios):
+            gather(rows[p, :, :, taken[s - 1] : taken[s - 1] + 1].copy(), total, -ones, -1, 1.0, scaled, bases[s, p])
+    if fail:
+        scale[0] = 1.0 - 1.0 / max(1, number_left(rules[0], limits[0], state))
+    lines, left = np.empty((rules.shape[0], count)), limits.copy()
+    x, rise, room = np.empty(count), np.empty(count), 0.0
+    for i in range(rules.shape[0]):
+        for own in taken:
+            left[i] -= rules[i, own]
+        for j in range(count):
+            lines[i, j] = rules[i, free[j]]
+    for j in range(count):
+        x[j] = min(1.0 - _INSIDE, max(_INSIDE, w[free[j]]))
+        room += x[j] * lines[0, j]
+    if room > left[0]:
+        for j in range(count):
+            x[j] *= max(left[0], 0.0) / room
+            x[j] = max(1e-3, x[j])
+    bound, value, steps = relax(inner, bases, weight, d, off, scale, lines, left, kind, worst, x, enough, most, rise)
+    cost[:] = 0.0
+    for j in range(n):
+        w[j] = 1.0 if state[j] == IN else 0.0
+    for j in range(count):
+        w[free[j]] = x[j]
+        cost[free[j]] = rise[j]
+    return bound, value, steps
+
+
+@compiled
+def settle(bound: float, cost: Array, enough: float, state: Array) -> int:
+    """Fix in `state` free sites whose other value would lift the bound to enough; return how many."""
+    fixed = 0
+    for j in range(state.shape[0]):
+        if state[j] == FREE and bound + abs(cost[j]) >= enough:
+            state[j] = OUT if cost[j] > 0.0 else IN
+            fixed += 1
+    return fixed

@@ -1,0 +1,377 @@
+"""Where to put stations: the set of sites, how far from the best it can be, and what becomes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from formulations.placement import covariances
+from optloc.base.errors import InvalidProblem
+from optloc.base.types import Array, Status
+from optloc.bounds.crlb import crlb
+from optloc.linear.simulate import simulate
+from optloc.placement.best_set import Searched, Task, random_sets, search
+from optloc.placement.sites import LETTER, Plan, Posed, pose
+
+PRIOR = 0.01
+"""Share of the variance at a place that is owed to the prior, above which the place has no fix of its own."""
+
+AMBIGUOUS = 0.05
+"""Share of ambiguous fixes above which a set is given up for the next."""
+
+# Singular values of stations about their centre, over the bound of a place, below which they are flat: a mirror image
+# is told from the place by an error of so many standard deviations.
+_FLAT = 3.0
+# Random sets whose median stands for what there was before, where nothing is kept.
+_RANDOM = 25
+# The 95 % quantile of chi-square with two and three degrees of freedom.
+_QUANTILE = {2: 5.991464547107979, 3: 7.814727903251179}
+
+
+@dataclass(frozen=True, slots=True)
+class Swap:
+    """What the loss of a station costs.
+
+    Parameters
+    ----------
+    name : str
+        The station.
+    value : float
+        The criterion without it, square metres.
+    replacement : str
+        What would best take its place; empty where there is nothing.
+    replaced : float
+        The criterion then.
+    """
+
+    name: str
+    value: float
+    replacement: str
+    replaced: float
+
+
+@dataclass(frozen=True, slots=True)
+class Draws:
+    """What became of simulated fixes with the chosen stations.
+
+    Parameters
+    ----------
+    count : int
+        Draws at each place.
+    ambiguous : array (P,)
+        Share of fixes at each place whose data fit another position about as well.
+    ratio : array (P,)
+        Root mean square error over the bound, of the fixes that are not ambiguous; NaN where there are none.
+    coverage : array (P,)
+        Share of these whose 95 % ellipse holds the place.
+    flat : array (P,)
+        How far stations in sight are off their best plane (root of the sum of squares), in bounds of the place; a small
+        number says mirror image.
+    """
+
+    count: int
+    ambiguous: Array
+    ratio: Array
+    coverage: Array
+    flat: Array
+
+    @property
+    def clean(self) -> bool:
+        """Return whether few enough fixes are ambiguous."""
+        return float(self.ambiguous.mean()) <= AMBIGUOUS
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """A set of sites, and a proof of how good any set of the candidates can be.
+
+    Parameters
+    ----------
+    chosen, kept : tuple of str
+        Sites that were taken beyond those that were there; and those.
+    criterion : str
+        "rms", "volume" or "axis".
+    value, bound : float
+        The criterion of the set, and what no set that meets the rules is below, square metres: the mean over places of
+        the squared error, of the geometric mean of the variances along the axes, or of the largest of them.
+    gap : float
+        Share of the value by which the bound is below it.
+    closed : bool
+        Whether the gap is no larger than was asked.
+    reason : str
+        What that means, in a sentence.
+    per_place, failed : array (P,)
+        Bound of the position error at each place (root of the trace), metres: of the set, and with the worst loss of
+        one site at this place.
+    before : array (P,)
+        The same of the kept sites, or of the median of random sets where those have no fix.
+    before_sites : tuple of str
+        Whose they are.
+    share_of_prior : array (P,)
+        Share of the variance that is owed to the prior.
+    redundancy : int array (P,)
+        Rows in sight less unknowns: with none a wrong one is not noticed.
+    swaps : tuple of Swap
+        What the loss of each taken site costs, the dearest first.
+    alternatives : tuple of (tuple of str, float)
+        The best sets that were seen, and their values, square metres.
+    following : tuple of (str, float)
+        What another site would bring: names and values, square metres, the best first.
+    course : array (q, 3)
+        Seconds, bound and value while it searched.
+    nodes : int
+        Relaxations that were solved.
+    draws : Draws, optional
+        What simulated fixes say.
+    banned : tuple of tuple of str
+        Better sets that were given up because their fixes are ambiguous.
+    refined : array (k, d), optional
+        Positions of the taken sites after continuous refinement, metres.
+    refined_value : float
+        The criterion there; the bound says nothing about it.
+    """
+
+    chosen: tuple[str, ...]
+    kept: tuple[str, ...]
+    criterion: str
+    value: float
+    bound: float
+    gap: float
+    closed: bool
+    reason: str
+    per_place: Array
+    failed: Array
+    before: Array
+    before_sites: tuple[str, ...]
+    share_of_prior: Array
+    redundancy: Array
+    swaps: tuple[Swap, ...]
+    alternatives: tuple[tuple[tuple[str, ...], float], ...]
+    following: tuple[tuple[str, float], ...]
+    course: Array
+    nodes: int
+    draws: Draws | None = None
+    banned: tuple[tuple[str, ...], ...] = ()
+    refined: Array | None = None
+    refined_value: float = float("nan")
+
+    @property
+    def sigma(self) -> float:
+        """Return the root of the value, metres."""
+        return float(np.sqrt(self.value))
+
+
+def place(
+    plan: Plan, *, draws: int = 0, tell: Callable[[float, float, int], None] = lambda bound, value, nodes: None
+) -> Placement:
+    """Return which sites to take, with a bound of what any choice of the candidates can reach.
+
+    Parameters
+    ----------
+    plan : Plan
+        What is asked.
+    draws : int
+        Simulated fixes at each place that check the set for ambiguity; a set that fails is given up for the next best,
+        as often as `plan.alternatives` says. 0: none.
+    tell : callable of (bound, value, nodes)
+        Told now and then how far the search is; in the units of the criterion.
+
+    Returns
+    -------
+    Placement
+        Where `closed` is False, the time was up: the gap says what is known.
+
+    Raises
+    ------
+    InvalidProblem
+        Naming the argument, site or place that cannot be right, or the rules that allow no set.
+
+    References
+    ----------
+    S. Joshi and S. Boyd, "Sensor selection via convex optimization", IEEE Trans. Signal Process. 57 (2009).
+    """
+    posed = pose(plan)
+    task, banned = task_of(posed), list[Array]()
+    while True:
+        found = search(
+            _without(task, banned),
+            gap=plan.gap,
+            seconds=plan.seconds,
+            keep=plan.alternatives,
+            seed=plan.seed,
+            tell=tell,
+        )
+        if not found.best:
+            what = "no set of sites meets the rules" if not banned else "every set that meets the rules is ambiguous"
+            raise InvalidProblem(what, "groups", "allow more sites of a group, ask for fewer, or name more candidates")
+        chosen = found.best[0][1]
+        checked = drawn(posed, chosen, draws, plan.seed) if draws else None
+        if checked is None or checked.clean or len(banned) >= plan.alternatives:
+            return _answer(posed, task, found, checked, banned)
+        banned.append(chosen)
+
+
+def task_of(posed: Posed) -> Task:
+    """Return what is searched for a plan."""
+    plan = posed.plan
+    return Task(posed.design, LETTER[plan.criterion], plan.worst, plan.fail_one, posed.rules, posed.limits, posed.state)
+
+
+def _without(task: Task, banned: Sequence[Array]) -> Task:
+    """Return a task that does not allow some sets."""
+    rules = np.array([chosen / chosen.sum() for chosen in banned]).reshape(len(banned), len(task.state))
+    limits = np.array([1.0 - 1.0 / chosen.sum() for chosen in banned])
+    return replace(task, rules=np.vstack([task.rules, rules]), limits=np.concatenate([task.limits, limits]))
+
+
+def _answer(posed: Posed, task: Task, found: Searched, checked: Draws | None, banned: Sequence[Array]) -> Placement:
+    plan, names = posed.plan, posed.names
+    value, chosen = found.best[0]
+    bound, reached = task.scale(found.bound), task.scale(value)
+    gap = max(0.0, 1.0 - bound / reached)
+    before, sites = _before(posed, task)
+    per_place, share = _per_place(posed, chosen)
+    told = f"no set of these candidates has a value more than {100 * gap:.2g} % lower"
+    reason = told if found.closed else f"the time was up: {told}; give it more time, or accept a larger gap"
+    new = (chosen == 1) & (posed.state != 1)
+    return Placement(
+        _named(names, new),
+        _named(names, posed.state == 1),
+        plan.criterion,
+        reached,
+        bound,
+        gap,
+        found.closed,
+        reason,
+        per_place,
+        _failed(posed, chosen),
+        before,
+        sites,
+        share,
+        _redundancy(posed, chosen),
+        tuple(_swaps(task, names, chosen)),
+        tuple((_named(names, (one == 1) & (posed.state != 1)), task.scale(v)) for v, one in found.best),
+        tuple(_following(task, names, chosen)),
+        _course(task, found.course),
+        found.nodes,
+        checked,
+        tuple(_named(names, one == 1) for one in banned),
+    )
+
+
+def _course(task: Task, course: Array) -> Array:
+    out = course.copy()
+    out[:, 1:] = [[task.scale(v) for v in row] for row in course[:, 1:]]
+    return out
+
+
+def _named(names: Sequence[str], mask: Array) -> tuple[str, ...]:
+    return tuple(names[i] for i in np.flatnonzero(mask).tolist())
+
+
+def _per_place(posed: Posed, chosen: Array) -> tuple[Array, Array]:
+    """Return the bound (P,) of the position error of a set, metres, and the prior's share of its variance."""
+    covariance = np.asarray(crlb(posed.assembled(chosen), posed.vectors))
+    d = posed.design.dimension
+    variance = np.trace(covariance[..., :d, :d], axis1=-2, axis2=-1)
+    information = posed.design.prior + np.einsum(
+        "prmn,n,prkn->pmk", posed.design.rows, chosen.astype(float), posed.design.rows
+    )
+    inverse = np.linalg.inv(information)[:, :d]
+    owed = np.trace(inverse @ posed.design.prior @ np.swapaxes(inverse, 1, 2), axis1=1, axis2=2)
+    return np.sqrt(variance), owed / variance
+
+
+def _failed(posed: Posed, chosen: Array) -> Array:
+    """Return the bound (P,) at each place after the loss of the site that is worst there, metres."""
+    lost = np.repeat(chosen[None], int(chosen.sum()), axis=0)
+    lost[np.arange(len(lost)), np.flatnonzero(chosen)] = 0
+    variance = np.trace(covariances(posed.design, lost), axis1=-2, axis2=-1)
+    return np.asarray(np.sqrt(variance.max(0)))
+
+
+def _before(posed: Posed, task: Task) -> tuple[Array, tuple[str, ...]]:
+    kept = (posed.state == 1).astype(np.int64)
+    if kept.any():
+        per_place, share = _per_place(posed, kept)
+        if (share <= PRIOR).all():
+            return per_place, _named(posed.names, kept)
+    sets = np.array(list(random_sets(task, _RANDOM, posed.plan.seed)))
+    middle = sets[np.argsort(task.score(sets))[len(sets) // 2]]
+    return _per_place(posed, middle)[0], _named(posed.names, middle)
+
+
+def _redundancy(posed: Posed, chosen: Array) -> Array:
+    """Return rows in sight less unknowns without a prior of their own (P,)."""
+    rows = (posed.assembled(chosen).weight > 0.0).sum(-1)
+    given = {prior.name for prior in posed.plan.problem.priors}
+    slots = (*posed.problem.layout.shared, *posed.problem.layout.local)
+    known = {bias.name for bias in posed.problem.biases if bias.sigma is not None} | given
+    return np.asarray(rows - sum(slot.size for slot in slots if slot.name not in known))
+
+
+def _swaps(task: Task, names: Sequence[str], chosen: Array) -> Iterator[Swap]:
+    found = []
+    for i in np.flatnonzero(chosen).tolist():
+        without = chosen.copy()
+        without[i] = 0
+        value = task.scale(float(task.score(without[None])[0]))
+        tries = np.repeat(without[None], len(chosen), axis=0)
+        tries[np.arange(len(chosen)), np.arange(len(chosen))] = 1
+        others = np.flatnonzero((chosen == 0) & (task.state != 0) & task.fits(tries)).tolist()
+        if others:
+            values = task.score(tries[others])
+            best = int(values.argmin())
+            found.append(Swap(names[i], value, names[others[best]], task.scale(float(values[best]))))
+        else:
+            found.append(Swap(names[i], value, "", value))
+    yield from sorted(found, key=lambda swap: -swap.value)
+
+
+def _following(task: Task, names: Sequence[str], chosen: Array) -> Iterator[tuple[str, float]]:
+    others = np.flatnonzero((chosen == 0) & (task.state != 0)).tolist()
+    if not others:
+        return
+    tries = np.repeat(chosen[None], len(others), axis=0)
+    tries[np.arange(len(others)), others] = 1
+    values = task.score(tries)
+    yield from ((names[others[i]], task.scale(float(values[i]))) for i in np.argsort(values, kind="stable").tolist())
+
+
+def drawn(posed: Posed, chosen: Array, count: int, seed: int = 0) -> Draws:
+    """Return what becomes of simulated fixes with a set (n,) of sites: `count` at each place, by the method "auto"."""
+    from optloc.solvers import solve
+
+    places, d = len(posed.vectors), posed.design.dimension
+    flat = replace(posed.assembled(chosen), priors=posed.plan.problem.priors).flat()
+    bounds = _per_place(posed, chosen)[0]
+    ambiguous, ratio, coverage = np.zeros(places), np.full(places, np.nan), np.full(places, np.nan)
+    for p in range(places):
+        one = flat.take(np.array([p]))
+        fix = solve(simulate(one, posed.vectors[p], seed + p, count), "auto")
+        codes = np.broadcast_to(np.asarray(fix.code), fix.cost.shape).ravel()
+        position = fix.position.reshape(len(codes), -1)
+        error = position - posed.vectors[p, :d]
+        good = (codes != Status.AMBIGUOUS) & np.isfinite(error).all(-1)
+        ambiguous[p] = np.mean(~good)
+        if good.any():
+            ratio[p] = np.sqrt((error[good] ** 2).sum(-1).mean()) / bounds[p]
+            cov = fix.covariance().reshape(len(codes), d, d)[good]
+            coverage[p] = np.mean(
+                np.einsum("qi,qij,qj->q", error[good], np.linalg.inv(cov), error[good]) <= _QUANTILE[d]
+            )
+    return Draws(count, ambiguous, ratio, coverage, _flat(posed, chosen, bounds))
+
+
+def _flat(posed: Posed, chosen: Array, bounds: Array) -> Array:
+    stations = posed.problem.stations.position.reshape(-1, posed.design.dimension)
+    weight = posed.assembled(chosen).weight
+    out = np.empty(len(bounds))
+    owner = np.concatenate([rows.a for rows in posed.problem.rows])
+    for p in range(len(bounds)):
+        heard = stations[np.unique(owner[weight[p] > 0.0])]
+        off = np.linalg.svd(heard - heard.mean(0), compute_uv=False)[-1] if len(heard) > 1 else 0.0
+        out[p] = off / bounds[p]
+    return out

@@ -1,0 +1,362 @@
+"""Criteria of a relaxed choice of sites, with gradient and Hessian, as machine code.
+
+Sites have weights 0 <= w <= 1 and rows g, so that the information at place p is M_p = M0_p + sum_i w_i g_pi g_pi' and
+the covariance of the position Cov_p is the leading block of its inverse. All criteria are maxima of
+
+    L(w; lambda, W) = sum_q lambda_q tr(W_q Cov_q(w)),   lambda >= 0, sum 1,  W_q >= 0
+
+over the multipliers lambda of places and failures, and W of directions: convex in w, with gradient
+-lambda_q c_i' W_q c_i where c_i = C M^-1 g_i. (A determinant has W = Cov^-1 and the value log det Cov.)
+`formulations.placement` has the same in numpy.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled
+
+TRACE, VOLUME, AXIS = 0, 1, 2
+"""Criteria: tr Cov, log det Cov, and the largest eigenvalue of Cov."""
+
+# Width of the smoothed largest eigenvalue, as a share of it: the bound loses less than this.
+_SMOOTH = 5e-3
+
+
+@compiled
+def invert(matrix: Array, inverse: Array, lower: Array) -> float:
+    """Write the inverse of a positive definite matrix (m, m); return its log determinant, or NaN."""
+    m = matrix.shape[0]
+    logdet = 0.0
+    for j in range(m):
+        for i in range(j, m):
+            s = matrix[i, j]
+            for k in range(j):
+                s -= lower[i, k] * lower[j, k]
+            if i == j:
+                if not s > 0.0:
+                    return np.nan
+                lower[j, j] = np.sqrt(s)
+                logdet += np.log(s)
+            else:
+                lower[i, j] = s / lower[j, j]
+    for c in range(m):
+        for i in range(m):
+            s = 1.0 if i == c else 0.0
+            for k in range(i):
+                s -= lower[i, k] * inverse[k, c]
+            inverse[i, c] = s / lower[i, i]
+        for i in range(m - 1, -1, -1):
+            s = inverse[i, c]
+            for k in range(i + 1, m):
+                s -= lower[k, i] * inverse[k, c]
+            inverse[i, c] = s / lower[i, i]
+    return logdet
+
+
+@compiled
+def eigen(matrix: Array, values: Array, vectors: Array) -> None:
+    """Write eigenvalues and eigenvectors (columns) of a small symmetric matrix, by Jacobi's rotations."""
+    d = matrix.shape[0]
+    a = matrix.copy()
+    for i in range(d):
+        for j in range(d):
+            vectors[i, j] = 1.0 if i == j else 0.0
+    for _ in range(30):
+        off = 0.0
+        for i in range(d):
+            for j in range(i):
+                off += a[i, j] * a[i, j]
+        trace = 0.0
+        for i in range(d):
+            trace += abs(a[i, i])
+        if off <= 1e-30 * trace * trace:
+            break
+        for p in range(d):
+            for q in range(p + 1, d):
+                if a[p, q] == 0.0:
+                    continue
+                theta = 0.5 * (a[q, q] - a[p, p]) / a[p, q]
+                t = 1.0 / (abs(theta) + np.sqrt(theta * theta + 1.0))
+                t = t if theta >= 0.0 else -t
+                c = 1.0 / np.sqrt(t * t + 1.0)
+                s = t * c
+                for k in range(d):
+                    x, y = a[k, p], a[k, q]
+                    a[k, p], a[k, q] = c * x - s * y, s * x + c * y
+                for k in range(d):
+                    x, y = a[p, k], a[q, k]
+                    a[p, k], a[q, k] = c * x - s * y, s * x + c * y
+                for k in range(d):
+                    x, y = vectors[k, p], vectors[k, q]
+                    vectors[k, p], vectors[k, q] = c * x - s * y, s * x + c * y
+    for i in range(d):
+        values[i] = a[i, i]
+
+
+@compiled
+def measure(kind: int, cov: Array, weight: Array, basis: Array, shares: Array) -> tuple[float, float, float]:
+    """Write the weight (d, d) of a covariance; return its value by a criterion, smoothed, and that of its tangent.
+
+    The largest eigenvalue e is smoothed to tau log sum exp(e / tau): its weight has the directions `basis` (d, d,
+    columns) in the `shares` (d,), and tr(W Cov) is below e, by nothing to speak of where the others are apart from it.
+    """
+    d = cov.shape[0]
+    value = 0.0
+    if kind != AXIS:
+        if kind == VOLUME:
+            value = invert(cov, weight, basis)
+            return value, value, value
+        for i in range(d):
+            value += cov[i, i]
+            for j in range(d):
+                weight[i, j] = 1.0 if i == j else 0.0
+        return value, value, value
+    values = np.empty(d)
+    eigen(cov, values, basis)
+    for i in range(d):
+        value = max(value, values[i])
+    total, tangent = 0.0, 0.0
+    for i in range(d):
+        shares[i] = np.exp((values[i] - value) / (_SMOOTH * value))
+        total += shares[i]
+    for i in range(d):
+        shares[i] /= total
+        tangent += shares[i] * values[i]
+        for j in range(d):
+            weight[i, j] = 0.0
+    for i in range(d):
+        for j in range(d):
+            for k in range(d):
+                weight[i, j] += shares[k] * basis[i, k] * basis[j, k]
+    return value, value * (1.0 + _SMOOTH * np.log(total)), tangent
+
+
+@compiled
+def gather(rows: Array, base: Array, w: Array, off: int, scale: float, out: Array, matrix: Array) -> None:
+    """Write sqrt(scale) times rows (r, m, n), none of site `off`, and base + sum w g g' (m, m) of these."""
+    r, m, n = rows.shape
+    root = np.sqrt(scale)
+    for a in range(m):
+        for b in range(m):
+            matrix[a, b] = base[a, b]
+    for q in range(r):
+        for a in range(m):
+            for j in range(n):
+                out[q, a, j] = root * rows[q, a, j]
+            if off >= 0:
+                out[q, a, off] = 0.0
+        for a in range(m):
+            for b in range(a + 1):
+                s = 0.0
+                for j in range(n):
+                    s += w[j] * out[q, a, j] * out[q, b, j]
+                matrix[a, b] += s
+                if a != b:
+                    matrix[b, a] += s
+
+
+@compiled
+def slope(rows: Array, inverse: Array, weight: Array, u: Array, v: Array, gradient: Array) -> None:
+    """Write u = M^-1 g, v = W C u, and add to the gradient (n,): minus u'v, summed over the rows of each site."""
+    r, m, n = rows.shape
+    d = weight.shape[0]
+    for q in range(r):
+        for a in range(m):
+            for j in range(n):
+                u[q, a, j] = 0.0
+            for b in range(m):
+                x = inverse[a, b]
+                for j in range(n):
+                    u[q, a, j] += x * rows[q, b, j]
+        for a in range(d):
+            for j in range(n):
+                v[q, a, j] = 0.0
+            for b in range(d):
+                x = weight[a, b]
+                for j in range(n):
+                    v[q, a, j] += x * u[q, b, j]
+        for a in range(d):
+            for j in range(n):
+                gradient[j] -= u[q, a, j] * v[q, a, j]
+
+
+@compiled
+def bend(
+    rows: Array, u: Array, v: Array, factor: float, extra: float, hessian: Array, near: Array, along: Array
+) -> None:
+    """Add factor * (2 (g_i'M^-1 g_j)(c_i'W c_j) + extra (c_i'W c_j)^2) to the lower triangle of a Hessian (n, n)."""
+    r, m, n = rows.shape
+    d = v.shape[1]
+    for q in range(r):
+        for p in range(r):
+            for i in range(n):
+                x = u[q, 0, i]
+                for j in range(i + 1):
+                    near[j] = x * rows[p, 0, j]
+                for a in range(1, m):
+                    x = u[q, a, i]
+                    for j in range(i + 1):
+                        near[j] += x * rows[p, a, j]
+                x = v[q, 0, i]
+                for j in range(i + 1):
+                    along[j] = x * u[p, 0, j]
+                for a in range(1, d):
+                    x = v[q, a, i]
+                    for j in range(i + 1):
+                        along[j] += x * u[p, a, j]
+                for j in range(i + 1):
+                    hessian[i, j] += factor * along[j] * (2.0 * near[j] + extra * along[j])
+
+
+@compiled
+def add_square(vector: Array, factor: float, hessian: Array) -> None:
+    """Add factor * x x' to the lower triangle of a matrix."""
+    n = vector.shape[0]
+    for i in range(n):
+        x = factor * vector[i]
+        for j in range(i + 1):
+            hessian[i, j] += x * vector[j]
+
+
+@compiled
+def evaluate(
+    rows: Array,
+    bases: Array,
+    weight: Array,
+    d: int,
+    w: Array,
+    off: Array,
+    scale: Array,
+    kind: int,
+    worst: int,
+    state: tuple[Array, ...],
+    values: Array,
+) -> float:
+    """Return the criterion at w, and keep what its derivatives need.
+
+    Parameters
+    ----------
+    rows : array (P, r, m, n)
+        Of the free sites.
+    bases : array (S, P, m, m)
+        Information without them, of each scenario.
+    weight : array (P,)
+        Of the places, sum 1.
+    d : int
+        How many of the unknowns are the position.
+    w : array (n,)
+        Weights of the sites.
+    off : int array (S,)
+        Free site that fails, or -1.
+    scale : array (S,)
+        By which the weights of the free sites are multiplied.
+    kind, worst : int
+        TRACE, VOLUME or AXIS; whether the worst place counts, else their mean.
+    state : tuple of arrays
+        Written, of each scenario and place: inverse (S, P, m, m), weight and directions (S, P, d, d), shares (S, P, d).
+    values : array (2, Q)
+        Written, of each item that the maximum is taken over: smoothed value, and value of the tangent.
+    """
+    places, r, m, n = rows.shape
+    inverse, turn, basis, shares = state
+    scaled, matrix, lower = np.empty((r, m, n)), np.empty((m, m)), np.empty((m, m))
+    values[:] = 0.0
+    best = -np.inf
+    for s in range(bases.shape[0]):
+        mean = 0.0
+        for p in range(places):
+            gather(rows[p], bases[s, p], w, off[s], scale[s], scaled, matrix)
+            invert(matrix, inverse[s, p], lower)
+            cov = inverse[s, p, :d, :d].copy()
+            top, smooth, touched = measure(kind, cov, turn[s, p], basis[s, p], shares[s, p])
+            part = 1.0 if worst else weight[p]
+            q = s * places + p if worst else s
+            values[0, q] += part * smooth
+            values[1, q] += part * touched
+            mean = top if worst else mean + part * top
+            best = max(best, mean) if worst else best
+        best = best if worst else max(best, mean)
+    return best
+
+
+@compiled
+def derive(
+    rows: Array,
+    bases: Array,
+    weight: Array,
+    d: int,
+    w: Array,
+    off: Array,
+    scale: Array,
+    kind: int,
+    worst: int,
+    state: tuple[Array, ...],
+    share: Array,
+    slopes: Array,
+    hessian: Array,
+) -> None:
+    """Write gradients (Q, n) of the items of positive share, and the Hessian (n, n) of their sum by shares.
+
+    Arguments as in `evaluate`, which goes before; of the Hessian the lower triangle.
+    """
+    places, r, m, n = rows.shape
+    inverse, turn, basis, shares = state
+    scaled, matrix = np.empty((r, m, n)), np.empty((m, m))
+    u, v, near, along = np.empty((r, m, n)), np.empty((r, d, n)), np.empty(n), np.empty(n)
+    single = np.empty(n)
+    slopes[:] = 0.0
+    hessian[:] = 0.0
+    for s in range(bases.shape[0]):
+        for p in range(places):
+            q = s * places + p if worst else s
+            if share[q] == 0.0:
+                continue
+            part = 1.0 if worst else weight[p]
+            gather(rows[p], bases[s, p], w, off[s], scale[s], scaled, matrix)
+            single[:] = 0.0
+            slope(scaled, inverse[s, p], turn[s, p], u, v, single)
+            for j in range(n):
+                slopes[q, j] += part * single[j]
+            factor = share[q] * part
+            bend(scaled, u, v, factor, -1.0 if kind == VOLUME else 0.0, hessian, near, along)
+            if kind == AXIS:
+                cov = inverse[s, p, :d, :d].copy()
+                turned(cov, u, basis[s, p], shares[s, p], single, factor, hessian, near)
+
+
+@compiled
+def turned(
+    cov: Array, u: Array, basis: Array, shares: Array, gradient: Array, factor: float, hessian: Array, along: Array
+) -> None:
+    """Add what the smoothed largest eigenvalue bends beyond tr(W Cov): its eigenvalues trade places, and turn."""
+    d, n = shares.shape[0], hessian.shape[0]
+    values = np.empty(d)
+    top = 0.0
+    for k in range(d):
+        values[k] = 0.0
+        for a in range(d):
+            for b in range(d):
+                values[k] += basis[a, k] * cov[a, b] * basis[b, k]
+        top = max(top, values[k])
+    for k in range(d):
+        for i in range(k + 1):
+            # the divided difference of the shares, twice where both orders count
+            rate = shares[k] / (_SMOOTH * top)
+            if i < k:
+                apart = values[k] - values[i]
+                if abs(apart) > 1e-3 * _SMOOTH * top:
+                    rate = (shares[k] - shares[i]) / apart
+                rate *= 2.0
+            for j in range(n):
+                along[j] = 0.0
+            for q in range(u.shape[0]):
+                for j in range(n):
+                    x, y = 0.0, 0.0
+                    for a in range(d):
+                        x += basis[a, k] * u[q, a, j]
+                        y += basis[a, i] * u[q, a, j]
+                    along[j] += x * y
+            add_square(along, factor * rate, hessian)
+    add_square(gradient, -factor / (_SMOOTH * top), hessian)

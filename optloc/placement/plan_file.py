@@ -1,0 +1,497 @@
+"""Plans as files: candidates, places, kinds and rules in tables of problem files; and the file of what is chosen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from formulations.placement import Ground, Region
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.frames import Frame
+from optloc.base.inputs import read_text, within
+from optloc.base.outputs import claim, write_text
+from optloc.base.types import Array
+from optloc.files.reader import assemble
+from optloc.files.schema import (
+    Amount,
+    DataTable,
+    FrameTable,
+    MeasurementsTable,
+    PriorTable,
+    SoundTable,
+    StationsTable,
+    Units,
+    conform,
+    join,
+    kind_model,
+    name_of,
+    parse_toml,
+    validate,
+)
+from optloc.files.stations import survey
+from optloc.files.table import Table, distinct, of_rows, table_of
+from optloc.files.unknowns import settle_frame
+from optloc.files.writer import toml_text
+from optloc.placement.areas import convex_parts, ground_of, inside, plan_of, polygons_of, region_of, visible
+from optloc.placement.sites import Group, Name, Plan
+from optloc.problem.problem import Problem
+
+# Columns of stations and candidates that a problem file knows.
+_PLACE = (
+    "x",
+    "y",
+    "z",
+    "lat_deg",
+    "lon_deg",
+    "height",
+    "vx",
+    "vy",
+    "vz",
+    "qw",
+    "qx",
+    "qy",
+    "qz",
+    "azimuth",
+    "tilt",
+    "roll",
+)
+# What says where rows come from.
+_ROWS = {"file", "rows", "columns", "separator"}
+# Places that an area may become.
+_MANY = 10_000
+
+
+class _Table(BaseModel):
+    """A table of the file; keys that it does not know are refused."""
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
+
+
+class ChoiceTable(_Table):
+    """What to choose, by what, and when to stop."""
+
+    choose: int | None = Field(default=None, ge=1)
+    """How many candidates to take, beyond the stations that are there."""
+    budget: float | None = Field(default=None, ge=0.0)
+    """What they may cost together; candidates need a column cost."""
+    criterion: Literal["rms", "volume", "axis"] = "rms"
+    """Mean-square error (A), determinant (D) or largest eigenvalue (E) of the covariance of the position."""
+    worst: bool = False
+    """The worst place counts, in place of the weighted mean."""
+    fail_one: bool = False
+    """The worst loss of any one station counts."""
+    gap: float = Field(default=0.01, gt=0.0, lt=1.0)
+    """Share of the value that the bound may be below it."""
+    time: float = Field(default=60.0, gt=0.0)
+    """Seconds after which it stops."""
+    alternatives: int = Field(default=5, ge=1, le=100)
+    """How many of the best sets are told."""
+    kept: list[str] = Field(default_factory=list)
+    """Candidates that are taken in any case, and not counted."""
+    forbidden: list[str] = Field(default_factory=list)
+    """Candidates that are not taken."""
+    seed: int = Field(default=0, ge=0)
+    """Decides the random sets."""
+
+
+class TargetsTable(DataTable):
+    """Places of interest. Columns: x, y, z or lat_deg, lon_deg, height; name, weight. Or an area with a spacing."""
+
+    unit: str = "m"
+    """Unit of x, y, z and height."""
+    polygon: str | None = None
+    """GeoJSON file with a polygon: longitude and latitude on Earth, else metres of the frame."""
+    spacing: Amount | None = None
+    """Distance of the places in the area."""
+    height: Amount | None = None
+    """Their height, or third coordinate."""
+
+
+class PlannedTable(MeasurementsTable):
+    """What each station would measure: as in a problem file, without values; by default every station has a row."""
+
+    range_max: Amount | None = None
+    """Distance beyond which there is no measurement."""
+
+
+class SightTable(DataTable):
+    """What is in sight. Columns: candidate, place, sight (0, 1 or a factor on sigma); pairs left out are in sight."""
+
+    terrain: str | None = None
+    """CSV file with columns x, y, z on a grid, metres of the frame: what is behind the ground is out of sight."""
+
+
+class GroupTable(_Table):
+    """How many of some candidates: those of a mast, of a region, of an owner."""
+
+    group: str | None = None
+    """Those with this word in their column group."""
+    members: list[str] | None = None
+    """Or their names."""
+    most: int | None = Field(default=None, ge=0)
+    """At most so many."""
+    least: int | None = Field(default=None, ge=0)
+    """At least so many."""
+
+
+class RefineTable(_Table):
+    """Where stations may move for the refinement."""
+
+    polygon: str
+    """GeoJSON file with a polygon."""
+    height: list[Amount] = Field(default=["0 m", "0 m"], min_length=2, max_length=2)
+    """Least and greatest height, or third coordinate; above the terrain where there is one."""
+    terrain: str | None = None
+    """CSV file with columns x, y, z on a grid."""
+
+
+class PlanFile(_Table):
+    """A plan: which of these candidates to take."""
+
+    format: Literal[1]
+    """Version of the format."""
+    title: str | None = None
+    """What it is."""
+    propagation_speed: float | str | SoundTable | None = None
+    """As in a problem file."""
+    frame: FrameTable = FrameTable()
+    choice: ChoiceTable
+    stations: StationsTable | None = None
+    """Stations that are there already, and kept."""
+    candidates: StationsTable
+    """Where stations may stand. Columns as of stations; optional: cost, group, and sigma of their measurements."""
+    targets: TargetsTable
+    measurements: list[PlannedTable] = Field(min_length=1)
+    sight: SightTable | None = None
+    groups: list[GroupTable] = Field(default_factory=list)
+    priors: list[PriorTable] = Field(default_factory=list)
+    """What is known without any station, such as the position; by default the area of stations and places."""
+    refine: RefineTable | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """A plan and what its file says beyond it.
+
+    Parameters
+    ----------
+    plan : Plan
+        The plan.
+    source, title : str
+        Name of the file, and what it says it is.
+    settings : dict
+        Tables of the problem file of all sites.
+    regions : tuple of Region
+        Where stations may move; none without a refinement.
+    ground : Ground, optional
+        What their heights are above.
+    """
+
+    plan: Plan
+    source: str
+    title: str
+    settings: dict[str, Any]
+    regions: tuple[Region, ...] = ()
+    ground: Ground | None = None
+
+
+def is_plan(path: Path) -> bool:
+    """Return whether a file is a plan: it has a table [choice] or [candidates]."""
+    found = parse_toml(read_text(path), name_of(path), formats=(1, 2))
+    return "choice" in found or "candidates" in found
+
+
+def read_plan(path: Path) -> Planned:
+    """Return the plan of a file.
+
+    Raises
+    ------
+    InvalidProblem
+        Naming the file, the row and the column or key.
+    """
+    source, folder = name_of(path), path.parent
+    file = conform(PlanFile, parse_toml(read_text(path), source), source)
+    candidates = table_of(_bare(file.candidates), folder, join(source, "[candidates]"))
+    tables = [(candidates, file.candidates)]
+    if file.stations is not None:
+        tables.append((table_of(_bare(file.stations), folder, join(source, "[stations]")), file.stations))
+    names = [table.labels("name").tolist() for table, _ in tables]
+    all_names = [name for own in names for name in own]
+    twice = [name for i, name in enumerate(all_names) if name in all_names[:i]]
+    if twice:
+        raise InvalidProblem(f"station name {twice[0]!r} is used twice", source, "rename one of them")
+    settings = _settings(file, tables, folder, source)
+    made = validate(settings, source)
+    stations = of_rows(settings["stations"]["rows"], join(source, "[stations]"), {})
+    rows = [table_of(m, folder, join(source, f"[[measurements]] {i + 1}")) for i, m in enumerate(made.measurements)]
+    problem = assemble(made, stations, rows, source, values=False).loaded.problem
+    wanted = settle_frame(file.frame, problem.frame, problem.dimension)
+    settings["frame"] = wanted.model_dump(exclude_none=True)
+    places, labels, weights = _places(file.targets, wanted, problem, folder, source)
+    choice = file.choice
+    plan = Plan(
+        problem,
+        places,
+        weights,
+        choice.choose,
+        choice.budget,
+        _column(candidates, "cost", problem) if choice.budget is not None else None,
+        (*(names[1] if len(names) > 1 else ()), *choice.kept),
+        tuple(choice.forbidden),
+        tuple(_group(group, candidates, join(source, f"[[groups]] {i + 1}")) for i, group in enumerate(file.groups)),
+        choice.criterion,
+        choice.worst,
+        choice.fail_one,
+        _sight(file.sight, problem, places, labels, folder, source),
+        _reach(file, [len(table.columns["a"]) for table in rows], source),
+        choice.gap,
+        choice.time,
+        choice.alternatives,
+        "station",
+        labels,
+        choice.seed,
+    )
+    regions, ground = _regions(file.refine, problem.frame, problem.dimension, folder, source)
+    return Planned(plan, source, file.title or source, settings, regions, ground)
+
+
+def _bare(section: StationsTable) -> DataTable:
+    return DataTable(file=section.file, rows=section.rows, columns=section.columns, separator=section.separator)
+
+
+def _settings(
+    file: PlanFile, tables: Sequence[tuple[Table, StationsTable]], folder: Path, source: str
+) -> dict[str, Any]:
+    """Return the tables of a problem file with all stations and the rows that each would have."""
+    units = {(section.unit, section.speed_unit) for _, section in tables}
+    if len(units) > 1:
+        raise InvalidProblem("stations and candidates are in different units", source, "give both the same")
+    keys = [key for key in _PLACE if any(table.has(key) for table, _ in tables)]
+    rows: list[dict[str, Any]] = []
+    for table, section in tables:
+        survey(section.model_copy(update={"sigma": None}), _without_sigma(table), file.frame, table.source)
+        for i, name in enumerate(table.labels("name")):
+            rows.append({"name": str(name)} | {key: float(table.numbers(key)[i]) for key in keys if table.has(key)})
+    own = {str(n): v for n, v in zip(*_own_sigma(tables[0][0]), strict=True)}
+    station = file.candidates.model_dump(exclude_defaults=True, exclude=_ROWS)
+    measurements = []
+    for i, planned in enumerate(file.measurements):
+        given = planned.model_dump(exclude_defaults=True, exclude=_ROWS | {"range_max"})
+        place = join(source, f"[[measurements]] {i + 1}")
+        measurements.append(given | {"rows": _planned_rows(planned, rows, own, folder, place)})
+        if own:
+            measurements[-1].pop("sigma", None)
+    out = {
+        "format": 1,
+        "title": file.title,
+        "propagation_speed": file.propagation_speed
+        if not isinstance(file.propagation_speed, SoundTable)
+        else file.propagation_speed.model_dump(),
+        "frame": file.frame.model_dump(exclude_none=True),
+        "stations": station | {"rows": rows},
+        "measurements": measurements,
+        "priors": [prior.model_dump(exclude_none=True) for prior in file.priors],
+    }
+    return {key: value for key, value in out.items() if value is not None and value != []}
+
+
+def _without_sigma(table: Table) -> Table:
+    columns = {name: column for name, column in table.columns.items() if name != table.name("sigma")}
+    return replace(table, columns=columns)
+
+
+def _own_sigma(table: Table) -> tuple[Sequence[str], Sequence[float]]:
+    if not table.has("sigma"):
+        return (), ()
+    return table.labels("name").tolist(), table.numbers("sigma").tolist()
+
+
+def _planned_rows(
+    section: PlannedTable, stations: Sequence[dict[str, Any]], own: dict[str, float], folder: Path, where: str
+) -> list[dict[str, Any]]:
+    """Return the rows that a section lists, or one of each station but the other end."""
+    if section.kind is None:
+        raise InvalidProblem("the key 'kind' is missing", where, 'write kind = "toa"')
+    kind_model(section.kind, join(where, "key 'kind'"))
+    if section.file is not None or section.rows is not None:
+        table = table_of(section, folder, where)
+        keys = [key for key in ("a", "b", "sigma", "weight", "correction") if table.has(key)]
+        found = [{key: table.raw(key)[i] for key in keys} for i in range(table.count)]
+        return [{key: v.item() if isinstance(v, np.generic) else v for key, v in row.items()} for row in found]
+    made = []
+    for station in stations:
+        if station["name"] not in (section.a, section.b):
+            row: dict[str, Any] = {"a": station["name"]}
+            if own:
+                sigma = own.get(station["name"])
+                if sigma is None and section.sigma is None:
+                    raise InvalidProblem(f"{station['name']!r} has no sigma", where, "give sigma for all")
+                row["sigma"] = sigma if sigma is not None else float(str(section.sigma).split()[0])
+            made.append(row)
+    return made
+
+
+def _column(candidates: Table, key: str, problem: Problem) -> Array:
+    """Return a column of the candidates for all stations, zero for those that are there."""
+    given = dict(zip(candidates.labels("name").tolist(), candidates.numbers(key).tolist(), strict=True))
+    return np.array([given.get(name, 0.0) for name in problem.stations.names])
+
+
+def _group(table: GroupTable, candidates: Table, where: str) -> Group:
+    if (table.group is None) == (table.members is None):
+        raise InvalidProblem("a group is given once", where, "give group, a word of the column, or members")
+    if table.most is None and table.least is None:
+        raise InvalidProblem("the group has no rule", where, "give most or least")
+    if table.members is not None:
+        return Group(tuple(table.members), table.most, table.least)
+    words = [str(word) for word in candidates.raw("group")]
+    if table.group not in words:
+        what = f"no candidate is in group {table.group!r}"
+        raise InvalidProblem(what, where, nearest(str(table.group), sorted({*words})))
+    labels = candidates.labels("name")
+    members = tuple(str(name) for name, word in zip(labels, words, strict=True) if word == table.group)
+    return Group(members, table.most, table.least)
+
+
+def _places(
+    section: TargetsTable, wanted: FrameTable, problem: Problem, folder: Path, source: str
+) -> tuple[Array, tuple[str, ...], Array | None]:
+    """Return places (P, d), their names, and weights, None where they count alike."""
+    where = join(source, "[targets]")
+    if section.polygon is not None:
+        if section.file is not None or section.rows is not None or section.spacing is None:
+            raise InvalidProblem("an area has a polygon and a spacing alone", where, 'write spacing = "5 m"')
+        points = _area(section, problem.frame, problem.dimension, folder, where)
+        return points, tuple(f"P{i + 1}" for i in range(len(points))), None
+    table = table_of(section, folder, where)
+    if not table.has("name"):
+        labels = np.array([f"P{i + 1}" for i in range(table.count)], dtype=object)
+        table = replace(table, columns={**table.columns, table.name("name"): labels})
+    found = survey(StationsTable(unit=section.unit), _without_sigma(table), wanted, table.source)[0]
+    _, first, _ = distinct(table.labels("name"))
+    if len(first) < table.count:
+        raise InvalidProblem("a place has the name of another", table.source, "give each a name of its own")
+    weights = None
+    if table.has("weight"):
+        weights = table.numbers("weight")
+        bad = np.flatnonzero(weights <= 0.0)
+        if len(bad):
+            what = f"the weight {weights[bad[0]]:g} is not positive"
+            raise InvalidProblem(what, table.where("weight", int(bad[0])), "give a weight above 0, or leave it out")
+    return found.position, found.names, weights
+
+
+def _area(section: TargetsTable, frame: Frame, dimension: int, folder: Path, where: str) -> Array:
+    """Return places (P, d) on a square grid inside a polygon."""
+    assert section.polygon is not None
+    step = Units("length").plain(section.spacing or 0.0, section.unit, join(where, "key 'spacing'"))
+    if not step > 0.0:
+        raise InvalidProblem(f"the spacing {step:g} m is not positive", where, 'write spacing = "5 m"')
+    height = 0.0 if section.height is None else Units("length").plain(section.height, section.unit, where)
+    rings = [
+        plan_of(r, frame, where) for r in polygons_of(within(folder, section.polygon, join(where, "key 'polygon'")))
+    ]
+    low, high = np.min([r.min(0) for r in rings], axis=0), np.max([r.max(0) for r in rings], axis=0)
+    if np.prod((high - low) / step + 1.0) > _MANY:
+        raise InvalidProblem(f"the spacing {step:g} m makes more than {_MANY} places", where, "widen it")
+    axes = [np.arange(a + step / 2, b, step) for a, b in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    points = grid[np.any([inside(grid, ring) for ring in rings], axis=0)]
+    if not len(points):
+        raise InvalidProblem("the spacing leaves no place in the area", where, "narrow it")
+    return points if dimension == 2 else np.column_stack([points, np.full(len(points), height)])
+
+
+def _reach(file: PlanFile, counts: Sequence[int], source: str) -> Array | None:
+    """Return the greatest range (m,) of each row, metres; None where all are without end."""
+    if all(section.range_max is None for section in file.measurements):
+        return None
+    # blocks of rows stand in the order of the kinds' first appearance: `assemble` has put equal kinds together
+    kinds: dict[str, list[float]] = {}
+    for i, (section, count) in enumerate(zip(file.measurements, counts, strict=True)):
+        place = join(source, f"[[measurements]] {i + 1}", "key 'range_max'")
+        most = np.inf if section.range_max is None else Units("length").plain(section.range_max, "m", place)
+        if not most > 0.0:
+            raise InvalidProblem(f"the range {most:g} m is not positive", place, "give a positive range")
+        kinds.setdefault(str(section.kind), []).extend([most] * count)
+    return np.concatenate([np.array(values) for values in kinds.values()])
+
+
+def _sight(
+    section: SightTable | None, problem: Problem, places: Array, labels: Sequence[str], folder: Path, source: str
+) -> Array | None:
+    """Return the factor (P, s) of each pair, 0 where it is out of sight; None where all are in sight."""
+    if section is None:
+        return None
+    where, names = join(source, "[sight]"), problem.stations.names
+    out = np.ones((len(places), len(names)))
+    if section.terrain is not None:
+        ground = ground_of(within(folder, section.terrain, join(where, "key 'terrain'")), join(where, "key 'terrain'"))
+        out *= visible(ground, places, problem.stations.position.reshape(-1, problem.dimension))
+    if section.file is None and section.rows is None:
+        return out
+    table = table_of(section, folder, where)
+    values = table.numbers("sight")
+    for key, known in (("candidate", names), ("place", labels)):
+        for row, label in enumerate(table.labels(key)):
+            if label not in known:
+                raise InvalidProblem(f"there is no {key} {label!r}", table.where(key, row), nearest(label, list(known)))
+    bad = np.flatnonzero(~((values == 0.0) | (values >= 1.0)))
+    if len(bad):
+        what = f"the sight {values[bad[0]]:g} is neither 0 nor 1 nor a larger factor"
+        raise InvalidProblem(what, table.where("sight", int(bad[0])), "give 0 for out of sight, 1 for in sight")
+    site, place = {n: i for i, n in enumerate(names)}, {n: i for i, n in enumerate(labels)}
+    for one, other, value in zip(table.labels("candidate"), table.labels("place"), values, strict=True):
+        out[place[other], site[one]] *= value
+    return out
+
+
+def _regions(
+    section: RefineTable | None, frame: Frame, dimension: int, folder: Path, source: str
+) -> tuple[tuple[Region, ...], Ground | None]:
+    if section is None:
+        return (), None
+    where = join(source, "[refine]")
+    low, high = (Units("length").plain(v, "m", join(where, "key 'height'")) for v in section.height)
+    if low > high:
+        raise InvalidProblem("the least height is above the greatest", join(where, "key 'height'"), "swap them")
+    path = within(folder, section.polygon, join(where, "key 'polygon'"))
+    parts = [part for ring in polygons_of(path) for part in convex_parts(plan_of(ring, frame, where))]
+    ground = None
+    if section.terrain is not None and dimension == 3:
+        ground = ground_of(within(folder, section.terrain, join(where, "key 'terrain'")), join(where, "key 'terrain'"))
+    return tuple(region_of(part, low, high) for part in parts), ground
+
+
+def write_chosen(planned: Planned, taken: Sequence[str], out: Path, source: Path) -> None:
+    """Write an ordinary problem file with the taken stations and their rows, ready for `crlb --map` and studies."""
+    if out.suffix.lower() != ".toml":
+        raise InvalidProblem("the chosen stations are written as a problem file", str(out), "let its name end in .toml")
+    claim(out, inputs=[source])
+    kept, settings = {*taken}, dict(planned.settings)
+    others = {s.get("b") for s in settings["measurements"]}
+    stations = [row for row in settings["stations"]["rows"] if row["name"] in kept | others]
+    settings["stations"] = settings["stations"] | {"rows": stations}
+    rows = [[row for row in section["rows"] if row["a"] in kept] for section in settings["measurements"]]
+    settings["measurements"] = [
+        section | {"rows": own} for section, own in zip(settings["measurements"], rows, strict=True) if own
+    ]
+    settings["title"] = f"{planned.title}: the chosen stations"
+    text = "format = 1\n" + toml_text({key: value for key, value in settings.items() if key != "format"})
+    write_text(out, text)
+
+
+def criterion_name(name: str) -> Name:
+    """Return the name of a criterion; raise InvalidProblem for an unknown one."""
+    known: tuple[Name, ...] = ("rms", "volume", "axis")
+    for one in known:
+        if name == one:
+            return one
+    raise InvalidProblem(f"there is no criterion {name!r}", "--criterion", nearest(name, list(known)))

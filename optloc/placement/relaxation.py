@@ -1,0 +1,435 @@
+"""The relaxed choice of a node of the search, as machine code: its least value from below, and what it forbids.
+
+For any weights w and any multipliers the tangent of L at w (`optloc.placement.criteria`) lies below the criterion at
+every choice, so that its least value over the node is a bound, converged or not. A primal-dual interior-point method
+finds multipliers that make it a good one: those of the places and failures that count, of the rules, and of 0 <= w <=
+1. Nodes that are pruned, or that cannot be, need a few of its steps.
+
+S. Boyd and L. Vandenberghe, "Convex Optimization" (2004), sections 7.5 and 11.7.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled
+from optloc.placement.criteria import VOLUME, add_square, derive, evaluate
+
+# Multipliers below this share of the largest are left out: they cost as much as the others, and move the bound by less.
+_SHARE = 1e-3
+# Share of the way to the boundary that a step may go, and by how much the barrier falls at each.
+_REACH, _FALL = 0.9, 0.2
+# Rounding of a bound, as a share of what it is the difference of.
+_ROUNDING = 1e-9
+# Barrier of the first step, as a share of the criterion and for each site; how close bound and criterion end; and steps
+# that a node takes after it is known to be branched.
+_BEGIN, _CLOSE, _LATE = 0.15, 1e-4, 2
+# Distance of the first level from the largest item, as a share of the criterion.
+_ABOVE = 0.1
+
+
+@compiled
+def barrier_weights(values: Array, mu: float, weights: Array) -> None:
+    """Write mu / (t - values), with the t that makes their sum one: the multipliers of a smoothed maximum."""
+    n = values.shape[0]
+    top = values[0]
+    for i in range(n):
+        top = max(top, values[i])
+    # the sum falls with t and is convex: Newton from the left stays on the left
+    t = top + mu
+    for _ in range(50):
+        total, slope = 0.0, 0.0
+        for i in range(n):
+            x = mu / (t - values[i])
+            total += x
+            slope += x * x / mu
+        move = (total - 1.0) / slope
+        t += move
+        if move <= 1e-12 * mu:
+            break
+    total = 0.0
+    for i in range(n):
+        weights[i] = mu / (t - values[i])
+        total += weights[i]
+    for i in range(n):
+        weights[i] /= total
+
+
+@compiled
+def share_out(
+    values: Array, level: float, mu: float, share: Array, active: Array, slopes: Array, gradient: Array, hessian: Array
+) -> tuple[float, Array]:
+    """Write the gradient (n,) that a step over items meets, and add what they bend; return the level's own part.
+
+    The maximum is min t with t >= f_q; s_q = t - f_q, multipliers `share`. With a_q = share_q / s_q the step of the
+    level is dt = (sum mu / s_q - 1 + sum a_q g_q'dw) / sum a_q, and is eliminated.
+    """
+    count, n = slopes.shape
+    pull, push, total = np.zeros(n), -1.0, 0.0
+    gradient[:] = 0.0
+    for q in range(count):
+        if active[q] == 0.0:
+            continue
+        left = level - values[q]
+        a = share[q] / left
+        total += a
+        push += mu / left
+        for j in range(n):
+            gradient[j] += mu / left * slopes[q, j]
+            pull[j] += a * slopes[q, j]
+        add_square(slopes[q], a, hessian)
+    add_square(pull, -1.0 / total, hessian)
+    for j in range(n):
+        gradient[j] -= pull[j] * push / total
+        pull[j] /= total
+    return push / total, pull
+
+
+@compiled
+def cheapest(cost: Array, size: Array, most: float, at: Array) -> tuple[float, float]:
+    """Return the least cost'v over 0 <= v <= 1 with size'v <= most, and the multiplier of that rule; `at` gets v."""
+    n = cost.shape[0]
+    rate = np.empty(n)
+    total = 0.0
+    for j in range(n):
+        at[j] = 0.0
+        rate[j] = 0.0
+        if cost[j] < 0.0:
+            if size[j] > 0.0:
+                rate[j] = cost[j] / size[j]
+            else:
+                at[j] = 1.0
+                total += cost[j]
+    left, multiplier = most, 0.0
+    for j in np.argsort(rate, kind="mergesort"):
+        if rate[j] >= 0.0:
+            break
+        if left <= 0.0:
+            multiplier = -rate[j]
+            break
+        at[j] = min(1.0, left / size[j])
+        total += cost[j] * at[j]
+        left -= size[j] * at[j]
+        if at[j] < 1.0:
+            multiplier = -rate[j]
+            break
+    return total, multiplier
+
+
+@compiled
+def solve(matrix: Array, right: Array) -> bool:
+    """Solve a positive definite system in place, given by its lower triangle; return whether it is definite."""
+    n = matrix.shape[0]
+    for j in range(n):
+        for k in range(j):
+            x = matrix[j, k]
+            if x != 0.0:
+                for i in range(j, n):
+                    matrix[i, j] -= matrix[i, k] * x
+        if not matrix[j, j] > 0.0:
+            return False
+        root = np.sqrt(matrix[j, j])
+        for i in range(j, n):
+            matrix[i, j] /= root
+    for i in range(n):
+        for k in range(i):
+            right[i] -= matrix[i, k] * right[k]
+        right[i] /= matrix[i, i]
+    for i in range(n - 1, -1, -1):
+        for k in range(i + 1, n):
+            right[i] -= matrix[k, i] * right[k]
+        right[i] /= matrix[i, i]
+    return True
+
+
+@compiled
+def step(
+    w: Array,
+    left: Array,
+    duals: Array,
+    rules: Array,
+    limits: Array,
+    mu: float,
+    gradient: Array,
+    hessian: Array,
+    move: Array,
+    change: Array,
+    gain: Array,
+) -> float:
+    """Write the step of the interior point: of w, multipliers and slacks; return how far it may go, 0 for none.
+
+    Parameters
+    ----------
+    w : array (n,)
+        Inside 0 < w < 1.
+    left : array (R,)
+        Slack of the rules, positive.
+    duals : array (2 n + R,)
+        Multipliers of w >= 0, of w <= 1 and of the rules, positive.
+    rules, limits : array (R, n), (R,)
+        rules @ w <= limits.
+    mu : float
+        Where the products of slacks and multipliers are to be.
+    gradient, hessian : array (n,), (n, n)
+        Of the criterion; the Hessian is overwritten.
+    move, change, gain : array (n,), (2 n + R,), (R,)
+        Written.
+    """
+    n, count = w.shape[0], rules.shape[0]
+    for j in range(n):
+        move[j] = mu / w[j] - mu / (1.0 - w[j]) - gradient[j]
+        hessian[j, j] += duals[j] / w[j] + duals[n + j] / (1.0 - w[j])
+    for i in range(count):
+        gain[i] = limits[i] - left[i]
+        for j in range(n):
+            gain[i] -= rules[i, j] * w[j]
+        pull = duals[2 * n + i] / left[i]
+        for j in range(n):
+            move[j] -= rules[i, j] * (mu / left[i] - pull * gain[i])
+        add_square(rules[i], pull, hessian)
+    if not solve(hessian, move):
+        return 0.0
+    reach = 1.0
+    for i in range(count):
+        for j in range(n):
+            gain[i] -= rules[i, j] * move[j]
+        change[2 * n + i] = mu / left[i] - duals[2 * n + i] * (1.0 + gain[i] / left[i])
+        if gain[i] < 0.0:
+            reach = min(reach, -_REACH * left[i] / gain[i])
+    for j in range(n):
+        change[j] = mu / w[j] - duals[j] * (1.0 + move[j] / w[j])
+        change[n + j] = mu / (1.0 - w[j]) - duals[n + j] * (1.0 - move[j] / (1.0 - w[j]))
+        if move[j] < 0.0:
+            reach = min(reach, -_REACH * w[j] / move[j])
+        elif move[j] > 0.0:
+            reach = min(reach, _REACH * (1.0 - w[j]) / move[j])
+    return reach
+
+
+@compiled
+def advance(duals: Array, change: Array) -> None:
+    """Add the change of multipliers, as far as all stay positive."""
+    reach = 1.0
+    for i in range(duals.shape[0]):
+        if change[i] < 0.0:
+            reach = min(reach, -_REACH * duals[i] / change[i])
+    for i in range(duals.shape[0]):
+        duals[i] += reach * change[i]
+
+
+@compiled
+def bound_at(
+    x: Array, low: float, gradient: Array, duals: Array, rules: Array, limits: Array, reduced: Array, at: Array
+) -> float:
+    """Return the least value of a tangent over the node; write the reduced costs."""
+    n, held = x.shape[0], low
+    for j in range(n):
+        reduced[j] = gradient[j]
+        held -= gradient[j] * x[j]
+    for i in range(1, rules.shape[0]):
+        held -= duals[2 * n + i] * limits[i]
+        for j in range(n):
+            reduced[j] += duals[2 * n + i] * rules[i, j]
+    least, price = cheapest(reduced, rules[0], limits[0], at)
+    for j in range(n):
+        reduced[j] += price * rules[0, j]
+    return held + least - _ROUNDING * (abs(held) + abs(least) + abs(low))
+
+
+@compiled
+def relax(
+    rows: Array,
+    bases: Array,
+    weight: Array,
+    d: int,
+    off: Array,
+    scale: Array,
+    rules: Array,
+    limits: Array,
+    kind: int,
+    worst: int,
+    w: Array,
+    enough: float,
+    most: int,
+    cost: Array,
+) -> tuple[float, float, int]:
+    """Return bound, criterion and steps of a node; w becomes where the bound was found, cost what sites cost there.
+
+    The bound is L - gradient'w - limits'nu + min over 0 <= v <= 1 with rules[0]'v <= limits[0] of (gradient +
+    rules'nu)'v, which holds for any w and any multipliers nu >= 0 of the other rules.
+
+    Parameters
+    ----------
+    rows, bases, weight, d, off, scale, kind, worst
+        As in `evaluate`.
+    rules, limits : array (R, n), (R,)
+        rules @ w <= limits; the first has no negative entry.
+    w : array (n,)
+        Where it begins, inside; overwritten.
+    enough : float
+        A node whose bound is no less needs no further steps, nor much does one whose criterion is less.
+    most : int
+        Steps.
+    cost : array (n,)
+        Written: by how much the bound rises where a site is taken (positive), or left out (negative).
+    """
+    places, m, n = rows.shape[0], rows.shape[2], w.shape[0]
+    scenarios, count = bases.shape[0], rules.shape[0]
+    items = scenarios * places if worst else scenarios
+    state = (
+        np.empty((scenarios, places, m, m)),
+        np.empty((scenarios, places, d, d)),
+        np.empty((scenarios, places, d, d)),
+        np.empty((scenarios, places, d)),
+    )
+    values, share, slopes = np.empty((2, items)), np.ones(items), np.empty((items, n))
+    gradient, hessian, reduced, at = np.empty(n), np.empty((n, n)), np.empty(n), np.empty(n)
+    left, duals, x, turns = np.empty(count), np.empty(2 * n + count), w.copy(), np.zeros(items)
+    bound, best, mu, level, late, taken = -np.inf, np.inf, -1.0, 0.0, 0, 0
+    while taken < most:
+        taken += 1
+        value = evaluate(rows, bases, weight, d, x, off, scale, kind, worst, state, values)
+        if not np.isfinite(value):
+            break
+        size = float(d) if kind == VOLUME else abs(value)
+        if mu < 0.0:
+            mu = _BEGIN * size / n
+            begin(x, left, duals, rules, limits, mu)
+            barrier_weights(values[0], _ABOVE * size, share)
+            level = values[0].max() + _ABOVE * size
+        level = max(level, values[0].max() + 0.5 * mu)
+        low = weigh(values, level, mu, share, turns)
+        derive(rows, bases, weight, d, x, off, scale, kind, worst, state, turns, slopes, hessian)
+        mix(turns, slopes, gradient)
+        found = bound_at(x, low, gradient, duals, rules, limits, reduced, at)
+        if found > bound:
+            bound = found
+            w[:] = x
+            cost[:] = reduced
+        best = min(best, value) if meets(x, rules, limits) else best
+        late += 1 if best < enough else 0
+        if bound >= enough or best - bound <= _CLOSE * size or late > _LATE:
+            break
+        mu = _FALL * product(x, left, duals, level, values[0], share)
+        reach, level = go(x, left, duals, rules, limits, mu, level, values[0], share, turns, slopes, gradient, hessian)
+        if reach <= 0.0:
+            break
+    return bound, best, taken
+
+
+@compiled
+def mix(turns: Array, slopes: Array, gradient: Array) -> None:
+    """Write the gradient of all items together from those of each."""
+    for j in range(gradient.shape[0]):
+        gradient[j] = 0.0
+        for q in range(turns.shape[0]):
+            gradient[j] += turns[q] * slopes[q, j]
+
+
+@compiled
+def product(x: Array, left: Array, duals: Array, level: float, values: Array, share: Array) -> float:
+    """Return the mean product of slacks and multipliers: those of the sites, of the rules, of the items if many."""
+    n, count, items = x.shape[0], left.shape[0], share.shape[0]
+    total, terms = 0.0, 2 * n + count
+    for j in range(n):
+        total += duals[j] * x[j] + duals[n + j] * (1.0 - x[j])
+    for i in range(count):
+        total += duals[2 * n + i] * left[i]
+    if items > 1:
+        terms += items
+        for q in range(items):
+            total += share[q] * (level - values[q])
+    return float(total / terms)
+
+
+@compiled
+def go(
+    x: Array,
+    left: Array,
+    duals: Array,
+    rules: Array,
+    limits: Array,
+    mu: float,
+    level: float,
+    values: Array,
+    share: Array,
+    active: Array,
+    slopes: Array,
+    gradient: Array,
+    hessian: Array,
+) -> tuple[float, float]:
+    """Take one step in all unknowns; return how far it went, 0 for none, and the new level of the items."""
+    n, count, items = x.shape[0], left.shape[0], share.shape[0]
+    move, change, gain = np.empty(n), np.empty(2 * n + count), np.empty(count)
+    turn, pull, rise = np.empty(items), np.zeros(n), 0.0
+    if items > 1:
+        rise, pull = share_out(values, level, mu, share, active, slopes, gradient, hessian)
+    reach = step(x, left, duals, rules, limits, mu, gradient, hessian, move, change, gain)
+    if reach <= 0.0:
+        return 0.0, level
+    if items > 1:
+        for j in range(n):
+            rise += pull[j] * move[j]
+        for q in range(items):
+            away, grow = level - values[q], rise
+            for j in range(n):
+                grow -= slopes[q, j] * move[j]
+            turn[q] = mu / away - share[q] * (1.0 + grow / away)
+            if grow < 0.0:
+                reach = min(reach, -_REACH * away / grow)
+        level += reach * rise
+        advance(share, turn)
+    for j in range(n):
+        x[j] += reach * move[j]
+    for i in range(count):
+        left[i] += reach * gain[i]
+    advance(duals, change)
+    return reach, level
+
+
+@compiled
+def weigh(values: Array, level: float, mu: float, share: Array, turns: Array) -> float:
+    """Write the shares of items, sum 1, of those that count; return the value of their tangent."""
+    items = share.shape[0]
+    if items == 1:
+        share[0] = turns[0] = 1.0
+        return float(values[1, 0])
+    most, total, low = 0.0, 0.0, 0.0
+    for q in range(items):
+        most = max(most, share[q])
+    for q in range(items):
+        counts = share[q] > _SHARE * most or mu / (level - values[0, q]) > _SHARE * most
+        turns[q] = share[q] if counts else 0.0
+        total += turns[q]
+    for q in range(items):
+        turns[q] /= total
+        low += turns[q] * values[1, q]
+    return low
+
+
+@compiled
+def meets(w: Array, rules: Array, limits: Array) -> bool:
+    """Return whether weights meet rules, to rounding."""
+    for i in range(rules.shape[0]):
+        used = 0.0
+        for j in range(w.shape[0]):
+            used += rules[i, j] * w[j]
+        if used > limits[i] + 1e-6 * max(1.0, abs(limits[i])):
+            return False
+    return True
+
+
+@compiled
+def begin(w: Array, left: Array, duals: Array, rules: Array, limits: Array, mu: float) -> None:
+    """Write slacks of the rules and multipliers to begin with at w: all products are mu."""
+    n, count = w.shape[0], rules.shape[0]
+    for j in range(n):
+        duals[j] = mu / w[j]
+        duals[n + j] = mu / (1.0 - w[j])
+    for i in range(count):
+        left[i] = limits[i]
+        for j in range(n):
+            left[i] -= rules[i, j] * w[j]
+        left[i] = max(left[i], 0.1)
+        duals[2 * n + i] = mu / left[i]

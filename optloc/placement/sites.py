@@ -1,0 +1,418 @@
+"""What is asked of a placement, and what every site would say: rows of the house's own linearisation, site by site."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from formulations.placement import Criterion, Design
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.types import Array, Prior
+from optloc.linear.normal import Normal, linearise, with_priors
+from optloc.models import MODELS
+from optloc.problem.arrivals import as_arrivals
+from optloc.problem.layout import emission_name
+from optloc.problem.noise import variances
+from optloc.problem.problem import Problem
+
+Name = Literal["rms", "volume", "axis"]
+"""Criteria: mean-square error, volume and longest axis of the error ellipsoid."""
+
+LETTER: dict[str, Criterion] = {"rms": "A", "volume": "D", "axis": "E"}
+"""The criteria's names in the literature."""
+
+# Where the direction from a site to a place means nothing any more, metres.
+_SAME = 1e-3
+# Variance of an arrival, as a share of the mean, below which it was made up: `as_arrivals` gives an exact one 1e-6.
+_EXACT = 1e-5
+# The emission time is known to this many half extents of the area: far less than any arrival says.
+_EMISSION = 10.0
+# The least area that a prior is made of, metres: a single place has no extent.
+_EXTENT = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """A rule about some of the sites.
+
+    Parameters
+    ----------
+    members : tuple of str
+        Names of sites.
+    most, least : int, optional
+        How many of them may, or must, be taken, those that are kept included.
+    """
+
+    members: tuple[str, ...]
+    most: int | None = None
+    least: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What is asked: of these sites, for these places, which to take.
+
+    Parameters
+    ----------
+    problem : Problem
+        One epoch and one target at rest or with a state of its own; every station that measures is a site, and its rows
+        are those it would add. The measured values do not matter. Priors are what is known without any site; where
+        there is none of the position it is the area of sites and places.
+    places : array (p, d), or (p, n)
+        Where the target may be, metres; or whole parameter vectors, for states with a velocity.
+    weights : array (p,), optional
+        How much each place counts, positive; alike by default.
+    choose : int, optional
+        How many sites to take beyond those that are kept.
+    budget : float, optional
+        What the sites that are taken may cost together, kept ones not counted.
+    cost : array (s,), optional
+        Of each station, not negative.
+    kept, forbidden : tuple of str
+        Sites that are taken, and that are not, in any case.
+    groups : tuple of Group
+        Further rules.
+    criterion : "rms", "volume" or "axis"
+        Mean-square error (A), determinant (D) or largest eigenvalue (E) of the covariance of the position.
+    worst : bool
+        The worst place counts, in place of the mean.
+    fail_one : bool
+        The worst loss of any one site counts.
+    sight : array (p, s), optional
+        Factor, 1 or more, by which the standard deviations of a station's rows grow at a place; 0 where it is out of
+        sight.
+    reach : array (m,), optional
+        Distance to the target beyond which a row is not measured, metres.
+    gap : float
+        Share of the value that the bound may be below it.
+    seconds : float
+        After which the search stops.
+    alternatives : int
+        How many of the best sets are told.
+    by : "station" or "row"
+        Whether stations are chosen, or single rows.
+    names : tuple of p str
+        Of the places.
+    seed : int
+        Decides the random sets.
+    """
+
+    problem: Problem
+    places: Array
+    weights: Array | None = None
+    choose: int | None = None
+    budget: float | None = None
+    cost: Array | None = None
+    kept: tuple[str, ...] = ()
+    forbidden: tuple[str, ...] = ()
+    groups: tuple[Group, ...] = ()
+    criterion: Name = "rms"
+    worst: bool = False
+    fail_one: bool = False
+    sight: Array | None = None
+    reach: Array | None = None
+    gap: float = 0.01
+    seconds: float = 60.0
+    alternatives: int = 5
+    by: Literal["station", "row"] = "station"
+    names: tuple[str, ...] = ()
+    seed: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Posed:
+    """A plan as numbers.
+
+    Parameters
+    ----------
+    plan : Plan
+        As it was given.
+    problem : Problem
+        A batch of P problems: that of all sites for a target at each place, with priors, rows out of sight left out.
+    vectors : array (P, size)
+        Their parameter vectors.
+    site : int array (m,)
+        Site of each row.
+    names : tuple of n str
+        Of the sites.
+    design : Design
+        Rows and prior information of each place.
+    rules, limits : array (R, n), (R,)
+        rules @ w <= limits; the first counts or costs.
+    state : int array (n,)
+        -1 for a free site, 0 for one that is forbidden, 1 for one that is kept.
+    """
+
+    plan: Plan
+    problem: Problem
+    vectors: Array
+    site: Array
+    names: tuple[str, ...]
+    design: Design
+    rules: Array
+    limits: Array
+    state: Array
+
+    def assembled(self, chosen: Array) -> Problem:
+        """Return the batch of P problems that is left where the sites (n,) are taken: what `optloc.crlb` takes."""
+        taken = np.asarray(chosen, dtype=float)[self.site]
+        return self.problem.with_rows(weight=self.problem.weight * taken)
+
+
+def pose(plan: Plan) -> Posed:
+    """Return a plan as numbers.
+
+    Raises
+    ------
+    InvalidProblem
+        Naming the argument, site or place that cannot be right.
+    """
+    plan = _checked(plan)
+    problem = _arrivals(plan.problem)
+    site, names = _sites(problem, plan)
+    size, d = problem.layout.size, problem.dimension
+    places = np.atleast_2d(np.asarray(plan.places, dtype=float))
+    if places.ndim != 2 or places.shape[1] not in (d, size) or not np.isfinite(places).all() or not len(places):
+        what = f"the places have shape {np.shape(plan.places)}"
+        raise InvalidProblem(what, "places", f"give finite numbers (places, {d}), metres")
+    vectors = np.zeros((len(places), size))
+    vectors[:, : places.shape[1]] = places
+    _check_apart(problem, site, names, places[:, :d])
+    batch = problem.with_rows(weight=_weights(plan, problem, places[:, :d]))
+    batch = _with_prior(batch, places[:, :d])
+    weight = _weight(plan, len(places))
+    design = Design(_rows(batch, vectors, site, len(names)), _prior(batch, vectors), weight, d)
+    rules, limits, state = _rules(plan, names, site)
+    posed = Posed(plan, batch, vectors, site, names, design, rules, limits, state)
+    _check_seen(posed)
+    return posed
+
+
+def _checked(plan: Plan) -> Plan:
+    if plan.criterion not in LETTER:
+        what = f"there is no criterion {plan.criterion!r}"
+        raise InvalidProblem(what, "criterion", nearest(str(plan.criterion), list(LETTER)))
+    if not 0.0 < plan.gap < 1.0:
+        raise InvalidProblem(f"the gap {plan.gap:g} is not between 0 and 1", "gap", "give a share, such as 0.01")
+    if not plan.seconds > 0.0:
+        raise InvalidProblem(f"the time {plan.seconds:g} s is not positive", "time", "give seconds, such as 60")
+    if plan.choose is None and plan.budget is None:
+        raise InvalidProblem("nothing says how many sites to take", "choose", "give choose, or budget with cost")
+    return plan
+
+
+def _arrivals(problem: Problem) -> Problem:
+    """Return the problem with arrival times for range differences: what a difference says depends on the whole set."""
+    if problem.epochs != 1 or len(problem.motions) != 1 or problem.motions[0].known is not None:
+        what = "a placement is for one target at one epoch whose position is unknown"
+        raise InvalidProblem(what, "problem", "give one epoch of one target, and places as an argument")
+    pairs = [rows.kind for rows in problem.rows if MODELS[rows.kind].signs == (1, -1)]
+    if not pairs:
+        return problem
+    made = as_arrivals(problem.flat()) if pairs == ["tdoa"] else None
+    # pairs that are independent have a reference without noise, which no station is
+    if made is None or (variance := variances(made.problem.noise, made.problem.count)).min() < _EXACT * variance.mean():
+        what = f"{pairs[0]} rows pair stations, and a set of stations has other pairs than another"
+        raise InvalidProblem(what, "measurements", "give toa rows, or tdoa rows with an arrival_sigma")
+    return made.problem.take(np.zeros(1, dtype=int))
+
+
+def _sites(problem: Problem, plan: Plan) -> tuple[Array, tuple[str, ...]]:
+    """Return the site of each row, and the names of the sites."""
+    a, b = (np.concatenate([getattr(rows, end) for rows in problem.rows]) for end in ("a", "b"))
+    stations = problem.stations.names
+    if (a < 0).any():
+        what = "a row without a station belongs to no site"
+        raise InvalidProblem(what, "measurements", "leave heights out, or give them as a prior of the position")
+    if plan.by == "row":
+        kinds = [rows.kind for rows in problem.rows for _ in range(rows.count)]
+        named = [f"{kind} {stations[i]}" for kind, i in zip(kinds, a, strict=True)]
+        seen = {name: named.count(name) for name in named}
+        if max(seen.values()) > 1:
+            named = [f"{name} {i + 1}" for i, name in enumerate(named)]
+        return np.arange(len(a)), tuple(named)
+    measuring = np.unique(a)
+    site = np.searchsorted(measuring, a)
+    names = tuple(stations[i] for i in measuring)
+    lone = set(names) - set(plan.kept)
+    for other in np.unique(b[b >= 0]):
+        if stations[other] in lone:
+            what = f"{stations[other]!r} is a candidate and the other end of a row"
+            raise InvalidProblem(what, "measurements", "keep that station, or give it no rows of its own")
+    return site, names
+
+
+def _check_apart(problem: Problem, site: Array, names: Sequence[str], places: Array) -> None:
+    stations = problem.stations.position.reshape(-1, problem.dimension)
+    apart = np.linalg.norm(places[:, None] - stations[None], axis=-1)
+    p, s = np.unravel_index(int(apart.argmin()), apart.shape)
+    if apart[p, s] < _SAME:
+        what = f"place {p + 1} is where station {problem.stations.names[s]!r} stands"
+        raise InvalidProblem(what, "places", "move one of them by more than a millimetre")
+    own = np.unique(stations, axis=0, return_index=True)[1]
+    twice = np.setdiff1d(np.arange(len(stations)), own)
+    if len(twice):
+        name = problem.stations.names[int(twice[0])]
+        raise InvalidProblem(f"station {name!r} stands where another one does", "candidates", "remove one of them")
+
+
+def _weight(plan: Plan, count: int) -> Array:
+    weight = np.ones(count) if plan.weights is None else np.asarray(plan.weights, dtype=float)
+    if weight.shape != (count,) or not (weight > 0.0).all() or not np.isfinite(weight).all():
+        what = f"the weights of {count} places are not so many positive numbers"
+        raise InvalidProblem(what, "weights", "give each place a weight above 0, or leave it out")
+    return np.asarray(weight / weight.sum())
+
+
+def _weights(plan: Plan, problem: Problem, places: Array) -> Array:
+    """Return the weights (P, m) of the rows: rows out of sight or range have none, less exact ones less."""
+    count, stations = len(places), problem.stations.count
+    weight = np.broadcast_to(problem.weight, (count, problem.count)).copy()
+    end = np.concatenate([rows.a for rows in problem.rows])
+    if plan.sight is not None:
+        sight = np.asarray(plan.sight, dtype=float)
+        if sight.shape != (count, stations) or not ((sight == 0.0) | (sight >= 1.0)).all():
+            what = f"the sight of {count} places and {stations} stations is not 0, 1 or a larger factor for each"
+            raise InvalidProblem(what, "sight", "give 0 where a station is out of sight, else a factor of sigma")
+        factor = sight[:, end]
+        weight = np.where(factor > 0.0, weight / np.maximum(factor, 1.0) ** 2, 0.0)
+    if plan.reach is not None:
+        reach = np.asarray(plan.reach, dtype=float)
+        if reach.shape != (problem.count,) or not (reach > 0.0).all():
+            what = f"the reach of {problem.count} rows is not so many positive numbers"
+            raise InvalidProblem(what, "reach", "give each row a distance in metres")
+        position = problem.stations.position.reshape(-1, problem.dimension)[end]
+        weight[np.linalg.norm(places[:, None] - position, axis=-1) > reach] = 0.0
+    return weight
+
+
+def _with_prior(problem: Problem, places: Array) -> Problem:
+    """Return the problem with priors that leave nothing unknown: the area of sites and places, and ten times that."""
+    known = {prior.name for prior in problem.priors}
+    points = np.concatenate([places, problem.stations.position.reshape(-1, problem.dimension)])
+    half = max(0.5 * float(np.ptp(points, axis=0).max()), _EXTENT)
+    priors = list(problem.priors)
+    if "position" not in known:
+        priors.append(Prior("position", np.zeros(problem.dimension), half**2 * np.eye(problem.dimension)))
+    if problem.emitting and emission_name(0, 1) not in known:
+        priors.append(Prior(emission_name(0, 1), np.zeros(1), np.full((1, 1), (_EMISSION * half) ** 2)))
+    return replace(problem, priors=tuple(priors))
+
+
+def _rows(problem: Problem, vectors: Array, site: Array, count: int) -> Array:
+    """Return the whitened rows (P, r, m, n) of each site, filled up with zeros."""
+    linear = linearise(problem, vectors)
+    jacobian = np.concatenate([linear.shared, linear.local], axis=-1)
+    found: list[list[Array]] = [[] for _ in range(count)]
+    for whitener in linear.noise:
+        owner = site[whitener.row]
+        if (owner != owner[:, :1]).any():
+            what = "the noise correlates rows of different sites, so that what they say does not add up"
+            raise InvalidProblem(what, "measurements", "give each site noise of its own")
+        white = np.broadcast_to(whitener.apply(jacobian), (len(vectors), whitener.row.size, jacobian.shape[-1]))
+        white = white.reshape(len(vectors), *whitener.row.shape, -1)
+        for group, one in enumerate(owner[:, 0]):
+            found[one] += [white[:, group, i] for i in range(whitener.row.shape[1])]
+    out = np.zeros((len(vectors), max(map(len, found)), jacobian.shape[-1], count))
+    for i, rows in enumerate(found):
+        for q, row in enumerate(rows):
+            out[:, q, :, i] = row
+    return out
+
+
+def _prior(problem: Problem, vectors: Array) -> Array:
+    """Return the information (P, m, m) of the priors."""
+    n, length, size = problem.layout.n_shared, problem.layout.n_local, len(vectors)
+    none = Normal(
+        np.zeros((size, n, n)),
+        np.zeros((size, 1, length, length)),
+        np.zeros((size, 1, n, length)),
+        np.zeros((size, n)),
+        np.zeros((size, 1, length)),
+        np.zeros(size),
+    )
+    known = with_priors(problem, vectors, none)
+    out = np.zeros((size, n + length, n + length))
+    out[:, :n, :n], out[:, n:, n:] = known.shared, known.local[:, 0]
+    if (np.diagonal(out, axis1=1, axis2=2) <= 0.0).any():
+        unknown = problem.layout.labels()[int(np.argmin(np.diagonal(out[0])))] if n else "emission"
+        what = f"nothing is known of {unknown!r} before anything is measured"
+        raise InvalidProblem(what, "priors", "give it a prior, however wide")
+    return out
+
+
+def _rules(plan: Plan, names: tuple[str, ...], site: Array) -> tuple[Array, Array, Array]:
+    """Return rules, limits and states of the sites; what is kept counts in groups alone."""
+    n, place = len(names), {name: i for i, name in enumerate(names)}
+
+    def where(wanted: Sequence[str], argument: str) -> Array:
+        for name in wanted:
+            if name not in place:
+                raise InvalidProblem(f"there is no site {name!r}", argument, nearest(name, list(names)))
+        return np.array([place[name] for name in wanted], dtype=int)
+
+    state = np.full(n, -1, dtype=np.int64)
+    kept = where(plan.kept, "kept")
+    state[where(plan.forbidden, "forbidden")] = 0
+    if (state[kept] == 0).any():
+        raise InvalidProblem("a site is kept and forbidden", "forbidden", "say one of the two")
+    state[kept] = 1
+    free = (state == -1).astype(float)
+    rules, limits = [], []
+    if plan.choose is not None:
+        if not 1 <= plan.choose <= free.sum():
+            what = f"{plan.choose} sites are wanted of {int(free.sum())} candidates"
+            raise InvalidProblem(what, "choose", "ask for fewer, or name more candidates")
+        rules.append(free + 0.0)
+        limits.append(float(plan.choose))
+    if plan.budget is not None:
+        rules.append(_costs(plan, n, site) * free)
+        limits.append(float(plan.budget))
+    for i, group in enumerate(plan.groups):
+        members = np.isin(np.arange(n), where(group.members, f"groups, entry {i + 1}")).astype(float)
+        if group.most is not None:
+            rules.append(members)
+            limits.append(float(group.most))
+        if group.least is not None:
+            rules.append(-members)
+            limits.append(-float(group.least))
+    # in units of their largest entries: budgets and counts are alike to the interior point
+    size = np.array([np.abs(rule).max() or 1.0 for rule in rules])
+    return np.array(rules) / size[:, None], np.array(limits) / size, state
+
+
+def _costs(plan: Plan, n: int, site: Array) -> Array:
+    stations = np.concatenate([rows.a for rows in plan.problem.rows])
+    cost = None if plan.cost is None else np.asarray(plan.cost, dtype=float)
+    if cost is None or cost.shape != (plan.problem.stations.count,) or not (cost >= 0.0).all():
+        what = "a budget needs a cost of each station that is not negative"
+        raise InvalidProblem(what, "cost", "give one number for each station")
+    if not np.isfinite(cost).all() or not 0.0 <= float(plan.budget or 0.0) < np.inf:
+        raise InvalidProblem("a cost or the budget is no finite number", "budget", "correct it")
+    out = np.zeros(n)
+    measuring = np.unique(stations) if plan.by == "station" else None
+    if measuring is None:
+        return np.asarray(cost[stations])
+    out[:] = cost[measuring]
+    return out
+
+
+def _check_seen(posed: Posed) -> None:
+    """Refuse a place at which all sites together leave the position open: no choice has a fix there."""
+    heard = (posed.design.rows != 0.0).any(axis=(1, 2)) & (posed.state != 0)
+    rows = posed.design.rows[..., posed.state != 0]
+    places, r, m, n = rows.shape
+    flat = np.moveaxis(rows, -1, 1).reshape(places, n * r, m)
+    prior = posed.design.prior
+    scale = 1.0 / np.sqrt(np.diagonal(prior, axis1=1, axis2=2))
+    for p in range(places):
+        # In units of what the prior knows, a direction that rows know no better than it is open.
+        singular = np.linalg.svd(flat[p] * scale[p], compute_uv=False)
+        known = int((singular > 1.0).sum())
+        if known < m:
+            name = posed.plan.names[p] if posed.plan.names else str(p + 1)
+            what = f"place {name!r} is in sight of {int(heard[p].sum())} sites, which leave its position open"
+            raise InvalidProblem(what, "places", "add candidates that see it, or leave the place out")

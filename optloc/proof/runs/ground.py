@@ -1,0 +1,356 @@
+"""A target that keeps a known height over the Earth: its places at all epochs, and bounds of how these bend.
+
+Its state has four numbers: where it is along two axes of a plane, and its velocity along them. The surface gives the
+rest: the place lies on it, and the velocity along it. Where the target is at an epoch is then a function of the place's
+two numbers q and the way's w, which is the velocity times the time. Values are those of `optloc.models.course.carry`;
+derivatives at a state are differences, whose error the bound of the third derivatives of that function says.
+"""
+
+from __future__ import annotations
+
+from math import asin, cos, inf, sin, sqrt
+from typing import NamedTuple
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled
+from optloc.models.primitives import WGS84_A, WGS84_F
+from optloc.proof.nodes.level import EXACT, LEAST_RADIUS, normal_at
+from optloc.proof.nodes.node import Triple, blend, inner, triple, write
+
+# What is carried over the Earth.
+
+
+class Ground(NamedTuple):
+    """A surface of constant height, and the four numbers of a state on it.
+
+    Parameters
+    ----------
+    data : array (HEIGHT_WIDTH,)
+        Numbers of the height, see `optloc.proof.nodes.level`; none where courses are straight.
+    axes : array (3, 3)
+        Orthonormal axes in the frame: two along which states are counted, and the one upward, as rows.
+    level : float
+        Height of the state, metres.
+    rise : array (K,)
+        What heights of the epochs are above it, metres.
+    span : float
+        Seconds of the epoch farthest from the time at which the state holds.
+    """
+
+    data: Array
+    axes: Array
+    level: float
+    rise: Array
+    span: float
+
+
+STRAIGHT = Ground(np.zeros(0), np.eye(3), 0.0, np.zeros(0), 0.0)
+
+
+@compiled
+def over_ground(ground: Ground) -> bool:
+    """Return whether courses are carried over the Earth, and not straight."""
+    return bool(ground.data.shape[0] > 0)
+
+
+# Newton's steps onto a surface, and their end; see `optloc.proof.surface`.
+_STEPS, _CLOSE = 20, 1e-7
+# As of `optloc.models.course`.
+_STILL, _E2 = 1e-14, WGS84_F * (2.0 - WGS84_F)
+
+
+@compiled
+def lift(ground: Ground, first: float, second: float) -> tuple[float, Triple, Triple]:
+    """Return what is left of the height (metres), the place of two numbers on the surface, and its normal."""
+    data, e, f, up = ground.data, triple(ground.axes[0], 0), triple(ground.axes[1], 0), triple(ground.axes[2], 0)
+    place = blend(first, e, second, f)
+    centre = _centre(data)
+    # above the Earth's centre by about what a sphere has there
+    aside = (first - inner(e, centre)) ** 2 + (second - inner(f, centre)) ** 2
+    above = inner(up, centre) + sqrt(max((WGS84_A + ground.level) ** 2 - aside, 0.0))
+    place = blend(1.0, place, above, up)
+    off, normal = inf, up
+    for _ in range(_STEPS):
+        height, normal, _, _, _ = normal_at(data, np.array(place))
+        off = height - ground.level
+        rise = inner(normal, up)
+        if abs(off) <= _CLOSE or not rise > 0.0:
+            break
+        place = blend(1.0, place, -off / rise, up)
+    return off, place, normal
+
+
+@compiled
+def _centre(data: Array) -> Triple:
+    """Return the Earth's centre in the frame."""
+    x, y, z = data[3], data[4], data[5]
+    first, second, third = triple(data, 6), triple(data, 9), triple(data, 12)
+    c = blend(1.0, blend(x, first, y, second), z, third)
+    return data[0] - c[0], data[1] - c[1], data[2] - c[2]
+
+
+@compiled
+def level_way(ground: Ground, normal: Triple, first: float, second: float) -> Triple:
+    """Return the vector along the surface that has two components along the axes."""
+    up = triple(ground.axes[2], 0)
+    plan = blend(first, triple(ground.axes[0], 0), second, triple(ground.axes[1], 0))
+    return blend(1.0, plan, -inner(plan, normal) / inner(up, normal), up)
+
+
+@compiled
+def carried(ground: Ground, start: Triple, way: Triple, rise: float) -> Triple:
+    """Return the place that a target reaches over ground, as `optloc.models.course.carry` does, in the frame."""
+    data = ground.data
+    height, up, _, _, sp = normal_at(data, np.array(start))
+    climb = inner(way, up)
+    level = blend(1.0, way, -climb, up)
+    radius = WGS84_A * sqrt(1.0 - _E2) / (1.0 - _E2 * sp * sp) + height
+    squared = inner(level, level)
+    half = 0.5 * sqrt(squared / (radius * radius) + _STILL)
+    share = sin(half) / half
+    place = blend(1.0, start, share * cos(half), level)
+    place = blend(1.0, place, -0.5 * share * share * squared / radius, up)
+    reached, normal, _, _, _ = normal_at(data, np.array(place))
+    return blend(1.0, place, height + climb + rise - reached, normal)
+
+
+# Derivatives at a state.
+
+# Metres of the differences: their error is (step^2 / 6) times the third derivative, 1e-9 of a lever, where rounding of
+# 1e-8 m leaves 1e-10.
+_STEP = 200.0
+# Places of differences: the state, two each along the four numbers, and two each along each pair of them.
+_PAIRS = ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3))
+FIRST_ORDER, SECOND_ORDER = 9, 21
+# What is rounded of a place, metres.
+_ROUNDED = 4.0 * EXACT
+
+
+def _moves() -> Array:
+    """Return the moves (21, 4) of the places of differences, in steps."""
+    own = np.eye(4)
+    pairs = [own[i] + own[j] for i, j in _PAIRS]
+    return np.array([np.zeros(4), *(sign * move for move in (*own, *pairs) for sign in (1.0, -1.0))])
+
+
+_MOVES = _moves()
+
+
+@compiled
+def set_starts(ground: Ground, state: Array, begin: int, end: int, starts: Array) -> None:
+    """Write places and normals (SECOND_ORDER, 6) of some of the states of differences."""
+    for k in range(begin, end):
+        twin = k
+        for other in range(k):  # those along ways alone start at one place
+            if _MOVES[other, 0] == _MOVES[k, 0] and _MOVES[other, 1] == _MOVES[k, 1]:
+                twin = other
+        if twin < k:
+            starts[k] = starts[twin]
+            continue
+        _, place, normal = lift(ground, state[0] + _STEP * _MOVES[k, 0], state[1] + _STEP * _MOVES[k, 1])
+        for i in range(3):
+            starts[k, i], starts[k, 3 + i] = place[i], normal[i]
+
+
+@compiled
+def set_reached(
+    ground: Ground, state: Array, time: float, rise: float, starts: Array, begin: int, end: int, reached: Array
+) -> None:
+    """Write where some of the states of differences lead (SECOND_ORDER, 3)."""
+    for k in range(begin, end):
+        first, second = time * state[2] + _STEP * _MOVES[k, 2], time * state[3] + _STEP * _MOVES[k, 3]
+        way = level_way(ground, triple(starts[k], 3), first, second)
+        write(carried(ground, triple(starts[k], 0), way, rise), reached[k])
+
+
+@compiled
+def slope_of(reached: Array, i: int, a: int) -> float:
+    """Return the derivative of a coordinate of a place along one of (q, w)."""
+    return float((reached[1 + 2 * a, i] - reached[2 + 2 * a, i]) / (2.0 * _STEP))
+
+
+@compiled
+def set_second(reached: Array, i: int, out: Array) -> None:
+    """Write the second derivatives (4, 4) of a coordinate of a place."""
+    share, here = 1.0 / (_STEP * _STEP), reached[0, i]
+    for a in range(4):
+        out[a, a] = share * (reached[1 + 2 * a, i] - here + (reached[2 + 2 * a, i] - here))
+    for p in range(6):
+        a, b = _PAIRS[p]
+        both = reached[9 + 2 * p, i] - here + (reached[10 + 2 * p, i] - here)
+        out[a, b] = out[b, a] = 0.5 * (share * both - out[a, a] - out[b, b])
+
+
+# Bounds of derivatives over a box.
+
+# Greatest distance from the middle of the plane, and greatest way, as shares of the Earth's least radius; least cosine
+# between the plane's axis and the normals.
+_ASIDE, _FAR, _LEAN = 0.85, 0.5, 0.5
+# How far a normal of the ellipsoid leans from the line through the Earth's centre, radians: e^2 / 2 and a little.
+_DEFLECTION = 0.0034
+# Of normals of surfaces of constant height, in radii: derivatives of first order 1 / R, of second 1.2 / R^2 (see
+# `optloc.proof.nodes.level.curve_height`), of third 4 / R^3: those of a sphere are at most 3 (across the normal), and
+# what changes with the latitude adds some e^2 of that.
+_FIRST, _SECOND, _THIRD = 1.0, 1.2, 4.0
+# Of the radius b / (1 - e^2 y^2) of the sphere by a component y of the normal, in b: its three derivatives.
+_E = _E2 / (1.0 - _E2)
+_RADIUS = (2.1 * _E, 2.1 * _E, 25.0 * _E * _E)
+# Of sin(w) / w and (1 - cos(w)) / w^2 by w^2: derivatives are largest at zero.
+_SINE, _DROP = (1.0 / 6.0, 1.0 / 60.0, 1.0 / 840.0), (1.0 / 24.0, 1.0 / 360.0, 1.0 / 6720.0)
+
+# A bound of a function of one variable with those of its first three derivatives, and derivatives of an outer function.
+Jet = tuple[float, float, float, float]
+Derivatives = tuple[float, float, float]
+
+
+@compiled
+def bends_of(ground: Ground, state: Array, half: Array) -> tuple[bool, float, float, float]:
+    """Return whether the places of a box of states are bounded, and bounds of their derivatives by (q, w).
+
+    The first three derivatives, per metre, metre^2 and metre^3. All functions are looked at along lines of (q, w), one
+    metre a metre: a bound of the k-th derivative along each bounds that of the function. With u the normal at the
+    start p, ``u.p' = 0`` and ``u.w = 0`` give p and w, the sphere ``Y = p + S w - D u``, and the place ``F = Y + G n``
+    follows with the normal n at Y and the height G that is left. Of ``Y'' + G'' n`` and ``Y''' + G''' n`` what is
+    along n in the first is taken away by the second.
+
+    Parameters
+    ----------
+    ground : Ground
+        The surface.
+    state, half : array (4,)
+        Middle and half-widths of the states.
+    """
+    centre, way2, plan2, high = _centre(ground.data), 0.0, 0.0, 0.0
+    for k in range(2):
+        # with the places of differences beside the box
+        aside = abs(state[k] - inner(triple(ground.axes[k], 0), centre)) + half[k] + 2.0 * _STEP
+        way = ground.span * (abs(state[2 + k]) + half[2 + k]) + 2.0 * _STEP
+        plan2, way2 = plan2 + aside * aside, way2 + way * way
+    for rise in ground.rise:
+        high = max(high, abs(rise))
+    radius, plan, way = LEAST_RADIUS + ground.level - high, sqrt(plan2), sqrt(way2)
+    if not (radius > _ASIDE * LEAST_RADIUS and plan < _ASIDE * radius and way < _FAR * radius):
+        return False, inf, inf, inf
+    lean = asin(plan / radius) + _DEFLECTION
+    if not cos(lean) > _LEAN:
+        return False, inf, inf, inf
+    # the sphere lies at most so far below the level of its start
+    radius -= 1.1 * (way / cos(lean)) ** 2 / radius
+    turns = (_FIRST / radius, _SECOND / radius**2, _THIRD / radius**3)
+    place, normal, along = _begun(turns, lean, way)
+    b1, b2, b3 = _ended(turns, ground.level, high, place, normal, along)
+    return True, b1, b2, b3
+
+
+@compiled
+def errors_of(third: float) -> tuple[float, float]:
+    """Return bounds of the errors of slopes and of second derivatives as norms over (q, w), by the third derivatives.
+
+    A difference along one number is off by ``b3 h^2 / 6``, a second one by ``b3 h / 3``, one along two by
+    ``(2 2^1.5 + 4) b3 h / 12``; four numbers at right angles double the first, and quadruple the others.
+    """
+    first = 2.0 * (third * _STEP * _STEP / 6.0 + _ROUNDED / _STEP)
+    return first, 4.0 * (0.6 * third * _STEP + 4.0 * _ROUNDED / (_STEP * _STEP))
+
+
+@compiled
+def _begun(turns: Derivatives, lean: float, way: float) -> tuple[Jet, Jet, Jet]:
+    """Return bounds of the place on the surface (its first number is no bound), the normal there, and the way."""
+    n1, n2, _ = turns
+    c, s = cos(lean), sin(lean)
+    p1 = 1.0 / c
+    p2 = n1 * p1 * p1 / c
+    place = (inf, p1, p2, (3.0 * n1 * p1 * p2 + n2 * p1**3) / c)
+    normal = _composed(1.0, turns, place)
+    u1, u2, u3 = normal[1], normal[2], normal[3]
+    # the way upward: its plan along the normal, over what of the normal is upward
+    across = _inverse((1.0, u1, u2, u3), c)
+    upward = _product((way * s, s + way * u1, 2.0 * u1 + way * u2, 3.0 * u2 + way * u3), across)
+    return place, normal, (way / c, 1.0 + upward[1], upward[2], upward[3])
+
+
+@compiled
+def _ended(
+    turns: Derivatives, level: float, high: float, place: Jet, normal: Jet, along: Jet
+) -> tuple[float, float, float]:
+    """Return bounds of the first three derivatives of where a way leads."""
+    n1, n2, _ = turns
+    flat = WGS84_A * sqrt(1.0 - _E2)
+    outer = (_RADIUS[0] * flat, _RADIUS[1] * flat, _RADIUS[2] * flat)
+    over = _inverse(_composed(flat / (1.0 - _E2) + abs(level), outer, normal), flat + level)
+    squared = _product(along, along)
+    angle = _product(squared, _product(over, over))
+    fallen = _product(_product(_composed(0.5, _DROP, angle), squared), over)
+    ahead, below = _product(_composed(1.0, _SINE, angle), along), _product(fallen, normal)
+    y1, y2, y3 = place[1] + ahead[1] + below[1], place[2] + ahead[2] + below[2], place[3] + ahead[3] + below[3]
+    turned = _composed(1.0, turns, (inf, y1, y2, y3))
+    # the height left, and its change: the normal at the end is nearly that at the start, across which p' and w' go
+    off = along[0] + fallen[0]
+    g0 = fallen[0] + 0.5 * n1 * off * off + high
+    g1 = n1 * off * (place[1] + ahead[1]) + normal[1] * along[0] + below[1]
+    g2, bent = n1 * y1 * y1 + y2, 3.0 * n1 * y1 * y2 + n2 * y1**3
+    return (
+        y1 + g0 * turned[1],
+        sqrt(y2**2 + (n1 * y1 * y1) ** 2) + 2.0 * g1 * turned[1] + g0 * turned[2],
+        sqrt(y3**2 + bent**2) + 3.0 * (g2 * turned[1] + g1 * turned[2]) + g0 * turned[3],
+    )
+
+
+@compiled
+def _product(f: Jet, g: Jet) -> Jet:
+    return (
+        f[0] * g[0],
+        f[1] * g[0] + f[0] * g[1],
+        f[2] * g[0] + 2.0 * f[1] * g[1] + f[0] * g[2],
+        f[3] * g[0] + 3.0 * (f[2] * g[1] + f[1] * g[2]) + f[0] * g[3],
+    )
+
+
+@compiled
+def _composed(most: float, outer: Derivatives, own: Jet) -> Jet:
+    """Return bounds of a function of a function, by its greatest value and the outer one's derivatives."""
+    a, b, c = own[1], own[2], own[3]
+    bent = outer[2] * a**3 + 3.0 * outer[1] * a * b
+    return most, outer[0] * a, outer[1] * a * a + outer[0] * b, bent + outer[0] * c
+
+
+@compiled
+def _inverse(f: Jet, least: float) -> Jet:
+    """Return bounds of one over a function that is nowhere less than a positive number."""
+    return _composed(1.0 / least, (1.0 / least**2, 2.0 / least**3, 6.0 / least**4), f)
+
+
+# From states in space to those on the surface, and back.
+
+
+# Cosine between the frame's third axis and the normal from which on it is the upward one of states.
+_UPRIGHT = 0.9
+
+
+def axes_at(data: Array, place: Array) -> Array:
+    """Return the axes of states around a place (3,): the frame's where its third is upward, else east, north, up."""
+    _, up, east, north, _ = normal_at(data, np.ascontiguousarray(place))
+    return np.eye(3) if up[2] > _UPRIGHT else np.array([east, north, up])
+
+
+def state_on(ground: Ground, state: Array) -> Array:
+    """Return the four numbers of states (..., 6) on the surface."""
+    plan = ground.axes[:2]
+    return np.concatenate([state[..., :3] @ plan.T, state[..., 3:] @ plan.T], axis=-1)
+
+
+def corners_on(ground: Ground, corners: Array) -> Array:
+    """Return the least box (2, 4) of states on the surface that holds all those of a box (2, 6)."""
+    plan, out = ground.axes[:2], np.zeros((2, 4))
+    for k in range(4):
+        for axis in np.flatnonzero(plan[k % 2]):  # what an axis does not see need not be limited
+            out[:, k] += np.sort(plan[k % 2, axis] * corners[:, 3 * (k // 2) + axis])
+    return out
+
+
+def state_off(ground: Ground, state: Array) -> Array:
+    """Return position and velocity (6,) of a state (4,) on the surface."""
+    _, place, normal = lift(ground, state[0], state[1])
+    return np.array([*place, *level_way(ground, normal, state[2], state[3])])

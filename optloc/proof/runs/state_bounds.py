@@ -1,0 +1,309 @@
+"""The residual of a course and its second derivatives, bounded over boxes of states."""
+
+from __future__ import annotations
+
+from math import inf, sqrt
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled
+from optloc.compute.systems import invert
+from optloc.proof.batch import plainly
+from optloc.proof.nodes.node import HIGH, LOW, SLOPE0
+from optloc.proof.runs.ground import errors_of
+from optloc.proof.runs.rows import (
+    digits_of,
+    greatest_length,
+    multiply,
+    project,
+    pull_back,
+    residual_at,
+)
+from optloc.proof.runs.states import STATE, Axes, Course, Table, set_bends, set_box, table_of
+
+# Rows over a box.
+
+
+@compiled
+def set_lines(course: Course, table: Table) -> None:
+    """Write the Jacobian of the rows at the centre of a box whose nodes are bounded."""
+    values, d = table.sheet.reach, table.lever.shape[1]
+    for m in range(table.at.shape[0]):
+        for k in range(course.since.shape[0]):
+            for j in range(course.first[k], course.first[k + 1]):
+                values[j] = 0.0
+                for i in range(d):
+                    values[j] += table.nodes[j, SLOPE0 + i] * table.lever[k, i, m]
+        multiply(course.rows, values, table.lines[m])
+        project(course.rows, table.lines[m])
+
+
+# Bounds of the residual over a box.
+
+# Coordinate descents towards the least-squares point of a box; any point gives a valid bound.
+_SWEEPS = 3
+
+
+@compiled
+def _reach(course: Course, table: Table, direction: Array, curved: bool) -> float:
+    """Return a lower bound of ``|P e|`` over a box from one direction (q,), rounding apart; see `least_length`."""
+    n, d, force = table.at.shape[0], table.lever.shape[1], table.sheet.force
+    length, total, rest = 0.0, 0.0, 0.0
+    for i in range(direction.shape[0]):
+        length += direction[i] * direction[i]
+        total += direction[i] * table.sheet.residual[i]
+    if not length > 0.0:
+        return -1.0
+    pull_back(course.rows, direction, force)
+    table.along[:], table.solve[:] = 0.0, 0.0
+    for k in range(course.since.shape[0]):
+        lever = table.lever[k]
+        for j in range(course.first[k], course.first[k + 1]):
+            still = True
+            for i in range(d):
+                slope = force[j] * table.nodes[j, SLOPE0 + i]
+                still = still and table.nodes[j, SLOPE0 + i] == 0.0
+                for m in range(n):
+                    table.along[m] += slope * lever[i, m]
+            enclosed = min(force[j] * table.nodes[j, LOW], force[j] * table.nodes[j, HIGH])
+            left = -abs(force[j]) * table.rests[j, 0] if curved and not still else -inf
+            if left > enclosed:
+                rest += left
+                for m in range(n):
+                    for other in range(m + 1):
+                        table.solve[m, other] += force[j] * table.bends[j, m, other]
+            else:
+                rest += enclosed
+    for m in range(n):
+        rest += 0.5 * min(table.solve[m, m], 0.0)
+        for other in range(m):
+            rest -= abs(table.solve[m, other])
+        rest -= abs(table.along[m])
+    return float((total + rest) / sqrt(length))
+
+
+@compiled
+def least_length(course: Course, table: Table, cost: float, curved: bool) -> float:
+    """Return a lower bound of ``|P e|`` over a box, rounding apart; negative where it says nothing.
+
+    The residual at the centre and the Jacobian are set. Of the directions that are tried the last is the residual
+    nearest to zero of the linear part.
+    """
+    sheet, lines, n = table.sheet, table.lines, table.at.shape[0]
+    if not cost > 0.0:
+        return -1.0
+    s, v = table.move, sheet.length
+    for m in range(n):
+        s[m] = 0.0
+    for i in range(v.shape[0]):
+        v[i] = sheet.residual[i]
+    for _ in range(_SWEEPS):
+        for m in range(n):
+            pull = own = 0.0
+            for i in range(v.shape[0]):
+                pull += lines[m, i] * v[i]
+                own += lines[m, i] * lines[m, i]
+            if own > 0.0:
+                new = min(max(s[m] - pull / own, -1.0), 1.0)
+                step = new - s[m]
+                for i in range(v.shape[0]):
+                    v[i] += step * lines[m, i]
+                s[m] = new
+    return _reach(course, table, v, curved)
+
+
+# Second derivatives of f/2 over a box.
+
+
+@compiled
+def sum_up(course: Course, table: Table, noise: float) -> tuple[float, float]:
+    """Fill gradient, Hessian and its change of first order; return bounds of the rest's norm and the gradient's blur.
+
+    As `optloc.proof.runs.rows.sum_up_rows`, in units of the half-widths of the box; nodes, Hessians of nodes, residual
+    and Jacobian are set, `noise` is the rounding of a residual.
+    """
+    rows, sheet, lines, pulls, n = course.rows, table.sheet, table.lines, table.pulls, table.at.shape[0]
+    pull_back(rows, sheet.residual, sheet.force)
+    longest, widest = 0.0, 0.0
+    for value in sheet.residual:
+        longest += value * value
+    longest = sqrt(longest)
+    table.hessian[:] = 0.0
+    for m in range(n):
+        pull_back(rows, lines[m], pulls[m])
+        table.slope[m] = 0.0
+        for i in range(lines.shape[1]):
+            table.slope[m] += lines[m, i] * sheet.residual[i]
+        for other in range(m + 1):
+            for i in range(lines.shape[1]):
+                table.hessian[m, other] += lines[m, i] * lines[other, i]
+        widest = max(widest, table.hessian[m, m])
+    blur = _blur_of_lines(course, table)
+    _turn(course, table)
+    for m in range(n):
+        for other in range(m):
+            table.hessian[other, m] = table.hessian[m, other]
+        for other in range(
+            n
+        ):  # the rounding of J'J counts as change, twice: for the mean over a line half of it counts
+            table.change[m, other] += 4.0 * sqrt(widest) * blur
+    ball = _rest(course, table, noise + digits_of(rows) * longest)
+    return ball, sqrt(widest) * noise + blur * (longest + noise)
+
+
+@compiled
+def _blur_of_lines(course: Course, table: Table) -> float:
+    """Return a bound of the rounding of each column of the Jacobian."""
+    most, missed = 0.0, _missed(course, table)
+    for m in range(table.at.shape[0]):
+        total = 0.0
+        for k in range(course.since.shape[0]):
+            for j in range(course.first[k], course.first[k + 1]):
+                for i in range(table.lever.shape[1]):
+                    total += course.rows.weight[j] * abs(table.nodes[j, SLOPE0 + i] * table.lever[k, i, m])
+        most = max(most, total)
+    return float(digits_of(course.rows) * most + missed)
+
+
+@compiled
+def _missed(course: Course, table: Table) -> float:
+    """Return a bound of what differences leave out of each column of the Jacobian."""
+    total = 0.0
+    if table.lever.shape[1] == 3:
+        first, _ = errors_of(table.limits[2])
+        for k in range(course.since.shape[0]):
+            for j in range(course.first[k], course.first[k + 1]):
+                slope = 0.0
+                for i in range(3):
+                    slope += table.nodes[j, SLOPE0 + i] ** 2
+                total += course.rows.weight[j] * sqrt(slope * table.sizes[k, 1]) * first
+    return float(total)
+
+
+@compiled
+def _turn(course: Course, table: Table) -> None:
+    """Add the nodes' part of the Hessian, and write what is linear in s of its change."""
+    n = table.at.shape[0]
+    third = np.zeros((n, n, n))
+    for j in range(course.kinds.shape[0]):
+        own = table.bends[j]
+        for m in range(n):
+            for other in range(m + 1):
+                table.hessian[m, other] += table.sheet.force[j] * own[m, other]
+                for along in range(n):
+                    third[along, m, other] += table.pulls[along, j] * own[m, other]
+    for a in range(n):
+        for b in range(a + 1):
+            change = 0.0
+            for k in range(n):
+                ka, kb = third[b, max(k, a), min(k, a)], third[a, max(k, b), min(k, b)]
+                change += abs(third[k, a, b] + ka + kb)
+            table.change[a, b] = table.change[b, a] = change
+
+
+@compiled
+def _rest(course: Course, table: Table, blur: float) -> float:
+    """Return a bound of the norm of what else changes in the Hessian; see `optloc.proof.runs.rows`."""
+    rows, sheet, reach, n = course.rows, table.sheet, table.sheet.reach, table.at.shape[0]
+    own = cross = ball = 0.0
+    size = sqrt(float(n))
+    for j in range(course.kinds.shape[0]):
+        change, across, along = table.rests[j, 1], 0.0, 0.0
+        for m in range(n):
+            across += table.pulls[m, j] * table.pulls[m, j]
+            along += abs(table.pulls[m, j])
+        ball += (abs(sheet.force[j]) + along) * change
+        cross += sqrt(across) * change * size
+        own += rows.weight[j] * blur * table.rests[j, 2]
+        reach[j] = max(-table.nodes[j, LOW], table.nodes[j, HIGH])
+    if not ball < inf:
+        return inf
+    remainder = greatest_length(rows, reach, sheet.length)
+    reach[:] = table.rests[:, 2]
+    bent = greatest_length(rows, reach, sheet.length)
+    reach[:] = table.rests[:, 1]
+    wide = greatest_length(rows, reach, sheet.length)
+    jump = bent * size + 0.5 * wide * size
+    return float(ball + cross + 2.0 * own + remainder * (bent + wide) + jump * jump)
+
+
+@compiled
+def is_convex(table: Table, ball: float, margin: float) -> bool:
+    """Return whether the Hessian of f/2, in lengths of 1, exceeds `margin` all over a box whose sums are filled."""
+    if not ball < inf:
+        return False
+    n, matrix = table.at.shape[0], table.solve
+    for m in range(n):
+        away = ball + margin * table.unit[m] * table.unit[m]
+        for other in range(n):
+            matrix[m, other] = table.hessian[m, other]
+            away += table.change[m, other]
+        matrix[m, m] -= away
+    return invert(matrix, n, 1e-12)
+
+
+@compiled
+def has_no_minimum(table: Table, ball: float, noise: float) -> bool:
+    """Return whether no minimum of the cost can lie in a box whose sums are filled.
+
+    The gradient does not vanish, or the cost bends downwards along a coordinate.
+    """
+    n, matrix = table.at.shape[0], table.solve
+    if not ball < inf:
+        return False
+    size = sqrt(float(n))
+    for m in range(n):
+        change = ball * size
+        for other in range(n):
+            change += abs(table.hessian[m, other]) + table.change[m, other]
+            matrix[m, other] = table.hessian[m, other]
+        # slack for the rounding of the sums
+        if abs(table.slope[m]) > change * (1.0 + 1e-6) + noise:
+            return True
+        if table.hessian[m, m] + (table.change[m, m] + ball) * (1.0 + 1e-6) < 0.0:
+            return True
+    if not invert(matrix, n, 1e-12):
+        return False
+    # with Y nearly the inverse: s = -Y slope - (Y H - 1) s - Y (change s)
+    for k in range(n):
+        centre, spread = 0.0, 0.0
+        for m in range(n):
+            own, turned = abs(matrix[k, m]), -1.0 if k == m else 0.0
+            centre -= matrix[k, m] * table.slope[m]
+            for other in range(n):
+                turned += matrix[k, other] * table.hessian[other, m]
+                spread += own * table.change[m, other]
+            spread += own * (noise + ball * size) + abs(turned)
+        if abs(centre) > 1.0 + spread * (1.0 + 1e-6) + 1e-9 * abs(centre):
+            return True
+    return False
+
+
+# Second derivatives at a state.
+
+
+@compiled
+def hessian_of_state(course: Course, state: Array) -> Array:
+    """Return the Hessian (4, 4) of f/2 at a state (4,)."""
+    table = table_of(course)
+    table.unit[:] = 1.0
+    axes = Axes(state, np.eye(STATE), np.eye(STATE), np.zeros((2, STATE)))
+    set_box(course, axes, table)
+    residual_at(course.rows, table.nodes, table.sheet)
+    set_lines(course, table)
+    set_bends(course, axes, table)
+    sum_up(course, table, 0.0)
+    return table.hessian
+
+
+def axes_of(hessian: Array, state: Array, corners: Array) -> Axes | None:
+    """Return the principal axes of the cost at a state (n,), in standard deviations; None where it is no minimum."""
+    size = np.sqrt(np.maximum(np.diag(hessian), 0.0))
+    if not (np.isfinite(hessian).all() and size.all()):
+        return None
+    values, vectors = np.linalg.eigh(hessian / size / size[:, None])
+    if not values[0] > 0.0:
+        return None
+    turn = vectors / size[:, None] / np.sqrt(values)
+    return Axes(state, plainly(turn), plainly(np.linalg.inv(turn)), corners)

@@ -1,0 +1,357 @@
+"""Whether a fix is the best one that constraints admit: what is proven of each of their faces, put together.
+
+A minimum of what inequalities admit is a minimum of all positions, or one along a face: a set of inequalities that hold
+with equality. So all of them are among the minima along the faces, each of which is a problem without inequalities.
+Those that break another constraint do not count, nor those from which the cost falls inwards.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from time import perf_counter
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem
+from optloc.base.records import overwrite, take
+from optloc.base.types import Array, Certificate, Status
+from optloc.compute.sums import equations_at
+from optloc.linear.constraints import (
+    TOLERANCE,
+    Face,
+    exact,
+    face_names,
+    faces,
+    is_corner,
+    is_exact,
+    is_held,
+    on_face,
+    violation,
+    violation_names,
+)
+from optloc.linear.normal import marginal
+from optloc.problem.epochs import by_epoch, separable
+from optloc.problem.fix import Fix, Stage
+from optloc.problem.problem import Problem
+from optloc.proof.scope import unsupported
+from optloc.solvers.certify.branch_and_bound import (
+    HELD,
+    RESTLESS,
+    certified_freely,
+    certify_stage,
+    column,
+    keep_evidence,
+    state_claim,
+    to_prove,
+    unknown,
+)
+from optloc.solvers.certify.posed import admitted, is_free
+from optloc.solvers.inequalities import is_hidden
+from optloc.solvers.outside import accept
+from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, equal_cost
+from optloc.solvers.pool import Pool, in_parts, offer, pack, where
+from optloc.solvers.stages import lsr
+from optloc.solvers.verdict.judge import failed, fill, judge, verdict
+from optloc.solvers.verdict.minima import settle
+
+# Rounds of minima that are found along faces and of proofs anew: one suffices but for batches of bad fixes.
+_ROUNDS = 4
+UNFOLLOWED = "the proof does not follow the edge {}: {}"
+LEFT = "no minimum was found along the edge {}"
+
+
+def certified(
+    problem: Problem, pool: Pool | None, region: Array | None = None, margin: float = LISTED_GAP, effort: int = 1
+) -> Pool:
+    """Return the pools of a flat batch with certificates: the stage "certify"; region (2, d) as of `certify`.
+
+    `effort` multiplies the boxes that a proof may take.
+    """
+    limited = any(not is_exact(constraint) for constraint in problem.constraints)
+    if pool is None or region is not None or not limited or unsupported(problem) or problem.motions[0].order:
+        return certified_freely(problem, pool, region, margin, effort)
+    began, stages, fix = perf_counter(), pool.stages, judge(problem, pool)
+    certificate = fill(len(pool), None) if pool.certificate is None else np.array(pool.certificate)
+    asked, same = to_prove(pool, fix)
+    for i in np.flatnonzero(same).tolist():
+        assert pool.claims is not None
+        certificate[i] = pool.claims[i].certificate
+    items, more = np.flatnonzero(asked & ~same), 0
+    for _ in range(_ROUNDS):
+        if not len(items):
+            break
+        part, own = problem.take(items), take(pool, items)
+        told, minima = _prove_within(part, own, fix[items], margin, effort)
+        new = _beside(part, own, minima)
+        better = judge(part, new)
+        changed = np.flatnonzero(_is_new(fix[items], better))
+        # of a fix that an inequality holds nothing is claimed: its covariance is that along the edge alone
+        certificate[items] = column(told)
+        certificate[items[~is_free(problem, fix, items)]] = unknown(HELD)
+        more += len(changed)
+        pool = pool.merge(items[changed], take(new, changed))
+        fix = overwrite(fix, items[changed], better[changed])
+        items = items[changed[better.answered[changed]]]
+    certificate[items] = unknown(RESTLESS)
+    detail = f"{int(asked.sum())} within {violation_names(problem)}" + (f", {more} other minima found" if more else "")
+    return replace(pool, certificate=certificate, stages=(*stages, certify_stage(detail, began)))
+
+
+def _is_new(fix: Fix, other: Fix) -> Array:
+    """Return where other fixes (n,) cost less, have more alternatives, or are none."""
+    with np.errstate(invalid="ignore"):
+        lower = other.cost < fix.cost - equal_cost(fix.cost)
+    more = np.isfinite(other.alternatives.gap).sum(1) > np.isfinite(fix.alternatives.gap).sum(1)
+    return np.asarray(lower | more | ~other.answered)
+
+
+@dataclass(frozen=True, slots=True)
+class Along:
+    """What is known of n problems along one face.
+
+    Parameters
+    ----------
+    x : array (n, q, size)
+        Minima along the face; NaN in empty slots.
+    cost : array (n, q)
+        Of these; infinite in empty slots.
+    least, rest : array (n,)
+        What every point of the face costs more than the fix at least, and every minimum that is not among these; -inf
+        where that is not proven.
+    boxes : int array (n,)
+        Boxes looked at.
+    why : list of str
+        Why nothing is proven, or "".
+    """
+
+    x: Array
+    cost: Array
+    least: Array
+    rest: Array
+    boxes: Array
+    why: list[str]
+
+
+Minima = tuple[Array, Array, Array]
+"""Vectors (n, q, size), costs (n, q) and numbers of faces (n, q); infinite costs in empty slots."""
+
+
+def _beside(problem: Problem, pool: Pool, minima: Minima) -> Pool:
+    """Return pools with more minima, which are refined already, settled anew."""
+    x, cost, face = minima
+    here = np.isfinite(cost)
+    code = np.where(here, np.int8(Status.OK), np.int8(Status.INFEASIBLE))
+
+    def join(one: Array, other: Array) -> Array:
+        return np.concatenate([one, other], axis=1)
+
+    both = replace(
+        pool,
+        x=join(pool.x, x),
+        cost=join(pool.cost, cost),
+        code=join(pool.code, code),
+        face=join(pool.face, face),
+    )
+    stage = Stage("certify", f"{int(here.sum())} minima along edges", 0.0)
+    return keep_evidence(settle(problem, both, stage), pool)
+
+
+def _prove_within(
+    problem: Problem, pool: Pool, fix: Fix, margin: float, effort: int
+) -> tuple[list[Certificate], Minima]:
+    """Return certificates of n fixes, and all minima that are admitted."""
+    sides, known, found = faces(problem), dict[Face, Along](), list[Minima]()
+    sure, boxes = np.full(len(pool), margin), np.zeros(len(pool), dtype=np.int64)
+    why, seeds, tight = fill(len(pool), ""), pool.x, np.zeros(len(pool), dtype=bool)
+    for number, face in enumerate(sides):
+        # on an edge of an edge nothing costs less than on that
+        above = _least_around(known, face, len(pool))
+        if not (above < margin).any():
+            continue
+        along = known[face] = _prove_along(problem, fix, face, seeds, margin, effort)
+        own, admitted = np.maximum(above, along.rest), _is_admitted(problem, face, along)
+        if number:
+            # of an edge that the proof does not follow nothing is known; where the free minima are all admitted, the
+            # cost falls from there to one of them
+            own = np.where(np.isfinite(along.rest) | ~tight, own, margin)
+        else:
+            seeds = pack(np.concatenate([fix.x[:, None], along.x], axis=1))
+            tight = np.asarray((admitted | ~(along.cost < fix.cost[:, None] + margin)).all(1))
+        found.append((along.x, np.where(admitted, along.cost, np.inf), np.full(admitted.shape, number)))
+        sure, boxes = np.minimum(sure, own), boxes + along.boxes
+        why = np.where((own < 0.0) & (why == ""), along.why, why)
+    listed = (fix.alternatives.gap < sure[:, None]).sum(1)
+    bound = fix.cost - equal_cost(fix.cost)
+    numbers = (values.tolist() for values in (why, boxes, sure, fix.cost, bound, listed))
+    claims = [
+        state_claim(cost, low, gap, spent, count, None) if gap >= 0.0 else unknown(reason, spent)
+        for reason, spent, gap, cost, low, count in zip(*numbers, strict=True)
+    ]
+    x, cost, face_of = (np.concatenate(each, axis=1) for each in zip(*found, strict=True))
+    return claims, (x, cost, face_of)
+
+
+def _least_around(known: dict[Face, Along], face: Face, size: int) -> Array:
+    """Return by how much a face costs more than the fixes at least (n,), because it is part of others that do."""
+    own = set(face)
+    around = [along.least for other, along in known.items() if own > {*other}]
+    return np.asarray(np.max([np.full(size, -np.inf), *around], axis=0))
+
+
+def _prove_along(problem: Problem, fix: Fix, face: Face, seeds: Array, margin: float, effort: int) -> Along:
+    """Return what is known of n problems along a face, looked for from seeds (n, q, size)."""
+    began, on, limits = perf_counter(), on_face(problem, face), admitted(problem, problem.dimension)
+    names = " and ".join(face_names(problem, face)) or "inside"
+    pool = lsr(on, offer(on, seeds, None, "certify", began))
+    alone = judge(on, pool)
+    corner, reason = is_corner(problem, face), unsupported(on)
+    if corner or reason:
+        lost = np.full(len(seeds), -np.inf)
+        none, least = np.zeros(len(seeds), dtype=np.int64), _gain(alone.cost, fix.cost) if corner else lost
+        # a corner is the only minimum of itself
+        rest = np.where(np.isfinite(least), np.inf, -np.inf)
+        return Along(*_minima(alone), least, rest, none, [UNFOLLOWED.format(names, reason)] * len(seeds))
+    gain = _gain(alone.cost, fix.cost)
+    # nothing on a face that costs so much more need be told apart; where a minimum that is not admitted costs less than
+    # the fix, all up to the margin above the fix must be found: in whole numbers, so that fixes of a batch ask alike
+    above = np.where(gain > -LISTED_GAP, max(margin, AMBIGUOUS_GAP) - gain, max(margin, AMBIGUOUS_GAP))
+    wanted = np.where(gain >= margin, 0.0, np.where(gain < 0.0, np.ceil(above), margin))
+    certificate, boxes = fill(len(seeds), unknown(LEFT.format(names))), np.zeros(len(seeds), dtype=np.int64)
+    for gap in np.unique(wanted[alone.answered]):
+        items = np.flatnonzero(alone.answered & (wanted == gap))
+        part = on.take(items)
+        done = certified_freely(part, take(pool, items), None, float(gap), effort)
+        done = _within_limits(part, done, limits, float(gap), effort)
+        pool = pool.merge(items, done)
+        assert done.certificate is not None
+        certificate[items] = [claim or certificate[i] for i, claim in zip(items, done.certificate, strict=True)]
+    alone = judge(on, replace(pool, certificate=None))
+    gain = _gain(alone.cost, fix.cost)
+    sure = np.array([_is_sure(claim, limits) for claim in certificate], dtype=bool)
+    gap = np.array([claim.margin if claim.unique else 0.0 for claim in certificate])
+    boxes = np.array([claim.boxes for claim in certificate], dtype=np.int64)
+    least, rest = np.where(sure, gain, -np.inf), np.where(sure, gain + gap, -np.inf)
+    return Along(*_minima(alone), least, rest, boxes, [claim.reason for claim in certificate])
+
+
+def _gain(cost: Array, best: Array) -> Array:
+    """Return by how much costs (n,) exceed those of fixes; zero where they are equal but for rounding."""
+    gain = np.where(np.isfinite(cost), cost - best, -np.inf)
+    return np.where(np.abs(gain) <= equal_cost(best), 0.0, gain)
+
+
+def _minima(fix: Fix) -> tuple[Array, Array]:
+    """Return fixes and their alternatives: vectors (n, q, size) and costs (n, q), infinite in empty slots."""
+    others = fix.alternatives
+    cost = np.concatenate([fix.cost[:, None], fix.cost[:, None] + others.gap], axis=1)
+    return np.concatenate([fix.x[:, None], others.x], axis=1), np.where(np.isfinite(cost), cost, np.inf)
+
+
+def _is_sure(claim: Certificate | None, limits: Array) -> bool:
+    """Return whether a claim is about all that a box admits, or about all positions."""
+    if claim is None:
+        return False
+    if claim.proof != "region" or claim.region is None:
+        return claim.proof == "global"
+    lower, upper = np.array(claim.region)
+    return bool((lower <= limits[0]).all() and (upper >= limits[1]).all())
+
+
+def _within_limits(problem: Problem, pool: Pool, limits: Array, margin: float, effort: int) -> Pool:
+    """Return pools of which claims that cannot be made of all positions are about those that a box admits."""
+    assert pool.certificate is not None
+    open_ones = np.flatnonzero([not _is_sure(claim, limits) for claim in pool.certificate])
+    if not len(open_ones) or not np.isfinite(limits).all():
+        return pool
+    part = replace(take(pool, open_ones), certificate=None)
+    again = certified_freely(problem.take(open_ones), part, limits, margin, effort)
+    return pool.merge(open_ones, again)
+
+
+def _is_admitted(problem: Problem, face: Face, along: Along) -> Array:
+    """Return which minima along a face (n, q) are minima of all that is admitted."""
+    out = np.isfinite(along.cost)
+    item, slot = np.nonzero(out)
+    part, x = problem.take(item), along.x[item, slot]
+    good = (violation(part, x) <= TOLERANCE) & ~is_hidden(part, x)
+    if len(face) > len(exact(problem)):
+        _, vector, _ = marginal(equations_at(part, x))
+        good &= is_held(part, face, x, vector)
+    out[item, slot] = good
+    return out
+
+
+# Who asks for a proof gives it more time than a method that goes on without one.
+_EFFORT = 4
+
+
+def certify(
+    problem: Problem, fix: Fix, region: tuple[Array, Array] | None = None, *, margin: float = LISTED_GAP
+) -> Fix:
+    """Return a fix with a certificate of what is proven about it, and with every better or other minimum met.
+
+    The proof encloses all positions that could cost less, shows that the cost is convex around the fix, and splits
+    the rest into boxes until a lower bound excludes each. A better position replaces the fix, which is then proven
+    again; other minima with a cost within 25 are listed as alternatives.
+
+    Parameters
+    ----------
+    problem : Problem
+        Batch (...) of problems.
+    fix : Fix
+        Their fixes, refined.
+    region : (lower, upper), optional
+        Corners (d,) of the box to which the claim may be limited, in the problem's frame, metres; None: all positions,
+        or where that cannot be bounded a box around the stations that the certificate names. Of a target that moves
+        (2 d,), velocities in metres per second after the coordinates; None: what its constraints admit, see
+        `optloc.solvers.certify.posed.regions_of`.
+    margin : float
+        Gap between the cost of the fix and that of any other minimum that is tried to prove first; where the proof is
+        not finished, 9, the gap of `ambiguous`, and the value alone follow. 0 asks for the value alone: quicker.
+
+    Returns
+    -------
+    Fix
+        Like `fix`. Fixes without an answer stay as they are; what cannot be proven has the certificate "unknown" with
+        the reason, and one whose proof fails numerically the status `numerical`.
+
+    Raises
+    ------
+    InvalidProblem
+        For a fix of another shape, corners that do not bound a box, or a negative margin.
+    """
+    if separable(problem):
+        problem = by_epoch(problem)
+    shape, flat = problem.batch_shape, problem.flat()
+    if fix.shape != shape:
+        raise InvalidProblem(
+            f"a fix of shape {fix.shape} for problems of shape {shape}", "fix", "give the fix of this problem"
+        )
+    if not 0.0 <= margin < np.inf:
+        raise InvalidProblem(f"the margin is {margin}", "margin", "give 0 or a positive number")
+    corners = None if region is None else _corners(problem, region)
+    given = fix.reshape((flat.batch_shape[0],))
+
+    def work(some: Problem, part: slice) -> Fix:
+        with where("certify"):
+            return verdict(some, certified(some, accept(some, given[part]), corners, margin, _EFFORT))
+
+    return in_parts(flat, work, failed=failed).reshape(shape)
+
+
+def value_certified(problem: Problem, pool: Pool | None) -> Pool:
+    """Return the pools of a flat batch of problems with a proof that nothing costs less: the stage "value"."""
+    return certified(problem, pool, margin=0.0)
+
+
+def _corners(problem: Problem, region: tuple[Array, Array]) -> Array:
+    """Return the corners (2, d) of a region that is a box, (2, 2 d) where it says velocities as well."""
+    corners = np.array([np.asarray(corner, dtype=float) for corner in region])
+    sizes = sorted({problem.dimension, problem.dimension * (problem.motions[0].order + 1)})
+    shaped = corners.ndim == 2 and len(corners) == 2 and corners.shape[1] in sizes
+    if not shaped or not np.isfinite(corners).all() or (corners[0] >= corners[1]).any():
+        count = " or ".join(map(str, sizes))
+        raise InvalidProblem(
+            "the region is no box", "region", f"give (lower, upper) with {count} finite coordinates each"
+        )
+    return corners
