@@ -15,7 +15,7 @@ import scipy.linalg
 from optloc import Status, assemble, certify, measured, prepare, simulate, solve
 from optloc.base import linalg
 from optloc.solvers import METHODS, SOLVERS
-from optloc.solvers.certify import branch_and_bound
+from optloc.solvers.certify import admitted
 
 STATIONS = np.array([[0.0, 0.0], [1000.0, 0.0], [0.0, 1000.0], [1000.0, 1100.0], [500.0, -300.0]])
 PLACE = np.array([300.0, 400.0])
@@ -202,14 +202,14 @@ def test_proofs_that_are_asked_for_apart_are_contained_too(monkeypatch):
     many = ranged(3)
     fix = solve(many, "gtrs+lsr")
     expected = certify(many, fix)
-    culprit, prove = many.z[1].tobytes(), branch_and_bound.certified
+    culprit, prove = many.z[1].tobytes(), admitted.certified
 
     def fail(some, *args):
         if culprit in [row.tobytes() for row in some.z]:
             raise np.linalg.LinAlgError("injected")
         return prove(some, *args)
 
-    monkeypatch.setattr(branch_and_bound, "certified", fail)
+    monkeypatch.setattr(admitted, "certified", fail)
     found = certify(many, fix)
     assert (found[1].status, found[1].reason) == (Status.NUMERICAL, "certify: injected")
     assert found.code[[0, 2]].tolist() == expected.code[[0, 2]].tolist()

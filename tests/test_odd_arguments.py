@@ -30,6 +30,7 @@ BASE = {
     "list": "list kinds",
     "schema": "schema",
     "compile": "compile --check",
+    "place": "place demo --choose 4 --at 1200,800,50 --draws 0",
     "live": "live demo --check",
     "serve": "serve demo --check",
     "study status": "study status no",

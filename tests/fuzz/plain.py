@@ -60,10 +60,14 @@ class Plain:
 def read(path):
     """Return a problem file as plain numbers."""
     data = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
-    assert data["format"] == 1
+    assert data["format"] in (1, 2)
+    if data.get("medium") is not None:
+        raise Uncovered("rays")
+    compass = data["format"] == 2 and data.get("frame", {}).get("kind", "cartesian") != "cartesian"
     speed = data.get("propagation_speed", C)
     rows = []
     for section in data["measurements"]:
+        section = {"azimuth": "north-clockwise"} | section if compass else section
         rows += measured(section, cells(section, path.parent), speed, len(data["measurements"]) > 1)
     order = list(dict.fromkeys(row.kind for row in rows))
     epochs, count, times = grouped(data, rows)

@@ -8,7 +8,7 @@ from cases import CASES, ENU, STATIONS, TARGET
 from proof.plain import node_values
 from scipy.optimize import least_squares
 
-from optloc import Motion, Stations, assemble, measured, solve
+from optloc import Motion, Stations, assemble, certify, measured, solve
 from optloc.base.types import Band
 from optloc.compute.jit import enabled
 from optloc.linear.constraints import height
@@ -176,7 +176,7 @@ def test_where_infinity_is_near_the_gap_of_the_region_is_tried(why, margin, monk
         return answer._replace(verdict=np.where(asked.kappa >= 9.0, why, answer.verdict))
 
     monkeypatch.setattr(branch_and_bound, "prove", failing)
-    proof = branch_and_bound.certify(problem, solve(problem, "gtrs+lsr")).certificate
+    proof = certify(problem, solve(problem, "gtrs+lsr")).certificate
     assert (proof.proof, proof.unique) == ("global", margin > 0.0)
     assert proof.margin == pytest.approx(margin, abs=1e-3)
     assert tried[:2] == [25.0, 9.0]
@@ -199,9 +199,9 @@ def test_costs_beside_the_fix_are_compared_too(name, monkeypatch):
         rest = (pose.K @ phi[..., None])[..., 0] - pose.w
         return pose._replace(K=1.001 * pose.K, w=1.001 * (pose.w + rest) - rest)
 
-    assert branch_and_bound.certify(problem, fix).certificate.reason != branch_and_bound.MISMATCHED
+    assert certify(problem, fix).certificate.reason != branch_and_bound.MISMATCHED
     monkeypatch.setattr(branch_and_bound, "pose", steeper)
-    turned = branch_and_bound.certify(problem, fix)
+    turned = certify(problem, fix)
     assert turned.certificate.proof == "unknown"
     assert turned.certificate.reason == branch_and_bound.MISMATCHED
     assert turned.stages[-1].detail.endswith("1 posed cost did not match")
