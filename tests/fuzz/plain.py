@@ -66,8 +66,8 @@ def read(path):
     compass = data["format"] == 2 and data.get("frame", {}).get("kind", "cartesian") != "cartesian"
     speed = data.get("propagation_speed", C)
     rows = []
-    for section in data["measurements"]:
-        section = {"azimuth": "north-clockwise"} | section if compass else section
+    for written in data["measurements"]:
+        section = {"azimuth": "north-clockwise"} | written if compass else written
         rows += measured(section, cells(section, path.parent), speed, len(data["measurements"]) > 1)
     order = list(dict.fromkeys(row.kind for row in rows))
     epochs, count, times = grouped(data, rows)
