@@ -101,9 +101,11 @@ def measured(case, count, seconds):
 
 
 @pytest.fixture(scope="module")
-def book():
+def book(pytestconfig):
     facts = "sigma^2 = 1 + (r / 40 m)^2, seeds from 0, one core of a machine that was busy with other work"
-    with ledger("placement", HEADER, list(CASES), facts) as made:
+    # counts in full go on where they were stopped; a part of them is none of theirs
+    kept = pytestconfig.cache.mkdir("optloc-tables") if PART == 1 else None
+    with ledger("placement", HEADER, list(CASES), facts, kept=kept) as made:
         yield made
 
 
