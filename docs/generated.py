@@ -82,6 +82,21 @@ def words() -> str:
     return "\n".join(["| word | role | what the stage does |", "|---|---|---|", *lines])
 
 
+def formats() -> str:
+    """Return the formats as a table: what of the uncertainty each carries, and what of a fix that is not ok."""
+    from optloc.report.formats import FORMATS
+
+    head = [
+        "| ending | for | uncertainty of a fix that is ok | a fix that is not ok | stream |",
+        "|---|---|---|---|---|",
+    ]
+    lines = []
+    for name, one in FORMATS.items():
+        endings, stream = " ".join(f"`{each}`" for each in one.endings), f"`--format {name}`" if one.each else ""
+        lines.append(f"| {endings} | {one.summary} | {one.uncertainty} | {one.doubt} | {stream} |")
+    return "\n".join([*head, *lines])
+
+
 def kinds() -> str:
     """Return the measurement kinds as a table."""
     from optloc import MODELS
@@ -332,6 +347,7 @@ GENERATED: dict[str, Callable[..., str]] = {
     "rows": rows,
     "formulation": formulation,
     "costs": costs,
+    "formats": formats,
     "kinds": kinds,
     "words": words,
     "commands": commands,

@@ -8,11 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from optloc.cli.from_table import EXAMPLES as CONVERSIONS
-from optloc.cli.from_table import (
-    convert,
-    table_told,
-    takes_table,
-)
+from optloc.cli.from_table import convert, table_told, takes_table
 from optloc.cli.live import EXAMPLES, SERVED, live, serve
 from optloc.cli.options import (
     EXIT_CODES,
@@ -35,6 +31,7 @@ from optloc.cli.options import (
     LateFromData,
     Method,
     NoiseFromData,
+    Out,
     Outside,
     PlacementMap,
     PlaceOfInterest,
@@ -115,6 +112,7 @@ def _options(
     epilog=example(
         "optloc fix site.toml",
         "optloc fix flight.toml --out fixes.csv",
+        "optloc fix flight.toml --out fixes.kml",
         "optloc fix site.toml --html map.html",
         "optloc fix site.toml --json | jq .fixes",
         "optloc fix site.toml --height '1640 ft'",
@@ -128,7 +126,7 @@ def fix(
     as_json: Json = False,
     geojson: Annotated[Path | None, typer.Option(metavar="OUT", help="Write GeoJSON; - is standard output.")] = None,
     plot: Plot = None,
-    out: Annotated[Path | None, typer.Option(metavar="OUT", help="Write all fixes as .csv or .parquet.")] = None,
+    out: Out = None,
     html: Html = None,
     height: Height = None,
     above_ground: AboveGround = False,
@@ -196,7 +194,7 @@ def track(
     memory: Annotated[
         float, typer.Option(metavar="SECONDS", help="Time over which accelerations last (singer, csm).")
     ] = 10.0,
-    out: Annotated[Path | None, typer.Option(metavar="OUT", help="Write the track as .csv or .parquet.")] = None,
+    out: Out = None,
     as_json: Json = False,
     plot: Annotated[Path | None, typer.Option("--plot", metavar="OUT.png", help="Draw track, sigma and NIS.")] = None,
     html: Html = None,
@@ -547,8 +545,8 @@ def list_(
         typer.Argument(
             metavar="WHAT",
             autocompletion=_lists,
-            help="kinds, formulations, solvers, methods, losses, trackers, motions, baselines, executors, studies, "
-            "papers, datasets, pictures, demos or starters.",
+            help="kinds, formulations, solvers, methods, losses, trackers, motions, baselines, formats, executors, "
+            "studies, papers, datasets, pictures, demos or starters.",
         ),
     ],
     as_json: Json = False,

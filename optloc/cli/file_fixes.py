@@ -1,4 +1,4 @@
-"""The fixes of a file: one problem or its epochs in batches, as a long table, as JSON and as GeoJSON."""
+"""The fixes of a file: one problem or its epochs in batches, as a long table, as JSON, and for every format."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from optloc.problem.layout import state_names
 from optloc.problem.problem import Problem
 from optloc.report import columns as told
 from optloc.report.columns import Columns, fix_detail, join_tables, level_covariance, records
+from optloc.report.formats.marks import Results
 
 LOG = logging.getLogger("optloc.problem.fix")
 
@@ -187,7 +188,7 @@ def _unnoticed(fix: Fix, found: FileFixes, item: int) -> dict[str, Any]:
     return {"unnoticed": reliability_json(reliability_of(one, fix.x, fix.suspects))}
 
 
-def geojson(found: FileFixes) -> dict[str, Any]:
-    """Return stations, fixes and what holds 95 % as GeoJSON, see `optloc.report.columns.geojson`."""
+def results_of(found: FileFixes) -> Results:
+    """Return the fixes as formats take them."""
     problem = found.loaded.problem
-    return told.geojson(found.columns, problem.frame, found.fixes, problem, found.loaded.source)
+    return Results(found.columns, problem.frame, found.fixes, problem, found.loaded.title)

@@ -23,7 +23,7 @@ from optloc.cli.file_fixes import (
     FileFixes,
     fix_file,
     fixes_json,
-    geojson,
+    results_of,
 )
 from optloc.cli.from_table import read_problem
 from optloc.cli.output import (
@@ -33,7 +33,7 @@ from optloc.cli.output import (
     say,
     say_all,
     write_picture,
-    write_table,
+    write_results,
     write_text,
 )
 from optloc.files import Loaded
@@ -60,6 +60,7 @@ from optloc.report.fixes import (
     whose,
     with_sigma,
 )
+from optloc.report.formats.marks import geojson
 
 # What a screen holds of each list; the rest is counted, and --json and --out have all of it.
 _STATES, _FAILURES = SHOWN, 10
@@ -91,7 +92,7 @@ def run_fix(
     if as_json and on_output:
         raise InvalidProblem("JSON and GeoJSON cannot both go to standard output", "--geojson", "name a file")
     loaded = read_problem(file, table, more, quiet=quiet or as_json, on_error=on_output)
-    claim_outputs(geojson_path, html, table=out, picture=plot, inputs=[file])
+    claim_outputs(geojson_path, html, results=(out, loaded.problem.frame), picture=plot, inputs=[file])
     loaded = _estimate_noise(loaded, noise)
     rescaled = _common_level(loaded.problem) if rescale else None
     if rescaled is not None:
@@ -130,9 +131,9 @@ def _write(found: FileFixes, out: Path | None, geojson_path: Path | None, plot: 
     """Write the files that were asked for: all of them, or none."""
     with together():
         if out is not None:
-            write_table(out, found.columns)
+            write_results(out, results_of(found))
         if geojson_path is not None:
-            write_text(geojson_path, dumps(geojson(found)))
+            write_text(geojson_path, dumps(geojson(results_of(found))))
         if plot is not None:
             draw(found, plot)
         if html is not None:

@@ -66,7 +66,7 @@ Shed = Annotated[
 Part = Annotated[
     str, typer.Option("--partition", metavar="K/N", help="Answer the events of the Kth of N processes only.")
 ]
-Format = Annotated[str, typer.Option("--format", metavar="ndjson|geojson|aircraft", help="What is written.")]
+Format = Annotated[str, typer.Option("--format", metavar="NAME", help="ndjson, geojson, aircraft, cot or nmea.")]
 State = Annotated[Path | None, typer.Option("--state", metavar="FILE", help="Keep a checkpoint, and go on from it.")]
 Every = Annotated[str, typer.Option("--every", metavar="TIME", help="How often the checkpoint is written.")]
 Record = Annotated[Path | None, typer.Option("--record", metavar="FILE", help="Keep the lines that are read.")]

@@ -247,6 +247,14 @@ Budget = Annotated[
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON on standard output and nothing else.")]
 Plot = Annotated[Path | None, typer.Option("--plot", metavar="OUT.png", help="Draw stations, fix and 95 % ellipse.")]
+Out = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="OUT",
+        help="Write all of it: .csv, .parquet, .geojson, .kml, .gpx, .cot, .nmea, .yaml (ROS) or .g2o, as "
+        "[bold]optloc list formats[/bold] describes them.",
+    ),
+]
 Html = Annotated[
     Path | None, typer.Option("--html", metavar="OUT.html", help="Write a page with a map that moves; Earth only.")
 ]

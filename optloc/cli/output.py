@@ -15,12 +15,15 @@ from rich.text import Text
 
 from optloc.base import outputs
 from optloc.base.errors import InvalidProblem
-from optloc.base.outputs import claim, is_stream, visible, written
+from optloc.base.frames import Frame
+from optloc.base.outputs import claim, is_stream, visible
 from optloc.compute.progress import Reporter
 from optloc.report.columns import Columns, plain
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from optloc.report.formats import Results
 
 LOG = logging.getLogger("optloc.write")
 
@@ -71,19 +74,18 @@ def write_text(path: Path, text: str) -> None:
 
 def write_table(path: Path, columns: Columns) -> None:
     """Write a long table as CSV or Parquet, by the ending of its name; NaN is an empty cell."""
-    if is_csv(path):
-        from optloc.files.writer import write_csv  # with the schema, which not every command needs
+    from optloc.report.formats import write_csv, write_parquet
 
-        write_csv(path, columns, for_people=True)
-    else:
-        import pyarrow as pa
-        from pyarrow import parquet
-
-        # from_pandas: NaN is a missing value.
-        table = pa.table({name: pa.array(values, from_pandas=True) for name, values in columns.items()})
-        with written(path) as file:
-            parquet.write_table(table, file)
+    (write_csv if is_csv(path) else write_parquet)(path, columns)
     LOG.info("wrote %s: %d rows", path, len(next(iter(columns.values()))))
+
+
+def write_results(path: Path, results: Results) -> None:
+    """Write fixes or tracks in the format that the ending of the name says."""
+    from optloc.report.formats import format_of
+
+    format_of(path).write(path, results)
+    LOG.info("wrote %s: %d rows", path, len(results.columns["status"]))
 
 
 def is_csv(path: Path) -> bool:
@@ -92,7 +94,11 @@ def is_csv(path: Path) -> bool:
 
 
 def claim_outputs(
-    *others: Path | None, table: Path | None = None, picture: Path | None = None, inputs: Sequence[Path] = ()
+    *others: Path | None,
+    table: Path | None = None,
+    results: tuple[Path | None, Frame] | None = None,
+    picture: Path | None = None,
+    inputs: Sequence[Path] = (),
 ) -> None:
     """Refuse outputs of a command that cannot or must not be written, before the work.
 
@@ -102,16 +108,23 @@ def claim_outputs(
         Files of text.
     table, picture : Path, optional
         Files whose endings say their types.
+    results : (Path or None, Frame), optional
+        A file whose ending says the format, and the frame of the fixes or tracks in it.
     inputs : sequence of Path
         What the command reads, beside what was read already.
     """
     if table is not None and not is_csv(table) and table.suffix.lower() not in {".parquet", ".pq"}:
         what = f"results of type {table.suffix or table.name!r} are unknown"
         raise InvalidProblem(what, str(table), "use .csv or .parquet")
+    fixes, frame = results or (None, None)
+    if fixes is not None:
+        from optloc.report.formats import format_of
+
+        format_of(fixes, frame)
     if picture is not None and picture.suffix.lower() not in PICTURES and not is_stream(picture):
         what = f"pictures of type {picture.suffix or picture.name!r} are unknown"
         raise InvalidProblem(what, str(picture), f"use {', '.join(PICTURES[:-1])} or {PICTURES[-1]}")
-    claim(table, picture, *others, inputs=inputs)
+    claim(table, fixes, picture, *others, inputs=inputs)
 
 
 def write_picture(figure: Figure, path: Path) -> None:

@@ -25,7 +25,7 @@ from optloc.cli.output import (
     is_csv,
     say,
     write_picture,
-    write_table,
+    write_results,
     write_text,
 )
 from optloc.files import Loaded
@@ -33,6 +33,7 @@ from optloc.files.readings import Told
 from optloc.files.writer import GrowingTable
 from optloc.problem.problem import Problem
 from optloc.report.columns import Columns, covariance_columns, geodetic_columns, join_tables, records
+from optloc.report.formats.marks import Results
 from optloc.track import Dynamics, State, current_statistical, polynomial, singer
 from optloc.track.run import Entry, Rules, tracked
 from optloc.track.several_targets import alone
@@ -155,7 +156,7 @@ def run_track(
     # Wrong words are refused before the file is read.
     update = filter_of(wanted.filter) if wanted.loss is None else reweighted(wanted.filter, wanted.loss)
     loaded = read_problem(file, table, quiet=quiet or as_json)
-    claim_outputs(html, table=out, picture=plot, inputs=[file])
+    claim_outputs(html, results=(out, loaded.problem.frame), picture=plot, inputs=[file])
     ones = [TargetTrack(*parts, []) for parts in runs_of(loaded)]
     if wanted.start is not None and len(ones) > 1:
         raise InvalidProblem("one initial state does not fit several targets", "--start", "leave it out")
@@ -305,7 +306,7 @@ def _write(
         table.file.finish()
         LOG.info("wrote %s: %d rows", table.path, table.rows)
     elif out is not None:
-        write_table(out, columns)
+        write_results(out, Results(columns, loaded.problem.frame, (), loaded.problem, loaded.title))
         if table is not None:
             table.file.discard()
     if plot is not None:

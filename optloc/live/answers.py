@@ -1,4 +1,4 @@
-"""What a stream answers: records of fixes and proofs, and the same as GeoJSON and as aircraft of readsb."""
+"""What a stream answers: records of fixes and proofs, and the same in other formats."""
 
 from __future__ import annotations
 
@@ -9,10 +9,14 @@ from typing import Any
 
 import numpy as np
 
+from optloc.base.frames import Frame
 from optloc.base.types import Array, Status
 from optloc.live.events import Event
+from optloc.plot.outlines import earth_points
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
+from optloc.report import formats
+from optloc.report.formats.marks import Mark, Other, mark_of
 from optloc.track.run import Entry
 
 Record = dict[str, Any]
@@ -254,12 +258,56 @@ def to_aircraft(record: Record, seen: float = 0.0) -> Record:
     }
 
 
-FORMATS: Mapping[str, Callable[[Record], bytes | None]] = {
-    "ndjson": to_line,
-    "geojson": lambda record: to_line(to_feature(record)),
-    "aircraft": lambda record: to_line(to_aircraft(record)) if record.get("lat_deg") is not None else None,
+def to_mark(record: Record, frame: Frame) -> Mark:
+    """Return a fix or the state of a track as formats take it."""
+    position, d = np.array(record["position"], dtype=float), len(record["position"])
+    spread = np.full((d, d), np.nan) if record.get("cov") is None else np.array(record["cov"], dtype=float)[:d, :d]
+    others = [
+        Other(x := np.array(each["position"], dtype=float), earth_points(frame, x[None])[0], each["gap"], _doubt(each))
+        for each in record.get("alternatives", ())
+    ]
+    name = record.get("target") or record["event"]
+    return mark_of(
+        frame,
+        position,
+        spread,
+        record["status"],
+        velocity=np.array(record["velocity"], dtype=float) if record.get("velocity") else None,
+        name=name,
+        target=name,
+        time=float(record.get("time", np.nan)),
+        others=tuple(others),
+        reason=record.get("reason", ""),
+    )
+
+
+def _doubt(each: Record) -> float:
+    """Return the probability of an alternative, as `optloc.problem.fix.Alternatives` does."""
+    return float(1.0 / (1.0 + np.exp(min(each["gap"] / 2.0, 700.0))))  # beyond, exp overflows
+
+
+def _of_file(each: Callable[[Mark], str]) -> Callable[[Record, Frame], bytes | None]:
+    """Return what writes a record in a format of files; None of one without a place on Earth."""
+
+    def line(record: Record, frame: Frame) -> bytes | None:
+        if record.get("lat_deg") is None:
+            return None
+        text = each(to_mark(record, frame))
+        return (text if text.endswith("\n") else text + "\n").encode()
+
+    return line
+
+
+FORMATS: Mapping[str, Callable[[Record, Frame], bytes | None]] = {
+    "ndjson": lambda record, _: to_line(record),
+    "geojson": lambda record, _: to_line(to_feature(record)),
+    "aircraft": lambda record, _: to_line(to_aircraft(record)) if record.get("lat_deg") is not None else None,
+    **{name: _of_file(one.each) for name, one in formats.FORMATS.items() if one.each is not None},
 }
-"""What lines of the output are: records, GeoJSON features, or aircraft where there is a place on Earth."""
+"""What lines of the output are, by name: a function of a record and the frame of its site."""
+
+OF_RECORDS = ("ndjson", "geojson")
+"""Formats in which notes, errors and health have lines, too; beside others they are told to people."""
 
 
 class Latest:

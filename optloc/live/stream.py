@@ -18,7 +18,7 @@ from optloc.base.outputs import Growing, write_text
 from optloc.compute.jit import enabled
 from optloc.linear.simulate import simulate
 from optloc.live import events as of_events
-from optloc.live.answers import FORMATS, Latest, Record, to_line
+from optloc.live.answers import FORMATS, OF_RECORDS, Latest, Record, to_line
 from optloc.live.engine import BATCH, Engine
 from optloc.live.events import LINE, Events, parse
 from optloc.live.metrics import Metrics
@@ -313,7 +313,7 @@ class Stream:
 
     def _answer(self, event: of_events.Event, record: Record, last: bool) -> None:
         self._tell(record)
-        self._outbox.put(self._format(record) or b"", event.name if last else None)
+        self._outbox.put(self._format(record, self.site.frame) or b"", event.name if last else None)
         if event.reply is not None:
             event.reply.answer(record, last)
             if last:
@@ -322,8 +322,8 @@ class Stream:
     def _emit(self, record: Record) -> None:
         """Write a record that is no answer: a note, an error, health."""
         self._tell(record)
-        if self._settings.format != "aircraft":
-            self._outbox.put(self._format(record) or b"")
+        if self._settings.format in OF_RECORDS:
+            self._outbox.put(self._format(record, self.site.frame) or b"")
         else:
             self._say(json.dumps(record))
 

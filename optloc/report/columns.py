@@ -1,4 +1,4 @@
-"""Fixes as columns of a long table, as JSON and as GeoJSON: what files of results hold."""
+"""Fixes as columns of a long table and as JSON: what files of results hold."""
 
 from __future__ import annotations
 
@@ -8,22 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem
 from optloc.base.frames import Frame
 from optloc.base.linalg import error_ellipse
 from optloc.base.types import Array, Status
 from optloc.bounds.observability import Observability
-from optloc.problem.chart import CARTESIAN, CURVED, INVERSE_RANGE
+from optloc.problem.chart import CURVED, INVERSE_RANGE
 from optloc.problem.fix import Active, Explanation, Fix
-from optloc.problem.problem import Problem
 
 Columns = dict[str, Array]
 """A long table: columns (rows,) by name, in SI units and degrees, NaN where there is no number."""
 
 _RATES = {"velocity": "v", "acceleration": "a"}
 _STATES = ("position", *_RATES)
-# Corners of an ellipse on a map, one for every 5 degrees: no edge is seen at any zoom that shows the whole.
-_CORNERS = 72
 
 # Numbers and tables.
 
@@ -288,89 +284,3 @@ def _chart_json(fix: Fix) -> dict[str, Any] | None:
     if chart.kind != CURVED:
         told["range95"] = fix.interval("range")
     return told
-
-
-# As GeoJSON.
-
-
-def geojson(
-    columns: Columns, frame: Frame, fixes: Sequence[Fix], problem: Problem | None = None, source: str | None = None
-) -> dict[str, Any]:
-    """Return stations, fixes and what holds 95 % as a GeoJSON feature collection (RFC 7946).
-
-    An ellipse where it covers, else the outline of the region; a curved fix without one has none.
-
-    Parameters
-    ----------
-    columns : dict of str to array
-        The table of the fixes.
-    frame : Frame
-        Of their positions.
-    fixes : sequence of Fix
-        In the order of the table.
-    problem : Problem, optional
-        Whose stations are told, and by which curved regions are known.
-    source : str, optional
-        Place to name.
-    """
-    from optloc.plot.outlines import earth_points, feature, point_geometry
-
-    if not frame.geodetic:
-        what = "GeoJSON needs positions on Earth, but the frame is cartesian"
-        raise InvalidProblem(what, source, 'give a [frame] of kind "geodetic", "ecef" or "enu"')
-    features = []
-    if problem is not None:
-        place = problem.stations.position.reshape(-1, problem.stations.count, problem.dimension)[0]
-        named = zip(problem.stations.names, earth_points(frame, place), strict=True)
-        features = [feature(point_geometry(point), {"role": "station", "name": name}) for name, point in named]
-    outlines = {} if problem is None else _outlines(columns, fixes, problem)
-    skipped = {"x", "y", "z", "lat_deg", "lon_deg", "height"}
-    for number, row in enumerate(records(columns)):
-        if row["lat_deg"] is None:
-            continue
-        about = {name: value for name, value in row.items() if name not in skipped and not name.startswith("cov_")}
-        point = np.array([row["lon_deg"], row["lat_deg"], row["height"]])
-        features.append(feature(point_geometry(point), {"role": "fix", **about}))
-        about = {name: row[name] for name in ("number", "epoch", "target") if name in row}
-        if pieces := outlines.get(number, ()):
-            features.append(feature(_region(frame, row, pieces), {"role": "region95", **about}))
-        elif row["cov_ee"] is not None and number not in outlines:
-            features.append(feature(_ellipse(frame, row), {"role": "ellipse95", **about}))
-    return {"type": "FeatureCollection", "features": features}
-
-
-def _outlines(columns: Columns, fixes: Sequence[Fix], problem: Problem) -> dict[int, tuple[Array, ...]]:
-    """Return the convex parts of the regions of rows whose ellipses do not cover; empty where they are not known."""
-    from optloc.plot.outlines import pieces_of
-
-    charts = [fix.chart for fix in fixes]
-    kinds = [np.ravel(chart.kind) for chart in charts if chart is not None]
-    # Fixes of one position each: a row is a fix.
-    if len(kinds) != len(charts) or sum(map(len, kinds)) != len(columns["x"]):
-        return {}
-    pieces = [part for fix in fixes for part in pieces_of(problem, fix)]
-    return {int(i): pieces[i] for i in np.flatnonzero(np.concatenate(kinds) != CARTESIAN)}
-
-
-def _region(frame: Frame, row: dict[str, Any], pieces: tuple[Array, ...]) -> dict[str, Any]:
-    """Return the plan of a region of convex parts as a geometry."""
-    from optloc.plot.outlines import earth_line, polygon_geometry, polygons
-
-    centre = np.array([row[axis] for axis in "xyz" if axis in row])
-    axes = frame.enu_axes(centre)[:2]
-    plan = polygons([(piece - centre) @ axes.T for piece in pieces])
-    return polygon_geometry([[earth_line(frame, centre + line @ axes) for line in each] for each in plan])
-
-
-def _ellipse(frame: Frame, row: dict[str, Any]) -> dict[str, Any]:
-    """Return the horizontal 95 % ellipse of a row as a geometry, counter-clockwise."""
-    from optloc.plot.outlines import earth_line, polygon_geometry
-
-    covariance = np.array([[row["cov_ee"], row["cov_en"]], [row["cov_en"], row["cov_nn"]]])
-    semi_axes, directions = error_ellipse(covariance)
-    # Eigenvectors may be left-handed: the sign of the turn makes up for it.
-    angle = np.linspace(0.0, 2.0 * np.pi, _CORNERS + 1) * np.sign(np.linalg.det(directions))
-    plane = (np.stack([np.cos(angle), np.sin(angle)], axis=-1) * semi_axes) @ directions.T
-    plane[-1] = plane[0]
-    centre = np.array([row[axis] for axis in "xyz" if axis in row])
-    return polygon_geometry([[earth_line(frame, centre + plane @ frame.enu_axes(centre)[:2])]])

@@ -29,7 +29,6 @@ from optloc.report.columns import (
     explanations_of,
     fix_columns,
     fix_detail,
-    geojson,
     level_covariance,
     plain,
     records,
@@ -349,4 +348,6 @@ def frame_of(fix: Fix) -> Any:
 
 def geojson_of(fix: Fix, problem: Problem | None = None) -> dict[str, Any]:
     """Return fixes as a GeoJSON feature collection, with the stations where their problem is given."""
-    return geojson(fix_columns(fix), fix.frame, [fix], problem)
+    from optloc.report.formats.marks import Results, geojson
+
+    return geojson(Results(fix_columns(fix), fix.frame, (fix,), problem))

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from optloc.cli import app
 from optloc.files import load
-from optloc.live.answers import to_aircraft, to_feature, to_line
+from optloc.live.answers import FORMATS, to_aircraft, to_feature, to_line, to_mark
 from optloc.live.engine import PENDING, Engine
 from optloc.live.events import Events, parse
 from optloc.live.metrics import COUNTS, Metrics
@@ -504,6 +504,23 @@ def test_fixes_on_earth_are_features_and_aircraft(tmp_path):
     assert (plane["hex"], plane["type"]) == ("4b1234", "mlat")
     assert plane["alt_geom"] == round(record["height"] / 0.3048)
     assert to_feature({"error": "x", "line": 1})["geometry"] is None
+
+
+def test_fixes_on_earth_are_events_and_sentences(tmp_path):
+    text = SITE.replace("[stations]", '[frame]\nkind = "enu"\norigin = { lat_deg = 47.5, lon_deg = 8.0 }\n\n[stations]')
+    site = site_in(tmp_path, text)
+    _, lines = whole(site, 1)
+    (record,) = answers(site, lines, phases="one")[0]
+    mark = to_mark(record, site.frame)
+    assert mark.covers
+    assert mark.place == pytest.approx([record["lon_deg"], record["lat_deg"], record["height"]])
+    assert np.trace(mark.level) == pytest.approx(np.trace(record["cov"]))
+    assert FORMATS["cot"](record, site.frame).startswith(b'<event version="2.0"')
+    assert FORMATS["nmea"](record, site.frame).count(b"\r\n") == 2
+    doubtful = record | {"status": "ambiguous", "alternatives": [{"position": record["position"], "gap": 0.0}]}
+    assert FORMATS["cot"](doubtful, site.frame).count(b'ce="9999999.000"') == 2
+    assert FORMATS["nmea"](doubtful, site.frame).split(b",")[6] == b"0"
+    assert FORMATS["cot"]({"error": "x", "line": 1}, site.frame) is None
 
 
 def test_the_epochs_of_a_file_give_the_numbers_of_fix(tmp_path):

@@ -8,11 +8,12 @@ import pytest
 from uncertainty.scenes import fixed
 
 import optloc
-from optloc.cli.file_fixes import fix_file, geojson
+from optloc.cli.file_fixes import fix_file, results_of
 from optloc.files import read
 from optloc.plot import plot_fixes
 from optloc.plot.outlines import hull, pieces_of, polygons
 from optloc.problem.chart import quantile
+from optloc.report.formats.marks import geojson
 from optloc.report.map import fixed_spots
 
 DEMOS = Path(optloc.__file__).parent / "scenarios"
@@ -104,7 +105,7 @@ def test_geojson_has_the_region_of_a_far_fix():
     truth[:3] = away
     far = fix_file(replace(loaded, problem=optloc.simulate(problem, truth, 5)), "auto", quiet=True)
     assert far.fixes[0].chart.name != "cartesian"
-    found = geojson(far)["features"][-1]
+    found = geojson(results_of(far))["features"][-1]
     assert found["properties"]["role"] == "region95"
     assert found["geometry"]["type"] == "Polygon"
     ring = np.array(found["geometry"]["coordinates"][0])

@@ -1,0 +1,258 @@
+"""Marks as XML: KML for maps, GPX for receivers, Cursor on Target for situation displays.
+
+Sources: OGC 07-147r2, OGC KML 2.2; GPX 1.1 Schema, Topografix (2004); M. J. Kristan et al., Cursor-on-Target Message
+Router User's Guide, MITRE MP090284 (2009), and its base event schema.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from datetime import UTC, datetime, timedelta
+from itertools import groupby
+from xml.etree.ElementTree import Element, SubElement, indent, tostring  # it writes and reads nothing
+
+import numpy as np
+
+from optloc.base.outputs import visible
+from optloc.base.types import Array
+from optloc.report.formats.marks import Area, Mark, Other, Results, ellipse
+
+# Decimals of a degree and of a metre: a tenth of a millimetre, and one.
+_DEGREES, _METRES = 9, 3
+_HEAD = '<?xml version="1.0" encoding="UTF-8"?>\n'
+
+
+def _add(parent: Element, tag: str, text: str | None = None, /, **attributes: str) -> Element:
+    """Return a new last child; what XML cannot hold is spelled."""
+    child = SubElement(parent, tag, {key: visible(value) for key, value in attributes.items()})
+    child.text = None if text is None else visible(text)
+    return child
+
+
+def _document(root: Element) -> str:
+    indent(root)
+    return _HEAD + tostring(root, encoding="unicode")
+
+
+def _iso(when: datetime) -> str:
+    return when.isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def _number(value: float, digits: int = _METRES) -> str:
+    """Return a number as XML has decimals, without an exponent."""
+    return f"{value:.{digits}f}"
+
+
+def _courses(marks: Sequence[Mark]) -> Iterator[tuple[str, list[list[Mark]]]]:
+    """Yield targets with the parts of their tracks between which they were lost."""
+    for target in dict.fromkeys(mark.target for mark in marks):
+        own = (mark for mark in marks if mark.target == target)
+        yield target, [list(part) for sure, part in groupby(own, key=lambda mark: mark.sure) if sure]
+
+
+def _covariance(level: Array) -> str:
+    """Return the upper triangle of a level covariance as text: ee en eu nn nu uu."""
+    return " ".join(f"{value:.9g}" for value in level[np.triu_indices(len(level))])
+
+
+# KML.
+
+# Colours aabbggrr: green, amber and grey as on optloc's own maps, areas half transparent.
+_STYLES = {"ok": "ff50a030", "doubtful": "ff00a0f0", "alternative": "ff909090", "station": "ffb06020"}
+_PADDLE = {"PolyStyle": "60", "LineStyle": "ff", "IconStyle": "ff"}
+
+
+def kml(results: Results) -> str:
+    """Return marks as KML 2.2: a point each, what holds 95 % as an area, alternatives beside them, tracks as lines."""
+    root = Element("kml", {"xmlns": "http://www.opengis.net/kml/2.2"})
+    document = _add(root, "Document")
+    _add(document, "name", results.title)
+    for name, colour in _STYLES.items():
+        style = _add(document, "Style", id=name)
+        for part in ("IconStyle", "LineStyle", "PolyStyle"):
+            _add(_add(style, part), "color", _PADDLE[part] + colour[2:])
+    for name, place in results.stations():
+        _point(_placemark(document, name, "station", "station"), place, len(results.axes))
+    marks = results.marks()
+    for mark, area in zip(marks, results.areas(), strict=True):
+        _kml_mark(document, mark, area)
+    for target, parts in _courses(marks) if results.course else ():
+        line = _add(_placemark(document, f"{target}: track", "ok scans, in order", "ok"), "MultiGeometry")
+        for run in (run for run in parts if len(run) > 1):
+            string = _add(line, "LineString")
+            _height(string, len(results.axes))
+            _add(string, "coordinates", _line(mark.place for mark in run))
+    return _document(root)
+
+
+def _kml_mark(document: Element, mark: Mark, area: Area | None) -> None:
+    if not mark.known:
+        _placemark(document, mark.name, mark.words, "doubtful", mark)
+        return
+    style, flat = "ok" if mark.sure else "doubtful", len(mark.position)
+    label = mark.name if mark.sure else f"{mark.name}: {mark.status}"
+    _point(_placemark(document, label, mark.words, style, mark), mark.place, flat)
+    if area is not None:
+        word = area.role.replace("95", ", 95 %")
+        _polygons(_placemark(document, f"{mark.name}: {word}", mark.words, style), area)
+    for number, other in enumerate(mark.others, 1):
+        place = _placemark(document, _named(mark, number), _doubt(mark, other), "alternative")
+        _point(place, other.place, flat)
+
+
+def _named(mark: Mark, number: int) -> str:
+    return f"{mark.name}: alternative {number}"
+
+
+def _doubt(mark: Mark, other: Other) -> str:
+    return f"another position that the data of {mark.name} allow; probability {other.probability:.2g}"
+
+
+def _placemark(document: Element, name: str, about: str, style: str, mark: Mark | None = None) -> Element:
+    """Return a placemark that lacks its geometry alone, which comes last."""
+    placemark = _add(document, "Placemark")
+    _add(placemark, "name", name)
+    _add(placemark, "description", about)
+    if mark is not None and mark.date is not None:
+        _add(_add(placemark, "TimeStamp"), "when", _iso(mark.date))
+    _add(placemark, "styleUrl", f"#{style}")
+    if mark is not None:
+        data = {"status": mark.status} | ({"time": repr(mark.time)} if np.isfinite(mark.time) else {})
+        data |= {"covariance_enu_m2": _covariance(mark.level)} if mark.covers else {}
+        extended = _add(placemark, "ExtendedData")
+        for key, value in data.items():
+            _add(_add(extended, "Data", name=key), "value", value)
+    return placemark
+
+
+def _height(geometry: Element, dimension: int) -> None:
+    _add(geometry, "altitudeMode", "absolute" if dimension == 3 else "clampToGround")
+
+
+def _point(placemark: Element, place: Array, dimension: int) -> None:
+    point = _add(placemark, "Point")
+    _height(point, dimension)
+    _add(point, "coordinates", _line([place]))
+
+
+def _line(places: Iterable[Array]) -> str:
+    return " ".join(
+        f"{_number(p[0], _DEGREES)},{_number(p[1], _DEGREES)},{_number(p[2] if len(p) > 2 else 0.0)}" for p in places
+    )
+
+
+def _polygons(placemark: Element, area: Area) -> None:
+    several, coordinates = area.geometry["type"] == "MultiPolygon", area.geometry["coordinates"]
+    parent = _add(placemark, "MultiGeometry") if several else placemark
+    for rings in coordinates if several else [coordinates]:
+        polygon = _add(parent, "Polygon")
+        _add(polygon, "tessellate", "1")
+        _add(polygon, "altitudeMode", "clampToGround")
+        for i, ring in enumerate(rings):
+            edge = _add(_add(polygon, "innerBoundaryIs" if i else "outerBoundaryIs"), "LinearRing")
+            _add(edge, "coordinates", _line(np.array(ring)))
+
+
+# GPX.
+
+_OWN = "urn:optloc:fix"
+
+
+def gpx(results: Results) -> str:
+    """Return marks as GPX 1.1: fixes and alternatives as waypoints, tracks as segments between which they are lost."""
+    names = {"xmlns": "http://www.topografix.com/GPX/1/1", "xmlns:optloc": _OWN, "version": "1.1", "creator": "optloc"}
+    root, marks, flat = Element("gpx", names), results.marks(), len(results.axes)
+    _add(_add(root, "metadata"), "name", results.title)
+    for name, place in results.stations():
+        _gpx_point(root, "wpt", place, flat, name=name, type="station")
+    for mark in marks:
+        if mark.known and not (results.course and mark.sure):
+            label = mark.name if mark.sure else f"{mark.name}: {mark.status}"
+            _told(_gpx_point(root, "wpt", mark.place, flat, _time(mark), name=label, desc=mark.words, type="fix"), mark)
+        for number, other in enumerate(mark.others, 1):
+            told = {"name": _named(mark, number), "desc": _doubt(mark, other), "type": "alternative"}
+            _gpx_point(root, "wpt", other.place, flat, _time(mark), **told)
+    for target, parts in _courses(marks) if results.course else ():
+        track = _add(root, "trk")
+        _add(track, "name", target)
+        for part in parts:
+            segment = _add(track, "trkseg")
+            for mark in part:
+                _told(_gpx_point(segment, "trkpt", mark.place, flat, _time(mark)), mark)
+    return _document(root)
+
+
+def _time(mark: Mark) -> str | None:
+    return None if mark.date is None else _iso(mark.date)
+
+
+def _gpx_point(
+    parent: Element, tag: str, place: Array, dimension: int, when: str | None = None, /, **about: str
+) -> Element:
+    """Return a point whose children have the order of the schema: ele, time, name, desc, type."""
+    point = _add(parent, tag, lat=_number(place[1], _DEGREES), lon=_number(place[0], _DEGREES))
+    children = {"ele": _number(place[2]) if dimension == 3 else None, "time": when}
+    children |= {key: about.get(key) for key in ("name", "desc", "type")}
+    for key, value in children.items():
+        if value is not None:
+            _add(point, key, value)
+    return point
+
+
+def _told(point: Element, mark: Mark) -> None:
+    """Add status and covariance as an extension, which the schema has last."""
+    extensions = _add(point, "extensions")
+    _add(extensions, "optloc:status", mark.status)
+    if mark.covers:
+        _add(extensions, "optloc:covariance_enu_m2", _covariance(mark.level))
+
+
+# Cursor on Target.
+
+# What the schema has for a length that is not known.
+_UNKNOWN = 9999999.0
+# Seconds after which an event is stale: what maps of aircraft take.
+_STALE = 60.0
+
+
+def cot(results: Results) -> str:
+    """Return an event of Cursor on Target for each mark and each alternative, a line each."""
+    return "\n".join(filter(None, map(event, results.marks())))
+
+
+def event(mark: Mark) -> str:
+    """Return a mark as an event of Cursor on Target 2.0, and its alternatives below it; empty without a place.
+
+    `ce` and `le` are one standard deviation: that of the longest axis of the ellipse, and that of the height.
+    """
+    if not np.isfinite(mark.place).all():
+        return ""
+    atom = "a-u-G" if mark.sure else "a-p-G"  # an unknown thing, or one that is pending
+    major = ellipse(mark.level)[0] if mark.covers else _UNKNOWN
+    rise = float(np.sqrt(max(mark.level[2, 2], 0.0))) if mark.covers and len(mark.level) == 3 else _UNKNOWN
+    lines = [_event(mark, mark.name, mark.place, (major, rise), atom, mark.words)]
+    for number, other in enumerate(mark.others, 1):
+        name = _named(mark, number)
+        lines.append(_event(mark, name, other.place, (_UNKNOWN, _UNKNOWN), "a-p-G", _doubt(mark, other), moves=False))
+    return "\n".join(lines)
+
+
+def _event(
+    mark: Mark, name: str, place: Array, errors: tuple[float, float], atom: str, about: str, *, moves: bool = True
+) -> str:
+    now = datetime.now(UTC)
+    start = mark.date or now
+    # m-f: by a machine, fused from several sources
+    root = Element("event", {"version": "2.0", "uid": visible(f"optloc.{name}"), "type": atom, "how": "m-f"})
+    times = {"time": now, "start": start, "stale": start + timedelta(seconds=_STALE)}
+    root.attrib |= {key: _iso(value) for key, value in times.items()}
+    where = {"lat": _number(place[1], _DEGREES), "lon": _number(place[0], _DEGREES), "hae": _number(place[2])}
+    _add(root, "point", **where, ce=_number(errors[0]), le=_number(errors[1]))
+    detail = _add(root, "detail")
+    _add(detail, "contact", callsign=name)
+    if moves and mark.velocity is not None and mark.covers:
+        east, north = mark.velocity[:2]
+        course = float(np.degrees(np.arctan2(east, north)) % 360.0)
+        _add(detail, "track", course=_number(course, 2), speed=_number(float(np.hypot(east, north))))
+    _add(detail, "remarks", about)
+    return tostring(root, encoding="unicode")

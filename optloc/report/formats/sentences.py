@@ -1,0 +1,139 @@
+"""Marks as lines: NMEA 0183 for instruments, poses with covariance for ROS, vertices and priors for g2o.
+
+Sources: NMEA 0183 4.10 (2012), GGA and GST; geometry_msgs/PoseWithCovarianceStamped and REP 103, 105 of ROS;
+R. Kuemmerle et al., "g2o: a general framework for graph optimization", ICRA (2011), and its types slam2d and slam3d.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import reduce
+from typing import Any
+
+import numpy as np
+
+from optloc.base.outputs import visible
+from optloc.base.types import Array
+from optloc.report.formats.marks import Mark, Results, ellipse
+
+# NMEA 0183.
+
+# An electronic positioning system that is none of the others: neither of its numbers comes from satellites.
+_TALKER = "SN"
+# Decimals of a minute of arc: a fifth of a millimetre.
+_MINUTES = 7
+
+
+def nmea(results: Results) -> str:
+    """Return a GGA sentence of each mark, and a GST sentence of each whose covariance covers."""
+    return "".join(map(sentences, results.marks())).removesuffix("\n")
+
+
+def sentences(mark: Mark) -> str:
+    """Return GGA, and GST where the covariance covers; what is not sure has fix quality 0 and no place."""
+    clock = "" if mark.date is None else mark.date.strftime("%H%M%S.") + f"{mark.date.microsecond // 10000:02d}"
+    if not mark.sure:
+        return _sentence("GGA", clock, "", "", "", "", "0", "00", "", "", "M", "", "M", "", "")
+    lon, lat, height = mark.place
+    place = (_angle(lat, 2), "N" if lat >= 0.0 else "S", _angle(lon, 3), "E" if lon >= 0.0 else "W")
+    # There is no geoid here: a height above the ellipsoid is one above a geoid that is the ellipsoid.
+    told = (f"{height:.3f}", "M", "0.0", "M") if len(mark.position) == 3 else ("", "M", "", "M")
+    line = _sentence("GGA", clock, *place, "1", "00", "", *told, "", "")
+    if not mark.covers:
+        return line
+    major, minor, bearing = ellipse(mark.level)
+    sigma = np.sqrt(np.maximum(np.diagonal(mark.level), 0.0))
+    sizes = [f"{v:.3f}" for v in (sigma[1], sigma[0], *sigma[2:])]
+    rise = [] if len(sigma) == 3 else [""]
+    return line + _sentence("GST", clock, "", f"{major:.3f}", f"{minor:.3f}", f"{bearing:.1f}", *sizes, *rise)
+
+
+def _angle(degrees: float, digits: int) -> str:
+    """Return an angle as degrees and minutes in one number, rounded as a whole: 60 minutes are a degree."""
+    units = round(abs(float(degrees)) * 60.0 * 10**_MINUTES)
+    whole, rest = divmod(units, 60 * 10**_MINUTES)
+    minutes, part = divmod(rest, 10**_MINUTES)
+    return f"{whole:0{digits}d}{minutes:02d}.{part:0{_MINUTES}d}"
+
+
+def _sentence(name: str, *fields: str) -> str:
+    """Return a sentence with its checksum: all characters between $ and * by exclusive or."""
+    text = f"{_TALKER}{name},{','.join(fields)}"
+    return f"${text}*{reduce(lambda sum_, letter: sum_ ^ ord(letter), text, 0):02X}\r\n"
+
+
+# ROS.
+
+# Variance of what is not estimated, m² and rad²: above 1e4, from where programs of ROS take one for unknown.
+_OPEN = 1e6
+_FRAMES = {"ecef": "earth", "enu": "map", "cartesian": "map"}
+
+
+def ros(results: Results) -> str:
+    """Return a PoseWithCovarianceStamped of each mark that covers, as YAML documents; all others are comments."""
+    frame = _FRAMES[results.frame.kind]
+    return "\n".join(_pose(mark, frame) for mark in results.marks())
+
+
+def _pose(mark: Mark, frame: str) -> str:
+    if not (mark.sure and mark.covers):
+        return _comment(mark)
+    d = len(mark.position)
+    covariance = np.diag(np.full(6, _OPEN))
+    covariance[:d, :d] = mark.covariance
+    when = mark.time if np.isfinite(mark.time) else 0.0
+    seconds = int(np.floor(when))
+    message: dict[str, Any] = {
+        "header": {
+            "stamp": {"sec": seconds, "nanosec": min(round((when - seconds) * 1e9), 999_999_999)},
+            "frame_id": frame,
+        },
+        "pose": {
+            "pose": {
+                "position": dict(zip("xyz", [*mark.position.tolist(), 0.0][:3], strict=True)),
+                "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+            },
+            "covariance": covariance.ravel().tolist(),
+        },
+    }
+    return f"# {visible(mark.name)}\n{json.dumps(message, allow_nan=False)}\n---"
+
+
+def _comment(mark: Mark) -> str:
+    """Return what is said of a mark that has no covariance, and of its alternatives, in the frame."""
+    lines = [f"{mark.name}: {mark.words}" + (f" at {_spelled(mark.position)}" if mark.known else "")]
+    lines += [f"or {_spelled(other.position)}, probability {other.probability:.2g}" for other in mark.others]
+    return "\n".join(f"# {visible(line)}".replace("\n", " ") for line in lines)
+
+
+def _spelled(position: Array) -> str:
+    return " ".join(f"{v:.6f}" for v in position)
+
+
+# g2o.
+
+# Least standard deviation of a prior, metres: what is held exactly has no information matrix.
+_HELD = 1e-4
+_POINTS = {2: ("VERTEX_XY", "EDGE_PRIOR_XY"), 3: ("VERTEX_TRACKXYZ", "EDGE_POINTXYZ_PRIOR")}
+
+
+def g2o(results: Results) -> str:
+    """Return a vertex of each mark, and a prior with its information matrix where the covariance covers."""
+    lines = []
+    vertex, prior = _POINTS[len(results.axes)]
+    for number, mark in enumerate(results.marks()):
+        lines.append(_comment(mark))
+        if not mark.known:
+            continue
+        place = " ".join(f"{v:.12g}" for v in mark.position)
+        lines.append(f"{vertex} {number} {place}")
+        if mark.sure and mark.covers:
+            triangle = _information(mark.covariance)[np.triu_indices(len(mark.position))]
+            lines.append(f"{prior} {number} {place} {' '.join(f'{v:.12g}' for v in triangle)}")
+    return "\n".join(lines)
+
+
+def _information(covariance: Array) -> Array:
+    """Return the inverse of a covariance (d, d) none of whose axes is shorter than 0.1 mm."""
+    values, vectors = np.linalg.eigh(covariance)
+    return np.asarray((vectors / np.maximum(values, _HELD**2)) @ vectors.T)
