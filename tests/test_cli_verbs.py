@@ -68,8 +68,8 @@ def options(verb):
 @pytest.mark.parametrize("verb", VERBS, ids=" ".join)
 def test_every_command_can_be_verbose_or_quiet(verb):
     assert {"--verbose", "-v"} <= options(verb)
-    # What these two print is all they do.
-    assert verb[-1] in {"list", "schema"} or {"--quiet", "-q"} <= options(verb)
+    # What these three print is all they do.
+    assert verb[-1] in {"list", "schema", "doctor"} or {"--quiet", "-q"} <= options(verb)
 
 
 @pytest.mark.parametrize("verb", ["fix", "check", "crlb", "track", "separate", "demo", "convert", "list"])

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from optloc.cli.doctor import doctor
 from optloc.cli.from_table import EXAMPLES as CONVERSIONS
 from optloc.cli.from_table import convert, table_told, takes_table
 from optloc.cli.live import EXAMPLES, SERVED, live, serve
@@ -591,6 +592,7 @@ def schema(verbose: Verbose = False) -> None:
     typer.echo(dumps(of_files()))
 
 
+app.command(rich_help_panel=MORE, epilog=example("optloc doctor", "optloc doctor --json"))(doctor)
 app.command(rich_help_panel=ANSWERS, epilog=EXAMPLES)(live)
 app.command(rich_help_panel=ANSWERS, epilog=SERVED)(serve)
 

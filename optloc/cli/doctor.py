@@ -1,0 +1,177 @@
+"""``optloc doctor``: versions, machine, caches, what is missing, and the command that brings it."""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import sys
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, requires, version
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.table import Table
+
+from optloc.cli.options import Json, Verbose
+from optloc.cli.output import Screen, dumps, say
+
+# Extras for work on optloc itself, which users do not miss.
+_OURS = frozenset({"test", "lint", "docs"})
+_REQUIREMENT = re.compile(r"^([A-Za-z0-9._-]+)[^<>=!~;]*(?:>=([\d.]+))?")
+_EXTRA = re.compile(r"""extra\s*==\s*['"]([\w-]+)['"]""")
+
+
+@dataclass(frozen=True, slots=True)
+class Package:
+    """A package that optloc uses: its version, None where it is missing, the least one, and the extra that brings it.
+
+    The extra is empty for what every installation has.
+    """
+
+    name: str
+    version: str | None
+    least: str
+    extra: str
+
+    @property
+    def state(self) -> str:
+        """Return "ok", "too old" or "missing"."""
+        if self.version is None:
+            return "missing"
+        return "ok" if _numbers(self.version) >= _numbers(self.least) else "too old"
+
+
+@dataclass(frozen=True, slots=True)
+class Advice:
+    """What is missing, what it is for, and the command that brings it."""
+
+    missing: str
+    used_for: str
+    command: str
+
+
+def _numbers(text: str) -> tuple[int, ...]:
+    """Return the leading numbers of a version, so that 1.10 is above 1.9."""
+    found = re.match(r"\d+(?:\.\d+)*", text)
+    return tuple(map(int, found[0].split("."))) if found else ()
+
+
+def packages() -> list[Package]:
+    """Return what this optloc requires, the core first; nothing where it was not installed but put on the path."""
+    found = []
+    for line in _asked(requires, "optloc") or ():
+        named, extra = _REQUIREMENT.match(line), _EXTRA.search(line)
+        if named is None or (extra is not None and extra[1] in _OURS):
+            continue
+        name = named[1]
+        found.append(Package(name, _asked(version, name), named[2] or "", "" if extra is None else extra[1]))
+    return sorted(found, key=lambda one: (one.extra, one.name))
+
+
+def _asked(of: Any, name: str) -> Any:
+    try:
+        return of(name)
+    except PackageNotFoundError:
+        return None
+
+
+def machine() -> dict[str, Any]:
+    """Return what this computer is, and what of it may be used."""
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    settings = ("OPTLOC_THREADS", "OPTLOC_COMPILE", "OPTLOC_DATA", "NUMBA_CACHE_DIR", "NUMBA_DISABLE_JIT")
+    return {
+        "system": platform.platform(),
+        "processor": platform.machine(),
+        "processors": os.cpu_count(),
+        "usable": usable,
+        "settings": {name: os.environ[name] for name in settings if name in os.environ},
+    }
+
+
+def machine_code() -> dict[str, Any]:
+    """Return where machine code is kept, for which processor, and which parts of it are there."""
+    from optloc.compute.jit import enabled
+
+    if not enabled():
+        return {"folder": None, "made_for": None, "installed": False, "parts": {}}
+    from optloc.cli.compile import PARTS
+    from optloc.compute.kept import kept_in
+    from optloc.compute.manifest import installed, of_this_process
+
+    place = kept_in()
+    return {
+        "folder": None if place is None else str(place),
+        "made_for": of_this_process().processor,
+        "installed": installed() is not None,
+        "parts": {part.summary: place is not None and not part.missing() for part in PARTS.values()},
+    }
+
+
+def advice(found: list[Package], code: dict[str, Any]) -> list[Advice]:
+    """Return what is missing with the command that brings it: what everybody needs first."""
+    told = [
+        Advice(f"{one.name} >= {one.least}", "everything", f"pip install '{one.name}>={one.least}'")
+        for one in found
+        if not one.extra and one.state != "ok"
+    ]
+    if not found:
+        told.append(Advice("the installed package", "versions, extras of other packages", "pip install ."))
+    if not code["parts"]:
+        told.append(Advice("machine code", "speed: a thousand times", "unset NUMBA_DISABLE_JIT"))
+    elif not all(code["parts"].values()):
+        lacking = [name for name, there in code["parts"].items() if not there]
+        told.append(Advice("machine code", ", ".join(lacking), "optloc compile"))
+    for extra in dict.fromkeys(one.extra for one in found if one.extra and one.state != "ok"):
+        names = [one.name for one in found if one.extra == extra and one.state != "ok"]
+        told.append(Advice(", ".join(names), f"the extra {extra}", f"pip install 'optloc[{extra}]'"))
+    return told
+
+
+def _datasets() -> dict[str, Any]:
+    from optloc.datasets import available
+
+    folder = os.environ.get("OPTLOC_DATA")
+    return {"folder": folder, "there": list(available()) if folder else []}
+
+
+def doctor(as_json: Json = False, verbose: Verbose = False) -> None:
+    """Print versions, machine, where machine code lies and whether it is there, what is missing and what brings it."""
+    found, code = packages(), machine_code()
+    told = {
+        "optloc": {"version": _asked(version, "optloc"), "folder": str(Path(__file__).resolve().parents[1])},
+        "python": {"version": platform.python_version(), "executable": sys.executable},
+        "machine": machine(),
+        "packages": [asdict(one) | {"state": one.state} for one in found],
+        "machine_code": code,
+        "datasets": _datasets(),
+        "advice": [asdict(one) for one in advice(found, code)],
+    }
+    if as_json:
+        typer.echo(dumps(told))
+    else:
+        _show(told)
+
+
+def _show(told: dict[str, Any]) -> None:
+    screen, here, code = Screen(), told["machine"], told["machine_code"]
+    say(screen, f"optloc {told['optloc']['version'] or '(not installed)'} in {told['optloc']['folder']}")
+    say(screen, f"Python {told['python']['version']}: {told['python']['executable']}")
+    say(screen, f"{here['system']}; {here['usable']} of {here['processors']} processors may be used")
+    for name, value in here["settings"].items():
+        say(screen, f"{name}={value}")
+    table = Table("package", "version", "needed", "for", "state")
+    for one in told["packages"]:
+        needed = f">= {one['least']}" if one["least"] else "any"
+        table.add_row(one["name"], one["version"] or "-", needed, one["extra"] or "all", one["state"])
+    screen.print(table)
+    if code["parts"]:
+        say(screen, f"Machine code for {code['made_for']} is kept in {code['folder'] or 'no folder'}")
+        for name, there in code["parts"].items():
+            say(screen, f"  {'yes' if there else 'no ':3} {name}")
+    if told["datasets"]["folder"]:
+        say(screen, f"Data sets in {told['datasets']['folder']}: {', '.join(told['datasets']['there']) or 'none'}")
+    say(screen, "Nothing is missing." if not told["advice"] else "Missing:")
+    for one in told["advice"]:
+        say(screen, f"  {one['missing']} ({one['used_for']}): {one['command']}")
