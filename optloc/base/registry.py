@@ -8,6 +8,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from types import ModuleType
 from typing import Any, TypeVar, cast
 
 from optloc.base.errors import InvalidProblem
@@ -124,8 +125,7 @@ def load_plugin(name: str) -> None:
     InvalidProblem
         Where there is none, or it fails; with what it says.
     """
-    path = Path(name)
-    known = str(path.resolve()) if path.suffix == ".py" else name
+    path, known = Path(name), _known(name)
     if known in _PLUGINS:
         return
     try:
@@ -139,9 +139,25 @@ def load_plugin(name: str) -> None:
     _PLUGINS.append(known)
 
 
+def plugin_module(name: str) -> ModuleType | None:
+    """Return a plugin that was loaded, by the name that it was loaded by; None where there is none."""
+    known = _known(name)
+    if known not in _PLUGINS:
+        return None
+    return sys.modules.get(_key(Path(known)) if known.endswith(".py") else known)
+
+
+def _known(name: str) -> str:
+    return str(Path(name).resolve()) if name.endswith(".py") else name
+
+
+def _key(path: Path) -> str:
+    return f"optloc plugin {path}"
+
+
 def _run_file(path: Path) -> None:
     # By its path: two plugins may have one file name, and neither hides a module of that name.
-    key = f"optloc plugin {path}"
+    key = _key(path)
     found = importlib.util.spec_from_file_location(key, path)
     assert found is not None
     assert found.loader is not None

@@ -35,6 +35,19 @@ study = typer.Typer(
     help="Compare methods and solvers over scenarios, noise levels and many trials.",
 )
 
+Plugins = Annotated[
+    list[str] | None,
+    typer.Option("--plugin", metavar="FILE.py", help="Run a Python file or module first, as optloc --plugin does."),
+]
+Methods = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--method", "-m", metavar="NAME", help="One more method: its name, or FILE.py:FUNCTION or MODULE:FUNCTION."
+    ),
+]
+Jobs = Annotated[
+    int | None, typer.Option("--jobs", "-j", min=1, max=_MOST_JOBS, help="Processes; all processors by default.")
+]
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Output folder of a study.")]
 
 
@@ -42,6 +55,7 @@ Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Output folder of a 
     epilog=example(
         "optloc study run divergence --out divergence",
         "optloc study run my.toml --out runs/my --trials 10000",
+        "optloc study run my.toml --out runs/my --method mine.py:simplex",
         "optloc study run my.toml --out runs/my --executor dask --scheduler tcp://10.0.0.1:8786",
     )
 )
@@ -61,28 +75,32 @@ def run(
     scheduler: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="Cluster that exists, such as tcp://host:8786; implies dask.")
     ] = None,
-    jobs: Annotated[
-        int | None, typer.Option("--jobs", "-j", min=1, max=_MOST_JOBS, help="Processes; all processors by default.")
-    ] = None,
+    jobs: Jobs = None,
     limit: Annotated[
         float, typer.Option("--task-limit", metavar="SECONDS", help="Time that a task may take: methods may hang.")
     ] = 600.0,
     trials: Annotated[int | None, typer.Option(min=1, help="Trials, in the place of those of the file.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Seed, in the place of that of the file.")] = None,
+    methods: Methods = None,
+    plugin: Plugins = None,
     outside: Outside = False,
     budget: Budget = None,
     as_json: Json = False,
     quiet: Quiet = False,
     verbose: Verbose = False,
 ) -> None:
-    """Run a study, or go on with one that was stopped: finished parts are kept."""
+    """Run a study, or go on with one that was stopped: finished parts are kept, and new methods run alone."""
+    from optloc.base.registry import load_plugin
     from optloc.study.execute import executor as chosen
     from optloc.study.execute import run_plan
+    from optloc.study.methods import added
     from optloc.study.plan import plan_of
 
+    for name in plugin or ():
+        load_plugin(name)
     # A scheduler can only be meant for dask.
     by = chosen("dask" if scheduler is not None and executor == "processes" else executor, jobs, scheduler, limit)
-    plan = plan_of(file, trials=trials, seed=seed)
+    plan = plan_of(file, trials=trials, seed=seed, more=added(methods or ()))
     folder = Path(f"{plan.study.name}-study".replace(" ", "-").replace("/", "-")) if out is None else out
     try:
         with _bar(plan.study.name, plan.rows, quiet or as_json) as tell:
@@ -154,6 +172,68 @@ def compare(
     elif not quiet:
         _show_comparison(found, one, two, Screen())
     raise typer.Exit(int(any(abs(difference.z) > _DIFFERS for difference in found)))
+
+
+@study.command(
+    epilog=example("optloc study bench", "optloc study bench --method mine.py:simplex --page leaderboard.md")
+)
+def bench(
+    methods: Methods = None,
+    plugin: Plugins = None,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Output folder; new methods run alone.")] = Path(
+        "bench-study"
+    ),
+    page: Annotated[
+        Path | None, typer.Option(metavar="OUT.md", help="Where the leaderboard goes; standard output by default.")
+    ] = None,
+    jobs: Jobs = None,
+    trials: Annotated[int | None, typer.Option(min=1, help="Fewer trials, to try it out: other data.")] = None,
+    force: Force = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Solve the public test set by a few methods and yours, and write who is right how often as a page."""
+    from optloc.base.registry import load_plugin
+    from optloc.cli.output import write_text
+    from optloc.study.execute import executor, run_plan
+    from optloc.study.leaderboard import SET
+    from optloc.study.leaderboard import page as made
+    from optloc.study.methods import added
+    from optloc.study.plan import plan_of
+
+    claim(page)
+    for name in plugin or ():
+        load_plugin(name)
+    plan = plan_of(Path(SET), trials=trials, more=added(methods or ()))
+    with _bar(plan.study.name, plan.rows, quiet) as tell:
+        run_plan(plan, out, executor("processes", jobs), tell, lambda line: typer.echo(line, err=True))
+    if page is not None or not quiet:
+        write_text(Path("-") if page is None else page, made(out, plan))
+
+
+@study.command(epilog=example("optloc study pairs runs/my --against auto"))
+def pairs(
+    folder: Folder,
+    against: Annotated[
+        str | None, typer.Option(metavar="METHOD", help="Whom the others are compared with; the first of the study.")
+    ] = None,
+    as_json: Json = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Compare methods on the same trials: who alone is right, differences of errors and times, with 95 % intervals."""
+    from dataclasses import asdict
+
+    from optloc.study.folder import read_frame, read_manifest
+    from optloc.study.paired import paired
+    from optloc.study.summary import COLUMNS, judged
+
+    first = next(iter(read_manifest(folder).methods.values()), "")
+    found = paired(judged(read_frame(folder, COLUMNS)), first if against is None else against)
+    if as_json:
+        _print_json([asdict(one) for one in found])
+    elif not quiet:
+        _show_pairs(found, Screen())
 
 
 @study.command(epilog=example("optloc study schema > study.schema.json"))
@@ -255,6 +335,21 @@ def _show_comparison(found: list[Any], one: Path, two: Path, console: Console) -
             times = d.two.seconds / d.one.seconds if d.one.seconds else nan
             numbers = (100 * d.one.answered, 100 * d.two.answered, d.z, d.one.rmse, d.two.rmse, times)
             table.add_row(d.cell[3], *("-" if isnan(n) else f"{n:.4g}" for n in numbers), values)
+        console.print(table)
+
+
+def _show_pairs(found: list[Any], console: Console) -> None:
+    for (case, noise), same in groupby(found, lambda one: (one.case, one.noise)):
+        rows = list(same)
+        title = f"{case}, {noise}: against {rows[0].against}"
+        console.print(title, style="bold", highlight=False, markup=False, soft_wrap=True)
+        table = Table("method")
+        for name in ("trials", "it alone right", "other alone", "p", "error less, m", "time over"):
+            table.add_column(name, justify="right")
+        for one in rows:
+            cells = (f"{m.value:.2g} [{m.low:.2g}, {m.high:.2g}]" for m in (one.error, one.time))
+            counts = (str(n) for n in (one.trials, one.alone, one.other_alone))
+            table.add_row(one.method, *counts, f"{one.p:.2g}", *cells)
         console.print(table)
 
 

@@ -170,7 +170,7 @@ def least_squares(problem: Problem, start: Array, limit: int = _EVALUATIONS) -> 
     pool = np.array(start, dtype=float)[:, None]
     cost, code = np.full(pool.shape[:2], np.inf), np.full(pool.shape[:2], int(Status.NUMERICAL), dtype=np.int8)
     for i in range(len(pool)):
-        residual, jacobian = _whiten_one(plain.take(np.array([i])))
+        residual, jacobian = whiten_one(plain.take(np.array([i])))
         try:
             end = optimize.least_squares(residual, start[i], jacobian, method="lm", max_nfev=limit)
         except ValueError:  # values that are not finite, or fewer rows than unknowns
@@ -182,7 +182,7 @@ def least_squares(problem: Problem, start: Array, limit: int = _EVALUATIONS) -> 
     return judge_points(problem, start, pool, cost, code, stage)
 
 
-def _whiten_one(one: Problem) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
+def whiten_one(one: Problem) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
     """Return residual (m,) and Jacobian (m, size) of one problem in units of the standard deviation, for SciPy."""
     white = whiten(one.noise, one.weight)
 

@@ -7,7 +7,7 @@ import json
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -58,6 +58,10 @@ class Manifest:
         Where it was begun and with what.
     folder : str
         Where its problem files are; empty where that is not known.
+    data : str
+        Of the data that all its methods see; empty where that is not known.
+    methods : dict of str to str
+        Names of the methods by the keys of their cells.
     """
 
     name: str
@@ -73,6 +77,8 @@ class Manifest:
     machine: str
     versions: str
     folder: str = ""
+    data: str = ""
+    methods: dict[str, str] = field(default_factory=dict)
 
     @property
     def rows(self) -> int:
@@ -97,7 +103,22 @@ def manifest_of(plan: Plan) -> Manifest:
         machine(),
         versions(),
         plan.folder,
+        plan.data,
+        {cell.key: cell.method.name for cell in plan.cells},
     )
+
+
+def joined(found: Manifest, wanted: Manifest) -> Manifest | None:
+    """Return the manifest of a folder that gets the methods of a plan, too; None where the data are others.
+
+    What was computed stays, but for methods that the plan has by the same name: those are as the plan says now.
+    """
+    if not found.data or found.data != wanted.data:
+        return None
+    names = set(wanted.methods.values())
+    kept = {key: name for key, name in found.methods.items() if name not in names}
+    chunks = {key: count for key, count in found.chunks.items() if key.partition("-")[0] in kept}
+    return replace(found, chunks=chunks | wanted.chunks, methods=kept | wanted.methods)
 
 
 def read_manifest(folder: Path) -> Manifest:
@@ -122,7 +143,9 @@ def read_manifest(folder: Path) -> Manifest:
 
 
 def begin(plan: Plan, folder: Path) -> Manifest:
-    """Return the manifest of a folder for a plan, written where there is none; call it while the folder is `locked`.
+    """Return the manifest of a folder for a plan, written where it is new; call it while the folder is `locked`.
+
+    A folder of the same data by other methods gets those of the plan, too: see `joined`.
 
     Raises
     ------
@@ -130,24 +153,29 @@ def begin(plan: Plan, folder: Path) -> Manifest:
         Where the folder cannot be written, or belongs to another study or another version of optloc.
     """
     wanted = manifest_of(plan)
+    before, found = None, wanted
     if (folder / MANIFEST).exists():
-        found = read_manifest(folder)
-        if found.fingerprint != wanted.fingerprint:
-            what = f"the folder holds another study ({found.name!r}, or other trials, seed or settings)"
+        before = read_manifest(folder)
+        same = before.fingerprint == wanted.fingerprint and wanted.chunks.keys() <= before.chunks.keys()
+        found = before if same else joined(before, wanted) or wanted
+        if found is wanted:
+            what = f"the folder holds another study ({before.name!r}, or other trials, seed or settings)"
             raise InvalidProblem(what, str(folder), "choose another folder with --out")
         if (found.version, found.columns) != (wanted.version, wanted.columns):
             what = f"the folder was written by optloc {found.version}, and this is {wanted.version}"
             raise InvalidProblem(what, str(folder), "choose another folder with --out")
-    else:
-        found = wanted
     try:
         (folder / "parts").mkdir(parents=True, exist_ok=True)
         _clean(folder)
     except OSError as error:
         raise _unwritable(folder, error) from None
-    if found is wanted:
-        data = {"format": FORMAT, **{name: getattr(wanted, name) for name in Manifest.__slots__}}
-        _write(folder / MANIFEST, json.dumps(data, indent=1).encode())
+    if found != before:
+        data = {"format": FORMAT, **{name: getattr(found, name) for name in Manifest.__slots__}}
+        content = json.dumps(data, indent=1).encode()
+        if before is None:
+            _write(folder / MANIFEST, content)
+        else:
+            _renew(folder / MANIFEST, content)
     return found
 
 
@@ -165,6 +193,16 @@ def _write(path: Path, content: bytes) -> None:
             place.write_bytes(content)
     except InvalidProblem as error:
         raise InvalidProblem(error.what, error.where, _KEPT) from None
+
+
+def _renew(path: Path, content: bytes) -> None:
+    """Replace a file of the folder's own: it was read here, and nobody needs to force that."""
+    scratch = path.with_name(f".optloc-{path.name}")
+    _write(scratch, content)
+    try:
+        scratch.replace(path)
+    except OSError as error:
+        raise _unwritable(path, error) from None
 
 
 def _clean(folder: Path) -> None:

@@ -6,7 +6,7 @@ A method is one of optloc's or a baseline; nothing in a study knows one by its n
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
@@ -23,6 +23,7 @@ from optloc.problem.fix import Fix
 from optloc.study.baselines import BASELINES, start_of
 from optloc.study.document import MethodTable
 from optloc.study.draws import Drawn
+from optloc.study.minimizers import baseline_of, code_of, load_minimizer
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +46,8 @@ class Method:
         Width of the box of random starts, metres.
     batch, chunk : int, optional
         Fixes in a call, and in a task.
+    code : str
+        Digest of the file that a baseline of a plugin is written in; empty of optloc's own.
     """
 
     name: str
@@ -56,6 +59,7 @@ class Method:
     width: float = 1e5  # the default of a study file
     batch: int | None = None
     chunk: int | None = None
+    code: str = ""
 
     @property
     def identity(self) -> str:
@@ -63,13 +67,13 @@ class Method:
         # Not the chunk: it decides how the work is cut, and the fingerprint of a plan has that.
         settings = json.dumps(self.settings, sort_keys=True)
         parts = (self.name, self.method, self.baseline, self.solver, settings, self.start, self.width, self.batch)
-        return json.dumps(parts)
+        return json.dumps((*parts, self.code) if self.code else parts)
 
     @property
     def slow(self) -> bool:
         """Return whether fixes are solved one by one."""
         if self.baseline is not None:
-            return BASELINES[self.baseline].slow
+            return baseline_of(self.baseline).slow
         from optloc.solvers import Method as Pipeline
 
         assert self.method is not None
@@ -78,8 +82,10 @@ class Method:
     @property
     def reference(self) -> bool:
         """Return whether it knows the truth, so that it judges the others and is not ranked."""
-        known = BASELINES.get(self.baseline or "")
-        return known is not None and (known.reference or (known.guess and self.start == "truth"))
+        if self.baseline is None:
+            return False
+        known = baseline_of(self.baseline)
+        return known.reference or (known.guess and self.start == "truth")
 
 
 def methods_of(table: MethodTable, number: int) -> Iterator[Method]:
@@ -130,7 +136,32 @@ def methods_of(table: MethodTable, number: int) -> Iterator[Method]:
             Units("length").plain(table.width, "m", join(where, "width")),
             table.batch,
             table.chunk,
+            "" if table.baseline is None else code_of(name),
         )
+
+
+def added(names: Sequence[str]) -> list[Method]:
+    """Return methods that the user names beside those of a file.
+
+    Parameters
+    ----------
+    names : sequence of str
+        A method such as gtrs+lsr, a baseline, or a function to load: FILE.py:FUNCTION or MODULE:FUNCTION.
+
+    Raises
+    ------
+    InvalidProblem
+        For an unknown method, and for a function that cannot be loaded.
+    """
+    found = []
+    for name in names:
+        if ":" in name:
+            load_minimizer(name)
+            found.append(Method(name.rpartition(":")[2], None, name, code=code_of(name)))
+        else:
+            table = {"baseline": name} if name in BASELINES else {"method": name}
+            found += methods_of(MethodTable.model_validate(table), len(found) + 1)
+    return found
 
 
 def _list(value: str | list[str] | None) -> list[str]:
@@ -206,7 +237,7 @@ def require_program(method: Method, found: Run) -> None:
 
 def _solved(method: Method, drawn: Drawn) -> Any:
     if method.baseline is not None:
-        return BASELINES[method.baseline].run(drawn, start_of(method.start, method.width, drawn))
+        return baseline_of(method.baseline).run(drawn, start_of(method.start, method.width, drawn))
     from optloc.solvers import solve
 
     assert method.method is not None

@@ -9,7 +9,7 @@ import hashlib
 import json
 import os
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import as_file, files
 from importlib.resources.abc import Traversable
@@ -144,8 +144,16 @@ class Plan:
     def fingerprint(self) -> str:
         """Return hexadecimal digits that are equal for equal data and methods, whatever the remarks of the file."""
         # Remarks, titles and the order of keys do not count: the folder of the same study is continued.
-        text = " ".join(f"{cell.key}:{cell.case.trials}:{cell.stretch}" for cell in self.cells)
-        return hashlib.blake2b(text.encode(), digest_size=16).hexdigest()
+        return _digest(f"{cell.key}:{cell.case.trials}:{cell.stretch}" for cell in self.cells)
+
+    @property
+    def data(self) -> str:
+        """Return hexadecimal digits that are equal for equal data, whatever the methods."""
+        return _digest(dict.fromkeys(f"{cell.case.key}:{cell.case.trials}" for cell in self.cells))
+
+
+def _digest(words: Iterable[str]) -> str:
+    return hashlib.blake2b(" ".join(words).encode(), digest_size=16).hexdigest()
 
 
 def shipped() -> dict[str, Traversable]:
@@ -161,7 +169,7 @@ def shipped() -> dict[str, Traversable]:
 _CASES, _PARTS = 10_000, 1_000_000
 
 
-def plan_of(file: Path, *, trials: int | None = None, seed: int | None = None) -> Plan:
+def plan_of(file: Path, *, trials: int | None = None, seed: int | None = None, more: Sequence[Method] = ()) -> Plan:
     """Return the plan of a study file, or of a shipped study by its name.
 
     Parameters
@@ -170,6 +178,8 @@ def plan_of(file: Path, *, trials: int | None = None, seed: int | None = None) -
         A TOML file with ``format = 1``.
     trials, seed : int, optional
         In the place of those of the file; `trials` also in that of single scenarios.
+    more : sequence of Method
+        Methods beside those of the file.
 
     Raises
     ------
@@ -182,17 +192,26 @@ def plan_of(file: Path, *, trials: int | None = None, seed: int | None = None) -
             advice = f"{nearest(str(file), known)}, or give the path of a study file"
             raise InvalidProblem(f"there is no study {str(file)!r}", "study", advice)
         with as_file(known[str(file)]) as path:
-            return planned(read_text(path), path.name, path.parent, trials=trials, seed=seed)
-    return planned(read_text(file), file.name, file.parent, trials=trials, seed=seed)
+            return planned(read_text(path), path.name, path.parent, trials=trials, seed=seed, more=more)
+    return planned(read_text(file), file.name, file.parent, trials=trials, seed=seed, more=more)
 
 
-def planned(text: str, source: str, folder: Path, *, trials: int | None = None, seed: int | None = None) -> Plan:
+def planned(
+    text: str,
+    source: str,
+    folder: Path,
+    *,
+    trials: int | None = None,
+    seed: int | None = None,
+    more: Sequence[Method] = (),
+) -> Plan:
     """Return the plan of the text of a study file; `folder` is where its problem files are."""
     study = conform(StudyFile, parse_toml(text, source), source)
     new = {key: value for key, value in (("trials", trials), ("seed", seed)) if value is not None}
     study = study.model_copy(update=new)
     try:
         methods = [method for i, table in enumerate(study.method) for method in methods_of(table, i + 1)]
+        methods += more
         cases = []
         for table in study.scenario:
             # What the command line says holds for scenarios that have a number of their own, too.

@@ -1,0 +1,83 @@
+"""The leaderboard of the public test set as a page of Markdown: who is right how often, how fast, and on which data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optloc.study.folder import Manifest, read_frame, read_manifest
+from optloc.study.paired import paired
+from optloc.study.plan import Plan
+from optloc.study.summary import COLUMNS, judged, methods, wilson
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+SET = "bench"
+"""Name of the shipped study that is the test set."""
+
+_JUDGE = "truth"
+
+
+def page(folder: Path, plan: Plan) -> str:
+    """Return the leaderboard of a folder as Markdown.
+
+    Parameters
+    ----------
+    folder : Path
+        Output folder of a run of the test set.
+    plan : Plan
+        Its plan: tells which data these are.
+    """
+    rows, manifest = judged(read_frame(folder, COLUMNS)), read_manifest(folder)
+    # The judge knows the truth: it is compared with nobody.
+    ranked = rows[rows["method"].astype(str) != _JUDGE]
+    lines = ["---", "orphan: true", "---", "", "<!-- table -->", "", _about(manifest, plan), ""]
+    lines += [*_ranks(ranked), "", "Share of right answers by scene, %:", "", *_by_case(ranked)]
+    return "\n".join(lines)
+
+
+def _about(manifest: Manifest, plan: Plan) -> str:
+    return (
+        f"optloc {manifest.version}, {manifest.created[:10]}, test set {plan.data[:16]}, seed {manifest.seed}, "
+        f"{plan.cells[0].case.trials} trials a scene; {manifest.machine}."
+    )
+
+
+def _ranks(rows: pd.DataFrame) -> list[str]:
+    order = methods(rows)
+    first = order[0]
+    alone = dict.fromkeys(order, 0)
+    other = dict.fromkeys(order, 0)
+    for one in paired(rows, first):
+        alone[one.method] += one.alone
+        other[one.method] += one.other_alone
+    lines = [
+        f"| | method | right, % | 95 % | ok but wrong, % | median ms | alone right : {first} alone |",
+        "|---:|---|---:|---:|---:|---:|---:|",
+    ]
+    for place, name in enumerate(order, 1):
+        own = rows[rows["method"].astype(str) == name]
+        count = len(own)
+        low, high = wilson(float(own["right"].sum()), float(count))
+        duel = "" if name == first else f"{alone[name]} : {other[name]}"
+        shares = f"{100 * own['right'].mean():.2f} | {100 * float(low):.2f} to {100 * float(high):.2f}"
+        wrong, time = 100 * own["wrong"].mean(), 1e3 * float(np.median(own["seconds"]))
+        lines.append(f"| {place} | {_cell(name)} | {shares} | {wrong:.2f} | {time:.3g} | {duel} |")
+    return lines
+
+
+def _by_case(rows: pd.DataFrame) -> list[str]:
+    order = methods(rows)
+    wide = rows.pivot_table(index="case", columns="method", values="right", aggfunc="mean", observed=True)
+    lines = [f"| scene | {' | '.join(map(_cell, order))} |", f"|---|{'---:|' * len(order)}"]
+    for case, row in wide.iterrows():
+        lines.append(f"| {_cell(str(case))} | {' | '.join(f'{100 * row[name]:.1f}' for name in order)} |")
+    return lines
+
+
+def _cell(text: str) -> str:
+    """Return text as a cell of a table: names come from whoever ran the set."""
+    return "".join(f"\\{c}" if c in "\\|`*_<>[]" else c for c in text)

@@ -1,0 +1,114 @@
+"""Minimizers of others in a study: a function of a cost and a start, by its place on the command line, in no table.
+
+A study file cannot name one: only what the user has loaded as a plugin is found.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.registry import load_plugin, plugin_module
+from optloc.base.types import Array
+from optloc.linear.normal import weighed
+from optloc.problem.fix import Fix
+from optloc.problem.problem import Problem
+from optloc.study.baselines import BASELINES, Baseline, claim, whiten_one
+from optloc.study.draws import Drawn
+
+Cost = Callable[[Array], tuple[float, Array]]
+"""Returns the maximum-likelihood cost at a vector (size,) and its gradient (size,); SI units."""
+
+
+@dataclass(frozen=True, slots=True)
+class Minimizer:
+    """Fixes of a function that minimises, one by one.
+
+    Parameters
+    ----------
+    function : callable of (Cost, array (size,))
+        Returns the vector (size,) where it ends, as ``scipy.optimize.minimize(cost, start, jac=True).x`` does.
+    """
+
+    function: Callable[[Cost, Array], Array]
+
+    def __call__(self, drawn: Drawn, start: Array) -> Fix:
+        """Return the fixes; they claim to be answers wherever they are finite, and the study judges them."""
+        plain = weighed(drawn.problem)
+        x = np.array(start, dtype=float)
+        for i in range(len(x)):
+            x[i] = self.function(cost_of(plain.take(np.array([i]))), start[i].copy())
+        return claim(drawn.problem, start, x)
+
+
+def cost_of(one: Problem) -> Cost:
+    """Return the cost of a flat batch of one problem with its gradient."""
+    residual, jacobian = whiten_one(one)
+
+    def cost(x: Array) -> tuple[float, Array]:
+        r = residual(np.asarray(x, dtype=float))
+        return float(r @ r), np.asarray(2.0 * jacobian(np.asarray(x, dtype=float)).T @ r)
+
+    return cost
+
+
+def load_minimizer(name: str) -> None:
+    """Load ``FILE.py:FUNCTION`` or ``MODULE:FUNCTION``, which the user names, so that `baseline_of` finds it.
+
+    Raises
+    ------
+    InvalidProblem
+        Where there is no such file, module or function.
+    """
+    place, _, _ = name.rpartition(":")
+    load_plugin(place)
+    baseline_of(name)
+
+
+def baseline_of(name: str) -> Baseline:
+    """Return a baseline by its name, or a function of a plugin that is loaded as one.
+
+    Raises
+    ------
+    InvalidProblem
+        For an unknown name, and for a function of a file or a module that nobody has loaded.
+    """
+    if name in BASELINES:
+        return BASELINES[name]
+    place, _, word = name.rpartition(":")
+    module = plugin_module(place) if place else None
+    if module is None:
+        raise InvalidProblem(f"unknown baseline {name!r}", "baseline", nearest(name, list(BASELINES)))
+    function = getattr(module, word, None)
+    if not callable(function):
+        known = [each for each, value in vars(module).items() if callable(value) and not each.startswith("_")]
+        raise InvalidProblem(f"there is no function {word!r}", place, nearest(word, known))
+    if isinstance(function, Baseline):
+        return function
+    summary = (function.__doc__ or "a function of a plugin").partition("\n")[0]
+    return Baseline(Minimizer(function), summary, slow=True)
+
+
+def code_of(name: str) -> str:
+    """Return a digest of the file that a baseline of a plugin is written in; empty of optloc's own.
+
+    A method whose file has changed is another one: what was computed by the old one is not its result.
+    """
+    run = baseline_of(name).run
+    function = run.function if isinstance(run, Minimizer) else run
+    module = sys.modules.get(getattr(function, "__module__", None) or "")
+    if module is None or module.__name__.partition(".")[0] == "optloc":
+        return ""
+    return _digest(module)
+
+
+def _digest(module: ModuleType) -> str:
+    file = getattr(module, "__file__", None)
+    return "" if file is None else hashlib.blake2b(Path(file).read_bytes(), digest_size=8).hexdigest()
