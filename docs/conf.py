@@ -1,4 +1,4 @@
-"""Configuration of the documentation; nothing is fetched while it is built."""
+"""Configuration of the documentation; nothing is fetched while it is built or read."""
 
 import sys
 from importlib.metadata import version as installed_version
@@ -20,9 +20,12 @@ extensions = [
     "sphinx.ext.mathjax",
     "sphinx.ext.viewcode",
     "sphinx_gallery.gen_gallery",
+    "sphinx-mathjax-offline",  # MathJax and its fonts lie beside the pages
 ]
 exclude_patterns = ["_build", "examples"]
 html_theme = "furo"
+html_static_path = ["_static"]
+html_css_files = ["pages.css"]
 html_title = f"optloc {release}"
 
 myst_enable_extensions = ["colon_fence", "dollarmath", "deflist"]

@@ -1,0 +1,120 @@
+"""The pages of the documentation as they are built: they ask nobody for anything, draw all formulas, and fit a phone.
+
+Without OPTLOC_PAGES, the folder of built pages, a few of them are built here.
+"""
+
+import importlib.util
+import os
+import re
+import shutil
+import subprocess
+import sys
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from doc_pages import DOCS
+from report.browser import Browser, executable
+
+# Links that a reader follows are no requests; everything that a browser fetches by itself is.
+FETCHED = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src", "embed": "src"}
+NEEDED = ("sphinx", "furo", "myst_parser", "numpydoc", "sphinx_gallery", "sphinx-mathjax-offline")
+FEW = ("how-to-choose.md", "theory/squared_range.md", "howto/formats.md")
+PHONE = 390
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory):
+    if given := os.environ.get("OPTLOC_PAGES"):
+        return Path(given)
+    if lacking := [name for name in NEEDED if importlib.util.find_spec(name) is None]:
+        pytest.skip(f"{', '.join(lacking)} is not installed: pip install 'optloc[docs]'")
+    folder = tmp_path_factory.mktemp("docs")
+    for name in ("conf.py", "generated.py", "scraper.py", "_static", "measured", *FEW):
+        place = folder / name
+        place.parent.mkdir(exist_ok=True)
+        (shutil.copytree if (DOCS / name).is_dir() else shutil.copy)(DOCS / name, place)
+    (folder / "index.md").write_text("# optloc\n\n```{toctree}\n" + "\n".join(n[:-3] for n in FEW) + "\n```\n")
+    # Without the gallery, whose examples run, and the sources of all modules.
+    settings = "extensions=myst_parser,sphinx.ext.mathjax,sphinx-mathjax-offline"
+    command = [sys.executable, "-m", "sphinx", "-q", "-D", settings, str(folder), str(folder / "html")]
+    subprocess.run(command, check=True, capture_output=True, timeout=120)
+    return folder / "html"
+
+
+def found(pages):
+    return sorted(path for path in pages.rglob("*.html") if "_static" not in path.parts)
+
+
+class Fetches(HTMLParser):
+    """Notes what a page fetches."""
+
+    def __init__(self):
+        super().__init__()
+        self.places = []
+
+    def handle_starttag(self, tag, attrs):
+        known = dict(attrs)
+        # a link to another form of the page is for machines that look for it
+        if tag in FETCHED and known.get("rel") not in ("canonical", "author", "license"):
+            self.places.append(known.get(FETCHED[tag]) or "")
+            self.places += (known.get("srcset") or "").split()
+
+
+def is_foreign(place):
+    return re.match(r"(?:[a-z]+:)?//", place.strip("'\" "), re.IGNORECASE) is not None
+
+
+def test_no_page_fetches_anything_from_elsewhere(pages):
+    foreign, formulas = [], 0
+    for path in found(pages):
+        text, parser = path.read_text(encoding="utf-8"), Fetches()
+        parser.feed(text)
+        foreign += [f"{path.name}: {place}" for place in parser.places if is_foreign(place)]
+        foreign += [f"{path.name}: {place}" for place in in_style(text) if is_foreign(place)]
+        if 'class="math' in text:
+            formulas += 1
+            assert any("mathjax/tex-chtml.js" in place for place in parser.places), path.name
+    for path in pages.rglob("*.css"):
+        text = path.read_text(encoding="utf-8", errors="replace")
+        foreign += [f"{path.name}: {place}" for place in in_style(text) if is_foreign(place)]
+    assert foreign == []
+    assert formulas
+    assert (
+        pages / "_static" / "mathjax" / "output" / "chtml" / "fonts" / "woff-v2" / "MathJax_Main-Regular.woff"
+    ).exists()
+
+
+def in_style(text):
+    """Return what url() and @import name."""
+    found = re.findall(r"url\(\s*['\"]?([^'\")]{1,200})", text)
+    return found + re.findall(r"@import\s+['\"]([^'\"]+)", text)
+
+
+def test_the_test_sees_what_is_fetched():
+    parser = Fetches()
+    parser.feed('<script src="https://a.b/c.js"></script><a href="https://d.e"></a><img src="_images/x.png">')
+    assert [place for place in parser.places if is_foreign(place)] == ["https://a.b/c.js"]
+    assert in_style("a{src:url( 'https://f.g/h.woff')} @import \"//i.j/k.css\";") == [
+        "https://f.g/h.woff",
+        "//i.j/k.css",
+    ]
+    assert is_foreign("//i.j/k.css")
+    assert not is_foreign("data:image/svg+xml,<svg xmlns='http://www.w3.org/2000/svg'>")
+
+
+@pytest.mark.skipif(executable() is None, reason="there is no browser")
+def test_a_browser_draws_all_formulas_and_a_phone_shows_all_of_a_page(pages):
+    wide = []
+    with Browser() as browser:
+        for path in found(pages):
+            browser.open(path, PHONE, 800, phone=True)
+            if browser.run("document.querySelectorAll('.math').length"):
+                browser.run("MathJax.startup.promise.then(() => document.fonts.ready).then(() => 0)")
+                undrawn = "[...document.querySelectorAll('.math')].filter(m => !m.querySelector('mjx-container'))"
+                assert browser.run(f"{undrawn}.length") == 0, path.name
+                assert browser.run("document.querySelectorAll('mjx-merror').length") == 0, path.name
+            reach = browser.run("document.documentElement.scrollWidth")
+            wide += [f"{path.name}: {reach}"] if reach > PHONE else []
+        assert {url.partition(":")[0] for url in browser.requests} == {"file"}
+    assert wide == []
