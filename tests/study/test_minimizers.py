@@ -138,11 +138,11 @@ def test_pairs_count_who_is_right_alone(folder):
 
 def test_the_public_test_set_has_a_leaderboard(mine, tmp_path):
     page = tmp_path / "board.md"
-    words = ["study", "bench", "--trials", "3", "-j", "1", "--quiet", "--page", str(page)]
+    words = ["study", "bench", "--trials", "2", "-j", "1", "--quiet", "--page", str(page)]
     done = RUN.invoke(app, [*words, "--out", str(tmp_path / "out"), "--method", f"{mine}:bfgs"])
     assert done.exit_code == 0, done.output
     text = page.read_text()
-    assert "3 trials a scene" in text
+    assert "2 trials a scene" in text
     ranks = [line.split("|")[2].strip() for line in text.splitlines() if line.startswith("| ") and line[2:3].isdigit()]
     assert set(ranks) >= {"auto", "gtrs+lsr", "bfgs"}
     assert "truth" not in ranks

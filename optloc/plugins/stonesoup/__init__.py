@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from optloc.plugins.stonesoup.initiator import FixInitiator
+from optloc.plugins.stonesoup.initiator import FixInitiator, mixture_state
 from optloc.plugins.stonesoup.models import (
     AOATDOA,
     FDOA,
     GROA,
     TDOA,
     TDOAFDOA,
+    AnyRows,
     PairFeeder,
     RangeRate,
     RateMeasurement,
@@ -28,12 +29,14 @@ __all__ = [
     "GROA",
     "TDOA",
     "TDOAFDOA",
+    "AnyRows",
     "FixInitiator",
     "PairFeeder",
     "RangeRate",
     "RateMeasurement",
     "StationMeasurement",
     "arrival_covariance",
+    "mixture_state",
     "register_yaml",
 ]
 
@@ -46,7 +49,9 @@ def register_yaml(yaml: Any) -> None:
     yaml : ruamel.yaml.YAML
         Given by Stone Soup, which finds this function by the entry point ``stonesoup.serialise.yaml``.
     """
-    classes = {cls.__name__: cls for cls in (TDOA, GROA, AOATDOA, RangeRate, FDOA, TDOAFDOA, FixInitiator, PairFeeder)}
+    classes = {
+        cls.__name__: cls for cls in (TDOA, GROA, AOATDOA, RangeRate, FDOA, TDOAFDOA, AnyRows, FixInitiator, PairFeeder)
+    }
 
     # Stone Soup writes the module of a class into its tag; the class alone is read, so files outlive moves.
     def construct(constructor: Any, suffix: str, node: Any) -> Any:

@@ -26,6 +26,7 @@ from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Motion, Status
 from optloc.linear.evaluate import predict
 from optloc.linear.normal import linearise
+from optloc.models import MODELS, kind_named
 from optloc.problem.build import assemble, measured, station_array
 from optloc.problem.noise import Block, arrivals, group
 from optloc.problem.problem import Problem
@@ -69,6 +70,9 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
     """
 
     stations: np.ndarray = Property(doc="Positions (s, d) of the stations, metres.")
+    translation_offset: StateVector | None = Property(
+        default=None, doc="Where the origin of these positions is (d, 1), such as a platform's place; by default zero."
+    )
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -78,6 +82,9 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
         if self.stations.ndim != 2 or self.stations.shape[1] != len(self.mapping):
             what = f"stations have shape {self.stations.shape} and {len(self.mapping)} coordinates are mapped"
             raise InvalidProblem(what, "stations", "give an array (stations, 2 or 3)")
+        if self.translation_offset is not None and np.size(self.translation_offset) != len(self.mapping):
+            what = f"the offset has shape {np.shape(self.translation_offset)} for {len(self.mapping)} coordinates"
+            raise InvalidProblem(what, "translation_offset", "give one number for each coordinate")
         if np.shape(self.noise_covar) != (self.ndim_meas, self.ndim_meas):
             what = f"the covariance has shape {np.shape(self.noise_covar)} for {self.ndim_meas} rows"
             raise InvalidProblem(what, "noise_covar", "give one row and column for each row of the measurement")
@@ -93,6 +100,12 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
         return len(self.rows)
 
     @property
+    def sites(self) -> Array:
+        """Return where the stations are (s, d): their positions from the translation offset on."""
+        offset = self.translation_offset
+        return self.stations if offset is None else self.stations + np.asarray(offset, dtype=float).ravel()
+
+    @property
     def places(self) -> list[int]:
         """Return the places in the state of what the measurement depends on: the position."""
         return list(self.mapping)
@@ -102,7 +115,7 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
         """Return the velocities (s, d) of the stations, metres per second, where they matter."""
         return None
 
-    @clearable_cached_property("stations", "noise_covar")  # type: ignore[untyped-decorator]
+    @clearable_cached_property("stations", "translation_offset", "noise_covar")  # type: ignore[untyped-decorator]
     def problem(self) -> Problem:
         """Return the optloc problem of one measurement: an unknown position, values of zero."""
         return self._posed(Motion())
@@ -110,7 +123,7 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
     def _posed(self, motion: Motion) -> Problem:
         rates = None if self.rates is None else self.rates[None]
         covariance = np.asarray(self.noise_covar, dtype=float)
-        return problem_of(self.stations[None], [self.rows], [covariance], velocity=rates, motions=(motion,))
+        return problem_of(self.sites[None], [self.rows], [covariance], velocity=rates, motions=(motion,))
 
     def function(self, state: Any, noise: Any = False, **kwargs: Any) -> Any:
         """Return the measurement (m, 1) of a state, or (m, N) of N of them, with noise if wanted."""
@@ -128,19 +141,23 @@ class StationMeasurement(NonLinearGaussianMeasurement, ReversibleModel, ABC):  #
         return out
 
     def inverse_function(self, detection: Any, **kwargs: Any) -> Any:
-        """Return the state (n, 1) of which `places` fit a detection best, found without a guess; zeros elsewhere.
+        """Return the state (n, 1) whose `places` fit a detection best, found without a guess; zeros elsewhere.
+
+        Of a detection with several measurements (m, N) it returns their states (n, N), each found by itself.
 
         Raises
         ------
         NotImplementedError
-            Where the detection has no clean fix of its own; initiators of Stone Soup can skip such ones.
+            Where one has no clean fix of its own; initiators of Stone Soup can skip such ones.
         """
-        fix = solve(self.problem.with_rows(z=values_of(detection)[self.order]))
-        if not bool(fix.answered) or bool(fix.has(*_NOT_ONE_PLACE)):
-            raise NotImplementedError(Status(int(fix.code)).sentence)
-        out = np.zeros((self.ndim_state, 1))
-        out[self.places, 0] = fix.x
-        return out.view(StateVector)
+        z = np.asarray(detection.state_vector, dtype=float)[self.order].T
+        fix = solve(self.problem.with_rows(z=z if len(z) > 1 else z[0])).flat()
+        bad = np.flatnonzero(~fix.answered | fix.has(*_NOT_ONE_PLACE))
+        if len(bad):
+            raise NotImplementedError(Status(int(fix.code[bad[0]])).sentence)
+        out = np.zeros((self.ndim_state, len(z)))
+        out[self.places] = fix.x.T
+        return out.view(StateVector if len(z) == 1 else StateVectors)
 
     def rvs(self, num_samples: int = 1, **kwargs: Any) -> Any:
         """Return samples (m, N) of the noise."""
@@ -235,9 +252,14 @@ class RateMeasurement(StationMeasurement, ABC):
         if self.velocities is not None and self.velocities.shape != self.stations.shape:
             what = f"velocities have shape {self.velocities.shape}, stations {self.stations.shape}"
             raise InvalidProblem(what, "velocities", "give one for each station")
-        if len(self.places) != 2 * len(self.mapping) or max(self.places) >= self.ndim_state:
+        if self.moving and (len(self.places) != 2 * len(self.mapping) or max(self.places) >= self.ndim_state):
             what = f"the velocity is at {self.places[len(self.mapping) :]} of a state of {self.ndim_state}"
             raise InvalidProblem(what, "velocity_mapping", "name the places of the velocity")
+
+    @property
+    def moving(self) -> bool:
+        """Return whether any row depends on velocities."""
+        return True
 
     @property
     def places(self) -> list[int]:
@@ -250,7 +272,7 @@ class RateMeasurement(StationMeasurement, ABC):
         """Return the velocities (s, d) of the stations."""
         return np.zeros_like(self.stations) if self.velocities is None else self.velocities
 
-    @clearable_cached_property("stations", "noise_covar", "velocities")  # type: ignore[untyped-decorator]
+    @clearable_cached_property("stations", "translation_offset", "noise_covar", "velocities")  # type: ignore[untyped-decorator]
     def problem(self) -> Problem:
         """Return the optloc problem of one measurement: an unknown position and velocity, values of zero."""
         return self._posed(Motion(1))
@@ -287,6 +309,41 @@ class TDOAFDOA(RateMeasurement):
     def rows(self) -> Sequence[Row]:
         """Return kind and stations of each row."""
         return [(kind, int(a), int(b)) for kind in ("tdoa", "fdoa") for a, b in np.atleast_2d(self.pairs)]
+
+
+class AnyRows(RateMeasurement):
+    """Any mixture of kinds in one measurement, with one inverse of all of them together.
+
+    Stone Soup's combined model of several sums their inverses, which is a state of none: name the rows here instead.
+    Elements follow `optloc.MODELS`: metres, radians, ratios, metres per second.
+    """
+
+    table: Sequence[Row] = Property(doc="Kind, first and second station of each row; -1 where a kind takes none.")
+
+    @property
+    def rows(self) -> Sequence[Row]:
+        """Return kind and stations of each row."""
+        return [(kind_named(str(kind), "table"), int(a), int(b)) for kind, a, b in self.table]
+
+    @property
+    def moving(self) -> bool:
+        """Return whether any row depends on velocities."""
+        return any(MODELS[kind].velocity for kind, _, _ in self.rows)
+
+    @property
+    def places(self) -> list[int]:
+        """Return the places in the state of the position and, where a row depends on it, of the velocity."""
+        return super().places if self.moving else list(self.mapping)
+
+    @property
+    def rates(self) -> Array | None:
+        """Return the velocities (s, d) of the stations, where they matter."""
+        return super().rates if self.moving else None
+
+    @clearable_cached_property("stations", "translation_offset", "noise_covar", "velocities", "table")  # type: ignore[untyped-decorator]
+    def problem(self) -> Problem:
+        """Return the optloc problem of one measurement: an unknown position, or position and velocity."""
+        return self._posed(Motion(int(self.moving)))
 
 
 def values_of(detection: Any) -> Array:
