@@ -1,0 +1,118 @@
+r"""Metric upgrade: the affine image of a network becomes the network, from the side of the stations or of the pulses.
+
+A fit of small rank (:mod:`formulations.low_rank_network`) knows :math:`\alpha_i + \beta_j + o_j^2 + u_i^\top v_j =
+|a_i - y_j|^2`. With :math:`u` centred and white, :math:`a_i = T^\top u_i`, :math:`y_j = -T^{-1} (v_j + h)/2` and
+:math:`H = T T^\top`, :math:`K = H^{-1}`,
+
+.. math::
+   \alpha_i = u_i^\top H u_i + u_i^\top h + c, \qquad
+   \beta_j + o_j^2 = \tfrac14 v_j^\top K v_j + \tfrac12 v_j^\top K h + c'
+
+are each linear: in (H, h, c) for enough stations, in (K, K h, c') for enough pulses, and exact without noise. Noise can
+make H or K indefinite along the thinnest axis; its eigenvalues are then kept above a share of the largest, of which
+several are tried.
+
+Sources: the rank condition is that of M. Pollefeys and D. Nister, "Direct computation of sound and microphone locations
+from time-difference-of-arrival data", Proc. ICASSP 2008; the upgrade from stations is in M. Crocco, A. Del Bue and V.
+Murino, "A bilinear approach to the position self-calibration of multiple sensors", IEEE Trans. Signal Process. 60
+(2012), section IV.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from formulations.algebra import Array
+from formulations.low_rank_network import LowRank
+
+# Least share of the largest eigenvalue: a network all but flat, one like a hall, and one like a cube.
+_FLOORS = (1e-3, 5e-2, 0.3)
+# Singular values below this share of the largest are directions that the side leaves open.
+_OPEN = 1e-9
+
+
+def unknowns(d: int) -> int:
+    """Return how many stations, or pulses, a side needs: the entries of H, h and c in d dimensions."""
+    return d * (d + 1) // 2 + d + 1
+
+
+def upgrade(fit: LowRank) -> tuple[Array, Array, Array]:
+    """Return places of stations and pulses of one dimensionless fit after another.
+
+    Parameters
+    ----------
+    fit : LowRank
+        S fits of M stations and N pulses.
+
+    Returns
+    -------
+    stations : array (C, M, d)
+        Candidates, from each side that has enough points and with each floor; centred.
+    pulses : array (C, N, d)
+        Likewise.
+    which : int array (C,)
+        Fit that each comes from.
+    """
+    found: list[tuple[Array, Array, int]] = []
+    for s in range(len(fit.cost)):
+        u, v, alpha, square = _white(fit, s)
+        for H, h in _sides(u, v, alpha, square):
+            T = np.linalg.cholesky(H)
+            found.append((u @ T, -0.5 * np.linalg.solve(T, (v + h).T).T, s))
+    d = fit.stations.u.shape[-1]
+    m, n = fit.stations.alpha.shape[1], fit.pulses.beta.shape[1]
+    kept = [one for one in found if np.isfinite(one[0]).all() and np.isfinite(one[1]).all()]
+    return (
+        np.array([one[0] for one in kept]).reshape(-1, m, d),
+        np.array([one[1] for one in kept]).reshape(-1, n, d),
+        np.array([one[2] for one in kept], dtype=np.int64),
+    )
+
+
+def _white(fit: LowRank, s: int) -> tuple[Array, Array, Array, Array]:
+    """Return centred and white stations, pulses that go with them, and what squares they have."""
+    u, v = fit.stations.u[s], fit.pulses.v[s]
+    middle = u.mean(axis=0)
+    centred = u - middle
+    width, axes = np.linalg.eigh(centred.T @ centred / len(u))
+    root = axes * np.sqrt(np.maximum(width, _OPEN**2 * width[-1]))
+    beta = fit.pulses.beta[s] + v @ middle
+    return np.linalg.solve(root, centred.T).T, v @ root, fit.stations.alpha[s], beta + fit.pulses.o[s] ** 2
+
+
+def _sides(u: Array, v: Array, alpha: Array, square: Array) -> list[tuple[Array, Array]]:
+    """Return candidates for H and h."""
+    d, out = u.shape[1], []
+    if len(u) >= unknowns(d):
+        H, h = _quadric(u, alpha)
+        out += [(positive, h) for positive in _positive(H)]
+    if len(v) >= unknowns(d):
+        # 4 K and 2 K h of a quadric in v; pulses may be far: lengths of their own
+        length = np.sqrt(np.mean(v * v))
+        K, Kh = _quadric(v / length, square)
+        K, Kh = 4.0 * K / length**2, 2.0 * Kh / length
+        for positive in _positive(K):
+            H = np.linalg.inv(positive)
+            out.append((0.5 * (H + H.T), H @ Kh))
+    return out
+
+
+def _quadric(x: Array, value: Array) -> tuple[Array, Array]:
+    """Fit ``x'Qx + x'q + constant`` to values: Q (d, d) and q (d,)."""
+    d = x.shape[1]
+    i, k = np.triu_indices(d)
+    columns = np.concatenate([x[:, i] * x[:, k] * np.where(i == k, 1.0, 2.0), x, np.ones((len(x), 1))], axis=1)
+    found = np.linalg.lstsq(columns, value, rcond=_OPEN)[0]
+    Q = np.zeros((d, d))
+    Q[i, k] = Q[k, i] = found[: len(i)]
+    return Q, found[len(i) : len(i) + d]
+
+
+def _positive(Q: Array) -> list[Array]:
+    """Return matrices with eigenvalues kept above each floor; one where none is below."""
+    width, axes = np.linalg.eigh(Q)
+    largest = np.abs(width).max()
+    if not np.isfinite(largest) or largest <= 0.0:
+        return []
+    floors = _FLOORS[:1] if width[0] >= _FLOORS[-1] * largest else _FLOORS
+    return [(axes * np.maximum(width, f * largest)) @ axes.T for f in floors]
