@@ -1,0 +1,257 @@
+"""A network whose stations, clocks and emitters are unknown together: what was measured, and what is known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.arrays import numbers
+from optloc.base.types import Array
+from optloc.models import MODELS, kind_named
+
+CLOCKED = ("toa", "tdoa")
+"""Kinds that a station's clock enters; a two-way range has none."""
+
+KINDS = (*CLOCKED, "range")
+"""Kinds of rows between stations and pulses."""
+
+
+@dataclass(frozen=True, slots=True)
+class Slot:
+    """Which stations measure what: one column of the table of measurements.
+
+    Parameters
+    ----------
+    kind : str
+        "toa", "tdoa" or "range".
+    a, b : int
+        Stations; `b` is -1 where the kind takes one.
+    """
+
+    kind: str
+    a: int
+    b: int = -1
+
+
+@dataclass(frozen=True, slots=True)
+class Network:
+    """Measurements between stations and pulses, none of whose places need be known.
+
+    Parameters
+    ----------
+    names : tuple of M str
+        Stations.
+    slots : tuple of R Slot
+        Columns of `z`.
+    z : array (N, R)
+        Measured values of N pulses, metres (times multiplied by the speed of propagation).
+    sigma : array (N, R)
+        Standard deviations, metres; infinite where nothing was measured.
+    place : array (M, d)
+        What is known of the stations' places, metres.
+    place_sigma : array (M, d)
+        Its standard deviations: infinite where a coordinate is free, zero where it is known.
+    synchronised : bool
+        Whether the stations share a clock; else each has an unknown offset.
+    between : int array (q, 2)
+        Pairs of stations whose distance was measured.
+    distance, distance_sigma : array (q,)
+        That distance and its standard deviation, metres.
+    labels : tuple of N str
+        Names of the pulses.
+    """
+
+    names: tuple[str, ...]
+    slots: tuple[Slot, ...]
+    z: Array
+    sigma: Array
+    place: Array
+    place_sigma: Array
+    synchronised: bool
+    between: Array
+    distance: Array
+    distance_sigma: Array
+    labels: tuple[str, ...]
+
+    @property
+    def dimension(self) -> int:
+        """Return 2 or 3."""
+        return int(self.place.shape[1])
+
+    @property
+    def stations(self) -> int:
+        """Return the number of stations, M."""
+        return len(self.names)
+
+    @property
+    def pulses(self) -> int:
+        """Return the number of pulses, N."""
+        return int(self.z.shape[0])
+
+    @property
+    def given(self) -> Array:
+        """Return which entries of `z` were measured, (N, R)."""
+        return np.isfinite(self.sigma)
+
+    @property
+    def emission(self) -> Array:
+        """Return which pulses have an unknown time of emission, (N,)."""
+        emitting = np.array([MODELS[slot.kind].emission for slot in self.slots])
+        return np.asarray((self.given & emitting).any(axis=1))
+
+    @property
+    def rows(self) -> int:
+        """Return how many numbers were measured or known before, exact ones not counted."""
+        soft = np.isfinite(self.place_sigma) & (self.place_sigma > 0.0)
+        return int(self.given.sum() + len(self.distance) + soft.sum())
+
+    @property
+    def unknowns(self) -> int:
+        """Return how many numbers are sought, the frame included."""
+        free = int((self.place_sigma > 0.0).sum())
+        clocks = 0 if self.synchronised else self.stations
+        return free + clocks + self.pulses * self.dimension + int(self.emission.sum())
+
+    def take(self, pulses: Array) -> Network:
+        """Return the network of some pulses (mask or indices)."""
+        labels = tuple(np.array(self.labels, dtype=object)[pulses])
+        return Network(
+            self.names,
+            self.slots,
+            self.z[pulses],
+            self.sigma[pulses],
+            self.place,
+            self.place_sigma,
+            self.synchronised,
+            self.between,
+            self.distance,
+            self.distance_sigma,
+            labels,
+        )
+
+
+def network(
+    z: Any,
+    sigma: Any,
+    *,
+    kind: str = "toa",
+    pairs: Sequence[tuple[int, int]] | None = None,
+    names: Sequence[str] | None = None,
+    dimension: int = 3,
+    place: Any = None,
+    place_sigma: Any = None,
+    synchronised: bool = True,
+    distances: Sequence[tuple[int, int, float, float]] = (),
+    labels: Sequence[str] | None = None,
+) -> Network:
+    """Return a network of one kind of measurements.
+
+    Parameters
+    ----------
+    z : array (N, M), or (N, R) with `pairs`
+        Arrival times times the speed of propagation (or ranges) of N pulses at M stations, metres; NaN where there is
+        none.
+    sigma : float or array like `z`
+        Standard deviations, metres.
+    kind : str
+        "toa" (unknown time of emission), "range" (two-way) or, with `pairs`, "tdoa".
+    pairs : sequence of (a, b), optional
+        Stations of each column of differences ``r_a - r_b``.
+    names : sequence of M str, optional
+        Stations; "A1", "A2" and so on by default.
+    dimension : 2 or 3
+        Of space.
+    place, place_sigma : array (M, d), optional
+        What is known of the stations' places, metres: sigma zero is exact, infinite (or a place that is NaN) is free.
+        By default everything is.
+    synchronised : bool
+        Whether the stations share a clock.
+    distances : sequence of (a, b, distance, sigma)
+        Measured distances between stations, metres.
+    labels : sequence of N str, optional
+        Names of the pulses.
+
+    Returns
+    -------
+    Network
+        To be given to `calibrate`.
+
+    Raises
+    ------
+    InvalidProblem
+        Naming the argument that cannot be right.
+    """
+    kind = kind_named(kind)
+    if kind not in KINDS:
+        raise InvalidProblem(f"networks have no rows of kind {kind!r}", "kind", nearest(kind, list(KINDS)))
+    if (kind == "tdoa") != (pairs is not None):
+        raise InvalidProblem("pairs of stations belong to time differences", "pairs", 'give them with kind="tdoa"')
+    values = np.asarray(numbers(np.where(np.isnan(z := np.asarray(z, dtype=float)), 0.0, z), "z"))
+    if values.ndim != 2 or not values.size:
+        raise InvalidProblem(f"the measurements have shape {values.shape}", "z", "give one line a pulse")
+    count = values.shape[1] if pairs is None else 1 + max(max(pair) for pair in pairs)
+    names = tuple(names) if names is not None else tuple(f"A{i + 1}" for i in range(count))
+    if pairs is None:
+        slots = tuple(Slot(kind, i) for i in range(values.shape[1]))
+    else:
+        slots = tuple(Slot(kind, int(a), int(b)) for a, b in pairs)
+    deviations = np.where(np.isnan(z), np.inf, np.broadcast_to(np.asarray(sigma, dtype=float), values.shape))
+    free = np.full((len(names), dimension), np.nan)
+    known = free if place is None else np.asarray(place, dtype=float)
+    if place_sigma is None:
+        place_sigma = np.where(np.isnan(known), np.inf, 0.0)
+    spread = np.where(np.isnan(known), np.inf, np.broadcast_to(np.asarray(place_sigma, dtype=float), known.shape))
+    made = Network(
+        names,
+        slots,
+        values,
+        deviations,
+        np.where(np.isnan(known), 0.0, known),
+        spread,
+        synchronised,
+        np.array([[a, b] for a, b, _, _ in distances], dtype=np.int64).reshape(-1, 2),
+        np.array([d for _, _, d, _ in distances], dtype=float),
+        np.array([s for _, _, _, s in distances], dtype=float),
+        tuple(labels) if labels is not None else tuple(str(j) for j in range(len(values))),
+    )
+    return checked(made)
+
+
+def checked(made: Network) -> Network:
+    """Return a network whose parts fit together.
+
+    Raises
+    ------
+    InvalidProblem
+        Naming the part that does not.
+    """
+    m, (n, r) = made.stations, made.z.shape
+    if made.dimension not in (2, 3):
+        raise InvalidProblem(f"a network has {made.dimension} dimensions", "dimension", "give 2 or 3")
+    if len(set(made.names)) < m:
+        twice = next(name for i, name in enumerate(made.names) if name in made.names[:i])
+        raise InvalidProblem(f"station name {twice!r} is used twice", "names", "rename one of them")
+    if len(made.slots) != r or len(made.labels) != n or made.sigma.shape != (n, r):
+        raise InvalidProblem("measurements, deviations and labels differ in number", "z", "give one for each")
+    ends = np.array([[slot.a, slot.b] for slot in made.slots]).reshape(-1, 2)
+    two = np.array([MODELS[slot.kind].stations == 2 for slot in made.slots])
+    if (ends[:, 0] < 0).any() or (ends >= m).any() or (ends[two, 1] < 0).any() or (ends[:, 0] == ends[:, 1]).any():
+        raise InvalidProblem("a row names a station that is not there", "pairs", f"give two of 0 to {m - 1}")
+    if np.isnan(made.sigma).any() or (made.sigma <= 0.0).any():
+        raise InvalidProblem("a standard deviation is not positive", "sigma", "give metres above zero")
+    if made.place.shape != (m, made.dimension) or made.place_sigma.shape != made.place.shape:
+        raise InvalidProblem(f"places have shape {made.place.shape}", "place", f"give ({m}, {made.dimension})")
+    if np.isnan(made.place_sigma).any() or (made.place_sigma < 0.0).any() or not np.isfinite(made.place).all():
+        raise InvalidProblem("a place or its deviation is no number", "place_sigma", "give zero, metres or infinity")
+    b = made.between
+    if len(b) and ((b < 0).any() or (b >= m).any() or (b[:, 0] == b[:, 1]).any()):
+        raise InvalidProblem("a distance names a station that is not there", "distances", f"give two of 0 to {m - 1}")
+    if (made.distance < 0.0).any() or not np.isfinite(made.distance).all():
+        raise InvalidProblem("a distance between stations is not positive", "distances", "give metres")
+    if not np.isfinite(made.distance_sigma).all() or (made.distance_sigma <= 0.0).any():
+        raise InvalidProblem("a distance has no deviation", "distances", "give metres above zero")
+    return made

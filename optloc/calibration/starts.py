@@ -1,0 +1,301 @@
+"""Where networks may be, without a guess: fits of low rank and random places, refined until three starts agree."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+
+from formulations.low_rank_network import fit_low_rank, random_stations
+from formulations.metric_upgrade import unknowns, upgrade
+from optloc.base.types import Array
+from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, together
+from optloc.calibration.network import Network
+from optloc.solvers.policy import equal_cost
+
+# Starts at a time: a batch of eight costs little more than one.
+_LOW_RANK, _RANDOM = 8, 4
+# Fits whose relaxed cost is within this factor of the best are refined: the relaxation weighs errors otherwise than the
+# likelihood does, so that its best need not lead to the best.
+_NEARLY = 2.0
+# Steps of a refinement in the free network, before it is laid over what is known.
+_ROUGH = 15
+# Orientations from which a network is laid over known places, and the steps of that.
+_TURNS, _LAID = 24, 12
+# Share of the spread by which what is known exactly may be missed while a network is laid over it.
+_LOOSE = 1e-4
+
+
+@dataclass(frozen=True, slots=True)
+class Ends:
+    """Minima that starts arrived at.
+
+    Parameters
+    ----------
+    at : Estimate
+        S minima.
+    cost : array (S,)
+        Their costs.
+    start : int array (S,)
+        Number of the start that each comes from.
+    """
+
+    at: Estimate
+    cost: Array
+    start: Array
+
+    def agreeing(self, cost: float) -> int:
+        """Return how many starts arrived at a cost."""
+        # a hundredth is a tenth of a sigma of one number: nobody can tell such minima apart
+        return len(np.unique(self.start[self.cost <= cost + 0.01 + equal_cost(cost)]))
+
+
+def arrivals(network: Network) -> tuple[Array, Array, Array]:
+    """Return what each pulse measured as one number a station.
+
+    Parameters
+    ----------
+    network : Network
+        What was measured.
+
+    Returns
+    -------
+    z, weight : array (N, M)
+        Arrivals or ranges, and their inverse standard deviations, zero where there is none. Differences become arrivals
+        by least squares, up to a number that no difference tells.
+    emission : bool array (N,)
+        Whether a pulse has an unknown offset.
+    """
+    n, m = network.pulses, network.stations
+    z, weight, emission = np.zeros((n, m)), np.zeros((n, m)), np.ones(n, dtype=bool)
+    kinds = np.array([slot.kind for slot in network.slots])
+    ends = np.array([[slot.a, slot.b] for slot in network.slots])
+    for j in range(n):
+        given = network.given[j]
+        for kind in ("toa", "range", "tdoa"):
+            rows = np.flatnonzero(given & (kinds == kind))
+            if rows.size:
+                values, deviation = network.z[j, rows], network.sigma[j, rows]
+                told = _of_differences if kind == "tdoa" else _of_stations
+                z[j], weight[j] = told(ends[rows], values, 1.0 / deviation**2, m)
+                emission[j] = kind != "range"
+                break
+    return z, weight, emission
+
+
+def _of_stations(ends: Array, values: Array, weight: Array, m: int) -> tuple[Array, Array]:
+    total, sums = np.zeros(m), np.zeros(m)
+    np.add.at(total, ends[:, 0], weight)
+    np.add.at(sums, ends[:, 0], weight * values)
+    return np.divide(sums, total, out=np.zeros(m), where=total > 0.0), np.sqrt(total)
+
+
+def _of_differences(ends: Array, values: Array, weight: Array, m: int) -> tuple[Array, Array]:
+    """Return the arrivals of the largest group of stations that differences link, up to a number."""
+    linked = np.zeros((m, m))
+    np.add.at(linked, (ends[:, 0], ends[:, 1]), weight)
+    _, group = connected_components(linked, directed=False)
+    largest = np.bincount(group).argmax()
+    inside = group[ends[:, 0]] == largest
+    design = np.zeros((len(ends), m))
+    design[np.arange(len(ends)), ends[:, 0]], design[np.arange(len(ends)), ends[:, 1]] = 1.0, -1.0
+    design, values, weight = design[inside], values[inside], weight[inside]
+    found = np.linalg.lstsq(design * np.sqrt(weight)[:, None], values * np.sqrt(weight), rcond=None)[0]
+    total = (np.abs(design) * weight[:, None]).sum(axis=0)
+    return np.where(group == largest, found, 0.0), np.where(group == largest, np.sqrt(total / 2.0), 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Starts:
+    """Starts of one network: see `rounds`."""
+
+    lik: Likelihood
+    z: Array
+    weight: Array
+    emission: Array
+    shift: Array
+    spread: float
+    rng: np.random.Generator
+
+    @property
+    def dimension(self) -> int:
+        """Return 2 or 3."""
+        return self.lik.network.dimension
+
+    def low_rank(self, count: int) -> tuple[Estimate, Array]:
+        """Return networks from fits of low rank, and which of `count` starts each comes from."""
+        net, d = self.lik.network, self.dimension
+        full = (self.weight > 0.0).sum(axis=1) >= d + 3
+        relative = self.weight / self.weight.max()
+        begun = random_stations(self.rng, count, net.stations, d)
+        z = (self.z - self.shift[:, None]) / self.spread
+        fit = fit_low_rank(
+            z[full], relative[full], self.emission[full], begun, clocks=not net.synchronised
+        )
+        keep = np.flatnonzero(fit.cost <= _NEARLY * np.nanmin(fit.cost))
+        # starts that found the same fit lead to the same network
+        order = keep[np.argsort(fit.cost[keep], kind="stable")]
+        new = np.diff(fit.cost[order], prepend=-1.0) > 1e-6 * fit.cost[order] + 1e-24
+        family = np.zeros(count, dtype=int) - 1
+        family[order] = np.cumsum(new) - 1
+        stations, pulses, which = upgrade(fit.take(order[new]))
+        if not len(which):
+            return _nothing(net), np.zeros(0, dtype=int)
+        b = fit.stations.b[order[new]][which] * self.spread
+        places = np.zeros((len(which), net.pulses, d))
+        places[:, full] = pulses * self.spread
+        places[:, ~full] = stations.mean(axis=1, keepdims=True) * self.spread
+        offsets = np.zeros((len(which), net.pulses))
+        offsets[:, full] = fit.pulses.o[order[new]][which] * self.spread
+        offsets = np.where(self.emission, offsets + self.shift, 0.0)
+        made = Estimate(stations * self.spread, b, places, offsets * net.emission)
+        self._settle(made, ~full)
+        # each start of a family arrives where its family does
+        rows, starts = [], []
+        for i, f in enumerate(family):
+            own = np.flatnonzero(which == f) if f >= 0 else []
+            rows.extend(own)
+            starts.extend([i] * len(own))
+        return made.take(np.unique(rows)), _first(family, which[np.unique(rows)])
+
+    def _settle(self, made: Estimate, few: Array) -> None:
+        """Give pulses that took no part in a fit the emission that their places at the centre call for."""
+        if few.any():
+            apart = np.linalg.norm(made.stations[:, None] - made.pulses[:, few, None], axis=-1)
+            weight = self.weight[few] / np.maximum(self.weight[few].sum(axis=1, keepdims=True), 1e-300)
+            offset = ((self.z[few] - apart) * weight).sum(axis=-1)
+            made.emission[:, few] = offset * self.lik.network.emission[few]
+
+    def random(self, count: int) -> Estimate:
+        """Return networks with all places drawn, in the spread that the arrivals tell."""
+        net, d = self.lik.network, self.dimension
+        size = np.full(d, self.spread)
+        box = np.ones((count, 1, d)) * size
+        box[::2, :, -1] *= 0.3
+        stations = (self.rng.random((count, net.stations, d)) - 0.5) * box
+        pulses = (self.rng.random((count, net.pulses, d)) - 0.5) * box
+        apart = np.linalg.norm(stations[:, None] - pulses[:, :, None], axis=-1)
+        weight = self.weight / np.maximum(self.weight.sum(axis=1, keepdims=True), 1e-300)
+        offset = ((self.z - apart) * weight).sum(axis=-1)
+        return Estimate(stations, np.zeros((count, net.stations)), pulses, offset * net.emission)
+
+    def ends(self, at: Estimate, start: Array) -> Ends:
+        """Refine networks, laid over what is known of the stations in both ways."""
+        net = self.lik.network
+        if np.isfinite(net.place_sigma).any():
+            free = replace(net, place_sigma=np.full(net.place.shape, np.inf), place=np.zeros(net.place.shape))
+            rough, _ = likelihood(free, self.lik.weigh).refine(at, _ROUGH)
+            at, start = laid(rough, net, self.rng), np.concatenate([start, start])
+        found, cost = self.lik.refine(at)
+        return Ends(found, cost, start)
+
+
+def _first(family: Array, which: Array) -> Array:
+    return np.array([np.flatnonzero(family == f)[0] for f in which], dtype=int)
+
+
+def _nothing(net: Network) -> Estimate:
+    m, n, d = net.stations, net.pulses, net.dimension
+    return Estimate(np.zeros((0, m, d)), np.zeros((0, m)), np.zeros((0, n, d)), np.zeros((0, n)))
+
+
+def starts_of(lik: Likelihood, seed: int) -> Starts:
+    """Return the starts of a network."""
+    z, weight, emission = arrivals(lik.network)
+    measured = weight > 0.0
+    shift = np.where(emission, [np.median(z[j, measured[j]]) if measured[j].any() else 0.0 for j in range(len(z))], 0.0)
+    high = np.where(measured, z, -np.inf).max(axis=1) - np.where(emission, np.where(measured, z, np.inf).min(axis=1), 0)
+    finite = high[np.isfinite(high) & (high > 0.0)]
+    spread = float(np.quantile(finite, 0.9)) if finite.size else 1.0
+    return Starts(lik, z, weight, emission, shift, spread, np.random.default_rng(seed))
+
+
+def rounds(starts: Starts) -> Iterator[Ends]:
+    """Yield the ends of round after round of starts: low rank where it applies, and random places."""
+    net, d = starts.lik.network, starts.dimension
+    full = int(((starts.weight > 0.0).sum(axis=1) >= d + 3).sum())
+    able = net.stations >= d + 3 and full > 0 and max(net.stations, full) >= unknowns(d)
+    begun = 0
+    while True:
+        if able:
+            at, start = starts.low_rank(_LOW_RANK)
+            if at.count:
+                yield starts.ends(at, start + begun)
+            begun += _LOW_RANK
+        yield starts.ends(starts.random(_RANDOM), np.arange(_RANDOM) + begun)
+        begun += _RANDOM
+
+
+def laid(at: Estimate, net: Network, rng: np.random.Generator) -> Estimate:
+    """Return networks moved and turned onto what is known of the stations: S as they are, then S mirrored.
+
+    Parameters
+    ----------
+    at : Estimate
+        S networks.
+    net : Network
+        With places that are known, each coordinate by itself.
+    rng : numpy.random.Generator
+        Draws the orientations from which each is turned.
+
+    Returns
+    -------
+    Estimate
+        2 S networks; exact coordinates are as they are known.
+    """
+    d = net.dimension
+    mirror = np.ones(d)
+    mirror[-1] = -1.0
+    both = together(at, replace(at, stations=at.stations * mirror, pulses=at.pulses * mirror))
+    middle = both.stations.mean(axis=1, keepdims=True)
+    points, pulses = both.stations - middle, both.pulses - middle
+    extent = np.sqrt(np.mean(points**2)) or 1.0
+    weight = 1.0 / np.maximum(net.place_sigma, _LOOSE * extent)
+    turn, move = _onto(points, net.place, weight, rng)
+    stations = points @ np.swapaxes(turn, 1, 2) + move[:, None]
+    exact = net.place_sigma <= 0.0
+    return replace(
+        both,
+        stations=np.where(exact, net.place, stations),
+        pulses=pulses @ np.swapaxes(turn, 1, 2) + move[:, None],
+    )
+
+
+def _onto(points: Array, place: Array, weight: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Return rotations (S, d, d) and shifts (S, d) with the least weighted distance from known coordinates."""
+    s, m, d = points.shape
+    generators = np.array([_generator(i, k, d) for i in range(d) for k in range(i)])
+    turn = np.linalg.qr(rng.standard_normal((_TURNS, d, d)))[0]
+    turn[np.linalg.det(turn) < 0, 0] *= -1.0
+    turn = np.broadcast_to(turn, (s, _TURNS, d, d)).copy()
+    known = weight > 0.0
+    centre = np.where(known.any(axis=0), (place * weight).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-300), 0.0)
+    move = np.broadcast_to(centre, (s, _TURNS, d)).copy()
+    for _ in range(_LAID):
+        turned = points[:, None] @ np.swapaxes(turn, -1, -2)
+        residual = ((place - turned - move[:, :, None]) * weight).reshape(s, _TURNS, m * d)
+        spun = np.einsum("gab,stmb->stmag", generators, turned) * weight[..., None]
+        shifts = np.broadcast_to(np.eye(d) * weight[..., None], (s, _TURNS, m, d, d))
+        columns = np.concatenate([spun, shifts], axis=-1).reshape(s, _TURNS, m * d, -1)
+        normal = np.swapaxes(columns, -1, -2) @ columns
+        diagonal = np.einsum("stii->sti", normal)
+        diagonal += 1e-6 * diagonal + 1e-9 * diagonal.max(axis=-1, keepdims=True) + 1e-290
+        gradient = np.einsum("stqp,stq->stp", columns, residual)
+        step = np.linalg.solve(normal, gradient[..., None])[..., 0]
+        half = 0.5 * np.einsum("stg,gab->stab", step[..., : len(generators)], generators)
+        # Cayley's map is a rotation for any step
+        turn = np.linalg.solve(np.eye(d) - half, (np.eye(d) + half) @ turn)
+        move = move + step[..., len(generators) :]
+    turned = points[:, None] @ np.swapaxes(turn, -1, -2)
+    cost = (((place - turned - move[:, :, None]) * weight) ** 2).sum(axis=(2, 3))
+    best = np.nanargmin(np.where(np.isfinite(cost), cost, 1e300), axis=1)
+    every = np.arange(s)
+    return turn[every, best], move[every, best]
+
+
+def _generator(i: int, k: int, d: int) -> Array:
+    out = np.zeros((d, d))
+    out[i, k], out[k, i] = 1.0, -1.0
+    return out
