@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.arrays import numbers
+from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import Array
 from optloc.models import MODELS, kind_named
 

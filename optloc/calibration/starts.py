@@ -131,9 +131,7 @@ class Starts:
         relative = self.weight / self.weight.max()
         begun = random_stations(self.rng, count, net.stations, d)
         z = (self.z - self.shift[:, None]) / self.spread
-        fit = fit_low_rank(
-            z[full], relative[full], self.emission[full], begun, clocks=not net.synchronised
-        )
+        fit = fit_low_rank(z[full], relative[full], self.emission[full], begun, clocks=not net.synchronised)
         keep = np.flatnonzero(fit.cost <= _NEARLY * np.nanmin(fit.cost))
         # starts that found the same fit lead to the same network
         order = keep[np.argsort(fit.cost[keep], kind="stable")]

@@ -1,0 +1,660 @@
+"""Networks from nothing: starts until three agree, moves of single blocks, and a verdict with its reasons."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem, NoSolution, nearest
+from optloc.base.types import PRECEDENCE, Array, Status
+from optloc.calibration.blocks import MOVED, Block, blocks, moved, place_pulses
+from optloc.calibration.gauge import Determined, determined, fixed_by, in_frame
+from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, together
+from optloc.calibration.network import CLOCKED, Network
+from optloc.calibration.starts import Ends, laid, rounds, starts_of
+from optloc.compute.range_shape import STRAIGHT
+from optloc.problem.fix import tail_probability
+from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, REFUTED, equal_cost
+
+AGREEING = 3
+"""Starts that must arrive at the least cost: with fewer, one network in ten was found in another minimum."""
+
+# Starts after which the best is taken for what it is: nine networks in ten of six stations need fewer.
+_STARTS = 144
+# Networks whose blocks are moved after each round, the cheapest first.
+_TRIED = 2
+# Pulses that starts are made from: those with most rows. More find nothing that so many do not.
+_CORE = 60
+# Sweeps of block moves: each lowers the cost or is the last.
+_SWEEPS = 6
+# Singular value of stations about their centre, in its standard deviations, below which they are flat.
+_FLAT = 3.0
+# The weakest directions along which the cost is looked at three sigma out: where it bends, it bends there first.
+_WEAKEST = 6
+# Whitened residual beyond which a robust fit leaves a row out, and the least scale of its weights.
+_LIAR, _SCALE = 4.0, 3.0
+# Robust refinements begin at more places: liars make minima of their own.
+_ROBUST_STARTS = 96
+
+
+@dataclass(frozen=True, slots=True)
+class Alternative:
+    """Another network that the data allow.
+
+    Parameters
+    ----------
+    what : str
+        How it differs, for instance "pulse 7 elsewhere".
+    gap : float
+        Its cost beyond that of the network found.
+    stations : array (M, d)
+        Where it has the stations, metres, in the same frame.
+    """
+
+    what: str
+    gap: float
+    stations: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """A network with its covariance and verdict.
+
+    Parameters
+    ----------
+    network : Network
+        What was measured.
+    stations : array (M, d)
+        Places, metres, in the frame `gauge`.
+    clocks : array (M,)
+        Offsets times the speed of propagation, metres; zeros where stations share a clock.
+    pulses : array (N, d)
+        Places, metres; NaN where a pulse has too few rows to be placed.
+    emission : array (N,)
+        Times of emission times the speed of propagation, metres.
+    covariance : array (P, P)
+        Of the M d station coordinates, then the clocks where these are sought, square metres, in that frame.
+    gauge : str
+        What defines the frame: "known places", "centre and main axes of the stations" or the names of stations.
+    status : Status
+        The verdict.
+    findings : tuple of str
+        All that speaks against the network, a sentence each; empty for `ok`.
+    proof : "blockwise" or "unknown"
+        "blockwise": with the others held, no other place of any one station or pulse costs less, and none costs up to 9
+        more, proven. It does not exclude that several move together.
+    cost : float
+        Weighted sum of squared residuals.
+    dof : int
+        Degrees of freedom.
+    p_value : float
+        Chi-square probability of a cost at least this large.
+    agreeing, starts : int
+        How many starts arrived here, and how many were made.
+    alternatives : tuple of Alternative
+        Other networks within 25 of the cost, cheapest first.
+    residuals : array (N, R)
+        Whitened residuals; NaN where nothing was measured.
+    left_out : array (k, 2) of int
+        Rows (pulse, slot) that a robust fit left out.
+    """
+
+    network: Network
+    stations: Array
+    clocks: Array
+    pulses: Array
+    emission: Array
+    covariance: Array
+    gauge: str
+    status: Status
+    findings: tuple[str, ...]
+    proof: str
+    cost: float
+    dof: int
+    p_value: float
+    agreeing: int
+    starts: int
+    alternatives: tuple[Alternative, ...]
+    residuals: Array
+    left_out: Array = field(default_factory=lambda: np.zeros((0, 2), dtype=int))
+
+    @property
+    def sigma(self) -> Array:
+        """Return the standard deviations (M, d) of the stations' coordinates in the frame, metres."""
+        m, d = self.stations.shape
+        return np.asarray(np.sqrt(np.diag(self.covariance)[: m * d]).reshape(m, d))
+
+    def distances(self) -> tuple[Array, Array, Array]:
+        """Return distances between stations, which no frame changes, and their covariance.
+
+        Returns
+        -------
+        pairs : int array (q, 2)
+            All pairs of stations.
+        distance : array (q,)
+            Metres.
+        covariance : array (q, q)
+            Square metres.
+        """
+        m, d = self.stations.shape
+        pairs = np.array([(i, k) for i in range(m) for k in range(i)], dtype=int).reshape(-1, 2)
+        line = self.stations[pairs[:, 0]] - self.stations[pairs[:, 1]]
+        length = np.linalg.norm(line, axis=1)
+        unit = line / np.maximum(length, 1e-300)[:, None]
+        jacobian = np.zeros((len(pairs), m, d))
+        every = np.arange(len(pairs))
+        jacobian[every, pairs[:, 0]], jacobian[every, pairs[:, 1]] = unit, -unit
+        flat = jacobian.reshape(len(pairs), m * d)
+        return pairs, length, flat @ self.covariance[: m * d, : m * d] @ flat.T
+
+    def require(self, allow: tuple[str, ...] = ()) -> Calibration:
+        """Return this where its status is `ok` or one that is allowed.
+
+        Raises
+        ------
+        NoSolution
+            With the findings.
+        """
+        if self.status is not Status.OK and self.status.label not in allow:
+            raise NoSolution(self.network, self)
+        return self
+
+
+def calibrate(
+    network: Network,
+    *,
+    gauge: tuple[str, ...] = (),
+    robust: bool = False,
+    seed: int = 0,
+    starts: int | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> Calibration:
+    """Find stations, clocks and pulses together, without a guess.
+
+    Parameters
+    ----------
+    network : Network
+        What was measured and what is known.
+    gauge : tuple of str
+        Names of d stations that define the frame of a free network; by default all do.
+    robust : bool
+        Whether some rows may be grossly wrong; they are left out and listed, and the status is `unproven` at best.
+    seed : int
+        Decides the starts.
+    starts : int, optional
+        Starts after which the search ends, agreed or not.
+    tell : callable, optional
+        Called with a sentence on each round.
+
+    Returns
+    -------
+    Calibration
+        Network, covariance, verdict.
+
+    Raises
+    ------
+    InvalidProblem
+        For stations of `gauge` that are not there, or where known places define the frame.
+    """
+    named = _named(network, gauge)
+    enough = _placeable(network)
+    if network.rows - network.unknowns + _frame_size(network) < 0 or enough.sum() < 1:
+        return _refused(network, Status.TOO_FEW_ROWS, "There are fewer measurements than unknowns.")
+    core = np.sort(np.argsort(-network.given.sum(axis=1), kind="stable")[:_CORE])
+    core = core[enough[core]]
+    found = _search(network.take(core), robust, seed, starts or (_ROBUST_STARTS if robust else _STARTS), tell)
+    if found is None:
+        return _refused(network, Status.NUMERICAL, "No start led to a network.")
+    at = found.best
+    rest = enough.copy()
+    rest[core] = False
+    if rest.any():
+        at = _with_rest(network, at, core, np.flatnonzero(rest))
+    kept = network.take(enough)
+    left_out = np.zeros((0, 2), dtype=int)
+    if robust:
+        kept, at, left_out = _without_liars(kept, at)
+        left_out[:, 0] = np.flatnonzero(enough)[left_out[:, 0]]
+    lik = likelihood(kept)
+    at, _ = lik.refine(at)
+    made = _judged(lik, at, found, named, robust)
+    return _whole(made, network, enough, left_out)
+
+
+# The search.
+
+
+@dataclass(slots=True)
+class _Found:
+    """What a search has arrived at so far.
+
+    `ends` are the minima of starts; `onward` tells where moves of blocks lead from the cost of one, and `others` are
+    networks with one block of the best elsewhere, by name.
+    """
+
+    ends: Ends
+    best: Estimate
+    cost: float
+    made: int
+    others: list[tuple[str, Estimate, float]] = field(default_factory=list)
+    onward: dict[float, float] = field(default_factory=dict)
+
+    @property
+    def agreeing(self) -> int:
+        """Return how many starts led to the best: by themselves, or by moves of blocks."""
+        led = np.array([self.onward.get(_key(cost), cost) for cost in self.ends.cost])
+        return len(np.unique(self.ends.start[led <= self.cost + _SAME + equal_cost(self.cost)]))
+
+
+# Difference of cost that nobody can tell: a tenth of a sigma of one number.
+_SAME = 0.01
+
+
+def _key(cost: float) -> float:
+    return round(float(cost), 4)
+
+
+def _search(net: Network, robust: bool, seed: int, limit: int, tell: Callable[[str], None] | None) -> _Found | None:
+    lik = likelihood(net, geman_mcclure if robust else None)
+    score = _truncated if robust else _plain
+    found: _Found | None = None
+    for one in rounds(starts_of(lik, seed)):
+        cost = score(lik, one.at)
+        good, made = np.isfinite(cost), int(one.start.max()) + 1
+        if good.any():
+            found = _joined(found, Ends(one.at.take(good), cost[good], one.start[good]), made)
+            if not robust:
+                _move_on(lik, found)
+            if tell is not None:
+                tell(f"{found.made} starts, {found.agreeing} at the least cost {found.cost:.5g}")
+            agreed = found.agreeing >= AGREEING and (robust or _fits(net, found.cost))
+            if (agreed or made >= limit) and (robust or not _lowered(lik, found)):
+                return found
+        if made >= 2 * limit:
+            return found
+    return found
+
+
+def _lowered(lik: Likelihood, found: _Found) -> bool:
+    """Move blocks to all places that a proof leaves, and return whether the best network became cheaper."""
+    at, cost, found.others = _swept(lik, found.best, found.cost, prove=True)
+    if cost >= found.cost - _SAME:
+        return False
+    found.onward[_key(found.cost)] = cost
+    found.best, found.cost = at, cost
+    return True
+
+
+def _joined(found: _Found | None, ends: Ends, made: int) -> _Found:
+    if found is not None:
+        ends = Ends(
+            together(found.ends.at, ends.at),
+            np.concatenate([found.ends.cost, ends.cost]),
+            np.concatenate([found.ends.start, ends.start]),
+        )
+    i = int(ends.cost.argmin())
+    if found is None:
+        return _Found(ends, ends.at.take(np.array([i])), float(ends.cost[i]), made)
+    found.ends, found.made = ends, made
+    if ends.cost[i] < found.cost - _SAME:
+        found.best, found.cost = ends.at.take(np.array([i])), float(ends.cost[i])
+    return found
+
+
+def _move_on(lik: Likelihood, found: _Found) -> None:
+    """Move single blocks of the cheapest networks to their other places, as long as that lowers the cost."""
+    ends = found.ends
+    tried = 0
+    for i in np.argsort(ends.cost, kind="stable"):
+        if found.agreeing >= AGREEING or tried == _TRIED:
+            return
+        if _key(ends.cost[i]) in found.onward:
+            continue
+        tried += 1
+        at, cost = _swept(lik, ends.at.take(np.array([i])), float(ends.cost[i]))[:2]
+        found.onward[_key(ends.cost[i])] = cost
+        if cost < found.cost - _SAME:
+            found.best, found.cost = at, cost
+
+
+def _swept(
+    lik: Likelihood, at: Estimate, cost: float, prove: bool = False
+) -> tuple[Estimate, float, list[tuple[str, Estimate, float]]]:
+    """Return where moves of blocks lead from a minimum, and the networks with one block elsewhere."""
+    others: list[tuple[str, Estimate, float]] = []
+    for _ in range(_SWEEPS):
+        names, starts = [], []
+        for block in blocks(lik, at, prove=prove):
+            for place, gap in zip(block.places, block.gaps, strict=True):
+                if gap <= MOVED:
+                    names.append(block.name)
+                    starts.append(moved(lik, at, block, place))
+        if not starts:
+            break
+        ends, costs = lik.refine(together(*starts))
+        i = int(np.argmin(costs))
+        others = [(f"{name} elsewhere", ends.take(np.array([n])), float(costs[n])) for n, name in enumerate(names)]
+        if costs[i] >= cost - _SAME - equal_cost(cost):
+            break
+        at, cost = ends.take(np.array([i])), float(costs[i])
+    return at, cost, others
+
+
+def _plain(lik: Likelihood, at: Estimate) -> Array:
+    return lik.cost(at)
+
+
+def _truncated(lik: Likelihood, at: Estimate) -> Array:
+    squares = np.minimum(lik.residual(at) ** 2, _LIAR**2).sum(axis=(1, 2))
+    return squares + lik.cost(at) - (lik.residual(at) ** 2).sum(axis=(1, 2))
+
+
+def geman_mcclure(residual: Array) -> Array:
+    """Return weights of whitened residuals (S, N, R): Geman and McClure's, with a scale for each estimate.
+
+    S. Geman and D. McClure, "Statistical methods for tomographic image reconstruction", Bull. Int. Stat. Inst. 52
+    (1987).
+    """
+    flat = np.where(residual != 0.0, np.abs(residual), np.nan).reshape(len(residual), -1)
+    scale = np.maximum(2.0 * np.nanmedian(flat, axis=1), _SCALE)[:, None, None]
+    return np.asarray((1.0 + (residual / scale) ** 2) ** -2)
+
+
+def _fits(net: Network, cost: float) -> bool:
+    dof = np.array(net.rows - net.unknowns + _frame_size(net))
+    return not float(tail_probability(np.array(cost), dof)) < REFUTED
+
+
+def _with_rest(network: Network, at: Estimate, core: Array, rest: Array) -> Estimate:
+    """Return an estimate of all pulses that can be placed: the core's, and fixes of the others."""
+    fix = place_pulses(network, at, rest)
+    n, d = network.pulses, network.dimension
+    pulses, emission = np.zeros((1, n, d)), np.zeros((1, n))
+    pulses[0, core], emission[0, core] = at.pulses[0], at.emission[0]
+    centre = at.stations[0].mean(axis=0)
+    place = np.where(np.isfinite(fix.position), fix.position, centre)
+    pulses[0, rest] = place
+    lik = likelihood(network)
+    there = Estimate(at.stations, at.clocks, pulses, emission)
+    weight = lik.root * lik.emits
+    total = np.maximum((weight**2).sum(axis=1), 1e-300)
+    shift = (lik.residual(there)[0] * weight).sum(axis=1) / total
+    emission[0, rest] = np.where(network.emission, shift, 0.0)[rest]
+    every = np.sort(np.concatenate([core, rest]))
+    return Estimate(at.stations, at.clocks, pulses[:, every], emission[:, every])
+
+
+def _without_liars(net: Network, at: Estimate) -> tuple[Network, Estimate, Array]:
+    """Return the network without rows far off, its estimate, and which they are (pulse, slot)."""
+    at, _ = likelihood(net, geman_mcclure).refine(at)
+    out = np.zeros(net.z.shape, dtype=bool)
+    for _ in range(_SWEEPS):
+        residual = likelihood(net).residual(at)[0]
+        far = net.given & (np.abs(residual) > _LIAR)
+        kept = replace(net, sigma=np.where(far, np.inf, net.sigma))
+        at, _ = likelihood(kept).refine(at)
+        if (far == out).all():
+            break
+        out = far
+    return replace(net, sigma=np.where(out, np.inf, net.sigma)), at, np.argwhere(out)
+
+
+# The verdict.
+
+
+def _judged(lik: Likelihood, at: Estimate, found: _Found, named: tuple[int, ...], robust: bool) -> Calibration:
+    net = lik.network
+    soft = np.isfinite(net.place_sigma).any()
+    if not soft:
+        at = in_frame(net, at, named)
+    told = determined(lik, at)
+    cost = float(lik.cost(at)[0])
+    dof = net.rows - net.unknowns + told.free.shape[1]
+    p = float(tail_probability(np.array(cost), np.array(dof)))
+    findings: list[tuple[Status, str]] = []
+    if told.open.shape[1]:
+        findings.append((Status.SINGULAR_GEOMETRY, _open_words(net, told)))
+        covariance = np.full((lik.free.size, lik.free.size), np.nan)
+    else:
+        covariance = told.covariance(fixed_by(net, named) if named else told.free.T)
+        findings += _flat_findings(net, at, covariance)
+        findings += _curved_findings(lik, at, cost, told)
+    if p < REFUTED:
+        findings.append((Status.MISFIT, f"The residuals are larger than the stated noise allows: p = {p:.2g}."))
+    proof, block_findings = _proof(lik, at)
+    alternatives = _alternatives(lik, at, cost, found, bool(soft))
+    close = [one for one in alternatives if one.gap < AMBIGUOUS_GAP]
+    if close:
+        findings.append((Status.AMBIGUOUS, f"{close[0].what} costs {close[0].gap:.2g} more: both fit the data."))
+    findings += block_findings
+    if found.agreeing < AGREEING:
+        words = f"{found.agreeing} of {found.made} starts arrived at this network; {AGREEING} must agree."
+        findings.append((Status.SEARCHED, words))
+    if robust:
+        findings.append((Status.UNPROVEN, "Rows were left out as wrong; no proof covers which."))
+    findings.sort(key=lambda one: PRECEDENCE.index(one[0]))
+    gauge = "known places" if soft else ", ".join(net.names[i] for i in named)
+    return Calibration(
+        net,
+        at.stations[0],
+        at.clocks[0],
+        at.pulses[0],
+        at.emission[0],
+        covariance,
+        gauge or "centre and main axes of the stations",
+        findings[0][0] if findings else Status.OK,
+        tuple(words for _, words in findings),
+        proof,
+        cost,
+        dof,
+        p,
+        found.agreeing,
+        found.made,
+        alternatives,
+        np.where(net.given, lik.residual(at)[0], np.nan),
+    )
+
+
+def _open_words(net: Network, told: Determined) -> str:
+    m, d = net.stations, net.dimension
+    share = np.sqrt((told.open[: m * d] ** 2).sum(axis=1).reshape(m, d).sum(axis=1))
+    if not net.synchronised:
+        share = np.hypot(share, np.sqrt((told.open[m * d :] ** 2).sum(axis=1)))
+    largest = [net.names[i] for i in np.argsort(-share, kind="stable")[:3]]
+    count = told.open.shape[1]
+    return (
+        f"{count} motion{'s' if count > 1 else ''} of the network beyond the frame change no measurement, mostly of "
+        f"{', '.join(largest)}; add pulses off their plane, distances between stations, or known places."
+    )
+
+
+def _flat_findings(net: Network, at: Estimate, covariance: Array) -> list[tuple[Status, str]]:
+    """Return what follows from stations, or pulses, in one plane: each of the others has a mirror image."""
+    out = []
+    m, d = net.stations, net.dimension
+    if np.isfinite(net.place_sigma).all():
+        return out
+    centred = at.stations[0] - at.stations[0].mean(axis=0)
+    s, normal = np.linalg.svd(centred)[1:]
+    along = centred @ normal[-1]
+    gradient = (along[:, None] * normal[-1] / max(s[-1], 1e-300)).ravel()
+    sigma = np.sqrt(max(float(gradient @ covariance[: m * d, : m * d] @ gradient), 0.0))
+    if s[-1] < _FLAT * sigma:
+        words = "The stations are in one plane as far as the data tell: which side of it pulses are on is open."
+        out.append((Status.AMBIGUOUS, words))
+    return out
+
+
+def _curved_findings(lik: Likelihood, at: Estimate, cost: float, told: Determined) -> list[tuple[Status, str]]:
+    """Compare the cost three sigma out along the weakest directions, pulses following, with nine."""
+    p = told.jacobian.shape[1]
+    basis = np.eye(p)[:, np.flatnonzero(lik.free)]
+    if told.free.shape[1]:
+        within = np.linalg.svd(told.free[lik.free].T)[2][told.free.shape[1] :]
+        basis = basis @ within.T
+    _, s, turn = np.linalg.svd(told.jacobian @ basis, full_matrices=False)
+    steps = (basis @ turn[::-1][:_WEAKEST].T) * (3.0 / s[::-1][:_WEAKEST])
+    m, d = lik.network.stations, lik.network.dimension
+    shift = np.concatenate([steps, -steps], axis=1).T
+    count = len(shift)
+    every = np.zeros(count, dtype=int)
+    clocks = at.clocks[every] if lik.network.synchronised else at.clocks + shift[:, m * d :]
+    there = replace(at.take(every), stations=at.stations + shift[:, : m * d].reshape(count, m, d), clocks=clocks)
+    held = replace(lik, free=np.zeros_like(lik.free))
+    ratio = np.maximum((held.refine(there)[1] - cost) / 9.0, 1e-9)
+    kappa = float(np.abs(np.log(ratio)).max())
+    if kappa <= STRAIGHT:
+        return []
+    words = f"The covariance does not cover: three sigma out the cost is {9 * np.exp(kappa):.3g} or less than it says."
+    return [(Status.CURVED, words)]
+
+
+def _proof(lik: Likelihood, at: Estimate) -> tuple[str, list[tuple[Status, str]]]:
+    found = blocks(lik, at)
+    refuted = [block.name for block in found if block.refuted]
+    open_ = [block.name for block in found if not block.proven and not block.refuted]
+    if refuted:
+        return "unknown", [(Status.UNPROVEN, f"Another place costs less for {_few(refuted)}, the others held.")]
+    if open_:
+        words = f"That no other place fits as well is not proven of {_few(open_)}."
+        return "unknown", [(Status.UNPROVEN, words)]
+    return "blockwise", []
+
+
+def _few(names: list[str]) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
+def refuted_blocks(network: Network, at: Estimate) -> tuple[Block, ...]:
+    """Return the stations and pulses that cost less elsewhere with the others held, proven.
+
+    Parameters
+    ----------
+    network : Network
+        What was measured.
+    at : Estimate
+        One network, S = 1, for instance one with a station on the wrong side.
+
+    Returns
+    -------
+    tuple of Block
+        Empty where none is.
+    """
+    return tuple(block for block in blocks(likelihood(network), at) if block.refuted)
+
+
+def _alternatives(lik: Likelihood, at: Estimate, cost: float, found: _Found, soft: bool) -> tuple[Alternative, ...]:
+    """Return other minima within `LISTED_GAP`: ends of other starts, blocks elsewhere, and the mirror image."""
+    net = lik.network
+    others: list[tuple[str, Estimate]] = []
+    near = found.ends.cost < found.cost + LISTED_GAP
+    _, first = np.unique(np.round(found.ends.cost[near], 3), return_index=True)
+    others += [("Another network", found.ends.at.take(np.flatnonzero(near)[[i]])) for i in first]
+    others += [(name, one) for name, one, value in found.others if value < found.cost + LISTED_GAP]
+    same = at.pulses.shape[1] == found.best.pulses.shape[1]
+    if not same:  # starts are of the core alone; all pulses are refined for the network found
+        others = []
+    if soft:
+        both = laid(at, net, np.random.default_rng(0))
+        others.append(("The mirror image", both.take(np.array([1]))))
+    if not others:
+        return ()
+    ends, costs = lik.refine(together(*(one for _, one in others)))
+    out: list[Alternative] = []
+    shapes = [_shape(at)]
+    for i in np.argsort(costs, kind="stable"):
+        one, gap = ends.take(np.array([i])), float(costs[i] - cost)
+        shape = _shape(one) if not soft else np.concatenate([one.stations.ravel(), _shape(one)])
+        reference = [np.concatenate([at.stations.ravel(), shapes[0]]), *shapes[1:]] if soft else shapes
+        scale = max(float(np.abs(shape).max()), 1e-300)
+        # a thousandth of the size, or where costs agree to what is left of the digits, is the same network
+        distinct = all(np.abs(shape - s).max() > 1e-3 * scale for s in reference)
+        if gap < LISTED_GAP and distinct:
+            shapes.append(shape)
+            words = others[i][0]
+            placed = one if soft else _over(one, at)
+            out.append(Alternative(words[0].upper() + words[1:], max(gap, 0.0), placed.stations[0]))
+    return tuple(out)
+
+
+def _shape(at: Estimate) -> Array:
+    """Return distances between stations and to the pulses: what no frame changes."""
+    points = np.concatenate([at.stations[0], at.pulses[0]])
+    return np.asarray(np.linalg.norm(points[:, None] - at.stations[0][None], axis=-1).ravel())
+
+
+def _over(one: Estimate, at: Estimate) -> Estimate:
+    """Return a network turned, and mirrored if need be, onto another's stations (Procrustes)."""
+    a, b = one.stations[0], at.stations[0]
+    u, _, v = np.linalg.svd((a - a.mean(axis=0)).T @ (b - b.mean(axis=0)))
+    turn = u @ v
+    return replace(
+        one,
+        stations=(one.stations - a.mean(axis=0)) @ turn + b.mean(axis=0),
+        pulses=(one.pulses - a.mean(axis=0)) @ turn + b.mean(axis=0),
+    )
+
+
+# What surrounds a search.
+
+
+def _named(network: Network, gauge: tuple[str, ...]) -> tuple[int, ...]:
+    if not gauge:
+        return ()
+    if np.isfinite(network.place_sigma).any():
+        raise InvalidProblem("known places define the frame already", "gauge", "leave it out")
+    if len(gauge) != network.dimension or len(set(gauge)) != len(gauge):
+        raise InvalidProblem(f"a frame needs {network.dimension} stations", "gauge", "name so many, each once")
+    for name in gauge:
+        if name not in network.names:
+            raise InvalidProblem(f"there is no station {name!r}", "gauge", nearest(name, list(network.names)))
+    return tuple(network.names.index(name) for name in gauge)
+
+
+def _placeable(network: Network) -> Array:
+    """Return which pulses have as many rows as unknowns (N,)."""
+    needed = network.dimension + network.emission
+    return np.asarray(network.given.sum(axis=1) >= needed)
+
+
+def _frame_size(network: Network) -> int:
+    """Return how many unknowns the frame is, as far as known coordinates can fix it."""
+    d = network.dimension
+    known = int(np.isfinite(network.place_sigma).sum())
+    clocks = int(not network.synchronised and any(slot.kind in CLOCKED for slot in network.slots))
+    return max(d * (d + 1) // 2 - known, 0) + clocks
+
+
+def _refused(network: Network, status: Status, words: str) -> Calibration:
+    m, n, d = network.stations, network.pulses, network.dimension
+    p = m * d + (0 if network.synchronised else m)
+    nan = np.full
+    return Calibration(
+        network,
+        nan((m, d), np.nan),
+        nan(m, np.nan),
+        nan((n, d), np.nan),
+        nan(n, np.nan),
+        nan((p, p), np.nan),
+        "none",
+        status,
+        (words,),
+        "unknown",
+        float("nan"),
+        network.rows - network.unknowns + _frame_size(network),
+        float("nan"),
+        0,
+        0,
+        (),
+        np.where(network.given, np.nan, np.nan),
+    )
+
+
+def _whole(made: Calibration, network: Network, enough: Array, left_out: Array) -> Calibration:
+    """Return a calibration of all pulses, NaN for those that have too few rows."""
+    pulses = np.full((network.pulses, network.dimension), np.nan)
+    emission, residuals = np.full(network.pulses, np.nan), np.full(network.z.shape, np.nan)
+    pulses[enough], emission[enough], residuals[enough] = made.pulses, made.emission, made.residuals
+    return replace(made, network=network, pulses=pulses, emission=emission, residuals=residuals, left_out=left_out)

@@ -1,0 +1,152 @@
+"""Frames of networks: what no measurement tells, the covariance without it, and networks turned into a frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.calibration.likelihood import Estimate, Likelihood
+from optloc.calibration.network import Network
+
+# Singular values of scaled derivatives below this share of the largest are zeros: exact ones come out at 1e-15.
+_ZERO = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class Determined:
+    """What rows determine of stations and clocks at an estimate, pulses eliminated.
+
+    Parameters
+    ----------
+    jacobian : array (q, P)
+        Whitened derivatives by station coordinates and clocks, what pulses explain taken away.
+    free : array (P, g)
+        Orthonormal: moves of the whole network and of its clocks that no row sees, the frame.
+    open : array (P, f)
+        Orthonormal: other changes that no row sees.
+    """
+
+    jacobian: Array
+    free: Array
+    open: Array
+
+    def covariance(self, fixed: Array) -> Array:
+        """Return the covariance (P, P) in the frame in which `fixed` (g, P) times any change is zero."""
+        p = self.jacobian.shape[1]
+        moving = np.flatnonzero(np.abs(self.jacobian).max(axis=0) > 0.0)
+        basis = np.eye(p)[:, moving]
+        if len(fixed):
+            within = np.linalg.svd(fixed[:, moving])[2][np.linalg.matrix_rank(fixed[:, moving]) :]
+            basis = basis @ within.T
+        triangle = np.linalg.qr(self.jacobian @ basis)[1]
+        half = basis @ np.linalg.inv(triangle)
+        return np.asarray(half @ half.T)
+
+
+def determined(lik: Likelihood, at: Estimate) -> Determined:
+    """Return what the rows determine at an estimate (S = 1)."""
+    by_station, by_pulse = (one[0] for one in lik.jacobian(at))
+    n, r, p = by_station.shape
+    # a pulse far away has columns of very different lengths
+    length = np.sqrt((by_pulse**2).sum(axis=1, keepdims=True))
+    q, triangle = np.linalg.qr(by_pulse / np.where(length > 0.0, length, 1.0))
+    pivot = np.abs(np.einsum("nii->ni", triangle))
+    q = q * (pivot > _ZERO)[:, None]
+    reduced = (by_station - q @ (np.swapaxes(q, 1, 2) @ by_station)).reshape(n * r, p)
+    jacobian = np.linalg.qr(np.concatenate([reduced, lik.known(at)[1][0]]))[1]
+    motions = frame_moves(lik.network, at)
+    motions[~lik.free] = 0.0
+    size = np.linalg.norm(jacobian, 2)
+    free = _unseen(jacobian, _span(motions), size)
+    rest = np.linalg.svd(free.T)[2][free.shape[1] :].T if free.shape[1] else np.eye(p)
+    rest = rest[:, np.abs(rest[lik.free]).max(axis=0) > _ZERO]
+    held = np.flatnonzero(~lik.free)
+    rest = _span(rest - np.isin(np.arange(p), held)[:, None] * rest)
+    return Determined(jacobian, free, _unseen(jacobian, rest, size))
+
+
+def _span(columns: Array) -> Array:
+    u, s, _ = np.linalg.svd(columns, full_matrices=False)
+    return np.asarray(u[:, s > _ZERO * max(s.max(initial=0.0), 1e-300)])
+
+
+def _unseen(jacobian: Array, basis: Array, size: float) -> Array:
+    """Return those directions of a subspace that a matrix takes to nothing."""
+    if not basis.shape[1]:
+        return basis
+    _, s, turn = np.linalg.svd(jacobian @ basis, full_matrices=True)
+    small = np.ones(basis.shape[1], dtype=bool)
+    small[: len(s)] = s <= _ZERO * size
+    return np.asarray(basis @ turn[small].T)
+
+
+def frame_moves(net: Network, at: Estimate) -> Array:
+    """Return columns (P, g): translations, rotations and, with clocks, the common offset of all."""
+    m, d = net.stations, net.dimension
+    p = m * d + (0 if net.synchronised else m)
+    columns = []
+    for c in range(d):
+        column = np.zeros(p)
+        column[c : m * d : d] = 1.0
+        columns.append(column)
+    for i in range(d):
+        for k in range(i):
+            turned = np.zeros((m, d))
+            turned[:, i], turned[:, k] = at.stations[0, :, k], -at.stations[0, :, i]
+            columns.append(np.concatenate([turned.ravel(), np.zeros(p - m * d)]))
+    if not net.synchronised:
+        columns.append(np.concatenate([np.zeros(m * d), np.ones(m)]))
+    return np.array([c / max(np.linalg.norm(c), 1e-300) for c in columns]).T
+
+
+def in_frame(net: Network, at: Estimate, named: tuple[int, ...]) -> Estimate:
+    """Return a free network in the frame of some stations, or of all.
+
+    Parameters
+    ----------
+    net : Network
+        What was measured.
+    at : Estimate
+        S = 1.
+    named : tuple of int
+        The first is the origin, the second lies on the first axis, the third in the plane of the first two (in space).
+        Empty: the centroid is the origin, and the axes are the principal ones of the stations.
+
+    Returns
+    -------
+    Estimate
+        Of the two mirror images in space the one in which the station farthest from the plane of the first two axes is
+        above it; in the plane likewise.
+    """
+    d = net.dimension
+    stations = at.stations[0]
+    if named:
+        origin = stations[named[0]]
+        basis = np.linalg.qr(np.array([stations[i] - origin for i in named[1:d]]).T, mode="complete")[0]
+        for c, i in enumerate(named[1:d]):
+            basis[:, c] *= 1.0 if basis[:, c] @ (stations[i] - origin) >= 0.0 else -1.0
+        signed = [d - 1]
+    else:
+        origin = stations.mean(axis=0)
+        basis = np.linalg.svd(stations - origin)[2].T
+        signed = list(range(d))
+    for c in signed:
+        along = (stations - origin) @ basis[:, c]
+        basis[:, c] *= 1.0 if along[np.abs(along).argmax()] >= 0.0 else -1.0
+    moved = replace(at, stations=(at.stations - origin) @ basis, pulses=(at.pulses - origin) @ basis)
+    if net.synchronised:
+        return moved
+    offset = at.clocks[0, named[0]] if named else at.clocks[0].mean()
+    return replace(moved, clocks=at.clocks - offset, emission=at.emission + np.where(net.emission, offset, 0.0))
+
+
+def fixed_by(net: Network, named: tuple[int, ...]) -> Array:
+    """Return rows (g, P) that name the coordinates, and the clock, which named stations hold at zero."""
+    m, d = net.stations, net.dimension
+    p = m * d + (0 if net.synchronised else m)
+    held = [named[c] * d + k for c in range(d) for k in range(d) if k >= c]
+    if not net.synchronised:
+        held.append(m * d + named[0])
+    return np.eye(p)[held]
