@@ -23,10 +23,11 @@ solving separable nonlinear least squares problems", BIT 15 (1975).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from formulations.algebra import Array
+from formulations.algebra import Array, Mask
 
 # Steps that a start takes. Of starts that end at the best fit nine in ten are there after forty.
 _STEPS = 60
@@ -88,7 +89,7 @@ class LowRank:
     pulses: Pulses
     cost: Array
 
-    def take(self, which: Array) -> LowRank:
+    def take(self, which: Any) -> LowRank:
         """Return some of the fits."""
         s, p = self.stations, self.pulses
         return LowRank(
@@ -223,7 +224,7 @@ class _Projected:
     scale: Array
     cost: Array
 
-    def replaced(self, mask: Array, other: _Projected) -> _Projected:
+    def replaced(self, mask: Mask, other: _Projected) -> _Projected:
         """Return this with the other's fits where the mask says so."""
         p, o = self.pulses, other.pulses
         pulses = Pulses(_where(mask, o.beta, p.beta), _where(mask, o.v, p.v), _where(mask, o.o, p.o))
@@ -236,11 +237,11 @@ class _Projected:
         )
 
 
-def _where(mask: Array, one: Array, other: Array) -> Array:
+def _where(mask: Mask, one: Array, other: Array) -> Array:
     return np.where(mask.reshape(-1, *[1] * (one.ndim - 1)), one, other)
 
 
-def _chosen(mask: Array, one: Stations, other: Stations) -> Stations:
+def _chosen(mask: Mask, one: Stations, other: Stations) -> Stations:
     return Stations(_where(mask, one.alpha, other.alpha), _where(mask, one.u, other.u), _where(mask, one.b, other.b))
 
 

@@ -92,8 +92,8 @@ def _sides(u: Array, v: Array, alpha: Array, square: Array) -> list[tuple[Array,
         K, Kh = _quadric(v / length, square)
         K, Kh = 4.0 * K / length**2, 2.0 * Kh / length
         for positive in _positive(K):
-            H = np.linalg.inv(positive)
-            out.append((0.5 * (H + H.T), H @ Kh))
+            inverse = np.asarray(np.linalg.inv(positive), dtype=float)
+            out.append((0.5 * (inverse + inverse.T), inverse @ Kh))
     return out
 
 

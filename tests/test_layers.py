@@ -23,11 +23,11 @@ LAYERS = (
     "files papers several plot plugins",
     "study",
     "report",
-    "live placement",
+    "live placement calibration",
     "cli",
 )
 LAYER = {room: floor for floor, rooms in enumerate(LAYERS) for room in rooms.split()}
-USERS_OF_FORMULATIONS = {"solvers", "placement"}
+USERS_OF_FORMULATIONS = {"solvers", "placement", "calibration"}
 BASELINES = {"optloc.study.baselines"}
 # clarabel: the back end of cvxpy, whose data a warm solve updates directly
 GROUND = {"numpy", "scipy", "cvxpy", "casadi", "clarabel", "formulations"} | sys.stdlib_module_names
@@ -76,7 +76,7 @@ def wrong_arrows(root: Path) -> list[str]:
         if not here or here == there:
             continue
         if target.split(".")[0] == "formulations" and here not in USERS_OF_FORMULATIONS and name not in BASELINES:
-            out.append(f"{name}:{line} imports {target}: only solvers, placement and the baselines do")
+            out.append(f"{name}:{line} imports {target}: only solvers, placement, calibration and the baselines do")
         if target == "optloc" or (there and LAYER[there] >= LAYER[here]):
             out.append(f"{name}:{line} imports {target}")
     return out
@@ -189,7 +189,7 @@ def test_the_test_sees_lazy_relative_and_sideways_imports(tmp_path):
         "optloc.base.types optloc.solvers.ipopt",
         "optloc.base.types optloc.problem.fix",
         "optloc.base.types optloc.cli",
-        "optloc.bounds.crlb formulations.nls: only solvers, placement and the baselines do",
+        "optloc.bounds.crlb formulations.nls: only solvers, placement, calibration and the baselines do",
         "optloc.bounds.crlb optloc.proof.box",
         "optloc.solvers.ipopt optloc",
     ]

@@ -132,7 +132,7 @@ def place_pulses(net: Network, at: Estimate, which: Array, method: str = "auto")
     stations, clocks = at.stations[0], at.clocks[0]
     kinds = []
     for kind in dict.fromkeys(slot.kind for slot in net.slots):
-        slots = [r for r, slot in enumerate(net.slots) if slot.kind == kind]
+        slots = np.array([r for r, slot in enumerate(net.slots) if slot.kind == kind])
         a = np.array([net.slots[r].a for r in slots])
         b = np.array([net.slots[r].b for r in slots])
         tick = 0.0 if kind == "range" else clocks[a] - (clocks[b] if kind == "tdoa" else 0.0)
@@ -178,7 +178,7 @@ def _stations(net: Network, at: Estimate, which: list[int], method: str) -> list
                 )
             )
     spread = float(np.ptp(places, axis=0).max()) or 1.0
-    out, soft = [], np.isfinite(net.place_sigma[which]).any(axis=1)
+    out, soft = [], np.asarray(np.isfinite(net.place_sigma[which]).any(axis=1))
     plain = [i for i, known in zip(which, soft, strict=True) if not known]
     problem = assemble(places, *rows)
     free = solve(problem.take(np.flatnonzero(~soft)), method) if plain else None
@@ -203,6 +203,7 @@ def _ranges(net: Network, at: Estimate) -> tuple[tuple[Array, Array], tuple[Arra
     for r, slot in enumerate(net.slots):
         weight = np.where(net.given[:, r], net.sigma[:, r] ** -2.0, 0.0)
         z = net.z[:, r]
+        ends: tuple[tuple[int, Array], ...]
         if slot.kind == "tdoa":
             ends = ((slot.a, z + apart[slot.b]), (slot.b, apart[slot.a] - z))
         else:

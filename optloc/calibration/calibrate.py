@@ -9,34 +9,22 @@ import numpy as np
 
 from optloc.base.errors import InvalidProblem, NoSolution, nearest
 from optloc.base.types import PRECEDENCE, Array, Status
-from optloc.calibration.blocks import MOVED, Block, blocks, moved, place_pulses
-from optloc.calibration.gauge import Determined, determined, fixed_by, in_frame
+from optloc.calibration.blocks import Block, blocks, place_pulses
+from optloc.calibration.gauge import Determined, determined, fixed_by, in_frame, with_mean_clock
 from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, together
-from optloc.calibration.network import CLOCKED, Network
-from optloc.calibration.starts import Ends, laid, rounds, starts_of
+from optloc.calibration.network import Network
+from optloc.calibration.search import AGREEING, Found, frame_size, search, without_liars
+from optloc.calibration.starts import laid
 from optloc.compute.range_shape import STRAIGHT
 from optloc.problem.fix import tail_probability
-from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, REFUTED, equal_cost
+from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, REFUTED
 
-AGREEING = 3
-"""Starts that must arrive at the least cost: with fewer, one network in ten was found in another minimum."""
-
-# Starts after which the best is taken for what it is: nine networks in ten of six stations need fewer.
-_STARTS = 144
-# Networks whose blocks are moved after each round, the cheapest first.
-_TRIED = 2
 # Pulses that starts are made from: those with most rows. More find nothing that so many do not.
 _CORE = 60
-# Sweeps of block moves: each lowers the cost or is the last.
-_SWEEPS = 6
 # Singular value of stations about their centre, in its standard deviations, below which they are flat.
 _FLAT = 3.0
 # The weakest directions along which the cost is looked at three sigma out: where it bends, it bends there first.
 _WEAKEST = 6
-# Whitened residual beyond which a robust fit leaves a row out, and the least scale of its weights.
-_LIAR, _SCALE = 4.0, 3.0
-# Robust refinements begin at more places: liars make minima of their own.
-_ROBUST_STARTS = 96
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,11 +188,11 @@ def calibrate(
     """
     named = _named(network, gauge)
     enough = _placeable(network)
-    if network.rows - network.unknowns + _frame_size(network) < 0 or enough.sum() < 1:
+    if network.rows - network.unknowns + frame_size(network) < 0 or enough.sum() < 1:
         return _refused(network, Status.TOO_FEW_ROWS, "There are fewer measurements than unknowns.")
     core = np.sort(np.argsort(-network.given.sum(axis=1), kind="stable")[:_CORE])
     core = core[enough[core]]
-    found = _search(network.take(core), robust, seed, starts or (_ROBUST_STARTS if robust else _STARTS), tell)
+    found = search(network.take(core), robust, seed, starts, tell)
     if found is None:
         return _refused(network, Status.NUMERICAL, "No start led to a network.")
     at = found.best
@@ -215,156 +203,12 @@ def calibrate(
     kept = network.take(enough)
     left_out = np.zeros((0, 2), dtype=int)
     if robust:
-        kept, at, left_out = _without_liars(kept, at)
+        kept, at, left_out = without_liars(kept, at)
         left_out[:, 0] = np.flatnonzero(enough)[left_out[:, 0]]
     lik = likelihood(kept)
     at, _ = lik.refine(at)
     made = _judged(lik, at, found, named, robust)
     return _whole(made, network, enough, left_out)
-
-
-# The search.
-
-
-@dataclass(slots=True)
-class _Found:
-    """What a search has arrived at so far.
-
-    `ends` are the minima of starts; `onward` tells where moves of blocks lead from the cost of one, and `others` are
-    networks with one block of the best elsewhere, by name.
-    """
-
-    ends: Ends
-    best: Estimate
-    cost: float
-    made: int
-    others: list[tuple[str, Estimate, float]] = field(default_factory=list)
-    onward: dict[float, float] = field(default_factory=dict)
-
-    @property
-    def agreeing(self) -> int:
-        """Return how many starts led to the best: by themselves, or by moves of blocks."""
-        led = np.array([self.onward.get(_key(cost), cost) for cost in self.ends.cost])
-        return len(np.unique(self.ends.start[led <= self.cost + _SAME + equal_cost(self.cost)]))
-
-
-# Difference of cost that nobody can tell: a tenth of a sigma of one number.
-_SAME = 0.01
-
-
-def _key(cost: float) -> float:
-    return round(float(cost), 4)
-
-
-def _search(net: Network, robust: bool, seed: int, limit: int, tell: Callable[[str], None] | None) -> _Found | None:
-    lik = likelihood(net, geman_mcclure if robust else None)
-    score = _truncated if robust else _plain
-    found: _Found | None = None
-    for one in rounds(starts_of(lik, seed)):
-        cost = score(lik, one.at)
-        good, made = np.isfinite(cost), int(one.start.max()) + 1
-        if good.any():
-            found = _joined(found, Ends(one.at.take(good), cost[good], one.start[good]), made)
-            if not robust:
-                _move_on(lik, found)
-            if tell is not None:
-                tell(f"{found.made} starts, {found.agreeing} at the least cost {found.cost:.5g}")
-            agreed = found.agreeing >= AGREEING and (robust or _fits(net, found.cost))
-            if (agreed or made >= limit) and (robust or not _lowered(lik, found)):
-                return found
-        if made >= 2 * limit:
-            return found
-    return found
-
-
-def _lowered(lik: Likelihood, found: _Found) -> bool:
-    """Move blocks to all places that a proof leaves, and return whether the best network became cheaper."""
-    at, cost, found.others = _swept(lik, found.best, found.cost, prove=True)
-    if cost >= found.cost - _SAME:
-        return False
-    found.onward[_key(found.cost)] = cost
-    found.best, found.cost = at, cost
-    return True
-
-
-def _joined(found: _Found | None, ends: Ends, made: int) -> _Found:
-    if found is not None:
-        ends = Ends(
-            together(found.ends.at, ends.at),
-            np.concatenate([found.ends.cost, ends.cost]),
-            np.concatenate([found.ends.start, ends.start]),
-        )
-    i = int(ends.cost.argmin())
-    if found is None:
-        return _Found(ends, ends.at.take(np.array([i])), float(ends.cost[i]), made)
-    found.ends, found.made = ends, made
-    if ends.cost[i] < found.cost - _SAME:
-        found.best, found.cost = ends.at.take(np.array([i])), float(ends.cost[i])
-    return found
-
-
-def _move_on(lik: Likelihood, found: _Found) -> None:
-    """Move single blocks of the cheapest networks to their other places, as long as that lowers the cost."""
-    ends = found.ends
-    tried = 0
-    for i in np.argsort(ends.cost, kind="stable"):
-        if found.agreeing >= AGREEING or tried == _TRIED:
-            return
-        if _key(ends.cost[i]) in found.onward:
-            continue
-        tried += 1
-        at, cost = _swept(lik, ends.at.take(np.array([i])), float(ends.cost[i]))[:2]
-        found.onward[_key(ends.cost[i])] = cost
-        if cost < found.cost - _SAME:
-            found.best, found.cost = at, cost
-
-
-def _swept(
-    lik: Likelihood, at: Estimate, cost: float, prove: bool = False
-) -> tuple[Estimate, float, list[tuple[str, Estimate, float]]]:
-    """Return where moves of blocks lead from a minimum, and the networks with one block elsewhere."""
-    others: list[tuple[str, Estimate, float]] = []
-    for _ in range(_SWEEPS):
-        names, starts = [], []
-        for block in blocks(lik, at, prove=prove):
-            for place, gap in zip(block.places, block.gaps, strict=True):
-                if gap <= MOVED:
-                    names.append(block.name)
-                    starts.append(moved(lik, at, block, place))
-        if not starts:
-            break
-        ends, costs = lik.refine(together(*starts))
-        i = int(np.argmin(costs))
-        others = [(f"{name} elsewhere", ends.take(np.array([n])), float(costs[n])) for n, name in enumerate(names)]
-        if costs[i] >= cost - _SAME - equal_cost(cost):
-            break
-        at, cost = ends.take(np.array([i])), float(costs[i])
-    return at, cost, others
-
-
-def _plain(lik: Likelihood, at: Estimate) -> Array:
-    return lik.cost(at)
-
-
-def _truncated(lik: Likelihood, at: Estimate) -> Array:
-    squares = np.minimum(lik.residual(at) ** 2, _LIAR**2).sum(axis=(1, 2))
-    return squares + lik.cost(at) - (lik.residual(at) ** 2).sum(axis=(1, 2))
-
-
-def geman_mcclure(residual: Array) -> Array:
-    """Return weights of whitened residuals (S, N, R): Geman and McClure's, with a scale for each estimate.
-
-    S. Geman and D. McClure, "Statistical methods for tomographic image reconstruction", Bull. Int. Stat. Inst. 52
-    (1987).
-    """
-    flat = np.where(residual != 0.0, np.abs(residual), np.nan).reshape(len(residual), -1)
-    scale = np.maximum(2.0 * np.nanmedian(flat, axis=1), _SCALE)[:, None, None]
-    return np.asarray((1.0 + (residual / scale) ** 2) ** -2)
-
-
-def _fits(net: Network, cost: float) -> bool:
-    dof = np.array(net.rows - net.unknowns + _frame_size(net))
-    return not float(tail_probability(np.array(cost), dof)) < REFUTED
 
 
 def _with_rest(network: Network, at: Estimate, core: Array, rest: Array) -> Estimate:
@@ -386,29 +230,13 @@ def _with_rest(network: Network, at: Estimate, core: Array, rest: Array) -> Esti
     return Estimate(at.stations, at.clocks, pulses[:, every], emission[:, every])
 
 
-def _without_liars(net: Network, at: Estimate) -> tuple[Network, Estimate, Array]:
-    """Return the network without rows far off, its estimate, and which they are (pulse, slot)."""
-    at, _ = likelihood(net, geman_mcclure).refine(at)
-    out = np.zeros(net.z.shape, dtype=bool)
-    for _ in range(_SWEEPS):
-        residual = likelihood(net).residual(at)[0]
-        far = net.given & (np.abs(residual) > _LIAR)
-        kept = replace(net, sigma=np.where(far, np.inf, net.sigma))
-        at, _ = likelihood(kept).refine(at)
-        if (far == out).all():
-            break
-        out = far
-    return replace(net, sigma=np.where(out, np.inf, net.sigma)), at, np.argwhere(out)
-
-
 # The verdict.
 
 
-def _judged(lik: Likelihood, at: Estimate, found: _Found, named: tuple[int, ...], robust: bool) -> Calibration:
+def _judged(lik: Likelihood, at: Estimate, found: Found, named: tuple[int, ...], robust: bool) -> Calibration:
     net = lik.network
     soft = np.isfinite(net.place_sigma).any()
-    if not soft:
-        at = in_frame(net, at, named)
+    at = with_mean_clock(net, at) if soft else in_frame(net, at, named)
     told = determined(lik, at)
     cost = float(lik.cost(at)[0])
     dof = net.rows - net.unknowns + told.free.shape[1]
@@ -472,7 +300,7 @@ def _open_words(net: Network, told: Determined) -> str:
 
 def _flat_findings(net: Network, at: Estimate, covariance: Array) -> list[tuple[Status, str]]:
     """Return what follows from stations, or pulses, in one plane: each of the others has a mirror image."""
-    out = []
+    out: list[tuple[Status, str]] = []
     m, d = net.stations, net.dimension
     if np.isfinite(net.place_sigma).all():
         return out
@@ -545,7 +373,7 @@ def refuted_blocks(network: Network, at: Estimate) -> tuple[Block, ...]:
     return tuple(block for block in blocks(likelihood(network), at) if block.refuted)
 
 
-def _alternatives(lik: Likelihood, at: Estimate, cost: float, found: _Found, soft: bool) -> tuple[Alternative, ...]:
+def _alternatives(lik: Likelihood, at: Estimate, cost: float, found: Found, soft: bool) -> tuple[Alternative, ...]:
     """Return other minima within `LISTED_GAP`: ends of other starts, blocks elsewhere, and the mirror image."""
     net = lik.network
     others: list[tuple[str, Estimate]] = []
@@ -619,14 +447,6 @@ def _placeable(network: Network) -> Array:
     return np.asarray(network.given.sum(axis=1) >= needed)
 
 
-def _frame_size(network: Network) -> int:
-    """Return how many unknowns the frame is, as far as known coordinates can fix it."""
-    d = network.dimension
-    known = int(np.isfinite(network.place_sigma).sum())
-    clocks = int(not network.synchronised and any(slot.kind in CLOCKED for slot in network.slots))
-    return max(d * (d + 1) // 2 - known, 0) + clocks
-
-
 def _refused(network: Network, status: Status, words: str) -> Calibration:
     m, n, d = network.stations, network.pulses, network.dimension
     p = m * d + (0 if network.synchronised else m)
@@ -643,7 +463,7 @@ def _refused(network: Network, status: Status, words: str) -> Calibration:
         (words,),
         "unknown",
         float("nan"),
-        network.rows - network.unknowns + _frame_size(network),
+        network.rows - network.unknowns + frame_size(network),
         float("nan"),
         0,
         0,

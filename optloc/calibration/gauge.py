@@ -58,7 +58,7 @@ def determined(lik: Likelihood, at: Estimate) -> Determined:
     jacobian = np.linalg.qr(np.concatenate([reduced, lik.known(at)[1][0]]))[1]
     motions = frame_moves(lik.network, at)
     motions[~lik.free] = 0.0
-    size = np.linalg.norm(jacobian, 2)
+    size = float(np.linalg.norm(jacobian, 2))
     free = _unseen(jacobian, _span(motions), size)
     rest = np.linalg.svd(free.T)[2][free.shape[1] :].T if free.shape[1] else np.eye(p)
     rest = rest[:, np.abs(rest[lik.free]).max(axis=0) > _ZERO]
@@ -69,7 +69,7 @@ def determined(lik: Likelihood, at: Estimate) -> Determined:
 
 def _span(columns: Array) -> Array:
     u, s, _ = np.linalg.svd(columns, full_matrices=False)
-    return np.asarray(u[:, s > _ZERO * max(s.max(initial=0.0), 1e-300)])
+    return np.asarray(u[:, s > _ZERO * max(float(np.max(s, initial=0.0)), 1e-300)])
 
 
 def _unseen(jacobian: Array, basis: Array, size: float) -> Array:
@@ -98,7 +98,7 @@ def frame_moves(net: Network, at: Estimate) -> Array:
             columns.append(np.concatenate([turned.ravel(), np.zeros(p - m * d)]))
     if not net.synchronised:
         columns.append(np.concatenate([np.zeros(m * d), np.ones(m)]))
-    return np.array([c / max(np.linalg.norm(c), 1e-300) for c in columns]).T
+    return np.array([c / max(float(np.linalg.norm(c)), 1e-300) for c in columns]).T
 
 
 def in_frame(net: Network, at: Estimate, named: tuple[int, ...]) -> Estimate:
@@ -136,10 +136,25 @@ def in_frame(net: Network, at: Estimate, named: tuple[int, ...]) -> Estimate:
         along = (stations - origin) @ basis[:, c]
         basis[:, c] *= 1.0 if along[np.abs(along).argmax()] >= 0.0 else -1.0
     moved = replace(at, stations=(at.stations - origin) @ basis, pulses=(at.pulses - origin) @ basis)
+    return with_mean_clock(net, moved, named[:1])
+
+
+def with_mean_clock(net: Network, at: Estimate, named: tuple[int, ...] = ()) -> Estimate:
+    """Return a network whose clocks are told against that of a named station, or against their mean.
+
+    Parameters
+    ----------
+    net : Network
+        What was measured.
+    at : Estimate
+        S = 1.
+    named : tuple of int
+        The station, or empty.
+    """
     if net.synchronised:
-        return moved
+        return at
     offset = at.clocks[0, named[0]] if named else at.clocks[0].mean()
-    return replace(moved, clocks=at.clocks - offset, emission=at.emission + np.where(net.emission, offset, 0.0))
+    return replace(at, clocks=at.clocks - offset, emission=at.emission + np.where(net.emission, offset, 0.0))
 
 
 def fixed_by(net: Network, named: tuple[int, ...]) -> Array:

@@ -90,7 +90,7 @@ class Likelihood:
         for end, gain, tick in zip((self.first, self.second), self.gains, self.ticks, strict=True):
             line = at.stations[:, None, end] - at.pulses[:, :, None]
             predicted = predicted + gain * np.sqrt(np.sum(line * line, axis=-1)) + tick * at.clocks[:, None, end]
-        return (self.network.z - predicted) * self.root
+        return np.asarray((self.network.z - predicted) * self.root)
 
     def spans(self, at: Estimate) -> tuple[Array, Array]:
         """Return whitened residuals of distances between stations (S, q), and their unit vectors over sigma."""

@@ -13,7 +13,6 @@ from formulations.metric_upgrade import unknowns, upgrade
 from optloc.base.types import Array
 from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, together
 from optloc.calibration.network import Network
-from optloc.solvers.policy import equal_cost
 
 # Starts at a time: a batch of eight costs little more than one.
 _LOW_RANK, _RANDOM = 8, 4
@@ -40,16 +39,22 @@ class Ends:
         Their costs.
     start : int array (S,)
         Number of the start that each comes from.
+    weight : int array (S,)
+        How many starts that one stands for: those that had found the same fit.
     """
 
     at: Estimate
     cost: Array
     start: Array
+    weight: Array
 
-    def agreeing(self, cost: float) -> int:
-        """Return how many starts arrived at a cost."""
-        # a hundredth is a tenth of a sigma of one number: nobody can tell such minima apart
-        return len(np.unique(self.start[self.cost <= cost + 0.01 + equal_cost(cost)]))
+    def take(self, which: Array) -> Ends:
+        """Return some of the ends."""
+        return Ends(self.at.take(which), self.cost[which], self.start[which], self.weight[which])
+
+    def counted(self, which: Array) -> int:
+        """Return how many starts some of the ends (mask) come from."""
+        return int(self.weight[which][np.unique(self.start[which], return_index=True)[1]].sum())
 
 
 def arrivals(network: Network) -> tuple[Array, Array, Array]:
@@ -124,8 +129,8 @@ class Starts:
         """Return 2 or 3."""
         return self.lik.network.dimension
 
-    def low_rank(self, count: int) -> tuple[Estimate, Array]:
-        """Return networks from fits of low rank, and which of `count` starts each comes from."""
+    def low_rank(self, count: int) -> tuple[Estimate, Array, Array]:
+        """Return networks from fits of low rank, the number of each fit, and how many of `count` starts found it."""
         net, d = self.lik.network, self.dimension
         full = (self.weight > 0.0).sum(axis=1) >= d + 3
         relative = self.weight / self.weight.max()
@@ -140,7 +145,7 @@ class Starts:
         family[order] = np.cumsum(new) - 1
         stations, pulses, which = upgrade(fit.take(order[new]))
         if not len(which):
-            return _nothing(net), np.zeros(0, dtype=int)
+            return _nothing(net), np.zeros(0, dtype=int), np.zeros(0, dtype=int)
         b = fit.stations.b[order[new]][which] * self.spread
         places = np.zeros((len(which), net.pulses, d))
         places[:, full] = pulses * self.spread
@@ -150,13 +155,8 @@ class Starts:
         offsets = np.where(self.emission, offsets + self.shift, 0.0)
         made = Estimate(stations * self.spread, b, places, offsets * net.emission)
         self._settle(made, ~full)
-        # each start of a family arrives where its family does
-        rows, starts = [], []
-        for i, f in enumerate(family):
-            own = np.flatnonzero(which == f) if f >= 0 else []
-            rows.extend(own)
-            starts.extend([i] * len(own))
-        return made.take(np.unique(rows)), _first(family, which[np.unique(rows)])
+        # each start of a family arrives where the family does
+        return made, which, np.bincount(family[family >= 0])[which]
 
     def _settle(self, made: Estimate, few: Array) -> None:
         """Give pulses that took no part in a fit the emission that their places at the centre call for."""
@@ -179,19 +179,15 @@ class Starts:
         offset = ((self.z - apart) * weight).sum(axis=-1)
         return Estimate(stations, np.zeros((count, net.stations)), pulses, offset * net.emission)
 
-    def ends(self, at: Estimate, start: Array) -> Ends:
+    def ends(self, at: Estimate, start: Array, weight: Array) -> Ends:
         """Refine networks, laid over what is known of the stations in both ways."""
         net = self.lik.network
         if np.isfinite(net.place_sigma).any():
             free = replace(net, place_sigma=np.full(net.place.shape, np.inf), place=np.zeros(net.place.shape))
             rough, _ = likelihood(free, self.lik.weigh).refine(at, _ROUGH)
-            at, start = laid(rough, net, self.rng), np.concatenate([start, start])
+            at, start, weight = laid(rough, net, self.rng), np.tile(start, 2), np.tile(weight, 2)
         found, cost = self.lik.refine(at)
-        return Ends(found, cost, start)
-
-
-def _first(family: Array, which: Array) -> Array:
-    return np.array([np.flatnonzero(family == f)[0] for f in which], dtype=int)
+        return Ends(found, cost, start, weight)
 
 
 def _nothing(net: Network) -> Estimate:
@@ -210,20 +206,22 @@ def starts_of(lik: Likelihood, seed: int) -> Starts:
     return Starts(lik, z, weight, emission, shift, spread, np.random.default_rng(seed))
 
 
-def rounds(starts: Starts) -> Iterator[Ends]:
-    """Yield the ends of round after round of starts: low rank where it applies, and random places."""
+def rounds(starts: Starts) -> Iterator[tuple[int, Ends]]:
+    """Yield how many starts were made, and the ends of each round: low rank where it applies, and random places."""
     net, d = starts.lik.network, starts.dimension
     full = int(((starts.weight > 0.0).sum(axis=1) >= d + 3).sum())
     able = net.stations >= d + 3 and full > 0 and max(net.stations, full) >= unknowns(d)
     begun = 0
     while True:
         if able:
-            at, start = starts.low_rank(_LOW_RANK)
-            if at.count:
-                yield starts.ends(at, start + begun)
+            at, start, weight = starts.low_rank(_LOW_RANK)
+            found = starts.ends(at, start + begun, weight) if at.count else None
             begun += _LOW_RANK
-        yield starts.ends(starts.random(_RANDOM), np.arange(_RANDOM) + begun)
+            if found is not None:
+                yield begun, found
+        found = starts.ends(starts.random(_RANDOM), np.arange(_RANDOM) + begun, np.ones(_RANDOM, dtype=int))
         begun += _RANDOM
+        yield begun, found
 
 
 def laid(at: Estimate, net: Network, rng: np.random.Generator) -> Estimate:

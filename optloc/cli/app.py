@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from optloc.cli.calibrate import NETWORKS, calibrate
 from optloc.cli.doctor import doctor
 from optloc.cli.from_table import EXAMPLES as CONVERSIONS
 from optloc.cli.from_table import convert, table_told, takes_table
@@ -505,6 +506,7 @@ def new(
 
 
 app.command(rich_help_panel=FIRST, epilog=example(*CONVERSIONS))(convert)
+app.command(rich_help_panel=ANSWERS, epilog=example(*NETWORKS))(calibrate)
 
 
 @app.command(

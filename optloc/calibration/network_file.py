@@ -1,0 +1,237 @@
+"""Networks as files: stations with coordinates left out, pulses, distances; and the problem file of what is found."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.inputs import read_text
+from optloc.base.outputs import claim, write_text
+from optloc.base.types import Array
+from optloc.base.units import SPEED_OF_LIGHT
+from optloc.calibration.calibrate import Calibration
+from optloc.calibration.network import KINDS, Network, Slot, checked
+from optloc.files.schema import Amount, DataTable, Units, conform, join, name_of, parse_toml
+from optloc.files.table import Table, distinct, table_of
+from optloc.files.writer import toml_text
+from optloc.models import MODELS, kind_named
+
+# Deviation that stations of the frame get in a file, metres: as good as exact.
+_EXACT = 1e-6
+
+BETWEEN = "station_range"
+"""Kind of rows that are distances between two stations."""
+
+
+class _Table(BaseModel):
+    """A table of the file; keys that it does not know are refused."""
+
+    model_config = ConfigDict(
+        extra="forbid", frozen=True, strict=True, allow_inf_nan=False, use_attribute_docstrings=True
+    )
+
+
+class NetworkStations(DataTable):
+    """The stations. Columns: name; x, y, z where something is known of them, sigma where not exactly."""
+
+    unit: str = "m"
+    """Unit of x, y, z and sigma."""
+    sigma: Amount | None = None
+    """Standard deviation of known coordinates; None: exact."""
+    synchronised: bool = True
+    """Whether the stations share a clock; else each has an unknown offset."""
+    dimension: Literal[2, 3] = 3
+    """Of space."""
+
+
+class NetworkRows(DataTable):
+    """Measurements of one kind. Columns: epoch (the pulse), a, z; b of two stations; sigma."""
+
+    kind: str
+    """toa, tdoa, range; station_range is the distance of stations a and b, without epoch."""
+    unit: str = "m"
+    """Unit of z, or of time."""
+    sigma: Amount | None = None
+    """Standard deviation of each row, where there is no column sigma."""
+
+
+class NetworkFile(_Table):
+    """A network whose stations are to be found."""
+
+    format: Literal[1]
+    """Version of the format."""
+    title: str | None = None
+    """What it is."""
+    propagation_speed: Amount | None = None
+    """Metres per second, or an amount such as "1480 m/s"; light by default."""
+    stations: NetworkStations
+    measurements: list[NetworkRows] = Field(min_length=1)
+
+
+def read_network(path: Path) -> Network:
+    """Return the network of a file.
+
+    Raises
+    ------
+    InvalidProblem
+        Naming the file, the row and the column or key.
+    """
+    source, folder = name_of(path), path.parent
+    file = conform(NetworkFile, parse_toml(read_text(path), source), source)
+    speed = _speed(file.propagation_speed, source)
+    table = table_of(file.stations, folder, where := join(source, "[stations]"))
+    names = tuple(str(name) for name in table.labels("name"))
+    place, place_sigma = _places(file.stations, table, where)
+    rows: list[tuple[str, Array, Array, Array, Array, Array]] = []
+    apart: list[tuple[Array, Array, Array, Array]] = []
+    for i, section in enumerate(file.measurements):
+        place_of = join(source, f"[[measurements]] {i + 1}")
+        own = table_of(section, folder, place_of)
+        between = section.kind == BETWEEN
+        kind = BETWEEN if between else kind_named(section.kind, place_of)
+        if not between and kind not in KINDS:
+            raise InvalidProblem(f"networks have no rows of kind {kind!r}", place_of, nearest(kind, [*KINDS, BETWEEN]))
+        z, sigma = _values(section, own, Units("length", speed), place_of)
+        a = _stations(own, "a", names)
+        two = between or MODELS[kind].stations == 2
+        b = _stations(own, "b", names) if two else np.full(own.count, -1)
+        if between:
+            apart.append((a, b, z, sigma))
+        else:
+            rows.append((kind, own.labels("epoch"), a, b, z, sigma))
+    if not rows:
+        raise InvalidProblem("there are no pulses", source, 'add [[measurements]] of kind "toa", "tdoa" or "range"')
+    labels, slots, table_z, table_sigma = _by_pulse(rows)
+    ends = np.array([[a, b] for one in apart for a, b in zip(one[0], one[1], strict=True)], dtype=np.int64)
+    return checked(
+        Network(
+            names,
+            slots,
+            table_z,
+            table_sigma,
+            place,
+            place_sigma,
+            file.stations.synchronised,
+            ends.reshape(-1, 2),
+            np.concatenate([np.zeros(0), *(one[2] for one in apart)]),
+            np.concatenate([np.zeros(0), *(one[3] for one in apart)]),
+            labels,
+        )
+    )
+
+
+def _speed(given: Amount | None, source: str) -> float:
+    where = join(source, "key 'propagation_speed'")
+    speed = SPEED_OF_LIGHT if given is None else Units("speed").plain(given, "m/s", where)
+    if not speed > 0.0:
+        raise InvalidProblem("the speed is not positive", where, "give metres per second")
+    return speed
+
+
+def _places(section: NetworkStations, table: Table, where: str) -> tuple[Array, Array]:
+    """Return what is known of places (M, d), and how well: infinite where a cell is empty."""
+    unit = Units("length").conversion(section.unit, where)
+    keys = ("x", "y", "z")[: section.dimension]
+    if section.dimension == 2 and table.has("z"):
+        raise InvalidProblem("a network in the plane has no column z", where, "leave it out, or write dimension = 3")
+    place = np.array([_optional(table, key) for key in keys]).T * unit.factor
+    own = _optional(table, "sigma") * unit.factor
+    common = 0.0 if section.sigma is None else Units("length").plain(section.sigma, section.unit, where)
+    sigma = np.where(np.isnan(own), common, own)[:, None]
+    if (sigma < 0.0).any():
+        raise InvalidProblem("a standard deviation is negative", where, "give zero where a place is exact")
+    return np.where(np.isnan(place), 0.0, place), np.where(np.isnan(place), np.inf, sigma)
+
+
+def _optional(table: Table, key: str) -> Array:
+    return table.numbers(key, optional=True) if table.has(key) else np.full(table.count, np.nan)
+
+
+def _values(section: NetworkRows, table: Table, units: Units, where: str) -> tuple[Array, Array]:
+    unit = units.conversion(section.unit, where)
+    z = table.numbers("z") * unit.factor
+    if table.has("sigma"):
+        return z, table.numbers("sigma") * unit.factor
+    if section.sigma is None:
+        raise InvalidProblem("the rows have no standard deviation", where, 'write sigma = "5 cm", or a column sigma')
+    return z, np.full(table.count, units.plain(section.sigma, section.unit, where))
+
+
+def _stations(table: Table, key: str, names: tuple[str, ...]) -> Array:
+    labels, known = table.labels(key), {name: i for i, name in enumerate(names)}
+    for row, label in enumerate(labels):
+        if label not in known:
+            what = f"there is no station {label!r}"
+            raise InvalidProblem(what, table.where(key, row), nearest(label, list(names)))
+    return np.array([known[label] for label in labels], dtype=np.int64)
+
+
+def _by_pulse(
+    rows: list[tuple[str, Array, Array, Array, Array, Array]],
+) -> tuple[tuple[str, ...], tuple[Slot, ...], Array, Array]:
+    """Return labels of pulses, slots, and tables (N, R) of values and deviations.
+
+    What the same stations measure of one pulse more than once has a slot for each time.
+    """
+    labels, _, pulse = distinct(np.concatenate([one[1] for one in rows]))
+    slots: dict[tuple[str, int, int, int], int] = {}
+    cells: list[tuple[int, int, float, float]] = []
+    seen: dict[tuple[int, str, int, int], int] = {}
+    at = 0
+    for kind, epochs, a, b, z, sigma in rows:
+        for i in range(len(epochs)):
+            j = int(pulse[at])
+            at += 1
+            key = (j, kind, int(a[i]), int(b[i]))
+            seen[key] = seen.get(key, -1) + 1
+            slot = slots.setdefault((kind, int(a[i]), int(b[i]), seen[key]), len(slots))
+            cells.append((j, slot, float(z[i]), float(sigma[i])))
+    table = np.zeros((len(labels), len(slots)))
+    deviations = np.full(table.shape, np.inf)
+    for j, slot, value, deviation in cells:
+        table[j, slot], deviations[j, slot] = value, deviation
+    return tuple(labels), tuple(Slot(kind, a, b) for kind, a, b, _ in slots), table, deviations
+
+
+def write_calibrated(found: Calibration, title: str, out: Path, source: Path) -> None:
+    """Write a problem file with the stations that were found, their deviations, and the rows of the pulses.
+
+    Raises
+    ------
+    InvalidProblem
+        Where there is no network to write, or the file is no TOML.
+    """
+    if out.suffix.lower() != ".toml":
+        raise InvalidProblem("what was found is written as a problem file", str(out), "let its name end in .toml")
+    if not np.isfinite(found.covariance).all():
+        raise InvalidProblem(f"the network is {found.status.label}", str(out), "see its findings")
+    claim(out, inputs=[source])
+    net, sigma = found.network, np.sqrt(np.mean(found.sigma**2, axis=1))
+    stations = []
+    for name, place, own in zip(net.names, found.stations, sigma, strict=True):
+        stations.append(
+            {"name": name, **{k: float(v) for k, v in zip("xyz", place, strict=False)}, "sigma": max(float(own), _EXACT)}
+        )
+    measurements = []
+    for kind in dict.fromkeys(slot.kind for slot in net.slots):
+        rows = []
+        for j, r in np.argwhere(net.given & [slot.kind == kind for slot in net.slots]):
+            slot = net.slots[r]
+            tick = found.clocks[slot.a] - (found.clocks[slot.b] if slot.b >= 0 else 0.0) if kind != "range" else 0.0
+            row: dict[str, Any] = {"epoch": net.labels[j], "a": net.names[slot.a]}
+            if slot.b >= 0:
+                row["b"] = net.names[slot.b]
+            rows.append(row | {"z": float(net.z[j, r] - tick), "sigma": float(net.sigma[j, r])})
+        measurements.append({"kind": kind, "rows": rows})
+    settings = {
+        "format": 1,
+        "title": f"{title}: stations found ({found.status.label}), frame of {found.gauge}",
+        "stations": {"span": "run", "rows": stations},
+        "measurements": measurements,
+        "target": {"motion": "free"},
+    }
+    write_text(out, toml_text(settings))

@@ -1,0 +1,165 @@
+"""What ``optloc calibrate`` does: stations, clocks and pulses from measurements alone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+import typer
+
+from optloc.cli.options import Budget, Force, Json, Outside, ProblemPath, Quiet, Verbose
+
+if TYPE_CHECKING:
+    from optloc.calibration import Calibration
+
+NETWORKS = (
+    "optloc calibrate hall.toml",
+    "optloc calibrate hall.toml --gauge A1,A2,A3 --out surveyed.toml --plot network.png",
+)
+# Stations that a table shows: what a screen holds.
+_LINES = 40
+
+Gauge = Annotated[str | None, typer.Option(metavar="A1,A2,A3", help="Stations that define the frame.")]
+Robust = Annotated[bool, typer.Option("--robust", help="Some rows may be wrong: leave them out, and list them.")]
+Seed = Annotated[int, typer.Option(min=0, help="Decides the starts.")]
+Out = Annotated[Path | None, typer.Option(metavar="OUT.toml", help="Write a problem file with the stations found.")]
+Picture = Annotated[Path | None, typer.Option(metavar="FILE", help="Draw plan, elevation and residuals.")]
+
+
+def calibrate(
+    file: ProblemPath,
+    gauge: Gauge = None,
+    robust: Robust = False,
+    seed: Seed = 0,
+    out: Out = None,
+    plot: Picture = None,
+    as_json: Json = False,
+    outside: Outside = False,
+    budget: Budget = None,
+    force: Force = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Find where stations are, and their clocks, from pulses at unknown places: no first guess, and a verdict.
+
+    FILE lists stations, with the coordinates that are known and no others, and what they measured of each pulse.
+    """
+    raise typer.Exit(_run(file, gauge, robust, seed, out, plot, as_json=as_json, quiet=quiet))
+
+
+def _run(
+    file: Path,
+    gauge: str | None,
+    robust: bool,
+    seed: int,
+    out: Path | None,
+    plot: Path | None,
+    *,
+    as_json: bool,
+    quiet: bool,
+) -> int:
+    from optloc.base.types import Status
+    from optloc.calibration import calibrate as find
+    from optloc.calibration.network_file import read_network, write_calibrated
+    from optloc.cli.output import Screen, claim_outputs, dumps, line, say, write_picture, write_text
+
+    claim_outputs(out, picture=plot, inputs=[file])
+    network = read_network(file)
+    named = tuple(name.strip() for name in gauge.split(",")) if gauge else ()
+    with line(quiet or as_json) as tell:
+        tell("searching")
+        found = find(network, gauge=named, robust=robust, seed=seed, tell=tell)
+    if out is not None:
+        write_calibrated(found, file.stem, out, file)
+    if plot is not None:
+        write_picture(_picture(found, file.stem), plot)
+    if as_json:
+        write_text(Path("-"), dumps(_record(found, file)))
+    elif not quiet:
+        _show(found)
+        if out is not None:
+            say(Screen(), f"The stations are in {out}: try optloc fix {out}.")
+    return 0 if found.status is Status.OK else 1
+
+
+def _show(found: Calibration) -> None:
+    from rich.table import Table
+
+    from optloc.cli.output import Screen, say
+
+    console, net = Screen(), found.network
+    say(console, f"status {found.status.label}, proof {found.proof}; frame of {found.gauge}")
+    for words in found.findings:
+        say(console, words)
+    if found.starts:
+        fit = f"cost {found.cost:.4g}, {found.dof} degrees of freedom, p = {found.p_value:.3g}"
+        say(console, f"{fit}; {found.agreeing} of {found.starts} starts agree")
+    table = Table(title="Stations, m", title_justify="left")
+    axes = "xyz"[: net.dimension]
+    clocks = [] if net.synchronised else ["clock"]
+    for heading in ("station", *(f"{c} ±" for c in axes), *clocks, "residual, sigma"):
+        table.add_column(heading, justify="left" if heading == "station" else "right")
+    with np.errstate(invalid="ignore"):
+        sigma = found.sigma
+    for i, name in enumerate(net.names[:_LINES]):
+        own = found.residuals[:, [i in (slot.a, slot.b) for slot in net.slots]]
+        own = own[np.isfinite(own)]
+        cells = [f"{v:.3f} {s:.3f}" for v, s in zip(found.stations[i], sigma[i], strict=True)]
+        clock = [] if net.synchronised else [f"{found.clocks[i]:.3f}"]
+        table.add_row(name, *cells, *clock, f"{np.sqrt(np.mean(own**2)):.2f}" if own.size else "-")
+    console.print(table)
+    for other in found.alternatives[:5]:
+        say(console, f"{other.what}: cost + {other.gap:.3g}")
+    if len(found.left_out):
+        say(console, f"{len(found.left_out)} rows were left out as wrong; --json lists them.")
+
+
+def _record(found: Calibration, file: Path) -> dict[str, Any]:
+    net = found.network
+    return {
+        "file": str(file),
+        "status": found.status.label,
+        "findings": found.findings,
+        "proof": found.proof,
+        "frame": found.gauge,
+        "cost": found.cost,
+        "dof": found.dof,
+        "p_value": found.p_value,
+        "agreeing": found.agreeing,
+        "starts": found.starts,
+        "stations": [
+            {"name": name, "position": place, "sigma": sigma, "clock": clock}
+            for name, place, sigma, clock in zip(net.names, found.stations, found.sigma, found.clocks, strict=True)
+        ],
+        "covariance": found.covariance,
+        "pulses": [
+            {"name": name, "position": place, "emission": emission}
+            for name, place, emission in zip(net.labels, found.pulses, found.emission, strict=True)
+        ],
+        "alternatives": [{"what": o.what, "gap": o.gap, "stations": o.stations} for o in found.alternatives],
+        "left_out": [
+            {"pulse": net.labels[j], "a": net.names[net.slots[r].a], "b": net.names[net.slots[r].b]}
+            if net.slots[r].b >= 0
+            else {"pulse": net.labels[j], "a": net.names[net.slots[r].a]}
+            for j, r in found.left_out
+        ],
+    }
+
+
+def _picture(found: Calibration, title: str) -> Any:
+    from optloc.plot.network import plot_network
+
+    net = found.network
+    known = np.where(np.isfinite(net.place_sigma), net.place, np.nan)
+    size = net.stations * net.dimension
+    return plot_network(
+        net.names,
+        found.stations,
+        found.covariance[:size, :size],
+        found.pulses,
+        known,
+        [other.stations for other in found.alternatives[:3]],
+        found.residuals,
+        f"{title}: {found.status.label}",
+    )

@@ -1,0 +1,103 @@
+"""A network in plan and elevation: stations with ellipses, pulses, what was known, and other networks that fit."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.plot.style import BLACK, GREY, figure_class, literal
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+# Root of the 95 % quantile of chi-square with two degrees of freedom.
+_RADIUS = 2.447746830680816
+# Points of an ellipse, and bars of the residuals' histogram.
+_POINTS, _BARS = 60, 30
+
+
+def plot_network(
+    names: Sequence[str],
+    stations: Array,
+    covariance: Array,
+    pulses: Array,
+    known: Array,
+    others: Sequence[Array],
+    residuals: Array,
+    title: str,
+) -> Figure:
+    """Return plan, elevation (in space) and histogram of the residuals of a network.
+
+    Parameters
+    ----------
+    names : sequence of M str
+        Stations.
+    stations : array (M, d)
+        Metres.
+    covariance : array (M d, M d)
+        Of their coordinates, square metres.
+    pulses : array (N, d)
+        Metres; NaN where there is none.
+    known : array (M, d)
+        What was known of the stations; NaN where nothing.
+    others : sequence of arrays (M, d)
+        Stations of other networks that fit the data, in the same frame.
+    residuals : array (...)
+        Residuals in standard deviations; NaN where there is none.
+    title : str
+        Of the picture.
+    """
+    d = stations.shape[1]
+    figure = figure_class()(figsize=(9.6, 4.8 if d == 2 else 6.4), layout="constrained")
+    figure.suptitle(literal(title))
+    grid = figure.add_gridspec(d - 1, 2, width_ratios=[2.0, 1.0], height_ratios=[2.0, 1.0][: d - 1])
+    views = [(0, 1)] if d == 2 else [(0, 1), (0, 2)]
+    for row, view in enumerate(views):
+        axes = figure.add_subplot(grid[row, 0])
+        _view(axes, view, names, stations, covariance, pulses, known, others)
+        if row == 0:
+            axes.legend(fontsize="small", loc="best")
+    axes = figure.add_subplot(grid[:, 1])
+    finite = residuals[np.isfinite(residuals)]
+    axes.hist(finite, bins=_BARS, density=True, color=GREY)
+    width = np.linspace(-4.0, 4.0, 200)
+    axes.plot(width, np.exp(-0.5 * width**2) / np.sqrt(2.0 * np.pi), color=BLACK)
+    axes.set(xlabel="residual, standard deviations", ylabel="share", title="residuals and the normal law")
+    return figure
+
+
+def _view(
+    axes: Axes,
+    view: tuple[int, int],
+    names: Sequence[str],
+    stations: Array,
+    covariance: Array,
+    pulses: Array,
+    known: Array,
+    others: Sequence[Array],
+) -> None:
+    i, k = view
+    d = stations.shape[1]
+    axes.plot(pulses[:, i], pulses[:, k], ".", color=GREY, markersize=4, label="pulses")
+    for place, other in ((s, o) for one in others for s, o in zip(stations, one, strict=True)):
+        axes.plot([place[i], other[i]], [place[k], other[k]], "-", color=GREY, linewidth=0.6)
+    for n, one in enumerate(others):
+        label = "other networks that fit" if n == 0 else None
+        axes.plot(one[:, i], one[:, k], "o", markerfacecolor="none", color=GREY, label=label)
+    axes.plot(known[:, i], known[:, k], "x", color="tab:orange", label="known" if np.isfinite(known).any() else None)
+    axes.plot(stations[:, i], stations[:, k], "^", color="tab:blue", label="stations, 95 %")
+    turn = np.linspace(0.0, 2.0 * np.pi, _POINTS)
+    circle = _RADIUS * np.array([np.cos(turn), np.sin(turn)])
+    for n, name in enumerate(names):
+        block = covariance[np.ix_([n * d + i, n * d + k], [n * d + i, n * d + k])]
+        if np.isfinite(block).all():
+            width, turned = np.linalg.eigh(block)
+            shape = turned @ (np.sqrt(np.maximum(width, 0.0))[:, None] * circle)
+            axes.plot(stations[n, i] + shape[0], stations[n, k] + shape[1], color="tab:blue", linewidth=0.8)
+        axes.annotate(literal(name), (stations[n, i], stations[n, k]), xytext=(4, 4), textcoords="offset points")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set(xlabel=f"{'xyz'[i]}, m", ylabel=f"{'xyz'[k]}, m")
