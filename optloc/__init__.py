@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from optloc.base.types import Bias, Certificate, Motion, Prior, Rows, Stations, Status
     from optloc.bounds.crlb import Course, crlb, crlb_course
     from optloc.bounds.observability import Observability, observability
+    from optloc.calibration.calibrated import Calibration, calibrate
+    from optloc.calibration.network import Network, network_of
     from optloc.files import from_table, load
     from optloc.files.locate import locate
     from optloc.files.orbits import satellites
@@ -96,6 +98,7 @@ __all__ = [
     "Atmosphere",
     "Bias",
     "Budget",
+    "Calibration",
     "Certificate",
     "Chart",
     "CommonLevel",
@@ -115,6 +118,7 @@ __all__ = [
     "Mixture",
     "Model",
     "Motion",
+    "Network",
     "NoSolution",
     "Noise",
     "NoiseLevels",
@@ -140,6 +144,7 @@ __all__ = [
     "advise",
     "assemble",
     "by_epoch",
+    "calibrate",
     "certify",
     "clock_densities",
     "common_level",
@@ -159,6 +164,7 @@ __all__ = [
     "locate",
     "measured",
     "mixture",
+    "network_of",
     "noise",
     "noise_levels",
     "normal",
@@ -198,6 +204,8 @@ _HOMES = {
     "base.types": "Bias Certificate Motion Prior Rows Stations Status",
     "bounds.crlb": "Course crlb crlb_course",
     "bounds.observability": "Observability observability",
+    "calibration.calibrated": "Calibration calibrate",
+    "calibration.network": "Network network_of",
     "files": "from_table load",
     "files.locate": "locate",
     "files.orbits": "satellites",

@@ -22,6 +22,9 @@ four sigma with the others held hardly ends below when they move as well."""
 QUICK = "gtrs+lsr"
 """Method that tells a fix and its likeliest rivals, unproven."""
 
+# Cost that tells no two places apart: a tenth of a sigma of one number.
+_ALIKE = 0.01
+
 # Deviation, as a share of the spread, of a coordinate that is known exactly beside others that are not.
 _EXACT = 1e-7
 
@@ -77,37 +80,37 @@ def blocks(lik: Likelihood, at: Estimate, *, prove: bool = True) -> tuple[Block,
     """
     net, method = lik.network, "auto" if prove else QUICK
     stations = [i for i in range(net.stations) if (net.place_sigma[i] > 0.0).any()]
-    free = _stations(net, at, stations, method)
-    found = [_block(fix, i, f"station {net.names[i]}", True, at.stations[0, i]) for i, fix in free]
+    d, cost = net.dimension, float(lik.cost(at)[0])
+    found = []
+    for i, fix in _stations(net, at, stations, method):
+        at_best = _moved_station(lik, at, i, fix.position[:d])
+        above = cost - float(lik.cost(at_best)[0])
+        found.append(_block(fix, i, f"station {net.names[i]}", True, at.stations[0, i], above))
     fix = place_pulses(net, at, np.arange(net.pulses), method)
-    every = [_block(fix[j], j, f"pulse {net.labels[j]}", False, at.pulses[0, j]) for j in range(net.pulses)]
-    return (*found, *every)
+    # pulses do not know of each other: all are moved at once
+    before = (lik.residual(at)[0] ** 2).sum(axis=1)
+    after = (lik.residual(moved_pulses(lik, at, np.arange(net.pulses), fix.position))[0] ** 2).sum(axis=1)
+    for j in range(net.pulses):
+        above = float(before[j] - after[j])
+        found.append(_block(fix[j], j, f"pulse {net.labels[j]}", False, at.pulses[0, j], above))
+    return tuple(found)
 
 
-def _block(fix: Fix, index: int, name: str, station: bool, here: Array) -> Block:
+def _block(fix: Fix, index: int, name: str, station: bool, here: Array, above: float) -> Block:
+    """Return a block from the fix that has its place: `above` is what the present place costs beyond the best."""
     certificate, d = fix.certificate, len(here)
     claim: Any = certificate.item() if isinstance(certificate, np.ndarray) else certificate
-    best = fix.position[:d]
-    places, gaps = [best], [0.0]
-    for x, gap in zip(fix.alternatives.x.reshape(-1, fix.x.shape[-1]), fix.alternatives.gap.ravel(), strict=True):
-        if np.isfinite(gap):
-            places.append(x[:d])
-            gaps.append(float(gap))
-    apart = np.linalg.norm(np.array(places) - here, axis=1)
-    same = int(np.nanargmin(apart)) if np.isfinite(apart).any() else 0
-    # how far the present place is above the best one: the nearest of those that were found stands for it
-    above = gaps[same]
-    others = [i for i in range(len(places)) if i != same and np.isfinite(places[i]).all()]
-    proven = claim.proof == "global" and claim.unique and claim.margin >= AMBIGUOUS_GAP and same == 0
-    return Block(
-        name,
-        station,
-        index,
-        proven,
-        above > equal_cost(float(fix.cost)),
-        tuple(gaps[i] - above for i in others),
-        np.array([places[i] for i in others]).reshape(-1, d),
-    )
+    x = np.concatenate([fix.position[None, :d], fix.alternatives.x.reshape(-1, fix.x.shape[-1])[:, :d]])
+    gaps = np.concatenate([[0.0], fix.alternatives.gap.ravel()])
+    kept = np.isfinite(gaps) & np.isfinite(x).all(axis=1)
+    x, gaps = x[kept], gaps[kept]
+    # the present place is among those found, unless it is no minimum or too dear to be listed
+    alike = np.abs(gaps - above) <= _ALIKE + equal_cost(float(fix.cost))
+    apart = np.where(alike, np.linalg.norm(x - here, axis=1), np.inf)
+    others = np.arange(len(x)) != (apart.argmin() if alike.any() else -1)
+    refuted = above > _ALIKE + equal_cost(float(fix.cost))
+    proven = claim.proof == "global" and claim.unique and claim.margin >= AMBIGUOUS_GAP and not refuted
+    return Block(name, station, index, proven, refuted, tuple(gaps[others] - above), x[others])
 
 
 def place_pulses(net: Network, at: Estimate, which: Array, method: str = "auto") -> Fix:
@@ -219,21 +222,30 @@ def _ranges(net: Network, at: Estimate) -> tuple[tuple[Array, Array], tuple[Arra
 
 def moved(lik: Likelihood, at: Estimate, block: Block, place: Array) -> Estimate:
     """Return an estimate with one block at another place, and its clock or emission as that place wants it."""
-    stations, pulses = at.stations.copy(), at.pulses.copy()
-    (stations if block.station else pulses)[0, block.index] = place
-    there = replace(at, stations=stations, pulses=pulses)
-    weight = np.where(lik.root > 0.0, lik.root, 0.0)
-    residual = lik.residual(there)[0] * weight
-    if not block.station and lik.emission[block.index]:
-        emits = lik.emits
-        shift = (residual[block.index] * emits).sum() / (weight[block.index] ** 2 * emits).sum()
-        emission = there.emission.copy()
-        emission[0, block.index] += shift
-        return replace(there, emission=emission)
-    if block.station and not lik.network.synchronised:
-        own = np.where(lik.first == block.index, lik.ticks[0], 0.0)
-        own = own + np.where(lik.second == block.index, lik.ticks[1], 0.0)
-        clocks = there.clocks.copy()
-        clocks[0, block.index] += (residual * own).sum() / max((weight**2 * own**2).sum(), 1e-300)
-        return replace(there, clocks=clocks)
-    return there
+    if block.station:
+        return _moved_station(lik, at, block.index, place)
+    return moved_pulses(lik, at, np.array([block.index]), place[None])
+
+
+def moved_pulses(lik: Likelihood, at: Estimate, which: Array, places: Array) -> Estimate:
+    """Return an estimate with some pulses (n,) at other places (n, d), and their emission as these want it."""
+    pulses, emission = at.pulses.copy(), at.emission.copy()
+    pulses[0, which] = np.where(np.isfinite(places), places, pulses[0, which])
+    there = replace(at, pulses=pulses)
+    weight = lik.root[which] * lik.emits
+    total = np.maximum((weight**2).sum(axis=1), 1e-300)
+    shift = (lik.residual(there)[0, which] * weight).sum(axis=1) / total
+    emission[0, which] += np.where(lik.emission[which], shift, 0.0)
+    return replace(there, emission=emission)
+
+
+def _moved_station(lik: Likelihood, at: Estimate, i: int, place: Array) -> Estimate:
+    stations, clocks = at.stations.copy(), at.clocks.copy()
+    stations[0, i] = np.where(np.isfinite(place), place, stations[0, i])
+    there = replace(at, stations=stations)
+    if lik.network.synchronised:
+        return there
+    own = np.where(lik.first == i, lik.ticks[0], 0.0) + np.where(lik.second == i, lik.ticks[1], 0.0)
+    weight = lik.root * own
+    clocks[0, i] += (lik.residual(there)[0] * weight).sum() / max(float((weight**2).sum()), 1e-300)
+    return replace(there, clocks=clocks)

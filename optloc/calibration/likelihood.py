@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,7 +81,6 @@ class Likelihood:
     prior: Array  # (M, d) the same of what is known of places; zero where exact
     free: Array  # (P,) which station unknowns move
     emission: Array  # (N,)
-    weigh: Callable[[Array], Array] | None = None
 
     def residual(self, at: Estimate) -> Array:
         """Return whitened residuals (S, N, R) of the measurements of pulses."""
@@ -102,13 +100,12 @@ class Likelihood:
 
     def cost(self, at: Estimate) -> Array:
         """Return the weighted sum of squared residuals, (S,)."""
-        return self._total(at, self.residual(at), None)
+        return self._total(at, self.residual(at))
 
-    def _total(self, at: Estimate, residual: Array, weight: Array | None) -> Array:
-        squares = residual**2 if weight is None else weight * residual**2
+    def _total(self, at: Estimate, residual: Array) -> Array:
         known = (at.stations - self.network.place) * self.prior
         apart = self.spans(at)[0]
-        return np.asarray(squares.sum(axis=(1, 2)) + (known**2).sum(axis=(1, 2)) + (apart**2).sum(axis=1))
+        return np.asarray((residual**2).sum(axis=(1, 2)) + (known**2).sum(axis=(1, 2)) + (apart**2).sum(axis=1))
 
     def jacobian(self, at: Estimate) -> tuple[Array, Array]:
         """Return whitened derivatives of predictions: by station unknowns (S, N, R, P) and by pulses (S, N, R, d + 1).
@@ -167,10 +164,9 @@ class Likelihood:
         for _ in range(steps):
             here = out.take(left)
             residual = self.residual(here)
-            weight = None if self.weigh is None else self.weigh(residual)
-            before = self._total(here, residual, weight)
-            there = self._step(here, residual, weight, damping[left])
-            after = self._total(there, self.residual(there), weight)
+            before = self._total(here, residual)
+            there = self._step(here, residual, damping[left])
+            after = self._total(there, self.residual(there))
             good = after < before
             now = there.where(good, here)
             out = _put(out, left, now)
@@ -182,15 +178,12 @@ class Likelihood:
             left = left[(stuck[left] < 3) & np.isfinite(cost[left])]
             if not left.size:
                 break
-        return out, cost if self.weigh is None else self.cost(out)
+        return out, cost
 
-    def _step(self, at: Estimate, residual: Array, weight: Array | None, damping: Array) -> Estimate:
+    def _step(self, at: Estimate, residual: Array, damping: Array) -> Estimate:
         by_station, by_pulse = self.jacobian(at)
         extra, rows = self.known(at)
         s, n, r, p = by_station.shape
-        if weight is not None:
-            root = np.sqrt(weight)
-            by_station, by_pulse, residual = by_station * root[..., None], by_pulse * root[..., None], residual * root
         inner, coupling, gradient = eliminated(by_station, by_pulse, residual, damping, self.emission)
         flat = by_station.reshape(s, n * r, p)
         normal = np.swapaxes(flat, 1, 2) @ flat + np.swapaxes(rows, 1, 2) @ rows
@@ -212,15 +205,13 @@ class Likelihood:
         )
 
 
-def likelihood(network: Network, weigh: Callable[[Array], Array] | None = None) -> Likelihood:
+def likelihood(network: Network) -> Likelihood:
     """Return the likelihood of a network.
 
     Parameters
     ----------
     network : Network
         What was measured.
-    weigh : callable, optional
-        Weights (S, N, R) between 0 and 1 of whitened residuals, for a robust fit.
 
     Returns
     -------
@@ -246,7 +237,6 @@ def likelihood(network: Network, weigh: Callable[[Array], Array] | None = None) 
         prior,
         np.concatenate([~exact.ravel(), clocks]),
         network.emission,
-        weigh,
     )
 
 

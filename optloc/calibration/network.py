@@ -134,7 +134,7 @@ class Network:
         )
 
 
-def network(
+def network_of(
     z: Any,
     sigma: Any,
     *,

@@ -13,7 +13,7 @@ from optloc.base.inputs import read_text
 from optloc.base.outputs import claim, write_text
 from optloc.base.types import Array
 from optloc.base.units import SPEED_OF_LIGHT
-from optloc.calibration.calibrate import Calibration
+from optloc.calibration.calibrated import Calibration
 from optloc.calibration.network import KINDS, Network, Slot, checked
 from optloc.files.schema import Amount, DataTable, Units, conform, join, name_of, parse_toml
 from optloc.files.table import Table, distinct, table_of
@@ -213,9 +213,8 @@ def write_calibrated(found: Calibration, title: str, out: Path, source: Path) ->
     net, sigma = found.network, np.sqrt(np.mean(found.sigma**2, axis=1))
     stations = []
     for name, place, own in zip(net.names, found.stations, sigma, strict=True):
-        stations.append(
-            {"name": name, **{k: float(v) for k, v in zip("xyz", place, strict=False)}, "sigma": max(float(own), _EXACT)}
-        )
+        at = {key: float(v) for key, v in zip("xyz", place, strict=False)}
+        stations.append({"name": name} | at | {"sigma": max(float(own), _EXACT)})
     measurements = []
     for kind in dict.fromkeys(slot.kind for slot in net.slots):
         rows = []

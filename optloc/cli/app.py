@@ -351,7 +351,6 @@ def crlb(
 @app.command(
     rich_help_panel=ANSWERS,
     epilog=example(
-        "optloc place sites.toml",
         "optloc place sites.toml -k 6 --worst --fail-one --plot map.png --out chosen.toml",
         "optloc place site.toml -k 4 --at 1200,800,50",
     ),
@@ -390,7 +389,6 @@ def place(
 @app.command(
     rich_help_panel=ANSWERS,
     epilog=example(
-        "optloc check site.toml",
         "optloc check flight.toml --plot health.svg --out health.csv",
         "optloc check toa.csv --stations sites.csv --sigma '20 ns'",
     ),

@@ -21,7 +21,6 @@ NETWORKS = (
 _LINES = 40
 
 Gauge = Annotated[str | None, typer.Option(metavar="A1,A2,A3", help="Stations that define the frame.")]
-Robust = Annotated[bool, typer.Option("--robust", help="Some rows may be wrong: leave them out, and list them.")]
 Seed = Annotated[int, typer.Option(min=0, help="Decides the starts.")]
 Out = Annotated[Path | None, typer.Option(metavar="OUT.toml", help="Write a problem file with the stations found.")]
 Picture = Annotated[Path | None, typer.Option(metavar="FILE", help="Draw plan, elevation and residuals.")]
@@ -30,7 +29,6 @@ Picture = Annotated[Path | None, typer.Option(metavar="FILE", help="Draw plan, e
 def calibrate(
     file: ProblemPath,
     gauge: Gauge = None,
-    robust: Robust = False,
     seed: Seed = 0,
     out: Out = None,
     plot: Picture = None,
@@ -45,13 +43,12 @@ def calibrate(
 
     FILE lists stations, with the coordinates that are known and no others, and what they measured of each pulse.
     """
-    raise typer.Exit(_run(file, gauge, robust, seed, out, plot, as_json=as_json, quiet=quiet))
+    raise typer.Exit(_run(file, gauge, seed, out, plot, as_json=as_json, quiet=quiet))
 
 
 def _run(
     file: Path,
     gauge: str | None,
-    robust: bool,
     seed: int,
     out: Path | None,
     plot: Path | None,
@@ -69,7 +66,7 @@ def _run(
     named = tuple(name.strip() for name in gauge.split(",")) if gauge else ()
     with line(quiet or as_json) as tell:
         tell("searching")
-        found = find(network, gauge=named, robust=robust, seed=seed, tell=tell)
+        found = find(network, gauge=named, seed=seed, tell=tell)
     if out is not None:
         write_calibrated(found, file.stem, out, file)
     if plot is not None:
@@ -111,8 +108,6 @@ def _show(found: Calibration) -> None:
     console.print(table)
     for other in found.alternatives[:5]:
         say(console, f"{other.what}: cost + {other.gap:.3g}")
-    if len(found.left_out):
-        say(console, f"{len(found.left_out)} rows were left out as wrong; --json lists them.")
 
 
 def _record(found: Calibration, file: Path) -> dict[str, Any]:
@@ -138,17 +133,11 @@ def _record(found: Calibration, file: Path) -> dict[str, Any]:
             for name, place, emission in zip(net.labels, found.pulses, found.emission, strict=True)
         ],
         "alternatives": [{"what": o.what, "gap": o.gap, "stations": o.stations} for o in found.alternatives],
-        "left_out": [
-            {"pulse": net.labels[j], "a": net.names[net.slots[r].a], "b": net.names[net.slots[r].b]}
-            if net.slots[r].b >= 0
-            else {"pulse": net.labels[j], "a": net.names[net.slots[r].a]}
-            for j, r in found.left_out
-        ],
     }
 
 
 def _picture(found: Calibration, title: str) -> Any:
-    from optloc.plot.network import plot_network
+    from optloc.plot.network_map import plot_network
 
     net = found.network
     known = np.where(np.isfinite(net.place_sigma), net.place, np.nan)

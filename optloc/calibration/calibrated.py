@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from optloc.base.errors import InvalidProblem, NoSolution, nearest
 from optloc.base.types import PRECEDENCE, Array, Status
-from optloc.calibration.blocks import Block, blocks, place_pulses
+from optloc.calibration.agreement import AGREEING, Found, frame_size, search
+from optloc.calibration.blocks import Block, blocks, moved_pulses, place_pulses
 from optloc.calibration.gauge import Determined, determined, fixed_by, in_frame, with_mean_clock
 from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, together
 from optloc.calibration.network import Network
-from optloc.calibration.search import AGREEING, Found, frame_size, search, without_liars
-from optloc.calibration.starts import laid
+from optloc.calibration.rounds import laid
 from optloc.compute.range_shape import STRAIGHT
 from optloc.problem.fix import tail_probability
 from optloc.solvers.policy import AMBIGUOUS_GAP, LISTED_GAP, REFUTED
@@ -85,8 +85,6 @@ class Calibration:
         Other networks within 25 of the cost, cheapest first.
     residuals : array (N, R)
         Whitened residuals; NaN where nothing was measured.
-    left_out : array (k, 2) of int
-        Rows (pulse, slot) that a robust fit left out.
     """
 
     network: Network
@@ -106,7 +104,6 @@ class Calibration:
     starts: int
     alternatives: tuple[Alternative, ...]
     residuals: Array
-    left_out: Array = field(default_factory=lambda: np.zeros((0, 2), dtype=int))
 
     @property
     def sigma(self) -> Array:
@@ -154,7 +151,6 @@ def calibrate(
     network: Network,
     *,
     gauge: tuple[str, ...] = (),
-    robust: bool = False,
     seed: int = 0,
     starts: int | None = None,
     tell: Callable[[str], None] | None = None,
@@ -167,8 +163,6 @@ def calibrate(
         What was measured and what is known.
     gauge : tuple of str
         Names of d stations that define the frame of a free network; by default all do.
-    robust : bool
-        Whether some rows may be grossly wrong; they are left out and listed, and the status is `unproven` at best.
     seed : int
         Decides the starts.
     starts : int, optional
@@ -192,7 +186,7 @@ def calibrate(
         return _refused(network, Status.TOO_FEW_ROWS, "There are fewer measurements than unknowns.")
     core = np.sort(np.argsort(-network.given.sum(axis=1), kind="stable")[:_CORE])
     core = core[enough[core]]
-    found = search(network.take(core), robust, seed, starts, tell)
+    found = search(network.take(core), seed, starts, tell)
     if found is None:
         return _refused(network, Status.NUMERICAL, "No start led to a network.")
     at = found.best
@@ -200,40 +194,28 @@ def calibrate(
     rest[core] = False
     if rest.any():
         at = _with_rest(network, at, core, np.flatnonzero(rest))
-    kept = network.take(enough)
-    left_out = np.zeros((0, 2), dtype=int)
-    if robust:
-        kept, at, left_out = without_liars(kept, at)
-        left_out[:, 0] = np.flatnonzero(enough)[left_out[:, 0]]
-    lik = likelihood(kept)
+    lik = likelihood(network.take(enough))
     at, _ = lik.refine(at)
-    made = _judged(lik, at, found, named, robust)
-    return _whole(made, network, enough, left_out)
+    made = _judged(lik, at, found, named)
+    return _whole(made, network, enough)
 
 
 def _with_rest(network: Network, at: Estimate, core: Array, rest: Array) -> Estimate:
     """Return an estimate of all pulses that can be placed: the core's, and fixes of the others."""
-    fix = place_pulses(network, at, rest)
     n, d = network.pulses, network.dimension
     pulses, emission = np.zeros((1, n, d)), np.zeros((1, n))
     pulses[0, core], emission[0, core] = at.pulses[0], at.emission[0]
-    centre = at.stations[0].mean(axis=0)
-    place = np.where(np.isfinite(fix.position), fix.position, centre)
-    pulses[0, rest] = place
-    lik = likelihood(network)
+    pulses[0, rest] = at.stations[0].mean(axis=0)
     there = Estimate(at.stations, at.clocks, pulses, emission)
-    weight = lik.root * lik.emits
-    total = np.maximum((weight**2).sum(axis=1), 1e-300)
-    shift = (lik.residual(there)[0] * weight).sum(axis=1) / total
-    emission[0, rest] = np.where(network.emission, shift, 0.0)[rest]
+    whole = moved_pulses(likelihood(network), there, rest, place_pulses(network, at, rest).position)
     every = np.sort(np.concatenate([core, rest]))
-    return Estimate(at.stations, at.clocks, pulses[:, every], emission[:, every])
+    return Estimate(at.stations, at.clocks, whole.pulses[:, every], whole.emission[:, every])
 
 
 # The verdict.
 
 
-def _judged(lik: Likelihood, at: Estimate, found: Found, named: tuple[int, ...], robust: bool) -> Calibration:
+def _judged(lik: Likelihood, at: Estimate, found: Found, named: tuple[int, ...]) -> Calibration:
     net = lik.network
     soft = np.isfinite(net.place_sigma).any()
     at = with_mean_clock(net, at) if soft else in_frame(net, at, named)
@@ -260,8 +242,6 @@ def _judged(lik: Likelihood, at: Estimate, found: Found, named: tuple[int, ...],
     if found.agreeing < AGREEING:
         words = f"{found.agreeing} of {found.made} starts arrived at this network; {AGREEING} must agree."
         findings.append((Status.SEARCHED, words))
-    if robust:
-        findings.append((Status.UNPROVEN, "Rows were left out as wrong; no proof covers which."))
     findings.sort(key=lambda one: PRECEDENCE.index(one[0]))
     gauge = "known places" if soft else ", ".join(net.names[i] for i in named)
     return Calibration(
@@ -472,9 +452,9 @@ def _refused(network: Network, status: Status, words: str) -> Calibration:
     )
 
 
-def _whole(made: Calibration, network: Network, enough: Array, left_out: Array) -> Calibration:
+def _whole(made: Calibration, network: Network, enough: Array) -> Calibration:
     """Return a calibration of all pulses, NaN for those that have too few rows."""
     pulses = np.full((network.pulses, network.dimension), np.nan)
     emission, residuals = np.full(network.pulses, np.nan), np.full(network.z.shape, np.nan)
     pulses[enough], emission[enough], residuals[enough] = made.pulses, made.emission, made.residuals
-    return replace(made, network=network, pulses=pulses, emission=emission, residuals=residuals, left_out=left_out)
+    return replace(made, network=network, pulses=pulses, emission=emission, residuals=residuals)

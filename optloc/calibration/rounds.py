@@ -184,7 +184,7 @@ class Starts:
         net = self.lik.network
         if np.isfinite(net.place_sigma).any():
             free = replace(net, place_sigma=np.full(net.place.shape, np.inf), place=np.zeros(net.place.shape))
-            rough, _ = likelihood(free, self.lik.weigh).refine(at, _ROUGH)
+            rough, _ = likelihood(free).refine(at, _ROUGH)
             at, start, weight = laid(rough, net, self.rng), np.tile(start, 2), np.tile(weight, 2)
         found, cost = self.lik.refine(at)
         return Ends(found, cost, start, weight)

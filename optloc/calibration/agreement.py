@@ -3,32 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from optloc.base.types import Array
 from optloc.calibration.blocks import MOVED, blocks, moved
 from optloc.calibration.likelihood import Estimate, Likelihood, likelihood, together
 from optloc.calibration.network import CLOCKED, Network
-from optloc.calibration.starts import Ends, rounds, starts_of
+from optloc.calibration.rounds import Ends, rounds, starts_of
 from optloc.problem.fix import tail_probability
 from optloc.solvers.policy import REFUTED, equal_cost
 
 AGREEING = 3
 """Starts that must arrive at the least cost: with fewer, one network in ten was found in another minimum."""
 
-# Starts after which the best is taken for what it is: nine networks in ten of six stations need fewer. Robust ones
-# begin at more places: liars make minima of their own.
-_STARTS, _ROBUST_STARTS = 144, 240
+# Starts after which the best is taken for what it is: nine networks in ten of six stations need fewer.
+_STARTS = 144
 # Networks whose blocks are moved after each round, the cheapest first.
 _TRIED = 2
-# Sweeps of block moves, and of rows that are left out: each lowers the cost or is the last.
+# Moves that are tried of one network while the search goes on, the cheapest first.
+_MOVES = 8
+# Sweeps of block moves: each lowers the cost or is the last.
 _SWEEPS = 6
 # Difference of cost that nobody can tell: a tenth of a sigma of one number.
 _SAME = 0.01
-# Whitened residual beyond which a robust fit leaves a row out, and the least scale of its weights.
-_LIAR, _SCALE = 4.0, 3.0
 
 
 @dataclass(slots=True)
@@ -57,17 +55,13 @@ def _key(cost: float) -> float:
     return round(float(cost), 4)
 
 
-def search(
-    net: Network, robust: bool, seed: int, limit: int | None, tell: Callable[[str], None] | None
-) -> Found | None:
+def search(net: Network, seed: int, limit: int | None, tell: Callable[[str], None] | None) -> Found | None:
     """Return the cheapest network that a search finds, None where no start leads to one.
 
     Parameters
     ----------
     net : Network
         What was measured.
-    robust : bool
-        Whether rows may be grossly wrong.
     seed : int
         Decides the starts.
     limit : int, optional
@@ -75,21 +69,18 @@ def search(
     tell : callable, optional
         Called with a sentence on each round.
     """
-    limit = limit or (_ROBUST_STARTS if robust else _STARTS)
-    lik = likelihood(net, geman_mcclure if robust else None)
-    score = _truncated if robust else _plain
+    limit = limit or _STARTS
+    lik = likelihood(net)
     found: Found | None = None
     for made, one in rounds(starts_of(lik, seed)):
-        cost = score(lik, one.at)
-        good = np.isfinite(cost)
+        good = np.isfinite(one.cost)
         if good.any():
-            found = _joined(found, replace(one, cost=cost).take(good), made)
-            if not robust:
-                _move_on(lik, found)
+            found = _joined(found, one.take(good), made)
+            _move_on(lik, found)
             if tell is not None:
                 tell(f"{found.made} starts, {found.agreeing} at the least cost {found.cost:.5g}")
-            agreed = found.agreeing >= AGREEING and (robust or _fits(net, found.cost))
-            if (agreed or made >= limit) and (robust or not _lowered(lik, found)):
+            agreed = found.agreeing >= AGREEING and _fits(net, found.cost)
+            if (agreed or made >= limit) and not _lowered(lik, found):
                 return found
         if made >= 2 * limit:
             return found
@@ -145,14 +136,18 @@ def _swept(
     """Return where moves of blocks lead from a minimum, and the networks with one block elsewhere."""
     others: list[tuple[str, Estimate, float]] = []
     for _ in range(_SWEEPS):
-        names, starts = [], []
-        for block in blocks(lik, at, prove=prove):
-            for place, gap in zip(block.places, block.gaps, strict=True):
-                if gap <= MOVED:
-                    names.append(block.name)
-                    starts.append(moved(lik, at, block, place))
-        if not starts:
+        places = [
+            (gap, block, place)
+            for block in blocks(lik, at, prove=prove)
+            for place, gap in zip(block.places, block.gaps, strict=True)
+            if gap <= MOVED
+        ]
+        if not places:
             break
+        if not prove:
+            places = sorted(places, key=lambda one: one[0])[:_MOVES]
+        names = [block.name for _, block, _ in places]
+        starts = [moved(lik, at, block, place) for _, block, place in places]
         ends, costs = lik.refine(together(*starts))
         i = int(np.argmin(costs))
         others = [(f"{name} elsewhere", ends.take(np.array([n])), float(costs[n])) for n, name in enumerate(names)]
@@ -162,44 +157,9 @@ def _swept(
     return at, cost, others
 
 
-def _plain(lik: Likelihood, at: Estimate) -> Array:
-    return lik.cost(at)
-
-
-def _truncated(lik: Likelihood, at: Estimate) -> Array:
-    squares = np.minimum(lik.residual(at) ** 2, _LIAR**2).sum(axis=(1, 2))
-    return np.asarray(squares + lik.cost(at) - (lik.residual(at) ** 2).sum(axis=(1, 2)))
-
-
-def geman_mcclure(residual: Array) -> Array:
-    """Return weights of whitened residuals (S, N, R): Geman and McClure's, with a scale for each estimate.
-
-    S. Geman and D. McClure, "Statistical methods for tomographic image reconstruction", Bull. Int. Stat. Inst. 52
-    (1987).
-    """
-    flat = np.where(residual != 0.0, np.abs(residual), np.nan).reshape(len(residual), -1)
-    scale = np.maximum(2.0 * np.nanmedian(flat, axis=1), _SCALE)[:, None, None]
-    return np.asarray((1.0 + (residual / scale) ** 2) ** -2)
-
-
 def _fits(net: Network, cost: float) -> bool:
     dof = np.array(net.rows - net.unknowns + frame_size(net))
     return not float(tail_probability(np.array(cost), dof)) < REFUTED
-
-
-def without_liars(net: Network, at: Estimate) -> tuple[Network, Estimate, Array]:
-    """Return the network without rows far off, its estimate, and which they are (pulse, slot)."""
-    at, _ = likelihood(net, geman_mcclure).refine(at)
-    out = np.zeros(net.z.shape, dtype=bool)
-    for _ in range(_SWEEPS):
-        residual = likelihood(net).residual(at)[0]
-        far = net.given & (np.abs(residual) > _LIAR)
-        kept = replace(net, sigma=np.where(far, np.inf, net.sigma))
-        at, _ = likelihood(kept).refine(at)
-        if (far == out).all():
-            break
-        out = far
-    return replace(net, sigma=np.where(out, np.inf, net.sigma)), at, np.argwhere(out)
 
 
 def frame_size(network: Network) -> int:

@@ -1,0 +1,221 @@
+"""Networks from nothing: known answers, what no frame changes, named refusals, and single blocks refuted."""
+
+import casadi
+import numpy as np
+import pytest
+from calibration_scenes import HALL, hall
+
+import optloc
+from optloc import InvalidProblem, Status, calibrate, network_of
+from optloc.calibration.calibrated import refuted_blocks
+from optloc.calibration.gauge import determined
+from optloc.calibration.likelihood import likelihood
+
+EXACT = 1e-6
+
+
+def errors(found, truth):
+    pairs, distance, covariance = found.distances()
+    line = truth.stations[0][pairs[:, 0]] - truth.stations[0][pairs[:, 1]]
+    return np.linalg.norm(line, axis=1) - distance, covariance
+
+
+@pytest.mark.parametrize(
+    ("m", "n", "clocks", "box"),
+    [(6, 20, False, HALL), (8, 30, False, HALL), (12, 20, True, HALL), (7, 15, False, HALL[:2])],
+)
+def test_without_noise_a_network_is_found_to_rounding(m, n, clocks, box):
+    truth, z = hall(3, m, n, 0.0, clocks=clocks, box=box)
+    found = calibrate(network_of(z, 1e-3, dimension=len(box), synchronised=not clocks))
+    assert errors(found, truth)[0] == pytest.approx(0.0, abs=EXACT)
+    assert found.cost < 1e-6
+    offset = truth.clocks[0].mean()
+    assert found.clocks == pytest.approx(truth.clocks[0] - offset, abs=EXACT)
+
+
+def test_noisy_networks_are_as_cheap_as_from_the_truth_and_ok():
+    statuses, shares = [], []
+    for seed in range(8):
+        truth, z = hall(seed, 12, 20, 0.03)
+        net = network_of(z, 0.03)
+        found = calibrate(net)
+        assert found.cost <= likelihood(net).refine(truth)[1][0] + 0.01
+        error, covariance = errors(found, truth)
+        width, axes = np.linalg.eigh(covariance)
+        seen = width > 1e-9 * width[-1]
+        shares.append(((axes[:, seen].T @ error) ** 2 / width[seen]).mean())
+        statuses.append(found.status)
+    assert statuses.count(Status.OK) >= 6
+    # the mean of 8 x 30 squares: four of its deviations
+    assert np.mean(shares) == pytest.approx(1.0, abs=4 * np.sqrt(2 / 240))
+
+
+def test_derivatives_are_those_of_automatic_differentiation():
+    truth, z = hall(5, 5, 6, 0.1, clocks=True)
+    near = calibrated_near(truth)
+    net = network_of(z, 0.1, synchronised=False, distances=[(0, 2, 7.0, 0.2)], place=truth.stations[0], place_sigma=0.5)
+    lik = likelihood(net)
+    a, b, y, o = (casadi.SX.sym(n, *s) for n, s in (("a", (5, 3)), ("b", (5, 1)), ("y", (6, 3)), ("o", (6, 1))))
+    rows = [(z[j, i] - casadi.norm_2(a[i, :] - y[j, :]) - o[j] - b[i]) / 0.1 for j in range(6) for i in range(5)]
+    rows.append((7.0 - casadi.norm_2(a[0, :] - a[2, :])) / 0.2)
+    rows.append(casadi.vec(net.place - a) / 0.5)
+    cost = casadi.sumsqr(casadi.vertcat(*rows))
+    unknowns = casadi.vertcat(casadi.vec(a.T), b, casadi.vec(y.T), o)
+    both = casadi.Function("f", [a, b, y, o], [cost, casadi.gradient(cost, unknowns)])
+    value, gradient = both(near.stations[0], near.clocks[0], near.pulses[0], near.emission[0])
+    assert lik.cost(near)[0] == pytest.approx(float(value))
+    by_station, by_pulse = lik.jacobian(near)
+    residual, (extra, more) = lik.residual(near)[0], (one[0] for one in lik.known(near))
+    stations = -2.0 * (np.einsum("nrp,nr->p", by_station[0], residual) + more.T @ extra)
+    pulses = -2.0 * np.einsum("nrq,nr->nq", by_pulse[0], residual)
+    ours = np.concatenate([stations, pulses[:, :3].ravel(), pulses[:, 3]])
+    assert ours == pytest.approx(np.asarray(gradient).ravel(), rel=1e-9, abs=1e-7)
+
+
+def calibrated_near(truth):
+    rng = np.random.default_rng(1)
+    return type(truth)(*(v + 0.3 * rng.standard_normal(v.shape) for v in (getattr(truth, n) for n in truth.__slots__)))
+
+
+def test_distances_and_their_deviations_do_not_depend_on_the_frame():
+    _, z = hall(2, 8, 30, 0.03)
+    net = network_of(z, 0.03)
+    free, named = calibrate(net), calibrate(net, gauge=("A2", "A5", "A7"))
+    (_, one, first), (_, two, second) = free.distances(), named.distances()
+    assert one == pytest.approx(two, abs=1e-6)
+    assert np.diag(first) == pytest.approx(np.diag(second), rel=1e-5)
+    assert named.stations[1] == pytest.approx([0, 0, 0], abs=1e-9)
+    assert named.stations[4, 1:] == pytest.approx([0, 0], abs=1e-9)
+    assert named.sigma[6, 2] == pytest.approx(0.0, abs=1e-9)
+    assert np.trace(free.covariance) < np.trace(named.covariance)
+
+
+def test_the_order_of_rows_the_zero_of_time_and_the_place_change_nothing():
+    _, z = hall(4, 8, 20, 0.03)
+    rng = np.random.default_rng(0)
+    stations, pulses = rng.permutation(8), rng.permutation(20)
+    found = calibrate(network_of(z, 0.03))
+    other = calibrate(network_of((z + 1e4 * np.arange(20)[:, None])[pulses][:, stations], 0.03))
+    assert other.cost == pytest.approx(found.cost, abs=1e-3)
+    assert np.sort(other.distances()[1]) == pytest.approx(np.sort(found.distances()[1]), abs=1e-3)
+
+
+def test_known_places_define_the_frame_and_missing_entries_are_nothing_special():
+    truth, z = hall(6, 10, 30, 0.03)
+    z[np.random.default_rng(2).random(z.shape) < 0.2] = np.nan
+    place = np.full((10, 3), np.nan)
+    place[:4] = truth.stations[0, :4]
+    found = calibrate(network_of(z, 0.03, place=place))
+    assert found.gauge == "known places"
+    assert found.stations[:4] == pytest.approx(truth.stations[0, :4])
+    assert found.stations == pytest.approx(truth.stations[0], abs=0.3)
+
+
+def test_differences_and_two_way_ranges():
+    truth, z = hall(8, 8, 30, 0.01)
+    pairs = [(i, (i + 1) % 8) for i in range(8)] + [(0, 4), (1, 5), (2, 6)]
+    differences = np.array([z[:, a] - z[:, b] for a, b in pairs]).T
+    found = calibrate(network_of(differences, 0.02, kind="tdoa", pairs=pairs))
+    assert np.sqrt(np.mean(errors(found, truth)[0] ** 2)) < 0.1
+    found = calibrate(network_of(z - truth.emission[0][:, None], 0.01, kind="range"))
+    assert found.cost < 300
+    assert np.sqrt(np.mean(errors(found, truth)[0] ** 2)) < 0.05
+
+
+def test_a_station_on_the_wrong_side_is_refuted():
+    refuted = 0
+    for seed in range(5):
+        truth, z = hall(seed, 12, 20, 0.03)
+        net = network_of(z, 0.03)
+        stations = truth.stations.copy()
+        centre = truth.pulses[0].mean(axis=0)
+        normal = np.linalg.svd(truth.pulses[0] - centre)[2][-1]
+        i = int(np.abs((stations[0] - centre) @ normal).argmax())
+        stations[0, i] -= 2.0 * ((stations[0, i] - centre) @ normal) * normal
+        wrong = type(truth)(stations, truth.clocks, truth.pulses, truth.emission)
+        refuted += f"station A{i + 1}" in [block.name for block in refuted_blocks(net, wrong)]
+    assert refuted == 5
+
+
+FLAT = ["pulses flat", "one plane", "in line", "parallel planes"]
+
+
+@pytest.mark.parametrize(
+    "case", ["stations flat", "few", *(pytest.param(name, marks=pytest.mark.full) for name in FLAT)]
+)
+def test_degenerate_networks_are_named(case):
+    for seed in range(2):
+        truth, _ = hall(seed, 5 if case == "few" else 9, 6 if case == "few" else 20, 0.0)
+        stations, pulses = truth.stations[0].copy(), truth.pulses[0].copy()
+        if case in ("stations flat", "one plane", "parallel planes"):
+            stations[:, 2] = 0.0
+        if case in ("pulses flat", "one plane", "parallel planes"):
+            pulses[:, 2] = 3.0 if case == "parallel planes" else 0.0
+        if case == "in line":
+            stations[:, 1:] = 0.0
+        rng = np.random.default_rng(seed + 50)
+        z = np.linalg.norm(pulses[:, None] - stations, axis=-1) + truth.emission[0][:, None]
+        found = calibrate(network_of(z + 0.03 * rng.standard_normal(z.shape), 0.03), starts=24)
+        assert found.status is not Status.OK
+        assert found.findings
+
+
+def test_the_frame_is_all_that_a_good_network_leaves_open():
+    for d, clocks, size in ((3, False, 6), (3, True, 7), (2, False, 3), (2, True, 4)):
+        truth, z = hall(1, 9, 20, 0.0, clocks=clocks, box=HALL[:d])
+        told = determined(likelihood(network_of(z, 0.1, dimension=d, synchronised=not clocks)), truth)
+        assert (told.free.shape[1], told.open.shape[1]) == (size, 0)
+    truth, z = hall(1, 5, 20, 0.0)
+    flat = type(truth)(truth.stations * [1, 1, 0], truth.clocks, truth.pulses, truth.emission)
+    assert determined(likelihood(network_of(z, 0.1)), flat).open.shape[1] == 1
+
+
+def test_gross_rows_are_a_misfit():
+    _, z = hall(11, 12, 20, 0.03)
+    z[3, 4] += 2.0
+    assert calibrate(network_of(z, 0.03), starts=24).status is Status.MISFIT
+
+
+def test_many_pulses_and_pulses_of_few_rows():
+    truth, z = hall(12, 8, 120, 0.03)
+    z[100:, 6:] = np.nan
+    z[110:, 2:] = np.nan
+    found = calibrate(network_of(z, 0.03))
+    assert np.sqrt(np.mean(errors(found, truth)[0] ** 2)) < 0.05
+    assert np.isfinite(found.pulses[:110]).all()
+    assert np.isnan(found.pulses[110:]).all()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "where"),
+    [
+        ({"kind": "azimuth"}, "kind"),
+        ({"kind": "tdoa"}, "pairs"),
+        ({"sigma": -1.0}, "sigma"),
+        ({"names": ["A"] * 6}, "names"),
+        ({"place": np.zeros((2, 3))}, "place"),
+        ({"distances": [(0, 9, 1.0, 0.1)]}, "distances"),
+        ({"dimension": 4}, "dimension"),
+    ],
+)
+def test_what_cannot_be_a_network_is_refused(arguments, where):
+    _, z = hall(0, 6, 8, 0.1)
+    with pytest.raises(InvalidProblem) as refused:
+        network_of(z, **({"sigma": 0.1} | arguments))
+    assert where in str(refused.value)
+
+
+def test_frames_that_cannot_be_are_refused():
+    truth, z = hall(0, 6, 20, 0.03)
+    with pytest.raises(InvalidProblem, match="A9"):
+        calibrate(network_of(z, 0.03), gauge=("A1", "A2", "A9"))
+    with pytest.raises(InvalidProblem, match="known places"):
+        calibrate(network_of(z, 0.03, place=truth.stations[0]), gauge=("A1", "A2", "A3"))
+
+
+def test_too_few_rows_are_a_status():
+    _, z = hall(0, 4, 10, 0.03)
+    found = optloc.calibrate(network_of(z, 0.03))
+    assert found.status is Status.TOO_FEW_ROWS
+    with pytest.raises(optloc.NoSolution):
+        found.require()
