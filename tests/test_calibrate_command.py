@@ -25,7 +25,7 @@ file = "pulses.csv"
 @pytest.fixture
 def folder(tmp_path):
     _, z = hall(2, 8, 30, 0.03)
-    rows = [f"p{j},A{i + 1},{z[j, i]!r}" for j in range(30) for i in range(8)]
+    rows = [f"p{j},A{i + 1},{float(z[j, i])!r}" for j in range(30) for i in range(8)]
     (tmp_path / "pulses.csv").write_text("\n".join(["epoch,a,z", *rows]))
     (tmp_path / "hall.toml").write_text(FILE)
     return tmp_path

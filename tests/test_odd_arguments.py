@@ -15,7 +15,7 @@ from optloc.cli import app
 resource = pytest.importorskip("resource", reason="limits and forks of POSIX")
 
 # One run of each command that ends soon; the last two would run for minutes, were there such a folder.
-LONG = ("study run", "reproduce")
+LONG = ("study run", "study bench", "reproduce")
 BASE = {
     "fix": "fix demo",
     "track": "track run",
@@ -31,12 +31,15 @@ BASE = {
     "schema": "schema",
     "compile": "compile --check",
     "place": "place demo --choose 4 --at 1200,800,50 --draws 0",
+    "calibrate": "calibrate net.toml",
     "live": "live demo --check",
     "serve": "serve demo --check",
     "study status": "study status no",
     "study report": "study report no",
     "study compare": "study compare no no",
     "study schema": "study schema",
+    "study pairs": "study pairs no",
+    "study bench": "study bench --out /dev/null/no",
     "study run": "study run divergence --out /dev/null/no",
     "reproduce": "reproduce registration --out /dev/null/no",
 }
@@ -191,6 +194,10 @@ def place(tmp_path):
     rows = [f'{{ a = "{n}", b = "A", z = {r[n] - r["A"]} }}' for r in away for n in "BCDE"]
     stations = [f'{{ name = "{n}", x = {x}, y = {y} }}' for n, (x, y) in ring.items()]
     text = f'format = 1\n[stations]\nrows = [{", ".join(stations)}]\n[[measurements]]\nkind = "tdoa"\nsigma = 3\n'
+    heard = [f'{{ epoch = {j}, a = "{n}", z = {r[n]} }}' for j, r in enumerate(away) for n in "ABCDE"]
+    names = ", ".join(f'{{ name = "{n}" }}' for n in "ABCDE")
+    net = f'format = 1\n[stations]\ndimension = 2\nrows = [{names}]\n[[measurements]]\nkind = "range"\nsigma = 3\n'
+    (folder / "net.toml").write_text(f"{net}rows = [{', '.join(heard)}]\n")
     (folder / "two.toml").write_text(f"{text}rows = [{', '.join(rows)}]\n")
     return folder
 

@@ -229,7 +229,7 @@ def write_calibrated(found: Calibration, title: str, out: Path, source: Path) ->
     settings = {
         "format": 1,
         "title": f"{title}: stations found ({found.status.label}), frame of {found.gauge}",
-        "stations": {"span": "run", "rows": stations},
+        "stations": {"span": "noise", "rows": stations},
         "measurements": measurements,
         "target": {"motion": "free"},
     }
