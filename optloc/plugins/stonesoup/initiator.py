@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime as dt
 from collections.abc import Sequence
-from dataclasses import dataclass
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -14,44 +14,21 @@ from stonesoup.types.array import CovarianceMatrix, StateVector
 from stonesoup.types.hypothesis import SingleHypothesis
 from stonesoup.types.mixture import GaussianMixture
 from stonesoup.types.numeric import Probability
-from stonesoup.types.state import GaussianState, State, WeightedGaussianState
+from stonesoup.types.state import GaussianState, WeightedGaussianState
 from stonesoup.types.track import Track
 from stonesoup.types.update import GaussianStateUpdate
 
 from optloc.base.errors import InvalidProblem
-from optloc.base.types import Array, Motion, Prior
-from optloc.plugins.stonesoup.models import StationMeasurement, problem_of, rows_by_kind, values_of
+from optloc.plugins.stonesoup.chains import GAP, LONG, Chain, Terms, Work, alone, grown, is_flat, near, posed
+from optloc.plugins.stonesoup.models import StationMeasurement, values_of
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
 from optloc.solvers import solve
 from optloc.track.start import is_one_gaussian
 from optloc.uncertainty.posterior import mixture
 
-# A fix is trusted as a Gaussian where no other minimum costs less than this more: five standard deviations.
-_GAP = 25.0
-# ... and where its largest standard deviation is below this share of the nearest range: a circle bends away from its
-# tangent by half the square of that, which is then 2.5 % of the deviation.
-_FLAT = 0.05
-# Chains that wait for more scans. Each detection is tried on every one of them, a fix each: false alarms must not make
-# scans take longer and longer.
+# Chains that wait for more scans: of those that no detection has continued for long the oldest are forgotten.
 _REMEMBERED = 40
-# What tests whether detections are of one target: without a search for other minima, and without a proof.
-_QUICK = "roots+lsr"
-# The gate before a fix is twice as wide in standard deviations as the test after it: rows are curved, the gate is not.
-_WIDE = 4.0
-
-
-@dataclass(frozen=True, slots=True)
-class _Chain:
-    """Detections that may be of one target, and their fix."""
-
-    detections: tuple[Any, ...]
-    fix: Fix
-    p: float
-
-    @property
-    def last(self) -> dt.datetime:
-        return self.detections[-1].timestamp  # type: ignore[no-any-return]
 
 
 def mixture_state(
@@ -107,7 +84,11 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
     )
     limit: int = Property(default=10, doc="Scans after which a chain that is not clear is given up.")
     confirm: int = Property(default=1, doc="Scans of a chain at least before it becomes a track: more in clutter.")
-    work: int = Property(default=100, doc="Fixes tried in one call at most, longer chains first: a bound of its time.")
+    work: int = Property(
+        default=300,
+        doc="Bound of the work of one call beside the fix of each detection, in units of about a millisecond: longer "
+        "chains come first, and what exceeds it is left out.",
+    )
     prior_state: GaussianState | None = Property(
         default=None,
         doc="Mean and covariance of what a fix does not say, such as an acceleration; initiators of particles, "
@@ -119,8 +100,7 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         super().__init__(*args, **kwargs)
         if self.order not in (0, 1):
             raise InvalidProblem(f"a motion of order {self.order}", "order", "use 0 or 1")
-        self._chains: list[_Chain] = []
-        self._left = 0
+        self._chains: list[Chain] = []
 
     def initiate(self, detections: Any, timestamp: dt.datetime, **kwargs: Any) -> set[Track]:
         """Return the tracks that begin with some of the detections that belong to no track yet.
@@ -130,109 +110,62 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         InvalidProblem
             For a detection whose measurement model is not one of this plug-in.
         """
-        tracks, grown = set(), []
-        self._left = self.work
-        for detection in sorted(detections, key=lambda d: (d.timestamp, tuple(values_of(d)))):
-            chain = self._extended(detection)
-            # Whether it is the only fix is asked of what looks like a track alone: that takes ten times longer.
-            proven = self._chain(chain.detections, proven=True) if self._clear(chain) else chain
-            if proven is not chain and self._clear(proven):
-                tracks.add(self._track(proven))
-            elif len(chain.detections) < self.limit and chain.p >= self.least_p:
-                grown.append(chain)
-        # What no detection has continued for long is forgotten: false alarms must not pile up.
-        self._chains = [*self._chains, *grown][-_REMEMBERED:]
+        for detection in detections:
+            if not isinstance(detection.measurement_model, StationMeasurement):
+                what = f"a detection has the measurement model {type(detection.measurement_model).__name__}"
+                raise InvalidProblem(what, "initiator", "use a model of this plug-in, such as TDOA")
+        work, tracks = Work(float(self.work)), set()
+        # In an order of their own, so that a set that is iterated in another one begins the same tracks.
+        ordered = sorted(detections, key=lambda d: (d.timestamp, tuple(values_of(d))))
+        for _, scan in groupby(ordered, key=lambda d: d.timestamp):
+            waiting = []
+            for chain in self._continued(list(scan), work):
+                fix = self._proven(chain, work)
+                if fix is not None:
+                    tracks.add(self._track(chain, fix))
+                elif len(chain) < self.limit:
+                    waiting.append(chain)
+            self._chains = [*self._chains, *waiting][-_REMEMBERED:]
         return tracks
 
-    def _extended(self, detection: Any) -> _Chain:
-        """Return the most likely chain that a detection continues, which is then taken, or a new one."""
-        if not isinstance(detection.measurement_model, StationMeasurement):
-            what = f"a detection has the measurement model {type(detection.measurement_model).__name__}"
-            raise InvalidProblem(what, "initiator", "use a model of this plug-in, such as TDOA")
-        known = [c for c in self._chains if c.last < detection.timestamp and _alike(c.detections[-1], detection)]
-        starts = [(chain, self._ahead(chain, detection)) for chain in known]
+    def _continued(self, scan: list[Any], work: Work) -> list[Chain]:
+        """Return the chains that the detections of a scan continue, which are taken, and those that they begin."""
+        terms = Terms(self.order, self.speed, self.least_p)
+        # Where the rows of a detection do not fit together no chain with it would fit.
+        singles = [single for single in alone(scan, terms) if single.p >= self.least_p]
+        pairs = [(share, self._chains[i], single) for single in singles for share, i in near(self._chains, single, terms)]
         # What has fitted many scans is continued before what has fitted one, which in clutter is mostly false.
-        near = sorted((pair for pair in starts if pair[1] is not None), key=lambda pair: -len(pair[0].detections))
-        near = near[: max(self._left, 0)]
-        self._left -= len(near)
-        tried = [(self._chain((*chain.detections, detection), start), chain) for chain, start in near]
-        fitting = [(new, old) for new, old in tried if new.p >= self.least_p]
-        if not fitting:
-            return self._chain((detection,))
-        # Longer before likelier: a chain that has fitted many scans is hardly one of false alarms.
-        new, old = max(fitting, key=lambda pair: (len(pair[0].detections), pair[0].p))
-        self._chains.remove(old)
-        return new
+        pairs.sort(key=lambda pair: (-len(pair[1]), pair[0]))
+        fitting = grown([(chain, single) for _, chain, single in pairs], terms, work)
+        fitting.sort(key=lambda found: (-len(found[0]), -found[0].p))
+        taken: set[int] = set()
+        out = []
+        for new, old, single in fitting:
+            if taken.isdisjoint((id(old), id(single))):
+                taken |= {id(old), id(single)}
+                out.append(new)
+        self._chains = [chain for chain in self._chains if id(chain) not in taken]
+        return [*out, *(single for single in singles if id(single) not in taken)]
 
-    def _ahead(self, chain: _Chain, detection: Any) -> Array | None:
-        """Return where a chain is at a detection that is in a wide gate about it, else None: a fix takes far longer.
+    def _proven(self, chain: Chain, work: Work) -> Fix | None:
+        """Return the fix of a chain that is long enough where it is the only one, and nearly Gaussian; else None."""
+        size = len(chain.detections[-1].measurement_model.mapping) * (self.order + 1)
+        # Another place is looked for where all else speaks for a track: that takes as long as hundreds of descents.
+        if len(chain) < self.confirm or chain.cov is None or len(chain.cov) != size or not work.take(LONG):
+            return None
+        problem, z = posed([chain.detections], Terms(self.order, self.speed, self.least_p))
+        fix = solve(problem.with_rows(z=z[0]))
+        known = is_one_gaussian(fix) and not (fix.alternatives.gap < GAP).any()
+        # Without redundancy nothing speaks against the chain.
+        if not known or fix.p_value < self.least_p:
+            return None
+        return fix if is_flat(fix.covariance(), fix.position, chain.detections[-1]) else None
 
-        The vector is empty where the chain's fix is no Gaussian to look ahead from.
-        """
-        from scipy.special import chdtri
-
-        if not is_one_gaussian(chain.fix):
-            return np.zeros(0)
-        model, (mean, cov) = detection.measurement_model, chain.fix.gaussian()
-        d, place = len(model.mapping), [*model.mapping, *self._rates(model)]
-        ahead = np.eye(len(mean))
-        if self.order:
-            ahead[:d, d:] = (detection.timestamp - chain.last).total_seconds() * np.eye(d)
-        state = np.zeros((model.ndim_state, 1))
-        state[place, 0] = ahead @ mean
-        H = model.jacobian(State(state))[:, place]
-        off = np.asarray(detection.state_vector - model.function(State(state)), dtype=float)[:, 0]
-        S = H @ ahead @ cov @ ahead.T @ H.T + np.asarray(model.covar(), dtype=float)
-        near = off @ np.linalg.solve(S, off) < _WIDE * chdtri(len(off), self.least_p)
-        return np.asarray(ahead @ mean) if near else None
-
-    def _chain(self, detections: tuple[Any, ...], start: Array | None = None, *, proven: bool = False) -> _Chain:
-        """Return a chain with its fix: by descent where it is known to begin, and proven only where that is asked."""
-        problem = self._problem(detections)
-        if start is not None and len(start) and not proven:
-            fix = solve(problem, "lsr", start=start)
-        else:
-            fix = solve(problem, "auto" if proven else _QUICK)
-        if not bool(fix.answered) and not proven:
-            fix = solve(problem)
-        p = float(fix.p_value)  # NaN without redundancy: nothing speaks against the chain then
-        return _Chain(detections, fix, 1.0 if np.isnan(p) else p)
-
-    def _problem(self, detections: tuple[Any, ...]) -> Problem:
-        models = [detection.measurement_model for detection in detections]
-        last = detections[-1].timestamp  # the state is that of the last scan
-        times = np.array([(detection.timestamp - last).total_seconds() for detection in detections])
-        d = len(models[0].mapping)
-        priors = [Prior("velocity", np.zeros(d), self.speed**2 * np.eye(d))] if self.order and self.speed else []
-        rates = [model.rates for model in models]
-        problem = problem_of(
-            np.stack([model.sites for model in models]),
-            [model.rows for model in models],
-            [model.covar() for model in models],
-            velocity=None if any(rate is None for rate in rates) else np.stack(rates),
-            times=times,
-            motions=(Motion(self.order, reference=0.0),),
-            priors=priors,
-        )
-        z = np.concatenate([values_of(detection) for detection in detections])
-        return problem.with_rows(z=z[rows_by_kind([model.rows for model in models])[1]])
-
-    def _clear(self, chain: _Chain) -> bool:
-        """Return whether a fix is the only one, and nearly Gaussian."""
-        fix = chain.fix
-        if len(chain.detections) < self.confirm:
-            return False
-        if not is_one_gaussian(fix) or chain.p < self.least_p or (fix.alternatives.gap < _GAP).any():
-            return False
-        stations = chain.detections[-1].measurement_model.sites
-        nearest = np.linalg.norm(stations - fix.position, axis=-1).min()
-        return bool(np.sqrt(np.linalg.eigvalsh(fix.covariance())[-1]) < _FLAT * nearest)
-
-    def _track(self, chain: _Chain) -> Track:
+    def _track(self, chain: Chain, fix: Fix) -> Track:
         detection = chain.detections[-1]
         model = detection.measurement_model
         place = [*model.mapping, *self._rates(model)]
-        mean, cov = chain.fix.gaussian()
+        mean, cov = fix.gaussian()
         vector, covariance = np.zeros((model.ndim_state, 1)), np.zeros((model.ndim_state,) * 2)
         if self.prior_state is not None:
             vector += np.asarray(self.prior_state.state_vector, dtype=float)
@@ -254,8 +187,3 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         own = getattr(model, "velocity_mapping", None) if self.velocity_mapping is None else self.velocity_mapping
         return [i + 1 for i in model.mapping] if own is None else list(own)
 
-
-def _alike(one: Any, two: Any) -> bool:
-    """Return whether two detections can be scans of one run."""
-    a, b = one.measurement_model, two.measurement_model
-    return a.stations.shape == b.stations.shape and list(a.mapping) == list(b.mapping)

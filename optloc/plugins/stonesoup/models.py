@@ -374,13 +374,13 @@ def problem_of(
 
     Parameters
     ----------
-    stations : array (k, s, d)
+    stations : array (..., k, s, d)
         Positions at each scan.
     scans : sequence of k sequences of (kind, a, b)
         Rows.
-    covariances : sequence of k arrays (m, m)
+    covariances : sequence of k arrays (..., m, m)
         Of the rows of each scan.
-    velocity : array (k, s, d), optional
+    velocity : array (..., k, s, d), optional
         Of the stations at each scan.
     **more
         Further arguments of `optloc.assemble`.
@@ -393,10 +393,11 @@ def problem_of(
     place = np.argsort(order)  # where each row of the scans stands among those sorted by kind
     ends = np.cumsum([0, *(len(rows) for rows in scans)])
     blocks = [
-        Block(place[None, first:last], np.asarray(covariance, dtype=float)[None])
+        Block(place[None, first:last], np.asarray(covariance, dtype=float)[..., None, :, :])
         for first, last, covariance in zip(ends[:-1], ends[1:], covariances, strict=True)
     ]
-    still = stations[:1] if np.array_equal(stations, np.broadcast_to(stations[:1], stations.shape)) else stations
+    first = stations[..., :1, :, :]
+    still = first if np.array_equal(stations, np.broadcast_to(first, stations.shape)) else stations
     return replace(assemble(station_array(still, velocity=velocity), *parts, **more), noise=group(blocks))
 
 

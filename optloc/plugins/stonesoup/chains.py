@@ -1,0 +1,323 @@
+"""Chains: detections of several scans that may be of one target, fitted many at a time, within a bound of work.
+
+A scan's own fix says where its target is, and two of them how fast it goes: with such starts a chain takes one descent,
+where a search without them takes as long as hundreds.
+"""
+
+from __future__ import annotations
+
+import datetime as dt
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+from scipy.special import chdtri
+
+from optloc.base.types import Array, Motion, Prior, Status
+from optloc.linear.normal import covariance, degrees_of_freedom, linearise
+from optloc.plugins.stonesoup.models import problem_of, rows_by_kind, values_of
+from optloc.problem.fix import Fix, tail_probability
+from optloc.problem.problem import Problem
+from optloc.solvers import solve
+from optloc.solvers.prepared import prepare
+from optloc.solvers.refine import Refined, refine
+
+# A fix is trusted as a Gaussian where no other minimum costs less than this more: five standard deviations.
+GAP = 25.0
+# ... and where its largest standard deviation is below this share of the nearest range: a circle bends away from its
+# tangent by half the square of that, which is then 2.5 % of the deviation.
+_FLAT = 0.05
+# The gate before a fit is twice as wide in standard deviations as the test after it: rows are curved, the gate is not.
+_WIDE = 4.0
+# Of single scans: without a search for other minima than the mirror image, and without a proof.
+_QUICK = "gtrs+lsr"
+# Places of a scan, or states of a chain, that are kept: the best and its rivals. Flat networks have two.
+_KEPT = 3
+# Steps of a descent: chains of one target take four to eight, and what wanders longer is hardly one.
+_STEPS = 30
+# Two descents ended in one minimum where their squared distance, in its covariance, is below this: a tenth of a sigma.
+_SAME = 1e-2
+
+# What things cost, in milliseconds of one core (of 2020 or later; five rows a scan): the bound of a call is in them.
+_BATCH, _DESCENT = 8.0, 0.3
+LONG = 100.0
+"""Of a search without a start, or of a proof that a fix is the only one."""
+
+
+@dataclass(slots=True)
+class Work:
+    """What is left of the work that one call may do, in about a millisecond each."""
+
+    left: float
+
+    def take(self, cost: float) -> bool:
+        """Return whether there is work left, which is then less by a cost."""
+        if self.left <= 0.0:
+            return False
+        self.left -= cost
+        return True
+
+
+@dataclass(frozen=True, slots=True)
+class Terms:
+    """What is assumed of all targets.
+
+    Parameters
+    ----------
+    order : int
+        1 where they have a velocity, 0 where they are at rest.
+    speed : float, optional
+        Prior standard deviation of each coordinate of a velocity about zero, m/s.
+    least_p : float
+        Chains whose chi-square is less likely are not of one target.
+    """
+
+    order: int
+    speed: float | None
+    least_p: float
+
+
+@dataclass(frozen=True, slots=True)
+class Chain:
+    """Detections that may be of one target, in their order of time.
+
+    Parameters
+    ----------
+    detections : tuple of Detection
+        With models of this plug-in.
+    x : array (q, n)
+        States at the last detection that fit, the best first: a position alone where nothing shows a velocity yet;
+        none (q = 0) where nothing shows a position.
+    cov : array (n, n), optional
+        Covariance of the first; None where it is too wide to be trusted as that of a Gaussian.
+    p : float
+        Tail probability of the chi-square; 1 without redundancy.
+    """
+
+    detections: tuple[Any, ...]
+    x: Array
+    cov: Array | None
+    p: float
+
+    @property
+    def last(self) -> dt.datetime:
+        """Return the time of the last detection."""
+        return self.detections[-1].timestamp  # type: ignore[no-any-return]
+
+    def __len__(self) -> int:
+        """Return the number of detections."""
+        return len(self.detections)
+
+
+def is_flat(cov: Array, position: Array, detection: Any) -> bool:
+    """Return whether a covariance (d, d) is small against the range of the nearest station."""
+    nearest = np.linalg.norm(detection.measurement_model.sites - position, axis=-1).min()
+    return bool(np.isfinite(cov).all() and np.sqrt(np.linalg.eigvalsh(cov)[-1]) < _FLAT * nearest)
+
+
+def posed(runs: Sequence[Sequence[Any]], terms: Terms) -> tuple[Problem, Array]:
+    """Return the problem of runs of detections (B), without their values, and the values (B, m) of its rows.
+
+    The runs have the same rows in each scan, and the same times before the last; the state is that at the last.
+    """
+    models = [[detection.measurement_model for detection in run] for run in runs]
+    last = runs[0][-1].timestamp
+    times = np.array([(detection.timestamp - last).total_seconds() for detection in runs[0]])
+    d = len(models[0][0].mapping)
+    priors = [Prior("velocity", np.zeros(d), terms.speed**2 * np.eye(d))] if terms.order and terms.speed else []
+    rates = None if models[0][0].rates is None else _shared([[model.rates for model in run] for run in models])
+    rows = [model.rows for model in models[0]]
+    problem = problem_of(
+        _shared([[model.sites for model in run] for run in models]),
+        rows,
+        [_shared([run[k].covar() for run in models]) for k in range(len(rows))],
+        velocity=rates,
+        times=times,
+        motions=(Motion(terms.order, reference=0.0),),
+        priors=priors,
+    )
+    z = np.array([np.concatenate([values_of(detection) for detection in run]) for run in runs])
+    return problem, z[:, rows_by_kind(rows)[1]]
+
+
+def _shared(values: Any) -> Array:
+    """Return an array (B, ...), or only its first entry where all are the same."""
+    array = np.asarray(values, dtype=float)
+    return array[0] if (array == array[:1]).all() else array
+
+
+def _key(run: Sequence[Any]) -> Any:
+    """Return what runs that are posed together have in common."""
+    last = run[-1].timestamp
+    shape = run[0].measurement_model.stations.shape, tuple(run[0].measurement_model.mapping)
+    scans = tuple((tuple(d.measurement_model.rows), d.measurement_model.rates is None) for d in run)
+    return shape, scans, tuple(last - detection.timestamp for detection in run)
+
+
+def _grouped(keys: Sequence[Any]) -> list[list[int]]:
+    """Return the places of equal keys."""
+    found: dict[Any, list[int]] = {}
+    for i, key in enumerate(keys):
+        found.setdefault(key, []).append(i)
+    return list(found.values())
+
+
+def alone(scan: Sequence[Any], terms: Terms) -> list[Chain]:
+    """Return a chain of each detection of a scan: where its own rows place it."""
+    out: list[Any] = [None] * len(scan)
+    for members in _grouped([_key([detection]) for detection in scan]):
+        moving = scan[members[0]].measurement_model.rates is not None
+        own = Terms(terms.order if moving else 0, terms.speed, terms.least_p)
+        problem, z = posed([[scan[i]] for i in members], own)
+        fixes = prepare(problem, _QUICK)(z).flat()
+        for place, i in enumerate(members):
+            out[i] = _of_fix((scan[i],), fixes[place], terms)
+    return out
+
+
+def _of_fix(detections: tuple[Any, ...], fix: Fix, terms: Terms) -> Chain:
+    """Return a chain with the states of its single fix: where rows do not show the velocity, its prior does."""
+    p = float(fix.p_value)
+    p = 1.0 if np.isnan(p) else p
+    if not bool(fix.answered) or bool(fix.has(Status.UNBOUNDED)):
+        return Chain(detections, np.zeros((0, len(fix.x))), None, p)
+    rivals = fix.alternatives.x[fix.alternatives.gap < GAP]
+    x, cov = np.concatenate([fix.x[None], rivals])[:_KEPT], np.array(fix.cov)
+    d = fix.position.shape[-1]
+    if terms.order and terms.speed and x.shape[1] == d:
+        x, cov = np.hstack([x, np.zeros_like(x)]), np.kron(np.diag([0.0, terms.speed**2]), np.eye(d))
+        cov[:d, :d] = fix.cov
+    good = len(x) == 1 and is_flat(cov[:d, :d], x[0, :d], detections[-1])
+    return Chain(detections, x, cov if good else None, p)
+
+
+def near(chains: Sequence[Chain], single: Chain, terms: Terms) -> list[tuple[float, int]]:
+    """Return how far a detection is from each chain that it may continue, and the chain's place.
+
+    The squared distance in the covariance of the innovation, in shares of the gate: 1 at its edge; 1 as well for
+    chains that are no Gaussian to look ahead from. What is beyond the gate is left out.
+    """
+    detection = single.detections[-1]
+    known = [i for i, c in enumerate(chains) if c.last < detection.timestamp and _alike(c.detections[-1], detection)]
+    d = len(detection.measurement_model.mapping)
+    blind = [i for i in known if chains[i].cov is None or chains[i].x.shape[1] != d * (terms.order + 1)]
+    sharp = [i for i in known if i not in set(blind)]
+    out = [(1.0, i) for i in blind]
+    if not sharp:
+        return out
+    mean = np.stack([_ahead(chains[i].x[:1], chains[i], detection, d)[0] for i in sharp])
+    step = np.array([(detection.timestamp - chains[i].last).total_seconds() for i in sharp])
+    cov = np.stack([np.asarray(chains[i].cov) for i in sharp])
+    F = np.tile(np.eye(mean.shape[1]), (len(sharp), 1, 1))
+    if terms.order:
+        F[:, :d, d:] = step[:, None, None] * np.eye(d)
+    share = _innovations(detection, mean, F @ cov @ F.mT) / (_WIDE * chdtri(detection.measurement_model.ndim_meas, terms.least_p))
+    return out + [(float(s), i) for s, i in zip(share, sharp, strict=True) if s < 1.0]
+
+
+def _innovations(detection: Any, mean: Array, cov: Array) -> Array:
+    """Return the squared distances (C,) of a detection from what states (C, n) with covariances predict."""
+    model = detection.measurement_model
+    size, order = len(model.places), model.order
+    # Of a target at rest a model of rates asks the velocity as well, which is then zero and known.
+    x, P = np.zeros((len(mean), size)), np.zeros((len(mean), size, size))
+    n = min(size, mean.shape[1])
+    x[:, :n], P[:, :n, :n] = mean[:, :n], cov[:, :n, :n]
+    linear = linearise(model.problem.with_rows(z=values_of(detection)[order]), x)
+    S = linear.shared @ P @ linear.shared.mT + np.asarray(model.covar(), dtype=float)[np.ix_(order, order)]
+    return np.asarray((linear.residual * np.linalg.solve(S, linear.residual[..., None])[..., 0]).sum(-1))
+
+
+def _alike(one: Any, two: Any) -> bool:
+    """Return whether two detections can be scans of one run."""
+    a, b = one.measurement_model, two.measurement_model
+    return a.stations.shape == b.stations.shape and list(a.mapping) == list(b.mapping)
+
+
+def _ahead(x: Array, chain: Chain, detection: Any, d: int) -> Array:
+    """Return states (q, n) of a chain at the time of a detection, in uniform motion."""
+    if x.shape[1] == d:
+        return x
+    step = (detection.timestamp - chain.last).total_seconds()
+    return np.hstack([x[:, :d] + step * x[:, d:], x[:, d:]])
+
+
+def _starts(chain: Chain, single: Chain, terms: Terms) -> Array:
+    """Return the states (q, n) from which a chain with one more detection is fitted."""
+    detection = single.detections[-1]
+    d = len(detection.measurement_model.mapping)
+    if not terms.order:
+        return np.concatenate([chain.x, single.x])[:_KEPT]
+    ahead = [_ahead(chain.x, chain, detection, d)] if chain.x.shape[1] == 2 * d else []
+    if len(chain) == 1 or not len(chain.x):
+        step = (detection.timestamp - chain.last).total_seconds()
+        # From place to place; where only one of both has a place, from a target at rest.
+        pairs = [(b, (b - a) / step) for a, b in product(chain.x[:, :d], single.x[:, :d])]
+        pairs = pairs or [(a, np.zeros(d)) for a in (*chain.x[:, :d], *single.x[:, :d])]
+        ahead.append(np.array([np.concatenate(pair) for pair in pairs]).reshape(-1, 2 * d))
+    return np.concatenate(ahead)
+
+
+def grown(pairs: Sequence[tuple[Chain, Chain]], terms: Terms, work: Work) -> list[tuple[Chain, Chain, Chain]]:
+    """Return (longer chain, chain, chain of the detection) of the pairs that fit, the first within the work left.
+
+    Pairs of the same rows and times are fitted together, from all their starts at once.
+    """
+    chosen: dict[Any, list[tuple[Chain, Chain, Array]]] = {}
+    for chain, single in pairs:
+        key, starts = _key((*chain.detections, *single.detections)), _starts(chain, single, terms)
+        if not work.take((0.0 if key in chosen else _BATCH) + _DESCENT * len(starts)):
+            break
+        chosen.setdefault(key, []).append((chain, single, starts))
+    out = []
+    for members in chosen.values():
+        runs = [(*chain.detections, *single.detections) for chain, single, _ in members]
+        longer = _fitted(runs, [starts for _, _, starts in members], terms, work)
+        found = zip(longer, members, strict=True)
+        out += [(new, chain, single) for new, (chain, single, _) in found if new is not None and new.p >= terms.least_p]
+    return out
+
+
+def _fitted(
+    runs: Sequence[tuple[Any, ...]], starts: Sequence[Array], terms: Terms, work: Work
+) -> list[Chain | None]:
+    """Return the chains of runs of the same rows and times; None where it takes a search and no work is left."""
+    problem, z = posed(runs, terms)
+    problem = problem.with_rows(z=z)
+    dof = degrees_of_freedom(problem)
+    out: list[Chain | None] = [None] * len(runs)
+    begun = [i for i, start in enumerate(starts) if len(start)]
+    if begun:
+        item = np.repeat(begun, [len(starts[i]) for i in begun])
+        done = refine(problem, np.concatenate([starts[i] for i in begun]), item=item, limit=_STEPS)
+        p = tail_probability(done.cost, dof[item])
+        cov, _ = covariance(done.equations)
+        for i in begun:
+            out[i] = _best(runs[i], done, p, cov, np.flatnonzero(item == i))
+    for i in range(len(runs)):
+        if len(starts[i]):
+            continue
+        if dof[i] < 0:  # too few rows for any state: more scans may do
+            out[i] = Chain(runs[i], np.zeros((0, problem.layout.size)), None, 1.0)
+        elif work.take(LONG):
+            fix = solve(problem.take(np.array([i])), "roots+lsr").flat()[0]
+            out[i] = _of_fix(runs[i], fix, terms)
+    return out
+
+
+def _best(run: tuple[Any, ...], done: Refined, p: Array, cov: Array, own: Array) -> Chain:
+    """Return the chain of a run by the descents that are its own: their distinct ends, the best first."""
+    own = own[np.argsort(np.where(np.isfinite(done.cost[own]), done.cost[own], np.inf), kind="stable")]
+    first, d = own[0], len(run[-1].measurement_model.mapping)
+    kept: list[int] = []
+    for i in own:
+        if not done.cost[i] < done.cost[first] + GAP or len(kept) == _KEPT:
+            break
+        apart = [done.x[i] - done.x[j] for j in kept]
+        if all(not (np.linalg.solve(cov[j], a) @ a < _SAME) for j, a in zip(kept, apart, strict=True)):
+            kept.append(i)
+    value = 1.0 if np.isnan(p[first]) and np.isfinite(done.cost[first]) else float(np.nan_to_num(p[first]))
+    good = len(kept) == 1 and is_flat(cov[first, :d, :d], done.x[first, :d], run[-1])
+    return Chain(run, done.x[np.array(kept, dtype=int)], cov[first] if good else None, value)
