@@ -213,7 +213,9 @@ def near(chains: Sequence[Chain], single: Chain, terms: Terms) -> list[tuple[flo
     F = np.tile(np.eye(mean.shape[1]), (len(sharp), 1, 1))
     if terms.order:
         F[:, :d, d:] = step[:, None, None] * np.eye(d)
-    share = _innovations(detection, mean, F @ cov @ F.mT) / (_WIDE * chdtri(detection.measurement_model.ndim_meas, terms.least_p))
+    share = _innovations(detection, mean, F @ cov @ F.mT) / (
+        _WIDE * chdtri(detection.measurement_model.ndim_meas, terms.least_p)
+    )
     return out + [(float(s), i) for s, i in zip(share, sharp, strict=True) if s < 1.0]
 
 
@@ -280,9 +282,7 @@ def grown(pairs: Sequence[tuple[Chain, Chain]], terms: Terms, work: Work) -> lis
     return out
 
 
-def _fitted(
-    runs: Sequence[tuple[Any, ...]], starts: Sequence[Array], terms: Terms, work: Work
-) -> list[Chain | None]:
+def _fitted(runs: Sequence[tuple[Any, ...]], starts: Sequence[Array], terms: Terms, work: Work) -> list[Chain | None]:
     """Return the chains of runs of the same rows and times; None where it takes a search and no work is left."""
     problem, z = posed(runs, terms)
     problem = problem.with_rows(z=z)

@@ -133,7 +133,9 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
         terms = Terms(self.order, self.speed, self.least_p)
         # Where the rows of a detection do not fit together no chain with it would fit.
         singles = [single for single in alone(scan, terms) if single.p >= self.least_p]
-        pairs = [(share, self._chains[i], single) for single in singles for share, i in near(self._chains, single, terms)]
+        pairs = [
+            (share, self._chains[i], single) for single in singles for share, i in near(self._chains, single, terms)
+        ]
         # What has fitted many scans is continued before what has fitted one, which in clutter is mostly false.
         pairs.sort(key=lambda pair: (-len(pair[1]), pair[0]))
         fitting = grown([(chain, single) for _, chain, single in pairs], terms, work)
@@ -186,4 +188,3 @@ class FixInitiator(GaussianInitiator):  # type: ignore[misc]  # untyped base
             return []
         own = getattr(model, "velocity_mapping", None) if self.velocity_mapping is None else self.velocity_mapping
         return [i + 1 for i in model.mapping] if own is None else list(own)
-
