@@ -306,6 +306,6 @@ def test_counts_in_clutter():
     header = ["false alarms a scan", "targets with a track", "of", "spurious tracks", "mean, s", "median, s"]
     header += ["mean of the slowest run, s", "slowest scan, s"]
     facts = (
-        f"seeds 0 to {COUNTED['seeds'] - 1}, {COUNTED['scans']} scans each, processor time a scan of the whole tracker"
+        f"seeds 0 to {COUNTED['seeds'] - 1}, {COUNTED['scans']} scans each, processor time of each scan"
     )
     write("stonesoup_clutter", header, rows, facts)
