@@ -136,8 +136,8 @@ def test_no_loose_module():
 # which others take fixes: their table, marks, what is XML, and what is lines; what an installation is and lacks;
 # minimizers of others in studies, methods on the same trials, and the leaderboard; networks of unknown places:
 # fits of low rank and their upgrade, the network, its likelihood, starts, blocks, search, frame and verdict, its files,
-# its command and its map.
-MODULES, LINES, BODY, RECURRING = 339, 600, 60, 20
+# its command and its map; chains of Stone Soup's detections, fitted within a bound of work.
+MODULES, LINES, BODY, RECURRING = 340, 600, 60, 20
 
 
 def test_files_and_functions_are_of_a_size_to_be_read():

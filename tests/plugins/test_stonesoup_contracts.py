@@ -305,7 +305,5 @@ def test_counts_in_clutter():
         assert found.sum() >= 0.97 * 2 * len(found)
     header = ["false alarms a scan", "targets with a track", "of", "spurious tracks", "mean, s", "median, s"]
     header += ["mean of the slowest run, s", "slowest scan, s"]
-    facts = (
-        f"seeds 0 to {COUNTED['seeds'] - 1}, {COUNTED['scans']} scans each, processor time of each scan"
-    )
+    facts = f"seeds 0 to {COUNTED['seeds'] - 1}, {COUNTED['scans']} scans each, processor time of each scan"
     write("stonesoup_clutter", header, rows, facts)
