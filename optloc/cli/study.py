@@ -236,6 +236,50 @@ def pairs(
         _show_pairs(found, Screen())
 
 
+@study.command(
+    epilog=example(
+        "optloc study profiles runs/my",
+        "optloc study profiles runs/my --work evaluations --tau 0.01 --plot profiles.svg",
+    )
+)
+def profiles(
+    folder: Folder,
+    tau: Annotated[
+        float, typer.Option(metavar="COST", help="Cost above the least known with which a trial counts as solved.")
+    ] = 1e-3,
+    work: Annotated[
+        str, typer.Option(metavar="NAME", help="processor (time) or evaluations (of the cost).")
+    ] = "processor",
+    plot: Annotated[
+        Path | None, typer.Option(metavar="OUT", help="Picture of both profiles: .png, .svg or .pdf.")
+    ] = None,
+    as_json: Json = False,
+    force: Force = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Say which share of the trials each method solves, within how much work: data and performance profiles."""
+    from optloc.cli.output import claim_outputs, write_picture
+    from optloc.study import summary
+    from optloc.study.folder import plan_again, read_frame, read_manifest, references
+    from optloc.study.profiles import profiles as profiled
+
+    claim_outputs(picture=plot)
+    frame = read_frame(folder, summary.COLUMNS)
+    if not len(frame):
+        raise InvalidProblem("nothing of the study is finished yet", str(folder), "run the study")
+    known = references(plan_again(read_manifest(folder)))
+    found = profiled(frame, tau=tau, work=work, out=known)
+    if plot is not None:
+        from optloc.report.figures import marks, profile_picture
+
+        write_picture(profile_picture(found, marks(list(found.methods))), plot)
+    if as_json:
+        _print_json(_profile_record(found))
+    elif not quiet:
+        _show_profiles(found, Screen())
+
+
 @study.command(epilog=example("optloc study schema > study.schema.json"))
 def schema(verbose: Verbose = False) -> None:
     """Print the JSON schema of study files."""
@@ -351,6 +395,40 @@ def _show_pairs(found: list[Any], console: Console) -> None:
             counts = (str(n) for n in (one.trials, one.alone, one.other_alone))
             table.add_row(one.method, *counts, f"{one.p:.2g}", *cells)
         console.print(table)
+
+
+def _profile_record(found: Any) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    from optloc.study.profiles import RATIOS, shares
+
+    budgets = found.budgets
+    return {
+        "tau": found.tau,
+        "work": found.work,
+        "trials": found.spent.shape[1],
+        "trials_of_the_study": found.total,
+        "not_told": list(found.silent),
+        "ratios": list(RATIOS),
+        "budgets": budgets,
+        "methods": [
+            asdict(one) | {"within": list(one.within.values()), "data_profile": curve}
+            for one, curve in zip(shares(found), found.data(budgets), strict=True)
+        ],
+    }
+
+
+def _show_profiles(found: Any, console: Console) -> None:
+    from optloc.report.sheets import solved_within
+
+    made = solved_within(found).shown
+    table = Table()
+    for i, heading in enumerate(made.header):
+        table.add_column(heading, justify="right" if i else "left")
+    for row in made.rows:
+        table.add_row(*row)
+    console.print(table)
+    console.print(made.note, highlight=False, markup=False, soft_wrap=True)
 
 
 # A paper is a study of its own: its trials, tables and pictures are made again.

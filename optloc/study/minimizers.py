@@ -17,10 +17,11 @@ import numpy as np
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.registry import load_plugin, plugin_module
 from optloc.base.types import Array
-from optloc.linear.normal import weighed
+from optloc.compute.sums import equations_at
 from optloc.problem.fix import Fix
+from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
-from optloc.study.baselines import BASELINES, Baseline, claim, whiten_one
+from optloc.study.baselines import BASELINES, Baseline, claim, teller, weighed_at, weighings
 from optloc.study.draws import Drawn
 
 Cost = Callable[[Array], tuple[float, Array]]
@@ -41,20 +42,24 @@ class Minimizer:
 
     def __call__(self, drawn: Drawn, start: Array) -> Fix:
         """Return the fixes; they claim to be answers wherever they are finite, and the study judges them."""
-        plain = weighed(drawn.problem)
         x = np.array(start, dtype=float)
-        for i in range(len(x)):
-            x[i] = self.function(cost_of(plain.take(np.array([i]))), start[i].copy())
+        for _ in range(weighings(drawn.problem)):
+            plain = weighed_at(drawn.problem, x, start)
+            for i in range(len(x)):
+                x[i] = self.function(cost_of(plain.take(np.array([i])), teller(i)), x[i].copy())
         return claim(drawn.problem, start, x)
 
 
-def cost_of(one: Problem) -> Cost:
-    """Return the cost of a flat batch of one problem with its gradient."""
-    residual, jacobian = whiten_one(one)
+def cost_of(one: Problem, tell: Callable[[float], None] = lambda _: None) -> Cost:
+    """Return the cost of a flat batch of one problem with its gradient; `tell` hears of each evaluation."""
+    white = whiten(one.noise, one.weight)
 
     def cost(x: Array) -> tuple[float, Array]:
-        r = residual(np.asarray(x, dtype=float))
-        return float(r @ r), np.asarray(2.0 * jacobian(np.asarray(x, dtype=float)).T @ r)
+        at = equations_at(one, np.array(x, dtype=float)[None], white)
+        value = float(at.cost[0])
+        tell(value)
+        # The normal equations hold minus half the gradient.
+        return value, -2.0 * np.concatenate([at.shared_vector[0], at.local_vector[0].ravel()])
 
     return cost
 

@@ -116,7 +116,17 @@ COLUMNS: tuple[Column, ...] = (
         "iterations", "float", "1", "Iterations of solver and refinement, mean over the fixes of one call; NaN unknown."
     ),
     Column(
+        "evaluations", "float", "1", "Evaluations of the cost that a minimizer asked for; NaN where none are counted."
+    ),
+    Column(
         "seconds", "float", "s", "Time of the solution: that of the call over the number of its fixes.", value=False
+    ),
+    Column(
+        "processor",
+        "float",
+        "s",
+        "The same of processor time, of all threads of the process: whatever else the machine does.",
+        value=False,
     ),
     Column(
         "build",
@@ -278,7 +288,8 @@ def _solve(cell: Cell, known: Known) -> Values:
     count = len(known.drawn.truth)
     found = run(cell.method, known.drawn)
     values = fix_values(cell.case, known, found.fix)
-    return values | {"seconds": found.seconds / count, "iterations": found.iterations / count, "batch": count}
+    work = {"seconds": found.seconds / count, "processor": found.processor / count, "evaluations": found.evaluations}
+    return values | work | {"iterations": found.iterations / count, "batch": count}
 
 
 def _failure(status: str, reason: str) -> Values:
