@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from itertools import groupby
-from math import isnan, nan
+from math import isinf, isnan, nan
 from pathlib import Path
 from typing import Annotated, Any, cast, get_args
 
@@ -280,6 +280,58 @@ def profiles(
         _show_profiles(found, Screen())
 
 
+@study.command(
+    epilog=example(
+        "optloc study histories runs/my --plot down.png --out down.csv",
+        "optloc study histories runs/my --method mine.py:simplex --case outside --noise '10 m'",
+        "optloc study histories site.toml --method gauss-newton --method mine.py:simplex --plot down.png",
+    )
+)
+def histories(
+    place: Annotated[Path, typer.Argument(metavar="WHERE", help="Output folder of a study, or a problem file.")],
+    methods: Methods = None,
+    plugin: Plugins = None,
+    trials: Annotated[int, typer.Option(min=1, help="Trials, or epochs of a file, at most: the first ones.")] = 20,
+    case: Annotated[str | None, typer.Option(metavar="LABEL", help="Case of a study; the first by default.")] = None,
+    noise: Annotated[
+        str | None, typer.Option(metavar="LABEL", help="Noise level of a study; the first by default.")
+    ] = None,
+    tau: Annotated[
+        float, typer.Option(metavar="COST", help="Cost above the least known that counts as reached.")
+    ] = 1e-3,
+    out: Annotated[Path | None, typer.Option(metavar="OUT", help="Every point of every way: .csv or .parquet.")] = None,
+    plot: Annotated[Path | None, typer.Option(metavar="OUT", help="Picture: .png, .svg or .pdf.")] = None,
+    as_json: Json = False,
+    force: Force = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Follow methods on their way down: the cost against evaluations of it and against iterations."""
+    from optloc.base.registry import load_plugin
+    from optloc.cli.output import claim_outputs, write_picture, write_table
+    from optloc.study.histories import histories as followed
+    from optloc.study.histories import question, reach
+
+    claim_outputs(table=out, picture=plot, inputs=[] if place.is_dir() else [place])
+    for name in plugin or ():
+        load_plugin(name)
+    found = followed(question(place, methods or (), trials, case, noise))
+    if out is not None and found.methods:
+        write_table(out, {str(name): column.to_numpy() for name, column in found.frame.items()})
+    if plot is not None and found.methods:
+        from optloc.report.figures import history_picture, marks
+
+        write_picture(history_picture(found, marks(list(found.methods))), plot)
+    reached = reach(found, tau)
+    if as_json:
+        from dataclasses import asdict
+
+        ways = [asdict(one) for one in reached]
+        _print_json({"title": found.title, "tau": tau, "methods": ways, "remarks": list(found.remarks)})
+    elif not quiet:
+        _show_histories(found, reached, tau, Screen())
+
+
 @study.command(epilog=example("optloc study schema > study.schema.json"))
 def schema(verbose: Verbose = False) -> None:
     """Print the JSON schema of study files."""
@@ -419,16 +471,39 @@ def _profile_record(found: Any) -> dict[str, Any]:
 
 
 def _show_profiles(found: Any, console: Console) -> None:
-    from optloc.report.sheets import solved_within
+    from optloc.report.sheets import duration, number, percent, solved_within
+    from optloc.study.profiles import RATIOS, shares
 
-    made = solved_within(found).shown
-    table = Table()
-    for i, heading in enumerate(made.header):
-        table.add_column(heading, justify="right" if i else "left")
-    for row in made.rows:
-        table.add_row(*row)
+    table = Table("method")
+    for name in ("trials", "solved, %", *(f"{ratio:g}×" for ratio in RATIOS), "median"):
+        table.add_column(name, justify="right")
+    shown = duration if found.work == "processor" else number
+    for one in shares(found):
+        within = (percent(one.within[ratio]) for ratio in RATIOS)
+        table.add_row(one.method, str(one.trials), percent(one.solved / one.trials), *within, shown(one.median))
     console.print(table)
-    console.print(made.note, highlight=False, markup=False, soft_wrap=True)
+    console.print(solved_within(found).shown.note, highlight=False, markup=False, soft_wrap=True)
+
+
+def _show_histories(found: Any, reached: list[Any], tau: float, console: Console) -> None:
+    console.print(found.title, style="bold", highlight=False, markup=False, soft_wrap=True)
+    table = Table("method")
+    for name in ("trials", f"within {tau:g}", "evaluations", "iterations"):
+        table.add_column(name, justify="right")
+    for one in reached:
+        counts = (_quartiles(one.evaluations), _quartiles(one.iterations))
+        table.add_row(one.method, str(one.trials), str(one.reached), *counts)
+    console.print(table)
+    for remark in found.remarks:
+        console.print(f"{remark}.", highlight=False, markup=False, soft_wrap=True)
+
+
+def _quartiles(values: tuple[float, ...] | None) -> str:
+    """Return the median with the quartiles; a dash where nobody counts."""
+    if values is None:
+        return "-"
+    low, middle, high = ("∞" if isinf(value) else f"{value:g}" for value in values)
+    return f"{middle} [{low}, {high}]"
 
 
 # A paper is a study of its own: its trials, tables and pictures are made again.

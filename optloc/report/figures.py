@@ -14,6 +14,7 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.papers.report import Picture
 from optloc.plot.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, YELLOW, figure_class, literal
+from optloc.study.histories import COUNTS, Histories, band
 from optloc.study.profiles import WORK, Profiles
 from optloc.study.summary import accuracy_rows, distribution, noise_text, wilson
 
@@ -217,7 +218,7 @@ def _log(axis: Any, scale: Any, low: float, high: float) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def _line(axes: Axes, mark: Mark, x: Array, y: Array, *, marker: bool, steps: bool = False) -> None:
+def _line(axes: Axes, mark: Mark, x: Array, y: Array, *, marker: bool, steps: bool = False, width: float = 1.5) -> None:
     (line,) = axes.plot(
         x,
         y,
@@ -225,7 +226,7 @@ def _line(axes: Axes, mark: Mark, x: Array, y: Array, *, marker: bool, steps: bo
         linestyle=mark.dash,
         marker=mark.mark if marker else None,
         markersize=4.5,
-        linewidth=1.5,
+        linewidth=width,
         drawstyle="steps-post" if steps else "default",
         label=literal(mark.name),
     )
@@ -319,6 +320,45 @@ def _curves(axes: Axes, found: Profiles, looks: Looks, x: Array, shares: Array) 
     axes.set_xlim(x[0], x[-1])
     axes.set_ylim(-0.02, 1.02)
     axes.set_ylabel(f"share of trials solved to {found.tau:g}")
+
+
+# Share of a band of quartiles that one sees through: lines of other methods cross it.
+_BAND = 0.15
+# Widths of the first line and of the last, points: methods that go the same way are seen beside each other.
+_WIDTHS = (3.5, 1.2)
+
+
+def history_picture(found: Histories, looks: Looks) -> Figure:
+    """Return how methods came down, against evaluations and against iterations: medians over trials, with quartiles."""
+    trials = found.frame["trial"].nunique()
+    figure, both = panels(f"{found.title}: {trials} trial{'s' * (trials > 1)}", len(COUNTS))
+    for axes, (by, label) in zip(both, COUNTS.items(), strict=True):
+        for name, width in zip(found.methods, np.linspace(*_WIDTHS, len(found.methods)), strict=True):
+            counts = found.frame.loc[found.frame["method"] == name, by].to_numpy(dtype=float)
+            if np.isnan(counts).any():
+                continue
+            at = np.unique(counts)
+            low, middle, high = np.maximum(band(found, name, by, at), _LEAST)
+            # A way that is drawn from zero on has no place on a logarithmic axis: its start stands at one.
+            x = at + 1.0 if by == "iterations" else at
+            _line(
+                axes,
+                looks[name],
+                x,
+                np.where(np.isfinite(middle), middle, np.nan),
+                marker=False,
+                steps=True,
+                width=width,
+            )
+            # What is infinitely high reaches beyond the panel.
+            top = np.where(np.isfinite(high), high, _DEAREST)
+            axes.fill_between(x, low, top, color=looks[name].colour, alpha=_BAND, step="post", linewidth=0)
+        axes.set_yscale("log")
+        _log(axes.xaxis, axes.set_xscale, 1.0, axes.get_xlim()[1])
+        axes.set_xlim(left=1.0)
+        axes.set_xlabel(label if by == "evaluations" else "iterations + 1")
+        axes.set_ylabel("cost above the least known")
+    return with_legend(figure)
 
 
 _PROFILES = (
