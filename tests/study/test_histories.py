@@ -2,15 +2,19 @@
 
 import json
 from importlib.resources import files
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
+from doc_pages import DOCS, blocks
 from study.texts import QUICK, plan, run_here
 from typer.testing import CliRunner
 
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
+from optloc.plot.style import save
+from optloc.report.figures import history_picture, marks, profile_picture
 from optloc.solvers.methods import counting
 from optloc.study.baselines import BASELINES, Baseline, start_of, whiten_one
 from optloc.study.draws import draw
@@ -18,6 +22,9 @@ from optloc.study.folder import read_frame
 from optloc.study.histories import Histories, band, histories, question, reach, way_of
 from optloc.study.methods import added, run
 from optloc.study.minimizers import Minimizer
+from optloc.study.plan import plan_of
+from optloc.study.profiles import profiles
+from optloc.study.summary import COLUMNS
 
 RUN = CliRunner()
 TEXT = QUICK.replace("trials = 60", "trials = 8")
@@ -203,3 +210,18 @@ def test_the_command_follows_a_study_and_a_file(folder, tmp_path, monkeypatch):
     done = RUN.invoke(app, ["study", "histories", str(tmp_path / "held.toml")])
     assert done.exit_code == 2
     assert "constraints" in done.output
+
+
+@pytest.mark.full
+def test_the_pictures_of_the_page_are_of_the_public_test_set(tmp_path):
+    """Write docs/measured/profiles.png and histories.png: the public test set with few trials, and the page's file."""
+    mine = next(b.text for b in blocks(DOCS / "studies.md") if b.mark == "file: mine.py")
+    (tmp_path / "mine.py").write_text(mine)
+    names = ["ipopt", f"{tmp_path}/mine.py:bfgs", f"{tmp_path}/mine.py:simplex"]
+    out = run_here(plan_of(Path("bench"), trials=40, more=added(names)), tmp_path / "out")
+    found = profiles(read_frame(out, COLUMNS), out=["truth"])
+    assert found.spent.shape == (8, 240)
+    save(profile_picture(found, marks(list(found.methods))), DOCS / "measured" / "profiles.png")
+    ways = histories(question(out, names, 40, "differences, far"))
+    assert len(ways.methods) == 8
+    save(history_picture(ways, marks(list(ways.methods))), DOCS / "measured" / "histories.png")

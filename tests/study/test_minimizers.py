@@ -6,7 +6,8 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
-from doc_pages import DOCS, blocks
+from doc_pages import DOCS
+from recipes import files_of_the_page
 from scipy.optimize import minimize
 from scipy.stats import quantile_test
 from study.texts import QUICK, plan, run_here
@@ -207,7 +208,7 @@ def test_what_breaks_a_constraint_has_no_cost_and_wins_against_nobody(tmp_path):
     assert right.to_dict() == {"gtrs+lsr": 4, "scipy from the centre": 0, "truth": 4}
 
 
-NLOPT = next(b.text for b in blocks(DOCS / "studies.md") if b.mark == "file: others.py")
+NLOPT = files_of_the_page(DOCS / "studies.md")["others.py"]
 
 
 @pytest.mark.skipif(find_spec("nlopt") is None, reason="needs nlopt: pip install nlopt")
