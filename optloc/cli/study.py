@@ -316,13 +316,13 @@ def histories(
     for name in plugin or ():
         load_plugin(name)
     found = followed(question(place, methods or (), trials, case, noise))
-    if out is not None and found.methods:
+    reached = reach(found, tau)
+    if out is not None:
         write_table(out, {str(name): column.to_numpy() for name, column in found.frame.items()})
-    if plot is not None and found.methods:
+    if plot is not None:
         from optloc.report.figures import history_picture, marks
 
         write_picture(history_picture(found, marks(list(found.methods))), plot)
-    reached = reach(found, tau)
     if as_json:
         from dataclasses import asdict
 

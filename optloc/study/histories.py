@@ -33,6 +33,7 @@ from optloc.study.draws import Case, Drawn, draw
 from optloc.study.folder import plan_again, read_frame, read_manifest
 from optloc.study.methods import SETTINGS, Method, added
 from optloc.study.minimizers import baseline_of
+from optloc.study.profiles import check_accuracy
 from optloc.study.summary import case_label, noise_text
 
 if TYPE_CHECKING:
@@ -119,7 +120,8 @@ def histories(asked: Question) -> Histories:
     Raises
     ------
     InvalidProblem
-        For trials whose costs along a way cannot be compared: with constraints, or weights that depend on the place.
+        For trials whose costs along a way cannot be compared: with constraints, or weights that depend on the place;
+        and where no method tells its way.
     """
     import pandas as pd
 
@@ -136,12 +138,14 @@ def histories(asked: Question) -> Histories:
             remarks.append(f"{method.name}: {remark}")
         if any(len(way.cost) for way in found):
             ways[method.name] = found
+    if not ways:
+        why = remarks[0] if remarks else "there is none"
+        raise InvalidProblem(f"no method tells its way ({why})", asked.title, "name a minimizer with --method")
     least = np.array(asked.least, dtype=float)
     for found in ways.values():
         least = np.fmin(least, [np.min(way.cost, initial=np.inf) for way in found])
     parts = [_rows(name, trial, way, least[trial]) for name, found in ways.items() for trial, way in enumerate(found)]
-    frame = pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
-    return Histories(asked.title, frame, tuple(ways), tuple(remarks))
+    return Histories(asked.title, pd.concat(parts, ignore_index=True), tuple(ways), tuple(remarks))
 
 
 def _rows(method: str, trial: int, way: Way, least: float) -> pd.DataFrame:
@@ -203,6 +207,7 @@ class Reach:
 
 def reach(found: Histories, tau: float) -> list[Reach]:
     """Return how each method came within an accuracy `tau` of the least known cost."""
+    check_accuracy(tau)
     out = []
     for name in found.methods:
         rows = found.frame[found.frame["method"] == name]

@@ -129,8 +129,7 @@ def profiles(frame: pd.DataFrame, *, tau: float = TAU, work: str = "processor", 
     InvalidProblem
         For an accuracy that is not positive, an unknown work, and where no method tells it.
     """
-    if not 0.0 < tau < np.inf:
-        raise InvalidProblem(f"the accuracy {tau:g} is not positive", "--tau", "give a cost such as 1e-3")
+    check_accuracy(tau)
     if work not in WORK:
         raise InvalidProblem(f"there is no work {work!r}", "--work", nearest(work, list(WORK)))
     rivals = frame[~frame["method"].astype(str).isin(out)]
@@ -150,6 +149,12 @@ def profiles(frame: pd.DataFrame, *, tau: float = TAU, work: str = "processor", 
     order = sorted(range(len(methods)), key=lambda i: (-int(solved[i].sum()), _median(spent[i][solved[i]]), methods[i]))
     silent = tuple(str(name) for name in known.index[known == 0])
     return Profiles(tau, work, tuple(methods[i] for i in order), silent, spent[order], solved[order], total)
+
+
+def check_accuracy(tau: float) -> None:
+    """Raise InvalidProblem for an accuracy that nothing or everything would meet."""
+    if not 0.0 < tau < np.inf:
+        raise InvalidProblem(f"the accuracy {tau:g} is not positive and finite", "--tau", "give a cost such as 1e-3")
 
 
 def data_profile(spent: Array, solved: Array, budgets: Array) -> Array:
