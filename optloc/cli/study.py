@@ -16,7 +16,19 @@ from rich.table import Table
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.outputs import claim, make_folder
-from optloc.cli.options import STOPPED, Budget, Force, Group, Json, Outside, Quiet, Verbose, complete, example
+from optloc.cli.options import (
+    STOPPED,
+    Budget,
+    Force,
+    Group,
+    Json,
+    Outside,
+    Quiet,
+    Verbose,
+    complete,
+    example,
+    find_problem,
+)
 from optloc.cli.output import Screen
 
 # Heavy libraries are imported inside the commands, so that --help answers at once.
@@ -288,7 +300,14 @@ def profiles(
     )
 )
 def histories(
-    place: Annotated[Path, typer.Argument(metavar="WHERE", help="Output folder of a study, or a problem file.")],
+    place: Annotated[
+        Path,
+        typer.Argument(
+            metavar="WHERE",
+            help="Output folder of a study, a problem file, or the name of a shipped problem.",
+            callback=find_problem,
+        ),
+    ],
     methods: Methods = None,
     plugin: Plugins = None,
     trials: Annotated[int, typer.Option(min=1, help="Trials, or epochs of a file, at most: the first ones.")] = 20,
