@@ -23,10 +23,10 @@ TABLES = {
 _BLOCK = re.compile(r"^```\{code-block\} \w+\n:caption: (\S+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
-def files_of_the_page():
-    """Return the text of every file of the page; parts of one file are joined."""
+def files_of_the_page(page=PAGE):
+    """Return the text of every file of a page; parts of one file are joined."""
     files = {}
-    for name, text in _BLOCK.findall(PAGE.read_text(encoding="utf-8")):
+    for name, text in _BLOCK.findall(page.read_text(encoding="utf-8")):
         files[name] = files.get(name, "") + text
     return files
 

@@ -39,6 +39,8 @@ BASE = {
     "study compare": "study compare no no",
     "study schema": "study schema",
     "study pairs": "study pairs no",
+    "study profiles": "study profiles no",
+    "study histories": "study histories demo --trials 1 --method gauss-newton",
     "study bench": "study bench --out /dev/null/no",
     "study run": "study run divergence --out /dev/null/no",
     "reproduce": "reproduce registration --out /dev/null/no",

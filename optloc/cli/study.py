@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from itertools import groupby
-from math import isnan, nan
+from math import isinf, isnan, nan
 from pathlib import Path
 from typing import Annotated, Any, cast, get_args
 
@@ -16,7 +16,19 @@ from rich.table import Table
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.outputs import claim, make_folder
-from optloc.cli.options import STOPPED, Budget, Force, Group, Json, Outside, Quiet, Verbose, complete, example
+from optloc.cli.options import (
+    STOPPED,
+    Budget,
+    Force,
+    Group,
+    Json,
+    Outside,
+    Quiet,
+    Verbose,
+    complete,
+    example,
+    find_problem,
+)
 from optloc.cli.output import Screen
 
 # Heavy libraries are imported inside the commands, so that --help answers at once.
@@ -236,6 +248,109 @@ def pairs(
         _show_pairs(found, Screen())
 
 
+@study.command(
+    epilog=example(
+        "optloc study profiles runs/my",
+        "optloc study profiles runs/my --work evaluations --tau 0.01 --plot profiles.svg",
+    )
+)
+def profiles(
+    folder: Folder,
+    tau: Annotated[
+        float, typer.Option(metavar="COST", help="Cost above the least known with which a trial counts as solved.")
+    ] = 1e-3,
+    work: Annotated[
+        str, typer.Option(metavar="NAME", help="processor (time) or evaluations (of the cost).")
+    ] = "processor",
+    plot: Annotated[
+        Path | None, typer.Option(metavar="OUT", help="Picture of both profiles: .png, .svg or .pdf.")
+    ] = None,
+    as_json: Json = False,
+    force: Force = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Say which share of the trials each method solves, within how much work: data and performance profiles."""
+    from optloc.cli.output import claim_outputs, write_picture
+    from optloc.study import summary
+    from optloc.study.folder import plan_again, read_frame, read_manifest, references
+    from optloc.study.profiles import profiles as profiled
+
+    claim_outputs(picture=plot)
+    frame = read_frame(folder, summary.COLUMNS)
+    if not len(frame):
+        raise InvalidProblem("nothing of the study is finished yet", str(folder), "run the study")
+    known = references(plan_again(read_manifest(folder)))
+    found = profiled(frame, tau=tau, work=work, out=known)
+    if plot is not None:
+        from optloc.report.figures import marks, profile_picture
+
+        write_picture(profile_picture(found, marks(list(found.methods))), plot)
+    if as_json:
+        _print_json(_profile_record(found))
+    elif not quiet:
+        _show_profiles(found, Screen())
+
+
+@study.command(
+    epilog=example(
+        "optloc study histories runs/my --plot down.png --out down.csv",
+        "optloc study histories runs/my --method mine.py:simplex --case outside --noise '10 m'",
+        "optloc study histories site.toml --method gauss-newton --method mine.py:simplex --plot down.png",
+    )
+)
+def histories(
+    place: Annotated[
+        Path,
+        typer.Argument(
+            metavar="WHERE",
+            help="Output folder of a study, a problem file, or the name of a shipped problem.",
+            callback=find_problem,
+        ),
+    ],
+    methods: Methods = None,
+    plugin: Plugins = None,
+    trials: Annotated[int, typer.Option(min=1, help="Trials, or epochs of a file, at most: the first ones.")] = 20,
+    case: Annotated[str | None, typer.Option(metavar="LABEL", help="Case of a study; the first by default.")] = None,
+    noise: Annotated[
+        str | None, typer.Option(metavar="LABEL", help="Noise level of a study; the first by default.")
+    ] = None,
+    tau: Annotated[
+        float, typer.Option(metavar="COST", help="Cost above the least known that counts as reached.")
+    ] = 1e-3,
+    out: Annotated[Path | None, typer.Option(metavar="OUT", help="Every point of every way: .csv or .parquet.")] = None,
+    plot: Annotated[Path | None, typer.Option(metavar="OUT", help="Picture: .png, .svg or .pdf.")] = None,
+    as_json: Json = False,
+    force: Force = False,
+    quiet: Quiet = False,
+    verbose: Verbose = False,
+) -> None:
+    """Follow methods on their way down: the cost against evaluations of it and against iterations."""
+    from optloc.base.registry import load_plugin
+    from optloc.cli.output import claim_outputs, write_picture, write_table
+    from optloc.study.histories import histories as followed
+    from optloc.study.histories import question, reach
+
+    claim_outputs(table=out, picture=plot, inputs=[] if place.is_dir() else [place])
+    for name in plugin or ():
+        load_plugin(name)
+    found = followed(question(place, methods or (), trials, case, noise))
+    reached = reach(found, tau)
+    if out is not None:
+        write_table(out, {str(name): column.to_numpy() for name, column in found.frame.items()})
+    if plot is not None:
+        from optloc.report.figures import history_picture, marks
+
+        write_picture(history_picture(found, marks(list(found.methods))), plot)
+    if as_json:
+        from dataclasses import asdict
+
+        ways = [asdict(one) for one in reached]
+        _print_json({"title": found.title, "tau": tau, "methods": ways, "remarks": list(found.remarks)})
+    elif not quiet:
+        _show_histories(found, reached, tau, Screen())
+
+
 @study.command(epilog=example("optloc study schema > study.schema.json"))
 def schema(verbose: Verbose = False) -> None:
     """Print the JSON schema of study files."""
@@ -351,6 +466,63 @@ def _show_pairs(found: list[Any], console: Console) -> None:
             counts = (str(n) for n in (one.trials, one.alone, one.other_alone))
             table.add_row(one.method, *counts, f"{one.p:.2g}", *cells)
         console.print(table)
+
+
+def _profile_record(found: Any) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    from optloc.study.profiles import RATIOS, shares
+
+    budgets = found.budgets
+    return {
+        "tau": found.tau,
+        "work": found.work,
+        "trials": found.spent.shape[1],
+        "trials_of_the_study": found.total,
+        "not_told": list(found.silent),
+        "ratios": list(RATIOS),
+        "budgets": budgets,
+        "methods": [
+            asdict(one) | {"within": list(one.within.values()), "data_profile": curve}
+            for one, curve in zip(shares(found), found.data(budgets), strict=True)
+        ],
+    }
+
+
+def _show_profiles(found: Any, console: Console) -> None:
+    from optloc.report.sheets import duration, number, percent, solved_within
+    from optloc.study.profiles import RATIOS, shares
+
+    table = Table("method")
+    for name in ("trials", "solved, %", *(f"{ratio:g}×" for ratio in RATIOS), "median"):
+        table.add_column(name, justify="right")
+    shown = duration if found.work == "processor" else number
+    for one in shares(found):
+        within = (percent(one.within[ratio]) for ratio in RATIOS)
+        table.add_row(one.method, str(one.trials), percent(one.solved / one.trials), *within, shown(one.median))
+    console.print(table)
+    console.print(solved_within(found).shown.note, highlight=False, markup=False, soft_wrap=True)
+
+
+def _show_histories(found: Any, reached: list[Any], tau: float, console: Console) -> None:
+    console.print(found.title, style="bold", highlight=False, markup=False, soft_wrap=True)
+    table = Table("method")
+    for name in ("trials", f"within {tau:g}", "evaluations", "iterations"):
+        table.add_column(name, justify="right")
+    for one in reached:
+        counts = (_quartiles(one.evaluations), _quartiles(one.iterations))
+        table.add_row(one.method, str(one.trials), str(one.reached), *counts)
+    console.print(table)
+    for remark in found.remarks:
+        console.print(f"{remark}.", highlight=False, markup=False, soft_wrap=True)
+
+
+def _quartiles(values: tuple[float, ...] | None) -> str:
+    """Return the median with the quartiles; a dash where nobody counts."""
+    if values is None:
+        return "-"
+    low, middle, high = ("∞" if isinf(value) else f"{value:g}" for value in values)
+    return f"{middle} [{low}, {high}]"
 
 
 # A paper is a study of its own: its trials, tables and pictures are made again.

@@ -14,7 +14,9 @@ import numpy as np
 from optloc.base.types import Array
 from optloc.papers.report import Picture
 from optloc.plot.style import BLACK, BLUE, GREEN, GREY, ORANGE, PURPLE, SKY, YELLOW, figure_class, literal
-from optloc.study.summary import accuracy_rows, distribution, instances, noise_text, performance_profile, wilson
+from optloc.study.histories import COUNTS, Histories, band
+from optloc.study.profiles import WORK, Profiles
+from optloc.study.summary import accuracy_rows, distribution, noise_text, wilson
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -82,19 +84,46 @@ _MOST = 12
 _LEAST = 1e-6
 # Inches, with texts of 8 to 10 points: two panels beside each other on a desk, one on a phone, and both can be read.
 _SIZE = (5.2, 3.5)
+# Letters of a name with which only two columns of a legend fit the width of a figure; inches of one of its lines.
+_WIDE, _LEGEND_LINE = 22, 0.16
+# Points of a curve with steps: two for each pixel of a panel.
+_FINE = 480
 # Ranges of logarithmic axes: errors in units of the bound, costs above the best. Beyond them all is equally bad.
 _FARTHEST, _DEAREST = 1e4, 1e8
 
 
 def panel(title: str, size: tuple[float, float] = _SIZE) -> tuple[Figure, Axes]:
     """Return an empty figure of one panel with a grid."""
-    figure = figure_class()(figsize=size, layout="constrained")
-    axes = figure.subplots()
-    axes.grid(color=GREY, alpha=0.3, linewidth=0.6)
-    axes.set_axisbelow(True)
+    figure, (axes,) = panels("", 1, size)
     if title:
         axes.set_title(literal(title), fontsize=10)
     return figure, axes
+
+
+def panels(title: str, count: int, size: tuple[float, float] = _SIZE) -> tuple[Figure, list[Axes]]:
+    """Return an empty figure of panels with grids side by side."""
+    figure = figure_class()(figsize=(count * size[0], size[1]), layout="constrained")
+    made = figure.subplots(1, count, squeeze=False).ravel().tolist()
+    for axes in made:
+        axes.grid(color=GREY, alpha=0.3, linewidth=0.6)
+        axes.set_axisbelow(True)
+    if title:
+        figure.suptitle(literal(title), fontsize=10)
+    return figure, made
+
+
+def with_legend(figure: Figure) -> Figure:
+    """Return a figure with a legend of the methods of all its panels below them."""
+    shown: dict[str, Any] = {}
+    for axes in figure.axes:
+        handles, labels = axes.get_legend_handles_labels()
+        shown |= dict(zip(labels, handles, strict=True))
+    # Names of 22 letters leave room for two columns a panel, shorter ones for three.
+    columns = len(figure.axes) * (2 if max(map(len, shown), default=0) > _WIDE else 3)
+    figure.legend(shown.values(), shown, loc="outside lower center", ncols=columns, frameon=False, fontsize=7)
+    width, height = figure.get_size_inches()
+    figure.set_size_inches(width, height + _LEGEND_LINE * -(-len(shown) // columns))
+    return figure
 
 
 def success(table: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
@@ -189,7 +218,7 @@ def _log(axis: Any, scale: Any, low: float, high: float) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def _line(axes: Axes, mark: Mark, x: Array, y: Array, *, marker: bool, steps: bool = False) -> None:
+def _line(axes: Axes, mark: Mark, x: Array, y: Array, *, marker: bool, steps: bool = False, width: float = 1.5) -> None:
     (line,) = axes.plot(
         x,
         y,
@@ -197,7 +226,7 @@ def _line(axes: Axes, mark: Mark, x: Array, y: Array, *, marker: bool, steps: bo
         linestyle=mark.dash,
         marker=mark.mark if marker else None,
         markersize=4.5,
-        linewidth=1.5,
+        linewidth=width,
         drawstyle="steps-post" if steps else "default",
         label=literal(mark.name),
     )
@@ -248,26 +277,94 @@ def gaps(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
         yield Picture(f"gaps-{number + 1}", f"Cost above the best known: {case}", figure)
 
 
-def profile(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:
-    """Yield the performance profile over all instances that every method has seen."""
-    names = [name for name in looks if name in set(frame["method"])]
-    times, solved, _ = instances(frame, names)
-    if not times.size or not solved.any():
-        return
-    spent = np.where(solved, times, np.inf)
+def profiles(found: Profiles, looks: Looks) -> Iterator[Picture]:
+    """Yield the data profile and the performance profile over all trials that every method has seen."""
+    for name, title, draw in _PROFILES:
+        if found.solved.any():
+            figure, axes = panel("")
+            draw(axes, found, looks)
+            yield Picture(name, f"{title} over {found.spent.shape[1]} trials", figure)
+
+
+def profile_picture(found: Profiles, looks: Looks) -> Figure:
+    """Return both profiles side by side, with a legend."""
+    figure, axes = panels("", len(_PROFILES))
+    for one, (_, title, draw) in zip(axes, _PROFILES, strict=True):
+        one.set_title(title, fontsize=10)
+        if found.solved.any():
+            draw(one, found, looks)
+    return with_legend(figure)
+
+
+def _data_profile(axes: Axes, found: Profiles, looks: Looks) -> None:
+    needed = found.spent[found.solved]
+    budgets = np.geomspace(needed.min() / 1.5, 1.5 * needed.max(), _FINE)
+    _curves(axes, found, looks, budgets, found.data(budgets))
+    axes.set_xlabel(WORK[found.work])
+
+
+def _performance_profile(axes: Axes, found: Profiles, looks: Looks) -> None:
+    needed = np.where(found.solved, found.spent, np.inf)
     with np.errstate(invalid="ignore"):
-        slower = np.where(solved, spent / spent.min(0), 1.0)
-    # To half beyond the slowest that is right, where no curve rises any more.
-    ratios = np.geomspace(1.0, max(10.0, 1.5 * float(slower.max())), 240)
-    figure, axes = panel("", (6.0, 3.8))
-    for name, shares in zip(names, performance_profile(times, solved, ratios), strict=True):
-        _line(axes, looks[name], ratios, shares, marker=False, steps=True)
+        slower = np.where(found.solved, needed / needed.min(0), 1.0)
+    # To half beyond the last trial that is solved, where no curve rises any more.
+    ratios = np.geomspace(1.0, max(10.0, 1.5 * float(slower.max())), _FINE)
+    _curves(axes, found, looks, ratios, found.performance(ratios))
+    axes.set_xlabel(f"{WORK[found.work].partition(' (')[0]} / least of any method")
+
+
+def _curves(axes: Axes, found: Profiles, looks: Looks, x: Array, shares: Array) -> None:
+    for method, share in zip(found.methods, shares, strict=True):
+        _line(axes, looks[method], x, share, marker=False, steps=True)
     axes.set_xscale("log")
-    axes.set_xlim(ratios[0], ratios[-1])
+    axes.set_xlim(x[0], x[-1])
     axes.set_ylim(-0.02, 1.02)
-    axes.set_xlabel("time / time of the fastest method of the instance")
-    axes.set_ylabel("share of instances with a right answer")
-    yield Picture("profile", f"Performance profile over {times.shape[1]} instances", figure)
+    axes.set_ylabel(f"share of trials solved to {found.tau:g}")
+
+
+# Share of a band of quartiles that one sees through: lines of other methods cross it.
+_BAND = 0.15
+# Widths of the first line and of the last, points: methods that go the same way are seen beside each other.
+_WIDTHS = (3.5, 1.2)
+
+
+def history_picture(found: Histories, looks: Looks) -> Figure:
+    """Return how methods came down, against evaluations and against iterations: medians over trials, with quartiles."""
+    trials = found.frame["trial"].nunique()
+    figure, both = panels(f"{found.title}: {trials} trial{'s' * (trials > 1)}", len(COUNTS))
+    for axes, (by, label) in zip(both, COUNTS.items(), strict=True):
+        for name, width in zip(found.methods, np.linspace(*_WIDTHS, len(found.methods)), strict=True):
+            counts = found.frame.loc[found.frame["method"] == name, by].to_numpy(dtype=float)
+            if np.isnan(counts).any():
+                continue
+            at = np.unique(counts)
+            low, middle, high = np.maximum(band(found, name, by, at), _LEAST)
+            # A way that is drawn from zero on has no place on a logarithmic axis: its start stands at one.
+            x = at + 1.0 if by == "iterations" else at
+            _line(
+                axes,
+                looks[name],
+                x,
+                np.where(np.isfinite(middle), middle, np.nan),
+                marker=False,
+                steps=True,
+                width=width,
+            )
+            # What is infinitely high reaches beyond the panel.
+            top = np.where(np.isfinite(high), high, _DEAREST)
+            axes.fill_between(x, low, top, color=looks[name].colour, alpha=_BAND, step="post", linewidth=0)
+        axes.set_yscale("log")
+        _log(axes.xaxis, axes.set_xscale, 1.0, axes.get_xlim()[1])
+        axes.set_xlim(left=1.0)
+        axes.set_xlabel(label if by == "evaluations" else "iterations + 1")
+        axes.set_ylabel("cost above the least known")
+    return with_legend(figure)
+
+
+_PROFILES = (
+    ("data-profile", "Data profile", _data_profile),
+    ("profile", "Performance profile", _performance_profile),
+)
 
 
 def timing(frame: pd.DataFrame, looks: Looks) -> Iterator[Picture]:

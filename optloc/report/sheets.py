@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from optloc.papers.report import Table
+from optloc.study.profiles import RATIOS, Profiles, shares
 from optloc.study.summary import PROVEN, by_status, clopper_pearson, noise_text, ranking, wilson
 
 if TYPE_CHECKING:
@@ -202,6 +203,41 @@ def timing(cells: pd.DataFrame) -> Sheet:
     return _sheet("timing", "Times", note, cells[names.split()], columns, 3)
 
 
+def solved_within(found: Profiles) -> Sheet:
+    """Return what each method solves within multiples of the least work on each trial."""
+    import pandas as pd
+
+    rows = [
+        {"method": one.method, "trials": one.trials, "solved": one.solved}
+        | {f"within_{ratio:g}": one.within[ratio] for ratio in RATIOS}
+        | {f"median_{found.work}": one.median}
+        for one in shares(found)
+    ]
+    shown = duration if found.work == "processor" else number
+    columns: list[Column] = [
+        ("method", lambda r: str(r.method)),
+        ("trials", lambda r: str(r.trials)),
+        ("solved, % (95 %)", lambda r: _interval(r.solved, r.trials)),
+        *((f"within {ratio:g}×", partial(_within, ratio)) for ratio in RATIOS),
+        ("median when solved", lambda r: shown(getattr(r, f"median_{found.work}"))),
+    ]
+    note = (
+        f"Solved: the cost exceeds the least that is known by {found.tau:g} at most, whatever the status. Then the "
+        f"share, in per cent, that is solved within multiples of the {_LEAST[found.work]} that the best method needs "
+        "for the trial. Methods that know the truth do not take part."
+    )
+    if found.silent:
+        note += f" Not counted are those of {', '.join(found.silent)}."
+    return _sheet("profiles", "Solved within so much work", note, pd.DataFrame(rows), columns, 1)
+
+
+_LEAST = {"processor": "processor time", "evaluations": "evaluations of the cost"}
+
+
+def _within(ratio: float, row: Any) -> str:
+    return percent(getattr(row, f"within_{ratio:g}"))
+
+
 # Proofs that say something of an answer, from the strongest on.
 _PROOFS = (PROVEN, "region", "local")
 
@@ -254,13 +290,17 @@ def made_with(frame: pd.DataFrame) -> Sheet:
     return _sheet("machine", "Machine and versions", "", table, columns, 2)
 
 
-def sheets(frame: pd.DataFrame, rivals: pd.DataFrame, cells: pd.DataFrame, order: list[str]) -> Iterator[Sheet]:
-    """Yield all tables of judged rows, of those that are ranked, and of their cells, in reading order."""
+def sheets(
+    frame: pd.DataFrame, rivals: pd.DataFrame, cells: pd.DataFrame, order: list[str], found: Profiles | None
+) -> Iterator[Sheet]:
+    """Yield all tables of judged rows, of those that are ranked, of cells and of profiles, in reading order."""
     yield best_first(rivals, [name for name in order if name in set(rivals["method"])])
     yield success(cells)
     yield statuses(frame)
     yield accuracy(cells)
     yield certificates(frame, order)
+    if found is not None:
+        yield solved_within(found)
     yield timing(cells)
     yield made_with(frame)
 

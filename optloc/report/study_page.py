@@ -19,15 +19,15 @@ from optloc.papers.report import Picture
 from optloc.plot.bound_map import plot_bound_map
 from optloc.plot.style import figure_class
 from optloc.report import figures as drawn
-from optloc.report.figures import Drawing, Mark, inline, marks, svg_text
+from optloc.report.figures import Drawing, Mark, inline, marks, svg_text, with_legend
 from optloc.report.map import Canvas
 from optloc.report.page import Part, map_element, write_page
 from optloc.report.sheets import Sheet, latex, sheets
 from optloc.study import summary
-from optloc.study.baselines import BASELINES
 from optloc.study.draws import Case, draw
-from optloc.study.folder import Manifest, read_frame, read_manifest
-from optloc.study.plan import Plan, planned
+from optloc.study.folder import Manifest, plan_again, read_frame, read_manifest, references
+from optloc.study.plan import Plan
+from optloc.study.profiles import Profiles, profiles
 from optloc.study.summary import case_label, noise_text
 
 if TYPE_CHECKING:
@@ -64,21 +64,6 @@ class Place:
     found: BoundMap
     truths: Array
     off: Array
-
-
-def plan_again(manifest: Manifest) -> Plan | None:
-    """Return the plan of a study from its manifest, None where a problem file cannot be read any more."""
-    try:
-        return planned(manifest.text, manifest.name, Path(manifest.folder or "."), seed=manifest.seed)
-    except InvalidProblem:
-        return None
-
-
-def references(plan: Plan | None) -> set[str]:
-    """Return the names of the methods that begin at the truth, with which nobody competes."""
-    if plan is None:
-        return {name for name, baseline in BASELINES.items() if baseline.reference}
-    return {cell.method.name for cell in plan.cells if cell.method.reference}
 
 
 def scenario_maps(plan: Plan, frame: pd.DataFrame) -> Iterator[Place]:
@@ -125,13 +110,11 @@ Tell = Callable[[str], None]
 
 # Pixels of an inch in PNG files: a figure of 5.2 inches has 1040, enough for screens of twice the density.
 _DPI = 200
-# Letters of a name with which only two columns of a legend fit the width of a figure; inches of one of its lines.
-_WIDE, _LEGEND_LINE = 22, 0.16
 
 
 @dataclass(frozen=True, slots=True)
 class _Found:
-    """What a report is made of; rivals are the rows of methods that do not begin at the truth."""
+    """What a report is made of; profiles are those of methods that do not begin at the truth, None without a fix."""
 
     manifest: Manifest
     frame: pd.DataFrame
@@ -139,7 +122,7 @@ class _Found:
     looks: dict[str, Mark]
     sheets: dict[str, Sheet]
     places: list[Place]
-    rivals: pd.DataFrame
+    profiles: Profiles | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,9 +203,12 @@ def _found(folder: Path) -> _Found:
     # Nobody competes with methods that know the truth, unless there are no others.
     rivals = frame[~frame["method"].isin(known)]
     rivals = rivals if len(rivals) else frame
-    tables = {sheet.shown.name: sheet for sheet in sheets(frame, rivals, cells, order)}
+    # Where every trial came to grief, nobody has spent anything.
+    some = frame["processor"].notna().any()
+    profiled = profiles(rivals) if some else None
+    tables = {sheet.shown.name: sheet for sheet in sheets(frame, rivals, cells, order, profiled)}
     places = [] if plan is None else list(scenario_maps(plan, frame))
-    return _Found(manifest, frame, cells, marks(order), tables, places, rivals)
+    return _Found(manifest, frame, cells, marks(order), tables, places, profiled)
 
 
 def _page(found: _Found, parts: list[Part]) -> str:
@@ -251,11 +237,7 @@ def _figure_files(place: Path, picture: Picture, *, legend: bool) -> list[Path]:
     """
     figure = picture.figure
     if legend:
-        handles, labels = figure.axes[0].get_legend_handles_labels()
-        columns = 2 if max(map(len, labels), default=0) > _WIDE else 3
-        figure.legend(handles, labels, loc="outside lower center", ncols=columns, frameon=False, fontsize=7)
-        width, height = figure.get_size_inches()
-        figure.set_size_inches(width, height + _LEGEND_LINE * -(-len(labels) // columns))
+        with_legend(figure)
     paths = [place / "figures" / f"{picture.name}.{ending}" for ending in ("png", "svg")]
     make_folder(paths[0].parent)
     with written(paths[0]) as file:
@@ -302,8 +284,8 @@ def _of_rows(make: Callable[..., object], found: _Found) -> list[Picture]:
     return list(make(found.frame, found.looks))  # type: ignore[call-overload,no-any-return]
 
 
-def _profile(found: _Found) -> list[Picture]:
-    return list(drawn.profile(found.rivals, found.looks))
+def _profiles(found: _Found) -> list[Picture]:
+    return [] if found.profiles is None else list(drawn.profiles(found.profiles, found.looks))
 
 
 _SECTIONS = (
@@ -341,11 +323,13 @@ _SECTIONS = (
     ),
     _Section(
         "profile",
-        "Performance profile",
-        "Share of instances that a method answers right within a multiple of the time of the fastest right one. "
-        "Methods that begin at the truth do not take part.",
-        _profile,
-        wide=True,
+        "Data and performance profiles",
+        "Share of trials that a method solves within so much processor time (Moré and Wild 2009), and within a "
+        "multiple of that of the fastest method of the trial (Dolan and Moré 2002). Solved: the cost exceeds the least "
+        "that is known by a thousandth at most, whatever the status. Where fixes are made many in a call, a trial has "
+        "their mean time. Methods that begin at the truth do not take part.",
+        _profiles,
+        tables=("profiles",),
     ),
     _Section(
         "time",

@@ -5,7 +5,9 @@ None of them looks for another minimum, and some claim whatever they arrive at: 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass
 from time import perf_counter
 
@@ -18,7 +20,7 @@ from optloc.base.threads import WORTH, mapped
 from optloc.base.types import Array, Status
 from optloc.compute.sums import equations_at
 from optloc.linear.evaluate import differentiate
-from optloc.linear.normal import step, weighed
+from optloc.linear.normal import depends_on_place, prior_parts, step, weighed
 from optloc.models import MODELS
 from optloc.problem.epochs import tied, window
 from optloc.problem.fix import Fix, Stage
@@ -26,6 +28,7 @@ from optloc.problem.noise import whiten
 from optloc.problem.problem import Problem
 from optloc.solvers.outside import given, judge_points
 from optloc.solvers.pool import offer
+from optloc.solvers.refine import WEIGHINGS
 from optloc.solvers.starts.position import one_position, spread_of, vectors
 from optloc.solvers.verdict.judge import judge
 from optloc.study.draws import Drawn
@@ -143,6 +146,40 @@ def claim(problem: Problem, start: Array, x: Array) -> Fix:
     return judge_points(problem, start, x[:, None], cost[:, None], code[:, None], stage)
 
 
+# Who wants to know which costs a method asks for, trial by trial: a study counts them, a history keeps them.
+
+Listener = Callable[[int, float], None]
+"""Hears of each evaluation: which trial of the call, and the cost there."""
+
+_LISTENER: ContextVar[Listener | None] = ContextVar("listener", default=None)
+
+
+@contextmanager
+def heard(by: Listener) -> Iterator[None]:
+    """Let somebody hear of every evaluation of a cost that a method of others is given inside."""
+    token = _LISTENER.set(by)
+    try:
+        yield
+    finally:
+        _LISTENER.reset(token)
+
+
+def teller(trial: int) -> Callable[[float], None]:
+    """Return what is told the costs of a trial, for whoever listens now."""
+    listener = _LISTENER.get()
+    return (lambda _: None) if listener is None else lambda cost: listener(trial, cost)
+
+
+def weighings(problem: Problem) -> int:
+    """Return how often a trial is solved, the next time with the weights of the place that was found."""
+    return WEIGHINGS if depends_on_place(problem) else 1
+
+
+def weighed_at(problem: Problem, x: Array, start: Array) -> Problem:
+    """Return problems with the weights of places (N, size), of those of the start where there is no place."""
+    return weighed(problem, np.where(np.isfinite(x).all(-1, keepdims=True), x, start))
+
+
 # General tools on the same data: SciPy's least squares from a guess, the plain lift of ranges.
 
 
@@ -166,35 +203,57 @@ def least_squares(problem: Problem, start: Array, limit: int = _EVALUATIONS) -> 
     from scipy import optimize
 
     began = perf_counter()
-    plain = weighed(problem)
     pool = np.array(start, dtype=float)[:, None]
     cost, code = np.full(pool.shape[:2], np.inf), np.full(pool.shape[:2], int(Status.NUMERICAL), dtype=np.int8)
-    for i in range(len(pool)):
-        residual, jacobian = whiten_one(plain.take(np.array([i])))
-        try:
-            end = optimize.least_squares(residual, start[i], jacobian, method="lm", max_nfev=limit)
-        except ValueError:  # values that are not finite, or fewer rows than unknowns
-            continue
-        pool[i, 0], cost[i, 0] = end.x, 2.0 * end.cost  # SciPy's cost has a half in front
-        code[i, 0] = Status.OK if end.status > 0 else Status.MAX_ITERATIONS
-        count("scipy", int(end.nfev))
+    for _ in range(weighings(problem)):
+        plain = weighed_at(problem, pool[:, 0], start)
+        for i in range(len(pool)):
+            residual, jacobian = whiten_one(plain.take(np.array([i])), teller(i))
+            try:
+                end = optimize.least_squares(residual, pool[i, 0], jacobian, method="lm", max_nfev=limit)
+            except ValueError:  # values that are not finite, or fewer rows than unknowns
+                continue
+            pool[i, 0], cost[i, 0] = end.x, 2.0 * end.cost  # SciPy's cost has a half in front
+            code[i, 0] = Status.OK if end.status > 0 else Status.MAX_ITERATIONS
+            count("scipy", int(end.nfev))
     stage = Stage("scipy", f"{len(pool)} problems", perf_counter() - began)
     return judge_points(problem, start, pool, cost, code, stage)
 
 
-def whiten_one(one: Problem) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
-    """Return residual (m,) and Jacobian (m, size) of one problem in units of the standard deviation, for SciPy."""
-    white = whiten(one.noise, one.weight)
+def whiten_one(
+    one: Problem, tell: Callable[[float], None]
+) -> tuple[Callable[[Array], Array], Callable[[Array], Array]]:
+    """Return residual (m,) and Jacobian (m, size) of one problem in units of the standard deviation, for SciPy.
+
+    What is known beforehand adds a residual for each unknown that it is of. `tell` hears the cost of each residual.
+    """
+    white, (slope, level) = whiten(one.noise, one.weight), _prior_rows(one)
 
     def residual(x: Array) -> Array:
         values = differentiate(one, x[None])[0][..., None]
-        return np.concatenate([w.apply(values)[0, :, 0] for w in white])
+        found = np.concatenate([*(w.apply(values)[0, :, 0] for w in white), level - slope @ x])
+        tell(float(found @ found))
+        return found
 
     def jacobian(x: Array) -> Array:
         H = differentiate(one, x[None])[1]
-        return -np.concatenate([w.apply(H)[0] for w in white])
+        return -np.concatenate([*(w.apply(H)[0] for w in white), slope])
 
     return residual, jacobian
+
+
+def _prior_rows(one: Problem) -> tuple[Array, Array]:
+    """Return the rows A (r, size) and b (r,) of the priors of one problem, whose cost is |b - A x|^2."""
+    layout, rows, levels = one.layout, [np.zeros((0, one.layout.size))], [np.zeros(0)]
+    for name, mean, precision in prior_parts(one):
+        slot, shared = layout.find(name)
+        # One problem: what batch or epochs there are have length one.
+        middle, root = mean.reshape(slot.size), np.linalg.cholesky(precision.reshape(slot.size, slot.size))
+        for k in range(1 if shared else layout.epochs):
+            first = slot.start + (0 if shared else layout.n_shared + k * layout.n_local)
+            rows.append(root.T @ np.eye(layout.size)[first : first + slot.size])
+            levels.append(root.T @ middle)
+    return np.concatenate(rows), np.concatenate(levels)
 
 
 def lifted_sdp(problem: Problem) -> Fix:
@@ -263,6 +322,8 @@ class Baseline:
         Whether it solves one by one.
     reference : bool
         Whether it knows the truth: it judges the others, and nobody competes with it.
+    method : str
+        The method of optloc that it runs from its start, where it is one.
     """
 
     run: Callable[[Drawn, Array], Fix]
@@ -270,6 +331,7 @@ class Baseline:
     guess: bool = True
     slow: bool = False
     reference: bool = False
+    method: str = ""
 
 
 def _iterate(method: str) -> Callable[[Drawn, Array], Fix]:
@@ -304,8 +366,12 @@ _OWN = {
     "truth": Baseline(
         _truth, "damped least squares from the truth: the best that any start can lead to", guess=False, reference=True
     ),
-    "gauss-newton": Baseline(_iterate("lsr"), "damped least squares from a guess"),
-    "taylor": Baseline(_iterate("taylor"), "plain undamped Taylor iteration from a guess (Foy 1976), as in the papers"),
+    "gauss-newton": Baseline(_iterate("lsr"), "damped least squares from a guess", method="lsr"),
+    "taylor": Baseline(
+        _iterate("taylor"),
+        "plain undamped Taylor iteration from a guess (Foy 1976), as in the papers",
+        method="taylor",
+    ),
     "taylor-printed": Baseline(_printed, "the same with the sign of equations 8 and 15 of the paper `kinematic`"),
     "single-step": Baseline(
         _original(single_step), "one linearised step from a guess, as in the update of the paper `angles`"
@@ -313,7 +379,7 @@ _OWN = {
     "recursion": Baseline(
         _original(recursion), "two undamped steps over all data at every new epoch, as in the paper `registration`"
     ),
-    "ipopt": Baseline(_iterate("nlp"), "IPOPT from a guess, or another nonlinear solver", slow=True),
+    "ipopt": Baseline(_iterate("nlp"), "IPOPT from a guess, or another nonlinear solver", slow=True, method="nlp"),
     "scipy": Baseline(
         lambda drawn, start: least_squares(drawn.problem, start),
         "scipy.optimize.least_squares with exact derivatives from a guess",

@@ -17,9 +17,10 @@ import numpy as np
 from optloc.base.errors import InvalidProblem
 from optloc.base.inputs import json_of, read_bytes
 from optloc.base.outputs import written
+from optloc.study.baselines import BASELINES
 from optloc.study.draws import draw
 from optloc.study.methods import version_of
-from optloc.study.plan import Plan
+from optloc.study.plan import Plan, planned
 from optloc.study.trial import COLUMNS, FAILED, GAP, Part, arrow_schema, machine, versions
 
 if TYPE_CHECKING:
@@ -140,6 +141,21 @@ def read_manifest(folder: Path) -> Manifest:
         return TypeAdapter(Manifest).validate_python(data)
     except ValidationError:
         raise InvalidProblem("the manifest is incomplete", str(path), "write to another folder") from None
+
+
+def plan_again(manifest: Manifest) -> Plan | None:
+    """Return the plan of a study from its manifest, None where a problem file cannot be read any more."""
+    try:
+        return planned(manifest.text, manifest.name, Path(manifest.folder or "."), seed=manifest.seed)
+    except InvalidProblem:
+        return None
+
+
+def references(plan: Plan | None) -> set[str]:
+    """Return the names of the methods that begin at the truth, with which nobody competes."""
+    # A method that was added to the folder has the name of its baseline, and is in no plan.
+    known = {name for name, baseline in BASELINES.items() if baseline.reference}
+    return known | ({cell.method.name for cell in plan.cells if cell.method.reference} if plan else set())
 
 
 def begin(plan: Plan, folder: Path) -> Manifest:

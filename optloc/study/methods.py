@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from itertools import product
-from time import perf_counter
+from time import perf_counter, process_time
 from typing import Any, Literal
 
 import numpy as np
@@ -20,7 +20,7 @@ from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.types import ANSWERED, Array, Certificate, Status
 from optloc.files.schema import Units, join
 from optloc.problem.fix import Fix
-from optloc.study.baselines import BASELINES, start_of
+from optloc.study.baselines import BASELINES, heard, start_of
 from optloc.study.document import MethodTable
 from optloc.study.draws import Drawn
 from optloc.study.minimizers import baseline_of, code_of, load_minimizer
@@ -188,6 +188,10 @@ class Run:
         Fixes (n,).
     seconds : float
         Time of the call.
+    processor : float
+        Processor time of the call, of all its threads, seconds.
+    evaluations : array (n,)
+        Evaluations of the cost of each trial; NaN where nobody counts them.
     iterations : float
         Iterations of all its solvers and refinements; NaN where nothing was counted.
     used : bool
@@ -196,6 +200,8 @@ class Run:
 
     fix: Fix
     seconds: float
+    processor: float
+    evaluations: Array
     iterations: float
     used: bool
 
@@ -218,13 +224,19 @@ def run(method: Method, drawn: Drawn) -> Run:
     if method.solver:
         choice = Choice(backend_kind(method.solver, "solver"), method.solver, method.settings)
     # What a method does about rounding and division is its own affair, and ends with it.
-    with using(choice), counting() as tally, np.errstate():
-        began = perf_counter()
+    asked = np.zeros(len(drawn.truth))
+    with using(choice), counting() as tally, heard(lambda trial, _: _add(asked, trial)), np.errstate():
+        began, busy = perf_counter(), process_time()
         fix = _solved(method, drawn)
-        seconds = perf_counter() - began
+        seconds, busy = perf_counter() - began, process_time() - busy
     _check(fix, drawn)
     used = choice is None or choice.name in {name for name, _ in tally}
-    return Run(fix, seconds, float(sum(n for _, n in tally)) if tally else np.nan, used)
+    iterations = float(sum(n for _, n in tally)) if tally else np.nan
+    return Run(fix, seconds, busy, np.where(asked > 0.0, asked, np.nan), iterations, used)
+
+
+def _add(counts: Array, trial: int) -> None:
+    counts[trial] += 1.0
 
 
 def require_program(method: Method, found: Run) -> None:

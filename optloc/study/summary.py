@@ -31,7 +31,7 @@ PROVEN = "global"
 COLUMNS = tuple(
     "key data scenario method solver noise noise_unit noise_label sweep kinds rows stations dimension trial status "
     "answered located truth_x truth_y truth_z error crlb deviation nees cost cost_truth proof certificate bound "
-    "iterations seconds build batch machine versions".split()
+    "iterations evaluations seconds processor build batch machine versions".split()
 )
 """Columns of the study's table that a summary reads."""
 
@@ -58,11 +58,11 @@ def judged(frame: pd.DataFrame) -> pd.DataFrame:
     """
     import pandas as pd
 
-    above, slack = _above(frame)
+    above, rounding = above_least(frame)
     answered = frame["answered"].to_numpy(dtype=bool)
     with np.errstate(invalid="ignore"):
         # A row without a cost is not the best of anything: NaN counts as worse.
-        better = ~(above <= slack)
+        better = ~(above <= SLACK + rounding)
     pairs = frame[list(CASE)].astype(str)
     names = {(a, b): case_label(a, b) for a, b in pairs.drop_duplicates().itertuples(index=False, name=None)}
     labels = [names[pair] for pair in zip(pairs["scenario"], pairs["sweep"], strict=True)]
@@ -75,12 +75,12 @@ def judged(frame: pd.DataFrame) -> pd.DataFrame:
     )
 
 
-def _above(frame: pd.DataFrame) -> tuple[Array, Array]:
-    """Return the costs less the lowest known (n,), and how much of that is rounding (n,)."""
+def above_least(frame: pd.DataFrame) -> tuple[Array, Array]:
+    """Return the costs less the lowest known (n,), and how much of that may be rounding (n,)."""
     cost, gap, truth = (frame[name].to_numpy(dtype=float) for name in ("cost", "gap", "cost_truth"))
     # The truth is a point like any other: what costs more than it is not the minimum.
     best = np.fmin(cost - gap, truth)
-    return cost - best, SLACK + _RELATIVE * np.abs(best)
+    return cost - best, _RELATIVE * np.abs(best)
 
 
 def _natural(text: str) -> list[tuple[bool, float, str]]:
@@ -186,9 +186,9 @@ def by_status(frame: pd.DataFrame) -> pd.DataFrame:
         the columns method and status and the counts trials, right, better (a better point is known) and wrong (that,
         and the status is ok). Without a cost there is no point to compare: such trials are not right, and not better.
     """
-    above, slack = _above(frame)
+    above, rounding = above_least(frame)
     with np.errstate(invalid="ignore"):
-        made = frame.assign(better=above > slack, trials=1)
+        made = frame.assign(better=above > SLACK + rounding, trials=1)
     pairs = {"method": made["method"].astype(str), "status": made["status"].astype(str)}
     table = made.assign(**pairs).groupby(["method", "status"], sort=False)[["trials", "right", "better", "wrong"]].sum()
     table = table.astype(int).reset_index()
@@ -215,13 +215,24 @@ def methods(frame: pd.DataFrame) -> list[str]:
     return [str(name) for name in found.sort_values(["right", "t"], ascending=[False, True], kind="stable").index]
 
 
-def instances(frame: pd.DataFrame, order: list[str]) -> tuple[Array, Array, int]:
-    """Return times and successes of the instances (one trial of one cell of data) that every method has seen.
+def instances(
+    frame: pd.DataFrame, order: list[str], work: str = "seconds", success: str = "right"
+) -> tuple[Array, Array, int]:
+    """Return work and successes of the instances (one trial of one cell of data) that every method has seen.
+
+    Parameters
+    ----------
+    frame : DataFrame
+        Judged rows.
+    order : list of str
+        Methods.
+    work, success : str
+        Columns: what each trial took, and whether the method found what was sought.
 
     Returns
     -------
     times : array (methods, n)
-        Seconds.
+        Seconds, or whatever the work is counted in.
     solved : bool array (methods, n)
         Whether the answer is right.
     total : int
@@ -229,11 +240,11 @@ def instances(frame: pd.DataFrame, order: list[str]) -> tuple[Array, Array, int]
     """
     numbers, names = frame["data"].astype(str), frame["method"].astype(str)
     wide = frame.assign(data=numbers, method=names).pivot_table(
-        index=["data", "trial"], columns="method", values=["seconds", "right"], aggfunc="first"
+        index=["data", "trial"], columns="method", values=[work, success], aggfunc="first"
     )
     # A study that still runs has trials that one method has seen and another has not.
     common = wide.dropna()
-    times, solved = (np.stack([common[what][name] for name in order]) for what in ("seconds", "right"))
+    times, solved = (np.stack([common[what][name] for name in order]) for what in (work, success))
     return times.astype(float), solved.astype(bool), len(wide)
 
 

@@ -19,7 +19,7 @@ from optloc.base import linalg
 from optloc.base.types import Array, Status
 from optloc.bounds.crlb import crlb
 from optloc.compute.sums import equations_at
-from optloc.linear.constraints import exact
+from optloc.linear.constraints import TOLERANCE, exact, violation
 from optloc.linear.normal import covariance, eliminated
 from optloc.problem.fix import Fix
 from optloc.problem.problem import Problem
@@ -105,7 +105,13 @@ COLUMNS: tuple[Column, ...] = (
     ),
     Column("sigma", "float", "m", "Root of the trace of the position covariance that the method claims."),
     Column("nees", "float", "1", "e' C^-1 e with the claimed covariance C; its expectation is `dimension`."),
-    Column("cost", "float", "1", "Maximum-likelihood cost at the estimate, also of estimates that were not refined."),
+    Column(
+        "cost",
+        "float",
+        "1",
+        "Maximum-likelihood cost at the estimate, also of estimates that were not refined; NaN where it breaks a "
+        "constraint.",
+    ),
     Column("cost_truth", "float", "1", "The same cost at the truth (unknowns of single epochs at their best)."),
     Column("dof", "int", "", "Degrees of freedom of the cost."),
     Column("alternatives", "int", "", "Number of other minima that the fix lists."),
@@ -116,7 +122,17 @@ COLUMNS: tuple[Column, ...] = (
         "iterations", "float", "1", "Iterations of solver and refinement, mean over the fixes of one call; NaN unknown."
     ),
     Column(
+        "evaluations", "float", "1", "Evaluations of the cost that a minimizer asked for; NaN where none are counted."
+    ),
+    Column(
         "seconds", "float", "s", "Time of the solution: that of the call over the number of its fixes.", value=False
+    ),
+    Column(
+        "processor",
+        "float",
+        "s",
+        "The same of processor time, of all threads of the process: whatever else the machine does.",
+        value=False,
     ),
     Column(
         "build",
@@ -278,7 +294,8 @@ def _solve(cell: Cell, known: Known) -> Values:
     count = len(known.drawn.truth)
     found = run(cell.method, known.drawn)
     values = fix_values(cell.case, known, found.fix)
-    return values | {"seconds": found.seconds / count, "iterations": found.iterations / count, "batch": count}
+    work = {"seconds": found.seconds / count, "processor": found.processor / count, "evaluations": found.evaluations}
+    return values | work | {"iterations": found.iterations / count, "batch": count}
 
 
 def _failure(status: str, reason: str) -> Values:
@@ -407,8 +424,8 @@ def known_of(drawn: Drawn) -> Known:
     with np.errstate(all="ignore"):
         equations = equations_at(problem, drawn.truth)
         bound = crlb(problem, drawn.truth) if exact(problem) else covariance(equations)[0]
-        cost = eliminated(equations).cost
-    return Known(drawn, np.broadcast_to(bound, (size, *bound.shape[-2:])), np.broadcast_to(cost, (size,)))
+        cost = _admitted(problem, drawn.truth, np.broadcast_to(eliminated(equations).cost, (size,)))
+    return Known(drawn, np.broadcast_to(bound, (size, *bound.shape[-2:])), cost)
 
 
 def truth_values(case: Case, known: Known) -> Values:
@@ -513,7 +530,17 @@ def _cost(problem: Problem, fix: Fix, x: Array) -> Array:
         with np.errstate(all="ignore"):
             found = eliminated(equations_at(problem.take(items), x[items])).cost
         cost[items] = np.where(np.isfinite(found), found, np.nan)
-    return cost
+    return _admitted(problem, x, cost)
+
+
+def _admitted(problem: Problem, x: Array, cost: Array) -> Array:
+    """Return costs (n,) at vectors x (n, size), NaN where these break a constraint: nobody asked for less there."""
+    if not problem.constraints:
+        return cost
+    items = np.flatnonzero(np.isfinite(x).all(-1))
+    out = np.array(cost)
+    out[items[violation(problem.take(items), x[items]) > TOLERANCE]] = np.nan
+    return out
 
 
 # Where it was computed, and with what.

@@ -100,12 +100,22 @@ def test_every_figure_is_there_twice_and_every_table_too(site, made):
     assert made[0] == folder / "report.html"
     assert sorted(made[1:]) == sorted([*(folder / "tables").iterdir(), *(folder / "figures").iterdir()])
     names = {path.stem for path in (folder / "figures").iterdir()}
-    assert {"success-1", "accuracy-1", "errors-1", "gaps-1", "profile", "time-1", "map-1", "map-2"} <= names
+    assert {
+        "success-1",
+        "accuracy-1",
+        "errors-1",
+        "gaps-1",
+        "data-profile",
+        "profile",
+        "time-1",
+        "map-1",
+        "map-2",
+    } <= names
     for name in names:
         assert (folder / "figures" / f"{name}.png").read_bytes().startswith(b"\x89PNG")
         assert ET.parse(folder / "figures" / f"{name}.svg").getroot().tag.endswith("svg")
     assert {p.stem for p in (folder / "tables").iterdir()} == {
-        "ranking", "success", "statuses", "accuracy", "certificates", "timing", "machine"
+        "ranking", "success", "statuses", "accuracy", "certificates", "profiles", "timing", "machine"
     }  # fmt: skip
 
 

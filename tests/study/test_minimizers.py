@@ -1,20 +1,29 @@
 """Minimizers of others: one file, and a run that computes them alone; pairs of methods; the public test set."""
 
 import json
+from importlib.resources import files
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
+from doc_pages import DOCS
+from recipes import files_of_the_page
+from scipy.optimize import minimize
 from scipy.stats import quantile_test
-from study.texts import QUICK, plan
+from study.texts import QUICK, plan, run_here
 from typer.testing import CliRunner
 
 from optloc.base.errors import InvalidProblem
 from optloc.cli import app
+from optloc.compute.sums import equations_at
+from optloc.study.baselines import BASELINES, start_of, whiten_one
+from optloc.study.draws import draw
 from optloc.study.execute import executor, run_plan
 from optloc.study.folder import part_files, progress, read_frame
 from optloc.study.methods import added
-from optloc.study.minimizers import baseline_of, cost_of
+from optloc.study.minimizers import Minimizer, baseline_of, cost_of
 from optloc.study.paired import median_of, paired
+from optloc.study.plan import planned
 from optloc.study.summary import COLUMNS, judged
 
 RUN, HERE = CliRunner(), executor("processes", 1)
@@ -97,15 +106,133 @@ def test_what_cannot_be_loaded_is_a_sentence(mine, tmp_path):
     assert baseline_of(f"{mine}:bfgs").summary == "BFGS with the gradient, as SciPy has it."
 
 
-def test_the_gradient_is_that_of_the_cost():
-    from optloc.study.draws import draw
+# What is known beforehand of a clock, of the place, and of the emission of each pulse: all of it is part of the cost.
+KNOWN = """
+[[biases]]
+name = "clock"
+members = ["Mill", "Tower"]
+mean = "10 m"
+sigma = "20 m"
 
-    drawn = draw(plan(FEW).cells[0].case, 0, 1)
-    cost, x = cost_of(drawn.problem), drawn.truth[0] + 10.0
-    value, slope = cost(x)
-    steps = 0.1 * np.eye(len(x))
-    assert value > 0.0
-    assert slope == pytest.approx([(cost(x + s)[0] - cost(x - s)[0]) / 0.2 for s in steps], rel=1e-5)
+[[priors]]
+name = "position"
+mean = [500.0, -300.0, 800.0]
+sigma = [800.0, 500.0, 100.0]
+unit = "m"
+"""
+# What is known exactly: a cost does not tell.
+HEIGHT = """
+[[constraints]]
+kind = "height"
+exactly = 1500.0
+unit = "m"
+"""
+SITE = """
+format = 1
+name = "site"
+trials = 4
+
+[[scenario]]
+name = "site"
+problem = "site.toml"
+truth = { kind = "area", lat_deg = [47.75, 47.86], lon_deg = [11.15, 11.3], height = "1500 m" }
+
+[[method]]
+method = "gtrs+lsr"
+"""
+
+
+BEARINGS = """
+format = 1
+name = "bearings"
+trials = 4
+
+[[scenario]]
+name = "surveyed"
+layout = { stations = 5, dimension = 2, box = ["10 km", "10 km"], kinds = ["azimuth"], survey = "100 m" }
+truth = { kind = "hull" }
+noise = ["1 deg"]
+
+[[method]]
+method = "gtrs+lsr"
+"""
+
+
+def site(folder, more, names=()):
+    """Return the plan of a study of the shipped site with more in its file."""
+    text = (files("optloc") / "scenarios" / "demo.toml").read_text()
+    (folder / "site.toml").write_text(text + more)
+    return planned(SITE, "site", folder, more=added(names))
+
+
+def problems(folder):
+    yield draw(plan(FEW).cells[0].case, 0, 1)
+    yield draw(plan(FEW).cells[2].case, 0, 1)  # with an unknown emission
+    yield draw(site(folder, KNOWN).cells[0].case, 0, 1)
+
+
+def test_the_cost_of_a_minimizer_is_the_one_that_judges_it_and_has_its_gradient(tmp_path, monkeypatch):
+    for drawn in problems(tmp_path):
+        x = drawn.truth[0] + 10.0
+        quick, judge = cost_of(drawn.problem)(x), float(equations_at(drawn.problem, x[None]).cost[0])
+        monkeypatch.setattr("optloc.study.minimizers.usable", lambda *_: False)
+        cost = cost_of(drawn.problem)
+        value, slope = cost(x)
+        monkeypatch.undo()
+        assert quick[0] == pytest.approx(value, rel=1e-12)
+        assert quick[1] == pytest.approx(slope, rel=1e-9)
+        assert value == pytest.approx(judge, rel=1e-12)
+        steps = 0.1 * np.eye(len(x))
+        assert slope == pytest.approx([(cost(x + s)[0] - cost(x - s)[0]) / 0.2 for s in steps], rel=1e-5)
+        residual, jacobian = whiten_one(drawn.problem, lambda _: None)
+        assert residual(x) @ residual(x) == pytest.approx(judge, rel=1e-9)
+        assert 2.0 * jacobian(x).T @ residual(x) == pytest.approx(slope, rel=1e-6)
+
+
+def test_errors_of_stations_weigh_for_minimizers_as_for_the_others():
+    drawn = draw(plan(BEARINGS).cells[0].case, 0, 4)
+    start = start_of("centre", 0.0, drawn)
+    wanted = BASELINES["gauss-newton"].run(drawn, start)
+    mine = Minimizer(lambda cost, x: minimize(cost, x, jac=True, method="BFGS").x)(drawn, start)
+    for fix in (BASELINES["scipy"].run(drawn, start), mine):
+        # Fixes are good to some hundred metres; with the noise of the rows alone they were 6 to 40 m off.
+        assert fix.x == pytest.approx(wanted.x, abs=0.1)
+
+
+def test_what_breaks_a_constraint_has_no_cost_and_wins_against_nobody(tmp_path):
+    out = run_here(site(tmp_path, HEIGHT, ["scipy", "truth"]), tmp_path / "out")
+    rows = judged(read_frame(out, COLUMNS))
+    known = rows.groupby("method", observed=True)["cost"].count()
+    assert known.to_dict() == {"gtrs+lsr": 4, "scipy from the centre": 0, "truth": 4}
+    right = rows.groupby("method", observed=True)["right"].sum()
+    assert right.to_dict() == {"gtrs+lsr": 4, "scipy from the centre": 0, "truth": 4}
+
+
+NLOPT = files_of_the_page(DOCS / "studies.md")["others.py"]
+
+
+@pytest.mark.skipif(find_spec("nlopt") is None, reason="needs nlopt: pip install nlopt")
+def test_nlopt_and_a_method_of_ones_own_are_one_file(mine, tmp_path):
+    path = tmp_path / "others.py"
+    path.write_text(NLOPT)
+    told, few = [], FEW.replace("trials = 10", "trials = 4")
+
+    def run(*names):
+        told.clear()
+        return run_plan(plan(few, more=added(list(names))), tmp_path / "out", HERE, lambda rows, _: told.append(rows))
+
+    assert run(f"{path}:bobyqa", f"{path}:downhill").complete
+    rows = judged(read_frame(tmp_path / "out", COLUMNS))
+    assert (rows.groupby("method", observed=True)["right"].mean()[["bobyqa", "downhill"]] > 0.6).all()
+    assert (rows[rows["method"] == "bobyqa"]["evaluations"] > 10.0).all()
+    # One method more: it is all that is computed.
+    assert run(f"{path}:bobyqa", f"{path}:downhill", f"{mine}:bfgs").complete
+    assert (told[0], sum(told[1:])) == (36, 12)
+
+
+def test_the_file_of_the_page_is_short():
+    assert len(NLOPT.splitlines()) <= 15
+    assert "nlopt" in NLOPT
 
 
 @pytest.mark.parametrize("count", [1, 5, 6, 25, 200])

@@ -1,0 +1,199 @@
+"""Profiles of a study's methods: which share of the trials each solves, to an accuracy, within so much work.
+
+Moré and Wild ask for a share of the descent from a start that all solvers have. Methods that need no start have none,
+and the cost of a fix has a unit: one is the square of a standard deviation. So a trial is solved here where the cost
+exceeds the least that is known by tau at most: the point is then within sqrt(tau) standard deviations of the minimum.
+
+Sources: J. J. Moré and S. M. Wild, "Benchmarking derivative-free optimization algorithms", SIAM J. Optim. 20 (2009),
+for data profiles; E. D. Dolan and J. J. Moré, "Benchmarking optimization software with performance profiles",
+Math. Program. 91 (2002).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from optloc.base.errors import InvalidProblem, nearest
+from optloc.base.types import Array
+from optloc.study.summary import above_least, instances, performance_profile
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+TAU = 1e-3
+"""Cost above the least known with which a trial counts as solved: 0.03 standard deviations."""
+
+RATIOS = (1.0, 2.0, 10.0)
+"""Multiples of the least work of any method for which tables say the share that is solved."""
+
+WORK = {"processor": "processor time of a fix (s)", "evaluations": "evaluations of the cost"}
+"""Units of work, columns of a study's table, and what axes call them."""
+
+# Clocks count nanoseconds at best: a time of zero is one below that.
+_LEAST = 1e-9
+# Points of a curve in files: more than a picture shows apart.
+_POINTS = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Profiles:
+    """What methods solve, and what it takes them.
+
+    Parameters
+    ----------
+    tau : float
+        Cost above the least known with which a trial counts as solved.
+    work : str
+        A key of `WORK`.
+    methods : tuple of str
+        The most solved first, the quicker first among equals.
+    silent : tuple of str
+        Methods that do not tell this work.
+    spent : array (methods, n)
+        Work on each trial.
+    solved : bool array (methods, n)
+        Whether it is solved.
+    total : int
+        All trials, also those that some method has not seen.
+    """
+
+    tau: float
+    work: str
+    methods: tuple[str, ...]
+    silent: tuple[str, ...]
+    spent: Array
+    solved: Array
+    total: int
+
+    @property
+    def budgets(self) -> Array:
+        """Return the work (q,) at which the data profile of some method rises, thinned; it ends at the largest."""
+        found = np.unique(self.spent[self.solved])
+        at = np.unique(np.linspace(0, len(found) - 1, min(_POINTS, len(found))).astype(int))
+        return np.asarray(found[at])
+
+    def data(self, budgets: Array) -> Array:
+        """Return the share (methods, q) of the trials that each method solves within budgets (q,) of work."""
+        return data_profile(self.spent, self.solved, budgets)
+
+    def performance(self, ratios: Array) -> Array:
+        """Return the share (methods, q) solved within multiples (q,) of the least work of any method on the trial."""
+        return performance_profile(self.spent, self.solved, ratios)
+
+
+@dataclass(frozen=True, slots=True)
+class Share:
+    """What a method solves.
+
+    Parameters
+    ----------
+    method : str
+        The method.
+    trials, solved : int
+        How many trials, and how many are solved.
+    within : dict of float to float
+        By multiples of the least work on each trial: the share solved with so much.
+    median : float
+        Work on a trial that is solved, the middle one.
+    """
+
+    method: str
+    trials: int
+    solved: int
+    within: dict[float, float]
+    median: float
+
+
+def profiles(frame: pd.DataFrame, *, tau: float = TAU, work: str = "processor", out: Collection[str] = ()) -> Profiles:
+    """Return the profiles of a study's methods over the trials that all of them have seen.
+
+    Parameters
+    ----------
+    frame : DataFrame
+        Rows with the columns `optloc.study.summary.COLUMNS` and `gap`.
+    tau : float
+        Cost above the least known, of all methods and of the truth, with which a trial counts as solved, whatever
+        the status: profiles ask what was reached, not what was said of it.
+    work : str
+        A key of `WORK`.
+    out : collection of str
+        Methods that do not compete: those that know the truth.
+
+    Raises
+    ------
+    InvalidProblem
+        For an accuracy that is not positive, an unknown work, and where no method tells it.
+    """
+    check_accuracy(tau)
+    if work not in WORK:
+        raise InvalidProblem(f"there is no work {work!r}", "--work", nearest(work, list(WORK)))
+    rivals = frame[~frame["method"].astype(str).isin(out)]
+    if not len(rivals):
+        raise InvalidProblem("no method competes", "profiles", "run the study by a method that does not know the truth")
+    above, rounding = above_least(rivals)
+    with np.errstate(invalid="ignore"):
+        rows = rivals.assign(solved=above <= tau + rounding, work=rivals[work].clip(lower=_LEAST))
+    known = rows.groupby(rows["method"].astype(str))["work"].count()
+    methods = [str(name) for name in known.index[known > 0]]
+    if not methods:
+        raise InvalidProblem(f"no method of the study tells its {work}", "--work", "ask for processor")
+    # Of a trial that came to grief nobody knows the work: it is not solved, whatever it took.
+    told = rows[rows["method"].astype(str).isin(methods)].fillna({"work": np.inf})
+    spent, solved, total = instances(told, methods, "work", "solved")
+    solved &= np.isfinite(spent)
+    order = sorted(range(len(methods)), key=lambda i: (-int(solved[i].sum()), _median(spent[i][solved[i]]), methods[i]))
+    silent = tuple(str(name) for name in known.index[known == 0])
+    return Profiles(tau, work, tuple(methods[i] for i in order), silent, spent[order], solved[order], total)
+
+
+def check_accuracy(tau: float) -> None:
+    """Raise InvalidProblem for an accuracy that nothing or everything would meet."""
+    if not 0.0 < tau < np.inf:
+        raise InvalidProblem(f"the accuracy {tau:g} is not positive and finite", "--tau", "give a cost such as 1e-3")
+
+
+def data_profile(spent: Array, solved: Array, budgets: Array) -> Array:
+    """Return the share of problems that each method solves within budgets of work: equation 2.8 of Moré and Wild.
+
+    Parameters
+    ----------
+    spent : array (methods, n)
+        Work on each problem.
+    solved : bool array (methods, n)
+        Where the method found what was sought; elsewhere its work does not matter.
+    budgets : array (q,)
+        Work, in the unit of `spent`.
+
+    Returns
+    -------
+    array (methods, q)
+        Shares of all n problems, those among them that no method solves; NaN of none.
+    """
+    if not spent.shape[-1]:
+        return np.full((len(spent), len(budgets)), np.nan)
+    needed = np.sort(np.where(solved, spent, np.inf), axis=-1)
+    return np.stack([np.searchsorted(row, budgets, side="right") / len(row) for row in needed])
+
+
+def shares(found: Profiles) -> list[Share]:
+    """Return what each method solves within multiples of the least work of any method."""
+    within = found.performance(np.array(RATIOS))
+    return [
+        Share(
+            name,
+            found.spent.shape[1],
+            int(found.solved[i].sum()),
+            dict(zip(RATIOS, within[i].tolist(), strict=True)),
+            _median(found.spent[i][found.solved[i]]),
+        )
+        for i, name in enumerate(found.methods)
+    ]
+
+
+def _median(values: Array) -> float:
+    return float(np.median(values)) if len(values) else float("inf")
