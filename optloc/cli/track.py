@@ -14,7 +14,7 @@ from rich.text import Text
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.outputs import is_stream
-from optloc.base.types import Rows
+from optloc.base.types import Array, Rows
 from optloc.cli.from_table import read_problem
 from optloc.cli.options import coordinates
 from optloc.cli.output import (
@@ -262,8 +262,12 @@ def differences(run: Problem) -> Problem:
 
 def _one_after_another(parts: list[Rows]) -> Rows:
     """Return rows of one kind as one."""
-    names = ("z", "a", "b", "epoch", "target", "weight", "correction")
-    return replace(parts[0], **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+    def of(name: str) -> Array:
+        return np.concatenate([getattr(part, name) for part in parts])
+
+    z, weight, correction = of("z"), of("weight"), of("correction")
+    return Rows(parts[0].kind, z, of("a"), of("b"), of("epoch"), of("target"), weight, correction)
 
 
 def _start(problem: Problem, dynamics: Dynamics, wanted: Wanted) -> State | None:
