@@ -243,3 +243,39 @@ def test_the_track_so_far_is_kept(tmp_path, monkeypatch):
     result = RUN.invoke(app, ["track", str(drive(tmp_path)), "--filter", "failing", "--out", str(tmp_path / "t.csv")])
     assert result.exit_code not in (0, 1) or result.exception
     assert pd.read_csv(tmp_path / "t.csv")["status"].tolist() == ["starting", "started"] + ["ok"] * 4
+
+
+@pytest.mark.parametrize("gaps", [False, True])
+def test_arrivals_are_tracked_by_what_their_differences_say(gaps, tmp_path):
+    arrivals, rng = drive(tmp_path), np.random.default_rng(3)
+    rows = pd.read_csv(tmp_path / "rows.csv")
+    sent = rng.uniform(-500.0, 500.0, 12)
+    rows["z"] += sent[rows["time"]]
+    # one of four arrivals is missing now and then; the first of an epoch is then another station
+    rows = rows.drop(index=[9, 16, 35]) if gaps else rows
+    rows.to_csv(tmp_path / "rows.csv", index=False)
+    arrivals.write_text(arrivals.read_text().replace('"range"', '"toa"'))
+    first = rows.groupby("time")[["a", "z"]].transform("last")  # another reference than that of the arrivals
+    pairs = rows.assign(b=first["a"], z=rows["z"] - first["z"])
+    pairs[pairs["a"] != pairs["b"]].to_csv(tmp_path / "pairs.csv", index=False)
+    differences = tmp_path / "differences.toml"
+    text = arrivals.read_text().replace("rows.csv", "pairs.csv").replace('"toa"', '"tdoa"')
+    differences.write_text(text.replace("sigma = 1.0", "arrival_sigma = 1.0"))
+    one, two = (json.loads(run(path, "--json", "--gate", "50").stdout)["scans"] for path in (arrivals, differences))
+    assert [scan["status"] for scan in one] == [scan["status"] for scan in two]
+    assert [scan["status"] for scan in one].count("ok") >= 9
+    for name in ("x", "y", "vx", "vy", "sigma_x", "cov_xy", "nis"):
+        shown = [[np.nan if scan[name] is None else scan[name] for scan in scans] for scans in (one, two)]
+        np.testing.assert_allclose(shown[0], shown[1], rtol=1e-5, atol=1e-4)
+    assert np.hypot(one[-1]["x"] - 320.0, one[-1]["y"] - 410.0) < 5.0
+
+
+def test_arrivals_keep_the_rows_beside_them(tmp_path):
+    path = drive(tmp_path, more='[[measurements]]\nkind = "azimuth"\nfile = "bearings.csv"\nsigma = 0.01\n')
+    path.write_text(path.read_text().replace('"range"', '"toa"'))
+    times = np.arange(12)
+    seen = np.arctan2(300.0 + 10.0 * times, 100.0 + 20.0 * times)
+    pd.DataFrame({"time": times, "a": "A", "z": seen}).to_csv(tmp_path / "bearings.csv", index=False)
+    scans = json.loads(run(path, "--json").stdout)["scans"]
+    # three differences of four arrivals, and the bearing
+    assert {scan["rows"] for scan in scans if scan["status"] == "ok"} == {4}

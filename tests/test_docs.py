@@ -9,7 +9,9 @@ import importlib
 import inspect
 import os
 import re
+import shutil
 import warnings
+from pathlib import Path
 
 import pytest
 from conftest import DATA_DEFAULT
@@ -26,6 +28,7 @@ ELSEWHERE = ("measured", "papers", "examples", "gallery", "_build")
 PAGES = [page for page in sorted(DOCS.rglob("*.md")) if page.relative_to(DOCS).parts[0] not in ELSEWHERE]
 RUN = [page for page in PAGES if any(block.kind in ("python", "console", "sh") for block in blocks(page))]
 THEORY = DOCS / "theory"
+PICTURE = re.compile(r"!\[[^\]]*\]\(([^)]+)\)")
 
 
 def text_of(name):
@@ -44,11 +47,16 @@ def test_every_block_runs_and_prints_what_is_shown(page, tmp_path, monkeypatch):
         warnings.simplefilter("error", UserWarning)
         warnings.simplefilter("error", RuntimeWarning)
         wrong, fresh = run_page(page)
+    pictures = [name for name in PICTURE.findall(page.read_text(encoding="utf-8")) if "/" not in name]
     if os.environ.get("OPTLOC_WRITE_DOCS"):
         page.write_text(fresh, encoding="utf-8")
+        for name in pictures:
+            shutil.copy(name, page.parent)
     if not enabled():  # what is shown was proven by machine code
         wrong = [each for each in wrong if ": shown" not in each]
     assert wrong == [], "\n".join(wrong)
+    # a picture beside a page is one that its commands draw
+    assert [name for name in pictures if not (Path(name).exists() and (page.parent / name).exists())] == []
 
 
 def test_marks_are_known_and_few_blocks_are_not_run():

@@ -14,6 +14,7 @@ from rich.text import Text
 
 from optloc.base.errors import InvalidProblem, nearest
 from optloc.base.outputs import is_stream
+from optloc.base.types import Array, Rows
 from optloc.cli.from_table import read_problem
 from optloc.cli.options import coordinates
 from optloc.cli.output import (
@@ -31,9 +32,12 @@ from optloc.cli.output import (
 from optloc.files import Loaded
 from optloc.files.readings import Told
 from optloc.files.writer import GrowingTable
+from optloc.problem.epochs import cut
+from optloc.problem.noise import Block, Noise
 from optloc.problem.problem import Problem
 from optloc.report.columns import Columns, covariance_columns, geodetic_columns, join_tables, records
 from optloc.report.formats.marks import Results
+from optloc.solvers.starts.least_squares_ranges import reduce
 from optloc.track import Dynamics, State, current_statistical, polynomial, singer
 from optloc.track.run import Entry, Rules, tracked
 from optloc.track.several_targets import alone
@@ -226,7 +230,44 @@ def runs_of(loaded: Loaded) -> Iterator[tuple[str, Problem, tuple[str, ...]]]:
             raise InvalidProblem(what, source, "correct the times, or give both one label")
         # A file without times has one epoch: any time serves.
         times = loaded.times if np.isfinite(loaded.times).all() else problem.times
-        yield name, alone(problem, kept, times), tuple(loaded.epochs[k] for k in epochs)
+        run = alone(problem, kept, times)
+        yield name, differences(run) if run.emitting else run, tuple(loaded.epochs[k] for k in epochs)
+
+
+def differences(run: Problem) -> Problem:
+    """Return the run of one target with the differences of its arrivals, epoch by epoch, in the place of the arrivals.
+
+    A tracker's state has no emission times, and differences with their covariance say all that arrivals say of places.
+    """
+    scans = [reduce(cut(run, k, k + 1)) for k in range(run.epochs)]
+    kinds = dict.fromkeys(rows.kind for scan in scans for rows in scan.rows)
+    own: dict[str, list[Rows]] = {kind: [] for kind in kinds}
+    numbers = [np.zeros(scan.count, dtype=np.int64) for scan in scans]
+    count = 0
+    for kind, found in own.items():
+        for k, scan in enumerate(scans):
+            for rows, start in zip(scan.rows, scan.starts, strict=True):
+                if rows.kind == kind:
+                    numbers[k][start : start + rows.count] = np.arange(count, count + rows.count)
+                    found.append(replace(rows, epoch=np.full(rows.count, k)))
+                    count += rows.count
+    blocks = [
+        Block(numbers[k][block.row], block.covariance)
+        for k, scan in enumerate(scans)
+        for block in scan.noise.blocks
+        if block.row.size
+    ]
+    return replace(run, rows=tuple(_one_after_another(found) for found in own.values()), noise=Noise(tuple(blocks)))
+
+
+def _one_after_another(parts: list[Rows]) -> Rows:
+    """Return rows of one kind as one."""
+
+    def of(name: str) -> Array:
+        return np.concatenate([getattr(part, name) for part in parts])
+
+    z, weight, correction = of("z"), of("weight"), of("correction")
+    return Rows(parts[0].kind, z, of("a"), of("b"), of("epoch"), of("target"), weight, correction)
 
 
 def _start(problem: Problem, dynamics: Dynamics, wanted: Wanted) -> State | None:
