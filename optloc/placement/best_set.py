@@ -36,6 +36,8 @@ _EVERY = 0.05
 # Sets, all but their last site, and all but that where one may fail, below which a node is looked at set by set: that
 # takes as long as one or two relaxations, and spares a tree of them.
 _FEW, _FEW_FAIL = 2_000, 8_000
+# Share of these where sites are not compared all at once: with several rows each, or by a volume or an axis.
+_SLOW = 0.1
 _KINDS: dict[Criterion, int] = {"A": 0, "D": 1, "E": 2}
 
 
@@ -322,7 +324,8 @@ def _is_small(task: Task, state: Array) -> bool:
     last = max(1, room - int(task.fail))
     counted = len(task.rules) == 1 and np.ptp(free) == 0.0
     number = sum(comb(len(free), size) for size in range(last if counted else 1, last + 1))
-    return number <= (_FEW_FAIL if task.fail else _FEW)
+    at_once = task.criterion == "A" and task.design.rows.shape[1] == 1
+    return number <= (_FEW_FAIL if task.fail else _FEW) * (1.0 if at_once else _SLOW)
 
 
 def _starts(task: Task, state: Array, w: Array, seed: int) -> Iterator[tuple[float, Array]]:
