@@ -2,8 +2,8 @@
 Where to put stations
 =====================
 
-Eight of forty masts, so that fixes at twelve places are as good as possible even if one of them fails. Below the maps: the
-best set against what no set can be better than, while it was searched.
+Eight of forty masts, so that fixes at twelve places are as good as possible even if one of them fails. Below the maps:
+the best set against what no set can be better than, while it was searched.
 """
 
 import numpy as np
