@@ -180,7 +180,10 @@ PARTS: Mapping[str, Part] = {
         "placements of stations",
         "optloc.placement",
         (_place,),
-        tuple(f"optloc.placement.branching.{name}" for name in ("propagate", "expand", "score", "settle")),
+        (
+            *(f"optloc.placement.branching.{name}" for name in ("propagate", "expand", "score", "settle")),
+            "optloc.placement.completions.exhaust",
+        ),
     ),
     "regions": Part(
         "cells of regions",

@@ -11,19 +11,17 @@ from rich.table import Table
 
 from optloc.base.errors import InvalidProblem
 from optloc.base.outputs import is_stream
-from optloc.base.types import Array
-from optloc.bounds.bound_map import bound_map, extent, plan_of
 from optloc.cli.crlb import vector
 from optloc.cli.output import Screen, claim_outputs, dumps, line, say, write_picture, write_text
 from optloc.files import read
-from optloc.placement import Placement, Plan, place
+from optloc.placement import Placement, Plan, picture, place
 from optloc.placement.chosen import PRIOR
 from optloc.placement.plan_file import Planned, criterion_name, is_plan, read_plan, write_chosen
 from optloc.placement.refinement import refined
 from optloc.problem.epochs import by_epoch, separable
 
-# Points along each side of a map, and lines of a table of places or stations: what a picture and a screen hold.
-_MAP_POINTS, _LINES = 80, 20
+# Lines of a table of places or stations: what a screen holds.
+_LINES = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +74,7 @@ def run_place(
             raise InvalidProblem("only a plan with candidates is written", str(out), "leave --out out")
         write_chosen(planned, (*found.chosen, *found.kept), out, file)
     if plot is not None:
-        write_picture(_picture(plan, found), plot)
+        write_picture(picture(plan, found), plot)
     if as_json:
         write_text(Path("-"), dumps(_record(planned, plan, found)))
     elif not quiet:
@@ -244,33 +242,3 @@ def _remarks(plan: Plan, found: Placement) -> list[str]:
         spots = "; ".join(", ".join(f"{v:.1f}" for v in row) for row in found.refined)
         out.append(f"Refined to {np.sqrt(found.refined_value):.4g} m, a local optimum, at {spots}.")
     return out
-
-
-def _picture(plan: Plan, found: Placement) -> Any:
-    from optloc.plot.placement_map import plot_placement
-
-    problem, names = plan.problem, np.array(plan.problem.stations.names)
-    if plan.by == "row":
-        raise InvalidProblem("rows that are chosen have no map", "--plot", "choose stations")
-    single = problem.flat().take(np.zeros(1, dtype=int)) if problem.batch_shape else problem
-    places = np.atleast_2d(np.asarray(plan.places, dtype=float))[:, : problem.dimension]
-    truth = np.zeros(problem.layout.size)
-    truth[: problem.dimension] = places[0]
-    earth = problem.frame.geodetic and problem.dimension == 3
-    flat = plan_of(problem.frame, places, earth)
-    height = float(np.median(flat[:, 2])) if problem.dimension == 3 else 0.0
-    x0, x1, y0, y1 = extent(problem, places, widen=0.08)
-    grid = np.linspace(x0, x1, _MAP_POINTS), np.linspace(y0, y1, _MAP_POINTS)
-    end = np.concatenate([rows.a for rows in problem.rows])
-    maps, taken = [], []
-    for sites in (found.before_sites, (*found.chosen, *found.kept)):
-        mask = np.isin(names, sites)
-        own = single.with_rows(weight=single.weight * mask[end])
-        maps.append(bound_map(own, truth, *grid, height))
-        taken.append(mask)
-    weights = np.ones(len(places)) if plan.weights is None else np.asarray(plan.weights)
-    course: Array = found.course.copy()
-    course[:, 1:] = np.sqrt(np.maximum(course[:, 1:], 0.0))
-    kept = set(found.before_sites) == set(found.kept)
-    titles = ("before: kept stations" if kept else "before: a random set", f"after: {found.sigma:.3g} m")
-    return plot_placement(maps, taken, flat[:, :2], weights, course, titles)

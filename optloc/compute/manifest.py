@@ -21,7 +21,7 @@ SOURCES = (
     "base/linalg.py",
     "linear/normal.py",
     "models/primitives.py",
-    *(f"placement/{name}.py" for name in ("criteria", "relaxation", "branching")),
+    *(f"placement/{name}.py" for name in ("criteria", "relaxation", "branching", "completions")),
 )
 
 PREFIX = "optloc-"

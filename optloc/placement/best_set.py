@@ -6,9 +6,12 @@ the reduced costs forbid is fixed at once.
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from heapq import heappop, heappush
+from math import comb
+from operator import itemgetter
 from time import monotonic
 
 import numpy as np
@@ -16,10 +19,11 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 
 from formulations.placement import Criterion, Design
 from optloc.base.types import Array
-from optloc.placement.branching import FREE, IN, expand, propagate, score, settle
+from optloc.placement.branching import FREE, IN, OUT, expand, propagate, score, settle
+from optloc.placement.completions import Asked, exhaust
 
 # Random sets that are exchanged beside the rounded relaxation, and steps of a relaxation: at the root, and of a node.
-_STARTS, _ROOT_STEPS, _STEPS = 5, 60, 40
+_STARTS, _ROOT_STEPS, _STEPS = 15, 60, 40
 # A value that is better than another by less is the same, relatively: rounding of sums over places.
 _SAME = 1e-12
 # Weight above which a site is as good as taken: to cut there decides little. With weights nearest one half the
@@ -29,6 +33,11 @@ _TAKEN = 0.9
 _ROOM = 1e-9
 # Seconds between two points of the course of bound and value.
 _EVERY = 0.05
+# Sets, all but their last site, and all but that where one may fail, below which a node is looked at set by set: that
+# takes as long as one or two relaxations, and spares a tree of them.
+_FEW, _FEW_FAIL = 2_000, 8_000
+# Share of these where sites are not compared all at once: with several rows each, or by a volume or an axis.
+_SLOW = 0.1
 _KINDS: dict[Criterion, int] = {"A": 0, "D": 1, "E": 2}
 
 
@@ -79,6 +88,14 @@ class Task:
             )
         )
 
+    def asked(self) -> Asked:
+        """Return what sets are judged by, for machine code."""
+        design = self.design
+        sites = np.ascontiguousarray(np.moveaxis(design.rows, -1, 1))
+        whole = np.trace(design.prior, axis1=1, axis2=2) + (sites**2).sum(axis=(1, 2, 3))
+        kinds = self.kind, int(self.worst), int(self.fail)
+        return Asked(sites, design.prior, whole, design.weight, design.dimension, *kinds, self.rules, self.limits)
+
     def fits(self, sets: Array) -> Array:
         """Return whether sets (B, n) meet the rules."""
         room = self.limits + _ROOM * np.maximum(1.0, np.abs(self.limits))
@@ -128,6 +145,7 @@ class _Open:
     """The state of a search: sets that were seen, open nodes, how far it is."""
 
     task: Task
+    asked: Asked
     gap: float
     keep: int
     seen: dict[bytes, tuple[float, Array]]
@@ -188,7 +206,7 @@ def search(
     begun = monotonic()
     rows = np.ascontiguousarray(task.design.rows)  # one type of array: machine code is made for each
     task = replace(task, design=replace(task.design, rows=rows))
-    made, state = _Open(task, gap, max(1, keep), {}, []), np.array(task.state, dtype=np.int64)
+    made, state = _Open(task, task.asked(), gap, max(1, keep), {}, []), np.array(task.state, dtype=np.int64)
     if not propagate(task.rules, task.limits, state):
         return Searched((), np.inf, True, np.inf, 0, np.zeros((0, 3)))
     root, w = -np.inf, np.where(state == IN, 1.0, 0.0)
@@ -208,7 +226,12 @@ def search(
             tell(made.bound, made.value, made.nodes)
     closed = not made.heap or made.heap[0][0] >= made.enough
     course.append((monotonic() - begun, made.bound, made.value))
-    best = sorted(made.seen.values(), key=lambda pair: pair[0])[: made.keep]
+    first = min(made.seen.values(), key=itemgetter(0))[1]
+    for gone in np.flatnonzero((first == 1) & (task.state == FREE)).tolist():  # sets that are nearly as good
+        value, chosen = _exchange(task, made.asked, first, gone, np.inf)
+        if chosen.any():
+            made.add(value, chosen)
+    best = sorted(made.seen.values(), key=itemgetter(0))[: made.keep]
     return Searched(tuple(best), made.bound, closed, root, made.nodes, np.array(course))
 
 
@@ -220,9 +243,10 @@ def _load() -> None:
     )
     state = np.full(2, FREE, dtype=np.int64)
     propagate(one.rules, one.limits, state)
-    _relax(_Open(one, 0.5, 1, {}, []), state, np.full(2, 0.5), np.nan, 1)
+    _relax(_Open(one, one.asked(), 0.5, 1, {}, []), state, np.full(2, 0.5), np.nan, 1)
     settle(0.0, np.zeros(2), 1.0, state)
     one.score(np.eye(2))
+    _exhausted(one.asked(), state, np.zeros(2), 1.0)
 
 
 def _relax(made: _Open, state: Array, w: Array, enough: float, steps: int) -> tuple[float, Array, Array]:
@@ -267,6 +291,11 @@ def _open(made: _Open, bound: float, state: Array, w: Array) -> None:
             if task.fits(state[None])[0]:
                 made.add(float(task.score(state[None])[0]), state)
             return
+        if _is_small(task, state):
+            value, best = _exhausted(made.asked, state, w, made.enough)
+            if best.any():
+                made.add(value, best)
+            return
         low, w, cost = _relax(made, state, w, made.enough, _STEPS)
         bound = max(bound, low)
         if bound >= made.enough:
@@ -278,6 +307,25 @@ def _open(made: _Open, bound: float, state: Array, w: Array) -> None:
             if (state == FREE).any():
                 made.push(bound, state, w)
                 return
+
+
+def _exhausted(asked: Asked, state: Array, w: Array, enough: float, most: int = sys.maxsize) -> tuple[float, Array]:
+    """Return the best set (n,) of a node and its value, below `enough`; of zeros where there is none."""
+    best, free = np.zeros(len(state), dtype=np.int64), np.flatnonzero(state == FREE)
+    order = free[np.argsort(w[free], kind="stable")]
+    return float(exhaust(asked, state, order, most, enough, best)), best
+
+
+def _is_small(task: Task, state: Array) -> bool:
+    """Return whether a node has so few sets that it is cheaper to look at each."""
+    free = task.rules[0][state == FREE]
+    left = task.limits[0] - task.rules[0][state == IN].sum()
+    room = int((np.cumsum(np.sort(free)) <= left + _ROOM * max(1.0, abs(task.limits[0]))).sum())
+    last = max(1, room - int(task.fail))
+    counted = len(task.rules) == 1 and np.ptp(free) == 0.0
+    number = sum(comb(len(free), size) for size in range(last if counted else 1, last + 1))
+    at_once = task.criterion == "A" and task.design.rows.shape[1] == 1
+    return number <= (_FEW_FAIL if task.fail else _FEW) * (1.0 if at_once else _SLOW)
 
 
 def _starts(task: Task, state: Array, w: Array, seed: int) -> Iterator[tuple[float, Array]]:
@@ -322,20 +370,21 @@ def random_sets(task: Task, count: int, seed: int) -> Iterator[Array]:
 
 def exchanged(task: Task, chosen: Array) -> tuple[float, Array]:
     """Return value and set (n,) after the best exchanges of two sites, or additions, until none improves it."""
-    fixed = task.state != FREE
-    value = float(task.score(chosen[None])[0])
+    asked, value = task.asked(), float(task.score(chosen[None])[0])
     while True:
-        out, into = np.flatnonzero((chosen == 1) & ~fixed), np.flatnonzero((chosen == 0) & ~fixed)
-        tries = np.repeat(chosen[None], (len(out) + 1) * len(into), axis=0)
-        number = np.arange(len(tries))
-        swapped = number[: len(out) * len(into)]
-        tries[swapped, np.repeat(out, len(into))] = 0
-        tries[number, np.tile(into, len(out) + 1)] = 1
-        tries = tries[task.fits(tries)]
-        if not len(tries):
+        better, other = value - _SAME * max(1.0, abs(value)), None
+        for gone in (None, *np.flatnonzero((chosen == 1) & (task.state == FREE)).tolist()):
+            found, tried = _exchange(task, asked, chosen, gone, better)
+            if tried.any():
+                better, other = found, tried
+        if other is None:
             return value, chosen
-        values = task.score(tries)
-        best = int(values.argmin())
-        if not values[best] < value - _SAME * max(1.0, abs(value)):
-            return value, chosen
-        value, chosen = float(values[best]), tries[best]
+        value, chosen = float(task.score(other[None])[0]), other
+
+
+def _exchange(task: Task, asked: Asked, chosen: Array, gone: int | None, enough: float) -> tuple[float, Array]:
+    """Return the best set (n,) with another site in the place of one, or beside all, and its value, as `_exhausted`."""
+    state = np.where(chosen == 1, IN, np.where(task.state == FREE, FREE, OUT))
+    if gone is not None:
+        state[gone] = OUT
+    return _exhausted(asked, state, np.zeros(len(chosen)), enough, 1)

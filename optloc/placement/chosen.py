@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from formulations.placement import covariances
 from optloc.base.errors import InvalidProblem
 from optloc.base.types import Array, Status
+from optloc.bounds.bound_map import bound_map, extent, plan_of
 from optloc.bounds.crlb import crlb
 from optloc.linear.simulate import simulate
 from optloc.placement.best_set import Searched, Task, random_sets, search
 from optloc.placement.sites import LETTER, Plan, Posed, pose
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 PRIOR = 0.01
 """Share of the variance at a place that is owed to the prior, above which the place has no fix of its own."""
@@ -26,6 +31,8 @@ AMBIGUOUS = 0.05
 _FLAT = 3.0
 # Random sets whose median stands for what there was before, where nothing is kept.
 _RANDOM = 25
+# Points along each side of a map.
+_MAP_POINTS = 80
 # The 95 % quantile of chi-square with two and three degrees of freedom.
 _QUANTILE = {2: 5.991464547107979, 3: 7.814727903251179}
 
@@ -375,3 +382,48 @@ def _flat(posed: Posed, chosen: Array, bounds: Array) -> Array:
         off = np.linalg.svd(heard - heard.mean(0), compute_uv=False)[-1] if len(heard) > 1 else 0.0
         out[p] = off / bounds[p]
     return out
+
+
+def picture(plan: Plan, found: Placement) -> Figure:
+    """Return maps of the bound before and after on one scale, and how the gap closed while it was searched.
+
+    Parameters
+    ----------
+    plan : Plan
+        As it was given to `place`.
+    found : Placement
+        Its answer.
+
+    Raises
+    ------
+    InvalidProblem
+        Where rows were chosen, which have no map.
+    """
+    from optloc.plot.placement_map import plot_placement
+
+    problem, names = plan.problem, np.array(plan.problem.stations.names)
+    if plan.by == "row":
+        raise InvalidProblem("rows that are chosen have no map", "plot", "choose stations")
+    single = problem.flat().take(np.zeros(1, dtype=int)) if problem.batch_shape else problem
+    places = np.atleast_2d(np.asarray(plan.places, dtype=float))[:, : problem.dimension]
+    truth = np.zeros(problem.layout.size)
+    truth[: problem.dimension] = places[0]
+    flat = plan_of(problem.frame, places, problem.frame.geodetic and problem.dimension == 3)
+    height = float(np.median(flat[:, 2])) if problem.dimension == 3 else 0.0
+    x0, x1, y0, y1 = extent(problem, places, widen=0.08)
+    grid = np.linspace(x0, x1, _MAP_POINTS), np.linspace(y0, y1, _MAP_POINTS)
+    end = np.concatenate([rows.a for rows in problem.rows])
+    maps, taken = [], []
+    for sites in (found.before_sites, (*found.chosen, *found.kept)):
+        mask = np.isin(names, sites)
+        maps.append(bound_map(single.with_rows(weight=single.weight * mask[end]), truth, *grid, height))
+        taken.append(mask)
+    weights = np.ones(len(places)) if plan.weights is None else np.asarray(plan.weights)
+    course: Array = found.course.copy()
+    course[:, 1:] = np.sqrt(np.maximum(course[:, 1:], 0.0))
+    kept = set(found.before_sites) == set(found.kept)
+    titles = (
+        "before: kept stations" if kept else "before: a random set",
+        f"after: {found.sigma:.3g} m{', one failed' * plan.fail_one}",
+    )
+    return plot_placement(maps, taken, flat[:, :2], weights, course, titles)

@@ -88,7 +88,7 @@ def imported(module: str) -> dict[str, str]:
 
 def test_what_kernels_name_stands_in_the_sources():
     """A constant from elsewhere would be part of machine code that does not change with it."""
-    for module in ("compute.refine", "compute.range_fixes", "proof.best_first", "proof.batch", "placement.branching"):
+    for module in ("compute.refine", "compute.range_fixes", "proof.best_first", "proof.batch", "placement.completions"):
         importlib.import_module(f"optloc.{module}")
     inside = tuple("optloc." + name.replace("/", ".").removesuffix(".py") for name in manifest.SOURCES)
     libraries = ("math", "numpy", "heapq", "typing")

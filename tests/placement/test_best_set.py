@@ -7,7 +7,15 @@ import pytest
 from placement.scenes import CASES, CRITERIA, every_set, task
 
 import formulations.placement as theory
+from optloc.placement import best_set
 from optloc.placement.best_set import exchanged, random_sets, search
+
+
+@pytest.fixture
+def tree(monkeypatch):
+    """Nothing is small enough to be looked at set by set: bounds alone decide."""
+    monkeypatch.setattr(best_set, "_FEW", 0)
+    monkeypatch.setattr(best_set, "_FEW_FAIL", 0)
 
 
 def proven(one, gap=1e-6, **more):
@@ -17,7 +25,7 @@ def proven(one, gap=1e-6, **more):
 
 
 @pytest.mark.parametrize(("criterion", "worst", "fail"), CASES)
-def test_the_set_is_that_of_enumeration(criterion, worst, fail, seed):
+def test_the_set_is_that_of_enumeration(criterion, worst, fail, seed, tree):
     one = task(seed, 11, 4, 4, criterion, worst, fail)
     best = one.score(every_set(11, 4)).min()
     found = proven(one)
@@ -37,7 +45,7 @@ def test_alternatives_are_sets_in_order_of_their_values():
 
 def test_a_search_that_is_stopped_says_what_it_knows():
     one = task(1, 24, 8, 6, fail=True)
-    found = search(one, gap=1e-9, seconds=0.05)
+    found = search(one, gap=1e-9, seconds=0.02)
     assert not found.closed
     assert found.root <= found.bound < found.best[0][0]
     assert (np.diff(found.course[:, 1]) >= -1e-12).all()
@@ -53,8 +61,10 @@ def groups(n, seed):
     return rules, np.concatenate([[4.0, 2.2], np.ones(len(thirds)), [-2.0]])
 
 
+@pytest.mark.parametrize("few", [0, 20, 2000])
 @pytest.mark.parametrize("criterion", CRITERIA)
-def test_rules_are_met_and_the_set_is_the_best_of_those_that_do(criterion, seed):
+def test_rules_are_met_and_the_set_is_the_best_of_those_that_do(criterion, few, seed, monkeypatch):
+    monkeypatch.setattr(best_set, "_FEW", few)
     rules, limits = groups(12, seed)
     one = task(seed + 10, 12, 4, 4, criterion, rules=rules, limits=limits)
     sets = np.vstack([every_set(12, k) for k in range(2, 5)])
@@ -64,9 +74,10 @@ def test_rules_are_met_and_the_set_is_the_best_of_those_that_do(criterion, seed)
     assert one.fits(found.best[0][1][None])[0]
 
 
-def test_a_budget_alone_is_a_rule(seed):
+@pytest.mark.parametrize("fail", [False, True])
+def test_a_budget_alone_is_a_rule(fail, seed):
     cost = np.random.default_rng(seed).uniform(0.3, 1.0, 11)
-    one = task(seed, 11, 0, 4, rules=cost[None], limits=np.array([2.0]))
+    one = task(seed, 11, 0, 4, fail=fail, rules=cost[None], limits=np.array([2.0]))
     sets = np.array(np.meshgrid(*[[0, 1]] * 11)).reshape(11, -1).T
     allowed = sets[sets @ cost <= 2.0]
     assert proven(one).best[0][0] == pytest.approx(one.score(allowed).min(), rel=1e-9)
@@ -92,9 +103,10 @@ def test_outer_approximation_agrees(criterion, worst):
     assert proven(one).best[0][0] == pytest.approx(best, rel=1e-9)
 
 
-def test_no_exchanged_random_set_is_below_the_bound(seed):
+@pytest.mark.parametrize("fail", [False, True])
+def test_no_exchanged_random_set_is_below_the_bound(fail, seed):
     for criterion in CRITERIA:
-        one = task(seed + 5, 20, 6, 6, criterion)
+        one = task(seed + 5, 20, 6, 6, criterion, fail=fail)
         found = search(one, seconds=60.0)
         values = [exchanged(one, chosen)[0] for chosen in random_sets(one, 20, seed)]
         assert min(values) >= found.bound
@@ -146,7 +158,7 @@ def test_three_sites_need_the_prior():
     assert bare.score(every_set(9, 3)).min() > 1e12  # singular but for rounding
 
 
-def test_a_leaf_that_fixing_leaves_is_scored():
+def test_a_leaf_that_fixing_leaves_is_scored(tree):
     """With one site to take every child is a leaf, and nothing is left to branch."""
     for k in (1, 8):
         one = task(2, 9, k, 3)

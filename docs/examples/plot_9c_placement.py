@@ -1,0 +1,19 @@
+"""
+Where to put stations
+=====================
+
+Eight of forty masts, so that fixes at twelve places are as good as possible even if one of them fails. Below the maps:
+the best set against what no set can be better than, while it was searched.
+"""
+
+import numpy as np
+
+import optloc
+from optloc.placement import picture
+
+rng = np.random.default_rng(3)
+masts = rng.uniform([-3000, -3000, 0], [3000, 3000, 300], (40, 3))
+places = rng.uniform([-4000, -4000, 0], [4000, 4000, 500], (12, 3))
+problem = optloc.assemble(masts, optloc.measured("toa", a=np.arange(40), sigma=3.0))
+plan = optloc.Plan(problem, places, choose=8, fail_one=True)
+figure = picture(plan, optloc.place(plan))

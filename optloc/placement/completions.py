@@ -1,0 +1,389 @@
+"""All sets of a node that leaves little open, as machine code: to look at each is cheaper than to bound them.
+
+Sites are added depth first, each by an update of the inverse information, and all that may come last are compared at
+once. Where any one site may fail, the last two are: each of them must be good enough without the other, which few are.
+Both leave a millionth for rounding; what is within it is computed from its sums.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from optloc.base.types import Array
+from optloc.compute.jit import compiled
+from optloc.placement.branching import IN, OUT, number_left
+from optloc.placement.criteria import TRACE, VOLUME, invert, measure
+
+# Rounding of sums of costs, as a share of a limit: a budget that is met exactly is met.
+_EXACT = 1e-9
+# Share of a criterion by which an update may be wrong. Rounding, 1e-16, grows by the condition, and by how much
+# another site lowers the variance, which is the condition again at the most.
+_WRONG = 1e-6
+# Condition times that drop up to which an update is good enough to compare, and to be updated again.
+_COMPARE, _AGAIN = 1e9, 1e8
+
+
+class Asked(NamedTuple):
+    """What sets are judged by.
+
+    Parameters
+    ----------
+    sites : array (P, n, r, m)
+        Whitened rows of each site at each place.
+    prior : array (P, m, m)
+        Information without any site.
+    whole : array (P,)
+        Trace of the information of all sites.
+    weight : array (P,)
+        Of the places.
+    d, kind, worst, fail : int
+        As in `optloc.placement.branching.score`.
+    rules, limits : array (R, n), (R,)
+        rules @ w <= limits; the first has no negative entry.
+    """
+
+    sites: Array
+    prior: Array
+    whole: Array
+    weight: Array
+    d: int
+    kind: int
+    worst: int
+    fail: int
+    rules: Array
+    limits: Array
+
+
+class Others(NamedTuple):
+    """Sites that may be added, in their order.
+
+    Parameters
+    ----------
+    site : int array (q,)
+        Their numbers.
+    rows : array (P, r, m, q)
+        Their rows.
+    products : array (P, m (m + 1) / 2, q)
+        Products g_a g_b, b <= a, of their first rows.
+    """
+
+    site: Array
+    rows: Array
+    products: Array
+
+
+class Scratch(NamedTuple):
+    """Arrays that are overwritten: (m, m) twice, (d, d) three times, (d,), and the loss that was the worst, (1,)."""
+
+    matrix: Array
+    inverse: Array
+    cov: Array
+    turn: Array
+    basis: Array
+    shares: Array
+    first: Array
+
+
+@compiled
+def trace_of(matrix: Array, d: int) -> float:
+    """Return the trace of the leading (d, d)."""
+    total = 0.0
+    for i in range(d):
+        total += matrix[i, i]
+    return total
+
+
+@compiled
+def inverse_of(asked: Asked, p: int, members: Array, size: int, lost: int, matrix: Array, out: Array) -> bool:
+    """Write the inverse (m, m) of the information of members but entry `lost` (or -1); return whether there is one.
+
+    Of `members` the first `size` entries are taken; `matrix` (m, m) is overwritten.
+    """
+    _, _, r, m = asked.sites.shape
+    for i in range(m):
+        for k in range(i + 1):
+            matrix[i, k] = asked.prior[p, i, k]
+    for one in range(size):
+        if one == lost:
+            continue
+        for q in range(r):
+            row = asked.sites[p, members[one], q]
+            for i in range(m):
+                x = row[i]
+                for k in range(i + 1):
+                    matrix[i, k] += x * row[k]
+    return bool(np.isfinite(invert(matrix, out, matrix)))  # in place: what was read of it is not read again
+
+
+@compiled
+def update(inverse: Array, row: Array, s: Array) -> None:
+    """Change the inverse of M (m, m) to that of M + g g', by Sherman and Morrison."""
+    m, along = inverse.shape[0], 1.0
+    for i in range(m):
+        x = 0.0
+        for k in range(m):
+            x += inverse[i, k] * row[k]
+        s[i] = x
+        along += row[i] * x
+    for i in range(m):
+        x = s[i] / along
+        for k in range(m):
+            inverse[i, k] -= x * s[k]
+
+
+@compiled
+def grow(asked: Asked, members: Array, size: int, last: Array, condition: float, out: Array, work: Scratch) -> float:
+    """Write the inverses (P, m, m) of members from those `last` of all but the latest; return their condition at most.
+
+    Where rounding would show they are computed from sums.
+    """
+    places, _, r, m = asked.sites.shape
+    most = 0.0
+    for p in range(places):
+        good = condition < _AGAIN
+        if good:
+            for i in range(m):
+                for k in range(m):
+                    out[p, i, k] = last[p, i, k]
+            for q in range(r):
+                update(out[p], asked.sites[p, members[size - 1], q], work.matrix[0])
+            good = condition * trace_of(last[p], m) < _AGAIN * trace_of(out[p], m)
+        if not good and not inverse_of(asked, p, members, size, -1, work.matrix, out[p]):
+            return np.inf
+        most = max(most, asked.whole[p] * trace_of(out[p], m))
+    return most
+
+
+@compiled
+def worth(asked: Asked, members: Array, size: int, lost: int, enough: float, work: Scratch) -> float:
+    """Return the criterion of members but one, or, where it is not below `enough`, a number that is not either."""
+    d, worst = asked.d, asked.worst
+    total = -np.inf if worst else 0.0
+    for p in range(asked.prior.shape[0]):
+        if not inverse_of(asked, p, members, size, lost, work.matrix, work.inverse):
+            return np.inf
+        if asked.kind == TRACE:
+            top = trace_of(work.inverse, d)
+        else:
+            work.cov[:, :] = work.inverse[:d, :d]
+            top, _, _ = measure(asked.kind, work.cov, work.turn, work.basis, work.shares)
+        total = max(total, top) if worst else total + asked.weight[p] * top
+        if total >= enough and (worst or asked.kind != VOLUME):  # a logarithm may be negative
+            break
+    return total
+
+
+@compiled
+def with_loss(asked: Asked, members: Array, size: int, enough: float, work: Scratch) -> float:
+    """Return the criterion of a set, with its worst loss where one may fail; as `worth` does.
+
+    The loss that was too bad in the set before is looked at first.
+    """
+    if not asked.fail or not size:
+        return worth(asked, members, size, -1, enough, work)
+    total, begin = -np.inf, work.first[0]
+    for step in range(size):
+        lost = (begin + step) % size
+        total = max(total, worth(asked, members, size, lost, enough, work))
+        if total >= enough:
+            work.first[0] = lost
+            break
+    return total
+
+
+@compiled
+def trace_with(products: Array, inverse: Array, d: int, begin: int, along: Array, trace: Array) -> None:
+    """Write tr C (M + g g')^-1 C' = tr C M^-1 C' - |C M^-1 g|^2 / (1 + g'M^-1 g) of each row g from `begin` on.
+
+    Both forms are linear in the `products` of rows, (m (m + 1) / 2, q).
+    """
+    m, n, i = inverse.shape[0], products.shape[1], 0
+    for j in range(begin, n):
+        along[j] = 1.0
+        trace[j] = 0.0
+    for a in range(m):
+        for b in range(a + 1):
+            twice, x, y = 1.0 if a == b else 2.0, inverse[a, b], 0.0
+            for k in range(d):
+                y += inverse[k, a] * inverse[k, b]
+            x *= twice
+            y *= twice
+            for j in range(begin, n):
+                along[j] += x * products[i, j]
+                trace[j] += y * products[i, j]
+            i += 1
+    whole = trace_of(inverse, d)
+    for j in range(begin, n):
+        trace[j] = whole - trace[j] / along[j]
+
+
+@compiled
+def one_more(asked: Asked, others: Others, inverses: Array, begin: int, values: Array, work: Scratch) -> None:
+    """Write the criterion (q,) of a set with each other site from `begin` on, by updates of its inverses (P, m, m)."""
+    d, n = asked.d, len(others.site)
+    single, brought = np.empty(n), np.empty(n)
+    values[begin:] = -np.inf if asked.worst else 0.0
+    for p in range(len(asked.weight)):
+        if others.rows.shape[1] == 1 and asked.kind == TRACE:  # all sites at once: most of the time is spent here
+            trace_with(others.products[p], inverses[p], d, begin, single, brought)
+        else:
+            for j in range(begin, n):
+                work.inverse[:, :] = inverses[p]
+                for q in range(others.rows.shape[1]):
+                    update(work.inverse, others.rows[p, q, :, j], work.matrix[0])
+                work.cov[:, :] = work.inverse[:d, :d]
+                brought[j], _, _ = measure(asked.kind, work.cov, work.turn, work.basis, work.shares)
+        for j in range(begin, n):
+            values[j] = max(values[j], brought[j]) if asked.worst else values[j] + asked.weight[p] * brought[j]
+
+
+@compiled
+def comparable(asked: Asked, inverses: Array, condition: float, enough: float) -> bool:
+    """Return whether updates of inverses (P, m, m) tell criteria near `enough` to the share that they may be wrong."""
+    if asked.kind == VOLUME:
+        return condition * condition < _COMPARE
+    total = 0.0
+    for p in range(len(asked.weight)):
+        part = trace_of(inverses[p], asked.d)
+        total = max(total, part) if asked.worst else total + asked.weight[p] * part
+    return condition * max(1.0, total / enough) < _COMPARE
+
+
+@compiled
+def allowed(asked: Asked, members: Array, size: int, partly: bool) -> bool:
+    """Return whether members meet the rules; if they are a part of a set, those without a negative entry."""
+    for i in range(asked.rules.shape[0]):
+        used, low = 0.0, 0.0
+        for one in range(size):
+            used += asked.rules[i, members[one]]
+        if partly:
+            for j in range(asked.rules.shape[1]):
+                low = min(low, asked.rules[i, j])
+        if low == 0.0 and used > asked.limits[i] + _EXACT * max(1.0, abs(asked.limits[i])):
+            return False
+    return True
+
+
+@compiled
+def finish(
+    asked: Asked,
+    members: Array,
+    size: int,
+    others: Others,
+    begin: int,
+    one: bool,
+    two: bool,
+    inverses: Array,
+    condition: float,
+    enough: float,
+    best: Array,
+    work: Scratch,
+) -> float:
+    """Return the least criterion below `enough` of members with `one` site more, or `two`; `best` (n,) gets the set.
+
+    Two are added only where one may fail: then each of them is good enough without the other.
+    """
+    count, keep, values = 0, np.empty(len(others.site), dtype=np.int64), np.full(len(others.site), -np.inf)
+    limit = enough + _WRONG * abs(enough)
+    if comparable(asked, inverses, condition, enough):
+        one_more(asked, others, inverses, begin, values, work)
+    for q in range(begin, len(others.site)):
+        if values[q] < limit:
+            keep[count] = others.site[q]
+            count += 1
+    for q in range(count):
+        for t in range(q if one else q + 1, count if two else q + 1):
+            members[size], members[size + 1] = keep[q], keep[t]
+            taken = size + 1 if t == q else size + 2
+            value = with_loss(asked, members, taken, enough, work)
+            if value < enough and allowed(asked, members, taken, False):
+                enough = value
+                best[:] = OUT
+                for i in range(taken):
+                    best[members[i]] = IN
+    return enough
+
+
+@compiled
+def picked(asked: Asked, order: Array) -> Others:
+    """Return sites in an order (q,), with what is compared of them."""
+    places, _, r, m = asked.sites.shape
+    count = len(order)
+    rows, products = np.empty((places, r, m, count)), np.empty((places, m * (m + 1) // 2, count))
+    for p in range(places):
+        for j in range(count):
+            i = 0
+            for a in range(m):
+                for q in range(r):
+                    rows[p, q, a, j] = asked.sites[p, order[j], q, a]
+                for b in range(a + 1):
+                    products[p, i, j] = asked.sites[p, order[j], 0, a] * asked.sites[p, order[j], 0, b]
+                    i += 1
+    return Others(order, rows, products)
+
+
+@compiled
+def scratch(m: int, d: int) -> Scratch:
+    """Return arrays for `m` unknowns, of which `d` are the position."""
+    square, small = np.empty((2, m, m)), np.empty((3, d, d))
+    return Scratch(square[0], square[1], small[0], small[1], small[2], np.empty(d), np.zeros(1, dtype=np.int64))
+
+
+@compiled
+def is_counted(asked: Asked, order: Array) -> bool:
+    """Return whether all that rules say is how many of these sites are taken: then no set is a part of another."""
+    for j in order:
+        if asked.rules[0, j] != asked.rules[0, order[0]]:
+            return False
+    return asked.rules.shape[0] == 1
+
+
+@compiled
+def exhaust(asked: Asked, state: Array, order: Array, most: int, enough: float, best: Array) -> float:
+    """Return the least criterion below `enough` of all sets of a node, or `enough`; `best` (n,) gets the set.
+
+    Parameters
+    ----------
+    asked : Asked
+        What sets are judged by.
+    state : int array (n,)
+        FREE, OUT or IN.
+    order : int array (free,)
+        The free sites; those that promise most come last, so that what is added first is soon too bad.
+    most : int
+        How many of them are added at the most.
+    """
+    places, n, _, m = asked.sites.shape
+    room = min(most, number_left(asked.rules[0], asked.limits[0], state))
+    if room < 1:
+        return enough
+    members, sure, deep = np.empty(n + 2, dtype=np.int64), 0, max(0, room - (2 if asked.fail else 1))
+    for j in range(n):
+        if state[j] == IN:
+            members[sure] = j
+            sure += 1
+    counted, others, work = is_counted(asked, order), picked(asked, order), scratch(m, asked.d)
+    at, inverses = np.zeros(deep + 1, dtype=np.int64), np.empty((deep + 1, places, m, m))
+    condition = np.empty(deep + 1)
+    condition[0] = grow(asked, members, sure, inverses[0], np.inf, inverses[0], work)
+    depth, fresh = 0, True
+    while depth >= 0:
+        size, begin, own = sure + depth, at[depth], inverses[depth]
+        if fresh and (depth == deep or not counted):
+            two = depth == deep and room - depth > 1
+            one = not (two and counted)
+            enough = finish(asked, members, size, others, begin, one, two, own, condition[depth], enough, best, work)
+        fresh = depth < deep and begin < len(order)
+        if not fresh:
+            depth -= 1
+            continue
+        members[size] = order[begin]
+        at[depth] = begin + 1
+        fresh = allowed(asked, members, size + 1, True)
+        if fresh:
+            depth += 1
+            at[depth] = begin + 1
+            condition[depth] = grow(asked, members, size + 1, own, condition[depth - 1], inverses[depth], work)
+    return enough
