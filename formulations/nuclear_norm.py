@@ -14,9 +14,9 @@ sum of the singular values, its convex envelope on matrices of bounded norm, and
 so that the least nuclear norm lies between the true times and those of the nearest stations. Without the bounds on
 `o` it ends beyond them.
 
-*Further passes*, :math:`W = U_d V_d^\top` of the pass before: the truncated nuclear norm, the sum of the singular values
-beyond the first d, decreased by linearising what is concave in it. It is zero at the true times without noise, and
-where the passes arrive there, they are exact; a local method from one start.
+*Further passes*, :math:`W = U_d V_d^\top` of the pass before: the truncated nuclear norm, the sum of the singular
+values beyond the first d, decreased by linearising what is concave in it. It is zero at the true times without noise,
+and where the passes arrive there, they are exact; a local method from one start.
 
 Times of emission make the network affine by one singular value decomposition, and :mod:`formulations.metric_upgrade`
 gives the places. Stations without a common clock are outside: their term :math:`b \, o^\top` is not affine.

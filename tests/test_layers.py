@@ -21,9 +21,10 @@ LAYERS = (
     "solvers uncertainty",
     "track quality",
     "files papers several plot plugins",
+    "calibration",
     "study",
     "report",
-    "live placement calibration",
+    "live placement",
     "cli",
 )
 LAYER = {room: floor for floor, rooms in enumerate(LAYERS) for room in rooms.split()}
