@@ -138,7 +138,7 @@ def test_no_loose_module():
 # minimizers of others in studies, methods on the same trials, and the leaderboard; networks of unknown places:
 # fits of low rank and their upgrade, the network, its likelihood, starts, blocks, search, frame and verdict, its files,
 # its command and its map.
-MODULES, LINES, BODY, RECURRING = 339, 600, 60, 20
+MODULES, LINES, BODY, RECURRING = 341, 600, 60, 20
 
 
 def test_files_and_functions_are_of_a_size_to_be_read():

@@ -1,4 +1,4 @@
-"""Studies of networks: what is drawn, errors after the best motion, the judge, covariances, and files that do not fit."""
+"""Studies of networks: what is drawn, errors after the best motion, the judge, covariances, files that do not fit."""
 
 import numpy as np
 import pytest
@@ -55,7 +55,8 @@ def test_a_trial_does_not_depend_on_the_others_and_has_the_flaws_that_were_asked
     assert len(set(many.digest)) == 40
     given = np.array([network.given for network in many.networks])
     assert given.sum(axis=2).min() >= 5
-    assert given.mean() == pytest.approx(0.7, abs=0.02)
+    # a little more than 0.7, as no pulse keeps fewer than five
+    assert 0.7 < given.mean() < 0.75
     off = []
     for i, network in enumerate(many.networks):
         at = many.truth.take(slice(i, i + 1))
@@ -81,7 +82,7 @@ def test_the_judge_is_below_the_truth_and_below_random_places():
 
 @pytest.mark.parametrize("flaw", ["", "synchronised = false"])
 def test_covariances_are_those_of_errors_after_the_best_motion(flaw):
-    trials = 60
+    trials = 25
     judge = frames(changed(HALL, flaw, trials=trials))["truth"]
     shape = 10 * 2 - 3  # coordinates less the frame
     low, high = chi2.ppf([1e-4, 1.0 - 1e-4], trials * shape) / (trials * shape)
