@@ -150,5 +150,6 @@ def _picture(found: Calibration, title: str) -> Any:
         known,
         [other.stations for other in found.alternatives[:3]],
         found.residuals,
+        found.dof,
         f"{title}: {found.status.label}",
     )
