@@ -74,7 +74,7 @@ def _histogram(axes: Axes, residuals: Array, dof: int) -> None:
     """Draw residuals (n,), and the normal law that is left of the noise when so many degrees of freedom remain."""
     edges = np.arange(-_FAR, _FAR + _BAR, _BAR)
     weights = np.full(residuals.size, 1.0 / (max(residuals.size, 1) * _BAR))
-    axes.hist(np.clip(residuals, -_FAR, _FAR), bins=edges, weights=weights, color=GREY)
+    axes.hist(np.clip(residuals, -_FAR, _FAR), bins=edges.tolist(), weights=weights, color=GREY)
     if residuals.size and dof > 0:
         spread = np.sqrt(min(dof / residuals.size, 1.0))
         x = np.linspace(-_FAR, _FAR, 200)
