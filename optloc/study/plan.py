@@ -240,7 +240,7 @@ def _one_kind(study: StudyFile, methods: list[Method]) -> None:
     """Refuse studies of nothing, of scenarios and networks at once, and methods that do not serve what is studied."""
     if bool(study.scenario) == bool(study.network):
         what = "there are both scenarios and networks" if study.scenario else "there is nothing to study"
-        raise InvalidProblem(what, "", "give either [[scenario]] or [[network]] tables")
+        raise InvalidProblem(what, "[[scenario]]", "give either [[scenario]] or [[network]] tables")
     for method in methods:
         if study.network and not method.networked:
             advice = 'use method = "calibrate", or a baseline of networks: optloc list baselines'
